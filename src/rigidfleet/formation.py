@@ -1,0 +1,349 @@
+"""Shapes, edges and the distances between them: what a formation is before it flies.
+
+Pure NumPy. Agents count from 0 here; a shape is an (N, 3) array of *slots* [m] in the body frame, one per
+agent, with its geometric centre at the origin. Distances alone know neither a mirror image nor an attitude;
+slots do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+#: Relative tolerance within which given distances must be realisable. Flat and straight shapes sit exactly
+#: on the limit, so distances need about seven digits: 5.656854, not 5.657.
+REALISABLE = 1e-6
+
+#: The 18 edges of the paper's cube (its Table 4 with the swapped pair d45, d48 put right), counted from 0.
+CUBE_EDGES: Ints = np.array(
+    [(0, 1), (0, 3), (0, 4), (0, 5), (1, 2), (1, 3), (1, 5), (1, 6), (2, 3), (2, 6), (2, 7), (3, 4)]
+    + [(3, 7), (4, 5), (4, 7), (5, 6), (5, 7), (6, 7)],
+    dtype=np.int64,
+)
+
+
+# -- shapes ------------------------------------------------------------------------------------------
+
+
+def _line(size: Floats, n: int) -> Floats:
+    x = size[0] * np.arange(n)
+    return np.column_stack([x, 0 * x, 0 * x])
+
+
+def _triangle(size: Floats, n: int) -> Floats:
+    # The paper's attachment: x towards agent 3, y along r1 - r2.
+    a, h = size[0], size[0] * np.sqrt(3) / 2
+    return np.array([[0, a / 2, 0], [0, -a / 2, 0], [h, 0, 0]])
+
+
+def _polygon(size: Floats, n: int) -> Floats:
+    angle = 2 * np.pi * np.arange(n) / n
+    radius = size[0] / (2 * np.sin(np.pi / n))
+    return radius * np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
+
+
+def _cuboid(size: Floats, n: int) -> Floats:
+    base = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+    return np.vstack([base, base + [0, 0, 1]]) * size
+
+
+def _square(size: Floats, n: int) -> Floats:
+    return _cuboid(size, 8)[:4]
+
+
+def _pyramid(size: Floats, n: int) -> Floats:
+    base = _polygon(size, n - 1) if n != 5 else _square(size, 4) - size * [0.5, 0.5, 0]
+    height = np.sqrt(size[0] ** 2 - base[0] @ base[0])
+    return np.vstack([base, [0, 0, height]])
+
+
+class Shape(NamedTuple):
+    """A named shape: which numbers of agents it takes, how many sizes, and what it looks like."""
+
+    agents: range
+    sizes: int
+    make: Callable[[Floats, int], Floats]
+    text: str
+
+
+_ANY = 1 << 30
+SHAPES: dict[str, Shape] = {
+    "line": Shape(range(1, _ANY), 1, _line, "along x, `size` apart, in the order of the agents"),
+    "triangle": Shape(range(3, 4), 1, _triangle, "equilateral; x towards agent 3, y along r1 - r2"),
+    "square": Shape(range(4, 5), 1, _square, "1-4 counter-clockwise from (-, -)"),
+    "polygon": Shape(range(3, _ANY), 1, _polygon, "regular, counter-clockwise, agent 1 on x"),
+    "hexagon": Shape(range(6, 7), 1, _polygon, "regular, counter-clockwise, agent 1 on x"),
+    "pyramid": Shape(range(4, 7), 1, _pyramid, "all edges equal; the base counter-clockwise, the apex last"),
+    "cube": Shape(range(8, 9), 1, _cuboid, "1-4 counter-clockwise from (-, -, -) below, 5-8 above them"),
+    "cuboid": Shape(range(8, 9), 3, _cuboid, "as the cube, with three edge lengths [x, y, z]"),
+}
+
+
+def slots(shape: str, size: float | Sequence[float], n: int) -> Floats:
+    """Slots of a named shape of `n` agents, geometric centre at 0.
+
+    Parameters
+    ----------
+    shape : a key of `SHAPES`
+    size : edge length [m]; three of them for a cuboid
+    n : number of agents
+
+    Returns
+    -------
+    (n, 3) slots [m]
+
+    Raises
+    ------
+    ValueError
+        The shape is unknown, takes another number of agents or sizes, or a size is not positive.
+    """
+    if shape not in SHAPES:
+        raise ValueError(f"unknown shape {shape!r}; known: {', '.join(SHAPES)}")
+    form = SHAPES[shape]
+    sizes = np.atleast_1d(np.asarray(size, dtype=np.float64))
+    if n not in form.agents:
+        raise ValueError(f"shape {shape!r} takes {agents_taken(shape)}, not {n}")
+    if sizes.shape != (form.sizes,):
+        wanted = "one size, its edge length" if form.sizes == 1 else f"{form.sizes} sizes [x, y, z]"
+        raise ValueError(f"shape {shape!r} takes {wanted}")
+    if not (np.isfinite(sizes).all() and (sizes > 0).all()):
+        raise ValueError(f"shape {shape!r} needs sizes > 0 m, not {size}")
+    return centred(form.make(sizes, n))
+
+
+def agents_taken(shape: str) -> str:
+    """How many agents a named shape takes, in words."""
+    taken = SHAPES[shape].agents
+    if len(taken) == 1:
+        return f"{taken.start} agents"
+    if taken.stop == _ANY:
+        return f"{taken.start} or more agents"
+    return f"{taken.start} to {taken.stop - 1} agents"
+
+
+def centred(points: ArrayLike) -> Floats:
+    """Points (N, 3) with their geometric centre moved to 0."""
+    p = np.asarray(points, dtype=np.float64)
+    return p - p.mean(axis=0)
+
+
+# -- edges and distances -----------------------------------------------------------------------------
+
+
+def complete_graph(n: int) -> Ints:
+    """All n (n - 1) / 2 edges (i, j), i < j, in lexical order, shape (m, 2)."""
+    return np.column_stack(np.triu_indices(n, 1)).astype(np.int64)
+
+
+def distances(points: ArrayLike, edges: ArrayLike) -> Floats:
+    """Lengths (m,) [m] of edges (m, 2) between points (N, 3)."""
+    p = np.asarray(points, dtype=np.float64)
+    e = np.asarray(edges, dtype=np.int64).reshape(-1, 2)
+    return np.linalg.norm(p[e[:, 0]] - p[e[:, 1]], axis=1)
+
+
+def dimension(points: ArrayLike, tol: float = 1e-6) -> int:
+    """0 for a point, 1 for a line, 2 for a plane, 3 for a spatial shape.
+
+    `tol` is relative: a shape is flat when it is `tol` times as thick as it is long (in the sense of the
+    singular values of its centred points).
+    """
+    s = np.linalg.svd(centred(points), compute_uv=False)
+    scale = max(s[0], 1e-12 * float(np.abs(points).max(initial=0.0)))
+    return int(np.count_nonzero(s > tol * scale)) if s[0] >= scale > 0 else 0
+
+
+class Violation(NamedTuple):
+    """Given distances which no points in space have."""
+
+    agents: tuple[int, ...]
+    edges: tuple[int, ...]
+    excess: float
+    """Triangle: by how much the longest side is too long [m]. Tetrahedron: its squared volume [m^6], < 0."""
+
+
+def unrealisable(edges: ArrayLike, lengths: ArrayLike, tol: float = REALISABLE) -> list[Violation]:
+    """Every triangle and tetrahedron among the given distances that does not exist in space.
+
+    A triangle whose three sides are given must meet the triangle inequality; a quadruple with all six
+    distances, and faces that exist, must have a Cayley-Menger determinant 288 V^2 >= 0. Both hold within
+    `tol` of their own size, so that straight (4-8-4) and flat shapes pass. Other quadruples are not judged,
+    and more agents than four may contradict each other where every four agree.
+    """
+    pairs = [(int(min(e)), int(max(e))) for e in np.asarray(edges).reshape(-1, 2)]
+    index = {pair: k for k, pair in enumerate(pairs)}
+    length = np.asarray(lengths, dtype=np.float64)
+    later: dict[int, set[int]] = {}
+    for i, j in pairs:
+        later.setdefault(i, set()).add(j)
+    none: set[int] = set()
+
+    found: list[Violation] = []
+    broken: set[tuple[int, ...]] = set()
+    quadruples: list[tuple[int, int, int, int]] = []
+    for i, j in sorted(index):
+        third = later.get(i, none) & later.get(j, none)
+        for k in sorted(third):
+            sides = (index[i, j], index[i, k], index[j, k])
+            longest = max(length[s] for s in sides)
+            excess = 2 * longest - sum(length[s] for s in sides)
+            if excess > tol * longest:
+                found.append(Violation((i, j, k), sides, float(excess)))
+                broken.add((i, j, k))
+            quadruples += [(i, j, k, m) for m in sorted(third & later.get(k, none))]
+    for chunk in _chunks(quadruples, 4096):
+        sides = np.array([[index[pair] for pair in combinations(q, 2)] for q in chunk])
+        d2 = length[sides] ** 2
+        # Gram matrix of the three edges from the first agent; its determinant is 36 V^2.
+        a, b, c, ab, ac, bc = d2.T
+        gram = np.array([[2 * a, a + b - ab, a + c - ac], [a + b - ab, 2 * b, b + c - bc], [a + c - ac, b + c - bc, 2 * c]])
+        volume2 = np.linalg.det(np.moveaxis(gram / 2, -1, 0)) / 36
+        for row in np.flatnonzero(volume2 < -tol * d2.max(axis=1) ** 3):
+            if not any(face in broken for face in combinations(chunk[row], 3)):
+                found.append(Violation(chunk[row], tuple(map(int, sides[row])), float(volume2[row])))
+    return found
+
+
+def _chunks(items: list[tuple[int, int, int, int]], size: int) -> Iterator[list[tuple[int, int, int, int]]]:
+    for start in range(0, len(items), size):
+        yield items[start : start + size]
+
+
+def slots_from_distances(n: int, edges: ArrayLike, lengths: ArrayLike, tol: float = REALISABLE) -> Floats | None:
+    """Slots (n, 3) [m] of a *complete* set of distances (classical multidimensional scaling).
+
+    Distances know neither attitude nor mirror image; both follow a convention in which the paper's triangle
+    comes out as it attaches it, and every named shape with its own handedness: x points from the centre
+    to the last agent, y along r1 - r2 made orthogonal to x, and of a spatial shape that mirror image is taken
+    whose first four agents that span space, a < b < c < d, have (b - a) x (c - a) . (d - a) > 0.
+
+    Returns None where a distance is missing, since the shape is then not determined.
+
+    Raises
+    ------
+    ValueError
+        No points in space have these distances, within `tol` of the largest.
+    """
+    e = np.asarray(edges, dtype=np.int64).reshape(-1, 2)
+    d = np.zeros((n, n))
+    d[e[:, 0], e[:, 1]] = d[e[:, 1], e[:, 0]] = lengths
+    if len({(min(i, j), max(i, j)) for i, j in e.tolist()}) < n * (n - 1) // 2:
+        return None
+    centring = np.eye(n) - 1 / n
+    value, vector = np.linalg.eigh(-0.5 * centring @ d**2 @ centring)
+    top = value[-3:][::-1]
+    p = np.zeros((n, 3))
+    p[:, : len(top)] = vector[:, -3:][:, ::-1] * np.sqrt(np.maximum(top, 0))
+    error = float(np.abs(distances(p, e) - lengths).max(initial=0.0))
+    # Near a flat shape, an error e in a distance moves points by sqrt(e): judged by distances, not by volume.
+    if error > np.sqrt(tol) * d.max(initial=0.0) or value[0] < -tol * n * d.max(initial=0.0) ** 2:
+        raise ValueError(f"no points in space have these distances (nearest set is {error:.3g} m off)")
+    return _conventional(p)
+
+
+def _conventional(p: Floats) -> Floats:
+    """Turn and mirror centred points (N, 3) to the convention of `slots_from_distances`."""
+    small = 1e-9 * np.abs(p).max(initial=0.0)
+
+    def first(candidates: Iterator[Floats]) -> Floats | None:
+        return next((v / np.linalg.norm(v) for v in candidates if np.linalg.norm(v) > 1e3 * small), None)
+
+    x = first(iter(p[::-1]))
+    if x is None:
+        return p
+    q = p - np.outer(p @ x, x)
+    y = first(q[i] - q[j] for i, j in combinations(range(len(p)), 2))
+    if y is None:
+        return np.column_stack([p @ x, np.zeros((len(p), 2))])
+    out = np.column_stack([p @ x, p @ y, p @ np.cross(x, y)])
+    if dimension(out) == 3 and handedness(out) < 0:
+        out[:, 2] *= -1
+    return out
+
+
+def handedness(points: ArrayLike, tol: float = 1e-6) -> int:
+    """+1 or -1 for a spatial shape and its mirror image, 0 for a planar one.
+
+    The sign of (b - a) x (c - a) . (d - a) for the first four agents a < b < c < d that span space, and so the
+    same for every rotation of the shape.
+    """
+    p = np.asarray(points, dtype=np.float64)
+    size = float(np.abs(p - p.mean(axis=0)).max(initial=0.0))
+    basis: list[Floats] = []
+    for q in p[1:] - p[0]:
+        rest = q.copy()
+        for b in basis:
+            rest -= (rest @ b) * b
+        length = np.linalg.norm(rest)
+        if length <= tol * size:
+            continue
+        if len(basis) == 2:
+            return int(np.sign(np.cross(basis[0], basis[1]) @ q))
+        basis.append(rest / length)
+    return 0
+
+
+# -- attitude of a shape -----------------------------------------------------------------------------
+
+
+def kabsch(
+    target: ArrayLike,
+    source: ArrayLike,
+    weights: ArrayLike | None = None,
+    near: ArrayLike | None = None,
+    tol: float = 1e-9,
+) -> Floats:
+    """Rotation R minimising sum_i w_i |target_i - R source_i|^2, both sets taken about their weighted centres.
+
+    With slots as source and positions in the world as target, R is body -> world, the transpose of the paper's
+    T. Where several rotations fit equally well (points on a line, a mirrored symmetric shape), the one nearest
+    to `near` is taken, so that a line gets the *minimal* rotation and no spin about itself.
+
+    Parameters
+    ----------
+    target, source : (..., N, 3), leading axes (samples in time) broadcast
+    weights : (N,) >= 0, default equal
+    near : (3, 3) rotation, default the identity
+    tol : singular values below `tol` times the largest count as zero, and so do differences between them
+
+    Returns
+    -------
+    (..., 3, 3) rotations, det +1
+    """
+    p, q = np.asarray(target, dtype=np.float64), np.asarray(source, dtype=np.float64)
+    w = np.ones(p.shape[-2]) if weights is None else np.asarray(weights, dtype=np.float64)
+    w = w[:, None] / w.sum()
+    p, q = p - (w * p).sum(axis=-2, keepdims=True), q - (w * q).sum(axis=-2, keepdims=True)
+    u, s, vt = np.linalg.svd(np.swapaxes(w * p, -1, -2) @ q)
+    rotation = u @ vt
+    proper = np.linalg.det(rotation) > 0
+    free = ~proper | (s[..., 1] <= tol * s[..., 0])
+    guide = np.eye(3) if near is None else np.asarray(near, dtype=np.float64)
+    for at in np.argwhere(free):
+        k = tuple(at)
+        rotation[k] = _nearest_fit(u[k], s[k], vt[k], bool(proper[k]), guide, tol)
+    return rotation
+
+
+def _nearest_fit(u: Floats, s: Floats, vt: Floats, proper: bool, near: Floats, tol: float) -> Floats:
+    """Of the rotations that maximise tr(R^T U S V^T), the one nearest to `near`.
+
+    They are U (1 - 2 n n^T) V^T with n any unit vector among the equal smallest singular values, if det(U V^T) =
+    -1; where the smallest is zero, the sign of U's last column is free and this covers det = +1 as well.
+    """
+    if s[0] == 0:
+        return near.copy()
+    if proper:
+        u = u * [1, 1, -1]
+    equal = int(np.count_nonzero(s <= s[2] + tol * s[0]))
+    overlap = (vt @ near.T @ u)[-equal:, -equal:]
+    n = np.zeros(3)
+    n[-equal:] = np.linalg.eigh(overlap + overlap.T)[1][:, 0]
+    return (u - 2 * np.outer(u @ n, n)) @ vt
