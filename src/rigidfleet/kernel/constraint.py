@@ -1,0 +1,136 @@
+"""The constraint force: Baumgarte-stabilised Lagrange multipliers (paper, section III).
+
+Eq. 14 of the paper, with the moving reference fed forward, reads
+
+    f_C = J^T lambda,   (J M^-1 J^T) lambda = b,
+    b = d_ddot - J_dot r_dot - J M^-1 f_E - 2 alpha c_dot - beta^2 c - gamma int c dt.
+
+Row k of J holds the unit vector u_k of edge (i, j) at i and -u_k at j. The matrix
+A = J M^-1 J^T is singular where a formation lies on a line or in a plane, or has redundant edges:
+the named solves differ only in what they do there.
+"""
+
+import math
+
+from rigidfleet.kernel.compiled import compiled
+from rigidfleet.kernel.linalg import cholesky, cholesky_solve, jacobi_eigen
+from rigidfleet.kernel.program import EXACT, ITERATED, PINV
+
+
+@compiled
+def edge_geometry(r, edges, u, L):
+    """Unit vectors u (m, 3) and lengths L (m,) [m] of the edges at positions r (N, 3) (Eq. 3)."""
+    for k in range(edges.shape[0]):
+        i, j = edges[k, 0], edges[k, 1]
+        x, y, z = r[i, 0] - r[j, 0], r[i, 1] - r[j, 1], r[i, 2] - r[j, 2]
+        L[k] = math.sqrt(x * x + y * y + z * z)
+        inverse = 1.0 / L[k]
+        u[k, 0], u[k, 1], u[k, 2] = x * inverse, y * inverse, z * inverse
+
+
+@compiled
+def right_side(v, integral, f, m, edges, law, w):
+    """The bracket of Eq. 14 into w.b (m,) [m/s^2], the constraints (Eq. 3) into w.c.
+
+    Jdot v of an edge is (|dv|^2 - (u . dv)^2) / L; ``f`` (N, 3) [N] is every force but f_C.
+    """
+    for k in range(edges.shape[0]):
+        i, j = edges[k, 0], edges[k, 1]
+        speed2 = along = pull = 0.0
+        for q in range(3):
+            dv = v[i, q] - v[j, q]
+            speed2 += dv * dv
+            along += w.u[k, q] * dv
+            pull += w.u[k, q] * (f[i, q] / m[i] - f[j, q] / m[j])
+        w.c[k] = w.L[k] - w.d[k]
+        w.b[k] = (
+            w.d_ddot[k]
+            - (speed2 - along * along) / w.L[k]
+            - pull
+            - 2.0 * law.alpha * (along - w.d_dot[k])
+            - law.beta * law.beta * w.c[k]
+            - law.gamma * integral[k]
+        )
+
+
+@compiled
+def assemble(u, m, graph, scale, shift, A):
+    """Lower triangle of A = scale J M^-1 J^T + shift 1 (m, m)."""
+    edges, pairs, weight = graph.edges, graph.pairs, graph.weight
+    n = edges.shape[0]
+    for k in range(n):
+        for l in range(k):
+            A[k, l] = 0.0
+        A[k, k] = scale * (1.0 / m[edges[k, 0]] + 1.0 / m[edges[k, 1]]) + shift
+    for p in range(pairs.shape[0]):
+        k, l = pairs[p, 0], pairs[p, 1]
+        dot = u[k, 0] * u[l, 0] + u[k, 1] * u[l, 1] + u[k, 2] * u[l, 2]
+        A[k, l] = scale * weight[p] * dot
+
+
+@compiled
+def solve_multipliers(m, graph, law, w):
+    """Multipliers w.multiplier (m,) [N] for w.b; NaN where A is singular and the law exact.
+
+    On the eigenvalues w of mbar A (mbar the mean mass), each law is mbar phi(w) b with
+    exact      1/w, the paper's;
+    iterated   (1 - (mu/(w + mu))^k)/w, Tikhonov regularisation iterated k times;
+    spectral   1/(w + nu), nu = (s0/4)(1 - w/s0)^2 for w < s0, else 0;
+    pinv       1/w, or 0 where w is below the cut-off.
+    """
+    n = graph.edges.shape[0]
+    b, y = w.b, w.multiplier
+    mbar = m.mean()
+    if law.solver == ITERATED:
+        assemble(w.u, m, graph, mbar, law.mu, w.A)
+        cholesky(w.A)
+        for k in range(n):
+            y[k] = 0.0
+        for _ in range(law.iterations):  # (mbar A + mu) y_new = mbar b + mu y
+            for k in range(n):
+                y[k] = mbar * b[k] + law.mu * y[k]
+            cholesky_solve(w.A, y)
+        return
+    definite = False
+    if law.solver == EXACT:
+        assemble(w.u, m, graph, mbar, 0.0, w.A)
+        definite = cholesky(w.A)
+    elif law.solver != PINV:  # spectral: the exact law wherever all w >= s0
+        assemble(w.u, m, graph, mbar, -law.s0, w.A)
+        if cholesky(w.A):
+            assemble(w.u, m, graph, mbar, 0.0, w.A)
+            definite = cholesky(w.A)
+    if definite or law.solver == EXACT:
+        for k in range(n):
+            y[k] = mbar * b[k] if definite else math.nan
+        cholesky_solve(w.A, y)
+        return
+    assemble(w.u, m, graph, mbar, 0.0, w.A)
+    jacobi_eigen(w.A, w.V, w.w)
+    largest = w.w.max()
+    for k in range(n):
+        y[k] = 0.0
+    for q in range(n):
+        value = w.w[q]
+        if law.solver == PINV:
+            phi = 1.0 / value if value > law.cutoff * largest else 0.0
+        else:
+            short = max(0.0, 1.0 - value / law.s0)
+            phi = 1.0 / (value + 0.25 * law.s0 * short * short)
+        s = 0.0
+        for k in range(n):
+            s += w.V[k, q] * b[k]
+        for k in range(n):
+            y[k] += mbar * phi * s * w.V[k, q]
+
+
+@compiled
+def apply_multipliers(u, edges, multiplier, f_C):
+    """f_C = J^T lambda (Eq. 11) into f_C (N, 3) [N]: no net force, no net torque."""
+    f_C[:] = 0.0
+    for k in range(edges.shape[0]):
+        i, j = edges[k, 0], edges[k, 1]
+        for q in range(3):
+            pull = multiplier[k] * u[k, q]
+            f_C[i, q] += pull
+            f_C[j, q] -= pull

@@ -1,0 +1,356 @@
+"""The closed loop's right-hand side, its integrator and its recorder.
+
+States: inertial formulation [r (3N), v (3N), int c (m), q (4, if there is a frame)];
+body formulation [x (3N), y (3N), int c (m), q (4), r_cm (3), v_cm (3)], x_i = T (r_i - r_cm),
+y_i = T (v_i - v_cm).
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import types
+from numba.extending import intrinsic
+from numpy.typing import NDArray
+
+from rigidfleet.kernel.body import (
+    attitude_matrix,
+    damp_deformation,
+    mean_axes,
+    multiply,
+    multiply_transposed,
+    quaternion_rate,
+)
+from rigidfleet.kernel.compiled import compiled
+from rigidfleet.kernel.constraint import (
+    apply_multipliers,
+    edge_geometry,
+    right_side,
+    solve_multipliers,
+)
+from rigidfleet.kernel.control import body_law, desired_agents, local_law, reference_motion
+from rigidfleet.kernel.program import BODY, LOCAL, SLOTS, Array, Program, Workspace
+from rigidfleet.kernel.references import blend_slots, distance_references
+
+# What `integrate` returns.
+FINISHED, PAUSED, COLLAPSED = range(3)
+
+
+@intrinsic
+def call_external(_context, address, t, r, v, f):
+    """Call the C function at ``address``: void(double t, double *r, *v, *f, ssize_t n)."""
+    from llvmlite import ir  # noqa: PLC0415  (only while compiling)
+
+    def generate(context, builder, signature, arguments):
+        pointer, double, size = ir.IntType(8).as_pointer(), ir.DoubleType(), ir.IntType(64)
+        kind = ir.FunctionType(ir.VoidType(), [double, pointer, pointer, pointer, size])
+        function = builder.inttoptr(arguments[0], kind.as_pointer())
+        arrays = [
+            context.make_array(signature.args[k])(context, builder, arguments[k]) for k in (2, 3, 4)
+        ]
+        data = [builder.bitcast(a.data, pointer) for a in arrays]
+        count = builder.extract_value(arrays[0].shape, 0)
+        builder.call(function, [arguments[1], *data, count])
+        return context.get_dummy_value()
+
+    return types.void(types.int64, types.float64, r, v, f), generate
+
+
+@compiled
+def closed_loop(t, y, dy, p, w):
+    """Right-hand side dy of the closed loop at time t [s] and state y.
+
+    Newton's law with the constraint force: M dv/dt = f_E + f_u + f_C (Eq. 2), f_u from the input
+    law of the phase, f_C from the multipliers (Eq. 14). Everything computed stays in ``w``.
+    """
+    vehicles, graph, control = p.vehicles, p.graph, p.control
+    m, g = vehicles.m, vehicles.g
+    n = m.shape[0]
+    n_edges = graph.edges.shape[0]
+    r, v, T = w.r, w.v, w.T
+    q = 6 * n + n_edges
+    if p.has_frame:
+        attitude_matrix(y[q : q + 4], T)
+    for i in range(n):
+        for s in range(3):
+            r[i, s], v[i, s] = y[3 * i + s], y[3 * n + 3 * i + s]
+        if p.body_formulation:
+            multiply_transposed(T, y[3 * i : 3 * i + 3], r[i])
+            multiply_transposed(T, y[3 * (n + i) : 3 * (n + i) + 3], v[i])
+            for s in range(3):
+                r[i, s] += y[q + 4 + s]
+                v[i, s] += y[q + 7 + s]
+
+    for i in range(n):
+        w.f_E[i, 0], w.f_E[i, 1], w.f_E[i, 2] = 0.0, 0.0, -m[i] * g
+        for s in range(3):
+            w.a[i, s] = 0.0
+    if p.external != 0:
+        call_external(p.external, t, r, v, w.a)
+        for i in range(n):
+            for s in range(3):
+                w.f_E[i, s] += w.a[i, s]
+
+    if p.law.k_def > 0.0 or p.has_frame or control.kind == BODY:
+        mean_axes(r, v, m, w)
+    if p.reference.kind == SLOTS or control.kind == LOCAL:
+        blend_slots(t, p.reference, w.p, w.p_dot, w.p_ddot)
+    if control.kind == LOCAL:
+        reference_motion(t, p.motion, w)
+        desired_agents(w)
+        local_law(r, v, m, g, control, w)
+    elif control.kind == BODY:
+        body_law(t, m, g, T, p.feedback, control, w)
+    else:
+        w.f_u[:] = control.force
+    if p.law.k_def > 0.0:
+        damp_deformation(r, v, m, p.law.k_def, w.cm, w.f_u)
+
+    if n_edges > 0:
+        edge_geometry(r, graph.edges, w.u, w.L)
+        distance_references(
+            t, p.reference, graph.edges, w.p, w.p_dot, w.p_ddot, w.d, w.d_dot, w.d_ddot
+        )
+        for i in range(n):
+            for s in range(3):
+                w.a[i, s] = w.f_E[i, s] + w.f_u[i, s]
+        right_side(v, y[6 * n : q], w.a, m, graph.edges, p.law, w)
+        solve_multipliers(m, graph, p.law, w)
+        apply_multipliers(w.u, graph.edges, w.multiplier, w.f_C)
+        for k in range(n_edges):
+            dy[6 * n + k] = w.c[k]
+
+    for i in range(n):
+        share = 1.0
+        if vehicles.saturate:
+            thrust = 0.0
+            for s in range(3):
+                thrust += (w.f_u[i, s] + w.f_C[i, s]) ** 2
+            share = min(1.0, vehicles.thrust_limit[i] / max(math.sqrt(thrust), 1e-300))
+        for s in range(3):
+            w.a[i, s] = (w.f_E[i, s] + share * (w.f_u[i, s] + w.f_C[i, s])) / m[i]
+
+    if not p.body_formulation:
+        for i in range(n):
+            for s in range(3):
+                dy[3 * i + s], dy[3 * n + 3 * i + s] = v[i, s], w.a[i, s]
+    else:
+        body_derivatives(y, dy, p, w)
+    if p.has_frame:
+        multiply(T, w.cm[2], w.cm[4])
+        quaternion_rate(y[q : q + 4], w.cm[4], dy[q : q + 4])
+
+
+@compiled
+def body_derivatives(y, dy, p, w):
+    """The paper's equations of motion in the body frame, in their well-posed form.
+
+    The paper's pair for d2x/dt2 and domega/dt is linearly dependent: omega of a deforming body is
+    a choice of frame. With mean axes, omega = I^+ h, and y_i = dx_i/dt + omega x x_i in place of
+    dx_i/dt, its Eq. 17 reads
+
+        dx_i/dt = y_i - omega x x_i,   dy_i/dt = -omega x y_i + T (f_i/m_i - F/M),
+
+    regular on a line too. Substituting y_i gives Eq. 17 back with all its Coriolis terms.
+    """
+    n = p.vehicles.m.shape[0]
+    q = 6 * n + p.graph.edges.shape[0]
+    omega, a_cm, relative, a = w.cm[4], w.E[0], w.E[1], w.E[2]
+    multiply(w.T, w.cm[2], omega)
+    a_cm[:] = 0.0
+    for i in range(n):
+        for s in range(3):
+            a_cm[s] += p.vehicles.m[i] * w.a[i, s]
+    total = p.vehicles.m.sum()
+    for s in range(3):
+        a_cm[s] /= total
+        dy[q + 4 + s] = y[q + 7 + s]
+        dy[q + 7 + s] = a_cm[s]
+    for i in range(n):
+        x, v = y[3 * i : 3 * i + 3], y[3 * (n + i) : 3 * (n + i) + 3]
+        for s in range(3):
+            relative[s] = w.a[i, s] - a_cm[s]
+        multiply(w.T, relative, a)
+        for s in range(3):
+            j, k = (s + 1) % 3, (s + 2) % 3
+            dy[3 * i + s] = v[s] - (omega[j] * x[k] - omega[k] * x[j])
+            dy[3 * (n + i) + s] = a[s] - (omega[j] * v[k] - omega[k] * v[j])
+
+
+# Dormand and Prince's 5(4) pair, with Hairer's fourth-order continuous extension.
+_A = np.zeros((7, 6))
+_A[1, :1] = 1 / 5
+_A[2, :2] = 3 / 40, 9 / 40
+_A[3, :3] = 44 / 45, -56 / 15, 32 / 9
+_A[4, :4] = 19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729
+_A[5, :5] = 9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656
+_A[6] = 35 / 384, 0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84
+_C = np.array([0, 1 / 5, 3 / 10, 4 / 5, 8 / 9, 1, 1])
+_E = np.array([71 / 57600, 0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40])
+_D = np.array(
+    [
+        -12715105075 / 11282082432, 0, 87487479700 / 32700410799, -10690763975 / 1880347072,
+        701980252875 / 199316789632, -1453857185 / 822651844, 69997945 / 29380423,
+    ]
+)  # fmt: skip
+
+
+class Integrator(NamedTuple):
+    """State of an integration, so that it can pause and go on."""
+
+    y: Array  # (n,) state at `clock[0]`
+    trial: Array  # (n,)
+    K: Array  # (7, n) stages; K[0] is the derivative at y
+    clock: Array  # (3,) t [s], next step h [s], last error
+    count: NDArray[np.int64]  # (4,) evaluations, accepted, rejected, samples written
+    atol: Array  # (n,) absolute tolerance of each state
+    rtol: float
+
+
+def integrator(y: Array, t: float, *, rtol: float, atol: Array, step: float = 1e-3) -> Integrator:
+    """Start an integration from state ``y`` (n,) at time t [s] with a first step [s] to try."""
+    n = len(y)
+    clock, count = np.array([t, step, 1e-4]), np.zeros(4, dtype=np.int64)
+    return Integrator(y.copy(), np.empty(n), np.empty((7, n)), clock, count, atol, rtol)
+
+
+@compiled
+def integrate(p, w, state, t_end, fresh, times, samples, max_steps):
+    """Integrate `closed_loop` to ``t_end`` [s]; adaptive Dormand-Prince 5(4), PI step control.
+
+    Parameters
+    ----------
+    p, w, state : Program, Workspace, Integrator (changed in place)
+    t_end : time to land on [s]
+    fresh : True at a start or after a switch, where the derivative at y is not known yet
+    times, samples : (K,) [s] increasing and (K, n): where to write the dense output; the next
+        index to write is ``state.count[3]``
+    max_steps : pause after so many steps
+
+    Returns FINISHED, PAUSED, or COLLAPSED where the step size fell to nothing (singular
+    constraints, non-finite forces); y and t are then those of the last step that was good.
+    """
+    y, trial, K, clock, count = state.y, state.trial, state.K, state.clock, state.count
+    n = y.shape[0]
+    t, h, last = clock[0], clock[1], clock[2]
+    first = 0 if fresh else 1
+    status = PAUSED
+    for _ in range(max_steps):
+        h = min(h, t_end - t)
+        stage = first
+        # One call site of the right-hand side: stage 0 is the derivative at y itself.
+        while stage < 7:
+            for q in range(n):
+                trial[q] = y[q]
+            for s in range(stage):
+                a = h * _A[stage, s]
+                if a != 0.0:
+                    for q in range(n):
+                        trial[q] += a * K[s, q]
+            closed_loop(t + _C[stage] * h, trial, K[stage], p, w)
+            count[0] += 1
+            stage += 1
+        error = 0.0
+        for q in range(n):
+            e = 0.0
+            for s in range(7):
+                e += _E[s] * K[s, q]
+            e *= h / (state.atol[q] + state.rtol * max(abs(y[q]), abs(trial[q])))
+            error += e * e
+        error = math.sqrt(error / n)
+        if not error <= 1.0:  # NaN too
+            count[2] += 1
+            first = 1
+            shrink = 0.9 * error**-0.2 if error < math.inf else 0.1
+            h *= max(0.1, shrink)
+            if h < 1e-12 * max(1.0, abs(t)):
+                status = COLLAPSED
+                break
+            continue
+        t_new = t + h if t + h < t_end else t_end
+        while count[3] < times.shape[0] and times[count[3]] <= t_new:
+            x = (times[count[3]] - t) / h
+            for q in range(n):
+                d = 0.0
+                for s in range(7):
+                    d += _D[s] * K[s, q]
+                rise = trial[q] - y[q]
+                bend = h * K[0, q] - rise
+                rest = rise - h * K[6, q] - bend
+                inner = bend + x * (rest + (1.0 - x) * h * d)
+                samples[count[3], q] = y[q] + x * (rise + (1.0 - x) * inner)
+            count[3] += 1
+        for q in range(n):
+            y[q] = trial[q]
+            K[0, q] = K[6, q]
+        t = t_new
+        first = 1
+        count[1] += 1
+        error = max(error, 1e-8)
+        h *= min(5.0, max(0.2, 0.9 * error**-0.17 * last**0.04))
+        last = max(error, 1e-4)
+        if t >= t_end:
+            status = FINISHED
+            break
+    clock[0], clock[1], clock[2] = t, h, last
+    return status
+
+
+class Record(NamedTuple):
+    """What `record` writes, one row per sample."""
+
+    r: Array  # (K, N, 3)
+    v: Array
+    a: Array
+    f_E: Array
+    f_u: Array
+    f_C: Array
+    r_ref: Array
+    c: Array  # (K, m)
+    L: Array
+    d: Array
+    d_dot: Array
+    multiplier: Array
+    p: Array  # (K, N, 3) slots
+    motion: Array  # (K, 6) CM reference position and velocity
+    rates: Array  # (K, 3) reference rates, body axes
+    T_ref: Array  # (K, 3, 3)
+    wrench: Array  # (K, 6)
+
+
+def recorder(k: int, n: int, m: int) -> Record:
+    """Allocate a record of ``k`` samples."""
+    agent, edge = (lambda: np.full((k, n, 3), np.nan)), (lambda: np.full((k, m), np.nan))
+    return Record(
+        *(agent() for _ in range(7)), *(edge() for _ in range(5)), agent(),
+        np.full((k, 6), np.nan), np.full((k, 3), np.nan), np.full((k, 3, 3), np.nan),
+        np.full((k, 6), np.nan),
+    )  # fmt: skip
+
+
+@compiled
+def record(times, samples, p, w, out):
+    """Evaluate the closed loop at the sampled states and keep its forces and references."""
+    dy = np.empty(samples.shape[1])
+    for k in range(times.shape[0]):
+        closed_loop(times[k], samples[k], dy, p, w)
+        out.r[k], out.v[k], out.a[k] = w.r, w.v, w.a
+        out.f_E[k], out.f_u[k], out.f_C[k] = w.f_E, w.f_u, w.f_C
+        out.c[k], out.L[k], out.multiplier[k] = w.c, w.L, w.multiplier
+        out.d[k], out.d_dot[k] = w.d, w.d_dot
+        if p.reference.kind == SLOTS or p.control.kind == LOCAL:
+            out.p[k] = w.p
+        out.wrench[k] = w.wrench
+        if p.control.kind == LOCAL:
+            out.r_ref[k] = w.r_ref
+            out.motion[k, :3], out.motion[k, 3:] = w.body[0], w.body[1]
+            out.rates[k], out.T_ref[k] = w.body[3], w.T_ref
+        elif p.control.kind == BODY:
+            since = times[k] - p.feedback.arrival
+            for q in range(3):
+                out.motion[k, q] = p.feedback.r[q] + p.feedback.v[q] * since
+                out.motion[k, 3 + q] = p.feedback.v[q]
+            out.rates[k], out.T_ref[k] = p.feedback.omega, w.T_ref
+
+
+__all__ = ["Program", "Workspace", "integrate", "integrator", "record", "recorder"]

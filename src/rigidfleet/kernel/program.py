@@ -1,0 +1,191 @@
+"""What one phase of a flight is made of, as arrays: read by the kernel, written by `plan`.
+
+Short names are the paper's; every array is C-contiguous float64 (edges: int64). N agents, m edges.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+# Multiplier solves (`Law.solver`).
+ITERATED, SPECTRAL, EXACT, PINV = range(4)
+# Distance references (`Reference.kind`).
+CONSTANT, SQUARED, SLOTS = range(3)
+# Input laws (`Control.kind`).
+OPEN, LOCAL, BODY = range(3)
+# Allocation of a wrench (`Control.allocation`), the last three with the paper's H.
+RIGID, PINV_EQUAL, PINV_INERTIA, PINV_INERTIA_FORCE = range(4)
+
+
+class Vehicles(NamedTuple):
+    """The agents: point masses."""
+
+    m: Array  # (N,) mass [kg]
+    thrust_limit: Array  # (N,) [N], inf where unlimited
+    saturate: bool  # clip the thrust at its limit
+    g: float  # gravity along -z [m/s^2]
+
+
+class Graph(NamedTuple):
+    """The constraint graph, and which of its edges meet at an agent.
+
+    ``pairs[p] = (k, l)``, k > l, are the edges that share an agent and ``weight[p]`` is what
+    that agent adds to ``A = J M^-1 J^T``: ``A[k, l] = weight[p] * (u_k . u_l)``.
+    """
+
+    edges: NDArray[np.int64]  # (m, 2), agents from 0
+    pairs: NDArray[np.int64]  # (P, 2)
+    weight: Array  # (P,) +-1/m_i [1/kg]
+
+
+class Law(NamedTuple):
+    """Baumgarte gains and how the multipliers are solved for."""
+
+    alpha: float  # [1/s]
+    beta: float  # [1/s]
+    gamma: float  # [1/s^3]
+    solver: int
+    mu: float  # Tikhonov damping, on the scale of the eigenvalues of mbar A
+    iterations: int
+    s0: float  # spectral damping starts below this eigenvalue of mbar A
+    cutoff: float  # relative, of pinv
+    k_def: float  # deformation damping [1/s]
+
+
+class Reference(NamedTuple):
+    """Desired shape or distances, blended from one to another over [t0, t0 + T_b]."""
+
+    kind: int
+    t0: float  # [s]
+    T_b: float  # [s]
+    d0: Array  # (m,) distances before [m]
+    d1: Array  # (m,) distances after [m]
+    p0: Array  # (N, 3) slots before, body axes [m]
+    dp: Array  # (N, 3) what the blend adds to them [m]
+    turn: Array  # (3,) rotation vector by which the slots turn meanwhile [rad]
+
+
+class Motion(NamedTuple):
+    """Reference motion of the virtual body: piecewise quintics of CM and attitude.
+
+    Channels 0-2 are the CM [m], 3-5 the rotation vector phi [rad] of the body relative to the
+    attitude ``T1``: body -> world is ``T1^T Exp(phi)``.
+    """
+
+    knots: Array  # (n + 1,) [s]
+    coefficients: Array  # (n, 6, 6): piece, channel, power of (t - knots[piece])
+    T1: Array  # (3, 3) world -> body
+
+
+class Feedback(NamedTuple):
+    """LQR on the virtual body: gain tables over the time to go, and the moving target."""
+
+    to_go: Array  # (n,) increasing, from 0 [s]
+    gain: Array  # (n, 4): position [1/s^2], velocity [1/s]; attitude, rate
+    arrival: float  # T [s]
+    r: Array  # (3,) target at T [m]
+    v: Array  # (3,) [m/s]
+    T1: Array  # (3, 3) target attitude at T, world -> body
+    omega: Array  # (3,) target rates, body axes [rad/s]
+    hold: Array  # (4,) gains after T
+
+
+class Control(NamedTuple):
+    """Input law of a phase."""
+
+    kind: int
+    force: Array  # (N, 3) open loop: input force, weight balance included [N]
+    k1: float  # local LQR [1/s^2]
+    k2: float  # [1/s]
+    allocation: int
+
+
+class Program(NamedTuple):
+    """One phase of a flight."""
+
+    body_formulation: bool
+    has_frame: bool  # the mean-axis quaternion is among the states
+    vehicles: Vehicles
+    graph: Graph
+    law: Law
+    reference: Reference
+    motion: Motion
+    feedback: Feedback
+    control: Control
+    external: int  # address of a force callback, 0 for none
+
+
+class Workspace(NamedTuple):
+    """Everything the right-hand side writes; after a call it holds the values at that state."""
+
+    r: Array  # (N, 3) position, world [m]
+    v: Array  # (N, 3) velocity [m/s]
+    u: Array  # (m, 3) unit vectors of the edges
+    L: Array  # (m,) lengths [m]
+    d: Array  # (m,) references [m]
+    d_dot: Array  # (m,) [m/s]
+    d_ddot: Array  # (m,) [m/s^2]
+    c: Array  # (m,) constraints [m]
+    b: Array  # (m,) right side of the multiplier equation [m/s^2]
+    A: Array  # (m, m) J M^-1 J^T [1/kg]; its lower triangle is factored in place
+    V: Array  # (m, m) eigenvectors
+    w: Array  # (m,) eigenvalues; work
+    multiplier: Array  # (m,) [N]
+    f_E: Array  # (N, 3) gravity and the user's force [N]
+    f_u: Array  # (N, 3) input [N]
+    f_C: Array  # (N, 3) constraint force [N]
+    a: Array  # (N, 3) acceleration [m/s^2]
+    p: Array  # (N, 3) slots, body axes [m]
+    p_dot: Array  # (N, 3)
+    p_ddot: Array  # (N, 3)
+    r_ref: Array  # (N, 3) desired positions, world [m]
+    v_ref: Array  # (N, 3)
+    a_ref: Array  # (N, 3)
+    cm: Array  # (5, 3): CM position, velocity; omega, h, world axes; omega, body axes
+    I: Array  # (3, 3) inertia about the CM, world axes [kg m^2]
+    I_inv: Array  # (3, 3) its pseudo-inverse
+    T: Array  # (3, 3) world -> body, of the frame among the states
+    body: Array  # (8, 3) reference motion: r, v, a of the CM; omega, omega_dot; phi, its rates
+    gain: Array  # (4,)
+    E: Array  # (3, 3) a relative rotation
+    T_ref: Array  # (3, 3) world -> body, of the reference motion
+    wrench: Array  # (6,) asked of the agents: force, torque about the CM, world [N, N m]
+    H: Array  # (3N, 3N) normal matrix of the paper's H; work
+    H_V: Array  # (3N, 3N)
+    H_w: Array  # (3N, 3): right side, eigenvalues, work
+
+
+def workspace(n: int, m: int, *, with_h: bool = False) -> Workspace:
+    """Allocate a workspace for N = ``n`` agents and ``m`` edges."""
+    agent = lambda: np.zeros((n, 3))  # noqa: E731
+    edge = lambda: np.zeros(m)  # noqa: E731
+    k = 3 * n if with_h else 0
+    return Workspace(
+        r=agent(), v=agent(), u=np.zeros((m, 3)), L=edge(), d=edge(), d_dot=edge(), d_ddot=edge(),
+        c=edge(), b=edge(), A=np.zeros((m, m)), V=np.zeros((m, m)), w=edge(), multiplier=edge(),
+        f_E=agent(), f_u=agent(), f_C=agent(), a=agent(), p=agent(), p_dot=agent(),
+        p_ddot=agent(), r_ref=agent(), v_ref=agent(), a_ref=agent(), cm=np.zeros((5, 3)),
+        I=np.zeros((3, 3)), I_inv=np.zeros((3, 3)), T=np.eye(3), body=np.zeros((8, 3)), gain=np.zeros(4), E=np.zeros((3, 3)),
+        T_ref=np.eye(3), wrench=np.zeros(6), H=np.zeros((k, k)), H_V=np.zeros((k, k)),
+        H_w=np.zeros((k, 3)),
+    )  # fmt: skip
+
+
+def graph(edges: NDArray[np.int64], masses: Array) -> Graph:
+    """Prepare a constraint graph: (m, 2) edges with agents from 0, (N,) masses [kg]."""
+    pairs, weight = [], []
+    for k, (i, j) in enumerate(edges):
+        for l in range(k):
+            sign = {edges[l][0]: 1.0, edges[l][1]: -1.0}
+            shared = [(1.0 if a == i else -1.0) * sign[a] / masses[a] for a in (i, j) if a in sign]
+            if shared:
+                pairs.append((k, l))
+                weight.append(sum(shared))
+    return Graph(
+        np.ascontiguousarray(edges, dtype=np.int64).reshape(-1, 2),
+        np.array(pairs, dtype=np.int64).reshape(-1, 2),
+        np.array(weight, dtype=np.float64),
+    )

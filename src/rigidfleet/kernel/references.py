@@ -1,0 +1,100 @@
+"""What the formation should be at a time: slots and distances, with two exact derivatives."""
+
+import math
+
+from rigidfleet.kernel.compiled import compiled
+from rigidfleet.kernel.program import SLOTS, SQUARED
+
+
+@compiled
+def septic(t, t0, T_b):
+    """Blend s from 0 to 1 over [t0, t0 + T_b] with three vanishing derivatives at either end.
+
+    s = 35 tau^4 - 84 tau^5 + 70 tau^6 - 20 tau^7. Returns s, ds/dt [1/s], d2s/dt2 [1/s^2];
+    T_b = 0 is a step.
+    """
+    if t >= t0 + T_b:
+        return 1.0, 0.0, 0.0
+    if t <= t0:
+        return 0.0, 0.0, 0.0
+    x = (t - t0) / T_b
+    rest = 1.0 - x
+    s = x**4 * (35.0 - x * (84.0 - x * (70.0 - 20.0 * x)))
+    return s, 140.0 * (x * rest) ** 3 / T_b, 420.0 * (x * rest) ** 2 * (rest - x) / T_b**2
+
+
+@compiled
+def blend_slots(t, reference, p, p_dot, p_ddot):
+    """Slots p (N, 3) [m] in body axes at t, and their derivatives.
+
+    p = R(s turn) (p0 + s dp): the shape moves on straight lines while it turns about one axis, so
+    that reshaping by a Kabsch-aligned ``dp`` need not change the commanded attitude.
+    """
+    s, s_dot, s_ddot = septic(t, reference.t0, reference.T_b)
+    n = reference.turn
+    angle = math.sqrt(n[0] * n[0] + n[1] * n[1] + n[2] * n[2])
+    if angle == 0.0:
+        for i in range(p.shape[0]):
+            for q in range(3):
+                p[i, q] = reference.p0[i, q] + s * reference.dp[i, q]
+                p_dot[i, q] = s_dot * reference.dp[i, q]
+                p_ddot[i, q] = s_ddot * reference.dp[i, q]
+        return
+    e0, e1, e2 = n[0] / angle, n[1] / angle, n[2] / angle
+    cos, sin = math.cos(s * angle), math.sin(s * angle)
+    w, w_dot = angle * s_dot, angle * s_ddot
+    for i in range(p.shape[0]):
+        # The shape without the turn, and its velocity; then both turned by Rodrigues' formula.
+        x = reference.p0[i, 0] + s * reference.dp[i, 0]
+        y = reference.p0[i, 1] + s * reference.dp[i, 1]
+        z = reference.p0[i, 2] + s * reference.dp[i, 2]
+        k = (e0 * x + e1 * y + e2 * z) * (1.0 - cos)
+        X = cos * x + sin * (e1 * z - e2 * y) + k * e0
+        Y = cos * y + sin * (e2 * x - e0 * z) + k * e1
+        Z = cos * z + sin * (e0 * y - e1 * x) + k * e2
+        x, y, z = reference.dp[i, 0], reference.dp[i, 1], reference.dp[i, 2]
+        k = (e0 * x + e1 * y + e2 * z) * (1.0 - cos)
+        dX = cos * x + sin * (e1 * z - e2 * y) + k * e0
+        dY = cos * y + sin * (e2 * x - e0 * z) + k * e1
+        dZ = cos * z + sin * (e0 * y - e1 * x) + k * e2
+        eX, eY, eZ = e1 * Z - e2 * Y, e2 * X - e0 * Z, e0 * Y - e1 * X  # e x P
+        fX, fY, fZ = e1 * dZ - e2 * dY, e2 * dX - e0 * dZ, e0 * dY - e1 * dX  # e x dP
+        p[i, 0], p[i, 1], p[i, 2] = X, Y, Z
+        p_dot[i, 0] = w * eX + s_dot * dX
+        p_dot[i, 1] = w * eY + s_dot * dY
+        p_dot[i, 2] = w * eZ + s_dot * dZ
+        u = 2.0 * w * s_dot
+        p_ddot[i, 0] = w_dot * eX + w * w * (e1 * eZ - e2 * eY) + u * fX + s_ddot * dX
+        p_ddot[i, 1] = w_dot * eY + w * w * (e2 * eX - e0 * eZ) + u * fY + s_ddot * dY
+        p_ddot[i, 2] = w_dot * eZ + w * w * (e0 * eY - e1 * eX) + u * fZ + s_ddot * dZ
+
+
+@compiled
+def distance_references(t, reference, edges, p, p_dot, p_ddot, d, d_dot, d_ddot):
+    """Desired distances d (m,) [m] and two derivatives, by the reference's kind.
+
+    Constant; blended in d^2, which stays realisable for up to four agents; or those of the
+    slots, which are realisable always: d = |p_i - p_j|.
+    """
+    if reference.kind == SLOTS:
+        for k in range(edges.shape[0]):
+            i, j = edges[k, 0], edges[k, 1]
+            dd = dv = vv = da = 0.0
+            for q in range(3):
+                x, v, a = p[i, q] - p[j, q], p_dot[i, q] - p_dot[j, q], p_ddot[i, q] - p_ddot[j, q]
+                dd, dv, vv, da = dd + x * x, dv + x * v, vv + v * v, da + x * a
+            d[k] = math.sqrt(dd)
+            d_dot[k] = dv / d[k]
+            d_ddot[k] = (vv + da - d_dot[k] * d_dot[k]) / d[k]
+    elif reference.kind == SQUARED:
+        s, s_dot, s_ddot = septic(t, reference.t0, reference.T_b)
+        for k in range(edges.shape[0]):
+            before, after = reference.d0[k] ** 2, reference.d1[k] ** 2
+            d[k] = math.sqrt(before + (after - before) * s)
+            d_dot[k] = 0.5 * (after - before) * s_dot / d[k]
+            d_ddot[k] = (0.5 * (after - before) * s_ddot - d_dot[k] * d_dot[k]) / d[k]
+    else:
+        for k in range(edges.shape[0]):
+            d[k] = reference.d1[k]
+            d_dot[k] = 0.0
+            d_ddot[k] = 0.0
