@@ -1,0 +1,64 @@
+# Set-up needs Python >= 3.11 with venv and pip; everything else goes into .venv.
+PYTHON ?= python3
+# Tests run on this many processes; MARK selects them (pytest -m), empty for all.
+JOBS ?= 2
+MARK ?= not long
+
+BIN := .venv/bin
+INSTALL := $(BIN)/uv pip install --quiet --python $(BIN)/python \
+	--constraints constraints.txt --build-constraints constraints.txt --editable .
+
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.PHONY: help setup demo test bench lint format constraints clean
+
+help:  ## Show this list
+	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' Makefile
+
+setup: .venv/.core .venv/.dev  ## Make .venv with all that development needs
+
+demo: .venv/.core  ## Fly the paper's narrow passage
+	@$(BIN)/rigidfleet run narrow-passage
+
+test: .venv/.dev  ## Run the tests (MARK= runs the long ones, too)
+	@$(BIN)/python -m pytest -n $(JOBS) -m "$(MARK)"
+
+bench: .venv/.bench  ## Measure the speed, as ratios
+	@$(BIN)/python benchmarks/run.py
+
+lint: .venv/.dev  ## Check style, types and import layers
+	@$(BIN)/ruff check
+	@$(BIN)/ruff format --check
+	@$(BIN)/ty check --no-progress
+	@$(BIN)/lint-imports --no-cache
+
+format: .venv/.dev  ## Rewrite the code in the project's style
+	@$(BIN)/ruff check --fix
+	@$(BIN)/ruff format
+
+constraints: .venv/.dev  ## Choose newer versions of all packages
+	@$(BIN)/uv pip compile --quiet --universal --upgrade --no-emit-index-url --no-header \
+		--no-annotate --all-extras --group dev --group bench --group build \
+		pyproject.toml --output-file constraints.txt
+
+clean:  ## Remove .venv, caches and builds
+	@rm -rf .venv .pytest_cache .ruff_cache .import_linter_cache build dist
+	@find src tests -type d -name __pycache__ -prune -exec rm -rf {} +
+
+.venv/.uv: constraints.txt
+	@$(PYTHON) -c 'import sys; v = sys.version.split()[0]; print("Setting up .venv with Python", v) \
+		if sys.version_info >= (3, 11) else sys.exit("rigidfleet needs Python 3.11 or newer, this is " \
+		+ v + ". Name another one: make PYTHON=/path/to/python")'
+	@$(PYTHON) -m venv .venv
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt uv
+	@touch $@
+
+.venv/.core: .venv/.uv pyproject.toml constraints.txt
+	@echo "Installing rigidfleet and what it needs"
+	@$(INSTALL)
+	@touch $@
+
+.venv/.dev .venv/.bench: .venv/.%: .venv/.core
+	@echo "Installing what '$*' needs"
+	@$(INSTALL) --group $*
+	@touch $@

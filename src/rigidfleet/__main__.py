@@ -1,0 +1,8 @@
+"""``python -m rigidfleet`` is the command ``rigidfleet``."""
+
+import sys
+
+from rigidfleet.cli import main
+
+if __name__ == "__main__":
+    sys.exit(main())
