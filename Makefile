@@ -5,6 +5,7 @@ JOBS ?= 2
 MARK ?= not long
 
 BIN := .venv/bin
+export UV_PYTHON_DOWNLOADS := never
 INSTALL := $(BIN)/uv pip install --quiet --python $(BIN)/python \
 	--constraints constraints.txt --build-constraints constraints.txt --editable .
 
@@ -30,7 +31,7 @@ lint: .venv/.dev  ## Check style, types and import layers
 	@$(BIN)/ruff check
 	@$(BIN)/ruff format --check
 	@$(BIN)/ty check --no-progress
-	@$(BIN)/lint-imports --no-cache
+	@$(BIN)/lint-imports --no-cache --no-logo
 
 format: .venv/.dev  ## Rewrite the code in the project's style
 	@$(BIN)/ruff check --fix
