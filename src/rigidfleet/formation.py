@@ -80,8 +80,12 @@ SHAPES: dict[str, Shape] = {
     "square": Shape(range(4, 5), 1, _square, "1-4 counter-clockwise from (-, -)"),
     "polygon": Shape(range(3, _ANY), 1, _polygon, "regular, counter-clockwise, agent 1 on x"),
     "hexagon": Shape(range(6, 7), 1, _polygon, "regular, counter-clockwise, agent 1 on x"),
-    "pyramid": Shape(range(4, 7), 1, _pyramid, "all edges equal; the base counter-clockwise, the apex last"),
-    "cube": Shape(range(8, 9), 1, _cuboid, "1-4 counter-clockwise from (-, -, -) below, 5-8 above them"),
+    "pyramid": Shape(
+        range(4, 7), 1, _pyramid, "all edges equal; the base counter-clockwise, the apex last"
+    ),
+    "cube": Shape(
+        range(8, 9), 1, _cuboid, "1-4 counter-clockwise from (-, -, -) below, 5-8 above them"
+    ),
     "cuboid": Shape(range(8, 9), 3, _cuboid, "as the cube, with three edge lengths [x, y, z]"),
 }
 
@@ -203,20 +207,32 @@ def unrealisable(edges: ArrayLike, lengths: ArrayLike, tol: float = REALISABLE) 
         d2 = length[sides] ** 2
         # Gram matrix of the three edges from the first agent; its determinant is 36 V^2.
         a, b, c, ab, ac, bc = d2.T
-        gram = np.array([[2 * a, a + b - ab, a + c - ac], [a + b - ab, 2 * b, b + c - bc], [a + c - ac, b + c - bc, 2 * c]])
+        gram = np.array(
+            [
+                [2 * a, a + b - ab, a + c - ac],
+                [a + b - ab, 2 * b, b + c - bc],
+                [a + c - ac, b + c - bc, 2 * c],
+            ]
+        )
         volume2 = np.linalg.det(np.moveaxis(gram / 2, -1, 0)) / 36
         for row in np.flatnonzero(volume2 < -tol * d2.max(axis=1) ** 3):
             if not any(face in broken for face in combinations(chunk[row], 3)):
-                found.append(Violation(chunk[row], tuple(map(int, sides[row])), float(volume2[row])))
+                found.append(
+                    Violation(chunk[row], tuple(map(int, sides[row])), float(volume2[row]))
+                )
     return found
 
 
-def _chunks(items: list[tuple[int, int, int, int]], size: int) -> Iterator[list[tuple[int, int, int, int]]]:
+def _chunks(
+    items: list[tuple[int, int, int, int]], size: int
+) -> Iterator[list[tuple[int, int, int, int]]]:
     for start in range(0, len(items), size):
         yield items[start : start + size]
 
 
-def slots_from_distances(n: int, edges: ArrayLike, lengths: ArrayLike, tol: float = REALISABLE) -> Floats | None:
+def slots_from_distances(
+    n: int, edges: ArrayLike, lengths: ArrayLike, tol: float = REALISABLE
+) -> Floats | None:
     """Slots (n, 3) [m] of a *complete* set of distances (classical multidimensional scaling).
 
     Distances know neither attitude nor mirror image; both follow a convention in which the paper's triangle
@@ -232,8 +248,9 @@ def slots_from_distances(n: int, edges: ArrayLike, lengths: ArrayLike, tol: floa
         No points in space have these distances, within `tol` of the largest.
     """
     e = np.asarray(edges, dtype=np.int64).reshape(-1, 2)
+    given = np.asarray(lengths, dtype=np.float64)
     d = np.zeros((n, n))
-    d[e[:, 0], e[:, 1]] = d[e[:, 1], e[:, 0]] = lengths
+    d[e[:, 0], e[:, 1]] = d[e[:, 1], e[:, 0]] = given
     if len({(min(i, j), max(i, j)) for i, j in e.tolist()}) < n * (n - 1) // 2:
         return None
     centring = np.eye(n) - 1 / n
@@ -241,10 +258,12 @@ def slots_from_distances(n: int, edges: ArrayLike, lengths: ArrayLike, tol: floa
     top = value[-3:][::-1]
     p = np.zeros((n, 3))
     p[:, : len(top)] = vector[:, -3:][:, ::-1] * np.sqrt(np.maximum(top, 0))
-    error = float(np.abs(distances(p, e) - lengths).max(initial=0.0))
+    error = float(np.abs(distances(p, e) - given).max(initial=0.0))
     # Near a flat shape, an error e in a distance moves points by sqrt(e): judged by distances, not by volume.
     if error > np.sqrt(tol) * d.max(initial=0.0) or value[0] < -tol * n * d.max(initial=0.0) ** 2:
-        raise ValueError(f"no points in space have these distances (nearest set is {error:.3g} m off)")
+        raise ValueError(
+            f"no points in space have these distances (nearest set is {error:.3g} m off)"
+        )
     return _conventional(p)
 
 
@@ -253,7 +272,9 @@ def _conventional(p: Floats) -> Floats:
     small = 1e-9 * np.abs(p).max(initial=0.0)
 
     def first(candidates: Iterator[Floats]) -> Floats | None:
-        return next((v / np.linalg.norm(v) for v in candidates if np.linalg.norm(v) > 1e3 * small), None)
+        return next(
+            (v / np.linalg.norm(v) for v in candidates if np.linalg.norm(v) > 1e3 * small), None
+        )
 
     x = first(iter(p[::-1]))
     if x is None:
@@ -332,7 +353,9 @@ def kabsch(
     return rotation
 
 
-def _nearest_fit(u: Floats, s: Floats, vt: Floats, proper: bool, near: Floats, tol: float) -> Floats:
+def _nearest_fit(
+    u: Floats, s: Floats, vt: Floats, proper: bool, near: Floats, tol: float
+) -> Floats:
     """Of the rotations that maximise tr(R^T U S V^T), the one nearest to `near`.
 
     They are U (1 - 2 n n^T) V^T with n any unit vector among the equal smallest singular values, if det(U V^T) =
