@@ -1,0 +1,479 @@
+"""The one record of a flight: what flew, where, under which forces; saved, loaded, exported.
+
+A `Result` holds NumPy arrays (radians, scalar-first quaternions, agents counted from 0) and is saved as one
+netCDF-4 file, in which each variable carries its unit and its meaning. The file also holds the mission, so
+that a flight can be repeated from its result. NaN stands for "not active" throughout.
+
+Reading and writing the format needs h5netcdf, which is imported only then.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import os
+import platform
+import secrets
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields
+from datetime import UTC, datetime
+from functools import cached_property
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Self, get_type_hints
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigidfleet.errors import MissionError, ResultError
+
+if TYPE_CHECKING:
+    from rigidfleet.mission import Mission
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+#: Version of the file format; files with a higher one are refused.
+SCHEMA_VERSION = 1
+
+
+class Variable(NamedTuple):
+    """What an array of a result is."""
+
+    dims: tuple[str, ...]
+    units: str
+    text: str
+
+
+def _v(dims: str, units: str, text: str) -> Variable:
+    return Variable(tuple(dims.split()), units, text)
+
+
+#: Length of each dimension that does not depend on the flight, and the names along it.
+LABELS: dict[str, tuple[str, ...]] = {
+    "axis": ("x", "y", "z"),
+    "quaternion": ("w", "x", "y", "z"),
+    "wrench": ("Fx", "Fy", "Fz", "tau_x", "tau_y", "tau_z"),
+    "end": ("first", "second"),
+}
+
+
+@dataclass(slots=True)
+class PhaseRecord:
+    """One phase as flown.
+
+    Attributes
+    ----------
+    name, kind, control : as in the mission; control is "open", "slots" or "body"
+    formation : name of the formation held or approached, None if there is none yet
+    t_start, t_end : mission time [s]
+    settled : for a phase that ends by settling: whether it did; None for one that ends at a time
+    target : for fly and turn: {"time" [s], "position" [m], "velocity" [m/s], "attitude" quaternion, "rates" [rad/s]},
+        each but the time None where nothing is asked
+    """
+
+    name: str
+    kind: Literal["establish", "fly", "reshape", "turn", "hold"]
+    control: Literal["open", "slots", "body"]
+    formation: str | None
+    t_start: float
+    t_end: float
+    settled: bool | None = None
+    target: dict[str, Any] | None = None
+
+
+def _versions() -> dict[str, str]:
+    found = {"python": platform.python_version()}
+    for package in ("rigidfleet", "numpy", "scipy", "numba", "h5netcdf"):
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def _now() -> str:
+    return datetime.now(UTC).isoformat(timespec="seconds")
+
+
+@dataclass(kw_only=True, eq=False, repr=False)
+class Result:
+    """Record of one flight: K samples in time, N agents, m edges (the union over all formations).
+
+    At each switch of phases there are two samples, the end of one phase and, one representable number later, the
+    start of the next: references and inputs jump there. Each array's dimensions, unit and meaning stand at its
+    declaration and in `VARIABLES`; `phases` and the rest say what the flight was.
+
+    Raises
+    ------
+    ValueError
+        An array has the wrong shape, or time does not increase.
+    """
+
+    time: Annotated[Floats, _v("time", "s", "mission time")]
+    phase: Annotated[Ints, _v("time", "1", "index of the phase flown, from 0")]
+
+    position: Annotated[Floats, _v("time agent axis", "m", "position, world axes (ENU)")]
+    velocity: Annotated[Floats, _v("time agent axis", "m s-1", "velocity, world axes")]
+    acceleration: Annotated[Floats, _v("time agent axis", "m s-2", "acceleration, world axes")]
+    slot_position: Annotated[Floats, _v("time agent axis", "m", "desired position, world axes")]
+
+    input_force: Annotated[Floats, _v("time agent axis", "N", "input force f_u, world axes")]
+    constraint_force: Annotated[
+        Floats, _v("time agent axis", "N", "constraint force f_C, world axes")
+    ]
+    external_force: Annotated[
+        Floats, _v("time agent axis", "N", "gravity and disturbances, world axes")
+    ]
+    thrust: Annotated[Floats, _v("time agent", "N", "thrust |f_u + f_C|")]
+
+    cm: Annotated[Floats, _v("time axis", "m", "centre of mass, world axes")]
+    cm_velocity: Annotated[Floats, _v("time axis", "m s-1", "velocity of the centre of mass")]
+    cm_reference: Annotated[Floats, _v("time axis", "m", "commanded centre of mass")]
+    cm_velocity_reference: Annotated[
+        Floats, _v("time axis", "m s-1", "commanded velocity of the centre of mass")
+    ]
+
+    attitude: Annotated[
+        Floats, _v("time quaternion", "1", "attitude of the formation, world to body, scalar first")
+    ]
+    attitude_reference: Annotated[Floats, _v("time quaternion", "1", "commanded attitude")]
+    frame: Annotated[Floats, _v("time quaternion", "1", "integrated mean-axis frame")]
+    rates: Annotated[Floats, _v("time axis", "rad s-1", "angular velocity, body axes (p, q, r)")]
+    rates_reference: Annotated[
+        Floats, _v("time axis", "rad s-1", "commanded angular velocity, body axes")
+    ]
+
+    wrench_asked: Annotated[
+        Floats,
+        _v("time wrench", "N or N m", "wrench asked for: force, torque about the centre of mass"),
+    ]
+    wrench_achieved: Annotated[
+        Floats,
+        _v(
+            "time wrench", "N or N m", "wrench that results: force, torque about the centre of mass"
+        ),
+    ]
+
+    edges: Annotated[Ints, _v("edge end", "1", "the two agents of each edge, from 0")]
+    distance: Annotated[Floats, _v("time edge", "m", "edge length L")]
+    distance_reference: Annotated[Floats, _v("time edge", "m", "reference d of an edge's length")]
+    distance_rate_reference: Annotated[Floats, _v("time edge", "m s-1", "rate of the reference d")]
+    constraint: Annotated[Floats, _v("time edge", "m", "constraint error c = L - d")]
+    integral: Annotated[Floats, _v("time edge", "m s", "integral of the constraint error")]
+    multiplier: Annotated[Floats, _v("time edge", "N", "multiplier lambda; the tension is -lambda")]
+    singular_value: Annotated[
+        Floats, _v("time", "1", "smallest non-zero singular value of the constraint Jacobian J")
+    ]
+
+    separation: Annotated[
+        Floats, _v("time", "m", "least separation of two agents: centre distance minus radii")
+    ]
+    separation_pair: Annotated[
+        Ints, _v("time end", "1", "the two agents with it, from 0; -1 for none")
+    ]
+    clearance: Annotated[
+        Floats, _v("time", "m", "least clearance to an obstacle: distance minus radius")
+    ]
+    clearance_agent: Annotated[Ints, _v("time", "1", "the agent with it, from 0; -1 for none")]
+    clearance_obstacle: Annotated[
+        Ints, _v("time", "1", "the obstacle with it, from 0; -1 for none")
+    ]
+
+    phases: list[PhaseRecord]
+    mission_text: str
+    complete: bool = True
+    ending: str = ""
+    statistics: dict[str, Any] = field(default_factory=dict)
+    versions: dict[str, str] = field(default_factory=_versions)
+    platform: str = field(default_factory=platform.platform)
+    created: str = field(default_factory=_now)
+
+    def __post_init__(self) -> None:
+        sizes: dict[str, int] = {dim: len(names) for dim, names in LABELS.items()}
+        for name, variable in VARIABLES.items():
+            dtype = np.int64 if name in _INTEGERS else np.float64
+            value = np.ascontiguousarray(getattr(self, name), dtype=dtype)
+            asked = tuple(sizes.get(dim, "any") for dim in variable.dims)
+            if value.ndim != len(asked) or any(
+                sizes.setdefault(dim, n) != n
+                for dim, n in zip(variable.dims, value.shape, strict=True)
+            ):
+                dims = ", ".join(variable.dims)
+                raise ValueError(f"{name} ({dims}) has shape {value.shape}, not {asked}")
+            setattr(self, name, value)
+        if sizes["time"] == 0 or sizes["agent"] == 0:
+            raise ValueError("a result needs at least one sample and one agent")
+        if not (np.isfinite(self.time).all() and (np.diff(self.time) > 0).all()):
+            raise ValueError("time is not finite and strictly increasing")
+        if self.phase.min() < 0 or self.phase.max() >= len(self.phases):
+            raise ValueError(f"phase has indices outside of 0 to {len(self.phases) - 1}")
+
+    def __repr__(self) -> str:
+        end = "complete" if self.complete else f"incomplete: {self.ending or 'stopped'}"
+        return (
+            f"<Result: {self.n_agents} agents, {len(self.edges)} edges, {len(self.phases)} phases, "
+            f"{len(self.time)} samples from {self.time[0]:g} to {self.time[-1]:g} s, {end}>"
+        )
+
+    @property
+    def n_agents(self) -> int:
+        """Number of agents N."""
+        return self.position.shape[1]
+
+    @property
+    def edge_labels(self) -> list[str]:
+        """Name of each edge, agents counted from 1: "1-2"."""
+        return [f"{i + 1}-{j + 1}" for i, j in self.edges]
+
+    @cached_property
+    def mission(self) -> Mission:
+        """The mission flown, parsed from `mission_text` when first asked for.
+
+        Raises
+        ------
+        ResultError
+            This version of rigidfleet does not take the mission any more.
+        """
+        from rigidfleet.mission import Mission
+
+        try:
+            return Mission.from_toml(self.mission_text, "mission of the result")
+        except MissionError as error:
+            made = self.versions.get("rigidfleet", "an unknown version")
+            message = f"the mission inside the result cannot be read (it was made by rigidfleet {made}):\n{error}"
+            raise ResultError(message) from error
+
+    def samples(self, phase: int) -> slice:
+        """Samples of a phase (index from 0; negative ones from the end), empty if it was never reached."""
+        index = range(len(self.phases))[phase]
+        first, last = np.searchsorted(self.phase, [index, index + 1])
+        return slice(int(first), int(last))
+
+    def save(self, path: str | Path) -> None:
+        """Write the result to a netCDF-4 file, whole or not at all.
+
+        An existing file is replaced at the very end, in one step; until then, and if anything fails, it stays
+        as it is.
+
+        Raises
+        ------
+        ResultError
+            The file cannot be written.
+        """
+        _write(Path(path), self._netcdf())
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read a result that `save` has written.
+
+        Raises
+        ------
+        ResultError
+            There is no such file, it is no result, it is damaged, or a newer version of rigidfleet wrote it.
+        """
+        path = Path(path)
+        data = _read(path)
+        try:
+            return cls(**_parse(path, data))
+        except ResultError:
+            raise
+        except Exception as error:  # damage inside may show itself as almost any error
+            raise ResultError(
+                f"{path}: this result is damaged ({_one_line(error)}). Fly its mission again, or use another copy."
+            ) from error
+
+    def to_csv(self, path: str | Path) -> None:
+        """Write time, position, velocity and yaw of each agent as a table, one row for each sample and agent.
+
+        Columns: time_s, agent (from 1), x_m, y_m, z_m, vx_m_s, vy_m_s, vz_m_s, yaw_deg. The yaw is that of the
+        formation (3-2-1 Euler angles), left empty before a frame is attached. Of the two samples at a switch of
+        phases only the later one is kept. The file is written whole or not at all, as by `save`.
+
+        Raises
+        ------
+        ResultError
+            The file cannot be written.
+        """
+        w, x, y, z = self.attitude.T
+        yaw = np.degrees(np.arctan2(2 * (x * y + w * z), w**2 + x**2 - y**2 - z**2))
+        keep = np.append(np.nextafter(self.time[:-1], math.inf) < self.time[1:], True)
+        lines = ["time_s,agent,x_m,y_m,z_m,vx_m_s,vy_m_s,vz_m_s,yaw_deg\n"]
+        state = np.concatenate([self.position, self.velocity], axis=2)
+        row = "{:.6f},{},{:.6f},{:.6f},{:.6f},{:.6f},{:.6f},{:.6f},{}\n".format
+        for k in np.flatnonzero(keep):
+            angle = "" if np.isnan(yaw[k]) else f"{yaw[k]:.6f}"
+            t = self.time[k]
+            lines += [row(t, i, *s, angle) for i, s in enumerate(state[k].tolist(), start=1)]
+        _write(Path(path), "".join(lines).encode())
+
+    def _netcdf(self) -> bytes:
+        """The file's content. Built in memory, so that a full disk meets a plain write and not the HDF5 library."""
+        import h5netcdf
+        import h5py
+
+        text = h5py.string_dtype()
+        labels: dict[str, Any] = dict(LABELS)
+        labels["edge"] = self.edge_labels
+        sizes = {dim: len(names) for dim, names in labels.items()}
+        sizes |= {"time": len(self.time), "agent": self.n_agents}
+        buffer = io.BytesIO()
+        with h5netcdf.File(buffer, "w") as file:
+            file.dimensions = sizes
+            file.attrs.update(self._attributes())
+            for name, names in labels.items():
+                names_along = file.create_variable(name, (name,), text)
+                if names:
+                    names_along[...] = np.array(names, dtype=object)
+            agent = file.create_variable("agent", ("agent",), "i4")
+            agent[...] = np.arange(1, self.n_agents + 1)
+            agent.attrs["long_name"] = "agent, from 1"
+            for name, variable in VARIABLES.items():
+                value = getattr(self, name)
+                entry = file.create_variable(
+                    name,
+                    variable.dims,
+                    "i4" if name in _INTEGERS else "f8",
+                    data=value,
+                    chunks=_chunks(value.shape),
+                    fletcher32=True,  # damage is noticed; compression doubles the time for a seventh of the size
+                )
+                entry.attrs["units"] = variable.units
+                entry.attrs["long_name"] = variable.text
+        return buffer.getvalue()
+
+    def _attributes(self) -> dict[str, Any]:
+        # Attributes take text and numbers, but no dict, bool or None: those go in as JSON.
+        return {
+            "Conventions": "CF-1.11",
+            "title": "flight of a virtual rigid body formation",
+            _MARK: SCHEMA_VERSION,
+            "mission": self.mission_text,
+            "complete": int(self.complete),
+            "ending": self.ending,
+            "phases": _json([asdict(phase) for phase in self.phases]),
+            "statistics": _json(self.statistics),
+            "versions": _json(self.versions),
+            "platform": self.platform,
+            "created": self.created,
+        }
+
+
+_HINTS = get_type_hints(Result, include_extras=True)
+#: Dimensions, unit and meaning of each array of a result.
+VARIABLES: dict[str, Variable] = {
+    f.name: _HINTS[f.name].__metadata__[0]
+    for f in fields(Result)
+    if hasattr(_HINTS[f.name], "__metadata__")
+}
+_INTEGERS = {name for name in VARIABLES if _HINTS[name].__origin__ == Ints}
+#: Attribute by which a file is known as a result.
+_MARK = "rigidfleet_schema_version"
+#: Bytes of a chunk at most: as much as HDF5's cache holds.
+_CHUNK = 1 << 20
+
+
+def plain(value: Any) -> Any:
+    """Value as plain JSON data: arrays become lists, NumPy scalars numbers, what is not finite None."""
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return [plain(item) for item in value]
+    return value
+
+
+def _json(value: Any) -> str:
+    return json.dumps(plain(value), ensure_ascii=False, allow_nan=False)
+
+
+def _chunks(shape: tuple[int, ...]) -> tuple[int, ...] | None:
+    """Whole rows, as many as fit into `_CHUNK`."""
+    if 0 in shape:
+        return None
+    row = 8 * math.prod(shape[1:])
+    return (min(shape[0], max(1, _CHUNK // row)), *shape[1:])
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+# -- files -------------------------------------------------------------------------------------------
+
+
+def _write(path: Path, data: bytes) -> None:
+    """Write a file whole or not at all: beside its place first, then into it in one step."""
+    target = Path(os.path.realpath(path))  # through a symbolic link, not in place of it
+    part = target.with_name(f".{target.name[:200]}.{secrets.token_hex(4)}.part")
+    try:
+        if target.is_dir():
+            raise IsADirectoryError
+        try:
+            with open(part, "xb") as file:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(part, target)
+        except BaseException:
+            part.unlink(missing_ok=True)
+            raise
+    except OSError as error:
+        raise ResultError(f"{path}: {_why_not(error, 'written', path)}") from error
+
+
+def _why_not(error: OSError, done: str, path: Path) -> str:
+    match error:
+        case IsADirectoryError():
+            return "is a folder. Name a file."
+        case FileNotFoundError() | NotADirectoryError():
+            return f"cannot be {done}: there is no folder {path.parent}. Make it first."
+        case PermissionError():
+            return f"may not be {done} by you. Choose another folder, or ask for permission."
+    return f"cannot be {done}: {error.strerror or error}. Choose another place."
+
+
+def _read(path: Path) -> bytes:
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError as error:
+        raise ResultError(f"{path}: there is no such file. `rigidfleet run` makes one.") from error
+    except IsADirectoryError as error:
+        raise ResultError(f"{path}: is a folder. Name the result file in it.") from error
+    except OSError as error:
+        raise ResultError(f"{path}: {_why_not(error, 'read', path)}") from error
+    if not data.startswith(b"\x89HDF\r\n\x1a\n"):
+        what = "is empty" if not data else "is not a netCDF-4 file"
+        raise ResultError(f"{path}: {what}. Name a result of `rigidfleet run`.")
+    return data
+
+
+def _parse(path: Path, data: bytes) -> dict[str, Any]:
+    """Arguments of `Result` from a file's content."""
+    import h5netcdf
+
+    with h5netcdf.File(io.BytesIO(data), "r") as file:
+        if _MARK not in file.attrs:
+            raise ResultError(
+                f"{path}: is a netCDF-4 or HDF5 file, but no result of rigidfleet. "
+                "Name a result of `rigidfleet run`."
+            )
+        if file.attrs[_MARK] > SCHEMA_VERSION:
+            raise ResultError(
+                f"{path}: was written in format {file.attrs[_MARK]}, and this version of rigidfleet reads up to "
+                f"{SCHEMA_VERSION}. Use a newer version."
+            )
+        attributes = {key: file.attrs[key] for key in ("ending", "platform", "created")}
+        decoded = {key: json.loads(file.attrs[key]) for key in ("statistics", "versions")}
+        return {
+            **{name: file.variables[name][...] for name in VARIABLES},
+            **attributes,
+            **decoded,
+            "mission_text": file.attrs["mission"],
+            "complete": bool(file.attrs["complete"]),
+            "phases": [PhaseRecord(**phase) for phase in json.loads(file.attrs["phases"])],
+        }
