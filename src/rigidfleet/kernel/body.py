@@ -8,21 +8,21 @@ from rigidfleet.kernel.program import PINV_EQUAL, PINV_INERTIA_FORCE, RIGID
 
 
 @compiled
-def centre_of_mass(r, m, out):
-    """Mass-weighted mean of r (N, 3) into out (3,)."""
-    out[:] = 0.0
+def centre_of_mass(r, m, M, out):
+    """Mass-weighted mean of r (N, 3) into out (3,); M is the sum of the masses m (N,)."""
+    out[0], out[1], out[2] = 0.0, 0.0, 0.0
     for i in range(r.shape[0]):
         for q in range(3):
             out[q] += m[i] * r[i, q]
-    total = m.sum()
     for q in range(3):
-        out[q] /= total
+        out[q] /= M
 
 
 @compiled
 def inertia(r, m, cm, I):  # noqa: E741
     """Inertia I (3, 3) [kg m^2] of points r (N, 3) about cm: sum m (|x|^2 1 - x x^T)."""
-    I[:] = 0.0
+    for q in range(3):
+        I[q, 0], I[q, 1], I[q, 2] = 0.0, 0.0, 0.0
     for i in range(r.shape[0]):
         x, y, z = r[i, 0] - cm[0], r[i, 1] - cm[1], r[i, 2] - cm[2]
         I[0, 0] += m[i] * (y * y + z * z)
@@ -73,18 +73,18 @@ def multiply_transposed(A, x, out):
 
 
 @compiled
-def mean_axes(r, v, m, w):
+def mean_axes(r, v, m, M, w):
     """Centre of mass, inertia and mean-axis angular velocity omega = I^+ h, world axes.
 
     In the mean-axis (Tisserand) frame sum m x cross dx/dt = 0, so h = I omega (the paper's h_cm
     with its misprint mended). Fills w.cm = (r_cm, v_cm, omega, h), w.I and w.I_inv.
     """
-    centre_of_mass(r, m, w.cm[0])
-    centre_of_mass(v, m, w.cm[1])
+    centre_of_mass(r, m, M, w.cm[0])
+    centre_of_mass(v, m, M, w.cm[1])
     inertia(r, m, w.cm[0], w.I)
     inertia_inverse(w.I, w.I_inv)
     h = w.cm[3]
-    h[:] = 0.0
+    h[0], h[1], h[2] = 0.0, 0.0, 0.0
     for i in range(r.shape[0]):
         x, y, z = r[i, 0] - w.cm[0, 0], r[i, 1] - w.cm[0, 1], r[i, 2] - w.cm[0, 2]
         X, Y, Z = v[i, 0] - w.cm[1, 0], v[i, 1] - w.cm[1, 1], v[i, 2] - w.cm[1, 2]
@@ -156,15 +156,15 @@ def rotation_vector(R, phi):
 
 
 @compiled
-def allocate_rigid(x, m, F, tau, omega, I, I_inv, f):  # noqa: E741
+def allocate_rigid(x, m, M, F, tau, omega, I, I_inv, f):  # noqa: E741
     """Share a wrench among agents as a rigid body would: no internal force.
 
     f_i = m_i (F/M + alpha x x_i + omega x (omega x x_i)), alpha = I^+ (tau - omega x I omega).
 
-    Parameters: x (N, 3) positions about the CM [m], m (N,), F and tau (3,) [N, N m], omega (3,)
+    Parameters: x (N, 3) positions about the CM [m], m (N,) and
+    their sum M, F and tau (3,) [N, N m], omega (3,)
     [rad/s], I and I_inv (3, 3), all in the same axes; f (N, 3) [N] is written.
     """
-    M = m.sum()
     o = omega
     h0 = I[0, 0] * o[0] + I[0, 1] * o[1] + I[0, 2] * o[2]
     h1 = I[1, 0] * o[0] + I[1, 1] * o[1] + I[1, 2] * o[2]
@@ -184,7 +184,7 @@ def allocate_rigid(x, m, F, tau, omega, I, I_inv, f):  # noqa: E741
 
 
 @compiled
-def allocate_pinv(x, m, F, tau, split, I, I_inv, f, H, V, work):  # noqa: E741
+def allocate_pinv(x, m, M, F, tau, split, I, I_inv, f, H, V, work):  # noqa: E741
     """The paper's input decoupling (Eq. 25-27): f = H^+ [F; tau_1; ...; tau_N].
 
     H^T H is always singular (forces along m_i x_i that sum to zero lie in its null space), so its
@@ -196,12 +196,10 @@ def allocate_pinv(x, m, F, tau, split, I, I_inv, f, H, V, work):  # noqa: E741
     H (3N, 3N), V (3N, 3N) and work (3N, 3) are scratch; other arguments as in `allocate_rigid`.
     """
     n = x.shape[0]
-    M = m.sum()
     b = work[:, 1]
     a0 = I_inv[0, 0] * tau[0] + I_inv[0, 1] * tau[1] + I_inv[0, 2] * tau[2]
     a1 = I_inv[1, 0] * tau[0] + I_inv[1, 1] * tau[1] + I_inv[1, 2] * tau[2]
     a2 = I_inv[2, 0] * tau[0] + I_inv[2, 1] * tau[1] + I_inv[2, 2] * tau[2]
-    H[:] = 0.0
     for i in range(n):
         X, Y, Z = x[i, 0], x[i, 1], x[i, 2]
         if split == PINV_EQUAL:
@@ -222,16 +220,17 @@ def allocate_pinv(x, m, F, tau, split, I, I_inv, f, H, V, work):  # noqa: E741
         b[3 * i + 2] = F[2] - (X * t1 - Y * t0)
         for j in range(n):
             for q in range(3):
-                H[3 * i + q, 3 * j + q] = 1.0
+                for p in range(3):
+                    H[3 * i + q, 3 * j + p] = 1.0 if p == q else 0.0
         square = X * X + Y * Y + Z * Z
         for q in range(3):
             H[3 * i + q, 3 * i + q] += square
             for p in range(3):
                 H[3 * i + q, 3 * i + p] -= x[i, q] * x[i, p]
     values = work[:, 2]
-    jacobi_eigen(H, V, values)
-    largest = values.max()
-    f[:] = 0.0
+    largest = jacobi_eigen(H, V, values)
+    for k in range(3 * n):
+        f[k // 3, k % 3] = 0.0
     for q in range(3 * n):
         if values[q] > 1e-12 * largest:
             s = 0.0
@@ -243,9 +242,9 @@ def allocate_pinv(x, m, F, tau, split, I, I_inv, f, H, V, work):  # noqa: E741
 
 
 @compiled
-def allocate(x, m, F, tau, omega, method, I, I_inv, f, H, V, work):  # noqa: E741
+def allocate(x, m, M, F, tau, omega, method, I, I_inv, f, H, V, work):  # noqa: E741
     """Share a wrench among the agents by the named method; see the two functions above."""
     if method == RIGID:
-        allocate_rigid(x, m, F, tau, omega, I, I_inv, f)
+        allocate_rigid(x, m, M, F, tau, omega, I, I_inv, f)
     else:
-        allocate_pinv(x, m, F, tau, method, I, I_inv, f, H, V, work)
+        allocate_pinv(x, m, M, F, tau, method, I, I_inv, f, H, V, work)

@@ -69,7 +69,7 @@ def assemble(u, m, graph, scale, shift, A):
 
 
 @compiled
-def solve_multipliers(m, graph, law, w):
+def solve_multipliers(vehicles, graph, law, w):
     """Multipliers w.multiplier (m,) [N] for w.b; NaN where A is singular and the law exact.
 
     On the eigenvalues w of mbar A (mbar the mean mass), each law is mbar phi(w) b with
@@ -78,9 +78,10 @@ def solve_multipliers(m, graph, law, w):
     spectral   1/(w + nu), nu = (s0/4)(1 - w/s0)^2 for w < s0, else 0;
     pinv       1/w, or 0 where w is below the cut-off.
     """
+    m = vehicles.m
     n = graph.edges.shape[0]
     b, y = w.b, w.multiplier
-    mbar = m.mean()
+    mbar = vehicles.M / m.shape[0]
     if law.solver == ITERATED:
         assemble(w.u, m, graph, mbar, law.mu, w.A)
         cholesky(w.A)
@@ -106,8 +107,7 @@ def solve_multipliers(m, graph, law, w):
         cholesky_solve(w.A, y)
         return
     assemble(w.u, m, graph, mbar, 0.0, w.A)
-    jacobi_eigen(w.A, w.V, w.w)
-    largest = w.w.max()
+    largest = jacobi_eigen(w.A, w.V, w.w)
     for k in range(n):
         y[k] = 0.0
     for q in range(n):
@@ -127,7 +127,8 @@ def solve_multipliers(m, graph, law, w):
 @compiled
 def apply_multipliers(u, edges, multiplier, f_C):
     """f_C = J^T lambda (Eq. 11) into f_C (N, 3) [N]: no net force, no net torque."""
-    f_C[:] = 0.0
+    for i in range(f_C.shape[0]):
+        f_C[i, 0], f_C[i, 1], f_C[i, 2] = 0.0, 0.0, 0.0
     for k in range(edges.shape[0]):
         i, j = edges[k, 0], edges[k, 1]
         for q in range(3):

@@ -133,7 +133,8 @@ def local_law(r, v, m, g, control, w):
 
     Writes w.f_u and, into w.wrench, the wrench that the reference motion itself asks for.
     """
-    w.wrench[:] = 0.0
+    for q in range(6):
+        w.wrench[q] = 0.0
     for i in range(r.shape[0]):
         for q in range(3):
             e = r[i, q] - w.r_ref[i, q]
@@ -154,7 +155,8 @@ def body_gains(t, feedback, out):
     remaining = feedback.arrival - t
     n = feedback.to_go.shape[0]
     if remaining <= 0.0 or n == 0:
-        out[:] = feedback.hold
+        for q in range(4):
+            out[q] = feedback.hold[q]
         return
     low, high = 0, n - 1
     while high - low > 1:
@@ -170,14 +172,13 @@ def body_gains(t, feedback, out):
 
 
 @compiled
-def body_law(t, m, g, T, feedback, control, w):
+def body_law(t, m, M, g, T, feedback, control, w):
     """LQR on the virtual body: CM and attitude -> wrench -> every agent (w.f_u, w.wrench).
 
     The target moves: r_wp + v_wp (t - T), and turns at omega_wp. With the attitude error phi,
     body = target Exp(phi): F = M (g - K e), tau = I (-K phi ...) + omega x I omega, world axes.
     """
     n = m.shape[0]
-    M = m.sum()
     gain = w.gain
     body_gains(t, feedback, gain)
     since = t - feedback.arrival
@@ -211,4 +212,4 @@ def body_law(t, m, g, T, feedback, control, w):
     for i in range(n):
         for q in range(3):
             w.a[i, q] = w.r[i, q] - w.cm[0, q]
-    allocate(w.a, m, F, tau, o, control.allocation, w.I, w.I_inv, w.f_u, w.H, w.H_V, w.H_w)
+    allocate(w.a, m, M, F, tau, o, control.allocation, w.I, w.I_inv, w.f_u, w.H, w.H_V, w.H_w)

@@ -29,7 +29,7 @@ from rigidfleet.kernel.constraint import (
     solve_multipliers,
 )
 from rigidfleet.kernel.control import body_law, desired_agents, local_law, reference_motion
-from rigidfleet.kernel.program import BODY, LOCAL, SLOTS, Array, Program, Workspace
+from rigidfleet.kernel.program import BODY, LOCAL, OPEN, SLOTS, Array, Program, Workspace
 from rigidfleet.kernel.references import blend_slots, distance_references
 
 # What `integrate` returns.
@@ -92,7 +92,7 @@ def closed_loop(t, y, dy, p, w):
                 w.f_E[i, s] += w.a[i, s]
 
     if p.law.k_def > 0.0 or p.has_frame or control.kind == BODY:
-        mean_axes(r, v, m, w)
+        mean_axes(r, v, m, vehicles.M, w)
     if p.reference.kind == SLOTS or control.kind == LOCAL:
         blend_slots(t, p.reference, w.p, w.p_dot, w.p_ddot)
     if control.kind == LOCAL:
@@ -100,9 +100,11 @@ def closed_loop(t, y, dy, p, w):
         desired_agents(w)
         local_law(r, v, m, g, control, w)
     elif control.kind == BODY:
-        body_law(t, m, g, T, p.feedback, control, w)
+        body_law(t, m, vehicles.M, g, T, p.feedback, control, w)
     else:
-        w.f_u[:] = control.force
+        for i in range(n):
+            for s in range(3):
+                w.f_u[i, s] = control.force[i, s]
     if p.law.k_def > 0.0:
         damp_deformation(r, v, m, p.law.k_def, w.cm, w.f_u)
 
@@ -115,7 +117,7 @@ def closed_loop(t, y, dy, p, w):
             for s in range(3):
                 w.a[i, s] = w.f_E[i, s] + w.f_u[i, s]
         right_side(v, y[6 * n : q], w.a, m, graph.edges, p.law, w)
-        solve_multipliers(m, graph, p.law, w)
+        solve_multipliers(vehicles, graph, p.law, w)
         apply_multipliers(w.u, graph.edges, w.multiplier, w.f_C)
         for k in range(n_edges):
             dy[6 * n + k] = w.c[k]
@@ -157,13 +159,13 @@ def body_derivatives(y, dy, p, w):
     q = 6 * n + p.graph.edges.shape[0]
     omega, a_cm, relative, a = w.cm[4], w.E[0], w.E[1], w.E[2]
     multiply(w.T, w.cm[2], omega)
-    a_cm[:] = 0.0
+    for s in range(3):
+        a_cm[s] = 0.0
     for i in range(n):
         for s in range(3):
             a_cm[s] += p.vehicles.m[i] * w.a[i, s]
-    total = p.vehicles.m.sum()
     for s in range(3):
-        a_cm[s] /= total
+        a_cm[s] /= p.vehicles.M
         dy[q + 4 + s] = y[q + 7 + s]
         dy[q + 7 + s] = a_cm[s]
     for i in range(n):
@@ -329,28 +331,46 @@ def recorder(k: int, n: int, m: int) -> Record:
 
 
 @compiled
+def copy(a, out):
+    """Copy a into out, both two-dimensional."""
+    for i in range(a.shape[0]):
+        for j in range(a.shape[1]):
+            out[i, j] = a[i, j]
+
+
+@compiled
 def record(times, samples, p, w, out):
     """Evaluate the closed loop at the sampled states and keep its forces and references."""
     dy = np.empty(samples.shape[1])
+    kind = p.control.kind
     for k in range(times.shape[0]):
         closed_loop(times[k], samples[k], dy, p, w)
-        out.r[k], out.v[k], out.a[k] = w.r, w.v, w.a
-        out.f_E[k], out.f_u[k], out.f_C[k] = w.f_E, w.f_u, w.f_C
-        out.c[k], out.L[k], out.multiplier[k] = w.c, w.L, w.multiplier
-        out.d[k], out.d_dot[k] = w.d, w.d_dot
-        if p.reference.kind == SLOTS or p.control.kind == LOCAL:
-            out.p[k] = w.p
-        out.wrench[k] = w.wrench
-        if p.control.kind == LOCAL:
-            out.r_ref[k] = w.r_ref
-            out.motion[k, :3], out.motion[k, 3:] = w.body[0], w.body[1]
-            out.rates[k], out.T_ref[k] = w.body[3], w.T_ref
-        elif p.control.kind == BODY:
+        for i in range(w.c.shape[0]):
+            out.c[k, i], out.L[k, i], out.multiplier[k, i] = w.c[i], w.L[i], w.multiplier[i]
+            out.d[k, i], out.d_dot[k, i] = w.d[i], w.d_dot[i]
+        copy(w.r, out.r[k])
+        copy(w.v, out.v[k])
+        copy(w.a, out.a[k])
+        copy(w.f_E, out.f_E[k])
+        copy(w.f_u, out.f_u[k])
+        copy(w.f_C, out.f_C[k])
+        for q in range(6):
+            out.wrench[k, q] = w.wrench[q]
+        if p.reference.kind == SLOTS or kind == LOCAL:
+            copy(w.p, out.p[k])
+        if kind != OPEN:
+            copy(w.T_ref, out.T_ref[k])
+        if kind == LOCAL:
+            copy(w.r_ref, out.r_ref[k])
+            for q in range(3):
+                out.motion[k, q], out.motion[k, 3 + q] = w.body[0, q], w.body[1, q]
+                out.rates[k, q] = w.body[3, q]
+        elif kind == BODY:
             since = times[k] - p.feedback.arrival
             for q in range(3):
                 out.motion[k, q] = p.feedback.r[q] + p.feedback.v[q] * since
                 out.motion[k, 3 + q] = p.feedback.v[q]
-            out.rates[k], out.T_ref[k] = p.feedback.omega, w.T_ref
+                out.rates[k, q] = p.feedback.omega[q]
 
 
 __all__ = ["Program", "Workspace", "integrate", "integrator", "record", "recorder"]

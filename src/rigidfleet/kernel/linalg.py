@@ -48,6 +48,8 @@ def cholesky_solve(A, x):
 def jacobi_eigen(A, V, w):
     """Eigenvalues ``w`` and eigenvectors ``V[:, i]`` of symmetric A by cyclic Jacobi rotations.
 
+    Returns the largest eigenvalue.
+
     Reads the lower triangle; A is destroyed. Small eigenvalues come out accurate, and nothing is
     allocated.
     """
@@ -90,5 +92,8 @@ def jacobi_eigen(A, V, w):
                     x, y = V[k, p], V[k, q]
                     V[k, p] = c * x - s * y
                     V[k, q] = s * x + c * y
+    largest = A[0, 0]
     for i in range(n):
         w[i] = A[i, i]
+        largest = max(largest, w[i])
+    return largest

@@ -1,0 +1,145 @@
+"""How close agents come to each other and to obstacles, and how a formation lies in space."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+if TYPE_CHECKING:
+    from rigidfleet.mission import Box, Ground
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+# Slots thinner than this, relative to their length, are a line to an attitude fit.
+_THIN = 1e-3
+
+
+def separation(r: Array, radius: ArrayLike) -> tuple[Array, Ints]:
+    """Least room between two agents' surfaces (K,) [m], and the pair (K, 2) that has it.
+
+    Parameters: r (K, N, 3) [m], radius (N,) [m]. One agent alone: infinity and (-1, -1).
+    """
+    n = r.shape[1]
+    radius = np.asarray(radius, dtype=float)
+    least, pair = np.full(len(r), np.inf), np.full((len(r), 2), -1)
+    for i in range(n - 1):
+        room = np.linalg.norm(r[:, i + 1 :] - r[:, i : i + 1], axis=2) - radius[i] - radius[i + 1 :]
+        j = room.argmin(axis=1)
+        room = room[np.arange(len(r)), j]
+        closer = room < least
+        least[closer] = room[closer]
+        pair[closer, 0], pair[closer, 1] = i, i + 1 + j[closer]
+    return least, pair
+
+
+def clearance(
+    r: Array, radius: ArrayLike, obstacles: Sequence[Box | Ground]
+) -> tuple[Array, Ints, Ints]:
+    """Least room to an obstacle (K,) [m], and the agent and the obstacle (K,) that have it.
+
+    Negative where they overlap; infinity, -1 and -1 without obstacles. r (K, N, 3), radius (N,).
+    """
+    radius = np.asarray(radius, dtype=float)
+    least = np.full(len(r), np.inf)
+    agent, obstacle = np.full(len(r), -1), np.full(len(r), -1)
+    for k, thing in enumerate(obstacles):
+        if thing.kind == "ground":
+            room = r[:, :, 2] - thing.height - radius
+        else:
+            low, high = np.array(thing.min), np.array(thing.max)
+            beyond = np.maximum(low - r, r - high)  # positive outside
+            outside = np.linalg.norm(np.maximum(beyond, 0.0), axis=2)
+            room = outside + np.minimum(beyond.max(axis=2), 0.0) - radius
+        i = room.argmin(axis=1)
+        room = room[np.arange(len(r)), i]
+        closer = room < least
+        least[closer], agent[closer], obstacle[closer] = room[closer], i[closer], k
+    return least, agent, obstacle
+
+
+def fit_attitudes(x: Array, p: Array, masses: Array, near: Array) -> Array:
+    """Attitude T (K, 3, 3), world -> body, of slots fitted to agents at each of K samples (Kabsch).
+
+    Parameters
+    ----------
+    x, p : (K, N, 3) agents about their CM in world axes, and slots in body axes [m]
+    masses : (N,) weights [kg]
+    near : (K, 3, 3) or (3, 3) the attitude expected, which decides what the fit leaves open: the
+        spin of a line about itself. One matrix: each sample's is taken from the sample before.
+    """
+    fit = np.einsum("i,kia,kib->kab", masses, p, x)
+    U, _, Vt = np.linalg.svd(fit)
+    U[:, :, 2] *= np.sign(np.linalg.det(U @ Vt))[:, None]
+    T = U @ Vt
+    guess = near[0] if near.ndim == 3 else near
+    _, spread, axes = np.linalg.svd(np.sqrt(masses)[:, None] * p, full_matrices=False)
+    flat = np.zeros(len(p), dtype=bool) if p.shape[1] > 1 else np.ones(len(p), dtype=bool)
+    if p.shape[1] > 1:
+        flat = spread[:, 1] <= _THIN * spread[:, 0]
+    for k in range(len(p)):
+        if flat[k]:
+            if near.ndim == 3:
+                guess = near[k]
+            T[k] = _turn_line(x[k], p[k], axes[k, 0], guess)
+        guess = T[k]
+    return T
+
+
+def _turn_line(x: Array, p: Array, axis: Array, near: Array) -> Array:
+    """Attitude of a line, from ``near`` by the smallest rotation that brings the line's axis home."""
+    now = near.T @ axis
+    there = (p @ axis) @ x
+    length = np.linalg.norm(there)
+    if length == 0.0:
+        return near
+    there = there / length
+    n, c = np.cross(now, there), now @ there
+    if c < -1.0 + 1e-12:  # half a turn: any axis across the line will do
+        n = np.cross(now, np.eye(3)[np.abs(now).argmin()])
+        n /= np.linalg.norm(n)
+        R = 2.0 * np.outer(n, n) - np.eye(3)
+    else:
+        skew = np.array([[0, -n[2], n[1]], [n[2], 0, -n[0]], [-n[1], n[0], 0]])
+        R = np.eye(3) + skew + skew @ skew / (1.0 + c)
+    return near @ R.T
+
+
+def mean_axis_rates(x: Array, y: Array, masses: Array) -> Array:
+    """Angular velocity omega = I^+ h (K, 3) [rad/s], world axes, of agents about their CM.
+
+    x, y (K, N, 3): positions and velocities about the CM [m, m/s].
+    """
+    h = np.einsum("i,kia->ka", masses, np.cross(x, y))
+    C = np.einsum("i,kia,kib->kab", masses, x, x)
+    inertia = np.trace(C, axis1=1, axis2=2)[:, None, None] * np.eye(3) - C
+    return np.einsum("kab,kb->ka", np.linalg.pinv(inertia, 1e-9, hermitian=True), h)
+
+
+def smallest_singular_value(r: Array, edges: Ints, masses: ArrayLike | None = None) -> Array:
+    """Smallest non-zero singular value (K,) of the constraint Jacobian J at r (K, N, 3).
+
+    Zero means below 1e-7 of the largest. NaN without edges. With ``masses`` the Jacobian is
+    weighted, J M^-1/2 sqrt(mbar), whose squares are the eigenvalues w of mbar A.
+    """
+    if not len(edges):
+        return np.full(len(r), np.nan)
+    i, j = edges.T
+    u = r[:, i] - r[:, j]
+    u /= np.linalg.norm(u, axis=2, keepdims=True)
+    J = np.zeros((len(edges), r.shape[1], len(r), 3))
+    rows = np.arange(len(edges))
+    J[rows, i], J[rows, j] = u.swapaxes(0, 1), -u.swapaxes(0, 1)
+    J = J.transpose(2, 0, 1, 3)
+    if masses is not None:
+        m = np.asarray(masses, dtype=float)
+        J = J * np.sqrt(m.mean() / m)[:, None]
+    J = J.reshape(len(r), len(edges), -1)
+    # The smaller Gram matrix: a third of the time of a decomposition of J itself.
+    gram = J @ J.swapaxes(1, 2) if J.shape[1] <= J.shape[2] else J.swapaxes(1, 2) @ J
+    w = np.linalg.eigvalsh(gram)
+    w[w < 1e-14 * w[:, -1:]] = np.inf
+    return np.sqrt(w.min(axis=1))

@@ -1,0 +1,286 @@
+"""From a mission and the state at a switch to what the kernel flies: everything known before.
+
+A phase of a mission becomes a `Program`: time functions (blends, piecewise quintics), gain tables
+and weights, which the kernel only evaluates. What the next phase inherits travels in a `Situation`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigidfleet import attitude as att
+from rigidfleet import formation as shapes
+from rigidfleet import lqr
+from rigidfleet.kernel import program as k
+from rigidfleet.mission import Establish, Fly, Mission, Phase, Regulator, Reshape, Turn
+
+Array = NDArray[np.float64]
+
+_SOLVERS = {"iterated": k.ITERATED, "spectral": k.SPECTRAL, "exact": k.EXACT, "pinv": k.PINV}
+_SPLITS = {"equal": k.PINV_EQUAL, "inertia": k.PINV_INERTIA, "inertia+force": k.PINV_INERTIA_FORCE}
+
+Edge = tuple[int, int]
+
+
+@dataclass
+class Pose:
+    """Where the virtual body is, or is to be: CM [m], attitude T (world -> body), their rates."""
+
+    r: Array
+    v: Array
+    T: Array
+    omega: Array  # body axes [rad/s]
+
+
+@dataclass
+class Situation:
+    """The state at a switch, and what was commanded up to it."""
+
+    t: float
+    r: Array  # (N, 3) [m]
+    v: Array  # (N, 3) [m/s]
+    integral: dict[Edge, float] = field(default_factory=dict)  # of c, by edge [m s]
+    reference: dict[Edge, float] = field(default_factory=dict)  # distances commanded last [m]
+    frame: Array | None = None  # attitude (3, 3) of the integrated mean-axis frame
+    formation: str | None = None  # the one taken last
+    slots: Array | None = None  # (N, 3) commanded last, about the CM, body axes [m]
+    pose: Pose | None = None  # commanded last; None where nothing was
+    goal: Pose | None = None  # what to stay at
+
+
+@dataclass
+class PhasePlan:
+    """A phase, ready to fly."""
+
+    program: k.Program
+    edges: NDArray[np.int64]  # (m, 2), from 0
+    slots: Array | None  # (N, 3) at the end, about the CM, body axes [m]
+    formation: str | None
+    distances: Array  # (m,) at the end [m]
+    goal: Pose | None
+    arrival: float  # when the goal is to be reached [s]
+    frame: Array | None  # attitude (3, 3) of the mean-axis frame at the start
+
+
+def about_cm(points: Array, masses: Array) -> Array:
+    """Points (N, 3) [m] relative to their centre of mass."""
+    return points - masses @ points / masses.sum()
+
+
+def body_rates(r: Array, v: Array, masses: Array, T: Array) -> Array:
+    """Mean-axis rates omega = I^+ h (3,) [rad/s] of agents r, v (N, 3), in the axes of T (3, 3)."""
+    x, y = about_cm(r, masses), about_cm(v, masses)
+    inertia = np.einsum("i,ij,ij->", masses, x, x) * np.eye(3) - (masses[:, None] * x).T @ x
+    h = masses @ np.cross(x, y)
+    return T @ np.linalg.pinv(inertia, 1e-9, hermitian=True) @ h
+
+
+def plan_phase(mission: Mission, phase: Phase, now: Situation, t_end: float) -> PhasePlan:
+    """Prepare a phase that starts at ``now.t`` and ends at ``t_end`` [s] at the latest."""
+    masses = np.array(mission.agents.mass)
+    shaping = isinstance(phase, Establish | Reshape)
+    name = phase.formation if shaping else now.formation
+    edges = mission.formation_edges(name) if name else np.zeros((0, 2), dtype=np.int64)
+    target = _slots(mission, name, masses)
+    frame, now = _attach(mission, phase, now, masses, target)
+
+    d1 = mission.formation_distances(name) if name else np.zeros(0)
+    if not shaping:
+        d1 = np.array([now.reference.get(e, d) for e, d in zip(_keys(edges), d1, strict=True)])
+    d0 = np.array([now.reference.get(e, _distance(now.r, e)) for e in _keys(edges)])
+    # Slots are blended wherever the shape leads; where distances lead, slots only follow if tracked.
+    before = now.slots if now.slots is not None else about_cm(now.r, masses)
+    after = target if shaping and target is not None else before
+    kind, T_b = k.CONSTANT, 0.0
+    if shaping:
+        T_b = 0.0 if phase.reference == "step" else phase.blend
+        kind = {"shape": k.SLOTS, "distances": k.SQUARED, "step": k.CONSTANT}[phase.reference]
+    elif phase.control == "slots" and np.allclose(d1, shapes.distances(before, edges), rtol=1e-12):
+        kind = k.SLOTS
+    dp, turn = _align(before, after, masses) if shaping else (np.zeros_like(before), np.zeros(3))
+    reference = k.Reference(kind, now.t, T_b, d0, d1, before, dp, turn)
+
+    goal, arrival = _goal(phase, now, t_end)
+    motion, feedback = _REST, _NO_FEEDBACK
+    if phase.control == "slots":
+        assert now.pose is not None and goal is not None  # attached above
+        motion = _motion(mission, now.pose, goal, now.t, arrival)
+    elif phase.control == "body":
+        assert goal is not None
+        moves = isinstance(phase, Fly | Turn)
+        feedback = _feedback(mission, goal, now.t, arrival, moves=moves)
+    program = k.Program(
+        body_formulation=mission.formulation == "body",
+        has_frame=frame is not None,
+        vehicles=k.Vehicles(
+            masses, float(masses.sum()), np.array(mission.agents.thrust_limit),
+            mission.agents.saturate, mission.gravity,
+        ),
+        graph=k.graph(edges, masses),
+        law=_law(mission, damped=phase.control != "slots" and len(edges) > 0),
+        reference=reference,
+        motion=motion,
+        feedback=feedback,
+        control=_control(mission, phase, masses),
+        external=0,
+    )  # fmt: skip
+    slots = after if phase.control != "open" or kind == k.SLOTS else target if shaping else now.slots
+    return PhasePlan(program, edges, slots, name, d1, goal, arrival, frame)
+
+
+def _keys(edges: NDArray[np.int64]) -> list[Edge]:
+    return [(int(i), int(j)) for i, j in edges]
+
+
+def _distance(r: Array, edge: Edge) -> float:
+    return float(np.linalg.norm(r[edge[0]] - r[edge[1]]))
+
+
+def _slots(mission: Mission, name: str | None, masses: Array) -> Array | None:
+    slots = mission.formation_slots(name) if name else None
+    return None if slots is None else about_cm(slots, masses)
+
+
+def _attach(
+    mission: Mission, phase: Phase, now: Situation, masses: Array, target: Array | None
+) -> tuple[Array | None, Situation]:
+    """Attach the body frame where a phase needs one; return the frame to integrate, if any.
+
+    Slots fitted to the agents (Kabsch) give the attitude; where nothing is established yet and
+    the phase shapes nothing, the agents themselves are the slots, in the world's axes.
+    """
+    shaping = isinstance(phase, Establish | Reshape)
+    frame = now.frame
+    near = frame if frame is not None else now.pose.T if now.pose is not None else np.eye(3)
+    fit = now.slots if now.slots is not None else target if shaping else None
+    if phase.control == "open":
+        if mission.formulation == "body" and frame is None:
+            frame = np.eye(3)
+        return frame, now
+    x = about_cm(now.r, masses)
+    if phase.control == "slots" and now.pose is not None:
+        pose = now.pose  # the reference goes on from where it is
+    else:
+        T = near if fit is None else shapes.kabsch(x, fit, masses, near=near.T).T
+        pose = Pose(masses @ now.r / masses.sum(), masses @ now.v / masses.sum(), T, np.zeros(3))
+        pose.omega = body_rates(now.r, now.v, masses, T)
+    slots = now.slots if now.slots is not None else x @ pose.T.T
+    if phase.control == "body" or frame is not None:
+        frame = pose.T if phase.control == "body" or frame is None else frame
+    goal = now.goal or replace(pose, v=np.zeros(3), omega=np.zeros(3))
+    return frame, replace(now, pose=pose, slots=slots, goal=goal)
+
+
+def _align(before: Array, after: Array, masses: Array) -> tuple[Array, Array]:
+    """What a blend adds to the slots, and by which rotation vector it turns them meanwhile.
+
+    The new slots are turned onto the old ones first (Kabsch, weighted by mass): the straight
+    blend then has no angular momentum in its own frame, and moves the agents least. The turn
+    brings them back, so that the body axes keep their meaning.
+    """
+    R = shapes.kabsch(before, after, masses)
+    return after @ R.T - before, att.rotation_vector_from_dcm(R)  # log of R^T
+
+
+def _goal(phase: Phase, now: Situation, t_end: float) -> tuple[Pose | None, float]:
+    """The pose to be at, and when."""
+    goal = now.goal
+    if goal is None or not isinstance(phase, Fly | Turn):
+        return goal, t_end
+    arrival = t_end
+    angles = phase.attitude_deg
+    T = goal.T if angles is None else att.dcm_from_euler(np.deg2rad(angles))
+    r, v = goal.r, np.zeros(3)
+    if isinstance(phase, Fly):
+        r, v = np.array(phase.position), np.array(phase.velocity)
+    return Pose(r, v, T, np.deg2rad(phase.rates_deg_s)), arrival
+
+
+def _law(mission: Mission, *, damped: bool) -> k.Law:
+    c = mission.constraint
+    pid = c.stabilisation == "pid"
+    return k.Law(
+        alpha=c.alpha if pid else 0.0,
+        beta=c.beta if pid else 0.0,
+        gamma=c.gamma if pid else 0.0,
+        solver=_SOLVERS[c.solver],
+        mu=c.damping,
+        iterations=c.iterations,
+        s0=c.threshold,
+        cutoff=c.cutoff,
+        k_def=c.deformation_damping if damped else 0.0,
+    )
+
+
+def _control(mission: Mission, phase: Phase, masses: Array) -> k.Control:
+    kind = {"open": k.OPEN, "slots": k.LOCAL, "body": k.BODY}[phase.control]
+    force = np.tile(np.array(phase.input_force), (len(masses), 1))
+    force[:, 2] += masses * mission.gravity
+    k1, k2 = lqr.double_integrator_gains(mission.tracking.Q, mission.tracking.R)
+    allocation = mission.allocation
+    method = k.RIGID if allocation.method == "rigid" else _SPLITS[allocation.torque_split]
+    return k.Control(kind, force, k1, k2, method)
+
+
+_REST = k.Motion(np.zeros(2), np.zeros((1, 6, 6)), np.eye(3))
+_NO_FEEDBACK = k.Feedback(
+    np.zeros(0), np.zeros((0, 4)), 0.0, np.zeros(3), np.zeros(3), np.eye(3), np.zeros(3),
+    np.zeros(4),
+)  # fmt: skip
+
+
+def _motion(mission: Mission, start: Pose, goal: Pose, t0: float, arrival: float) -> k.Motion:
+    """LQR of the virtual body from one pose to another, as the trajectory it makes.
+
+    The attitude is regulated as the rotation vector phi from the goal to the body: three more
+    double integrators, phi'' their input, exact for a turn about one axis.
+    """
+    T = arrival - t0
+    phi = att.rotation_vector_from_dcm(start.T @ goal.T.T)  # start = goal Exp(phi)
+    phi_dot = att.rotation_vector_rate(phi, start.omega)
+    flights = [
+        (mission.lqr, (start.r, start.v), (goal.r, goal.v)),
+        (mission.lqr.attitude, (phi, phi_dot), (np.zeros(3), goal.omega)),
+    ]
+    times = np.unique(np.concatenate([_knots(law, T) for law, _, _ in flights]))
+    pieces = []
+    for law, begin, end in flights:
+        if law.horizon == "finite":
+            x = lqr.finite_horizon_trajectory(times, begin, end, T, law.Q, law.R, law.S)
+        else:
+            x = lqr.infinite_horizon_trajectory(times, begin, end, T, law.Q, law.R)
+        pieces.append(lqr.quintic_pieces(times, *x))
+    return k.Motion(t0 + times, np.ascontiguousarray(np.concatenate(pieces, axis=1)), goal.T)
+
+
+def _knots(law: Regulator, T: float) -> Array:
+    return lqr.knots(T, law.Q, law.R, law.S if law.horizon == "finite" else None)
+
+
+def _feedback(
+    mission: Mission, goal: Pose, t0: float, arrival: float, *, moves: bool
+) -> k.Feedback:
+    """LQR on the virtual body itself: gain tables to a waypoint, tracking gains where it stays."""
+    hold = lqr.double_integrator_gains(mission.tracking.Q, mission.tracking.R) * 2
+    to_go, gain = np.zeros(0), np.zeros((0, 4))
+    if moves:
+        # Gains grow like 1/tau near arrival: a geometric grid keeps linear interpolation to 1e-4.
+        to_go = np.concatenate([[0.0], np.geomspace(1e-3, arrival - t0, 500)])
+        gain = np.concatenate(
+            [_gains(law, to_go) for law in (mission.lqr, mission.lqr.attitude)], axis=1
+        )
+    return k.Feedback(
+        to_go, np.ascontiguousarray(gain), arrival, goal.r, goal.v, goal.T, goal.omega,
+        np.array(hold),
+    )  # fmt: skip
+
+
+def _gains(law: Regulator, to_go: Array) -> Array:
+    """Gains (K, 2) of one axis over the time to go (K,) [s]."""
+    if law.horizon == "infinite":
+        return np.tile(lqr.double_integrator_gains(law.Q, law.R), (len(to_go), 1))
+    A, B = [[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]]
+    return lqr.finite_horizon(A, B, law.Q, np.atleast_2d(law.R), law.S, to_go)[1][:, 0]

@@ -1,0 +1,151 @@
+"""From the kernel's samples to a `Result`: attitude, rates, closeness, one time line."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rigidfleet import attitude as att
+from rigidfleet import geometry
+from rigidfleet.result import PhaseRecord, Result
+
+if TYPE_CHECKING:
+    from rigidfleet.kernel.flight import Record
+    from rigidfleet.kernel.program import Array
+    from rigidfleet.mission import Mission
+
+
+@dataclass
+class Piece:
+    """Samples of a phase, or of part of one, as the kernel gave them."""
+
+    phase: int
+    time: Array  # (K,) [s]
+    record: Record
+    integral: Array  # (K, m) [m s]
+    frame: Array  # (K, 4)
+    edges: Array  # (m, 2) of this phase
+    slots: Array | None  # (N, 3) to fit where the kernel blends none; None: no frame attached yet
+
+
+def assemble(
+    mission: Mission,
+    phases: Sequence[PhaseRecord],
+    pieces: Sequence[Piece],
+    *,
+    ending: str,
+    statistics: dict[str, Any],
+) -> Result:
+    """Join the pieces of a flight and compute what follows from positions and forces."""
+    pieces = [p for p in pieces if len(p.time)]
+    masses = np.array(mission.agents.mass)
+    M = masses.sum()
+
+    def joined(name: str) -> Array:
+        return np.concatenate([getattr(p.record, name) for p in pieces])
+
+    r, v = joined("r"), joined("v")
+    f_u, f_C = joined("f_u"), joined("f_C")
+    cm, cm_velocity = np.einsum("i,kia->ka", masses, r) / M, np.einsum("i,kia->ka", masses, v) / M
+    x, y = r - cm[:, None], v - cm_velocity[:, None]
+    attitude = _attitudes(pieces, x, masses)
+    T = np.full((len(r), 3, 3), np.nan)
+    attached = np.isfinite(attitude[:, 0])
+    T[attached] = att.dcm_from_quaternion(attitude[attached])
+    T_ref = joined("T_ref")
+    attitude_reference = np.full((len(r), 4), np.nan)
+    commanded = np.isfinite(T_ref[:, 0, 0])
+    attitude_reference[commanded] = att.quaternion_from_dcm(T_ref[commanded])
+    motion = joined("motion")
+    wrench = np.concatenate([f_u.sum(axis=1), np.cross(x, f_u).sum(axis=1)], axis=1)
+    asked = joined("wrench")
+    separation, pair = geometry.separation(r, mission.agents.radius)
+    clearance, agent, obstacle = geometry.clearance(r, mission.agents.radius, mission.obstacles)
+    edges = mission.edges
+    distance = np.linalg.norm(r[:, edges[:, 0]] - r[:, edges[:, 1]], axis=2)
+    return Result(
+        time=np.concatenate([p.time for p in pieces]),
+        phase=np.concatenate([np.full(len(p.time), p.phase) for p in pieces]),
+        position=r,
+        velocity=v,
+        acceleration=joined("a"),
+        slot_position=joined("r_ref"),
+        input_force=f_u,
+        constraint_force=f_C,
+        external_force=joined("f_E"),
+        thrust=np.linalg.norm(f_u + f_C, axis=2),
+        cm=cm,
+        cm_velocity=cm_velocity,
+        cm_reference=motion[:, :3],
+        cm_velocity_reference=motion[:, 3:],
+        attitude=attitude,
+        attitude_reference=att.unwrap_quaternion(attitude_reference),
+        frame=att.unwrap_quaternion(np.concatenate([p.frame for p in pieces])),
+        rates=np.einsum("kab,kb->ka", T, geometry.mean_axis_rates(x, y, masses)),
+        rates_reference=joined("rates"),
+        wrench_asked=np.where(np.isfinite(motion[:, :1]), asked, wrench),
+        wrench_achieved=wrench,
+        edges=edges,
+        distance=distance,
+        distance_reference=_by_edge(pieces, "d", edges),
+        distance_rate_reference=_by_edge(pieces, "d_dot", edges),
+        constraint=_by_edge(pieces, "c", edges),
+        integral=_by_edge(pieces, "integral", edges),
+        multiplier=_by_edge(pieces, "multiplier", edges),
+        singular_value=_singular_values(pieces),
+        separation=separation,
+        separation_pair=pair,
+        clearance=clearance,
+        clearance_agent=agent,
+        clearance_obstacle=obstacle,
+        phases=list(phases),
+        mission_text=mission.text,
+        complete=not ending,
+        ending=ending,
+        statistics=statistics,
+    )
+
+
+def _attitudes(pieces: Sequence[Piece], x: Array, masses: Array) -> Array:
+    """Attitude quaternions (K, 4) of the formation's slots; of the integrated frame without slots."""
+    quaternions = np.full((len(x), 4), np.nan)
+    last = np.eye(3)
+    start = 0
+    for piece in pieces:
+        rows = slice(start, start + len(piece.time))
+        start = rows.stop
+        if piece.slots is None:
+            if np.isfinite(piece.frame).all():
+                quaternions[rows] = piece.frame
+            continue
+        p = piece.record.p
+        if np.isnan(p[0, 0, 0]):
+            p = np.broadcast_to(piece.slots, x[rows].shape)
+        near = piece.record.T_ref
+        if np.isnan(near[0, 0, 0]):
+            near = last
+        T = geometry.fit_attitudes(x[rows], p, masses, near)
+        last = T[-1]
+        quaternions[rows] = att.quaternion_from_dcm(T)
+    return att.unwrap_quaternion(quaternions)
+
+
+def _by_edge(pieces: Sequence[Piece], name: str, edges: Array) -> Array:
+    """A quantity of the edges (K, m), NaN while an edge is not active."""
+    column = {(i, j): k for k, (i, j) in enumerate(edges.tolist())}
+    rows = []
+    for piece in pieces:
+        values = piece.integral if name == "integral" else getattr(piece.record, name)
+        full = np.full((len(piece.time), len(edges)), np.nan)
+        full[:, [column[i, j] for i, j in piece.edges.tolist()]] = values
+        rows.append(full)
+    return np.concatenate(rows)
+
+
+def _singular_values(pieces: Sequence[Piece]) -> Array:
+    return np.concatenate(
+        [geometry.smallest_singular_value(p.record.r, p.edges) for p in pieces]
+    )

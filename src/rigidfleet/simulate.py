@@ -1,0 +1,489 @@
+"""Fly a mission: run its phases, restart the integrator at every switch, report progress."""
+
+from __future__ import annotations
+
+import ctypes
+import math
+import time as clock
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rigidfleet import attitude as att
+from rigidfleet.errors import FlightError
+from rigidfleet.kernel import flight
+from rigidfleet.kernel import program as k
+from rigidfleet.mission import Establish, Fly, Mission, Phase, Reshape, Turn
+from rigidfleet.plan import PhasePlan, Pose, Situation, about_cm, plan_phase
+from rigidfleet.record import Piece, assemble
+from rigidfleet.result import PhaseRecord, Result
+
+if TYPE_CHECKING:
+    from rigidfleet.kernel.program import Array
+
+#: The integrator returns to Python after so many steps: often enough for Ctrl-C and progress.
+_STEPS = 2000
+#: Where a phase ends by settling, whether it has is asked this often [s].
+_CHECK = 0.1
+#: A frame further than this from the slots it is attached to has left them [rad].
+_FLIPPED = math.pi / 2
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a flight is."""
+
+    t: float  # mission time reached [s]
+    t_end: float  # mission time at the end, settling phases at their longest [s]
+    phase: str
+    wall: float  # time taken so far [s]
+
+
+@dataclass(frozen=True)
+class Observation:
+    """What a controller sees at a control step; arrays (N, 3) world axes, copies."""
+
+    t: float  # [s]
+    phase: str
+    position: Array  # [m]
+    velocity: Array  # [m/s]
+    reference_position: Array  # desired [m]
+    reference_velocity: Array  # [m/s]
+    reference_acceleration: Array  # [m/s^2]
+    masses: Array  # (N,) [kg]
+    gravity: float  # [m/s^2]
+
+
+Controller = Callable[[Observation], ArrayLike]
+Force = Callable[[float, "Array", "Array"], ArrayLike]
+
+
+class FlightInterrupted(KeyboardInterrupt):
+    """Ctrl-C during a flight; ``result`` holds what was flown."""
+
+    def __init__(self, result: Result) -> None:
+        super().__init__(result.ending)
+        self.result = result
+
+
+def simulate(
+    mission: Mission,
+    *,
+    controller: Controller | None = None,
+    rate: float = 50.0,
+    force: Force | None = None,
+    times: ArrayLike | None = None,
+    progress: Callable[[Progress], None] | None = None,
+) -> Result:
+    """Fly a mission and return its record.
+
+    Parameters
+    ----------
+    mission : the mission
+    controller : in place of the input law wherever slots are tracked: a function of an
+        `Observation` that returns the input force (N, 3) [N] of every agent, weight included. It
+        is called ``rate`` times a second, its force held in between, as on a vehicle.
+    rate : control rate [Hz]
+    force : an external force f(t, r, v) -> (N, 3) [N], world axes, continuous in time, besides
+        gravity. A Numba ``cfunc`` of void(double t, double* r, double* v, double* f, ssize_t n)
+        is called without Python.
+    times : samples [s] to record instead of a multiple of the mission's ``output_step``
+    progress : called some times a second
+
+    Returns
+    -------
+    Result
+        A flight that fails on its way (a singular constraint, a phase that does not settle) comes
+        back incomplete, with the diagnosis in ``ending``.
+
+    Raises
+    ------
+    FlightInterrupted
+        On Ctrl-C, with the incomplete result.
+    FlightError
+        The controller or the force returned something that is no force.
+    """
+    run = _Flight(mission, controller, rate, force, times, progress)
+    try:
+        run.fly()
+    except KeyboardInterrupt:
+        run.ending = f"interrupted at t = {run.now.t:.2f} s"
+        raise FlightInterrupted(run.result()) from None
+    return run.result()
+
+
+class _Stopped(Exception):
+    """The flight cannot go on; the message is the diagnosis."""
+
+
+class _Flight:
+    """One flight under way."""
+
+    def __init__(
+        self,
+        mission: Mission,
+        controller: Controller | None,
+        rate: float,
+        force: Force | None,
+        times: ArrayLike | None,
+        progress: Callable[[Progress], None] | None,
+    ) -> None:
+        self.mission = mission
+        self.masses = np.array(mission.agents.mass)
+        self.controller, self.rate = controller, rate
+        self.external = _External(force, mission.n_agents) if force is not None else None
+        self.times = None if times is None else np.unique(np.asarray(times, dtype=float))
+        self.progress = progress
+        frame = None
+        if mission.body_frame is not None:
+            b = mission.body_frame
+            frame = att.dcm_from_euler(np.deg2rad([b.roll_deg, b.pitch_deg, b.yaw_deg]))
+        self.now = Situation(
+            0.0, np.array(mission.agents.position), np.array(mission.agents.velocity), frame=frame
+        )
+        self.pieces: list[Piece] = []
+        self.phases: list[PhaseRecord] = []
+        self.ending = ""
+        self.started = self.reported = clock.perf_counter()
+        self.count = np.zeros(3, dtype=np.int64)
+
+    def fly(self) -> None:
+        """Run all phases, or as many as can be flown."""
+        try:
+            for index, phase in enumerate(self.mission.phases):
+                self._phase(index, phase)
+        except _Stopped as stop:
+            self.ending = str(stop)
+
+    # -- one phase --------------------------------------------------------------------------------
+
+    def _phase(self, index: int, phase: Phase) -> None:
+        start = self.now.t
+        t_end = _end(phase, start)
+        plan = plan_phase(self.mission, phase, self.now, t_end)
+        self._check_frame(phase, plan)
+        if self.external is not None:
+            plan.program = plan.program._replace(external=self.external.address)
+        record = PhaseRecord(
+            phase.name, phase.kind, phase.control, plan.formation, start, start,
+            settled=None if phase.settle is None else False, target=_target(phase, plan),
+        )  # fmt: skip
+        self.phases.append(record)
+        workspace = k.workspace(
+            len(self.masses), len(plan.edges), with_h=plan.program.control.allocation != k.RIGID
+        )
+        y = self._pack(plan)
+        state = flight.integrator(
+            y, start, rtol=self.mission.integrator.rtol, atol=np.full(len(y), self.mission.integrator.atol)
+        )
+        try:
+            if phase.settle is not None:
+                self._settle(index, phase, plan, workspace, state, record)
+            elif self.controller is not None and phase.control == "slots":
+                self._controlled(index, plan, workspace, state, t_end)
+            else:
+                self._integrate(index, plan, plan.program, workspace, state, t_end)
+        finally:
+            self.count += state.count[:3]
+            self._arrive(plan, state, workspace)
+            record.t_end = self.now.t
+        if record.settled is False:
+            raise _Stopped(
+                f"phase '{phase.name}' did not settle within {phase.settle.timeout:g} s: at t ="
+                f" {self.now.t:.2f} s its error was above {phase.settle.tolerance:g} m. Give it a"
+                " longer timeout or a larger tolerance, or see the constraint error to learn why"
+            )
+
+    def _integrate(self, index, plan, program, workspace, state, t_end, observe=None) -> Array:
+        """Integrate to ``t_end`` and record the samples on the way; return their times."""
+        t0 = float(state.clock[0])
+        fresh = state.count[0] == 0 or program is not plan.program
+        times = self._samples(t0, t_end, first=state.count[0] == 0, index=index)
+        samples = np.empty((len(times), len(state.y)))
+        state.count[3] = 0
+        status = flight.PAUSED
+        try:
+            while status == flight.PAUSED:
+                status = flight.integrate(
+                    program, workspace, state, t_end, fresh, times, samples, _STEPS
+                )
+                fresh = False
+                if self.external is not None:
+                    self.external.check()
+                self._report(index, float(state.clock[0]))
+        finally:
+            done = int(state.count[3])
+            self._record(index, plan, program, workspace, times[:done], samples[:done], observe)
+        if status == flight.COLLAPSED:
+            raise _Stopped(self._diagnose(plan, state))
+        return times
+
+    def _samples(self, t0: float, t_end: float, *, first: bool, index: int) -> Array:
+        """Times to record in (t0, t_end], and at a phase's start just after the switch."""
+        if self.times is not None:
+            inside = self.times[(self.times > t0) & (self.times <= t_end)]
+            return self.times[self.times <= t_end] if index == 0 and first else inside
+        step = self.mission.output_step
+        low, high = math.floor(t0 / step + 1e-9) + 1, math.ceil(t_end / step - 1e-9)
+        grid = np.arange(low, high) * step
+        start = [t0 if index == 0 else np.nextafter(t0, math.inf)] if first else []
+        return np.concatenate([start, grid, [t_end]])
+
+    def _settle(self, index, phase, plan, workspace, state, record) -> None:
+        """Integrate in short stretches until the phase has settled, or its time is over."""
+        settle, start = phase.settle, self.now.t
+        least = start + (phase.blend if isinstance(phase, Establish | Reshape) else 0.0)
+        since = math.inf
+        n = 1
+        while True:
+            t = min(start + n * _CHECK, start + settle.timeout)
+            self._integrate(index, plan, plan.program, workspace, state, t)
+            n += 1
+            if t >= least and self._error(plan, workspace, state) <= settle.tolerance:
+                since = min(since, t)
+            else:
+                since = math.inf
+            if t - since >= settle.dwell - 1e-9:
+                record.settled = True
+                return
+            if t >= start + settle.timeout:
+                return
+
+    def _error(self, plan: PhasePlan, w: k.Workspace, state: flight.Integrator) -> float:
+        """Largest error [m] of a constraint, a slot or the goal at the integrator's state."""
+        flight.closed_loop(state.clock[0], state.y, np.empty_like(state.y), plan.program, w)
+        errors = [np.abs(w.c).max(initial=0.0)]
+        if plan.program.control.kind == k.LOCAL:
+            errors.append(np.linalg.norm(w.r - w.r_ref, axis=1).max())
+        if plan.goal is not None and plan.program.control.kind != k.OPEN:
+            errors.append(np.linalg.norm(self.masses @ w.r / self.masses.sum() - plan.goal.r))
+        return float(max(errors))
+
+    def _controlled(self, index, plan, workspace, state, t_end) -> None:
+        """Integrate under the user's controller, its force held over each control step."""
+        start, step = self.now.t, 0
+        dy = np.empty_like(state.y)
+        while state.clock[0] < t_end:
+            t = float(state.clock[0])
+            flight.closed_loop(t, state.y, dy, plan.program, workspace)
+            seen = Observation(
+                t, self.mission.phases[index].name, workspace.r.copy(), workspace.v.copy(),
+                workspace.r_ref.copy(), workspace.v_ref.copy(), workspace.a_ref.copy(),
+                self.masses.copy(), self.mission.gravity,
+            )  # fmt: skip
+            f = _checked(self.controller(seen), self.mission.n_agents, "the controller", t)
+            held = plan.program._replace(
+                control=plan.program.control._replace(kind=k.OPEN, force=f)
+            )
+            step += 1
+            self._integrate(
+                index, plan, held, workspace, state, min(start + step / self.rate, t_end), plan.program
+            )
+
+    # -- states -----------------------------------------------------------------------------------
+
+    def _pack(self, plan: PhasePlan) -> Array:
+        """The kernel's state vector at the switch."""
+        now, masses = self.now, self.masses
+        integral = [now.integral.get((int(i), int(j)), 0.0) for i, j in plan.edges]
+        if plan.frame is None:
+            return np.concatenate([now.r.ravel(), now.v.ravel(), integral])
+        q = att.quaternion_from_dcm(plan.frame)
+        if not plan.program.body_formulation:
+            return np.concatenate([now.r.ravel(), now.v.ravel(), integral, q])
+        x, y = about_cm(now.r, masses) @ plan.frame.T, about_cm(now.v, masses) @ plan.frame.T
+        cm = (masses @ now.r / masses.sum(), masses @ now.v / masses.sum())
+        return np.concatenate([x.ravel(), y.ravel(), integral, q, *cm])
+
+    def _arrive(self, plan: PhasePlan, state: flight.Integrator, w: k.Workspace) -> None:
+        """Make the state the integrator has reached the situation of the next phase."""
+        t = float(state.clock[0])
+        flight.closed_loop(t, state.y, np.empty_like(state.y), plan.program, w)
+        n, m = len(self.masses), len(plan.edges)
+        keys = [(int(i), int(j)) for i, j in plan.edges]
+        frame = self.now.frame
+        if plan.frame is not None:
+            q = state.y[6 * n + m : 6 * n + m + 4]
+            frame = att.dcm_from_quaternion(q / np.linalg.norm(q))
+        pose = None
+        if plan.program.control.kind == k.LOCAL:
+            pose = Pose(w.body[0].copy(), w.body[1].copy(), w.T_ref.copy(), w.body[3].copy())
+        self.now = replace(
+            self.now,
+            t=t,
+            r=w.r.copy(),
+            v=w.v.copy(),
+            integral=self.now.integral | dict(zip(keys, state.y[6 * n : 6 * n + m].tolist(), strict=True)),
+            reference=self.now.reference | dict(zip(keys, plan.distances.tolist(), strict=True)),
+            frame=frame,
+            formation=plan.formation,
+            slots=plan.slots,
+            pose=pose,
+            goal=plan.goal,
+        )
+
+    # -- diagnosis --------------------------------------------------------------------------------
+
+    def _check_frame(self, phase: Phase, plan: PhasePlan) -> None:
+        """Stop where the formation has flipped: its slots no longer lie as the frame says."""
+        if phase.control != "body" or self.now.frame is None or plan.frame is None:
+            return
+        angle = att.angle_between(
+            att.quaternion_from_dcm(self.now.frame), att.quaternion_from_dcm(plan.frame)
+        )
+        if angle > _FLIPPED:
+            raise _Stopped(
+                f"the formation '{self.now.formation}' has flipped at t = {self.now.t:.2f} s: its slots lie"
+                f" {math.degrees(angle):.0f} deg from the body frame that was integrated. Out of a line,"
+                " distances alone do not say to which side a shape unfolds. Track slots through that"
+                ' phase: control = "slots"'
+            )
+
+    def _diagnose(self, plan: PhasePlan, state: flight.Integrator) -> str:
+        """Say when, where and why the integrator could not go on."""
+        n, t = len(self.masses), float(state.clock[0])
+        r = state.y[: 3 * n].reshape(1, n, 3)
+        head = f"the flight cannot go on at t = {t:.3f} s, in phase '{self.phases[-1].name}'"
+        if not len(plan.edges):
+            return f"{head}: the forces are not finite. Look for a force or a gain far too large"
+        i, j = plan.edges.T
+        u = r[0, i] - r[0, j]
+        lengths = np.linalg.norm(u, axis=1)
+        closest = int(lengths.argmin())
+        J = np.zeros((len(plan.edges), n, 3))
+        rows = np.arange(len(plan.edges))
+        J[rows, i], J[rows, j] = u / lengths[:, None], -u / lengths[:, None]
+        values = np.linalg.svd(J.reshape(len(plan.edges), -1), compute_uv=False)
+        edge = f"{i[closest] + 1}-{j[closest] + 1}"
+        return (
+            f"{head}: singular value {len(values)} of {len(values)} of the constraint Jacobian J has"
+            f" fallen to {values[-1]:.2g} (the largest is {values[0]:.2g}; the shortest edge {edge}"
+            f" is {lengths[closest]:.3g} m), and the force of solver"
+            f' "{self.mission.constraint.solver}" has no bound there. Use solver = "iterated" (or'
+            ' "spectral"), and references that move smoothly: reference = "shape" or "distances"'
+        )
+
+    def _report(self, index: int, t: float) -> None:
+        wall = clock.perf_counter()
+        if self.progress is not None and (wall - self.reported > 0.1 or self.reported == self.started):
+            self.reported = wall
+            self.progress(
+                Progress(t, self.mission.latest_end, self.mission.phases[index].name, wall - self.started)
+            )
+
+    # -- the record -------------------------------------------------------------------------------
+
+    def _record(self, index, plan, program, w, times, samples, observe) -> None:
+        """Evaluate forces and references at the samples and keep them."""
+        n, m = len(self.masses), len(plan.edges)
+        out = flight.recorder(len(times), n, m)
+        flight.record(times, samples, program, w, out)
+        if observe is not None:  # the references of the law in whose place the controller flies
+            asked = flight.recorder(len(times), n, m)
+            flight.record(times, samples, observe, w, asked)
+            out = out._replace(
+                r_ref=asked.r_ref, p=asked.p, motion=asked.motion, rates=asked.rates, T_ref=asked.T_ref
+            )
+        frame = np.full((len(times), 4), np.nan)
+        if plan.frame is not None:
+            q = samples[:, 6 * n + m : 6 * n + m + 4]
+            frame = q / np.linalg.norm(q, axis=1, keepdims=True)
+        # A frame is attached from the first establishment on, or wherever something is tracked.
+        attached = self.now.formation is not None or plan.program.control.kind != k.OPEN
+        self.pieces.append(
+            Piece(index, times, out, samples[:, 6 * n : 6 * n + m], frame, plan.edges,
+                  plan.slots if attached else None)
+        )  # fmt: skip
+
+    def result(self) -> Result:
+        """The record of what has been flown."""
+        wall = clock.perf_counter() - self.started
+        evaluations, steps, rejected = (int(c) for c in self.count)
+        statistics = {
+            "evaluations": evaluations, "steps": steps, "rejected": rejected,
+            "wall_s": wall, "simulated_s": self.now.t,
+            "rtol": self.mission.integrator.rtol, "atol": self.mission.integrator.atol,
+        }  # fmt: skip
+        return assemble(self.mission, self.phases, self.pieces, ending=self.ending, statistics=statistics)
+
+
+def _end(phase: Phase, start: float) -> float:
+    """Time [s] at which a phase ends, at the latest."""
+    if phase.until is not None:
+        if phase.until <= start:
+            raise _Stopped(
+                f"phase '{phase.name}' is to end at {phase.until:g} s, but the phases before it took until"
+                f" {start:.2f} s. Give it a duration in place of until"
+            )
+        return phase.until
+    return start + (phase.duration if phase.duration is not None else phase.settle.timeout)
+
+
+def _target(phase: Phase, plan: PhasePlan) -> dict[str, Any] | None:
+    """What a fly or turn phase is to reach, for the record."""
+    if not isinstance(phase, Fly | Turn) or plan.goal is None:
+        return None
+    turns = phase.attitude_deg is not None
+    return {
+        "time": plan.arrival,
+        "position": plan.goal.r.tolist() if isinstance(phase, Fly) else None,
+        "velocity": plan.goal.v.tolist() if isinstance(phase, Fly) else None,
+        "attitude": att.quaternion_from_dcm(plan.goal.T).tolist() if turns else None,
+        "rates": plan.goal.omega.tolist() if turns else None,
+    }
+
+
+def _checked(f: ArrayLike, n: int, who: str, t: float) -> Array:
+    """Forces (N, 3) [N] from a user's function, or an error that says what came instead."""
+    try:
+        force = np.array(f, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise FlightError(f"{who} returned {f!r} at t = {t:.3f} s; return an array ({n}, 3) of forces [N]") from None
+    if force.shape != (n, 3):
+        raise FlightError(
+            f"{who} returned an array of shape {force.shape} at t = {t:.3f} s; return ({n}, 3), a row for"
+            " each agent [N]"
+        )
+    if not np.isfinite(force).all():
+        raise FlightError(f"{who} returned a force that is not finite at t = {t:.3f} s")
+    return np.ascontiguousarray(force)
+
+
+class _External:
+    """A user's force as a C function that the kernel can call.
+
+    An exception cannot pass through compiled code: it is kept, the force becomes NaN, the step is
+    rejected, and `check` raises it once the kernel has returned.
+    """
+
+    _SIGNATURE = ctypes.CFUNCTYPE(
+        None, ctypes.c_double, *(ctypes.POINTER(ctypes.c_double),) * 3, ctypes.c_ssize_t
+    )
+
+    def __init__(self, force: Force, n: int) -> None:
+        self.error: BaseException | None = None
+        self._keep: Any = force  # whatever owns the code must live as long as its address
+        if hasattr(force, "address"):  # a Numba cfunc
+            self.address = int(force.address)
+            return
+
+        def call(t: float, r: Any, v: Any, f: Any, count: int) -> None:
+            arrays = [np.ctypeslib.as_array(a, (count, 3)) for a in (r, v, f)]
+            try:
+                if self.error is None:
+                    arrays[2][:] = _checked(force(t, arrays[0].copy(), arrays[1].copy()), n, "the force", t)
+                    return
+            except BaseException as error:  # noqa: BLE001  (raised again by `check`)
+                self.error = error
+            arrays[2][:] = math.nan
+
+        self._keep = self._SIGNATURE(call)
+        self.address = int(ctypes.cast(self._keep, ctypes.c_void_p).value or 0)
+
+    def check(self) -> None:
+        """Raise what the user's function raised."""
+        if self.error is not None:
+            raise self.error
