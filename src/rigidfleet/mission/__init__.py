@@ -1,0 +1,55 @@
+"""Missions: what the user asked for, read from TOML and checked on entry. Data only.
+
+A mission is checked as a whole, and *all* its errors are raised at once in one `MissionError` whose
+findings name the file, the key, the value and the remedy. What a user sees counts from 1, as in the
+paper: agents, edges, phases, and so the places in a key such as `phases[3].until`. Arrays that
+`Mission` hands to code count agents from 0.
+"""
+
+from rigidfleet.mission.model import (
+    Mission,
+    json_schema,
+    load_mission,
+    mission_names,
+    mission_text,
+)
+from rigidfleet.mission.schema import (
+    Box,
+    Establish,
+    Fly,
+    Formation,
+    Geofence,
+    Ground,
+    Hold,
+    Limits,
+    Lqr,
+    Obstacle,
+    Phase,
+    Regulator,
+    Reshape,
+    Settle,
+    Turn,
+)
+
+__all__ = [
+    "Box",
+    "Establish",
+    "Fly",
+    "Formation",
+    "Geofence",
+    "Ground",
+    "Hold",
+    "Limits",
+    "Lqr",
+    "Mission",
+    "Obstacle",
+    "Phase",
+    "Regulator",
+    "Reshape",
+    "Settle",
+    "Turn",
+    "json_schema",
+    "load_mission",
+    "mission_names",
+    "mission_text",
+]

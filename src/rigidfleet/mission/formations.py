@@ -1,0 +1,133 @@
+"""Check the formations of a mission: shapes, edges and distances that exist."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import islice
+
+from rigidfleet import formation as shapes
+from rigidfleet.mission.notes import Keys, Notes, near
+from rigidfleet.mission.schema import Formation
+
+#: So many contradictions among distances are shown one by one.
+_SHOWN = 6
+
+
+def check(notes: Notes, n: int | None) -> dict[str, Formation]:
+    """The formations by name, `n` agents each; those with findings are among them."""
+    tables = notes.data.get("formations", {})
+    if not isinstance(tables, dict):
+        notes.add(("formations",), "must be a table", "write [formations.NAME] for each formation")
+        return {}
+    found = {}
+    for name, data in tables.items():
+        form = notes.validate(Formation, data, ("formations", name))
+        if form is not None:
+            found[name] = form
+            _formation(notes, form, n, ("formations", name))
+    return found
+
+
+def sound(notes: Notes, name: str) -> bool:
+    """Whether nothing has been found in a formation."""
+    return notes.right(("formations",), name)
+
+
+def coincident(points: Sequence[Sequence[float]]) -> Iterator[tuple[int, int]]:
+    """Pairs (first, later) of points within a nanometre of each other."""
+    seen: dict[tuple[float, ...], int] = {}
+    for j, point in enumerate(points):
+        i = seen.setdefault(tuple(round(x, 9) for x in point), j)
+        if i != j:
+            yield i, j
+
+
+def agents(indices: Iterable[int], between: str = ", ") -> str:
+    """Agents counted from 1."""
+    return between.join(str(int(i) + 1) for i in indices)
+
+
+def _formation(notes: Notes, form: Formation, n: int | None, path: Keys) -> None:
+    right = notes.right(path, "shape", "size", "slots", "distances")
+    if form.shape is not None and form.slots is not None:
+        notes.add((*path, "slots"), "a shape has its own slots", "keep shape and size, or slots")
+    if right and form.shape is None and form.size is not None:
+        notes.add((*path, "size"), "is the size of no shape", "give shape, or remove size")
+    if right and form.shape is form.slots is form.distances is None:
+        problem = "has neither a shape, nor slots, nor distances"
+        notes.add(path, problem, f"give shape and size; shapes: {', '.join(shapes.SHAPES)}", None)
+    if form.shape is not None:
+        _shape(notes, form, form.shape, n, path)
+    if n is None:
+        return
+    if form.slots is not None:
+        if len(form.slots) != n:
+            problem = f"has {len(form.slots)} slots for {n} agents"
+            notes.add((*path, "slots"), problem, f"give one for each agent, {n} in all", None)
+        for i, j in coincident(form.slots):
+            notes.add((*path, "slots", j), f"is slot {i + 1} again", "keep the slots apart")
+    if notes.right(path, "edges"):
+        _edges(notes, form, n, (*path, "edges"))
+    if form.distances is not None and notes.right(path, "edges", "distances"):
+        _distances(notes, form, form.distances, n, (*path, "distances"))
+
+
+def _shape(notes: Notes, form: Formation, shape: str, n: int | None, path: Keys) -> None:
+    if shape not in shapes.SHAPES:
+        remedy = near(shape, shapes.SHAPES) or f"known shapes: {', '.join(shapes.SHAPES)}"
+        notes.add((*path, "shape"), "unknown shape", remedy)
+    elif form.size is None:
+        if notes.right(path, "size"):
+            notes.add((*path, "size"), "is missing", "add size, the edge length [m]")
+    elif n is not None:
+        try:
+            shapes.slots(shape, form.size, n)
+        except ValueError as error:
+            remedy = "change the shape, its size, or the number of agents"
+            notes.add((*path, "shape"), str(error), remedy)
+
+
+def _edges(notes: Notes, form: Formation, n: int, path: Keys) -> None:
+    if form.edges == "complete":
+        return
+    seen: dict[tuple[int, ...], int] = {}
+    for k, edge in enumerate(form.edges):
+        first = seen.setdefault(tuple(sorted(edge)), k)
+        if not all(1 <= agent <= n for agent in edge):
+            notes.add((*path, k), f"there are agents 1 to {n}", "correct it; agents count from 1")
+        elif edge[0] == edge[1]:
+            notes.add((*path, k), "joins an agent to itself", "join two agents")
+        elif first != k:
+            notes.add((*path, k), f"is edge {first + 1} again", "remove it, and its distance")
+
+
+def _distances(notes: Notes, form: Formation, lengths: Sequence[float], n: int, path: Keys) -> None:
+    edges = form.edge_array(n)
+    if len(lengths) != len(edges):
+        problem = f"has {len(lengths)} entries for {len(edges)} edges"
+        order = "12, 13, ..., 23, ..." if form.edges == "complete" else "that of edges"
+        notes.add(path, problem, f"give one for each edge, in the order {order}", None)
+        return
+    found = shapes.unrealisable(edges, lengths)
+    names = [
+        f"d{agents(e, '' if n < 10 else '-')} = {d:g}" for e, d in zip(edges, lengths, strict=True)
+    ]
+    for v in islice(found, _SHOWN):
+        given = ", ".join(names[k] for k in v.edges)
+        if len(v.agents) == 3:
+            problem = f"agents {agents(v.agents)} make no triangle: {given} m"
+            remedy = f"shorten the longest by {v.excess:.4g} m or more, or lengthen the others"
+        else:
+            problem = (
+                f"agents {agents(v.agents)} make no tetrahedron (Cayley-Menger < 0): {given} m"
+            )
+            remedy = "change one of the six (flat shapes need 7 digits: 5.656854), or give a shape"
+        notes.add(path, problem, remedy, None)
+    if len(found) > _SHOWN:
+        problem = f"{len(found) - _SHOWN} more triangles or tetrahedra do not exist"
+        notes.add(path, problem, "correct those above first", None)
+    if not found:
+        try:
+            shapes.slots_from_distances(n, edges, lengths)
+        except ValueError as error:
+            notes.add(path, str(error), "change them, or give shape and size", None)

@@ -1,0 +1,192 @@
+"""Missions from TOML text, from plain data, from files, and those that ship with the package."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from functools import cached_property
+from importlib import resources
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from pydantic import PrivateAttr
+
+from rigidfleet.errors import Finding, MissionError
+from rigidfleet.formation import Floats, Ints
+from rigidfleet.mission.check import check
+from rigidfleet.mission.notes import near
+from rigidfleet.mission.schema import Contents
+from rigidfleet.mission.toml import to_toml
+
+_SHIPPED = resources.files("rigidfleet") / "missions"
+#: A device or a video given by mistake is noticed before memory is full.
+_LARGEST = 64 * 2**20
+
+
+class Mission(Contents):
+    """A checked mission: make one by `load_mission`, `Mission.from_toml` or `Mission.from_dict`."""
+
+    _text: str = PrivateAttr("")
+    _origin: str = PrivateAttr("")
+
+    @classmethod
+    def from_toml(cls, text: str, origin: str = "<text>") -> Self:
+        """Check a mission given as TOML; `origin` names it in messages.
+
+        Raises
+        ------
+        MissionError
+            With a finding for each error.
+        """
+        mission = cls(**check(_parse(text, origin), origin))
+        mission._text, mission._origin = text, origin
+        return mission
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any], origin: str = "<dict>") -> Self:
+        """Check a mission given as plain data with the keys of the TOML format, NumPy's arrays too.
+
+        Raises
+        ------
+        MissionError
+            With a finding for each error.
+        """
+        try:
+            text = to_toml(data)
+        except TypeError as error:
+            remedy = "use numbers, strings, lists and dicts"
+            raise MissionError([Finding(origin, "", None, str(error), remedy)]) from None
+        return cls.from_toml(text, origin)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data as it was written: change it, and check it again by `Mission.from_dict`."""
+        return tomllib.loads(self._text)
+
+    @property
+    def text(self) -> str:
+        """The mission's TOML."""
+        return self._text
+
+    @property
+    def origin(self) -> str:
+        """Where the mission was read."""
+        return self._origin
+
+    @property
+    def n_agents(self) -> int:
+        """Number of agents N."""
+        return len(self.agents.position)
+
+    @cached_property
+    def edges(self) -> Ints:
+        """Edges (m, 2) of all formations, counted from 0, i < j, in the order of first mention."""
+        pairs = (pair for name in self.formations for pair in self.formation_edges(name).tolist())
+        return np.array(list(dict.fromkeys(map(tuple, pairs))), dtype=np.int64).reshape(-1, 2)
+
+    def formation_edges(self, name: str) -> Ints:
+        """Edges (m, 2) of a formation, counted from 0, i < j."""
+        return self.formations[name].edge_array(self.n_agents)
+
+    def formation_slots(self, name: str) -> Floats | None:
+        """Slots (N, 3) [m] of a formation about their geometric centre.
+
+        Derived from a complete set of distances where no slots are given; None where that is
+        incomplete, too.
+        """
+        return self.formations[name].slot_array(self.n_agents)
+
+    def formation_distances(self, name: str) -> Floats:
+        """Length (m,) [m] of each edge of a formation."""
+        return self.formations[name].distance_array(self.n_agents)
+
+    @property
+    def latest_end(self) -> float:
+        """Mission time [s] by which the last phase has ended, if each settling times out."""
+        t = 0.0
+        for p in self.phases:
+            length = p.settle.timeout if p.settle is not None else p.duration or 0.0
+            t = p.until if p.until is not None else t + length
+        return t
+
+
+def mission_names() -> list[str]:
+    """Names of the missions that ship with the package, in alphabetical order."""
+    names = (entry.name for entry in _SHIPPED.iterdir())
+    return sorted(name.removesuffix(".toml") for name in names if name.endswith(".toml"))
+
+
+def mission_text(name: str) -> str:
+    """TOML of a shipped mission.
+
+    Raises
+    ------
+    MissionError
+        There is none of this name.
+    """
+    if name not in mission_names():
+        raise MissionError([_not_found(name)])
+    return (_SHIPPED / f"{name}.toml").read_text(encoding="utf-8")
+
+
+def load_mission(name_or_path: str | Path) -> Mission:
+    """Read and check a mission: a shipped one by its name, or a file.
+
+    A shipped name wins over a file of that name; write `./name` for the file.
+
+    Raises
+    ------
+    MissionError
+        There is no such mission, it cannot be read, or it has errors: all of them, in `findings`.
+    """
+    if isinstance(name_or_path, str) and name_or_path in mission_names():
+        return Mission.from_toml(mission_text(name_or_path), name_or_path)
+    return Mission.from_toml(_read(name_or_path), str(name_or_path))
+
+
+def json_schema() -> dict[str, Any]:
+    """JSON schema of the mission format, for editors: every key with its unit and meaning."""
+    draft = {"$schema": "https://json-schema.org/draft/2020-12/schema"}
+    return draft | Mission.model_json_schema()
+
+
+def _read(path: str | Path) -> str:
+    origin = str(path)
+    try:
+        with open(path, "rb") as file:
+            data = file.read(_LARGEST + 1)
+    except FileNotFoundError:
+        raise MissionError([_not_found(origin)]) from None
+    except IsADirectoryError:
+        raise _unread(origin, "is a directory", "name a mission file in it") from None
+    except PermissionError:
+        raise _unread(origin, "may not be read", "change its permissions") from None
+    except (OSError, ValueError) as error:
+        raise _unread(origin, f"cannot be read ({error})", "name a mission file") from None
+    if len(data) > _LARGEST:
+        raise _unread(origin, f"is larger than {_LARGEST >> 20} MiB", "name a mission file (TOML)")
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        remedy = "name a mission file (TOML)" if b"\0" in data else "save it as UTF-8"
+        raise _unread(origin, f"is not UTF-8 text (byte {error.start + 1})", remedy) from None
+
+
+def _unread(origin: str, problem: str, remedy: str) -> MissionError:
+    return MissionError([Finding(origin, "", None, problem, remedy)])
+
+
+def _not_found(name: str) -> Finding:
+    known = mission_names()
+    remedy = near(Path(name).stem, known) or f"shipped missions: {', '.join(known)}"
+    return Finding(name, "", None, "there is no such file, nor a shipped mission", remedy)
+
+
+def _parse(text: str, origin: str) -> dict[str, Any]:
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        problem, remedy = f"is not valid TOML: {error}", "correct the line; toml.io has the format"
+    except (ValueError, RecursionError) as error:  # thousands of digits, or of brackets
+        problem, remedy = f"cannot be read as TOML: {error}", "correct it; toml.io has the format"
+    raise _unread(origin, problem, remedy)

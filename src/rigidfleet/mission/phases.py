@@ -1,0 +1,281 @@
+"""Check the phases of a mission: in order, long enough, and each possible after the one before."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from rigidfleet import formation as shapes
+from rigidfleet.mission.formations import agents as agents_text
+from rigidfleet.mission.formations import sound
+from rigidfleet.mission.notes import Keys, Notes, near
+from rigidfleet.mission.schema import (
+    Agents,
+    AnyPhase,
+    Establish,
+    Fly,
+    Formation,
+    Hold,
+    Lqr,
+    Reshape,
+    Shaping,
+    Steering,
+    Turn,
+)
+from rigidfleet.mission.toml import toml_key
+
+_KINDS: dict[str, type[AnyPhase]] = {
+    "establish": Establish,
+    "fly": Fly,
+    "reshape": Reshape,
+    "turn": Turn,
+    "hold": Hold,
+}
+_ENDINGS = ("until", "duration", "settle")
+_MOST_SAMPLES = 1_000_000
+
+
+def check(notes: Notes, parts: Mapping[str, Any], n: int | None) -> tuple[AnyPhase, ...]:
+    """The phases; those with findings are among them."""
+    found = _phases(notes)
+    _names(notes, found)
+    end = _times(notes, found)
+    _samples(notes, parts.get("output_step"), end)
+    _controls(notes, found)
+    _formations(notes, found, parts, n)
+    _arrivals(notes, found, parts.get("lqr", Lqr()))
+    return tuple(p for p in found if p is not None)
+
+
+def tables(notes: Notes, key: str) -> Sequence[Any]:
+    """An array of tables of the mission."""
+    found = notes.data.get(key, [])
+    if isinstance(found, list):
+        return found
+    notes.add((key,), "must be an array of tables", f"write [[{key}]] above each")
+    return []
+
+
+def kind(notes: Notes, data: Any, path: Keys, kinds: Mapping[str, type[Any]]) -> Any:
+    """The model that a table's `kind` names, or None with a finding."""
+    choice = f"use one of {', '.join(kinds)}"
+    if not isinstance(data, dict):
+        notes.add(path, "must be a table", f"write [[{path[0]}]] above it")
+    elif "kind" not in data:
+        notes.add((*path, "kind"), "is missing", choice)
+    elif not isinstance(data["kind"], str) or data["kind"] not in kinds:
+        notes.add((*path, "kind"), "unknown kind", near(data["kind"], kinds) or choice)
+    else:
+        return kinds[data["kind"]]
+    return None
+
+
+def _phases(notes: Notes) -> list[AnyPhase | None]:
+    """Each phase with its name and control filled in, None where nothing can be made of it."""
+    body = notes.data.get("architecture") == "body"
+    found: list[AnyPhase | None] = []
+    for k, data in enumerate(tables(notes, "phases")):
+        model = kind(notes, data, ("phases", k), _KINDS)
+        if model is None:
+            found.append(None)
+            continue
+        control = "slots" if not body else "open" if model is Establish else "body"
+        given = {"name": f"{data['kind']} {k + 1}", "control": control} | data
+        found.append(notes.validate(model, given, ("phases", k)))
+    if not found and notes.right((), "phases"):
+        notes.add(("phases",), "there is none", "add [[phases]]: what to do, in order", None)
+    return found
+
+
+def _names(notes: Notes, found: Sequence[AnyPhase | None]) -> None:
+    seen: dict[str, int] = {}
+    for k, p in enumerate(found):
+        first = seen.setdefault(p.name, k) if p is not None else k
+        if p is not None and first != k:
+            problem = f"is the name of phase {first + 1}, too"
+            notes.add(("phases", k, "name"), problem, "give each phase its own", p.name)
+
+
+def _times(notes: Notes, found: Sequence[AnyPhase | None]) -> float | None:
+    """One ending each, in order of time. The latest end [s], None if it cannot be told."""
+    first: float | None = 0.0  # earliest and latest start of the phase; None where unknown
+    last: float | None = 0.0
+    for k, p in enumerate(found):
+        path = ("phases", k)
+        if p is None or not notes.right(path, *_ENDINGS):
+            first = last = None
+            continue
+        endings = [e for e in _ENDINGS if getattr(p, e) is not None]
+        if len(endings) != 1:
+            problem = f"ends by {' and '.join(endings)}" if endings else "has no ending"
+            notes.add(
+                path, problem, f"give one of {', '.join(_ENDINGS)} (until: mission time)", p.name
+            )
+            first = last = None
+            continue
+        longest = p.duration
+        if p.until is not None:
+            if first is not None and last is not None:
+                _in_order(notes, p.until, first, last, path)
+                longest = p.until - first
+            first = last = p.until
+        else:
+            if p.settle is not None:
+                longest = p.settle.timeout
+                if p.settle.timeout <= p.settle.dwell:
+                    problem = "times out before it can have stayed within tolerance"
+                    notes.add((*path, "settle"), problem, "give a timeout longer than dwell")
+            shortest = p.settle.dwell if p.settle is not None else p.duration
+            first = first + (shortest or 0.0) if first is not None else None
+            last = last + (longest or 0.0) if last is not None else None
+        if isinstance(p, Shaping):
+            _blend(notes, p, longest, path)
+    return last
+
+
+def _in_order(notes: Notes, until: float, first: float, last: float, path: Keys) -> None:
+    if until <= first:
+        problem = f"the phase begins at {first:g} s and would end before"
+        remedy = "until is mission time and grows from phase to phase; duration is a length"
+        notes.add((*path, "until"), problem, remedy)
+    elif until <= last:
+        problem = (
+            f"the phase may begin as late as {last:g} s, if the one before takes long to settle"
+        )
+        remedy = "end it by duration, or give the settling a shorter timeout"
+        notes.add((*path, "until"), problem, remedy)
+
+
+def _blend(notes: Notes, p: Shaping, longest: float | None, path: Keys) -> None:
+    if not notes.right(path, "reference", "blend", *_ENDINGS):
+        return
+    if p.reference == "step":
+        if "blend" in p.model_fields_set:
+            remedy = "remove it, or use reference = 'shape' or 'distances'"
+            notes.add((*path, "blend"), "a step has no blend", remedy)
+    elif longest is not None and p.blend > longest * (1 + 1e-9):
+        problem = f"the phase lasts {longest:g} s, less than its blend"
+        notes.add((*path, "blend"), problem, f"use blend <= {longest:g}, or end it later", p.blend)
+
+
+def _samples(notes: Notes, step: float | None, end: float | None) -> None:
+    if not step or not end or not notes.right((), "output_step"):
+        return
+    if step > end:
+        problem = f"the mission ends before the first step, at {end:g} s"
+        notes.add(("output_step",), problem, "make it shorter", step)
+    elif end / step > _MOST_SAMPLES:
+        problem = f"{end / step:.2g} samples would be stored, more than {_MOST_SAMPLES:,}"
+        notes.add(("output_step",), problem, f"use {end / _MOST_SAMPLES:.2g} s or more", step)
+
+
+def _controls(notes: Notes, found: Sequence[AnyPhase | None]) -> None:
+    local = notes.data.get("architecture", "local") == "local"
+    for k, p in enumerate(found):
+        path = ("phases", k)
+        if p is None or not notes.right(path, "control"):
+            continue
+        if p.control == "body" and local:
+            remedy = "use control = 'slots', or architecture = 'body' for the mission"
+            notes.add((*path, "control"), "the architecture is 'local'", remedy)
+        if p.control == "open" and isinstance(p, Steering):
+            problem = f"nothing would steer this {notes.data['phases'][k]['kind']} phase"
+            notes.add((*path, "control"), problem, "use control = 'slots' or 'body'")
+        if p.control != "open" and any(p.input_force):
+            problem = f"has no effect with control '{p.control}'"
+            notes.add((*path, "input_force"), problem, "remove it, or use control = 'open'")
+        angles = ("yaw_deg", "pitch_deg", "roll_deg")
+        if isinstance(p, Turn) and p.attitude_deg is None and notes.right(path, *angles):
+            notes.add(
+                path, "turns to no angle", f"give {', '.join(angles)} or some of them", p.name
+            )
+
+
+def _formations(
+    notes: Notes, found: Sequence[AnyPhase | None], parts: Mapping[str, Any], n: int | None
+) -> None:
+    """Formations exist, can be blended to, tracked and reached."""
+    forms: Mapping[str, Formation] = parts["formations"]
+    held: str | None = ""  # name of the formation held; "" the initial positions; None unknown
+    for k, p in enumerate(found):
+        path = ("phases", k)
+        if p is None or not notes.right(path, "formation", "reference"):
+            held = None if p is None or isinstance(p, Shaping) else held
+            continue
+        if isinstance(p, Shaping):
+            _exists(notes, p.formation, path)
+            form = forms.get(p.formation)
+            if isinstance(p, Reshape) and held == "":
+                problem = "there is no formation yet to change from"
+                notes.add((*path, "kind"), problem, "use kind = 'establish' for the first")
+            if n is not None and form is not None and sound(notes, p.formation):
+                _blendable(notes, p, form, n, path)
+                if held == "" and "agents" in parts:
+                    _reachable(notes, p, form, parts["agents"], path)
+            held = p.formation
+        form = forms.get(held) if held else None
+        tracked = p.control == "slots" and notes.right(path, "control")
+        if not tracked or n is None or form is None or not held or not sound(notes, held):
+            continue
+        if form.slot_array(n) is None:
+            problem = f"formation '{held}' has no slots to track"
+            remedy = f"give formations.{toml_key(held)} a shape or slots, or use another control"
+            notes.add((*path, "control"), problem, remedy, p.control)
+
+
+def _exists(notes: Notes, name: str, path: Keys) -> None:
+    known = notes.data.get("formations", {})
+    if isinstance(known, dict) and name not in known:
+        names = f"formations: {', '.join(known)}" if known else "add a table [formations.NAME]"
+        notes.add((*path, "formation"), "there is no such formation", near(name, known) or names)
+
+
+def _blendable(notes: Notes, p: Shaping, form: Formation, n: int, path: Keys) -> None:
+    """Blending slots needs them, and distances that are theirs."""
+    if p.reference != "shape":
+        return
+    slots = form.slot_array(n)
+    if slots is None:
+        problem = f"formation '{p.formation}' has no slots to blend"
+        remedy = "give it a shape or slots, or use reference = 'distances'"
+        notes.add((*path, "reference"), problem, remedy, p.reference)
+    elif form.distances is not None:
+        edges = form.edge_array(n)
+        between = shapes.distances(slots, edges)
+        for k in np.flatnonzero(np.abs(between - form.distances) > 1e-3 * between):
+            problem = f"the slots of agents {agents_text(edges[k])} are {between[k]:.7g} m apart"
+            remedy = f"correct it, or fly {p.name} by reference = 'distances'"
+            notes.add(("formations", p.formation, "distances", int(k)), problem, remedy)
+
+
+def _reachable(notes: Notes, p: Shaping, form: Formation, agents: Agents, path: Keys) -> None:
+    """Forces along the edges cannot leave the line or plane in which the agents start."""
+    if p.control != "open" or not notes.right(path, "control", "input_force"):
+        return
+    if any(p.input_force) and len(set(agents.mass)) > 1:
+        return  # the same force moves unequal masses apart
+    target = form.slot_array(len(agents.position))
+    motion = [shapes.centred(agents.position), shapes.centred(agents.velocity)]
+    start = shapes.dimension(np.vstack([*motion, *(-m for m in motion)]))
+    if target is not None and start < shapes.dimension(target):
+        where = ("point", "line", "plane")[start]
+        problem = f"the agents start on one {where}, which forces between them cannot leave"
+        remedy = f"move a start off the {where}, or use control = 'slots'"
+        notes.add((*path, "control"), problem, remedy, p.control)
+
+
+def _arrivals(notes: Notes, found: Sequence[AnyPhase | None], lqr: Lqr) -> None:
+    """A finite horizon ends at a time."""
+    for k, p in enumerate(found):
+        if not isinstance(p, Steering) or p.settle is None or not notes.right((), "lqr"):
+            continue
+        for key, weights, used in (
+            ("lqr", lqr, isinstance(p, Fly)),
+            ("lqr.attitude", lqr.attitude, p.attitude_deg is not None),
+        ):
+            if used and weights.horizon == "finite":
+                problem = f"the finite horizon of {key} needs a time of arrival"
+                remedy = f"end by until or duration, or use {key}.horizon = 'infinite'"
+                notes.add(("phases", k, "settle"), problem, remedy, None)

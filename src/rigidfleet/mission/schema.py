@@ -1,0 +1,423 @@
+"""What a mission holds: every table of the format, with the unit and meaning of each key.
+
+The descriptions are the documentation of the format: `rigidfleet missions --schema` exports them.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Discriminator,
+    Field,
+    Strict,
+    Tag,
+    WithJsonSchema,
+    model_validator,
+)
+
+from rigidfleet import formation as shapes
+from rigidfleet.formation import Floats, Ints
+
+#: No quantity in SI units is larger here, and the sixth power of a length is still a float.
+HUGE = 1e15
+
+Number = Annotated[float, Strict(), Field(ge=-HUGE, le=HUGE)]
+Positive = Annotated[float, Strict(), Field(gt=0, le=HUGE)]
+NonNegative = Annotated[float, Strict(), Field(ge=0, le=HUGE)]
+Limit = Annotated[float, Strict(), Field(gt=0, allow_inf_nan=True)]
+Whole = Annotated[int, Strict(), Field(ge=-(2**31), lt=2**31)]
+Flag = Annotated[bool, Strict()]
+Vector = Annotated[tuple[Number, ...], Field(min_length=3, max_length=3)]
+Weights = Annotated[tuple[NonNegative, ...], Field(min_length=2, max_length=2)]
+
+_Extent = Annotated[tuple[Positive, ...], Field(min_length=3, max_length=3)]
+_Pair = Annotated[tuple[Whole, ...], Field(min_length=2, max_length=2)]
+
+
+def _form(value: object) -> str:
+    return "list" if isinstance(value, list | tuple) else "one"
+
+
+Size = Annotated[
+    Annotated[Positive, Tag("one")] | Annotated[_Extent, Tag("list")], Discriminator(_form)
+]
+Edges = Annotated[
+    Annotated[Literal["complete"], Tag("one")] | Annotated[tuple[_Pair, ...], Tag("list")],
+    Discriminator(_form),
+]
+
+
+def _number_or_list(lowest: str) -> WithJsonSchema:
+    number = {"type": "number", lowest: 0}
+    return WithJsonSchema({"anyOf": [number, {"type": "array", "items": number}]})
+
+
+class Part(BaseModel):
+    """A table of a mission file: frozen, without unknown keys, with finite numbers."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Agents(Part):
+    """The vehicles, as point masses. Once checked, each field has one entry for each agent."""
+
+    mass: Annotated[tuple[Positive, ...], _number_or_list("exclusiveMinimum")] = Field(
+        description="mass [kg], > 0: a number for all agents, or a list with one for each"
+    )
+    position: Annotated[tuple[Vector, ...], Field(min_length=1)] = Field(
+        description="initial position [x, y, z] of each agent [m], world frame ENU (z up)"
+    )
+    velocity: tuple[Vector, ...] = Field(
+        (), description="initial velocity of each agent [m/s]; at rest when absent"
+    )
+    radius: Annotated[tuple[NonNegative, ...], _number_or_list("minimum")] = Field(
+        (0.25,), description="radius of the sphere that must touch nothing [m]: a number or a list"
+    )
+    thrust_limit: Annotated[tuple[Limit, ...], _number_or_list("exclusiveMinimum")] = Field(
+        (math.inf,),
+        description="greatest thrust |f_u + f_C| [N]: a number or a list; unlimited when absent",
+    )
+    saturate: Flag = Field(
+        False, description="true: thrust is cut off at thrust_limit; false: only judged against it"
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _spread(cls, data: Any) -> Any:
+        """One number stands for all agents; agents without velocities start at rest."""
+        if not (isinstance(data, dict) and isinstance(data.get("position"), list | tuple)):
+            return data
+        n = len(data["position"])
+        full = {"velocity": [(0.0, 0.0, 0.0)] * n, "radius": 0.25, "thrust_limit": math.inf} | data
+        for key in full.keys() & {"mass", "radius", "thrust_limit"}:
+            if not isinstance(full[key], list | tuple):
+                full[key] = [full[key]] * n
+        return full
+
+
+class Constraint(Part):
+    """The constraint force: feedback of the error c = L - d, and the solve for the multipliers."""
+
+    alpha: Number = Field(3.0, description="feedback 2 alpha of dc/dt [1/s], > 0")
+    beta: Number = Field(math.sqrt(12), description="feedback beta^2 of c; beta [1/s], > 0")
+    gamma: Number = Field(
+        8.0, description="feedback of the integral of c [1/s^3], >= 0, below 2 alpha beta^2"
+    )
+    stabilisation: Literal["pid", "none"] = Field(
+        "pid", description="'none': no feedback at all, the law whose drift the paper discusses"
+    )
+    solver: Literal["iterated", "spectral", "exact", "pinv"] = Field(
+        "iterated",
+        description="iterated Tikhonov; spectral damping (gentler under steps); exact, the paper's "
+        "inverse; pinv, the pseudo-inverse",
+    )
+    damping: Positive = Field(0.03, description="mu of the iterated solver [-], > 0")
+    iterations: Annotated[int, Strict(), Field(ge=1, le=100)] = Field(
+        3, description="number k of iterations of the iterated solver, 1 to 100"
+    )
+    threshold: Positive = Field(0.1, description="s0 of the spectral solver [-], > 0")
+    cutoff: Annotated[float, Strict(), Field(ge=0, lt=1)] = Field(
+        1e-12, description="relative cut-off of the pinv solver [-], in [0, 1)"
+    )
+    deformation_damping: NonNegative = Field(
+        1.0, description="damping of deformation while no slots are tracked [1/s], >= 0"
+    )
+
+
+class Regulator(Part):
+    """Weights of a linear quadratic regulator for a double integrator, the same on each axis."""
+
+    horizon: Literal["finite", "infinite"] = Field(
+        "finite", description="finite: S weighs the arrival; infinite: Q and R alone"
+    )
+    Q: Weights = Field((0.0, 0.0), description="weights [error, rate error], >= 0")
+    R: Positive = Field(1.0, description="weight of the acceleration, > 0")
+    S: Weights = Field((1e3, 1e2), description="weights on arrival [error, rate error], >= 0")
+
+
+class Lqr(Regulator):
+    """Regulator of the virtual body: of its centre of mass, and in `lqr.attitude` of its attitude."""
+
+    attitude: Regulator = Field(
+        default_factory=Regulator,
+        description="regulator of the attitude; its keys default to those of lqr",
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _inherit(cls, data: Any) -> Any:
+        if not (isinstance(data, dict) and isinstance(data.get("attitude", {}), dict)):
+            return data
+        own = {key: value for key, value in data.items() if key in Regulator.model_fields}
+        return data | {"attitude": own | data.get("attitude", {})}
+
+
+class Tracking(Part):
+    """Infinite-horizon regulator with which each agent tracks its slot."""
+
+    Q: Weights = Field(
+        (4.0, 4.0), description="weights [position error, velocity error], the first > 0"
+    )
+    R: Positive = Field(1.0, description="weight of the acceleration, > 0")
+
+
+class Allocation(Part):
+    """How the wrench on the virtual body is shared among the agents (control 'body')."""
+
+    method: Literal["rigid", "pinv"] = Field(
+        "rigid", description="rigid: what a rigid body's points need; pinv: the paper's H"
+    )
+    torque_split: Literal["equal", "inertia", "inertia+force"] = Field(
+        "equal", description="method 'pinv' only: how the torque is split over the agents"
+    )
+
+
+class Integrator(Part):
+    """Tolerances of the adaptive integrator."""
+
+    rtol: Annotated[float, Strict(), Field(gt=0, le=0.1)] = Field(
+        1e-8, description="relative tolerance [-]"
+    )
+    atol: Positive = Field(1e-10, description="absolute tolerance [m, m/s]")
+
+
+class BodyFrame(Part):
+    """Attach the body frame at t = 0 with this attitude, not when a formation is established."""
+
+    roll_deg: Number = Field(0.0, description="roll [deg], 3-2-1 Euler angles")
+    pitch_deg: Number = Field(0.0, description="pitch [deg]")
+    yaw_deg: Number = Field(0.0, description="yaw [deg]")
+
+
+class Formation(Part):
+    """A shape (named, or slots), the edges that hold it, and their lengths.
+
+    The arrays below are about a checked formation of `n` agents.
+    """
+
+    shape: str | None = Field(
+        None,
+        description=f"named shape: {', '.join(shapes.SHAPES)}",
+        json_schema_extra={"enum": [*shapes.SHAPES]},
+    )
+    size: Size | None = Field(
+        None, description="edge length of the shape [m]; a cuboid's [x, y, z]"
+    )
+    slots: tuple[Vector, ...] | None = Field(
+        None, description="instead of a shape: place of each agent in the body frame [m]"
+    )
+    edges: Edges = Field(
+        "complete", description="pairs of agents, counted from 1; 'complete': every pair"
+    )
+    distances: tuple[Positive, ...] | None = Field(
+        None, description="length of each edge [m]; when absent, those of the slots"
+    )
+
+    def edge_array(self, n: int) -> Ints:
+        """Edges (m, 2), counted from 0, i < j."""
+        if self.edges == "complete":
+            return shapes.complete_graph(n)
+        return np.sort(np.array(self.edges, dtype=np.int64).reshape(-1, 2) - 1, axis=1)
+
+    def slot_array(self, n: int) -> Floats | None:
+        """Slots (n, 3) [m] about their geometric centre; None where distances do not give them."""
+        if self.shape is not None and self.size is not None:
+            return shapes.slots(self.shape, self.size, n)
+        if self.slots is not None:
+            return shapes.centred(self.slots)
+        return shapes.slots_from_distances(n, self.edge_array(n), self.distances or ())
+
+    def distance_array(self, n: int) -> Floats:
+        """Length (m,) [m] of each edge."""
+        if self.distances is not None:
+            return np.array(self.distances, dtype=np.float64)
+        slots = self.slot_array(n)
+        assert slots is not None  # checked: without distances there are a shape or slots
+        return shapes.distances(slots, self.edge_array(n))
+
+
+class Box(Part):
+    """A box along the world's axes."""
+
+    kind: Literal["box"]
+    name: str = Field("", description="what to call it; 'box' and its number when absent")
+    min: Vector = Field(description="lowest corner [x, y, z] [m]")
+    max: Vector = Field(description="highest corner [x, y, z] [m]")
+
+
+class Ground(Part):
+    """Everything below a height."""
+
+    kind: Literal["ground"]
+    name: str = Field("", description="what to call it; 'ground' when absent")
+    height: Number = Field(0.0, description="height of the ground [m]")
+
+
+class Geofence(Part):
+    """The box that no agent may leave."""
+
+    min: Vector = Field(description="lowest corner [x, y, z] [m]")
+    max: Vector = Field(description="highest corner [x, y, z] [m]")
+
+
+class Limits(Part):
+    """What the verdict holds each agent to."""
+
+    speed: Positive | None = Field(None, description="greatest speed [m/s]")
+    acceleration: Positive | None = Field(None, description="greatest acceleration [m/s^2]")
+    separation: NonNegative | None = Field(
+        None, description="least room between agents [m]: centre distance minus radii"
+    )
+    separation_below: NonNegative | None = Field(
+        None, description="least height [m] between an agent and one that flies in its downwash"
+    )
+    geofence: Geofence | None = Field(None, description="box that no agent may leave")
+
+
+class Settle(Part):
+    """A phase ends once its error has stayed within a tolerance."""
+
+    tolerance: Positive = Field(1e-3, description="greatest error [m]")
+    dwell: NonNegative = Field(1.0, description="how long the error must stay within it [s]")
+    timeout: Positive = Field(60.0, description="after this long the mission fails [s]")
+
+
+class AnyPhase(Part):
+    """What every phase has. It ends by exactly one of until, duration and settle."""
+
+    name: str = Field("", description="what to call it, unique; its kind and number when absent")
+    until: Positive | None = Field(None, description="ending: at this mission time [s]")
+    duration: Positive | None = Field(None, description="ending: after this long [s]")
+    settle: Settle | None = Field(None, description="ending: when settled")
+    control: Literal["open", "slots", "body"] = Field(
+        "slots",
+        description="open: weight balance and input_force; slots: each agent tracks its slot; body: "
+        "wrench on the virtual body. Default slots; in architecture 'body', open to establish and "
+        "body otherwise",
+    )
+    input_force: Vector = Field(
+        (0.0, 0.0, 0.0),
+        description="force on each agent besides the weight balance [N], control 'open' only",
+    )
+
+
+class Shaping(AnyPhase):
+    """A phase that changes the formation."""
+
+    formation: str = Field(description="name of the formation to take")
+    reference: Literal["shape", "distances", "step"] = Field(
+        "shape",
+        description="how the distances get there: with slots that blend, with squares that blend, or "
+        "at once as in the paper",
+    )
+    blend: Positive = Field(4.0, description="length of the blend [s], from the phase's start")
+
+
+class Establish(Shaping):
+    """Take a formation from wherever the agents are, and attach the body frame to it."""
+
+    kind: Literal["establish"]
+
+
+class Reshape(Shaping):
+    """Change from one formation to another."""
+
+    kind: Literal["reshape"]
+
+
+class Steering(AnyPhase):
+    """A phase that may change the attitude."""
+
+    roll_deg: Number | None = Field(None, description="roll at the end [deg], 3-2-1 Euler angles")
+    pitch_deg: Number | None = Field(None, description="pitch at the end [deg]")
+    yaw_deg: Number | None = Field(
+        None, description="yaw at the end [deg]; when one angle is given, the others are 0"
+    )
+    rates_deg_s: Vector = Field(
+        (0.0, 0.0, 0.0), description="body rates [p, q, r] at the end [deg/s]"
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _complete(cls, data: Any) -> Any:
+        angles = ("roll_deg", "pitch_deg", "yaw_deg")
+        if isinstance(data, dict) and any(angle in data for angle in angles):
+            return dict.fromkeys(angles, 0.0) | data
+        return data
+
+    @property
+    def attitude_deg(self) -> tuple[float, float, float] | None:
+        """Commanded (roll, pitch, yaw) [deg]; None to keep the attitude commanded before."""
+        if self.roll_deg is None or self.pitch_deg is None or self.yaw_deg is None:
+            return None
+        return self.roll_deg, self.pitch_deg, self.yaw_deg
+
+
+class Fly(Steering):
+    """Fly the centre of mass to a waypoint, to arrive at the phase's end."""
+
+    kind: Literal["fly"]
+    position: Vector = Field(description="centre of mass at the end [x, y, z] [m]")
+    velocity: Vector = Field((0.0, 0.0, 0.0), description="its velocity at the end [m/s]")
+
+
+class Turn(Steering):
+    """Turn on the spot to an attitude: at least one angle is given."""
+
+    kind: Literal["turn"]
+
+
+class Hold(AnyPhase):
+    """Stay."""
+
+    kind: Literal["hold"]
+
+
+Phase = Annotated[Establish | Fly | Reshape | Turn | Hold, Field(discriminator="kind")]
+Obstacle = Annotated[Box | Ground, Field(discriminator="kind")]
+
+
+class Header(Part):
+    """Keys at the top of a mission file."""
+
+    schema_version: Literal[1] = Field(description="version of this format: 1")
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")] = Field(
+        description="short name, which results are filed under: letters, digits, '.', '_', '-'"
+    )
+    title: Annotated[str, Field(pattern=r"^[^\r\n]*$")] = Field(
+        "", description="what it shows, in one line"
+    )
+    source: str = Field("", description="table or figure of the paper that it reproduces")
+    architecture: Literal["local", "body"] = Field(
+        "local", description="local: each agent tracks its slot; body: a wrench on the virtual body"
+    )
+    formulation: Literal["inertial", "body"] = Field(
+        "inertial", description="equations integrated: Newton's, or the paper's in the body frame"
+    )
+    gravity: NonNegative = Field(9.81, description="gravity [m/s^2], >= 0")
+    output_step: Positive = Field(0.05, description="time between samples of the result [s]")
+
+
+class Contents(Header):
+    """A whole mission file."""
+
+    agents: Agents
+    constraint: Constraint = Field(default_factory=Constraint)
+    lqr: Lqr = Field(default_factory=Lqr)
+    tracking: Tracking = Field(default_factory=Tracking)
+    allocation: Allocation = Field(default_factory=Allocation)
+    integrator: Integrator = Field(default_factory=Integrator)
+    body_frame: BodyFrame | None = None
+    formations: dict[str, Formation] = Field(
+        default_factory=dict, description="formations by name: [formations.NAME]"
+    )
+    obstacles: tuple[Obstacle, ...] = Field((), description="what not to touch: [[obstacles]]")
+    limits: Limits = Field(default_factory=Limits)
+    phases: Annotated[tuple[Phase, ...], Field(min_length=1)] = Field(
+        description="what to do, in order: [[phases]]"
+    )
