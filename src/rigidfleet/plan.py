@@ -100,13 +100,16 @@ def plan_phase(mission: Mission, phase: Phase, now: Situation, t_end: float) -> 
         kind = {"shape": k.SLOTS, "distances": k.SQUARED, "step": k.CONSTANT}[phase.reference]
     elif phase.control == "slots" and np.allclose(d1, shapes.distances(before, edges), rtol=1e-12):
         kind = k.SLOTS
-    dp, turn = _align(before, after, masses) if shaping else (np.zeros_like(before), np.zeros(3))
+    dp, turn = (
+        align_slots(before, after, masses) if shaping else (np.zeros_like(before), np.zeros(3))
+    )
     reference = k.Reference(kind, now.t, T_b, d0, d1, before, dp, turn)
 
     goal, arrival = _goal(phase, now, t_end)
     motion, feedback = _REST, _NO_FEEDBACK
     if phase.control == "slots":
-        assert now.pose is not None and goal is not None  # attached above
+        assert now.pose is not None  # attached above
+        assert goal is not None
         motion = _motion(mission, now.pose, goal, now.t, arrival)
     elif phase.control == "body":
         assert goal is not None
@@ -127,7 +130,9 @@ def plan_phase(mission: Mission, phase: Phase, now: Situation, t_end: float) -> 
         control=_control(mission, phase, masses),
         external=0,
     )  # fmt: skip
-    slots = after if phase.control != "open" or kind == k.SLOTS else target if shaping else now.slots
+    slots = (
+        after if phase.control != "open" or kind == k.SLOTS else target if shaping else now.slots
+    )
     return PhasePlan(program, edges, slots, name, d1, goal, arrival, frame)
 
 
@@ -174,7 +179,7 @@ def _attach(
     return frame, replace(now, pose=pose, slots=slots, goal=goal)
 
 
-def _align(before: Array, after: Array, masses: Array) -> tuple[Array, Array]:
+def align_slots(before: Array, after: Array, masses: Array) -> tuple[Array, Array]:
     """What a blend adds to the slots, and by which rotation vector it turns them meanwhile.
 
     The new slots are turned onto the old ones first (Kabsch, weighted by mass): the straight

@@ -13,6 +13,7 @@ from rigidfleet import geometry
 from rigidfleet.result import PhaseRecord, Result
 
 if TYPE_CHECKING:
+    from rigidfleet.geometry import Ints
     from rigidfleet.kernel.flight import Record
     from rigidfleet.kernel.program import Array
     from rigidfleet.mission import Mission
@@ -27,7 +28,7 @@ class Piece:
     record: Record
     integral: Array  # (K, m) [m s]
     frame: Array  # (K, 4)
-    edges: Array  # (m, 2) of this phase
+    edges: Ints  # (m, 2) of this phase
     slots: Array | None  # (N, 3) to fit where the kernel blends none; None: no frame attached yet
 
 
@@ -51,7 +52,7 @@ def assemble(
     f_u, f_C = joined("f_u"), joined("f_C")
     cm, cm_velocity = np.einsum("i,kia->ka", masses, r) / M, np.einsum("i,kia->ka", masses, v) / M
     x, y = r - cm[:, None], v - cm_velocity[:, None]
-    attitude = _attitudes(pieces, x, masses)
+    attitude = _attitudes(pieces, x, masses, framed=mission.body_frame is not None)
     T = np.full((len(r), 3, 3), np.nan)
     attached = np.isfinite(attitude[:, 0])
     T[attached] = att.dcm_from_quaternion(attitude[attached])
@@ -109,8 +110,11 @@ def assemble(
     )
 
 
-def _attitudes(pieces: Sequence[Piece], x: Array, masses: Array) -> Array:
-    """Attitude quaternions (K, 4) of the formation's slots; of the integrated frame without slots."""
+def _attitudes(pieces: Sequence[Piece], x: Array, masses: Array, *, framed: bool) -> Array:
+    """Attitude quaternions (K, 4) of the formation's slots.
+
+    Without slots, that of the integrated frame, if the mission attaches one (``framed``).
+    """
     quaternions = np.full((len(x), 4), np.nan)
     last = np.eye(3)
     start = 0
@@ -118,7 +122,7 @@ def _attitudes(pieces: Sequence[Piece], x: Array, masses: Array) -> Array:
         rows = slice(start, start + len(piece.time))
         start = rows.stop
         if piece.slots is None:
-            if np.isfinite(piece.frame).all():
+            if framed:
                 quaternions[rows] = piece.frame
             continue
         p = piece.record.p
@@ -133,7 +137,7 @@ def _attitudes(pieces: Sequence[Piece], x: Array, masses: Array) -> Array:
     return att.unwrap_quaternion(quaternions)
 
 
-def _by_edge(pieces: Sequence[Piece], name: str, edges: Array) -> Array:
+def _by_edge(pieces: Sequence[Piece], name: str, edges: Ints) -> Array:
     """A quantity of the edges (K, m), NaN while an edge is not active."""
     column = {(i, j): k for k, (i, j) in enumerate(edges.tolist())}
     rows = []
@@ -146,6 +150,4 @@ def _by_edge(pieces: Sequence[Piece], name: str, edges: Array) -> Array:
 
 
 def _singular_values(pieces: Sequence[Piece]) -> Array:
-    return np.concatenate(
-        [geometry.smallest_singular_value(p.record.r, p.edges) for p in pieces]
-    )
+    return np.concatenate([geometry.smallest_singular_value(p.record.r, p.edges) for p in pieces])

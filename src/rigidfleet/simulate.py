@@ -16,7 +16,7 @@ from rigidfleet import attitude as att
 from rigidfleet.errors import FlightError
 from rigidfleet.kernel import flight
 from rigidfleet.kernel import program as k
-from rigidfleet.mission import Establish, Fly, Mission, Phase, Reshape, Turn
+from rigidfleet.mission import Establish, Fly, Mission, Phase, Reshape, Settle, Turn
 from rigidfleet.plan import PhasePlan, Pose, Situation, about_cm, plan_phase
 from rigidfleet.record import Piece, assemble
 from rigidfleet.result import PhaseRecord, Result
@@ -115,7 +115,7 @@ def simulate(
     return run.result()
 
 
-class _Stopped(Exception):
+class _StoppedError(Exception):
     """The flight cannot go on; the message is the diagnosis."""
 
 
@@ -155,7 +155,7 @@ class _Flight:
         try:
             for index, phase in enumerate(self.mission.phases):
                 self._phase(index, phase)
-        except _Stopped as stop:
+        except _StoppedError as stop:
             self.ending = str(stop)
 
     # -- one phase --------------------------------------------------------------------------------
@@ -177,13 +177,16 @@ class _Flight:
         )
         y = self._pack(plan)
         state = flight.integrator(
-            y, start, rtol=self.mission.integrator.rtol, atol=np.full(len(y), self.mission.integrator.atol)
+            y,
+            start,
+            rtol=self.mission.integrator.rtol,
+            atol=np.full(len(y), self.mission.integrator.atol),
         )
         try:
             if phase.settle is not None:
                 self._settle(index, phase, plan, workspace, state, record)
             elif self.controller is not None and phase.control == "slots":
-                self._controlled(index, plan, workspace, state, t_end)
+                self._controlled(index, self.controller, plan, workspace, state, t_end)
             else:
                 self._integrate(index, plan, plan.program, workspace, state, t_end)
         finally:
@@ -191,14 +194,27 @@ class _Flight:
             self._arrive(plan, state, workspace)
             record.t_end = self.now.t
         if record.settled is False:
-            raise _Stopped(
-                f"phase '{phase.name}' did not settle within {phase.settle.timeout:g} s: at t ="
-                f" {self.now.t:.2f} s its error was above {phase.settle.tolerance:g} m. Give it a"
+            settle = phase.settle or Settle()
+            raise _StoppedError(
+                f"phase '{phase.name}' did not settle within {settle.timeout:g} s: at t ="
+                f" {self.now.t:.2f} s its error was above {settle.tolerance:g} m. Give it a"
                 " longer timeout or a larger tolerance, or see the constraint error to learn why"
             )
 
-    def _integrate(self, index, plan, program, workspace, state, t_end, observe=None) -> Array:
-        """Integrate to ``t_end`` and record the samples on the way; return their times."""
+    def _integrate(
+        self,
+        index: int,
+        plan: PhasePlan,
+        program: k.Program,
+        workspace: k.Workspace,
+        state: flight.Integrator,
+        t_end: float,
+        observe: k.Program | None = None,
+    ) -> None:
+        """Integrate to ``t_end`` [s] and record the samples on the way.
+
+        ``observe`` names the program whose references count, where another one flies.
+        """
         t0 = float(state.clock[0])
         fresh = state.count[0] == 0 or program is not plan.program
         times = self._samples(t0, t_end, first=state.count[0] == 0, index=index)
@@ -218,8 +234,7 @@ class _Flight:
             done = int(state.count[3])
             self._record(index, plan, program, workspace, times[:done], samples[:done], observe)
         if status == flight.COLLAPSED:
-            raise _Stopped(self._diagnose(plan, state))
-        return times
+            raise _StoppedError(self._diagnose(plan, state))
 
     def _samples(self, t0: float, t_end: float, *, first: bool, index: int) -> Array:
         """Times to record in (t0, t_end], and at a phase's start just after the switch."""
@@ -232,9 +247,17 @@ class _Flight:
         start = [t0 if index == 0 else np.nextafter(t0, math.inf)] if first else []
         return np.concatenate([start, grid, [t_end]])
 
-    def _settle(self, index, phase, plan, workspace, state, record) -> None:
+    def _settle(
+        self,
+        index: int,
+        phase: Phase,
+        plan: PhasePlan,
+        workspace: k.Workspace,
+        state: flight.Integrator,
+        record: PhaseRecord,
+    ) -> None:
         """Integrate in short stretches until the phase has settled, or its time is over."""
-        settle, start = phase.settle, self.now.t
+        settle, start = phase.settle or Settle(), self.now.t
         least = start + (phase.blend if isinstance(phase, Establish | Reshape) else 0.0)
         since = math.inf
         n = 1
@@ -262,7 +285,15 @@ class _Flight:
             errors.append(np.linalg.norm(self.masses @ w.r / self.masses.sum() - plan.goal.r))
         return float(max(errors))
 
-    def _controlled(self, index, plan, workspace, state, t_end) -> None:
+    def _controlled(
+        self,
+        index: int,
+        controller: Controller,
+        plan: PhasePlan,
+        workspace: k.Workspace,
+        state: flight.Integrator,
+        t_end: float,
+    ) -> None:
         """Integrate under the user's controller, its force held over each control step."""
         start, step = self.now.t, 0
         dy = np.empty_like(state.y)
@@ -274,13 +305,19 @@ class _Flight:
                 workspace.r_ref.copy(), workspace.v_ref.copy(), workspace.a_ref.copy(),
                 self.masses.copy(), self.mission.gravity,
             )  # fmt: skip
-            f = _checked(self.controller(seen), self.mission.n_agents, "the controller", t)
+            f = _checked(controller(seen), self.mission.n_agents, "the controller", t)
             held = plan.program._replace(
                 control=plan.program.control._replace(kind=k.OPEN, force=f)
             )
             step += 1
             self._integrate(
-                index, plan, held, workspace, state, min(start + step / self.rate, t_end), plan.program
+                index,
+                plan,
+                held,
+                workspace,
+                state,
+                min(start + step / self.rate, t_end),
+                plan.program,
             )
 
     # -- states -----------------------------------------------------------------------------------
@@ -316,7 +353,8 @@ class _Flight:
             t=t,
             r=w.r.copy(),
             v=w.v.copy(),
-            integral=self.now.integral | dict(zip(keys, state.y[6 * n : 6 * n + m].tolist(), strict=True)),
+            integral=self.now.integral
+            | dict(zip(keys, state.y[6 * n : 6 * n + m].tolist(), strict=True)),
             reference=self.now.reference | dict(zip(keys, plan.distances.tolist(), strict=True)),
             frame=frame,
             formation=plan.formation,
@@ -335,7 +373,7 @@ class _Flight:
             att.quaternion_from_dcm(self.now.frame), att.quaternion_from_dcm(plan.frame)
         )
         if angle > _FLIPPED:
-            raise _Stopped(
+            raise _StoppedError(
                 f"the formation '{self.now.formation}' has flipped at t = {self.now.t:.2f} s: its slots lie"
                 f" {math.degrees(angle):.0f} deg from the body frame that was integrated. Out of a line,"
                 " distances alone do not say to which side a shape unfolds. Track slots through that"
@@ -368,15 +406,28 @@ class _Flight:
 
     def _report(self, index: int, t: float) -> None:
         wall = clock.perf_counter()
-        if self.progress is not None and (wall - self.reported > 0.1 or self.reported == self.started):
+        if self.progress is not None and (
+            wall - self.reported > 0.1 or self.reported == self.started
+        ):
             self.reported = wall
             self.progress(
-                Progress(t, self.mission.latest_end, self.mission.phases[index].name, wall - self.started)
+                Progress(
+                    t, self.mission.latest_end, self.mission.phases[index].name, wall - self.started
+                )
             )
 
     # -- the record -------------------------------------------------------------------------------
 
-    def _record(self, index, plan, program, w, times, samples, observe) -> None:
+    def _record(
+        self,
+        index: int,
+        plan: PhasePlan,
+        program: k.Program,
+        w: k.Workspace,
+        times: Array,
+        samples: Array,
+        observe: k.Program | None,
+    ) -> None:
         """Evaluate forces and references at the samples and keep them."""
         n, m = len(self.masses), len(plan.edges)
         out = flight.recorder(len(times), n, m)
@@ -385,7 +436,11 @@ class _Flight:
             asked = flight.recorder(len(times), n, m)
             flight.record(times, samples, observe, w, asked)
             out = out._replace(
-                r_ref=asked.r_ref, p=asked.p, motion=asked.motion, rates=asked.rates, T_ref=asked.T_ref
+                r_ref=asked.r_ref,
+                p=asked.p,
+                motion=asked.motion,
+                rates=asked.rates,
+                T_ref=asked.T_ref,
             )
         frame = np.full((len(times), 4), np.nan)
         if plan.frame is not None:
@@ -407,19 +462,21 @@ class _Flight:
             "wall_s": wall, "simulated_s": self.now.t,
             "rtol": self.mission.integrator.rtol, "atol": self.mission.integrator.atol,
         }  # fmt: skip
-        return assemble(self.mission, self.phases, self.pieces, ending=self.ending, statistics=statistics)
+        return assemble(
+            self.mission, self.phases, self.pieces, ending=self.ending, statistics=statistics
+        )
 
 
 def _end(phase: Phase, start: float) -> float:
     """Time [s] at which a phase ends, at the latest."""
     if phase.until is not None:
         if phase.until <= start:
-            raise _Stopped(
+            raise _StoppedError(
                 f"phase '{phase.name}' is to end at {phase.until:g} s, but the phases before it took until"
                 f" {start:.2f} s. Give it a duration in place of until"
             )
         return phase.until
-    return start + (phase.duration if phase.duration is not None else phase.settle.timeout)
+    return start + (phase.duration or (phase.settle or Settle()).timeout)
 
 
 def _target(phase: Phase, plan: PhasePlan) -> dict[str, Any] | None:
@@ -441,7 +498,9 @@ def _checked(f: ArrayLike, n: int, who: str, t: float) -> Array:
     try:
         force = np.array(f, dtype=np.float64)
     except (TypeError, ValueError):
-        raise FlightError(f"{who} returned {f!r} at t = {t:.3f} s; return an array ({n}, 3) of forces [N]") from None
+        raise FlightError(
+            f"{who} returned {f!r} at t = {t:.3f} s; return an array ({n}, 3) of forces [N]"
+        ) from None
     if force.shape != (n, 3):
         raise FlightError(
             f"{who} returned an array of shape {force.shape} at t = {t:.3f} s; return ({n}, 3), a row for"
@@ -466,17 +525,20 @@ class _External:
     def __init__(self, force: Force, n: int) -> None:
         self.error: BaseException | None = None
         self._keep: Any = force  # whatever owns the code must live as long as its address
-        if hasattr(force, "address"):  # a Numba cfunc
-            self.address = int(force.address)
+        address = getattr(force, "address", None)
+        if address is not None:  # a Numba cfunc
+            self.address = int(address)
             return
 
         def call(t: float, r: Any, v: Any, f: Any, count: int) -> None:
             arrays = [np.ctypeslib.as_array(a, (count, 3)) for a in (r, v, f)]
             try:
                 if self.error is None:
-                    arrays[2][:] = _checked(force(t, arrays[0].copy(), arrays[1].copy()), n, "the force", t)
+                    arrays[2][:] = _checked(
+                        force(t, arrays[0].copy(), arrays[1].copy()), n, "the force", t
+                    )
                     return
-            except BaseException as error:  # noqa: BLE001  (raised again by `check`)
+            except BaseException as error:
                 self.error = error
             arrays[2][:] = math.nan
 

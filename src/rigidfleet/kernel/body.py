@@ -19,7 +19,7 @@ def centre_of_mass(r, m, M, out):
 
 
 @compiled
-def inertia(r, m, cm, I):  # noqa: E741
+def inertia(r, m, cm, I):
     """Inertia I (3, 3) [kg m^2] of points r (N, 3) about cm: sum m (|x|^2 1 - x x^T)."""
     for q in range(3):
         I[q, 0], I[q, 1], I[q, 2] = 0.0, 0.0, 0.0
@@ -35,7 +35,7 @@ def inertia(r, m, cm, I):  # noqa: E741
 
 
 @compiled
-def inertia_inverse(I, out):  # noqa: E741
+def inertia_inverse(I, out):
     """Pseudo-inverse of the inertia of point masses into out (3, 3), relative cut-off 1e-9.
 
     Points on a line have the eigenvalues 0, c, c with c = trace / 2, so that I^+ = I / c^2; that
@@ -49,7 +49,11 @@ def inertia_inverse(I, out):  # noqa: E741
     if det > 1e-9 * half**3:
         q = 1.0 / det
         out[0, 0], out[0, 1], out[0, 2] = A * q, B * q, C * q
-        out[1, 1], out[1, 2], out[2, 2] = (a * f - c * c) * q, (b * c - a * e) * q, (a * d - b * b) * q
+        out[1, 1], out[1, 2], out[2, 2] = (
+            (a * f - c * c) * q,
+            (b * c - a * e) * q,
+            (a * d - b * b) * q,
+        )
         out[1, 0], out[2, 0], out[2, 1] = out[0, 1], out[0, 2], out[1, 2]
     else:
         q = 1.0 / (half * half) if half > 0.0 else 0.0
@@ -156,7 +160,7 @@ def rotation_vector(R, phi):
 
 
 @compiled
-def allocate_rigid(x, m, M, F, tau, omega, I, I_inv, f):  # noqa: E741
+def allocate_rigid(x, m, M, F, tau, omega, I, I_inv, f):
     """Share a wrench among agents as a rigid body would: no internal force.
 
     f_i = m_i (F/M + alpha x x_i + omega x (omega x x_i)), alpha = I^+ (tau - omega x I omega).
@@ -184,7 +188,7 @@ def allocate_rigid(x, m, M, F, tau, omega, I, I_inv, f):  # noqa: E741
 
 
 @compiled
-def allocate_pinv(x, m, M, F, tau, split, I, I_inv, f, H, V, work):  # noqa: E741
+def allocate_pinv(x, m, M, F, tau, split, I, I_inv, f, H, V, work):
     """The paper's input decoupling (Eq. 25-27): f = H^+ [F; tau_1; ...; tau_N].
 
     H^T H is always singular (forces along m_i x_i that sum to zero lie in its null space), so its
@@ -242,7 +246,7 @@ def allocate_pinv(x, m, M, F, tau, split, I, I_inv, f, H, V, work):  # noqa: E74
 
 
 @compiled
-def allocate(x, m, M, F, tau, omega, method, I, I_inv, f, H, V, work):  # noqa: E741
+def allocate(x, m, M, F, tau, omega, method, I, I_inv, f, H, V, work):
     """Share a wrench among the agents by the named method; see the two functions above."""
     if method == RIGID:
         allocate_rigid(x, m, M, F, tau, omega, I, I_inv, f)

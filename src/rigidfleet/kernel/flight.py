@@ -39,7 +39,7 @@ FINISHED, PAUSED, COLLAPSED = range(3)
 @intrinsic
 def call_external(_context, address, t, r, v, f):
     """Call the C function at ``address``: void(double t, double *r, *v, *f, ssize_t n)."""
-    from llvmlite import ir  # noqa: PLC0415  (only while compiling)
+    from llvmlite import ir
 
     def generate(context, builder, signature, arguments):
         pointer, double, size = ir.IntType(8).as_pointer(), ir.DoubleType(), ir.IntType(64)

@@ -169,7 +169,8 @@ def workspace(n: int, m: int, *, with_h: bool = False) -> Workspace:
         c=edge(), b=edge(), A=np.zeros((m, m)), V=np.zeros((m, m)), w=edge(), multiplier=edge(),
         f_E=agent(), f_u=agent(), f_C=agent(), a=agent(), p=agent(), p_dot=agent(),
         p_ddot=agent(), r_ref=agent(), v_ref=agent(), a_ref=agent(), cm=np.zeros((5, 3)),
-        I=np.zeros((3, 3)), I_inv=np.zeros((3, 3)), T=np.eye(3), body=np.zeros((8, 3)), gain=np.zeros(4), E=np.zeros((3, 3)),
+        I=np.zeros((3, 3)), I_inv=np.zeros((3, 3)), T=np.eye(3), body=np.zeros((8, 3)),
+        gain=np.zeros(4), E=np.zeros((3, 3)),
         T_ref=np.eye(3), wrench=np.zeros(6), H=np.zeros((k, k)), H_V=np.zeros((k, k)),
         H_w=np.zeros((k, 3)),
     )  # fmt: skip
