@@ -173,9 +173,16 @@ def _attach(
         pose = Pose(masses @ now.r / masses.sum(), masses @ now.v / masses.sum(), T, np.zeros(3))
         pose.omega = body_rates(now.r, now.v, masses, T)
     slots = now.slots if now.slots is not None else x @ pose.T.T
-    if phase.control == "body" or frame is not None:
-        frame = pose.T if phase.control == "body" or frame is None else frame
     goal = now.goal or replace(pose, v=np.zeros(3), omega=np.zeros(3))
+    if isinstance(phase, Establish) and target is not None:
+        # A formation is established as it lies nearest: its axes are attached to the agents, and
+        # turned to where they are wanted by a later phase.
+        R = shapes.kabsch(slots, target, masses)
+        slots = slots @ R
+        pose = replace(pose, T=R.T @ pose.T, omega=R.T @ pose.omega)
+        goal = replace(goal, T=pose.T)
+    if phase.control == "body" or (mission.formulation == "body" and frame is None):
+        frame = pose.T
     return frame, replace(now, pose=pose, slots=slots, goal=goal)
 
 

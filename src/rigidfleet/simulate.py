@@ -164,7 +164,7 @@ class _Flight:
         start = self.now.t
         t_end = _end(phase, start)
         plan = plan_phase(self.mission, phase, self.now, t_end)
-        self._check_frame(phase, plan)
+        self._check_frame(index, plan)
         if self.external is not None:
             plan.program = plan.program._replace(external=self.external.address)
         record = PhaseRecord(
@@ -365,9 +365,10 @@ class _Flight:
 
     # -- diagnosis --------------------------------------------------------------------------------
 
-    def _check_frame(self, phase: Phase, plan: PhasePlan) -> None:
+    def _check_frame(self, index: int, plan: PhasePlan) -> None:
         """Stop where the formation has flipped: its slots no longer lie as the frame says."""
-        if phase.control != "body" or self.now.frame is None or plan.frame is None:
+        both = {phase.control for phase in self.mission.phases[max(index - 1, 0) : index + 1]}
+        if both != {"body"} or self.now.frame is None or plan.frame is None:
             return
         angle = att.angle_between(
             att.quaternion_from_dcm(self.now.frame), att.quaternion_from_dcm(plan.frame)
