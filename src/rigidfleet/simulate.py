@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 _STEPS = 2000
 #: Where a phase ends by settling, whether it has is asked this often [s].
 _CHECK = 0.1
+#: Progress is reported this often [s of wall time].
+_REPORT = 0.1
 #: A frame further than this from the slots it is attached to has left them [rad].
 _FLIPPED = math.pi / 2
 
@@ -119,6 +121,22 @@ class _StoppedError(Exception):
     """The flight cannot go on; the message is the diagnosis."""
 
 
+@dataclass
+class _Leg:
+    """A phase under way."""
+
+    index: int
+    phase: Phase
+    plan: PhasePlan
+    workspace: k.Workspace
+    state: flight.Integrator
+    t_end: float  # [s] at the latest
+
+    @property
+    def t(self) -> float:
+        return float(self.state.clock[0])
+
+
 class _Flight:
     """One flight under way."""
 
@@ -161,123 +179,114 @@ class _Flight:
     # -- one phase --------------------------------------------------------------------------------
 
     def _phase(self, index: int, phase: Phase) -> None:
-        start = self.now.t
-        t_end = _end(phase, start)
+        leg = self._begin(index, phase)
+        record = PhaseRecord(
+            phase.name, phase.kind, phase.control, leg.plan.formation, leg.t, leg.t,
+            settled=None if phase.settle is None else False, target=_target(phase, leg.plan),
+        )  # fmt: skip
+        self.phases.append(record)
+        try:
+            if phase.settle is not None:
+                record.settled = self._settle(leg, phase.settle)
+            elif self.controller is not None and phase.control == "slots":
+                self._controlled(leg, self.controller)
+            else:
+                self._integrate(leg, leg.plan.program, leg.t_end)
+        finally:
+            self.count += leg.state.count[:3]
+            self._arrive(leg)
+            record.t_end = self.now.t
+        if phase.settle is not None and not record.settled:
+            raise _StoppedError(
+                f"phase '{phase.name}' did not settle within {phase.settle.timeout:g} s: at t ="
+                f" {self.now.t:.2f} s its error was above {phase.settle.tolerance:g} m. Give it a"
+                " longer timeout or a larger tolerance, or see the constraint error to learn why"
+            )
+
+    def _begin(self, index: int, phase: Phase) -> _Leg:
+        t_end = _end(phase, self.now.t)
         plan = plan_phase(self.mission, phase, self.now, t_end)
         self._check_frame(index, plan)
         if self.external is not None:
             plan.program = plan.program._replace(external=self.external.address)
-        record = PhaseRecord(
-            phase.name, phase.kind, phase.control, plan.formation, start, start,
-            settled=None if phase.settle is None else False, target=_target(phase, plan),
-        )  # fmt: skip
-        self.phases.append(record)
-        workspace = k.workspace(
-            len(self.masses), len(plan.edges), with_h=plan.program.control.allocation != k.RIGID
-        )
         y = self._pack(plan)
-        state = flight.integrator(
-            y,
-            start,
-            rtol=self.mission.integrator.rtol,
-            atol=np.full(len(y), self.mission.integrator.atol),
+        tolerances = self.mission.integrator
+        return _Leg(
+            index,
+            phase,
+            plan,
+            k.workspace(
+                len(self.masses), len(plan.edges), with_h=plan.program.control.allocation != k.RIGID
+            ),
+            flight.integrator(
+                y, self.now.t, rtol=tolerances.rtol, atol=np.full(len(y), tolerances.atol)
+            ),
+            t_end,
         )
-        try:
-            if phase.settle is not None:
-                self._settle(index, phase, plan, workspace, state, record)
-            elif self.controller is not None and phase.control == "slots":
-                self._controlled(index, self.controller, plan, workspace, state, t_end)
-            else:
-                self._integrate(index, plan, plan.program, workspace, state, t_end)
-        finally:
-            self.count += state.count[:3]
-            self._arrive(plan, state, workspace)
-            record.t_end = self.now.t
-        if record.settled is False:
-            settle = phase.settle or Settle()
-            raise _StoppedError(
-                f"phase '{phase.name}' did not settle within {settle.timeout:g} s: at t ="
-                f" {self.now.t:.2f} s its error was above {settle.tolerance:g} m. Give it a"
-                " longer timeout or a larger tolerance, or see the constraint error to learn why"
-            )
 
-    def _integrate(
-        self,
-        index: int,
-        plan: PhasePlan,
-        program: k.Program,
-        workspace: k.Workspace,
-        state: flight.Integrator,
-        t_end: float,
-        observe: k.Program | None = None,
-    ) -> None:
+    def _integrate(self, leg: _Leg, program: k.Program, t_end: float) -> None:
         """Integrate to ``t_end`` [s] and record the samples on the way.
 
-        ``observe`` names the program whose references count, where another one flies.
+        ``program`` may hold a user's force in place of the phase's own input law.
         """
-        t0 = float(state.clock[0])
-        fresh = state.count[0] == 0 or program is not plan.program
-        times = self._samples(t0, t_end, first=state.count[0] == 0, index=index)
+        state = leg.state
+        fresh = state.count[0] == 0 or program is not leg.plan.program
+        times = self._samples(leg, t_end)
         samples = np.empty((len(times), len(state.y)))
         state.count[3] = 0
         status = flight.PAUSED
         try:
             while status == flight.PAUSED:
                 status = flight.integrate(
-                    program, workspace, state, t_end, fresh, times, samples, _STEPS
+                    program, leg.workspace, state, t_end, fresh, times, samples, _STEPS
                 )
                 fresh = False
                 if self.external is not None:
                     self.external.check()
-                self._report(index, float(state.clock[0]))
+                self._report(leg)
         finally:
             done = int(state.count[3])
-            self._record(index, plan, program, workspace, times[:done], samples[:done], observe)
+            self._record(leg, program, times[:done], samples[:done])
         if status == flight.COLLAPSED:
-            raise _StoppedError(self._diagnose(plan, state))
+            raise _StoppedError(self._diagnose(leg))
 
-    def _samples(self, t0: float, t_end: float, *, first: bool, index: int) -> Array:
-        """Times to record in (t0, t_end], and at a phase's start just after the switch."""
+    def _samples(self, leg: _Leg, t_end: float) -> Array:
+        """Times to record in (t, t_end]: multiples of the output step, and the phase's two ends.
+
+        The start of a phase is recorded one representable number after the switch.
+        """
+        t, first = leg.t, leg.state.count[0] == 0
         if self.times is not None:
-            inside = self.times[(self.times > t0) & (self.times <= t_end)]
-            return self.times[self.times <= t_end] if index == 0 and first else inside
+            before = -math.inf if first and leg.index == 0 else t
+            return self.times[(self.times > before) & (self.times <= t_end)]
         step = self.mission.output_step
-        low, high = math.floor(t0 / step + 1e-9) + 1, math.ceil(t_end / step - 1e-9)
-        grid = np.arange(low, high) * step
-        start = [t0 if index == 0 else np.nextafter(t0, math.inf)] if first else []
-        return np.concatenate([start, grid, [t_end]])
+        low, high = math.floor(t / step + 1e-9) + 1, math.floor(t_end / step + 1e-9) + 1
+        grid = np.minimum(np.arange(low, high) * step, t_end)
+        if t_end == leg.t_end:
+            grid = np.append(grid[grid < t_end - 1e-9 * step], t_end)
+        start = [t if leg.index == 0 else np.nextafter(t, math.inf)] if first else []
+        return np.concatenate([start, grid])
 
-    def _settle(
-        self,
-        index: int,
-        phase: Phase,
-        plan: PhasePlan,
-        workspace: k.Workspace,
-        state: flight.Integrator,
-        record: PhaseRecord,
-    ) -> None:
-        """Integrate in short stretches until the phase has settled, or its time is over."""
-        settle, start = phase.settle or Settle(), self.now.t
-        least = start + (phase.blend if isinstance(phase, Establish | Reshape) else 0.0)
+    def _settle(self, leg: _Leg, settle: Settle) -> bool:
+        """Integrate in short stretches until the phase has settled; False if its time was over."""
+        start = self.now.t
+        step = self.mission.output_step
+        step *= max(1.0, round(_CHECK / step))  # stretches end at samples
+        least = start + (leg.phase.blend if isinstance(leg.phase, Establish | Reshape) else 0.0)
         since = math.inf
-        n = 1
-        while True:
-            t = min(start + n * _CHECK, start + settle.timeout)
-            self._integrate(index, plan, plan.program, workspace, state, t)
-            n += 1
-            if t >= least and self._error(plan, workspace, state) <= settle.tolerance:
-                since = min(since, t)
-            else:
-                since = math.inf
-            if t - since >= settle.dwell - 1e-9:
-                record.settled = True
-                return
-            if t >= start + settle.timeout:
-                return
+        while leg.t < leg.t_end:
+            t = (math.floor(leg.t / step + 1e-9) + 1) * step
+            self._integrate(leg, leg.plan.program, min(t, leg.t_end))
+            quiet = leg.t >= least and self._error(leg) <= settle.tolerance
+            since = min(since, leg.t) if quiet else math.inf
+            if leg.t - since >= settle.dwell - 1e-9:
+                return True
+        return False
 
-    def _error(self, plan: PhasePlan, w: k.Workspace, state: flight.Integrator) -> float:
+    def _error(self, leg: _Leg) -> float:
         """Largest error [m] of a constraint, a slot or the goal at the integrator's state."""
-        flight.closed_loop(state.clock[0], state.y, np.empty_like(state.y), plan.program, w)
+        plan, w = leg.plan, leg.workspace
+        flight.closed_loop(leg.t, leg.state.y, np.empty_like(leg.state.y), plan.program, w)
         errors = [np.abs(w.c).max(initial=0.0)]
         if plan.program.control.kind == k.LOCAL:
             errors.append(np.linalg.norm(w.r - w.r_ref, axis=1).max())
@@ -285,40 +294,22 @@ class _Flight:
             errors.append(np.linalg.norm(self.masses @ w.r / self.masses.sum() - plan.goal.r))
         return float(max(errors))
 
-    def _controlled(
-        self,
-        index: int,
-        controller: Controller,
-        plan: PhasePlan,
-        workspace: k.Workspace,
-        state: flight.Integrator,
-        t_end: float,
-    ) -> None:
+    def _controlled(self, leg: _Leg, controller: Controller) -> None:
         """Integrate under the user's controller, its force held over each control step."""
-        start, step = self.now.t, 0
-        dy = np.empty_like(state.y)
-        while state.clock[0] < t_end:
-            t = float(state.clock[0])
-            flight.closed_loop(t, state.y, dy, plan.program, workspace)
+        start, step = leg.t, 0
+        plan, w, y = leg.plan, leg.workspace, leg.state.y
+        dy = np.empty_like(y)
+        while leg.t < leg.t_end:
+            flight.closed_loop(leg.t, y, dy, plan.program, w)
             seen = Observation(
-                t, self.mission.phases[index].name, workspace.r.copy(), workspace.v.copy(),
-                workspace.r_ref.copy(), workspace.v_ref.copy(), workspace.a_ref.copy(),
-                self.masses.copy(), self.mission.gravity,
+                leg.t, leg.phase.name, w.r.copy(), w.v.copy(), w.r_ref.copy(), w.v_ref.copy(),
+                w.a_ref.copy(), self.masses.copy(), self.mission.gravity,
             )  # fmt: skip
-            f = _checked(controller(seen), self.mission.n_agents, "the controller", t)
-            held = plan.program._replace(
-                control=plan.program.control._replace(kind=k.OPEN, force=f)
-            )
+            f = _checked(controller(seen), self.mission.n_agents, "the controller", leg.t)
+            held = plan.program.control._replace(kind=k.OPEN, force=f)
             step += 1
-            self._integrate(
-                index,
-                plan,
-                held,
-                workspace,
-                state,
-                min(start + step / self.rate, t_end),
-                plan.program,
-            )
+            t = min(start + step / self.rate, leg.t_end)
+            self._integrate(leg, plan.program._replace(control=held), t)
 
     # -- states -----------------------------------------------------------------------------------
 
@@ -335,10 +326,10 @@ class _Flight:
         cm = (masses @ now.r / masses.sum(), masses @ now.v / masses.sum())
         return np.concatenate([x.ravel(), y.ravel(), integral, q, *cm])
 
-    def _arrive(self, plan: PhasePlan, state: flight.Integrator, w: k.Workspace) -> None:
+    def _arrive(self, leg: _Leg) -> None:
         """Make the state the integrator has reached the situation of the next phase."""
-        t = float(state.clock[0])
-        flight.closed_loop(t, state.y, np.empty_like(state.y), plan.program, w)
+        plan, state, w = leg.plan, leg.state, leg.workspace
+        flight.closed_loop(leg.t, state.y, np.empty_like(state.y), plan.program, w)
         n, m = len(self.masses), len(plan.edges)
         keys = [(int(i), int(j)) for i, j in plan.edges]
         frame = self.now.frame
@@ -350,7 +341,7 @@ class _Flight:
             pose = Pose(w.body[0].copy(), w.body[1].copy(), w.T_ref.copy(), w.body[3].copy())
         self.now = replace(
             self.now,
-            t=t,
+            t=leg.t,
             r=w.r.copy(),
             v=w.v.copy(),
             integral=self.now.integral
@@ -381,11 +372,11 @@ class _Flight:
                 ' phase: control = "slots"'
             )
 
-    def _diagnose(self, plan: PhasePlan, state: flight.Integrator) -> str:
+    def _diagnose(self, leg: _Leg) -> str:
         """Say when, where and why the integrator could not go on."""
-        n, t = len(self.masses), float(state.clock[0])
-        r = state.y[: 3 * n].reshape(1, n, 3)
-        head = f"the flight cannot go on at t = {t:.3f} s, in phase '{self.phases[-1].name}'"
+        n, plan = len(self.masses), leg.plan
+        r = leg.state.y[: 3 * n].reshape(1, n, 3)
+        head = f"the flight cannot go on at t = {leg.t:.3f} s, in phase '{leg.phase.name}'"
         if not len(plan.edges):
             return f"{head}: the forces are not finite. Look for a force or a gain far too large"
         i, j = plan.edges.T
@@ -405,43 +396,32 @@ class _Flight:
             ' "spectral"), and references that move smoothly: reference = "shape" or "distances"'
         )
 
-    def _report(self, index: int, t: float) -> None:
+    def _report(self, leg: _Leg) -> None:
         wall = clock.perf_counter()
-        if self.progress is not None and (
-            wall - self.reported > 0.1 or self.reported == self.started
-        ):
+        if self.progress is not None and (wall - self.reported > _REPORT or len(self.pieces) == 0):
             self.reported = wall
             self.progress(
-                Progress(
-                    t, self.mission.latest_end, self.mission.phases[index].name, wall - self.started
-                )
+                Progress(leg.t, self.mission.latest_end, leg.phase.name, wall - self.started)
             )
 
     # -- the record -------------------------------------------------------------------------------
 
-    def _record(
-        self,
-        index: int,
-        plan: PhasePlan,
-        program: k.Program,
-        w: k.Workspace,
-        times: Array,
-        samples: Array,
-        observe: k.Program | None,
-    ) -> None:
+    def _record(self, leg: _Leg, program: k.Program, times: Array, samples: Array) -> None:
         """Evaluate forces and references at the samples and keep them."""
+        plan, w = leg.plan, leg.workspace
         n, m = len(self.masses), len(plan.edges)
         out = flight.recorder(len(times), n, m)
         flight.record(times, samples, program, w, out)
-        if observe is not None:  # the references of the law in whose place the controller flies
+        if program is not plan.program:  # flown by a user's controller: the phase's references
             asked = flight.recorder(len(times), n, m)
-            flight.record(times, samples, observe, w, asked)
+            flight.record(times, samples, plan.program, w, asked)
             out = out._replace(
                 r_ref=asked.r_ref,
                 p=asked.p,
                 motion=asked.motion,
                 rates=asked.rates,
                 T_ref=asked.T_ref,
+                wrench=asked.wrench,
             )
         frame = np.full((len(times), 4), np.nan)
         if plan.frame is not None:
@@ -449,10 +429,9 @@ class _Flight:
             frame = q / np.linalg.norm(q, axis=1, keepdims=True)
         # A frame is attached from the first establishment on, or wherever something is tracked.
         attached = self.now.formation is not None or plan.program.control.kind != k.OPEN
-        self.pieces.append(
-            Piece(index, times, out, samples[:, 6 * n : 6 * n + m], frame, plan.edges,
-                  plan.slots if attached else None)
-        )  # fmt: skip
+        integral = samples[:, 6 * n : 6 * n + m]
+        slots = plan.slots if attached else None
+        self.pieces.append(Piece(leg.index, times, out, integral, frame, plan.edges, slots))
 
     def result(self) -> Result:
         """The record of what has been flown."""
