@@ -50,7 +50,7 @@ def constraint_force(
     threshold: float = 0.1,
     cutoff: float = 1e-12,
 ) -> ConstraintForce:
-    """Constraint force f_C = J^T lambda (Eq. 14 of the paper, references fed forward).
+    """Constraint force f_C = J^T lambda (Eq. 12 of the paper, references fed forward).
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ def allocate(
     """Input force (N, 3) [N] of every agent for a wrench on the virtual body (input decoupling).
 
     ``rigid`` is exact: f_i = m_i (F/M + alpha x x_i + omega x (omega x x_i)) with
-    alpha = I^+ (tau - omega x I omega). ``pinv`` is the paper's H (Eq. 25 to 27) with a
+    alpha = I^+ (tau - omega x I omega). ``pinv`` is the paper's H (Eq. 24 to 27) with a
     pseudo-inverse, for H^T H is always singular; its wrench is not the one asked for, see
     `wrench`.
 

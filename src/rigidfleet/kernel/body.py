@@ -189,7 +189,7 @@ def allocate_rigid(x, m, M, F, tau, omega, I, I_inv, f):
 
 @compiled
 def allocate_pinv(x, m, M, F, tau, split, I, I_inv, f, H, V, work):
-    """The paper's input decoupling (Eq. 25-27): f = H^+ [F; tau_1; ...; tau_N].
+    """The paper's input decoupling (Eq. 24-27): f = H^+ [F; tau_1; ...; tau_N].
 
     H^T H is always singular (forces along m_i x_i that sum to zero lie in its null space), so its
     inverse is a pseudo-inverse here, with relative cut-off 1e-12. The torque is split among the

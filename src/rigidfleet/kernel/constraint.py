@@ -1,6 +1,6 @@
 """The constraint force: Baumgarte-stabilised Lagrange multipliers (paper, section III).
 
-Eq. 14 of the paper, with the moving reference fed forward, reads
+Eq. 12 of the paper, with the moving reference fed forward, reads
 
     f_C = J^T lambda,   (J M^-1 J^T) lambda = b,
     b = d_ddot - J_dot r_dot - J M^-1 f_E - 2 alpha c_dot - beta^2 c - gamma int c dt.
@@ -30,7 +30,7 @@ def edge_geometry(r, edges, u, L):
 
 @compiled
 def right_side(v, integral, f, m, edges, law, w):
-    """The bracket of Eq. 14 into w.b (m,) [m/s^2], the constraints (Eq. 3) into w.c.
+    """The bracket of Eq. 12 into w.b (m,) [m/s^2], the constraints (Eq. 3) into w.c.
 
     Jdot v of an edge is (|dv|^2 - (u . dv)^2) / L; ``f`` (N, 3) [N] is every force but f_C.
     """
@@ -126,7 +126,7 @@ def solve_multipliers(vehicles, graph, law, w):
 
 @compiled
 def apply_multipliers(u, edges, multiplier, f_C):
-    """f_C = J^T lambda (Eq. 11) into f_C (N, 3) [N]: no net force, no net torque."""
+    """f_C = J^T lambda (Eq. 10) into f_C (N, 3) [N]: no net force, no net torque."""
     for i in range(f_C.shape[0]):
         f_C[i, 0], f_C[i, 1], f_C[i, 2] = 0.0, 0.0, 0.0
     for k in range(edges.shape[0]):

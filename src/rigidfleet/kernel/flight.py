@@ -61,7 +61,7 @@ def closed_loop(t, y, dy, p, w):
     """Right-hand side dy of the closed loop at time t [s] and state y.
 
     Newton's law with the constraint force: M dv/dt = f_E + f_u + f_C (Eq. 2), f_u from the input
-    law of the phase, f_C from the multipliers (Eq. 14). Everything computed stays in ``w``.
+    law of the phase, f_C from the multipliers (Eq. 12). Everything computed stays in ``w``.
     """
     vehicles, graph, control = p.vehicles, p.graph, p.control
     m, g = vehicles.m, vehicles.g
@@ -149,11 +149,11 @@ def body_derivatives(y, dy, p, w):
 
     The paper's pair for d2x/dt2 and domega/dt is linearly dependent: omega of a deforming body is
     a choice of frame. With mean axes, omega = I^+ h, and y_i = dx_i/dt + omega x x_i in place of
-    dx_i/dt, its Eq. 17 reads
+    dx_i/dt, its Eq. 16 reads
 
         dx_i/dt = y_i - omega x x_i,   dy_i/dt = -omega x y_i + T (f_i/m_i - F/M),
 
-    regular on a line too. Substituting y_i gives Eq. 17 back with all its Coriolis terms.
+    regular on a line too. Substituting y_i gives Eq. 16 back with all its Coriolis terms.
     """
     n = p.vehicles.m.shape[0]
     q = 6 * n + p.graph.edges.shape[0]
