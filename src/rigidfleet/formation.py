@@ -7,8 +7,8 @@ slots do.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from itertools import combinations
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import combinations, islice
 from typing import NamedTuple
 
 import numpy as np
@@ -160,8 +160,8 @@ def dimension(points: ArrayLike, tol: float = 1e-6) -> int:
     singular values of its centred points).
     """
     s = np.linalg.svd(centred(points), compute_uv=False)
-    scale = max(s[0], 1e-12 * float(np.abs(points).max(initial=0.0)))
-    return int(np.count_nonzero(s > tol * scale)) if s[0] >= scale > 0 else 0
+    rounding = 1e-12 * np.abs(points).max(initial=0.0)
+    return int(np.count_nonzero(s > max(tol * s[0], rounding)))
 
 
 class Violation(NamedTuple):
@@ -181,53 +181,55 @@ def unrealisable(edges: ArrayLike, lengths: ArrayLike, tol: float = REALISABLE) 
     `tol` of their own size, so that straight (4-8-4) and flat shapes pass. Other quadruples are not judged,
     and more agents than four may contradict each other where every four agree.
     """
-    pairs = [(int(min(e)), int(max(e))) for e in np.asarray(edges).reshape(-1, 2)]
-    index = {pair: k for k, pair in enumerate(pairs)}
+    pairs = np.sort(np.asarray(edges, dtype=np.int64).reshape(-1, 2), axis=1).tolist()
+    index = {(i, j): k for k, (i, j) in enumerate(pairs)}
     length = np.asarray(lengths, dtype=np.float64)
-    later: dict[int, set[int]] = {}
+    after: dict[int, set[int]] = {i: set() for pair in pairs for i in pair}
     for i, j in pairs:
-        later.setdefault(i, set()).add(j)
-    none: set[int] = set()
+        after[i].add(j)
 
     found: list[Violation] = []
-    broken: set[tuple[int, ...]] = set()
-    quadruples: list[tuple[int, int, int, int]] = []
-    for i, j in sorted(index):
-        third = later.get(i, none) & later.get(j, none)
-        for k in sorted(third):
-            sides = (index[i, j], index[i, k], index[j, k])
-            longest = max(length[s] for s in sides)
-            excess = 2 * longest - sum(length[s] for s in sides)
-            if excess > tol * longest:
-                found.append(Violation((i, j, k), sides, float(excess)))
-                broken.add((i, j, k))
-            quadruples += [(i, j, k, m) for m in sorted(third & later.get(k, none))]
-    for chunk in _chunks(quadruples, 4096):
-        sides = np.array([[index[pair] for pair in combinations(q, 2)] for q in chunk])
+    for agents, sides in _measured(_cliques(after, 3), index):
+        a = length[sides]
+        excess = 2 * a.max(axis=1) - a.sum(axis=1)
+        for t in np.flatnonzero(excess > tol * a.max(axis=1)):
+            found.append(Violation(agents[t], tuple(sides[t].tolist()), float(excess[t])))
+    broken = {v.agents for v in found}
+    for agents, sides in _measured(_cliques(after, 4), index):
         d2 = length[sides] ** 2
-        # Gram matrix of the three edges from the first agent; its determinant is 36 V^2.
-        a, b, c, ab, ac, bc = d2.T
-        gram = np.array(
-            [
-                [2 * a, a + b - ab, a + c - ac],
-                [a + b - ab, 2 * b, b + c - bc],
-                [a + c - ac, b + c - bc, 2 * c],
-            ]
-        )
-        volume2 = np.linalg.det(np.moveaxis(gram / 2, -1, 0)) / 36
-        for row in np.flatnonzero(volume2 < -tol * d2.max(axis=1) ** 3):
-            if not any(face in broken for face in combinations(chunk[row], 3)):
-                found.append(
-                    Violation(chunk[row], tuple(map(int, sides[row])), float(volume2[row]))
-                )
+        volume2 = _squared_volume(*d2.T)
+        for q in np.flatnonzero(volume2 < -tol * d2.max(axis=1) ** 3):
+            if not any(face in broken for face in combinations(agents[q], 3)):
+                found.append(Violation(agents[q], tuple(sides[q].tolist()), float(volume2[q])))
     return found
 
 
-def _chunks(
-    items: list[tuple[int, int, int, int]], size: int
-) -> Iterator[list[tuple[int, int, int, int]]]:
-    for start in range(0, len(items), size):
-        yield items[start : start + size]
+def _cliques(after: dict[int, set[int]], size: int) -> Iterator[tuple[int, ...]]:
+    """Agents i < j < ... of which every two share an edge."""
+
+    def extend(clique: tuple[int, ...], common: set[int]) -> Iterator[tuple[int, ...]]:
+        if len(clique) == size:
+            yield clique
+            return
+        for i in sorted(common):
+            yield from extend((*clique, i), common & after[i])
+
+    return extend((), set(after))
+
+
+def _measured(
+    cliques: Iterator[tuple[int, ...]], index: dict[tuple[int, int], int]
+) -> Iterator[tuple[list[tuple[int, ...]], Ints]]:
+    """Some thousands of cliques at a time, each with the numbers of its edges 12, 13, ..., 23, ..."""
+    while agents := list(islice(cliques, 4096)):
+        yield agents, np.array([[index[i, j] for i, j in combinations(c, 2)] for c in agents])
+
+
+def _squared_volume(a: Floats, b: Floats, c: Floats, ab: Floats, ac: Floats, bc: Floats) -> Floats:
+    """Squared volume of tetrahedra from squared lengths 12, 13, 14, 23, 24, 34 (Cayley-Menger / 288)."""
+    # Gram matrix of the three edges from the first agent, doubled: its determinant is 288 V^2.
+    x, y, z = a + b - ab, a + c - ac, b + c - bc
+    return (8 * a * b * c + 2 * x * y * z - 2 * (a * z**2 + b * y**2 + c * x**2)) / 288
 
 
 def slots_from_distances(
@@ -255,9 +257,10 @@ def slots_from_distances(
         return None
     centring = np.eye(n) - 1 / n
     value, vector = np.linalg.eigh(-0.5 * centring @ d**2 @ centring)
-    top = value[-3:][::-1]
+    # An eigenvalue is a squared extent: what rounding alone leaves is no thickness.
+    top = np.where(value[-3:] > 1e-12 * value[-1], value[-3:], 0.0)[::-1]
     p = np.zeros((n, 3))
-    p[:, : len(top)] = vector[:, -3:][:, ::-1] * np.sqrt(np.maximum(top, 0))
+    p[:, : len(top)] = vector[:, -3:][:, ::-1] * np.sqrt(top)
     error = float(np.abs(distances(p, e) - given).max(initial=0.0))
     # Near a flat shape, an error e in a distance moves points by sqrt(e): judged by distances, not by volume.
     if error > np.sqrt(tol) * d.max(initial=0.0) or value[0] < -tol * n * d.max(initial=0.0) ** 2:
@@ -269,24 +272,21 @@ def slots_from_distances(
 
 def _conventional(p: Floats) -> Floats:
     """Turn and mirror centred points (N, 3) to the convention of `slots_from_distances`."""
-    small = 1e-9 * np.abs(p).max(initial=0.0)
-
-    def first(candidates: Iterator[Floats]) -> Floats | None:
-        return next(
-            (v / np.linalg.norm(v) for v in candidates if np.linalg.norm(v) > 1e3 * small), None
-        )
-
-    x = first(iter(p[::-1]))
+    x = _first_direction(p[::-1], p)
     if x is None:
         return p
-    q = p - np.outer(p @ x, x)
-    y = first(q[i] - q[j] for i, j in combinations(range(len(p)), 2))
+    across = p - np.outer(p @ x, x)
+    y = _first_direction((a - b for a, b in combinations(across, 2)), p)
     if y is None:
-        return np.column_stack([p @ x, np.zeros((len(p), 2))])
-    out = np.column_stack([p @ x, p @ y, p @ np.cross(x, y)])
-    if dimension(out) == 3 and handedness(out) < 0:
-        out[:, 2] *= -1
-    return out
+        return np.outer(p @ x, [1.0, 0.0, 0.0])
+    out = p @ np.column_stack([x, y, np.cross(x, y)])
+    return out * [1, 1, -1] if handedness(out) < 0 else out
+
+
+def _first_direction(vectors: Iterable[Floats], p: Floats) -> Floats | None:
+    """Unit vector along the first of the vectors that is not small beside the shape of p."""
+    small = 1e-6 * np.abs(p).max(initial=0.0)
+    return next((v / np.linalg.norm(v) for v in vectors if np.linalg.norm(v) > small), None)
 
 
 def handedness(points: ArrayLike, tol: float = 1e-6) -> int:
@@ -343,28 +343,27 @@ def kabsch(
     w = w[:, None] / w.sum()
     p, q = p - (w * p).sum(axis=-2, keepdims=True), q - (w * q).sum(axis=-2, keepdims=True)
     u, s, vt = np.linalg.svd(np.swapaxes(w * p, -1, -2) @ q)
+    proper = np.linalg.det(u @ vt) > 0
+    u[..., 2] *= np.where(proper, 1.0, -1.0)[..., None]
     rotation = u @ vt
-    proper = np.linalg.det(rotation) > 0
-    free = ~proper | (s[..., 1] <= tol * s[..., 0])
+    alike = tol * s[..., 0]
+    free = (s[..., 1] <= alike) | (~proper & (s[..., 1] - s[..., 2] <= alike))
     guide = np.eye(3) if near is None else np.asarray(near, dtype=np.float64)
     for at in np.argwhere(free):
         k = tuple(at)
-        rotation[k] = _nearest_fit(u[k], s[k], vt[k], bool(proper[k]), guide, tol)
+        rotation[k] = _nearest_fit(u[k], s[k], vt[k], guide, tol)
     return rotation
 
 
-def _nearest_fit(
-    u: Floats, s: Floats, vt: Floats, proper: bool, near: Floats, tol: float
-) -> Floats:
-    """Of the rotations that maximise tr(R^T U S V^T), the one nearest to `near`.
+def _nearest_fit(u: Floats, s: Floats, vt: Floats, near: Floats, tol: float) -> Floats:
+    """Of the rotations that fit as well as U V^T, the one nearest to `near`.
 
-    They are U (1 - 2 n n^T) V^T with n any unit vector among the equal smallest singular values, if det(U V^T) =
-    -1; where the smallest is zero, the sign of U's last column is free and this covers det = +1 as well.
+    With the last column of U reversed they are U (1 - 2 n n^T) V^T, n any unit vector among the
+    directions of the equal smallest singular values.
     """
     if s[0] == 0:
         return near.copy()
-    if proper:
-        u = u * [1, 1, -1]
+    u = u * [1, 1, -1]
     equal = int(np.count_nonzero(s <= s[2] + tol * s[0]))
     overlap = (vt @ near.T @ u)[-equal:, -equal:]
     n = np.zeros(3)

@@ -274,7 +274,7 @@ class Limits(Part):
         None, description="least room between agents [m]: centre distance minus radii"
     )
     separation_below: NonNegative | None = Field(
-        None, description="least height [m] between an agent and one that flies in its downwash"
+        None, description="least room [m] to an agent straight below: height minus radii (downwash)"
     )
     geofence: Geofence | None = Field(None, description="box that no agent may leave")
 

@@ -1,0 +1,295 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from scipy.spatial.distance import pdist
+from scipy.spatial.transform import Rotation
+
+from rigidfleet import formation as f
+
+NAMED = [
+    ("line", 4.0, 3),
+    ("line", 4.0, 2),
+    ("triangle", 4.0, 3),
+    ("square", 4.0, 4),
+    ("polygon", 4.0, 7),
+    ("hexagon", 4.0, 6),
+    ("pyramid", 4.0, 4),
+    ("pyramid", 4.0, 5),
+    ("pyramid", 4.0, 6),
+    ("cube", 4.0, 8),
+    ("cuboid", [8.0, 2.0, 4.0], 8),
+]
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+def points(seed, *shape):
+    return np.random.default_rng(seed).normal(size=shape)
+
+
+def rotation(seed):
+    return Rotation.random(random_state=np.random.RandomState(seed)).as_matrix()
+
+
+# -- shapes
+
+
+@pytest.mark.parametrize(("shape", "size", "n"), NAMED)
+def test_shape_is_centred(shape, size, n):
+    """Every named shape has a slot for each agent, about its geometric centre."""
+    p = f.slots(shape, size, n)
+    assert p.shape == (n, 3)
+    np.testing.assert_allclose(p.mean(axis=0), 0, atol=1e-15)
+
+
+@pytest.mark.parametrize(("shape", "size", "n"), NAMED)
+def test_size_is_edge_length(shape, size, n):
+    """The shortest distance in a shape is its size, the smallest of them for a cuboid."""
+    assert pdist(f.slots(shape, size, n)).min() == pytest.approx(np.min(size))
+
+
+def test_line_is_4_8_4():
+    """Three agents on a line are -4, 0 and 4 m along x: the 4-8-4 of Table 1."""
+    assert f.slots("line", 4.0, 3).tolist() == [[-4, 0, 0], [0, 0, 0], [4, 0, 0]]
+
+
+def test_triangle_lies_as_paper_attaches_it():
+    """x points to agent 3, y runs along r1 - r2."""
+    a, h = 4.0, 2 * np.sqrt(3)
+    want = [[-h / 3, a / 2, 0], [-h / 3, -a / 2, 0], [2 * h / 3, 0, 0]]
+    np.testing.assert_allclose(f.slots("triangle", a, 3), want, atol=1e-15)
+
+
+def test_cube_counts_counter_clockwise_from_below():
+    """Agents 1-4 are counter-clockwise from (-, -, -) at the bottom, 5-8 above them."""
+    p = f.slots("cube", 2.0, 8)
+    assert p[:4].tolist() == [[-1, -1, -1], [1, -1, -1], [1, 1, -1], [-1, 1, -1]]
+    np.testing.assert_array_equal(p[4:] - p[:4], np.tile([0, 0, 2], (4, 1)))
+
+
+def test_paper_edges_of_cube_are_sides_and_face_diagonals():
+    """The 18 edges of Table 4 are 12 sides and one diagonal of each face, as a rigid cube needs."""
+    d = np.sort(f.distances(f.slots("cube", 4.0, 8), f.CUBE_EDGES))
+    np.testing.assert_allclose(d, [4.0] * 12 + [4 * np.sqrt(2)] * 6)
+    assert len({tuple(e) for e in f.CUBE_EDGES.tolist()}) == 18
+
+
+@pytest.mark.parametrize(("n", "height"), [(4, np.sqrt(2 / 3)), (5, np.sqrt(1 / 2))])
+def test_pyramid_has_equal_edges(n, height):
+    """A pyramid's apex is one size from each agent of its base."""
+    p = f.slots("pyramid", 1.0, n)
+    np.testing.assert_allclose(np.linalg.norm(p[:-1] - p[-1], axis=1), 1)
+    assert p[-1, 2] - p[0, 2] == pytest.approx(height)
+
+
+@pytest.mark.parametrize(
+    ("shape", "size", "n", "message"),
+    [
+        ("tringle", 4.0, 3, "unknown shape"),
+        ("triangle", 4.0, 4, "takes 3 agents, not 4"),
+        ("pyramid", 4.0, 7, "takes 4 to 6 agents, not 7"),
+        ("polygon", 4.0, 2, "takes 3 or more agents, not 2"),
+        ("cuboid", 4.0, 8, "3 sizes"),
+        ("cube", [4.0, 4.0, 4.0], 8, "one size"),
+        ("line", 0.0, 3, "> 0 m"),
+        ("line", np.nan, 3, "> 0 m"),
+    ],
+)
+def test_impossible_shapes_are_refused(shape, size, n, message):
+    """A shape that does not exist, or not for so many agents, says so."""
+    with pytest.raises(ValueError, match=message):
+        f.slots(shape, size, n)
+
+
+# -- edges, distances, dimension
+
+
+def test_complete_graph_is_in_lexical_order():
+    """Edges run 12, 13, 14, 23, 24, 34, the order in which distances are given."""
+    assert f.complete_graph(4).tolist() == [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]]
+    assert f.complete_graph(1).shape == (0, 2)
+
+
+def test_distances_agree_with_scipy():
+    """Distances over the complete graph are SciPy's pdist, in its order."""
+    p = points(1, 6, 3)
+    np.testing.assert_allclose(f.distances(p, f.complete_graph(6)), pdist(p))
+
+
+@pytest.mark.parametrize(
+    ("shape", "n", "want"),
+    [("line", 1, 0), ("line", 2, 1), ("line", 3, 1), ("square", 4, 2), ("cube", 8, 3)],
+)
+def test_dimension(shape, n, want):
+    """A line has dimension 1 and a square 2, wherever they lie; rounding does not add one."""
+    far = f.slots(shape, 4.0, n) @ rotation(3).T + [1e3, -2e3, 50.0]
+    assert f.dimension(far) == want
+
+
+@given(SEEDS)
+def test_handedness_follows_rotations_and_flips_in_mirrors(seed):
+    """Turning a shape keeps its hand, mirroring changes it."""
+    p, R = points(seed, 5, 3), rotation(seed)
+    hand = f.handedness(p)
+    assert hand in (-1, 1)
+    assert f.handedness(p @ R.T) == hand
+    assert f.handedness(p * [1, -1, 1]) == -hand
+
+
+def test_flat_shapes_have_no_hand():
+    """A planar shape is its own mirror image, turned over."""
+    assert f.handedness(f.slots("hexagon", 4.0, 6)) == 0
+
+
+# -- distances that exist
+
+
+@given(SEEDS, st.integers(2, 7), st.integers(1, 3))
+def test_measured_distances_exist(seed, n, dimension):
+    """Distances measured between points, be they on a line or in a plane, are never refused."""
+    p = points(seed, n, 3)
+    p[:, dimension:] = 0
+    edges = f.complete_graph(n)
+    assert f.unrealisable(edges, f.distances(p, edges)) == []
+
+
+def test_triangle_inequality():
+    """4-8-4 is a line and exists; 4-8.1-4 does not, by 0.1 m."""
+    edges = f.complete_graph(3)
+    assert f.unrealisable(edges, [4, 8, 4]) == []
+    (found,) = f.unrealisable(edges, [4, 8.1, 4])
+    assert found.agents == (0, 1, 2)
+    assert found.excess == pytest.approx(0.1)
+
+
+@given(arrays(float, 6, elements=st.floats(1.0, 1.9)))
+def test_cayley_menger(d):
+    """Quadruples whose faces exist are refused where the 5 x 5 Cayley-Menger determinant is negative."""
+    squares = np.zeros((5, 5))
+    squares[0, 1:] = squares[1:, 0] = 1
+    i, j = f.complete_graph(4).T + 1
+    squares[i, j] = squares[j, i] = d**2
+    determinant = np.linalg.det(squares)  # 288 V^2
+    found = f.unrealisable(f.complete_graph(4), d)
+    if determinant < -1e-2:
+        assert [v.agents for v in found] == [(0, 1, 2, 3)]
+        assert found[0].excess == pytest.approx(determinant / 288)
+    elif determinant > 0:
+        assert found == []
+
+
+def test_only_complete_quadruples_are_judged():
+    """Without one of its six distances a quadruple is free to exist."""
+    edges = f.complete_graph(4)
+    d = [4, 4, 4, 4, 4, 7.5]
+    assert len(f.unrealisable(edges, d)) == 1
+    assert f.unrealisable(edges[[0, 1, 2, 3, 5]], np.array(d)[[0, 1, 2, 3, 5]]) == []
+
+
+def test_edges_may_be_written_either_way():
+    """Edge 21 is edge 12."""
+    assert len(f.unrealisable([[1, 0], [2, 0], [2, 1]], [4, 9, 4])) == 1
+
+
+# -- slots from distances
+
+
+@pytest.mark.parametrize(("shape", "size", "n"), NAMED)
+def test_slots_come_back_from_distances(shape, size, n):
+    """A complete set of distances gives the shape back, in its own handedness."""
+    want, edges = f.slots(shape, size, n), f.complete_graph(n)
+    got = f.slots_from_distances(n, edges, f.distances(want, edges))
+    assert got is not None
+    np.testing.assert_allclose(got.mean(axis=0), 0, atol=1e-12)
+    R = f.kabsch(want, got)
+    np.testing.assert_allclose(got @ R.T, want, atol=1e-12)
+
+
+@pytest.mark.parametrize(("shape", "n"), [("line", 3), ("triangle", 3)])
+def test_slots_from_distances_lie_as_the_named_shapes(shape, n):
+    """Table 1 gives distances alone: its triangle and line come out where the paper puts them."""
+    want, edges = f.slots(shape, 4.0, n), f.complete_graph(n)
+    got = f.slots_from_distances(n, edges, f.distances(want, edges))
+    assert got is not None
+    np.testing.assert_allclose(got, want, atol=1e-12)
+
+
+def test_incomplete_distances_give_no_slots():
+    """One missing distance leaves the shape open."""
+    edges = f.complete_graph(4)[:-1]
+    assert f.slots_from_distances(4, edges, np.ones(5)) is None
+
+
+def test_distances_of_four_dimensions_are_refused():
+    """Five agents that are all 1 m apart need a fourth dimension."""
+    with pytest.raises(ValueError, match="no points in space"):
+        f.slots_from_distances(5, f.complete_graph(5), np.ones(10))
+
+
+# -- Kabsch
+
+
+@given(SEEDS)
+def test_kabsch_agrees_with_scipy(seed):
+    """In general position the weighted fit is SciPy's align_vectors about the weighted centres."""
+    target, source = points(seed, 2, 5, 3)
+    w = np.random.default_rng(seed).random(5) + 0.1
+    centre = (w[:, None] * np.stack([target, source])).sum(axis=1) / w.sum()
+    want, _ = Rotation.align_vectors(target - centre[0], source - centre[1], weights=w)
+    np.testing.assert_allclose(f.kabsch(target, source, w), want.as_matrix(), atol=1e-7)
+
+
+@given(SEEDS)
+def test_kabsch_finds_the_rotation_of_moved_points(seed):
+    """Points that were turned and shifted are turned back, flat ones, too."""
+    R = rotation(seed)
+    for shape, n in (("cube", 8), ("hexagon", 6)):
+        p = f.slots(shape, 4.0, n)
+        np.testing.assert_allclose(f.kabsch(p @ R.T + [9, 8, 7], p), R, atol=1e-12)
+
+
+@given(SEEDS, SEEDS)
+def test_line_turns_minimally(seed, near_seed):
+    """On a line the fit is the shortest rotation from the guide: no spin about the line."""
+    p, T, near = f.slots("line", 4.0, 3), rotation(seed), rotation(near_seed)
+    R = f.kabsch(p @ T.T, p, near=near)
+    np.testing.assert_allclose(R[:, 0], T[:, 0], atol=1e-12)
+    # The shortest turn takes the guide's x axis to the line by the angle between them, and no more.
+    turned = Rotation.from_matrix(R @ near.T).magnitude()
+    between = np.arctan2(np.linalg.norm(np.cross(near[:, 0], T[:, 0])), near[:, 0] @ T[:, 0])
+    assert turned == pytest.approx(between, abs=1e-7)
+
+
+@given(SEEDS)
+def test_mirrored_cube_fits_as_near_as_possible(seed):
+    """A mirrored cube fits many ways equally well: the nearest to the guide is a proper rotation."""
+    near, p = rotation(seed), f.slots("cube", 2.0, 8)
+    mirrored = p * [1, 1, -1]
+    R = f.kabsch(mirrored, p, near=near)
+    assert np.linalg.det(R) == pytest.approx(1)
+    best = np.sum((mirrored - p @ R.T) ** 2)
+    others = Rotation.random(500, random_state=np.random.RandomState(seed)).as_matrix()
+    assert best <= np.sum((mirrored - p @ np.swapaxes(others, 1, 2)) ** 2, axis=(1, 2)).min() + 1e-9
+    # Each mirror after the mirror fits as well; none of them is nearer.
+    n = points(seed, 500, 3)
+    n /= np.linalg.norm(n, axis=1)[:, None]
+    equal = (np.eye(3) - 2 * n[:, :, None] * n[:, None]) * [1, 1, -1]
+    fit = np.sum((mirrored - p @ np.swapaxes(equal, 1, 2)) ** 2, axis=(1, 2))
+    np.testing.assert_allclose(fit, best)
+    assert np.trace(near.T @ R) >= np.trace(near.T @ equal, axis1=1, axis2=2).max() - 1e-9
+
+
+def test_point_keeps_the_guide():
+    """Coincident points have no attitude: the guide stands."""
+    near = rotation(5)
+    np.testing.assert_array_equal(f.kabsch(np.zeros((3, 3)), np.zeros((3, 3)), near=near), near)
+
+
+def test_kabsch_takes_samples_at_once():
+    """Samples along leading axes are fitted each by itself, degenerate ones among them."""
+    line, triangle = f.slots("line", 4.0, 3), f.slots("triangle", 4.0, 3)
+    targets = np.stack([triangle @ rotation(1).T, line @ rotation(2).T, triangle])
+    many = f.kabsch(targets, triangle)
+    for target, R in zip(targets, many, strict=True):
+        np.testing.assert_allclose(R, f.kabsch(target, triangle), atol=1e-12)
