@@ -244,7 +244,7 @@ class Formation(Part):
 class Box(Part):
     """A box along the world's axes."""
 
-    kind: Literal["box"]
+    kind: Literal["box"] = Field(description="a box along the world's axes")
     name: str = Field("", description="what to call it; 'box' and its number when absent")
     min: Vector = Field(description="lowest corner [x, y, z] [m]")
     max: Vector = Field(description="highest corner [x, y, z] [m]")
@@ -253,7 +253,7 @@ class Box(Part):
 class Ground(Part):
     """Everything below a height."""
 
-    kind: Literal["ground"]
+    kind: Literal["ground"] = Field(description="everything below a height")
     name: str = Field("", description="what to call it; 'ground' when absent")
     height: Number = Field(0.0, description="height of the ground [m]")
 
@@ -321,13 +321,13 @@ class Shaping(AnyPhase):
 class Establish(Shaping):
     """Take a formation from wherever the agents are, and attach the body frame to it."""
 
-    kind: Literal["establish"]
+    kind: Literal["establish"] = Field(description="take a formation")
 
 
 class Reshape(Shaping):
     """Change from one formation to another."""
 
-    kind: Literal["reshape"]
+    kind: Literal["reshape"] = Field(description="change the formation")
 
 
 class Steering(AnyPhase):
@@ -361,7 +361,7 @@ class Steering(AnyPhase):
 class Fly(Steering):
     """Fly the centre of mass to a waypoint, to arrive at the phase's end."""
 
-    kind: Literal["fly"]
+    kind: Literal["fly"] = Field(description="fly to a waypoint")
     position: Vector = Field(description="centre of mass at the end [x, y, z] [m]")
     velocity: Vector = Field((0.0, 0.0, 0.0), description="its velocity at the end [m/s]")
 
@@ -369,13 +369,13 @@ class Fly(Steering):
 class Turn(Steering):
     """Turn on the spot to an attitude: at least one angle is given."""
 
-    kind: Literal["turn"]
+    kind: Literal["turn"] = Field(description="turn on the spot")
 
 
 class Hold(AnyPhase):
     """Stay."""
 
-    kind: Literal["hold"]
+    kind: Literal["hold"] = Field(description="stay")
 
 
 Phase = Annotated[Establish | Fly | Reshape | Turn | Hold, Field(discriminator="kind")]
@@ -406,18 +406,28 @@ class Header(Part):
 class Contents(Header):
     """A whole mission file."""
 
-    agents: Agents
-    constraint: Constraint = Field(default_factory=Constraint)
-    lqr: Lqr = Field(default_factory=Lqr)
-    tracking: Tracking = Field(default_factory=Tracking)
-    allocation: Allocation = Field(default_factory=Allocation)
-    integrator: Integrator = Field(default_factory=Integrator)
-    body_frame: BodyFrame | None = None
+    agents: Agents = Field(description="the vehicles: [agents]")
+    constraint: Constraint = Field(
+        default_factory=Constraint, description="the constraint force: [constraint]"
+    )
+    lqr: Lqr = Field(default_factory=Lqr, description="regulator of the virtual body: [lqr]")
+    tracking: Tracking = Field(
+        default_factory=Tracking, description="regulator of each agent: [tracking]"
+    )
+    allocation: Allocation = Field(
+        default_factory=Allocation, description="from wrench to agents: [allocation]"
+    )
+    integrator: Integrator = Field(
+        default_factory=Integrator, description="tolerances: [integrator]"
+    )
+    body_frame: BodyFrame | None = Field(
+        None, description="attitude of the body frame at t = 0: [body_frame]"
+    )
     formations: dict[str, Formation] = Field(
         default_factory=dict, description="formations by name: [formations.NAME]"
     )
     obstacles: tuple[Obstacle, ...] = Field((), description="what not to touch: [[obstacles]]")
-    limits: Limits = Field(default_factory=Limits)
+    limits: Limits = Field(default_factory=Limits, description="what to stay within: [limits]")
     phases: Annotated[tuple[Phase, ...], Field(min_length=1)] = Field(
         description="what to do, in order: [[phases]]"
     )

@@ -1,0 +1,782 @@
+import copy
+import math
+import os
+import pickle
+import subprocess
+import sys
+import tomllib
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rigidfleet import formation
+from rigidfleet.errors import MissionError
+from rigidfleet.mission import (
+    Box,
+    Fly,
+    Mission,
+    json_schema,
+    load_mission,
+    mission_names,
+    mission_text,
+)
+
+SHIPPED = [
+    "cube-passage",
+    "cube-waypoint",
+    "drift",
+    "establish-cube",
+    "establish-cube-as-printed",
+    "establish-triangle",
+    "hexagon",
+    "line-singular",
+    "narrow-passage",
+    "pyramid",
+    "single-waypoint",
+    "square",
+    "two-agents",
+]
+
+PLAIN: dict[str, Any] = {
+    "schema_version": 1,
+    "name": "plain",
+    "agents": {"mass": 1.0, "position": [[1, 6, 3], [8, 3, 3], [7, 6, 3]]},
+    "formations": {
+        "triangle": {"shape": "triangle", "size": 4.0},
+        "line": {"distances": [4, 8, 4]},
+    },
+    "phases": [
+        {"kind": "establish", "formation": "triangle", "until": 6.0},
+        {"kind": "fly", "position": [5, 5, 8], "yaw_deg": 10.0, "duration": 9.0},
+        {"kind": "hold", "until": 20.0},
+    ],
+}
+REMOVED: Any = object()
+
+
+def changed(*edits: tuple[str, Any], base: dict[str, Any] = PLAIN) -> dict[str, Any]:
+    """The plain mission with entries replaced, added or removed: (path, value) each."""
+    data = copy.deepcopy(base)
+    for path, value in edits:
+        *above, last = path.split("/")
+        table: Any = data
+        for step in above:
+            table = table[int(step)] if isinstance(table, list) else table.setdefault(step, {})
+        place: Any = int(last) if isinstance(table, list) else last
+        if value is REMOVED:
+            del table[place]
+        elif isinstance(table, list) and place == len(table):
+            table.append(value)
+        else:
+            table[place] = value
+    return data
+
+
+def findings(*edits, base=PLAIN):
+    with pytest.raises(MissionError) as caught:
+        Mission.from_dict(changed(*edits, base=base), "plain.toml")
+    return caught.value.findings
+
+
+def slots(mission, name):
+    found = mission.formation_slots(name)
+    assert found is not None
+    return found
+
+
+def fails(call, *args):
+    with pytest.raises(MissionError) as caught:
+        call(*args)
+    (finding,) = caught.value.findings
+    return finding
+
+
+# -- shipped missions
+
+
+def test_all_missions_of_the_paper_are_shipped():
+    """The tables, the appendix, and the two failures that the paper's plain laws have."""
+    assert mission_names() == SHIPPED
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_shipped_mission_is_in_order(name):
+    """A shipped mission loads, carries its name, says what it shows and where it is from."""
+    mission = load_mission(name)
+    assert mission.name == name
+    assert mission.title
+    assert mission.source
+    assert mission.text == mission_text(name)
+    assert mission.text.startswith("# ")
+
+
+@pytest.mark.parametrize("name", ["establish-cube", "cube-waypoint", "cube-passage"])
+def test_cube_missions_have_corrected_table_4(name):
+    """The 18 edges are the paper's, with d45 a diagonal and d48 a side."""
+    mission = load_mission(name)
+    np.testing.assert_array_equal(mission.formation_edges("cube"), formation.CUBE_EDGES)
+    length = {
+        tuple(e): d
+        for e, d in zip(
+            mission.formation_edges("cube").tolist(),
+            mission.formation_distances("cube"),
+            strict=True,
+        )
+    }
+    assert length[3, 4] == pytest.approx(4 * math.sqrt(2))
+    assert length[3, 7] == pytest.approx(4)
+
+
+def test_table_4_as_printed_keeps_its_swapped_pair():
+    """As printed d45 is 4 m and d48 a diagonal, and the shape that is meant is still the cube."""
+    mission = load_mission("establish-cube-as-printed")
+    off = mission.formation_distances("cube") - formation.distances(
+        slots(mission, "cube"), mission.formation_edges("cube")
+    )
+    swapped = mission.formation_edges("cube")[np.abs(off) > 1e-9]
+    assert swapped.tolist() == [[3, 4], [3, 7]]
+    assert off[np.abs(off) > 1e-9] == pytest.approx([4 - 4 * math.sqrt(2), 4 * math.sqrt(2) - 4])
+
+
+def test_passages_share_their_environment():
+    """Both passages fly among the same obstacles; the gap takes 2 m and two radii, but not 4 m."""
+    triangle, cube = load_mission("narrow-passage"), load_mission("cube-passage")
+    assert triangle.obstacles == cube.obstacles
+    walls = {o.name: o for o in triangle.obstacles if isinstance(o, Box)}
+    gap = walls["east wall"].min[0] - walls["west wall"].max[0]
+    width = 2 * triangle.agents.radius[0]
+    assert 2 + width < gap < 4 + width
+    assert walls["east wall"].max[1] < 84
+
+
+# -- what a mission holds
+
+
+def test_numbers_stand_for_all_agents():
+    """Masses, radii and limits come out as one for each agent; agents without velocity are at rest."""
+    agents = Mission.from_dict(changed(("agents/thrust_limit", 23.6))).agents
+    assert agents.mass == (1.0, 1.0, 1.0)
+    assert agents.radius == (0.25, 0.25, 0.25)
+    assert agents.thrust_limit == (23.6, 23.6, 23.6)
+    assert agents.velocity == ((0.0, 0.0, 0.0),) * 3
+    assert Mission.from_dict(PLAIN).agents.thrust_limit == (math.inf,) * 3
+
+
+def test_lists_stand_for_one_agent_each():
+    """Agents may differ."""
+    agents = Mission.from_dict(
+        changed(("agents/mass", [1, 2, 3]), ("agents/radius", [0, 1, 2]))
+    ).agents
+    assert agents.mass == (1.0, 2.0, 3.0)
+    assert agents.radius == (0.0, 1.0, 2.0)
+
+
+def test_gains_default_to_a_triple_pole():
+    """The default gains have three poles at -2 /s: (s + 2)^3 = s^3 + 6 s^2 + 12 s + 8."""
+    c = Mission.from_dict(PLAIN).constraint
+    np.testing.assert_allclose([2 * c.alpha, c.beta**2, c.gamma], np.poly([-2, -2, -2])[1:])
+
+
+def test_attitude_inherits_weights():
+    """Weights of the attitude are those of the centre of mass unless given, key by key."""
+    plain = Mission.from_dict(changed(("lqr", {"R": 2.0}))).lqr
+    assert (plain.attitude.R, plain.attitude.S) == (2.0, (1e3, 1e2))
+    given = Mission.from_dict(changed(("lqr", {"R": 2.0, "attitude": {"S": [1e5, 1e4]}}))).lqr
+    assert (given.attitude.R, given.attitude.S, given.S) == (2.0, (1e5, 1e4), (1e3, 1e2))
+
+
+@pytest.mark.parametrize(
+    ("architecture", "controls"),
+    [("local", ["slots", "slots", "slots"]), ("body", ["open", "body", "body"])],
+)
+def test_control_follows_architecture(architecture, controls):
+    """Locally every phase tracks slots; the virtual body is controlled once it is established."""
+    mission = Mission.from_dict(changed(("architecture", architecture)))
+    assert [p.control for p in mission.phases] == controls
+
+
+def test_names_default_to_kind_and_number():
+    """Phases and obstacles without a name can be told apart."""
+    boxes = [{"kind": "box", "min": [0, 0, 0], "max": [1, 1, 1]}, {"kind": "ground"}]
+    mission = Mission.from_dict(changed(("obstacles", boxes)))
+    assert [p.name for p in mission.phases] == ["establish 1", "fly 2", "hold 3"]
+    assert [o.name for o in mission.obstacles] == ["box 1", "ground"]
+
+
+def test_angles_are_given_together_or_kept():
+    """With one angle given the others are 0; with none the commanded attitude is kept."""
+    for value, angles in ((-90, (0.0, 0.0, -90.0)), (REMOVED, None)):
+        fly = Mission.from_dict(changed(("phases/1/yaw_deg", value))).phases[1]
+        assert isinstance(fly, Fly)
+        assert fly.attitude_deg == angles
+
+
+def test_edges_are_the_union_of_all_formations():
+    """Edges of all formations, each once, counted from 0, in the order in which they appear."""
+    base = load_mission("cube-passage").to_dict()
+    base["formations"]["cuboid"]["edges"] += [[8, 1]]
+    edges = Mission.from_dict(base).edges
+    np.testing.assert_array_equal(edges, [*formation.CUBE_EDGES.tolist(), [0, 7]])
+
+
+def test_slots_are_centred_and_derived_from_distances():
+    """Slots come about their centre, and from a complete set of distances where none are given."""
+    own = [[1.0, 0, 0], [2, 0, 0], [3, 3, 0]]
+    mission = Mission.from_dict(changed(("formations/own", {"slots": own})))
+    np.testing.assert_allclose(slots(mission, "own"), np.array(own) - [2, 1, 0])
+    np.testing.assert_allclose(
+        slots(mission, "line"), [[-4, 0, 0], [0, 0, 0], [4, 0, 0]], atol=1e-9
+    )
+    some = {"edges": [[1, 2], [2, 3]], "distances": [4, 4]}
+    assert Mission.from_dict(changed(("formations/some", some))).formation_slots("some") is None
+
+
+def test_latest_end_counts_time_outs():
+    """A mission is over at its last `until`, or after each time-out at the latest."""
+    assert Mission.from_dict(PLAIN).latest_end == 20.0
+    hold = {"kind": "hold", "settle": {"timeout": 30.0}}
+    assert Mission.from_dict(changed(("phases/2", hold))).latest_end == 45.0
+
+
+def test_one_agent_is_a_mission():
+    """A single vehicle flies without any formation."""
+    agents = {"mass": 1.0, "position": [[0, 0, 1]]}
+    phases = [{"kind": "fly", "position": [1, 0, 1], "until": 5.0}]
+    mission = Mission.from_dict(
+        {"schema_version": 1, "name": "one", "agents": agents, "phases": phases}
+    )
+    assert mission.edges.shape == (0, 2)
+
+
+# -- plain data and TOML
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_mission_survives_a_round_trip(name):
+    """A mission written as plain data and read again is the same mission."""
+    mission = load_mission(name)
+    again = Mission.from_dict(mission.to_dict())
+    assert again.model_dump() == mission.model_dump()
+    assert Mission.from_toml(again.text).model_dump() == mission.model_dump()
+
+
+def test_arrays_of_numpy_are_plain_data():
+    """Positions may come as an array, numbers as NumPy's; None stands for an absent key."""
+    edits = ("agents/position", np.eye(3)), ("gravity", np.float64(1.62)), ("title", None)
+    mission = Mission.from_dict(changed(*edits))
+    assert mission.agents.position == ((1, 0, 0), (0, 1, 0), (0, 0, 1))
+    assert mission.gravity == 1.62
+    assert mission.title == ""
+
+
+def test_awkward_names_survive_toml():
+    """Quotes, dots, controls and other scripts in names come back as they were."""
+    name = 'a "quoted" .dotted\\ \u03b1\x7f\n'
+    data = changed(
+        (f"formations/{name}", {"shape": "line", "size": 2}), ("phases/0/formation", name)
+    )
+    assert list(Mission.from_dict(data).formations) == ["triangle", "line", name]
+
+
+def test_what_has_no_toml_form_is_named():
+    """An object in plain data is refused with its type."""
+    finding = fails(Mission.from_dict, changed(("agents/mass", object())))
+    assert "object has no place in a mission" in finding.problem
+
+
+def test_missions_cross_processes():
+    """A mission comes back whole from a worker process, its text included."""
+    mission = load_mission("square")
+    again = pickle.loads(pickle.dumps(mission))
+    assert again == mission
+    assert again.text == mission.text
+
+
+# -- what is found
+
+
+@pytest.mark.parametrize(
+    ("edit", "key", "problem", "remedy"),
+    [
+        # keys and types
+        (("gravty", 9.81), "gravty", "unknown key", "did you mean 'gravity'?"),
+        (("agents/masses", 1.0), "agents.masses", "unknown key", "did you mean 'mass'?"),
+        (("phases/1/yaw", 3.0), "phases[2].yaw", "unknown key", "did you mean 'yaw_deg'?"),
+        (("phases/2/position", [0, 0, 0]), "phases[3].position", "unknown key", "known keys"),
+        (("lqr/attitude/q", [1, 1]), "lqr.attitude.q", "unknown key", "did you mean 'Q'?"),
+        (("schema_version", REMOVED), "schema_version", "is missing", "1"),
+        (("schema_version", 2), "schema_version", "must be 1", "use 1"),
+        (("name", "../up"), "name", "characters", "letters, digits"),
+        (("title", "two\nlines"), "title", "characters", "one line"),
+        (("architecture", "locl"), "architecture", "'local' or 'body'", "did you mean 'local'?"),
+        (("gravity", "9.81"), "gravity", "must be a number", "[m/s^2]"),
+        (("gravity", True), "gravity", "must be a number", "[m/s^2]"),
+        (("gravity", math.nan), "gravity", "must be finite", "[m/s^2]"),
+        (("gravity", 10**400), "gravity", "must be", "[m/s^2]"),
+        (("agents", REMOVED), "agents", "is missing", "[agents]"),
+        (("agents", 3), "agents", "must be a table", "[agents]"),
+        (("formations", [1]), "formations", "must be a table", "[formations.NAME]"),
+        (("formations/line", 3), "formations.line", "must be a table", "[formations.line]"),
+        (("obstacles", {"kind": "box"}), "obstacles", "array of tables", "[[obstacles]]"),
+        (("phases", []), "phases", "there is none", "[[phases]]"),
+        (("phases/0", 3), "phases[1]", "must be a table", "[[phases]]"),
+        # agents
+        (("agents/mass", -1.0), "agents.mass", "must be > 0", "[kg]"),
+        (("agents/mass", [1, 0, 1]), "agents.mass[2]", "must be > 0", "[kg]"),
+        (("agents/mass", [1, 1]), "agents.mass", "2 entries for 3 agents", "3 in all"),
+        (("agents/mass", math.inf), "agents.mass", "must be finite", "[kg]"),
+        (("agents/mass", REMOVED), "agents.mass", "is missing", "[kg]"),
+        (("agents/position", []), "agents.position", "is empty", "[m]"),
+        (("agents/position/1", [8, 3]), "agents.position[2]", "3 numbers, not 2", "[x, y, z]"),
+        (("agents/position/1/2", math.nan), "agents.position[2][3]", "must be finite", "[m]"),
+        (("agents/position/1", [1, 6, 3]), "agents.position[2]", "where agent 1 does", "apart"),
+        (("agents/velocity", [[0, 0, 0]]), "agents.velocity", "1 entries for 3", "3 in all"),
+        (("agents/thrust_limit", 0), "agents.thrust_limit", "must be > 0", "[N]"),
+        (("agents/thrust_limit", math.nan), "agents.thrust_limit", "must be", "[N]"),
+        (("agents/saturate", True), "agents.saturate", "no limit", "thrust_limit"),
+        (("agents/saturate", 1), "agents.saturate", "true or false", "thrust_limit"),
+        # gains and weights
+        (("constraint/alpha", 0.0), "constraint.alpha", "unstable, must be > 0", "stabilisation"),
+        (("constraint/beta", -1.0), "constraint.beta", "unstable, must be > 0", "sqrt(3) p"),
+        (("constraint/gamma", -1.0), "constraint.gamma", "unstable, must be >= 0", "p^3"),
+        (("constraint/gamma", 72.0), "constraint.gamma", "below 2 alpha beta^2 = 72", "lower gamma"),
+        (("constraint/solver", "exat"), "constraint.solver", "must be", "did you mean 'exact'?"),
+        (("constraint/iterations", 0), "constraint.iterations", "must be >= 1", "iterations"),
+        (("constraint/iterations", 3.0), "constraint.iterations", "whole number", "iterations"),
+        (("lqr/R", 0), "lqr.R", "must be > 0", "acceleration"),
+        (("lqr/Q", [1, -1]), "lqr.Q[2]", "must be >= 0", "rate error"),
+        (("lqr/horizon", "infinite"), "lqr.Q", "infinite horizon needs", "Q = [1.0, 1.0]"),
+        (("lqr/S", [0, 0]), "lqr.S", "nothing to steer for", "S = [1e3, 1e2]"),
+        (("lqr/attitude", {"S": [0, 0]}), "lqr.attitude.S", "nothing to steer for", "S ="),
+        (("tracking/Q", [0, 1]), "tracking.Q", "weight > 0", "[4.0, 4.0]"),
+        (("allocation/torque_split", "equal"), "allocation.torque_split", "no effect", "pinv"),
+        (("integrator/rtol", 0), "integrator.rtol", "must be > 0", "relative"),
+        # formations
+        (("formations/triangle/shape", "triangel"), "formations.triangle.shape", "unknown", "did you"),
+        (("formations/triangle/size", REMOVED), "formations.triangle.size", "is missing", "[m]"),
+        (("formations/triangle/shape", "cube"), "formations.triangle.shape", "8 agents, not 3", "chan"),
+        (("formations/triangle/size", [1, 2]), "formations.triangle.size", "3 numbers, not 2", "[m]"),
+        (("formations/a.b", {}), 'formations."a.b"', "neither a shape", "give shape"),
+        (("formations/line/distances", [4, 4]), "formations.line.distances", "2 entries for 3", "each"),
+        (("formations/line/distances/1", 8.5), "formations.line.distances", "no triangle", "0.5 m"),
+        (("formations/line/distances/1", 0), "formations.line.distances[2]", "must be > 0", "[m]"),
+        (("formations/line/edges", [[1, 4]]), "formations.line.edges[1]", "agents 1 to 3", "from 1"),
+        (("formations/line/edges", [[0, 1]]), "formations.line.edges[1]", "agents 1 to 3", "from 1"),
+        (("formations/line/edges", [[2, 2]]), "formations.line.edges[1]", "to itself", "two agents"),
+        (("formations/line/edges", [[1, 2], [2, 1]]), "formations.line.edges[2]", "edge 1 again", "rem"),
+        (("formations/line/edges", [[1, 2, 3]]), "formations.line.edges[1]", "2 numbers, not 3", "pairs"),
+        (("formations/line/edges", [[1, 2.0]]), "formations.line.edges[1][2]", "whole number", "pairs"),
+        (("formations/line/edges", "all"), "formations.line.edges", "must be 'complete'", "complete"),
+        # obstacles and limits
+        (("obstacles", [{"kind": "bx"}]), "obstacles[1].kind", "unknown kind", "did you mean 'box'?"),
+        (("obstacles", [{}]), "obstacles[1].kind", "is missing", "box, ground"),
+        (("limits/geofence", {"min": [0, 0, 0]}), "limits.geofence.max", "is missing", "corner"),
+        (("limits/geofence", {"min": [0, 0, 9], "max": [1, 1, 1]}), "limits.geofence", "in z 9 >= 1 m", "exchange"),
+        (("limits/speed", 0), "limits.speed", "must be > 0", "[m/s]"),
+        # phases
+        (("phases/1/kind", "flly"), "phases[2].kind", "unknown kind", "did you mean 'fly'?"),
+        (("phases/1/kind", REMOVED), "phases[2].kind", "is missing", "establish, fly"),
+        (("phases/0/until", REMOVED), "phases[1]", "has no ending", "until, duration, settle"),
+        (("phases/0/duration", 6.0), "phases[1]", "ends by until and duration", "give one of"),
+        (("phases/2/until", 15.0), "phases[3].until", "begins at 15 s", "duration is a length"),
+        (("phases/0/blend", 6.5), "phases[1].blend", "lasts 6 s", "blend <= 6"),
+        (("phases/0/until", 3.0), "phases[1].blend", "lasts 3 s", "blend <= 3"),
+        (("phases/0/settle", {"timout": 3}), "phases[1].settle.timout", "unknown key", "'timeout'"),
+        (("phases/0/name", "hold 3"), "phases[3].name", "name of phase 1", "its own"),
+        (("phases/0/formation", "triangel"), "phases[1].formation", "no such", "'triangle'?"),
+        (("phases/0/formation", REMOVED), "phases[1].formation", "is missing", "name of the"),
+        (("phases/0/kind", "reshape"), "phases[1].kind", "no formation yet", "establish"),
+        (("phases/0/control", "body"), "phases[1].control", "architecture is 'local'", "slots"),
+        (("phases/1/control", "open"), "phases[2].control", "nothing would steer", "slots"),
+        (("phases/0/input_force", [1, 0, 0]), "phases[1].input_force", "no effect", "open"),
+        (("phases/1/position", REMOVED), "phases[2].position", "is missing", "[m]"),
+        (("phases/1", {"kind": "turn", "duration": 3.0}), "phases[2]", "no angle", "yaw_deg"),
+        (("output_step", 30.0), "output_step", "ends before the first step", "shorter"),
+        (("output_step", 1e-6), "output_step", "samples would be stored", "or more"),
+        (("output_step", 0), "output_step", "must be > 0", "[s]"),
+    ],
+)  # fmt: skip
+def test_error_is_found(edit, key, problem, remedy):
+    """Each error is found alone, at its key, with its problem and a remedy."""
+    (finding,) = findings(edit)
+    assert finding.file == "plain.toml"
+    assert finding.key == key
+    assert problem in finding.problem
+    assert remedy in finding.remedy
+
+
+@pytest.mark.parametrize(
+    ("edits", "key", "problem"),
+    [
+        # A settling phase has a latest end, which a later `until` must leave room for.
+        (
+            [("phases/1", {"kind": "hold", "settle": {"timeout": 60.0}})],
+            "phases[3].until",
+            "as late as 66 s",
+        ),
+        # A finite horizon needs to know when to arrive.
+        (
+            [
+                ("phases/1/duration", REMOVED),
+                ("phases/1/settle", {"timeout": 10.0}),
+                ("lqr/attitude", {"horizon": "infinite", "Q": [1, 1]}),
+            ],
+            "phases[2].settle",
+            "finite horizon of lqr needs a time of arrival",
+        ),
+        ([("phases/0/settle", {"dwell": 9, "timeout": 9}), ("phases/0/until", REMOVED),
+          ("phases/2/until", 90.0)], "phases[1].settle", "times out before"),
+        # Distances alone give slots only where they are complete.
+        (
+            [("formations/triangle", {"edges": [[1, 2], [2, 3]], "distances": [4, 4]}),
+             ("phases/0/reference", "distances"), ("phases/0/control", "open"),
+             ("phases/1", REMOVED)],
+            "phases[2].control",
+            "'triangle' has no slots to track",
+        ),
+        (
+            [("formations/triangle", {"edges": [[1, 2], [2, 3]], "distances": [4, 4]}),
+             ("phases/0/control", "open"), ("phases", PLAIN["phases"][:1]),
+             ("phases/0/control", "open")],
+            "phases[1].reference",
+            "'triangle' has no slots to blend",
+        ),
+        # Distances beside a shape are typing errors unless they are flown as such.
+        (
+            [("formations/triangle/distances", [4, 4, 4.1])],
+            "formations.triangle.distances[3]",
+            "slots of agents 2, 3 are 4 m apart",
+        ),
+        (
+            [("phases/0/reference", "step"), ("phases/0/blend", 2.0)],
+            "phases[1].blend",
+            "a step has no blend",
+        ),
+        # Forces along edges stay within the line through all agents.
+        (
+            [("agents/position", [[0, 0, 0], [1, 1, 1], [3, 3, 3]]), ("phases/0/control", "open")],
+            "phases[1].control",
+            "start on one line",
+        ),
+        (
+            [("formations/line", {"slots": [[0, 0, 0], [1, 0, 0], [0, 0, 0]]})],
+            "formations.line.slots[3]",
+            "is slot 1 again",
+        ),
+        (
+            [("formations/triangle/slots", [[0, 0, 0], [1, 0, 0], [2, 0, 0]])],
+            "formations.triangle.slots",
+            "a shape has its own slots",
+        ),
+        ([("formations/line", {"slots": [[0, 0, 0], [1, 0, 0]]})], "formations.line.slots", "2 slots"),
+    ],
+)  # fmt: skip
+def test_contradiction_is_found(edits, key, problem):
+    """What only several keys together tell is found at the key to change."""
+    (finding,) = findings(*edits)
+    assert finding.key == key
+    assert problem in finding.problem
+    assert finding.remedy
+
+
+def test_tetrahedra_are_judged():
+    """Six distances whose faces exist but whose volume would be imaginary are named by their agents."""
+    square = load_mission("square").to_dict()
+    d = 4 * math.sqrt(2)
+    square["formations"]["square"] = {"distances": [4, d, 4, 4, d, 4]}
+    assert Mission.from_dict(square).formation_slots("square") is not None
+    (finding,) = findings(("formations/square/distances", [4, d, 4, 4, d + 0.1, 4]), base=square)
+    assert "agents 1, 2, 3, 4 make no tetrahedron (Cayley-Menger < 0)" in finding.problem
+    assert "d24 = 5.75685" in finding.problem
+
+
+def test_contradictions_of_five_agents_are_found():
+    """Distances of which every four exist, but not all together, are refused."""
+    p = formation.slots("pyramid", 4.0, 5)
+    d = formation.distances(p, formation.complete_graph(5))
+    base = load_mission("pyramid").to_dict()
+    base["formations"]["pyramid"] = {"distances": d.tolist()}
+    assert Mission.from_dict(base).formation_slots("pyramid") is not None
+    ones = findings(("formations/pyramid/distances", [1.0] * 10), base=base)
+    assert [f.key for f in ones] == ["formations.pyramid.distances"]
+    assert "no points in space" in ones[0].problem
+
+
+def test_many_contradictions_are_counted():
+    """A set of distances that is wrong all over does not flood the screen."""
+    base = load_mission("cube-passage").to_dict()
+    base["formations"]["cube"] = {"distances": [1.0, 9.0] * 14}
+    found = findings(base=base)
+    assert len(found) < 10
+    assert any("more triangles or tetrahedra" in f.problem for f in found)
+
+
+def test_no_stabilisation_needs_no_stable_gains():
+    """`stabilisation = "none"` is the named way to fly without feedback."""
+    edits = ("constraint", {"stabilisation": "none", "alpha": 0, "beta": 0, "gamma": 0})
+    assert Mission.from_dict(changed(edits)).constraint.alpha == 0
+
+
+def test_planar_start_cannot_leave_its_plane():
+    """Eight agents in a plane become no cube by forces along their edges, but by tracking slots."""
+    base = load_mission("establish-cube").to_dict()
+    for p in base["agents"]["position"]:
+        p[2] = p[0] + p[1] * 0.5
+    (finding,) = findings(base=base)
+    assert "start on one plane" in finding.problem
+    data = changed(
+        ("phases/0/control", "slots"), ("phases/0/input_force", [0.0, 0.0, 0.0]), base=base
+    )
+    assert Mission.from_dict(data)
+
+
+def test_all_errors_at_once():
+    """Errors in every part are found in one look, each at its key, though other keys beside it are wrong."""
+    found = findings(
+        ("nam", "x"),
+        ("gravity", -1),
+        ("agents/mass", 0),
+        ("agents/position/1", [1, 6, 3]),
+        ("agents/colour", "red"),
+        ("constraint", {"gamma": 100.0, "solver": "exat"}),
+        ("lqr", {"R": 0, "horizon": "infinite"}),
+        ("formations/line", {"distances": [4, 9, 4], "colour": 1}),
+        ("formations/star", {"shape": "str", "edges": [[1, 9]]}),
+        ("obstacles", [{"kind": "box", "min": [0, 0, 0], "max": [1, 1, -1], "nme": "x"}]),
+        ("limits", {"sped": 1.0, "geofence": {"min": [0, 0, 0], "max": [0, 1, 1]}}),
+        ("phases/0/formation", "triangel"),
+        ("phases/1/position", [1, 2]),
+        ("phases/1/duration", -1.0),
+        ("phases/2/until", "soon"),
+        ("phases/2/input_force", [1, 0, 0]),
+        ("phases/3", {"kind": "turn", "until": 30.0, "control": "body"}),
+        ("phases/4", {"kind": "hold", "until": 29.0}),
+    )
+    assert {f.key for f in found} == {
+        "nam",
+        "gravity",
+        "agents.mass",
+        "agents.position[2]",
+        "agents.colour",
+        "constraint.gamma",
+        "constraint.solver",
+        "lqr.R",
+        "lqr.Q",
+        "formations.line.distances",
+        "formations.line.colour",
+        "formations.star.shape",
+        "formations.star.edges[1]",
+        "obstacles[1]",
+        "obstacles[1].nme",
+        "limits.sped",
+        "limits.geofence",
+        "phases[1].formation",
+        "phases[2].position",
+        "phases[2].duration",
+        "phases[3].until",
+        "phases[3].input_force",
+        "phases[4]",
+        "phases[4].control",
+        "phases[5].until",
+    }
+    assert all(f.file == "plain.toml" and f.problem and f.remedy for f in found)
+
+
+def test_values_are_shown_as_written():
+    """A finding carries the value that the user wrote."""
+    (finding,) = findings(("agents/position/1", [8, 3]))
+    assert finding.value == [8, 3]
+    (finding,) = findings(("agents/mass", -1))
+    assert finding.value == -1
+
+
+def test_wrong_keys_cause_no_errors_elsewhere():
+    """A wrong value is reported once; what would follow from it is not."""
+    assert [f.key for f in findings(("formations/triangle/shape", 3))] == [
+        "formations.triangle.shape"
+    ]
+    assert [f.key for f in findings(("phases/0/until", "6"))] == ["phases[1].until"]
+    assert [f.key for f in findings(("lqr/Q", [-1, 0]))] == ["lqr.Q[1]"]
+    assert [f.key for f in findings(("phases/0/blend", "x"), ("phases/0/until", 3.0))] == [
+        "phases[1].blend"
+    ]
+
+
+# -- files
+
+
+def test_mission_is_read_from_a_file(tmp_path):
+    """A path is read as a file; its errors name it."""
+    path = tmp_path / "mine.toml"
+    path.write_text(mission_text("square"))
+    assert load_mission(path).origin == str(path)
+    assert load_mission(str(path)).name == "square"
+    path.write_text(mission_text("square") + "colour = 1\n")
+    with pytest.raises(MissionError) as caught:
+        load_mission(path)
+    assert caught.value.findings[0].file == str(path)
+
+
+def test_shipped_name_wins(tmp_path, monkeypatch):
+    """A shipped name means the shipped mission, `./name` a file of that name."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "square").write_text(mission_text("pyramid"))
+    assert load_mission("square").name == "square"
+    assert load_mission("./square").name == "pyramid"
+
+
+def test_windows_files_are_read(tmp_path):
+    """A byte order mark and Windows' line ends do not matter."""
+    path = tmp_path / "mine.toml"
+    path.write_bytes(b"\xef\xbb\xbf" + mission_text("square").replace("\n", "\r\n").encode())
+    assert load_mission(path).name == "square"
+
+
+@pytest.mark.parametrize(
+    ("name", "remedy"),
+    [
+        ("narow-passage", "did you mean 'narrow-passage'?"),
+        ("missions/establish-cub.toml", "did you mean 'establish-cube'?"),
+        ("zzz", "shipped missions: cube-passage, "),
+    ],
+)
+def test_unknown_missions_are_near_known_ones(name, remedy):
+    """A name that is neither shipped nor a file is answered with what was perhaps meant."""
+    finding = fails(load_mission, name)
+    assert finding.file == name
+    assert remedy in finding.remedy
+    assert fails(mission_text, name).remedy == finding.remedy
+
+
+@pytest.mark.parametrize(
+    ("content", "problem"),
+    [
+        (b"a = ", "is not valid TOML: Invalid value (at end of document)"),
+        (b"a = 1\na = 2\n", "at line 2"),
+        (b"\x89PNG\r\n\x1a\n\0\0", "is not UTF-8 text (byte 1)"),
+        ("name = 'Zürich'".encode("latin-1"), "is not UTF-8 text (byte 10)"),
+        (b"a = " + b"[" * 100_000, "cannot be read as TOML"),
+        (b"a = " + b"1" * 10_000, "cannot be read as TOML"),
+    ],
+)
+def test_files_that_are_no_missions(tmp_path, content, problem):
+    """What is no TOML is refused with the place, whatever it is."""
+    path = tmp_path / "mine.toml"
+    path.write_bytes(content)
+    finding = fails(load_mission, path)
+    assert finding.file == str(path)
+    assert problem in finding.problem
+    assert finding.remedy
+
+
+def test_paths_that_are_no_files(tmp_path):
+    """A directory, an impossible name and an endless device are refused in a sentence."""
+    assert "is a directory" in fails(load_mission, tmp_path).problem
+    assert "cannot be read" in fails(load_mission, "a\0b").problem
+    assert "cannot be read" in fails(load_mission, "x" * 5000).problem
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/zero"), reason="needs an endless device")
+def test_endless_files_end(monkeypatch):
+    """A file larger than any mission is refused before it fills memory."""
+    monkeypatch.setattr("rigidfleet.mission.model._LARGEST", 2**20)
+    assert "larger than 1 MiB" in fails(load_mission, "/dev/zero").problem
+
+
+def test_unreadable_files(monkeypatch):
+    """A file without permission is refused in a sentence."""
+
+    def refused(*_):
+        raise PermissionError
+
+    monkeypatch.setattr("rigidfleet.mission.model.open", refused, raising=False)
+    assert "may not be read" in fails(load_mission, "mine.toml").problem
+
+
+# -- robustness
+
+JUNK = st.one_of(
+    st.none(),
+    st.booleans(),
+    st.integers(-3, 12),
+    st.integers(),
+    st.floats(),
+    st.text(max_size=4),
+    st.sampled_from(["open", "slots", "body", "step", "distances", "complete", "cube", "fly"]),
+    st.lists(st.floats(-9, 9), max_size=4),
+    st.lists(st.lists(st.integers(-1, 9), max_size=3), max_size=9),
+    st.dictionaries(
+        st.sampled_from(["S", "min", "max", "kind", "timeout"]), st.floats(), max_size=2
+    ),
+)
+
+
+def places(data, path=()):
+    """Every place in plain data."""
+    yield path
+    for key, value in data.items() if isinstance(data, dict) else enumerate(data):
+        if isinstance(value, dict | list):
+            yield from places(value, (*path, key))
+        else:
+            yield (*path, key)
+
+
+@given(
+    st.sampled_from(SHIPPED),
+    st.lists(st.tuples(st.integers(0, 10**6), JUNK), min_size=1, max_size=3),
+)
+def test_nothing_but_findings(name, changes):
+    """Whatever is put in whatever place, a mission is either accepted or refused with findings."""
+    data = tomllib.loads(mission_text(name))
+    for pick, junk in changes:
+        every = [p for p in places(data) if p]
+        *above, last = every[pick % len(every)]
+        table: Any = data
+        for step in above:
+            table = table[step]
+        table[last] = junk
+    try:
+        mission = Mission.from_dict(data)
+    except MissionError as error:
+        refused = error
+    else:
+        assert mission.latest_end > 0
+        for form in mission.formations:
+            d = mission.formation_distances(form)
+            assert d.shape == (len(mission.formation_edges(form)),)
+            assert (d > 0).all()
+        return
+    assert all(f.problem and f.remedy for f in refused.findings)
+    assert str(refused)
+
+
+# -- for editors, and for a quick start
+
+
+def test_schema_explains_every_key():
+    """Each key of the format has a description in the JSON schema, each table its own."""
+    schema = json_schema()
+    tables = {"Mission": schema} | schema["$defs"]
+    assert {"Agents", "Formation", "Establish", "Fly", "Box"} <= tables.keys()
+    for name, table in tables.items():
+        assert table["additionalProperties"] is False, name
+        assert table["description"], name
+        assert all(key["description"] for key in table["properties"].values()), name
+
+
+def test_schema_takes_a_number_for_all_agents():
+    """The schema accepts what the reader accepts: a number, or a list."""
+    mass = json_schema()["$defs"]["Agents"]["properties"]["mass"]
+    assert [choice["type"] for choice in mass["anyOf"]] == ["number", "array"]
+
+
+def test_reading_missions_waits_for_no_compiler():
+    """Checking a mission imports neither Numba nor SciPy."""
+    code = (
+        "import sys; from rigidfleet.mission import load_mission; load_mission('narrow-passage'); "
+        "sys.exit(any(m in sys.modules for m in ('numba', 'scipy', 'matplotlib', 'xarray')))"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
