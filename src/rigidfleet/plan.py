@@ -265,7 +265,9 @@ def _motion(mission: Mission, start: Pose, goal: Pose, t0: float, arrival: float
         else:
             x = lqr.infinite_horizon_trajectory(times, begin, end, T, law.Q, law.R)
         pieces.append(lqr.quintic_pieces(times, *x))
-    return k.Motion(t0 + times, np.ascontiguousarray(np.concatenate(pieces, axis=1)), goal.T)
+    coefficients = np.concatenate(pieces, axis=1)
+    # Another layout of an array would be another type, and compile the kernel once more.
+    return k.Motion(t0 + times, np.ascontiguousarray(coefficients), np.ascontiguousarray(goal.T))
 
 
 def _knots(law: Regulator, T: float) -> Array:
@@ -285,8 +287,8 @@ def _feedback(
             [_gains(law, to_go) for law in (mission.lqr, mission.lqr.attitude)], axis=1
         )
     return k.Feedback(
-        to_go, np.ascontiguousarray(gain), arrival, goal.r, goal.v, goal.T, goal.omega,
-        np.array(hold),
+        to_go, np.ascontiguousarray(gain), arrival, goal.r, goal.v, np.ascontiguousarray(goal.T),
+        goal.omega, np.array(hold),
     )  # fmt: skip
 
 

@@ -39,7 +39,7 @@ def cache_directory() -> Path:
 
 def is_compiled() -> bool:
     """Return whether the flight kernel is in the cache, so that nothing has to be compiled."""
-    return any(_CACHE.rglob("integrate*.nbc"))
+    return any(_CACHE.rglob("flight.integrate-*.nbc"))
 
 
 _CACHE = cache_directory()
