@@ -1,0 +1,262 @@
+"""Attitude: quaternions, direction cosines, Euler angles, rotation vectors.
+
+Conventions, of the paper where it states them:
+
+- A quaternion q = (q0, q1, q2, q3) has its scalar first; T(q) takes world axes to body axes.
+- Euler angles are (roll, pitch, yaw) [rad] of the 3-2-1 sequence, T = R1(roll) R2(pitch) R3(yaw);
+  the paper does not state its sequence.
+- A rotation vector phi [rad] turns the world axes into the body axes: T = exp(-[phi x]). At the
+  constant body rates omega, phi = omega t.
+
+All functions take any leading axes, and give NaN where their input is NaN: a formation has no
+attitude before its frame is attached.
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+
+def dcm_from_quaternion(q: ArrayLike) -> Array:
+    """Direction cosines T(q) (..., 3, 3), world to body, of quaternions (..., 4).
+
+    The quaternions need not be of unit length. ValueError where one is zero.
+    """
+    q0, q1, q2, q3 = np.moveaxis(_unit(q), -1, 0)
+    rows = [
+        [q0**2 + q1**2 - q2**2 - q3**2, 2 * (q1 * q2 + q0 * q3), 2 * (q1 * q3 - q0 * q2)],
+        [2 * (q1 * q2 - q0 * q3), q0**2 - q1**2 + q2**2 - q3**2, 2 * (q2 * q3 + q0 * q1)],
+        [2 * (q1 * q3 + q0 * q2), 2 * (q2 * q3 - q0 * q1), q0**2 - q1**2 - q2**2 + q3**2],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def quaternion_from_dcm(T: ArrayLike) -> Array:
+    """Unit quaternions (..., 4) with q0 >= 0 of direction cosines (..., 3, 3).
+
+    By the branch of the largest component, so that nothing small is divided by. ValueError where
+    T is not a rotation to 1e-6.
+    """
+    T = _vectors("T", T, 3, 3)
+    deviation = T @ np.swapaxes(T, -1, -2) - np.eye(3)
+    determinant = np.sum(np.cross(T[..., 0, :], T[..., 1, :]) * T[..., 2, :], axis=-1)
+    if np.any(np.abs(deviation) > 1e-6) or np.any(determinant < 0.0):
+        raise ValueError(
+            "T is not a rotation (T T^T = 1 to 1e-6 and det T = +1): a mirror image or a matrix"
+            " that has drifted has no quaternion; orthonormalise its rows first"
+        )
+    N = np.empty((*T.shape[:-2], 4, 4))  # 4 q q^T
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        N[..., i + 1, i + 1] = 1 + T[..., i, i] - T[..., j, j] - T[..., k, k]
+        N[..., 0, i + 1] = N[..., i + 1, 0] = T[..., j, k] - T[..., k, j]
+        N[..., j + 1, k + 1] = N[..., k + 1, j + 1] = T[..., j, k] + T[..., k, j]
+    N[..., 0, 0] = 1 + np.trace(T, axis1=-2, axis2=-1)
+    largest = np.argmax(np.diagonal(N, axis1=-2, axis2=-1), axis=-1)
+    return _scalar_positive(
+        _unit(np.take_along_axis(N, largest[..., None, None], axis=-2)[..., 0, :])
+    )
+
+
+def dcm_from_euler(euler: ArrayLike) -> Array:
+    """Direction cosines (..., 3, 3) of Euler angles (..., 3) = (roll, pitch, yaw) [rad]."""
+    angles = np.moveaxis(_vectors("euler", euler, 3), -1, 0)
+    sr, sp, sy = np.sin(angles)
+    cr, cp, cy = np.cos(angles)
+    rows = [
+        [cp * cy, cp * sy, -sp],
+        [sr * sp * cy - cr * sy, sr * sp * sy + cr * cy, sr * cp],
+        [cr * sp * cy + sr * sy, cr * sp * sy - sr * cy, cr * cp],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def euler_from_dcm(T: ArrayLike) -> Array:
+    """Euler angles (..., 3) = (roll, pitch, yaw) [rad] of direction cosines (..., 3, 3).
+
+    Roll and yaw lie in [-pi, pi], pitch in [-pi/2, pi/2]. At pitch = +-90 deg only the sum or
+    difference of roll and yaw exists: roll is then 0. Angles give T back to rounding everywhere.
+    """
+    T = _vectors("T", T, 3, 3)
+    cos_pitch = np.hypot(T[..., 0, 0], T[..., 0, 1])
+    pitch = np.arctan2(-T[..., 0, 2], cos_pitch)
+    locked = cos_pitch < 1e-12
+    yaw = np.where(
+        locked, np.arctan2(-T[..., 1, 0], T[..., 1, 1]), np.arctan2(T[..., 0, 1], T[..., 0, 0])
+    )
+    # From T R3(yaw)^T = R1 R2, in which roll stands beside no small cos(pitch).
+    s, c = np.sin(yaw), np.cos(yaw)
+    roll = np.arctan2(s * T[..., 2, 0] - c * T[..., 2, 1], c * T[..., 1, 1] - s * T[..., 1, 0])
+    return np.stack([np.where(locked, 0.0, roll), pitch, yaw], axis=-1)
+
+
+def quaternion_from_euler(euler: ArrayLike) -> Array:
+    """Unit quaternions (..., 4) with q0 >= 0 of Euler angles (..., 3) = (roll, pitch, yaw) [rad]."""
+    half = 0.5 * np.moveaxis(_vectors("euler", euler, 3), -1, 0)
+    sr, sp, sy = np.sin(half)
+    cr, cp, cy = np.cos(half)
+    q = [
+        cr * cp * cy + sr * sp * sy,
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+    ]
+    return _scalar_positive(np.stack(q, axis=-1))
+
+
+def euler_from_quaternion(q: ArrayLike) -> Array:
+    """Euler angles (..., 3) = (roll, pitch, yaw) [rad] of quaternions (..., 4); see `euler_from_dcm`."""
+    return euler_from_dcm(dcm_from_quaternion(q))
+
+
+def quaternion_rate(q: ArrayLike, omega: ArrayLike) -> Array:
+    """Rate (..., 4) [1/s] of quaternions (..., 4) at body rates omega (..., 3) = (p, q, r) [rad/s].
+
+    qdot = 1/2 Omega(omega) q (Eq. 21 of the paper); the same as 1/2 q (0, omega), and as
+    Tdot = -[omega x] T.
+    """
+    omega = _vectors("omega", omega, 3)
+    zero = np.zeros((*omega.shape[:-1], 1))
+    return 0.5 * quaternion_multiply(q, np.concatenate([zero, omega], axis=-1))
+
+
+def quaternion_multiply(p: ArrayLike, q: ArrayLike) -> Array:
+    """Hamilton's product p q (..., 4): T(p q) = T(q) T(p), first p, then q from there."""
+    p0, p1, p2, p3 = np.moveaxis(_vectors("p", p, 4), -1, 0)
+    q0, q1, q2, q3 = np.moveaxis(_vectors("q", q, 4), -1, 0)
+    product = [
+        p0 * q0 - p1 * q1 - p2 * q2 - p3 * q3,
+        p0 * q1 + p1 * q0 + p2 * q3 - p3 * q2,
+        p0 * q2 - p1 * q3 + p2 * q0 + p3 * q1,
+        p0 * q3 + p1 * q2 - p2 * q1 + p3 * q0,
+    ]
+    return np.stack(product, axis=-1)
+
+
+def quaternion_conjugate(q: ArrayLike) -> Array:
+    """Conjugate (q0, -q1, -q2, -q3) (..., 4): T of it is the transpose, body to world."""
+    return _vectors("q", q, 4) * np.array([1.0, -1.0, -1.0, -1.0])
+
+
+def unwrap_quaternion(q: ArrayLike) -> Array:
+    """Choose the signs of a time series (..., K, 4) so that neighbours never jump to -q.
+
+    Keeps the first sample's sign; a gap of NaN is bridged from the last sample before it.
+    """
+    q = _vectors("q", q, 4)
+    if q.ndim < 2:
+        raise ValueError(f"q must be a time series (..., K, 4), not of shape {q.shape}")
+    known = ~np.isnan(q).any(axis=-1)
+    last = np.maximum.accumulate(np.where(known, np.arange(q.shape[-2]), 0), axis=-1)
+    filled = np.take_along_axis(q, last[..., None], axis=-2)
+    turned = np.sum(filled[..., 1:, :] * filled[..., :-1, :], axis=-1) < 0.0
+    sign = np.cumprod(np.where(turned, -1.0, 1.0), axis=-1)
+    return q * np.concatenate([np.ones_like(q[..., :1, 0]), sign], axis=-1)[..., None]
+
+
+def angle_between(p: ArrayLike, q: ArrayLike) -> Array:
+    """Angle (...) [rad] in [0, pi] of the rotation that takes attitude p into q, both (..., 4).
+
+    Exact to rounding for small angles too, where an arc cosine keeps half of the digits.
+    """
+    p, q = _unit(p), _unit(q)
+    apart, together = np.linalg.norm(p - q, axis=-1), np.linalg.norm(p + q, axis=-1)
+    return 4.0 * np.arctan2(np.minimum(apart, together), np.maximum(apart, together))
+
+
+def quaternion_from_rotation_vector(phi: ArrayLike) -> Array:
+    """Unit quaternions (..., 4) of rotation vectors phi (..., 3) [rad]; q0 < 0 beyond half a turn."""
+    phi = _vectors("phi", phi, 3)
+    x = np.linalg.norm(phi, axis=-1, keepdims=True)
+    small = x < 1e-4
+    ratio = np.where(small, 0.5 - x**2 / 48, np.sin(0.5 * x) / np.where(small, 1.0, x))
+    return np.concatenate([np.cos(0.5 * x), ratio * phi], axis=-1)
+
+
+def rotation_vector_from_quaternion(q: ArrayLike) -> Array:
+    """Rotation vectors (..., 3) [rad], at most pi long, of quaternions (..., 4).
+
+    Of the two vectors of half a turn it gives the one along (q1, q2, q3).
+    """
+    q = _scalar_positive(_unit(q))
+    vector = q[..., 1:]
+    n = np.linalg.norm(vector, axis=-1, keepdims=True)
+    tiny = n == 0.0
+    return vector * np.where(tiny, 2.0, 2.0 * np.arctan2(n, q[..., :1]) / np.where(tiny, 1.0, n))
+
+
+def dcm_from_rotation_vector(phi: ArrayLike) -> Array:
+    """Direction cosines T = exp(-[phi x]) (..., 3, 3) of rotation vectors phi (..., 3) [rad]."""
+    return dcm_from_quaternion(quaternion_from_rotation_vector(phi))
+
+
+def rotation_vector_from_dcm(T: ArrayLike) -> Array:
+    """Rotation vectors (..., 3) [rad], at most pi long, of direction cosines (..., 3, 3)."""
+    return rotation_vector_from_quaternion(quaternion_from_dcm(T))
+
+
+def rotation_vector_rate(phi: ArrayLike, omega: ArrayLike) -> Array:
+    """Rate (..., 3) [rad/s] of rotation vectors phi (..., 3) [rad] at body rates omega (..., 3) [rad/s].
+
+    phi_dot = omega + phi x omega / 2 + k phi x (phi x omega), k = (1 - x/2 cot(x/2))/x^2,
+    x = |phi|. It is singular at whole turns, x = 2 pi; keep |phi| <= pi.
+    """
+    phi, omega = _vectors("phi", phi, 3), _vectors("omega", omega, 3)
+    x = np.linalg.norm(phi, axis=-1, keepdims=True)
+    small = x < 0.05
+    safe = np.where(small, 1.0, x)
+    series = 1 / 12 + x**2 / 720 + x**4 / 30240
+    k = np.where(small, series, (1.0 - 0.5 * safe / np.tan(0.5 * safe)) / safe**2)
+    turn = np.cross(phi, omega)
+    return omega + 0.5 * turn + k * np.cross(phi, turn)
+
+
+def triangle_frame(r: ArrayLike, masses: ArrayLike | None = None) -> Array:
+    """Body frame of a triangle by the paper's recipe ("Body Frame Attachment"): T (..., 3, 3).
+
+    x points from the centre of mass to agent 3, y along r_1 - r_2 made orthogonal to x, and
+    z = x cross y. Positions r (..., 3, 3) [m], one row per agent; masses (3,) [kg], equal by
+    default. ValueError on a line, where the recipe has no y axis.
+    """
+    r = _vectors("r", r, 3, 3)
+    m = np.ones(3) if masses is None else np.asarray(masses, dtype=float)
+    if m.shape != (3,) or not np.all(m > 0):
+        raise ValueError(f"masses must be three positive numbers [kg], not {masses!r}")
+    x = r[..., 2, :] - m @ r / m.sum()
+    y = r[..., 0, :] - r[..., 1, :]
+    normal = np.cross(x, y)
+    sides = r - np.roll(r, 1, axis=-2)
+    longest = np.linalg.norm(sides, axis=-1).max(axis=-1)
+    flat = np.linalg.norm(normal, axis=-1) <= 1e-9 * longest**2
+    if np.any(flat):
+        raise ValueError(
+            "the three agents stand on a line (to 1e-9 of its length), where agent 3 and the side"
+            " 1-2 fix no plane: attach the frame before the line is reached, or fit the slots"
+        )
+    x = x / np.linalg.norm(x, axis=-1, keepdims=True)
+    z = normal / np.linalg.norm(normal, axis=-1, keepdims=True)
+    return np.stack([x, np.cross(z, x), z], axis=-2)
+
+
+def _vectors(name: str, value: ArrayLike, *shape: int) -> Array:
+    """Array of floats whose last axes have this shape."""
+    array = np.asarray(value, dtype=float)
+    if array.shape[-len(shape) :] != shape:
+        wanted = ", ".join(["...", *map(str, shape)])
+        raise ValueError(f"{name} must have the shape ({wanted}), not {array.shape}")
+    return array
+
+
+def _unit(q: ArrayLike) -> Array:
+    q = _vectors("q", q, 4)
+    norm = np.linalg.norm(q, axis=-1, keepdims=True)
+    if np.any(norm == 0.0):
+        raise ValueError(
+            "a quaternion of length zero is no attitude; no turn at all is (1, 0, 0, 0)"
+        )
+    return q / norm
+
+
+def _scalar_positive(q: Array) -> Array:
+    return np.where(q[..., :1] < 0.0, -q, q)

@@ -1,0 +1,329 @@
+"""Linear quadratic regulators: infinite and finite horizon, and the exact motions they make.
+
+For x' = A x + B u and the paper's cost (Table 2)
+
+    J = 1/2 x(T)^T S x(T) + 1/2 int_0^T (x^T Q x + u^T R u) dt
+
+the optimal input is u = -K x, K = R^-1 B^T P, where P(T - t) solves the Riccati equation back
+from P(0) = S. Weights are symmetric matrices, or lists of their diagonals. Each axis of a
+formation is a double integrator: x = (position, velocity), u the acceleration.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+# The double integrator.
+_A = np.array([[0.0, 1.0], [0.0, 0.0]])
+_B = np.array([[0.0], [1.0]])
+
+
+def infinite_horizon(A: ArrayLike, B: ArrayLike, Q: ArrayLike, R: ArrayLike) -> tuple[Array, Array]:
+    """Gain K (m, n) and cost P (n, n) for T to infinity: u = -K x.
+
+    P is the stabilising solution of A^T P + P A - P B R^-1 B^T P + Q = 0. ValueError where the
+    weights or shapes are wrong, or no gain both stabilises and is optimal.
+    """
+    from scipy.linalg import solve_continuous_are
+
+    A, B, Q, R = _system(A, B, Q, R)
+    for s in np.linalg.eigvals(A):
+        mode = A - s * np.eye(len(A))
+        if s.real >= 0.0 and np.linalg.matrix_rank(np.hstack([mode, B])) < len(A):
+            raise ValueError(
+                f"the input B does not reach the motion of A with eigenvalue {s:.3g}, which does not"
+                " settle by itself: no gain stabilises it"
+            )
+        if s.real == 0.0 and np.linalg.matrix_rank(np.vstack([mode, Q])) < len(A):
+            raise ValueError(
+                f"Q does not weigh the motion of A with eigenvalue {s:.3g}, so that an infinite"
+                " horizon leaves it where it is: weigh it (for a double integrator the position,"
+                " Q[0] > 0), or use a finite horizon"
+            )
+    try:
+        P = solve_continuous_are(A, B, Q, R)
+        slowest = -np.linalg.eigvals(A - B @ _solve(R, B.T @ P)).real.max()
+    except np.linalg.LinAlgError:
+        slowest = 0.0
+    if not slowest > 0.0:
+        raise ValueError(
+            "the Riccati equation has no stabilising solution within rounding: bring the entries of"
+            " Q and R closer together, or use a finite horizon"
+        )
+    # The equation's own flow, over 40 of the slowest time constants, takes rounding errors away.
+    P = _cost_to_go(A, B, Q, R, 0.5 * (P + P.T), np.array(40.0 / slowest))
+    return _solve(R, B.T @ P), P
+
+
+def finite_horizon(
+    A: ArrayLike, B: ArrayLike, Q: ArrayLike, R: ArrayLike, S: ArrayLike, time_to_go: ArrayLike
+) -> tuple[Array, Array]:
+    """Cost P (..., n, n) and gain K (..., m, n) at times to go T - t (...) [s]: u = -K x.
+
+    From the exponential of the Hamiltonian matrix, taken over a short step and doubled in a form
+    that keeps every part positive, so that horizons of any length neither overflow nor cancel.
+    With Q = 0 it is P = Phi^T (S^-1 + W)^-1 Phi. ValueError where a time to go is negative.
+    """
+    A, B, Q, R = _system(A, B, Q, R)
+    S = _weight("S", S, len(A))
+    P = _cost_to_go(A, B, Q, R, S, _times("time_to_go", time_to_go))
+    return P, _solve(R, B.T @ P)
+
+
+def closed_loop_response(
+    A: ArrayLike,
+    B: ArrayLike,
+    Q: ArrayLike,
+    R: ArrayLike,
+    S: ArrayLike,
+    T: float,
+    x0: ArrayLike,
+    times: ArrayLike,
+) -> tuple[Array, Array]:
+    """Optimal states x (K, n, ...) and inputs u (K, m, ...) at times (K,) [s] in [0, T] from x0 (n, ...).
+
+    The solution of the Hamiltonian's boundary problem, not an integration: every time stands for
+    itself. ValueError where a time lies outside [0, T].
+    """
+    A, B, Q, R = _system(A, B, Q, R)
+    S = _weight("S", S, len(A))
+    x0 = np.asarray(x0, dtype=float)
+    if x0.shape[:1] != (len(A),):
+        raise ValueError(f"x0 must have {len(A)} rows, one per state, not the shape {x0.shape}")
+    t, T = _times("times", times), float(_times("T", T))
+    if t.ndim != 1 or np.any(t > T * (1.0 + 1e-12)):
+        raise ValueError(f"times must be a list of times between 0 and T = {T} s")
+    P = _cost_to_go(A, B, Q, R, S, np.maximum(T - t, 0.0))
+    Phi, W, _ = _propagate(A, B @ _solve(R, B.T), Q, t)
+    x = _solve(np.eye(len(A)) + W @ P, Phi)
+    u = -_solve(R, B.T @ P @ x)
+    return np.tensordot(x, x0, axes=1), np.tensordot(u, x0, axes=1)
+
+
+def double_integrator_gains(Q: ArrayLike, R: ArrayLike) -> tuple[float, float]:
+    """Infinite-horizon gains k1 [1/s^2], k2 [1/s] of a double integrator: u = -k1 x - k2 v.
+
+    In closed form: k1 = sqrt(q1/r), k2 = sqrt(q2/r + 2 k1), whatever couples the two in Q.
+    """
+    _, _, Q, R = _system(_A, _B, Q, R)
+    if not Q[0, 0] > 0.0:
+        raise ValueError(
+            "an infinite horizon needs a weight on the position, Q[0] > 0: without one nothing"
+            " draws a resting vehicle to its target; or use a finite horizon"
+        )
+    k1 = math.sqrt(Q[0, 0] / R[0, 0])
+    return k1, math.sqrt(Q[1, 1] / R[0, 0] + 2.0 * k1)
+
+
+def finite_horizon_trajectory(
+    times: ArrayLike,
+    start: tuple[ArrayLike, ArrayLike] | Array,
+    target: tuple[ArrayLike, ArrayLike] | Array,
+    T: float,
+    Q: ArrayLike,
+    R: ArrayLike,
+    S: ArrayLike,
+) -> tuple[Array, Array, Array]:
+    """Flight of a double integrator to a moving target: x, v, a (K, ...) at times (K,) [s] in [0, T].
+
+    ``start`` = (x, v) at t = 0 and ``target`` = (x, v) at t = T [m, m/s], any shape, one entry
+    per axis. What is regulated is e = x - (x_target + v_target (t - T)): a target that stands
+    still is missed by far where a velocity is asked for on arrival.
+    """
+    t = _times("times", times)
+    x0, v0, x1, v1 = np.broadcast_arrays(*(np.asarray(z, dtype=float) for z in (*start, *target)))
+    e0 = np.stack([x0 - (x1 - T * v1), v0 - v1])
+    e, a = closed_loop_response(_A, _B, Q, R, S, T, e0, t)
+    since = (t - T).reshape(-1, *[1] * x0.ndim)
+    return x1 + since * v1 + e[:, 0], v1 + e[:, 1], a[:, 0]
+
+
+def infinite_horizon_trajectory(
+    times: ArrayLike,
+    start: tuple[ArrayLike, ArrayLike] | Array,
+    target: tuple[ArrayLike, ArrayLike] | Array,
+    T: float,
+    Q: ArrayLike,
+    R: ArrayLike,
+) -> tuple[Array, Array, Array]:
+    """The same flight under the infinite-horizon regulator, its gains constant.
+
+    The target is where it moves at t = T; one that rests makes T nothing but the end of ``times``.
+    """
+    # The cost of an infinite horizon, as the final weight, is the Riccati equation's rest point.
+    return finite_horizon_trajectory(
+        times, start, target, T, Q, R, infinite_horizon(_A, _B, Q, R)[1]
+    )
+
+
+def knots(
+    T: float, Q: ArrayLike, R: ArrayLike, S: ArrayLike | None = None, tolerance: float = 1e-10
+) -> Array:
+    """Knots (n + 1,) [s] from 0 to T between which quintics represent a flight of a double integrator.
+
+    Position and velocity deviate by at most ``tolerance``, relative to the largest they reach, from
+    any start: where the flight bends (at the start if Q is large, at the end if S is) pieces are
+    halved. One piece is exact for Q = 0, where the flight is a cubic. S = None: infinite horizon.
+    """
+    if not (math.isfinite(T) and T > 0):
+        raise ValueError(f"the horizon T must be positive [s], not {T}")
+    if S is None:
+        S = infinite_horizon(_A, _B, Q, R)[1]
+    _, _, Q, R = _system(_A, _B, Q, R)
+    fastest = np.abs(np.linalg.eigvals(_hamiltonian(_A, _B @ _solve(R, _B.T), Q))).max()
+    inside = np.array([0.25, 0.5, 0.75])
+    powers = np.arange(6)
+    u = inside[:, None] ** powers
+    u_dot = powers * inside[:, None] ** np.maximum(powers - 1, 0)
+    left, width = np.zeros(1), float(T)
+    result, largest = [np.zeros(1)], np.zeros((2, 2))
+    while left.size:
+        t = left[:, None] + width * np.array([0.0, *inside, 1.0])
+        # Two starts span all: at distance 1 with velocity 0, and the converse.
+        x, a = closed_loop_response(_A, _B, Q, R, S, T, np.eye(2), t.ravel())
+        x, a = x.reshape(*t.shape, 2, 2), a.reshape(*t.shape, 2)
+        largest = np.maximum(largest, np.abs(x).max(axis=(0, 1)))
+        # In units of the width, so that one set of powers serves all pieces.
+        ends = [z[:, [0, -1]] for z in (x[:, :, 0], width * x[:, :, 1], width**2 * a)]
+        c = _quintics(np.ones(len(left)), *(z.swapaxes(0, 1) for z in ends))
+        quintic = np.stack([c @ u.T, c @ u_dot.T / width], axis=2)
+        deviation = quintic - x[:, 1:-1].transpose(0, 3, 2, 1)
+        # Rounding of the positions enters the quintic's velocity divided by the width.
+        rounding = 16 * np.finfo(float).eps * largest[0] * np.array([[1.0], [1.0 / width]])
+        allowed = tolerance * largest + rounding
+        bad = np.any(np.abs(deviation) > allowed.T[..., None], axis=(1, 2, 3))
+        bad &= width * fastest > 1 / 64  # below, only rounding is left
+        result.append(left[~bad] + width)
+        width *= 0.5
+        left = np.concatenate([left[bad], left[bad] + width])
+    result.append(np.array([T]))
+    return np.unique(np.concatenate(result))
+
+
+def quintic_pieces(times: ArrayLike, x: ArrayLike, v: ArrayLike, a: ArrayLike) -> Array:
+    """Quintics that meet x, v, a (n + 1, ...) at the times (n + 1,) [s]: coefficients (n, ..., 6).
+
+    x(t) = sum_p coefficients[i, ..., p] (t - times[i])^p for times[i] <= t <= times[i + 1], with two
+    continuous derivatives. ValueError unless the times increase.
+    """
+    t = np.asarray(times, dtype=float)
+    x, v, a = (np.asarray(z, dtype=float) for z in (x, v, a))
+    if t.ndim != 1 or len(t) < 2 or not np.all(np.diff(t) > 0):
+        raise ValueError("times must be at least two increasing times [s]")
+    if not x.shape == v.shape == a.shape or x.shape[:1] != t.shape:
+        raise ValueError(
+            f"x, v and a must have one row for each of the {len(t)} times and the same shape,"
+            f" not {x.shape}, {v.shape} and {a.shape}"
+        )
+    return _quintics(np.diff(t), (x[:-1], x[1:]), (v[:-1], v[1:]), (a[:-1], a[1:]))
+
+
+def _quintics(h: Array, x: ArrayLike, v: ArrayLike, a: ArrayLike) -> Array:
+    """Coefficients (n, ..., 6) from both ends' (2, n, ...) values, widths h (n,)."""
+    (x0, x1), (v0, v1), (a0, a1) = (np.asarray(z) for z in (x, v, a))
+    h = h.reshape(-1, *[1] * (x0.ndim - 1))
+    # What a parabola from the left end misses at the right one.
+    x = (x1 - x0 - h * (v0 + 0.5 * h * a0)) / h**3
+    v = (v1 - v0 - h * a0) / h**2
+    a = (a1 - a0) / h
+    c = [x0, v0, 0.5 * a0, 10 * x - 4 * v + 0.5 * a, (-15 * x + 7 * v - a) / h]
+    return np.stack([*c, (6 * x - 3 * v + 0.5 * a) / h**2], axis=-1)
+
+
+def _cost_to_go(A: Array, B: Array, Q: Array, R: Array, S: Array, tau: Array) -> Array:
+    """P (..., n, n) at times to go tau (...)."""
+    Phi, W, V = _propagate(A, B @ _solve(R, B.T), Q, tau)
+    P = V + _transposed(Phi) @ _solve(np.eye(len(A)) + S @ W, S @ Phi)
+    return 0.5 * (P + _transposed(P))
+
+
+def _propagate(A: Array, G: Array, Q: Array, tau: Array) -> tuple[Array, Array, Array]:
+    """Phi, W, V (..., n, n): x(tau) = Phi x(0) - W y(tau), y(0) = V x(0) + Phi^T y(tau).
+
+    The flow of the Hamiltonian system x' = A x - G y, y' = -Q x - A^T y over tau, solved for what
+    is known of its boundary problem. Its exponential would grow as fast as y does; these do not:
+    W and V grow from zero, never shrink, and Phi tends to the closed loop's transition.
+    """
+    n = len(A)
+    identity = np.eye(n)
+    backward = -_hamiltonian(A, G, Q)
+    rate = np.abs(np.linalg.eigvals(backward)).max()
+    with np.errstate(divide="ignore"):
+        doublings = np.ceil(np.log2(2.0 * rate * tau)).clip(min=0.0)
+    # Taylor's series, for every entry keeps its own leading power of the step: a Pade approximant
+    # would round the small ones (W begins with the third power) to the size of the large.
+    step = backward * (tau * 0.5**doublings)[..., None, None]
+    E = term = step
+    for k in range(2, 25):
+        term = term @ step / k
+        E = E + term
+    # D = Phi - 1 in place of Phi: squaring a matrix near 1 doubles its rounding error each time.
+    D = -_solve(identity + E[..., :n, :n], E[..., :n, :n])
+    W = E[..., :n, n:] + D @ E[..., :n, n:]
+    V = E[..., n:, :n] + E[..., n:, :n] @ D
+    for k in range(int(doublings.max(initial=0.0))):
+        more = doublings > k
+        d, w, v = D[more], W[more], V[more]
+        phi, wv = identity + d, w @ v
+        turn = _solve(identity + wv, np.concatenate([wv, w @ _transposed(phi)], axis=-1))
+        loss, reach = turn[..., :n], turn[..., n:]
+        D[more] = 2.0 * d + d @ d - phi @ loss @ phi
+        W[more] = w + phi @ reach
+        V[more] = v + _transposed(phi) @ v @ (phi - loss @ phi)
+    return identity + D, W, V
+
+
+def _hamiltonian(A: Array, G: Array, Q: Array) -> Array:
+    return np.block([[A, -G], [-Q, -A.T]])
+
+
+def _solve(M: Array, b: Array) -> Array:
+    return np.linalg.solve(M, b).astype(float, copy=False)
+
+
+def _transposed(M: Array) -> Array:
+    return np.swapaxes(M, -1, -2)
+
+
+def _system(
+    A: ArrayLike, B: ArrayLike, Q: ArrayLike, R: ArrayLike
+) -> tuple[Array, Array, Array, Array]:
+    """A (n, n), B (n, m), Q (n, n) >= 0 and R (m, m) > 0, checked."""
+    A, B = np.asarray(A, dtype=float), np.asarray(B, dtype=float)
+    if A.ndim != 2 or A.shape[0] != A.shape[1] or B.ndim != 2 or len(B) != len(A):
+        raise ValueError(f"A must be (n, n) and B (n, m), not {A.shape} and {B.shape}")
+    if not (np.all(np.isfinite(A)) and np.all(np.isfinite(B))):
+        raise ValueError("A and B must be finite")
+    R = _weight("R", R, B.shape[1])
+    if np.linalg.eigvalsh(R)[0] <= 0.0:
+        raise ValueError("R must be positive definite: every input has to cost something")
+    return A, B, _weight("Q", Q, len(A)), R
+
+
+def _weight(name: str, value: ArrayLike, n: int) -> Array:
+    """A symmetric positive semi-definite weight (n, n), from it or its diagonal."""
+    weight = np.asarray(value, dtype=float)
+    if weight.shape == (n,) or (n == 1 and weight.shape == ()):
+        weight = np.diag(weight.reshape(n))
+    if weight.shape != (n, n):
+        raise ValueError(f"{name} must be ({n}, {n}) or its diagonal ({n},), not {weight.shape}")
+    if not np.all(np.isfinite(weight)):
+        raise ValueError(f"{name} must be finite; a very large weight asks for a value exactly")
+    size = np.abs(weight).max()
+    if np.abs(weight - weight.T).max() > 1e-12 * size:
+        raise ValueError(
+            f"{name} must be symmetric; use ({name} + {name}^T)/2, which costs the same"
+        )
+    if np.linalg.eigvalsh(weight)[0] < -1e-12 * size:
+        raise ValueError(f"{name} must not be negative in any direction: it is a cost")
+    return weight
+
+
+def _times(name: str, value: ArrayLike) -> Array:
+    t = np.asarray(value, dtype=float)
+    if not np.all(np.isfinite(t)) or np.any(t < 0.0):
+        raise ValueError(f"{name} must be finite and not negative [s]")
+    return t
