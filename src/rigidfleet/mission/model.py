@@ -39,7 +39,7 @@ class Mission(Contents):
         MissionError
             With a finding for each error.
         """
-        mission = cls(**check(_parse(text, origin), origin))
+        mission = cls.model_construct(**check(_parse(text, origin), origin))
         mission._text, mission._origin = text, origin
         return mission
 

@@ -406,6 +406,9 @@ class Header(Part):
 class Contents(Header):
     """A whole mission file."""
 
+    # Its tables are validated one by one; as a whole it is only needed for its schema.
+    model_config = ConfigDict(defer_build=True)
+
     agents: Agents = Field(description="the vehicles: [agents]")
     constraint: Constraint = Field(
         default_factory=Constraint, description="the constraint force: [constraint]"
