@@ -200,7 +200,7 @@ def _vehicles(m: Array) -> k.Vehicles:
 
 
 def _masses_and_points(masses: ArrayLike, points: ArrayLike) -> tuple[Array, Array]:
-    r = np.ascontiguousarray(points, dtype=float)
+    r = np.array(points, dtype=float, order="C")
     if r.ndim != 2 or r.shape[1] != 3:
         raise ValueError(f"positions must be (N, 3), not {r.shape}")
     m = _full(masses, (len(r),), "masses")
@@ -211,7 +211,8 @@ def _masses_and_points(masses: ArrayLike, points: ArrayLike) -> tuple[Array, Arr
 
 def _full(value: ArrayLike, shape: tuple[int, ...], name: str) -> Array:
     try:
-        return np.ascontiguousarray(np.broadcast_to(np.asarray(value, dtype=float), shape))
+        # A copy: a view that cannot be written is another type, and compiles the call once more.
+        return np.array(np.broadcast_to(np.asarray(value, dtype=float), shape), order="C")
     except ValueError:
         raise ValueError(f"{name} must be {shape}, not {np.shape(value)}") from None
 
