@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Self, get
 import numpy as np
 from numpy.typing import NDArray
 
+from rigidfleet import attitude
 from rigidfleet.errors import MissionError, ResultError
 
 if TYPE_CHECKING:
@@ -296,8 +297,7 @@ class Result:
         ResultError
             The file cannot be written.
         """
-        w, x, y, z = self.attitude.T
-        yaw = np.degrees(np.arctan2(2 * (x * y + w * z), w**2 + x**2 - y**2 - z**2))
+        yaw = np.degrees(attitude.euler_from_quaternion(self.attitude)[:, 2])
         keep = np.append(np.nextafter(self.time[:-1], math.inf) < self.time[1:], True)
         lines = ["time_s,agent,x_m,y_m,z_m,vx_m_s,vy_m_s,vz_m_s,yaw_deg\n"]
         state = np.concatenate([self.position, self.velocity], axis=2)

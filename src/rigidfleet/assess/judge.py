@@ -1,0 +1,294 @@
+"""What holds and what does not: the checks of a flight, and what is worth a note."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+
+from rigidfleet.assess.measure import Flight, Floats, angle_between, is_rigid
+from rigidfleet.assess.verdict import (
+    DIP,
+    FLIPPED,
+    SHAPE_TOLERANCE,
+    WAYPOINT_TOLERANCE,
+    Extreme,
+    Finding,
+    PhaseVerdict,
+    Verdict,
+    names,
+    value,
+)
+from rigidfleet.result import Result
+
+# Rounding on a limit is not beyond it.
+_SLACK = 1e-9
+
+
+def findings(flight: Flight, verdict: Verdict) -> Iterator[Finding]:
+    """Every check of a flight: of one that can fail in several phases all that do, else the worst."""
+    yield _complete(flight.result)
+    candidates = [
+        *_settled(verdict.phases),
+        *_shapes(flight, verdict.phases),
+        *_waypoints(verdict.phases),
+    ]
+    yield from _failures_or_worst(candidates)
+    worst = verdict.worst
+    if "separation" in worst:
+        yield _separation(flight, worst["separation"])
+    if "clearance" in worst:
+        yield _clearance(flight, worst["clearance"])
+    limits = flight.mission.limits
+    if limits.separation_below is not None:
+        yield _downwash(flight, limits.separation_below)
+    if limits.geofence is not None:
+        yield _geofence(flight, np.array(limits.geofence.min), np.array(limits.geofence.max))
+    yield _bounded("speed", worst.get("speed"), "m/s", limits.speed)
+    yield _bounded("acceleration", worst.get("acceleration"), "m/s^2", limits.acceleration)
+    yield _thrust(flight, worst.get("thrust"))
+    units = {"constraint": "m", "constraint_force": "N", "tension": "N", "singular_value": ""}
+    yield from (_bounded(name, worst[name], units[name], None) for name in units if name in worst)
+
+
+def _failures_or_worst(candidates: Iterable[Finding]) -> Iterator[Finding]:
+    """Of the findings of each check all that fail, or else the one nearest to its limit."""
+    by_check: dict[str, list[Finding]] = {}
+    for finding in candidates:
+        by_check.setdefault(finding.check, []).append(finding)
+    for found in by_check.values():
+        failed = [finding for finding in found if not finding.passed]
+        yield from failed or [max(found, key=lambda f: (f.worst or 0.0) / (f.limit or 1.0))]
+
+
+def _complete(result: Result) -> Finding:
+    end = float(result.time[-1])
+    finite = np.isfinite(result.position).all(axis=(1, 2))
+    if not finite.all():
+        bad = float(result.time[int(np.argmin(finite))])
+        return Finding("complete", False, f"positions are not finite from {bad:.2f} s on", when=bad)
+    if result.complete:
+        return Finding("complete", True, f"flown to its end at {end:.2f} s", when=end)
+    words = f"incomplete, it ends at {end:.2f} s: {result.ending or 'it was stopped'}"
+    return Finding("complete", False, words, when=end, phase=result.phases[-1].name)
+
+
+def _settled(phases: list[PhaseVerdict]) -> Iterator[Finding]:
+    for p in phases:
+        if p.settled is not None:
+            how = "settled after" if p.settled else "did not settle within"
+            words = f"phase '{p.name}' {how} {p.t_end - p.t_start:.2f} s"
+            yield Finding("settled", p.settled, words, when=p.t_end, phase=p.name)
+
+
+def _shapes(flight: Flight, phases: list[PhaseVerdict]) -> Iterator[Finding]:
+    """Whether formations are what they should be, where they should be by then."""
+    for i, p in enumerate(phases):
+        shaping = p.kind in ("establish", "reshape") or i == len(phases) - 1
+        if not (shaping and p.finished) or p.formation is None or p.distances is None:
+            continue
+        edges = flight.mission.formation_edges(p.formation)
+        limit = SHAPE_TOLERANCE * float(flight.mission.formation_distances(p.formation).min())
+        held = p.distances <= limit
+        words = f"{value(p.distances, 'm')} off (limit {value(limit, 'm')})"
+        words = f"the worst of the {len(edges)} edges of '{p.formation}' is {words}"
+        yield _at_end(p, "distances", held, words, p.distances, limit, "m")
+        if i not in flight.fits:
+            continue
+        fit = flight.fits[i]
+        passed = fit.error <= fit.limit
+        who = names(fit.pair)
+        words = (
+            f"{who} are {value(fit.flown, 'm')} apart instead of {value(fit.intended, 'm')}"
+            f" (limit {value(fit.limit, 'm')} off)"
+        )
+        if held and not passed:
+            last = flight.result.position[flight.result.samples(i).stop - 1]
+            form = flight.mission.formations[p.formation].shape
+            wanted = f"no {form}" if form else f"not the shape of '{p.formation}'"
+            state = "rigid, but" if is_rigid(last, edges) else "held by its edges, but"
+            words = f"'{p.formation}' is {state} {wanted}: all {len(edges)} edges hold, yet {words}"
+        elif not passed:
+            words = f"'{p.formation}' is not reached: {words}"
+        else:
+            words = f"'{p.formation}' is reached: {words}"
+        yield _at_end(p, "shape", passed, words, fit.error, fit.limit, "m", who=who)
+        if fit.in_order is not None:
+            words = f"the agents of '{p.formation}' are {'' if fit.in_order else 'not '}in order"
+            yield _at_end(p, "order", fit.in_order, words)
+        if not passed:
+            continue  # of another shape, a hand or a side says nothing
+        if p.handedness is not None:
+            words = "its own mirror image" if fit.mirrored else "of the right hand"
+            yield _at_end(p, "handedness", p.handedness, f"'{p.formation}' is {words}")
+        if p.flip is not None:
+            what = "normal" if fit.dimension == 2 else "direction"
+            flipped = "has flipped" if p.flip > FLIPPED else "lies well"
+            words = f"{what} is {value(p.flip, 'deg')} from where it should point"
+            words = f"'{p.formation}' {flipped}: its {words}"
+            yield _at_end(p, "flip", p.flip <= FLIPPED, words, p.flip, FLIPPED, "deg")
+
+
+def _at_end(
+    p: PhaseVerdict,
+    check: str,
+    passed: bool,
+    words: str,
+    worst: float | None = None,
+    limit: float | None = None,
+    unit: str = "",
+    who: str = "",
+) -> Finding:
+    """A finding about the end of a phase."""
+    words = f"at the end of phase '{p.name}' ({p.t_end:.2f} s) {words}"
+    return Finding(check, passed, words, worst, limit, unit, when=p.t_end, who=who, phase=p.name)
+
+
+def _waypoints(phases: list[PhaseVerdict]) -> Iterator[Finding]:
+    for name, limit in WAYPOINT_TOLERANCE.items():
+        unit = {"position": "m", "velocity": "m/s", "attitude": "deg", "rates": "deg/s"}[name]
+        for p in phases:
+            miss = getattr(p.waypoint, name) if p.waypoint is not None else None
+            if p.waypoint is not None and miss is not None:
+                when, passed = p.waypoint.time, miss <= limit
+                words = f"{'met' if passed else 'missed'}, {value(miss, unit)} off in {name}"
+                words = f"the waypoint of phase '{p.name}' is {words} (limit {limit:g} {unit})"
+                check = f"waypoint_{name}"
+                yield Finding(check, passed, words, miss, limit, unit, when=when, phase=p.name)
+
+
+def _bounded(
+    check: str,
+    e: Extreme | None,
+    unit: str,
+    limit: float | None,
+    words: str = "",
+    *,
+    passed: bool | None = None,
+    at_least: bool = False,
+) -> Finding:
+    """A worst value against its limit, if it has one."""
+    if e is None:
+        words = words or f"no {check} to judge"
+        return Finding(check, True, words, None, limit, unit, at_least, judged=limit is not None)
+    if not words:
+        name = check.replace("_", " ").replace("value", "value of J")
+        who = f", {e.who}," if e.who else ""
+        bound = "" if limit is None else f" (limit {limit:g} {unit})"
+        extreme = "smallest" if check == "singular_value" else "greatest"
+        words = f"{extreme} {name} {value(e.value, unit)}{who} at {e.when:.2f} s{bound}"
+    if passed is None:
+        passed = limit is None or e.value <= limit + _SLACK * max(1.0, abs(limit))
+    return Finding(
+        check, passed, words, e.value, limit, unit, at_least, e.when, e.who, e.phase, limit is not None
+    )  # fmt: skip
+
+
+def _separation(flight: Flight, e: Extreme) -> Finding:
+    limit = flight.mission.limits.separation or 0.0
+    passed = e.value > 0 and e.value >= limit - _SLACK
+    words = f"{e.who} come within {value(e.value, 'm')} of each other at {e.when:.2f} s"
+    words += f" (limit {limit:g} m)"
+    if e.value <= 0:
+        since = flight.first(flight.result.separation <= 0)
+        depth = f"by {value(-e.value, 'm')} at {e.when:.2f} s"
+        words = f"agents collide, first at {since}; {e.who} overlap the most, {depth}"
+    return _bounded("separation", e, "m", limit, words, passed=passed, at_least=True)
+
+
+def _clearance(flight: Flight, e: Extreme) -> Finding:
+    agent, obstacle = e.who.split(", ", 1)
+    words = f"{agent} comes within {value(e.value, 'm')} of '{obstacle}' at {e.when:.2f} s"
+    if e.value <= 0:
+        since = flight.first(flight.result.clearance <= 0)
+        depth = f"by {value(-e.value, 'm')} at {e.when:.2f} s"
+        words = f"obstacles are hit, first at {since}; {agent} is deepest in '{obstacle}', {depth}"
+    return _bounded("clearance", e, "m", 0.0, words, passed=e.value > 0, at_least=True)
+
+
+def _downwash(flight: Flight, limit: float) -> Finding:
+    """Least vertical room between two agents of which one is below the other."""
+    r, radius = flight.result.position, np.array(flight.mission.agents.radius)
+    least, who = np.full(len(r), np.inf), np.zeros((len(r), 2), dtype=np.int64)
+    for i in range(r.shape[1] - 1):
+        apart, radii = r[:, i + 1 :] - r[:, i : i + 1], radius[i] + radius[i + 1 :]
+        beside = np.hypot(apart[..., 0], apart[..., 1]) >= radii
+        room = np.where(beside, np.inf, np.abs(apart[..., 2]) - radii)
+        j = room.argmin(axis=1)
+        room = room[np.arange(len(r)), j]
+        closer = room < least
+        least[closer] = room[closer]
+        who[closer] = np.column_stack([np.full(len(r), i), i + 1 + j])[closer]
+    e = flight.extreme(least, lambda k: names(who[k]), lambda x: -x)
+    if e is None:
+        return _bounded("separation_below", e, "m", limit, "nobody is below another", at_least=True)
+    passed = e.value >= limit - _SLACK
+    words = f"{e.who} fly one below the other with {value(e.value, 'm')} between them"
+    words += f" at {e.when:.2f} s (limit {limit:g} m)"
+    return _bounded("separation_below", e, "m", limit, words, passed=passed, at_least=True)
+
+
+def _geofence(flight: Flight, low: Floats, high: Floats) -> Finding:
+    r = flight.result.position
+    e = flight.extreme(np.maximum(low - r, r - high).max(axis=2), flight.agent)
+    assert e is not None
+    words = f"{e.who} comes within {value(-e.value, 'm')} of the geofence at {e.when:.2f} s"
+    if e.value > 0:
+        words = f"{e.who} leaves the geofence by {value(e.value, 'm')} at {e.when:.2f} s"
+    return _bounded("geofence", e, "m", 0.0, words)
+
+
+def _thrust(flight: Flight, e: Extreme | None) -> Finding:
+    most = np.array(flight.mission.agents.thrust_limit)
+    beyond = flight.extreme(flight.result.thrust - most, flight.agent)
+    if beyond is None:
+        return _bounded("thrust", e, "N", None)
+    # The agent nearest to its own limit, or furthest beyond.
+    limit = float(most[int(beyond.who.removeprefix("agent ")) - 1])
+    e = Extreme(beyond.value + limit, beyond.when, beyond.who, beyond.phase)
+    return _bounded("thrust", e, "N", limit)
+
+
+# -- notes -------------------------------------------------------------------------------------------
+
+
+def notes(flight: Flight, phases: list[PhaseVerdict]) -> Iterator[str]:
+    """What fails nothing and yet should be known."""
+    yield from _dips(flight)
+    yield from _turned_over(flight, phases)
+    agents = flight.mission.agents
+    if agents.saturate:
+        full = flight.result.thrust >= np.array(agents.thrust_limit) * (1 - 1e-6)
+        if full.any():
+            who, since = names(np.flatnonzero(full.any(axis=0))), flight.first(full.max(axis=1))
+            yield f"the thrust of {who} is cut off at its limit, first at {since}"
+
+
+def _dips(flight: Flight) -> Iterator[str]:
+    """Agents below z = 0 where neither ground nor geofence would tell."""
+    mission, z = flight.mission, flight.result.position[..., 2]
+    if mission.limits.geofence is not None or any(o.kind == "ground" for o in mission.obstacles):
+        return
+    low = np.flatnonzero((z < -DIP).any(axis=0))
+    e = flight.extreme(z, flight.agent, lambda x: -x)
+    if len(low) and e is not None:
+        others = f" ({names(low)} are below 0 at times)" if len(low) > 1 else ""
+        words = f"dips to z = {e.value:.2f} m at {e.when:.2f} s{others}"
+        yield f"{e.who} {words}; the mission has no ground"
+
+
+def _turned_over(flight: Flight, phases: list[PhaseVerdict]) -> Iterator[str]:
+    """Planar formations that come back with another side up where nothing commands an attitude."""
+    seen: dict[str, tuple[Floats, float]] = {}
+    for i, p in enumerate(phases):
+        fit = flight.fits.get(i)
+        if fit is None or p.formation is None or fit.dimension != 2 or p.flip is not None:
+            continue
+        if not p.finished or fit.error > fit.limit:
+            continue
+        normal, since = seen.setdefault(p.formation, (fit.points, p.t_end))
+        if angle_between(normal, fit.points) > FLIPPED:
+            yield (
+                f"'{p.formation}' lies with its other side up at {p.t_end:.2f} s than at {since:.2f} s;"
+                " nothing commands its attitude"
+            )

@@ -1,0 +1,226 @@
+"""What was flown, in numbers: shapes against their slots, waypoints, extremes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigidfleet import attitude as att
+from rigidfleet import formation as shapes
+from rigidfleet.assess.verdict import SENSE, SHAPE_TOLERANCE, Extreme, PhaseVerdict, Waypoint, names
+from rigidfleet.result import PhaseRecord, Result
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+# Slots thinner than this, relative to their length, are planar or straight: distances of seven digits
+# leave a flat shape 3e-4 thick.
+_THIN = 1e-3
+
+
+class Fit:
+    """A formation as flown at one sample, p (N, 3), against its slots (N, 3)."""
+
+    def __init__(self, p: Floats, slots: Floats) -> None:
+        self.error, self.pair, self.flown, self.intended, self.shortest = _all_pairs(p, slots)
+        p, slots = shapes.centred(p), shapes.centred(slots)
+        self.dimension = shapes.dimension(slots, _THIN)
+        self.mirrored = self.dimension == 3 and bool(np.linalg.det(p.T @ slots) < 0)
+        axes = np.linalg.svd(slots)[2]
+        #: Direction of a line or normal of a plane, in the slots' axes, and where it points in the world.
+        self.axis: Floats = axes[0] if self.dimension == 1 else axes[2]
+        self.points: Floats = shapes.kabsch(p, slots) @ self.axis
+        self.in_order: bool | None = None
+        if self.dimension == 1 and len(p) > 2:
+            asked = np.argsort(slots @ self.axis).tolist()
+            flown = np.argsort(p @ np.linalg.svd(p)[2][0]).tolist()
+            self.in_order = flown in (asked, asked[::-1])
+
+    @property
+    def limit(self) -> float:
+        """Greatest error of a pair [m]."""
+        return SHAPE_TOLERANCE * self.shortest
+
+    def angle_from(self, quaternion: Floats) -> float:
+        """Angle [deg] from where the axis would point in an attitude (4,); NaN where there is none."""
+        if not np.isfinite(quaternion).all():
+            return math.nan
+        return angle_between(self.points, att.dcm_from_quaternion(quaternion).T @ self.axis)
+
+
+class Flight:
+    """Measures a result, phase by phase."""
+
+    def __init__(self, result: Result) -> None:
+        self.result, self.mission = result, result.mission
+        self.labels = result.edge_labels
+        self.fits: dict[int, Fit] = {}
+        norm = np.linalg.norm
+        self.measured: dict[str, tuple[Floats, Callable[..., str]]] = {
+            "constraint": (np.abs(result.constraint), self.edge),
+            "separation": (result.separation, self.pair),
+            "clearance": (result.clearance, self.obstacle),
+            "thrust": (result.thrust, self.agent),
+            "speed": (norm(result.velocity, axis=2), self.agent),
+            "acceleration": (norm(result.acceleration, axis=2), self.agent),
+            "constraint_force": (norm(result.constraint_force, axis=2), self.agent),
+            "tension": (-result.multiplier, self.edge),
+            "singular_value": (result.singular_value, lambda k: ""),
+        }
+
+    def agent(self, _k: int, i: int) -> str:
+        """Name of agent i (from 0), at whichever sample."""
+        return f"agent {i + 1}"
+
+    def edge(self, _k: int, e: int) -> str:
+        """Name of edge e (from 0), at whichever sample."""
+        return f"edge {self.labels[e]}"
+
+    def pair(self, k: int) -> str:
+        """The two agents that are nearest to each other at sample k."""
+        return names(np.sort(self.result.separation_pair[k]))
+
+    def obstacle(self, k: int) -> str:
+        """The agent that is nearest to an obstacle at sample k, and the obstacle."""
+        name = self.mission.obstacles[self.result.clearance_obstacle[k]].name
+        return f"agent {self.result.clearance_agent[k] + 1}, {name}"
+
+    def at(self, k: int) -> dict[str, Any]:
+        """When sample k is, and in which phase."""
+        return {
+            "when": float(self.result.time[k]),
+            "phase": self.result.phases[self.result.phase[k]].name,
+        }
+
+    def first(self, broken: NDArray[np.bool_]) -> str:
+        """Time of the first sample at which something is broken, in words."""
+        return f"{self.result.time[int(np.argmax(broken))]:.2f} s"
+
+    def extreme(
+        self,
+        values: Floats,
+        who: Callable[..., str],
+        sense: Callable[..., Any] = lambda x: x,
+        samples: slice = slice(None),
+    ) -> Extreme | None:
+        """Where sense(values) is greatest; values (K, ...), of which only the finite ones count."""
+        part = values[samples]
+        rank = np.where(np.isfinite(part), sense(part), -np.inf)
+        if rank.max(initial=-np.inf) == -np.inf:
+            return None
+        at = np.unravel_index(int(rank.argmax()), rank.shape)
+        k = (samples.start or 0) + int(at[0])
+        return Extreme(float(part[at]), who=who(k, *map(int, at[1:])), **self.at(k))
+
+    def phase(self, index: int, record: PhaseRecord) -> PhaseVerdict:
+        """Numbers of a phase."""
+        result, samples = self.result, self.result.samples(index)
+        flown, last = samples.stop > samples.start, samples.stop - 1
+        finished = flown and (result.complete or index < len(result.phases) - 1)
+        fit = distances = flip = constraint = None
+        if flown:
+            constraint = _greatest(result.constraint[last])
+        if flown and record.formation is not None:
+            p = result.position[last]
+            slots = self.mission.formation_slots(record.formation)
+            edges = self.mission.formation_edges(record.formation)
+            intended = self.mission.formation_distances(record.formation)
+            distances = _greatest(shapes.distances(p, edges) - intended)
+            if slots is not None and len(slots) > 1 and np.isfinite(p).all():
+                fit = self.fits[index] = Fit(p, slots)
+                flip = self.flip(fit, record, last)
+        extremes = {
+            name: self.extreme(values, who, SENSE[name], samples)
+            for name, (values, who) in self.measured.items()
+        }
+        return PhaseVerdict(
+            name=record.name,
+            kind=record.kind,
+            control=record.control,
+            formation=record.formation,
+            t_start=record.t_start,
+            t_end=record.t_end,
+            settled=record.settled,
+            finished=finished,
+            constraint=constraint,
+            distances=distances,
+            shape=None if fit is None else fit.error,
+            handedness=None if fit is None or fit.dimension < 3 else not fit.mirrored,
+            flip=flip,
+            order=None if fit is None else fit.in_order,
+            waypoint=self.waypoint(record, samples) if finished else None,
+            worst={name: found for name, found in extremes.items() if found is not None},
+        )
+
+    def flip(self, fit: Fit, record: PhaseRecord, k: int) -> float | None:
+        """Angle [deg] of a line or plane from where it should point at sample k; None if nothing says."""
+        references = [self.result.attitude_reference[k]]
+        if fit.dimension == 2:
+            references.append(self.result.frame[k])
+        elif fit.dimension != 1 or record.control != "slots":
+            # Only tracked slots steer a line; else it keeps the direction of what it was folded from.
+            return None
+        return max((a for q in references if math.isfinite(a := fit.angle_from(q))), default=None)
+
+    def waypoint(self, record: PhaseRecord, samples: slice) -> Waypoint | None:
+        """Miss at the waypoint's time, or at the phase's end if it settles before."""
+        target = record.target
+        if target is None:
+            return None
+        result = self.result
+        k = samples.start + int(np.abs(result.time[samples] - target["time"]).argmin())
+
+        def miss(name: str, flown: Floats) -> float | None:
+            asked = target.get(name)
+            if asked is None or not np.isfinite(flown).all():
+                return None
+            if name == "attitude":
+                return math.degrees(float(att.angle_between(flown, asked)))
+            return float(np.linalg.norm(flown - np.asarray(asked)))
+
+        rates = miss("rates", result.rates[k])
+        return Waypoint(
+            time=float(result.time[k]),
+            position=miss("position", result.cm[k]),
+            velocity=miss("velocity", result.cm_velocity[k]),
+            attitude=miss("attitude", result.attitude[k]),
+            rates=None if rates is None else math.degrees(rates),
+        )
+
+
+def _all_pairs(p: Floats, slots: Floats) -> tuple[float, tuple[int, int], float, float, float]:
+    """Worst error of a distance: error, pair, flown, intended; and the shortest intended [m]."""
+    worst, shortest = (-1.0, (0, 0), 0.0, 0.0), np.inf
+    for i in range(len(p) - 1):
+        flown = np.linalg.norm(p[i + 1 :] - p[i], axis=1)
+        intended = np.linalg.norm(slots[i + 1 :] - slots[i], axis=1)
+        error = np.abs(flown - intended)
+        j = int(error.argmax())
+        if error[j] > worst[0]:
+            worst = (float(error[j]), (i, i + 1 + j), float(flown[j]), float(intended[j]))
+        shortest = min(shortest, float(intended.min()))
+    return *worst, shortest
+
+
+def is_rigid(p: Floats, edges: Ints) -> bool:
+    """Whether edges (m, 2) at positions (N, 3) are infinitesimally rigid in space: rank J = 3N - 6."""
+    i, j = edges.T
+    u = p[i] - p[j]
+    J = np.zeros((len(edges), len(p), 3))
+    rows = np.arange(len(edges))
+    J[rows, i], J[rows, j] = u, -u
+    return np.linalg.matrix_rank(J.reshape(len(edges), -1), rtol=1e-6) == 3 * len(p) - 6
+
+
+def _greatest(values: Floats) -> float | None:
+    values = np.abs(values[np.isfinite(values)])
+    return float(values.max()) if len(values) else None
+
+
+def angle_between(a: Floats, b: Floats) -> float:
+    """Angle [deg] between two vectors."""
+    return math.degrees(math.atan2(float(np.linalg.norm(np.cross(a, b))), float(a @ b)))
