@@ -67,13 +67,11 @@ def error_response(
     unstable gains. t has any shape, c0, cdot0 and I0 broadcast against each other (one entry per
     edge, say); the results have the shape of t followed by theirs.
     """
-    from scipy.linalg import expm
-
     c0, cdot0, I0 = np.broadcast_arrays(*(np.asarray(z, dtype=float) for z in (c0, cdot0, I0)))
     t = np.asarray(t, dtype=float)
     p, A = _companion(alpha, beta, gamma)
     z0 = np.stack([p * I0, c0, cdot0 / p])
-    z = np.tensordot(expm(A * (p * t)[..., None, None]), z0, axes=1)
+    z = np.tensordot(_exponential(A, p * t), z0, axes=1)
     integral, c, c_dot = np.moveaxis(z, t.ndim, 0)
     return c, p * c_dot, integral / p
 
@@ -116,10 +114,28 @@ def _companion(alpha: float, beta: float, gamma: float) -> tuple[float, Array]:
     return p, np.array([[0, 1, 0], [0, 0, 1], [-gamma / p**3, -((beta / p) ** 2), -2 * alpha / p]])
 
 
+def _exponential(A: Array, x: Array) -> Array:
+    """e^(A x) (..., n, n) for x (...): Taylor's series of a step |A x| <= 1/2, then doubled.
+
+    Much faster on many small matrices than `scipy.linalg.expm`. What is doubled is e^(A x) - 1:
+    squaring a matrix near 1 doubles its rounding error each time.
+    """
+    with np.errstate(divide="ignore"):
+        doublings = np.ceil(np.log2(2.0 * np.linalg.norm(A) * np.abs(x))).clip(min=0.0)
+    step = A * (x * 0.5**doublings)[..., None, None]
+    D = term = step
+    for k in range(2, 17):
+        term = term @ step / k
+        D = D + term
+    for k in range(int(doublings.max(initial=0.0))):
+        more = doublings > k
+        d = D[more]
+        D[more] = 2.0 * d + d @ d
+    return np.eye(len(A)) + D
+
+
 def _time_grid(alpha: float, beta: float, gamma: float, tolerance: float) -> Array:
     """Times from 0 until |c| is below tolerance for good, dense enough to see every swing."""
-    from scipy.linalg import expm, solve_continuous_lyapunov
-
     if not is_stable(alpha, beta, gamma):
         raise ValueError(
             f"alpha = {alpha}, beta = {beta}, gamma = {gamma} are unstable: choose"
@@ -128,12 +144,13 @@ def _time_grid(alpha: float, beta: float, gamma: float, tolerance: float) -> Arr
     p, A = _companion(alpha, beta, gamma)
     first = 1 if gamma == 0 else 0  # without gamma the integral is no part of the error's dynamics
     A = A[first:, first:]
-    X = solve_continuous_lyapunov(A.T, -np.eye(len(A)))
-    z0 = np.eye(len(A))[:, 1 - first]
-    # V = z^T X z only falls, and c^2 <= V / (smallest V at which c = 1).
+    one = np.eye(len(A))
+    z0 = one[1 - first]
+    # V = z^T X z only falls, where A^T X + X A = -1, and c^2 <= V / (smallest V at which c = 1).
+    X = np.linalg.solve(np.kron(A.T, one) + np.kron(one, A.T), -one.ravel()).reshape(A.shape)
     bound = np.linalg.inv(X)[1 - first, 1 - first]
     x = 1.0
-    while bound * (z := expm(A * x) @ z0) @ X @ z > tolerance**2:
+    while bound * (z := _exponential(A, np.array(x)) @ z0) @ X @ z > tolerance**2:
         x *= 2.0
     s = poles(alpha, beta, gamma)
     swings = np.abs(s.imag).max() * x / p / math.pi
