@@ -16,7 +16,7 @@ from rigidfleet import attitude as att
 from rigidfleet.errors import FlightError
 from rigidfleet.kernel import flight
 from rigidfleet.kernel import program as k
-from rigidfleet.mission import Establish, Fly, Mission, Phase, Reshape, Settle, Turn
+from rigidfleet.mission import Fly, Mission, Phase, Settle, Turn
 from rigidfleet.plan import PhasePlan, Pose, Situation, about_cm, plan_phase
 from rigidfleet.record import Piece, assemble
 from rigidfleet.result import PhaseRecord, Result
@@ -104,16 +104,23 @@ def simulate(
     Raises
     ------
     FlightInterrupted
-        On Ctrl-C, with the incomplete result.
+        On Ctrl-C, with the incomplete result; before anything has flown, a plain
+        KeyboardInterrupt.
     FlightError
         The controller or the force returned something that is no force.
+    ValueError
+        A time to record lies outside of the mission, or the control rate is not positive.
     """
     run = _Flight(mission, controller, rate, force, times, progress)
     try:
         run.fly()
     except KeyboardInterrupt:
+        if not run.pieces:
+            raise
         run.ending = f"interrupted at t = {run.now.t:.2f} s"
         raise FlightInterrupted(run.result()) from None
+    if not run.pieces:
+        raise FlightError(run.ending or "the flight ended before the first time to record")
     return run.result()
 
 
@@ -153,7 +160,9 @@ class _Flight:
         self.masses = np.array(mission.agents.mass)
         self.controller, self.rate = controller, rate
         self.external = _External(force, mission.n_agents) if force is not None else None
-        self.times = None if times is None else np.unique(np.asarray(times, dtype=float))
+        self.times = None if times is None else _times(times, mission.latest_end)
+        if not rate > 0.0:
+            raise ValueError(f"the control rate must be positive [Hz], not {rate!r}")
         self.progress = progress
         frame = None
         if mission.body_frame is not None:
@@ -194,7 +203,8 @@ class _Flight:
                 self._integrate(leg, leg.plan.program, leg.t_end)
         finally:
             self.count += leg.state.count[:3]
-            self._arrive(leg)
+            if leg.state.count[0]:
+                self._arrive(leg)
             record.t_end = self.now.t
         if phase.settle is not None and not record.settled:
             raise _StoppedError(
@@ -234,6 +244,7 @@ class _Flight:
         times = self._samples(leg, t_end)
         samples = np.empty((len(times), len(state.y)))
         state.count[3] = 0
+        first = np.nextafter(leg.t, math.inf)
         status = flight.PAUSED
         try:
             while status == flight.PAUSED:
@@ -246,7 +257,10 @@ class _Flight:
                 self._report(leg)
         finally:
             done = int(state.count[3])
-            self._record(leg, program, times[:done], samples[:done])
+            if state.count[0] and not state.count[1] and len(times) and times[0] <= first:
+                samples[0], done = state.y, 1  # no step was possible: the start is all there is
+            if done:
+                self._record(leg, program, times[:done], samples[:done])
         if status == flight.COLLAPSED:
             raise _StoppedError(self._diagnose(leg))
 
@@ -272,7 +286,7 @@ class _Flight:
         start = self.now.t
         step = self.mission.output_step
         step *= max(1.0, round(_CHECK / step))  # stretches end at samples
-        least = start + (leg.phase.blend if isinstance(leg.phase, Establish | Reshape) else 0.0)
+        least = start + leg.plan.program.reference.T_b
         since = math.inf
         while leg.t < leg.t_end:
             t = (math.floor(leg.t / step + 1e-9) + 1) * step
@@ -447,6 +461,14 @@ class _Flight:
         )
 
 
+def _times(times: ArrayLike, end: float) -> Array:
+    """Times [s] to record, sorted; those that rounding has put behind the end are at the end."""
+    t = np.unique(np.asarray(times, dtype=float))
+    if not (len(t) and t[0] >= 0.0 and t[-1] <= end * (1.0 + 1e-12)):
+        raise ValueError(f"times to record must lie between 0 and the mission's end, {end:g} s")
+    return np.unique(np.minimum(t, end))
+
+
 def _end(phase: Phase, start: float) -> float:
     """Time [s] at which a phase ends, at the latest."""
     if phase.until is not None:
@@ -526,6 +548,7 @@ class _External:
         self.address = int(ctypes.cast(self._keep, ctypes.c_void_p).value or 0)
 
     def check(self) -> None:
-        """Raise what the user's function raised."""
-        if self.error is not None:
-            raise self.error
+        """Raise what the user's function raised, and listen to it again."""
+        error, self.error = self.error, None
+        if error is not None:
+            raise error
