@@ -1,0 +1,129 @@
+"""Write the tables of missions.md: the keys of a mission file and the variables of a result.
+
+`python docs/tables.py` rewrites them in place, each between `<!-- table: NAME -->` and `<!-- end -->`;
+tests/test_docs.py fails where they are out of date. NAME is a table of the JSON schema; `A-B` the keys of A
+which B lacks; `shapes` and `result` what their names say.
+"""
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+from rigidfleet.formation import SHAPES, agents_taken
+from rigidfleet.mission import json_schema
+from rigidfleet.result import LABELS, VARIABLES
+
+PAGE = Path(__file__).with_name("missions.md")
+
+
+def render(page: str) -> str:
+    """A page with its tables as they should be."""
+    schema = json_schema()
+
+    def table(match: re.Match[str]) -> str:
+        name = match[1]
+        special = {"result": _result, "shapes": _shapes}
+        text = special[name]() if name in special else _keys(schema, name)
+        return f"<!-- table: {name} -->\n{text}\n<!-- end -->"
+
+    return re.sub(r"<!-- table: ([\w-]+) -->\n.*?<!-- end -->", table, page, flags=re.DOTALL)
+
+
+def _keys(schema: dict[str, Any], name: str) -> str:
+    """The keys of a table: name, value, default, meaning."""
+    whole, _, without = name.partition("-")
+    part = schema if whole == "Header" else schema["$defs"][whole]
+    left_out = set(schema["$defs"][without]["properties"]) if without else set()
+    if whole == "Header":
+        left_out |= {key for key, entry in part["properties"].items() if _is_table(entry)}
+    if name == "Hold":  # which stands for every kind
+        left_out |= {"kind"}
+    rows = [
+        (f"`{key}`", _value(entry), _default(entry, key in part.get("required", ())), _text(entry))
+        for key, entry in part["properties"].items()
+        if key not in left_out
+    ]
+    return _table(("key", "value", "default", "meaning"), rows)
+
+
+def _is_table(entry: dict[str, Any]) -> bool:
+    """Whether a key of the whole file is a table, or an array of tables, with a section of its own."""
+    return "$ref" in json.dumps(entry)
+
+
+def _text(entry: dict[str, Any]) -> str:
+    return entry["description"].replace("|", "\\|")
+
+
+def _value(entry: dict[str, Any]) -> str:
+    """What a key takes, in words."""
+    match entry:
+        case {"const": value}:
+            return _quoted(value)
+        case {"enum": values}:
+            return ", ".join(map(_quoted, values))
+        case {"anyOf": choices} | {"oneOf": choices}:
+            return " or ".join(_value(c) for c in choices if c.get("type") != "null")
+        case {"$ref": target}:
+            return f"table, see `{target.rpartition('/')[2].lower()}`"
+        case {"type": "array", "items": {"type": "array", "items": inner, **size}}:
+            return f"list of [{size['minItems']} {_PLURAL[inner['type']]}]"
+        case {"type": "array", "minItems": n}:
+            return f"[{n} numbers]"
+        case {"type": "array", "items": inner}:
+            return f"list of {_PLURAL[inner['type']]}"
+    return {"integer": "whole number", "boolean": "true, false"}.get(entry["type"], entry["type"])
+
+
+_PLURAL = {"number": "numbers", "integer": "whole numbers"}
+
+
+def _default(entry: dict[str, Any], given: bool) -> str:
+    """The default in words; empty where there is none to tell."""
+    if given:
+        return "required"
+    match entry.get("default"):
+        case None | "" | [] | [None]:
+            return ""
+        case [value]:
+            return _short(value)
+        case list() as values:
+            return f"[{', '.join(map(_short, values))}]"
+        case value:
+            return _short(value)
+
+
+def _short(value: Any) -> str:
+    return _quoted(value) if isinstance(value, bool | str) else f"{value:.6g}"
+
+
+def _quoted(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f'`"{value}"`' if isinstance(value, str) else str(value)
+
+
+def _shapes() -> str:
+    """The named shapes: name, agents, slots."""
+    rows = [(f"`{name}`", agents_taken(name), shape.text) for name, shape in SHAPES.items()]
+    return _table(("shape", "agents", "slots"), rows)
+
+
+def _result() -> str:
+    """The variables of a result: name, dimensions, unit, meaning."""
+    rows = [
+        (f"`{name}`", ", ".join(v.dims), v.units, v.text.replace("|", "\\|"))
+        for name, v in VARIABLES.items()
+    ]
+    along = "; ".join(f"`{dim}`: {', '.join(names)}" for dim, names in LABELS.items())
+    return f"{_table(('variable', 'dimensions', 'unit', 'meaning'), rows)}\n\n{along}."
+
+
+def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
+    lines = [head, ("---",) * len(head), *rows]
+    return "\n".join(f"| {' | '.join(row)} |" for row in lines)
+
+
+if __name__ == "__main__":
+    PAGE.write_text(render(PAGE.read_text(encoding="utf-8")), encoding="utf-8")
