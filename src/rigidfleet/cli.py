@@ -1,0 +1,656 @@
+"""The command ``rigidfleet``: it parses, calls and prints.
+
+What was asked for goes to standard output: verdicts, tables, JSON. Progress and errors go to standard
+error. Colours and animation are for terminals, and `NO_COLOR` is respected.
+
+Exit codes
+----------
+- 0: done; for `run` and `report`: the flight passed its verdict
+- 1: flew, but failed its verdict, as a flight does that could not be flown to its end
+- 2: bad input, or files that cannot be read or written
+- 130: interrupted (Ctrl-C); what flew is saved, marked incomplete
+
+Packages that take long to load are imported by the commands that need them.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
+from functools import cache
+from io import TextIOWrapper
+from pathlib import Path
+from tempfile import TemporaryDirectory, TemporaryFile
+from time import perf_counter
+from typing import IO, TYPE_CHECKING, Annotated, Self
+
+from cyclopts import App, CycloptsError, Parameter, UnusedCliTokensError
+
+from rigidfleet import __version__
+from rigidfleet.errors import MissionError, ResultError, RigidfleetError
+
+if TYPE_CHECKING:
+    from rich.console import Console, RenderableType
+    from rich.live import Live
+    from rich.table import Table
+
+    from rigidfleet.assess import Verdict
+    from rigidfleet.mission import Mission, Phase
+    from rigidfleet.result import Result
+    from rigidfleet.simulate import Progress
+
+PASSED, FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
+
+#: Columns of a table that goes to a file or a pipe, where no row may be broken.
+_WIDE = 1000
+#: Where there is no terminal to draw a bar on, a line says so often how far a flight is [s].
+_SELDOM = 10.0
+#: A flight is heard of several times a second: when not for so long, it compiles [s].
+_SILENCE = 1.0
+_COMPILING = "Compiling the flight kernel (once, about 20 s)"
+
+app = App(
+    name="rigidfleet",
+    help="Fly many air vehicles as one rigid body: simulate, judge and draw formation flights.",
+    help_epilogue="Exit codes: 0 done, or the flight passed; 1 it flew but failed its verdict; "
+    "2 bad input; 130 interrupted, what flew is saved.",
+    help_format="plaintext",
+    version=f"rigidfleet {__version__}",
+    version_flags=["--version"],
+    default_parameter=Parameter(negative=(), show_default=False),
+    exit_on_error=False,
+    print_error=False,
+    suppress_keyboard_interrupt=False,
+    result_action="return_value",
+)
+
+
+def main(tokens: Sequence[str] | None = None) -> int:
+    """Run the command and return its exit code; without `tokens`, on the arguments of the process."""
+    _prepare_streams()
+    try:
+        return app(tokens, console=_out(), error_console=_err()) or PASSED
+    except CycloptsError as error:
+        _complain(_usage(error))
+        return BAD_INPUT
+    except RigidfleetError as error:
+        _complain(error)
+        return BAD_INPUT
+    except BrokenPipeError:
+        _hang_up(sys.stdout)
+        return PASSED
+    except OSError as error:  # a full disk and the like: no fault of the program
+        if error.filename is None:
+            _hang_up(sys.stdout)
+        _complain(f"{error.filename or 'standard output'}: {error.strerror or error}")
+        return BAD_INPUT
+    except KeyboardInterrupt:
+        _err().print("Interrupted", style="yellow")
+        return INTERRUPTED
+
+
+# -- commands ----------------------------------------------------------------------------------------
+
+
+@app.command(sort_key=1)
+def run(
+    mission: str,
+    /,
+    *,
+    out: Path | None = None,
+    force: bool = False,
+    no_figures: bool = False,
+    csv: bool = False,
+    json: bool = False,
+    quiet: bool = False,
+) -> int:
+    """Fly a mission: simulate it, judge it, draw it.
+
+    Parameters
+    ----------
+    mission : str
+        A shipped mission (see "rigidfleet missions") or a mission file.
+    out : Path
+        Folder for the files: NAME.nc, verdict.json and figures/; flights/NAME if not given.
+    force : bool
+        Replace the files of an earlier flight; without it they are kept and nothing is flown.
+    no_figures : bool
+        Draw no figures; "rigidfleet report" can do so later.
+    csv : bool
+        Also write NAME.csv: time, position, velocity and yaw of each agent.
+    json : bool
+        Print the verdict as JSON.
+    quiet : bool
+        Print nothing but errors, and the JSON if asked for.
+    """
+    from rigidfleet.mission import load_mission
+
+    flown = load_mission(mission)
+    files = _Files(out or Path("flights", flown.name), flown.name)
+    files.claim(replace=force)
+    watch = None if quiet else _Watch()
+    with watch or nullcontext():
+        result, interrupted = _fly(flown, watch)
+
+    from rigidfleet.assess import assess
+
+    files.make_folder()
+    result.save(files.result)
+    files.forget()
+    if csv:
+        result.to_csv(files.table)
+    verdict = assess(result)
+    _write_verdict(verdict, files)
+    if json:
+        _print_exactly(verdict.json() + "\n")
+    elif not quiet:
+        _out().print(verdict)
+    if not (no_figures or interrupted):
+        _draw(result, files, quiet=quiet)
+    if not (json or quiet):
+        _out().print()
+        _list(files)
+    if interrupted:
+        message = f"Interrupted: what flew is saved, marked incomplete, in {files.result}"
+        _err().print(message, style="yellow", soft_wrap=True)
+        return INTERRUPTED
+    return PASSED if verdict.passed else FAILED
+
+
+@app.command(sort_key=2)
+def missions(
+    *, print_: Annotated[str, Parameter(name="--print")] = "", schema: bool = False
+) -> int:
+    """List the missions that ship with the program.
+
+    Parameters
+    ----------
+    print_ : str
+        Print the file of this mission instead, to be copied and changed.
+    schema : bool
+        Print the JSON schema of mission files instead, for editors.
+    """
+    from rigidfleet.mission import json_schema, mission_names, mission_text
+
+    if print_ and schema:
+        raise RigidfleetError("--print and --schema exclude each other. Give one of them.")
+    if print_:
+        _print_exactly(mission_text(print_))
+    elif schema:
+        _print_json(json_schema())
+    else:
+        import tomllib
+
+        table = _table("mission", "what it shows", "in the paper")
+        for name in mission_names():
+            head = tomllib.loads(mission_text(name))
+            table.add_row(name, head.get("title", ""), head.get("source", ""))
+        _print_table(table)
+    return PASSED
+
+
+@app.command(sort_key=3)
+def check(mission: str, /, *, json: bool = False) -> int:
+    """Check whether a mission is right, without flying it.
+
+    Parameters
+    ----------
+    mission : str
+        A shipped mission or a mission file.
+    json : bool
+        Print what was found as JSON.
+    """
+    from rigidfleet.mission import load_mission
+
+    try:
+        found = load_mission(mission)
+    except MissionError as error:
+        if not json:
+            raise
+        findings = [
+            {"key": f.key, "value": f.value, "problem": f.problem, "remedy": f.remedy}
+            for f in error.findings
+        ]
+        _print_json({"mission": mission, "right": False, "findings": findings})
+        return BAD_INPUT
+    if json:
+        _print_json({"mission": mission, "right": True} | _facts(found))
+        return PASSED
+    counts = (
+        _count(found.n_agents, "agent"),
+        _count(len(found.formations), "formation"),
+        _count(len(found.phases), "phase"),
+        _length(found),
+    )
+    table = _table("#", "phase", "kind", "to", "ends", "control")
+    for n, phase in enumerate(found.phases, start=1):
+        table.add_row(str(n), phase.name, phase.kind, _goal(phase), _ends(phase), phase.control)
+    _out().print(f"{found.name}: right: {', '.join(counts)}")
+    _print_table(table)
+    return PASSED
+
+
+@app.command(sort_key=4)
+def report(result: Path, /, *, out: Path | None = None, force: bool = False) -> int:
+    """Judge and draw a flight again, from its result.
+
+    Parameters
+    ----------
+    result : Path
+        Result of a flight, NAME.nc.
+    out : Path
+        Folder for verdict.json and figures/; that of the result if not given.
+    force : bool
+        Replace files that are there already; without it they are kept.
+    """
+    from rigidfleet.assess import assess
+    from rigidfleet.result import Result
+
+    record = Result.load(result)
+    files = _Files(out or result.parent, record.mission.name)
+    files.try_out()
+    verdict = assess(record)
+    _out().print(verdict)
+    files.make_folder()
+    kept = _write_verdict(verdict, files, keep=not force)
+    kept += _draw(record, files, keep=not force)
+    _out().print()
+    _list(files)
+    if kept:
+        _err().print(f"{_count(kept, 'file')} kept as before; --force replaces them")
+    return PASSED if verdict.passed else FAILED
+
+
+# -- flying ------------------------------------------------------------------------------------------
+
+
+def _fly(mission: Mission, watch: _Watch | None) -> tuple[Result, bool]:
+    """Result of a mission, and whether the flight was interrupted."""
+    from rigidfleet.kernel import is_compiled
+
+    if watch is not None and not is_compiled():
+        watch.compiling()
+    from rigidfleet.simulate import FlightInterrupted, simulate
+
+    try:
+        with _heeding_interrupts():
+            return simulate(mission, progress=None if watch is None else watch.update), False
+    except FlightInterrupted as stop:
+        return stop.result, True
+
+
+@contextmanager
+def _heeding_interrupts() -> Generator[None]:
+    """Ctrl-C inside the compiler may come out of it as any error: make it Ctrl-C again."""
+    interrupted = False
+
+    def note(*_: object) -> None:
+        nonlocal interrupted
+        interrupted = True
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGINT, note)
+    try:
+        yield
+    except Exception:
+        if interrupted:
+            raise KeyboardInterrupt from None
+        raise
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _draw(result: Result, files: _Files, *, quiet: bool = False, keep: bool = False) -> int:
+    """Draw the figures and return how many were there already and kept."""
+    shown = _err().is_interactive and not quiet
+    with _err().status("Drawing the figures") if shown else nullcontext():
+        from rigidfleet.figures import plot
+
+        files.figures.mkdir(exist_ok=True)
+        with _staged(files.figures, keep=keep) as (folder, kept):
+            plot(result, folder)
+    return len(kept)
+
+
+def _write_verdict(verdict: Verdict, files: _Files, *, keep: bool = False) -> int:
+    """Write the verdict and return how many files (0 or 1) were there already and kept."""
+    with _staged(files.folder, keep=keep) as (folder, kept):
+        (folder / files.verdict.name).write_text(verdict.json() + "\n", encoding="utf-8")
+    return len(kept)
+
+
+# -- files -------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Files:
+    """Where the files of a flight are."""
+
+    folder: Path
+    name: str
+
+    @property
+    def result(self) -> Path:
+        return self.folder / f"{self.name}.nc"
+
+    @property
+    def verdict(self) -> Path:
+        return self.folder / "verdict.json"
+
+    @property
+    def table(self) -> Path:
+        return self.folder / f"{self.name}.csv"
+
+    @property
+    def figures(self) -> Path:
+        return self.folder / "figures"
+
+    def drawn(self) -> list[Path]:
+        """Figures that are there."""
+        found = (self.figures.glob(f"{self.name}-*{kind}") for kind in (".png", ".svg"))
+        return sorted(path for paths in found for path in paths)
+
+    def claim(self, *, replace: bool) -> None:
+        """Make sure, before anything is flown, that the files of a flight can be written.
+
+        Raises
+        ------
+        ResultError
+            There are some already, and they are not to be replaced; or the folder cannot be written.
+        """
+        there = [path for path in (self.result, self.verdict, self.table) if path.exists()]
+        there += self.drawn()[:1]
+        if there and not replace:
+            raise ResultError(
+                f"{there[0]}: exists already and is kept. "
+                "Replace it by --force, or name another folder by --out."
+            )
+        self.try_out()
+
+    def try_out(self) -> None:
+        """Write for a moment into the folder, or into the one that it will be made in.
+
+        Raises
+        ------
+        ResultError
+            It cannot be written.
+        """
+        folder = self.folder.absolute()
+        while not os.path.lexists(folder):
+            folder = folder.parent
+        try:
+            TemporaryFile(dir=folder).close()
+        except OSError as error:
+            raise _unwritable(self.folder, error) from error
+
+    def make_folder(self) -> None:
+        """Make the folder, if it is not there.
+
+        Raises
+        ------
+        ResultError
+            It cannot be made.
+        """
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise _unwritable(self.folder, error) from error
+
+    def forget(self) -> None:
+        """Remove what was made from an earlier result."""
+        for path in (self.verdict, self.table, *self.drawn()):
+            path.unlink(missing_ok=True)
+
+
+@contextmanager
+def _staged(folder: Path, *, keep: bool) -> Generator[tuple[Path, list[Path]]]:
+    """A folder to write to; once all is written its files move into `folder`, each in one step.
+
+    With `keep`, files that are there already stay as they are; the second value lists them.
+    """
+    kept: list[Path] = []
+    try:
+        with TemporaryDirectory(prefix=".", suffix=".part", dir=folder) as part:
+            yield Path(part), kept
+            for file in sorted(Path(part).iterdir()):
+                target = folder / file.name
+                if keep and target.exists():
+                    kept.append(target)
+                else:
+                    os.replace(file, target)
+    except OSError as error:
+        raise _unwritable(folder, error) from error
+
+
+def _unwritable(folder: Path, error: OSError) -> ResultError:
+    why = (error.strerror or str(error)).lower()
+    return ResultError(f"{folder}: cannot be written ({why}). Name another folder by --out.")
+
+
+def _list(files: _Files) -> None:
+    """Print where the files of a flight are."""
+    for what, path in (
+        ("Result", files.result),
+        ("Verdict", files.verdict),
+        ("Table", files.table),
+    ):
+        if path.exists():
+            _out().print(f"{what:8} {path}", soft_wrap=True)
+    if drawn := files.drawn():
+        _out().print(f"Figures  {files.figures}{os.sep} ({len(drawn)} files)", soft_wrap=True)
+
+
+# -- a mission in words ------------------------------------------------------------------------------
+
+
+def _facts(mission: Mission) -> dict[str, object]:
+    """A mission in plain data."""
+    return {
+        "name": mission.name,
+        "title": mission.title,
+        "source": mission.source,
+        "agents": mission.n_agents,
+        "formations": list(mission.formations),
+        "phases": [
+            {"name": p.name, "kind": p.kind, "to": _goal(p), "ends": _ends(p), "control": p.control}
+            for p in mission.phases
+        ],
+        "latest_end_s": mission.latest_end,
+    }
+
+
+def _length(mission: Mission) -> str:
+    most = "at most " if any(phase.settle for phase in mission.phases) else ""
+    return f"{most}{mission.latest_end:g} s"
+
+
+def _goal(phase: Phase) -> str:
+    """What a phase leads to."""
+    from rigidfleet.mission import Establish, Fly, Hold, Reshape
+
+    if isinstance(phase, Hold):
+        return ""
+    if isinstance(phase, Establish | Reshape):
+        return phase.formation
+    parts = []
+    if isinstance(phase, Fly):
+        parts.append(_vector(phase.position, "m"))
+        if any(phase.velocity):
+            parts.append(_vector(phase.velocity, "m/s"))
+    if phase.attitude_deg is not None:
+        angles = zip(("roll", "pitch", "yaw"), phase.attitude_deg, strict=True)
+        parts += [f"{name} {angle:g}°" for name, angle in angles if angle or name == "yaw"]
+    if any(phase.rates_deg_s):
+        parts.append(_vector(phase.rates_deg_s, "°/s"))
+    return ", ".join(parts)
+
+
+def _ends(phase: Phase) -> str:
+    """When a phase ends."""
+    if phase.settle is not None:
+        return f"settled, within {phase.settle.timeout:g} s"
+    return f"at {phase.until:g} s" if phase.until is not None else f"after {phase.duration:g} s"
+
+
+def _vector(values: Sequence[float], unit: str) -> str:
+    return f"({', '.join(f'{value:g}' for value in values)}) {unit}"
+
+
+def _count(n: int, noun: str) -> str:
+    return f"{n} {noun}{'' if n == 1 else 's'}"
+
+
+# -- the screen --------------------------------------------------------------------------------------
+
+
+def _out() -> Console:
+    """For what was asked for."""
+    return _console(stderr=False)
+
+
+def _err() -> Console:
+    """For progress and errors."""
+    return _console(stderr=True)
+
+
+@cache
+def _console(*, stderr: bool, width: int | None = None) -> Console:
+    from rich.console import Console
+
+    class Polite(Console):
+        def on_broken_pipe(self) -> None:
+            # The reader has had enough, as `head` has: go on without it, the exit code still counts.
+            self.quiet = True
+            _hang_up(self.file)
+
+    return Polite(stderr=stderr, width=width, markup=False, highlight=False, emoji=False)
+
+
+def _prepare_streams() -> None:
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:  # closed by `>&-`
+            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
+        elif isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="replace")  # a sign that the terminal lacks becomes "?"
+
+
+def _hang_up(stream: IO[str]) -> None:
+    """Send nowhere what is still to be written to a stream."""
+    with open(os.devnull, "wb") as nowhere:
+        os.dup2(nowhere.fileno(), stream.fileno())
+
+
+def _print_exactly(text: str) -> None:
+    """Print text for other programs: in UTF-8, no line changed."""
+    try:
+        sys.stdout.flush()
+        sys.stdout.buffer.write(text.encode())
+        sys.stdout.buffer.flush()
+    except BrokenPipeError:
+        _hang_up(sys.stdout)
+
+
+def _print_json(data: object) -> None:
+    import json
+
+    _print_exactly(json.dumps(data, ensure_ascii=False, indent=2, default=str) + "\n")
+
+
+def _usage(error: CycloptsError) -> str:
+    """What is wrong with the command as typed."""
+    command = " ".join(("rigidfleet", *(error.command_chain or ()), "--help"))
+    text = str(error)
+    if isinstance(error, UnusedCliTokensError):
+        text = f"Unexpected: {' '.join(error.unused_tokens or ())}."
+    return f"{text}\n    see `{command}`"
+
+
+def _complain(error: object) -> None:
+    from rich.text import Text
+
+    for finding in error.findings if isinstance(error, MissionError) else [error]:
+        _err().print(Text.assemble(("error: ", "bold red"), str(finding)), soft_wrap=True)
+
+
+def _table(*columns: str) -> Table:
+    from rich.table import Table
+
+    return Table(*columns, box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold")
+
+
+def _print_table(table: Table) -> None:
+    console = _out() if _out().is_terminal else _console(stderr=False, width=_WIDE)
+    console.print(table)
+
+
+class _Watch:
+    """Shows how a flight goes on: a bar on a terminal, and elsewhere a line now and then."""
+
+    def __init__(self) -> None:
+        self.console = _err()
+        self.live: Live | None = None
+        self.cold = False
+        self.begun = self.heard = self.told = perf_counter()
+        self.base: Progress | None = None
+        self.last: Progress | None = None
+
+    def __enter__(self) -> Self:
+        if self.console.is_interactive:
+            from rich.live import Live
+            from rich.spinner import Spinner
+
+            self.spinner = Spinner("dots")
+            self.live = Live(self, console=self.console, transient=True, refresh_per_second=10)
+            self.live.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self.live is not None:
+            self.live.stop()
+
+    def compiling(self) -> None:
+        """Expect the kernel to be compiled, on the way, in several parts."""
+        self.cold, self.begun = True, perf_counter()
+        if self.live is None:
+            self.console.print(_COMPILING)
+
+    def update(self, progress: Progress) -> None:
+        """Take note of how far the flight is."""
+        now = perf_counter()
+        if self.base is None or (self.cold and now - self.heard > _SILENCE):
+            self.base = progress  # the speed is that of flying, without that of compiling
+        self.last, self.heard = progress, now
+        if self.live is None and now - self.told > _SELDOM:
+            self.told = now
+            self.console.print(self._words())
+
+    def __rich__(self) -> RenderableType:
+        from rich.progress_bar import ProgressBar
+        from rich.table import Table
+
+        now = perf_counter()
+        if self.last is None or (self.cold and now - self.heard > _SILENCE):
+            text = _COMPILING if self.cold else "Starting"
+            self.spinner.update(text=f"{text}: {now - self.begun:.0f} s")
+            return self.spinner
+        row = Table.grid(padding=(0, 1))
+        row.add_row(ProgressBar(self.last.t_end, self.last.t, width=30), self._words())
+        return row
+
+    def _words(self) -> str:
+        """Time flown, speed against real time, time left, phase."""
+        if self.base is None or self.last is None:
+            return ""
+        t, t_end = self.last.t, self.last.t_end
+        words = [f"{t:.1f} of {t_end:g} s"]
+        if (wall := self.last.wall - self.base.wall) > 0 and (
+            speed := (t - self.base.t) / wall
+        ) > 0:
+            left = round((t_end - t) / speed)
+            words += [f"x{speed:.{0 if speed >= 10 else 1}f}", f"{left // 60}:{left % 60:02} left"]
+        return "  ".join([*words, self.last.phase])
