@@ -427,6 +427,11 @@ def test_error_is_found(edit, key, problem, remedy):
             "phases[2].settle",
             "finite horizon of lqr needs a time of arrival",
         ),
+        (
+            [("phases/1/travel", 30.0)],
+            "phases[2].travel",
+            "the phase ends before",
+        ),
         ([("phases/0/settle", {"dwell": 9, "timeout": 9}), ("phases/0/until", REMOVED),
           ("phases/2/until", 90.0)], "phases[1].settle", "times out before"),
         # Distances alone give slots only where they are complete.

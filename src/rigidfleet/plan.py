@@ -24,6 +24,9 @@ _SPLITS = {"equal": k.PINV_EQUAL, "inertia": k.PINV_INERTIA, "inertia+force": k.
 
 Edge = tuple[int, int]
 
+#: A phase that ends by settling and steers nowhere brings the body to rest within this time [s].
+_REST_WITHIN = 10.0
+
 
 @dataclass
 class Pose:
@@ -201,8 +204,9 @@ def _goal(phase: Phase, now: Situation, t_end: float) -> tuple[Pose | None, floa
     """The pose to be at, and when."""
     goal = now.goal
     if goal is None or not isinstance(phase, Fly | Turn):
-        return goal, t_end
-    arrival = t_end
+        # Nothing says when what stays must have come to rest: by the end, if that is known.
+        return goal, t_end if phase.settle is None else min(t_end, now.t + _REST_WITHIN)
+    arrival = t_end if phase.travel is None else now.t + phase.travel
     angles = phase.attitude_deg
     T = goal.T if angles is None else att.dcm_from_euler(np.deg2rad(angles))
     r, v = goal.r, np.zeros(3)

@@ -132,6 +132,10 @@ def _times(notes: Notes, found: Sequence[AnyPhase | None]) -> float | None:
             last = last + (longest or 0.0) if last is not None else None
         if isinstance(p, Shaping):
             _blend(notes, p, longest, path)
+        elif isinstance(p, Steering) and p.travel is not None and longest is not None:
+            if p.travel > longest * (1 + 1e-9):
+                problem = f"the phase ends before, after {longest:g} s"
+                notes.add((*path, "travel"), problem, "arrive earlier, or end it later", p.travel)
     return last
 
 
@@ -269,7 +273,9 @@ def _reachable(notes: Notes, p: Shaping, form: Formation, agents: Agents, path: 
 def _arrivals(notes: Notes, found: Sequence[AnyPhase | None], lqr: Lqr) -> None:
     """A finite horizon ends at a time."""
     for k, p in enumerate(found):
-        if not isinstance(p, Steering) or p.settle is None or not notes.right((), "lqr"):
+        if not isinstance(p, Steering) or p.settle is None or p.travel is not None:
+            continue
+        if not notes.right((), "lqr"):
             continue
         for key, weights, used in (
             ("lqr", lqr, isinstance(p, Fly)),
@@ -277,5 +283,5 @@ def _arrivals(notes: Notes, found: Sequence[AnyPhase | None], lqr: Lqr) -> None:
         ):
             if used and weights.horizon == "finite":
                 problem = f"the finite horizon of {key} needs a time of arrival"
-                remedy = f"end by until or duration, or use {key}.horizon = 'infinite'"
+                remedy = f"give travel, end by until or duration, or use {key}.horizon = 'infinite'"
                 notes.add(("phases", k, "settle"), problem, remedy, None)

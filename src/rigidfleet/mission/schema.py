@@ -333,13 +333,16 @@ class Reshape(Shaping):
 class Steering(AnyPhase):
     """A phase that may change the attitude."""
 
-    roll_deg: Number | None = Field(None, description="roll at the end [deg], 3-2-1 Euler angles")
-    pitch_deg: Number | None = Field(None, description="pitch at the end [deg]")
+    travel: Positive | None = Field(
+        None, description="from the start to the arrival [s]; when absent, the whole phase"
+    )
+    roll_deg: Number | None = Field(None, description="roll on arrival [deg], 3-2-1 Euler angles")
+    pitch_deg: Number | None = Field(None, description="pitch on arrival [deg]")
     yaw_deg: Number | None = Field(
-        None, description="yaw at the end [deg]; when one angle is given, the others are 0"
+        None, description="yaw on arrival [deg]; when one angle is given, the others are 0"
     )
     rates_deg_s: Vector = Field(
-        (0.0, 0.0, 0.0), description="body rates [p, q, r] at the end [deg/s]"
+        (0.0, 0.0, 0.0), description="body rates [p, q, r] on arrival [deg/s]"
     )
 
     @model_validator(mode="before")
@@ -359,11 +362,11 @@ class Steering(AnyPhase):
 
 
 class Fly(Steering):
-    """Fly the centre of mass to a waypoint, to arrive at the phase's end."""
+    """Fly the centre of mass to a waypoint, to arrive after `travel`, or at the phase's end."""
 
     kind: Literal["fly"] = Field(description="fly to a waypoint")
-    position: Vector = Field(description="centre of mass at the end [x, y, z] [m]")
-    velocity: Vector = Field((0.0, 0.0, 0.0), description="its velocity at the end [m/s]")
+    position: Vector = Field(description="centre of mass on arrival [x, y, z] [m]")
+    velocity: Vector = Field((0.0, 0.0, 0.0), description="its velocity on arrival [m/s]")
 
 
 class Turn(Steering):
