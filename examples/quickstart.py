@@ -1,16 +1,13 @@
 """Load a mission, fly it, look at it, draw it: in five lines."""
 
-from pathlib import Path
-
 import rigidfleet as rf
 
 
-def main(folder=Path("flights", "quickstart")):
+def main(folder="figures"):
     """Fly the paper's narrow passage and draw it into a folder; return the result."""
     mission = rf.load_mission("narrow-passage")
     result = rf.simulate(mission)
     print(result, rf.assess(result).summary, sep="\n")
-    Path(folder).mkdir(parents=True, exist_ok=True)
     rf.plot(result, folder)
     return result
 

@@ -1,0 +1,198 @@
+"""What the documents say is so: tables, code, commands, links, functions and tests they name."""
+
+import ast
+import importlib
+import importlib.util
+import re
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from rigidfleet.assess import assess
+from rigidfleet.errors import MissionError
+from rigidfleet.figures import figure_names
+from rigidfleet.mission import Mission, mission_names
+from rigidfleet.simulate import simulate
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+
+def page(name: str) -> str:
+    """Text of a page below docs."""
+    return (ROOT / "docs" / name).read_text(encoding="utf-8")
+
+
+def blocks(text: str, language: str) -> list[str]:
+    """Code blocks of a language."""
+    return re.findall(rf"^```{language}\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
+
+
+def anchors(text: str) -> set[str]:
+    """Places that a link may lead to: headings, as GitHub names them, and named ones."""
+    prose = re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE)
+    heads = re.findall(r"^#+ (.*)$", prose, re.MULTILINE)
+    plain = (re.sub(r"[^\w\- ]", "", head.lower()).replace(" ", "-") for head in heads)
+    return {*plain, *re.findall(r'<a id="([^"]+)">', text)}
+
+
+# -- missions.md -------------------------------------------------------------------------------------
+
+
+def test_tables_are_up_to_date():
+    """The keys of the format and the variables of a result are those of the code.
+
+    If this fails: python docs/tables.py
+    """
+    spec = importlib.util.spec_from_file_location("tables", ROOT / "docs" / "tables.py")
+    assert spec is not None
+    assert spec.loader is not None
+    tables = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(tables)
+    assert page("missions.md") == tables.render(page("missions.md"))
+
+
+def test_first_mission_flies():
+    """The mission written out in full is right, and passes its verdict."""
+    (text,) = re.findall(r"<!-- mission -->\n```toml\n(.*?)```", page("missions.md"), re.DOTALL)
+    verdict = assess(simulate(Mission.from_toml(text)))
+    assert verdict.passed, verdict.summary
+
+
+def test_formations_are_right():
+    """The three forms of a formation are accepted as they stand."""
+    forms = next(b for b in blocks(page("missions.md"), "toml") if "[formations.skein]" in b)
+    data = {
+        "schema_version": 1,
+        "name": "forms",
+        "agents": {"mass": 1.0, "position": [[0, 0, 0], [1, 0, 0], [0, 1, 1]]},
+        "phases": [{"kind": "fly", "position": [0, 0, 9], "duration": 5.0}],
+    } | tomllib.loads(forms)
+    assert list(Mission.from_dict(data).formations) == ["triangle", "skein", "line"]
+
+
+@pytest.mark.parametrize("ending", ["settle", "duration"])
+def test_finite_horizons_need_an_arrival(ending):
+    """A fly phase that ends by settling has to give its travel, as the page says."""
+    phase = {"kind": "fly", "position": [0, 0, 9]}
+    data = {
+        "schema_version": 1,
+        "name": "arrival",
+        "agents": {"mass": 1.0, "position": [[0, 0, 0], [1, 0, 0]]},
+        "phases": [phase | ({"settle": {}} if ending == "settle" else {"duration": 5.0})],
+    }
+    if ending == "duration":
+        Mission.from_dict(data)
+        return
+    with pytest.raises(MissionError, match="travel"):
+        Mission.from_dict(data)
+    data["phases"][0]["travel"] = 5.0
+    Mission.from_dict(data)
+
+
+# -- paper.md ----------------------------------------------------------------------------------------
+
+
+def rows(section: str) -> Iterator[list[str]]:
+    """Cells of the table in a section of paper.md."""
+    text = page("paper.md").split(f"\n## {section}\n")[1].split("\n## ")[0]
+    for line in re.findall(r"^\|(.*)\|$", text, re.MULTILINE):
+        yield [cell.strip() for cell in line.split("|")]
+
+
+@pytest.mark.parametrize(("section", "count"), [("Equations", 27), ("Tables", 5), ("Figures", 27)])
+def test_nothing_of_the_paper_is_left_out(section, count):
+    """Every equation, table and figure that carries a number has its row, in order."""
+    numbers = [row[0] for row in rows(section) if row[0].isdigit()]
+    assert numbers == [str(n + 1) for n in range(count)]
+
+
+def test_missions_and_figures_exist():
+    """Missions and figures that paper.md names are shipped and drawn; no mission is left out."""
+    known = set(mission_names())
+    figures = [row for row in rows("Figures") if row[0].isdigit()]
+    named = {name for row in figures for name in re.findall(r"`([\w-]+)`", row[2])}
+    drawn = {name for row in figures for name in re.findall(r"`(\w+)`", row[3])}
+    assert named
+    assert named <= known
+    assert drawn
+    assert drawn <= set(figure_names())
+    assert all(f"`{name}`" in page("paper.md") for name in known)
+
+
+HOMES = "kernel|plan|simulate|formation|attitude|lqr|gains|physics|geometry|record|result|assess|mission|figures|errors"
+
+
+@pytest.mark.parametrize("name", ["theory.md", "paper.md"])
+def test_functions_exist(name):
+    """Every module and function that a page names is there."""
+    named = re.findall(rf"`(?:rigidfleet\.)?((?:{HOMES})\.\w[\w.]*)`", page(name))
+    assert len(named) > 10
+    for dotted in named:
+        parts = dotted.split(".")
+        for k in range(len(parts), 0, -1):
+            try:
+                found = importlib.import_module(".".join(["rigidfleet", *parts[:k]]))
+            except ModuleNotFoundError:
+                continue
+            break
+        for part in parts[k:]:
+            found = getattr(found, part, None)
+            assert found is not None, f"{name} names {dotted}"
+
+
+def test_tests_exist():
+    """Every test that paper.md names is there, and every erratum has one."""
+    text = page("paper.md")
+    for file, name in re.findall(r"`(test_\w+\.py)::(test_\w+)`", text):
+        tree = ast.parse((ROOT / "tests" / file).read_text(encoding="utf-8"))
+        assert name in {n.name for n in ast.walk(tree) if isinstance(n, ast.FunctionDef)}
+    errata = text.split("\n## Errata\n")[1].split("\nSlips of wording")[0]
+    for paragraph in re.split(r"\n(?=<a id)", errata)[1:]:
+        assert "test_errata.py::" in paragraph
+    shown = set(re.findall(r"test_errata\.py::(test_\w+)", text))
+    tree = ast.parse((ROOT / "tests" / "test_errata.py").read_text(encoding="utf-8"))
+    tests = {n.name for n in tree.body if isinstance(n, ast.FunctionDef)}
+    assert {name for name in tests if name.startswith("test_")} == shown
+
+
+# -- all pages ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.name)
+def test_links_lead_somewhere(path):
+    """Every link within the repository leads to a file, and to a heading in it where it names one."""
+    text = path.read_text(encoding="utf-8")
+    for target in re.findall(r"\]\(([^)\s]+)\)", text):
+        if re.match(r"[a-z]+:", target):
+            continue
+        file, _, place = target.partition("#")
+        there = path.parent / file if file else path
+        assert there.exists(), f"{path.name}: {target}"
+        if place:
+            assert place in anchors(there.read_text(encoding="utf-8")), f"{path.name}: {target}"
+
+
+def test_commands_are_documented(capsys):
+    """Every command and option of `rigidfleet` stands in missions.md, and no other option."""
+    from rigidfleet.cli import main
+
+    text = page("missions.md").split("\n## Commands")[1].split("\n## ")[0]
+    options = set()
+    for command in ("run", "missions", "check", "report"):
+        assert f"`rigidfleet {command}" in text
+        main([command, "--help"])
+        options |= set(re.findall(r"--[a-z][\w-]*", capsys.readouterr().out))
+    documented = set(re.findall(r"--[a-z][\w-]*", text))
+    assert documented - {"--help"} == options - {"--help", "--version"}
+
+
+def test_five_lines_of_the_readme(tmp_path, monkeypatch):
+    """The README's Python is five lines, and draws what it flew."""
+    monkeypatch.chdir(tmp_path)
+    code = next(b for b in blocks((ROOT / "README.md").read_text("utf-8"), "python"))
+    assert len([line for line in code.splitlines() if line.strip()]) == 5
+    exec(compile(code.replace("narrow-passage", "square"), "README.md", "exec"), {})
+    assert list(tmp_path.rglob("*.png"))
