@@ -18,7 +18,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Iterable, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import cache
@@ -144,13 +144,13 @@ def run(
     if csv:
         result.to_csv(files.table)
     verdict = assess(result)
-    _write_verdict(verdict, files)
+    _write_verdict(verdict, files.verdict)
     if json:
         _print_exactly(verdict.json() + "\n")
     elif not quiet:
         _out().print(verdict)
     if not (no_figures or interrupted):
-        _draw(result, files, quiet=quiet)
+        _draw(result, files.figures, quiet=quiet)
     if not (json or quiet):
         _out().print()
         _list(files)
@@ -256,12 +256,15 @@ def report(result: Path, /, *, out: Path | None = None, force: bool = False) -> 
     verdict = assess(record)
     _out().print(verdict)
     files.make_folder()
-    kept = _write_verdict(verdict, files, keep=not force)
-    kept += _draw(record, files, keep=not force)
+    made = [files.verdict, *files.figures]
+    kept = [] if force else [path for path in made if path.exists()]
+    if files.verdict not in kept:
+        _write_verdict(verdict, files.verdict)
+    _draw(record, [path for path in files.figures if path not in kept])
     _out().print()
     _list(files)
     if kept:
-        _err().print(f"{_count(kept, 'file')} kept as before; --force replaces them")
+        _err().print(f"{_count(len(kept), 'file')} kept as before; --force makes them again")
     return PASSED if verdict.passed else FAILED
 
 
@@ -304,23 +307,36 @@ def _heeding_interrupts() -> Generator[None]:
         signal.signal(signal.SIGINT, before)
 
 
-def _draw(result: Result, files: _Files, *, quiet: bool = False, keep: bool = False) -> int:
-    """Draw the figures and return how many were there already and kept."""
+def _draw(result: Result, figures: Iterable[Path], *, quiet: bool = False) -> None:
+    """Draw figures, each to the file of its name."""
+    from rigidfleet.figures import plot
+
+    formats: dict[Path, list[str]] = {}
+    for path in figures:
+        formats.setdefault(path.with_suffix(""), []).append(path.suffix[1:])
     shown = _err().is_interactive and not quiet
-    with _err().status("Drawing the figures") if shown else nullcontext():
-        from rigidfleet.figures import plot
-
-        files.figures.mkdir(exist_ok=True)
-        with _staged(files.figures, keep=keep) as (folder, kept):
-            plot(result, folder)
-    return len(kept)
+    with _err().status("Drawing the figures") if shown else nullcontext() as status:
+        for n, (path, kinds) in enumerate(formats.items(), start=1):
+            if status is not None:
+                status.update(f"Drawing figure {n} of {len(formats)}: {path.name}")
+            plot(result, path.parent, names=[path.name], formats=kinds)
 
 
-def _write_verdict(verdict: Verdict, files: _Files, *, keep: bool = False) -> int:
-    """Write the verdict and return how many files (0 or 1) were there already and kept."""
-    with _staged(files.folder, keep=keep) as (folder, kept):
-        (folder / files.verdict.name).write_text(verdict.json() + "\n", encoding="utf-8")
-    return len(kept)
+def _write_verdict(verdict: Verdict, path: Path) -> None:
+    """Write a verdict as JSON, whole or not at all.
+
+    Raises
+    ------
+    ResultError
+        It cannot be written.
+    """
+    try:
+        with TemporaryDirectory(prefix=".", suffix=".part", dir=path.parent) as part:
+            file = Path(part, path.name)
+            file.write_text(verdict.json() + "\n", encoding="utf-8")
+            os.replace(file, path)
+    except OSError as error:
+        raise _unwritable(path, error) from error
 
 
 # -- files -------------------------------------------------------------------------------------------
@@ -346,13 +362,19 @@ class _Files:
         return self.folder / f"{self.name}.csv"
 
     @property
-    def figures(self) -> Path:
-        return self.folder / "figures"
+    def figures(self) -> list[Path]:
+        from rigidfleet.figures import figure_names
 
-    def drawn(self) -> list[Path]:
-        """Figures that are there."""
-        found = (self.figures.glob(f"{self.name}-*{kind}") for kind in (".png", ".svg"))
-        return sorted(path for paths in found for path in paths)
+        return [
+            self.folder / "figures" / f"{name}.{kind}"
+            for name in figure_names()
+            for kind in ("png", "svg")
+        ]
+
+    @property
+    def derived(self) -> list[Path]:
+        """All that is made from the result."""
+        return [self.verdict, self.table, *self.figures]
 
     def claim(self, *, replace: bool) -> None:
         """Make sure, before anything is flown, that the files of a flight can be written.
@@ -362,8 +384,7 @@ class _Files:
         ResultError
             There are some already, and they are not to be replaced; or the folder cannot be written.
         """
-        there = [path for path in (self.result, self.verdict, self.table) if path.exists()]
-        there += self.drawn()[:1]
+        there = [path for path in (self.result, *self.derived) if path.exists()]
         if there and not replace:
             raise ResultError(
                 f"{there[0]}: exists already and is kept. "
@@ -402,33 +423,13 @@ class _Files:
 
     def forget(self) -> None:
         """Remove what was made from an earlier result."""
-        for path in (self.verdict, self.table, *self.drawn()):
+        for path in self.derived:
             path.unlink(missing_ok=True)
 
 
-@contextmanager
-def _staged(folder: Path, *, keep: bool) -> Generator[tuple[Path, list[Path]]]:
-    """A folder to write to; once all is written its files move into `folder`, each in one step.
-
-    With `keep`, files that are there already stay as they are; the second value lists them.
-    """
-    kept: list[Path] = []
-    try:
-        with TemporaryDirectory(prefix=".", suffix=".part", dir=folder) as part:
-            yield Path(part), kept
-            for file in sorted(Path(part).iterdir()):
-                target = folder / file.name
-                if keep and target.exists():
-                    kept.append(target)
-                else:
-                    os.replace(file, target)
-    except OSError as error:
-        raise _unwritable(folder, error) from error
-
-
-def _unwritable(folder: Path, error: OSError) -> ResultError:
+def _unwritable(path: Path, error: OSError) -> ResultError:
     why = (error.strerror or str(error)).lower()
-    return ResultError(f"{folder}: cannot be written ({why}). Name another folder by --out.")
+    return ResultError(f"{path}: cannot be written ({why}). Name another folder by --out.")
 
 
 def _list(files: _Files) -> None:
@@ -440,8 +441,10 @@ def _list(files: _Files) -> None:
     ):
         if path.exists():
             _out().print(f"{what:8} {path}", soft_wrap=True)
-    if drawn := files.drawn():
-        _out().print(f"Figures  {files.figures}{os.sep} ({len(drawn)} files)", soft_wrap=True)
+    drawn = [path for path in files.figures if path.exists()]
+    if drawn:
+        text = f"Figures  {drawn[0].parent}{os.sep} ({_count(len(drawn), 'file')})"
+        _out().print(text, soft_wrap=True)
 
 
 # -- a mission in words ------------------------------------------------------------------------------

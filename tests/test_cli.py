@@ -1,0 +1,537 @@
+import itertools
+import json
+import os
+import pty
+import resource
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from rigidfleet import cli
+from rigidfleet.errors import FlightError
+from rigidfleet.figures import figure_names
+from rigidfleet.mission import mission_names, mission_text
+from rigidfleet.result import Result
+from rigidfleet.simulate import Progress
+
+TRIANGLE = """
+schema_version = 1
+name = "short"
+title = "Hold a triangle for a second"
+[agents]
+mass = 1.0
+position = [[0, 0, 0], [4, 0, 0], [2, 3.4641016151377544, 0]]
+[formations.triangle]
+shape = "triangle"
+size = 4.0
+[[phases]]
+kind = "establish"
+formation = "triangle"
+blend = 0.5
+until = 1.0
+"""
+#: It flies for minutes: the controller's stiffness keeps the steps short, however still all stand.
+LONG = (
+    TRIANGLE.replace('"short"', '"long"').replace("[agents]", "output_step = 1e5\n[agents]")
+    + '[[phases]]\nkind = "hold"\nname = "stand still"\nuntil = 1e8\n'
+)
+#: These do not pass: one is to settle within less than the integrator's error, the other not to move.
+OFF = TRIANGLE.replace("[[0, 0, 0]", "[[0, 1, 0]")
+RESTLESS = OFF.replace("until = 1.0", "settle = {tolerance = 1e-15, timeout = 2}")
+SPEEDING = OFF + "[limits]\nspeed = 0.001\n"
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    """An empty folder to stand in, with the mission `short.toml`."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("NO_COLOR", "FORCE_COLOR", "COLUMNS"):
+        monkeypatch.delenv(name, raising=False)
+    cli._console.cache_clear()
+    Path("short.toml").write_text(TRIANGLE, encoding="utf-8")
+    yield tmp_path
+    cli._console.cache_clear()
+
+
+@pytest.fixture
+def simulate(monkeypatch):
+    """Replace the simulation by another function."""
+
+    def replace(function):
+        monkeypatch.setattr(sys.modules["rigidfleet.simulate"], "simulate", function)
+
+    return replace
+
+
+def write(name, text):
+    Path(name).write_text(text, encoding="utf-8")
+    return name
+
+
+def command(*arguments, stdout=subprocess.PIPE, preexec_fn=None, **environment):
+    """The command as a process of its own; its output goes to pipes."""
+    done = subprocess.run(
+        [sys.executable, "-m", "rigidfleet", *arguments],
+        stdout=stdout,
+        stderr=subprocess.PIPE,
+        env=os.environ | environment,
+        text=True,
+        check=False,
+        timeout=300,
+        preexec_fn=preexec_fn,
+    )
+    assert "Traceback" not in done.stderr
+    return done
+
+
+# -- usage -------------------------------------------------------------------------------------------
+
+
+def test_help_is_light():
+    """Help, which gives the exit codes, loads none of the packages that take long to load."""
+    heavy = {"numpy", "scipy", "numba", "pydantic", "matplotlib", "h5py", "h5netcdf", "xarray"}
+    code = f"""if True:
+        import sys
+        from rigidfleet.cli import main
+        for tokens in [], ["--help"], ["run", "--help"], ["--version"], ["fly"]:
+            main(tokens)
+        sys.exit(", ".join(sorted({heavy!r} & set(sys.modules))) or None)
+    """
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    for words in ("0 done", "1 it flew", "2 bad input", "130 interrupted", "--no-figures"):
+        assert words in " ".join(done.stdout.split())
+
+
+def test_module_is_the_command():
+    """`python -m rigidfleet` is the command."""
+    done = command("--version")
+    assert (done.returncode, done.stdout) == (0, "rigidfleet 0.1.0\n")
+
+
+@pytest.mark.parametrize(
+    ("tokens", "words"),
+    [
+        (["rnu"], 'Did you mean "run"'),
+        (["run", "short.toml", "--ouut", "x"], "Did you mean --out"),
+        (["run"], "MISSION requires an argument"),
+        (["run", "short.toml", "more"], "Unexpected: more"),
+        (["missions", "--print"], "--print requires an argument"),
+        (["missions", "--print", "square", "--schema"], "exclude each other"),
+        (["missions", "--print", "sqare"], "did you mean 'square'"),
+        (["run", "sqare"], "did you mean 'square'"),
+        (["check", "nowhere.toml"], "no such file"),
+        (["report", "nowhere.nc"], "no such file"),
+        (["report", "short.toml"], "not a netCDF-4 file"),
+    ],
+)
+def test_bad_input(capsys, tokens, words):
+    """Bad input exits with 2 and says on standard error, and there alone, what to do."""
+    assert cli.main(tokens) == cli.BAD_INPUT
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith("error: ")
+    assert words in " ".join(err.split())
+
+
+# -- missions, check ---------------------------------------------------------------------------------
+
+
+def test_missions(capsys):
+    """Each shipped mission has one line, with its table or figure of the paper."""
+    assert cli.main(["missions"]) == cli.PASSED
+    head, *lines = capsys.readouterr().out.splitlines()
+    assert "in the paper" in head
+    assert [line.split()[0] for line in lines] == mission_names()
+    passage = next(line for line in lines if line.startswith("narrow-passage"))
+    assert "unfold" in passage
+    assert "Table 3" in passage
+
+
+def test_missions_print(capfdbinary):
+    """A mission is printed as it is shipped, byte for byte."""
+    assert cli.main(["missions", "--print", "narrow-passage"]) == cli.PASSED
+    assert capfdbinary.readouterr().out == mission_text("narrow-passage").encode()
+
+
+def test_missions_schema(capsys):
+    """The schema is JSON and describes the mission's keys."""
+    assert cli.main(["missions", "--schema"]) == cli.PASSED
+    assert "phases" in json.loads(capsys.readouterr().out)["properties"]
+
+
+def test_check(capsys):
+    """A mission that is right is counted up, and its phases are listed."""
+    assert cli.main(["check", "narrow-passage"]) == cli.PASSED
+    first, _, *phases = capsys.readouterr().out.splitlines()
+    assert first == "narrow-passage: right: 3 agents, 2 formations, 12 phases, 90 s"
+    assert len(phases) == 12
+    wp2 = "WP2 fly (35, 7.5, 20) m, (2, 0, 0) m/s, yaw 0° at 32 s slots"
+    assert " ".join(phases[3].split()) == f"4 {wp2}"
+
+
+def test_check_words(capsys):
+    """Ends by settling or duration are told apart, and turned angles are named."""
+    text = (
+        RESTLESS
+        + '[[phases]]\nkind = "turn"\nroll_deg = 5\nrates_deg_s = [0, 0, 1]\nduration = 4\n'
+    )
+    assert cli.main(["check", write("restless.toml", text)]) == cli.PASSED
+    first, _, *phases = capsys.readouterr().out.splitlines()
+    assert first.endswith("1 formation, 2 phases, at most 6 s")
+    assert "settled, within 2 s" in phases[0]
+    assert "roll 5°, yaw 0°, (0, 0, 1) °/s" in phases[1]
+    assert "after 4 s" in phases[1]
+
+
+def test_check_json(capsys):
+    """As JSON, a mission that is right is described in plain data."""
+    assert cli.main(["check", "narrow-passage", "--json"]) == cli.PASSED
+    found = json.loads(capsys.readouterr().out)
+    assert found["right"] is True
+    assert (found["agents"], found["latest_end_s"], len(found["phases"])) == (3, 90.0, 12)
+
+
+WRONG = TRIANGLE.replace("mass = 1.0", "mass = -1").replace("size = 4.0", "size = nan\ncolour = 3")
+
+
+def test_check_wrong(capsys):
+    """All errors of a mission are told at once, each with key, value and remedy."""
+    assert cli.main(["check", write("wrong.toml", WRONG)]) == cli.BAD_INPUT
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.count("error: wrong.toml: ") == 3
+    assert "agents.mass = -1" in err
+
+
+def test_check_wrong_json(capsys):
+    """As JSON, the errors are on standard output, and the exit code is the same."""
+    assert cli.main(["check", write("wrong.toml", WRONG), "--json"]) == cli.BAD_INPUT
+    out, err = capsys.readouterr()
+    found = json.loads(out)
+    assert err == ""
+    assert found["right"] is False
+    assert {finding["key"] for finding in found["findings"]} >= {"agents.mass"}
+    assert all(finding["remedy"] for finding in found["findings"])
+
+
+# -- run ---------------------------------------------------------------------------------------------
+
+
+def test_run(capsys, folder):
+    """A flight leaves its result and verdict in flights/NAME, and says so."""
+    assert cli.main(["run", "short.toml", "--no-figures", "--csv"]) == cli.PASSED
+    out = capsys.readouterr().out
+    home = folder / "flights" / "short"
+    assert sorted(p.name for p in home.iterdir()) == ["short.csv", "short.nc", "verdict.json"]
+    assert "Passed" in out
+    for name in ("short.nc", "short.csv", "verdict.json"):
+        assert os.path.join("flights", "short", name) in out
+    assert Result.load(home / "short.nc").complete
+    assert json.loads((home / "verdict.json").read_text(encoding="utf-8"))["passed"] is True
+
+
+def test_run_json(capsys):
+    """With --json, standard output is the verdict's file and nothing else."""
+    assert cli.main(["run", "short.toml", "--no-figures", "--json", "--out", "x"]) == cli.PASSED
+    assert capsys.readouterr().out == Path("x/verdict.json").read_text(encoding="utf-8")
+
+
+def test_run_quiet(capsys):
+    """With --quiet, a flight that passes prints nothing at all."""
+    assert cli.main(["run", "short.toml", "--no-figures", "--quiet"]) == cli.PASSED
+    assert capsys.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(
+    ("text", "complete", "words"),
+    [(SPEEDING, True, "speed"), (RESTLESS, False, "did not settle")],
+    ids=["limit passed", "incomplete"],
+)
+def test_run_fails_its_verdict(capsys, text, complete, words):
+    """A flight that passes a limit, or cannot be flown to its end, exits with 1 and is saved."""
+    assert cli.main(["run", write("bad.toml", text), "--no-figures"]) == cli.FAILED
+    out = capsys.readouterr().out
+    assert "Failed" in out
+    assert words in " ".join(out.split())
+    assert Result.load("flights/short/short.nc").complete is complete
+
+
+def test_run_keeps_an_existing_result(capsys, simulate):
+    """An existing result is kept, and nothing is flown, unless it is to be replaced."""
+    assert cli.main(["run", "short.toml", "--no-figures", "--quiet"]) == cli.PASSED
+    before = Path("flights/short/short.nc").read_bytes()
+    simulate(lambda *_, **__: pytest.fail("it flew"))
+    assert cli.main(["run", "short.toml"]) == cli.BAD_INPUT
+    err = capsys.readouterr().err
+    assert "short.nc: exists already" in err
+    assert "--force" in err
+    assert Path("flights/short/short.nc").read_bytes() == before
+
+
+def test_run_keeps_the_verdict_of_another_flight(capsys):
+    """A verdict.json of another mission in the same folder is not overwritten."""
+    Path("shared").mkdir()
+    write("shared/verdict.json", "theirs")
+    assert cli.main(["run", "short.toml", "--out", "shared"]) == cli.BAD_INPUT
+    assert "verdict.json: exists already" in capsys.readouterr().err
+    assert Path("shared/verdict.json").read_text(encoding="utf-8") == "theirs"
+
+
+def test_run_force():
+    """With --force nothing of an earlier flight stays beside the new result, and all else does."""
+    home = Path("flights/short")
+    (home / "figures").mkdir(parents=True)
+    for name in ("short.nc", "short.csv", "verdict.json", "figures/cm.png"):
+        write(home / name, "earlier")
+    for name in ("notes.txt", "figures/mine.png"):
+        write(home / name, "mine")
+    assert cli.main(["run", "short.toml", "--no-figures", "--force", "--quiet"]) == cli.PASSED
+    assert Result.load(home / "short.nc").complete
+    found = {str(p.relative_to(home)) for p in home.rglob("*") if p.is_file()}
+    assert found == {"short.nc", "verdict.json", "notes.txt", os.path.join("figures", "mine.png")}
+
+
+@pytest.mark.parametrize("out", ["short.toml", "short.toml/deep/down"])
+def test_run_into_no_folder(capsys, simulate, out):
+    """A folder that cannot be written is an error before anything is flown, and leaves nothing."""
+    simulate(lambda *_, **__: pytest.fail("it flew"))
+    assert cli.main(["run", "short.toml", "--out", out]) == cli.BAD_INPUT
+    assert "--out" in capsys.readouterr().err
+    assert [p.name for p in Path().iterdir()] == ["short.toml"]
+
+
+def test_run_on_a_full_disk():
+    """A disk that is full at the end of a flight is one clear error, and leaves no half of a file."""
+
+    def shrink():
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
+
+    done = command("run", "short.toml", "--no-figures", preexec_fn=shrink)
+    assert done.returncode == cli.BAD_INPUT
+    assert done.stderr.splitlines()[-1].startswith(
+        "error: flights/short/short.nc: cannot be written"
+    )
+    assert list(Path("flights/short").iterdir()) == []
+
+
+def test_errors_of_a_flight(capsys, simulate):
+    """A flight that cannot begin is an error to read, not a traceback."""
+
+    def refuse(*_, **__):
+        raise FlightError("there is no wind today")
+
+    simulate(refuse)
+    assert cli.main(["run", "short.toml", "--quiet"]) == cli.BAD_INPUT
+    assert capsys.readouterr().err == "error: there is no wind today\n"
+
+
+def test_bugs_are_not_hidden(simulate):
+    """An unexpected error is a bug, and is shown as one."""
+    simulate(lambda *_, **__: 1 // 0)
+    with pytest.raises(ZeroDivisionError):
+        cli.main(["run", "short.toml", "--quiet"])
+
+
+def test_first_compile(capsys, monkeypatch):
+    """A first compile says on standard error that it compiles, and a later flight does not."""
+    words = "Compiling the flight kernel"
+    for compiled in (False, True):
+        monkeypatch.setattr("rigidfleet.kernel.is_compiled", lambda c=compiled: c)
+        assert cli.main(["run", "short.toml", "--no-figures", "--force"]) == cli.PASSED
+        assert (words in capsys.readouterr().err) is not compiled
+
+
+# -- interruption ------------------------------------------------------------------------------------
+
+
+def test_interrupt():
+    """On Ctrl-C a terminal's progress bar gives way, what flew is saved as incomplete, and it exits with 130."""
+    write("long.toml", LONG)
+    terminal, side = pty.openpty()
+    with subprocess.Popen(
+        [sys.executable, "-m", "rigidfleet", "run", "long.toml"],
+        stdout=subprocess.PIPE,
+        stderr=side,
+        env=os.environ | {"COLUMNS": "120", "TERM": "xterm"},
+    ) as process:
+        os.close(side)
+        shown = b""
+        while b"left  stand still" not in shown:  # time flown, speed, time left, phase
+            shown += os.read(terminal, 4096)
+        process.send_signal(signal.SIGINT)
+        printed = process.communicate(timeout=60)[0].decode()
+    try:
+        while more := os.read(terminal, 4096):
+            shown += more
+    except OSError:  # the terminal's other end is closed
+        pass
+    assert process.returncode == cli.INTERRUPTED
+    assert b" of 1e+08 s  x" in shown
+    os.close(terminal)
+    assert b"Interrupted: what flew is saved" in shown
+    assert b"Traceback" not in shown
+    assert "incomplete" in printed
+    result = Result.load("flights/long/long.nc")
+    assert not result.complete
+    assert 1.0 < result.phases[-1].t_end < 1e8
+    assert not Path("flights/long/figures").exists()
+
+
+def test_interrupt_inside_the_compiler(capsys, simulate):
+    """Ctrl-C that comes out of the compiler as another error is Ctrl-C all the same."""
+
+    def compile_for_long(*_, **__):
+        try:
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(10)
+        except KeyboardInterrupt:
+            raise RuntimeError("no compiled object yet") from None
+
+    simulate(compile_for_long)
+    before = signal.getsignal(signal.SIGINT)
+    assert cli.main(["run", "short.toml", "--quiet"]) == cli.INTERRUPTED
+    assert capsys.readouterr().err == "Interrupted\n"
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+# -- report ------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def plot(monkeypatch):
+    """Draw figures in no time."""
+
+    def draw(result, folder, *, formats, names):
+        Path(folder).mkdir(exist_ok=True)
+        for name, kind in itertools.product(names, formats):
+            write(Path(folder, f"{name}.{kind}"), "drawn")
+
+    monkeypatch.setattr("rigidfleet.figures.plot", draw)
+
+
+def test_run_draws(capsys, plot):
+    """Figures are drawn into a folder of their own, each as PNG and SVG."""
+    assert cli.main(["run", "short.toml"]) == cli.PASSED
+    found = {p.name for p in Path("flights/short/figures").iterdir()}
+    assert found == {f"{name}.{kind}" for name in figure_names() for kind in ("png", "svg")}
+    where = os.path.join("flights", "short", "figures") + os.sep
+    assert f"Figures  {where} ({len(found)} files)" in capsys.readouterr().out
+
+
+def test_report(capsys, plot):
+    """A report gives the verdict again, draws what is missing, and keeps what is there."""
+    cli.main(["run", "short.toml", "--no-figures"])
+    verdict = Path("flights/short/verdict.json")
+    capsys.readouterr()
+    write(verdict, "earlier")
+    figures = Path("flights/short/figures")
+    figures.mkdir()
+    write(figures / "cm.svg", "earlier")
+    assert cli.main(["report", "flights/short/short.nc"]) == cli.PASSED
+    out, err = capsys.readouterr()
+    assert "Passed" in out
+    assert "2 files kept" in err
+    for path, text in (
+        (verdict, "earlier"),
+        (figures / "cm.svg", "earlier"),
+        (figures / "cm.png", "drawn"),
+    ):
+        assert path.read_text(encoding="utf-8") == text
+    assert len(list(figures.iterdir())) == 2 * len(figure_names())
+
+
+def test_report_force(capsys, plot):
+    """With --force a report replaces verdict and figures; with --out it leaves them alone."""
+    cli.main(["run", "short.toml"])
+    verdict = Path("flights/short/verdict.json")
+    text = verdict.read_text(encoding="utf-8")
+    write(verdict, "earlier")
+    assert cli.main(["report", "flights/short/short.nc", "--out", "deep/down"]) == cli.PASSED
+    assert Path("deep/down/verdict.json").read_text(encoding="utf-8") == text
+    assert verdict.read_text(encoding="utf-8") == "earlier"
+    assert cli.main(["report", "flights/short/short.nc", "--force"]) == cli.PASSED
+    assert verdict.read_text(encoding="utf-8") == text
+    assert "kept" not in capsys.readouterr().err
+
+
+def test_report_of_a_flight_that_failed(plot):
+    """The report of a flight that failed its verdict exits with 1."""
+    write("bad.toml", SPEEDING)
+    cli.main(["run", "bad.toml", "--no-figures", "--quiet"])
+    assert cli.main(["report", "flights/short/short.nc"]) == cli.FAILED
+
+
+# -- the screen --------------------------------------------------------------------------------------
+
+
+def test_piped_output_is_plain():
+    """What goes to a pipe has no colours and no animation, and no row of a table is broken."""
+    done = command("missions", TERM="xterm-256color")
+    assert "\x1b" not in done.stdout + done.stderr
+    assert len(done.stdout.splitlines()) == 1 + len(mission_names())
+
+
+@pytest.mark.parametrize("arguments", [["missions"], ["missions", "--schema"], ["--help"]])
+def test_reader_went_away(arguments):
+    """A reader that has had enough, as `head` has, is no error."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    done = command(*arguments, stdout=writer)
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="there is no /dev/full here")
+@pytest.mark.parametrize("arguments", [["missions"], ["missions", "--schema"]])
+def test_output_onto_a_full_disk(arguments):
+    """Output that cannot be written is one clear error."""
+    with open("/dev/full", "w") as full:
+        done = command(*arguments, stdout=full)
+    assert done.returncode == cli.BAD_INPUT
+    assert done.stderr == "error: standard output: No space left on device\n"
+
+
+def test_simple_terminal():
+    """Signs that the terminal lacks are replaced, and do not end the program."""
+    done = command("check", "narrow-passage", PYTHONIOENCODING="ascii")
+    assert done.returncode == cli.PASSED
+    assert "yaw 90?" in done.stdout
+
+
+def test_no_color(capsys, monkeypatch):
+    """On a terminal errors are coloured, unless NO_COLOR is set."""
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    for value, coloured in (("", True), ("1", False)):
+        monkeypatch.setenv("NO_COLOR", value)
+        cli._console.cache_clear()
+        cli.main(["run", "sqare"])
+        assert ("\x1b[1;31m" in capsys.readouterr().err) is coloured
+
+
+def test_progress_words():
+    """Progress says the time flown, the speed against real time, the time left and the phase."""
+    watch = cli._Watch()
+    watch.update(Progress(0.0, 90.0, "WP0", 1.0))
+    assert watch._words() == "0.0 of 90 s  WP0"
+    watch.update(Progress(30.0, 90.0, "WP3", 3.0))
+    assert watch._words() == "30.0 of 90 s  x15  0:04 left  WP3"
+    watch.update(Progress(30.5, 90.0, "WP3", 62.0))
+    assert watch._words() == "30.5 of 90 s  x0.5  1:59 left  WP3"
+
+
+def test_progress_leaves_compiling_out(monkeypatch):
+    """The speed is that of flying: time without news, while the kernel compiles, does not count."""
+    clock = iter([0.0, 0.0, 0.1, 12.0, 12.5])
+    monkeypatch.setattr(cli, "perf_counter", lambda: next(clock))
+    monkeypatch.setattr(cli, "_SELDOM", 1e9)
+    watch = cli._Watch()
+    watch.compiling()
+    watch.update(Progress(0.0, 90.0, "WP0", 0.1))
+    watch.update(Progress(10.0, 90.0, "WP0", 12.0))
+    watch.update(Progress(20.0, 90.0, "WP1", 12.5))
+    assert watch._words() == "20.0 of 90 s  x20  0:04 left  WP1"
