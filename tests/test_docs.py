@@ -144,11 +144,13 @@ def test_functions_exist(name):
 
 
 def test_tests_exist():
-    """Every test that paper.md names is there, and every erratum has one."""
+    """Every test that paper.md names is there; every row and every erratum has one."""
     text = page("paper.md")
     for file, name in re.findall(r"`(test_\w+\.py)::(test_\w+)`", text):
         tree = ast.parse((ROOT / "tests" / file).read_text(encoding="utf-8"))
         assert name in {n.name for n in ast.walk(tree) if isinstance(n, ast.FunctionDef)}
+    for section in ("Equations", "Tables", "Figures"):
+        assert all("test_" in row[-1] for row in rows(section) if row[0].isdigit())
     errata = text.split("\n## Errata\n")[1].split("\nSlips of wording")[0]
     for paragraph in re.split(r"\n(?=<a id)", errata)[1:]:
         assert "test_errata.py::" in paragraph
