@@ -382,6 +382,18 @@ def test_interrupt():
     assert not Path("flights/long/figures").exists()
 
 
+def test_interrupt_of_drawing(capsys, monkeypatch):
+    """Ctrl-C while figures are drawn leaves the flight as it is, and says so."""
+
+    def draw(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("rigidfleet.figures.plot", draw)
+    assert cli.main(["run", "short.toml"]) == cli.INTERRUPTED
+    assert capsys.readouterr().err.startswith("Interrupted: the flight is saved in flights")
+    assert Result.load("flights/short/short.nc").complete
+
+
 def test_interrupt_inside_the_compiler(capsys, simulate):
     """Ctrl-C that comes out of the compiler as another error is Ctrl-C all the same."""
 
@@ -421,6 +433,17 @@ def test_run_draws(capsys, plot):
     assert found == {f"{name}.{kind}" for name in figure_names() for kind in ("png", "svg")}
     where = os.path.join("flights", "short", "figures") + os.sep
     assert f"Figures  {where} ({len(found)} files)" in capsys.readouterr().out
+
+
+@pytest.mark.long
+def test_demo(folder):
+    """The demonstration passes its verdict, may be repeated, and leaves every figure."""
+    for _ in range(2):
+        done = command("run", "narrow-passage", "--force")
+        assert done.returncode == cli.PASSED, done.stderr
+    figures = folder / "flights" / "narrow-passage" / "figures"
+    found = {path.name for path in figures.iterdir() if path.stat().st_size > 10_000}
+    assert found == {f"{name}.{kind}" for name in figure_names() for kind in ("png", "svg")}
 
 
 def test_report(capsys, plot):

@@ -149,14 +149,17 @@ def run(
         _print_exactly(verdict.json() + "\n")
     elif not quiet:
         _out().print(verdict)
+    what = "what flew is saved, marked incomplete," if interrupted else "the flight is saved"
     if not (no_figures or interrupted):
-        _draw(result, files.figures, quiet=quiet)
+        try:
+            _draw(result, files.figures, quiet=quiet)
+        except KeyboardInterrupt:
+            interrupted = True
     if not (json or quiet):
         _out().print()
         _list(files)
     if interrupted:
-        message = f"Interrupted: what flew is saved, marked incomplete, in {files.result}"
-        _err().print(message, style="yellow", soft_wrap=True)
+        _err().print(f"Interrupted: {what} in {files.result}", style="yellow", soft_wrap=True)
         return INTERRUPTED
     return PASSED if verdict.passed else FAILED
 
