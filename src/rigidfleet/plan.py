@@ -113,7 +113,7 @@ def plan_phase(mission: Mission, phase: Phase, now: Situation, t_end: float) -> 
     if phase.control == "slots":
         assert now.pose is not None  # attached above
         assert goal is not None
-        motion = _motion(mission, now.pose, goal, now.t, arrival)
+        motion = _motion(mission, now.pose, goal, now.t, arrival, t_end)
     elif phase.control == "body":
         assert goal is not None
         moves = isinstance(phase, Fly | Turn)
@@ -248,8 +248,13 @@ _NO_FEEDBACK = k.Feedback(
 )  # fmt: skip
 
 
-def _motion(mission: Mission, start: Pose, goal: Pose, t0: float, arrival: float) -> k.Motion:
+def _motion(
+    mission: Mission, start: Pose, goal: Pose, t0: float, arrival: float, t_end: float
+) -> k.Motion:
     """LQR of the virtual body from one pose to another, as the trajectory it makes.
+
+    From arrival to ``t_end`` the tracking gains take over, or what the finite horizon has left of
+    the velocity's error would carry the body away.
 
     The attitude is regulated as the rotation vector phi from the goal to the body: three more
     double integrators, phi'' their input, exact for a turn about one axis.
@@ -262,16 +267,24 @@ def _motion(mission: Mission, start: Pose, goal: Pose, t0: float, arrival: float
         (mission.lqr.attitude, (phi, phi_dot), (np.zeros(3), goal.omega)),
     ]
     times = np.unique(np.concatenate([_knots(law, T) for law, _, _ in flights]))
+    Q, R, rest = mission.tracking.Q, mission.tracking.R, t_end - arrival
+    after = lqr.knots(rest, Q, R) if rest > 0.0 else np.zeros(1)
     pieces = []
     for law, begin, end in flights:
         if law.horizon == "finite":
             x = lqr.finite_horizon_trajectory(times, begin, end, T, law.Q, law.R, law.S)
         else:
             x = lqr.infinite_horizon_trajectory(times, begin, end, T, law.Q, law.R)
-        pieces.append(lqr.quintic_pieces(times, *x))
+        piece = lqr.quintic_pieces(times, *x)
+        if rest > 0.0:
+            target = end[0] + end[1] * rest, end[1]
+            x = lqr.infinite_horizon_trajectory(after, (x[0][-1], x[1][-1]), target, rest, Q, R)
+            piece = np.concatenate([piece, lqr.quintic_pieces(after, *x)])
+        pieces.append(piece)
+    knots = np.concatenate([t0 + times, arrival + after[1:]])
     coefficients = np.concatenate(pieces, axis=1)
     # Another layout of an array would be another type, and compile the kernel once more.
-    return k.Motion(t0 + times, np.ascontiguousarray(coefficients), np.ascontiguousarray(goal.T))
+    return k.Motion(knots, np.ascontiguousarray(coefficients), np.ascontiguousarray(goal.T))
 
 
 def _knots(law: Regulator, T: float) -> Array:

@@ -305,7 +305,8 @@ class _Flight:
         if plan.program.control.kind == k.LOCAL:
             errors.append(np.linalg.norm(w.r - w.r_ref, axis=1).max())
         if plan.goal is not None and plan.program.control.kind != k.OPEN:
-            errors.append(np.linalg.norm(self.masses @ w.r / self.masses.sum() - plan.goal.r))
+            target = plan.goal.r + plan.goal.v * (leg.t - plan.arrival)  # it moves on
+            errors.append(np.linalg.norm(self.masses @ w.r / self.masses.sum() - target))
         return float(max(errors))
 
     def _controlled(self, leg: _Leg, controller: Controller) -> None:
