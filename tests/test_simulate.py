@@ -239,6 +239,25 @@ def test_flying_can_end_by_settling():
     assert np.linalg.norm(result.cm[-1] - [9, 5, 6]) <= 2e-3
 
 
+@pytest.mark.parametrize("architecture", ["local", "body"])
+def test_a_hold_after_a_waypoint_in_motion_comes_to_rest_there(architecture):
+    """Flown through at 2 m/s and 10 deg/s, then held: the body comes back and stays, at rest."""
+    through = {
+        "kind": "fly", "position": [15, 5, 6], "velocity": [2, 0, 0], "yaw_deg": 90.0,
+        "rates_deg_s": [0, 0, 10], "duration": 8.0,
+    }  # fmt: skip
+    mission = a_mission(
+        establish(), through, {"kind": "hold", "duration": 8.0}, architecture=architecture
+    )
+    result = simulate(mission)
+    assert np.linalg.norm(result.cm_velocity[last(result, 1)] - [2, 0, 0]) < 0.01
+    assert np.linalg.norm(result.cm[-1] - [15, 5, 6]) < 1e-3
+    assert np.linalg.norm(result.cm_velocity[-1]) < 0.02
+    assert np.rad2deg(np.linalg.norm(result.rates[-1])) < 0.2
+    hold = result.phase == 2
+    assert np.linalg.norm(result.cm[hold] - [15, 5, 6], axis=1).max() < 3.0
+
+
 # -- failures --------------------------------------------------------------------------------------
 
 

@@ -203,9 +203,12 @@ def align_slots(before: Array, after: Array, masses: Array) -> tuple[Array, Arra
 def _goal(phase: Phase, now: Situation, t_end: float) -> tuple[Pose | None, float]:
     """The pose to be at, and when."""
     goal = now.goal
-    if goal is None or not isinstance(phase, Fly | Turn):
+    if goal is None:
+        return None, t_end
+    if not isinstance(phase, Fly | Turn):
         # Nothing says when what stays must have come to rest: by the end, if that is known.
-        return goal, t_end if phase.settle is None else min(t_end, now.t + _REST_WITHIN)
+        arrival = t_end if phase.settle is None else min(t_end, now.t + _REST_WITHIN)
+        return replace(goal, v=np.zeros(3), omega=np.zeros(3)), arrival
     arrival = t_end if phase.travel is None else now.t + phase.travel
     angles = phase.attitude_deg
     T = goal.T if angles is None else att.dcm_from_euler(np.deg2rad(angles))
