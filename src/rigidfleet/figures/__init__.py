@@ -1,0 +1,141 @@
+"""Pictures of a flight, drawn with matplotlib from its `Result` alone.
+
+`plot` writes them to files; each function of the same name as a figure returns it as a matplotlib
+`Figure`, to be shown in a notebook or changed. An agent has the same colour in all of them
+(`agent_colours`), told apart by colour-blind eyes too. Nothing here touches pyplot or the user's
+settings of matplotlib.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import secrets
+import warnings
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rigidfleet.errors import ResultError
+from rigidfleet.figures.curves import (
+    attitude,
+    clearance,
+    cm,
+    constraint_error,
+    constraint_force,
+    distances,
+    inputs,
+)
+from rigidfleet.figures.page import summary
+from rigidfleet.figures.space import formations, trajectory
+from rigidfleet.figures.style import agent_colours, settings
+from rigidfleet.result import Result
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = [
+    "agent_colours",
+    "attitude",
+    "clearance",
+    "cm",
+    "constraint_error",
+    "constraint_force",
+    "distances",
+    "figure_names",
+    "formations",
+    "inputs",
+    "plot",
+    "summary",
+    "trajectory",
+]
+
+_FIGURES: dict[str, Callable[[Result], Figure]] = {
+    draw.__name__: draw
+    for draw in (
+        summary, trajectory, distances, cm, attitude, inputs, constraint_force, constraint_error,
+        clearance, formations,
+    )
+}  # fmt: skip
+_FORMATS = ("png", "svg", "pdf")
+
+
+def figure_names() -> list[str]:
+    """Names of all figures, which are also the names of the functions that draw them."""
+    return list(_FIGURES)
+
+
+def plot(
+    result: Result,
+    folder: str | Path,
+    *,
+    formats: Iterable[str] = ("png", "svg"),
+    names: Iterable[str] | None = None,
+) -> list[Path]:
+    """Draw a flight and write each figure to ``folder/NAME.FORMAT``, whole or not at all.
+
+    Parameters
+    ----------
+    folder : made if it does not exist; files of these names in it are replaced
+    formats : of png, svg (text stays text) and pdf
+    names : of `figure_names`; all of them by default
+
+    Returns
+    -------
+    The files written.
+
+    Raises
+    ------
+    ValueError
+        A format or a name is unknown.
+    ResultError
+        A file cannot be written, or the mission inside the result cannot be read.
+    """
+    formats = _known("format", formats, _FORMATS)
+    names = list(_FIGURES) if names is None else _known("figure", names, _FIGURES)
+    written = []
+    for name in names:
+        figure = _FIGURES[name](result)
+        for kind in formats:
+            path = Path(folder) / f"{name}.{kind}"
+            _write(path, _rendered(figure, kind))
+            written.append(path)
+    return written
+
+
+def _known(what: str, asked: Iterable[str], known: Iterable[str]) -> list[str]:
+    asked = [asked] if isinstance(asked, str) else list(dict.fromkeys(asked))
+    for name in asked:
+        if name not in known:
+            raise ValueError(f"there is no {what} {name!r}; known: {', '.join(known)}")
+    return asked
+
+
+def _rendered(figure: Figure, kind: str) -> bytes:
+    # No date inside, so that the same flight gives the same file.
+    metadata: dict[str, Any] = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}
+    buffer = io.BytesIO()
+    with settings(), warnings.catch_warnings():
+        # A name in letters that the font lacks is drawn as boxes; in SVG it shows.
+        warnings.filterwarnings("ignore", message="Glyph .* missing from font")
+        figure.savefig(buffer, format=kind, metadata=metadata.get(kind))
+    # The layout is found; drawing again need not look for it.
+    figure.set_layout_engine("none")
+    return buffer.getvalue()
+
+
+def _write(path: Path, data: bytes) -> None:
+    part = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            part.write_bytes(data)
+            os.replace(part, path)
+        except BaseException:
+            part.unlink(missing_ok=True)
+            raise
+    except OSError as error:
+        reason = error.strerror or error
+        raise ResultError(
+            f"{path}: the figure cannot be written: {reason}. Choose another folder."
+        ) from error

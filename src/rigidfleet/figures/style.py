@@ -1,0 +1,347 @@
+"""What all figures share: colours, type, the phases along time, lines, legends."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Generator, Iterable, Sequence
+from contextlib import contextmanager
+from functools import wraps
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigidfleet.result import Result
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
+    from matplotlib.text import Text
+
+Floats = NDArray[np.float64]
+Draw = Callable[[Result], "Figure"]
+
+#: Colours of the first twelve agents: of Okabe and Ito's set those that stand out on white, then
+#: others as far from all before as can be, to normal and to colour-blind eyes alike.
+PALETTE = (
+    "#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9",
+    "#882255", "#332288", "#999933", "#117733", "#8B0000", "#1A1A1A",
+)  # fmt: skip
+INK, GREY, FAINT = "#222222", "#6B6B6B", "#B5B5B5"
+#: What belongs to no agent: the formation as a whole; and its three components, dark to light.
+FLOWN = "#8FA3B8"
+TONES = ("#1F2A36", "#66798D", "#A9B8C6")
+BAND = "#F1F3F5"
+DASHES = (0, (4, 2.5))
+ALERT = "#B00020"
+
+WIDTH = 9.0  # [in] of a figure over time
+_PAD = 0.07  # [in] around what is drawn
+_SLANT = 38.0  # of phase names that do not fit upright [deg]
+_LONGEST = 28  # letters of a phase name
+_POINTS = 3000  # samples of a line; more would be drawn over each other
+_ENTRIES = 12  # of a legend
+
+_RC: dict[str, Any] = {
+    "font.family": "sans-serif",
+    "font.size": 8.5,
+    "axes.titlesize": 9,
+    "axes.labelsize": 8.5,
+    "axes.edgecolor": GREY,
+    "axes.linewidth": 0.6,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.formatter.useoffset": False,
+    "axes.formatter.limits": (-5, 6),
+    "axes.xmargin": 0,
+    "axes3d.xaxis.panecolor": "none",
+    "axes3d.yaxis.panecolor": "none",
+    "axes3d.zaxis.panecolor": "none",
+    "grid.color": "#E3E6E8",
+    "grid.linewidth": 0.5,
+    "xtick.color": GREY,
+    "ytick.color": GREY,
+    "xtick.labelcolor": INK,
+    "ytick.labelcolor": INK,
+    "xtick.labelsize": 8,
+    "ytick.labelsize": 8,
+    "text.color": INK,
+    "axes.labelcolor": INK,
+    "lines.linewidth": 1.1,
+    "lines.solid_capstyle": "round",
+    "legend.frameon": False,
+    "legend.fontsize": 8,
+    "legend.handlelength": 1.6,
+    "legend.borderaxespad": 0.0,
+    "figure.dpi": 100,
+    "figure.constrained_layout.w_pad": _PAD,
+    "figure.constrained_layout.h_pad": _PAD,
+    "savefig.dpi": 160,
+    "svg.fonttype": "none",  # text stays text
+    "svg.hashsalt": "rigidfleet",  # the same flight gives the same file
+}
+
+
+@contextmanager
+def settings() -> Generator[None]:
+    """Matplotlib's defaults and ours over them, whatever the user has set; undone at the end."""
+    import matplotlib.style
+
+    with matplotlib.style.context(["default", _RC]):
+        yield
+
+
+def styled(draw: Draw) -> Draw:
+    """Draw a figure in our style."""
+
+    @wraps(draw)
+    def drawn(result: Result) -> Figure:
+        with settings():
+            return draw(result)
+
+    return drawn
+
+
+def agent_colours(n: int) -> list[str]:
+    """Colour of each of n agents ("#rrggbb"), the same in all figures, apart to colour-blind eyes.
+
+    Up to twelve each have a colour of their own; more lie along the scale of viridis, by number.
+    """
+    return list(PALETTE[:n]) if n <= len(PALETTE) else scale(n)
+
+
+def scale(n: int) -> list[str]:
+    """n colours from dark to light, in an order that colour-blind eyes see too."""
+    from matplotlib import colormaps
+    from matplotlib.colors import to_hex
+
+    return [to_hex(c) for c in colormaps["viridis"](np.linspace(0.0, 0.82, n))]
+
+
+# -- figures over time -------------------------------------------------------------------------------
+
+
+def time_figure(
+    result: Result, title: str, rows: int, columns: int = 1, height: float = 2.1
+) -> tuple[Figure, Any]:
+    """Figure of rows x columns axes (object array) that share time; `height` of a row [in]."""
+    from matplotlib.figure import Figure
+
+    fig = Figure(figsize=(WIDTH, 1.3 + height * rows), layout="constrained")
+    axes = fig.subplots(rows, columns, sharex=True, squeeze=False)
+    head(fig, result, title)
+    for ax in axes.flat:
+        over_time(ax, result)
+    for ax in axes[-1]:
+        ax.set_xlabel("time [s]")
+    return fig, axes
+
+
+def head(fig: Figure, result: Result, title: str) -> None:
+    """Title at the left; the mission and, if it did not end well, when it stopped at the right."""
+    top = 1 - _PAD / fig.get_figheight()
+    heading = fig.suptitle(title, x=0.012, ha="left", va="top", fontsize=11, fontweight="bold")
+    if fig.get_layout_engine() is None:  # else it finds the place, and keeps the axes clear of it
+        heading.set_y(top)
+    words, colour = result.mission.name, GREY
+    if not result.complete:
+        words, colour = f"{words}: incomplete, stopped at {result.phases[-1].t_end:.2f} s", ALERT
+    fig.text(0.988, top, words, ha="right", va="top", fontsize=9, color=colour, parse_math=False)
+
+
+def over_time(ax: Axes, result: Result) -> None:
+    """Time axis with every second phase shaded."""
+    t = result.time
+    ax.set_xlim(t[0], t[-1] if t[-1] > t[0] else t[0] + 1.0)
+    for i, phase in enumerate(result.phases):
+        if i % 2:
+            ax.axvspan(phase.t_start, phase.t_end, color=BAND, linewidth=0, zorder=0)
+    if not result.complete:
+        ax.axvline(t[-1], color=ALERT, linewidth=0.8)
+
+
+def line(ax: Axes, t: Floats, y: Floats, **look: Any) -> Line2D:
+    """Line through samples y (K,) at t (K,), thinned if there are more than anybody sees."""
+    return ax.plot(*thinned(t, y), **look)[0]
+
+
+def thinned(t: Floats, y: Floats, most: int = _POINTS) -> tuple[Floats, Floats]:
+    """At most about `most` samples that look the same: of each stretch the first, least and greatest."""
+    if len(t) <= most:
+        return t, y
+    keep = {0, len(t) - 1}
+    for start, stop in pairwise(np.linspace(0, len(t), most // 3 + 1).astype(int).tolist()):
+        part = y[start:stop]
+        low, high = np.where(np.isnan(part), np.inf, part), np.where(np.isnan(part), -np.inf, part)
+        keep |= {start, start + int(low.argmin()), start + int(high.argmax())}
+    kept = sorted(keep)
+    return t[kept], y[kept]
+
+
+def reference(ax: Axes, t: Floats, y: Floats) -> Line2D:
+    """Dashed line of a reference."""
+    return line(ax, t, y, color=INK, linewidth=0.8, linestyle=DASHES, zorder=3)
+
+
+def limit(ax: Axes, value: float, label: str, colour: str = ALERT) -> None:
+    """Line of a limit, with its name on it."""
+    ax.axhline(value, color=colour, linewidth=1.0, linestyle=(0, (6, 2)), zorder=2.5, gid="limit")
+    ax.annotate(
+        label, (0.995, value), (0, 2), xycoords=("axes fraction", "data"), va="bottom", ha="right",
+        textcoords="offset points", fontsize=7.5, color=colour, path_effects=halo(),
+    )  # fmt: skip
+
+
+def halo() -> list[Any]:
+    """White around letters that stand on lines."""
+    from matplotlib.patheffects import withStroke
+
+    return [withStroke(linewidth=2.5, foreground="white")]
+
+
+def note(ax: Axes, words: str) -> None:
+    """Words in an axes that has nothing to show."""
+    ax.text(0.5, 0.5, words, transform=ax.transAxes, ha="center", va="center", color=GREY)
+    ax.tick_params(left=False, labelleft=False)
+
+
+def agent_lines(ax: Axes, result: Result, values: Floats) -> None:
+    """A line for each agent, values (K, N), in its colour; the first widest, so that all show."""
+    n = result.n_agents
+    for i, colour in enumerate(agent_colours(n)):
+        width = 1.0 + 1.6 * (n - 1 - i) / max(n - 1, 1)
+        name = f"agent-{i + 1}"
+        line(ax, result.time, values[:, i], color=colour, linewidth=width, gid=name)
+
+
+def agent_handles(n: int, **look: Any) -> list[Line2D]:
+    """Legend entries of the agents: all of them, or some evenly spread ones."""
+    from matplotlib.lines import Line2D
+
+    colours = agent_colours(n)
+    return [
+        Line2D([], [], color=colours[i], label=f"agent {i + 1}", **look) for i in some(n, _ENTRIES)
+    ]
+
+
+def some(n: int, most: int) -> list[int]:
+    """Indices of n things, or of `most` evenly spread ones with both ends."""
+    return sorted({round(i) for i in np.linspace(0, n - 1, min(n, most)).tolist()}) if n else []
+
+
+def legend(ax: Axes, handles: Sequence[Any], title: str = "") -> None:
+    """Legend to the right of an axes."""
+    if handles:
+        ax.legend(
+            handles=handles, loc="upper left", bbox_to_anchor=(1.012, 1.0), title=title or None,
+            title_fontsize=8, alignment="left", labelspacing=0.3,
+        )  # fmt: skip
+
+
+# -- names of phases ---------------------------------------------------------------------------------
+
+
+def clean(name: str, longest: int = _LONGEST) -> str:
+    """A user's name in one printable line, cut if it is long."""
+    words = " ".join("".join(c if c.isprintable() else " " for c in name).split())
+    return words if len(words) <= longest else words[: longest - 1].rstrip() + "…"
+
+
+def name_phases(fig: Figure, axes: Iterable[Axes], result: Result) -> None:
+    """Write the phases' names along the top of axes, where nothing overlaps.
+
+    Upright over each phase if all fit; else slanting, moved apart where phases are short, with a
+    line to where they belong. Where even that is too narrow, the shortest phases go without.
+    """
+    engine = fig.get_layout_engine()
+    if engine is not None:
+        engine.execute(fig)
+    for ax in axes:
+        labels = _upright(ax, result) or _slanting(ax, result)
+        for label in labels:
+            label.set_gid("phase")
+
+
+def number_phases(fig: Figure, axes: Iterable[Axes], result: Result) -> str:
+    """Write the phases' numbers along the top of small axes; returns the key to them.
+
+    A number without room is left out.
+    """
+    for ax in axes:
+        right = -math.inf
+        for i, phase in enumerate(result.phases):
+            label = ax.text(
+                (phase.t_start + phase.t_end) / 2, 1.01, str(i + 1), fontsize=6.5, color=GREY,
+                ha="center", va="bottom", transform=ax.get_xaxis_transform(), gid="phase",
+            )  # fmt: skip
+            box = label.get_window_extent()
+            if box.x0 < right + 1:
+                label.remove()
+            else:
+                right = box.x1
+    names = (f"{i + 1} {clean(p.name)}" for i, p in enumerate(result.phases))
+    return "   ".join(name.replace(" ", "\N{NO-BREAK SPACE}") for name in names)
+
+
+def _upright(ax: Axes, result: Result) -> list[Text]:
+    labels = []
+    for phase in result.phases:
+        label = ax.text(
+            (phase.t_start + phase.t_end) / 2, 1.02, clean(phase.name, 60), fontsize=8, color=GREY,
+            ha="center", va="bottom", transform=ax.get_xaxis_transform(), parse_math=False,
+        )  # fmt: skip
+        labels.append(label)
+        room = _per_second(ax) * (phase.t_end - phase.t_start)
+        if label.get_window_extent().width > 0.9 * room:
+            for drawn in labels:
+                drawn.remove()
+            return []
+    return labels
+
+
+def _slanting(ax: Axes, result: Result) -> list[Text]:
+    scale, t0 = _per_second(ax), ax.get_xlim()[0]
+    size = 7.5
+    # Lines of text keep apart by their height across the slant.
+    pitch = 1.25 * size * ax.figure.dpi / 72 / math.sin(math.radians(_SLANT))
+    room = 1 + int(scale * np.diff(ax.get_xlim())[0] / pitch)
+    longest = sorted(result.phases, key=lambda p: p.t_start - p.t_end)[:room]
+    phases = sorted(longest, key=lambda p: p.t_start)
+    middle = np.array([(p.t_start + p.t_end) / 2 - t0 for p in phases]) * scale
+    place = _apart(middle, pitch)
+    above = 6 * ax.figure.dpi / 72 / ax.bbox.height
+    labels = []
+    for phase, x, at in zip(phases, middle / scale + t0, place / scale + t0, strict=True):
+        label = ax.text(
+            at, 1 + above, clean(phase.name), fontsize=size, color=GREY, ha="left", va="baseline",
+            rotation=_SLANT, rotation_mode="anchor", transform=ax.get_xaxis_transform(),
+            parse_math=False,
+        )  # fmt: skip
+        labels.append(label)
+        ax.plot(
+            [x, at], [1, 1 + 0.8 * above], color=FAINT, linewidth=0.6, clip_on=False,
+            transform=ax.get_xaxis_transform(),
+        )  # fmt: skip
+    return labels
+
+
+def _per_second(ax: Axes) -> float:
+    """Pixels of a second; fewer than there are, as names at the right may narrow the axes."""
+    return 0.93 * ax.bbox.width / float(np.diff(ax.get_xlim())[0])
+
+
+def _apart(places: Floats, pitch: float) -> Floats:
+    """Ascending places moved as little as possible (least squares) to be `pitch` apart or more."""
+    # Pool adjacent violators on the places less their least distances.
+    blocks: list[list[float]] = []
+    for value in places - pitch * np.arange(len(places)):
+        blocks.append([float(value), 1.0])
+        while len(blocks) > 1 and blocks[-2][0] > blocks[-1][0]:
+            (b, n), (a, m) = blocks.pop(), blocks.pop()
+            blocks.append([(a * m + b * n) / (m + n), m + n])
+    level = np.repeat([b[0] for b in blocks], [int(b[1]) for b in blocks])
+    return level + pitch * np.arange(len(places))
