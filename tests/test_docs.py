@@ -147,8 +147,8 @@ def test_tests_exist():
     """Every test that paper.md names is there; every row and every erratum has one."""
     text = page("paper.md")
     for file, name in re.findall(r"`(test_\w+\.py)::(test_\w+)`", text):
-        tree = ast.parse((ROOT / "tests" / file).read_text(encoding="utf-8"))
-        assert name in {n.name for n in ast.walk(tree) if isinstance(n, ast.FunctionDef)}
+        source = (ROOT / "tests" / file).read_text(encoding="utf-8")
+        assert f"\ndef {name}(" in source, f"paper.md names {file}::{name}"
     for section in ("Equations", "Tables", "Figures"):
         assert all("test_" in row[-1] for row in rows(section) if row[0].isdigit())
     errata = text.split("\n## Errata\n")[1].split("\nSlips of wording")[0]
