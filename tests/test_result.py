@@ -332,7 +332,7 @@ def test_a_killed_save_leaves_the_old_file(tmp_path):
     path.write_bytes(b"old")
     code = (
         "import os, sys; from pathlib import Path; from rigidfleet import result; "
-        "os.replace = lambda *a: os._exit(9); result._write(Path(sys.argv[1]), b'new')"
+        "os.replace = lambda *a: os._exit(9); result.write_file(Path(sys.argv[1]), b'new')"
     )
     assert subprocess.run([sys.executable, "-c", code, str(path)], check=False).returncode == 9
     assert path.read_bytes() == b"old"

@@ -263,7 +263,7 @@ class Result:
         ResultError
             The file cannot be written.
         """
-        _write(Path(path), self._netcdf())
+        write_file(Path(path), self._netcdf())
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -306,7 +306,7 @@ class Result:
             angle = "" if np.isnan(yaw[k]) else f"{yaw[k]:.6f}"
             t = self.time[k]
             lines += [row(t, i, *s, angle) for i, s in enumerate(state[k].tolist(), start=1)]
-        _write(Path(path), "".join(lines).encode())
+        write_file(Path(path), "".join(lines).encode())
 
     def _netcdf(self) -> bytes:
         """The file's content. Built in memory, so that a full disk meets a plain write and not the HDF5 library."""
@@ -406,7 +406,7 @@ def _one_line(error: BaseException) -> str:
 # -- files -------------------------------------------------------------------------------------------
 
 
-def _write(path: Path, data: bytes) -> None:
+def write_file(path: Path, data: bytes) -> None:
     """Write a file whole or not at all: beside its place first, then into it in one step."""
     target = Path(os.path.realpath(path))  # through a symbolic link, not in place of it
     part = target.with_name(f".{target.name[:200]}.{secrets.token_hex(4)}.part")
