@@ -39,7 +39,7 @@ format: .venv/.dev  ## Rewrite the code in the project's style
 
 constraints: .venv/.dev  ## Choose newer versions of all packages
 	@$(BIN)/uv pip compile --quiet --universal --upgrade --no-emit-index-url --no-header \
-		--no-annotate --all-extras --group dev --group bench --group build \
+		--no-annotate --all-extras --group dev --group bench --group docs --group build \
 		pyproject.toml --output-file constraints.txt
 
 clean:  ## Remove .venv, caches and builds
