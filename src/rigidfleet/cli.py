@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from rigidfleet.assess import Verdict
-    from rigidfleet.mission import Mission, Phase
+    from rigidfleet.mission import Mission
     from rigidfleet.result import Result
     from rigidfleet.simulate import Progress
 
@@ -207,7 +207,7 @@ def check(mission: str, /, *, json: bool = False) -> int:
     json : bool
         Print what was found as JSON.
     """
-    from rigidfleet.mission import load_mission
+    from rigidfleet.mission import ending, goal, load_mission
 
     try:
         found = load_mission(mission)
@@ -231,7 +231,7 @@ def check(mission: str, /, *, json: bool = False) -> int:
     )
     table = _table("#", "phase", "kind", "to", "ends", "control")
     for n, phase in enumerate(found.phases, start=1):
-        table.add_row(str(n), phase.name, phase.kind, _goal(phase), _ends(phase), phase.control)
+        table.add_row(str(n), phase.name, phase.kind, goal(phase), ending(phase), phase.control)
     _out().print(f"{found.name}: right: {', '.join(counts)}")
     _print_table(table)
     return PASSED
@@ -455,6 +455,8 @@ def _list(files: _Files) -> None:
 
 def _facts(mission: Mission) -> dict[str, object]:
     """A mission in plain data."""
+    from rigidfleet.mission import ending, goal
+
     return {
         "name": mission.name,
         "title": mission.title,
@@ -462,7 +464,7 @@ def _facts(mission: Mission) -> dict[str, object]:
         "agents": mission.n_agents,
         "formations": list(mission.formations),
         "phases": [
-            {"name": p.name, "kind": p.kind, "to": _goal(p), "ends": _ends(p), "control": p.control}
+            {"name": p.name, "kind": p.kind, "to": goal(p), "ends": ending(p), "control": p.control}
             for p in mission.phases
         ],
         "latest_end_s": mission.latest_end,
@@ -472,38 +474,6 @@ def _facts(mission: Mission) -> dict[str, object]:
 def _length(mission: Mission) -> str:
     most = "at most " if any(phase.settle for phase in mission.phases) else ""
     return f"{most}{mission.latest_end:g} s"
-
-
-def _goal(phase: Phase) -> str:
-    """What a phase leads to."""
-    from rigidfleet.mission import Establish, Fly, Hold, Reshape
-
-    if isinstance(phase, Hold):
-        return ""
-    if isinstance(phase, Establish | Reshape):
-        return phase.formation
-    parts = []
-    if isinstance(phase, Fly):
-        parts.append(_vector(phase.position, "m"))
-        if any(phase.velocity):
-            parts.append(_vector(phase.velocity, "m/s"))
-    if phase.attitude_deg is not None:
-        angles = zip(("roll", "pitch", "yaw"), phase.attitude_deg, strict=True)
-        parts += [f"{name} {angle:g}°" for name, angle in angles if angle or name == "yaw"]
-    if any(phase.rates_deg_s):
-        parts.append(_vector(phase.rates_deg_s, "°/s"))
-    return ", ".join(parts)
-
-
-def _ends(phase: Phase) -> str:
-    """When a phase ends."""
-    if phase.settle is not None:
-        return f"settled, within {phase.settle.timeout:g} s"
-    return f"at {phase.until:g} s" if phase.until is not None else f"after {phase.duration:g} s"
-
-
-def _vector(values: Sequence[float], unit: str) -> str:
-    return f"({', '.join(f'{value:g}' for value in values)}) {unit}"
 
 
 def _count(n: int, noun: str) -> str:

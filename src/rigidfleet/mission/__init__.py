@@ -30,6 +30,7 @@ from rigidfleet.mission.schema import (
     Settle,
     Turn,
 )
+from rigidfleet.mission.words import ending, goal
 
 __all__ = [
     "Box",
@@ -48,6 +49,8 @@ __all__ = [
     "Reshape",
     "Settle",
     "Turn",
+    "ending",
+    "goal",
     "json_schema",
     "load_mission",
     "mission_names",

@@ -1,0 +1,37 @@
+"""A phase in words: what it leads to, and when it ends."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rigidfleet.mission.schema import Establish, Fly, Hold, Phase, Reshape
+
+
+def goal(phase: Phase) -> str:
+    """What a phase leads to; "" for a hold."""
+    if isinstance(phase, Hold):
+        return ""
+    if isinstance(phase, Establish | Reshape):
+        return phase.formation
+    parts = []
+    if isinstance(phase, Fly):
+        parts.append(_vector(phase.position, "m"))
+        if any(phase.velocity):
+            parts.append(_vector(phase.velocity, "m/s"))
+    if phase.attitude_deg is not None:
+        angles = zip(("roll", "pitch", "yaw"), phase.attitude_deg, strict=True)
+        parts += [f"{name} {angle:g}°" for name, angle in angles if angle or name == "yaw"]
+    if any(phase.rates_deg_s):
+        parts.append(_vector(phase.rates_deg_s, "°/s"))
+    return ", ".join(parts)
+
+
+def ending(phase: Phase) -> str:
+    """When a phase ends."""
+    if phase.settle is not None:
+        return f"settled, within {phase.settle.timeout:g} s"
+    return f"at {phase.until:g} s" if phase.until is not None else f"after {phase.duration:g} s"
+
+
+def _vector(values: Sequence[float], unit: str) -> str:
+    return f"({', '.join(f'{value:g}' for value in values)}) {unit}"
