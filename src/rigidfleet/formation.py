@@ -1,18 +1,22 @@
 """Shapes, edges and the distances between them: what a formation is before it flies.
 
-Pure NumPy. Agents count from 0 here; a shape is an (N, 3) array of *slots* [m] in the body frame, one per
+Agents count from 0 here; a shape is an (N, 3) array of *slots* [m] in the body frame, one per
 agent, with its geometric centre at the origin. Distances alone know neither a mirror image nor an attitude;
 slots do.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import combinations, islice
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from rigidfleet.errors import Finding, MissionError
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -64,6 +68,81 @@ def _pyramid(size: Floats, n: int) -> Floats:
     return np.vstack([base, [0, 0, height]])
 
 
+def _v(size: Floats, n: int) -> Floats:
+    # Wings at 45 degrees: 0, then left, right, left, ... in ranks behind the leader.
+    rank, side = (np.arange(n) + 1) // 2, np.where(np.arange(n) % 2, 1.0, -1.0)
+    step = size[0] / np.sqrt(2) * rank
+    return np.column_stack([-step, side * step, 0 * step])
+
+
+def _grid(size: Floats, n: int) -> Floats:
+    row, column = np.divmod(np.arange(n), int(np.ceil(np.sqrt(n))))
+    return size[0] * np.column_stack([column, row, 0 * row])
+
+
+def _sphere(size: Floats, n: int) -> Floats:
+    # Fibonacci's spiral: equal areas in height, the golden angle around.
+    z = (2 * np.arange(n) + 1) / n - 1
+    angle = np.pi * (3 - np.sqrt(5)) * np.arange(n)
+    across = np.sqrt(1 - z**2)
+    p = np.column_stack([across * np.cos(angle), across * np.sin(angle), z])
+    return p * size[0] / min(np.linalg.norm(p[:k] - p[k], axis=1).min() for k in range(1, n))
+
+
+def _helix(size: Floats, n: int) -> Floats:
+    radius, rise, spacing = size
+
+    def chord(angle: float) -> float:
+        return float(np.hypot(2 * radius * np.sin(angle / 2), rise * angle / (2 * np.pi)))
+
+    low, high = 0.0, np.pi
+    if spacing > chord(high):
+        raise ValueError(
+            f"a helix of radius {radius:g} m that rises {rise:g} m a turn takes a distance of neighbours of at "
+            f"most {chord(high):.4g} m, half a turn, not {spacing:g}"
+        )
+    for _ in range(60):
+        middle = (low + high) / 2
+        low, high = (middle, high) if chord(middle) < spacing else (low, middle)
+    angle = high * np.arange(n)
+    return np.column_stack(
+        [radius * np.cos(angle), radius * np.sin(angle), rise * angle / 2 / np.pi]
+    )
+
+
+def _rings(*rings: tuple[int, float, float, float]) -> Floats:
+    """Rings (count, radius, height, angle of the first), each counter-clockwise, one after the other."""
+    points = []
+    for count, radius, height, first in rings:
+        angle = first + 2 * np.pi * np.arange(count) / count
+        points += [radius * np.cos(angle), radius * np.sin(angle), np.full(count, height)]
+    return np.column_stack([np.concatenate(points[axis::3]) for axis in range(3)])
+
+
+def _octahedron(size: Floats, n: int) -> Floats:
+    r = size[0] / np.sqrt(2)
+    return _rings((1, 0, -r, 0), (4, r, 0, 0), (1, 0, r, 0))
+
+
+def _icosahedron(size: Floats, n: int) -> Floats:
+    # Circumradius R; two rings of five, the upper half a step ahead, at heights -+ R / sqrt 5.
+    R = size[0] * np.sqrt((5 + np.sqrt(5)) / 8)
+    ring, height = 2 * R / np.sqrt(5), R / np.sqrt(5)
+    return _rings((1, 0, -R, 0), (5, ring, -height, 0), (5, ring, height, np.pi / 5), (1, 0, R, 0))
+
+
+def _dodecahedron(size: Floats, n: int) -> Floats:
+    golden = (1 + np.sqrt(5)) / 2
+    outer = size[0] / (2 * np.sin(np.pi / 5))
+    # Face at the top and bottom; between them two rings, golden times as wide.
+    top = size[0] / 2 * np.sqrt((25 + 11 * np.sqrt(5)) / 10)
+    low = top - size[0] * np.sqrt(1 - (outer * (golden - 1) / size[0]) ** 2)
+    wide, half = golden * outer, np.pi / 5
+    return _rings(
+        (5, outer, -top, 0), (5, wide, -low, 0), (5, wide, low, half), (5, outer, top, half)
+    )
+
+
 class Shape(NamedTuple):
     """A named shape: which numbers of agents it takes, how many sizes, and what it looks like."""
 
@@ -87,6 +166,31 @@ SHAPES: dict[str, Shape] = {
         range(8, 9), 1, _cuboid, "1-4 counter-clockwise from (-, -, -) below, 5-8 above them"
     ),
     "cuboid": Shape(range(8, 9), 3, _cuboid, "as the cube, with three edge lengths [x, y, z]"),
+    "v": Shape(
+        range(3, _ANY), 1, _v, "flying along x, wings at 45°: agent 1 leads, then left, right, ..."
+    ),
+    "grid": Shape(
+        range(4, _ANY), 1, _grid, "rows along x, as near to square as can be, then rows along y"
+    ),
+    "sphere": Shape(
+        range(4, _ANY), 1, _sphere, "Fibonacci spiral from below; `size` is the least distance"
+    ),
+    "helix": Shape(
+        range(3, _ANY),
+        3,
+        _helix,
+        "round z, rising; sizes [radius, rise per turn, neighbours' distance]",
+    ),
+    "tetrahedron": Shape(range(4, 5), 1, _pyramid, "1-3 counter-clockwise below, 4 above"),
+    "octahedron": Shape(
+        range(6, 7), 1, _octahedron, "1 below, 2-5 counter-clockwise from x, 6 above"
+    ),
+    "icosahedron": Shape(
+        range(12, 13), 1, _icosahedron, "1 below, rings 2-6 and 7-11 counter-clockwise, 12 above"
+    ),
+    "dodecahedron": Shape(
+        range(20, 21), 1, _dodecahedron, "rings 1-5, 6-10, 11-15, 16-20 upwards, counter-clockwise"
+    ),
 }
 
 
@@ -96,7 +200,7 @@ def slots(shape: str, size: float | Sequence[float], n: int) -> Floats:
     Parameters
     ----------
     shape : a key of `SHAPES`
-    size : edge length [m]; three of them for a cuboid
+    size : edge length [m]; three of them for a cuboid, or the helix's radius, rise per turn and distance
     n : number of agents
 
     Returns
@@ -115,7 +219,8 @@ def slots(shape: str, size: float | Sequence[float], n: int) -> Floats:
     if n not in form.agents:
         raise ValueError(f"shape {shape!r} takes {agents_taken(shape)}, not {n}")
     if sizes.shape != (form.sizes,):
-        wanted = "one size, its edge length" if form.sizes == 1 else f"{form.sizes} sizes [x, y, z]"
+        names = "[radius, rise per turn, distance]" if shape == "helix" else "[x, y, z]"
+        wanted = "one size, its edge length" if form.sizes == 1 else f"{form.sizes} sizes {names}"
         raise ValueError(f"shape {shape!r} takes {wanted}")
     if not (np.isfinite(sizes).all() and (sizes > 0).all()):
         raise ValueError(f"shape {shape!r} needs sizes > 0 m, not {size}")
@@ -130,6 +235,73 @@ def agents_taken(shape: str) -> str:
     if taken.stop == _ANY:
         return f"{taken.start} or more agents"
     return f"{taken.start} to {taken.stop - 1} agents"
+
+
+def read_points(path: str | Path) -> Floats:
+    """Slots (N, 3) [m] from a text file: one agent a line, x, y and z (or x and y, for z = 0).
+
+    Numbers are separated by commas, semicolons or blanks; empty lines and what follows `#` are passed over,
+    and so is a first line of names (`x,y,z`).
+
+    Raises
+    ------
+    MissionError
+        The file cannot be read or has no points; with a finding for each line that is none.
+    """
+    lines = _lines(Path(path))
+    findings, points, first = [], [], {}
+    for number, line in enumerate(lines, start=1):
+        fields = [f for f in re.split(r"\s*[,;]\s*|\s+", line.partition("#")[0].strip()) if f]
+        if not fields or (not points and not findings and _are_names(fields)):
+            continue
+        problem = remedy = ""
+        try:
+            point = [float(field) for field in fields]
+        except ValueError:
+            point = []
+            problem, remedy = "is no point", "write x, y, z as numbers, with decimal points"
+        if point and len(point) not in (2, 3):
+            problem = f"has {len(point)} numbers"
+            remedy = "write x, y, z (or x, y); decimal points, not commas"
+        elif not np.isfinite(point).all():
+            problem, remedy = "is not finite", "write x, y, z [m] as finite numbers"
+        if not problem:
+            at = first.setdefault(tuple(round(x, 9) for x in (*point, 0.0)[:3]), number)
+            if at != number:
+                problem, remedy = f"is the point of line {at} again", "keep the slots apart"
+        if problem:
+            findings.append(Finding(str(path), f"line {number}", line.strip(), problem, remedy))
+        else:
+            points.append((*point, 0.0)[:3])
+    if not points and not findings:
+        remedy = "write one agent a line: x, y, z"
+        findings.append(Finding(str(path), "", None, "has no points", remedy))
+    if findings:
+        raise MissionError(findings)
+    return np.array(points, dtype=np.float64)
+
+
+def _are_names(fields: list[str]) -> bool:
+    def number(field: str) -> bool:
+        try:
+            float(field)
+        except ValueError:
+            return False
+        return True
+
+    return not any(number(f) or f[0].isdigit() for f in fields)
+
+
+def _lines(path: Path) -> list[str]:
+    try:
+        return path.read_text(encoding="utf-8-sig").splitlines()
+    except UnicodeDecodeError:
+        problem = "is not text"
+    except OSError as error:
+        problem = f"cannot be read: {(error.strerror or str(error)).lower()}"
+    raise MissionError(
+        [Finding(str(path), "", None, problem, "give a text file, one agent a line")]
+    )
 
 
 def centred(points: ArrayLike) -> Floats:

@@ -1,0 +1,19 @@
+"""Rigidity: what distances hold of a shape, what they leave free, and which other shapes they allow."""
+
+from rigidfleet.rigidity.analysis import Rigidity, Verdict, analyse, full_rank
+from rigidfleet.rigidity.framework import Flex, jacobian, rigid_motions
+from rigidfleet.rigidity.realisations import Kind, Realisation, Realisations, realisations
+
+__all__ = [
+    "Flex",
+    "Kind",
+    "Realisation",
+    "Realisations",
+    "Rigidity",
+    "Verdict",
+    "analyse",
+    "full_rank",
+    "jacobian",
+    "realisations",
+    "rigid_motions",
+]

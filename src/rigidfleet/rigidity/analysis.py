@@ -1,0 +1,287 @@
+"""The verdict on a formation: does it hold its shape by distances alone, why, and what stays free."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rigidfleet.formation import Floats, Ints, dimension
+from rigidfleet.rigidity.framework import Flex, Framework, jacobian, localised
+from rigidfleet.rigidity.order import StressEnergy, blocking_stress, finite_flex
+
+
+class Verdict(StrEnum):
+    """What distances make of a shape."""
+
+    INFINITESIMALLY_RIGID = "infinitesimally rigid"
+    PRESTRESS_STABLE = "prestress-stable"
+    FLEXIBLE = "flexible"
+    UNDECIDED = "undecided"
+
+
+#: Below this index a formation is rigid in name: 1 mm of error in lengths hides 1 m of displacement.
+_BARELY = 1e-3
+
+_WHERE = {0: "point", 1: "line", 2: "plane", 3: "space"}
+
+
+@dataclass(frozen=True)
+class Rigidity:
+    """What the distances of some edges hold of a shape, and what they leave free.
+
+    Attributes
+    ----------
+    edges : (m, 2), agents from 0
+    dimension : 0 a point, 1 a line, 2 a plane, 3 a spatial shape
+    space : dimension of the space in which the agents may move
+    rank : of J, the number of independent edges
+    reachable : the most that J can have at slots like these: 3N - 6 in space, 2N - 3 in a plane, N - 1 on a line
+    needed : rank of an infinitesimally rigid framework: 3N - 6 (N = 2: 1; N = 1: 0) where the space is 3-D
+    redundant : edges any one of which could go without loss of rank
+    spare : edges that could all go at once, m - rank of them, long ones first
+    flexes : a basis of the motions that change no distance to first order, fewest agents first
+    index : smallest non-zero singular value of J M^-1/2 sqrt(mbar), the rigidity index; NaN without edges
+    verdict, reason : and why, in words
+    stress : (m,) blocking self-stress, the largest force 1 N, where one was found
+    deformed : (N, 3) another shape with the same distances, reached by a finite motion, where one was found
+    within : verdict on a flat shape in its own plane, on a straight one in its own line
+    """
+
+    agents: int
+    edges: Ints
+    dimension: int
+    space: int
+    rank: int
+    reachable: int
+    needed: int
+    redundant: Ints
+    spare: Ints
+    flexes: tuple[Flex, ...]
+    index: float
+    verdict: Verdict
+    reason: str
+    stress: Floats | None = None
+    deformed: Floats | None = None
+    within: Rigidity | None = None
+
+    @property
+    def w(self) -> float:
+        """Smallest non-zero eigenvalue of mbar J M^-1 J^T: the index squared."""
+        return self.index**2
+
+    @property
+    def rigid(self) -> bool:
+        """Whether the distances are known to hold the shape against every small motion."""
+        return self.verdict in (Verdict.INFINITESIMALLY_RIGID, Verdict.PRESTRESS_STABLE)
+
+    def force(self, b: float, mass: float = 1.0) -> float:
+        """Greatest norm of f_C (all agents) [N] that a right side b of norm `b` [m/s^2] asks of the exact law.
+
+        |f_C| <= m |b| / index for equal masses: a shape of half the index may need twice the force.
+        """
+        return mass * b / self.index
+
+    def offset(self, error: float) -> float:
+        """Greatest displacement (norm over all agents) [m] behind errors of lengths of norm `error` [m]."""
+        return error / self.index
+
+    def data(self) -> dict[str, Any]:
+        """Plain data for JSON, agents and edges counted from 1."""
+        return {
+            "agents": self.agents,
+            "edges": len(self.edges),
+            "dimension": self.dimension,
+            "space": self.space,
+            "rank": self.rank,
+            "reachable": self.reachable,
+            "needed": self.needed,
+            "redundant": (self.edges[self.redundant] + 1).tolist(),
+            "spare": (self.edges[self.spare] + 1).tolist(),
+            "flexes": [
+                {"agents": [i + 1 for i in flex.agents], "motion": flex.motion.tolist()}
+                for flex in self.flexes
+            ],
+            "index": None if np.isnan(self.index) else self.index,
+            "w": None if np.isnan(self.index) else self.w,
+            "verdict": str(self.verdict),
+            "reason": self.reason,
+            "stress": None if self.stress is None else self.stress.tolist(),
+            "deformed": None if self.deformed is None else self.deformed.tolist(),
+            "within": None if self.within is None else self.within.data(),
+        }
+
+
+def analyse(
+    slots: ArrayLike, edges: ArrayLike, *, space: int = 3, masses: ArrayLike | None = None
+) -> Rigidity:
+    """Judge a formation: rank, redundant edges, free motions, rigidity index and verdict.
+
+    The verdict is reached in this order, and each step is a proof up to rounding:
+
+    1. no flex: infinitesimally rigid (so rigid);
+    2. flexible already within the shape's own plane or line: flexible;
+    3. J has the greatest rank that this graph has anywhere, and there is a flex: flexible (Asimow and Roth,
+       1978: near such points the lengths' level sets are manifolds, larger than the rigid motions);
+    4. a self-stress with positive energy on every flex: prestress-stable (so rigid);
+    5. a finite motion followed numerically, with lengths equal to 1e-12: flexible;
+    6. else undecided.
+
+    Parameters
+    ----------
+    slots : (N, 3) [m], or (N, d) with d <= 3
+    edges : (m, 2), agents from 0
+    space : the agents move in a space of this dimension; less than 3 holds them in the shape's plane or line
+    masses : (N,) [kg], default equal
+
+    Raises
+    ------
+    ValueError
+        An edge names an agent that there is not, joins an agent to itself or two in one place, or is there
+        twice; a slot is not finite; the shape does not fit into the space; a mass is not positive.
+    """
+    p, e = checked(slots, edges)
+    n = len(p)
+    flat, axes = _flattened(p)
+    d = flat.shape[1]
+    if d > space:
+        raise ValueError(f"a shape of dimension {d} does not fit into a {_WHERE[space]}")
+    frame = Framework(np.pad(flat, [(0, 0), (0, space - d)]), e)
+    within = analyse(flat, e, space=d, masses=masses) if 0 < d < space else None
+    motions = localised(frame)
+    to_world = axes[:space]
+    flexes = tuple(Flex(agents, motion @ to_world) for agents, motion in motions)
+    verdict, reason, stress, bent = _judge(frame, within)
+    return Rigidity(
+        agents=n,
+        edges=e,
+        dimension=d,
+        space=space,
+        rank=frame.rank,
+        reachable=full_rank(n, d),
+        needed=full_rank(n, space),
+        redundant=frame.redundant(),
+        spare=frame.spare(),
+        flexes=flexes,
+        index=_index(frame, masses),
+        verdict=verdict,
+        reason=reason,
+        stress=stress,
+        deformed=None if bent is None else bent @ to_world + p.mean(axis=0),
+        within=within,
+    )
+
+
+def full_rank(n: int, d: int) -> int:
+    """Most independent distances of n points that span d dimensions: n d - d (d + 1) / 2 where n > d."""
+    d = min(d, max(n - 1, 0))
+    return n * d - d * (d + 1) // 2
+
+
+def checked(slots: ArrayLike, edges: ArrayLike) -> tuple[Floats, Ints]:
+    """Slots (N, 3) and edges (m, 2) as arrays; a ValueError where they are no framework."""
+    p = np.asarray(slots, dtype=np.float64)
+    if p.ndim != 2 or not len(p) or not 1 <= p.shape[1] <= 3:
+        raise ValueError(f"slots must be (N, 3) [m] with N >= 1, not {p.shape}")
+    if not np.isfinite(p).all():
+        raise ValueError(f"slot {int(np.argwhere(~np.isfinite(p))[0, 0]) + 1} is not finite")
+    p = np.pad(p, [(0, 0), (0, 3 - p.shape[1])])
+    e = np.asarray(edges, dtype=np.int64).reshape(-1, 2)
+    seen: dict[tuple[int, int], int] = {}
+    for k, (i, j) in enumerate(e.tolist()):
+        name = f"edge {k + 1}, agents {i + 1} and {j + 1},"
+        if not (0 <= i < len(p) and 0 <= j < len(p)):
+            raise ValueError(f"{name} names an agent that there is not; there are {len(p)}")
+        if i == j:
+            raise ValueError(f"{name} joins an agent to itself")
+        first = seen.setdefault((min(i, j), max(i, j)), k)
+        if first != k:
+            raise ValueError(f"{name} is edge {first + 1} again")
+    length = np.linalg.norm(p[e[:, 0]] - p[e[:, 1]], axis=1)
+    short = np.flatnonzero(length <= 1e-9 * np.abs(p - p.mean(axis=0)).max())
+    if len(short):
+        i, j = e[short[0]] + 1
+        raise ValueError(f"edge {short[0] + 1} joins agents {i} and {j}, whose slots coincide")
+    return p, e
+
+
+def _flattened(p: Floats) -> tuple[Floats, Floats]:
+    """Points (N, d) of a shape of dimension d in the axes (3, 3) that hold it, exactly flat."""
+    d = dimension(p)
+    x = p - p.mean(axis=0)
+    if d == 3:
+        return x, np.eye(3)
+    axes = np.linalg.svd(x, full_matrices=True)[2]
+    return x @ axes[:d].T, axes
+
+
+def _index(frame: Framework, masses: ArrayLike | None) -> float:
+    if masses is None:
+        return float(frame.s[-1]) if frame.rank else np.nan
+    m = np.asarray(masses, dtype=np.float64)
+    if m.shape != (len(frame.p),) or not (m > 0).all() or not np.isfinite(m).all():
+        raise ValueError(f"masses must be {len(frame.p)} numbers > 0 kg")
+    if not frame.rank:
+        return np.nan
+    J = jacobian(frame.p, frame.edges)
+    weighted = J * np.repeat(np.sqrt(m.mean() / m), frame.p.shape[1])
+    return float(np.linalg.svd(weighted, compute_uv=False)[frame.rank - 1])
+
+
+def _judge(
+    frame: Framework, within: Rigidity | None
+) -> tuple[Verdict, str, Floats | None, Floats | None]:
+    """Verdict, reason, blocking stress, deformed shape."""
+    k = frame.flexes.shape[1]
+    if k == 0:
+        reason = "every motion changes a distance"
+        if frame.rank and frame.s[-1] < _BARELY:
+            reason += f", but one of them hardly (index {frame.s[-1]:.1e}): expect large forces"
+        return Verdict.INFINITESIMALLY_RIGID, reason, None, None
+    if within is not None and within.verdict is Verdict.FLEXIBLE:
+        where = _WHERE[within.dimension]
+        return (
+            Verdict.FLEXIBLE,
+            f"flexible already within its own {where}: {within.reason}",
+            None,
+            None,
+        )
+    if frame.rank == _generic_rank(frame):
+        reason = (
+            f"{_count(k, 'motion')} free, and the rank {frame.rank} is the greatest that these edges have "
+            "anywhere, so the shape moves on (Asimow and Roth)"
+        )
+        return Verdict.FLEXIBLE, reason, None, None
+    energy = StressEnergy(frame)
+    stress, open_flexes, none_exists = blocking_stress(energy)
+    if stress is not None:
+        reason = f"{_count(k, 'motion')} free to first order; a self-stress blocks all of them"
+        return Verdict.PRESTRESS_STABLE, reason, stress, None
+    bent = finite_flex(StressEnergy(frame, frame.flexes @ open_flexes))
+    if bent is not None:
+        return Verdict.FLEXIBLE, "a finite motion was followed that keeps all distances", None, bent
+    reason = (
+        f"{_count(k, 'motion')} free to first order; "
+        + (
+            "no self-stress blocks all of them"
+            if none_exists
+            else "no blocking self-stress was found"
+        )
+        + ", and no finite motion was found"
+    )
+    return Verdict.UNDECIDED, reason, None, None
+
+
+def _count(k: int, what: str) -> str:
+    return f"{k} {what}{'s' * (k != 1)}"
+
+
+def _generic_rank(frame: Framework) -> int:
+    """Greatest rank of J over all positions of the agents: that at random ones, almost surely."""
+    if frame.stresses == 0:
+        return frame.rank
+    random = np.random.default_rng(1).normal(size=frame.p.shape)
+    return Framework(random, frame.edges).rank

@@ -1,0 +1,244 @@
+"""First order: the Jacobian of the distances, its rank, stresses and free motions.
+
+A framework is points joined by bars: slots and edges. Row k of its Jacobian J holds the unit vector u of edge
+k = (i, j) at i and -u at j, as in the constraint force (theory, section 1); J v are the rates of the lengths.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rigidfleet.formation import Floats, Ints
+
+#: Singular values below this times the largest are zero: points rounded to seven digits count as flat.
+ZERO = 1e-7
+
+#: In a flex whose fastest agent has speed 1, an agent slower than this stands still.
+_STILL = 1e-5
+
+
+def jacobian(points: ArrayLike, edges: ArrayLike) -> Floats:
+    """J (m, N d) of edges (m, 2) at points (N, d): unit vector u at i, -u at j."""
+    p = np.asarray(points, dtype=np.float64)
+    e = np.asarray(edges, dtype=np.int64).reshape(-1, 2)
+    u = p[e[:, 0]] - p[e[:, 1]]
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    J = np.zeros((len(e), *p.shape))
+    row = np.arange(len(e))
+    J[row, e[:, 0]], J[row, e[:, 1]] = u, -u
+    return J.reshape(len(e), p.size)
+
+
+def rigid_motions(points: Floats) -> Floats:
+    """Orthonormal basis (N d, t) of translations and rotations of points (N, d)."""
+    n, d = points.shape
+    x = points - points.mean(axis=0)
+    scale = max(np.linalg.norm(x), np.finfo(float).tiny)
+    motions = [np.tile(axis, (n, 1)) / np.sqrt(n) for axis in np.eye(d)]
+    for a in range(d):
+        for b in range(a + 1, d):
+            turn = np.zeros((n, d))
+            turn[:, a], turn[:, b] = -x[:, b] / scale, x[:, a] / scale
+            motions.append(turn)
+    u, s, _ = np.linalg.svd(np.reshape(motions, (len(motions), n * d)).T, full_matrices=False)
+    return u[:, s > 1e-9]
+
+
+class Flex(NamedTuple):
+    """A motion that changes no distance of an edge to first order, up to a rigid motion of all agents."""
+
+    agents: tuple[int, ...]
+    """Those that move; the others stand still."""
+    motion: Floats
+    """Velocities (N, 3), the fastest of 1 m/s."""
+
+
+@dataclass(frozen=True)
+class Framework:
+    """Points (N, d) joined by edges (m, 2), and what the singular values of J tell about them.
+
+    Attributes
+    ----------
+    span : (m, rank) orthonormal, the range of J; what is orthogonal to it is a self-stress
+    s : (rank,) non-zero singular values of J, descending
+    null : (N d, .) orthonormal, all motions that change no distance, rigid ones among them
+    """
+
+    p: Floats
+    edges: Ints
+
+    @cached_property
+    def _decomposed(self) -> tuple[Floats, Floats, Floats]:
+        J = jacobian(self.p, self.edges)
+        m, size = J.shape
+        if m == 0:
+            return np.zeros((0, 0)), np.zeros(0), np.eye(size)
+        Q, R = np.linalg.qr(J) if m > size else (None, J)
+        u, s, vt = np.linalg.svd(R)
+        rank = int(np.count_nonzero(s > ZERO * s[0]))
+        U = u[:, :rank] if Q is None else Q @ u[:, :rank]
+        return U, s[:rank], vt[rank:].T
+
+    @property
+    def span(self) -> Floats:
+        """Range of J (m, rank)."""
+        return self._decomposed[0]
+
+    @property
+    def s(self) -> Floats:
+        """Non-zero singular values of J."""
+        return self._decomposed[1]
+
+    @property
+    def null(self) -> Floats:
+        """Null space of J (N d, N d - rank)."""
+        return self._decomposed[2]
+
+    @property
+    def rank(self) -> int:
+        """Rank of J."""
+        return len(self.s)
+
+    @property
+    def stresses(self) -> int:
+        """Dimension of the space of self-stresses, and the number of edges too many."""
+        return len(self.edges) - self.rank
+
+    @cached_property
+    def lengths(self) -> Floats:
+        """Lengths (m,) of the edges [m]."""
+        return np.linalg.norm(self.p[self.edges[:, 0]] - self.p[self.edges[:, 1]], axis=1)
+
+    @cached_property
+    def rigid(self) -> Floats:
+        """Rigid motions (N d, t), orthonormal."""
+        return rigid_motions(self.p)
+
+    @cached_property
+    def flexes(self) -> Floats:
+        """Motions (N d, k), orthonormal, that change no distance and have no rigid part."""
+        k = self.null.shape[1] - self.rigid.shape[1]
+        if k <= 0:
+            return np.zeros((self.p.size, 0))
+        u = np.linalg.svd(self.null.T @ self.rigid)[0]
+        return self.null @ u[:, -k:]
+
+    def redundant(self) -> Ints:
+        """Edges any one of which could go without loss of rank: those that some self-stress loads."""
+        return np.flatnonzero(1 - (self.span**2).sum(axis=1) > ZERO)
+
+    def spare(self) -> Ints:
+        """Edges that could all go at once without loss of rank, long ones first."""
+        from scipy.linalg import qr
+
+        if self.stresses == 0:
+            return np.zeros(0, dtype=np.int64)
+        # Pivoting takes the largest remainder: a weight makes short edges large. It spans the range all the
+        # same, since each pivot is independent of those before.
+        weight = self.lengths.min() / self.lengths
+        order = qr((weight[:, None] * self.span).T, mode="r", pivoting=True)[1]
+        return np.sort(order[self.rank :])
+
+
+def localised(frame: Framework) -> list[tuple[tuple[int, ...], Floats]]:
+    """A basis of the flexes, each moving few agents: [(agents, motion (N, d))], fewest first.
+
+    Any flex plus any rigid motion is the same flex, so there is a choice of who stands still. Candidates are
+    the motions of single agents that their edges leave free, and, for each agent, the motion of least
+    sum of speeds in which it moves (by iteratively reweighted least squares: such sums favour
+    motions of few). Of all candidates the greedy choice, fewest agents first, is a basis of the least
+    total number of agents that they allow.
+    """
+    n, d = frame.p.shape
+    F = frame.flexes
+    k = F.shape[1]
+    if k == 0:
+        return []
+    basis = _Basis(F)
+    for motion in _single(frame):
+        basis.add(motion)
+    if basis.rank < k:
+        found = sparse(F, frame.rigid, n)
+        for motion in sorted(found, key=lambda f: int(np.count_nonzero(f.any(axis=1)))):
+            basis.add(motion)
+    for motion in F.T:
+        basis.add(motion.reshape(n, d))
+    out = [(tuple(np.flatnonzero(f.any(axis=1)).tolist()), f) for f in basis.chosen]
+    return sorted(out, key=lambda flex: (len(flex[0]), flex[0]))
+
+
+class _Basis:
+    """Motions that are independent of each other and of the rigid motions."""
+
+    def __init__(self, F: Floats) -> None:
+        self._F = F
+        self._q = np.zeros((F.shape[1], 0))
+        self.chosen: list[Floats] = []
+
+    @property
+    def rank(self) -> int:
+        return len(self.chosen)
+
+    def add(self, motion: Floats) -> None:
+        """Keep a motion if it is new."""
+        if self.rank == self._F.shape[1]:
+            return
+        part = self._F.T @ motion.ravel()
+        rest = part - self._q @ (self._q.T @ part)
+        rest -= self._q @ (self._q.T @ rest)
+        if np.linalg.norm(rest) > 1e-4 * np.linalg.norm(motion):
+            self._q = np.column_stack([self._q, rest / np.linalg.norm(rest)])
+            self.chosen.append(motion / np.linalg.norm(motion, axis=1).max())
+
+
+def _single(frame: Framework) -> list[Floats]:
+    """Motions of one agent that all its edges leave free, agents of few edges first."""
+    n, d = frame.p.shape
+    J = jacobian(frame.p, frame.edges).reshape(-1, n, d)
+    degree = np.bincount(frame.edges.ravel(), minlength=n)
+    found = []
+    for i in np.argsort(degree, kind="stable"):
+        _, s, vt = np.linalg.svd(J[(frame.edges == i).any(axis=1), i], full_matrices=True)
+        for direction in vt[np.count_nonzero(s > ZERO) :]:
+            motion = np.zeros((n, d))
+            motion[i] = direction
+            found.append(motion)
+    return found
+
+
+def sparse(flexes: Floats, rigid: Floats, n: int, most: int = 1 << 30) -> list[Floats]:
+    """Flexes (N, d) that move few agents: for each agent one of least sum of speeds in which it moves.
+
+    Parameters
+    ----------
+    flexes, rigid : (N d, .) orthonormal; any rigid motion may be added to a flex
+    most : take no more agents than this
+    """
+    V = np.column_stack([flexes, rigid])
+    blocks = V.reshape(n, len(V) // n, -1)
+    part, strength, _ = np.linalg.svd(blocks[:, :, : flexes.shape[1]], full_matrices=False)
+    # Reweighting costs N d k^2 a step: with many agents and flexes, some are left out to stay below a second.
+    most = min(most, max(8, int(1.5e9 / (20.0 * V.shape[0] * V.shape[1] ** 2))))
+    seeds = np.flatnonzero(strength[:, 0] > _STILL)
+    found = []
+    for i in seeds[:: max(1, -(-len(seeds) // most))]:
+        c = part[i, :, 0] @ blocks[i]
+        speed = np.ones(n)
+        for sharp in np.logspace(0, -7, 20):
+            weight = np.repeat(1 / (speed + sharp), len(V) // n)
+            a = np.linalg.solve(V.T @ (weight[:, None] * V), c)
+            motion = (V @ (a / (c @ a))).reshape(n, -1)
+            speed = np.linalg.norm(motion, axis=1)
+        found.append(_clean(motion))
+    return found
+
+
+def _clean(motion: Floats) -> Floats:
+    """The motion with agents that stand still at exactly 0."""
+    speed = np.linalg.norm(motion, axis=1)
+    return np.where((speed > _STILL * speed.max())[:, None], motion, 0.0)

@@ -1,0 +1,227 @@
+"""Beyond first order: whether a self-stress blocks the flexes, or one of them goes on.
+
+Connelly and Whiteley, "Second-order rigidity and prestress stability in tensegrity frameworks" (1996): a
+self-stress (forces f_k along the edges, in balance at each agent) with densities omega_k = f_k / L_k gives
+a flex q the energy
+
+    E(q) = sum_k omega_k |q_i - q_j|^2,
+
+quadratic in the flex. If some stress has E > 0 for every flex, the framework is rigid (prestress-stable). If
+E(q) = 0 for every stress, q goes on to second order.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rigidfleet.formation import Floats, Ints, kabsch
+from rigidfleet.rigidity.framework import Framework, jacobian, sparse
+
+#: A stress blocks all flexes when its least energy is more than this times its largest.
+_DEFINITE = 1e-7
+
+#: Lengths that agree within this times the size of the shape are the same.
+_EQUAL = 1e-12
+
+#: A flex is finite when it changes some distance by this times the size of the shape.
+_FINITE = 0.03
+
+
+class StressEnergy:
+    """The energies of all self-stresses on flexes of a framework.
+
+    `flexes` (N d, k), orthonormal, are all of them by default.
+    """
+
+    def __init__(self, frame: Framework, flexes: Floats | None = None) -> None:
+        n, d = frame.p.shape
+        self.frame, self.n = frame, n
+        self.flexes = frame.flexes if flexes is None else flexes
+        self.k = self.flexes.shape[1]
+        self._F = np.ascontiguousarray(self.flexes.reshape(n, d, -1).transpose(1, 0, 2))
+        self._i, self._j = frame.edges.T
+        self._length = frame.lengths / frame.lengths.mean()
+
+    def stress(self, z: Floats) -> Floats:
+        """Nearest self-stress to forces z (m,)."""
+        return z - self.frame.span @ (self.frame.span.T @ z)
+
+    def form(self, force: Floats) -> Floats:
+        """Matrix E (k, k) of a self-stress (m,): energy q^T E q of the flex with coordinates q."""
+        omega = np.zeros((self.n, self.n))
+        np.add.at(omega, (self._i, self._j), -force / self._length)
+        omega += omega.T
+        np.fill_diagonal(omega, -omega.sum(axis=1))
+        return (self._F.transpose(0, 2, 1) @ (omega @ self._F)).sum(axis=0)
+
+    def adjoint(self, Y: Floats) -> Floats:
+        """Self-stress (m,) with which every other stress has the inner product <Y, E>."""
+        G = (self._F @ Y @ self._F.transpose(0, 2, 1)).sum(axis=0)
+        diagonal = np.diag(G)
+        reach = diagonal[self._i] + diagonal[self._j] - 2 * G[self._i, self._j]
+        return self.stress(reach / self._length)
+
+    def left_over(self, q: Floats) -> Floats:
+        """What stops a flex with coordinates q at second order (m,): 0 if nothing does."""
+        return self.adjoint(np.outer(q, q))
+
+    def left_over_rate(self, q: Floats) -> Floats:
+        """Derivative (m, k) of `left_over`."""
+        step = self._F[:, self._i] - self._F[:, self._j]
+        rate = 2 * np.einsum("qm,qmk->mk", step @ q, step) / self._length[:, None]
+        return rate - self.frame.span @ (self.frame.span.T @ rate)
+
+
+def blocking_stress(energy: StressEnergy) -> tuple[Floats | None, Floats, bool]:
+    """A self-stress with positive energy on every flex, or the flexes that may go on.
+
+    With one independent stress, its eigenvalues decide. With more, minimise the convex function
+    1/2 |(1 - E)_+|^2 over the stresses: it goes to 0 where a blocking stress exists, and is at least 1/2 where
+    none does, because then some Y >= 0 is orthogonal to all E, and |(1 - E)_+| |Y| >= <1 - E, Y> = tr Y >= |Y|.
+    At the minimum (1 - E)_+ is itself such a Y, and its range is where to look for flexes.
+
+    Returns
+    -------
+    stress : (m,), the largest force 1 N, or None
+    flexes : (k, .) orthonormal coordinates of the flexes that no stress found blocks
+    proven : whether it is certain that no stress blocks all
+    """
+    frame = energy.frame
+    if frame.stresses == 0:
+        return None, np.eye(energy.k), True
+    if frame.stresses > 1:
+        return _search(energy)
+    z = np.zeros(len(frame.edges))
+    z[(frame.span**2).sum(axis=1).argmin()] = 1
+    force = energy.stress(z)
+    force /= np.abs(force).max()
+    value, vector = np.linalg.eigh(energy.form(force))
+    if value.sum() < 0:
+        force, value, vector = -force, -value[::-1], vector[:, ::-1]
+    small = _DEFINITE * max(value[-1], 1.0)
+    if value[0] > small:
+        return force, vector[:, :0], False
+    return None, vector[:, value < small] if value[0] > -small else vector, True
+
+
+def _search(energy: StressEnergy) -> tuple[Floats | None, Floats, bool]:
+    from scipy.optimize import minimize
+
+    unit = np.eye(energy.k)
+    found: list[Floats] = []
+
+    def lack(z: Floats) -> tuple[float, Floats]:
+        force = energy.stress(z)
+        value, vector = np.linalg.eigh(unit - energy.form(force))
+        if value[-1] < 0.9 and 1 - value[-1] > _DEFINITE * (1 - value[0]):
+            found.append(force)
+            raise StopIteration
+        Y = (vector * np.maximum(value, 0)) @ vector.T
+        return 0.5 * float((Y**2).sum()), -energy.adjoint(Y)
+
+    start = energy.adjoint(unit)
+    size = float(start @ start)
+    if size > 1e-18:
+        start *= energy.k / size  # then the trace of E is that of 1
+    options = {"maxiter": 300, "maxfun": 300, "ftol": 1e-14, "gtol": 1e-9}
+    try:
+        best = minimize(lack, start, jac=True, method="L-BFGS-B", options=options)
+    except StopIteration:
+        return found[-1] / np.abs(found[-1]).max(), unit[:, :0], False
+    value, vector = np.linalg.eigh(unit - energy.form(energy.stress(best.x)))
+    Y = (vector * np.maximum(value, 0)) @ vector.T
+    proven = bool(np.linalg.norm(energy.adjoint(Y)) < 1e-4 * np.linalg.norm(Y))
+    return None, vector[:, value > 1e-3], proven
+
+
+def finite_flex(energy: StressEnergy, starts: int = 8, seed: int = 0) -> Floats | None:
+    """The framework bent by a finite motion that keeps all its lengths, (N, d), or None where none is found.
+
+    Flexes that go on to second order are sought near those that move few agents and near random ones; each is
+    then followed, from the framework itself until the shape has changed visibly, with lengths equal to 1e-12.
+    """
+    frame = energy.frame
+    few = sparse(energy.flexes, frame.rigid, energy.n, starts)
+    candidates = [energy.flexes.T @ motion.ravel() for motion in few]
+    candidates += list(np.random.default_rng(seed).normal(size=(starts, energy.k)))
+    for q in candidates:
+        flex = _second_order(energy, q)
+        if flex is None:
+            continue
+        for way in (flex, -flex):
+            bent = _follow(frame, (energy.flexes @ way).reshape(frame.p.shape))
+            if bent is not None:
+                return bent
+    return None
+
+
+def _second_order(energy: StressEnergy, q: Floats) -> Floats | None:
+    """A flex (k,) near q that goes on to second order: Gauss-Newton on the unit sphere."""
+    q = q / max(np.linalg.norm(q), 1e-9)
+    for _ in range(30):
+        rest = energy.left_over(q)
+        if np.linalg.norm(rest) < 1e-11:
+            return q
+        rate = energy.left_over_rate(q)
+        damping = np.linalg.norm(rest) * np.eye(energy.k)
+        q = q - np.linalg.solve(rate.T @ rate + damping, rate.T @ rest)
+        if np.linalg.norm(q) < 1e-3:
+            return None
+        q = q / np.linalg.norm(q)
+    return q if np.linalg.norm(energy.left_over(q)) < 1e-6 else None
+
+
+def _follow(frame: Framework, direction: Floats) -> Floats | None:
+    """Points on the curve of equal lengths that leaves the framework in a direction, at its end."""
+    p = frame.p
+    size = np.linalg.norm(p - p.mean(axis=0), axis=1).max()
+    step = 2e-3 * size
+    direction = direction / np.linalg.norm(direction)
+    here, pairs = p, _all_pairs(p)
+    for _ in range(60):
+        there = restore(here + step * direction, frame.edges, frame.lengths, _EQUAL * size)
+        if there is None:
+            return None
+        there = _aligned(there, here)
+        moved = there - here
+        if not 0.5 * step < np.linalg.norm(moved) < 2 * step:
+            return None
+        here, direction = there, moved / np.linalg.norm(moved)
+        step = min(1.5 * step, 0.05 * size * np.sqrt(len(p)))
+        if np.abs(_all_pairs(here) - pairs).max() > _FINITE * size:
+            return here
+    return None
+
+
+def restore(p: Floats, edges: Ints, lengths: Floats, tol: float) -> Floats | None:
+    """Points near p (N, d) whose edges have the given lengths within tol [m], or None.
+
+    Levenberg-Marquardt with the error itself as damping, which converges quadratically even where J loses rank
+    along the solutions (Yamashita and Fukushima, 2001).
+    """
+    e = edges
+    for _ in range(25):
+        L = np.linalg.norm(p[e[:, 0]] - p[e[:, 1]], axis=1)
+        c = L - lengths
+        if np.abs(c).max(initial=0.0) <= tol:
+            return p
+        if not (L > 0).all():
+            return None
+        J = jacobian(p, e)
+        damping = np.linalg.norm(c) / lengths.mean() * 1e-2
+        K = J.T @ J
+        K[np.diag_indices_from(K)] += damping
+        p = p - np.linalg.solve(K, J.T @ c).reshape(p.shape)
+    return None
+
+
+def _aligned(p: Floats, onto: Floats) -> Floats:
+    """Points p (N, d) moved rigidly onto others."""
+    space = [(0, 0), (0, 3 - p.shape[1])]
+    R = kabsch(np.pad(onto, space), np.pad(p, space))
+    x = np.pad(p - p.mean(axis=0), space) @ R.T
+    return x[:, : p.shape[1]] + onto.mean(axis=0)
+
+
+def _all_pairs(p: Floats) -> Floats:
+    return np.linalg.norm(p[:, None] - p, axis=2)

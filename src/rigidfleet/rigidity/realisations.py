@@ -1,0 +1,258 @@
+"""Other shapes with the same distances: where else a formation may end while every error goes to zero."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rigidfleet.formation import Floats, Ints, kabsch
+from rigidfleet.rigidity.analysis import checked
+from rigidfleet.rigidity.framework import Framework
+
+#: Shapes whose all-pairs distances agree within this times their size are one.
+_ALIKE = 1e-3
+
+#: Lengths count as reached within this times the size of the shape.
+_REACHED = 1e-9
+
+
+class Kind(StrEnum):
+    """How a realisation differs from the intended shape."""
+
+    SAME = "same"
+    MIRRORED = "mirror image"
+    FOLDED = "folded"
+    COINCIDENT = "coincident"
+
+
+@dataclass(frozen=True)
+class Realisation:
+    """A shape with the given distances.
+
+    Attributes
+    ----------
+    kind : same; mirror image; folded (other all-pairs distances); coincident (folded with two agents in one place)
+    slots : (N, 3) [m], turned as near as possible to the intended shape
+    found : how many of the starts led here
+    deviation : greatest difference of an all-pairs distance from the intended [m]
+    closest : least distance between two agents [m]
+    rigid : whether it is infinitesimally rigid; where not, it may be one of a continuum
+    """
+
+    kind: Kind
+    slots: Floats
+    found: int
+    deviation: float
+    closest: float
+    rigid: bool
+
+    def data(self) -> dict[str, Any]:
+        """Plain data for JSON."""
+        return {
+            "kind": str(self.kind),
+            "found": self.found,
+            "deviation": self.deviation,
+            "closest": self.closest,
+            "rigid": self.rigid,
+            "slots": self.slots.tolist(),
+        }
+
+
+@dataclass(frozen=True)
+class Realisations:
+    """What a search from many starts found.
+
+    Attributes
+    ----------
+    found : the shapes, the intended one and its mirror image first, then the most frequent first
+    starts, converged : how many starts, and how many of them met all distances
+    leads_to : index into `found` of the shape to which the given start leads; None if to none, or none given
+    """
+
+    found: tuple[Realisation, ...]
+    starts: int
+    converged: int
+    leads_to: int | None = None
+
+    @property
+    def unique(self) -> bool:
+        """Whether the search met nothing but the intended shape and its mirror image."""
+        return all(r.kind in (Kind.SAME, Kind.MIRRORED) for r in self.found)
+
+    def data(self) -> dict[str, Any]:
+        """Plain data for JSON."""
+        return {
+            "starts": self.starts,
+            "converged": self.converged,
+            "unique": self.unique,
+            "leads_to": self.leads_to,
+            "found": [r.data() for r in self.found],
+        }
+
+
+def realisations(
+    slots: ArrayLike,
+    edges: ArrayLike,
+    *,
+    starts: int = 200,
+    seed: int = 0,
+    start: ArrayLike | None = None,
+    iterations: int = 150,
+) -> Realisations:
+    """Search for all shapes whose edges are as long as those of the slots.
+
+    Levenberg-Marquardt runs on (L^2 - d^2)/(2 d) from random positions of the size of the shape, all starts at
+    once. Equal shapes are put together by all-pairs distances and handedness. Nothing found is no proof that
+    there is nothing: the share of starts that met each shape says how thorough the search was.
+
+    Parameters
+    ----------
+    slots : (N, 3) [m], the intended shape
+    edges : (m, 2), agents from 0
+    starts, seed, iterations : the budget, and what makes it repeatable; 200 starts of 8 agents take a second
+    start : (N, 3) [m] positions from which the distances are to be established; answered by `leads_to`: the
+        squared lengths are led from those at the start to those wanted, as `reference = "distances"` does
+
+    Raises
+    ------
+    ValueError
+        As `analyse`; or the start is not (N, 3).
+    """
+    p, e = checked(slots, edges)
+    p = p - p.mean(axis=0)
+    n, length = len(p), np.linalg.norm(p[e[:, 0]] - p[e[:, 1]], axis=1)
+    size = float(np.linalg.norm(p, axis=1).max(initial=0.0))
+    if n < 2 or not len(e):
+        return Realisations((_describe(p, p, e, 1, size),), starts, starts)
+    rng = np.random.default_rng(seed)
+    spread = np.sqrt((p**2).sum() / (3 * n))
+    at = rng.normal(scale=spread, size=(starts, n, 3))
+    groups = _Groups(p, _ALIKE * size)
+    groups.add(p, 0)
+    converged = 0
+    share = max(1, int(1e7 / (len(e) * 3 * n)))  # starts whose Jacobians fit into 80 MB
+    for first in range(0, starts, share):
+        some = at[first : first + share]
+        ends, reached = _descend(some, e, length, _REACHED * size, iterations)
+        converged += int(reached.sum())
+        for end in ends[reached]:
+            groups.add(end, 1)
+    end = None if start is None else _led(_positions(start, n), e, length, _REACHED * size)
+    last = None if end is None else groups.add(end, 0)
+    found = [_describe(q, p, e, count, size) for q, count in groups.shapes]
+    rank = {Kind.SAME: 0, Kind.MIRRORED: 1}
+    order = sorted(range(len(found)), key=lambda k: (rank.get(found[k].kind, 2), -found[k].found))
+    return Realisations(
+        tuple(found[k] for k in order),
+        starts,
+        converged,
+        None if last is None else order.index(last),
+    )
+
+
+class _Groups:
+    """Shapes told apart by all-pairs distances and handedness."""
+
+    def __init__(self, intended: Floats, tol: float) -> None:
+        self._intended, self._tol = intended, tol
+        self._pairs: list[Floats] = []
+        self.shapes: list[tuple[Floats, int]] = []
+
+    def add(self, p: Floats, count: int) -> int:
+        """Count a shape; its number among all."""
+        pairs = _pairs(p)
+        for k in range(len(self.shapes)):
+            q, seen = self.shapes[k]
+            if np.abs(self._pairs[k] - pairs).max() <= self._tol and self._fits(p, q):
+                self.shapes[k] = (q, seen + count)
+                return k
+        self._pairs.append(pairs)
+        self.shapes.append((_onto(p, self._intended), count))
+        return len(self.shapes) - 1
+
+    def _fits(self, p: Floats, q: Floats) -> bool:
+        # A flat shape is thick by the root of what its distances are off, so the mirror image is told by a wide gap.
+        return bool(np.linalg.norm(_onto(p, q) - q, axis=1).max() <= 30 * self._tol)
+
+
+def _describe(q: Floats, p: Floats, e: Ints, found: int, size: float) -> Realisation:
+    deviation = float(np.abs(_pairs(q) - _pairs(p)).max(initial=0.0))
+    closest = float(_pairs(q).min(initial=np.inf))
+    if deviation <= _ALIKE * size:
+        same = np.linalg.norm(_onto(q, p) - p, axis=1).max(initial=0.0) <= 30 * _ALIKE * size
+        kind = Kind.SAME if same else Kind.MIRRORED
+    else:
+        kind = Kind.COINCIDENT if closest <= _ALIKE * size else Kind.FOLDED
+    rigid = Framework(q, e).flexes.shape[1] == 0
+    return Realisation(kind, q, found, deviation, closest, rigid)
+
+
+def _pairs(p: Floats) -> Floats:
+    i, j = np.triu_indices(len(p), 1)
+    return np.linalg.norm(p[i] - p[j], axis=1)
+
+
+def _onto(p: Floats, q: Floats) -> Floats:
+    x, y = p - p.mean(axis=0), q - q.mean(axis=0)
+    return x @ kabsch(y, x).T
+
+
+def _positions(start: ArrayLike, n: int) -> Floats:
+    at = np.asarray(start, dtype=np.float64)
+    if at.shape != (n, 3) or not np.isfinite(at).all():
+        raise ValueError(f"start must be ({n}, 3) finite positions [m], not {at.shape}")
+    return at
+
+
+def _led(start: Floats, e: Ints, length: Floats, tol: float) -> Floats | None:
+    """Where positions (N, 3) end when their squared lengths are led in small steps to those wanted."""
+    at = start[None]
+    now = ((start[e[:, 0]] - start[e[:, 1]]) ** 2).sum(axis=1)
+    steps = 50
+    for k in range(1, steps + 1):
+        wanted = np.sqrt(np.maximum(now + (length**2 - now) * (k / steps), (1e-3 * length) ** 2))
+        at, reached = _descend(at, e, wanted, tol, 8 if k < steps else 300)
+    return at[0] if reached[0] else None
+
+
+def _descend(
+    at: Floats, e: Ints, length: Floats, tol: float, iterations: int
+) -> tuple[Floats, np.ndarray]:
+    """Levenberg-Marquardt from positions (B, N, 3): the ends, and which of them have the lengths within tol."""
+    at = at.copy()
+    count, n = at.shape[:2]
+    ends, done = at.copy(), np.zeros(count, dtype=bool)
+    damping = np.full(count, 1e-2)
+    i, j = e.T
+    rows, size = np.arange(len(e)), 3 * n
+    lane = np.arange(count)
+    c = _lack(at, i, j, length)
+    for _ in range(iterations):
+        x = (at[:, i] - at[:, j]) / length[:, None]
+        J = np.zeros((len(at), len(e), n, 3))
+        J[:, rows, i], J[:, rows, j] = x, -x
+        J = J.reshape(len(at), len(e), size)
+        K = J.transpose(0, 2, 1) @ J
+        K[:, np.arange(size), np.arange(size)] += damping[:, None] + 1e-14
+        step = np.linalg.solve(K, (J.transpose(0, 2, 1) @ c[..., None]))[..., 0]
+        new = at - step.reshape(at.shape)
+        after = _lack(new, i, j, length)
+        better = (after**2).sum(axis=1) < (c**2).sum(axis=1)
+        at, c = np.where(better[:, None, None], new, at), np.where(better[:, None], after, c)
+        damping = np.where(better, damping * 0.2, np.minimum(damping * 4, 1e6))
+        met = np.abs(c).max(axis=1) <= tol
+        ends[lane], done[lane] = at, met
+        go_on = ~met & (damping < 1e6)
+        at, c, damping, lane = at[go_on], c[go_on], damping[go_on], lane[go_on]
+        if not len(at):
+            break
+    return ends, done
+
+
+def _lack(p: Floats, i: Ints, j: Ints, length: Floats) -> Floats:
+    """(L^2 - d^2) / (2 d) [m], which is smooth where agents meet and L - d near the solution."""
+    return (((p[:, i] - p[:, j]) ** 2).sum(axis=2) - length**2) / (2 * length)
