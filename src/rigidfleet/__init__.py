@@ -7,7 +7,14 @@ wait neither for the compiler nor for the plotting library.
 import sys
 from importlib import import_module
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rigidfleet.assess import assess
+    from rigidfleet.figures import plot
+    from rigidfleet.mission import load_mission
+    from rigidfleet.result import Result
+    from rigidfleet.simulate import simulate
 
 __version__ = "0.1.0"
 
