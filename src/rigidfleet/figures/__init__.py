@@ -11,7 +11,6 @@ from __future__ import annotations
 import io
 import os
 import secrets
-import warnings
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -115,9 +114,7 @@ def _rendered(figure: Figure, kind: str) -> bytes:
     # No date inside, so that the same flight gives the same file.
     metadata: dict[str, Any] = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}
     buffer = io.BytesIO()
-    with settings(), warnings.catch_warnings():
-        # A name in letters that the font lacks is drawn as boxes; in SVG it shows.
-        warnings.filterwarnings("ignore", message="Glyph .* missing from font")
+    with settings():
         figure.savefig(buffer, format=kind, metadata=metadata.get(kind))
     # The layout is found; drawing again need not look for it.
     figure.set_layout_engine("none")

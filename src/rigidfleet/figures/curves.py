@@ -68,7 +68,7 @@ def _edge_label(result: Result, edges: list[int], lengths: Floats) -> str:
         return result.edge_labels[edges[0]]
     names = ["–" if np.isnan(d) else f"{d:.3g}" for d in lengths]
     steps = [name for i, name in enumerate(names) if i == 0 or name != names[i - 1]]
-    return f"{len(edges)} × {' → '.join(steps)} m"
+    return f"{len(edges)} edge{'s' if len(edges) > 1 else ''}: {' → '.join(steps)} m"
 
 
 def edge_lines(ax: Axes, result: Result, values: Floats, **look: Any) -> None:
@@ -120,7 +120,7 @@ def distances(result: Result) -> Figure:
     ax = axes[0, 0]
     draw_distances(ax, result)
     if len(result.edges):
-        title = "edge" if len(result.edges) <= SINGLE else "edges × length"
+        title = "edge" if len(result.edges) <= SINGLE else ""
         st.legend(ax, [*edge_handles(result), *_reference_handle(result.distance_reference)], title)
     st.name_phases(fig, [ax], result)
     return fig

@@ -59,7 +59,7 @@ def scene(result: Result) -> Scene:
         seen = np.zeros((1, 3))
     low, high = seen.min(axis=0), seen.max(axis=0)
     heights = [o.height for o in mission.obstacles if o.kind == "ground"]
-    near = 0.6 * float((high - low).max()) + 2.0
+    near = float((high - low).max()) + 5.0
     if heights and max(heights) > low[2] - near:
         low[2] = min(low[2], max(heights))
     else:
@@ -426,7 +426,7 @@ def formations(result: Result) -> Figure:
         fig.legend(
             handles=entries,
             loc="lower center",
-            ncols=min(2 * columns, len(entries)),
+            ncols=min(int(fig.get_figwidth() / 2.2), len(entries)),
             borderaxespad=0.8,
         )
     return fig
@@ -465,7 +465,9 @@ def _sketch(
     _draw_graph(ax, turned, edges, of_edge, lengths if len(edges) <= curves.SINGLE else None)
     if placed and len(p) > 1:
         reach = float(np.linalg.norm(turned, axis=1).max())
-        _draw_axes(ax, axes, (0.5 if shapes.dimension(p, 1e-3) > 1 else 0.3) * reach)
+        taken = bool(np.linalg.norm(turned, axis=1).min() < 0.1 * reach)
+        length = (0.3, 0.3, 0.42, 0.5)[shapes.dimension(p, 1e-3)] * reach
+        _draw_axes(ax, axes, length, taken=taken)
 
 
 def _draw_graph(
@@ -508,24 +510,29 @@ def _draw_graph(
             )  # fmt: skip
 
 
-def _draw_axes(ax: Axes, axes: Floats, length: float) -> None:
-    """Body axes from the centre of mass; rows of `axes` (3, 3) as seen, the last column towards us."""
+def _draw_axes(ax: Axes, axes: Floats, length: float, *, taken: bool) -> None:
+    """Body axes from the centre of mass; rows of `axes` (3, 3) as seen, the last column towards us.
+
+    An axis towards us is a ring with a point, beside the centre where an agent has `taken` that.
+    """
     tips = length * axes
     for tip, name in zip(tips, "xyz", strict=True):
         label = f"${name}_b$"
-        if np.hypot(*tip[:2]) < 1e-6 * length:  # towards us
-            ax.plot(
-                0, 0, "o", markersize=9, markerfacecolor="white", markeredgecolor=st.INK, zorder=7
-            )
-            ax.plot(0, 0, "o", markersize=2.5, color=st.INK, zorder=8)
-            ax.annotate(label, (0, 0), (-9, -9), textcoords="offset points", ha="right", va="top")
+        if np.hypot(*tip[:2]) < 1e-6 * length:
+            words = f"⊙ {label}" if taken else label
+            place: dict[str, Any] = {"textcoords": "offset points", "ha": "right", "va": "top"}
+            ax.annotate(words, (0, 0), (-9, -9), fontsize=9.5, gid="body-axis", **place)
+            if not taken:
+                ring: dict[str, Any] = {"markerfacecolor": "white", "markeredgecolor": st.INK}
+                ax.plot(0, 0, "o", markersize=9, zorder=7, **ring)
+                ax.plot(0, 0, "o", markersize=2.5, color=st.INK, zorder=8)
             continue
         ax.annotate(
             "", tip[:2], (0, 0), zorder=4,
             arrowprops={"arrowstyle": "-|>", "color": st.INK, "linewidth": 1.3, "shrinkA": 0, "shrinkB": 0},
         )  # fmt: skip
         ax.annotate(
-            label, 1.1 * tip[:2], ha="center", va="center", zorder=7, fontsize=9.5,
+            label, 1.1 * tip[:2], ha="center", va="center", zorder=7, fontsize=9.5, gid="body-axis",
             bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.5, "alpha": 0.8},
         )  # fmt: skip
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import contextmanager
 from functools import wraps
@@ -91,7 +92,9 @@ def settings() -> Generator[None]:
     """Matplotlib's defaults and ours over them, whatever the user has set; undone at the end."""
     import matplotlib.style
 
-    with matplotlib.style.context(["default", _RC]):
+    with matplotlib.style.context(["default", _RC]), warnings.catch_warnings():
+        # A name in letters that the font lacks shows as boxes in a PNG, and as it is in an SVG.
+        warnings.filterwarnings("ignore", message="Glyph .* missing from font")
         yield
 
 
@@ -273,10 +276,10 @@ def number_phases(fig: Figure, axes: Iterable[Axes], result: Result) -> str:
     """
     for ax in axes:
         right = -math.inf
-        for i, phase in enumerate(result.phases):
+        for i, (_, start, end) in enumerate(_spans(ax, result)):
             label = ax.text(
-                (phase.t_start + phase.t_end) / 2, 1.01, str(i + 1), fontsize=6.5, color=GREY,
-                ha="center", va="bottom", transform=ax.get_xaxis_transform(), gid="phase",
+                (start + end) / 2, 1.01, str(i + 1), fontsize=6.5, color=GREY, ha="center",
+                va="bottom", transform=ax.get_xaxis_transform(), gid="phase",
             )  # fmt: skip
             box = label.get_window_extent()
             if box.x0 < right + 1:
@@ -289,14 +292,13 @@ def number_phases(fig: Figure, axes: Iterable[Axes], result: Result) -> str:
 
 def _upright(ax: Axes, result: Result) -> list[Text]:
     labels = []
-    for phase in result.phases:
+    for name, start, end in _spans(ax, result):
         label = ax.text(
-            (phase.t_start + phase.t_end) / 2, 1.02, clean(phase.name, 60), fontsize=8, color=GREY,
-            ha="center", va="bottom", transform=ax.get_xaxis_transform(), parse_math=False,
+            (start + end) / 2, 1.02, clean(name, 60), fontsize=8, color=GREY, ha="center",
+            va="bottom", transform=ax.get_xaxis_transform(), parse_math=False,
         )  # fmt: skip
         labels.append(label)
-        room = _per_second(ax) * (phase.t_end - phase.t_start)
-        if label.get_window_extent().width > 0.9 * room:
+        if label.get_window_extent().width > 0.9 * _per_second(ax) * (end - start):
             for drawn in labels:
                 drawn.remove()
             return []
@@ -308,16 +310,16 @@ def _slanting(ax: Axes, result: Result) -> list[Text]:
     size = 7.5
     # Lines of text keep apart by their height across the slant.
     pitch = 1.25 * size * ax.figure.dpi / 72 / math.sin(math.radians(_SLANT))
-    room = 1 + int(scale * np.diff(ax.get_xlim())[0] / pitch)
-    longest = sorted(result.phases, key=lambda p: p.t_start - p.t_end)[:room]
-    phases = sorted(longest, key=lambda p: p.t_start)
-    middle = np.array([(p.t_start + p.t_end) / 2 - t0 for p in phases]) * scale
-    place = _apart(middle, pitch)
+    room = int(scale * np.diff(ax.get_xlim())[0] / pitch)
+    longest = sorted(_spans(ax, result), key=lambda span: span[1] - span[2])[:room]
+    spans = sorted(longest, key=lambda span: span[1])
+    middle = np.array([(start + end) / 2 - t0 for _, start, end in spans]) * scale
+    place = np.maximum(_apart(middle, pitch), pitch * np.arange(len(middle)))
     above = 6 * ax.figure.dpi / 72 / ax.bbox.height
     labels = []
-    for phase, x, at in zip(phases, middle / scale + t0, place / scale + t0, strict=True):
+    for (name, *_), x, at in zip(spans, middle / scale + t0, place / scale + t0, strict=True):
         label = ax.text(
-            at, 1 + above, clean(phase.name), fontsize=size, color=GREY, ha="left", va="baseline",
+            at, 1 + above, clean(name), fontsize=size, color=GREY, ha="left", va="baseline",
             rotation=_SLANT, rotation_mode="anchor", transform=ax.get_xaxis_transform(),
             parse_math=False,
         )  # fmt: skip
@@ -329,9 +331,17 @@ def _slanting(ax: Axes, result: Result) -> list[Text]:
     return labels
 
 
+def _spans(ax: Axes, result: Result) -> list[tuple[str, float, float]]:
+    """Name, start and end [s] of each phase, as far as the axes show it."""
+    low, high = ax.get_xlim()
+    return [
+        (p.name, max(p.t_start, low), min(p.t_end, high)) for p in result.phases if p.t_start < high
+    ]
+
+
 def _per_second(ax: Axes) -> float:
     """Pixels of a second; fewer than there are, as names at the right may narrow the axes."""
-    return 0.93 * ax.bbox.width / float(np.diff(ax.get_xlim())[0])
+    return 0.88 * ax.bbox.width / float(np.diff(ax.get_xlim())[0])
 
 
 def _apart(places: Floats, pitch: float) -> Floats:

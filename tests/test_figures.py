@@ -1,0 +1,663 @@
+import math
+import subprocess
+import sys
+import warnings
+import xml.etree.ElementTree as ET
+from itertools import combinations
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+from matplotlib.colors import to_hex, to_rgb
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.text import Text
+from PIL import Image
+
+from rigidfleet import attitude as att
+from rigidfleet import figures, geometry
+from rigidfleet.errors import ResultError
+from rigidfleet.figures import curves, space, style
+from rigidfleet.mission import Mission
+from rigidfleet.result import VARIABLES, PhaseRecord, Result
+
+START = [[1.0, 6.0, 3.0], [8.0, 3.0, 3.0], [7.0, 6.0, 3.0]]
+TRIANGLE = {"shape": "triangle", "size": 4.0}
+CUBE = {"shape": "cube", "size": 4.0}
+BOX = {"kind": "box", "name": "wall", "min": [10.0, 8.0, 0.0], "max": [14.0, 12.0, 6.0]}
+OVER_TIME = [
+    "distances", "cm", "attitude", "inputs", "constraint_force", "constraint_error", "clearance",
+]  # fmt: skip
+
+
+def _rate(t: np.ndarray, x: np.ndarray) -> np.ndarray:
+    return np.gradient(x, t, axis=0) if len(t) > 1 else 0 * x
+
+
+def a_flight(
+    *,
+    n: int = 3,
+    formation: dict[str, Any] | None = TRIANGLE,
+    phases: list[tuple[str, float]] | None = None,
+    samples: int = 181,
+    mission: dict[str, Any] | None = None,
+    **changes: Any,
+) -> Result:
+    """A made-up flight: agents move from a spread-out start into slots that turn, climb and drift."""
+    phases = [("establish", 6.0), ("fly", 14.0)] if phases is None else phases
+    names = [f"{name} {k}" if name == "fly" else name for k, (name, _) in enumerate(phases)]
+    ends = np.cumsum([length for _, length in phases])
+    starts = ends - [length for _, length in phases]
+    rng = np.random.default_rng(n)
+    start = np.array(START[:n]) if n <= 3 else rng.uniform(0, 8, (n, 3)) + [0, 0, 3]
+    kinds: list[dict[str, Any]] = [
+        {"kind": "fly", "name": name, "position": [15.0, 15.0, 15.0], "until": float(end)}
+        for name, end in zip(names, ends, strict=True)
+    ]
+    if formation is not None:
+        kinds[0] |= {"kind": "establish", "formation": "shape", "blend": min(4.0, float(ends[0]))}
+        del kinds[0]["position"]
+        if "edges" in formation:
+            kinds[0] |= {"reference": "distances", "control": "open"}
+            kinds[1:] = [
+                {"kind": "hold", "name": kind["name"], "until": kind["until"], "control": "open"}
+                for kind in kinds[1:]
+            ]
+    data: dict[str, Any] = {
+        "schema_version": 1, "name": "made-up", "title": "A made-up flight",
+        "agents": {"mass": 1.0, "position": start.tolist(), "thrust_limit": 23.6},
+        "formations": {} if formation is None else {"shape": formation},
+        "obstacles": [{"kind": "ground"}, BOX], "limits": {"separation": 0.5}, "phases": kinds,
+    }  # fmt: skip
+    flown = Mission.from_dict(data | (mission or {}))
+
+    t = np.linspace(0, ends[-1], samples)
+    s = np.clip(t / ends[-1], 0, 1)[:, None, None]
+    slots = None if formation is None else flown.formation_slots("shape")
+    goal = start - start.mean(axis=0) if slots is None else slots
+    yaw = np.linspace(0, 1.5, samples)
+    q = att.quaternion_from_euler(np.column_stack([0 * yaw, 0 * yaw, yaw]))
+    turned = np.einsum("kba,ib->kia", att.dcm_from_quaternion(q), goal)
+    target = start.mean(axis=0) * (1 - s) + 15.0 * s + turned
+    r = start * (1 - np.minimum(3 * s, 1)) + target * np.minimum(3 * s, 1)
+    i, j = flown.edges.T
+    length = np.linalg.norm(r[:, i] - r[:, j], axis=2)
+    final = np.linalg.norm(goal[i] - goal[j], axis=1)
+    blank = {
+        name: np.full([{"time": samples, "agent": n, "edge": len(i), "axis": 3, "quaternion": 4,
+                        "wrench": 6, "end": 2}[d] for d in v.dims], np.nan)
+        for name, v in VARIABLES.items()
+    }  # fmt: skip
+    force = np.zeros((samples, n, 3)) + [0, 0, 9.81]
+    pull = np.sin(t)[:, None, None] * (r - r.mean(axis=1, keepdims=True))
+    separation, pair = geometry.separation(r, flown.agents.radius)
+    clearance, agent, obstacle = geometry.clearance(r, flown.agents.radius, flown.obstacles)
+    arrays: dict[str, Any] = {**blank} | {
+        "time": t, "phase": np.minimum(np.searchsorted(ends, t, "right"), len(ends) - 1),
+        "position": r, "slot_position": target, "cm": r.mean(axis=1),
+        "cm_velocity": _rate(t, r.mean(axis=1)),
+        "cm_reference": r.mean(axis=1) + 0.01,
+        "attitude": np.where(t[:, None] < ends[0], np.nan, q), "attitude_reference": q,
+        "rates": np.column_stack([0 * t, 0 * t, _rate(t, yaw)]),
+        "rates_reference": np.zeros((samples, 3)),
+        "input_force": force, "constraint_force": pull,
+        "thrust": np.linalg.norm(force + pull, axis=2), "edges": flown.edges, "distance": length,
+        "distance_reference": np.broadcast_to(final, length.shape),
+        "constraint": length - final, "multiplier": 0.1 * length,
+        "separation": separation, "separation_pair": pair, "clearance": clearance,
+        "clearance_agent": agent, "clearance_obstacle": obstacle,
+    }  # fmt: skip
+    records = [
+        PhaseRecord(
+            name, "fly" if k or formation is None else "establish", "slots",
+            None if formation is None else "shape", float(a), float(b), None,
+            {"time": float(b), "position": [15.0, 15.0, 15.0], "velocity": [0.0, 0.0, 0.0],
+             "attitude": q[-1].tolist(), "rates": [0.0, 0.0, 0.0]} if k else None,
+        )
+        for k, (name, a, b) in enumerate(zip(names, starts, ends, strict=True))
+    ]  # fmt: skip
+    arrays |= {"phases": records, "mission_text": flown.text} | changes
+    return Result(**arrays)
+
+
+FREE = {"obstacles": [], "limits": {}, "agents": {"mass": 1.0, "position": START}}
+FENCED = {
+    "limits": {
+        "separation": 0.5, "separation_below": 1.0,
+        "geofence": {"min": [0.0, 0.0, 0.0], "max": [20.0, 20.0, 20.0]},
+    }
+}  # fmt: skip
+CHAIN = {"edges": [[1, 2], [2, 3], [3, 4]], "distances": [4.0, 4.0, 4.0]}
+FLIGHTS: dict[str, Any] = {
+    "one agent": {"n": 1, "formation": None, "mission": FENCED},
+    "two agents, stopped": {
+        "n": 2, "formation": {"distances": [4.0]}, "complete": False, "ending": "singular",
+    },
+    "no formation": {"n": 4, "formation": None},
+    "no obstacles, no limits": {"mission": FREE},
+    "distances only": {"n": 4, "formation": CHAIN},
+    "one sample": {"samples": 1, "complete": False, "ending": "at once"},
+    "twenty agents": {"n": 20, "formation": {"shape": "line", "size": 2.0}},
+}  # fmt: skip
+
+
+def nothing_known(samples: int = 30) -> Result:
+    """A flight of which only time is known: every other number is NaN."""
+    result = a_flight(samples=samples)
+    unknown = {
+        name: np.full_like(getattr(result, name), np.nan)
+        for name in VARIABLES
+        if getattr(result, name).dtype == float and name != "time"
+    }
+    return a_flight(samples=samples, **unknown)
+
+
+def drawn(name: str, result: Result) -> Any:
+    figure = getattr(figures, name)(result)
+    figure.draw_without_rendering()
+    return figure
+
+
+def by_gid(figure: Any, gid: str) -> list[Any]:
+    return figure.findobj(lambda artist: artist.get_gid() == gid)
+
+
+def texts(figure: Any) -> list[str]:
+    return [text.get_text() for text in figure.findobj(Text) if text.get_visible()]
+
+
+@pytest.fixture(scope="module")
+def triangle() -> Result:
+    return a_flight()
+
+
+@pytest.fixture(scope="module")
+def cube() -> Result:
+    return a_flight(n=8, formation=CUBE)
+
+
+# -- every flight can be drawn
+
+
+@pytest.mark.parametrize("flight", [*FLIGHTS, "nothing known"])
+def test_every_flight_can_be_drawn(flight):
+    """Each figure draws without a warning: one agent, no edges, no obstacles, stopped, only NaN."""
+    few = {"samples": 31} | FLIGHTS.get(flight, {})
+    result = nothing_known() if flight == "nothing known" else a_flight(**few)
+    for name in figures.figure_names():
+        figure = drawn(name, result)
+        assert isinstance(figure, Figure), name
+        assert figure.axes or name == "formations", name
+
+
+def test_axes_have_units(triangle):
+    """Each quantity on an axis has its unit in brackets."""
+    for name in figures.figure_names():
+        for ax in getattr(figures, name)(triangle).axes:
+            for label in (ax.get_xlabel(), ax.get_ylabel()):
+                assert not label or label.endswith("]"), (name, label)
+
+
+# -- colours
+
+
+def test_an_agent_has_the_same_colour_in_every_figure(cube):
+    """Lines, discs and legend entries of agent k have the k-th colour wherever they appear."""
+    colours = figures.agent_colours(8)
+    seen = set()
+    for name in figures.figure_names():
+        figure = getattr(figures, name)(cube)
+        for k, colour in enumerate(colours):
+            for artist in by_gid(figure, f"agent-{k + 1}"):
+                marked = artist.get_marker() not in ("", "None")
+                own = artist.get_markerfacecolor() if marked else artist.get_color()
+                assert to_hex(own) == colour.lower(), (name, k)
+                seen.add(name)
+            for line in figure.findobj(
+                lambda a, k=k: isinstance(a, Line2D) and a.get_label() == f"agent {k + 1}"
+            ):
+                assert to_hex(line.get_color()) == colour.lower(), (name, k)
+    assert seen >= {"trajectory", "inputs", "constraint_force", "formations", "summary"}
+
+
+# Machado, Oliveira and Fernandes (2009), severity 1, on linear RGB.
+VISION = {
+    "normal": np.eye(3),
+    "protanopia": [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216],
+                   [-0.003882, -0.048116, 1.051998]],
+    "deuteranopia": [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413],
+                     [-0.011820, 0.042940, 0.968881]],
+    "tritanopia": [[1.255528, -0.076749, -0.178779], [-0.078411, 0.930809, 0.147602],
+                   [0.004733, 0.691367, 0.303900]],
+}  # fmt: skip
+
+
+def cielab(rgb: np.ndarray) -> np.ndarray:
+    xyz = np.array([[0.41246, 0.35758, 0.18044], [0.21267, 0.71515, 0.07218],
+                    [0.01933, 0.11919, 0.95030]]) @ rgb / [0.95047, 1.0, 1.08883]  # fmt: skip
+    x, y, z = np.where(xyz > 0.008856, np.cbrt(xyz), 7.787 * xyz + 16 / 116)
+    return np.array([116 * y - 16, 500 * (x - y), 200 * (y - z)])
+
+
+@pytest.mark.parametrize("eyes", VISION)
+@pytest.mark.parametrize("n", [3, 8, 12])
+def test_colours_stay_apart_to_colour_blind_eyes(eyes, n):
+    """Any two agents' colours differ by more than 12 in CIELAB, for each kind of colour vision."""
+    seen = []
+    for colour in figures.agent_colours(n):
+        c = np.array(to_rgb(colour))
+        linear = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
+        seen.append(cielab(np.clip(np.array(VISION[eyes]) @ linear, 0, 1)))
+    assert min(np.linalg.norm(a - b) for a, b in combinations(seen, 2)) > 12
+    assert max(lab[0] for lab in seen) < 75, "too pale on white"
+
+
+def test_many_agents_all_have_colours_of_their_own():
+    """Beyond the palette, colours are still distinct."""
+    assert len(set(figures.agent_colours(100))) == 100
+
+
+# -- phases
+
+
+def legend_of(ax: Any) -> list[str]:
+    return [text.get_text() for text in ax.get_legend().get_texts()]
+
+
+def corners(text: Any, points: float = 0.0) -> np.ndarray:
+    """Corners (4, 2) [pixels] of a text as it stands, also if it slants."""
+    angle = math.radians(text.get_rotation())
+    text.set_rotation(0)
+    box = text.get_window_extent().padded(points)
+    text.set_rotation(math.degrees(angle))
+    x, y = text.get_transform().transform(text.get_position())
+    c, s = math.cos(angle), math.sin(angle)
+    return (box.corners() - [x, y]) @ np.array([[c, s], [-s, c]]) + [x, y]
+
+
+def overlap(a: np.ndarray, b: np.ndarray) -> bool:
+    """Whether two rectangles overlap: no line along a side of either lies between them."""
+    for box in (a, b):
+        for side in (box[1] - box[0], box[2] - box[0]):
+            p, q = a @ side, b @ side
+            if p.max() <= q.min() or q.max() <= p.min():
+                return False
+    return True
+
+
+LENGTHS = {
+    "two": [6.0, 14.0],
+    "twelve as in the paper": [6, 9, 9, 8, 8, 10, 4, 3, 8, 10, 4, 11],
+    "twelve in a rush": [40, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 20, 0.5, 0.5, 0.5, 30],
+    "sixty": [1.0] * 60,
+}
+
+
+@pytest.mark.parametrize("name", ["cm", "clearance", "summary"])
+@pytest.mark.parametrize("lengths", LENGTHS)
+def test_phase_names_do_not_overlap(name, lengths):
+    """Names of phases keep clear of each other, of the title and of the figure's edge."""
+    phases = [(f"fly to some place far off, {k}", x) for k, x in enumerate(LENGTHS[lengths])]
+    figure = drawn(name, a_flight(phases=phases, samples=61))
+    labels = by_gid(figure, "phase")
+    assert labels
+    boxes = [corners(label) for label in labels]
+    assert figure._suptitle is not None
+    boxes.append(figure._suptitle.get_window_extent().corners())
+    for a, b in combinations(boxes, 2):
+        assert not overlap(a, b)
+    everything = np.concatenate(boxes)
+    assert everything.min() >= 0
+    assert (everything.max(axis=0) <= figure.bbox.size).all()
+
+
+@pytest.mark.parametrize("lengths", ["two", "twelve as in the paper", "twelve in a rush"])
+def test_every_phase_is_named(lengths):
+    """Up to a dozen phases all have their names, however short they are, in the order of time."""
+    phases = [(f"leg {k}", x) for k, x in enumerate(LENGTHS[lengths])]
+    labels = by_gid(drawn("distances", a_flight(phases=phases)), "phase")
+    assert [label.get_text() for label in labels] == [name for name, _ in phases]
+    places = [label.get_position()[0] for label in labels]
+    assert places == sorted(places)
+
+
+def test_names_stand_upright_where_they_fit(triangle):
+    """Long phases have their names level and centred; short ones slanting."""
+    labels = by_gid(drawn("distances", triangle), "phase")
+    assert [label.get_rotation() for label in labels] == [0, 0]
+    assert [label.get_position()[0] for label in labels] == [3.0, 13.0]
+
+
+def test_the_summary_says_which_phase_has_which_number(triangle):
+    """The summary numbers the phases and has the key to the numbers."""
+    words = " ".join(texts(figures.summary(triangle))).replace("\N{NO-BREAK SPACE}", " ")
+    assert "1 establish" in words
+    assert "2 fly 1" in words
+
+
+def test_every_second_phase_is_shaded():
+    """Of five phases the second and the fourth are shaded, from their start to their end."""
+    figure = drawn("distances", a_flight(phases=[(f"leg {k}", 4.0) for k in range(5)]))
+    bands = [p for p in figure.axes[0].patches if to_hex(p.get_facecolor()) == style.BAND.lower()]
+    spans = [(band.get_x(), band.get_x() + band.get_width()) for band in bands]
+    assert spans == [(4.0, 8.0), (12.0, 16.0)]
+
+
+def test_a_name_may_hold_anything(tmp_path):
+    """Dollars, tabs, bells, emoji and Chinese in a phase's name do no harm."""
+    phases = [("$x^{", 5.0), ("a\tb\x07 <&>", 5.0), ("起飞 🚁", 5.0), ("long " * 30, 5.0)]
+    result = a_flight(phases=phases)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for path in figures.plot(result, tmp_path, names=["distances", "summary"]):
+            if path.suffix == ".svg":
+                words = " ".join(ET.parse(path).getroot().itertext())
+                assert "$x^{" in words
+                assert "a b <&>" in words.replace("\N{NO-BREAK SPACE}", " ")
+
+
+# -- what the figures show
+
+
+def test_the_thrust_limit_is_drawn(triangle):
+    """The limit is a line at 23.6 N, named, and inside the axes, in the figure and on the summary."""
+    for name in ("inputs", "summary"):
+        figure = drawn(name, triangle)
+        (line,) = [x for x in by_gid(figure, "limit") if x.get_ydata()[0] == 23.6]
+        low, high = line.axes.get_ylim()
+        assert low < 23.6 < high
+        assert "limit 23.6 N" in texts(figure)
+
+
+def test_each_thrust_limit_is_drawn_and_none_where_there_is_none():
+    """Different limits have a line each, an agent's own in its colour; without limits there is none."""
+    agents = {"mass": 1.0, "position": START, "thrust_limit": [20.0, 20.0, 30.0]}
+    figure = figures.inputs(a_flight(mission={"agents": agents}))
+    lines = {x.get_ydata()[0]: to_hex(x.get_color()) for x in by_gid(figure, "limit")}
+    assert lines == {20.0: style.ALERT.lower(), 30.0: figures.agent_colours(3)[2].lower()}
+    assert "limit of 1, 2 20 N" in texts(figure)
+    free = figures.inputs(a_flight(mission=FREE))
+    assert not by_gid(free, "limit")
+
+
+def test_clearance_shows_limits_and_the_worst(triangle):
+    """The separation's limit, contact with obstacles, and the least value with when and who."""
+    figure = figures.clearance(a_flight(mission=FENCED))
+    assert sorted(x.get_ydata()[0] for x in by_gid(figure, "limit")) == [0.0, 0.5, 1.0]
+    k = int(triangle.separation.argmin())
+    i, j = sorted(triangle.separation_pair[k] + 1)
+    words = f"{triangle.separation[k]:.3g} m at {triangle.time[k]:.2f} s, agents {i} and {j}"
+    assert words in texts(figures.clearance(triangle))
+    k = int(triangle.clearance.argmin())
+    thing = triangle.mission.obstacles[triangle.clearance_obstacle[k]].name
+    assert any(
+        text.endswith(f"agent {triangle.clearance_agent[k] + 1} to {thing}")
+        for text in texts(figures.clearance(triangle))
+    )
+
+
+def test_room_below_counts_only_agents_above_each_other():
+    """Two spheres of 0.25 m, 2 m above each other: 1.5 m of room; side by side: none to speak of."""
+    result = a_flight(n=2, formation=None, samples=2)
+    position = np.array([[[0, 0, 0], [0.4, 0, 2.0]], [[0, 0, 0], [0.6, 0, 2.0]]])
+    np.testing.assert_allclose(
+        curves.room_below(a_flight(n=2, formation=None, samples=2, position=position)),
+        [1.5, np.nan],
+    )
+    assert len(curves.room_below(result)) == 2
+
+
+def test_every_edge_has_a_line_and_few_legend_entries(cube):
+    """The cube's 28 edges are all drawn, in a colour for each length, with a legend of three lengths."""
+    (ax,) = drawn("distances", cube).axes
+    flown = [x for x in ax.lines if x.get_linestyle() == "-" and len(x.get_xdata()) > 2]
+    assert len(flown) == len(cube.edges) == 28
+    assert legend_of(ax) == [
+        "12 edges: 4 m", "12 edges: 5.66 m", "4 edges: 6.93 m", "reference",
+    ]  # fmt: skip
+    last = {round(float(x.get_ydata()[-1]), 2): to_hex(x.get_color()) for x in flown}
+    assert len(set(last.values())) == len(last) == 3
+
+
+def test_few_edges_have_names(triangle):
+    """The triangle's edges each have their entry, agents counted from 1."""
+    assert legend_of(figures.distances(triangle).axes[0]) == ["1-2", "1-3", "2-3", "reference"]
+
+
+def test_euler_angles_do_not_jump():
+    """Two turns about z show as a straight line to 720 deg, and nothing before the frame is attached."""
+    yaw = np.linspace(0, 4 * np.pi, 101)
+    q = att.quaternion_from_euler(np.column_stack([0 * yaw, 0 * yaw, yaw]))
+    q[:20] = np.nan
+    shown = curves.euler_deg(q)
+    assert np.isnan(shown[:20]).all()
+    np.testing.assert_allclose(np.diff(shown[20:, 2]), 7.2, atol=1e-9)
+    result = a_flight(samples=101, attitude=q, attitude_reference=np.where(np.isnan(q), q, -q))
+    flown, wanted, _ = curves.flown_and_wanted_euler(result)
+    np.testing.assert_allclose(wanted[20:], flown[20:], atol=1e-9)
+
+
+def test_a_reference_lies_on_the_turn_that_is_flown():
+    """A command of -170 deg is drawn at 190 deg where 185 deg is flown."""
+    flown = np.array([[0.0, 0.0, 185.0], [np.nan] * 3])
+    wanted = np.array([[0.0, 0.0, -170.0], [0.0, 0.0, -170.0]])
+    np.testing.assert_allclose(curves._nearest_turn(wanted, flown)[:, 2], [190.0, -170.0])
+
+
+def test_shape_error_is_that_of_the_worst_pair():
+    """A triangle of 4 m that is flown 10 % too large is 0.4 m off."""
+    result = a_flight()
+    slots = np.array(result.mission.formation_slots("shape"))
+    grown = a_flight(position=np.broadcast_to(1.1 * slots + 7.0, result.position.shape))
+    np.testing.assert_allclose(curves.shape_error(grown), 0.4)
+
+
+def test_thinned_lines_keep_their_peaks():
+    """Of 200,000 samples a few thousand are drawn, with the ends and the single sample that peaks."""
+    t = np.linspace(0, 90, 200_000)
+    y = np.sin(t)
+    y[[77_777, 123_456]] = 100.0, -100.0
+    x, z = style.thinned(t, y)
+    assert len(x) < 4000
+    assert (np.diff(x) > 0).all()
+    assert (x[0], x[-1]) == (t[0], t[-1])
+    assert (z.max(), z.min()) == (100.0, -100.0)
+    assert style.thinned(t[:100], y[:100])[0] is not None
+    np.testing.assert_array_equal(style.thinned(t[:100], y[:100])[1], y[:100])
+
+
+def test_a_flight_that_breaks_down_is_still_readable():
+    """A thrust of 1e6 N in the last sample does not flatten what was flown before."""
+    thrust = np.full((181, 3), 9.8)
+    thrust[-1] = 1e6
+    wild = figures.inputs(a_flight(thrust=thrust, complete=False, ending="singular"))
+    assert all(ax.get_ylim()[1] < 50 for ax in wild.axes)
+    assert any("1e+06 N" in text for text in texts(wild))
+    assert any("incomplete, stopped at 20.00 s" in text for text in texts(wild))
+
+
+# -- space
+
+
+@pytest.mark.parametrize("name", ["trajectory", "summary"])
+@pytest.mark.parametrize("flight", ["no obstacles, no limits", "one agent", "two agents, stopped"])
+def test_three_dimensions_have_one_scale(name, flight):
+    """A metre is as long in x, y and z: the view is a rotation, cut to two rows, times one scale."""
+    figure = drawn(name, a_flight(**FLIGHTS[flight]))
+    (ax,) = [ax for ax in figure.axes if ax.name == "3d"]
+    origin, *units = space._on_screen(ax, np.vstack([np.zeros(3), np.eye(3)]))
+    A = np.array(units).T - origin[:, None]
+    scale = np.linalg.norm(A[0])
+    np.testing.assert_allclose(A @ A.T / scale**2, np.eye(2), atol=1e-6)
+
+
+@pytest.mark.parametrize("flight", [f for f in FLIGHTS if f != "one sample"])
+def test_everything_in_space_is_in_the_picture(flight):
+    """All agents at all times, all obstacles and waypoints lie inside their part of the trajectory's figure."""
+    result = a_flight(**FLIGHTS[flight])
+    figure = drawn("trajectory", result)
+    view = space.scene(result)
+    spatial, above = figure.axes
+    points = np.concatenate(
+        [result.position.reshape(-1, 3), *([low, high] for _, low, high in view.boxes)]
+    )
+    inside = space._on_screen(spatial, points) / figure.bbox.size
+    assert (inside > [0, 0.05]).all()
+    assert (inside < [0.62, 0.97]).all()
+    flat = above.transData.transform(points[:, :2])
+    assert (flat >= above.bbox.min).all()
+    assert (flat <= above.bbox.max).all()
+    assert (points >= view.low - 1e-9).all()
+    assert (points <= view.high + 1e-9).all()
+
+
+def test_the_formation_is_drawn_at_both_ends_and_not_on_top_of_itself(triangle):
+    """The first and last sample are drawn, and no two drawn formations lie within each other's shape."""
+    shots = space.scene(triangle).shots
+    assert (shots[0], shots[-1]) == (0, len(triangle.time) - 1)
+    assert 3 < len(shots) < 25
+    r = triangle.position[shots]
+    for a, b in combinations(r[1:-1], 2):
+        assert np.sqrt(np.mean(np.sum((a - b) ** 2, axis=1))) > 1.0
+
+
+def test_a_flight_without_edges_still_draws_its_agents():
+    """Without any edge there are paths, starts and ends, in both views."""
+    figure = figures.trajectory(a_flight(n=4, formation=None))
+    for k in range(4):
+        assert len(by_gid(figure, f"agent-{k + 1}")) == 2
+    assert len(by_gid(figure, "start")) == len(by_gid(figure, "end")) == 8
+    assert "no edges" in texts(figures.distances(a_flight(n=4, formation=None)))
+
+
+def test_a_huge_obstacle_does_not_shrink_the_flight():
+    """Of a wall a hundred kilometres long only what stands near the flight is shown."""
+    wall = {"kind": "box", "name": "wall", "min": [-1e5, 20.0, 0.0], "max": [1e5, 21.0, 50.0]}
+    near = space.scene(a_flight(mission={"obstacles": [wall]}))
+    assert near.boxes
+    assert np.ptp([near.low, near.high], axis=0).max() < 100
+
+
+@pytest.mark.parametrize(("n", "formation"), [(3, TRIANGLE), (8, CUBE), (4, CHAIN)])
+def test_a_formation_shows_its_graph(n, formation):
+    """Every edge is a line between its two agents, which carry their numbers; slots have body axes."""
+    result = a_flight(n=n, formation=formation)
+    figure = drawn("formations", result)
+    for i, j in result.edges:
+        (edge,) = by_gid(figure, f"edge-{i + 1}-{j + 1}")
+        ends = [by_gid(figure, f"agent-{k + 1}")[0].get_xydata()[0] for k in (i, j)]
+        np.testing.assert_allclose(edge.get_xydata()[[0, -1]], ends)
+    assert {str(k + 1) for k in range(result.n_agents)} <= set(texts(figure))
+    assert len(by_gid(figure, "body-axis")) == (0 if formation is CHAIN else 3)
+
+
+def test_a_graph_without_slots_is_spread_out():
+    """A chain of four distances is drawn as a line: each shortest path as long as it is."""
+    result = a_flight(n=4, formation=CHAIN)
+    places, placed = space.sketch_places(result.mission, "shape")
+    assert not placed
+    np.testing.assert_allclose(np.linalg.norm(np.diff(places, axis=0), axis=1), 4.0, atol=1e-6)
+    assert np.linalg.norm(places[0] - places[3]) == pytest.approx(12.0)
+
+
+def test_every_formation_of_the_mission_is_drawn():
+    """A mission with two formations has both sketches, also of the one never flown."""
+    both = {"shape": TRIANGLE, "row": {"shape": "line", "size": 4.0}}
+    words = texts(figures.formations(a_flight(mission={"formations": both})))
+    assert {"shape", "row", "triangle, 3 edges", "line, 3 edges"} <= set(words)
+
+
+# -- files
+
+
+def test_files_appear_in_both_formats(triangle, tmp_path):
+    """Each figure is a PNG of 150 to 200 dpi and an SVG whose text is text."""
+    paths = figures.plot(triangle, tmp_path / "new" / "folder")
+    assert {p.name for p in paths} == {
+        f"{name}.{kind}" for name in figures.figure_names() for kind in ("png", "svg")
+    }
+    assert sorted(p.name for p in (tmp_path / "new" / "folder").iterdir()) == sorted(
+        p.name for p in paths
+    )
+    for path in paths:
+        if path.suffix == ".png":
+            with Image.open(path) as image:
+                assert 150 <= image.info["dpi"][0] <= 200
+                assert image.width >= 900
+        else:
+            root = ET.parse(path).getroot()
+            assert root.tag == "{http://www.w3.org/2000/svg}svg"
+            words = " ".join("".join(e.itertext()) for e in root.iter() if e.tag.endswith("}text"))
+            assert "made-up" in words or path.stem == "summary"
+            if path.stem in OVER_TIME:
+                assert "time [s]" in words
+                assert "establish" in words
+
+
+def test_names_and_formats_choose(triangle, tmp_path):
+    """Only the figures and formats asked for are written, in the order asked."""
+    paths = figures.plot(triangle, tmp_path, formats=["svg"], names=["cm", "distances"])
+    assert [p.name for p in paths] == ["cm.svg", "distances.svg"]
+    assert sorted(tmp_path.iterdir()) == sorted(paths)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "known"), [({"names": ["speed"]}, "clearance"), ({"formats": ["bmp"]}, "svg")]
+)
+def test_an_unknown_name_is_refused_before_anything_is_drawn(triangle, tmp_path, wrong, known):
+    """An unknown figure or format is named, with those there are, and nothing is written."""
+    with pytest.raises(ValueError, match=known):
+        figures.plot(triangle, tmp_path, **wrong)
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_same_flight_gives_the_same_files(tmp_path):
+    """Drawn twice, also with other settings of matplotlib in between, the files are equal byte by byte."""
+    names = ["trajectory", "inputs"]
+    first = figures.plot(a_flight(), tmp_path / "a", names=names)
+    with mpl.rc_context({"font.size": 30, "axes.facecolor": "black", "svg.fonttype": "path"}):
+        second = figures.plot(a_flight(), tmp_path / "b", names=names)
+    for a, b in zip(first, second, strict=True):
+        assert a.read_bytes() == b.read_bytes(), a.name
+
+
+def test_a_failure_leaves_the_old_file(triangle, tmp_path, monkeypatch):
+    """If a picture cannot be put in its place, the old one stays, no part is left, and the error says where."""
+    (tmp_path / "cm.png").write_bytes(b"old")
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.replace", full)
+    with pytest.raises(ResultError, match=r"cm\.png.*No space left"):
+        figures.plot(triangle, tmp_path, names=["cm"], formats=["png"])
+    assert [p.name for p in tmp_path.iterdir()] == ["cm.png"]
+    assert (tmp_path / "cm.png").read_bytes() == b"old"
+
+
+def test_a_folder_that_is_a_file_is_reported(triangle, tmp_path):
+    """A file in the way of the folder is an error for the user, not a traceback."""
+    (tmp_path / "x").write_text("here")
+    with pytest.raises(ResultError, match="cannot be written"):
+        figures.plot(triangle, tmp_path / "x", names=["cm"], formats=["png"])
+
+
+def test_drawing_leaves_matplotlib_alone(triangle, tmp_path):
+    """Settings are as before, and the backend is not chosen for the user."""
+    before = dict(mpl.rcParams)
+    figures.plot(triangle, tmp_path, names=["distances", "trajectory"], formats=["png"])
+    assert dict(mpl.rcParams) == before
+
+
+def test_matplotlib_waits_until_something_is_drawn():
+    """Importing the figures imports no matplotlib, and drawing no pyplot."""
+    code = (
+        "import sys, rigidfleet.figures as f\n"
+        "assert 'matplotlib' not in sys.modules\n"
+        "from rigidfleet.figures.style import settings\n"
+        "with settings(): pass\n"
+        "import matplotlib.figure, mpl_toolkits.mplot3d.art3d\n"
+        "assert 'matplotlib.pyplot' not in sys.modules\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
