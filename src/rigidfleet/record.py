@@ -29,7 +29,7 @@ class Piece:
     integral: Array  # (K, m) [m s]
     frame: Array  # (K, 4)
     edges: Ints  # (m, 2) of this phase
-    slots: Array | None  # (N, 3) to fit where the kernel blends none; None: no frame attached yet
+    attached: bool  # whether the slots carry the body frame
 
 
 def assemble(
@@ -121,17 +121,14 @@ def _attitudes(pieces: Sequence[Piece], x: Array, masses: Array, *, framed: bool
     for piece in pieces:
         rows = slice(start, start + len(piece.time))
         start = rows.stop
-        if piece.slots is None:
+        if not piece.attached:
             if framed:
                 quaternions[rows] = piece.frame
             continue
-        p = piece.record.p
-        if np.isnan(p[0, 0, 0]):
-            p = np.broadcast_to(piece.slots, x[rows].shape)
         near = piece.record.T_ref
         if np.isnan(near[0, 0, 0]):
             near = last
-        T = geometry.fit_attitudes(x[rows], p, masses, near)
+        T = geometry.fit_attitudes(x[rows], piece.record.p, masses, near)
         last = T[-1]
         quaternions[rows] = att.quaternion_from_dcm(T)
     return att.unwrap_quaternion(quaternions)

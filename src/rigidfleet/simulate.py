@@ -16,7 +16,7 @@ from rigidfleet import attitude as att
 from rigidfleet.errors import FlightError
 from rigidfleet.kernel import flight
 from rigidfleet.kernel import program as k
-from rigidfleet.mission import Fly, Mission, Phase, Settle, Turn
+from rigidfleet.mission import Establish, Fly, Mission, Phase, Reshape, Settle, Turn
 from rigidfleet.plan import PhasePlan, Pose, Situation, about_cm, plan_phase
 from rigidfleet.record import Piece, assemble
 from rigidfleet.result import PhaseRecord, Result
@@ -24,8 +24,14 @@ from rigidfleet.result import PhaseRecord, Result
 if TYPE_CHECKING:
     from rigidfleet.kernel.program import Array
 
-#: The integrator returns to Python after so many steps: often enough for Ctrl-C and progress.
-_STEPS = 2000
+#: The integrator returns to Python after so many steps, or fewer: as many as take this long [s of
+#: wall time], often enough for Ctrl-C and progress whatever the size of the formation.
+_STEPS, _PAUSE = 2000, 0.05
+#: A phase has stalled that took more steps than these and those for each second of mission time, or
+#: more than the last in all. A step of 1 ms is already that of gains above 1e3 /s.
+_STALLED, _STALLED_RATE, _MOST_STEPS = 100_000, 10_000.0, 5_000_000
+#: Beyond, one evaluation of the constraint force by its dense solve takes more than seconds.
+_MOST_EDGES = 2000
 #: Where a phase ends by settling, whether it has is asked this often [s].
 _CHECK = 0.1
 #: Progress is reported this often [s of wall time].
@@ -215,6 +221,7 @@ class _Flight:
 
     def _begin(self, index: int, phase: Phase) -> _Leg:
         t_end = _end(phase, self.now.t)
+        _check_size(self.mission, phase)
         plan = plan_phase(self.mission, phase, self.now, t_end)
         self._check_frame(index, plan)
         if self.external is not None:
@@ -240,6 +247,7 @@ class _Flight:
         ``program`` may hold a user's force in place of the phase's own input law.
         """
         state = leg.state
+        steps = 10
         fresh = state.count[0] == 0 or program is not leg.plan.program
         times = self._samples(leg, t_end)
         samples = np.empty((len(times), len(state.y)))
@@ -248,21 +256,26 @@ class _Flight:
         status = flight.PAUSED
         try:
             while status == flight.PAUSED:
+                begun = clock.perf_counter()
                 status = flight.integrate(
-                    program, leg.workspace, state, t_end, fresh, times, samples, _STEPS
+                    program, leg.workspace, state, t_end, fresh, times, samples, steps
                 )
+                took = max(clock.perf_counter() - begun, 1e-6)
+                steps = min(_STEPS, max(1, int(steps * min(_PAUSE / took, 10.0))))
                 fresh = False
                 if self.external is not None:
                     self.external.check()
                 self._report(leg)
+                if status == flight.PAUSED and self._stalled(leg):
+                    break
         finally:
             done = int(state.count[3])
             if state.count[0] and not state.count[1] and len(times) and times[0] <= first:
                 samples[0], done = state.y, 1  # no step was possible: the start is all there is
             if done:
                 self._record(leg, program, times[:done], samples[:done])
-        if status == flight.COLLAPSED:
-            raise _StoppedError(self._diagnose(leg))
+        if status != flight.FINISHED:
+            raise _StoppedError(self._diagnose(leg, collapsed=status == flight.COLLAPSED))
 
     def _samples(self, leg: _Leg, t_end: float) -> Array:
         """Times to record in (t, t_end]: multiples of the output step, and the phase's two ends.
@@ -387,28 +400,70 @@ class _Flight:
                 ' phase: control = "slots"'
             )
 
-    def _diagnose(self, leg: _Leg) -> str:
-        """Say when, where and why the integrator could not go on."""
-        n, plan = len(self.masses), leg.plan
-        r = leg.state.y[: 3 * n].reshape(1, n, 3)
-        head = f"the flight cannot go on at t = {leg.t:.3f} s, in phase '{leg.phase.name}'"
-        if not len(plan.edges):
-            return f"{head}: the forces are not finite. Look for a force or a gain far too large"
-        i, j = plan.edges.T
-        u = r[0, i] - r[0, j]
-        lengths = np.linalg.norm(u, axis=1)
-        closest = int(lengths.argmin())
-        J = np.zeros((len(plan.edges), n, 3))
-        rows = np.arange(len(plan.edges))
-        J[rows, i], J[rows, j] = u / lengths[:, None], -u / lengths[:, None]
-        values = np.linalg.svd(J.reshape(len(plan.edges), -1), compute_uv=False)
-        edge = f"{i[closest] + 1}-{j[closest] + 1}"
+    def _stalled(self, leg: _Leg) -> bool:
+        """Whether a phase takes far more steps than its length in time explains."""
+        steps = int(leg.state.count[1] + leg.state.count[2])
+        flown = leg.t - self.now.t
+        return steps > min(_STALLED + _STALLED_RATE * flown, _MOST_STEPS)
+
+    def _diagnose(self, leg: _Leg, *, collapsed: bool) -> str:
+        """Say when, where and why the integrator could not go on, and what to try."""
+        count, h = leg.state.count, float(leg.state.clock[1])
+        if collapsed:
+            what = f"the step size has fallen to {h:.1g} s"
+        else:
+            what = f"{count[1] + count[2]} steps have been taken in it, the last of {h:.1g} s"
+        head = f"the flight cannot go on at t = {leg.t:.3f} s, in phase '{leg.phase.name}': {what}"
+        if not len(leg.plan.edges):
+            return f"{head}. {self._remedy(leg, collapsed=collapsed)}"
+        J, closest, length = _jacobian(leg, len(self.masses))
+        edge = "-".join(str(int(a) + 1) for a in leg.plan.edges[closest])
+        if not np.isfinite(J).all():
+            return (
+                f"{head}, because agents {edge.replace('-', ' and ')} are at one place: along the edge"
+                f" {edge} between them, {length:.2g} m long, no force has a direction, and none of the"
+                " singular values of the constraint Jacobian J is defined. Let their paths not cross:"
+                " exchange their slots, or start them elsewhere"
+            )
+        values = np.linalg.svd(J, compute_uv=False)
+        where = (
+            f"singular value {len(values)} of {len(values)} of the constraint Jacobian J is"
+            f" {values[-1]:.2g} (the largest is {values[0]:.2g}; the shortest edge {edge} is"
+            f" {length:.3g} m)"
+        )
+        solver = self.mission.constraint.solver
+        if solver in ("exact", "pinv"):
+            return (
+                f"{head}, and {where}. The force of solver \"{solver}\" has no bound where one of them"
+                ' vanishes. Use solver = "iterated" (or "spectral"), and references that move'
+                ' smoothly: reference = "shape" or "distances"'
+            )
+        return f"{head}, and {where}. {self._remedy(leg, collapsed=collapsed)}"
+
+    def _remedy(self, leg: _Leg, *, collapsed: bool) -> str:
+        """What to try where J is not to blame."""
+        flight.closed_loop(
+            leg.t, leg.state.y, np.empty_like(leg.state.y), leg.plan.program, leg.workspace
+        )
+        w = leg.workspace
+        names = {"input force": w.f_u, "constraint force": w.f_C, "external force": w.f_E}
+        lost = [name for name, f in names.items() if not np.isfinite(f).all()]
+        if lost:
+            return f"The {lost[0]} is not finite. Look for a gain, a distance or a mass far too large"
+        name, f = max(names.items(), key=lambda item: float(np.abs(item[1]).max()))
+        agent = int(np.abs(f).max(axis=1).argmax())
+        size = float(np.linalg.norm(f[agent]))
+        if collapsed:
+            return (
+                f"The greatest force is the {name} on agent {agent + 1}, {size:.3g} N. Look for what"
+                " makes it jump: a force of your own, or a mass, gain or distance far too large or"
+                " small; and for tolerances near 1e-15"
+            )
         return (
-            f"{head}: singular value {len(values)} of {len(values)} of the constraint Jacobian J has"
-            f" fallen to {values[-1]:.2g} (the largest is {values[0]:.2g}; the shortest edge {edge}"
-            f" is {lengths[closest]:.3g} m), and the force of solver"
-            f' "{self.mission.constraint.solver}" has no bound there. Use solver = "iterated" (or'
-            ' "spectral"), and references that move smoothly: reference = "shape" or "distances"'
+            f"The greatest force is the {name} on agent {agent + 1}, {size:.3g} N. Steps as short as"
+            " this come from gains (constraint, tracking, lqr) far above 1e3 /s, from a damping far"
+            " below 1e-6, or from tolerances that are too tight (integrator.rtol, atol): relax them;"
+            " or the phase is too long"
         )
 
     def _report(self, leg: _Leg) -> None:
@@ -443,10 +498,9 @@ class _Flight:
             q = samples[:, 6 * n + m : 6 * n + m + 4]
             frame = q / np.linalg.norm(q, axis=1, keepdims=True)
         # A frame is attached from the first establishment on, or wherever something is tracked.
-        attached = self.now.formation is not None or plan.program.control.kind != k.OPEN
+        attached = self.now.slots is not None or plan.program.control.kind != k.OPEN
         integral = samples[:, 6 * n : 6 * n + m]
-        slots = plan.slots if attached else None
-        self.pieces.append(Piece(leg.index, times, out, integral, frame, plan.edges, slots))
+        self.pieces.append(Piece(leg.index, times, out, integral, frame, plan.edges, attached))
 
     def result(self) -> Result:
         """The record of what has been flown."""
@@ -460,6 +514,36 @@ class _Flight:
         return assemble(
             self.mission, self.phases, self.pieces, ending=self.ending, statistics=statistics
         )
+
+
+def _check_size(mission: Mission, phase: Phase) -> None:
+    """Stop before a flight that would take hours."""
+    if not isinstance(phase, Establish | Reshape):
+        return
+    edges = len(mission.formation_edges(phase.formation))
+    if edges > _MOST_EDGES:
+        raise _StoppedError(
+            f"phase '{phase.name}' takes '{phase.formation}', which has {edges:,} edges: with more than"
+            f" {_MOST_EDGES:,} a flight takes hours. Give it fewer; 3 N - 6, and some more, will do"
+        )
+
+
+def _jacobian(leg: _Leg, n: int) -> tuple[Array, int, float]:
+    """J (m, 3N) where the integrator is, its shortest edge and that edge's length [m]."""
+    edges = leg.plan.edges
+    flight.closed_loop(
+        leg.t, leg.state.y, np.empty_like(leg.state.y), leg.plan.program, leg.workspace
+    )
+    r = leg.workspace.r
+    u = r[edges[:, 0]] - r[edges[:, 1]]
+    lengths = np.linalg.norm(u, axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u /= lengths[:, None]
+    J = np.zeros((len(edges), n, 3))
+    rows = np.arange(len(edges))
+    J[rows, edges[:, 0]], J[rows, edges[:, 1]] = u, -u
+    closest = int(lengths.argmin())
+    return J.reshape(len(edges), -1), closest, float(lengths[closest])
 
 
 def _times(times: ArrayLike, end: float) -> Array:

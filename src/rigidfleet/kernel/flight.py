@@ -356,8 +356,9 @@ def record(times, samples, p, w, out):
         copy(w.f_C, out.f_C[k])
         for q in range(6):
             out.wrench[k, q] = w.wrench[q]
-        if p.reference.kind == SLOTS or kind == LOCAL:
-            copy(w.p, out.p[k])
+        # Where only distances are blended, their slots still say how the formation lies.
+        blend_slots(times[k], p.reference, w.p, w.p_dot, w.p_ddot)
+        copy(w.p, out.p[k])
         if kind != OPEN:
             copy(w.T_ref, out.T_ref[k])
         if kind == LOCAL:
