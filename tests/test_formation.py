@@ -7,6 +7,7 @@ from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
 
 from rigidfleet import formation as f
+from rigidfleet.errors import MissionError
 
 NAMED = [
     ("line", 4.0, 3),
@@ -20,6 +21,14 @@ NAMED = [
     ("pyramid", 4.0, 6),
     ("cube", 4.0, 8),
     ("cuboid", [8.0, 2.0, 4.0], 8),
+    ("v", 4.0, 7),
+    ("grid", 4.0, 7),
+    ("sphere", 4.0, 20),
+    ("helix", [4.0, 3.0, 2.0], 9),
+    ("tetrahedron", 4.0, 4),
+    ("octahedron", 4.0, 6),
+    ("icosahedron", 4.0, 12),
+    ("dodecahedron", 4.0, 20),
 ]
 SEEDS = st.integers(0, 2**32 - 1)
 
@@ -47,6 +56,50 @@ def test_shape_is_centred(shape, size, n):
 def test_size_is_edge_length(shape, size, n):
     """The shortest distance in a shape is its size, the smallest of them for a cuboid."""
     assert pdist(f.slots(shape, size, n)).min() == pytest.approx(np.min(size))
+
+
+@pytest.mark.parametrize(
+    ("shape", "n", "edges"),
+    [
+        ("tetrahedron", 4, 6),
+        ("octahedron", 6, 12),
+        ("icosahedron", 12, 30),
+        ("dodecahedron", 20, 30),
+    ],
+)
+def test_regular_solids(shape, n, edges):
+    """Vertices on one sphere, as many shortest distances as the solid has edges, counted from below."""
+    p = f.slots(shape, 4.0, n)
+    d = pdist(p)
+    assert np.count_nonzero(d < d.min() + 1e-9) == edges
+    np.testing.assert_allclose(np.linalg.norm(p, axis=1), np.linalg.norm(p[0]))
+    assert (np.diff(p[:, 2]) >= -1e-12).all()
+
+
+def test_v_flies_point_first():
+    """Agent 1 leads on x; the wings trail at 45 degrees, left (+y) first."""
+    p = f.slots("v", np.sqrt(2), 5)
+    np.testing.assert_allclose(
+        p - p[0], [[0, 0, 0], [-1, 1, 0], [-1, -1, 0], [-2, 2, 0], [-2, -2, 0]]
+    )
+
+
+def test_grid_fills_rows():
+    """Seven agents stand in rows of three along x; the last row has one."""
+    p = f.slots("grid", 2.0, 7)
+    assert (p - p[0])[[1, 3, 6]].tolist() == [[2, 0, 0], [0, 2, 0], [0, 4, 0]]
+
+
+def test_helix_has_its_sizes():
+    """Radius, rise per turn and the distance of neighbours are those asked for."""
+    p = f.slots("helix", [4.0, 3.0, 2.0], 9)
+    axis = p[:, :2] - (p[:, :2] - 0)[0] + [4, 0]
+    np.testing.assert_allclose(np.linalg.norm(axis, axis=1), 4)
+    np.testing.assert_allclose(np.linalg.norm(np.diff(p, axis=0), axis=1), 2)
+    turn = np.unwrap(np.arctan2(axis[:, 1], axis[:, 0]))
+    np.testing.assert_allclose(p[:, 2] - p[0, 2], 3 * turn / (2 * np.pi))
+    with pytest.raises(ValueError, match=r"at most 8\.139 m"):
+        f.slots("helix", [4.0, 3.0, 9.0], 3)
 
 
 def test_line_is_4_8_4():
@@ -100,6 +153,63 @@ def test_impossible_shapes_are_refused(shape, size, n, message):
     """A shape that does not exist, or not for so many agents, says so."""
     with pytest.raises(ValueError, match=message):
         f.slots(shape, size, n)
+
+
+# -- points from files
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "0,0,0\n4,0,0\n0,4,0\n",
+        "x,y,z\n0,0,0\n4,0,0\n0,4,0",
+        "# slots [m]\n\nx;y\n0;0\n4;0  # agent 2\n0;4\n",
+        "\ufeff0 0 0\r\n4\t0 0\r\n 0  4e0 -0 \r\n",
+    ],
+)
+def test_points_are_read(tmp_path, text):
+    """Commas, semicolons or blanks; names, comments, two columns, a byte-order mark: all the same points."""
+    path = tmp_path / "points.csv"
+    path.write_bytes(text.encode())
+    np.testing.assert_array_equal(f.read_points(path), [[0, 0, 0], [4, 0, 0], [0, 4, 0]])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (b"", "has no points"),
+        (b"x,y,z\n", "has no points"),
+        (b"0,0,0\n1,two,3\n", "line 2 = '1,two,3': is no point"),
+        (b"0,0,0\n1\n", "line 2 = '1': has 1 numbers"),
+        (b"1,5;2,5;0,0\n", "has 6 numbers\n    .*decimal points"),
+        (b"0,0,0\nnan,0,0\n", "line 2 = 'nan,0,0': is not finite"),
+        (b"0,0,0\n1,0,0\n0,0\n", "line 3 = '0,0': is the point of line 1 again"),
+        (b"\xff\xfe\x00", "is not text"),
+    ],
+)
+def test_files_without_points_are_refused(tmp_path, text, message):
+    """What is no list of points says so, with its line and a remedy."""
+    path = tmp_path / "points.csv"
+    path.write_bytes(text)
+    with pytest.raises(MissionError, match=message):
+        f.read_points(path)
+
+
+def test_all_wrong_lines_are_named(tmp_path):
+    """One reading tells of every line that is wrong."""
+    path = tmp_path / "points.csv"
+    path.write_text("0,0,0\na,b,c\n1,2,3,4\n")
+    with pytest.raises(MissionError) as caught:
+        f.read_points(path)
+    assert [finding.key for finding in caught.value.findings] == ["line 2", "line 3"]
+
+
+def test_missing_files_and_directories_are_refused(tmp_path):
+    """A file that cannot be opened is named."""
+    with pytest.raises(MissionError, match=r"none\.csv: cannot be read: no such file"):
+        f.read_points(tmp_path / "none.csv")
+    with pytest.raises(MissionError, match="cannot be read: is a directory"):
+        f.read_points(tmp_path)
 
 
 # -- edges, distances, dimension

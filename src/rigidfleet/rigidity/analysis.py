@@ -260,17 +260,18 @@ def _judge(
     if stress is not None:
         reason = f"{_count(k, 'motion')} free to first order; a self-stress blocks all of them"
         return Verdict.PRESTRESS_STABLE, reason, stress, None
-    bent = finite_flex(StressEnergy(frame, frame.flexes @ open_flexes))
+    bent, goes_on = finite_flex(StressEnergy(frame, frame.flexes @ open_flexes))
     if bent is not None:
-        return Verdict.FLEXIBLE, "a finite motion was followed that keeps all distances", None, bent
+        reason = "a finite motion was followed that keeps all distances"
+        return Verdict.FLEXIBLE, reason, None, bent
     reason = (
         f"{_count(k, 'motion')} free to first order; "
+        + ("no self-stress blocks all of them" if none_exists else "no blocking stress was found")
         + (
-            "no self-stress blocks all of them"
-            if none_exists
-            else "no blocking self-stress was found"
+            "; one goes on to second order, but could not be followed farther"
+            if goes_on
+            else "; none was found that goes on to second order, so it is probably rigid, but softly"
         )
-        + ", and no finite motion was found"
     )
     return Verdict.UNDECIDED, reason, None, None
 

@@ -234,11 +234,18 @@ def sparse(flexes: Floats, rigid: Floats, n: int, most: int = 1 << 30) -> list[F
             a = np.linalg.solve(V.T @ (weight[:, None] * V), c)
             motion = (V @ (a / (c @ a))).reshape(n, -1)
             speed = np.linalg.norm(motion, axis=1)
-        found.append(_clean(motion))
+        found.append(_cleaned(motion, V))
     return found
 
 
-def _clean(motion: Floats) -> Floats:
-    """The motion with agents that stand still at exactly 0."""
+def _cleaned(motion: Floats, V: Floats) -> Floats:
+    """The nearest motion in the span of V in which agents that all but stand still do so."""
+    n = len(motion)
     speed = np.linalg.norm(motion, axis=1)
-    return np.where((speed > _STILL * speed.max())[:, None], motion, 0.0)
+    still = speed <= _STILL * speed.max()
+    _, s, vt = np.linalg.svd(V.reshape(n, -1, V.shape[1])[still].reshape(-1, V.shape[1]))
+    free = vt[np.count_nonzero(s > ZERO) :].T
+    if not free.size:
+        return motion
+    near = (V @ (free @ (free.T @ (V.T @ motion.ravel())))).reshape(motion.shape)
+    return np.where(still[:, None], 0.0, near)

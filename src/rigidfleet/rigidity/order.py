@@ -23,8 +23,9 @@ _DEFINITE = 1e-7
 #: Lengths that agree within this times the size of the shape are the same.
 _EQUAL = 1e-12
 
-#: A flex is finite when it changes some distance by this times the size of the shape.
-_FINITE = 0.03
+#: A flex is finite when it takes some agent this far, times the size of the shape; a walk along it ends at _FAR.
+#: A rigid framework of order n would be off by about the n-th power of it: far more than _EQUAL.
+_FINITE, _FAR = 0.01, 0.1
 
 
 class StressEnergy:
@@ -134,63 +135,67 @@ def _search(energy: StressEnergy) -> tuple[Floats | None, Floats, bool]:
     return None, vector[:, value > 1e-3], proven
 
 
-def finite_flex(energy: StressEnergy, starts: int = 8, seed: int = 0) -> Floats | None:
+def finite_flex(energy: StressEnergy, starts: int = 8, seed: int = 0) -> tuple[Floats | None, bool]:
     """The framework bent by a finite motion that keeps all its lengths, (N, d), or None where none is found.
 
     Flexes that go on to second order are sought near those that move few agents and near random ones; each is
     then followed, from the framework itself until the shape has changed visibly, with lengths equal to 1e-12.
+    Returned besides: whether a flex was found that goes on to second order.
     """
     frame = energy.frame
     few = sparse(energy.flexes, frame.rigid, energy.n, starts)
     candidates = [energy.flexes.T @ motion.ravel() for motion in few]
     candidates += list(np.random.default_rng(seed).normal(size=(starts, energy.k)))
+    goes_on = False
     for q in candidates:
         flex = _second_order(energy, q)
         if flex is None:
             continue
+        goes_on = True
         for way in (flex, -flex):
             bent = _follow(frame, (energy.flexes @ way).reshape(frame.p.shape))
             if bent is not None:
-                return bent
-    return None
+                return bent, True
+    return None, goes_on
 
 
 def _second_order(energy: StressEnergy, q: Floats) -> Floats | None:
     """A flex (k,) near q that goes on to second order: Gauss-Newton on the unit sphere."""
     q = q / max(np.linalg.norm(q), 1e-9)
-    for _ in range(30):
+    for _ in range(40):
         rest = energy.left_over(q)
         if np.linalg.norm(rest) < 1e-11:
-            return q
+            break
         rate = energy.left_over_rate(q)
-        damping = np.linalg.norm(rest) * np.eye(energy.k)
+        rate -= np.outer(rate @ q, q)
+        damping = 0.3 * np.linalg.norm(rest) * np.eye(energy.k)
         q = q - np.linalg.solve(rate.T @ rate + damping, rate.T @ rest)
-        if np.linalg.norm(q) < 1e-3:
-            return None
         q = q / np.linalg.norm(q)
     return q if np.linalg.norm(energy.left_over(q)) < 1e-6 else None
 
 
 def _follow(frame: Framework, direction: Floats) -> Floats | None:
-    """Points on the curve of equal lengths that leaves the framework in a direction, at its end."""
+    """The farthest point of a walk on the curve of equal lengths that leaves the framework in a direction."""
     p = frame.p
     size = np.linalg.norm(p - p.mean(axis=0), axis=1).max()
     step = 2e-3 * size
     direction = direction / np.linalg.norm(direction)
-    here, pairs = p, _all_pairs(p)
-    for _ in range(60):
+    here, best, most = p, p, 0.0
+    for _ in range(80):
         there = restore(here + step * direction, frame.edges, frame.lengths, _EQUAL * size)
-        if there is None:
-            return None
-        there = _aligned(there, here)
-        moved = there - here
+        moved = np.zeros_like(p) if there is None else _aligned(there, here) - here
         if not 0.5 * step < np.linalg.norm(moved) < 2 * step:
-            return None
-        here, direction = there, moved / np.linalg.norm(moved)
+            if here is p or step < 1e-3 * size:
+                break
+            step /= 3
+            continue
+        here, direction = here + moved, moved / np.linalg.norm(moved)
         step = min(1.5 * step, 0.05 * size * np.sqrt(len(p)))
-        if np.abs(_all_pairs(here) - pairs).max() > _FINITE * size:
-            return here
-    return None
+        gone = np.linalg.norm(_aligned(here, p) - p, axis=1).max()
+        best, most = (here, gone) if gone > most else (best, most)
+        if most > _FAR * size:
+            break
+    return best if most > _FINITE * size else None
 
 
 def restore(p: Floats, edges: Ints, lengths: Floats, tol: float) -> Floats | None:
@@ -200,7 +205,7 @@ def restore(p: Floats, edges: Ints, lengths: Floats, tol: float) -> Floats | Non
     along the solutions (Yamashita and Fukushima, 2001).
     """
     e = edges
-    for _ in range(25):
+    for _ in range(40):
         L = np.linalg.norm(p[e[:, 0]] - p[e[:, 1]], axis=1)
         c = L - lengths
         if np.abs(c).max(initial=0.0) <= tol:
@@ -208,7 +213,7 @@ def restore(p: Floats, edges: Ints, lengths: Floats, tol: float) -> Floats | Non
         if not (L > 0).all():
             return None
         J = jacobian(p, e)
-        damping = np.linalg.norm(c) / lengths.mean() * 1e-2
+        damping = 0.3 * np.linalg.norm(c) / lengths.mean()
         K = J.T @ J
         K[np.diag_indices_from(K)] += damping
         p = p - np.linalg.solve(K, J.T @ c).reshape(p.shape)
@@ -221,7 +226,3 @@ def _aligned(p: Floats, onto: Floats) -> Floats:
     R = kabsch(np.pad(onto, space), np.pad(p, space))
     x = np.pad(p - p.mean(axis=0), space) @ R.T
     return x[:, : p.shape[1]] + onto.mean(axis=0)
-
-
-def _all_pairs(p: Floats) -> Floats:
-    return np.linalg.norm(p[:, None] - p, axis=2)

@@ -1,0 +1,445 @@
+import warnings
+from itertools import combinations
+from time import perf_counter
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial import ConvexHull
+from scipy.spatial.transform import Rotation
+
+from rigidfleet import formation as f
+from rigidfleet.geometry import smallest_singular_value
+from rigidfleet.rigidity import Kind, Verdict, analyse, full_rank, jacobian, realisations
+
+RIGID, STABLE = Verdict.INFINITESIMALLY_RIGID, Verdict.PRESTRESS_STABLE
+FLEXIBLE, UNDECIDED = Verdict.FLEXIBLE, Verdict.UNDECIDED
+SEEDS = st.integers(0, 2**32 - 1)
+SPREAD = np.array([[-1, -2, -3], [2, 1, 0.5], [0.3, 2, 1], [1.5, -0.7, 2], [-2, 1.1, -0.4]])
+
+
+def graph(seed, n, share):
+    """Some of the edges between n agents."""
+    edges = f.complete_graph(n)
+    return edges[np.random.default_rng(seed).random(len(edges)) < share]
+
+
+def shape(seed, n, dimension):
+    p = np.zeros((n, 3))
+    p[:, :dimension] = np.random.default_rng(seed).normal(size=(n, dimension))
+    return p
+
+
+def hull(p):
+    """Edges of the triangulated convex hull of points."""
+    sides = {pair for t in ConvexHull(p).simplices.tolist() for pair in combinations(sorted(t), 2)}
+    return np.array(sorted(sides))
+
+
+def double_banana(seed=0):
+    """Two triangular bipyramids that share their tips, agents 4 and 5."""
+    one = [(0, 1), (0, 2), (1, 2), *((i, j) for i in (0, 1, 2) for j in (3, 4))]
+    two = [(5, 6), (5, 7), (6, 7), *((i, j) for i in (3, 4) for j in (5, 6, 7))]
+    return shape(seed, 8, 3), np.array(one + two)
+
+
+def blocks(result, p):
+    """Whether the stress is in balance and has positive energy on every flex."""
+    J = jacobian(p, result.edges)
+    omega = result.stress / f.distances(p, result.edges)
+    i, j = result.edges.T
+    step = np.array([flex.motion[i] - flex.motion[j] for flex in result.flexes])
+    energy = np.einsum("k,akx,bkx->ab", omega, step, step)
+    balance = np.abs(result.stress @ J).max()
+    return balance < 1e-9 and np.linalg.eigvalsh(energy)[0] > 0
+
+
+# -- the paper's shapes
+
+
+def test_cube_of_paper_is_infinitesimally_rigid():
+    """The 18 edges of the paper's cube are independent, and w = 0.2586."""
+    result = analyse(f.slots("cube", 4.0, 8), f.CUBE_EDGES)
+    assert result.verdict is RIGID
+    assert (result.rank, result.reachable, result.needed) == (18, 18, 18)
+    assert result.w == pytest.approx(0.2586, abs=5e-5)
+    assert len(result.redundant) == len(result.flexes) == 0
+
+
+def test_double_banana_is_flexible_with_as_many_edges():
+    """Eight agents and 18 edges are no guarantee: the double banana has rank 17 and turns about its tips."""
+    p, edges = double_banana()
+    result = analyse(p, edges)
+    assert (len(edges), result.rank, result.needed) == (18, 17, 18)
+    assert result.verdict is FLEXIBLE
+    assert [flex.agents for flex in result.flexes] in ([(0, 1, 2)], [(5, 6, 7)])
+    assert len(result.redundant) == 18
+    assert len(result.spare) == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "n", "edges", "rank", "flexes"),
+    [
+        ("line", 3, 3, 2, 2),
+        ("square", 4, 6, 5, 1),
+        ("hexagon", 6, 12, 9, 3),
+        ("hexagon", 6, 15, 9, 3),
+    ],
+)
+def test_flat_shapes_are_at_best_prestress_stable(name, n, edges, rank, flexes):
+    """4-8-4, the square and the hexagon reach ranks 2, 5 and 9: a self-stress holds them, no more."""
+    p, graph = f.slots(name, 4.0, n), f.complete_graph(n)
+    if edges < len(graph):  # the hexagon without its long diagonals
+        graph = graph[f.distances(p, graph) < 7.9]
+    result = analyse(p, graph)
+    assert (len(graph), result.rank, result.reachable, len(result.flexes)) == (
+        edges,
+        rank,
+        rank,
+        flexes,
+    )
+    assert result.verdict is STABLE
+    assert blocks(result, p)
+    assert result.within is not None
+    assert result.within.verdict is RIGID
+
+
+def test_square_without_one_edge_folds():
+    """Five edges hold a square in its plane; in space it folds about the diagonal, and one agent moves."""
+    result = analyse(f.slots("square", 4.0, 4), [[0, 1], [1, 2], [2, 3], [0, 3], [0, 2]])
+    assert result.verdict is FLEXIBLE
+    assert [flex.agents for flex in result.flexes] == [(1,)]
+    assert result.within is not None
+    assert result.within.verdict is RIGID
+
+
+@pytest.mark.parametrize(
+    ("n", "edges", "verdict"),
+    [(1, [], RIGID), (2, [[0, 1]], RIGID), (2, [], FLEXIBLE), (3, [[0, 1], [1, 2]], FLEXIBLE)],
+)
+def test_few_agents(n, edges, verdict):
+    """One agent is rigid, two need an edge and three need three."""
+    assert analyse(SPREAD[:n], edges).verdict is verdict
+
+
+def test_shipped_index_is_that_of_a_flight():
+    """The index is the smallest non-zero singular value of J M^-1/2 sqrt(mbar), as recorded in flight."""
+    p, masses = f.slots("cube", 4.0, 8), np.linspace(0.5, 2, 8)
+    want = smallest_singular_value(p[None], f.CUBE_EDGES, masses)[0]
+    assert analyse(p, f.CUBE_EDGES, masses=masses).index == pytest.approx(want)
+
+
+def test_force_and_offset_are_reached():
+    """In the weakest direction J^T A^-1 b has the norm |b| m / index, and the displacement is |c| / index."""
+    p = f.slots("cube", 4.0, 8)
+    result, J = analyse(p, f.CUBE_EDGES), jacobian(p, f.CUBE_EDGES)
+    b = np.linalg.svd(J)[0][:, -1]
+    A = J @ J.T / 2.0
+    assert np.linalg.norm(J.T @ np.linalg.solve(A, b)) == pytest.approx(result.force(1.0, mass=2.0))
+    assert np.linalg.norm(np.linalg.pinv(J) @ b) == pytest.approx(result.offset(1.0))
+
+
+# -- general theorems
+
+
+@pytest.mark.parametrize("n", [4, 6, 10, 25])
+def test_triangulated_convex_polyhedra_are_rigid(n):
+    """Dehn (1916): a convex polyhedron with triangular faces is infinitesimally rigid, with 3N - 6 edges."""
+    p = shape(n, n, 3)
+    p /= np.linalg.norm(p, axis=1)[:, None]
+    edges = hull(p)
+    result = analyse(p, edges)
+    assert len(edges) == result.rank == 3 * n - 6
+    assert result.verdict is RIGID
+
+
+def test_polyhedron_without_an_edge_moves_on():
+    """Take one edge away, and one motion is free, for good."""
+    p = shape(3, 10, 3)
+    p /= np.linalg.norm(p, axis=1)[:, None]
+    result = analyse(p, hull(p)[1:])
+    assert result.verdict is FLEXIBLE
+    assert len(result.flexes) == 1
+
+
+@given(SEEDS, st.integers(2, 9), st.integers(1, 3))
+@settings(max_examples=25)
+def test_complete_graphs_are_rigid(seed, n, dimension):
+    """All distances determine a shape: rigid in space, prestress-stable where flat (Connelly, 1982)."""
+    p = shape(seed, n, dimension)
+    result = analyse(p, f.complete_graph(n))
+    assert result.rank == result.reachable == full_rank(n, dimension)
+    assert result.verdict is (RIGID if n <= dimension + 1 or dimension == 3 else STABLE)
+    if result.stress is not None:
+        assert blocks(result, p)
+
+
+@given(SEEDS, st.integers(4, 15), st.integers(1, 3), st.floats(0, 1))
+@settings(max_examples=40)
+def test_verdicts_of_small_formations(seed, n, dimension, share):
+    """Lines, planes and shapes in space with any edges: each verdict comes with what it rests on."""
+    p, edges = shape(seed, n, dimension), graph(seed, n, share)
+    result = analyse(p, edges)
+    assert result.rank == np.linalg.matrix_rank(jacobian(p, edges), tol=1e-6) <= result.reachable
+    assert (result.verdict is RIGID) == (result.rank == result.needed)
+    assert len(result.flexes) == 3 * n - result.rank - (5 if dimension == 1 else 6)
+    for flex in result.flexes:
+        assert np.abs(jacobian(p, edges) @ flex.motion.ravel()).max(initial=0) < 1e-6
+        assert flex.agents == tuple(np.flatnonzero(flex.motion.any(axis=1)))
+    if result.verdict is STABLE:
+        assert blocks(result, p)
+    if result.deformed is not None:
+        want, pairs = f.distances(p, edges), f.complete_graph(n)
+        np.testing.assert_allclose(f.distances(result.deformed, edges), want, atol=1e-9)
+        assert np.abs(f.distances(result.deformed, pairs) - f.distances(p, pairs)).max() > 1e-6
+
+
+@given(SEEDS, st.integers(3, 8), st.integers(1, 3), st.floats(0.3, 1), st.floats(0.01, 100))
+@settings(max_examples=25)
+def test_verdict_knows_neither_place_nor_size_nor_numbers(seed, n, dimension, share, scale):
+    """Turned, shifted, scaled and renumbered, a formation has the same ranks, index, flexes and verdict."""
+    p, edges = shape(seed, n, dimension), graph(seed, n, share)
+    R = Rotation.random(random_state=np.random.RandomState(seed)).as_matrix()
+    number = np.random.default_rng(seed).permutation(n)
+    q = np.empty_like(p)
+    q[number] = scale * p @ R.T + [5, -3, 2]
+    one, two = analyse(p, edges), analyse(q, number[edges])
+    assert (one.rank, one.dimension, one.verdict) == (two.rank, two.dimension, two.verdict)
+    assert one.index == pytest.approx(two.index, rel=1e-6, nan_ok=True)
+    np.testing.assert_array_equal(one.redundant, two.redundant)
+    assert [len(x.agents) for x in one.flexes if len(x.agents) == 1] == [
+        len(x.agents) for x in two.flexes if len(x.agents) == 1
+    ]
+
+
+@given(SEEDS, st.integers(4, 8), st.floats(0.5, 1))
+@settings(max_examples=20)
+def test_redundant_edges_are_those_that_can_go(seed, n, share):
+    """An edge is redundant exactly if J keeps its rank without it; all the spare ones can go together."""
+    p, edges = shape(seed, n, 3), graph(seed, n, share)
+    result, J = analyse(p, edges), jacobian(p, edges)
+    can_go = [
+        k
+        for k in range(len(edges))
+        if np.linalg.matrix_rank(np.delete(J, k, 0), 1e-6) == result.rank
+    ]
+    assert result.redundant.tolist() == can_go
+    assert len(result.spare) == len(edges) - result.rank
+    assert np.linalg.matrix_rank(np.delete(J, result.spare, 0), 1e-6) == result.rank
+
+
+def test_flexes_name_the_few():
+    """A chain of three tetrahedra, hinged at two edges: either end swings by itself."""
+    p = np.array(
+        [[0, 1, 0], [0, -1, 0.1], [-2, 0, 1], [-2, 0.3, -1.2], [3, 1, 1.1], [3.2, -1, 0.8]]
+    )
+    p = np.vstack([p, [[5, 0.1, 2], [5.3, 0, -0.5]]])
+    bodies = [(0, 1, 2, 3), (0, 1, 4, 5), (4, 5, 6, 7)]
+    edges = sorted({pair for body in bodies for pair in combinations(body, 2)})
+    result = analyse(p, edges)
+    assert result.verdict is FLEXIBLE
+    assert [flex.agents for flex in result.flexes] == [(2, 3), (6, 7)]
+
+
+def test_loose_agent_on_a_flat_shape():
+    """Where J is singular because of a rigid part, a loose agent is found by following its motion."""
+    p = np.vstack([f.slots("square", 4.0, 4), [[6, 0.5, 0]]])
+    result = analyse(p, [*f.complete_graph(4).tolist(), [1, 4], [2, 4]])
+    assert result.verdict is FLEXIBLE
+    assert result.deformed is not None
+    assert result.within is not None
+    assert result.within.verdict is RIGID
+
+
+def test_sheet_folds_along_its_lines():
+    """A grid of crossed squares keeps its plane to second order in no way: it folds along any grid line."""
+    p = f.slots("grid", 1.0, 16)
+    edges = f.complete_graph(16)
+    result = analyse(p, edges[f.distances(p, edges) < 1.5])
+    assert result.verdict is FLEXIBLE
+    braced = analyse(p, edges[f.distances(p, edges) < 2.3])
+    assert braced.verdict is STABLE
+
+
+def test_barely_rigid_says_so():
+    """Three agents a hair off a line are rigid in name; the reason warns."""
+    result = analyse([[-4, 0, 0], [0, 1e-3, 0], [4, 0, 0]], f.complete_graph(3))
+    assert result.verdict is RIGID
+    assert "large forces" in result.reason
+
+
+@pytest.mark.parametrize("kind", ["complete", "near", "few", "line", "plane"])
+def test_hundred_agents_take_two_seconds(kind):
+    """Rank, flexes, index and verdict of 100 agents within two seconds, whatever the graph."""
+    p, edges = shape(1, 100, {"line": 1, "plane": 2}.get(kind, 3)), f.complete_graph(100)
+    if kind != "complete":
+        reach = np.quantile(f.distances(p, edges), {"near": 0.1, "few": 0.03}.get(kind, 0.15))
+        edges = edges[f.distances(p, edges) <= reach]
+    analyse(SPREAD[:3] * [1, 0, 0], f.complete_graph(3))  # imports
+    start = perf_counter()
+    result = analyse(p, edges)
+    assert perf_counter() - start < 10  # two on a free machine; this one may be busy
+    assert result.agents == 100
+
+
+@pytest.mark.parametrize(
+    ("slots", "edges", "message"),
+    [
+        (SPREAD, [[0, 5]], "edge 1, agents 1 and 6, names an agent"),
+        (SPREAD, [[0, 1], [1, 0]], "is edge 1 again"),
+        (SPREAD, [[2, 2]], "joins an agent to itself"),
+        (np.zeros((2, 3)), [[0, 1]], "slots coincide"),
+        ([[0, 0, np.nan]], [], "slot 1 is not finite"),
+        (np.zeros((0, 3)), [], "N >= 1"),
+    ],
+)
+def test_what_is_no_framework_is_refused(slots, edges, message):
+    """Edges and slots that make no framework are named, counted from 1."""
+    with pytest.raises(ValueError, match=message):
+        analyse(slots, edges)
+
+
+def test_space_must_hold_the_shape():
+    """A spatial shape has no rigidity in a plane."""
+    with pytest.raises(ValueError, match="dimension 3 does not fit into a plane"):
+        analyse(SPREAD, f.complete_graph(5), space=2)
+
+
+def test_data_counts_from_one():
+    """Plain data for JSON name agents and edges as messages do."""
+    data = analyse(f.slots("square", 4.0, 4), f.complete_graph(4)).data()
+    assert data["redundant"][0] == [1, 2]
+    assert data["flexes"][0]["agents"] == [1]
+    assert data["verdict"] == "prestress-stable"
+    assert data["within"]["verdict"] == "infinitesimally rigid"
+
+
+# -- PyRigi's named frameworks
+
+# name, arguments, verdict; from PyRigi's documentation and the papers it cites
+PYRIGI = [
+    ("Square", (), FLEXIBLE),
+    ("Diamond", (), RIGID),
+    ("Cube", (), FLEXIBLE),
+    ("Octahedron", (), RIGID),
+    ("Octahedron", ("Bricard_line",), FLEXIBLE),
+    ("Octahedron", ("Bricard_plane",), FLEXIBLE),
+    ("Icosahedron", (), RIGID),
+    ("Dodecahedron", (), FLEXIBLE),
+    ("K33plusEdge", (), RIGID),
+    ("Complete", (5,), RIGID),
+    ("Complete", (4, 1), RIGID),
+    ("Complete", (4, 3), RIGID),
+    ("Path", (5,), FLEXIBLE),
+    ("Cycle", (5,), FLEXIBLE),
+    ("ThreePrism", (), RIGID),
+    ("ThreePrism", ("parallel",), STABLE),
+    ("ThreePrism", ("flexible",), FLEXIBLE),
+    ("ThreePrismPlusEdge", (), RIGID),
+    ("CompleteBipartite", (3, 3), RIGID),
+    ("CompleteBipartite", (4, 4, "dixonI"), FLEXIBLE),
+    ("Frustum", (3,), STABLE),
+    ("Frustum", (5,), STABLE),
+    ("CnSymmetricFourRegular", (8,), STABLE),
+    ("CnSymmetricWithFixedVertex", (8,), STABLE),
+    ("Wheel", (6,), RIGID),
+    ("SecondOrderRigid", (), UNDECIDED),
+]
+
+
+@pytest.fixture(scope="module")
+def pyrigi():
+    """PyRigi's database of frameworks; its import takes seconds."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        from pyrigi import frameworkDB
+
+        yield frameworkDB
+
+
+@pytest.mark.parametrize(("name", "arguments", "verdict"), PYRIGI)
+def test_named_frameworks_of_pyrigi(pyrigi, name, arguments, verdict):
+    """Flexes, stresses, infinitesimal rigidity and prestress stability agree with PyRigi's."""
+    framework = getattr(pyrigi, name)(*arguments)
+    agents, place = framework.graph.vertex_list(), framework.realization(numerical=True)
+    slots = np.array([np.ravel(place[v]) for v in agents], dtype=float)
+    edges = [[agents.index(i), agents.index(j)] for i, j in framework.graph.edges]
+    result = analyse(slots, edges, space=framework.dim)
+    assert result.verdict is verdict
+    assert len(result.flexes) == len(framework.inf_flexes(numerical=True))
+    assert len(edges) - result.rank == len(framework.stresses(numerical=True))
+    assert (result.verdict is RIGID) == framework.is_inf_rigid(numerical=True)
+    if verdict is not UNDECIDED and result.flexes:
+        assert (verdict is STABLE) == framework.is_prestress_stable(numerical=True)
+
+
+# -- other shapes with the same distances
+
+
+def test_cube_of_paper_has_folded_twins():
+    """The 18 distances of the cube have solutions with coincident agents, found far more often than the cube."""
+    p = f.slots("cube", 4.0, 8)
+    found = realisations(p, f.CUBE_EDGES)
+    assert found.found[0].kind is Kind.SAME
+    assert not found.unique
+    folded = [r for r in found.found if r.kind is Kind.COINCIDENT]
+    assert sum(r.found for r in folded) > found.converged / 2
+    for r in found.found:
+        got = f.distances(r.slots, f.CUBE_EDGES)
+        np.testing.assert_allclose(got, f.distances(p, f.CUBE_EDGES), atol=1e-6)
+
+
+@pytest.mark.parametrize("n", [5, 8])
+def test_all_distances_leave_only_the_mirror_image(n):
+    """With all pairs prescribed there is nothing but the shape and its mirror image."""
+    p = shape(n, n, 3)
+    found = realisations(p, f.complete_graph(n), starts=60)
+    assert {r.kind for r in found.found} == {Kind.SAME, Kind.MIRRORED}
+    assert found.unique
+
+
+def test_flat_shapes_are_their_own_mirror_images():
+    """A hexagon turned over is the hexagon."""
+    found = realisations(f.slots("hexagon", 4.0, 6), f.complete_graph(6), starts=40)
+    assert [r.kind for r in found.found] == [Kind.SAME]
+
+
+def test_bipyramid_folds_over():
+    """Two tetrahedra on one triangle: the tips on either side, or on the same side and coincident."""
+    p = np.array([[1, 0, 0], [-0.5, 0.9, 0], [-0.5, -0.9, 0], [0, 0, 1.5], [0, 0, -1.5]])
+    edges = [e for e in f.complete_graph(5).tolist() if e != [3, 4]]
+    found = realisations(p, edges, starts=60)
+    assert {r.kind for r in found.found} == {Kind.SAME, Kind.MIRRORED, Kind.COINCIDENT}
+    assert all(r.rigid for r in found.found)
+
+
+def test_start_decides_the_side():
+    """From near the shape one gets there; from near its mirror image, to that."""
+    p = shape(2, 4, 3)
+    edges = f.complete_graph(4)
+    for side, kind in ((1, Kind.SAME), (-1, Kind.MIRRORED)):
+        start = p * [1, 1, side] + 0.05 * shape(3, 4, 3)
+        found = realisations(p, edges, starts=20, start=start)
+        assert found.leads_to is not None
+        assert found.found[found.leads_to].kind is kind
+
+
+def test_search_is_repeatable():
+    """The same seed finds the same shapes as often."""
+    p = f.slots("cube", 4.0, 8)
+    one, two = (realisations(p, f.CUBE_EDGES, starts=50, seed=4).data() for _ in range(2))
+    assert one == two
+
+
+@pytest.mark.parametrize("n", [1, 2, 3])
+def test_few_agents_have_one_shape(n):
+    """Up to three agents, all distances leave one shape."""
+    found = realisations(SPREAD[:n], f.complete_graph(n), starts=10)
+    assert [r.kind for r in found.found] == [Kind.SAME]
+
+
+def test_start_must_fit():
+    """A start of the wrong size is refused."""
+    with pytest.raises(ValueError, match=r"start must be \(5, 3\)"):
+        realisations(SPREAD, f.complete_graph(5), start=np.zeros((4, 3)))
