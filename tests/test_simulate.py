@@ -577,7 +577,7 @@ def test_one_agent_alone_flies(architecture, formulation):
     mission = a_mission(
         {"kind": "fly", "position": [1, 2, 3], "yaw_deg": 30.0, "until": 5.0},
         {"kind": "hold", "duration": 3.0},
-        agents={"mass": 2.0, "position": [[0, 0, 1]]},
+        agents={"mass": 1.3, "position": [[0.3, 0.1, 1]], "velocity": [[0.1, 0.2, 0.3]]},
         formations={},
         architecture=architecture,
         formulation=formulation,
@@ -586,6 +586,7 @@ def test_one_agent_alone_flies(architecture, formulation):
     assert result.complete
     assert np.linalg.norm(result.position[last(result, 0), 0] - [1, 2, 3]) <= 1e-2
     assert np.linalg.norm(result.position[-1, 0] - [1, 2, 3]) <= 1e-2
+    np.testing.assert_array_equal(result.rates, 0.0)
     assert result.edges.shape == (0, 2)
     assert np.isnan(result.singular_value).all()
     assert np.isinf(result.separation).all()

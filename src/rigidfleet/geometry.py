@@ -113,6 +113,8 @@ def mean_axis_rates(x: Array, y: Array, masses: Array) -> Array:
 
     x, y (K, N, 3): positions and velocities about the CM [m, m/s].
     """
+    if len(masses) == 1:
+        return np.zeros((len(x), 3))  # of a point; not what rounding makes of it
     h = np.einsum("i,kia->ka", masses, np.cross(x, y))
     C = np.einsum("i,kia,kib->kab", masses, x, x)
     inertia = np.trace(C, axis1=1, axis2=2)[:, None, None] * np.eye(3) - C

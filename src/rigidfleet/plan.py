@@ -75,6 +75,8 @@ def about_cm(points: Array, masses: Array) -> Array:
 
 def body_rates(r: Array, v: Array, masses: Array, T: Array) -> Array:
     """Mean-axis rates omega = I^+ h (3,) [rad/s] of agents r, v (N, 3), in the axes of T (3, 3)."""
+    if len(masses) == 1:
+        return np.zeros(3)  # of a point; not what rounding makes of it
     x, y = about_cm(r, masses), about_cm(v, masses)
     inertia = np.einsum("i,ij,ij->", masses, x, x) * np.eye(3) - (masses[:, None] * x).T @ x
     h = masses @ np.cross(x, y)

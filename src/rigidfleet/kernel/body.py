@@ -23,6 +23,8 @@ def inertia(r, m, cm, I):
     """Inertia I (3, 3) [kg m^2] of points r (N, 3) about cm: sum m (|x|^2 1 - x x^T)."""
     for q in range(3):
         I[q, 0], I[q, 1], I[q, 2] = 0.0, 0.0, 0.0
+    if r.shape[0] == 1:
+        return  # exactly: what rounding leaves of r - cm would have an inverse
     for i in range(r.shape[0]):
         x, y, z = r[i, 0] - cm[0], r[i, 1] - cm[1], r[i, 2] - cm[2]
         I[0, 0] += m[i] * (y * y + z * z)

@@ -1,0 +1,331 @@
+"""Closeness, attitudes of slots and ranks, against SciPy, PyRigi and plain geometry."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from rigidfleet import formation, geometry
+from rigidfleet.mission import Box, Ground
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+# -- closeness -------------------------------------------------------------------------------------
+
+
+@settings(max_examples=20)
+@given(seed=seeds, n=st.integers(2, 7))
+def test_separation_is_the_least_over_all_pairs(seed, n):
+    """At each sample, centre distance minus both radii, least over pairs; the pair is named."""
+    rng = np.random.default_rng(seed)
+    r, radius = rng.normal(size=(5, n, 3)) * 3, rng.uniform(0.1, 1.0, n)
+    least, pair = geometry.separation(r, radius)
+    for k in range(5):
+        room = {
+            (i, j): np.linalg.norm(r[k, i] - r[k, j]) - radius[i] - radius[j]
+            for i in range(n)
+            for j in range(i + 1, n)
+        }
+        closest = min(room, key=lambda p: room[p])
+        assert tuple(pair[k]) == closest
+        assert least[k] == pytest.approx(room[closest], abs=1e-14)
+
+
+def test_one_agent_is_apart_from_nobody():
+    """Without a pair the separation is infinite and names nobody."""
+    least, pair = geometry.separation(np.zeros((2, 1, 3)), [0.5])
+    np.testing.assert_array_equal(least, [np.inf, np.inf])
+    np.testing.assert_array_equal(pair, -1)
+
+
+BOX = Box(kind="box", name="wall", min=(1.0, 2.0, 3.0), max=(4.0, 6.0, 8.0))
+
+
+@pytest.mark.parametrize(
+    ("point", "room"),
+    [
+        ([0.0, 3.0, 4.0], 1.0),  # before a face
+        ([7.0, 10.0, 5.0], 5.0),  # beside an edge
+        ([0.0, 0.0, 1.0], 3.0),  # off a corner
+        ([1.0, 4.0, 5.0], 0.0),  # on a face
+        ([1.5, 4.0, 5.0], -0.5),  # inside, nearest to a face
+        ([2.5, 4.0, 7.9], -0.1),
+    ],
+)
+def test_clearance_of_a_box(point, room):
+    """Distance to the box's nearest point minus the radius; inside, minus the depth as well."""
+    r = np.array([[[50.0, 50.0, 50.0], point]])
+    least, agent, obstacle = geometry.clearance(r, [0.25, 0.25], [BOX])
+    assert least[0] == pytest.approx(room - 0.25, abs=1e-14)
+    assert (agent[0], obstacle[0]) == (1, 0)
+
+
+@settings(max_examples=20)
+@given(seed=seeds)
+def test_clearance_of_a_box_is_the_distance_to_its_nearest_point(seed):
+    """Outside, no point of the box is nearer than the one a projection finds."""
+    rng = np.random.default_rng(seed)
+    r = rng.uniform(-10, 15, (20, 1, 3))
+    least, _, _ = geometry.clearance(r, [0.0], [BOX])
+    low, high = np.array(BOX.min), np.array(BOX.max)
+    nearest = np.clip(r[:, 0], low, high)
+    distance = np.linalg.norm(r[:, 0] - nearest, axis=1)
+    outside = distance > 0
+    np.testing.assert_allclose(least[outside], distance[outside], rtol=1e-14)
+    assert (least[~outside] <= 0).all()
+
+
+def test_clearance_names_the_nearest_of_several_obstacles():
+    """Over time the nearest obstacle and the agent next to it change, and are named."""
+    ground = Ground(kind="ground", name="ground", height=0.5)
+    r = np.array(
+        [
+            [[2.0, 4.0, 1.2], [20.0, 0.0, 9.0]],  # agent 0 above the ground, below the box
+            [[2.0, 4.0, 2.9], [20.0, 0.0, 9.0]],  # agent 0 under the box
+            [[2.0, 20.0, 9.0], [20.0, 0.0, 0.3]],  # agent 1 in the ground
+        ]
+    )
+    least, agent, obstacle = geometry.clearance(r, [0.1, 0.2], [ground, BOX])
+    np.testing.assert_allclose(least, [0.6, 0.0, -0.4], rtol=0, atol=1e-14)
+    np.testing.assert_array_equal(agent, [0, 0, 1])
+    np.testing.assert_array_equal(obstacle, [0, 1, 0])
+
+
+def test_no_obstacle_is_clear():
+    """Without obstacles the clearance is infinite and names nothing."""
+    least, agent, obstacle = geometry.clearance(np.zeros((2, 3, 3)), [0.1] * 3, [])
+    np.testing.assert_array_equal(least, np.inf)
+    np.testing.assert_array_equal(np.concatenate([agent, obstacle]), -1)
+
+
+# -- attitude --------------------------------------------------------------------------------------
+
+LINE = np.array([[-4.0, 0, 0], [0, 0, 0], [4, 0, 0]])
+EYE = np.eye(3)
+
+
+def shape(name: str, rng: np.random.Generator) -> np.ndarray:
+    """Slots (N, 3) in any position about their own axes."""
+    flat = {"spatial": [1, 1, 1], "planar": [1, 1, 0]}[name]
+    return Rotation.random(random_state=rng).apply(rng.normal(size=(5, 3)) * 3 * np.array(flat))
+
+
+@pytest.mark.parametrize("name", ["spatial", "planar"])
+@settings(max_examples=20)
+@given(seed=seeds)
+def test_fit_finds_the_attitude_of_turned_slots(name, seed):
+    """Agents at T^T p give T back, whatever is expected: spatial and planar shapes, any weights."""
+    rng = np.random.default_rng(seed)
+    m = rng.uniform(0.5, 2.0, 5)
+    p = shape(name, rng)
+    p -= m @ p / m.sum()
+    T = Rotation.random(4, random_state=rng).as_matrix()
+    x = np.einsum("kba,ib->kia", T, p)
+    found = geometry.fit_attitudes(x, np.broadcast_to(p, x.shape), m, EYE)
+    np.testing.assert_allclose(found, T, rtol=0, atol=1e-12)
+
+
+@settings(max_examples=20)
+@given(seed=seeds)
+def test_fit_of_a_deformed_shape_is_scipys(seed):
+    """Where slots do not fit exactly, the weighted least-squares rotation is SciPy's."""
+    rng = np.random.default_rng(seed)
+    m = rng.uniform(0.5, 2.0, 5)
+    p = shape("spatial", rng)
+    p -= m @ p / m.sum()
+    T = Rotation.random(random_state=rng)
+    x = T.inv().apply(p) + rng.normal(size=p.shape) * 0.2
+    x -= m @ x / m.sum()
+    found = geometry.fit_attitudes(x[None], p[None], m, EYE)[0]
+    expected = Rotation.align_vectors(p, x, weights=m)[0].as_matrix()
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-10)
+
+
+def test_a_mirror_image_gets_a_rotation_all_the_same():
+    """Of a spatial shape's mirror image the fit is a proper rotation, det +1, and no exact one."""
+    rng = np.random.default_rng(3)
+    p = shape("spatial", rng)
+    p -= p.mean(axis=0)
+    x = p * [1, 1, -1]
+    T = geometry.fit_attitudes(x[None], p[None], np.ones(5), EYE)[0]
+    assert np.linalg.det(T) == pytest.approx(1.0, abs=1e-12)
+    np.testing.assert_allclose(T @ T.T, EYE, rtol=0, atol=1e-12)
+    assert np.abs(x @ T.T - p).max() > 0.5
+
+
+def turned_line(T: np.ndarray) -> np.ndarray:
+    """Agents on a line of attitude T (K, 3, 3)."""
+    return np.einsum("kba,ib->kia", T, LINE)
+
+
+@settings(max_examples=20)
+@given(seed=seeds)
+def test_a_line_takes_the_attitude_nearest_to_the_one_expected(seed):
+    """Its axis points along the agents; about it the line does not spin against what is expected."""
+    rng = np.random.default_rng(seed)
+    near = Rotation.random(3, random_state=rng).as_matrix()
+    small = Rotation.from_rotvec(rng.normal(size=(3, 3)) * 0.3).as_matrix()
+    x = turned_line(small @ near)
+    found = geometry.fit_attitudes(x, np.broadcast_to(LINE, x.shape), np.ones(3), near)
+    np.testing.assert_allclose(
+        np.einsum("kab,kib->kia", found, x), np.broadcast_to(LINE, x.shape), atol=1e-12
+    )
+    # The rotation from the expected attitude is about an axis across the line: none along it.
+    between = Rotation.from_matrix(np.einsum("kab,kcb->kac", found, near)).as_rotvec()
+    np.testing.assert_allclose(between[:, 0], 0, atol=1e-12)
+    # No attitude with the same axis is nearer.
+    for k in range(3):
+        least = np.linalg.norm(between[k])
+        for spin in (-0.1, 0.1):
+            other = Rotation.from_rotvec([spin, 0, 0]).as_matrix() @ found[k]
+            turn = Rotation.from_matrix(other @ near[k].T).magnitude()
+            assert turn > least - 1e-12
+
+
+def test_a_line_is_followed_from_sample_to_sample():
+    """A line that turns slowly keeps the roll it had, through more than half a turn, without a jump."""
+    yaw = np.linspace(0, 1.5 * np.pi, 60)
+    roll = Rotation.from_rotvec([0.7, 0, 0]).as_matrix()
+    T = roll @ Rotation.from_euler("z", -yaw[:, None]).as_matrix()
+    x = turned_line(T)
+    found = geometry.fit_attitudes(x, np.broadcast_to(LINE, x.shape), np.ones(3), T[0])
+    np.testing.assert_allclose(found, T, rtol=0, atol=1e-10)
+
+
+def test_a_line_turned_about_by_half_a_turn_has_an_attitude():
+    """Where every axis across the line would do, one is taken: a rotation that brings the line home."""
+    found = geometry.fit_attitudes(-LINE[None], LINE[None], np.ones(3), EYE)[0]
+    np.testing.assert_allclose(-LINE @ found.T, LINE, rtol=0, atol=1e-12)
+    assert np.linalg.det(found) == pytest.approx(1.0, abs=1e-12)
+
+
+def test_attitude_goes_on_through_a_line():
+    """A triangle that folds into a line and opens again keeps its attitude all the way."""
+    triangle = formation.slots("triangle", 4.0, 3)
+    s = np.concatenate([np.linspace(1, 0, 30), np.linspace(0, 1, 30)])[:, None, None]
+    p = LINE[[0, 1, 2]] * (1 - s) + triangle * s
+    p -= p.mean(axis=1, keepdims=True)
+    T = Rotation.from_euler("ZYX", [50, 20, -30], degrees=True).as_matrix().T
+    x = p @ T
+    found = geometry.fit_attitudes(x, p, np.ones(3), T)
+    np.testing.assert_allclose(found, np.broadcast_to(T, found.shape), rtol=0, atol=1e-9)
+
+
+def test_one_agent_has_the_attitude_expected():
+    """A point has no attitude of its own."""
+    near = Rotation.from_euler("z", [[0.3], [0.4]]).as_matrix()
+    found = geometry.fit_attitudes(np.zeros((2, 1, 3)), np.zeros((2, 1, 3)), np.ones(1), near)
+    np.testing.assert_array_equal(found, near)
+
+
+@settings(max_examples=20)
+@given(seed=seeds, n=st.integers(1, 6))
+def test_mean_axis_rates_are_those_of_the_rigid_motion(seed, n):
+    """v = omega x r gives omega; of a pair its part across the line, of a point nothing."""
+    rng = np.random.default_rng(seed)
+    m = rng.uniform(0.5, 2.0, n)
+    x = rng.normal(size=(3, n, 3)) * 2
+    x -= np.einsum("i,kia->ka", m, x)[:, None] / m.sum()
+    omega = rng.normal(size=(3, 3))
+    found = geometry.mean_axis_rates(x, np.cross(omega[:, None], x), m)
+    if n == 1:
+        omega = np.zeros((3, 3))
+    elif n == 2:
+        u = x[:, 0] / np.linalg.norm(x[:, 0], axis=1)[:, None]
+        omega = omega - np.einsum("ka,ka->k", u, omega)[:, None] * u
+    np.testing.assert_allclose(found, omega, rtol=0, atol=1e-9)
+
+
+# -- ranks -----------------------------------------------------------------------------------------
+
+
+def jacobian(r: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    J = np.zeros((len(edges), *r.shape))
+    for row, (i, j) in enumerate(edges):
+        J[row, i] = (r[i] - r[j]) / np.linalg.norm(r[i] - r[j])
+        J[row, j] = -J[row, i]
+    return J.reshape(len(edges), -1)
+
+
+CYCLE = np.array([(0, 1), (1, 2), (2, 3), (0, 3)])
+CUBE = formation.slots("cube", 4.0, 8)
+HEXAGON_EDGES = np.array(
+    [(0, 1), (1, 2), (2, 3), (3, 4), (4, 5), (0, 5), (0, 2), (1, 3), (2, 4), (3, 5), (0, 4), (1, 5)]
+)
+PRINTED = {  # slots, edges, rank of J
+    "pair": (formation.slots("line", 4.0, 2), formation.complete_graph(2), 1),
+    "triangle": (formation.slots("triangle", 4.0, 3), formation.complete_graph(3), 3),
+    "line": (LINE, formation.complete_graph(3), 2),
+    "square": (formation.slots("square", 4.0, 4), formation.complete_graph(4), 5),
+    "cycle": (formation.slots("square", 4.0, 4), CYCLE, 4),
+    "tetrahedron": (formation.slots("pyramid", 4.0, 4), formation.complete_graph(4), 6),
+    "hexagon": (formation.slots("hexagon", 4.0, 6), HEXAGON_EDGES, 9),
+    "cube": (CUBE, formation.CUBE_EDGES, 18),
+    "complete cube": (CUBE, formation.complete_graph(8), 18),
+}
+
+
+@pytest.mark.parametrize("name", PRINTED)
+def test_smallest_singular_value_is_the_last_above_the_rank(name):
+    """It is the singular value that NumPy finds at the rank, not a zero beyond it."""
+    r, edges, rank = PRINTED[name]
+    values = np.linalg.svd(jacobian(r, edges), compute_uv=False)
+    assert np.linalg.matrix_rank(jacobian(r, edges), 1e-9) == rank
+    found = geometry.smallest_singular_value(r[None], edges)
+    assert found[0] == pytest.approx(values[rank - 1], rel=1e-9)
+
+
+def test_weighted_singular_values_are_those_of_the_law():
+    """With masses, the squares are the eigenvalues of mbar J M^-1 J^T, which the solvers see."""
+    rng = np.random.default_rng(0)
+    r, m = rng.normal(size=(4, 5, 3)), rng.uniform(0.5, 2.0, 5)
+    edges = formation.complete_graph(5)[:8]
+    found = geometry.smallest_singular_value(r, edges, m)
+    for k in range(4):
+        J = jacobian(r[k], edges)
+        w = np.linalg.eigvalsh(m.mean() * (J / np.repeat(m, 3)) @ J.T)
+        assert found[k] ** 2 == pytest.approx(w[0], rel=1e-9)
+
+
+def test_without_edges_there_is_no_singular_value():
+    """No edge, no Jacobian: NaN at every sample."""
+    found = geometry.smallest_singular_value(np.zeros((3, 2, 3)), np.zeros((0, 2), dtype=np.int64))
+    assert np.isnan(found).all()
+    assert found.shape == (3,)
+
+
+def test_the_line_shows_in_the_singular_value():
+    """An offset h from the line of three leaves lambda_min = h^2/8, so sigma = h/sqrt(8)."""
+    for h in (1e-1, 1e-2, 1e-3):
+        r = LINE + [[0, 0, 0], [0, h, 0], [0, 0, 0]]
+        sigma = geometry.smallest_singular_value(r[None], formation.complete_graph(3))[0]
+        assert sigma == pytest.approx(h / np.sqrt(8), rel=5e-3)
+
+
+@pytest.mark.parametrize("name", PRINTED)
+def test_ranks_are_pyrigis(name):
+    """The rank at the shape, and the rank that a generic shape has, are those of PyRigi."""
+    from pyrigi import Framework, Graph
+
+    r, edges, rank = PRINTED[name]
+    n = len(r)
+    graph: Any = Graph([(int(i), int(j)) for i, j in edges])
+    at = lambda points: Framework(graph, {i: list(map(float, p)) for i, p in enumerate(points)})  # noqa: E731
+    assert at(r).rigidity_matrix_rank(numerical=True) == rank
+    points = np.random.default_rng(n).normal(size=(n, 3)) * 3
+    generic = np.linalg.matrix_rank(jacobian(points, edges), 1e-9)
+    assert at(points).rigidity_matrix_rank(numerical=True) == generic
+    rigid = (
+        graph.is_rigid(dim=3, algorithm="randomized") if n > 3 else len(edges) == n * (n - 1) / 2
+    )
+    assert rigid == (generic == max(3 * n - 6, n - 1))
+    values = np.linalg.svd(jacobian(points, edges), compute_uv=False)
+    found = geometry.smallest_singular_value(points[None], edges)[0]
+    assert found == pytest.approx(values[generic - 1], rel=1e-9)
+    # Planar and straight shapes lose rank: at most 2 N - 3 and N - 1 of what a generic shape has.
+    dimension = formation.dimension(r)
+    assert rank <= {1: n - 1, 2: 2 * n - 3, 3: 3 * n - 6}[dimension]
