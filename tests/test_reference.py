@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rigidfleet import attitude, gains, lqr, physics
+from rigidfleet import attitude, gains, lqr, physics, simulate
 from rigidfleet.mission import Mission
-from rigidfleet.simulate import simulate
 
 CASES = json.loads((Path(__file__).parent / "data" / "reference_cases.json").read_text())["cases"]
 FLIGHTS = [name for name, case in CASES.items() if "solver" in case["spec"]]

@@ -240,6 +240,17 @@ def test_flying_can_end_by_settling():
 
 
 @pytest.mark.parametrize("architecture", ["local", "body"])
+def test_turning_can_end_by_settling(architecture):
+    """A turn has not settled before it is over, though nothing is off its place on the way."""
+    turn = {"kind": "turn", "yaw_deg": -90.0, "travel": 8.0, "settle": {"tolerance": 5e-3}}
+    result = simulate(a_mission(establish(), turn, architecture=architecture))
+    assert result.phases[1].settled is True
+    assert 6.0 + 7.0 < result.phases[1].t_end < 6.0 + 14.0
+    euler = attitude.euler_from_quaternion(result.attitude[-1])
+    np.testing.assert_allclose(np.rad2deg(euler), [0, 0, -90], rtol=0, atol=0.2)
+
+
+@pytest.mark.parametrize("architecture", ["local", "body"])
 def test_a_hold_after_a_waypoint_in_motion_comes_to_rest_there(architecture):
     """Flown through at 2 m/s and 10 deg/s, then held: the body comes back and stays, at rest."""
     through = {

@@ -311,15 +311,25 @@ class _Flight:
         return False
 
     def _error(self, leg: _Leg) -> float:
-        """Largest error [m] of a constraint, a slot or the goal at the integrator's state."""
+        """Largest error [m] of a constraint, a slot or the goal at the integrator's state.
+
+        The goal's attitude counts by how far it takes a slot.
+        """
         plan, w = leg.plan, leg.workspace
         flight.closed_loop(leg.t, leg.state.y, np.empty_like(leg.state.y), plan.program, w)
         errors = [np.abs(w.c).max(initial=0.0)]
-        if plan.program.control.kind == k.LOCAL:
+        local = plan.program.control.kind == k.LOCAL
+        if local:
             errors.append(np.linalg.norm(w.r - w.r_ref, axis=1).max())
-        if plan.goal is not None and plan.program.control.kind != k.OPEN:
-            target = plan.goal.r + plan.goal.v * (leg.t - plan.arrival)  # it moves on
-            errors.append(np.linalg.norm(self.masses @ w.r / self.masses.sum() - target))
+        tracks = plan.program.control.kind != k.OPEN
+        if tracks and plan.goal is not None and plan.slots is not None:
+            goal, since = plan.goal, leg.t - plan.arrival  # it moves on
+            cm = self.masses @ w.r / self.masses.sum()
+            errors.append(np.linalg.norm(cm - goal.r - goal.v * since))
+            turned = (w.T_ref if local else w.T) - (
+                att.dcm_from_rotation_vector(goal.omega * since) @ goal.T
+            )
+            errors.append(np.linalg.norm(plan.slots @ turned, axis=1).max())
         return float(max(errors))
 
     def _controlled(self, leg: _Leg, controller: Controller) -> None:
@@ -434,7 +444,7 @@ class _Flight:
         solver = self.mission.constraint.solver
         if solver in ("exact", "pinv"):
             return (
-                f"{head}, and {where}. The force of solver \"{solver}\" has no bound where one of them"
+                f'{head}, and {where}. The force of solver "{solver}" has no bound where one of them'
                 ' vanishes. Use solver = "iterated" (or "spectral"), and references that move'
                 ' smoothly: reference = "shape" or "distances"'
             )
@@ -449,7 +459,9 @@ class _Flight:
         names = {"input force": w.f_u, "constraint force": w.f_C, "external force": w.f_E}
         lost = [name for name, f in names.items() if not np.isfinite(f).all()]
         if lost:
-            return f"The {lost[0]} is not finite. Look for a gain, a distance or a mass far too large"
+            return (
+                f"The {lost[0]} is not finite. Look for a gain, a distance or a mass far too large"
+            )
         name, f = max(names.items(), key=lambda item: float(np.abs(item[1]).max()))
         agent = int(np.abs(f).max(axis=1).argmax())
         size = float(np.linalg.norm(f[agent]))
