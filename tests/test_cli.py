@@ -482,11 +482,62 @@ def test_report_force(capsys, plot):
     assert "kept" not in capsys.readouterr().err
 
 
+def test_report_page(capsys, plot):
+    """A report is a page beside the result, which is kept, replaced with --force, and gone with its flight."""
+    cli.main(["run", "short.toml", "--no-figures", "--quiet"])
+    page = Path("flights/short/report.html")
+    assert cli.main(["report", "flights/short/short.nc", "--no-figures"]) == cli.PASSED
+    assert f"Report   {page}" in capsys.readouterr().out
+    assert "Hold a triangle for a second" in page.read_text(encoding="utf-8")
+    assert not Path("flights/short/figures").exists()
+    write(page, "earlier")
+    cli.main(["report", "flights/short/short.nc", "--no-figures"])
+    assert page.read_text(encoding="utf-8") == "earlier"
+    cli.main(["report", "flights/short/short.nc", "--no-figures", "--force"])
+    assert page.read_text(encoding="utf-8") != "earlier"
+    cli.main(["run", "short.toml", "--no-figures", "--quiet", "--force"])
+    assert not page.exists()
+
+
+def test_report_json_and_quiet(capsys, plot):
+    """With --json a report prints the verdict's file and nothing else; with --quiet nothing."""
+    cli.main(["run", "short.toml", "--no-figures", "--quiet"])
+    assert cli.main(["report", "flights/short/short.nc", "--json"]) == cli.PASSED
+    verdict = Path("flights/short/verdict.json").read_text(encoding="utf-8")
+    assert capsys.readouterr().out == verdict
+    assert cli.main(["report", "flights/short/short.nc", "--quiet"]) == cli.PASSED
+    assert capsys.readouterr() == ("", "")
+
+
 def test_report_of_a_flight_that_failed(plot):
     """The report of a flight that failed its verdict exits with 1."""
     write("bad.toml", SPEEDING)
     cli.main(["run", "bad.toml", "--no-figures", "--quiet"])
     assert cli.main(["report", "flights/short/short.nc"]) == cli.FAILED
+
+
+def test_report_of_several(capsys, plot):
+    """Several flights make one page, named by what tells them apart; one that failed makes the exit code 1."""
+    write("bad.toml", SPEEDING)
+    results = []
+    for name in ("short", "bad"):
+        cli.main(["run", f"{name}.toml", "--no-figures", "--quiet", "--out", name])
+        results.append(f"{name}/short.nc")
+    assert cli.main(["report", *results]) == cli.FAILED
+    out = capsys.readouterr().out
+    labels = [os.path.join(name, "short") for name in ("short", "bad")]
+    assert f"{labels[0]}: Passed" in out
+    assert f"{labels[1]}: Failed" in out
+    assert "Report   comparison.html" in out
+    text = Path("comparison.html").read_text(encoding="utf-8")
+    assert all(label in text for label in labels)
+    assert not list(Path().rglob("report.html"))
+    assert cli.main(["report", *results]) == cli.BAD_INPUT
+    assert "comparison.html: exists already" in capsys.readouterr().err
+    assert cli.main(["report", *results, "--force", "--json"]) == cli.FAILED
+    assert [verdict["passed"] for verdict in json.loads(capsys.readouterr().out)] == [True, False]
+    assert cli.main(["report", *results, "--out", "side/by/side", "--quiet"]) == cli.FAILED
+    assert Path("side/by/side/comparison.html").exists()
 
 
 # -- the screen --------------------------------------------------------------------------------------

@@ -18,13 +18,14 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
-__all__ = ["Result", "__version__", "assess", "load_mission", "plot", "simulate"]
+__all__ = ["Result", "__version__", "assess", "load_mission", "plot", "report", "simulate"]
 
 _HOME = {
     "Result": "result",
     "assess": "assess",
     "load_mission": "mission",
     "plot": "figures",
+    "report": "report",
     "simulate": "simulate",
 }
 

@@ -238,37 +238,79 @@ def check(mission: str, /, *, json: bool = False) -> int:
 
 
 @app.command(sort_key=4)
-def report(result: Path, /, *, out: Path | None = None, force: bool = False) -> int:
-    """Judge and draw a flight again, from its result.
+def report(
+    result: Path,
+    /,
+    *others: Path,
+    out: Path | None = None,
+    force: bool = False,
+    no_figures: bool = False,
+    json: bool = False,
+    quiet: bool = False,
+) -> int:
+    """Judge and draw a flight again, and write a report to print and to send.
+
+    Of several flights, write one report that shows them side by side: comparison.html.
 
     Parameters
     ----------
     result : Path
         Result of a flight, NAME.nc.
+    others : Path
+        Results of more flights, to be compared with it.
     out : Path
-        Folder for verdict.json and figures/; that of the result if not given.
+        Folder for report.html, verdict.json and figures/; that of the result if not given. For
+        comparison.html, the working folder.
     force : bool
         Replace files that are there already; without it they are kept.
+    no_figures : bool
+        Write no files of figures; those in the report are drawn in any case.
+    json : bool
+        Print the verdict as JSON; of several flights a list of them.
+    quiet : bool
+        Print nothing but errors, and the JSON if asked for.
     """
     from rigidfleet.assess import assess
     from rigidfleet.result import Result
 
-    record = Result.load(result)
-    files = _Files(out or result.parent, record.mission.name)
+    paths = [result, *others]
+    records = [Result.load(path) for path in paths]
+    if others:
+        page = (out or Path()) / "comparison.html"
+        if page.exists() and not force:
+            raise _kept(page)
+    files = _Files(out or (Path() if others else result.parent), records[0].mission.name)
     files.try_out()
-    verdict = assess(record)
-    _out().print(verdict)
+    verdicts = [assess(record) for record in records]
+    if json:
+        found = [verdict.to_dict() for verdict in verdicts]
+        _print_json(found if others else found[0])
     files.make_folder()
-    made = [files.verdict, *files.figures]
-    kept = [] if force else [path for path in made if path.exists()]
-    if files.verdict not in kept:
-        _write_verdict(verdict, files.verdict)
-    _draw(record, [path for path in files.figures if path not in kept])
-    _out().print()
-    _list(files)
-    if kept:
-        _err().print(f"{_count(len(kept), 'file')} kept as before; --force makes them again")
-    return PASSED if verdict.passed else FAILED
+    if others:
+        labels = _labels(paths, records)
+        if not (json or quiet):
+            for label, verdict in zip(labels, verdicts, strict=True):
+                _out().print(f"{label}: {verdict.summary}", soft_wrap=True)
+        _write_report(records, verdicts, page, labels=labels, quiet=quiet)
+        if not (json or quiet):
+            _out().print(f"\nReport   {page}", soft_wrap=True)
+    else:
+        if not (json or quiet):
+            _out().print(verdicts[0])
+        drawn = [] if no_figures else files.figures
+        made = [files.verdict, files.report, *drawn]
+        kept = [] if force else [path for path in made if path.exists()]
+        if files.verdict not in kept:
+            _write_verdict(verdicts[0], files.verdict)
+        _draw(records[0], [path for path in drawn if path not in kept], quiet=quiet)
+        if files.report not in kept:
+            _write_report(records, verdicts, files.report, quiet=quiet)
+        if not (json or quiet):
+            _out().print()
+            _list(files)
+        if kept and not quiet:
+            _err().print(f"{_count(len(kept), 'file')} kept as before; --force makes them again")
+    return PASSED if all(verdict.passed for verdict in verdicts) else FAILED
 
 
 # -- flying ------------------------------------------------------------------------------------------
@@ -325,6 +367,30 @@ def _draw(result: Result, figures: Iterable[Path], *, quiet: bool = False) -> No
             plot(result, path.parent, names=[path.name], formats=kinds)
 
 
+def _write_report(
+    records: list[Result],
+    verdicts: list[Verdict],
+    path: Path,
+    *,
+    labels: list[str] | None = None,
+    quiet: bool = False,
+) -> None:
+    """Write the page of a flight, or of several."""
+    from rigidfleet.report import report as write
+
+    shown = _err().is_interactive and not quiet
+    with _err().status("Writing the report") if shown else nullcontext():
+        write(records, path, labels=labels, verdicts=verdicts)
+
+
+def _labels(paths: list[Path], records: list[Result]) -> list[str]:
+    """What to call each of several flights: what tells them apart, and is short."""
+    missions = [record.mission.name for record in records]
+    stems = [path.stem for path in paths]
+    folders = [str(path.parent / path.stem) for path in paths]
+    return next((names for names in (missions, stems) if len({*names}) == len(names)), folders)
+
+
 def _write_verdict(verdict: Verdict, path: Path) -> None:
     """Write a verdict as JSON, whole or not at all.
 
@@ -375,9 +441,13 @@ class _Files:
         ]
 
     @property
+    def report(self) -> Path:
+        return self.folder / "report.html"
+
+    @property
     def derived(self) -> list[Path]:
         """All that is made from the result."""
-        return [self.verdict, self.table, *self.figures]
+        return [self.verdict, self.table, self.report, *self.figures]
 
     def claim(self, *, replace: bool) -> None:
         """Make sure, before anything is flown, that the files of a flight can be written.
@@ -389,10 +459,7 @@ class _Files:
         """
         there = [path for path in (self.result, *self.derived) if path.exists()]
         if there and not replace:
-            raise ResultError(
-                f"{there[0]}: exists already and is kept. "
-                "Replace it by --force, or name another folder by --out."
-            )
+            raise _kept(there[0])
         self.try_out()
 
     def try_out(self) -> None:
@@ -430,6 +497,13 @@ class _Files:
             path.unlink(missing_ok=True)
 
 
+def _kept(path: Path) -> ResultError:
+    return ResultError(
+        f"{path}: exists already and is kept. "
+        "Replace it by --force, or name another folder by --out."
+    )
+
+
 def _unwritable(path: Path, error: OSError) -> ResultError:
     why = (error.strerror or str(error)).lower()
     return ResultError(f"{path}: cannot be written ({why}). Name another folder by --out.")
@@ -441,6 +515,7 @@ def _list(files: _Files) -> None:
         ("Result", files.result),
         ("Verdict", files.verdict),
         ("Table", files.table),
+        ("Report", files.report),
     ):
         if path.exists():
             _out().print(f"{what:8} {path}", soft_wrap=True)

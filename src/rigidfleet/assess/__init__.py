@@ -10,6 +10,7 @@ count from 1.
 
 from rigidfleet.assess.judge import findings, notes
 from rigidfleet.assess.measure import Flight
+from rigidfleet.assess.safety import Safety, safety
 from rigidfleet.assess.verdict import (
     FLIPPED,
     SHAPE_TOLERANCE,
@@ -29,9 +30,11 @@ __all__ = [
     "Extreme",
     "Finding",
     "PhaseVerdict",
+    "Safety",
     "Verdict",
     "Waypoint",
     "assess",
+    "safety",
 ]
 
 

@@ -207,19 +207,7 @@ def _clearance(flight: Flight, e: Extreme) -> Finding:
 
 
 def _downwash(flight: Flight, limit: float) -> Finding:
-    """Least vertical room between two agents of which one is below the other."""
-    r, radius = flight.result.position, np.array(flight.mission.agents.radius)
-    least, who = np.full(len(r), np.inf), np.zeros((len(r), 2), dtype=np.int64)
-    for i in range(r.shape[1] - 1):
-        apart, radii = r[:, i + 1 :] - r[:, i : i + 1], radius[i] + radius[i + 1 :]
-        beside = np.hypot(apart[..., 0], apart[..., 1]) >= radii
-        room = np.where(beside, np.inf, np.abs(apart[..., 2]) - radii)
-        j = room.argmin(axis=1)
-        room = room[np.arange(len(r)), j]
-        closer = room < least
-        least[closer] = room[closer]
-        who[closer] = np.column_stack([np.full(len(r), i), i + 1 + j])[closer]
-    e = flight.extreme(least, lambda k: names(who[k]), lambda x: -x)
+    e = flight.below()
     if e is None:
         return _bounded("separation_below", e, "m", limit, "nobody is below another", at_least=True)
     passed = e.value >= limit - _SLACK
@@ -229,8 +217,7 @@ def _downwash(flight: Flight, limit: float) -> Finding:
 
 
 def _geofence(flight: Flight, low: Floats, high: Floats) -> Finding:
-    r = flight.result.position
-    e = flight.extreme(np.maximum(low - r, r - high).max(axis=2), flight.agent)
+    e = flight.outside(low, high)
     assert e is not None
     words = f"{e.who} comes within {value(-e.value, 'm')} of the geofence at {e.when:.2f} s"
     if e.value > 0:

@@ -116,6 +116,26 @@ class Flight:
         k = (samples.start or 0) + int(at[0])
         return Extreme(float(part[at]), who=who(k, *map(int, at[1:])), **self.at(k))
 
+    def below(self) -> Extreme | None:
+        """Least vertical room [m] between two agents of which one is below the other."""
+        r, radius = self.result.position, np.array(self.mission.agents.radius)
+        least, who = np.full(len(r), np.inf), np.zeros((len(r), 2), dtype=np.int64)
+        for i in range(r.shape[1] - 1):
+            apart, radii = r[:, i + 1 :] - r[:, i : i + 1], radius[i] + radius[i + 1 :]
+            beside = np.hypot(apart[..., 0], apart[..., 1]) >= radii
+            room = np.where(beside, np.inf, np.abs(apart[..., 2]) - radii)
+            j = room.argmin(axis=1)
+            room = room[np.arange(len(r)), j]
+            closer = room < least
+            least[closer] = room[closer]
+            who[closer] = np.column_stack([np.full(len(r), i), i + 1 + j])[closer]
+        return self.extreme(least, lambda k: names(who[k]), lambda x: -x)
+
+    def outside(self, low: Floats, high: Floats) -> Extreme | None:
+        """How far [m] an agent's centre comes out of a box with these corners; negative inside."""
+        r = self.result.position
+        return self.extreme(np.maximum(low - r, r - high).max(axis=2), self.agent)
+
     def phase(self, index: int, record: PhaseRecord) -> PhaseVerdict:
         """Numbers of a phase."""
         result, samples = self.result, self.result.samples(index)

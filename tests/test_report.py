@@ -1,0 +1,285 @@
+"""The report of a flight, and of several side by side."""
+
+import html.parser
+import math
+import re
+import xml.etree.ElementTree as ET
+from base64 import b64decode
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rigidfleet import figures
+from rigidfleet.assess import Extreme, Safety, assess, safety
+from rigidfleet.errors import ResultError
+from rigidfleet.mission import Mission
+from rigidfleet.report import gains, html_page, report
+from rigidfleet.report.contents import contents
+from rigidfleet.result import Result
+from rigidfleet.simulate import simulate
+
+TOML = """
+schema_version = 1
+name = "pair"
+title = "Three <b>climb</b> & turn"
+[agents]
+mass = [1.0, 1.0, 2.0]
+position = [[0, 0, 1], [4, 0, 1], [2, 3.4641016151377544, 1]]
+thrust_limit = 30.0
+[formations.triangle]
+shape = "triangle"
+size = 4.0
+[[obstacles]]
+kind = "ground"
+[limits]
+speed = 9.0
+separation = 1.0
+geofence = {min = [-5, -5, 0], max = [15, 15, 12]}
+[[phases]]
+kind = "establish"
+formation = "triangle"
+duration = 4.0
+[[phases]]
+kind = "fly"
+position = [6, 3, 8]
+duration = 8.0
+"""
+
+
+@pytest.fixture(scope="module")
+def calm() -> Result:
+    return simulate(Mission.from_toml(TOML))
+
+
+@pytest.fixture(scope="module")
+def hasty() -> Result:
+    """The same in half the time, with other gains; it breaks two limits."""
+    text = TOML.replace("duration = 8.0", "duration = 3.0").replace("speed = 9.0", "speed = 2.0")
+    text += "[constraint]\nalpha = 2\nbeta = 3\ngamma = 0\n"
+    return simulate(Mission.from_toml(text.replace("max = [15, 15, 12]", "max = [15, 15, 7]")))
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """Figures of a flight in no time."""
+
+    def draw(result, folder, *, formats, names):
+        for name in names:
+            Path(folder, f"{name}.svg").write_text(f"<svg>{name}</svg>", encoding="utf-8")
+
+    monkeypatch.setattr(figures, "plot", draw)
+
+
+def worst(row: Safety) -> Extreme:
+    """The worst of a quantity that was measured."""
+    assert row.worst is not None
+    return row.worst
+
+
+class Page(html.parser.HTMLParser):
+    """What a page consists of: its words, its links, whether each element is closed."""
+
+    VOID = frozenset({"meta", "img", "link", "br"})
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.words: list[str] = []
+        self.sources: list[str] = []
+        self.open: list[str] = []
+        self.feed(text)
+        self.close()
+        assert self.open == []
+        self.text = " ".join(" ".join(self.words).split())
+
+    def handle_starttag(self, tag, attrs):
+        self.sources += [v for k, v in attrs if k in ("src", "href") and v]
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if self.open and self.open[-1] not in ("style", "title"):
+            self.words.append(data)
+
+
+def test_page_is_whole(calm, tmp_path):
+    """The page is well-formed, holds all its figures as SVG, and asks nothing of a network."""
+    path = tmp_path / "report.html"
+    report(calm, path)
+    page = Page(path.read_text(encoding="utf-8"))
+    assert len(page.sources) == len(figures.figure_names()) + 1  # and the answer of the gains
+    for source in page.sources:
+        head, _, data = source.partition(",")
+        assert head == "data:image/svg+xml;base64"
+        assert ET.fromstring(b64decode(data)).tag.endswith("svg")
+    assert "default-src 'none'" in path.read_text(encoding="utf-8")
+
+
+def test_verdict_comes_first(calm, hasty, quick):
+    """The verdict stands before all else, in words that are those of the verdict."""
+    assert "Passed" in Page(html_page(calm)).text.split("Safety")[0]
+    first = Page(html_page(hasty)).text.split("Safety")[0]
+    assert "Failed" in first
+    failed = [f.message for f in assess(hasty).findings if not f.passed]
+    assert len(failed) == 2
+    assert all(message in first for message in failed)
+
+
+def test_words_of_users_are_words(calm, quick):
+    """What a user writes into a title stays text, whatever it looks like."""
+    assert "<b>climb" not in html_page(calm)
+    assert "Three <b>climb</b> & turn" in Page(html_page(calm)).text
+
+
+def test_safety(calm):
+    """Every quantity has its worst value, its limit and what is left, as measured on the result."""
+    rows = {row.quantity: row for row in safety(calm, assess(calm))}
+    assert list(rows) == [
+        "proximity", "downwash", "speed", "acceleration", "lowest", "highest", "geofence", "thrust",
+        "clearance",
+    ]  # fmt: skip
+    z, r = calm.position[..., 2], calm.position
+    assert worst(rows["highest"]).value == z.max()
+    assert rows["highest"].margin == pytest.approx(12 - z.max())
+    assert worst(rows["lowest"]).value == z.min()
+    assert rows["lowest"].margin == pytest.approx(z.min())
+    inside = np.minimum(r - [-5, -5, 0], [15, 15, 12] - r).min()
+    assert worst(rows["geofence"]).value == pytest.approx(inside)
+    assert rows["geofence"].passed
+    assert rows["thrust"].used == pytest.approx(calm.thrust.max() / 30)
+    assert rows["speed"].limit == 9.0
+    assert rows["acceleration"].limit is None
+    assert rows["acceleration"].margin is None
+    assert rows["downwash"].worst is None
+    assert rows["proximity"].margin == pytest.approx(np.min(calm.separation) - 1.0)
+
+
+def test_safety_of_a_flight_that_breaks_limits(hasty):
+    """What is beyond its limit is so in the verdict and on the safety page alike, ceiling included."""
+    verdict = assess(hasty)
+    broken = {row.quantity for row in safety(hasty, verdict) if not row.passed}
+    assert {f.check for f in verdict.findings if not f.passed} == {"geofence", "speed"}
+    assert broken == {"geofence", "speed", "highest"}
+    assert all((row.margin or 0.0) < 0 for row in safety(hasty, verdict) if not row.passed)
+
+
+def test_downwash_is_measured_without_a_limit():
+    """One vehicle above another is noticed even where the mission sets no limit to it."""
+    text = TOML.replace("[4, 0, 1]", "[0.1, 0, 3]").replace("establish", "hold")
+    text = text.replace('formation = "triangle"\nduration = 4.0', "duration = 1.0")
+    result = simulate(Mission.from_toml(text))
+    (row,) = (row for row in safety(result, assess(result)) if row.quantity == "downwash")
+    assert row.limit is None
+    assert worst(row).value == pytest.approx(1.5)
+    assert worst(row).who == "agents 1 and 2"
+
+
+def test_side_by_side(calm, hasty, quick):
+    """Of several flights the page tells what differs: numbers, keys of the missions, overlaid figures."""
+    page = contents([calm, hasty], ["calm", "hasty"], None)
+    assert {row["key"] for row in page["keys"]} == {
+        "constraint.alpha", "constraint.beta", "constraint.gamma", "limits.geofence.max",
+        "limits.speed", "phases[2].duration",
+    }  # fmt: skip
+    numbers = {row["name"]: row for row in page["numbers"]}
+    assert numbers["length of the flight"]["cells"] == ["12", "7"]
+    assert not numbers["greatest speed"]["same"]
+    assert numbers["greatest speed"]["change"][1].startswith(("+", "×"))
+    assert numbers["least room between vehicles"]["same"]
+    assert len(page["overlays"]) == 2
+    text = Page(html_page([calm, hasty], labels=["calm", "hasty"])).text
+    for words in ("2 flights side by side", "What differs", "calm", "hasty", "Passed", "Failed"):
+        assert words in text
+
+
+def test_flights_of_one_mission_are_numbered(calm, quick):
+    """Two flights of one mission are told apart, and their missions found to be the same."""
+    page = contents([calm, calm], None, None)
+    assert [flight["label"] for flight in page["flights"]] == ["pair (1)", "pair (2)"]
+    assert page["keys"] == []
+    assert all(row["same"] for row in page["numbers"])
+
+
+def test_gains_mean_what_they_do():
+    """The triple pole overshoots by 24.9 %, may have nine times its gamma, and tracking is what it is."""
+    lines = {line.what: line for line in gains.explained(Mission.from_toml(TOML))}
+    assert lines["its poles"].value == "-2, -2, -2 /s"
+    assert lines["stability margin"].value == "9"
+    assert lines["overshoot"].value == "24.9 %"
+    assert lines["tracking"].value == "k₁ = 2 /s², k₂ = 2.83 /s"
+    assert f"damping ratio {math.sqrt(8) / (2 * math.sqrt(2)):.2f}" in lines["tracking"].meaning
+    assert "finite horizon" in " ".join(lines)
+
+
+@pytest.mark.parametrize(
+    ("tables", "present", "absent"),
+    [
+        ("[constraint]\nstabilisation = 'none'\n", "constraint force", "overshoot"),
+        ("[constraint]\ngamma = 0\n", "overshoot", "stability margin"),
+        ("[lqr]\nhorizon = 'infinite'\nQ = [1, 4]\n", "attitude, infinite horizon", "x"),
+    ],
+)
+def test_gains_of_other_missions(tables, present, absent):
+    """Gains that are not there are not explained."""
+    whats = [line.what for line in gains.explained(Mission.from_toml(TOML + tables))]
+    assert present in whats
+    assert absent not in whats
+
+
+def test_slowest_of_overdamped_gains():
+    """Gains that creep are said to take as long as their slow pole does."""
+    mission = Mission.from_toml(TOML + "[tracking]\nQ = [1, 100]\n")
+    (line,) = (line for line in gains.explained(mission) if line.what == "tracking")
+    slow = min(abs(np.roots([1, math.sqrt(102), 1])))
+    assert f"in about {4 / slow:.2g} s" in line.meaning
+
+
+def test_flight_that_broke_off(tmp_path, quick):
+    """A flight that could not be flown to its end has a report, which says so."""
+    text = TOML.replace("duration = 8.0", "settle = {tolerance = 1e-15, timeout = 2}\ntravel = 1.0")
+    result = simulate(Mission.from_toml(text))
+    report(result, tmp_path / "report.html")
+    words = Page((tmp_path / "report.html").read_text(encoding="utf-8")).text
+    assert "Failed" in words
+    assert "incomplete" in words
+
+
+def test_one_agent_alone(tmp_path, quick):
+    """A flight of one vehicle, without edges, obstacles or limits, has a report too, alone and beside others."""
+    text = re.sub(r"\[formations.*?(?=\[\[phases\]\])", "", TOML, flags=re.DOTALL)
+    text = re.sub(r"position = \[\[0.*", "position = [[0, 0, 1]]", text).replace(
+        "mass = [1.0, 1.0, 2.0]", "mass = 1"
+    )
+    text = text.replace('kind = "establish"\nformation = "triangle"', 'kind = "hold"')
+    alone = simulate(Mission.from_toml(text))
+    for flights in (alone, [alone, alone]):
+        report(flights, tmp_path / "report.html")
+        Page((tmp_path / "report.html").read_text(encoding="utf-8"))
+
+
+def test_many_vehicles(quick):
+    """Of more vehicles than a page takes, those with the most thrust have a row."""
+    n = 40
+    text = f"""
+schema_version = 1
+name = "many"
+agents = {{mass = {[1 + 0.01 * i for i in range(n)]}, position = {[[3 * i, 0, 1] for i in range(n)]}}}
+phases = [{{kind = "hold", duration = 1}}]
+"""
+    page = contents([simulate(Mission.from_toml(text))], None, None)
+    (flight,) = page["flights"]
+    assert [v["name"] for v in flight["vehicles"]] == [str(i) for i in range(17, 41)]
+    assert flight["vehicles_left_out"] == 16
+
+
+def test_what_cannot_be_reported(calm, tmp_path, quick):
+    """No flight, labels that do not fit, and a folder that is not there are errors that say so."""
+    with pytest.raises(ValueError, match="needs a result"):
+        html_page([])
+    with pytest.raises(ValueError, match="as many labels"):
+        html_page([calm], labels=["a", "b"])
+    with pytest.raises(ResultError, match="no folder"):
+        report(calm, tmp_path / "none" / "report.html")
