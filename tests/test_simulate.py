@@ -694,6 +694,22 @@ def as_option(kind: str, function: Any) -> Data:
     return {kind: function}
 
 
+def test_a_controller_flies_phases_that_end_by_settling_too():
+    """Its rate counts from the phase's start, however often the phase asks whether it has settled."""
+    seen: list[Observation] = []
+
+    def controller(o: Observation) -> np.ndarray:
+        seen.append(o)
+        return the_local_law(o)
+
+    fly = {"kind": "fly", "position": [9, 5, 6], "travel": 4.0, "settle": {"tolerance": 0.02}}
+    result = simulate(a_mission(establish(until=5.0), fly), controller=controller, rate=30.0)
+    assert result.phases[1].settled is True
+    times = np.array([o.t for o in seen])
+    np.testing.assert_allclose(times, 5.0 + np.arange(len(seen)) / 30, rtol=0, atol=1e-12)
+    assert times[-1] == pytest.approx(result.time[-1], abs=1 / 30 + 1e-9)
+
+
 @pytest.mark.parametrize("kind", ["controller", "force"])
 @pytest.mark.parametrize(
     ("returned", "message"),

@@ -144,6 +144,8 @@ class _Leg:
     workspace: k.Workspace
     state: flight.Integrator
     t_end: float  # [s] at the latest
+    asked: int = 0  # how often the user's controller has been
+    held: k.Program | None = None  # with its force
 
     @property
     def t(self) -> float:
@@ -203,10 +205,8 @@ class _Flight:
         try:
             if phase.settle is not None:
                 record.settled = self._settle(leg, phase.settle)
-            elif self.controller is not None and phase.control == "slots":
-                self._controlled(leg, self.controller)
             else:
-                self._integrate(leg, leg.plan.program, leg.t_end)
+                self._fly_to(leg, leg.t_end)
         finally:
             self.count += leg.state.count[:3]
             if leg.state.count[0]:
@@ -240,6 +240,30 @@ class _Flight:
             ),
             t_end,
         )
+
+    def _fly_to(self, leg: _Leg, t_end: float) -> None:
+        """Integrate to ``t_end`` [s] under the phase's input law, or the user's controller."""
+        if self.controller is None or leg.phase.control != "slots":
+            self._integrate(leg, leg.plan.program, t_end)
+            return
+        start = self.now.t
+        while leg.t < t_end:
+            # Control instants count from the phase's start, wherever a stretch of it ends.
+            if leg.held is None or leg.t >= start + leg.asked / self.rate:
+                leg.held = self._controlled(leg, self.controller)
+                leg.asked += 1
+            self._integrate(leg, leg.held, min(start + leg.asked / self.rate, t_end))
+
+    def _controlled(self, leg: _Leg, controller: Controller) -> k.Program:
+        """Ask the user's controller; return the phase's program with its force held."""
+        plan, w, y = leg.plan, leg.workspace, leg.state.y
+        flight.closed_loop(leg.t, y, np.empty_like(y), plan.program, w)
+        seen = Observation(
+            leg.t, leg.phase.name, w.r.copy(), w.v.copy(), w.r_ref.copy(), w.v_ref.copy(),
+            w.a_ref.copy(), self.masses.copy(), self.mission.gravity,
+        )  # fmt: skip
+        f = _checked(controller(seen), self.mission.n_agents, "the controller", leg.t)
+        return plan.program._replace(control=plan.program.control._replace(kind=k.OPEN, force=f))
 
     def _integrate(self, leg: _Leg, program: k.Program, t_end: float) -> None:
         """Integrate to ``t_end`` [s] and record the samples on the way.
@@ -303,7 +327,7 @@ class _Flight:
         since = math.inf
         while leg.t < leg.t_end:
             t = (math.floor(leg.t / step + 1e-9) + 1) * step
-            self._integrate(leg, leg.plan.program, min(t, leg.t_end))
+            self._fly_to(leg, min(t, leg.t_end))
             quiet = leg.t >= least and self._error(leg) <= settle.tolerance
             since = min(since, leg.t) if quiet else math.inf
             if leg.t - since >= settle.dwell - 1e-9:
@@ -331,23 +355,6 @@ class _Flight:
             )
             errors.append(np.linalg.norm(plan.slots @ turned, axis=1).max())
         return float(max(errors))
-
-    def _controlled(self, leg: _Leg, controller: Controller) -> None:
-        """Integrate under the user's controller, its force held over each control step."""
-        start, step = leg.t, 0
-        plan, w, y = leg.plan, leg.workspace, leg.state.y
-        dy = np.empty_like(y)
-        while leg.t < leg.t_end:
-            flight.closed_loop(leg.t, y, dy, plan.program, w)
-            seen = Observation(
-                leg.t, leg.phase.name, w.r.copy(), w.v.copy(), w.r_ref.copy(), w.v_ref.copy(),
-                w.a_ref.copy(), self.masses.copy(), self.mission.gravity,
-            )  # fmt: skip
-            f = _checked(controller(seen), self.mission.n_agents, "the controller", leg.t)
-            held = plan.program.control._replace(kind=k.OPEN, force=f)
-            step += 1
-            t = min(start + step / self.rate, leg.t_end)
-            self._integrate(leg, plan.program._replace(control=held), t)
 
     # -- states -----------------------------------------------------------------------------------
 
