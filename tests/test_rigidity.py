@@ -1,6 +1,6 @@
 import warnings
 from itertools import combinations
-from time import perf_counter
+from time import thread_time
 
 import numpy as np
 import pytest
@@ -277,9 +277,9 @@ def test_hundred_agents_take_two_seconds(kind):
         reach = np.quantile(f.distances(p, edges), {"near": 0.1, "few": 0.03}.get(kind, 0.15))
         edges = edges[f.distances(p, edges) <= reach]
     analyse(SPREAD[:3] * [1, 0, 0], f.complete_graph(3))  # imports
-    start = perf_counter()
+    start = thread_time()  # what others do on this machine does not count
     result = analyse(p, edges)
-    assert perf_counter() - start < 10  # two on a free machine; this one may be busy
+    assert thread_time() - start < 2
     assert result.agents == 100
 
 
