@@ -16,6 +16,8 @@ Ints = NDArray[np.int64]
 
 # Slots thinner than this, relative to their length, are a line to an attitude fit.
 _THIN = 1e-3
+# Numbers in a temporary array at most.
+_ELEMENTS = 8_000_000
 
 
 def separation(r: Array, radius: ArrayLike) -> tuple[Array, Ints]:
@@ -129,6 +131,11 @@ def smallest_singular_value(r: Array, edges: Ints, masses: ArrayLike | None = No
     """
     if not len(edges):
         return np.full(len(r), np.nan)
+    # Some samples at a time: J of all of them may not fit into memory.
+    some = max(1, _ELEMENTS // (len(edges) * r.shape[1] * 3))
+    if len(r) > some:
+        parts = [r[k : k + some] for k in range(0, len(r), some)]
+        return np.concatenate([smallest_singular_value(part, edges, masses) for part in parts])
     i, j = edges.T
     u = r[:, i] - r[:, j]
     u /= np.linalg.norm(u, axis=2, keepdims=True)

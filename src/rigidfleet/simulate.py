@@ -233,7 +233,10 @@ class _Flight:
             phase,
             plan,
             k.workspace(
-                len(self.masses), len(plan.edges), with_h=plan.program.control.allocation != k.RIGID
+                len(self.masses),
+                len(plan.edges),
+                with_h=plan.program.control.allocation != k.RIGID,
+                solver=plan.program.law.solver,
             ),
             flight.integrator(
                 y, self.now.t, rtol=tolerances.rtol, atol=np.full(len(y), tolerances.atol)

@@ -82,6 +82,9 @@ def solve_multipliers(vehicles, graph, law, w):
     n = graph.edges.shape[0]
     b, y = w.b, w.multiplier
     mbar = vehicles.M / m.shape[0]
+    if w.A.shape[0] < n:
+        solve_at_agents(m, mbar, graph.edges, law, w)
+        return
     if law.solver == ITERATED:
         assemble(w.u, m, graph, mbar, law.mu, w.A)
         cholesky(w.A)
@@ -122,6 +125,57 @@ def solve_multipliers(vehicles, graph, law, w):
             s += w.V[k, q] * b[k]
         for k in range(n):
             y[k] += mbar * phi * s * w.V[k, q]
+
+
+@compiled
+def solve_at_agents(m, mbar, edges, law, w):
+    """The iterated solve in the agents' coordinates, the smaller system where edges are many.
+
+    With K = mbar J^T J + mu M (3N, 3N), each iteration is a += mbar K^-1 J^T (b - J a), and the
+    multipliers are lambda = (mbar/mu) sum of the residuals b - J a: f_C = J^T lambda = M a.
+    """
+    K, u, b, y = w.A, w.u, w.b, w.multiplier
+    n = m.shape[0]
+    x, a = w.w, w.f_C
+    for p in range(3 * n):
+        for q in range(p):
+            K[p, q] = 0.0
+        K[p, p] = law.mu * m[p // 3]
+    for k in range(edges.shape[0]):
+        i, j = edges[k, 0], edges[k, 1]
+        high, low = 3 * max(i, j), 3 * min(i, j)
+        for p in range(3):
+            for q in range(3):
+                block = mbar * u[k, p] * u[k, q]
+                K[high + p, low + q] -= block
+                if q <= p:
+                    K[high + p, high + q] += block
+                    K[low + p, low + q] += block
+    cholesky(K)
+    for i in range(n):
+        for p in range(3):
+            a[i, p] = 0.0
+    for k in range(edges.shape[0]):
+        y[k] = 0.0
+    for it in range(law.iterations + 1):
+        for p in range(3 * n):
+            x[p] = 0.0
+        for k in range(edges.shape[0]):
+            i, j = edges[k, 0], edges[k, 1]
+            rest = b[k]
+            for p in range(3):
+                rest -= u[k, p] * (a[i, p] - a[j, p])
+            if it > 0:
+                y[k] += mbar / law.mu * rest
+            for p in range(3):
+                x[3 * i + p] += mbar * rest * u[k, p]
+                x[3 * j + p] -= mbar * rest * u[k, p]
+        if it == law.iterations:
+            return
+        cholesky_solve(K, x[: 3 * n])
+        for i in range(n):
+            for p in range(3):
+                a[i, p] += x[3 * i + p]
 
 
 @compiled

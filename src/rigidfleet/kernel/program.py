@@ -131,8 +131,8 @@ class Workspace(NamedTuple):
     d_ddot: Array  # (m,) [m/s^2]
     c: Array  # (m,) constraints [m]
     b: Array  # (m,) right side of the multiplier equation [m/s^2]
-    A: Array  # (m, m) J M^-1 J^T [1/kg]; its lower triangle is factored in place
-    V: Array  # (m, m) eigenvectors
+    A: Array  # (m, m) J M^-1 J^T, or (3N, 3N) J^T J; its lower triangle is factored in place
+    V: Array  # (m, m) eigenvectors, where a law needs them
     w: Array  # (m,) eigenvalues; work
     multiplier: Array  # (m,) [N]
     f_E: Array  # (N, 3) gravity and the user's force [N]
@@ -159,14 +159,20 @@ class Workspace(NamedTuple):
     H_w: Array  # (3N, 3): right side, eigenvalues, work
 
 
-def workspace(n: int, m: int, *, with_h: bool = False) -> Workspace:
-    """Allocate a workspace for N = ``n`` agents and ``m`` edges."""
+def workspace(n: int, m: int, *, with_h: bool = False, solver: int | None = None) -> Workspace:
+    """Allocate a workspace for N = ``n`` agents and ``m`` edges.
+
+    One for the iterated ``solver`` alone has the smaller of the two systems it may solve, in the
+    edges or in the agents' coordinates.
+    """
+    size = min(m, 3 * n) if solver == ITERATED else m
+    vectors = 0 if solver in (ITERATED, EXACT) else m
     agent = lambda: np.zeros((n, 3))  # noqa: E731
     edge = lambda: np.zeros(m)  # noqa: E731
     k = 3 * n if with_h else 0
     return Workspace(
         r=agent(), v=agent(), u=np.zeros((m, 3)), L=edge(), d=edge(), d_dot=edge(), d_ddot=edge(),
-        c=edge(), b=edge(), A=np.zeros((m, m)), V=np.zeros((m, m)), w=edge(), multiplier=edge(),
+        c=edge(), b=edge(), A=np.zeros((size, size)), V=np.zeros((vectors, vectors)), w=edge(), multiplier=edge(),
         f_E=agent(), f_u=agent(), f_C=agent(), a=agent(), p=agent(), p_dot=agent(),
         p_ddot=agent(), r_ref=agent(), v_ref=agent(), a_ref=agent(), cm=np.zeros((5, 3)),
         I=np.zeros((3, 3)), I_inv=np.zeros((3, 3)), T=np.eye(3), body=np.zeros((8, 3)),
@@ -178,16 +184,16 @@ def workspace(n: int, m: int, *, with_h: bool = False) -> Workspace:
 
 def graph(edges: NDArray[np.int64], masses: Array) -> Graph:
     """Prepare a constraint graph: (m, 2) edges with agents from 0, (N,) masses [kg]."""
-    pairs, weight = [], []
-    for k, (i, j) in enumerate(edges):
-        for l in range(k):
-            sign = {edges[l][0]: 1.0, edges[l][1]: -1.0}
-            shared = [(1.0 if a == i else -1.0) * sign[a] / masses[a] for a in (i, j) if a in sign]
-            if shared:
-                pairs.append((k, l))
-                weight.append(sum(shared))
-    return Graph(
-        np.ascontiguousarray(edges, dtype=np.int64).reshape(-1, 2),
-        np.array(pairs, dtype=np.int64).reshape(-1, 2),
-        np.array(weight, dtype=np.float64),
-    )
+    edges = np.ascontiguousarray(edges, dtype=np.int64).reshape(-1, 2)
+    parts = []
+    for agent in np.unique(edges):
+        k, end = np.nonzero(edges == agent)
+        sign = 1.0 - 2.0 * end
+        p, q = np.tril_indices(len(k), -1)
+        parts.append(np.stack([k[p], k[q], sign[p] * sign[q] / masses[agent]]))
+    found = np.concatenate(parts, axis=1) if parts else np.zeros((3, 0))
+    # Edges that share both agents meet twice.
+    met, where = np.unique(found[:2].T.astype(np.int64), axis=0, return_inverse=True)
+    weight = np.zeros(len(met))
+    np.add.at(weight, where.ravel(), found[2])
+    return Graph(edges, np.ascontiguousarray(met).reshape(-1, 2), weight)
