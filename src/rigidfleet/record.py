@@ -50,6 +50,9 @@ def assemble(
 
     r, v = joined("r"), joined("v")
     f_u, f_C = joined("f_u"), joined("f_C")
+    thrust = np.linalg.norm(f_u + f_C, axis=2)
+    if mission.agents.saturate:  # what was flown, not what was asked
+        thrust = np.minimum(thrust, mission.agents.thrust_limit)
     cm, cm_velocity = np.einsum("i,kia->ka", masses, r) / M, np.einsum("i,kia->ka", masses, v) / M
     x, y = r - cm[:, None], v - cm_velocity[:, None]
     attitude = _attitudes(pieces, x, masses, framed=mission.body_frame is not None)
@@ -77,7 +80,7 @@ def assemble(
         input_force=f_u,
         constraint_force=f_C,
         external_force=joined("f_E"),
-        thrust=np.linalg.norm(f_u + f_C, axis=2),
+        thrust=thrust,
         cm=cm,
         cm_velocity=cm_velocity,
         cm_reference=motion[:, :3],

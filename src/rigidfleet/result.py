@@ -127,7 +127,7 @@ class Result:
     external_force: Annotated[
         Floats, _v("time agent axis", "N", "gravity and disturbances, world axes")
     ]
-    thrust: Annotated[Floats, _v("time agent", "N", "thrust |f_u + f_C|")]
+    thrust: Annotated[Floats, _v("time agent", "N", "thrust |f_u + f_C|, cut off at the limit if it saturates")]
 
     cm: Annotated[Floats, _v("time axis", "m", "centre of mass, world axes")]
     cm_velocity: Annotated[Floats, _v("time axis", "m s-1", "velocity of the centre of mass")]
