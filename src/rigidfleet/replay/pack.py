@@ -1,0 +1,47 @@
+"""Samples of a flight as text inside a page: a tenth of their size, and read there in no time.
+
+Each column is rounded to a step far below what can be seen, its second differences along time are
+taken, the bytes of equal weight put side by side, and all is deflated. ``unpack`` in recording.js
+undoes it.
+"""
+
+from __future__ import annotations
+
+import base64
+import zlib
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+#: Stands for NaN; one below the least that is kept of a number.
+_MISSING = -(2**31)
+
+
+class Column(NamedTuple):
+    """A quantity over time and the step it is rounded to, both in its unit."""
+
+    values: Floats  # (K,) or (K, ...), NaN where there is none
+    step: float
+
+
+def pack(columns: Mapping[str, Column]) -> tuple[list[dict[str, Any]], str]:
+    """Description of each column, in order, and all of them as one text (base64)."""
+    described, planes = [], []
+    for name, (values, step) in columns.items():
+        flat = values.reshape(len(values), -1)
+        described.append({"name": name, "width": flat.shape[1], "step": step})
+        planes.append(_bytes(flat.T / step))
+    data = zlib.compress(b"".join(planes), 9)
+    return described, base64.b64encode(data).decode("ascii")
+
+
+def _bytes(rows: Floats) -> bytes:
+    """Second differences of rounded rows, lowest bytes first; sums of 32 bits wrap around."""
+    whole = np.clip(np.round(rows), _MISSING + 1, -_MISSING - 1)
+    steps = np.where(np.isnan(rows), _MISSING, whole).astype(np.int64)
+    twice = np.diff(np.diff(steps, axis=1, prepend=0), axis=1, prepend=0)
+    return twice.astype("<u4", casting="unsafe").reshape(-1, 1).view(np.uint8).T.tobytes()

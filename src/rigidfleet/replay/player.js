@@ -1,0 +1,408 @@
+"use strict";
+// The page around the picture: time line, speed, cameras, plots, keys.
+
+const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 4, 8, 16];
+const ICONS = {
+  Play: '<svg viewBox="0 0 14 14" aria-hidden="true"><path d="M2.5 1 13 7 2.5 13z"/></svg>',
+  Pause: '<svg viewBox="0 0 14 14" aria-hidden="true"><path d="M2 1h3.6v12H2zM8.4 1H12v12H8.4z"/></svg>',
+};
+const SHOWN = { edges: "edges", trails: "trails", slots: "slots", axes: "body axes", names: "names" };
+const SLOW = 1 / 24; // seconds a picture: above, the resolution is lowered
+
+const part = (id) => document.getElementById(id);
+
+function element(tag, parent, attributes = {}, text = "") {
+  const made = parent.appendChild(document.createElement(tag));
+  for (const [name, value] of Object.entries(attributes)) made.setAttribute(name, value);
+  if (text) made.textContent = text;
+  return made;
+}
+
+/** A number as read on an instrument: three digits, no exponent. */
+function digits(x) {
+  const size = Math.abs(x);
+  return x.toFixed(size >= 99.95 ? 0 : size >= 9.995 ? 1 : 2).replace("-", "−");
+}
+
+function withUnit(x, unit) {
+  if (!Number.isFinite(x)) return "–";
+  if (x === 0) return `0 ${unit}`;
+  const size = Math.abs(x);
+  if (unit !== "m" || size >= 0.0995) return `${digits(x)} ${unit}`;
+  if (size >= 0.000995) return `${digits(1000 * x)} mm`;
+  return size > 1.5e-6 ? `${digits(1e6 * x)} µm` : "≤ 1 µm";
+}
+
+// -- plots ----------------------------------------------------------------------------------------------
+
+/** One quantity over time: `plot` {title, unit, column, colours, worst, limit, least, log, floor}. */
+class Plot {
+  constructor(parent, plot, recording, seek) {
+    this.plot = plot;
+    this.recording = recording;
+    const box = element("div", parent, { class: "plot" }), header = element("header", box);
+    element("h2", header, {}, plot.title);
+    this.value = element("output", header);
+    this.area = element("div", box, { class: "area", title: "Click to go there" });
+    this.canvas = element("canvas", this.area);
+    this.cursor = element("div", this.area, { class: "cursor" });
+    const go = (event) => seek(Math.max(0, Math.min(event.offsetX / this.area.clientWidth, 1)));
+    this.area.addEventListener("pointerdown", (event) => {
+      this.area.setPointerCapture(event.pointerId);
+      go(event);
+    });
+    this.area.addEventListener("pointermove", (event) => event.buttons && go(event));
+  }
+
+  /** Samples of all lines: the least and greatest of each stretch that falls on one pixel. */
+  stretch(first, last, pixels, visit) {
+    const { plot, recording } = this, data = recording.columns[plot.column], width = recording.widths[plot.column];
+    for (let line = 0; line < width; line++) {
+      const points = [];
+      for (let x = 0; x < pixels; x++) {
+        const a = first + Math.floor((x / pixels) * (last - first + 1));
+        const b = Math.max(a + 1, first + Math.floor(((x + 1) / pixels) * (last - first + 1)));
+        let low = Infinity, high = -Infinity;
+        for (let k = a; k < Math.min(b, last + 1); k++) {
+          const y = data[k * width + line];
+          if (y < low) low = y;
+          if (y > high) high = y;
+        }
+        if (low <= high) points.push([x, low, high]);
+      }
+      visit(line, points);
+    }
+  }
+
+  /** Draw the samples from the first to the last. */
+  draw(first, last) {
+    const { plot, canvas, area } = this, ratio = Math.min(window.devicePixelRatio || 1, 2);
+    const width = area.clientWidth, height = area.clientHeight;
+    if (!width || last < first) return;
+    [canvas.width, canvas.height] = [Math.round(width * ratio), Math.round(height * ratio)];
+    const pen = canvas.getContext("2d");
+    pen.scale(ratio, ratio);
+    const lines = [], values = [];
+    this.stretch(first, last, Math.floor(width), (line, points) => {
+      lines.push([line, points]);
+      for (const [, low, high] of points) values.push(low, high);
+    });
+    let low = Math.min(...values), high = Math.max(...values);
+    if (!(low <= high)) return;
+    const y = plot.log ? (v) => Math.log10(Math.max(v, plot.floor)) : (v) => v;
+    if (plot.log) [low, high] = [y(low), Math.max(y(high), y(low) + 1)];
+    else {
+      // A limit is shown if the flight comes anywhere near it.
+      if (plot.limit !== null && plot.limit < high + 1.5 * (high - low) + 1e-9) high = Math.max(high, plot.limit);
+      if (plot.least !== null && plot.least > low - 1.5 * (high - low) - 1e-9) low = Math.min(low, plot.least);
+      if (low > 0 && low < 0.6 * high) low = 0;
+      const least = 0.02 * Math.max(Math.abs(high), Math.abs(low), 1e-3);
+      if (high - low < least) [low, high] = [low - least / 2, high + least / 2];
+    }
+    const place = (v) => 3 + (1 - (y(v) - low) / (high - low)) * (height - 6);
+    pen.fillStyle = "rgb(255 255 255 / 70%)";
+    pen.fillRect(0, 0, width, height);
+    for (const bound of [plot.limit, plot.least]) {
+      if (bound === null || place(bound) < 0 || place(bound) > height) continue;
+      pen.strokeStyle = "#b00020";
+      pen.setLineDash([5, 3]);
+      pen.beginPath();
+      pen.moveTo(0, place(bound));
+      pen.lineTo(width, place(bound));
+      pen.stroke();
+      pen.setLineDash([]);
+    }
+    for (const [line, points] of lines) {
+      pen.strokeStyle = plot.colours[line % plot.colours.length];
+      pen.lineWidth = 1.2;
+      pen.beginPath();
+      points.forEach(([x, a, b], k) => {
+        const gap = k > 0 && x > points[k - 1][0] + 1;
+        if (k === 0 || gap) pen.moveTo(x, place(a));
+        else pen.lineTo(x, place(a));
+        if (b > a) pen.lineTo(x, place(b));
+      });
+      pen.stroke();
+    }
+    pen.font = "10px system-ui, sans-serif";
+    pen.textAlign = "right";
+    for (const [v, at] of [[high, 10], [low, height - 3]]) {
+      const name = withUnit(plot.log ? Math.pow(10, v) : v, plot.unit);
+      const { width: wide } = pen.measureText(name);
+      pen.fillStyle = "rgb(255 255 255 / 80%)";
+      pen.fillRect(width - 5 - wide, at - 9, wide + 4, 11);
+      pen.fillStyle = "#66717d";
+      pen.fillText(name, width - 3, at);
+    }
+  }
+
+  point(share, state) {
+    const { plot } = this, values = Array.from(state[plot.column]).filter(Number.isFinite);
+    this.cursor.style.transform = `translateX(${(share * this.area.clientWidth).toFixed(1)}px)`;
+    const worst = values.length ? (plot.worst === "least" ? Math.min(...values) : Math.max(...values)) : NaN;
+    const text = withUnit(plot.log ? Math.max(worst, plot.floor) : worst, plot.unit);
+    if (this.value.textContent !== text) this.value.textContent = text;
+    const limit = plot.limit !== null && worst > plot.limit, least = plot.least !== null && worst < plot.least;
+    this.value.style.color = limit || least ? "var(--alert)" : "";
+  }
+}
+
+// -- the player -----------------------------------------------------------------------------------------
+
+class Player {
+  constructor(recording) {
+    const { info } = recording;
+    this.recording = recording;
+    this.time = recording.start;
+    this.playing = false;
+    this.speed = 1;
+    this.pictures = 0;
+    this.stale = true;
+    this.slow = 0;
+    this.told = 0;
+    this.scene = new Scene(part("view"), part("labels"), recording);
+    this.write(info);
+    this.plots = info.plots.map((plot) => new Plot(part("plots"), plot, recording, (share) => this.seek(recording.start + share * (recording.end - recording.start))));
+    this.listen();
+    new ResizeObserver(() => this.resize()).observe(document.documentElement);
+    this.follow();
+    requestAnimationFrame((now) => {
+      this.last = now;
+      this.frame(now);
+    });
+  }
+
+  /** Words that stay. */
+  write(info) {
+    part("name").textContent = info.name;
+    part("title").textContent = info.title;
+    part("whole").textContent = `of ${Number(this.recording.end.toFixed(2))} s`;
+    if (info.ending) {
+      part("ending").textContent = `Incomplete: ${info.ending.split(": ")[0]}`;
+      part("ending").title = info.ending;
+      part("ending").hidden = false;
+    }
+    info.phases.forEach((phase, k) => {
+      const button = element("button", part("phases"), { type: "button", title: `${k + 1}. ${phase.name} (${digits(phase.start)} to ${digits(phase.end)} s)` }, phase.name);
+      button.style.flexGrow = String(Math.max(phase.end - phase.start, 1e-3));
+      button.addEventListener("click", () => this.seek(phase.start));
+    });
+    for (const speed of SPEEDS) element("option", part("speed"), { value: String(speed) }, `${speed}×`);
+    part("speed").value = "1";
+    for (const mode of CAMERAS) {
+      const title = { follow: "Follow the formation (1)", overview: "See the whole flight (2)", top: "See from above (3)" }[mode];
+      element("button", part("cameras"), { type: "button", title, "data-mode": mode }, mode[0].toUpperCase() + mode.slice(1))
+        .addEventListener("click", () => this.look(mode));
+    }
+    for (const [name, text] of Object.entries(SHOWN)) {
+      const label = element("label", part("show")), box = element("input", label, { type: "checkbox", "data-show": name });
+      box.checked = true;
+      label.append(text);
+      box.addEventListener("change", () => {
+        this.scene.show[name] = box.checked;
+        this.stale = true;
+      });
+    }
+    if (info.edges.length) this.writeScale(info);
+    this.look("follow");
+    part("more").setAttribute("aria-pressed", String(part("panel").offsetWidth > 0));
+  }
+
+  writeScale(info) {
+    part("tension").hidden = false;
+    const most = `${info.beyond ? "≥ " : ""}${digits(info.tension)} N`;
+    part("push").textContent = `pushes ${most}`;
+    part("pull").textContent = `pulls ${most}`;
+    const canvas = part("scale"), pen = canvas.getContext("2d");
+    for (let x = 0; x < canvas.width; x++) {
+      const place = (2 * (x + 0.5)) / canvas.width - 1;
+      pen.fillStyle = `rgb(${tensionColour(Math.sign(place) * place * place).map((c) => 255 * c)})`;
+      pen.fillRect(x, 0, 1, canvas.height);
+    }
+  }
+
+  listen() {
+    part("play").addEventListener("click", () => this.toggle());
+    part("scrub").addEventListener("input", (event) => this.seek(Number(event.target.value)));
+    part("speed").addEventListener("change", (event) => this.hasten(Number(event.target.value)));
+    part("more").addEventListener("click", () => this.panel());
+    document.addEventListener("keydown", (event) => this.key(event));
+    window.addEventListener("hashchange", () => this.follow());
+    this.steer(part("view"));
+    this.scene.renderer.canvas.addEventListener("webglcontextlost", () => say("The graphics of this machine failed. Reload the page."));
+  }
+
+  /** Drag turns, with the right button or Shift it moves; the wheel or two fingers zoom. */
+  steer(view) {
+    const { camera } = this.scene, fingers = new Map();
+    view.addEventListener("contextmenu", (event) => event.preventDefault());
+    view.addEventListener("pointerdown", (event) => {
+      view.setPointerCapture(event.pointerId);
+      fingers.set(event.pointerId, event);
+    });
+    const away = (event) => fingers.delete(event.pointerId);
+    view.addEventListener("pointerup", away);
+    view.addEventListener("pointercancel", away);
+    view.addEventListener("pointermove", (event) => {
+      const before = fingers.get(event.pointerId);
+      if (!before) return;
+      const dx = event.clientX - before.clientX, dy = event.clientY - before.clientY;
+      const other = [...fingers.values()].find((finger) => finger.pointerId !== event.pointerId);
+      if (other) {
+        const apart = (finger) => Math.hypot(finger.clientX - other.clientX, finger.clientY - other.clientY);
+        camera.zoom *= apart(before) / Math.max(apart(event), 1);
+        camera.shift((0.5 * dx) / view.clientHeight, (0.5 * dy) / view.clientHeight);
+      } else if (event.buttons === 2 || event.shiftKey) camera.shift(dx / view.clientHeight, dy / view.clientHeight);
+      else camera.turn(dx * 0.006, dy * 0.006);
+      fingers.set(event.pointerId, event);
+      this.stale = true;
+    });
+    view.addEventListener("wheel", (event) => {
+      event.preventDefault();
+      const lines = event.deltaMode === 1 ? 16 : 1;
+      camera.zoom = Math.max(0.03, Math.min(camera.zoom * Math.exp(event.deltaY * lines * 0.0012), 60));
+      this.stale = true;
+    }, { passive: false });
+  }
+
+  key(event) {
+    if (event.ctrlKey || event.metaKey || event.altKey || event.target.tagName === "SELECT") return;
+    const step = event.shiftKey ? 0.1 : 1, { phases } = this.recording.info, now = this.recording.phaseAt(this.time);
+    const speed = (by) => this.hasten(SPEEDS[Math.max(0, Math.min(SPEEDS.indexOf(this.speed) + by, SPEEDS.length - 1))]);
+    const deeds = {
+      " ": () => event.target.tagName !== "BUTTON" && this.toggle(),
+      k: () => this.toggle(),
+      ArrowLeft: () => this.seek(this.time - step),
+      ArrowRight: () => this.seek(this.time + step),
+      Home: () => this.seek(this.recording.start),
+      End: () => this.seek(this.recording.end),
+      "[": () => this.seek(phases[Math.max(now - (this.time - phases[now].start < 0.5 ? 1 : 0), 0)].start),
+      "]": () => this.seek(phases[now + 1]?.start ?? this.recording.end),
+      "+": () => speed(1), "=": () => speed(1), "-": () => speed(-1),
+      1: () => this.look("follow"), 2: () => this.look("overview"), 3: () => this.look("top"),
+      p: () => this.panel(),
+    };
+    const deed = deeds[event.key];
+    if (!deed || deed() === false) return;
+    event.preventDefault();
+  }
+
+  // -- what can be asked of it --
+
+  toggle() {
+    if (!this.playing && this.time >= this.recording.end) this.seek(this.recording.start);
+    this.play(!this.playing);
+  }
+
+  play(on) {
+    this.playing = on && this.recording.end > this.recording.start;
+    const name = this.playing ? "Pause" : "Play";
+    part("play").innerHTML = ICONS[name];
+    part("play").setAttribute("aria-label", name);
+    this.slow = 0;
+    this.stale = true;
+  }
+
+  seek(time) {
+    this.time = Math.max(this.recording.start, Math.min(time, this.recording.end));
+    this.stale = true;
+  }
+
+  hasten(speed) {
+    this.speed = speed;
+    part("speed").value = String(speed);
+  }
+
+  look(mode) {
+    this.scene.camera.use(mode);
+    for (const button of part("cameras").children) button.setAttribute("aria-pressed", String(button.dataset.mode === mode));
+    this.stale = true;
+  }
+
+  panel() {
+    const panel = part("panel"), hidden = getComputedStyle(panel).display === "none";
+    panel.classList.toggle("asked", hidden);
+    panel.classList.toggle("dismissed", !hidden);
+    part("more").setAttribute("aria-pressed", String(hidden));
+    this.resize();
+  }
+
+  /** Go where the address asks: `#t=52` shows that moment, `&camera=top`, `&speed=2`; it then stands still. */
+  follow() {
+    const asked = new URLSearchParams(location.hash.slice(1)), t = parseFloat(asked.get("t"));
+    if (CAMERAS.includes(asked.get("camera"))) this.look(asked.get("camera"));
+    if (SPEEDS.includes(Number(asked.get("speed")))) this.hasten(Number(asked.get("speed")));
+    if (Number.isFinite(t)) this.seek(t);
+    this.scene.camera.shown = null;
+    this.play(!Number.isFinite(t) && !matchMedia("(prefers-reduced-motion: reduce)").matches);
+  }
+
+  resize() {
+    // The picture's centre lies in the middle of what is free.
+    const page = document.documentElement, side = part("panel").offsetWidth, bottom = part("bar").offsetHeight + 14;
+    const right = side && side < 0.4 * page.clientWidth ? side + 14 : 0, { camera } = this.scene;
+    camera.centre = [-right / page.clientWidth, bottom / page.clientHeight];
+    camera.free = [1 - right / page.clientWidth, 1 - bottom / page.clientHeight];
+    this.redraw();
+    this.stale = true;
+  }
+
+  redraw() {
+    for (const plot of this.plots) plot.draw(0, this.recording.count - 1);
+  }
+
+  // -- from picture to picture --
+
+  frame(now) {
+    requestAnimationFrame((next) => this.frame(next));
+    const wait = Math.min((now - this.last) / 1000, 0.25);
+    this.last = now;
+    if (this.playing) {
+      this.seek(this.time + wait * this.speed);
+      if (this.time >= this.recording.end) this.play(false);
+      this.spare(wait);
+    }
+    // A picture at rest is drawn once more, at full resolution.
+    const { renderer } = this.scene, sharpen = !this.stale && renderer.scale < 1;
+    if (!this.stale && !sharpen) return;
+    renderer.scale = sharpen ? 1 : renderer.effort;
+    this.stale = this.scene.draw(this.time, wait);
+    // Words and sliders need not change with every picture.
+    if (!this.playing || now - this.told > 80) {
+      this.told = now;
+      this.tell();
+    }
+    this.pictures++;
+  }
+
+  /** Where pictures come slowly, draw fewer pixels. */
+  spare(wait) {
+    const { renderer } = this.scene;
+    this.slow = wait > SLOW ? this.slow + 1 : Math.max(0, this.slow - 1);
+    if (this.slow < 12) return;
+    renderer.effort = Math.max(0.5, 0.8 * renderer.effort);
+    this.slow = 0;
+  }
+
+  tell() {
+    const { recording, scene, time } = this, { info } = recording, { state } = scene, phase = info.phases[state.phase];
+    const write = (id, text) => part(id).textContent !== text && (part(id).textContent = text);
+    write("time", `${time.toFixed(1)} s`);
+    write("number", `${state.phase + 1}/${info.phases.length}`);
+    write("phase-name", phase?.name ?? "");
+    part("scrub").min = String(recording.start);
+    part("scrub").max = String(recording.end);
+    part("scrub").value = String(time);
+    part("scrub").setAttribute("aria-valuetext", `${time.toFixed(1)} s, ${phase?.name ?? ""}`);
+    [...part("phases").children].forEach((button, k) => button.toggleAttribute("aria-current", k === state.phase));
+    const share = recording.end > recording.start ? (time - recording.start) / (recording.end - recording.start) : 0;
+    for (const plot of this.plots) plot.point(share, state);
+    const larger = scene.enlarged > 1.15 ? `Vehicles are drawn ${digits(scene.enlarged)} times as large as they are.` : "";
+    write("notes", [info.note, larger].filter(Boolean).join("\n"));
+  }
+}
+
+function say(words) {
+  part("notice").textContent = words;
+  part("notice").hidden = false;
+}

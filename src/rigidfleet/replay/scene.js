@@ -1,0 +1,401 @@
+"use strict";
+// What a flight looks like at one moment, and from where it is seen.
+
+const AXES = [[0.84, 0.15, 0.16], [0.13, 0.58, 0.22], [0.12, 0.36, 0.86]];
+const IDLE = [0.42, 0.47, 0.53], PULL = [0.80, 0.11, 0.09], PUSH = [0.10, 0.33, 0.75];
+const INK = [0.13, 0.15, 0.18], BOX = [0.88, 0.88, 0.87], RIM = [0.50, 0.56, 0.63], FENCE = [0.69, 0, 0.13];
+const SMALLEST = 6, DETAILED = 12; // radius of a vehicle on the screen: at least; with all detail from [px]
+const TRAIL = 8; // length of trails [s]
+const CROWD = 60; // where more vehicles fly, each stands out less
+
+/** Colour of an edge: `share` of the largest tension, from -1 (pushes) to 1 (pulls), by its square root. */
+function tensionColour(share) {
+  return mixed(IDLE, share < 0 ? PUSH : PULL, Math.sqrt(Math.min(Math.abs(share), 1)));
+}
+
+const rgb = (hex) => [1, 3, 5].map((k) => parseInt(hex.slice(k, k + 2), 16) / 255);
+
+// -- the camera ---------------------------------------------------------------------------------------
+
+const CAMERAS = ["follow", "overview", "top"];
+
+class Camera {
+  constructor(info) {
+    this.info = info;
+    this.fov = (36 * Math.PI) / 180;
+    this.centre = [0, 0]; // of the part of the page that nothing covers, and the part's size: shares of half the page
+    this.free = [1, 1];
+    this.use("follow", true);
+    this.pan = [0, 0, 0];
+  }
+
+  /** Look from where a mode looks from; a moving picture goes there smoothly, unless `now`. */
+  use(mode, now = false) {
+    this.mode = mode;
+    this.azimuth = this.info.azimuth;
+    this.elevation = mode === "top" ? 1.55 : mode === "overview" ? 0.62 : 0.4;
+    this.zoom = 1;
+    this.pan = [0, 0, 0];
+    if (now) this.shown = null;
+  }
+
+  turn(dx, dy) {
+    this.azimuth -= dx;
+    this.elevation = Math.max(-0.15, Math.min(this.elevation + dy, 1.55));
+  }
+
+  /** Move what is looked at across the screen by shares of its height. */
+  shift(dx, dy) {
+    const { eye, target } = this, back = unit(sub(eye, target));
+    const right = unit(cross([0, 0, 1], back)), up = cross(back, right);
+    const s = 2 * Math.tan(this.fov / 2) * length(sub(eye, target));
+    this.pan = add(this.pan, add(scaled(right, -dx * s), scaled(up, dy * s)));
+  }
+
+  /** Be where it ought to be `wait` seconds after the last picture; true while still on its way. */
+  update(recording, state, aspect, wait) {
+    const { info } = this, narrow = Math.tan(this.fov / 2) * Math.min(aspect * this.free[0], this.free[1]);
+    let target = info.middle, reach = info.extent;
+    if (this.mode !== "overview") {
+      // Room for the formation as it will be soon, so that a change of shape does not leave the picture.
+      const [k] = recording.place(state.time), rate = info.step > 0 ? 1 / info.step : 0;
+      target = state.cm;
+      reach = 0;
+      for (let ahead = -1; ahead <= 2; ahead += 0.25) {
+        const at = Math.max(0, Math.min(k + Math.round(ahead * rate), recording.count - 1));
+        reach = Math.max(reach, recording.reachAt(at));
+      }
+      reach *= this.mode === "top" ? 1.6 : 1.08;
+    }
+    const wanted = {
+      distance: (reach * this.zoom) / Math.sin(Math.atan(narrow)),
+      azimuth: this.azimuth,
+      elevation: this.elevation,
+      target: add(target, this.pan),
+    };
+    // What moves with the formation stays with it; only what is left of a change of view fades.
+    const s = this.shown ?? { ...wanted, off: [0, 0, 0], mode: this.mode };
+    if (s.mode !== this.mode) s.off = sub(s.target, wanted.target);
+    const keep = Math.exp(-wait / 0.16), slow = Math.exp(-wait / 0.45);
+    s.mode = this.mode;
+    s.off = scaled(s.off, keep);
+    s.target = add(wanted.target, s.off);
+    s.azimuth = wanted.azimuth + (s.azimuth - wanted.azimuth) * keep;
+    s.elevation = wanted.elevation + (s.elevation - wanted.elevation) * keep;
+    s.distance = wanted.distance * Math.pow(s.distance / wanted.distance, slow);
+    this.shown = s;
+    const ce = Math.cos(s.elevation);
+    this.target = s.target;
+    this.eye = add(s.target, scaled([ce * Math.cos(s.azimuth), ce * Math.sin(s.azimuth), Math.sin(s.elevation)], s.distance));
+    if (info.solid) this.eye[2] = Math.max(this.eye[2], info.ground + 0.02 * s.distance + 0.05);
+    this.distance = s.distance;
+    this.near = s.distance * 0.02;
+    this.far = s.distance * 4 + 4 * info.extent + length(sub(this.eye, info.middle));
+    this.fog = Math.max(s.distance * 1.6, 0.5 * info.extent);
+    return length(s.off) > 1e-3 * s.distance || Math.abs(s.distance / wanted.distance - 1) > 1e-3
+      || Math.abs(s.azimuth - wanted.azimuth) + Math.abs(s.elevation - wanted.elevation) > 1e-3;
+  }
+}
+
+// -- the scene ----------------------------------------------------------------------------------------
+
+class Scene {
+  constructor(canvas, labels, recording) {
+    const { info } = recording;
+    this.recording = recording;
+    this.info = info;
+    this.n = info.radius.length;
+    this.colours = info.colours.map(rgb);
+    this.renderer = new Renderer(canvas);
+    this.labels = new Labels(labels);
+    this.show = { edges: true, trails: true, slots: true, axes: true, names: true };
+    this.camera = new Camera(info);
+    this.crowd = this.n > CROWD;
+    const upload = (mesh) => this.renderer.upload(mesh);
+    this.meshes = {
+      vehicle: upload(vehicleMesh()),
+      small: upload(smallVehicleMesh()),
+      rotor: upload(rotorMesh()),
+      box: upload(new Mesh().box([-0.5, -0.5, -0.5], [0.5, 0.5, 0.5], OWN)),
+      cone: upload(new Mesh().prism([0, 0, 0], 1, 0, 1, 12, OWN)),
+      pin: upload(new Mesh().prism([0, 0, 0], 1, 0, 1.3, 4, OWN).prism([0, 0, 0], 1, 0, -1.3, 4, OWN)),
+      shade: upload(new Mesh().ring([0, 0, 0], 0, 1, 16, OWN, [1, 0])),
+    };
+    const names = ["solid", "veils", "vehicles", "small", "ghosts", "smallGhosts", "cones", "pins", "shades"];
+    this.places = Object.fromEntries(names.map((name) => [name, new Places()]));
+    this.lines = { ground: new Lines(), world: new Lines() };
+    this.fade = info.boxes.map(() => 1);
+    this.enlarged = 1;
+    // Grid lines 1, 10, ... m apart, so that the formation covers some.
+    const size = Math.max(...recording.columns.position ? [recording.reachAt(0)] : [1], 1e-3);
+    this.gridStep = Math.pow(10, Math.floor(Math.log10(size) + 0.35));
+  }
+
+  /** Draw the flight at a time; true if the picture is not at rest. */
+  draw(time, wait) {
+    const { renderer, camera, recording } = this, { canvas } = renderer;
+    const state = recording.at(time);
+    this.state = state;
+    let moving = camera.update(recording, state, canvas.clientWidth / Math.max(canvas.clientHeight, 1), wait);
+    renderer.begin(camera);
+    for (const name in this.places) this.places[name].clear();
+    for (const name in this.lines) this.lines[name].clear();
+    this.labels.clear();
+    // World length of a pixel at a distance of 1 m.
+    this.pixel = (2 * Math.tan(camera.fov / 2)) / Math.max(canvas.clientHeight, 1);
+
+    moving = this.placeBoxes(wait) || moving;
+    this.placeVehicles(state);
+    if (this.show.trails) this.placeTrails(time);
+    if (this.show.edges) this.placeEdges(state);
+    if (this.show.axes) this.placeAxes(state);
+    this.placePath();
+    this.placeWaypoints(state);
+
+    const { meshes, places, lines, info } = this;
+    renderer.depth(null);
+    const under = [camera.target[0], camera.target[1], info.ground];
+    renderer.ground(under, Math.max(8 * camera.distance, 0.6 * info.extent), this.gridStep, info.solid);
+    renderer.meshes(meshes.shade, places.shades);
+    renderer.lines(lines.ground);
+    renderer.depth(true);
+    renderer.meshes(meshes.box, places.solid);
+    renderer.meshes(meshes.vehicle, places.vehicles);
+    renderer.meshes(meshes.small, places.small);
+    renderer.meshes(meshes.cone, places.cones);
+    renderer.meshes(meshes.pin, places.pins);
+    renderer.depth(false);
+    renderer.lines(lines.world);
+    renderer.meshes(meshes.vehicle, places.ghosts);
+    renderer.meshes(meshes.small, places.smallGhosts);
+    renderer.meshes(meshes.rotor, places.vehicles);
+    renderer.meshes(meshes.box, places.veils);
+    this.labels.flush();
+    return moving;
+  }
+
+  /** Metres that `px` pixels cover at a point. */
+  sized(point, px) {
+    return px * this.pixel * length(sub(point, this.camera.eye));
+  }
+
+  // -- what stands still --
+
+  /** Boxes; those between the eye and the vehicles turn into veils. */
+  placeBoxes(wait) {
+    const { info, camera, state, places, lines } = this;
+    let moving = false;
+    const order = info.boxes.map((box, i) => [i, length(sub(camera.eye, mixed(box.min, box.max, 0.5)))]);
+    for (const [i] of order.sort((a, b) => b[1] - a[1])) {
+      const { min, max } = info.boxes[i], goal = this.hides(min, max, state) ? 0.13 : 1;
+      this.fade[i] = goal + (this.fade[i] - goal) * Math.exp(-wait / 0.12);
+      if (Math.abs(this.fade[i] - goal) < 0.01) this.fade[i] = goal;
+      else moving = true;
+      const alpha = this.fade[i];
+      (alpha < 1 ? places.veils : places.solid).add(mixed(min, max, 0.5), sub(max, min), NO_TURN, BOX, alpha);
+      this.frame(min, max, RIM, 0.35 + 0.45 * alpha);
+      this.storeys(min, max, 0.22 * alpha);
+    }
+    if (info.fence) this.frame(info.fence.min, info.fence.max, FENCE, 0.45);
+    return moving;
+  }
+
+  hides(low, high, state) {
+    const { eye } = this.camera, every = Math.max(1, Math.floor(this.n / 24));
+    for (let i = 0; i < this.n; i += every) {
+      if (meets(eye, state.position.subarray(3 * i, 3 * i + 3), low, high)) return true;
+    }
+    return meets(eye, state.cm, low, high);
+  }
+
+  frame(low, high, colour, alpha) {
+    const at = (k) => [k & 1 ? high[0] : low[0], k & 2 ? high[1] : low[1], k & 4 ? high[2] : low[2]];
+    for (let k = 0; k < 8; k++) {
+      for (const bit of [1, 2, 4]) if (!(k & bit)) this.lines.world.add(at(k), at(k | bit), 1.2, colour, alpha);
+    }
+  }
+
+  /** Lines around a box at even heights, to show how large it is. */
+  storeys(low, high, alpha) {
+    const step = this.gridStep * (high[2] - low[2] > 40 * this.gridStep ? 10 : high[2] - low[2] > 8 * this.gridStep ? 5 : 1);
+    for (let z = Math.ceil(low[2] / step + 0.01) * step; z < high[2]; z += step) {
+      const at = [[low[0], low[1], z], [high[0], low[1], z], [high[0], high[1], z], [low[0], high[1], z]];
+      at.forEach((p, k) => this.lines.world.add(p, at[(k + 1) % 4], 1, RIM, alpha));
+    }
+  }
+
+  placeWaypoints(state) {
+    const { info, lines, places } = this;
+    const current = info.phases[state.phase];
+    info.phases.forEach((phase, k) => {
+      if (!phase.position) return;
+      const p = phase.position, now = phase === current, past = k < state.phase;
+      const size = this.sized(p, now ? 7 : 5), alpha = past ? 0.35 : 1;
+      const colour = past ? mixed(RIM, BACKGROUND, 0.35) : now ? INK : RIM;
+      places.pins.add(p, size, NO_TURN, colour, 1);
+      lines.world.add(p, [p[0], p[1], info.ground], 1, RIM, 0.45 * alpha);
+      places.shades.add([p[0], p[1], info.ground], this.sized(p, 7), NO_TURN, INK, 0.3 * alpha);
+      if (this.show.names) this.labels.add(this.renderer.project(p), phase.name, now ? "now" : "place", 14);
+    });
+  }
+
+  /** The way of the centre of mass through the whole flight. */
+  placePath() {
+    const { recording, lines, info } = this;
+    if (!info.path || !this.show.trails) return;
+    const { cm } = recording.columns, every = Math.max(1, Math.ceil(recording.count / 600));
+    const at = (k) => cm.subarray(3 * k, 3 * k + 3);
+    for (let k = 0; k < recording.count - 1; k += every) {
+      lines.world.add(at(k), at(Math.min(k + every, recording.count - 1)), 1.2, RIM, 0.38);
+    }
+  }
+
+  // -- what flies --
+
+  placeVehicles(state) {
+    const { info, places, n, recording } = this, shade = this.crowd ? 0.2 : 0.28;
+    const heading = Number.isNaN(state.attitude[0]) ? [1, 0, 0] : bodyAxes(state.attitude)[0];
+    this.enlarged = 1;
+    // Numbers where there is room for them.
+    const room = recording.reachAt(recording.place(state.time)[0]) / this.sized(state.cm, 1);
+    const named = this.show.names && n <= 40 && room > 22 * Math.sqrt(n);
+    for (let i = 0; i < n; i++) {
+      const p = state.position.subarray(3 * i, 3 * i + 3), radius = info.radius[i];
+      const pixel = this.sized(p, 1), size = Math.max(radius, SMALLEST * pixel), near = size > DETAILED * pixel;
+      this.enlarged = Math.max(this.enlarged, size / Math.max(radius, 1e-9));
+      const z = unit(state.thrust.subarray(3 * i, 3 * i + 3));
+      const y = unit(cross(z, Math.abs(dot(z, heading)) > 0.999 ? [0, 1, 0] : heading));
+      const q = quaternion(cross(y, z), y, z);
+      (near ? places.vehicles : places.small).add(p, size, q, this.colours[i], 1);
+      if (this.show.slots && !Number.isNaN(state.slot[3 * i])) {
+        this.placeGhost(near ? places.ghosts : places.smallGhosts, p, size, q, state.slot.subarray(3 * i, 3 * i + 3), i);
+      }
+      const height = p[2] - info.ground;
+      if (height > 0) {
+        const blur = size * 1.2 + 0.02 * height;
+        places.shades.add([p[0], p[1], info.ground], blur, NO_TURN, INK, (shade * size) / blur + 0.04);
+      }
+      if (named) this.labels.add(this.renderer.project(p), String(i + 1), "agent", 10 + (0.6 * size) / pixel, info.colours[i]);
+    }
+  }
+
+  /** Where a vehicle ought to be; seen only where it is not there. */
+  placeGhost(ghosts, p, size, q, error, i) {
+    const off = length(error), slot = add(p, error);
+    const alpha = Math.max(0, Math.min((off / size - 0.1) / 0.6, 1));
+    if (alpha === 0) return;
+    ghosts.add(slot, size, q, this.colours[i], 0.3 * alpha);
+    if (off > size) this.lines.world.add(p, slot, 1.2, this.colours[i], 0.55 * alpha);
+  }
+
+  placeEdges(state) {
+    const { info, lines } = this, { edges, tension } = info;
+    const slim = edges.length > 200 ? 0.55 : 1, veil = edges.length > 200 ? 0.55 : 0.9;
+    const at = (i) => state.position.subarray(3 * i, 3 * i + 3);
+    const below = (p) => [p[0], p[1], info.ground];
+    edges.forEach(([i, j], k) => {
+      const pull = state.tension[k];
+      if (Number.isNaN(pull)) return;
+      const share = pull / tension, load = Math.sqrt(Math.min(Math.abs(share), 1));
+      lines.world.add(at(i), at(j), slim * (2.2 + 2.8 * load), tensionColour(share), veil);
+      if (edges.length <= 200) lines.ground.add(below(at(i)), below(at(j)), 1.5, INK, 0.09);
+    });
+  }
+
+  /** The last seconds of every vehicle's way. */
+  placeTrails(time) {
+    const { recording, lines, n, state } = this, { position } = recording.columns;
+    const [k] = recording.place(time), step = recording.info.step;
+    if (!(step > 0)) return;
+    const first = Math.max(0, k - Math.floor(TRAIL / step));
+    const every = Math.max(1, Math.ceil(((k - first) * n) / (12000 * this.renderer.effort ** 3)), Math.round(0.06 / step));
+    const at = (j, i) => position.subarray(3 * (j * n + i), 3 * (j * n + i) + 3);
+    // Places that do not move along with the time, or the trail would shiver.
+    const begin = Math.ceil(first / every) * every;
+    const full = this.crowd ? 0.3 : 0.6;
+    const fresh = (j) => Math.pow(Math.max(0, 1 - (time - recording.start - j * step) / TRAIL), 1.4) * full;
+    for (let i = 0; i < n; i++) {
+      const colour = this.colours[i];
+      let j = begin;
+      for (; j + every <= k; j += every) lines.world.add(at(j, i), at(j + every, i), 2, colour, fresh(j), fresh(j + every));
+      if (j <= k) lines.world.add(at(j, i), state.position.subarray(3 * i, 3 * i + 3), 2, colour, fresh(j), full);
+    }
+  }
+
+  /** Body axes at the centre of mass, and faintly those commanded where they differ. */
+  placeAxes(state) {
+    const { lines, places, recording } = this;
+    if (Number.isNaN(state.attitude[0])) return;
+    const origin = Array.from(state.cm), [k] = recording.place(state.time);
+    const size = Math.max(0.42 * recording.reachAt(k), this.sized(origin, 26));
+    bodyAxes(state.attitude).forEach((axis, a) => {
+      const tip = add(origin, scaled(axis, size)), head = 0.05 * size + this.sized(tip, 3);
+      lines.world.add(origin, tip, 2.6, AXES[a], 0.95);
+      const across = unit(cross(axis, Math.abs(axis[2]) > 0.9 ? [1, 0, 0] : [0, 0, 1]));
+      places.cones.add(tip, [0.45 * head, 0.45 * head, 1.3 * head], quaternion(across, cross(axis, across), axis), AXES[a], 1);
+      if (this.show.names) this.labels.add(this.renderer.project(add(tip, scaled(axis, 1.9 * head))), "xyz"[a], "axis", 0, `rgb(${AXES[a].map((c) => 255 * c)})`);
+    });
+    if (Number.isNaN(state.reference[0])) return;
+    bodyAxes(state.reference).forEach((axis, a) => {
+      lines.world.add(origin, add(origin, scaled(axis, 1.15 * size)), 1.4, AXES[a], 0.4);
+    });
+  }
+}
+
+/** Does the way from a to b meet a box? */
+function meets(a, b, low, high) {
+  let from = 0, to = 1;
+  for (let s = 0; s < 3; s++) {
+    const d = b[s] - a[s];
+    if (Math.abs(d) < 1e-9) {
+      if (a[s] < low[s] || a[s] > high[s]) return false;
+      continue;
+    }
+    const x = (low[s] - a[s]) / d, y = (high[s] - a[s]) / d;
+    from = Math.max(from, Math.min(x, y));
+    to = Math.min(to, Math.max(x, y));
+  }
+  return from < to;
+}
+
+// -- words in the picture -----------------------------------------------------------------------------
+
+/** Labels over the picture; those that would cover an earlier one of their kind are left out. */
+class Labels {
+  constructor(box) {
+    this.box = box;
+    this.pool = [];
+    this.wanted = [];
+  }
+
+  clear() {
+    this.wanted.length = 0;
+  }
+
+  /** Words above a point (from `Renderer.project`) by `lift` pixels. */
+  add(point, text, kind, lift, colour = "") {
+    if (point) this.wanted.push({ x: point[0], y: point[1] - lift, far: point[2], text, kind, colour });
+  }
+
+  flush() {
+    const { wanted, pool, box } = this, taken = [];
+    const rank = (label) => ({ axis: 0, agent: 1, now: 2, place: 3 })[label.kind];
+    wanted.sort((a, b) => rank(a) - rank(b) || a.far - b.far);
+    let used = 0;
+    for (const label of wanted) {
+      const half = 3.4 * label.text.length + 3;
+      if (label.x < -half || label.x > box.clientWidth + half || label.y < 0 || label.y > box.clientHeight + 9) continue;
+      const covers = (t) => Math.abs(t.x - label.x) < t.half + half && Math.abs(t.y - label.y) < 13;
+      if (label.kind !== "agent" && label.kind !== "axis" && taken.some(covers)) continue;
+      taken.push({ ...label, half });
+      const span = (pool[used] ??= box.appendChild(document.createElement("span")));
+      used++;
+      if (span.textContent !== label.text) span.textContent = label.text;
+      if (span.className !== label.kind) span.className = label.kind;
+      if (span.style.color !== label.colour) span.style.color = label.colour;
+      span.style.transform = `translate(-50%, -50%) translate(${label.x.toFixed(1)}px, ${label.y.toFixed(1)}px)`;
+      span.hidden = false;
+    }
+    for (; used < pool.length; used++) pool[used].hidden = true;
+  }
+}

@@ -1,0 +1,42 @@
+"""A browser for all tests, and pages in it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from chromium import Browser, started
+from flights import swarm
+
+
+@pytest.fixture(scope="session")
+def browser(tmp_path_factory) -> Iterator[Browser]:
+    browser = started(tmp_path_factory.mktemp("chromium"))
+    yield browser
+    browser.driver.quit()
+
+
+@pytest.fixture(scope="session")
+def show(browser, tmp_path_factory) -> Callable[..., Browser]:
+    """Open the replay of a result; `where` is the part of the address after #."""
+    from rigidfleet.replay import replay
+
+    folder = tmp_path_factory.mktemp("pages")
+    written: dict[int, Path] = {}
+
+    def shown(result: Any, where: str = "t=0") -> Browser:
+        if id(result) not in written:
+            written[id(result)] = folder / f"{len(written)}.html"
+            replay(result, written[id(result)])
+        browser.open(f"{written[id(result)].as_uri()}#{where}")
+        return browser
+
+    return shown
+
+
+@pytest.fixture(scope="session")
+def eight() -> Any:
+    """Eight vehicles for 90 s."""
+    return swarm(8, 90.0)

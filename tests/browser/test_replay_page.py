@@ -1,0 +1,458 @@
+"""The replay in a real browser: what is on the page is the flight, and the controls control."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from chromium import started
+from flights import swarm
+
+from rigidfleet import attitude as att
+from rigidfleet.replay import replay
+
+pytestmark = pytest.mark.long
+
+# Draw at a time and read back the colour of the pixel where a point of the world is.
+PIXEL = """
+const [time, point] = arguments, { scene } = replay, { renderer } = scene, { gl, canvas } = renderer;
+renderer.scale = 1;
+scene.camera.shown = null;
+scene.draw(time, 10);
+const [x, y] = renderer.project(point), px = new Uint8Array(4), ratio = canvas.width / canvas.clientWidth;
+gl.readPixels(Math.round(x * ratio), canvas.height - Math.round(y * ratio), 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, px);
+return Array.from(px);
+"""
+
+
+def at(result, name: str, t: float) -> np.ndarray:
+    """An array of a result at a time."""
+    values = getattr(result, name)
+    flat = values.reshape(len(values), -1)
+    found = [np.interp(t, result.time, column) for column in flat.T]
+    return np.array(found).reshape(values.shape[1:])
+
+
+# -- the page
+
+
+def test_alone(show, eight):
+    """The page loads without an error, and asks nothing of any network."""
+    page = show(eight)
+    time.sleep(0.5)
+    assert page.heard() == []
+    assert [url for url in page.asked() if not url.startswith(("data:", "blob:"))] == []
+
+
+def test_may_not_ask(show, eight):
+    """The page could not reach a network if it tried: its own policy forbids it."""
+    page = show(eight)
+    refused = page.driver.execute_async_script(
+        "const done = arguments[0]; fetch('http://127.0.0.1:9/').then(() => done('sent'), (e) => done(e.name))"
+    )
+    assert refused == "TypeError"
+    assert any("Content Security Policy" in line for line in page.heard())
+
+
+def test_words(show, eight):
+    """Name, title, phase and time are on the screen; a user's words are words, not mark-up."""
+    page = show(eight, "t=60")
+    assert page.text("#name") == "swarm"
+    assert page.text("#title") == "8 vehicles, one sheet"
+    assert page.text("#phase-name") == '<round> & "round"</script>'
+    assert page.text("#number") == "2/2"
+    assert page.text("#time") == "60.0 s"
+    assert page.driver.title == "swarm – rigidfleet"
+    assert page.run("return document.querySelectorAll('#phases button').length") == 2
+
+
+def test_state_is_the_flight(show, eight):
+    """At any time, positions, slots, attitude and tension on the page are those of the result."""
+    page = show(eight)
+    for t in (0.0, 12.34, 44.99, 45.0, 71.717, 90.0):
+        state = page.run(
+            "const s = replay.recording.at(arguments[0]);"
+            "return Object.fromEntries(Object.entries(s).map(([k, v]) => [k, v.length ? Array.from(v) : v]))",
+            t,
+        )
+        r = at(eight, "position", t)
+        np.testing.assert_allclose(np.reshape(state["position"], (-1, 3)), r, atol=2e-3)
+        slots = r + np.reshape(state["slot"], (-1, 3))
+        np.testing.assert_allclose(slots, at(eight, "slot_position", t), atol=2e-3)
+        np.testing.assert_allclose(state["cm"], at(eight, "cm", t), atol=2e-3)
+        np.testing.assert_allclose(state["attitude"], at(eight, "attitude", t), atol=2e-3)
+        np.testing.assert_allclose(state["tension"], -at(eight, "multiplier", t), atol=5e-3)
+        force = at(eight, "input_force", t)
+        up = force / np.linalg.norm(force, axis=1, keepdims=True)
+        np.testing.assert_allclose(np.reshape(state["thrust"], (-1, 3)), up, atol=5e-3)
+
+
+def test_rotations(show, eight):
+    """Axes and quaternions on the page follow the package's conventions."""
+    page = show(eight)
+    rng = np.random.default_rng(3)
+    q = rng.normal(size=(20, 4))
+    q /= np.linalg.norm(q, axis=1, keepdims=True)
+    axes = page.run("return arguments[0].map((q) => bodyAxes(q))", q.tolist())
+    np.testing.assert_allclose(axes, att.dcm_from_quaternion(q), atol=1e-12)
+    # The rotation that takes the world's axes to the body's, up to its sign.
+    back = np.array(page.run("return arguments[0].map((a) => quaternion(...a))", axes))
+    turned = np.abs(np.sum(back * q, axis=1))
+    np.testing.assert_allclose(turned, 1.0, atol=1e-12)
+
+
+# -- the controls
+
+
+def test_plays_by_itself(show, eight):
+    """Opened without more, the flight plays, as fast as it flew."""
+    page = show(eight, "")
+    start, t = page.run("return [performance.now(), replay.time]")
+    time.sleep(1.5)
+    end, later = page.run("return [performance.now(), replay.time]")
+    assert later - t == pytest.approx((end - start) / 1000, rel=0.35)
+    assert page.run("return document.getElementById('play').getAttribute('aria-label')") == "Pause"
+
+
+def test_pause_and_play(show, eight):
+    """The button and the space bar pause and go on."""
+    page = show(eight, "")
+    page.click("#play")
+    t = page.run("return replay.time")
+    time.sleep(0.3)
+    assert page.run("return replay.time") == t
+    page.run("document.activeElement.blur()")
+    page.press(" ")
+    page.wait(f"return replay.time > {t}")
+    page.press(" ")
+    assert page.run("return replay.playing") is False
+
+
+def test_ends(show, eight):
+    """At its end the flight stops; played again, it begins anew."""
+    page = show(eight, "t=89.9")
+    page.click("#play")
+    page.wait("return !replay.playing")
+    assert page.run("return replay.time") == 90.0
+    page.click("#play")
+    page.wait("return replay.playing && replay.time > 0 && replay.time < 20")
+
+
+def test_scrub(show, eight):
+    """The slider goes to any time, and the picture with it."""
+    page = show(eight)
+    pictures = page.run("return replay.pictures")
+    page.run(
+        "const s = document.getElementById('scrub'); s.value = 33.3; s.dispatchEvent(new Event('input'))"
+    )
+    page.wait(
+        f"return replay.pictures > {pictures} && document.getElementById('time').textContent === '33.3 s'"
+    )
+    assert page.run("return replay.scene.state.time") == pytest.approx(33.3)
+
+
+def test_slider_follows(show, eight):
+    """While the flight plays, the slider and the marks in the plots move along."""
+    page = show(eight, "")
+    place = "return [Number(document.getElementById('scrub').value), document.querySelector('.cursor').style.transform]"
+    before = page.run(place)
+    page.wait("return replay.time > 1.5")
+    after = page.run(place)
+    assert after[0] > before[0]
+    assert after[1] != before[1]
+
+
+def test_speed(show, eight):
+    """At eight times the speed, time passes eight times as fast."""
+    page = show(eight, "")
+    page.run(
+        "const s = document.getElementById('speed'); s.value = '8'; s.dispatchEvent(new Event('change'))"
+    )
+    start, t = page.run("return [performance.now(), replay.time]")
+    time.sleep(1.5)
+    end, later = page.run("return [performance.now(), replay.time]")
+    assert later - t == pytest.approx(8 * (end - start) / 1000, rel=0.35)
+    page.press("-")
+    assert page.run("return replay.speed") == 4
+
+
+def test_keys(show, eight):
+    """Arrows step by a second, with Shift by a tenth; brackets go from phase to phase."""
+    from selenium.webdriver.common.keys import Keys
+
+    page = show(eight, "t=10")
+    page.press(Keys.ARROW_RIGHT)
+    assert page.run("return replay.time") == pytest.approx(11)
+    page.press(Keys.SHIFT + Keys.ARROW_LEFT + Keys.NULL)
+    assert page.run("return replay.time") == pytest.approx(10.9)
+    page.press("]")
+    assert page.run("return replay.time") == pytest.approx(45)
+    page.press("[")
+    assert page.run("return replay.time") == 0
+    page.press(Keys.END)
+    assert page.run("return replay.time") == 90
+
+
+def test_phase_and_plot(show, eight):
+    """A click on a phase goes to its start, a click in a plot to that time."""
+    page = show(eight)
+    page.click("#phases button:nth-child(2)")
+    page.wait("return document.getElementById('number').textContent === '2/2'")
+    assert page.run("return replay.time") == 45
+    page.click(".plot .area")  # its middle
+    assert page.run("return replay.time") == pytest.approx(45, abs=1)
+
+
+def test_address(show, eight):
+    """An address names a moment, a speed and a camera."""
+    page = show(eight, "t=52&camera=top&speed=2")
+    assert page.run("return [replay.time, replay.speed, replay.scene.camera.mode]") == [
+        52,
+        2,
+        "top",
+    ]
+    assert page.run("return replay.playing") is False
+
+
+# -- the picture
+
+
+def test_follows(show, eight):
+    """The camera keeps the centre of mass in the middle of what the panels leave free, and all in sight."""
+    page = show(eight)
+    for t in (0.0, 30.0, 60.0, 90.0):
+        page.run(
+            "replay.seek(arguments[0]); replay.scene.camera.shown = null; replay.scene.draw(arguments[0], 10)",
+            t,
+        )
+        middle = page.run("return replay.scene.renderer.project(replay.scene.state.cm)")
+        free = page.run(
+            "return [document.getElementById('panel').offsetLeft, document.getElementById('bar').offsetTop]"
+        )
+        assert middle[:2] == pytest.approx([free[0] / 2, free[1] / 2], abs=12)
+        for r in at(eight, "position", t):
+            x, y, _ = page.run("return replay.scene.renderer.project(arguments[0])", r.tolist())
+            assert 0 < x < free[0]
+            assert 0 < y < free[1]
+
+
+def test_cameras(show, eight):
+    """The overview holds the whole flight; from above, height does not show."""
+    page = show(eight, "t=30&camera=overview")
+    free = page.run(
+        "return [document.getElementById('panel').offsetLeft, document.getElementById('bar').offsetTop]"
+    )
+    for r in eight.position[::100].reshape(-1, 3):
+        x, y, _ = page.run("return replay.scene.renderer.project(arguments[0])", r.tolist())
+        assert 0 < x < free[0]
+        assert 0 < y < free[1]
+    page = show(eight, "t=30&camera=top")
+    low, high = page.run(
+        "const [x, y, z] = replay.scene.state.cm, see = (h) => replay.scene.renderer.project([x, y, h]);"
+        "return [see(z), see(z - 5)]"
+    )
+    assert low[:2] == pytest.approx(high[:2], abs=25)
+
+
+def test_turn_and_zoom(show, eight):
+    """Dragging turns, the wheel zooms, and the right button moves the view."""
+    from selenium.webdriver import ActionChains
+    from selenium.webdriver.common.actions.wheel_input import ScrollOrigin
+
+    page = show(eight)
+    view = page.driver.find_element("css selector", "#view")
+    look = "const c = replay.scene.camera; return [c.azimuth, c.elevation, c.zoom, ...c.pan]"
+    before = page.run(look)
+    # From a place that no panel covers.
+    drag = ActionChains(page.driver).move_to_element_with_offset(view, -100, 0)
+    drag.click_and_hold().move_by_offset(80, 30).release().perform()
+    turned = page.run(look)
+    assert turned[0] < before[0]
+    assert turned[1] > before[1]
+    ActionChains(page.driver).scroll_from_origin(
+        ScrollOrigin.from_element(view, -100, 0), 0, -300
+    ).perform()
+    page.wait("return replay.scene.camera.zoom < 0.9")
+    ActionChains(page.driver).key_down("\ue008").click_and_hold().move_by_offset(
+        40, 0
+    ).release().key_up("\ue008").perform()
+    assert page.run(look)[3:] != [0, 0, 0]
+    page.click("[data-mode=follow]")
+    assert page.run(look) == before
+
+
+def test_edges_show_tension(show, eight):
+    """An edge is red where it pulls and grey where it idles; blue where it pushes."""
+    page = show(eight)
+    page.run("for (const k in replay.scene.show) replay.scene.show[k] = k === 'edges'")
+    k, e = np.unravel_index(np.argmax(-eight.multiplier), eight.multiplier.shape)
+    i, j = eight.edges[e]
+    t = float(eight.time[k])
+    middle = at(eight, "position", t)[[i, j]].mean(axis=0).tolist()
+    red, _, blue, _ = page.run(PIXEL, t, middle)
+    assert red > blue + 60
+    page.run(
+        "const { tension } = replay.recording.columns; tension.forEach((v, k) => (tension[k] = -Math.abs(v)))"
+    )
+    red, _, blue, _ = page.run(PIXEL, t, middle)
+    assert blue > red + 60
+    page.run("replay.recording.columns.tension.fill(0)")
+    red, _, blue, _ = page.run(PIXEL, t, middle)
+    assert abs(blue - red) < 50
+
+
+def test_vehicles_in_their_colours(show, eight):
+    """A vehicle has its colour from the figures, and tilts as its thrust does."""
+    page = show(eight)
+    places = page.run(
+        "replay.scene.camera.zoom = 0.4; replay.scene.camera.shown = null; replay.scene.draw(5, 10);"
+        "const p = replay.scene.places.vehicles; return [p.count, Array.from(p.data.slice(0, 12 * p.count)),"
+        "Array.from(p.words.slice(0, 12 * p.count))]"
+    )
+    count, data, words = places
+    assert count == 8
+    data, words = np.reshape(data, (8, 12)), np.reshape(words, (8, 12))
+    first = int(words[0, 3])
+    assert [first & 255, first >> 8 & 255, first >> 16 & 255] == pytest.approx(
+        [0x00, 0x72, 0xB2], abs=1
+    )
+    force = at(eight, "input_force", 5.0)
+    up = force / np.linalg.norm(force, axis=1, keepdims=True)
+    # The body's z axis in the world: the last row of its attitude, world to body.
+    T = att.dcm_from_quaternion(data[:, 7:11])
+    np.testing.assert_allclose(T[:, 2], up, atol=5e-3)
+
+
+def test_ghosts(show, eight):
+    """A slot shows as a ghost where its vehicle is not, and only there."""
+    page = show(eight)
+    ghosts = (
+        "replay.scene.draw(arguments[0], 10); const { ghosts, smallGhosts } = replay.scene.places;"
+        "return ghosts.count + smallGhosts.count"
+    )
+    assert page.run(ghosts, 10.0) > 0
+    page.run("replay.recording.columns.slot.fill(0)")
+    assert page.run(ghosts, 10.0) == 0
+    page.run("replay.recording.columns.slot.fill(NaN)")
+    assert page.run(ghosts, 10.0) == 0
+
+
+def test_box_in_the_way(show, eight):
+    """A box between the eye and the vehicles becomes a veil."""
+    page = show(eight, "t=10")
+    solid = "replay.scene.draw(10, 10); return replay.scene.fade[0]"
+    assert page.run(solid) == 1
+    page.run(
+        "const s = replay.scene, at = mixed(s.camera.eye, s.state.cm, 0.5);"
+        "s.info.boxes[0] = { min: sub(at, [1, 1, 1]), max: add(at, [1, 1, 1]) }"
+    )
+    page.run(solid)
+    assert page.run(solid) < 0.3
+
+
+def test_switches(show, eight):
+    """What is switched off is not drawn."""
+    page = show(eight, "t=30")
+    count = "replay.scene.draw(30, 10); return replay.scene.lines.world.count"
+    everything = page.run(count)
+    for name in ("edges", "trails", "axes"):
+        page.click(f"[data-show={name}]")
+        less = page.run(count)
+        assert less < everything, name
+        everything = less
+    assert page.run("return document.querySelectorAll('#labels span:not([hidden])').length") > 0
+    page.click("[data-show=names]")
+    page.wait("return document.querySelectorAll('#labels span:not([hidden])').length === 0")
+
+
+def test_panel(show, eight):
+    """The panel can be put away; the picture then takes its place."""
+    page = show(eight)
+    middle = (
+        "replay.scene.draw(0, 10); return replay.scene.renderer.project(replay.scene.state.cm)[0]"
+    )
+    before = page.run(middle)
+    page.click("#more")
+    assert page.run("return document.getElementById('panel').offsetWidth") == 0
+    assert page.run(middle) > before + 80
+    page.click("#more")
+
+
+# -- unusual flights
+
+
+@pytest.mark.parametrize(
+    "flight",
+    [
+        pytest.param({"n": 1}, id="one vehicle"),
+        pytest.param({"n": 4, "seconds": 0.2}, id="short"),
+        pytest.param(
+            {"n": 3, "complete": False, "ending": "the flight <b>stopped</b>: far"}, id="incomplete"
+        ),
+        pytest.param({"n": 700}, id="hundreds"),
+    ],
+)
+def test_unusual(show, flight):
+    """One vehicle, a tenth of a second, a flight that stopped, hundreds: each is shown without an error."""
+    result = swarm(flight.pop("n"), flight.pop("seconds", 10.0), **flight)
+    page = show(result, "")
+    page.wait("return replay.pictures > 2")
+    assert page.heard() == []
+    if not result.complete:
+        assert page.text("#ending") == "Incomplete: the flight <b>stopped</b>"
+
+
+def test_no_webgl(tmp_path, eight):
+    """Where a browser cannot draw, the page says so and what to do."""
+    browser = started(tmp_path / "chromium", "--disable-3d-apis")
+    try:
+        replay(eight, tmp_path / "page.html")
+        browser.driver.get((tmp_path / "page.html").as_uri())
+        browser.wait("return !document.getElementById('notice').hidden")
+        assert "WebGL 2" in browser.text("#notice")
+    finally:
+        browser.driver.quit()
+
+
+@pytest.mark.skipif(
+    not Path("/proc/self/stat").exists(), reason="processor times are read in /proc"
+)
+def test_fluid(show):
+    """200 vehicles take less than 50 ms of two processors a picture, without any graphics card: 20 a second."""
+    page = show(swarm(200, 60.0), "t=20")
+    page.run("replay.scene.renderer.effort = 0.5; replay.play(true)")
+    time.sleep(1)
+    processes = _family(page.driver.service.process.pid)
+    used, pictures = _seconds(processes), page.run("return replay.pictures")
+    page.wait(f"return replay.pictures > {pictures} + 40", 60)
+    each = (_seconds(processes) - used) / (page.run("return replay.pictures") - pictures)
+    assert each / min(os.cpu_count() or 1, 2) < 0.05
+
+
+def _family(pid: int) -> list[int]:
+    """A process and all that descend from it."""
+    parents = {}
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            parents[int(stat.parent.name)] = int(stat.read_text().rsplit(")", 1)[1].split()[1])
+        except OSError:
+            continue
+    found = [pid]
+    for one in found:
+        found += [child for child, parent in parents.items() if parent == one]
+    return found
+
+
+def _seconds(processes: list[int]) -> float:
+    """Processor time that processes have used [s]."""
+    ticks = 0
+    for pid in processes:
+        try:
+            fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
+        except OSError:
+            continue
+        ticks += int(fields[11]) + int(fields[12])
+    return ticks / os.sysconf("SC_CLK_TCK")

@@ -1,0 +1,83 @@
+"""Flights made up from formulas, for looking at: no simulation, any number of vehicles."""
+
+from typing import Any
+
+import numpy as np
+
+from rigidfleet.mission import Mission
+from rigidfleet.result import PhaseRecord, Result
+
+G = 9.81
+
+
+def swarm(n: int, seconds: float, **changes) -> Result:
+    """A square sheet of vehicles that circles, turns and waves; edges to the nearest neighbours."""
+    side = int(np.ceil(np.sqrt(n)))
+    index = np.arange(n)
+    slots = 3.0 * np.stack([index % side, index // side, np.zeros(n)], axis=1).astype(float)
+    slots -= slots.mean(axis=0)
+    edges = _neighbours(slots)
+    half = seconds / 2
+    t = np.concatenate([np.arange(0, half, 0.05), [half, np.nextafter(half, 1e9)]])
+    t = np.concatenate([t, np.arange(half + 0.05, seconds, 0.05), [seconds]])
+    yaw = 0.1 * t
+    q = np.stack([np.cos(yaw / 2), 0 * t, 0 * t, np.sin(yaw / 2)], axis=1)
+    cm = np.stack([20 * np.sin(0.1 * t), 20 - 20 * np.cos(0.1 * t), 12 + 0 * t], axis=1)
+    c, s = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
+    x, y = slots[:, 0], slots[:, 1]
+    wanted = cm[:, None] + np.stack([c * x - s * y, s * x + c * y, 0 * c * x], axis=2)
+    r = wanted.copy()
+    r[:, :, 2] += 0.6 * np.sin(1.2 * t[:, None] + 0.3 * x)
+    v, a = np.gradient(r, 0.05, axis=0), np.gradient(np.gradient(r, 0.05, axis=0), 0.05, axis=0)
+    force = np.clip(a, -3, 3) + [0, 0, G]
+    k, m = len(t), len(edges)
+    distance = np.linalg.norm(r[:, edges[:, 0]] - r[:, edges[:, 1]], axis=2)
+    rest = np.linalg.norm(slots[edges[:, 0]] - slots[edges[:, 1]], axis=1)
+    error = distance - rest
+    empty3, empty4 = np.full((k, 3), np.nan), np.full((k, 4), np.nan)
+    mission = {
+        "schema_version": 1,
+        "name": "swarm",
+        "title": f"{n} vehicles, one sheet",
+        "agents": {"mass": 1.0, "position": slots + [0, 0, 12.0], "thrust_limit": 14.0},
+        "formations": {"sheet": {"slots": slots, "edges": edges + 1}},
+        "obstacles": [
+            {"kind": "ground"},
+            {"kind": "box", "name": "hall", "min": [-8.0, 45.0, 0.0], "max": [8.0, 60.0, 9.0]},
+        ],
+        "limits": {"separation": 1.0},
+        "phases": [
+            {"kind": "establish", "formation": "sheet", "blend": half, "until": half},
+            {"kind": "fly", "name": "<round> & \"round\"</script>", "position": cm[-1], "until": seconds},
+        ],
+    }  # fmt: skip
+    target = {"time": seconds, "position": cm[-1].tolist()}
+    arrays: dict[str, Any] = {
+        "time": t, "phase": (t > half).astype(int), "position": r, "velocity": v,
+        "acceleration": a, "slot_position": wanted, "input_force": force,
+        "constraint_force": np.zeros_like(r), "external_force": np.zeros_like(r),
+        "thrust": np.linalg.norm(force, axis=2), "cm": r.mean(axis=1), "cm_velocity": v.mean(axis=1),
+        "cm_reference": cm, "cm_velocity_reference": np.gradient(cm, 0.05, axis=0), "attitude": q,
+        "attitude_reference": q, "frame": empty4, "rates": empty3, "rates_reference": empty3,
+        "wrench_asked": np.zeros((k, 6)), "wrench_achieved": np.zeros((k, 6)), "edges": edges,
+        "distance": distance, "distance_reference": np.tile(rest, (k, 1)),
+        "distance_rate_reference": np.zeros((k, m)), "constraint": error,
+        "integral": np.zeros((k, m)), "multiplier": -8.0 * error, "singular_value": np.ones(k),
+        "separation": distance.min(axis=1, initial=9.0) - 0.5, "separation_pair": np.zeros((k, 2), int),
+        "clearance": r[:, :, 2].min(axis=1) - 0.25, "clearance_agent": np.zeros(k, int),
+        "clearance_obstacle": np.zeros(k, int),
+    }  # fmt: skip
+    phases = [
+        PhaseRecord("establish 1", "establish", "slots", "sheet", 0.0, half),
+        PhaseRecord("<round> & \"round\"</script>", "fly", "slots", "sheet", half, seconds, None, target),
+    ]  # fmt: skip
+    text = Mission.from_dict(mission).text
+    rest: dict[str, Any] = {"phases": phases, "mission_text": text}
+    return Result(**(arrays | rest | changes))
+
+
+def _neighbours(slots: np.ndarray) -> np.ndarray:
+    """Pairs no further apart than the diagonal of a square of four."""
+    apart = np.linalg.norm(slots[:, None] - slots[None], axis=2)
+    i, j = np.nonzero(np.triu(apart < 4.5, 1))
+    return np.stack([i, j], axis=1)

@@ -1,0 +1,234 @@
+"""The page of a flight, as far as it can be judged without a browser (see tests/browser)."""
+
+import base64
+import json
+import re
+import zlib
+
+import numpy as np
+import pytest
+from flights import swarm
+
+from rigidfleet.errors import ResultError
+from rigidfleet.figures import agent_colours
+from rigidfleet.replay import html_page, replay, thrust_directions
+from rigidfleet.replay.pack import Column, pack
+
+EIGHT = swarm(8, 90.0)
+
+
+def parts(page: str) -> tuple[dict, dict[str, np.ndarray]]:
+    """What a page tells of its flight, and its columns."""
+    found = re.search(
+        r'id="info">(.*?)</script>\s*<script type="text/plain" id="data">(.*?)</script>', page, re.S
+    )
+    assert found
+    info = json.loads(found[1])
+    return info, unpacked(info["columns"], found[2], info["count"])
+
+
+def unpacked(described: list[dict], text: str, count: int) -> dict[str, np.ndarray]:
+    """What `unpack` of the page makes of packed columns."""
+    data = np.frombuffer(zlib.decompress(base64.b64decode(text)), np.uint8)
+    columns, start = {}, 0
+    for column in described:
+        n = count * column["width"]
+        planes = data[start : start + 4 * n].reshape(4, n)
+        twice = np.ascontiguousarray(planes.T).view("<i4").reshape(column["width"], count)
+        whole = np.cumsum(np.cumsum(twice, axis=1, dtype=np.int32), axis=1, dtype=np.int32)
+        values = np.where(whole == -(2**31), np.nan, whole * column["step"])
+        columns[column["name"]] = values.T
+        start += 4 * n
+    assert start == len(data)
+    return columns
+
+
+# -- packing
+
+
+def test_packed_values_return():
+    """Packed values come back to half a step, NaN as NaN, and what is too large as large."""
+    rng = np.random.default_rng(0)
+    values = rng.normal(scale=50.0, size=(40, 3, 2))
+    values[10:20, 1] = np.nan
+    values[5, 0, 0] = np.inf
+    described, text = pack({"a": Column(values, 0.01), "b": Column(values[:, 0, 1], 0.5)})
+    assert [(c["name"], c["width"]) for c in described] == [("a", 6), ("b", 1)]
+    found = unpacked(described, text, 40)
+    a = found["a"].reshape(values.shape)
+    assert a[5, 0, 0] == pytest.approx(0.01 * (2**31 - 1))
+    a[5, 0, 0] = np.inf
+    np.testing.assert_allclose(a, values, atol=0.005 + 1e-9)
+    np.testing.assert_allclose(found["b"][:, 0], values[:, 0, 1], atol=0.25)
+
+
+# -- what the page holds
+
+
+def test_alone():
+    """Nothing in the page comes from elsewhere, and its policy allows nothing else."""
+    page = html_page(EIGHT)
+    assert re.findall(r"https?://|//cdn|@import|\bsrc\s*=|\bimport\s*\(", page) == []
+    assert "content=\"default-src 'none';" in page
+    assert not re.search(r"\{(policy|title|style|info|data|script)\}", page)
+
+
+def test_users_words_stay_words():
+    """A name that looks like mark-up does not end the script it stands in."""
+    page = html_page(EIGHT)
+    assert page.count("</script>") == 3
+    assert parts(page)[0]["phases"][1]["name"] == '<round> & "round"</script>'
+
+
+def test_same_flight_same_page():
+    """The same flight makes the same page, byte for byte."""
+    assert html_page(EIGHT) == html_page(swarm(8, 90.0))
+
+
+@pytest.mark.parametrize(("n", "seconds", "megabytes"), [(8, 90.0, 0.3), (200, 60.0, 1.5)])
+def test_small(n, seconds, megabytes):
+    """90 s of eight vehicles take less than 0.3 MB, 60 s of 200 less than 1.5 MB."""
+    assert len(html_page(swarm(n, seconds))) < megabytes * 1e6
+
+
+def test_colours_of_the_figures():
+    """Vehicles have the colours of the figures."""
+    assert parts(html_page(EIGHT))[0]["colours"] == agent_colours(8)
+
+
+def test_columns_are_the_flight():
+    """Position, slot, attitude and tension at the page's even times are those of the result."""
+    info, columns = parts(html_page(EIGHT))
+    t = info["start"] + info["step"] * np.arange(info["count"])
+    assert t[0] == EIGHT.time[0]
+    assert t[-1] == pytest.approx(EIGHT.time[-1])
+
+    def at(values):
+        flat = values.reshape(len(values), -1)
+        return np.stack([np.interp(t, EIGHT.time, column) for column in flat.T], axis=1)
+
+    position = at(EIGHT.position)
+    np.testing.assert_allclose(columns["position"], position, atol=1e-3)
+    np.testing.assert_allclose(
+        columns["position"] + columns["slot"], at(EIGHT.slot_position), atol=1e-3
+    )
+    np.testing.assert_allclose(columns["attitude"], at(EIGHT.attitude), atol=1e-4)
+    np.testing.assert_allclose(
+        columns["tension"], -at(EIGHT.multiplier), atol=info["tension"] / 999
+    )
+    np.testing.assert_allclose(columns["plot thrust"], at(EIGHT.thrust), atol=1e-3)
+    np.testing.assert_allclose(columns["plot separation"], at(EIGHT.separation[:, None]), atol=1e-3)
+    error = np.abs(EIGHT.constraint).max(axis=1, keepdims=True)
+    np.testing.assert_allclose(columns["plot error"], at(error), atol=2e-6)
+
+
+def test_jumps_stay_where_they_are():
+    """A slot that jumps at a switch of phases is the old one before it, and the new one from there on."""
+    result = swarm(4, 10.0)
+    second = result.phase == 1
+    result.slot_position[second] += [0.0, 0.0, 2.0]
+    result.slot_position[~second, 0] = np.nan
+    info, columns = parts(html_page(result))
+    t = info["start"] + info["step"] * np.arange(info["count"])
+    rise = (columns["position"] + columns["slot"]).reshape(-1, 4, 3)[:, 1, 2] - 12.0
+    np.testing.assert_allclose(rise[t < 5.0 - 1e-9], 0.0, atol=2e-3)
+    np.testing.assert_allclose(rise[t > 5.0 + 1e-9], 2.0, atol=2e-3)
+    missing = np.isnan(columns["slot"][:, 0])
+    assert missing[t < 5.0 - 1e-9].all()
+    assert not missing[t > 5.0 + 1e-9].any()
+
+
+def test_samples_no_denser_than_seen():
+    """A result of 1000 samples a second is thinned to 30; a sparse one stays as sparse."""
+    dense = swarm(2, 4.0)
+    fine = np.linspace(0, 4.0, 4001)
+    resampled = {}
+    for name in vars(dense):
+        value = getattr(dense, name)
+        if isinstance(value, np.ndarray) and len(value) == len(dense.time):
+            resampled[name] = value[np.searchsorted(dense.time, fine).clip(0, len(dense.time) - 1)]
+    resampled["time"] = fine
+    assert parts(html_page(swarm(2, 4.0, **resampled)))[0]["step"] == pytest.approx(1 / 30)
+    assert parts(html_page(dense))[0]["step"] == pytest.approx(0.05)
+
+
+# -- choices
+
+
+def test_thrust_directions():
+    """A vehicle points along its thrust; without one, or with noise, upwards."""
+    force = np.array([[3.0, 0.0, 4.0], [0.0, 0.0, 0.0], [1e-9, -1e-9, -1e-9], [0.0, 0.0, -9.0]])
+    up = thrust_directions(force, np.ones(4))
+    expected = [[0.6, 0.0, 0.8], [0, 0, 1], [0, 0, 1], [0, 0, -1]]
+    np.testing.assert_allclose(up, expected, atol=1e-7)
+    np.testing.assert_allclose(np.linalg.norm(up, axis=1), 1.0)
+
+
+@pytest.mark.parametrize(
+    ("share", "tension", "beyond"),
+    [(1e-9, 0.04905, False), (0.5, 4.905, False), (50.0, 19.62, True)],
+)
+def test_tension_scale(share, tension, beyond):
+    """Full colour stands for the greatest tension, but for no less than 0.5 % and no more than twice the weight."""
+    multiplier = np.zeros_like(EIGHT.multiplier)
+    multiplier[7, 3] = -share * 9.81
+    info, _ = parts(html_page(swarm(8, 90.0, multiplier=multiplier)))
+    assert info["tension"] == pytest.approx(tension)
+    assert info["beyond"] is beyond
+    assert ("No edge carries more" in info["note"]) is (share < 0.005)
+
+
+def test_too_many_edges(monkeypatch):
+    """Of too many edges the shortest are drawn, and the page says so."""
+    monkeypatch.setattr("rigidfleet.replay._EDGES", 10)
+    info, columns = parts(html_page(EIGHT))
+    assert len(info["edges"]) == columns["tension"].shape[1] == 10
+    assert "10 shortest of 17 edges" in info["note"]
+    straight = {
+        (int(i), int(j)) for (i, j), d in zip(EIGHT.edges, EIGHT.distance[0], strict=True) if d < 4
+    }
+    assert {tuple(e) for e in info["edges"]} <= straight
+
+
+def test_nothing_known():
+    """One vehicle, one sample, nothing but positions: there is still a page."""
+    one = swarm(1, 10.0)
+    first = {
+        name: value[:1]
+        for name, value in vars(one).items()
+        if isinstance(value, np.ndarray) and len(value) == len(one.time)
+    }
+    for name in ("slot_position", "attitude", "attitude_reference", "cm_reference"):
+        first[name] = np.full_like(first[name], np.nan)
+    first["separation"] = np.array([np.inf])
+    info, columns = parts(html_page(swarm(1, 10.0, **first, phases=one.phases[:1])))
+    assert info["count"] == 1
+    assert info["step"] == 0.0
+    assert np.isnan(columns["slot"]).all()
+    assert [plot["key"] for plot in info["plots"]] == ["thrust", "clearance"]
+
+
+def test_incomplete():
+    """A flight that stopped says why."""
+    assert (
+        parts(html_page(swarm(2, 4.0, complete=False, ending="too steep")))[0]["ending"]
+        == "too steep"
+    )
+
+
+# -- the file
+
+
+def test_file(tmp_path):
+    """`replay` writes the page, in place of an older file."""
+    path = tmp_path / "flight.html"
+    path.write_text("old")
+    replay(EIGHT, path)
+    assert path.read_text(encoding="utf-8") == html_page(EIGHT)
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_no_such_folder(tmp_path):
+    """A file that cannot be written is an error that names it."""
+    with pytest.raises(ResultError, match="there is no folder"):
+        replay(EIGHT, tmp_path / "missing" / "flight.html")
