@@ -2,11 +2,13 @@ import itertools
 import json
 import os
 import pty
+import re
 import resource
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -14,6 +16,7 @@ import pytest
 from rigidfleet import cli
 from rigidfleet.errors import FlightError
 from rigidfleet.figures import figure_names
+from rigidfleet.formation import SHAPES
 from rigidfleet.mission import mission_names, mission_text
 from rigidfleet.result import Result
 from rigidfleet.simulate import Progress
@@ -217,6 +220,105 @@ def test_check_wrong_json(capsys):
     assert found["right"] is False
     assert {finding["key"] for finding in found["findings"]} >= {"agents.mass"}
     assert all(finding["remedy"] for finding in found["findings"])
+
+
+# -- new ---------------------------------------------------------------------------------------------
+
+
+def test_new(capsys):
+    """A new mission is written where it says, is right, and is kept unless it is to be replaced."""
+    assert cli.main(["new", "mine", "--shape", "square", "--to", "3", "-4", "9"]) == cli.PASSED
+    assert "mine.toml: 4 agents, 1 formation, 4 phases" in capsys.readouterr().out
+    assert cli.main(["check", "mine.toml"]) == cli.PASSED
+    assert "(3, -4, 9) m" in capsys.readouterr().out
+    text = Path("mine.toml").read_text(encoding="utf-8")
+    assert cli.main(["new", "mine"]) == cli.BAD_INPUT
+    assert "mine.toml: exists already" in capsys.readouterr().err
+    assert Path("mine.toml").read_text(encoding="utf-8") == text
+    assert cli.main(["new", "mine.toml", "--force", "--quiet"]) == cli.PASSED
+    assert capsys.readouterr() == ("", "")
+    assert 'shape = "triangle"' in Path("mine.toml").read_text(encoding="utf-8")
+
+
+def test_new_without_a_terminal_asks_nothing():
+    """Where nobody can answer, a new mission is that of the defaults."""
+    done = command("new")
+    assert done.returncode == cli.PASSED
+    assert done.stdout.startswith("mission.toml: 3 agents")
+    assert done.stderr == ""
+
+
+def test_new_names_every_shape(capsys):
+    """Help names the shapes that there are."""
+    cli.main(["new", "--help"])
+    words = re.split(r"\W+", capsys.readouterr().out)
+    assert SHAPES.keys() <= {*words}
+
+
+def test_new_json(capsys):
+    """As JSON, a new mission is described as `check` describes it."""
+    assert cli.main(["new", "mine", "--json", "--agents", "6"]) == cli.PASSED
+    found = json.loads(capsys.readouterr().out)
+    assert (found["file"], found["agents"], found["formations"]) == ("mine.toml", 6, ["hexagon"])
+
+
+@pytest.mark.parametrize(
+    ("tokens", "words"),
+    [
+        (["--shape", "trangle"], "did you mean 'triangle'"),
+        (["--mass", "-1"], "agents.mass = -1"),
+        (["--to", "1", "2"], "requires"),
+    ],
+)
+def test_new_that_cannot_be(capsys, tokens, words):
+    """A mission that would be wrong is not written."""
+    assert cli.main(["new", "mine", *tokens]) == cli.BAD_INPUT
+    assert words in " ".join(capsys.readouterr().err.split())
+    assert not Path("mine.toml").exists()
+
+
+def test_new_into_no_folder(capsys):
+    """A folder that is not there is an error that says so."""
+    assert cli.main(["new", "no/folder/mine", "--quiet"]) == cli.BAD_INPUT
+    assert "there is no folder" in capsys.readouterr().err
+
+
+def test_new_asks_on_a_terminal(folder):
+    """On a terminal a few questions are asked; an answer that cannot be is asked for again."""
+    answers = ["asked", "polgon", "polygon", "2", "7", "", "x", "2", "1 2", "10, 5 9"]
+    out = on_terminal(["new"], answers)
+    for words in ("did you mean 'polygon'", "3 or more agents, not 2", "'x' is no number", "Three"):
+        assert words in out
+    text = Path("asked.toml").read_text(encoding="utf-8")
+    for line in ('shape = "polygon"', "mass = 2 ", "size = 4 ", "position = [10, 5, 9]"):
+        assert line in text
+    assert "No answer" in on_terminal(["new"], [None])
+    assert not Path("mission.toml").exists()
+
+
+def on_terminal(arguments: list[str], answers: Sequence[str | None]) -> str:
+    """What a terminal shows of the command, each answer given when it is asked for; None ends the input."""
+    terminal, side = pty.openpty()
+    with subprocess.Popen(
+        [sys.executable, "-m", "rigidfleet", *arguments],
+        stdin=side, stdout=side, stderr=side,
+        env=os.environ | {"COLUMNS": "200", "TERM": "xterm"},
+    ) as process:  # fmt: skip
+        os.close(side)
+        shown, since = "", 0
+        for answer in answers:
+            while "]: " not in shown[since:]:
+                shown += os.read(terminal, 4096).decode()
+            since = len(shown)
+            os.write(terminal, b"\x04" if answer is None else answer.encode() + b"\n")
+        try:
+            while more := os.read(terminal, 4096):
+                shown += more.decode()
+        except OSError:  # the terminal's other end is closed
+            pass
+        os.close(terminal)
+        process.wait(timeout=60)
+    return shown
 
 
 # -- run ---------------------------------------------------------------------------------------------

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from rigidfleet.assess import assess
     from rigidfleet.figures import plot
     from rigidfleet.mission import load_mission
+    from rigidfleet.report import report
     from rigidfleet.result import Result
     from rigidfleet.simulate import simulate
 

@@ -18,7 +18,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
-from collections.abc import Generator, Iterable, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import cache
@@ -26,7 +26,7 @@ from io import TextIOWrapper
 from pathlib import Path
 from tempfile import TemporaryDirectory, TemporaryFile
 from time import perf_counter
-from typing import IO, TYPE_CHECKING, Annotated, Self
+from typing import IO, TYPE_CHECKING, Annotated, Any, Self
 
 from cyclopts import App, CycloptsError, Parameter, UnusedCliTokensError
 
@@ -223,21 +223,87 @@ def check(mission: str, /, *, json: bool = False) -> int:
     if json:
         _print_json({"mission": mission, "right": True} | _facts(found))
         return PASSED
-    counts = (
-        _count(found.n_agents, "agent"),
-        _count(len(found.formations), "formation"),
-        _count(len(found.phases), "phase"),
-        _length(found),
-    )
     table = _table("#", "phase", "kind", "to", "ends", "control")
     for n, phase in enumerate(found.phases, start=1):
         table.add_row(str(n), phase.name, phase.kind, goal(phase), ending(phase), phase.control)
-    _out().print(f"{found.name}: right: {', '.join(counts)}")
+    _out().print(f"{found.name}: right: {_counted(found)}")
     _print_table(table)
     return PASSED
 
 
 @app.command(sort_key=4)
+def new(
+    name: str = "",
+    /,
+    *,
+    shape: str | None = None,
+    agents: int | None = None,
+    size: Annotated[list[float] | None, Parameter(consume_multiple=True)] = None,
+    mass: float | None = None,
+    thrust_limit: float | None = None,
+    to: list[tuple[float, float, float]] | None = None,
+    force: bool = False,
+    quiet: bool = False,
+    json: bool = False,
+) -> int:
+    """Write a mission to start from: commented, checked, ready to fly.
+
+    Without options, on a terminal, it asks a few questions.
+
+    Parameters
+    ----------
+    name : str
+        Name of the mission, which is written to NAME.toml; or a path that ends so.
+    shape : str
+        line, triangle, square, polygon, hexagon, pyramid, cube, cuboid, v, grid, sphere, helix,
+        tetrahedron, octahedron, icosahedron or dodecahedron.
+    agents : int
+        Number of vehicles; as many as the shape needs if not given.
+    size : float
+        Edge length of the shape [m]; of a cuboid or a helix one, or three.
+    mass : float
+        Mass of each vehicle [kg].
+    thrust_limit : float
+        Greatest thrust of each vehicle [N]; 2.2 times its weight if not given.
+    to : float
+        Waypoint to fly to, X Y Z [m]; may be repeated.
+    force : bool
+        Replace a file that is there already.
+    quiet : bool
+        Print nothing but errors, and the JSON if asked for. Ask nothing.
+    json : bool
+        Print what was written as JSON. Ask nothing.
+    """
+    from rigidfleet.mission import Mission
+    from rigidfleet.mission import draft as drafts
+    from rigidfleet.result import write_file
+
+    given: dict[str, Any] = {
+        "shape": shape, "agents": agents, "size": size, "mass": mass,
+        "thrust_limit": thrust_limit, "waypoints": to,
+    }  # fmt: skip
+    asked = {key: value for key, value in given.items() if value is not None}
+    if not (asked or quiet or json) and sys.stdin.isatty() and _err().is_terminal:
+        name, asked = _ask(name)
+    file = Path(name or "mission")
+    file = file if file.suffix == ".toml" else file.with_name(f"{file.name}.toml")
+    if file.exists() and not force:
+        raise RigidfleetError(f"{file}: exists already and is kept. Replace it by --force.")
+    try:
+        text = drafts.draft(file.stem, file=str(file), **asked)
+    except ValueError as error:
+        raise RigidfleetError(str(error)) from None
+    mission = Mission.from_toml(text, str(file))
+    write_file(file, text.encode())
+    if json:
+        _print_json({"file": str(file)} | _facts(mission))
+    elif not quiet:
+        _out().print(f"{file}: {_counted(mission)}", soft_wrap=True)
+        _out().print(f"Fly it by: rigidfleet run {file}", soft_wrap=True)
+    return PASSED
+
+
+@app.command(sort_key=5)
 def report(
     result: Path,
     /,
@@ -311,6 +377,62 @@ def report(
         if kept and not quiet:
             _err().print(f"{_count(len(kept), 'file')} kept as before; --force makes them again")
     return PASSED if all(verdict.passed for verdict in verdicts) else FAILED
+
+
+def _ask(name: str) -> tuple[str, dict[str, Any]]:
+    """Name and contents of a new mission, asked for one by one; an empty answer takes what is offered."""
+    from rigidfleet.formation import SHAPES, agents_taken, slots
+    from rigidfleet.mission import draft as drafts
+
+    def answer(question: str, offered: str, take: Callable[[str], Any]) -> Any:
+        while True:
+            try:
+                text = _err().input(f"{question} [{offered}]: ", markup=False).strip() or offered
+            except EOFError:
+                raise RigidfleetError("No answer, so nothing is written. Give options.") from None
+            try:
+                return take(text)
+            except ValueError as error:
+                _err().print(f"  {error}", style="yellow")
+
+    def number(text: str) -> float:
+        value = _number(text)
+        if not value > 0:
+            raise ValueError("It must be positive.")
+        return value
+
+    def known(text: str) -> str:
+        drafts.shape_known(text)
+        return text
+
+    def count(text: str) -> int:
+        slots(shape, [1.0] * SHAPES[shape].sizes, int(_number(text)))
+        return int(_number(text))
+
+    def point(text: str) -> tuple[float, ...]:
+        values = tuple(map(_number, text.replace(",", " ").split()))
+        if len(values) != 3:
+            raise ValueError("Three numbers: x, y, z.")
+        return values
+
+    name = name or answer("Name", "mission", str)
+    shape = answer(f"Shape ({', '.join(SHAPES)})", "triangle", known)
+    asked: dict[str, Any] = {"shape": shape}
+    usual = drafts.agents_for(shape)
+    if len(SHAPES[shape].agents) > 1:
+        asked["agents"] = answer(f"Vehicles ({agents_taken(shape)})", str(usual), count)
+    asked["size"] = [answer("Edge length [m]", f"{drafts.SIZE:g}", number)]
+    asked["mass"] = answer("Mass of each [kg]", f"{drafts.MASS:g}", number)
+    there = " ".join(f"{x:g}" for x in drafts.WAYPOINT)
+    asked["waypoints"] = [answer("Fly to x y z [m]", there, point)]
+    return name, asked
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise ValueError(f"'{text}' is no number.") from None
 
 
 # -- flying ------------------------------------------------------------------------------------------
@@ -546,9 +668,16 @@ def _facts(mission: Mission) -> dict[str, object]:
     }
 
 
-def _length(mission: Mission) -> str:
+def _counted(mission: Mission) -> str:
+    """How much of everything a mission has."""
     most = "at most " if any(phase.settle for phase in mission.phases) else ""
-    return f"{most}{mission.latest_end:g} s"
+    counts = (
+        _count(mission.n_agents, "agent"),
+        _count(len(mission.formations), "formation"),
+        _count(len(mission.phases), "phase"),
+        f"{most}{mission.latest_end:g} s",
+    )
+    return ", ".join(counts)
 
 
 def _count(n: int, noun: str) -> str:

@@ -1,0 +1,246 @@
+"""A mission to start from: commented, flyable, and to be changed."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Sequence
+
+import numpy as np
+
+from rigidfleet import formation as shapes
+from rigidfleet.formation import Floats
+from rigidfleet.mission.notes import near
+
+#: Chosen for a mission that says nothing of them: vehicle [kg], [m], shape [m], where it flies [m].
+MASS, RADIUS, SIZE, WAYPOINT = 1.2, 0.25, 4.0, (20.0, 10.0, 10.0)
+#: Thrust over weight of a usual vehicle.
+_LIFT = 2.2
+#: Speed [m/s] and acceleration [m/s^2] that the times of flights are chosen for.
+_SPEED, _ACCELERATION = 4.0, 1.2
+#: Room between vehicles on the ground, centre to centre [m].
+_APART = 1.2
+#: More agents are held by their slots alone; edges between all pairs would be too many.
+_ALL_PAIRS, _MOST = 40, 2000
+#: Where comments beside keys begin.
+_COLUMN = 34
+
+
+def draft(
+    name: str,
+    *,
+    shape: str | None = None,
+    agents: int | None = None,
+    size: Sequence[float] = (SIZE,),
+    mass: float = MASS,
+    thrust_limit: float | None = None,
+    waypoints: Sequence[Sequence[float]] = (WAYPOINT,),
+    file: str = "",
+) -> str:
+    """TOML text of a mission: take off, form a shape, fly it to waypoints, hold.
+
+    What is wrong with its numbers is found when it is checked.
+
+    Parameters
+    ----------
+    shape : of `rigidfleet.formation.SHAPES`; by default one that takes so many agents
+    agents : how many; by default as many as the shape needs
+    size : edge length of the shape [m], or three of them
+    mass : of each agent [kg]
+    thrust_limit : of each agent [N]; by default 2.2 times its weight
+    waypoints : of the centre of mass [m], in turn
+    file : its name, for the comments
+
+    Raises
+    ------
+    ValueError
+        The shape is unknown, or takes another number of agents or sizes; there are too many agents,
+        or a number is not finite.
+    """
+    if shape is None:
+        shape = shape_for(agents)
+    shape_known(shape)
+    n = agents_for(shape) if agents is None else agents
+    if n > _MOST:
+        raise ValueError(f"{n} agents are more than {_MOST}, the most that a new mission takes")
+    if not np.isfinite([thrust_limit or 0.0, mass, *size, *np.ravel(waypoints)]).all():
+        raise ValueError("masses, sizes, limits and waypoints must be finite")
+    slots = shapes.slots(shape, list(size) * (3 if _is_box(shape, size) else 1), n)
+    pairs = shapes.distances(slots, shapes.complete_graph(n))
+    nearest = float(pairs.min()) if n > 1 else SIZE
+    start = _start(slots, min(_APART, nearest))
+    height = max(5.0, math.ceil(np.ptp(slots[:, 2]) + 3.0))
+    centre = start.mean(axis=0)
+    aloft = np.array([centre[0], centre[1], height])
+    limit = math.ceil(_LIFT * mass * 9.81) if thrust_limit is None else thrust_limit
+    extent = json.dumps([float(x) for x in size]) if len(size) > 1 else f"{size[0]:g}"
+    if _is_box(shape, size):
+        extent = json.dumps([float(size[0])] * 3)
+    head = _HEAD.format(
+        name=name,
+        title=f"{n} vehicles fly as a {shape}" if n > 1 else "One vehicle flies",
+        file=file or f"{name}.toml",
+        mass=f"{mass:g}",
+        start=_rows(start),
+        radius=f"{min(RADIUS, nearest / 4):.3g}",
+        thrust=f"{limit:g}",
+        shape=shape,
+        size=extent,
+        edges="" if n <= _ALL_PAIRS else _NO_EDGES,
+        takes=shapes.agents_taken(shape),
+        text=shapes.SHAPES[shape].text,
+        separation=f"{min(0.5, nearest / 6):.3g}",
+        # Of a small shape in space those below are near, whatever one does.
+        below="# " if shapes.dimension(slots) == 3 and nearest < 3.0 else "",
+        aloft=_row(aloft),
+        climb=_time(aloft - centre),
+    )
+    return _aligned(head + "".join(_flights(aloft, waypoints)) + _TAIL)
+
+
+def shape_known(shape: str) -> None:
+    """ValueError, with a near one, where there is no such shape."""
+    if shape not in shapes.SHAPES:
+        remedy = near(shape, shapes.SHAPES) or f"known shapes: {', '.join(shapes.SHAPES)}"
+        raise ValueError(f"there is no shape {shape!r}: {remedy}")
+
+
+def shape_for(agents: int | None) -> str:
+    """The shape that a number of agents makes best."""
+    usual = {None: "triangle", 1: "line", 2: "line", 3: "triangle", 4: "square", 6: "hexagon"}
+    return usual.get(agents, "cube" if agents == 8 else "polygon")
+
+
+def agents_for(shape: str) -> int:
+    """The number of agents that makes a shape what it looks like."""
+    taken = shapes.SHAPES[shape].agents
+    usual = {"line": 3, "polygon": 5, "pyramid": 5, "v": 5, "grid": 9, "sphere": 12, "helix": 12}
+    return usual.get(shape, taken.start)
+
+
+def _is_box(shape: str, size: Sequence[float]) -> bool:
+    """Whether one size stands for three."""
+    return len(size) == 1 and shapes.SHAPES[shape].sizes == 3
+
+
+def _start(slots: Floats, apart: float) -> Floats:
+    """Places (N, 3) [m] on the ground, each under its slot; those above others stand further out."""
+    order = np.argsort(slots[:, 2], kind="stable")
+    placed: list[Floats] = []
+    start = np.empty_like(slots)
+    for i in order.tolist():
+        way = slots[i, :2]
+        out = way / np.linalg.norm(way) if np.linalg.norm(way) > 1e-9 else np.array([1.0, 0.0])
+        place = way
+        while any(np.linalg.norm(place - other) < apart * (1 - 1e-9) for other in placed):
+            place = place + 0.5 * apart * out
+        placed.append(place)
+        start[i] = [*place, 0.3]
+    return start
+
+
+def _flights(at: Floats, waypoints: Sequence[Sequence[float]]) -> list[str]:
+    """A phase for each waypoint, on the way from where the formation is."""
+    found = []
+    for waypoint in waypoints:
+        to = np.asarray(waypoint, dtype=float)
+        found.append(_FLY.format(position=_row(to), time=_time(to - at)))
+        at = to
+    return found
+
+
+def _time(way: Floats) -> str:
+    """A time [s] for a way (3,) [m] from rest to rest, within the speed and acceleration chosen."""
+    distance = float(np.linalg.norm(way))
+    least = max(1.5 * distance / _SPEED, math.sqrt(6.0 * distance / _ACCELERATION))
+    return f"{max(4, math.ceil(least))}.0"
+
+
+def _aligned(text: str) -> str:
+    """Text whose comments beside keys begin in one column."""
+    beside = re.compile(r"^([^#\n]*[^#\s]) +# ?(.*)$", re.MULTILINE)
+    return beside.sub(lambda m: f"{m[1]:<{_COLUMN - 1}} # {m[2]}", text)
+
+
+def _row(values: Sequence[float] | Floats) -> str:
+    # Adding zero takes the sign off a negative zero.
+    return f"[{', '.join(f'{round(float(x), 3) + 0.0:g}' for x in values)}]"
+
+
+def _rows(values: Floats) -> str:
+    return "".join(f"    {_row(row)},\n" for row in values)
+
+
+_HEAD = """\
+# {title}.
+#
+# Change any number, and say what you see:
+#     rigidfleet check {file}
+#     rigidfleet run {file}
+# Units are SI; x is east, y north, z up; agents count from 1. A key that is wrong is an error with a remedy.
+
+schema_version = 1
+name = "{name}"                   # results go to flights/NAME
+title = "{title}"
+
+[agents]
+mass = {mass}                        # [kg] one number for all, or a list
+position = [                      # [m] where they stand at the start
+{start}]
+radius = {radius}                     # [m] of the sphere around each that must touch nothing
+thrust_limit = {thrust}                # [N] of each; the verdict fails where it is passed
+
+[formations.{shape}]              # {takes}: {text}
+shape = "{shape}"                 # or slots = [[x, y, z], ...], one for each agent [m]
+size = {size}                          # [m]
+{edges}
+# Another shape to change to in flight: a table [formations.NAME] for it, and a phase
+#     kind = "reshape", formation = "NAME", duration = 6.0
+
+[[obstacles]]
+kind = "ground"
+
+# [[obstacles]]                   # a wall that must not be hit
+# kind = "box"
+# min = [8, 4, 0]                 # [m]
+# max = [9, 6, 15]
+
+[limits]                          # what the verdict holds each vehicle to
+separation = {separation}                  # [m] between surfaces
+{below}separation_below = 0.8            # [m] below another, for its downwash
+# speed = 6.0                     # [m/s]
+# acceleration = 4.0              # [m/s^2]
+# geofence = {{min = [-50, -50, 0], max = [50, 50, 30]}}
+
+# -- the flight: phases in order, each ending after its duration [s] ------------------------------
+
+[[phases]]                        # straight up, in the shape of the start
+name = "climb"
+kind = "fly"
+position = {aloft}                # [m] of the centre of mass, here and below
+duration = {climb}
+
+[[phases]]                        # take the formation
+kind = "establish"
+formation = "{shape}"
+duration = 6.0
+"""
+
+_NO_EDGES = (
+    "edges = []  # held by tracking alone; between so many, list those that count: [[1, 2], ...]\n"
+)
+
+_FLY = """
+[[phases]]
+kind = "fly"
+position = {position}
+yaw_deg = 0.0                     # attitude of the formation on arrival
+duration = {time}
+"""
+
+_TAIL = """
+[[phases]]
+kind = "hold"
+duration = 3.0
+"""

@@ -1,0 +1,92 @@
+"""New missions: whatever is asked for flies and passes."""
+
+import numpy as np
+import pytest
+
+from rigidfleet.assess import assess
+from rigidfleet.formation import SHAPES
+from rigidfleet.mission import Mission
+from rigidfleet.mission.draft import agents_for, draft, shape_for
+from rigidfleet.simulate import simulate
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_every_shape_flies_and_passes(shape):
+    """A new mission of any shape passes its verdict as it is."""
+    mission = Mission.from_toml(draft("new", shape=shape))
+    assert mission.n_agents == agents_for(shape)
+    verdict = assess(simulate(mission))
+    assert verdict.passed, verdict.summary
+
+
+@pytest.mark.parametrize(
+    "asked",
+    [
+        {"agents": 1},
+        {"agents": 2, "size": [0.5]},
+        {"shape": "cube", "size": [1.0]},
+        {"shape": "cuboid", "size": [8.0, 2.0, 4.0]},
+        {"shape": "pyramid", "agents": 6},
+        {"shape": "line", "agents": 7, "size": [1.2], "mass": 0.3},
+        {"agents": 50},
+        {"waypoints": [(0.0, 0.0, 20.0), (-40.0, 30.0, 6.0)]},
+    ],
+    ids=str,
+)
+def test_other_numbers_fly_and_pass(asked):
+    """So does one of few or many agents, small or long, light, or with several waypoints."""
+    verdict = assess(simulate(Mission.from_toml(draft("new", **asked))))
+    assert verdict.passed, verdict.summary
+
+
+def test_what_is_asked_is_what_is_written():
+    """Numbers given are those of the mission; times leave room for vehicles to keep up."""
+    mission = Mission.from_toml(
+        draft(
+            "mine", shape="hexagon", size=[3.0], mass=0.8, thrust_limit=15.0, waypoints=[(1, 2, 9)]
+        )
+    )
+    assert mission.name == "mine"
+    assert mission.agents.mass == (0.8,) * 6
+    assert mission.agents.thrust_limit == (15.0,) * 6
+    assert mission.formations["hexagon"].size == 3.0
+    result = simulate(mission)
+    assert np.linalg.norm(result.cm_velocity, axis=1).max() < 4.1
+    np.testing.assert_allclose(result.cm[-1], [1, 2, 9], atol=1e-2)
+
+
+def test_comments_stand_in_one_column():
+    """Comments beside keys begin in one column, and no line is wider than an editor's window."""
+    lines = draft("a-name", shape="cuboid").splitlines()
+    beside = [line for line in lines if "#" in line and not line.startswith("#")]
+    assert len(beside) > 10
+    assert {line.index("#") for line in beside} == {34}
+    assert max(map(len, lines)) <= 120
+
+
+@pytest.mark.parametrize(
+    ("agents", "shape"), [(None, "triangle"), (3, "triangle"), (8, "cube"), (5, "polygon")]
+)
+def test_shape_for_agents(agents, shape):
+    """Without a shape, agents make the one that suits their number."""
+    assert shape_for(agents) == shape
+
+
+@pytest.mark.parametrize(
+    ("asked", "words"),
+    [
+        ({"shape": "trangle"}, "did you mean 'triangle'"),
+        ({"shape": "cube", "agents": 3}, "takes 8 agents, not 3"),
+        ({"agents": 0}, "not 0"),
+        ({"agents": 10**7}, "more than 2000"),
+        ({"size": [1.0, 2.0]}, "takes one size"),
+        ({"size": [0.0]}, "sizes > 0"),
+        ({"waypoints": [(float("nan"), 0.0, 0.0)]}, "finite"),
+        ({"waypoints": [(float("inf"), 0.0, 0.0)]}, "finite"),
+    ],
+    ids=str,
+)
+def test_what_cannot_be(asked, words):
+    """What cannot be drafted is refused, and it is said why."""
+    with pytest.raises(ValueError, match=words):
+        draft("new", **asked)
