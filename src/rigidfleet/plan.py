@@ -6,52 +6,31 @@ and weights, which the kernel only evaluates. What the next phase inherits trave
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rigidfleet import attitude as att
 from rigidfleet import formation as shapes
 from rigidfleet import lqr
 from rigidfleet.kernel import program as k
 from rigidfleet.mission import Establish, Fly, Mission, Phase, Regulator, Reshape, Turn
+from rigidfleet.route import (
+    Edge,
+    Pose,
+    Situation,
+    about_cm,
+    align_slots,
+    attach,
+    goal_of,
+    legs,
+    slots_about_cm,
+)
 
 Array = NDArray[np.float64]
 
 _SOLVERS = {"iterated": k.ITERATED, "spectral": k.SPECTRAL, "exact": k.EXACT, "pinv": k.PINV}
 _SPLITS = {"equal": k.PINV_EQUAL, "inertia": k.PINV_INERTIA, "inertia+force": k.PINV_INERTIA_FORCE}
-
-Edge = tuple[int, int]
-
-#: A phase that ends by settling and steers nowhere brings the body to rest within this time [s].
-_REST_WITHIN = 10.0
-
-
-@dataclass
-class Pose:
-    """Where the virtual body is, or is to be: CM [m], attitude T (world -> body), their rates."""
-
-    r: Array
-    v: Array
-    T: Array
-    omega: Array  # body axes [rad/s]
-
-
-@dataclass
-class Situation:
-    """The state at a switch, and what was commanded up to it."""
-
-    t: float
-    r: Array  # (N, 3) [m]
-    v: Array  # (N, 3) [m/s]
-    integral: dict[Edge, float] = field(default_factory=dict)  # of c, by edge [m s]
-    reference: dict[Edge, float] = field(default_factory=dict)  # distances commanded last [m]
-    frame: Array | None = None  # attitude (3, 3) of the integrated mean-axis frame
-    formation: str | None = None  # the one taken last
-    slots: Array | None = None  # (N, 3) commanded last, about the CM, body axes [m]
-    pose: Pose | None = None  # commanded last; None where nothing was
-    goal: Pose | None = None  # what to stay at
 
 
 @dataclass
@@ -68,29 +47,14 @@ class PhasePlan:
     frame: Array | None  # attitude (3, 3) of the mean-axis frame at the start
 
 
-def about_cm(points: Array, masses: Array) -> Array:
-    """Points (N, 3) [m] relative to their centre of mass."""
-    return points - masses @ points / masses.sum()
-
-
-def body_rates(r: Array, v: Array, masses: Array, T: Array) -> Array:
-    """Mean-axis rates omega = I^+ h (3,) [rad/s] of agents r, v (N, 3), in the axes of T (3, 3)."""
-    if len(masses) == 1:
-        return np.zeros(3)  # of a point; not what rounding makes of it
-    x, y = about_cm(r, masses), about_cm(v, masses)
-    inertia = np.einsum("i,ij,ij->", masses, x, x) * np.eye(3) - (masses[:, None] * x).T @ x
-    h = masses @ np.cross(x, y)
-    return T @ np.linalg.pinv(inertia, 1e-9, hermitian=True) @ h
-
-
 def plan_phase(mission: Mission, phase: Phase, now: Situation, t_end: float) -> PhasePlan:
     """Prepare a phase that starts at ``now.t`` and ends at ``t_end`` [s] at the latest."""
     masses = np.array(mission.agents.mass)
     shaping = isinstance(phase, Establish | Reshape)
     name = phase.formation if shaping else now.formation
     edges = mission.formation_edges(name) if name else np.zeros((0, 2), dtype=np.int64)
-    target = _slots(mission, name, masses)
-    frame, now = _attach(mission, phase, now, masses, target)
+    target = slots_about_cm(mission, name, masses)
+    frame, now = attach(mission, phase, now, masses, target)
 
     d1 = mission.formation_distances(name) if name else np.zeros(0)
     if not shaping:
@@ -110,7 +74,7 @@ def plan_phase(mission: Mission, phase: Phase, now: Situation, t_end: float) -> 
     )
     reference = k.Reference(kind, now.t, T_b, d0, d1, before, dp, turn)
 
-    goal, arrival = _goal(phase, now, t_end)
+    goal, arrival = goal_of(phase, now, t_end)
     motion, feedback = _REST, _NO_FEEDBACK
     if phase.control == "slots":
         assert now.pose is not None  # attached above
@@ -147,77 +111,6 @@ def _keys(edges: NDArray[np.int64]) -> list[Edge]:
 
 def _distance(r: Array, edge: Edge) -> float:
     return float(np.linalg.norm(r[edge[0]] - r[edge[1]]))
-
-
-def _slots(mission: Mission, name: str | None, masses: Array) -> Array | None:
-    slots = mission.formation_slots(name) if name else None
-    return None if slots is None else about_cm(slots, masses)
-
-
-def _attach(
-    mission: Mission, phase: Phase, now: Situation, masses: Array, target: Array | None
-) -> tuple[Array | None, Situation]:
-    """Attach the body frame where a phase needs one; return the frame to integrate, if any.
-
-    Slots fitted to the agents (Kabsch) give the attitude; where nothing is established yet and
-    the phase shapes nothing, the agents themselves are the slots, in the world's axes.
-    """
-    shaping = isinstance(phase, Establish | Reshape)
-    frame = now.frame
-    near = frame if frame is not None else now.pose.T if now.pose is not None else np.eye(3)
-    fit = now.slots if now.slots is not None else target if shaping else None
-    if phase.control == "open":
-        if mission.formulation == "body" and frame is None:
-            frame = np.eye(3)
-        return frame, now
-    x = about_cm(now.r, masses)
-    if phase.control == "slots" and now.pose is not None:
-        pose = now.pose  # the reference goes on from where it is
-    else:
-        T = near if fit is None else shapes.kabsch(x, fit, masses, near=near.T).T
-        pose = Pose(masses @ now.r / masses.sum(), masses @ now.v / masses.sum(), T, np.zeros(3))
-        pose.omega = body_rates(now.r, now.v, masses, T)
-    slots = now.slots if now.slots is not None else x @ pose.T.T
-    goal = now.goal or replace(pose, v=np.zeros(3), omega=np.zeros(3))
-    if isinstance(phase, Establish) and target is not None:
-        # A formation is established as it lies nearest: its axes are attached to the agents, and
-        # turned to where they are wanted by a later phase.
-        R = shapes.kabsch(slots, target, masses)
-        slots = slots @ R
-        pose = replace(pose, T=R.T @ pose.T, omega=R.T @ pose.omega)
-        goal = replace(goal, T=pose.T)
-    if phase.control == "body" or (mission.formulation == "body" and frame is None):
-        frame = pose.T
-    return frame, replace(now, pose=pose, slots=slots, goal=goal)
-
-
-def align_slots(before: Array, after: Array, masses: Array) -> tuple[Array, Array]:
-    """What a blend adds to the slots, and by which rotation vector it turns them meanwhile.
-
-    The new slots are turned onto the old ones first (Kabsch, weighted by mass): the straight
-    blend then has no angular momentum in its own frame, and moves the agents least. The turn
-    brings them back, so that the body axes keep their meaning.
-    """
-    R = shapes.kabsch(before, after, masses)
-    return after @ R.T - before, att.rotation_vector_from_dcm(R)  # log of R^T
-
-
-def _goal(phase: Phase, now: Situation, t_end: float) -> tuple[Pose | None, float]:
-    """The pose to be at, and when."""
-    goal = now.goal
-    if goal is None:
-        return None, t_end
-    if not isinstance(phase, Fly | Turn):
-        # Nothing says when what stays must have come to rest: by the end, if that is known.
-        arrival = t_end if phase.settle is None else min(t_end, now.t + _REST_WITHIN)
-        return replace(goal, v=np.zeros(3), omega=np.zeros(3)), arrival
-    arrival = t_end if phase.travel is None else now.t + phase.travel
-    angles = phase.attitude_deg
-    T = goal.T if angles is None else att.dcm_from_euler(np.deg2rad(angles))
-    r, v = goal.r, np.zeros(3)
-    if isinstance(phase, Fly):
-        r, v = np.array(phase.position), np.array(phase.velocity)
-    return Pose(r, v, T, np.deg2rad(phase.rates_deg_s)), arrival
 
 
 def _law(mission: Mission, *, damped: bool) -> k.Law:
@@ -260,30 +153,18 @@ def _motion(
 
     From arrival to ``t_end`` the tracking gains take over, or what the finite horizon has left of
     the velocity's error would carry the body away.
-
-    The attitude is regulated as the rotation vector phi from the goal to the body: three more
-    double integrators, phi'' their input, exact for a turn about one axis.
     """
     T = arrival - t0
-    phi = att.rotation_vector_from_dcm(start.T @ goal.T.T)  # start = goal Exp(phi)
-    phi_dot = att.rotation_vector_rate(phi, start.omega)
-    flights = [
-        (mission.lqr, (start.r, start.v), (goal.r, goal.v)),
-        (mission.lqr.attitude, (phi, phi_dot), (np.zeros(3), goal.omega)),
-    ]
-    times = np.unique(np.concatenate([_knots(law, T) for law, _, _ in flights]))
-    Q, R, rest = mission.tracking.Q, mission.tracking.R, t_end - arrival
-    after = lqr.knots(rest, Q, R) if rest > 0.0 else np.zeros(1)
+    flights = legs(mission, start, goal, T)
+    times = np.unique(np.concatenate([_knots(law, T) for law in flights.regulators]))
+    rest = t_end - arrival
+    after = lqr.knots(rest, mission.tracking.Q, mission.tracking.R) if rest > 0.0 else np.zeros(1)
     pieces = []
-    for law, begin, end in flights:
-        if law.horizon == "finite":
-            x = lqr.finite_horizon_trajectory(times, begin, end, T, law.Q, law.R, law.S)
-        else:
-            x = lqr.infinite_horizon_trajectory(times, begin, end, T, law.Q, law.R)
+    for i in range(2):
+        x = flights.sample(i, times)
         piece = lqr.quintic_pieces(times, *x)
         if rest > 0.0:
-            target = end[0] + end[1] * rest, end[1]
-            x = lqr.infinite_horizon_trajectory(after, (x[0][-1], x[1][-1]), target, rest, Q, R)
+            x = flights.sample_rest(mission, i, (x[0][-1], x[1][-1]), rest, after)
             piece = np.concatenate([piece, lqr.quintic_pieces(after, *x)])
         pieces.append(piece)
     knots = np.concatenate([t0 + times, arrival + after[1:]])

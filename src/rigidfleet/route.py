@@ -1,0 +1,181 @@
+"""Where a mission leads: poses of the virtual body, what a phase starts from and steers to.
+
+The plan of a flight, and a check before it, are made from these. Nothing here flies or compiles.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigidfleet import attitude as att
+from rigidfleet import formation as shapes
+from rigidfleet import lqr
+from rigidfleet.mission import Establish, Fly, Mission, Phase, Regulator, Reshape, Turn
+
+Array = NDArray[np.float64]
+
+Edge = tuple[int, int]
+
+#: A phase that ends by settling and steers nowhere brings the body to rest within this time [s].
+_REST_WITHIN = 10.0
+
+
+@dataclass
+class Pose:
+    """Where the virtual body is, or is to be: CM [m], attitude T (world -> body), their rates."""
+
+    r: Array
+    v: Array
+    T: Array
+    omega: Array  # body axes [rad/s]
+
+
+@dataclass
+class Situation:
+    """The state at a switch, and what was commanded up to it."""
+
+    t: float
+    r: Array  # (N, 3) [m]
+    v: Array  # (N, 3) [m/s]
+    integral: dict[Edge, float] = field(default_factory=dict)  # of c, by edge [m s]
+    reference: dict[Edge, float] = field(default_factory=dict)  # distances commanded last [m]
+    frame: Array | None = None  # attitude (3, 3) of the integrated mean-axis frame
+    formation: str | None = None  # the one taken last
+    slots: Array | None = None  # (N, 3) commanded last, about the CM, body axes [m]
+    pose: Pose | None = None  # commanded last; None where nothing was
+    goal: Pose | None = None  # what to stay at
+
+
+def about_cm(points: Array, masses: Array) -> Array:
+    """Points (N, 3) [m] relative to their centre of mass."""
+    return points - masses @ points / masses.sum()
+
+
+def body_rates(r: Array, v: Array, masses: Array, T: Array) -> Array:
+    """Mean-axis rates omega = I^+ h (3,) [rad/s] of agents r, v (N, 3), in the axes of T (3, 3)."""
+    if len(masses) == 1:
+        return np.zeros(3)  # of a point; not what rounding makes of it
+    x, y = about_cm(r, masses), about_cm(v, masses)
+    inertia = np.einsum("i,ij,ij->", masses, x, x) * np.eye(3) - (masses[:, None] * x).T @ x
+    h = masses @ np.cross(x, y)
+    return T @ np.linalg.pinv(inertia, 1e-9, hermitian=True) @ h
+
+
+def slots_about_cm(mission: Mission, name: str | None, masses: Array) -> Array | None:
+    """Slots (N, 3) [m] of a formation about their centre of mass; None where there are none."""
+    slots = mission.formation_slots(name) if name else None
+    return None if slots is None else about_cm(slots, masses)
+
+
+def attach(
+    mission: Mission, phase: Phase, now: Situation, masses: Array, target: Array | None
+) -> tuple[Array | None, Situation]:
+    """Attach the body frame where a phase needs one; return the frame to integrate, if any.
+
+    Slots fitted to the agents (Kabsch) give the attitude; where nothing is established yet and
+    the phase shapes nothing, the agents themselves are the slots, in the world's axes.
+    """
+    shaping = isinstance(phase, Establish | Reshape)
+    frame = now.frame
+    near = frame if frame is not None else now.pose.T if now.pose is not None else np.eye(3)
+    fit = now.slots if now.slots is not None else target if shaping else None
+    if phase.control == "open":
+        if mission.formulation == "body" and frame is None:
+            frame = np.eye(3)
+        return frame, now
+    x = about_cm(now.r, masses)
+    if phase.control == "slots" and now.pose is not None:
+        pose = now.pose  # the reference goes on from where it is
+    else:
+        T = near if fit is None else shapes.kabsch(x, fit, masses, near=near.T).T
+        pose = Pose(masses @ now.r / masses.sum(), masses @ now.v / masses.sum(), T, np.zeros(3))
+        pose.omega = body_rates(now.r, now.v, masses, T)
+    slots = now.slots if now.slots is not None else x @ pose.T.T
+    goal = now.goal or replace(pose, v=np.zeros(3), omega=np.zeros(3))
+    if isinstance(phase, Establish) and target is not None:
+        # A formation is established as it lies nearest: its axes are attached to the agents, and
+        # turned to where they are wanted by a later phase.
+        R = shapes.kabsch(slots, target, masses)
+        slots = slots @ R
+        pose = replace(pose, T=R.T @ pose.T, omega=R.T @ pose.omega)
+        goal = replace(goal, T=pose.T)
+    if phase.control == "body" or (mission.formulation == "body" and frame is None):
+        frame = pose.T
+    return frame, replace(now, pose=pose, slots=slots, goal=goal)
+
+
+def align_slots(before: Array, after: Array, masses: Array) -> tuple[Array, Array]:
+    """What a blend adds to the slots, and by which rotation vector it turns them meanwhile.
+
+    The new slots are turned onto the old ones first (Kabsch, weighted by mass): the straight
+    blend then has no angular momentum in its own frame, and moves the agents least. The turn
+    brings them back, so that the body axes keep their meaning.
+    """
+    R = shapes.kabsch(before, after, masses)
+    return after @ R.T - before, att.rotation_vector_from_dcm(R)  # log of R^T
+
+
+def goal_of(phase: Phase, now: Situation, t_end: float) -> tuple[Pose | None, float]:
+    """The pose to be at, and when."""
+    goal = now.goal
+    if goal is None:
+        return None, t_end
+    if not isinstance(phase, Fly | Turn):
+        # Nothing says when what stays must have come to rest: by the end, if that is known.
+        arrival = t_end if phase.settle is None else min(t_end, now.t + _REST_WITHIN)
+        return replace(goal, v=np.zeros(3), omega=np.zeros(3)), arrival
+    arrival = t_end if phase.travel is None else now.t + phase.travel
+    angles = phase.attitude_deg
+    T = goal.T if angles is None else att.dcm_from_euler(np.deg2rad(angles))
+    r, v = goal.r, np.zeros(3)
+    if isinstance(phase, Fly):
+        r, v = np.array(phase.position), np.array(phase.velocity)
+    return Pose(r, v, T, np.deg2rad(phase.rates_deg_s)), arrival
+
+
+@dataclass
+class Legs:
+    """The LQR flights of the virtual body to its goal: of its CM, and of its attitude phi."""
+
+    regulators: tuple[Regulator, Regulator]
+    begin: tuple[tuple[Array, Array], tuple[Array, Array]]  # (r, v), (phi, phi_dot)
+    end: tuple[tuple[Array, Array], tuple[Array, Array]]
+    T: float  # [s]
+
+    def sample(self, k: int, times: Array) -> tuple[Array, Array, Array]:
+        """Position, rate and second derivative (K, 3) of one of the two at times (K,) in [0, T]."""
+        law = self.regulators[k]
+        if law.horizon == "finite":
+            return lqr.finite_horizon_trajectory(
+                times, self.begin[k], self.end[k], self.T, law.Q, law.R, law.S
+            )
+        return lqr.infinite_horizon_trajectory(
+            times, self.begin[k], self.end[k], self.T, law.Q, law.R
+        )
+
+    def sample_rest(
+        self, mission: Mission, k: int, state: tuple[Array, Array], rest: float, times: Array
+    ) -> tuple[Array, Array, Array]:
+        """The same at times (K,) in [0, rest] after arrival in a state, where tracking gains take over."""
+        r, v = self.end[k]
+        Q, R = mission.tracking.Q, mission.tracking.R
+        return lqr.infinite_horizon_trajectory(times, state, (r + v * rest, v), rest, Q, R)
+
+
+def legs(mission: Mission, start: Pose, goal: Pose, T: float) -> Legs:
+    """Flights of the virtual body from one pose to another within T [s].
+
+    The attitude is regulated as the rotation vector phi from the goal to the body: three more
+    double integrators, phi'' their input, exact for a turn about one axis.
+    """
+    phi = att.rotation_vector_from_dcm(start.T @ goal.T.T)  # start = goal Exp(phi)
+    phi_dot = att.rotation_vector_rate(phi, start.omega)
+    return Legs(
+        (mission.lqr, mission.lqr.attitude),
+        ((start.r, start.v), (phi, phi_dot)),
+        ((goal.r, goal.v), (np.zeros(3), goal.omega)),
+        T,
+    )
