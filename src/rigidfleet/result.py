@@ -18,7 +18,7 @@ import secrets
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from datetime import UTC, datetime
-from functools import cached_property
+from functools import cache, cached_property
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Self, get_type_hints
@@ -84,7 +84,8 @@ class PhaseRecord:
     target: dict[str, Any] | None = None
 
 
-def _versions() -> dict[str, str]:
+@cache
+def _versions_found() -> dict[str, str]:
     found = {"python": platform.python_version()}
     for package in ("rigidfleet", "numpy", "scipy", "numba", "h5netcdf"):
         try:
@@ -92,6 +93,10 @@ def _versions() -> dict[str, str]:
         except PackageNotFoundError:
             continue
     return found
+
+
+def _versions() -> dict[str, str]:
+    return dict(_versions_found())
 
 
 def _now() -> str:
@@ -127,7 +132,9 @@ class Result:
     external_force: Annotated[
         Floats, _v("time agent axis", "N", "gravity and disturbances, world axes")
     ]
-    thrust: Annotated[Floats, _v("time agent", "N", "thrust |f_u + f_C|, cut off at the limit if it saturates")]
+    thrust: Annotated[
+        Floats, _v("time agent", "N", "thrust |f_u + f_C|, cut off at the limit if it saturates")
+    ]
 
     cm: Annotated[Floats, _v("time axis", "m", "centre of mass, world axes")]
     cm_velocity: Annotated[Floats, _v("time axis", "m s-1", "velocity of the centre of mass")]

@@ -117,7 +117,7 @@ def simulate(
     ValueError
         A time to record lies outside of the mission, or the control rate is not positive.
     """
-    run = _Flight(mission, controller, rate, force, times, progress)
+    run = Flight(mission, controller, rate, force, times, progress)
     try:
         run.fly()
     except KeyboardInterrupt:
@@ -130,12 +130,12 @@ def simulate(
     return run.result()
 
 
-class _StoppedError(Exception):
+class StoppedError(Exception):
     """The flight cannot go on; the message is the diagnosis."""
 
 
 @dataclass
-class _Leg:
+class Leg:
     """A phase under way."""
 
     index: int
@@ -149,11 +149,12 @@ class _Leg:
 
     @property
     def t(self) -> float:
+        """Mission time reached [s]."""
         return float(self.state.clock[0])
 
 
-class _Flight:
-    """One flight under way."""
+class Flight:
+    """One flight under way; `simulate` flies one of a mission's phases, others may fly on."""
 
     def __init__(
         self,
@@ -190,7 +191,7 @@ class _Flight:
         try:
             for index, phase in enumerate(self.mission.phases):
                 self._phase(index, phase)
-        except _StoppedError as stop:
+        except StoppedError as stop:
             self.ending = str(stop)
 
     # -- one phase --------------------------------------------------------------------------------
@@ -213,13 +214,13 @@ class _Flight:
                 self._arrive(leg)
             record.t_end = self.now.t
         if phase.settle is not None and not record.settled:
-            raise _StoppedError(
+            raise StoppedError(
                 f"phase '{phase.name}' did not settle within {phase.settle.timeout:g} s: at t ="
                 f" {self.now.t:.2f} s its error was above {phase.settle.tolerance:g} m. Give it a"
                 " longer timeout or a larger tolerance, or see the constraint error to learn why"
             )
 
-    def _begin(self, index: int, phase: Phase) -> _Leg:
+    def _begin(self, index: int, phase: Phase) -> Leg:
         t_end = _end(phase, self.now.t)
         _check_size(self.mission, phase)
         plan = plan_phase(self.mission, phase, self.now, t_end)
@@ -228,7 +229,7 @@ class _Flight:
             plan.program = plan.program._replace(external=self.external.address)
         y = self._pack(plan)
         tolerances = self.mission.integrator
-        return _Leg(
+        return Leg(
             index,
             phase,
             plan,
@@ -244,7 +245,7 @@ class _Flight:
             t_end,
         )
 
-    def _fly_to(self, leg: _Leg, t_end: float) -> None:
+    def _fly_to(self, leg: Leg, t_end: float) -> None:
         """Integrate to ``t_end`` [s] under the phase's input law, or the user's controller."""
         if self.controller is None or leg.phase.control != "slots":
             self._integrate(leg, leg.plan.program, t_end)
@@ -257,7 +258,7 @@ class _Flight:
                 leg.asked += 1
             self._integrate(leg, leg.held, min(start + leg.asked / self.rate, t_end))
 
-    def _controlled(self, leg: _Leg, controller: Controller) -> k.Program:
+    def _controlled(self, leg: Leg, controller: Controller) -> k.Program:
         """Ask the user's controller; return the phase's program with its force held."""
         plan, w, y = leg.plan, leg.workspace, leg.state.y
         flight.closed_loop(leg.t, y, np.empty_like(y), plan.program, w)
@@ -268,7 +269,7 @@ class _Flight:
         f = _checked(controller(seen), self.mission.n_agents, "the controller", leg.t)
         return plan.program._replace(control=plan.program.control._replace(kind=k.OPEN, force=f))
 
-    def _integrate(self, leg: _Leg, program: k.Program, t_end: float) -> None:
+    def _integrate(self, leg: Leg, program: k.Program, t_end: float) -> None:
         """Integrate to ``t_end`` [s] and record the samples on the way.
 
         ``program`` may hold a user's force in place of the phase's own input law.
@@ -302,9 +303,9 @@ class _Flight:
             if done:
                 self._record(leg, program, times[:done], samples[:done])
         if status != flight.FINISHED:
-            raise _StoppedError(self._diagnose(leg, collapsed=status == flight.COLLAPSED))
+            raise StoppedError(self._diagnose(leg, collapsed=status == flight.COLLAPSED))
 
-    def _samples(self, leg: _Leg, t_end: float) -> Array:
+    def _samples(self, leg: Leg, t_end: float) -> Array:
         """Times to record in (t, t_end]: multiples of the output step, and the phase's two ends.
 
         The start of a phase is recorded one representable number after the switch.
@@ -321,7 +322,7 @@ class _Flight:
         start = [t if leg.index == 0 else np.nextafter(t, math.inf)] if first else []
         return np.concatenate([start, grid])
 
-    def _settle(self, leg: _Leg, settle: Settle) -> bool:
+    def _settle(self, leg: Leg, settle: Settle) -> bool:
         """Integrate in short stretches until the phase has settled; False if its time was over."""
         start = self.now.t
         step = self.mission.output_step
@@ -337,7 +338,7 @@ class _Flight:
                 return True
         return False
 
-    def _error(self, leg: _Leg) -> float:
+    def _error(self, leg: Leg) -> float:
         """Largest error [m] of a constraint, a slot or the goal at the integrator's state.
 
         The goal's attitude counts by how far it takes a slot.
@@ -374,7 +375,7 @@ class _Flight:
         cm = (masses @ now.r / masses.sum(), masses @ now.v / masses.sum())
         return np.concatenate([x.ravel(), y.ravel(), integral, q, *cm])
 
-    def _arrive(self, leg: _Leg) -> None:
+    def _arrive(self, leg: Leg) -> None:
         """Make the state the integrator has reached the situation of the next phase."""
         plan, state, w = leg.plan, leg.state, leg.workspace
         flight.closed_loop(leg.t, state.y, np.empty_like(state.y), plan.program, w)
@@ -413,20 +414,20 @@ class _Flight:
             att.quaternion_from_dcm(self.now.frame), att.quaternion_from_dcm(plan.frame)
         )
         if angle > _FLIPPED:
-            raise _StoppedError(
+            raise StoppedError(
                 f"the formation '{self.now.formation}' has flipped at t = {self.now.t:.2f} s: its slots lie"
                 f" {math.degrees(angle):.0f} deg from the body frame that was integrated. Out of a line,"
                 " distances alone do not say to which side a shape unfolds. Track slots through that"
                 ' phase: control = "slots"'
             )
 
-    def _stalled(self, leg: _Leg) -> bool:
+    def _stalled(self, leg: Leg) -> bool:
         """Whether a phase takes far more steps than its length in time explains."""
         steps = int(leg.state.count[1] + leg.state.count[2])
         flown = leg.t - self.now.t
         return steps > min(_STALLED + _STALLED_RATE * flown, _MOST_STEPS)
 
-    def _diagnose(self, leg: _Leg, *, collapsed: bool) -> str:
+    def _diagnose(self, leg: Leg, *, collapsed: bool) -> str:
         """Say when, where and why the integrator could not go on, and what to try."""
         count, h = leg.state.count, float(leg.state.clock[1])
         if collapsed:
@@ -460,7 +461,7 @@ class _Flight:
             )
         return f"{head}, and {where}. {self._remedy(leg, collapsed=collapsed)}"
 
-    def _remedy(self, leg: _Leg, *, collapsed: bool) -> str:
+    def _remedy(self, leg: Leg, *, collapsed: bool) -> str:
         """What to try where J is not to blame."""
         flight.closed_loop(
             leg.t, leg.state.y, np.empty_like(leg.state.y), leg.plan.program, leg.workspace
@@ -488,7 +489,7 @@ class _Flight:
             " or the phase is too long"
         )
 
-    def _report(self, leg: _Leg) -> None:
+    def _report(self, leg: Leg) -> None:
         wall = clock.perf_counter()
         if self.progress is not None and (wall - self.reported > _REPORT or len(self.pieces) == 0):
             self.reported = wall
@@ -498,7 +499,7 @@ class _Flight:
 
     # -- the record -------------------------------------------------------------------------------
 
-    def _record(self, leg: _Leg, program: k.Program, times: Array, samples: Array) -> None:
+    def _record(self, leg: Leg, program: k.Program, times: Array, samples: Array) -> None:
         """Evaluate forces and references at the samples and keep them."""
         plan, w = leg.plan, leg.workspace
         n, m = len(self.masses), len(plan.edges)
@@ -544,13 +545,13 @@ def _check_size(mission: Mission, phase: Phase) -> None:
         return
     edges = len(mission.formation_edges(phase.formation))
     if edges > _MOST_EDGES:
-        raise _StoppedError(
+        raise StoppedError(
             f"phase '{phase.name}' takes '{phase.formation}', which has {edges:,} edges: with more than"
             f" {_MOST_EDGES:,} a flight takes hours. Give it fewer; 3 N - 6, and some more, will do"
         )
 
 
-def _jacobian(leg: _Leg, n: int) -> tuple[Array, int, float]:
+def _jacobian(leg: Leg, n: int) -> tuple[Array, int, float]:
     """J (m, 3N) where the integrator is, its shortest edge and that edge's length [m]."""
     edges = leg.plan.edges
     flight.closed_loop(
@@ -580,7 +581,7 @@ def _end(phase: Phase, start: float) -> float:
     """Time [s] at which a phase ends, at the latest."""
     if phase.until is not None:
         if phase.until <= start:
-            raise _StoppedError(
+            raise StoppedError(
                 f"phase '{phase.name}' is to end at {phase.until:g} s, but the phases before it took until"
                 f" {start:.2f} s. Give it a duration in place of until"
             )
