@@ -170,9 +170,13 @@ def test_missions_schema(capsys):
 def test_check(capsys):
     """A mission that is right is counted up, and its phases are listed."""
     assert cli.main(["check", "narrow-passage"]) == cli.PASSED
-    first, _, *phases = capsys.readouterr().out.splitlines()
+    first, _, *lines = capsys.readouterr().out.splitlines()
     assert first == "narrow-passage: right: 3 agents, 2 formations, 12 phases, 90 s"
+    phases, facts = lines[: lines.index("")], lines[lines.index("") :]
     assert len(phases) == 12
+    assert facts[-1] == "narrow-passage: nothing found that will fail"
+    assert max(map(len, facts)) <= 80
+    assert "infinitesimally rigid" in facts[1]
     wp2 = "WP2 fly (35, 7.5, 20) m, (2, 0, 0) m/s, yaw 0° at 32 s slots"
     assert " ".join(phases[3].split()) == f"4 {wp2}"
 
@@ -197,6 +201,32 @@ def test_check_json(capsys):
     found = json.loads(capsys.readouterr().out)
     assert found["right"] is True
     assert (found["agents"], found["latest_end_s"], len(found["phases"])) == (3, 90.0, 12)
+    assert found["passed"] is True
+    assert found["formations"]["line"]["rigidity"]["verdict"] == "prestress-stable"
+
+
+def test_check_that_fails(capsys):
+    """What will fail is said, with exit code 1; in JSON, too."""
+    assert cli.main(["check", "establish-cube-as-printed"]) == cli.FAILED
+    assert "fails  'cube' will be another shape" in capsys.readouterr().out
+    assert cli.main(["check", "establish-cube-as-printed", "--json"]) == cli.FAILED
+    assert json.loads(capsys.readouterr().out)["passed"] is False
+
+
+def test_check_realisations(capsys):
+    """The search for other shapes is made unless it is forbidden."""
+    assert cli.main(["check", "establish-cube"]) == cli.PASSED
+    assert "random starts" in capsys.readouterr().out
+    assert cli.main(["check", "establish-cube", "--no-realisations"]) == cli.PASSED
+    assert "random starts" not in capsys.readouterr().out
+
+
+def test_check_figure(capsys):
+    """The graphs are drawn to the file asked for; one of another kind is refused."""
+    assert cli.main(["check", "square", "--figure", "graph.svg"]) == cli.PASSED
+    assert "flex-1-" in Path("graph.svg").read_text(encoding="utf-8")
+    assert cli.main(["check", "square", "--figure", "graph.gif"]) == cli.BAD_INPUT
+    assert "graph.gif: no format" in capsys.readouterr().err
 
 
 WRONG = TRIANGLE.replace("mass = 1.0", "mass = -1").replace("size = 4.0", "size = nan\ncolour = 3")

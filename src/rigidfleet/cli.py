@@ -6,7 +6,8 @@ error. Colours and animation are for terminals, and `NO_COLOR` is respected.
 Exit codes
 ----------
 - 0: done; for `run` and `report`: the flight passed its verdict
-- 1: flew, but failed its verdict, as a flight does that could not be flown to its end
+- 1: flew, but failed its verdict, as a flight does that could not be flown to its end; for `check`:
+  something will fail
 - 2: bad input, or files that cannot be read or written
 - 130: interrupted (Ctrl-C); what flew is saved, marked incomplete
 
@@ -56,8 +57,8 @@ _COMPILING = "Compiling the flight kernel (once, about 20 s)"
 app = App(
     name="rigidfleet",
     help="Fly many air vehicles as one rigid body: simulate, judge and draw formation flights.",
-    help_epilogue="Exit codes: 0 done, or the flight passed; 1 it flew but failed its verdict; "
-    "2 bad input; 130 interrupted, what flew is saved.",
+    help_epilogue="Exit codes: 0 done, or the flight passed; 1 it flew but failed its verdict, or "
+    "will fail (check); 2 bad input; 130 interrupted, what flew is saved.",
     help_format="plaintext",
     version=f"rigidfleet {__version__}",
     version_flags=["--version"],
@@ -197,13 +198,27 @@ def missions(
 
 
 @app.command(sort_key=3)
-def check(mission: str, /, *, json: bool = False) -> int:
-    """Check whether a mission is right, without flying it.
+def check(
+    mission: str,
+    /,
+    *,
+    realisations: Annotated[bool | None, Parameter(negative="--no-realisations")] = None,
+    figure: Path | None = None,
+    json: bool = False,
+) -> int:
+    """Check whether a mission is right, and what it will meet, without flying it.
+
+    Rigidity of its formations, gains, and the planned way: collisions, thrust, gaps.
 
     Parameters
     ----------
     mission : str
         A shipped mission or a mission file.
+    realisations : bool
+        Search for other shapes with the same distances, 40 random starts for each formation; if
+        neither is given, for up to 12 agents.
+    figure : Path
+        Draw the graphs to this file, .png, .svg or .pdf: redundant edges dashed, flexes as arrows.
     json : bool
         Print what was found as JSON.
     """
@@ -220,15 +235,30 @@ def check(mission: str, /, *, json: bool = False) -> int:
         ]
         _print_json({"mission": mission, "right": False, "findings": findings})
         return BAD_INPUT
+    from rigidfleet.preflight import preflight
+
+    ahead = preflight(found, search=realisations)
+    if figure is not None:
+        from rigidfleet.figures.graph import draw_graphs
+
+        judged = {f.name: f.rigidity for f in ahead.formations}
+        draw_graphs(found, judged, figure)
     if json:
-        _print_json({"mission": mission, "right": True} | _facts(found))
-        return PASSED
+        _print_json({"mission": mission, "right": True} | _facts(found) | ahead.data())
+        return PASSED if ahead.passed else FAILED
     table = _table("#", "phase", "kind", "to", "ends", "control")
     for n, phase in enumerate(found.phases, start=1):
         table.add_row(str(n), phase.name, phase.kind, goal(phase), ending(phase), phase.control)
     _out().print(f"{found.name}: right: {_counted(found)}")
     _print_table(table)
-    return PASSED
+    _out().print()
+    _print_words(ahead.words())
+    if ahead.remarks:
+        _out().print()
+        _print_words((remark.level, remark.text) for remark in ahead.remarks)
+    verdict = "nothing found that will fail" if ahead.passed else "it will fail as it is"
+    _out().print(f"\n{found.name}: {verdict}", style=None if ahead.passed else "bold red")
+    return PASSED if ahead.passed else FAILED
 
 
 @app.command(sort_key=4)
@@ -766,6 +796,21 @@ def _table(*columns: str) -> Table:
 def _print_table(table: Table) -> None:
     console = _out() if _out().is_terminal else _console(stderr=False, width=_WIDE)
     console.print(table)
+
+
+def _print_words(rows: Iterable[tuple[str, str]]) -> None:
+    """Print facts under headings, wrapped to the screen, a heading that repeats only once."""
+    from rich.table import Table
+    from rich.text import Text
+
+    table, before = Table.grid(padding=(0, 2, 0, 0)), ""
+    table.add_column(no_wrap=True, max_width=24)
+    table.add_column(overflow="fold")
+    for heading, text in rows:
+        style = "bold red" if heading == "fails" else "bold"
+        table.add_row(Text("" if heading == before else heading, style=style), Text(text))
+        before = heading
+    _out().print(table)
 
 
 class _Watch:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from itertools import combinations, islice
+from itertools import combinations, islice, permutations, product
 from pathlib import Path
 from typing import NamedTuple
 
@@ -541,3 +541,82 @@ def _nearest_fit(u: Floats, s: Floats, vt: Floats, near: Floats, tol: float) -> 
     n = np.zeros(3)
     n[-equal:] = np.linalg.eigh(overlap + overlap.T)[1][:, 0]
     return (u - 2 * np.outer(u @ n, n)) @ vt
+
+
+# -- who takes which slot ----------------------------------------------------------------------------
+
+
+def straight_way(
+    start: ArrayLike, slots: ArrayLike, masses: ArrayLike, radius: ArrayLike
+) -> tuple[float, float]:
+    """Total way [m] and least room between surfaces [m] of agents that go straight to their slots.
+
+    The slots (N, 3) are turned onto the agents (Kabsch, weighted by mass), and all arrive together.
+    """
+    p, q = _about_cm(start, masses), _about_cm(slots, masses)
+    q = q @ kabsch(p, q, masses).T
+    i, j = np.triu_indices(len(p), 1)
+    r = np.asarray(radius, dtype=np.float64)
+    x, dx = p[i] - p[j], (q - p)[i] - (q - p)[j]
+    # Nearest on the way: a line from x to x + dx past zero.
+    s = np.clip(-(x * dx).sum(axis=1) / np.maximum((dx**2).sum(axis=1), 1e-300), 0.0, 1.0)
+    room = np.linalg.norm(x + s[:, None] * dx, axis=1) - r[i] - r[j]
+    return float(np.linalg.norm(q - p, axis=1).sum()), float(room.min(initial=np.inf))
+
+
+def assigned(
+    start: ArrayLike, slots: ArrayLike, masses: ArrayLike, radius: ArrayLike | None = None
+) -> Ints:
+    """Slot (N,) that each agent is to take: the shortest way, or with radii the safest among some.
+
+    From several attitudes in turn the slots are assigned by least squared distances
+    (`scipy.optimize.linear_sum_assignment`) and turned to the agents again (Kabsch), until nothing changes. The
+    shortest has the least sum of squares. The safest has the most room between agents on straight ways, among
+    these and the given one; all but equal room counts as equal, and then the shorter is taken. The order
+    given is kept where nothing is better.
+    """
+    from scipy.optimize import linear_sum_assignment
+
+    p, q = _about_cm(start, masses), centred(slots)
+    n = len(p)
+    given = np.arange(n)
+    found = {tuple(given.tolist()): given}
+    for turn in [kabsch(p, _about_cm(q, masses), masses), *_attitudes()]:
+        order, rotation = given, turn
+        for _ in range(20):
+            placed = q @ rotation.T
+            cost = ((p[:, None] - placed[None]) ** 2).sum(axis=2)
+            new = linear_sum_assignment(cost)[1]
+            same = bool((new == order).all())
+            order = new
+            if same:
+                break
+            rotation = kabsch(p, _about_cm(q[order], masses), masses)
+        found[tuple(order.tolist())] = order
+    m = np.asarray(masses, dtype=np.float64)[:, None]
+
+    def squares(order: Ints) -> float:
+        x = _about_cm(q[order], masses)
+        return float((m * (x @ kabsch(p, x, masses).T - p) ** 2).sum())
+
+    def worth(order: Ints) -> tuple[float, float, bool]:
+        room = 0.0 if radius is None else straight_way(p, q[order], masses, radius)[1]
+        return -round(room, 2), round(squares(order), 9), bool((order != given).any())
+
+    return min(found.values(), key=worth)
+
+
+def _attitudes() -> list[Floats]:
+    """The 24 rotations of a cube: attitudes to start from."""
+    turns = []
+    for axes in permutations(range(3)):
+        for signs in product((1.0, -1.0), repeat=3):
+            R = np.eye(3)[list(axes)] * np.array(signs)[:, None]
+            if np.linalg.det(R) > 0:
+                turns.append(R)
+    return turns
+
+
+def _about_cm(points: ArrayLike, masses: ArrayLike) -> Floats:
+    p, m = np.asarray(points, dtype=np.float64), np.asarray(masses, dtype=np.float64)
+    return p - m @ p / m.sum()

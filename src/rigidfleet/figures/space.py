@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import TYPE_CHECKING, Any, cast
@@ -238,7 +239,7 @@ def _azimuth(view: Scene) -> float:
     points = points[np.isfinite(points).all(axis=1)]
 
     def spread(azimuth: float) -> float:
-        seen = points @ _camera(azimuth, _ELEVATION)[:2].T
+        seen = points @ camera(azimuth, _ELEVATION)[:2].T
         return float(np.linalg.det(np.cov(seen, rowvar=False)))
 
     # Of views that show about as much, the one nearest to the middle.
@@ -457,12 +458,12 @@ def _sketch(
     turned = p - origin
     axes = np.eye(3)
     if not flat:
-        R = _camera(-70.0, 16.0)
+        R = camera(-70.0, 16.0)
         turned, axes = turned @ R.T, axes @ R.T
     colours = {k: g.colour for g in curves.edge_groups(result) for k in g.edges}
     index = {edge: k for k, edge in enumerate(map(tuple, result.edges.tolist()))}
     of_edge = [colours[index[edge]] for edge in map(tuple, edges.tolist())]
-    _draw_graph(ax, turned, edges, of_edge, lengths if len(edges) <= curves.SINGLE else None)
+    draw_graph(ax, turned, edges, of_edge, lengths if len(edges) <= curves.SINGLE else None)
     if placed and len(p) > 1:
         reach = float(np.linalg.norm(turned, axis=1).max())
         taken = bool(np.linalg.norm(turned, axis=1).min() < 0.1 * reach)
@@ -470,8 +471,14 @@ def _sketch(
         _draw_axes(ax, axes, length, taken=taken)
 
 
-def _draw_graph(
-    ax: Axes, p: Floats, edges: Any, colours: list[str], lengths: Floats | None
+def draw_graph(
+    ax: Axes,
+    p: Floats,
+    edges: Any,
+    colours: list[str],
+    lengths: Floats | None,
+    *,
+    dashed: Sequence[bool] = (),
 ) -> None:
     """Agents at p (N, 3), seen along the last axis, as numbered discs, with edges and their lengths [m]."""
     n = len(p)
@@ -491,7 +498,9 @@ def _draw_graph(
             s = np.linspace(0, 1, 40)[:, None]
             path = (1 - s) * a[:2] + s * b[:2] + 4 * s * (1 - s) * across
             middle = np.append((a + b)[:2] / 2 + across, 0.0)
-        ax.plot(*path.T, color=colours[e], linewidth=1.6, zorder=2, gid=f"edge-{i + 1}-{j + 1}")
+        dash: Any = st.DASHES if dashed and dashed[e] else "-"
+        look: dict[str, Any] = {"color": colours[e], "linewidth": 1.6, "linestyle": dash}
+        ax.plot(*path.T, **look, zorder=2, gid=f"edge-{i + 1}-{j + 1}")
         if lengths is not None:
             x, y = middle[:2]
             ax.text(
@@ -537,7 +546,7 @@ def _draw_axes(ax: Axes, axes: Floats, length: float, *, taken: bool) -> None:
         )  # fmt: skip
 
 
-def _camera(azimuth: float, elevation: float) -> Floats:
+def camera(azimuth: float, elevation: float) -> Floats:
     """Rows right, up, and towards us of a camera at these angles [deg]."""
     a, e = math.radians(azimuth), math.radians(elevation)
     out = np.array([math.cos(a) * math.cos(e), math.sin(a) * math.cos(e), math.sin(e)])

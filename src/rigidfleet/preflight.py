@@ -1,0 +1,838 @@
+"""What a mission will meet, found before it flies: rigidity, gains, and what is on the way.
+
+The way is the planned reference, sampled: slots that blend, moved by the LQR flights of the virtual body.
+Nothing is integrated, so this takes a fraction of a second and no compiler. Where nothing but distances leads,
+the agents are taken to go straight to their slots, which is a guess: such legs are not `exact`, and what is found
+on them is a note.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from itertools import combinations
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigidfleet import attitude as att
+from rigidfleet import formation as shapes
+from rigidfleet import gains, geometry
+from rigidfleet.mission import Box, Establish, Mission, Phase, Reshape
+from rigidfleet.rigidity import (
+    Kind,
+    Realisations,
+    Rigidity,
+    Verdict,
+    analyse,
+    jacobian,
+    realisations,
+)
+from rigidfleet.route import (
+    Pose,
+    Situation,
+    about_cm,
+    align_slots,
+    attach,
+    goal_of,
+    legs,
+    slots_about_cm,
+)
+
+Array = NDArray[np.float64]
+
+#: Formations of up to so many agents are searched for other shapes of the same distances.
+SEARCHED = 12
+#: So many random starts that search has: enough for what is common, in a tenth of a second.
+STARTS = 40
+#: Samples of a leg: so many, or one each so many seconds, within bounds.
+_SAMPLES, _STEP, _MOST = 201, 0.05, 2001
+#: So much of the shortest distance may be missed: the verdict's own tolerance of a shape.
+_TOLERANCE = 0.01
+#: Another assignment is worth a note if it saves this share of the way.
+_WORTH = 0.05
+#: Rounding on a limit is not beyond it.
+_SLACK = 1e-9
+
+Level = Literal["fails", "note"]
+
+
+@dataclass(frozen=True)
+class Remark:
+    """Something that will fail, or should be known.
+
+    `topic` is formation, gains, collision, downwash, assignment, thrust, obstacle, geofence, speed or
+    acceleration.
+    """
+
+    level: Level
+    topic: str
+    text: str
+
+
+@dataclass(frozen=True)
+class Leg:
+    """The planned way of all agents through one phase.
+
+    Attributes
+    ----------
+    time : (K,) [s] of the mission
+    position, acceleration : (K, N, 3) [m, m/s^2]
+    exact : whether the reference is followed as planned, up to control; False: a guess
+    """
+
+    phase: str
+    time: Array
+    position: Array
+    acceleration: Array
+    exact: bool
+
+    @property
+    def velocity(self) -> Array:
+        """(K, N, 3) [m/s]."""
+        return _rate(self.position, self.time)
+
+
+@dataclass(frozen=True)
+class FormationCheck:
+    """One formation: its rigidity, and other shapes that its distances allow, where looked for.
+
+    `held_by` is "slots" if they are tracked in every phase that flies it, else "distances".
+    """
+
+    name: str
+    rigidity: Rigidity | None
+    held_by: Literal["slots", "distances", "nothing"]
+    realisations: Realisations | None = None
+
+
+@dataclass(frozen=True)
+class GainsCheck:
+    """The answer to an error of length: stability, and what it costs.
+
+    `margin` is 2 alpha beta^2 / gamma (above 1: stable), `settling_time` [s] to 2 %, `overshoot` a fraction, `force`
+    [N] per metre of error of one distance, at most, by formation.
+    """
+
+    stabilised: bool
+    margin: float
+    settling_time: float | None
+    overshoot: float | None
+    force: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Assignment:
+    """How agents get to slots: total way [m], and least room between them meanwhile [m].
+
+    `order[i]` is the slot that agent i takes, both from 0.
+    """
+
+    order: tuple[int, ...]
+    way: float
+    room: float
+
+
+@dataclass
+class Preflight:
+    """All that was found; `remarks` say what of it matters."""
+
+    formations: list[FormationCheck]
+    gains: GainsCheck
+    legs: list[Leg]
+    room: tuple[float, float, str] | None = None  # [m], when [s], who
+    thrust: tuple[float, float, str, float] | None = None  # [N], when, who, limit
+    clearance: list[tuple[str, float, float, str]] = field(default_factory=list)
+    gaps: list[tuple[str, float, float, float]] = field(default_factory=list)
+    assignments: dict[str, Assignment] = field(default_factory=dict)
+    judged_to: float = math.inf
+    remarks: list[Remark] = field(default_factory=list)
+
+    @property
+    def passed(self) -> bool:
+        """Whether nothing was found that will fail."""
+        return all(remark.level != "fails" for remark in self.remarks)
+
+    def words(self) -> Iterator[tuple[str, str]]:
+        """All facts, each under a heading: formations, gains, the way. `remarks` come besides."""
+        for f in self.formations:
+            yield f.name, _formation_words(f)
+        if self.formations:
+            yield "gains", _gain_words(self.gains)
+        if self.room is not None:
+            yield (
+                "separation",
+                f"{self.room[0]:.2f} m at least, {self.room[2]} at {self.room[1]:.2f} s",
+            )
+        if self.thrust is not None:
+            force, t, who, limit = self.thrust
+            of = f" of {limit:g} N" if math.isfinite(limit) else ", of no limit,"
+            yield "thrust", f"{force:.1f} N{of} planned for {who} at {t:.2f} s"
+        for name, room, t, who in self.clearance:
+            yield "clearance", f"{room:.2f} m to '{name}', {who} at {t:.2f} s"
+        for between, wide, takes, t in self.gaps:
+            text = f"{between}: {wide:.2f} m wide, the formation takes {takes:.2f} m at {t:.2f} s"
+            yield "gap", text
+        if len(self.assignments) > 1:
+            told = [
+                f"{name} {a.way:.1f} m, room {a.room:.2f} m" for name, a in self.assignments.items()
+            ]
+            yield "assignment", f"way in all and least room: {'; '.join(told)}"
+        guessed = [leg.phase for leg in self.legs if not leg.exact]
+        if guessed:
+            names = ", ".join(f"'{name}'" for name in guessed)
+            yield "guessed", f"straight ways in {names}, where nothing but distances leads"
+
+    def data(self) -> dict[str, Any]:
+        """Plain data for JSON, agents and slots counted from 1."""
+        g = self.gains
+        return {
+            "passed": self.passed,
+            "remarks": [vars(remark) for remark in self.remarks],
+            "formations": {
+                f.name: {
+                    "held_by": f.held_by,
+                    "rigidity": None if f.rigidity is None else f.rigidity.data(),
+                    "realisations": None if f.realisations is None else f.realisations.data(),
+                }
+                for f in self.formations
+            },
+            "gains": {
+                "stabilised": g.stabilised,
+                "margin": g.margin if math.isfinite(g.margin) else None,
+                "settling_time_s": g.settling_time,
+                "overshoot": g.overshoot,
+                "force_per_error_n_m": g.force,
+            },
+            "way": {
+                "judged_to_s": self.judged_to if math.isfinite(self.judged_to) else None,
+                "guessed_phases": [leg.phase for leg in self.legs if not leg.exact],
+                "separation": _named(("room_m", "time_s", "who"), self.room),
+                "thrust": _named(("thrust_n", "time_s", "who", "limit_n"), self.thrust),
+                "clearance": [
+                    _named(("obstacle", "room_m", "time_s", "who"), c) for c in self.clearance
+                ],
+                "gaps": [_named(("between", "wide_m", "takes_m", "time_s"), g) for g in self.gaps],
+                "assignments": {
+                    name: {"order": [s + 1 for s in a.order], "way_m": a.way, "room_m": a.room}
+                    for name, a in self.assignments.items()
+                },
+            },
+        }
+
+
+def preflight(mission: Mission, *, search: bool | None = None) -> Preflight:
+    """Check a mission that is right in itself for what it will meet.
+
+    Parameters
+    ----------
+    search : for other shapes with the same distances, `STARTS` random starts a formation; default: for up to
+        `SEARCHED` agents
+    """
+    search = mission.n_agents <= SEARCHED if search is None else search
+    formations = [_formation(mission, name, search=search) for name in mission.formations]
+    way, known = planned(mission)
+    found = Preflight(formations, _gains(mission, formations), way)
+    if not known:
+        found.judged_to = float(way[-1].time[-1]) if way else 0.0
+    found.remarks = [
+        *_formation_remarks(mission, formations),
+        *_gain_remarks(mission, found),
+        *_separation(mission, found),
+        *_below(mission, found),
+        *_assigned(mission, found),
+        *_thrust(mission, found),
+        *_obstacles(mission, found),
+        *_limits(mission, found),
+    ]
+    if not known:
+        text = (
+            f"the way is judged to {found.judged_to:g} s: what follows is led by distances that fix no places"
+            " before it flies"
+        )
+        found.remarks.append(Remark("note", "way", text))
+    return found
+
+
+# -- formations --------------------------------------------------------------------------------------
+
+
+def _formation(mission: Mission, name: str, *, search: bool) -> FormationCheck:
+    held = _held_by(mission, name)
+    slots, edges = mission.formation_slots(name), mission.formation_edges(name)
+    if slots is None or not len(edges):
+        return FormationCheck(name, None, held)
+    rigidity = analyse(slots, edges, masses=mission.agents.mass)
+    endless = rigidity.verdict is Verdict.FLEXIBLE  # a continuum of other shapes
+    if not search or endless or _contradiction(mission, name) is not None:
+        return FormationCheck(name, rigidity, held)
+    start = mission.agents.position
+    others = realisations(slots, edges, starts=STARTS, start=start)
+    return FormationCheck(name, rigidity, held, others)
+
+
+def _held_by(mission: Mission, name: str) -> Literal["slots", "distances", "nothing"]:
+    """By what a formation is held in the phases that fly it."""
+    now, controls = None, set()
+    for phase in mission.phases:
+        now = phase.formation if isinstance(phase, Establish | Reshape) else now
+        controls |= {phase.control} if now == name else set()
+    if not controls:
+        return "nothing"
+    return "slots" if controls == {"slots"} else "distances"
+
+
+def _contradiction(mission: Mission, name: str) -> tuple[int, float] | None:
+    """Edge whose given distance is farthest from that of the slots, and by how much [m], if by much."""
+    slots, edges = mission.formation_slots(name), mission.formation_edges(name)
+    if slots is None or not len(edges):
+        return None
+    given = mission.formation_distances(name)
+    error = np.abs(shapes.distances(slots, edges) - given)
+    worst = int(error.argmax())
+    return (worst, float(error[worst])) if error[worst] > _TOLERANCE * given.min() else None
+
+
+def _formation_remarks(mission: Mission, formations: list[FormationCheck]) -> Iterator[Remark]:
+    exact = mission.constraint.solver == "exact"
+    for f in formations:
+        if f.held_by == "nothing":
+            yield Remark("note", "formation", f"'{f.name}' is flown in no phase")
+            continue
+        alone = f.held_by == "distances"
+        if (off := _contradiction(mission, f.name)) is not None:
+            i, j = mission.formation_edges(f.name)[off[0]] + 1
+            given = mission.formation_distances(f.name)[off[0]]
+            text = (
+                f"'{f.name}' will be another shape than its slots: agents {i} and {j} are to be {given:.4g} m"
+                f" apart, their slots are {off[1]:.3g} m off that"
+            )
+            yield Remark("fails", "formation", text)
+        r = f.rigidity
+        if r is None:
+            if len(mission.formation_edges(f.name)):
+                text = f"'{f.name}' has distances that fix no places: its rigidity is not judged"
+                yield Remark("note", "formation", text)
+            continue
+        if r.verdict is Verdict.FLEXIBLE:
+            who = "; ".join(_agents(flex.agents) for flex in r.flexes[:4])
+            more = f" and {len(r.flexes) - 4} more" if len(r.flexes) > 4 else ""
+            text = f"'{f.name}' is flexible: {r.rank} independent distances, {r.needed} hold it; free: {who}{more}"
+            held = ". Add edges (rigidfleet design), or track slots" if alone else "; slots hold it"
+            yield Remark("fails" if alone else "note", "formation", text + held)
+        elif r.verdict is Verdict.UNDECIDED and alone:
+            yield Remark("note", "formation", f"'{f.name}' is undecided: {r.reason}")
+        elif r.verdict is Verdict.PRESTRESS_STABLE and alone:
+            where = "line" if r.dimension == 1 else "plane"
+            text = f"'{f.name}' is held softly"
+            text += f" across its {where}" if r.dimension < 3 else ""
+            yield Remark("note", "formation", f"{text}, by self-stress; slots would hold it firmly")
+        if exact and alone and len(r.edges) > r.rank:
+            text = (
+                f"solver 'exact' has no solution at '{f.name}': {r.rank} of its {len(r.edges)} distances are"
+                " independent there. Use solver = 'iterated'"
+            )
+            yield Remark("fails", "formation", text)
+        yield from _other_shapes(mission, f, alone=alone)
+
+
+def _other_shapes(mission: Mission, f: FormationCheck, *, alone: bool) -> Iterator[Remark]:
+    """Shapes with the same distances, where distances alone lead to one."""
+    others = f.realisations
+    if others is None or not alone:
+        return
+    led = any(
+        isinstance(p, Establish) and p.formation == f.name and p.reference != "shape"
+        for p in mission.phases[:1]
+    )
+    if led and others.leads_to is not None and others.found[others.leads_to].kind is not Kind.SAME:
+        kind = others.found[others.leads_to].kind
+        text = (
+            f"from the start, the distances of '{f.name}' lead to a shape that is {kind}, not to it"
+        )
+        yield Remark("note", "formation", text)
+    elif not others.unique:
+        n = sum(r.kind not in (Kind.SAME, Kind.MIRRORED) for r in others.found)
+        share = sum(r.found for r in others.found if r.kind not in (Kind.SAME, Kind.MIRRORED))
+        what = "another shape has" if n == 1 else f"{n} other shapes have"
+        text = (
+            f"{what} the distances of '{f.name}'; {share} of {others.starts} random starts ended there."
+            " Redundant edges or slots rule them out"
+        )
+        yield Remark("note", "formation", text)
+
+
+# -- gains -------------------------------------------------------------------------------------------
+
+
+def _gains(mission: Mission, formations: list[FormationCheck]) -> GainsCheck:
+    c = mission.constraint
+    stabilised = c.stabilisation == "pid"
+    alpha, beta, gamma = (c.alpha, c.beta, c.gamma) if stabilised else (0.0, 0.0, 0.0)
+    settling = over = None
+    if stabilised:
+        try:
+            settling = gains.settling_time(alpha, beta, gamma)
+            over = gains.overshoot(alpha, beta, gamma)
+        except ValueError:
+            pass  # it rings for a thousand cycles: said in a remark
+    mass = float(np.mean(mission.agents.mass))
+    force = {
+        f.name: f.rigidity.force(beta**2, mass)
+        for f in formations
+        if f.rigidity is not None and f.rigidity.rank
+    }
+    margin = 2 * alpha * beta**2 / gamma if gamma > 0 else math.inf
+    return GainsCheck(stabilised, margin, settling, over, force)
+
+
+def _gain_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
+    g, phases = found.gains, mission.phases
+    if all(phase.control == "slots" for phase in phases) or not len(mission.edges):
+        return
+    if not g.stabilised:
+        yield from _drift(mission)
+    elif g.settling_time is None:
+        yield Remark("note", "gains", "the gains ring for more than a thousand cycles: raise alpha")
+    elif g.settling_time > max(b - a for a, b in _spans(mission)):
+        text = (
+            f"errors of length take {g.settling_time:.3g} s to settle, longer than any phase lasts"
+        )
+        yield Remark("note", "gains", text)
+
+
+def _drift(mission: Mission) -> Iterator[Remark]:
+    """Without feedback an error of length goes on at the rate that it has."""
+    text = "no feedback (stabilisation = 'none'): errors of length stay, and grow at their rates"
+    first = mission.phases[0]
+    if not isinstance(first, Establish):
+        yield Remark("note", "gains", text)
+        return
+    r, v = np.array(mission.agents.position), np.array(mission.agents.velocity)
+    edges, d = (
+        mission.formation_edges(first.formation),
+        mission.formation_distances(first.formation),
+    )
+    i, j = edges.T
+    x = r[i] - r[j]
+    L = np.linalg.norm(x, axis=1)
+    c_dot = ((v[i] - v[j]) * x).sum(axis=1) / L
+    end = _spans(mission)[0][1]
+    error = np.abs(L - d) if first.reference == "step" else np.abs(c_dot) * first.blend / 2
+    error = np.abs(np.where(first.reference == "step", L - d + c_dot * end, error))
+    fails = error.max() > _TOLERANCE * d.min()
+    text += f"; by {end:g} s they reach {error.max():.2g} m"
+    yield Remark("fails" if fails else "note", "gains", text)
+
+
+# -- the way -----------------------------------------------------------------------------------------
+
+
+def planned(mission: Mission) -> tuple[list[Leg], bool]:
+    """The way of all agents, a leg for each phase, and whether it is known to its end."""
+    masses = np.array(mission.agents.mass)
+    frame = None
+    if mission.body_frame is not None:
+        b = mission.body_frame
+        frame = att.dcm_from_euler(np.deg2rad([b.roll_deg, b.pitch_deg, b.yaw_deg]))
+    now = Situation(
+        0.0, np.array(mission.agents.position), np.array(mission.agents.velocity), frame=frame
+    )
+    way: list[Leg] = []
+    for phase, (begin, end) in zip(mission.phases, _spans(mission), strict=True):
+        name = phase.formation if isinstance(phase, Establish | Reshape) else now.formation
+        target = slots_about_cm(mission, name, masses)
+        if isinstance(phase, Establish | Reshape) and target is None:
+            return way, False
+        now = replace(now, t=begin)
+        count = min(max(_SAMPLES, int((end - begin) / _STEP) + 1), _MOST)
+        time = np.linspace(begin, end, count)
+        position, now = _leg(mission, phase, now, masses, target, time)
+        guess = (
+            isinstance(phase, Establish | Reshape)
+            and phase.control != "slots"
+            and phase.reference != "shape"
+        )
+        acceleration = _rate(_rate(position, time), time)
+        way.append(Leg(phase.name, time, position, acceleration, not guess))
+    return way, True
+
+
+def _leg(
+    mission: Mission,
+    phase: Phase,
+    now: Situation,
+    masses: Array,
+    target: Array | None,
+    time: Array,
+) -> tuple[Array, Situation]:
+    """Positions (K, N, 3) of all agents over a phase, and the situation at its end."""
+    t0, t_end = time[0], time[-1]
+    shaping = isinstance(phase, Establish | Reshape)
+    frame, now = attach(mission, phase, now, masses, target)
+    s = _septic((time - t0) / phase.blend) if shaping else np.zeros(len(time))
+    if phase.control == "open":
+        x = about_cm(now.r, masses)
+        after = x
+        if shaping and target is not None:
+            after = target @ shapes.kabsch(x, target, masses).T
+        cm, v = masses @ now.r / masses.sum(), masses @ now.v / masses.sum()
+        a = np.array(phase.input_force) * len(masses) / masses.sum()
+        tau = (time - t0)[:, None]
+        shape = x + s[:, None, None] * (after - x)
+        position = shape + (cm + tau * v + 0.5 * tau**2 * a)[:, None]
+        v_end = np.tile(v + a * (t_end - t0), (len(masses), 1))
+        slots = target if shaping else now.slots
+        now = replace(now, r=position[-1], v=v_end, slots=slots, pose=None, frame=frame)
+    else:
+        assert now.pose is not None  # attached above
+        assert now.slots is not None
+        goal, arrival = goal_of(phase, now, t_end)
+        assert goal is not None
+        r, T, v_cm, omega = _body(mission, now.pose, goal, arrival, time)
+        before = now.slots
+        after = target if shaping and target is not None else before
+        dp, turn = align_slots(before, after, masses) if shaping else (0.0 * before, np.zeros(3))
+        p = before + s[:, None, None] * dp
+        p = p @ att.dcm_from_rotation_vector(s[:, None] * turn)
+        position = r[:, None] + p @ T
+        pose = Pose(r[-1], v_cm, T[-1], omega)
+        velocity = v_cm + np.cross(omega, after) @ T[-1]
+        tracked = pose if phase.control == "slots" else None
+        frame = T[-1] if frame is not None else None
+        now = replace(
+            now, r=position[-1], v=velocity, slots=after, pose=tracked, goal=goal, frame=frame
+        )
+    name = phase.formation if isinstance(phase, Establish | Reshape) else now.formation
+    return position, replace(now, t=t_end, formation=name)
+
+
+def _body(
+    mission: Mission, start: Pose, goal: Pose, arrival: float, time: Array
+) -> tuple[Array, Array, Array, Array]:
+    """CM (K, 3) [m], attitude T (K, 3, 3) of the virtual body, and its velocities [m/s, rad/s] at the end."""
+    t0, rest = time[0], time[-1] - arrival
+    flights = legs(mission, start, goal, arrival - t0)
+    under_way = time <= arrival
+    found = []
+    for i in range(2):
+        x, rate, _ = flights.sample(i, np.append(time[under_way] - t0, arrival - t0))
+        x_end = (x[-1], rate[-1])
+        x = x[:-1]
+        if rest > 0.0 and not under_way.all():
+            after = flights.sample_rest(mission, i, x_end, rest, time[~under_way] - arrival)
+            x, rate = np.concatenate([x, after[0]]), after[1]
+        found.append((x, rate[-1]))
+    (r, v), (phi, phi_dot) = found
+    # Where phi is small at the end, its rate is the body's.
+    return r, att.dcm_from_rotation_vector(phi) @ goal.T, v, phi_dot
+
+
+def _spans(mission: Mission) -> list[tuple[float, float]]:
+    """Start and end [s] of each phase; what ends by settling is taken to settle soon, at most at its timeout."""
+    t, spans = 0.0, []
+    settling = _settling(mission)
+    for phase in mission.phases:
+        begin = t
+        if phase.until is not None:
+            t = phase.until
+        elif phase.duration is not None:
+            t = begin + phase.duration
+        elif phase.settle is not None:
+            least = max(getattr(phase, "blend", 0.0), getattr(phase, "travel", None) or 0.0)
+            t = begin + min(phase.settle.timeout, least + settling + phase.settle.dwell)
+        spans.append((begin, max(t, begin + 1e-6)))
+        t = spans[-1][1]
+    return spans
+
+
+def _settling(mission: Mission) -> float:
+    c = mission.constraint
+    if c.stabilisation == "none":
+        return 0.0
+    try:
+        return gains.settling_time(c.alpha, c.beta, c.gamma)
+    except ValueError:
+        return 0.0
+
+
+def _septic(x: Array) -> Array:
+    """The blend of slots over x = (t - t0) / T_b, as the kernel's references have it."""
+    x = np.clip(x, 0.0, 1.0)
+    return x**4 * (35.0 - x * (84.0 - x * (70.0 - 20.0 * x)))
+
+
+def _rate(x: Array, time: Array) -> Array:
+    return np.gradient(x, time, axis=0, edge_order=2)
+
+
+# -- on the way --------------------------------------------------------------------------------------
+
+
+def _separation(mission: Mission, found: Preflight) -> Iterator[Remark]:
+    if mission.n_agents < 2:
+        return
+    radius, limit = np.array(mission.agents.radius), mission.limits.separation or 0.0
+    worst: dict[bool, tuple[float, float, tuple[int, ...], str]] = {}
+    for leg in found.legs:
+        room, pair = geometry.separation(leg.position, radius)
+        k = int(room.argmin())
+        # Where agents start is known, whatever leads them from there.
+        for exact, at in ((leg.exact, k), (True, 0)) if leg is found.legs[0] else ((leg.exact, k),):
+            if exact not in worst or room[at] < worst[exact][0]:
+                who = tuple(pair[at].tolist())
+                worst[exact] = float(room[at]), float(leg.time[at]), who, leg.phase
+    if worst:
+        least = min(worst.values())
+        found.room = least[0], least[1], _agents(least[2])
+    for exact, (room, t, who, phase) in worst.items():
+        if room > 0 and room >= limit - _SLACK:
+            continue
+        if room <= 0:
+            text = f"{_agents(who)} {'' if exact else 'may '}collide at {t:.2f} s, in '{phase}'"
+        else:
+            text = f"{_agents(who)} come within {room:.2f} m at {t:.2f} s, in '{phase}' (limit {limit:g} m)"
+        guess = "" if exact else "; distances lead there, and the way is a guess"
+        yield Remark("fails" if exact else "note", "collision", text + guess)
+
+
+def _below(mission: Mission, found: Preflight) -> Iterator[Remark]:
+    """One vehicle in the downwash of another."""
+    radius, limit = np.array(mission.agents.radius), mission.limits.separation_below
+    worst: dict[bool, tuple[float, float, tuple[int, ...], str]] = {}
+    for leg in found.legs:
+        for i, j in combinations(range(mission.n_agents), 2) if mission.n_agents <= 100 else ():
+            apart = leg.position[:, j] - leg.position[:, i]
+            beside = np.hypot(apart[:, 0], apart[:, 1]) >= radius[i] + radius[j]
+            room = np.where(beside, np.inf, np.abs(apart[:, 2]) - radius[i] - radius[j])
+            k = int(room.argmin())
+            if room[k] < worst.get(leg.exact, (np.inf,))[0]:
+                who = (j, i) if apart[k, 2] < 0 else (i, j)
+                worst[leg.exact] = float(room[k]), float(leg.time[k]), who, leg.phase
+    for exact, (room, t, (low, high), phase) in worst.items():
+        text = f"agent {low + 1} is below agent {high + 1}, {max(room, 0.0):.2f} m from it at {t:.2f} s, in '{phase}'"
+        if limit is None:
+            yield Remark("note", "downwash", text)
+        elif room < limit - _SLACK:
+            text += f" (limit {limit:g} m)"
+            yield Remark("fails" if exact else "note", "downwash", text)
+
+
+def _thrust(mission: Mission, found: Preflight) -> Iterator[Remark]:
+    masses, limits = np.array(mission.agents.mass), np.array(mission.agents.thrust_limit)
+    weight = np.array([0.0, 0.0, mission.gravity])
+    best: tuple[float, float, str, float, str, bool] | None = None
+    for leg in found.legs:
+        force = masses * np.linalg.norm(leg.acceleration + weight, axis=2)
+        over = force - limits if np.isfinite(limits).any() else force
+        k, i = np.unravel_index(int(over.argmax()), over.shape)
+        share = force[k, i] - (limits[i] if math.isfinite(limits[i]) else 0.0)
+        at = (float(force[k, i]), float(leg.time[k]), f"agent {i + 1}", float(limits[i]))
+        if best is None or share > best[0] - (best[3] if math.isfinite(best[3]) else 0.0):
+            best = (*at, leg.phase, leg.exact)
+    if best is not None:
+        found.thrust = best[:4]
+        force, t, who, limit, phase, exact = best
+        if force > limit * (1 + 1e-3):
+            text = f"{who} needs {force:.1f} N at {t:.2f} s, in '{phase}', and has {limit:g} N"
+            yield Remark("fails" if exact else "note", "thrust", text)
+    yield from _step_thrust(mission, found)
+
+
+def _step_thrust(mission: Mission, found: Preflight) -> Iterator[Remark]:
+    """Forces that references ask for which jump: J M^-1 J^T lambda = -beta^2 c at the jump."""
+    c, masses = mission.constraint, np.array(mission.agents.mass)
+    if c.stabilisation == "none":
+        return
+    limits = np.array(mission.agents.thrust_limit)
+    starts = [np.array(mission.agents.position), *(leg.position[-1] for leg in found.legs)]
+    for phase, r in zip(mission.phases, starts, strict=False):
+        if not (isinstance(phase, Establish | Reshape) and phase.reference == "step"):
+            continue
+        edges = mission.formation_edges(phase.formation)
+        error = shapes.distances(r, edges) - mission.formation_distances(phase.formation)
+        J = jacobian(r, edges)
+        root = np.repeat(1 / np.sqrt(masses), 3)
+        f = np.linalg.lstsq(J * root, -(c.beta**2) * error, rcond=1e-7)[0] / root
+        f = f.reshape(-1, 3) + masses[:, None] * [0.0, 0.0, mission.gravity]
+        need = np.linalg.norm(f, axis=1)
+        i = int((need - np.where(np.isfinite(limits), limits, 0.0)).argmax())
+        if need[i] > limits[i]:
+            text = (
+                f"the step to '{phase.formation}' in '{phase.name}' asks agent {i + 1} for {need[i]:.0f} N, and it has"
+                f" {limits[i]:g} N. Blend: reference = 'shape' or 'distances'"
+            )
+            yield Remark("fails" if c.solver in ("exact", "pinv") else "note", "thrust", text)
+
+
+def _obstacles(mission: Mission, found: Preflight) -> Iterator[Remark]:
+    radius = np.array(mission.agents.radius)
+    for thing in mission.obstacles:
+        worst: dict[bool, tuple[float, float, int, str]] = {}
+        for leg in found.legs:
+            room, agent, _ = geometry.clearance(leg.position, radius, [thing])
+            k = int(room.argmin())
+            if room[k] < worst.get(leg.exact, (np.inf,))[0]:
+                worst[leg.exact] = float(room[k]), float(leg.time[k]), int(agent[k]), leg.phase
+        if worst:
+            room, t, i, _ = min(worst.values())
+            found.clearance.append((thing.name, room, t, f"agent {i + 1}"))
+        for exact, (room, t, i, phase) in worst.items():
+            if room <= 0:
+                verb = "hits" if exact else "may hit"
+                text = f"agent {i + 1} {verb} '{thing.name}' at {t:.2f} s, in '{phase}'"
+                yield Remark("fails" if exact else "note", "obstacle", text)
+    yield from _gaps(mission, found, radius)
+
+
+def _gaps(mission: Mission, found: Preflight, radius: Array) -> Iterator[Remark]:
+    """Gaps between two boxes that the formation's centre passes, and how much of each it takes."""
+    masses = np.array(mission.agents.mass)
+    boxes = [thing for thing in mission.obstacles if isinstance(thing, Box)]
+    for a, b in combinations(boxes, 2):
+        for axis in range(3):
+            one, two = (a, b) if a.max[axis] <= b.min[axis] else (b, a)
+            wide = two.min[axis] - one.max[axis]
+            rest = [k for k in range(3) if k != axis]
+            low, high = np.maximum(a.min, b.min)[rest], np.minimum(a.max, b.max)[rest]
+            if wide <= 0 or (low >= high).any():
+                continue
+            least: tuple[float, float, str] | None = None
+            for leg in found.legs:
+                cm = np.einsum("i,kia->ka", masses, leg.position) / masses.sum()
+                inside = ((cm[:, rest] > low) & (cm[:, rest] < high)).all(axis=1)
+                inside &= (cm[:, axis] > one.max[axis]) & (cm[:, axis] < two.min[axis])
+                if not inside.any():
+                    continue
+                along = leg.position[inside][:, :, axis]
+                takes = (along + radius).max(axis=1) - (along - radius).min(axis=1)
+                k = int(takes.argmax())
+                if least is None or takes[k] > least[0]:
+                    least = float(takes[k]), float(leg.time[inside][k]), leg.phase
+            if least is None:
+                continue
+            takes, t, phase = least
+            between = f"'{one.name}' and '{two.name}'"
+            found.gaps.append((between, wide, takes, t))
+            if takes > wide:
+                text = (
+                    f"the gap between {between} is {wide:.2f} m wide, and the formation takes {takes:.2f} m"
+                    f" in its attitude at {t:.2f} s, in '{phase}': turn or reshape it before"
+                )
+                yield Remark("fails", "obstacle", text)
+
+
+def _limits(mission: Mission, found: Preflight) -> Iterator[Remark]:
+    limits = mission.limits
+    for leg in found.legs:
+        for what, values, limit, unit in (
+            ("speed", leg.velocity, limits.speed, "m/s"),
+            ("acceleration", leg.acceleration, limits.acceleration, "m/s^2"),
+        ):
+            if limit is None:
+                continue
+            size = np.linalg.norm(values, axis=2)
+            k, i = np.unravel_index(int(size.argmax()), size.shape)
+            if size[k, i] > limit * (1 + 1e-3):
+                text = (
+                    f"agent {i + 1} reaches {size[k, i]:.3g} {unit} at {leg.time[k]:.2f} s, in '{leg.phase}'"
+                    f" (limit {limit:g} {unit})"
+                )
+                yield Remark("fails" if leg.exact else "note", what, text)
+        if limits.geofence is not None:
+            low, high = np.array(limits.geofence.min), np.array(limits.geofence.max)
+            out = np.maximum(low - leg.position, leg.position - high).max(axis=2)
+            k, i = np.unravel_index(int(out.argmax()), out.shape)
+            if out[k, i] > _SLACK:
+                by, t = float(out[k, i]), float(leg.time[k])
+                text = f"agent {i + 1} leaves the geofence by {by:.2f} m at {t:.2f} s, in '{leg.phase}'"
+                yield Remark("fails" if leg.exact else "note", "geofence", text)
+
+
+# -- assignment --------------------------------------------------------------------------------------
+
+
+def _assigned(mission: Mission, found: Preflight) -> Iterator[Remark]:
+    """Whether other agents in the slots of the first formation would be better off."""
+    first = next((p for p in mission.phases if isinstance(p, Establish)), None)
+    slots = mission.formation_slots(first.formation) if first is not None else None
+    if slots is None or mission.n_agents < 2:
+        return
+    masses, radius = np.array(mission.agents.mass), np.array(mission.agents.radius)
+    start = np.array(mission.agents.position)
+    identity = np.arange(len(slots))
+    for name, order in (
+        ("as it is", identity),
+        ("shortest", shapes.assigned(start, slots, masses)),
+        ("safe", shapes.assigned(start, slots, masses, radius)),
+    ):
+        way, room = shapes.straight_way(start, slots[order], masses, radius)
+        found.assignments[name] = Assignment(tuple(order.tolist()), way, room)
+    now, short, safe = found.assignments.values()
+    if short.way < (1 - _WORTH) * now.way:
+        text = (
+            f"another assignment to slots is shorter: {short.way:.1f} m in all, not {now.way:.1f} m"
+        )
+        yield Remark("note", "assignment", text + ' (assignment = "shortest")')
+    if safe.room > now.room + 0.05 and now.room < 2 * radius.max():
+        text = f"another one is safer: {safe.room:.2f} m between agents on the way instead of {now.room:.2f} m"
+        yield Remark("note", "assignment", text + ' (assignment = "safe")')
+
+
+def _formation_words(f: FormationCheck) -> str:
+    r = f.rigidity
+    held = {"slots": "held by slots", "distances": "held by distances", "nothing": "not flown"}[
+        f.held_by
+    ]
+    if r is None:
+        return f"{held}; its distances fix no places, so its rigidity is not judged"
+    parts = [f"{r.verdict}, {held}: {len(r.edges)} edges, rank {r.rank} of {r.needed}"]
+    if r.reachable < r.needed:
+        where = "line" if r.dimension == 1 else "plane"
+        parts[0] += f" ({r.reachable} reachable on a {where})"
+    if len(r.redundant):
+        names = ", ".join(f"{i}-{j}" for i, j in (r.edges[r.redundant][:6] + 1).tolist())
+        more = ", ..." if len(r.redundant) > 6 else ""
+        parts.append(f"{len(r.redundant)} edges of which any one is redundant ({names}{more})")
+    if r.flexes:
+        free = "; ".join(_agents(flex.agents) for flex in r.flexes[:3])
+        more = f" and {len(r.flexes) - 3} more" if len(r.flexes) > 3 else ""
+        parts.append(f"{len(r.flexes)} free to first order: {free}{more}")
+    if r.rank:
+        parts.append(
+            f"index {r.index:.3g}, w {r.w:.3g}: behind 1 cm of error up to {r.offset(1.0):.3g} cm of displacement"
+        )
+    if f.realisations is not None:
+        counts = [f"{x.kind} {x.found}" for x in f.realisations.found]
+        most = f", and {len(counts) - 4} more" if len(counts) > 4 else ""
+        parts.append(f"from {f.realisations.starts} random starts: {', '.join(counts[:4])}{most}")
+    return "; ".join(parts)
+
+
+def _gain_words(g: GainsCheck) -> str:
+    if not g.stabilised:
+        return "no feedback: stabilisation = 'none'"
+    text = f"stable, margin {g.margin:.3g} (2 alpha beta^2 / gamma > 1)"
+    if g.settling_time is not None and g.overshoot is not None:
+        text += f"; settles to 2 % in {g.settling_time:.3g} s, overshoot {100 * g.overshoot:.0f} %"
+    if g.force:
+        name, force = max(g.force.items(), key=lambda item: item[1])
+        text += f"; 1 cm of sudden error asks for up to {force / 100:.2g} N ('{name}')"
+    return text
+
+
+def _agents(who: tuple[int, ...]) -> str:
+    """Agents counted from 1, in words."""
+    names = [str(i + 1) for i in who]
+    if len(names) == 1:
+        return f"agent {names[0]}"
+    return f"agents {', '.join(names[:-1])} and {names[-1]}"
+
+
+def _named(names: tuple[str, ...], values: tuple[Any, ...] | None) -> dict[str, Any] | None:
+    if values is None:
+        return None
+    plain = [None if isinstance(v, float) and not math.isfinite(v) else v for v in values]
+    return dict(zip(names, plain, strict=True))
