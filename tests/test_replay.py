@@ -11,8 +11,9 @@ from flights import swarm
 
 from rigidfleet.errors import ResultError
 from rigidfleet.figures import agent_colours
-from rigidfleet.replay import html_page, replay, thrust_directions
+from rigidfleet.replay import html_page, replay
 from rigidfleet.replay.pack import Column, pack
+from rigidfleet.replay.scene import thrust_directions
 
 EIGHT = swarm(8, 90.0)
 
@@ -116,10 +117,10 @@ def test_columns_are_the_flight():
     np.testing.assert_allclose(
         columns["tension"], -at(EIGHT.multiplier), atol=info["tension"] / 999
     )
-    np.testing.assert_allclose(columns["plot thrust"], at(EIGHT.thrust), atol=1e-3)
-    np.testing.assert_allclose(columns["plot separation"], at(EIGHT.separation[:, None]), atol=1e-3)
+    np.testing.assert_allclose(columns["thrust plot"], at(EIGHT.thrust), atol=1e-3)
+    np.testing.assert_allclose(columns["separation plot"], at(EIGHT.separation[:, None]), atol=1e-3)
     error = np.abs(EIGHT.constraint).max(axis=1, keepdims=True)
-    np.testing.assert_allclose(columns["plot error"], at(error), atol=2e-6)
+    np.testing.assert_allclose(columns["error plot"], at(error), atol=2e-6)
 
 
 def test_jumps_stay_where_they_are():
@@ -205,7 +206,7 @@ def test_nothing_known():
     assert info["count"] == 1
     assert info["step"] == 0.0
     assert np.isnan(columns["slot"]).all()
-    assert [plot["key"] for plot in info["plots"]] == ["thrust", "clearance"]
+    assert [plot["column"] for plot in info["plots"]] == ["thrust plot", "clearance plot"]
 
 
 def test_incomplete():

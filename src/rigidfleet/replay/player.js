@@ -162,7 +162,8 @@ class Player {
     this.told = 0;
     this.scene = new Scene(part("view"), part("labels"), recording);
     this.write(info);
-    this.plots = info.plots.map((plot) => new Plot(part("plots"), plot, recording, (share) => this.seek(recording.start + share * (recording.end - recording.start))));
+    const go = (share) => this.seek(this.span()[0] + share * (this.span()[1] - this.span()[0]));
+    this.plots = info.plots.map((plot) => new Plot(part("plots"), plot, recording, go));
     this.listen();
     new ResizeObserver(() => this.resize()).observe(document.documentElement);
     this.follow();
@@ -176,18 +177,8 @@ class Player {
   write(info) {
     part("name").textContent = info.name;
     part("title").textContent = info.title;
-    part("whole").textContent = `of ${Number(this.recording.end.toFixed(2))} s`;
-    if (info.ending) {
-      part("ending").textContent = `Incomplete: ${info.ending.split(": ")[0]}`;
-      part("ending").title = info.ending;
-      part("ending").hidden = false;
-    }
-    info.phases.forEach((phase, k) => {
-      const button = element("button", part("phases"), { type: "button", title: `${k + 1}. ${phase.name} (${digits(phase.start)} to ${digits(phase.end)} s)` }, phase.name);
-      button.style.flexGrow = String(Math.max(phase.end - phase.start, 1e-3));
-      button.addEventListener("click", () => this.seek(phase.start));
-    });
-    for (const speed of SPEEDS) element("option", part("speed"), { value: String(speed) }, `${speed}×`);
+    this.writeStory(info);
+    for (const speed of this.speeds()) element("option", part("speed"), { value: String(speed) }, `${speed}×`);
     part("speed").value = "1";
     for (const mode of CAMERAS) {
       const title = { follow: "Follow the formation (1)", overview: "See the whole flight (2)", top: "See from above (3)" }[mode];
@@ -206,6 +197,25 @@ class Player {
     if (info.edges.length) this.writeScale(info);
     this.look("follow");
     part("more").setAttribute("aria-pressed", String(part("panel").offsetWidth > 0));
+  }
+
+  speeds() {
+    return SPEEDS;
+  }
+
+  /** What is known of the flight as a whole. */
+  writeStory(info) {
+    part("whole").textContent = `of ${Number(this.recording.end.toFixed(2))} s`;
+    part("ending").hidden = !info.ending;
+    part("ending").textContent = `Incomplete: ${info.ending.split(": ")[0]}`;
+    part("ending").title = info.ending;
+    part("phases").replaceChildren();
+    info.phases.forEach((phase, k) => {
+      const title = `${k + 1}. ${phase.name} (${digits(phase.start)} to ${digits(phase.end)} s)`;
+      const button = element("button", part("phases"), { type: "button", title }, phase.name);
+      button.style.flexGrow = String(Math.max(phase.end - phase.start, 1e-3));
+      button.addEventListener("click", () => this.seek(phase.start));
+    });
   }
 
   writeScale(info) {
@@ -268,7 +278,8 @@ class Player {
   key(event) {
     if (event.ctrlKey || event.metaKey || event.altKey || event.target.tagName === "SELECT") return;
     const step = event.shiftKey ? 0.1 : 1, { phases } = this.recording.info, now = this.recording.phaseAt(this.time);
-    const speed = (by) => this.hasten(SPEEDS[Math.max(0, Math.min(SPEEDS.indexOf(this.speed) + by, SPEEDS.length - 1))]);
+    const speeds = this.speeds();
+    const speed = (by) => this.hasten(speeds[Math.max(0, Math.min(speeds.indexOf(this.speed) + by, speeds.length - 1))]);
     const deeds = {
       " ": () => event.target.tagName !== "BUTTON" && this.toggle(),
       k: () => this.toggle(),
@@ -339,16 +350,23 @@ class Player {
 
   resize() {
     // The picture's centre lies in the middle of what is free.
-    const page = document.documentElement, side = part("panel").offsetWidth, bottom = part("bar").offsetHeight + 14;
-    const right = side && side < 0.4 * page.clientWidth ? side + 14 : 0, { camera } = this.scene;
-    camera.centre = [-right / page.clientWidth, bottom / page.clientHeight];
-    camera.free = [1 - right / page.clientWidth, 1 - bottom / page.clientHeight];
+    const { clientWidth: width, clientHeight: height } = document.documentElement, { camera } = this.scene;
+    const beside = (id) => (part(id)?.offsetWidth && width > 760 ? part(id).offsetWidth + 14 : 0);
+    const left = beside("fly"), right = beside("panel"), bottom = part("bar").offsetHeight + 14;
+    camera.centre = [(left - right) / width, bottom / height];
+    camera.free = [1 - (left + right) / width, 1 - bottom / height];
     this.redraw();
     this.stale = true;
   }
 
+  /** The times that plots show. */
+  span() {
+    return [this.recording.start, this.recording.end];
+  }
+
   redraw() {
-    for (const plot of this.plots) plot.draw(0, this.recording.count - 1);
+    const [first, last] = this.span().map((time) => this.recording.nearest(time));
+    for (const plot of this.plots) plot.draw(first, last);
   }
 
   // -- from picture to picture --
@@ -358,8 +376,7 @@ class Player {
     const wait = Math.min((now - this.last) / 1000, 0.25);
     this.last = now;
     if (this.playing) {
-      this.seek(this.time + wait * this.speed);
-      if (this.time >= this.recording.end) this.play(false);
+      this.advance(wait);
       this.spare(wait);
     }
     // A picture at rest is drawn once more, at full resolution.
@@ -373,6 +390,11 @@ class Player {
       this.tell();
     }
     this.pictures++;
+  }
+
+  advance(wait) {
+    this.seek(this.time + wait * this.speed);
+    if (this.time >= this.recording.end) this.play(false);
   }
 
   /** Where pictures come slowly, draw fewer pixels. */
@@ -395,7 +417,7 @@ class Player {
     part("scrub").value = String(time);
     part("scrub").setAttribute("aria-valuetext", `${time.toFixed(1)} s, ${phase?.name ?? ""}`);
     [...part("phases").children].forEach((button, k) => button.toggleAttribute("aria-current", k === state.phase));
-    const share = recording.end > recording.start ? (time - recording.start) / (recording.end - recording.start) : 0;
+    const [first, last] = this.span(), share = last > first ? (time - first) / (last - first) : 0;
     for (const plot of this.plots) plot.point(share, state);
     const larger = scene.enlarged > 1.15 ? `Vehicles are drawn ${digits(scene.enlarged)} times as large as they are.` : "";
     write("notes", [info.note, larger].filter(Boolean).join("\n"));

@@ -45,6 +45,14 @@ class Recording {
     return this.info.start + Math.max(this.count - 1, 0) * this.info.step;
   }
 
+  /** Forget the first samples. */
+  forget(samples) {
+    for (const name in this.widths) this.columns[name] = this.columns[name].slice(samples * this.widths[name]);
+    this.reach.splice(0, samples);
+    this.count -= samples;
+    this.info.start += samples * this.info.step;
+  }
+
   /** Add a sample, values by name. */
   append(values) {
     for (const name in this.widths) {
@@ -55,6 +63,12 @@ class Recording {
       this.columns[name] = data;
     }
     this.count++;
+  }
+
+  /** Index of the sample nearest to a time. */
+  nearest(time) {
+    const [k, f] = this.place(time);
+    return k + Math.round(f);
   }
 
   /** Index of the sample before a time, and how far it is to the next (0 to 1). */

@@ -149,6 +149,7 @@ class Scene {
     if (this.show.trails) this.placeTrails(time);
     if (this.show.edges) this.placeEdges(state);
     if (this.show.axes) this.placeAxes(state);
+    if (state.target) this.placeTarget(state);
     this.placePath();
     this.placeWaypoints(state);
 
@@ -320,6 +321,17 @@ class Scene {
       for (; j + every <= k; j += every) lines.world.add(at(j, i), at(j + every, i), 2, colour, fresh(j), fresh(j + every));
       if (j <= k) lines.world.add(at(j, i), state.position.subarray(3 * i, 3 * i + 3), 2, colour, fresh(j), full);
     }
+  }
+
+  /** Where the hand wants the body to be, on a live flight. */
+  placeTarget(state) {
+    const { lines, places, info, recording } = this, p = Array.from(state.target.subarray(0, 3)), cm = Array.from(state.cm);
+    const [k] = recording.place(state.time), size = 0.3 * recording.reachAt(k);
+    places.pins.add(p, this.sized(p, 6), NO_TURN, INK, 1);
+    places.shades.add([p[0], p[1], info.ground], this.sized(p, 10), NO_TURN, INK, 0.4);
+    lines.world.add(p, [p[0], p[1], info.ground], 1, RIM, 0.5);
+    if (length(sub(p, cm)) > 0.02 * size) lines.world.add(cm, p, 1.6, INK, 0.35);
+    bodyAxes(state.target.subarray(3, 7)).forEach((axis, a) => lines.world.add(p, add(p, scaled(axis, size)), 2, AXES[a], 0.7));
   }
 
   /** Body axes at the centre of mass, and faintly those commanded where they differ. */
