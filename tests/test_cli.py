@@ -351,6 +351,61 @@ def on_terminal(arguments: list[str], answers: Sequence[str | None]) -> str:
     return shown
 
 
+# -- design ------------------------------------------------------------------------------------------
+
+
+def test_design(capsys):
+    """The designed cube beats the paper's 18 edges, and its formation can be flown as printed."""
+    assert cli.main(["design", "cube"]) == cli.PASSED
+    out, err = capsys.readouterr()
+    rows = {line[:14].strip(): line.split() for line in err.splitlines()[1:]}
+    assert rows["designed"][5:7] == ["0.6180", "0.3820"]
+    assert rows["the paper's 18"][7:9] == ["0.5085", "0.2586"]
+    assert rows["all pairs"][2] == "28"
+    mission = mission_text("establish-cube").split("[formations.cube]")[0]
+    phase = '[[phases]]\nkind = "establish"\nformation = "cube"\nuntil = 9\n'
+    assert cli.main(["check", write("mine.toml", mission + out + phase)]) == cli.PASSED
+
+
+def test_design_of_points(capsys):
+    """Points from a file get their edges; what distances do not hold of a flat shape is said."""
+    Path("flat.csv").write_text("x,y,z\n0,0,0\n4,0,0\n4,4,0\n0,4,0\n", encoding="utf-8")
+    assert cli.main(["design", "flat.csv", "--extra", "complete", "--json"]) == cli.PASSED
+    found = json.loads(capsys.readouterr().out)
+    assert found["graphs"]["designed"]["edges"] == 6
+    assert "The shape is flat" in found["limits"]
+    assert found["toml"].startswith("[formations.flat]")
+
+
+def test_design_keeps_files(capsys):
+    """A file that is there is kept, unless it is to be replaced."""
+    arguments = ["design", "square", "--out", "square.toml"]
+    assert cli.main(arguments) == cli.PASSED
+    assert "Formation  square.toml" in capsys.readouterr().out
+    assert cli.main(arguments) == cli.BAD_INPUT
+    assert cli.main([*arguments, "--force", "--extra", "1"]) == cli.PASSED
+    assert Path("square.toml").read_text(encoding="utf-8").count("], [") == 5
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["cube", "--range", "3"], "5.65685 m would do"),
+        (["cube", "--extra", "some"], "'some' is no number"),
+        (["cube", "--extra", "-1"], "extra must be >= 0"),
+        (["sphere"], "give --agents"),
+        (["cube", "--agents", "7"], "takes 8 agents"),
+        (["blob"], "neither a shape nor a file"),
+        (["short.toml", "--size", "4"], "remove --agents and --size"),
+        (["short.toml"], "short.toml"),
+    ],
+)
+def test_design_of_nothing(arguments, message, capsys):
+    """What cannot be designed is refused with a reason."""
+    assert cli.main(["design", *arguments]) == cli.BAD_INPUT
+    assert message in capsys.readouterr().err
+
+
 # -- run ---------------------------------------------------------------------------------------------
 
 

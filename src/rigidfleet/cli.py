@@ -52,6 +52,8 @@ _WIDE = 1000
 _SELDOM = 10.0
 #: A flight is heard of several times a second: when not for so long, it compiles [s].
 _SILENCE = 1.0
+#: A design of so many agents is compared with all pairs.
+_COMPARED = 60
 _COMPILING = "Compiling the flight kernel (once, about 20 s)"
 
 app = App(
@@ -262,6 +264,110 @@ def check(
 
 
 @app.command(sort_key=4)
+def design(
+    shape: str,
+    /,
+    *,
+    agents: int | None = None,
+    size: Annotated[list[float] | None, Parameter(consume_multiple=True)] = None,
+    extra: str = "0",
+    sensing_range: Annotated[float | None, Parameter(name="--range")] = None,
+    out: Path | None = None,
+    force: bool = False,
+    json: bool = False,
+) -> int:
+    """Choose the edges that hold a shape best, and write the formation for a mission file.
+
+    As few edges as hold it, of the greatest rigidity index found; compared with all pairs.
+
+    Parameters
+    ----------
+    shape : str
+        A named shape, or a file of points: x, y, z of one agent a line.
+    agents : int
+        Number of agents; as many as the shape needs if not given.
+    size : float
+        Edge length of a named shape [m], 4 if not given; three for a cuboid or a helix.
+    extra : str
+        Number of redundant edges besides, or "complete" for all.
+    sensing_range : float
+        No edge is longer than this [m].
+    out : Path
+        Write the formation to this file; else it is printed.
+    force : bool
+        Replace that file if it is there already.
+    json : bool
+        Print all of it as JSON.
+    """
+    from rigidfleet import design as designs
+    from rigidfleet.formation import CUBE_EDGES, complete_graph
+    from rigidfleet.result import write_file
+    from rigidfleet.rigidity import analyse
+
+    if out is not None and out.exists() and not force:
+        raise RigidfleetError(f"{out}: exists already and is kept. Replace it by --force.")
+    try:
+        name, slots = _points(shape, agents, size)
+        more = extra if extra == "complete" else int(_number(extra))
+        edges = designs.design(slots, extra=more, sensing_range=sensing_range)
+        kinds = {"designed": edges}
+        if shape == "cube":
+            kinds["the paper's 18"] = CUBE_EDGES
+        if len(slots) <= _COMPARED:
+            kinds["all pairs"] = complete_graph(len(slots))
+        judged = {what: analyse(slots, graph) for what, graph in kinds.items()}
+    except ValueError as error:
+        raise RigidfleetError(f"{shape}: {str(error).rstrip('.')}.") from None
+    text = designs.mission_fragment(name, slots, edges)
+    limits = designs.limits(slots)
+    if out is not None:
+        write_file(out, text.encode())
+    if json:
+        found = {what: rigidity.data() for what, rigidity in judged.items()}
+        _print_json({"name": name, "toml": text, "limits": limits, "graphs": found})
+        return PASSED
+    table = _table("graph", "edges", "rank", "index", "w", "longest", "verdict")
+    for what, rigidity in judged.items():
+        i, j = rigidity.edges.T
+        longest = max(((slots[i] - slots[j]) ** 2).sum(axis=1) ** 0.5, default=0.0)
+        rank = f"{rigidity.rank} of {rigidity.needed}"
+        cells = (f"{rigidity.index:.4f}", f"{rigidity.w:.4f}", f"{longest:.3g} m")
+        table.add_row(what, str(len(rigidity.edges)), rank, *cells, str(rigidity.verdict))
+    console = _out() if out is not None else _err()  # so that the formation alone can be piped
+    console.print(table)
+    if limits:
+        console.print(limits)
+    if out is None:
+        _print_exactly(text)
+    else:
+        console.print(f"Formation  {out}", soft_wrap=True)
+    return PASSED
+
+
+def _points(shape: str, agents: int | None, size: list[float] | None) -> tuple[str, Any]:
+    """Name and slots (N, 3) [m] of a named shape, or of a file of points.
+
+    Raises
+    ------
+    ValueError
+        The shape takes other numbers of agents or sizes, or an option has no effect on a file.
+    """
+    from rigidfleet.formation import SHAPES, agents_taken, centred, read_points, slots
+
+    if shape in SHAPES:
+        form = SHAPES[shape]
+        count = form.agents.start if agents is None else agents
+        if agents is None and len(form.agents) > 1:
+            raise ValueError(f"takes {agents_taken(shape)}, give --agents")
+        return shape, slots(shape, size or [4.0] * form.sizes, count)
+    if not Path(shape).exists():
+        raise ValueError(f"neither a shape nor a file; shapes: {', '.join(SHAPES)}")
+    if agents is not None or size is not None:
+        raise ValueError("a file has its own points, remove --agents and --size")
+    return Path(shape).stem, centred(read_points(shape))
+
+
+@app.command(sort_key=5)
 def new(
     name: str = "",
     /,
@@ -333,7 +439,7 @@ def new(
     return PASSED
 
 
-@app.command(sort_key=5)
+@app.command(sort_key=6)
 def report(
     result: Path,
     /,
