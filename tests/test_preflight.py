@@ -5,8 +5,9 @@ import sys
 import numpy as np
 import pytest
 
+from rigidfleet.assess import assess
 from rigidfleet.figures.graph import graphs
-from rigidfleet.formation import assigned, slots, straight_way
+from rigidfleet.formation import assigned, distances, slots, straight_way
 from rigidfleet.mission import Mission, load_mission, mission_names
 from rigidfleet.preflight import STARTS, planned, preflight
 from rigidfleet.simulate import simulate
@@ -257,6 +258,30 @@ def test_safe_assignment():
             for order in (np.arange(8), assigned(start, cube, m), assigned(start, cube, m, radius))
         ]
         assert rooms[2] >= max(rooms) - 0.01
+
+
+@pytest.mark.parametrize("assignment", ["given", "shortest", "safe"])
+def test_assignment_of_a_mission(assignment):
+    """Agents that would collide on their way are sent to other slots, and the flight is judged by those."""
+    crossed = [SQUARE[1], SQUARE[0], SQUARE[2], SQUARE[3]]
+    sides = {"edges": [[1, 2], [2, 3], [3, 4], [1, 4], [1, 3]]}
+    flown = mission(crossed, square=sides, assignment=assignment)
+    assert preflight(flown).passed == (assignment != "given")
+    verdict = assess(simulate(flown))
+    assert verdict.passed == (assignment != "given")
+    edges, lengths = flown.formation_edges("square"), flown.formation_distances("square")
+    places = flown.formation_slots("square")
+    np.testing.assert_allclose(distances(places, edges), lengths)
+    if assignment != "given":
+        start = np.array(crossed, dtype=float)
+        np.testing.assert_allclose(distances(start, edges), lengths)
+
+
+def test_assignment_by_default_changes_nothing():
+    """Without the key, agent 1 takes slot 1."""
+    cube = load_mission("establish-cube")
+    np.testing.assert_array_equal(cube.assigned_slots, np.arange(8))
+    np.testing.assert_array_equal(cube.formation_slots("cube"), slots("cube", 4.0, 8))
 
 
 # -- figure ------------------------------------------------------------------------------------------

@@ -769,7 +769,8 @@ def _assigned(mission: Mission, found: Preflight) -> Iterator[Remark]:
         ("safe", shapes.assigned(start, slots, masses, radius)),
     ):
         way, room = shapes.straight_way(start, slots[order], masses, radius)
-        found.assignments[name] = Assignment(tuple(order.tolist()), way, room)
+        taken = mission.assigned_slots[order]
+        found.assignments[name] = Assignment(tuple(taken.tolist()), way, room)
     now, short, safe = found.assignments.values()
     if short.way < (1 - _WORTH) * now.way:
         text = (

@@ -13,10 +13,10 @@ import numpy as np
 from pydantic import PrivateAttr
 
 from rigidfleet.errors import Finding, MissionError
-from rigidfleet.formation import Floats, Ints
+from rigidfleet.formation import Floats, Ints, assigned
 from rigidfleet.mission.check import check
 from rigidfleet.mission.notes import near
-from rigidfleet.mission.schema import Contents
+from rigidfleet.mission.schema import Contents, Establish
 from rigidfleet.mission.toml import to_toml
 
 _SHIPPED = resources.files("rigidfleet") / "missions"
@@ -84,17 +84,32 @@ class Mission(Contents):
         pairs = (pair for name in self.formations for pair in self.formation_edges(name).tolist())
         return np.array(list(dict.fromkeys(map(tuple, pairs))), dtype=np.int64).reshape(-1, 2)
 
+    @cached_property
+    def assigned_slots(self) -> Ints:
+        """Slot (N,) that each agent takes, from 0, as `assignment` has it: the same in all formations."""
+        n = self.n_agents
+        first = next((p.formation for p in self.phases if isinstance(p, Establish)), None)
+        slots = None if first is None else self.formations[first].slot_array(n)
+        if self.assignment == "given" or slots is None or n < 2:
+            return np.arange(n)
+        radius = self.agents.radius if self.assignment == "safe" else None
+        return assigned(self.agents.position, slots, self.agents.mass, radius)
+
     def formation_edges(self, name: str) -> Ints:
-        """Edges (m, 2) of a formation, counted from 0, i < j."""
-        return self.formations[name].edge_array(self.n_agents)
+        """Edges (m, 2) of a formation between agents, counted from 0, i < j."""
+        edges = self.formations[name].edge_array(self.n_agents)
+        if self.assignment == "given":
+            return edges
+        return np.sort(np.argsort(self.assigned_slots)[edges], axis=1)
 
     def formation_slots(self, name: str) -> Floats | None:
-        """Slots (N, 3) [m] of a formation about their geometric centre.
+        """Slots (N, 3) [m] of a formation about their geometric centre, in the order of the agents.
 
         Derived from a complete set of distances where no slots are given; None where that is
         incomplete, too.
         """
-        return self.formations[name].slot_array(self.n_agents)
+        slots = self.formations[name].slot_array(self.n_agents)
+        return slots if slots is None else slots[self.assigned_slots]
 
     def formation_distances(self, name: str) -> Floats:
         """Length (m,) [m] of each edge of a formation."""

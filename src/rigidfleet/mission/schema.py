@@ -402,6 +402,11 @@ class Header(Part):
     formulation: Literal["inertial", "body"] = Field(
         "inertial", description="equations integrated: Newton's, or the paper's in the body frame"
     )
+    assignment: Literal["given", "shortest", "safe"] = Field(
+        "given",
+        description="who takes which slot (and its edges): given, agent 1 slot 1 and so on; shortest, least "
+        "squared way from the start to the first formation established; safe, most room on the way",
+    )
     gravity: NonNegative = Field(9.81, description="gravity [m/s^2], >= 0")
     output_step: Positive = Field(0.05, description="time between samples of the result [s]")
 
