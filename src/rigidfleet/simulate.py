@@ -30,8 +30,8 @@ _STEPS, _PAUSE = 2000, 0.05
 #: A phase has stalled that took more steps than these and those for each second of mission time, or
 #: more than the last in all. A step of 1 ms is already that of gains above 1e3 /s.
 _STALLED, _STALLED_RATE, _MOST_STEPS = 100_000, 10_000.0, 5_000_000
-#: Beyond, one evaluation of the constraint force by its dense solve takes more than seconds.
-_MOST_EDGES = 2000
+#: Equations of the constraint force at most: beyond, one evaluation takes seconds.
+_LARGEST = 2000
 #: Where a phase ends by settling, whether it has is asked this often [s].
 _CHECK = 0.1
 #: Progress is reported this often [s of wall time].
@@ -504,10 +504,10 @@ class Flight:
         plan, w = leg.plan, leg.workspace
         n, m = len(self.masses), len(plan.edges)
         out = flight.recorder(len(times), n, m)
-        flight.record(times, samples, program, w, out)
+        flight.record(times, samples, program, w, np.empty(samples.shape[1]), out)
         if program is not plan.program:  # flown by a user's controller: the phase's references
             asked = flight.recorder(len(times), n, m)
-            flight.record(times, samples, plan.program, w, asked)
+            flight.record(times, samples, plan.program, w, np.empty(samples.shape[1]), asked)
             out = out._replace(
                 r_ref=asked.r_ref,
                 p=asked.p,
@@ -544,10 +544,13 @@ def _check_size(mission: Mission, phase: Phase) -> None:
     if not isinstance(phase, Establish | Reshape):
         return
     edges = len(mission.formation_edges(phase.formation))
-    if edges > _MOST_EDGES:
+    size = min(edges, 3 * mission.n_agents) if mission.constraint.solver == "iterated" else edges
+    if size > _LARGEST:
         raise StoppedError(
-            f"phase '{phase.name}' takes '{phase.formation}', which has {edges:,} edges: with more than"
-            f" {_MOST_EDGES:,} a flight takes hours. Give it fewer; 3 N - 6, and some more, will do"
+            f"phase '{phase.name}' takes '{phase.formation}', whose {edges:,} edges between"
+            f" {mission.n_agents:,} agents make {size:,} equations for the constraint force; with more"
+            f" than {_LARGEST:,} a flight takes hours. Give it fewer edges, fly fewer agents, or track"
+            " slots with edges = []"
         )
 
 

@@ -13,5 +13,11 @@ _FAST = {"reassoc", "contract", "arcp", "nsz"}
 
 
 def compiled(function: F) -> F:
-    """Compile for the flight: cached on disk, without the GIL, division by zero gives infinity."""
-    return numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)(function)
+    """Compile for the flight: cached on disk, without the GIL, division by zero gives infinity.
+
+    Nothing in the kernel allocates, so that Numba need not count references (``_nrt``): counting
+    them takes as long as the physics of three agents.
+    """
+    return numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST, _nrt=False)(
+        function
+    )

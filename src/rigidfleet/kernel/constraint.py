@@ -29,10 +29,11 @@ def edge_geometry(r, edges, u, L):
 
 
 @compiled
-def right_side(v, integral, f, m, edges, law, w):
+def right_side(v, integral, a, edges, law, w):
     """The bracket of Eq. 12 into w.b (m,) [m/s^2], the constraints (Eq. 3) into w.c.
 
-    Jdot v of an edge is (|dv|^2 - (u . dv)^2) / L; ``f`` (N, 3) [N] is every force but f_C.
+    Jdot v of an edge is (|dv|^2 - (u . dv)^2) / L; ``a`` (N, 3) [m/s^2] is M^-1 f_E, the acceleration
+    by every force but f_C.
     """
     for k in range(edges.shape[0]):
         i, j = edges[k, 0], edges[k, 1]
@@ -41,7 +42,7 @@ def right_side(v, integral, f, m, edges, law, w):
             dv = v[i, q] - v[j, q]
             speed2 += dv * dv
             along += w.u[k, q] * dv
-            pull += w.u[k, q] * (f[i, q] / m[i] - f[j, q] / m[j])
+            pull += w.u[k, q] * (a[i, q] - a[j, q])
         w.c[k] = w.L[k] - w.d[k]
         w.b[k] = (
             w.d_ddot[k]

@@ -114,23 +114,24 @@ def closed_loop(t, y, dy, p, w):
             t, p.reference, graph.edges, w.p, w.p_dot, w.p_ddot, w.d, w.d_dot, w.d_ddot
         )
         for i in range(n):
+            inverse = 1.0 / m[i]
             for s in range(3):
-                w.a[i, s] = w.f_E[i, s] + w.f_u[i, s]
-        right_side(v, y[6 * n : q], w.a, m, graph.edges, p.law, w)
+                w.a[i, s] = inverse * (w.f_E[i, s] + w.f_u[i, s])
+        right_side(v, y[6 * n : q], w.a, graph.edges, p.law, w)
         solve_multipliers(vehicles, graph, p.law, w)
         apply_multipliers(w.u, graph.edges, w.multiplier, w.f_C)
         for k in range(n_edges):
             dy[6 * n + k] = w.c[k]
 
     for i in range(n):
-        share = 1.0
+        share, inverse = 1.0, 1.0 / m[i]
         if vehicles.saturate:
             thrust = 0.0
             for s in range(3):
                 thrust += (w.f_u[i, s] + w.f_C[i, s]) ** 2
             share = min(1.0, vehicles.thrust_limit[i] / max(math.sqrt(thrust), 1e-300))
         for s in range(3):
-            w.a[i, s] = (w.f_E[i, s] + share * (w.f_u[i, s] + w.f_C[i, s])) / m[i]
+            w.a[i, s] = inverse * (w.f_E[i, s] + share * (w.f_u[i, s] + w.f_C[i, s]))
 
     if not p.body_formulation:
         for i in range(n):
@@ -339,9 +340,8 @@ def copy(a, out):
 
 
 @compiled
-def record(times, samples, p, w, out):
+def record(times, samples, p, w, dy, out):
     """Evaluate the closed loop at the sampled states and keep its forces and references."""
-    dy = np.empty(samples.shape[1])
     kind = p.control.kind
     for k in range(times.shape[0]):
         closed_loop(times[k], samples[k], dy, p, w)

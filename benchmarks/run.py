@@ -1,0 +1,250 @@
+"""How fast: ratios against SciPy and against a bare interpreter, all from one run.
+
+``make bench`` runs it. Rounds are interleaved, so that a machine whose speed drifts slows both sides
+alike, and the median of the rounds' ratios counts; single times on a shared machine mean little.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from datetime import date
+from importlib.metadata import version
+from pathlib import Path
+from statistics import median
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+from scipy_peer import Literal, Peer, constant, squared
+
+from rigidfleet import formation as shapes
+from rigidfleet.kernel import flight
+from rigidfleet.kernel.program import workspace
+from rigidfleet.mission import Mission, load_mission
+from rigidfleet.plan import plan_phase
+from rigidfleet.route import Situation
+from rigidfleet.simulate import simulate
+
+TOLERANCE = 1e-8
+DURATION, SAMPLES = 20.0, 200
+#: Peers fly the same law: their positions may differ by no more [m].
+AGREEMENT = 1e-6
+
+
+@dataclass
+class Row:
+    """One comparison: times [s] of each round, and the ratio that is asked for."""
+
+    name: str
+    ours: list[float]
+    theirs: list[float]
+    goal: float | None
+    faster: bool  # ratio theirs/ours, at least the goal; else ours/theirs, at most the goal
+    note: str = ""
+
+    @property
+    def ratios(self) -> list[float]:
+        pairs = zip(self.ours, self.theirs, strict=True)
+        return [b / a if self.faster else a / b for a, b in pairs]
+
+    @property
+    def reached(self) -> bool | None:
+        value = median(self.ratios)
+        if self.goal is None:
+            return None
+        return value >= self.goal if self.faster else value <= self.goal
+
+
+def establishment(source: str, *, default_law: bool) -> Mission:
+    """A shipped establishment as one phase of 20 s: the paper's undamped steps, or the default law."""
+    data = load_mission(source).to_dict()
+    name = data["phases"][0]["formation"]
+    reference = "distances" if default_law else "step"
+    data["phases"] = [
+        {"kind": "establish", "formation": name, "reference": reference, "control": "open",
+         "input_force": [0.1, 0.1, 0.0], "duration": DURATION},
+    ]  # fmt: skip
+    data["formations"] = {name: data["formations"][name]}
+    data["integrator"] = {"rtol": TOLERANCE, "atol": TOLERANCE}
+    if not default_law:
+        data["constraint"] = {"solver": "exact", "deformation_damping": 0.0}
+    return Mission.from_dict(data)
+
+
+def peer(mission: Mission, kind: type[Peer]) -> Peer:
+    """The mission's law, programmed with NumPy."""
+    agents, c = mission.agents, mission.constraint
+    r0, m = np.array(agents.position), np.array(agents.mass)
+    name = mission.phases[0].formation
+    edges, d1 = mission.formation_edges(name), mission.formation_distances(name)
+    B = np.zeros((len(edges), len(m)))
+    rows = np.arange(len(edges))
+    B[rows, edges[:, 0]], B[rows, edges[:, 1]] = 1.0, -1.0
+    steps = mission.phases[0].reference == "step"
+    d0 = shapes.distances(r0, edges)
+    return kind(
+        r0=r0,
+        m=m,
+        B=B,
+        gains=(c.alpha, c.beta, c.gamma),
+        reference=constant(d1) if steps else squared(d0, d1, mission.phases[0].blend),
+        f=np.tile(mission.phases[0].input_force, (len(m), 1)),
+        mu=c.damping if c.solver == "iterated" else 0.0,
+        iterations=c.iterations,
+        k_def=c.deformation_damping,
+    )
+
+
+def compiled_flight(mission: Mission) -> Callable[[], np.ndarray]:
+    """The kernel alone: all that is known before the flight is prepared before the clock starts."""
+    agents = mission.agents
+    now = Situation(0.0, np.array(agents.position), np.array(agents.velocity))
+    plan = plan_phase(mission, mission.phases[0], now, DURATION)
+    work = workspace(len(now.r), len(plan.edges), solver=plan.program.law.solver)
+    y = np.concatenate([now.r.ravel(), now.v.ravel(), np.zeros(len(plan.edges))])
+    times = np.linspace(0.0, DURATION, SAMPLES)
+    atol = np.full(len(y), TOLERANCE)
+
+    def fly() -> np.ndarray:
+        samples = np.empty((SAMPLES, len(y)))
+        state = flight.integrator(y, 0.0, rtol=TOLERANCE, atol=atol)
+        flight.integrate(plan.program, work, state, DURATION, True, times, samples, 1 << 40)
+        return samples
+
+    return fly
+
+
+def seconds(job: Callable[[], object], at_least: float = 0.0) -> float:
+    """Time [s] of one call, repeated for ``at_least`` so long and averaged."""
+    start, calls = time.perf_counter(), 0
+    while True:
+        job()
+        calls += 1
+        passed = time.perf_counter() - start
+        if passed >= at_least:
+            return passed / calls
+
+
+def flights(rounds: int) -> tuple[list[Row], bool]:
+    """Kernel and `simulate` against SciPy; and whether all agree."""
+    rows, agree = [], True
+    times = np.linspace(0.0, DURATION, SAMPLES)
+    for default_law, law, goals in (
+        (False, "undamped law", {3: 250.0, 8: 50.0}),
+        (True, "default law", {3: 150.0, 8: 30.0}),
+    ):
+        for source, n in (("establish-triangle", 3), ("establish-cube", 8)):
+            mission = establishment(source, default_law=default_law)
+            ours = compiled_flight(mission)
+            literal, tuned = peer(mission, Literal), peer(mission, Peer)
+            off = max(
+                float(np.abs(ours() - p.fly(times, TOLERANCE))[:, : 3 * n].max())
+                for p in (literal, tuned)
+            )
+            agree &= off <= AGREEMENT
+            simulate(mission, times=times)
+            jobs = {
+                "literal": lambda p=literal: p.fly(times, TOLERANCE),
+                "tuned": lambda p=tuned: p.fly(times, TOLERANCE),
+                "kernel": ours,
+                "simulate": lambda m=mission: simulate(m, times=times),
+            }
+            spent = {name: [] for name in jobs}
+            for _ in range(rounds):
+                for name, job in jobs.items():
+                    spent[name].append(seconds(job, 0.1))
+            title = f"{n} agents, {law}"
+            note = f"positions agree to {off:.0e} m"
+            rows += [
+                Row(title, spent["kernel"], spent["literal"], goals[n], True, note),
+                Row("  hand-tuned NumPy", spent["kernel"], spent["tuned"], None, True),
+                Row("  all of simulate()", spent["simulate"], spent["literal"], None, True),
+            ]
+    return rows, agree
+
+
+def processes(rounds: int) -> list[Row]:
+    """Whole processes: a run with a warm cache, and the first one ever."""
+    program = [sys.executable, "-m", "rigidfleet", "run", "narrow-passage", "--no-figures"]
+    bare = [sys.executable, "-c", "import numpy, scipy.linalg, numba"]
+    with tempfile.TemporaryDirectory() as folder:
+        program += ["--out", folder, "--force"]
+
+        def call(command: list[str], cache: str = "") -> None:
+            # Bytecode is cached on both sides, as it is wherever packages are installed.
+            drop = {"PYTHONDONTWRITEBYTECODE"}
+            env = {k: v for k, v in os.environ.items() if k not in drop}
+            env |= {"NUMBA_CACHE_DIR": cache} if cache else {}
+            subprocess.run(command, check=True, capture_output=True, env=env)
+
+        call(program)
+        call(bare)
+        warm, base = [], []
+        for _ in range(rounds):
+            warm.append(seconds(lambda: call(program)))
+            base.append(seconds(lambda: call(bare)))
+        first = [seconds(lambda: call(program, str(Path(folder) / "cache")))]
+    return [
+        Row("run narrow-passage", warm, base, 4.0, False, "whole process, against its imports"),
+        Row("the first run ever", first, [1.0], 40.0, False, "seconds, compile included"),
+    ]
+
+
+def show(console: Console, rows: list[Row]) -> None:
+    """The table."""
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for column in ("", "ours [ms]", "theirs [ms]", "ratio", "spread", "goal", "reached"):
+        table.add_column(column, justify="right" if column else "left", no_wrap=True)
+    for row in rows:
+        ratios, sign = row.ratios, ">=" if row.faster else "<="
+        table.add_row(
+            row.name,
+            f"{1e3 * median(row.ours):.3g}",
+            f"{1e3 * median(row.theirs):.3g}",
+            f"{median(ratios):.3g}",
+            f"{min(ratios):.3g}..{max(ratios):.3g}",
+            "" if row.goal is None else f"{sign} {row.goal:g}",
+            {None: "", True: "yes", False: "NO"}[row.reached],
+        )
+    console.print(table)
+    for row in rows:
+        if row.note:
+            console.print(f"{row.name}: {row.note}", highlight=False)
+
+
+def main() -> int:
+    """Measure, print, and say whether the peers agree."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--rounds", type=int, default=5, help="rounds, of which the median counts")
+    parser.add_argument("--json", type=Path, help="write the figures to this file")
+    arguments = parser.parse_args()
+    versions = {p: version(p) for p in ("rigidfleet", "numba", "numpy", "scipy")}
+    machine = f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}"
+    console = Console()
+    console.print(f"{date.today()}; {machine}; {versions}", highlight=False)
+    console.print(
+        f"{DURATION:g} s of flight, tolerance {TOLERANCE:g}, {SAMPLES} outputs; SciPy: RK45"
+    )
+    rows, agree = flights(arguments.rounds)
+    rows += processes(arguments.rounds)
+    show(console, rows)
+    if arguments.json:
+        data = [asdict(r) | {"ratios": r.ratios, "reached": r.reached} for r in rows]
+        head = {"date": str(date.today()), "machine": machine, "versions": versions}
+        arguments.json.write_text(json.dumps(head | {"rows": data}, indent=1))
+    if not agree:
+        console.print(f"The peers do not agree to {AGREEMENT:g} m: they do not fly the same law.")
+    return 0 if agree else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
