@@ -16,6 +16,8 @@ Ints = NDArray[np.int64]
 
 # Slots thinner than this, relative to their length, are a line to an attitude fit.
 _THIN = 1e-3
+# Beyond so many agents the closest two are found by a tree, not among all pairs.
+_MANY = 200
 # Numbers in a temporary array at most.
 _ELEMENTS = 8_000_000
 
@@ -28,6 +30,10 @@ def separation(r: Array, radius: ArrayLike) -> tuple[Array, Ints]:
     n = r.shape[1]
     radius = np.asarray(radius, dtype=float)
     least, pair = np.full(len(r), np.inf), np.full((len(r), 2), -1)
+    if n > _MANY and np.ptp(radius) == 0.0 and np.isfinite(r).all():
+        for k, points in enumerate(r):
+            least[k], pair[k] = _closest(points, radius)
+        return least, pair
     for i in range(n - 1):
         room = np.linalg.norm(r[:, i + 1 :] - r[:, i : i + 1], axis=2) - radius[i] - radius[i + 1 :]
         j = room.argmin(axis=1)
@@ -36,6 +42,16 @@ def separation(r: Array, radius: ArrayLike) -> tuple[Array, Ints]:
         least[closer] = room[closer]
         pair[closer, 0], pair[closer, 1] = i, i + 1 + j[closer]
     return least, pair
+
+
+def _closest(r: Array, radius: Array) -> tuple[float, Ints]:
+    """Least room between two of many agents (N, 3) of equal radii, and the pair."""
+    from scipy.spatial import KDTree
+
+    tree = KDTree(r)
+    d, j = tree.query(r, k=2)
+    i = int(d[:, 1].argmin())
+    return float(d[i, 1] - 2.0 * radius[i]), np.sort([i, int(j[i, 1])])
 
 
 def clearance(

@@ -11,6 +11,10 @@ from rigidfleet.mission.schema import Formation
 
 #: So many contradictions among distances are shown one by one.
 _SHOWN = 6
+#: Edges of a formation at most: all pairs of 200 agents. Ten thousand have fifty million.
+_MOST_EDGES = 20_000
+#: Triangles and tetrahedra among distances are judged up to about so many.
+_MOST_CLIQUES = 5e6
 
 
 def check(notes: Notes, n: int | None) -> dict[str, Formation]:
@@ -60,6 +64,13 @@ def _formation(notes: Notes, form: Formation, n: int | None, path: Keys) -> None
         _shape(notes, form, form.shape, n, path)
     if n is None:
         return
+    edges = n * (n - 1) // 2 if form.edges == "complete" else len(form.edges)
+    if edges > _MOST_EDGES:
+        problem = f"are {edges:,} for {n:,} agents, more than {_MOST_EDGES:,}"
+        remedy = "give a list of pairs; 3 N - 6 edges, and some more, hold a shape"
+        notes.add(
+            (*path, "edges"), problem, remedy, "complete" if form.edges == "complete" else None
+        )
     if form.slots is not None:
         if len(form.slots) != n:
             problem = f"has {len(form.slots)} slots for {n} agents"
@@ -108,7 +119,8 @@ def _distances(notes: Notes, form: Formation, lengths: Sequence[float], n: int, 
         order = "12, 13, ..., 23, ..." if form.edges == "complete" else "that of edges"
         notes.add(path, problem, f"give one for each edge, in the order {order}", None)
         return
-    found = shapes.unrealisable(edges, lengths)
+    cliques = len(edges) * (2 * len(edges) / n) ** 2
+    found = shapes.unrealisable(edges, lengths) if cliques < _MOST_CLIQUES else []
     names = [
         f"d{agents(e, '' if n < 10 else '-')} = {d:g}" for e, d in zip(edges, lengths, strict=True)
     ]

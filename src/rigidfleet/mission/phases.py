@@ -35,6 +35,8 @@ _KINDS: dict[str, type[AnyPhase]] = {
 }
 _ENDINGS = ("until", "duration", "settle")
 _MOST_SAMPLES = 1_000_000
+#: Numbers in a result at most: 2 GB of them.
+_MOST_NUMBERS = 2.5e8
 
 
 def check(notes: Notes, parts: Mapping[str, Any], n: int | None) -> tuple[AnyPhase, ...]:
@@ -42,7 +44,7 @@ def check(notes: Notes, parts: Mapping[str, Any], n: int | None) -> tuple[AnyPha
     found = _phases(notes)
     _names(notes, found)
     end = _times(notes, found)
-    _samples(notes, parts.get("output_step"), end)
+    _samples(notes, parts, end, n)
     _controls(notes, found)
     _formations(notes, found, parts, n)
     _arrivals(notes, found, parts.get("lqr", Lqr()))
@@ -164,15 +166,25 @@ def _blend(notes: Notes, p: Shaping, longest: float | None, path: Keys) -> None:
         notes.add((*path, "blend"), problem, f"use blend <= {longest:g}, or end it later", p.blend)
 
 
-def _samples(notes: Notes, step: float | None, end: float | None) -> None:
+def _samples(notes: Notes, parts: Mapping[str, Any], end: float | None, n: int | None) -> None:
+    step = parts.get("output_step")
     if not step or not end or not notes.right((), "output_step"):
         return
+    forms = parts["formations"].values()
+    edges = sum(
+        len(form.edges) if form.edges != "complete" else (n or 0) ** 2 // 2 for form in forms
+    )
+    numbers = 30 * (n or 0) + 8 * edges + 50
     if step > end:
         problem = f"the mission ends before the first step, at {end:g} s"
         notes.add(("output_step",), problem, "make it shorter", step)
     elif end / step > _MOST_SAMPLES:
         problem = f"{end / step:.2g} samples would be stored, more than {_MOST_SAMPLES:,}"
         notes.add(("output_step",), problem, f"use {end / _MOST_SAMPLES:.2g} s or more", step)
+    elif end / step * numbers > _MOST_NUMBERS:
+        problem = f"{end / step * numbers * 8e-9:.2g} GB would be stored, more than {_MOST_NUMBERS * 8e-9:g}"
+        least = end * numbers / _MOST_NUMBERS
+        notes.add(("output_step",), problem, f"use {least:.2g} s or more, or fewer edges", step)
 
 
 def _controls(notes: Notes, found: Sequence[AnyPhase | None]) -> None:
