@@ -603,14 +603,16 @@ def _below(mission: Mission, found: Preflight) -> Iterator[Remark]:
     radius, limit = np.array(mission.agents.radius), mission.limits.separation_below
     worst: dict[bool, tuple[float, float, tuple[int, ...], str]] = {}
     for leg in found.legs:
-        for i, j in combinations(range(mission.n_agents), 2) if mission.n_agents <= 100 else ():
-            apart = leg.position[:, j] - leg.position[:, i]
-            beside = np.hypot(apart[:, 0], apart[:, 1]) >= radius[i] + radius[j]
-            room = np.where(beside, np.inf, np.abs(apart[:, 2]) - radius[i] - radius[j])
-            k = int(room.argmin())
-            if room[k] < worst.get(leg.exact, (np.inf,))[0]:
-                who = (j, i) if apart[k, 2] < 0 else (i, j)
-                worst[leg.exact] = float(room[k]), float(leg.time[k]), who, leg.phase
+        for i in range(mission.n_agents - 1):
+            apart = leg.position[:, i + 1 :] - leg.position[:, i : i + 1]
+            radii = radius[i] + radius[i + 1 :]
+            beside = np.hypot(apart[..., 0], apart[..., 1]) >= radii
+            room = np.where(beside, np.inf, np.abs(apart[..., 2]) - radii)
+            k, n = np.unravel_index(int(room.argmin()), room.shape)
+            if room[k, n] < worst.get(leg.exact, (np.inf,))[0]:
+                other = i + 1 + int(n)
+                who = (other, i) if apart[k, n, 2] < 0 else (i, other)
+                worst[leg.exact] = float(room[k, n]), float(leg.time[k]), who, leg.phase
     for exact, (room, t, (low, high), phase) in worst.items():
         text = f"agent {low + 1} is below agent {high + 1}, {max(room, 0.0):.2f} m from it at {t:.2f} s, in '{phase}'"
         if limit is None:
