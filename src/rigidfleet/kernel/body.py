@@ -2,7 +2,7 @@
 
 import math
 
-from rigidfleet.kernel.compiled import compiled
+from rigidfleet.kernel.compiled import compiled, inlined
 from rigidfleet.kernel.linalg import jacobi_eigen
 from rigidfleet.kernel.program import PINV_EQUAL, PINV_INERTIA_FORCE, RIGID
 
@@ -78,7 +78,7 @@ def multiply_transposed(A, x, out):
         out[i] = A[0, i] * x[0] + A[1, i] * x[1] + A[2, i] * x[2]
 
 
-@compiled
+@inlined
 def mean_axes(r, v, m, M, w):
     """Centre of mass, inertia and mean-axis angular velocity omega = I^+ h, world axes.
 

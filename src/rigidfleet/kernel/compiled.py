@@ -7,17 +7,28 @@ import numba
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-# Sums may be reordered and fused, but NaN and infinity keep their meaning: the integrator has to
-# see them to reject a step.
-_FAST = {"reassoc", "contract", "arcp", "nsz"}
+_OPTIONS: dict[str, Any] = {
+    "cache": True,
+    "nogil": True,
+    "error_model": "numpy",  # division by zero gives infinity
+    # Sums may be reordered and fused, but NaN and infinity keep their meaning: the integrator has
+    # to see them to reject a step.
+    "fastmath": {"reassoc", "contract", "arcp", "nsz"},
+    # Without reference counts, which cost more than the physics: whoever calls keeps the arrays
+    # alive. The compiler then refuses any function that would allocate.
+    "_nrt": False,
+    "no_cfunc_wrapper": True,
+}
 
 
 def compiled(function: F) -> F:
-    """Compile for the flight: cached on disk, without the GIL, division by zero gives infinity.
+    """Compile for the flight: cached on disk, without the GIL, without allocation."""
+    return numba.njit(**_OPTIONS)(function)
 
-    Nothing in the kernel allocates, so that Numba need not count references (``_nrt``): counting
-    them takes as long as the physics of three agents.
+
+def inlined(function: F) -> F:
+    """Compile into each caller: for functions of a whole `Program` or `Workspace`.
+
+    A call would copy every field of theirs, some 300 numbers, to the stack.
     """
-    return numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST, _nrt=False)(
-        function
-    )
+    return numba.njit(forceinline=True, **_OPTIONS)(function)

@@ -12,9 +12,9 @@ the named solves differ only in what they do there.
 
 import math
 
-from rigidfleet.kernel.compiled import compiled
+from rigidfleet.kernel.compiled import compiled, inlined
 from rigidfleet.kernel.linalg import cholesky, cholesky_solve, jacobi_eigen
-from rigidfleet.kernel.program import EXACT, ITERATED, PINV
+from rigidfleet.kernel.program import EXACT, ITERATED, PINV, SPECTRAL
 
 
 @compiled
@@ -28,7 +28,7 @@ def edge_geometry(r, edges, u, L):
         u[k, 0], u[k, 1], u[k, 2] = x * inverse, y * inverse, z * inverse
 
 
-@compiled
+@inlined
 def right_side(v, integral, a, edges, law, w):
     """The bracket of Eq. 12 into w.b (m,) [m/s^2], the constraints (Eq. 3) into w.c.
 
@@ -62,14 +62,15 @@ def assemble(u, m, graph, scale, shift, A):
     for k in range(n):
         for l in range(k):
             A[k, l] = 0.0
-        A[k, k] = scale * (1.0 / m[edges[k, 0]] + 1.0 / m[edges[k, 1]]) + shift
+        m_i, m_j = m[edges[k, 0]], m[edges[k, 1]]
+        A[k, k] = scale * (m_i + m_j) / (m_i * m_j) + shift
     for p in range(pairs.shape[0]):
         k, l = pairs[p, 0], pairs[p, 1]
         dot = u[k, 0] * u[l, 0] + u[k, 1] * u[l, 1] + u[k, 2] * u[l, 2]
         A[k, l] = scale * weight[p] * dot
 
 
-@compiled
+@inlined
 def solve_multipliers(vehicles, graph, law, w):
     """Multipliers w.multiplier (m,) [N] for w.b; NaN where A is singular and the law exact.
 
@@ -86,29 +87,24 @@ def solve_multipliers(vehicles, graph, law, w):
     if w.A.shape[0] < n:
         solve_at_agents(m, mbar, graph.edges, law, w)
         return
-    if law.solver == ITERATED:
-        assemble(w.u, m, graph, mbar, law.mu, w.A)
-        cholesky(w.A)
-        for k in range(n):
-            y[k] = 0.0
-        for _ in range(law.iterations):  # (mbar A + mu) y_new = mbar b + mu y
+    mu, iterations = (law.mu, law.iterations) if law.solver == ITERATED else (0.0, 1)
+    # Spectral damping is the exact law wherever all w >= s0: where mbar A - s0 is definite, too.
+    trials = 2 if law.solver == SPECTRAL else 0 if law.solver == PINV else 1
+    definite = False
+    for trial in range(trials, 0, -1):
+        assemble(w.u, m, graph, mbar, mu if trial == 1 else -law.s0, w.A)
+        definite = cholesky(w.A)
+        if not definite:
+            break
+    if definite:
+        for i in range(iterations):  # (mbar A + mu) y_new = mbar b + mu y, from y = 0
             for k in range(n):
-                y[k] = mbar * b[k] + law.mu * y[k]
+                y[k] = mbar * b[k] + (mu * y[k] if i > 0 else 0.0)
             cholesky_solve(w.A, y)
         return
-    definite = False
-    if law.solver == EXACT:
-        assemble(w.u, m, graph, mbar, 0.0, w.A)
-        definite = cholesky(w.A)
-    elif law.solver != PINV:  # spectral: the exact law wherever all w >= s0
-        assemble(w.u, m, graph, mbar, -law.s0, w.A)
-        if cholesky(w.A):
-            assemble(w.u, m, graph, mbar, 0.0, w.A)
-            definite = cholesky(w.A)
-    if definite or law.solver == EXACT:
+    if law.solver in (ITERATED, EXACT):
         for k in range(n):
-            y[k] = mbar * b[k] if definite else math.nan
-        cholesky_solve(w.A, y)
+            y[k] = math.nan
         return
     assemble(w.u, m, graph, mbar, 0.0, w.A)
     largest = jacobi_eigen(w.A, w.V, w.w)

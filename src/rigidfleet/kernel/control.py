@@ -3,7 +3,7 @@
 import math
 
 from rigidfleet.kernel.body import allocate, multiply, multiply_transposed, rotation_vector
-from rigidfleet.kernel.compiled import compiled
+from rigidfleet.kernel.compiled import compiled, inlined
 
 
 @compiled
@@ -69,7 +69,7 @@ def rotate_after(E, T, out):
             out[i, j] = E[i, 0] * T[0, j] + E[i, 1] * T[1, j] + E[i, 2] * T[2, j]
 
 
-@compiled
+@inlined
 def reference_motion(t, motion, w):
     """Reference motion of the virtual body at t into w.body (see `Workspace`) and w.T_ref.
 
@@ -103,7 +103,7 @@ def reference_motion(t, motion, w):
     rotate_after(w.E, motion.T1, w.T_ref)
 
 
-@compiled
+@inlined
 def desired_agents(w):
     """Where each agent should be: r_i = r_cm + T^T p_i and two derivatives, into w.r_ref etc.
 
@@ -127,7 +127,7 @@ def desired_agents(w):
             w.a_ref[i, q] = w.body[2, q] + T[0, q] * a0 + T[1, q] * a1 + T[2, q] * a2
 
 
-@compiled
+@inlined
 def local_law(r, v, m, g, control, w):
     """Local LQR of every agent (paper, section V): f_i = m_i (a_i + g - k1 e_i - k2 de_i).
 
@@ -175,7 +175,7 @@ def body_gains(t, feedback, out):
         out[q] = (1.0 - s) * feedback.gain[low, q] + s * feedback.gain[high, q]
 
 
-@compiled
+@inlined
 def body_law(t, m, M, g, T, feedback, control, w):
     """LQR on the virtual body: CM and attitude -> wrench -> every agent (w.f_u, w.wrench).
 

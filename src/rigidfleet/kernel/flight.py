@@ -21,7 +21,7 @@ from rigidfleet.kernel.body import (
     multiply_transposed,
     quaternion_rate,
 )
-from rigidfleet.kernel.compiled import compiled
+from rigidfleet.kernel.compiled import compiled, inlined
 from rigidfleet.kernel.constraint import (
     apply_multipliers,
     edge_geometry,
@@ -56,7 +56,7 @@ def call_external(_context, address, t, r, v, f):
     return types.void(types.int64, types.float64, r, v, f), generate
 
 
-@compiled
+@inlined
 def closed_loop(t, y, dy, p, w):
     """Right-hand side dy of the closed loop at time t [s] and state y.
 
@@ -74,18 +74,12 @@ def closed_loop(t, y, dy, p, w):
     for i in range(n):
         for s in range(3):
             r[i, s], v[i, s] = y[3 * i + s], y[3 * n + 3 * i + s]
-        if p.body_formulation:
-            multiply_transposed(T, y[3 * i : 3 * i + 3], r[i])
-            multiply_transposed(T, y[3 * (n + i) : 3 * (n + i) + 3], v[i])
-            for s in range(3):
-                r[i, s] += y[q + 4 + s]
-                v[i, s] += y[q + 7 + s]
-
-    for i in range(n):
         w.f_E[i, 0], w.f_E[i, 1], w.f_E[i, 2] = 0.0, 0.0, -m[i] * g
-        for s in range(3):
-            w.a[i, s] = 0.0
+    if p.body_formulation:
+        world_states(y, p, w)
     if p.external != 0:
+        for i in range(n):
+            w.a[i, 0], w.a[i, 1], w.a[i, 2] = 0.0, 0.0, 0.0
         call_external(p.external, t, r, v, w.a)
         for i in range(n):
             for s in range(3):
@@ -132,19 +126,28 @@ def closed_loop(t, y, dy, p, w):
             share = min(1.0, vehicles.thrust_limit[i] / max(math.sqrt(thrust), 1e-300))
         for s in range(3):
             w.a[i, s] = inverse * (w.f_E[i, s] + share * (w.f_u[i, s] + w.f_C[i, s]))
-
-    if not p.body_formulation:
-        for i in range(n):
-            for s in range(3):
-                dy[3 * i + s], dy[3 * n + 3 * i + s] = v[i, s], w.a[i, s]
-    else:
+            dy[3 * i + s], dy[3 * n + 3 * i + s] = v[i, s], w.a[i, s]
+    if p.body_formulation:
         body_derivatives(y, dy, p, w)
     if p.has_frame:
         multiply(T, w.cm[2], w.cm[4])
         quaternion_rate(y[q : q + 4], w.cm[4], dy[q : q + 4])
 
 
-@compiled
+@inlined
+def world_states(y, p, w):
+    """Positions and velocities in world axes from the states of the body formulation."""
+    n = p.vehicles.m.shape[0]
+    q = 6 * n + p.graph.edges.shape[0]
+    for i in range(n):
+        multiply_transposed(w.T, y[3 * i : 3 * i + 3], w.r[i])
+        multiply_transposed(w.T, y[3 * (n + i) : 3 * (n + i) + 3], w.v[i])
+        for s in range(3):
+            w.r[i, s] += y[q + 4 + s]
+            w.v[i, s] += y[q + 7 + s]
+
+
+@inlined
 def body_derivatives(y, dy, p, w):
     """The paper's equations of motion in the body frame, in their well-posed form.
 
@@ -271,16 +274,19 @@ def integrate(p, w, state, t_end, fresh, times, samples, max_steps):
                 break
             continue
         t_new = t + h if t + h < t_end else t_end
-        while count[3] < times.shape[0] and times[count[3]] <= t_new:
-            x = (times[count[3]] - t) / h
-            for q in range(n):
+        if count[3] < times.shape[0] and times[count[3]] <= t_new:
+            for q in range(n):  # into K[1], which has no weight in the sums
                 d = 0.0
                 for s in range(7):
                     d += _D[s] * K[s, q]
+                K[1, q] = h * d
+        while count[3] < times.shape[0] and times[count[3]] <= t_new:
+            x = (times[count[3]] - t) / h
+            for q in range(n):
                 rise = trial[q] - y[q]
                 bend = h * K[0, q] - rise
                 rest = rise - h * K[6, q] - bend
-                inner = bend + x * (rest + (1.0 - x) * h * d)
+                inner = bend + x * (rest + (1.0 - x) * K[1, q])
                 samples[count[3], q] = y[q] + x * (rise + (1.0 - x) * inner)
             count[3] += 1
         for q in range(n):
