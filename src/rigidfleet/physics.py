@@ -85,7 +85,8 @@ def constraint_force(
     if e and not w.L.min() > 0.0:
         i, j = graph.edges[w.L.argmin()]
         raise ValueError(f"agents {i} and {j} coincide: their edge has no direction")
-    constraint.right_side(v, _full(integral, (e,), "integral"), f, m, graph.edges, law, w)
+    a = np.ascontiguousarray(f / m[:, None])
+    constraint.right_side(v, _full(integral, (e,), "integral"), a, graph.edges, law, w)
     constraint.solve_multipliers(_vehicles(m), graph, law, w)
     f_C = np.zeros((n, 3))
     constraint.apply_multipliers(w.u, graph.edges, w.multiplier, f_C)

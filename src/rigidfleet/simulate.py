@@ -504,10 +504,10 @@ class Flight:
         plan, w = leg.plan, leg.workspace
         n, m = len(self.masses), len(plan.edges)
         out = flight.recorder(len(times), n, m)
-        flight.record(times, samples, program, w, out)
+        flight.record(times, samples, program, w, np.empty(samples.shape[1]), out)
         if program is not plan.program:  # flown by a user's controller: the phase's references
             asked = flight.recorder(len(times), n, m)
-            flight.record(times, samples, plan.program, w, asked)
+            flight.record(times, samples, plan.program, w, np.empty(samples.shape[1]), asked)
             out = out._replace(
                 r_ref=asked.r_ref,
                 p=asked.p,
