@@ -1,0 +1,179 @@
+"""The live flight in a real browser: what the page's controls do, the flight does."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+
+import pytest
+from chromium import Browser
+
+from rigidfleet.live.server import Server
+from rigidfleet.live.session import Session
+from rigidfleet.mission import load_mission
+
+pytestmark = pytest.mark.long
+
+
+@pytest.fixture
+def session() -> Iterator[Session]:
+    """A flight, flown while the test lasts."""
+    session = Session(load_mission("narrow-passage"))
+    thread = threading.Thread(target=session.run)
+    thread.start()
+    yield session
+    session.stop()
+    thread.join(5)
+    assert not thread.is_alive()
+
+
+@pytest.fixture
+def page(session, browser) -> Iterator[Browser]:
+    """The flight's page."""
+    with Server(session) as server:
+        browser.open(server.url)
+        yield browser
+        browser.driver.get("about:blank")
+
+
+def until(condition, seconds: float = 15.0) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
+def test_shows_the_flight(page, session):
+    """The page loads without an error, asks nobody but its flight, and its time goes on."""
+    t = page.run("return replay.time")
+    page.wait(f"return replay.time > {t} + 1")
+    assert page.text("#phase-name") == "establish triangle"
+    assert page.heard() == []
+    assert {
+        url.split("/")[2] for url in page.asked() if not url.startswith(("data:", "blob:"))
+    } <= {page.run("return location.host")}
+
+
+def test_pad_moves_the_target(page, session):
+    """Pushed away from the eye, the pad moves the target away from the eye; let go, it rests."""
+    from selenium.webdriver import ActionChains
+
+    start = session.pilot.target.r.copy()
+    pad = page.driver.find_element("css selector", "#pad")
+    hold = ActionChains(page.driver).move_to_element(pad).click_and_hold().move_by_offset(0, -40)
+    hold.perform()
+    until(lambda: abs(session.pilot.target.r - start).max() > 0.5)
+    ActionChains(page.driver).release().perform()
+    until(lambda: not session.pilot.target.move.any())
+    way = session.pilot.target.r - start
+    forward = page.run("return replay.view()[0]")
+    assert way[:2] @ forward > 0.9 * abs(way).max()
+    assert way[2] == 0.0
+
+
+def test_lever_and_keys_turn(page, session):
+    """A lever turns the target until it is let go; so do keys."""
+    yaw = session.pilot.target.euler[2]
+    page.run(
+        "const l = document.querySelector('[data-lever=yaw]'); l.value = 1; l.dispatchEvent(new Event('input'))"
+    )
+    until(lambda: session.pilot.target.euler[2] > yaw + 0.1)
+    page.run("document.querySelector('[data-lever=yaw]').dispatchEvent(new Event('pointerup'))")
+    until(lambda: not session.pilot.target.turn.any())
+    yaw = session.pilot.target.euler[2]
+    page.run("document.dispatchEvent(new KeyboardEvent('keydown', { key: 'e', bubbles: true }))")
+    until(lambda: session.pilot.target.euler[2] < yaw - 0.1)
+    page.run("document.dispatchEvent(new KeyboardEvent('keyup', { key: 'e', bubbles: true }))")
+    until(lambda: not session.pilot.target.turn.any())
+
+
+def test_formation(page, session):
+    """A formation's button has it taken once the one before is there; the page shows both."""
+    page.click("[data-formation=line]")
+    page.wait("return document.querySelector('[data-formation=line]').className === 'waiting'")
+    page.wait(
+        "return document.querySelector('[data-formation=line]').getAttribute('aria-pressed') === 'true'"
+    )
+    assert session.pilot.formation == "line"
+    page.wait("return document.getElementById('phase-name').textContent === 'change to line'")
+    assert page.run("return document.querySelectorAll('#phases button').length") == 2
+
+
+def test_gust(page, session):
+    """A gust from the left blows to the right of the picture, as strong as asked."""
+    page.run("document.getElementById('strength').value = '5'")
+    page.run(
+        "[...document.querySelectorAll('#fly button')].find((b) => b.textContent === 'the left').click()"
+    )
+    until(lambda: session.pilot.gusts)
+    gust = session.pilot.gusts[0]
+    left = page.run("return replay.view()[1]")
+    assert gust.direction[:2] @ left == pytest.approx(-1.0)
+    assert gust.strength == 5.0
+    page.wait("return Math.hypot(...replay.recording.at(replay.recording.end).slot) > 0.1")
+
+
+def test_pause_and_speed(page, session):
+    """The flight pauses and goes on, slower or faster."""
+    page.click("#play")
+    until(lambda: session.paused)
+    page.wait("return document.getElementById('play').getAttribute('aria-label') === 'Play'")
+    t = session.pilot.t
+    time.sleep(0.3)
+    assert session.pilot.t == t
+    page.click("#play")
+    until(lambda: session.pilot.t > t)
+    page.run(
+        "const s = document.getElementById('speed'); s.value = '0.25'; s.dispatchEvent(new Event('change'))"
+    )
+    until(lambda: session.speed == 0.25)
+
+
+def test_look_back(page, session):
+    """The slider looks back while the flight goes on; Live returns to the present."""
+    page.wait("return replay.recording.end > replay.recording.start + 2")
+    page.run(
+        "const s = document.getElementById('scrub'); s.value = s.min; s.dispatchEvent(new Event('input'))"
+    )
+    t = session.pilot.t
+    until(lambda: session.pilot.t > t + 0.5)
+    assert page.run("return replay.time - replay.recording.start") < 0.1
+    page.wait("return document.getElementById('whole').textContent.endsWith('ago')")
+    page.click("#now")
+    page.wait("return replay.recording.end - replay.time < 0.5")
+
+
+def test_plots(page, session):
+    """Thrust, constraint error and clearance are drawn as they come."""
+    titles = page.run("return [...document.querySelectorAll('.plot h2')].map((h) => h.textContent)")
+    assert titles == ["Greatest thrust", "Constraint error", "Separation", "Clearance"]
+    picture = "return document.querySelector('.plot canvas').toDataURL()"
+    before = page.run(picture)
+    page.wait(f"return document.querySelector('.plot canvas').toDataURL() !== '{before}'")
+    assert page.text(".plot output").endswith(" N")
+
+
+def test_again(page, session):
+    """A flight can be begun anew."""
+    page.wait("return replay.recording.end > 2")
+    page.click("#again")
+    page.wait("return Boolean(window.replay) && replay.recording.end < 2")
+    assert session.flights == 2
+
+
+def test_end(page, session):
+    """The flight ends when asked, and the page says so."""
+    page.click("#end")
+    page.wait("return !document.getElementById('notice').hidden")
+    assert page.text("#notice") == "The flight has ended. This page can be closed."
+    assert session.stopped.is_set()
+
+
+def test_tab_closed(session, browser, monkeypatch):
+    """When the last page is closed, the flight ends."""
+    monkeypatch.setattr("rigidfleet.live.session._PATIENCE", 0.5)
+    with Server(session) as server:
+        browser.open(server.url)
+        browser.driver.get("about:blank")
+        until(session.stopped.is_set)

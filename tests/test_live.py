@@ -1,0 +1,416 @@
+"""Flying by hand: the pilot, the session around it, and the address it is served on."""
+
+import base64
+import http.client
+import json
+import math
+import queue
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from contextlib import closing
+from urllib.parse import urlsplit
+
+import numpy as np
+import pytest
+
+from rigidfleet import attitude as att
+from rigidfleet.errors import FlightError
+from rigidfleet.live import live
+from rigidfleet.live.pilot import TICK, Gust, Pilot
+from rigidfleet.live.server import Server
+from rigidfleet.live.session import Session
+from rigidfleet.mission import Mission, load_mission
+from rigidfleet.simulate import StoppedError
+
+TRIANGLE = load_mission("narrow-passage")  # triangle and line
+
+
+def mission(**changes) -> Mission:
+    """Three vehicles, a triangle and a line, with changes."""
+    data = TRIANGLE.to_dict()
+    data["phases"] = [{"kind": "establish", "formation": "triangle", "until": 6.0}]
+    return Mission.from_dict(data | changes)
+
+
+def flown(pilot: Pilot, seconds: float) -> list:
+    """Records of all ticks."""
+    return [pilot.step() for _ in range(round(seconds / TICK))]
+
+
+def worst(records: list, name: str) -> float:
+    """Largest absolute value in records, where there is one."""
+    values = np.concatenate([np.ravel(getattr(r, name)) for r in records])
+    return float(np.nanmax(np.abs(values)))
+
+
+def slot_error(record) -> float:
+    return float(np.linalg.norm(record.slot_position - record.position, axis=2).max())
+
+
+# -- the pilot
+
+
+def test_follows_the_hand():
+    """The body goes where the target was moved and turned, and stays there."""
+    pilot = Pilot(TRIANGLE)
+    flown(pilot, 6.0)
+    start, yaw = pilot.target.r.copy(), pilot.target.euler[2]
+    for _ in range(40):
+        pilot.steer(np.array([1.0, -0.5, 0.25]), np.array([0.0, 0.0, 0.3]))
+        pilot.step()
+    np.testing.assert_allclose(pilot.target.r - start, [2.0, -1.0, 0.5], atol=1e-9)
+    assert pilot.target.euler[2] - yaw == pytest.approx(0.6)
+    pilot.steer(np.zeros(3), np.zeros(3))
+    last = flown(pilot, 12.0)[-1]
+    np.testing.assert_allclose(last.cm[0], pilot.target.r, atol=1e-4)
+    away = att.angle_between(last.attitude[0], att.quaternion_from_dcm(pilot.target.attitude))
+    assert float(away) < 1e-4
+
+
+def test_stays_rigid():
+    """Whatever the hand does, the formation holds its shape to a micrometre: references are fed forward."""
+    pilot = Pilot(TRIANGLE)
+    records = flown(pilot, 4.5)
+    rng = np.random.default_rng(1)
+    for k in range(200):
+        if k % 8 == 0:
+            pilot.steer(rng.normal(size=3), 0.4 * rng.normal(size=3))
+        if k == 60:
+            pilot.change("line")
+        records.append(pilot.step())
+    assert pilot.formation == "line"
+    assert worst(records, "constraint") < 1e-6
+    assert max(map(slot_error, records)) < 1e-6
+
+
+def test_levels_and_clears_the_ground():
+    """At its start the body turns upright, and rises so far that it can turn without touching the ground."""
+    last = flown(Pilot(TRIANGLE), 12.0)[-1]
+    roll, pitch, _ = att.euler_from_quaternion(last.attitude[0])
+    assert (abs(roll), abs(pitch)) < (1e-3, 1e-3)
+    slots = TRIANGLE.formation_slots("triangle")
+    assert slots is not None
+    assert last.cm[0, 2] > np.linalg.norm(slots, axis=1).max() + 0.25
+
+
+def test_one_change_after_another():
+    """A change of formation waits until the one before is over; asking for the present one cancels it."""
+    pilot = Pilot(TRIANGLE)
+    pilot.change("line")
+    pilot.step()
+    assert (pilot.formation, pilot.waiting, pilot.busy) == ("triangle", "line", True)
+    flown(pilot, 4.1)
+    assert (pilot.formation, pilot.waiting, pilot.busy) == ("line", None, True)
+    pilot.change("triangle")
+    pilot.change("line")
+    flown(pilot, 5.0)
+    assert (pilot.formation, pilot.busy) == ("line", False)
+    assert [p.name for p in pilot.phases] == ["establish triangle", "change to line"]
+
+
+def test_lets_go():
+    """A hand that is no longer heard of has let go."""
+    pilot = Pilot(TRIANGLE)
+    start = pilot.target.r[0]
+    pilot.steer(np.array([1.0, 0.0, 0.0]), np.zeros(3))
+    flown(pilot, 3.0)
+    assert pilot.target.r[0] - start == pytest.approx(0.6, abs=TICK + 1e-9)
+
+
+def test_speed_limit():
+    """The hand moves the target no faster than 70 % of the mission's speed limit."""
+    pilot = Pilot(mission(limits={"speed": 2.0}))
+    pilot.steer(np.array([30.0, 40.0, 0.0]), np.zeros(3))
+    np.testing.assert_allclose(pilot.target.move, [0.84, 1.12, 0.0])
+
+
+def test_gust():
+    """A gust displaces the vehicles one after the other and loads the edges; then all is as before."""
+    pilot = Pilot(TRIANGLE)
+    flown(pilot, 8.0)
+    pilot.gust(np.array([2.0, 0.0, 0.0]), 3.0)
+    hit = flown(pilot, 3.0)
+    assert max(map(slot_error, hit)) > 0.2
+    assert worst(hit, "multiplier") > 0.3
+    assert max(r.external_force[0, :, 0].max() for r in hit) == pytest.approx(3.0, rel=0.05)
+    after = flown(pilot, 12.0)
+    assert pilot.gusts == []
+    assert slot_error(after[-1]) < 1e-3
+    np.testing.assert_allclose(after[-1].external_force[0], [[0, 0, -9.81]] * 3)
+
+
+def test_gust_passes_over():
+    """A gust is a front: further along its way it comes later, by distance over speed."""
+    gust = Gust(start=10.0, origin=-2.0, direction=np.array([0.0, 1.0, 0.0]), strength=3.0)
+    r = np.array([[5.0, -2.0, 1.0], [0.0, 6.0, 9.0]])
+    first = gust.force(10.8, r, np.array([1.0, 2.0]))
+    np.testing.assert_allclose(first, [[0, 3, 0], [0, 0, 0]], atol=1e-12)
+    second = gust.force(11.8, r, np.array([1.0, 2.0]))
+    np.testing.assert_allclose(second, [[0, 0, 0], [0, 6, 0]], atol=1e-12)
+
+
+def test_by_body():
+    """In the body architecture distances establish the formation, then the wrench on the body follows the hand."""
+    pilot = Pilot(mission(architecture="body"))
+    flown(pilot, 6.0)
+    assert pilot.phases[-1].control == "open"
+    pilot.steer(np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 0.2]))
+    records = flown(pilot, 0.6)
+    records += flown(pilot, 12.0)
+    assert pilot.phases[-1].control == "body"
+    np.testing.assert_allclose(records[-1].cm[0], pilot.target.r, atol=1e-3)
+    assert worst(records, "constraint") < 1e-3
+    pilot.change("line")
+    flown(pilot, 6.0)
+    assert pilot.formation == "line"
+    assert pilot.ending == ""
+
+
+def test_nothing_to_fly():
+    """A mission whose formations have no slots cannot be flown by hand, and says why."""
+    edges = [[1, 2], [2, 3]]
+    formations = {"chain": {"edges": edges, "distances": [4.0, 4.0]}}
+    chain = {"kind": "establish", "formation": "chain", "reference": "distances", "control": "open"}
+    with pytest.raises(FlightError, match="no formation has slots"):
+        Pilot(mission(formations=formations, phases=[chain | {"until": 6.0}]))
+
+
+def test_cannot_go_on(monkeypatch):
+    """A flight that cannot go on says why, and stays where it is."""
+    pilot = Pilot(TRIANGLE)
+    before = flown(pilot, 1.0)[-1]
+
+    def stop(*_):
+        raise StoppedError("too steep")
+
+    monkeypatch.setattr(pilot, "_integrate", stop)
+    after = pilot.step()
+    assert pilot.ending == "too steep"
+    assert after is before
+
+
+# -- the session
+
+
+def test_commands():
+    """Commands do what they say, and anything else is refused."""
+    session = Session(TRIANGLE)
+    session.command({"move": [1, 0, 0], "turn": [0, 0, 0.5]})
+    assert session.pilot.target.move.tolist() == [1, 0, 0]
+    session.command({"formation": "line"})
+    assert session.pilot.waiting == "line"
+    session.command({"gust": [0, 1, 0], "strength": 1e9})
+    assert session.pilot.gusts[0].strength == 20.0
+    session.command({"pause": True})
+    session.command({"speed": 2})
+    assert (session.paused, session.speed) == (True, 2.0)
+    first = session.pilot
+    session.command({"again": True})
+    assert session.pilot is not first
+    for wrong in (
+        {}, {"move": [1, 0], "turn": [0, 0, 0]}, {"move": [1, 0, "x"], "turn": [0, 0, 0]},
+        {"move": [1, 0, math.nan], "turn": [0, 0, 0]}, {"move": [True, 0, 0], "turn": [0, 0, 0]},
+        {"formation": "star"}, {"gust": [0, 0, 0], "strength": 1}, {"pause": 1}, {"speed": 3}, {"stop": 1},
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match=r"\w"):
+            session.command(wrong)
+    session.command({"stop": True})
+    assert session.stopped.is_set()
+
+
+def told(messages: queue.Queue) -> tuple[str, str]:
+    """The next event: its name and data."""
+    name, data = messages.get(timeout=5).decode().strip().split("\n")
+    return name.removeprefix("event: "), data.removeprefix("data: ")
+
+
+def test_samples_are_the_flight():
+    """A page hears the story, then samples of the flight, as long as somebody looks."""
+    session = Session(TRIANGLE)
+    thread = threading.Thread(target=session.run)
+    thread.start()
+    time.sleep(0.3)
+    assert session.result.time[-1] == pytest.approx(TICK)  # nobody looks: it waits
+    messages = session.join()
+    name, data = told(messages)
+    assert name == "story"
+    assert json.loads(data)["formation"] == "triangle"
+    while name != "sample":
+        name, data = told(messages)
+    numbers = np.frombuffer(base64.b64decode(data), "<f4")
+    n, m = 3, len(TRIANGLE.edges)
+    assert len(numbers) == 1 + 9 * n + 3 + 8 + m + (n + 3) + 7
+    position = numbers[1 : 1 + 3 * n].reshape(n, 3)
+    np.testing.assert_allclose(position, TRIANGLE.agents.position, atol=0.05)
+    session.command({"stop": True})
+    thread.join(5)
+    assert not thread.is_alive()
+    while (last := messages.get(timeout=5)) is not None:
+        assert last.startswith(b"event: ")
+
+
+def test_real_time():
+    """A flight takes as long as it lasts, and at twice the speed half of it."""
+    session = Session(TRIANGLE)
+    thread = threading.Thread(target=session.run)
+    messages = session.join()
+    thread.start()
+    marks = []
+    for speed in (1, 2):
+        session.command({"speed": speed})
+        t, begun = session.pilot.t, time.monotonic()
+        time.sleep(1.0)
+        marks.append((session.pilot.t - t) / (time.monotonic() - begun))
+        session.command({"pause": True})
+        time.sleep(0.15)
+        t = session.pilot.t
+        time.sleep(0.2)
+        assert session.pilot.t == t
+        session.command({"pause": False})
+    session.stop()
+    session.leave(messages)
+    thread.join(5)
+    assert marks == pytest.approx([1.0, 2.0], rel=0.35)
+
+
+def test_last_page_closed(monkeypatch):
+    """Some time after the last page was closed, the flight ends."""
+    monkeypatch.setattr("rigidfleet.live.session._PATIENCE", 0.3)
+    session = Session(TRIANGLE)
+    thread = threading.Thread(target=session.run)
+    thread.start()
+    time.sleep(0.5)
+    assert thread.is_alive()  # the first page is still awaited
+    session.leave(session.join())
+    thread.join(3)
+    assert not thread.is_alive()
+
+
+# -- the address
+
+
+@pytest.fixture(scope="module")
+def server():
+    session = Session(TRIANGLE)
+    with Server(session) as server:
+        yield server
+        session.stop()
+
+
+def ask(server: Server, method: str, path: str, body: str | None = None, **headers: str):
+    """Status and text of an answer; a path without / is in the session's folder."""
+    where = urlsplit(server.url)
+    with closing(http.client.HTTPConnection(where.netloc, timeout=5)) as connection:
+        connection.request(
+            method, path if path.startswith("/") else where.path + path, body, headers
+        )
+        answer = connection.getresponse()
+        return answer.status, answer.read().decode()
+
+
+def test_page(server):
+    """The address gives a page that may talk to nobody but its flight."""
+    status, text = ask(server, "GET", "")
+    assert status == 200
+    assert "default-src 'none'" in text
+    assert "connect-src 'self'" in text
+    assert "EventSource" in text
+
+
+@pytest.mark.parametrize(
+    ("path", "headers"),
+    [
+        pytest.param("/", {}, id="no secret"),
+        pytest.param("", {"Host": "evil.example"}, id="another host"),
+        pytest.param("", {"Origin": "http://evil.example"}, id="from another page"),
+        pytest.param("", {"Origin": "null"}, id="from a file"),
+    ],
+)
+def test_others_are_refused(server, path, headers):
+    """Without the secret, under another name, or from another page, nothing is to be had."""
+    assert ask(server, "GET", path, **headers)[0] == 403
+    assert (
+        ask(server, "POST", path if path == "/" else "command", '{"pause": true}', **headers)[0]
+        == 403
+    )
+
+
+def test_only_this_machine(server):
+    """Nobody but this machine can reach the flight."""
+    assert urlsplit(server.url).hostname == "127.0.0.1"
+    assert server.http.socket.getsockname()[0] == "127.0.0.1"
+
+
+@pytest.mark.parametrize("body", ["", "[]", "{", '{"fly": 1}', " " * 20_000])
+def test_wrong_commands(server, body):
+    """What is no command is refused, and nothing happens."""
+    assert ask(server, "POST", "command", body)[0] == 400
+
+
+def test_command(server):
+    """A command is done, and answered with nothing."""
+    assert ask(server, "POST", "command", '{"formation": "line"}') == (204, "")
+    assert server.http.RequestHandlerClass.session.pilot.waiting == "line"
+    assert ask(server, "GET", "other")[0] == 404
+    assert ask(server, "POST", "other", "{}")[0] == 404
+
+
+def test_port_taken():
+    """A port that is taken is an error that says so."""
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        with pytest.raises(FlightError, match="cannot be used"):
+            live(TRIANGLE, port=taken.getsockname()[1], browser=False)
+
+
+def test_stops_from_the_page():
+    """The flight ends when the page says so, and the page hears of it."""
+    heard: list[str] = []
+    threads: list[threading.Thread] = []
+
+    def look(url: str) -> None:
+        where = urlsplit(url)
+
+        def listen() -> None:
+            with closing(http.client.HTTPConnection(where.netloc, timeout=10)) as stream:
+                stream.request("GET", f"{where.path}stream")
+                heard.append(stream.getresponse().read().decode())
+
+        def end() -> None:
+            with closing(http.client.HTTPConnection(where.netloc, timeout=10)) as control:
+                control.request("POST", f"{where.path}command", '{"stop": true}')
+                control.getresponse().read()
+
+        threads.extend([threading.Thread(target=listen), threading.Timer(0.5, end)])
+        for thread in threads:
+            thread.start()
+
+    live(TRIANGLE, browser=False, ready=look)
+    for thread in threads:
+        thread.join(5)
+    assert heard[0].startswith("event: story")
+    assert heard[0].count("event: sample") > 3
+    assert heard[0].endswith("event: end\ndata: \n\n")
+
+
+@pytest.mark.long
+def test_ctrl_c():
+    """Ctrl-C ends the flight at once, without a trace of an error."""
+    code = (
+        "from rigidfleet.mission import load_mission; from rigidfleet.live import live\n"
+        "live(load_mission('narrow-passage'), browser=False, ready=lambda url: print(url, flush=True))\n"
+        "print('landed')"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline().startswith("http://127.0.0.1:")
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=10)
+    assert (process.returncode, out, err) == (0, "landed\n", "")
