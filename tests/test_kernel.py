@@ -597,15 +597,19 @@ def test_reference_motion_goes_on_after_its_end():
 
 
 def test_gains_are_interpolated_over_the_time_to_go():
-    """Linear between the table's entries, its last one before it begins, the held ones on arrival."""
-    to_go, gain = np.array([0.0, 1.0, 3.0]), np.arange(12.0).reshape(3, 4)
+    """Cubics between the table's entries, its last one before it begins, held ones after arrival."""
+    to_go, powers = np.array([0.0, 1.0, 3.0]), np.array([[1.0, 2.0, -1.0, 0.5]])
+    gain = np.tile(to_go[:, None] ** np.arange(4) @ powers.T, 4)  # a cubic, met exactly
+    slope = np.tile(np.polyval([1.5, -2.0, 2.0], to_go)[:, None], 4)
     feedback = k.Feedback(
-        to_go, gain, 10.0, *np.zeros((2, 3)), np.eye(3), np.zeros(3), np.full(4, -1.0)
+        to_go, gain, slope, 10.0, *np.zeros((2, 3)), np.eye(3), np.zeros(3), np.full(4, -1.0)
     )
     out = np.zeros(4)
-    for t, expected in ((9.5, 2.0), (9.0, 4.0), (8.0, 6.0), (7.0, 8.0), (2.0, 8.0), (10.0, -1.0)):
+    for t, tau in ((10.0, 0.0), (9.5, 0.5), (9.0, 1.0), (8.0, 2.0), (7.0, 3.0), (2.0, 3.0)):
         control.body_gains(t, feedback, out)
-        assert out[0] == pytest.approx(expected, abs=1e-14), t
+        np.testing.assert_allclose(out, np.polyval([0.5, -1, 2, 1], tau), rtol=0, atol=1e-13)
+    control.body_gains(10.1, feedback, out)
+    np.testing.assert_array_equal(out, -1.0)
 
 
 # -- the integrator --------------------------------------------------------------------------------

@@ -846,3 +846,37 @@ def test_recorded_constraint_forces_are_those_of_a_single_call():
         )  # fmt: skip
         np.testing.assert_allclose(call.f_C, result.constraint_force[k], rtol=0, atol=1e-10)
         np.testing.assert_allclose(call.multiplier, result.multiplier[k, edges], atol=1e-10)
+
+
+@pytest.mark.parametrize("formulation", ["inertial", "body"])
+def test_the_virtual_body_flies_its_own_regulator(formulation):
+    """In architecture body the CM moves as the finite-horizon LQR says, to 1e-7 m."""
+    weights = {"Q": [0.5, 0.7], "R": 2.0, "S": [100.0, 30.0]}
+    start, end = ([16 / 3, 5.0, 3.0], [0.0] * 3), ([10.0] * 3, [1.0, 0.0, 0.0])
+    mission = Mission.from_dict(
+        {
+            "schema_version": 1,
+            "name": "regulator",
+            "architecture": "body",
+            "formulation": formulation,
+            "agents": {"mass": 1.0, "position": [[1, 6, 3], [8, 3, 3], [7, 6, 3]]},
+            "lqr": weights,
+            "integrator": {"rtol": 1e-10, "atol": 1e-11},
+            "phases": [{"kind": "fly", "position": end[0], "velocity": end[1], "duration": 6.0}],
+        }
+    )
+    result = simulate(mission)
+    Q, R, S = weights["Q"], weights["R"], weights["S"]
+    x, v, _ = lqr.finite_horizon_trajectory(result.time, start, end, 6.0, Q, R, S)
+    np.testing.assert_allclose(result.cm, x, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(result.cm_velocity, v, rtol=0, atol=1e-7)
+
+
+def test_an_arrival_between_two_samples_is_recorded():
+    """A waypoint is judged when it is reached, however coarse the output."""
+    data = load_mission("single-waypoint").to_dict() | {"output_step": 1.0}
+    data["phases"][1] |= {"travel": 5.37, "velocity": [2.0, 0.0, 0.0]}
+    result = simulate(Mission.from_dict(data))
+    k = int(np.searchsorted(result.time, 11.37 - 1e-9))
+    assert result.time[k] == pytest.approx(11.37, abs=1e-12)
+    np.testing.assert_allclose(result.cm[k], data["phases"][1]["position"], rtol=0, atol=1e-2)

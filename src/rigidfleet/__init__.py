@@ -12,20 +12,34 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from rigidfleet.assess import assess
     from rigidfleet.figures import plot
+    from rigidfleet.live import live
     from rigidfleet.mission import load_mission
+    from rigidfleet.replay import replay
     from rigidfleet.report import report
     from rigidfleet.result import Result
     from rigidfleet.simulate import simulate
 
 __version__ = "0.1.0"
 
-__all__ = ["Result", "__version__", "assess", "load_mission", "plot", "report", "simulate"]
+__all__ = [
+    "Result",
+    "__version__",
+    "assess",
+    "live",
+    "load_mission",
+    "plot",
+    "replay",
+    "report",
+    "simulate",
+]
 
 _HOME = {
     "Result": "result",
     "assess": "assess",
+    "live": "live",
     "load_mission": "mission",
     "plot": "figures",
+    "replay": "replay",
     "report": "report",
     "simulate": "simulate",
 }

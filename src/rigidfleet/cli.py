@@ -107,6 +107,7 @@ def run(
     out: Path | None = None,
     force: bool = False,
     no_figures: bool = False,
+    replay: bool = False,
     csv: bool = False,
     json: bool = False,
     quiet: bool = False,
@@ -123,6 +124,8 @@ def run(
         Replace the files of an earlier flight; without it they are kept and nothing is flown.
     no_figures : bool
         Draw no figures; "rigidfleet report" can do so later.
+    replay : bool
+        Also write replay.html: the flight to be watched in a browser.
     csv : bool
         Also write NAME.csv: time, position, velocity and yaw of each agent.
     json : bool
@@ -153,9 +156,12 @@ def run(
     elif not quiet:
         _out().print(verdict)
     what = "what flew is saved, marked incomplete," if interrupted else "the flight is saved"
-    if not (no_figures or interrupted):
+    if not interrupted:
         try:
-            _draw(result, files.figures, quiet=quiet)
+            if replay:
+                _write_replay(result, files.replay)
+            if not no_figures:
+                _draw(result, files.figures, quiet=quiet)
         except KeyboardInterrupt:
             interrupted = True
     if not (json or quiet):
@@ -515,6 +521,60 @@ def report(
     return PASSED if all(verdict.passed for verdict in verdicts) else FAILED
 
 
+@app.command(sort_key=7)
+def replay(result: Path, /, *, out: Path | None = None, force: bool = False) -> int:
+    """Write a flight as a page to be watched in a browser, and to be sent: it needs no network.
+
+    Parameters
+    ----------
+    result : Path
+        Result of a flight, NAME.nc.
+    out : Path
+        The page; replay.html beside the result if not given.
+    force : bool
+        Replace a page that is there already.
+    """
+    from rigidfleet.result import Result
+
+    record = Result.load(result)
+    page = out or _Files(result.parent, record.mission.name).replay
+    if page.exists() and not force:
+        raise _kept(page)
+    _write_replay(record, page)
+    _out().print(f"Replay   {page}", soft_wrap=True)
+    return PASSED
+
+
+@app.command(sort_key=8)
+def live(mission: str, /, *, port: int = 0, no_browser: bool = False) -> int:
+    """Fly a mission's vehicles by hand, in the browser, in real time.
+
+    Parameters
+    ----------
+    mission : str
+        A shipped mission or a mission file: its vehicles, formations, gains and obstacles.
+    port : int
+        Port on this machine, which alone can reach it; any that is free if not given.
+    no_browser : bool
+        Only print the address.
+    """
+    from rigidfleet.kernel import is_compiled
+    from rigidfleet.mission import load_mission
+
+    flown = load_mission(mission)
+    if not is_compiled():
+        _err().print(_COMPILING)
+    from rigidfleet.live import live as fly
+
+    def ready(url: str) -> None:
+        _out().print(f"Flying {flown.name} at {url}", soft_wrap=True)
+        _err().print("Ctrl-C ends the flight, and so does closing its page")
+
+    with _heeding_interrupts():
+        fly(flown, port=port, browser=not no_browser, ready=ready)
+    return PASSED
+
+
 def _ask(name: str) -> tuple[str, dict[str, Any]]:
     """Name and contents of a new mission, asked for one by one; an empty answer takes what is offered."""
     from rigidfleet.formation import SHAPES, agents_taken, slots
@@ -641,6 +701,13 @@ def _write_report(
         write(records, path, labels=labels, verdicts=verdicts)
 
 
+def _write_replay(result: Result, path: Path) -> None:
+    """Write the page that plays a flight."""
+    from rigidfleet.replay import replay as write
+
+    write(result, path)
+
+
 def _labels(paths: list[Path], records: list[Result]) -> list[str]:
     """What to call each of several flights: what tells them apart, and is short."""
     missions = [record.mission.name for record in records]
@@ -703,9 +770,13 @@ class _Files:
         return self.folder / "report.html"
 
     @property
+    def replay(self) -> Path:
+        return self.folder / "replay.html"
+
+    @property
     def derived(self) -> list[Path]:
         """All that is made from the result."""
-        return [self.verdict, self.table, self.report, *self.figures]
+        return [self.verdict, self.table, self.report, self.replay, *self.figures]
 
     def claim(self, *, replace: bool) -> None:
         """Make sure, before anything is flown, that the files of a flight can be written.
@@ -758,7 +829,7 @@ class _Files:
 def _kept(path: Path) -> ResultError:
     return ResultError(
         f"{path}: exists already and is kept. "
-        "Replace it by --force, or name another folder by --out."
+        "Replace it by --force, or name another place by --out."
     )
 
 
@@ -774,6 +845,7 @@ def _list(files: _Files) -> None:
         ("Verdict", files.verdict),
         ("Table", files.table),
         ("Report", files.report),
+        ("Replay", files.replay),
     ):
         if path.exists():
             _out().print(f"{what:8} {path}", soft_wrap=True)

@@ -141,7 +141,7 @@ def _control(mission: Mission, phase: Phase, masses: Array) -> k.Control:
 
 _REST = k.Motion(np.zeros(2), np.zeros((1, 6, 6)), np.eye(3))
 _NO_FEEDBACK = k.Feedback(
-    np.zeros(0), np.zeros((0, 4)), 0.0, np.zeros(3), np.zeros(3), np.eye(3), np.zeros(3),
+    np.zeros(0), np.zeros((0, 4)), np.zeros((0, 4)), 0.0, np.zeros(3), np.zeros(3), np.eye(3), np.zeros(3),
     np.zeros(4),
 )  # fmt: skip
 
@@ -182,22 +182,26 @@ def _feedback(
 ) -> k.Feedback:
     """LQR on the virtual body itself: gain tables to a waypoint, tracking gains where it stays."""
     hold = lqr.double_integrator_gains(mission.tracking.Q, mission.tracking.R) * 2
-    to_go, gain = np.zeros(0), np.zeros((0, 4))
+    to_go, gain, slope = np.zeros(0), np.zeros((0, 4)), np.zeros((0, 4))
     if moves:
-        # Gains grow like 1/tau near arrival: a geometric grid keeps linear interpolation to 1e-4.
-        to_go = np.concatenate([[0.0], np.geomspace(1e-3, arrival - t0, 500)])
-        gain = np.concatenate(
-            [_gains(law, to_go) for law in (mission.lqr, mission.lqr.attitude)], axis=1
-        )
+        # Gains grow like 1/tau near arrival, until S bounds them: on a geometric grid cubics keep
+        # them to 1e-8.
+        to_go = np.concatenate([[0.0], np.geomspace(1e-6, arrival - t0, 1000)])
+        tables = [_gains(law, to_go) for law in (mission.lqr, mission.lqr.attitude)]
+        gain, slope = (np.concatenate(columns, axis=1) for columns in zip(*tables, strict=True))
     return k.Feedback(
-        to_go, np.ascontiguousarray(gain), arrival, goal.r, goal.v, np.ascontiguousarray(goal.T),
-        goal.omega, np.array(hold),
+        to_go, np.ascontiguousarray(gain), np.ascontiguousarray(slope), arrival, goal.r, goal.v,
+        np.ascontiguousarray(goal.T), goal.omega, np.array(hold),
     )  # fmt: skip
 
 
-def _gains(law: Regulator, to_go: Array) -> Array:
-    """Gains (K, 2) of one axis over the time to go (K,) [s]."""
+def _gains(law: Regulator, to_go: Array) -> tuple[Array, Array]:
+    """Gains (K, 2) of one axis over the time to go (K,) [s], and their slopes (Riccati equation)."""
     if law.horizon == "infinite":
-        return np.tile(lqr.double_integrator_gains(law.Q, law.R), (len(to_go), 1))
+        gain = np.tile(lqr.double_integrator_gains(law.Q, law.R), (len(to_go), 1))
+        return gain, np.zeros_like(gain)
     A, B = [[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]]
-    return lqr.finite_horizon(A, B, law.Q, np.atleast_2d(law.R), law.S, to_go)[1][:, 0]
+    P, K = lqr.finite_horizon(A, B, law.Q, np.atleast_2d(law.R), law.S, to_go)
+    gain = K[:, 0]
+    slope = np.stack([P[:, 0, 0], 2 * P[:, 0, 1] + law.Q[1]], axis=1) / law.R
+    return gain, slope - gain * gain[:, 1:]

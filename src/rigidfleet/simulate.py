@@ -306,7 +306,7 @@ class Flight:
             raise StoppedError(self._diagnose(leg, collapsed=status == flight.COLLAPSED))
 
     def _samples(self, leg: Leg, t_end: float) -> Array:
-        """Times to record in (t, t_end]: multiples of the output step, and the phase's two ends.
+        """Times to record in (t, t_end]: multiples of the output step, the phase's two ends, its arrival.
 
         The start of a phase is recorded one representable number after the switch.
         """
@@ -317,8 +317,10 @@ class Flight:
         step = self.mission.output_step
         low, high = math.floor(t / step + 1e-9) + 1, math.floor(t_end / step + 1e-9) + 1
         grid = np.minimum(np.arange(low, high) * step, t_end)
-        if t_end == leg.t_end:
-            grid = np.append(grid[grid < t_end - 1e-9 * step], t_end)
+        # The two ends of a phase count, and its arrival.
+        for exact in (leg.plan.arrival, leg.t_end):
+            if t < exact <= t_end:
+                grid = np.sort(np.append(grid[abs(grid - exact) > 1e-9 * step], exact))
         start = [t if leg.index == 0 else np.nextafter(t, math.inf)] if first else []
         return np.concatenate([start, grid])
 

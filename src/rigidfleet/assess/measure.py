@@ -122,7 +122,7 @@ class Flight:
         least, who = np.full(len(r), np.inf), np.zeros((len(r), 2), dtype=np.int64)
         for i in range(r.shape[1] - 1):
             apart, radii = r[:, i + 1 :] - r[:, i : i + 1], radius[i] + radius[i + 1 :]
-            beside = np.hypot(apart[..., 0], apart[..., 1]) >= radii
+            beside = np.hypot(apart[..., 0], apart[..., 1]) > radii
             room = np.where(beside, np.inf, np.abs(apart[..., 2]) - radii)
             j = room.argmin(axis=1)
             room = room[np.arange(len(r)), j]

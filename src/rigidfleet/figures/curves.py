@@ -435,7 +435,7 @@ def _mark_least(ax: Axes, result: Result, values: Floats, who: str) -> None:
         f"{value:.3g} m at {t:.2f} s{who}", (t, value), (5 if share < 0.25 else -5 if share > 0.75 else 0, -6),
         ha="left" if share < 0.25 else "right" if share > 0.75 else "center", va="top",
         textcoords="offset points",
-        fontsize=7.5, path_effects=st.halo(),
+        fontsize=7.5, parse_math=False, path_effects=st.halo(),
     )  # fmt: skip
 
 

@@ -147,7 +147,9 @@ def time_figure(
 def head(fig: Figure, result: Result, title: str) -> None:
     """Title at the left; the mission and, if it did not end well, when it stopped at the right."""
     top = 1 - _PAD / fig.get_figheight()
-    heading = fig.suptitle(title, x=0.012, ha="left", va="top", fontsize=11, fontweight="bold")
+    heading = fig.suptitle(
+        title, x=0.012, ha="left", va="top", fontsize=11, fontweight="bold", parse_math=False
+    )
     if fig.get_layout_engine() is None:  # else it finds the place, and keeps the axes clear of it
         heading.set_y(top)
     words, colour = result.mission.name, GREY

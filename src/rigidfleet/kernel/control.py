@@ -155,10 +155,10 @@ def local_law(r, v, m, g, control, w):
 
 @compiled
 def body_gains(t, feedback, out):
-    """Gains (4,) at t: from the table over the time to go, linear between entries; then held."""
+    """Gains (4,) at t: cubics through the table over the time to go; after arrival those held."""
     remaining = feedback.arrival - t
     n = feedback.to_go.shape[0]
-    if remaining <= 0.0 or n == 0:
+    if remaining < 0.0 or n == 0:
         for q in range(4):
             out[q] = feedback.hold[q]
         return
@@ -169,10 +169,13 @@ def body_gains(t, feedback, out):
             low = middle
         else:
             high = middle
-    x0, x1 = feedback.to_go[low], feedback.to_go[high]
-    s = min(1.0, (remaining - x0) / (x1 - x0)) if x1 > x0 else 0.0
+    h = feedback.to_go[high] - feedback.to_go[low]
+    s = min(1.0, (remaining - feedback.to_go[low]) / h)
     for q in range(4):
-        out[q] = (1.0 - s) * feedback.gain[low, q] + s * feedback.gain[high, q]
+        x0, x1 = feedback.gain[low, q], feedback.gain[high, q]
+        v0, v1 = h * feedback.slope[low, q], h * feedback.slope[high, q]
+        rise = x1 - x0
+        out[q] = x0 + s * (v0 + s * (3.0 * rise - 2.0 * v0 - v1 + s * (v0 + v1 - 2.0 * rise)))
 
 
 @inlined

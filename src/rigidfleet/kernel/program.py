@@ -86,6 +86,7 @@ class Feedback(NamedTuple):
 
     to_go: Array  # (n,) increasing, from 0 [s]
     gain: Array  # (n, 4): position [1/s^2], velocity [1/s]; attitude, rate
+    slope: Array  # (n, 4) their derivatives by the time to go
     arrival: float  # T [s]
     r: Array  # (3,) target at T [m]
     v: Array  # (3,) [m/s]

@@ -103,6 +103,9 @@ def _agents(notes: Notes, parts: dict[str, Any]) -> None:
     for i, j in formations.coincident(agents.position):
         problem = f"agent {j + 1} starts where agent {i + 1} does"
         notes.add(("agents", "position", j), problem, "start them apart")
+    written = notes.data["agents"].get("thrust_limit", 0.0)
+    if math.inf in (written if isinstance(written, list) else [written]):
+        notes.add(("agents", "thrust_limit"), "is not finite", "leave it out for no limit")
     unlimited = all(math.isinf(limit) for limit in agents.thrust_limit)
     if agents.saturate and unlimited and notes.right(("agents",), "thrust_limit"):
         notes.add(

@@ -134,10 +134,9 @@ def _times(notes: Notes, found: Sequence[AnyPhase | None]) -> float | None:
             last = last + (longest or 0.0) if last is not None else None
         if isinstance(p, Shaping):
             _blend(notes, p, longest, path)
-        elif isinstance(p, Steering) and p.travel is not None and longest is not None:
-            if p.travel > longest * (1 + 1e-9):
-                problem = f"the phase ends before, after {longest:g} s"
-                notes.add((*path, "travel"), problem, "arrive earlier, or end it later", p.travel)
+        elif isinstance(p, Steering) and p.travel and p.travel > (longest or p.travel) * (1 + 1e-9):
+            problem = f"the phase ends before, after {longest:g} s"
+            notes.add((*path, "travel"), problem, "arrive earlier, or end it later", p.travel)
     return last
 
 

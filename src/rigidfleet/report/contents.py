@@ -380,7 +380,8 @@ def _picture(name: str, svg: bytes, caption: str) -> dict[str, str]:
 
 
 def _embedded(svg: bytes) -> str:
-    # As an image its names and styles stay its own.
+    # As an image its names and styles stay its own; blanks between words are kept, as they were drawn.
+    svg = svg.replace(b"</style>", b" text{white-space:pre}</style>", 1)
     return f"data:image/svg+xml;base64,{b64encode(svg).decode()}"
 
 
