@@ -851,7 +851,7 @@ def test_recorded_constraint_forces_are_those_of_a_single_call():
 @pytest.mark.parametrize("formulation", ["inertial", "body"])
 def test_the_virtual_body_flies_its_own_regulator(formulation):
     """In architecture body the CM moves as the finite-horizon LQR says, to 1e-7 m."""
-    weights = {"Q": [0.5, 0.7], "R": 2.0, "S": [100.0, 30.0]}
+    weights: dict[str, Any] = {"Q": [0.5, 0.7], "R": 2.0, "S": [100.0, 30.0]}
     start, end = ([16 / 3, 5.0, 3.0], [0.0] * 3), ([10.0] * 3, [1.0, 0.0, 0.0])
     mission = Mission.from_dict(
         {
@@ -874,7 +874,7 @@ def test_the_virtual_body_flies_its_own_regulator(formulation):
 
 def test_an_arrival_between_two_samples_is_recorded():
     """A waypoint is judged when it is reached, however coarse the output."""
-    data = load_mission("single-waypoint").to_dict() | {"output_step": 1.0}
+    data: dict[str, Any] = load_mission("single-waypoint").to_dict() | {"output_step": 1.0}
     data["phases"][1] |= {"travel": 5.37, "velocity": [2.0, 0.0, 0.0]}
     result = simulate(Mission.from_dict(data))
     k = int(np.searchsorted(result.time, 11.37 - 1e-9))
