@@ -686,6 +686,54 @@ def test_report_page(capsys, plot):
     assert not page.exists()
 
 
+def test_replay(capsys, plot):
+    """A replay is a page beside the result, which is kept, replaced with --force, and gone with its flight."""
+    assert cli.main(["run", "short.toml", "--no-figures", "--replay"]) == cli.PASSED
+    page = Path("flights/short/replay.html")
+    assert f"Replay   {page}" in capsys.readouterr().out
+    write(page, "earlier")
+    assert cli.main(["replay", "flights/short/short.nc"]) == cli.BAD_INPUT
+    assert "exists already and is kept" in capsys.readouterr().err
+    assert page.read_text(encoding="utf-8") == "earlier"
+    assert cli.main(["replay", "flights/short/short.nc", "--force"]) == cli.PASSED
+    assert capsys.readouterr().out == f"Replay   {page}\n"
+    assert "Hold a triangle for a second" in page.read_text(encoding="utf-8")
+    assert cli.main(["replay", "flights/short/short.nc", "--out", "to-send.html"]) == cli.PASSED
+    assert Path("to-send.html").read_bytes() == page.read_bytes()
+    cli.main(["run", "short.toml", "--no-figures", "--quiet", "--force"])
+    assert not page.exists()
+
+
+def test_live(capsys, monkeypatch):
+    """A live flight says where it is to be seen, and opens the browser unless told not to."""
+
+    asked = []
+
+    def fly(mission, *, port, browser, ready):
+        asked.append((mission.name, port, browser))
+        ready("http://127.0.0.1:1/secret/")
+
+    monkeypatch.setattr(sys.modules["rigidfleet.live"], "live", fly)
+    assert cli.main(["live", "short.toml"]) == cli.PASSED
+    assert cli.main(["live", "narrow-passage", "--port", "8000", "--no-browser"]) == cli.PASSED
+    assert asked == [("short", 0, True), ("narrow-passage", 8000, False)]
+    out = capsys.readouterr().out
+    assert "Flying short at http://127.0.0.1:1/secret/\n" in out
+
+
+def test_live_needs_slots(capsys):
+    """A mission that has no slots to fly by hand is refused."""
+    chain = (
+        'edges = [[1, 2], [2, 3]]\ndistances = [4.0, 4.0]\n[[phases]]\nreference = "distances"\n'
+    )
+    text = TRIANGLE.replace(
+        'shape = "triangle"\nsize = 4.0\n[[phases]]\n', chain + 'control = "open"\n'
+    )
+    write("chain.toml", text.replace("blend = 0.5", "blend = 1.0"))
+    assert cli.main(["live", "chain.toml", "--no-browser"]) == cli.BAD_INPUT
+    assert "no formation has slots" in capsys.readouterr().err
+
+
 def test_report_json_and_quiet(capsys, plot):
     """With --json a report prints the verdict's file and nothing else; with --quiet nothing."""
     cli.main(["run", "short.toml", "--no-figures", "--quiet"])

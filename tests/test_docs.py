@@ -186,7 +186,7 @@ def test_commands_are_documented(capsys):
 
     text = page("missions.md").split("\n## Commands")[1].split("\n## ")[0]
     options = set()
-    for command in ("run", "missions", "check", "design", "new", "report"):
+    for command in ("run", "missions", "check", "design", "new", "report", "replay", "live"):
         assert f"`rigidfleet {command}" in text
         main([command, "--help"])
         options |= set(re.findall(r"--[a-z][\w-]*", capsys.readouterr().out))

@@ -20,6 +20,7 @@ import pytest
 from rigidfleet import attitude as att
 from rigidfleet.errors import FlightError
 from rigidfleet.live import live
+from rigidfleet.live import session as sessions
 from rigidfleet.live.pilot import TICK, Gust, Pilot
 from rigidfleet.live.server import Server
 from rigidfleet.live.session import Session
@@ -279,7 +280,7 @@ def test_real_time():
 
 def test_last_page_closed(monkeypatch):
     """Some time after the last page was closed, the flight ends."""
-    monkeypatch.setattr("rigidfleet.live.session._PATIENCE", 0.3)
+    monkeypatch.setattr(sessions, "_PATIENCE", 0.3)
     session = Session(TRIANGLE)
     thread = threading.Thread(target=session.run)
     thread.start()

@@ -4,6 +4,7 @@ import base64
 import json
 import re
 import zlib
+from importlib import import_module
 
 import numpy as np
 import pytest
@@ -181,7 +182,7 @@ def test_tension_scale(share, tension, beyond):
 
 def test_too_many_edges(monkeypatch):
     """Of too many edges the shortest are drawn, and the page says so."""
-    monkeypatch.setattr("rigidfleet.replay._EDGES", 10)
+    monkeypatch.setattr(import_module("rigidfleet.replay"), "_EDGES", 10)
     info, columns = parts(html_page(EIGHT))
     assert len(info["edges"]) == columns["tension"].shape[1] == 10
     assert "10 shortest of 17 edges" in info["note"]

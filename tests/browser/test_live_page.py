@@ -9,6 +9,7 @@ from collections.abc import Iterator
 import pytest
 from chromium import Browser
 
+from rigidfleet.live import session as sessions
 from rigidfleet.live.server import Server
 from rigidfleet.live.session import Session
 from rigidfleet.mission import load_mission
@@ -172,7 +173,7 @@ def test_end(page, session):
 
 def test_tab_closed(session, browser, monkeypatch):
     """When the last page is closed, the flight ends."""
-    monkeypatch.setattr("rigidfleet.live.session._PATIENCE", 0.5)
+    monkeypatch.setattr(sessions, "_PATIENCE", 0.5)
     with Server(session) as server:
         browser.open(server.url)
         browser.driver.get("about:blank")
