@@ -154,6 +154,16 @@ class LivePlayer extends Player {
     }
   }
 
+  /** What was flown can still be looked at. */
+  end() {
+    this.over = true;
+    part("ending").textContent = "The flight has ended. This page can be closed.";
+    part("ending").hidden = false;
+    for (const id of ["fly", "play", "speed", "now", "again", "end"]) part(id).hidden = true;
+    this.resize();
+    this.tell();
+  }
+
   // -- instead of what a flight that is over does --
 
   speeds() {
@@ -208,7 +218,9 @@ class LivePlayer extends Player {
     const { recording } = this, { info } = recording, last = part("phases").lastElementChild, phase = info.phases.at(-1);
     if (last) last.style.flexGrow = String(Math.max(recording.end - phase.start, 1e-3));
     const ago = `${digits(recording.end - this.time)} s ago`, slow = info.pace < 0.9 ? `live, at ${info.pace} of its speed` : "live";
-    part("whole").textContent = this.back ? ago : info.paused ? "paused" : slow;
+    const now = this.over ? "" : info.paused ? "paused" : slow;
+    part("whole").textContent = this.back ? ago : now;
+    if (!this.back && !info.busy && !info.ending) part("phase-name").textContent = `holding ${info.formation}`;
     part("now").setAttribute("aria-pressed", String(!this.back));
   }
 }
@@ -251,7 +263,8 @@ function main() {
   });
   const over = () => {
     source.close();
-    say("The flight has ended. This page can be closed.");
+    if (player) player.end();
+    else say("The flight has ended. This page can be closed.");
   };
   source.addEventListener("end", over);
   source.addEventListener("open", () => clearTimeout(lost));
