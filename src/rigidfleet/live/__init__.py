@@ -40,11 +40,11 @@ def live(
     """
     session = Session(mission)
     with Server(session, port) as server:
-        if ready is not None:
-            ready(server.url)
-        if browser:
-            webbrowser.open(server.url)
         try:
+            if ready is not None:
+                ready(server.url)
+            if browser:
+                webbrowser.open(server.url)
             session.run()
         except KeyboardInterrupt:
             return
