@@ -35,7 +35,7 @@ def pack(columns: Mapping[str, Column]) -> tuple[list[dict[str, Any]], str]:
         flat = values.reshape(len(values), -1)
         described.append({"name": name, "width": flat.shape[1], "step": step})
         planes.append(_bytes(flat.T / step))
-    data = zlib.compress(b"".join(planes), 9)
+    data = zlib.compress(b"".join(planes), 6)
     return described, base64.b64encode(data).decode("ascii")
 
 
