@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 _STEPS, _PAUSE = 2000, 0.05
 #: A phase has stalled that took more steps than these and those for each second of mission time, or
 #: more than the last in all. A step of 1 ms is already that of gains above 1e3 /s.
-_STALLED, _STALLED_RATE, _MOST_STEPS = 100_000, 10_000.0, 5_000_000
+_STALLED, _STALLED_RATE, _MOST_STEPS = 50_000, 2_000.0, 5_000_000
 #: Equations of the constraint force at most: beyond, one evaluation takes seconds.
 _LARGEST = 2000
 #: Where a phase ends by settling, whether it has is asked this often [s].

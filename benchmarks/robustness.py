@@ -1,0 +1,540 @@
+"""Which shapes come out: shipped and random formations from random starts, by every graph and law.
+
+    make robustness                        the table of docs/robustness.md, on all cores
+    python benchmarks/robustness.py --random 20 --rows "slots, complete" --json out.json
+
+Each formation is flown once in each row. What counts as the intended shape is judged here by all pairs
+of agents and by the volume of a tetrahedron, independently of `rigidfleet.assess`, whose verdict is
+then held against it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import os
+import sys
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigidfleet import formation as shapes
+from rigidfleet.assess import assess
+from rigidfleet.errors import FlightError
+from rigidfleet.geometry import smallest_singular_value
+from rigidfleet.mission import Mission, load_mission, mission_names
+from rigidfleet.plan import align_slots
+from rigidfleet.result import Result
+from rigidfleet.rigidity import jacobian
+from rigidfleet.simulate import simulate
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+#: Least distance of two random slots, and of two agents at the start [m].
+SPACING, APART = 2.0, 1.0
+#: Length of a flight [s], that of the paper's Table 1.
+FLIGHT = 20.0
+#: The paper's law, and the dense eigenvalue solves, are flown on formations of so many agents at most.
+FEW = 5
+#: A pair is right within this part of the shortest distance.
+TOLERANCE = 0.01
+#: What the flight itself has to say, whatever comes near to whom.
+_SHAPE_CHECKS = {"complete", "settled", "distances", "shape", "handedness", "order"}
+_WHERE = {1: "line", 2: "plane", 3: "space"}
+
+
+@dataclass(frozen=True)
+class Case:
+    """A formation and a start."""
+
+    name: str
+    slots: Floats  # (N, 3) [m]
+    start: Floats  # (N, 3) [m]
+    own: Ints | None = None  # the edges it ships with, unless complete
+
+    @property
+    def n(self) -> int:
+        """Number of agents."""
+        return len(self.slots)
+
+    @property
+    def dimension(self) -> int:
+        """1, 2 or 3: of the formation."""
+        return shapes.dimension(self.slots, 1e-3)
+
+
+@dataclass(frozen=True)
+class Row:
+    """How the formations are flown."""
+
+    name: str
+    graph: str  # minimal, redundant, complete
+    control: str = "open"
+    reference: str = "shape"
+    constraint: dict[str, Any] = field(default_factory=dict)
+    assigned: bool = False  # each agent takes the slot that makes the ways short
+    most: int = 1000  # agents
+    tied: bool = (
+        False  # the damping is a quarter of the smallest eigenvalue w of the shape, or 0.03
+    )
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of one flight."""
+
+    row: str
+    case: str
+    agents: int
+    dimension: int
+    end: str  # intended, mirrored, folded; failure, stall, nan
+    noticed: bool  # the verdict agrees
+    force: float  # greatest force of an agent beyond its weight [N]
+    steps: int
+    wall: float  # [s]
+    ending: str
+    error: float = np.nan  # of the worst pair at the end, in parts of the shortest distance
+    crossings: int | None = None  # of singular shapes on the way, minimal graphs in space
+
+
+def _rows() -> Iterator[Row]:
+    graphs = ("minimal", "redundant", "complete")
+    for graph in graphs:
+        yield Row(f"slots, {graph}", graph, control="slots")
+    for reference in ("shape", "distances", "step"):
+        for graph in graphs:
+            yield Row(f"{reference}, {graph}", graph, reference=reference)
+            if reference == "shape" and graph != "complete":
+                yield Row(f"shape, {graph}, assigned", graph, assigned=True)
+    for law in ("exact", "pinv", "spectral", "iterated"):
+        for reference in ("shape", "step"):
+            for graph in ("minimal", "complete"):
+                name = f"few, {law}, {reference}, {graph}"
+                yield Row(
+                    name, graph, "open", reference, {"solver": law}, most=FEW - (law == "pinv")
+                )
+
+
+ROWS: tuple[Row, ...] = tuple(_rows())
+
+
+def _damping_rows() -> Iterator[Row]:
+    for reference in ("shape", "step"):
+        for law in ("0.03", "tied", "spectral"):
+            constraint = {"solver": "spectral"} if law == "spectral" else {}
+            most, tied = 8 if law == "spectral" else 1000, law == "tied"
+            name = f"{law}, {reference}"
+            yield Row(name, "redundant", "open", reference, constraint, most=most, tied=tied)
+
+
+DAMPING: tuple[Row, ...] = tuple(_damping_rows())
+
+
+# -- formations ------------------------------------------------------------------------------------
+
+
+def cases(count: int = 200, seed: int = 1) -> list[Case]:
+    """The shipped formations, and ``count`` random ones: on lines, in planes, in space in turn."""
+    return [*shipped(seed), *(random_case(k, seed) for k in range(count))]
+
+
+def shipped(seed: int) -> list[Case]:
+    """The formations of the missions that ship, each once, from random starts."""
+    found: dict[bytes, Case] = {}
+    for mission in map(load_mission, mission_names()):
+        for name in mission.formations:
+            slots = mission.formation_slots(name)
+            if slots is None:
+                continue
+            edges = mission.formation_edges(name)
+            rng = np.random.default_rng([seed, len(found)])
+            own = None if len(edges) == len(shapes.complete_graph(len(slots))) else edges
+            case = Case(f"{mission.name}: {name}", slots, start(slots, rng), own)
+            found.setdefault(np.round(slots, 6).tobytes(), case)
+    return list(found.values())
+
+
+def random_case(k: int, seed: int) -> Case:
+    """Formation k: on a line, in a plane or in space, of 2, 3 or 4 to 20 agents, and a start."""
+    rng = np.random.default_rng([seed, 1000 + k])
+    d = 1 + k % 3
+    n = int(rng.integers(d + 1, 21))
+    side = 1.6 * SPACING * n ** (1 / d) * np.exp(rng.uniform(-0.5, 0.5, d))
+    slots = np.zeros((n, 3))
+    slots[:, :d] = scattered(rng, n, side, SPACING)
+    return Case(f"{_WHERE[d]} {k}", shapes.centred(slots), start(slots, rng))
+
+
+def start(slots: Floats, rng: np.random.Generator) -> Floats:
+    """A random start in a cube with as much room as a spatial formation has, high above ground."""
+    side = np.full(3, 1.6 * SPACING * len(slots) ** (1 / 3))
+    return scattered(rng, len(slots), side, APART) + [0.0, 0.0, 20.0]
+
+
+def scattered(rng: np.random.Generator, n: int, side: Floats, apart: float) -> Floats:
+    """n random points in a box, no two nearer than ``apart``; the box grows where they do not fit."""
+    points = np.zeros((0, len(side)))
+    for trial in range(1, 1_000_000):
+        p = rng.uniform(-0.5, 0.5, len(side)) * side * (1 + trial / 2000)
+        if not len(points) or np.linalg.norm(points - p, axis=1).min() >= apart:
+            points = np.vstack([points, p])
+        if len(points) == n:
+            return points
+    raise RuntimeError("no room for the points")
+
+
+def named() -> dict[str, list[Case]]:
+    """Formations of four kinds for the choice of the damping, each from four starts."""
+    kinds: dict[str, dict[str, Floats]] = {
+        "small": {
+            "triangle": shapes.slots("triangle", 4.0, 3),
+            "pyramid": shapes.slots("pyramid", 4.0, 5),
+            "cube": shapes.slots("cube", 4.0, 8),
+        },
+        "slender": {
+            "cuboid 8 x 2 x 4": shapes.slots("cuboid", [8.0, 2.0, 4.0], 8),
+            "cuboid 16 x 2 x 2": shapes.slots("cuboid", [16.0, 2.0, 2.0], 8),
+            "truss of 12": _lattice(6, 2, 1) + _lattice(6, 2, 1)[:, [2, 1, 1]] * [0, 0, 0.5],
+        },
+        "flat": {
+            "square": shapes.slots("square", 4.0, 4),
+            "hexagon": shapes.slots("hexagon", 4.0, 6),
+            "grid of 16": _lattice(4, 4, 1),
+        },
+        "large": {
+            "lattice of 27": _lattice(3, 3, 3),
+            "lattice of 30": _lattice(5, 3, 2),
+            "bar of 28": _lattice(7, 2, 2),
+        },
+    }
+    return {
+        kind: [
+            Case(f"{name}, {k}", shapes.centred(slots), start(slots, np.random.default_rng([7, k])))
+            for name, slots in some.items()
+            for k in range(4)
+        ]
+        for kind, some in kinds.items()
+    }
+
+
+def _lattice(a: int, b: int, c: int) -> Floats:
+    """Points 4 m apart."""
+    return 4.0 * np.array(list(np.ndindex(a, b, c)), dtype=float)
+
+
+def edges_of(case: Case, graph: str) -> Ints:
+    """Edges of a formation: as few as its dimension needs, half as many more, or all."""
+    complete = shapes.complete_graph(case.n)
+    if graph == "complete":
+        return complete
+    rng = np.random.default_rng(case.n)
+    few = case.own if case.own is not None else joined(case.slots, case.dimension, rng)
+    if graph == "minimal":
+        return few
+    have = {tuple(e) for e in few.tolist()}
+    rest = np.array([e for e in complete.tolist() if tuple(e) not in have], dtype=np.int64)
+    extra = min(len(rest), (len(few) + 1) // 2)
+    chosen = rng.permutation(len(rest))[:extra]
+    return np.vstack([few, rest.reshape(-1, 2)[chosen]])
+
+
+def joined(slots: Floats, d: int, rng: np.random.Generator) -> Ints:
+    """A minimal graph: each agent joined to d earlier ones (fewer at the start), well spread."""
+    edges = []
+    for j in range(1, len(slots)):
+        before = list(combinations(range(j), min(d, j)))
+        picks = [before[k] for k in rng.permutation(len(before))[:30]]
+        best = max(picks, key=lambda who: _spread(slots[list(who)] - slots[j], d))
+        edges += [(i, j) for i in best]
+    return np.array(sorted(edges), dtype=np.int64)
+
+
+def _spread(u: Floats, d: int) -> float:
+    """Smallest singular value of the directions u (k, 3), those to one agent from its neighbours."""
+    s = np.linalg.svd(u / np.linalg.norm(u, axis=1)[:, None], compute_uv=False)
+    return float(s[min(len(u), d) - 1])
+
+
+def smallest_eigenvalue(slots: Floats, edges: Ints) -> float:
+    """Smallest non-zero eigenvalue w of mbar A at the intended shape, equal masses."""
+    return float(smallest_singular_value(slots[None], edges)[0] ** 2)
+
+
+def assigned(case: Case) -> Case:
+    """The same start, each agent where another slot is nearer: least squares over turns and orders."""
+    from scipy.optimize import linear_sum_assignment
+
+    there, best = shapes.centred(case.start), (np.inf, np.arange(case.n))
+    for trial in range(20):
+        R = np.linalg.qr(np.random.default_rng(trial).normal(size=(3, 3)))[0]
+        R *= np.sign(np.linalg.det(R))
+        for _ in range(30):
+            apart = ((case.slots @ R.T)[:, None] - there) ** 2
+            order = linear_sum_assignment(apart.sum(axis=2))[1]
+            turned = shapes.kabsch(there[order], case.slots, near=R)
+            if np.allclose(turned, R):
+                break
+            R = turned
+        cost = ((case.slots @ R.T - there[order]) ** 2).sum()
+        best = min(best, (cost, order), key=lambda found: found[0])
+    return replace(case, start=case.start[best[1]])
+
+
+def singular_on_the_way(case: Case, edges: Ints) -> int:
+    """How often J of a minimal graph in space loses rank while the shape is blended to.
+
+    J and the six rigid motions make a square matrix: its determinant changes sign there.
+    """
+    before, after = shapes.centred(case.start), shapes.centred(case.slots)
+    dp = align_slots(before, after, np.ones(case.n))[0]
+    signs = []
+    for s in np.linspace(0.0, 1.0, 200):
+        p = before + s * dp
+        turns = [np.cross(axis, p).ravel() for axis in np.eye(3)]
+        whole = np.vstack([jacobian(p, edges), np.tile(np.eye(3), case.n), turns])
+        signs.append(np.linalg.slogdet(whole)[0])
+    return int(np.count_nonzero(np.diff(signs)))
+
+
+# -- flights ---------------------------------------------------------------------------------------
+
+
+def mission_of(case: Case, row: Row) -> Mission:
+    """The mission that takes the formation from its start."""
+    phase = {"kind": "establish", "formation": "shape", "until": FLIGHT}
+    phase |= {"control": row.control, "reference": row.reference}
+    edges = edges_of(case, row.graph)
+    damping = {}
+    if row.tied:
+        damping = {"damping": min(0.03, smallest_eigenvalue(case.slots, edges) / 4)}
+    return Mission.from_dict(
+        {
+            "schema_version": 1,
+            "name": "robustness",
+            "output_step": 0.1,
+            "agents": {"mass": 1.0, "position": case.start},
+            "constraint": row.constraint | damping,
+            "formations": {"shape": {"slots": case.slots, "edges": edges + 1}},
+            "phases": [phase],
+        }
+    )
+
+
+def fly(case: Case, row: Row) -> Outcome:
+    """Fly one formation in one row, and judge it twice."""
+    if row.assigned:
+        case = assigned(case)
+    about = (row.name, case.name, case.n, case.dimension)
+    crossings = None
+    if row.graph == "minimal" and case.dimension == 3 and row.most > FEW:
+        crossings = singular_on_the_way(case, edges_of(case, row.graph))
+    begun = time.perf_counter()
+    try:
+        result = simulate(mission_of(case, row))
+    except FlightError as error:
+        wall = time.perf_counter() - begun
+        return Outcome(*about, "failure", True, np.nan, 0, wall, str(error), crossings=crossings)
+    wall = time.perf_counter() - begun
+    end = judged(case, result)
+    verdict = assess(result)
+    wrong = any(f.check in _SHAPE_CHECKS and not f.passed for f in verdict.findings)
+    weight = np.array([0.0, 0.0, 9.81])
+    force = np.linalg.norm(result.input_force + result.constraint_force - weight, axis=2).max()
+    steps = result.statistics["steps"] + result.statistics["rejected"]
+    noticed = wrong == (end != "intended")
+    return Outcome(
+        *about, end, noticed, float(force), steps, wall, result.ending,
+        worst_pair(case, result.position[-1]), crossings,
+    )  # fmt: skip
+
+
+def judged(case: Case, result: Result) -> str:
+    """How a flight ended, by distances of all pairs and the hand of its largest tetrahedron."""
+    if not result.complete:
+        return "stall" if "steps have been taken" in result.ending else "failure"
+    r = result.position[-1]
+    numbers = (result.position, result.velocity, result.constraint_force, result.input_force)
+    if not all(np.isfinite(x).all() for x in numbers):
+        return "nan"
+    if case.dimension == 3:
+        some = largest_tetrahedron(case.slots)
+        mirrored = volume(r[some]) * volume(case.slots[some]) < 0
+    else:
+        mirrored = False
+    if worst_pair(case, r) > TOLERANCE:
+        return "folded"
+    return "mirrored" if mirrored else "intended"
+
+
+def worst_pair(case: Case, r: Floats) -> float:
+    """Greatest error of a distance between two agents, relative to the shortest one."""
+    i, j = np.triu_indices(case.n, 1)
+    wanted = np.linalg.norm(case.slots[i] - case.slots[j], axis=1)
+    return float(np.abs(np.linalg.norm(r[i] - r[j], axis=1) - wanted).max() / wanted.min())
+
+
+def largest_tetrahedron(slots: Floats) -> list[int]:
+    """Four agents that span the most."""
+    return list(
+        max(combinations(range(len(slots)), 4), key=lambda who: abs(volume(slots[list(who)])))
+    )
+
+
+def volume(p: Floats) -> float:
+    """Six times the signed volume of a tetrahedron (4, 3)."""
+    a, b, c = p[1:] - p[0]
+    return float(a @ np.cross(b, c))
+
+
+# -- the table -------------------------------------------------------------------------------------
+
+
+def fly_all(work: tuple[Case, Sequence[Row]]) -> list[Outcome]:
+    """One formation in all rows."""
+    case, rows = work
+    return [fly(case, row) for row in rows if case.n <= row.most]
+
+
+def run(some: Sequence[Case], rows: Sequence[Row], jobs: int) -> Iterator[list[Outcome]]:
+    """All flights, a formation at a time, on ``jobs`` processes."""
+    fly(some[0], rows[0])  # compiles, if need be, for all
+    work = [(case, rows) for case in sorted(some, key=lambda c: -c.n)]
+    if jobs == 1:
+        yield from map(fly_all, work)
+        return
+    with multiprocessing.get_context("spawn").Pool(jobs) as pool:
+        yield from pool.imap_unordered(fly_all, work)
+
+
+def summary(row: Row, outcomes: Sequence[Outcome]) -> dict[str, Any]:
+    """A row of the table."""
+    mine = [o for o in outcomes if o.row == row.name]
+    ends = {end: sum(o.end == end for o in mine) for end in (
+        "intended", "mirrored", "folded", "failure", "stall", "nan",
+    )}  # fmt: skip
+    by_dimension = {}
+    for d, where in _WHERE.items():
+        there = [o for o in mine if o.dimension == d]
+        intended = sum(o.end == "intended" for o in there)
+        by_dimension[where] = intended / len(there) if there else None
+    flown = np.array([o.force for o in mine if np.isfinite(o.force)])
+    return {
+        "row": row.name, "flights": len(mine), **ends, **by_dimension,
+        "unnoticed": sum(not o.noticed for o in mine),
+        "force_median": float(np.median(flown)) if len(flown) else None,
+        "force_95": float(np.quantile(flown, 0.95)) if len(flown) else None,
+        "steps": int(np.median([o.steps for o in mine])) if mine else None,
+    }  # fmt: skip
+
+
+_HEAD = (
+    "row", "flights", "intended", "line", "plane", "space", "mirrored", "folded", "failures",
+    "stalls", "NaN", "not noticed", "peak force, median / 95 % [N]", "steps",
+)  # fmt: skip
+
+
+def cells(s: dict[str, Any]) -> list[str]:
+    """A row of the table as text."""
+    part = lambda x: "" if x is None else f"{100 * x:.0f} %"  # noqa: E731
+    force = "" if s["force_median"] is None else f"{s['force_median']:.3g} / {s['force_95']:.3g}"
+    ends = [str(s[end]) for end in ("mirrored", "folded", "failure", "stall", "nan", "unnoticed")]
+    where = [part(s[w]) for w in _WHERE.values()]
+    return [
+        s["row"],
+        str(s["flights"]),
+        _share(s["intended"], s["flights"]),
+        *where,
+        *ends,
+        force,
+        str(s["steps"]),
+    ]
+
+
+def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table as Markdown."""
+    lines = [head, ["---", *["---:"] * (len(head) - 1)], *rows]
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
+def crossings(outcomes: Sequence[Outcome]) -> list[list[str]]:
+    """Minimal graphs in space, by how often they lose rank on the way: flights, and right ones."""
+    lines = []
+    for row in ("shape, minimal", "shape, minimal, assigned"):
+        mine = [o for o in outcomes if o.row == row and o.crossings is not None]
+        for name, times in (("0", [0]), ("1 or 2", [1, 2]), ("3 or more", range(3, 200))):
+            there = [o for o in mine if o.crossings in times]
+            right = sum(o.end == "intended" for o in there)
+            lines.append([row, name, str(len(there)), _share(right, len(there))])
+    return lines
+
+
+def damping_table(jobs: int) -> tuple[list[list[str]], list[Outcome]]:
+    """The laws of damping, by kind of shape."""
+    lines, every = [], []
+    for kind, some in named().items():
+        outcomes = [o for part in run(some, DAMPING, jobs) for o in part]
+        every += outcomes
+        for row in DAMPING:
+            mine = [o for o in outcomes if o.row == row.name]
+            if not mine:
+                continue
+            right = sum(o.end == "intended" for o in mine)
+            error = [o.error for o in mine if o.end == "intended"]
+            force = [o.force for o in mine]
+            worst = f"{max(error):.1e}" if error else ""
+            force = f"{np.median(force):.3g} / {max(force):.3g}"
+            steps = f"{np.median([o.steps for o in mine]):.0f}"
+            lines.append([kind, row.name, f"{right} of {len(mine)}", worst, force, steps])
+    return lines, every
+
+
+def _share(part: int, whole: int) -> str:
+    return f"{100 * part / whole:.1f} %" if whole else ""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Fly, print the tables, write JSON."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--random", type=int, default=200, help="number of random formations")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--rows", action="append", help="only rows whose names begin so")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--json", type=Path, help="write every outcome to a file")
+    asked = parser.parse_args(arguments)
+    rows = [r for r in ROWS if not asked.rows or r.name.startswith(tuple(asked.rows))]
+    some = cases(asked.random, asked.seed)
+    begun = time.perf_counter()
+    outcomes: list[Outcome] = []
+    for k, part in enumerate(run(some, rows, asked.jobs), start=1):
+        outcomes += part
+        if sys.stderr.isatty():
+            print(f"\r{k} of {len(some)} formations", end="", file=sys.stderr)
+    table = [summary(row, outcomes) for row in rows]
+    print(markdown(_HEAD, map(cells, table)))
+    damped: list[Outcome] = []
+    if not asked.rows:
+        print(markdown(("row", "singular on the way", "flights", "intended"), crossings(outcomes)))
+        lines, damped = damping_table(asked.jobs)
+        head = (
+            "shapes", "damping, reference", "intended", "worst pair of these",
+            "peak force, median / most [N]", "steps",
+        )  # fmt: skip
+        print(markdown(head, lines))
+    wall = time.perf_counter() - begun
+    print(f"{len(outcomes) + len(damped)} flights, {wall:.0f} s on {asked.jobs} processes")
+    if asked.json:
+        every = [asdict(o) for o in (*outcomes, *damped)]
+        asked.json.write_text(json.dumps({"table": table, "outcomes": every, "wall_s": wall}))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
