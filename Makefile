@@ -11,7 +11,7 @@ INSTALL := $(BIN)/uv pip install --quiet --python $(BIN)/python \
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test bench lint format constraints clean
+.PHONY: help setup demo test bench docs lint format constraints clean
 
 help:  ## Show this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' Makefile
@@ -26,6 +26,11 @@ test: .venv/.dev  ## Run the tests (MARK= runs the long ones, too)
 
 bench: .venv/.bench  ## Measure the speed, as ratios
 	@$(BIN)/python benchmarks/run.py
+
+docs: .venv/.docs  ## Build the site into site/, with every figure on it
+	@$(BIN)/python docs/picture.py
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	@echo "Open site/index.html"
 
 lint: .venv/.dev  ## Check style, types and import layers
 	@$(BIN)/ruff check
@@ -43,7 +48,7 @@ constraints: .venv/.dev  ## Choose newer versions of all packages
 		pyproject.toml --output-file constraints.txt
 
 clean:  ## Remove .venv, caches and builds
-	@rm -rf .venv .pytest_cache .ruff_cache .import_linter_cache build dist
+	@rm -rf .venv .pytest_cache .ruff_cache .import_linter_cache build dist site
 	@find src tests -type d -name __pycache__ -prune -exec rm -rf {} +
 
 .venv/.uv: constraints.txt
@@ -59,7 +64,7 @@ clean:  ## Remove .venv, caches and builds
 	@$(INSTALL)
 	@touch $@
 
-.venv/.dev .venv/.bench: .venv/.%: .venv/.core
+.venv/.dev .venv/.bench .venv/.docs: .venv/.%: .venv/.core
 	@echo "Installing what '$*' needs"
 	@$(INSTALL) --group $*
 	@touch $@

@@ -13,7 +13,7 @@ import pytest
 from rigidfleet.assess import assess
 from rigidfleet.errors import MissionError
 from rigidfleet.figures import figure_names
-from rigidfleet.mission import Mission, mission_names
+from rigidfleet.mission import Mission, mission_names, mission_text
 from rigidfleet.simulate import simulate
 
 ROOT = Path(__file__).parents[1]
@@ -93,6 +93,48 @@ def test_finite_horizons_need_an_arrival(ending):
         Mission.from_dict(data)
     data["phases"][0]["travel"] = 5.0
     Mission.from_dict(data)
+
+
+# -- first-flight.md, controller.md --------------------------------------------------------------------
+
+
+def test_first_flight(tmp_path, monkeypatch, capsys):
+    """The commands of the first flight do what the page says, up to the flight that hits the wall."""
+    from rigidfleet.cli import main
+
+    monkeypatch.chdir(tmp_path)
+    text = page("first-flight.md")
+    printed = mission_text("narrow-passage")
+    (before,) = re.findall(r"^max = .*$", text, re.MULTILINE)
+    (after,) = re.findall(r"to `(max = [^`]*)`", text)
+    assert printed.count(before) == 1
+    Path("mine.toml").write_text(printed.replace(before, after), encoding="utf-8")
+    commands = [line.split() for line in text.splitlines() if line.startswith("rigidfleet ")]
+    assert [command[1] for command in commands] == [
+        "report",
+        "missions",
+        "run",
+        "report",
+        "new",
+        "run",
+    ]
+    run, new = commands[2], commands[4]
+    assert main([*run[1:], "--no-figures"]) == 1
+    assert "west wall" in " ".join(capsys.readouterr().out.split())
+    assert Path(commands[3][3]).exists()
+    assert main(new[1:]) == 0
+    assert main([*commands[5][1:], "--no-figures"]) == 0
+
+
+def test_controller_page(capsys):
+    """The code of the page on controllers flies: it passes in calm air, and in wind misses by what the page says."""
+    names: dict[str, object] = {}
+    for code in blocks(page("controller.md"), "python"):
+        exec(compile(code, "controller.md", "exec"), names)
+    calm, windy = capsys.readouterr().out.split("Failed")
+    assert "Passed" in calm
+    (miss,) = re.findall(r"missed, (\S+) m off", windy)
+    assert float(miss) == pytest.approx(1 / 3, abs=0.05)
 
 
 # -- paper.md ----------------------------------------------------------------------------------------

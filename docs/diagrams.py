@@ -1,0 +1,398 @@
+"""The drawings of the documents: the paper's diagrams redrawn, and what its law does, computed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
+
+from rigidfleet import attitude, gains, physics
+from rigidfleet.figures.style import DASHES, FAINT, FLOWN, GREY, INK, PALETTE, TONES
+from rigidfleet.formation import complete_graph, kabsch, slots
+
+BLUE, ORANGE, GREEN, RED = PALETTE[:4]
+PALE = "#F4F7FA"
+
+
+def canvas(width: float, height: float, unit: float = 0.62) -> tuple[Figure, Axes]:
+    """Figure of a drawing whose axes count in units of `unit` inches."""
+    fig = Figure(figsize=(unit * width, unit * height))
+    ax = fig.add_axes((0, 0, 1, 1))
+    ax.set(xlim=(0, width), ylim=(0, height))
+    ax.set_aspect("equal")
+    ax.axis("off")
+    return fig, ax
+
+
+def box(
+    ax: Axes,
+    x: float,
+    y: float,
+    text: str,
+    *,
+    w: float = 3.0,
+    h: float = 1.3,
+    colour: str = TONES[1],
+) -> None:
+    """A block about (x, y)."""
+    ax.add_patch(
+        FancyBboxPatch(
+            (x - w / 2, y - h / 2), w, h, boxstyle="round,pad=0,rounding_size=0.14",
+            facecolor=PALE, edgecolor=colour, linewidth=1.3, zorder=2,
+        )
+    )  # fmt: skip
+    ax.text(x, y, text, ha="center", va="center", fontsize=9, zorder=3, linespacing=1.35)
+
+
+def arrow(
+    ax: Axes,
+    *points: tuple[float, float],
+    text: str = "",
+    at: float = 0.5,
+    above: float = 0.22,
+    colour: str = INK,
+) -> None:
+    """A signal along points, with its name beside the first stretch."""
+    for a, b in pairwise(points[:-1]):
+        ax.plot(
+            *zip(a, b, strict=True), color=colour, linewidth=1.1, zorder=1, solid_capstyle="round"
+        )
+    ax.add_patch(
+        FancyArrowPatch(
+            points[-2], points[-1], arrowstyle="-|>", mutation_scale=10, color=colour,
+            linewidth=1.1, shrinkA=0, shrinkB=0, zorder=1,
+        )
+    )  # fmt: skip
+    if text:
+        (x0, y0), (x1, y1) = points[0], points[1]
+        x, y = x0 + at * (x1 - x0), y0 + at * (y1 - y0)
+        level = abs(y1 - y0) < 1e-9
+        ax.text(
+            x + (0 if level else above), y + (above if level else 0), text, fontsize=8.5, color=colour,
+            ha="center" if level else "left", va="center",
+        )  # fmt: skip
+
+
+def sum_sign(ax: Axes, x: float, y: float) -> None:
+    """Where signals are added."""
+    ax.plot(x, y, "o", markersize=17, markerfacecolor="white", markeredgecolor=INK, zorder=2)
+    ax.text(x, y, "+", ha="center", va="center", fontsize=11, zorder=3)
+
+
+# -- the paper's diagrams ------------------------------------------------------------------------------
+
+
+def edge() -> Figure:
+    """Two agents and their edge (Fig. 1)."""
+    fig, ax = canvas(11, 4.2)
+    a, b = np.array([2.4, 1.2]), np.array([8.4, 2.6])
+    u = (a - b) / np.linalg.norm(a - b)
+    ax.plot(*zip(a, b, strict=True), color=FLOWN, linewidth=2.5, zorder=1)
+    for p, name, side, colour in ((a, "i", -1, BLUE), (b, "j", 1, ORANGE)):
+        ax.plot(*p, "o", markersize=24, color=colour, zorder=3)
+        ax.text(*p, f"${name}$", ha="center", va="center", color="white", fontsize=12, zorder=4)
+        arrow(ax, tuple(p), tuple(p + side * 2.0 * u), colour=RED)
+    ax.text(*(a - 2.1 * u + [0.0, 0.42]), r"$\lambda_k u_k$", color=RED, fontsize=10, ha="center")
+    ax.text(*(b + 2.1 * u + [0.1, 0.5]), r"$-\lambda_k u_k$", color=RED, fontsize=10, ha="center")
+    middle = (a + b) / 2
+    ax.text(*(middle + [0.1, -0.62]), r"$L_k=|r_i-r_j|$", fontsize=11, ha="left")
+    ax.text(0.4, 3.72, r"error $c_k=L_k-d_k$", fontsize=10.5)
+    ax.text(0.4, 3.22, r"unit vector $u_k=(r_i-r_j)/L_k$", fontsize=10.5)
+    ax.text(
+        10.6,
+        0.42,
+        r"too long: $\lambda_k<0$, the edge pulls, equally and oppositely",
+        fontsize=9,
+        ha="right",
+        color=GREY,
+    )
+    return fig
+
+
+def frame() -> Figure:
+    """Agents, their centre of mass and a frame that goes with them (Fig. 2)."""
+    fig, ax = canvas(11, 5.4)
+    origin = np.array([1.0, 0.7])
+    cm = np.array([6.3, 2.7])
+    for v, name in (((1.6, 0), "$x$"), ((0, 1.6), "$z$")):
+        arrow(ax, tuple(origin), tuple(origin + v))
+        ax.text(*(origin + 1.18 * np.array(v)), name, ha="center", va="center", fontsize=10)
+    ax.text(0.95, 0.3, "world (east, north, up)", fontsize=8.5, color=GREY)
+    arrow(ax, tuple(origin), tuple(cm), colour=GREY)
+    ax.text(3.3, 2.05, r"$r_{cm}$", fontsize=11, color=GREY)
+    angle = np.deg2rad(24.0)
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    for v, name in (((1.9, 0), "$x_b$"), ((0, 1.9), "$z_b$")):
+        tip = cm + turn @ v
+        arrow(ax, tuple(cm), tuple(tip), colour=RED)
+        ax.text(*(cm + 1.13 * (tip - cm)), name, ha="center", va="center", fontsize=10.5, color=RED)
+    places = cm + (turn @ np.array([[-2.7, -0.7], [3.0, -1.4], [-1.5, 2.0]]).T).T * 0.95
+    for k, p in enumerate(places):
+        q = places[(k + 1) % 3]
+        ax.plot([p[0], q[0]], [p[1], q[1]], color=FLOWN, linewidth=1.6, zorder=0)
+        ax.plot(*p, "o", markersize=21, color=PALETTE[k], zorder=3)
+        ax.text(*p, str(k + 1), ha="center", va="center", color="white", fontsize=10, zorder=4)
+    arrow(ax, tuple(cm), tuple(cm + 0.86 * (places[1] - cm)))
+    ax.text(
+        *(cm + 0.55 * (places[1] - cm) + [0.0, -0.42]), r"$\delta r_2$", fontsize=11, ha="center"
+    )
+    ax.plot(*cm, "o", markersize=6, color=INK, zorder=4)
+    return fig
+
+
+def constraint_architecture() -> Figure:
+    """Constraint forces alone (Fig. 4): control = "open"."""
+    fig, ax = canvas(16, 5.0)
+    box(ax, 2.0, 3.6, "desired distances\n" r"$d,\ \dot d,\ \ddot d$")
+    box(ax, 6.4, 3.6, "constraint force\n" r"$f_C=J^T\lambda$  (Eq. 12)", w=3.8, colour=RED)
+    box(ax, 2.0, 1.3, "weight balance\n" r"$f_{u,i}=m_i g$")
+    sum_sign(ax, 9.7, 3.6)
+    box(ax, 13.0, 3.6, "agents\n" r"$m_i\ddot r_i=f_{E,i}+f_{u,i}+f_{C,i}$", w=4.4)
+    arrow(ax, (3.5, 3.6), (4.5, 3.6))
+    arrow(ax, (8.3, 3.6), (9.4, 3.6), text="$f_C$")
+    arrow(ax, (10.0, 3.6), (10.8, 3.6))
+    arrow(ax, (3.5, 1.3), (9.7, 1.3), (9.7, 3.28), text="$f_u$", at=0.85)
+    arrow(ax, (13.0, 2.95), (13.0, 2.1), (6.4, 2.1), (6.4, 2.95), text="$r,\\ \\dot r$")
+    return fig
+
+
+def body_architecture() -> Figure:
+    """A wrench on the virtual body (Fig. 6 and 12): architecture = "body"."""
+    fig, ax = canvas(18.4, 6.6)
+    box(ax, 1.9, 5.1, "waypoint\n" r"$r_{wp},v_{wp},q_{wp},\omega_{wp}$", w=3.2)
+    box(ax, 6.0, 5.1, "LQR on the\nvirtual body", w=2.8, colour=BLUE)
+    box(ax, 9.9, 5.1, "allocation\n(Eq. 24 to 27)", w=2.8, colour=BLUE)
+    sum_sign(ax, 12.4, 5.1)
+    box(ax, 15.6, 5.1, "agents\n" r"$m_i\ddot r_i=f_{E,i}+f_{u,i}+f_{C,i}$", w=4.4)
+    box(ax, 9.9, 2.9, "constraint force\n" r"$f_C=J^T\lambda$", w=2.8, colour=RED)
+    box(ax, 6.0, 0.9, "virtual body\n" r"$r_{cm},v_{cm},q,\omega$", w=2.8)
+    box(ax, 6.0, 2.9, "desired distances", w=2.8)
+    arrow(ax, (3.5, 5.1), (4.6, 5.1))
+    arrow(ax, (7.4, 5.1), (8.5, 5.1), text=r"$F,\ \tau$")
+    arrow(ax, (11.3, 5.1), (12.1, 5.1), text="$f_u$")
+    arrow(ax, (12.7, 5.1), (13.4, 5.1))
+    arrow(ax, (7.4, 2.9), (8.5, 2.9), text="$d$")
+    arrow(ax, (11.3, 2.9), (12.4, 2.9), (12.4, 4.78), text="$f_C$")
+    arrow(ax, (15.6, 4.45), (15.6, 0.9), (7.4, 0.9), text=r"$r_i,\ \dot r_i$", at=0.55)
+    arrow(ax, (9.9, 0.9), (9.9, 2.25))
+    arrow(ax, (4.6, 0.9), (3.9, 0.9), (3.9, 4.3), (5.2, 4.3), (5.2, 4.45))
+    return fig
+
+
+def local_architecture() -> Figure:
+    """Each agent tracks its slot (section V of the paper): architecture = "local", the default."""
+    fig, ax = canvas(18.4, 5.8)
+    box(ax, 1.9, 4.4, "waypoint\nand formation", w=3.0)
+    box(
+        ax,
+        6.0,
+        4.4,
+        "virtual body's flight\n" r"$r_{cm}^*(t),\ T^*(t),\ p_i(t)$",
+        w=3.6,
+        colour=BLUE,
+    )
+    box(ax, 10.3, 4.4, "each agent tracks\n" r"$r_i^*=r_{cm}^*+T^{*T}p_i$", w=3.4, colour=BLUE)
+    sum_sign(ax, 13.0, 4.4)
+    box(ax, 16.1, 4.4, "agents\n" r"$m_i\ddot r_i=f_{E,i}+f_{u,i}+f_{C,i}$", w=4.2)
+    box(ax, 10.3, 2.0, "constraint force\n" r"$f_C=J^T\lambda$", w=3.4, colour=RED)
+    arrow(ax, (3.4, 4.4), (4.2, 4.4))
+    arrow(ax, (7.8, 4.4), (8.6, 4.4))
+    arrow(ax, (12.0, 4.4), (12.7, 4.4), text="$f_u$")
+    arrow(ax, (13.3, 4.4), (14.0, 4.4))
+    arrow(ax, (6.0, 3.75), (6.0, 2.0), (8.6, 2.0), text=r"$d_{ij}=|p_i-p_j|$", at=0.62)
+    arrow(ax, (12.0, 2.0), (13.0, 2.0), (13.0, 4.08), text="$f_C$")
+    arrow(
+        ax, (16.1, 3.75), (16.1, 0.7), (10.3, 0.7), (10.3, 1.35), text=r"$r_i,\ \dot r_i$", at=0.6
+    )
+    arrow(ax, (8.2, 0.7), (8.2, 3.2), (9.4, 3.2), (9.4, 3.75))
+    ax.plot([8.2, 10.3], [0.7, 0.7], color=INK, linewidth=1.1)
+    return fig
+
+
+# -- what the law does -----------------------------------------------------------------------------------
+
+
+def singular_line() -> Figure:
+    """Near a line, the same correction takes ever more force."""
+    fig = Figure(figsize=(9.0, 3.2), layout="constrained")
+    left, right = fig.subplots(1, 2, width_ratios=(1, 1.15))
+    left.set_aspect("equal")
+    left.axis("off")
+    for h, alpha in ((1.6, 0.25), (0.8, 0.5), (0.3, 1.0)):
+        x, y = (-4, 0, 4), (0, h, 0)
+        left.plot(x, y, color=FLOWN, linewidth=2, alpha=alpha, zorder=1)
+        left.plot(x, y, "o", color=BLUE, markersize=9, alpha=alpha, zorder=2)
+    left.annotate("", (0, -1.4), (0, 0.2), arrowprops={"arrowstyle": "-|>", "color": RED})
+    left.text(0.25, -1.0, "no edge points this way", color=RED, va="center")
+    left.text(0.25, 1.25, "$h$", fontsize=11)
+    left.set(xlim=(-4.6, 4.6), ylim=(-1.9, 2.3))
+    h = np.geomspace(1e-3, 2.0, 80)
+    edges, masses = complete_graph(3), np.ones(3)
+    for solver, colour, name in (
+        ("exact", RED, "the law as printed"),
+        ("iterated", BLUE, "iterated (default)"),
+    ):
+        size = []
+        for offset in h:
+            r = np.array([[-4.0, 0, 0], [0, offset, 0], [4.0, 0, 0]])
+            lengths = np.linalg.norm(r[edges[:, 0]] - r[edges[:, 1]], axis=1)
+            out = physics.constraint_force(
+                r, np.zeros((3, 3)), masses, edges, lengths, solver=solver, alpha=0, beta=0, gamma=0,
+                d_ddot=[0.0, 1.0, 0.0],
+            )  # fmt: skip
+            size.append(np.abs(out.multiplier).max())
+        right.loglog(h, size, color=colour, label=name, linewidth=2)
+    right.loglog(h, 8 / 3 / h**2, color=INK, linewidth=0.9, linestyle=DASHES, label=r"$8/(3h^2)$")
+    right.set(
+        xlabel="offset $h$ of the middle agent [m]",
+        ylabel=r"greatest tension $|\lambda|$ [N]",
+        ylim=(0.3, 3e6),
+    )
+    right.set_title(r"to lengthen edge 1-3 by 1 m/s$^2$")
+    right.legend(loc="upper right")
+    return fig
+
+
+def overshoot() -> Figure:
+    """An integral has to return to zero, so the error has to pass zero."""
+    fig = Figure(figsize=(9.0, 2.8), layout="constrained")
+    left, right = fig.subplots(1, 2)
+    t = np.linspace(0.0, 5.0, 400)
+    for ax, gamma, name in (
+        (left, 8.0, r"with an integral ($\gamma=8$)"),
+        (right, 0.0, r"without ($\gamma=0$)"),
+    ):
+        c, _, integral = gains.error_response(3.0, np.sqrt(12.0), gamma, 1.0, 0.0, 0.0, t)
+        ax.fill_between(t, c, 0, where=c > 0, color=BLUE, alpha=0.15, linewidth=0)
+        ax.fill_between(t, c, 0, where=c < 0, color=RED, alpha=0.25, linewidth=0)
+        ax.plot(t, c, color=BLUE, linewidth=2, label="error $c$")
+        ax.plot(t, integral, color=ORANGE, linewidth=1.6, label="its integral $I$")
+        ax.axhline(0, color=GREY, linewidth=0.7)
+        ax.set(xlabel="time [s]", title=name, ylim=(-0.35, 1.05))
+    left.annotate("overshoot 24.9 %", (1.5, -0.249), (2.4, -0.24), va="center", fontsize=8.5,
+                  arrowprops={"arrowstyle": "-", "color": GREY})  # fmt: skip
+    left.legend(loc="upper right")
+    right.text(4.95, 0.4, "$I$ never returns, nor need it", ha="right", fontsize=8.5, color=GREY)
+    return fig
+
+
+def solvers() -> Figure:
+    """How strongly each solve answers along an eigenvector of A."""
+    fig = Figure(figsize=(9.0, 3.0), layout="constrained")
+    ax = fig.subplots()
+    w = np.geomspace(1e-4, 10.0, 500)
+    mu, s0 = 0.03, 0.1
+    nu = np.where(w < s0, s0 / 4 * (1 - w / s0) ** 2, 0.0)
+    ax.loglog(w, 1 / w, color=RED, linewidth=1.6, label="exact: $1/w$")
+    ax.loglog(
+        w,
+        (1 - (mu / (w + mu)) ** 3) / w,
+        color=BLUE,
+        linewidth=2.2,
+        label=r"iterated: $\leq k/\mu$ = 100",
+    )
+    ax.loglog(
+        w, 1 / (w + nu), color=GREEN, linewidth=2.2, label="spectral: exact from $s_0$ = 0.1 on"
+    )
+    marks = ((1.5, "triangle"), (0.259, "cube"), (0.05, "cuboid"), (8e-4, "line, 8 cm off"))
+    for at, name in marks:
+        ax.axvline(at, color=FAINT, linewidth=0.9, linestyle=":")
+        ax.text(at, 1.5e4, f"{name} ", rotation=90, fontsize=8, color=GREY, va="top", ha="right")
+    ax.set(
+        xlabel=r"eigenvalue $w$ of $\bar m A$", ylabel=r"gain $\varphi(w)/\bar m$", ylim=(0.08, 2e4)
+    )
+    ax.legend(loc="lower left")
+    return fig
+
+
+def blend() -> Figure:
+    """The septic from 0 to 1 and its derivatives, and a triangle on its way to a line."""
+    fig = Figure(figsize=(9.0, 3.0), layout="constrained")
+    left, right = fig.subplots(1, 2)
+    tau = np.linspace(0, 1, 300)
+    s = np.polynomial.Polynomial([0, 0, 0, 0, 35, -84, 70, -20])
+    for k, (name, colour) in enumerate(
+        (("$s$", BLUE), (r"$\dot s\,T_b$", ORANGE), (r"$\ddot s\,T_b^2$", GREEN))
+    ):
+        left.plot(tau, s.deriv(k)(tau) if k else s(tau), color=colour, linewidth=1.8, label=name)
+    left.set(xlabel=r"$\tau$", title="the blend is smooth at both ends")
+    left.legend(loc="upper right")
+    before, after = slots("triangle", 4.0, 3), slots("line", 4.0, 3)
+    for share in (0.0, 0.25, 0.5, 0.75, 1.0):
+        p = _on_the_way(before, after, share)
+        ring = np.vstack([p, p[:1]])
+        right.plot(ring[:, 0], ring[:, 1], color=TONES[2], linewidth=0.8 + share, zorder=1)
+        for i, colour in enumerate(PALETTE[:3]):
+            right.plot(p[i, 0], p[i, 1], "o", color=colour, markersize=4 + 5 * share, zorder=2)
+    right.set_aspect("equal", adjustable="datalim")
+    right.set(
+        xlabel="$x_b$ [m]", ylabel="$y_b$ [m]", title="slots, small at the start, large at the end"
+    )
+    return fig
+
+
+def _on_the_way(before: np.ndarray, after: np.ndarray, share: float) -> np.ndarray:
+    """Slots (N, 3) [m] at a share of the way: straight in a frame that turns (theory.md, section 4)."""
+    R = kabsch(before, after)
+    turn = attitude.dcm_from_rotation_vector(share * attitude.rotation_vector_from_dcm(R))
+    return (before + share * (after @ R.T - before)) @ turn
+
+
+def no_inverse() -> Figure:
+    """Forces m x push no one anywhere: H cannot tell them, so H^T H has no inverse."""
+    fig = Figure(figsize=(9.0, 3.1), layout="constrained")
+    axes = fig.subplots(1, 3)
+    x = slots("triangle", 4.0, 3)[:, :2]
+    asked = np.tile([0.0, 1.3], (3, 1))
+    radial = 0.55 * x
+    titles = ("lift", "and forces along $\\delta r_i$ ...", "... are the same wrench")
+    for ax, f, title in zip(axes, (asked, radial, asked + radial), titles, strict=True):
+        ring = np.vstack([x, x[:1]])
+        ax.plot(*ring.T, color=FLOWN, linewidth=1.4, zorder=1)
+        for p, v, colour in zip(x, f, PALETTE[:3], strict=True):
+            ax.plot(*p, "o", color=colour, markersize=9, zorder=3)
+            ax.annotate(
+                "", p + v, p, arrowprops={"arrowstyle": "-|>", "color": INK, "linewidth": 1.5}
+            )
+        ax.plot(0, 0, "+", color=GREY, markersize=9)
+        ax.set_title(title)
+        ax.set_aspect("equal")
+        ax.set(xlim=(-3.2, 4.2), ylim=(-4.0, 4.9))
+        ax.axis("off")
+    words = ("$F$ = 3.9 N up, $\\tau$ = 0", "$F$ = 0, $\\tau$ = 0", "$F$ = 3.9 N up, $\\tau$ = 0")
+    for ax, text in zip(axes, words, strict=True):
+        ax.text(0.5, -3.9, text, ha="center", fontsize=9, color=GREY)
+    return fig
+
+
+def realisations() -> Figure:
+    """Shapes that distances cannot tell apart."""
+    fig = Figure(figsize=(9.0, 2.7), layout="constrained")
+    axes = fig.subplots(1, 3)
+    kite = np.array([[0, 0], [3, -1.5], [3, 1.5], [5, 0]], dtype=float)
+    folded = kite.copy()
+    folded[3] = [1, 0]
+    mirrored = kite * [1, -1]
+    edges = ((0, 1), (0, 2), (1, 2), (1, 3), (2, 3))
+    names = ("what was meant", "folded: the same five lengths", "other side up: all six the same")
+    for ax, p, name in zip(axes, (kite, folded, mirrored), names, strict=True):
+        for i, j in edges:
+            ax.plot(*zip(p[i], p[j], strict=True), color=FLOWN, linewidth=1.6, zorder=1)
+        for k, q in enumerate(p):
+            ax.plot(*q, "o", color=PALETTE[k], markersize=14, zorder=2)
+            ax.text(*q, str(k + 1), ha="center", va="center", color="white", fontsize=8.5, zorder=3)
+        ax.set_title(name)
+        ax.set_aspect("equal")
+        ax.set(xlim=(-0.8, 5.8), ylim=(-2.2, 2.2))
+        ax.axis("off")
+    return fig
+
+
+DIAGRAMS: Sequence[Callable[[], Figure]] = (
+    edge, frame, constraint_architecture, body_architecture, local_architecture, singular_line,
+    overshoot, solvers, blend, no_inverse, realisations,
+)  # fmt: skip
