@@ -81,12 +81,11 @@ def constraint_force(
         float(alpha), float(beta), float(gamma), _SOLVERS[solver], float(damping), int(iterations),
         float(threshold), float(cutoff), 0.0,
     )  # fmt: skip
-    constraint.edge_geometry(r, graph.edges, w.u, w.L)
+    a = np.ascontiguousarray(f / m[:, None])
+    constraint.right_side(r, v, _full(integral, (e,), "integral"), a, graph.edges, law, w)
     if e and not w.L.min() > 0.0:
         i, j = graph.edges[w.L.argmin()]
         raise ValueError(f"agents {i} and {j} coincide: their edge has no direction")
-    a = np.ascontiguousarray(f / m[:, None])
-    constraint.right_side(v, _full(integral, (e,), "integral"), a, graph.edges, law, w)
     constraint.solve_multipliers(_vehicles(m), graph, law, w)
     f_C = np.zeros((n, 3))
     constraint.apply_multipliers(w.u, graph.edges, w.multiplier, f_C)

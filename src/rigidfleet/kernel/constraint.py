@@ -17,36 +17,29 @@ from rigidfleet.kernel.linalg import cholesky, cholesky_solve, jacobi_eigen
 from rigidfleet.kernel.program import EXACT, ITERATED, PINV, SPECTRAL
 
 
-@compiled
-def edge_geometry(r, edges, u, L):
-    """Unit vectors u (m, 3) and lengths L (m,) [m] of the edges at positions r (N, 3) (Eq. 3)."""
-    for k in range(edges.shape[0]):
-        i, j = edges[k, 0], edges[k, 1]
-        x, y, z = r[i, 0] - r[j, 0], r[i, 1] - r[j, 1], r[i, 2] - r[j, 2]
-        L[k] = math.sqrt(x * x + y * y + z * z)
-        inverse = 1.0 / L[k]
-        u[k, 0], u[k, 1], u[k, 2] = x * inverse, y * inverse, z * inverse
-
-
 @inlined
-def right_side(v, integral, a, edges, law, w):
-    """The bracket of Eq. 12 into w.b (m,) [m/s^2], the constraints (Eq. 3) into w.c.
+def right_side(r, v, integral, a, edges, law, w):
+    """Edges at positions r and velocities v (N, 3), and the bracket of Eq. 12.
 
-    Jdot v of an edge is (|dv|^2 - (u . dv)^2) / L; ``a`` (N, 3) [m/s^2] is M^-1 f_E, the acceleration
-    by every force but f_C.
+    Fills w.u (m, 3) with unit vectors and w.L (m,) [m] with lengths (Eq. 3), w.c with the
+    constraints and w.b [m/s^2] with the right side. Jdot v of an edge is
+    (|dv|^2 - (u . dv)^2) / L; ``a`` (N, 3) [m/s^2] is M^-1 f_E, the acceleration by every force
+    but f_C.
     """
     for k in range(edges.shape[0]):
         i, j = edges[k, 0], edges[k, 1]
-        speed2 = along = pull = 0.0
-        for q in range(3):
-            dv = v[i, q] - v[j, q]
-            speed2 += dv * dv
-            along += w.u[k, q] * dv
-            pull += w.u[k, q] * (a[i, q] - a[j, q])
-        w.c[k] = w.L[k] - w.d[k]
+        x, y, z = r[i, 0] - r[j, 0], r[i, 1] - r[j, 1], r[i, 2] - r[j, 2]
+        X, Y, Z = v[i, 0] - v[j, 0], v[i, 1] - v[j, 1], v[i, 2] - v[j, 2]
+        L = math.sqrt(x * x + y * y + z * z)
+        inverse = 1.0 / L
+        x, y, z = x * inverse, y * inverse, z * inverse
+        along = x * X + y * Y + z * Z
+        pull = x * (a[i, 0] - a[j, 0]) + y * (a[i, 1] - a[j, 1]) + z * (a[i, 2] - a[j, 2])
+        w.L[k], w.c[k] = L, L - w.d[k]
+        w.u[k, 0], w.u[k, 1], w.u[k, 2] = x, y, z
         w.b[k] = (
             w.d_ddot[k]
-            - (speed2 - along * along) / w.L[k]
+            - (X * X + Y * Y + Z * Z - along * along) * inverse
             - pull
             - 2.0 * law.alpha * (along - w.d_dot[k])
             - law.beta * law.beta * w.c[k]
@@ -55,15 +48,16 @@ def right_side(v, integral, a, edges, law, w):
 
 
 @compiled
-def assemble(u, m, graph, scale, shift, A):
+def assemble(u, graph, scale, shift, A):
     """Lower triangle of A = scale J M^-1 J^T + shift 1 (m, m)."""
-    edges, pairs, weight = graph.edges, graph.pairs, graph.weight
-    n = edges.shape[0]
+    pairs, weight = graph.pairs, graph.weight
+    n = A.shape[0]
+    all_meet = 2 * pairs.shape[0] == n * (n - 1)
     for k in range(n):
-        for l in range(k):
-            A[k, l] = 0.0
-        m_i, m_j = m[edges[k, 0]], m[edges[k, 1]]
-        A[k, k] = scale * (m_i + m_j) / (m_i * m_j) + shift
+        if not all_meet:
+            for l in range(k):
+                A[k, l] = 0.0
+        A[k, k] = scale * graph.diagonal[k] + shift
     for p in range(pairs.shape[0]):
         k, l = pairs[p, 0], pairs[p, 1]
         dot = u[k, 0] * u[l, 0] + u[k, 1] * u[l, 1] + u[k, 2] * u[l, 2]
@@ -92,7 +86,7 @@ def solve_multipliers(vehicles, graph, law, w):
     trials = 2 if law.solver == SPECTRAL else 0 if law.solver == PINV else 1
     definite = False
     for trial in range(trials, 0, -1):
-        assemble(w.u, m, graph, mbar, mu if trial == 1 else -law.s0, w.A)
+        assemble(w.u, graph, mbar, mu if trial == 1 else -law.s0, w.A)
         definite = cholesky(w.A)
         if not definite:
             break
@@ -106,7 +100,7 @@ def solve_multipliers(vehicles, graph, law, w):
         for k in range(n):
             y[k] = math.nan
         return
-    assemble(w.u, m, graph, mbar, 0.0, w.A)
+    assemble(w.u, graph, mbar, 0.0, w.A)
     largest = jacobi_eigen(w.A, w.V, w.w)
     for k in range(n):
         y[k] = 0.0

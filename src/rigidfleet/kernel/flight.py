@@ -24,12 +24,12 @@ from rigidfleet.kernel.body import (
 from rigidfleet.kernel.compiled import compiled, inlined
 from rigidfleet.kernel.constraint import (
     apply_multipliers,
-    edge_geometry,
     right_side,
     solve_multipliers,
 )
 from rigidfleet.kernel.control import body_law, desired_agents, local_law, reference_motion
-from rigidfleet.kernel.program import BODY, LOCAL, OPEN, SLOTS, Array, Program, Workspace
+from rigidfleet.kernel.lanes import blocks, padded, spread, total_or_worst
+from rigidfleet.kernel.program import BODY, LOCAL, OPEN, SLOTS, Array, Program, Workspace, zeros
 from rigidfleet.kernel.references import blend_slots, distance_references
 
 # What `integrate` returns.
@@ -103,7 +103,6 @@ def closed_loop(t, y, dy, p, w):
         damp_deformation(r, v, m, p.law.k_def, w.cm, w.f_u)
 
     if n_edges > 0:
-        edge_geometry(r, graph.edges, w.u, w.L)
         distance_references(
             t, p.reference, graph.edges, w.p, w.p_dot, w.p_ddot, w.d, w.d_dot, w.d_ddot
         )
@@ -111,7 +110,7 @@ def closed_loop(t, y, dy, p, w):
             inverse = 1.0 / m[i]
             for s in range(3):
                 w.a[i, s] = inverse * (w.f_E[i, s] + w.f_u[i, s])
-        right_side(v, y[6 * n : q], w.a, graph.edges, p.law, w)
+        right_side(r, v, y[6 * n : q], w.a, graph.edges, p.law, w)
         solve_multipliers(vehicles, graph, p.law, w)
         apply_multipliers(w.u, graph.edges, w.multiplier, w.f_C)
         for k in range(n_edges):
@@ -201,23 +200,31 @@ _D = np.array(
 )  # fmt: skip
 
 
+# Rows of `Integrator.K` after the seven stages.
+_STATE, _TRIAL, _ATOL = 7, 8, 9
+
+
 class Integrator(NamedTuple):
     """State of an integration, so that it can pause and go on."""
 
     y: Array  # (n,) state at `clock[0]`
-    trial: Array  # (n,)
-    K: Array  # (7, n) stages; K[0] is the derivative at y
+    K: Array  # (10, n padded to eights) stages, K[0] the derivative at y; y, trial, tolerance
     clock: Array  # (3,) t [s], next step h [s], last error
     count: NDArray[np.int64]  # (4,) evaluations, accepted, rejected, samples written
-    atol: Array  # (n,) absolute tolerance of each state
     rtol: float
 
 
 def integrator(y: Array, t: float, *, rtol: float, atol: Array, step: float = 1e-3) -> Integrator:
-    """Start an integration from state ``y`` (n,) at time t [s] with a first step [s] to try."""
+    """Start an integration from state ``y`` (n,) at time t [s] with a first step [s] to try.
+
+    ``atol`` (n,) is the absolute tolerance of each state, ``rtol`` the relative one of all.
+    """
     n = len(y)
+    K = zeros(10, padded(n))
+    K[_ATOL] = 1.0
+    K[_ATOL, :n] = atol
     clock, count = np.array([t, step, 1e-4]), np.zeros(4, dtype=np.int64)
-    return Integrator(y.copy(), np.empty(n), np.empty((7, n)), clock, count, atol, rtol)
+    return Integrator(y.copy(), K, clock, count, rtol)
 
 
 @compiled
@@ -236,8 +243,12 @@ def integrate(p, w, state, t_end, fresh, times, samples, max_steps):
     Returns FINISHED, PAUSED, or COLLAPSED where the step size fell to nothing (singular
     constraints, non-finite forces); y and t are then those of the last step that was good.
     """
-    y, trial, K, clock, count = state.y, state.trial, state.K, state.clock, state.count
-    n = y.shape[0]
+    K, clock, count = state.K, state.clock, state.count
+    n = state.y.shape[0]
+    y, trial = K[_STATE], K[_TRIAL]
+    for q in range(n):
+        y[q] = state.y[q]
+    k = blocks(K)
     t, h, last = clock[0], clock[1], clock[2]
     first = 0 if fresh else 1
     status = PAUSED
@@ -246,28 +257,36 @@ def integrate(p, w, state, t_end, fresh, times, samples, max_steps):
         stage = first
         # One call site of the right-hand side: stage 0 is the derivative at y itself.
         while stage < 7:
-            for q in range(n):
-                trial[q] = y[q]
-            for s in range(stage):
-                a = h * _A[stage, s]
-                if a != 0.0:
-                    for q in range(n):
-                        trial[q] += a * K[s, q]
+            # All six terms at once: stages still to come have no weight, and finite values.
+            a0, a1, a2 = h * _A[stage, 0], h * _A[stage, 1], h * _A[stage, 2]
+            a3, a4, a5 = h * _A[stage, 3], h * _A[stage, 4], h * _A[stage, 5]
+            for q in range(k.shape[1]):
+                k[_TRIAL, q] = ((a0 * k[0, q] + a1 * k[1, q]) + (a2 * k[2, q] + a3 * k[3, q])) + (
+                    k[_STATE, q] + (a4 * k[4, q] + a5 * k[5, q])
+                )
             closed_loop(t + _C[stage] * h, trial, K[stage], p, w)
             count[0] += 1
             stage += 1
-        error = 0.0
-        for q in range(n):
-            e = 0.0
-            for s in range(7):
-                e += _E[s] * K[s, q]
-            e *= h / (state.atol[q] + state.rtol * max(abs(y[q]), abs(trial[q])))
-            error += e * e
-        error = math.sqrt(error / n)
+        squares = spread(0.0)
+        for q in range(k.shape[1]):
+            e = h * (
+                (_E[0] * k[0, q] + _E[2] * k[2, q] + _E[3] * k[3, q])
+                + (_E[4] * k[4, q] + _E[5] * k[5, q] + _E[6] * k[6, q])
+            )
+            size = max(abs(k[_STATE, q]), abs(k[_TRIAL, q]))
+            e = e / (k[_ATOL, q] + state.rtol * size)
+            squares += e * e
+        error = math.sqrt(total_or_worst(squares, y) / n)
         if not error <= 1.0:  # NaN too
             count[2] += 1
             first = 1
-            shrink = 0.9 * error**-0.2 if error < math.inf else 0.1
+            shrink = 0.1
+            if error < math.inf:
+                shrink = 0.9 * error**-0.2
+            else:
+                for q in range(k.shape[1]):
+                    for s in range(1, 7):
+                        k[s, q] = spread(0.0)
             h *= max(0.1, shrink)
             if h < 1e-12 * max(1.0, abs(t)):
                 status = COLLAPSED
@@ -276,8 +295,8 @@ def integrate(p, w, state, t_end, fresh, times, samples, max_steps):
         t_new = t + h if t + h < t_end else t_end
         if count[3] < times.shape[0] and times[count[3]] <= t_new:
             for q in range(n):  # into K[1], which has no weight in the sums
-                d = 0.0
-                for s in range(7):
+                d = _D[0] * K[0, q]
+                for s in range(1, 7):
                     d += _D[s] * K[s, q]
                 K[1, q] = h * d
         while count[3] < times.shape[0] and times[count[3]] <= t_new:
@@ -289,9 +308,9 @@ def integrate(p, w, state, t_end, fresh, times, samples, max_steps):
                 inner = bend + x * (rest + (1.0 - x) * K[1, q])
                 samples[count[3], q] = y[q] + x * (rise + (1.0 - x) * inner)
             count[3] += 1
-        for q in range(n):
-            y[q] = trial[q]
-            K[0, q] = K[6, q]
+        for q in range(k.shape[1]):
+            k[_STATE, q] = k[_TRIAL, q]
+            k[0, q] = k[6, q]
         t = t_new
         first = 1
         count[1] += 1
@@ -301,6 +320,8 @@ def integrate(p, w, state, t_end, fresh, times, samples, max_steps):
         if t >= t_end:
             status = FINISHED
             break
+    for q in range(n):
+        state.y[q] = y[q]
     clock[0], clock[1], clock[2] = t, h, last
     return status
 
