@@ -196,7 +196,7 @@ def _schedule(
 
 
 def _vehicles(m: Array) -> k.Vehicles:
-    return k.Vehicles(m, float(m.sum()), np.full(len(m), np.inf), False, 0.0)
+    return k.Vehicles(m, 1.0 / m, float(m.sum()), np.full(len(m), np.inf), False, 0.0)
 
 
 def _masses_and_points(masses: ArrayLike, points: ArrayLike) -> tuple[Array, Array]:

@@ -88,7 +88,7 @@ def plan_phase(mission: Mission, phase: Phase, now: Situation, t_end: float) -> 
         body_formulation=mission.formulation == "body",
         has_frame=frame is not None,
         vehicles=k.Vehicles(
-            masses, float(masses.sum()), np.array(mission.agents.thrust_limit),
+            masses, 1.0 / masses, float(masses.sum()), np.array(mission.agents.thrust_limit),
             mission.agents.saturate, mission.gravity,
         ),
         graph=k.graph(edges, masses),

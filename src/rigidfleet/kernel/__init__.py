@@ -46,6 +46,7 @@ _CACHE = cache_directory()
 _before = numba.config.CACHE_DIR
 numba.config.CACHE_DIR = str(_CACHE)
 try:
+    from rigidfleet.kernel import ensemble as ensemble
     from rigidfleet.kernel import flight as flight
 finally:
     numba.config.CACHE_DIR = _before

@@ -3,6 +3,7 @@
 import math
 
 from rigidfleet.kernel.compiled import compiled, inlined
+from rigidfleet.kernel.lanes import where_positive
 from rigidfleet.kernel.linalg import jacobi_eigen
 from rigidfleet.kernel.program import PINV_EQUAL, PINV_INERTIA_FORCE, RIGID
 
@@ -48,20 +49,17 @@ def inertia_inverse(I, out):
     A, B, C = d * f - e * e, c * e - b * f, b * e - c * d
     det = a * A + b * B + c * C
     half = 0.5 * (a + d + f)
-    if det > 1e-9 * half**3:
-        q = 1.0 / det
-        out[0, 0], out[0, 1], out[0, 2] = A * q, B * q, C * q
-        out[1, 1], out[1, 2], out[2, 2] = (
-            (a * f - c * c) * q,
-            (b * c - a * e) * q,
-            (a * d - b * b) * q,
-        )
-        out[1, 0], out[2, 0], out[2, 1] = out[0, 1], out[0, 2], out[1, 2]
-    else:
-        q = 1.0 / (half * half) if half > 0.0 else 0.0
+    spatial = det - 1e-9 * half * half * half
+    q = 1.0 / det
+    out[0, 0], out[0, 1], out[0, 2] = A * q, B * q, C * q
+    out[1, 1], out[1, 2] = (a * f - c * c) * q, (b * c - a * e) * q
+    out[2, 2] = (a * d - b * b) * q
+    if not spatial > 0.0:
+        q = where_positive(half, 1.0 / (half * half), 0.0)
         for i in range(3):
-            for j in range(3):
-                out[i, j] = q * I[i, j]
+            for j in range(i, 3):
+                out[i, j] = where_positive(spatial, out[i, j], q * I[i, j])
+    out[1, 0], out[2, 0], out[2, 1] = out[0, 1], out[0, 2], out[1, 2]
 
 
 @compiled
@@ -142,7 +140,7 @@ def rotation_vector(R, phi):
     """Log of a rotation matrix R = Exp(phi) into phi (3,) [rad], |phi| <= pi."""
     # By the quaternion's largest component, which is well conditioned at every angle.
     trace = R[0, 0] + R[1, 1] + R[2, 2]
-    if trace >= max(R[0, 0], R[1, 1], R[2, 2]):
+    if trace >= R[0, 0] and trace >= R[1, 1] and trace >= R[2, 2]:
         w = 1.0 + trace
         x, y, z = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
     elif R[0, 0] >= R[1, 1] and R[0, 0] >= R[2, 2]:

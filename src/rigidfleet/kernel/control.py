@@ -4,6 +4,26 @@ import math
 
 from rigidfleet.kernel.body import allocate, multiply, multiply_transposed, rotation_vector
 from rigidfleet.kernel.compiled import compiled, inlined
+from rigidfleet.kernel.lanes import where_positive
+
+
+@compiled
+def _series(xx, s):
+    a = 0.5 - xx * (1 / 24 - xx * (1 / 720 - xx / 40320))
+    b = 1 / 6 - xx * (1 / 120 - xx * (1 / 5040 - xx / 362880))
+    a_dot = -s * (1 / 12 - xx * (1 / 180 - xx * (1 / 6720 - xx / 453600)))
+    b_dot = -s * (1 / 60 - xx * (1 / 1260 - xx * (1 / 60480 - xx / 4989600)))
+    return a, b, a_dot, b_dot
+
+
+@compiled
+def _closed(xx, s):
+    x = math.sqrt(xx)
+    sin, cos = math.sin(x), math.cos(x)
+    a, b = (1.0 - cos) / xx, (x - sin) / (xx * x)
+    a_dot = s * (x * sin - 2.0 + 2.0 * cos) / (xx * xx)
+    b_dot = s * (3.0 * sin - 2.0 * x - x * cos) / (xx * xx * x)
+    return a, b, a_dot, b_dot
 
 
 @compiled
@@ -13,19 +33,14 @@ def body_rates(phi, phi_dot, phi_ddot, omega, omega_dot):
     J_r = 1 - a [phi x] + b [phi x]^2, a = (1 - cos x)/x^2, b = (x - sin x)/x^3, x = |phi|; the
     rates of a and b enter through a'/x and b'/x, all by their series where x is small.
     """
-    xx = phi[0] ** 2 + phi[1] ** 2 + phi[2] ** 2
+    xx = phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]
     s = phi[0] * phi_dot[0] + phi[1] * phi_dot[1] + phi[2] * phi_dot[2]  # x dx/dt
-    if xx < 0.04:
-        a = 0.5 - xx * (1 / 24 - xx * (1 / 720 - xx / 40320))
-        b = 1 / 6 - xx * (1 / 120 - xx * (1 / 5040 - xx / 362880))
-        a_dot = -s * (1 / 12 - xx * (1 / 180 - xx * (1 / 6720 - xx / 453600)))
-        b_dot = -s * (1 / 60 - xx * (1 / 1260 - xx * (1 / 60480 - xx / 4989600)))
-    else:
-        x = math.sqrt(xx)
-        sin, cos = math.sin(x), math.cos(x)
-        a, b = (1.0 - cos) / xx, (x - sin) / (xx * x)
-        a_dot = s * (x * sin - 2.0 + 2.0 * cos) / (xx * xx)
-        b_dot = s * (3.0 * sin - 2.0 * x - x * cos) / (xx * xx * x)
+    small = 0.04 - xx
+    a, b, a_dot, b_dot = _series(xx, s)
+    if not small > 0.0:
+        c = _closed(max(xx, 0.04), s)
+        a, b = where_positive(small, a, c[0]), where_positive(small, b, c[1])
+        a_dot, b_dot = where_positive(small, a_dot, c[2]), where_positive(small, b_dot, c[3])
     for q in range(3):
         i, j = (q + 1) % 3, (q + 2) % 3
         pv_i = phi[j] * phi_dot[q] - phi[q] * phi_dot[j]  # components of phi x phi_dot
@@ -44,10 +59,10 @@ def body_rates(phi, phi_dot, phi_ddot, omega, omega_dot):
 @compiled
 def exp_transposed(phi, E):
     """E (3, 3) = Exp(phi)^T."""
-    xx = phi[0] ** 2 + phi[1] ** 2 + phi[2] ** 2
-    x = math.sqrt(xx)
-    a = math.sin(x) / x if x > 1e-8 else 1.0
-    half = math.sin(0.5 * x) / (0.5 * x) if x > 1e-8 else 1.0
+    xx = phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]
+    x = max(math.sqrt(xx), 1e-8)
+    a = math.sin(x) / x
+    half = math.sin(0.5 * x) / (0.5 * x)
     b = 0.5 * half * half
     for i in range(3):
         for j in range(3):

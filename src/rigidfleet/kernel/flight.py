@@ -107,9 +107,8 @@ def closed_loop(t, y, dy, p, w):
             t, p.reference, graph.edges, w.p, w.p_dot, w.p_ddot, w.d, w.d_dot, w.d_ddot
         )
         for i in range(n):
-            inverse = 1.0 / m[i]
             for s in range(3):
-                w.a[i, s] = inverse * (w.f_E[i, s] + w.f_u[i, s])
+                w.a[i, s] = vehicles.inverse[i] * (w.f_E[i, s] + w.f_u[i, s])
         right_side(r, v, y[6 * n : q], w.a, graph.edges, p.law, w)
         solve_multipliers(vehicles, graph, p.law, w)
         apply_multipliers(w.u, graph.edges, w.multiplier, w.f_C)
@@ -117,14 +116,16 @@ def closed_loop(t, y, dy, p, w):
             dy[6 * n + k] = w.c[k]
 
     for i in range(n):
-        share, inverse = 1.0, 1.0 / m[i]
+        share = 1.0
         if vehicles.saturate:
             thrust = 0.0
             for s in range(3):
-                thrust += (w.f_u[i, s] + w.f_C[i, s]) ** 2
+                force = w.f_u[i, s] + w.f_C[i, s]
+                thrust += force * force
             share = min(1.0, vehicles.thrust_limit[i] / max(math.sqrt(thrust), 1e-300))
         for s in range(3):
-            w.a[i, s] = inverse * (w.f_E[i, s] + share * (w.f_u[i, s] + w.f_C[i, s]))
+            net = w.f_E[i, s] + share * (w.f_u[i, s] + w.f_C[i, s])
+            w.a[i, s] = vehicles.inverse[i] * net
             dy[3 * i + s], dy[3 * n + 3 * i + s] = v[i, s], w.a[i, s]
     if p.body_formulation:
         body_derivatives(y, dy, p, w)
@@ -228,6 +229,14 @@ def integrator(y: Array, t: float, *, rtol: float, atol: Array, step: float = 1e
 
 
 @compiled
+def forget_stages(k):
+    """Make all stages zero that are still to come: no weight makes a number of NaN."""
+    for s in range(1, 7):
+        for q in range(k.shape[1]):
+            k[s, q] = spread(0.0)
+
+
+@compiled
 def integrate(p, w, state, t_end, fresh, times, samples, max_steps):
     """Integrate `closed_loop` to ``t_end`` [s]; adaptive Dormand-Prince 5(4), PI step control.
 
@@ -250,6 +259,8 @@ def integrate(p, w, state, t_end, fresh, times, samples, max_steps):
         y[q] = state.y[q]
     k = blocks(K)
     t, h, last = clock[0], clock[1], clock[2]
+    if fresh:
+        forget_stages(k)
     first = 0 if fresh else 1
     status = PAUSED
     for _ in range(max_steps):
@@ -284,9 +295,7 @@ def integrate(p, w, state, t_end, fresh, times, samples, max_steps):
             if error < math.inf:
                 shrink = 0.9 * error**-0.2
             else:
-                for q in range(k.shape[1]):
-                    for s in range(1, 7):
-                        k[s, q] = spread(0.0)
+                forget_stages(k)
             h *= max(0.1, shrink)
             if h < 1e-12 * max(1.0, abs(t)):
                 status = COLLAPSED

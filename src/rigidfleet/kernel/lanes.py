@@ -15,11 +15,14 @@ import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
+from numba.core.imputils import impl_ret_borrowed
+from numba.core.typeconv import Conversion
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numba.extending import (
     NativeValue,
     intrinsic,
     lower_builtin,
+    lower_cast,
     models,
     overload,
     register_model,
@@ -39,6 +42,16 @@ _INDEX = ir.IntType(32)
 class _Lanes(types.Type):
     def __init__(self) -> None:
         super().__init__(name="lanes")
+
+    def can_convert_from(self, _context: Any, other: types.Type) -> Conversion | None:
+        return Conversion.safe if _is_number(other) else None
+
+    def unify(self, _context: Any, other: types.Type) -> types.Type | None:
+        return self if _is_number(other) else None
+
+
+def _is_number(kind: types.Type) -> bool:
+    return isinstance(kind, types.Float | types.Integer)
 
 
 lanes = _Lanes()
@@ -65,7 +78,7 @@ def pack(values: NDArray[np.float64]) -> LaneArray:
     return flat.view(kind).reshape(values.shape[:-1]).view(LaneArray)
 
 
-def unpack(array: LaneArray) -> NDArray[np.float64]:
+def unpack(array: NDArray[Any]) -> NDArray[np.float64]:
     """View an array (...) of lanes as float64 (..., 8)."""
     plain = array.view(np.ndarray)
     return plain.reshape(plain.shape + (1,)).view(np.float64)
@@ -93,6 +106,12 @@ def _spread(builder: ir.IRBuilder, number: ir.Value) -> ir.Value:
     one = builder.insert_element(start, number, ir.Constant(_INDEX, 0))
     every = ir.Constant(ir.VectorType(_INDEX, WIDTH), [0] * WIDTH)
     return builder.shuffle_vector(one, start, every)
+
+
+@lower_cast(types.Float, _Lanes)
+@lower_cast(types.Integer, _Lanes)
+def _cast(context: Any, builder: Any, kind: Any, _to: Any, value: Any) -> ir.Value:
+    return _spread(builder, context.cast(builder, value, kind, types.float64))
 
 
 def _operands(context: Any, builder: Any, sig: Any, arguments: Any) -> list[ir.Value]:
@@ -149,6 +168,22 @@ def _each(name: str) -> Any:
     return generate
 
 
+def _library(name: str) -> Any:
+    """Return what calls a function of the C library on one lane after the other."""
+
+    def generate(builder: Any, *vectors: Any) -> ir.Value:
+        kind = ir.FunctionType(ir.DoubleType(), [ir.DoubleType()] * len(vectors))
+        function = cgutils.get_or_insert_function(builder.module, kind, name)
+        result = ir.Constant(_VECTOR, ir.Undefined)
+        for k in range(WIDTH):
+            lane = ir.Constant(_INDEX, k)
+            value = builder.call(function, [builder.extract_element(v, lane) for v in vectors])
+            result = builder.insert_element(result, value, lane)
+        return result
+
+    return generate
+
+
 def _larger(sign: str) -> Any:
     return lambda builder, a, b: builder.select(builder.fcmp_ordered(sign, a, b), a, b)
 
@@ -171,6 +206,7 @@ for _operator, _sign in (
 for _function, _name in ((math.sqrt, "sqrt"), (math.sin, "sin"), (math.cos, "cos"), (abs, "fabs")):
     _register((_function,), 1, lanes, _each(_name))
 _register((operator.neg,), 1, lanes, lambda builder, x: builder.fneg(x))
+_register((math.atan2,), 2, lanes, _library("atan2"))
 _register((max,), 2, lanes, _larger(">"))
 _register((min,), 2, lanes, _larger("<"))
 
@@ -212,7 +248,10 @@ def spread(_context, x):
 def blocks(_context, array):
     """Look at float64 (..., n), n a multiple of 8, as lanes (..., n / 8); at lanes as they are."""
     if array.dtype == lanes:
-        return array(array), lambda _context, _builder, _sig, args: args[0]
+        same = lambda context, builder, sig, args: impl_ret_borrowed(  # noqa: E731
+            context, builder, sig.return_type, args[0]
+        )
+        return array(array), same
     kind = types.Array(lanes, array.ndim, "C", aligned=False)
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
@@ -228,7 +267,7 @@ def blocks(_context, array):
         view.shape = cgutils.pack_array(builder, shape)
         view.strides = cgutils.pack_array(builder, strides)
         view.meminfo, view.parent = source.meminfo, source.parent
-        return view._getvalue()
+        return impl_ret_borrowed(context, builder, sig.return_type, view._getvalue())
 
     return kind(array), generate
 

@@ -24,6 +24,7 @@ class Vehicles(NamedTuple):
     """The agents: point masses."""
 
     m: Array  # (N,) mass [kg]
+    inverse: Array  # (N,) of it [1/kg]
     M: float  # their sum [kg]
     thrust_limit: Array  # (N,) [N], inf where unlimited
     saturate: bool  # clip the thrust at its limit

@@ -40,7 +40,8 @@ def blend_slots(t, reference, p, p_dot, p_ddot):
                 p_dot[i, q] = s_dot * reference.dp[i, q]
                 p_ddot[i, q] = s_ddot * reference.dp[i, q]
         return
-    e0, e1, e2 = n[0] / angle, n[1] / angle, n[2] / angle
+    some = max(angle, 1e-300)  # lanes may not all turn
+    e0, e1, e2 = n[0] / some, n[1] / some, n[2] / some
     cos, sin = math.cos(s * angle), math.sin(s * angle)
     w, w_dot = angle * s_dot, angle * s_ddot
     for i in range(p.shape[0]):
@@ -89,7 +90,7 @@ def distance_references(t, reference, edges, p, p_dot, p_ddot, d, d_dot, d_ddot)
     elif reference.kind == SQUARED:
         s, s_dot, s_ddot = septic(t, reference.t0, reference.T_b)
         for k in range(edges.shape[0]):
-            before, after = reference.d0[k] ** 2, reference.d1[k] ** 2
+            before, after = reference.d0[k] * reference.d0[k], reference.d1[k] * reference.d1[k]
             d[k] = math.sqrt(before + (after - before) * s)
             d_dot[k] = 0.5 * (after - before) * s_dot / d[k]
             d_ddot[k] = (0.5 * (after - before) * s_ddot - d_dot[k] * d_dot[k]) / d[k]

@@ -1,0 +1,92 @@
+"""Many flights at once: `rigidfleet.ensemble` and `rigidfleet.kernel.ensemble`."""
+
+import numpy as np
+import pytest
+
+from rigidfleet.ensemble import establish
+from rigidfleet.mission import Mission, load_mission
+from rigidfleet.simulate import simulate
+
+
+def table_1(end: float = 10.0) -> Mission:
+    """The paper's Table 1 to a time within its second phase."""
+    data = load_mission("establish-triangle").to_dict()
+    data["phases"] = data["phases"][:2]
+    data["phases"][1]["until"] = end
+    return Mission.from_dict(data)
+
+
+def starts(mission: Mission, count: int, spread: float = 0.3) -> np.ndarray:
+    """Positions about the mission's own."""
+    r = np.array(mission.agents.position)
+    return r + np.random.default_rng(5).uniform(-spread, spread, (count, *r.shape))
+
+
+@pytest.mark.parametrize("vectors", [False, pytest.param(True, marks=pytest.mark.long)])
+def test_each_flight_is_that_of_a_mission_with_its_start(vectors: bool):
+    """Positions, velocities and errors are those of `simulate`, from each start, within tolerance."""
+    mission = table_1()
+    position = starts(mission, 11)
+    velocity = 0.1 * starts(mission, 11)[::-1]
+    found = establish(mission, position, velocity, vectors=vectors)
+    assert found.finished.all()
+    assert found.vectors is vectors
+    data = mission.to_dict()
+    for k in (0, 7, 8, 10):
+        data["agents"] |= {"position": position[k].tolist(), "velocity": velocity[k].tolist()}
+        one = simulate(Mission.from_dict(data))
+        np.testing.assert_allclose(found.position[k], one.position[-1], rtol=0, atol=1e-7)
+        np.testing.assert_allclose(found.velocity[k], one.velocity[-1], rtol=0, atol=1e-7)
+        lengths = [
+            np.linalg.norm(found.position[k, i] - found.position[k, j]) for i, j in one.edges
+        ]
+        wanted = mission.formation_distances("line")
+        assert found.error[k] == pytest.approx(np.abs(lengths - wanted).max(), abs=1e-12)
+
+
+@pytest.mark.parametrize("vectors", [False, pytest.param(True, marks=pytest.mark.long)])
+def test_threads_and_neighbours_in_other_vectors_change_no_bit(vectors: bool):
+    """One thread or three, 19 flights or the first 16 of them: flight k is the same, bit for bit."""
+    mission = table_1()
+    position = starts(mission, 19)
+    whole = establish(mission, position, vectors=vectors, threads=1)
+    shared = establish(mission, position, vectors=vectors, threads=3)
+    first = establish(mission, position[:16], vectors=vectors, threads=2)
+    np.testing.assert_array_equal(whole.position, shared.position)
+    np.testing.assert_array_equal(whole.velocity, shared.velocity)
+    np.testing.assert_array_equal(whole.position[:16], first.position)
+
+
+@pytest.mark.long
+def test_a_flight_that_fails_takes_nobody_along():
+    """Of eight flights in a vector one begins with two agents at one place: the others are flown again alone."""
+    mission = table_1()
+    position = starts(mission, 16)
+    position[3, 1] = position[3, 0]
+    found = establish(mission, position, vectors=True)
+    assert found.finished.tolist() == [k != 3 for k in range(16)]
+    alone = establish(mission, position, vectors=False)
+    np.testing.assert_array_equal(found.position[:8], alone.position[:8])
+    np.testing.assert_allclose(found.position[8:], alone.position[8:], rtol=0, atol=1e-7)
+
+
+def test_short_work_does_not_wait_for_the_compiler():
+    """Vectors are chosen by the work ahead: not for a hundred flights of three agents."""
+    mission = table_1()
+    assert not establish(mission, starts(mission, 3)).vectors
+
+
+def test_what_it_cannot_fly_is_refused():
+    """Other phases than open-loop ones, and starts of another shape, are told apart."""
+    passage = load_mission("narrow-passage")
+    with pytest.raises(ValueError, match=r"phase 2 .* open-loop"):
+        establish(passage, starts(passage, 2))
+    mission = table_1()
+    with pytest.raises(ValueError, match=r"position must be \(B, 3, 3\)"):
+        establish(mission, np.zeros((2, 4, 3)))
+    with pytest.raises(ValueError, match="one shape"):
+        establish(mission, starts(mission, 2), starts(mission, 3))
+    broken = starts(mission, 4)
+    broken[2, 1, 0] = np.nan
+    with pytest.raises(ValueError, match="flight 2 is not finite"):
+        establish(mission, broken)
