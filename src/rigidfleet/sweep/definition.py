@@ -19,14 +19,22 @@ import numpy as np
 from pydantic import Field, Strict
 
 from rigidfleet import __version__
-from rigidfleet.errors import Finding, MissionError, SweepError
+from rigidfleet.errors import MissionError, SweepError
 from rigidfleet.mission import Mission, load_mission, mission_names
 from rigidfleet.mission.model import parse_toml, read_text
 from rigidfleet.mission.notes import Keys, Notes, unknown_key
 from rigidfleet.mission.phases import kind, tables
 from rigidfleet.mission.schema import Part
 from rigidfleet.sweep import paths
-from rigidfleet.sweep.variation import KINDS, Drawn, Gridded, Variation, from_line, is_number
+from rigidfleet.sweep.variation import (
+    KINDS,
+    Drawn,
+    Gridded,
+    Variation,
+    WrongLine,
+    from_line,
+    is_number,
+)
 
 #: Least fraction of a distribution, so that no normal number is infinite.
 _LEAST = 2.0**-54
@@ -114,12 +122,9 @@ class Sweep:
         """
         if not isinstance(mission, Mission):
             mission = load_mission(mission)
-        entries = [from_line(v, origin) if isinstance(v, str) else dict(v) for v in vary]
-        wrong = [entry for entry in entries if isinstance(entry, Finding)]
-        data: dict[str, Any] = {"mission": mission.name, "seed": seed}
-        data |= {"vary": [entry for entry in entries if not isinstance(entry, Finding)]}
+        data: dict[str, Any] = {"mission": mission.name, "seed": seed, "vary": list(vary)}
         data |= {} if runs is None else {"runs": runs}
-        header, variations = _checked(data, origin, mission, wrong)
+        header, variations = _checked(data, origin, mission)
         return cls(mission, variations, header.runs, header.seed, name or mission.name)
 
     @classmethod
@@ -155,11 +160,9 @@ class Sweep:
             mission = load_mission(named if shipped else path.parent / named)
         data |= {} if runs is None else {"runs": runs}
         data |= {} if seed is None else {"seed": seed}
-        entries = [from_line(line, "--vary") for line in more]
-        if isinstance(data.get("vary", []), list):
-            data["vary"] = data.get("vary", []) + [e for e in entries if isinstance(e, dict)]
-        wrong = [entry for entry in entries if isinstance(entry, Finding)]
-        header, variations = _checked(data, origin, mission, wrong)
+        if isinstance(given := data.get("vary", []), list):
+            data["vary"] = [*given, *more]
+        header, variations = _checked(data, origin, mission)
         assert mission is not None  # else the check has raised
         return cls(mission, variations, header.runs, header.seed, path.stem)
 
@@ -276,9 +279,14 @@ def apply(document: dict[str, Any], whole: Mapping[str, Any], column: Column, va
 
 
 def _checked(
-    data: dict[str, Any], origin: str, mission: Mission | None, wrong: list[Finding]
+    data: dict[str, Any], origin: str, mission: Mission | None
 ) -> tuple[Header, list[Variation]]:
     """Header and variations of a sweep that is in order."""
+    wrong: dict[int, WrongLine] = {}
+    if isinstance(given := data.get("vary"), list):
+        parsed = [from_line(entry) if isinstance(entry, str) else entry for entry in given]
+        wrong = {k: entry for k, entry in enumerate(parsed) if isinstance(entry, WrongLine)}
+        data["vary"] = [given[k] if k in wrong else entry for k, entry in enumerate(parsed)]
     notes = Notes(data, origin)
     known = [*Header.model_fields, "vary"]
     for key in data:
@@ -286,56 +294,74 @@ def _checked(
             notes.add((key,), *unknown_key(key, known))
     own = {key: value for key, value in data.items() if key in Header.model_fields}
     header = notes.validate(Header, own, ())
+    whole = None if mission is None else paths.whole_document(mission)
     variations = []
     for k, entry in enumerate(tables(notes, "vary")):
-        model = kind(notes, entry, ("vary", k), KINDS)
-        found = None if model is None else notes.validate(model, entry, ("vary", k))
-        if found is None or any(f.key.startswith(f"vary[{k + 1}]") for f in notes.findings):
+        if k in wrong:
+            notes.add(("vary", k), wrong[k].problem, wrong[k].remedy)
             continue
-        variations.append(found)
-        if (problem := found.wrong()) is not None:
-            notes.add(("vary", k, problem[0]), *problem[1:])
-        elif mission is not None:
-            _fits(notes, ("vary", k, "path"), found, mission)
-    if not data.get("vary") and not wrong:
+        found = _variation(notes, entry, k)
+        if mission is not None and whole is not None:
+            _fits(notes, k, entry, found, mission, whole)
+        variations += [] if found is None else [found]
+    if "vary" not in data or data["vary"] == []:
         notes.add(
             ("vary",), "nothing varies", 'give --vary "agents.mass.* *= normal(1, 0.05)", say'
         )
     gridded = any(isinstance(v, Gridded) for v in variations)
-    if "runs" not in data and variations and not gridded and not (notes.findings or wrong):
+    if "runs" not in data and variations and not gridded:
         notes.add(("runs",), "is missing", "say how many; only a grid has a number of its own")
-    if notes.findings or wrong or header is None:
-        raise SweepError([*wrong, *notes.findings])
+    if notes.findings or header is None:
+        raise SweepError(notes.findings)
     return header, variations
 
 
-def _fits(notes: Notes, where: Keys, v: Variation, mission: Mission) -> None:
+def _variation(notes: Notes, entry: Any, k: int) -> Variation | None:
+    """A variation that is in order by itself."""
+    before = len(notes.findings)
+    model = kind(notes, entry, ("vary", k), KINDS)
+    found = None if model is None else notes.validate(model, entry, ("vary", k))
+    if found is None or len(notes.findings) > before:
+        return None
+    if (problem := found.wrong()) is not None:
+        key, *words = problem
+        notes.add(("vary", k, key), *words, getattr(found, key))
+        return None
+    return found
+
+
+def _fits(
+    notes: Notes, k: int, entry: Any, v: Variation | None, mission: Mission, whole: dict[str, Any]
+) -> None:
     """Whether a variation leads somewhere in the mission, and to what it can vary."""
-    whole = paths.whole_document(mission)
+    path = v.path if v is not None else entry.get("path") if isinstance(entry, dict) else None
+    if not isinstance(path, str):
+        return
+    where = ("vary", k, "path")
     try:
-        places = paths.expand(whole, v.path)
+        places = paths.expand(whole, path)
     except paths.PathError as error:
-        notes.add(where, error.problem, error.remedy)
+        notes.add(where, error.problem, error.remedy, path)
+        return
+    if v is None:
         return
     values = getattr(v, "values", None)
     numeric = values is None or all(map(is_number, values))
     for keys in places:
-        at = paths.look_up(whole, keys)
-        leaves = paths.numbers(at)
-        absent = [x for x in leaves if x is None]
-        if any(isinstance(x, dict) for x in leaves):
-            inside = leaves[0] if isinstance(leaves[0], dict) else {}
-            notes.add(where, "is a table", f"go on to one of its keys: {', '.join(inside)}")
-        elif numeric and not absent and not all(map(is_number, leaves)):
-            notes.add(
-                where, f"is no number, but {leaves[0]!r}", "vary it by choice or grid of words"
-            )
+        leaves = paths.numbers(paths.look_up(whole, keys))
+        absent = any(x is None for x in leaves)
+        table = next((x for x in leaves if isinstance(x, dict)), None)
+        if table is not None:
+            notes.add(where, "is a table", f"go on to one of its keys: {', '.join(table)}", path)
         elif absent and v.change != "set":
             notes.add(
-                where, f"there is nothing to {v.change} to", "set it, or give it in the mission"
+                where, f"there is nothing to {v.change} to", "set it, or write it there", path
             )
         elif absent:
             _taken(notes, where, v, keys, mission, whole)
+        elif numeric and not all(map(is_number, leaves)):
+            remedy = "vary it by choice or grid of words"
+            notes.add(where, f"is no number, but {leaves[0]!r}", remedy, path)
 
 
 def _taken(
@@ -349,4 +375,5 @@ def _taken(
         Mission.from_dict(document)
     except MissionError as error:
         first = error.findings[0]
-        notes.add(where, f"the mission does not take it: {first.key} {first.problem}", first.remedy)
+        problem = f"the mission does not take it: {first.key} {first.problem}"
+        notes.add(where, problem, first.remedy, v.path)

@@ -68,6 +68,8 @@ def _fly(sweep: Sweep, run: int) -> Row:
         first = error.findings[0]
         reason, detail = "mission", f"{first.key} = {first.value!r}: {first.problem}"
     except Exception as error:  # one run that breaks must not end a hundred thousand others
+        if isinstance(error.__context__ or error.__cause__, KeyboardInterrupt):
+            raise  # Ctrl-C, as the compiler gives it back
         reason, detail = "error", f"{type(error).__name__}: {error}"
     wall = perf_counter() - begun
     return Row(run, not reason, reason, " ".join(detail.split()), codes, metrics, wall)

@@ -12,13 +12,13 @@ from __future__ import annotations
 import json
 import re
 from abc import abstractmethod
+from dataclasses import dataclass
 from statistics import NormalDist
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field, Strict
 
-from rigidfleet.errors import Finding
 from rigidfleet.mission.notes import near
 from rigidfleet.mission.schema import Number, Part, Positive
 
@@ -214,25 +214,31 @@ _LINE = re.compile(r"\s*(.+?)\s*(\+=|\*=|=)\s*([\w-]+)\s*\((.*)\)\s*", re.DOTALL
 _FORM = "write PATH = KIND(NUMBERS), as in agents.mass.* *= normal(1, 0.05)"
 
 
-def from_line(line: str, origin: str) -> dict[str, Any] | Finding:
-    """The table of a sweep file that a line stands for, or what is wrong with the line."""
+@dataclass(frozen=True)
+class WrongLine:
+    """What is wrong with a line, and what to do about it."""
+
+    problem: str
+    remedy: str
+
+
+def from_line(line: str) -> dict[str, Any] | WrongLine:
+    """The table that a line stands for."""
     match = _LINE.fullmatch(line)
     if match is None:
-        return Finding(origin, "", line, "is no variation", _FORM)
+        return WrongLine("is no variation", _FORM)
     path, sign, kind, inside = match.groups()
     data = {"path": path, "change": SIGNS[sign], "kind": kind}
     if kind not in KINDS:
         remedy = near(kind, KINDS) or f"use one of {', '.join(KINDS)}"
-        return Finding(origin, "", line, f"there is no distribution or grid '{kind}'", remedy)
+        return WrongLine(f"there is no distribution or grid '{kind}'", remedy)
     values = [_value(word) for word in _words(inside)]
     if kind not in _KEYS:
         return data | {"values": values}
     keys = _KEYS[kind]
     if len(values) != len(keys):
-        remedy = f"write {kind}({', '.join(keys)})"
-        return Finding(
-            origin, "", line, f"{kind} takes {len(keys)} numbers, not {len(values)}", remedy
-        )
+        problem = f"{kind} takes {len(keys)} numbers, not {len(values)}"
+        return WrongLine(problem, f"write {kind}({', '.join(keys)})")
     return data | dict(zip(keys, values, strict=True))
 
 
