@@ -28,7 +28,7 @@ from rigidfleet.sweep.figures import over_two, plot
 from rigidfleet.sweep.summary import drivers, rate, summarise
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "gain_study.toml"
-PAIR = {
+PAIR: dict[str, Any] = {
     "schema_version": 1,
     "name": "pair",
     "agents": {"mass": 1.0, "position": [[0.0, 0.0, 5.0], [3.0, 1.0, 5.0]], "thrust_limit": 14.0},
@@ -50,10 +50,10 @@ def numbers(table: Table) -> tuple[Any, ...]:
     return table.run.tolist(), table.passed.tolist(), words, table.codes.tobytes(), metrics
 
 
-def refused(*vary: Any, **more: Any) -> dict[str, tuple[str, str]]:
+def refused(*vary: Any, runs: int | None = 5, seed: int = 0) -> dict[str, tuple[str, str]]:
     """Problem and remedy of each finding, by its key."""
     with pytest.raises(SweepError) as caught:
-        Sweep.of(MISSION, vary, **({"runs": 5} | more))
+        Sweep.of(MISSION, vary, runs=runs, seed=seed)
     return {f.key: (f.problem, f.remedy) for f in caught.value.findings}
 
 
@@ -362,7 +362,8 @@ def count(folder: Path) -> int:
         return 0
 
 
-@pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("workers", [1, 2])
 def test_killed_at_any_moment(workers, tmp_path):
     """After kill -9 at random moments the same command ends with the rows of an uninterrupted sweep."""
     runs = 64 if workers == 1 else 1500
@@ -423,29 +424,26 @@ def test_a_killed_worker_is_replaced(flown, tmp_path, monkeypatch):
     assert numbers(table) == numbers(fly(sweep(runs=40), tmp_path / "whole", workers=1))
 
 
+def started(arguments: list[str]) -> subprocess.Popen[bytes]:
+    """A Dask process."""
+    tool = str(Path(sys.executable).with_name("dask"))
+    quiet = subprocess.DEVNULL
+    return subprocess.Popen([tool, *arguments, "--no-dashboard"], stdout=quiet, stderr=quiet)
+
+
 @pytest.fixture
 def dask(tmp_path) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
     """A scheduler and two workers as the manual starts them, each a process: address, and the workers."""
     pytest.importorskip("distributed")
-    tool = Path(sys.executable).with_name("dask")
     place = tmp_path / "scheduler.json"
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    processes = [
-        subprocess.Popen(
-            [tool, "scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard",
-             "--scheduler-file", place], **quiet,
-        )
-    ]  # fmt: skip
+    here = ["scheduler", "--host", "127.0.0.1", "--port", "0", "--scheduler-file", str(place)]
+    processes = [started(here)]
     try:
         until(place.exists, processes[0])
         address = json.loads(place.read_text())["address"]
         for k in range(2):
-            processes.append(
-                subprocess.Popen(
-                    [tool, "worker", address, "--nthreads", "1", "--no-nanny", "--no-dashboard",
-                     "--local-directory", tmp_path / f"worker-{k}"], **quiet,
-                )
-            )  # fmt: skip
+            local = ["--local-directory", str(tmp_path / f"worker-{k}")]
+            processes.append(started(["worker", address, "--nthreads", "1", "--no-nanny", *local]))
         yield address, processes[1:]
     finally:
         for process in reversed(processes):
