@@ -378,7 +378,7 @@ def test_killed_at_any_moment(workers, tmp_path):
         time.sleep(0.2 * moments.random())
         kills += process.poll() is None
         process.kill()
-        assert process.communicate()[1] == b""
+        assert b"Traceback" not in process.communicate()[1]
     assert kills >= 1
     assert subprocess.run(command(*asked), check=False).returncode == cli.PASSED
     whole = fly(Sweep.of(MISSION, SCATTER, runs=runs), tmp_path / "whole", workers=1)
