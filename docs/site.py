@@ -173,7 +173,9 @@ def _uri(path: str) -> str | None:
         return COPIES[path]
     if path.startswith("docs/"):
         return path.removeprefix("docs/")
-    return _page_of(path) if path.startswith("examples/") and path.endswith((".py", ".toml")) else None
+    return (
+        _page_of(path) if path.startswith("examples/") and path.endswith((".py", ".toml")) else None
+    )
 
 
 # -- formulas ----------------------------------------------------------------------------------------
