@@ -465,7 +465,7 @@ def test_a_cluster_loses_a_worker(dask, tmp_path):
             killed.append(progress.done)
             workers[0].kill()
 
-    table = fly(asked, tmp_path / "cluster", cluster_address=address, progress=kill)
+    table = fly(asked, tmp_path / "cluster", cluster=address, progress=kill)
     assert killed
     assert killed[0] < 200
     assert numbers(table) == numbers(alone)
@@ -476,7 +476,7 @@ def test_no_cluster_answers(tmp_path, monkeypatch):
     """An address without a scheduler is one clear error."""
     monkeypatch.setattr("rigidfleet.sweep.workers._CONNECT", 0.5)
     with pytest.raises(RigidfleetError, match="no scheduler answers"):
-        fly(sweep(), tmp_path, cluster_address="tcp://127.0.0.1:9")
+        fly(sweep(), tmp_path, cluster="tcp://127.0.0.1:9")
 
 
 # -- analysis ----------------------------------------------------------------------------------------

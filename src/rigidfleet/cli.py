@@ -773,7 +773,7 @@ def _fly_sweep(
         asked,
         folder,
         workers=workers,
-        cluster_address=cluster,
+        cluster=cluster,
         replace=force,
         progress=None if watch is None else watch.update,
     )

@@ -15,10 +15,10 @@ import numpy as np
 
 from rigidfleet import __version__
 from rigidfleet.errors import RigidfleetError
+from rigidfleet.sweep import workers as crews
 from rigidfleet.sweep.definition import Sweep
 from rigidfleet.sweep.engine import GROUP, Row, fly_runs
 from rigidfleet.sweep.store import Store, Table, read
-from rigidfleet.sweep.workers import Crew, chunk, cluster, processes
 
 #: A chunk takes about so long [s]: what is lost by kill -9 for each worker, and how often a bar moves.
 _CHUNK = 1.0
@@ -49,7 +49,7 @@ def fly(
     folder: str | Path,
     *,
     workers: int | None = None,
-    cluster_address: str | None = None,
+    cluster: str | None = None,
     replace: bool = False,
     progress: Callable[[SweepProgress], None] | None = None,
 ) -> Table:
@@ -60,7 +60,7 @@ def fly(
     folder : made if it is not there; its file `sweep.db` keeps every chunk as soon as it is flown
     workers : processes on this machine; as many as it has cores when absent. Work of a few seconds is
         done without any. A script that starts processes needs `if __name__ == "__main__":`
-    cluster_address : of a Dask scheduler, whose workers fly instead
+    cluster : address of a Dask scheduler, whose workers fly instead
     replace : begin anew if the folder has a sweep
     progress : called after each chunk
 
@@ -76,8 +76,8 @@ def fly(
     folder = Path(folder)
     with Store(folder, sweep, replace=replace) as store:
         flight = _Sweeping(sweep, store, progress)
-        if cluster_address is not None:
-            with cluster(cluster_address) as crew:
+        if cluster is not None:
+            with crews.cluster(cluster) as crew:
                 flight.hand_out(crew)
         else:
             count = _cores() if workers is None else workers
@@ -86,7 +86,7 @@ def fly(
             while flight.missing:
                 before = flight.flown
                 try:
-                    with processes(count) as crew:
+                    with crews.processes(count) as crew:
                         flight.hand_out(crew)
                 except BrokenExecutor as error:
                     deaths = 1 if flight.flown > before else deaths + 1
@@ -102,10 +102,10 @@ class _Sweeping:
         self, sweep: Sweep, store: Store, progress: Callable[[SweepProgress], None] | None
     ) -> None:
         self.sweep, self.store, self.progress = sweep, store, progress
-        there = store.there()
+        self.there = store.there()
         # A group is flown as a whole, so that its rows do not depend on when the sweep was stopped.
-        self.missing = deque(np.unique(np.flatnonzero(~there) // GROUP).tolist())
-        self.done, self.flown, self.failed = int(there.sum()), 0, 0
+        self.missing = deque(np.unique(np.flatnonzero(~self.there) // GROUP).tolist())
+        self.flown, self.failed = 0, 0
         self.begun, self.workers = perf_counter(), 1
         self.pace = 0.0  # [s] a run
         self._report()
@@ -117,7 +117,7 @@ class _Sweeping:
                 return
             self.keep(fly_runs(self.sweep, self.take(1)))
 
-    def hand_out(self, crew: Crew) -> None:
+    def hand_out(self, crew: crews.Crew) -> None:
         """Fly all that is missing by a crew; what it does not bring back is missing again."""
         executor, capacity = crew
         flying: dict[Future[list[Row]], list[int]] = {}
@@ -127,7 +127,7 @@ class _Sweeping:
                 self.workers = capacity()
                 while self.missing and len(flying) < _AHEAD * self.workers:
                     runs = self.take(self.workers)
-                    flying[executor.submit(chunk, text, __version__, runs)] = runs
+                    flying[executor.submit(crews.chunk, text, __version__, runs)] = runs
                 for future in wait(flying, _LOOK, FIRST_COMPLETED).done:
                     self.keep(future.result())
                     del flying[future]
@@ -145,9 +145,8 @@ class _Sweeping:
 
     def keep(self, rows: list[Row]) -> None:
         """Put the rows of a chunk into the store."""
-        again = int(self.store.there()[[row.run for row in rows]].sum())
         self.store.add(rows)
-        self.done += len(rows) - again
+        self.there[[row.run for row in rows]] = True
         self.flown += len(rows)
         self.failed += sum(not row.passed for row in rows)
         self.pace = max(median(row.wall for row in rows), 1e-9)
@@ -156,10 +155,9 @@ class _Sweeping:
     def _report(self) -> None:
         if self.progress is not None:
             wall = perf_counter() - self.begun
+            done = int(self.there.sum())
             self.progress(
-                SweepProgress(
-                    self.done, self.sweep.runs, self.flown, self.failed, wall, self.workers
-                )
+                SweepProgress(done, self.sweep.runs, self.flown, self.failed, wall, self.workers)
             )
 
 

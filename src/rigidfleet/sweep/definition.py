@@ -46,7 +46,7 @@ class Header(Part):
     mission: str = Field(
         description="a shipped mission, or the path of a mission file as seen from this one"
     )
-    runs: Annotated[int, Strict(), Field(ge=1, le=10**9)] | None = Field(
+    runs: Annotated[int, Strict(), Field(ge=1, le=10**8)] | None = Field(
         None, description="how many runs; when absent, one for each point of the grid"
     )
     seed: Annotated[int, Strict(), Field(ge=0, lt=2**63)] = Field(
@@ -56,10 +56,11 @@ class Header(Part):
 
 @dataclass(frozen=True)
 class Column:
-    """One number that varies: what varies it, and where in the mission."""
+    """One number that varies: what varies it, where in the mission, and its values if it is gridded."""
 
     variation: Variation
     keys: Keys
+    grid: tuple[Any, ...] | None
 
     @property
     def name(self) -> str:
@@ -89,8 +90,7 @@ class Sweep:
     ) -> None:
         self.mission, self.variations = mission, tuple(variations)
         self.seed, self.name = seed, name
-        axes = (c.variation for c in self.columns)
-        self.runs = runs or math.prod(len(v.grid) for v in axes if isinstance(v, Gridded))
+        self.runs = runs or math.prod(len(c.grid) for c in self.columns if c.grid is not None)
 
     @classmethod
     def of(
@@ -199,30 +199,26 @@ class Sweep:
     def columns(self) -> list[Column]:
         """Every number that varies, in order."""
         return [
-            Column(v, keys) for v in self.variations for keys in paths.expand(self.whole, v.path)
+            Column(v, keys, grid)
+            for v in self.variations
+            for grid in [v.grid if isinstance(v, Gridded) else None]
+            for keys in paths.expand(self.whole, v.path)
         ]
 
     def values(self, run: int) -> list[Any]:
         """Value of every column in a run, counted from 0."""
-        drawn = [c for c in self.columns if isinstance(c.variation, Drawn)]
         stream = np.random.Philox(np.random.SeedSequence(self.seed, spawn_key=(run,)))
-        fractions = iter(
-            np.maximum(np.random.Generator(stream).random(len(drawn)), _LEAST).tolist()
-        )
+        drawn = sum(column.grid is None for column in self.columns)
+        fractions = np.maximum(np.random.Generator(stream).random(drawn), _LEAST).tolist()
         point, found = run, []
         for column in reversed(self.columns):  # the last grid varies fastest
-            v = column.variation
-            if isinstance(v, Gridded):
-                point, place = divmod(point, len(v.grid))
-                found.append(v.grid[place])
+            if column.grid is None:
+                assert isinstance(column.variation, Drawn)
+                found.append(column.variation.quantile(fractions.pop()))
             else:
-                found.append(None)
-        return [
-            column.variation.quantile(next(fractions))
-            if isinstance(column.variation, Drawn)
-            else value
-            for column, value in zip(self.columns, reversed(found), strict=True)
-        ]
+                point, place = divmod(point, len(column.grid))
+                found.append(column.grid[place])
+        return found[::-1]
 
     def varied(self, run: int) -> dict[str, Any]:
         """The document of a run, not checked yet."""
@@ -370,7 +366,7 @@ def _taken(
     """Whether a mission takes a value where it has had none."""
     middle = v.quantile(0.5) if isinstance(v, Drawn) else v.grid[0] if isinstance(v, Gridded) else 0
     document = mission.to_dict()
-    apply(document, whole, Column(v, keys), middle)
+    apply(document, whole, Column(v, keys, None), middle)
     try:
         Mission.from_dict(document)
     except MissionError as error:
