@@ -639,6 +639,17 @@ def test_command(folder, capsys):
     assert cli.main([*line, "--workers", "0"]) == cli.BAD_INPUT
 
 
+def test_progress_words():
+    """Progress says the runs flown, their rate without that of starting, the time left and the failures."""
+    watch = cli._SweepWatch()
+    assert watch._words() == ""
+    watch.update(SweepProgress(0, 5000, 0, 0, 0.0, 1))
+    watch.update(SweepProgress(8, 5000, 8, 0, 20.0, 1))
+    assert watch._words() == "8 of 5000 runs"
+    watch.update(SweepProgress(1008, 5000, 1008, 30, 30.0, 2))
+    assert watch._words() == "1008 of 5000 runs  100 runs/s  0:40 left  30 failed  2 workers"
+
+
 def test_interrupted(folder):
     """Ctrl-C ends with 130, keeps what is flown, and says how to go on."""
     asked = ["sweep", "pair.toml", "--runs", 5000, "--workers", 1, "--vary", SCATTER[0]]

@@ -1177,12 +1177,14 @@ class _Screen:
         self.spinner.update(text=f"{text}: {perf_counter() - self.begun:.0f} s")
         return self.spinner
 
-    def tell(self, words: str) -> None:
+    def tell(self, now: float) -> None:
         """Print a line where nothing moves, if the last one was long ago."""
-        now = perf_counter()
         if self.live is None and now - self.told > _SELDOM:
             self.told = now
-            self.console.print(words)
+            self.console.print(self._words())
+
+    def _words(self) -> str:
+        return ""
 
 
 class _Watch(_Screen):
@@ -1200,7 +1202,7 @@ class _Watch(_Screen):
         if self.base is None or (self.cold and now - self.heard > _SILENCE):
             self.base = progress  # the speed is that of flying, without that of compiling
         self.last, self.heard = progress, now
-        self.tell(self._words())
+        self.tell(now)
 
     def __rich__(self) -> RenderableType:
         from rich.progress_bar import ProgressBar
@@ -1240,7 +1242,7 @@ class _SweepWatch(_Screen):
         if progress.flown and self.base is None:
             self.base = progress  # the rate is that of flying, without that of starting
         self.last = progress
-        self.tell(self._words())
+        self.tell(perf_counter())
 
     def __rich__(self) -> RenderableType:
         from rich.progress_bar import ProgressBar
