@@ -640,14 +640,17 @@ def test_command(folder, capsys):
 
 
 def test_progress_words():
-    """Progress says the runs flown, their rate without that of starting, the time left and the failures."""
+    """Progress says the runs flown, their rate without starts, the time left and the failures."""
     watch = cli._SweepWatch()
     assert watch._words() == ""
     watch.update(SweepProgress(0, 5000, 0, 0, 0.0, 1))
     watch.update(SweepProgress(8, 5000, 8, 0, 20.0, 1))
     assert watch._words() == "8 of 5000 runs"
-    watch.update(SweepProgress(1008, 5000, 1008, 30, 30.0, 2))
-    assert watch._words() == "1008 of 5000 runs  100 runs/s  0:40 left  30 failed  2 workers"
+    watch.update(SweepProgress(508, 5000, 508, 0, 30.0, 1))
+    assert watch._words() == "508 of 5000 runs  50 runs/s  1:30 left"
+    watch.update(SweepProgress(1000, 5000, 1000, 0, 40.0, 2))
+    watch.update(SweepProgress(2000, 5000, 2000, 30, 50.0, 2))
+    assert watch._words() == "2000 of 5000 runs  100 runs/s  0:30 left  30 failed  2 workers"
 
 
 def test_interrupted(folder):

@@ -1239,8 +1239,8 @@ class _SweepWatch(_Screen):
 
     def update(self, progress: SweepProgress) -> None:
         """Take note of how far the sweep is."""
-        if progress.flown and self.base is None:
-            self.base = progress  # the rate is that of flying, without that of starting
+        if progress.flown and (self.base is None or self.base.workers != progress.workers):
+            self.base = progress  # the rate is that of these workers, without their start
         self.last = progress
         self.tell(perf_counter())
 
