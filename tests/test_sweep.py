@@ -634,6 +634,8 @@ def test_command(folder, capsys):
     assert capsys.readouterr() == ("", "")
     assert Path("sweeps/pair/sweep.db").read_bytes() == before
     assert "Median: thrust" in Path("sweeps/pair/figures/map.svg").read_text()
+    assert cli.main(["sweep", "pair.toml", "--summary"]) == cli.BAD_INPUT
+    assert "holds no sweep" in capsys.readouterr().err
     assert cli.main(["sweep", "sweeps/pair", "--seed", "3"]) == cli.BAD_INPUT
     assert cli.main(["sweep", "pair.toml", "--runs", "4"]) == cli.BAD_INPUT
     assert cli.main([*line, "--workers", "0"]) == cli.BAD_INPUT

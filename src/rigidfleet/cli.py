@@ -676,7 +676,7 @@ def sweep(
     cluster : str
         Address of a Dask scheduler, whose workers fly instead.
     summary : bool
-        Fly nothing; sum up and draw again what the folder has.
+        Fly nothing; sum up and draw again the sweep of a folder.
     map_ : str
         The two paths that the map is drawn over.
     metric : str
@@ -691,12 +691,13 @@ def sweep(
     from rigidfleet.sweep import store
     from rigidfleet.sweep.summary import summarise
 
-    asked, folder = _asked(mission, vary or [], runs, seed, out)
     if workers is not None and workers < 1:
         raise RigidfleetError(f"--workers = {workers}: must be at least 1.")
     if summary:
+        folder = Path(mission)
         table = store.read(folder)
     else:
+        asked, folder = _asked(mission, vary or [], runs, seed, out)
         watch = None if quiet else _SweepWatch()
         try:
             with watch or nullcontext(), _heeding_interrupts():

@@ -14,11 +14,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Metric:
-    """One number of a run: its unit and meaning, and whether a small value is the bad one."""
+    """One number of a run: its unit and meaning."""
 
     unit: str
     text: str
-    least: bool = False
 
 
 METRICS: dict[str, Metric] = {
@@ -26,22 +25,22 @@ METRICS: dict[str, Metric] = {
     "shape": Metric("m", "worst shape error at the end of a phase"),
     "constraint_end": Metric("m", "greatest constraint error |c| at the end"),
     "constraint": Metric("m", "greatest constraint error |c|"),
-    "handed": Metric("1", "1: right-handed at the end of every phase; 0: mirrored", least=True),
+    "handed": Metric("1", "1: right-handed at the end of every phase; 0: mirrored"),
     "flip": Metric("deg", "greatest angle of a plane or line from where it should point"),
     "waypoint_position": Metric("m", "greatest miss of a waypoint"),
     "waypoint_velocity": Metric("m s-1", "greatest miss of a waypoint's velocity"),
     "waypoint_attitude": Metric("deg", "greatest miss of a waypoint's attitude"),
     "waypoint_rates": Metric("deg s-1", "greatest miss of a waypoint's body rates"),
-    "separation": Metric("m", "least separation of two agents, less radii", least=True),
-    "separation_below": Metric("m", "least height over an agent below, less radii", least=True),
-    "clearance": Metric("m", "least clearance to an obstacle, less radius", least=True),
+    "separation": Metric("m", "least separation of two agents, less radii"),
+    "separation_below": Metric("m", "least height over an agent below, less radii"),
+    "clearance": Metric("m", "least clearance to an obstacle, less radius"),
     "geofence": Metric("m", "how far an agent leaves the geofence; negative inside"),
     "thrust": Metric("N", "thrust nearest to, or furthest beyond, its limit; without one the peak"),
     "speed": Metric("m s-1", "peak speed"),
     "acceleration": Metric("m s-2", "peak acceleration"),
     "constraint_force": Metric("N", "peak constraint force on an agent"),
     "tension": Metric("N", "tension of greatest size in an edge; negative: a push"),
-    "singular_value": Metric("1", "smallest singular value of the constraint Jacobian", least=True),
+    "singular_value": Metric("1", "smallest singular value of the constraint Jacobian"),
     "flown": Metric("s", "mission time at the end"),
     "steps": Metric("1", "steps of the integrator"),
     "evaluations": Metric("1", "evaluations of the right-hand side"),
