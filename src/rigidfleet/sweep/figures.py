@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +22,7 @@ from rigidfleet.sweep.variation import Geomspace, LogUniform
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
 Floats = NDArray[np.float64]
@@ -32,6 +32,7 @@ _COLUMNS = 4  # of small axes
 _BINS = 30
 _ENVELOPE = 12  # stretches of an envelope
 _CELLS = 10  # a side of a map of drawn numbers
+_VALUES = 20  # so many values, of a grid, have a cell each
 _ROWS = 14  # varied numbers in the figure of drivers, the strongest
 _LOGARITHMIC = 100.0  # a metric over more than this many times its least has a logarithmic axis
 _NAMES = ("outcome", "histograms", "envelopes", "drivers", "map")
@@ -166,7 +167,9 @@ def envelopes(table: Table) -> Figure | None:
         ax.plot(centres, middle, color=st.INK)
         scale = _scale(y[np.isfinite(y)])
         ax.set_yscale(scale)
-        ax.set_xscale(_spacing(table, over))
+        if _spacing(table, over) == "log":
+            ax.set_xscale("log")
+            _log_ticks(ax.xaxis, x)
         ax.margins(x=0.02)
         ax.set_title(_label(name), loc="left", fontsize=8.5)
         ax.set_xlabel(_axis_label(table, over).replace(", ", ",\n"), fontsize=7.5)
@@ -247,18 +250,24 @@ def over_two(table: Table, over: Sequence[str] = (), metric: str = "") -> Figure
     ax = fig.subplots()
     title = "Success rate" if metric == "success" else f"Median: {metric.replace('_', ' ')}"
     _head(fig, table, title)
-    limits: dict[str, Any] = {"vmin": 0, "vmax": 100} if metric == "success" else {}
-    image = ax.pcolormesh(x, y, cells, cmap="viridis", edgecolor="white", linewidth=0.4, **limits)
+    wide = metric != "success" and _scale(cells[np.isfinite(cells)]) == "log"
+    look: dict[str, Any] = {"vmin": 0, "vmax": 100} if metric == "success" else {}
+    look |= {"norm": "log"} if wide else {}
+    image = ax.pcolormesh(x, y, cells, cmap="viridis", edgecolor="white", linewidth=0.4, **look)
     unit = "passed [%]" if metric == "success" else f"{METRICS[metric].text} [{_unit(metric)}]"
     fig.colorbar(image, ax=ax, label=unit, pad=0.02)
     ax.grid(visible=False)
     ax.set(xlabel=_axis_label(table, over[0]), ylabel=_axis_label(table, over[1]))
-    ax.set(xscale=_spacing(table, over[0]), yscale=_spacing(table, over[1]))
-    for axis, name in ((ax.xaxis, over[0]), (ax.yaxis, over[1])):
+    for axis, scale, name in (
+        (ax.xaxis, ax.set_xscale, over[0]),
+        (ax.yaxis, ax.set_yscale, over[1]),
+    ):
         distinct = np.unique(numbers[name])
-        if len(distinct) <= _CELLS:
-            axis.set_ticks(distinct, [f"{v:.3g}" for v in distinct])
-            axis.set_ticks([], minor=True)
+        if len(distinct) <= _VALUES:
+            axis.set_ticks(range(len(distinct)), [f"{v:.3g}" for v in distinct])
+        elif _spacing(table, name) == "log":
+            scale("log")
+            _log_ticks(axis, distinct)
     return fig
 
 
@@ -361,18 +370,24 @@ def _spacing(table: Table, name: str) -> str:
     return "log" if isinstance(column.variation, LogUniform | Geomspace) else "linear"
 
 
+def _log_ticks(axis: Axis, x: Floats) -> None:
+    """Plain numbers along a logarithmic axis, of which there may be less than a decade."""
+    if x.max() > _LOGARITHMIC * x.min():
+        return
+    ticks = np.geomspace(x.min(), x.max(), 3)
+    axis.set_ticks(ticks, [f"{v:.2g}" for v in ticks])
+    axis.set_ticks([], minor=True)
+
+
 def _cells(x: Floats, scale: str) -> tuple[Floats, NDArray[np.int64]]:
-    """Edges of cells along an axis, and the cell of each run: one for each value of a grid."""
-    if scale == "log":
-        edges, cells = _cells(np.log(x), "linear")
-        return np.exp(edges), cells
+    """Edges of cells along an axis, and the cell of each run: of few values each has one of its own."""
     distinct = np.unique(x)
-    if len(distinct) > 2 * _CELLS:
-        edges = np.linspace(distinct[0], distinct[-1], _CELLS + 1)
-        return edges, np.clip(np.searchsorted(edges, x, side="right") - 1, 0, _CELLS - 1)
-    middle = np.array([(a + b) / 2 for a, b in pairwise(distinct.tolist())])
-    first, last = 2 * distinct[0] - middle[0], 2 * distinct[-1] - middle[-1]
-    return np.array([first, *middle, last]), np.searchsorted(distinct, x)
+    if len(distinct) <= _VALUES:
+        edges = np.arange(len(distinct) + 1, dtype=np.float64) - 0.5
+        return np.asarray(edges, dtype=np.float64), np.searchsorted(distinct, x)
+    space = np.geomspace if scale == "log" else np.linspace
+    edges = space(distinct[0], distinct[-1], _CELLS + 1)
+    return edges, np.clip(np.searchsorted(edges, x, side="right") - 1, 0, _CELLS - 1)
 
 
 def _running(x: Floats, y: Floats) -> tuple[Floats, Floats, Floats, Floats]:
