@@ -119,6 +119,8 @@ def _attitudes(pieces: Sequence[Piece], x: Array, masses: Array, *, framed: bool
     Without slots, that of the integrated frame, if the mission attaches one (``framed``).
     """
     quaternions = np.full((len(x), 4), np.nan)
+    fitted = np.zeros(len(x), dtype=bool)
+    T = np.empty((len(x), 3, 3))
     last = np.eye(3)
     start = 0
     for piece in pieces:
@@ -131,9 +133,11 @@ def _attitudes(pieces: Sequence[Piece], x: Array, masses: Array, *, framed: bool
         near = piece.record.T_ref
         if np.isnan(near[0, 0, 0]):
             near = last
-        T = geometry.fit_attitudes(x[rows], piece.record.p, masses, near)
-        last = T[-1]
-        quaternions[rows] = att.quaternion_from_dcm(T)
+        T[rows] = geometry.fit_attitudes(x[rows], piece.record.p, masses, near)
+        last = T[rows][-1]
+        fitted[rows] = True
+    if fitted.any():
+        quaternions[fitted] = att.quaternion_from_dcm(T[fitted])
     return att.unwrap_quaternion(quaternions)
 
 

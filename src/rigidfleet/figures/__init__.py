@@ -92,14 +92,25 @@ def plot(
     """
     formats = _known("format", formats, _FORMATS)
     names = list(_FIGURES) if names is None else _known("figure", names, _FIGURES)
-    written = []
-    for name in names:
-        figure = _FIGURES[name](result)
-        for kind in formats:
-            path = Path(folder) / f"{name}.{kind}"
-            _write(path, _rendered(figure, kind))
-            written.append(path)
-    return written
+    return [
+        path
+        for name in names
+        for path in write_figure(_FIGURES[name](result), Path(folder), name, formats)
+    ]
+
+
+def write_figure(figure: Figure, folder: Path, name: str, formats: Iterable[str]) -> list[Path]:
+    """Write a figure to ``folder/NAME.FORMAT``, each file whole or not at all; returns the files.
+
+    Raises
+    ------
+    ResultError
+        A file cannot be written.
+    """
+    paths = {kind: folder / f"{name}.{kind}" for kind in formats}
+    for kind, path in paths.items():
+        _write(path, _rendered(figure, kind))
+    return list(paths.values())
 
 
 def _known(what: str, asked: Iterable[str], known: Iterable[str]) -> list[str]:
