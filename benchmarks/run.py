@@ -27,6 +27,7 @@ from rich.table import Table
 from scipy_peer import Literal, Peer, constant, squared
 
 from rigidfleet import formation as shapes
+from rigidfleet.ensemble import establish
 from rigidfleet.kernel import flight
 from rigidfleet.kernel.program import workspace
 from rigidfleet.mission import Mission, load_mission
@@ -36,6 +37,10 @@ from rigidfleet.simulate import simulate
 
 TOLERANCE = 1e-8
 DURATION, SAMPLES = 20.0, 200
+#: Ensembles: flights of a round, of which SciPy flies a few; tolerances; how far starts scatter [m].
+FLIGHTS, SCIPYS = 1000, 5
+RTOL, ATOL = 1e-6, 1e-8
+SPREAD = 0.25
 #: Peers fly the same law: their positions may differ by no more [m].
 AGREEMENT = 1e-6
 
@@ -173,6 +178,46 @@ def flights(rounds: int) -> tuple[list[Row], bool]:
     return rows, agree
 
 
+def ensembles(rounds: int) -> list[Row]:
+    """A thousand flights from random starts, on all cores, against SciPy in a loop."""
+    rows = []
+    for default_law, law, goals in (
+        (False, "undamped law", {3: 4000.0, 8: 500.0}),
+        (True, "default law", {3: None, 8: None}),
+    ):
+        for source, n in (("establish-triangle", 3), ("establish-cube", 8)):
+            data = establishment(source, default_law=default_law).to_dict()
+            data["integrator"] = {"rtol": RTOL, "atol": ATOL}
+            mission = Mission.from_dict(data)
+            r = np.array(mission.agents.position)
+            starts = r + np.random.default_rng(0).uniform(-SPREAD, SPREAD, (FLIGHTS, *r.shape))
+            peers = []
+            for start in starts[: SCIPYS * rounds]:
+                data["agents"]["position"] = start.tolist()
+                peers.append(peer(Mission.from_dict(data), Literal))
+            end = np.array([DURATION])
+            ours = establish(mission, starts, vectors=True)
+            theirs = peers[0].fly(end, RTOL, ATOL)[-1, : 3 * n].reshape(n, 3)
+            alone, vectors, scipy = [], [], []
+            for k in range(rounds):
+                some = peers[SCIPYS * k : SCIPYS * (k + 1)]
+                spent = seconds(lambda some=some: [p.fly(end, RTOL, ATOL) for p in some])
+                scipy.append(spent / len(some))
+                for times, choice in ((vectors, True), (alone, False)):
+                    spent = seconds(lambda c=choice: establish(mission, starts, vectors=c), 0.1)
+                    times.append(spent / FLIGHTS)
+            title = f"{n} agents, {law}, {FLIGHTS:,} flights"
+            note = (
+                f"median {np.median(ours.evaluations):.0f} evaluations; positions agree to"
+                f" {np.abs(ours.position[0] - theirs).max():.0e} m"
+            )
+            rows += [
+                Row(title, vectors, scipy, goals[n], True, note),
+                Row("  each flight alone", alone, scipy, None, True),
+            ]
+    return rows
+
+
 def processes(rounds: int) -> list[Row]:
     """Whole processes: a run with a warm cache, and the first one ever."""
     program = [sys.executable, "-m", "rigidfleet", "run", "narrow-passage", "--no-figures"]
@@ -236,6 +281,7 @@ def main() -> int:
         f"{DURATION:g} s of flight, tolerance {TOLERANCE:g}, {SAMPLES} outputs; SciPy: RK45"
     )
     rows, agree = flights(arguments.rounds)
+    rows += ensembles(arguments.rounds)
     rows += processes(arguments.rounds)
     show(console, rows)
     if arguments.json:

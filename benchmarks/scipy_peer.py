@@ -85,11 +85,10 @@ class Peer:
         omega = np.linalg.solve(np.trace(S) * np.eye(3) - S, h)
         return y - np.cross(omega, x)
 
-    def fly(self, times: Array, tolerance: float) -> Array:
-        """States (K, n) at ``times`` (K,) [s]."""
-        flight = solve_ivp(
-            self, (0.0, times[-1]), self.start, "RK45", times, rtol=tolerance, atol=tolerance
-        )
+    def fly(self, times: Array, rtol: float, atol: float | None = None) -> Array:
+        """States (K, n) at ``times`` (K,) [s]; ``atol`` is ``rtol`` unless given."""
+        atol = rtol if atol is None else atol
+        flight = solve_ivp(self, (0.0, times[-1]), self.start, "RK45", times, rtol=rtol, atol=atol)
         return flight.y.T
 
 
