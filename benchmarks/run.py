@@ -17,6 +17,7 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from datetime import date
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from statistics import median
@@ -201,11 +202,11 @@ def ensembles(rounds: int) -> list[Row]:
             alone, vectors, scipy = [], [], []
             for k in range(rounds):
                 some = peers[SCIPYS * k : SCIPYS * (k + 1)]
-                spent = seconds(lambda some=some: [p.fly(end, RTOL, ATOL) for p in some])
-                scipy.append(spent / len(some))
+                loop = [partial(p.fly, end, RTOL, ATOL) for p in some]
+                scipy.append(sum(map(seconds, loop)) / len(loop))
                 for times, choice in ((vectors, True), (alone, False)):
-                    spent = seconds(lambda c=choice: establish(mission, starts, vectors=c), 0.1)
-                    times.append(spent / FLIGHTS)
+                    all_of_them = partial(establish, mission, starts, vectors=choice)
+                    times.append(seconds(all_of_them, 0.1) / FLIGHTS)
             title = f"{n} agents, {law}, {FLIGHTS:,} flights"
             note = (
                 f"median {np.median(ours.evaluations):.0f} evaluations; positions agree to"
