@@ -129,14 +129,15 @@ def _turn_line(x: Array, p: Array, axis: Array, near: Array) -> Array:
 def mean_axis_rates(x: Array, y: Array, masses: Array) -> Array:
     """Angular velocity omega = I^+ h (K, 3) [rad/s], world axes, of agents about their CM.
 
-    x, y (K, N, 3): positions and velocities about the CM [m, m/s].
+    x, y (K, N, 3): positions and velocities about the CM [m, m/s]; masses (N,) or (K, N).
     """
-    if len(masses) == 1:
-        return np.zeros((len(x), 3))  # of a point; not what rounding makes of it
-    h = np.einsum("i,kia->ka", masses, np.cross(x, y))
-    C = np.einsum("i,kia,kib->kab", masses, x, x)
+    masses = np.broadcast_to(masses, x.shape[:2])
+    h = np.einsum("ki,kia->ka", masses, np.cross(x, y))
+    C = np.einsum("ki,kia,kib->kab", masses, x, x)
     inertia = np.trace(C, axis1=1, axis2=2)[:, None, None] * np.eye(3) - C
-    return np.einsum("kab,kb->ka", np.linalg.pinv(inertia, 1e-9, hermitian=True), h)
+    omega = np.einsum("kab,kb->ka", np.linalg.pinv(inertia, 1e-9, hermitian=True), h)
+    # Of a point none; not what rounding makes of it.
+    return np.where(np.count_nonzero(masses, axis=1)[:, None] > 1, omega, 0.0)
 
 
 def smallest_singular_value(r: Array, edges: Ints, masses: ArrayLike | None = None) -> Array:

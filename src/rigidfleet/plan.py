@@ -61,7 +61,8 @@ def plan_phase(mission: Mission, phase: Phase, now: Situation, t_end: float) -> 
         d1 = np.array([now.reference.get(e, d) for e, d in zip(_keys(edges), d1, strict=True)])
     d0 = np.array([now.reference.get(e, _distance(now.r, e)) for e in _keys(edges)])
     # Slots are blended wherever the shape leads; where distances lead, slots only follow if tracked.
-    before = now.slots if now.slots is not None else about_cm(now.r, masses)
+    left = masses if now.lost is None else np.where(now.lost, 0.0, masses)
+    before = now.slots if now.slots is not None else about_cm(now.r, left)
     after = target if shaping and target is not None else before
     kind, T_b = k.CONSTANT, 0.0
     if shaping:
@@ -98,6 +99,7 @@ def plan_phase(mission: Mission, phase: Phase, now: Situation, t_end: float) -> 
         feedback=feedback,
         control=_control(mission, phase, masses),
         external=0,
+        disturbance=k.calm(masses),
     )  # fmt: skip
     slots = (
         after if phase.control != "open" or kind == k.SLOTS else target if shaping else now.slots

@@ -126,8 +126,8 @@ def _model_at(owner: type[Part], key: object) -> type[Part]:
 
 
 def _models(annotation: Any) -> Iterator[type[Part]]:
-    """Models in an annotation such as `Settle | None`."""
-    if get_origin(annotation) in (Union, UnionType, Annotated):
+    """Models in an annotation such as `Settle | None` or `tuple[Lost, ...]`."""
+    if get_origin(annotation) in (Union, UnionType, Annotated, tuple):
         for choice in get_args(annotation):
             yield from _models(choice)
     elif isinstance(annotation, type) and issubclass(annotation, Part):
