@@ -761,7 +761,7 @@ class _Files:
 
         return [
             self.folder / "figures" / f"{name}.{kind}"
-            for name in figure_names()
+            for name in figure_names(disturbed=True)
             for kind in ("png", "svg")
         ]
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from rigidfleet import turbulence
 from rigidfleet.kernel import program as k
 from rigidfleet.mission import Establish, Gusts, Mission
-from rigidfleet.mission.disturbances import gust_step
+from rigidfleet.mission.disturbances import gust_step, intensity
 
 if TYPE_CHECKING:
     from rigidfleet.kernel.program import Array
@@ -71,14 +71,12 @@ def _gusts(mission: Mission, gusts: Gusts, wind: Array, step: float) -> Array:
         )
     else:
         white = turbulence.correlate_evenly(white, gusts.correlation or 0.0)
-    sigma = np.broadcast_to(np.array(gusts.intensity or 0.0), 3)
     if gusts.model == "first-order":
-        assert gusts.time_scale is not None  # checked on entry, as is the intensity
+        assert gusts.time_scale is not None  # checked on entry
         u = turbulence.first_order(white[:, 0], step, gusts.time_scale)
     else:
         if gusts.altitude is not None:
-            usual, length = turbulence.low_altitude(gusts.altitude, speed)
-            sigma = usual if gusts.intensity is None else sigma
+            _, length = turbulence.low_altitude(gusts.altitude, speed)
         else:
             length = np.broadcast_to(np.array(gusts.length, dtype=np.float64), 3)
         tau = length / (gusts.airspeed or speed)
@@ -86,7 +84,7 @@ def _gusts(mission: Mission, gusts: Gusts, wind: Array, step: float) -> Array:
         u[..., 0] = turbulence.first_order(white[:, 0, :, 0], step, tau[0])
         for axis in (1, 2):
             u[..., axis] = turbulence.second_order(white[..., axis], step, tau[axis])
-    return (sigma * u) @ _wind_axes(wind)
+    return (intensity(gusts, speed) * u) @ _wind_axes(wind)
 
 
 def _wind_axes(wind: Array) -> Array:

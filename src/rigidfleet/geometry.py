@@ -16,6 +16,8 @@ Ints = NDArray[np.int64]
 
 # Slots thinner than this, relative to their length, are a line to an attitude fit.
 _THIN = 1e-3
+# Narrower ones than this are a line where they are not so many times wider than agents are off them.
+_NARROW, _SURE = 0.1, 4.0
 # Beyond so many agents the closest two are found by a tree, not among all pairs.
 _MANY = 200
 # Numbers in a temporary array at most.
@@ -79,8 +81,13 @@ def clearance(
     return least, agent, obstacle
 
 
-def fit_attitudes(x: Array, p: Array, masses: Array, near: Array) -> Array:
+def fit_attitudes(
+    x: Array, p: Array, masses: Array, near: Array
+) -> tuple[Array, NDArray[np.bool_]]:
     """Attitude T (K, 3, 3), world -> body, of slots fitted to agents at each of K samples (Kabsch).
+
+    Also returns where the slots are one line (K,). So are slots that are narrower than agents are off them: how
+    those lie about their long axis is chance.
 
     Parameters
     ----------
@@ -94,17 +101,20 @@ def fit_attitudes(x: Array, p: Array, masses: Array, near: Array) -> Array:
     U[:, :, 2] *= np.sign(np.linalg.det(U @ Vt))[:, None]
     T = U @ Vt
     guess = near[0] if near.ndim == 3 else near
-    _, spread, axes = np.linalg.svd(np.sqrt(masses)[:, None] * p, full_matrices=False)
-    flat = np.zeros(len(p), dtype=bool) if p.shape[1] > 1 else np.ones(len(p), dtype=bool)
-    if p.shape[1] > 1:
-        flat = spread[:, 1] <= _THIN * spread[:, 0]
+    weights = np.sqrt(masses)[:, None]
+    _, spread, axes = np.linalg.svd(weights * p, full_matrices=False)
+    width = spread[:, 1] if p.shape[1] > 1 else np.zeros(len(p))
+    line = width <= _THIN * spread[:, 0]
+    narrow = width <= _NARROW * spread[:, 0]
     for k in range(len(p)):
-        if flat[k]:
+        if narrow[k]:
             if near.ndim == 3:
                 guess = near[k]
-            T[k] = _turn_line(x[k], p[k], axes[k, 0], guess)
+            along = _turn_line(x[k], p[k], axes[k, 0], guess)
+            line[k] |= width[k] <= _SURE * np.linalg.norm(weights * (x[k] - p[k] @ along))
+            T[k] = along if line[k] else T[k]
         guess = T[k]
-    return T
+    return T, line
 
 
 def _turn_line(x: Array, p: Array, axis: Array, near: Array) -> Array:
@@ -126,16 +136,19 @@ def _turn_line(x: Array, p: Array, axis: Array, near: Array) -> Array:
     return near @ R.T
 
 
-def mean_axis_rates(x: Array, y: Array, masses: Array) -> Array:
+def mean_axis_rates(x: Array, y: Array, masses: Array, line: ArrayLike = False) -> Array:
     """Angular velocity omega = I^+ h (K, 3) [rad/s], world axes, of agents about their CM.
 
-    x, y (K, N, 3): positions and velocities about the CM [m, m/s]; masses (N,) or (K, N).
+    x, y (K, N, 3): positions and velocities about the CM [m, m/s]; masses (N,) or (K, N); line (K,):
+    where they are one, and have no spin about themselves. That of a line bent by some centimetres would be noise.
     """
     masses = np.broadcast_to(masses, x.shape[:2])
     h = np.einsum("ki,kia->ka", masses, np.cross(x, y))
     C = np.einsum("ki,kia,kib->kab", masses, x, x)
     inertia = np.trace(C, axis1=1, axis2=2)[:, None, None] * np.eye(3) - C
-    omega = np.einsum("kab,kb->ka", np.linalg.pinv(inertia, 1e-9, hermitian=True), h)
+    cutoff = np.broadcast_to(np.where(line, _NARROW**2, 1e-9), len(x))
+    pseudo = np.linalg.pinv(inertia, cutoff, hermitian=True)
+    omega = np.einsum("kab,kb->ka", pseudo, h)
     # Of a point none; not what rounding makes of it.
     return np.where(np.count_nonzero(masses, axis=1)[:, None] > 1, omega, 0.0)
 

@@ -61,7 +61,7 @@ def assemble(
     x, y = r - cm[:, None], v - cm_velocity[:, None]
     slots = joined("p")
     centre = np.einsum("ki,kia->ka", masses, slots) / M  # of those left; else the body's origin
-    attitude = _attitudes(
+    attitude, line = _attitudes(
         pieces, x, slots - centre[:, None], masses, framed=mission.body_frame is not None
     )
     T = np.full((len(r), 3, 3), np.nan)
@@ -71,7 +71,7 @@ def assemble(
     attitude_reference = np.full((len(r), 4), np.nan)
     commanded = np.isfinite(T_ref[:, 0, 0])
     attitude_reference[commanded] = att.quaternion_from_dcm(T_ref[commanded])
-    omega = geometry.mean_axis_rates(x, y, masses)
+    omega = geometry.mean_axis_rates(x, y, masses, line)
     lacking = attached & ~left.all(axis=1)
     offset = np.einsum("kab,ka->kb", T[lacking], centre[lacking])
     cm[lacking] -= offset
@@ -82,6 +82,7 @@ def assemble(
     separation, pair, clearance, agent, obstacle = _closeness(mission, r, left)
     edges = mission.edges
     distance = np.linalg.norm(r[:, edges[:, 0]] - r[:, edges[:, 1]], axis=2)
+    distance[~left[:, edges].all(axis=2)] = np.nan
     reference = _by_edge(pieces, "d", edges)
     noisy = mission.disturbances is not None and mission.disturbances.noise is not None
     return Result(
@@ -149,12 +150,14 @@ def _closeness(mission: Mission, r: Array, left: NDArray[np.bool_]) -> tuple[Any
 
 def _attitudes(
     pieces: Sequence[Piece], x: Array, p: Array, masses: Array, *, framed: bool
-) -> Array:
+) -> tuple[Array, NDArray[np.bool_]]:
     """Attitude quaternions (K, 4) of the formation's slots p (K, N, 3), fitted to x by masses (K, N).
+
+    And where the slots are a line (K,).
 
     Without slots, that of the integrated frame, if the mission attaches one (``framed``).
     """
-    quaternions = np.full((len(x), 4), np.nan)
+    quaternions, line = np.full((len(x), 4), np.nan), np.zeros(len(x), dtype=np.bool_)
     last = np.eye(3)
     start = 0
     for piece in pieces:
@@ -167,10 +170,10 @@ def _attitudes(
         near = piece.record.T_ref
         if np.isnan(near[0, 0, 0]):
             near = last
-        T = geometry.fit_attitudes(x[rows], p[rows], masses[rows.start], near)
+        T, line[rows] = geometry.fit_attitudes(x[rows], p[rows], masses[rows.start], near)
         last = T[-1]
         quaternions[rows] = att.quaternion_from_dcm(T)
-    return att.unwrap_quaternion(quaternions)
+    return att.unwrap_quaternion(quaternions), line
 
 
 def _by_edge(pieces: Sequence[Piece], name: str, edges: Ints) -> Array:

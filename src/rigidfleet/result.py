@@ -266,6 +266,11 @@ class Result:
             message = f"the mission inside the result cannot be read (it was made by rigidfleet {made}):\n{error}"
             raise ResultError(message) from error
 
+    @cached_property
+    def left(self) -> NDArray[np.bool_]:
+        """Which agents are left (K, N): not lost by then, as the mission has it."""
+        return self.time[:, None] <= self.mission.lost_at
+
     def samples(self, phase: int) -> slice:
         """Samples of a phase (index from 0; negative ones from the end), empty if it was never reached."""
         index = range(len(self.phases))[phase]
