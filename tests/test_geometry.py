@@ -329,3 +329,33 @@ def test_ranks_are_pyrigis(name):
     # Planar and straight shapes lose rank: at most 2 N - 3 and N - 1 of what a generic shape has.
     dimension = formation.dimension(r)
     assert rank <= {1: n - 1, 2: 2 * n - 3, 3: 3 * n - 6}[dimension]
+
+
+def test_a_bent_line_has_no_attitude_about_itself():
+    """Slots a tenth as wide as agents are off them lie as expected about their axis, and spin about it by nothing."""
+    rng = np.random.default_rng(5)
+    p = np.array([[-4.0, 0.02, 0], [0, -0.04, 0], [4, 0.02, 0]])
+    T = Rotation.random(20, random_state=rng).as_matrix()
+    off = rng.normal(size=(20, 3, 3)) * 0.2
+    x = np.einsum("kba,ib->kia", T, p) + off
+    x -= x.mean(axis=1, keepdims=True)
+    found, line = geometry.fit_attitudes(x, np.broadcast_to(p, x.shape), np.ones(3), T)
+    assert line.all()
+    away = np.einsum("kab,kcb->kac", found, T)
+    assert np.degrees(np.arccos((np.trace(away, axis1=1, axis2=2) - 1) / 2)).max() < 10
+    y = rng.normal(size=x.shape)
+    omega = geometry.mean_axis_rates(x, y - y.mean(axis=1, keepdims=True), np.ones(3), line)
+    axis = np.linalg.svd(x)[2][:, 0]
+    assert np.abs(np.einsum("ka,ka->k", omega, axis)).max() < 1e-9
+
+
+def test_a_narrow_shape_that_fits_keeps_its_attitude():
+    """Narrow slots that agents are on, to a hundredth of the width, are no line: their roll is found."""
+    rng = np.random.default_rng(6)
+    p = np.array([[-4.0, 0.1, 0], [0, -0.2, 0], [4, 0.1, 0]])
+    T = Rotation.random(20, random_state=rng).as_matrix()
+    x = np.einsum("kba,ib->kia", T, p) + rng.normal(size=(20, 3, 3)) * 1e-3
+    x -= x.mean(axis=1, keepdims=True)
+    found, line = geometry.fit_attitudes(x, np.broadcast_to(p, x.shape), np.ones(3), T)
+    assert not line.any()
+    np.testing.assert_allclose(found, T, rtol=0, atol=0.03)

@@ -86,8 +86,8 @@ def fit_attitudes(
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Attitude T (K, 3, 3), world -> body, of slots fitted to agents at each of K samples (Kabsch).
 
-    Also returns where the slots are one line (K,). So are slots that are narrower than agents are off them: how
-    those lie about their long axis is chance.
+    Also returns where the slots are one line (K,). So are narrow slots, if the attitude expected is known, where
+    agents are off them by more than their width: how those lie about their long axis is chance.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ def fit_attitudes(
     line = width <= _THIN * spread[:, 0]
     narrow = width <= _NARROW * spread[:, 0]
     for k in range(len(p)):
-        if narrow[k]:
+        if line[k] or (narrow[k] and near.ndim == 3):
             if near.ndim == 3:
                 guess = near[k]
             along = _turn_line(x[k], p[k], axes[k, 0], guess)

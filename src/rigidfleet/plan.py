@@ -70,9 +70,7 @@ def plan_phase(mission: Mission, phase: Phase, now: Situation, t_end: float) -> 
         kind = {"shape": k.SLOTS, "distances": k.SQUARED, "step": k.CONSTANT}[phase.reference]
     elif phase.control == "slots" and np.allclose(d1, shapes.distances(before, edges), rtol=1e-12):
         kind = k.SLOTS
-    dp, turn = (
-        align_slots(before, after, masses) if shaping else (np.zeros_like(before), np.zeros(3))
-    )
+    dp, turn = align_slots(before, after, left) if shaping else (np.zeros_like(before), np.zeros(3))
     reference = k.Reference(kind, now.t, T_b, d0, d1, before, dp, turn)
 
     goal, arrival = goal_of(phase, now, t_end)

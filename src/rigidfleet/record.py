@@ -170,7 +170,10 @@ def _attitudes(
         near = piece.record.T_ref
         if np.isnan(near[0, 0, 0]):
             near = last
-        T, line[rows] = geometry.fit_attitudes(x[rows], p[rows], masses[rows.start], near)
+        who = masses[rows.start] > 0.0
+        T, line[rows] = geometry.fit_attitudes(
+            x[rows][:, who], p[rows][:, who], masses[rows.start, who], near
+        )
         last = T[-1]
         quaternions[rows] = att.quaternion_from_dcm(T)
     return att.unwrap_quaternion(quaternions), line

@@ -97,9 +97,10 @@ def attach(
         pose = Pose(masses @ now.r / masses.sum(), masses @ now.v / masses.sum(), T, np.zeros(3))
         pose.omega = body_rates(now.r, now.v, masses, T)
         if now.lost is not None and fit is not None:
-            centre = T.T @ (masses @ fit / masses.sum())  # of those left, from the body's origin
-            pose.r = pose.r - centre
-            pose.v = pose.v - np.cross(T.T @ pose.omega, centre)
+            centre = masses @ fit / masses.sum()  # of those left, from the body's origin
+            pose.r = pose.r - T.T @ centre
+            pose.v = pose.v - T.T @ np.cross(pose.omega, centre)
+            x = x + T.T @ centre
     slots = now.slots if now.slots is not None else x @ pose.T.T
     goal = now.goal or replace(pose, v=np.zeros(3), omega=np.zeros(3))
     if isinstance(phase, Establish) and target is not None:

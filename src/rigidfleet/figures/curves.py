@@ -380,12 +380,11 @@ def shape_error(result: Result) -> Floats:
         if slots is None or len(slots) < 2 or rows.start == rows.stop:
             continue
         r = np.where(result.left[rows, :, None], result.position[rows], np.nan)
-        worst = np.zeros(len(r))
+        worst = np.full(len(r), np.nan)
         for i in range(len(slots) - 1):
             flown = np.linalg.norm(r[:, i + 1 :] - r[:, i : i + 1], axis=2)
             asked = np.linalg.norm(slots[i + 1 :] - slots[i], axis=1)
-            off = np.abs(flown - asked)
-            worst = np.maximum(worst, np.where(np.isfinite(off), off, 0.0).max(axis=1))
+            worst = np.fmax(worst, np.fmax.reduce(np.abs(flown - asked), axis=1))
         error[rows] = worst
     return error
 

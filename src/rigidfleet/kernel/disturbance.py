@@ -19,9 +19,9 @@ def spline(t, step, table, out):
     Twice continuously differentiable; constant before the first and behind the last knot.
     """
     last = table.shape[0] - 4
-    x = max(t / step, 0.0)
+    x = min(max(t / step, 0.0), last + 1.0)
     j = min(int(x), last)
-    s = min(x - j, 1.0)
+    s = x - j
     rest = 1.0 - s
     b0, b3 = rest * rest * rest / 6.0, s * s * s / 6.0
     b1 = 2.0 / 3.0 - s * s * (1.0 - 0.5 * s)
