@@ -205,7 +205,8 @@ def workspace(n: int, m: int, *, with_h: bool = False, solver: int | None = None
     edge = lambda: zeros(m)  # noqa: E731
     k = 3 * n if with_h else 0
     return Workspace(
-        r=agent(), v=agent(), r_seen=agent(), v_seen=agent(), u=zeros(m, 3), L=edge(), d=edge(), d_dot=edge(), d_ddot=edge(),
+        r=agent(), v=agent(), r_seen=agent(), v_seen=agent(), u=zeros(m, 3), L=edge(),
+        d=edge(), d_dot=edge(), d_ddot=edge(),
         c=edge(), b=edge(), A=zeros(size, size), V=zeros(vectors, vectors), w=edge(), multiplier=edge(),
         f_E=agent(), f_u=agent(), f_C=agent(), f_D=agent(), a=agent(), p=agent(), p_dot=agent(),
         p_ddot=agent(), r_ref=agent(), v_ref=agent(), a_ref=agent(), cm=zeros(5, 3),
@@ -219,7 +220,7 @@ def workspace(n: int, m: int, *, with_h: bool = False, solver: int | None = None
 def calm(masses: Array) -> Disturbance:
     """No disturbance of agents with these masses (N,) [kg]."""
     n = len(masses)
-    none = np.zeros((0, n, 3))
+    none = zeros(0, n, 3)
     return Disturbance(
         False, masses, np.zeros(n), np.zeros(3), 1.0, none, 1.0, none, none, np.zeros(n, dtype=np.bool_),
         np.full(n, -np.inf),
