@@ -26,7 +26,7 @@ from rigidfleet.formation import Floats, Ints
 #: No quantity in SI units is larger here, and the sixth power of a length is still a float.
 HUGE = 1e15
 #: Drag of a vehicle for each kg of its mass [1/s]. At the speeds of formation flight that of rotors leads, which is
-#: linear in the speed; flights identified 0.54 and 0.39 /s along two axes of a quadrotor (Faessler, Franchi,
+#: linear in the speed; flights identified some 0.4 to 0.5 /s along two axes of a quadrotor (Faessler, Franchi,
 #: Scaramuzza, Robotics and Automation Letters 3, 2018), and a vehicle with more mass on each rotor has less.
 DRAG = 0.3
 
