@@ -82,7 +82,8 @@ def assemble(
     separation, pair, clearance, agent, obstacle = _closeness(mission, r, left)
     edges = mission.edges
     distance = np.linalg.norm(r[:, edges[:, 0]] - r[:, edges[:, 1]], axis=2)
-    distance[~left[:, edges].all(axis=2)] = np.nan
+    if not left.all():
+        distance[~left[:, edges].all(axis=2)] = np.nan
     reference = _by_edge(pieces, "d", edges)
     noisy = mission.disturbances is not None and mission.disturbances.noise is not None
     return Result(

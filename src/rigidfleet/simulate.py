@@ -359,7 +359,8 @@ class Flight:
         low, high = math.floor(t / step + 1e-9) + 1, math.floor(t_end / step + 1e-9) + 1
         grid = np.minimum(np.arange(low, high) * step, t_end)
         # The two ends of a phase count, its arrival, and losses.
-        for exact in (leg.plan.arrival, leg.t_end, *self.mission.lost_at):
+        lost = self.mission.lost_at
+        for exact in (leg.plan.arrival, leg.t_end, *lost[np.isfinite(lost)]):
             if t < exact <= t_end:
                 grid = np.sort(np.append(grid[abs(grid - exact) > 1e-9 * step], exact))
         start = [t if t == 0.0 else np.nextafter(t, math.inf)] if first else []
