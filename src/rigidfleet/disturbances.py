@@ -35,6 +35,7 @@ def disturbance(mission: Mission) -> k.Disturbance:
     out = calm._replace(
         active=True,
         m=mission.true_mass,
+        inverse=1.0 / mission.true_mass,
         drag=mission.drag,
         wind=wind,
         floor=max(grounds, default=-math.inf) + np.array(mission.agents.radius),
@@ -109,7 +110,7 @@ def without(program: k.Program, edges: NDArray[np.bool_], lost: NDArray[np.bool_
     m = np.where(lost, NOTHING, program.vehicles.m)
     reference, control = program.reference, program.control
     return program._replace(
-        vehicles=program.vehicles._replace(m=m, M=float(m.sum())),
+        vehicles=program.vehicles._replace(m=m, inverse=1.0 / m, M=float(m.sum())),
         graph=k.graph(program.graph.edges[edges], m),
         reference=reference._replace(d0=reference.d0[edges], d1=reference.d1[edges]),
         control=control._replace(force=np.where(lost[:, None], 0.0, control.force)),

@@ -113,8 +113,9 @@ class Disturbance(NamedTuple):
     Gusts and noise are cubic B-splines over time, by their coefficients; empty where there are none.
     """
 
-    active: bool  # whether there is any; `m` counts always
+    active: bool  # whether there is any; `inverse` counts always
     m: Array  # (N,) true mass [kg]
+    inverse: Array  # (N,) of it [1/kg]
     drag: Array  # (N,) [N s/m]
     wind: Array  # (3,) steady, world [m/s]
     gust_step: float  # between knots [s]
@@ -222,7 +223,7 @@ def calm(masses: Array) -> Disturbance:
     n = len(masses)
     none = zeros(0, n, 3)
     return Disturbance(
-        False, masses, np.zeros(n), np.zeros(3), 1.0, none, 1.0, none, none, np.zeros(n, dtype=np.bool_),
+        False, masses, 1.0 / masses, np.zeros(n), np.zeros(3), 1.0, none, 1.0, none, none, np.zeros(n, dtype=np.bool_),
         np.full(n, -np.inf),
     )  # fmt: skip
 
