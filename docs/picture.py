@@ -9,7 +9,10 @@ from diagrams import DIAGRAMS
 from PIL import Image
 
 import rigidfleet as rf
+from rigidfleet.figures import write_figure
 from rigidfleet.figures.style import settings
+from rigidfleet.sweep import Sweep, fly
+from rigidfleet.sweep.figures import over_two
 
 IMAGES = Path(__file__).parent / "images"
 MISSION = "narrow-passage"
@@ -20,9 +23,24 @@ def flight() -> None:
     result = rf.simulate(rf.load_mission(MISSION))
     with TemporaryDirectory() as folder:
         (path,) = rf.plot(result, folder, formats=["png"], names=["summary"])
-        # A palette makes a third of the size; without refining it (kmeans), greys come out tinted.
-        picture = Image.open(path).convert("RGB").quantize(256, kmeans=5, dither=Image.Dither.NONE)
-    picture.save(IMAGES / f"{MISSION}.png", optimize=True)
+        _save_with_few_colours(path, MISSION)
+
+
+def study() -> None:
+    """The map of the example of a sweep."""
+    sweep = Sweep.load(IMAGES.parents[1] / "examples" / "gain_study.toml")
+    with TemporaryDirectory() as folder:
+        table = fly(sweep, folder, workers=1)
+        figure = over_two(table, ["constraint.alpha", "constraint.gamma"], "shape_end")
+        assert figure is not None
+        (path,) = write_figure(figure, Path(folder), "map", ["png"])
+        _save_with_few_colours(path, "gain-study")
+
+
+def _save_with_few_colours(path: Path, name: str) -> None:
+    # A palette makes a third of the size; without refining it (kmeans), greys come out tinted.
+    picture = Image.open(path).convert("RGB").quantize(256, kmeans=5, dither=Image.Dither.NONE)
+    picture.save(IMAGES / f"{name}.png", optimize=True)
 
 
 def drawings() -> None:
@@ -40,4 +58,5 @@ def drawings() -> None:
 if __name__ == "__main__":
     IMAGES.mkdir(exist_ok=True)
     flight()
+    study()
     drawings()

@@ -43,12 +43,13 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
     for source, uri in COPIES.items():
         add(uri, (ROOT / source).read_text(encoding="utf-8"))
-    for path in sorted((ROOT / "examples").glob("*.py")):
+    languages = {".py": "python", ".toml": "toml"}
+    for path in sorted(p for p in (ROOT / "examples").iterdir() if p.suffix in languages):
         text = path.read_text(encoding="utf-8")
         title = path.stem.replace("_", " ").capitalize()
         add(
             _page_of(f"examples/{path.name}"),
-            f'# {title}\n\n```python title="examples/{path.name}"\n{text}```\n',
+            f'# {title}\n\n```{languages[path.suffix]} title="examples/{path.name}"\n{text}```\n',
         )
     for path in sorted((ROOT / "examples" / "notebooks").glob("*.py")):
         pictures: dict[str, bytes] = {}
@@ -62,7 +63,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def _page_of(source: str) -> str:
-    return source.removesuffix(".py") + ".md"
+    return posixpath.splitext(source)[0] + ".md"
 
 
 @cache
@@ -172,7 +173,9 @@ def _uri(path: str) -> str | None:
         return COPIES[path]
     if path.startswith("docs/"):
         return path.removeprefix("docs/")
-    return _page_of(path) if path.startswith("examples/") and path.endswith(".py") else None
+    return (
+        _page_of(path) if path.startswith("examples/") and path.endswith((".py", ".toml")) else None
+    )
 
 
 # -- formulas ----------------------------------------------------------------------------------------

@@ -1,8 +1,8 @@
-"""Write the tables of missions.md: the keys of a mission file and the variables of a result.
+"""Write the tables of missions.md and sweep.md: keys of a mission file, variables of a result, metrics.
 
 `python docs/tables.py` rewrites them in place, each between `<!-- table: NAME -->` and `<!-- end -->`;
 tests/test_docs.py fails where they are out of date. NAME is a table of the JSON schema; `A-B` the keys of A
-which B lacks; `shapes` and `result` what their names say.
+which B lacks; `shapes`, `result` and `metrics` what their names say.
 """
 
 import json
@@ -13,8 +13,9 @@ from typing import Any
 from rigidfleet.formation import SHAPES, agents_taken
 from rigidfleet.mission import json_schema
 from rigidfleet.result import LABELS, VARIABLES
+from rigidfleet.sweep import METRICS
 
-PAGE = Path(__file__).with_name("missions.md")
+PAGES = [Path(__file__).with_name(name) for name in ("missions.md", "sweep.md")]
 
 
 def render(page: str) -> str:
@@ -23,7 +24,7 @@ def render(page: str) -> str:
 
     def table(match: re.Match[str]) -> str:
         name = match[1]
-        special = {"result": _result, "shapes": _shapes}
+        special = {"result": _result, "shapes": _shapes, "metrics": _metrics}
         text = special[name]() if name in special else _keys(schema, name)
         return f"<!-- table: {name} -->\n{text}\n<!-- end -->"
 
@@ -122,10 +123,17 @@ def _result() -> str:
     return f"{_table(('variable', 'dimensions', 'unit', 'meaning'), rows)}\n\n{along}."
 
 
+def _metrics() -> str:
+    """The metrics of a sweep: name, unit, meaning."""
+    rows = [(f"`{name}`", m.unit, m.text.replace("|", "\\|")) for name, m in METRICS.items()]
+    return _table(("metric", "unit", "meaning"), rows)
+
+
 def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
     lines = [head, ("---",) * len(head), *rows]
     return "\n".join(f"| {' | '.join(row)} |" for row in lines)
 
 
 if __name__ == "__main__":
-    PAGE.write_text(render(PAGE.read_text(encoding="utf-8")), encoding="utf-8")
+    for page in PAGES:
+        page.write_text(render(page.read_text(encoding="utf-8")), encoding="utf-8")

@@ -45,7 +45,7 @@ def anchors(text: str) -> set[str]:
 
 
 def test_tables_are_up_to_date():
-    """The keys of the format and the variables of a result are those of the code.
+    """The keys of the format, the variables of a result and the metrics of a sweep are those of the code.
 
     If this fails: python docs/tables.py
     """
@@ -54,7 +54,8 @@ def test_tables_are_up_to_date():
     assert spec.loader is not None
     tables = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(tables)
-    assert page("missions.md") == tables.render(page("missions.md"))
+    for path in tables.PAGES:
+        assert page(path.name) == tables.render(page(path.name))
 
 
 def test_first_mission_flies():
@@ -135,6 +136,32 @@ def test_controller_page(capsys):
     assert "Passed" in calm
     (miss,) = re.findall(r"missed, (\S+) m off", windy)
     assert float(miss) == pytest.approx(1 / 3, abs=0.05)
+
+
+# -- sweep.md ----------------------------------------------------------------------------------------
+
+
+def test_sweep_page(tmp_path, monkeypatch, capsys):
+    """The lines, the file and the code of the page on sweeps are right, and fly."""
+    from rigidfleet.cli import main
+    from rigidfleet.sweep import Sweep
+
+    monkeypatch.chdir(tmp_path)
+    text = page("sweep.md")
+    lines = re.findall(r"^    (\S+ \S?= .*?\))(?:  .*)?$", text, re.MULTILINE)
+    assert len(lines) == 7
+    Sweep.of("narrow-passage", lines, runs=1)
+    (file,) = blocks(text, "toml")
+    Path("study.toml").write_text(file, encoding="utf-8")
+    assert main(["sweep", "study.toml", "--runs", "4", "--workers", "1", "--no-figures"]) == 0
+    names: dict[str, object] = {}
+    for code in blocks(text, "python"):
+        exec(compile(code, "sweep.md", "exec"), names)
+    assert "\nN " in capsys.readouterr().out
+    kinds = re.findall(r"`([\w-]+)\((?:mean|low|a)", text)
+    from rigidfleet.sweep.variation import KINDS
+
+    assert set(kinds) == set(KINDS)
 
 
 # -- paper.md ----------------------------------------------------------------------------------------
@@ -228,7 +255,17 @@ def test_commands_are_documented(capsys):
 
     text = page("missions.md").split("\n## Commands")[1].split("\n## ")[0]
     options = set()
-    for command in ("run", "missions", "check", "design", "new", "report", "replay", "live"):
+    for command in (
+        "run",
+        "missions",
+        "check",
+        "design",
+        "new",
+        "report",
+        "replay",
+        "live",
+        "sweep",
+    ):
         assert f"`rigidfleet {command}" in text
         main([command, "--help"])
         options |= set(re.findall(r"--[a-z][\w-]*", capsys.readouterr().out))

@@ -250,6 +250,22 @@ def test_quintic_pieces_reproduce_a_quintic():
                 assert joint == pytest.approx(z[i + 1, j], rel=1e-12, abs=1e-12)
 
 
+def test_what_is_kept_is_not_handed_out():
+    """What a caller does with a result changes no later one; other weights, other results."""
+    weights = ([1.0, 1.0], 1.0, S)
+    first = knots(3.0, *weights)
+    kept = first.copy()
+    first[:] = -1.0
+    assert knots(3.0, *weights) == pytest.approx(kept, abs=0)
+    start = np.eye(2)
+    x, u = closed_loop_response(A, B, *weights, 3.0, start, kept)
+    before = x.copy()
+    x[:], u[:] = 0.0, 0.0
+    assert closed_loop_response(A, B, *weights, 3.0, start, kept)[0] == pytest.approx(before, abs=0)
+    stiffer = closed_loop_response(A, B, [1.0, 1.0], 0.1, S, 3.0, start, kept)[0]
+    assert np.abs(stiffer - before).max() > 0.1
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [

@@ -5,7 +5,8 @@ error. Colours and animation are for terminals, and `NO_COLOR` is respected.
 
 Exit codes
 ----------
-- 0: done; for `run` and `report`: the flight passed its verdict
+- 0: done; for `run` and `report`: the flight passed its verdict; for `sweep`: every run is flown,
+  passed or not
 - 1: flew, but failed its verdict, as a flight does that could not be flown to its end; for `check`:
   something will fail
 - 2: bad input, or files that cannot be read or written
@@ -43,6 +44,7 @@ if TYPE_CHECKING:
     from rigidfleet.mission import Mission
     from rigidfleet.result import Result
     from rigidfleet.simulate import Progress
+    from rigidfleet.sweep import Sweep, SweepProgress
 
 PASSED, FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 
@@ -631,6 +633,153 @@ def _number(text: str) -> float:
         raise ValueError(f"'{text}' is no number.") from None
 
 
+@app.command(sort_key=9)
+def sweep(
+    mission: str,
+    /,
+    *,
+    vary: list[str] | None = None,
+    runs: int | None = None,
+    seed: int | None = None,
+    out: Path | None = None,
+    force: bool = False,
+    workers: int | None = None,
+    cluster: str | None = None,
+    summary: bool = False,
+    map_: Annotated[tuple[str, str] | None, Parameter(name="--map")] = None,
+    metric: str = "",
+    no_figures: bool = False,
+    json: bool = False,
+    quiet: bool = False,
+) -> int:
+    """Fly a mission many times, varied: how many flights pass, and what makes others fail.
+
+    Stopped at any moment, even by kill -9, the same command goes on where it was.
+
+    Parameters
+    ----------
+    mission : str
+        A mission, a sweep file, or the folder of a sweep, to go on with it.
+    vary : str
+        What varies: "PATH = KIND(NUMBERS)", with += to add to and *= to scale what the mission has; may be
+        repeated. KIND is normal, uniform, log-uniform, choice, grid, linspace or geomspace.
+    runs : int
+        Number of runs; one for each point of the grid if not given. More may be added later.
+    seed : int
+        Seed of the random numbers, 0 if not given.
+    out : Path
+        Folder for sweep.db, summary.json and figures/; sweeps/NAME if not given.
+    force : bool
+        Replace another sweep in that folder; without it, it is kept and nothing is flown.
+    workers : int
+        Processes on this machine; as many as it has cores if not given.
+    cluster : str
+        Address of a Dask scheduler, whose workers fly instead.
+    summary : bool
+        Fly nothing; sum up and draw again the sweep of a folder.
+    map_ : str
+        The two paths that the map is drawn over.
+    metric : str
+        What the map shows: success or a metric.
+    no_figures : bool
+        Draw no figures.
+    json : bool
+        Print the summary as JSON.
+    quiet : bool
+        Print nothing but errors, and the JSON if asked for.
+    """
+    from rigidfleet.sweep import store
+    from rigidfleet.sweep.summary import summarise
+
+    if workers is not None and workers < 1:
+        raise RigidfleetError(f"--workers = {workers}: must be at least 1.")
+    if summary:
+        folder = Path(mission)
+        table = store.read(folder)
+    else:
+        asked, folder = _asked(mission, vary or [], runs, seed, out)
+        watch = None if quiet else _SweepWatch()
+        try:
+            with watch or nullcontext(), _heeding_interrupts():
+                table = _fly_sweep(asked, folder, workers, cluster, force, watch)
+        except KeyboardInterrupt:
+            done = len(store.read(folder).run) if store.is_store(folder) else 0
+            words = f"Interrupted: {done} of {asked.runs} runs are kept in {folder}"
+            again = f"Go on by: rigidfleet sweep {folder}"
+            _err().print(f"{words}\n{again}", style="yellow", soft_wrap=True)
+            return INTERRUPTED
+    found = summarise(table)
+    from rigidfleet.result import write_file
+
+    write_file(folder / "summary.json", (found.json() + "\n").encode())
+    if json:
+        _print_exactly(found.json() + "\n")
+    elif not quiet:
+        console = _out() if _out().is_terminal else _console(stderr=False, width=_WIDE)
+        console.print(found)
+    drawn: list[Path] = []
+    if not no_figures:
+        from rigidfleet.sweep.figures import plot
+
+        shown = _err().is_interactive and not quiet
+        with _err().status("Drawing the figures") if shown else nullcontext():
+            drawn = plot(table, folder / "figures", over=map_ or (), metric=metric)
+    if not (json or quiet):
+        _out().print(f"\nRuns     {folder / store.FILE}", soft_wrap=True)
+        _out().print(f"Summary  {folder / 'summary.json'}", soft_wrap=True)
+        if drawn:
+            text = f"Figures  {drawn[0].parent}{os.sep} ({_count(len(drawn), 'file')})"
+            _out().print(text, soft_wrap=True)
+    return PASSED
+
+
+def _asked(
+    what: str, vary: list[str], runs: int | None, seed: int | None, out: Path | None
+) -> tuple[Sweep, Path]:
+    """The sweep that is asked for, and its folder."""
+    from rigidfleet.mission import mission_names
+    from rigidfleet.sweep import Sweep, store
+    from rigidfleet.sweep.definition import is_sweep_file
+
+    if store.is_store(Path(what)):
+        if vary or seed is not None or out is not None:
+            raise RigidfleetError(
+                f"{what}: is a sweep already, and goes on as it is. Remove --vary, --seed and --out."
+            )
+        found = store.read_sweep(Path(what))
+        found.runs = runs or found.runs
+        return found, Path(what)
+    if what not in mission_names() and is_sweep_file(what):
+        found = Sweep.load(what, more=vary, runs=runs, seed=seed)
+    else:
+        found = Sweep.of(what, vary, runs=runs, seed=seed or 0, origin="rigidfleet sweep")
+    return found, out or Path("sweeps", found.name)
+
+
+def _fly_sweep(
+    asked: Sweep,
+    folder: Path,
+    workers: int | None,
+    cluster: str | None,
+    force: bool,
+    watch: _SweepWatch | None,
+) -> Any:
+    """Fly a sweep; returns the table of its rows."""
+    from rigidfleet.kernel import is_compiled
+    from rigidfleet.sweep import fly
+
+    if watch is not None and not is_compiled():
+        watch.compiling()
+    return fly(
+        asked,
+        folder,
+        workers=workers,
+        cluster=cluster,
+        replace=force,
+        progress=None if watch is None else watch.update,
+    )
+
+
 # -- flying ------------------------------------------------------------------------------------------
 
 
@@ -994,16 +1143,14 @@ def _print_words(rows: Iterable[tuple[str, str]]) -> None:
     _out().print(table)
 
 
-class _Watch:
-    """Shows how a flight goes on: a bar on a terminal, and elsewhere a line now and then."""
+class _Screen:
+    """Shows what goes on: on a terminal as it changes, and elsewhere by a line now and then."""
 
     def __init__(self) -> None:
         self.console = _err()
         self.live: Live | None = None
+        self.begun = self.told = perf_counter()
         self.cold = False
-        self.begun = self.heard = self.told = perf_counter()
-        self.base: Progress | None = None
-        self.last: Progress | None = None
 
     def __enter__(self) -> Self:
         if self.console.is_interactive:
@@ -1019,11 +1166,39 @@ class _Watch:
         if self.live is not None:
             self.live.stop()
 
+    def __rich__(self) -> RenderableType:
+        return ""
+
     def compiling(self) -> None:
         """Expect the kernel to be compiled, on the way, in several parts."""
         self.cold, self.begun = True, perf_counter()
         if self.live is None:
             self.console.print(_COMPILING)
+
+    def waiting(self) -> RenderableType:
+        """What is shown before there is anything to show."""
+        text = _COMPILING if self.cold else "Starting"
+        self.spinner.update(text=f"{text}: {perf_counter() - self.begun:.0f} s")
+        return self.spinner
+
+    def tell(self, now: float) -> None:
+        """Print a line where nothing moves, if the last one was long ago."""
+        if self.live is None and now - self.told > _SELDOM:
+            self.told = now
+            self.console.print(self._words())
+
+    def _words(self) -> str:
+        return ""
+
+
+class _Watch(_Screen):
+    """Shows how a flight goes on."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.heard = self.begun
+        self.base: Progress | None = None
+        self.last: Progress | None = None
 
     def update(self, progress: Progress) -> None:
         """Take note of how far the flight is."""
@@ -1031,9 +1206,7 @@ class _Watch:
         if self.base is None or (self.cold and now - self.heard > _SILENCE):
             self.base = progress  # the speed is that of flying, without that of compiling
         self.last, self.heard = progress, now
-        if self.live is None and now - self.told > _SELDOM:
-            self.told = now
-            self.console.print(self._words())
+        self.tell(now)
 
     def __rich__(self) -> RenderableType:
         from rich.progress_bar import ProgressBar
@@ -1041,9 +1214,7 @@ class _Watch:
 
         now = perf_counter()
         if self.last is None or (self.cold and now - self.heard > _SILENCE):
-            text = _COMPILING if self.cold else "Starting"
-            self.spinner.update(text=f"{text}: {now - self.begun:.0f} s")
-            return self.spinner
+            return self.waiting()
         row = Table.grid(padding=(0, 1))
         row.add_row(ProgressBar(self.last.t_end, self.last.t, width=30), self._words())
         return row
@@ -1060,3 +1231,43 @@ class _Watch:
             left = round((t_end - t) / speed)
             words += [f"x{speed:.{0 if speed >= 10 else 1}f}", f"{left // 60}:{left % 60:02} left"]
         return "  ".join([*words, self.last.phase])
+
+
+class _SweepWatch(_Screen):
+    """Shows how a sweep goes on."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.base: SweepProgress | None = None
+        self.last: SweepProgress | None = None
+
+    def update(self, progress: SweepProgress) -> None:
+        """Take note of how far the sweep is."""
+        if progress.flown and (self.base is None or self.base.workers != progress.workers):
+            self.base = progress  # the rate is that of these workers, without their start
+        self.last = progress
+        self.tell(perf_counter())
+
+    def __rich__(self) -> RenderableType:
+        from rich.progress_bar import ProgressBar
+        from rich.table import Table
+
+        if self.base is None or self.last is None:
+            return self.waiting()
+        row = Table.grid(padding=(0, 1))
+        row.add_row(ProgressBar(self.last.runs, self.last.done, width=30), self._words())
+        return row
+
+    def _words(self) -> str:
+        """Runs flown, rate, time left, failures."""
+        if self.base is None or self.last is None:
+            return ""
+        p = self.last
+        words = [f"{p.done} of {p.runs} runs"]
+        if (wall := p.wall - self.base.wall) > 0 and (flown := p.flown - self.base.flown) > 0:
+            rate = flown / wall
+            left = round((p.runs - p.done) / rate)
+            words += [f"{rate:.3g} runs/s", f"{left // 60}:{left % 60:02} left"]
+        words += [f"{p.failed} failed"] if p.failed else []
+        words += [f"{_count(p.workers, 'worker')}"] if p.workers > 1 else []
+        return "  ".join(words)

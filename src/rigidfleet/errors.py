@@ -54,6 +54,10 @@ class MissionError(RigidfleetError):
         return "\n".join(map(str, self.findings))
 
 
+class SweepError(MissionError):
+    """A sweep whose definition is wrong; its findings are about the sweep file, or the options."""
+
+
 class ResultError(RigidfleetError):
     """A result that cannot be read or written."""
 

@@ -100,40 +100,51 @@ def fit_attitudes(
     U, _, Vt = np.linalg.svd(fit)
     U[:, :, 2] *= np.sign(np.linalg.det(U @ Vt))[:, None]
     T = U @ Vt
-    guess = near[0] if near.ndim == 3 else near
     weights = np.sqrt(masses)[:, None]
-    _, spread, axes = np.linalg.svd(weights * p, full_matrices=False)
-    width = spread[:, 1] if p.shape[1] > 1 else np.zeros(len(p))
-    line = width <= _THIN * spread[:, 0]
-    narrow = width <= _NARROW * spread[:, 0]
+    if p.shape[1] == 1:
+        width, long = np.zeros(len(p)), np.zeros(len(p))
+        axes = np.broadcast_to(np.eye(3), (len(p), 3, 3))
+    else:
+        # Slots mostly stand still: one decomposition then serves all samples.
+        few = p[:1] if (p == p[0]).all() else p
+        _, spread, axes = np.linalg.svd(weights * few, full_matrices=False)
+        width, long = (np.broadcast_to(spread[:, q], len(p)) for q in (1, 0))
+        axes = np.broadcast_to(axes, (len(p), *axes.shape[1:]))
+    line = width <= _THIN * long
+    if near.ndim == 3:
+        thin = np.flatnonzero(width <= _NARROW * long)
+        along = _turn_lines(x[thin], p[thin], axes[thin, 0], near[thin])
+        off = np.linalg.norm(weights * (x[thin] - p[thin] @ along), axis=(1, 2))
+        line[thin] |= width[thin] <= _SURE * off
+        T[thin] = np.where(line[thin, None, None], along, T[thin])
+        return T, line
+    guess = near[None]
     for k in range(len(p)):
-        if line[k] or (narrow[k] and near.ndim == 3):
-            if near.ndim == 3:
-                guess = near[k]
-            along = _turn_line(x[k], p[k], axes[k, 0], guess)
-            line[k] |= width[k] <= _SURE * np.linalg.norm(weights * (x[k] - p[k] @ along))
-            T[k] = along if line[k] else T[k]
-        guess = T[k]
+        if line[k]:
+            T[k] = _turn_lines(x[k : k + 1], p[k : k + 1], axes[k : k + 1, 0], guess)[0]
+        guess = T[k : k + 1]
     return T, line
 
 
-def _turn_line(x: Array, p: Array, axis: Array, near: Array) -> Array:
-    """Attitude of a line, from ``near`` by the smallest rotation that brings the line's axis home."""
-    now = near.T @ axis
-    there = (p @ axis) @ x
-    length = np.linalg.norm(there)
-    if length == 0.0:
-        return near
-    there = there / length
-    n, c = np.cross(now, there), now @ there
-    if c < -1.0 + 1e-12:  # half a turn: any axis across the line will do
-        n = np.cross(now, np.eye(3)[np.abs(now).argmin()])
-        n /= np.linalg.norm(n)
-        R = 2.0 * np.outer(n, n) - np.eye(3)
-    else:
-        skew = np.array([[0, -n[2], n[1]], [n[2], 0, -n[0]], [-n[1], n[0], 0]])
-        R = np.eye(3) + skew + skew @ skew / (1.0 + c)
-    return near @ R.T
+def _turn_lines(x: Array, p: Array, axis: Array, near: Array) -> Array:
+    """Attitudes (K, 3, 3) of lines, from ``near`` by the smallest rotation that brings each axis home."""
+    now = np.einsum("kba,kb->ka", near, axis)
+    there = np.einsum("ki,kia->ka", np.einsum("kia,ka->ki", p, axis), x)
+    length = np.linalg.norm(there, axis=1)
+    pointlike = length == 0.0
+    there /= np.where(pointlike, 1.0, length)[:, None]
+    n, c = np.cross(now, there), np.einsum("ka,ka->k", now, there)
+    opposite = c < -1.0 + 1e-12
+    skew = np.zeros((len(x), 3, 3))
+    for a, b, d in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        skew[:, a, b], skew[:, b, a] = -n[:, d], n[:, d]
+    R = np.eye(3) + skew + skew @ skew / np.where(opposite, 1.0, 1.0 + c)[:, None, None]
+    for k in np.flatnonzero(opposite):  # half a turn: any axis across the line will do
+        across = np.cross(now[k], np.eye(3)[np.abs(now[k]).argmin()])
+        across /= np.linalg.norm(across)
+        R[k] = 2.0 * np.outer(across, across) - np.eye(3)
+    R[pointlike] = np.eye(3)
+    return near @ R.swapaxes(1, 2)
 
 
 def mean_axis_rates(x: Array, y: Array, masses: Array, line: ArrayLike = False) -> Array:

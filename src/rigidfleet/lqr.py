@@ -10,11 +10,19 @@ formation is a double integrator: x = (position, velocity), u the acceleration.
 """
 
 import math
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
+
+# An array as what it is kept under: its shape and contents.
+Key = tuple[tuple[int, ...], bytes]
+
+# So many results are kept that depend on weights and times alone: they are the same in every run of a
+# sweep, and often from phase to phase.
+_KEPT = 512
 
 # The double integrator.
 _A = np.array([[0.0, 1.0], [0.0, 0.0]])
@@ -88,18 +96,10 @@ def closed_loop_response(
     The solution of the Hamiltonian's boundary problem, not an integration: every time stands for
     itself. ValueError where a time lies outside [0, T].
     """
-    A, B, Q, R = _system(A, B, Q, R)
-    S = _weight("S", S, len(A))
-    x0 = np.asarray(x0, dtype=float)
-    if x0.shape[:1] != (len(A),):
+    A, x0 = np.asarray(A, dtype=float), np.asarray(x0, dtype=float)
+    if x0.shape[:1] != A.shape[:1]:
         raise ValueError(f"x0 must have {len(A)} rows, one per state, not the shape {x0.shape}")
-    t, T = _times("times", times), float(_times("T", T))
-    if t.ndim != 1 or np.any(t > T * (1.0 + 1e-12)):
-        raise ValueError(f"times must be a list of times between 0 and T = {T} s")
-    P = _cost_to_go(A, B, Q, R, S, np.maximum(T - t, 0.0))
-    Phi, W, _ = _propagate(A, B @ _solve(R, B.T), Q, t)
-    x = _solve(np.eye(len(A)) + W @ P, Phi)
-    u = -_solve(R, B.T @ P @ x)
+    x, u = _responses(*map(_key, (A, B, Q, R, S, T, times)))
     return np.tensordot(x, x0, axes=1), np.tensordot(u, x0, axes=1)
 
 
@@ -108,7 +108,12 @@ def double_integrator_gains(Q: ArrayLike, R: ArrayLike) -> tuple[float, float]:
 
     In closed form: k1 = sqrt(q1/r), k2 = sqrt(q2/r + 2 k1), whatever couples the two in Q.
     """
-    _, _, Q, R = _system(_A, _B, Q, R)
+    return _gains(_key(Q), _key(R))
+
+
+@lru_cache(_KEPT)
+def _gains(Q_key: Key, R_key: Key) -> tuple[float, float]:
+    _, _, Q, R = _system(_A, _B, _array(Q_key), _array(R_key))
     if not Q[0, 0] > 0.0:
         raise ValueError(
             "an infinite horizon needs a weight on the position, Q[0] > 0: without one nothing"
@@ -154,9 +159,7 @@ def infinite_horizon_trajectory(
     The target is where it moves at t = T; one that rests makes T nothing but the end of ``times``.
     """
     # The cost of an infinite horizon, as the final weight, is the Riccati equation's rest point.
-    return finite_horizon_trajectory(
-        times, start, target, T, Q, R, infinite_horizon(_A, _B, Q, R)[1]
-    )
+    return finite_horizon_trajectory(times, start, target, T, Q, R, _cost_at_rest(_key(Q), _key(R)))
 
 
 def knots(
@@ -171,8 +174,14 @@ def knots(
     if not (math.isfinite(T) and T > 0):
         raise ValueError(f"the horizon T must be positive [s], not {T}")
     if S is None:
-        S = infinite_horizon(_A, _B, Q, R)[1]
-    _, _, Q, R = _system(_A, _B, Q, R)
+        S = _cost_at_rest(_key(Q), _key(R))
+    return _knots(T, _key(Q), _key(R), _key(S), tolerance).copy()
+
+
+@lru_cache(_KEPT)
+def _knots(T: float, Q_key: Key, R_key: Key, S_key: Key, tolerance: float) -> Array:
+    S = _array(S_key)
+    _, _, Q, R = _system(_A, _B, _array(Q_key), _array(R_key))
     fastest = np.abs(np.linalg.eigvals(_hamiltonian(_A, _B @ _solve(R, _B.T), Q))).max()
     inside = np.array([0.25, 0.5, 0.75])
     powers = np.arange(6)
@@ -231,6 +240,37 @@ def _quintics(h: Array, x: ArrayLike, v: ArrayLike, a: ArrayLike) -> Array:
     a = (a1 - a0) / h
     c = [x0, v0, 0.5 * a0, 10 * x - 4 * v + 0.5 * a, (-15 * x + 7 * v - a) / h]
     return np.stack([*c, (6 * x - 3 * v + 0.5 * a) / h**2], axis=-1)
+
+
+@lru_cache(_KEPT)
+def _responses(*keys: Key) -> tuple[Array, Array]:
+    """States (K, n, n) and inputs (K, m, n) from each state alone; of A, B, Q, R, S, T and times."""
+    *system, S, T, times = map(_array, keys)
+    A, B, Q, R = _system(*system)
+    S = _weight("S", S, len(A))
+    t, T = _times("times", times), float(_times("T", T))
+    if t.ndim != 1 or np.any(t > T * (1.0 + 1e-12)):
+        raise ValueError(f"times must be a list of times between 0 and T = {T} s")
+    P = _cost_to_go(A, B, Q, R, S, np.maximum(T - t, 0.0))
+    Phi, W, _ = _propagate(A, B @ _solve(R, B.T), Q, t)
+    x = _solve(np.eye(len(A)) + W @ P, Phi)
+    return x, -_solve(R, B.T @ P @ x)
+
+
+@lru_cache(_KEPT)
+def _cost_at_rest(Q: Key, R: Key) -> Array:
+    """P (2, 2) of the double integrator's infinite horizon."""
+    return infinite_horizon(_A, _B, _array(Q), _array(R))[1]
+
+
+def _key(value: ArrayLike) -> Key:
+    array = np.asarray(value, dtype=float)
+    return array.shape, array.tobytes()
+
+
+def _array(key: Key) -> Array:
+    shape, data = key
+    return np.frombuffer(data).reshape(shape)
 
 
 def _cost_to_go(A: Array, B: Array, Q: Array, R: Array, S: Array, tau: Array) -> Array:

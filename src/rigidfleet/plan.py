@@ -7,6 +7,7 @@ and weights, which the kernel only evaluates. What the next phase inherits trave
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -90,7 +91,7 @@ def plan_phase(mission: Mission, phase: Phase, now: Situation, t_end: float) -> 
             masses, 1.0 / masses, float(masses.sum()), np.array(mission.agents.thrust_limit),
             mission.agents.saturate, mission.gravity,
         ),
-        graph=k.graph(edges, masses),
+        graph=_graph(edges.tobytes(), masses.tobytes()),
         law=_law(mission, damped=phase.control != "slots" and len(edges) > 0),
         reference=reference,
         motion=motion,
@@ -103,6 +104,13 @@ def plan_phase(mission: Mission, phase: Phase, now: Situation, t_end: float) -> 
         after if phase.control != "open" or kind == k.SLOTS else target if shaping else now.slots
     )
     return PhasePlan(program, edges, slots, name, d1, goal, arrival, frame)
+
+
+@lru_cache(64)
+def _graph(edges: bytes, masses: bytes) -> k.Graph:
+    """The constraint graph, which the kernel only reads: most phases have the one before."""
+    pairs = np.frombuffer(edges, dtype=np.int64).reshape(-1, 2).copy()
+    return k.graph(pairs, np.frombuffer(masses))
 
 
 def _keys(edges: NDArray[np.int64]) -> list[Edge]:

@@ -159,6 +159,8 @@ def _attitudes(
     Without slots, that of the integrated frame, if the mission attaches one (``framed``).
     """
     quaternions, line = np.full((len(x), 4), np.nan), np.zeros(len(x), dtype=np.bool_)
+    fitted = np.zeros(len(x), dtype=bool)
+    T = np.empty((len(x), 3, 3))
     last = np.eye(3)
     start = 0
     for piece in pieces:
@@ -172,11 +174,13 @@ def _attitudes(
         if np.isnan(near[0, 0, 0]):
             near = last
         who = masses[rows.start] > 0.0
-        T, line[rows] = geometry.fit_attitudes(
+        T[rows], line[rows] = geometry.fit_attitudes(
             x[rows][:, who], p[rows][:, who], masses[rows.start, who], near
         )
-        last = T[-1]
-        quaternions[rows] = att.quaternion_from_dcm(T)
+        last = T[rows][-1]
+        fitted[rows] = True
+    if fitted.any():
+        quaternions[fitted] = att.quaternion_from_dcm(T[fitted])
     return att.unwrap_quaternion(quaternions), line
 
 

@@ -99,14 +99,25 @@ def plot(
     if names is None:
         names = figure_names(disturbed=result.disturbance_force is not None)
     names = _known("figure", names, _FIGURES)
-    written = []
-    for name in names:
-        figure = _FIGURES[name](result)
-        for kind in formats:
-            path = Path(folder) / f"{name}.{kind}"
-            _write(path, _rendered(figure, kind))
-            written.append(path)
-    return written
+    return [
+        path
+        for name in names
+        for path in write_figure(_FIGURES[name](result), Path(folder), name, formats)
+    ]
+
+
+def write_figure(figure: Figure, folder: Path, name: str, formats: Iterable[str]) -> list[Path]:
+    """Write a figure to ``folder/NAME.FORMAT``, each file whole or not at all; returns the files.
+
+    Raises
+    ------
+    ResultError
+        A file cannot be written.
+    """
+    paths = {kind: folder / f"{name}.{kind}" for kind in formats}
+    for kind, path in paths.items():
+        _write(path, _rendered(figure, kind))
+    return list(paths.values())
 
 
 def _known(what: str, asked: Iterable[str], known: Iterable[str]) -> list[str]:

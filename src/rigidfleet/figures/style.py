@@ -146,15 +146,20 @@ def time_figure(
 
 def head(fig: Figure, result: Result, title: str) -> None:
     """Title at the left; the mission and, if it did not end well, when it stopped at the right."""
-    top = 1 - _PAD / fig.get_figheight()
-    heading = fig.suptitle(
-        title, x=0.012, ha="left", va="top", fontsize=11, fontweight="bold", parse_math=False
-    )
-    if fig.get_layout_engine() is None:  # else it finds the place, and keeps the axes clear of it
-        heading.set_y(top)
     words, colour = result.mission.name, GREY
     if not result.complete:
         words, colour = f"{words}: incomplete, stopped at {result.phases[-1].t_end:.2f} s", ALERT
+    heading(fig, title, words, colour)
+
+
+def heading(fig: Figure, title: str, words: str, colour: str = GREY) -> None:
+    """Title at the left, words at the right."""
+    top = 1 - _PAD / fig.get_figheight()
+    title_text = fig.suptitle(
+        title, x=0.012, ha="left", va="top", fontsize=11, fontweight="bold", parse_math=False
+    )
+    if fig.get_layout_engine() is None:  # else it finds the place, and keeps the axes clear of it
+        title_text.set_y(top)
     fig.text(0.988, top, words, ha="right", va="top", fontsize=9, color=colour, parse_math=False)
 
 

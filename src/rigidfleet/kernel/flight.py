@@ -237,9 +237,9 @@ def integrator(y: Array, t: float, *, rtol: float, atol: Array, step: float = 1e
 
 
 @compiled
-def forget_stages(k):
-    """Make all stages zero that are still to come: no weight makes a number of NaN."""
-    for s in range(1, 7):
+def forget_stages(k, first):
+    """Make the stages from ``first`` on zero: NaN left in them would outlive its weight of zero."""
+    for s in range(first, 7):
         for q in range(k.shape[1]):
             k[s, q] = spread(0.0)
 
@@ -268,7 +268,7 @@ def integrate(p, w, state, t_end, fresh, times, samples, max_steps):
     k = blocks(K)
     t, h, last = clock[0], clock[1], clock[2]
     if fresh:
-        forget_stages(k)
+        forget_stages(k, 0)
     first = 0 if fresh else 1
     status = PAUSED
     for _ in range(max_steps):
@@ -303,7 +303,7 @@ def integrate(p, w, state, t_end, fresh, times, samples, max_steps):
             if error < math.inf:
                 shrink = 0.9 * error**-0.2
             else:
-                forget_stages(k)
+                forget_stages(k, 1)
             h *= max(0.1, shrink)
             if h < 1e-12 * max(1.0, abs(t)):
                 status = COLLAPSED

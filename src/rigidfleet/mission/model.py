@@ -40,7 +40,7 @@ class Mission(Contents):
         MissionError
             With a finding for each error.
         """
-        mission = cls.model_construct(**check(_parse(text, origin), origin))
+        mission = cls.model_construct(**check(parse_toml(text, origin), origin))
         mission._text, mission._origin = text, origin
         return mission
 
@@ -177,7 +177,7 @@ def load_mission(name_or_path: str | Path) -> Mission:
     """
     if isinstance(name_or_path, str) and name_or_path in mission_names():
         return Mission.from_toml(mission_text(name_or_path), name_or_path)
-    return Mission.from_toml(_read(name_or_path), str(name_or_path))
+    return Mission.from_toml(read_text(name_or_path), str(name_or_path))
 
 
 def json_schema() -> dict[str, Any]:
@@ -186,7 +186,14 @@ def json_schema() -> dict[str, Any]:
     return draft | Mission.model_json_schema()
 
 
-def _read(path: str | Path) -> str:
+def read_text(path: str | Path) -> str:
+    """Text of a mission file, or of one like it.
+
+    Raises
+    ------
+    MissionError
+        It cannot be read.
+    """
     origin = str(path)
     try:
         with open(path, "rb") as file:
@@ -218,7 +225,14 @@ def _not_found(name: str) -> Finding:
     return Finding(name, "", None, "there is no such file, nor a shipped mission", remedy)
 
 
-def _parse(text: str, origin: str) -> dict[str, Any]:
+def parse_toml(text: str, origin: str) -> dict[str, Any]:
+    """Plain data of TOML text.
+
+    Raises
+    ------
+    MissionError
+        It is no TOML.
+    """
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:

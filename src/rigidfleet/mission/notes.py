@@ -122,7 +122,12 @@ def _key(path: Keys) -> str:
 def _model_at(owner: type[Part], key: object) -> type[Part]:
     """The model of a key, or its owner where it has none."""
     field = owner.model_fields.get(str(key))
-    return next(_models(field.annotation), owner) if field else owner
+    return (model_of(field.annotation) if field else None) or owner
+
+
+def model_of(annotation: Any) -> type[Part] | None:
+    """The first model in an annotation such as `Settle | None`, None where there is none."""
+    return next(_models(annotation), None)
 
 
 def _models(annotation: Any) -> Iterator[type[Part]]:

@@ -1,0 +1,16 @@
+"""Many flights of one mission: vary anything in it, fly on all cores, see what drives failure.
+
+from rigidfleet.sweep import Sweep, fly, load
+
+sweep = Sweep.of("narrow-passage", ["agents.mass.* *= normal(1, 0.05)"], runs=200, seed=1)
+fly(sweep, "sweeps/masses")
+data = load("sweeps/masses")  # an xarray dataset
+"""
+
+from rigidfleet.sweep.conduct import SweepProgress, fly
+from rigidfleet.sweep.dataset import load
+from rigidfleet.sweep.definition import Sweep
+from rigidfleet.sweep.metrics import METRICS
+from rigidfleet.sweep.store import Table, read
+
+__all__ = ["METRICS", "Sweep", "SweepProgress", "Table", "fly", "load", "read"]

@@ -1,0 +1,72 @@
+"""A sweep as an xarray dataset."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rigidfleet.sweep import paths
+from rigidfleet.sweep.definition import Column, Sweep
+from rigidfleet.sweep.metrics import METRICS
+from rigidfleet.sweep.store import read
+
+if TYPE_CHECKING:
+    import xarray
+
+_UNIT = re.compile(r"\[([^\[\],]+)\]")
+_ROLE = {"set": "", "add": "added to: ", "scale": "factor of: "}
+
+
+def load(folder: str | Path) -> xarray.Dataset:
+    """A folder's sweep as one xarray dataset along `run`, with units and meanings; needs xarray.
+
+    Its variables are what varies, by path (`agents.mass.2`), every metric, `passed`, `reason`, `detail`
+    and `wall`. It may be opened while the sweep goes on: then it has the runs flown so far.
+
+    Raises
+    ------
+    ResultError
+        The folder holds no sweep.
+    """
+    import xarray as xr
+
+    table = read(folder)
+    sweep = table.sweep
+    variables: dict[str, Any] = {}
+    for k, column in enumerate(sweep.columns):
+        unit, text = explained(sweep, column)
+        values = [column.variation.value(code) for code in table.codes[:, k].tolist()]
+        variables[column.name] = ("run", values, {"units": unit, "long_name": text})
+    variables["passed"] = (
+        "run",
+        table.passed,
+        {"long_name": "whether the flight passed its verdict"},
+    )
+    variables["reason"] = ("run", table.reason.astype(str), {"long_name": "checks that failed"})
+    variables["detail"] = ("run", table.detail.astype(str), {"long_name": "first failure in words"})
+    for name, metric in METRICS.items():
+        about = {"units": metric.unit, "long_name": metric.text}
+        variables[name] = ("run", table.metrics[name], about)
+    variables["wall"] = ("run", table.wall, {"units": "s", "long_name": "time taken"})
+    about = {"long_name": "number of the run, from 0"}
+    return xr.Dataset(
+        variables,
+        coords={"run": ("run", table.run, about)},
+        attrs={
+            "title": f"sweep of the mission {sweep.mission.name}",
+            "seed": sweep.seed,
+            "runs": sweep.runs,
+            "complete": int(table.complete),
+            "mission": sweep.mission.text,
+            "version": sweep.identity["version"],
+        },
+    )
+
+
+def explained(sweep: Sweep, column: Column) -> tuple[str, str]:
+    """Unit and meaning of what a column varies."""
+    text = paths.meaning(sweep.mission, column.keys)
+    units = _UNIT.findall(text)
+    unit = "1" if column.variation.change == "scale" or not units else units[-1].replace("-", "1")
+    return unit, f"{_ROLE[column.variation.change]}{text}"

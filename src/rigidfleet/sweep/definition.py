@@ -1,0 +1,375 @@
+"""What a sweep is: a mission, what varies in it, how many runs, and a seed; checked as a whole on entry.
+
+Run k depends on the definition and on k alone: its point of the grid is k modulo the size of the grid,
+and its random numbers come from a Philox stream of its own, keyed by (seed, k).
+"""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import Annotated, Any, Self
+
+import numpy as np
+from pydantic import Field, Strict
+
+from rigidfleet import __version__
+from rigidfleet.errors import MissionError, SweepError
+from rigidfleet.mission import Mission, load_mission, mission_names
+from rigidfleet.mission.model import parse_toml, read_text
+from rigidfleet.mission.notes import Keys, Notes, unknown_key
+from rigidfleet.mission.phases import kind, tables
+from rigidfleet.mission.schema import Part
+from rigidfleet.sweep import paths
+from rigidfleet.sweep.variation import (
+    KINDS,
+    Drawn,
+    Gridded,
+    Variation,
+    WrongLine,
+    from_line,
+    is_number,
+)
+
+#: Least fraction of a distribution, so that no normal number is infinite.
+_LEAST = 2.0**-54
+
+
+class Header(Part):
+    """Keys at the top of a sweep file."""
+
+    mission: str = Field(
+        description="a shipped mission, or the path of a mission file as seen from this one"
+    )
+    runs: Annotated[int, Strict(), Field(ge=1, le=10**8)] | None = Field(
+        None, description="how many runs; when absent, one for each point of the grid"
+    )
+    seed: Annotated[int, Strict(), Field(ge=0, lt=2**63)] = Field(
+        0, description="seed of the random numbers"
+    )
+
+
+@dataclass(frozen=True)
+class Column:
+    """One number that varies: what varies it, where in the mission, and its values if it is gridded."""
+
+    variation: Variation
+    keys: Keys
+    grid: tuple[Any, ...] | None
+
+    @property
+    def name(self) -> str:
+        """Its path, counted from 1."""
+        return paths.name_of(self.keys)
+
+
+class Sweep:
+    """A checked sweep: make one by `Sweep.of`, or `Sweep.load` from a file.
+
+    Attributes
+    ----------
+    mission : the mission that varies
+    variations : what varies in it
+    runs : number of runs
+    seed : of the random numbers
+    name : what to call it
+    """
+
+    def __init__(
+        self,
+        mission: Mission,
+        variations: Sequence[Variation],
+        runs: int | None,
+        seed: int,
+        name: str,
+    ) -> None:
+        self.mission, self.variations = mission, tuple(variations)
+        self.seed, self.name = seed, name
+        self.runs = runs or math.prod(len(c.grid) for c in self.columns if c.grid is not None)
+
+    @classmethod
+    def of(
+        cls,
+        mission: Mission | str | Path,
+        vary: Iterable[str | Mapping[str, Any]],
+        *,
+        runs: int | None = None,
+        seed: int = 0,
+        name: str = "",
+        origin: str = "sweep",
+    ) -> Self:
+        """A sweep of a mission, or of one by its name or path.
+
+        Parameters
+        ----------
+        vary : a line for each variation, as `agents.mass.* *= normal(1, 0.05)`, or its table
+        runs : one for each point of the grid when absent
+        seed : of the random numbers
+        name : that of the mission when absent
+        origin : what messages call the sweep
+
+        Raises
+        ------
+        SweepError
+            With a finding for each error of the sweep.
+        MissionError
+            The mission is wrong.
+        """
+        if not isinstance(mission, Mission):
+            mission = load_mission(mission)
+        data: dict[str, Any] = {"mission": mission.name, "seed": seed, "vary": list(vary)}
+        data |= {} if runs is None else {"runs": runs}
+        header, variations = _checked(data, origin, mission)
+        return cls(mission, variations, header.runs, header.seed, name or mission.name)
+
+    @classmethod
+    def load(
+        cls,
+        path: str | Path,
+        *,
+        more: Iterable[str] = (),
+        runs: int | None = None,
+        seed: int | None = None,
+    ) -> Self:
+        """Read a sweep file.
+
+        Parameters
+        ----------
+        more : lines of further variations
+        runs, seed : in place of the file's
+
+        Raises
+        ------
+        SweepError
+            With a finding for each error of the sweep.
+        MissionError
+            The file cannot be read, or its mission is wrong.
+        """
+        path = Path(path)
+        origin = str(path)
+        data = parse_toml(read_text(path), origin)
+        named = data.get("mission")
+        mission = None
+        if isinstance(named, str):
+            shipped = named in mission_names()
+            mission = load_mission(named if shipped else path.parent / named)
+        data |= {} if runs is None else {"runs": runs}
+        data |= {} if seed is None else {"seed": seed}
+        if isinstance(given := data.get("vary", []), list):
+            data["vary"] = [*given, *more]
+        header, variations = _checked(data, origin, mission)
+        assert mission is not None  # else the check has raised
+        return cls(mission, variations, header.runs, header.seed, path.stem)
+
+    @classmethod
+    def from_json(cls, text: str) -> Self:
+        """A sweep from what `json` gave."""
+        data = json.loads(text)
+        variations = [KINDS[entry["kind"]].model_validate(entry) for entry in data["vary"]]
+        mission = Mission.from_toml(data["mission"], "mission of the sweep")
+        return cls(mission, variations, data["runs"], data["seed"], data["name"])
+
+    def json(self) -> str:
+        """All of it as JSON text, with the mission inside."""
+        return json.dumps(self._data(), ensure_ascii=False)
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """What a run depends on besides its number; further runs may be added to a sweep."""
+        data = self._data()
+        del data["runs"], data["name"]
+        return data | {"version": __version__}
+
+    @cached_property
+    def document(self) -> dict[str, Any]:
+        """The mission as written."""
+        return self.mission.to_dict()
+
+    @cached_property
+    def whole(self) -> dict[str, Any]:
+        """The mission with every default filled in."""
+        return paths.whole_document(self.mission)
+
+    @cached_property
+    def columns(self) -> list[Column]:
+        """Every number that varies, in order."""
+        return [
+            Column(v, keys, grid)
+            for v in self.variations
+            for grid in [v.grid if isinstance(v, Gridded) else None]
+            for keys in paths.expand(self.whole, v.path)
+        ]
+
+    def values(self, run: int) -> list[Any]:
+        """Value of every column in a run, counted from 0."""
+        stream = np.random.Philox(np.random.SeedSequence(self.seed, spawn_key=(run,)))
+        drawn = sum(column.grid is None for column in self.columns)
+        fractions = np.maximum(np.random.Generator(stream).random(drawn), _LEAST).tolist()
+        point, found = run, []
+        for column in reversed(self.columns):  # the last grid varies fastest
+            if column.grid is None:
+                assert isinstance(column.variation, Drawn)
+                found.append(column.variation.quantile(fractions.pop()))
+            else:
+                point, place = divmod(point, len(column.grid))
+                found.append(column.grid[place])
+        return found[::-1]
+
+    def varied(self, run: int) -> dict[str, Any]:
+        """The document of a run, not checked yet."""
+        document = copy.deepcopy(self.document)
+        for column, value in zip(self.columns, self.values(run), strict=True):
+            apply(document, self.whole, column, value)
+        return document
+
+    def _data(self) -> dict[str, Any]:
+        return {
+            "name": self.name,
+            "mission": self.mission.text,
+            "vary": [v.model_dump() for v in self.variations],
+            "runs": self.runs,
+            "seed": self.seed,
+        }
+
+
+@lru_cache(maxsize=4)
+def shared(text: str) -> Sweep:
+    """A sweep from its JSON, kept for the chunks that follow."""
+    return Sweep.from_json(text)
+
+
+def is_sweep_file(path: str | Path) -> bool:
+    """Whether a file is a sweep file and no mission: it names a mission."""
+    try:
+        return "mission" in parse_toml(read_text(path), str(path))
+    except MissionError:
+        return False
+
+
+def apply(document: dict[str, Any], whole: Mapping[str, Any], column: Column, value: Any) -> None:
+    """Change a document by a column's value: every number at its place alike."""
+    integral = all(isinstance(x, int) for x in paths.numbers(paths.look_up(whole, column.keys)))
+
+    def changed(there: Any) -> Any:
+        match column.variation.change:
+            case "add":
+                new = there + value
+            case "scale":
+                new = there * value
+            case _:
+                new = value
+        return round(new) if integral and math.isfinite(new) else new
+
+    def replaced(there: Any) -> Any:
+        return paths.mapped(there, changed) if is_number(value) else value
+
+    paths.change(document, whole, column.keys, replaced)
+
+
+# -- the check ---------------------------------------------------------------------------------------
+
+
+def _checked(
+    data: dict[str, Any], origin: str, mission: Mission | None
+) -> tuple[Header, list[Variation]]:
+    """Header and variations of a sweep that is in order."""
+    wrong: dict[int, WrongLine] = {}
+    if isinstance(given := data.get("vary"), list):
+        parsed = [from_line(entry) if isinstance(entry, str) else entry for entry in given]
+        wrong = {k: entry for k, entry in enumerate(parsed) if isinstance(entry, WrongLine)}
+        data["vary"] = [given[k] if k in wrong else entry for k, entry in enumerate(parsed)]
+    notes = Notes(data, origin)
+    known = [*Header.model_fields, "vary"]
+    for key in data:
+        if key not in known:
+            notes.add((key,), *unknown_key(key, known))
+    own = {key: value for key, value in data.items() if key in Header.model_fields}
+    header = notes.validate(Header, own, ())
+    whole = None if mission is None else paths.whole_document(mission)
+    variations = []
+    for k, entry in enumerate(tables(notes, "vary")):
+        if k in wrong:
+            notes.add(("vary", k), wrong[k].problem, wrong[k].remedy)
+            continue
+        found = _variation(notes, entry, k)
+        if mission is not None and whole is not None:
+            _fits(notes, k, entry, found, mission, whole)
+        variations += [] if found is None else [found]
+    if "vary" not in data or data["vary"] == []:
+        notes.add(
+            ("vary",), "nothing varies", 'give --vary "agents.mass.* *= normal(1, 0.05)", say'
+        )
+    gridded = any(isinstance(v, Gridded) for v in variations)
+    if "runs" not in data and variations and not gridded:
+        notes.add(("runs",), "is missing", "say how many; only a grid has a number of its own")
+    if notes.findings or header is None:
+        raise SweepError(notes.findings)
+    return header, variations
+
+
+def _variation(notes: Notes, entry: Any, k: int) -> Variation | None:
+    """A variation that is in order by itself."""
+    before = len(notes.findings)
+    model = kind(notes, entry, ("vary", k), KINDS)
+    found = None if model is None else notes.validate(model, entry, ("vary", k))
+    if found is None or len(notes.findings) > before:
+        return None
+    if (problem := found.wrong()) is not None:
+        key, *words = problem
+        notes.add(("vary", k, key), *words, getattr(found, key))
+        return None
+    return found
+
+
+def _fits(
+    notes: Notes, k: int, entry: Any, v: Variation | None, mission: Mission, whole: dict[str, Any]
+) -> None:
+    """Whether a variation leads somewhere in the mission, and to what it can vary."""
+    path = v.path if v is not None else entry.get("path") if isinstance(entry, dict) else None
+    if not isinstance(path, str):
+        return
+    where = ("vary", k, "path")
+    try:
+        places = paths.expand(whole, path)
+    except paths.PathError as error:
+        notes.add(where, error.problem, error.remedy, path)
+        return
+    if v is None:
+        return
+    values = getattr(v, "values", None)
+    numeric = values is None or all(map(is_number, values))
+    for keys in places:
+        leaves = paths.numbers(paths.look_up(whole, keys))
+        absent = any(x is None for x in leaves)
+        table = next((x for x in leaves if isinstance(x, dict)), None)
+        if table is not None:
+            notes.add(where, "is a table", f"go on to one of its keys: {', '.join(table)}", path)
+        elif absent and v.change != "set":
+            notes.add(
+                where, f"there is nothing to {v.change} to", "set it, or write it there", path
+            )
+        elif absent:
+            _taken(notes, where, v, keys, mission, whole)
+        elif numeric and not all(map(is_number, leaves)):
+            remedy = "vary it by choice or grid of words"
+            notes.add(where, f"is no number, but {leaves[0]!r}", remedy, path)
+
+
+def _taken(
+    notes: Notes, where: Keys, v: Variation, keys: Keys, mission: Mission, whole: dict[str, Any]
+) -> None:
+    """Whether a mission takes a value where it has had none."""
+    middle = v.quantile(0.5) if isinstance(v, Drawn) else v.grid[0] if isinstance(v, Gridded) else 0
+    document = mission.to_dict()
+    apply(document, whole, Column(v, keys, None), middle)
+    try:
+        Mission.from_dict(document)
+    except MissionError as error:
+        first = error.findings[0]
+        problem = f"the mission does not take it: {first.key} {first.problem}"
+        notes.add(where, problem, first.remedy, v.path)

@@ -1,0 +1,75 @@
+"""Fly runs of a sweep: the one place where a run becomes a row."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from time import perf_counter
+
+from rigidfleet.errors import MissionError
+from rigidfleet.sweep.definition import Sweep
+from rigidfleet.sweep.metrics import METRICS, measure
+
+#: Runs are flown in groups of so many consecutive ones, the first of which is a multiple of it.
+GROUP = 8
+
+
+@dataclass(frozen=True)
+class Row:
+    """What is kept of one run.
+
+    Attributes
+    ----------
+    run : its number, from 0
+    passed : whether it passed its verdict
+    reason : the checks that failed, with commas; "mission" for one that cannot be flown; else ""
+    detail : the first failure in words
+    codes : value of every column of the sweep, as `Variation.code` has it
+    metrics : value of each of `METRICS`, NaN where it does not apply
+    wall : how long it took [s]
+    """
+
+    run: int
+    passed: bool
+    reason: str
+    detail: str
+    codes: tuple[float, ...]
+    metrics: dict[str, float]
+    wall: float
+
+
+def fly_runs(sweep: Sweep, runs: Sequence[int]) -> list[Row]:
+    """Fly whole groups of runs (only the sweep's last may be a part of one) and measure them.
+
+    A row depends on the sweep and the run's number alone, but for `wall`. A run that cannot be flown is a
+    row with its reason.
+    """
+    return [_fly(sweep, run) for run in runs]
+
+
+def _fly(sweep: Sweep, run: int) -> Row:
+    from rigidfleet.assess import assess
+    from rigidfleet.mission import Mission
+    from rigidfleet.simulate import simulate
+
+    begun = perf_counter()
+    values = sweep.values(run)
+    codes = tuple(c.variation.code(v) for c, v in zip(sweep.columns, values, strict=True))
+    metrics = dict.fromkeys(METRICS, math.nan)
+    try:
+        result = simulate(Mission.from_dict(sweep.varied(run), f"run {run}"))
+        verdict = assess(result)
+        metrics = measure(result, verdict)
+        failed = [f for f in verdict.findings if not f.passed]
+        reason = ", ".join(dict.fromkeys(f.check for f in failed))
+        detail = failed[0].message if failed else ""
+    except MissionError as error:
+        first = error.findings[0]
+        reason, detail = "mission", f"{first.key} = {first.value!r}: {first.problem}"
+    except Exception as error:  # one run that breaks must not end a hundred thousand others
+        if isinstance(error.__context__ or error.__cause__, KeyboardInterrupt):
+            raise  # Ctrl-C, as the compiler gives it back
+        reason, detail = "error", f"{type(error).__name__}: {error}"
+    wall = perf_counter() - begun
+    return Row(run, not reason, reason, " ".join(detail.split()), codes, metrics, wall)

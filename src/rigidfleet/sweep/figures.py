@@ -1,0 +1,405 @@
+"""Figures of a sweep: outcome, histograms, envelopes, drivers, and a map over two varied numbers."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigidfleet.errors import RigidfleetError
+from rigidfleet.figures import style as st
+from rigidfleet.figures import write_figure
+from rigidfleet.sweep.dataset import explained
+from rigidfleet.sweep.metrics import METRICS
+from rigidfleet.sweep.store import Table
+from rigidfleet.sweep.summary import drivers, outcomes, rate, summarise, varied
+from rigidfleet.sweep.variation import Geomspace, LogUniform
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
+    from matplotlib.figure import Figure
+
+Floats = NDArray[np.float64]
+
+PASSED, FAILED = "#56B4E9", "#D55E00"
+_COLUMNS = 4  # of small axes
+_BINS = 30
+_ENVELOPE = 12  # stretches of an envelope
+_CELLS = 10  # a side of a map of drawn numbers
+_VALUES = 20  # so many values, of a grid, have a cell each
+_ROWS = 14  # varied numbers in the figure of drivers, the strongest
+_LOGARITHMIC = 100.0  # a metric over more than this many times its least has a logarithmic axis
+_NAMES = ("outcome", "histograms", "envelopes", "drivers", "map")
+
+
+def plot(
+    table: Table,
+    folder: str | Path,
+    *,
+    formats: Iterable[str] = ("png", "svg"),
+    over: Sequence[str] = (),
+    metric: str = "",
+) -> list[Path]:
+    """Draw a sweep, each figure to ``folder/NAME.FORMAT``, whole or not at all.
+
+    Parameters
+    ----------
+    over : the two paths that the map is over; the two that matter most when absent
+    metric : what it shows: success, or one of `METRICS`; success when absent, if any run failed
+
+    Raises
+    ------
+    RigidfleetError
+        A path or a metric is none of the sweep's.
+    ResultError
+        A file cannot be written.
+    """
+    draw = {
+        "outcome": outcome,
+        "histograms": histograms,
+        "envelopes": envelopes,
+        "drivers": correlations,
+        "map": partial(over_two, over=over, metric=metric),
+    }
+    files = []
+    for name in _NAMES:
+        with st.settings():
+            figure = draw[name](table)
+        if figure is None:
+            for kind in formats:
+                Path(folder, f"{name}.{kind}").unlink(missing_ok=True)
+            continue
+        files += write_figure(figure, Path(folder), name, formats)
+    return files
+
+
+def outcome(table: Table) -> Figure | None:
+    """Success rate as the runs come, with its interval, and how many failed which check."""
+    if not len(table.run):
+        return None
+    from matplotlib.figure import Figure
+
+    reasons = summarise(table).reasons
+    fig = Figure(figsize=(st.WIDTH, 2.9 + 0.14 * max(0, len(reasons) - 6)), layout="constrained")
+    left, right = fig.subplots(1, 2, width_ratios=(3, 2))
+    _head(fig, table, "Outcome")
+    n = np.unique(np.geomspace(1, len(table.run), 200).astype(int))
+    rates = [rate(table.passed[:k]) for k in n.tolist()]
+    low, high = (100 * np.array([getattr(r, end) for r in rates]) for end in ("low", "high"))
+    left.fill_between(n, low, high, color=st.BAND, label="95 % interval")
+    left.plot(n, [100 * r.rate for r in rates], color=st.PALETTE[0])
+    left.set(xlabel="runs", ylabel="passed [%]", ylim=(-3, 103))
+    if len(table.run) > 1:
+        left.set(xscale="log", xlim=(1, len(table.run)))
+    last = rates[-1]
+    left.set_title(
+        f"{100 * last.rate:.3g} % passed, 95 % interval {100 * last.low:.3g} to {100 * last.high:.3g} %",
+        loc="left",
+    )
+    right.set_title("failed checks", loc="left")
+    if not reasons:
+        st.note(right, "no run failed")
+        right.grid(visible=False)
+        right.tick_params(bottom=False, labelbottom=False)
+        return fig
+    names = [name.replace("_", " ") for name in reasons]
+    bars = right.barh(names, list(reasons.values()), color=FAILED, height=0.65)
+    right.bar_label(bars, padding=3, fontsize=8)
+    right.grid(visible=False, axis="y")
+    right.set(xlabel="runs")
+    right.set_ylim(max(len(names), 4) - 0.5, -0.5)
+    right.margins(x=0.15)
+    return fig
+
+
+def histograms(table: Table) -> Figure | None:
+    """How every metric is spread, of runs that passed and of those that failed, with its limit."""
+    names = [name for name in outcomes(table) if name != "success"]
+    if not names:
+        return None
+    fig, axes = _small(table, "Metrics of all runs", names)
+    limits, shown = _limits(table), False
+    for name, ax in zip(names, axes, strict=True):
+        x = table.metrics[name]
+        finite = np.isfinite(x)
+        scale = _scale(x[finite])
+        low, high = float(x[finite].min()), float(x[finite].max())
+        edges = (np.geomspace if scale == "log" else np.linspace)(low, high, _BINS + 1)
+        parts = [x[finite & table.passed], x[finite & ~table.passed]]
+        ax.hist(parts, bins=edges.tolist(), stacked=True, color=[PASSED, FAILED], linewidth=0)
+        ax.set_xscale(scale)
+        ax.set_xlim(low, high)
+        ax.grid(visible=False, axis="x")
+        _ticks(ax, scale)
+        ax.set_xlabel(_label(name))
+        if name in limits and low <= limits[name] <= high:
+            ax.axvline(limits[name], color=st.ALERT, linewidth=1.0, linestyle=(0, (6, 2)))
+            shown = True
+    for ax in axes[::_COLUMNS]:
+        ax.set_ylabel("runs")
+    _key(fig, table, limit=shown)
+    return fig
+
+
+def envelopes(table: Table) -> Figure | None:
+    """Every metric over the number that drives it most: runs, median, and the middle 90 %."""
+    strongest: dict[str, str] = {}
+    for d in drivers(table):
+        if d.outcome != "success":
+            strongest.setdefault(d.outcome, d.varied)
+    if not strongest:
+        return None
+    fig, axes = _small(table, "Metrics over what drives them most", list(strongest))
+    numbers = varied(table)
+    for (name, over), ax in zip(strongest.items(), axes, strict=True):
+        x, y = numbers[over], table.metrics[name]
+        for passed, colour in ((True, PASSED), (False, FAILED)):
+            some = (table.passed == passed) & np.isfinite(y)
+            ax.plot(x[some], y[some], ".", color=colour, markersize=2.5, alpha=0.5, rasterized=True)
+        centres, low, middle, high = _running(x[np.isfinite(y)], y[np.isfinite(y)])
+        ax.fill_between(centres, low, high, color=st.INK, alpha=0.12, linewidth=0)
+        ax.plot(centres, middle, color=st.INK)
+        scale = _scale(y[np.isfinite(y)])
+        ax.set_yscale(scale)
+        if _spacing(table, over) == "log":
+            ax.set_xscale("log")
+            _log_ticks(ax.xaxis, x)
+        ax.margins(x=0.02)
+        ax.set_title(_label(name), loc="left", fontsize=8.5)
+        ax.set_xlabel(_axis_label(table, over).replace(", ", ",\n"), fontsize=7.5)
+    _key(fig, table)
+    return fig
+
+
+def correlations(table: Table) -> Figure | None:
+    """Rank correlation of what varies with success and with every metric."""
+    found = drivers(table)
+    if not found:
+        return None
+    from matplotlib.figure import Figure
+
+    rows = list(dict.fromkeys(d.varied for d in found))[:_ROWS]
+    rows = [name for name in varied(table) if name in rows]
+    columns = [name for name in outcomes(table) if any(d.outcome == name for d in found)]
+    values = np.full((len(rows), len(columns)), np.nan)
+    for d in found:
+        if d.varied in rows:
+            values[rows.index(d.varied), columns.index(d.outcome)] = d.correlation
+    fig = Figure(figsize=(st.WIDTH, 2.2 + 0.27 * len(rows)), layout="constrained")
+    ax = fig.subplots()
+    _head(fig, table, "What drives success and the metrics")
+    image = ax.imshow(values, cmap="PuOr", vmin=-1, vmax=1, aspect="auto")
+    ax.set_xticks(range(len(columns)), [c.replace("_", " ") for c in columns])
+    ax.tick_params(axis="x", labelrotation=38, length=0)
+    for label in ax.get_xticklabels():
+        label.set(ha="right", rotation_mode="anchor")
+    ax.set_yticks(range(len(rows)), rows)
+    ax.tick_params(axis="y", length=0)
+    ax.grid(visible=False)
+    for spine in ax.spines.values():
+        spine.set_visible(False)
+    for (i, j), value in np.ndenumerate(values):
+        if math.isfinite(value):
+            colour = "white" if abs(value) > 0.65 else st.INK
+            ax.text(j, i, f"{value:+.2f}", ha="center", va="center", fontsize=7, color=colour)
+    fig.colorbar(image, ax=ax, label="Spearman's rank correlation [-]", pad=0.01)
+    return fig
+
+
+def over_two(table: Table, over: Sequence[str] = (), metric: str = "") -> Figure | None:
+    """A map of the success rate, or of a metric's median, over two varied numbers.
+
+    Raises
+    ------
+    RigidfleetError
+        A path or a metric is none of the sweep's.
+    """
+    numbers = varied(table)
+    if not metric:
+        judged = outcomes(table)
+        strongest = [d.outcome for d in drivers(table)]
+        metric = "success" if "success" in judged or not strongest else strongest[0]
+    if not over:
+        ranked = [d.varied for d in drivers(table) if d.outcome == metric]
+        over = list(dict.fromkeys([*ranked, *numbers]))[:2]
+        if len(over) < 2:
+            return None
+    known = ["success", *METRICS]
+    unknown = [(p, list(numbers)) for p in over if p not in numbers]
+    unknown += [(metric, known)] if metric not in known else []
+    if unknown or len(over) != 2:
+        word, words = unknown[0] if unknown else (" ".join(over), list(numbers))
+        raise RigidfleetError(f"map: '{word}' cannot be drawn. Use two of: {', '.join(words)}.")
+    from matplotlib.figure import Figure
+
+    values = 100.0 * table.passed if metric == "success" else table.metrics[metric]
+    (x, at_x), (y, at_y) = (_cells(numbers[p], _spacing(table, p)) for p in over)
+    cells = np.full((len(y) - 1, len(x) - 1), np.nan)
+    for i, j in np.ndindex(cells.shape):
+        inside = values[(at_y == i) & (at_x == j)]
+        inside = inside[np.isfinite(inside)]
+        if len(inside):
+            cells[i, j] = inside.mean() if metric == "success" else np.median(inside)
+    fig = Figure(figsize=(0.75 * st.WIDTH, 0.58 * st.WIDTH), layout="constrained")
+    ax = fig.subplots()
+    title = "Success rate" if metric == "success" else f"Median: {metric.replace('_', ' ')}"
+    _head(fig, table, title)
+    wide = metric != "success" and _scale(cells[np.isfinite(cells)]) == "log"
+    look: dict[str, Any] = {"vmin": 0, "vmax": 100} if metric == "success" else {}
+    look |= {"norm": "log"} if wide else {}
+    image = ax.pcolormesh(x, y, cells, cmap="viridis", edgecolor="white", linewidth=0.4, **look)
+    unit = "passed [%]" if metric == "success" else f"{METRICS[metric].text} [{_unit(metric)}]"
+    fig.colorbar(image, ax=ax, label=unit, pad=0.02)
+    ax.grid(visible=False)
+    ax.set(xlabel=_axis_label(table, over[0]), ylabel=_axis_label(table, over[1]))
+    for axis, scale, name in (
+        (ax.xaxis, ax.set_xscale, over[0]),
+        (ax.yaxis, ax.set_yscale, over[1]),
+    ):
+        distinct = np.unique(numbers[name])
+        if len(distinct) <= _VALUES:
+            axis.set_ticks(range(len(distinct)), [f"{v:.3g}" for v in distinct])
+        elif _spacing(table, name) == "log":
+            scale("log")
+            _log_ticks(axis, distinct)
+    return fig
+
+
+# -- parts -------------------------------------------------------------------------------------------
+
+
+def _head(fig: Figure, table: Table, title: str) -> None:
+    n = len(table.run)
+    words = f"{table.sweep.name}: {n} runs" if table.complete else (
+        f"{table.sweep.name}: {n} of {table.sweep.runs} runs"
+    )  # fmt: skip
+    st.heading(fig, title, words, st.GREY if table.complete else st.ALERT)
+
+
+def _small(table: Table, title: str, names: Sequence[str]) -> tuple[Figure, list[Axes]]:
+    """A small axes for each metric."""
+    from matplotlib.figure import Figure
+
+    rows = -(-len(names) // _COLUMNS)
+    fig = Figure(figsize=(st.WIDTH, 0.9 + 1.75 * rows), layout="constrained")
+    axes = fig.subplots(rows, _COLUMNS, squeeze=False).ravel().tolist()
+    _head(fig, table, title)
+    for ax in axes[len(names) :]:
+        ax.set_visible(False)
+    return fig, axes[: len(names)]
+
+
+def _key(fig: Figure, table: Table, *, limit: bool = False) -> None:
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    handles: list[Any] = [Patch(color=PASSED, label=f"{int(table.passed.sum())} passed")]
+    if not table.passed.all():
+        handles.append(Patch(color=FAILED, label=f"{int((~table.passed).sum())} failed"))
+    if limit:
+        handles.append(Line2D([], [], color=st.ALERT, linestyle=(0, (6, 2)), label="limit"))
+    fig.legend(handles=handles, loc="outside lower left", ncols=len(handles), fontsize=8)
+
+
+def _label(metric: str) -> str:
+    return f"{metric.replace('_', ' ')} [{_unit(metric)}]"
+
+
+def _unit(metric: str) -> str:
+    return _readable(METRICS[metric].unit)
+
+
+def _readable(unit: str) -> str:
+    """A unit as the other figures write it: m/s^2 for m s-2."""
+    words = {"1": "-", "m s-1": "m/s", "m s-2": "m/s²", "deg s-1": "deg/s"}
+    return words.get(unit, unit)
+
+
+def _axis_label(table: Table, name: str) -> str:
+    column = next(c for c in table.sweep.columns if c.name == name)
+    unit, _ = explained(table.sweep, column)
+    how = {"set": "", "add": ", added", "scale": ", factor"}[column.variation.change]
+    return f"{name}{how} [{_readable(unit)}]"
+
+
+def _limits(table: Table) -> dict[str, float]:
+    """The mission's own limits that a metric is held to."""
+    limits, agents = table.sweep.mission.limits, table.sweep.mission.agents
+    found = {
+        "speed": limits.speed,
+        "acceleration": limits.acceleration,
+        "separation": limits.separation,
+        "separation_below": limits.separation_below,
+        "thrust": min(agents.thrust_limit),
+        "clearance": 0.0 if table.sweep.mission.obstacles else None,
+    }
+    moved = {key for column in table.sweep.columns for key in column.keys[:2]}
+    moved |= {"thrust"} if "thrust_limit" in moved else set()
+    return {
+        name: v
+        for name, v in found.items()
+        if v is not None and math.isfinite(v) and name not in moved
+    }
+
+
+def _scale(x: Floats) -> str:
+    wide = len(x) and x.min() > 0 and x.max() > _LOGARITHMIC * x.min()
+    return "log" if wide else "linear"
+
+
+def _ticks(ax: Axes, scale: str) -> None:
+    from matplotlib.ticker import LogLocator, MaxNLocator
+
+    if scale == "log":
+        ax.xaxis.set_major_locator(LogLocator(numticks=4))
+        ax.minorticks_off()
+    else:
+        ax.xaxis.set_major_locator(MaxNLocator(3))
+    ax.yaxis.set_major_locator(MaxNLocator(3, integer=True))
+
+
+def _spacing(table: Table, name: str) -> str:
+    """The scale that what varies is spread over evenly."""
+    column = next(c for c in table.sweep.columns if c.name == name)
+    return "log" if isinstance(column.variation, LogUniform | Geomspace) else "linear"
+
+
+def _log_ticks(axis: Axis, x: Floats) -> None:
+    """Plain numbers along a logarithmic axis, of which there may be less than a decade."""
+    if x.max() > _LOGARITHMIC * x.min():
+        return
+    ticks = np.geomspace(x.min(), x.max(), 3)
+    axis.set_ticks(ticks, [f"{v:.2g}" for v in ticks])
+    axis.set_ticks([], minor=True)
+
+
+def _cells(x: Floats, scale: str) -> tuple[Floats, NDArray[np.int64]]:
+    """Edges of cells along an axis, and the cell of each run: of few values each has one of its own."""
+    distinct = np.unique(x)
+    if len(distinct) <= _VALUES:
+        edges = np.arange(len(distinct) + 1, dtype=np.float64) - 0.5
+        return np.asarray(edges, dtype=np.float64), np.searchsorted(distinct, x)
+    space = np.geomspace if scale == "log" else np.linspace
+    edges = space(distinct[0], distinct[-1], _CELLS + 1)
+    return edges, np.clip(np.searchsorted(edges, x, side="right") - 1, 0, _CELLS - 1)
+
+
+def _running(x: Floats, y: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+    """Median and 5th and 95th percentile of y at each value of x, or along stretches of as many runs."""
+    distinct = np.unique(x)
+    if len(distinct) <= _ENVELOPE:
+        parts = [y[x == v] for v in distinct]
+        centres = distinct
+    else:
+        order = np.argsort(x)
+        stretches = np.array_split(order, min(_ENVELOPE, max(1, len(x) // 5)))
+        parts = [y[s] for s in stretches]
+        centres = np.array([np.median(x[s]) for s in stretches])
+    low, middle, high = np.array([np.percentile(part, (5, 50, 95)) for part in parts]).T
+    return centres, low, middle, high

@@ -1,0 +1,79 @@
+"""What is kept of each run: the one list of a sweep's metrics, and how a verdict gives them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rigidfleet.assess import Verdict
+    from rigidfleet.result import Result
+
+
+@dataclass(frozen=True)
+class Metric:
+    """One number of a run: its unit and meaning."""
+
+    unit: str
+    text: str
+
+
+METRICS: dict[str, Metric] = {
+    "shape_end": Metric("m", "shape error at the end: worst of all pairs against the slots"),
+    "shape": Metric("m", "worst shape error at the end of a phase"),
+    "constraint_end": Metric("m", "greatest constraint error |c| at the end"),
+    "constraint": Metric("m", "greatest constraint error |c|"),
+    "handed": Metric("1", "1: right-handed at the end of every phase; 0: mirrored"),
+    "flip": Metric("deg", "greatest angle of a plane or line from where it should point"),
+    "waypoint_position": Metric("m", "greatest miss of a waypoint"),
+    "waypoint_velocity": Metric("m s-1", "greatest miss of a waypoint's velocity"),
+    "waypoint_attitude": Metric("deg", "greatest miss of a waypoint's attitude"),
+    "waypoint_rates": Metric("deg s-1", "greatest miss of a waypoint's body rates"),
+    "separation": Metric("m", "least separation of two agents, less radii"),
+    "separation_below": Metric("m", "least height over an agent below, less radii"),
+    "clearance": Metric("m", "least clearance to an obstacle, less radius"),
+    "geofence": Metric("m", "how far an agent leaves the geofence; negative inside"),
+    "thrust": Metric("N", "thrust nearest to, or furthest beyond, its limit; without one the peak"),
+    "speed": Metric("m s-1", "peak speed"),
+    "acceleration": Metric("m s-2", "peak acceleration"),
+    "constraint_force": Metric("N", "peak constraint force on an agent"),
+    "tension": Metric("N", "tension of greatest size in an edge; negative: a push"),
+    "singular_value": Metric("1", "smallest singular value of the constraint Jacobian"),
+    "flown": Metric("s", "mission time at the end"),
+    "steps": Metric("1", "steps of the integrator"),
+    "evaluations": Metric("1", "evaluations of the right-hand side"),
+}
+
+
+def measure(result: Result, verdict: Verdict) -> dict[str, float]:
+    """Value of every metric of a flight; NaN where it does not apply."""
+    phases = verdict.phases
+    shapes = [p.shape for p in phases if p.shape is not None]
+    hands = [float(p.handedness) for p in phases if p.handedness is not None]
+    found = {
+        "shape_end": shapes[-1] if shapes else math.nan,
+        "shape": _greatest(shapes),
+        "constraint_end": _greatest(p.constraint for p in phases[-1:]),
+        "handed": min(hands, default=math.nan),
+        "flip": _greatest(p.flip for p in phases),
+        "flown": float(result.time[-1]),
+        "steps": float(result.statistics["steps"]),
+        "evaluations": float(result.statistics["evaluations"]),
+    }
+    for name in ("position", "velocity", "attitude", "rates"):
+        misses = (getattr(p.waypoint, name) for p in phases if p.waypoint is not None)
+        found[f"waypoint_{name}"] = _greatest(misses)
+    checked = {f.check: f.worst for f in verdict.findings if f.worst is not None}
+    worst = {name: extreme.value for name, extreme in verdict.worst.items()}
+    worst |= {
+        name: checked[name]
+        for name in ("separation_below", "geofence", "thrust")
+        if name in checked
+    }
+    return {name: float((worst | found).get(name, math.nan)) for name in METRICS}
+
+
+def _greatest(values: Iterable[float | None]) -> float:
+    return max((v for v in values if v is not None), default=math.nan)

@@ -1,0 +1,96 @@
+"""Who flies: this process, processes beside it, or those of a Dask cluster; and what they are sent."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable, Generator, Sequence
+from concurrent.futures import Executor, ProcessPoolExecutor
+from contextlib import contextmanager
+from multiprocessing import connection
+from typing import Any
+
+from rigidfleet import __version__
+from rigidfleet.errors import RigidfleetError
+from rigidfleet.sweep.definition import shared
+from rigidfleet.sweep.engine import Row, fly_runs
+
+#: An executor, and how many chunks it works on at the same time.
+Crew = tuple[Executor, Callable[[], int]]
+_CONNECT = 20.0  # [s] to wait for a scheduler
+
+
+def chunk(sweep: str, version: str, runs: Sequence[int]) -> list[Row]:
+    """Fly a chunk of a sweep, given as JSON, for another process.
+
+    Raises
+    ------
+    RigidfleetError
+        This process has another version of rigidfleet than the one that asks.
+    """
+    if version != __version__:
+        raise RigidfleetError(
+            f"a worker has rigidfleet {__version__}, and this sweep is flown by {version}. Install the same"
+            " version on all machines."
+        )
+    return fly_runs(shared(sweep), runs)
+
+
+@contextmanager
+def processes(count: int) -> Generator[Crew]:
+    """Persistent processes on this machine; they end with this one, however it ends."""
+    before = set(multiprocessing.active_children())
+    context = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(count, mp_context=context, initializer=_begin)
+    try:
+        yield pool, lambda: count
+    finally:
+        pool.shutdown(wait=False, cancel_futures=True)
+        for process in set(multiprocessing.active_children()) - before:
+            process.terminate()
+
+
+def _begin() -> None:
+    """Leave Ctrl-C to the process that started this one, and end when it does."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_follow, daemon=True).start()
+
+
+def _follow() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    connection.wait([parent.sentinel])
+    os._exit(1)
+
+
+@contextmanager
+def cluster(address: str) -> Generator[Crew]:
+    """The workers of a Dask cluster, as many as there are at any time.
+
+    Raises
+    ------
+    RigidfleetError
+        Dask is not installed, or no scheduler answers at the address.
+    """
+    try:
+        from distributed import Client
+    except ImportError:
+        raise RigidfleetError(
+            'a cluster needs the package distributed. Install it by: pip install "rigidfleet[cluster]"'
+        ) from None
+    try:
+        client: Any = Client(address, timeout=_CONNECT, set_as_default=False)
+    except (OSError, ValueError, TypeError) as error:
+        why = str(error) or type(error).__name__
+        raise RigidfleetError(
+            f"--cluster {address}: no scheduler answers there ({why}). Start one by `dask scheduler`, and"
+            " give the address that it prints, as tcp://HOST:8786."
+        ) from None
+    with client:
+        executor = client.get_executor(pure=False)
+        try:
+            yield executor, lambda: max(1, sum(client.nthreads().values()))
+        finally:
+            executor.shutdown(wait=False)

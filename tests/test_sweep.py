@@ -1,0 +1,681 @@
+"""Sweeps: what varies, the same rows however they are flown, the store, the summary, the command."""
+
+import json
+import math
+import os
+import random
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+import tomllib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from rigidfleet import cli
+from rigidfleet.errors import ResultError, RigidfleetError, SweepError
+from rigidfleet.mission import Mission
+from rigidfleet.sweep import METRICS, Sweep, Table, fly, load, read
+from rigidfleet.sweep.conduct import SweepProgress
+from rigidfleet.sweep.engine import GROUP, fly_runs
+from rigidfleet.sweep.figures import over_two, plot
+from rigidfleet.sweep.summary import drivers, rate, summarise
+
+EXAMPLE = Path(__file__).parents[1] / "examples" / "gain_study.toml"
+PAIR: dict[str, Any] = {
+    "schema_version": 1,
+    "name": "pair",
+    "agents": {"mass": 1.0, "position": [[0.0, 0.0, 5.0], [3.0, 1.0, 5.0]], "thrust_limit": 14.0},
+    "formations": {"pair": {"shape": "line", "size": 4.0}},
+    "phases": [{"kind": "establish", "formation": "pair", "blend": 1.0, "until": 2.0}],
+}
+MISSION = Mission.from_dict(PAIR)
+SCATTER = ["agents.position.*.* += normal(0, 0.3)", "agents.mass.* *= uniform(0.8, 1.2)"]
+
+
+def sweep(*vary: str, runs: int | None = 20, seed: int = 3, mission: Mission = MISSION) -> Sweep:
+    return Sweep.of(mission, vary or SCATTER, runs=runs, seed=seed)
+
+
+def numbers(table: Table) -> tuple[Any, ...]:
+    """All of a sweep that has to be the same each time: bits, not values, so that NaN equals NaN."""
+    metrics = {name: values.tobytes() for name, values in table.metrics.items()}
+    words = table.reason.tolist(), table.detail.tolist()
+    return table.run.tolist(), table.passed.tolist(), words, table.codes.tobytes(), metrics
+
+
+def refused(*vary: Any, runs: int | None = 5, seed: int = 0) -> dict[str, tuple[str, str]]:
+    """Problem and remedy of each finding, by its key."""
+    with pytest.raises(SweepError) as caught:
+        Sweep.of(MISSION, vary, runs=runs, seed=seed)
+    return {f.key: (f.problem, f.remedy) for f in caught.value.findings}
+
+
+# -- what varies -------------------------------------------------------------------------------------
+
+
+def test_a_path_leads_to_what_the_document_has():
+    """Whatever stands in a mission, or would by default, can be set, shifted and scaled; the rest stays."""
+    found = sweep(
+        "agents.position.2.3 = grid(7)",
+        "agents.mass.1 *= grid(3)",
+        "agents.velocity.*.1 += grid(0.5)",
+        "constraint.alpha = grid(2)",
+        "phases[1].until += grid(1)",
+        "formations.pair.size *= grid(1.5)",
+        "constraint.solver = grid(exact)",
+        runs=None,
+    )
+    document = found.varied(0)
+    mission = Mission.from_dict(document)
+    assert mission.agents.position == ((0.0, 0.0, 5.0), (3.0, 1.0, 7.0))
+    assert mission.agents.mass == (3.0, 1.0)
+    assert mission.agents.velocity == ((0.5, 0.0, 0.0), (0.5, 0.0, 0.0))
+    assert (mission.constraint.alpha, mission.constraint.solver) == (2.0, "exact")
+    assert mission.phases[0].until == 3.0
+    assert mission.formations["pair"].size == 6.0
+    assert document["formations"]["pair"].keys() == PAIR["formations"]["pair"].keys()
+    assert found.mission.to_dict() == tomllib.loads(MISSION.text)
+
+
+def test_a_star_gives_each_its_own_and_no_star_all_the_same():
+    """`agents.mass.*` draws a mass for each vehicle, `agents.mass` one for all."""
+    own = sweep("agents.mass.* = uniform(1, 2)").varied(0)["agents"]["mass"]
+    assert own[0] != own[1]
+    assert sweep("agents.mass = uniform(1, 2)").varied(0)["agents"]["mass"] != 1.0
+    shifted = sweep("agents.position.*.3 += uniform(1, 2)", "agents.position.1 += grid(1)").varied(
+        0
+    )
+    assert shifted["agents"]["position"][0][:2] == [1.0, 1.0]
+
+
+def test_whole_numbers_stay_whole():
+    """A number that the mission counts with is rounded."""
+    drawn = sweep("constraint.iterations = uniform(1, 9)", runs=40)
+    found = {drawn.varied(k)["constraint"]["iterations"] for k in range(40)}
+    assert found == set(range(1, 10))
+
+
+@pytest.mark.parametrize(
+    ("kind", "distribution"),
+    [
+        ("normal(2, 0.5)", stats.norm(2, 0.5)),
+        ("uniform(1, 4)", stats.uniform(1, 3)),
+        ("log-uniform(0.1, 10)", stats.loguniform(0.1, 10)),
+    ],
+)
+def test_distributions(kind, distribution):
+    """Draws over the runs follow the distribution (Kolmogorov-Smirnov against SciPy's)."""
+    drawn = sweep(f"agents.mass = {kind}", runs=2000)
+    assert stats.kstest([drawn.values(k)[0] for k in range(2000)], distribution.cdf).pvalue > 0.01
+
+
+def test_choices_are_as_likely():
+    """Each of several words comes as often, and into the mission."""
+    found = sweep("constraint.solver = choice(iterated, exact, pinv)", runs=900)
+    words = [found.values(k)[0] for k in range(900)]
+    assert stats.chisquare([words.count(w) for w in ("iterated", "exact", "pinv")]).pvalue > 0.01
+    assert found.varied(0)["constraint"]["solver"] == words[0]
+
+
+def test_columns_and_runs_are_independent():
+    """What one vehicle draws says nothing of another, nor one run of the next."""
+    found = sweep(runs=1000)
+    draws = np.array([found.values(k) for k in range(1000)])
+    correlation = np.corrcoef(np.hstack([draws[1:], draws[:-1]]).T) - np.eye(2 * draws.shape[1])
+    assert np.abs(correlation).max() < 4.5 / math.sqrt(1000)
+
+
+def test_a_grid_is_gone_through_in_order():
+    """Runs take the points of the product of all grids, the last fastest, and go round."""
+    found = sweep("constraint.alpha = grid(1, 2)", "agents.mass = linspace(1, 3, 3)", runs=None)
+    assert found.runs == 6
+    points = [tuple(found.values(k)) for k in range(12)]
+    assert points[:6] == [(a, m) for a in (1, 2) for m in (1.0, 2.0, 3.0)]
+    assert points[6:] == points[:6]
+    ratios = sweep("constraint.beta = geomspace(1, 8, 4)", runs=None)
+    assert [ratios.values(k)[0] for k in range(4)] == pytest.approx([1, 2, 4, 8])
+
+
+def test_a_run_depends_on_seed_and_number_alone():
+    """More runs change none of the first; another seed changes all."""
+    few, many, other = sweep(runs=3), sweep(runs=3000), sweep(seed=4)
+    assert [few.values(k) for k in range(3)] == [many.values(k) for k in range(3)]
+    assert not set(few.values(0)) & set(other.values(0))
+
+
+def test_lines_and_tables_say_the_same():
+    """A line is short for a table."""
+    table = {"path": "agents.mass", "change": "scale", "kind": "normal", "mean": 1.0, "sd": 0.1}
+    assert (
+        sweep("agents.mass *= normal(1, 0.1)").json()
+        == Sweep.of(MISSION, [table], runs=20, seed=3).json()
+    )
+
+
+# -- the check on entry ------------------------------------------------------------------------------
+
+
+def test_all_errors_at_once():
+    """Every error of a sweep has its key and what to do, with what may be meant."""
+    found = refused(
+        "agents.mas.* *= normal(1, -0.5)",
+        "agents.2.mass = uniform(2, 1)",
+        "phases.1.untl = uniform(1, 2)",
+        "phases.4.until = uniform(1, 2)",
+        "agents.mass = norml(1, 2)",
+        "agents.mass = normal(1)",
+        "mass is heavy",
+        "constraint.solver = uniform(1, 2)",
+        "agents = grid(1)",
+        "phases.1.duration = uniform(1, 2)",
+        "phases.1.duration += uniform(1, 2)",
+        "constraint.solver += choice(exact)",
+        {"path": "agents.mass", "kind": "normal", "mean": 1.0, "sdd": 0.1},
+        seed=-1,
+    )
+    assert found["vary[1].sd"][0] == "must be > 0"
+    assert found["vary[1].path"][1] == "did you mean 'agents.mass.*'?"
+    assert "above low = 2" in found["vary[2].high"][0]
+    assert found["vary[2].path"][1] == "did you mean 'agents.mass.2'?"
+    assert found["vary[3].path"][1] == "did you mean 'phases.1.until'?"
+    assert "from 1 to 1" in found["vary[4].path"][1]
+    assert found["vary[5]"][1] == "did you mean 'normal'?"
+    assert found["vary[6]"] == ("normal takes 2 numbers, not 1", "write normal(mean, sd)")
+    assert found["vary[7]"][0] == "is no variation"
+    assert "no number" in found["vary[8].path"][0]
+    assert "is a table" in found["vary[9].path"][0]
+    assert "ends by until and duration" in found["vary[10].path"][0]
+    assert "nothing to add to" in found["vary[11].path"][0]
+    assert "numbers to add" in found["vary[12].values"][0]
+    assert found["vary[13].sdd"][1] == "did you mean 'sd'?"
+    assert "vary[13].sd" in found
+    assert found["seed"][0] == "must be >= 0"
+
+
+def test_runs_are_needed_without_a_grid():
+    """A distribution has no number of runs of its own, and something has to vary."""
+    assert "runs" in refused("agents.mass = normal(1, 0.1)", runs=None)
+    assert refused()["vary"][0] == "nothing varies"
+
+
+def test_a_file_is_checked_like_a_mission(tmp_path):
+    """Errors of a sweep file name the file; its mission may lie beside it."""
+    file = tmp_path / "study.toml"
+    (tmp_path / "pair.toml").write_text(MISSION.text)
+    good = 'mission = "pair.toml"\nruns = 4\nvary = ["agents.mass = uniform(1, 2)"]\n'
+    file.write_text(good)
+    found = Sweep.load(file, more=["agents.radius = grid(0.1, 0.2)"], seed=5)
+    assert (found.name, found.runs, found.seed, len(found.columns)) == ("study", 4, 5, 2)
+    file.write_text(good + "sed = 3\n[[obstacles]]\n")
+    with pytest.raises(SweepError) as caught:
+        Sweep.load(file)
+    assert [f.file for f in caught.value.findings] == [str(file)] * 2
+    assert "did you mean 'seed'?" in str(caught.value)
+
+
+# -- flying ------------------------------------------------------------------------------------------
+
+
+def test_metrics_are_those_of_the_verdict(tmp_path):
+    """A row has what simulate and assess say of the varied mission."""
+    from rigidfleet.assess import assess
+    from rigidfleet.simulate import simulate
+
+    found = sweep(runs=3)
+    (row,) = fly_runs(found, [2])
+    result = simulate(Mission.from_dict(found.varied(2)))
+    verdict = assess(result)
+    assert list(row.metrics) == list(METRICS)
+    assert row.passed == verdict.passed
+    assert row.metrics["thrust"] == result.thrust.max()
+    assert row.metrics["separation"] == result.separation.min()
+    assert row.metrics["constraint"] == abs(verdict.worst["constraint"].value)
+    assert row.metrics["shape_end"] == verdict.phases[-1].shape
+    assert row.metrics["steps"] == result.statistics["steps"]
+    assert math.isnan(row.metrics["clearance"])
+
+
+def test_a_failed_run_is_a_row_with_its_reason(tmp_path):
+    """A mission that cannot be, and one that does not pass, end no sweep."""
+    table = fly(sweep("agents.mass = grid(1, -1, 2)", runs=None), tmp_path, workers=1)
+    assert table.reason.tolist() == ["", "mission", "thrust"]
+    assert table.passed.tolist() == [True, False, False]
+    assert "agents.mass" in table.detail[1]
+    assert "thrust" in table.detail[2]
+    assert np.isnan(table.metrics["speed"][1])
+    assert table.metrics["thrust"][2] > 14.0
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory) -> Table:
+    """A sweep of twenty runs, flown in one go by one process."""
+    return fly(sweep(), tmp_path_factory.mktemp("flown"), workers=1)
+
+
+def test_rows_are_the_same_for_any_number_of_workers(flown, tmp_path, monkeypatch):
+    """Processes give the rows of one process, bit for bit."""
+    monkeypatch.setattr("rigidfleet.sweep.conduct._WORTH", 0.0)
+    seen: list[SweepProgress] = []
+    table = fly(sweep(), tmp_path, workers=2, progress=seen.append)
+    assert numbers(table) == numbers(flown)
+    assert seen[-1].workers == 2
+    assert (seen[0].done, seen[-1].done, seen[-1].flown) == (0, 20, 20)
+
+
+def test_a_sweep_goes_on_where_it_was_stopped(flown, tmp_path):
+    """Ctrl-C after any chunk leaves whole groups; the same call adds the rest, and flies nothing twice."""
+
+    def stop(progress: SweepProgress) -> None:
+        if progress.flown:
+            raise KeyboardInterrupt
+
+    for there in (8, 16):
+        with pytest.raises(KeyboardInterrupt):
+            fly(sweep(), tmp_path, workers=1, progress=stop)
+        assert len(read(tmp_path).run) == there
+        assert not read(tmp_path).complete
+    seen: list[SweepProgress] = []
+    assert numbers(fly(sweep(), tmp_path, workers=1, progress=seen.append)) == numbers(flown)
+    assert seen[-1].flown == 4
+
+
+def test_more_runs_may_be_added(flown, tmp_path):
+    """Six runs that become twenty are those of twenty, and fewer than there are is refused."""
+    fly(sweep(runs=6), tmp_path, workers=1)
+    assert numbers(fly(sweep(), tmp_path, workers=1)) == numbers(flown)
+    with pytest.raises(ResultError, match="with 20 runs, more than 6"):
+        fly(sweep(runs=6), tmp_path, workers=1)
+
+
+def test_another_sweep_is_refused(tmp_path):
+    """A folder keeps its sweep, unless it is to be replaced."""
+    fly(sweep(runs=3), tmp_path, workers=1)
+    with pytest.raises(ResultError, match=r"another sweep.*seed.*--force"):
+        fly(sweep(runs=3, seed=9), tmp_path, workers=1)
+    assert read(tmp_path).sweep.seed == 3
+    assert fly(sweep(runs=2, seed=9), tmp_path, workers=1, replace=True).run.tolist() == [0, 1]
+
+
+def test_two_do_not_write_the_same_sweep(tmp_path):
+    """While one process flies a sweep another is told so; reading goes on."""
+
+    def second(progress: SweepProgress) -> None:
+        with pytest.raises(ResultError, match="another sweep is writing"):
+            fly(sweep(runs=3), tmp_path, workers=1)
+        assert len(read(tmp_path).run) == progress.done
+
+    fly(sweep(runs=3), tmp_path, workers=1, progress=second)
+
+
+def test_what_is_no_store(tmp_path):
+    """A folder without a sweep, and a file that is none, are named, not overwritten."""
+    with pytest.raises(ResultError, match="holds no sweep"):
+        read(tmp_path)
+    (tmp_path / "sweep.db").write_bytes(b"not a database at all" * 100)
+    with pytest.raises(ResultError, match="is no store"):
+        fly(sweep(runs=3), tmp_path, workers=1)
+    assert (tmp_path / "sweep.db").read_bytes().startswith(b"not a database")
+
+
+def test_a_group_is_never_split():
+    """Chunks are whole groups of eight consecutive runs, whatever is missing."""
+    from rigidfleet.sweep.conduct import _Sweeping
+
+    class Gaps:
+        def there(self):
+            there = np.ones(100, dtype=bool)
+            there[[3, 4, 40, 97]] = False
+            return there
+
+    under_way = _Sweeping(sweep(runs=100), Gaps(), None)  # ty: ignore[invalid-argument-type]
+    under_way.pace = 1e-6
+    taken = [under_way.take(1) for _ in range(2)]
+    assert taken == [[*range(8), *range(40, 48)], [96, 97, 98, 99]]
+    assert GROUP == 8
+
+
+# -- killed ------------------------------------------------------------------------------------------
+
+
+def command(*arguments: object) -> list[str]:
+    return [sys.executable, "-m", "rigidfleet", *map(str, arguments)]
+
+
+def until(ready: Callable[[], bool], process: subprocess.Popen[bytes]) -> None:
+    """Wait for something that a process does, or for its end."""
+    while process.poll() is None and not ready():
+        time.sleep(0.01)
+
+
+def count(folder: Path) -> int:
+    try:
+        with sqlite3.connect(folder / "sweep.db") as db:
+            return db.execute("SELECT count(*) FROM runs").fetchone()[0]
+    except sqlite3.Error:
+        return 0
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("workers", [1, 2])
+def test_killed_at_any_moment(workers, tmp_path):
+    """After kill -9 at random moments the same command ends with the rows of an uninterrupted sweep."""
+    runs = 64 if workers == 1 else 1500
+    (tmp_path / "pair.toml").write_text(MISSION.text)
+    asked = ["sweep", tmp_path / "pair.toml", "--runs", runs, "--workers", workers, "--no-figures"]
+    asked += [option for line in SCATTER for option in ("--vary", line)]
+    asked += ["--out", tmp_path / "killed", "--quiet"]
+    moments, kills = random.Random(1), 0
+    for share in (0.1, 0.5, 0.8):
+        process = subprocess.Popen(command(*asked), stderr=subprocess.PIPE)
+        until(lambda share=share: count(tmp_path / "killed") > share * runs, process)
+        time.sleep(0.2 * moments.random())
+        kills += process.poll() is None
+        process.kill()
+        assert b"Traceback" not in process.communicate()[1]
+    assert kills >= 1
+    assert subprocess.run(command(*asked), check=False).returncode == cli.PASSED
+    whole = fly(Sweep.of(MISSION, SCATTER, runs=runs), tmp_path / "whole", workers=1)
+    assert numbers(read(tmp_path / "killed")) == numbers(whole)
+
+
+@pytest.mark.long
+def test_workers_end_with_what_started_them(tmp_path):
+    """After kill -9 of the command none of its processes is left."""
+    asked = ["sweep", "narrow-passage", "--runs", 5000, "--workers", 2, "--vary", SCATTER[1]]
+    process = subprocess.Popen(command(*asked, "--out", tmp_path, "--quiet"))
+    until(lambda: count(tmp_path) > 30, process)
+    listed = subprocess.run(
+        ["ps", "--ppid", str(process.pid), "-o", "pid="], check=True, capture_output=True, text=True
+    )
+    children = [int(pid) for pid in listed.stdout.split()]
+    assert len(children) >= 2
+    process.kill()
+    process.wait()
+    deadline = time.monotonic() + 20
+    while any(Path(f"/proc/{pid}").exists() for pid in children) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert not any(Path(f"/proc/{pid}").exists() for pid in children)
+
+
+@pytest.mark.long
+def test_a_killed_worker_is_replaced(flown, tmp_path, monkeypatch):
+    """A worker process killed in mid-run costs its chunk some time, and nothing else."""
+    import multiprocessing
+
+    monkeypatch.setattr("rigidfleet.sweep.conduct._WORTH", 0.0)
+    killed: list[int] = []
+
+    def kill(progress: SweepProgress) -> None:
+        if progress.workers == 2 and not killed:
+            child = multiprocessing.active_children()[0]
+            assert child.pid is not None
+            killed.append(child.pid)
+            os.kill(child.pid, signal.SIGKILL)
+
+    table = fly(sweep(runs=40), tmp_path, workers=2, progress=kill)
+    assert killed
+    assert numbers(table) == numbers(fly(sweep(runs=40), tmp_path / "whole", workers=1))
+
+
+def started(arguments: list[str]) -> subprocess.Popen[bytes]:
+    """A Dask process."""
+    tool = str(Path(sys.executable).with_name("dask"))
+    quiet = subprocess.DEVNULL
+    return subprocess.Popen([tool, *arguments, "--no-dashboard"], stdout=quiet, stderr=quiet)
+
+
+@pytest.fixture
+def dask(tmp_path) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
+    """A scheduler and two workers as the manual starts them, each a process: address, and the workers."""
+    pytest.importorskip("distributed")
+    place = tmp_path / "scheduler.json"
+    here = ["scheduler", "--host", "127.0.0.1", "--port", "0", "--scheduler-file", str(place)]
+    processes = [started(here)]
+    try:
+        until(place.exists, processes[0])
+        address = json.loads(place.read_text())["address"]
+        for k in range(2):
+            local = ["--local-directory", str(tmp_path / f"worker-{k}")]
+            processes.append(started(["worker", address, "--nthreads", "1", "--no-nanny", *local]))
+        yield address, processes[1:]
+    finally:
+        for process in reversed(processes):
+            process.kill()
+            process.wait()
+
+
+@pytest.mark.long
+def test_a_cluster_loses_a_worker(dask, tmp_path):
+    """Of two Dask workers one is killed in mid-run: all rows come, the same bit for bit."""
+    address, workers = dask
+    mission = "single-waypoint"
+    asked = Sweep.of(mission, SCATTER, runs=200, seed=2)
+    alone = fly(asked, tmp_path / "alone", workers=1)
+    killed = []
+
+    def kill(progress: SweepProgress) -> None:
+        if progress.workers == 2 and progress.flown >= 32 and not killed:
+            killed.append(progress.done)
+            workers[0].kill()
+
+    table = fly(asked, tmp_path / "cluster", cluster=address, progress=kill)
+    assert killed
+    assert killed[0] < 200
+    assert numbers(table) == numbers(alone)
+
+
+@pytest.mark.long
+def test_no_cluster_answers(tmp_path, monkeypatch):
+    """An address without a scheduler is one clear error."""
+    monkeypatch.setattr("rigidfleet.sweep.workers._CONNECT", 0.5)
+    with pytest.raises(RigidfleetError, match="no scheduler answers"):
+        fly(sweep(), tmp_path, cluster="tcp://127.0.0.1:9")
+
+
+# -- analysis ----------------------------------------------------------------------------------------
+
+
+def made(n: int = 400, runs: int | None = None) -> Table:
+    """A table of known law: heavier vehicles need more thrust, and fail beyond 14 N."""
+    found = sweep(
+        "agents.mass = uniform(0.8, 2)", "agents.radius = uniform(0.1, 0.5)", runs=runs or n
+    )
+    codes = np.array([found.values(k) for k in range(n)])
+    thrust = 9.81 * codes[:, 0]
+    metrics = {name: np.full(n, math.nan) for name in METRICS}
+    metrics |= {"thrust": thrust, "separation": 3.0 - 2.0 * codes[:, 1] + 0.1 * codes[:, 0]}
+    passed = thrust <= 14.0
+    reason = np.where(passed, "", "thrust, speed").astype(object)
+    return Table(found, np.arange(n), passed, reason, reason, codes, metrics, np.full(n, 0.1))
+
+
+def test_wilsons_interval():
+    """The interval of a rate solves Wilson's equation |p - k/n| = z sqrt(p (1 - p) / n)."""
+    found = rate(np.arange(50) < 41)
+    assert found.rate == 0.82
+    z = stats.norm.ppf(0.975)
+    for p in (found.low, found.high):
+        assert abs(p - found.rate) == pytest.approx(z * math.sqrt(p * (1 - p) / 50))
+    assert rate(np.array([], dtype=bool)).high == 1.0
+
+
+def test_summary_finds_what_drives_failure():
+    """Rates, percentiles and reasons are those of the rows; the driver comes first, by Spearman's formula."""
+    table = made()
+    found = summarise(table)
+    mass = table.codes[:, 0]
+    assert found.success.count == int((mass <= 14.0 / 9.81).sum())
+    assert found.reasons == {
+        "thrust": 400 - found.success.count,
+        "speed": 400 - found.success.count,
+    }
+    assert found.percentiles["thrust"][3] == np.median(9.81 * mass)
+    assert "clearance" not in found.percentiles
+    assert (found.drivers[0].varied, found.drivers[0].outcome) == ("agents.mass", "thrust")
+    assert found.drivers[0].correlation == pytest.approx(1.0)
+    radius = next(
+        d for d in drivers(table) if (d.varied, d.outcome) == ("agents.radius", "separation")
+    )
+    ranks = stats.rankdata(table.codes[:, 1]) - stats.rankdata(table.metrics["separation"])
+    assert radius.correlation == pytest.approx(1 - 6 * (ranks**2).sum() / (400 * (400**2 - 1)))
+    failing = next(d for d in found.drivers if d.outcome == "success")
+    assert failing.varied == "agents.mass"
+    assert failing.correlation < -0.7
+    assert json.loads(found.json())["percentiles"]["thrust"]["50"] == found.percentiles["thrust"][3]
+
+
+def test_words_have_a_rate_each(tmp_path):
+    """What varies by words has no rank: each of its values has its rate."""
+    vary = ["constraint.solver = grid(exact, pinv)", "agents.mass = grid(1, 2)"]
+    table = fly(sweep(*vary, runs=None), tmp_path, workers=1)
+    found = summarise(table)
+    assert {k: (r.count, r.of) for k, r in found.by_value["constraint.solver"].items()} == {
+        "exact": (1, 2),
+        "pinv": (1, 2),
+    }
+    assert {d.varied for d in found.drivers} == {"agents.mass"}
+    assert load(tmp_path)["constraint.solver"].values.tolist() == ["exact", "exact", "pinv", "pinv"]
+
+
+def test_dataset(flown, tmp_path):
+    """One xarray dataset along the runs, with units and meanings."""
+    data = load(fly_into(tmp_path))
+    assert dict(data.sizes) == {"run": 20}
+    assert data["thrust"].values.tolist() == flown.metrics["thrust"].tolist()
+    assert data["agents.position.2.3"].attrs["units"] == "m"
+    assert data["agents.mass.1"].attrs["units"] == "1"
+    assert data["agents.mass.1"].attrs["long_name"].startswith("factor of: mass [kg]")
+    assert all(data[name].attrs["units"] == METRICS[name].unit for name in METRICS)
+    assert data.attrs["complete"] == 1
+    assert Mission.from_toml(data.attrs["mission"]).name == "pair"
+
+
+def fly_into(folder: Path) -> Path:
+    fly(sweep(), folder, workers=1)
+    return folder
+
+
+def test_figures(tmp_path):
+    """Every figure is drawn, with the limit, and a unit on every axis."""
+    files = plot(made(), tmp_path, formats=["png", "svg"])
+    names = {path.name for path in files}
+    assert names == {
+        f"{name}.{kind}"
+        for name in ("outcome", "histograms", "envelopes", "drivers", "map")
+        for kind in ("png", "svg")
+    }
+    text = (tmp_path / "histograms.svg").read_text()
+    assert "thrust [N]" in text
+    assert "separation [m]" in text
+    assert "limit" in text
+    assert "agents.mass [kg]" in (tmp_path / "envelopes.svg").read_text()
+
+
+def test_a_map_shows_rates_where_the_runs_are():
+    """Cells of the map hold the success rate of the runs in them, and a metric's median."""
+    found = made()
+    heavy = over_two(found, ["agents.mass", "agents.radius"], "thrust")
+    assert heavy is not None
+    mesh = heavy.axes[0].collections[0].get_array()
+    assert mesh is not None
+    columns = np.nanmean(np.asarray(mesh), axis=0)
+    edges = np.linspace(found.codes[:, 0].min(), found.codes[:, 0].max(), 11)
+    assert columns == pytest.approx(9.81 * (edges[1:] + edges[:-1]) / 2, rel=0.03)
+    with pytest.raises(RigidfleetError, match=r"agents\.mas' cannot be drawn"):
+        over_two(found, ["agents.mas", "agents.radius"])
+
+
+def test_little_is_drawn_as_well(tmp_path):
+    """A sweep without failures, of a single run, or stopped early, draws what there is."""
+    for table in (made(1), made(3), made(5, runs=50)):
+        assert "outcome.png" in {p.name for p in plot(table, tmp_path, formats=["png"])}
+
+
+# -- the command -------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    cli._console.cache_clear()
+    Path("pair.toml").write_text(MISSION.text)
+    return tmp_path
+
+
+def test_command(folder, capsys):
+    """A line flies a sweep; its folder alone goes on with more runs, and is summed up again."""
+    line = ["sweep", "pair.toml", "--vary", SCATTER[1], "--workers", "1"]
+    assert cli.main([*line, "--runs", "4"]) == cli.PASSED
+    out = capsys.readouterr().out
+    assert "4 of 4 runs passed" in out
+    assert Path("sweeps/pair/figures/outcome.png").exists()
+    assert cli.main([*line[:2], "--vary", SCATTER[0], "--runs", "4"]) == cli.BAD_INPUT
+    assert "differs in: variations" in capsys.readouterr().err
+    assert cli.main(["sweep", "sweeps/pair", "--runs", "6", "--no-figures", "--json"]) == cli.PASSED
+    assert json.loads(capsys.readouterr().out)["success"]["of"] == 6
+    before = Path("sweeps/pair/sweep.db").read_bytes()
+    again = [
+        "sweep",
+        "sweeps/pair",
+        "--summary",
+        "--quiet",
+        "--map",
+        "agents.mass.1",
+        "agents.mass.2",
+    ]
+    assert cli.main([*again, "--metric", "thrust"]) == cli.PASSED
+    assert capsys.readouterr() == ("", "")
+    assert Path("sweeps/pair/sweep.db").read_bytes() == before
+    assert "Median: thrust" in Path("sweeps/pair/figures/map.svg").read_text()
+    assert cli.main(["sweep", "pair.toml", "--summary"]) == cli.BAD_INPUT
+    assert "holds no sweep" in capsys.readouterr().err
+    assert cli.main(["sweep", "sweeps/pair", "--seed", "3"]) == cli.BAD_INPUT
+    assert cli.main(["sweep", "pair.toml", "--runs", "4"]) == cli.BAD_INPUT
+    assert cli.main([*line, "--workers", "0"]) == cli.BAD_INPUT
+
+
+def test_progress_words():
+    """Progress says the runs flown, their rate without starts, the time left and the failures."""
+    watch = cli._SweepWatch()
+    assert watch._words() == ""
+    watch.update(SweepProgress(0, 5000, 0, 0, 0.0, 1))
+    watch.update(SweepProgress(8, 5000, 8, 0, 20.0, 1))
+    assert watch._words() == "8 of 5000 runs"
+    watch.update(SweepProgress(508, 5000, 508, 0, 30.0, 1))
+    assert watch._words() == "508 of 5000 runs  50 runs/s  1:30 left"
+    watch.update(SweepProgress(1000, 5000, 1000, 0, 40.0, 2))
+    watch.update(SweepProgress(2000, 5000, 2000, 30, 50.0, 2))
+    assert watch._words() == "2000 of 5000 runs  100 runs/s  0:30 left  30 failed  2 workers"
+
+
+def test_interrupted(folder):
+    """Ctrl-C ends with 130, keeps what is flown, and says how to go on."""
+    asked = ["sweep", "pair.toml", "--runs", 5000, "--workers", 1, "--vary", SCATTER[0]]
+    process = subprocess.Popen(command(*asked), stderr=subprocess.PIPE, text=True)
+    until(lambda: count(folder / "sweeps" / "pair") > 0, process)  # ty: ignore[invalid-argument-type]
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == cli.INTERRUPTED
+    kept = len(read(folder / "sweeps" / "pair").run)
+    assert f"{kept} of 5000 runs are kept" in err
+    assert "rigidfleet sweep sweeps/pair" in err
+
+
+def test_the_example_flies(folder, capsys):
+    """The sweep file among the examples flies; only unstable gains are refused."""
+    assert (
+        cli.main(["sweep", str(EXAMPLE), "--runs", "12", "--workers", "1", "--no-figures"])
+        == cli.PASSED
+    )
+    table = read("sweeps/gain_study")
+    alpha, gamma = table.codes[:, 0], table.codes[:, 1]
+    unstable = gamma >= 2 * alpha * table.sweep.mission.constraint.beta**2
+    assert 0 < unstable.sum() < 12
+    assert (table.reason == "mission").tolist() == unstable.tolist()
