@@ -68,6 +68,8 @@ def _value(entry: dict[str, Any]) -> str:
             return " or ".join(_value(c) for c in choices if c.get("type") != "null")
         case {"$ref": target}:
             return f"table, see `{target.rpartition('/')[2].lower()}`"
+        case {"type": "array", "items": {"$ref": target}}:
+            return f"list of tables, see `{target.rpartition('/')[2].lower()}`"
         case {"type": "array", "items": {"type": "array", "items": inner, **size}}:
             return f"list of [{size['minItems']} {_PLURAL[inner['type']]}]"
         case {"type": "array", "minItems": n}:

@@ -77,7 +77,7 @@ def test_short_work_does_not_wait_for_the_compiler():
 
 
 def test_what_it_cannot_fly_is_refused():
-    """Other phases than open-loop ones, and starts of another shape, are told apart."""
+    """Other phases than open-loop ones, disturbances, and starts of another shape are told apart."""
     passage = load_mission("narrow-passage")
     with pytest.raises(ValueError, match=r"phase 2 .* open-loop"):
         establish(passage, starts(passage, 2))
@@ -86,6 +86,9 @@ def test_what_it_cannot_fly_is_refused():
         establish(mission, np.zeros((2, 4, 3)))
     with pytest.raises(ValueError, match="one shape"):
         establish(mission, starts(mission, 2), starts(mission, 3))
+    windy = Mission.from_dict(mission.to_dict() | {"disturbances": {"wind": [1.0, 0.0, 0.0]}})
+    with pytest.raises(ValueError, match="calm air"):
+        establish(windy, starts(windy, 2))
     broken = starts(mission, 4)
     broken[2, 1, 0] = np.nan
     with pytest.raises(ValueError, match="flight 2 is not finite"):

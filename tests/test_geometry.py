@@ -125,7 +125,7 @@ def test_fit_finds_the_attitude_of_turned_slots(name, seed):
     p -= m @ p / m.sum()
     T = Rotation.random(4, random_state=rng).as_matrix()
     x = np.einsum("kba,ib->kia", T, p)
-    found = geometry.fit_attitudes(x, np.broadcast_to(p, x.shape), m, EYE)
+    found, _ = geometry.fit_attitudes(x, np.broadcast_to(p, x.shape), m, EYE)
     np.testing.assert_allclose(found, T, rtol=0, atol=1e-12)
 
 
@@ -140,7 +140,7 @@ def test_fit_of_a_deformed_shape_is_scipys(seed):
     T = Rotation.random(random_state=rng)
     x = T.inv().apply(p) + rng.normal(size=p.shape) * 0.2
     x -= m @ x / m.sum()
-    found = geometry.fit_attitudes(x[None], p[None], m, EYE)[0]
+    found = geometry.fit_attitudes(x[None], p[None], m, EYE)[0][0]
     expected = Rotation.align_vectors(p, x, weights=m)[0].as_matrix()
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-10)
 
@@ -151,7 +151,7 @@ def test_a_mirror_image_gets_a_rotation_all_the_same():
     p = shape("spatial", rng)
     p -= p.mean(axis=0)
     x = p * [1, 1, -1]
-    T = geometry.fit_attitudes(x[None], p[None], np.ones(5), EYE)[0]
+    T = geometry.fit_attitudes(x[None], p[None], np.ones(5), EYE)[0][0]
     assert np.linalg.det(T) == pytest.approx(1.0, abs=1e-12)
     np.testing.assert_allclose(T @ T.T, EYE, rtol=0, atol=1e-12)
     assert np.abs(x @ T.T - p).max() > 0.5
@@ -170,7 +170,7 @@ def test_a_line_takes_the_attitude_nearest_to_the_one_expected(seed):
     near = Rotation.random(3, random_state=rng).as_matrix()
     small = Rotation.from_rotvec(rng.normal(size=(3, 3)) * 0.3).as_matrix()
     x = turned_line(small @ near)
-    found = geometry.fit_attitudes(x, np.broadcast_to(LINE, x.shape), np.ones(3), near)
+    found, _ = geometry.fit_attitudes(x, np.broadcast_to(LINE, x.shape), np.ones(3), near)
     np.testing.assert_allclose(
         np.einsum("kab,kib->kia", found, x), np.broadcast_to(LINE, x.shape), atol=1e-12
     )
@@ -192,13 +192,13 @@ def test_a_line_is_followed_from_sample_to_sample():
     roll = Rotation.from_rotvec([0.7, 0, 0]).as_matrix()
     T = roll @ Rotation.from_euler("z", -yaw[:, None]).as_matrix()
     x = turned_line(T)
-    found = geometry.fit_attitudes(x, np.broadcast_to(LINE, x.shape), np.ones(3), T[0])
+    found, _ = geometry.fit_attitudes(x, np.broadcast_to(LINE, x.shape), np.ones(3), T[0])
     np.testing.assert_allclose(found, T, rtol=0, atol=1e-10)
 
 
 def test_a_line_turned_about_by_half_a_turn_has_an_attitude():
     """Where every axis across the line would do, one is taken: a rotation that brings the line home."""
-    found = geometry.fit_attitudes(-LINE[None], LINE[None], np.ones(3), EYE)[0]
+    found = geometry.fit_attitudes(-LINE[None], LINE[None], np.ones(3), EYE)[0][0]
     np.testing.assert_allclose(-LINE @ found.T, LINE, rtol=0, atol=1e-12)
     assert np.linalg.det(found) == pytest.approx(1.0, abs=1e-12)
 
@@ -211,14 +211,14 @@ def test_attitude_goes_on_through_a_line():
     p -= p.mean(axis=1, keepdims=True)
     T = Rotation.from_euler("ZYX", [50, 20, -30], degrees=True).as_matrix().T
     x = p @ T
-    found = geometry.fit_attitudes(x, p, np.ones(3), T)
+    found, _ = geometry.fit_attitudes(x, p, np.ones(3), T)
     np.testing.assert_allclose(found, np.broadcast_to(T, found.shape), rtol=0, atol=1e-9)
 
 
 def test_one_agent_has_the_attitude_expected():
     """A point has no attitude of its own."""
     near = Rotation.from_euler("z", [[0.3], [0.4]]).as_matrix()
-    found = geometry.fit_attitudes(np.zeros((2, 1, 3)), np.zeros((2, 1, 3)), np.ones(1), near)
+    found, _ = geometry.fit_attitudes(np.zeros((2, 1, 3)), np.zeros((2, 1, 3)), np.ones(1), near)
     np.testing.assert_array_equal(found, near)
 
 
@@ -329,3 +329,33 @@ def test_ranks_are_pyrigis(name):
     # Planar and straight shapes lose rank: at most 2 N - 3 and N - 1 of what a generic shape has.
     dimension = formation.dimension(r)
     assert rank <= {1: n - 1, 2: 2 * n - 3, 3: 3 * n - 6}[dimension]
+
+
+def test_a_bent_line_has_no_attitude_about_itself():
+    """Slots a tenth as wide as agents are off them lie as expected about their axis, and spin about it by nothing."""
+    rng = np.random.default_rng(5)
+    p = np.array([[-4.0, 0.02, 0], [0, -0.04, 0], [4, 0.02, 0]])
+    T = Rotation.random(20, random_state=rng).as_matrix()
+    off = rng.normal(size=(20, 3, 3)) * 0.2
+    x = np.einsum("kba,ib->kia", T, p) + off
+    x -= x.mean(axis=1, keepdims=True)
+    found, line = geometry.fit_attitudes(x, np.broadcast_to(p, x.shape), np.ones(3), T)
+    assert line.all()
+    away = np.einsum("kab,kcb->kac", found, T)
+    assert np.degrees(np.arccos((np.trace(away, axis1=1, axis2=2) - 1) / 2)).max() < 10
+    y = rng.normal(size=x.shape)
+    omega = geometry.mean_axis_rates(x, y - y.mean(axis=1, keepdims=True), np.ones(3), line)
+    axis = np.linalg.svd(x)[2][:, 0]
+    assert np.abs(np.einsum("ka,ka->k", omega, axis)).max() < 1e-9
+
+
+def test_a_narrow_shape_that_fits_keeps_its_attitude():
+    """Narrow slots that agents are on, to a hundredth of the width, are no line: their roll is found."""
+    rng = np.random.default_rng(6)
+    p = np.array([[-4.0, 0.1, 0], [0, -0.2, 0], [4, 0.1, 0]])
+    T = Rotation.random(20, random_state=rng).as_matrix()
+    x = np.einsum("kba,ib->kia", T, p) + rng.normal(size=(20, 3, 3)) * 1e-3
+    x -= x.mean(axis=1, keepdims=True)
+    found, line = geometry.fit_attitudes(x, np.broadcast_to(p, x.shape), np.ones(3), T)
+    assert not line.any()
+    np.testing.assert_allclose(found, T, rtol=0, atol=0.03)

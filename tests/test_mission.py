@@ -38,6 +38,7 @@ SHIPPED = [
     "single-waypoint",
     "square",
     "two-agents",
+    "windy-passage",
 ]
 
 PLAIN: dict[str, Any] = {
@@ -406,6 +407,114 @@ def test_error_is_found(edit, key, problem, remedy):
     assert finding.key == key
     assert problem in finding.problem
     assert remedy in finding.remedy
+
+
+@pytest.mark.parametrize(
+    ("given", "key", "problem", "remedy"),
+    [
+        ([1], "", "must be a table", "[disturbances]"),
+        ({"winds": [1, 0, 0]}, "winds", "unknown key", "did you mean 'wind'?"),
+        ({"wind": [1, 0]}, "wind", "must have 3 numbers", "[m/s]"),
+        ({"drag": -0.1}, "drag", "must be >= 0", "[N s/m]"),
+        ({"drag": [0.1, 0.2]}, "drag", "2 entries for 3 agents", "3 in all"),
+        ({"wind": [1, 0, 0], "drag": 0}, "drag", "move nothing", "leave it out"),
+        ({"mass_error": -1}, "mass_error", "must be > -1", "true mass"),
+        ({"mass_error": [0.1]}, "mass_error", "1 entries for 3 agents", "3 in all"),
+        ({"gusts": {"model": "drydn"}}, "gusts.model", "'first-order' or 'dryden'", "mean 'dryden'?"),
+        ({"noise": {}}, "noise", "is zero", "position [m]"),
+        ({"noise": {"position": -1}}, "noise.position", "must be >= 0", "[m]"),
+        ({"noise": {"position": 1, "rate": 1e4}}, "noise.rate", "must be <= 1000", "[Hz]"),
+        ({"lost": {"agent": 4, "time": 1}}, "lost", "must be a list", "vehicles lost"),
+        ({"lost": [{"agent": 4, "time": 1}]}, "lost[1].agent", "no such agent", "from 1 to 3"),
+        ({"lost": [{"agent": 1, "time": 0}]}, "lost[1].time", "must be > 0", "[s]"),
+        ({"lost": [{"agent": 1, "time": 20}]}, "lost[1].time", "mission's end, 20 s", "earlier"),
+        ({"lost": [{"agent": 1, "at": 2, "time": 3}]}, "lost[1].at", "unknown key", "'agent'"),
+        ({"lost": [{"agent": 1, "time": t} for t in (2, 3)]}, "lost[2].agent", "twice", "remove"),
+        ({"lost": [{"agent": i, "time": 2} for i in (1, 2, 3)]}, "lost", "no vehicle", "keep one"),
+    ],
+)  # fmt: skip
+def test_error_of_disturbances_is_found(given, key, problem, remedy):
+    """Each error of [disturbances] is found alone, at its key, with its problem and a remedy."""
+    (finding,) = findings(("disturbances", given))
+    assert finding.key == f"disturbances.{key}".rstrip(".")
+    assert problem in finding.problem
+    assert remedy in finding.remedy
+
+
+FIRST = {"model": "first-order", "time_scale": 1.0, "intensity": 0.5}
+DRYDEN = {"model": "dryden", "length": 10.0, "intensity": 0.5, "airspeed": 3.0}
+
+
+@pytest.mark.parametrize(
+    ("gusts", "key", "problem", "remedy"),
+    [
+        (FIRST | {"time_scale": None}, "time_scale", "is missing", "[s]"),
+        (FIRST | {"intensity": None}, "intensity", "is missing", "[m/s]"),
+        (FIRST | {"intensity": [1, 2]}, "intensity", "must have 3 numbers", "[m/s]"),
+        (FIRST | {"length": 3.0}, "length", "no effect with model 'first-order'", "'dryden'"),
+        (FIRST | {"altitude": 9.0}, "altitude", "no effect with model 'first-order'", "'dryden'"),
+        (FIRST | {"airspeed": 3.0}, "airspeed", "no effect with model 'first-order'", "'dryden'"),
+        (FIRST | {"correlation": 1.5}, "correlation", "must be <= 1", "0 to 1"),
+        (FIRST | {"correlation": 0.5, "correlation_length": 9.0}, "correlation", "_length, too", "one of"),
+        (FIRST | {"seed": -1}, "seed", "must be >= 0", "random numbers"),
+        (FIRST | {"time_scale": 1e-7}, "", "too fast", "larger scales"),
+        (DRYDEN | {"time_scale": 1.0}, "time_scale", "no effect with model 'dryden'", "'first-order'"),
+        (DRYDEN | {"length": None}, "length", "is missing", "altitude"),
+        (DRYDEN | {"altitude": 9.0}, "length", "altitude, too", "one of them"),
+        (DRYDEN | {"length": None, "altitude": 1.0}, "altitude", "must be >= 3.048", "[m]"),
+        (DRYDEN | {"airspeed": None}, "airspeed", "no wind", "[m/s]"),
+        (DRYDEN | {"intensity": None}, "intensity", "altitude together with a wind", "[m/s]"),
+    ],
+)  # fmt: skip
+def test_error_of_gusts_is_found(gusts, key, problem, remedy):
+    """Each error of gusts is found alone, at its key, with its problem and a remedy."""
+    (finding,) = findings(("disturbances/gusts", gusts))
+    assert finding.key == f"disturbances.gusts.{key}".rstrip(".")
+    assert problem in finding.problem
+    assert remedy in finding.remedy
+
+
+def test_tables_of_noise_that_fit_into_no_memory_are_refused():
+    """A thousand measurements a second of three agents over days are refused, not attempted."""
+    edits = ("disturbances/noise", {"position": 0.1, "rate": 1000.0}), ("phases/2/until", 1e5)
+    (finding,) = findings(*edits, ("output_step", 10.0))
+    assert finding.key == "disturbances.noise.rate"
+    assert "3 agents over 100000 s" in finding.problem
+
+
+def test_correlation_by_distance_is_for_formations_not_swarms():
+    """Beyond 2000 agents, correlation by distance names the other key."""
+    place = [[float(i), 0.0, 5.0] for i in range(2001)]
+    data = changed(
+        ("agents/position", place), ("formations", {}), ("disturbances/gusts", FIRST | {"correlation_length": 9.0}),
+        ("phases", [{"kind": "hold", "duration": 1.0}]),
+    )  # fmt: skip
+    (finding,) = findings(base=data)
+    assert finding.key == "disturbances.gusts.correlation_length"
+    assert "use correlation" in finding.remedy
+
+
+@pytest.mark.parametrize(("key", "cure"), [("architecture", "local"), ("formulation", "inertial")])
+def test_a_body_cannot_lose_a_vehicle(key, cure):
+    """Where the states or the wrench are those of one body of all agents, a loss is refused in clear words."""
+    (finding,) = findings((key, "body"), ("disturbances/lost", [{"agent": 2, "time": 3.0}]))
+    assert finding.key == "disturbances.lost"
+    assert f"{key} = 'body' cannot lose a vehicle" in finding.problem
+    assert finding.remedy == f"use {key} = '{cure}'"
+
+
+def test_drag_defaults_where_air_moves():
+    """Without a number, drag is 0.3 N s/m for each kg where there is wind or a gust, and none in still air."""
+    masses = ("agents/mass", [1.0, 2.0, 0.5])
+    windy = Mission.from_dict(changed(masses, ("disturbances/wind", [1, 0, 0])))
+    np.testing.assert_allclose(windy.drag, [0.3, 0.6, 0.15])
+    gusty = Mission.from_dict(changed(masses, ("disturbances/gusts", FIRST)))
+    np.testing.assert_allclose(gusty.drag, [0.3, 0.6, 0.15])
+    given = Mission.from_dict(changed(masses, ("disturbances/drag", 0.2)))
+    np.testing.assert_allclose(given.drag, 0.2)
+    still = Mission.from_dict(changed(masses, ("disturbances/mass_error", [0.1, 0.0, -0.1])))
+    np.testing.assert_allclose(still.drag, 0.0)
+    np.testing.assert_allclose(still.true_mass, [1.1, 2.0, 0.45])
 
 
 @pytest.mark.parametrize(

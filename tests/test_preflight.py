@@ -305,3 +305,53 @@ def test_figure_shows_flexes_and_redundant_edges():
     (ax,) = graphs(triangle, judged).axes
     assert {line.get_linestyle() for line in ax.lines if "edge" in str(line.get_gid())} == {"-"}
     assert not arrows(ax)
+
+
+# -- disturbances
+
+
+def test_disturbances_and_their_thrust_are_told():
+    """Wind, gusts, a wrong mass and noise each have their force, together the thrust that a flight needs at most."""
+    steady = {"wind": [3.0, 0, 0], "drag": 0.4, "mass_error": [0.1, 0, 0, 0]}
+    random = {
+        "gusts": {"model": "first-order", "time_scale": 1.0, "intensity": 0.5},
+        "noise": {"position": 0.01, "velocity": 0.02},
+    }
+    disturbed = mission(disturbances=steady | random)
+    found = preflight(disturbed)
+    d = found.disturbed
+    assert d is not None
+    m = np.array(disturbed.agents.mass)
+    assert d.air == pytest.approx(1.2)
+    assert d.gusts == pytest.approx(0.6)
+    assert d.weight == pytest.approx(0.1 * m[0] * 9.81)
+    assert d.noise == pytest.approx(3 * m.max() * np.hypot(2 * 0.01, np.sqrt(8) * 0.02))
+    assert d.offset[0] == pytest.approx(np.hypot(1.2 / m[0], 0.981) / 2)
+    flown = simulate(disturbed)
+    assert flown.thrust.max() < d.thrust[0] < 1.2 * flown.thrust.max()
+    told = dict(found.words())["disturbances"]
+    for part in (
+        "steady wind up to 1.2 N",
+        "gusts (3 sigma) up to 0.6 N",
+        "of thrust",
+        "offset from slots",
+    ):
+        assert part in told, part
+    assert any("no integral" in remark.text for remark in found.remarks)
+    assert found.data()["disturbances"]["air_n"] == d.air
+
+
+def test_losses_are_told_and_judged_as_if_flown_on():
+    """A vehicle to be lost is named with its time, and a note says that its way is judged to the end."""
+    found = preflight(mission(disturbances={"lost": [{"agent": 3, "time": 7.5}]}))
+    assert "agent 3 is lost at 7.5 s" in dict(found.words())["disturbances"]
+    assert any("as if agent 3 flew on" in remark.text for remark in found.remarks)
+    assert found.passed
+
+
+def test_calm_missions_tell_of_no_disturbances():
+    """Without [disturbances] there is no line about them."""
+    found = preflight(mission())
+    assert found.disturbed is None
+    assert "disturbances" not in dict(found.words())
+    assert found.data()["disturbances"] is None

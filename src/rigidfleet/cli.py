@@ -820,11 +820,14 @@ def _heeding_interrupts() -> Generator[None]:
 
 
 def _draw(result: Result, figures: Iterable[Path], *, quiet: bool = False) -> None:
-    """Draw figures, each to the file of its name."""
-    from rigidfleet.figures import plot
+    """Draw figures, each to the file of its name, of which the flight has something to show."""
+    from rigidfleet.figures import figure_names, plot
 
+    names = figure_names(disturbed=result.disturbance_force is not None)
     formats: dict[Path, list[str]] = {}
     for path in figures:
+        if path.stem not in names:
+            continue
         formats.setdefault(path.with_suffix(""), []).append(path.suffix[1:])
     shown = _err().is_interactive and not quiet
     with _err().status("Drawing the figures") if shown else nullcontext() as status:
@@ -910,7 +913,7 @@ class _Files:
 
         return [
             self.folder / "figures" / f"{name}.{kind}"
-            for name in figure_names()
+            for name in figure_names(disturbed=True)
             for kind in ("png", "svg")
         ]
 

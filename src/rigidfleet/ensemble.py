@@ -73,7 +73,7 @@ def establish(
     Raises
     ------
     ValueError
-        The mission has other phases, or the shapes of the starts do not fit it.
+        The mission has other phases, or disturbances, or the shapes of the starts do not fit it.
     """
     r = _starts("position", position, mission.n_agents)
     v = np.zeros_like(r) if velocity is None else _starts("velocity", velocity, mission.n_agents)
@@ -89,6 +89,10 @@ def establish(
                 f"phase {index + 1} '{phase.name}' is not flown open-loop under distances to a given time, which is all"
                 " that an ensemble flies; vary other missions by `rigidfleet.sweep`"
             )
+    if mission.disturbances is not None:
+        raise ValueError(
+            "an ensemble flies in calm air; vary missions with [disturbances] by `rigidfleet.sweep`"
+        )
     count, n = r.shape[:2]
     threads = threads or os.cpu_count() or 1
     if vectors is None:

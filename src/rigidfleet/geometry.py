@@ -16,6 +16,8 @@ Ints = NDArray[np.int64]
 
 # Slots thinner than this, relative to their length, are a line to an attitude fit.
 _THIN = 1e-3
+# Narrower ones than this are a line where they are not so many times wider than agents are off them.
+_NARROW, _SURE = 0.1, 4.0
 # Beyond so many agents the closest two are found by a tree, not among all pairs.
 _MANY = 200
 # Numbers in a temporary array at most.
@@ -79,8 +81,13 @@ def clearance(
     return least, agent, obstacle
 
 
-def fit_attitudes(x: Array, p: Array, masses: Array, near: Array) -> Array:
+def fit_attitudes(
+    x: Array, p: Array, masses: Array, near: Array
+) -> tuple[Array, NDArray[np.bool_]]:
     """Attitude T (K, 3, 3), world -> body, of slots fitted to agents at each of K samples (Kabsch).
+
+    Also returns where the slots are one line (K,). So are narrow slots, if the attitude expected is known, where
+    agents are off them by more than their width: how those lie about their long axis is chance.
 
     Parameters
     ----------
@@ -93,23 +100,30 @@ def fit_attitudes(x: Array, p: Array, masses: Array, near: Array) -> Array:
     U, _, Vt = np.linalg.svd(fit)
     U[:, :, 2] *= np.sign(np.linalg.det(U @ Vt))[:, None]
     T = U @ Vt
+    weights = np.sqrt(masses)[:, None]
     if p.shape[1] == 1:
-        flat, axes = np.ones(len(p), dtype=bool), np.broadcast_to(np.eye(3), (len(p), 3, 3))
+        width, long = np.zeros(len(p)), np.zeros(len(p))
+        axes = np.broadcast_to(np.eye(3), (len(p), 3, 3))
     else:
         # Slots mostly stand still: one decomposition then serves all samples.
         few = p[:1] if (p == p[0]).all() else p
-        _, spread, axes = np.linalg.svd(np.sqrt(masses)[:, None] * few, full_matrices=False)
-        flat = np.broadcast_to(spread[:, 1] <= _THIN * spread[:, 0], len(p))
+        _, spread, axes = np.linalg.svd(weights * few, full_matrices=False)
+        width, long = (np.broadcast_to(spread[:, q], len(p)) for q in (1, 0))
         axes = np.broadcast_to(axes, (len(p), *axes.shape[1:]))
+    line = width <= _THIN * long
     if near.ndim == 3:
-        T[flat] = _turn_lines(x[flat], p[flat], axes[flat, 0], near[flat])
-        return T
+        thin = np.flatnonzero(width <= _NARROW * long)
+        along = _turn_lines(x[thin], p[thin], axes[thin, 0], near[thin])
+        off = np.linalg.norm(weights * (x[thin] - p[thin] @ along), axis=(1, 2))
+        line[thin] |= width[thin] <= _SURE * off
+        T[thin] = np.where(line[thin, None, None], along, T[thin])
+        return T, line
     guess = near[None]
     for k in range(len(p)):
-        if flat[k]:
+        if line[k]:
             T[k] = _turn_lines(x[k : k + 1], p[k : k + 1], axes[k : k + 1, 0], guess)[0]
         guess = T[k : k + 1]
-    return T
+    return T, line
 
 
 def _turn_lines(x: Array, p: Array, axis: Array, near: Array) -> Array:
@@ -133,17 +147,21 @@ def _turn_lines(x: Array, p: Array, axis: Array, near: Array) -> Array:
     return near @ R.swapaxes(1, 2)
 
 
-def mean_axis_rates(x: Array, y: Array, masses: Array) -> Array:
+def mean_axis_rates(x: Array, y: Array, masses: Array, line: ArrayLike = False) -> Array:
     """Angular velocity omega = I^+ h (K, 3) [rad/s], world axes, of agents about their CM.
 
-    x, y (K, N, 3): positions and velocities about the CM [m, m/s].
+    x, y (K, N, 3): positions and velocities about the CM [m, m/s]; masses (N,) or (K, N); line (K,):
+    where they are one, and have no spin about themselves. That of a line bent by some centimetres would be noise.
     """
-    if len(masses) == 1:
-        return np.zeros((len(x), 3))  # of a point; not what rounding makes of it
-    h = np.einsum("i,kia->ka", masses, np.cross(x, y))
-    C = np.einsum("i,kia,kib->kab", masses, x, x)
+    masses = np.broadcast_to(masses, x.shape[:2])
+    h = np.einsum("ki,kia->ka", masses, np.cross(x, y))
+    C = np.einsum("ki,kia,kib->kab", masses, x, x)
     inertia = np.trace(C, axis1=1, axis2=2)[:, None, None] * np.eye(3) - C
-    return np.einsum("kab,kb->ka", np.linalg.pinv(inertia, 1e-9, hermitian=True), h)
+    cutoff = np.broadcast_to(np.where(line, _NARROW**2, 1e-9), len(x))
+    pseudo = np.linalg.pinv(inertia, cutoff, hermitian=True)
+    omega = np.einsum("kab,kb->ka", pseudo, h)
+    # Of a point none; not what rounding makes of it.
+    return np.where(np.count_nonzero(masses, axis=1)[:, None] > 1, omega, 0.0)
 
 
 def smallest_singular_value(r: Array, edges: Ints, masses: ArrayLike | None = None) -> Array:

@@ -62,7 +62,8 @@ def plan_phase(mission: Mission, phase: Phase, now: Situation, t_end: float) -> 
         d1 = np.array([now.reference.get(e, d) for e, d in zip(_keys(edges), d1, strict=True)])
     d0 = np.array([now.reference.get(e, _distance(now.r, e)) for e in _keys(edges)])
     # Slots are blended wherever the shape leads; where distances lead, slots only follow if tracked.
-    before = now.slots if now.slots is not None else about_cm(now.r, masses)
+    left = masses if now.lost is None else np.where(now.lost, 0.0, masses)
+    before = now.slots if now.slots is not None else about_cm(now.r, left)
     after = target if shaping and target is not None else before
     kind, T_b = k.CONSTANT, 0.0
     if shaping:
@@ -70,9 +71,7 @@ def plan_phase(mission: Mission, phase: Phase, now: Situation, t_end: float) -> 
         kind = {"shape": k.SLOTS, "distances": k.SQUARED, "step": k.CONSTANT}[phase.reference]
     elif phase.control == "slots" and np.allclose(d1, shapes.distances(before, edges), rtol=1e-12):
         kind = k.SLOTS
-    dp, turn = (
-        align_slots(before, after, masses) if shaping else (np.zeros_like(before), np.zeros(3))
-    )
+    dp, turn = align_slots(before, after, left) if shaping else (np.zeros_like(before), np.zeros(3))
     reference = k.Reference(kind, now.t, T_b, d0, d1, before, dp, turn)
 
     goal, arrival = goal_of(phase, now, t_end)
@@ -99,6 +98,7 @@ def plan_phase(mission: Mission, phase: Phase, now: Situation, t_end: float) -> 
         feedback=feedback,
         control=_control(mission, phase, masses),
         external=0,
+        disturbance=k.calm(masses),
     )  # fmt: skip
     slots = (
         after if phase.control != "open" or kind == k.SLOTS else target if shaping else now.slots

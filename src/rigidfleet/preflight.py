@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 
 from rigidfleet import attitude as att
 from rigidfleet import formation as shapes
-from rigidfleet import gains, geometry
+from rigidfleet import gains, geometry, lqr
 from rigidfleet.mission import Box, Establish, Mission, Phase, Reshape
+from rigidfleet.mission.disturbances import intensity
 from rigidfleet.rigidity import (
     Kind,
     Realisations,
@@ -55,6 +56,8 @@ _TOLERANCE = 0.01
 _WORTH = 0.05
 #: Rounding on a limit is not beyond it.
 _SLACK = 1e-9
+#: A steady distance from the slots beyond this is worth a note [m]: the verdict's tolerance of a waypoint.
+_OFFSET = 0.1
 
 Level = Literal["fails", "note"]
 
@@ -63,8 +66,8 @@ Level = Literal["fails", "note"]
 class Remark:
     """Something that will fail, or should be known.
 
-    `topic` is formation, gains, collision, downwash, assignment, thrust, obstacle, geofence, speed or
-    acceleration.
+    `topic` is formation, gains, collision, downwash, assignment, thrust, disturbances, obstacle, geofence, speed
+    or acceleration.
     """
 
     level: Level
@@ -135,6 +138,30 @@ class Assignment:
     room: float
 
 
+@dataclass(frozen=True)
+class Disturbed:
+    """What the mission's disturbances cost, beside the planned way.
+
+    Attributes
+    ----------
+    air : greatest force of the steady wind on a vehicle at rest [N]
+    gusts : three standard deviations of the gusts' force [N]
+    weight : greatest weight that is not believed in [N]
+    noise : three standard deviations of the thrust that noise asks for where slots are tracked [N]
+    thrust : all of it on the planned way: [N], when [s], who, limit [N]
+    offset : greatest steady distance from a tracked slot [m], and whose
+    lost : who is lost, and when [s]
+    """
+
+    air: float
+    gusts: float
+    weight: float
+    noise: float
+    thrust: tuple[float, float, str, float]
+    offset: tuple[float, str]
+    lost: tuple[tuple[int, float], ...]
+
+
 @dataclass
 class Preflight:
     """All that was found; `remarks` say what of it matters."""
@@ -147,6 +174,7 @@ class Preflight:
     clearance: list[tuple[str, float, float, str]] = field(default_factory=list)
     gaps: list[tuple[str, float, float, float]] = field(default_factory=list)
     assignments: dict[str, Assignment] = field(default_factory=dict)
+    disturbed: Disturbed | None = None
     judged_to: float = math.inf
     remarks: list[Remark] = field(default_factory=list)
 
@@ -170,6 +198,8 @@ class Preflight:
             force, t, who, limit = self.thrust
             of = f" of {limit:g} N" if math.isfinite(limit) else ", of no limit,"
             yield "thrust", f"{force:.1f} N{of} planned for {who} at {t:.2f} s"
+        if self.disturbed is not None:
+            yield "disturbances", _disturbed_words(self.disturbed)
         for name, room, t, who in self.clearance:
             yield "clearance", f"{room:.2f} m to '{name}', {who} at {t:.2f} s"
         for between, wide, takes, t in self.gaps:
@@ -205,6 +235,17 @@ class Preflight:
                 "settling_time_s": g.settling_time,
                 "overshoot": g.overshoot,
                 "force_per_error_n_m": g.force,
+            },
+            "disturbances": None
+            if (d := self.disturbed) is None
+            else {
+                "air_n": d.air,
+                "gusts_n": d.gusts,
+                "weight_n": d.weight,
+                "noise_n": d.noise,
+                "thrust": _named(("thrust_n", "time_s", "who", "limit_n"), d.thrust),
+                "offset": _named(("offset_m", "who"), d.offset),
+                "lost": [_named(("agent", "time_s"), (i + 1, t)) for i, t in d.lost],
             },
             "way": {
                 "judged_to_s": self.judged_to if math.isfinite(self.judged_to) else None,
@@ -244,6 +285,7 @@ def preflight(mission: Mission, *, search: bool | None = None) -> Preflight:
         *_below(mission, found),
         *_assigned(mission, found),
         *_thrust(mission, found),
+        *_disturbed(mission, found),
         *_obstacles(mission, found),
         *_limits(mission, found),
     ]
@@ -641,6 +683,71 @@ def _thrust(mission: Mission, found: Preflight) -> Iterator[Remark]:
             text = f"{who} needs {force:.1f} N at {t:.2f} s, in '{phase}', and has {limit:g} N"
             yield Remark("fails" if exact else "note", "thrust", text)
     yield from _step_thrust(mission, found)
+
+
+def _disturbed(mission: Mission, found: Preflight) -> Iterator[Remark]:
+    """What wind, gusts, noise and wrong masses ask for, as far as it follows from the planned way."""
+    d = mission.disturbances
+    if d is None or not found.legs:
+        return
+    believed, true, drag = np.array(mission.agents.mass), mission.true_mass, mission.drag
+    wind, up = np.array(d.wind), np.array([0.0, 0.0, 1.0])
+    g, speed = mission.gravity, float(np.linalg.norm(d.wind))
+    k1, k2 = lqr.double_integrator_gains(mission.tracking.Q, mission.tracking.R)
+    sigma = 0.0 if d.gusts is None else float(intensity(d.gusts, speed).max())
+    gusts = 3 * sigma * drag
+    noise = np.zeros(len(believed))
+    if d.noise is not None:
+        noise = 3 * believed * math.hypot(k1 * d.noise.position, k2 * d.noise.velocity)
+    limits = np.array(mission.agents.thrust_limit)
+    worst, most = -math.inf, (0.0, 0.0, "", math.inf)
+    for leg in found.legs:
+        force = true[:, None] * (leg.acceleration + g * up)
+        force -= drag[:, None] * (wind - leg.velocity)
+        need = np.linalg.norm(force, axis=2) + gusts + noise
+        over = need - np.where(np.isfinite(limits), limits, 0.0)
+        k, i = np.unravel_index(int(over.argmax()), over.shape)
+        if over[k, i] > worst:
+            worst = float(over[k, i])
+            most = float(need[k, i]), float(leg.time[k]), f"agent {i + 1}", float(limits[i])
+    steady = drag[:, None] * wind - ((true - believed) * g)[:, None] * up
+    off = np.linalg.norm(steady, axis=1) / (k1 * believed)
+    far = int(off.argmax())
+    lost = tuple((lost.agent - 1, lost.time) for lost in d.lost)
+    found.disturbed = Disturbed(
+        float((drag * speed).max()), float(gusts.max()), float((np.abs(true - believed) * g).max()),
+        float(noise.max()), most, (float(off[far]), f"agent {far + 1}"), lost,
+    )  # fmt: skip
+    if most[0] > most[3]:
+        text = f"disturbed, {most[2]} may need {most[0]:.1f} N at {most[1]:.2f} s, and has {most[3]:g} N"
+        yield Remark("note", "thrust", text)
+    if off[far] > _OFFSET and any(phase.control == "slots" for phase in mission.phases):
+        text = (
+            f"what is steady in the disturbances holds agent {far + 1} {off[far]:.2f} m off its slot, as tracking"
+            f" has no integral; a greater first weight in tracking.Q shortens it (now {mission.tracking.Q[0]:g})"
+        )
+        yield Remark("note", "disturbances", text)
+    if lost:
+        text = f"the way is judged as if {_agents(tuple(i for i, _ in lost))} flew on to its end"
+        yield Remark("note", "disturbances", text)
+
+
+def _disturbed_words(d: Disturbed) -> str:
+    parts = [
+        f"{what} up to {force:.2g} N"
+        for what, force in (
+            ("steady wind", d.air), ("gusts (3 sigma)", d.gusts), ("weight not believed in", d.weight),
+            ("noise (3 sigma)", d.noise),
+        )
+        if force > 0
+    ]  # fmt: skip
+    force, t, who, limit = d.thrust
+    of = f" of {limit:g} N" if math.isfinite(limit) else ""
+    parts.append(f"with them {force:.1f} N of thrust{of} for {who} at {t:.2f} s")
+    if d.offset[0] > 0:
+        parts.append(f"steady offset from slots up to {d.offset[0]:.2g} m, {d.offset[1]}")
+    parts += [f"agent {i + 1} is lost at {t:g} s" for i, t in d.lost]
+    return "; ".join(parts)
 
 
 def _step_thrust(mission: Mission, found: Preflight) -> Iterator[Remark]:

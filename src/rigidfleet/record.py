@@ -13,6 +13,8 @@ from rigidfleet import geometry
 from rigidfleet.result import PhaseRecord, Result
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from rigidfleet.geometry import Ints
     from rigidfleet.kernel.flight import Record
     from rigidfleet.kernel.program import Array
@@ -42,8 +44,10 @@ def assemble(
 ) -> Result:
     """Join the pieces of a flight and compute what follows from positions and forces."""
     pieces = [p for p in pieces if len(p.time)]
-    masses = np.array(mission.agents.mass)
-    M = masses.sum()
+    time = np.concatenate([p.time for p in pieces])
+    left = time[:, None] <= mission.lost_at  # (K, N)
+    masses = np.where(left, np.array(mission.agents.mass), 0.0)
+    M = masses.sum(axis=1)[:, None]
 
     def joined(name: str) -> Array:
         return np.concatenate([getattr(p.record, name) for p in pieces])
@@ -53,9 +57,13 @@ def assemble(
     thrust = np.linalg.norm(f_u + f_C, axis=2)
     if mission.agents.saturate:  # what was flown, not what was asked
         thrust = np.minimum(thrust, mission.agents.thrust_limit)
-    cm, cm_velocity = np.einsum("i,kia->ka", masses, r) / M, np.einsum("i,kia->ka", masses, v) / M
+    cm, cm_velocity = (np.einsum("ki,kia->ka", masses, z) / M for z in (r, v))
     x, y = r - cm[:, None], v - cm_velocity[:, None]
-    attitude = _attitudes(pieces, x, masses, framed=mission.body_frame is not None)
+    slots = joined("p")
+    centre = np.einsum("ki,kia->ka", masses, slots) / M  # of those left; else the body's origin
+    attitude, line = _attitudes(
+        pieces, x, slots - centre[:, None], masses, framed=mission.body_frame is not None
+    )
     T = np.full((len(r), 3, 3), np.nan)
     attached = np.isfinite(attitude[:, 0])
     T[attached] = att.dcm_from_quaternion(attitude[attached])
@@ -63,20 +71,28 @@ def assemble(
     attitude_reference = np.full((len(r), 4), np.nan)
     commanded = np.isfinite(T_ref[:, 0, 0])
     attitude_reference[commanded] = att.quaternion_from_dcm(T_ref[commanded])
+    omega = geometry.mean_axis_rates(x, y, masses, line)
+    lacking = attached & ~left.all(axis=1)
+    offset = np.einsum("kab,ka->kb", T[lacking], centre[lacking])
+    cm[lacking] -= offset
+    cm_velocity[lacking] -= np.cross(omega[lacking], offset)
     motion = joined("motion")
     wrench = np.concatenate([f_u.sum(axis=1), np.cross(x, f_u).sum(axis=1)], axis=1)
     asked = joined("wrench")
-    separation, pair = geometry.separation(r, mission.agents.radius)
-    clearance, agent, obstacle = geometry.clearance(r, mission.agents.radius, mission.obstacles)
+    separation, pair, clearance, agent, obstacle = _closeness(mission, r, left)
     edges = mission.edges
     distance = np.linalg.norm(r[:, edges[:, 0]] - r[:, edges[:, 1]], axis=2)
+    if not left.all():
+        distance[~left[:, edges].all(axis=2)] = np.nan
+    reference = _by_edge(pieces, "d", edges)
+    noisy = mission.disturbances is not None and mission.disturbances.noise is not None
     return Result(
-        time=np.concatenate([p.time for p in pieces]),
+        time=time,
         phase=np.concatenate([np.full(len(p.time), p.phase) for p in pieces]),
         position=r,
         velocity=v,
         acceleration=joined("a"),
-        slot_position=joined("r_ref"),
+        slot_position=np.where(left[:, :, None], joined("r_ref"), np.nan),
         input_force=f_u,
         constraint_force=f_C,
         external_force=joined("f_E"),
@@ -88,15 +104,15 @@ def assemble(
         attitude=attitude,
         attitude_reference=att.unwrap_quaternion(attitude_reference),
         frame=att.unwrap_quaternion(np.concatenate([p.frame for p in pieces])),
-        rates=np.einsum("kab,kb->ka", T, geometry.mean_axis_rates(x, y, masses)),
+        rates=np.einsum("kab,kb->ka", T, omega),
         rates_reference=joined("rates"),
         wrench_asked=np.where(np.isfinite(motion[:, :1]), asked, wrench),
         wrench_achieved=wrench,
         edges=edges,
         distance=distance,
-        distance_reference=_by_edge(pieces, "d", edges),
+        distance_reference=reference,
         distance_rate_reference=_by_edge(pieces, "d_dot", edges),
-        constraint=_by_edge(pieces, "c", edges),
+        constraint=distance - reference if noisy else _by_edge(pieces, "c", edges),
         integral=_by_edge(pieces, "integral", edges),
         multiplier=_by_edge(pieces, "multiplier", edges),
         singular_value=_singular_values(pieces),
@@ -105,6 +121,9 @@ def assemble(
         clearance=clearance,
         clearance_agent=agent,
         clearance_obstacle=obstacle,
+        disturbance_force=joined("f_D") if mission.drag.any() else None,
+        measured_position=joined("r_seen") if noisy else None,
+        measured_velocity=joined("v_seen") if noisy else None,
         phases=list(phases),
         mission_text=mission.text,
         complete=not ending,
@@ -113,12 +132,33 @@ def assemble(
     )
 
 
-def _attitudes(pieces: Sequence[Piece], x: Array, masses: Array, *, framed: bool) -> Array:
-    """Attitude quaternions (K, 4) of the formation's slots.
+def _closeness(mission: Mission, r: Array, left: NDArray[np.bool_]) -> tuple[Any, ...]:
+    """What `geometry.separation` and `geometry.clearance` find among the vehicles left (K, N)."""
+    radius = np.array(mission.agents.radius)
+    found = np.full(len(r), np.inf), np.full((len(r), 2), -1), np.full(len(r), np.inf)
+    found = *found, np.full(len(r), -1), np.full(len(r), -1)
+    for who in np.unique(left, axis=0):
+        rows, agents = (left == who).all(axis=1), np.flatnonzero(who)
+        among = r[rows][:, agents]
+        room, pair = geometry.separation(among, radius[agents])
+        near = geometry.clearance(among, radius[agents], mission.obstacles)
+        names = np.append(agents, -1)  # -1 stays -1
+        values = room, names[pair], near[0], names[near[1]], near[2]
+        for out, value in zip(found, values, strict=True):
+            out[rows] = value
+    return found
+
+
+def _attitudes(
+    pieces: Sequence[Piece], x: Array, p: Array, masses: Array, *, framed: bool
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Attitude quaternions (K, 4) of the formation's slots p (K, N, 3), fitted to x by masses (K, N).
+
+    And where the slots are a line (K,).
 
     Without slots, that of the integrated frame, if the mission attaches one (``framed``).
     """
-    quaternions = np.full((len(x), 4), np.nan)
+    quaternions, line = np.full((len(x), 4), np.nan), np.zeros(len(x), dtype=np.bool_)
     fitted = np.zeros(len(x), dtype=bool)
     T = np.empty((len(x), 3, 3))
     last = np.eye(3)
@@ -133,12 +173,15 @@ def _attitudes(pieces: Sequence[Piece], x: Array, masses: Array, *, framed: bool
         near = piece.record.T_ref
         if np.isnan(near[0, 0, 0]):
             near = last
-        T[rows] = geometry.fit_attitudes(x[rows], piece.record.p, masses, near)
+        who = masses[rows.start] > 0.0
+        T[rows], line[rows] = geometry.fit_attitudes(
+            x[rows][:, who], p[rows][:, who], masses[rows.start, who], near
+        )
         last = T[rows][-1]
         fitted[rows] = True
     if fitted.any():
         quaternions[fitted] = att.quaternion_from_dcm(T[fitted])
-    return att.unwrap_quaternion(quaternions)
+    return att.unwrap_quaternion(quaternions), line
 
 
 def _by_edge(pieces: Sequence[Piece], name: str, edges: Ints) -> Array:

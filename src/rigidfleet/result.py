@@ -189,6 +189,17 @@ class Result:
         Ints, _v("time", "1", "the obstacle with it, from 0; -1 for none")
     ]
 
+    disturbance_force: Annotated[
+        Floats | None,
+        _v("time agent axis", "N", "force of the air, part of external_force; absent in still air"),
+    ] = None
+    measured_position: Annotated[
+        Floats | None, _v("time agent axis", "m", "position as measured; absent without noise")
+    ] = None
+    measured_velocity: Annotated[
+        Floats | None, _v("time agent axis", "m s-1", "velocity as measured; absent without noise")
+    ] = None
+
     phases: list[PhaseRecord]
     mission_text: str
     complete: bool = True
@@ -201,6 +212,8 @@ class Result:
     def __post_init__(self) -> None:
         sizes: dict[str, int] = {dim: len(names) for dim, names in LABELS.items()}
         for name, variable in VARIABLES.items():
+            if getattr(self, name) is None and name in _OPTIONAL:
+                continue
             dtype = np.int64 if name in _INTEGERS else np.float64
             value = np.ascontiguousarray(getattr(self, name), dtype=dtype)
             asked = tuple(sizes.get(dim, "any") for dim in variable.dims)
@@ -252,6 +265,11 @@ class Result:
             made = self.versions.get("rigidfleet", "an unknown version")
             message = f"the mission inside the result cannot be read (it was made by rigidfleet {made}):\n{error}"
             raise ResultError(message) from error
+
+    @cached_property
+    def left(self) -> NDArray[np.bool_]:
+        """Which agents are left (K, N): not lost by then, as the mission has it."""
+        return self.time[:, None] <= self.mission.lost_at
 
     def samples(self, phase: int) -> slice:
         """Samples of a phase (index from 0; negative ones from the end), empty if it was never reached."""
@@ -338,6 +356,8 @@ class Result:
             agent.attrs["long_name"] = "agent, from 1"
             for name, variable in VARIABLES.items():
                 value = getattr(self, name)
+                if value is None:
+                    continue
                 entry = file.create_variable(
                     name,
                     variable.dims,
@@ -374,6 +394,8 @@ VARIABLES: dict[str, Variable] = {
     for f in fields(Result)
     if hasattr(_HINTS[f.name], "__metadata__")
 }
+#: Those that a flight need not have.
+_OPTIONAL = {f.name for f in fields(Result) if f.name in VARIABLES and f.default is None}
 _INTEGERS = {name for name in VARIABLES if _HINTS[name].__origin__ == Ints}
 #: Attribute by which a file is known as a result.
 _MARK = "rigidfleet_schema_version"
@@ -477,7 +499,7 @@ def _parse(path: Path, data: bytes) -> dict[str, Any]:
         attributes = {key: file.attrs[key] for key in ("ending", "platform", "created")}
         decoded = {key: json.loads(file.attrs[key]) for key in ("statistics", "versions")}
         return {
-            **{name: file.variables[name][...] for name in VARIABLES},
+            **{name: file.variables[name][...] for name in VARIABLES if name in file.variables},
             **attributes,
             **decoded,
             "mission_text": file.attrs["mission"],

@@ -47,6 +47,7 @@ class Situation:
     slots: Array | None = None  # (N, 3) commanded last, about the CM, body axes [m]
     pose: Pose | None = None  # commanded last; None where nothing was
     goal: Pose | None = None  # what to stay at
+    lost: NDArray[np.bool_] | None = None  # (N,) vehicles that fly no more; None: none
 
 
 def about_cm(points: Array, masses: Array) -> Array:
@@ -76,8 +77,10 @@ def attach(
     """Attach the body frame where a phase needs one; return the frame to integrate, if any.
 
     Slots fitted to the agents (Kabsch) give the attitude; where nothing is established yet and
-    the phase shapes nothing, the agents themselves are the slots, in the world's axes.
+    the phase shapes nothing, the agents themselves are the slots, in the world's axes. Lost
+    vehicles count in neither; the virtual body keeps their slots.
     """
+    masses = masses if now.lost is None else np.where(now.lost, 0.0, masses)
     shaping = isinstance(phase, Establish | Reshape)
     frame = now.frame
     near = frame if frame is not None else now.pose.T if now.pose is not None else np.eye(3)
@@ -93,6 +96,11 @@ def attach(
         T = near if fit is None else shapes.kabsch(x, fit, masses, near=near.T).T
         pose = Pose(masses @ now.r / masses.sum(), masses @ now.v / masses.sum(), T, np.zeros(3))
         pose.omega = body_rates(now.r, now.v, masses, T)
+        if now.lost is not None and fit is not None:
+            centre = masses @ fit / masses.sum()  # of those left, from the body's origin
+            pose.r = pose.r - T.T @ centre
+            pose.v = pose.v - T.T @ np.cross(pose.omega, centre)
+            x = x + T.T @ centre
     slots = now.slots if now.slots is not None else x @ pose.T.T
     goal = now.goal or replace(pose, v=np.zeros(3), omega=np.zeros(3))
     if isinstance(phase, Establish) and target is not None:

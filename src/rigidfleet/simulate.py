@@ -10,9 +10,10 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from rigidfleet import attitude as att
+from rigidfleet.disturbances import disturbance, without
 from rigidfleet.errors import FlightError
 from rigidfleet.kernel import flight
 from rigidfleet.kernel import program as k
@@ -52,7 +53,10 @@ class Progress:
 
 @dataclass(frozen=True)
 class Observation:
-    """What a controller sees at a control step; arrays (N, 3) world axes, copies."""
+    """What a controller sees at a control step; arrays (N, 3) world axes, copies.
+
+    Positions and velocities are as measured, masses as believed.
+    """
 
     t: float  # [s]
     phase: str
@@ -168,6 +172,8 @@ class Flight:
         self.mission = mission
         self.masses = np.array(mission.agents.mass)
         self.controller, self.rate = controller, rate
+        self.disturbance = disturbance(mission)
+        self.lost = np.zeros(mission.n_agents, dtype=np.bool_)
         self.external = _External(force, mission.n_agents) if force is not None else None
         self.times = None if times is None else _times(times, mission.latest_end)
         if not rate > 0.0:
@@ -210,7 +216,7 @@ class Flight:
                 self._fly_to(leg, leg.t_end)
         finally:
             self.count += leg.state.count[:3]
-            if leg.state.count[0]:
+            if leg.state.count[0] or leg.t > self.now.t:
                 self._arrive(leg)
             record.t_end = self.now.t
         if phase.settle is not None and not record.settled:
@@ -225,25 +231,26 @@ class Flight:
         _check_size(self.mission, phase)
         plan = plan_phase(self.mission, phase, self.now, t_end)
         self._check_frame(index, plan)
-        if self.external is not None:
-            plan.program = plan.program._replace(external=self.external.address)
+        external = 0 if self.external is None else self.external.address
+        plan.program = plan.program._replace(external=external, disturbance=self.disturbance)
+        if self.lost.any():
+            self._release(plan)
         y = self._pack(plan)
-        tolerances = self.mission.integrator
         return Leg(
-            index,
-            phase,
-            plan,
-            k.workspace(
-                len(self.masses),
-                len(plan.edges),
-                with_h=plan.program.control.allocation != k.RIGID,
-                solver=plan.program.law.solver,
-            ),
-            flight.integrator(
-                y, self.now.t, rtol=tolerances.rtol, atol=np.full(len(y), tolerances.atol)
-            ),
-            t_end,
+            index, phase, plan, self._workspace(plan), self._integrator(y, self.now.t), t_end
         )
+
+    def _workspace(self, plan: PhasePlan) -> k.Workspace:
+        return k.workspace(
+            len(self.masses),
+            len(plan.edges),
+            with_h=plan.program.control.allocation != k.RIGID,
+            solver=plan.program.law.solver,
+        )
+
+    def _integrator(self, y: Array, t: float) -> flight.Integrator:
+        tolerances = self.mission.integrator
+        return flight.integrator(y, t, rtol=tolerances.rtol, atol=np.full(len(y), tolerances.atol))
 
     def _fly_to(self, leg: Leg, t_end: float) -> None:
         """Integrate to ``t_end`` [s] under the phase's input law, or the user's controller."""
@@ -262,18 +269,51 @@ class Flight:
         """Ask the user's controller; return the phase's program with its force held."""
         plan, w, y = leg.plan, leg.workspace, leg.state.y
         flight.closed_loop(leg.t, y, np.empty_like(y), plan.program, w)
+        noisy = len(self.disturbance.noise_r) > 0
+        r, v = (w.r_seen, w.v_seen) if noisy else (w.r, w.v)
         seen = Observation(
-            leg.t, leg.phase.name, w.r.copy(), w.v.copy(), w.r_ref.copy(), w.v_ref.copy(),
+            leg.t, leg.phase.name, r.copy(), v.copy(), w.r_ref.copy(), w.v_ref.copy(),
             w.a_ref.copy(), self.masses.copy(), self.mission.gravity,
         )  # fmt: skip
         f = _checked(controller(seen), self.mission.n_agents, "the controller", leg.t)
         return plan.program._replace(control=plan.program.control._replace(kind=k.OPEN, force=f))
 
     def _integrate(self, leg: Leg, program: k.Program, t_end: float) -> None:
-        """Integrate to ``t_end`` [s] and record the samples on the way.
+        """Integrate to ``t_end`` [s] through the times at which vehicles are lost.
 
         ``program`` may hold a user's force in place of the phase's own input law.
         """
+        while leg.t < t_end:
+            coming = np.where(self.lost, math.inf, self.mission.lost_at)
+            if coming.min() <= leg.t:
+                program = self._lose(leg, program, coming <= leg.t)
+            else:
+                self._stretch(leg, program, min(t_end, float(coming.min())))
+
+    def _lose(self, leg: Leg, program: k.Program, now: NDArray[np.bool_]) -> k.Program:
+        """Go on without the vehicles that are lost ``now`` (N,); returns what is flown of a program."""
+        self.lost = self.lost | now
+        self.now.lost = self.lost
+        y, own, n = leg.state.y, program is leg.plan.program, len(self.masses)
+        kept = self._release(leg.plan)
+        self.count += leg.state.count[:3]
+        integral = y[6 * n : 6 * n + len(kept)][kept]
+        leg.state = self._integrator(np.concatenate([y[: 6 * n], integral]), leg.t)
+        leg.workspace = self._workspace(leg.plan)
+        if own:
+            return leg.plan.program
+        leg.held = without(program, kept, self.lost)
+        return leg.held
+
+    def _release(self, plan: PhasePlan) -> NDArray[np.bool_]:
+        """Take a plan's edges to lost vehicles away; returns which are kept."""
+        kept = ~np.any(self.lost[plan.edges], axis=1)
+        plan.program = without(plan.program, kept, self.lost)
+        plan.edges, plan.distances = plan.edges[kept], plan.distances[kept]
+        return kept
+
+    def _stretch(self, leg: Leg, program: k.Program, t_end: float) -> None:
+        """Integrate to ``t_end`` [s] and record the samples on the way."""
         state = leg.state
         steps = 10
         fresh = state.count[0] == 0 or program is not leg.plan.program
@@ -308,20 +348,22 @@ class Flight:
     def _samples(self, leg: Leg, t_end: float) -> Array:
         """Times to record in (t, t_end]: multiples of the output step, the phase's two ends, its arrival.
 
-        The start of a phase is recorded one representable number after the switch.
+        The start of a phase is recorded one representable number after the switch, and so is what
+        follows a loss.
         """
         t, first = leg.t, leg.state.count[0] == 0
         if self.times is not None:
-            before = -math.inf if first and leg.index == 0 else t
+            before = -math.inf if first and t == 0.0 else t
             return self.times[(self.times > before) & (self.times <= t_end)]
         step = self.mission.output_step
         low, high = math.floor(t / step + 1e-9) + 1, math.floor(t_end / step + 1e-9) + 1
         grid = np.minimum(np.arange(low, high) * step, t_end)
-        # The two ends of a phase count, and its arrival.
-        for exact in (leg.plan.arrival, leg.t_end):
+        # The two ends of a phase count, its arrival, and losses.
+        lost = self.mission.lost_at
+        for exact in (leg.plan.arrival, leg.t_end, *lost[np.isfinite(lost)]):
             if t < exact <= t_end:
                 grid = np.sort(np.append(grid[abs(grid - exact) > 1e-9 * step], exact))
-        start = [t if leg.index == 0 else np.nextafter(t, math.inf)] if first else []
+        start = [t if t == 0.0 else np.nextafter(t, math.inf)] if first else []
         return np.concatenate([start, grid])
 
     def _settle(self, leg: Leg, settle: Settle) -> bool:
@@ -350,11 +392,14 @@ class Flight:
         errors = [np.abs(w.c).max(initial=0.0)]
         local = plan.program.control.kind == k.LOCAL
         if local:
-            errors.append(np.linalg.norm(w.r - w.r_ref, axis=1).max())
+            errors.append(np.linalg.norm(w.r - w.r_ref, axis=1)[~self.lost].max())
         tracks = plan.program.control.kind != k.OPEN
         if tracks and plan.goal is not None and plan.slots is not None:
             goal, since = plan.goal, leg.t - plan.arrival  # it moves on
-            cm = self.masses @ w.r / self.masses.sum()
+            left = np.where(self.lost, 0.0, self.masses)
+            cm = left @ w.r / left.sum()
+            if self.lost.any():  # the virtual body's, as those left show it
+                cm += w.body[0] - left @ w.r_ref / left.sum()
             errors.append(np.linalg.norm(cm - goal.r - goal.v * since))
             turned = (w.T_ref if local else w.T) - (
                 att.dcm_from_rotation_vector(goal.omega * since) @ goal.T

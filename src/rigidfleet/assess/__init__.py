@@ -49,7 +49,8 @@ def assess(result: Result) -> Verdict:
 
     Limits are held against the samples of the result: the geofence against the agents' centres,
     separation and clearance against their surfaces (distance minus radii), and so `separation_below`,
-    the vertical room between two agents whose spheres overlap as seen from above.
+    the vertical room between two agents whose spheres overlap as seen from above. A vehicle that the mission
+    loses counts in none of this from then on, except that it must not hit those that are left.
 
     Raises
     ------

@@ -39,6 +39,8 @@ def findings(flight: Flight, verdict: Verdict) -> Iterator[Finding]:
         yield _separation(flight, worst["separation"])
     if "clearance" in worst:
         yield _clearance(flight, worst["clearance"])
+    if not flight.left.all():
+        yield _lost(flight)
     limits = flight.mission.limits
     if limits.separation_below is not None:
         yield _downwash(flight, limits.separation_below)
@@ -87,7 +89,8 @@ def _shapes(flight: Flight, phases: list[PhaseVerdict]) -> Iterator[Finding]:
         shaping = p.kind in ("establish", "reshape") or i == len(phases) - 1
         if not (shaping and p.finished) or p.formation is None or p.distances is None:
             continue
-        edges = flight.mission.formation_edges(p.formation)
+        last = flight.result.samples(i).stop - 1
+        edges, _ = flight.edges(p.formation, last)
         limit = SHAPE_TOLERANCE * float(flight.mission.formation_distances(p.formation).min())
         held = p.distances <= limit
         words = f"{value(p.distances, 'm')} off (limit {value(limit, 'm')})"
@@ -103,10 +106,12 @@ def _shapes(flight: Flight, phases: list[PhaseVerdict]) -> Iterator[Finding]:
             f" (limit {value(fit.limit, 'm')} off)"
         )
         if held and not passed:
-            last = flight.result.position[flight.result.samples(i).stop - 1]
+            left = flight.left[last]
             form = flight.mission.formations[p.formation].shape
             wanted = f"no {form}" if form else f"not the shape of '{p.formation}'"
-            state = "rigid, but" if is_rigid(last, edges) else "held by its edges, but"
+            place = np.cumsum(left) - 1  # of each agent among those left
+            rigid = is_rigid(flight.result.position[last][left], place[edges])
+            state = "rigid, but" if rigid else "held by its edges, but"
             words = f"'{p.formation}' is {state} {wanted}: all {len(edges)} edges hold, yet {words}"
         elif not passed:
             words = f"'{p.formation}' is not reached: {words}"
@@ -206,6 +211,23 @@ def _clearance(flight: Flight, e: Extreme) -> Finding:
     return _bounded("clearance", e, "m", 0.0, words, passed=e.value > 0, at_least=True)
 
 
+def _lost(flight: Flight) -> Finding:
+    """Vehicles that the mission loses: who is left is judged, and that nobody is hit."""
+    who = np.flatnonzero(~flight.left[-1])
+    when = flight.mission.lost_at[who]
+    told = ", ".join(f"agent {i + 1} at {t:.2f} s" for i, t in zip(who, when, strict=True))
+    e = flight.fallen_on()
+    if e is None:
+        return _bounded("lost", e, "m", 0.0, f"lost: {told}", at_least=True)
+    words = (
+        f"lost: {told}; while they fall, {e.who} come within {value(e.value, 'm')} of each other"
+    )
+    if e.value <= 0:
+        words = f"lost: {told}; {e.who} collide"
+    words += f" at {e.when:.2f} s"
+    return _bounded("lost", e, "m", 0.0, words, passed=e.value > 0, at_least=True)
+
+
 def _downwash(flight: Flight, limit: float) -> Finding:
     e = flight.below()
     if e is None:
@@ -227,7 +249,7 @@ def _geofence(flight: Flight, low: Floats, high: Floats) -> Finding:
 
 def _thrust(flight: Flight, e: Extreme | None) -> Finding:
     most = np.array(flight.mission.agents.thrust_limit)
-    beyond = flight.extreme(flight.result.thrust - most, flight.agent)
+    beyond = flight.extreme(flight.of_left(flight.result.thrust - most), flight.agent)
     if beyond is None:
         return _bounded("thrust", e, "N", None)
     # The agent nearest to its own limit, or furthest beyond.
@@ -243,6 +265,7 @@ def notes(flight: Flight, phases: list[PhaseVerdict]) -> Iterator[str]:
     """What fails nothing and yet should be known."""
     yield from _dips(flight)
     yield from _turned_over(flight, phases)
+    yield from _fallen(flight)
     agents = flight.mission.agents
     if agents.saturate:
         full = flight.result.thrust >= np.array(agents.thrust_limit) * (1 - 1e-6)
@@ -251,9 +274,25 @@ def notes(flight: Flight, phases: list[PhaseVerdict]) -> Iterator[str]:
             yield f"the thrust of {who} is cut off at its limit, first at {since}"
 
 
+def _fallen(flight: Flight) -> Iterator[str]:
+    """What becomes of vehicles that are lost."""
+    grounds = [o.height for o in flight.mission.obstacles if o.kind == "ground"]
+    radius = flight.mission.agents.radius
+    for i in np.flatnonzero(~flight.left[-1]):
+        r = flight.result.position[:, i]
+        words = f"agent {i + 1}, lost at {flight.mission.lost_at[i]:.2f} s,"
+        down = r[:, 2] <= max(grounds) + radius[i] if grounds else np.zeros(len(r), dtype=np.bool_)
+        down &= ~flight.left[:, i]
+        if down.any():
+            x, y, _ = r[-1]
+            yield f"{words} hits the ground at {flight.first(down)} and lies at ({x:.1f}, {y:.1f}) m"
+        else:
+            yield f"{words} has fallen to z = {r[-1, 2]:.1f} m when the flight ends"
+
+
 def _dips(flight: Flight) -> Iterator[str]:
     """Agents below z = 0 where neither ground nor geofence would tell."""
-    mission, z = flight.mission, flight.result.position[..., 2]
+    mission, z = flight.mission, flight.of_left(flight.result.position[..., 2])
     if mission.limits.geofence is not None or any(o.kind == "ground" for o in mission.obstacles):
         return
     low = np.flatnonzero((z < -DIP).any(axis=0))

@@ -25,8 +25,10 @@ _THIN = 1e-3
 class Fit:
     """A formation as flown at one sample, p (N, 3), against its slots (N, 3)."""
 
-    def __init__(self, p: Floats, slots: Floats) -> None:
-        self.error, self.pair, self.flown, self.intended, self.shortest = _all_pairs(p, slots)
+    def __init__(self, p: Floats, slots: Floats, who: Ints | None = None) -> None:
+        self.error, pair, self.flown, self.intended, self.shortest = _all_pairs(p, slots)
+        #: The pair with the greatest error, by the numbers ``who`` (N,) of the agents.
+        self.pair = pair if who is None else (int(who[pair[0]]), int(who[pair[1]]))
         p, slots = shapes.centred(p), shapes.centred(slots)
         self.dimension = shapes.dimension(slots, _THIN)
         self.mirrored = self.dimension == 3 and bool(np.linalg.det(p.T @ slots) < 0)
@@ -59,18 +61,23 @@ class Flight:
         self.result, self.mission = result, result.mission
         self.labels = result.edge_labels
         self.fits: dict[int, Fit] = {}
+        self.left = result.left
         norm = np.linalg.norm
         self.measured: dict[str, tuple[Floats, Callable[..., str]]] = {
             "constraint": (np.abs(result.constraint), self.edge),
             "separation": (result.separation, self.pair),
             "clearance": (result.clearance, self.obstacle),
-            "thrust": (result.thrust, self.agent),
-            "speed": (norm(result.velocity, axis=2), self.agent),
-            "acceleration": (norm(result.acceleration, axis=2), self.agent),
-            "constraint_force": (norm(result.constraint_force, axis=2), self.agent),
+            "thrust": (self.of_left(result.thrust), self.agent),
+            "speed": (self.of_left(norm(result.velocity, axis=2)), self.agent),
+            "acceleration": (self.of_left(norm(result.acceleration, axis=2)), self.agent),
+            "constraint_force": (self.of_left(norm(result.constraint_force, axis=2)), self.agent),
             "tension": (-result.multiplier, self.edge),
             "singular_value": (result.singular_value, lambda k: ""),
         }
+
+    def of_left(self, values: Floats) -> Floats:
+        """Values (K, N), NaN of agents that are lost."""
+        return np.where(self.left, values, np.nan)
 
     def agent(self, _k: int, i: int) -> str:
         """Name of agent i (from 0), at whichever sample."""
@@ -123,6 +130,7 @@ class Flight:
         for i in range(r.shape[1] - 1):
             apart, radii = r[:, i + 1 :] - r[:, i : i + 1], radius[i] + radius[i + 1 :]
             beside = np.hypot(apart[..., 0], apart[..., 1]) > radii
+            beside |= ~(self.left[:, i + 1 :] & self.left[:, i : i + 1])
             room = np.where(beside, np.inf, np.abs(apart[..., 2]) - radii)
             j = room.argmin(axis=1)
             room = room[np.arange(len(r)), j]
@@ -134,7 +142,22 @@ class Flight:
     def outside(self, low: Floats, high: Floats) -> Extreme | None:
         """How far [m] an agent's centre comes out of a box with these corners; negative inside."""
         r = self.result.position
-        return self.extreme(np.maximum(low - r, r - high).max(axis=2), self.agent)
+        return self.extreme(self.of_left(np.maximum(low - r, r - high).max(axis=2)), self.agent)
+
+    def fallen_on(self) -> Extreme | None:
+        """Least room [m] between a lost agent and one that is left; None if none is lost."""
+        r, radius = self.result.position, np.array(self.mission.agents.radius)
+        least, who = np.full(len(r), np.nan), np.zeros((len(r), 2), dtype=np.int64)
+        for i in np.flatnonzero(~self.left[-1]):
+            room = np.linalg.norm(r - r[:, [i]], axis=2) - radius - radius[i]
+            room = np.where(self.left & ~self.left[:, [i]], room, np.inf)
+            j = room.argmin(axis=1)
+            room = np.where(self.left[:, i], np.nan, room[np.arange(len(r)), j])
+            closer = np.fmin(room, least) != least
+            closer &= np.isfinite(room)
+            least[closer] = room[closer]
+            who[closer] = np.column_stack([np.full(len(r), i), j])[closer]
+        return self.extreme(least, lambda k: names(who[k]), lambda x: -x)
 
     def phase(self, index: int, record: PhaseRecord) -> PhaseVerdict:
         """Numbers of a phase."""
@@ -145,13 +168,12 @@ class Flight:
         if flown:
             constraint = _greatest(result.constraint[last])
         if flown and record.formation is not None:
-            p = result.position[last]
+            p, left = result.position[last], np.flatnonzero(self.left[last])
             slots = self.mission.formation_slots(record.formation)
-            edges = self.mission.formation_edges(record.formation)
-            intended = self.mission.formation_distances(record.formation)
+            edges, intended = self.edges(record.formation, last)
             distances = _greatest(shapes.distances(p, edges) - intended)
-            if slots is not None and len(slots) > 1 and np.isfinite(p).all():
-                fit = self.fits[index] = Fit(p, slots)
+            if slots is not None and len(left) > 1 and np.isfinite(p).all():
+                fit = self.fits[index] = Fit(p[left], slots[left], left)
                 flip = self.flip(fit, record, last)
         extremes = {
             name: self.extreme(values, who, SENSE[name], samples)
@@ -175,6 +197,12 @@ class Flight:
             waypoint=self.waypoint(record, samples) if finished else None,
             worst={name: found for name, found in extremes.items() if found is not None},
         )
+
+    def edges(self, formation: str, k: int) -> tuple[Ints, Floats]:
+        """Edges (m, 2) of a formation between agents left at sample k, and their lengths (m,) [m]."""
+        edges = self.mission.formation_edges(formation)
+        kept = self.left[k][edges].all(axis=1)
+        return edges[kept], self.mission.formation_distances(formation)[kept]
 
     def flip(self, fit: Fit, record: PhaseRecord, k: int) -> float | None:
         """Angle [deg] of a line or plane from where it should point at sample k; None if nothing says."""

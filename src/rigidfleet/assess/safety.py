@@ -105,7 +105,7 @@ def _from_inside(finding: Finding | None) -> Finding | None:
 
 
 def _altitudes(flight: Flight) -> list[Safety]:
-    z, fence = flight.result.position[..., 2], flight.mission.limits.geofence
+    z, fence = flight.of_left(flight.result.position[..., 2]), flight.mission.limits.geofence
     lowest = flight.extreme(z, flight.agent, lambda x: -x)
     highest = flight.extreme(z, flight.agent)
     floor, ceiling = (None, None) if fence is None else (fence.min[2], fence.max[2])

@@ -42,6 +42,7 @@ _PRAISE = {
     "waypoint_position": "waypoints are met within {}",
     "separation": "agents stay {} apart",
     "clearance": "obstacles {} away",
+    "lost": "vehicles lost keep {} from the others",
     "thrust": "thrust peaks at {}",
 }
 

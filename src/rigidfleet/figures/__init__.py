@@ -23,6 +23,7 @@ from rigidfleet.figures.curves import (
     constraint_error,
     constraint_force,
     distances,
+    disturbance,
     inputs,
 )
 from rigidfleet.figures.page import summary
@@ -41,6 +42,7 @@ __all__ = [
     "constraint_error",
     "constraint_force",
     "distances",
+    "disturbance",
     "figure_names",
     "formations",
     "inputs",
@@ -53,15 +55,18 @@ _FIGURES: dict[str, Callable[[Result], Figure]] = {
     draw.__name__: draw
     for draw in (
         summary, trajectory, distances, cm, attitude, inputs, constraint_force, constraint_error,
-        clearance, formations,
+        clearance, formations, disturbance,
     )
 }  # fmt: skip
 _FORMATS = ("png", "svg", "pdf")
 
 
-def figure_names() -> list[str]:
-    """Names of all figures, which are also the names of the functions that draw them."""
-    return list(_FIGURES)
+def figure_names(*, disturbed: bool = False) -> list[str]:
+    """Names of the figures of every flight, which are also the names of the functions that draw them.
+
+    With ``disturbed``, also those of flights in moving air.
+    """
+    return [name for name in _FIGURES if disturbed or name != "disturbance"]
 
 
 def plot(
@@ -77,7 +82,7 @@ def plot(
     ----------
     folder : made if it does not exist; files of these names in it are replaced
     formats : of png, svg (text stays text) and pdf
-    names : of `figure_names`; all of them by default
+    names : of `figure_names`; by default all that there is something to draw in
 
     Returns
     -------
@@ -91,7 +96,9 @@ def plot(
         A file cannot be written, or the mission inside the result cannot be read.
     """
     formats = _known("format", formats, _FORMATS)
-    names = list(_FIGURES) if names is None else _known("figure", names, _FIGURES)
+    if names is None:
+        names = figure_names(disturbed=result.disturbance_force is not None)
+    names = _known("figure", names, _FIGURES)
     return [
         path
         for name in names

@@ -293,12 +293,12 @@ def inputs(result: Result) -> Figure:
     return fig
 
 
-def _peak(ax: Axes, result: Result, values: Floats) -> None:
-    """Write the greatest of the agents' values (K, N) [N] into a corner."""
+def _peak(ax: Axes, result: Result, values: Floats, unit: str = "N") -> None:
+    """Write the greatest of the agents' values (K, N) into a corner."""
     known = np.where(np.isfinite(values), values, -np.inf)
     k, i = np.unravel_index(int(known.argmax()), known.shape)
     if np.isfinite(known[k, i]):
-        words = f"peak {known[k, i]:.3g} N: agent {i + 1} at {result.time[k]:.2f} s"
+        words = f"peak {known[k, i]:.3g} {unit}: agent {i + 1} at {result.time[k]:.2f} s"
         ax.text(
             0.995, 0.97, words, transform=ax.transAxes, ha="right", va="top", fontsize=7.5,
             path_effects=st.halo(),
@@ -339,6 +339,32 @@ def constraint_force(result: Result) -> Figure:
     return fig
 
 
+@styled
+def disturbance(result: Result) -> Figure:
+    """Force of the air |f_D| on each agent, and how far each is from its slot."""
+    fig, axes = st.time_figure(result, "Force of the air, and distance from the slots", 2)
+    above, below = axes[:, 0]
+    above.set_ylabel(r"force $|f_D|$ [N]")
+    if result.disturbance_force is None:
+        st.note(above, "still air")
+    else:
+        force = np.where(result.left, np.linalg.norm(result.disturbance_force, axis=2), np.nan)
+        st.agent_lines(above, result, force)
+        above.set_ylim(0, 1.12 * max(_sane(result, force), 1e-3))
+        _peak(above, result, force)
+        st.legend(above, st.agent_handles(result.n_agents))
+    below.set_ylabel("from the slot [m]")
+    off = np.linalg.norm(result.position - result.slot_position, axis=2)
+    if np.isfinite(off).any():
+        st.agent_lines(below, result, off)
+        below.set_ylim(0, 1.12 * max(_sane(result, off), 1e-3))
+        _peak(below, result, off, "m")
+    else:
+        st.note(below, "no slots are tracked")
+    st.name_phases(fig, [above], result)
+    return fig
+
+
 # -- errors ------------------------------------------------------------------------------------------
 
 
@@ -353,12 +379,12 @@ def shape_error(result: Result) -> Floats:
         slots = None if phase.formation is None else result.mission.formation_slots(phase.formation)
         if slots is None or len(slots) < 2 or rows.start == rows.stop:
             continue
-        r = result.position[rows]
-        worst = np.zeros(len(r))
+        r = np.where(result.left[rows, :, None], result.position[rows], np.nan)
+        worst = np.full(len(r), np.nan)
         for i in range(len(slots) - 1):
             flown = np.linalg.norm(r[:, i + 1 :] - r[:, i : i + 1], axis=2)
             asked = np.linalg.norm(slots[i + 1 :] - slots[i], axis=1)
-            worst = np.maximum(worst, np.abs(flown - asked).max(axis=1))
+            worst = np.fmax(worst, np.fmax.reduce(np.abs(flown - asked), axis=1))
         error[rows] = worst
     return error
 
@@ -415,6 +441,7 @@ def room_below(result: Result) -> Floats:
         apart = result.position[:, i + 1 :] - result.position[:, i : i + 1]
         both = radius[i] + radius[i + 1 :]
         over = np.hypot(apart[..., 0], apart[..., 1]) < both
+        over &= result.left[:, i + 1 :] & result.left[:, i : i + 1]
         room = np.where(over, np.abs(apart[..., 2]) - both, np.inf)
         least = np.fmin(least, room.min(axis=1))
     return np.where(np.isfinite(least), least, np.nan)

@@ -23,7 +23,7 @@ from rigidfleet.kernel.program import (
 )
 
 #: What the flights of one vector have in common: times, and what decides on branches.
-_COMMON = {"g", "t0", "T_b", "knots", "to_go", "arrival"}
+_COMMON = {"g", "t0", "T_b", "knots", "to_go", "arrival", "gust_step", "noise_step"}
 #: A range of flights is begun by whichever thread is free, so many ranges to a thread.
 _RANGES = 8
 #: Steps of one flight in a phase at most.

@@ -28,6 +28,7 @@ from rigidfleet.kernel.constraint import (
     solve_multipliers,
 )
 from rigidfleet.kernel.control import body_law, desired_agents, local_law, reference_motion
+from rigidfleet.kernel.disturbance import disturb, sense
 from rigidfleet.kernel.lanes import blocks, padded, spread, total_or_worst
 from rigidfleet.kernel.program import BODY, LOCAL, OPEN, SLOTS, Array, Program, Workspace, zeros
 from rigidfleet.kernel.references import blend_slots, distance_references
@@ -61,9 +62,10 @@ def closed_loop(t, y, dy, p, w):
     """Right-hand side dy of the closed loop at time t [s] and state y.
 
     Newton's law with the constraint force: M dv/dt = f_E + f_u + f_C (Eq. 2), f_u from the input
-    law of the phase, f_C from the multipliers (Eq. 12). Everything computed stays in ``w``.
+    law of the phase, f_C from the multipliers (Eq. 12), both from measured states and believed
+    masses. Everything computed stays in ``w``.
     """
-    vehicles, graph, control = p.vehicles, p.graph, p.control
+    vehicles, graph, control, disturbance = p.vehicles, p.graph, p.control, p.disturbance
     m, g = vehicles.m, vehicles.g
     n = m.shape[0]
     n_edges = graph.edges.shape[0]
@@ -84,6 +86,8 @@ def closed_loop(t, y, dy, p, w):
         for i in range(n):
             for s in range(3):
                 w.f_E[i, s] += w.a[i, s]
+    if disturbance.active:
+        sense(t, disturbance, w)
 
     if p.law.k_def > 0.0 or p.has_frame or control.kind == BODY:
         mean_axes(r, v, m, vehicles.M, w)
@@ -115,6 +119,10 @@ def closed_loop(t, y, dy, p, w):
         for k in range(n_edges):
             dy[6 * n + k] = w.c[k]
 
+    if disturbance.active:
+        disturb(t, m, g, disturbance, w)
+        if p.has_frame and disturbance.noise_r.shape[0] > 0:  # the frame turns as the body does
+            mean_axes(r, v, m, vehicles.M, w)
     for i in range(n):
         share = 1.0
         if vehicles.saturate:
@@ -125,7 +133,7 @@ def closed_loop(t, y, dy, p, w):
             share = min(1.0, vehicles.thrust_limit[i] / max(math.sqrt(thrust), 1e-300))
         for s in range(3):
             net = w.f_E[i, s] + share * (w.f_u[i, s] + w.f_C[i, s])
-            w.a[i, s] = vehicles.inverse[i] * net
+            w.a[i, s] = disturbance.inverse[i] * net
             dy[3 * i + s], dy[3 * n + 3 * i + s] = v[i, s], w.a[i, s]
     if p.body_formulation:
         body_derivatives(y, dy, p, w)
@@ -355,6 +363,9 @@ class Record(NamedTuple):
     rates: Array  # (K, 3) reference rates, body axes
     T_ref: Array  # (K, 3, 3)
     wrench: Array  # (K, 6)
+    r_seen: Array  # (K, N, 3) as measured
+    v_seen: Array
+    f_D: Array
 
 
 def recorder(k: int, n: int, m: int) -> Record:
@@ -363,7 +374,7 @@ def recorder(k: int, n: int, m: int) -> Record:
     return Record(
         *(agent() for _ in range(7)), *(edge() for _ in range(5)), agent(),
         np.full((k, 6), np.nan), np.full((k, 3), np.nan), np.full((k, 3, 3), np.nan),
-        np.full((k, 6), np.nan),
+        np.full((k, 6), np.nan), *(agent() for _ in range(3)),
     )  # fmt: skip
 
 
@@ -390,6 +401,11 @@ def record(times, samples, p, w, dy, out):
         copy(w.f_E, out.f_E[k])
         copy(w.f_u, out.f_u[k])
         copy(w.f_C, out.f_C[k])
+        if p.disturbance.active:
+            copy(w.f_D, out.f_D[k])
+            if p.disturbance.noise_r.shape[0] > 0:
+                copy(w.r_seen, out.r_seen[k])
+                copy(w.v_seen, out.v_seen[k])
         for q in range(6):
             out.wrench[k, q] = w.wrench[q]
         # Where only distances are blended, their slots still say how the formation lies.

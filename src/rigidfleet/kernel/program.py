@@ -107,6 +107,26 @@ class Control(NamedTuple):
     allocation: int
 
 
+class Disturbance(NamedTuple):
+    """What acts on the flight and is told to no law; see `rigidfleet.kernel.disturbance`.
+
+    Gusts and noise are cubic B-splines over time, by their coefficients; empty where there are none.
+    """
+
+    active: bool  # whether there is any; `inverse` counts always
+    m: Array  # (N,) true mass [kg]
+    inverse: Array  # (N,) of it [1/kg]
+    drag: Array  # (N,) [N s/m]
+    wind: Array  # (3,) steady, world [m/s]
+    gust_step: float  # between knots [s]
+    gust: Array  # (K, N, 3) [m/s]
+    noise_step: float  # [s]
+    noise_r: Array  # (K', N, 3) of the measured position [m]
+    noise_v: Array  # (K', N, 3) of the measured velocity [m/s]
+    lost: NDArray[np.bool_]  # (N,) without thrust
+    floor: Array  # (N,) height at which a lost vehicle comes to rest [m]
+
+
 class Program(NamedTuple):
     """One phase of a flight."""
 
@@ -120,6 +140,7 @@ class Program(NamedTuple):
     feedback: Feedback
     control: Control
     external: int  # address of a force callback, 0 for none
+    disturbance: Disturbance
 
 
 class Workspace(NamedTuple):
@@ -127,6 +148,8 @@ class Workspace(NamedTuple):
 
     r: Array  # (N, 3) position, world [m]
     v: Array  # (N, 3) velocity [m/s]
+    r_seen: Array  # (N, 3) position as measured [m], where there is noise
+    v_seen: Array  # (N, 3) velocity as measured [m/s], where there is noise
     u: Array  # (m, 3) unit vectors of the edges
     L: Array  # (m,) lengths [m]
     d: Array  # (m,) references [m]
@@ -138,9 +161,10 @@ class Workspace(NamedTuple):
     V: Array  # (m, m) eigenvectors, where a law needs them
     w: Array  # (m,) eigenvalues; work
     multiplier: Array  # (m,) [N]
-    f_E: Array  # (N, 3) gravity and the user's force [N]
+    f_E: Array  # (N, 3) gravity, the user's force and disturbances [N]
     f_u: Array  # (N, 3) input [N]
     f_C: Array  # (N, 3) constraint force [N]
+    f_D: Array  # (N, 3) force of the air, part of f_E, where there are disturbances [N]
     a: Array  # (N, 3) acceleration [m/s^2]
     p: Array  # (N, 3) slots, body axes [m]
     p_dot: Array  # (N, 3)
@@ -182,14 +206,25 @@ def workspace(n: int, m: int, *, with_h: bool = False, solver: int | None = None
     edge = lambda: zeros(m)  # noqa: E731
     k = 3 * n if with_h else 0
     return Workspace(
-        r=agent(), v=agent(), u=zeros(m, 3), L=edge(), d=edge(), d_dot=edge(), d_ddot=edge(),
+        r=agent(), v=agent(), r_seen=agent(), v_seen=agent(), u=zeros(m, 3), L=edge(),
+        d=edge(), d_dot=edge(), d_ddot=edge(),
         c=edge(), b=edge(), A=zeros(size, size), V=zeros(vectors, vectors), w=edge(), multiplier=edge(),
-        f_E=agent(), f_u=agent(), f_C=agent(), a=agent(), p=agent(), p_dot=agent(),
+        f_E=agent(), f_u=agent(), f_C=agent(), f_D=agent(), a=agent(), p=agent(), p_dot=agent(),
         p_ddot=agent(), r_ref=agent(), v_ref=agent(), a_ref=agent(), cm=zeros(5, 3),
         I=zeros(3, 3), I_inv=zeros(3, 3), T=np.eye(3), body=zeros(8, 3),
         gain=zeros(4), E=zeros(3, 3),
         T_ref=np.eye(3), wrench=zeros(6), H=zeros(k, k), H_V=zeros(k, k),
         H_w=zeros(k, 3),
+    )  # fmt: skip
+
+
+def calm(masses: Array) -> Disturbance:
+    """No disturbance of agents with these masses (N,) [kg]."""
+    n = len(masses)
+    none = zeros(0, n, 3)
+    return Disturbance(
+        False, masses, 1.0 / masses, np.zeros(n), np.zeros(3), 1.0, none, 1.0, none, none, np.zeros(n, dtype=np.bool_),
+        np.full(n, -np.inf),
     )  # fmt: skip
 
 

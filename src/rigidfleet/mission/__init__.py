@@ -15,11 +15,13 @@ from rigidfleet.mission.model import (
 )
 from rigidfleet.mission.schema import (
     Box,
+    Disturbances,
     Establish,
     Fly,
     Formation,
     Geofence,
     Ground,
+    Gusts,
     Hold,
     Limits,
     Lqr,
@@ -34,11 +36,13 @@ from rigidfleet.mission.words import ending, goal
 
 __all__ = [
     "Box",
+    "Disturbances",
     "Establish",
     "Fly",
     "Formation",
     "Geofence",
     "Ground",
+    "Gusts",
     "Hold",
     "Limits",
     "Lqr",

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from rigidfleet.errors import MissionError
-from rigidfleet.mission import formations, phases
+from rigidfleet.mission import disturbances, formations, phases
 from rigidfleet.mission.notes import Notes, unknown_key
 from rigidfleet.mission.schema import (
     Agents,
@@ -20,6 +20,7 @@ from rigidfleet.mission.schema import (
     Box,
     Constraint,
     Contents,
+    Disturbances,
     Geofence,
     Ground,
     Header,
@@ -41,6 +42,7 @@ _TABLES: dict[str, type[Part]] = {
     "integrator": Integrator,
     "body_frame": BodyFrame,
     "limits": Limits,
+    "disturbances": Disturbances,
 }
 _OBSTACLES: dict[str, type[Part]] = {"box": Box, "ground": Ground}
 
@@ -61,6 +63,7 @@ def check(data: Mapping[str, Any], origin: str) -> dict[str, Any]:
     parts["obstacles"] = _obstacles(notes)
     parts["formations"] = formations.check(notes, n)
     parts["phases"] = phases.check(notes, parts, n)
+    disturbances.check(notes, parts, n)
     if notes.findings:
         raise MissionError(notes.findings)
     return parts

@@ -16,7 +16,8 @@ from rigidfleet.errors import Finding, MissionError
 from rigidfleet.formation import Floats, Ints, assigned
 from rigidfleet.mission.check import check
 from rigidfleet.mission.notes import near
-from rigidfleet.mission.schema import Contents, Establish
+from rigidfleet.mission.phases import latest_end
+from rigidfleet.mission.schema import DRAG, Contents, Establish
 from rigidfleet.mission.toml import to_toml
 
 _SHIPPED = resources.files("rigidfleet") / "missions"
@@ -118,11 +119,31 @@ class Mission(Contents):
     @property
     def latest_end(self) -> float:
         """Mission time [s] by which the last phase has ended, if each settling times out."""
-        t = 0.0
-        for p in self.phases:
-            length = p.settle.timeout if p.settle is not None else p.duration or 0.0
-            t = p.until if p.until is not None else t + length
-        return t
+        return latest_end(self.phases)
+
+    @cached_property
+    def true_mass(self) -> Floats:
+        """Mass (N,) [kg] that each vehicle has: `agents.mass` is what the laws believe."""
+        error = self.disturbances.mass_error if self.disturbances is not None else 0.0
+        return np.array(self.agents.mass) * (1.0 + np.array(error))
+
+    @cached_property
+    def drag(self) -> Floats:
+        """Force of the air (N,) on each vehicle for each m/s of velocity through it [N s/m]."""
+        d = self.disturbances
+        if d is None or (d.drag is None and not any(d.wind) and d.gusts is None):
+            return np.zeros(self.n_agents)
+        if d.drag is None:
+            return DRAG * np.array(self.agents.mass)
+        return np.broadcast_to(np.array(d.drag, dtype=np.float64), self.n_agents).copy()
+
+    @cached_property
+    def lost_at(self) -> Floats:
+        """Time (N,) [s] at which each vehicle is lost; infinite for those that are not."""
+        when = np.full(self.n_agents, np.inf)
+        for lost in self.disturbances.lost if self.disturbances is not None else ():
+            when[lost.agent - 1] = lost.time
+        return when
 
 
 def mission_names() -> list[str]:

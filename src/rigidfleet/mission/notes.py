@@ -131,8 +131,8 @@ def model_of(annotation: Any) -> type[Part] | None:
 
 
 def _models(annotation: Any) -> Iterator[type[Part]]:
-    """Models in an annotation such as `Settle | None`."""
-    if get_origin(annotation) in (Union, UnionType, Annotated):
+    """Models in an annotation such as `Settle | None` or `tuple[Lost, ...]`."""
+    if get_origin(annotation) in (Union, UnionType, Annotated, tuple):
         for choice in get_args(annotation):
             yield from _models(choice)
     elif isinstance(annotation, type) and issubclass(annotation, Part):

@@ -51,6 +51,15 @@ def check(notes: Notes, parts: Mapping[str, Any], n: int | None) -> tuple[AnyPha
     return tuple(p for p in found if p is not None)
 
 
+def latest_end(phases: Sequence[AnyPhase]) -> float:
+    """Mission time [s] by which the last phase has ended, if each settling times out."""
+    t = 0.0
+    for p in phases:
+        length = p.settle.timeout if p.settle is not None else p.duration or 0.0
+        t = p.until if p.until is not None else t + length
+    return t
+
+
 def tables(notes: Notes, key: str) -> Sequence[Any]:
     """An array of tables of the mission."""
     found = notes.data.get(key, [])

@@ -25,6 +25,10 @@ from rigidfleet.formation import Floats, Ints
 
 #: No quantity in SI units is larger here, and the sixth power of a length is still a float.
 HUGE = 1e15
+#: Drag of a vehicle for each kg of its mass [1/s]. At the speeds of formation flight that of rotors leads, which is
+#: linear in the speed; flights identified some 0.4 to 0.5 /s along two axes of a quadrotor (Faessler, Franchi,
+#: Scaramuzza, Robotics and Automation Letters 3, 2018), and a vehicle with more mass on each rotor has less.
+DRAG = 0.3
 
 Number = Annotated[float, Strict(), Field(ge=-HUGE, le=HUGE)]
 Positive = Annotated[float, Strict(), Field(gt=0, le=HUGE)]
@@ -48,6 +52,23 @@ Size = Annotated[
 ]
 Edges = Annotated[
     Annotated[Literal["complete"], Tag("one")] | Annotated[tuple[_Pair, ...], Tag("list")],
+    Discriminator(_form),
+]
+
+
+_Error = Annotated[float, Strict(), Field(gt=-1, le=HUGE)]
+_Three = Field(min_length=3, max_length=3)
+Seed = Annotated[int, Strict(), Field(ge=0, lt=2**31)]
+PerAgent = Annotated[
+    Annotated[NonNegative, Tag("one")] | Annotated[tuple[NonNegative, ...], Tag("list")],
+    Discriminator(_form),
+]
+PerAgentError = Annotated[
+    Annotated[_Error, Tag("one")] | Annotated[tuple[_Error, ...], Tag("list")],
+    Discriminator(_form),
+]
+PerAxis = Annotated[
+    Annotated[NonNegative, Tag("one")] | Annotated[tuple[NonNegative, ...], _Three, Tag("list")],
     Discriminator(_form),
 ]
 
@@ -279,6 +300,87 @@ class Limits(Part):
     geofence: Geofence | None = Field(None, description="box that no agent may leave")
 
 
+class Gusts(Part):
+    """Gusts: the velocity of the air beside the steady wind, of each agent, stationary from the start."""
+
+    model: Literal["first-order", "dryden"] = Field(
+        description="first-order: one correlation time, alike in all directions; dryden: MIL-F-8785C's spectra, "
+        "along the wind, across and vertical"
+    )
+    intensity: PerAxis | None = Field(
+        None,
+        description="standard deviation [m/s]: a number, or [along the wind, across, vertical]; by altitude and "
+        "wind speed when absent",
+    )
+    time_scale: Positive | None = Field(
+        None, description="correlation time of first-order gusts [s]"
+    )
+    length: Size | None = Field(
+        None,
+        description="scale length of Dryden's gusts [m]: a number, or [along the wind, across, vertical]",
+    )
+    altitude: Annotated[float, Strict(), Field(ge=3.048, le=304.8)] | None = Field(
+        None,
+        description="in place of length: height above ground [m] from which MIL-F-8785C has the lengths, 3.048 to "
+        "304.8",
+    )
+    airspeed: Positive | None = Field(
+        None,
+        description="speed at which Dryden's gusts pass by [m/s]; the wind's when absent",
+    )
+    correlation: Annotated[float, Strict(), Field(ge=0, le=1)] | None = Field(
+        None, description="correlation of any two agents' gusts [-], 0 to 1; 0 when absent"
+    )
+    correlation_length: Positive | None = Field(
+        None,
+        description="in place of correlation: it is exp(-distance / this length [m]), of the slots of the first "
+        "formation established",
+    )
+    seed: Seed = Field(0, description="of the random numbers: the same seed, the same gusts")
+
+
+class Noise(Part):
+    """Errors of what each vehicle measures of itself, normal, independent, new at a sensor's rate."""
+
+    position: NonNegative = Field(
+        0.0, description="standard deviation of each component of the position [m]"
+    )
+    velocity: NonNegative = Field(
+        0.0, description="standard deviation of each component of the velocity [m/s]"
+    )
+    rate: Annotated[float, Strict(), Field(gt=0, le=1000)] = Field(
+        50.0, description="measurements each second [Hz], at most 1000"
+    )
+    seed: Seed = Field(0, description="of the random numbers: the same seed, the same noise")
+
+
+class Lost(Part):
+    """A vehicle lost: from then on without thrust and without edges."""
+
+    agent: Whole = Field(description="which one, counted from 1")
+    time: Positive = Field(description="mission time [s], > 0")
+
+
+class Disturbances(Part):
+    """What disturbs the flight, and is told to no law."""
+
+    wind: Vector = Field((0.0, 0.0, 0.0), description="steady wind [m/s], where the air goes to")
+    drag: PerAgent | None = Field(
+        None,
+        description="force of the air for each m/s of velocity through it [N s/m]: a number or a list; when absent, "
+        "0.3 for each kg of mass if there is wind or a gust, else 0",
+    )
+    mass_error: PerAgentError = Field(
+        0.0,
+        description="true mass = mass (1 + mass_error) [-], > -1: a number or a list; the laws work with mass",
+    )
+    gusts: Gusts | None = Field(None, description="gusts: [disturbances.gusts]")
+    noise: Noise | None = Field(None, description="measurement noise: [disturbances.noise]")
+    lost: tuple[Lost, ...] = Field(
+        (), description="vehicles lost on the way, `lost = [{ agent = 2, time = 30.0 }]`"
+    )
+
+
 class Settle(Part):
     """A phase ends once its error has stayed within a tolerance."""
 
@@ -439,6 +541,9 @@ class Contents(Header):
     )
     obstacles: tuple[Obstacle, ...] = Field((), description="what not to touch: [[obstacles]]")
     limits: Limits = Field(default_factory=Limits, description="what to stay within: [limits]")
+    disturbances: Disturbances | None = Field(
+        None, description="wind, gusts, noise, wrong masses, vehicles lost: [disturbances]"
+    )
     phases: Annotated[tuple[Phase, ...], Field(min_length=1)] = Field(
         description="what to do, in order: [[phases]]"
     )

@@ -360,12 +360,14 @@ _CAPTIONS = {
     "constraint_error": "Errors of the distances held, and of all pairs against the slots.",
     "clearance": "Room between surfaces, with the limits.",
     "formations": "Formations with their edges and body axes.",
+    "disturbance": "Force of the air on each vehicle, and how far each is from its slot.",
 }  # fmt: skip
 
 
 def _figures(result: Result) -> list[dict[str, str]]:
     """All figures but the summary, which has a page of its own."""
-    return [_figure(result, name) for name in figures.figure_names() if name != "summary"]
+    names = figures.figure_names(disturbed=result.disturbance_force is not None)
+    return [_figure(result, name) for name in names if name != "summary"]
 
 
 def _figure(result: Result, name: str) -> dict[str, str]:

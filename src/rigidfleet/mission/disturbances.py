@@ -1,0 +1,143 @@
+"""Check the disturbances of a mission: complete, of the right number, and possible in it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from rigidfleet.formation import Floats
+from rigidfleet.mission.notes import Notes
+from rigidfleet.mission.phases import latest_end
+from rigidfleet.mission.schema import Disturbances, Gusts
+
+_TABLE = "disturbances"
+_GUSTS = (_TABLE, "gusts")
+#: Correlation by distance takes a matrix of all pairs.
+_MOST_BY_DISTANCE = 2000
+#: Numbers in a table of gusts or noise at most: 2 GB of them.
+_MOST_NUMBERS = 2.5e8
+#: Knots of gusts: so many in the shortest time scale, and no further apart than this [s]. Of the roughest process, a
+#: first-order one, 99 % of the variance is at frequencies that they resolve.
+_KNOTS, _STEP = 16, 0.1
+
+
+def gust_step(gusts: Gusts, wind: float) -> float:
+    """Time between the knots of gusts [s], in a steady wind [m/s]."""
+    shortest = gusts.time_scale
+    if shortest is None:
+        length = gusts.length if gusts.length is not None else gusts.altitude or 1.0
+        shortest = min(length if isinstance(length, tuple) else (length,)) / (
+            gusts.airspeed or wind
+        )
+    return min(shortest / _KNOTS, _STEP)
+
+
+def intensity(gusts: Gusts, wind: float) -> Floats:
+    """Standard deviations (3,) [m/s] of gusts along a steady wind [m/s], across it and vertical."""
+    if gusts.intensity is None:
+        from rigidfleet.turbulence import low_altitude
+
+        return low_altitude(gusts.altitude or 0.0, wind)[0]
+    return np.broadcast_to(np.array(gusts.intensity, dtype=np.float64), 3)
+
+
+def check(notes: Notes, parts: Mapping[str, Any], n: int | None) -> None:
+    """Find what is wrong with [disturbances]."""
+    found: Disturbances | None = parts.get(_TABLE)
+    if found is None:
+        return
+    wind = sum(w * w for w in found.wind) ** 0.5
+    for key in ("drag", "mass_error"):
+        given = getattr(found, key)
+        if n is not None and isinstance(given, tuple) and len(given) != n:
+            problem = f"has {len(given)} entries for {n} agents"
+            notes.add((_TABLE, key), problem, f"give one for each agent, {n} in all, or a number")
+    drag = found.drag if isinstance(found.drag, tuple) else (found.drag,)
+    if (wind > 0 or found.gusts is not None) and not any(d is None or d > 0 for d in drag):
+        problem = "without drag, wind and gusts move nothing"
+        notes.add((_TABLE, "drag"), problem, "give a drag > 0 [N s/m], or leave it out")
+    if found.gusts is not None:
+        _gusts(notes, found.gusts, wind, n)
+    silent = found.noise is not None and not (found.noise.position or found.noise.velocity)
+    if silent and notes.right((_TABLE, "noise"), "position", "velocity"):
+        notes.add((_TABLE, "noise"), "is zero", "give position [m] or velocity [m/s] > 0")
+    end = latest_end(parts["phases"]) if notes.right((), "phases") else None
+    _lost(notes, found, parts, n, end)
+    if end is not None and n is not None and not notes.findings:
+        _size(notes, found, wind, n, end)
+
+
+def _gusts(notes: Notes, gusts: Gusts, wind: float, n: int | None) -> None:
+    def wrong(key: str, problem: str, remedy: str) -> None:
+        if notes.right(_GUSTS, key):
+            notes.add((*_GUSTS, key), problem, remedy)
+
+    if not notes.right(_GUSTS, "model"):
+        return
+    if gusts.model == "first-order":
+        if gusts.time_scale is None:
+            wrong("time_scale", "is missing", "add the gusts' correlation time [s]")
+        for key in ("length", "altitude", "airspeed"):
+            if getattr(gusts, key) is not None:
+                remedy = "remove it, or use model = 'dryden'"
+                wrong(key, "has no effect with model 'first-order'", remedy)
+        if gusts.intensity is None:
+            wrong("intensity", "is missing", "add the gusts' standard deviation [m/s]")
+    else:
+        if gusts.time_scale is not None:
+            remedy = "give length or altitude, or use model = 'first-order'"
+            wrong("time_scale", "has no effect with model 'dryden'", remedy)
+        if gusts.length is not None and gusts.altitude is not None:
+            wrong("length", "is given, and altitude, too", "give one of them")
+        if gusts.length is None and gusts.altitude is None:
+            wrong("length", "is missing", "add length [m], or altitude [m] from which it follows")
+        if gusts.airspeed is None and wind == 0 and notes.right((_TABLE,), "wind"):
+            problem = "is missing, and there is no wind that would carry the gusts past"
+            wrong("airspeed", problem, "add it [m/s], or a wind")
+        if gusts.intensity is None and (gusts.altitude is None or wind == 0):
+            problem = "is missing; it follows only from altitude together with a wind"
+            wrong("intensity", problem, "add the gusts' standard deviation [m/s]")
+    if gusts.correlation is not None and gusts.correlation_length is not None:
+        wrong("correlation", "is given, and correlation_length, too", "give one of them")
+    if gusts.correlation_length is not None and n is not None and n > _MOST_BY_DISTANCE:
+        problem = f"takes a matrix of all pairs, too many with {n} agents"
+        wrong("correlation_length", problem, f"use correlation beyond {_MOST_BY_DISTANCE} agents")
+
+
+def _lost(
+    notes: Notes, found: Disturbances, parts: Mapping[str, Any], n: int | None, end: float | None
+) -> None:
+    seen: set[int] = set()
+    for k, lost in enumerate(found.lost):
+        path = (_TABLE, "lost", k)
+        if n is not None and not 1 <= lost.agent <= n:
+            notes.add((*path, "agent"), "there is no such agent", f"agents count from 1 to {n}")
+        elif lost.agent in seen:
+            notes.add((*path, "agent"), "is lost twice", "remove one of the two")
+        if end is not None and lost.time >= end:
+            problem = f"is not before the mission's end, {end:g} s"
+            notes.add((*path, "time"), problem, "give an earlier time, or remove it")
+        seen.add(lost.agent)
+    if n is not None and len(seen) >= n:
+        notes.add((_TABLE, "lost"), "leaves no vehicle", "keep one of them at least")
+    for key, possible in (("architecture", "local"), ("formulation", "inertial")):
+        if found.lost and parts.get(key) == "body":
+            problem = (
+                f"{key} = 'body' cannot lose a vehicle: its states are those of a body of all agents"
+                if key == "formulation"
+                else "architecture = 'body' cannot lose a vehicle: its wrench is for a body of all agents"
+            )
+            notes.add((_TABLE, "lost"), problem, f"use {key} = '{possible}'")
+
+
+def _size(notes: Notes, found: Disturbances, wind: float, n: int, end: float) -> None:
+    """Refuse tables that fit into no memory."""
+    if found.gusts is not None and 6 * n * end / gust_step(found.gusts, wind) > _MOST_NUMBERS:
+        problem = f"changes too fast for a flight of {n} agents over {end:g} s"
+        remedy = "give larger scales (time_scale, length), or fly shorter"
+        notes.add(_GUSTS, problem, remedy, f"{gust_step(found.gusts, wind):.3g} s between knots")
+    if found.noise is not None and 6 * n * end * found.noise.rate > _MOST_NUMBERS:
+        problem = f"is too high for a flight of {n} agents over {end:g} s"
+        notes.add((_TABLE, "noise", "rate"), problem, "lower it, or fly shorter", found.noise.rate)

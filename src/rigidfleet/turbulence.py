@@ -1,0 +1,101 @@
+"""Random processes of air and sensors, as samples: gusts with a spectrum, correlated between places.
+
+Shaping filters are discretised exactly: samples have the covariances of the continuous process, whatever the step,
+from the first on. Randomness comes in as white samples, standard normal, so that who draws them decides on seeds.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import cholesky, solve_banded
+
+Array = NDArray[np.float64]
+
+_FOOT = 0.3048  # [m]
+
+
+def first_order(white: Array, step: float, tau: float) -> Array:
+    """Gauss-Markov process (K, ...) of unit variance and autocorrelation exp(-|t| / tau).
+
+    x_{k+1} = a x_k + sqrt(1 - a^2) e_k with a = exp(-step / tau), stationary from the start (Uhlenbeck and
+    Ornstein, 1930). Parameters: white samples e (K, ...); their step and tau [s].
+    """
+    a = math.exp(-step / tau)
+    x = white * math.sqrt(-math.expm1(-2.0 * step / tau))
+    x[0] = white[0]
+    for k in range(1, len(x)):
+        x[k] += a * x[k - 1]
+    return x
+
+
+def second_order(white: Array, step: float, tau: float) -> Array:
+    """Dryden's transverse process (K, ...), unit variance, autocorrelation exp(-s) (1 - s / 2), s = |t| / tau.
+
+    Its spectrum is that of (1 + sqrt(3) tau s) / (1 + tau s)^2, the lateral and vertical filter of MIL-F-8785C. In
+    partial fractions it is y = sqrt(3) z1 + (1 - sqrt(3)) z2 with tau dz1/dt = -z1 + e, tau dz2/dt = -z2 + z1,
+    whose transition matrix and covariances are known in closed form.
+
+    Parameters: white samples (K, 2, ...), two of them for each sample; their step and tau [s].
+    """
+    s = step / tau
+    A = math.exp(-s) * np.array([[1.0, 0.0], [s, 1.0]])
+    P = np.array([[1.0, 0.5], [0.5, 0.5]])  # stationary
+    start, root = cholesky(P, lower=True), cholesky(P - A @ P @ A.T, lower=True)
+    z = np.einsum("ab,kb...->ka...", root, white)
+    z[0] = np.tensordot(start, white[0], 1)
+    for k in range(1, len(z)):
+        z[k] += np.tensordot(A, z[k - 1], 1)
+    return (math.sqrt(3.0) * z[:, 0] + (1.0 - math.sqrt(3.0)) * z[:, 1]) / math.sqrt(2.0)
+
+
+def low_altitude(height: float, wind: float) -> tuple[Array, Array]:
+    """Intensities (3,) [m/s] and lengths (3,) [m] of Dryden's gusts near the ground, by MIL-F-8785C.
+
+    Along the wind, across and vertical, h in feet: sigma_w = 0.1 W, sigma_u = sigma_v = sigma_w / (0.177 + 0.000823
+    h)^0.4; L_w = h, L_u = L_v = h / (0.177 + 0.000823 h)^1.2. Valid from 10 to 1000 ft.
+
+    Parameters: height above ground [m]; mean wind speed W 20 ft above ground [m/s].
+    """
+    h = height / _FOOT
+    factor = 0.177 + 0.000823 * h
+    vertical = 0.1 * wind
+    along = h / factor**1.2 * _FOOT
+    return (
+        np.array([vertical / factor**0.4, vertical / factor**0.4, vertical]),
+        np.array([along, along, height]),
+    )
+
+
+def correlate_evenly(white: Array, correlation: float) -> Array:
+    """Samples (..., N, 3) of which any two agents' have the same correlation, from (..., N + 1, 3)."""
+    own, common = white[..., :-1, :], white[..., -1:, :]
+    return math.sqrt(1.0 - correlation) * own + math.sqrt(correlation) * common
+
+
+def correlate_by_distance(white: Array, points: ArrayLike, length: float) -> Array:
+    """Samples (..., N, 3) correlated by exp(-distance / length) of the agents' places (N, 3) [m]."""
+    p = np.asarray(points, dtype=np.float64)
+    apart = np.linalg.norm(p[:, None] - p[None], axis=2)
+    # Places that are nearly one would make the matrix singular to rounding.
+    C = np.exp(-apart / length) + 1e-12 * np.eye(len(p))
+    return np.einsum("ij,...jq->...iq", cholesky(C, lower=True), white)
+
+
+def spline_coefficients(samples: Array) -> Array:
+    """Coefficients (K + 2, ...) of the natural cubic B-spline through samples (K, ...), K >= 2, on even knots."""
+    n = len(samples)
+    flat = samples.reshape(n, -1)
+    inner = np.empty_like(flat)
+    inner[0], inner[-1] = flat[0], flat[-1]
+    if n > 2:
+        right = 6.0 * flat[1:-1]
+        right[0] -= flat[0]
+        right[-1] -= flat[-1]
+        bands = np.ones((3, n - 2))
+        bands[1] = 4.0
+        inner[1:-1] = solve_banded((1, 1), bands, right, overwrite_b=True)
+    ends = 2.0 * inner[[0]] - inner[[1]], 2.0 * inner[[-1]] - inner[[-2]]
+    return np.concatenate([ends[0], inner, ends[1]]).reshape(n + 2, *samples.shape[1:])
