@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -706,14 +707,13 @@ def test_replay(capsys, plot):
 
 def test_live(capsys, monkeypatch):
     """A live flight says where it is to be seen, and opens the browser unless told not to."""
-
     asked = []
 
     def fly(mission, *, port, browser, ready):
         asked.append((mission.name, port, browser))
         ready("http://127.0.0.1:1/secret/")
 
-    monkeypatch.setattr(sys.modules["rigidfleet.live"], "live", fly)
+    monkeypatch.setattr(import_module("rigidfleet.live"), "live", fly)
     assert cli.main(["live", "short.toml"]) == cli.PASSED
     assert cli.main(["live", "narrow-passage", "--port", "8000", "--no-browser"]) == cli.PASSED
     assert asked == [("short", 0, True), ("narrow-passage", 8000, False)]

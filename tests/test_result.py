@@ -5,7 +5,6 @@ import math
 import os
 import subprocess
 import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -165,22 +164,6 @@ def test_a_rewritten_file_still_loads(tmp_path):
     with xarray.open_dataset(tmp_path / "a.nc", engine="h5netcdf") as ds:
         ds.to_netcdf(tmp_path / "b.nc", engine="h5netcdf")
     assert_same(result, Result.load(tmp_path / "b.nc"))
-
-
-def test_saving_is_fast(tmp_path):
-    """1801 undisturbed samples of 8 agents with 18 edges are saved, and loaded, within 0.15 s of work."""
-    calm: dict[str, Any] = dict.fromkeys(
-        ("disturbance_force", "measured_position", "measured_velocity")
-    )
-    result = a_result(1801, 8, 18, **calm)
-    best = [math.inf, math.inf]
-    for _ in range(5):
-        start = time.process_time()
-        result.save(tmp_path / "a.nc")
-        middle = time.process_time()
-        Result.load(tmp_path / "a.nc")
-        best = [min(best[0], middle - start), min(best[1], time.process_time() - middle)]
-    assert max(best) < 0.15, best
 
 
 def test_importing_results_is_light():
