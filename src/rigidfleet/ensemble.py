@@ -22,11 +22,11 @@ if TYPE_CHECKING:
     from rigidfleet.kernel.program import Array
 
 #: Flying alone takes about this long for an evaluation [s]: so much for any, so much for each edge pair.
-_CALL, _PAIR = 2e-7, 4e-9
+_CALL, _PAIR = 4e-7, 4e-9
 #: Evaluations in a second of mission time, about.
-_RATE = 25.0
-#: What the compiler takes for vectors of flights, once on a machine [s].
-_COMPILE = 60.0
+_RATE = 40.0
+#: Work alone [s] from which on vectors are worth the compiler's minute, which is due once on a machine.
+_WORTH = 15.0
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ def establish(
     count, n = r.shape[:2]
     threads = threads or os.cpu_count() or 1
     if vectors is None:
-        vectors = _alone(mission, count) / threads > _COMPILE
+        vectors = _alone(mission, count) > _WORTH
     now = Situation(0.0, r[0], v[0])
     integral: dict[tuple[int, int], Array] = {}
     finished = np.ones(count, dtype=bool)
