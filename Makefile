@@ -26,6 +26,7 @@ test: .venv/.dev  ## Run the tests (MARK= runs the long ones, too)
 
 bench: .venv/.bench  ## Measure the speed, as ratios
 	@$(BIN)/python benchmarks/run.py
+	@$(BIN)/python benchmarks/many.py
 
 docs: .venv/.docs  ## Build the site into site/, with every figure on it
 	@$(BIN)/python docs/picture.py

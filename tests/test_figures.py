@@ -668,3 +668,40 @@ def test_matplotlib_waits_until_something_is_drawn():
         "assert 'matplotlib.pyplot' not in sys.modules\n"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+# -- many agents -----------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def many():
+    """A flight of more agents than can be told apart."""
+    return a_flight(
+        n=240, samples=41, formation={"shape": "sphere", "size": 2.0, "edges": "neighbours"}
+    )
+
+
+def test_of_many_agents_the_spread_is_drawn(many):
+    """Bands from least to greatest instead of lines: at each time they enclose every agent's thrust."""
+    ax = figures.inputs(many).axes[0]
+    (band,) = [c for c in ax.collections if c.get_gid() == "spread"]
+    edge = np.array(band.get_paths()[0].vertices)
+    for k in (3, 20, 37):
+        at = edge[np.isclose(edge[:, 0], many.time[k]), 1]
+        thrust = many.thrust[k]
+        np.testing.assert_allclose((at.min(), at.max()), (thrust.min(), thrust.max()))
+    assert len(ax.lines) < 10
+
+
+@pytest.mark.parametrize("name", figures.figure_names())
+def test_figures_of_many_agents_are_light(many, name):
+    """No figure has an artist for every agent or edge, but for paths."""
+    fig = getattr(figures, name)(many)
+    assert sum(len(ax.lines) for ax in fig.axes) <= 2 * style.MANY + 40
+
+
+def test_many_edges_are_told_by_formation(many):
+    """A legend entry for each formation, with the range of its lengths."""
+    (entry,) = curves.edge_handles(many)
+    d = many.mission.formation_distances("shape")
+    assert entry.get_label() == f"{len(d)} edges of shape: {d.min():.3g} to {d.max():.3g} m"

@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from rigidfleet import formation as f
 from rigidfleet.errors import MissionError
+from rigidfleet.rigidity import jacobian
 
 NAMED = [
     ("line", 4.0, 3),
@@ -403,3 +404,39 @@ def test_kabsch_takes_samples_at_once():
     many = f.kabsch(targets, triangle)
     for target, R in zip(targets, many, strict=True):
         np.testing.assert_allclose(R, f.kabsch(target, triangle), atol=1e-12)
+
+
+# -- graphs of many -------------------------------------------------------------------------------
+
+
+def test_neighbours_reach_so_many_spacings():
+    """In a cubic lattice 1.5 spacings take in faces' diagonals, 1.9 those of the cube."""
+    side = np.arange(5.0)
+    p = np.stack(np.meshgrid(3.0 * side, 3.0 * side, 3.0 * side, indexing="ij"), axis=-1)
+    p = p.reshape(-1, 3)
+    for reach, lengths in ((1.1, [1]), (1.5, [1, 2]), (1.9, [1, 2, 3])):
+        edges = f.neighbours(p, reach)
+        squares = np.unique((f.distances(p, edges) / 3.0).round(9) ** 2)
+        np.testing.assert_allclose(squares, lengths)
+        assert len(np.unique(edges, axis=0)) == len(edges)
+    degree = np.bincount(f.neighbours(p, 1.9).ravel())
+    assert degree.max() == 26
+
+
+@pytest.mark.parametrize("n", [4, 5, 13, 64])
+def test_joined_is_minimally_rigid(n):
+    """Three edges each, from the centre outwards: 3N - 6 in all, of full rank."""
+    p = np.random.default_rng(n).normal(size=(n, 3))
+    edges = f.joined(p)
+    assert edges.shape == (3 * n - 6, 2)
+    assert np.linalg.matrix_rank(jacobian(p, edges)) == 3 * n - 6
+
+
+def test_joined_of_a_lattice_has_good_pivots():
+    """On a lattice, whose points lie in planes, no agent is joined within a plane."""
+    side = np.arange(6.0)
+    p = np.stack(np.meshgrid(side, side, side, indexing="ij"), axis=-1).reshape(-1, 3)
+    edges = f.joined(p)
+    assert np.linalg.svd(jacobian(p, edges), compute_uv=False)[-1] > 0.01
+    with pytest.raises(ValueError, match="need slots"):
+        f.joined(p[:36])

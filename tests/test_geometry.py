@@ -359,3 +359,21 @@ def test_a_narrow_shape_that_fits_keeps_its_attitude():
     found, line = geometry.fit_attitudes(x, np.broadcast_to(p, x.shape), np.ones(3), T)
     assert not line.any()
     np.testing.assert_allclose(found, T, rtol=0, atol=0.03)
+
+
+def test_headroom_is_the_least_height_above_another():
+    """Of pairs that overlap as seen from above the nearest in height; by trying all of them."""
+    rng = np.random.default_rng(7)
+    r, radius = rng.uniform(0, 6, (5, 30, 3)), rng.uniform(0.1, 0.6, 30)
+    room, pair = geometry.headroom(r, radius)
+    for k in range(5):
+        found = [
+            (abs(r[k, i, 2] - r[k, j, 2]) - radius[i] - radius[j], i, j)
+            for i in range(30)
+            for j in range(i + 1, 30)
+            if np.hypot(*(r[k, i] - r[k, j])[:2]) <= radius[i] + radius[j]
+        ]
+        assert (room[k], *pair[k]) == pytest.approx(min(found))
+    room, pair = geometry.headroom(np.array([[[0.0, 0, 0], [9, 0, 0]]]), [0.1, 0.1])
+    assert np.isinf(room[0])
+    assert pair.tolist() == [[-1, -1]]

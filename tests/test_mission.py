@@ -35,11 +35,14 @@ SHIPPED = [
     "line-singular",
     "narrow-passage",
     "pyramid",
+    "show-1000",
     "single-waypoint",
     "square",
     "two-agents",
     "windy-passage",
 ]
+
+HELD = [{"kind": "hold", "duration": 5.0}]
 
 PLAIN: dict[str, Any] = {
     "schema_version": 1,
@@ -99,7 +102,7 @@ def fails(call, *args):
 
 
 def test_all_missions_of_the_paper_are_shipped():
-    """The tables, the appendix, and the two failures that the paper's plain laws have."""
+    """The tables, the appendix, the two failures that the paper's plain laws have, and a show."""
     assert mission_names() == SHIPPED
 
 
@@ -109,7 +112,7 @@ def test_shipped_mission_is_in_order(name):
     mission = load_mission(name)
     assert mission.name == name
     assert mission.title
-    assert mission.source
+    assert mission.source or name == "show-1000"
     assert mission.text == mission_text(name)
     assert mission.text.startswith("# ")
 
@@ -262,6 +265,95 @@ def test_mission_survives_a_round_trip(name):
     again = Mission.from_dict(mission.to_dict())
     assert again.model_dump() == mission.model_dump()
     assert Mission.from_toml(again.text).model_dump() == mission.model_dump()
+
+
+def test_agents_may_start_in_a_shape():
+    """A start given as a shape is the list of its slots, about its centre."""
+    shape = {"shape": "grid", "size": 2.0, "count": 7, "centre": [1, 2, 3]}
+    mission = Mission.from_dict(
+        changed(("agents/position", shape)) | {"formations": {}, "phases": HELD}
+    )
+    np.testing.assert_allclose(mission.agents.position, formation.slots("grid", 2.0, 7) + [1, 2, 3])
+    assert len(mission.agents.mass) == mission.n_agents == 7
+    assert mission.to_dict()["agents"]["position"] == shape
+
+
+@pytest.mark.parametrize(
+    ("edit", "key", "words"),
+    [
+        ({"shape": "gird"}, "agents.position.shape", "did you mean 'grid'?"),
+        ({"count": 0}, "agents.position.count", "must be >= 1"),
+        ({"count": 3}, "agents.position.shape", "takes 4 or more agents, not 3"),
+        ({"sise": 1.0}, "agents.position.sise", "did you mean 'size'?"),
+    ],
+)
+def test_errors_of_a_start_in_a_shape(edit, key, words):
+    """What is wrong with the shape is said where it stands."""
+    start = {"shape": "grid", "size": 2.0, "count": 7} | edit
+    with pytest.raises(MissionError) as caught:
+        Mission.from_dict(changed(("agents/position", start)) | {"formations": {}, "phases": HELD})
+    assert [f.key for f in caught.value.findings] == [key]
+    assert words in str(caught.value)
+
+
+def large(**form) -> dict[str, Any]:
+    """Thirty agents that start in a grid and take one formation, by edges with names."""
+    return changed(("agents/position", {"shape": "grid", "size": 3.0, "count": 30})) | {
+        "formations": {"f": {"shape": "sphere", "size": 2.0} | form},
+        "phases": [{"kind": "establish", "formation": "f", "duration": 9.0}],
+    }
+
+
+def test_graphs_have_names():
+    """'neighbours' and 'joined' are the graphs that the functions of those names make."""
+    p = formation.slots("sphere", 2.0, 30)
+    for form, want in (
+        ({"edges": "neighbours"}, formation.neighbours(p)),
+        ({"edges": "neighbours", "reach": 1.2}, formation.neighbours(p, 1.2)),
+        ({"edges": "joined"}, formation.joined(p)),
+    ):
+        np.testing.assert_array_equal(Mission.from_dict(large(**form)).formation_edges("f"), want)
+
+
+@pytest.mark.parametrize(
+    ("form", "key", "words"),
+    [
+        ({"edges": "joined", "reach": 1.5}, "formations.f.reach", "has no effect"),
+        ({"edges": "joined", "shape": "grid"}, "formations.f.edges", "need slots"),
+        ({"edges": "neighbours", "distances": [1.0]}, "formations.f.edges", "needs places"),
+        ({"edges": "all"}, "formations.f.edges", "must be 'complete', 'neighbours' or 'joined'"),
+    ],
+)
+def test_errors_of_graphs_with_names(form, key, words):
+    """A graph that cannot be made says why."""
+    with pytest.raises(MissionError) as caught:
+        Mission.from_dict(large(**form))
+    assert key in [f.key for f in caught.value.findings]
+    assert words in str(caught.value)
+
+
+def test_slots_are_assigned_anew_at_each_change():
+    """By 'each', every change takes the least sum of squares, and edges go with their slots."""
+    data: dict[str, Any] = large(edges="neighbours") | {"assignment": "each"}
+    data["formations"]["g"] = {"shape": "helix", "size": [6.0, 3.0, 2.0], "edges": []}
+    data["phases"].append({"kind": "reshape", "formation": "g", "duration": 9.0})
+    mission = Mission.from_dict(data)
+    places = np.array(mission.agents.position)
+    for name in ("f", "g"):
+        slots = mission.formation_slots(name)
+        assert slots is not None
+        taken = mission.assigned_slots[name]
+        own = mission.formations[name].slot_array(30)
+        assert own is not None
+        np.testing.assert_array_equal(slots, own[taken])
+        # Least squares: no two agents are better off with each other's slot.
+        x, y = places @ slots.T, (places * slots).sum(axis=1)
+        assert (x + x.T <= y[:, None] + y + 1e-9).all()
+        places = slots
+    slots = mission.formation_slots("f")
+    assert slots is not None
+    between = formation.distances(slots, mission.formation_edges("f"))
+    np.testing.assert_allclose(between, mission.formation_distances("f"))
 
 
 def test_arrays_of_numpy_are_plain_data():

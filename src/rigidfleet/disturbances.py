@@ -102,7 +102,9 @@ def _places(mission: Mission) -> Array:
     return np.array(mission.agents.position) if slots is None else slots
 
 
-def without(program: k.Program, edges: NDArray[np.bool_], lost: NDArray[np.bool_]) -> k.Program:
+def without(
+    program: k.Program, edges: NDArray[np.bool_], lost: NDArray[np.bool_], *, large: bool = False
+) -> k.Program:
     """A program for those that are left: ``edges`` (m,) kept of its own, agents ``lost`` (N,) without thrust.
 
     In the laws the lost count for nothing: their masses there are `NOTHING`. Newton's law keeps them.
@@ -111,7 +113,7 @@ def without(program: k.Program, edges: NDArray[np.bool_], lost: NDArray[np.bool_
     reference, control = program.reference, program.control
     return program._replace(
         vehicles=program.vehicles._replace(m=m, inverse=1.0 / m, M=float(m.sum())),
-        graph=k.graph(program.graph.edges[edges], m),
+        graph=k.graph(program.graph.edges[edges], m, large=large),
         reference=reference._replace(d0=reference.d0[edges], d1=reference.d1[edges]),
         control=control._replace(force=np.where(lost[:, None], 0.0, control.force)),
         disturbance=program.disturbance._replace(lost=lost.copy()),

@@ -106,6 +106,11 @@ def establish(
         t_end = now.t + (phase.duration or 0.0) if phase.until is None else phase.until
         # One plan for all: without slots, only the distances it starts from are a flight's own.
         plan = plan_phase(mission, phase, now, t_end)
+        if plan.method != "dense":
+            raise ValueError(
+                f"an ensemble solves densely, and the {len(plan.edges)} edges of '{plan.formation}' are too many for that;"
+                " vary such missions by `rigidfleet.sweep`"
+            )
         edges = [(int(i), int(j)) for i, j in plan.edges]
         before = np.stack(
             [np.full(count, now.reference[e]) if e in now.reference else _distance(r, e) for e in edges], axis=1

@@ -25,6 +25,9 @@ Ints = NDArray[np.int64]
 #: on the limit, so distances need about seven digits: 5.656854, not 5.657.
 REALISABLE = 1e-6
 
+#: How far neighbours reach, in spacings: to the second, on a shell or in a lattice.
+REACH = 1.9
+
 #: The 18 edges of the paper's cube (its Table 4 with the swapped pair d45, d48 put right), counted from 0.
 CUBE_EDGES: Ints = np.array(
     [(0, 1), (0, 3), (0, 4), (0, 5), (1, 2), (1, 3), (1, 5), (1, 6), (2, 3), (2, 6), (2, 7), (3, 4)]
@@ -86,7 +89,14 @@ def _sphere(size: Floats, n: int) -> Floats:
     angle = np.pi * (3 - np.sqrt(5)) * np.arange(n)
     across = np.sqrt(1 - z**2)
     p = np.column_stack([across * np.cos(angle), across * np.sin(angle), z])
-    return p * size[0] / min(np.linalg.norm(p[:k] - p[k], axis=1).min() for k in range(1, n))
+    return p * size[0] / _nearest(p).min()
+
+
+def _nearest(p: Floats) -> Floats:
+    """Distance (N,) of each of N points (N, 3) to the nearest other."""
+    from scipy.spatial import KDTree
+
+    return KDTree(p).query(p, k=2)[0][:, 1]
 
 
 def _helix(size: Floats, n: int) -> Floats:
@@ -316,6 +326,87 @@ def centred(points: ArrayLike) -> Floats:
 def complete_graph(n: int) -> Ints:
     """All n (n - 1) / 2 edges (i, j), i < j, in lexical order, shape (m, 2)."""
     return np.column_stack(np.triu_indices(n, 1)).astype(np.int64)
+
+
+def neighbours(points: ArrayLike, reach: float = REACH) -> Ints:
+    """Edges (m, 2), i < j, between points (N, 3) no further apart than ``reach`` times their spacing.
+
+    The spacing is the median distance to the nearest point. At 1.9 second neighbours are joined, too, which
+    keeps shells and lattices from folding; at 1.5 a cubic lattice has its diagonals of faces.
+    """
+    from scipy.spatial import KDTree
+
+    p = np.asarray(points, dtype=np.float64)
+    if len(p) < 2:
+        return np.zeros((0, 2), dtype=np.int64)
+    tree = KDTree(p)
+    spacing = float(np.median(_nearest(p)))
+    pairs = tree.query_pairs(reach * spacing * (1 + 1e-9), output_type="ndarray")
+    return pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))].astype(np.int64)
+
+
+def joined(points: ArrayLike) -> Ints:
+    """3N - 6 edges (m, 2), i < j, that join each of N points in space to three nearer to the centre.
+
+    A generically rigid graph by Henneberg's first step, whose exact law is solved in O(N). Of the nearest twelve
+    points that come earlier those three are taken that span the largest volume of directions; from the centre
+    outwards that keeps chains of agents short.
+
+    Raises
+    ------
+    ValueError
+        The points do not span space.
+    """
+    from scipy.spatial import KDTree
+
+    p = np.asarray(points, dtype=np.float64)
+    n = len(p)
+    order = _spanning_first(p, np.argsort(((p - p.mean(axis=0)) ** 2).sum(axis=1), kind="stable"))
+    rank = np.empty(n, dtype=np.int64)
+    rank[order] = np.arange(n)
+    tree = KDTree(p)
+    first = order[:3]
+    edges = [np.array([first[[0, 1]], first[[0, 2]], first[[1, 2]]])]
+    triples = np.array(list(combinations(range(12), 3)))
+    for some in np.array_split(order[3:], max(1, n // 4000)):
+        near = tree.query(p[some], k=min(n, 48))[1]
+        later = rank[near] >= rank[some][:, None]
+        lone = np.flatnonzero((~later).sum(axis=1) < 12)  # few of the nearest come before
+        at = np.take_along_axis(near, np.argsort(later, axis=1, kind="stable"), axis=1)[:, :12]
+        at = np.pad(at, ((0, 0), (0, 12 - at.shape[1])), constant_values=-1)
+        for k in lone:
+            before = order[: rank[some[k]]]
+            d = ((p[before] - p[some[k]]) ** 2).sum(axis=1)
+            few = before[np.argsort(d, kind="stable")[:12]]
+            at[k] = np.append(few, np.full(12 - len(few), -1))
+        x = p[at] - p[some][:, None]
+        length = np.linalg.norm(x, axis=2, keepdims=True)
+        u = np.where(at[..., None] >= 0, x / np.maximum(length, 1e-300), 0.0)
+        a, b, c = (u[:, triples[:, k]] for k in range(3))
+        volume = np.abs((a * np.cross(b, c)).sum(axis=2))
+        # Of as good triples the shortest.
+        worth = volume.round(3) - 1e-6 * length[:, triples, 0].sum(axis=2) / length.max()
+        best = triples[worth.argmax(axis=1)]
+        edges.append(np.column_stack([np.repeat(some, 3), np.take_along_axis(at, best, 1).ravel()]))
+    return np.sort(np.concatenate(edges), axis=1).astype(np.int64)
+
+
+def _spanning_first(p: Floats, order: Ints) -> Ints:
+    """The order (N,) with four points in front that span space, each the earliest that will do."""
+    x = p[order] - p[order[0]]
+    x = x / np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-300)
+    found = [0, 1]
+    for size in (
+        lambda: np.linalg.norm(np.cross(x, x[1]), axis=1),
+        lambda: np.abs(x @ np.cross(x[1], x[found[2]])),
+    ):
+        fits = np.flatnonzero(size() > 0.2)
+        if not len(fits):
+            raise ValueError(
+                "points in a plane or on a line have no three edges each; they need slots"
+            )
+        found.append(int(fits[0]))
+    return np.concatenate([order[found], np.delete(order, found)])
 
 
 def distances(points: ArrayLike, edges: ArrayLike) -> Floats:
@@ -575,23 +666,12 @@ def assigned(
     these and the given one; all but equal room counts as equal, and then the shorter is taken. The order
     given is kept where nothing is better.
     """
-    from scipy.optimize import linear_sum_assignment
-
     p, q = _about_cm(start, masses), centred(slots)
     n = len(p)
     given = np.arange(n)
     found = {tuple(given.tolist()): given}
     for turn in [kabsch(p, _about_cm(q, masses), masses), *_attitudes()]:
-        order, rotation = given, turn
-        for _ in range(20):
-            placed = q @ rotation.T
-            cost = ((p[:, None] - placed[None]) ** 2).sum(axis=2)
-            new = linear_sum_assignment(cost)[1]
-            same = bool((new == order).all())
-            order = new
-            if same:
-                break
-            rotation = kabsch(p, _about_cm(q[order], masses), masses)
+        order = _settled(p, q, masses, turn)
         found[tuple(order.tolist())] = order
     m = np.asarray(masses, dtype=np.float64)[:, None]
 
@@ -604,6 +684,36 @@ def assigned(
         return -round(room, 2), round(squares(order), 9), bool((order != given).any())
 
     return min(found.values(), key=worth)
+
+
+def assigned_upright(start: ArrayLike, slots: ArrayLike, masses: ArrayLike) -> Ints:
+    """Slot (N,) that each agent is to take by the least squared way, without turning the slots.
+
+    On straight ways of least squares, in step with each other, no two agents come nearer than 0.7 times
+    (one over the root of 2) the least distance of both shapes (Turpin, Michael and Kumar, 2014).
+    """
+    return _nearest_slots(_about_cm(start, masses), centred(slots))
+
+
+def _nearest_slots(p: Floats, q: Floats) -> Ints:
+    """Of slots q (N, 3) those (N,) that make the sum of squared ways from p least."""
+    from scipy.optimize import linear_sum_assignment
+
+    # |p|^2 + |q|^2 is the same for every order.
+    return linear_sum_assignment(-p @ q.T)[1]
+
+
+def _settled(p: Floats, q: Floats, masses: ArrayLike, turn: Floats) -> Ints:
+    """Slots q (N, 3) assigned to agents p and turned onto them in turns, until nothing changes."""
+    order = np.arange(len(p))
+    for _ in range(20):
+        new = _nearest_slots(p, q @ turn.T)
+        same = bool((new == order).all())
+        order = new
+        if same:
+            break
+        turn = kabsch(p, _about_cm(q[order], masses), masses)
+    return order
 
 
 def _attitudes() -> list[Floats]:

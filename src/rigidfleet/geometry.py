@@ -56,6 +56,37 @@ def _closest(r: Array, radius: Array) -> tuple[float, Ints]:
     return float(d[i, 1] - 2.0 * radius[i]), np.sort([i, int(j[i, 1])])
 
 
+def headroom(
+    r: Array, radius: ArrayLike, among: NDArray[np.bool_] | None = None
+) -> tuple[Array, Ints]:
+    """Least height between two agents of which one is below the other (K,) [m], and the pair (K, 2).
+
+    Below is who overlaps as seen from above. Infinity and (-1, -1) where nobody is. r (K, N, 3) [m],
+    radius (N,); ``among`` (K, N): whom to look at, all by default.
+    """
+    from scipy.spatial import KDTree
+
+    radius = np.asarray(radius, dtype=float)
+    least, pair = np.full(len(r), np.inf), np.full((len(r), 2), -1)
+    for k, points in enumerate(r):
+        who = np.isfinite(points).all(axis=1)
+        if among is not None:
+            who &= among[k]
+        who = np.flatnonzero(who)
+        if not len(who):
+            continue
+        near = who[KDTree(points[who, :2]).query_pairs(2.0 * radius.max(), output_type="ndarray")]
+        i, j = near.T
+        apart, radii = points[i] - points[j], radius[i] + radius[j]
+        room = np.where(
+            np.hypot(apart[:, 0], apart[:, 1]) > radii, np.inf, abs(apart[:, 2]) - radii
+        )
+        if len(room) and np.isfinite(room.min()):
+            at = int(room.argmin())
+            least[k], pair[k] = room[at], np.sort(near[at])
+    return least, pair
+
+
 def clearance(
     r: Array, radius: ArrayLike, obstacles: Sequence[Box | Ground]
 ) -> tuple[Array, Ints, Ints]:

@@ -13,11 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigidfleet import formation as shapes
-from rigidfleet import lqr
+from rigidfleet import lqr, solvers
 from rigidfleet.kernel import program as k
 from rigidfleet.mission import Establish, Fly, Mission, Phase, Regulator, Reshape, Turn
 from rigidfleet.route import (
-    Edge,
     Pose,
     Situation,
     about_cm,
@@ -46,6 +45,7 @@ class PhasePlan:
     goal: Pose | None
     arrival: float  # when the goal is to be reached [s]
     frame: Array | None  # attitude (3, 3) of the mean-axis frame at the start
+    method: solvers.Method  # how the multipliers are solved for
 
 
 def plan_phase(mission: Mission, phase: Phase, now: Situation, t_end: float) -> PhasePlan:
@@ -59,8 +59,8 @@ def plan_phase(mission: Mission, phase: Phase, now: Situation, t_end: float) -> 
 
     d1 = mission.formation_distances(name) if name else np.zeros(0)
     if not shaping:
-        d1 = np.array([now.reference.get(e, d) for e, d in zip(_keys(edges), d1, strict=True)])
-    d0 = np.array([now.reference.get(e, _distance(now.r, e)) for e in _keys(edges)])
+        d1 = _commanded(now, edges, d1)
+    d0 = _commanded(now, edges, shapes.distances(now.r, edges))
     # Slots are blended wherever the shape leads; where distances lead, slots only follow if tracked.
     left = masses if now.lost is None else np.where(now.lost, 0.0, masses)
     before = now.slots if now.slots is not None else about_cm(now.r, left)
@@ -84,6 +84,7 @@ def plan_phase(mission: Mission, phase: Phase, now: Situation, t_end: float) -> 
         assert goal is not None
         moves = isinstance(phase, Fly | Turn)
         feedback = _feedback(mission, goal, now.t, arrival, moves=moves)
+    method = solvers.choose(len(masses), edges, mission.constraint.solver)
     program = k.Program(
         body_formulation=mission.formulation == "body",
         has_frame=frame is not None,
@@ -91,7 +92,7 @@ def plan_phase(mission: Mission, phase: Phase, now: Situation, t_end: float) -> 
             masses, 1.0 / masses, float(masses.sum()), np.array(mission.agents.thrust_limit),
             mission.agents.saturate, mission.gravity,
         ),
-        graph=_graph(edges.tobytes(), masses.tobytes()),
+        graph=_graph(edges.tobytes(), masses.tobytes(), large=method != "dense"),
         law=_law(mission, damped=phase.control != "slots" and len(edges) > 0),
         reference=reference,
         motion=motion,
@@ -103,22 +104,20 @@ def plan_phase(mission: Mission, phase: Phase, now: Situation, t_end: float) -> 
     slots = (
         after if phase.control != "open" or kind == k.SLOTS else target if shaping else now.slots
     )
-    return PhasePlan(program, edges, slots, name, d1, goal, arrival, frame)
+    return PhasePlan(program, edges, slots, name, d1, goal, arrival, frame, method)
 
 
 @lru_cache(64)
-def _graph(edges: bytes, masses: bytes) -> k.Graph:
+def _graph(edges: bytes, masses: bytes, *, large: bool) -> k.Graph:
     """The constraint graph, which the kernel only reads: most phases have the one before."""
     pairs = np.frombuffer(edges, dtype=np.int64).reshape(-1, 2).copy()
-    return k.graph(pairs, np.frombuffer(masses))
+    return k.graph(pairs, np.frombuffer(masses), large=large)
 
 
-def _keys(edges: NDArray[np.int64]) -> list[Edge]:
-    return [(int(i), int(j)) for i, j in edges]
-
-
-def _distance(r: Array, edge: Edge) -> float:
-    return float(np.linalg.norm(r[edge[0]] - r[edge[1]]))
+def _commanded(now: Situation, edges: NDArray[np.int64], other: Array) -> Array:
+    """Distances (m,) commanded last; ``other`` (m,) where an edge is new."""
+    keys = map(tuple, edges.tolist())
+    return np.array([now.reference.get(e, d) for e, d in zip(keys, other.tolist(), strict=True)])
 
 
 def _law(mission: Mission, *, damped: bool) -> k.Law:

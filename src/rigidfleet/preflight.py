@@ -19,18 +19,21 @@ from numpy.typing import NDArray
 
 from rigidfleet import attitude as att
 from rigidfleet import formation as shapes
-from rigidfleet import gains, geometry, lqr
+from rigidfleet import gains, geometry, lqr, solvers
 from rigidfleet.mission import Box, Establish, Mission, Phase, Reshape
 from rigidfleet.mission.disturbances import intensity
 from rigidfleet.rigidity import (
     Kind,
     Realisations,
     Rigidity,
+    Spectrum,
     Verdict,
     analyse,
     jacobian,
     realisations,
+    spectrum,
 )
+from rigidfleet.rigidity.spectrum import MOST as LANCZOS
 from rigidfleet.route import (
     Pose,
     Situation,
@@ -54,6 +57,10 @@ _SAMPLES, _STEP, _MOST = 201, 0.05, 2001
 _TOLERANCE = 0.01
 #: Another assignment is worth a note if it saves this share of the way.
 _WORTH = 0.05
+#: Equations up to which rigidity is judged by a dense decomposition.
+_DENSE = 600
+#: Assignments of so many agents are compared, in a second or so.
+_COMPARED = 200
 #: Rounding on a limit is not beyond it.
 _SLACK = 1e-9
 #: A steady distance from the slots beyond this is worth a note [m]: the verdict's tolerance of a waypoint.
@@ -102,13 +109,16 @@ class Leg:
 class FormationCheck:
     """One formation: its rigidity, and other shapes that its distances allow, where looked for.
 
-    `held_by` is "slots" if they are tracked in every phase that flies it, else "distances".
+    `held_by` is "slots" if they are tracked in every phase that flies it, else "distances"; `method` how its
+    constraint force is solved for. A large one has a `spectrum` in place of its rigidity.
     """
 
     name: str
     rigidity: Rigidity | None
     held_by: Literal["slots", "distances", "nothing"]
     realisations: Realisations | None = None
+    method: solvers.Method = "dense"
+    spectrum: Spectrum | None = None
 
 
 @dataclass(frozen=True)
@@ -226,6 +236,8 @@ class Preflight:
                     "held_by": f.held_by,
                     "rigidity": None if f.rigidity is None else f.rigidity.data(),
                     "realisations": None if f.realisations is None else f.realisations.data(),
+                    "solve": f.method,
+                    "spectrum": None if f.spectrum is None else _spectral_data(f.spectrum),
                 }
                 for f in self.formations
             },
@@ -304,15 +316,19 @@ def preflight(mission: Mission, *, search: bool | None = None) -> Preflight:
 def _formation(mission: Mission, name: str, *, search: bool) -> FormationCheck:
     held = _held_by(mission, name)
     slots, edges = mission.formation_slots(name), mission.formation_edges(name)
+    method = solvers.choose(mission.n_agents, edges, mission.constraint.solver)
     if slots is None or not len(edges):
-        return FormationCheck(name, None, held)
+        return FormationCheck(name, None, held, method=method)
+    if min(len(edges), 3 * mission.n_agents) > _DENSE:
+        ends = spectrum(slots, edges, mission.agents.mass) if len(slots) <= LANCZOS else None
+        return FormationCheck(name, None, held, method=method, spectrum=ends)
     rigidity = analyse(slots, edges, masses=mission.agents.mass)
     endless = rigidity.verdict is Verdict.FLEXIBLE  # a continuum of other shapes
     if not search or endless or _contradiction(mission, name) is not None:
-        return FormationCheck(name, rigidity, held)
+        return FormationCheck(name, rigidity, held, method=method)
     start = mission.agents.position
     others = realisations(slots, edges, starts=STARTS, start=start)
-    return FormationCheck(name, rigidity, held, others)
+    return FormationCheck(name, rigidity, held, others, method)
 
 
 def _held_by(mission: Mission, name: str) -> Literal["slots", "distances", "nothing"]:
@@ -353,6 +369,14 @@ def _formation_remarks(mission: Mission, formations: list[FormationCheck]) -> It
             )
             yield Remark("fails", "formation", text)
         r = f.rigidity
+        if f.spectrum is not None:
+            if f.spectrum.free:
+                text = f"'{f.name}' is flexible to first order: {f.spectrum.free} motions or more are free"
+                held = ". Add edges, or track slots" if alone else "; slots hold it"
+                yield Remark("fails" if alone else "note", "formation", text + held)
+            continue
+        if r is None and mission.formation_slots(f.name) is not None:
+            continue  # too large to judge
         if r is None:
             if len(mission.formation_edges(f.name)):
                 text = f"'{f.name}' has distances that fix no places: its rigidity is not judged"
@@ -645,16 +669,11 @@ def _below(mission: Mission, found: Preflight) -> Iterator[Remark]:
     radius, limit = np.array(mission.agents.radius), mission.limits.separation_below
     worst: dict[bool, tuple[float, float, tuple[int, ...], str]] = {}
     for leg in found.legs:
-        for i in range(mission.n_agents - 1):
-            apart = leg.position[:, i + 1 :] - leg.position[:, i : i + 1]
-            radii = radius[i] + radius[i + 1 :]
-            beside = np.hypot(apart[..., 0], apart[..., 1]) >= radii
-            room = np.where(beside, np.inf, np.abs(apart[..., 2]) - radii)
-            k, n = np.unravel_index(int(room.argmin()), room.shape)
-            if room[k, n] < worst.get(leg.exact, (np.inf,))[0]:
-                other = i + 1 + int(n)
-                who = (other, i) if apart[k, n, 2] < 0 else (i, other)
-                worst[leg.exact] = float(room[k, n]), float(leg.time[k]), who, leg.phase
+        room, pair = geometry.headroom(leg.position, radius)
+        k = int(room.argmin())
+        if room[k] < worst.get(leg.exact, (np.inf,))[0]:
+            low, high = sorted(pair[k].tolist(), key=lambda i: leg.position[k, i, 2])
+            worst[leg.exact] = float(room[k]), float(leg.time[k]), (low, high), leg.phase
     for exact, (room, t, (low, high), phase) in worst.items():
         text = f"agent {low + 1} is below agent {high + 1}, {max(room, 0.0):.2f} m from it at {t:.2f} s, in '{phase}'"
         if limit is None:
@@ -867,7 +886,7 @@ def _assigned(mission: Mission, found: Preflight) -> Iterator[Remark]:
     """Whether other agents in the slots of the first formation would be better off."""
     first = next((p for p in mission.phases if isinstance(p, Establish)), None)
     slots = mission.formation_slots(first.formation) if first is not None else None
-    if slots is None or mission.n_agents < 2:
+    if first is None or slots is None or not 2 <= mission.n_agents <= _COMPARED:
         return
     masses, radius = np.array(mission.agents.mass), np.array(mission.agents.radius)
     start = np.array(mission.agents.position)
@@ -878,7 +897,7 @@ def _assigned(mission: Mission, found: Preflight) -> Iterator[Remark]:
         ("safe", shapes.assigned(start, slots, masses, radius)),
     ):
         way, room = shapes.straight_way(start, slots[order], masses, radius)
-        taken = mission.assigned_slots[order]
+        taken = mission.assigned_slots[first.formation][order]
         found.assignments[name] = Assignment(tuple(taken.tolist()), way, room)
     now, short, safe = found.assignments.values()
     if short.way < (1 - _WORTH) * now.way:
@@ -896,8 +915,17 @@ def _formation_words(f: FormationCheck) -> str:
     held = {"slots": "held by slots", "distances": "held by distances", "nothing": "not flown"}[
         f.held_by
     ]
+    if f.spectrum is not None:
+        text = f"{held}; solved by {solvers.WORDS[f.method]}"
+        if f.spectrum.free:
+            return f"{text}; flexible to first order, {f.spectrum.free} motions or more"
+        return f"{text}; rigid, index {f.spectrum.index:.3g}, condition {f.spectrum.condition:.3g}"
+    if r is None and f.method != "dense":
+        return f"{held}; solved by {solvers.WORDS[f.method]}; too large to judge its rigidity"
     if r is None:
         return f"{held}; its distances fix no places, so its rigidity is not judged"
+    if f.method != "dense":
+        held += f", solved by {solvers.WORDS[f.method]}"
     parts = [f"{r.verdict}, {held}: {len(r.edges)} edges, rank {r.rank} of {r.needed}"]
     if r.reachable < r.needed:
         where = "line" if r.dimension == 1 else "plane"
@@ -919,6 +947,11 @@ def _formation_words(f: FormationCheck) -> str:
         most = f", and {len(counts) - 4} more" if len(counts) > 4 else ""
         parts.append(f"from {f.realisations.starts} random starts: {', '.join(counts[:4])}{most}")
     return "; ".join(parts)
+
+
+def _spectral_data(s: Spectrum) -> dict[str, Any]:
+    condition = s.condition if math.isfinite(s.condition) else None
+    return {"w": s.w, "index": s.index, "condition": condition, "free": s.free}
 
 
 def _gain_words(g: GainsCheck) -> str:

@@ -21,6 +21,10 @@ if TYPE_CHECKING:
     from rigidfleet.mission import Mission
 
 
+#: Edges, or coordinates, up to which the smallest singular value of J is recorded at each sample.
+_SINGULAR = 400
+
+
 @dataclass
 class Piece:
     """Samples of a phase, or of part of one, as the kernel gave them."""
@@ -186,15 +190,30 @@ def _attitudes(
 
 def _by_edge(pieces: Sequence[Piece], name: str, edges: Ints) -> Array:
     """A quantity of the edges (K, m), NaN while an edge is not active."""
-    column = {(i, j): k for k, (i, j) in enumerate(edges.tolist())}
     rows = []
     for piece in pieces:
         values = piece.integral if name == "integral" else getattr(piece.record, name)
         full = np.full((len(piece.time), len(edges)), np.nan)
-        full[:, [column[i, j] for i, j in piece.edges.tolist()]] = values
+        full[:, _columns(piece.edges, edges)] = values
         rows.append(full)
     return np.concatenate(rows)
 
 
+def _columns(some: Ints, edges: Ints) -> Ints:
+    """Where some edges are among all, (m, 2) both."""
+    key = edges.max(initial=0) + 1
+    keys = edges[:, 0] * key + edges[:, 1]
+    order = np.argsort(keys)
+    return order[np.searchsorted(keys[order], some[:, 0] * key + some[:, 1])]
+
+
 def _singular_values(pieces: Sequence[Piece]) -> Array:
-    return np.concatenate([geometry.smallest_singular_value(p.record.r, p.edges) for p in pieces])
+    """Smallest non-zero singular value of J (K,); NaN where a sample would take longer than a flight."""
+    return np.concatenate(
+        [
+            geometry.smallest_singular_value(p.record.r, p.edges)
+            if min(len(p.edges), 3 * p.record.r.shape[1]) <= _SINGULAR
+            else np.full(len(p.time), np.nan)
+            for p in pieces
+        ]
+    )

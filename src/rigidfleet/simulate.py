@@ -7,15 +7,17 @@ import math
 import time as clock
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rigidfleet import attitude as att
+from rigidfleet import solvers
 from rigidfleet.disturbances import disturbance, without
 from rigidfleet.errors import FlightError
-from rigidfleet.kernel import flight
+from rigidfleet.kernel import flight, large
 from rigidfleet.kernel import program as k
 from rigidfleet.mission import Establish, Fly, Mission, Phase, Reshape, Settle, Turn
 from rigidfleet.plan import PhasePlan, Pose, Situation, about_cm, plan_phase
@@ -31,8 +33,8 @@ _STEPS, _PAUSE = 2000, 0.05
 #: A phase has stalled that took more steps than these and those for each second of mission time, or
 #: more than the last in all. A step of 1 ms is already that of gains above 1e3 /s.
 _STALLED, _STALLED_RATE, _MOST_STEPS = 50_000, 2_000.0, 5_000_000
-#: Equations of the constraint force at most: beyond, one evaluation takes seconds.
-_LARGEST = 2000
+#: Residual of an iterative solve, as a share of the integrator's tolerance; the relative one within bounds.
+_RESIDUAL, _LEAST, _MOST_RESIDUAL = 1e-3, 1e-13, 1e-8
 #: Where a phase ends by settling, whether it has is asked this often [s].
 _CHECK = 0.1
 #: Progress is reported this often [s of wall time].
@@ -150,6 +152,9 @@ class Leg:
     t_end: float  # [s] at the latest
     asked: int = 0  # how often the user's controller has been
     held: k.Program | None = None  # with its force
+    solver: large.LargeSolver | None = (
+        None  # of the multipliers, where that is not the kernel itself
+    )
 
     @property
     def t(self) -> float:
@@ -191,6 +196,7 @@ class Flight:
         self.ending = ""
         self.started = self.reported = clock.perf_counter()
         self.count = np.zeros(3, dtype=np.int64)
+        self.solves: dict[solvers.Method, large.Counts] = {}
 
     def fly(self) -> None:
         """Run all phases, or as many as can be flown."""
@@ -215,7 +221,7 @@ class Flight:
             else:
                 self._fly_to(leg, leg.t_end)
         finally:
-            self.count += leg.state.count[:3]
+            self._count(leg)
             if leg.state.count[0] or leg.t > self.now.t:
                 self._arrive(leg)
             record.t_end = self.now.t
@@ -235,22 +241,69 @@ class Flight:
         plan.program = plan.program._replace(external=external, disturbance=self.disturbance)
         if self.lost.any():
             self._release(plan)
+        work, solver = self._equip(plan)
         y = self._pack(plan)
-        return Leg(
-            index, phase, plan, self._workspace(plan), self._integrator(y, self.now.t), t_end
-        )
+        state = self._integrator(plan, y, self.now.t)
+        return Leg(index, phase, plan, work, state, t_end, solver=solver)
 
-    def _workspace(self, plan: PhasePlan) -> k.Workspace:
-        return k.workspace(
+    def _equip(self, plan: PhasePlan) -> tuple[k.Workspace, large.LargeSolver | None]:
+        """Workspace of a plan, and what solves for its multipliers where that is not the kernel itself."""
+        program, dense = plan.program, plan.method == "dense"
+        work = k.workspace(
             len(self.masses),
             len(plan.edges),
-            with_h=plan.program.control.allocation != k.RIGID,
-            solver=plan.program.law.solver,
+            with_h=program.control.allocation != k.RIGID,
+            solver=program.law.solver,
+            large=not dense,
+        )
+        if dense:
+            return work, None
+        solver = self._large(plan, work)
+        plan.program = program._replace(graph=program.graph._replace(solver=solver.address))
+        return work, solver
+
+    def _large(self, plan: PhasePlan, work: k.Workspace) -> large.LargeSolver:
+        """What solves for the multipliers of a large formation, in one phase."""
+        edges = plan.edges
+        points = self.now.r if plan.slots is None else plan.slots
+        steps = solvers.sweep_steps(len(points), edges) if plan.method == "sweep" else None
+        given = self.mission.integrator
+        residual = min(max(_RESIDUAL * given.rtol, _LEAST), _MOST_RESIDUAL)
+        floor = _RESIDUAL * (given.atol_velocity or given.atol)  # of a step of a second
+        order = partial(solvers.dissection, points, edges)
+        p = plan.program
+        return large.LargeSolver(
+            p.vehicles, p.graph.edges, p.law, work, steps, order, residual, floor
         )
 
-    def _integrator(self, y: Array, t: float) -> flight.Integrator:
-        tolerances = self.mission.integrator
-        return flight.integrator(y, t, rtol=tolerances.rtol, atol=np.full(len(y), tolerances.atol))
+    def _tolerances(self, plan: PhasePlan, size: int) -> Array:
+        """Absolute tolerances (size,) of the states, class by class.
+
+        The integral of c is in its law what a distance is, times a second; but it stays near zero, where
+        a relative tolerance asks for nothing. In large formations it would set the step alone: there it is held
+        to what its own distance is held to.
+        """
+        n, m, given = len(self.masses), len(plan.edges), self.mission.integrator
+        atol = np.full(size, given.atol)
+        if given.atol_velocity is not None:
+            atol[3 * n : 6 * n] = given.atol_velocity
+        if given.atol_integral is not None:
+            atol[6 * n : 6 * n + m] = given.atol_integral
+        elif plan.method != "dense":
+            atol[6 * n : 6 * n + m] = given.atol + given.rtol * plan.distances
+        if given.atol_attitude is not None:
+            atol[6 * n + m : 6 * n + m + 4] = given.atol_attitude
+        return atol
+
+    def _integrator(self, plan: PhasePlan, y: Array, t: float) -> flight.Integrator:
+        rtol = self.mission.integrator.rtol
+        return flight.integrator(y, t, rtol=rtol, atol=self._tolerances(plan, len(y)))
+
+    def _count(self, leg: Leg) -> None:
+        """Add up what a leg, or its part up to a loss, has taken."""
+        self.count += leg.state.count[:3]
+        if leg.solver is not None:
+            self.solves.setdefault(leg.plan.method, large.Counts()).add(leg.solver.counts)
 
     def _fly_to(self, leg: Leg, t_end: float) -> None:
         """Integrate to ``t_end`` [s] under the phase's input law, or the user's controller."""
@@ -295,21 +348,24 @@ class Flight:
         self.lost = self.lost | now
         self.now.lost = self.lost
         y, own, n = leg.state.y, program is leg.plan.program, len(self.masses)
+        self._count(leg)
         kept = self._release(leg.plan)
-        self.count += leg.state.count[:3]
         integral = y[6 * n : 6 * n + len(kept)][kept]
-        leg.state = self._integrator(np.concatenate([y[: 6 * n], integral]), leg.t)
-        leg.workspace = self._workspace(leg.plan)
+        y = np.concatenate([y[: 6 * n], integral])
+        leg.state = self._integrator(leg.plan, y, leg.t)
+        leg.workspace, leg.solver = self._equip(leg.plan)
         if own:
             return leg.plan.program
-        leg.held = without(program, kept, self.lost)
+        held = without(program, kept, self.lost, large=leg.plan.method != "dense")
+        leg.held = held._replace(graph=leg.plan.program.graph)
         return leg.held
 
     def _release(self, plan: PhasePlan) -> NDArray[np.bool_]:
         """Take a plan's edges to lost vehicles away; returns which are kept."""
         kept = ~np.any(self.lost[plan.edges], axis=1)
-        plan.program = without(plan.program, kept, self.lost)
         plan.edges, plan.distances = plan.edges[kept], plan.distances[kept]
+        plan.method = solvers.choose(len(self.masses), plan.edges, self.mission.constraint.solver)
+        plan.program = without(plan.program, kept, self.lost, large=plan.method != "dense")
         return kept
 
     def _stretch(self, leg: Leg, program: k.Program, t_end: float) -> None:
@@ -333,6 +389,8 @@ class Flight:
                 fresh = False
                 if self.external is not None:
                     self.external.check()
+                if leg.solver is not None:
+                    leg.solver.check()
                 self._report(leg)
                 if status == flight.PAUSED and self._stalled(leg):
                     break
@@ -412,7 +470,8 @@ class Flight:
     def _pack(self, plan: PhasePlan) -> Array:
         """The kernel's state vector at the switch."""
         now, masses = self.now, self.masses
-        integral = [now.integral.get((int(i), int(j)), 0.0) for i, j in plan.edges]
+        keys = map(tuple, plan.edges.tolist())
+        integral = [now.integral.get(edge, 0.0) for edge in keys]
         if plan.frame is None:
             return np.concatenate([now.r.ravel(), now.v.ravel(), integral])
         q = att.quaternion_from_dcm(plan.frame)
@@ -427,7 +486,7 @@ class Flight:
         plan, state, w = leg.plan, leg.state, leg.workspace
         flight.closed_loop(leg.t, state.y, np.empty_like(state.y), plan.program, w)
         n, m = len(self.masses), len(plan.edges)
-        keys = [(int(i), int(j)) for i, j in plan.edges]
+        keys = [(i, j) for i, j in plan.edges.tolist()]
         frame = self.now.frame
         if plan.frame is not None:
             q = state.y[6 * n + m : 6 * n + m + 4]
@@ -484,6 +543,12 @@ class Flight:
         head = f"the flight cannot go on at t = {leg.t:.3f} s, in phase '{leg.phase.name}': {what}"
         if not len(leg.plan.edges):
             return f"{head}. {self._remedy(leg, collapsed=collapsed)}"
+        if leg.solver is not None:
+            lost, failed = leg.solver.counts.fallbacks, leg.solver.counts.failures
+            return (
+                f"{head}; solved by {solvers.WORDS[leg.plan.method]}, which lost a pivot {lost} times and found no"
+                f" solution {failed} times. {self._remedy(leg, collapsed=collapsed)}"
+            )
         J, closest, length = _jacobian(leg, len(self.masses))
         edge = "-".join(str(int(a) + 1) for a in leg.plan.edges[closest])
         if not np.isfinite(J).all():
@@ -580,6 +645,7 @@ class Flight:
             "evaluations": evaluations, "steps": steps, "rejected": rejected,
             "wall_s": wall, "simulated_s": self.now.t,
             "rtol": self.mission.integrator.rtol, "atol": self.mission.integrator.atol,
+            "solvers": {method: vars(counts) for method, counts in self.solves.items()},
         }  # fmt: skip
         return assemble(
             self.mission, self.phases, self.pieces, ending=self.ending, statistics=statistics
@@ -590,14 +656,17 @@ def _check_size(mission: Mission, phase: Phase) -> None:
     """Stop before a flight that would take hours."""
     if not isinstance(phase, Establish | Reshape):
         return
-    edges = len(mission.formation_edges(phase.formation))
-    size = min(edges, 3 * mission.n_agents) if mission.constraint.solver == "iterated" else edges
-    if size > _LARGEST:
+    n, solver = mission.n_agents, mission.constraint.solver
+    edges = mission.formation_edges(phase.formation)
+    if solvers.choose(n, edges, solver) != "dense":
+        return
+    size = solvers.equations(n, len(edges), solver)
+    if size > solvers.MOST_DENSE:
         raise StoppedError(
-            f"phase '{phase.name}' takes '{phase.formation}', whose {edges:,} edges between"
-            f" {mission.n_agents:,} agents make {size:,} equations for the constraint force; with more"
-            f" than {_LARGEST:,} a flight takes hours. Give it fewer edges, fly fewer agents, or track"
-            " slots with edges = []"
+            f"phase '{phase.name}' takes '{phase.formation}', whose {len(edges):,} edges between"
+            f' {n:,} agents make {size:,} equations for the constraint force, and solver "{solver}" needs'
+            f" their eigenvalues; with more than {solvers.MOST_DENSE:,} a flight takes hours. Use solver ="
+            ' "iterated" (or "exact"), give it fewer edges, or track slots with edges = []'
         )
 
 

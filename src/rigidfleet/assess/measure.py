@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from rigidfleet import attitude as att
 from rigidfleet import formation as shapes
+from rigidfleet import geometry
 from rigidfleet.assess.verdict import SENSE, SHAPE_TOLERANCE, Extreme, PhaseVerdict, Waypoint, names
 from rigidfleet.result import PhaseRecord, Result
 
@@ -20,6 +21,9 @@ Ints = NDArray[np.int64]
 # Slots thinner than this, relative to their length, are planar or straight: distances of seven digits
 # leave a flat shape 3e-4 thick.
 _THIN = 1e-3
+
+#: Agents up to which a shape that is not the intended one is asked whether it is rigid.
+_JUDGED = 200
 
 
 class Fit:
@@ -32,14 +36,14 @@ class Fit:
         p, slots = shapes.centred(p), shapes.centred(slots)
         self.dimension = shapes.dimension(slots, _THIN)
         self.mirrored = self.dimension == 3 and bool(np.linalg.det(p.T @ slots) < 0)
-        axes = np.linalg.svd(slots)[2]
+        axes = np.linalg.svd(slots, full_matrices=False)[2]
         #: Direction of a line or normal of a plane, in the slots' axes, and where it points in the world.
         self.axis: Floats = axes[0] if self.dimension == 1 else axes[2]
         self.points: Floats = shapes.kabsch(p, slots) @ self.axis
         self.in_order: bool | None = None
         if self.dimension == 1 and len(p) > 2:
             asked = np.argsort(slots @ self.axis).tolist()
-            flown = np.argsort(p @ np.linalg.svd(p)[2][0]).tolist()
+            flown = np.argsort(p @ np.linalg.svd(p, full_matrices=False)[2][0]).tolist()
             self.in_order = flown in (asked, asked[::-1])
 
     @property
@@ -125,19 +129,8 @@ class Flight:
 
     def below(self) -> Extreme | None:
         """Least vertical room [m] between two agents of which one is below the other."""
-        r, radius = self.result.position, np.array(self.mission.agents.radius)
-        least, who = np.full(len(r), np.inf), np.zeros((len(r), 2), dtype=np.int64)
-        for i in range(r.shape[1] - 1):
-            apart, radii = r[:, i + 1 :] - r[:, i : i + 1], radius[i] + radius[i + 1 :]
-            beside = np.hypot(apart[..., 0], apart[..., 1]) > radii
-            beside |= ~(self.left[:, i + 1 :] & self.left[:, i : i + 1])
-            room = np.where(beside, np.inf, np.abs(apart[..., 2]) - radii)
-            j = room.argmin(axis=1)
-            room = room[np.arange(len(r)), j]
-            closer = room < least
-            least[closer] = room[closer]
-            who[closer] = np.column_stack([np.full(len(r), i), i + 1 + j])[closer]
-        return self.extreme(least, lambda k: names(who[k]), lambda x: -x)
+        least, pair = geometry.headroom(self.result.position, self.mission.agents.radius, self.left)
+        return self.extreme(least, lambda k: names(pair[k]), lambda x: -x)
 
     def outside(self, low: Floats, high: Floats) -> Extreme | None:
         """How far [m] an agent's centre comes out of a box with these corners; negative inside."""
@@ -255,7 +248,12 @@ def _all_pairs(p: Floats, slots: Floats) -> tuple[float, tuple[int, int], float,
 
 
 def is_rigid(p: Floats, edges: Ints) -> bool:
-    """Whether edges (m, 2) at positions (N, 3) are infinitesimally rigid in space: rank J = 3N - 6."""
+    """Whether edges (m, 2) at positions (N, 3) are infinitesimally rigid in space: rank J = 3N - 6.
+
+    Of more than `_JUDGED` agents that is not claimed: it would take longer than all else.
+    """
+    if len(p) > _JUDGED:
+        return False
     i, j = edges.T
     u = p[i] - p[j]
     J = np.zeros((len(edges), len(p), 3))

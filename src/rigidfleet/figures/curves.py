@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rigidfleet import attitude as att
+from rigidfleet import geometry
 from rigidfleet.figures import style as st
 from rigidfleet.figures.style import Floats, styled
 from rigidfleet.result import Result
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from rigidfleet.mission import Mission
 
 SINGLE = 6  # so many edges have a colour each; more share one by their lengths
+_PAIRS = 5e7  # distances of pairs that are looked at, in all
 _SMALLEST = 1e-12  # error that is drawn on a logarithmic axis [m]; below is rounding
 
 
@@ -54,6 +56,8 @@ def edge_groups(result: Result) -> list[EdgeGroup]:
         keys.setdefault(
             tuple(f"{d:.4g}" for d in row) + ((str(k),) if m <= SINGLE else ()), []
         ).append(k)
+    if m > st.MANY:
+        return _by_formation(result, lengths)
     groups = list(keys.values())
     if m > SINGLE:
         groups.sort(key=lambda g: np.nan_to_num(lengths[g[0]], nan=0.0).tolist())
@@ -61,6 +65,20 @@ def edge_groups(result: Result) -> list[EdgeGroup]:
         EdgeGroup(g, tuple(lengths[g[0]].tolist()), colour, _edge_label(result, g, lengths[g[0]]))
         for g, colour in zip(groups, st.scale(len(groups)), strict=True)
     ]
+
+
+def _by_formation(result: Result, lengths: Floats) -> list[EdgeGroup]:
+    """Of many edges, a group for those of each formation, or of the same formations."""
+    names = list(result.mission.formations)
+    kinds, kind = np.unique(np.isfinite(lengths), axis=0, return_inverse=True)
+    groups = []
+    for k, (held, colour) in enumerate(zip(kinds, st.scale(len(kinds)), strict=True)):
+        edges = np.flatnonzero(kind.ravel() == k)
+        own = lengths[edges][:, held]
+        of = " and ".join(st.clean(name, 20) for name, h in zip(names, held, strict=True) if h)
+        label = f"{len(edges)} edges of {of}: {own.min():.3g} to {own.max():.3g} m"
+        groups.append(EdgeGroup(edges.tolist(), tuple(lengths[edges[0]].tolist()), colour, label))
+    return groups
 
 
 def _edge_label(result: Result, edges: list[int], lengths: Floats) -> str:
@@ -72,8 +90,14 @@ def _edge_label(result: Result, edges: list[int], lengths: Floats) -> str:
 
 
 def edge_lines(ax: Axes, result: Result, values: Floats, **look: Any) -> None:
-    """A line for each edge, values (K, m), in the colour of its group."""
+    """A line for each edge, values (K, m), in the colour of its group; of many the spread of each group."""
     for group in edge_groups(result):
+        if len(result.edges) > st.MANY:
+            active = np.isfinite(result.constraint[:, group.edges])
+            st.spread(
+                ax, result.time, np.where(active, values[:, group.edges], np.nan), group.colour
+            )
+            continue
         for k in group.edges:
             st.line(ax, result.time, values[:, k], color=group.colour, **look)
 
@@ -103,8 +127,11 @@ def draw_distances(ax: Axes, result: Result) -> None:
         st.note(ax, "no edges")
         return
     edge_lines(ax, result, result.distance, linewidth=1.9)
-    for k in _distinct(result.distance_reference):
-        st.reference(ax, result.time, result.distance_reference[:, k])
+    wanted = result.distance_reference
+    if len(result.edges) > st.MANY:
+        wanted = np.column_stack([np.fmin.reduce(wanted, axis=1), np.fmax.reduce(wanted, axis=1)])
+    for k in _distinct(wanted):
+        st.reference(ax, result.time, wanted[:, k])
 
 
 def _distinct(values: Floats) -> list[int]:
@@ -288,7 +315,7 @@ def inputs(result: Result) -> Figure:
     _within(below, result, result.thrust)
     widen(below, 0.1)
     _peak(below, result, result.thrust)
-    st.legend(above, st.agent_handles(result.n_agents))
+    st.agents_legend(above, result.n_agents)
     st.name_phases(fig, [above], result)
     return fig
 
@@ -334,7 +361,7 @@ def constraint_force(result: Result) -> Figure:
     else:
         st.note(below, "no edges")
     widen(below, 1e-3)
-    st.legend(above, st.agent_handles(result.n_agents))
+    st.agents_legend(above, result.n_agents)
     st.name_phases(fig, [above], result)
     return fig
 
@@ -371,7 +398,7 @@ def disturbance(result: Result) -> Figure:
 def shape_error(result: Result) -> Floats:
     """Greatest error (K,) [m] of all pairs' distances against the slots of the phase's formation.
 
-    NaN where the formation has no slots.
+    NaN where the formation has no slots, and of many agents at all but some samples.
     """
     error = np.full(len(result.time), np.nan)
     for k, phase in enumerate(result.phases):
@@ -379,13 +406,15 @@ def shape_error(result: Result) -> Floats:
         slots = None if phase.formation is None else result.mission.formation_slots(phase.formation)
         if slots is None or len(slots) < 2 or rows.start == rows.stop:
             continue
-        r = np.where(result.left[rows, :, None], result.position[rows], np.nan)
+        most = max(3, int(_PAIRS / len(slots) ** 2 / len(result.phases)))
+        at = rows.start + np.array(st.some(rows.stop - rows.start, most))
+        r = np.where(result.left[at, :, None], result.position[at], np.nan)
         worst = np.full(len(r), np.nan)
         for i in range(len(slots) - 1):
             flown = np.linalg.norm(r[:, i + 1 :] - r[:, i : i + 1], axis=2)
             asked = np.linalg.norm(slots[i + 1 :] - slots[i], axis=1)
             worst = np.fmax(worst, np.fmax.reduce(np.abs(flown - asked), axis=1))
-        error[rows] = worst
+        error[at] = worst
     return error
 
 
@@ -398,7 +427,8 @@ def draw_error(ax: Axes, result: Result) -> list[Line2D]:
     handles = []
     if np.isfinite(shape).any():
         look: dict[str, Any] = {"color": st.FLOWN, "linewidth": 2.0, "zorder": 1.9}
-        st.line(ax, result.time, shape, **look)
+        known = np.isfinite(shape) if result.n_agents > st.MANY else slice(None)
+        st.line(ax, result.time[known], shape[known], **look)
         handles.append(Line2D([], [], label="all pairs", **look))
     if np.isfinite(size).any():
         edge_lines(ax, result, size, linewidth=0.6, alpha=0.7)
@@ -435,15 +465,8 @@ def constraint_error(result: Result) -> Figure:
 
 def room_below(result: Result) -> Floats:
     """Least vertical room (K,) [m] between agents whose spheres overlap seen from above; NaN if none."""
-    radius = np.array(result.mission.agents.radius)
-    least = np.full(len(result.time), np.inf)
-    for i in range(result.n_agents - 1):
-        apart = result.position[:, i + 1 :] - result.position[:, i : i + 1]
-        both = radius[i] + radius[i + 1 :]
-        over = np.hypot(apart[..., 0], apart[..., 1]) < both
-        over &= result.left[:, i + 1 :] & result.left[:, i : i + 1]
-        room = np.where(over, np.abs(apart[..., 2]) - both, np.inf)
-        least = np.fmin(least, room.min(axis=1))
+    radius = result.mission.agents.radius
+    least = geometry.headroom(result.position, radius, result.left)[0]
     return np.where(np.isfinite(least), least, np.nan)
 
 

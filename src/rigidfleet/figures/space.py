@@ -27,6 +27,7 @@ _BOX = "#9A9184"
 _GROUND = "#E9E6DF"
 _ELEVATION = 24.0  # of the camera [deg]
 _TRAIL = 1500  # points of an agent's path
+_LINES = 2000  # edges that are drawn among paths
 
 
 # -- what there is to see ------------------------------------------------------------------------------
@@ -51,7 +52,7 @@ def scene(result: Result) -> Scene:
     """What a trajectory's figure shows."""
     mission, r = result.mission, result.position
     rows = np.flatnonzero(np.isfinite(r).all(axis=(1, 2)))
-    thin = rows[st.some(len(rows), _TRAIL)]
+    thin = rows[st.some(len(rows), _TRAIL if r.shape[1] <= st.MANY else _TRAIL // 10)]
     waypoints = _waypoints(result)
     seen = np.concatenate(
         [r[thin].reshape(-1, 3), *(w[1][None] for w in waypoints), np.zeros((0, 3))]
@@ -154,6 +155,9 @@ def _segments(result: Result, shots: list[int]) -> Floats:
 def _draw_paths(ax: Axes, result: Result, view: Scene, axes: int) -> None:
     """Paths, agents where the formation is drawn, start, end and waypoints, in 2 or 3 axes."""
     shots = view.shots
+    if result.n_agents > st.MANY:
+        _draw_many(ax, result, view, axes)
+        return
     for i, colour in enumerate(st.agent_colours(result.n_agents)):
         path: dict[str, Any] = {"color": colour, "linewidth": 0.8, "alpha": 0.9, "zorder": 3}
         ax.plot(*view.paths[:, i, :axes].T, **path, gid=f"agent-{i + 1}")
@@ -161,6 +165,22 @@ def _draw_paths(ax: Axes, result: Result, view: Scene, axes: int) -> None:
         ax.plot(*r, **_dot(colour, 3), zorder=5)
         ax.plot(*r[:, :1], **_dot(colour, 5, hollow=True), zorder=6, gid="start")
         ax.plot(*r[:, -1:], **_dot(colour, 5, marker="s"), zorder=6, gid="end")
+    for _, place in view.waypoints:
+        ax.plot(*place[:axes, None], **_CROSS, zorder=7)
+
+
+def _draw_many(ax: Axes, result: Result, view: Scene, axes: int) -> None:
+    """Paths of some of many agents, and all of them where the formation is drawn."""
+    colours = np.array(st.agent_colours(result.n_agents))
+    for i in st.some(result.n_agents, st.MANY):
+        ax.plot(*view.paths[:, i, :axes].T, color=colours[i], linewidth=0.4, alpha=0.5, zorder=3)
+    first, last = view.shots[0], view.shots[-1]
+    for k in view.shots:
+        r = result.position[k, :, :axes].T
+        hollow = k == first != last
+        look: dict[str, Any] = {"c": "white" if hollow else colours, "edgecolors": colours}
+        look |= {"marker": "s" if k == last else "o", "linewidths": 0.5 if hollow else 0.0}
+        ax.scatter(*r, s=4 if k in (first, last) else 3, **look, zorder=6 if hollow else 5)
     for _, place in view.waypoints:
         ax.plot(*place[:axes, None], **_CROSS, zorder=7)
 
@@ -208,7 +228,7 @@ def draw_space(
     shadow = np.full(len(view.centre), view.floor)
     ax.plot(*view.centre[:, :2].T, shadow, color=st.FAINT, linewidth=1.0, zorder=1)
     edges = _segments(result, view.shots)
-    if len(edges):
+    if 0 < len(edges) <= _LINES:
         ax.add_collection3d(Line3DCollection(edges, colors=st.INK, linewidths=0.6, zorder=4))
     _draw_paths(ax, result, view, 3)
     for name, (x, y, z) in view.waypoints:
@@ -318,11 +338,15 @@ def draw_above(ax: Axes, result: Result, view: Scene) -> None:
         look: dict[str, Any] = {"fill": False, "edgecolor": st.ALERT, "linestyle": (0, (6, 2))}
         _outline(ax, np.array(fence.min), np.array(fence.max), "", **look, gid="geofence")
     edges = _segments(result, view.shots)[..., :2]
+    edges = edges if len(edges) <= _LINES else edges[:0]  # they would hide everything
     ax.add_collection(LineCollection(list(edges), colors=st.INK, linewidths=0.6, zorder=4))
     _draw_paths(ax, result, view, 2)
+    over: dict[tuple[float, float], list[str]] = {}
     for name, (x, y, _) in view.waypoints:
+        over.setdefault((x, y), []).append(name)
+    for (x, y), names in over.items():
         ax.annotate(
-            name, (x, y), (5, 4), textcoords="offset points", fontsize=7.5, zorder=8,
+            ", ".join(names), (x, y), (5, 4), textcoords="offset points", fontsize=7.5, zorder=8,
             parse_math=False, path_effects=st.halo(),
         )  # fmt: skip
 
@@ -485,6 +509,9 @@ def draw_graph(
     room = 1.25 * float(np.abs(p[:, :2]).max()) or 1.0
     ax.set(xlim=(-room, room), ylim=(-room, room), aspect="equal")
     ax.axis("off")
+    if n > st.MANY:
+        _draw_mesh(ax, p, edges, colours)
+        return
     for e in np.argsort(p[edges, 2].mean(axis=1)) if len(edges) else []:
         i, j = edges[e]
         a, b = p[i], p[j]
@@ -517,6 +544,29 @@ def draw_graph(
                 x, y, str(i + 1), fontsize=0.6 * size, color=_readable_on(colour), ha="center",
                 va="center_baseline", zorder=6, fontweight="bold",
             )  # fmt: skip
+
+
+def _draw_mesh(ax: Axes, p: Floats, edges: Any, colours: list[str]) -> None:
+    """A graph of many agents: what is behind first and fainter."""
+    from matplotlib.collections import LineCollection
+    from matplotlib.colors import to_rgba_array
+
+    depth = p[:, 2] - p[:, 2].min()
+    depth = (
+        0.15 + 0.85 * depth / max(float(depth.max()), 1e-9) if np.ptp(p[:, 2]) else 1 + 0 * depth
+    )
+    if len(edges):
+        near = depth[edges].mean(axis=1)
+        order = np.argsort(near)
+        look = to_rgba_array(colours)
+        look[:, 3] = near
+        lines = LineCollection(list(p[edges[order]][:, :, :2]), colors=look[order], linewidths=0.5)
+        lines.set_gid("edges")
+        ax.add_collection(lines)
+    order = np.argsort(p[:, 2])
+    dots = to_rgba_array(st.agent_colours(len(p)))
+    dots[:, 3] = depth
+    ax.scatter(*p[order, :2].T, s=2000 / len(p) + 1, c=dots[order], linewidths=0, zorder=3)
 
 
 def _draw_axes(ax: Axes, axes: Floats, length: float, *, taken: bool) -> None:

@@ -43,6 +43,8 @@ _PAD = 0.07  # [in] around what is drawn
 _SLANT = 38.0  # of phase names that do not fit upright [deg]
 _LONGEST = 28  # letters of a phase name
 _POINTS = 3000  # samples of a line; more would be drawn over each other
+#: Of more agents or edges than this the spread is drawn, not each of them.
+MANY = 200
 _ENTRIES = 12  # of a legend
 
 _RC: dict[str, Any] = {
@@ -219,9 +221,41 @@ def note(ax: Axes, words: str) -> None:
     ax.tick_params(left=False, labelleft=False)
 
 
+def spread(ax: Axes, t: Floats, values: Floats, colour: str) -> None:
+    """Values (K, n) of many as a band from least to greatest, one of nine in ten, and their median."""
+    known = np.isfinite(values).any(axis=1)
+    if not known.any():
+        return
+    found = np.full((5, len(t)), np.nan)
+    found[:, known] = np.nanquantile(values[known], [0.0, 0.05, 0.5, 0.95, 1.0], axis=1)
+    least, low, middle, high, greatest = found
+    look: dict[str, Any] = {"color": colour, "linewidth": 0.0, "zorder": 2.0}
+    ax.fill_between(t, least, greatest, alpha=0.25, **look, gid="spread")
+    ax.fill_between(t, low, high, alpha=0.45, **look)
+    line(ax, t, middle, color=colour, linewidth=1.4, zorder=2.1)
+
+
+def spread_handles(what: str, colour: str) -> list[Any]:
+    """Legend entries of `spread`."""
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    return [
+        Patch(color=colour, alpha=0.25, linewidth=0, label=f"all {what}"),
+        Patch(color=colour, alpha=0.7, linewidth=0, label="nine in ten"),
+        Line2D([], [], color=colour, linewidth=1.4, label="median"),
+    ]
+
+
 def agent_lines(ax: Axes, result: Result, values: Floats) -> None:
-    """A line for each agent, values (K, N), in its colour; the first widest, so that all show."""
+    """A line for each agent, values (K, N), in its colour; the first widest, so that all show.
+
+    Of more than `MANY` agents their spread.
+    """
     n = result.n_agents
+    if n > MANY:
+        spread(ax, result.time, values, FLOWN)
+        return
     for i, colour in enumerate(agent_colours(n)):
         width = 1.0 + 1.6 * (n - 1 - i) / max(n - 1, 1)
         name = f"agent-{i + 1}"
@@ -233,9 +267,15 @@ def agent_handles(n: int, **look: Any) -> list[Line2D]:
     from matplotlib.lines import Line2D
 
     colours = agent_colours(n)
+    entries = _ENTRIES if n <= MANY else 4
     return [
-        Line2D([], [], color=colours[i], label=f"agent {i + 1}", **look) for i in some(n, _ENTRIES)
+        Line2D([], [], color=colours[i], label=f"agent {i + 1}", **look) for i in some(n, entries)
     ]
+
+
+def agents_legend(ax: Axes, n: int) -> None:
+    """Legend of `agent_lines`."""
+    legend(ax, agent_handles(n) if n <= MANY else spread_handles(f"{n} agents", FLOWN))
 
 
 def some(n: int, most: int) -> list[int]:

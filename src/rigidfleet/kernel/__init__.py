@@ -48,5 +48,6 @@ numba.config.CACHE_DIR = str(_CACHE)
 try:
     from rigidfleet.kernel import ensemble as ensemble
     from rigidfleet.kernel import flight as flight
+    from rigidfleet.kernel import large as large
 finally:
     numba.config.CACHE_DIR = _before

@@ -4,6 +4,8 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 import numba
+from numba import types
+from numba.extending import intrinsic
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -32,3 +34,16 @@ def inlined(function: F) -> F:
     A call would copy every field of theirs, some 300 numbers, to the stack.
     """
     return numba.njit(forceinline=True, **_OPTIONS)(function)
+
+
+@intrinsic
+def call_solver(_context, address):
+    """Call the C function at ``address``: void()."""
+    from llvmlite import ir
+
+    def generate(context, builder, signature, arguments):
+        kind = ir.FunctionType(ir.VoidType(), [])
+        builder.call(builder.inttoptr(arguments[0], kind.as_pointer()), [])
+        return context.get_dummy_value()
+
+    return types.void(types.int64), generate

@@ -12,7 +12,7 @@ the named solves differ only in what they do there.
 
 import math
 
-from rigidfleet.kernel.compiled import compiled, inlined
+from rigidfleet.kernel.compiled import call_solver, compiled, inlined
 from rigidfleet.kernel.linalg import cholesky, cholesky_solve, jacobi_eigen
 from rigidfleet.kernel.program import EXACT, ITERATED, PINV, SPECTRAL
 
@@ -74,6 +74,9 @@ def solve_multipliers(vehicles, graph, law, w):
     spectral   1/(w + nu), nu = (s0/4)(1 - w/s0)^2 for w < s0, else 0;
     pinv       1/w, or 0 where w is below the cut-off.
     """
+    if graph.solver != 0:
+        call_solver(graph.solver)
+        return
     m = vehicles.m
     n = graph.edges.shape[0]
     b, y = w.b, w.multiplier

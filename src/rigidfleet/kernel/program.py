@@ -42,6 +42,7 @@ class Graph(NamedTuple):
     pairs: NDArray[np.uint32]  # (P, 2)
     weight: Array  # (P,) +-1/m_i [1/kg]
     diagonal: Array  # (m,) of A: 1/m_i + 1/m_j [1/kg]
+    solver: int = 0  # address of what solves for the multipliers of a large formation (`large`)
 
 
 class Law(NamedTuple):
@@ -194,14 +195,16 @@ def zeros(*shape: int) -> Array:
     return room[skip : skip + size].reshape(shape)
 
 
-def workspace(n: int, m: int, *, with_h: bool = False, solver: int | None = None) -> Workspace:
+def workspace(
+    n: int, m: int, *, with_h: bool = False, solver: int | None = None, large: bool = False
+) -> Workspace:
     """Allocate a workspace for N = ``n`` agents and ``m`` edges.
 
     One for the iterated ``solver`` alone has the smaller of the two systems it may solve, in the
-    edges or in the agents' coordinates.
+    edges or in the agents' coordinates; one of a ``large`` formation has none.
     """
-    size = min(m, 3 * n) if solver == ITERATED else m
-    vectors = 0 if solver in (ITERATED, EXACT) else m
+    size = 0 if large else min(m, 3 * n) if solver == ITERATED else m
+    vectors = 0 if large or solver in (ITERATED, EXACT) else m
     agent = lambda: zeros(n, 3)  # noqa: E731
     edge = lambda: zeros(m)  # noqa: E731
     k = 3 * n if with_h else 0
@@ -228,9 +231,14 @@ def calm(masses: Array) -> Disturbance:
     )  # fmt: skip
 
 
-def graph(ends: NDArray[np.integer], masses: Array) -> Graph:
-    """Prepare a constraint graph: edges (m, 2) with agents from 0, (N,) masses [kg]."""
+def graph(ends: NDArray[np.integer], masses: Array, *, large: bool = False) -> Graph:
+    """Prepare a constraint graph: edges (m, 2) with agents from 0, (N,) masses [kg].
+
+    A ``large`` one, which is not solved densely, needs no pairs of edges.
+    """
     edges = np.ascontiguousarray(ends, dtype=np.uint32).reshape(-1, 2)
+    if large:
+        return Graph(edges, np.zeros((0, 2), dtype=np.uint32), np.zeros(0), np.zeros(0))
     parts = []
     for agent in np.unique(edges):
         k, end = np.nonzero(edges == agent)

@@ -11,8 +11,9 @@ from collections.abc import Mapping
 from typing import Any
 
 from rigidfleet.errors import MissionError
+from rigidfleet.formation import SHAPES
 from rigidfleet.mission import disturbances, formations, phases
-from rigidfleet.mission.notes import Notes, unknown_key
+from rigidfleet.mission.notes import Notes, near, unknown_key
 from rigidfleet.mission.schema import (
     Agents,
     Allocation,
@@ -30,6 +31,7 @@ from rigidfleet.mission.schema import (
     Obstacle,
     Part,
     Regulator,
+    Start,
     Tracking,
 )
 
@@ -79,17 +81,38 @@ def _tables(notes: Notes) -> dict[str, Any]:
     parts = {key: getattr(header, key) for key in Header.model_fields} if header else {}
     for key, kind in _TABLES.items():
         if key in notes.data:
-            part = notes.validate(kind, notes.data[key], (key,))
+            data = notes.data[key] if key != "agents" else _placed(notes, notes.data[key])
+            part = None if data is None else notes.validate(kind, data, (key,))
             parts |= {key: part} if part is not None else {}
     if "agents" not in notes.data:
         notes.add(("agents",), "is missing", "add a table [agents] with mass and position")
     return parts
 
 
+def _placed(notes: Notes, agents: Any) -> Any:
+    """[agents] with positions written out where they are given as a shape; None where that is wrong."""
+    if not (isinstance(agents, dict) and isinstance(agents.get("position"), dict)):
+        return agents
+    path = ("agents", "position")
+    start = notes.validate(Start, agents["position"], path)
+    if start is None or not notes.right((), *path[:1]):
+        return None
+    try:
+        return agents | {"position": start.points().tolist()}
+    except ValueError as error:
+        known = "" if start.shape in SHAPES else near(start.shape, SHAPES)
+        remedy = known or "change the shape, its size, or the number of agents"
+        notes.add((*path, "shape"), str(error), remedy)
+        return None
+
+
 def _count(data: Mapping[str, Any]) -> int | None:
     """Number of agents, as far as it can be told."""
     agents = data.get("agents")
     position = agents.get("position") if isinstance(agents, dict) else None
+    if isinstance(position, dict):
+        count = position.get("count")
+        return count if isinstance(count, int) and count > 0 else None
     return len(position) if isinstance(position, list) and position else None
 
 

@@ -64,13 +64,11 @@ def _formation(notes: Notes, form: Formation, n: int | None, path: Keys) -> None
         _shape(notes, form, form.shape, n, path)
     if n is None:
         return
-    edges = n * (n - 1) // 2 if form.edges == "complete" else len(form.edges)
-    if edges > _MOST_EDGES:
+    edges = n * (n - 1) // 2
+    if form.edges == "complete" and edges > _MOST_EDGES:
         problem = f"are {edges:,} for {n:,} agents, more than {_MOST_EDGES:,}"
-        remedy = "give a list of pairs; 3 N - 6 edges, and some more, hold a shape"
-        notes.add(
-            (*path, "edges"), problem, remedy, "complete" if form.edges == "complete" else None
-        )
+        remedy = "use 'neighbours', or a list of pairs; 3 N - 6 edges, and some more, hold a shape"
+        notes.add((*path, "edges"), problem, remedy, "complete")
     if form.slots is not None:
         if len(form.slots) != n:
             problem = f"has {len(form.slots)} slots for {n} agents"
@@ -99,7 +97,8 @@ def _shape(notes: Notes, form: Formation, shape: str, n: int | None, path: Keys)
 
 
 def _edges(notes: Notes, form: Formation, n: int, path: Keys) -> None:
-    if form.edges == "complete":
+    if isinstance(form.edges, str):
+        _graph(notes, form, n, path)
         return
     seen: dict[tuple[int, ...], int] = {}
     for k, edge in enumerate(form.edges):
@@ -110,6 +109,23 @@ def _edges(notes: Notes, form: Formation, n: int, path: Keys) -> None:
             notes.add((*path, k), "joins an agent to itself", "join two agents")
         elif first != k:
             notes.add((*path, k), f"is edge {first + 1} again", "remove it, and its distance")
+
+
+def _graph(notes: Notes, form: Formation, n: int, path: Keys) -> None:
+    """A named graph other than 'complete' is made from places."""
+    above = path[:-1]
+    if form.edges != "neighbours" and "reach" in form.model_fields_set:
+        notes.add((*above, "reach"), f"has no effect with edges '{form.edges}'", "remove it")
+    if form.edges == "complete" or not notes.right(above, "shape", "size", "slots"):
+        return
+    if form.distances is not None or form.shape is form.slots is None:
+        remedy = "list the pairs, or give shape and size and no distances"
+        notes.add(path, "needs places, and distances that are theirs", remedy)
+        return
+    try:
+        form.edge_array(n)
+    except ValueError as error:
+        notes.add(path, str(error), "use 'neighbours', or give a list of pairs")
 
 
 def _distances(notes: Notes, form: Formation, lengths: Sequence[float], n: int, path: Keys) -> None:

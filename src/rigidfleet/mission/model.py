@@ -13,11 +13,11 @@ import numpy as np
 from pydantic import PrivateAttr
 
 from rigidfleet.errors import Finding, MissionError
-from rigidfleet.formation import Floats, Ints, assigned
+from rigidfleet.formation import Floats, Ints, assigned, assigned_upright, distances
 from rigidfleet.mission.check import check
 from rigidfleet.mission.notes import near
 from rigidfleet.mission.phases import latest_end
-from rigidfleet.mission.schema import DRAG, Contents, Establish
+from rigidfleet.mission.schema import DRAG, Contents, Establish, Reshape, Start
 from rigidfleet.mission.toml import to_toml
 
 _SHIPPED = resources.files("rigidfleet") / "missions"
@@ -30,6 +30,8 @@ class Mission(Contents):
 
     _text: str = PrivateAttr("")
     _origin: str = PrivateAttr("")
+    _made_slots: dict[str, Floats | None] = PrivateAttr(default_factory=dict)
+    _made_edges: dict[str, Ints] = PrivateAttr(default_factory=dict)
 
     @classmethod
     def from_toml(cls, text: str, origin: str = "<text>") -> Self:
@@ -82,26 +84,55 @@ class Mission(Contents):
     @cached_property
     def edges(self) -> Ints:
         """Edges (m, 2) of all formations, counted from 0, i < j, in the order of first mention."""
-        pairs = (pair for name in self.formations for pair in self.formation_edges(name).tolist())
-        return np.array(list(dict.fromkeys(map(tuple, pairs))), dtype=np.int64).reshape(-1, 2)
+        all_ = [self.formation_edges(name) for name in self.formations]
+        pairs = np.concatenate([np.zeros((0, 2), dtype=np.int64), *all_])
+        first = np.unique(pairs, axis=0, return_index=True)[1]
+        return pairs[np.sort(first)]
 
     @cached_property
-    def assigned_slots(self) -> Ints:
-        """Slot (N,) that each agent takes, from 0, as `assignment` has it: the same in all formations."""
-        n = self.n_agents
+    def assigned_slots(self) -> dict[str, Ints]:
+        """Slot (N,) of each formation that each agent takes, from 0, as `assignment` has it.
+
+        By "shortest" and "safe" the same in all formations; by "each" what is nearest to where the agents are
+        when the formation is first flown.
+        """
+        n, masses = self.n_agents, self.agents.mass
+        given = dict.fromkeys(self.formations, np.arange(n))
+        if self.assignment == "given" or n < 2:
+            return given
+        flown = [p.formation for p in self.phases if isinstance(p, Establish | Reshape)]
+        if self.assignment == "each":
+            found: dict[str, Ints] = {}
+            places = np.array(self.agents.position)
+            for name in flown:
+                slots = self._slots(name)
+                if slots is None:
+                    continue
+                if name not in found:
+                    found[name] = assigned_upright(places, slots, masses)
+                places = slots[found[name]]
+            return given | found
         first = next((p.formation for p in self.phases if isinstance(p, Establish)), None)
-        slots = None if first is None else self.formations[first].slot_array(n)
-        if self.assignment == "given" or slots is None or n < 2:
-            return np.arange(n)
+        slots = None if first is None else self._slots(first)
+        if slots is None:
+            return given
         radius = self.agents.radius if self.assignment == "safe" else None
-        return assigned(self.agents.position, slots, self.agents.mass, radius)
+        return dict.fromkeys(self.formations, assigned(self.agents.position, slots, masses, radius))
+
+    def _slots(self, name: str) -> Floats | None:
+        """Slots (N, 3) [m] of a formation in their own order; made once."""
+        if name not in self._made_slots:
+            self._made_slots[name] = self.formations[name].slot_array(self.n_agents)
+        return self._made_slots[name]
 
     def formation_edges(self, name: str) -> Ints:
         """Edges (m, 2) of a formation between agents, counted from 0, i < j."""
-        edges = self.formations[name].edge_array(self.n_agents)
-        if self.assignment == "given":
-            return edges
-        return np.sort(np.argsort(self.assigned_slots)[edges], axis=1)
+        if name not in self._made_edges:
+            edges = self.formations[name].edge_array(self.n_agents)
+            if self.assignment != "given":
+                edges = np.sort(np.argsort(self.assigned_slots[name])[edges], axis=1)
+            self._made_edges[name] = edges
+        return self._made_edges[name]
 
     def formation_slots(self, name: str) -> Floats | None:
         """Slots (N, 3) [m] of a formation about their geometric centre, in the order of the agents.
@@ -109,12 +140,17 @@ class Mission(Contents):
         Derived from a complete set of distances where no slots are given; None where that is
         incomplete, too.
         """
-        slots = self.formations[name].slot_array(self.n_agents)
-        return slots if slots is None else slots[self.assigned_slots]
+        slots = self._slots(name)
+        return slots if slots is None else slots[self.assigned_slots[name]]
 
     def formation_distances(self, name: str) -> Floats:
         """Length (m,) [m] of each edge of a formation."""
-        return self.formations[name].distance_array(self.n_agents)
+        given = self.formations[name].distances
+        if given is not None:
+            return np.array(given, dtype=np.float64)
+        slots = self.formation_slots(name)
+        assert slots is not None  # checked: without distances there are a shape or slots
+        return distances(slots, self.formation_edges(name))
 
     @property
     def latest_end(self) -> float:
@@ -183,7 +219,14 @@ def load_mission(name_or_path: str | Path) -> Mission:
 def json_schema() -> dict[str, Any]:
     """JSON schema of the mission format, for editors: every key with its unit and meaning."""
     draft = {"$schema": "https://json-schema.org/draft/2020-12/schema"}
-    return draft | Mission.model_json_schema()
+    schema = Mission.model_json_schema()
+    parts = schema["$defs"]
+    parts["Start"] = Start.model_json_schema()
+    # Positions are written out before they become those of a model.
+    position = parts["Agents"]["properties"]["position"]
+    listed = {key: position.pop(key) for key in ("type", "items", "minItems")}
+    position["anyOf"] = [listed, {"$ref": "#/$defs/Start"}]
+    return draft | schema
 
 
 def read_text(path: str | Path) -> str:

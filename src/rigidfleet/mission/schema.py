@@ -51,7 +51,8 @@ Size = Annotated[
     Annotated[Positive, Tag("one")] | Annotated[_Extent, Tag("list")], Discriminator(_form)
 ]
 Edges = Annotated[
-    Annotated[Literal["complete"], Tag("one")] | Annotated[tuple[_Pair, ...], Tag("list")],
+    Annotated[Literal["complete", "neighbours", "joined"], Tag("one")]
+    | Annotated[tuple[_Pair, ...], Tag("list")],
     Discriminator(_form),
 ]
 
@@ -84,6 +85,30 @@ class Part(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
+class Start(Part):
+    """Agents that start in a named shape, in the order of its slots."""
+
+    shape: str = Field(
+        description=f"named shape: {', '.join(shapes.SHAPES)}",
+        json_schema_extra={"enum": [*shapes.SHAPES]},
+    )
+    size: Size = Field(description="edge length of the shape [m], or its sizes")
+    count: Annotated[int, Strict(), Field(ge=1, le=1_000_000)] = Field(
+        description="number of agents"
+    )
+    centre: Vector = Field((0.0, 0.0, 0.0), description="where its centre is [x, y, z] [m]")
+
+    def points(self) -> Floats:
+        """Positions (count, 3) [m].
+
+        Raises
+        ------
+        ValueError
+            The shape is unknown, or takes another number of agents or sizes.
+        """
+        return shapes.slots(self.shape, self.size, self.count) + np.array(self.centre)
+
+
 class Agents(Part):
     """The vehicles, as point masses. Once checked, each field has one entry for each agent."""
 
@@ -91,7 +116,8 @@ class Agents(Part):
         description="mass [kg], > 0: a number for all agents, or a list with one for each"
     )
     position: Annotated[tuple[Vector, ...], Field(min_length=1)] = Field(
-        description="initial position [x, y, z] of each agent [m], world frame ENU (z up)"
+        description="initial position [x, y, z] of each agent [m], world frame ENU (z up); or a table, the "
+        "shape in which they start"
     )
     velocity: tuple[Vector, ...] = Field(
         (), description="initial velocity of each agent [m/s]; at rest when absent"
@@ -205,6 +231,17 @@ class Integrator(Part):
         1e-8, description="relative tolerance [-]"
     )
     atol: Positive = Field(1e-10, description="absolute tolerance [m, m/s]")
+    atol_velocity: Positive | None = Field(
+        None, description="that of velocities [m/s]; atol when absent"
+    )
+    atol_integral: Positive | None = Field(
+        None,
+        description="that of the integrals of c [m s]; when absent atol, and rtol times the distance besides where "
+        "a large formation is not solved densely",
+    )
+    atol_attitude: Positive | None = Field(
+        None, description="that of the frame's quaternion [-]; atol when absent"
+    )
 
 
 class BodyFrame(Part):
@@ -233,7 +270,13 @@ class Formation(Part):
         None, description="instead of a shape: place of each agent in the body frame [m]"
     )
     edges: Edges = Field(
-        "complete", description="pairs of agents, counted from 1; 'complete': every pair"
+        "complete",
+        description="pairs of agents, counted from 1; 'complete': every pair; 'neighbours': those within reach; "
+        "'joined': each to three nearer to the centre, 3 N - 6 in all",
+    )
+    reach: Positive = Field(
+        shapes.REACH,
+        description="how far edges 'neighbours' reach, in distances of nearest neighbours: 1.9 takes the second, too",
     )
     distances: tuple[Positive, ...] | None = Field(
         None, description="length of each edge [m]; when absent, those of the slots"
@@ -243,6 +286,12 @@ class Formation(Part):
         """Edges (m, 2), counted from 0, i < j."""
         if self.edges == "complete":
             return shapes.complete_graph(n)
+        if isinstance(self.edges, str):
+            slots = self.slot_array(n)
+            assert slots is not None  # checked: there are a shape or slots
+            if self.edges == "joined":
+                return shapes.joined(slots)
+            return shapes.neighbours(slots, self.reach)
         return np.sort(np.array(self.edges, dtype=np.int64).reshape(-1, 2) - 1, axis=1)
 
     def slot_array(self, n: int) -> Floats | None:
@@ -252,14 +301,6 @@ class Formation(Part):
         if self.slots is not None:
             return shapes.centred(self.slots)
         return shapes.slots_from_distances(n, self.edge_array(n), self.distances or ())
-
-    def distance_array(self, n: int) -> Floats:
-        """Length (m,) [m] of each edge."""
-        if self.distances is not None:
-            return np.array(self.distances, dtype=np.float64)
-        slots = self.slot_array(n)
-        assert slots is not None  # checked: without distances there are a shape or slots
-        return shapes.distances(slots, self.edge_array(n))
 
 
 class Box(Part):
@@ -504,10 +545,11 @@ class Header(Part):
     formulation: Literal["inertial", "body"] = Field(
         "inertial", description="equations integrated: Newton's, or the paper's in the body frame"
     )
-    assignment: Literal["given", "shortest", "safe"] = Field(
+    assignment: Literal["given", "shortest", "safe", "each"] = Field(
         "given",
         description="who takes which slot (and its edges): given, agent 1 slot 1 and so on; shortest, least "
-        "squared way from the start to the first formation established; safe, most room on the way",
+        "squared way from the start to the first formation established; safe, most room on the way; each, least "
+        "squared way anew at each change, without turning the shapes",
     )
     gravity: NonNegative = Field(9.81, description="gravity [m/s^2], >= 0")
     output_step: Positive = Field(0.05, description="time between samples of the result [s]")

@@ -3,6 +3,7 @@
 from rigidfleet.rigidity.analysis import Rigidity, Verdict, analyse, full_rank
 from rigidfleet.rigidity.framework import Flex, jacobian, rigid_motions
 from rigidfleet.rigidity.realisations import Kind, Realisation, Realisations, realisations
+from rigidfleet.rigidity.spectrum import Spectrum, spectrum
 
 __all__ = [
     "Flex",
@@ -10,10 +11,12 @@ __all__ = [
     "Realisation",
     "Realisations",
     "Rigidity",
+    "Spectrum",
     "Verdict",
     "analyse",
     "full_rank",
     "jacobian",
     "realisations",
     "rigid_motions",
+    "spectrum",
 ]

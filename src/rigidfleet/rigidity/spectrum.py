@@ -1,0 +1,65 @@
+"""The index of large formations: the ends of the spectrum of J, without a dense matrix."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rigidfleet.formation import Ints
+from rigidfleet.rigidity.framework import ZERO
+
+#: So many eigenvalues are looked for at the lower end: six of rigid motions, and some more.
+_LOWEST = 12
+#: Beyond so many agents the factor that this takes is too large.
+MOST = 5000
+
+
+@dataclass(frozen=True)
+class Spectrum:
+    """Ends of the spectrum of mbar A, A = J M^-1 J^T.
+
+    ``w`` is the smallest eigenvalue that belongs to no rigid motion, 0 where the formation is flexible to first order;
+    ``free`` counts the other motions that no distance resists, as far as they were looked for.
+    """
+
+    w: float
+    w_max: float
+    free: int
+
+    @property
+    def index(self) -> float:
+        """Smallest non-zero singular value of J, of equal masses."""
+        return float(np.sqrt(self.w))
+
+    @property
+    def condition(self) -> float:
+        """Condition number of A on what distances hold; infinite where the formation is flexible."""
+        return self.w_max / self.w if self.w > 0 else np.inf
+
+
+def spectrum(points: ArrayLike, edges: Ints, masses: ArrayLike) -> Spectrum:
+    """Ends of the spectrum of a formation in space, by Lanczos' method, inverted at the lower end.
+
+    Parameters: points (N, 3) [m], edges (m, 2), masses (N,) [kg].
+    """
+    from scipy.sparse import csr_array
+    from scipy.sparse.linalg import eigsh
+
+    p, m = np.asarray(points, dtype=np.float64), np.asarray(masses, dtype=np.float64)
+    n, count = len(p), len(edges)
+    u = p[edges[:, 0]] - p[edges[:, 1]]
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    share = np.sqrt(m.mean() / m)
+    data = np.stack([u * share[edges[:, 0], None], -u * share[edges[:, 1], None]], axis=1)
+    columns = 3 * edges[:, :, None] + np.arange(3)
+    J = csr_array((data.ravel(), columns.ravel(), np.arange(0, 6 * count + 1, 6)), (count, 3 * n))
+    K = (J.T @ J).tocsc()
+    start = np.random.default_rng(0).normal(size=3 * n)
+    w_max = float(eigsh(K, k=1, v0=start, return_eigenvectors=False)[0])
+    # A little below zero, where K can be factored.
+    lowest = eigsh(K, k=_LOWEST, sigma=-1e-6 * w_max, v0=start, return_eigenvectors=False, tol=1e-9)
+    held = np.sort(lowest)[6:]
+    zero = held < (10 * ZERO) ** 2 * w_max
+    return Spectrum(0.0 if zero.any() else float(held[0]), w_max, int(np.count_nonzero(zero)))

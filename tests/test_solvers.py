@@ -1,0 +1,291 @@
+"""Large formations: the sweep, the vertex graph and the dense factor solve the same law."""
+
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rigidfleet import formation as shapes
+from rigidfleet import solvers
+from rigidfleet.kernel import flight as kernel
+from rigidfleet.kernel import large, sparse
+from rigidfleet.kernel import program as k
+from rigidfleet.mission import Mission
+from rigidfleet.rigidity import jacobian
+from rigidfleet.simulate import simulate
+
+
+def lattice(side: int, *, seed: int = 0) -> np.ndarray:
+    """A cubic lattice of side^3 points 1 m apart, out of order by 2 cm."""
+    grid = np.stack(np.meshgrid(*[np.arange(side)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    return grid + np.random.default_rng(seed).uniform(-0.02, 0.02, grid.shape)
+
+
+def directions(p, edges) -> np.ndarray:
+    """Unit vectors (m, 3) of the edges."""
+    u = p[edges[:, 0]] - p[edges[:, 1]]
+    return u / np.linalg.norm(u, axis=1, keepdims=True)
+
+
+def solver_of(p, edges, masses, law, *, sweep=False, tolerance=1e-13) -> large.LargeSolver:
+    """A solver in the state p (N, 3)."""
+    law = k.Law(3.0, 12**0.5, 8.0, law, 0.03, 3, 0.1, 1e-12, 0.0)
+    vehicles = k.Vehicles(masses, 1.0 / masses, float(masses.sum()), masses, False, 9.81)
+    work = k.workspace(len(p), len(edges), large=True)
+    work.r[:] = p
+    work.u[:] = directions(p, edges)
+    steps = solvers.sweep_steps(len(p), edges) if sweep else None
+    order = partial(solvers.dissection, p, edges)
+    return large.LargeSolver(vehicles, edges, law, work, steps, order, tolerance)
+
+
+def solved(solver, b) -> np.ndarray:
+    solver.workspace.b[:] = b
+    solver.solve()
+    return solver.workspace.multiplier.copy()
+
+
+def gram(p, edges, masses) -> np.ndarray:
+    """A = J M^-1 J^T, dense."""
+    J = jacobian(p, edges)
+    return J / np.repeat(masses, 3) @ J.T
+
+
+@pytest.fixture(scope="module")
+def rng():
+    return np.random.default_rng(1)
+
+
+@pytest.mark.parametrize("side", [3, 4, 5])
+def test_sweep_vertex_graph_and_dense_factor_agree_on_the_exact_law(side, rng):
+    """Undamped, of unequal masses, the three solves agree to 1e-9 where A is well conditioned."""
+    p = lattice(side)
+    edges, masses = shapes.joined(p), rng.uniform(0.5, 2.0, len(p))
+    b = rng.normal(size=len(edges))
+    A = gram(p, edges, masses)
+    assert np.linalg.cond(A) < 1e5
+    dense = np.linalg.solve(A, b)
+    swept = solved(solver_of(p, edges, masses, k.EXACT, sweep=True), b)
+    nodes = solved(solver_of(p, edges, masses, k.EXACT), b)
+    np.testing.assert_allclose(swept, dense, rtol=0, atol=1e-12 * np.abs(dense).max())
+    np.testing.assert_allclose(nodes, dense, rtol=0, atol=1e-9 * np.abs(dense).max())
+
+
+@pytest.mark.parametrize("reach", [1.5, 1.9])
+def test_vertex_graph_is_the_damped_law_of_redundant_edges(reach, rng):
+    """Iterated Tikhonov on the vertex graph is its definition in edge space, of unequal masses."""
+    p = lattice(5)
+    edges, masses = shapes.neighbours(p, reach), rng.uniform(0.5, 2.0, len(p))
+    b, mbar, mu = rng.normal(size=len(edges)), masses.mean(), 0.03
+    regular = mbar * gram(p, edges, masses) + mu * np.eye(len(edges))
+    y = np.zeros(len(edges))
+    for _ in range(3):
+        y = np.linalg.solve(regular, mbar * b + mu * y)
+    found = solved(solver_of(p, edges, masses, k.ITERATED), b)
+    np.testing.assert_allclose(found, y, rtol=0, atol=1e-9 * np.abs(y).max())
+
+
+def test_factor_is_kept_while_the_formation_turns(rng):
+    """One factor serves a formation turned by any angle; one that has changed its shape gets a new one."""
+    p = shapes.slots("sphere", 1.0, 200)
+    edges = shapes.neighbours(p)
+    solver = solver_of(p, edges, np.ones(200), k.ITERATED, tolerance=1e-10)
+    b = rng.normal(size=len(edges))
+    before = solved(solver, b)
+    c, s = np.cos(2.0), np.sin(2.0)
+    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+    def move(points):
+        solver.workspace.r[:] = points
+        w = solver.workspace
+        w.u[:] = directions(points, edges)
+
+    move(p @ turn.T)
+    np.testing.assert_allclose(solved(solver, b), before, atol=1e-7 * np.abs(before).max())
+    assert solver.counts.factors == 1
+    move(p * [1.0, 1.0, 3.0])
+    solved(solver, b)
+    assert solver.counts.factors == 2
+
+
+def test_pattern_without_fill_solves_as_well(rng, monkeypatch):
+    """Where a complete factor would fill up, an incomplete one preconditions, with more iterations."""
+    p = lattice(6)
+    edges, masses = shapes.neighbours(p, 1.5), np.ones(216)
+    b = rng.normal(size=len(edges))
+    full = solver_of(p, edges, masses, k.ITERATED)
+    want = solved(full, b)
+    monkeypatch.setattr(large, "_FILL", 0.0)
+    lean = solver_of(p, edges, masses, k.ITERATED)
+    np.testing.assert_allclose(solved(lean, b), want, atol=1e-9 * np.abs(want).max())
+    assert full.pattern is not None
+    assert lean.pattern is not None
+    assert len(lean.pattern.row) == len(p) + len(edges) < len(full.pattern.row)
+    assert lean.counts.iterations > full.counts.iterations
+
+
+def test_factor_is_that_of_the_matrix(rng):
+    """L L^T is K, block by block, in the order of the dissection."""
+    p = lattice(4)
+    edges, masses = shapes.neighbours(p, 1.5), rng.uniform(0.5, 2.0, 64)
+    found = sparse.pattern(64, edges, solvers.dissection(p, edges), 1e9)
+    blocks, at = np.empty((len(found.row), 9)), np.empty(64, dtype=np.int64)
+    u = directions(p, edges)
+    sparse.assemble(u, edges, masses, 1.3, 0.1, found.place, found.column, found.of_edge, blocks)
+    assert sparse.factor(found.column, found.row, found.first, found.left, found.block, blocks, at)
+    L = np.zeros((64, 3, 64, 3))
+    column = np.repeat(np.arange(64), np.diff(found.column))
+    L[found.row, :, column] = blocks.reshape(-1, 3, 3)
+    L = L.reshape(192, 192)
+    for i in range(64):  # the diagonal blocks hold inverse pivots, and nothing above them
+        d = slice(3 * i, 3 * i + 3)
+        L[d, d] = np.tril(L[d, d], -1) + np.diag(1 / np.diag(L[d, d]))
+    J = jacobian(p, edges)
+    K = 1.3 * J.T @ J + 0.1 * np.diag(np.repeat(masses, 3))
+    inverse = (3 * found.place[:, None] + np.arange(3)).ravel()
+    np.testing.assert_allclose((L @ L.T)[np.ix_(inverse, inverse)], K, atol=1e-12)
+
+
+def test_a_lost_pivot_falls_back_and_is_counted(rng):
+    """Where an agent lies in a plane with its three, the sweep has no pivot; the vertex graph goes on."""
+    p = lattice(3)
+    edges = shapes.joined(p)
+    steps = solvers.sweep_steps(27, edges)
+    assert steps is not None
+    i, mine = steps[-1, 0], steps[-1, 1:]
+    a, b, c = (int(x) for x in edges[mine].sum(axis=1) - i)
+    p[i] = 0.5 * p[a] + 0.2 * p[b] + 0.3 * p[c]
+    solver = solver_of(p, edges, np.ones(27), k.EXACT, sweep=True, tolerance=1e-12)
+    # A right side that some motion has, so that the singular system has a solution.
+    found = solved(solver, jacobian(p, edges) @ rng.normal(size=81))
+    assert solver.counts.fallbacks == 1
+    assert solver.counts.failures == 0
+    J = jacobian(p, edges)
+    np.testing.assert_allclose(J @ J.T @ found, solver.workspace.b, atol=1e-6)
+
+
+def test_what_is_not_finite_has_no_solution(rng):
+    """NaN goes in, NaN comes out, and the next solve is none the worse."""
+    p = lattice(4)
+    edges = shapes.neighbours(p, 1.5)
+    solver = solver_of(p, edges, np.ones(64), k.ITERATED)
+    b = rng.normal(size=len(edges))
+    want = solved(solver, b)
+    assert np.isnan(solved(solver, b * np.nan)).all()
+    assert solver.counts.failures == 1
+    np.testing.assert_allclose(solved(solver, b), want, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("n", "count", "law", "method"),
+    [
+        (8, "complete", "iterated", "dense"),
+        (8, "joined", "exact", "dense"),
+        (64, "joined", "exact", "sweep"),
+        (64, "neighbours", "exact", "nodes"),
+        (64, "joined", "iterated", "nodes"),
+        (64, "neighbours", "iterated", "nodes"),
+        (64, "neighbours", "spectral", "dense"),
+        (64, "neighbours", "pinv", "dense"),
+    ],
+)
+def test_solve_is_chosen_by_size_law_and_graph(n, count, law, method):
+    """Small ones and laws with eigenvalues are dense, exact ones of three edges each swept."""
+    p = lattice(round(n ** (1 / 3)))
+    graphs = {
+        "complete": lambda: shapes.complete_graph(n),
+        "joined": lambda: shapes.joined(p),
+        "neighbours": lambda: shapes.neighbours(p, 1.5),
+    }
+    assert solvers.choose(n, graphs[count](), law) == method
+
+
+def test_order_of_the_sweep_is_found_whatever_the_numbers(rng):
+    """Each agent comes after the three it is joined to, and every edge once; a cube's graph has no such order."""
+    p = lattice(5)
+    edges = shapes.joined(p)
+    for order in (np.arange(125), rng.permutation(125)):
+        renamed = np.sort(order[edges], axis=1)
+        steps = solvers.sweep_steps(125, renamed)
+        assert steps is not None
+        place = np.argsort(steps[:, 0])
+        assert sorted(steps[:, 1:][steps[:, 1:] >= 0].tolist()) == list(range(len(edges)))
+        for s, (i, *mine) in enumerate(steps.tolist()):
+            others = [renamed[e].sum() - i for e in mine if e >= 0]
+            assert len(others) == min(s, 3)
+            assert all(place[j] < s for j in others)
+    assert solvers.sweep_steps(8, shapes.CUBE_EDGES) is None
+
+
+def test_dissection_orders_every_agent_once():
+    """A permutation, of coincident points, too."""
+    p = np.repeat(lattice(3), 2, axis=0)
+    assert sorted(solvers.dissection(p, shapes.complete_graph(54))) == list(range(54))
+
+
+def flight(law: str, kind: str, **integrator) -> Mission:
+    """64 agents on a lattice, 2 cm off, that turn and are pushed."""
+    p = lattice(4, seed=2)
+    rest = np.rint(p)
+    edges = shapes.joined(rest) if kind == "joined" else shapes.neighbours(rest, 1.5)
+    return Mission.from_dict(
+        {
+            "schema_version": 1,
+            "name": "lattice",
+            "agents": {
+                "mass": np.random.default_rng(3).uniform(0.5, 2.0, 64),
+                "position": 4.0 * p,
+                "velocity": np.cross([0.0, 0.0, 0.1], 4.0 * p),
+            },
+            "constraint": {"solver": law},
+            "integrator": {"rtol": 1e-8, "atol": 1e-8} | integrator,
+            "formations": {"lattice": {"slots": 4.0 * rest, "edges": edges + 1}},
+            "output_step": 0.5,
+            "phases": [
+                {"kind": "establish", "formation": "lattice", "control": "open", "duration": 4.0},
+                {
+                    "kind": "hold",
+                    "control": "open",
+                    "input_force": [0.1, 0.0, 0.0],
+                    "duration": 1.0,
+                },
+            ],
+        }
+    )
+
+
+@pytest.mark.parametrize(
+    ("law", "kind", "method"),
+    [
+        ("exact", "joined", "sweep"),
+        ("exact", "joined", "nodes"),
+        ("iterated", "neighbours", "nodes"),
+    ],
+)
+def test_flights_are_the_same_whatever_the_solve(law, kind, method, monkeypatch):
+    """A flight by sweeps, and one on the vertex graph, is the one with dense factors, and says which it was."""
+    mission = flight(law, kind)
+    found = {}
+    for each in ("dense", method):
+        monkeypatch.setattr(solvers, "choose", lambda *_, each=each: each)
+        found[each] = simulate(mission)
+    integrate: Any = kernel.integrate
+    assert len(integrate.signatures) == 1  # the kernel of small ones
+    assert found["dense"].statistics["solvers"] == {}
+    counts = found[method].statistics["solvers"][method]
+    assert counts["evaluations"] >= found[method].statistics["evaluations"]
+    assert counts["fallbacks"] == counts["failures"] == 0
+    np.testing.assert_allclose(found[method].position, found["dense"].position, atol=1e-6)
+    np.testing.assert_allclose(found[method].multiplier, found["dense"].multiplier, atol=1e-4)
+
+
+def test_the_integral_does_not_set_the_step(monkeypatch):
+    """Held to the tolerance of its distance, the integral of c costs no steps, and no accuracy of the place."""
+    monkeypatch.setattr(solvers, "FROM_SWEEP", 1)
+    strict = simulate(
+        flight("exact", "joined", atol=1e-12, atol_velocity=1e-8, atol_integral=1e-14)
+    )
+    loose = simulate(flight("exact", "joined", atol=1e-12, atol_velocity=1e-8))
+    assert loose.statistics["steps"] < 0.8 * strict.statistics["steps"]
+    np.testing.assert_allclose(loose.position, strict.position, atol=1e-6)

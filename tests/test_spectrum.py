@@ -1,0 +1,37 @@
+"""The ends of the spectrum of large formations."""
+
+import numpy as np
+import pytest
+
+from rigidfleet import formation as shapes
+from rigidfleet.rigidity import analyse, spectrum
+
+
+@pytest.mark.parametrize("edges", [shapes.neighbours, shapes.joined])
+def test_spectrum_is_that_of_the_dense_analysis(edges):
+    """Lanczos finds the smallest and the largest eigenvalue of mbar A, of unequal masses."""
+    rng = np.random.default_rng(4)
+    p, masses = rng.normal(size=(40, 3)), rng.uniform(0.5, 2.0, 40)
+    graph = shapes.complete_graph(40)[::2] if edges is shapes.neighbours else shapes.joined(p)
+    found, dense = spectrum(p, graph, masses), analyse(p, graph, masses=masses)
+    assert found.free == 0
+    assert found.w == pytest.approx(dense.w, rel=1e-6)
+    J = np.zeros((len(graph), 40, 3))
+    u = p[graph[:, 0]] - p[graph[:, 1]]
+    u /= np.linalg.norm(u, axis=1)[:, None]
+    rows = np.arange(len(graph))
+    J[rows, graph[:, 0]], J[rows, graph[:, 1]] = u, -u
+    J = (J * np.sqrt(masses.mean() / masses)[:, None]).reshape(len(graph), -1)
+    assert found.w_max == pytest.approx(np.linalg.norm(J, 2) ** 2, rel=1e-6)
+    assert found.condition == pytest.approx(found.w_max / found.w)
+
+
+def test_flexible_formations_are_found():
+    """A cubic lattice with edges along its axes alone shears in three ways, and in more at its sides."""
+    side = np.arange(5.0)
+    p = np.stack(np.meshgrid(side, side, side, indexing="ij"), axis=-1).reshape(-1, 3)
+    loose = spectrum(p, shapes.neighbours(p, 1.1), np.ones(125))
+    assert loose.w == 0
+    assert loose.free > 0
+    assert loose.condition == np.inf
+    assert spectrum(p, shapes.neighbours(p, 1.5), np.ones(125)).free == 0
