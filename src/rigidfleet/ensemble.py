@@ -108,8 +108,8 @@ def establish(
         plan = plan_phase(mission, phase, now, t_end)
         if plan.method != "dense":
             raise ValueError(
-                f"an ensemble solves densely, and the {len(plan.edges)} edges of '{plan.formation}' are too many for that;"
-                " vary such missions by `rigidfleet.sweep`"
+                f"an ensemble solves densely, and '{plan.formation}' has too many edges for that"
+                f" ({len(plan.edges)}); vary such missions by `rigidfleet.sweep`"
             )
         edges = [(int(i), int(j)) for i, j in plan.edges]
         before = np.stack(
