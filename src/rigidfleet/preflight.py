@@ -57,7 +57,7 @@ _SAMPLES, _STEP, _MOST = 201, 0.05, 2001
 _TOLERANCE = 0.01
 #: Another assignment is worth a note if it saves this share of the way.
 _WORTH = 0.05
-#: Equations up to which rigidity is judged by a dense decomposition.
+#: Equations up to which rigidity, and forces at a jump, are judged by a dense decomposition.
 _DENSE = 600
 #: Assignments of so many agents are compared, in a second or so.
 _COMPARED = 200
@@ -780,6 +780,8 @@ def _step_thrust(mission: Mission, found: Preflight) -> Iterator[Remark]:
         if not (isinstance(phase, Establish | Reshape) and phase.reference == "step"):
             continue
         edges = mission.formation_edges(phase.formation)
+        if min(len(edges), 3 * mission.n_agents) > _DENSE:
+            continue
         error = shapes.distances(r, edges) - mission.formation_distances(phase.formation)
         J = jacobian(r, edges)
         root = np.repeat(1 / np.sqrt(masses), 3)
