@@ -1,5 +1,6 @@
 """Whole flights: phases and switches, the paper's missions, their failures, users' own forces."""
 
+import re
 from functools import cache
 from itertools import pairwise
 from typing import Any
@@ -331,6 +332,84 @@ def test_a_failure_before_the_first_time_asked_for_is_an_error():
     """With nothing to record, the diagnosis is raised."""
     with pytest.raises(FlightError, match=r"cannot go on at t = 6\.809 s"):
         simulate(load_mission("line-singular"), times=[8.0, 9.0])
+
+
+def test_a_short_collision_between_samples_is_seen():
+    """Two agents that pass through each other within an output step collide, however coarse it is."""
+    two = {
+        "mass": 1.0,
+        "radius": 0.25,
+        "position": [[-5, 0, 9], [5, 0.1, 9]],
+        "velocity": [[10, 0, 0], [-10, 0, 0]],
+    }
+    pair = {"pair": {"slots": [[-1, 0, 0], [1, 0, 0]], "edges": []}}
+    hold = {"kind": "hold", "until": 2.0, "control": "open"}
+    mission = a_mission(hold, agents=two, formations=pair, output_step=0.4)
+    for times in (None, [0.0, 1.2, 2.0], [0.0, 0.1]):
+        result = simulate(mission, times=times)
+        assert result.separation.min() == pytest.approx(0.1 - 0.5, abs=1e-3)
+        assert result.separation[0] > 9.0
+        assert not assess(result).passed
+        np.testing.assert_array_equal(result.time, np.arange(6) * 0.4 if times is None else times)
+
+
+@pytest.mark.parametrize("formulation", ["inertial", "body"])
+def test_what_is_watched_between_samples_is_what_is_recorded(formulation):
+    """The least separation between coarse samples is the least of fine ones, in either formulation."""
+    data = load_mission("cube-waypoint").to_dict() | {"formulation": formulation}
+    fine = simulate(Mission.from_dict(data | {"output_step": 0.05}))
+    coarse = simulate(Mission.from_dict(data | {"output_step": 1.0}))
+    assert len(coarse.time) < len(fine.time) / 10
+    assert coarse.separation.min() == pytest.approx(fine.separation.min(), abs=1e-9)
+
+
+def test_sparse_times_leave_nothing_passed_unseen():
+    """A waypoint that lies between the times recorded is not judged, and the flight not passed."""
+    mission = load_mission("single-waypoint")
+    end = mission.latest_end
+    verdict = assess(simulate(mission, times=[0.0, 1.0, end - 1.0]))
+    assert not verdict.passed
+    assert "is not judged" in verdict.summary
+
+
+@pytest.mark.parametrize(
+    ("constraint", "changes", "remedy"),
+    [
+        ({"solver": "exact"}, {}, 'Use solver = "iterated" (or "spectral")$'),
+        ({"solver": "exact"}, {"reference": "step"}, 'smoothly: reference = "shape"$'),
+    ],
+)
+def test_a_law_without_bound_is_diagnosed_with_what_helps(constraint, changes, remedy):
+    """Where the inverse has no bound, the diagnosis says when, where, which singular value, what to try."""
+    folded = {"line": {"slots": [[-4, 0, 0], [0, 0, 0], [4, 0, 0]]}}
+    phase = establish(formation="line", until=9.0, **changes)
+    result = simulate(a_mission(phase, formations=folded, constraint=constraint))
+    assert re.search(r"cannot go on at t = \d+\.\d+ s, in phase 'establish 1': ", result.ending)
+    assert re.search(
+        r"singular value 3 of 3 of the constraint Jacobian J is \S+e-\d+ ", result.ending
+    )
+    assert re.search(remedy.replace("(", r"\(").replace(")", r"\)"), result.ending)
+
+
+def test_a_law_without_feedback_is_told_of_it():
+    """Lengths that drift into a line end a flight whose diagnosis names the feedback that is missing."""
+    triangle = formation.slots("triangle", 4.0, 3)
+    velocity = np.array([[0, 0.5, 0], [0, -0.5, 0], [-1.5, 0, 0]])
+    agents = {"mass": 1.0, "position": triangle + [0, 0, 9.0], "velocity": velocity}
+    law = {"solver": "exact", "stabilisation": "none", "deformation_damping": 0.0}
+    result = simulate(a_mission(establish(), agents=agents, constraint=law))
+    assert "singular value 3 of 3" in result.ending
+    assert result.ending.endswith('errors grow: stabilisation = "pid" takes them back')
+
+
+def test_distances_without_slots_are_not_told_to_blend_a_shape():
+    """Where only distances are given, the smooth reference to try is that of distances."""
+    edges, lengths = [[1, 2], [2, 3], [1, 3], [1, 4]], [4.0, 4.0, 8.0, 5.0]
+    line = {"line": {"edges": edges, "distances": lengths}}
+    agents = {"mass": 1.0, "position": [[1, 6, 3], [8, 3, 3], [7, 6, 3], [0, 0, 3]]}
+    phase = establish(formation="line", reference="step", until=9.0)
+    mission = a_mission(phase, formations=line, agents=agents, constraint={"solver": "exact"})
+    assert simulate(mission).ending.endswith('smoothly: reference = "distances"')
 
 
 class Interrupt:
@@ -742,15 +821,32 @@ def test_what_is_no_force_is_refused(kind, returned, message):
 
 
 @pytest.mark.parametrize("kind", ["controller", "force"])
-def test_an_exception_of_a_users_function_reaches_the_user(kind):
-    """What a controller or a force raises comes out as it is."""
+@pytest.mark.parametrize("since", [0.0, 4.5])
+def test_an_exception_of_a_users_function_keeps_the_flight(kind, since):
+    """What a controller or a force raises is named with its time, and comes with what had flown."""
 
-    def broken(*_: Any) -> None:
-        raise LookupError("no wind today")
+    def broken(*seen: Any) -> np.ndarray:
+        t = seen[0].t if kind == "controller" else seen[0]
+        if t >= since:
+            raise LookupError("no wind today")
+        return np.full((3, 3), 0.1)
 
-    mission = a_mission(establish(until=4.0), {"kind": "hold", "duration": 1.0})
-    with pytest.raises(LookupError, match="no wind today"):
-        simulate(mission, **as_option(kind, broken))
+    phases = (
+        {"kind": "establish", "formation": "triangle", "until": 4.0},
+        {"kind": "hold", "until": 5.0},
+    )
+    with pytest.raises(
+        FlightError, match=f"the {kind} raised LookupError at t = .*no wind"
+    ) as stop:
+        simulate(a_mission(*phases), **as_option(kind, broken))
+    assert isinstance(stop.value.__cause__, LookupError)
+    result = stop.value.result
+    if since:
+        assert not result.complete
+        assert result.time[-1] == pytest.approx(since, abs=0.05)
+        assert str(stop.value) in result.ending
+        assert "in phase 'hold 2'" in result.ending
+        assert np.isfinite(result.position).all()
 
 
 @pytest.mark.parametrize("rate", [0.0, -50.0, np.nan])

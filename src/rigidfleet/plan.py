@@ -120,7 +120,7 @@ def _commanded(now: Situation, edges: NDArray[np.int64], other: Array) -> Array:
     return np.array([now.reference.get(e, d) for e, d in zip(keys, other.tolist(), strict=True)])
 
 
-def _law(mission: Mission, *, damped: bool) -> k.Law:
+def _law(mission: Mission, name: str | None, *, damped: bool) -> k.Law:
     c = mission.constraint
     pid = c.stabilisation == "pid"
     return k.Law(
@@ -128,7 +128,7 @@ def _law(mission: Mission, *, damped: bool) -> k.Law:
         beta=c.beta if pid else 0.0,
         gamma=c.gamma if pid else 0.0,
         solver=_SOLVERS[c.solver],
-        mu=c.damping,
+        mu=mission.damping(name),
         iterations=c.iterations,
         s0=c.threshold,
         cutoff=c.cutoff,

@@ -12,6 +12,7 @@ from typing import Any, Self
 import numpy as np
 from pydantic import PrivateAttr
 
+from rigidfleet import geometry
 from rigidfleet.errors import Finding, MissionError
 from rigidfleet.formation import Floats, Ints, assigned, assigned_upright, distances
 from rigidfleet.mission.check import check
@@ -23,6 +24,8 @@ from rigidfleet.mission.toml import to_toml
 _SHIPPED = resources.files("rigidfleet") / "missions"
 #: A device or a video given by mistake is noticed before memory is full.
 _LARGEST = 64 * 2**20
+#: Least and greatest damping that "auto" takes: below, rounding shows; docs/robustness.md has the table.
+_DAMPING = (1e-5, 0.03)
 
 
 class Mission(Contents):
@@ -151,6 +154,23 @@ class Mission(Contents):
         slots = self.formation_slots(name)
         assert slots is not None  # checked: without distances there are a shape or slots
         return distances(slots, self.formation_edges(name))
+
+    def damping(self, name: str | None) -> float:
+        """Damping mu [-] of the iterated solve while a formation is held, or led to by its shape.
+
+        "auto" is a quarter of the smallest non-zero eigenvalue w of mbar J M^-1 J^T at the
+        formation, at most 0.03. It is 0.03 where there are no slots, and on ways led by distances,
+        which nobody knows (``name`` None).
+        """
+        given = self.constraint.damping
+        if given != "auto":
+            return given
+        slots = self.formation_slots(name) if name else None
+        if name is None or slots is None or not len(self.formation_edges(name)):
+            return _DAMPING[1]
+        edges = self.formation_edges(name)
+        index = geometry.smallest_singular_value(slots[None], edges, self.agents.mass)[0]
+        return float(np.clip(index**2 / 4, *_DAMPING))
 
     @property
     def latest_end(self) -> float:
