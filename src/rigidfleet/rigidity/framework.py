@@ -134,10 +134,10 @@ class Framework:
 
     def spare(self) -> Ints:
         """Edges that could all go at once without loss of rank, long ones first."""
-        from scipy.linalg import qr
-
         if self.stresses == 0:
             return np.zeros(0, dtype=np.int64)
+        from scipy.linalg import qr
+
         # Pivoting takes the largest remainder: a weight makes short edges large. It spans the range all the
         # same, since each pivot is independent of those before.
         weight = self.lengths.min() / self.lengths
