@@ -30,6 +30,8 @@ from rigidfleet.route import (
 Array = NDArray[np.float64]
 
 _SOLVERS = {"iterated": k.ITERATED, "spectral": k.SPECTRAL, "exact": k.EXACT, "pinv": k.PINV}
+#: A formation is held from where all pairs are right within this part of the shortest distance.
+_NEAR = 0.1
 _SPLITS = {"equal": k.PINV_EQUAL, "inertia": k.PINV_INERTIA, "inertia+force": k.PINV_INERTIA_FORCE}
 
 
@@ -118,6 +120,18 @@ def _commanded(now: Situation, edges: NDArray[np.int64], other: Array) -> Array:
     """Distances (m,) commanded last; ``other`` (m,) where an edge is new."""
     keys = map(tuple, edges.tolist())
     return np.array([now.reference.get(e, d) for e, d in zip(keys, other.tolist(), strict=True)])
+
+
+def _held(mission: Mission, name: str | None, r: Array) -> str | None:
+    """The formation, if agents at r (N, 3) [m] are in it: all pairs within a tenth of the shortest."""
+    slots = mission.formation_slots(name) if name else None
+    if slots is None or len(slots) < 2:
+        return None
+    pairs = shapes.complete_graph(len(slots))
+    wanted = shapes.distances(slots, pairs)
+    return (
+        name if np.abs(shapes.distances(r, pairs) - wanted).max() <= _NEAR * wanted.min() else None
+    )
 
 
 def _law(mission: Mission, name: str | None, *, damped: bool) -> k.Law:

@@ -156,11 +156,10 @@ class Mission(Contents):
         return distances(slots, self.formation_edges(name))
 
     def damping(self, name: str | None) -> float:
-        """Damping mu [-] of the iterated solve while a formation is held, or led to by its shape.
+        """Damping mu [-] of the iterated solve while a formation is held; ``name`` None: on the way.
 
         "auto" is a quarter of the smallest non-zero eigenvalue w of mbar J M^-1 J^T at the
-        formation, at most 0.03. It is 0.03 where there are no slots, and on ways led by distances,
-        which nobody knows (``name`` None).
+        formation, at most 0.03; and 0.03 on the way to one, or where there are no slots.
         """
         given = self.constraint.damping
         if given != "auto":

@@ -170,8 +170,8 @@ class Constraint(Part):
     )
     damping: Damping = Field(
         "auto",
-        description="mu of the iterated solver [-], > 0; auto: 0.03, or where no distances lead a quarter "
-        "of the formation's smallest non-zero w if that is less",
+        description="mu of the iterated solver [-], > 0; auto: 0.03, and in phases that begin in their "
+        "formation a quarter of its smallest non-zero w if that is less",
     )
     iterations: Annotated[int, Strict(), Field(ge=1, le=100)] = Field(
         3, description="number k of iterations of the iterated solver, 1 to 100"

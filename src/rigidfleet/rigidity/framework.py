@@ -168,7 +168,19 @@ def localised(frame: Framework) -> list[tuple[tuple[int, ...], Floats]]:
             basis.add(motion)
     for motion in F.T:
         basis.add(motion.reshape(n, d))
-    out = [(tuple(np.flatnonzero(f.any(axis=1)).tolist()), f) for f in basis.chosen]
+    return _apart(basis.chosen)
+
+
+def _apart(motions: list[Floats]) -> list[tuple[tuple[int, ...], Floats]]:
+    """Motions (N, d) with the agents that move, fewest first, without what is some fewer agents' own."""
+    out: list[tuple[tuple[int, ...], Floats]] = []
+    for motion in sorted(motions, key=lambda f: (np.count_nonzero(f.any(axis=1)), *~f.any(axis=1))):
+        f, moves = motion.copy(), motion.any(axis=1)
+        for who, g in out:
+            if moves[list(who)].all():
+                f -= (f * g).sum() * g
+        f[np.abs(f) <= ZERO * np.abs(motion).max()] = 0.0
+        out.append((tuple(np.flatnonzero(f.any(axis=1)).tolist()), f / np.linalg.norm(f)))
     return sorted(out, key=lambda flex: (len(flex[0]), flex[0]))
 
 
