@@ -174,10 +174,10 @@ def localised(frame: Framework) -> list[tuple[tuple[int, ...], Floats]]:
 def _apart(motions: list[Floats]) -> list[tuple[tuple[int, ...], Floats]]:
     """Motions (N, d) with the agents that move, fewest first, without what is some fewer agents' own."""
     out: list[tuple[tuple[int, ...], Floats]] = []
-    for motion in sorted(motions, key=lambda f: (np.count_nonzero(f.any(axis=1)), *~f.any(axis=1))):
-        f, moves = motion.copy(), motion.any(axis=1)
+    for motion in sorted(motions, key=lambda f: int(np.count_nonzero(np.any(f, axis=1)))):
+        f, moves = motion.copy(), set(np.flatnonzero(np.any(motion, axis=1)).tolist())
         for who, g in out:
-            if moves[list(who)].all():
+            if moves.issuperset(who):
                 f -= (f * g).sum() * g
         f[np.abs(f) <= ZERO * np.abs(motion).max()] = 0.0
         out.append((tuple(np.flatnonzero(f.any(axis=1)).tolist()), f / np.linalg.norm(f)))
