@@ -18,6 +18,7 @@ import sys
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import lru_cache
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -374,10 +375,17 @@ def judged(case: Case, edges: Ints, result: Result) -> str:
         return "nan"
     if worst_pair(case, r) <= TOLERANCE:
         return "mirrored" if mirrored(case, r) else "intended"
-    if analyse(case.slots, edges).verdict is Verdict.FLEXIBLE:
+    if flexible(case.slots.tobytes(), edges.tobytes()):
         return "flexible"
     error = np.abs(shapes.distances(r, edges) - shapes.distances(case.slots, edges)).max()
     return "other" if error <= TOLERANCE * _shortest(case) else "unmet"
+
+
+@lru_cache(64)
+def flexible(slots: bytes, edges: bytes) -> bool:
+    """Whether a graph is certain to be flexible; each is asked for in several rows."""
+    p, graph = np.frombuffer(slots).reshape(-1, 3), np.frombuffer(edges, dtype=np.int64)
+    return analyse(p, graph.reshape(-1, 2)).verdict is Verdict.FLEXIBLE
 
 
 def mirrored(case: Case, r: Floats) -> bool:

@@ -14,6 +14,7 @@ from rigidfleet.errors import FlightError
 from rigidfleet.kernel import flight
 from rigidfleet.mission import Mission, load_mission, mission_names
 from rigidfleet.result import Result
+from rigidfleet.rigidity import jacobian
 from rigidfleet.simulate import FlightInterrupted, Observation, Progress, simulate
 
 Data = dict[str, Any]
@@ -389,6 +390,41 @@ def test_a_law_without_bound_is_diagnosed_with_what_helps(constraint, changes, r
         r"singular value 3 of 3 of the constraint Jacobian J is \S+e-\d+ ", result.ending
     )
     assert re.search(remedy.replace("(", r"\(").replace(")", r"\)"), result.ending)
+
+
+def test_damping_follows_a_slender_shape_once_it_is_taken():
+    """On the way to a beam the damping is 0.03, held it is w/4, and what is left of the error dies out."""
+    k = 16
+    side = 3.0 * np.array([[0, 0, 0], [0, 1, 0], [0, 0.5, 0.75**0.5]])
+    slots = np.concatenate([side + [3.0 * s, 0, 0] for s in range(k)])
+    edges = [(3 * s + a, 3 * s + b) for s in range(k) for a, b in ((0, 1), (1, 2), (0, 2))]
+    edges += [
+        (3 * s + i, 3 * s + 3 + (i + t) % 3) for s in range(k - 1) for i in range(3) for t in (0, 1)
+    ]
+    start = slots + np.random.default_rng(0).normal(0.0, 0.3, slots.shape) + [0, 0, 20]
+    beam = {"beam": {"slots": slots, "edges": np.array(edges) + 1}}
+    phases = (
+        establish(formation="beam", until=8.0),
+        {"kind": "hold", "until": 16.0, "control": "open"},
+    )
+    J = jacobian(slots, np.array(edges))
+    w = np.linalg.svd(J, compute_uv=False)[-1] ** 2
+    assert w < 2e-3
+    left = {}
+    for damping in ("auto", 0.03):
+        mission = a_mission(
+            *phases,
+            agents={"mass": 1.0, "position": start},
+            formations=beam,
+            constraint={"damping": damping},
+            output_step=1.0,
+        )
+        result = simulate(mission)
+        left[damping] = np.abs(result.constraint[-1]).max(), pull(result).max()
+    assert mission.damping("beam") == 0.03
+    assert load_mission("cube-passage").damping("cuboid") == pytest.approx(0.05157 / 4, rel=1e-3)
+    assert left["auto"][0] < 1e-3 * left[0.03][0]
+    assert left["auto"][1] == pytest.approx(left[0.03][1], rel=1e-2)
 
 
 def test_a_law_without_feedback_is_told_of_it():
