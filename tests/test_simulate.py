@@ -448,6 +448,39 @@ def test_distances_without_slots_are_not_told_to_blend_a_shape():
     assert simulate(mission).ending.endswith('smoothly: reference = "distances"')
 
 
+def test_a_stall_says_what_makes_the_steps_short():
+    """Gains a thousand times too large end in a diagnosis: when, which phase, singular value, force, what to relax."""
+    law = {"alpha": 3e5, "beta": 3e5, "gamma": 0.0}
+    result = simulate(a_mission(establish(until=4000.0), constraint=law, output_step=10.0))
+    assert not result.complete
+    assert re.search(
+        r"cannot go on at t = [\d.]+ s, in phase 'establish 1': \d+ steps have", result.ending
+    )
+    assert "singular value 3 of 3" in result.ending
+    assert re.search(
+        r"force on agent \d, \S+ N\. Steps as short as this come from gains", result.ending
+    )
+
+
+def test_a_compiled_force_that_is_lost_is_named():
+    """A cfunc whose force is not finite from 2 s on ends the flight there, and the diagnosis names it."""
+    from numba import carray, cfunc, types
+
+    pointer = types.CPointer(types.float64)
+
+    @cfunc(types.void(types.float64, pointer, pointer, pointer, types.intp))
+    def lost(t, r, v, f, n):  # pragma: no cover
+        force = carray(f, (n, 3))
+        force[:] = 0.0
+        if t > 2.0:
+            force[1, 0] = np.nan
+
+    result = simulate(a_mission(), force=lost)
+    assert result.time[-1] == pytest.approx(2.0, abs=0.051)
+    assert "cannot go on at t = 2.000 s, in phase 'establish 1': the step size" in result.ending
+    assert result.ending.endswith("not finite on agent 2: mend that function")
+
+
 class Interrupt:
     """A force or a progress bar during which Ctrl-C is pressed once."""
 

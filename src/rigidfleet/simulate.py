@@ -618,12 +618,16 @@ class Flight:
 
     def _remedy(self, leg: Leg, *, collapsed: bool) -> str:
         """What to try where J is not to blame."""
+        beyond = leg.t + 1e-9 * max(1.0, leg.t)  # what happens at leg.t shows a moment later
         flight.closed_loop(
-            leg.t, leg.state.y, np.empty_like(leg.state.y), leg.plan.program, leg.workspace
+            beyond, leg.state.y, np.empty_like(leg.state.y), leg.plan.program, leg.workspace
         )
         w = leg.workspace
         names = {"input force": w.f_u, "constraint force": w.f_C, "external force": w.f_E}
         lost = [name for name, f in names.items() if not np.isfinite(f).all()]
+        if "external force" in lost and self.external is not None:
+            bad = np.flatnonzero(~np.isfinite(w.f_E).all(axis=1))
+            return f"The force of your own is not finite on agent {bad[0] + 1}: mend that function"
         if lost:
             return (
                 f"The {lost[0]} is not finite. Look for a gain, a distance or a mass far too large"
