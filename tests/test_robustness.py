@@ -94,7 +94,7 @@ def test_nearly_blocked_flexes_are_undecided():
 
 @pytest.mark.long
 def test_goals_hold_on_forty_formations():
-    """No failure in any row; 99 % with slots, 90 % by distances under all edges; nothing passes that is elsewhere."""
+    """No failure in any row; 99 % with slots and by blended shapes, 90 % by distances; nothing passes that is elsewhere."""
     cases = table.cases(40 - len(table.shipped(1)), seed=4)
     assert len(cases) == 40
     outcomes = flown(cases, table.ROWS)
@@ -102,4 +102,4 @@ def test_goals_hold_on_forty_formations():
     assert [o for o in outcomes if not o.noticed] == []
     assert min(share(outcomes, row) for row in SLOTS) >= 0.99
     assert share(outcomes, "shape, complete") >= 0.99
-    assert share(outcomes, "distances, complete") >= 0.9
+    assert share(outcomes, "distances, complete, assigned") >= 0.9
