@@ -112,6 +112,7 @@ def establish(
                 f"an ensemble solves densely, and '{plan.formation}' has too many edges for that"
                 f" ({len(plan.edges)}); vary such missions by `rigidfleet.sweep`"
             )
+        law = plan.program.law._replace(mu=mission.damping(None))
         edges = [(int(i), int(j)) for i, j in plan.edges]
         before = np.stack(
             [np.full(count, now.reference[e]) if e in now.reference else _distance(r, e) for e in edges], axis=1

@@ -95,7 +95,11 @@ def plan_phase(mission: Mission, phase: Phase, now: Situation, t_end: float) -> 
             mission.agents.saturate, mission.gravity,
         ),
         graph=_graph(edges.tobytes(), masses.tobytes(), large=method != "dense"),
-        law=_law(mission, damped=phase.control != "slots" and len(edges) > 0),
+        law=_law(
+            mission,
+            _held(mission, name, now.r) if method == "dense" else None,
+            damped=phase.control != "slots" and len(edges) > 0,
+        ),
         reference=reference,
         motion=motion,
         feedback=feedback,

@@ -26,6 +26,8 @@ _SHIPPED = resources.files("rigidfleet") / "missions"
 _LARGEST = 64 * 2**20
 #: Least and greatest damping that "auto" takes: below, rounding shows; docs/robustness.md has the table.
 _DAMPING = (1e-5, 0.03)
+#: Beyond so many equations eigenvalues take too long; the greatest damping is taken.
+_DENSE = 1000
 
 
 class Mission(Contents):
@@ -168,6 +170,8 @@ class Mission(Contents):
         if name is None or slots is None or not len(self.formation_edges(name)):
             return _DAMPING[1]
         edges = self.formation_edges(name)
+        if min(len(edges), 3 * self.n_agents) > _DENSE:
+            return _DAMPING[1]
         index = geometry.smallest_singular_value(slots[None], edges, self.agents.mass)[0]
         return float(np.clip(index**2 / 4, *_DAMPING))
 
