@@ -11,7 +11,7 @@ INSTALL := $(BIN)/uv pip install --quiet --python $(BIN)/python \
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test bench docs lint format constraints clean
+.PHONY: help setup demo test bench robustness docs lint format constraints clean
 
 help:  ## Show this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' Makefile
@@ -27,6 +27,9 @@ test: .venv/.dev  ## Run the tests (MARK= runs the long ones, too)
 bench: .venv/.bench  ## Measure the speed, as ratios
 	@$(BIN)/python benchmarks/run.py
 	@$(BIN)/python benchmarks/many.py
+
+robustness: .venv/.bench  ## Fly 200 random formations under every graph and law
+	@$(BIN)/python benchmarks/robustness.py
 
 docs: .venv/.docs  ## Build the site into site/, with every figure on it
 	@$(BIN)/python docs/picture.py

@@ -1,7 +1,7 @@
 """Which shapes come out: shipped and random formations from random starts, by every graph and law.
 
-    make robustness                        the table of docs/robustness.md, on all cores
-    python benchmarks/robustness.py --random 20 --rows "slots, complete" --json out.json
+    make robustness                        the tables of docs/robustness.md, on all cores
+    python benchmarks/robustness.py --random 20 --rows "slots" --json out.json
 
 Each formation is flown once in each row. What counts as the intended shape is judged here by all pairs
 of agents and by the volume of a tetrahedron, independently of `rigidfleet.assess`, whose verdict is
@@ -18,6 +18,7 @@ import sys
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import lru_cache
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -32,7 +33,7 @@ from rigidfleet.geometry import smallest_singular_value
 from rigidfleet.mission import Mission, load_mission, mission_names
 from rigidfleet.plan import align_slots
 from rigidfleet.result import Result
-from rigidfleet.rigidity import jacobian
+from rigidfleet.rigidity import Verdict, analyse, jacobian
 from rigidfleet.simulate import simulate
 
 Floats = NDArray[np.float64]
@@ -42,7 +43,7 @@ Ints = NDArray[np.int64]
 SPACING, APART = 2.0, 1.0
 #: Length of a flight [s], that of the paper's Table 1.
 FLIGHT = 20.0
-#: The paper's law, and the dense eigenvalue solves, are flown on formations of so many agents at most.
+#: Laws are compared on formations of so many agents at most, pinv on one fewer: it stalls, for minutes.
 FEW = 5
 #: A pair is right within this part of the shortest distance.
 TOLERANCE = 0.01
@@ -82,9 +83,8 @@ class Row:
     constraint: dict[str, Any] = field(default_factory=dict)
     assigned: bool = False  # each agent takes the slot that makes the ways short
     most: int = 1000  # agents
-    tied: bool = (
-        False  # the damping is a quarter of the smallest eigenvalue w of the shape, or 0.03
-    )
+    near: bool = False  # from a tenth of the shortest distance beside the slots, not from anywhere
+    hold: bool = False  # for the second half of the flight
 
 
 @dataclass(frozen=True)
@@ -95,13 +95,14 @@ class Outcome:
     case: str
     agents: int
     dimension: int
-    end: str  # intended, mirrored, folded; failure, stall, nan
+    end: str  # intended; flexible, other, mirrored, unmet; failure, stall, nan
     noticed: bool  # the verdict agrees
     force: float  # greatest force of an agent beyond its weight [N]
     steps: int
     wall: float  # [s]
     ending: str
     error: float = np.nan  # of the worst pair at the end, in parts of the shortest distance
+    same_side: bool = True  # the agents start on the intended side of the mirror
     crossings: int | None = None  # of singular shapes on the way, minimal graphs in space
 
 
@@ -112,30 +113,43 @@ def _rows() -> Iterator[Row]:
     for reference in ("shape", "distances", "step"):
         for graph in graphs:
             yield Row(f"{reference}, {graph}", graph, reference=reference)
-            if reference == "shape" and graph != "complete":
-                yield Row(f"shape, {graph}, assigned", graph, assigned=True)
-    for law in ("exact", "pinv", "spectral", "iterated"):
-        for reference in ("shape", "step"):
-            for graph in ("minimal", "complete"):
-                name = f"few, {law}, {reference}, {graph}"
+            if (graph == "complete") != (reference == "shape"):
                 yield Row(
-                    name, graph, "open", reference, {"solver": law}, most=FEW - (law == "pinv")
+                    f"{reference}, {graph}, assigned", graph, "open", reference, assigned=True
                 )
 
 
-ROWS: tuple[Row, ...] = tuple(_rows())
+def _law_rows() -> Iterator[Row]:
+    laws: dict[str, dict[str, Any]] = {
+        "exact": {"solver": "exact"},
+        "pinv": {"solver": "pinv"},
+        "Tikhonov": {"iterations": 1},
+        "iterated": {},
+        "spectral": {"solver": "spectral"},
+    }
+    for law, constraint in laws.items():
+        for reference in ("shape", "step"):
+            for graph in ("minimal", "complete"):
+                yield Row(
+                    f"{law}, {reference}, {graph}",
+                    graph,
+                    "open",
+                    reference,
+                    constraint,
+                    most=FEW - (law == "pinv"),
+                )
 
 
 def _damping_rows() -> Iterator[Row]:
-    for reference in ("shape", "step"):
-        for law in ("0.03", "tied", "spectral"):
-            constraint = {"solver": "spectral"} if law == "spectral" else {}
-            most, tied = 8 if law == "spectral" else 1000, law == "tied"
-            name = f"{law}, {reference}"
-            yield Row(name, "redundant", "open", reference, constraint, most=most, tied=tied)
+    for start, reference in (("near", "shape"), ("near", "step"), ("anywhere", "shape")):
+        for damping in (0.03, "w/4", "auto"):
+            yield Row(
+                f"{reference}, from {start}, {damping}", "minimal", "open", reference,
+                {"damping": damping}, near=start == "near", hold=True,
+            )  # fmt: skip
 
 
-DAMPING: tuple[Row, ...] = tuple(_damping_rows())
+ROWS, LAWS, DAMPING = tuple(_rows()), tuple(_law_rows()), tuple(_damping_rows())
 
 
 # -- formations ------------------------------------------------------------------------------------
@@ -192,42 +206,46 @@ def scattered(rng: np.random.Generator, n: int, side: Floats, apart: float) -> F
 
 
 def named() -> dict[str, list[Case]]:
-    """Formations of four kinds for the choice of the damping, each from four starts."""
+    """Formations of four kinds for the choice of the damping, each from two starts.
+
+    The flat ones have all edges, as no fewer hold them.
+    """
     kinds: dict[str, dict[str, Floats]] = {
         "small": {
-            "triangle": shapes.slots("triangle", 4.0, 3),
+            "tetrahedron": shapes.slots("tetrahedron", 4.0, 4),
             "pyramid": shapes.slots("pyramid", 4.0, 5),
             "cube": shapes.slots("cube", 4.0, 8),
         },
         "slender": {
-            "cuboid 8 x 2 x 4": shapes.slots("cuboid", [8.0, 2.0, 4.0], 8),
-            "cuboid 16 x 2 x 2": shapes.slots("cuboid", [16.0, 2.0, 2.0], 8),
-            "truss of 12": _lattice(6, 2, 1) + _lattice(6, 2, 1)[:, [2, 1, 1]] * [0, 0, 0.5],
+            "cuboid": shapes.slots("cuboid", [8.0, 2.0, 4.0], 8),
+            "beam of 12": _beam(4),
+            "beam of 36": _beam(12),
         },
         "flat": {
             "square": shapes.slots("square", 4.0, 4),
             "hexagon": shapes.slots("hexagon", 4.0, 6),
-            "grid of 16": _lattice(4, 4, 1),
+            "grid of 16": shapes.slots("grid", 4.0, 16),
         },
         "large": {
-            "lattice of 27": _lattice(3, 3, 3),
-            "lattice of 30": _lattice(5, 3, 2),
-            "bar of 28": _lattice(7, 2, 2),
+            "helix of 30": shapes.slots("helix", [6.0, 3.0, 4.0], 30),
+            "sphere of 40": shapes.slots("sphere", 4.0, 40),
         },
     }
     return {
         kind: [
-            Case(f"{name}, {k}", shapes.centred(slots), start(slots, np.random.default_rng([7, k])))
-            for name, slots in some.items()
-            for k in range(4)
+            Case(f"{name}, {k}", slots, start(slots, np.random.default_rng([7, k])),
+                 shapes.complete_graph(len(slots)) if kind == "flat" else None)
+            for name, slots in ((name, shapes.centred(p)) for name, p in some.items())
+            for k in range(2)
         ]
         for kind, some in kinds.items()
-    }
+    }  # fmt: skip
 
 
-def _lattice(a: int, b: int, c: int) -> Floats:
-    """Points 4 m apart."""
-    return 4.0 * np.array(list(np.ndindex(a, b, c)), dtype=float)
+def _beam(stations: int) -> Floats:
+    """Triangles one behind the other, 3 m apart, their sides 3 m long."""
+    triangle = 3.0 * np.array([[0.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.5, 0.75**0.5]])
+    return np.concatenate([triangle + [3.0 * k, 0.0, 0.0] for k in range(stations)])
 
 
 def edges_of(case: Case, graph: str) -> Ints:
@@ -263,29 +281,19 @@ def _spread(u: Floats, d: int) -> float:
     return float(s[min(len(u), d) - 1])
 
 
-def smallest_eigenvalue(slots: Floats, edges: Ints) -> float:
-    """Smallest non-zero eigenvalue w of mbar A at the intended shape, equal masses."""
-    return float(smallest_singular_value(slots[None], edges)[0] ** 2)
+def beside(case: Case) -> Case:
+    """The same formation, its agents a tenth of its shortest distance beside their slots."""
+    rng = np.random.default_rng(case.n)
+    offset = 0.1 * shapes.distances(case.slots, shapes.complete_graph(case.n)).min()
+    return replace(
+        case, start=case.slots + offset * rng.normal(size=case.slots.shape) + [0.0, 0.0, 20.0]
+    )
 
 
 def assigned(case: Case) -> Case:
-    """The same start, each agent where another slot is nearer: least squares over turns and orders."""
-    from scipy.optimize import linear_sum_assignment
-
-    there, best = shapes.centred(case.start), (np.inf, np.arange(case.n))
-    for trial in range(20):
-        R = np.linalg.qr(np.random.default_rng(trial).normal(size=(3, 3)))[0]
-        R *= np.sign(np.linalg.det(R))
-        for _ in range(30):
-            apart = ((case.slots @ R.T)[:, None] - there) ** 2
-            order = linear_sum_assignment(apart.sum(axis=2))[1]
-            turned = shapes.kabsch(there[order], case.slots, near=R)
-            if np.allclose(turned, R):
-                break
-            R = turned
-        cost = ((case.slots @ R.T - there[order]) ** 2).sum()
-        best = min(best, (cost, order), key=lambda found: found[0])
-    return replace(case, start=case.start[best[1]])
+    """The same start, each agent where the slots are nearer: as assignment = "shortest" has it."""
+    order = shapes.assigned(case.start, case.slots, np.ones(case.n))
+    return replace(case, start=case.start[np.argsort(order)])
 
 
 def singular_on_the_way(case: Case, edges: Ints) -> int:
@@ -311,31 +319,37 @@ def mission_of(case: Case, row: Row) -> Mission:
     """The mission that takes the formation from its start."""
     phase = {"kind": "establish", "formation": "shape", "until": FLIGHT}
     phase |= {"control": row.control, "reference": row.reference}
-    edges = edges_of(case, row.graph)
-    damping = {}
-    if row.tied:
-        damping = {"damping": min(0.03, smallest_eigenvalue(case.slots, edges) / 4)}
+    edges, constraint = edges_of(case, row.graph), dict(row.constraint)
+    if constraint.get("damping") == "w/4":
+        w = smallest_singular_value(case.slots[None], edges)[0] ** 2
+        constraint["damping"] = float(np.clip(w / 4, 1e-5, 0.03))
+    phases = [phase]
+    if row.hold:
+        phases = [
+            phase | {"until": FLIGHT / 2},
+            {"kind": "hold", "until": FLIGHT, "control": "open"},
+        ]
     return Mission.from_dict(
         {
             "schema_version": 1,
             "name": "robustness",
             "output_step": 0.1,
             "agents": {"mass": 1.0, "position": case.start},
-            "constraint": row.constraint | damping,
+            "constraint": constraint,
             "formations": {"shape": {"slots": case.slots, "edges": edges + 1}},
-            "phases": [phase],
+            "phases": phases,
         }
     )
 
 
 def fly(case: Case, row: Row) -> Outcome:
     """Fly one formation in one row, and judge it twice."""
-    if row.assigned:
-        case = assigned(case)
+    case = beside(case) if row.near else assigned(case) if row.assigned else case
+    edges = edges_of(case, row.graph)
     about = (row.name, case.name, case.n, case.dimension)
     crossings = None
-    if row.graph == "minimal" and case.dimension == 3 and row.most > FEW:
-        crossings = singular_on_the_way(case, edges_of(case, row.graph))
+    if row.graph == "minimal" and case.dimension == 3 and row.control == "open":
+        crossings = singular_on_the_way(case, edges)
     begun = time.perf_counter()
     try:
         result = simulate(mission_of(case, row))
@@ -343,7 +357,7 @@ def fly(case: Case, row: Row) -> Outcome:
         wall = time.perf_counter() - begun
         return Outcome(*about, "failure", True, np.nan, 0, wall, str(error), crossings=crossings)
     wall = time.perf_counter() - begun
-    end = judged(case, result)
+    end = judged(case, edges, result)
     verdict = assess(result)
     wrong = any(f.check in _SHAPE_CHECKS and not f.passed for f in verdict.findings)
     weight = np.array([0.0, 0.0, 9.81])
@@ -352,40 +366,58 @@ def fly(case: Case, row: Row) -> Outcome:
     noticed = wrong == (end != "intended")
     return Outcome(
         *about, end, noticed, float(force), steps, wall, result.ending,
-        worst_pair(case, result.position[-1]), crossings,
+        worst_pair(case, result.position[-1]), not mirrored(case, case.start), crossings,
     )  # fmt: skip
 
 
-def judged(case: Case, result: Result) -> str:
-    """How a flight ended, by distances of all pairs and the hand of its largest tetrahedron."""
+def judged(case: Case, edges: Ints, result: Result) -> str:
+    """How a flight ended, by distances of all pairs and the hand of a large tetrahedron."""
     if not result.complete:
         return "stall" if "steps have been taken" in result.ending else "failure"
     r = result.position[-1]
     numbers = (result.position, result.velocity, result.constraint_force, result.input_force)
     if not all(np.isfinite(x).all() for x in numbers):
         return "nan"
-    if case.dimension == 3:
-        some = largest_tetrahedron(case.slots)
-        mirrored = volume(r[some]) * volume(case.slots[some]) < 0
-    else:
-        mirrored = False
-    if worst_pair(case, r) > TOLERANCE:
-        return "folded"
-    return "mirrored" if mirrored else "intended"
+    if worst_pair(case, r) <= TOLERANCE:
+        return "mirrored" if mirrored(case, r) else "intended"
+    if flexible(case.slots.tobytes(), edges.tobytes()):
+        return "flexible"
+    error = np.abs(shapes.distances(r, edges) - shapes.distances(case.slots, edges)).max()
+    return "other" if error <= TOLERANCE * _shortest(case) else "unmet"
+
+
+@lru_cache(64)
+def flexible(slots: bytes, edges: bytes) -> bool:
+    """Whether a graph is certain to be flexible; each is asked for in several rows."""
+    p, graph = np.frombuffer(slots).reshape(-1, 3), np.frombuffer(edges, dtype=np.int64)
+    return analyse(p, graph.reshape(-1, 2)).verdict is Verdict.FLEXIBLE
+
+
+def mirrored(case: Case, r: Floats) -> bool:
+    """Whether a large tetrahedron of a spatial formation has the other hand at r (N, 3)."""
+    if case.dimension < 3:
+        return False
+    some = large_tetrahedron(case.slots)
+    return volume(r[some]) * volume(case.slots[some]) < 0
 
 
 def worst_pair(case: Case, r: Floats) -> float:
     """Greatest error of a distance between two agents, relative to the shortest one."""
-    i, j = np.triu_indices(case.n, 1)
-    wanted = np.linalg.norm(case.slots[i] - case.slots[j], axis=1)
-    return float(np.abs(np.linalg.norm(r[i] - r[j], axis=1) - wanted).max() / wanted.min())
+    every = shapes.complete_graph(case.n)
+    error = np.abs(shapes.distances(r, every) - shapes.distances(case.slots, every))
+    return float(error.max() / _shortest(case))
 
 
-def largest_tetrahedron(slots: Floats) -> list[int]:
-    """Four agents that span the most."""
-    return list(
-        max(combinations(range(len(slots)), 4), key=lambda who: abs(volume(slots[list(who)])))
-    )
+def _shortest(case: Case) -> float:
+    return float(shapes.distances(case.slots, shapes.complete_graph(case.n)).min())
+
+
+def large_tetrahedron(slots: Floats) -> list[int]:
+    """Four agents that span much: far apart, far from their line, far from their plane."""
+    a, b = divmod(int(np.linalg.norm(slots[:, None] - slots, axis=2).argmax()), len(slots))
+    x = slots - slots[a]
+    c = int(np.linalg.norm(np.cross(x, x[b]), axis=1).argmax())
+    return [a, b, c, int(np.abs(x @ np.cross(x[b], x[c])).argmax())]
 
 
 def volume(p: Floats) -> float:
@@ -414,12 +446,14 @@ def run(some: Sequence[Case], rows: Sequence[Row], jobs: int) -> Iterator[list[O
         yield from pool.imap_unordered(fly_all, work)
 
 
+_ELSEWHERE = ("flexible", "other", "mirrored", "unmet")
+_FAILED = ("failure", "stall", "nan")
+
+
 def summary(row: Row, outcomes: Sequence[Outcome]) -> dict[str, Any]:
     """A row of the table."""
     mine = [o for o in outcomes if o.row == row.name]
-    ends = {end: sum(o.end == end for o in mine) for end in (
-        "intended", "mirrored", "folded", "failure", "stall", "nan",
-    )}  # fmt: skip
+    ends = {end: sum(o.end == end for o in mine) for end in ("intended", *_ELSEWHERE, *_FAILED)}
     by_dimension = {}
     for d, where in _WHERE.items():
         there = [o for o in mine if o.dimension == d]
@@ -436,8 +470,8 @@ def summary(row: Row, outcomes: Sequence[Outcome]) -> dict[str, Any]:
 
 
 _HEAD = (
-    "row", "flights", "intended", "line", "plane", "space", "mirrored", "folded", "failures",
-    "stalls", "NaN", "not noticed", "peak force, median / 95 % [N]", "steps",
+    "row", "flights", "intended", "line", "plane", "space", "flexible", "other shape", "mirrored",
+    "unmet", "solver failures", "not noticed", "peak force, median / 95 % [N]", "steps",
 )  # fmt: skip
 
 
@@ -445,14 +479,14 @@ def cells(s: dict[str, Any]) -> list[str]:
     """A row of the table as text."""
     part = lambda x: "" if x is None else f"{100 * x:.0f} %"  # noqa: E731
     force = "" if s["force_median"] is None else f"{s['force_median']:.3g} / {s['force_95']:.3g}"
-    ends = [str(s[end]) for end in ("mirrored", "folded", "failure", "stall", "nan", "unnoticed")]
-    where = [part(s[w]) for w in _WHERE.values()]
     return [
         s["row"],
         str(s["flights"]),
         _share(s["intended"], s["flights"]),
-        *where,
-        *ends,
+        *(part(s[w]) for w in _WHERE.values()),
+        *(str(s[end]) for end in _ELSEWHERE),
+        str(sum(s[end] for end in _FAILED)),
+        str(s["unnoticed"]),
         force,
         str(s["steps"]),
     ]
@@ -476,23 +510,35 @@ def crossings(outcomes: Sequence[Outcome]) -> list[list[str]]:
     return lines
 
 
+def sides(outcomes: Sequence[Outcome]) -> list[list[str]]:
+    """Spatial formations led by distances, by the side of the mirror on which they start."""
+    lines = []
+    for row in ("distances, complete", "distances, complete, assigned"):
+        for name, side in (("intended", True), ("other", False)):
+            there = [
+                o for o in outcomes if o.row == row and o.dimension == 3 and o.same_side == side
+            ]
+            right = sum(o.end == "intended" for o in there)
+            hand = sum(o.end == "mirrored" for o in there)
+            lines.append([row, name, str(len(there)), _share(right, len(there)), str(hand)])
+    return lines
+
+
 def damping_table(jobs: int) -> tuple[list[list[str]], list[Outcome]]:
-    """The laws of damping, by kind of shape."""
+    """The choice of the damping, by kind of shape."""
     lines, every = [], []
     for kind, some in named().items():
         outcomes = [o for part in run(some, DAMPING, jobs) for o in part]
         every += outcomes
         for row in DAMPING:
             mine = [o for o in outcomes if o.row == row.name]
-            if not mine:
-                continue
             right = sum(o.end == "intended" for o in mine)
-            error = [o.error for o in mine if o.end == "intended"]
+            errors = [o.error for o in mine]
+            error = f"{np.median(errors):.1e} / {max(errors):.1e}"
             force = [o.force for o in mine]
-            worst = f"{max(error):.1e}" if error else ""
             force = f"{np.median(force):.3g} / {max(force):.3g}"
             steps = f"{np.median([o.steps for o in mine]):.0f}"
-            lines.append([kind, row.name, f"{right} of {len(mine)}", worst, force, steps])
+            lines.append([kind, row.name, f"{right} of {len(mine)}", error, force, steps])
     return lines, every
 
 
@@ -509,7 +555,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--json", type=Path, help="write every outcome to a file")
     asked = parser.parse_args(arguments)
-    rows = [r for r in ROWS if not asked.rows or r.name.startswith(tuple(asked.rows))]
+    rows = [r for r in ROWS + LAWS if not asked.rows or r.name.startswith(tuple(asked.rows))]
     some = cases(asked.random, asked.seed)
     begun = time.perf_counter()
     outcomes: list[Outcome] = []
@@ -517,14 +563,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         outcomes += part
         if sys.stderr.isatty():
             print(f"\r{k} of {len(some)} formations", end="", file=sys.stderr)
-    table = [summary(row, outcomes) for row in rows]
-    print(markdown(_HEAD, map(cells, table)))
+    table = {row.name: summary(row, outcomes) for row in rows}
+    for part in (ROWS, LAWS):
+        lines = [cells(table[row.name]) for row in part if row.name in table]
+        print(markdown(_HEAD, lines) if lines else "")
     damped: list[Outcome] = []
     if not asked.rows:
         print(markdown(("row", "singular on the way", "flights", "intended"), crossings(outcomes)))
+        head = ("row", "starts on the side", "flights", "intended", "mirrored")
+        print(markdown(head, sides(outcomes)))
         lines, damped = damping_table(asked.jobs)
         head = (
-            "shapes", "damping, reference", "intended", "worst pair of these",
+            "shapes", "reference, start, damping", "intended", "worst pair, median / most",
             "peak force, median / most [N]", "steps",
         )  # fmt: skip
         print(markdown(head, lines))
@@ -532,7 +582,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     print(f"{len(outcomes) + len(damped)} flights, {wall:.0f} s on {asked.jobs} processes")
     if asked.json:
         every = [asdict(o) for o in (*outcomes, *damped)]
-        asked.json.write_text(json.dumps({"table": table, "outcomes": every, "wall_s": wall}))
+        asked.json.write_text(json.dumps({"table": list(table.values()), "outcomes": every}))
     return 0
 
 

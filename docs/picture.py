@@ -7,6 +7,7 @@ from tempfile import TemporaryDirectory
 import matplotlib
 from diagrams import DIAGRAMS
 from PIL import Image
+from shapes import SHAPES
 
 import rigidfleet as rf
 from rigidfleet.figures import write_figure
@@ -45,7 +46,7 @@ def _save_with_few_colours(path: Path, name: str) -> None:
 
 def drawings() -> None:
     """The drawings, letters as outlines: they are read on screens without our fonts."""
-    for draw in DIAGRAMS:
+    for draw in (*DIAGRAMS, *SHAPES):
         buffer = io.StringIO()
         with settings(), matplotlib.rc_context({"svg.fonttype": "path"}):
             draw().savefig(buffer, format="svg", metadata={"Date": None})

@@ -210,7 +210,8 @@ def test_a_triangle_that_comes_back_upside_down_is_noted(turn, noted):
         PhaseRecord(f"{k}", "reshape", "open", names[k], 5.0 * k, 5.0 * k + 5) for k in range(3)
     ]
     path = np.array([up, up, line, line, back, back]) + HEIGHT
-    verdict = assess(flown(mission, path, phases=records, phase=[0, 0, 1, 1, 2, 2]))
+    times = [0.0, 5.0, 5.1, 10.0, 10.1, 15.0]
+    verdict = assess(flown(mission, path, time=times, phases=records, phase=[0, 0, 1, 1, 2, 2]))
     assert verdict.passed
     assert len(verdict.notes) == noted
     if noted:
@@ -269,7 +270,8 @@ def test_a_lost_shape_fails_at_the_end_of_the_flight_only():
     for lost, fails in [(0, True), (1, False), (2, True)]:
         p = np.array([s] * 6)
         p[2 * lost + 1, 0] += 0.5
-        verdict = assess(flown(mission, p, phases=records, phase=[0, 0, 1, 1, 2, 2]))
+        times = [0.0, 4.0, 4.1, 7.0, 7.1, 10.0]
+        verdict = assess(flown(mission, p, time=times, phases=records, phase=[0, 0, 1, 1, 2, 2]))
         assert failures(verdict) == ({"distances", "shape"} if fails else set())
         assert (verdict.phases[lost].shape or 0) > 0.1
 
@@ -303,9 +305,9 @@ def a_waypoint(**miss: float) -> Verdict:
         PhaseRecord("form", "establish", "open", "triangle", 0.0, 4.0),
         PhaseRecord("WP1", "fly", "slots", "triangle", 4.0, 10.0, None, target),
     ]
-    flight = flown(
-        mission, slots(mission, "triangle") + HEIGHT, phases=records, phase=[0, 0, 1, 1, 1]
-    )
+    times, phase = [0.0, 4.0, 4.1, 7.0, 10.0], [0, 0, 1, 1, 1]
+    triangle = slots(mission, "triangle") + HEIGHT
+    flight = flown(mission, triangle, time=times, phases=records, phase=phase)
     flight.cm[-1] = [1, 2 + miss.get("position", 0), 10]
     flight.cm_velocity[-1] = [2 - miss.get("velocity", 0), 0, 0]
     flight.attitude[-1] = att.quaternion_from_euler(
@@ -546,8 +548,35 @@ def test_positions_that_are_not_finite_fail():
     p[3:] = np.nan
     verdict = assess(flown(mission, p))
     assert failures(verdict) == {"complete"}
-    assert "not finite from 7.50 s on" in verdict.summary
+    assert "agents 1, 2 and 3 is not finite, first at 7.50 s" in verdict.summary
     json.loads(verdict.json())
+
+
+def test_an_agent_that_is_nowhere_hides_no_other():
+    """With one agent's position lost, the collision of two others is found all the same."""
+    mission = a_mission(TRIANGLE, 3, agents={"radius": 0.25}, limits={"separation_below": 0.1})
+    p = np.array([slots(mission, "triangle") + HEIGHT] * 5)
+    p[2, 1] = p[2, 2] + [0.0, 0.0, 0.3]
+    p[1:, 0] = np.nan
+    verdict = assess(flown(mission, p))
+    assert failures(verdict) == {"complete", "separation", "separation_below"}
+    assert found(verdict, "complete").who == "agent 1"
+    assert found(verdict, "separation").who == "agents 2 and 3"
+    assert found(verdict, "separation_below").when == 5.0
+
+
+def test_a_moment_without_a_sample_is_not_passed():
+    """A shape or a waypoint that no sample shows fails the verdict, with the moment to record."""
+    mission = a_mission(TRIANGLE, 3)
+    flight = flown(mission, slots(mission, "triangle") + HEIGHT)
+    assert assess(flight).passed
+    flight.time = flight.time * 0.9
+    verdict = assess(flight)
+    assert failures(verdict) == {"samples"}
+    assert (
+        "the end of phase 'form' (10.00 s) is not judged: the nearest sample is 1 s"
+        in verdict.summary
+    )
 
 
 def test_a_phase_never_sampled_has_no_numbers():

@@ -7,7 +7,7 @@ import pytest
 
 from rigidfleet.assess import assess
 from rigidfleet.figures.graph import graphs
-from rigidfleet.formation import assigned, distances, slots, straight_way
+from rigidfleet.formation import assigned, complete_graph, distances, slots, straight_way
 from rigidfleet.mission import Mission, load_mission, mission_names
 from rigidfleet.preflight import STARTS, planned, preflight
 from rigidfleet.simulate import simulate
@@ -361,3 +361,86 @@ def test_calm_missions_tell_of_no_disturbances():
     assert found.disturbed is None
     assert "disturbances" not in dict(found.words())
     assert found.data()["disturbances"] is None
+
+
+# -- formations as the literature has them ---------------------------------------------------------
+
+
+def ring(n):
+    """Sides of a polygon."""
+    return [[i, (i + 1) % n] for i in range(n)]
+
+
+def path(n, reach=1):
+    """Each agent with the next ones."""
+    return [[i, j] for i in range(n) for j in range(i + 1, min(i + 1 + reach, n))]
+
+
+def grid(columns, rows, diagonals):
+    """Agents 3 m apart, edges to the nearest, and to those across so many cells."""
+    p = 3.0 * np.array([[x, y, 0] for y in range(rows) for x in range(columns)], dtype=float)
+    at = np.arange(rows * columns).reshape(rows, columns)
+    sides = [
+        *zip(at[:, :-1].flat, at[:, 1:].flat, strict=True),
+        *zip(at[:-1].flat, at[1:].flat, strict=True),
+    ]
+    across = list(zip(at[:-1, :-1].flat, at[1:, 1:].flat, strict=True))[:diagonals]
+    return p, np.array(sides + across)
+
+
+def long_diagonals(n):
+    """Each corner of a polygon with the opposite one."""
+    return [[i, i + n // 2] for i in range(n // 2)]
+
+
+RIGID, STABLE, FLEXIBLE = "infinitesimally rigid", "prestress-stable", "flexible"
+POLYGON = {n: slots("polygon", 4.0, n) for n in (4, 5, 6, 8)}
+LINE = slots("line", 3.0, 5)
+#: Slots, edges, the verdict in space, and in the formation's own plane or line, by theorems:
+#: 2N - 3 edges hold a plane and no more (Laman), sides and long diagonals of a regular polygon have a
+#: stress that holds it everywhere (Connelly), collinear triangles chained hold a line.
+PUBLISHED = {
+    "square, 4 sides": (POLYGON[4], ring(4), FLEXIBLE, FLEXIBLE),
+    "square, 5 edges": (POLYGON[4], [*ring(4), [0, 2]], FLEXIBLE, RIGID),
+    "square, all 6": (POLYGON[4], complete_graph(4), STABLE, RIGID),
+    "pentagon, 7 edges": (POLYGON[5], [*ring(5), [0, 2], [0, 3]], FLEXIBLE, RIGID),
+    "hexagon, 6 sides": (POLYGON[6], ring(6), FLEXIBLE, FLEXIBLE),
+    "hexagon, 9 edges": (POLYGON[6], [*ring(6), [0, 2], [2, 4], [4, 0]], FLEXIBLE, RIGID),
+    "hexagon, long diagonals": (POLYGON[6], ring(6) + long_diagonals(6), STABLE, STABLE),
+    "octagon, long diagonals": (POLYGON[8], ring(8) + long_diagonals(8), STABLE, STABLE),
+    "line, leader to follower": (LINE, path(5), FLEXIBLE, RIGID),
+    "line, second neighbours": (LINE, path(5, 2), STABLE, RIGID),
+    "wedge, path": (slots("v", 4.0, 7), path(7), FLEXIBLE, FLEXIBLE),
+    "grid of 15, neighbours": (*grid(5, 3, 0), FLEXIBLE, FLEXIBLE),
+    "grid of 15, 27 edges": (*grid(5, 3, 5), FLEXIBLE, RIGID),
+    "grid of 15, all diagonals": (*grid(5, 3, 8), FLEXIBLE, RIGID),
+    "octahedron": (slots("octahedron", 4.0, 6), None, RIGID, None),
+}
+
+
+@pytest.mark.parametrize("control", ["open", "slots"])
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_published_formations(name, control):
+    """Each gets its verdict; by distances alone flexible ones fail the check, by slots none; all of them fly."""
+    p, edges, in_space, within = PUBLISHED[name]
+    formation = {"slots": p, "edges": "complete" if edges is None else np.asarray(edges) + 1}
+    start = p + np.random.default_rng(len(p)).normal(0.0, 0.2, p.shape) + [0, 0, 10]
+    flown = mission(
+        agents={"position": start, "radius": 0.1},
+        formations={"shape": formation},
+        phases=[{"kind": "establish", "formation": "shape", "until": 15.0, "control": control}],
+    )
+    found = preflight(flown)
+    rigidity = found.formations[0].rigidity
+    assert rigidity is not None
+    assert rigidity.verdict == in_space
+    assert (None if rigidity.within is None else rigidity.within.verdict) == within
+    alone = control == "open" and in_space == FLEXIBLE
+    assert failures(found) == ({"formation"} if alone else set())
+
+    result = simulate(flown)
+    assert result.complete
+    every = complete_graph(len(p))
+    error = np.abs(distances(result.position[-1], every) - distances(p, every)).max()
+    assert assess(result).passed == (error < 0.01 * distances(p, every).min())
+    assert control == "open" or error < 1e-3

@@ -269,6 +269,15 @@ def test_barely_rigid_says_so():
     assert "large forces" in result.reason
 
 
+def test_flexes_of_more_agents_hold_none_of_fewer():
+    """A square of four sides: agent 1 leaves the plane, and apart from that 1, 2 and 4 shear within it."""
+    result = analyse(f.slots("square", 4.0, 4), [[0, 1], [1, 2], [2, 3], [0, 3]])
+    fold, shear = result.flexes
+    assert (fold.agents, shear.agents) == ((0,), (0, 1, 3))
+    np.testing.assert_allclose(np.abs(fold.motion[0]), [0, 0, 1], atol=1e-12)
+    np.testing.assert_allclose(shear.motion[:, 2], 0, atol=1e-9)
+
+
 @pytest.mark.parametrize("kind", ["complete", "near", "few", "line", "plane"])
 def test_hundred_agents_take_two_seconds(kind):
     """Rank, flexes, index and verdict of 100 agents within two seconds, whatever the graph."""

@@ -1,5 +1,6 @@
 """Whole flights: phases and switches, the paper's missions, their failures, users' own forces."""
 
+import re
 from functools import cache
 from itertools import pairwise
 from typing import Any
@@ -13,6 +14,7 @@ from rigidfleet.errors import FlightError
 from rigidfleet.kernel import flight
 from rigidfleet.mission import Mission, load_mission, mission_names
 from rigidfleet.result import Result
+from rigidfleet.rigidity import jacobian
 from rigidfleet.simulate import FlightInterrupted, Observation, Progress, simulate
 
 Data = dict[str, Any]
@@ -331,6 +333,152 @@ def test_a_failure_before_the_first_time_asked_for_is_an_error():
     """With nothing to record, the diagnosis is raised."""
     with pytest.raises(FlightError, match=r"cannot go on at t = 6\.809 s"):
         simulate(load_mission("line-singular"), times=[8.0, 9.0])
+
+
+def test_a_short_collision_between_samples_is_seen():
+    """Two agents that pass through each other within an output step collide, however coarse it is."""
+    two = {
+        "mass": 1.0,
+        "radius": 0.25,
+        "position": [[-5, 0, 9], [5, 0.1, 9]],
+        "velocity": [[10, 0, 0], [-10, 0, 0]],
+    }
+    pair = {"pair": {"slots": [[-1, 0, 0], [1, 0, 0]], "edges": []}}
+    hold = {"kind": "hold", "until": 2.0, "control": "open"}
+    mission = a_mission(hold, agents=two, formations=pair, output_step=0.4)
+    for times in (None, [0.0, 1.2, 2.0], [0.0, 0.1]):
+        result = simulate(mission, times=times)
+        assert result.separation.min() == pytest.approx(0.1 - 0.5, abs=1e-3)
+        assert result.separation[0] > 9.0
+        assert not assess(result).passed
+        np.testing.assert_array_equal(result.time, np.arange(6) * 0.4 if times is None else times)
+
+
+@pytest.mark.parametrize("formulation", ["inertial", "body"])
+def test_what_is_watched_between_samples_is_what_is_recorded(formulation):
+    """The least separation between coarse samples is the least of fine ones, in either formulation."""
+    data = load_mission("cube-waypoint").to_dict() | {"formulation": formulation}
+    fine = simulate(Mission.from_dict(data | {"output_step": 0.05}))
+    coarse = simulate(Mission.from_dict(data | {"output_step": 1.0}))
+    assert len(coarse.time) < len(fine.time) / 10
+    assert coarse.separation.min() == pytest.approx(fine.separation.min(), abs=1e-9)
+
+
+def test_sparse_times_leave_nothing_passed_unseen():
+    """A waypoint that lies between the times recorded is not judged, and the flight not passed."""
+    mission = load_mission("single-waypoint")
+    end = mission.latest_end
+    verdict = assess(simulate(mission, times=[0.0, 1.0, end - 1.0]))
+    assert not verdict.passed
+    assert "is not judged" in verdict.summary
+
+
+@pytest.mark.parametrize(
+    ("constraint", "changes", "remedy"),
+    [
+        ({"solver": "exact"}, {}, 'Use solver = "iterated" (or "spectral")$'),
+        ({"solver": "exact"}, {"reference": "step"}, 'smoothly: reference = "shape"$'),
+    ],
+)
+def test_a_law_without_bound_is_diagnosed_with_what_helps(constraint, changes, remedy):
+    """Where the inverse has no bound, the diagnosis says when, where, which singular value, what to try."""
+    folded = {"line": {"slots": [[-4, 0, 0], [0, 0, 0], [4, 0, 0]]}}
+    phase = establish(formation="line", until=9.0, **changes)
+    result = simulate(a_mission(phase, formations=folded, constraint=constraint))
+    assert re.search(r"cannot go on at t = \d+\.\d+ s, in phase 'establish 1': ", result.ending)
+    assert re.search(
+        r"singular value 3 of 3 of the constraint Jacobian J is \S+e-\d+ ", result.ending
+    )
+    assert re.search(remedy.replace("(", r"\(").replace(")", r"\)"), result.ending)
+
+
+def test_damping_follows_a_slender_shape_once_it_is_taken():
+    """On the way to a beam the damping is 0.03, held it is w/4, and what is left of the error dies out."""
+    k = 16
+    side = 3.0 * np.array([[0, 0, 0], [0, 1, 0], [0, 0.5, 0.75**0.5]])
+    slots = np.concatenate([side + [3.0 * s, 0, 0] for s in range(k)])
+    edges = [(3 * s + a, 3 * s + b) for s in range(k) for a, b in ((0, 1), (1, 2), (0, 2))]
+    edges += [
+        (3 * s + i, 3 * s + 3 + (i + t) % 3) for s in range(k - 1) for i in range(3) for t in (0, 1)
+    ]
+    start = slots + np.random.default_rng(0).normal(0.0, 0.3, slots.shape) + [0, 0, 20]
+    beam = {"beam": {"slots": slots, "edges": np.array(edges) + 1}}
+    phases = (
+        establish(formation="beam", until=8.0),
+        {"kind": "hold", "until": 16.0, "control": "open"},
+    )
+    J = jacobian(slots, np.array(edges))
+    w = np.linalg.svd(J, compute_uv=False)[-1] ** 2
+    assert w < 2e-3
+    left = {}
+    for damping in ("auto", 0.03):
+        mission = a_mission(
+            *phases,
+            agents={"mass": 1.0, "position": start},
+            formations=beam,
+            constraint={"damping": damping},
+            output_step=1.0,
+        )
+        result = simulate(mission)
+        left[damping] = np.abs(result.constraint[-1]).max(), pull(result).max()
+    assert mission.damping("beam") == 0.03
+    assert load_mission("cube-passage").damping("cuboid") == pytest.approx(0.05157 / 4, rel=1e-3)
+    assert left["auto"][0] < 1e-3 * left[0.03][0]
+    assert left["auto"][1] == pytest.approx(left[0.03][1], rel=1e-2)
+
+
+def test_a_law_without_feedback_is_told_of_it():
+    """Lengths that drift into a line end a flight whose diagnosis names the feedback that is missing."""
+    triangle = formation.slots("triangle", 4.0, 3)
+    velocity = np.array([[0, 0.5, 0], [0, -0.5, 0], [-1.5, 0, 0]])
+    agents = {"mass": 1.0, "position": triangle + [0, 0, 9.0], "velocity": velocity}
+    law = {"solver": "exact", "stabilisation": "none", "deformation_damping": 0.0}
+    result = simulate(a_mission(establish(), agents=agents, constraint=law))
+    assert "singular value 3 of 3" in result.ending
+    assert result.ending.endswith('errors grow: stabilisation = "pid" takes them back')
+
+
+def test_distances_without_slots_are_not_told_to_blend_a_shape():
+    """Where only distances are given, the smooth reference to try is that of distances."""
+    edges, lengths = [[1, 2], [2, 3], [1, 3], [1, 4]], [4.0, 4.0, 8.0, 5.0]
+    line = {"line": {"edges": edges, "distances": lengths}}
+    agents = {"mass": 1.0, "position": [[1, 6, 3], [8, 3, 3], [7, 6, 3], [0, 0, 3]]}
+    phase = establish(formation="line", reference="step", until=9.0)
+    mission = a_mission(phase, formations=line, agents=agents, constraint={"solver": "exact"})
+    assert simulate(mission).ending.endswith('smoothly: reference = "distances"')
+
+
+def test_a_stall_says_what_makes_the_steps_short():
+    """Gains a thousand times too large end in a diagnosis: when, which phase, singular value, force, what to relax."""
+    law = {"alpha": 3e5, "beta": 3e5, "gamma": 0.0}
+    result = simulate(a_mission(establish(until=4000.0), constraint=law, output_step=10.0))
+    assert not result.complete
+    assert re.search(
+        r"cannot go on at t = [\d.]+ s, in phase 'establish 1': \d+ steps have", result.ending
+    )
+    assert "singular value 3 of 3" in result.ending
+    assert re.search(
+        r"force on agent \d, \S+ N\. Steps as short as this come from gains", result.ending
+    )
+
+
+def test_a_compiled_force_that_is_lost_is_named():
+    """A cfunc whose force is not finite from 2 s on ends the flight there, and the diagnosis names it."""
+    from numba import carray, cfunc, types
+
+    pointer = types.CPointer(types.float64)
+
+    @cfunc(types.void(types.float64, pointer, pointer, pointer, types.intp))
+    def lost(t, r, v, f, n):  # pragma: no cover
+        force = carray(f, (n, 3))
+        force[:] = 0.0
+        if t > 2.0:
+            force[1, 0] = np.nan
+
+    result = simulate(a_mission(), force=lost)
+    assert result.time[-1] == pytest.approx(2.0, abs=0.051)
+    assert "cannot go on at t = 2.000 s, in phase 'establish 1': the step size" in result.ending
+    assert result.ending.endswith("not finite on agent 2: mend that function")
 
 
 class Interrupt:
@@ -742,15 +890,32 @@ def test_what_is_no_force_is_refused(kind, returned, message):
 
 
 @pytest.mark.parametrize("kind", ["controller", "force"])
-def test_an_exception_of_a_users_function_reaches_the_user(kind):
-    """What a controller or a force raises comes out as it is."""
+@pytest.mark.parametrize("since", [0.0, 4.5])
+def test_an_exception_of_a_users_function_keeps_the_flight(kind, since):
+    """What a controller or a force raises is named with its time, and comes with what had flown."""
 
-    def broken(*_: Any) -> None:
-        raise LookupError("no wind today")
+    def broken(*seen: Any) -> np.ndarray:
+        t = seen[0].t if kind == "controller" else seen[0]
+        if t >= since:
+            raise LookupError("no wind today")
+        return np.full((3, 3), 0.1)
 
-    mission = a_mission(establish(until=4.0), {"kind": "hold", "duration": 1.0})
-    with pytest.raises(LookupError, match="no wind today"):
-        simulate(mission, **as_option(kind, broken))
+    phases = (
+        {"kind": "establish", "formation": "triangle", "until": 4.0},
+        {"kind": "hold", "until": 5.0},
+    )
+    with pytest.raises(
+        FlightError, match=f"the {kind} raised LookupError at t = .*no wind"
+    ) as stop:
+        simulate(a_mission(*phases), **as_option(kind, broken))
+    assert isinstance(stop.value.__cause__, LookupError)
+    result = stop.value.result
+    if since:
+        assert not result.complete
+        assert result.time[-1] == pytest.approx(since, abs=0.05)
+        assert str(stop.value) in result.ending
+        assert "in phase 'hold 2'" in result.ending
+        assert np.isfinite(result.position).all()
 
 
 @pytest.mark.parametrize("rate", [0.0, -50.0, np.nan])

@@ -63,7 +63,8 @@ def establish(
     Parameters
     ----------
     mission : all of its phases are flown under distances or steps (``reference``), with ``control = "open"``, and
-        end at a time, like those of Table 1; tolerances, gains and masses are the mission's
+        end at a time, like those of Table 1; tolerances, gains and masses are the mission's. A damping of
+        "auto" is 0.03 throughout, as flights of one phase are not all in their formation, or none
     position, velocity : (B, N, 3) at the start, world axes [m, m/s]; at rest without velocities
     vectors : whether eight flights share a vector of the machine, and their steps: five times as fast, once the
         compiler has had its minute. By default where flying alone would take longer than that; this
@@ -111,6 +112,7 @@ def establish(
                 f"an ensemble solves densely, and '{plan.formation}' has too many edges for that"
                 f" ({len(plan.edges)}); vary such missions by `rigidfleet.sweep`"
             )
+        law = plan.program.law._replace(mu=mission.damping(None))
         edges = [(int(i), int(j)) for i, j in plan.edges]
         before = np.stack(
             [np.full(count, now.reference[e]) if e in now.reference else _distance(r, e) for e in edges], axis=1
@@ -119,7 +121,7 @@ def establish(
         y = np.column_stack([r.reshape(count, -1), v.reshape(count, -1), *sums])
         tolerances = mission.integrator
         ends = ensemble.fly_all(
-            plan.program,
+            plan.program._replace(law=law),
             y[finished],
             before[finished],
             (now.t, t_end),

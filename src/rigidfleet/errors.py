@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 
 class RigidfleetError(Exception):
@@ -63,7 +64,14 @@ class ResultError(RigidfleetError):
 
 
 class FlightError(RigidfleetError):
-    """A flight that cannot go on, or cannot begin."""
+    """A flight that cannot go on, or cannot begin.
+
+    Attributes
+    ----------
+    result : the `Result` of what had flown by then; None where nothing had
+    """
+
+    result: Any = None
 
 
 def _short(value: object, width: int = 60) -> str:

@@ -37,7 +37,9 @@ def separation(r: Array, radius: ArrayLike) -> tuple[Array, Ints]:
             least[k], pair[k] = _closest(points, radius)
         return least, pair
     for i in range(n - 1):
-        room = np.linalg.norm(r[:, i + 1 :] - r[:, i : i + 1], axis=2) - radius[i] - radius[i + 1 :]
+        apart = r[:, i + 1 :] - r[:, i : i + 1]
+        room = np.sqrt(np.einsum("kia,kia->ki", apart, apart)) - radius[i] - radius[i + 1 :]
+        room[np.isnan(room)] = np.inf  # who is nowhere hides nobody else
         j = room.argmin(axis=1)
         room = room[np.arange(len(r)), j]
         closer = room < least
@@ -105,6 +107,7 @@ def clearance(
             beyond = np.maximum(low - r, r - high)  # positive outside
             outside = np.linalg.norm(np.maximum(beyond, 0.0), axis=2)
             room = outside + np.minimum(beyond.max(axis=2), 0.0) - radius
+        room[np.isnan(room)] = np.inf
         i = room.argmin(axis=1)
         room = room[np.arange(len(r)), i]
         closer = room < least

@@ -30,6 +30,8 @@ from rigidfleet.route import (
 Array = NDArray[np.float64]
 
 _SOLVERS = {"iterated": k.ITERATED, "spectral": k.SPECTRAL, "exact": k.EXACT, "pinv": k.PINV}
+#: A formation is held from where all pairs are right within this part of the shortest distance.
+_NEAR = 0.1
 _SPLITS = {"equal": k.PINV_EQUAL, "inertia": k.PINV_INERTIA, "inertia+force": k.PINV_INERTIA_FORCE}
 
 
@@ -93,7 +95,11 @@ def plan_phase(mission: Mission, phase: Phase, now: Situation, t_end: float) -> 
             mission.agents.saturate, mission.gravity,
         ),
         graph=_graph(edges.tobytes(), masses.tobytes(), large=method != "dense"),
-        law=_law(mission, damped=phase.control != "slots" and len(edges) > 0),
+        law=_law(
+            mission,
+            _held(mission, name, now.r) if method == "dense" else None,
+            damped=phase.control != "slots" and len(edges) > 0,
+        ),
         reference=reference,
         motion=motion,
         feedback=feedback,
@@ -120,7 +126,19 @@ def _commanded(now: Situation, edges: NDArray[np.int64], other: Array) -> Array:
     return np.array([now.reference.get(e, d) for e, d in zip(keys, other.tolist(), strict=True)])
 
 
-def _law(mission: Mission, *, damped: bool) -> k.Law:
+def _held(mission: Mission, name: str | None, r: Array) -> str | None:
+    """The formation, if agents at r (N, 3) [m] are in it: all pairs within a tenth of the shortest."""
+    slots = mission.formation_slots(name) if name else None
+    if slots is None or len(slots) < 2:
+        return None
+    pairs = shapes.complete_graph(len(slots))
+    wanted = shapes.distances(slots, pairs)
+    return (
+        name if np.abs(shapes.distances(r, pairs) - wanted).max() <= _NEAR * wanted.min() else None
+    )
+
+
+def _law(mission: Mission, name: str | None, *, damped: bool) -> k.Law:
     c = mission.constraint
     pid = c.stabilisation == "pid"
     return k.Law(
@@ -128,7 +146,7 @@ def _law(mission: Mission, *, damped: bool) -> k.Law:
         beta=c.beta if pid else 0.0,
         gamma=c.gamma if pid else 0.0,
         solver=_SOLVERS[c.solver],
-        mu=c.damping,
+        mu=mission.damping(name),
         iterations=c.iterations,
         s0=c.threshold,
         cutoff=c.cutoff,

@@ -38,6 +38,10 @@ class Piece:
     attached: bool  # whether the slots carry the body frame
 
 
+#: Positions between samples, for how close agents come: times (K,) [s] and r (K, N, 3) [m].
+Watched = tuple["Array", "Array"]
+
+
 def assemble(
     mission: Mission,
     phases: Sequence[PhaseRecord],
@@ -45,6 +49,7 @@ def assemble(
     *,
     ending: str,
     statistics: dict[str, Any],
+    watched: Sequence[Watched] = (),
 ) -> Result:
     """Join the pieces of a flight and compute what follows from positions and forces."""
     pieces = [p for p in pieces if len(p.time)]
@@ -83,7 +88,13 @@ def assemble(
     motion = joined("motion")
     wrench = np.concatenate([f_u.sum(axis=1), np.cross(x, f_u).sum(axis=1)], axis=1)
     asked = joined("wrench")
-    separation, pair, clearance, agent, obstacle = _closeness(mission, r, left)
+    closeness = _closeness(mission, r, left)
+    for t, between in watched:  # a sample answers for all since the one before
+        k = np.minimum(np.searchsorted(time, t), len(time) - 1)
+        found = _closeness(mission, between, left[k])
+        _least(k, found[:2], closeness[:2])
+        _least(k, found[2:], closeness[2:])
+    separation, pair, clearance, agent, obstacle = closeness
     edges = mission.edges
     distance = np.linalg.norm(r[:, edges[:, 0]] - r[:, edges[:, 1]], axis=2)
     if not left.all():
@@ -151,6 +162,17 @@ def _closeness(mission: Mission, r: Array, left: NDArray[np.bool_]) -> tuple[Any
         for out, value in zip(found, values, strict=True):
             out[rows] = value
     return found
+
+
+def _least(k: Ints, found: tuple[Any, ...], least: tuple[Any, ...]) -> None:
+    """Take into ``least`` at index k what is less in ``found``; values first, then who has them."""
+    order = np.argsort(-found[0], kind="stable")  # of several at one index the least comes last
+    best = np.full(len(least[0]), -1)
+    best[k[order]] = order
+    less = np.flatnonzero(best >= 0)
+    less = less[found[0][best[less]] < least[0][less]]
+    for mine, theirs in zip(least, found, strict=True):
+        mine[less] = theirs[best[less]]
 
 
 def _attitudes(

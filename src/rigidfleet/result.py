@@ -176,13 +176,23 @@ class Result:
     ]
 
     separation: Annotated[
-        Floats, _v("time", "m", "least separation of two agents: centre distance minus radii")
+        Floats,
+        _v(
+            "time",
+            "m",
+            "least separation of two agents since the sample before: centre distance minus radii",
+        ),
     ]
     separation_pair: Annotated[
         Ints, _v("time end", "1", "the two agents with it, from 0; -1 for none")
     ]
     clearance: Annotated[
-        Floats, _v("time", "m", "least clearance to an obstacle: distance minus radius")
+        Floats,
+        _v(
+            "time",
+            "m",
+            "least clearance to an obstacle since the sample before: distance minus radius",
+        ),
     ]
     clearance_agent: Annotated[Ints, _v("time", "1", "the agent with it, from 0; -1 for none")]
     clearance_obstacle: Annotated[

@@ -21,7 +21,7 @@ from rigidfleet.kernel import flight, large
 from rigidfleet.kernel import program as k
 from rigidfleet.mission import Establish, Fly, Mission, Phase, Reshape, Settle, Turn
 from rigidfleet.plan import PhasePlan, Pose, Situation, about_cm, plan_phase
-from rigidfleet.record import Piece, assemble
+from rigidfleet.record import Piece, Watched, assemble
 from rigidfleet.result import PhaseRecord, Result
 
 if TYPE_CHECKING:
@@ -37,8 +37,12 @@ _STALLED, _STALLED_RATE, _MOST_STEPS = 50_000, 2_000.0, 5_000_000
 _RESIDUAL, _LEAST, _MOST_RESIDUAL = 1e-3, 1e-13, 1e-8
 #: Where a phase ends by settling, whether it has is asked this often [s].
 _CHECK = 0.1
+#: How close agents come is watched at least this often [s], whatever is recorded.
+_WATCH = 0.05
 #: Progress is reported this often [s of wall time].
 _REPORT = 0.1
+#: What to do about errors that nothing takes back.
+_FEEDBACK = '; without feedback errors grow: stabilisation = "pid" takes them back'
 #: A frame further than this from the slots it is attached to has left them [rad].
 _FLIPPED = math.pi / 2
 
@@ -119,7 +123,8 @@ def simulate(
         On Ctrl-C, with the incomplete result; before anything has flown, a plain
         KeyboardInterrupt.
     FlightError
-        The controller or the force returned something that is no force.
+        The controller or the force raised an exception, which is its cause, or returned something
+        that is no force; its ``result`` is what had flown, incomplete, or None.
     ValueError
         A time to record lies outside of the mission, or the control rate is not positive.
     """
@@ -131,6 +136,11 @@ def simulate(
             raise
         run.ending = f"interrupted at t = {run.now.t:.2f} s"
         raise FlightInterrupted(run.result()) from None
+    except FlightError as error:
+        if run.pieces:
+            run.ending = f"{error}, in phase '{run.phases[-1].name}'"
+            error.result = run.result()
+        raise
     if not run.pieces:
         raise FlightError(run.ending or "the flight ended before the first time to record")
     return run.result()
@@ -192,6 +202,7 @@ class Flight:
             0.0, np.array(mission.agents.position), np.array(mission.agents.velocity), frame=frame
         )
         self.pieces: list[Piece] = []
+        self.watched: list[Watched] = []
         self.phases: list[PhaseRecord] = []
         self.ending = ""
         self.started = self.reported = clock.perf_counter()
@@ -328,7 +339,7 @@ class Flight:
             leg.t, leg.phase.name, r.copy(), v.copy(), w.r_ref.copy(), w.v_ref.copy(),
             w.a_ref.copy(), self.masses.copy(), self.mission.gravity,
         )  # fmt: skip
-        f = _checked(controller(seen), self.mission.n_agents, "the controller", leg.t)
+        f = _asked("the controller", leg.t, self.mission.n_agents, controller, seen)
         return plan.program._replace(control=plan.program.control._replace(kind=k.OPEN, force=f))
 
     def _integrate(self, leg: Leg, program: k.Program, t_end: float) -> None:
@@ -373,7 +384,7 @@ class Flight:
         state = leg.state
         steps = 10
         fresh = state.count[0] == 0 or program is not leg.plan.program
-        times = self._samples(leg, t_end)
+        times, kept = self._watched(leg.t, self._samples(leg, t_end), t_end)
         samples = np.empty((len(times), len(state.y)))
         state.count[3] = 0
         first = np.nextafter(leg.t, math.inf)
@@ -398,8 +409,12 @@ class Flight:
             done = int(state.count[3])
             if state.count[0] and not state.count[1] and len(times) and times[0] <= first:
                 samples[0], done = state.y, 1  # no step was possible: the start is all there is
-            if done:
-                self._record(leg, program, times[:done], samples[:done])
+            times, samples, kept = times[:done], samples[:done], kept[:done]
+            if not kept.all():
+                r = _positions(leg.plan, samples[~kept], len(self.masses))
+                self.watched.append((times[~kept], r))
+            if kept.any():
+                self._record(leg, program, times[kept], samples[kept])
         if status != flight.FINISHED:
             raise StoppedError(self._diagnose(leg, collapsed=status == flight.COLLAPSED))
 
@@ -423,6 +438,24 @@ class Flight:
                 grid = np.sort(np.append(grid[abs(grid - exact) > 1e-9 * step], exact))
         start = [t if t == 0.0 else np.nextafter(t, math.inf)] if first else []
         return np.concatenate([start, grid])
+
+    def _watched(self, t: float, times: Array, t_end: float) -> tuple[Array, NDArray[np.bool_]]:
+        """Times to record and, where they are far apart, some in between; which of them to record."""
+        if self.times is None and self.mission.output_step <= _WATCH * (1 + 1e-9):
+            return times, np.ones(len(times), dtype=bool)
+        knots = np.concatenate([[t], times, [t_end]])
+        gaps = np.diff(knots)
+        parts = np.maximum(1, np.ceil(gaps / _WATCH - 1e-6)).astype(np.int64)
+        gap = np.repeat(np.arange(len(gaps)), parts)
+        step = np.arange(len(gap)) - np.repeat(np.cumsum(parts) - parts, parts) + 1
+        # Each gap ends at the time that it leads to: one to record, the last at the end.
+        full = np.where(
+            step == parts[gap], knots[gap + 1], knots[gap] + gaps[gap] * (step / parts[gap])
+        )
+        kept = (step == parts[gap]) & (gap < len(times))
+        if gaps[-1] <= 0.0:
+            full, kept = full[: -parts[-1]], kept[: -parts[-1]]
+        return full, kept
 
     def _settle(self, leg: Leg, settle: Settle) -> bool:
         """Integrate in short stretches until the phase has settled; False if its time was over."""
@@ -568,23 +601,41 @@ class Flight:
         if solver in ("exact", "pinv"):
             return (
                 f'{head}, and {where}. The force of solver "{solver}" has no bound where one of them'
-                ' vanishes. Use solver = "iterated" (or "spectral"), and references that move'
-                ' smoothly: reference = "shape" or "distances"'
+                f' vanishes. Use solver = "iterated" (or "spectral"){self._smoother(leg)}'
             )
         return f"{head}, and {where}. {self._remedy(leg, collapsed=collapsed)}"
 
+    def _smoother(self, leg: Leg) -> str:
+        """What else helps a law without bound: a smooth reference, feedback; "" where both are there."""
+        words = ""
+        if isinstance(leg.phase, Establish | Reshape) and leg.phase.reference == "step":
+            slots = self.mission.formation_slots(leg.phase.formation)
+            smooth = "distances" if slots is None else "shape"
+            words += f', with a reference that moves smoothly: reference = "{smooth}"'
+        if self.mission.constraint.stabilisation == "none":
+            words += _FEEDBACK
+        return words
+
     def _remedy(self, leg: Leg, *, collapsed: bool) -> str:
         """What to try where J is not to blame."""
+        beyond = leg.t + 1e-9 * max(1.0, leg.t)  # what happens at leg.t shows a moment later
         flight.closed_loop(
-            leg.t, leg.state.y, np.empty_like(leg.state.y), leg.plan.program, leg.workspace
+            beyond, leg.state.y, np.empty_like(leg.state.y), leg.plan.program, leg.workspace
         )
         w = leg.workspace
         names = {"input force": w.f_u, "constraint force": w.f_C, "external force": w.f_E}
         lost = [name for name, f in names.items() if not np.isfinite(f).all()]
+        if "external force" in lost and self.external is not None:
+            bad = np.flatnonzero(~np.isfinite(w.f_E).all(axis=1))
+            return f"The force of your own is not finite on agent {bad[0] + 1}: mend that function"
         if lost:
             return (
                 f"The {lost[0]} is not finite. Look for a gain, a distance or a mass far too large"
             )
+        if self.mission.constraint.stabilisation == "none" and np.abs(w.c).max(initial=0.0) > 1e-3:
+            k = int(np.abs(w.c).argmax())
+            i, j = leg.plan.edges[k] + 1
+            return f"The distance {i}-{j} is {w.c[k]:+.3g} m off{_FEEDBACK}"
         name, f = max(names.items(), key=lambda item: float(np.abs(item[1]).max()))
         agent = int(np.abs(f).max(axis=1).argmax())
         size = float(np.linalg.norm(f[agent]))
@@ -648,8 +699,9 @@ class Flight:
             "solvers": {method: vars(counts) for method, counts in self.solves.items()},
         }  # fmt: skip
         return assemble(
-            self.mission, self.phases, self.pieces, ending=self.ending, statistics=statistics
-        )
+            self.mission, self.phases, self.pieces, ending=self.ending, statistics=statistics,
+            watched=self.watched,
+        )  # fmt: skip
 
 
 def _check_size(mission: Mission, phase: Phase) -> None:
@@ -688,6 +740,18 @@ def _jacobian(leg: Leg, n: int) -> tuple[Array, int, float]:
     return J.reshape(len(edges), -1), closest, float(lengths[closest])
 
 
+def _positions(plan: PhasePlan, states: Array, n: int) -> Array:
+    """Positions (K, N, 3) [m], world axes, of states of the kernel (K, n)."""
+    x = states[:, : 3 * n].reshape(-1, n, 3)
+    if not plan.program.body_formulation:
+        return x
+    q = 6 * n + len(plan.edges)
+    T = att.dcm_from_quaternion(
+        states[:, q : q + 4] / np.linalg.norm(states[:, q : q + 4], axis=1, keepdims=True)
+    )
+    return np.einsum("kba,kib->kia", T, x) + states[:, None, q + 4 : q + 7]
+
+
 def _times(times: ArrayLike, end: float) -> Array:
     """Times [s] to record, sorted; those that rounding has put behind the end are at the end."""
     t = np.unique(np.asarray(times, dtype=float))
@@ -720,6 +784,18 @@ def _target(phase: Phase, plan: PhasePlan) -> dict[str, Any] | None:
         "attitude": att.quaternion_from_dcm(plan.goal.T).tolist() if turns else None,
         "rates": plan.goal.omega.tolist() if turns else None,
     }
+
+
+def _asked(
+    who: str, t: float, n: int, function: Callable[..., ArrayLike], *arguments: object
+) -> Array:
+    """Forces (N, 3) [N] that a user's function gives, or an error that says what came instead."""
+    try:
+        f = function(*arguments)
+    except Exception as error:
+        words = f"{who} raised {type(error).__name__} at t = {t:.3f} s: {error}"
+        raise FlightError(words) from error
+    return _checked(f, n, who, t)
 
 
 def _checked(f: ArrayLike, n: int, who: str, t: float) -> Array:
@@ -763,8 +839,8 @@ class _External:
             arrays = [np.ctypeslib.as_array(a, (count, 3)) for a in (r, v, f)]
             try:
                 if self.error is None:
-                    arrays[2][:] = _checked(
-                        force(t, arrays[0].copy(), arrays[1].copy()), n, "the force", t
+                    arrays[2][:] = _asked(
+                        "the force", t, n, force, t, arrays[0].copy(), arrays[1].copy()
                     )
                     return
             except BaseException as error:

@@ -23,11 +23,14 @@ from rigidfleet.result import Result
 
 # Rounding on a limit is not beyond it.
 _SLACK = 1e-9
+#: A moment further than this from every sample has not been seen [s]: at 10 m/s, a waypoint's tolerance.
+_UNSEEN = 0.01
 
 
 def findings(flight: Flight, verdict: Verdict) -> Iterator[Finding]:
     """Every check of a flight: of one that can fail in several phases all that do, else the worst."""
     yield _complete(flight.result)
+    yield from _unseen(flight.result)
     candidates = [
         *_settled(verdict.phases),
         *_shapes(flight, verdict.phases),
@@ -65,14 +68,40 @@ def _failures_or_worst(candidates: Iterable[Finding]) -> Iterator[Finding]:
 
 def _complete(result: Result) -> Finding:
     end = float(result.time[-1])
-    finite = np.isfinite(result.position).all(axis=(1, 2))
-    if not finite.all():
-        bad = float(result.time[int(np.argmin(finite))])
-        return Finding("complete", False, f"positions are not finite from {bad:.2f} s on", when=bad)
+    lost = ~np.isfinite(result.position).all(axis=2)
+    if lost.any():
+        bad = float(result.time[int(np.argmax(np.any(lost, axis=1)))])
+        who = names(np.flatnonzero(np.any(lost, axis=0)))
+        words = f"the position of {who} is not finite, first at {bad:.2f} s"
+        return Finding("complete", False, words, when=bad, who=who)
     if result.complete:
         return Finding("complete", True, f"flown to its end at {end:.2f} s", when=end)
     words = f"incomplete, it ends at {end:.2f} s: {result.ending or 'it was stopped'}"
     return Finding("complete", False, words, when=end, phase=result.phases[-1].name)
+
+
+def _unseen(result: Result) -> Iterator[Finding]:
+    """Ends of shaping phases and waypoints of which no sample tells: they are not judged, nor passed."""
+    last = len(result.phases) - 1
+    for i, p in enumerate(result.phases):
+        if not result.complete and i == last:
+            continue
+        moments = {"waypoint": p.target["time"] if p.target is not None else None}
+        if p.kind in ("establish", "reshape") or i == last:
+            moments["end"] = p.t_end
+        for what, t in moments.items():
+            if t is None:
+                continue
+            seen = result.time[result.samples(i)]
+            away = float(np.abs(seen - min(t, p.t_end)).min(initial=np.inf))
+            if away > _UNSEEN:
+                nearest = (
+                    f"the nearest sample is {away:.2g} s from it"
+                    if len(seen)
+                    else "it has no sample"
+                )
+                words = f"the {what} of phase '{p.name}' ({t:.2f} s) is not judged: {nearest}. Record it, too"
+                yield Finding("samples", False, words, away, _UNSEEN, "s", when=t, phase=p.name)
 
 
 def _settled(phases: list[PhaseVerdict]) -> Iterator[Finding]:

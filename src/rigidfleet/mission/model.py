@@ -12,6 +12,7 @@ from typing import Any, Self
 import numpy as np
 from pydantic import PrivateAttr
 
+from rigidfleet import geometry
 from rigidfleet.errors import Finding, MissionError
 from rigidfleet.formation import Floats, Ints, assigned, assigned_upright, distances
 from rigidfleet.mission.check import check
@@ -23,6 +24,10 @@ from rigidfleet.mission.toml import to_toml
 _SHIPPED = resources.files("rigidfleet") / "missions"
 #: A device or a video given by mistake is noticed before memory is full.
 _LARGEST = 64 * 2**20
+#: Least and greatest damping that "auto" takes: below, rounding shows; docs/robustness.md has the table.
+_DAMPING = (1e-5, 0.03)
+#: Beyond so many equations eigenvalues take too long; the greatest damping is taken.
+_DENSE = 1000
 
 
 class Mission(Contents):
@@ -151,6 +156,24 @@ class Mission(Contents):
         slots = self.formation_slots(name)
         assert slots is not None  # checked: without distances there are a shape or slots
         return distances(slots, self.formation_edges(name))
+
+    def damping(self, name: str | None) -> float:
+        """Damping mu [-] of the iterated solve while a formation is held; ``name`` None: on the way.
+
+        "auto" is a quarter of the smallest non-zero eigenvalue w of mbar J M^-1 J^T at the
+        formation, at most 0.03; and 0.03 on the way to one, or where there are no slots.
+        """
+        given = self.constraint.damping
+        if given != "auto":
+            return given
+        slots = self.formation_slots(name) if name else None
+        if name is None or slots is None or not len(self.formation_edges(name)):
+            return _DAMPING[1]
+        edges = self.formation_edges(name)
+        if min(len(edges), 3 * self.n_agents) > _DENSE:
+            return _DAMPING[1]
+        index = geometry.smallest_singular_value(slots[None], edges, self.agents.mass)[0]
+        return float(np.clip(index**2 / 4, *_DAMPING))
 
     @property
     def latest_end(self) -> float:

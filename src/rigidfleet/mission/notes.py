@@ -91,6 +91,10 @@ class Notes:
         self.add(path, *_explain(error, path, owner))
 
 
+#: Words for what is called "none".
+_OFF = ("off", "no", "never", "disabled", False)
+
+
 def look_up(data: Any, path: Keys, default: Any = None) -> Any:
     """What is at a path of keys, or the default."""
     for step in path:
@@ -154,7 +158,7 @@ def _explain(error: Any, path: Keys, owner: type[Part]) -> tuple[str, str]:
             words = _words(context["expected"])
             return f"must be {context['expected']}", near(
                 error["input"], words
-            ) or f"use {words[0]}"
+            ) or f"use {'none' if error['input'] in _OFF and 'none' in words else words[0]}"
         case "too_short" if context["min_length"] == 1:
             return "is empty", meaning
         case "too_short" | "too_long":

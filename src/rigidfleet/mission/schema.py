@@ -56,6 +56,11 @@ Edges = Annotated[
     Discriminator(_form),
 ]
 
+Damping = Annotated[
+    Annotated[Positive, Tag("one")] | Annotated[Literal["auto"], Tag("word")],
+    Discriminator(lambda value: "word" if isinstance(value, str) else "one"),
+]
+
 
 _Error = Annotated[float, Strict(), Field(gt=-1, le=HUGE)]
 _Three = Field(min_length=3, max_length=3)
@@ -163,7 +168,11 @@ class Constraint(Part):
         description="iterated Tikhonov; spectral damping (gentler under steps); exact, the paper's "
         "inverse; pinv, the pseudo-inverse",
     )
-    damping: Positive = Field(0.03, description="mu of the iterated solver [-], > 0")
+    damping: Damping = Field(
+        "auto",
+        description="mu of the iterated solver [-], > 0; auto: 0.03, and in phases that begin in their "
+        "formation a quarter of its smallest non-zero w if that is less",
+    )
     iterations: Annotated[int, Strict(), Field(ge=1, le=100)] = Field(
         3, description="number k of iterations of the iterated solver, 1 to 100"
     )

@@ -77,7 +77,7 @@ def _constraint(mission: Mission) -> list[Line]:
                 Line("overshoot", f"{beyond:.3g} %", f"how far an error passes zero: {why}"),
             ]
     setting = {
-        "iterated": f"μ = {c.damping:g}, {c.iterations} iterations",
+        "iterated": f"μ = {_damping(mission)}, {c.iterations} iterations",
         "spectral": f"s₀ = {c.threshold:g}",
         "exact": "",
         "pinv": f"cut-off {c.cutoff:g}",
@@ -89,6 +89,13 @@ def _constraint(mission: Mission) -> list[Line]:
         meaning = "what distances do not see dies out at this rate while no slots are tracked"
         found.append(Line("deformation damping", rate, meaning))
     return found
+
+
+def _damping(mission: Mission) -> str:
+    """Damping of the iterated solve: of all formations, if it follows them."""
+    every = [mission.damping(name) for name in mission.formations] or [mission.damping(None)]
+    low, high = f"{min(every):.2g}", f"{max(every):.2g}"
+    return low if low == high else f"{low} to {high}"
 
 
 def _tracking(mission: Mission) -> list[Line]:

@@ -134,10 +134,10 @@ class Framework:
 
     def spare(self) -> Ints:
         """Edges that could all go at once without loss of rank, long ones first."""
-        from scipy.linalg import qr
-
         if self.stresses == 0:
             return np.zeros(0, dtype=np.int64)
+        from scipy.linalg import qr
+
         # Pivoting takes the largest remainder: a weight makes short edges large. It spans the range all the
         # same, since each pivot is independent of those before.
         weight = self.lengths.min() / self.lengths
@@ -168,7 +168,19 @@ def localised(frame: Framework) -> list[tuple[tuple[int, ...], Floats]]:
             basis.add(motion)
     for motion in F.T:
         basis.add(motion.reshape(n, d))
-    out = [(tuple(np.flatnonzero(f.any(axis=1)).tolist()), f) for f in basis.chosen]
+    return _apart(basis.chosen)
+
+
+def _apart(motions: list[Floats]) -> list[tuple[tuple[int, ...], Floats]]:
+    """Motions (N, d) with the agents that move, fewest first, without what is some fewer agents' own."""
+    out: list[tuple[tuple[int, ...], Floats]] = []
+    for motion in sorted(motions, key=lambda f: int(np.count_nonzero(np.any(f, axis=1)))):
+        f, moves = motion.copy(), set(np.flatnonzero(np.any(motion, axis=1)).tolist())
+        for who, g in out:
+            if moves.issuperset(who):
+                f -= (f * g).sum() * g
+        f[np.abs(f) <= ZERO * np.abs(motion).max()] = 0.0
+        out.append((tuple(np.flatnonzero(f.any(axis=1)).tolist()), f / np.linalg.norm(f)))
     return sorted(out, key=lambda flex: (len(flex[0]), flex[0]))
 
 

@@ -143,6 +143,8 @@ def finite_flex(energy: StressEnergy, starts: int = 8, seed: int = 0) -> tuple[F
     Returned besides: whether a flex was found that goes on to second order.
     """
     frame = energy.frame
+    if energy.k == 0:
+        return None, False  # a stress all but blocks every flex
     few = sparse(energy.flexes, frame.rigid, energy.n, starts)
     candidates = [energy.flexes.T @ motion.ravel() for motion in few]
     candidates += list(np.random.default_rng(seed).normal(size=(starts, energy.k)))
