@@ -193,7 +193,8 @@ def test_all_missions_fly_with_one_compiled_kernel():
     flown("narrow-passage", "body")
     simulate(Mission.from_dict(load_mission("single-waypoint").to_dict() | {"formulation": "body"}))
     integrate: Any = flight.integrate
-    assert len(integrate.signatures) == 1
+    plain = [s for s in integrate.signatures if "lanes" not in str(s)]  # those of ensembles
+    assert len(plain) == 1
 
 
 @pytest.mark.long
