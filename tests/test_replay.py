@@ -8,7 +8,7 @@ from importlib import import_module
 
 import numpy as np
 import pytest
-from flights import swarm
+from sample_flights import swarm
 
 from rigidfleet.errors import ResultError
 from rigidfleet.figures import agent_colours

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 from chromium import Browser, started
-from flights import swarm
+from sample_flights import swarm
 
 
 @pytest.fixture(scope="session")

@@ -7,7 +7,7 @@ import time
 import numpy as np
 import pytest
 from chromium import started
-from flights import swarm
+from sample_flights import swarm
 
 from rigidfleet import attitude as att
 from rigidfleet.replay import replay
