@@ -39,6 +39,8 @@ _RESIDUAL, _LEAST, _MOST_RESIDUAL = 1e-3, 1e-13, 1e-8
 _CHECK = 0.1
 #: How close agents come is watched at least this often [s], whatever is recorded.
 _WATCH = 0.05
+#: That takes so many numbers of memory in a stretch at most; the watch over longer ones is coarser.
+_WATCHED = 10_000_000
 #: Progress is reported this often [s of wall time].
 _REPORT = 0.1
 #: What to do about errors that nothing takes back.
@@ -384,7 +386,8 @@ class Flight:
         state = leg.state
         steps = 10
         fresh = state.count[0] == 0 or program is not leg.plan.program
-        times, kept = self._watched(leg.t, self._samples(leg, t_end), t_end)
+        least = max(_WATCH, (t_end - leg.t) * len(state.y) / _WATCHED)
+        times, kept = self._watched(leg.t, self._samples(leg, t_end), t_end, least)
         samples = np.empty((len(times), len(state.y)))
         state.count[3] = 0
         first = np.nextafter(leg.t, math.inf)
@@ -439,20 +442,22 @@ class Flight:
         start = [t if t == 0.0 else np.nextafter(t, math.inf)] if first else []
         return np.concatenate([start, grid])
 
-    def _watched(self, t: float, times: Array, t_end: float) -> tuple[Array, NDArray[np.bool_]]:
-        """Times to record and, where they are far apart, some in between; which of them to record."""
-        if self.times is None and self.mission.output_step <= _WATCH * (1 + 1e-9):
+    def _watched(
+        self, t: float, times: Array, t_end: float, step: float
+    ) -> tuple[Array, NDArray[np.bool_]]:
+        """Times to record and, where further apart than a step [s], some between; which to record."""
+        if self.times is None and self.mission.output_step <= step * (1 + 1e-9):
             return times, np.ones(len(times), dtype=bool)
         knots = np.concatenate([[t], times, [t_end]])
         gaps = np.diff(knots)
-        parts = np.maximum(1, np.ceil(gaps / _WATCH - 1e-6)).astype(np.int64)
+        parts = np.maximum(1, np.ceil(gaps / step - 1e-6)).astype(np.int64)
         gap = np.repeat(np.arange(len(gaps)), parts)
-        step = np.arange(len(gap)) - np.repeat(np.cumsum(parts) - parts, parts) + 1
+        part = np.arange(len(gap)) - np.repeat(np.cumsum(parts) - parts, parts) + 1
         # Each gap ends at the time that it leads to: one to record, the last at the end.
         full = np.where(
-            step == parts[gap], knots[gap + 1], knots[gap] + gaps[gap] * (step / parts[gap])
+            part == parts[gap], knots[gap + 1], knots[gap] + gaps[gap] * (part / parts[gap])
         )
-        kept = (step == parts[gap]) & (gap < len(times))
+        kept = (part == parts[gap]) & (gap < len(times))
         if gaps[-1] <= 0.0:
             full, kept = full[: -parts[-1]], kept[: -parts[-1]]
         return full, kept
