@@ -11,7 +11,7 @@ INSTALL := $(BIN)/uv pip install --quiet --python $(BIN)/python \
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test bench robustness docs lint format constraints clean
+.PHONY: help setup demo test bench peers robustness docs lint format constraints clean
 
 help:  ## Show this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' Makefile
@@ -27,6 +27,9 @@ test: .venv/.dev  ## Run the tests (MARK= runs the long ones, too)
 bench: .venv/.bench  ## Measure the speed, as ratios
 	@$(BIN)/python benchmarks/run.py
 	@$(BIN)/python benchmarks/many.py
+
+peers: .venv/.peers  ## Fly beside other programs (Octave, too, if it is on PATH)
+	@$(BIN)/python benchmarks/compare.py
 
 robustness: .venv/.bench  ## Fly 200 random formations under every graph and law
 	@$(BIN)/python benchmarks/robustness.py
@@ -48,7 +51,7 @@ format: .venv/.dev  ## Rewrite the code in the project's style
 
 constraints: .venv/.dev  ## Choose newer versions of all packages
 	@$(BIN)/uv pip compile --quiet --universal --upgrade --no-emit-index-url --no-header \
-		--no-annotate --all-extras --group dev --group bench --group docs --group build \
+		--no-annotate --all-extras --group dev --group bench --group peers --group docs --group build \
 		pyproject.toml --output-file constraints.txt
 
 clean:  ## Remove .venv, caches and builds
@@ -68,7 +71,7 @@ clean:  ## Remove .venv, caches and builds
 	@$(INSTALL)
 	@touch $@
 
-.venv/.dev .venv/.bench .venv/.docs: .venv/.%: .venv/.core
+.venv/.dev .venv/.bench .venv/.peers .venv/.docs: .venv/.%: .venv/.core
 	@echo "Installing what '$*' needs"
 	@$(INSTALL) --group $*
 	@touch $@

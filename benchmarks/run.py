@@ -42,6 +42,8 @@ DURATION, SAMPLES = 20.0, 200
 FLIGHTS, SCIPYS = 1000, 5
 RTOL, ATOL = 1e-6, 1e-8
 SPREAD = 0.25
+#: Missions flown, and their agents.
+FORMATIONS = {"establish-triangle": 3, "establish-cube": 8}
 #: Peers fly the same law: their positions may differ by no more [m].
 AGREEMENT = 1e-6
 
@@ -56,6 +58,7 @@ class Row:
     goal: float | None
     faster: bool  # ratio theirs/ours, at least the goal; else ours/theirs, at most the goal
     note: str = ""
+    evaluations: float | None = None  # of the right-hand side in one of our flights
 
     @property
     def ratios(self) -> list[float]:
@@ -104,13 +107,13 @@ def peer(mission: Mission, kind: type[Peer]) -> Peer:
         gains=(c.alpha, c.beta, c.gamma),
         reference=constant(d1) if steps else squared(d0, d1, mission.phases[0].blend),
         f=np.tile(mission.phases[0].input_force, (len(m), 1)),
-        mu=c.damping if c.solver == "iterated" else 0.0,
+        mu=mission.damping(None) if c.solver == "iterated" else 0.0,
         iterations=c.iterations,
         k_def=c.deformation_damping,
     )
 
 
-def compiled_flight(mission: Mission) -> Callable[[], np.ndarray]:
+def compiled_flight(mission: Mission, tolerance: float = TOLERANCE) -> Callable[[], np.ndarray]:
     """The kernel alone: all that is known before the flight is prepared before the clock starts."""
     agents = mission.agents
     now = Situation(0.0, np.array(agents.position), np.array(agents.velocity))
@@ -119,7 +122,7 @@ def compiled_flight(mission: Mission) -> Callable[[], np.ndarray]:
     y = np.concatenate([now.r.ravel(), now.v.ravel(), np.zeros(len(plan.edges))])
     times = np.linspace(0.0, DURATION, SAMPLES)
     samples = np.empty((SAMPLES, len(y)))
-    start = flight.integrator(y, 0.0, rtol=TOLERANCE, atol=np.full(len(y), TOLERANCE))
+    start = flight.integrator(y, 0.0, rtol=tolerance, atol=np.full(len(y), tolerance))
     state = start._replace(y=y.copy(), clock=start.clock.copy(), count=start.count.copy())
 
     def fly() -> np.ndarray:
@@ -149,7 +152,7 @@ def flights(rounds: int) -> tuple[list[Row], bool]:
         (False, "undamped law", {3: 250.0, 8: 50.0}),
         (True, "default law", {3: 150.0, 8: 30.0}),
     ):
-        for source, n in (("establish-triangle", 3), ("establish-cube", 8)):
+        for source, n in FORMATIONS.items():
             mission = establishment(source, default_law=default_law)
             ours = compiled_flight(mission)
             literal, tuned = peer(mission, Literal), peer(mission, Peer)
@@ -158,7 +161,7 @@ def flights(rounds: int) -> tuple[list[Row], bool]:
                 for p in (literal, tuned)
             )
             agree &= off <= AGREEMENT
-            simulate(mission, times=times)
+            evaluations = simulate(mission, times=times).statistics["evaluations"]
             jobs = {
                 "literal": lambda p=literal: p.fly(times, TOLERANCE),
                 "tuned": lambda p=tuned: p.fly(times, TOLERANCE),
@@ -172,7 +175,7 @@ def flights(rounds: int) -> tuple[list[Row], bool]:
             title = f"{n} agents, {law}"
             note = f"positions agree to {off:.0e} m"
             rows += [
-                Row(title, spent["kernel"], spent["literal"], goals[n], True, note),
+                Row(title, spent["kernel"], spent["literal"], goals[n], True, note, evaluations),
                 Row("  hand-tuned NumPy", spent["kernel"], spent["tuned"], None, True),
                 Row("  all of simulate()", spent["simulate"], spent["literal"], None, True),
             ]
@@ -186,7 +189,7 @@ def ensembles(rounds: int) -> list[Row]:
         (False, "undamped law", {3: 4000.0, 8: 500.0}),
         (True, "default law", {3: None, 8: None}),
     ):
-        for source, n in (("establish-triangle", 3), ("establish-cube", 8)):
+        for source, n in FORMATIONS.items():
             data = establishment(source, default_law=default_law).to_dict()
             data["integrator"] = {"rtol": RTOL, "atol": ATOL}
             mission = Mission.from_dict(data)
@@ -208,41 +211,82 @@ def ensembles(rounds: int) -> list[Row]:
                     all_of_them = partial(establish, mission, starts, vectors=choice)
                     times.append(seconds(all_of_them, 0.1) / FLIGHTS)
             title = f"{n} agents, {law}, {FLIGHTS:,} flights"
+            evaluations = float(np.median(ours.evaluations))
             note = (
-                f"median {np.median(ours.evaluations):.0f} evaluations; positions agree to"
+                f"median {evaluations:.0f} evaluations; positions agree to"
                 f" {np.abs(ours.position[0] - theirs).max():.0e} m"
             )
             rows += [
-                Row(title, vectors, scipy, goals[n], True, note),
+                Row(title, vectors, scipy, goals[n], True, note, evaluations),
                 Row("  each flight alone", alone, scipy, None, True),
             ]
     return rows
 
 
-def processes(rounds: int) -> list[Row]:
-    """Whole processes: a run with a warm cache, and the first one ever."""
-    program = [sys.executable, "-m", "rigidfleet", "run", "narrow-passage", "--no-figures"]
-    bare = [sys.executable, "-c", "import numpy, scipy.linalg, numba"]
-    with tempfile.TemporaryDirectory() as folder:
-        program += ["--out", folder, "--force"]
+def operations(mission: Mission) -> dict[str, int]:
+    """Floating-point operations of an evaluation of the undamped law, by part; a root or quotient counts one.
 
-        def call(command: list[str], cache: str = "") -> None:
+    What its equations ask for, each common part once and A by its lower triangle: less than a compiler's code does.
+    """
+    edges = mission.formation_edges(mission.phases[0].formation)
+    n, m = mission.n_agents, len(edges)
+    degree = np.bincount(edges.ravel(), minlength=n)
+    # A pair of edges that share an agent: u_k . u_l over its mass; an edge with itself: the masses alone.
+    pairs = int((degree * (degree - 1) // 2).sum())
+    stages, weights = (
+        6,
+        1 + 2 + 3 + 4 + 5 + 5 + 6,
+    )  # Dormand and Prince: of the stages and of the error
+    return {
+        "edges: lengths, directions, rates, b": 45 * m,
+        "A": 6 * pairs + m,
+        "Cholesky factor and two solves": (2 * m**3 + 3 * m**2 + m) // 6 + 2 * m**2,
+        "forces and accelerations": 9 * m + 6 * n,
+        "its share of a step": (6 * n + m) * 2 * weights // stages,
+    }
+
+
+def bound() -> float:
+    """What all cores reach in a product of large matrices [operations/s]: near the machine's peak."""
+    n = 1500
+    a = np.random.default_rng(0).uniform(size=(n, n))
+    return 2.0 * n**3 / min(seconds(lambda: a @ a) for _ in range(5))
+
+
+def processes(rounds: int) -> list[Row]:
+    """Whole processes with a warm cache against a bare interpreter, and the first flight ever."""
+    with tempfile.TemporaryDirectory() as folder:
+        flight = ["run", "narrow-passage", "--no-figures", "--force", "--out", folder]
+        commands = {
+            "numpy": ["-c", "import numpy"],
+            "imports": ["-c", "import numpy, scipy.linalg, numba"],
+            "help": ["-m", "rigidfleet", "--help"],
+            "check": ["-m", "rigidfleet", "check", "narrow-passage"],
+            "run": ["-m", "rigidfleet", *flight],
+        }
+
+        def call(name: str, cache: str = "") -> None:
             # Bytecode is cached on both sides, as it is wherever packages are installed.
             drop = {"PYTHONDONTWRITEBYTECODE"}
             env = {k: v for k, v in os.environ.items() if k not in drop}
             env |= {"NUMBA_CACHE_DIR": cache} if cache else {}
+            command = [sys.executable, *commands[name]]
             subprocess.run(command, check=True, capture_output=True, env=env)
 
-        call(program)
-        call(bare)
-        warm, base = [], []
+        for name in commands:
+            call(name)
+        spent = {name: [] for name in commands}
         for _ in range(rounds):
-            warm.append(seconds(lambda: call(program)))
-            base.append(seconds(lambda: call(bare)))
-        first = [seconds(lambda: call(program, str(Path(folder) / "cache")))]
+            for name, times in spent.items():
+                times.append(seconds(lambda name=name: call(name)))
+        first = [seconds(lambda: call("run", str(Path(folder) / "cache")))]
+    bare = "whole process, against a bare interpreter that imports NumPy"
     return [
-        Row("run narrow-passage", warm, base, 4.0, False, "whole process, against its imports"),
-        Row("the first run ever", first, [1.0], 40.0, False, "seconds, compile included"),
+        Row("--help", spent["help"], spent["numpy"], 3.0, False, bare),
+        Row("check narrow-passage", spent["check"], spent["numpy"], 8.0, False, bare),
+        Row("run narrow-passage", spent["run"], spent["numpy"], 12.0, False, bare),
+        Row("  against its imports", spent["run"], spent["imports"], 4.0, False),
+        Row("the first run ever", first, [1.0], 25.0, False, "seconds, compile included"),
     ]
 
 
@@ -281,14 +325,33 @@ def main() -> int:
     console.print(
         f"{DURATION:g} s of flight, tolerance {TOLERANCE:g}, {SAMPLES} outputs; SciPy: RK45"
     )
-    rows, agree = flights(arguments.rounds)
-    rows += ensembles(arguments.rounds)
-    rows += processes(arguments.rounds)
-    show(console, rows)
+    alone, agree = flights(arguments.rounds)
+    tables = {
+        "flights": alone,
+        "ensembles": ensembles(arguments.rounds),
+        "processes": processes(arguments.rounds),
+    }
+    show(console, [row for rows in tables.values() for row in rows])
+    most, counts = bound(), {}
+    for row, (source, n) in zip(
+        (r for r in tables["ensembles"] if "undamped" in r.name), FORMATIONS.items(), strict=True
+    ):
+        counts[str(n)] = operations(establishment(source, default_law=False))
+        total = sum(counts[str(n)].values())
+        rate = total * (row.evaluations or 0.0) / median(row.ours)
+        console.print(
+            f"{row.name}: {total} operations an evaluation, {1e-9 * rate:.3g} Gflop/s on all cores of"
+            f" {1e-9 * most:.3g} in a product of matrices",
+            highlight=False,
+        )
     if arguments.json:
-        data = [asdict(r) | {"ratios": r.ratios, "reached": r.reached} for r in rows]
+        data = {
+            name: [asdict(r) | {"ratios": r.ratios, "reached": r.reached} for r in rows]
+            for name, rows in tables.items()
+        }
         head = {"date": str(date.today()), "machine": machine, "versions": versions}
-        arguments.json.write_text(json.dumps(head | {"rows": data}, indent=1))
+        head |= {"cores": os.cpu_count(), "bound": most, "operations": counts}
+        arguments.json.write_text(json.dumps(head | data, indent=1))
     if not agree:
         console.print(f"The peers do not agree to {AGREEMENT:g} m: they do not fly the same law.")
     return 0 if agree else 1

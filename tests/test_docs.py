@@ -7,6 +7,7 @@ import re
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
@@ -44,18 +45,38 @@ def anchors(text: str) -> set[str]:
 # -- missions.md -------------------------------------------------------------------------------------
 
 
+def script(name: str) -> ModuleType:
+    """A script below docs, as a module."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / "docs" / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
 def test_tables_are_up_to_date():
     """The keys of the format, the variables of a result and the metrics of a sweep are those of the code.
 
     If this fails: python docs/tables.py
     """
-    spec = importlib.util.spec_from_file_location("tables", ROOT / "docs" / "tables.py")
-    assert spec is not None
-    assert spec.loader is not None
-    tables = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(tables)
+    tables = script("tables")
     for path in tables.PAGES:
         assert page(path.name) == tables.render(page(path.name))
+
+
+def test_measured_tables_come_from_measurements():
+    """Every table of speeds is one that the script writes from the benchmarks' files, and has been written."""
+    performance = script("performance")
+    places = [
+        place
+        for path in performance.PAGES
+        for place in re.findall(
+            r"<!-- measured: ([\w-]+) -->\n(.+?)\n<!-- end -->", path.read_text("utf-8"), re.DOTALL
+        )
+    ]
+    assert {name for name, _ in places} == set(performance.TABLES)
+    assert all("Not measured" not in text for _, text in places)
 
 
 def test_first_mission_flies():

@@ -1,6 +1,15 @@
-"""How the kernel is compiled: one decorator, the same options everywhere."""
+"""How the kernel is compiled: the same options everywhere, and a cache that notices every change.
 
+Numba's own cache does not notice a change in a callee that lives in another file, so the cache
+folder is keyed here by a digest of all sources of the kernel.
+"""
+
+import hashlib
+import os
+import sys
+import tempfile
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numba
@@ -25,7 +34,7 @@ _OPTIONS: dict[str, Any] = {
 
 def compiled(function: F) -> F:
     """Compile for the flight: cached on disk, without the GIL, without allocation."""
-    return numba.njit(**_OPTIONS)(function)
+    return _cached(function, _OPTIONS)
 
 
 def inlined(function: F) -> F:
@@ -33,7 +42,7 @@ def inlined(function: F) -> F:
 
     A call would copy every field of theirs, some 300 numbers, to the stack.
     """
-    return numba.njit(forceinline=True, **_OPTIONS)(function)
+    return _cached(function, _OPTIONS | {"forceinline": True})
 
 
 @intrinsic
@@ -47,3 +56,42 @@ def call_solver(_context, address):
         return context.get_dummy_value()
 
     return types.void(types.int64), generate
+
+
+def cache_directory() -> Path:
+    """Return the folder of the compiled kernel: one per state of its sources, Numba and Python.
+
+    The base is ``NUMBA_CACHE_DIR`` if set, else ``XDG_CACHE_HOME`` or ``~/.cache``; a folder that
+    cannot be written falls back to the system's temporary folder.
+    """
+    digest = hashlib.sha256(f"{numba.__version__} {sys.version}".encode())
+    for source in sorted(Path(__file__).parent.glob("*.py")):
+        digest.update(source.read_bytes())
+    base = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    for root in (Path(base).expanduser(), Path(tempfile.gettempdir())):
+        folder = root / "rigidfleet" / f"kernel-{digest.hexdigest()[:16]}"
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError:
+            continue
+        if os.access(folder, os.W_OK):
+            return folder
+    return folder
+
+
+def is_compiled() -> bool:
+    """Return whether the flight kernel is in the cache, so that nothing has to be compiled."""
+    return any(_CACHE.rglob("flight.integrate-*.nbc"))
+
+
+_CACHE = cache_directory()
+
+
+def _cached(function: F, options: dict[str, Any]) -> F:
+    """Compile with the kernel's own cache folder; other users of Numba keep theirs."""
+    before = numba.config.CACHE_DIR
+    numba.config.CACHE_DIR = str(_CACHE)
+    try:
+        return numba.njit(**options)(function)
+    finally:
+        numba.config.CACHE_DIR = before

@@ -87,7 +87,8 @@ def _number_or_list(lowest: str) -> WithJsonSchema:
 class Part(BaseModel):
     """A table of a mission file: frozen, without unknown keys, with finite numbers."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    # Tables are validated one by one; a kind that a mission lacks is never prepared.
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, defer_build=True)
 
 
 class Start(Part):
@@ -566,9 +567,6 @@ class Header(Part):
 
 class Contents(Header):
     """A whole mission file."""
-
-    # Its tables are validated one by one; as a whole it is only needed for its schema.
-    model_config = ConfigDict(defer_build=True)
 
     agents: Agents = Field(description="the vehicles: [agents]")
     constraint: Constraint = Field(

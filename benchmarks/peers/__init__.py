@@ -1,0 +1,1 @@
+"""What else would fly a formation: one module a peer, each with `peer()`, which raises `AbsentError`."""

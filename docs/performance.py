@@ -1,0 +1,162 @@
+"""Write the tables of performance.md and README.md from what the benchmarks have measured.
+
+    python benchmarks/run.py --json bench.json
+    python benchmarks/compare.py --json peers.json --figure docs/images/work-precision.png
+    python docs/performance.py bench.json peers.json
+
+rewrites them in place, each between `<!-- measured: NAME -->` and `<!-- end -->`; a file may be left out, and its
+tables stay as they are. No number of theirs is written by hand.
+"""
+
+import json
+import re
+import sys
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+PAGES = [Path(__file__).with_name("performance.md"), Path(__file__).parents[1] / "README.md"]
+Data = dict[str, Any]
+
+
+def render(page: str, data: Data) -> str:
+    """A page with the tables that ``data`` (the benchmarks' files, as one) has the numbers of."""
+
+    def table(match: re.Match[str]) -> str:
+        name = match[1]
+        needed, write = TABLES[name]
+        text = write(data) if needed in data else match[2]
+        return f"<!-- measured: {name} -->\n{text}\n<!-- end -->"
+
+    return re.sub(r"<!-- measured: ([\w-]+) -->\n(.*?)\n<!-- end -->", table, page, flags=re.DOTALL)
+
+
+def _machine(data: Data) -> str:
+    """When and where `make bench` has run."""
+    versions = ", ".join(f"{name} {version}" for name, version in data["versions"].items())
+    return f"Measured on {data['date']}: {data['machine']}; {versions}."
+
+
+def _ratios(name: str, theirs: str) -> Any:
+    """A table of ratios against something else."""
+
+    def write(data: Data) -> str:
+        rows = [
+            (
+                row["name"].strip(),
+                _time(row["ours"]),
+                _time(row["theirs"]),
+                f"{median(row['ratios']):.3g}",
+                f"{min(row['ratios']):.3g} to {max(row['ratios']):.3g}",
+                "" if row["goal"] is None else f"{'≥' if row['faster'] else '≤'} {row['goal']:g}",
+            )
+            for row in data[name]
+        ]
+        return _table(("", "ours [ms]", f"{theirs} [ms]", "ratio", "rounds", "goal"), rows)
+
+    return write
+
+
+def _processes(data: Data) -> str:
+    """Whole processes: but for the first run, against a bare interpreter."""
+    *warm, first = data["processes"]
+    text = _ratios("processes", "interpreter")({"processes": warm})
+    return (
+        f"{text}\n\nThe first run ever: {median(first['ours']):.1f} s (goal: {first['goal']:g} s)."
+    )
+
+
+def _operations(data: Data) -> str:
+    """Operations of an evaluation, and how near to the bound the vectors come."""
+    counts = data["operations"]
+    rows = [
+        (part, *(f"{count[part]:,}" for count in counts.values()))
+        for part in next(iter(counts.values()))
+    ]
+    total = [sum(count.values()) for count in counts.values()]
+    rows.append(("together", *(f"{n:,}" for n in total)))
+    for name, title, cores in (
+        ("flights", "a flight alone, one core", 1),
+        ("ensembles", "eight to a vector, all cores", data["cores"]),
+    ):
+        found = [row for row in data[name] if row["evaluations"] and "undamped" in row["name"]]
+        each = [median(row["ours"]) / row["evaluations"] for row in found]
+        bound = data["bound"] * cores / data["cores"]
+        shares = zip(total, each, strict=True)
+        rows.append((f"{title}: ns an evaluation", *(f"{1e9 * s:,.0f}" for s in each)))
+        rows.append(("share of the bound", *(f"{100 * n / s / bound:.2g} %" for n, s in shares)))
+    text = _table(("", *(f"{n} agents" for n in counts)), rows)
+    return f"{text}\n\nThe bound: {1e-9 * data['bound']:.3g} Gflop/s on {data['cores']} cores."
+
+
+def _peers(data: Data) -> str:
+    """All of the comparison."""
+    rows = [
+        (
+            str(row["agents"]),
+            row["peer"],
+            f"{row['unit'].partition(' ')[0]} {row['effort']:g}",
+            f"{row['rate']:,.3g}" if row["rate"] < 1000 else f"{row['rate']:,.0f}",
+            f"{median(row['ratios']):.3g}",
+            f"{min(row['ratios']):.3g} to {max(row['ratios']):.3g}",
+            f"{row['error']:.0e}",
+            f"{row['from_ours']:.0e}",
+            f"{row['distances']:.0e}",
+        )
+        for row in data["rows"]
+    ]
+    head = ("agents", "", "setting", "simulated s in a second", "time / ours", "rounds")
+    text = _table((*head, "error [m]", "from ours [m]", "distances [m]"), rows)
+    absent = "".join(f"\n\nAbsent: {name}." for name in data["absent"])
+    return f"{text}\n\nMeasured on {data['date']}: {data['machine']}.{absent}"
+
+
+def _models(data: Data) -> str:
+    """In what the peers' models differ."""
+    texts = {f"{row['peer']} {row['version']}": row["model"] for row in data["rows"]}
+    return "\n".join(f"- *{name}*: {text}." for name, text in texts.items())
+
+
+def _summary(data: Data) -> str:
+    """Simulated seconds in a second: a row for each program, a column for each number of agents."""
+    agents = list(dict.fromkeys(row["agents"] for row in data["rows"]))
+    rates = {(row["peer"], row["agents"]): row["rate"] for row in data["rows"]}
+    names = {row["peer"]: f"{row['peer']} {row['version']}" for row in data["rows"]}
+    rows = [
+        (text, *(f"{float(f'{rates[peer, n]:.2g}'):,.10g}" for n in agents))
+        for peer, text in names.items()
+    ]
+    text = _table(("", *(f"{n} agents" for n in agents)), rows)
+    return f"{text}\n\nMeasured on {data['date']}: {data['machine']}."
+
+
+def _time(seconds: list[float]) -> str:
+    value = 1e3 * median(seconds)
+    return f"{value:.3g}" if value < 1000 else f"{value:,.0f}"
+
+
+def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
+    rule = ("---", *("--:" for _ in head[1:]))
+    return "\n".join(f"| {' | '.join(row)} |" for row in (head, rule, *rows))
+
+
+#: Each table's key in the files without which it cannot be written, and what writes it.
+TABLES: dict[str, tuple[str, Any]] = {
+    "machine": ("versions", _machine),
+    "flights": ("flights", _ratios("flights", "SciPy")),
+    "ensembles": ("ensembles", _ratios("ensembles", "SciPy")),
+    "operations": ("operations", _operations),
+    "processes": ("processes", _processes),
+    "peers": ("rows", _peers),
+    "models": ("rows", _models),
+    "summary": ("rows", _summary),
+}
+
+
+if __name__ == "__main__":
+    files = [json.loads(Path(name).read_text(encoding="utf-8")) for name in sys.argv[1:]]
+    for path in PAGES:
+        text = path.read_text(encoding="utf-8")
+        for found in files:
+            text = render(text, found)
+        path.write_text(text, encoding="utf-8")
