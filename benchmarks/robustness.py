@@ -45,6 +45,8 @@ SPACING, APART = 2.0, 1.0
 FLIGHT = 20.0
 #: Laws are compared on formations of so many agents at most, pinv on one fewer: it stalls, for minutes.
 FEW = 5
+#: Formations have so many agents at most.
+LARGEST = 20
 #: A pair is right within this part of the shortest distance.
 TOLERANCE = 0.01
 #: What the flight itself has to say, whatever comes near to whom.
@@ -161,12 +163,12 @@ def cases(count: int = 200, seed: int = 1) -> list[Case]:
 
 
 def shipped(seed: int) -> list[Case]:
-    """The formations of the missions that ship, each once, from random starts."""
+    """The formations of up to 20 agents of the missions that ship, each once, from random starts."""
     found: dict[bytes, Case] = {}
     for mission in map(load_mission, mission_names()):
         for name in mission.formations:
             slots = mission.formation_slots(name)
-            if slots is None:
+            if slots is None or len(slots) > LARGEST:
                 continue
             edges = mission.formation_edges(name)
             rng = np.random.default_rng([seed, len(found)])
@@ -180,7 +182,7 @@ def random_case(k: int, seed: int) -> Case:
     """Formation k: on a line, in a plane or in space, of 2, 3 or 4 to 20 agents, and a start."""
     rng = np.random.default_rng([seed, 1000 + k])
     d = 1 + k % 3
-    n = int(rng.integers(d + 1, 21))
+    n = int(rng.integers(d + 1, LARGEST + 1))
     side = 1.6 * SPACING * n ** (1 / d) * np.exp(rng.uniform(-0.5, 0.5, d))
     slots = np.zeros((n, 3))
     slots[:, :d] = scattered(rng, n, side, SPACING)

@@ -499,6 +499,7 @@ def test_run_on_a_full_disk():
     def shrink():
         resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
 
+    command("run", "short.toml", "--no-figures", "--out", "before")  # leaves what is compiled
     done = command("run", "short.toml", "--no-figures", preexec_fn=shrink)
     assert done.returncode == cli.BAD_INPUT
     assert done.stderr.splitlines()[-1].startswith(

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rigidfleet.kernel import ensemble
+from rigidfleet.kernel.lanes import WIDTH
 from rigidfleet.mission import Mission
 from rigidfleet.plan import plan_phase
 from rigidfleet.route import Situation
@@ -104,6 +105,9 @@ def establish(
     evaluations = np.zeros(count, dtype=np.int64)
     error = np.zeros(count)
     for phase in mission.phases:
+        if not finished.any():
+            break
+        places = _places(finished)
         t_end = now.t + (phase.duration or 0.0) if phase.until is None else phase.until
         # One plan for all: without slots, only the distances it starts from are a flight's own.
         plan = plan_phase(mission, phase, now, t_end)
@@ -122,17 +126,17 @@ def establish(
         tolerances = mission.integrator
         ends = ensemble.fly_all(
             plan.program._replace(law=law),
-            y[finished],
-            before[finished],
+            y[places],
+            before[places],
             (now.t, t_end),
             rtol=tolerances.rtol,
             atol=np.full(y.shape[1], tolerances.atol),
             lanes=vectors,
             threads=threads,
         )
-        y[finished] = ends.y
-        evaluations[finished] += ends.evaluations
-        finished[finished] = ends.finished
+        y[finished] = ends.y[finished]
+        evaluations[finished] += ends.evaluations[finished]
+        finished &= ends.finished
         r, v = (x.reshape(count, n, 3) for x in np.split(y[:, : 6 * n], 2, axis=1))
         integral |= dict(zip(edges, y[:, 6 * n :].T, strict=True))
         known = now.reference | dict(zip(edges, plan.distances.tolist(), strict=True))
@@ -151,6 +155,16 @@ def _starts(name: str, values: ArrayLike, agents: int) -> Array:
             f"{name} of flight {np.argwhere(~np.isfinite(starts))[0][0]} is not finite"
         )
     return starts
+
+
+def _places(finished: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Which flight takes each place: whoever is out lends it to a neighbour, so that the others keep theirs."""
+    places = np.arange(len(finished))
+    for k in np.flatnonzero(~finished):
+        first = k - k % WIDTH
+        near = np.flatnonzero(finished[first : first + WIDTH])
+        places[k] = first + near[0] if len(near) else np.flatnonzero(finished)[0]
+    return places
 
 
 def _distance(r: Array, edge: tuple[int, int]) -> Array:

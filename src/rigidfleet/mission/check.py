@@ -158,6 +158,10 @@ def _gains(notes: Notes, parts: dict[str, Any]) -> None:
         notes.add(("constraint", "gamma"), problem, remedy, c.gamma)
 
 
+#: Weights below this are none: a Riccati equation cannot tell them from zero.
+_NO_WEIGHT = 1e-12
+
+
 def _regulators(notes: Notes, parts: dict[str, Any]) -> None:
     lqr: Lqr = parts.get("lqr", Lqr())
     _regulator(notes, lqr, "lqr")
@@ -168,8 +172,8 @@ def _regulator(notes: Notes, weights: Regulator, *path: str) -> None:
     keys = ("horizon", "Q", "S")
     if not (notes.right(("lqr",), *keys) and notes.right(path, *keys)):
         return
-    if weights.horizon == "infinite" and weights.Q[0] == 0:
-        problem = "an infinite horizon needs a weight > 0 on the error"
+    if weights.horizon == "infinite" and weights.Q[0] < _NO_WEIGHT:
+        problem = f"an infinite horizon needs a weight of {_NO_WEIGHT:g} or more on the error"
         notes.add((*path, "Q"), problem, "give Q = [1.0, 1.0], say", weights.Q)
     if weights.horizon == "finite" and not any(weights.Q) and not any(weights.S):
         problem = "with Q and S zero there is nothing to steer for"
@@ -177,8 +181,8 @@ def _regulator(notes: Notes, weights: Regulator, *path: str) -> None:
 
 
 def _tracking(notes: Notes, parts: dict[str, Any]) -> None:
-    if parts.get("tracking", Tracking()).Q[0] == 0 and notes.right(("tracking",), "Q"):
-        problem = "tracking needs a weight > 0 on the position error"
+    if parts.get("tracking", Tracking()).Q[0] < _NO_WEIGHT and notes.right(("tracking",), "Q"):
+        problem = f"tracking needs a weight of {_NO_WEIGHT:g} or more on the position error"
         notes.add(("tracking", "Q"), problem, "give Q = [4.0, 4.0], say")
 
 
