@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from rigidfleet import attitude, formation, lqr, physics
 from rigidfleet.assess import assess
@@ -206,7 +206,7 @@ def test_a_show_of_a_thousand_vehicles():
     assert record.separation.min() > 1.0
     assert record.statistics["solvers"]["nodes"]["failures"] == 0
     # All vehicles are alike: each place to land is taken, by whomever it is nearest for.
-    away, who = cKDTree(record.position[0]).query(record.position[-1])
+    away, who = KDTree(record.position[0]).query(record.position[-1])
     assert away.max() < 1e-2
     assert len(set(who)) == 1000
 

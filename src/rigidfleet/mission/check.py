@@ -173,7 +173,7 @@ def _regulator(notes: Notes, weights: Regulator, *path: str) -> None:
     if not (notes.right(("lqr",), *keys) and notes.right(path, *keys)):
         return
     if weights.horizon == "infinite" and weights.Q[0] < _NO_WEIGHT:
-        problem = f"an infinite horizon needs a weight of {_NO_WEIGHT:g} or more on the error"
+        problem = f"an infinite horizon needs a weight > 0 on the error, {_NO_WEIGHT:g} at least"
         notes.add((*path, "Q"), problem, "give Q = [1.0, 1.0], say", weights.Q)
     if weights.horizon == "finite" and not any(weights.Q) and not any(weights.S):
         problem = "with Q and S zero there is nothing to steer for"
@@ -182,7 +182,7 @@ def _regulator(notes: Notes, weights: Regulator, *path: str) -> None:
 
 def _tracking(notes: Notes, parts: dict[str, Any]) -> None:
     if parts.get("tracking", Tracking()).Q[0] < _NO_WEIGHT and notes.right(("tracking",), "Q"):
-        problem = f"tracking needs a weight of {_NO_WEIGHT:g} or more on the position error"
+        problem = f"tracking needs a weight > 0 on the position error, {_NO_WEIGHT:g} at least"
         notes.add(("tracking", "Q"), problem, "give Q = [4.0, 4.0], say")
 
 
