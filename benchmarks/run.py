@@ -320,7 +320,7 @@ def main() -> int:
     arguments = parser.parse_args()
     versions = {p: version(p) for p in ("rigidfleet", "numba", "numpy", "scipy")}
     machine = f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}"
-    console = Console()
+    console = Console(width=None if sys.stdout.isatty() else 120)
     console.print(f"{date.today()}; {machine}; {versions}", highlight=False)
     console.print(
         f"{DURATION:g} s of flight, tolerance {TOLERANCE:g}, {SAMPLES} outputs; SciPy: RK45"
