@@ -31,13 +31,13 @@ _MOST_STEPS = 1_000_000
 
 
 @compiled
-def fly(p, w, state, t0, t_end, step, starts, before, ends, status, evaluations, max_steps):
+def fly(p, w, state, t0, t_end, step, starts, before, ends, status, evaluations, max_steps, fresh):
     """Integrate from each of ``starts`` (G, n) at t0 to ``t_end`` [s], into ``ends`` (G, n).
 
     A start is one flight, or eight where the arrays hold lanes. ``before`` (G, m) [m] are the
     distances from which the references of each are blended. What `integrate` returns goes into
     ``status`` (G,), the calls of the right-hand side into ``evaluations`` (G,); p, w and state are
-    overwritten.
+    overwritten. ``fresh`` is true; written here, the compiler would take it for another type.
     """
     unsampled = state.clock[:0]
     for g in range(starts.shape[0]):
@@ -48,7 +48,7 @@ def fly(p, w, state, t0, t_end, step, starts, before, ends, status, evaluations,
         state.clock[0], state.clock[1], state.clock[2] = t0, step, 1e-4
         for q in range(4):
             state.count[q] = 0
-        status[g] = integrate(p, w, state, t_end, True, unsampled, ends[:0], max_steps)
+        status[g] = integrate(p, w, state, t_end, fresh, unsampled, ends[:0], max_steps)
         evaluations[g] = state.count[0]
         for q in range(starts.shape[1]):
             ends[g, q] = state.y[q]
@@ -158,7 +158,7 @@ def _run(
             part = slice(first, first + size)
             fly(
                 p, w, state, *times, 1e-3, starts[part], before[part], ends[part], status[part],
-                evaluations[part], _MOST_STEPS,
+                evaluations[part], _MOST_STEPS, True,
             )  # fmt: skip
 
     with ThreadPoolExecutor(threads) as pool:
