@@ -63,13 +63,11 @@ class Ends:
     y : (B, n) states
     finished : (B,) whether the end was reached; the state is the last good one where not
     evaluations : (B,) calls of the right-hand side; flights of a vector share theirs
-    alone : (B,) whether a flight was taken out of its vector, and flown alone
     """
 
     y: Array
     finished: NDArray[np.bool_]
     evaluations: NDArray[np.int64]
-    alone: NDArray[np.bool_]
 
 
 def fits_lanes(program: Program) -> bool:
@@ -133,7 +131,7 @@ def fly_all(
     if alone.any():
         again = _run(program, starts[alone], before[alone], times, rtol, atol, threads)
         y[alone], finished[alone], evaluations[alone] = again.y, again.finished, again.evaluations
-    return Ends(y, finished, evaluations, alone)
+    return Ends(y, finished, evaluations)
 
 
 def _run(
@@ -164,7 +162,7 @@ def _run(
     with ThreadPoolExecutor(threads) as pool:
         for job in [pool.submit(work) for _ in range(threads)]:
             job.result()
-    return Ends(ends, status == FINISHED, evaluations, np.zeros(count, dtype=bool))
+    return Ends(ends, status == FINISHED, evaluations)
 
 
 def _buffers(
