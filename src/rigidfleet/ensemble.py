@@ -131,7 +131,7 @@ def establish(
             (now.t, t_end),
             rtol=tolerances.rtol,
             atol=np.full(y.shape[1], tolerances.atol),
-            lanes=vectors,
+            vectors=vectors,
             threads=threads,
         )
         y[finished] = ends.y[finished]

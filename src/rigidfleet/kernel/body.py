@@ -3,8 +3,7 @@
 import math
 
 from rigidfleet.kernel.compiled import compiled, inlined
-from rigidfleet.kernel.lanes import where_positive
-from rigidfleet.kernel.linalg import jacobi_eigen
+from rigidfleet.kernel.linalg import jacobi_eigen, surely_positive, where_positive
 from rigidfleet.kernel.program import PINV_EQUAL, PINV_INERTIA_FORCE, RIGID
 
 
@@ -54,7 +53,7 @@ def inertia_inverse(I, out):
     out[0, 0], out[0, 1], out[0, 2] = A * q, B * q, C * q
     out[1, 1], out[1, 2] = (a * f - c * c) * q, (b * c - a * e) * q
     out[2, 2] = (a * d - b * b) * q
-    if not spatial > 0.0:
+    if not surely_positive(spatial):
         q = where_positive(half, 1.0 / (half * half), 0.0)
         for i in range(3):
             for j in range(i, 3):

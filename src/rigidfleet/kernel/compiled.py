@@ -8,8 +8,10 @@ import hashlib
 import os
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from types import FunctionType
 from typing import Any, TypeVar
 
 import numba
@@ -43,6 +45,35 @@ def inlined(function: F) -> F:
     A call would copy every field of theirs, some 300 numbers, to the stack.
     """
     return _cached(function, _OPTIONS | {"forceinline": True})
+
+
+def compiled_copy(function: Any, name: str, **instead: Any) -> Any:
+    """Compile a compiled function's source once more, with other functions in place of some it calls."""
+    return _cached(_copy(function.py_func, name, instead), _OPTIONS)
+
+
+def compiled_for_c(
+    function: Callable[..., Any], name: str, *, arguments: int, **instead: Any
+) -> int:
+    """Compile a copy of a function of so many pointers to float64; return its address.
+
+    Both it and the copy stay as long as the process does.
+    """
+    signature = types.void(*[types.CPointer(types.float64)] * arguments)
+    copy = _copy(function, name, instead)
+    with _own_cache():
+        made = numba.cfunc(signature, cache=True, nopython=True)(copy)
+    _STAYING.append(made)
+    return made.address
+
+
+_STAYING: list[Any] = []
+
+
+def _copy(function: Callable[..., Any], name: str, instead: dict[str, Any]) -> FunctionType:
+    copy = FunctionType(function.__code__, function.__globals__ | instead, name)
+    copy.__module__, copy.__qualname__ = function.__module__, name
+    return copy
 
 
 @intrinsic
@@ -87,11 +118,17 @@ def is_compiled() -> bool:
 _CACHE = cache_directory()
 
 
-def _cached(function: F, options: dict[str, Any]) -> F:
-    """Compile with the kernel's own cache folder; other users of Numba keep theirs."""
+@contextmanager
+def _own_cache() -> Iterator[None]:
+    """Let Numba use the kernel's folder; its other users keep theirs."""
     before = numba.config.CACHE_DIR
     numba.config.CACHE_DIR = str(_CACHE)
     try:
-        return numba.njit(**options)(function)
+        yield
     finally:
         numba.config.CACHE_DIR = before
+
+
+def _cached(function: F, options: dict[str, Any]) -> F:
+    with _own_cache():
+        return numba.njit(**options)(function)

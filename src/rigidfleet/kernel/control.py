@@ -4,7 +4,6 @@ import math
 
 from rigidfleet.kernel.body import allocate, multiply, multiply_transposed, rotation_vector
 from rigidfleet.kernel.compiled import compiled, inlined
-from rigidfleet.kernel.lanes import where_positive
 
 
 @compiled
@@ -35,12 +34,7 @@ def body_rates(phi, phi_dot, phi_ddot, omega, omega_dot):
     """
     xx = phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]
     s = phi[0] * phi_dot[0] + phi[1] * phi_dot[1] + phi[2] * phi_dot[2]  # x dx/dt
-    small = 0.04 - xx
-    a, b, a_dot, b_dot = _series(xx, s)
-    if not small > 0.0:
-        c = _closed(max(xx, 0.04), s)
-        a, b = where_positive(small, a, c[0]), where_positive(small, b, c[1])
-        a_dot, b_dot = where_positive(small, a_dot, c[2]), where_positive(small, b_dot, c[3])
+    a, b, a_dot, b_dot = _series(xx, s) if xx < 0.04 else _closed(xx, s)
     for q in range(3):
         i, j = (q + 1) % 3, (q + 2) % 3
         pv_i = phi[j] * phi_dot[q] - phi[q] * phi_dot[j]  # components of phi x phi_dot

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -9,42 +10,58 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rigidfleet.kernel.compiled import compiled
+from rigidfleet.kernel.compiled import compiled, compiled_copy, inlined
 from rigidfleet.kernel.flight import FINISHED, Integrator, integrate, integrator
 from rigidfleet.kernel.lanes import WIDTH, LaneArray, pack, padded, unpack
 from rigidfleet.kernel.program import (
     EXACT,
     ITERATED,
     OPEN,
+    SLOTS,
     Array,
     Program,
     Workspace,
+    graph,
     workspace,
 )
+from rigidfleet.kernel.straight import integrate as integrate_straight
+from rigidfleet.kernel.straight import straight
 
-#: What the flights of one vector have in common: times, and what decides on branches.
-_COMMON = {"g", "t0", "T_b", "knots", "to_go", "arrival", "gust_step", "noise_step"}
 #: A range of flights is begun by whichever thread is free, so many ranges to a thread.
 _RANGES = 8
 #: Steps of one flight in a phase at most.
 _MOST_STEPS = 1_000_000
+#: Equations of a solve up to which straight-line code is made: its length grows with their cube.
+_MOST_EQUATIONS = 36
+
+
+@inlined
+def blend_from(before, p):
+    """Let references be blended from these distances (m,) [m]."""
+    for k in range(before.shape[0]):
+        p.reference.d0[k] = before[k]
+
+
+@inlined
+def _blend_from(before, p):
+    for k in range(before.shape[0]):
+        p.before[k] = before[k]
 
 
 @compiled
 def fly(p, w, state, t0, t_end, step, starts, before, ends, status, evaluations, max_steps, fresh):
     """Integrate from each of ``starts`` (G, n) at t0 to ``t_end`` [s], into ``ends`` (G, n).
 
-    A start is one flight, or eight where the arrays hold lanes. ``before`` (G, m) [m] are the
-    distances from which the references of each are blended. What `integrate` returns goes into
-    ``status`` (G,), the calls of the right-hand side into ``evaluations`` (G,); p, w and state are
-    overwritten. ``fresh`` is true; written here, the compiler would take it for another type.
+    ``before`` (G, m) [m] are the distances from which the references of each are blended. What
+    `integrate` returns goes into ``status`` (G,), the calls of the right-hand side into
+    ``evaluations`` (G,); p, w and state are overwritten. ``fresh`` is true; written here, the
+    compiler would take it for another type.
     """
     unsampled = state.clock[:0]
     for g in range(starts.shape[0]):
         for q in range(starts.shape[1]):
             state.y[q] = starts[g, q]
-        for k in range(before.shape[1]):
-            p.reference.d0[k] = before[g, k]
+        blend_from(before[g], p)
         state.clock[0], state.clock[1], state.clock[2] = t0, step, 1e-4
         for q in range(4):
             state.count[q] = 0
@@ -52,6 +69,12 @@ def fly(p, w, state, t0, t_end, step, starts, before, ends, status, evaluations,
         evaluations[g] = state.count[0]
         for q in range(starts.shape[1]):
             ends[g, q] = state.y[q]
+
+
+#: As `fly`; p is a `Straight`, w is not used, a start is eight flights.
+fly_straight = compiled_copy(
+    fly, "fly_straight", integrate=integrate_straight, blend_from=_blend_from
+)
 
 
 @dataclass(frozen=True)
@@ -70,13 +93,19 @@ class Ends:
     evaluations: NDArray[np.int64]
 
 
-def fits_lanes(program: Program) -> bool:
-    """Return whether flights of a program may share vectors: all their branches are common."""
+def fits(program: Program) -> bool:
+    """Return whether straight-line code can be made of a program, and is worth it.
+
+    Its branches must not depend on the state, and its code must not be too long to be compiled.
+    """
+    edges, agents = len(program.graph.edges), len(program.vehicles.m)
     return (
         program.control.kind == OPEN
         and program.law.solver in (ITERATED, EXACT)
-        and not program.body_formulation
+        and program.reference.kind != SLOTS
+        and not (program.has_frame or program.body_formulation or program.disturbance.active)
         and program.external == 0
+        and min(edges, 3 * agents) <= _MOST_EQUATIONS
     )
 
 
@@ -88,7 +117,7 @@ def fly_all(
     *,
     rtol: float,
     atol: Array,
-    lanes: bool,
+    vectors: bool,
     threads: int,
 ) -> Ends:
     """Fly one program from many starts.
@@ -100,41 +129,82 @@ def fly_all(
     before : (B, m) distances from which references are blended [m]
     times : start and end [s]
     rtol, atol : relative tolerance, and the absolute one (n,) of each state
-    lanes : whether eight flights share a vector, its steps and its fate: should one of them be
-        rejected for good, all eight are flown again alone. The first vectors ever take the
-        compiler a minute. Flight k lies in vector k // 8 however many threads there are, so
-        results do not depend on ``threads``.
+    vectors : whether eight flights share a vector, its steps and its fate: should one of them be
+        rejected for good, all eight are flown again alone. Flight k lies in vector k // 8 however
+        many threads there are, so results do not depend on ``threads``.
     threads : how many run at a time
 
     Raises
     ------
     ValueError
-        The program does not fit lanes, see `fits_lanes`.
+        The program does not fit vectors, see `fits`.
     """
-    if lanes and not fits_lanes(program):
+    if not vectors:
+        return _fly_alone(program, starts, before, times, rtol, atol, threads)
+    if not fits(program):
         raise ValueError(
-            "flights of this program take branches of their own: fly them with lanes=False"
+            "flights of this program cannot share vectors: fly them with vectors=False"
         )
-    if not lanes:
-        return _run(program, starts, before, times, rtol, atol, threads)
-    count = len(starts)
+    count, n = starts.shape
+    order = elimination_order(program.graph.edges)
+    states = np.arange(n)
+    states[n - len(order) :] = states[n - len(order) :][order]
     # Places left over in the last vector repeat the last flight.
-    index = np.minimum(np.arange(padded(count)), count - 1)
-    vectors = [
-        pack(x[index].reshape(-1, WIDTH, x.shape[1]).swapaxes(1, 2)) for x in (starts, before)
-    ]
-    found = _run(_lifted(program), *vectors, times, rtol, atol, threads)
-    y = unpack(found.y).swapaxes(1, 2).reshape(len(index), -1)[:count].copy()
+    places = np.minimum(np.arange(padded(count)), count - 1)
+
+    def packed(x: Array, columns: NDArray[np.int64]) -> LaneArray:
+        return pack(x[places][:, columns].reshape(-1, WIDTH, len(columns)).swapaxes(1, 2))
+
+    ordered = _ordered(program, order)
+    ready = straight(ordered)
+
+    def begin() -> tuple[Any, Any, Integrator]:
+        state = integrator(np.zeros(n), 0.0, rtol=rtol, atol=atol[states])
+        K = np.zeros((*state.K.shape[:1], n, WIDTH))
+        K[-1] = atol[states][:, None]
+        own = ready._replace(before=ready.before.copy(), time=ready.time.copy())
+        return own, None, state._replace(y=pack(np.zeros((n, WIDTH))), K=pack(K))
+
+    inputs = packed(starts, states), packed(before, order)
+    found = _share(fly_straight, begin, *inputs, times, threads)
+    y = np.empty((count, n))
+    y[:, states] = unpack(found.y).swapaxes(1, 2).reshape(-1, n)[:count]
     finished = np.repeat(found.finished, WIDTH)[:count]
     evaluations = np.repeat(found.evaluations, WIDTH)[:count]
-    alone = ~finished
-    if alone.any():
-        again = _run(program, starts[alone], before[alone], times, rtol, atol, threads)
-        y[alone], finished[alone], evaluations[alone] = again.y, again.finished, again.evaluations
+    lost = ~finished
+    if lost.any():
+        again = _fly_alone(program, starts[lost], before[lost], times, rtol, atol, threads)
+        y[lost], finished[lost], evaluations[lost] = again.y, again.finished, again.evaluations
     return Ends(y, finished, evaluations)
 
 
-def _run(
+def elimination_order(edges: NDArray[np.integer]) -> NDArray[np.int64]:
+    """Order (m,) of edges in which the factor of J M^-1 J^T fills up little: least degree first."""
+    at: dict[int, set[int]] = {}
+    for k, ends in enumerate(edges.tolist()):
+        for agent in ends:
+            at.setdefault(agent, set()).add(k)
+    near = {k: set().union(*(at[i] for i in ends)) - {k} for k, ends in enumerate(edges.tolist())}
+    order = []
+    while near:
+        k = min(near, key=lambda k: (len(near[k]), k))
+        order.append(k)
+        neighbours = near.pop(k)
+        for l in neighbours:
+            near[l] = (near[l] | neighbours) - {k, l}
+    return np.array(order, dtype=np.int64)
+
+
+def _ordered(program: Program, order: NDArray[np.int64]) -> Program:
+    """The program with its edges in this order."""
+    edges = program.graph.edges[order]
+    reference = program.reference._replace(
+        d0=program.reference.d0[order], d1=program.reference.d1[order]
+    )
+    return program._replace(graph=graph(edges, program.vehicles.m), reference=reference)
+
+
+def _fly_alone(
     program: Program,
     starts: Array,
     before: Array,
@@ -143,7 +213,25 @@ def _run(
     atol: Array,
     threads: int,
 ) -> Ends:
-    """Share the flights, or vectors of them, out over threads."""
+    def begin() -> tuple[Program, Workspace, Integrator]:
+        own = program.reference._replace(d0=program.reference.d0.copy())
+        n, m = len(program.vehicles.m), len(program.graph.edges)
+        w = workspace(n, m, solver=program.law.solver)
+        state = integrator(np.zeros(len(atol)), 0.0, rtol=rtol, atol=atol)
+        return program._replace(reference=own), w, state
+
+    return _share(fly, begin, starts, before, times, threads)
+
+
+def _share(
+    fly: Callable[..., None],
+    begin: Callable[[], tuple[Any, Any, Integrator]],
+    starts: Array,
+    before: Array,
+    times: tuple[float, float],
+    threads: int,
+) -> Ends:
+    """Share the flights, or vectors of them, out over threads, each with what `begin` gives it."""
     count = len(starts)
     ends = np.empty_like(starts)
     status, evaluations = np.empty(count, dtype=np.int64), np.empty(count, dtype=np.int64)
@@ -151,7 +239,7 @@ def _run(
     ranges = iter(range(0, count, size))
 
     def work() -> None:
-        p, w, state = _buffers(program, starts, rtol, atol)
+        p, w, state = begin()
         for first in ranges:
             part = slice(first, first + size)
             fly(
@@ -163,29 +251,3 @@ def _run(
         for job in [pool.submit(work) for _ in range(threads)]:
             job.result()
     return Ends(ends, status == FINISHED, evaluations)
-
-
-def _buffers(
-    program: Program, starts: Array, rtol: float, atol: Array
-) -> tuple[Program, Workspace, Integrator]:
-    """What one thread overwrites."""
-    reference = program.reference._replace(d0=program.reference.d0.copy())
-    n, m = program.vehicles.m.shape[0], program.graph.edges.shape[0]
-    w = workspace(n, m, solver=program.law.solver)
-    state = integrator(np.zeros(len(atol)), 0.0, rtol=rtol, atol=atol)
-    if isinstance(starts, LaneArray):
-        w = _lifted(w)
-        K = np.zeros((*state.K.shape[:1], len(atol), WIDTH))
-        K[-1] = atol[:, None]
-        state = state._replace(y=_lifted(state.y), K=pack(K))
-    return program._replace(reference=reference), w, state
-
-
-def _lifted(x: Any, name: str = "") -> Any:
-    """Repeat the numbers of a program or workspace in all lanes."""
-    if isinstance(x, tuple) and hasattr(x, "_fields"):
-        return type(x)(*(_lifted(v, f) for v, f in zip(x, x._fields, strict=True)))
-    real = isinstance(x, float) or (isinstance(x, np.ndarray) and x.dtype == np.float64)
-    if not real or name in _COMMON:
-        return x
-    return pack(np.repeat(np.asarray(x)[..., None], WIDTH, axis=-1))

@@ -244,6 +244,18 @@ def forget_stages(k, first):
             k[s, q] = spread(0.0)
 
 
+@inlined
+def advance(k, stage, a, h):
+    """Write the state of a stage: y + h sum a[stage, s] k_s."""
+    # All six terms at once: stages still to come have no weight, and finite values.
+    a0, a1, a2 = h * a[stage, 0], h * a[stage, 1], h * a[stage, 2]
+    a3, a4, a5 = h * a[stage, 3], h * a[stage, 4], h * a[stage, 5]
+    for q in range(k.shape[1]):
+        k[_TRIAL, q] = ((a0 * k[0, q] + a1 * k[1, q]) + (a2 * k[2, q] + a3 * k[3, q])) + (
+            k[_STATE, q] + (a4 * k[4, q] + a5 * k[5, q])
+        )
+
+
 @compiled
 def integrate(p, w, state, t_end, fresh, times, samples, max_steps):
     """Integrate `closed_loop` to ``t_end`` [s]; adaptive Dormand-Prince 5(4), PI step control.
@@ -276,13 +288,7 @@ def integrate(p, w, state, t_end, fresh, times, samples, max_steps):
         stage = first
         # One call site of the right-hand side: stage 0 is the derivative at y itself.
         while stage < 7:
-            # All six terms at once: stages still to come have no weight, and finite values.
-            a0, a1, a2 = h * _A[stage, 0], h * _A[stage, 1], h * _A[stage, 2]
-            a3, a4, a5 = h * _A[stage, 3], h * _A[stage, 4], h * _A[stage, 5]
-            for q in range(k.shape[1]):
-                k[_TRIAL, q] = ((a0 * k[0, q] + a1 * k[1, q]) + (a2 * k[2, q] + a3 * k[3, q])) + (
-                    k[_STATE, q] + (a4 * k[4, q] + a5 * k[5, q])
-                )
+            advance(k, stage, _A, h)
             closed_loop(t + _C[stage] * h, trial, K[stage], p, w)
             count[0] += 1
             stage += 1

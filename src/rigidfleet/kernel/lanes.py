@@ -1,25 +1,23 @@
 """Eight numbers in one: a vector of doubles as a Numba value, so that one source serves two ends.
 
-A `lanes` value holds eight doubles; arithmetic, `math` functions, ``min``, ``max`` and ``abs`` act
-on each of them, and a comparison is true where it holds in *all*. A `LaneArray` is an array whose
-elements are such values. The kernel's functions compile for them as they stand: eight flights in the
-lanes share their steps and their branches. For a single flight, `blocks` looks at eight consecutive
+A `lanes` value holds eight doubles; arithmetic, ``max`` and ``abs`` act on each of them. A `LaneArray`
+is an array whose elements are such values. The integrator compiles for them as it stands: eight
+flights in the lanes share their steps. For a single flight, `blocks` looks at eight consecutive
 states as one value, which is how the integrator's sums use the machine's vector registers.
 """
 
-import math
 import operator
+from functools import partial
 from typing import Any
 
 import numpy as np
-from llvmlite import ir
+from llvmlite import binding, ir
 from numba import types
 from numba.core import cgutils
 from numba.core.imputils import impl_ret_borrowed
 from numba.core.typeconv import Conversion
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numba.extending import (
-    NativeValue,
     intrinsic,
     lower_builtin,
     lower_cast,
@@ -27,7 +25,6 @@ from numba.extending import (
     overload,
     register_model,
     typeof_impl,
-    unbox,
 )
 from numpy.typing import NDArray
 
@@ -35,8 +32,10 @@ from numpy.typing import NDArray
 WIDTH = 8
 # Products and sums may be fused, but not reordered: what a lane gets never depends on the compiler.
 _FAST = ("contract", "arcp", "nsz")
-_VECTOR = ir.VectorType(ir.DoubleType(), WIDTH)
+VECTOR = ir.VectorType(ir.DoubleType(), WIDTH)
 _INDEX = ir.IntType(32)
+# Of x86, which have an estimate of 14 bits for eight roots or quotients at once.
+_ESTIMATES = bool(binding.get_host_cpu_features().get("avx512f"))
 
 
 class _Lanes(types.Type):
@@ -60,11 +59,11 @@ lanes = _Lanes()
 @register_model(_Lanes)
 class _Model(models.PrimitiveModel):
     def __init__(self, manager: Any, kind: Any) -> None:
-        super().__init__(manager, kind, _VECTOR)
+        super().__init__(manager, kind, VECTOR)
 
 
 class LaneArray(np.ndarray):
-    """An array of `lanes`; of no dimension, one value. Made by `pack`, read by `unpack`."""
+    """An array of `lanes`, made by `pack` and read by `unpack`."""
 
 
 def pack(values: NDArray[np.float64]) -> LaneArray:
@@ -86,23 +85,13 @@ def unpack(array: NDArray[Any]) -> NDArray[np.float64]:
 
 @typeof_impl.register(LaneArray)
 def _typeof(value: LaneArray, _context: Any) -> types.Type:
-    if value.ndim == 0:
-        return lanes
     # Alignment is not promised, as NumPy promises none; vectors in `pack`'s arrays have it.
     return types.Array(lanes, value.ndim, "C", aligned=False)
 
 
-@unbox(_Lanes)
-def _unbox(_type: Any, value: Any, context: Any) -> NativeValue:
-    native = context.unbox(types.Array(lanes, 0, "C", aligned=False), value)
-    builder = context.builder
-    kind = types.Array(lanes, 0, "C", aligned=False)
-    array = context.context.make_array(kind)(context.context, builder, native.value)
-    return NativeValue(builder.load(array.data, align=8), is_error=native.is_error)
-
-
-def _spread(builder: ir.IRBuilder, number: ir.Value) -> ir.Value:
-    start = ir.Constant(_VECTOR, ir.Undefined)
+def in_all(builder: ir.IRBuilder, number: ir.Value) -> ir.Value:
+    """Build a vector that holds a number in all lanes."""
+    start = ir.Constant(VECTOR, ir.Undefined)
     one = builder.insert_element(start, number, ir.Constant(_INDEX, 0))
     every = ir.Constant(ir.VectorType(_INDEX, WIDTH), [0] * WIDTH)
     return builder.shuffle_vector(one, start, every)
@@ -111,7 +100,7 @@ def _spread(builder: ir.IRBuilder, number: ir.Value) -> ir.Value:
 @lower_cast(types.Float, _Lanes)
 @lower_cast(types.Integer, _Lanes)
 def _cast(context: Any, builder: Any, kind: Any, _to: Any, value: Any) -> ir.Value:
-    return _spread(builder, context.cast(builder, value, kind, types.float64))
+    return in_all(builder, context.cast(builder, value, kind, types.float64))
 
 
 def _operands(context: Any, builder: Any, sig: Any, arguments: Any) -> list[ir.Value]:
@@ -119,17 +108,17 @@ def _operands(context: Any, builder: Any, sig: Any, arguments: Any) -> list[ir.V
     return [
         value
         if isinstance(kind, _Lanes)
-        else _spread(builder, context.cast(builder, value, kind, types.float64))
+        else in_all(builder, context.cast(builder, value, kind, types.float64))
         for kind, value in zip(sig.args, arguments, strict=True)
     ]
 
 
-def _register(functions: tuple[Any, ...], arity: int, result: types.Type, generate: Any) -> None:
-    """Let functions or operators take lanes, with numbers among them, and give ``result``."""
+def _register(functions: tuple[Any, ...], arity: int, generate: Any) -> None:
+    """Let functions or operators take lanes, with numbers among them."""
 
     class Template(AbstractTemplate):
         def generic(self, args: Any, _kws: Any) -> Any:
-            return signature(result, *args) if len(args) == arity and lanes in args else None
+            return signature(lanes, *args) if len(args) == arity and lanes in args else None
 
     def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> ir.Value:
         return generate(builder, *_operands(context, builder, sig, arguments))
@@ -145,93 +134,111 @@ def _register(functions: tuple[Any, ...], arity: int, result: types.Type, genera
             lower_builtin(function, *kind)(lower)
 
 
-def _arithmetic(name: str) -> Any:
-    return lambda builder, a, b: getattr(builder, name)(a, b, flags=_FAST)
+def arithmetic(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, name: str) -> ir.Value:
+    """Build one of LLVM's instructions on vectors: fadd, fsub, fmul."""
+    return getattr(builder, name)(a, b, flags=_FAST)
 
 
-def _in_all(sign: str) -> Any:
-    def generate(builder: Any, a: Any, b: Any) -> ir.Value:
-        bits = builder.bitcast(builder.fcmp_ordered(sign, a, b), ir.IntType(WIDTH))
-        return builder.icmp_unsigned("==", bits, ir.Constant(bits.type, (1 << WIDTH) - 1))
-
-    return generate
+def absolute(builder: ir.IRBuilder, x: ir.Value) -> ir.Value:
+    """Build abs(x)."""
+    return builder.call(_llvm(builder, "fabs", 1), [x])
 
 
-def _each(name: str) -> Any:
-    """Return what calls one of LLVM's functions lane by lane."""
-
-    def generate(builder: Any, x: Any) -> ir.Value:
-        kind = ir.FunctionType(_VECTOR, [_VECTOR])
-        symbol = f"llvm.{name}.v{WIDTH}f64"
-        return builder.call(cgutils.get_or_insert_function(builder.module, kind, symbol), [x])
-
-    return generate
+def larger(builder: ir.IRBuilder, a: ir.Value, b: ir.Value) -> ir.Value:
+    """Build max(a, b)."""
+    return builder.select(builder.fcmp_ordered(">", a, b), a, b)
 
 
-def _library(name: str) -> Any:
-    """Return what calls a function of the C library on one lane after the other."""
-
-    def generate(builder: Any, *vectors: Any) -> ir.Value:
-        kind = ir.FunctionType(ir.DoubleType(), [ir.DoubleType()] * len(vectors))
-        function = cgutils.get_or_insert_function(builder.module, kind, name)
-        result = ir.Constant(_VECTOR, ir.Undefined)
-        for k in range(WIDTH):
-            lane = ir.Constant(_INDEX, k)
-            value = builder.call(function, [builder.extract_element(v, lane) for v in vectors])
-            result = builder.insert_element(result, value, lane)
-        return result
-
-    return generate
+def smaller(builder: ir.IRBuilder, a: ir.Value, b: ir.Value) -> ir.Value:
+    """Build min(a, b)."""
+    return builder.select(builder.fcmp_ordered("<", a, b), a, b)
 
 
-def _larger(sign: str) -> Any:
-    return lambda builder, a, b: builder.select(builder.fcmp_ordered(sign, a, b), a, b)
+def _fused(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, c: ir.Value) -> ir.Value:
+    return builder.call(_llvm(builder, "fma", 3), [a, b, c])
 
 
-for _operators, _name in (
-    ((operator.add, operator.iadd), "fadd"),
-    ((operator.sub, operator.isub), "fsub"),
-    ((operator.mul, operator.imul), "fmul"),
-    ((operator.truediv, operator.itruediv), "fdiv"),
-):
-    _register(_operators, 2, lanes, _arithmetic(_name))
-for _operator, _sign in (
-    (operator.lt, "<"),
-    (operator.le, "<="),
-    (operator.gt, ">"),
-    (operator.ge, ">="),
-    (operator.eq, "=="),
-):
-    _register((_operator,), 2, types.boolean, _in_all(_sign))
-for _function, _name in ((math.sqrt, "sqrt"), (math.sin, "sin"), (math.cos, "cos"), (abs, "fabs")):
-    _register((_function,), 1, lanes, _each(_name))
-_register((operator.neg,), 1, lanes, lambda builder, x: builder.fneg(x))
-_register((math.atan2,), 2, lanes, _library("atan2"))
-_register((max,), 2, lanes, _larger(">"))
-_register((min,), 2, lanes, _larger("<"))
+def _estimate(builder: ir.IRBuilder, name: str, x: ir.Value) -> ir.Value:
+    mask = ir.IntType(WIDTH)
+    kind = ir.FunctionType(VECTOR, [VECTOR, VECTOR, mask])
+    symbol = f"llvm.x86.avx512.{name}14.pd.512"
+    function = cgutils.get_or_insert_function(builder.module, kind, symbol)
+    return builder.call(function, [x, number(0.0), ir.Constant(mask, (1 << WIDTH) - 1)])
 
 
-@intrinsic
-def _select(_context, x, a, b):
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
-        x, a, b = _operands(context, builder, sig, args)
-        return builder.select(
-            builder.fcmp_ordered(">", x, ir.Constant(_VECTOR, [0.0] * WIDTH)), a, b
-        )
-
-    return lanes(x, a, b), generate
+def number(value: float) -> ir.Constant:
+    """Return a constant in all lanes."""
+    return ir.Constant(VECTOR, [value] * WIDTH)
 
 
-def where_positive(x, a, b):
-    """Return a where x > 0, else b; lane by lane."""
-    raise NotImplementedError("compiled code only")
+def inverse(builder: ir.IRBuilder, x: ir.Value) -> ir.Value:
+    """Build 1/x, to the last bit but one; NaN of zero, where the machine estimates quotients.
+
+    Eight quotients take a wide machine as long as sixteen products; its estimate y of 1/x, mended
+    by e + e^2 + e^3 of its error e = 1 - x y, a third of that.
+    """
+    if not _ESTIMATES:
+        return builder.fdiv(number(1.0), x, flags=_FAST)
+    y = _estimate(builder, "rcp", x)
+    e = _fused(builder, builder.fneg(x), y, number(1.0))
+    power = _fused(builder, e, e, e)
+    return _fused(builder, y, _fused(builder, power, e, e), y)
 
 
-@overload(where_positive)
-def _where_positive(x, a, b):
-    if lanes in (x, a, b):
-        return lambda x, a, b: _select(x, a, b)  # noqa: PLW0108
-    return lambda x, a, b: a if x > 0.0 else b
+def inverse_root(builder: ir.IRBuilder, x: ir.Value) -> ir.Value:
+    """Build 1/sqrt(x), to the last bit but one; NaN of zero, where the machine estimates roots.
+
+    Of an estimate y, with e = 1 - x y^2: y (1 + e/2 + 3 e^2/8 + 5 e^3/16).
+    """
+    if not _ESTIMATES:
+        root = builder.call(_llvm(builder, "sqrt", 1), [x])
+        return builder.fdiv(number(1.0), root, flags=_FAST)
+    y = _estimate(builder, "rsqrt", x)
+    e = _fused(builder, builder.fneg(builder.fmul(x, y)), y, number(1.0))
+    series = _fused(builder, number(0.3125), e, number(0.375))
+    series = _fused(builder, series, e, number(0.5))
+    return _fused(builder, builder.fmul(y, e), series, y)
+
+
+def root(builder: ir.IRBuilder, x: ir.Value, inverse_of_it: ir.Value) -> ir.Value:
+    """Build sqrt(x) from 1/sqrt(x)."""
+    zero = builder.fcmp_ordered("==", x, number(0.0))
+    return builder.select(zero, x, builder.fmul(x, inverse_of_it))
+
+
+def _quotient(builder: ir.IRBuilder, a: ir.Value, b: ir.Value) -> ir.Value:
+    return builder.fmul(a, inverse(builder, b), flags=_FAST)
+
+
+def _llvm(builder: ir.IRBuilder, name: str, arity: int) -> ir.Function:
+    kind = ir.FunctionType(VECTOR, [VECTOR] * arity)
+    return cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.v{WIDTH}f64")
+
+
+def _where_positive(builder: ir.IRBuilder, x: ir.Value, a: ir.Value, b: ir.Value) -> ir.Value:
+    return builder.select(builder.fcmp_ordered(">", x, number(0.0)), a, b)
+
+
+#: What builds each operation.
+BUILD: dict[str, Any] = {
+    "add": partial(arithmetic, name="fadd"),
+    "sub": partial(arithmetic, name="fsub"),
+    "mul": partial(arithmetic, name="fmul"),
+    "neg": ir.IRBuilder.fneg,
+    "inverse": inverse,
+    "inverse_root": inverse_root,
+    "root": root,
+    "abs": absolute,
+    "max": larger,
+    "min": smaller,
+    "where_positive": _where_positive,
+}
+_register((operator.add, operator.iadd), 2, BUILD["add"])
+_register((operator.sub, operator.isub), 2, BUILD["sub"])
+_register((operator.mul, operator.imul), 2, BUILD["mul"])
+_register((operator.truediv, operator.itruediv), 2, _quotient)
+_register((abs,), 1, BUILD["abs"])
+_register((max,), 2, BUILD["max"])
 
 
 @intrinsic
@@ -239,7 +246,7 @@ def spread(_context, x):
     """Return lanes that all hold the number x."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
-        return _spread(builder, context.cast(builder, args[0], sig.args[0], types.float64))
+        return in_all(builder, context.cast(builder, args[0], sig.args[0], types.float64))
 
     return lanes(x), generate
 

@@ -6,6 +6,18 @@ from rigidfleet.kernel.compiled import compiled
 
 
 @compiled
+def where_positive(x, a, b):
+    """Return a where x > 0, else b."""
+    return a if x > 0.0 else b
+
+
+@compiled
+def surely_positive(x):
+    """Whether x > 0; straight-line code, which cannot know, takes it that it is not (`trace`)."""
+    return x > 0.0
+
+
+@compiled
 def cholesky(A):
     """Factor the lower triangle of A (n, n) = L D L^T in place; the diagonal keeps 1 / D_jj.
 

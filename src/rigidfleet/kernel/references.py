@@ -40,8 +40,7 @@ def blend_slots(t, reference, p, p_dot, p_ddot):
                 p_dot[i, q] = s_dot * reference.dp[i, q]
                 p_ddot[i, q] = s_ddot * reference.dp[i, q]
         return
-    some = max(angle, 1e-300)  # lanes may not all turn
-    e0, e1, e2 = n[0] / some, n[1] / some, n[2] / some
+    e0, e1, e2 = n[0] / angle, n[1] / angle, n[2] / angle
     cos, sin = math.cos(s * angle), math.sin(s * angle)
     w, w_dot = angle * s_dot, angle * s_ddot
     for i in range(p.shape[0]):
