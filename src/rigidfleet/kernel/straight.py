@@ -152,21 +152,25 @@ def _emit(module: ir.Module, code: Code) -> ir.Function:
         place = builder.gep(array, [ir.Constant(ir.IntType(64), index)])
         return lanes.in_all(builder, builder.load(place))
 
-    def value(x: Symbol | float) -> ir.Value:
-        return values[x.serial] if isinstance(x, Symbol) else lanes.number(x)
+    inputs = {x.serial: index for index, x in enumerate(code.inputs)}
 
-    for index, x in enumerate(code.inputs):
-        values[x.serial] = scalar(uniform, index)
+    def value(x: Symbol | float) -> ir.Value:
+        """Of what is computed, or loaded where it is first needed."""
+        if not isinstance(x, Symbol):
+            return lanes.number(x)
+        if x.serial not in values:
+            if x.serial in inputs:
+                found = scalar(uniform, inputs[x.serial])
+            elif x.operation == "time":
+                found = scalar(time, x.arguments[0])
+            else:
+                array = {"y": y, "before": before}[x.operation]
+                found = builder.load(element(array, x.arguments[0]), align=8)
+            values[x.serial] = found
+        return values[x.serial]
+
     for x in code.lines:
-        if x.operation == "y":
-            found = builder.load(element(y, x.arguments[0]), align=8)
-        elif x.operation == "before":
-            found = builder.load(element(before, x.arguments[0]), align=8)
-        elif x.operation == "time":
-            found = scalar(time, x.arguments[0])
-        else:
-            found = lanes.BUILD[x.operation](builder, *map(value, x.arguments))
-        values[x.serial] = found
+        values[x.serial] = lanes.BUILD[x.operation](builder, *map(value, x.arguments))
     whole = [builder.fcmp_ordered(">", value(x), lanes.number(0.0)) for x in code.positive]
     for index, x in enumerate(code.outputs):
         found = value(x)

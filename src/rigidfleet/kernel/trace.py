@@ -249,6 +249,7 @@ class Code:
         self._seen: set[int] = set()
         for x in (*self.positive, *self.outputs):
             self._need(x)
+        self.lines = sorted((x for x in self.lines if x.operation not in _SOURCES), key=lambda x: x.serial)
         used = [x for line in self.lines for x in line.arguments] + self.outputs
         inputs = [x for x in used if isinstance(x, Symbol) and x.known == UNIFORM]
         self.inputs = list({x.serial: x for x in inputs}.values())
