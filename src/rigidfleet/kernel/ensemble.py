@@ -21,14 +21,13 @@ from rigidfleet.kernel.program import (
     Array,
     Program,
     Workspace,
-    graph,
     workspace,
 )
 from rigidfleet.kernel.straight import integrate as integrate_straight
 from rigidfleet.kernel.straight import straight
 
 #: A range of flights is begun by whichever thread is free, so many ranges to a thread.
-_RANGES = 8
+_RANGES = 4
 #: Steps of one flight in a phase at most.
 _MOST_STEPS = 1_000_000
 #: Equations of a solve up to which straight-line code is made: its length grows with their cube.
@@ -146,29 +145,22 @@ def fly_all(
             "flights of this program cannot share vectors: fly them with vectors=False"
         )
     count, n = starts.shape
-    order = elimination_order(program.graph.edges)
-    states = np.arange(n)
-    states[n - len(order) :] = states[n - len(order) :][order]
-    # Places left over in the last vector repeat the last flight.
-    places = np.minimum(np.arange(padded(count)), count - 1)
+    ready = straight(program)
 
-    def packed(x: Array, columns: NDArray[np.int64]) -> LaneArray:
-        return pack(x[places][:, columns].reshape(-1, WIDTH, len(columns)).swapaxes(1, 2))
-
-    ordered = _ordered(program, order)
-    ready = straight(ordered)
+    def packed(x: Array) -> LaneArray:
+        if count % WIDTH:  # places left over in the last vector repeat the last flight
+            x = x[np.minimum(np.arange(padded(count)), count - 1)]
+        return pack(x.reshape(-1, WIDTH, x.shape[1]).swapaxes(1, 2))
 
     def begin() -> tuple[Any, Any, Integrator]:
-        state = integrator(np.zeros(n), 0.0, rtol=rtol, atol=atol[states])
+        state = integrator(np.zeros(n), 0.0, rtol=rtol, atol=atol)
         K = np.zeros((*state.K.shape[:1], n, WIDTH))
-        K[-1] = atol[states][:, None]
+        K[-1] = atol[:, None]
         own = ready._replace(before=ready.before.copy(), time=ready.time.copy())
         return own, None, state._replace(y=pack(np.zeros((n, WIDTH))), K=pack(K))
 
-    inputs = packed(starts, states), packed(before, order)
-    found = _share(fly_straight, begin, *inputs, times, threads)
-    y = np.empty((count, n))
-    y[:, states] = unpack(found.y).swapaxes(1, 2).reshape(-1, n)[:count]
+    found = _share(fly_straight, begin, packed(starts), packed(before), times, threads)
+    y = unpack(found.y).swapaxes(1, 2).reshape(-1, n)[:count]
     finished = np.repeat(found.finished, WIDTH)[:count]
     evaluations = np.repeat(found.evaluations, WIDTH)[:count]
     lost = ~finished
@@ -176,32 +168,6 @@ def fly_all(
         again = _fly_alone(program, starts[lost], before[lost], times, rtol, atol, threads)
         y[lost], finished[lost], evaluations[lost] = again.y, again.finished, again.evaluations
     return Ends(y, finished, evaluations)
-
-
-def elimination_order(edges: NDArray[np.integer]) -> NDArray[np.int64]:
-    """Order (m,) of edges in which the factor of J M^-1 J^T fills up little: least degree first."""
-    at: dict[int, set[int]] = {}
-    for k, ends in enumerate(edges.tolist()):
-        for agent in ends:
-            at.setdefault(agent, set()).add(k)
-    near = {k: set().union(*(at[i] for i in ends)) - {k} for k, ends in enumerate(edges.tolist())}
-    order = []
-    while near:
-        k = min(near, key=lambda k: (len(near[k]), k))
-        order.append(k)
-        neighbours = near.pop(k)
-        for l in neighbours:
-            near[l] = (near[l] | neighbours) - {k, l}
-    return np.array(order, dtype=np.int64)
-
-
-def _ordered(program: Program, order: NDArray[np.int64]) -> Program:
-    """The program with its edges in this order."""
-    edges = program.graph.edges[order]
-    reference = program.reference._replace(
-        d0=program.reference.d0[order], d1=program.reference.d1[order]
-    )
-    return program._replace(graph=graph(edges, program.vehicles.m), reference=reference)
 
 
 def _fly_alone(
@@ -247,7 +213,9 @@ def _share(
                 evaluations[part], _MOST_STEPS, True,
             )  # fmt: skip
 
-    with ThreadPoolExecutor(threads) as pool:
-        for job in [pool.submit(work) for _ in range(threads)]:
+    with ThreadPoolExecutor(max(1, threads - 1)) as pool:  # this thread works, too
+        jobs = [pool.submit(work) for _ in range(threads - 1)]
+        work()
+        for job in jobs:
             job.result()
     return Ends(ends, status == FINISHED, evaluations)

@@ -29,7 +29,7 @@ from rigidfleet.kernel.constraint import (
 )
 from rigidfleet.kernel.control import body_law, desired_agents, local_law, reference_motion
 from rigidfleet.kernel.disturbance import disturb, sense
-from rigidfleet.kernel.lanes import blocks, padded, spread, total_or_worst
+from rigidfleet.kernel.lanes import blocks, padded, rough_inverse, spread, total_or_worst
 from rigidfleet.kernel.program import BODY, LOCAL, OPEN, SLOTS, Array, Program, Workspace, zeros
 from rigidfleet.kernel.references import blend_slots, distance_references
 
@@ -299,7 +299,7 @@ def integrate(p, w, state, t_end, fresh, times, samples, max_steps):
                 + (_E[4] * k[4, q] + _E[5] * k[5, q] + _E[6] * k[6, q])
             )
             size = max(abs(k[_STATE, q]), abs(k[_TRIAL, q]))
-            e = e / (k[_ATOL, q] + state.rtol * size)
+            e *= rough_inverse(k[_ATOL, q] + state.rtol * size)
             squares += e * e
         error = math.sqrt(total_or_worst(squares, y) / n)
         if not error <= 1.0:  # NaN too

@@ -185,6 +185,18 @@ def inverse(builder: ir.IRBuilder, x: ir.Value) -> ir.Value:
     return _fused(builder, y, _fused(builder, power, e, e), y)
 
 
+@intrinsic
+def rough_inverse(_context, x):
+    """Return lanes of 1/x to four digits; exactly, where the machine has no estimate of quotients."""
+
+    def generate(_context: Any, builder: Any, _sig: Any, args: Any) -> ir.Value:
+        if _ESTIMATES:
+            return _estimate(builder, "rcp", args[0])
+        return inverse(builder, args[0])
+
+    return lanes(x), generate
+
+
 def inverse_root(builder: ir.IRBuilder, x: ir.Value) -> ir.Value:
     """Build 1/sqrt(x), to the last bit but one; NaN of zero, where the machine estimates roots.
 
@@ -284,11 +296,19 @@ def _fold(_context, x, largest):
     """Sum over the lanes, or the largest of them if any; NaN where any lane is NaN."""
 
     def generate(_context: Any, builder: Any, _sig: Any, args: Any) -> ir.Value:
-        lane = [builder.extract_element(args[0], ir.Constant(_INDEX, k)) for k in range(WIDTH)]
-        total = most = lane[0]
-        for value in lane[1:]:
-            total = builder.fadd(total, value)
-            most = builder.select(builder.fcmp_ordered(">", value, most), value, most)
+        def halved(x: ir.Value, combine: Any) -> ir.Value:
+            width = WIDTH
+            while width > 1:
+                width //= 2
+                sides = [
+                    ir.Constant(ir.VectorType(_INDEX, width), [*range(k, k + width)])
+                    for k in (0, width)
+                ]
+                x = combine(*(builder.shuffle_vector(x, x, side) for side in sides))
+            return builder.extract_element(x, ir.Constant(_INDEX, 0))
+
+        total = halved(args[0], builder.fadd)
+        most = halved(args[0], partial(larger, builder))
         number = builder.fcmp_ordered("ord", total, total)
         most = builder.select(number, most, total)
         return builder.select(args[1], most, total)

@@ -20,7 +20,7 @@ from rigidfleet.kernel.compiled import compiled_copy, compiled_for_c, inlined
 from rigidfleet.kernel.lanes import VECTOR, WIDTH, LaneArray
 from rigidfleet.kernel.program import Array, Program
 from rigidfleet.kernel.references import septic
-from rigidfleet.kernel.trace import Code, Symbol, Trace, pattern, structure
+from rigidfleet.kernel.trace import Code, Symbol, Trace, structure
 
 
 class Straight(NamedTuple):
@@ -42,15 +42,15 @@ def straight(program: Program) -> Straight:
     UnfitError
         The program has branches that depend on the state.
     """
-    name = hashlib.sha256(structure(program)).hexdigest()[:16]
+    description, numbers, _ = structure(program)
+    name = hashlib.sha256(description).hexdigest()[:16]
     if name not in _KNOWN:
         code = Code(Trace(program))
         _KNOWN[name] = code, _compile(code, name)
     code, address = _KNOWN[name]
     reference = program.reference
     before = lanes.pack(np.zeros((len(program.graph.edges), WIDTH)))
-    values = code.values(pattern(program)[0])
-    return Straight(address, values, before, np.zeros(3), reference.t0, reference.T_b)
+    return Straight(address, code.values(numbers), before, np.zeros(3), reference.t0, reference.T_b)
 
 
 _KNOWN: dict[str, tuple[Code, int]] = {}

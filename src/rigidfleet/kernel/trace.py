@@ -18,7 +18,7 @@ from numba.core.dispatcher import Dispatcher
 from numpy.typing import NDArray
 
 from rigidfleet.kernel import flight
-from rigidfleet.kernel.program import Array, Program, workspace
+from rigidfleet.kernel.program import Array, Graph, Program, workspace
 
 #: From where a symbol gets its value, in the order in which they are known: numbers of the program;
 #: numbers of the flight, of the moment, and of its state.
@@ -101,6 +101,9 @@ class Symbol:
 class Trace:
     """What the kernel does to the numbers of one program.
 
+    Its edges are taken in another order, in which the factor of A fills up little; states, outputs
+    and distances keep theirs.
+
     Parameters
     ----------
     program : of an open-loop flight of distances
@@ -120,22 +123,25 @@ class Trace:
     def __init__(self, program: Program) -> None:
         self.made: dict[tuple[Any, ...], Symbol] = {}
         self.positive: list[Symbol] = []
-        self._numbers = iter(pattern(program)[1].tolist())
-        self._values = pattern(program)[0]
+        _, self._values, which = structure(program)
+        self._numbers = iter(which.tolist())
         n, m = len(program.vehicles.m), len(program.graph.edges)
+        states = np.arange(6 * n + m)
+        states[6 * n :] += (order := elimination_order(program.graph.edges)) - np.arange(m)
         work = workspace(n, m, solver=program.law.solver)
         w = type(work)(*(np.full(x.shape, 0.0, dtype=object) for x in work))
-        y = np.array([self.symbol("y", q) for q in range(6 * n + m)], dtype=object)
-        before = [self.symbol("before", k) for k in range(m)]
+        y = np.array([self.symbol("y", q) for q in states.tolist()], dtype=object)
+        before = [self.symbol("before", k) for k in order.tolist()]
         p = _used(program)
         p = p._replace(**{name: self._symbolic(getattr(p, name)) for name in _PARTS})
-        p = p._replace(reference=p.reference._replace(d0=np.array(before, dtype=object)))
+        d0, d1 = np.array(before, dtype=object), p.reference.d1[order]
+        p = p._replace(graph=_ordered(p.graph, order), reference=p.reference._replace(d0=d0, d1=d1))
         dy = np.full(len(y), 0.0, dtype=object)
         self._plain(flight.closed_loop)(0.0, y, dy, p, w)
-        self.outputs: list[Any] = dy.tolist()
+        self.outputs: list[Any] = dy[np.argsort(states)].tolist()
 
     def known_positive(self, x: Symbol) -> bool:
-        """Whether a number of the program is positive: `pattern` tells apart those that are not."""
+        """Whether a number of the program is positive: `structure` tells apart those that are not."""
         return bool(self._values[x.arguments[0]] > 0.0)
 
     def symbol(self, operation: str, *arguments: Any) -> Symbol:
@@ -249,13 +255,15 @@ class Code:
         self._seen: set[int] = set()
         for x in (*self.positive, *self.outputs):
             self._need(x)
-        self.lines = sorted((x for x in self.lines if x.operation not in _SOURCES), key=lambda x: x.serial)
+        self.lines = sorted(
+            (x for x in self.lines if x.operation not in _SOURCES), key=lambda x: x.serial
+        )
         used = [x for line in self.lines for x in line.arguments] + self.outputs
         inputs = [x for x in used if isinstance(x, Symbol) and x.known == UNIFORM]
         self.inputs = list({x.serial: x for x in inputs}.values())
 
     def values(self, numbers: Array) -> Array:
-        """Values (U,) of the inputs where the program's different numbers are these, by `pattern`."""
+        """Values (U,) of the inputs where the program's different numbers are these, by `structure`."""
         found: dict[int, float] = {}
         with np.errstate(all="ignore"):
             for x in self._uniform:
@@ -283,30 +291,47 @@ class Code:
             (self._uniform if x.known == UNIFORM else self.lines).append(x)
 
 
-def pattern(program: Program) -> tuple[Array, NDArray[np.int64]]:
-    """The different numbers that a program flies by, in the order of their first appearance.
+def structure(program: Program) -> tuple[bytes, Array, NDArray[np.int64]]:
+    """All that straight-line code depends on: programs with equal structures share it.
 
-    Returns them and, for each number in the order of `Trace`, which of them it is.
+    Returns it, the different numbers that the program flies by, in the order of their first
+    appearance, and for each number, in the order of `Trace`, which of them it is.
     """
-    numbers = np.concatenate([x for name in _PARTS for x in _floats(getattr(_used(program), name))])
-    _, first, which = np.unique(numbers, return_index=True, return_inverse=True)
+    numbers: list[Array] = []
+    others: list[Any] = [program.has_frame, program.body_formulation, program.external]
+    used = _used(program)
+    for name in _PARTS:
+        _sort_out(getattr(used, name), numbers, others)
+    together = np.concatenate(numbers)
+    _, first, which = np.unique(together, return_index=True, return_inverse=True)
     order = np.argsort(first)
     rank = np.empty(len(order), dtype=np.int64)
     rank[order] = np.arange(len(order))
-    return numbers[first[order]], rank[which.ravel()]
-
-
-def structure(program: Program) -> bytes:
-    """All that straight-line code depends on: programs with equal structures share it."""
-    values, which = pattern(program)
-    p = _used(program)
-    whole = [x for name in _PARTS for x in _others(getattr(p, name))]
+    values, which = together[first[order]], rank[which]
     kinds = np.select([values == 0.0, values == 1.0, values > 0.0], [0, 1, 2], 3)
-    return (
-        repr((p.has_frame, p.body_formulation, p.external, whole)).encode()
-        + which.tobytes()
-        + kinds.tobytes()
-    )
+    return repr((others, which.tolist(), kinds.tolist())).encode(), values, which
+
+
+def elimination_order(edges: NDArray[np.integer]) -> NDArray[np.int64]:
+    """Order (m,) of edges (m, 2) in which to factor J M^-1 J^T: least degree first."""
+    at: dict[int, set[int]] = {}
+    for k, ends in enumerate(edges.tolist()):
+        for agent in ends:
+            at.setdefault(agent, set()).add(k)
+    near = {k: set().union(*(at[i] for i in ends)) - {k} for k, ends in enumerate(edges.tolist())}
+    order = []
+    while near:
+        k = min(near, key=lambda k: (len(near[k]), k))
+        order.append(k)
+        neighbours = near.pop(k)
+        for l in neighbours:
+            near[l] = (near[l] | neighbours) - {k, l}
+    return np.array(order, dtype=np.int64)
+
+
+def _ordered(graph: Graph, order: NDArray[np.int64]) -> Graph:
+    pairs = np.sort(np.argsort(order)[graph.pairs.astype(np.int64)], axis=1)[:, ::-1]
+    return graph._replace(edges=graph.edges[order], pairs=pairs, diagonal=graph.diagonal[order])
 
 
 # Parts of a program that open-loop flights of distances use.
@@ -325,22 +350,18 @@ def _used(program: Program) -> Program:
     )
 
 
-def _floats(x: Any) -> list[Array]:
-    """All real numbers of a part, in order."""
+def _sort_out(x: Any, numbers: list[Array], others: list[Any]) -> None:
+    """List the real numbers of a part; all the rest of it, with the shapes of arrays, apart."""
     if isinstance(x, tuple):
-        return [y for field in x for y in _floats(field)]
-    if isinstance(x, np.ndarray):
-        return [x.ravel()] if x.dtype == np.float64 else []
-    return [np.array([x])] if isinstance(x, float) else []
-
-
-def _others(x: Any) -> list[Any]:
-    """All the rest of a part, and the shapes of its arrays."""
-    if isinstance(x, tuple):
-        return [y for field in x for y in _others(field)]
-    if isinstance(x, np.ndarray):
-        return [x.shape] if x.dtype == np.float64 else [x.tolist()]
-    return [] if isinstance(x, float) else [x]
+        for field in x:
+            _sort_out(field, numbers, others)
+    elif isinstance(x, np.ndarray) and x.dtype == np.float64:
+        numbers.append(x.ravel())
+        others.append(x.shape)
+    elif isinstance(x, float):
+        numbers.append(np.array([x]))
+    else:
+        others.append(x.tolist() if isinstance(x, np.ndarray) else x)
 
 
 def _is(x: Any, number: float) -> bool:
