@@ -22,7 +22,7 @@ def starts(mission: Mission, count: int, spread: float = 0.3) -> np.ndarray:
     return r + np.random.default_rng(5).uniform(-spread, spread, (count, *r.shape))
 
 
-@pytest.mark.parametrize("vectors", [False, pytest.param(True, marks=pytest.mark.long)])
+@pytest.mark.parametrize("vectors", [False, True])
 def test_each_flight_is_that_of_a_mission_with_its_start(vectors: bool):
     """Positions, velocities and errors are those of `simulate`, from each start, within tolerance."""
     mission = table_1()
@@ -44,7 +44,7 @@ def test_each_flight_is_that_of_a_mission_with_its_start(vectors: bool):
         assert found.error[k] == pytest.approx(np.abs(lengths - wanted).max(), abs=1e-12)
 
 
-@pytest.mark.parametrize("vectors", [False, pytest.param(True, marks=pytest.mark.long)])
+@pytest.mark.parametrize("vectors", [False, True])
 def test_threads_and_neighbours_in_other_vectors_change_no_bit(vectors: bool):
     """One thread or three, 19 flights or the first 16 of them: flight k is the same, bit for bit."""
     mission = table_1()
@@ -57,7 +57,6 @@ def test_threads_and_neighbours_in_other_vectors_change_no_bit(vectors: bool):
     np.testing.assert_array_equal(whole.position[:16], first.position)
 
 
-@pytest.mark.long
 def test_a_flight_that_fails_takes_nobody_along():
     """Of eight flights in a vector one begins with two agents at one place: the others are flown again alone."""
     mission = table_1()
@@ -72,10 +71,22 @@ def test_a_flight_that_fails_takes_nobody_along():
     np.testing.assert_array_equal(found.position[8:], without.position)
 
 
-def test_short_work_does_not_wait_for_the_compiler():
-    """Vectors are chosen by the work ahead: not for a hundred flights of three agents."""
+def test_what_fits_no_vector_flies_alone():
+    """Sixteen agents, all joined, have too many equations for straight-line code; three have not."""
     mission = table_1()
-    assert not establish(mission, starts(mission, 3)).vectors
+    assert establish(mission, starts(mission, 3)).vectors
+    data = mission.to_dict()
+    x, y = np.divmod(np.arange(16), 4)
+    slots = 4.0 * np.stack([x, y, 0.3 * (x + y) ** 2], axis=1)
+    data |= {
+        "agents": {"mass": 1.0, "position": slots.tolist()},
+        "formations": {"sheet": {"slots": slots.tolist(), "edges": "complete"}},
+        "phases": [data["phases"][0] | {"formation": "sheet", "until": 0.1, "blend": 0.05}],
+    }
+    many = Mission.from_dict(data)
+    assert not establish(many, starts(many, 2)).vectors
+    with pytest.raises(ValueError, match="cannot share vectors"):
+        establish(many, starts(many, 2), vectors=True)
 
 
 def test_what_it_cannot_fly_is_refused():

@@ -15,19 +15,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from rigidfleet.kernel import ensemble
 from rigidfleet.kernel.lanes import WIDTH
-from rigidfleet.mission import Mission
+from rigidfleet.mission import Mission, Phase
 from rigidfleet.plan import plan_phase
 from rigidfleet.route import Situation
 
 if TYPE_CHECKING:
     from rigidfleet.kernel.program import Array
-
-#: Flying alone takes about this long for an evaluation [s]: so much for any, so much for each edge pair.
-_CALL, _PAIR = 4e-7, 4e-9
-#: Evaluations in a second of mission time, about.
-_RATE = 40.0
-#: Work alone [s] from which on vectors are worth the compiler's minute, which is due once on a machine.
-_WORTH = 15.0
 
 
 @dataclass(frozen=True)
@@ -67,9 +60,9 @@ def establish(
         end at a time, like those of Table 1; tolerances, gains and masses are the mission's. A damping of
         "auto" is 0.03 throughout, as flights of one phase are not all in their formation, or none
     position, velocity : (B, N, 3) at the start, world axes [m, m/s]; at rest without velocities
-    vectors : whether eight flights share a vector of the machine, and their steps: five times as fast, once the
-        compiler has had its minute. By default where flying alone would take longer than that; this
-        depends on the mission and on B only.
+    vectors : whether eight flights share a vector of the machine, and their steps, through code made for the
+        mission's graph: seven times as fast, and compiled in seconds. By default in each phase that
+        `rigidfleet.kernel.ensemble.fits`; True asks for it in all of them.
     threads : by default one for each core. Results do not depend on it, bit for bit.
 
     Raises
@@ -81,12 +74,20 @@ def establish(
     v = np.zeros_like(r) if velocity is None else _starts("velocity", velocity, mission.n_agents)
     if v.shape != r.shape:
         raise ValueError(f"velocity {v.shape} and position {r.shape} must have one shape")
+    _refuse_others(mission)
+    flights = _Flights(mission, r, v)
+    for phase in mission.phases:
+        if flights.finished.any():
+            flights.fly(phase, vectors, threads or os.cpu_count() or 1)
+    return Ensemble(
+        flights.r, flights.v, flights.error, flights.finished, flights.evaluations, flights.vectors
+    )
+
+
+def _refuse_others(mission: Mission) -> None:
     for index, phase in enumerate(mission.phases):
-        if (
-            phase.control != "open"
-            or phase.settle
-            or getattr(phase, "reference", "step") == "shape"
-        ):
+        shape = getattr(phase, "reference", "step") == "shape"
+        if phase.control != "open" or phase.settle or shape:
             raise ValueError(
                 f"phase {index + 1} '{phase.name}' is not flown open-loop under distances to a given time, which is all"
                 " that an ensemble flies; vary other missions by `rigidfleet.sweep`"
@@ -95,55 +96,63 @@ def establish(
         raise ValueError(
             "an ensemble flies in calm air; vary missions with [disturbances] by `rigidfleet.sweep`"
         )
-    count, n = r.shape[:2]
-    threads = threads or os.cpu_count() or 1
-    if vectors is None:
-        vectors = _alone(mission, count) > _WORTH
-    now = Situation(0.0, r[0], v[0])
-    integral: dict[tuple[int, int], Array] = {}
-    finished = np.ones(count, dtype=bool)
-    evaluations = np.zeros(count, dtype=np.int64)
-    error = np.zeros(count)
-    for phase in mission.phases:
-        if not finished.any():
-            break
-        places = _places(finished)
-        t_end = now.t + (phase.duration or 0.0) if phase.until is None else phase.until
+
+
+class _Flights:
+    """Where all flights are, and what their phases hand on."""
+
+    def __init__(self, mission: Mission, r: Array, v: Array) -> None:
+        self.mission, self.r, self.v = mission, r, v
+        count = len(r)
         # One plan for all: without slots, only the distances it starts from are a flight's own.
-        plan = plan_phase(mission, phase, now, t_end)
+        self.now = Situation(0.0, r[0], v[0])
+        self.integral: dict[tuple[int, int], Array] = {}
+        self.finished = np.ones(count, dtype=bool)
+        self.evaluations = np.zeros(count, dtype=np.int64)
+        self.error = np.zeros(count)
+        self.vectors = True
+
+    def fly(self, phase: Phase, vectors: bool | None, threads: int) -> None:
+        """Fly one phase, and keep its ends."""
+        now, (count, n) = self.now, self.r.shape[:2]
+        t_end = now.t + (phase.duration or 0.0) if phase.until is None else phase.until
+        plan = plan_phase(self.mission, phase, now, t_end)
         if plan.method != "dense":
             raise ValueError(
                 f"an ensemble solves densely, and '{plan.formation}' has too many edges for that"
                 f" ({len(plan.edges)}); vary such missions by `rigidfleet.sweep`"
             )
-        law = plan.program.law._replace(mu=mission.damping(None))
+        law = plan.program.law._replace(mu=self.mission.damping(None))
+        program = plan.program._replace(law=law)
         edges = [(int(i), int(j)) for i, j in plan.edges]
-        before = np.stack(
-            [np.full(count, now.reference[e]) if e in now.reference else _distance(r, e) for e in edges], axis=1
-        )  # fmt: skip
-        sums = [integral.get(e, np.zeros(count)) for e in edges]
-        y = np.column_stack([r.reshape(count, -1), v.reshape(count, -1), *sums])
-        tolerances = mission.integrator
+        before = _lengths(self.r, plan.edges)
+        for k, edge in enumerate(edges):
+            before[:, k] = now.reference.get(edge, before[:, k])
+        sums = [self.integral.get(edge, np.zeros(count)) for edge in edges]
+        y = np.column_stack([self.r.reshape(count, -1), self.v.reshape(count, -1), *sums])
+        places, tolerances = _places(self.finished), self.mission.integrator
+        shared = ensemble.fits(program) if vectors is None else vectors
         ends = ensemble.fly_all(
-            plan.program._replace(law=law),
+            program,
             y[places],
             before[places],
             (now.t, t_end),
             rtol=tolerances.rtol,
             atol=np.full(y.shape[1], tolerances.atol),
-            vectors=vectors,
+            vectors=shared,
             threads=threads,
         )
-        y[finished] = ends.y[finished]
-        evaluations[finished] += ends.evaluations[finished]
-        finished &= ends.finished
-        r, v = (x.reshape(count, n, 3) for x in np.split(y[:, : 6 * n], 2, axis=1))
-        integral |= dict(zip(edges, y[:, 6 * n :].T, strict=True))
+        self.vectors &= shared
+        y[self.finished] = ends.y[self.finished]
+        self.evaluations[self.finished] += ends.evaluations[self.finished]
+        self.finished &= ends.finished
+        self.r, self.v = (x.reshape(count, n, 3) for x in np.split(y[:, : 6 * n], 2, axis=1))
+        self.integral |= dict(zip(edges, y[:, 6 * n :].T, strict=True))
         known = now.reference | dict(zip(edges, plan.distances.tolist(), strict=True))
-        now = replace(now, t=t_end, reference=known, formation=plan.formation, slots=plan.slots)
-        lengths = np.stack([_distance(r, e) for e in edges], axis=1)
-        error = np.abs(lengths - plan.distances).max(axis=1)
-    return Ensemble(r, v, error, finished, evaluations, vectors)
+        self.now = replace(
+            now, t=t_end, reference=known, formation=plan.formation, slots=plan.slots
+        )
+        self.error = np.abs(_lengths(self.r, plan.edges) - plan.distances).max(axis=1)
 
 
 def _starts(name: str, values: ArrayLike, agents: int) -> Array:
@@ -167,11 +176,6 @@ def _places(finished: NDArray[np.bool_]) -> NDArray[np.int64]:
     return places
 
 
-def _distance(r: Array, edge: tuple[int, int]) -> Array:
-    return np.linalg.norm(r[:, edge[0]] - r[:, edge[1]], axis=1)
-
-
-def _alone(mission: Mission, count: int) -> float:
-    """About how long flying alone would take [s]: a function of the mission, not of the machine."""
-    edges = max(len(mission.formation_edges(name)) for name in mission.formations)
-    return count * mission.latest_end * _RATE * (_CALL + _PAIR * edges**2)
+def _lengths(r: Array, edges: NDArray[np.integer]) -> Array:
+    """Lengths (B, m) of edges [m]."""
+    return np.linalg.norm(r[:, edges[:, 0]] - r[:, edges[:, 1]], axis=2)

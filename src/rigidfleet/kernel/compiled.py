@@ -8,7 +8,7 @@ import hashlib
 import os
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FunctionType
@@ -62,7 +62,7 @@ def compiled_for_c(
     signature = types.void(*[types.CPointer(types.float64)] * arguments)
     copy = _copy(function, name, instead)
     with _own_cache():
-        made = numba.cfunc(signature, cache=not os.environ.get("NOC"), nopython=True)(copy)
+        made = numba.cfunc(signature, cache=True, nopython=True)(copy)
     _STAYING.append(made)
     return made.address
 
@@ -70,7 +70,7 @@ def compiled_for_c(
 _STAYING: list[Any] = []
 
 
-def _copy(function: Callable[..., Any], name: str, instead: dict[str, Any]) -> FunctionType:
+def _copy(function: FunctionType, name: str, instead: dict[str, Any]) -> FunctionType:
     copy = FunctionType(function.__code__, function.__globals__ | instead, name)
     copy.__module__, copy.__qualname__ = function.__module__, name
     return copy
@@ -119,7 +119,7 @@ _CACHE = cache_directory()
 
 
 @contextmanager
-def _own_cache() -> Iterator[None]:
+def _own_cache() -> Generator[None]:
     """Let Numba use the kernel's folder; its other users keep theirs."""
     before = numba.config.CACHE_DIR
     numba.config.CACHE_DIR = str(_CACHE)

@@ -98,13 +98,14 @@ def fits(program: Program) -> bool:
     Its branches must not depend on the state, and its code must not be too long to be compiled.
     """
     edges, agents = len(program.graph.edges), len(program.vehicles.m)
+    equations = min(edges, 3 * agents) if program.law.solver == ITERATED else edges
     return (
         program.control.kind == OPEN
         and program.law.solver in (ITERATED, EXACT)
         and program.reference.kind != SLOTS
         and not (program.has_frame or program.body_formulation or program.disturbance.active)
         and program.external == 0
-        and min(edges, 3 * agents) <= _MOST_EQUATIONS
+        and equations <= _MOST_EQUATIONS
     )
 
 

@@ -114,8 +114,13 @@ integrate = compiled_copy(
 )
 
 
+def _lines(y, dy, uniform, before, time):
+    """Straight-line code: each copy of `_derivative` has its own."""
+    raise NotImplementedError
+
+
 def _derivative(y, dy, uniform, before, time):
-    _lines(y, dy, uniform, before, time)  # noqa: F821 - each copy has its own
+    _lines(y, dy, uniform, before, time)
 
 
 def _compile(code: Code, name: str) -> int:

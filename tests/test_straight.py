@@ -1,0 +1,147 @@
+"""The kernel's source as straight-line code: `rigidfleet.kernel.trace` and `kernel.straight`."""
+
+from typing import Any
+
+import numba
+import numpy as np
+import pytest
+
+from rigidfleet.kernel import flight, program, straight
+from rigidfleet.kernel.lanes import pack, unpack
+from rigidfleet.kernel.program import Program
+from rigidfleet.kernel.trace import Code, Trace, UnfitError, elimination_order, structure
+from rigidfleet.mission import Mission
+from rigidfleet.plan import plan_phase
+from rigidfleet.route import Situation
+
+#: What a program is made of: its agents, and what differs from the default.
+CASES: dict[str, tuple[int, dict[str, Any]]] = {
+    "the paper's law": (4, {"constraint": {"solver": "exact", "deformation_damping": 0.0}}),
+    "the default law": (5, {}),
+    "redundant edges, in the agents' coordinates": (6, {"edges": "complete"}),
+    "equal masses": (5, {"mass": 1.0}),
+    "thrust limits": (5, {"thrust_limit": 9.0}),
+    "two agents": (2, {"edges": "complete"}),
+    "a line": (4, {"line": True, "edges": "complete"}),
+}
+
+
+def make(agents: int, data: dict[str, Any]) -> tuple[Program, np.ndarray]:
+    """A program that establishes some shape from some other, and its start (n,)."""
+    random = np.random.default_rng(agents)
+    slots = random.uniform(-5.0, 5.0, (agents, 3))
+    if "line" in data:
+        slots[:, 1:] = 0.0
+        slots[:, 0] = 3.0 * np.arange(agents)
+    r = slots + random.uniform(-0.5, 0.5, slots.shape)
+    edges = [[i, j] for i in range(2, agents + 1) for j in range(max(1, i - 3), i)]
+    whole: dict[str, Any] = {
+        "schema_version": 1,
+        "name": "some",
+        "title": "Some shape",
+        "agents": {
+            "mass": data.get("mass", random.uniform(0.5, 2.0, agents).tolist()),
+            "position": r.tolist(),
+        },
+        "constraint": data.get("constraint", {}),
+        "formations": {"some": {"slots": slots.tolist(), "edges": data.get("edges", edges)}},
+        "phases": [
+            {"kind": "establish", "formation": "some", "control": "open", "duration": 9.0,
+             "reference": "distances", "blend": 4.0, "input_force": [0.1, 0.0, -0.2]},
+        ],
+    }  # fmt: skip
+    if "thrust_limit" in data:
+        whole["agents"] |= {"thrust_limit": data["thrust_limit"], "saturate": True}
+    mission = Mission.from_dict(whole)
+    now = Situation(0.0, r, np.zeros_like(r))
+    plan = plan_phase(mission, mission.phases[0], now, 9.0)
+    return plan.program, r
+
+
+def derivative(p: Program, y: np.ndarray, t: float) -> np.ndarray:
+    """dy/dt by the compiled kernel of single flights."""
+    n, m = len(p.vehicles.m), len(p.graph.edges)
+    w = program.workspace(n, m, solver=p.law.solver)
+    out = flight.recorder(1, n, m)
+    flight.record(np.array([t]), y[None], p, w, np.zeros(len(y)), out)
+    return np.concatenate([out.v[0].ravel(), out.a[0].ravel(), out.c[0]])
+
+
+@numba.njit(error_model="numpy")
+def call(p, y, dy, t):
+    """dy/dt by straight-line code, of eight states."""
+    straight._closed_loop(t, y, dy, p, None)
+
+
+def in_lanes(p: Program, y: np.ndarray, t: float) -> np.ndarray:
+    """dy/dt (8, n) of states y (8, n)."""
+    ready = straight.straight(p)
+    before = pack(np.repeat(p.reference.d0[:, None], 8, axis=1))
+    dy = pack(np.zeros_like(y.T))
+    call(ready._replace(before=before), pack(y.T), dy, t)
+    return unpack(dy).T
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_straight_line_code_is_the_kernel(case: str):
+    """Of random states, at the blend's start, within it and after it, the derivative is the kernel's."""
+    p, r = make(*CASES[case])
+    n = 6 * len(r) + len(p.graph.edges)
+    random = np.random.default_rng(0)
+    for t in (0.0, 1.3, 8.0):
+        y = np.concatenate([r.ravel(), np.zeros(n - r.size)]) + 0.3 * random.normal(size=(8, n))
+        expected = np.array([derivative(p, one, t) for one in y])
+        np.testing.assert_allclose(in_lanes(p, y, t), expected, rtol=1e-9, atol=1e-9)
+
+
+def test_no_loop_is_left_and_nothing_is_computed_twice():
+    """Products with zero are gone, equal numbers are one, what is known before a flight is not computed in it."""
+    p, _ = make(*CASES["the paper's law"])
+    code = Code(Trace(p))
+    made = [(x.operation, x.arguments) for x in code.lines]
+    assert len(set(made)) == len(made)
+    assert not any(0.0 in [a for a in x.arguments if isinstance(a, float)] for x in code.lines)
+    first = {x.serial: k for k, x in enumerate(code.lines)}
+    for k, x in enumerate(code.lines):
+        needed = [a.serial for a in x.arguments if hasattr(a, "serial")]
+        assert all(first.get(serial, -1) < k for serial in needed)
+
+
+def test_other_numbers_need_no_other_code():
+    """Another gain or mass flies by the same code; numbers that become equal do not."""
+    p, _ = make(*CASES["the default law"])
+    law = p.law._replace(alpha=1.7 * p.law.alpha)
+    assert structure(p)[0] == structure(p._replace(law=law))[0]
+    law = p.law._replace(alpha=p.law.beta)
+    assert structure(p)[0] != structure(p._replace(law=law))[0]
+    assert structure(p)[0] != structure(p._replace(law=p.law._replace(k_def=0.0)))[0]
+
+
+def test_a_state_without_multipliers_has_no_derivative():
+    """Agents on a line with all edges have no multipliers under the exact law: that lane is NaN, the others are not."""
+    p, r = make(
+        4, {"constraint": {"solver": "exact", "deformation_damping": 0.0}, "edges": "complete"}
+    )
+    n = 6 * len(r) + len(p.graph.edges)
+    y = np.zeros((8, n))
+    y[:, : r.size] = r.ravel()
+    line = np.zeros_like(r)
+    line[:, 0] = np.arange(4)
+    y[3, : r.size] = line.ravel()
+    dy = in_lanes(p, y, 1.0)
+    assert np.isnan(dy).any(axis=1).tolist() == [k == 3 for k in range(8)]
+
+
+def test_edges_are_eliminated_by_least_degree():
+    """Each edge once; of a chain its ends first, so that no row of the factor has more than one entry."""
+    chain = np.array([[3, 4], [1, 2], [0, 1], [2, 3]])
+    order = elimination_order(chain).tolist()
+    assert sorted(order) == [0, 1, 2, 3]
+    assert order[0] in (0, 2)
+
+
+def test_what_branches_on_the_state_is_refused():
+    """The pseudo-inverse iterates until its rotations have converged: no straight line."""
+    p, _ = make(4, {"constraint": {"solver": "pinv"}, "edges": "complete"})
+    with pytest.raises(UnfitError):
+        Trace(p)
