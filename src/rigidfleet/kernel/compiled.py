@@ -52,9 +52,7 @@ def compiled_copy(function: Any, name: str, **instead: Any) -> Any:
     return _cached(_copy(function.py_func, name, instead), _OPTIONS)
 
 
-def compiled_for_c(
-    function: Callable[..., Any], name: str, *, arguments: int, **instead: Any
-) -> int:
+def compiled_for_c(function: Any, name: str, *, arguments: int, **instead: Any) -> int:
     """Compile a copy of a function of so many pointers to float64; return its address.
 
     Both it and the copy stay as long as the process does.

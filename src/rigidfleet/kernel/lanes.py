@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from llvmlite import binding, ir
 from numba import types
-from numba.core import cgutils
+from numba.core import cgutils, config
 from numba.core.imputils import impl_ret_borrowed
 from numba.core.typeconv import Conversion
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
@@ -34,8 +34,8 @@ WIDTH = 8
 _FAST = ("contract", "arcp", "nsz")
 VECTOR = ir.VectorType(ir.DoubleType(), WIDTH)
 _INDEX = ir.IntType(32)
-# Of x86, which have an estimate of 14 bits for eight roots or quotients at once.
-_ESTIMATES = bool(binding.get_host_cpu_features().get("avx512f"))
+# Whether the machine estimates eight roots or quotients at once, to 14 bits, and may be asked to.
+_ESTIMATES = bool(binding.get_host_cpu_features().get("avx512f")) and not config.CPU_NAME
 
 
 class _Lanes(types.Type):
