@@ -361,16 +361,18 @@ def test_a_narrow_shape_that_fits_keeps_its_attitude():
     np.testing.assert_allclose(found, T, rtol=0, atol=0.03)
 
 
-def test_headroom_is_the_least_height_above_another():
+@pytest.mark.parametrize("n", [30, 210])
+def test_headroom_is_the_least_height_above_another(n: int):
     """Of pairs that overlap as seen from above the nearest in height; by trying all of them."""
     rng = np.random.default_rng(7)
-    r, radius = rng.uniform(0, 6, (5, 30, 3)), rng.uniform(0.1, 0.6, 30)
+    r, radius = rng.uniform(0, 6, (5, n, 3)), rng.uniform(0.1, 0.6, n)
+    r[:, 4] = np.nan  # who has left is below nobody
     room, pair = geometry.headroom(r, radius)
     for k in range(5):
         found = [
             (abs(r[k, i, 2] - r[k, j, 2]) - radius[i] - radius[j], i, j)
-            for i in range(30)
-            for j in range(i + 1, 30)
+            for i in range(n)
+            for j in range(i + 1, n)
             if np.hypot(*(r[k, i] - r[k, j])[:2]) <= radius[i] + radius[j]
         ]
         assert (room[k], *pair[k]) == pytest.approx(min(found))

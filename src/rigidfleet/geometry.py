@@ -18,7 +18,7 @@ Ints = NDArray[np.int64]
 _THIN = 1e-3
 # Narrower ones than this are a line where they are not so many times wider than agents are off them.
 _NARROW, _SURE = 0.1, 4.0
-# Beyond so many agents the closest two are found by a tree, not among all pairs.
+# Beyond so many agents two that are near each other are found by a tree, not among all pairs.
 _MANY = 200
 # Numbers in a temporary array at most.
 _ELEMENTS = 8_000_000
@@ -66,27 +66,43 @@ def headroom(
     Below is who overlaps as seen from above. Infinity and (-1, -1) where nobody is. r (K, N, 3) [m],
     radius (N,); ``among`` (K, N): whom to look at, all by default.
     """
-    from scipy.spatial import KDTree
-
+    n = r.shape[1]
     radius = np.asarray(radius, dtype=float)
     least, pair = np.full(len(r), np.inf), np.full((len(r), 2), -1)
-    for k, points in enumerate(r):
-        who = np.isfinite(points).all(axis=1)
-        if among is not None:
-            who &= among[k]
-        who = np.flatnonzero(who)
-        if not len(who):
-            continue
-        near = who[KDTree(points[who, :2]).query_pairs(2.0 * radius.max(), output_type="ndarray")]
-        i, j = near.T
-        apart, radii = points[i] - points[j], radius[i] + radius[j]
-        room = np.where(
-            np.hypot(apart[:, 0], apart[:, 1]) > radii, np.inf, abs(apart[:, 2]) - radii
-        )
-        if len(room) and np.isfinite(room.min()):
-            at = int(room.argmin())
-            least[k], pair[k] = room[at], np.sort(near[at])
+    if among is not None:
+        r = np.where(among[:, :, None], r, np.nan)
+    if n > _MANY:
+        for k, points in enumerate(r):
+            least[k], pair[k] = _lowest(points, radius)
+        return least, pair
+    for i in range(n - 1):
+        apart, radii = r[:, i + 1 :] - r[:, i : i + 1], radius[i] + radius[i + 1 :]
+        overlap = apart[:, :, 0] ** 2 + apart[:, :, 1] ** 2 <= radii**2
+        room = np.where(overlap, abs(apart[:, :, 2]) - radii, np.inf)
+        room[np.isnan(room)] = np.inf  # who is nowhere is below nobody
+        j = room.argmin(axis=1)
+        room = room[np.arange(len(r)), j]
+        lower = room < least
+        least[lower] = room[lower]
+        pair[lower, 0], pair[lower, 1] = i, i + 1 + j[lower]
     return least, pair
+
+
+def _lowest(r: Array, radius: Array) -> tuple[float, Ints]:
+    """Least height between two of many agents (N, 3) of which one is below the other, and the pair."""
+    from scipy.spatial import KDTree
+
+    who = np.flatnonzero(np.isfinite(r).all(axis=1))
+    if not len(who):
+        return np.inf, np.array([-1, -1])
+    near = who[KDTree(r[who, :2]).query_pairs(2.0 * radius.max(), output_type="ndarray")]
+    apart, radii = r[near[:, 0]] - r[near[:, 1]], radius[near].sum(axis=1)
+    overlap = apart[:, 0] ** 2 + apart[:, 1] ** 2 <= radii**2
+    room = np.where(overlap, abs(apart[:, 2]) - radii, np.inf)
+    if not overlap.any():
+        return np.inf, np.array([-1, -1])
+    at = int(room.argmin())
+    return float(room[at]), np.sort(near[at])
 
 
 def clearance(
