@@ -31,10 +31,13 @@ from rigidfleet import formation as shapes
 from rigidfleet.ensemble import establish
 from rigidfleet.kernel import flight
 from rigidfleet.kernel.program import workspace
+from rigidfleet.kernel.trace import Code, Trace
 from rigidfleet.mission import Mission, load_mission
 from rigidfleet.plan import plan_phase
 from rigidfleet.route import Situation
 from rigidfleet.simulate import simulate
+from rigidfleet.sweep.definition import Sweep
+from rigidfleet.sweep.engine import fly_runs
 
 TOLERANCE = 1e-8
 DURATION, SAMPLES = 20.0, 200
@@ -223,6 +226,20 @@ def ensembles(rounds: int) -> list[Row]:
     return rows
 
 
+def missions(rounds: int) -> list[Row]:
+    """Whole missions as a sweep flies them, verdict included, on one core; against the time they last."""
+    name, gain = "narrow-passage", "constraint.alpha=uniform(0.4,0.6)"
+    mission = load_mission(name)
+    sweep = Sweep.of(mission, vary=[gain], runs=20 * rounds, seed=1)
+    fly_runs(sweep, range(2))
+    spent = [
+        seconds(lambda k=k: fly_runs(sweep, range(20 * k, 20 * (k + 1)))) / 20
+        for k in range(rounds)
+    ]
+    lasts = simulate(mission).time[-1]
+    return [Row(f"{name}, {lasts:.0f} s, a run of a sweep", spent, [lasts] * rounds, None, True)]
+
+
 def operations(mission: Mission) -> dict[str, int]:
     """Floating-point operations of an evaluation of the undamped law, by part; a root or quotient counts one.
 
@@ -233,17 +250,28 @@ def operations(mission: Mission) -> dict[str, int]:
     degree = np.bincount(edges.ravel(), minlength=n)
     # A pair of edges that share an agent: u_k . u_l over its mass; an edge with itself: the masses alone.
     pairs = int((degree * (degree - 1) // 2).sum())
-    stages, weights = (
-        6,
-        1 + 2 + 3 + 4 + 5 + 5 + 6,
-    )  # Dormand and Prince: of the stages and of the error
     return {
         "edges: lengths, directions, rates, b": 45 * m,
         "A": 6 * pairs + m,
         "Cholesky factor and two solves": (2 * m**3 + 3 * m**2 + m) // 6 + 2 * m**2,
         "forces and accelerations": 9 * m + 6 * n,
-        "its share of a step": (6 * n + m) * 2 * weights // stages,
+        "its share of a step": share_of_a_step(mission),
     }
+
+
+def share_of_a_step(mission: Mission) -> int:
+    """Operations of an evaluation's part in a step of Dormand and Prince: sums of the stages and of the error."""
+    stages, weights = 6, 1 + 2 + 3 + 4 + 5 + 5 + 6
+    edges = mission.formation_edges(mission.phases[0].formation)
+    return (6 * mission.n_agents + len(edges)) * 2 * weights // stages
+
+
+def straight_line(mission: Mission) -> int:
+    """Operations of an evaluation as straight-line code does them, and its share of a step."""
+    r = np.array(mission.agents.position)
+    now = Situation(0.0, r, np.zeros_like(r))
+    code = Code(Trace(plan_phase(mission, mission.phases[0], now, DURATION).program))
+    return len(code.lines) + share_of_a_step(mission)
 
 
 def bound() -> float:
@@ -329,19 +357,20 @@ def main() -> int:
     tables = {
         "flights": alone,
         "ensembles": ensembles(arguments.rounds),
+        "missions": missions(arguments.rounds),
         "processes": processes(arguments.rounds),
     }
     show(console, [row for rows in tables.values() for row in rows])
-    most, counts = bound(), {}
+    most, counts, straight = bound(), {}, {}
     for row, (source, n) in zip(
         (r for r in tables["ensembles"] if "undamped" in r.name), FORMATIONS.items(), strict=True
     ):
-        counts[str(n)] = operations(establishment(source, default_law=False))
-        total = sum(counts[str(n)].values())
-        rate = total * (row.evaluations or 0.0) / median(row.ours)
+        mission = establishment(source, default_law=False)
+        counts[str(n)], straight[str(n)] = operations(mission), straight_line(mission)
+        rate = straight[str(n)] * (row.evaluations or 0.0) / median(row.ours)
         console.print(
-            f"{row.name}: {total} operations an evaluation, {1e-9 * rate:.3g} Gflop/s on all cores of"
-            f" {1e-9 * most:.3g} in a product of matrices",
+            f"{row.name}: {straight[str(n)]} operations an evaluation, {1e-9 * rate:.3g} Gflop/s on all cores"
+            f" of {1e-9 * most:.3g} in a product of matrices",
             highlight=False,
         )
     if arguments.json:
@@ -350,7 +379,7 @@ def main() -> int:
             for name, rows in tables.items()
         }
         head = {"date": str(date.today()), "machine": machine, "versions": versions}
-        head |= {"cores": os.cpu_count(), "bound": most, "operations": counts}
+        head |= {"cores": os.cpu_count(), "bound": most, "operations": counts, "straight": straight}
         arguments.json.write_text(json.dumps(head | data, indent=1))
     if not agree:
         console.print(f"The peers do not agree to {AGREEMENT:g} m: they do not fly the same law.")

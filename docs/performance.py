@@ -57,6 +57,15 @@ def _ratios(name: str, theirs: str) -> Any:
     return write
 
 
+def _missions(data: Data) -> str:
+    """Whole missions, against the time they last."""
+    rows = [
+        (row["name"], _time(row["ours"]), f"{median(row['ratios']):,.0f}")
+        for row in data["missions"]
+    ]
+    return _table(("", "ours [ms]", "simulated s in a second"), rows)
+
+
 def _processes(data: Data) -> str:
     """Whole processes: but for the first run, against a bare interpreter."""
     *warm, first = data["processes"]
@@ -75,14 +84,17 @@ def _operations(data: Data) -> str:
     ]
     total = [sum(count.values()) for count in counts.values()]
     rows.append(("together", *(f"{n:,}" for n in total)))
-    for name, title, cores in (
-        ("flights", "a flight alone, one core", 1),
-        ("ensembles", "eight to a vector, all cores", data["cores"]),
+    straight = list(data["straight"].values())
+    for name, title, cores, done in (
+        ("flights", "a flight alone, one core", 1, total),
+        ("ensembles", "eight to a vector, all cores", data["cores"], straight),
     ):
         found = [row for row in data[name] if row["evaluations"] and "undamped" in row["name"]]
         each = [median(row["ours"]) / row["evaluations"] for row in found]
         bound = data["bound"] * cores / data["cores"]
-        shares = zip(total, each, strict=True)
+        shares = zip(done, each, strict=True)
+        if done is straight:
+            rows.append(("as straight-line code", *(f"{n:,}" for n in straight)))
         rows.append((f"{title}: ns an evaluation", *(f"{1e9 * s:,.0f}" for s in each)))
         rows.append(("share of the bound", *(f"{100 * n / s / bound:.2g} %" for n, s in shares)))
     text = _table(("", *(f"{n} agents" for n in counts)), rows)
@@ -145,6 +157,7 @@ TABLES: dict[str, tuple[str, Any]] = {
     "machine": ("versions", _machine),
     "flights": ("flights", _ratios("flights", "SciPy")),
     "ensembles": ("ensembles", _ratios("ensembles", "SciPy")),
+    "missions": ("missions", _missions),
     "operations": ("operations", _operations),
     "processes": ("processes", _processes),
     "peers": ("rows", _peers),
