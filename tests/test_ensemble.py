@@ -89,6 +89,21 @@ def test_what_fits_no_vector_flies_alone():
         establish(many, starts(many, 2), vectors=True)
 
 
+@pytest.mark.parametrize("vectors", [False, True])
+def test_one_agent_has_no_distances(vectors: bool):
+    """It falls through none: pushed for a second, it is where the force has taken it."""
+    data = table_1().to_dict()
+    data |= {
+        "agents": {"mass": 2.0, "position": [[0.0, 0.0, 5.0]]},
+        "formations": {"alone": {"slots": [[0.0, 0.0, 0.0]], "edges": []}},
+        "phases": [data["phases"][0] | {"formation": "alone", "until": 1.0, "blend": 0.5}],
+    }
+    data["phases"][0]["input_force"] = [1.0, 0.0, 0.0]
+    found = establish(Mission.from_dict(data), [[[0.0, 0.0, 5.0]]], vectors=vectors)
+    np.testing.assert_allclose(found.position, [[[0.25, 0.0, 5.0]]], atol=1e-9)
+    assert found.error.tolist() == [0.0]
+
+
 def test_what_it_cannot_fly_is_refused():
     """Other phases than open-loop ones, disturbances, and starts of another shape are told apart."""
     passage = load_mission("narrow-passage")

@@ -152,7 +152,7 @@ class _Flights:
         self.now = replace(
             now, t=t_end, reference=known, formation=plan.formation, slots=plan.slots
         )
-        self.error = np.abs(_lengths(self.r, plan.edges) - plan.distances).max(axis=1)
+        self.error = abs(_lengths(self.r, plan.edges) - plan.distances).max(axis=1, initial=0.0)
 
 
 def _starts(name: str, values: ArrayLike, agents: int) -> Array:

@@ -151,7 +151,7 @@ def fly_all(
     def packed(x: Array) -> LaneArray:
         if count % WIDTH:  # places left over in the last vector repeat the last flight
             x = x[np.minimum(np.arange(padded(count)), count - 1)]
-        return pack(x.reshape(-1, WIDTH, x.shape[1]).swapaxes(1, 2))
+        return pack(x.reshape(len(x) // WIDTH, WIDTH, x.shape[1]).swapaxes(1, 2))
 
     def begin() -> tuple[Any, Any, Integrator]:
         state = integrator(np.zeros(n), 0.0, rtol=rtol, atol=atol)
