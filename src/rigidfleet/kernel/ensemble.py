@@ -200,6 +200,7 @@ def _share(
 ) -> Ends:
     """Share the flights, or vectors of them, out over threads, each with what `begin` gives it."""
     count = len(starts)
+    threads = min(threads, count)
     ends = np.empty_like(starts)
     status, evaluations = np.empty(count, dtype=np.int64), np.empty(count, dtype=np.int64)
     size = max(1, -(-count // (threads * _RANGES)))
