@@ -3,6 +3,8 @@
 Short names are the paper's; every array is C-contiguous float64 (edges: uint32). N agents, m edges.
 """
 
+import math
+from itertools import accumulate
 from typing import NamedTuple
 
 import numpy as np
@@ -189,7 +191,7 @@ class Workspace(NamedTuple):
 
 def zeros(*shape: int) -> Array:
     """Zeros that begin with a cache line: whether rows straddle lines costs up to a tenth."""
-    size = int(np.prod(shape))
+    size = math.prod(shape)
     room = np.zeros(size + 8)
     skip = -room.ctypes.data // room.itemsize % 8
     return room[skip : skip + size].reshape(shape)
@@ -205,20 +207,31 @@ def workspace(
     """
     size = 0 if large else min(m, 3 * n) if solver == ITERATED else m
     vectors = 0 if large or solver in (ITERATED, EXACT) else m
-    agent = lambda: zeros(n, 3)  # noqa: E731
-    edge = lambda: zeros(m)  # noqa: E731
     k = 3 * n if with_h else 0
-    return Workspace(
-        r=agent(), v=agent(), r_seen=agent(), v_seen=agent(), u=zeros(m, 3), L=edge(),
-        d=edge(), d_dot=edge(), d_ddot=edge(),
-        c=edge(), b=edge(), A=zeros(size, size), V=zeros(vectors, vectors), w=edge(), multiplier=edge(),
-        f_E=agent(), f_u=agent(), f_C=agent(), f_D=agent(), a=agent(), p=agent(), p_dot=agent(),
-        p_ddot=agent(), r_ref=agent(), v_ref=agent(), a_ref=agent(), cm=zeros(5, 3),
-        I=zeros(3, 3), I_inv=zeros(3, 3), T=np.eye(3), body=zeros(8, 3),
-        gain=zeros(4), E=zeros(3, 3),
-        T_ref=np.eye(3), wrench=zeros(6), H=zeros(k, k), H_V=zeros(k, k),
-        H_w=zeros(k, 3),
+    agents, edges, space = (n, 3), (m,), (3, 3)
+    w = Workspace(
+        **_side_by_side(
+            r=agents, v=agents, r_seen=agents, v_seen=agents, u=(m, 3), L=edges, d=edges,
+            d_dot=edges, d_ddot=edges, c=edges, b=edges, A=(size, size), V=(vectors, vectors),
+            w=edges, multiplier=edges, f_E=agents, f_u=agents, f_C=agents, f_D=agents, a=agents,
+            p=agents, p_dot=agents, p_ddot=agents, r_ref=agents, v_ref=agents, a_ref=agents,
+            cm=(5, 3), I=space, I_inv=space, T=space, body=(8, 3), gain=(4,), E=space, T_ref=space,
+            wrench=(6,), H=(k, k), H_V=(k, k), H_w=(k, 3),
+        )
     )  # fmt: skip
+    w.T[:] = w.T_ref[:] = np.eye(3)
+    return w
+
+
+def _side_by_side(**shapes: tuple[int, ...]) -> dict[str, Array]:
+    """Arrays of zeros, each of which begins with a cache line."""
+    sizes = [math.prod(shape) for shape in shapes.values()]
+    ends = list(accumulate(-(-size // 8) * 8 for size in sizes))
+    room = zeros(ends[-1])
+    return {
+        name: room[end - -(-size // 8) * 8 :][:size].reshape(shape)
+        for (name, shape), size, end in zip(shapes.items(), sizes, ends, strict=True)
+    }
 
 
 def calm(masses: Array) -> Disturbance:
