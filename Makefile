@@ -32,7 +32,7 @@ peers: .venv/.peers  ## Fly beside other programs (Octave, too, if it is on PATH
 	@$(BIN)/python benchmarks/compare.py
 
 robustness: .venv/.bench  ## Fly 200 random formations under every graph and law
-	@$(BIN)/python benchmarks/robustness.py
+	@$(BIN)/python benchmarks/robustness.py --write docs/robustness.md
 
 docs: .venv/.docs  ## Build the site into site/, with every figure on it
 	@$(BIN)/python docs/picture.py

@@ -14,6 +14,7 @@ import argparse
 import json
 import multiprocessing
 import os
+import re
 import sys
 import time
 from collections.abc import Iterable, Iterator, Sequence
@@ -43,7 +44,7 @@ Ints = NDArray[np.int64]
 SPACING, APART = 2.0, 1.0
 #: Length of a flight [s], that of the paper's Table 1.
 FLIGHT = 20.0
-#: Laws are compared on formations of so many agents at most, pinv on one fewer: it stalls, for minutes.
+#: Laws are compared on formations of so many agents at most.
 FEW = 5
 #: Formations have so many agents at most.
 LARGEST = 20
@@ -81,7 +82,7 @@ class Row:
     name: str
     graph: str  # minimal, redundant, complete
     control: str = "open"
-    reference: str = "shape"
+    reference: str = "shape"  # shape, distances, squares, step
     constraint: dict[str, Any] = field(default_factory=dict)
     assigned: bool = False  # each agent takes the slot that makes the ways short
     most: int = 1000  # agents
@@ -115,10 +116,12 @@ def _rows() -> Iterator[Row]:
     for reference in ("shape", "distances", "step"):
         for graph in graphs:
             yield Row(f"{reference}, {graph}", graph, reference=reference)
-            if (graph == "complete") != (reference == "shape"):
+            if (reference, graph == "complete") in {("shape", False), ("step", True)}:
                 yield Row(
                     f"{reference}, {graph}, assigned", graph, "open", reference, assigned=True
                 )
+    yield Row("squares, complete", "complete", reference="squares")
+    yield Row("squares, complete, assigned", "complete", reference="squares", assigned=True)
 
 
 def _law_rows() -> Iterator[Row]:
@@ -132,14 +135,8 @@ def _law_rows() -> Iterator[Row]:
     for law, constraint in laws.items():
         for reference in ("shape", "step"):
             for graph in ("minimal", "complete"):
-                yield Row(
-                    f"{law}, {reference}, {graph}",
-                    graph,
-                    "open",
-                    reference,
-                    constraint,
-                    most=FEW - (law == "pinv"),
-                )
+                name = f"{law}, {reference}, {graph}"
+                yield Row(name, graph, "open", reference, constraint, most=FEW)
 
 
 def _damping_rows() -> Iterator[Row]:
@@ -513,9 +510,9 @@ def crossings(outcomes: Sequence[Outcome]) -> list[list[str]]:
 
 
 def sides(outcomes: Sequence[Outcome]) -> list[list[str]]:
-    """Spatial formations led by distances, by the side of the mirror on which they start."""
+    """Spatial formations led by squares, by the side of the mirror on which they start."""
     lines = []
-    for row in ("distances, complete", "distances, complete, assigned"):
+    for row in ("squares, complete", "squares, complete, assigned"):
         for name, side in (("intended", True), ("other", False)):
             there = [
                 o for o in outcomes if o.row == row and o.dimension == 3 and o.same_side == side
@@ -526,14 +523,12 @@ def sides(outcomes: Sequence[Outcome]) -> list[list[str]]:
     return lines
 
 
-def damping_table(jobs: int) -> tuple[list[list[str]], list[Outcome]]:
+def damping_lines(outcomes: dict[str, list[Outcome]]) -> list[list[str]]:
     """The choice of the damping, by kind of shape."""
-    lines, every = [], []
-    for kind, some in named().items():
-        outcomes = [o for part in run(some, DAMPING, jobs) for o in part]
-        every += outcomes
+    lines = []
+    for kind, some in outcomes.items():
         for row in DAMPING:
-            mine = [o for o in outcomes if o.row == row.name]
+            mine = [o for o in some if o.row == row.name]
             right = sum(o.end == "intended" for o in mine)
             errors = [o.error for o in mine]
             error = f"{np.median(errors):.1e} / {max(errors):.1e}"
@@ -541,11 +536,54 @@ def damping_table(jobs: int) -> tuple[list[list[str]], list[Outcome]]:
             force = f"{np.median(force):.3g} / {max(force):.3g}"
             steps = f"{np.median([o.steps for o in mine]):.0f}"
             lines.append([kind, row.name, f"{right} of {len(mine)}", error, force, steps])
-    return lines, every
+    return lines
 
 
 def _share(part: int, whole: int) -> str:
     return f"{100 * part / whole:.1f} %" if whole else ""
+
+
+def tables(outcomes: Sequence[Outcome], damped: dict[str, list[Outcome]]) -> dict[str, str]:
+    """Every table as Markdown, by the name that it has on the page; of rows that were flown."""
+    flown = {o.row for o in outcomes}
+    found = {}
+    for name, part in (("graphs", ROWS), ("laws", LAWS)):
+        lines = [cells(summary(row, outcomes)) for row in part if row.name in flown]
+        if lines:
+            found[name] = markdown(_HEAD, lines)
+    if flown.issuperset(row.name for row in ROWS):
+        head = ("row", "singular on the way", "flights", "intended")
+        found["crossings"] = markdown(head, crossings(outcomes))
+        head = ("row", "starts on the side", "flights", "intended", "mirrored")
+        found["sides"] = markdown(head, sides(outcomes))
+    if damped:
+        head = (
+            "shapes", "reference, start, damping", "intended", "worst pair, median / most",
+            "peak force, median / most [N]", "steps",
+        )  # fmt: skip
+        found["damping"] = markdown(head, damping_lines(damped))
+    return found
+
+
+def rewritten(page: str, found: dict[str, str]) -> str:
+    """A page with its tables, each between ``<!-- flown: NAME -->`` and ``<!-- end -->``."""
+
+    def table(match: re.Match[str]) -> str:
+        return f"<!-- flown: {match[1]} -->\n{found.get(match[1], match[2])}<!-- end -->"
+
+    return re.sub(r"<!-- flown: (\w+) -->\n(.*?)<!-- end -->", table, page, flags=re.DOTALL)
+
+
+def progress(parts: Iterable[list[Outcome]], what: str, whole: int) -> list[Outcome]:
+    """All outcomes, and a word on stderr as they come: each time to a terminal, else now and then."""
+    outcomes: list[Outcome] = []
+    live = sys.stderr.isatty()
+    for k, part in enumerate(parts, start=1):
+        outcomes += part
+        if live or k % 20 == 0 or k == whole:
+            end = "" if live and k < whole else "\n"
+            print(f"\r{what}: {k} of {whole} formations", end=end, file=sys.stderr, flush=True)
+    return outcomes
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -556,35 +594,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--rows", action="append", help="only rows whose names begin so")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--json", type=Path, help="write every outcome to a file")
+    parser.add_argument("--write", type=Path, help="put the tables into a page (docs/robustness.md)")
     asked = parser.parse_args(arguments)
     rows = [r for r in ROWS + LAWS if not asked.rows or r.name.startswith(tuple(asked.rows))]
     some = cases(asked.random, asked.seed)
     begun = time.perf_counter()
-    outcomes: list[Outcome] = []
-    for k, part in enumerate(run(some, rows, asked.jobs), start=1):
-        outcomes += part
-        if sys.stderr.isatty():
-            print(f"\r{k} of {len(some)} formations", end="", file=sys.stderr)
-    table = {row.name: summary(row, outcomes) for row in rows}
-    for part in (ROWS, LAWS):
-        lines = [cells(table[row.name]) for row in part if row.name in table]
-        print(markdown(_HEAD, lines) if lines else "")
-    damped: list[Outcome] = []
-    if not asked.rows:
-        print(markdown(("row", "singular on the way", "flights", "intended"), crossings(outcomes)))
-        head = ("row", "starts on the side", "flights", "intended", "mirrored")
-        print(markdown(head, sides(outcomes)))
-        lines, damped = damping_table(asked.jobs)
-        head = (
-            "shapes", "reference, start, damping", "intended", "worst pair, median / most",
-            "peak force, median / most [N]", "steps",
-        )  # fmt: skip
-        print(markdown(head, lines))
+    outcomes = progress(run(some, rows, asked.jobs), "rows", len(some))
+    damped: dict[str, list[Outcome]] = {}
+    for kind, few in named().items() if not asked.rows else ():
+        damped[kind] = progress(run(few, DAMPING, asked.jobs), f"damping, {kind}", len(few))
+    found = tables(outcomes, damped)
+    print("\n".join(found.values()))
+    every = [*outcomes, *(o for part in damped.values() for o in part)]
     wall = time.perf_counter() - begun
-    print(f"{len(outcomes) + len(damped)} flights, {wall:.0f} s on {asked.jobs} processes")
+    print(f"{len(every)} flights, {wall:.0f} s on {asked.jobs} processes")
     if asked.json:
-        every = [asdict(o) for o in (*outcomes, *damped)]
-        asked.json.write_text(json.dumps({"table": list(table.values()), "outcomes": every}))
+        table = [summary(row, outcomes) for row in rows]
+        data = {"table": table, "outcomes": [asdict(o) for o in every]}
+        asked.json.write_text(json.dumps(data))
+    if asked.write:
+        asked.write.write_text(rewritten(asked.write.read_text("utf-8"), found), "utf-8")
     return 0
 
 

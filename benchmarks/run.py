@@ -80,7 +80,7 @@ def establishment(source: str, *, default_law: bool) -> Mission:
     """A shipped establishment as one phase of 20 s: the paper's undamped steps, or the default law."""
     data = load_mission(source).to_dict()
     name = data["phases"][0]["formation"]
-    reference = "distances" if default_law else "step"
+    reference = "squares" if default_law else "step"
     data["phases"] = [
         {"kind": "establish", "formation": name, "reference": reference, "control": "open",
          "input_force": [0.1, 0.1, 0.0], "duration": DURATION},

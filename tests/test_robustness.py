@@ -94,12 +94,14 @@ def test_nearly_blocked_flexes_are_undecided():
 
 @pytest.mark.long
 def test_goals_hold_on_forty_formations():
-    """No failure; 99 % with slots and by blended shapes, 90 % by distances; nothing passes that is elsewhere."""
+    """99 % with slots and by blended shapes, 90 % by distances; none fails but the paper's law, none passes wrongly."""
     cases = table.cases(40 - len(table.shipped(1)), seed=4)
     assert len(cases) == 40
-    outcomes = flown(cases, table.ROWS)
+    outcomes = flown(cases, [*table.ROWS, *(r for r in table.LAWS if "exact" not in r.name)])
     assert [o for o in outcomes if o.end in {"failure", "stall", "nan"}] == []
     assert [o for o in outcomes if not o.noticed] == []
     assert min(share(outcomes, row) for row in SLOTS) >= 0.99
     assert share(outcomes, "shape, complete") >= 0.99
-    assert share(outcomes, "distances, complete, assigned") >= 0.9
+    assert share(outcomes, "distances, complete") >= 0.9
+    assert share(outcomes, "squares, complete, assigned") >= 0.9
+    assert share(outcomes, "step, complete, assigned") >= 0.9

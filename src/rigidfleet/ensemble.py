@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from rigidfleet.kernel import ensemble
 from rigidfleet.kernel.lanes import WIDTH
-from rigidfleet.mission import Mission, Phase
+from rigidfleet.mission import Establish, Mission, Phase, Reshape
 from rigidfleet.plan import plan_phase
 from rigidfleet.route import Situation
 
@@ -56,9 +56,10 @@ def establish(
 
     Parameters
     ----------
-    mission : all of its phases are flown under distances or steps (``reference``), with ``control = "open"``, and
-        end at a time, like those of Table 1; tolerances, gains and masses are the mission's. A damping of
-        "auto" is 0.03 throughout, as flights of one phase are not all in their formation, or none
+    mission : all of its phases are flown under squares or steps (``reference``; "distances" where that is squares
+        from anywhere, without slots or with three agents), with ``control = "open"``, and end at a time, like those
+        of Table 1; tolerances, gains and masses are the mission's. A damping of "auto" is 0.03 throughout, as
+        flights of one phase are not all in their formation, or none
     position, velocity : (B, N, 3) at the start, world axes [m, m/s]; at rest without velocities
     vectors : whether eight flights share a vector of the machine, and their steps, through code made for the
         mission's graph: seven times as fast, and compiled in seconds. By default in each phase that
@@ -86,11 +87,10 @@ def establish(
 
 def _refuse_others(mission: Mission) -> None:
     for index, phase in enumerate(mission.phases):
-        shape = getattr(phase, "reference", "step") == "shape"
-        if phase.control != "open" or phase.settle or shape:
+        if phase.control != "open" or phase.settle or not _alike(mission, phase):
             raise ValueError(
-                f"phase {index + 1} '{phase.name}' is not flown open-loop under distances to a given time, which is all"
-                " that an ensemble flies; vary other missions by `rigidfleet.sweep`"
+                f"phase {index + 1} '{phase.name}' is not flown open-loop under squares or steps to a given time, which"
+                " is all that an ensemble flies; vary other missions by `rigidfleet.sweep`"
             )
     if mission.disturbances is not None:
         raise ValueError(
@@ -153,6 +153,14 @@ class _Flights:
             now, t=t_end, reference=known, formation=plan.formation, slots=plan.slots
         )
         self.error = abs(_lengths(self.r, plan.edges) - plan.distances).max(axis=1, initial=0.0)
+
+
+def _alike(mission: Mission, phase: Phase) -> bool:
+    """Whether a phase is led by squares or steps from anywhere, so that one plan serves all flights."""
+    if not isinstance(phase, Establish | Reshape):
+        return True
+    bare = mission.n_agents <= 3 or mission.formation_slots(phase.formation) is None
+    return phase.reference in ("squares", "step") or (phase.reference == "distances" and bare)
 
 
 def _starts(name: str, values: ArrayLike, agents: int) -> Array:

@@ -48,7 +48,7 @@ def constraint_force(
     damping: float = 0.03,
     iterations: int = 3,
     threshold: float = 0.1,
-    cutoff: float = 1e-12,
+    cutoff: float = 1e-3,
 ) -> ConstraintForce:
     """Constraint force f_C = J^T lambda (Eq. 12 of the paper, references fed forward).
 

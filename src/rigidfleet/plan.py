@@ -23,6 +23,7 @@ from rigidfleet.route import (
     align_slots,
     attach,
     goal_of,
+    led_by,
     legs,
     slots_about_cm,
 )
@@ -30,6 +31,7 @@ from rigidfleet.route import (
 Array = NDArray[np.float64]
 
 _SOLVERS = {"iterated": k.ITERATED, "spectral": k.SPECTRAL, "exact": k.EXACT, "pinv": k.PINV}
+_KINDS = {"shape": k.SLOTS, "squares": k.SQUARED, "step": k.CONSTANT}
 #: A formation is held from where all pairs are right within this part of the shortest distance.
 _NEAR = 0.1
 _SPLITS = {"equal": k.PINV_EQUAL, "inertia": k.PINV_INERTIA, "inertia+force": k.PINV_INERTIA_FORCE}
@@ -70,7 +72,7 @@ def plan_phase(mission: Mission, phase: Phase, now: Situation, t_end: float) -> 
     kind, T_b = k.CONSTANT, 0.0
     if shaping:
         T_b = 0.0 if phase.reference == "step" else phase.blend
-        kind = {"shape": k.SLOTS, "distances": k.SQUARED, "step": k.CONSTANT}[phase.reference]
+        kind = _KINDS[led_by(mission, phase, before, target)]
     elif phase.control == "slots" and np.allclose(d1, shapes.distances(before, edges), rtol=1e-12):
         kind = k.SLOTS
     dp, turn = align_slots(before, after, left) if shaping else (np.zeros_like(before), np.zeros(3))

@@ -41,6 +41,7 @@ from rigidfleet.route import (
     align_slots,
     attach,
     goal_of,
+    led_by,
     legs,
     slots_about_cm,
 )
@@ -409,8 +410,11 @@ def _other_shapes(mission: Mission, f: FormationCheck, *, alone: bool) -> Iterat
     others = f.realisations
     if others is None or not alone:
         return
+    start, slots = np.array(mission.agents.position), mission.formation_slots(f.name)
     led = any(
-        isinstance(p, Establish) and p.formation == f.name and p.reference != "shape"
+        isinstance(p, Establish)
+        and p.formation == f.name
+        and led_by(mission, p, start, slots) != "shape"
         for p in mission.phases[:1]
     )
     if led and others.leads_to is not None and others.found[others.leads_to].kind is not Kind.SAME:
@@ -513,13 +517,14 @@ def planned(mission: Mission) -> tuple[list[Leg], bool]:
         if isinstance(phase, Establish | Reshape) and target is None:
             return way, False
         now = replace(now, t=begin)
+        before = now.slots if now.slots is not None else now.r
         count = min(max(_SAMPLES, int((end - begin) / _STEP) + 1), _MOST)
         time = np.linspace(begin, end, count)
         position, now = _leg(mission, phase, now, masses, target, time)
         guess = (
             isinstance(phase, Establish | Reshape)
             and phase.control != "slots"
-            and phase.reference != "shape"
+            and led_by(mission, phase, before, target) != "shape"
         )
         acceleration = _rate(_rate(position, time), time)
         way.append(Leg(phase.name, time, position, acceleration, not guess))

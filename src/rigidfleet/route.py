@@ -6,6 +6,7 @@ The plan of a flight, and a check before it, are made from these. Nothing here f
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -113,6 +114,35 @@ def attach(
     if phase.control == "body" or (mission.formulation == "body" and frame is None):
         frame = pose.T
     return frame, replace(now, pose=pose, slots=slots, goal=goal)
+
+
+def led_by(
+    mission: Mission, phase: Establish | Reshape, before: Array, target: Array | None
+) -> Literal["shape", "squares", "step"]:
+    """What leads the distances of a phase: its reference, and which of two if that is "distances".
+
+    Blended squares of distances are those of points in space, and know no hand. They lead to the slots if an
+    affine map without reflection takes the agents there, as their blend then is that of the map: up to four
+    agents of the right hand, and any number in a stretched shape. Elsewhere the slots are blended, if there
+    are any with these distances.
+
+    Parameters: agents or slots before, and slots wanted (N, 3) [m], if there are any.
+    """
+    if phase.reference != "distances":
+        return phase.reference
+    if target is None:
+        return "squares"
+    edges = mission.formation_edges(phase.formation)
+    asked = mission.formation_distances(phase.formation)
+    if not np.allclose(shapes.distances(target, edges), asked, rtol=1e-3):
+        return "squares"
+    start, goal = shapes.centred(before), shapes.centred(target)
+    if shapes.dimension(np.hstack([start, goal])) > 3:
+        return "shape"
+    if shapes.dimension(goal) < 3:
+        return "squares"
+    same_hand = shapes.dimension(start) == 3 and np.linalg.det(start.T @ goal) > 0
+    return "squares" if same_hand else "shape"
 
 
 def align_slots(before: Array, after: Array, masses: Array) -> tuple[Array, Array]:

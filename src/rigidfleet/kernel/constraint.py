@@ -72,7 +72,8 @@ def solve_multipliers(vehicles, graph, law, w):
     exact      1/w, the paper's;
     iterated   (1 - (mu/(w + mu))^k)/w, Tikhonov regularisation iterated k times;
     spectral   1/(w + nu), nu = (s0/4)(1 - w/s0)^2 for w < s0, else 0;
-    pinv       1/w, or 0 where w is below the cut-off.
+    pinv       1/w, and below W = cutoff w_max (3 - 2 w/W) w/W^2, which goes on smoothly to 0: a jump
+               there would be one of the force, and no integrator passes that.
     """
     if graph.solver != 0:
         call_solver(graph.solver)
@@ -85,11 +86,18 @@ def solve_multipliers(vehicles, graph, law, w):
         solve_at_agents(m, mbar, graph.edges, law, w)
         return
     mu, iterations = (law.mu, law.iterations) if law.solver == ITERATED else (0.0, 1)
-    # Spectral damping is the exact law wherever all w >= s0: where mbar A - s0 is definite, too.
-    trials = 2 if law.solver == SPECTRAL else 0 if law.solver == PINV else 1
+    # Spectral damping is the exact law wherever all w >= s0, so where mbar A - s0 is definite, too;
+    # pinv wherever all are above its cut-off, of a trace that is no smaller than w_max.
+    trials, least = 1, law.s0
+    if law.solver == SPECTRAL:
+        trials = 2
+    elif law.solver == PINV:
+        trials, least = 2, 0.0
+        for k in range(n):
+            least += law.cutoff * mbar * graph.diagonal[k]
     definite = False
     for trial in range(trials, 0, -1):
-        assemble(w.u, graph, mbar, mu if trial == 1 else -law.s0, w.A)
+        assemble(w.u, graph, mbar, mu if trial == 1 else -least, w.A)
         definite = cholesky(w.A)
         if not definite:
             break
@@ -103,6 +111,14 @@ def solve_multipliers(vehicles, graph, law, w):
         for k in range(n):
             y[k] = math.nan
         return
+    solve_by_eigenvalues(graph, mbar, law, w)
+
+
+@inlined
+def solve_by_eigenvalues(graph, mbar, law, w):
+    """The laws that are functions of each eigenvalue where no factor exists: pinv and spectral."""
+    n = graph.edges.shape[0]
+    b, y = w.b, w.multiplier
     assemble(w.u, graph, mbar, 0.0, w.A)
     largest = jacobi_eigen(w.A, w.V, w.w)
     for k in range(n):
@@ -110,7 +126,9 @@ def solve_multipliers(vehicles, graph, law, w):
     for q in range(n):
         value = w.w[q]
         if law.solver == PINV:
-            phi = 1.0 / value if value > law.cutoff * largest else 0.0
+            low = law.cutoff * largest
+            x = value / low
+            phi = 1.0 / value if x >= 1.0 else (3.0 - 2.0 * x) * x / low
         else:
             short = max(0.0, 1.0 - value / law.s0)
             phi = 1.0 / (value + 0.25 * law.s0 * short * short)

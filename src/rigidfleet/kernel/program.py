@@ -57,7 +57,7 @@ class Law(NamedTuple):
     mu: float  # Tikhonov damping, on the scale of the eigenvalues of mbar A
     iterations: int
     s0: float  # spectral damping starts below this eigenvalue of mbar A
-    cutoff: float  # relative, of pinv
+    cutoff: float  # of pinv, in parts of the largest eigenvalue
     k_def: float  # deformation damping [1/s]
 
 

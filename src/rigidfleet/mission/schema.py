@@ -178,8 +178,9 @@ class Constraint(Part):
         3, description="number k of iterations of the iterated solver, 1 to 100"
     )
     threshold: Positive = Field(0.1, description="s0 of the spectral solver [-], > 0")
-    cutoff: Annotated[float, Strict(), Field(ge=0, lt=1)] = Field(
-        1e-12, description="relative cut-off of the pinv solver [-], in [0, 1)"
+    cutoff: Annotated[float, Strict(), Field(gt=0, lt=1)] = Field(
+        1e-3,
+        description="cut-off of the pinv solver, in parts of the largest w, in (0, 1); smooth below",
     )
     deformation_damping: NonNegative = Field(
         1.0, description="damping of deformation while no slots are tracked [1/s], >= 0"
@@ -463,10 +464,11 @@ class Shaping(AnyPhase):
     """A phase that changes the formation."""
 
     formation: str = Field(description="name of the formation to take")
-    reference: Literal["shape", "distances", "step"] = Field(
+    reference: Literal["shape", "distances", "squares", "step"] = Field(
         "shape",
-        description="how the distances get there: with slots that blend, with squares that blend, or "
-        "at once as in the paper",
+        description="how the distances get there: shape, with slots that blend; squares, with their "
+        "squares that blend; distances, so if that leads through space to the slots (always, of a "
+        "formation without), else as shape; step, at once as in the paper",
     )
     blend: Positive = Field(4.0, description="length of the blend [s], from the phase's start")
 

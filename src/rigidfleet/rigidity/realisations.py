@@ -115,7 +115,7 @@ def realisations(
     edges : (m, 2), agents from 0
     starts, seed, iterations : the budget, and what makes it repeatable; 200 starts of 8 agents take a second
     start : (N, 3) [m] positions from which the distances are to be established; answered by `leads_to`: the
-        squared lengths are led from those at the start to those wanted, as `reference = "distances"` does
+        squared lengths are led from those at the start to those wanted, as `reference = "squares"` does
 
     Raises
     ------
