@@ -594,7 +594,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--rows", action="append", help="only rows whose names begin so")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--json", type=Path, help="write every outcome to a file")
-    parser.add_argument("--write", type=Path, help="put the tables into a page (docs/robustness.md)")
+    parser.add_argument(
+        "--write", type=Path, help="put the tables into a page (docs/robustness.md)"
+    )
     asked = parser.parse_args(arguments)
     rows = [r for r in ROWS + LAWS if not asked.rows or r.name.startswith(tuple(asked.rows))]
     some = cases(asked.random, asked.seed)

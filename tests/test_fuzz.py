@@ -108,7 +108,9 @@ def phases(draw: Callable[..., Any], names: list[str], *, body: bool, first: boo
         phase["settle"] = {"tolerance": draw(SIZES), "dwell": 0.1, "timeout": length}
     if kind in ("establish", "reshape"):
         phase["formation"] = draw(st.sampled_from(names))
-        phase["reference"] = draw(st.sampled_from(["shape", "shape", "distances", "squares", "step"]))
+        phase["reference"] = draw(
+            st.sampled_from(["shape", "shape", "distances", "squares", "step"])
+        )
         if phase["reference"] != "step":
             phase["blend"] = length * draw(st.sampled_from([1e-9, 0.1, 1.0]))
         if draw(st.booleans()):
