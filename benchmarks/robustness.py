@@ -149,6 +149,12 @@ def _damping_rows() -> Iterator[Row]:
 
 
 ROWS, LAWS, DAMPING = tuple(_rows()), tuple(_law_rows()), tuple(_damping_rows())
+FEW_ROWS = tuple(
+    Row(f"{reference}, complete{', assigned' * again}", "complete", "open", reference, assigned=again)
+    for reference, again in (
+        ("shape", False), ("shape", True), ("distances", False), ("squares", False),
+    )
+)  # fmt: skip
 
 
 # -- formations ------------------------------------------------------------------------------------
@@ -175,11 +181,16 @@ def shipped(seed: int) -> list[Case]:
     return list(found.values())
 
 
-def random_case(k: int, seed: int) -> Case:
+def few_in_space(count: int, seed: int) -> dict[int, list[Case]]:
+    """Random formations in space, so many of four agents, of five and of six."""
+    return {n: [random_case(3 * k + 2, seed, n) for k in range(count)] for n in (4, 5, 6)}
+
+
+def random_case(k: int, seed: int, agents: int | None = None) -> Case:
     """Formation k: on a line, in a plane or in space, of 2, 3 or 4 to 20 agents, and a start."""
-    rng = np.random.default_rng([seed, 1000 + k])
+    rng = np.random.default_rng([seed, 1000 + k, *([agents] if agents else [])])
     d = 1 + k % 3
-    n = int(rng.integers(d + 1, LARGEST + 1))
+    n = agents or int(rng.integers(d + 1, LARGEST + 1))
     side = 1.6 * SPACING * n ** (1 / d) * np.exp(rng.uniform(-0.5, 0.5, d))
     slots = np.zeros((n, 3))
     slots[:, :d] = scattered(rng, n, side, SPACING)
@@ -523,6 +534,21 @@ def sides(outcomes: Sequence[Outcome]) -> list[list[str]]:
     return lines
 
 
+def few_lines(outcomes: dict[int, list[Outcome]]) -> list[list[str]]:
+    """Few agents in space, led by all edges, by the side of the mirror on which they start."""
+    lines = []
+    for n, some in outcomes.items():
+        for row in FEW_ROWS:
+            line = [str(n), row.name]
+            for side in (True, False):
+                there = [o for o in some if o.row == row.name and o.same_side == side]
+                right = sum(o.end == "intended" for o in there)
+                line.append(f"{right} of {len(there)}")
+            hand = sum(o.row == row.name and o.end == "mirrored" for o in some)
+            lines.append([*line, str(hand)])
+    return lines
+
+
 def damping_lines(outcomes: dict[str, list[Outcome]]) -> list[list[str]]:
     """The choice of the damping, by kind of shape."""
     lines = []
@@ -543,7 +569,9 @@ def _share(part: int, whole: int) -> str:
     return f"{100 * part / whole:.1f} %" if whole else ""
 
 
-def tables(outcomes: Sequence[Outcome], damped: dict[str, list[Outcome]]) -> dict[str, str]:
+def tables(
+    outcomes: Sequence[Outcome], few: dict[int, list[Outcome]], damped: dict[str, list[Outcome]]
+) -> dict[str, str]:
     """Every table as Markdown, by the name that it has on the page; of rows that were flown."""
     flown = {o.row for o in outcomes}
     found = {}
@@ -556,6 +584,9 @@ def tables(outcomes: Sequence[Outcome], damped: dict[str, list[Outcome]]) -> dic
         found["crossings"] = markdown(head, crossings(outcomes))
         head = ("row", "starts on the side", "flights", "intended", "mirrored")
         found["sides"] = markdown(head, sides(outcomes))
+    if few:
+        head = ("agents", "row", "from the intended side", "from the other", "mirrored")
+        found["few"] = markdown(head, few_lines(few))
     if damped:
         head = (
             "shapes", "reference, start, damping", "intended", "worst pair, median / most",
@@ -602,12 +633,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     some = cases(asked.random, asked.seed)
     begun = time.perf_counter()
     outcomes = progress(run(some, rows, asked.jobs), "rows", len(some))
+    few: dict[int, list[Outcome]] = {}
     damped: dict[str, list[Outcome]] = {}
-    for kind, few in named().items() if not asked.rows else ():
-        damped[kind] = progress(run(few, DAMPING, asked.jobs), f"damping, {kind}", len(few))
-    found = tables(outcomes, damped)
+    if not asked.rows:
+        for n, part in few_in_space(asked.random // 2, asked.seed).items():
+            few[n] = progress(run(part, FEW_ROWS, asked.jobs), f"{n} agents", len(part))
+        for kind, part in named().items():
+            damped[kind] = progress(run(part, DAMPING, asked.jobs), f"damping, {kind}", len(part))
+    found = tables(outcomes, few, damped)
     print("\n".join(found.values()))
-    every = [*outcomes, *(o for part in damped.values() for o in part)]
+    every = [*outcomes, *(o for part in (*few.values(), *damped.values()) for o in part)]
     wall = time.perf_counter() - begun
     print(f"{len(every)} flights, {wall:.0f} s on {asked.jobs} processes")
     if asked.json:

@@ -14,6 +14,7 @@ import pytest
 
 from rigidfleet import cli
 from rigidfleet.errors import ResultError
+from rigidfleet.kernel import compiled
 from rigidfleet.result import Result
 
 MISSION = """
@@ -167,3 +168,16 @@ def test_kill_in_the_middle_of_a_write(flown: bytes):
         Result.load(HOME / half)
     assert cli.main([*RUN, "--quiet"]) == cli.PASSED
     assert Result.load(HOME / "pair.nc").complete
+
+
+def test_a_full_disk_while_the_kernel_is_kept():
+    """A kernel that cannot be written to its cache flies all the same, and a warning names the folder and the reason."""
+    double = compiled.compiled(lambda x: 2.0 * x)
+    limit = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (16, limit[1]))
+    try:
+        with pytest.warns(RuntimeWarning, match=r"cannot be kept in /.*kernel-\w+.*: File too large"):
+            assert double(2.0) == 4.0
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
+    assert double.stats.cache_path.startswith(str(compiled.cache_directory()))

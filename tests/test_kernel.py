@@ -522,9 +522,8 @@ def test_the_pseudo_inverse_has_no_jump():
     across = np.abs(f[..., 1]).max(axis=1)
     assert across[0] < 1e-6 * across.max()
     assert np.abs(np.diff(across)).max() < 0.02 * across.max()
-    exact = physics.constraint_force(
-        lines[-1], 0 * LINE, 1.0, edges, **(call | {"solver": "exact"})
-    )
+    call["solver"] = "exact"
+    exact = physics.constraint_force(lines[-1], 0 * LINE, 1.0, edges, **call)
     np.testing.assert_allclose(f[-1], exact.f_C, rtol=1e-9, atol=1e-12)
 
 

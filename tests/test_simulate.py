@@ -12,10 +12,12 @@ from scipy.spatial import KDTree
 from rigidfleet import attitude, formation, lqr, physics
 from rigidfleet.assess import assess
 from rigidfleet.errors import FlightError
-from rigidfleet.kernel import flight
+from rigidfleet.kernel import flight, program
 from rigidfleet.mission import Mission, load_mission, mission_names
+from rigidfleet.plan import plan_phase
 from rigidfleet.result import Result
 from rigidfleet.rigidity import jacobian
+from rigidfleet.route import Situation, led_by
 from rigidfleet.simulate import FlightInterrupted, Observation, Progress, simulate
 
 Data = dict[str, Any]
@@ -210,6 +212,85 @@ def test_a_show_of_a_thousand_vehicles():
     away, who = KDTree(record.position[0]).query(record.position[-1])
     assert away.max() < 1e-2
     assert len(set(who)) == 1000
+
+
+# -- what leads the distances ----------------------------------------------------------------------
+
+TETRAHEDRON = formation.slots("tetrahedron", 4.0, 4)
+CUBE = formation.slots("cube", 4.0, 8)
+NINE = formation.slots("grid", 4.0, 9)
+SQUARE = formation.slots("square", 4.0, 4)
+SHEAR = np.array([[2.0, 0.5, 0.0], [0.0, 1.0, 0.3], [0.0, 0.0, 0.7]])
+
+
+@pytest.mark.parametrize(
+    ("slots", "start", "by"),
+    [
+        (TETRAHEDRON, TETRAHEDRON + [[1, 0, 0], [0, 2, 0], [0, 0, -1], [2, 0, 1]], "squares"),
+        (TETRAHEDRON, TETRAHEDRON * [1, 1, -1], "shape"),
+        (TETRAHEDRON, TETRAHEDRON * [1, 1, 0.0001], "squares"),
+        (TETRAHEDRON[[0, 1, 2]], TETRAHEDRON[[1, 0, 2]] * [1, 1, -1], "squares"),
+        (SQUARE, SQUARE[[1, 0, 2, 3]] + [[0, 0, 0], [0, 0, 3], [0, 0, 0], [0, 0, 0]], "squares"),
+        (CUBE, CUBE @ SHEAR, "squares"),
+        (CUBE, CUBE @ SHEAR * [1, 1, -1], "shape"),
+        (CUBE, CUBE + np.eye(8, 3), "shape"),
+        (NINE, NINE @ SHEAR, "squares"),
+        (NINE, NINE + np.eye(9, 3), "shape"),
+    ],
+)
+def test_distances_lead_by_squares_where_an_affine_map_leads_to_the_slots(slots, start, by):
+    """Squares blend up to four agents of the right hand and stretched shapes; elsewhere slots do.
+
+    Either gives the agents' distances at the start and those wanted at the end, and in between, a shape in space:
+    no fourth dimension, and the hand wanted.
+    """
+    turn = attitude.dcm_from_euler([0.3, -0.2, 2.0])
+    n = len(slots)
+    mission = a_mission(
+        establish(formation="f", reference="distances", until=20.0),
+        agents={"mass": [1.0 + 0.3 * k for k in range(n)], "position": start @ turn + [5, 6, 7]},
+        formations={"f": {"slots": slots}},
+    )
+    phase = mission.phases[0]
+    assert led_by(mission, phase, np.array(mission.agents.position), slots) == by
+    plan = plan_phase(mission, phase, Situation(0.0, start @ turn, 0 * start), 6.0)
+    assert plan.program.reference.kind == {"squares": program.SQUARED, "shape": program.SLOTS}[by]
+    result = simulate(mission)
+    wanted = formation.distances(slots, result.edges)
+    np.testing.assert_allclose(result.distance_reference[0], result.distance[0], rtol=1e-12)
+    np.testing.assert_allclose(result.distance_reference[-1], wanted, rtol=1e-12)
+    assert assess(result).passed
+    for d in result.distance_reference:
+        D = np.zeros((n, n))
+        D[tuple(result.edges.T)] = d**2
+        D += D.T
+        gram = -0.5 * (D - D.mean(axis=0) - D.mean(axis=1)[:, None] + D.mean())
+        w = np.linalg.eigvalsh(gram)
+        assert np.abs(w[: max(n - 3, 0)]).max(initial=0.0) < 1e-9 * w[-1]
+
+
+def test_distances_that_are_not_the_slots_are_led_by_squares():
+    """Squares blend distances beside a shape that has others, and those without any, which ask for no hand."""
+    start = CUBE + np.eye(8, 3)
+    other = formation.distances(1.1 * CUBE, formation.complete_graph(8))
+    for form in ({"shape": "cube", "size": 4.0, "distances": other}, {"distances": other}):
+        mission = a_mission(
+            establish(formation="f", reference="distances"),
+            agents={"mass": 1.0, "position": start},
+            formations={"f": form},
+        )
+        slots = mission.formation_slots("f")
+        assert slots is not None
+        assert led_by(mission, mission.phases[0], start, slots) == "squares"
+        assert led_by(mission, mission.phases[0], -start, slots) == "squares"
+    for reference in ("shape", "squares", "step"):
+        phase = establish(formation="f", reference=reference)
+        mission = a_mission(
+            phase,
+            agents={"mass": 1.0, "position": start},
+            formations={"f": {"shape": "cube", "size": 4.0}},
+        )
+        assert led_by(mission, mission.phases[0], start, CUBE) == reference
 
 
 # -- settling --------------------------------------------------------------------------------------

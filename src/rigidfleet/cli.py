@@ -21,6 +21,7 @@ import gc
 import os
 import signal
 import sys
+import warnings
 from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
@@ -81,6 +82,7 @@ def main(tokens: Sequence[str] | None = None) -> int:
         # Imports make a hundred thousand objects that stay: looked through as often as by default, they
         # would take a tenth longer.
         gc.set_threshold(100_000)
+        warnings.showwarning = _warn
     _prepare_streams()
     try:
         return app(tokens, console=_out(), error_console=_err()) or PASSED
@@ -1120,6 +1122,11 @@ def _complain(error: object) -> None:
 
     for finding in error.findings if isinstance(error, MissionError) else [error]:
         _err().print(Text.assemble(("error: ", "bold red"), str(finding)), soft_wrap=True)
+
+
+def _warn(message: object, *_where: object) -> None:
+    """Show a warning as the line that it is, not with the place in the source that gave it."""
+    _err().print(f"warning: {message}", style="yellow", soft_wrap=True, highlight=False)
 
 
 def _table(*columns: str) -> Table:

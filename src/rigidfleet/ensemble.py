@@ -159,7 +159,7 @@ def _alike(mission: Mission, phase: Phase) -> bool:
     """Whether a phase is led by squares or steps from anywhere, so that one plan serves all flights."""
     if not isinstance(phase, Establish | Reshape):
         return True
-    bare = mission.n_agents <= 3 or mission.formation_slots(phase.formation) is None
+    bare = mission.n_agents <= 3 or not mission.formations[phase.formation].knows_slots
     return phase.reference in ("squares", "step") or (phase.reference == "distances" and bare)
 
 

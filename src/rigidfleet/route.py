@@ -123,14 +123,14 @@ def led_by(
 
     Blended squares of distances are those of points in space, and know no hand. They lead to the slots if an
     affine map without reflection takes the agents there, as their blend then is that of the map: up to four
-    agents of the right hand, and any number in a stretched shape. Elsewhere the slots are blended, if there
-    are any with these distances.
+    agents of the right hand, and any number in a stretched shape. Elsewhere the slots are blended, if the
+    formation is given by some, with these distances; slots from distances have a hand that nobody asked for.
 
     Parameters: agents or slots before, and slots wanted (N, 3) [m], if there are any.
     """
     if phase.reference != "distances":
         return phase.reference
-    if target is None:
+    if target is None or not mission.formations[phase.formation].knows_slots:
         return "squares"
     edges = mission.formation_edges(phase.formation)
     asked = mission.formation_distances(phase.formation)

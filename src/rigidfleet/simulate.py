@@ -604,8 +604,9 @@ class Flight:
         )
         solver = self.mission.constraint.solver
         if solver in ("exact", "pinv"):
+            bound = "no bound" if solver == "exact" else "no bound but that of its cut-off"
             return (
-                f'{head}, and {where}. The force of solver "{solver}" has no bound where one of them'
+                f'{head}, and {where}. The force of solver "{solver}" has {bound} where one of them'
                 f' vanishes. Use solver = "iterated" (or "spectral"){self._smoother(leg)}'
             )
         return f"{head}, and {where}. {self._remedy(leg, collapsed=collapsed)}"

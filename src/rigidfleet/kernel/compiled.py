@@ -8,6 +8,7 @@ import hashlib
 import os
 import sys
 import tempfile
+import warnings
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,12 +17,12 @@ from typing import Any, TypeVar
 
 import numba
 from numba import types
+from numba.core.caching import FunctionCache
 from numba.extending import intrinsic
 
 F = TypeVar("F", bound=Callable[..., Any])
 
 _OPTIONS: dict[str, Any] = {
-    "cache": True,
     "nogil": True,
     "error_model": "numpy",  # division by zero gives infinity
     # Sums may be reordered and fused, but NaN and infinity keep their meaning: the integrator has
@@ -60,7 +61,11 @@ def compiled_for_c(function: Any, name: str, *, arguments: int, **instead: Any) 
     signature = types.void(*[types.CPointer(types.float64)] * arguments)
     copy = _copy(function, name, instead)
     with _own_cache():
-        made = numba.cfunc(signature, cache=True, nopython=True)(copy)
+        try:
+            made = numba.cfunc(signature, cache=True, nopython=True)(copy)
+        except OSError as error:
+            _not_kept(error)
+            made = numba.cfunc(signature, nopython=True)(copy)
     _STAYING.append(made)
     return made.address
 
@@ -127,6 +132,27 @@ def _own_cache() -> Generator[None]:
         numba.config.CACHE_DIR = before
 
 
+class _Cache(FunctionCache):
+    """Numba's cache of a function, on a disk that may be full: what cannot be kept is compiled again."""
+
+    def save_overload(self, sig, data):
+        try:
+            super().save_overload(sig, data)
+        except OSError as error:
+            _not_kept(error)
+
+
+def _not_kept(error: OSError) -> None:
+    warnings.warn(
+        f"the compiled flight kernel cannot be kept in {_CACHE}: {error.strerror or error}."
+        " It will be compiled again by the next process",
+        RuntimeWarning,
+        stacklevel=3,
+    )
+
+
 def _cached(function: F, options: dict[str, Any]) -> F:
     with _own_cache():
-        return numba.njit(**options)(function)
+        dispatcher = numba.njit(**options)(function)
+        dispatcher._cache = _Cache(function)
+    return dispatcher

@@ -305,6 +305,11 @@ class Formation(Part):
             return shapes.neighbours(slots, self.reach)
         return np.sort(np.array(self.edges, dtype=np.int64).reshape(-1, 2) - 1, axis=1)
 
+    @property
+    def knows_slots(self) -> bool:
+        """Whether it is given by slots, not by distances alone."""
+        return self.shape is not None or self.slots is not None
+
     def slot_array(self, n: int) -> Floats | None:
         """Slots (n, 3) [m] about their geometric centre; None where distances do not give them."""
         if self.shape is not None and self.size is not None:

@@ -15,7 +15,7 @@ _SOLVERS = {
     "iterated": "iterated Tikhonov: the force stays bounded where distances are redundant",
     "spectral": "spectral damping: the exact law unless distances are nearly redundant",
     "exact": "the paper's inverse, which has no value where distances are redundant",
-    "pinv": "the pseudo-inverse, which bounds nothing near a singular shape",
+    "pinv": "the pseudo-inverse, which lets go smoothly of what lies below its cut-off",
 }
 
 
@@ -80,7 +80,7 @@ def _constraint(mission: Mission) -> list[Line]:
         "iterated": f"μ = {_damping(mission)}, {c.iterations} iterations",
         "spectral": f"s₀ = {c.threshold:g}",
         "exact": "",
-        "pinv": f"cut-off {c.cutoff:g}",
+        "pinv": f"cut-off {c.cutoff:g} of the largest w",
     }[c.solver]
     value = f"{c.solver} ({setting})" if setting else c.solver
     found.append(Line("solver", value, _SOLVERS[c.solver]))
