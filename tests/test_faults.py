@@ -171,12 +171,14 @@ def test_kill_in_the_middle_of_a_write(flown: bytes):
 
 
 def test_a_full_disk_while_the_kernel_is_kept():
-    """A kernel that cannot be written to its cache flies all the same, and a warning names the folder and the reason."""
+    """A kernel that cannot be written to its cache flies all the same; a warning names the folder and the reason."""
     double = compiled.compiled(lambda x: 2.0 * x)
     limit = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (16, limit[1]))
     try:
-        with pytest.warns(RuntimeWarning, match=r"cannot be kept in /.*kernel-\w+.*: File too large"):
+        with pytest.warns(
+            RuntimeWarning, match=r"cannot be kept in /.*kernel-\w+.*: File too large"
+        ):
             assert double(2.0) == 4.0
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limit)
