@@ -13,7 +13,7 @@ from rigidfleet import attitude, formation, lqr, physics
 from rigidfleet.assess import assess
 from rigidfleet.errors import FlightError
 from rigidfleet.kernel import flight, program
-from rigidfleet.mission import Mission, load_mission, mission_names
+from rigidfleet.mission import Establish, Mission, load_mission, mission_names
 from rigidfleet.plan import plan_phase
 from rigidfleet.result import Result
 from rigidfleet.rigidity import jacobian
@@ -223,6 +223,15 @@ SQUARE = formation.slots("square", 4.0, 4)
 SHEAR = np.array([[2.0, 0.5, 0.0], [0.0, 1.0, 0.3], [0.0, 0.0, 0.7]])
 
 
+def leader(mission: Mission, start: np.ndarray) -> str:
+    """What leads the distances of the first phase from a start."""
+    phase = mission.phases[0]
+    assert isinstance(phase, Establish)
+    slots = mission.formation_slots(phase.formation)
+    assert slots is not None
+    return led_by(mission, phase, start, slots)
+
+
 @pytest.mark.parametrize(
     ("slots", "start", "by"),
     [
@@ -252,7 +261,7 @@ def test_distances_lead_by_squares_where_an_affine_map_leads_to_the_slots(slots,
         formations={"f": {"slots": slots}},
     )
     phase = mission.phases[0]
-    assert led_by(mission, phase, np.array(mission.agents.position), slots) == by
+    assert leader(mission, start @ turn) == by
     plan = plan_phase(mission, phase, Situation(0.0, start @ turn, 0 * start), 6.0)
     assert plan.program.reference.kind == {"squares": program.SQUARED, "shape": program.SLOTS}[by]
     result = simulate(mission)
@@ -279,10 +288,7 @@ def test_distances_that_are_not_the_slots_are_led_by_squares():
             agents={"mass": 1.0, "position": start},
             formations={"f": form},
         )
-        slots = mission.formation_slots("f")
-        assert slots is not None
-        assert led_by(mission, mission.phases[0], start, slots) == "squares"
-        assert led_by(mission, mission.phases[0], -start, slots) == "squares"
+        assert leader(mission, start) == leader(mission, -start) == "squares"
     for reference in ("shape", "squares", "step"):
         phase = establish(formation="f", reference=reference)
         mission = a_mission(
@@ -290,7 +296,7 @@ def test_distances_that_are_not_the_slots_are_led_by_squares():
             agents={"mass": 1.0, "position": start},
             formations={"f": {"shape": "cube", "size": 4.0}},
         )
-        assert led_by(mission, mission.phases[0], start, CUBE) == reference
+        assert leader(mission, start) == reference
 
 
 # -- settling --------------------------------------------------------------------------------------

@@ -30,7 +30,7 @@ from io import TextIOWrapper
 from pathlib import Path
 from tempfile import TemporaryDirectory, TemporaryFile
 from time import perf_counter
-from typing import IO, TYPE_CHECKING, Annotated, Any, Self
+from typing import IO, TYPE_CHECKING, Annotated, Any, Self, cast
 
 from cyclopts import App, CycloptsError, Parameter, UnusedCliTokensError
 
@@ -82,7 +82,7 @@ def main(tokens: Sequence[str] | None = None) -> int:
         # Imports make a hundred thousand objects that stay: looked through as often as by default, they
         # would take a tenth longer.
         gc.set_threshold(100_000)
-        warnings.showwarning = _warn
+        warnings.showwarning = cast("Any", _warn)
     _prepare_streams()
     try:
         return app(tokens, console=_out(), error_console=_err()) or PASSED

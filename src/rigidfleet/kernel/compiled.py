@@ -11,6 +11,7 @@ import tempfile
 import warnings
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from types import FunctionType
 from typing import Any, TypeVar
@@ -64,7 +65,7 @@ def compiled_for_c(function: Any, name: str, *, arguments: int, **instead: Any) 
         try:
             made = numba.cfunc(signature, cache=True, nopython=True)(copy)
         except OSError as error:
-            _not_kept(error)
+            _not_kept(error.strerror)
             made = numba.cfunc(signature, nopython=True)(copy)
     _STAYING.append(made)
     return made.address
@@ -139,13 +140,15 @@ class _Cache(FunctionCache):
         try:
             super().save_overload(sig, data)
         except OSError as error:
-            _not_kept(error)
+            _not_kept(error.strerror)
 
 
-def _not_kept(error: OSError) -> None:
+@cache
+def _not_kept(why: str) -> None:
+    """Warn once, not for each function; Numba makes Python forget what it has warned of."""
     warnings.warn(
-        f"the compiled flight kernel cannot be kept in {_CACHE}: {error.strerror or error}."
-        " It will be compiled again by the next process",
+        f"the compiled flight kernel cannot be kept in {_CACHE}: {why}. It will be compiled again by"
+        " the next process",
         RuntimeWarning,
         stacklevel=3,
     )
