@@ -81,7 +81,10 @@ def test_what_fits_no_vector_flies_alone():
     data |= {
         "agents": {"mass": 1.0, "position": slots.tolist()},
         "formations": {"sheet": {"slots": slots.tolist(), "edges": "complete"}},
-        "phases": [data["phases"][0] | {"formation": "sheet", "until": 0.1, "blend": 0.05}],
+        "phases": [
+            data["phases"][0]
+            | {"formation": "sheet", "reference": "squares", "until": 0.1, "blend": 0.05}
+        ],
     }
     many = Mission.from_dict(data)
     assert not establish(many, starts(many, 2)).vectors

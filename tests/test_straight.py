@@ -47,7 +47,7 @@ def make(agents: int, data: dict[str, Any]) -> tuple[Program, np.ndarray]:
         "formations": {"some": {"slots": slots.tolist(), "edges": data.get("edges", edges)}},
         "phases": [
             {"kind": "establish", "formation": "some", "control": "open", "duration": 9.0,
-             "reference": "distances", "blend": 4.0, "input_force": [0.1, 0.0, -0.2]},
+             "reference": "squares", "blend": 4.0, "input_force": [0.1, 0.0, -0.2]},
         ],
     }  # fmt: skip
     if "thrust_limit" in data:
