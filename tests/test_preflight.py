@@ -128,6 +128,24 @@ def test_collisions_on_a_guessed_way_are_notes():
     assert "collision" in failures(preflight(mission(crossed, phases=[step])))
 
 
+@pytest.mark.parametrize("reference", ["shape", "distances"])
+def test_four_agents_on_the_other_side_of_the_mirror(reference):
+    """Where distances alone lead them they may come out mirrored: a note; not with slots, nor from this side."""
+    four = slots("tetrahedron", 4.0, 4)
+    away = {"kind": "establish", "formation": "four", "reference": reference, "until": 9.0}
+
+    def noted(start: np.ndarray, **phase: str) -> bool:
+        forms = {"four": {"shape": "tetrahedron", "size": 4.0}}
+        found = preflight(mission(start.tolist(), formations=forms, phases=[away | phase]))
+        return any("mirror image" in remark.text for remark in found.remarks)
+
+    offset = [[0.5, 0, 9], [0, 0, 9], [0, 0.5, 9], [0, 0, 9]]
+    other = four * [1, 1, -1] + offset
+    assert noted(other, control="open")
+    assert not noted(four + offset, control="open")
+    assert not noted(other)
+
+
 def test_agents_that_start_in_each_other():
     """Where agents start is no guess."""
     step = {"kind": "establish", "formation": "square", "control": "open", "until": 5.0}

@@ -411,16 +411,19 @@ def _other_shapes(mission: Mission, f: FormationCheck, *, alone: bool) -> Iterat
     if others is None or not alone:
         return
     start, slots = np.array(mission.agents.position), mission.formation_slots(f.name)
-    led = any(
-        isinstance(p, Establish)
-        and p.formation == f.name
-        and led_by(mission, p, start, slots) != "shape"
-        for p in mission.phases[:1]
-    )
-    if led and others.leads_to is not None and others.found[others.leads_to].kind is not Kind.SAME:
-        kind = others.found[others.leads_to].kind
+    first, by = mission.phases[0], None
+    if isinstance(first, Establish) and first.formation == f.name:
+        by = led_by(mission, first, start, slots)
+    end = None if others.leads_to is None else others.found[others.leads_to].kind
+    if by == "shape" and slots is not None and _flattens(start, slots):
         text = (
-            f"from the start, the distances of '{f.name}' lead to a shape that is {kind}, not to it"
+            f"four agents start on the other side of the mirror of '{f.name}' and pass through one plane on their way,"
+            " where distances alone may turn them back, to its mirror image. Exchange two slots, or track slots"
+        )
+        yield Remark("note", "formation", text)
+    elif by in ("squares", "step") and end not in (None, Kind.SAME):
+        text = (
+            f"from the start, the distances of '{f.name}' lead to a shape that is {end}, not to it"
         )
         yield Remark("note", "formation", text)
     elif not others.unique:
@@ -432,6 +435,13 @@ def _other_shapes(mission: Mission, f: FormationCheck, *, alone: bool) -> Iterat
             " Redundant edges or slots rule them out"
         )
         yield Remark("note", "formation", text)
+
+
+def _flattens(start: Array, slots: Array) -> bool:
+    """Whether four agents are all in one plane on the way from a start to slots in space (4, 3)."""
+    if len(slots) != 4 or shapes.dimension(slots) < 3:
+        return False
+    return bool(np.linalg.det((start[1:] - start[0]).T @ (slots[1:] - slots[0])) < 0)
 
 
 # -- gains -------------------------------------------------------------------------------------------

@@ -72,8 +72,8 @@ def solve_multipliers(vehicles, graph, law, w):
     exact      1/w, the paper's;
     iterated   (1 - (mu/(w + mu))^k)/w, Tikhonov regularisation iterated k times;
     spectral   1/(w + nu), nu = (s0/4)(1 - w/s0)^2 for w < s0, else 0;
-    pinv       1/w, and below W = cutoff w_max (3 - 2 w/W) w/W^2, which goes on smoothly to 0: a jump
-               there would be one of the force, and no integrator passes that.
+    pinv       1/w, and below W = cutoff w_max (3 - 2 w/W) w/W^2, which goes on smoothly to 0, as a
+               jump there would be one of the force.
     """
     if graph.solver != 0:
         call_solver(graph.solver)
