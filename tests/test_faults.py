@@ -184,4 +184,4 @@ def test_a_full_disk_while_the_kernel_is_kept():
             assert double(2.0) == 4.0
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limit)
-    assert double.stats.cache_path.startswith(str(compiled.cache_directory()))
+    assert double.stats.cache_path.startswith(str(compiled._CACHE))
