@@ -140,8 +140,9 @@ def test_edges_are_eliminated_by_least_degree():
     assert order[0] in (0, 2)
 
 
-def test_what_branches_on_the_state_is_refused():
-    """The pseudo-inverse iterates until its rotations have converged: no straight line."""
-    p, _ = make(4, {"constraint": {"solver": "pinv"}, "edges": "complete"})
+@pytest.mark.parametrize("solver", ["pinv", "spectral"])
+def test_what_branches_on_the_state_is_refused(solver: str):
+    """Where no factor exists these go on by rotations until they have converged: no straight line."""
+    p, _ = make(4, {"constraint": {"solver": solver}, "edges": "complete"})
     with pytest.raises(UnfitError):
         Trace(p)

@@ -18,7 +18,7 @@ from numba.core.dispatcher import Dispatcher
 from numpy.typing import NDArray
 
 from rigidfleet.kernel import flight
-from rigidfleet.kernel.program import Array, Graph, Program, workspace
+from rigidfleet.kernel.program import EXACT, ITERATED, Array, Graph, Program, workspace
 
 #: From where a symbol gets its value, in the order in which they are known: numbers of the program;
 #: numbers of the flight, of the moment, and of its state.
@@ -121,6 +121,8 @@ class Trace:
     """
 
     def __init__(self, program: Program) -> None:
+        if program.law.solver not in (ITERATED, EXACT):
+            raise UnfitError("a law that goes on where its matrix has no factor")
         self.made: dict[tuple[Any, ...], Symbol] = {}
         self.positive: list[Symbol] = []
         _, self._values, which = structure(program)
