@@ -35,6 +35,29 @@ def test_separation_is_the_least_over_all_pairs(seed, n):
         assert least[k] == pytest.approx(room[closest], abs=1e-14)
 
 
+@pytest.mark.parametrize("sizes", ["equal", "different"])
+def test_separation_of_many_is_the_least_over_all_pairs_while_they_move_and_mix(sizes):
+    """As found among all pairs, in a formation that turns and flies off, wobbles, and then falls apart."""
+    rng = np.random.default_rng(2)
+    n = 300
+    radius = np.full(n, 0.1) if sizes == "equal" else rng.uniform(0.1, 0.5, n)
+    shape = formation.slots("sphere", 2.0, n)
+    velocity = rng.normal(size=shape.shape)
+    r = np.empty((24, n, 3))
+    for k in range(24):
+        turned = Rotation.from_rotvec([0.02 * k, 0.0, 0.1 * k]).apply(shape)
+        r[k] = turned + 5.0 * k + rng.uniform(-0.03, 0.03, shape.shape)
+        r[k] += max(0, k - 12) * velocity
+    r[20, 7] = np.nan
+    least, pair = geometry.separation(r, radius)
+    for k in range(24):
+        apart = np.linalg.norm(r[k, :, None] - r[k], axis=2) - radius - radius[:, None]
+        apart[np.tril_indices(n)] = np.inf
+        np.testing.assert_allclose(least[k], np.nanmin(apart), rtol=0, atol=1e-12)
+        assert pair[k, 0] < pair[k, 1]
+        assert apart[tuple(pair[k])] == pytest.approx(least[k], abs=1e-12)
+
+
 def test_one_agent_is_apart_from_nobody():
     """Without a pair the separation is infinite and names nobody."""
     least, pair = geometry.separation(np.zeros((2, 1, 3)), [0.5])

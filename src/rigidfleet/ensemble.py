@@ -125,9 +125,7 @@ class _Flights:
         law = plan.program.law._replace(mu=self.mission.damping(None))
         program = plan.program._replace(law=law)
         edges = [(int(i), int(j)) for i, j in plan.edges]
-        before = _lengths(self.r, plan.edges)
-        for k, edge in enumerate(edges):
-            before[:, k] = now.reference.get(edge, before[:, k])
+        before = now.reference.of(plan.edges, _lengths(self.r, plan.edges))
         sums = [self.integral.get(edge, np.zeros(count)) for edge in edges]
         y = np.column_stack([self.r.reshape(count, -1), self.v.reshape(count, -1), *sums])
         places, tolerances = _places(self.finished), self.mission.integrator
@@ -148,7 +146,7 @@ class _Flights:
         self.finished &= ends.finished
         self.r, self.v = (x.reshape(count, n, 3) for x in np.split(y[:, : 6 * n], 2, axis=1))
         self.integral |= dict(zip(edges, y[:, 6 * n :].T, strict=True))
-        known = now.reference | dict(zip(edges, plan.distances.tolist(), strict=True))
+        known = now.reference.updated(plan.edges, plan.distances)
         self.now = replace(
             now, t=t_end, reference=known, formation=plan.formation, slots=plan.slots
         )

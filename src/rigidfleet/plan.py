@@ -63,8 +63,8 @@ def plan_phase(mission: Mission, phase: Phase, now: Situation, t_end: float) -> 
 
     d1 = mission.formation_distances(name) if name else np.zeros(0)
     if not shaping:
-        d1 = _commanded(now, edges, d1)
-    d0 = _commanded(now, edges, shapes.distances(now.r, edges))
+        d1 = now.reference.of(edges, d1)
+    d0 = now.reference.of(edges, shapes.distances(now.r, edges))
     # Slots are blended wherever the shape leads; where distances lead, slots only follow if tracked.
     left = masses if now.lost is None else np.where(now.lost, 0.0, masses)
     before = now.slots if now.slots is not None else about_cm(now.r, left)
@@ -120,12 +120,6 @@ def _graph(edges: bytes, masses: bytes, *, large: bool) -> k.Graph:
     """The constraint graph, which the kernel only reads: most phases have the one before."""
     pairs = np.frombuffer(edges, dtype=np.int64).reshape(-1, 2).copy()
     return k.graph(pairs, np.frombuffer(masses), large=large)
-
-
-def _commanded(now: Situation, edges: NDArray[np.int64], other: Array) -> Array:
-    """Distances (m,) commanded last; ``other`` (m,) where an edge is new."""
-    keys = map(tuple, edges.tolist())
-    return np.array([now.reference.get(e, d) for e, d in zip(keys, other.tolist(), strict=True)])
 
 
 def _held(mission: Mission, name: str | None, r: Array) -> str | None:

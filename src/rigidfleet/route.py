@@ -18,10 +18,34 @@ from rigidfleet.mission import Establish, Fly, Mission, Phase, Regulator, Reshap
 
 Array = NDArray[np.float64]
 
-Edge = tuple[int, int]
-
 #: A phase that ends by settling and steers nowhere brings the body to rest within this time [s].
 _REST_WITHIN = 10.0
+
+
+@dataclass(frozen=True)
+class ByEdge:
+    """A number for each edge that has been in force: values (m,), by the edges' keys (m,) in ascending order."""
+
+    keys: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    values: Array = field(default_factory=lambda: np.zeros(0))
+
+    def of(self, edges: NDArray[np.int64], other: Array | float) -> Array:
+        """Values (m,) of edges (m, 2), i < j; ``other`` (m,) where an edge is new."""
+        keys = self._keys(edges)
+        at = np.searchsorted(self.keys, keys)
+        known = np.append(self.keys, -1)[at] == keys
+        return np.where(known, np.append(self.values, 0.0)[at], other)
+
+    def updated(self, edges: NDArray[np.int64], values: Array) -> ByEdge:
+        """These and those of edges (m, 2), i < j, of which the latter count where there are both."""
+        keys, first = np.unique(
+            np.concatenate([self._keys(edges), self.keys]), return_index=True
+        )
+        return ByEdge(keys, np.concatenate([values, self.values])[first])
+
+    @staticmethod
+    def _keys(edges: NDArray[np.int64]) -> NDArray[np.int64]:
+        return (edges[:, 0] << 32) + edges[:, 1]
 
 
 @dataclass
@@ -41,8 +65,8 @@ class Situation:
     t: float
     r: Array  # (N, 3) [m]
     v: Array  # (N, 3) [m/s]
-    integral: dict[Edge, float] = field(default_factory=dict)  # of c, by edge [m s]
-    reference: dict[Edge, float] = field(default_factory=dict)  # distances commanded last [m]
+    integral: ByEdge = field(default_factory=ByEdge)  # of c [m s]
+    reference: ByEdge = field(default_factory=ByEdge)  # distances commanded last [m]
     frame: Array | None = None  # attitude (3, 3) of the integrated mean-axis frame
     formation: str | None = None  # the one taken last
     slots: Array | None = None  # (N, 3) commanded last, about the CM, body axes [m]

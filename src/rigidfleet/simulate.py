@@ -35,6 +35,8 @@ _STEPS, _PAUSE = 2000, 0.05
 _STALLED, _STALLED_RATE, _MOST_STEPS = 50_000, 2_000.0, 5_000_000
 #: Residual of an iterative solve, as a share of the integrator's tolerance; the relative one within bounds.
 _RESIDUAL, _LEAST, _MOST_RESIDUAL = 1e-3, 1e-13, 1e-8
+#: Below this share of a velocity's tolerance, the error of an acceleration, times a second, is nothing.
+_FLOOR = 1e-2
 #: Where a phase ends by settling, whether it has is asked this often [s].
 _CHECK = 0.1
 #: How close agents come is watched at least this often [s], whatever is recorded.
@@ -282,7 +284,7 @@ class Flight:
         steps = solvers.sweep_steps(len(points), edges) if plan.method == "sweep" else None
         given = self.mission.integrator
         residual = min(max(_RESIDUAL * given.rtol, _LEAST), _MOST_RESIDUAL)
-        floor = _RESIDUAL * (given.atol_velocity or given.atol)  # of a step of a second
+        floor = _FLOOR * float(self._atol_velocity(plan).min())  # of a step of a second
         order = partial(solvers.dissection, points, edges)
         p = plan.program
         return large.LargeSolver(
@@ -294,12 +296,11 @@ class Flight:
 
         The integral of c is in its law what a distance is, times a second; but it stays near zero, where
         a relative tolerance asks for nothing. In large formations it would set the step alone: there it is held
-        to what its own distance is held to.
+        to what its own distance is held to, and velocities to what places are.
         """
         n, m, given = len(self.masses), len(plan.edges), self.mission.integrator
         atol = np.full(size, given.atol)
-        if given.atol_velocity is not None:
-            atol[3 * n : 6 * n] = given.atol_velocity
+        atol[3 * n : 6 * n] = np.repeat(self._atol_velocity(plan), 3)
         if given.atol_integral is not None:
             atol[6 * n : 6 * n + m] = given.atol_integral
         elif plan.method != "dense":
@@ -307,6 +308,18 @@ class Flight:
         if given.atol_attitude is not None:
             atol[6 * n + m : 6 * n + m + 4] = given.atol_attitude
         return atol
+
+    def _atol_velocity(self, plan: PhasePlan) -> Array:
+        """Absolute tolerance (N,) of velocities [m/s].
+
+        The law takes errors back at the rate beta: one of a velocity becomes one of a place 1/beta of it. In large
+        formations, unless given, it is therefore beta times the tolerance of the agent's place about the CM.
+        """
+        given, n = self.mission.integrator, len(self.masses)
+        if given.atol_velocity is not None or plan.method == "dense":
+            return np.full(n, given.atol_velocity or given.atol)
+        away = np.linalg.norm(about_cm(self.now.r, self.masses), axis=1)
+        return np.maximum(given.atol, plan.program.law.beta * (given.atol + given.rtol * away))
 
     def _integrator(self, plan: PhasePlan, y: Array, t: float) -> flight.Integrator:
         rtol = self.mission.integrator.rtol
@@ -414,7 +427,7 @@ class Flight:
                 samples[0], done = state.y, 1  # no step was possible: the start is all there is
             times, samples, kept = times[:done], samples[:done], kept[:done]
             if not kept.all():
-                r = _positions(leg.plan, samples[~kept], len(self.masses))
+                r = _positions(leg.plan, samples, len(self.masses), ~kept)
                 self.watched.append((times[~kept], r))
             if kept.any():
                 self._record(leg, program, times[kept], samples[kept])
@@ -508,8 +521,7 @@ class Flight:
     def _pack(self, plan: PhasePlan) -> Array:
         """The kernel's state vector at the switch."""
         now, masses = self.now, self.masses
-        keys = map(tuple, plan.edges.tolist())
-        integral = [now.integral.get(edge, 0.0) for edge in keys]
+        integral = now.integral.of(plan.edges, 0.0)
         if plan.frame is None:
             return np.concatenate([now.r.ravel(), now.v.ravel(), integral])
         q = att.quaternion_from_dcm(plan.frame)
@@ -524,7 +536,6 @@ class Flight:
         plan, state, w = leg.plan, leg.state, leg.workspace
         flight.closed_loop(leg.t, state.y, np.empty_like(state.y), plan.program, w)
         n, m = len(self.masses), len(plan.edges)
-        keys = [(i, j) for i, j in plan.edges.tolist()]
         frame = self.now.frame
         if plan.frame is not None:
             q = state.y[6 * n + m : 6 * n + m + 4]
@@ -537,9 +548,8 @@ class Flight:
             t=leg.t,
             r=w.r.copy(),
             v=w.v.copy(),
-            integral=self.now.integral
-            | dict(zip(keys, state.y[6 * n : 6 * n + m].tolist(), strict=True)),
-            reference=self.now.reference | dict(zip(keys, plan.distances.tolist(), strict=True)),
+            integral=self.now.integral.updated(plan.edges, state.y[6 * n : 6 * n + m]),
+            reference=self.now.reference.updated(plan.edges, plan.distances),
             frame=frame,
             formation=plan.formation,
             slots=plan.slots,
@@ -746,16 +756,15 @@ def _jacobian(leg: Leg, n: int) -> tuple[Array, int, float]:
     return J.reshape(len(edges), -1), closest, float(lengths[closest])
 
 
-def _positions(plan: PhasePlan, states: Array, n: int) -> Array:
-    """Positions (K, N, 3) [m], world axes, of states of the kernel (K, n)."""
-    x = states[:, : 3 * n].reshape(-1, n, 3)
+def _positions(plan: PhasePlan, states: Array, n: int, which: NDArray[np.bool_]) -> Array:
+    """Positions (K, N, 3) [m], world axes, at those of the states of the kernel (., n) that are asked for."""
+    x = states[:, : 3 * n][which].reshape(-1, n, 3)
     if not plan.program.body_formulation:
         return x
     q = 6 * n + len(plan.edges)
-    T = att.dcm_from_quaternion(
-        states[:, q : q + 4] / np.linalg.norm(states[:, q : q + 4], axis=1, keepdims=True)
-    )
-    return np.einsum("kba,kib->kia", T, x) + states[:, None, q + 4 : q + 7]
+    last = states[:, q : q + 7][which]
+    T = att.dcm_from_quaternion(last[:, :4] / np.linalg.norm(last[:, :4], axis=1, keepdims=True))
+    return np.einsum("kba,kib->kia", T, x) + last[:, None, 4:]
 
 
 def _times(times: ArrayLike, end: float) -> Array:

@@ -27,6 +27,8 @@ _RENEW, _STALE = 12, 1.5
 _MOST = 1000
 #: Fill of the factor, in blocks an agent, at most. Shells and sheets stay below, thick lattices do not.
 _FILL = 80.0
+#: Each solve starts from the best combination of the solutions of so many evaluations before.
+_PAST = 4
 #: Damping with which the exact law is solved on the vertex graph, twice over: it deviates by (mu/w)^2.
 _EXACT_MU = 1e-8
 
@@ -74,9 +76,9 @@ class LargeSolver:
         self.mbar = vehicles.M / n
         iterated = law.solver == ITERATED
         self.mu, self.iterations = (law.mu, law.iterations) if iterated else (_EXACT_MU, 2)
-        self.a, self.f, self.small = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((10, 3))
+        self.a, self.rest = np.zeros((n, 3)), np.zeros(len(self.edges))
         self.least = self.mu * self.mbar * self.floor * math.sqrt(n)
-        self.rest = np.zeros(len(self.edges))
+        self.sweep = None if self.steps is None else tree.order(self.steps, self.edges)
         self.pattern: sparse.Pattern | None = None  # where the sweep does, it is never needed
         # An exception cannot pass through compiled code; the multipliers become NaN instead.
         self._call = ctypes.CFUNCTYPE(None)(self._solve)
@@ -100,12 +102,13 @@ class LargeSolver:
     def solve(self) -> None:
         """Multipliers for ``workspace.b``; NaN where there is no solution."""
         w, vehicles = self.workspace, self.vehicles
-        edges = self.edges
-        if self.steps is not None:
-            pivot = tree.particular(w.u, w.b, edges, self.steps, self.a)
+        if self.sweep is not None:
+            # Where deformation is damped, the kernel knows the mean axes already.
+            known = self.law.k_def > 0.0
+            pivot = tree.solve(
+                w.u, w.b, w.r, vehicles.m, vehicles.M, self.sweep, known, w.cm[0], w.I, w.I_inv, self.a, w.multiplier
+            )  # fmt: skip
             if pivot > tree.LOST:
-                tree.balance(w.r, vehicles.m, vehicles.M, self.a, self.small)
-                tree.multipliers(w.u, edges, self.steps, vehicles.m, self.a, self.f, w.multiplier)
                 return
             self.counts.fallbacks += 1
         if not np.isfinite(w.b).all() or not self._on_vertex_graph():
@@ -121,6 +124,7 @@ class LargeSolver:
         w, edges, m = self.workspace, self.edges, self.vehicles.m
         if self.pattern is None:
             self._prepare()
+        self._turn()
         self.rest[:] = w.b
         y, a = w.multiplier, self.a
         y[:], a[:] = 0.0, 0.0
@@ -128,21 +132,21 @@ class LargeSolver:
         for k in range(self.iterations):
             self.g[:] = 0.0
             sparse.pull(w.u, edges, self.rest, self.mbar, self.g)
-            if not self._system(self.x[k]):
+            x = self._system(k)
+            if x is None:
                 return False
-            sparse.stretch(w.u, edges, self.x[k], -1.0, self.rest)
+            sparse.stretch(w.u, edges, x, -1.0, self.rest)
             if iterated:
                 y += (self.mbar / self.mu) * self.rest
             else:
-                a += self.x[k]
-        if iterated:
-            return True
-        for k in range(self.iterations):
+                a += x
+        for k in range(0 if iterated else self.iterations):
             self.g[:] = m[:, None] * a
             sparse.pull(w.u, edges, y, -1.0, self.g)
-            if not self._system(self.x[self.iterations + k]):
+            x = self._system(self.iterations + k)
+            if x is None:
                 return False
-            sparse.stretch(w.u, edges, self.x[self.iterations + k], self.mbar, y)
+            sparse.stretch(w.u, edges, x, self.mbar, y)
         return True
 
     def _prepare(self) -> None:
@@ -151,9 +155,10 @@ class LargeSolver:
         self.L, self.place = np.zeros((len(self.pattern.row), 9)), np.empty(n, dtype=np.int64)
         # To precondition, seven digits do, unless next to nothing is added to the rigid motions.
         self.kept = self.L.astype(np.float32) if self.mu > _EXACT_MU else self.L
-        # Solutions are kept: the next evaluation starts from them.
-        self.x = np.zeros((self.iterations * (1 if self.law.solver == ITERATED else 2), n, 3))
-        self.g, self.work = np.zeros((n, 3)), np.empty((5, n, 3))
+        systems = self.iterations * (1 if self.law.solver == ITERATED else 2)
+        self.past, self.taken = np.zeros((systems, _PAST, n, 3)), np.zeros(systems, dtype=int)
+        self.x, self.g, self.work = np.zeros((n, 3)), np.zeros((n, 3)), np.empty((5, n, 3))
+        self.gram = np.empty((_PAST, _PAST + 2))
         self.marks = _far_apart(self.workspace.r)
         # A factor takes as long as so many iterations.
         count = np.diff(self.pattern.column).astype(float)
@@ -161,48 +166,61 @@ class LargeSolver:
         self.fresh, self.wasted = 0, 0.0  # iterations that a new factor needs, and those beyond
         self.axes: Array | None = None  # of the marks when the factor was made; None: no factor
 
-    def _system(self, x: Array) -> bool:
-        """Solve K x = g from x on, with the kept factor, or with a new one if that has become stale."""
+    def _system(self, number: int) -> Array | None:
+        """The solution x (N, 3) of K x = g, that system of an evaluation; None where there is none.
+
+        By the kept factor, or by a new one if that has become stale, from past solutions of that system on.
+        """
+        w, x, past = self.workspace, self.x, self.past[number]
         # A residual r is an error r/mu of the force.
         within = max(self.tolerance * math.sqrt(sparse.inner(self.g, self.g)), self.least)
         self.counts.solves += 1
+        sparse.project(
+            w.u, self.edges, self.vehicles.m, self.mbar, self.mu, self.g, past, self.gram, x
+        )
         while True:
             new = self.axes is None or self.wasted > self.worth
             if new:
                 self._renew()
-            taken = self._gradients(x, within, _MOST if new else 4 * max(_RENEW, self.fresh))
+            most = _MOST if new else 4 * max(_RENEW, self.fresh)
+            taken = self._gradients(x, within, most)
             if new:
                 self.fresh, self.wasted = max(taken, 1), 0.0
             elif taken > max(_RENEW, _STALE * self.fresh):
                 self.wasted = math.inf
             else:
                 self.wasted += taken - self.fresh
-            if taken <= _MOST and np.isfinite(x).all():
-                if new or taken <= 4 * max(_RENEW, self.fresh):
-                    return True
-            else:
-                x[:] = 0.0
+            if taken <= most and np.isfinite(x).all():
+                past[self.taken[number] % _PAST] = x
+                self.taken[number] += 1
+                return x
             if new:
-                return False
+                past[:] = 0.0
+                return None
+            if taken > _MOST or not np.isfinite(x).all():
+                x[:] = 0.0
 
     def _gradients(self, x: Array, within: float, most: int) -> int:
         w, p, m = self.workspace, self.pattern, self.vehicles.m
         assert p is not None
-        assert self.axes is not None
-        turned = _axes(self.workspace.r[self.marks]).T @ self.axes
         taken = sparse.conjugate_gradients(
-            w.u, self.edges, m, self.mbar, self.mu, turned, p.place, p.column, p.row,
+            w.u, self.edges, m, self.mbar, self.mu, self.turned, p.place, p.column, p.row,
             self.kept, self.g, x, within, most, self.work,
         )  # fmt: skip
         self.counts.iterations += min(taken, most)
         return taken
+
+    def _turn(self) -> None:
+        """Find out how the formation has turned since the factor was made."""
+        self.now = _axes(*self.workspace.r[self.marks].tolist())
+        self.turned = np.eye(3) if self.axes is None else self.now.T @ self.axes
 
     def _renew(self) -> None:
         """Factor K at the current shape, with more damping where a factor without fill needs it."""
         w, p, m = self.workspace, self.pattern, self.vehicles.m
         assert p is not None
         self.counts.factors += 1
-        self.axes = _axes(self.workspace.r[self.marks])
+        self.axes, self.turned = self.now, np.eye(3)
         mu = self.mu
         for _ in range(12):
             sparse.assemble(
@@ -230,12 +248,17 @@ def _far_apart(r: Array) -> Ints:
     return np.array([i, j, k])
 
 
-def _axes(points: Array) -> Array:
-    """Rows of a rotation (3, 3) that goes with three points (3, 3); the identity on a line."""
-    x = points[1] - points[0]
-    z = np.cross(x, points[2] - points[0])
-    size, area = np.linalg.norm(x), np.linalg.norm(z)
+def _axes(a: list[float], b: list[float], c: list[float]) -> Array:
+    """Rows of a rotation (3, 3) that goes with three points; the identity on a line."""
+    x = [q - p for p, q in zip(a, b, strict=True)]
+    z = _cross(x, [q - p for p, q in zip(a, c, strict=True)])
+    size, area = math.hypot(*x), math.hypot(*z)
     if not area > 1e-9 * size * size:
         return np.eye(3)
-    x, z = x / size, z / area
-    return np.ascontiguousarray([x, np.cross(z, x), z])
+    x, z = [q / size for q in x], [q / area for q in z]
+    return np.array([x, _cross(z, x), z])
+
+
+def _cross(a: list[float], b: list[float]) -> list[float]:
+    """a x b, in a twentieth of the time that NumPy takes for three numbers."""
+    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]

@@ -272,6 +272,56 @@ def inner(a, b):
 
 
 @compiled
+def project(u, edges, m, mbar, mu, g, past, G, x):
+    """x (N, 3) = that combination of past solutions (P, N, 3) which is nearest to the one of K x = g.
+
+    In the norm of K, so that its residual is orthogonal to all of them (Fischer, 1998). What depends on those
+    before is left out. G (P, P + 2) is scratch.
+    """
+    count = past.shape[0]
+    c, scale = G[:, count], G[:, count + 1]
+    for p in range(count):
+        for q in range(count + 2):
+            G[p, q] = 0.0
+    for k in range(edges.shape[0]):
+        i, j = edges[k, 0], edges[k, 1]
+        for p in range(count):
+            along = 0.0
+            for s in range(3):
+                along += u[k, s] * (past[p, i, s] - past[p, j, s])
+            scale[p] = along
+            for q in range(p + 1):
+                G[p, q] += mbar * along * scale[q]
+    for i in range(m.shape[0]):
+        for p in range(count):
+            y0, y1, y2 = past[p, i, 0], past[p, i, 1], past[p, i, 2]
+            c[p] += y0 * g[i, 0] + y1 * g[i, 1] + y2 * g[i, 2]
+            y0, y1, y2 = mu * m[i] * y0, mu * m[i] * y1, mu * m[i] * y2
+            for q in range(p + 1):
+                G[p, q] += y0 * past[q, i, 0] + y1 * past[q, i, 1] + y2 * past[q, i, 2]
+    for p in range(count):
+        for q in range(p):
+            for l in range(q):
+                G[p, q] -= G[p, l] * G[q, l]
+            G[p, q] *= scale[q]
+        rest = G[p, p]
+        for q in range(p):
+            rest -= G[p, q] * G[p, q]
+            c[p] -= G[p, q] * c[q]
+        scale[p] = 1.0 / math.sqrt(rest) if rest > 1e-12 * G[p, p] else 0.0
+        c[p] *= scale[p]
+    for p in range(count - 1, -1, -1):
+        for q in range(p + 1, count):
+            c[p] -= G[q, p] * c[q]
+        c[p] *= scale[p]
+    for i in range(m.shape[0]):
+        for s in range(3):
+            x[i, s] = 0.0
+            for p in range(count):
+                x[i, s] += c[p] * past[p, i, s]
+
+
+@compiled
 def conjugate_gradients(u, edges, m, mbar, mu, R, place, column, row, L, g, x, within, most, work):
     """Solve K x = g from x on until |g - K x| <= within, all (N, 3); returns the iterations.
 
@@ -284,9 +334,9 @@ def conjugate_gradients(u, edges, m, mbar, mu, R, place, column, row, L, g, x, w
         for s in range(3):
             r[i, s] = g[i, s] - Kq[i, s]
             q[i, s] = 0.0
-    last = 1.0
+    last, rest = 1.0, inner(r, r)
     for iteration in range(most + 1):
-        if inner(r, r) <= within * within:
+        if rest <= within * within:
             return iteration
         precondition(R, place, column, row, L, r, w, z)
         rz = inner(r, z)
@@ -296,8 +346,10 @@ def conjugate_gradients(u, edges, m, mbar, mu, R, place, column, row, L, g, x, w
         last = rz
         apply(u, edges, m, mbar, mu, q, Kq)
         step = rz / inner(q, Kq)
+        rest = 0.0
         for i in range(n):
             for s in range(3):
                 x[i, s] += step * q[i, s]
                 r[i, s] -= step * Kq[i, s]
+                rest += r[i, s] * r[i, s]
     return most + 1

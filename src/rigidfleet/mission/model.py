@@ -91,7 +91,7 @@ class Mission(Contents):
         """Edges (m, 2) of all formations, counted from 0, i < j, in the order of first mention."""
         all_ = [self.formation_edges(name) for name in self.formations]
         pairs = np.concatenate([np.zeros((0, 2), dtype=np.int64), *all_])
-        first = np.unique(pairs, axis=0, return_index=True)[1]
+        first = np.unique(pairs[:, 0] * self.n_agents + pairs[:, 1], return_index=True)[1]
         return pairs[np.sort(first)]
 
     @cached_property
