@@ -92,6 +92,22 @@ def _sphere(size: Floats, n: int) -> Floats:
     return p * size[0] / _nearest(p).min()
 
 
+def _shells(size: Floats, n: int) -> Floats:
+    """Two concentric spheres, the outer one first, as near to each other as agents on each are."""
+
+    def radius(count: int) -> float:
+        return float(np.linalg.norm(_sphere(size, count)[0]))
+
+    low, high = n // 2, n - 4  # agents of the outer one: too few, and enough
+    if radius(high) - radius(n - high) < size[0]:
+        raise ValueError(f"{n} agents are too few for a sphere within a sphere")
+    while high - low > 1:
+        middle = (low + high) // 2
+        apart = radius(middle) - radius(n - middle)
+        low, high = (middle, high) if apart < size[0] else (low, middle)
+    return np.concatenate([_sphere(size, high), _sphere(size, n - high)])
+
+
 def _nearest(p: Floats) -> Floats:
     """Distance (N,) of each of N points (N, 3) to the nearest other."""
     from scipy.spatial import KDTree
@@ -184,6 +200,12 @@ SHAPES: dict[str, Shape] = {
     ),
     "sphere": Shape(
         range(4, _ANY), 1, _sphere, "Fibonacci spiral from below; `size` is the least distance"
+    ),
+    "shells": Shape(
+        range(40, _ANY),
+        1,
+        _shells,
+        "a sphere and, `size` below it, a second one within; each as `sphere`, the outer first",
     ),
     "helix": Shape(
         range(3, _ANY),
@@ -349,8 +371,8 @@ def joined(points: ArrayLike) -> Ints:
     """3N - 6 edges (m, 2), i < j, that join each of N points in space to three nearer to the centre.
 
     A generically rigid graph by Henneberg's first step, whose exact law is solved in O(N). Of the nearest twelve
-    points that come earlier those three are taken that span the largest volume of directions; from the centre
-    outwards that keeps chains of agents short.
+    points that come earlier those three are taken that span the largest volume of directions. Edges are short, and
+    chains of agents as long as from the centre to the border.
 
     Raises
     ------
@@ -365,9 +387,7 @@ def joined(points: ArrayLike) -> Ints:
     rank = np.empty(n, dtype=np.int64)
     rank[order] = np.arange(n)
     tree = KDTree(p)
-    first = order[:3]
-    edges = [np.array([first[[0, 1]], first[[0, 2]], first[[1, 2]]])]
-    triples = np.array(list(combinations(range(12), 3)))
+    edges = [_triangle_of(order)]
     for some in np.array_split(order[3:], max(1, n // 4000)):
         near = tree.query(p[some], k=min(n, 48))[1]
         later = rank[near] >= rank[some][:, None]
@@ -379,16 +399,97 @@ def joined(points: ArrayLike) -> Ints:
             d = ((p[before] - p[some[k]]) ** 2).sum(axis=1)
             few = before[np.argsort(d, kind="stable")[:12]]
             at[k] = np.append(few, np.full(12 - len(few), -1))
-        x = p[at] - p[some][:, None]
-        length = np.linalg.norm(x, axis=2, keepdims=True)
-        u = np.where(at[..., None] >= 0, x / np.maximum(length, 1e-300), 0.0)
-        a, b, c = (u[:, triples[:, k]] for k in range(3))
+        u, length = _towards(p, some, at)
+        a, b, c = (u[:, _TRIPLES[:, k]] for k in range(3))
         volume = np.abs((a * np.cross(b, c)).sum(axis=2))
         # Of as good triples the shortest.
-        worth = volume.round(3) - 1e-6 * length[:, triples, 0].sum(axis=2) / length.max()
-        best = triples[worth.argmax(axis=1)]
-        edges.append(np.column_stack([np.repeat(some, 3), np.take_along_axis(at, best, 1).ravel()]))
+        worth = volume.round(3) - 1e-6 * length[:, _TRIPLES].sum(axis=2) / length.max()
+        edges.append(_edges_to(some, at, _TRIPLES[worth.argmax(axis=1)]))
     return np.sort(np.concatenate(edges), axis=1).astype(np.int64)
+
+
+def coarse_to_fine(points: ArrayLike) -> Ints:
+    """3N - 6 edges (m, 2), i < j, that join each of N points in space to three before it, far ones first.
+
+    Of the kind that `joined` makes, and solved as fast; but it begins with points far apart, and doubles their
+    number again and again, each new one between those there are, so that no chain of agents is longer than log N.
+    Of the twelve nearest before it a point is joined to the three that leave it the stiffest: with the inverse G of
+    their directions, and e of each its own, least sum of |G_k|^2 (1 + e_k). It holds lattices better than `joined`,
+    and shells, which that one leaves flexible; its first edges are as long as the shape.
+
+    Raises
+    ------
+    ValueError
+        The points do not span space.
+    """
+    from scipy.spatial import KDTree
+
+    p = np.asarray(points, dtype=np.float64)
+    n = len(p)
+    first = _far_apart(p, min(n, 12))
+    order = _halves(p)
+    order = _spanning_first(p, np.concatenate([first, order[~np.isin(order, first)]]))
+    edges, soft, done = [_triangle_of(order)], np.zeros(n), 3
+    while done < n:
+        some = order[done : 2 * done if done >= 12 else done + 1]
+        near = KDTree(p[order[:done]]).query(p[some], k=min(done, 12))[1]
+        at = np.pad(order[near], ((0, 0), (0, 12 - near.shape[1])), constant_values=-1)
+        u, _ = _towards(p, some, at)
+        a, b, c = (u[:, _TRIPLES[:, k]] for k in range(3))
+        rows = np.cross(b, c), np.cross(c, a), np.cross(a, b)
+        volume = (a * rows[0]).sum(axis=2)
+        e = soft[at]
+        square = sum((g**2).sum(axis=2) * (1 + e[:, _TRIPLES[:, k]]) for k, g in enumerate(rows))
+        left = np.where(np.abs(volume) > 1e-9, square / np.maximum(volume**2, 1e-18), np.inf)
+        soft[some] = left.min(axis=1)
+        edges.append(_edges_to(some, at, _TRIPLES[left.argmin(axis=1)]))
+        done += len(some)
+    return np.sort(np.concatenate(edges), axis=1).astype(np.int64)
+
+
+#: Three out of twelve.
+_TRIPLES = np.array(list(combinations(range(12), 3)))
+
+
+def _triangle_of(order: Ints) -> Ints:
+    return np.array([order[[0, 1]], order[[0, 2]], order[[1, 2]]])
+
+
+def _towards(p: Floats, some: Ints, at: Ints) -> tuple[Floats, Floats]:
+    """Unit vectors (k, 12, 3) from some points (k,) to others (k, 12), and how far; 0 where they are -1: none."""
+    x = p[at] - p[some][:, None]
+    length = np.linalg.norm(x, axis=2)
+    there = (at >= 0) & (length > 0)
+    return np.where(there[..., None], x / np.maximum(length, 1e-300)[..., None], 0.0), length
+
+
+def _edges_to(some: Ints, at: Ints, triple: Ints) -> Ints:
+    """Edges (3k, 2) of points (k,) to three (k, 3) of those ``at`` (k, 12)."""
+    return np.column_stack([np.repeat(some, 3), np.take_along_axis(at, triple, 1).ravel()])
+
+
+def _far_apart(p: Floats, count: int) -> Ints:
+    """So many points, each the farthest from all before it, the first from the centre."""
+    away = np.linalg.norm(p - p.mean(axis=0), axis=1)
+    found = [int(away.argmax())]
+    away = np.linalg.norm(p - p[found[0]], axis=1)
+    while len(found) < count:
+        found.append(int(away.argmax()))
+        away = np.minimum(away, np.linalg.norm(p - p[found[-1]], axis=1))
+    return np.array(found)
+
+
+def _halves(p: Floats) -> Ints:
+    """Order (N,) of points: the middle one across the longest extent, the middles of both halves, and so on."""
+    order, todo = [], [np.arange(len(p))]
+    while todo:
+        parts, todo = todo, []
+        for some in parts:
+            axis = int(np.ptp(p[some], axis=0).argmax())
+            along, middle = some[np.argsort(p[some, axis], kind="stable")], len(some) // 2
+            order.append(along[middle])
+            todo += [half for half in (along[:middle], along[middle + 1 :]) if len(half)]
+    return np.array(order)
 
 
 def _spanning_first(p: Floats, order: Ints) -> Ints:

@@ -35,11 +35,12 @@ def separation(r: Array, radius: ArrayLike) -> tuple[Array, Ints]:
     radius = np.asarray(radius, dtype=float)
     least, pair = np.full(len(r), np.inf), np.full((len(r), 2), -1)
     if n > _MANY:
-        found = np.isfinite(r).all(axis=2)
-        whole = found.all(axis=1)
+        whole = np.isfinite(r.reshape(len(r), -1)).all(axis=1)
+        if whole.all():
+            return _closest_of_many(r, radius)
         least[whole], pair[whole] = _closest_of_many(r[whole], radius)
         for k in np.flatnonzero(~whole):  # who is nowhere hides nobody else
-            who = np.flatnonzero(found[k])
+            who = np.flatnonzero(np.isfinite(r[k]).all(axis=1))
             if len(who) > 1:
                 least[k : k + 1], near = _closest_of_many(r[k : k + 1, who], radius[who])
                 pair[k] = who[near[0]]

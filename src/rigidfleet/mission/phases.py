@@ -179,9 +179,10 @@ def _samples(notes: Notes, parts: Mapping[str, Any], end: float | None, n: int |
     if not step or not end or not notes.right((), "output_step"):
         return
     forms = parts["formations"].values()
-    about = {"complete": (n or 0) ** 2 // 2, "neighbours": 9 * (n or 0), "joined": 3 * (n or 0)}
+    about = {"complete": (n or 0) ** 2 // 2, "neighbours": 9 * (n or 0)}
     edges = sum(
-        about[form.edges] if isinstance(form.edges, str) else len(form.edges) for form in forms
+        about.get(form.edges, 3 * (n or 0)) if isinstance(form.edges, str) else len(form.edges)
+        for form in forms
     )
     numbers = 30 * (n or 0) + 8 * edges + 50
     if step > end:

@@ -51,7 +51,7 @@ Size = Annotated[
     Annotated[Positive, Tag("one")] | Annotated[_Extent, Tag("list")], Discriminator(_form)
 ]
 Edges = Annotated[
-    Annotated[Literal["complete", "neighbours", "joined"], Tag("one")]
+    Annotated[Literal["complete", "neighbours", "joined", "tree"], Tag("one")]
     | Annotated[tuple[_Pair, ...], Tag("list")],
     Discriminator(_form),
 ]
@@ -283,7 +283,7 @@ class Formation(Part):
     edges: Edges = Field(
         "complete",
         description="pairs of agents, counted from 1; 'complete': every pair; 'neighbours': those within reach; "
-        "'joined': each to three nearer to the centre, 3 N - 6 in all",
+        "'joined': each to three nearer to the centre; 'tree': each to three before it, far ones first; 3 N - 6 in all",
     )
     reach: Positive = Field(
         shapes.REACH,
@@ -300,9 +300,9 @@ class Formation(Part):
         if isinstance(self.edges, str):
             slots = self.slot_array(n)
             assert slots is not None  # checked: there are a shape or slots
-            if self.edges == "joined":
-                return shapes.joined(slots)
-            return shapes.neighbours(slots, self.reach)
+            if self.edges == "neighbours":
+                return shapes.neighbours(slots, self.reach)
+            return shapes.joined(slots) if self.edges == "joined" else shapes.coarse_to_fine(slots)
         return np.sort(np.array(self.edges, dtype=np.int64).reshape(-1, 2) - 1, axis=1)
 
     @property
