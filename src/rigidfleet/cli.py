@@ -56,8 +56,9 @@ _WIDE = 1000
 _SELDOM = 10.0
 #: A flight is heard of several times a second: when not for so long, it compiles [s].
 _SILENCE = 1.0
-#: A design of so many agents is compared with all pairs.
-_COMPARED = 60
+#: A design of so many agents is compared with all pairs; one of more than the latter is judged by the ends of its
+#: spectrum alone.
+_COMPARED, _DENSE = 60, 200
 _COMPILING = "Compiling the flight kernel (once, about 20 s)"
 
 app = App(
@@ -287,13 +288,16 @@ def design(
     size: Annotated[list[float] | None, Parameter(consume_multiple=True)] = None,
     extra: str = "0",
     sensing_range: Annotated[float | None, Parameter(name="--range")] = None,
+    edges: str | None = None,
+    reach: float | None = None,
     out: Path | None = None,
     force: bool = False,
     json: bool = False,
 ) -> int:
     """Choose the edges that hold a shape best, and write the formation for a mission file.
 
-    As few edges as hold it, of the greatest rigidity index found; compared with all pairs.
+    As few edges as hold it, of the greatest rigidity index found; compared with all pairs. For more than some
+    hundred agents, where that search would take hours, choose a graph by --edges; its index is reported.
 
     Parameters
     ----------
@@ -307,6 +311,10 @@ def design(
         Number of redundant edges besides, or "complete" for all.
     sensing_range : float
         No edge is longer than this [m].
+    edges : str
+        Do not search, but take this graph: complete, neighbours, joined or tree.
+    reach : float
+        How far edges "neighbours" reach, in distances of nearest neighbours; 1.9 if not given.
     out : Path
         Write the formation to this file; else it is printed.
     force : bool
@@ -315,39 +323,37 @@ def design(
         Print all of it as JSON.
     """
     from rigidfleet import design as designs
-    from rigidfleet.formation import CUBE_EDGES, complete_graph
+    from rigidfleet.formation import CUBE_EDGES, REACH, complete_graph
     from rigidfleet.result import write_file
-    from rigidfleet.rigidity import analyse
 
     if out is not None and out.exists() and not force:
         raise RigidfleetError(f"{out}: exists already and is kept. Replace it by --force.")
     try:
         name, slots = _points(shape, agents, size)
-        more = extra if extra == "complete" else int(_number(extra))
-        edges = designs.design(slots, extra=more, sensing_range=sensing_range)
-        kinds = {"designed": edges}
-        if shape == "cube":
-            kinds["the paper's 18"] = CUBE_EDGES
-        if len(slots) <= _COMPARED:
-            kinds["all pairs"] = complete_graph(len(slots))
-        judged = {what: analyse(slots, graph) for what, graph in kinds.items()}
+        if edges is not None:
+            _reject(edges, reach, searched=extra != "0" or sensing_range is not None)
+            kinds = {edges: designs.GRAPHS[edges](slots, reach or REACH)}
+        else:
+            more = extra if extra == "complete" else int(_number(extra))
+            kinds = {"designed": designs.design(slots, extra=more, sensing_range=sensing_range)}
+            if shape == "cube":
+                kinds["the paper's 18"] = CUBE_EDGES
+            if len(slots) <= _COMPARED:
+                kinds["all pairs"] = complete_graph(len(slots))
+        text = designs.mission_fragment(name, slots, edges or kinds["designed"], reach)
+        judged = {what: _judged(slots, graph) for what, graph in kinds.items()}
     except ValueError as error:
         raise RigidfleetError(f"{shape}: {str(error).rstrip('.')}.") from None
-    text = designs.mission_fragment(name, slots, edges)
     limits = designs.limits(slots)
     if out is not None:
         write_file(out, text.encode())
     if json:
-        found = {what: rigidity.data() for what, rigidity in judged.items()}
+        found = {what: data for what, (data, _) in judged.items()}
         _print_json({"name": name, "toml": text, "limits": limits, "graphs": found})
         return PASSED
-    table = _table("graph", "edges", "rank", "index", "w", "longest", "verdict")
-    for what, rigidity in judged.items():
-        i, j = rigidity.edges.T
-        longest = max(((slots[i] - slots[j]) ** 2).sum(axis=1) ** 0.5, default=0.0)
-        rank = f"{rigidity.rank} of {rigidity.needed}"
-        cells = (f"{rigidity.index:.4f}", f"{rigidity.w:.4f}", f"{longest:.3g} m")
-        table.add_row(what, str(len(rigidity.edges)), rank, *cells, str(rigidity.verdict))
+    table = _table("graph", "edges", "rank", "index", "cond.", "longest", "verdict")
+    for what, (_, cells) in judged.items():
+        table.add_row(what, *cells)
     console = _out() if out is not None else _err()  # so that the formation alone can be piped
     console.print(table)
     if limits:
@@ -357,6 +363,50 @@ def design(
     else:
         console.print(f"Formation  {out}", soft_wrap=True)
     return PASSED
+
+
+def _reject(edges: str, reach: float | None, *, searched: bool) -> None:
+    """Say so where a named graph is none, or goes with options of the search.
+
+    Raises
+    ------
+    ValueError
+    """
+    from rigidfleet.design import GRAPHS
+
+    if edges not in GRAPHS:
+        raise ValueError(f"no graph is called {edges!r}; graphs: {', '.join(GRAPHS)}")
+    if searched:
+        raise ValueError("--extra and --range are of the search, remove them or --edges")
+    if reach is not None and edges != "neighbours":
+        raise ValueError(f"--reach has no effect on edges {edges!r}, remove it")
+
+
+def _judged(slots: Any, edges: Any) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """How a graph holds slots (N, 3): as data, and as the cells of a row of `design`."""
+    import numpy as np
+
+    from rigidfleet.formation import distances
+    from rigidfleet.rigidity import analyse, jacobian, spectrum
+
+    longest = f"{distances(slots, edges).max(initial=0.0):.3g} m"
+    if len(slots) <= _DENSE:
+        found = analyse(slots, edges)
+        # The smallest value counts that is not zero, as in the index.
+        held = len(edges) > 0 and found.w > 0
+        ratio = float(np.linalg.norm(jacobian(slots, edges), 2) ** 2) / found.w if held else None
+        condition = "" if ratio is None else f"{ratio:.3g}"
+        cells = (f"{found.index:.4f}", condition, longest)
+        rank = f"{found.rank} of {found.needed}"
+        data = found.data() | {"condition": ratio}
+        return data, (str(len(edges)), rank, *cells, str(found.verdict))
+    ends = spectrum(slots, edges, [1.0] * len(slots))
+    verdict = "flexible to first order" if ends.free else "infinitesimally rigid"
+    rank = "" if ends.free else f"{3 * len(slots) - 6} of {3 * len(slots) - 6}"
+    cells = (f"{ends.index:.3g}", f"{ends.condition:.3g}", longest)
+    data = {"edges": len(edges), "index": ends.index, "w": ends.w, "free": ends.free}
+    data["condition"] = ends.condition if ends.w > 0 else None
+    return data | {"verdict": verdict}, (f"{len(edges):,}", rank, *cells, verdict)
 
 
 def _points(shape: str, agents: int | None, size: list[float] | None) -> tuple[str, Any]:
@@ -406,8 +456,8 @@ def new(
     name : str
         Name of the mission, which is written to NAME.toml; or a path that ends so.
     shape : str
-        line, triangle, square, polygon, hexagon, pyramid, cube, cuboid, v, grid, sphere, helix,
-        tetrahedron, octahedron, icosahedron or dodecahedron.
+        line, triangle, square, polygon, hexagon, pyramid, cube, cuboid, v, grid, sphere, shells,
+        helix, tetrahedron, octahedron, icosahedron or dodecahedron.
     agents : int
         Number of vehicles; as many as the shape needs if not given.
     size : float

@@ -8,13 +8,23 @@ drops the least useful of all candidates, and then exchanges edges as long as th
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import combinations
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigidfleet.formation import Floats, Ints, complete_graph, dimension, distances
+from rigidfleet.formation import (
+    Floats,
+    Ints,
+    coarse_to_fine,
+    complete_graph,
+    dimension,
+    distances,
+    joined,
+    neighbours,
+)
 from rigidfleet.rigidity import full_rank, jacobian, rigid_motions
 
 #: How near to the smallest eigenvalue the barrier of the exchange comes, step by step.
@@ -117,17 +127,32 @@ def limits(slots: ArrayLike) -> str:
     )
 
 
-def mission_fragment(name: str, slots: ArrayLike, edges: ArrayLike) -> str:
+#: Graphs that have a name in missions, from slots (N, 3) and, of neighbours, their reach in spacings.
+GRAPHS: dict[str, Callable[[Floats, float], Ints]] = {
+    "complete": lambda p, _: complete_graph(len(p)),
+    "neighbours": neighbours,
+    "joined": lambda p, _: joined(p),
+    "tree": lambda p, _: coarse_to_fine(p),
+}
+
+
+def mission_fragment(
+    name: str, slots: ArrayLike, edges: ArrayLike | str, reach: float | None = None
+) -> str:
     """A formation as a part of a mission file, agents counted from 1.
 
-    The name is quoted where TOML asks for it. Slots keep all their digits, since flat shapes need them.
+    The name is quoted where TOML asks for it. Slots keep all their digits, since flat shapes need them. ``edges`` may
+    be one of `GRAPHS`.
     """
     from rigidfleet.mission.toml import toml_key
 
     p = np.asarray(slots, dtype=np.float64) + 0.0  # no -0.0
-    e = np.asarray(edges, dtype=np.int64).reshape(-1, 2) + 1
     lines = [f"[formations.{toml_key(name)}]", "slots = ["]
     lines += [f"    {point}," for point in p.tolist()]
+    if isinstance(edges, str):
+        reached = [] if reach is None else [f"reach = {reach!r}"]
+        return "\n".join([*lines, "]", f'edges = "{edges}"', *reached, ""])
+    e = np.asarray(edges, dtype=np.int64).reshape(-1, 2) + 1
     lines += ["]", "edges = ["]
     pairs = [f"[{i}, {j}]" for i, j in e.tolist()]
     lines += [f"    {', '.join(pairs[k : k + 8])}," for k in range(0, len(pairs), 8)]

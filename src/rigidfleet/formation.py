@@ -434,19 +434,33 @@ def coarse_to_fine(points: ArrayLike) -> Ints:
         some = order[done : 2 * done if done >= 12 else done + 1]
         near = KDTree(p[order[:done]]).query(p[some], k=min(done, 12))[1]
         at = np.pad(order[near], ((0, 0), (0, 12 - near.shape[1])), constant_values=-1)
-        u, _ = _towards(p, some, at)
-        a, b, c = (u[:, _TRIPLES[:, k]] for k in range(3))
-        rows = np.cross(b, c), np.cross(c, a), np.cross(a, b)
-        volume = (a * rows[0]).sum(axis=2)
-        e = soft[at]
-        square = sum((g**2).sum(axis=2) * (1 + e[:, _TRIPLES[:, k]]) for k, g in enumerate(rows))
-        left = np.where(np.abs(volume) > 1e-9, square / np.maximum(volume**2, 1e-18), np.inf)
-        soft[some] = left.min(axis=1)
-        edges.append(_edges_to(some, at, _TRIPLES[left.argmin(axis=1)]))
+        square = _softness(p, some, at, soft)
+        flat = np.flatnonzero(square.min(axis=1) > _FLAT)  # all near ones lie in one plane with it
+        if len(flat):
+            at[flat] = first[np.arange(12) % len(first)]
+            square[flat] = _softness(p, some[flat], at[flat], soft)
+        soft[some] = square.min(axis=1)
+        edges.append(_edges_to(some, at, _TRIPLES[square.argmin(axis=1)]))
         done += len(some)
     return np.sort(np.concatenate(edges), axis=1).astype(np.int64)
 
 
+def _softness(p: Floats, some: Ints, at: Ints, soft: Floats) -> Floats:
+    """How soft (k, 220) points (k,) are that are joined to three of those at (k, 12), of which each is so ``soft``.
+
+    Three that lie in a plane with the point, or are not there, give some 1e18.
+    """
+    u, _ = _towards(p, some, at)
+    a, b, c = (u[:, _TRIPLES[:, k]] for k in range(3))
+    rows = np.cross(b, c), np.cross(c, a), np.cross(a, b)
+    volume = (a * rows[0]).sum(axis=2)
+    each = 1 + np.where(at >= 0, soft[at], 0.0)
+    square = sum((g**2).sum(axis=2) * each[:, _TRIPLES[:, k]] for k, g in enumerate(rows))
+    return np.maximum(square, 1e-6) / np.maximum(volume**2, 1e-24)
+
+
+#: Softer than this is who lies in a plane with all those near.
+_FLAT = 1e12
 #: Three out of twelve.
 _TRIPLES = np.array(list(combinations(range(12), 3)))
 
