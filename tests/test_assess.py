@@ -14,6 +14,7 @@ from rich.console import Console
 from rigidfleet import attitude as att
 from rigidfleet import formation as shapes
 from rigidfleet.assess import SHAPE_TOLERANCE, Finding, Verdict, assess
+from rigidfleet.assess.measure import Fit
 from rigidfleet.geometry import clearance, separation
 from rigidfleet.mission import Mission
 from rigidfleet.result import LABELS, VARIABLES, PhaseRecord, Result
@@ -691,3 +692,26 @@ def test_judging_is_light():
         "sys.exit(str(heavy) if heavy else 0)"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@pytest.mark.parametrize("flown", ["near", "mirrored", "larger", "exchanged", "scattered"])
+def test_worst_pair_is_that_of_all_pairs(flown):
+    """However the agents lie, though few pairs are looked at; turned and elsewhere, as flights are."""
+    rng = np.random.default_rng(5)
+    slots = shapes.slots("sphere", 2.0, 250)
+    p = {
+        "near": slots + 0.01 * rng.normal(size=slots.shape),
+        "mirrored": slots * [1.0, 1.0, -1.0] + 1e-5 * rng.normal(size=slots.shape),
+        "larger": 1.01 * slots,
+        "exchanged": slots[rng.permutation(250)],
+        "scattered": rng.normal(size=slots.shape),
+    }[flown]
+    fit = Fit(p @ att.dcm_from_euler([0.3, -0.2, 1.0]) + [5.0, -3.0, 20.0], slots)
+    pairs = shapes.complete_graph(250)
+    error = np.abs(shapes.distances(p, pairs) - shapes.distances(slots, pairs))
+    i, j = fit.pair
+    assert fit.error == pytest.approx(error.max(), abs=1e-10)
+    assert fit.flown == pytest.approx(np.linalg.norm(p[i] - p[j]))
+    assert fit.intended == pytest.approx(np.linalg.norm(slots[i] - slots[j]))
+    assert fit.shortest == pytest.approx(2.0)
+    assert fit.mirrored == (flown == "mirrored") or flown in ("exchanged", "scattered")

@@ -28,6 +28,9 @@ REALISABLE = 1e-6
 #: How far neighbours reach, in spacings: to the second, on a shell or in a lattice.
 REACH = 1.9
 
+#: The nearest of so many points are found among all pairs, sooner than SciPy's trees are imported.
+_FEW = 200
+
 #: The 18 edges of the paper's cube (its Table 4 with the swapped pair d45, d48 put right), counted from 0.
 CUBE_EDGES: Ints = np.array(
     [(0, 1), (0, 3), (0, 4), (0, 5), (1, 2), (1, 3), (1, 5), (1, 6), (2, 3), (2, 6), (2, 7), (3, 4)]
@@ -89,7 +92,7 @@ def _sphere(size: Floats, n: int) -> Floats:
     angle = np.pi * (3 - np.sqrt(5)) * np.arange(n)
     across = np.sqrt(1 - z**2)
     p = np.column_stack([across * np.cos(angle), across * np.sin(angle), z])
-    return p * size[0] / _nearest(p).min()
+    return p * size[0] / nearest(p).min()
 
 
 def _shells(size: Floats, n: int) -> Floats:
@@ -106,13 +109,6 @@ def _shells(size: Floats, n: int) -> Floats:
         apart = radius(middle) - radius(n - middle)
         low, high = (middle, high) if apart < size[0] else (low, middle)
     return np.concatenate([_sphere(size, high), _sphere(size, n - high)])
-
-
-def _nearest(p: Floats) -> Floats:
-    """Distance (N,) of each of N points (N, 3) to the nearest other."""
-    from scipy.spatial import KDTree
-
-    return KDTree(p).query(p, k=2)[0][:, 1]
 
 
 def _helix(size: Floats, n: int) -> Floats:
@@ -362,7 +358,7 @@ def neighbours(points: ArrayLike, reach: float = REACH) -> Ints:
     if len(p) < 2:
         return np.zeros((0, 2), dtype=np.int64)
     tree = KDTree(p)
-    spacing = float(np.median(_nearest(p)))
+    spacing = float(np.median(nearest(p)))
     pairs = tree.query_pairs(reach * spacing * (1 + 1e-9), output_type="ndarray")
     return pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))].astype(np.int64)
 
@@ -522,6 +518,18 @@ def _spanning_first(p: Floats, order: Ints) -> Ints:
             )
         found.append(int(fits[0]))
     return np.concatenate([order[found], np.delete(order, found)])
+
+
+def nearest(points: ArrayLike) -> Floats:
+    """Distance (N,) [m] of each of N points (N, 3) to the nearest other."""
+    p = np.asarray(points, dtype=np.float64)
+    if len(p) <= _FEW:
+        apart = np.linalg.norm(p[:, None] - p, axis=2)
+        np.fill_diagonal(apart, np.inf)
+        return apart.min(axis=1)
+    from scipy.spatial import KDTree
+
+    return KDTree(p).query(p, k=2)[0][:, 1]
 
 
 def distances(points: ArrayLike, edges: ArrayLike) -> Floats:

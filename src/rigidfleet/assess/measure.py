@@ -234,17 +234,30 @@ class Flight:
 
 
 def _all_pairs(p: Floats, slots: Floats) -> tuple[float, tuple[int, int], float, float, float]:
-    """Worst error of a distance: error, pair, flown, intended; and the shortest intended [m]."""
-    worst, shortest = (-1.0, (0, 0), 0.0, 0.0), np.inf
-    for i in range(len(p) - 1):
-        flown = np.linalg.norm(p[i + 1 :] - p[i], axis=1)
-        intended = np.linalg.norm(slots[i + 1 :] - slots[i], axis=1)
+    """Worst error of a distance: error, pair, flown, intended; and the shortest intended [m].
+
+    Of all pairs, but few are looked at: no error is greater than the sum of how far both agents are off their slots,
+    however those are laid onto them, as they are or mirrored. Less than rounding counts for nothing.
+    """
+    x, q = shapes.centred(p), shapes.centred(slots)
+    U, _, Vt = np.linalg.svd(q.T @ x)
+    off = np.linalg.norm(x - q @ (U @ Vt), axis=1)
+    order = np.argsort(-off, kind="stable")
+    ranked, rounding = -off[order], 1e-12 * float(np.abs(q).max())
+    worst = (-1.0, (0, 0), 0.0, 0.0)
+    for k, i in enumerate(order[:-1]):
+        last = int(np.searchsorted(ranked, off[i] - worst[0] - rounding))
+        if last <= k + 1:
+            break
+        others = np.sort(order[k + 1 : last])
+        flown = np.linalg.norm(p[others] - p[i], axis=1)
+        intended = np.linalg.norm(slots[others] - slots[i], axis=1)
         error = np.abs(flown - intended)
         j = int(error.argmax())
         if error[j] > worst[0]:
-            worst = (float(error[j]), (i, i + 1 + j), float(flown[j]), float(intended[j]))
-        shortest = min(shortest, float(intended.min()))
-    return *worst, shortest
+            pair = (int(min(i, others[j])), int(max(i, others[j])))
+            worst = (float(error[j]), pair, float(flown[j]), float(intended[j]))
+    return *worst, float(shapes.nearest(slots).min())
 
 
 def is_rigid(p: Floats, edges: Ints) -> bool:
