@@ -41,8 +41,8 @@ _FLOOR = 1e-2
 _CHECK = 0.1
 #: How close agents come is watched at least this often [s], whatever is recorded.
 _WATCH = 0.05
-#: That takes so many numbers of memory in a stretch at most; the watch over longer ones is coarser.
-_WATCHED = 10_000_000
+#: In a stretch so many times a place of an agent at most; the watch over longer ones is coarser.
+_WATCHED = 700_000
 #: Progress is reported this often [s of wall time].
 _REPORT = 0.1
 #: What to do about errors that nothing takes back.
@@ -399,7 +399,7 @@ class Flight:
         state = leg.state
         steps = 10
         fresh = state.count[0] == 0 or program is not leg.plan.program
-        least = max(_WATCH, (t_end - leg.t) * len(state.y) / _WATCHED)
+        least = max(_WATCH, (t_end - leg.t) * len(self.masses) / _WATCHED)
         times, kept = self._watched(leg.t, self._samples(leg, t_end), t_end, least)
         samples = np.empty((len(times), len(state.y)))
         state.count[3] = 0
@@ -714,10 +714,12 @@ class Flight:
             "rtol": self.mission.integrator.rtol, "atol": self.mission.integrator.atol,
             "solvers": {method: vars(counts) for method, counts in self.solves.items()},
         }  # fmt: skip
-        return assemble(
+        result = assemble(
             self.mission, self.phases, self.pieces, ending=self.ending, statistics=statistics,
             watched=self.watched,
         )  # fmt: skip
+        result.mission = self.mission  # with what it has made already: slots assigned, edges
+        return result
 
 
 def _check_size(mission: Mission, phase: Phase) -> None:
