@@ -1,8 +1,9 @@
-"""Write the tables of performance.md and README.md from what the benchmarks have measured.
+"""Write the tables of performance.md, many.md and README.md from what the benchmarks have measured.
 
     python benchmarks/run.py --json bench.json
     python benchmarks/compare.py --json peers.json --figure docs/images/work-precision.png
-    python docs/performance.py bench.json peers.json
+    python benchmarks/many.py --largest --json many.json
+    python docs/performance.py bench.json peers.json many.json
 
 rewrites them in place, each between `<!-- measured: NAME -->` and `<!-- end -->`; a file may be left out, and its
 tables stay as they are. No number of theirs is written by hand.
@@ -15,7 +16,11 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-PAGES = [Path(__file__).with_name("performance.md"), Path(__file__).parents[1] / "README.md"]
+PAGES = [
+    Path(__file__).with_name("performance.md"),
+    Path(__file__).with_name("many.md"),
+    Path(__file__).parents[1] / "README.md",
+]
 Data = dict[str, Any]
 
 
@@ -142,6 +147,39 @@ def _summary(data: Data) -> str:
     return f"{text}\n\nMeasured on {data['date']}: {data['machine']}."
 
 
+def _many(data: Data) -> str:
+    """Flights of large formations."""
+    found, rows = data["many"], []
+    for row in found["formations"]:
+        rates = [found["duration"] / row[clock] for clock in ("wall", "processor")]
+        flat = "" if row["flat"] is None else f", flat to {1e3 * row['flat']:.2g} mm"
+        rows.append(
+            (
+                row["kind"],
+                f"{row['agents']:,}",
+                f"{row['edges']:,}",
+                row["solve"],
+                str(row["steps"]),
+                f"{row['wall']:.2g}" if row["wall"] < 10 else f"{row['wall']:.0f}",
+                " / ".join(f"{rate:.2g}" if rate < 10 else f"{rate:.0f}" for rate in rates),
+                f"{row['memory']:.2g}",
+                f"{row['error']:.0e}{flat}",
+            )
+        )
+    head = ("formation", "agents", "edges", "solve", "steps", "wall [s]")
+    head = (*head, "times real time, wall / processor", "memory [GB]", "worst edge at the end [m]")
+    goals = [
+        (
+            goal["name"],
+            f"{'≥' if goal['least'] else '≤'} {goal['goal']:g}",
+            f"{goal['value']:.3g}",
+            "yes" if goal["reached"] else "no",
+        )
+        for goal in found["goals"]
+    ]
+    return f"{_table(head, rows)}\n\n{_table(('', 'goal', 'measured', 'reached'), goals)}\n\n{_machine(found)}"
+
+
 def _time(seconds: list[float]) -> str:
     value = 1e3 * median(seconds)
     return f"{value:.3g}" if value < 1000 else f"{value:,.0f}"
@@ -163,6 +201,7 @@ TABLES: dict[str, tuple[str, Any]] = {
     "peers": ("rows", _peers),
     "models": ("rows", _models),
     "summary": ("rows", _summary),
+    "many": ("many", _many),
 }
 
 

@@ -368,7 +368,9 @@ def test_design(capsys):
     assert cli.main(["design", "cube"]) == cli.PASSED
     out, err = capsys.readouterr()
     rows = {line[:14].strip(): line.split() for line in err.splitlines()[1:]}
-    w, w_max = (np.linalg.svd(jacobian(CUBE, design(CUBE)), compute_uv=False)[q] ** 2 for q in (-1, 0))
+    w, w_max = (
+        np.linalg.svd(jacobian(CUBE, design(CUBE)), compute_uv=False)[q] ** 2 for q in (-1, 0)
+    )
     assert rows["designed"][5:7] == ["0.6180", f"{w_max / w:.3g}"]
     assert rows["the paper's 18"][7] == "0.5085"
     assert rows["all pairs"][2] == "28"

@@ -322,7 +322,11 @@ def test_graphs_have_names():
         ({"edges": "joined", "reach": 1.5}, "formations.f.reach", "has no effect"),
         ({"edges": "joined", "shape": "grid"}, "formations.f.edges", "need slots"),
         ({"edges": "neighbours", "distances": [1.0]}, "formations.f.edges", "needs places"),
-        ({"edges": "all"}, "formations.f.edges", "must be 'complete', 'neighbours', 'joined' or 'tree'"),
+        (
+            {"edges": "all"},
+            "formations.f.edges",
+            "must be 'complete', 'neighbours', 'joined' or 'tree'",
+        ),
     ],
 )
 def test_errors_of_graphs_with_names(form, key, words):

@@ -38,9 +38,7 @@ class ByEdge:
 
     def updated(self, edges: NDArray[np.int64], values: Array) -> ByEdge:
         """These and those of edges (m, 2), i < j, of which the latter count where there are both."""
-        keys, first = np.unique(
-            np.concatenate([self._keys(edges), self.keys]), return_index=True
-        )
+        keys, first = np.unique(np.concatenate([self._keys(edges), self.keys]), return_index=True)
         return ByEdge(keys, np.concatenate([values, self.values])[first])
 
     @staticmethod
