@@ -31,7 +31,9 @@ from rich.console import Console
 from rich.table import Table
 
 from rigidfleet import formation as shapes
-from rigidfleet.mission import Mission
+from rigidfleet.design import GRAPHS as DESIGNS
+from rigidfleet.mission import Mission, load_mission
+from rigidfleet.rigidity import spectrum
 from rigidfleet.simulate import simulate
 from rigidfleet.solvers import WORDS
 
@@ -49,6 +51,22 @@ FLIGHTS: list[tuple[str, int, float | None]] = [
     ("sphere, triangulated", 2000, 5.0),
     ("shells, neighbours", 2000, None),
     ("sheet, neighbours and slots", 900, 5.0),
+]
+#: Graphs of the other table: shape, agents, edges and their reach in spacings.
+GRAPHS: list[tuple[str, int, str, float | None]] = [
+    ("lattice", 1000, "neighbours", 1.5),
+    ("lattice", 1000, "joined", None),
+    ("lattice", 1000, "tree", None),
+    ("sphere", 2000, "neighbours", 1.9),
+    ("sphere", 500, "neighbours", 1.9),
+    ("sphere", 500, "joined", None),
+    ("sphere", 500, "tree", None),
+    ("shells", 2000, "neighbours", 1.9),
+    ("shells", 500, "neighbours", 1.9),
+    ("shells", 500, "tree", None),
+    ("helix of show-1000", 1000, "neighbours", 2.1),
+    ("helix of show-1000", 1000, "neighbours", 3.05),
+    ("helix of show-1000", 1000, "tree", None),
 ]
 #: Flown if asked for.
 LARGEST = ("lattice, joined", 100_000, None)
@@ -81,6 +99,22 @@ def lattice(n: int) -> np.ndarray:
     p = np.stack(np.meshgrid(side, side, side, indexing="ij"), axis=-1).reshape(-1, 3)
     near = ((p - p.mean(axis=0)) ** 2).sum(axis=1)
     return SPACING * p[np.argsort(near, kind="stable")[:n]]
+
+
+def graph(shape: str, n: int, edges: str, reach: float | None) -> dict[str, Any]:
+    """How well a graph holds a shape."""
+    if shape.startswith("helix"):
+        p = load_mission("show-1000").formation_slots("helix")
+    else:
+        p = lattice(n) if shape == "lattice" else shapes.slots(shape, SPACING, n)
+    assert p is not None
+    pairs = DESIGNS[edges](p, reach or 0.0)
+    ends = spectrum(p, pairs, np.ones(n))
+    return {
+        "shape": shape, "agents": n, "graph": edges, "reach": reach, "edges": len(pairs),
+        "longest": float(shapes.distances(p, pairs).max()) / SPACING,
+        "index": ends.index, "condition": ends.condition if ends.w > 0 else None,
+    }  # fmt: skip
 
 
 def triangulated(p: np.ndarray) -> list[list[int]]:
@@ -295,7 +329,12 @@ def main() -> int:
             "formations": [asdict(row) | {"goal": goal} for row, goal in rows],
             "duration": DURATION,
         }
-        found |= {"exponent": exponent, "show": spent, "goals": judged}
+        found |= {
+            "graphs": [graph(*each) for each in GRAPHS],
+            "exponent": exponent,
+            "show": spent,
+            "goals": judged,
+        }
         arguments.json.write_text(json.dumps({"many": head | found}, indent=1))
     return 1 if failed else 0
 

@@ -180,6 +180,23 @@ def _many(data: Data) -> str:
     return f"{_table(head, rows)}\n\n{_table(('', 'goal', 'measured', 'reached'), goals)}\n\n{_machine(found)}"
 
 
+def _graphs(data: Data) -> str:
+    """How well graphs hold shapes of many."""
+    rows = [
+        (
+            f"{row['shape']}, {row['agents']:,}",
+            f'`"{row["graph"]}"`' + (f", `reach = {row['reach']}`" if row["reach"] else ""),
+            f"{row['edges']:,}",
+            f"{row['longest']:.2g}",
+            f"{row['index']:.2g}" if row["condition"] else "0",
+            f"{row['condition']:.2g}" if row["condition"] else "flexible",
+        )
+        for row in data["many"]["graphs"]
+    ]
+    head = ("shape", "edges", "how many", "longest [2 m]", "index", "condition of $A$")
+    return _table(head, rows)
+
+
 def _time(seconds: list[float]) -> str:
     value = 1e3 * median(seconds)
     return f"{value:.3g}" if value < 1000 else f"{value:,.0f}"
@@ -202,6 +219,7 @@ TABLES: dict[str, tuple[str, Any]] = {
     "models": ("rows", _models),
     "summary": ("rows", _summary),
     "many": ("many", _many),
+    "graphs": ("many", _graphs),
 }
 
 

@@ -17,7 +17,7 @@ from rigidfleet.mission import Establish, Mission, load_mission, mission_names
 from rigidfleet.plan import plan_phase
 from rigidfleet.result import Result
 from rigidfleet.rigidity import jacobian
-from rigidfleet.route import Situation, led_by
+from rigidfleet.route import ByEdge, Situation, led_by
 from rigidfleet.simulate import FlightInterrupted, Observation, Progress, simulate
 
 Data = dict[str, Any]
@@ -1149,3 +1149,18 @@ def test_an_arrival_between_two_samples_is_recorded():
     k = int(np.searchsorted(result.time, 11.37 - 1e-9))
     assert result.time[k] == pytest.approx(11.37, abs=1e-12)
     np.testing.assert_allclose(result.cm[k], data["phases"][1]["position"], rtol=0, atol=1e-2)
+
+
+def test_numbers_by_edge_are_kept_edge_by_edge():
+    """What an edge was given last counts, in whichever order; an edge never in force has what is offered."""
+    some, other = np.array([[0, 1], [2, 5], [1, 2]]), np.array([[1, 2], [0, 7]])
+    numbers = ByEdge().updated(some, np.array([1.0, 2.0, 3.0])).updated(other, np.array([4.0, 5.0]))
+    asked = np.array([[2, 5], [0, 7], [0, 1], [1, 2], [0, 2]])
+    np.testing.assert_array_equal(numbers.of(asked, 9.0), [2.0, 5.0, 1.0, 4.0, 9.0])
+    np.testing.assert_array_equal(ByEdge().of(some, np.arange(3.0)), [0.0, 1.0, 2.0])
+
+
+def test_a_result_knows_the_mission_that_was_flown():
+    """Not one read again: what has been made of it once, edges and slots assigned, serves the verdict, too."""
+    mission = load_mission("establish-triangle")
+    assert simulate(mission).mission is mission

@@ -109,6 +109,44 @@ def test_factor_is_kept_while_the_formation_turns(rng):
     assert solver.counts.factors == 2
 
 
+def test_a_solve_starts_from_the_best_of_past_solutions(rng):
+    """What past solutions span is found at once, though they repeat themselves; of others what is nearest to it."""
+    p = lattice(4)
+    edges, masses = shapes.neighbours(p, 1.5), rng.uniform(0.5, 2.0, 64)
+    u, mbar, mu = directions(p, edges), masses.mean(), 0.03
+    J = jacobian(p, edges)
+    K = mbar * J.T @ J + mu * np.diag(np.repeat(masses, 3))
+    past = rng.normal(size=(4, 64, 3))
+    past[2] = past[0] - 2.0 * past[1]
+    past[3] = 0.0
+    wanted = 3.0 * past[0] + 0.5 * past[1]
+    x, gram = np.full((64, 3), np.nan), np.empty((4, 6))
+    g = (K @ wanted.ravel()).reshape(64, 3)
+    sparse.project(u, edges, masses, mbar, mu, g, past, gram, x)
+    np.testing.assert_allclose(x, wanted, atol=1e-9)
+    g = rng.normal(size=(64, 3))
+    sparse.project(u, edges, masses, mbar, mu, g, past, gram, x)
+    rest = g - (K @ x.ravel()).reshape(64, 3)
+    np.testing.assert_allclose((past * rest).sum(axis=(1, 2)), 0.0, atol=1e-9)
+
+
+def test_solves_along_a_motion_take_fewer_iterations(rng):
+    """As a formation bends smoothly, past solutions leave less for conjugate gradients to find."""
+    p = shapes.slots("sphere", 1.0, 200)
+    edges, b = shapes.neighbours(p), rng.normal(size=len(shapes.neighbours(p)))
+    taken = {}
+    for past in (True, False):
+        solver = solver_of(p, edges, np.ones(200), k.ITERATED, tolerance=1e-8)
+        for step in range(12):
+            bent = p * [1.0, 1.0, 1.0 + 0.002 * step]
+            solver.workspace.r[:], solver.workspace.u[:] = bent, directions(bent, edges)
+            if step and not past:
+                solver.past[:] = 0.0
+            solved(solver, b)
+        taken[past] = solver.counts.iterations
+    assert taken[True] < 0.7 * taken[False]
+
+
 def test_pattern_without_fill_solves_as_well(rng, monkeypatch):
     """Where a complete factor would fill up, an incomplete one preconditions, with more iterations."""
     p = lattice(6)
@@ -289,3 +327,14 @@ def test_the_integral_does_not_set_the_step(monkeypatch):
     loose = simulate(flight("exact", "joined", atol=1e-12, atol_velocity=1e-8))
     assert loose.statistics["steps"] < 0.8 * strict.statistics["steps"]
     np.testing.assert_allclose(loose.position, strict.position, atol=1e-6)
+
+
+def test_velocities_are_held_to_what_places_are():
+    """In large formations, unless told otherwise: fewer steps, and places as near as their own tolerance asks."""
+    best = simulate(flight("exact", "joined", rtol=1e-10, atol=1e-10, atol_velocity=1e-10))
+    strict, loose = (
+        simulate(flight("exact", "joined", rtol=1e-6, atol=1e-6, **given))
+        for given in ({"atol_velocity": 1e-6}, {})
+    )
+    assert loose.statistics["steps"] < 0.85 * strict.statistics["steps"]
+    np.testing.assert_allclose(loose.position, best.position, atol=1e-5)

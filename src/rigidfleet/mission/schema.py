@@ -243,7 +243,8 @@ class Integrator(Part):
     )
     atol: Positive = Field(1e-10, description="absolute tolerance [m, m/s]")
     atol_velocity: Positive | None = Field(
-        None, description="that of velocities [m/s]; atol when absent"
+        None,
+        description="that of velocities [m/s]; when absent atol, and in a large formation that of places times beta",
     )
     atol_integral: Positive | None = Field(
         None,
