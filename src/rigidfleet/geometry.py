@@ -20,6 +20,8 @@ _THIN = 1e-3
 _NARROW, _SURE = 0.1, 4.0
 # Beyond so many agents two that are near each other are found by a tree, not among all pairs.
 _MANY = 200
+# So many agents are asked for their nearest, to begin with.
+_ASKED = 256
 # Pairs watched are those within so many times what the closest two are apart.
 _SPARE = 1.2
 # Numbers in a temporary array at most.
@@ -99,11 +101,16 @@ def _near(p: Array, radius: Array) -> _Near:
     """The pairs of agents p (3, N) that are not much farther apart than the closest two."""
     from scipy.spatial import KDTree
 
-    # A balanced tree takes longer to make than it saves here.
+    # A balanced tree takes longer to make than it saves here; and some agents tell how near all may be.
     tree = KDTree(p.T, balanced_tree=False, compact_nodes=False)
-    d, j = tree.query(p.T, k=2)
-    room, widest = float((d[:, 1] - radius - radius[j[:, 1]]).min()), 2.0 * float(radius.max())
-    reach = _SPARE * (room + widest) + 1e-9 * float(np.abs(p).max())
+    some = np.arange(0, len(radius), max(1, len(radius) // _ASKED))
+    d, j = tree.query(p.T[some], k=2)
+    widest, rounding = 2.0 * float(radius.max()), 1e-9 * float(np.abs(p).max())
+    room = float((d[:, 1] - radius[some] - radius[j[:, 1]]).min())
+    pairs = tree.query_pairs(room + widest + rounding, output_type="ndarray").T
+    if len(some) < len(radius):
+        room = float(_Near(pairs, radius[pairs].sum(axis=0), 0.0).rooms(p).min())
+    reach = _SPARE * (room + widest) + rounding
     pairs = np.ascontiguousarray(tree.query_pairs(reach, output_type="ndarray").T)
     return _Near(pairs, radius[pairs].sum(axis=0), reach - widest)
 

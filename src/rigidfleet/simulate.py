@@ -259,6 +259,9 @@ class Flight:
         work, solver = self._equip(plan)
         y = self._pack(plan)
         state = self._integrator(plan, y, self.now.t)
+        if solver is not None:
+            scale = self._tolerances(plan, len(y)) + state.rtol * np.abs(y)
+            state.clock[1] = _first_step(plan.program, work, state, scale, t_end - self.now.t)
         return Leg(index, phase, plan, work, state, t_end, solver=solver)
 
     def _equip(self, plan: PhasePlan) -> tuple[k.Workspace, large.LargeSolver | None]:
@@ -720,6 +723,30 @@ class Flight:
         )  # fmt: skip
         result.mission = self.mission  # with what it has made already: slots assigned, edges
         return result
+
+
+def _first_step(
+    program: k.Program, work: k.Workspace, state: flight.Integrator, scale: Array, longest: float
+) -> float:
+    """First step [s] to try in a large formation, from two evaluations; at most the ``longest``.
+
+    Hairer, Nørsett and Wanner, Solving Ordinary Differential Equations I, section II.4; ``scale`` (n,) is the
+    tolerance of each state. Steps that grow from a small one cost a large formation more.
+    """
+
+    def size(x: Array) -> float:
+        return float(np.sqrt(np.mean((x / scale) ** 2)))
+
+    t, y = float(state.clock[0]), state.y
+    slope, later = np.empty_like(y), np.empty_like(y)
+    flight.closed_loop(t, y, slope, program, work)
+    first = size(slope)
+    h = min(0.01 * size(y) / max(first, 1e-300), longest)
+    flight.closed_loop(t + h, y + h * slope, later, program, work)
+    steepest = max(first, size(later - slope) / h)
+    if not 0.0 < steepest < math.inf:
+        return float(state.clock[1])
+    return min(100.0 * h, (0.01 / steepest) ** 0.2, longest)
 
 
 def _check_size(mission: Mission, phase: Phase) -> None:
