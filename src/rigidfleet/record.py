@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rigidfleet.geometry import Ints
-    from rigidfleet.kernel.flight import Record
     from rigidfleet.kernel.program import Array
+    from rigidfleet.kernel.records import Record
     from rigidfleet.mission import Mission
 
 
