@@ -29,7 +29,7 @@ from scipy_peer import Literal, Peer, constant, squared
 
 from rigidfleet import formation as shapes
 from rigidfleet.ensemble import establish
-from rigidfleet.kernel import flight
+from rigidfleet.kernel import native, records
 from rigidfleet.kernel.program import workspace
 from rigidfleet.kernel.trace import Code, Trace
 from rigidfleet.mission import Mission, load_mission
@@ -125,12 +125,12 @@ def compiled_flight(mission: Mission, tolerance: float = TOLERANCE) -> Callable[
     y = np.concatenate([now.r.ravel(), now.v.ravel(), np.zeros(len(plan.edges))])
     times = np.linspace(0.0, DURATION, SAMPLES)
     samples = np.empty((SAMPLES, len(y)))
-    start = flight.integrator(y, 0.0, rtol=tolerance, atol=np.full(len(y), tolerance))
+    start = records.integrator(y, 0.0, rtol=tolerance, atol=np.full(len(y), tolerance))
     state = start._replace(y=y.copy(), clock=start.clock.copy(), count=start.count.copy())
 
     def fly() -> np.ndarray:
         state.y[:], state.clock[:], state.count[:] = start.y, start.clock, start.count
-        flight.integrate(plan.program, work, state, DURATION, True, times, samples, 1 << 40)
+        native.integrate(plan.program, work, state, DURATION, True, times, samples, 1 << 40)
         return samples
 
     return fly

@@ -1,6 +1,8 @@
 """The compiled kernel against finite differences, NumPy, SciPy and exact solutions."""
 
 import math
+import subprocess
+import sys
 from typing import Any
 
 import numba
@@ -15,9 +17,10 @@ from rigidfleet.kernel import (
     cache_directory,
     constraint,
     control,
-    flight,
     is_compiled,
     linalg,
+    native,
+    records,
     references,
 )
 from rigidfleet.kernel import program as k
@@ -670,12 +673,12 @@ def a_dumbbell() -> tuple[k.Program, k.Workspace, Any]:
 def fixed_steps(h: float, t_end: float, sampled: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """State at t_end, and the dense output, of the dumbbell in steps of exactly h."""
     program, w, exact = a_dumbbell()
-    state = flight.integrator(exact(0.0), 0.0, rtol=1e6, atol=np.full(17, 1e6))
+    state = records.integrator(exact(0.0), 0.0, rtol=1e6, atol=np.full(17, 1e6))
     samples = np.empty((len(sampled), 17))
     for step in range(round(t_end / h)):
         state.clock[1] = h  # whatever the step control would like
         fresh = step == 0
-        flight.integrate(program, w, state, t_end + 1.0, fresh, sampled, samples, 1)
+        native.integrate(program, w, state, t_end + 1.0, fresh, sampled, samples, 1)
     assert state.clock[0] == pytest.approx(t_end)
     return state.y, samples
 
@@ -712,11 +715,11 @@ def test_error_follows_the_tolerance():
     program, w, exact = a_dumbbell()
     errors = []
     for rtol in (1e-5, 1e-7, 1e-9, 1e-11):
-        state = flight.integrator(exact(0.0), 0.0, rtol=rtol, atol=np.full(17, rtol / 100))
-        status = flight.integrate(
+        state = records.integrator(exact(0.0), 0.0, rtol=rtol, atol=np.full(17, rtol / 100))
+        status = native.integrate(
             program, w, state, 5.0, True, np.zeros(0), np.zeros((0, 17)), 100_000
         )
-        assert status == flight.FINISHED
+        assert status == records.FINISHED
         assert state.clock[0] == 5.0
         errors.append(np.abs(state.y - exact(5.0)).max())
     assert (np.array(errors[1:]) < 0.1 * np.array(errors[:-1])).all()
@@ -732,9 +735,9 @@ def test_a_flight_that_pauses_goes_on_as_if_it_had_not(pause):
     times = np.linspace(0.0, 6.0, 121)
 
     def fly(steps: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
-        state = flight.integrator(y0, 0.0, rtol=1e-8, atol=np.full(21, 1e-10))
+        state = records.integrator(y0, 0.0, rtol=1e-8, atol=np.full(21, 1e-10))
         samples, w, pauses, fresh = np.zeros((121, 21)), k.workspace(3, 3), 0, True
-        while flight.integrate(program, w, state, 6.0, fresh, times, samples, steps):
+        while native.integrate(program, w, state, 6.0, fresh, times, samples, steps):
             fresh = False
             pauses += 1
         return state.y, samples, state.count, pauses
@@ -768,6 +771,40 @@ def test_nothing_is_compiled_twice(tmp_path, monkeypatch):
     folder = cache_directory()
     assert folder.is_relative_to(tmp_path)
     assert folder == cache_directory()
+    assert not is_compiled()
+
+
+def test_a_flight_needs_no_compiler():
+    """Once the machine code is in the cache, a whole flight imports neither Numba nor SciPy."""
+    simulate(a_mission(), times=[6.0])
+    code = """
+import sys
+from rigidfleet import assess, load_mission, simulate
+assert assess(simulate(load_mission("narrow-passage"))).passed
+assert not {"numba", "scipy"} & set(sys.modules)
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_half_a_kernel_is_none(tmp_path, monkeypatch):
+    """Machine code that was cut off in the writing is compiled again, not called."""
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    file = native._file()
+    native._write(file, b"machine code")
+    assert native._read(file) == b"machine code"
+    file.write_bytes(file.read_bytes()[:-1])
+    assert native._read(file) is None
+
+
+@pytest.mark.parametrize("change", ["type", "order", "dimensions"])
+def test_the_kernel_refuses_other_types(change):
+    """Arrays of another type, layout or dimension than those that the code is made for are an error, not a crash."""
+    program = a_program(a_mission())
+    r = program.control.force
+    wrong = {"type": r.astype(np.float32), "order": np.asfortranarray(r), "dimensions": r.ravel()}
+    other = program._replace(control=program.control._replace(force=wrong[change]))
+    with pytest.raises(TypeError):
+        native.closed_loop(0.0, np.zeros(21), np.zeros(21), other, k.workspace(3, 3))
 
 
 # -- a user's force --------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ from scipy.spatial import KDTree
 from rigidfleet import attitude, formation, lqr, physics
 from rigidfleet.assess import assess
 from rigidfleet.errors import FlightError
-from rigidfleet.kernel import flight, program
+from rigidfleet.kernel import program
 from rigidfleet.mission import Establish, Mission, load_mission, mission_names
 from rigidfleet.plan import plan_phase
 from rigidfleet.result import Result
@@ -190,15 +190,11 @@ def test_progress_is_reported():
 
 
 def test_all_missions_fly_with_one_compiled_kernel():
-    """No mission, architecture or formulation needs the kernel compiled for other types of arrays."""
-    integrate: Any = flight.integrate
-    flown("establish-triangle")
-    before = set(integrate.signatures)
+    """No mission, architecture or formulation has arrays of other types than the kernel takes."""
     for name in set(mission_names()) - {"show-1000"}:  # its kernel: test_solvers.py
         flown(name)
     flown("narrow-passage", "body")
     simulate(Mission.from_dict(load_mission("single-waypoint").to_dict() | {"formulation": "body"}))
-    assert set(integrate.signatures) == before
 
 
 @pytest.mark.long

@@ -6,7 +6,7 @@ import numba
 import numpy as np
 import pytest
 
-from rigidfleet.kernel import flight, program, straight
+from rigidfleet.kernel import native, program, straight
 from rigidfleet.kernel.lanes import pack, unpack
 from rigidfleet.kernel.program import Program
 from rigidfleet.kernel.trace import Code, Trace, UnfitError, elimination_order, structure
@@ -62,8 +62,7 @@ def derivative(p: Program, y: np.ndarray, t: float) -> np.ndarray:
     """dy/dt by the compiled kernel of single flights."""
     n, m = len(p.vehicles.m), len(p.graph.edges)
     w = program.workspace(n, m, solver=p.law.solver)
-    out = flight.recorder(1, n, m)
-    flight.record(np.array([t]), y[None], p, w, np.zeros(len(y)), out)
+    out = native.record(p, w, np.array([t]), y[None])
     return np.concatenate([out.v[0].ravel(), out.a[0].ravel(), out.c[0]])
 
 

@@ -59,7 +59,7 @@ _SILENCE = 1.0
 #: A design of so many agents is compared with all pairs; one of more than the latter is judged by the ends of its
 #: spectrum alone.
 _COMPARED, _DENSE = 60, 200
-_COMPILING = "Compiling the flight kernel (once, about 20 s)"
+_COMPILING = "Compiling the flight kernel (once, about 15 s)"
 
 app = App(
     name="rigidfleet",
@@ -84,6 +84,8 @@ def main(tokens: Sequence[str] | None = None) -> int:
         # would take a tenth longer.
         gc.set_threshold(100_000)
         warnings.showwarning = cast("Any", _warn)
+        # Matrices are small here: threads over them wait for each other, and on a busy machine for long.
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     _prepare_streams()
     try:
         return app(tokens, console=_out(), error_console=_err()) or PASSED

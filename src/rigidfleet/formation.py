@@ -25,11 +25,11 @@ Ints = NDArray[np.int64]
 #: on the limit, so distances need about seven digits: 5.656854, not 5.657.
 REALISABLE = 1e-6
 
+#: Up to so many points distances are compared all with all, and up to so many orders of slots tried, which takes
+#: less time than to import what does it better.
+_FEW, _TRIED = 400, 6
 #: How far neighbours reach, in spacings: to the second, on a shell or in a lattice.
 REACH = 1.9
-
-#: The nearest of so many points are found among all pairs, sooner than SciPy's trees are imported.
-_FEW = 200
 
 #: The 18 edges of the paper's cube (its Table 4 with the swapped pair d45, d48 put right), counted from 0.
 CUBE_EDGES: Ints = np.array(
@@ -820,10 +820,14 @@ def assigned_upright(start: ArrayLike, slots: ArrayLike, masses: ArrayLike) -> I
 
 def _nearest_slots(p: Floats, q: Floats) -> Ints:
     """Of slots q (N, 3) those (N,) that make the sum of squared ways from p least."""
+    near = p @ q.T  # |p|^2 + |q|^2 is the same for every order
+    n = len(p)
+    if n <= _TRIED:
+        orders = np.array(list(permutations(range(n))), dtype=np.int64)
+        return orders[near[np.arange(n), orders].sum(axis=1).argmax()]
     from scipy.optimize import linear_sum_assignment
 
-    # |p|^2 + |q|^2 is the same for every order.
-    return linear_sum_assignment(-p @ q.T)[1]
+    return linear_sum_assignment(-near)[1]
 
 
 def _settled(p: Floats, q: Floats, masses: ArrayLike, turn: Floats) -> Ints:

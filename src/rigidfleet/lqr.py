@@ -35,8 +35,6 @@ def infinite_horizon(A: ArrayLike, B: ArrayLike, Q: ArrayLike, R: ArrayLike) -> 
     P is the stabilising solution of A^T P + P A - P B R^-1 B^T P + Q = 0. ValueError where the
     weights or shapes are wrong, or no gain both stabilises and is optimal.
     """
-    from scipy.linalg import solve_continuous_are
-
     A, B, Q, R = _system(A, B, Q, R)
     for s in np.linalg.eigvals(A):
         mode = A - s * np.eye(len(A))
@@ -51,18 +49,16 @@ def infinite_horizon(A: ArrayLike, B: ArrayLike, Q: ArrayLike, R: ArrayLike) -> 
                 " horizon leaves it where it is: weigh it (for a double integrator the position,"
                 " Q[0] > 0), or use a finite horizon"
             )
-    try:
-        P = solve_continuous_are(A, B, Q, R)
-        slowest = -np.linalg.eigvals(A - B @ _solve(R, B.T @ P)).real.max()
-    except np.linalg.LinAlgError:
-        slowest = 0.0
-    if not slowest > 0.0:
+    # The closed loop has the stable half of the Hamiltonian's eigenvalues, which are +- each other.
+    modes = np.linalg.eigvals(_hamiltonian(A, B @ _solve(R, B.T), Q))
+    slowest = np.abs(modes.real).min()
+    if not slowest > 1e-12 * np.abs(modes).max():
         raise ValueError(
             "the Riccati equation has no stabilising solution within rounding: bring the entries of"
             " Q and R closer together, or use a finite horizon"
         )
-    # The equation's own flow, over 40 of the slowest time constants, takes rounding errors away.
-    P = _cost_to_go(A, B, Q, R, 0.5 * (P + P.T), np.array(40.0 / slowest))
+    # Over 40 of the slowest time constants the cost to go forgets what it is at the end.
+    P = _cost_to_go(A, B, Q, R, np.eye(len(A)), np.array(40.0 / slowest))
     return _solve(R, B.T @ P), P
 
 

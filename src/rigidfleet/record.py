@@ -16,13 +16,15 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rigidfleet.geometry import Ints
-    from rigidfleet.kernel.flight import Record
     from rigidfleet.kernel.program import Array
+    from rigidfleet.kernel.records import Record
     from rigidfleet.mission import Mission
 
 
-#: Edges, or coordinates, up to which the smallest singular value of J is recorded at each sample.
+#: Edges, or coordinates, up to which the smallest singular value of J is recorded.
 _SINGULAR = 400
+#: The work spent on them in a phase, as (size of J)^3 times samples: some tenths of a second; and samples at least.
+_WORK, _LEAST = 400_000_000, 9
 
 
 @dataclass
@@ -230,12 +232,19 @@ def _columns(some: Ints, edges: Ints) -> Ints:
 
 
 def _singular_values(pieces: Sequence[Piece]) -> Array:
-    """Smallest non-zero singular value of J (K,); NaN where a sample would take longer than a flight."""
-    return np.concatenate(
-        [
-            geometry.smallest_singular_value(p.record.r, p.edges)
-            if min(len(p.edges), 3 * p.record.r.shape[1]) <= _SINGULAR
-            else np.full(len(p.time), np.nan)
-            for p in pieces
-        ]
-    )
+    """Smallest non-zero singular value of J (K,); NaN where a sample would take longer than a flight.
+
+    In formations of some tens of agents it is that of some samples in each phase, and linear between them.
+    """
+    return np.concatenate([_singular(p.record.r, p.edges) for p in pieces])
+
+
+def _singular(r: Array, edges: Ints) -> Array:
+    """That of one phase, of positions r (K, N, 3)."""
+    size = min(len(edges), 3 * r.shape[1])
+    if size > _SINGULAR:
+        return np.full(len(r), np.nan)
+    count = min(len(r), max(_LEAST, _WORK // max(size, 1) ** 3))
+    some = np.unique(np.linspace(0, len(r) - 1, count).round().astype(np.int64))
+    found = geometry.smallest_singular_value(r[some], edges)
+    return np.interp(np.arange(len(r)), some, found)

@@ -17,7 +17,7 @@ from rigidfleet import attitude as att
 from rigidfleet import solvers
 from rigidfleet.disturbances import disturbance, without
 from rigidfleet.errors import FlightError
-from rigidfleet.kernel import flight, large
+from rigidfleet.kernel import native, records
 from rigidfleet.kernel import program as k
 from rigidfleet.mission import Establish, Fly, Mission, Phase, Reshape, Settle, Turn
 from rigidfleet.plan import PhasePlan, Pose, Situation, about_cm, plan_phase
@@ -25,6 +25,7 @@ from rigidfleet.record import Piece, Watched, assemble
 from rigidfleet.result import PhaseRecord, Result
 
 if TYPE_CHECKING:
+    from rigidfleet.kernel import large  # imports the compiler, which only large formations need
     from rigidfleet.kernel.program import Array
 
 #: The integrator returns to Python after so many steps, or fewer: as many as take this long [s of
@@ -162,7 +163,7 @@ class Leg:
     phase: Phase
     plan: PhasePlan
     workspace: k.Workspace
-    state: flight.Integrator
+    state: records.Integrator
     t_end: float  # [s] at the latest
     asked: int = 0  # how often the user's controller has been
     held: k.Program | None = None  # with its force
@@ -282,6 +283,8 @@ class Flight:
 
     def _large(self, plan: PhasePlan, work: k.Workspace) -> large.LargeSolver:
         """What solves for the multipliers of a large formation, in one phase."""
+        from rigidfleet.kernel import large
+
         edges = plan.edges
         points = self.now.r if plan.slots is None else plan.slots
         steps = solvers.sweep_steps(len(points), edges) if plan.method == "sweep" else None
@@ -324,15 +327,16 @@ class Flight:
         away = np.linalg.norm(about_cm(self.now.r, self.masses), axis=1)
         return np.maximum(given.atol, plan.program.law.beta * (given.atol + given.rtol * away))
 
-    def _integrator(self, plan: PhasePlan, y: Array, t: float) -> flight.Integrator:
+    def _integrator(self, plan: PhasePlan, y: Array, t: float) -> records.Integrator:
         rtol = self.mission.integrator.rtol
-        return flight.integrator(y, t, rtol=rtol, atol=self._tolerances(plan, len(y)))
+        return records.integrator(y, t, rtol=rtol, atol=self._tolerances(plan, len(y)))
 
     def _count(self, leg: Leg) -> None:
         """Add up what a leg, or its part up to a loss, has taken."""
         self.count += leg.state.count[:3]
         if leg.solver is not None:
-            self.solves.setdefault(leg.plan.method, large.Counts()).add(leg.solver.counts)
+            counts = leg.solver.counts
+            self.solves.setdefault(leg.plan.method, type(counts)()).add(counts)
 
     def _fly_to(self, leg: Leg, t_end: float) -> None:
         """Integrate to ``t_end`` [s] under the phase's input law, or the user's controller."""
@@ -350,7 +354,7 @@ class Flight:
     def _controlled(self, leg: Leg, controller: Controller) -> k.Program:
         """Ask the user's controller; return the phase's program with its force held."""
         plan, w, y = leg.plan, leg.workspace, leg.state.y
-        flight.closed_loop(leg.t, y, np.empty_like(y), plan.program, w)
+        native.closed_loop(leg.t, y, np.empty_like(y), plan.program, w)
         noisy = len(self.disturbance.noise_r) > 0
         r, v = (w.r_seen, w.v_seen) if noisy else (w.r, w.v)
         seen = Observation(
@@ -407,11 +411,11 @@ class Flight:
         samples = np.empty((len(times), len(state.y)))
         state.count[3] = 0
         first = np.nextafter(leg.t, math.inf)
-        status = flight.PAUSED
+        status = records.PAUSED
         try:
-            while status == flight.PAUSED:
+            while status == records.PAUSED:
                 begun = clock.perf_counter()
-                status = flight.integrate(
+                status = native.integrate(
                     program, leg.workspace, state, t_end, fresh, times, samples, steps
                 )
                 took = max(clock.perf_counter() - begun, 1e-6)
@@ -422,7 +426,7 @@ class Flight:
                 if leg.solver is not None:
                     leg.solver.check()
                 self._report(leg)
-                if status == flight.PAUSED and self._stalled(leg):
+                if status == records.PAUSED and self._stalled(leg):
                     break
         finally:
             done = int(state.count[3])
@@ -434,8 +438,8 @@ class Flight:
                 self.watched.append((times[~kept], r))
             if kept.any():
                 self._record(leg, program, times[kept], samples[kept])
-        if status != flight.FINISHED:
-            raise StoppedError(self._diagnose(leg, collapsed=status == flight.COLLAPSED))
+        if status != records.FINISHED:
+            raise StoppedError(self._diagnose(leg, collapsed=status == records.COLLAPSED))
 
     def _samples(self, leg: Leg, t_end: float) -> Array:
         """Times to record in (t, t_end]: multiples of the output step, the phase's two ends, its arrival.
@@ -500,7 +504,7 @@ class Flight:
         The goal's attitude counts by how far it takes a slot.
         """
         plan, w = leg.plan, leg.workspace
-        flight.closed_loop(leg.t, leg.state.y, np.empty_like(leg.state.y), plan.program, w)
+        native.closed_loop(leg.t, leg.state.y, np.empty_like(leg.state.y), plan.program, w)
         errors = [np.abs(w.c).max(initial=0.0)]
         local = plan.program.control.kind == k.LOCAL
         if local:
@@ -537,7 +541,7 @@ class Flight:
     def _arrive(self, leg: Leg) -> None:
         """Make the state the integrator has reached the situation of the next phase."""
         plan, state, w = leg.plan, leg.state, leg.workspace
-        flight.closed_loop(leg.t, state.y, np.empty_like(state.y), plan.program, w)
+        native.closed_loop(leg.t, state.y, np.empty_like(state.y), plan.program, w)
         n, m = len(self.masses), len(plan.edges)
         frame = self.now.frame
         if plan.frame is not None:
@@ -638,7 +642,7 @@ class Flight:
     def _remedy(self, leg: Leg, *, collapsed: bool) -> str:
         """What to try where J is not to blame."""
         beyond = leg.t + 1e-9 * max(1.0, leg.t)  # what happens at leg.t shows a moment later
-        flight.closed_loop(
+        native.closed_loop(
             beyond, leg.state.y, np.empty_like(leg.state.y), leg.plan.program, leg.workspace
         )
         w = leg.workspace
@@ -685,11 +689,9 @@ class Flight:
         """Evaluate forces and references at the samples and keep them."""
         plan, w = leg.plan, leg.workspace
         n, m = len(self.masses), len(plan.edges)
-        out = flight.recorder(len(times), n, m)
-        flight.record(times, samples, program, w, np.empty(samples.shape[1]), out)
+        out = native.record(program, w, times, samples)
         if program is not plan.program:  # flown by a user's controller: the phase's references
-            asked = flight.recorder(len(times), n, m)
-            flight.record(times, samples, plan.program, w, np.empty(samples.shape[1]), asked)
+            asked = native.record(plan.program, w, times, samples)
             out = out._replace(
                 r_ref=asked.r_ref,
                 p=asked.p,
@@ -726,7 +728,7 @@ class Flight:
 
 
 def _first_step(
-    program: k.Program, work: k.Workspace, state: flight.Integrator, scale: Array, longest: float
+    program: k.Program, work: k.Workspace, state: records.Integrator, scale: Array, longest: float
 ) -> float:
     """First step [s] to try in a large formation, from two evaluations; at most the ``longest``.
 
@@ -739,10 +741,10 @@ def _first_step(
 
     t, y = float(state.clock[0]), state.y
     slope, later = np.empty_like(y), np.empty_like(y)
-    flight.closed_loop(t, y, slope, program, work)
+    native.closed_loop(t, y, slope, program, work)
     first = size(slope)
     h = min(0.01 * size(y) / max(first, 1e-300), longest)
-    flight.closed_loop(t + h, y + h * slope, later, program, work)
+    native.closed_loop(t + h, y + h * slope, later, program, work)
     steepest = max(first, size(later - slope) / h)
     if not 0.0 < steepest < math.inf:
         return float(state.clock[1])
@@ -770,7 +772,7 @@ def _check_size(mission: Mission, phase: Phase) -> None:
 def _jacobian(leg: Leg, n: int) -> tuple[Array, int, float]:
     """J (m, 3N) where the integrator is, its shortest edge and that edge's length [m]."""
     edges = leg.plan.edges
-    flight.closed_loop(
+    native.closed_loop(
         leg.t, leg.state.y, np.empty_like(leg.state.y), leg.plan.program, leg.workspace
     )
     r = leg.workspace.r

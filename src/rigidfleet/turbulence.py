@@ -10,7 +10,6 @@ import math
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import cholesky, solve_banded
 
 Array = NDArray[np.float64]
 
@@ -43,7 +42,7 @@ def second_order(white: Array, step: float, tau: float) -> Array:
     s = step / tau
     A = math.exp(-s) * np.array([[1.0, 0.0], [s, 1.0]])
     P = np.array([[1.0, 0.5], [0.5, 0.5]])  # stationary
-    start, root = cholesky(P, lower=True), cholesky(P - A @ P @ A.T, lower=True)
+    start, root = np.linalg.cholesky(P), np.linalg.cholesky(P - A @ P @ A.T)
     z = np.einsum("ab,kb...->ka...", root, white)
     z[0] = np.tensordot(start, white[0], 1)
     for k in range(1, len(z)):
@@ -81,11 +80,13 @@ def correlate_by_distance(white: Array, points: ArrayLike, length: float) -> Arr
     apart = np.linalg.norm(p[:, None] - p[None], axis=2)
     # Places that are nearly one would make the matrix singular to rounding.
     C = np.exp(-apart / length) + 1e-12 * np.eye(len(p))
-    return np.einsum("ij,...jq->...iq", cholesky(C, lower=True), white)
+    return np.einsum("ij,...jq->...iq", np.linalg.cholesky(C), white)
 
 
 def spline_coefficients(samples: Array) -> Array:
     """Coefficients (K + 2, ...) of the natural cubic B-spline through samples (K, ...), K >= 2, on even knots."""
+    from scipy.linalg import solve_banded
+
     n = len(samples)
     flat = samples.reshape(n, -1)
     inner = np.empty_like(flat)

@@ -4,15 +4,10 @@ Numba's own cache does not notice a change in a callee that lives in another fil
 folder is keyed here by a digest of all sources of the kernel.
 """
 
-import hashlib
-import os
-import sys
-import tempfile
 import warnings
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from functools import cache
-from pathlib import Path
 from types import FunctionType
 from typing import Any, TypeVar
 
@@ -21,9 +16,11 @@ from numba import types
 from numba.core.caching import FunctionCache
 from numba.extending import intrinsic
 
+from rigidfleet.kernel.native import cache_directory
+
 F = TypeVar("F", bound=Callable[..., Any])
 
-_OPTIONS: dict[str, Any] = {
+OPTIONS: dict[str, Any] = {
     "nogil": True,
     "error_model": "numpy",  # division by zero gives infinity
     # Sums may be reordered and fused, but NaN and infinity keep their meaning: the integrator has
@@ -32,26 +29,25 @@ _OPTIONS: dict[str, Any] = {
     # Without reference counts, which cost more than the physics: whoever calls keeps the arrays
     # alive. The compiler then refuses any function that would allocate.
     "_nrt": False,
-    "no_cfunc_wrapper": True,
 }
+#: Where Numba is to optimise nothing (see `rigidfleet.kernel.native`), code is neither kept nor inlined yet.
+_OPTIMISES = numba.config.OPT > 0
+_CACHED = OPTIONS | {"cache": _OPTIMISES, "no_cfunc_wrapper": True}
 
 
 def compiled(function: F) -> F:
     """Compile for the flight: cached on disk, without the GIL, without allocation."""
-    return _cached(function, _OPTIONS)
+    return _cached(function, _CACHED)
 
 
 def inlined(function: F) -> F:
-    """Compile into each caller: for functions of a whole `Program` or `Workspace`.
-
-    A call would copy every field of theirs, some 300 numbers, to the stack.
-    """
-    return _cached(function, _OPTIONS | {"forceinline": True})
+    """Compile into each caller: for what every evaluation of a flight goes through."""
+    return _cached(function, _CACHED | {"forceinline": _OPTIMISES})
 
 
 def compiled_copy(function: Any, name: str, **instead: Any) -> Any:
     """Compile a compiled function's source once more, with other functions in place of some it calls."""
-    return _cached(_copy(function.py_func, name, instead), _OPTIONS)
+    return _cached(_copy(function.py_func, name, instead), _CACHED)
 
 
 def compiled_for_c(function: Any, name: str, *, arguments: int, **instead: Any) -> int:
@@ -93,32 +89,6 @@ def call_solver(_context, address):
     return types.void(types.int64), generate
 
 
-def cache_directory() -> Path:
-    """Return the folder of the compiled kernel: one per state of its sources, Numba and Python.
-
-    The base is ``NUMBA_CACHE_DIR`` if set, else ``XDG_CACHE_HOME`` or ``~/.cache``; a folder that
-    cannot be written falls back to the system's temporary folder.
-    """
-    digest = hashlib.sha256(f"{numba.__version__} {sys.version}".encode())
-    for source in sorted(Path(__file__).parent.glob("*.py")):
-        digest.update(source.read_bytes())
-    base = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME") or "~/.cache"
-    for root in (Path(base).expanduser(), Path(tempfile.gettempdir())):
-        folder = root / "rigidfleet" / f"kernel-{digest.hexdigest()[:16]}"
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError:
-            continue
-        if os.access(folder, os.W_OK):
-            return folder
-    return folder
-
-
-def is_compiled() -> bool:
-    """Return whether the flight kernel is in the cache, so that nothing has to be compiled."""
-    return any(_CACHE.rglob("flight.integrate-*.nbc"))
-
-
 _CACHE = cache_directory()
 
 
@@ -157,5 +127,6 @@ def _not_kept(why: str) -> None:
 def _cached(function: F, options: dict[str, Any]) -> F:
     with _own_cache():
         dispatcher = numba.njit(**options)(function)
-        dispatcher._cache = _Cache(function)
+        if options["cache"]:
+            dispatcher._cache = _Cache(function)
     return dispatcher

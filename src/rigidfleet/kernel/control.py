@@ -187,7 +187,7 @@ def body_gains(t, feedback, out):
         out[q] = x0 + s * (v0 + s * (3.0 * rise - 2.0 * v0 - v1 + s * (v0 + v1 - 2.0 * rise)))
 
 
-@inlined
+@compiled
 def body_law(t, m, M, g, T, feedback, control, w):
     """LQR on the virtual body: CM and attitude -> wrench -> every agent (w.f_u, w.wrench).
 

@@ -5,7 +5,7 @@ measured state in the place of the true one, before the laws; `disturb` puts the
 after them, and adds what no vehicle knows.
 """
 
-from rigidfleet.kernel.compiled import compiled, inlined
+from rigidfleet.kernel.compiled import compiled
 
 # A lost vehicle on the ground: critically damped contact of this natural frequency [1/s], damped from
 # this depth [m] on. It stops within a meter from 40 m/s, and asks for no shorter steps than a flight does.
@@ -44,7 +44,7 @@ def exchange(a, b):
             a[i, q], b[i, q] = b[i, q], a[i, q]
 
 
-@inlined
+@compiled
 def sense(t, disturbance, w):
     """Measured states into w.r and w.v, and the true ones into w.r_seen and w.v_seen meanwhile."""
     if disturbance.noise_r.shape[0] > 0:
@@ -57,7 +57,7 @@ def sense(t, disturbance, w):
                 w.r_seen[i, q], w.v_seen[i, q] = r, v
 
 
-@inlined
+@compiled
 def disturb(t, m, g, disturbance, w):
     """True states back into w.r and w.v, true forces into w.f_E; w.f_D (N, 3) [N] is that of the air.
 

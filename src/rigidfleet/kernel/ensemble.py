@@ -10,70 +10,47 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rigidfleet.kernel.compiled import compiled, compiled_copy, inlined
-from rigidfleet.kernel.flight import FINISHED, Integrator, integrate, integrator
+from rigidfleet.kernel import native
+from rigidfleet.kernel.compiled import compiled
 from rigidfleet.kernel.lanes import WIDTH, LaneArray, pack, padded, unpack
-from rigidfleet.kernel.program import (
-    EXACT,
-    ITERATED,
-    OPEN,
-    SLOTS,
-    Array,
-    Program,
-    Workspace,
-    workspace,
-)
-from rigidfleet.kernel.straight import integrate as integrate_straight
-from rigidfleet.kernel.straight import straight
+from rigidfleet.kernel.program import EXACT, ITERATED, OPEN, SLOTS, Array, Program, workspace
+from rigidfleet.kernel.records import FINISHED, integrator
+from rigidfleet.kernel.straight import integrate, straight
+
+Numbers = NDArray[np.int64]
 
 #: A range of flights is begun by whichever thread is free, so many ranges to a thread.
 _RANGES = 4
 #: Steps of one flight in a phase at most.
 _MOST_STEPS = 1_000_000
+#: What a flight tries first [s].
+_FIRST_STEP = 1e-3
 #: Equations of a solve up to which straight-line code is made: its length grows with their cube.
 _MOST_EQUATIONS = 36
 
 
-@inlined
-def blend_from(before, p):
-    """Let references be blended from these distances (m,) [m]."""
-    for k in range(before.shape[0]):
-        p.reference.d0[k] = before[k]
-
-
-@inlined
-def _blend_from(before, p):
-    for k in range(before.shape[0]):
-        p.before[k] = before[k]
-
-
 @compiled
-def fly(p, w, state, t0, t_end, step, starts, before, ends, status, evaluations, max_steps, fresh):
-    """Integrate from each of ``starts`` (G, n) at t0 to ``t_end`` [s], into ``ends`` (G, n).
+def fly(p, state, t0, t_end, step, starts, before, ends, status, evaluations, max_steps, fresh):
+    """Integrate vectors of eight flights from ``starts`` (G, n) at t0 to ``t_end`` [s], into ``ends``.
 
     ``before`` (G, m) [m] are the distances from which the references of each are blended. What
     `integrate` returns goes into ``status`` (G,), the calls of the right-hand side into
-    ``evaluations`` (G,); p, w and state are overwritten. ``fresh`` is true; written here, the
-    compiler would take it for another type.
+    ``evaluations`` (G,); p, a `Straight`, and state are overwritten. ``fresh`` is true; written
+    here, the compiler would take it for another type.
     """
     unsampled = state.clock[:0]
     for g in range(starts.shape[0]):
         for q in range(starts.shape[1]):
             state.y[q] = starts[g, q]
-        blend_from(before[g], p)
+        for k in range(before.shape[1]):
+            p.before[k] = before[g, k]
         state.clock[0], state.clock[1], state.clock[2] = t0, step, 1e-4
         for q in range(4):
             state.count[q] = 0
-        status[g] = integrate(p, w, state, t_end, fresh, unsampled, ends[:0], max_steps)
+        status[g] = integrate(p, p, state, t_end, fresh, unsampled, ends[:0], max_steps)
         evaluations[g] = state.count[0]
         for q in range(starts.shape[1]):
             ends[g, q] = state.y[q]
-
-
-#: As `fly`; p is a `Straight`, w is not used, a start is eight flights.
-fly_straight = compiled_copy(
-    fly, "fly_straight", integrate=integrate_straight, blend_from=_blend_from
-)
 
 
 @dataclass(frozen=True)
@@ -153,14 +130,19 @@ def fly_all(
             x = x[np.minimum(np.arange(padded(count)), count - 1)]
         return pack(x.reshape(len(x) // WIDTH, WIDTH, x.shape[1]).swapaxes(1, 2))
 
-    def begin() -> tuple[Any, Any, Integrator]:
+    def begin() -> Callable[..., None]:
         state = integrator(np.zeros(n), 0.0, rtol=rtol, atol=atol)
         K = np.zeros((*state.K.shape[:1], n, WIDTH))
         K[-1] = atol[:, None]
+        state = state._replace(y=pack(np.zeros((n, WIDTH))), K=pack(K))
         own = ready._replace(before=ready.before.copy(), time=ready.time.copy())
-        return own, None, state._replace(y=pack(np.zeros((n, WIDTH))), K=pack(K))
 
-    found = _share(fly_straight, begin, packed(starts), packed(before), times, threads)
+        def work(*part: Any) -> None:
+            fly(own, state, *times, _FIRST_STEP, *part, _MOST_STEPS, True)
+
+        return work
+
+    found = _share(begin, packed(starts), packed(before), threads)
     y = unpack(found.y).swapaxes(1, 2).reshape(-1, n)[:count]
     finished = np.repeat(found.finished, WIDTH)[:count]
     evaluations = np.repeat(found.evaluations, WIDTH)[:count]
@@ -180,25 +162,30 @@ def _fly_alone(
     atol: Array,
     threads: int,
 ) -> Ends:
-    def begin() -> tuple[Program, Workspace, Integrator]:
-        own = program.reference._replace(d0=program.reference.d0.copy())
-        n, m = len(program.vehicles.m), len(program.graph.edges)
-        w = workspace(n, m, solver=program.law.solver)
-        state = integrator(np.zeros(len(atol)), 0.0, rtol=rtol, atol=atol)
-        return program._replace(reference=own), w, state
+    def begin() -> Callable[..., None]:
+        d0 = program.reference.d0.copy()
+        own = program._replace(reference=program.reference._replace(d0=d0))
+        w = workspace(len(program.vehicles.m), len(d0), solver=program.law.solver)
+        unsampled = np.zeros(0), np.zeros((0, starts.shape[1]))
 
-    return _share(fly, begin, starts, before, times, threads)
+        def work(
+            starts: Array, before: Array, ends: Array, status: Numbers, evaluations: Numbers
+        ) -> None:
+            for k, start in enumerate(starts):
+                d0[:] = before[k]
+                state = integrator(start, times[0], rtol=rtol, atol=atol, step=_FIRST_STEP)
+                status[k] = native.integrate(own, w, state, times[1], True, *unsampled, _MOST_STEPS)
+                ends[k], evaluations[k] = state.y, state.count[0]
+
+        return work
+
+    return _share(begin, starts, before, threads)
 
 
 def _share(
-    fly: Callable[..., None],
-    begin: Callable[[], tuple[Any, Any, Integrator]],
-    starts: Array,
-    before: Array,
-    times: tuple[float, float],
-    threads: int,
+    begin: Callable[[], Callable[..., None]], starts: Array, before: Array, threads: int
 ) -> Ends:
-    """Share the flights, or vectors of them, out over threads, each with what `begin` gives it."""
+    """Share the flights, or vectors of them, out over threads, each with its own of what `begin` makes."""
     count = len(starts)
     threads = min(threads, count)
     ends = np.empty_like(starts)
@@ -207,13 +194,10 @@ def _share(
     ranges = iter(range(0, count, size))
 
     def work() -> None:
-        p, w, state = begin()
+        fly_part = begin()
         for first in ranges:
             part = slice(first, first + size)
-            fly(
-                p, w, state, *times, 1e-3, starts[part], before[part], ends[part], status[part],
-                evaluations[part], _MOST_STEPS, True,
-            )  # fmt: skip
+            fly_part(starts[part], before[part], ends[part], status[part], evaluations[part])
 
     with ThreadPoolExecutor(max(1, threads - 1)) as pool:  # this thread works, too
         jobs = [pool.submit(work) for _ in range(threads - 1)]

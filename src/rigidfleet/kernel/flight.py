@@ -6,12 +6,10 @@ y_i = T (v_i - v_cm).
 """
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 from numba import types
 from numba.extending import intrinsic
-from numpy.typing import NDArray
 
 from rigidfleet.kernel.body import (
     attitude_matrix,
@@ -29,12 +27,20 @@ from rigidfleet.kernel.constraint import (
 )
 from rigidfleet.kernel.control import body_law, desired_agents, local_law, reference_motion
 from rigidfleet.kernel.disturbance import disturb, sense
-from rigidfleet.kernel.lanes import blocks, padded, rough_inverse, spread, total_or_worst
-from rigidfleet.kernel.program import BODY, LOCAL, OPEN, SLOTS, Array, Program, Workspace, zeros
+from rigidfleet.kernel.lanes import blocks, rough_inverse, spread, total_or_worst
+from rigidfleet.kernel.pointers import by_address
+from rigidfleet.kernel.program import BODY, LOCAL, OPEN, SLOTS, Program, Workspace
+from rigidfleet.kernel.records import (
+    ATOL,
+    COLLAPSED,
+    FINISHED,
+    PAUSED,
+    STATE,
+    TRIAL,
+    Integrator,
+    integrator,
+)
 from rigidfleet.kernel.references import blend_slots, distance_references
-
-# What `integrate` returns.
-FINISHED, PAUSED, COLLAPSED = range(3)
 
 
 @intrinsic
@@ -142,7 +148,7 @@ def closed_loop(t, y, dy, p, w):
         quaternion_rate(y[q : q + 4], w.cm[4], dy[q : q + 4])
 
 
-@inlined
+@compiled
 def world_states(y, p, w):
     """Positions and velocities in world axes from the states of the body formulation."""
     n = p.vehicles.m.shape[0]
@@ -155,7 +161,7 @@ def world_states(y, p, w):
             w.v[i, s] += y[q + 7 + s]
 
 
-@inlined
+@compiled
 def body_derivatives(y, dy, p, w):
     """The paper's equations of motion in the body frame, in their well-posed form.
 
@@ -209,33 +215,6 @@ _D = np.array(
 )  # fmt: skip
 
 
-# Rows of `Integrator.K` after the seven stages.
-_STATE, _TRIAL, _ATOL = 7, 8, 9
-
-
-class Integrator(NamedTuple):
-    """State of an integration, so that it can pause and go on."""
-
-    y: Array  # (n,) state at `clock[0]`
-    K: Array  # (10, n padded to eights) stages, K[0] the derivative at y; y, trial, tolerance
-    clock: Array  # (3,) t [s], next step h [s], last error
-    count: NDArray[np.int64]  # (4,) evaluations, accepted, rejected, samples written
-    rtol: float
-
-
-def integrator(y: Array, t: float, *, rtol: float, atol: Array, step: float = 1e-3) -> Integrator:
-    """Start an integration from state ``y`` (n,) at time t [s] with a first step [s] to try.
-
-    ``atol`` (n,) is the absolute tolerance of each state, ``rtol`` the relative one of all.
-    """
-    n = len(y)
-    K = zeros(10, padded(n))
-    K[_ATOL] = 1.0
-    K[_ATOL, :n] = atol
-    clock, count = np.array([t, step, 1e-4]), np.zeros(4, dtype=np.int64)
-    return Integrator(y.copy(), K, clock, count, rtol)
-
-
 @compiled
 def forget_stages(k, first):
     """Make the stages from ``first`` on zero: NaN left in them would outlive its weight of zero."""
@@ -251,8 +230,8 @@ def advance(k, stage, a, h):
     a0, a1, a2 = h * a[stage, 0], h * a[stage, 1], h * a[stage, 2]
     a3, a4, a5 = h * a[stage, 3], h * a[stage, 4], h * a[stage, 5]
     for q in range(k.shape[1]):
-        k[_TRIAL, q] = ((a0 * k[0, q] + a1 * k[1, q]) + (a2 * k[2, q] + a3 * k[3, q])) + (
-            k[_STATE, q] + (a4 * k[4, q] + a5 * k[5, q])
+        k[TRIAL, q] = ((a0 * k[0, q] + a1 * k[1, q]) + (a2 * k[2, q] + a3 * k[3, q])) + (
+            k[STATE, q] + (a4 * k[4, q] + a5 * k[5, q])
         )
 
 
@@ -272,9 +251,10 @@ def integrate(p, w, state, t_end, fresh, times, samples, max_steps):
     Returns FINISHED, PAUSED, or COLLAPSED where the step size fell to nothing (singular
     constraints, non-finite forces); y and t are then those of the last step that was good.
     """
+    p, w, state = by_address(p), by_address(w), by_address(state)
     K, clock, count = state.K, state.clock, state.count
     n = state.y.shape[0]
-    y, trial = K[_STATE], K[_TRIAL]
+    y, trial = K[STATE], K[TRIAL]
     for q in range(n):
         y[q] = state.y[q]
     k = blocks(K)
@@ -298,8 +278,8 @@ def integrate(p, w, state, t_end, fresh, times, samples, max_steps):
                 (_E[0] * k[0, q] + _E[2] * k[2, q] + _E[3] * k[3, q])
                 + (_E[4] * k[4, q] + _E[5] * k[5, q] + _E[6] * k[6, q])
             )
-            size = max(abs(k[_STATE, q]), abs(k[_TRIAL, q]))
-            e *= rough_inverse(k[_ATOL, q] + state.rtol * size)
+            size = max(abs(k[STATE, q]), abs(k[TRIAL, q]))
+            e *= rough_inverse(k[ATOL, q] + state.rtol * size)
             squares += e * e
         error = math.sqrt(total_or_worst(squares, y) / n)
         if not error <= 1.0:  # NaN too
@@ -332,7 +312,7 @@ def integrate(p, w, state, t_end, fresh, times, samples, max_steps):
                 samples[count[3], q] = y[q] + x * (rise + (1.0 - x) * inner)
             count[3] += 1
         for q in range(k.shape[1]):
-            k[_STATE, q] = k[_TRIAL, q]
+            k[STATE, q] = k[TRIAL, q]
             k[0, q] = k[6, q]
         t = t_new
         first = 1
@@ -349,41 +329,6 @@ def integrate(p, w, state, t_end, fresh, times, samples, max_steps):
     return status
 
 
-class Record(NamedTuple):
-    """What `record` writes, one row per sample."""
-
-    r: Array  # (K, N, 3)
-    v: Array
-    a: Array
-    f_E: Array
-    f_u: Array
-    f_C: Array
-    r_ref: Array
-    c: Array  # (K, m)
-    L: Array
-    d: Array
-    d_dot: Array
-    multiplier: Array
-    p: Array  # (K, N, 3) slots
-    motion: Array  # (K, 6) CM reference position and velocity
-    rates: Array  # (K, 3) reference rates, body axes
-    T_ref: Array  # (K, 3, 3)
-    wrench: Array  # (K, 6)
-    r_seen: Array  # (K, N, 3) as measured
-    v_seen: Array
-    f_D: Array
-
-
-def recorder(k: int, n: int, m: int) -> Record:
-    """Allocate a record of ``k`` samples."""
-    agent, edge = (lambda: np.full((k, n, 3), np.nan)), (lambda: np.full((k, m), np.nan))
-    return Record(
-        *(agent() for _ in range(7)), *(edge() for _ in range(5)), agent(),
-        np.full((k, 6), np.nan), np.full((k, 3), np.nan), np.full((k, 3, 3), np.nan),
-        np.full((k, 6), np.nan), *(agent() for _ in range(3)),
-    )  # fmt: skip
-
-
 @compiled
 def copy(a, out):
     """Copy a into out, both two-dimensional."""
@@ -394,42 +339,52 @@ def copy(a, out):
 
 @compiled
 def record(times, samples, p, w, dy, out):
-    """Evaluate the closed loop at the sampled states and keep its forces and references."""
-    kind = p.control.kind
+    """Evaluate the closed loop at the sampled states and keep its forces and references.
+
+    Without rows in ``out``, what the last evaluation leaves in the workspace is all that was asked for.
+    """
     for k in range(times.shape[0]):
         closed_loop(times[k], samples[k], dy, p, w)
-        for i in range(w.c.shape[0]):
-            out.c[k, i], out.L[k, i], out.multiplier[k, i] = w.c[i], w.L[i], w.multiplier[i]
-            out.d[k, i], out.d_dot[k, i] = w.d[i], w.d_dot[i]
-        copy(w.r, out.r[k])
-        copy(w.v, out.v[k])
-        copy(w.a, out.a[k])
-        copy(w.f_E, out.f_E[k])
-        copy(w.f_u, out.f_u[k])
-        copy(w.f_C, out.f_C[k])
-        if p.disturbance.active:
-            copy(w.f_D, out.f_D[k])
-            if p.disturbance.noise_r.shape[0] > 0:
-                copy(w.r_seen, out.r_seen[k])
-                copy(w.v_seen, out.v_seen[k])
-        for q in range(6):
-            out.wrench[k, q] = w.wrench[q]
-        # Where only distances are blended, their slots still say how the formation lies.
-        blend_slots(times[k], p.reference, w.p, w.p_dot, w.p_ddot)
-        copy(w.p, out.p[k])
-        if kind != OPEN:
-            copy(w.T_ref, out.T_ref[k])
-        if kind == LOCAL:
-            copy(w.r_ref, out.r_ref[k])
-            for q in range(3):
-                out.motion[k, q], out.motion[k, 3 + q] = w.body[0, q], w.body[1, q]
-                out.rates[k, q] = w.body[3, q]
-        elif kind == BODY:
-            since = times[k] - p.feedback.arrival
-            for q in range(3):
-                out.motion[k, q] = p.feedback.r[q] + p.feedback.v[q] * since
-                out.motion[k, 3 + q] = p.feedback.v[q]
-                out.rates[k, q] = p.feedback.omega[q]
+        if k < out.r.shape[0]:
+            keep(times[k], p, w, k, out)
 
 
-__all__ = ["Program", "Workspace", "integrate", "integrator", "record", "recorder"]
+@compiled
+def keep(t, p, w, k, out):
+    """Copy what the closed loop has left in the workspace at time t [s] into row k of a record."""
+    kind = p.control.kind
+    for i in range(w.c.shape[0]):
+        out.c[k, i], out.L[k, i], out.multiplier[k, i] = w.c[i], w.L[i], w.multiplier[i]
+        out.d[k, i], out.d_dot[k, i] = w.d[i], w.d_dot[i]
+    copy(w.r, out.r[k])
+    copy(w.v, out.v[k])
+    copy(w.a, out.a[k])
+    copy(w.f_E, out.f_E[k])
+    copy(w.f_u, out.f_u[k])
+    copy(w.f_C, out.f_C[k])
+    if p.disturbance.active:
+        copy(w.f_D, out.f_D[k])
+        if p.disturbance.noise_r.shape[0] > 0:
+            copy(w.r_seen, out.r_seen[k])
+            copy(w.v_seen, out.v_seen[k])
+    for q in range(6):
+        out.wrench[k, q] = w.wrench[q]
+    # Where only distances are blended, their slots still say how the formation lies.
+    blend_slots(t, p.reference, w.p, w.p_dot, w.p_ddot)
+    copy(w.p, out.p[k])
+    if kind != OPEN:
+        copy(w.T_ref, out.T_ref[k])
+    if kind == LOCAL:
+        copy(w.r_ref, out.r_ref[k])
+        for q in range(3):
+            out.motion[k, q], out.motion[k, 3 + q] = w.body[0, q], w.body[1, q]
+            out.rates[k, q] = w.body[3, q]
+    elif kind == BODY:
+        since = t - p.feedback.arrival
+        for q in range(3):
+            out.motion[k, q] = p.feedback.r[q] + p.feedback.v[q] * since
+            out.motion[k, 3 + q] = p.feedback.v[q]
+            out.rates[k, q] = p.feedback.omega[q]
+
+
+__all__ = ["FINISHED", "Integrator", "Program", "Workspace", "integrate", "integrator", "record"]

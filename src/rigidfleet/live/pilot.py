@@ -15,7 +15,7 @@ import numpy as np
 from rigidfleet import attitude as att
 from rigidfleet import lqr
 from rigidfleet.errors import FlightError
-from rigidfleet.kernel import flight
+from rigidfleet.kernel import native
 from rigidfleet.kernel import program as k
 from rigidfleet.mission import Establish, Hold, Mission, Phase, Reshape
 from rigidfleet.record import assemble
@@ -200,7 +200,7 @@ class Pilot(Flight):
         if self.phases:
             self._arrive(self.leg)
         leg = self._begin(len(self.phases), phase)
-        flight.closed_loop(leg.t, leg.state.y, leg.state.K[0], leg.plan.program, leg.workspace)
+        native.closed_loop(leg.t, leg.state.y, leg.state.K[0], leg.plan.program, leg.workspace)
         control, name = phase.control, leg.plan.formation
         self.phases.append(PhaseRecord(phase.name, phase.kind, control, name, leg.t, leg.t))
         return leg

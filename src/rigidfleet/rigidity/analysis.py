@@ -224,8 +224,8 @@ def _index(frame: Framework, masses: ArrayLike | None) -> float:
     m = np.asarray(masses, dtype=np.float64)
     if m.shape != (len(frame.p),) or not (m > 0).all() or not np.isfinite(m).all():
         raise ValueError(f"masses must be {len(frame.p)} numbers > 0 kg")
-    if not frame.rank:
-        return np.nan
+    if not frame.rank or (m == m[0]).all():
+        return _index(frame, None)
     J = jacobian(frame.p, frame.edges)
     weighted = J * np.repeat(np.sqrt(m.mean() / m), frame.p.shape[1])
     return float(np.linalg.svd(weighted, compute_uv=False)[frame.rank - 1])

@@ -21,6 +21,9 @@ ZERO = 1e-7
 #: In a flex whose fastest agent has speed 1, an agent slower than this stands still.
 _STILL = 1e-5
 
+#: Squares that have been reduced to this share of themselves have few right digits left.
+_SPENT = 1e-8
+
 
 def jacobian(points: ArrayLike, edges: ArrayLike) -> Floats:
     """J (m, N d) of edges (m, 2) at points (N, d): unit vector u at i, -u at j."""
@@ -78,10 +81,9 @@ class Framework:
         m, size = J.shape
         if m == 0:
             return np.zeros((0, 0)), np.zeros(0), np.eye(size)
-        Q, R = np.linalg.qr(J) if m > size else (None, J)
-        u, s, vt = np.linalg.svd(R)
+        u, s, vt = np.linalg.svd(np.linalg.qr(J, mode="r") if m > size else J)
         rank = int(np.count_nonzero(s > ZERO * s[0]))
-        U = u[:, :rank] if Q is None else Q @ u[:, :rank]
+        U = u[:, :rank] if m <= size else (J @ vt[:rank].T) / s[:rank]
         return U, s[:rank], vt[rank:].T
 
     @property
@@ -136,13 +138,35 @@ class Framework:
         """Edges that could all go at once without loss of rank, long ones first."""
         if self.stresses == 0:
             return np.zeros(0, dtype=np.int64)
-        from scipy.linalg import qr
-
         # Pivoting takes the largest remainder: a weight makes short edges large. It spans the range all the
         # same, since each pivot is independent of those before.
         weight = self.lengths.min() / self.lengths
-        order = qr((weight[:, None] * self.span).T, mode="r", pivoting=True)[1]
-        return np.sort(order[self.rank :])
+        kept = _independent(weight[:, None] * self.span)
+        return np.setdiff1d(np.arange(len(self.edges)), kept)
+
+
+def _independent(rows: Floats) -> Ints:
+    """As many independent rows (k,) as there are columns of rows (., k), which has full rank: large ones first.
+
+    QR with column pivoting: each is the row whose part beyond the span of those before is largest.
+    """
+    k = rows.shape[1]
+    rest, Q, kept = (rows**2).sum(axis=1), np.zeros((k, k)), np.zeros(k, dtype=np.int64)
+    trusted = rest.max(initial=0.0)
+    for n in range(k):
+        if rest.max() < _SPENT * trusted:  # what is left of the squares is rounding: anew
+            beyond = rows - rows @ Q[:n].T @ Q[:n]
+            rest = (beyond**2).sum(axis=1)
+            rest[kept[:n]] = 0.0
+            trusted = rest.max()
+        kept[n] = rest.argmax()
+        q = rows[kept[n]]
+        for _ in range(2):
+            q = q - q @ Q[:n].T @ Q[:n]
+        Q[n] = q / np.linalg.norm(q)
+        rest -= (rows @ Q[n]) ** 2
+        rest[kept[: n + 1]] = 0.0
+    return kept
 
 
 def localised(frame: Framework) -> list[tuple[tuple[int, ...], Floats]]:

@@ -1,0 +1,316 @@
+"""The compiled kernel, called without the compiler.
+
+`rigidfleet.kernel.build` compiles the integrator and the recorder once to machine code, which is kept in the cache
+and loaded from there: Numba alone takes longer to import than most flights to fly. What the code reads and writes
+it finds through addresses of named tuples, laid out as `rigidfleet.kernel.pointers` says.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import os
+import struct
+import sys
+import tempfile
+import threading
+import warnings
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import llvmlite.binding as llvm
+import numpy as np
+from numpy.typing import NDArray
+
+from rigidfleet.kernel import program as k
+from rigidfleet.kernel.program import Array, Program, Workspace
+from rigidfleet.kernel.records import Integrator, Record, Stretch, integrator, recorder
+
+#: What the machine code is called: int64 enter(program, workspace, integrator, stretch, record), all addresses.
+ENTRY = "rigidfleet_enter"
+
+
+def integrate(
+    program: Program,
+    workspace: Workspace,
+    state: Integrator,
+    t_end: float,
+    fresh: bool,
+    times: Array,
+    samples: Array,
+    max_steps: int,
+) -> int:
+    """Integrate to ``t_end`` [s], see `rigidfleet.kernel.flight.integrate`."""
+    stretch = _pack(Stretch(t_end, fresh, max_steps, times, samples, _NOTHING))
+    return _enter(program, workspace, _packed(state), stretch, None)
+
+
+def record(program: Program, workspace: Workspace, times: Array, samples: Array) -> Record:
+    """Forces and references at states ``samples`` (K, n) at ``times`` (K,) [s]."""
+    n, m = len(program.vehicles.m), len(program.graph.edges)
+    out = recorder(len(times), n, m)
+    stretch = Stretch(0.0, False, 0, times, samples, np.empty(samples.shape[1]))
+    _enter(program, workspace, None, _pack(stretch), _pack(out))
+    return out
+
+
+def closed_loop(t: float, y: Array, dy: Array, program: Program, workspace: Workspace) -> None:
+    """Right-hand side dy (n,) at time t [s] and state y (n,), see `rigidfleet.kernel.flight.closed_loop`."""
+    stretch = Stretch(0.0, False, 0, np.array([t]), y.reshape(1, -1), dy)
+    _enter(program, workspace, None, _pack(stretch), _packed(_UNRECORDED))
+
+
+def _enter(
+    program: Program,
+    workspace: Workspace,
+    state: _Packed | None,
+    stretch: _Packed,
+    out: _Packed | None,
+) -> int:
+    packed = _packed(program), _packed(workspace), state, stretch, out
+    return _code().enter(*(0 if p is None else p.address for p in packed))
+
+
+# -- named tuples in words ---------------------------------------------------------------------------
+
+
+class _Packed(NamedTuple):
+    """A named tuple in words, and the tuple itself, which keeps its arrays."""
+
+    of: Any
+    words: NDArray[np.int64]
+    address: int
+
+
+class _Layout(NamedTuple):
+    """How a named tuple of one type is laid out."""
+
+    code: struct.Struct
+    arrays: tuple[tuple[str, int], ...]  # kind of number and dimensions of each
+
+
+def _flatten(x: Any, code: list[str], words: list[Any], arrays: list[tuple[str, int]]) -> None:
+    """Append the words of a named tuple, their kinds, and those of its arrays."""
+    for value in x:
+        if isinstance(value, np.ndarray):
+            if not value.flags.c_contiguous:
+                raise TypeError("the kernel takes C-contiguous arrays alone")
+            code.append("q" * (1 + value.ndim))
+            words += (value.__array_interface__["data"][0], *value.shape)
+            arrays.append((value.dtype.char, value.ndim))
+        elif isinstance(value, tuple):
+            _flatten(value, code, words, arrays)
+        elif isinstance(value, float):
+            code.append("d")
+            words.append(value)
+        else:
+            code.append("q")
+            words.append(int(value))
+
+
+def _pack(x: Any) -> _Packed:
+    """Lay a named tuple down in words.
+
+    Raises
+    ------
+    TypeError
+        Numbers or arrays are not of the types that the kernel is compiled for.
+    """
+    code: list[str] = []
+    values: list[Any] = []
+    arrays: list[tuple[str, int]] = []
+    _flatten(x, code, values, arrays)
+    layout = _layout(type(x))
+    if tuple(arrays) != layout.arrays or "".join(code) != layout.code.format[1:]:
+        raise TypeError(
+            f"this {type(x).__name__} has arrays or numbers of other types than the kernel takes"
+        )
+    words = np.frombuffer(layout.code.pack(*values), dtype=np.int64)
+    return _Packed(x, words, words.__array_interface__["data"][0])
+
+
+class _Last(threading.local):
+    """The last of each type that a thread has packed: flights call the kernel with the same ones again and again."""
+
+    def __init__(self) -> None:
+        self.packed: dict[type, _Packed] = {}
+
+
+_last = _Last()
+
+
+def _packed(x: Any) -> _Packed:
+    found = _last.packed.get(type(x))
+    if found is None or found.of is not x:
+        found = _last.packed[type(x)] = _pack(x)
+    return found
+
+
+@cache
+def _layout(kind: type) -> _Layout:
+    code: list[str] = []
+    arrays: list[tuple[str, int]] = []
+    _flatten(next(x for x in examples() if isinstance(x, kind)), code, [], arrays)
+    return _Layout(struct.Struct("=" + "".join(code)), tuple(arrays))
+
+
+@cache
+def examples() -> tuple[Program, Workspace, Integrator, Stretch, Record]:
+    """One of each named tuple, as small as can be: their fields have the types of all."""
+    one, none, places, frame = np.ones(1), np.zeros(0), np.zeros((1, 3)), np.eye(3)
+    program = Program(
+        body_formulation=False,
+        has_frame=False,
+        vehicles=k.Vehicles(one, one, 1.0, one, False, 0.0),
+        graph=k.graph(np.zeros((0, 2), dtype=np.int64), one),
+        law=k.Law(0.0, 0.0, 0.0, k.ITERATED, 0.0, 0, 0.0, 0.0, 0.0),
+        reference=k.Reference(k.CONSTANT, 0.0, 0.0, none, none, places, places, np.zeros(3)),
+        motion=k.Motion(np.zeros(2), np.zeros((1, 6, 6)), frame),
+        feedback=k.Feedback(
+            none, np.zeros((0, 4)), np.zeros((0, 4)), 0.0, *np.zeros((2, 3)), frame, np.zeros(3), np.zeros(4)
+        ),
+        control=k.Control(k.OPEN, places, 0.0, 0.0, k.RIGID),
+        external=0,
+        disturbance=k.calm(one),
+    )  # fmt: skip
+    state = integrator(np.zeros(6), 0.0, rtol=0.0, atol=np.ones(6))
+    stretch = Stretch(0.0, False, 0, none, np.zeros((0, 6)), none)
+    return program, k.workspace(1, 0), state, stretch, _UNRECORDED
+
+
+_NOTHING = np.zeros(0)
+_UNRECORDED = recorder(0, 0, 0)
+
+
+# -- machine code ------------------------------------------------------------------------------------
+
+
+class _Code(NamedTuple):
+    enter: Any
+    engine: Any  # keeps the code
+
+
+_loading = threading.Lock()
+_loaded: list[_Code] = []
+
+
+def _code() -> _Code:
+    """The kernel's machine code: from the cache, or compiled."""
+    if not _loaded:
+        with _loading:
+            if not _loaded:
+                _loaded.append(_load())
+    return _loaded[0]
+
+
+def _load() -> _Code:
+    file = _file()
+    code = _read(file)
+    if code is None:
+        code = _compile()
+        _write(file, code)
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), target_machine())
+    engine.add_object_file(llvm.ObjectFileRef.from_data(code))
+    engine.finalize_object()
+    address = engine.get_function_address(ENTRY)
+    enter = ctypes.CFUNCTYPE(ctypes.c_int64, *(ctypes.c_int64,) * 5)(address)
+    return _Code(enter, engine)
+
+
+def _compile() -> bytes:
+    """Compile the kernel, in a process of its own where one can be had.
+
+    There Numba is told to translate alone: it would optimise each function before all of them together are, and
+    take twice as long.
+    """
+    import subprocess
+
+    if sys.executable:
+        command = [sys.executable, "-m", "rigidfleet.kernel.build"]
+        environment = os.environ | {"NUMBA_OPT": "0"}
+        done = subprocess.run(command, env=environment, capture_output=True, check=False)
+        if done.returncode == 0 and (code := _opened(done.stdout)) is not None:
+            return code
+    from rigidfleet.kernel.build import machine_code
+
+    return machine_code()
+
+
+def target_machine() -> Any:
+    """What machine code is made for: this machine."""
+    return llvm.Target.from_default_triple().create_target_machine(
+        cpu=llvm.get_host_cpu_name(), features=llvm.get_host_cpu_features().flatten(), opt=3, jit=True
+    )  # fmt: skip
+
+
+# -- the cache ---------------------------------------------------------------------------------------
+
+
+def _file() -> Path:
+    """Where the machine code is kept: by kind of machine."""
+    machine = f"{llvm.get_process_triple()} {llvm.get_host_cpu_name()} {llvm.get_host_cpu_features().flatten()}"
+    return cache_directory() / f"flight-{hashlib.sha256(machine.encode()).hexdigest()[:16]}.o"
+
+
+def sealed(code: bytes) -> bytes:
+    """Machine code with its digest, so that half of it is never called."""
+    return code + hashlib.sha256(code).digest()
+
+
+def _opened(data: bytes) -> bytes | None:
+    """Machine code that was `sealed`; None if it is not whole."""
+    code = data[:-32]
+    return code if code and sealed(code) == data else None
+
+
+def _read(file: Path) -> bytes | None:
+    try:
+        return _opened(file.read_bytes())
+    except OSError:
+        return None
+
+
+def _write(file: Path, code: bytes) -> None:
+    """Keep machine code, or warn that it will be compiled again."""
+    part = file.with_suffix(f".{os.getpid()}")
+    try:
+        part.write_bytes(sealed(code))
+        part.replace(file)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        warnings.warn(
+            f"the compiled flight kernel cannot be kept in {file.parent}: {error.strerror}. It will be compiled"
+            " again by the next process",
+            RuntimeWarning,
+            stacklevel=2,
+        )
+
+
+def is_compiled() -> bool:
+    """Return whether the machine code is in the cache, so that nothing has to be compiled."""
+    return _file().exists()
+
+
+def cache_directory() -> Path:
+    """Return the folder of the compiled kernel: one per state of its sources, Numba and Python.
+
+    The base is ``NUMBA_CACHE_DIR`` if set, else ``XDG_CACHE_HOME`` or ``~/.cache``; a folder that
+    cannot be written falls back to the system's temporary folder.
+    """
+    digest = hashlib.sha256(f"{version('numba')} {sys.version}".encode())
+    for source in sorted(Path(__file__).parent.glob("*.py")):
+        digest.update(source.read_bytes())
+    base = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    for root in (Path(base).expanduser(), Path(tempfile.gettempdir())):
+        folder = root / "rigidfleet" / f"kernel-{digest.hexdigest()[:16]}"
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError:
+            continue
+        if os.access(folder, os.W_OK):
+            return folder
+    return folder
