@@ -15,7 +15,7 @@ import pytest
 
 from rigidfleet import cli
 from rigidfleet.errors import ResultError
-from rigidfleet.kernel import compiled
+from rigidfleet.kernel import compiled, native
 from rigidfleet.result import Result
 
 MISSION = """
@@ -173,7 +173,7 @@ def test_kill_in_the_middle_of_a_write(flown: bytes):
 
 def test_a_full_disk_while_the_kernel_is_kept():
     """A kernel that cannot be written to its cache flies all the same; a warning names the folder and the reason."""
-    compiled._not_kept.cache_clear()
+    native.not_kept.cache_clear()
     double: Any = compiled.compiled(lambda x: 2.0 * x)
     limit = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (16, limit[1]))
@@ -185,3 +185,18 @@ def test_a_full_disk_while_the_kernel_is_kept():
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limit)
     assert double.stats.cache_path.startswith(str(compiled._CACHE))
+
+
+def test_a_full_disk_while_machine_code_is_kept(tmp_path, monkeypatch):
+    """Nothing is left of machine code that could not be written, but a warning."""
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    native.not_kept.cache_clear()
+    file = native._file()
+    limit = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (16, limit[1]))
+    try:
+        with pytest.warns(RuntimeWarning, match="File too large"):
+            native._write(file, b"machine code")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
+    assert not any(file.parent.iterdir())

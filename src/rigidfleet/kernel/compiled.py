@@ -4,10 +4,8 @@ Numba's own cache does not notice a change in a callee that lives in another fil
 folder is keyed here by a digest of all sources of the kernel.
 """
 
-import warnings
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
-from functools import cache
 from types import FunctionType
 from typing import Any, TypeVar
 
@@ -16,7 +14,7 @@ from numba import types
 from numba.core.caching import FunctionCache
 from numba.extending import intrinsic
 
-from rigidfleet.kernel.native import cache_directory
+from rigidfleet.kernel.native import cache_directory, not_kept
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -61,7 +59,7 @@ def compiled_for_c(function: Any, name: str, *, arguments: int, **instead: Any) 
         try:
             made = numba.cfunc(signature, cache=True, nopython=True)(copy)
         except OSError as error:
-            _not_kept(error.strerror)
+            not_kept(error.strerror)
             made = numba.cfunc(signature, nopython=True)(copy)
     _STAYING.append(made)
     return made.address
@@ -110,18 +108,7 @@ class _Cache(FunctionCache):
         try:
             super().save_overload(sig, data)
         except OSError as error:
-            _not_kept(error.strerror)
-
-
-@cache
-def _not_kept(why: str) -> None:
-    """Warn once, not for each function; Numba makes Python forget what it has warned of."""
-    warnings.warn(
-        f"the compiled flight kernel cannot be kept in {_CACHE}: {why}. It will be compiled again by"
-        " the next process",
-        RuntimeWarning,
-        stacklevel=3,
-    )
+            not_kept(error.strerror)
 
 
 def _cached(function: F, options: dict[str, Any]) -> F:

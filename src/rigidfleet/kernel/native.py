@@ -282,12 +282,18 @@ def _write(file: Path, code: bytes) -> None:
         part.replace(file)
     except OSError as error:
         part.unlink(missing_ok=True)
-        warnings.warn(
-            f"the compiled flight kernel cannot be kept in {file.parent}: {error.strerror}. It will be compiled"
-            " again by the next process",
-            RuntimeWarning,
-            stacklevel=2,
-        )
+        not_kept(error.strerror)
+
+
+@cache
+def not_kept(why: str) -> None:
+    """Warn that what is compiled cannot be written to the cache; once, not for each function."""
+    warnings.warn(
+        f"the compiled flight kernel cannot be kept in {cache_directory()}: {why}. It will be compiled again by"
+        " the next process",
+        RuntimeWarning,
+        stacklevel=3,
+    )
 
 
 def is_compiled() -> bool:
