@@ -172,7 +172,12 @@ class Result:
     integral: Annotated[Floats, _v("time edge", "m s", "integral of the constraint error")]
     multiplier: Annotated[Floats, _v("time edge", "N", "multiplier lambda; the tension is -lambda")]
     singular_value: Annotated[
-        Floats, _v("time", "1", "smallest non-zero singular value of the constraint Jacobian J")
+        Floats,
+        _v(
+            "time",
+            "1",
+            "smallest non-zero singular value of the constraint Jacobian J; of many agents at some samples",
+        ),
     ]
 
     separation: Annotated[
