@@ -65,6 +65,7 @@ def _optimised(text: str, symbol: str) -> bytes:
     # quick run leaves it to the second.
     for level in (1, 3):
         options = llvm.create_pipeline_tuning_options(speed_level=level)
+        options.loop_vectorization = False  # loops are short; the integrator's sums are of vectors
         builder = llvm.create_pass_builder(machine, options)
         builder.getModulePassManager().run(module, builder)
     for function in module.functions:
