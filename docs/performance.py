@@ -163,11 +163,18 @@ def _many(data: Data) -> str:
                 f"{row['wall']:.2g}" if row["wall"] < 10 else f"{row['wall']:.0f}",
                 " / ".join(f"{rate:.2g}" if rate < 10 else f"{rate:.0f}" for rate in rates),
                 f"{row['memory']:.2g}",
-                f"{row['error']:.0e}{flat}",
+                f"{row['error']:.0e}",
+                f"{row['shape']:.0e}{flat}",
             )
         )
     head = ("formation", "agents", "edges", "solve", "steps", "wall [s]")
-    head = (*head, "times real time, wall / processor", "memory [GB]", "worst edge at the end [m]")
+    head = (
+        *head,
+        "times real time, wall / processor",
+        "memory [GB]",
+        "worst edge at the end [m]",
+        "worst pair [m]",
+    )
     goals = [
         (
             goal["name"],
@@ -177,7 +184,9 @@ def _many(data: Data) -> str:
         )
         for goal in found["goals"]
     ]
-    return f"{_table(head, rows)}\n\n{_table(('', 'goal', 'measured', 'reached'), goals)}\n\n{_machine(found)}"
+    judged = _table(("", "goal", "measured", "reached"), goals)
+    load = f"Other programs' load when it began: {found['load']:.1f}."
+    return f"{_table(head, rows)}\n\n{judged}\n\n{_machine(found)} {load}"
 
 
 def _graphs(data: Data) -> str:

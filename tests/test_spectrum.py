@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rigidfleet import formation as shapes
-from rigidfleet.rigidity import analyse, spectrum
+from rigidfleet.rigidity import analyse, jacobian, spectrum
 
 
 @pytest.mark.parametrize("edges", [shapes.neighbours, shapes.joined])
@@ -44,3 +44,13 @@ def test_a_crowd_of_free_motions_is_told_in_time():
     found = spectrum(p, chain, np.ones(600))
     assert found.w == 0
     assert found.free > 0
+
+
+@pytest.mark.parametrize("graph", [shapes.neighbours, shapes.coarse_to_fine])
+def test_no_eigenvalue_of_a_shell_is_missed(graph):
+    """Next to the six of rigid motions, which are equal, the lowest is found: that of the dense matrix."""
+    p = shapes.slots("sphere", 2.0, 300)
+    J = jacobian(p, graph(p))
+    found = spectrum(p, graph(p), np.ones(300))
+    assert found.w == pytest.approx(np.linalg.eigvalsh(J.T @ J)[6], rel=1e-6)
+    assert found.free == 0

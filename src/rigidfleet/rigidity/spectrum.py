@@ -7,13 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigidfleet.formation import Ints
+from rigidfleet.formation import Floats, Ints
 from rigidfleet.rigidity.framework import ZERO
 
-#: So many eigenvalues are looked for at the lower end: six of rigid motions, and some more.
-_LOWEST = 12
+#: So many eigenvalues are looked for at the lower end, besides those of rigid motions.
+_LOWEST = 6
 #: Beyond so many restarts eigenvalues that are not found are taken for zero: some seconds at 2,000 agents.
-_MOST_RESTARTS = 40
+_MOST_RESTARTS = 300
 #: Beyond so many agents the factor that this takes is too large.
 MOST = 5000
 
@@ -46,8 +46,8 @@ def spectrum(points: ArrayLike, edges: Ints, masses: ArrayLike) -> Spectrum:
 
     Parameters: points (N, 3) [m], edges (m, 2), masses (N,) [kg].
     """
-    from scipy.sparse import csr_array
-    from scipy.sparse.linalg import ArpackNoConvergence, eigsh
+    from scipy.sparse import csr_array, eye_array
+    from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh, splu
 
     p, m = np.asarray(points, dtype=np.float64), np.asarray(masses, dtype=np.float64)
     n, count = len(p), len(edges)
@@ -60,14 +60,31 @@ def spectrum(points: ArrayLike, edges: Ints, masses: ArrayLike) -> Spectrum:
     K = (J.T @ J).tocsc()
     start = np.random.default_rng(0).normal(size=3 * n)
     w_max = float(eigsh(K, k=1, v0=start, return_eigenvectors=False)[0])
-    # A little below zero, where K can be factored.
+    # A little below zero, where K can be factored. Rigid motions are taken out: six equal values would hide the next.
     shift = -1e-6 * w_max
+    solve, rigid = splu(K - shift * eye_array(3 * n, format="csc")).solve, _rigid(p, share)
+
+    def inverse(x: Floats) -> Floats:
+        y = solve(x - rigid @ (rigid.T @ x))
+        return y - rigid @ (rigid.T @ y)
+
+    operator = LinearOperator(K.shape, matvec=inverse, dtype=np.float64)  # ty: ignore
     try:
-        lowest = eigsh(
-            K, k=_LOWEST, sigma=shift, v0=start, return_eigenvectors=False, tol=1e-9, maxiter=_MOST_RESTARTS
+        held = eigsh(
+            K, k=_LOWEST, sigma=shift, OPinv=operator, v0=inverse(start), return_eigenvectors=False, tol=1e-9,
+            maxiter=_MOST_RESTARTS,
         )  # fmt: skip
     except ArpackNoConvergence:  # a crowd of them next to zero cannot be told apart
-        return Spectrum(0.0, w_max, _LOWEST - 6)
-    held = np.sort(lowest)[6:]
+        return Spectrum(0.0, w_max, _LOWEST)
     zero = held < (10 * ZERO) ** 2 * w_max
-    return Spectrum(0.0 if zero.any() else float(held[0]), w_max, int(np.count_nonzero(zero)))
+    return Spectrum(0.0 if zero.any() else float(held.min()), w_max, int(np.count_nonzero(zero)))
+
+
+def _rigid(p: Floats, share: Floats) -> Floats:
+    """Orthonormal rigid motions (3N, 6) of points (N, 3), in the coordinates of J M^-1/2; five of a line."""
+    x, turns = p - p.mean(axis=0), np.zeros((len(p), 3, 6))
+    for k in range(3):
+        turns[:, k, k] = 1.0
+        turns[:, :, 3 + k] = np.cross(np.eye(3)[k], x) / np.abs(x).max()
+    U, size, _ = np.linalg.svd((turns / share[:, None, None]).reshape(-1, 6), full_matrices=False)
+    return U[:, size > 1e-9 * size[0]]
