@@ -154,7 +154,7 @@ def _closeness(mission: Mission, r: Array, left: NDArray[np.bool_]) -> tuple[Any
     radius = np.array(mission.agents.radius)
     found = np.full(len(r), np.inf), np.full((len(r), 2), -1), np.full(len(r), np.inf)
     found = *found, np.full(len(r), -1), np.full(len(r), -1)
-    for who in np.unique(left, axis=0):
+    for who in left[:1] if left.all() else np.unique(left, axis=0):
         rows, agents = (left == who).all(axis=1), np.flatnonzero(who)
         among = r[rows][:, agents]
         room, pair = geometry.separation(among, radius[agents])
