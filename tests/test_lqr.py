@@ -291,3 +291,11 @@ def test_errors(call, message):
     """Weights, shapes and times that mean nothing are refused, and the message says why."""
     with pytest.raises(ValueError, match=message):
         call()
+
+
+@pytest.mark.parametrize("Q", [[1.0, 1e15], [1e-9, 1e9], [1e9, 1e-9], [1e15, 1.0]])
+def test_references_take_weights_of_any_proportion(Q):
+    """Knots of a reference come out where the two weights differ by 24 orders of magnitude."""
+    times = knots(0.2, Q, [1.0])
+    assert np.isfinite(times).all()
+    assert times[-1] == pytest.approx(0.2)

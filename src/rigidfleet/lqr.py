@@ -255,8 +255,17 @@ def _responses(*keys: Key) -> tuple[Array, Array]:
 
 @lru_cache(_KEPT)
 def _cost_at_rest(Q: Key, R: Key) -> Array:
-    """P (2, 2) of the double integrator's infinite horizon."""
-    return infinite_horizon(_A, _B, _array(Q), _array(R))[1]
+    """P (2, 2) of the double integrator's infinite horizon, as `infinite_horizon` has it.
+
+    Its Riccati equation has a solution in closed form, exact whatever the weights.
+    """
+    _, _, weights, effort = _system(_A, _B, _array(Q), _array(R))
+    (a, b), (_, d), r = *weights.tolist(), float(effort[0, 0])
+    if not a > 0.0:
+        return infinite_horizon(_A, _B, weights, effort)[1]  # says what is wrong
+    cross = math.sqrt(a) * math.sqrt(r)
+    last = math.sqrt(r) * math.sqrt(d + 2.0 * cross)
+    return np.array([[cross * last / r - b, cross], [cross, last]])
 
 
 def _key(value: ArrayLike) -> Key:
