@@ -19,6 +19,7 @@ from rigidfleet.kernel import flight, lanes
 from rigidfleet.kernel.compiled import compiled_copy, compiled_for_c, inlined
 from rigidfleet.kernel.lanes import VECTOR, WIDTH, LaneArray
 from rigidfleet.kernel.program import Array, Program
+from rigidfleet.kernel.records import STATE, TRIAL
 from rigidfleet.kernel.references import septic
 from rigidfleet.kernel.trace import Code, Symbol, Trace, structure
 
@@ -86,24 +87,26 @@ def _advance(k, stage, a, h):
     a3, a4, a5 = h * a[stage, 3], h * a[stage, 4], h * a[stage, 5]
     if stage <= 1:
         for q in range(k.shape[1]):
-            k[8, q] = k[7, q] + a0 * k[0, q]
+            k[TRIAL, q] = k[STATE, q] + a0 * k[0, q]
     elif stage == 2:
         for q in range(k.shape[1]):
-            k[8, q] = k[7, q] + a0 * k[0, q] + a1 * k[1, q]
+            k[TRIAL, q] = k[STATE, q] + a0 * k[0, q] + a1 * k[1, q]
     elif stage == 3:
         for q in range(k.shape[1]):
-            k[8, q] = (k[7, q] + a0 * k[0, q]) + (a1 * k[1, q] + a2 * k[2, q])
+            k[TRIAL, q] = (k[STATE, q] + a0 * k[0, q]) + (a1 * k[1, q] + a2 * k[2, q])
     elif stage == 4:
         for q in range(k.shape[1]):
-            k[8, q] = (k[7, q] + a0 * k[0, q] + a1 * k[1, q]) + (a2 * k[2, q] + a3 * k[3, q])
+            k[TRIAL, q] = (k[STATE, q] + a0 * k[0, q] + a1 * k[1, q]) + (
+                a2 * k[2, q] + a3 * k[3, q]
+            )
     elif stage == 5:
         for q in range(k.shape[1]):
-            k[8, q] = (k[7, q] + a0 * k[0, q] + a1 * k[1, q]) + (
+            k[TRIAL, q] = (k[STATE, q] + a0 * k[0, q] + a1 * k[1, q]) + (
                 a2 * k[2, q] + a3 * k[3, q] + a4 * k[4, q]
             )
     else:
         for q in range(k.shape[1]):
-            k[8, q] = (k[7, q] + a0 * k[0, q] + a2 * k[2, q]) + (
+            k[TRIAL, q] = (k[STATE, q] + a0 * k[0, q] + a2 * k[2, q]) + (
                 a3 * k[3, q] + a4 * k[4, q] + a5 * k[5, q]
             )
 
