@@ -17,6 +17,9 @@ from rigidfleet.mission import Mission, load_mission
 Array = NDArray[np.float64]
 DURATION = 20.0  # [s]
 FORCE = (0.1, 0.1, 0.0)  # on every agent beyond its weight, as in the paper [N]
+#: What programs with adaptive steps are flown at, and those with equal ones [s].
+TOLERANCES = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10)
+STEPS = (0.08, 0.04, 0.02, 0.01, 0.005, 0.0025, 0.00125)
 #: Flights are timed for so long at least [s].
 AT_LEAST = 0.1
 

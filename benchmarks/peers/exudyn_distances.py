@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .case import DURATION, AbsentError, Array, Case, Flight, Peer, timed
+from .case import DURATION, STEPS, AbsentError, Array, Case, Flight, Peer, timed
 
 
 def peer() -> Peer:
@@ -19,7 +19,7 @@ def peer() -> Peer:
         "hard constraints (index 3), whose distances are set before each step, from Python, to what our law makes"
         " of them, so that the motion is the same; implicit steps of equal length",
         True,
-        (0.08, 0.04, 0.02, 0.01, 0.005, 0.0025, 0.00125),
+        STEPS,
         "step [s]",
         flight,
     )

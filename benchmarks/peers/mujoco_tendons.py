@@ -6,7 +6,7 @@ import numpy as np
 
 from rigidfleet import formation as shapes
 
-from .case import DURATION, AbsentError, Array, Case, Flight, Peer, timed
+from .case import DURATION, STEPS, AbsentError, Array, Case, Flight, Peer, timed
 
 
 def peer() -> Peer:
@@ -21,7 +21,7 @@ def peer() -> Peer:
         "soft constraints, set as stiff as they get (impedance 0.9999), with our alpha and beta but without"
         " the integral and without the centripetal term of turning edges; steps of equal length",
         False,
-        (0.08, 0.04, 0.02, 0.01, 0.005, 0.0025, 0.00125),
+        STEPS,
         "step [s]",
         flight,
     )

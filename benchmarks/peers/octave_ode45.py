@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .case import DURATION, AbsentError, Array, Case, Flight, Peer
+from .case import DURATION, TOLERANCES, AbsentError, Array, Case, Flight, Peer
 
 SCRIPT = Path(__file__).with_name("establish.m")
 
@@ -48,7 +48,7 @@ def peer() -> Peer:
         text.stdout.split("version ")[1].split()[0],
         "the same law and order of method; vectorised",
         True,
-        (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10),
+        TOLERANCES,
         "tolerance",
         flight,
     )

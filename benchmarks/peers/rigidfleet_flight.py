@@ -5,7 +5,7 @@ from __future__ import annotations
 from rigidfleet import __version__
 from rigidfleet.simulate import simulate
 
-from .case import Array, Case, Flight, Peer, timed
+from .case import TOLERANCES, Array, Case, Flight, Peer, timed
 
 
 def peer() -> Peer:
@@ -15,7 +15,7 @@ def peer() -> Peer:
         __version__,
         "all that a user waits for: planning, flight, and a result of 200 samples",
         True,
-        (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10),
+        TOLERANCES,
         "tolerance",
         flight,
     )

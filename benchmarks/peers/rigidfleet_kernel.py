@@ -8,7 +8,7 @@ from run import compiled_flight
 from rigidfleet import __version__
 from rigidfleet.simulate import simulate
 
-from .case import DURATION, Array, Case, Flight, Peer, timed
+from .case import DURATION, TOLERANCES, Array, Case, Flight, Peer, timed
 
 #: Agents up to which constraint forces are solved for in the kernel itself.
 DENSE = 20
@@ -21,7 +21,7 @@ def peer() -> Peer:
         __version__,
         "adaptive steps; the flight alone, planned before the clock starts",
         True,
-        (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10),
+        TOLERANCES,
         "tolerance",
         flight,
     )

@@ -6,7 +6,7 @@ import numpy as np
 import scipy
 from scipy_peer import Literal, constant
 
-from .case import DURATION, Array, Case, Flight, Peer, timed
+from .case import DURATION, TOLERANCES, Array, Case, Flight, Peer, timed
 
 
 def peer() -> Peer:
@@ -16,7 +16,7 @@ def peer() -> Peer:
         scipy.__version__,
         "the same law and order of method; right-hand side in NumPy",
         True,
-        (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10),
+        TOLERANCES,
         "tolerance",
         flight,
     )

@@ -12,8 +12,17 @@ from numpy.typing import NDArray
 
 from rigidfleet.kernel import native
 from rigidfleet.kernel.compiled import compiled
-from rigidfleet.kernel.lanes import WIDTH, LaneArray, pack, padded, unpack
-from rigidfleet.kernel.program import EXACT, ITERATED, OPEN, SLOTS, Array, Program, workspace
+from rigidfleet.kernel.lanes import WIDTH, LaneArray, pack, unpack
+from rigidfleet.kernel.program import (
+    EXACT,
+    ITERATED,
+    OPEN,
+    SLOTS,
+    Array,
+    Program,
+    padded,
+    workspace,
+)
 from rigidfleet.kernel.records import FINISHED, integrator
 from rigidfleet.kernel.straight import integrate, straight
 

@@ -326,8 +326,3 @@ def _overload_total_or_worst(x, states):
     if states.dtype == lanes:
         return lambda x, states: _fold(x, True)
     return lambda x, states: _fold(x, False)
-
-
-def padded(count: int) -> int:
-    """``count`` rounded up to a whole number of values."""
-    return -(-count // WIDTH) * WIDTH

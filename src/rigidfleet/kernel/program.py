@@ -223,13 +223,18 @@ def workspace(
     return w
 
 
+def padded(count: int) -> int:
+    """``count`` rounded up to eights: of numbers to a cache line, and of flights or states to a value of `lanes`."""
+    return -(-count // 8) * 8
+
+
 def _side_by_side(**shapes: tuple[int, ...]) -> dict[str, Array]:
     """Arrays of zeros, each of which begins with a cache line."""
     sizes = [math.prod(shape) for shape in shapes.values()]
-    ends = list(accumulate(-(-size // 8) * 8 for size in sizes))
+    ends = list(accumulate(map(padded, sizes)))
     room = zeros(ends[-1])
     return {
-        name: room[end - -(-size // 8) * 8 :][:size].reshape(shape)
+        name: room[end - padded(size) :][:size].reshape(shape)
         for (name, shape), size, end in zip(shapes.items(), sizes, ends, strict=True)
     }
 

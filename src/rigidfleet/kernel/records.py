@@ -8,14 +8,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rigidfleet.kernel.program import Array, zeros
+from rigidfleet.kernel.program import Array, padded, zeros
 
 #: What an integration returns.
 FINISHED, PAUSED, COLLAPSED = range(3)
 #: Rows of `Integrator.K` after the seven stages.
 STATE, TRIAL, ATOL = 7, 8, 9
-#: The integrator's sums take so many states at a time, see `rigidfleet.kernel.lanes`.
-_EIGHT = 8
 
 
 class Integrator(NamedTuple):
@@ -34,7 +32,7 @@ def integrator(y: Array, t: float, *, rtol: float, atol: Array, step: float = 1e
     ``atol`` (n,) is the absolute tolerance of each state, ``rtol`` the relative one of all.
     """
     n = len(y)
-    K = zeros(10, -(-n // _EIGHT) * _EIGHT)
+    K = zeros(10, padded(n))
     K[ATOL] = 1.0
     K[ATOL, :n] = atol
     clock, count = np.array([t, step, 1e-4]), np.zeros(4, dtype=np.int64)
