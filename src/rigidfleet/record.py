@@ -101,7 +101,12 @@ def assemble(
     distance = np.linalg.norm(r[:, edges[:, 0]] - r[:, edges[:, 1]], axis=2)
     if not left.all():
         distance[~left[:, edges].all(axis=2)] = np.nan
-    reference = _by_edge(pieces, "d", edges)
+    columns = [_columns(p.edges, edges) for p in pieces]
+
+    def by_edge(name: str) -> Array:
+        return _by_edge(pieces, columns, name, len(edges))
+
+    reference = by_edge("d")
     noisy = mission.disturbances is not None and mission.disturbances.noise is not None
     return Result(
         time=time,
@@ -128,10 +133,10 @@ def assemble(
         edges=edges,
         distance=distance,
         distance_reference=reference,
-        distance_rate_reference=_by_edge(pieces, "d_dot", edges),
-        constraint=distance - reference if noisy else _by_edge(pieces, "c", edges),
-        integral=_by_edge(pieces, "integral", edges),
-        multiplier=_by_edge(pieces, "multiplier", edges),
+        distance_rate_reference=by_edge("d_dot"),
+        constraint=distance - reference if noisy else by_edge("c"),
+        integral=by_edge("integral"),
+        multiplier=by_edge("multiplier"),
         singular_value=_singular_values(pieces),
         separation=separation,
         separation_pair=pair,
@@ -152,9 +157,11 @@ def assemble(
 def _closeness(mission: Mission, r: Array, left: NDArray[np.bool_]) -> tuple[Any, ...]:
     """What `geometry.separation` and `geometry.clearance` find among the vehicles left (K, N)."""
     radius = np.array(mission.agents.radius)
+    if left.all():
+        return *geometry.separation(r, radius), *geometry.clearance(r, radius, mission.obstacles)
     found = np.full(len(r), np.inf), np.full((len(r), 2), -1), np.full(len(r), np.inf)
     found = *found, np.full(len(r), -1), np.full(len(r), -1)
-    for who in left[:1] if left.all() else np.unique(left, axis=0):
+    for who in np.unique(left, axis=0):
         rows, agents = (left == who).all(axis=1), np.flatnonzero(who)
         among = r[rows][:, agents]
         room, pair = geometry.separation(among, radius[agents])
@@ -212,19 +219,23 @@ def _attitudes(
     return att.unwrap_quaternion(quaternions), line
 
 
-def _by_edge(pieces: Sequence[Piece], name: str, edges: Ints) -> Array:
+def _by_edge(
+    pieces: Sequence[Piece], columns: Sequence[Ints | slice], name: str, count: int
+) -> Array:
     """A quantity of the edges (K, m), NaN while an edge is not active."""
     rows = []
-    for piece in pieces:
+    for piece, places in zip(pieces, columns, strict=True):
         values = piece.integral if name == "integral" else getattr(piece.record, name)
-        full = np.full((len(piece.time), len(edges)), np.nan)
-        full[:, _columns(piece.edges, edges)] = values
+        full = np.full((len(piece.time), count), np.nan)
+        full[:, places] = values
         rows.append(full)
     return np.concatenate(rows)
 
 
-def _columns(some: Ints, edges: Ints) -> Ints:
+def _columns(some: Ints, edges: Ints) -> Ints | slice:
     """Where some edges are among all, (m, 2) both."""
+    if np.array_equal(some, edges):
+        return slice(None)
     key = edges.max(initial=0) + 1
     keys = edges[:, 0] * key + edges[:, 1]
     order = np.argsort(keys)

@@ -10,30 +10,28 @@ from rigidfleet.kernel.program import PINV_EQUAL, PINV_INERTIA_FORCE, RIGID
 @compiled
 def centre_of_mass(r, m, M, out):
     """Mass-weighted mean of r (N, 3) into out (3,); M is the sum of the masses m (N,)."""
-    out[0], out[1], out[2] = 0.0, 0.0, 0.0
+    x = y = z = 0.0
     for i in range(r.shape[0]):
-        for q in range(3):
-            out[q] += m[i] * r[i, q]
-    for q in range(3):
-        out[q] /= M
+        x, y, z = x + m[i] * r[i, 0], y + m[i] * r[i, 1], z + m[i] * r[i, 2]
+    out[0], out[1], out[2] = x / M, y / M, z / M
 
 
 @compiled
 def inertia(r, m, cm, I):
     """Inertia I (3, 3) [kg m^2] of points r (N, 3) about cm: sum m (|x|^2 1 - x x^T)."""
-    for q in range(3):
-        I[q, 0], I[q, 1], I[q, 2] = 0.0, 0.0, 0.0
-    if r.shape[0] == 1:
-        return  # exactly: what rounding leaves of r - cm would have an inverse
-    for i in range(r.shape[0]):
+    a = b = c = d = e = f = 0.0
+    # Of one alone nothing, exactly: what rounding leaves of r - cm would have an inverse.
+    for i in range(r.shape[0] if r.shape[0] > 1 else 0):
         x, y, z = r[i, 0] - cm[0], r[i, 1] - cm[1], r[i, 2] - cm[2]
-        I[0, 0] += m[i] * (y * y + z * z)
-        I[1, 1] += m[i] * (x * x + z * z)
-        I[2, 2] += m[i] * (x * x + y * y)
-        I[0, 1] -= m[i] * x * y
-        I[0, 2] -= m[i] * x * z
-        I[1, 2] -= m[i] * y * z
-    I[1, 0], I[2, 0], I[2, 1] = I[0, 1], I[0, 2], I[1, 2]
+        a += m[i] * (y * y + z * z)
+        d += m[i] * (x * x + z * z)
+        f += m[i] * (x * x + y * y)
+        b -= m[i] * x * y
+        c -= m[i] * x * z
+        e -= m[i] * y * z
+    I[0, 0], I[0, 1], I[0, 2] = a, b, c
+    I[1, 0], I[1, 1], I[1, 2] = b, d, e
+    I[2, 0], I[2, 1], I[2, 2] = c, e, f
 
 
 @compiled
@@ -86,27 +84,31 @@ def mean_axes(r, v, m, M, w):
     centre_of_mass(v, m, M, w.cm[1])
     inertia(r, m, w.cm[0], w.I)
     inertia_inverse(w.I, w.I_inv)
-    h = w.cm[3]
-    h[0], h[1], h[2] = 0.0, 0.0, 0.0
+    r0, r1, r2 = w.cm[0, 0], w.cm[0, 1], w.cm[0, 2]
+    v0, v1, v2 = w.cm[1, 0], w.cm[1, 1], w.cm[1, 2]
+    h0 = h1 = h2 = 0.0
     for i in range(r.shape[0]):
-        x, y, z = r[i, 0] - w.cm[0, 0], r[i, 1] - w.cm[0, 1], r[i, 2] - w.cm[0, 2]
-        X, Y, Z = v[i, 0] - w.cm[1, 0], v[i, 1] - w.cm[1, 1], v[i, 2] - w.cm[1, 2]
-        h[0] += m[i] * (y * Z - z * Y)
-        h[1] += m[i] * (z * X - x * Z)
-        h[2] += m[i] * (x * Y - y * X)
-    multiply(w.I_inv, h, w.cm[2])
+        x, y, z = r[i, 0] - r0, r[i, 1] - r1, r[i, 2] - r2
+        X, Y, Z = v[i, 0] - v0, v[i, 1] - v1, v[i, 2] - v2
+        h0 += m[i] * (y * Z - z * Y)
+        h1 += m[i] * (z * X - x * Z)
+        h2 += m[i] * (x * Y - y * X)
+    w.cm[3, 0], w.cm[3, 1], w.cm[3, 2] = h0, h1, h2
+    multiply(w.I_inv, w.cm[3], w.cm[2])
 
 
 @compiled
 def damp_deformation(r, v, m, k_def, cm, f):
     """Add -k_def m_i (v_i - v_cm - omega x (r_i - r_cm)) to f (N, 3): no net force or torque."""
-    o = cm[2]
+    r0, r1, r2 = cm[0, 0], cm[0, 1], cm[0, 2]
+    v0, v1, v2 = cm[1, 0], cm[1, 1], cm[1, 2]
+    o0, o1, o2 = cm[2, 0], cm[2, 1], cm[2, 2]
     for i in range(r.shape[0]):
-        x, y, z = r[i, 0] - cm[0, 0], r[i, 1] - cm[0, 1], r[i, 2] - cm[0, 2]
+        x, y, z = r[i, 0] - r0, r[i, 1] - r1, r[i, 2] - r2
         k = k_def * m[i]
-        f[i, 0] -= k * (v[i, 0] - cm[1, 0] - (o[1] * z - o[2] * y))
-        f[i, 1] -= k * (v[i, 1] - cm[1, 1] - (o[2] * x - o[0] * z))
-        f[i, 2] -= k * (v[i, 2] - cm[1, 2] - (o[0] * y - o[1] * x))
+        f[i, 0] -= k * (v[i, 0] - v0 - (o1 * z - o2 * y))
+        f[i, 1] -= k * (v[i, 1] - v1 - (o2 * x - o0 * z))
+        f[i, 2] -= k * (v[i, 2] - v2 - (o0 * y - o1 * x))
 
 
 @compiled
@@ -196,10 +198,10 @@ def allocate_pinv(x, m, M, F, tau, split, I, I_inv, f, H, V, work):
     (``PINV_INERTIA``), or that plus x_i x m_i F/M, the torque of their share of the force.
     The wrench that results differs from the one asked: see theory in the documentation.
 
-    H (3N, 3N), V (3N, 3N) and work (3N, 3) are scratch; other arguments as in `allocate_rigid`.
+    H (3N, 3N), V (3N, 3N) and work (2, 3N) are scratch; other arguments as in `allocate_rigid`.
     """
     n = x.shape[0]
-    b = work[:, 1]
+    b, values = work[0], work[1]
     a0 = I_inv[0, 0] * tau[0] + I_inv[0, 1] * tau[1] + I_inv[0, 2] * tau[2]
     a1 = I_inv[1, 0] * tau[0] + I_inv[1, 1] * tau[1] + I_inv[1, 2] * tau[2]
     a2 = I_inv[2, 0] * tau[0] + I_inv[2, 1] * tau[1] + I_inv[2, 2] * tau[2]
@@ -230,7 +232,6 @@ def allocate_pinv(x, m, M, F, tau, split, I, I_inv, f, H, V, work):
             H[3 * i + q, 3 * i + q] += square
             for p in range(3):
                 H[3 * i + q, 3 * i + p] -= x[i, q] * x[i, p]
-    values = work[:, 2]
     largest = jacobi_eigen(H, V, values)
     for k in range(3 * n):
         f[k // 3, k % 3] = 0.0

@@ -3,24 +3,39 @@
 Numba translates the integrator, the recorder and all they call to LLVM's language. What is then called from
 nowhere else may be rearranged at will, and is optimised once, together.
 
-As a program (``python -m rigidfleet.kernel.build``) it writes the code to standard output.
+As a program (``python -m rigidfleet.kernel.build``) it writes the code to standard output. Most of the time goes into
+the translation, so that a second process does its half of it meanwhile.
 """
 
+import pickle
 import re
+import subprocess
 import sys
+from functools import cached_property
+from typing import Any
 
 import llvmlite.binding as llvm
 from numba import cfunc, typeof, types
+from numba.core import codegen, compiler, cpu, serialize
 
-from rigidfleet.kernel import flight, native
+from rigidfleet.kernel import body, constraint, control, flight, native
+from rigidfleet.kernel import disturbance as disturbances
 from rigidfleet.kernel.compiled import OPTIONS
-from rigidfleet.kernel.pointers import pointer
+from rigidfleet.kernel.pointers import Pointer, pointer
 
+_Functions = dict[Any, tuple[types.Type, ...]]
 #: What every evaluation of a flight goes through: its calls would take a tenth of a small formation's time.
 _HOT = (
-    "closed_loop", "mean_axes", "centre_of_mass", "inertia", "inertia_inverse", "multiply", "damp_deformation",
-    "reference_motion", "desired_agents", "local_law", "septic", "blend_slots", "distance_references", "right_side",
-    "solve_multipliers", "assemble", "cholesky", "cholesky_solve", "apply_multipliers",
+    "closed_loop", "input_law", "constraint_force", "accelerate", "mean_axes", "centre_of_mass", "inertia",
+    "inertia_inverse", "multiply", "damp_deformation", "reference_motion", "desired_agents", "local_law", "septic",
+    "blend_slots", "distance_references", "right_side", "solve_multipliers", "assemble", "cholesky",
+    "cholesky_solve", "apply_multipliers",
+)  # fmt: skip
+_NAME = "rigidfleet.kernel.build"
+#: Passes that simplify what Numba has translated, before and after functions are put into each other.
+_QUICK = (
+    "sroa", "simplify_cfg", "instruction_combine", "simplify_cfg", "always_inliner", "global_dead_code_eliminate",
+    "sroa", "instruction_combine", "simplify_cfg",
 )  # fmt: skip
 
 
@@ -45,36 +60,132 @@ def machine_code() -> bytes:
         return 0
 
     entry = cfunc(types.int64(*(types.int64,) * 5), **OPTIONS)(enter)
-    return _optimised(entry.inspect_llvm(), entry.native_name)
-
-
-def _optimised(text: str, symbol: str) -> bytes:
-    """Object code of a module of which ``symbol`` alone is called from outside."""
-    # Of the arguments only addresses of named tuples are said to be dereferenceable; nobody writes there.
-    module = llvm.parse_assembly(re.sub(r"(?=dereferenceable\(\d+\))", "readonly ", text))
-    hot = tuple(f"{len(name)}{name}B" for name in _HOT)  # as in the names that Numba gives
-    for thing in (*module.functions, *module.global_variables):
-        if thing.name == symbol:
-            thing.name = native.ENTRY
-        elif not thing.is_declaration:
-            thing.linkage = "internal"
-            if thing.is_function and any(name in thing.name for name in hot):
-                thing.add_function_attribute("alwaysinline")
-    machine = native.target_machine()
-    # That nothing fails, and nothing of Python is ever called to say so, shows only once all is inlined: a first,
-    # quick run leaves it to the second.
-    for level in (1, 3):
-        options = llvm.create_pipeline_tuning_options(speed_level=level)
-        options.loop_vectorization = False  # loops are short; the integrator's sums are of vectors
-        builder = llvm.create_pass_builder(machine, options)
-        builder.getModulePassManager().run(module, builder)
+    module = _simplified(entry.inspect_llvm(), entry.native_name, native.ENTRY)
+    builder = _passes(3)
+    builder.getModulePassManager().run(module, builder)
     for function in module.functions:
         if function.is_declaration and function.name.startswith(("numba_", "NRT_", "Py")):
             raise RuntimeError(
                 f"the kernel needs {function.name}, which only Numba's own callers have"
             )
-    return machine.emit_object(module)
+    return native.target_machine().emit_object(module)
+
+
+def _simplified(text: str, symbol: str, name: str) -> llvm.ModuleRef:
+    """Return a module of which ``symbol`` alone, now called ``name``, is called from outside."""
+    # Of the arguments only addresses of named tuples are said to be dereferenceable; nobody writes there.
+    module = llvm.parse_assembly(re.sub(r"(?=dereferenceable\(\d+\))", "readonly ", text))
+    hot = tuple(f"{len(name)}{name}B" for name in _HOT)  # as in the names that Numba gives
+    for thing in (*module.functions, *module.global_variables):
+        if thing.name == symbol:
+            thing.name, thing.linkage = name, "external"
+        elif not thing.is_declaration:
+            thing.linkage = "internal"
+            if thing.is_function and any(name in thing.name for name in hot):
+                thing.add_function_attribute("alwaysinline")
+    # That nothing fails, and nothing of Python is ever called to say so, shows only once all is inlined: a few quick
+    # passes leave little to the many.
+    quick = llvm.create_new_module_pass_manager()
+    for add in _QUICK:
+        getattr(quick, f"add_{add}_pass")()
+    quick.run(module, _passes(1))
+    return module
+
+
+def _passes(level: int) -> Any:
+    options = llvm.create_pipeline_tuning_options(speed_level=level)
+    options.loop_vectorization = False  # loops are short; the integrator's sums are of vectors
+    return llvm.create_pass_builder(native.target_machine(), options)
+
+
+# -- two processes -----------------------------------------------------------------------------------
+
+
+def _translate_only() -> None:
+    """Keep Numba from making machine code of each function that it translates: nobody calls it."""
+
+    def executable(_context: Any, library: Any, function: Any, environment: Any) -> Any:
+        library._ensure_finalized()
+        name, module = function.qualname.split(".")[-1], function.lookup_module()
+        return cpu._dynfunc.make_function(module, name, "", 0, environment, (library,))
+
+    cpu.CPUContext.get_executable = executable
+    codegen.JITCodeLibrary._finalize_specific = lambda _library: None
+    codegen.JITCPUCodegen.set_env = lambda _codegen, _name, _environment: None
+
+
+def _halves() -> tuple[_Functions, _Functions]:
+    """Functions, and the types of their arguments: those that this process begins with, those of the second."""
+    example, work, _, _, out = native.examples()
+    p, w, record = (Pointer(typeof(x)) for x in (example, work, out))
+    disturbance = Pointer(typeof(example.disturbance))
+    number, row = types.float64, typeof(example.vehicles.m)
+    own = {
+        constraint.constraint_force: (number, row, row, p, w),
+        flight.accelerate: (row, p, w),
+        flight.body_derivatives: (row, row, p, w),
+        flight.keep: (number, p, w, types.int64, record),
+        disturbances.disturb: (number, row, number, disturbance, w),
+        disturbances.sense: (number, disturbance, w),
+    }
+    places = typeof(work.r)
+    others = {
+        control.input_law: (number, p, w),
+        body.mean_axes: (places, places, row, number, w),
+        flight.world_states: (row, p, w),
+    }
+    return own, others
+
+
+def _translated() -> bytes:
+    """That half, each function as Numba would keep it, but simplified already."""
+    done = {}
+    for function, arguments in _halves()[1].items():
+        function.compile(arguments)
+        result = function.overloads[arguments]
+        symbol = result.fndesc.llvm_func_name
+        module = _simplified(result.library.get_llvm_str(), symbol, symbol)
+        result.library.serialize_using_object_code = result.library.serialize_using_bitcode
+        result.library._final_module = module
+        done[function.__name__] = serialize.dumps(result._reduce())
+    return pickle.dumps(done)
+
+
+class _SecondProcess:
+    """The second process, and, for the functions that it translates, what Numba takes for their cache."""
+
+    def __init__(self) -> None:
+        command = [sys.executable, "-m", _NAME, "half"]
+        self._process = subprocess.Popen(command, stdout=subprocess.PIPE)
+        for function, arguments in _halves()[1].items():
+            function._cache = self._Half(self, function, arguments)
+
+    @cached_property
+    def _done(self) -> dict[str, bytes]:
+        output, _ = self._process.communicate()
+        return pickle.loads(output) if self._process.returncode == 0 else {}
+
+    class _Half:
+        def __init__(self, process: "_SecondProcess", function: Any, arguments: Any) -> None:
+            self._process, self._name, self._arguments = process, function.__name__, arguments
+
+        def load_overload(self, arguments: Any, context: Any) -> Any:
+            """What the other process has made; None has Numba translate it here."""
+            done = self._process._done.get(self._name)
+            if done is None or arguments != self._arguments:
+                return None
+            return compiler.CompileResult._rebuild(context, *pickle.loads(done))
+
+        def save_overload(self, *_: Any) -> None:
+            """Nothing is kept."""
 
 
 if __name__ == "__main__":
-    sys.stdout.buffer.write(native.sealed(machine_code()))
+    _translate_only()
+    if sys.argv[1:] == ["half"]:
+        sys.stdout.buffer.write(_translated())
+    else:
+        _SecondProcess()
+        for function, arguments in _halves()[0].items():
+            function.compile(arguments)
+        sys.stdout.buffer.write(native.sealed(machine_code()))

@@ -15,6 +15,23 @@ import math
 from rigidfleet.kernel.compiled import call_solver, compiled, inlined
 from rigidfleet.kernel.linalg import cholesky, cholesky_solve, jacobi_eigen
 from rigidfleet.kernel.program import EXACT, ITERATED, PINV, SPECTRAL
+from rigidfleet.kernel.references import distance_references
+
+
+@inlined
+def constraint_force(t, y, dy, p, w):
+    """f_C (N, 3) [N] at time t [s] for w.r, w.v and the forces w.f_E and w.f_u; and dy of the integral of c."""
+    vehicles, graph = p.vehicles, p.graph
+    n, m = vehicles.m.shape[0], graph.edges.shape[0]
+    distance_references(t, p.reference, graph.edges, w.p, w.p_dot, w.p_ddot, w.d, w.d_dot, w.d_ddot)
+    for i in range(n):
+        for s in range(3):
+            w.a[i, s] = vehicles.inverse[i] * (w.f_E[i, s] + w.f_u[i, s])
+    right_side(w.r, w.v, y[6 * n : 6 * n + m], w.a, graph.edges, p.law, w)
+    solve_multipliers(vehicles, graph, p.law, w)
+    apply_multipliers(w.u, graph.edges, w.multiplier, w.f_C)
+    for k in range(m):
+        dy[6 * n + k] = w.c[k]
 
 
 @inlined

@@ -2,8 +2,17 @@
 
 import math
 
-from rigidfleet.kernel.body import allocate, multiply, multiply_transposed, rotation_vector
+from rigidfleet.kernel.body import (
+    allocate,
+    damp_deformation,
+    mean_axes,
+    multiply,
+    multiply_transposed,
+    rotation_vector,
+)
 from rigidfleet.kernel.compiled import compiled, inlined
+from rigidfleet.kernel.program import BODY, LOCAL, SLOTS
+from rigidfleet.kernel.references import blend_slots
 
 
 @compiled
@@ -229,3 +238,28 @@ def body_law(t, m, M, g, T, feedback, control, w):
         for q in range(3):
             w.a[i, q] = w.r[i, q] - w.cm[0, q]
     allocate(w.a, m, M, F, tau, o, control.allocation, w.I, w.I_inv, w.f_u, w.H, w.H_V, w.H_w)
+
+
+@inlined
+def input_law(t, p, w):
+    """Input force w.f_u (N, 3) [N] at t [s] by the phase's law, and what damps deformation, for w.r and w.v.
+
+    On the way come the mean axes (w.cm, w.I) where somebody needs them, and the slots (w.p).
+    """
+    m, M, g, control = p.vehicles.m, p.vehicles.M, p.vehicles.g, p.control
+    if p.law.k_def > 0.0 or p.has_frame or control.kind == BODY:
+        mean_axes(w.r, w.v, m, M, w)
+    if p.reference.kind == SLOTS or control.kind == LOCAL:
+        blend_slots(t, p.reference, w.p, w.p_dot, w.p_ddot)
+    if control.kind == LOCAL:
+        reference_motion(t, p.motion, w)
+        desired_agents(w)
+        local_law(w.r, w.v, m, g, control, w)
+    elif control.kind == BODY:
+        body_law(t, m, M, g, w.T, p.feedback, control, w)
+    else:
+        for i in range(m.shape[0]):
+            for s in range(3):
+                w.f_u[i, s] = control.force[i, s]
+    if p.law.k_def > 0.0:
+        damp_deformation(w.r, w.v, m, p.law.k_def, w.cm, w.f_u)

@@ -13,23 +13,18 @@ from numba.extending import intrinsic
 
 from rigidfleet.kernel.body import (
     attitude_matrix,
-    damp_deformation,
     mean_axes,
     multiply,
     multiply_transposed,
     quaternion_rate,
 )
 from rigidfleet.kernel.compiled import compiled, inlined
-from rigidfleet.kernel.constraint import (
-    apply_multipliers,
-    right_side,
-    solve_multipliers,
-)
-from rigidfleet.kernel.control import body_law, desired_agents, local_law, reference_motion
+from rigidfleet.kernel.constraint import constraint_force
+from rigidfleet.kernel.control import input_law
 from rigidfleet.kernel.disturbance import disturb, sense
 from rigidfleet.kernel.lanes import blocks, rough_inverse, spread, total_or_worst
 from rigidfleet.kernel.pointers import by_address
-from rigidfleet.kernel.program import BODY, LOCAL, OPEN, SLOTS, Program, Workspace
+from rigidfleet.kernel.program import BODY, LOCAL, OPEN, Program, Workspace
 from rigidfleet.kernel.records import (
     ATOL,
     COLLAPSED,
@@ -40,7 +35,7 @@ from rigidfleet.kernel.records import (
     Integrator,
     integrator,
 )
-from rigidfleet.kernel.references import blend_slots, distance_references
+from rigidfleet.kernel.references import blend_slots
 
 
 @intrinsic
@@ -71,7 +66,7 @@ def closed_loop(t, y, dy, p, w):
     law of the phase, f_C from the multipliers (Eq. 12), both from measured states and believed
     masses. Everything computed stays in ``w``.
     """
-    vehicles, graph, control, disturbance = p.vehicles, p.graph, p.control, p.disturbance
+    vehicles, graph, disturbance = p.vehicles, p.graph, p.disturbance
     m, g = vehicles.m, vehicles.g
     n = m.shape[0]
     n_edges = graph.edges.shape[0]
@@ -95,40 +90,27 @@ def closed_loop(t, y, dy, p, w):
     if disturbance.active:
         sense(t, disturbance, w)
 
-    if p.law.k_def > 0.0 or p.has_frame or control.kind == BODY:
-        mean_axes(r, v, m, vehicles.M, w)
-    if p.reference.kind == SLOTS or control.kind == LOCAL:
-        blend_slots(t, p.reference, w.p, w.p_dot, w.p_ddot)
-    if control.kind == LOCAL:
-        reference_motion(t, p.motion, w)
-        desired_agents(w)
-        local_law(r, v, m, g, control, w)
-    elif control.kind == BODY:
-        body_law(t, m, vehicles.M, g, T, p.feedback, control, w)
-    else:
-        for i in range(n):
-            for s in range(3):
-                w.f_u[i, s] = control.force[i, s]
-    if p.law.k_def > 0.0:
-        damp_deformation(r, v, m, p.law.k_def, w.cm, w.f_u)
+    input_law(t, p, w)
 
-    if n_edges > 0:
-        distance_references(
-            t, p.reference, graph.edges, w.p, w.p_dot, w.p_ddot, w.d, w.d_dot, w.d_ddot
-        )
-        for i in range(n):
-            for s in range(3):
-                w.a[i, s] = vehicles.inverse[i] * (w.f_E[i, s] + w.f_u[i, s])
-        right_side(r, v, y[6 * n : q], w.a, graph.edges, p.law, w)
-        solve_multipliers(vehicles, graph, p.law, w)
-        apply_multipliers(w.u, graph.edges, w.multiplier, w.f_C)
-        for k in range(n_edges):
-            dy[6 * n + k] = w.c[k]
-
+    if graph.edges.shape[0] > 0:
+        constraint_force(t, y, dy, p, w)
     if disturbance.active:
         disturb(t, m, g, disturbance, w)
         if p.has_frame and disturbance.noise_r.shape[0] > 0:  # the frame turns as the body does
             mean_axes(r, v, m, vehicles.M, w)
+    accelerate(dy, p, w)
+    if p.body_formulation:
+        body_derivatives(y, dy, p, w)
+    if p.has_frame:
+        multiply(T, w.cm[2], w.cm[4])
+        quaternion_rate(y[q : q + 4], w.cm[4], dy[q : q + 4])
+
+
+@inlined
+def accelerate(dy, p, w):
+    """Newton's law (Eq. 2) with true masses and what the vehicles can give: w.a (N, 3) [m/s^2], and dy of r and v."""
+    vehicles, inverse, v = p.vehicles, p.disturbance.inverse, w.v
+    n = inverse.shape[0]
     for i in range(n):
         share = 1.0
         if vehicles.saturate:
@@ -139,13 +121,8 @@ def closed_loop(t, y, dy, p, w):
             share = min(1.0, vehicles.thrust_limit[i] / max(math.sqrt(thrust), 1e-300))
         for s in range(3):
             net = w.f_E[i, s] + share * (w.f_u[i, s] + w.f_C[i, s])
-            w.a[i, s] = disturbance.inverse[i] * net
+            w.a[i, s] = inverse[i] * net
             dy[3 * i + s], dy[3 * n + 3 * i + s] = v[i, s], w.a[i, s]
-    if p.body_formulation:
-        body_derivatives(y, dy, p, w)
-    if p.has_frame:
-        multiply(T, w.cm[2], w.cm[4])
-        quaternion_rate(y[q : q + 4], w.cm[4], dy[q : q + 4])
 
 
 @compiled

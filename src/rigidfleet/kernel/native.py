@@ -231,7 +231,9 @@ def _compile() -> bytes:
 
     if sys.executable:
         command = [sys.executable, "-m", "rigidfleet.kernel.build"]
-        environment = os.environ | {"NUMBA_OPT": "0"}
+        # Nobody reads of the many versions that Numba tries, least of all in colours.
+        quiet = {"NUMBA_OPT": "0", "NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING": "1"}
+        environment = os.environ | quiet
         done = subprocess.run(command, env=environment, capture_output=True, check=False)
         if done.returncode == 0 and (code := _opened(done.stdout)) is not None:
             return code

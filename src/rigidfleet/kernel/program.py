@@ -186,7 +186,7 @@ class Workspace(NamedTuple):
     wrench: Array  # (6,) asked of the agents: force, torque about the CM, world [N, N m]
     H: Array  # (3N, 3N) normal matrix of the paper's H; work
     H_V: Array  # (3N, 3N)
-    H_w: Array  # (3N, 3): right side, eigenvalues, work
+    H_w: Array  # (2, 3N): right side, eigenvalues
 
 
 def zeros(*shape: int) -> Array:
@@ -216,7 +216,7 @@ def workspace(
             w=edges, multiplier=edges, f_E=agents, f_u=agents, f_C=agents, f_D=agents, a=agents,
             p=agents, p_dot=agents, p_ddot=agents, r_ref=agents, v_ref=agents, a_ref=agents,
             cm=(5, 3), I=space, I_inv=space, T=space, body=(8, 3), gain=(4,), E=space, T_ref=space,
-            wrench=(6,), H=(k, k), H_V=(k, k), H_w=(k, 3),
+            wrench=(6,), H=(k, k), H_V=(k, k), H_w=(2, k),
         )
     )  # fmt: skip
     w.T[:] = w.T_ref[:] = np.eye(3)
