@@ -32,11 +32,8 @@ _HOT = (
     "cholesky_solve", "apply_multipliers",
 )  # fmt: skip
 _NAME = "rigidfleet.kernel.build"
-#: Passes that simplify what Numba has translated, before and after functions are put into each other.
-_QUICK = (
-    "sroa", "simplify_cfg", "instruction_combine", "simplify_cfg", "always_inliner", "global_dead_code_eliminate",
-    "sroa", "instruction_combine", "simplify_cfg",
-)  # fmt: skip
+#: Passes that simplify each function that Numba has translated, before any is put into another.
+_QUICK = ("sroa", "simplify_cfg", "instruction_combine", "simplify_cfg")
 
 
 def machine_code() -> bytes:
@@ -83,8 +80,7 @@ def _simplified(text: str, symbol: str, name: str) -> llvm.ModuleRef:
             thing.linkage = "internal"
             if thing.is_function and any(name in thing.name for name in hot):
                 thing.add_function_attribute("alwaysinline")
-    # That nothing fails, and nothing of Python is ever called to say so, shows only once all is inlined: a few quick
-    # passes leave little to the many.
+    # A few quick passes leave a third of the work to the many.
     quick = llvm.create_new_module_pass_manager()
     for add in _QUICK:
         getattr(quick, f"add_{add}_pass")()
