@@ -196,7 +196,7 @@ def test_a_full_disk_while_machine_code_is_kept(tmp_path, monkeypatch):
     resource.setrlimit(resource.RLIMIT_FSIZE, (16, limit[1]))
     try:
         with pytest.warns(RuntimeWarning, match="File too large"):
-            native._write(file, b"machine code")
+            native._write(file, [b"machine code"])
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limit)
     assert not any(file.parent.iterdir())

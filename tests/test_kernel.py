@@ -1,6 +1,7 @@
 """The compiled kernel against finite differences, NumPy, SciPy and exact solutions."""
 
 import math
+import os
 import subprocess
 import sys
 from typing import Any
@@ -790,10 +791,29 @@ def test_half_a_kernel_is_none(tmp_path, monkeypatch):
     """Machine code that was cut off in the writing is compiled again, not called."""
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     file = native._file()
-    native._write(file, b"machine code")
-    assert native._read(file) == b"machine code"
+    native._write(file, [b"machine", b"code"])
+    assert native._read(file) == [b"machine", b"code"]
     file.write_bytes(file.read_bytes()[:-1])
     assert native._read(file) is None
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("helped", [True, False])
+def test_the_kernel_is_translated_once(helped):
+    """Two processes translate each function for the types that the others ask for; one does it alone if it must."""
+    code = f"""
+from rigidfleet.kernel import build
+build._translate_only()
+second = build._SecondProcess()
+if not {helped}:
+    second._process.kill()
+assert len(build.machine_code(second)) == 2
+ours, theirs = build._halves()
+assert [len(function.overloads) for function in (*ours, *theirs)] == [1] * len(ours | theirs)
+assert set(second.translated) == (set(function.__name__ for function in theirs) if {helped} else set())
+"""
+    environment = os.environ | {"NUMBA_OPT": "0"}
+    subprocess.run([sys.executable, "-c", code], check=True, env=environment)
 
 
 @pytest.mark.parametrize("change", ["type", "order", "dimensions"])

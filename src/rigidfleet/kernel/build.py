@@ -11,6 +11,7 @@ import pickle
 import re
 import subprocess
 import sys
+from contextlib import suppress
 from functools import cached_property
 from typing import Any
 
@@ -36,28 +37,46 @@ _NAME = "rigidfleet.kernel.build"
 _QUICK = ("sroa", "simplify_cfg", "instruction_combine", "simplify_cfg")
 
 
-def machine_code() -> bytes:
-    """Object code of the C function that `native` calls: int64(program, workspace, integrator, stretch, record).
+def machine_code(second: "_SecondProcess | None" = None) -> list[bytes]:
+    """Object code of the two C functions that `native` calls, `native.ENTRIES`.
 
-    All are addresses of named tuples. It integrates and returns what `flight.integrate` does; without an
-    integrator, it records.
+    All their arguments are addresses of named tuples. They integrate, and return what `flight.integrate` does, and
+    record. The ``second`` process, if there is one, does part of the work.
     """
     program, workspace, integrator, stretch, record = (
         pointer(typeof(x)) for x in native.examples()
     )
 
-    def enter(p, w, state, s, out):
+    def integrate_stretch(p, w, state, s):
         call = stretch(s)
-        if state != 0:
-            return flight.integrate(
-                program(p), workspace(w), integrator(state), call.t_end, call.fresh, call.times, call.samples,
-                call.max_steps,
-            )  # fmt: skip
+        return flight.integrate(
+            program(p), workspace(w), integrator(state), call.t_end, call.fresh, call.times, call.samples,
+            call.max_steps,
+        )  # fmt: skip
+
+    def record_stretch(p, w, s, out):
+        call = stretch(s)
         flight.record(call.times, call.samples, program(p), workspace(w), call.dy, record(out))
         return 0
 
-    entry = cfunc(types.int64(*(types.int64,) * 5), **OPTIONS)(enter)
-    module = _simplified(entry.inspect_llvm(), entry.native_name, native.ENTRY)
+    if second is not None:
+        for function, arguments in _halves()[0].items():  # before what waits for the second
+            function.compile(arguments)
+    compiled = cfunc(types.int64(*(types.int64,) * 4), **OPTIONS)
+    (integrate, name), (recorder, other) = (
+        (compiled(function), name)
+        for function, name in zip((integrate_stretch, record_stretch), native.ENTRIES, strict=True)
+    )
+    if second is not None:
+        second.optimise(recorder.inspect_llvm(), recorder.native_name, other)
+    code = _object(integrate.inspect_llvm(), integrate.native_name, name)
+    rest = None if second is None else second.optimised()
+    return [code, rest or _object(recorder.inspect_llvm(), recorder.native_name, other)]
+
+
+def _object(text: str, symbol: str, name: str) -> bytes:
+    """Object code of a module of which ``symbol`` alone, now called ``name``, is called from outside."""
+    module = _simplified(text, symbol, name)
     builder = _passes(3)
     builder.getModulePassManager().run(module, builder)
     for function in module.functions:
@@ -98,14 +117,28 @@ def _passes(level: int) -> Any:
 
 
 def _translate_only() -> None:
-    """Keep Numba from making machine code of each function that it translates: nobody calls it."""
+    """Keep Numba from all that nobody needs: machine code of each function, and of each a module with all it calls."""
 
     def executable(_context: Any, library: Any, function: Any, environment: Any) -> Any:
-        library._ensure_finalized()
         name, module = function.qualname.split(".")[-1], function.lookup_module()
         return cpu._dynfunc.make_function(module, name, "", 0, environment, (library,))
 
+    def finalize(library: Any) -> None:
+        library._finalized = True
+
+    def whole(library: Any) -> str:
+        module, seen, rest = library._final_module.clone(), {library}, [library]
+        while rest:
+            for other in rest.pop()._linking_libraries:
+                if other not in seen:
+                    seen.add(other)
+                    rest.append(other)
+                    module.link_in(other._final_module, preserve=True)
+        return str(module)
+
     cpu.CPUContext.get_executable = executable
+    codegen.CPUCodeLibrary.finalize = finalize
+    codegen.CPUCodeLibrary.get_llvm_str = whole
     codegen.JITCodeLibrary._finalize_specific = lambda _library: None
     codegen.JITCPUCodegen.set_env = lambda _codegen, _name, _environment: None
 
@@ -115,7 +148,7 @@ def _halves() -> tuple[_Functions, _Functions]:
     example, work, _, _, out = native.examples()
     p, w, record = (Pointer(typeof(x)) for x in (example, work, out))
     disturbance = Pointer(typeof(example.disturbance))
-    number, row = types.float64, typeof(example.vehicles.m)
+    number, row, places = types.float64, typeof(example.vehicles.m), typeof(work.r)
     own = {
         constraint.constraint_force: (number, row, row, p, w),
         flight.accelerate: (row, p, w),
@@ -123,18 +156,21 @@ def _halves() -> tuple[_Functions, _Functions]:
         flight.keep: (number, p, w, types.int64, record),
         disturbances.disturb: (number, row, number, disturbance, w),
         disturbances.sense: (number, disturbance, w),
-    }
-    places = typeof(work.r)
+        body.allocate: (
+            places, row, number, row, row, row, types.int64, places, places, places, places, places, places
+        ),
+    }  # fmt: skip
     others = {
-        control.input_law: (number, p, w),
+        control.local_law: (number, p, w),
+        control.body_law: (number, p, w),
         body.mean_axes: (places, places, row, number, w),
         flight.world_states: (row, p, w),
     }
     return own, others
 
 
-def _translated() -> bytes:
-    """That half, each function as Numba would keep it, but simplified already."""
+def _translated() -> dict[str, bytes]:
+    """The second half, each function as Numba would keep it, but simplified already."""
     done = {}
     for function, arguments in _halves()[1].items():
         function.compile(arguments)
@@ -144,30 +180,51 @@ def _translated() -> bytes:
         result.library.serialize_using_object_code = result.library.serialize_using_bitcode
         result.library._final_module = module
         done[function.__name__] = serialize.dumps(result._reduce())
-    return pickle.dumps(done)
+    return done
 
 
 class _SecondProcess:
-    """The second process, and, for the functions that it translates, what Numba takes for their cache."""
+    """The second process: it translates its half, and optimises one module.
+
+    Whatever comes to nothing there is done here.
+    """
 
     def __init__(self) -> None:
         command = [sys.executable, "-m", _NAME, "half"]
-        self._process = subprocess.Popen(command, stdout=subprocess.PIPE)
+        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
         for function, arguments in _halves()[1].items():
-            function._cache = self._Half(self, function, arguments)
+            function._cache = self._Half(self, function.__name__, arguments)
 
     @cached_property
-    def _done(self) -> dict[str, bytes]:
-        output, _ = self._process.communicate()
-        return pickle.loads(output) if self._process.returncode == 0 else {}
+    def translated(self) -> dict[str, bytes]:
+        """Its half, by the names of functions."""
+        return self._answer() or {}
+
+    def optimise(self, *module: str) -> None:
+        """Ask for the object of a module, see `_object`."""
+        assert self._process.stdin is not None
+        if self.translated:
+            with suppress(OSError), self._process.stdin as stream:
+                pickle.dump(module, stream)
+
+    def optimised(self) -> bytes | None:
+        """The object asked for."""
+        return self._answer()
+
+    def _answer(self) -> Any:
+        assert self._process.stdout is not None
+        with suppress(EOFError, pickle.UnpicklingError):
+            return pickle.load(self._process.stdout)
 
     class _Half:
-        def __init__(self, process: "_SecondProcess", function: Any, arguments: Any) -> None:
-            self._process, self._name, self._arguments = process, function.__name__, arguments
+        """What Numba takes for a function's cache."""
+
+        def __init__(self, process: "_SecondProcess", name: str, arguments: Any) -> None:
+            self._process, self._name, self._arguments = process, name, arguments
 
         def load_overload(self, arguments: Any, context: Any) -> Any:
             """What the other process has made; None has Numba translate it here."""
-            done = self._process._done.get(self._name)
+            done = self._process.translated.get(self._name)
             if done is None or arguments != self._arguments:
                 return None
             return compiler.CompileResult._rebuild(context, *pickle.loads(done))
@@ -176,12 +233,16 @@ class _SecondProcess:
             """Nothing is kept."""
 
 
-if __name__ == "__main__":
+def _main() -> None:
+    output = sys.stdout.buffer
     _translate_only()
     if sys.argv[1:] == ["half"]:
-        sys.stdout.buffer.write(_translated())
-    else:
-        _SecondProcess()
-        for function, arguments in _halves()[0].items():
-            function.compile(arguments)
-        sys.stdout.buffer.write(native.sealed(machine_code()))
+        pickle.dump(_translated(), output)
+        output.flush()
+        pickle.dump(_object(*pickle.load(sys.stdin.buffer)), output)
+        return
+    output.write(native.joined(machine_code(_SecondProcess())))
+
+
+if __name__ == "__main__":
+    _main()

@@ -146,11 +146,14 @@ def desired_agents(w):
 
 
 @inlined
-def local_law(r, v, m, g, control, w):
+def local_law(t, p, w):
     """Local LQR of every agent (paper, section V): f_i = m_i (a_i + g - k1 e_i - k2 de_i).
 
-    Writes w.f_u and, into w.wrench, the wrench that the reference motion itself asks for.
+    For slots w.p at t [s]. Writes w.f_u and, into w.wrench, the wrench that the reference motion itself asks for.
     """
+    r, v, m, g, control = w.r, w.v, p.vehicles.m, p.vehicles.g, p.control
+    reference_motion(t, p.motion, w)
+    desired_agents(w)
     for q in range(6):
         w.wrench[q] = 0.0
     for i in range(r.shape[0]):
@@ -197,14 +200,13 @@ def body_gains(t, feedback, out):
 
 
 @compiled
-def body_law(t, m, M, g, T, feedback, control, w):
-    """LQR on the virtual body: CM and attitude -> wrench -> every agent (w.f_u, w.wrench).
+def body_law(t, p, w):
+    """LQR on the virtual body: CM and attitude -> wrench w.wrench, for `allocate` to share.
 
     The target moves: r_wp + v_wp (t - T), and turns at omega_wp. With the attitude error phi,
     body = target Exp(phi): F = M (g - K e), tau = I (-K phi ...) + omega x I omega, world axes.
     """
-    n = m.shape[0]
-    gain = w.gain
+    M, g, T, feedback, gain = p.vehicles.M, p.vehicles.g, w.T, p.feedback, w.gain
     body_gains(t, feedback, gain)
     since = t - feedback.arrival
     F, tau = w.wrench[:3], w.wrench[3:]
@@ -234,10 +236,6 @@ def body_law(t, m, M, g, T, feedback, control, w):
     tau[0] += o[1] * h[2] - o[2] * h[1]
     tau[1] += o[2] * h[0] - o[0] * h[2]
     tau[2] += o[0] * h[1] - o[1] * h[0]
-    for i in range(n):
-        for q in range(3):
-            w.a[i, q] = w.r[i, q] - w.cm[0, q]
-    allocate(w.a, m, M, F, tau, o, control.allocation, w.I, w.I_inv, w.f_u, w.H, w.H_V, w.H_w)
 
 
 @inlined
@@ -246,20 +244,25 @@ def input_law(t, p, w):
 
     On the way come the mean axes (w.cm, w.I) where somebody needs them, and the slots (w.p).
     """
-    m, M, g, control = p.vehicles.m, p.vehicles.M, p.vehicles.g, p.control
+    m, M, control = p.vehicles.m, p.vehicles.M, p.control
     if p.law.k_def > 0.0 or p.has_frame or control.kind == BODY:
         mean_axes(w.r, w.v, m, M, w)
     if p.reference.kind == SLOTS or control.kind == LOCAL:
         blend_slots(t, p.reference, w.p, w.p_dot, w.p_ddot)
     if control.kind == LOCAL:
-        reference_motion(t, p.motion, w)
-        desired_agents(w)
-        local_law(w.r, w.v, m, g, control, w)
+        local_law(t, p, w)
     elif control.kind == BODY:
-        body_law(t, m, M, g, w.T, p.feedback, control, w)
+        body_law(t, p, w)
+        for i in range(m.shape[0]):
+            for q in range(3):
+                w.a[i, q] = w.r[i, q] - w.cm[0, q]
+        F, tau = w.wrench[:3], w.wrench[3:]
+        allocate(
+            w.a, m, M, F, tau, w.cm[2], control.allocation, w.I, w.I_inv, w.f_u, w.H, w.H_V, w.H_w
+        )
     else:
         for i in range(m.shape[0]):
-            for s in range(3):
-                w.f_u[i, s] = control.force[i, s]
+            for q in range(3):
+                w.f_u[i, q] = control.force[i, q]
     if p.law.k_def > 0.0:
         damp_deformation(w.r, w.v, m, p.law.k_def, w.cm, w.f_u)

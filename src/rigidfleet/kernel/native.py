@@ -15,6 +15,7 @@ import sys
 import tempfile
 import threading
 import warnings
+from collections.abc import Sequence
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -28,8 +29,9 @@ from rigidfleet.kernel import program as k
 from rigidfleet.kernel.program import Array, Program, Workspace
 from rigidfleet.kernel.records import Integrator, Record, Stretch, integrator, recorder
 
-#: What the machine code is called: int64 enter(program, workspace, integrator, stretch, record), all addresses.
-ENTRY = "rigidfleet_enter"
+#: What the machine code is called, its arguments being addresses: int64(program, workspace, integrator, stretch) and
+#: int64(program, workspace, stretch, record). Each comes in an object of its own.
+ENTRIES = "rigidfleet_integrate", "rigidfleet_record"
 
 
 def integrate(
@@ -44,7 +46,7 @@ def integrate(
 ) -> int:
     """Integrate to ``t_end`` [s], see `rigidfleet.kernel.flight.integrate`."""
     stretch = _pack(Stretch(t_end, fresh, max_steps, times, samples, _NOTHING))
-    return _enter(program, workspace, _packed(state), stretch, None)
+    return _call(_code().integrate, _packed(program), _packed(workspace), _packed(state), stretch)
 
 
 def record(program: Program, workspace: Workspace, times: Array, samples: Array) -> Record:
@@ -52,25 +54,19 @@ def record(program: Program, workspace: Workspace, times: Array, samples: Array)
     n, m = len(program.vehicles.m), len(program.graph.edges)
     out = recorder(len(times), n, m)
     stretch = Stretch(0.0, False, 0, times, samples, np.empty(samples.shape[1]))
-    _enter(program, workspace, None, _pack(stretch), _pack(out))
+    _call(_code().record, _packed(program), _packed(workspace), _pack(stretch), _pack(out))
     return out
 
 
 def closed_loop(t: float, y: Array, dy: Array, program: Program, workspace: Workspace) -> None:
     """Right-hand side dy (n,) at time t [s] and state y (n,), see `rigidfleet.kernel.flight.closed_loop`."""
     stretch = Stretch(0.0, False, 0, np.array([t]), y.reshape(1, -1), dy)
-    _enter(program, workspace, None, _pack(stretch), _packed(_UNRECORDED))
+    packed = _packed(program), _packed(workspace), _pack(stretch), _packed(_UNRECORDED)
+    _call(_code().record, *packed)
 
 
-def _enter(
-    program: Program,
-    workspace: Workspace,
-    state: _Packed | None,
-    stretch: _Packed,
-    out: _Packed | None,
-) -> int:
-    packed = _packed(program), _packed(workspace), state, stretch, out
-    return _code().enter(*(0 if p is None else p.address for p in packed))
+def _call(function: Any, *packed: _Packed) -> int:
+    return function(*(p.address for p in packed))
 
 
 # -- named tuples in words ---------------------------------------------------------------------------
@@ -188,7 +184,8 @@ _UNRECORDED = recorder(0, 0, 0)
 
 
 class _Code(NamedTuple):
-    enter: Any
+    integrate: Any
+    record: Any
     engine: Any  # keeps the code
 
 
@@ -207,21 +204,21 @@ def _code() -> _Code:
 
 def _load() -> _Code:
     file = _file()
-    code = _read(file)
-    if code is None:
-        code = _compile()
-        _write(file, code)
+    parts = _read(file)
+    if parts is None:
+        parts = _compile()
+        _write(file, parts)
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), target_machine())
-    engine.add_object_file(llvm.ObjectFileRef.from_data(code))
+    for part in parts:
+        engine.add_object_file(llvm.ObjectFileRef.from_data(part))
     engine.finalize_object()
-    address = engine.get_function_address(ENTRY)
-    enter = ctypes.CFUNCTYPE(ctypes.c_int64, *(ctypes.c_int64,) * 5)(address)
-    return _Code(enter, engine)
+    kind = ctypes.CFUNCTYPE(ctypes.c_int64, *(ctypes.c_int64,) * 4)
+    return _Code(*(kind(engine.get_function_address(name)) for name in ENTRIES), engine)
 
 
-def _compile() -> bytes:
+def _compile() -> list[bytes]:
     """Compile the kernel, in a process of its own where one can be had.
 
     There Numba is told to translate alone: it would optimise each function before all of them together are, and
@@ -235,8 +232,8 @@ def _compile() -> bytes:
         quiet = {"NUMBA_OPT": "0", "NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING": "1"}
         environment = os.environ | quiet
         done = subprocess.run(command, env=environment, capture_output=True, check=False)
-        if done.returncode == 0 and (code := _opened(done.stdout)) is not None:
-            return code
+        if done.returncode == 0 and (parts := _separated(done.stdout)) is not None:
+            return parts
     from rigidfleet.kernel.build import machine_code
 
     return machine_code()
@@ -258,29 +255,37 @@ def _file() -> Path:
     return cache_directory() / f"flight-{hashlib.sha256(machine.encode()).hexdigest()[:16]}.o"
 
 
-def sealed(code: bytes) -> bytes:
-    """Machine code with its digest, so that half of it is never called."""
+def joined(parts: Sequence[bytes]) -> bytes:
+    """Objects in one, each after its length, and their digest, so that half of them is never called."""
+    code = b"".join(len(part).to_bytes(8, "little") + part for part in parts)
     return code + hashlib.sha256(code).digest()
 
 
-def _opened(data: bytes) -> bytes | None:
-    """Machine code that was `sealed`; None if it is not whole."""
-    code = data[:-32]
-    return code if code and sealed(code) == data else None
+def _separated(data: bytes) -> list[bytes] | None:
+    """Objects that were `joined`; None if they are not whole."""
+    code, digest = data[:-32], data[-32:]
+    if not code or hashlib.sha256(code).digest() != digest:
+        return None
+    parts = []
+    while code:
+        end = 8 + int.from_bytes(code[:8], "little")
+        parts.append(code[8:end])
+        code = code[end:]
+    return parts
 
 
-def _read(file: Path) -> bytes | None:
+def _read(file: Path) -> list[bytes] | None:
     try:
-        return _opened(file.read_bytes())
+        return _separated(file.read_bytes())
     except OSError:
         return None
 
 
-def _write(file: Path, code: bytes) -> None:
+def _write(file: Path, parts: Sequence[bytes]) -> None:
     """Keep machine code, or warn that it will be compiled again."""
     part = file.with_suffix(f".{os.getpid()}")
     try:
-        part.write_bytes(sealed(code))
+        part.write_bytes(joined(parts))
         part.replace(file)
     except OSError as error:
         part.unlink(missing_ok=True)
