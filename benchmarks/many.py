@@ -43,19 +43,21 @@ LOAD = 0.05  # on an agent of the sheet, greatest [N]
 TOLERANCE = {"rtol": 1e-6, "atol": 1e-5}
 #: Flights of the table: kind, agents, and how many times real time they are to reach.
 FLIGHTS: list[tuple[str, int, float | None]] = [
-    ("lattice, joined", 1000, None),
-    ("lattice, joined", 3000, None),
-    ("lattice, joined", 10_000, 20.0),
+    ("lattice, joined, body axes", 1000, None),
+    ("lattice, joined, body axes", 3000, None),
+    ("lattice, joined, body axes", 10_000, 20.0),
+    ("lattice, joined", 10_000, None),
     ("lattice, joined, from 10 %", 10_000, None),
-    ("lattice, tree", 10_000, None),
+    ("lattice, tree, body axes", 10_000, None),
     ("lattice, neighbours within 1.5", 1000, None),
     ("sphere, triangulated", 500, None),
     ("sphere, triangulated", 2000, 5.0),
+    ("sphere, triangulated, body axes", 2000, None),
     ("shells, neighbours", 2000, None),
     ("sheet, neighbours and slots", 900, 5.0),
 ]
-#: Those that begin farther from their slots.
-_FAR = ", from 10 %"
+#: Those that begin farther from their slots; and whose equations are those of the body frame.
+_FAR, _BODY = ", from 10 %", ", body axes"
 #: Graphs of the other table: shape, agents, edges and their reach in spacings.
 GRAPHS: list[tuple[str, int, str, float | None]] = [
     ("lattice", 1000, "neighbours", 1.5),
@@ -73,7 +75,7 @@ GRAPHS: list[tuple[str, int, str, float | None]] = [
     ("helix of show-1000", 1000, "tree", None),
 ]
 #: Flown if asked for.
-LARGEST = ("lattice, joined", 100_000, None)
+LARGEST = ("lattice, joined, body axes", 100_000, None)
 #: Goals: growth of the time of a step, flatness of the sheet [m], the show from command to verdict [s].
 EXPONENT, FLAT, SHOW = 1.1, 5e-3, 60.0
 ROUNDS = 3
@@ -133,7 +135,7 @@ def triangulated(p: np.ndarray) -> list[list[int]]:
 
 def mission(kind: str, n: int) -> Mission:
     """The flight of a kind of formation."""
-    shape, _, graph = kind.removesuffix(_FAR).partition(", ")
+    shape, _, graph = kind.removesuffix(_FAR).removesuffix(_BODY).partition(", ")
     named = {"sheet": "grid", "lattice": None}.get(shape, shape)
     p = lattice(n) if named is None else shapes.slots(named, SPACING, n)
     off = (0.1 if kind.endswith(_FAR) else 0.02) * SPACING
@@ -148,6 +150,7 @@ def mission(kind: str, n: int) -> Mission:
         "schema_version": 1,
         "name": shape,
         "agents": {"mass": 1.0, "position": r.tolist()},
+        "formulation": "body" if kind.endswith(_BODY) else "inertial",
         "constraint": {"solver": "exact" if exact else "iterated"},
         "formations": {"f": form},
         "integrator": TOLERANCE,

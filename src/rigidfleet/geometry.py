@@ -107,12 +107,12 @@ def _near(p: Array, radius: Array) -> _Near:
     d, j = tree.query(p.T[some], k=2)
     widest, rounding = 2.0 * float(radius.max()), 1e-9 * float(np.abs(p).max())
     room = float((d[:, 1] - radius[some] - radius[j[:, 1]]).min())
-    pairs = tree.query_pairs(room + widest + rounding, output_type="ndarray").T
-    if len(some) < len(radius):
-        room = float(_Near(pairs, radius[pairs].sum(axis=0), 0.0).rooms(p).min())
-    reach = _SPARE * (room + widest) + rounding
-    pairs = np.ascontiguousarray(tree.query_pairs(reach, output_type="ndarray").T)
-    return _Near(pairs, radius[pairs].sum(axis=0), reach - widest)
+    pairs = tree.query_pairs(_SPARE * (room + widest) + rounding, output_type="ndarray").T
+    found = _Near(pairs, radius[pairs].sum(axis=0), 0.0)
+    rooms = found.rooms(p)
+    beyond = _SPARE * (float(rooms.min()) + widest) + rounding - widest
+    near = rooms <= beyond
+    return _Near(np.ascontiguousarray(pairs[:, near]), found.radii[near], beyond)
 
 
 def _moved(before: Array, after: Array) -> float:

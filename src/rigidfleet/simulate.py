@@ -795,7 +795,7 @@ def _positions(plan: PhasePlan, states: Array, n: int, which: NDArray[np.bool_])
     q = 6 * n + len(plan.edges)
     last = states[:, q : q + 7][which]
     T = att.dcm_from_quaternion(last[:, :4] / np.linalg.norm(last[:, :4], axis=1, keepdims=True))
-    return np.einsum("kba,kib->kia", T, x) + last[:, None, 4:]
+    return x @ T + last[:, None, 4:]
 
 
 def _times(times: ArrayLike, end: float) -> Array:

@@ -13,9 +13,9 @@ from numba.extending import intrinsic
 
 from rigidfleet.kernel.body import (
     attitude_matrix,
+    centre_of_mass,
     mean_axes,
     multiply,
-    multiply_transposed,
     quaternion_rate,
 )
 from rigidfleet.kernel.compiled import compiled, inlined
@@ -130,12 +130,23 @@ def world_states(y, p, w):
     """Positions and velocities in world axes from the states of the body formulation."""
     n = p.vehicles.m.shape[0]
     q = 6 * n + p.graph.edges.shape[0]
-    for i in range(n):
-        multiply_transposed(w.T, y[3 * i : 3 * i + 3], w.r[i])
-        multiply_transposed(w.T, y[3 * (n + i) : 3 * (n + i) + 3], w.v[i])
-        for s in range(3):
-            w.r[i, s] += y[q + 4 + s]
-            w.v[i, s] += y[q + 7 + s]
+    turn_back(w.T, y[: 3 * n], y[q + 4 : q + 7], w.r)
+    turn_back(w.T, y[3 * n : 6 * n], y[q + 7 : q + 10], w.v)
+
+
+@compiled
+def turn_back(T, x, origin, out):
+    """out_i = origin + T^T x_i (N, 3), of x (3N,)."""
+    # Numbers rather than elements: what is stored could be one of them, for all that the compiler knows.
+    T00, T01, T02 = T[0, 0], T[0, 1], T[0, 2]
+    T10, T11, T12 = T[1, 0], T[1, 1], T[1, 2]
+    T20, T21, T22 = T[2, 0], T[2, 1], T[2, 2]
+    o0, o1, o2 = origin[0], origin[1], origin[2]
+    for i in range(out.shape[0]):
+        x0, x1, x2 = x[3 * i], x[3 * i + 1], x[3 * i + 2]
+        out[i, 0] = o0 + T00 * x0 + T10 * x1 + T20 * x2
+        out[i, 1] = o1 + T01 * x0 + T11 * x1 + T21 * x2
+        out[i, 2] = o2 + T02 * x0 + T12 * x1 + T22 * x2
 
 
 @compiled
@@ -152,26 +163,27 @@ def body_derivatives(y, dy, p, w):
     """
     n = p.vehicles.m.shape[0]
     q = 6 * n + p.graph.edges.shape[0]
-    omega, a_cm, relative, a = w.cm[4], w.E[0], w.E[1], w.E[2]
-    multiply(w.T, w.cm[2], omega)
+    T, omega, a_cm = w.T, w.cm[4], w.E[0]
+    multiply(T, w.cm[2], omega)
+    centre_of_mass(w.a, p.vehicles.m, p.vehicles.M, a_cm)
     for s in range(3):
-        a_cm[s] = 0.0
+        dy[q + 4 + s], dy[q + 7 + s] = y[q + 7 + s], a_cm[s]
+    P, Q, R = omega[0], omega[1], omega[2]
+    A0, A1, A2 = a_cm[0], a_cm[1], a_cm[2]
+    T00, T01, T02 = T[0, 0], T[0, 1], T[0, 2]
+    T10, T11, T12 = T[1, 0], T[1, 1], T[1, 2]
+    T20, T21, T22 = T[2, 0], T[2, 1], T[2, 2]
     for i in range(n):
-        for s in range(3):
-            a_cm[s] += p.vehicles.m[i] * w.a[i, s]
-    for s in range(3):
-        a_cm[s] /= p.vehicles.M
-        dy[q + 4 + s] = y[q + 7 + s]
-        dy[q + 7 + s] = a_cm[s]
-    for i in range(n):
-        x, v = y[3 * i : 3 * i + 3], y[3 * (n + i) : 3 * (n + i) + 3]
-        for s in range(3):
-            relative[s] = w.a[i, s] - a_cm[s]
-        multiply(w.T, relative, a)
-        for s in range(3):
-            j, k = (s + 1) % 3, (s + 2) % 3
-            dy[3 * i + s] = v[s] - (omega[j] * x[k] - omega[k] * x[j])
-            dy[3 * (n + i) + s] = a[s] - (omega[j] * v[k] - omega[k] * v[j])
+        j, k = 3 * i, 3 * (n + i)
+        x0, x1, x2 = y[j], y[j + 1], y[j + 2]
+        v0, v1, v2 = y[k], y[k + 1], y[k + 2]
+        a0, a1, a2 = w.a[i, 0] - A0, w.a[i, 1] - A1, w.a[i, 2] - A2
+        dy[j] = v0 - (Q * x2 - R * x1)
+        dy[j + 1] = v1 - (R * x0 - P * x2)
+        dy[j + 2] = v2 - (P * x1 - Q * x0)
+        dy[k] = T00 * a0 + T01 * a1 + T02 * a2 - (Q * v2 - R * v1)
+        dy[k + 1] = T10 * a0 + T11 * a1 + T12 * a2 - (R * v0 - P * v2)
+        dy[k + 2] = T20 * a0 + T21 * a1 + T22 * a2 - (P * v1 - Q * v0)
 
 
 # Dormand and Prince's 5(4) pair, with Hairer's fourth-order continuous extension.
