@@ -207,7 +207,8 @@ def _feedback(
     if moves:
         # Gains grow like 1/tau near arrival, until S bounds them: on a geometric grid cubics keep
         # them to 1e-8.
-        to_go = np.concatenate([[0.0], np.geomspace(1e-6, arrival - t0, 1000)])
+        horizon = arrival - t0
+        to_go = np.concatenate([[0.0], np.geomspace(min(1e-6, 1e-3 * horizon), horizon, 1000)])
         tables = [_gains(law, to_go) for law in (mission.lqr, mission.lqr.attitude)]
         gain, slope = (np.concatenate(columns, axis=1) for columns in zip(*tables, strict=True))
     return k.Feedback(
@@ -224,5 +225,8 @@ def _gains(law: Regulator, to_go: Array) -> tuple[Array, Array]:
     A, B = [[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]]
     P, K = lqr.finite_horizon(A, B, law.Q, np.atleast_2d(law.R), law.S, to_go)
     gain = K[:, 0]
-    slope = np.stack([P[:, 0, 0], 2 * P[:, 0, 1] + law.Q[1]], axis=1) / law.R
-    return gain, slope - gain * gain[:, 1:]
+    with np.errstate(
+        over="ignore", invalid="ignore"
+    ):  # weights without measure: the flight will say so
+        slope = np.stack([P[:, 0, 0], 2 * P[:, 0, 1] + law.Q[1]], axis=1) / law.R
+        return gain, slope - gain * gain[:, 1:]

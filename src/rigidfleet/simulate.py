@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import math
 import time as clock
 from collections.abc import Callable
@@ -15,8 +14,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from rigidfleet import attitude as att
 from rigidfleet import solvers
+from rigidfleet.diagnosis import diagnose
 from rigidfleet.disturbances import disturbance, without
 from rigidfleet.errors import FlightError
+from rigidfleet.external import ExternalForce, Force, asked
 from rigidfleet.kernel import native, records
 from rigidfleet.kernel import program as k
 from rigidfleet.mission import Establish, Fly, Mission, Phase, Reshape, Settle, Turn
@@ -46,8 +47,6 @@ _WATCH = 0.05
 _WATCHED = 700_000
 #: Progress is reported this often [s of wall time].
 _REPORT = 0.1
-#: What to do about errors that nothing takes back.
-_FEEDBACK = '; without feedback errors grow: stabilisation = "pid" takes them back'
 #: A frame further than this from the slots it is attached to has left them [rad].
 _FLIPPED = math.pi / 2
 
@@ -81,7 +80,6 @@ class Observation:
 
 
 Controller = Callable[[Observation], ArrayLike]
-Force = Callable[[float, "Array", "Array"], ArrayLike]
 
 
 class FlightInterrupted(KeyboardInterrupt):
@@ -194,7 +192,7 @@ class Flight:
         self.controller, self.rate = controller, rate
         self.disturbance = disturbance(mission)
         self.lost = np.zeros(mission.n_agents, dtype=np.bool_)
-        self.external = _External(force, mission.n_agents) if force is not None else None
+        self.external = ExternalForce(force, mission.n_agents) if force is not None else None
         self.times = None if times is None else _times(times, mission.latest_end)
         if not rate > 0.0:
             raise ValueError(f"the control rate must be positive [Hz], not {rate!r}")
@@ -361,7 +359,7 @@ class Flight:
             leg.t, leg.phase.name, r.copy(), v.copy(), w.r_ref.copy(), w.v_ref.copy(),
             w.a_ref.copy(), self.masses.copy(), self.mission.gravity,
         )  # fmt: skip
-        f = _asked("the controller", leg.t, self.mission.n_agents, controller, seen)
+        f = asked("the controller", leg.t, self.mission.n_agents, controller, seen)
         return plan.program._replace(control=plan.program.control._replace(kind=k.OPEN, force=f))
 
     def _integrate(self, leg: Leg, program: k.Program, t_end: float) -> None:
@@ -439,7 +437,11 @@ class Flight:
             if kept.any():
                 self._record(leg, program, times[kept], samples[kept])
         if status != records.FINISHED:
-            raise StoppedError(self._diagnose(leg, collapsed=status == records.COLLAPSED))
+            collapsed = status == records.COLLAPSED
+            own_force = self.external is not None
+            raise StoppedError(
+                diagnose(self.mission, leg, own_force=own_force, collapsed=collapsed)
+            )
 
     def _samples(self, leg: Leg, t_end: float) -> Array:
         """Times to record in (t, t_end]: multiples of the output step, the phase's two ends, its arrival.
@@ -588,93 +590,6 @@ class Flight:
         flown = leg.t - self.now.t
         return steps > min(_STALLED + _STALLED_RATE * flown, _MOST_STEPS)
 
-    def _diagnose(self, leg: Leg, *, collapsed: bool) -> str:
-        """Say when, where and why the integrator could not go on, and what to try."""
-        count, h = leg.state.count, float(leg.state.clock[1])
-        if collapsed:
-            what = f"the step size has fallen to {h:.1g} s"
-        else:
-            what = f"{count[1] + count[2]} steps have been taken in it, the last of {h:.1g} s"
-        head = f"the flight cannot go on at t = {leg.t:.3f} s, in phase '{leg.phase.name}': {what}"
-        if not len(leg.plan.edges):
-            return f"{head}. {self._remedy(leg, collapsed=collapsed)}"
-        if leg.solver is not None:
-            lost, failed = leg.solver.counts.fallbacks, leg.solver.counts.failures
-            return (
-                f"{head}; solved by {solvers.WORDS[leg.plan.method]}, which lost a pivot {lost} times and found no"
-                f" solution {failed} times. {self._remedy(leg, collapsed=collapsed)}"
-            )
-        J, closest, length = _jacobian(leg, len(self.masses))
-        edge = "-".join(str(int(a) + 1) for a in leg.plan.edges[closest])
-        if not np.isfinite(J).all():
-            return (
-                f"{head}, because agents {edge.replace('-', ' and ')} are at one place: along the edge"
-                f" {edge} between them, {length:.2g} m long, no force has a direction, and none of the"
-                " singular values of the constraint Jacobian J is defined. Let their paths not cross:"
-                " exchange their slots, or start them elsewhere"
-            )
-        values = np.linalg.svd(J, compute_uv=False)
-        where = (
-            f"singular value {len(values)} of {len(values)} of the constraint Jacobian J is"
-            f" {values[-1]:.2g} (the largest is {values[0]:.2g}; the shortest edge {edge} is"
-            f" {length:.3g} m)"
-        )
-        solver = self.mission.constraint.solver
-        if solver in ("exact", "pinv"):
-            bound = "no bound" if solver == "exact" else "no bound but that of its cut-off"
-            return (
-                f'{head}, and {where}. The force of solver "{solver}" has {bound} where one of them'
-                f' vanishes. Use solver = "iterated" (or "spectral"){self._smoother(leg)}'
-            )
-        return f"{head}, and {where}. {self._remedy(leg, collapsed=collapsed)}"
-
-    def _smoother(self, leg: Leg) -> str:
-        """What else helps a law without bound: a smooth reference, feedback; "" where both are there."""
-        words = ""
-        if isinstance(leg.phase, Establish | Reshape) and leg.phase.reference == "step":
-            slots = self.mission.formation_slots(leg.phase.formation)
-            smooth = "distances" if slots is None else "shape"
-            words += f', with a reference that moves smoothly: reference = "{smooth}"'
-        if self.mission.constraint.stabilisation == "none":
-            words += _FEEDBACK
-        return words
-
-    def _remedy(self, leg: Leg, *, collapsed: bool) -> str:
-        """What to try where J is not to blame."""
-        beyond = leg.t + 1e-9 * max(1.0, leg.t)  # what happens at leg.t shows a moment later
-        native.closed_loop(
-            beyond, leg.state.y, np.empty_like(leg.state.y), leg.plan.program, leg.workspace
-        )
-        w = leg.workspace
-        names = {"input force": w.f_u, "constraint force": w.f_C, "external force": w.f_E}
-        lost = [name for name, f in names.items() if not np.isfinite(f).all()]
-        if "external force" in lost and self.external is not None:
-            bad = np.flatnonzero(~np.isfinite(w.f_E).all(axis=1))
-            return f"The force of your own is not finite on agent {bad[0] + 1}: mend that function"
-        if lost:
-            return (
-                f"The {lost[0]} is not finite. Look for a gain, a distance or a mass far too large"
-            )
-        if self.mission.constraint.stabilisation == "none" and np.abs(w.c).max(initial=0.0) > 1e-3:
-            k = int(np.abs(w.c).argmax())
-            i, j = leg.plan.edges[k] + 1
-            return f"The distance {i}-{j} is {w.c[k]:+.3g} m off{_FEEDBACK}"
-        name, f = max(names.items(), key=lambda item: float(np.abs(item[1]).max()))
-        agent = int(np.abs(f).max(axis=1).argmax())
-        size = float(np.linalg.norm(f[agent]))
-        if collapsed:
-            return (
-                f"The greatest force is the {name} on agent {agent + 1}, {size:.3g} N. Look for what"
-                " makes it jump: a force of your own, or a mass, gain or distance far too large or"
-                " small; and for tolerances near 1e-15"
-            )
-        return (
-            f"The greatest force is the {name} on agent {agent + 1}, {size:.3g} N. Steps as short as"
-            " this come from gains (constraint, tracking, lqr) far above 1e3 /s, from a damping far"
-            " below 1e-6, or from tolerances that are too tight (integrator.rtol, atol): relax them;"
-            " or the phase is too long"
-        )
-
     def _report(self, leg: Leg) -> None:
         wall = clock.perf_counter()
         if self.progress is not None and (wall - self.reported > _REPORT or len(self.pieces) == 0):
@@ -769,24 +684,6 @@ def _check_size(mission: Mission, phase: Phase) -> None:
         )
 
 
-def _jacobian(leg: Leg, n: int) -> tuple[Array, int, float]:
-    """J (m, 3N) where the integrator is, its shortest edge and that edge's length [m]."""
-    edges = leg.plan.edges
-    native.closed_loop(
-        leg.t, leg.state.y, np.empty_like(leg.state.y), leg.plan.program, leg.workspace
-    )
-    r = leg.workspace.r
-    u = r[edges[:, 0]] - r[edges[:, 1]]
-    lengths = np.linalg.norm(u, axis=1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        u /= lengths[:, None]
-    J = np.zeros((len(edges), n, 3))
-    rows = np.arange(len(edges))
-    J[rows, edges[:, 0]], J[rows, edges[:, 1]] = u, -u
-    closest = int(lengths.argmin())
-    return J.reshape(len(edges), -1), closest, float(lengths[closest])
-
-
 def _positions(plan: PhasePlan, states: Array, n: int, which: NDArray[np.bool_]) -> Array:
     """Positions (K, N, 3) [m], world axes, at those of the states of the kernel (., n) that are asked for."""
     x = states[:, : 3 * n][which].reshape(-1, n, 3)
@@ -830,74 +727,3 @@ def _target(phase: Phase, plan: PhasePlan) -> dict[str, Any] | None:
         "attitude": att.quaternion_from_dcm(plan.goal.T).tolist() if turns else None,
         "rates": plan.goal.omega.tolist() if turns else None,
     }
-
-
-def _asked(
-    who: str, t: float, n: int, function: Callable[..., ArrayLike], *arguments: object
-) -> Array:
-    """Forces (N, 3) [N] that a user's function gives, or an error that says what came instead."""
-    try:
-        f = function(*arguments)
-    except Exception as error:
-        words = f"{who} raised {type(error).__name__} at t = {t:.3f} s: {error}"
-        raise FlightError(words) from error
-    return _checked(f, n, who, t)
-
-
-def _checked(f: ArrayLike, n: int, who: str, t: float) -> Array:
-    """Forces (N, 3) [N] from a user's function, or an error that says what came instead."""
-    try:
-        force = np.array(f, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise FlightError(
-            f"{who} returned {f!r} at t = {t:.3f} s; return an array ({n}, 3) of forces [N]"
-        ) from None
-    if force.shape != (n, 3):
-        raise FlightError(
-            f"{who} returned an array of shape {force.shape} at t = {t:.3f} s; return ({n}, 3), a row for"
-            " each agent [N]"
-        )
-    if not np.isfinite(force).all():
-        raise FlightError(f"{who} returned a force that is not finite at t = {t:.3f} s")
-    return np.ascontiguousarray(force)
-
-
-class _External:
-    """A user's force as a C function that the kernel can call.
-
-    An exception cannot pass through compiled code: it is kept, the force becomes NaN, the step is
-    rejected, and `check` raises it once the kernel has returned.
-    """
-
-    _SIGNATURE = ctypes.CFUNCTYPE(
-        None, ctypes.c_double, *(ctypes.POINTER(ctypes.c_double),) * 3, ctypes.c_ssize_t
-    )
-
-    def __init__(self, force: Force, n: int) -> None:
-        self.error: BaseException | None = None
-        self._keep: Any = force  # whatever owns the code must live as long as its address
-        address = getattr(force, "address", None)
-        if address is not None:  # a Numba cfunc
-            self.address = int(address)
-            return
-
-        def call(t: float, r: Any, v: Any, f: Any, count: int) -> None:
-            arrays = [np.ctypeslib.as_array(a, (count, 3)) for a in (r, v, f)]
-            try:
-                if self.error is None:
-                    arrays[2][:] = _asked(
-                        "the force", t, n, force, t, arrays[0].copy(), arrays[1].copy()
-                    )
-                    return
-            except BaseException as error:
-                self.error = error
-            arrays[2][:] = math.nan
-
-        self._keep = self._SIGNATURE(call)
-        self.address = int(ctypes.cast(self._keep, ctypes.c_void_p).value or 0)
-
-    def check(self) -> None:
-        """Raise what the user's function raised, and listen to it again."""
-        error, self.error = self.error, None
-        if error is not None:
-            raise error

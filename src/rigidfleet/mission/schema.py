@@ -561,7 +561,9 @@ class Header(Part):
         "local", description="local: each agent tracks its slot; body: a wrench on the virtual body"
     )
     formulation: Literal["inertial", "body"] = Field(
-        "inertial", description="equations integrated: Newton's, or the paper's in the body frame"
+        "inertial",
+        description="equations integrated: Newton's, or the paper's in the body frame, of which many agents that turn "
+        "take fewer steps",
     )
     assignment: Literal["given", "shortest", "safe", "each"] = Field(
         "given",
