@@ -160,6 +160,8 @@ def _gains(notes: Notes, parts: dict[str, Any]) -> None:
 
 #: Weights below this are none: a Riccati equation cannot tell them from zero.
 _NO_WEIGHT = 1e-12
+#: An input that costs less than this part of an error costs nothing, and its gains know no bound.
+_FREE = 1e-15
 
 
 def _regulators(notes: Notes, parts: dict[str, Any]) -> None:
@@ -178,6 +180,12 @@ def _regulator(notes: Notes, weights: Regulator, *path: str) -> None:
     if weights.horizon == "finite" and not any(weights.Q) and not any(weights.S):
         problem = "with Q and S zero there is nothing to steer for"
         notes.add((*path, "S"), problem, "give S = [1e3, 1e2], say", weights.S)
+    most = max(*weights.Q, *weights.S)
+    if _FREE * most > weights.R and notes.right(("lqr",), "R") and notes.right(path, "R"):
+        problem = (
+            f"is less than {_FREE:g} of the largest weight, {most:g}: gains would have no bound"
+        )
+        notes.add((*path, "R"), problem, "raise R, or lower Q and S", weights.R)
 
 
 def _tracking(notes: Notes, parts: dict[str, Any]) -> None:
