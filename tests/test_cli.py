@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rigidfleet import cli
+from rigidfleet import cli, screen
 from rigidfleet.design import design
 from rigidfleet.errors import FlightError
 from rigidfleet.figures import figure_names
@@ -60,10 +60,10 @@ def folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name in ("NO_COLOR", "FORCE_COLOR", "COLUMNS"):
         monkeypatch.delenv(name, raising=False)
-    cli._console.cache_clear()
+    screen.console.cache_clear()
     Path("short.toml").write_text(TRIANGLE, encoding="utf-8")
     yield tmp_path
-    cli._console.cache_clear()
+    screen.console.cache_clear()
 
 
 @pytest.fixture
@@ -852,14 +852,14 @@ def test_no_color(capsys, monkeypatch):
     monkeypatch.setenv("FORCE_COLOR", "1")
     for value, coloured in (("", True), ("1", False)):
         monkeypatch.setenv("NO_COLOR", value)
-        cli._console.cache_clear()
+        screen.console.cache_clear()
         cli.main(["run", "sqare"])
         assert ("\x1b[1;31m" in capsys.readouterr().err) is coloured
 
 
 def test_progress_words():
     """Progress says the time flown, the speed against real time, the time left and the phase."""
-    watch = cli._Watch()
+    watch = screen.FlightWatch()
     watch.update(Progress(0.0, 90.0, "WP0", 1.0))
     assert watch._words() == "0.0 of 90 s  WP0"
     watch.update(Progress(30.0, 90.0, "WP3", 3.0))
@@ -871,9 +871,9 @@ def test_progress_words():
 def test_progress_leaves_compiling_out(monkeypatch):
     """The speed is that of flying: time without news, while the kernel compiles, does not count."""
     clock = iter([0.0, 0.0, 0.1, 12.0, 12.5])
-    monkeypatch.setattr(cli, "perf_counter", lambda: next(clock))
-    monkeypatch.setattr(cli, "_SELDOM", 1e9)
-    watch = cli._Watch()
+    monkeypatch.setattr(screen, "perf_counter", lambda: next(clock))
+    monkeypatch.setattr(screen, "_SELDOM", 1e9)
+    watch = screen.FlightWatch()
     watch.compiling()
     watch.update(Progress(0.0, 90.0, "WP0", 0.1))
     watch.update(Progress(10.0, 90.0, "WP0", 12.0))

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from rigidfleet import cli
+from rigidfleet import cli, screen
 from rigidfleet.errors import ResultError
 from rigidfleet.kernel import compiled, native
 from rigidfleet.result import Result
@@ -59,7 +59,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder to stand in, with a mission."""
     monkeypatch.chdir(tmp_path)
     Path("pair.toml").write_text(MISSION, encoding="utf-8")
-    cli._console.cache_clear()
+    screen.console.cache_clear()
     return tmp_path
 
 

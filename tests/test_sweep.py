@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from rigidfleet import cli
+from rigidfleet import cli, screen
 from rigidfleet.errors import ResultError, RigidfleetError, SweepError
 from rigidfleet.mission import Mission
 from rigidfleet.sweep import METRICS, Sweep, Table, fly, load, read
@@ -604,7 +604,7 @@ def test_little_is_drawn_as_well(tmp_path):
 @pytest.fixture
 def folder(tmp_path, monkeypatch) -> Path:
     monkeypatch.chdir(tmp_path)
-    cli._console.cache_clear()
+    screen.console.cache_clear()
     Path("pair.toml").write_text(MISSION.text)
     return tmp_path
 
@@ -643,7 +643,7 @@ def test_command(folder, capsys):
 
 def test_progress_words():
     """Progress says the runs flown, their rate without starts, the time left and the failures."""
-    watch = cli._SweepWatch()
+    watch = screen.SweepWatch()
     assert watch._words() == ""
     watch.update(SweepProgress(0, 5000, 0, 0, 0.0, 1))
     watch.update(SweepProgress(8, 5000, 8, 0, 20.0, 1))

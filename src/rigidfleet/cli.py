@@ -24,42 +24,26 @@ import sys
 import warnings
 from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
-from functools import cache
-from io import TextIOWrapper
 from pathlib import Path
-from tempfile import TemporaryDirectory, TemporaryFile
-from time import perf_counter
-from typing import IO, TYPE_CHECKING, Annotated, Any, Self, cast
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 from cyclopts import App, CycloptsError, Parameter, UnusedCliTokensError
 
-from rigidfleet import __version__
-from rigidfleet.errors import MissionError, ResultError, RigidfleetError
+from rigidfleet import __version__, screen
+from rigidfleet.errors import MissionError, RigidfleetError
+from rigidfleet.files import Files, taken, write_verdict
 
 if TYPE_CHECKING:
-    from rich.console import Console, RenderableType
-    from rich.live import Live
-    from rich.table import Table
-
     from rigidfleet.assess import Verdict
     from rigidfleet.mission import Mission
     from rigidfleet.result import Result
-    from rigidfleet.simulate import Progress
-    from rigidfleet.sweep import Sweep, SweepProgress
+    from rigidfleet.sweep import Sweep
 
 PASSED, FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 
-#: Columns of a table that goes to a file or a pipe, where no row may be broken.
-_WIDE = 1000
-#: Where there is no terminal to draw a bar on, a line says so often how far a flight is [s].
-_SELDOM = 10.0
-#: A flight is heard of several times a second: when not for so long, it compiles [s].
-_SILENCE = 1.0
 #: A design of so many agents is compared with all pairs; one of more than the latter is judged by the ends of its
 #: spectrum alone.
 _COMPARED, _DENSE = 60, 200
-_COMPILING = "Compiling the flight kernel (once, about 15 s)"
 
 app = App(
     name="rigidfleet",
@@ -83,28 +67,28 @@ def main(tokens: Sequence[str] | None = None) -> int:
         # Imports make a hundred thousand objects that stay: looked through as often as by default, they
         # would take a tenth longer.
         gc.set_threshold(100_000)
-        warnings.showwarning = cast("Any", _warn)
+        warnings.showwarning = cast("Any", screen.warn)
         # Matrices are small here: threads over them wait for each other, and on a busy machine for long.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    _prepare_streams()
+    screen.prepare_streams()
     try:
-        return app(tokens, console=_out(), error_console=_err()) or PASSED
+        return app(tokens, console=screen.out(), error_console=screen.err()) or PASSED
     except CycloptsError as error:
-        _complain(_usage(error))
+        screen.complain(_usage(error))
         return BAD_INPUT
     except RigidfleetError as error:
-        _complain(error)
+        screen.complain(error)
         return BAD_INPUT
     except BrokenPipeError:
-        _hang_up(sys.stdout)
+        screen.hang_up(sys.stdout)
         return PASSED
     except OSError as error:  # a full disk and the like: no fault of the program
         if error.filename is None:
-            _hang_up(sys.stdout)
-        _complain(f"{error.filename or 'standard output'}: {error.strerror or error}")
+            screen.hang_up(sys.stdout)
+        screen.complain(f"{error.filename or 'standard output'}: {error.strerror or error}")
         return BAD_INPUT
     except KeyboardInterrupt:
-        _err().print("Interrupted", style="yellow")
+        screen.err().print("Interrupted", style="yellow")
         return INTERRUPTED
 
 
@@ -148,9 +132,9 @@ def run(
     from rigidfleet.mission import load_mission
 
     flown = load_mission(mission)
-    files = _Files(out or Path("flights", flown.name), flown.name)
+    files = Files(out or Path("flights", flown.name), flown.name)
     files.claim(replace=force)
-    watch = None if quiet else _Watch()
+    watch = None if quiet else screen.FlightWatch()
     with watch or nullcontext():
         result, interrupted = _fly(flown, watch)
 
@@ -162,11 +146,11 @@ def run(
     if csv:
         result.to_csv(files.table)
     verdict = assess(result)
-    _write_verdict(verdict, files.verdict)
+    write_verdict(verdict, files.verdict)
     if json:
-        _print_exactly(verdict.json() + "\n")
+        screen.print_exactly(verdict.json() + "\n")
     elif not quiet:
-        _out().print(verdict)
+        screen.out().print(verdict)
     what = "what flew is saved, marked incomplete," if interrupted else "the flight is saved"
     if not interrupted:
         try:
@@ -177,10 +161,10 @@ def run(
         except KeyboardInterrupt:
             interrupted = True
     if not (json or quiet):
-        _out().print()
+        screen.out().print()
         _list(files)
     if interrupted:
-        _err().print(f"Interrupted: {what} in {files.result}", style="yellow", soft_wrap=True)
+        screen.err().print(f"Interrupted: {what} in {files.result}", style="yellow", soft_wrap=True)
         return INTERRUPTED
     return PASSED if verdict.passed else FAILED
 
@@ -203,17 +187,17 @@ def missions(
     if print_ and schema:
         raise RigidfleetError("--print and --schema exclude each other. Give one of them.")
     if print_:
-        _print_exactly(mission_text(print_))
+        screen.print_exactly(mission_text(print_))
     elif schema:
-        _print_json(json_schema())
+        screen.print_json(json_schema())
     else:
         import tomllib
 
-        table = _table("mission", "what it shows", "in the paper")
+        table = screen.table("mission", "what it shows", "in the paper")
         for name in mission_names():
             head = tomllib.loads(mission_text(name))
             table.add_row(name, head.get("title", ""), head.get("source", ""))
-        _print_table(table)
+        screen.print_table(table)
     return PASSED
 
 
@@ -253,7 +237,7 @@ def check(
             {"key": f.key, "value": f.value, "problem": f.problem, "remedy": f.remedy}
             for f in error.findings
         ]
-        _print_json({"mission": mission, "right": False, "findings": findings})
+        screen.print_json({"mission": mission, "right": False, "findings": findings})
         return BAD_INPUT
     from rigidfleet.preflight import preflight
 
@@ -264,20 +248,20 @@ def check(
         judged = {f.name: f.rigidity for f in ahead.formations}
         draw_graphs(found, judged, figure)
     if json:
-        _print_json({"mission": mission, "right": True} | _facts(found) | ahead.data())
+        screen.print_json({"mission": mission, "right": True} | _facts(found) | ahead.data())
         return PASSED if ahead.passed else FAILED
-    table = _table("#", "phase", "kind", "to", "ends", "control")
+    table = screen.table("#", "phase", "kind", "to", "ends", "control")
     for n, phase in enumerate(found.phases, start=1):
         table.add_row(str(n), phase.name, phase.kind, goal(phase), ending(phase), phase.control)
-    _out().print(f"{found.name}: right: {_counted(found)}")
-    _print_table(table)
-    _out().print()
-    _print_words(ahead.words())
+    screen.out().print(f"{found.name}: right: {_counted(found)}")
+    screen.print_table(table)
+    screen.out().print()
+    screen.print_words(ahead.words())
     if ahead.remarks:
-        _out().print()
-        _print_words((remark.level, remark.text) for remark in ahead.remarks)
+        screen.out().print()
+        screen.print_words((remark.level, remark.text) for remark in ahead.remarks)
     verdict = "nothing found that will fail" if ahead.passed else "it will fail as it is"
-    _out().print(f"\n{found.name}: {verdict}", style=None if ahead.passed else "bold red")
+    screen.out().print(f"\n{found.name}: {verdict}", style=None if ahead.passed else "bold red")
     return PASSED if ahead.passed else FAILED
 
 
@@ -351,17 +335,19 @@ def design(
         write_file(out, text.encode())
     if json:
         found = {what: data for what, (data, _) in judged.items()}
-        _print_json({"name": name, "toml": text, "limits": limits, "graphs": found})
+        screen.print_json({"name": name, "toml": text, "limits": limits, "graphs": found})
         return PASSED
-    table = _table("graph", "edges", "rank", "index", "cond.", "longest", "verdict")
+    table = screen.table("graph", "edges", "rank", "index", "cond.", "longest", "verdict")
     for what, (_, cells) in judged.items():
         table.add_row(what, *cells)
-    console = _out() if out is not None else _err()  # so that the formation alone can be piped
+    console = (
+        screen.out() if out is not None else screen.err()
+    )  # so that the formation alone can be piped
     console.print(table)
     if limits:
         console.print(limits)
     if out is None:
-        _print_exactly(text)
+        screen.print_exactly(text)
     else:
         console.print(f"Formation  {out}", soft_wrap=True)
     return PASSED
@@ -486,7 +472,7 @@ def new(
         "thrust_limit": thrust_limit, "waypoints": to,
     }  # fmt: skip
     asked = {key: value for key, value in given.items() if value is not None}
-    if not (asked or quiet or json) and sys.stdin.isatty() and _err().is_terminal:
+    if not (asked or quiet or json) and sys.stdin.isatty() and screen.err().is_terminal:
         name, asked = _ask(name)
     file = Path(name or "mission")
     file = file if file.suffix == ".toml" else file.with_name(f"{file.name}.toml")
@@ -499,10 +485,10 @@ def new(
     mission = Mission.from_toml(text, str(file))
     write_file(file, text.encode())
     if json:
-        _print_json({"file": str(file)} | _facts(mission))
+        screen.print_json({"file": str(file)} | _facts(mission))
     elif not quiet:
-        _out().print(f"{file}: {_counted(mission)}", soft_wrap=True)
-        _out().print(f"Fly it by: rigidfleet run {file}", soft_wrap=True)
+        screen.out().print(f"{file}: {_counted(mission)}", soft_wrap=True)
+        screen.out().print(f"Fly it by: rigidfleet run {file}", soft_wrap=True)
     return PASSED
 
 
@@ -547,38 +533,40 @@ def report(
     if others:
         page = (out or Path()) / "comparison.html"
         if page.exists() and not force:
-            raise _kept(page)
-    files = _Files(out or (Path() if others else result.parent), records[0].mission.name)
+            raise taken(page)
+    files = Files(out or (Path() if others else result.parent), records[0].mission.name)
     files.try_out()
     verdicts = [assess(record) for record in records]
     if json:
         found = [verdict.to_dict() for verdict in verdicts]
-        _print_json(found if others else found[0])
+        screen.print_json(found if others else found[0])
     files.make_folder()
     if others:
         labels = _labels(paths, records)
         if not (json or quiet):
             for label, verdict in zip(labels, verdicts, strict=True):
-                _out().print(f"{label}: {verdict.summary}", soft_wrap=True)
+                screen.out().print(f"{label}: {verdict.summary}", soft_wrap=True)
         _write_report(records, verdicts, page, labels=labels, quiet=quiet)
         if not (json or quiet):
-            _out().print(f"\nReport   {page}", soft_wrap=True)
+            screen.out().print(f"\nReport   {page}", soft_wrap=True)
     else:
         if not (json or quiet):
-            _out().print(verdicts[0])
+            screen.out().print(verdicts[0])
         drawn = [] if no_figures else files.figures
         made = [files.verdict, files.report, *drawn]
         kept = [] if force else [path for path in made if path.exists()]
         if files.verdict not in kept:
-            _write_verdict(verdicts[0], files.verdict)
+            write_verdict(verdicts[0], files.verdict)
         _draw(records[0], [path for path in drawn if path not in kept], quiet=quiet)
         if files.report not in kept:
             _write_report(records, verdicts, files.report, quiet=quiet)
         if not (json or quiet):
-            _out().print()
+            screen.out().print()
             _list(files)
         if kept and not quiet:
-            _err().print(f"{_count(len(kept), 'file')} kept as before; --force makes them again")
+            screen.err().print(
+                f"{screen.count(len(kept), 'file')} kept as before; --force makes them again"
+            )
     return PASSED if all(verdict.passed for verdict in verdicts) else FAILED
 
 
@@ -598,11 +586,11 @@ def replay(result: Path, /, *, out: Path | None = None, force: bool = False) -> 
     from rigidfleet.result import Result
 
     record = Result.load(result)
-    page = out or _Files(result.parent, record.mission.name).replay
+    page = out or Files(result.parent, record.mission.name).replay
     if page.exists() and not force:
-        raise _kept(page)
+        raise taken(page)
     _write_replay(record, page)
-    _out().print(f"Replay   {page}", soft_wrap=True)
+    screen.out().print(f"Replay   {page}", soft_wrap=True)
     return PASSED
 
 
@@ -624,12 +612,12 @@ def live(mission: str, /, *, port: int = 0, no_browser: bool = False) -> int:
 
     flown = load_mission(mission)
     if not is_compiled():
-        _err().print(_COMPILING)
+        screen.err().print(screen.COMPILING)
     from rigidfleet.live import live as fly
 
     def ready(url: str) -> None:
-        _out().print(f"Flying {flown.name} at {url}", soft_wrap=True)
-        _err().print("Ctrl-C ends the flight, and so does closing its page")
+        screen.out().print(f"Flying {flown.name} at {url}", soft_wrap=True)
+        screen.err().print("Ctrl-C ends the flight, and so does closing its page")
 
     with _heeding_interrupts():
         fly(flown, port=port, browser=not no_browser, ready=ready)
@@ -644,13 +632,15 @@ def _ask(name: str) -> tuple[str, dict[str, Any]]:
     def answer(question: str, offered: str, take: Callable[[str], Any]) -> Any:
         while True:
             try:
-                text = _err().input(f"{question} [{offered}]: ", markup=False).strip() or offered
+                text = (
+                    screen.err().input(f"{question} [{offered}]: ", markup=False).strip() or offered
+                )
             except EOFError:
                 raise RigidfleetError("No answer, so nothing is written. Give options.") from None
             try:
                 return take(text)
             except ValueError as error:
-                _err().print(f"  {error}", style="yellow")
+                screen.err().print(f"  {error}", style="yellow")
 
     def number(text: str) -> float:
         value = _number(text)
@@ -757,7 +747,7 @@ def sweep(
         table = store.read(folder)
     else:
         asked, folder = _asked(mission, vary or [], runs, seed, out)
-        watch = None if quiet else _SweepWatch()
+        watch = None if quiet else screen.SweepWatch()
         try:
             with watch or nullcontext(), _heeding_interrupts():
                 table = _fly_sweep(asked, folder, workers, cluster, force, watch)
@@ -765,30 +755,29 @@ def sweep(
             done = len(store.read(folder).run) if store.is_store(folder) else 0
             words = f"Interrupted: {done} of {asked.runs} runs are kept in {folder}"
             again = f"Go on by: rigidfleet sweep {folder}"
-            _err().print(f"{words}\n{again}", style="yellow", soft_wrap=True)
+            screen.err().print(f"{words}\n{again}", style="yellow", soft_wrap=True)
             return INTERRUPTED
     found = summarise(table)
     from rigidfleet.result import write_file
 
     write_file(folder / "summary.json", (found.json() + "\n").encode())
     if json:
-        _print_exactly(found.json() + "\n")
+        screen.print_exactly(found.json() + "\n")
     elif not quiet:
-        console = _out() if _out().is_terminal else _console(stderr=False, width=_WIDE)
-        console.print(found)
+        screen.print_table(found)
     drawn: list[Path] = []
     if not no_figures:
         from rigidfleet.sweep.figures import plot
 
-        shown = _err().is_interactive and not quiet
-        with _err().status("Drawing the figures") if shown else nullcontext():
+        shown = screen.err().is_interactive and not quiet
+        with screen.err().status("Drawing the figures") if shown else nullcontext():
             drawn = plot(table, folder / "figures", over=map_ or (), metric=metric)
     if not (json or quiet):
-        _out().print(f"\nRuns     {folder / store.FILE}", soft_wrap=True)
-        _out().print(f"Summary  {folder / 'summary.json'}", soft_wrap=True)
+        screen.out().print(f"\nRuns     {folder / store.FILE}", soft_wrap=True)
+        screen.out().print(f"Summary  {folder / 'summary.json'}", soft_wrap=True)
         if drawn:
-            text = f"Figures  {drawn[0].parent}{os.sep} ({_count(len(drawn), 'file')})"
-            _out().print(text, soft_wrap=True)
+            text = f"Figures  {drawn[0].parent}{os.sep} ({screen.count(len(drawn), 'file')})"
+            screen.out().print(text, soft_wrap=True)
     return PASSED
 
 
@@ -821,7 +810,7 @@ def _fly_sweep(
     workers: int | None,
     cluster: str | None,
     force: bool,
-    watch: _SweepWatch | None,
+    watch: screen.SweepWatch | None,
 ) -> Any:
     """Fly a sweep; returns the table of its rows."""
     from rigidfleet.kernel import is_compiled
@@ -842,7 +831,7 @@ def _fly_sweep(
 # -- flying ------------------------------------------------------------------------------------------
 
 
-def _fly(mission: Mission, watch: _Watch | None) -> tuple[Result, bool]:
+def _fly(mission: Mission, watch: screen.FlightWatch | None) -> tuple[Result, bool]:
     """Result of a mission, and whether the flight was interrupted."""
     from rigidfleet.kernel import is_compiled
 
@@ -888,8 +877,8 @@ def _draw(result: Result, figures: Iterable[Path], *, quiet: bool = False) -> No
         if path.stem not in names:
             continue
         formats.setdefault(path.with_suffix(""), []).append(path.suffix[1:])
-    shown = _err().is_interactive and not quiet
-    with _err().status("Drawing the figures") if shown else nullcontext() as status:
+    shown = screen.err().is_interactive and not quiet
+    with screen.err().status("Drawing the figures") if shown else nullcontext() as status:
         for n, (path, kinds) in enumerate(formats.items(), start=1):
             if status is not None:
                 status.update(f"Drawing figure {n} of {len(formats)}: {path.name}")
@@ -907,8 +896,8 @@ def _write_report(
     """Write the page of a flight, or of several."""
     from rigidfleet.report import report as write
 
-    shown = _err().is_interactive and not quiet
-    with _err().status("Writing the report") if shown else nullcontext():
+    shown = screen.err().is_interactive and not quiet
+    with screen.err().status("Writing the report") if shown else nullcontext():
         write(records, path, labels=labels, verdicts=verdicts)
 
 
@@ -927,129 +916,7 @@ def _labels(paths: list[Path], records: list[Result]) -> list[str]:
     return next((names for names in (missions, stems) if len({*names}) == len(names)), folders)
 
 
-def _write_verdict(verdict: Verdict, path: Path) -> None:
-    """Write a verdict as JSON, whole or not at all.
-
-    Raises
-    ------
-    ResultError
-        It cannot be written.
-    """
-    try:
-        with TemporaryDirectory(prefix=".", suffix=".part", dir=path.parent) as part:
-            file = Path(part, path.name)
-            file.write_text(verdict.json() + "\n", encoding="utf-8")
-            os.replace(file, path)
-    except OSError as error:
-        raise _unwritable(path, error) from error
-
-
-# -- files -------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class _Files:
-    """Where the files of a flight are."""
-
-    folder: Path
-    name: str
-
-    @property
-    def result(self) -> Path:
-        return self.folder / f"{self.name}.nc"
-
-    @property
-    def verdict(self) -> Path:
-        return self.folder / "verdict.json"
-
-    @property
-    def table(self) -> Path:
-        return self.folder / f"{self.name}.csv"
-
-    @property
-    def figures(self) -> list[Path]:
-        from rigidfleet.figures import figure_names
-
-        return [
-            self.folder / "figures" / f"{name}.{kind}"
-            for name in figure_names(disturbed=True)
-            for kind in ("png", "svg")
-        ]
-
-    @property
-    def report(self) -> Path:
-        return self.folder / "report.html"
-
-    @property
-    def replay(self) -> Path:
-        return self.folder / "replay.html"
-
-    @property
-    def derived(self) -> list[Path]:
-        """All that is made from the result."""
-        return [self.verdict, self.table, self.report, self.replay, *self.figures]
-
-    def claim(self, *, replace: bool) -> None:
-        """Make sure, before anything is flown, that the files of a flight can be written.
-
-        Raises
-        ------
-        ResultError
-            There are some already, and they are not to be replaced; or the folder cannot be written.
-        """
-        there = [path for path in (self.result, *self.derived) if path.exists()]
-        if there and not replace:
-            raise _kept(there[0])
-        self.try_out()
-
-    def try_out(self) -> None:
-        """Write for a moment into the folder, or into the one that it will be made in.
-
-        Raises
-        ------
-        ResultError
-            It cannot be written.
-        """
-        folder = self.folder.absolute()
-        while not os.path.lexists(folder):
-            folder = folder.parent
-        try:
-            TemporaryFile(dir=folder).close()
-        except OSError as error:
-            raise _unwritable(self.folder, error) from error
-
-    def make_folder(self) -> None:
-        """Make the folder, if it is not there.
-
-        Raises
-        ------
-        ResultError
-            It cannot be made.
-        """
-        try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise _unwritable(self.folder, error) from error
-
-    def forget(self) -> None:
-        """Remove what was made from an earlier result."""
-        for path in self.derived:
-            path.unlink(missing_ok=True)
-
-
-def _kept(path: Path) -> ResultError:
-    return ResultError(
-        f"{path}: exists already and is kept. "
-        "Replace it by --force, or name another place by --out."
-    )
-
-
-def _unwritable(path: Path, error: OSError) -> ResultError:
-    why = (error.strerror or str(error)).lower()
-    return ResultError(f"{path}: cannot be written ({why}). Name another folder by --out.")
-
-
-def _list(files: _Files) -> None:
+def _list(files: Files) -> None:
     """Print where the files of a flight are."""
     for what, path in (
         ("Result", files.result),
@@ -1059,11 +926,11 @@ def _list(files: _Files) -> None:
         ("Replay", files.replay),
     ):
         if path.exists():
-            _out().print(f"{what:8} {path}", soft_wrap=True)
+            screen.out().print(f"{what:8} {path}", soft_wrap=True)
     drawn = [path for path in files.figures if path.exists()]
     if drawn:
-        text = f"Figures  {drawn[0].parent}{os.sep} ({_count(len(drawn), 'file')})"
-        _out().print(text, soft_wrap=True)
+        text = f"Figures  {drawn[0].parent}{os.sep} ({screen.count(len(drawn), 'file')})"
+        screen.out().print(text, soft_wrap=True)
 
 
 # -- a mission in words ------------------------------------------------------------------------------
@@ -1091,73 +958,12 @@ def _counted(mission: Mission) -> str:
     """How much of everything a mission has."""
     most = "at most " if any(phase.settle for phase in mission.phases) else ""
     counts = (
-        _count(mission.n_agents, "agent"),
-        _count(len(mission.formations), "formation"),
-        _count(len(mission.phases), "phase"),
+        screen.count(mission.n_agents, "agent"),
+        screen.count(len(mission.formations), "formation"),
+        screen.count(len(mission.phases), "phase"),
         f"{most}{mission.latest_end:g} s",
     )
     return ", ".join(counts)
-
-
-def _count(n: int, noun: str) -> str:
-    return f"{n} {noun}{'' if n == 1 else 's'}"
-
-
-# -- the screen --------------------------------------------------------------------------------------
-
-
-def _out() -> Console:
-    """For what was asked for."""
-    return _console(stderr=False)
-
-
-def _err() -> Console:
-    """For progress and errors."""
-    return _console(stderr=True)
-
-
-@cache
-def _console(*, stderr: bool, width: int | None = None) -> Console:
-    from rich.console import Console
-
-    class Polite(Console):
-        def on_broken_pipe(self) -> None:
-            # The reader has had enough, as `head` has: go on without it, the exit code still counts.
-            self.quiet = True
-            _hang_up(self.file)
-
-    return Polite(stderr=stderr, width=width, markup=False, highlight=False, emoji=False)
-
-
-def _prepare_streams() -> None:
-    for name in ("stdout", "stderr"):
-        stream = getattr(sys, name)
-        if stream is None:  # closed by `>&-`
-            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
-        elif isinstance(stream, TextIOWrapper):
-            stream.reconfigure(errors="replace")  # a sign that the terminal lacks becomes "?"
-
-
-def _hang_up(stream: IO[str]) -> None:
-    """Send nowhere what is still to be written to a stream."""
-    with open(os.devnull, "wb") as nowhere:
-        os.dup2(nowhere.fileno(), stream.fileno())
-
-
-def _print_exactly(text: str) -> None:
-    """Print text for other programs: in UTF-8, no line changed."""
-    try:
-        sys.stdout.flush()
-        sys.stdout.buffer.write(text.encode())
-        sys.stdout.buffer.flush()
-    except BrokenPipeError:
-        _hang_up(sys.stdout)
-
-
-def _print_json(data: object) -> None:
-    import json
-
-    _print_exactly(json.dumps(data, ensure_ascii=False, indent=2, default=str) + "\n")
 
 
 def _usage(error: CycloptsError) -> str:
@@ -1167,171 +973,3 @@ def _usage(error: CycloptsError) -> str:
     if isinstance(error, UnusedCliTokensError):
         text = f"Unexpected: {' '.join(error.unused_tokens or ())}."
     return f"{text}\n    see `{command}`"
-
-
-def _complain(error: object) -> None:
-    from rich.text import Text
-
-    for finding in error.findings if isinstance(error, MissionError) else [error]:
-        _err().print(Text.assemble(("error: ", "bold red"), str(finding)), soft_wrap=True)
-
-
-def _warn(message: object, *_where: object) -> None:
-    """Show a warning as the line that it is, not with the place in the source that gave it."""
-    _err().print(f"warning: {message}", style="yellow", soft_wrap=True, highlight=False)
-
-
-def _table(*columns: str) -> Table:
-    from rich.table import Table
-
-    return Table(*columns, box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold")
-
-
-def _print_table(table: Table) -> None:
-    console = _out() if _out().is_terminal else _console(stderr=False, width=_WIDE)
-    console.print(table)
-
-
-def _print_words(rows: Iterable[tuple[str, str]]) -> None:
-    """Print facts under headings, wrapped to the screen, a heading that repeats only once."""
-    from rich.table import Table
-    from rich.text import Text
-
-    table, before = Table.grid(padding=(0, 2, 0, 0)), ""
-    table.add_column(no_wrap=True, max_width=24)
-    table.add_column(overflow="fold")
-    for heading, text in rows:
-        style = "bold red" if heading == "fails" else "bold"
-        table.add_row(Text("" if heading == before else heading, style=style), Text(text))
-        before = heading
-    _out().print(table)
-
-
-class _Screen:
-    """Shows what goes on: on a terminal as it changes, and elsewhere by a line now and then."""
-
-    def __init__(self) -> None:
-        self.console = _err()
-        self.live: Live | None = None
-        self.begun = self.told = perf_counter()
-        self.cold = False
-
-    def __enter__(self) -> Self:
-        if self.console.is_interactive:
-            from rich.live import Live
-            from rich.spinner import Spinner
-
-            self.spinner = Spinner("dots")
-            self.live = Live(self, console=self.console, transient=True, refresh_per_second=10)
-            self.live.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self.live is not None:
-            self.live.stop()
-
-    def __rich__(self) -> RenderableType:
-        return ""
-
-    def compiling(self) -> None:
-        """Expect the kernel to be compiled, on the way, in several parts."""
-        self.cold, self.begun = True, perf_counter()
-        if self.live is None:
-            self.console.print(_COMPILING)
-
-    def waiting(self) -> RenderableType:
-        """What is shown before there is anything to show."""
-        text = _COMPILING if self.cold else "Starting"
-        self.spinner.update(text=f"{text}: {perf_counter() - self.begun:.0f} s")
-        return self.spinner
-
-    def tell(self, now: float) -> None:
-        """Print a line where nothing moves, if the last one was long ago."""
-        if self.live is None and now - self.told > _SELDOM:
-            self.told = now
-            self.console.print(self._words())
-
-    def _words(self) -> str:
-        return ""
-
-
-class _Watch(_Screen):
-    """Shows how a flight goes on."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.heard = self.begun
-        self.base: Progress | None = None
-        self.last: Progress | None = None
-
-    def update(self, progress: Progress) -> None:
-        """Take note of how far the flight is."""
-        now = perf_counter()
-        if self.base is None or (self.cold and now - self.heard > _SILENCE):
-            self.base = progress  # the speed is that of flying, without that of compiling
-        self.last, self.heard = progress, now
-        self.tell(now)
-
-    def __rich__(self) -> RenderableType:
-        from rich.progress_bar import ProgressBar
-        from rich.table import Table
-
-        now = perf_counter()
-        if self.last is None or (self.cold and now - self.heard > _SILENCE):
-            return self.waiting()
-        row = Table.grid(padding=(0, 1))
-        row.add_row(ProgressBar(self.last.t_end, self.last.t, width=30), self._words())
-        return row
-
-    def _words(self) -> str:
-        """Time flown, speed against real time, time left, phase."""
-        if self.base is None or self.last is None:
-            return ""
-        t, t_end = self.last.t, self.last.t_end
-        words = [f"{t:.1f} of {t_end:g} s"]
-        if (wall := self.last.wall - self.base.wall) > 0 and (
-            speed := (t - self.base.t) / wall
-        ) > 0:
-            left = round((t_end - t) / speed)
-            words += [f"x{speed:.{0 if speed >= 10 else 1}f}", f"{left // 60}:{left % 60:02} left"]
-        return "  ".join([*words, self.last.phase])
-
-
-class _SweepWatch(_Screen):
-    """Shows how a sweep goes on."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.base: SweepProgress | None = None
-        self.last: SweepProgress | None = None
-
-    def update(self, progress: SweepProgress) -> None:
-        """Take note of how far the sweep is."""
-        if progress.flown and (self.base is None or self.base.workers != progress.workers):
-            self.base = progress  # the rate is that of these workers, without their start
-        self.last = progress
-        self.tell(perf_counter())
-
-    def __rich__(self) -> RenderableType:
-        from rich.progress_bar import ProgressBar
-        from rich.table import Table
-
-        if self.base is None or self.last is None:
-            return self.waiting()
-        row = Table.grid(padding=(0, 1))
-        row.add_row(ProgressBar(self.last.runs, self.last.done, width=30), self._words())
-        return row
-
-    def _words(self) -> str:
-        """Runs flown, rate, time left, failures."""
-        if self.base is None or self.last is None:
-            return ""
-        p = self.last
-        words = [f"{p.done} of {p.runs} runs"]
-        if (wall := p.wall - self.base.wall) > 0 and (flown := p.flown - self.base.flown) > 0:
-            rate = flown / wall
-            left = round((p.runs - p.done) / rate)
-            words += [f"{rate:.3g} runs/s", f"{left // 60}:{left % 60:02} left"]
-        words += [f"{p.failed} failed"] if p.failed else []
-        words += [f"{_count(p.workers, 'worker')}"] if p.workers > 1 else []
-        return "  ".join(words)
