@@ -38,7 +38,7 @@ _STALLED, _STALLED_RATE, _MOST_STEPS = 50_000, 2_000.0, 5_000_000
 #: Residual of an iterative solve, as a share of the integrator's tolerance; the relative one within bounds.
 _RESIDUAL, _LEAST, _MOST_RESIDUAL = 1e-3, 1e-13, 1e-8
 #: Below this share of a velocity's tolerance, the error of an acceleration, times a second, is nothing.
-_FLOOR = 1e-2
+_FLOOR = 3e-2
 #: Where a phase ends by settling, whether it has is asked this often [s].
 _CHECK = 0.1
 #: How close agents come is watched at least this often [s], whatever is recorded.
