@@ -23,7 +23,7 @@ from rigidfleet.kernel.program import (
     padded,
     workspace,
 )
-from rigidfleet.kernel.records import FINISHED, integrator
+from rigidfleet.kernel.records import FINISHED, LEAST_ERROR, integrator
 from rigidfleet.kernel.straight import integrate, straight
 
 Numbers = NDArray[np.int64]
@@ -53,7 +53,7 @@ def fly(p, state, t0, t_end, step, starts, before, ends, status, evaluations, ma
             state.y[q] = starts[g, q]
         for k in range(before.shape[1]):
             p.before[k] = before[g, k]
-        state.clock[0], state.clock[1], state.clock[2] = t0, step, 1e-4
+        state.clock[0], state.clock[1], state.clock[2] = t0, step, LEAST_ERROR
         for q in range(4):
             state.count[q] = 0
         status[g] = integrate(p, p, state, t_end, fresh, unsampled, ends[:0], max_steps)

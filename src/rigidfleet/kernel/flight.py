@@ -29,6 +29,7 @@ from rigidfleet.kernel.records import (
     ATOL,
     COLLAPSED,
     FINISHED,
+    LEAST_ERROR,
     PAUSED,
     STATE,
     TRIAL,
@@ -306,9 +307,10 @@ def integrate(p, w, state, t_end, fresh, times, samples, max_steps):
         t = t_new
         first = 1
         count[1] += 1
-        error = max(error, 1e-8)
-        h *= min(5.0, max(0.2, 0.9 * error**-0.17 * last**0.04))
-        last = max(error, 1e-4)
+        # 0.9 error^-0.17 last^0.04, by logarithms: two powers would take as long as half an evaluation.
+        error = math.log(max(error, 1e-8))
+        h *= min(5.0, max(0.2, 0.9 * math.exp(0.04 * last - 0.17 * error)))
+        last = max(error, LEAST_ERROR)
         if t >= t_end:
             status = FINISHED
             break

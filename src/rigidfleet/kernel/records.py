@@ -3,6 +3,7 @@
 K samples, N agents, m edges.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -14,6 +15,8 @@ from rigidfleet.kernel.program import Array, padded, zeros
 FINISHED, PAUSED, COLLAPSED = range(3)
 #: Rows of `Integrator.K` after the seven stages.
 STATE, TRIAL, ATOL = 7, 8, 9
+#: What counts as the last error where there was none, or a smaller one: its logarithm.
+LEAST_ERROR = math.log(1e-4)
 
 
 class Integrator(NamedTuple):
@@ -21,7 +24,7 @@ class Integrator(NamedTuple):
 
     y: Array  # (n,) state at `clock[0]`
     K: Array  # (10, n padded to eights) stages, K[0] the derivative at y; y, trial, tolerance
-    clock: Array  # (3,) t [s], next step h [s], last error
+    clock: Array  # (3,) t [s], next step h [s], logarithm of the last error
     count: NDArray[np.int64]  # (4,) evaluations, accepted, rejected, samples written
     rtol: float
 
@@ -35,7 +38,7 @@ def integrator(y: Array, t: float, *, rtol: float, atol: Array, step: float = 1e
     K = zeros(10, padded(n))
     K[ATOL] = 1.0
     K[ATOL, :n] = atol
-    clock, count = np.array([t, step, 1e-4]), np.zeros(4, dtype=np.int64)
+    clock, count = np.array([t, step, LEAST_ERROR]), np.zeros(4, dtype=np.int64)
     return Integrator(y.copy(), K, clock, count, rtol)
 
 
