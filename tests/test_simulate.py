@@ -968,6 +968,7 @@ def test_a_controller_flies_phases_that_end_by_settling_too():
         (np.full((3, 3), np.nan), "not finite at t = "),
         (np.full((3, 3), np.inf), "not finite at t = "),
         (None, r"return \(3, 3\)"),
+        (np.zeros((3, 3), dtype=complex), "complex numbers at t = "),
         ("north", "'north' at t = "),
     ],
 )

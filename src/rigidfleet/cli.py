@@ -18,6 +18,7 @@ Packages that take long to load are imported by the commands that need them.
 from __future__ import annotations
 
 import gc
+import math
 import os
 import signal
 import sys
@@ -318,9 +319,9 @@ def design(
         name, slots = _points(shape, agents, size)
         if edges is not None:
             _reject(edges, reach, searched=extra != "0" or sensing_range is not None)
-            kinds = {edges: designs.GRAPHS[edges](slots, reach or REACH)}
+            kinds = {edges: designs.GRAPHS[edges](slots, REACH if reach is None else reach)}
         else:
-            more = extra if extra == "complete" else int(_number(extra))
+            more = extra if extra == "complete" else _whole(extra)
             kinds = {"designed": designs.design(slots, extra=more, sensing_range=sensing_range)}
             if shape == "cube":
                 kinds["the paper's 18"] = CUBE_EDGES
@@ -368,6 +369,8 @@ def _reject(edges: str, reach: float | None, *, searched: bool) -> None:
         raise ValueError("--extra and --range are of the search, remove them or --edges")
     if reach is not None and edges != "neighbours":
         raise ValueError(f"--reach has no effect on edges {edges!r}, remove it")
+    if reach is not None and not 0.0 < reach < math.inf:
+        raise ValueError(f"--reach must be a positive number of spacings, not {reach:g}")
 
 
 def _judged(slots: Any, edges: Any) -> tuple[dict[str, Any], tuple[str, ...]]:
@@ -653,8 +656,8 @@ def _ask(name: str) -> tuple[str, dict[str, Any]]:
         return text
 
     def count(text: str) -> int:
-        slots(shape, [1.0] * SHAPES[shape].sizes, int(_number(text)))
-        return int(_number(text))
+        slots(shape, [1.0] * SHAPES[shape].sizes, _whole(text))
+        return _whole(text)
 
     def point(text: str) -> tuple[float, ...]:
         values = tuple(map(_number, text.replace(",", " ").split()))
@@ -680,6 +683,13 @@ def _number(text: str) -> float:
         return float(text)
     except ValueError:
         raise ValueError(f"'{text}' is no number.") from None
+
+
+def _whole(text: str) -> int:
+    number = _number(text)
+    if not (math.isfinite(number) and number == round(number)):
+        raise ValueError(f"'{text}' is no whole number.")
+    return int(number)
 
 
 @app.command(sort_key=9)

@@ -32,6 +32,10 @@ def asked(
 
 def _checked(f: ArrayLike, n: int, who: str, t: float) -> Array:
     """Forces (N, 3) [N] from a user's function, or an error that says what came instead."""
+    if np.iscomplexobj(f):
+        raise FlightError(
+            f"{who} returned complex numbers at t = {t:.3f} s; return an array ({n}, 3) of forces [N]"
+        )
     try:
         force = np.array(f, dtype=np.float64)
     except (TypeError, ValueError):

@@ -168,6 +168,7 @@ def _regulators(notes: Notes, parts: dict[str, Any]) -> None:
     lqr: Lqr = parts.get("lqr", Lqr())
     _regulator(notes, lqr, "lqr")
     _regulator(notes, lqr.attitude, "lqr", "attitude")
+    _free_input(notes, lqr)
 
 
 def _regulator(notes: Notes, weights: Regulator, *path: str) -> None:
@@ -180,12 +181,15 @@ def _regulator(notes: Notes, weights: Regulator, *path: str) -> None:
     if weights.horizon == "finite" and not any(weights.Q) and not any(weights.S):
         problem = "with Q and S zero there is nothing to steer for"
         notes.add((*path, "S"), problem, "give S = [1e3, 1e2], say", weights.S)
-    most = max(*weights.Q, *weights.S)
-    if _FREE * most > weights.R and notes.right(("lqr",), "R") and notes.right(path, "R"):
-        problem = (
-            f"is less than {_FREE:g} of the largest weight, {most:g}: gains would have no bound"
-        )
-        notes.add((*path, "R"), problem, "raise R, or lower Q and S", weights.R)
+
+
+def _free_input(notes: Notes, lqr: Lqr) -> None:
+    for weights, name in ((lqr, "lqr"), (lqr.attitude, "lqr.attitude")):
+        path, most = tuple(name.split(".")), max(*weights.Q, *weights.S)
+        if _FREE * most > weights.R and notes.right(("lqr",), "R") and notes.right(path, "R"):
+            problem = f"is less than {_FREE:g} of the largest weight of {name}, {most:g}: gains would have no bound"
+            where = ("lqr",) if weights.R == lqr.R else path  # inherited
+            notes.add((*where, "R"), problem, "raise R, or lower Q and S", weights.R)
 
 
 def _tracking(notes: Notes, parts: dict[str, Any]) -> None:
