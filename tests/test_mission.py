@@ -452,6 +452,7 @@ def test_missions_cross_processes():
         (("lqr", {"R": 1e-12, "attitude": {"S": [1e5, 0]}}), "lqr.R", "lqr.attitude, 100000", "raise R"),
         (("lqr/attitude", {"R": 1e-13}), "lqr.attitude.R", "no bound", "raise R"),
         (("lqr/attitude", {"S": [0, 0]}), "lqr.attitude.S", "nothing to steer for", "S ="),
+        (("tracking/R", 1e-300), "tracking.R", "gains would have no bound", "raise R"),
         (("tracking/Q", [0, 1]), "tracking.Q", "weight > 0", "[4.0, 4.0]"),
         (("allocation/torque_split", "equal"), "allocation.torque_split", "no effect", "pinv"),
         (("integrator/rtol", 0), "integrator.rtol", "must be > 0", "relative"),

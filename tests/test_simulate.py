@@ -979,6 +979,14 @@ def test_what_is_no_force_is_refused(kind, returned, message):
         simulate(mission, **as_option(kind, lambda *_: returned))
 
 
+def test_forces_whose_squares_overflow_are_named_as_they_are():
+    """The diagnosis of a force far too large does not fail of it."""
+    gust = np.array([[0, 0, 0], [1e200, 0, 0], [0, 0, 0]], dtype=float)
+    mission = a_mission(establish(until=4.0), {"kind": "hold", "duration": 1.0})
+    result = simulate(mission, force=lambda t, r, v: gust * (t > 4.5))
+    assert "external force on agent 2, 1e+200 N" in result.ending
+
+
 @pytest.mark.parametrize("kind", ["controller", "force"])
 @pytest.mark.parametrize("since", [0.0, 4.5])
 def test_an_exception_of_a_users_function_keeps_the_flight(kind, since):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -100,7 +101,7 @@ def _remedy(mission: Mission, leg: Leg, *, own_force: bool, collapsed: bool) -> 
         return f"The distance {i}-{j} is {w.c[k]:+.3g} m off{_FEEDBACK}"
     name, f = max(names.items(), key=lambda item: float(np.abs(item[1]).max()))
     agent = int(np.abs(f).max(axis=1).argmax())
-    size = float(np.linalg.norm(f[agent]))
+    size = math.hypot(*f[agent])  # no square of it overflows
     if collapsed:
         return (
             f"The greatest force is the {name} on agent {agent + 1}, {size:.3g} N. Look for what"
