@@ -23,13 +23,32 @@ def dcm_from_quaternion(q: ArrayLike) -> Array:
 
     The quaternions need not be of unit length. ValueError where one is zero.
     """
-    q0, q1, q2, q3 = np.moveaxis(_unit(q), -1, 0)
+    q = _unit(q)
+    q0, q1, q2, q3 = (q[..., k] for k in range(4))
     rows = [
         [q0**2 + q1**2 - q2**2 - q3**2, 2 * (q1 * q2 + q0 * q3), 2 * (q1 * q3 - q0 * q2)],
         [2 * (q1 * q2 - q0 * q3), q0**2 - q1**2 + q2**2 - q3**2, 2 * (q2 * q3 + q0 * q1)],
         [2 * (q1 * q3 + q0 * q2), 2 * (q2 * q3 - q0 * q1), q0**2 - q1**2 - q2**2 + q3**2],
     ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    return _matrices(rows)
+
+
+def _products() -> Array:
+    """4 q q^T - 1 (4, 4) of a rotation T (3, 3), which is linear in T: the map (9, 16)."""
+    N = np.zeros((3, 3, 4, 4))
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        N[i, i, 0, 0] = N[i, i, i + 1, i + 1] = 1.0
+        N[j, j, i + 1, i + 1] = N[k, k, i + 1, i + 1] = -1.0
+        N[j, k, 0, i + 1] = N[j, k, i + 1, 0] = 1.0
+        N[k, j, 0, i + 1] = N[k, j, i + 1, 0] = -1.0
+        N[
+            [j, k, j, k], [k, j, k, j], [j + 1, j + 1, k + 1, k + 1], [k + 1, k + 1, j + 1, j + 1]
+        ] = 1.0
+    return N.reshape(9, 16)
+
+
+_PRODUCTS = _products()
 
 
 def quaternion_from_dcm(T: ArrayLike) -> Array:
@@ -39,24 +58,17 @@ def quaternion_from_dcm(T: ArrayLike) -> Array:
     T is not a rotation to 1e-6.
     """
     T = _vectors("T", T, 3, 3)
-    deviation = T @ np.swapaxes(T, -1, -2) - np.eye(3)
-    determinant = np.sum(np.cross(T[..., 0, :], T[..., 1, :]) * T[..., 2, :], axis=-1)
-    if np.any(np.abs(deviation) > 1e-6) or np.any(determinant < 0.0):
+    deviation = T @ T.swapaxes(-1, -2) - np.eye(3)
+    with np.errstate(invalid="ignore"):  # NaN stays NaN
+        mirrored = np.linalg.det(T) < 0.0
+    if (np.abs(deviation) > 1e-6).any() or mirrored.any():
         raise ValueError(
             "T is not a rotation (T T^T = 1 to 1e-6 and det T = +1): a mirror image or a matrix"
             " that has drifted has no quaternion; orthonormalise its rows first"
         )
-    N = np.empty((*T.shape[:-2], 4, 4))  # 4 q q^T
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        N[..., i + 1, i + 1] = 1 + T[..., i, i] - T[..., j, j] - T[..., k, k]
-        N[..., 0, i + 1] = N[..., i + 1, 0] = T[..., j, k] - T[..., k, j]
-        N[..., j + 1, k + 1] = N[..., k + 1, j + 1] = T[..., j, k] + T[..., k, j]
-    N[..., 0, 0] = 1 + np.trace(T, axis1=-2, axis2=-1)
-    largest = np.argmax(np.diagonal(N, axis1=-2, axis2=-1), axis=-1)
-    return _scalar_positive(
-        _unit(np.take_along_axis(N, largest[..., None, None], axis=-2)[..., 0, :])
-    )
+    N = (T.reshape(-1, 9) @ _PRODUCTS).reshape(-1, 4, 4) + np.eye(4)  # 4 q q^T
+    largest = np.einsum("kii->ki", N).argmax(axis=1)
+    return _scalar_positive(_unit(N[np.arange(len(N)), largest].reshape(*T.shape[:-2], 4)))
 
 
 def dcm_from_euler(euler: ArrayLike) -> Array:
@@ -69,7 +81,7 @@ def dcm_from_euler(euler: ArrayLike) -> Array:
         [sr * sp * cy - cr * sy, sr * sp * sy + cr * cy, sr * cp],
         [cr * sp * cy + sr * sy, cr * sp * sy - sr * cy, cr * cp],
     ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    return _matrices(rows)
 
 
 def euler_from_dcm(T: ArrayLike) -> Array:
@@ -248,10 +260,16 @@ def _vectors(name: str, value: ArrayLike, *shape: int) -> Array:
     return array
 
 
+def _matrices(rows: list[list[Array]]) -> Array:
+    """Matrices (..., 3, 3) of entries (...)."""
+    entries = np.array(rows)
+    return np.ascontiguousarray(entries.transpose(*range(2, entries.ndim), 0, 1))
+
+
 def _unit(q: ArrayLike) -> Array:
     q = _vectors("q", q, 4)
-    norm = np.linalg.norm(q, axis=-1, keepdims=True)
-    if np.any(norm == 0.0):
+    norm = np.sqrt((q * q).sum(axis=-1, keepdims=True))
+    if (norm == 0.0).any():
         raise ValueError(
             "a quaternion of length zero is no attitude; no turn at all is (1, 0, 0, 0)"
         )

@@ -26,7 +26,7 @@ import warnings
 from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, cast
+from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
 from cyclopts import App, CycloptsError, Parameter, UnusedCliTokensError
 
@@ -702,6 +702,7 @@ def sweep(
     seed: int | None = None,
     out: Path | None = None,
     force: bool = False,
+    ends: bool = False,
     workers: int | None = None,
     cluster: str | None = None,
     summary: bool = False,
@@ -730,6 +731,8 @@ def sweep(
         Folder for sweep.db, summary.json and figures/; sweeps/NAME if not given.
     force : bool
         Replace another sweep in that folder; without it, it is kept and nothing is flown.
+    ends : bool
+        Judge where phases end alone: open-loop missions whose starts vary then fly by the thousand in a second.
     workers : int
         Processes on this machine; as many as it has cores if not given.
     cluster : str
@@ -756,7 +759,7 @@ def sweep(
         folder = Path(mission)
         table = store.read(folder)
     else:
-        asked, folder = _asked(mission, vary or [], runs, seed, out)
+        asked, folder = _asked(mission, vary or [], runs, seed, out, ends=ends)
         watch = None if quiet else screen.SweepWatch()
         try:
             with watch or nullcontext(), _heeding_interrupts():
@@ -792,7 +795,7 @@ def sweep(
 
 
 def _asked(
-    what: str, vary: list[str], runs: int | None, seed: int | None, out: Path | None
+    what: str, vary: list[str], runs: int | None, seed: int | None, out: Path | None, *, ends: bool
 ) -> tuple[Sweep, Path]:
     """The sweep that is asked for, and its folder."""
     from rigidfleet.mission import mission_names
@@ -800,17 +803,25 @@ def _asked(
     from rigidfleet.sweep.definition import is_sweep_file
 
     if store.is_store(Path(what)):
-        if vary or seed is not None or out is not None:
+        if vary or seed is not None or out is not None or ends:
             raise RigidfleetError(
-                f"{what}: is a sweep already, and goes on as it is. Remove --vary, --seed and --out."
+                f"{what}: is a sweep already, and goes on as it is. Remove --vary, --seed, --ends and --out."
             )
         found = store.read_sweep(Path(what))
         found.runs = runs or found.runs
         return found, Path(what)
+    judged: Literal["ends"] | None = "ends" if ends else None
     if what not in mission_names() and is_sweep_file(what):
-        found = Sweep.load(what, more=vary, runs=runs, seed=seed)
+        found = Sweep.load(what, more=vary, runs=runs, seed=seed, judged=judged)
     else:
-        found = Sweep.of(what, vary, runs=runs, seed=seed or 0, origin="rigidfleet sweep")
+        found = Sweep.of(
+            what,
+            vary,
+            runs=runs,
+            seed=seed or 0,
+            judged=judged or "flight",
+            origin="rigidfleet sweep",
+        )
     return found, out or Path("sweeps", found.name)
 
 

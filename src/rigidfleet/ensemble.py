@@ -1,7 +1,8 @@
 """Establish a formation from many starts at once: a hundred thousand flights in some seconds.
 
 For a gain study or a Monte Carlo study of the constraint law itself. What varies here are the starts alone, what
-comes out is where the agents end; `rigidfleet.sweep` varies anything in any mission, and judges every flight.
+comes out is where the agents are when phases end; `rigidfleet.sweep` flies so, too, if only ends are to be judged,
+and else varies anything in any mission and judges whole flights.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from rigidfleet.kernel.lanes import WIDTH
 from rigidfleet.mission import Establish, Mission, Phase, Reshape
 from rigidfleet.plan import plan_phase
 from rigidfleet.route import Situation
+from rigidfleet.solvers import choose
 
 if TYPE_CHECKING:
     from rigidfleet.kernel.program import Array
@@ -33,6 +35,7 @@ class Ensemble:
     error : (B,) the largest error of a distance that the last formation asks for [m]
     finished : (B,) whether a flight has reached the end; the rest holds its last good state
     evaluations : (B,) of the right-hand side
+    ends : position (B, N, 3) at the end of each phase [m]; of a flight that is not finished, its last good one
     vectors : whether eight flights shared a vector
     """
 
@@ -41,6 +44,7 @@ class Ensemble:
     error: Array
     finished: NDArray[np.bool_]
     evaluations: NDArray[np.int64]
+    ends: tuple[Array, ...]
     vectors: bool
 
 
@@ -75,27 +79,43 @@ def establish(
     v = np.zeros_like(r) if velocity is None else _starts("velocity", velocity, mission.n_agents)
     if v.shape != r.shape:
         raise ValueError(f"velocity {v.shape} and position {r.shape} must have one shape")
-    _refuse_others(mission)
+    if (why := unfit(mission)) is not None:
+        raise ValueError(f"{why}; vary such missions by `rigidfleet.sweep`")
     flights = _Flights(mission, r, v)
+    ends = []
     for phase in mission.phases:
         if flights.finished.any():
             flights.fly(phase, vectors, threads or os.cpu_count() or 1)
+        ends.append(flights.r)
     return Ensemble(
-        flights.r, flights.v, flights.error, flights.finished, flights.evaluations, flights.vectors
+        flights.r,
+        flights.v,
+        flights.error,
+        flights.finished,
+        flights.evaluations,
+        tuple(ends),
+        flights.vectors,
     )
 
 
-def _refuse_others(mission: Mission) -> None:
+def unfit(mission: Mission) -> str | None:
+    """Why a mission cannot be flown by `establish`; None if it can."""
     for index, phase in enumerate(mission.phases):
         if phase.control != "open" or phase.settle or not _alike(mission, phase):
-            raise ValueError(
+            return (
                 f"phase {index + 1} '{phase.name}' is not flown open-loop under squares or steps to a given time, which"
-                " is all that an ensemble flies; vary other missions by `rigidfleet.sweep`"
+                " is all that an ensemble flies"
             )
+        if isinstance(phase, Establish | Reshape):
+            edges = mission.formation_edges(phase.formation)
+            if choose(mission.n_agents, edges, mission.constraint.solver) != "dense":
+                return (
+                    f"an ensemble solves densely, and '{phase.formation}' has too many edges for that"
+                    f" ({len(edges)})"
+                )
     if mission.disturbances is not None:
-        raise ValueError(
-            "an ensemble flies in calm air; vary missions with [disturbances] by `rigidfleet.sweep`"
-        )
+        return "an ensemble flies in calm air, and the mission has [disturbances]"
+    return None
 
 
 class _Flights:
@@ -117,11 +137,6 @@ class _Flights:
         now, (count, n) = self.now, self.r.shape[:2]
         t_end = now.t + (phase.duration or 0.0) if phase.until is None else phase.until
         plan = plan_phase(self.mission, phase, now, t_end)
-        if plan.method != "dense":
-            raise ValueError(
-                f"an ensemble solves densely, and '{plan.formation}' has too many edges for that"
-                f" ({len(plan.edges)}); vary such missions by `rigidfleet.sweep`"
-            )
         law = plan.program.law._replace(mu=self.mission.damping(None))
         program = plan.program._replace(law=law)
         edges = [(int(i), int(j)) for i, j in plan.edges]

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import lru_cache
 from itertools import combinations, islice, permutations, product
 from pathlib import Path
 from typing import NamedTuple
@@ -343,6 +344,11 @@ def centred(points: ArrayLike) -> Floats:
 
 def complete_graph(n: int) -> Ints:
     """All n (n - 1) / 2 edges (i, j), i < j, in lexical order, shape (m, 2)."""
+    return _complete_graph(n).copy()
+
+
+@lru_cache(8)
+def _complete_graph(n: int) -> Ints:
     return np.column_stack(np.triu_indices(n, 1)).astype(np.int64)
 
 

@@ -215,50 +215,83 @@ def fit_attitudes(
     U[:, :, 2] *= np.sign(np.linalg.det(U @ Vt))[:, None]
     T = U @ Vt
     weights = np.sqrt(masses)[:, None]
-    if p.shape[1] == 1:
-        width, long = np.zeros(len(p)), np.zeros(len(p))
-        axes = np.broadcast_to(np.eye(3), (len(p), 3, 3))
-    else:
-        # Slots mostly stand still: one decomposition then serves all samples.
-        few = p[:1] if (p == p[0]).all() else p
-        _, spread, axes = np.linalg.svd(weights * few, full_matrices=False)
-        width, long = (np.broadcast_to(spread[:, q], len(p)) for q in (1, 0))
-        axes = np.broadcast_to(axes, (len(p), *axes.shape[1:]))
+    width, long, axes = _long_axes(weights * p)
     line = width <= _THIN * long
     if near.ndim == 3:
         thin = np.flatnonzero(width <= _NARROW * long)
-        along = _turn_lines(x[thin], p[thin], axes[thin, 0], near[thin])
+        along = _turn_lines(x[thin], p[thin], axes[thin], near[thin])
         off = np.linalg.norm(weights * (x[thin] - p[thin] @ along), axis=(1, 2))
         line[thin] |= width[thin] <= _SURE * off
         T[thin] = np.where(line[thin, None, None], along, T[thin])
         return T, line
-    guess = near[None]
+    # Out of samples on a line, each turns on from the one before: what turns them is known beforehand.
+    if not line.any():
+        return T, line
+    there = _directions(x, p, axes)
+    follows = line[1:] & line[:-1] & (axes[1:] == axes[:-1]).all(axis=1) & there[:-1].any(axis=1)
+    first = np.flatnonzero(line & ~np.append(False, follows))
+    now = np.concatenate([there[:1], there[:-1]])
+    now[first] = 0.0
+    turns = _smallest_turns(now, there)
+    guess = near
     for k in range(len(p)):
         if line[k]:
-            T[k] = _turn_lines(x[k : k + 1], p[k : k + 1], axes[k : k + 1, 0], guess)[0]
-        guess = T[k : k + 1]
+            turn = turns[k]
+            if not now[k].any():
+                turn = _smallest_turns((axes[k] @ guess)[None], there[k : k + 1])[0]
+            T[k] = guess @ turn.T
+        guess = T[k]
     return T, line
+
+
+def _long_axes(p: Array) -> tuple[Array, Array, Array]:
+    """Second and first singular value (K,) of points p (K, N, 3), and the direction (K, 3) of the first.
+
+    Of points so wide that they are no line, two others whose ratio says so.
+    """
+    # Slots mostly stand still: one decomposition then serves all samples.
+    few = p[:1] if (p == p[0]).all() else p
+    C = few.swapaxes(1, 2) @ few
+    # Eigenvalues a >= b >= c of C: with s = a + b + c, b >= (ab + ac + bc) / 3s.
+    s = np.trace(C, axis1=1, axis2=2)
+    long = np.sqrt(s)
+    width = np.sqrt(
+        np.maximum(s * s - (C * C).sum(axis=(1, 2)), 0.0) / (6.0 * np.where(s > 0.0, s, 1.0))
+    )
+    axis = np.zeros((len(few), 3))
+    slim = np.flatnonzero(width <= _NARROW * long)
+    if len(slim) and p.shape[1] > 1:
+        _, spread, axes = np.linalg.svd(few[slim], full_matrices=False)
+        long[slim], width[slim], axis[slim] = spread[:, 0], spread[:, 1], axes[:, 0]
+    K = len(p)
+    return np.broadcast_to(width, K), np.broadcast_to(long, K), np.broadcast_to(axis, (K, 3))
 
 
 def _turn_lines(x: Array, p: Array, axis: Array, near: Array) -> Array:
     """Attitudes (K, 3, 3) of lines, from ``near`` by the smallest rotation that brings each axis home."""
     now = np.einsum("kba,kb->ka", near, axis)
+    return near @ _smallest_turns(now, _directions(x, p, axis)).swapaxes(1, 2)
+
+
+def _directions(x: Array, p: Array, axis: Array) -> Array:
+    """Where the long axis (K, 3) of slots p points among agents x (K, N, 3): unit vectors, or zero."""
     there = np.einsum("ki,kia->ka", np.einsum("kia,ka->ki", p, axis), x)
     length = np.linalg.norm(there, axis=1)
-    pointlike = length == 0.0
-    there /= np.where(pointlike, 1.0, length)[:, None]
-    n, c = np.cross(now, there), np.einsum("ka,ka->k", now, there)
+    return there / np.where(length == 0.0, 1.0, length)[:, None]
+
+
+def _smallest_turns(now: Array, there: Array) -> Array:
+    """Smallest rotations (K, 3, 3) from unit vectors to others (K, 3); none to or from zero."""
+    c = np.einsum("ka,ka->k", now, there)
     opposite = c < -1.0 + 1e-12
-    skew = np.zeros((len(x), 3, 3))
-    for a, b, d in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        skew[:, a, b], skew[:, b, a] = -n[:, d], n[:, d]
+    skew = there[:, :, None] * now[:, None, :]  # of now x there, less its transpose
+    skew = skew - skew.swapaxes(1, 2)
     R = np.eye(3) + skew + skew @ skew / np.where(opposite, 1.0, 1.0 + c)[:, None, None]
     for k in np.flatnonzero(opposite):  # half a turn: any axis across the line will do
         across = np.cross(now[k], np.eye(3)[np.abs(now[k]).argmin()])
         across /= np.linalg.norm(across)
         R[k] = 2.0 * np.outer(across, across) - np.eye(3)
-    R[pointlike] = np.eye(3)
-    return near @ R.swapaxes(1, 2)
+    return R
 
 
 def mean_axis_rates(x: Array, y: Array, masses: Array, line: ArrayLike = False) -> Array:
@@ -271,9 +304,15 @@ def mean_axis_rates(x: Array, y: Array, masses: Array, line: ArrayLike = False) 
     h = np.einsum("ki,kia->ka", masses, np.cross(x, y))
     C = np.einsum("ki,kia,kib->kab", masses, x, x)
     inertia = np.trace(C, axis1=1, axis2=2)[:, None, None] * np.eye(3) - C
-    cutoff = np.broadcast_to(np.where(line, _NARROW**2, 1e-9), len(x))
-    pseudo = np.linalg.pinv(inertia, cutoff, hermitian=True)
-    omega = np.einsum("kab,kb->ka", pseudo, h)
+    # Far from a line the inverse is the pseudo-inverse, for a third of the time.
+    size = np.trace(inertia, axis1=1, axis2=2)
+    round_ = ~np.broadcast_to(line, len(x)) & (np.linalg.det(inertia) > 1e-4 * size**3)
+    omega = np.empty((len(x), 3))
+    omega[round_] = np.linalg.solve(inertia[round_], h[round_, :, None])[:, :, 0]
+    rest = ~round_
+    cutoff = np.broadcast_to(np.where(line, _NARROW**2, 1e-9), len(x))[rest]
+    pseudo = np.linalg.pinv(inertia[rest], cutoff, hermitian=True)
+    omega[rest] = np.einsum("kab,kb->ka", pseudo, h[rest])
     # Of a point none; not what rounding makes of it.
     return np.where(np.count_nonzero(masses, axis=1)[:, None] > 1, omega, 0.0)
 

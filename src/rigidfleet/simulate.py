@@ -210,6 +210,7 @@ class Flight:
         self.ending = ""
         self.started = self.reported = clock.perf_counter()
         self.count = np.zeros(3, dtype=np.int64)
+        self.steps = 10  # at a time; more as soon as it is known how long they take
         self.solves: dict[solvers.Method, large.Counts] = {}
 
     def fly(self) -> None:
@@ -402,7 +403,6 @@ class Flight:
     def _stretch(self, leg: Leg, program: k.Program, t_end: float) -> None:
         """Integrate to ``t_end`` [s] and record the samples on the way."""
         state = leg.state
-        steps = 10
         fresh = state.count[0] == 0 or program is not leg.plan.program
         least = max(_WATCH, (t_end - leg.t) * len(self.masses) / _WATCHED)
         times, kept = self._watched(leg.t, self._samples(leg, t_end), t_end, least)
@@ -414,10 +414,11 @@ class Flight:
             while status == records.PAUSED:
                 begun = clock.perf_counter()
                 status = native.integrate(
-                    program, leg.workspace, state, t_end, fresh, times, samples, steps
+                    program, leg.workspace, state, t_end, fresh, times, samples, self.steps
                 )
                 took = max(clock.perf_counter() - begun, 1e-6)
-                steps = min(_STEPS, max(1, int(steps * min(_PAUSE / took, 10.0))))
+                if status == records.PAUSED:
+                    self.steps = min(_STEPS, max(1, int(self.steps * min(_PAUSE / took, 10.0))))
                 fresh = False
                 if self.external is not None:
                     self.external.check()

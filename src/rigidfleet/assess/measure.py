@@ -18,9 +18,9 @@ from rigidfleet.result import PhaseRecord, Result
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-# Slots thinner than this, relative to their length, are planar or straight: distances of seven digits
-# leave a flat shape 3e-4 thick.
-_THIN = 1e-3
+#: Slots thinner than this, relative to their length, are planar or straight: distances of seven digits
+#: leave a flat shape 3e-4 thick.
+THIN = 1e-3
 
 #: Agents up to which a shape that is not the intended one is asked whether it is rigid.
 _JUDGED = 200
@@ -34,7 +34,7 @@ class Fit:
         #: The pair with the greatest error, by the numbers ``who`` (N,) of the agents.
         self.pair = pair if who is None else (int(who[pair[0]]), int(who[pair[1]]))
         p, slots = shapes.centred(p), shapes.centred(slots)
-        self.dimension = shapes.dimension(slots, _THIN)
+        self.dimension = shapes.dimension(slots, THIN)
         self.mirrored = self.dimension == 3 and bool(np.linalg.det(p.T @ slots) < 0)
         axes = np.linalg.svd(slots, full_matrices=False)[2]
         #: Direction of a line or normal of a plane, in the slots' axes, and where it points in the world.

@@ -17,7 +17,8 @@ from rigidfleet import __version__
 from rigidfleet.errors import RigidfleetError
 from rigidfleet.sweep import workers as crews
 from rigidfleet.sweep.definition import Sweep
-from rigidfleet.sweep.engine import GROUP, Row, fly_runs
+from rigidfleet.sweep.engine import GROUP, fly_runs
+from rigidfleet.sweep.row import Row
 from rigidfleet.sweep.store import Store, Table, read
 
 #: A chunk takes about so long [s]: what is lost by kill -9 for each worker, and how often a bar moves.

@@ -13,7 +13,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import Field, Strict
@@ -36,6 +36,8 @@ from rigidfleet.sweep.variation import (
     is_number,
 )
 
+Judged = Literal["flight", "ends"]
+
 #: Least fraction of a distribution, so that no normal number is infinite.
 _LEAST = 2.0**-54
 
@@ -51,6 +53,11 @@ class Header(Part):
     )
     seed: Annotated[int, Strict(), Field(ge=0, lt=2**63)] = Field(
         0, description="seed of the random numbers"
+    )
+    judged: Judged = Field(
+        "flight",
+        description="what of a run: its whole flight; or where its phases end alone, of open-loop missions whose "
+        "starts vary, thousands in a second",
     )
 
 
@@ -78,6 +85,7 @@ class Sweep:
     runs : number of runs
     seed : of the random numbers
     name : what to call it
+    judged : what of each run, "flight" or "ends"
     """
 
     def __init__(
@@ -87,9 +95,10 @@ class Sweep:
         runs: int | None,
         seed: int,
         name: str,
+        judged: Judged = "flight",
     ) -> None:
         self.mission, self.variations = mission, tuple(variations)
-        self.seed, self.name = seed, name
+        self.seed, self.name, self.judged = seed, name, judged
         self.runs = runs or math.prod(len(c.grid) for c in self.columns if c.grid is not None)
 
     @classmethod
@@ -100,6 +109,7 @@ class Sweep:
         *,
         runs: int | None = None,
         seed: int = 0,
+        judged: Judged = "flight",
         name: str = "",
         origin: str = "sweep",
     ) -> Self:
@@ -110,6 +120,7 @@ class Sweep:
         vary : a line for each variation, as `agents.mass.* *= normal(1, 0.05)`, or its table
         runs : one for each point of the grid when absent
         seed : of the random numbers
+        judged : "flight", or "ends": where phases end alone, of open-loop missions whose starts vary
         name : that of the mission when absent
         origin : what messages call the sweep
 
@@ -124,8 +135,11 @@ class Sweep:
             mission = load_mission(mission)
         data: dict[str, Any] = {"mission": mission.name, "seed": seed, "vary": list(vary)}
         data |= {} if runs is None else {"runs": runs}
+        data |= {} if judged == "flight" else {"judged": judged}
         header, variations = _checked(data, origin, mission)
-        return cls(mission, variations, header.runs, header.seed, name or mission.name)
+        return cls(
+            mission, variations, header.runs, header.seed, name or mission.name, header.judged
+        )
 
     @classmethod
     def load(
@@ -135,13 +149,14 @@ class Sweep:
         more: Iterable[str] = (),
         runs: int | None = None,
         seed: int | None = None,
+        judged: Judged | None = None,
     ) -> Self:
         """Read a sweep file.
 
         Parameters
         ----------
         more : lines of further variations
-        runs, seed : in place of the file's
+        runs, seed, judged : in place of the file's
 
         Raises
         ------
@@ -160,11 +175,12 @@ class Sweep:
             mission = load_mission(named if shipped else path.parent / named)
         data |= {} if runs is None else {"runs": runs}
         data |= {} if seed is None else {"seed": seed}
+        data |= {} if judged is None else {"judged": judged}
         if isinstance(given := data.get("vary", []), list):
             data["vary"] = [*given, *more]
         header, variations = _checked(data, origin, mission)
         assert mission is not None  # else the check has raised
-        return cls(mission, variations, header.runs, header.seed, path.stem)
+        return cls(mission, variations, header.runs, header.seed, path.stem, header.judged)
 
     @classmethod
     def from_json(cls, text: str) -> Self:
@@ -172,7 +188,7 @@ class Sweep:
         data = json.loads(text)
         variations = [KINDS[entry["kind"]].model_validate(entry) for entry in data["vary"]]
         mission = Mission.from_toml(data["mission"], "mission of the sweep")
-        return cls(mission, variations, data["runs"], data["seed"], data["name"])
+        return cls(mission, variations, data["runs"], data["seed"], data["name"], data["judged"])
 
     def json(self) -> str:
         """All of it as JSON text, with the mission inside."""
@@ -234,6 +250,7 @@ class Sweep:
             "vary": [v.model_dump() for v in self.variations],
             "runs": self.runs,
             "seed": self.seed,
+            "judged": self.judged,
         }
 
 
@@ -300,6 +317,18 @@ def _checked(
         if mission is not None and whole is not None:
             _fits(notes, k, entry, found, mission, whole)
         variations += [] if found is None else [found]
+        if (
+            found is not None
+            and whole is not None
+            and header is not None
+            and header.judged == "ends"
+        ):
+            _moves_starts(notes, k, found, whole)
+    if header is not None and header.judged == "ends" and mission is not None:
+        from rigidfleet.ensemble import unfit
+
+        if (why := unfit(mission)) is not None:
+            notes.add(("judged",), why, 'judge whole flights: judged = "flight", no --ends', "ends")
     if "vary" not in data or data["vary"] == []:
         notes.add(
             ("vary",), "nothing varies", 'give --vary "agents.mass.* *= normal(1, 0.05)", say'
@@ -358,6 +387,23 @@ def _fits(
         elif numeric and not all(map(is_number, leaves)):
             remedy = "vary it by choice or grid of words"
             notes.add(where, f"is no number, but {leaves[0]!r}", remedy, path)
+
+
+def _moves_starts(notes: Notes, k: int, v: Variation, whole: dict[str, Any]) -> None:
+    """Whether a variation moves starts alone, which is all that differs in runs judged by their ends."""
+    values = getattr(v, "values", ())
+    starts = ("agents", "position"), ("agents", "velocity")
+    try:
+        places = paths.expand(whole, v.path)
+    except paths.PathError:
+        return  # said already
+    if any(keys[:2] not in starts for keys in places) or not all(map(is_number, values)):
+        problem = (
+            "varies more than numbers of agents.position or agents.velocity, in which alone runs judged by their"
+            " ends differ"
+        )
+        remedy = 'remove it, or judge whole flights: judged = "flight", no --ends'
+        notes.add(("vary", k, "path"), problem, remedy, v.path)
 
 
 def _taken(

@@ -1,42 +1,18 @@
-"""Fly runs of a sweep: the one place where a run becomes a row."""
+"""Fly runs of a sweep: one after the other, whole flights; or where they end alone, eight to a vector."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from time import perf_counter
 
 from rigidfleet.errors import MissionError
 from rigidfleet.sweep.definition import Sweep
 from rigidfleet.sweep.metrics import METRICS, measure
+from rigidfleet.sweep.row import Row
 
 #: Runs are flown in groups of so many consecutive ones, the first of which is a multiple of it.
 GROUP = 8
-
-
-@dataclass(frozen=True)
-class Row:
-    """What is kept of one run.
-
-    Attributes
-    ----------
-    run : its number, from 0
-    passed : whether it passed its verdict
-    reason : the checks that failed, with commas; "mission" for one that cannot be flown; else ""
-    detail : the first failure in words
-    codes : value of every column of the sweep, as `Variation.code` has it
-    metrics : value of each of `METRICS`, NaN where it does not apply
-    wall : how long it took [s]
-    """
-
-    run: int
-    passed: bool
-    reason: str
-    detail: str
-    codes: tuple[float, ...]
-    metrics: dict[str, float]
-    wall: float
 
 
 def fly_runs(sweep: Sweep, runs: Sequence[int]) -> list[Row]:
@@ -45,6 +21,10 @@ def fly_runs(sweep: Sweep, runs: Sequence[int]) -> list[Row]:
     A row depends on the sweep and the run's number alone, but for `wall`. A run that cannot be flown is a
     row with its reason.
     """
+    if sweep.judged == "ends":
+        from rigidfleet.sweep.ends import fly_ends
+
+        return fly_ends(sweep, runs)
     return [_fly(sweep, run) for run in runs]
 
 

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from rigidfleet.errors import ResultError
 from rigidfleet.sweep.definition import Sweep
-from rigidfleet.sweep.engine import Row
 from rigidfleet.sweep.metrics import METRICS
+from rigidfleet.sweep.row import Row
 
 FILE = "sweep.db"
 #: Locked by the process that writes; the lock ends with it, however it ends.

@@ -15,7 +15,8 @@ from typing import Any
 from rigidfleet import __version__
 from rigidfleet.errors import RigidfleetError
 from rigidfleet.sweep.definition import shared
-from rigidfleet.sweep.engine import Row, fly_runs
+from rigidfleet.sweep.engine import fly_runs
+from rigidfleet.sweep.row import Row
 
 #: An executor, and how many chunks it works on at the same time.
 Crew = tuple[Executor, Callable[[], int]]

@@ -1,0 +1,158 @@
+"""Runs of which only the ends of their phases are judged: eight to a vector, thousands in a second.
+
+For starts that vary under open-loop phases, see `rigidfleet.ensemble`. Nothing on the way is recorded or judged.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import lru_cache
+from time import perf_counter
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rigidfleet.assess import SHAPE_TOLERANCE
+from rigidfleet.assess.measure import THIN
+from rigidfleet.ensemble import Ensemble, establish
+from rigidfleet.formation import centred, complete_graph, dimension, distances
+from rigidfleet.mission import Establish, Reshape
+from rigidfleet.mission.formations import coincident
+from rigidfleet.mission.schema import HUGE
+from rigidfleet.sweep.metrics import METRICS
+from rigidfleet.sweep.row import Row
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from rigidfleet.mission import Mission
+    from rigidfleet.sweep.definition import Sweep
+
+    Floats = NDArray[np.float64]
+    Flags = NDArray[np.bool_]
+    Ints = NDArray[np.int64]
+
+#: What has failed, in words, by its name and in the order of a verdict.
+_WORDS = {
+    "mission": "agents.position or agents.velocity: two agents at one place, or a number out of bounds",
+    "complete": "the flight cannot go on; flown alone, its mission says when, where and why",
+    "distances": "an edge of a formation is not reached where its phase ends",
+    "shape": "a formation is not reached where its phase ends",
+    "handedness": "a formation is reached as its own mirror image",
+}
+
+
+def fly_ends(sweep: Sweep, runs: Sequence[int]) -> list[Row]:
+    """Fly whole groups of runs and judge where their phases end.
+
+    A run passes if it is flown to its end and takes each of its formations: "distances", "shape" and "handedness"
+    as `rigidfleet.assess` has them. Of the metrics there are those of the shape, and the evaluations, which the
+    eight of a vector share.
+    """
+    _prepare(sweep)
+    begun = perf_counter()
+    values = [sweep.values(run) for run in runs]
+    r, v = starts(sweep, values)
+    sound = _sound(r, v)
+    r[~sound], v[~sound] = sweep.mission.agents.position, sweep.mission.agents.velocity
+    found = establish(sweep.mission, r, v)
+    checks, metrics = _judged(sweep.mission, found)
+    failed = {"mission": ~sound, "complete": sound & ~found.finished} | {
+        name: sound & found.finished & wrong for name, wrong in checks.items()
+    }
+    wall = (perf_counter() - begun) / len(runs)
+    rows = []
+    for k, (run, drawn) in enumerate(zip(runs, values, strict=True)):
+        codes = tuple(c.variation.code(x) for c, x in zip(sweep.columns, drawn, strict=True))
+        reasons = [name for name, wrong in failed.items() if wrong[k]]
+        detail = _WORDS[reasons[0]] if reasons else ""
+        known = {name: float(x[k]) for name, x in metrics.items()} if sound[k] else {}
+        of_run = {name: known.get(name, math.nan) for name in METRICS}
+        rows.append(Row(run, not reasons, ", ".join(reasons), detail, codes, of_run, wall))
+    return rows
+
+
+def starts(sweep: Sweep, values: Sequence[Sequence[Any]]) -> tuple[Floats, Floats]:
+    """Positions and velocities (B, N, 3) [m, m/s] at the start of runs with these values of the columns (B, D)."""
+    agents, count = sweep.mission.agents, len(values)
+    found = {
+        "position": np.tile(np.array(agents.position, dtype=float), (count, 1, 1)),
+        "velocity": np.tile(np.array(agents.velocity, dtype=float), (count, 1, 1)),
+    }
+    with np.errstate(over="ignore", invalid="ignore"):  # refused by `_sound`
+        for column, drawn in zip(sweep.columns, np.array(values, dtype=float).T, strict=True):
+            _, name, *inner = column.keys
+            place = found[str(name)][(slice(None), *map(int, inner))]
+            by = drawn.reshape(-1, *(1,) * (place.ndim - 1))
+            match column.variation.change:
+                case "add":
+                    place += by
+                case "scale":
+                    place *= by
+                case _:
+                    place[:] = by
+    return found["position"], found["velocity"]
+
+
+@lru_cache(maxsize=4)
+def _prepare(sweep: Sweep) -> None:
+    """Fly the mission's own start once: what has to be compiled then counts to no run's time."""
+    agents = sweep.mission.agents
+    establish(sweep.mission, [agents.position], [agents.velocity])
+
+
+def _sound(r: Floats, v: Floats) -> Flags:
+    """Whether starts (B, N, 3) are such as a mission may have (B,)."""
+    bounded = (np.abs(np.concatenate([r, v], axis=1)) <= HUGE).all(axis=(1, 2))
+    alone = [not any(coincident(points)) for points in r[bounded].tolist()]
+    bounded[bounded] = alone
+    return bounded
+
+
+def _judged(mission: Mission, flown: Ensemble) -> tuple[dict[str, Flags], dict[str, Floats]]:
+    """What fails (B,), and metrics (B,)."""
+    count = len(flown.finished)
+    wrong = {name: np.zeros(count, dtype=bool) for name in ("distances", "shape", "handedness")}
+    metrics = {"shape": np.full(count, np.nan), "handed": np.full(count, np.nan)}
+    formation, t, last = None, 0.0, len(mission.phases) - 1
+    for index, (phase, r) in enumerate(zip(mission.phases, flown.ends, strict=True)):
+        shaping = isinstance(phase, Establish | Reshape)
+        length = phase.duration if phase.until is None else phase.until - t
+        t += length or 0.0
+        formation = phase.formation if shaping else formation
+        if formation is None:
+            continue
+        judged = shaping or index == last
+        asked = mission.formation_distances(formation)
+        off = _off(r, mission.formation_edges(formation), asked)
+        blending = shaping and phase.reference != "step" and phase.blend > (length or 0.0)
+        if index == last and not blending:
+            metrics["constraint_end"] = off
+        if judged:
+            wrong["distances"] |= off > SHAPE_TOLERANCE * asked.min(initial=math.inf)
+        slots = mission.formation_slots(formation)
+        if slots is None or len(slots) < 2:
+            continue
+        pairs = complete_graph(len(slots))
+        intended = distances(slots, pairs)
+        metrics["shape_end"] = error = _off(r, pairs, intended)
+        metrics["shape"] = np.fmax(metrics["shape"], error)
+        misshapen = error > SHAPE_TOLERANCE * intended.min()
+        mirrored = np.zeros(count, dtype=bool)
+        if dimension(slots, THIN) == 3:
+            x = r - r.mean(axis=1, keepdims=True)
+            mirrored = np.linalg.det(x.swapaxes(1, 2) @ centred(slots)) < 0.0
+            metrics["handed"] = np.fmin(metrics["handed"], np.where(mirrored, 0.0, 1.0))
+        if judged:
+            wrong["shape"] |= misshapen
+            wrong["handedness"] |= mirrored & ~misshapen
+    metrics["flown"] = np.full(count, mission.latest_end)
+    metrics = {name: np.where(flown.finished, x, np.nan) for name, x in metrics.items()}
+    return wrong, metrics | {"evaluations": flown.evaluations.astype(float)}
+
+
+def _off(r: Floats, edges: Ints, asked: Floats) -> Floats:
+    """Greatest error (B,) of the lengths of edges (m, 2) at positions (B, N, 3) [m]."""
+    found = np.linalg.norm(r[:, edges[:, 0]] - r[:, edges[:, 1]], axis=2)
+    return np.abs(found - asked).max(axis=1, initial=0.0)

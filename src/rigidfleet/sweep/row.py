@@ -1,0 +1,29 @@
+"""What is kept of a run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Row:
+    """What is kept of one run.
+
+    Attributes
+    ----------
+    run : its number, from 0
+    passed : whether it passed its verdict
+    reason : the checks that failed, with commas; "mission" for one that cannot be flown; else ""
+    detail : the first failure in words
+    codes : value of every column of the sweep, as `Variation.code` has it
+    metrics : value of each of `METRICS`, NaN where it does not apply
+    wall : how long it took [s]
+    """
+
+    run: int
+    passed: bool
+    reason: str
+    detail: str
+    codes: tuple[float, ...]
+    metrics: dict[str, float]
+    wall: float
