@@ -36,7 +36,7 @@ from rigidfleet.mission import Mission, load_mission
 from rigidfleet.plan import plan_phase
 from rigidfleet.route import Situation
 from rigidfleet.simulate import simulate
-from rigidfleet.sweep.definition import Sweep
+from rigidfleet.sweep import Sweep, fly
 from rigidfleet.sweep.engine import fly_runs
 
 TOLERANCE = 1e-8
@@ -205,7 +205,13 @@ def ensembles(rounds: int) -> list[Row]:
             end = np.array([DURATION])
             ours = establish(mission, starts, vectors=True)
             theirs = peers[0].fly(end, RTOL, ATOL)[-1, : 3 * n].reshape(n, 3)
-            alone, vectors, scipy = [], [], []
+            kept = Sweep.of(
+                mission,
+                [f"agents.position.*.* += uniform({-SPREAD}, {SPREAD})"],
+                runs=FLIGHTS,
+                judged="ends",
+            )
+            alone, vectors, rows_kept, scipy = [], [], [], []
             for k in range(rounds):
                 some = peers[SCIPYS * k : SCIPYS * (k + 1)]
                 loop = [partial(p.fly, end, RTOL, ATOL) for p in some]
@@ -213,6 +219,8 @@ def ensembles(rounds: int) -> list[Row]:
                 for times, choice in ((vectors, True), (alone, False)):
                     all_of_them = partial(establish, mission, starts, vectors=choice)
                     times.append(seconds(all_of_them, 0.1) / FLIGHTS)
+                with tempfile.TemporaryDirectory() as folder:
+                    rows_kept.append(seconds(partial(fly, kept, folder)) / FLIGHTS)
             title = f"{n} agents, {law}, {FLIGHTS:,} flights"
             evaluations = float(np.median(ours.evaluations))
             note = (
@@ -222,6 +230,9 @@ def ensembles(rounds: int) -> list[Row]:
             rows += [
                 Row(title, vectors, scipy, goals[n], True, note, evaluations),
                 Row("  each flight alone", alone, scipy, None, True),
+                Row(
+                    "  as a sweep: drawn, flown, judged by ends, kept", rows_kept, scipy, None, True
+                ),
             ]
     return rows
 

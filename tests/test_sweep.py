@@ -23,6 +23,7 @@ from rigidfleet.errors import ResultError, RigidfleetError, SweepError
 from rigidfleet.mission import Mission
 from rigidfleet.sweep import METRICS, Sweep, Table, fly, load, read
 from rigidfleet.sweep.conduct import SweepProgress
+from rigidfleet.sweep.ends import starts
 from rigidfleet.sweep.engine import GROUP, fly_runs
 from rigidfleet.sweep.figures import over_two, plot
 from rigidfleet.sweep.summary import drivers, rate, summarise
@@ -339,6 +340,115 @@ def test_a_group_is_never_split():
     taken = [under_way.take(1) for _ in range(2)]
     assert taken == [[*range(8), *range(40, 48)], [96, 97, 98, 99]]
     assert GROUP == 8
+
+
+# -- judged by their ends ----------------------------------------------------------------------------
+
+TETRAHEDRON: dict[str, Any] = {
+    "schema_version": 1,
+    "name": "tetrahedron",
+    "output_step": 0.1,
+    "agents": {"mass": 1.0, "position": [[0, 0, 5], [3, 1, 5], [1, 3, 5], [1, 1, 7]], "radius": 1e-3},
+    "constraint": {"damping": 0.03},
+    "formations": {"tetrahedron": {"slots": [[0, 0, 0], [2, 0, 0], [0, 2, 0], [0, 0, 2]]}},
+    "phases": [
+        {
+            "kind": "establish", "formation": "tetrahedron", "reference": "squares", "control": "open",
+            "blend": 1.0, "until": 8.0,
+        },
+        {"kind": "hold", "control": "open", "duration": 1.0},
+    ],
+}  # fmt: skip
+STARTS = ["agents.position.*.* += normal(0, 1.5)", "agents.velocity.1 = uniform(-0.1, 0.1)"]
+
+
+def by_ends(*vary: str, mission: dict[str, Any] = TETRAHEDRON, runs: int | None = 20) -> Sweep:
+    return Sweep.of(Mission.from_dict(mission), vary or STARTS, runs=runs, seed=3, judged="ends")
+
+
+@pytest.fixture(scope="module")
+def ends(tmp_path_factory) -> Table:
+    return fly(by_ends(), tmp_path_factory.mktemp("ends"), workers=1)
+
+
+def test_ends_are_those_of_whole_flights(ends):
+    """Starts bit for bit, what fails, and the shape to the integrator's tolerance are those of whole flights."""
+    whole = Sweep.of(Mission.from_dict(TETRAHEDRON), STARTS, runs=20, seed=3)
+    values = [whole.values(run) for run in range(20)]
+    for k, (r, v) in enumerate(zip(*starts(whole, values), strict=True)):
+        agents = Mission.from_dict(whole.varied(k)).agents
+        assert (np.array(agents.position) == r).all()
+        assert (np.array(agents.velocity) == v).all()
+    rows = fly_runs(whole, range(20))
+    assert ends.codes.tolist() == [list(row.codes) for row in rows]
+    assert ends.reason.tolist() == [row.reason for row in rows]
+    assert 0 < ends.passed.sum() < 20  # some are their own mirror images
+    assert set(ends.reason) == {"", "handedness"}
+    for name in ("shape_end", "shape", "constraint_end", "handed", "flown"):
+        of_rows = [row.metrics[name] for row in rows]
+        np.testing.assert_allclose(ends.metrics[name], of_rows, rtol=0, atol=1e-7)
+    assert np.isnan(ends.metrics["thrust"]).all()
+
+
+def test_ends_are_the_same_however_they_are_flown(ends, tmp_path, monkeypatch):
+    """Bit for bit: after interruptions, with runs added, and by processes."""
+    fly(by_ends(runs=6), tmp_path / "a", workers=1)
+    assert numbers(fly(by_ends(), tmp_path / "a", workers=1)) == numbers(ends)
+    monkeypatch.setattr("rigidfleet.sweep.conduct._WORTH", 0.0)
+    assert numbers(fly(by_ends(), tmp_path / "b", workers=2)) == numbers(ends)
+    with pytest.raises(ResultError, match="it differs in: what is judged"):
+        fly(Sweep.of(Mission.from_dict(TETRAHEDRON), STARTS, runs=20, seed=3), tmp_path / "a")
+
+
+def test_starts_that_cannot_be_are_rows(ends, tmp_path):
+    """Agents at one place, or beyond all bounds, or too fast to go on: rows with the reason; others fly as ever."""
+    found = by_ends(
+        "agents.position.2.1 = grid(0, 3)",
+        "agents.position.2.2 = grid(0)",
+        "agents.position.1.3 *= grid(1, 1e300)",
+        "agents.velocity.3.1 = grid(0, 1e12)",
+        runs=None,
+    )
+    table = fly(found, tmp_path, workers=1)
+    assert table.reason.tolist()[:4] == ["mission", "mission", "mission", "mission"]
+    assert table.reason.tolist()[4:] == ["", "complete", "mission", "mission"]
+    assert np.isnan(table.metrics["shape_end"][1])
+    assert table.metrics["shape_end"][4] < 1e-3
+
+
+def test_what_ends_cannot_judge_is_refused(tmp_path):
+    """Other missions and other variations are named, with the way out."""
+    with pytest.raises(SweepError) as caught:
+        by_ends("agents.mass.* *= normal(1, 0.1)", "agents.position.1.1 = choice(0, 1)")
+    assert [f.key for f in caught.value.findings] == ["vary[1].path"]
+    assert "no --ends" in caught.value.findings[0].remedy
+    tracked = TETRAHEDRON | {
+        "phases": [{"kind": "establish", "formation": "tetrahedron", "until": 9.0}]
+    }
+    windy = TETRAHEDRON | {"disturbances": {"wind": [1, 0, 0]}}
+    for mission, why in ((tracked, "is not flown open-loop"), (windy, "calm air")):
+        with pytest.raises(SweepError, match=why):
+            by_ends(mission=mission)
+    file = tmp_path / "s.toml"
+    file.write_text(
+        'mission = "establish-triangle"\nruns = 3\njudged = "end"\nvary = ["agents.position.*.* += normal(0, 1)"]'
+    )
+    with pytest.raises(SweepError, match="judged"):
+        Sweep.load(file)
+    file.write_text(file.read_text().replace('"end"', '"ends"'))
+    assert Sweep.load(file).judged == "ends"
+    assert Sweep.from_json(Sweep.load(file).json()).judged == "ends"
+
+
+def test_the_command_judges_ends(capsys, tmp_path, monkeypatch):
+    """`--ends` flies starts, says so in the store, and cannot be put on a sweep that is there."""
+    monkeypatch.chdir(tmp_path)
+    vary = ["--vary", "agents.position.*.* += normal(0, 0.3)", "--runs", "16", "--no-figures"]
+    assert cli.main(["sweep", "establish-triangle", *vary, "--ends"]) == 0
+    assert "16 of 16 runs passed" in capsys.readouterr().out
+    assert read(tmp_path / "sweeps" / "establish-triangle").sweep.judged == "ends"
+    assert cli.main(["sweep", "sweeps/establish-triangle", "--ends"]) == 2
+    assert "goes on as it is" in capsys.readouterr().err
 
 
 # -- killed ------------------------------------------------------------------------------------------

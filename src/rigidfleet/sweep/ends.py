@@ -104,10 +104,11 @@ def _prepare(sweep: Sweep) -> None:
 
 def _sound(r: Floats, v: Floats) -> Flags:
     """Whether starts (B, N, 3) are such as a mission may have (B,)."""
-    bounded = (np.abs(np.concatenate([r, v], axis=1)) <= HUGE).all(axis=(1, 2))
-    alone = [not any(coincident(points)) for points in r[bounded].tolist()]
-    bounded[bounded] = alone
-    return bounded
+    bounded = np.all(np.abs(np.concatenate([r, v], axis=1)) <= HUGE, axis=(1, 2))
+    apart = [
+        not any(coincident(points)) for points in np.where(bounded[:, None, None], r, 0.0).tolist()
+    ]
+    return np.logical_and(bounded, apart)
 
 
 def _judged(mission: Mission, flown: Ensemble) -> tuple[dict[str, Flags], dict[str, Floats]]:

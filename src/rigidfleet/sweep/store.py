@@ -247,7 +247,13 @@ def _schema() -> str:
 def _difference(there: dict[str, str], identity: str) -> str:
     """What sets the sweep that is there apart from the one asked for."""
     old, new = json.loads(there["identity"]), json.loads(identity)
-    names = {"mission": "mission", "vary": "variations", "seed": "seed", "version": "version"}
+    names = {
+        "mission": "mission",
+        "vary": "variations",
+        "seed": "seed",
+        "judged": "what is judged",
+        "version": "version",
+    }
     other = [words for key, words in names.items() if old.get(key) != new[key]]
     return (
         f"holds another sweep, it differs in: {', '.join(other)}. It is kept; replace it by --force, or name"
