@@ -141,6 +141,16 @@ def test_a_shape_fails_just_beyond_its_tolerance(scale, passes):
     assert found(verdict, "shape").who == "agents 1 and 3"
 
 
+@pytest.mark.parametrize(("factor", "passes"), [(1.0, True), (1.02, False)])
+def test_what_slots_alone_hold_is_judged_by_its_shape(factor, passes):
+    """A formation without edges has no distances to judge, but a shape."""
+    mission = a_mission({"triangle": TRIANGLE["triangle"] | {"edges": []}}, 3)
+    verdict = assess(flown(mission, factor * slots(mission, "triangle") + HEIGHT))
+    assert failures(verdict) == (set() if passes else {"shape"})
+    assert "distances" not in {f.check for f in verdict.findings}
+    assert "is not reached" in found(verdict, "shape").message or passes
+
+
 def test_rigid_but_no_cube():
     """All 18 edges hold and the shape is another: the verdict says rigid, but no cube."""
     # Table 4 of the paper as printed, its pair (d45, d48) swapped: a skewed shape. Solved here by Newton.

@@ -120,6 +120,13 @@ def test_what_it_cannot_fly_is_refused():
     windy = Mission.from_dict(mission.to_dict() | {"disturbances": {"wind": [1.0, 0.0, 0.0]}})
     with pytest.raises(ValueError, match="calm air"):
         establish(windy, starts(windy, 2))
+    for change, why in (
+        ({"formulation": "body"}, "world axes"),
+        ({"assignment": "shortest"}, "slots as given"),
+    ):
+        other = Mission.from_dict(mission.to_dict() | change)
+        with pytest.raises(ValueError, match=why):
+            establish(other, starts(other, 2))
     broken = starts(mission, 4)
     broken[2, 1, 0] = np.nan
     with pytest.raises(ValueError, match="flight 2 is not finite"):

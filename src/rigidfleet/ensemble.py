@@ -73,7 +73,8 @@ def establish(
     Raises
     ------
     ValueError
-        The mission has other phases, or disturbances, or the shapes of the starts do not fit it.
+        The mission has other phases, axes or assignments, or disturbances, or too many edges for the dense solve; or
+        the shapes of the starts do not fit it.
     """
     r = _starts("position", position, mission.n_agents)
     v = np.zeros_like(r) if velocity is None else _starts("velocity", velocity, mission.n_agents)
@@ -113,6 +114,10 @@ def unfit(mission: Mission) -> str | None:
                     f"an ensemble solves densely, and '{phase.formation}' has too many edges for that"
                     f" ({len(edges)})"
                 )
+    if mission.formulation != "inertial":
+        return f'an ensemble flies in world axes, and the mission in formulation = "{mission.formulation}"'
+    if mission.assignment != "given":
+        return f'in an ensemble agents take the slots as given, and the mission has assignment = "{mission.assignment}"'
     if mission.disturbances is not None:
         return "an ensemble flies in calm air, and the mission has [disturbances]"
     return None

@@ -116,15 +116,17 @@ def _shapes(flight: Flight, phases: list[PhaseVerdict]) -> Iterator[Finding]:
     """Whether formations are what they should be, where they should be by then."""
     for i, p in enumerate(phases):
         shaping = p.kind in ("establish", "reshape") or i == len(phases) - 1
-        if not (shaping and p.finished) or p.formation is None or p.distances is None:
+        if not (shaping and p.finished) or p.formation is None:
             continue
         last = flight.result.samples(i).stop - 1
         edges, _ = flight.edges(p.formation, last)
-        limit = SHAPE_TOLERANCE * float(flight.mission.formation_distances(p.formation).min())
-        held = p.distances <= limit
-        words = f"{value(p.distances, 'm')} off (limit {value(limit, 'm')})"
-        words = f"the worst of the {len(edges)} edges of '{p.formation}' is {words}"
-        yield _at_end(p, "distances", held, words, p.distances, limit, "m")
+        held = False
+        if p.distances is not None:
+            limit = SHAPE_TOLERANCE * float(flight.mission.formation_distances(p.formation).min())
+            held = p.distances <= limit
+            words = f"{value(p.distances, 'm')} off (limit {value(limit, 'm')})"
+            words = f"the worst of the {len(edges)} edges of '{p.formation}' is {words}"
+            yield _at_end(p, "distances", held, words, p.distances, limit, "m")
         if i not in flight.fits:
             continue
         fit = flight.fits[i]
