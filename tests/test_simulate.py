@@ -1016,7 +1016,7 @@ def test_an_exception_of_a_users_function_keeps_the_flight(kind, since):
         assert np.isfinite(result.position).all()
 
 
-@pytest.mark.parametrize("rate", [0.0, -50.0, np.nan])
+@pytest.mark.parametrize("rate", [0.0, -50.0, np.nan, "50", None])
 def test_a_control_rate_must_be_positive(rate):
     """No control rate, no flight."""
     with pytest.raises(ValueError, match="control rate must be positive"):

@@ -32,7 +32,7 @@ from cyclopts import App, CycloptsError, Parameter, UnusedCliTokensError
 
 from rigidfleet import __version__, screen
 from rigidfleet.errors import MissionError, RigidfleetError
-from rigidfleet.files import Files, taken, write_verdict
+from rigidfleet.files import Files, taken
 
 if TYPE_CHECKING:
     from rigidfleet.assess import Verdict
@@ -140,6 +140,7 @@ def run(
         result, interrupted = _fly(flown, watch)
 
     from rigidfleet.assess import assess
+    from rigidfleet.result import write_file
 
     files.make_folder()
     result.save(files.result)
@@ -147,7 +148,7 @@ def run(
     if csv:
         result.to_csv(files.table)
     verdict = assess(result)
-    write_verdict(verdict, files.verdict)
+    write_file(files.verdict, (verdict.json() + "\n").encode())
     if json:
         screen.print_exactly(verdict.json() + "\n")
     elif not quiet:
@@ -529,7 +530,7 @@ def report(
         Print nothing but errors, and the JSON if asked for.
     """
     from rigidfleet.assess import assess
-    from rigidfleet.result import Result
+    from rigidfleet.result import Result, write_file
 
     paths = [result, *others]
     records = [Result.load(path) for path in paths]
@@ -559,7 +560,7 @@ def report(
         made = [files.verdict, files.report, *drawn]
         kept = [] if force else [path for path in made if path.exists()]
         if files.verdict not in kept:
-            write_verdict(verdicts[0], files.verdict)
+            write_file(files.verdict, (verdicts[0].json() + "\n").encode())
         _draw(records[0], [path for path in drawn if path not in kept], quiet=quiet)
         if files.report not in kept:
             _write_report(records, verdicts, files.report, quiet=quiet)

@@ -5,13 +5,9 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory, TemporaryFile
-from typing import TYPE_CHECKING
+from tempfile import TemporaryFile
 
 from rigidfleet.errors import ResultError
-
-if TYPE_CHECKING:
-    from rigidfleet.assess import Verdict
 
 
 @dataclass(frozen=True)
@@ -122,20 +118,3 @@ def unwritable(path: Path, error: OSError) -> ResultError:
     """Of a place that cannot be written."""
     why = (error.strerror or str(error)).lower()
     return ResultError(f"{path}: cannot be written ({why}). Name another folder by --out.")
-
-
-def write_verdict(verdict: Verdict, path: Path) -> None:
-    """Write a verdict as JSON, whole or not at all.
-
-    Raises
-    ------
-    ResultError
-        It cannot be written.
-    """
-    try:
-        with TemporaryDirectory(prefix=".", suffix=".part", dir=path.parent) as part:
-            file = Path(part, path.name)
-            file.write_text(verdict.json() + "\n", encoding="utf-8")
-            os.replace(file, path)
-    except OSError as error:
-        raise unwritable(path, error) from error

@@ -168,6 +168,15 @@ class _Screen:
         self.spinner.update(text=f"{text}: {perf_counter() - self.begun:.0f} s")
         return self.spinner
 
+    def bar(self, total: float, done: float) -> RenderableType:
+        """How much of it is done, and the words."""
+        from rich.progress_bar import ProgressBar
+        from rich.table import Table
+
+        row = Table.grid(padding=(0, 1))
+        row.add_row(ProgressBar(total, done, width=30), self._words())
+        return row
+
     def tell(self, now: float) -> None:
         """Print a line where nothing moves, if the last one was long ago."""
         if self.live is None and now - self.told > _SELDOM:
@@ -196,15 +205,10 @@ class FlightWatch(_Screen):
         self.tell(now)
 
     def __rich__(self) -> RenderableType:
-        from rich.progress_bar import ProgressBar
-        from rich.table import Table
-
         now = perf_counter()
         if self.last is None or (self.cold and now - self.heard > _SILENCE):
             return self.waiting()
-        row = Table.grid(padding=(0, 1))
-        row.add_row(ProgressBar(self.last.t_end, self.last.t, width=30), self._words())
-        return row
+        return self.bar(self.last.t_end, self.last.t)
 
     def _words(self) -> str:
         """Time flown, speed against real time, time left, phase."""
@@ -236,14 +240,9 @@ class SweepWatch(_Screen):
         self.tell(perf_counter())
 
     def __rich__(self) -> RenderableType:
-        from rich.progress_bar import ProgressBar
-        from rich.table import Table
-
         if self.base is None or self.last is None:
             return self.waiting()
-        row = Table.grid(padding=(0, 1))
-        row.add_row(ProgressBar(self.last.runs, self.last.done, width=30), self._words())
-        return row
+        return self.bar(self.last.runs, self.last.done)
 
     def _words(self) -> str:
         """Runs flown, rate, time left, failures."""

@@ -194,7 +194,7 @@ class Flight:
         self.lost = np.zeros(mission.n_agents, dtype=np.bool_)
         self.external = ExternalForce(force, mission.n_agents) if force is not None else None
         self.times = None if times is None else _times(times, mission.latest_end)
-        if not rate > 0.0:
+        if not (isinstance(rate, int | float | np.number) and rate > 0.0):
             raise ValueError(f"the control rate must be positive [Hz], not {rate!r}")
         self.progress = progress
         frame = None
