@@ -426,6 +426,8 @@ def test_design_keeps_files(capsys):
         (["cube", "--extra", "-1"], "extra must be >= 0"),
         (["cube", "--extra", "inf"], "'inf' is no whole number"),
         (["cube", "--extra", "1.5"], "'1.5' is no whole number"),
+        (["cube", "--reach", "2"], "--reach has no effect without --edges neighbours"),
+        (["cube", "--range", "nan"], "--range must be a positive length"),
         (["cube", "--edges", "neighbours", "--reach", "0"], "--reach must be a positive number"),
         (["sphere"], "give --agents"),
         (["cube", "--edges", "all"], "no graph is called 'all'"),

@@ -6,7 +6,6 @@ with numbers that are not finite and a verdict that is content.
 """
 
 import json
-import sys
 import time
 from collections.abc import Callable
 from typing import Any
@@ -16,6 +15,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from rigidfleet import accuracy
 from rigidfleet.assess import assess
 from rigidfleet.errors import FlightError, MissionError
 from rigidfleet.mission import Mission
@@ -221,8 +221,8 @@ NUMBERS = [
 @pytest.fixture(autouse=True)
 def _short(monkeypatch: pytest.MonkeyPatch) -> None:
     """A phase may take only so many steps, that a case takes a second and no minute."""
-    monkeypatch.setattr(sys.modules[simulate.__module__], "_STALLED", 3000)
-    monkeypatch.setattr(sys.modules[simulate.__module__], "_STALLED_RATE", 0.0)
+    monkeypatch.setattr(accuracy, "_STALLED", 3000)
+    monkeypatch.setattr(accuracy, "_STALLED_RATE", 0.0)
 
 
 def outcome(data: Data) -> str:

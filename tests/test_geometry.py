@@ -226,6 +226,18 @@ def test_a_line_turned_about_by_half_a_turn_has_an_attitude():
     assert np.linalg.det(found) == pytest.approx(1.0, abs=1e-12)
 
 
+@pytest.mark.parametrize("short", [1e-3, 1e-5, 1.5e-6, 1e-7, 2e-8, 1e-9, 0.0])
+def test_lines_that_are_nearly_reversed_have_attitudes(short):
+    """Next to half a turn the smallest rotation is one still, and lays the line where the agents are."""
+    towards = np.array([np.cos(np.pi - short), np.sin(np.pi - short), 0.0])
+    x = np.outer(LINE[:, 0], towards)
+    for near in (EYE, EYE[None]):
+        T = geometry.fit_attitudes(x[None], LINE[None], np.ones(3), near)[0][0]
+        np.testing.assert_allclose(T @ T.T, EYE, rtol=0, atol=1e-7)
+        np.testing.assert_allclose(LINE @ T, x, rtol=0, atol=1e-6)
+        assert np.linalg.det(T) > 0
+
+
 def test_attitude_goes_on_through_a_line():
     """A triangle that folds into a line and opens again keeps its attitude all the way."""
     triangle = formation.slots("triangle", 4.0, 3)

@@ -450,6 +450,12 @@ def test_missions_cross_processes():
         (("lqr/S", [0, 0]), "lqr.S", "nothing to steer for", "S = [1e3, 1e2]"),
         (("lqr/R", 1e-300), "lqr.R", "gains would have no bound", "raise R"),
         (("lqr", {"R": 1e-12, "attitude": {"S": [1e5, 0]}}), "lqr.R", "lqr.attitude, 100000", "raise R"),
+        (
+            ("lqr", {"R": 1e-12, "attitude": {"R": 1e-12, "S": [1e5, 0]}}),
+            "lqr.attitude.R",
+            "no bound",
+            "raise R",
+        ),
         (("lqr/attitude", {"R": 1e-13}), "lqr.attitude.R", "no bound", "raise R"),
         (("lqr/attitude", {"S": [0, 0]}), "lqr.attitude.S", "nothing to steer for", "S ="),
         (("tracking/R", 1e-300), "tracking.R", "gains would have no bound", "raise R"),

@@ -388,6 +388,9 @@ def test_ends_are_those_of_whole_flights(ends):
         of_rows = [row.metrics[name] for row in rows]
         np.testing.assert_allclose(ends.metrics[name], of_rows, rtol=0, atol=1e-7)
     assert np.isnan(ends.metrics["thrust"]).all()
+    bare = {"tetrahedron": TETRAHEDRON["formations"]["tetrahedron"] | {"edges": []}}
+    (row,) = fly_runs(by_ends(mission=TETRAHEDRON | {"formations": bare}, runs=1), [0])
+    assert (row.reason, math.isnan(row.metrics["constraint_end"])) == ("shape", True)
 
 
 def test_ends_are_the_same_however_they_are_flown(ends, tmp_path, monkeypatch):
@@ -406,7 +409,7 @@ def test_starts_that_cannot_be_are_rows(ends, tmp_path):
         "agents.position.2.1 = grid(0, 3)",
         "agents.position.2.2 = grid(0)",
         "agents.position.1.3 *= grid(1, 1e300)",
-        "agents.velocity.3.1 = grid(0, 1e12)",
+        "agents.velocity.3.1 = grid(0, 1e5)",
         runs=None,
     )
     table = fly(found, tmp_path, workers=1)
@@ -414,6 +417,34 @@ def test_starts_that_cannot_be_are_rows(ends, tmp_path):
     assert table.reason.tolist()[4:] == ["", "complete", "mission", "mission"]
     assert np.isnan(table.metrics["shape_end"][1])
     assert table.metrics["shape_end"][4] < 1e-3
+
+
+def test_starts_that_are_no_mission_are_told_as_whole_flights_are(tmp_path):
+    """Starts next to one plane or point, or far from all others: flown or refused as their missions are."""
+    vary = (
+        "agents.position.*.3 = grid(5, 6)",
+        "agents.position.4.3 += grid(0, 1e-10, 1e-4, 1e8)",
+        "agents.position.2.1 = grid(3, 1e-8)",
+    )
+    found = by_ends(*vary, runs=None)
+    rows = fly(found, tmp_path, workers=1)
+    whole = fly_runs(Sweep.of(Mission.from_dict(TETRAHEDRON), vary), range(found.runs))
+    refused = [row.reason == "mission" for row in whole]
+    assert 0 < sum(refused) < found.runs
+    assert (rows.reason == "mission").tolist() == refused
+    assert rows.detail[refused].tolist() == [row.detail for row in whole if row.reason == "mission"]
+
+
+@pytest.mark.parametrize("name", ["atol_velocity", "atol_integral"])
+def test_ends_are_flown_to_the_tolerances_of_the_mission(name, tmp_path):
+    """Those of a class of states, too: what they ask for is what the flights take in evaluations."""
+    given = {"rtol": 1e-6, "atol": 1e-4}
+    loose, tight = (TETRAHEDRON | {"integrator": given | more} for more in ({}, {name: 1e-12}))
+    few, many = (
+        fly(by_ends(mission=m, runs=8), tmp_path / str(k), workers=1).metrics["evaluations"]
+        for k, m in enumerate((loose, tight))
+    )
+    assert (many > 2 * few).all()
 
 
 def test_what_ends_cannot_judge_is_refused(tmp_path):

@@ -322,6 +322,10 @@ def design(
             _reject(edges, reach, searched=extra != "0" or sensing_range is not None)
             kinds = {edges: designs.GRAPHS[edges](slots, REACH if reach is None else reach)}
         else:
+            if reach is not None:
+                raise ValueError("--reach has no effect without --edges neighbours, remove it")
+            if sensing_range is not None and not sensing_range > 0.0:
+                raise ValueError(f"--range must be a positive length [m], not {sensing_range:g}")
             more = extra if extra == "complete" else _whole(extra)
             kinds = {"designed": designs.design(slots, extra=more, sensing_range=sensing_range)}
             if shape == "cube":

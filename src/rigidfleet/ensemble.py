@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rigidfleet.accuracy import absolute_tolerances, most_steps, tolerance_of_velocity
 from rigidfleet.kernel import ensemble
 from rigidfleet.kernel.lanes import WIDTH
 from rigidfleet.mission import Establish, Mission, Phase, Reshape
@@ -148,15 +149,17 @@ class _Flights:
         before = now.reference.of(plan.edges, _lengths(self.r, plan.edges))
         sums = [self.integral.get(edge, np.zeros(count)) for edge in edges]
         y = np.column_stack([self.r.reshape(count, -1), self.v.reshape(count, -1), *sums])
-        places, tolerances = _places(self.finished), self.mission.integrator
+        places, given = _places(self.finished), self.mission.integrator
+        velocity = tolerance_of_velocity(given, now.r, program.vehicles.m, law.beta, large=False)
         shared = ensemble.fits(program) if vectors is None else vectors
         ends = ensemble.fly_all(
             program,
             y[places],
             before[places],
             (now.t, t_end),
-            rtol=tolerances.rtol,
-            atol=np.full(y.shape[1], tolerances.atol),
+            rtol=given.rtol,
+            atol=absolute_tolerances(given, y.shape[1], velocity, plan.distances, large=False),
+            max_steps=most_steps(t_end - now.t),
             vectors=shared,
             threads=threads,
         )

@@ -18,6 +18,8 @@ Ints = NDArray[np.int64]
 _THIN = 1e-3
 # Narrower ones than this are a line where they are not so many times wider than agents are off them.
 _NARROW, _SURE = 0.1, 4.0
+# A turn is half a turn where 1 + cos of its angle is less: 1e-8 rad from it.
+_HALF_TURN = 5e-17
 # Beyond so many agents two that are near each other are found by a tree, not among all pairs.
 _MANY = 200
 # So many agents are asked for their nearest, to begin with.
@@ -250,7 +252,7 @@ def _long_axes(p: Array) -> tuple[Array, Array, Array]:
     Of points so wide that they are no line, two others whose ratio says so.
     """
     # Slots mostly stand still: one decomposition then serves all samples.
-    few = p[:1] if (p == p[0]).all() else p
+    few = p[:1] if (p == p[:1]).all() else p
     C = few.swapaxes(1, 2) @ few
     # Eigenvalues a >= b >= c of C: with s = a + b + c, b >= (ab + ac + bc) / 3s.
     s = np.trace(C, axis1=1, axis2=2)
@@ -282,11 +284,12 @@ def _directions(x: Array, p: Array, axis: Array) -> Array:
 
 def _smallest_turns(now: Array, there: Array) -> Array:
     """Smallest rotations (K, 3, 3) from unit vectors to others (K, 3); none to or from zero."""
-    c = np.einsum("ka,ka->k", now, there)
-    opposite = c < -1.0 + 1e-12
+    # 1 + c of their angle's cosine c, in digits that are good up to half a turn; of zero vectors it does not matter.
+    near = 0.5 * ((now + there) ** 2).sum(axis=1)
+    opposite = (near < _HALF_TURN) & now.any(axis=1) & there.any(axis=1)
     skew = there[:, :, None] * now[:, None, :]  # of now x there, less its transpose
     skew = skew - skew.swapaxes(1, 2)
-    R = np.eye(3) + skew + skew @ skew / np.where(opposite, 1.0, 1.0 + c)[:, None, None]
+    R = np.eye(3) + skew + skew @ skew / np.where(near < _HALF_TURN, 1.0, near)[:, None, None]
     for k in np.flatnonzero(opposite):  # half a turn: any axis across the line will do
         across = np.cross(now[k], np.eye(3)[np.abs(now[k]).argmin()])
         across /= np.linalg.norm(across)
@@ -306,7 +309,8 @@ def mean_axis_rates(x: Array, y: Array, masses: Array, line: ArrayLike = False) 
     inertia = np.trace(C, axis1=1, axis2=2)[:, None, None] * np.eye(3) - C
     # Far from a line the inverse is the pseudo-inverse, for a third of the time.
     size = np.trace(inertia, axis1=1, axis2=2)
-    round_ = ~np.broadcast_to(line, len(x)) & (np.linalg.det(inertia) > 1e-4 * size**3)
+    with np.errstate(over="ignore", invalid="ignore"):  # what has no inertia has no rates
+        round_ = ~np.broadcast_to(line, len(x)) & (np.linalg.det(inertia) > 1e-4 * size**3)
     omega = np.empty((len(x), 3))
     omega[round_] = np.linalg.solve(inertia[round_], h[round_, :, None])[:, :, 0]
     rest = ~round_

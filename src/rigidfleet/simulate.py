@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from rigidfleet import attitude as att
 from rigidfleet import solvers
+from rigidfleet.accuracy import absolute_tolerances, most_steps, tolerance_of_velocity
 from rigidfleet.diagnosis import diagnose
 from rigidfleet.disturbances import disturbance, without
 from rigidfleet.errors import FlightError
@@ -32,9 +33,6 @@ if TYPE_CHECKING:
 #: The integrator returns to Python after so many steps, or fewer: as many as take this long [s of
 #: wall time], often enough for Ctrl-C and progress whatever the size of the formation.
 _STEPS, _PAUSE = 2000, 0.05
-#: A phase has stalled that took more steps than these and those for each second of mission time, or
-#: more than the last in all. A step of 1 ms is already that of gains above 1e3 /s.
-_STALLED, _STALLED_RATE, _MOST_STEPS = 50_000, 2_000.0, 5_000_000
 #: Residual of an iterative solve, as a share of the integrator's tolerance; the relative one within bounds.
 _RESIDUAL, _LEAST, _MOST_RESIDUAL = 1e-3, 1e-13, 1e-8
 #: Below this share of a velocity's tolerance, the error of an acceleration, times a second, is nothing.
@@ -297,34 +295,17 @@ class Flight:
         )
 
     def _tolerances(self, plan: PhasePlan, size: int) -> Array:
-        """Absolute tolerances (size,) of the states, class by class.
-
-        The integral of c is in its law what a distance is, times a second; but it stays near zero, where
-        a relative tolerance asks for nothing. In large formations it would set the step alone: there it is held
-        to what its own distance is held to, and velocities to what places are.
-        """
-        n, m, given = len(self.masses), len(plan.edges), self.mission.integrator
-        atol = np.full(size, given.atol)
-        atol[3 * n : 6 * n] = np.repeat(self._atol_velocity(plan), 3)
-        if given.atol_integral is not None:
-            atol[6 * n : 6 * n + m] = given.atol_integral
-        elif plan.method != "dense":
-            atol[6 * n : 6 * n + m] = given.atol + given.rtol * plan.distances
-        if given.atol_attitude is not None:
-            atol[6 * n + m : 6 * n + m + 4] = given.atol_attitude
-        return atol
+        """Absolute tolerances (size,) of the states."""
+        given, large = self.mission.integrator, plan.method != "dense"
+        return absolute_tolerances(
+            given, size, self._atol_velocity(plan), plan.distances, large=large
+        )
 
     def _atol_velocity(self, plan: PhasePlan) -> Array:
-        """Absolute tolerance (N,) of velocities [m/s].
-
-        The law takes errors back at the rate beta: one of a velocity becomes one of a place 1/beta of it. In large
-        formations, unless given, it is therefore beta times the tolerance of the agent's place about the CM.
-        """
-        given, n = self.mission.integrator, len(self.masses)
-        if given.atol_velocity is not None or plan.method == "dense":
-            return np.full(n, given.atol_velocity or given.atol)
-        away = np.linalg.norm(about_cm(self.now.r, self.masses), axis=1)
-        return np.maximum(given.atol, plan.program.law.beta * (given.atol + given.rtol * away))
+        """Absolute tolerance (N,) of velocities [m/s]."""
+        given, beta = self.mission.integrator, plan.program.law.beta
+        large = plan.method != "dense"
+        return tolerance_of_velocity(given, self.now.r, self.masses, beta, large=large)
 
     def _integrator(self, plan: PhasePlan, y: Array, t: float) -> records.Integrator:
         rtol = self.mission.integrator.rtol
@@ -589,7 +570,7 @@ class Flight:
         """Whether a phase takes far more steps than its length in time explains."""
         steps = int(leg.state.count[1] + leg.state.count[2])
         flown = leg.t - self.now.t
-        return steps > min(_STALLED + _STALLED_RATE * flown, _MOST_STEPS)
+        return steps > most_steps(flown)
 
     def _report(self, leg: Leg) -> None:
         wall = clock.perf_counter()

@@ -30,8 +30,6 @@ Numbers = NDArray[np.int64]
 
 #: A range of flights is begun by whichever thread is free, so many ranges to a thread.
 _RANGES = 4
-#: Steps of one flight in a phase at most.
-_MOST_STEPS = 1_000_000
 #: What a flight tries first [s].
 _FIRST_STEP = 1e-3
 #: Equations of a solve up to which straight-line code is made: its length grows with their cube.
@@ -103,6 +101,7 @@ def fly_all(
     *,
     rtol: float,
     atol: Array,
+    max_steps: int,
     vectors: bool,
     threads: int,
 ) -> Ends:
@@ -115,6 +114,7 @@ def fly_all(
     before : (B, m) distances from which references are blended [m]
     times : start and end [s]
     rtol, atol : relative tolerance, and the absolute one (n,) of each state
+    max_steps : after so many of them a flight has failed
     vectors : whether eight flights share a vector, its steps and its fate: should one of them be
         rejected for good, all eight are flown again alone. Flight k lies in vector k // 8 however
         many threads there are, so results do not depend on ``threads``.
@@ -126,7 +126,7 @@ def fly_all(
         The program does not fit vectors, see `fits`.
     """
     if not vectors:
-        return _fly_alone(program, starts, before, times, rtol, atol, threads)
+        return _fly_alone(program, starts, before, times, rtol, atol, max_steps, threads)
     if not fits(program):
         raise ValueError(
             "flights of this program cannot share vectors: fly them with vectors=False"
@@ -147,7 +147,7 @@ def fly_all(
         own = ready._replace(before=ready.before.copy(), time=ready.time.copy())
 
         def work(*part: Any) -> None:
-            fly(own, state, *times, _FIRST_STEP, *part, _MOST_STEPS, True)
+            fly(own, state, *times, _FIRST_STEP, *part, max_steps, True)
 
         return work
 
@@ -157,7 +157,9 @@ def fly_all(
     evaluations = np.repeat(found.evaluations, WIDTH)[:count]
     lost = ~finished
     if lost.any():
-        again = _fly_alone(program, starts[lost], before[lost], times, rtol, atol, threads)
+        again = _fly_alone(
+            program, starts[lost], before[lost], times, rtol, atol, max_steps, threads
+        )
         y[lost], finished[lost], evaluations[lost] = again.y, again.finished, again.evaluations
     return Ends(y, finished, evaluations)
 
@@ -169,6 +171,7 @@ def _fly_alone(
     times: tuple[float, float],
     rtol: float,
     atol: Array,
+    max_steps: int,
     threads: int,
 ) -> Ends:
     def begin() -> Callable[..., None]:
@@ -183,7 +186,7 @@ def _fly_alone(
             for k, start in enumerate(starts):
                 d0[:] = before[k]
                 state = integrator(start, times[0], rtol=rtol, atol=atol, step=_FIRST_STEP)
-                status[k] = native.integrate(own, w, state, times[1], True, *unsampled, _MOST_STEPS)
+                status[k] = native.integrate(own, w, state, times[1], True, *unsampled, max_steps)
                 ends[k], evaluations[k] = state.y, state.count[0]
 
         return work

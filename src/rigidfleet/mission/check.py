@@ -186,18 +186,17 @@ def _regulator(notes: Notes, weights: Regulator, *path: str) -> None:
 def _free_input(notes: Notes, lqr: Lqr) -> None:
     for weights, name in ((lqr, "lqr"), (lqr.attitude, "lqr.attitude")):
         path, most = tuple(name.split(".")), max(*weights.Q, *weights.S)
-        if notes.right(("lqr",), "R") and notes.right(path, "R"):
-            where = ("lqr",) if weights.R == lqr.R else path  # inherited
-            _bounded(notes, weights.R, most, where, name)
+        if _FREE * most > weights.R and notes.right(("lqr",), "R") and notes.right(path, "R"):
+            inherited = name != "lqr" and "R" not in notes.data["lqr"].get("attitude", {})
+            _unbounded(notes, weights.R, most, ("lqr",) if inherited else path, name)
 
 
-def _bounded(notes: Notes, R: float, most: float, where: tuple[str, ...], name: str) -> None:
-    if _FREE * most > R:
-        problem = (
-            f"is less than {_FREE:g} of the largest weight of {name}, {most:g}:"
-            " gains would have no bound"
-        )
-        notes.add((*where, "R"), problem, f"raise R, or lower the weights of {name}", R)
+def _unbounded(notes: Notes, R: float, most: float, where: tuple[str, ...], name: str) -> None:
+    problem = (
+        f"is less than {_FREE:g} of the largest weight of {name}, {most:g}:"
+        " gains would have no bound"
+    )
+    notes.add((*where, "R"), problem, f"raise R, or lower the weights of {name}", R)
 
 
 def _tracking(notes: Notes, parts: dict[str, Any]) -> None:
@@ -207,8 +206,8 @@ def _tracking(notes: Notes, parts: dict[str, Any]) -> None:
     if tracking.Q[0] < _NO_WEIGHT:
         problem = f"tracking needs a weight > 0 on the position error, {_NO_WEIGHT:g} at least"
         notes.add(("tracking", "Q"), problem, "give Q = [4.0, 4.0], say")
-    if notes.right(("tracking",), "R"):
-        _bounded(notes, tracking.R, max(tracking.Q), ("tracking",), "tracking")
+    if _FREE * max(tracking.Q) > tracking.R and notes.right(("tracking",), "R"):
+        _unbounded(notes, tracking.R, max(tracking.Q), ("tracking",), "tracking")
 
 
 def _allocation(notes: Notes, parts: dict[str, Any]) -> None:

@@ -16,26 +16,27 @@ import numpy as np
 from rigidfleet.assess import SHAPE_TOLERANCE
 from rigidfleet.assess.measure import THIN
 from rigidfleet.ensemble import Ensemble, establish
+from rigidfleet.errors import MissionError
 from rigidfleet.formation import centred, complete_graph, dimension, distances
-from rigidfleet.mission import Establish, Reshape
+from rigidfleet.mission import Establish, Mission, Reshape
 from rigidfleet.mission.formations import coincident
 from rigidfleet.mission.schema import HUGE
 from rigidfleet.sweep.metrics import METRICS
-from rigidfleet.sweep.row import Row
+from rigidfleet.sweep.row import Row, refusal
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from rigidfleet.mission import Mission
     from rigidfleet.sweep.definition import Sweep
 
     Floats = NDArray[np.float64]
     Flags = NDArray[np.bool_]
     Ints = NDArray[np.int64]
 
-#: What has failed, in words, by its name and in the order of a verdict.
+#: Agents whose extent along an axis is less than this part of the longest may be flat: their mission decides.
+_CLEARLY = 1e-5
+#: What fails in flight, in words, by its name and in the order of a verdict.
 _WORDS = {
-    "mission": "agents.position or agents.velocity: two agents at one place, or a number out of bounds",
     "complete": "the flight cannot go on; flown alone, its mission says when, where and why",
     "distances": "an edge of a formation is not reached where its phase ends",
     "shape": "a formation is not reached where its phase ends",
@@ -54,22 +55,24 @@ def fly_ends(sweep: Sweep, runs: Sequence[int]) -> list[Row]:
     begun = perf_counter()
     values = [sweep.values(run) for run in runs]
     r, v = starts(sweep, values)
-    sound = _sound(r, v)
-    r[~sound], v[~sound] = sweep.mission.agents.position, sweep.mission.agents.velocity
+    refused = _refused(sweep, runs, r, v)
+    out = list(refused)
+    r[out], v[out] = sweep.mission.agents.position, sweep.mission.agents.velocity
     found = establish(sweep.mission, r, v)
-    checks, metrics = _judged(sweep.mission, found)
-    failed = {"mission": ~sound, "complete": sound & ~found.finished} | {
-        name: sound & found.finished & wrong for name, wrong in checks.items()
-    }
+    wrong, metrics = _judged(sweep.mission, found)
+    failed = {"complete": ~found.finished} | {k: found.finished & x for k, x in wrong.items()}
     wall = (perf_counter() - begun) / len(runs)
     rows = []
     for k, (run, drawn) in enumerate(zip(runs, values, strict=True)):
         codes = tuple(c.variation.code(x) for c, x in zip(sweep.columns, drawn, strict=True))
-        reasons = [name for name, wrong in failed.items() if wrong[k]]
+        if k in refused:
+            unknown = dict.fromkeys(METRICS, math.nan)
+            rows.append(Row(run, False, *refused[k], codes, unknown, wall))
+            continue
+        reasons = [name for name, which in failed.items() if which[k]]
         detail = _WORDS[reasons[0]] if reasons else ""
-        known = {name: float(x[k]) for name, x in metrics.items()} if sound[k] else {}
-        of_run = {name: known.get(name, math.nan) for name in METRICS}
-        rows.append(Row(run, not reasons, ", ".join(reasons), detail, codes, of_run, wall))
+        known = {name: float(metrics[name][k]) if name in metrics else math.nan for name in METRICS}
+        rows.append(Row(run, not reasons, ", ".join(reasons), detail, codes, known, wall))
     return rows
 
 
@@ -80,7 +83,7 @@ def starts(sweep: Sweep, values: Sequence[Sequence[Any]]) -> tuple[Floats, Float
         "position": np.tile(np.array(agents.position, dtype=float), (count, 1, 1)),
         "velocity": np.tile(np.array(agents.velocity, dtype=float), (count, 1, 1)),
     }
-    with np.errstate(over="ignore", invalid="ignore"):  # refused by `_sound`
+    with np.errstate(over="ignore", invalid="ignore"):  # refused in time
         for column, drawn in zip(sweep.columns, np.array(values, dtype=float).T, strict=True):
             _, name, *inner = column.keys
             place = found[str(name)][(slice(None), *map(int, inner))]
@@ -102,13 +105,33 @@ def _prepare(sweep: Sweep) -> None:
     establish(sweep.mission, [agents.position], [agents.velocity])
 
 
-def _sound(r: Floats, v: Floats) -> Flags:
-    """Whether starts (B, N, 3) are such as a mission may have (B,)."""
+def _refused(sweep: Sweep, runs: Sequence[int], r: Floats, v: Floats) -> dict[int, tuple[str, str]]:
+    """Reason and detail of runs (by their place among them) that are no missions; the doubtful are asked one by one."""
     bounded = np.all(np.abs(np.concatenate([r, v], axis=1)) <= HUGE, axis=(1, 2))
-    apart = [
-        not any(coincident(points)) for points in np.where(bounded[:, None, None], r, 0.0).tolist()
+    r, v = (np.where(bounded[:, None, None], x, 0.0) for x in (r, v))
+    apart = [not any(coincident(points)) for points in r.tolist()]
+    found = {}
+    for k in np.flatnonzero(~(bounded & apart & _spread(sweep.mission, r, v))):
+        try:
+            Mission.from_dict(sweep.varied(runs[k]))
+        except MissionError as error:
+            found[int(k)] = refusal(error)
+    return found
+
+
+def _spread(mission: Mission, r: Floats, v: Floats) -> Flags:
+    """Whether agents and their velocities clearly span as many dimensions as any formation asks for (B,)."""
+    asked = [
+        mission.formation_slots(p.formation)
+        for p in mission.phases
+        if isinstance(p, Establish | Reshape)
     ]
-    return np.logical_and(bounded, apart)
+    needed = max((dimension(slots) for slots in asked if slots is not None), default=0)
+    if not needed:
+        return np.ones(len(r), dtype=bool)
+    x = np.concatenate([z - z.mean(axis=1, keepdims=True) for z in (r, v)], axis=1)
+    extent = np.linalg.eigvalsh(x.swapaxes(1, 2) @ x)  # squared, in ascending order
+    return np.asarray(extent[:, 3 - needed] > _CLEARLY**2 * extent[:, 2])
 
 
 def _judged(mission: Mission, flown: Ensemble) -> tuple[dict[str, Flags], dict[str, Floats]]:
@@ -128,7 +151,7 @@ def _judged(mission: Mission, flown: Ensemble) -> tuple[dict[str, Flags], dict[s
         asked = mission.formation_distances(formation)
         off = _off(r, mission.formation_edges(formation), asked)
         blending = shaping and phase.reference != "step" and phase.blend > (length or 0.0)
-        if index == last and not blending:
+        if index == last and not blending and len(asked):
             metrics["constraint_end"] = off
         if judged:
             wrong["distances"] |= off > SHAPE_TOLERANCE * asked.min(initial=math.inf)

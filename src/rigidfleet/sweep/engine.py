@@ -9,7 +9,7 @@ from time import perf_counter
 from rigidfleet.errors import MissionError
 from rigidfleet.sweep.definition import Sweep
 from rigidfleet.sweep.metrics import METRICS, measure
-from rigidfleet.sweep.row import Row
+from rigidfleet.sweep.row import Row, refusal
 
 #: Runs are flown in groups of so many consecutive ones, the first of which is a multiple of it.
 GROUP = 8
@@ -45,8 +45,7 @@ def _fly(sweep: Sweep, run: int) -> Row:
         reason = ", ".join(dict.fromkeys(f.check for f in failed))
         detail = failed[0].message if failed else ""
     except MissionError as error:
-        first = error.findings[0]
-        reason, detail = "mission", f"{first.key} = {first.value!r}: {first.problem}"
+        reason, detail = refusal(error)
     except Exception as error:  # one run that breaks must not end a hundred thousand others
         if isinstance(error.__context__ or error.__cause__, KeyboardInterrupt):
             raise  # Ctrl-C, as the compiler gives it back

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 
 PASSED, FAILED = "#56B4E9", "#D55E00"
-_COLUMNS = 4  # of small axes
+_COLUMNS = 4  # of small axes at most
 _BINS = 30
 _ENVELOPE = 12  # stretches of an envelope
 _CELLS = 10  # a side of a map of drawn numbers
@@ -286,9 +286,10 @@ def _small(table: Table, title: str, names: Sequence[str]) -> tuple[Figure, list
     """A small axes for each metric."""
     from matplotlib.figure import Figure
 
-    rows = -(-len(names) // _COLUMNS)
+    columns = min(_COLUMNS, max(2, len(names)))
+    rows = -(-len(names) // columns)
     fig = Figure(figsize=(st.WIDTH, 0.9 + 1.75 * rows), layout="constrained")
-    axes = fig.subplots(rows, _COLUMNS, squeeze=False).ravel().tolist()
+    axes = fig.subplots(rows, columns, squeeze=False).ravel().tolist()
     _head(fig, table, title)
     for ax in axes[len(names) :]:
         ax.set_visible(False)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from rigidfleet.errors import MissionError
+
 
 @dataclass(frozen=True)
 class Row:
@@ -27,3 +29,10 @@ class Row:
     codes: tuple[float, ...]
     metrics: dict[str, float]
     wall: float
+
+
+def refusal(error: MissionError) -> tuple[str, str]:
+    """Reason and detail of a run whose mission cannot be."""
+    first = error.findings[0]
+    words = f"{first.key} = {first.value!r}: {first.problem}"
+    return "mission", " ".join(words.split())
