@@ -50,8 +50,8 @@ format: .venv/.dev  ## Rewrite the code in the project's style
 	@$(BIN)/ruff format
 
 constraints: .venv/.dev  ## Choose newer versions of all packages
-	@$(BIN)/uv pip compile --quiet --universal --upgrade --no-emit-index-url --no-header \
-		--no-annotate --all-extras --group dev --group bench --group peers --group docs --group build \
+	@$(BIN)/uv pip compile --quiet --universal --upgrade --no-header --no-annotate \
+		--all-extras --group dev --group bench --group peers --group docs --group build \
 		pyproject.toml --output-file constraints.txt
 
 clean:  ## Remove .venv, caches and builds

@@ -173,7 +173,7 @@ class _Flights:
         self.now = replace(
             now, t=t_end, reference=known, formation=plan.formation, slots=plan.slots
         )
-        self.error = abs(_lengths(self.r, plan.edges) - plan.distances).max(axis=1, initial=0.0)
+        self.error = off(self.r, plan.edges, plan.distances)
 
 
 def _alike(mission: Mission, phase: Phase) -> bool:
@@ -203,6 +203,11 @@ def _places(finished: NDArray[np.bool_]) -> NDArray[np.int64]:
         near = np.flatnonzero(finished[first : first + WIDTH])
         places[k] = first + near[0] if len(near) else np.flatnonzero(finished)[0]
     return places
+
+
+def off(r: Array, edges: NDArray[np.integer], asked: Array) -> Array:
+    """Greatest error (B,) [m] of edges (m, 2) that are to be ``asked`` (m,) long, at positions (B, N, 3)."""
+    return np.abs(_lengths(r, edges) - asked).max(axis=1, initial=0.0)
 
 
 def _lengths(r: Array, edges: NDArray[np.integer]) -> Array:

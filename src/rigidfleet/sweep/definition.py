@@ -38,6 +38,8 @@ from rigidfleet.sweep.variation import (
 
 Judged = Literal["flight", "ends"]
 
+#: What to do where ends alone cannot be judged.
+_WHOLE = 'judge whole flights: judged = "flight", no --ends'
 #: Least fraction of a distribution, so that no normal number is infinite.
 _LEAST = 2.0**-54
 
@@ -307,6 +309,7 @@ def _checked(
             notes.add((key,), *unknown_key(key, known))
     own = {key: value for key, value in data.items() if key in Header.model_fields}
     header = notes.validate(Header, own, ())
+    by_ends = header is not None and header.judged == "ends"
     whole = None if mission is None else paths.whole_document(mission)
     variations = []
     for k, entry in enumerate(tables(notes, "vary")):
@@ -317,18 +320,13 @@ def _checked(
         if mission is not None and whole is not None:
             _fits(notes, k, entry, found, mission, whole)
         variations += [] if found is None else [found]
-        if (
-            found is not None
-            and whole is not None
-            and header is not None
-            and header.judged == "ends"
-        ):
+        if by_ends and found is not None and whole is not None:
             _moves_starts(notes, k, found, whole)
-    if header is not None and header.judged == "ends" and mission is not None:
+    if by_ends and mission is not None:
         from rigidfleet.ensemble import unfit
 
         if (why := unfit(mission)) is not None:
-            notes.add(("judged",), why, 'judge whole flights: judged = "flight", no --ends', "ends")
+            notes.add(("judged",), why, _WHOLE, "ends")
     if "vary" not in data or data["vary"] == []:
         notes.add(
             ("vary",), "nothing varies", 'give --vary "agents.mass.* *= normal(1, 0.05)", say'
@@ -402,8 +400,7 @@ def _moves_starts(notes: Notes, k: int, v: Variation, whole: dict[str, Any]) -> 
             "varies more than numbers of agents.position or agents.velocity, in which alone runs judged by their"
             " ends differ"
         )
-        remedy = 'remove it, or judge whole flights: judged = "flight", no --ends'
-        notes.add(("vary", k, "path"), problem, remedy, v.path)
+        notes.add(("vary", k, "path"), problem, f"remove it, or {_WHOLE}", v.path)
 
 
 def _taken(

@@ -15,7 +15,7 @@ import numpy as np
 
 from rigidfleet.assess import SHAPE_TOLERANCE
 from rigidfleet.assess.measure import THIN
-from rigidfleet.ensemble import Ensemble, establish
+from rigidfleet.ensemble import Ensemble, establish, off
 from rigidfleet.errors import MissionError
 from rigidfleet.formation import centred, complete_graph, dimension, distances
 from rigidfleet.mission import Establish, Mission, Reshape
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 
     Floats = NDArray[np.float64]
     Flags = NDArray[np.bool_]
-    Ints = NDArray[np.int64]
 
 #: Agents whose extent along an axis is less than this part of the longest may be flat: their mission decides.
 _CLEARLY = 1e-5
@@ -149,18 +148,18 @@ def _judged(mission: Mission, flown: Ensemble) -> tuple[dict[str, Flags], dict[s
             continue
         judged = shaping or index == last
         asked = mission.formation_distances(formation)
-        off = _off(r, mission.formation_edges(formation), asked)
+        wide = off(r, mission.formation_edges(formation), asked)
         blending = shaping and phase.reference != "step" and phase.blend > (length or 0.0)
         if index == last and not blending and len(asked):
-            metrics["constraint_end"] = off
+            metrics["constraint_end"] = wide
         if judged:
-            wrong["distances"] |= off > SHAPE_TOLERANCE * asked.min(initial=math.inf)
+            wrong["distances"] |= wide > SHAPE_TOLERANCE * asked.min(initial=math.inf)
         slots = mission.formation_slots(formation)
         if slots is None or len(slots) < 2:
             continue
         pairs = complete_graph(len(slots))
         intended = distances(slots, pairs)
-        metrics["shape_end"] = error = _off(r, pairs, intended)
+        metrics["shape_end"] = error = off(r, pairs, intended)
         metrics["shape"] = np.fmax(metrics["shape"], error)
         misshapen = error > SHAPE_TOLERANCE * intended.min()
         mirrored = np.zeros(count, dtype=bool)
@@ -174,9 +173,3 @@ def _judged(mission: Mission, flown: Ensemble) -> tuple[dict[str, Flags], dict[s
     metrics["flown"] = np.full(count, mission.latest_end)
     metrics = {name: np.where(flown.finished, x, np.nan) for name, x in metrics.items()}
     return wrong, metrics | {"evaluations": flown.evaluations.astype(float)}
-
-
-def _off(r: Floats, edges: Ints, asked: Floats) -> Floats:
-    """Greatest error (B,) of the lengths of edges (m, 2) at positions (B, N, 3) [m]."""
-    found = np.linalg.norm(r[:, edges[:, 0]] - r[:, edges[:, 1]], axis=2)
-    return np.abs(found - asked).max(axis=1, initial=0.0)
