@@ -230,9 +230,7 @@ def ensembles(rounds: int) -> list[Row]:
             rows += [
                 Row(title, vectors, scipy, goals[n], True, note, evaluations),
                 Row("  each flight alone", alone, scipy, None, True),
-                Row(
-                    "  as a sweep: drawn, flown, judged by ends, kept", rows_kept, scipy, None, True
-                ),
+                Row("  as a sweep by ends", rows_kept, scipy, None, True),
             ]
     return rows
 

@@ -51,15 +51,20 @@ def _ratios(name: str, theirs: str) -> Any:
                 row["name"].strip(),
                 _time(row["ours"]),
                 _time(row["theirs"]),
-                f"{median(row['ratios']):.3g}",
-                f"{min(row['ratios']):.3g} to {max(row['ratios']):.3g}",
-                "" if row["goal"] is None else f"{'≥' if row['faster'] else '≤'} {row['goal']:g}",
+                _ratio(median(row["ratios"])),
+                f"{_ratio(min(row['ratios']))} to {_ratio(max(row['ratios']))}",
+                "" if row["goal"] is None else f"{'≥' if row['faster'] else '≤'} {row['goal']:,g}",
             )
             for row in data[name]
         ]
         return _table(("", "ours [ms]", f"{theirs} [ms]", "ratio", "rounds", "goal"), rows)
 
     return write
+
+
+def _ratio(x: float) -> str:
+    """Three digits, or all of a greater number."""
+    return f"{x:.3g}" if x < 1000 else f"{x:,.0f}"
 
 
 def _missions(data: Data) -> str:
@@ -113,7 +118,7 @@ def _peers(data: Data) -> str:
             str(row["agents"]),
             row["peer"],
             f"{row['unit'].partition(' ')[0]} {row['effort']:g}",
-            f"{row['rate']:,.3g}" if row["rate"] < 1000 else f"{row['rate']:,.0f}",
+            _ratio(row["rate"]),
             f"{median(row['ratios']):.3g}",
             f"{min(row['ratios']):.3g} to {max(row['ratios']):.3g}",
             f"{row['error']:.0e}",
