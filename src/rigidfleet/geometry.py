@@ -178,23 +178,50 @@ def clearance(
 
     Negative where they overlap; infinity, -1 and -1 without obstacles. r (K, N, 3), radius (N,).
     """
+    least, nearest = rooms(r, radius, obstacles)
+    agent, samples = least.argmin(axis=1), np.arange(len(r))
+    obstacle = nearest[samples, agent]
+    return least[samples, agent], np.where(obstacle < 0, -1, agent), obstacle
+
+
+def closeness(
+    r: Array, radius: ArrayLike, obstacles: Sequence[Box | Ground], left: NDArray[np.bool_]
+) -> tuple[Array, Ints, Array, Ints, Ints]:
+    """What `separation` and `clearance` find among the agents ``left`` (K, N) at each sample, one after the other."""
     radius = np.asarray(radius, dtype=float)
-    least = np.full(len(r), np.inf)
-    agent, obstacle = np.full(len(r), -1), np.full(len(r), -1)
+    if left.all():
+        return *separation(r, radius), *clearance(r, radius, obstacles)
+    found = np.full(len(r), np.inf), np.full((len(r), 2), -1), np.full(len(r), np.inf)
+    found = *found, np.full(len(r), -1), np.full(len(r), -1)
+    for who in np.unique(left, axis=0):
+        rows, agents = (left == who).all(axis=1), np.flatnonzero(who)
+        among = r[rows][:, agents]
+        room, pair = separation(among, radius[agents])
+        near = clearance(among, radius[agents], obstacles)
+        names = np.append(agents, -1)  # -1 stays -1
+        values = room, names[pair], near[0], names[near[1]], near[2]
+        for out, value in zip(found, values, strict=True):
+            out[rows] = value
+    return found
+
+
+def rooms(r: Array, radius: ArrayLike, obstacles: Sequence[Box | Ground]) -> tuple[Array, Ints]:
+    """Least room (..., N) [m] of agents r (..., N, 3) to an obstacle, and the obstacle; infinity and -1 without."""
+    radius = np.asarray(radius, dtype=float)
+    least, nearest = np.full(r.shape[:-1], np.inf), np.full(r.shape[:-1], -1)
     for k, thing in enumerate(obstacles):
         if thing.kind == "ground":
-            room = r[:, :, 2] - thing.height - radius
+            room = r[..., 2] - thing.height - radius
         else:
             low, high = np.array(thing.min), np.array(thing.max)
             beyond = np.maximum(low - r, r - high)  # positive outside
-            outside = np.linalg.norm(np.maximum(beyond, 0.0), axis=2)
-            room = outside + np.minimum(beyond.max(axis=2), 0.0) - radius
+            outside = np.maximum(beyond, 0.0)
+            room = np.sqrt(np.einsum("...a,...a->...", outside, outside))
+            room += np.minimum(beyond.max(axis=-1), 0.0) - radius
         room[np.isnan(room)] = np.inf
-        i = room.argmin(axis=1)
-        room = room[np.arange(len(r)), i]
         closer = room < least
-        least[closer], agent[closer], obstacle[closer] = room[closer], i[closer], k
-    return least, agent, obstacle
+        least[closer], nearest[closer] = room[closer], k
+    return least, nearest
 
 
 def fit_attitudes(

@@ -40,10 +40,6 @@ class Piece:
     attached: bool  # whether the slots carry the body frame
 
 
-#: Positions between samples, for how close agents come: times (K,) [s] and r (K, N, 3) [m].
-Watched = tuple["Array", "Array"]
-
-
 def assemble(
     mission: Mission,
     phases: Sequence[PhaseRecord],
@@ -51,7 +47,6 @@ def assemble(
     *,
     ending: str,
     statistics: dict[str, Any],
-    watched: Sequence[Watched] = (),
 ) -> Result:
     """Join the pieces of a flight and compute what follows from positions and forces."""
     pieces = [p for p in pieces if len(p.time)]
@@ -90,13 +85,9 @@ def assemble(
     motion = joined("motion")
     wrench = np.concatenate([f_u.sum(axis=1), np.cross(x, f_u).sum(axis=1)], axis=1)
     asked = joined("wrench")
-    closeness = _closeness(mission, r, left)
-    for t, between in watched:  # a sample answers for all since the one before
-        k = np.minimum(np.searchsorted(time, t), len(time) - 1)
-        found = _closeness(mission, between, left[k])
-        _least(k, found[:2], closeness[:2])
-        _least(k, found[2:], closeness[2:])
+    closeness = geometry.closeness(r, mission.agents.radius, mission.obstacles, left)
     separation, pair, clearance, agent, obstacle = closeness
+    _put_extremes(phases, time, closeness)
     edges = mission.edges
     distance = np.linalg.norm(r[:, edges[:, 0]] - r[:, edges[:, 1]], axis=2)
     if not left.all():
@@ -154,34 +145,21 @@ def assemble(
     )
 
 
-def _closeness(mission: Mission, r: Array, left: NDArray[np.bool_]) -> tuple[Any, ...]:
-    """What `geometry.separation` and `geometry.clearance` find among the vehicles left (K, N)."""
-    radius = np.array(mission.agents.radius)
-    if left.all():
-        return *geometry.separation(r, radius), *geometry.clearance(r, radius, mission.obstacles)
-    found = np.full(len(r), np.inf), np.full((len(r), 2), -1), np.full(len(r), np.inf)
-    found = *found, np.full(len(r), -1), np.full(len(r), -1)
-    for who in np.unique(left, axis=0):
-        rows, agents = (left == who).all(axis=1), np.flatnonzero(who)
-        among = r[rows][:, agents]
-        room, pair = geometry.separation(among, radius[agents])
-        near = geometry.clearance(among, radius[agents], mission.obstacles)
-        names = np.append(agents, -1)  # -1 stays -1
-        values = room, names[pair], near[0], names[near[1]], near[2]
-        for out, value in zip(found, values, strict=True):
-            out[rows] = value
-    return found
-
-
-def _least(k: Ints, found: tuple[Any, ...], least: tuple[Any, ...]) -> None:
-    """Take into ``least`` at index k what is less in ``found``; values first, then who has them."""
-    order = np.argsort(-found[0], kind="stable")  # of several at one index the least comes last
-    best = np.full(len(least[0]), -1)
-    best[k[order]] = order
-    less = np.flatnonzero(best >= 0)
-    less = less[found[0][best[less]] < least[0][less]]
-    for mine, theirs in zip(least, found, strict=True):
-        mine[less] = theirs[best[less]]
+def _put_extremes(phases: Sequence[PhaseRecord], time: Array, closeness: tuple[Any, ...]) -> None:
+    """What a phase comes to between samples stands at the sample behind it."""
+    separation, pair, clearance, agent, obstacle = closeness
+    for phase in phases:
+        for name, values in (("separation", separation), ("clearance", clearance)):
+            x = phase.extremes.get(name)
+            if x is None:
+                continue
+            k = min(int(np.searchsorted(time, x.time)), len(time) - 1)
+            if x.value < values[k]:
+                values[k] = x.value
+                if name == "separation":
+                    pair[k] = x.who, x.other
+                else:
+                    agent[k], obstacle[k] = x.who, x.other
 
 
 def _attitudes(

@@ -60,6 +60,22 @@ LABELS: dict[str, tuple[str, ...]] = {
 }
 
 
+#: A vehicle so near an obstacle since the start, or until the end, stands on it [m].
+PAD = 0.1
+
+
+class Extremum(NamedTuple):
+    """Worst value of a quantity in continuous time, not only at samples.
+
+    ``who`` has it: an agent, or the first of two, from 0; ``other`` is the second agent, the obstacle, or -1.
+    """
+
+    value: float
+    time: float
+    who: int
+    other: int
+
+
 @dataclass(slots=True)
 class PhaseRecord:
     """One phase as flown.
@@ -72,6 +88,12 @@ class PhaseRecord:
     settled : for a phase that ends by settling: whether it did; None for one that ends at a time
     target : for fly and turn: {"time" [s], "position" [m], "velocity" [m/s], "attitude" quaternion, "rates" [rad/s]},
         each but the time None where nothing is asked
+    extremes : worst values of the phase in continuous time, by name: separation, clearance, separation_below, lost (a
+        lost vehicle to one that is left), geofence (beyond it), lowest, highest [m]; speed [m/s]; acceleration [m/s^2];
+        thrust, thrust_margin (thrust less its limit), constraint_force, tension [N]; constraint [m]. In the phases
+        where they are, clearance_start, clearance_flight and clearance_end: of vehicles that stand on an obstacle
+        since the start, of those that fly, and of those that stand on one until the end. Empty if samples alone are
+        known
     """
 
     name: str
@@ -82,6 +104,10 @@ class PhaseRecord:
     t_end: float
     settled: bool | None = None
     target: dict[str, Any] | None = None
+    extremes: dict[str, Extremum] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.extremes = {name: Extremum(*x) for name, x in self.extremes.items()}
 
 
 @cache
@@ -185,7 +211,7 @@ class Result:
         _v(
             "time",
             "m",
-            "least separation of two agents since the sample before: centre distance minus radii",
+            "separation of the nearest two agents: centre distance minus radii; behind the least of a phase, that",
         ),
     ]
     separation_pair: Annotated[
@@ -196,7 +222,7 @@ class Result:
         _v(
             "time",
             "m",
-            "least clearance to an obstacle since the sample before: distance minus radius",
+            "clearance to the nearest obstacle: distance minus radius; behind the least of a phase, that",
         ),
     ]
     clearance_agent: Annotated[Ints, _v("time", "1", "the agent with it, from 0; -1 for none")]

@@ -19,11 +19,12 @@ from rigidfleet.diagnosis import diagnose
 from rigidfleet.disturbances import disturbance, without
 from rigidfleet.errors import FlightError
 from rigidfleet.external import ExternalForce, Force, asked
+from rigidfleet.extremes import Extremes
 from rigidfleet.kernel import native, records
 from rigidfleet.kernel import program as k
 from rigidfleet.mission import Establish, Fly, Mission, Phase, Reshape, Settle, Turn
 from rigidfleet.plan import PhasePlan, Pose, Situation, about_cm, plan_phase
-from rigidfleet.record import Piece, Watched, assemble
+from rigidfleet.record import Piece, assemble
 from rigidfleet.result import PhaseRecord, Result
 
 if TYPE_CHECKING:
@@ -39,10 +40,6 @@ _RESIDUAL, _LEAST, _MOST_RESIDUAL = 1e-3, 1e-13, 1e-8
 _FLOOR = 3e-2
 #: Where a phase ends by settling, whether it has is asked this often [s].
 _CHECK = 0.1
-#: How close agents come is watched at least this often [s], whatever is recorded.
-_WATCH = 0.05
-#: In a stretch so many times a place of an agent at most; the watch over longer ones is coarser.
-_WATCHED = 700_000
 #: Progress is reported this often [s of wall time].
 _REPORT = 0.1
 #: A frame further than this from the slots it is attached to has left them [rad].
@@ -163,6 +160,7 @@ class Leg:
     t_end: float  # [s] at the latest
     asked: int = 0  # how often the user's controller has been
     held: k.Program | None = None  # with its force
+    flown: k.Program | None = None  # what the steps in the trail were flown by
     solver: large.LargeSolver | None = (
         None  # of the multipliers, where that is not the kernel itself
     )
@@ -203,7 +201,7 @@ class Flight:
             0.0, np.array(mission.agents.position), np.array(mission.agents.velocity), frame=frame
         )
         self.pieces: list[Piece] = []
-        self.watched: list[Watched] = []
+        self.extremes = Extremes(mission)
         self.phases: list[PhaseRecord] = []
         self.ending = ""
         self.started = self.reported = clock.perf_counter()
@@ -234,6 +232,8 @@ class Flight:
             else:
                 self._fly_to(leg, leg.t_end)
         finally:
+            self._watch(leg, last=True)
+            record.extremes = self.extremes.phase()
             self._count(leg)
             if leg.state.count[0] or leg.t > self.now.t:
                 self._arrive(leg)
@@ -257,6 +257,7 @@ class Flight:
         work, solver = self._equip(plan)
         y = self._pack(plan)
         state = self._integrator(plan, y, self.now.t)
+        self.extremes.begin(state)
         if solver is not None:
             scale = self._tolerances(plan, len(y)) + state.rtol * np.abs(y)
             state.clock[1] = _first_step(plan.program, work, state, scale, t_end - self.now.t)
@@ -308,8 +309,11 @@ class Flight:
         return tolerance_of_velocity(given, self.now.r, self.masses, beta, large=large)
 
     def _integrator(self, plan: PhasePlan, y: Array, t: float) -> records.Integrator:
-        rtol = self.mission.integrator.rtol
-        return records.integrator(y, t, rtol=rtol, atol=self._tolerances(plan, len(y)))
+        rtol, trail = (
+            self.mission.integrator.rtol,
+            records.trail(len(y), len(self.masses), len(plan.edges)),
+        )
+        return records.integrator(y, t, rtol=rtol, atol=self._tolerances(plan, len(y)), trail=trail)
 
     def _count(self, leg: Leg) -> None:
         """Add up what a leg, or its part up to a loss, has taken."""
@@ -358,8 +362,10 @@ class Flight:
 
     def _lose(self, leg: Leg, program: k.Program, now: NDArray[np.bool_]) -> k.Program:
         """Go on without the vehicles that are lost ``now`` (N,); returns what is flown of a program."""
+        self._watch(leg, last=True)
         self.lost = self.lost | now
         self.now.lost = self.lost
+        self.extremes.lose(self.lost)
         y, own, n = leg.state.y, program is leg.plan.program, len(self.masses)
         self._count(leg)
         kept = self._release(leg.plan)
@@ -367,6 +373,7 @@ class Flight:
         y = np.concatenate([y[: 6 * n], integral])
         leg.state = self._integrator(leg.plan, y, leg.t)
         leg.workspace, leg.solver = self._equip(leg.plan)
+        self.extremes.begin(leg.state)
         if own:
             return leg.plan.program
         held = without(program, kept, self.lost, large=leg.plan.method != "dense")
@@ -385,8 +392,10 @@ class Flight:
         """Integrate to ``t_end`` [s] and record the samples on the way."""
         state = leg.state
         fresh = state.count[0] == 0 or program is not leg.plan.program
-        least = max(_WATCH, (t_end - leg.t) * len(self.masses) / _WATCHED)
-        times, kept = self._watched(leg.t, self._samples(leg, t_end), t_end, least)
+        if fresh:
+            self._watch(leg, last=True)
+        leg.flown = program
+        times = self._samples(leg, t_end)
         samples = np.empty((len(times), len(state.y)))
         state.count[3] = 0
         first = np.nextafter(leg.t, math.inf)
@@ -405,6 +414,7 @@ class Flight:
                     self.external.check()
                 if leg.solver is not None:
                     leg.solver.check()
+                self._watch(leg, last=False)
                 self._report(leg)
                 if status == records.PAUSED and self._stalled(leg):
                     break
@@ -412,12 +422,8 @@ class Flight:
             done = int(state.count[3])
             if state.count[0] and not state.count[1] and len(times) and times[0] <= first:
                 samples[0], done = state.y, 1  # no step was possible: the start is all there is
-            times, samples, kept = times[:done], samples[:done], kept[:done]
-            if not kept.all():
-                r = _positions(leg.plan, samples, len(self.masses), ~kept)
-                self.watched.append((times[~kept], r))
-            if kept.any():
-                self._record(leg, program, times[kept], samples[kept])
+            if done:
+                self._record(leg, program, times[:done], samples[:done])
         if status != records.FINISHED:
             collapsed = status == records.COLLAPSED
             own_force = self.external is not None
@@ -446,25 +452,10 @@ class Flight:
         start = [t if t == 0.0 else np.nextafter(t, math.inf)] if first else []
         return np.concatenate([start, grid])
 
-    def _watched(
-        self, t: float, times: Array, t_end: float, step: float
-    ) -> tuple[Array, NDArray[np.bool_]]:
-        """Times to record and, where further apart than a step [s], some between; which to record."""
-        if self.times is None and self.mission.output_step <= step * (1 + 1e-9):
-            return times, np.ones(len(times), dtype=bool)
-        knots = np.concatenate([[t], times, [t_end]])
-        gaps = np.diff(knots)
-        parts = np.maximum(1, np.ceil(gaps / step - 1e-6)).astype(np.int64)
-        gap = np.repeat(np.arange(len(gaps)), parts)
-        part = np.arange(len(gap)) - np.repeat(np.cumsum(parts) - parts, parts) + 1
-        # Each gap ends at the time that it leads to: one to record, the last at the end.
-        full = np.where(
-            part == parts[gap], knots[gap + 1], knots[gap] + gaps[gap] * (part / parts[gap])
-        )
-        kept = (part == parts[gap]) & (gap < len(times))
-        if gaps[-1] <= 0.0:
-            full, kept = full[: -parts[-1]], kept[: -parts[-1]]
-        return full, kept
+    def _watch(self, leg: Leg, *, last: bool) -> None:
+        """Look for extremes in the steps flown; the ``last`` ones under a program are not followed by others."""
+        if leg.state.count[4] and leg.flown is not None:
+            self.extremes.take(leg.flown, leg.workspace, leg.state, last=last)
 
     def _settle(self, leg: Leg, settle: Settle) -> bool:
         """Integrate in short stretches until the phase has settled; False if its time was over."""
@@ -609,6 +600,7 @@ class Flight:
     def result(self) -> Result:
         """The record of what has been flown."""
         wall = clock.perf_counter() - self.started
+        self.extremes.flight(self.phases)
         evaluations, steps, rejected = (int(c) for c in self.count)
         statistics = {
             "evaluations": evaluations, "steps": steps, "rejected": rejected,
@@ -618,7 +610,6 @@ class Flight:
         }  # fmt: skip
         result = assemble(
             self.mission, self.phases, self.pieces, ending=self.ending, statistics=statistics,
-            watched=self.watched,
         )  # fmt: skip
         result.mission = self.mission  # with what it has made already: slots assigned, edges
         return result
@@ -664,17 +655,6 @@ def _check_size(mission: Mission, phase: Phase) -> None:
             f" their eigenvalues; with more than {solvers.MOST_DENSE:,} a flight takes hours. Use solver ="
             ' "iterated" (or "exact"), give it fewer edges, or track slots with edges = []'
         )
-
-
-def _positions(plan: PhasePlan, states: Array, n: int, which: NDArray[np.bool_]) -> Array:
-    """Positions (K, N, 3) [m], world axes, at those of the states of the kernel (., n) that are asked for."""
-    x = states[:, : 3 * n][which].reshape(-1, n, 3)
-    if not plan.program.body_formulation:
-        return x
-    q = 6 * n + len(plan.edges)
-    last = states[:, q : q + 7][which]
-    T = att.dcm_from_quaternion(last[:, :4] / np.linalg.norm(last[:, :4], axis=1, keepdims=True))
-    return x @ T + last[:, None, 4:]
 
 
 def _times(times: ArrayLike, end: float) -> Array:

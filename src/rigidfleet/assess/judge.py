@@ -23,6 +23,8 @@ from rigidfleet.result import Result
 
 # Rounding on a limit is not beyond it.
 _SLACK = 1e-9
+# A vehicle that stands on an obstacle touches it by no more than this [m].
+_CONTACT = 1e-6
 #: A moment further than this from every sample has not been seen [s]: at 10 m/s, a waypoint's tolerance.
 _UNSEEN = 0.01
 
@@ -30,6 +32,7 @@ _UNSEEN = 0.01
 def findings(flight: Flight, verdict: Verdict) -> Iterator[Finding]:
     """Every check of a flight: of one that can fail in several phases all that do, else the worst."""
     yield _complete(flight.result)
+    yield from _record(flight)
     yield from _unseen(flight.result)
     candidates = [
         *_settled(verdict.phases),
@@ -41,7 +44,7 @@ def findings(flight: Flight, verdict: Verdict) -> Iterator[Finding]:
     if "separation" in worst:
         yield _separation(flight, worst["separation"])
     if "clearance" in worst:
-        yield _clearance(flight, worst["clearance"])
+        yield from _clearances(flight)
     if not flight.left.all():
         yield _lost(flight)
     limits = flight.mission.limits
@@ -51,7 +54,7 @@ def findings(flight: Flight, verdict: Verdict) -> Iterator[Finding]:
         yield _geofence(flight, np.array(limits.geofence.min), np.array(limits.geofence.max))
     yield _bounded("speed", worst.get("speed"), "m/s", limits.speed)
     yield _bounded("acceleration", worst.get("acceleration"), "m/s^2", limits.acceleration)
-    yield _thrust(flight, worst.get("thrust"))
+    yield from _thrust(flight, worst.get("thrust"))
     units = {"constraint": "m", "constraint_force": "N", "tension": "N", "singular_value": ""}
     yield from (_bounded(name, worst[name], units[name], None) for name in units if name in worst)
 
@@ -78,6 +81,16 @@ def _complete(result: Result) -> Finding:
         return Finding("complete", True, f"flown to its end at {end:.2f} s", when=end)
     words = f"incomplete, it ends at {end:.2f} s: {result.ending or 'it was stopped'}"
     return Finding("complete", False, words, when=end, phase=result.phases[-1].name)
+
+
+def _record(flight: Flight) -> Iterator[Finding]:
+    """A record that contradicts itself has been changed, and proves nothing."""
+    found = list(flight.contradictions())
+    if found:
+        words, when = found[0]
+        more = f", and {len(found) - 1} more like that" if len(found) > 1 else ""
+        words = f"the record contradicts itself: {words}{more}. Fly the mission again"
+        yield Finding("record", False, words, when=when)
 
 
 def _unseen(result: Result) -> Iterator[Finding]:
@@ -226,20 +239,42 @@ def _separation(flight: Flight, e: Extreme) -> Finding:
     words = f"{e.who} come within {value(e.value, 'm')} of each other at {e.when:.2f} s"
     words += f" (limit {limit:g} m)"
     if e.value <= 0:
-        since = flight.first(flight.result.separation <= 0)
+        since = _since(flight, "separation", flight.close[0])
         depth = f"by {value(-e.value, 'm')} at {e.when:.2f} s"
-        words = f"agents collide, first at {since}; {e.who} overlap the most, {depth}"
+        words = f"agents collide, first {since}; {e.who} overlap the most, {depth}"
     return _bounded("separation", e, "m", limit, words, passed=passed, at_least=True)
 
 
-def _clearance(flight: Flight, e: Extreme) -> Finding:
-    agent, obstacle = e.who.split(", ", 1)
-    words = f"{agent} comes within {value(e.value, 'm')} of '{obstacle}' at {e.when:.2f} s"
-    if e.value <= 0:
-        since = flight.first(flight.result.clearance <= 0)
-        depth = f"by {value(-e.value, 'm')} at {e.when:.2f} s"
-        words = f"obstacles are hit, first at {since}; {agent} is deepest in '{obstacle}', {depth}"
-    return _bounded("clearance", e, "m", 0.0, words, passed=e.value > 0, at_least=True)
+def _since(flight: Flight, name: str, sampled: Floats) -> str:
+    """When something first fell to zero, as far as samples and the worst of each phase tell."""
+    phases = range(len(flight.result.phases))
+    times = [e.when for k in phases if (e := flight.between(name, k)) is not None and e.value <= 0]
+    first = flight.first(sampled <= 0)
+    return f"by {min(times):.2f} s" if times and min(times) < first else f"at {first:.2f} s"
+
+
+def _clearances(flight: Flight) -> Iterator[Finding]:
+    """Obstacles in flight; and apart from that, those on which vehicles stand at the start and at the end."""
+    found = {name: e for name, e in flight.clearances().items() if e is not None}
+    e = min(found.values(), key=lambda e: e.value)
+    hit = e.value < -_CONTACT
+    if not hit:
+        e = found.pop("clearance_flight", None)
+    if e is not None:
+        agent, obstacle = e.who.split(", ", 1)
+        words = f"{agent} comes within {value(e.value, 'm')} of '{obstacle}' at {e.when:.2f} s"
+        if hit or e.value <= 0:
+            since = _since(flight, "clearance", flight.close[2])
+            depth = f"by {value(-e.value, 'm')} at {e.when:.2f} s"
+            words = f"obstacles are hit, first {since}; {agent} is deepest in '{obstacle}', {depth}"
+        yield _bounded("clearance", e, "m", 0.0, words, passed=e.value > 0, at_least=True)
+    for name, when in (("clearance_start", "since the start"), ("clearance_end", "at the end")):
+        if name in found and not hit:
+            e = found[name]
+            agent, obstacle = e.who.split(", ", 1)
+            how = "in contact with" if e.value <= _CONTACT else f"{value(e.value, 'm')} above"
+            words = f"{agent} stands {how} '{obstacle}' {when} ({e.when:.2f} s)"
+            yield _bounded(name, e, "m", 0.0, words, passed=True, at_least=True)
 
 
 def _lost(flight: Flight) -> Finding:
@@ -278,15 +313,22 @@ def _geofence(flight: Flight, low: Floats, high: Floats) -> Finding:
     return _bounded("geofence", e, "m", 0.0, words)
 
 
-def _thrust(flight: Flight, e: Extreme | None) -> Finding:
-    most = np.array(flight.mission.agents.thrust_limit)
-    beyond = flight.extreme(flight.of_left(flight.result.thrust - most), flight.agent)
-    if beyond is None:
-        return _bounded("thrust", e, "N", None)
-    # The agent nearest to its own limit, or furthest beyond.
-    limit = float(most[int(beyond.who.removeprefix("agent ")) - 1])
-    e = Extreme(beyond.value + limit, beyond.when, beyond.who, beyond.phase)
-    return _bounded("thrust", e, "N", limit)
+def _thrust(flight: Flight, e: Extreme | None) -> Iterator[Finding]:
+    """The vehicle that comes nearest to its own thrust limit; and the greatest thrust, where another one has that."""
+    beyond = flight.nearest_to_limit()
+    if e is None or beyond is None:
+        yield _bounded("thrust", e, "N", None)
+        return
+    limits = flight.mission.agents.thrust_limit
+
+    def limit(who: str) -> float:
+        return float(limits[int(who.removeprefix("agent ")) - 1])
+
+    if e.value - limit(e.who) < beyond.value:
+        yield _bounded("thrust_peak", e, "N", None)
+        most = limit(beyond.who)
+        e = Extreme(beyond.value + most, beyond.when, beyond.who, beyond.phase)
+    yield _bounded("thrust", e, "N", limit(e.who))
 
 
 # -- notes -------------------------------------------------------------------------------------------
@@ -299,10 +341,22 @@ def notes(flight: Flight, phases: list[PhaseVerdict]) -> Iterator[str]:
     yield from _fallen(flight)
     agents = flight.mission.agents
     if agents.saturate:
-        full = flight.result.thrust >= np.array(agents.thrust_limit) * (1 - 1e-6)
+        full = flight.thrust >= np.array(agents.thrust_limit) * (1 - 1e-6)
         if full.any():
             who, since = names(np.flatnonzero(full.any(axis=0))), flight.first(full.max(axis=1))
-            yield f"the thrust of {who} is cut off at its limit, first at {since}"
+            yield f"the thrust of {who} is cut off at its limit, first at {since:.2f} s"
+    yield from _sampled(flight)
+
+
+def _sampled(flight: Flight) -> Iterator[str]:
+    """A record that does not say what happens between its samples."""
+    flown = np.unique(flight.result.phase)
+    if any(not flight.result.phases[k].extremes for k in flown):
+        step = float(np.diff(flight.result.time).max(initial=0.0))
+        yield (
+            f"judged at samples alone, up to {step:.3g} s apart: the record does not tell what happens"
+            " between them"
+        )
 
 
 def _fallen(flight: Flight) -> Iterator[str]:
@@ -316,7 +370,7 @@ def _fallen(flight: Flight) -> Iterator[str]:
         down &= ~flight.left[:, i]
         if down.any():
             x, y, _ = r[-1]
-            yield f"{words} hits the ground at {flight.first(down)} and lies at ({x:.1f}, {y:.1f}) m"
+            yield f"{words} hits the ground at {flight.first(down):.2f} s and lies at ({x:.1f}, {y:.1f}) m"
         else:
             yield f"{words} has fallen to z = {r[-1, 2]:.1f} m when the flight ends"
 
@@ -327,8 +381,8 @@ def _dips(flight: Flight) -> Iterator[str]:
     if mission.limits.geofence is not None or any(o.kind == "ground" for o in mission.obstacles):
         return
     low = np.flatnonzero((z < -DIP).any(axis=0))
-    e = flight.extreme(z, flight.agent, lambda x: -x)
-    if len(low) and e is not None:
+    e = flight.height(lowest=True)
+    if e is not None and e.value < -DIP:
         others = f" ({names(low)} are below 0 at times)" if len(low) > 1 else ""
         words = f"dips to z = {e.value:.2f} m at {e.when:.2f} s{others}"
         yield f"{e.who} {words}; the mission has no ground"

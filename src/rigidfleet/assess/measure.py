@@ -1,9 +1,9 @@
-"""What was flown, in numbers: shapes against their slots, waypoints, extremes."""
+"""What was flown, in numbers: shapes against their slots, waypoints, extremes at samples and between them."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import numpy as np
@@ -12,8 +12,16 @@ from numpy.typing import NDArray
 from rigidfleet import attitude as att
 from rigidfleet import formation as shapes
 from rigidfleet import geometry
-from rigidfleet.assess.verdict import SENSE, SHAPE_TOLERANCE, Extreme, PhaseVerdict, Waypoint, names
-from rigidfleet.result import PhaseRecord, Result
+from rigidfleet.assess.verdict import (
+    SENSE,
+    SHAPE_TOLERANCE,
+    Extreme,
+    PhaseVerdict,
+    Waypoint,
+    names,
+    value,
+)
+from rigidfleet.result import PAD, PhaseRecord, Result
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -59,29 +67,35 @@ class Fit:
 
 
 class Flight:
-    """Measures a result, phase by phase."""
+    """Measures a result, phase by phase: at its samples, computed anew from positions and forces, and between them."""
 
     def __init__(self, result: Result) -> None:
         self.result, self.mission = result, result.mission
         self.labels = result.edge_labels
         self.fits: dict[int, Fit] = {}
         self.left = result.left
-        norm = np.linalg.norm
+        radius, obstacles = self.mission.agents.radius, self.mission.obstacles
+        #: Separation, pair, clearance, agent and obstacle at samples (K, ...), see `geometry.closeness`.
+        self.close = geometry.closeness(result.position, radius, obstacles, self.left)
+        thrust = _length(result.input_force + result.constraint_force)
+        if self.mission.agents.saturate:
+            thrust = np.minimum(thrust, self.mission.agents.thrust_limit)
+        self.thrust = self.of_left(np.maximum(thrust, result.thrust))
         self.measured: dict[str, tuple[Floats, Callable[..., str]]] = {
             "constraint": (np.abs(result.constraint), self.edge),
-            "separation": (result.separation, self.pair),
-            "clearance": (result.clearance, self.obstacle),
-            "thrust": (self.of_left(result.thrust), self.agent),
-            "speed": (self.of_left(norm(result.velocity, axis=2)), self.agent),
-            "acceleration": (self.of_left(norm(result.acceleration, axis=2)), self.agent),
-            "constraint_force": (self.of_left(norm(result.constraint_force, axis=2)), self.agent),
+            "separation": (self.close[0], self.pair),
+            "clearance": (self.close[2], self.obstacle),
+            "thrust": (self.thrust, self.agent),
+            "speed": (self.of_left(_length(result.velocity)), self.agent),
+            "acceleration": (self.of_left(_length(result.acceleration)), self.agent),
+            "constraint_force": (self.of_left(_length(result.constraint_force)), self.agent),
             "tension": (-result.multiplier, self.edge),
             "singular_value": (result.singular_value, lambda k: ""),
         }
 
     def of_left(self, values: Floats) -> Floats:
         """Values (K, N), NaN of agents that are lost."""
-        return np.where(self.left, values, np.nan)
+        return values if self.left.all() else np.where(self.left, values, np.nan)
 
     def agent(self, _k: int, i: int) -> str:
         """Name of agent i (from 0), at whichever sample."""
@@ -93,12 +107,15 @@ class Flight:
 
     def pair(self, k: int) -> str:
         """The two agents that are nearest to each other at sample k."""
-        return names(np.sort(self.result.separation_pair[k]))
+        return names(np.sort(self.close[1][k]))
 
     def obstacle(self, k: int) -> str:
         """The agent that is nearest to an obstacle at sample k, and the obstacle."""
-        name = self.mission.obstacles[self.result.clearance_obstacle[k]].name
-        return f"agent {self.result.clearance_agent[k] + 1}, {name}"
+        return self.beside(int(self.close[3][k]), int(self.close[4][k]))
+
+    def beside(self, agent: int, obstacle: int) -> str:
+        """Name of an agent and of an obstacle, from 0."""
+        return f"agent {agent + 1}, {self.mission.obstacles[obstacle].name}"
 
     def at(self, k: int) -> dict[str, Any]:
         """When sample k is, and in which phase."""
@@ -107,9 +124,9 @@ class Flight:
             "phase": self.result.phases[self.result.phase[k]].name,
         }
 
-    def first(self, broken: NDArray[np.bool_]) -> str:
-        """Time of the first sample at which something is broken, in words."""
-        return f"{self.result.time[int(np.argmax(broken))]:.2f} s"
+    def first(self, broken: NDArray[np.bool_]) -> float:
+        """Time [s] of the first sample at which something is broken; infinity if it never is."""
+        return float(self.result.time[int(np.argmax(broken))]) if broken.any() else math.inf
 
     def extreme(
         self,
@@ -120,22 +137,106 @@ class Flight:
     ) -> Extreme | None:
         """Where sense(values) is greatest; values (K, ...), of which only the finite ones count."""
         part = values[samples]
-        rank = np.where(np.isfinite(part), sense(part), -np.inf)
-        if rank.max(initial=-np.inf) == -np.inf:
+        if not part.size:
             return None
-        at = np.unravel_index(int(rank.argmax()), rank.shape)
-        k = (samples.start or 0) + int(at[0])
-        return Extreme(float(part[at]), who=who(k, *map(int, at[1:])), **self.at(k))
+        rank = sense(part)
+        at = int(rank.argmax())
+        if not np.isfinite(rank.flat[at]):  # rarely: infinity and NaN are first
+            rank = np.where(np.isfinite(part), rank, -np.inf)
+            at = int(rank.argmax())
+            if rank.flat[at] == -np.inf:
+                return None
+        where = np.unravel_index(at, rank.shape)
+        k = (samples.start or 0) + int(where[0])
+        return Extreme(float(part[where]), who=who(k, *map(int, where[1:])), **self.at(k))
+
+    # -- between samples ------------------------------------------------------------------------------
+
+    def between(self, name: str, index: int) -> Extreme | None:
+        """What the record says a phase comes to in continuous time; None where it does not say."""
+        phase = self.result.phases[index]
+        x = phase.extremes.get(name)
+        if x is None:
+            return None
+        if name in ("separation", "separation_below", "lost"):
+            who = names(sorted((x.who, x.other)))
+        elif name in ("tension", "constraint"):
+            who = f"edge {x.who + 1}-{x.other + 1}"
+        elif name.startswith("clearance"):
+            who = self.beside(x.who, x.other)
+        else:
+            who = self.agent(0, x.who)
+        return Extreme(x.value, x.time, who, phase.name)
+
+    def worst(
+        self, name: str, sampled: Extreme | None, sense: Callable[..., Any] = lambda x: x
+    ) -> Extreme | None:
+        """The worst of a flight: that of its samples, or that between them."""
+        every = [self.between(name, k) for k in range(len(self.result.phases))]
+        return _worse([sampled, *every], sense)
 
     def below(self) -> Extreme | None:
         """Least vertical room [m] between two agents of which one is below the other."""
         least, pair = geometry.headroom(self.result.position, self.mission.agents.radius, self.left)
-        return self.extreme(least, lambda k: names(pair[k]), lambda x: -x)
+        sampled = self.extreme(least, lambda k: names(pair[k]), lambda x: -x)
+        return self.worst("separation_below", sampled, lambda x: -x)
 
     def outside(self, low: Floats, high: Floats) -> Extreme | None:
         """How far [m] an agent's centre comes out of a box with these corners; negative inside."""
         r = self.result.position
-        return self.extreme(self.of_left(np.maximum(low - r, r - high).max(axis=2)), self.agent)
+        beyond = self.of_left(np.maximum(low - r, r - high).max(axis=2))
+        return self.worst("geofence", self.extreme(beyond, self.agent))
+
+    def height(self, *, lowest: bool) -> Extreme | None:
+        """Least or greatest altitude [m] of an agent's centre."""
+        z, sense = (
+            self.of_left(self.result.position[..., 2]),
+            np.negative if lowest else np.positive,
+        )
+        name = "lowest" if lowest else "highest"
+        return self.worst(name, self.extreme(z, self.agent, sense), sense)
+
+    def nearest_to_limit(self) -> Extreme | None:
+        """Thrust less its limit [N], of the agent that comes nearest to its own, or furthest beyond."""
+        most = np.array(self.mission.agents.thrust_limit)
+        return self.worst("thrust_margin", self.extreme(self.thrust - most, self.agent))
+
+    def clearances(self) -> dict[str, Extreme | None]:
+        """Least room to obstacles [m] in flight, and of who stands on one from the start, or at the end.
+
+        A vehicle within `PAD` of an obstacle since the start, or until the end, stands on it.
+        """
+        result, time = self.result, self.result.time
+        room, nearest = geometry.rooms(
+            result.position, self.mission.agents.radius, self.mission.obstacles
+        )
+        room = self.of_left(room)
+        off = room > PAD
+        first = np.where(off.any(axis=0), off.argmax(axis=0), len(time))
+        last = np.where(off.any(axis=0), len(time) - 1 - off[::-1].argmax(axis=0), len(time))
+        k = np.arange(len(time))[:, None]
+        parts = {
+            "clearance_start": k < first,
+            "clearance_flight": (k >= first) & (k <= last),
+            "clearance_end": (k >= first) & (k > last),
+        }
+        if not (parts["clearance_start"].any() or parts["clearance_end"].any()):
+            # All fly, all the time.
+            return {"clearance_flight": self.worst_clearance("clearance")}
+        found = {}
+        for name, part in parts.items():
+            values = np.where(part, room, np.nan)
+            sampled = self.extreme(
+                values, lambda k, i: self.beside(i, int(nearest[k, i])), lambda x: -x
+            )
+            found[name] = self.worst(name, sampled, lambda x: -x)
+        return found
+
+    def worst_clearance(self, name: str) -> Extreme | None:
+        """Least room to an obstacle [m] of all vehicles, standing ones among them."""
+        return self.worst(
+            name, self.extreme(self.close[2], self.obstacle, lambda x: -x), lambda x: -x
+        )
 
     def fallen_on(self) -> Extreme | None:
         """Least room [m] between a lost agent and one that is left; None if none is lost."""
@@ -150,7 +251,48 @@ class Flight:
             closer &= np.isfinite(room)
             least[closer] = room[closer]
             who[closer] = np.column_stack([np.full(len(r), i), j])[closer]
-        return self.extreme(least, lambda k: names(who[k]), lambda x: -x)
+        sampled = self.extreme(least, lambda k: names(who[k]), lambda x: -x)
+        return self.worst("lost", sampled, lambda x: -x)
+
+    def contradictions(self) -> Iterator[tuple[str, float]]:
+        """What in the record does not follow from its own positions and forces: in words, and when [s]."""
+        result, time = self.result, self.result.time
+        i, j = result.edges.T
+        length = _length(result.position[:, i] - result.position[:, j])
+        rounding = 1e-9 * (1.0 + float(np.nanmax(np.abs(result.position), initial=0.0)))
+        with np.errstate(invalid="ignore"):  # infinity where there is nothing to be near
+            stored = {
+                "separation": (result.separation - self.close[0], "m"),
+                "clearance": (result.clearance - self.close[2], "m"),
+                "distance": (np.abs(result.distance - length), "m"),
+                "thrust": (self.thrust - result.thrust, "N"),
+            }
+        for name, (off, unit) in stored.items():
+            wrong = off > (rounding if unit == "m" else 1e-6)
+            if wrong.any():
+                k = int(np.argmax(wrong.reshape(len(time), -1).any(axis=1)))
+                worst = float(off[wrong].max())
+                words = f"its {name} is up to {value(worst, unit)} off what its own samples give"
+                yield words, float(time[k])
+        for index, phase in enumerate(result.phases):
+            samples = result.samples(index)
+            for name, (values, who) in self.measured.items():
+                x = phase.extremes.get(name)
+                if x is None or samples.stop == samples.start:
+                    continue
+                sense = SENSE[name]
+                sampled = self.extreme(values, who, sense, samples)
+                if sampled is None:
+                    continue
+                slack = rounding + 1e-6 * abs(sampled.value)
+                if sense(sampled.value) > sense(x.value) + slack or not (
+                    phase.t_start - 1e-9 <= x.time <= phase.t_end + 1e-9
+                ):
+                    words = (
+                        f"its {name.replace('_', ' ')} of phase '{phase.name}' is said to come to"
+                    )
+                    words += f" {value(x.value)} at {x.time:.2f} s, and a sample shows {value(sampled.value)}"
+                    yield words, sampled.when
 
     def phase(self, index: int, record: PhaseRecord) -> PhaseVerdict:
         """Numbers of a phase."""
@@ -169,7 +311,10 @@ class Flight:
                 fit = self.fits[index] = Fit(p[left], slots[left], left)
                 flip = self.flip(fit, record, last)
         extremes = {
-            name: self.extreme(values, who, SENSE[name], samples)
+            name: _worse(
+                [self.extreme(values, who, SENSE[name], samples), self.between(name, index)],
+                SENSE[name],
+            )
             for name, (values, who) in self.measured.items()
         }
         return PhaseVerdict(
@@ -199,13 +344,15 @@ class Flight:
 
     def flip(self, fit: Fit, record: PhaseRecord, k: int) -> float | None:
         """Angle [deg] of a line or plane from where it should point at sample k; None if nothing says."""
-        references = [self.result.attitude_reference[k]]
+        # An attitude that is commanded decides; the integrated frame is where a plane should lie if none is.
         if fit.dimension == 2:
-            references.append(self.result.frame[k])
-        elif fit.dimension != 1 or record.control != "slots":
+            references = [self.result.attitude_reference[k], self.result.frame[k]]
+        elif fit.dimension == 1 and record.control == "slots":
             # Only tracked slots steer a line; else it keeps the direction of what it was folded from.
+            references = [self.result.attitude_reference[k]]
+        else:
             return None
-        return max((a for q in references if math.isfinite(a := fit.angle_from(q))), default=None)
+        return next((a for q in references if math.isfinite(a := fit.angle_from(q))), None)
 
     def waypoint(self, record: PhaseRecord, samples: slice) -> Waypoint | None:
         """Miss at the waypoint's time, or at the phase's end if it settles before."""
@@ -231,6 +378,16 @@ class Flight:
             attitude=miss("attitude", result.attitude[k]),
             rates=None if rates is None else math.degrees(rates),
         )
+
+
+def _worse(every: Iterable[Extreme | None], sense: Callable[..., Any]) -> Extreme | None:
+    """The worst of those there are; of equals the first."""
+    return max((e for e in every if e is not None), key=lambda e: sense(e.value), default=None)
+
+
+def _length(x: Floats) -> Floats:
+    """Lengths (...) of vectors (..., 3)."""
+    return np.sqrt(np.einsum("...a,...a->...", x, x))
 
 
 def _all_pairs(p: Floats, slots: Floats) -> tuple[float, tuple[int, int], float, float, float]:

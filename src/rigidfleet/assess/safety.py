@@ -105,9 +105,8 @@ def _from_inside(finding: Finding | None) -> Finding | None:
 
 
 def _altitudes(flight: Flight) -> list[Safety]:
-    z, fence = flight.of_left(flight.result.position[..., 2]), flight.mission.limits.geofence
-    lowest = flight.extreme(z, flight.agent, lambda x: -x)
-    highest = flight.extreme(z, flight.agent)
+    fence = flight.mission.limits.geofence
+    lowest, highest = flight.height(lowest=True), flight.height(lowest=False)
     floor, ceiling = (None, None) if fence is None else (fence.min[2], fence.max[2])
     rows = [
         Safety("lowest", "least altitude of a vehicle's centre", "m", True, floor, lowest, True),

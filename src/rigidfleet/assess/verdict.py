@@ -38,12 +38,15 @@ SENSE: dict[str, Callable[..., Any]] = {
 
 #: What a passed verdict says of a check's worst value.
 _PRAISE = {
-    "shape": "shapes are within {}",
-    "waypoint_position": "waypoints are met within {}",
-    "separation": "agents stay {} apart",
-    "clearance": "obstacles {} away",
-    "lost": "vehicles lost keep {} from the others",
-    "thrust": "thrust peaks at {}",
+    "shape": "shapes are within {worst}",
+    "waypoint_position": "waypoints are met within {worst}",
+    "separation": "agents stay {worst} apart",
+    "clearance": "obstacles {worst} away in flight",
+    "clearance_start": "{worst} above what they start on",
+    "clearance_end": "{worst} above what they land on",
+    "lost": "vehicles lost keep {worst} from the others",
+    "thrust_peak": "thrust peaks at {worst} ({who})",
+    "thrust": "thrust peaks at {worst}",
 }
 
 
@@ -85,6 +88,11 @@ class Finding:
     who: str = ""
     phase: str = ""
     judged: bool = True
+
+    def fill(self, words: str) -> str:
+        """Words with {worst}, {limit} and {who} put in."""
+        worst, limit = ("" if x is None else value(x, self.unit) for x in (self.worst, self.limit))
+        return words.format(worst=worst, limit=limit, who=self.who)
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,8 +176,11 @@ class Verdict:
         if failed:
             head = f"Failed: {len(failed)} of {len(judged)} checks."
             return "\n".join([head, *(f"- {finding.message}" for finding in failed)])
-        found = {f.check: value(f.worst, f.unit) for f in self.findings if f.worst is not None}
-        told = [words.format(found[name]) for name, words in _PRAISE.items() if name in found]
+        found = {f.check: f for f in self.findings if f.worst is not None}
+        praise = dict(_PRAISE)
+        if "thrust_peak" in found:
+            praise["thrust"] = "{who} comes nearest to its limit, at {worst} of {limit}"
+        told = [found[name].fill(words) for name, words in praise.items() if name in found]
         head = f"Passed: all {len(judged)} checks hold"
         return f"{head}; {', '.join(told)}." if told else f"{head}."
 

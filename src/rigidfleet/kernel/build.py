@@ -1,7 +1,7 @@
 """From the kernel's functions to machine code that needs no compiler to be called.
 
-Numba translates the integrator, the recorder and all they call to LLVM's language. What is then called from
-nowhere else may be rearranged at will, and is optimised once, together.
+Numba translates the integrator, the recorder, the monitor and all they call to LLVM's language. What is then called
+from nowhere else may be rearranged at will, and is optimised once, together.
 
 As a program (``python -m rigidfleet.kernel.build``) it writes the code to standard output. Most of the time goes into
 the translation, so that a second process does its half of it meanwhile.
@@ -19,7 +19,7 @@ import llvmlite.binding as llvm
 from numba import cfunc, typeof, types
 from numba.core import codegen, compiler, cpu, serialize
 
-from rigidfleet.kernel import body, constraint, control, flight, native
+from rigidfleet.kernel import body, constraint, control, flight, monitor, native
 from rigidfleet.kernel import disturbance as disturbances
 from rigidfleet.kernel.compiled import OPTIONS
 from rigidfleet.kernel.pointers import Pointer, pointer
@@ -38,12 +38,12 @@ _QUICK = ("sroa", "simplify_cfg", "instruction_combine", "simplify_cfg")
 
 
 def machine_code(second: "_SecondProcess | None" = None) -> list[bytes]:
-    """Object code of the two C functions that `native` calls, `native.ENTRIES`.
+    """Object code of the three C functions that `native` calls, `native.ENTRIES`.
 
-    All their arguments are addresses of named tuples. They integrate, and return what `flight.integrate` does, and
-    record. The ``second`` process, if there is one, does part of the work.
+    All their arguments are addresses of named tuples. They integrate, and return what `flight.integrate` does,
+    record, and watch, as `monitor.watch` does. The ``second`` process, if there is one, does part of the work.
     """
-    program, workspace, integrator, stretch, record = (
+    program, workspace, integrator, stretch, record, watching = (
         pointer(typeof(x)) for x in native.examples()
     )
 
@@ -59,19 +59,24 @@ def machine_code(second: "_SecondProcess | None" = None) -> list[bytes]:
         flight.record(call.times, call.samples, program(p), workspace(w), call.dy, record(out))
         return 0
 
+    def watch_trail(p, w, state, found):
+        return monitor.watch(program(p), workspace(w), integrator(state), watching(found))
+
     if second is not None:
         for function, arguments in _halves()[0].items():  # before what waits for the second
             function.compile(arguments)
     compiled = cfunc(types.int64(*(types.int64,) * 4), **OPTIONS)
-    (integrate, name), (recorder, other) = (
-        (compiled(function), name)
-        for function, name in zip((integrate_stretch, record_stretch), native.ENTRIES, strict=True)
-    )
+    modules = []
+    for function, name in zip(
+        (integrate_stretch, record_stretch, watch_trail), native.ENTRIES, strict=True
+    ):
+        made = compiled(function)
+        modules.append((made.inspect_llvm(), made.native_name, name))
     if second is not None:
-        second.optimise(recorder.inspect_llvm(), recorder.native_name, other)
-    code = _object(integrate.inspect_llvm(), integrate.native_name, name)
+        second.optimise(modules[1:])
+    code = _object(*modules[0])
     rest = None if second is None else second.optimised()
-    return [code, rest or _object(recorder.inspect_llvm(), recorder.native_name, other)]
+    return [code, *(rest or [_object(*module) for module in modules[1:]])]
 
 
 def _object(text: str, symbol: str, name: str) -> bytes:
@@ -145,7 +150,7 @@ def _translate_only() -> None:
 
 def _halves() -> tuple[_Functions, _Functions]:
     """Functions, and the types of their arguments: those that this process begins with, those of the second."""
-    example, work, _, _, out = native.examples()
+    example, work, _, _, out, _ = native.examples()
     p, w, record = (Pointer(typeof(x)) for x in (example, work, out))
     disturbance = Pointer(typeof(example.disturbance))
     number, row, places = types.float64, typeof(example.vehicles.m), typeof(work.r)
@@ -184,7 +189,7 @@ def _translated() -> dict[str, bytes]:
 
 
 class _SecondProcess:
-    """The second process: it translates its half, and optimises one module.
+    """The second process: it translates its half, and optimises two of the three modules.
 
     Whatever comes to nothing there is done here.
     """
@@ -200,15 +205,15 @@ class _SecondProcess:
         """Its half, by the names of functions."""
         return self._answer() or {}
 
-    def optimise(self, *module: str) -> None:
-        """Ask for the object of a module, see `_object`."""
+    def optimise(self, modules: list[tuple[str, str, str]]) -> None:
+        """Ask for the objects of modules, see `_object`."""
         assert self._process.stdin is not None
         if self.translated:
             with suppress(OSError), self._process.stdin as stream:
-                pickle.dump(module, stream)
+                pickle.dump(modules, stream)
 
-    def optimised(self) -> bytes | None:
-        """The object asked for."""
+    def optimised(self) -> list[bytes] | None:
+        """The objects asked for."""
         return self._answer()
 
     def _answer(self) -> Any:
@@ -239,7 +244,7 @@ def _main() -> None:
     if sys.argv[1:] == ["half"]:
         pickle.dump(_translated(), output)
         output.flush()
-        pickle.dump(_object(*pickle.load(sys.stdin.buffer)), output)
+        pickle.dump([_object(*module) for module in pickle.load(sys.stdin.buffer)], output)
         return
     output.write(native.joined(machine_code(_SecondProcess())))
 

@@ -87,6 +87,21 @@ def call_solver(_context, address):
     return types.void(types.int64), generate
 
 
+@intrinsic
+def call_recorder(_context, address, p, w, stretch, record):
+    """Call `native`'s recorder at ``address``: int64(program, workspace, stretch, record), all of them addresses."""
+    from llvmlite import ir
+
+    def generate(context, builder, signature, arguments):
+        word = ir.IntType(64)
+        kind = ir.FunctionType(word, [word] * 4)
+        function, p, w, *rest = arguments
+        words = [builder.ptrtoint(x, word) for x in (p, w)]
+        return builder.call(builder.inttoptr(function, kind.as_pointer()), [*words, *rest])
+
+    return types.int64(types.int64, p, w, types.int64, types.int64), generate
+
+
 _CACHE = cache_directory()
 
 

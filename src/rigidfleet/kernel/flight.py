@@ -22,6 +22,7 @@ from rigidfleet.kernel.compiled import compiled, inlined
 from rigidfleet.kernel.constraint import constraint_force
 from rigidfleet.kernel.control import input_law
 from rigidfleet.kernel.disturbance import disturb, sense
+from rigidfleet.kernel.gauge import read_gauge
 from rigidfleet.kernel.lanes import blocks, rough_inverse, spread, total_or_worst
 from rigidfleet.kernel.pointers import by_address
 from rigidfleet.kernel.program import BODY, LOCAL, OPEN, Program, Workspace
@@ -226,6 +227,30 @@ def advance(k, stage, a, h):
 
 
 @compiled
+def keep_step(t, h, p, w, state):
+    """Leave a step in the trail: its continuous extension by Bernstein coefficients, and the forces at its end.
+
+    With the terms of Hairer's form, y + x (rise + (1 - x) (bend + x (rest + (1 - x) twist))).
+    """
+    K, row = state.K, state.count[4]
+    points = state.trail.points[row]
+    state.trail.clock[row, 0], state.trail.clock[row, 1] = t, h
+    for q in range(points.shape[1]):
+        y, rise = K[STATE, q], K[TRIAL, q] - K[STATE, q]
+        bend = h * K[0, q] - rise
+        rest = rise - h * K[6, q] - bend
+        twist = _D[0] * K[0, q] + _D[2] * K[2, q] + _D[3] * K[3, q]
+        twist = h * (twist + _D[4] * K[4, q] + _D[5] * K[5, q] + _D[6] * K[6, q])
+        points[0, q] = y
+        points[1, q] = y + 0.25 * (rise + bend)
+        points[2, q] = y + 0.5 * rise + bend / 3.0 + (rest + twist) / 6.0
+        points[3, q] = y + 0.75 * rise + 0.25 * (bend + rest)
+        points[4, q] = K[TRIAL, q]
+    read_gauge(p, w, state.trail.gauge[row])
+    state.count[4] = row + 1
+
+
+@compiled
 def integrate(p, w, state, t_end, fresh, times, samples, max_steps):
     """Integrate `closed_loop` to ``t_end`` [s]; adaptive Dormand-Prince 5(4), PI step control.
 
@@ -238,12 +263,12 @@ def integrate(p, w, state, t_end, fresh, times, samples, max_steps):
         index to write is ``state.count[3]``
     max_steps : pause after so many steps
 
-    Returns FINISHED, PAUSED, or COLLAPSED where the step size fell to nothing (singular
-    constraints, non-finite forces); y and t are then those of the last step that was good.
+    Returns FINISHED, PAUSED (the trail may be full), or COLLAPSED where the step size fell to nothing
+    (singular constraints, non-finite forces); y and t are then those of the last step that was good.
     """
     p, w, state = by_address(p), by_address(w), by_address(state)
     K, clock, count = state.K, state.clock, state.count
-    n = state.y.shape[0]
+    n, room = state.y.shape[0], state.trail.clock.shape[0]
     y, trial = K[STATE], K[TRIAL]
     for q in range(n):
         y[q] = state.y[q]
@@ -301,6 +326,8 @@ def integrate(p, w, state, t_end, fresh, times, samples, max_steps):
                 inner = bend + x * (rest + (1.0 - x) * K[1, q])
                 samples[count[3], q] = y[q] + x * (rise + (1.0 - x) * inner)
             count[3] += 1
+        if room > 0:
+            keep_step(t, h, p, w, state)
         for q in range(k.shape[1]):
             k[STATE, q] = k[TRIAL, q]
             k[0, q] = k[6, q]
@@ -313,6 +340,8 @@ def integrate(p, w, state, t_end, fresh, times, samples, max_steps):
         last = max(error, LEAST_ERROR)
         if t >= t_end:
             status = FINISHED
+            break
+        if room > 0 and count[4] == room:
             break
     for q in range(n):
         state.y[q] = y[q]

@@ -1,8 +1,8 @@
 """The compiled kernel, called without the compiler.
 
-`rigidfleet.kernel.build` compiles the integrator and the recorder once to machine code, which is kept in the cache
-and loaded from there: Numba alone takes longer to import than most flights to fly. What the code reads and writes
-it finds through addresses of named tuples, laid out as `rigidfleet.kernel.pointers` says.
+`rigidfleet.kernel.build` compiles the integrator, the recorder and the monitor once to machine code, which is kept in
+the cache and loaded from there: Numba alone takes longer to import than most flights to fly. What the code reads and
+writes it finds through addresses of named tuples, laid out as `rigidfleet.kernel.pointers` says.
 """
 
 from __future__ import annotations
@@ -27,11 +27,20 @@ from numpy.typing import NDArray
 
 from rigidfleet.kernel import program as k
 from rigidfleet.kernel.program import Array, Program, Workspace
-from rigidfleet.kernel.records import Integrator, Record, Stretch, integrator, recorder
+from rigidfleet.kernel.records import (
+    Integrator,
+    Monitor,
+    Record,
+    Stretch,
+    integrator,
+    monitor,
+    recorder,
+)
 
-#: What the machine code is called, its arguments being addresses: int64(program, workspace, integrator, stretch) and
-#: int64(program, workspace, stretch, record). Each comes in an object of its own.
-ENTRIES = "rigidfleet_integrate", "rigidfleet_record"
+#: What the machine code is called, its arguments being addresses: int64(program, workspace, integrator, stretch),
+#: int64(program, workspace, stretch, record) and int64(program, workspace, integrator, monitor). Each comes in an
+#: object of its own.
+ENTRIES = "rigidfleet_integrate", "rigidfleet_record", "rigidfleet_watch"
 
 
 def integrate(
@@ -56,6 +65,25 @@ def record(program: Program, workspace: Workspace, times: Array, samples: Array)
     stretch = Stretch(0.0, False, 0, times, samples, np.empty(samples.shape[1]))
     _call(_code().record, _packed(program), _packed(workspace), _pack(stretch), _pack(out))
     return out
+
+
+class Watch:
+    """A monitor at work: takes the extremes of the steps in trails, see `rigidfleet.kernel.monitor.watch`."""
+
+    def __init__(self, monitor: Monitor) -> None:
+        # The recorder evaluates the law, at the monitor's own time and state.
+        n = monitor.states.shape[1]
+        stretch = Stretch(0.0, False, 0, monitor.time, monitor.states, np.empty(n))
+        self._kept = _pack(stretch), _pack(_UNRECORDED)
+        self.monitor = monitor._replace(
+            recorder=_code().recorder, stretch=self._kept[0].address, record=self._kept[1].address
+        )
+        self._packed = _pack(self.monitor)
+
+    def __call__(self, program: Program, workspace: Workspace, state: Integrator) -> int:
+        """What `rigidfleet.kernel.monitor.watch` returns."""
+        packed = _packed(program), _packed(workspace), _packed(state)
+        return _call(_code().watch, *packed, self._packed)
 
 
 def closed_loop(t: float, y: Array, dy: Array, program: Program, workspace: Workspace) -> None:
@@ -153,7 +181,7 @@ def _layout(kind: type) -> _Layout:
 
 
 @cache
-def examples() -> tuple[Program, Workspace, Integrator, Stretch, Record]:
+def examples() -> tuple[Program, Workspace, Integrator, Stretch, Record, Monitor]:
     """One of each named tuple, as small as can be: their fields have the types of all."""
     one, none, places, frame = np.ones(1), np.zeros(0), np.zeros((1, 3)), np.eye(3)
     program = Program(
@@ -173,7 +201,9 @@ def examples() -> tuple[Program, Workspace, Integrator, Stretch, Record]:
     )  # fmt: skip
     state = integrator(np.zeros(6), 0.0, rtol=0.0, atol=np.ones(6))
     stretch = Stretch(0.0, False, 0, none, np.zeros((0, 6)), none)
-    return program, k.workspace(1, 0), state, stretch, _UNRECORDED
+    nowhere = np.zeros((0, 6))
+    watching = monitor(one, nowhere, nowhere, 6, 3)
+    return program, k.workspace(1, 0), state, stretch, _UNRECORDED, watching
 
 
 _NOTHING = np.zeros(0)
@@ -186,6 +216,8 @@ _UNRECORDED = recorder(0, 0, 0)
 class _Code(NamedTuple):
     integrate: Any
     record: Any
+    watch: Any
+    recorder: int  # address of record
     engine: Any  # keeps the code
 
 
@@ -215,7 +247,8 @@ def _load() -> _Code:
         engine.add_object_file(llvm.ObjectFileRef.from_data(part))
     engine.finalize_object()
     kind = ctypes.CFUNCTYPE(ctypes.c_int64, *(ctypes.c_int64,) * 4)
-    return _Code(*(kind(engine.get_function_address(name)) for name in ENTRIES), engine)
+    addresses = [engine.get_function_address(name) for name in ENTRIES]
+    return _Code(*map(kind, addresses), addresses[1], engine)
 
 
 def _compile() -> list[bytes]:

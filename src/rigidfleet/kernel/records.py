@@ -1,10 +1,10 @@
-"""What the integrator and the recorder are told, and what they write: arrays, as in `program`.
+"""What the integrator, the recorder and the monitor are told, and what they write: arrays, as in `program`.
 
 K samples, N agents, m edges.
 """
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,90 @@ FINISHED, PAUSED, COLLAPSED = range(3)
 STATE, TRIAL, ATOL = 7, 8, 9
 #: What counts as the last error where there was none, or a smaller one: its logarithm.
 LEAST_ERROR = math.log(1e-4)
+#: Quantities of a `Monitor`; the less each of its `worst` is, the worse: greatest values are kept with the other sign.
+(
+    SEPARATION, LOST, SEPARATION_BELOW, CLEARANCE, STANDING, FLYING, GEOFENCE, LOWEST, HIGHEST, SPEED, THRUST,
+    THRUST_MARGIN, ACCELERATION, CONSTRAINT_FORCE, TENSION, CONSTRAINT,
+) = range(16)  # fmt: skip
+#: Bytes of a trail, about: the integrator pauses when it is full.
+_TRAIL = 1 << 20
+
+
+class Trail(NamedTuple):
+    """Steps as they were flown, for whoever looks between samples; no rows, and none are kept.
+
+    ``points`` are the Bernstein coefficients of the continuous extension, a polynomial of fourth degree.
+    """
+
+    clock: Array  # (S, 2) start [s], length [s]
+    points: Array  # (S, 5, n)
+    gauge: Array  # (S, 3N + 2m) at the end, see `gauge.read_gauge`
+
+
+def trail(states: int, agents: int, edges: int) -> Trail:
+    """Allocate a trail of a megabyte, or of two steps."""
+    row = 5 * states + 3 * agents + 2 * edges
+    rows = max(2, _TRAIL // (8 * row))
+    shapes = (rows, 2), (rows, 5, states), (rows, 3 * agents + 2 * edges)
+    return Trail(*(np.empty(shape) for shape in shapes))
+
+
+_NO_TRAIL = Trail(np.zeros((0, 2)), np.zeros((0, 5, 0)), np.zeros((0, 0)))
+
+
+class Monitor(NamedTuple):
+    """Worst values of a phase, in continuous time, and what they are looked for with; see `kernel.monitor`."""
+
+    worst: Array  # (16,) by quantity; infinity where there is none yet
+    when: Array  # (16,) [s]
+    who: NDArray[np.int64]  # (16, 2) agents; agent and obstacle; agents of an edge; -1: nobody
+    sign: Array  # (1,) of the greatest tension
+    radius: Array  # (N,) [m]
+    left: NDArray[np.bool_]  # (N,) who is judged: not lost
+    standing: NDArray[np.int64]  # (N,) whether an agent stands on an obstacle since the start
+    low: Array  # (N, 3) clearance, time and obstacle of who may be landing; infinity: nobody
+    pad: float  # who is so near an obstacle may stand on it [m]
+    boxes: Array  # (B, 6) corners of obstacles; of the ground infinite
+    fence: Array  # (F, 6) corners of the geofence, if there is one
+    pairs: NDArray[np.int64]  # (P, 2) whose separation is watched
+    struck: NDArray[np.int64]  # (P', 2) of a lost agent and one that is left
+    columns: NDArray[np.int64]  # (P'', 2) who may be below one another
+    flags: NDArray[np.int64]  # (4,) see `monitor.watch`
+    recorder: int  # address of the recorder, with its arguments: `time` and `states` to evaluate at
+    stretch: int
+    record: int
+    time: Array  # (1,) [s]
+    states: Array  # (1, n)
+    gauge: Array  # (3, 3N + 2m) forces before the first step, and at points within
+    places: Array  # (N, 5, 3) where agents are over a step: control points [m]
+    curve: Array  # (5, 3) of one pair
+    work: Array  # (40, 11) polynomials
+    pieces: Array  # (40, 17) curves
+    basis: Array  # (5, 5)
+    poses: Array  # (5, 15) attitude, centre and its velocity at knots
+    knots: Array  # (5, 3)
+    room: Array  # (3, 10)
+
+
+def monitor(
+    radius: Array, boxes: Array, fence: Array, states: int, gauge: int, **given: Any
+) -> Monitor:
+    """Begin to watch: nothing is known yet, and no pairs are listed but those ``given`` among the fields."""
+    n, none = len(radius), np.zeros((0, 2), dtype=np.int64)
+    count = CONSTRAINT + 1
+    fields: dict[str, Any] = {
+        "worst": np.full(count, np.inf), "when": np.zeros(count), "sign": np.zeros(1),
+        "who": np.full((count, 2), -1), "radius": radius, "boxes": boxes, "fence": fence,
+        "left": np.ones(n, dtype=np.bool_), "standing": np.zeros(n, dtype=np.int64),
+        "low": np.full((n, 3), np.inf), "pad": 0.0, "pairs": none, "struck": none, "columns": none,
+        "flags": np.zeros(4, dtype=np.int64),
+        "recorder": 0, "stretch": 0, "record": 0, "time": np.zeros(1),
+        "states": np.zeros((1, states)), "gauge": np.zeros((3, gauge)),
+        "places": np.zeros((n, 5, 3)), "curve": np.zeros((5, 3)), "work": np.zeros((40, 11)),
+        "pieces": np.zeros((40, 17)), "basis": np.zeros((5, 5)), "poses": np.zeros((5, 15)),
+        "knots": np.zeros((5, 3)), "room": np.zeros((3, 10)),
+    }  # fmt: skip
+    return Monitor(**(fields | given))
 
 
 class Integrator(NamedTuple):
@@ -25,21 +109,33 @@ class Integrator(NamedTuple):
     y: Array  # (n,) state at `clock[0]`
     K: Array  # (10, n padded to eights) stages, K[0] the derivative at y; y, trial, tolerance
     clock: Array  # (3,) t [s], next step h [s], logarithm of the last error
-    count: NDArray[np.int64]  # (4,) evaluations, accepted, rejected, samples written
+    count: NDArray[
+        np.int64
+    ]  # (5,) evaluations, accepted, rejected, samples written, steps in the trail
     rtol: float
+    trail: Trail
 
 
-def integrator(y: Array, t: float, *, rtol: float, atol: Array, step: float = 1e-3) -> Integrator:
+def integrator(
+    y: Array,
+    t: float,
+    *,
+    rtol: float,
+    atol: Array,
+    step: float = 1e-3,
+    trail: Trail = _NO_TRAIL,
+) -> Integrator:
     """Start an integration from state ``y`` (n,) at time t [s] with a first step [s] to try.
 
-    ``atol`` (n,) is the absolute tolerance of each state, ``rtol`` the relative one of all.
+    ``atol`` (n,) is the absolute tolerance of each state, ``rtol`` the relative one of all. Steps go
+    into the ``trail``.
     """
     n = len(y)
     K = zeros(10, padded(n))
     K[ATOL] = 1.0
     K[ATOL, :n] = atol
-    clock, count = np.array([t, step, LEAST_ERROR]), np.zeros(4, dtype=np.int64)
-    return Integrator(y.copy(), K, clock, count, rtol)
+    clock, count = np.array([t, step, LEAST_ERROR]), np.zeros(5, dtype=np.int64)
+    return Integrator(y.copy(), K, clock, count, rtol, trail)
 
 
 class Stretch(NamedTuple):

@@ -111,9 +111,18 @@ def _advance(k, stage, a, h):
             )
 
 
+@inlined
+def _keep_step(t, h, p, w, state):
+    """Flights of an ensemble leave no trail."""
+
+
 #: As `flight.integrate`; p is a `Straight`, w is not used, arrays hold lanes.
 integrate = compiled_copy(
-    flight.integrate, "integrate_straight", closed_loop=_closed_loop, advance=_advance
+    flight.integrate,
+    "integrate_straight",
+    closed_loop=_closed_loop,
+    advance=_advance,
+    keep_step=_keep_step,
 )
 
 

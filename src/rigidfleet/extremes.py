@@ -1,0 +1,251 @@
+"""The extremes of a flight in continuous time: the kernel's monitor, from phase to phase.
+
+`rigidfleet.kernel.monitor` says how they are found. Here is what it watches: all pairs of a small fleet; of a large
+one those near each other, listed anew before any other pair can have come as near.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigidfleet import attitude as att
+from rigidfleet import geometry
+from rigidfleet.kernel import native, records
+from rigidfleet.kernel.program import Array, Program, Workspace
+from rigidfleet.mission import Box, Ground, Mission
+from rigidfleet.result import PAD, Extremum, PhaseRecord
+
+Ints = NDArray[np.int64]
+
+#: Agents up to which all pairs are watched.
+_FEW = 40
+#: Pairs are listed so far beyond those that matter, in parts of the agents' spacing.
+_SPARE = 0.5
+#: A step of a large fleet is cut into so many pieces at most.
+_PIECES = 4096
+#: What the monitor keeps with the other sign.
+_GREATEST = frozenset(
+    ("geofence", "highest", "speed", "thrust", "thrust_margin", "acceleration", "constraint_force", "tension",
+     "constraint")
+)  # fmt: skip
+#: Quantities by name; the two clearances apart belong to the whole flight.
+_NAMES = {
+    "separation": records.SEPARATION,
+    "lost": records.LOST,
+    "separation_below": records.SEPARATION_BELOW,
+    "clearance": records.CLEARANCE,
+    "geofence": records.GEOFENCE,
+    "lowest": records.LOWEST,
+    "highest": records.HIGHEST,
+    "speed": records.SPEED,
+    "thrust": records.THRUST,
+    "thrust_margin": records.THRUST_MARGIN,
+    "acceleration": records.ACCELERATION,
+    "constraint_force": records.CONSTRAINT_FORCE,
+    "tension": records.TENSION,
+    "constraint": records.CONSTRAINT,
+}
+_OF_FLIGHT = {"clearance_start": records.STANDING, "clearance_flight": records.FLYING}
+
+_KNOTS = np.linspace(0.0, 1.0, 5)
+
+
+def _bernstein(x: Array) -> Array:
+    """Bernstein polynomials (..., 5) of fourth degree at x (...)."""
+    return np.stack([math.comb(4, k) * x**k * (1.0 - x) ** (4 - k) for k in range(5)], axis=-1)
+
+
+_FROM_KNOTS = np.linalg.inv(_bernstein(_KNOTS))
+
+
+class Extremes:
+    """Watches a flight, and tells what the worst of each phase was."""
+
+    def __init__(self, mission: Mission) -> None:
+        agents, limits = mission.agents, mission.limits
+        self.n = mission.n_agents
+        self.radius = np.array(agents.radius, dtype=float)
+        self.boxes = np.array([_corners(thing) for thing in mission.obstacles]).reshape(-1, 6)
+        fence = limits.geofence
+        self.fence = np.array([] if fence is None else [*fence.min, *fence.max]).reshape(-1, 6)
+        self.stacks = self.n <= _FEW or limits.separation_below is not None
+        count = records.CONSTRAINT + 1
+        self.worst, self.when = np.full(count, np.inf), np.zeros(count)
+        self.who, self.sign = np.full((count, 2), -1), np.zeros(1)
+        self.left = np.ones(self.n, dtype=np.bool_)
+        self.low = np.full((self.n, 3), np.inf)
+        start, _ = geometry.rooms(np.array(agents.position), self.radius, mission.obstacles)
+        self.standing = (start <= PAD).astype(np.int64)
+        self.pairs = self.columns = self.struck = np.zeros((0, 2), dtype=np.int64)
+        self.spare, self.moved = np.zeros(2), np.zeros(2)
+        self._list_all()
+
+    def begin(self, state: records.Integrator) -> None:
+        """Watch what an integrator leaves in its trail from now on."""
+        self._watch(state.trail)
+
+    def _watch(self, trail: records.Trail) -> None:
+        found = records.monitor(
+            self.radius, self.boxes, self.fence, trail.points.shape[2], trail.gauge.shape[1],
+            worst=self.worst, when=self.when, who=self.who, sign=self.sign, left=self.left,
+            standing=self.standing, low=self.low, pad=PAD, pairs=self.pairs, columns=self.columns,
+            struck=self.struck,
+        )  # fmt: skip
+        self.monitor = native.Watch(found)
+
+    def lose(self, lost: NDArray[np.bool_]) -> None:
+        """Go on without the vehicles ``lost`` (N,), which the others must not be hit by."""
+        self.left[:] = ~lost
+        gone, left = np.flatnonzero(lost), np.flatnonzero(~lost)
+        struck = np.stack(np.meshgrid(gone, left, indexing="ij"), axis=-1).reshape(-1, 2)
+        self.struck = np.ascontiguousarray(struck)
+        self._list_all()
+
+    def take(
+        self, program: Program, work: Workspace, state: records.Integrator, *, last: bool
+    ) -> None:
+        """Take the steps in the trail into account; the ``last`` ones of a stretch are not followed by others."""
+        flags, rows = self.monitor.monitor.flags, int(state.count[4])
+        flags[:3] = flags[3], rows, 2 if last else 1
+        if self.n > _FEW:
+            for row in range(int(flags[3]), rows):
+                self._step(program, work, state, row)
+            flags = self.monitor.monitor.flags
+            flags[:3] = rows, rows, 2 if last else 1
+        self.monitor(program, work, state)
+
+    def phase(self) -> dict[str, Extremum]:
+        """Extremes of the phase that ends, by name; the next one begins."""
+        found = {
+            name: x for name, k in _NAMES.items() if (x := self._extremum(name, k)) is not None
+        }
+        self.worst[list(_NAMES.values())] = np.inf
+        return found
+
+    def flight(self, phases: Sequence[PhaseRecord]) -> None:
+        """Tell the phases of a flight that has ended its clearance in flight, and of who stands on an obstacle."""
+        ends = np.where(self.left & (self.standing == 0), self.low[:, 0], np.inf)
+        i = int(ends.argmin())
+        found = {name: self._extremum(name, k) for name, k in _OF_FLIGHT.items()}
+        if ends[i] < np.inf:
+            t, b = self.low[i, 1:]
+            found["clearance_end"] = Extremum(float(ends[i]), float(t), i, int(b))
+        for name, x in found.items():
+            if x is not None:
+                last = [p for p in phases if p.t_start <= x.time] or phases
+                last[-1].extremes[name] = x
+
+    def _extremum(self, name: str, k: int) -> Extremum | None:
+        value = float(self.worst[k])
+        if not math.isfinite(value):
+            return None
+        if name in _GREATEST:
+            value = -value
+        if name == "tension":
+            value *= float(self.sign[0])
+        return Extremum(value, float(self.when[k]), *map(int, self.who[k]))
+
+    # -- large fleets ---------------------------------------------------------------------------------
+
+    def _list_all(self) -> None:
+        """List all pairs, if they are few; else none yet."""
+        self.moved[:] = np.inf
+        if self.n <= _FEW:
+            i, j = np.triu_indices(self.n, 1)
+            both = self.left[i] & self.left[j]
+            self.pairs = np.stack([i[both], j[both]], axis=1)
+            self.columns = self.pairs
+
+    def _step(self, program: Program, work: Workspace, state: records.Integrator, row: int) -> None:
+        """Watch the distances of one step, in pieces so short that the pairs listed are all that matter."""
+        t, h = state.trail.clock[row]
+        points = state.trail.points[row]
+        moved = self._moves(program, points)
+        if (self.moved + moved > self.spare).any():
+            self._list(program, points[0])
+        short = float((moved[: 1 + self.stacks] / self.spare[: 1 + self.stacks]).max())
+        pieces = min(_PIECES, max(1, math.ceil(short)))
+        flags = self.monitor.monitor.flags
+        if pieces == 1:
+            self.moved += moved
+            flags[:3] = row, row + 1, 0
+            self.monitor(program, work, state)
+            return
+        gauge = state.trail.gauge[:0]
+        for k in range(pieces):
+            part = _FROM_KNOTS @ (_bernstein((k + _KNOTS) / pieces) @ points)
+            moved = self._moves(program, part)
+            if (self.moved + moved > self.spare).any():
+                self._list(program, part[0])
+                flags = self.monitor.monitor.flags
+            self.moved += moved
+            clock = np.array([[t + k * h / pieces, h / pieces]])
+            trail = records.Trail(clock, np.ascontiguousarray(part[None]), gauge)
+            flags[:3] = 0, 1, 0
+            self.monitor(program, work, state._replace(trail=trail))
+
+    def _list(self, program: Program, y: Array) -> None:
+        """List the pairs that are near each other at a state (n,), or below one another."""
+        from scipy.spatial import KDTree
+
+        who = np.flatnonzero(self.left)
+        x = y[: 3 * self.n].reshape(-1, 3)[who]
+        widest = 2.0 * float(self.radius[who].max())
+        tree = KDTree(x, balanced_tree=False, compact_nodes=False)
+        near, j = tree.query(x, k=2)
+        rooms = near[:, 1] - self.radius[who] - self.radius[who[j[:, 1]]]
+        spare = _SPARE * max(float(np.median(near[:, 1])), 1e-6)
+        least = min(float(rooms.min()), float(self.worst[records.SEPARATION]))
+        pairs = who[tree.query_pairs(least + widest + spare, output_type="ndarray")]
+        self.spare[:], self.moved[:] = spare, 0.0
+        self.pairs = np.ascontiguousarray(np.sort(pairs, axis=1))
+        if self.stacks:
+            if program.body_formulation:
+                q = y[6 * self.n + len(program.graph.edges) :][:4]
+                x = x @ att.dcm_from_quaternion(q / np.linalg.norm(q))
+            flat = KDTree(x[:, :2], balanced_tree=False, compact_nodes=False)
+            columns = who[flat.query_pairs(widest + spare, output_type="ndarray")]
+            self.columns = np.ascontiguousarray(np.sort(columns, axis=1))
+        flags = self.monitor.monitor.flags.copy()
+        before = self.monitor.monitor
+        self.monitor = native.Watch(
+            before._replace(pairs=self.pairs, columns=self.columns, flags=flags)
+        )
+
+    def _moves(self, program: Program, points: Array) -> Array:
+        """By how much [m] over a step (5, n) any two agents' distance may change, and that as seen from above (2,).
+
+        With r_i' = any rigid motion + u_i, the rate of a distance is at most |u_i| + |u_j|, and |u_i| no more than
+        its greatest Bernstein coefficient. The rotation taken is the one that leaves least. Seen from above, all
+        that tilts counts besides.
+        """
+        x = points[:, : 3 * self.n].reshape(5, -1, 3)[:, self.left]
+        x = x - x.mean(axis=1, keepdims=True)
+        middle, way = 0.5 * (x[0] + x[4]), x[4] - x[0]
+        inertia = np.einsum("ia,ia->", middle, middle) * np.eye(3) - middle.T @ middle
+        spin = np.linalg.pinv(inertia, 1e-9, hermitian=True) @ np.cross(middle, way).sum(axis=0)
+        rise = 4.0 * np.diff(x, axis=0)
+        share = np.arange(5)[:, None, None] / 4.0
+        rate = np.zeros_like(x)
+        rate[1:] += share[1:] * rise
+        rate[:-1] += (1.0 - share[:-1]) * rise
+        rate -= np.cross(spin, x)
+        moved = 2.0 * math.sqrt(float(np.einsum("kia,kia->ki", rate, rate).max()))
+        tilt = math.hypot(spin[0], spin[1])
+        if program.body_formulation:
+            q = points[:, 6 * self.n + len(program.graph.edges) :][:, :4]
+            rates = 4.0 * np.linalg.norm(np.diff(q, axis=0), axis=1).max()
+            tilt = 2.0 * float(rates) / max(float(np.linalg.norm(q, axis=1).min()) - 0.1, 0.1)
+        widest = 2.0 * math.sqrt(float(np.einsum("kia,kia->ki", x, x).max()))
+        return np.array([moved, moved + tilt * widest if self.stacks else 0.0])
+
+
+def _corners(thing: Box | Ground) -> list[float]:
+    """Corners of an obstacle (6,); the ground is a box without sides and bottom."""
+    if thing.kind == "ground":
+        return [-math.inf] * 3 + [math.inf, math.inf, thing.height]
+    return [*thing.min, *thing.max]

@@ -1,0 +1,34 @@
+"""What the closed loop has left in its workspace, as the numbers that limits are held against."""
+
+import math
+
+from rigidfleet.kernel.compiled import compiled
+
+
+@compiled
+def read_gauge(p, w, values):
+    """Thrust, acceleration and constraint force of each agent; tension and constraint of each edge; into (3N + 2m,)."""
+    vehicles, edges = p.vehicles, p.graph.edges
+    n, m = vehicles.m.shape[0], edges.shape[0]
+    noisy = p.disturbance.noise_r.shape[0] > 0
+    for i in range(n):
+        thrust, a, f = 0.0, 0.0, 0.0
+        for q in range(3):
+            force = w.f_u[i, q] + w.f_C[i, q]
+            thrust += force * force
+            a += w.a[i, q] * w.a[i, q]
+            f += w.f_C[i, q] * w.f_C[i, q]
+        thrust = math.sqrt(thrust)
+        if vehicles.saturate:
+            thrust = min(thrust, vehicles.thrust_limit[i])
+        values[i], values[n + i], values[2 * n + i] = thrust, math.sqrt(a), math.sqrt(f)
+    for k in range(m):
+        values[3 * n + k] = -w.multiplier[k]
+        c = w.c[k]
+        if noisy:  # what is true, not what is measured
+            c = 0.0
+            for q in range(3):
+                d = w.r[edges[k, 0], q] - w.r[edges[k, 1], q]
+                c += d * d
+            c = math.sqrt(c) - w.d[k]
+        values[3 * n + m + k] = c

@@ -1,0 +1,687 @@
+"""What a flight comes to between samples: extremes over the steps of the integrator, in continuous time.
+
+The integrator leaves every step in its `Trail`: the continuous extension of each state, a polynomial of fourth
+degree, by its Bernstein coefficients (control points), and the forces at the step's end.
+
+Distances miss nothing. A polynomial in Bernstein form lies in the convex hull of its coefficients, so the least of them
+bounds it from below. A step whose bound is no worse than the worst found so far is done; else it is halved, by de
+Casteljau's algorithm, until the bound of each piece is within `CLOSE` of a value that was attained. Squared distances
+of two agents are polynomials of eighth degree. The distance to a box is convex: it is nowhere below its tangent plane,
+so the least coefficient along the plane's normal bounds it. With the body formulation, positions in the world are the
+quartics through five points of each step, of steps cut so short that they are within 1e-9 of the formation's size.
+
+Forces are known where the law is evaluated: at the end of each step, and on both sides of a jump. Where an end is
+higher than both its neighbours, the law is evaluated in between, until the parabola through three of its values has no
+more to give.
+"""
+
+import math
+
+import numpy as np
+
+from rigidfleet.kernel.compiled import call_recorder, compiled
+from rigidfleet.kernel.gauge import read_gauge
+from rigidfleet.kernel.pointers import by_address
+from rigidfleet.kernel.records import (
+    ACCELERATION,
+    CLEARANCE,
+    CONSTRAINT,
+    CONSTRAINT_FORCE,
+    FLYING,
+    GEOFENCE,
+    HIGHEST,
+    LOST,
+    LOWEST,
+    SEPARATION,
+    SEPARATION_BELOW,
+    SPEED,
+    STANDING,
+    TENSION,
+    THRUST,
+    THRUST_MARGIN,
+)
+
+#: A least value is found to this much [m, m/s], and a greatest force to so much of it.
+CLOSE, _CLOSE_FORCE = 1e-9, 1e-7
+#: Pieces of a step are no shorter than this.
+_SHORTEST = 2.0**-32
+#: So many pieces of a step are looked at, at most.
+_MOST = 10_000
+#: Of numbers so much of their size is rounding.
+_ROUNDING = 4e-15
+#: In the body formulation a step is cut into pieces that turn no further than this [rad].
+_TURN = 0.1
+#: Evaluations that a greatest force is looked for with, at most.
+_TRIES = 12
+
+_KNOTS = np.linspace(0.0, 1.0, 5)
+#: Bernstein polynomials (5, 5) at the knots, and from values there to coefficients.
+_BERNSTEIN = np.array(
+    [[math.comb(4, k) * x**k * (1 - x) ** (4 - k) for k in range(5)] for x in _KNOTS]
+)
+_FROM_KNOTS = np.linalg.inv(_BERNSTEIN)
+#: Coefficients of a square: C(4, i) C(4, j) / C(8, i + j).
+_SQUARE = np.array(
+    [[math.comb(4, i) * math.comb(4, j) / math.comb(8, i + j) for j in range(5)] for i in range(5)]
+)
+
+
+@compiled
+def lowest(work, degree, floor):
+    """Least value of a polynomial over [0, 1], if below ``floor``, and where; else ``floor`` and -1.
+
+    ``work[0]`` holds its Bernstein coefficients. The value is within `CLOSE` of the least and rounding; of squares,
+    of eighth degree, the root is. After `_MOST` pieces, which no flight has been seen to need, the bound itself
+    counts: too bad rather than too good.
+    """
+    best, at, top, pieces, size = floor, -1.0, 0, 0, 0.0
+    start, width = degree + 1, degree + 2
+    work[0, start], work[0, width] = 0.0, 1.0
+    for k in range(degree + 1):
+        size = max(size, abs(work[0, k]))
+    while top >= 0:
+        piece, pieces = work[top], pieces + 1
+        bound, value = piece[0], piece[0]
+        for k in range(1, degree + 1):
+            bound = min(bound, piece[k])
+        if piece[degree] < value:
+            value = piece[degree]
+            if value < best:
+                best, at = value, piece[start] + piece[width]
+        elif value < best:
+            best, at = value, piece[start]
+        close = CLOSE
+        if degree == 8:
+            close = CLOSE * (2.0 * math.sqrt(min(abs(best), size)) + CLOSE)
+        close = max(close, _ROUNDING * size)
+        if bound < best - close and pieces > _MOST:
+            best, at = bound, piece[start]
+        if not bound < best - close or piece[width] <= _SHORTEST:
+            top -= 1
+            continue
+        left = work[top + 1]
+        half = 0.5 * piece[width]
+        left[start], left[width] = piece[start], half
+        piece[start] += half
+        piece[width] = half
+        left[0] = piece[0]
+        for k in range(1, degree + 1):
+            for i in range(degree + 1 - k):
+                piece[i] = 0.5 * (piece[i] + piece[i + 1])
+            left[k] = piece[0]
+        top += 1
+    return best, at
+
+
+@compiled
+def halve(piece, left):
+    """Halve a curve of control points (15,), start and width: its first half into ``left``, its second stays."""
+    half = 0.5 * piece[16]
+    left[15], left[16] = piece[15], half
+    piece[15] += half
+    piece[16] = half
+    for q in range(3):
+        left[q] = piece[q]
+    for k in range(1, 5):
+        for i in range(5 - k):
+            for q in range(3):
+                piece[3 * i + q] = 0.5 * (piece[3 * i + q] + piece[3 * i + 3 + q])
+        for q in range(3):
+            left[3 * k + q] = piece[q]
+
+
+@compiled
+def square(points, sign, out):
+    """Bernstein coefficients (9,) of sign |r|^2 of a curve with control points (5, 3)."""
+    for k in range(9):
+        out[k] = 0.0
+    for i in range(5):
+        for j in range(5):
+            dot = 0.0
+            for q in range(3):
+                dot += points[i, q] * points[j, q]
+            out[i + j] += sign * _SQUARE[i, j] * dot
+
+
+@compiled
+def length_at(points, x):
+    """|r| of a curve with control points (5, 3) at x."""
+    rest, total = 1.0 - x, 0.0
+    for q in range(3):
+        value = rest**4 * points[0, q] + x**4 * points[4, q]
+        value += 4.0 * x * rest * (rest * rest * points[1, q] + x * x * points[3, q])
+        value += 6.0 * x * x * rest * rest * points[2, q]
+        total += value * value
+    return math.sqrt(total)
+
+
+@compiled
+def shortest(points, floor, work):
+    """Least |r| of a curve with control points (5, 3), if below ``floor``, and where; else ``floor`` and -1."""
+    best, at = floor, -1.0
+    start, middle, along = 0.0, 0.0, math.inf
+    for q in range(3):
+        start += points[0, q] * points[0, q]
+        middle += points[2, q] * points[2, q]
+    for k in range(5):
+        dot = 0.0
+        for q in range(3):
+            dot += points[2, q] * points[k, q]
+        along = min(along, dot)
+    start, middle = math.sqrt(start), math.sqrt(middle)
+    if start < best:
+        best, at = start, 0.0
+    if middle > 0.0 and not along < best * middle:
+        return best, at
+    square(points, 1.0, work[0])
+    _, found = lowest(work, 8, best * best)
+    return (length_at(points, found), found) if found >= 0.0 else (best, at)
+
+
+@compiled
+def from_box(x, y, z, box, normal):
+    """Signed distance of a point from a box (6,), negative inside, and a normal of a plane that supports it there."""
+    inside, face = -math.inf, 0
+    outside = 0.0
+    for q in range(3):
+        r = x if q == 0 else y if q == 1 else z
+        below, above = box[q] - r, r - box[3 + q]
+        beyond = max(below, above)
+        if beyond > inside:
+            inside, face = beyond, q
+        out = max(beyond, 0.0)
+        outside += out * out
+        normal[q] = -out if below > above else out
+    if outside > 0.0:
+        outside = math.sqrt(outside)
+        for q in range(3):
+            normal[q] /= outside
+        return outside
+    r = x if face == 0 else y if face == 1 else z
+    for q in range(3):
+        normal[q] = 0.0
+    normal[face] = -1.0 if box[face] - r > r - box[3 + face] else 1.0
+    return inside
+
+
+@compiled
+def nearest_box(points, box, floor, pieces, normal):
+    """Least distance of a curve with control points (5, 3) from a box, if below ``floor``, and where."""
+    best, at, top, count, close = floor, -1.0, 0, 0, CLOSE
+    for k in range(5):
+        for q in range(3):
+            pieces[0, 3 * k + q] = points[k, q]
+            close = max(close, _ROUNDING * abs(points[k, q]))
+    pieces[0, 15], pieces[0, 16] = 0.0, 1.0
+    while top >= 0:
+        piece, count = pieces[top], count + 1
+        for k in (0, 4):
+            distance = from_box(piece[3 * k], piece[3 * k + 1], piece[3 * k + 2], box, normal)
+            if distance < best:
+                best, at = distance, piece[15] + (piece[16] if k == 4 else 0.0)
+        # The tangent plane at any point will do: the middle control point is near the curve.
+        bound = from_box(piece[6], piece[7], piece[8], box, normal)
+        least = 0.0
+        for k in range(5):
+            along = 0.0
+            for q in range(3):
+                along += normal[q] * (piece[3 * k + q] - piece[6 + q])
+            least = min(least, along)
+        bound += least
+        if bound < best - close and count > _MOST:
+            best, at = bound, piece[15]
+        if not bound < best - close or piece[16] <= _SHORTEST:
+            top -= 1
+            continue
+        halve(piece, pieces[top + 1])
+        top += 1
+    return best, at
+
+
+@compiled
+def lowest_overlap(points, reach, floor, pieces):
+    """Least |z| of a curve with control points (5, 3) while it is within ``reach`` of the z axis, and where."""
+    best, at, top, count, close = floor, -1.0, 0, 0, CLOSE
+    for k in range(5):
+        for q in range(3):
+            pieces[0, 3 * k + q] = points[k, q]
+            close = max(close, _ROUNDING * abs(points[k, q]))
+    pieces[0, 15], pieces[0, 16] = 0.0, 1.0
+    while top >= 0:
+        piece, count = pieces[top], count + 1
+        for k in (0, 4):
+            x, y, z = piece[3 * k], piece[3 * k + 1], abs(piece[3 * k + 2])
+            if x * x + y * y <= reach * reach and z < best:
+                best, at = z, piece[15] + (piece[16] if k == 4 else 0.0)
+        x, y = piece[6], piece[7]
+        along, low, high = math.inf, math.inf, -math.inf
+        for k in range(5):
+            along = min(along, x * piece[3 * k] + y * piece[3 * k + 1])
+            low, high = min(low, piece[3 * k + 2]), max(high, piece[3 * k + 2])
+        apart = along > reach * math.sqrt(x * x + y * y)
+        bound = max(0.0, low, -high)
+        if apart or not bound < best - close:
+            top -= 1
+        elif (
+            piece[16] <= _SHORTEST or count > _MOST
+        ):  # at the brink of an overlap: it counts as one
+            best, at = bound, piece[15]
+            top -= 1
+        else:
+            halve(piece, pieces[top + 1])
+            top += 1
+    return best, at
+
+
+@compiled
+def take(kind, key, t, first, second, monitor):
+    """Keep what is worse than the worst of its kind; the less ``key``, the worse."""
+    if key < monitor.worst[kind]:
+        monitor.worst[kind] = key
+        monitor.when[kind] = t
+        monitor.who[kind, 0], monitor.who[kind, 1] = first, second
+
+
+# -- where agents are --------------------------------------------------------------------------------
+
+
+@compiled
+def angle_of(points, p):
+    """By how much [rad] the body frame turns over a step, at most."""
+    n = p.vehicles.m.shape[0]
+    q = 6 * n + p.graph.edges.shape[0]
+    fastest, size = 0.0, math.inf
+    for k in range(5):
+        here, rate = 0.0, 0.0
+        for s in range(4):
+            here += points[k, q + s] * points[k, q + s]
+            if k < 4:
+                d = 4.0 * (points[k + 1, q + s] - points[k, q + s])
+                rate += d * d
+        fastest, size = max(fastest, rate), min(size, here)
+    return 2.0 * math.sqrt(fastest) / max(math.sqrt(size), 1e-3)
+
+
+@compiled
+def weights(x, out):
+    """Bernstein polynomials (5,) of fourth degree at x."""
+    y = 1.0 - x
+    out[0], out[1], out[2] = y**4, 4.0 * x * y**3, 6.0 * x * x * y * y
+    out[3], out[4] = 4.0 * x**3 * y, x**4
+
+
+@compiled
+def attitudes(points, part, parts, p, monitor):
+    """Attitude, centre and its velocity at five knots of a piece of a step, in the body formulation."""
+    n = p.vehicles.m.shape[0]
+    first = 6 * n + p.graph.edges.shape[0]
+    state = monitor.room[0]
+    for k in range(5):
+        basis, pose = monitor.basis[k], monitor.poses[k]
+        weights((part + _KNOTS[k]) / parts, basis)
+        size = 0.0
+        for s in range(10):
+            state[s] = 0.0
+            for j in range(5):
+                state[s] += basis[j] * points[j, first + s]
+        for s in range(4):
+            size += state[s] * state[s]
+        size = 1.0 / math.sqrt(size)
+        a, b, c, d = state[0] * size, state[1] * size, state[2] * size, state[3] * size
+        # Columns of T^T, body -> world (Eq. 21's quaternion, scalar first).
+        pose[0], pose[1], pose[2] = (
+            1 - 2 * (c * c + d * d),
+            2 * (b * c - a * d),
+            2 * (b * d + a * c),
+        )
+        pose[3], pose[4], pose[5] = (
+            2 * (b * c + a * d),
+            1 - 2 * (b * b + d * d),
+            2 * (c * d - a * b),
+        )
+        pose[6], pose[7], pose[8] = (
+            2 * (b * d - a * c),
+            2 * (c * d + a * b),
+            1 - 2 * (b * b + c * c),
+        )
+        for s in range(6):
+            pose[9 + s] = state[4 + s]
+
+
+@compiled
+def in_world(points, i, moving, p, monitor, out):
+    """Control points (5, 3) of agent i's position in the world, or of its velocity (``moving`` 1)."""
+    n = p.vehicles.m.shape[0]
+    first = 3 * i + 3 * n * moving
+    if not p.body_formulation:
+        for k in range(5):
+            for q in range(3):
+                out[k, q] = points[k, first + q]
+        return
+    at, x = monitor.knots, monitor.room[1]
+    for k in range(5):
+        basis, pose = monitor.basis[k], monitor.poses[k]
+        for q in range(3):
+            x[q] = 0.0
+            for j in range(5):
+                x[q] += basis[j] * points[j, first + q]
+        for q in range(3):
+            at[k, q] = pose[9 + 3 * moving + q]
+            for s in range(3):
+                at[k, q] += pose[3 * q + s] * x[s]
+    for k in range(5):
+        for q in range(3):
+            out[k, q] = 0.0
+            for j in range(5):
+                out[k, q] += _FROM_KNOTS[k, j] * at[j, q]
+
+
+# -- distances ---------------------------------------------------------------------------------------
+
+
+@compiled
+def between(points, i, j, out):
+    """Control points (5, 3) of r_i - r_j, in the axes of the states."""
+    for k in range(5):
+        for q in range(3):
+            out[k, q] = points[k, 3 * i + q] - points[k, 3 * j + q]
+
+
+@compiled
+def watch_pairs(kind, pairs, points, t, h, monitor):
+    """Least room between the surfaces of pairs of agents (P, 2) over a step."""
+    radius, d = monitor.radius, monitor.curve
+    for k in range(pairs.shape[0]):
+        i, j = pairs[k, 0], pairs[k, 1]
+        between(points, i, j, d)
+        radii = radius[i] + radius[j]
+        floor = monitor.worst[kind] + radii
+        value, at = shortest(d, floor, monitor.work)
+        if at >= 0.0:
+            take(kind, value - radii, t + at * h, i, j, monitor)
+
+
+@compiled
+def watch_stacks(t, h, monitor):
+    """Least height between the surfaces of two agents of which one is below the other."""
+    radius, d = monitor.radius, monitor.curve
+    for k in range(monitor.columns.shape[0]):
+        i, j = monitor.columns[k, 0], monitor.columns[k, 1]
+        for s in range(5):
+            for q in range(3):
+                d[s, q] = monitor.places[i, s, q] - monitor.places[j, s, q]
+        radii = radius[i] + radius[j]
+        floor = monitor.worst[SEPARATION_BELOW] + radii
+        value, at = lowest_overlap(d, radii, floor, monitor.pieces)
+        if at >= 0.0:
+            take(SEPARATION_BELOW, value - radii, t + at * h, i, j, monitor)
+
+
+@compiled
+def watch_coordinate(kind, curve, axis, sign, offset, t, h, i, monitor):
+    """Least of sign r[axis] - offset over a curve (5, 3)."""
+    work, bound = monitor.work, math.inf
+    for k in range(5):
+        work[0, k] = sign * curve[k, axis] - offset
+        bound = min(bound, work[0, k])
+    if bound < monitor.worst[kind] - CLOSE:
+        value, at = lowest(work, 4, monitor.worst[kind])
+        if at >= 0.0:
+            take(kind, value, t + at * h, i, -1, monitor)
+
+
+@compiled
+def watch_obstacles(i, curve, t, h, last, monitor):
+    """Room between agent i's surface and obstacles over a piece of a step; ``last`` is its end's.
+
+    Who has not come off an obstacle by more than ``pad`` since the start stands on it. Who is that near is not yet
+    known to fly: it may be landing. What it comes to is kept apart until it is off again.
+    """
+    radius, standing = monitor.radius[i], monitor.standing[i] != 0
+    low, high = monitor.low, math.inf
+    for b in range(monitor.boxes.shape[0]):
+        box = monitor.boxes[b]
+        own = min(low[i, 0], monitor.worst[FLYING]) if not standing else monitor.worst[STANDING]
+        floor = max(own, monitor.worst[CLEARANCE]) + radius
+        value, at = nearest_box(curve, box, floor, monitor.pieces, monitor.room[2])
+        if at >= 0.0:
+            value -= radius
+            take(CLEARANCE, value, t + at * h, i, b, monitor)
+            if standing:
+                take(STANDING, value, t + at * h, i, b, monitor)
+            elif value < low[i, 0]:
+                low[i, 0], low[i, 1], low[i, 2] = value, t + at * h, float(b)
+        if last:
+            end = from_box(curve[4, 0], curve[4, 1], curve[4, 2], box, monitor.room[2]) - radius
+            high = min(high, end)
+    if last and high > monitor.pad:
+        if standing:
+            monitor.standing[i] = 0
+        elif low[i, 0] < math.inf:
+            take(FLYING, low[i, 0], low[i, 1], i, int(low[i, 2]), monitor)
+            low[i, 0] = math.inf
+
+
+@compiled
+def watch_distances(row, p, state, monitor):
+    """Distances and speeds over one step of the trail."""
+    trail = state.trail
+    points, t, h = trail.points[row], trail.clock[row, 0], trail.clock[row, 1]
+    watch_pairs(SEPARATION, monitor.pairs, points, t, h, monitor)
+    watch_pairs(LOST, monitor.struck, points, t, h, monitor)
+    parts = 1
+    if p.body_formulation:
+        parts = int(min(max(1.0, math.ceil(angle_of(points, p) / _TURN)), 1e4))
+    h /= parts
+    for part in range(parts):
+        start = t + part * h
+        if p.body_formulation:
+            attitudes(points, part, parts, p, monitor)
+        for i in range(monitor.left.shape[0]):
+            if not monitor.left[i]:
+                continue
+            curve = monitor.places[i]
+            in_world(points, i, 1, p, monitor, curve)
+            fastest = 0.0
+            for k in range(5):
+                size = 0.0
+                for q in range(3):
+                    size += curve[k, q] * curve[k, q]
+                fastest = max(fastest, size)
+            greatest = -monitor.worst[SPEED]  # -inf at first
+            if not fastest <= greatest * abs(greatest):
+                square(curve, -1.0, monitor.work[0])
+                floor = -greatest * abs(greatest)
+                _, at = lowest(monitor.work, 8, floor)
+                if at >= 0.0:
+                    take(SPEED, -length_at(curve, at), start + at * h, i, -1, monitor)
+            in_world(points, i, 0, p, monitor, curve)
+            watch_coordinate(LOWEST, curve, 2, 1.0, 0.0, start, h, i, monitor)
+            watch_coordinate(HIGHEST, curve, 2, -1.0, 0.0, start, h, i, monitor)
+            for f in range(monitor.fence.shape[0]):
+                for q in range(3):
+                    low, high = monitor.fence[f, q], monitor.fence[f, 3 + q]
+                    watch_coordinate(GEOFENCE, curve, q, 1.0, low, start, h, i, monitor)
+                    watch_coordinate(GEOFENCE, curve, q, -1.0, -high, start, h, i, monitor)
+            if monitor.boxes.shape[0] > 0:
+                watch_obstacles(i, curve, start, h, part == parts - 1, monitor)
+        if monitor.columns.shape[0] > 0:
+            watch_stacks(start, h, monitor)
+
+
+# -- forces ------------------------------------------------------------------------------------------
+
+
+@compiled
+def judge_forces(values, t, p, monitor):
+    """Take what a gauge (3N + 2m,) shows at time t [s]."""
+    n, edges = p.vehicles.m.shape[0], p.graph.edges
+    m = edges.shape[0]
+    for i in range(n):
+        if monitor.left[i]:
+            thrust = values[i]
+            take(THRUST, -thrust, t, i, -1, monitor)
+            take(THRUST_MARGIN, p.vehicles.thrust_limit[i] - thrust, t, i, -1, monitor)
+            take(ACCELERATION, -values[n + i], t, i, -1, monitor)
+            take(CONSTRAINT_FORCE, -values[2 * n + i], t, i, -1, monitor)
+    for k in range(m):
+        pull, c = values[3 * n + k], values[3 * n + m + k]
+        if -abs(pull) < monitor.worst[TENSION]:
+            monitor.sign[0] = 1.0 if pull > 0.0 else -1.0
+        take(TENSION, -abs(pull), t, edges[k, 0], edges[k, 1], monitor)
+        take(CONSTRAINT, -abs(c), t, edges[k, 0], edges[k, 1], monitor)
+
+
+@compiled
+def worst_of(c, p, monitor):
+    """The greatest value found so far of what entry c of a gauge is one of."""
+    n, m = p.vehicles.m.shape[0], p.graph.edges.shape[0]
+    if c < n:
+        limit = p.vehicles.thrust_limit[c]
+        beyond = limit - monitor.worst[THRUST_MARGIN] if limit < math.inf else math.inf
+        return min(-monitor.worst[THRUST], beyond)
+    if c < 2 * n:
+        return -monitor.worst[ACCELERATION]
+    if c < 3 * n:
+        return -monitor.worst[CONSTRAINT_FORCE]
+    return -monitor.worst[TENSION if c < 3 * n + m else CONSTRAINT]
+
+
+@compiled
+def evaluate(t, row, p, w, state, monitor, values):
+    """Forces at time t [s], within a step of the trail, into a gauge."""
+    trail = state.trail
+    x = (t - trail.clock[row, 0]) / trail.clock[row, 1]
+    basis, y = monitor.basis[0], monitor.states[0]
+    weights(min(max(x, 0.0), 1.0), basis)
+    for q in range(y.shape[0]):
+        y[q] = 0.0
+        for k in range(5):
+            y[q] += basis[k] * trail.points[row, k, q]
+    monitor.time[0] = t
+    # The recorder has the law compiled already; without rows to write, it leaves all in the workspace.
+    call_recorder(monitor.recorder, p, w, monitor.stretch, monitor.record)
+    read_gauge(p, w, values)
+    judge_forces(values, t, p, monitor)
+
+
+@compiled
+def refine(c, row, ta, tb, tc, a, b, v, p, w, state, monitor):
+    """Look for the greatest |value| of entry c of a gauge between ta and tc, from its values a, b, v at ta < tb < tc.
+
+    Steps go to the top of the parabola through the three, as long as that is worth more than rounding.
+    """
+    values = monitor.gauge[2]
+    for _ in range(_TRIES):
+        left, right = (b - a) / (tb - ta), (v - b) / (tc - tb)
+        bend = (right - left) / (tc - ta)
+        if not bend < 0.0:
+            return
+        top = 0.5 * (ta + tb) - 0.5 * left / bend
+        gain = -bend * (top - tb) ** 2
+        if b + 2.0 * gain <= worst_of(c, p, monitor) * (1.0 + _CLOSE_FORCE):
+            return
+        short = 1e-3 * (tc - ta)  # a point too near another tells nothing
+        if abs(top - tb) < short:
+            top = tb + short if tc - tb > tb - ta else tb - short
+        evaluate(top, row if top <= end_of(row, state) else row + 1, p, w, state, monitor, values)
+        new = abs(values[c])
+        if new > b:
+            if top > tb:
+                ta, a = tb, b
+            else:
+                tc, v = tb, b
+            tb, b = top, new
+        elif top > tb:
+            tc, v = top, new
+        else:
+            ta, a = top, new
+
+
+@compiled
+def end_of(row, state):
+    """Time [s] at which a step of the trail ends."""
+    return state.trail.clock[row, 0] + state.trail.clock[row, 1]
+
+
+@compiled
+def watch_middle(row, before, after, p, w, state, monitor):
+    """Look into a step that a jump, or the end, leaves without a neighbour."""
+    start, end = state.trail.clock[row, 0], end_of(row, state)
+    middle, values = 0.5 * (start + end), monitor.gauge[1]
+    evaluate(middle, row, p, w, state, monitor, values)
+    for c in range(values.shape[0]):
+        a, b, v = abs(before[c]), abs(values[c]), abs(after[c])
+        if b > a and b > v:
+            refine(c, row, start, middle, end, a, b, v, p, w, state, monitor)
+
+
+@compiled
+def watch_forces(p, w, state, monitor, rows, last):
+    """Forces over the steps of a trail; the ``last`` of a stretch has nobody to wait for."""
+    trail, before = state.trail, monitor.gauge[0]
+    inside = p.graph.solver == 0  # a large formation's solver remembers what it is asked
+    for row in range(rows):
+        new = row > 0 or monitor.flags[3] == 0
+        start, end = trail.clock[row, 0], end_of(row, state)
+        after = trail.gauge[row]
+        a_row = trail.gauge[row - 1] if row > 0 else before
+        if row == 0 and new:
+            if inside:
+                evaluate(start, 0, p, w, state, monitor, before)
+            else:
+                for c in range(before.shape[0]):
+                    before[c] = after[c]
+        if new:
+            judge_forces(after, end, p, monitor)
+        if not inside:
+            continue
+        if row == 0 and new:
+            watch_middle(0, before, after, p, w, state, monitor)
+        if row + 1 < rows:
+            then, until = trail.gauge[row + 1], end_of(row + 1, state)
+            for c in range(after.shape[0]):
+                a, b, v = abs(a_row[c]), abs(after[c]), abs(then[c])
+                if b >= a and b >= v and b > a + v - b:
+                    refine(c, row, start, end, until, a, b, v, p, w, state, monitor)
+        elif last and (row > 0 or not new):
+            watch_middle(row, a_row, after, p, w, state, monitor)
+
+
+# -- all of it ---------------------------------------------------------------------------------------
+
+
+@compiled
+def watch(p, w, state, monitor):
+    """Take the extremes of the steps in a trail.
+
+    Distances are those of the steps from ``monitor.flags[0]`` to before ``flags[1]``. ``flags[2]`` says what comes
+    then: nothing; forces (1), the last step staying in the trail until its neighbour is known; or forces of all, as
+    none follows (2). ``flags[3]`` is 1 where a step has stayed.
+    """
+    p, w, state, monitor = by_address(p), by_address(w), by_address(state), by_address(monitor)
+    trail, flags = state.trail, monitor.flags
+    for row in range(flags[0], flags[1]):
+        watch_distances(row, p, state, monitor)
+    if flags[2] == 0:
+        return 0
+    rows, last = state.count[4], flags[2] == 2
+    watch_forces(p, w, state, monitor, rows, last)
+    if last or rows == 0:
+        flags[3], state.count[4] = 0, 0
+        return 0
+    if rows > 1:
+        copy(trail.gauge[rows - 2 : rows - 1], monitor.gauge)
+        copy(trail.gauge[rows - 1 :], trail.gauge[:1])
+        copy(trail.clock[rows - 1 :], trail.clock[:1])
+        copy(trail.points[rows - 1], trail.points[0])
+    flags[3], state.count[4] = 1, 1
+    return 0
+
+
+@compiled
+def copy(a, out):
+    """Copy as many rows as out has, or a."""
+    for k in range(min(a.shape[0], out.shape[0])):
+        for c in range(a.shape[1]):
+            out[k, c] = a[k, c]

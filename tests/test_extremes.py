@@ -1,0 +1,430 @@
+"""Extremes in continuous time, against the same steps and continuous extension sampled finely."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rigidfleet import extremes as watching
+from rigidfleet import geometry
+from rigidfleet.assess import assess
+from rigidfleet.errors import FlightError
+from rigidfleet.geometry import headroom, rooms
+from rigidfleet.mission import Mission, load_mission
+from rigidfleet.result import Extremum, Result
+from rigidfleet.simulate import FlightInterrupted, simulate
+
+CLOSE = 1e-6
+
+
+class Steps:
+    """Every step of a flight, written down as the integrator leaves it; evaluated by interpolation."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.rows: list[tuple[float, float, np.ndarray]] = []
+        take = watching.Extremes.take
+
+        def spy(extremes: Any, program: Any, work: Any, state: Any, *, last: bool) -> None:
+            seen = int(extremes.monitor.monitor.flags[3])
+            for row in range(seen, int(state.count[4])):
+                t, h = state.trail.clock[row]
+                self.rows.append((t, h, state.trail.points[row].copy()))
+            take(extremes, program, work, state, last=last)
+
+        monkeypatch.setattr(watching.Extremes, "take", spy)
+
+    def positions(self, n: int, spacing: float) -> tuple[np.ndarray, np.ndarray]:
+        """Times (K,) and positions (K, N, 3) of agents in all steps; of the inertial formulation."""
+        times, places = [], []
+        for t, h, points in self.rows:
+            x = np.linspace(0.0, 1.0, max(2, math.ceil(h / spacing) + 1))
+            basis = np.stack([math.comb(4, k) * x**k * (1 - x) ** (4 - k) for k in range(5)], 1)
+            times.append(t + h * x)
+            places.append((basis @ points[:, : 3 * n]).reshape(len(x), n, 3))
+        return np.concatenate(times), np.concatenate(places)
+
+
+def a_flight(rng: np.random.Generator) -> dict[str, Any]:
+    """Vehicles that fly through each other, past each other, into walls and to the ground, or nearly."""
+    n, speed = int(rng.integers(2, 5)), 10.0 ** rng.uniform(-0.5, 1.5)
+    target = rng.uniform(-3, 3, (n, 3)) * 10.0 ** rng.uniform(-2, 0) + [0, 0, 10]
+    direction = rng.standard_normal((n, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    meet = rng.uniform(0.3, 1.2)
+    velocity = speed * direction
+    force = rng.uniform(-4, 4, 3)
+    if rng.random() < 0.3:
+        force = np.zeros(3)
+    position = target - meet * velocity - 0.5 * meet**2 * force
+    low = rng.uniform(-2, 1, 3) + [0, 0, 10]
+    return {
+        "schema_version": 1,
+        "name": "random",
+        "agents": {
+            "mass": 1.0,
+            "radius": float(rng.uniform(0.05, 0.4)),
+            "position": position.tolist(),
+            "velocity": velocity.tolist(),
+        },
+        "obstacles": [
+            {"kind": "box", "name": "wall", "min": low.tolist(), "max": (low + rng.uniform(0.05, 2, 3)).tolist()},
+            {"kind": "ground", "height": float(rng.uniform(4, 8))},
+        ],
+        "limits": {
+            "geofence": {"min": [-20.0, -20.0, 0.0], "max": [20.0, 20.0, 20.0]},
+            "separation_below": 0.1,
+        },
+        "phases": [{"kind": "hold", "control": "open", "until": 1.5, "input_force": force.tolist()}],
+        "integrator": {"rtol": float(10.0 ** rng.uniform(-9, -3))},
+        "output_step": float(rng.choice([0.05, 0.5])),
+    }  # fmt: skip
+
+
+def sampled(mission: Mission, r: np.ndarray) -> dict[str, np.ndarray]:
+    """Each distance (K,) at positions (K, N, 3), as `Extremum.value` counts them."""
+    radius = np.array(mission.agents.radius)
+    i, j = np.triu_indices(len(radius), 1)
+    apart = np.linalg.norm(r[:, i] - r[:, j], axis=2) - radius[i] - radius[j]
+    fence = mission.limits.geofence
+    assert fence is not None
+    beyond = np.maximum(np.array(fence.min) - r, r - np.array(fence.max))
+    return {
+        "separation": apart.min(axis=1),
+        "clearance": rooms(r, radius, mission.obstacles)[0].min(axis=1),
+        "separation_below": headroom(r, radius)[0],
+        "geofence": -beyond.max(axis=(1, 2)),
+        "lowest": r[..., 2].min(axis=1),
+        "highest": -r[..., 2].max(axis=1),
+    }
+
+
+def agrees(mission: Mission, result: Result, steps: Steps, spacing: float) -> int:
+    """Assert that extremes are those of finely sampled steps; how many flights of these two touch something."""
+    times, r = steps.positions(result.n_agents, spacing)
+    (phase,) = result.phases
+    for name, values in sampled(mission, r).items():
+        k = int(values.argmin())
+        sign = -1.0 if name in ("geofence", "highest") else 1.0
+        if not np.isfinite(values[k]):
+            # Nobody is below another at any sample: at most for less than a sample.
+            assert name == "separation_below"
+            continue
+        x = phase.extremes[name]
+        least = sign * x.value
+        # No sample is worse; and what is said to be reached is reached close to where it is said to be.
+        assert least <= values[k] + CLOSE, (name, x, values[k], times[k])
+        if name == "separation_below":
+            continue  # it jumps where an overlap begins: judged by the others of this test
+        near = np.abs(times - x.time) <= 2.0 * spacing
+        rate = np.abs(np.diff(values)).max() if len(values) > 1 else 0.0
+        assert least >= values[near].min() - rate - CLOSE, (name, x, values[near].min())
+    verdict = assess(result)
+    failed = {f.check for f in verdict.findings if not f.passed}
+    touched = 0
+    for name in ("separation", "clearance"):
+        least = sampled(mission, r)[name].min()
+        if abs(least) > CLOSE:
+            assert (name in failed) == (least < 0), (name, least, verdict.summary)
+            touched += least < 0
+    return touched
+
+
+def test_random_flights_are_judged_by_what_happens_between_samples(monkeypatch):
+    """Of random flights that touch or graze, none passes that touches, and none fails that does not."""
+    rng, touched = np.random.default_rng(1), 0
+    for _ in range(60):
+        mission = Mission.from_dict(a_flight(rng))
+        with monkeypatch.context() as patch:
+            steps = Steps(patch)
+            result = simulate(mission)
+        touched += agrees(mission, result, steps, 1e-4)
+    assert 20 < touched < 100
+
+
+@pytest.mark.long
+def test_two_thousand_random_flights_are_judged_by_what_happens_between_samples(monkeypatch):
+    """As above, 2,000 of them, against samples every 1e-5 s."""
+    rng, touched = np.random.default_rng(2), 0
+    for _ in range(2000):
+        mission = Mission.from_dict(a_flight(rng))
+        with monkeypatch.context() as patch:
+            steps = Steps(patch)
+            result = simulate(mission)
+        touched += agrees(mission, result, steps, 1e-5)
+    assert 700 < touched < 3500
+
+
+# -- forces, large fleets, formulations
+
+
+def forces(result: Result) -> dict[str, float]:
+    """Greatest forces, speeds and constraint errors at samples."""
+    length = np.linalg.norm
+    return {
+        "thrust": result.thrust.max(),
+        "speed": length(result.velocity, axis=2).max(),
+        "acceleration": length(result.acceleration, axis=2).max(),
+        "constraint_force": length(result.constraint_force, axis=2).max(),
+        "tension": np.nanmax(np.abs(result.multiplier)),
+        "constraint": np.nanmax(np.abs(result.constraint)),
+    }
+
+
+def greatest(result: Result, name: str) -> float:
+    return max(abs(p.extremes[name].value) for p in result.phases if name in p.extremes)
+
+
+def changed(name: str, **changes: Any) -> Mission:
+    data = load_mission(name).to_dict()
+    for key, value in changes.items():
+        data[key] = data.get(key, {}) | value if isinstance(value, dict) else value
+    return Mission.from_dict(data)
+
+
+def test_forces_between_samples_are_found():
+    """What gusts and noise make of forces is told to 1e-5 of it, whatever is recorded."""
+    mission = changed("windy-passage", output_step=0.5)
+    result, fine = simulate(mission), forces(simulate(changed("windy-passage", output_step=0.002)))
+    assert forces(result)["thrust"] < 0.99 * fine["thrust"]
+    for name, value in fine.items():
+        every = [p.extremes[name] for p in result.phases if name in p.extremes]
+        x = max(every, key=lambda x: abs(x.value))
+        assert abs(x.value) >= value * (1.0 - 1e-9)
+        near = simulate(mission, times=x.time + np.linspace(-5e-3, 5e-3, 2001))
+        assert forces(near)[name] == pytest.approx(abs(x.value), rel=1e-5)
+
+
+@pytest.mark.parametrize("step", [0.05, 1.0])
+def test_a_thrust_limit_is_held_between_samples(step):
+    """A limit between the greatest thrust and that of the samples is passed."""
+    mission = changed("windy-passage", output_step=step, agents={"thrust_limit": 11.8})
+    result = simulate(mission)
+    assert result.thrust.max() < 11.8
+    verdict = assess(result)
+    assert {f.check for f in verdict.findings if not f.passed} == {"thrust"}
+    assert verdict.worst["thrust"].value == pytest.approx(11.92, abs=0.01)
+
+
+def a_crowd(formulation: str) -> Mission:
+    """Vehicles that cross each other's ways, with nothing that holds them together; and a turn."""
+    rng = np.random.default_rng(5)
+    n = 60
+    start = rng.uniform(-6, 6, (n, 3)) + [0, 0, 30]
+    slots = rng.permutation(
+        np.stack(np.meshgrid([0, 2, 4, 6], [0, 2, 4], range(0, 10, 2)), -1).reshape(-1, 3)
+    )
+    return Mission.from_dict(
+        {
+            "schema_version": 1,
+            "name": "crowd",
+            "formulation": formulation,
+            "agents": {"mass": 1.0, "radius": 0.05, "position": start.tolist()},
+            "formations": {"grid": {"slots": slots.tolist(), "edges": []}},
+            "obstacles": [{"kind": "box", "min": [8, -1, 20], "max": [9, 1, 40]}],
+            "limits": {"separation_below": 0.2},
+            "phases": [
+                {"kind": "establish", "formation": "grid", "duration": 4.0, "control": "slots"},
+                {"kind": "turn", "roll_deg": 40.0, "pitch_deg": 20.0, "yaw_deg": 90.0, "duration": 3.0},
+            ],
+            "output_step": 0.5,
+        }
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("formulation", ["inertial", "body"])
+def test_pairs_of_a_large_fleet_that_are_not_listed_are_not_the_nearest(formulation, monkeypatch):
+    """Watching the pairs near each other finds what watching all of them does, and what fine samples show."""
+    mission = a_crowd(formulation)
+    some = simulate(mission)
+    monkeypatch.setattr(watching, "_FEW", 1000)
+    every = simulate(mission)
+    fine = simulate(Mission.from_dict(mission.to_dict() | {"output_step": 0.002}))
+    for a, b in zip(some.phases, every.phases, strict=True):
+        assert a.extremes.keys() == b.extremes.keys()
+        for name, x in a.extremes.items():
+            assert x.value == pytest.approx(b.extremes[name].value, abs=1e-8), name
+    worst = assess(fine).worst
+    for name in ("separation", "clearance", "speed"):
+        found = assess(some).worst[name]
+        assert found.value == pytest.approx(worst[name].value, abs=1e-8)
+        assert found.when == pytest.approx(worst[name].when, abs=2e-3)
+    below = geometry.headroom(fine.position, mission.agents.radius)[0].min()
+    stacks = [p.extremes.get("separation_below") for p in some.phases]
+    least = min(x.value for x in stacks if x is not None)
+    assert below - 0.02 < least < below + CLOSE
+
+
+@pytest.mark.parametrize("name", ["cube-waypoint", "narrow-passage"])
+def test_both_formulations_come_to_the_same(name):
+    """Positions as polynomials in world and in body axes have the same extremes."""
+    a, b = (simulate(changed(name, formulation=f)) for f in ("inertial", "body"))
+    for p, q in zip(a.phases, b.phases, strict=True):
+        for key in ("separation", "clearance", "lowest", "highest", "speed", "thrust"):
+            if key in p.extremes:
+                assert p.extremes[key].value == pytest.approx(q.extremes[key].value, abs=1e-6), key
+
+
+def test_extremes_do_not_depend_on_what_is_recorded():
+    """Times to record and output steps change no extreme by a bit."""
+    found = [
+        [p.extremes for p in simulate(mission, times=times).phases]
+        for mission, times in (
+            (load_mission("cube-waypoint"), None),
+            (changed("cube-waypoint", output_step=3.0), None),
+            (load_mission("cube-waypoint"), [0.0, 1.0]),
+        )
+    ]
+    assert found[0] == found[1] == found[2]
+
+
+def two(**tables: Any) -> Mission:
+    """The shortest flight that collides: two vehicles meet at 30 m/s, 0.1 m apart."""
+    agents = {
+        "mass": 1.0, "radius": 0.25, "position": [[-15.375, 0, 10], [15.375, 0.1, 10]],
+        "velocity": [[15, 0, 0], [-15, 0, 0]],
+    }  # fmt: skip
+    agents |= tables.pop("agents", {})
+    hold = {"kind": "hold", "control": "open", "until": 3.0}
+    data = {"schema_version": 1, "name": "meet", "agents": agents, "phases": [hold]}
+    return Mission.from_dict(data | tables)
+
+
+def test_two_that_meet_between_samples_collide():
+    """The closed form of two that fly straight past each other: 0.1 m between centres at 1.025 s."""
+    result = simulate(two())
+    x = result.phases[0].extremes["separation"]
+    assert x.value == pytest.approx(-0.4, abs=1e-8)
+    assert x.time == pytest.approx(15.375 / 15, abs=1e-5)
+    assert result.separation.min() == x.value
+    assert not assess(result).passed
+
+
+def test_a_flight_that_is_interrupted_or_fails_is_watched_to_its_end():
+    """What has flown before a flight ends is judged like any other."""
+
+    def stop(progress: Any) -> None:
+        if progress.t > 1.2:
+            raise KeyboardInterrupt
+
+    def buzz(t: float, r: Any, v: Any) -> Any:
+        return np.full_like(r, 1e-3 * math.sin(1e3 * t) if t < 1.5 else math.nan)
+
+    mission = two(integrator={"rtol": 1e-12, "atol": 1e-14})
+    with pytest.raises(FlightError) as failed:
+        simulate(mission, force=buzz)
+    assert failed.value.result is not None
+    x = failed.value.result.phases[0].extremes["separation"]
+    assert x.value == pytest.approx(-0.4, abs=1e-4)
+    with pytest.raises(FlightInterrupted) as caught:
+        simulate(mission, force=buzz, progress=stop)
+    assert caught.value.result.phases[0].extremes["separation"] == x
+    singular = simulate(load_mission("line-singular"))
+    assert not singular.complete
+    assert greatest(singular, "tension") >= forces(singular)["tension"]
+
+
+def test_a_controller_and_saturation_are_watched():
+    """Steps between the instants of a user's controller count, and thrust as it is cut off."""
+    mission = changed("single-waypoint", agents={"thrust_limit": 10.2, "saturate": True})
+    result = simulate(
+        mission, controller=lambda o: 1.1 * o.masses[:, None] * [0.0, 0.0, o.gravity], rate=5.0
+    )
+    assert greatest(result, "thrust") == pytest.approx(10.2, abs=1e-9)
+    assert greatest(result, "speed") >= forces(result)["speed"] - 1e-9
+
+
+# -- what the verdict makes of them
+
+
+def test_the_peak_of_unequal_limits_is_told_with_what_comes_nearest_to_one():
+    """22 N of 30 N are the greatest thrust, 10.8 N of 11 N the nearest to a limit; both are said."""
+    agents = {
+        "mass": [2.2, 1.1], "thrust_limit": [30.0, 11.0], "velocity": [[0, 0, 0], [0, 0, 0]]
+    }  # fmt: skip
+    verdict = assess(simulate(two(agents=agents)))
+    found = {f.check: f for f in verdict.findings}
+    assert (found["thrust_peak"].worst, found["thrust_peak"].who) == (2.2 * 9.81, "agent 1")
+    assert (found["thrust"].worst, found["thrust"].limit) == (pytest.approx(1.1 * 9.81), 11.0)
+    assert verdict.worst["thrust"].value == 2.2 * 9.81
+    assert (
+        "thrust peaks at 21.6 N (agent 1), agent 2 comes nearest to its limit, at 10.8 N of 11 N"
+        in verdict.summary
+    )
+
+
+def above_ground(path: list[float], **tables: Any) -> Any:
+    """Verdict on one vehicle that is carried through heights [m] above the ground, a second each."""
+    phases = [
+        {"kind": "fly", "position": [0, 0, z + 0.25], "duration": 4.0} for z in path[1:]
+    ]  # fmt: skip
+    one = {"mass": 1.0, "radius": 0.25, "position": [[0, 0, path[0] + 0.25]]}
+    data = {"schema_version": 1, "name": "hop", "agents": one, "phases": phases}
+    ground = [{"kind": "ground", "height": 0.0}]
+    return assess(simulate(Mission.from_dict(data | {"obstacles": ground} | tables)))
+
+
+def test_what_a_flight_starts_and_lands_on_is_told_apart():
+    """A vehicle that starts 5 cm above the ground and lands 3 cm above it was 1 m away in between."""
+    verdict = above_ground([0.05, 2.0, 1.0, 2.0, 0.03])
+    assert verdict.passed
+    found = {f.check: f.worst for f in verdict.findings}
+    assert found["clearance_start"] == pytest.approx(0.05, abs=1e-9)
+    assert found["clearance_end"] == pytest.approx(0.03, abs=1e-3)
+    assert 0.09 < found["clearance"] < 0.2  # where it comes off, and before it has landed
+    assert "0.05 m above what they start on" in verdict.summary
+
+
+def test_contact_at_the_start_is_no_collision():
+    """A vehicle that stands on the ground passes, not one that touches it on its way, nor one that ends below it."""
+    assert above_ground([0.0, 2.0]).passed
+    assert not above_ground([1.0, -0.05, 1.0]).passed
+    assert not above_ground([1.0, -0.05]).passed
+    assert not above_ground([-0.05, 1.0]).passed
+
+
+@pytest.mark.parametrize(
+    ("what", "words"),
+    [
+        (lambda r: r.separation.__setitem__(slice(None), 9.0), "separation"),
+        (lambda r: r.distance.__iadd__(0.1), "distance"),
+        (lambda r: r.thrust.__imul__(0.5), "thrust"),
+        (lambda r: r.phases[0].extremes.update(speed=Extremum(0.0, 1.0, 0, -1)), "speed"),
+        (lambda r: r.phases[0].extremes.update(separation=Extremum(9.0, 1.0, 0, 1)), "separation"),
+    ],
+)
+def test_a_record_that_contradicts_its_own_samples_fails(what, words):
+    """Whoever writes better values into a record than its positions and forces have does not pass."""
+    result = simulate(load_mission("establish-triangle"))
+    assert assess(result).passed
+    what(result)
+    verdict = assess(result)
+    failed = [f for f in verdict.findings if not f.passed]
+    assert [f.check for f in failed] == ["record"]
+    assert words in failed[0].message
+
+
+def test_positions_count_and_not_what_is_stored_beside_them():
+    """Vehicles moved into each other collide, whatever separation the record states."""
+    result = simulate(load_mission("establish-triangle"))
+    result.position[50, 1] = result.position[50, 0]
+    failed = {f.check for f in assess(result).findings if not f.passed}
+    assert {"separation", "record"} <= failed
+
+
+def test_extremes_are_kept_in_the_file(tmp_path):
+    """A result that is saved and loaded has the same extremes, to the bit."""
+    result = simulate(load_mission("establish-triangle"))
+    result.save(tmp_path / "a.nc")
+    again = Result.load(tmp_path / "a.nc")
+    assert [p.extremes for p in again.phases] == [p.extremes for p in result.phases]
+    assert again.phases[0].extremes
+
+
+def test_a_record_without_extremes_says_so():
+    """What is judged at samples alone is noted, with how far they are apart."""
+    result = simulate(load_mission("establish-triangle"))
+    assert assess(result).notes == []
+    result.phases[1].extremes = {}
+    (note,) = assess(result).notes
+    assert "judged at samples alone, up to 0.01 s apart" in note
