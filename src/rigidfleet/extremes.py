@@ -175,7 +175,7 @@ class Extremes:
             flags[:3] = row, row + 1, 0
             self.monitor(program, work, state)
             return
-        gauge = state.trail.gauge[:0]
+        gauge, none = state.trail.gauge[:0], state.trail.start
         for k in range(pieces):
             part = _FROM_KNOTS @ (_bernstein((k + _KNOTS) / pieces) @ points)
             moved = self._moves(program, part)
@@ -184,7 +184,7 @@ class Extremes:
                 flags = self.monitor.monitor.flags
             self.moved += moved
             clock = np.array([[t + k * h / pieces, h / pieces]])
-            trail = records.Trail(clock, np.ascontiguousarray(part[None]), gauge)
+            trail = records.Trail(clock, np.ascontiguousarray(part[None]), gauge, none)
             flags[:3] = 0, 1, 0
             self.monitor(program, work, state._replace(trail=trail))
 

@@ -227,6 +227,12 @@ def advance(k, stage, a, h):
 
 
 @compiled
+def keep_start(p, w, state):
+    """Leave the forces behind a jump in the trail."""
+    read_gauge(p, w, state.trail.start)
+
+
+@compiled
 def keep_step(t, h, p, w, state):
     """Leave a step in the trail: its continuous extension by Bernstein coefficients, and the forces at its end.
 
@@ -285,6 +291,8 @@ def integrate(p, w, state, t_end, fresh, times, samples, max_steps):
         while stage < 7:
             advance(k, stage, _A, h)
             closed_loop(t + _C[stage] * h, trial, K[stage], p, w)
+            if stage == 0 and room > 0:
+                keep_start(p, w, state)
             count[0] += 1
             stage += 1
         squares = spread(0.0)

@@ -627,11 +627,9 @@ def watch_forces(p, w, state, monitor, rows, last):
         after = trail.gauge[row]
         a_row = trail.gauge[row - 1] if row > 0 else before
         if row == 0 and new:
-            if inside:
-                evaluate(start, 0, p, w, state, monitor, before)
-            else:
-                for c in range(before.shape[0]):
-                    before[c] = after[c]
+            for c in range(before.shape[0]):
+                before[c] = trail.start[c]
+            judge_forces(before, start, p, monitor)
         if new:
             judge_forces(after, end, p, monitor)
         if not inside:

@@ -35,17 +35,19 @@ class Trail(NamedTuple):
     clock: Array  # (S, 2) start [s], length [s]
     points: Array  # (S, 5, n)
     gauge: Array  # (S, 3N + 2m) at the end, see `gauge.read_gauge`
+    start: Array  # (3N + 2m,) at the start of the first step, behind a jump
 
 
 def trail(states: int, agents: int, edges: int) -> Trail:
     """Allocate a trail of a megabyte, or of two steps."""
     row = 5 * states + 3 * agents + 2 * edges
     rows = max(2, _TRAIL // (8 * row))
-    shapes = (rows, 2), (rows, 5, states), (rows, 3 * agents + 2 * edges)
+    gauge = 3 * agents + 2 * edges
+    shapes = (rows, 2), (rows, 5, states), (rows, gauge), (gauge,)
     return Trail(*(np.empty(shape) for shape in shapes))
 
 
-_NO_TRAIL = Trail(np.zeros((0, 2)), np.zeros((0, 5, 0)), np.zeros((0, 0)))
+_NO_TRAIL = Trail(np.zeros((0, 2)), np.zeros((0, 5, 0)), np.zeros((0, 0)), np.zeros(0))
 
 
 class Monitor(NamedTuple):

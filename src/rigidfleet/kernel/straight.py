@@ -116,12 +116,18 @@ def _keep_step(t, h, p, w, state):
     """Flights of an ensemble leave no trail."""
 
 
+@inlined
+def _keep_start(p, w, state):
+    """Nor any forces."""
+
+
 #: As `flight.integrate`; p is a `Straight`, w is not used, arrays hold lanes.
 integrate = compiled_copy(
     flight.integrate,
     "integrate_straight",
     closed_loop=_closed_loop,
     advance=_advance,
+    keep_start=_keep_start,
     keep_step=_keep_step,
 )
 
