@@ -19,7 +19,7 @@ from typing import Any
 import llvmlite.binding as llvm
 import pytest
 
-from rigidfleet.kernel import cache_directory, compiled, is_compiled, native
+from rigidfleet.kernel import cache, cache_directory, compiled, is_compiled, native
 
 PLANTED, OWN = 666, 1
 SOMEONE = 12345
@@ -45,10 +45,7 @@ def answer() -> int:
 
 def forget() -> None:
     """Let the next warning be the first."""
-    if hasattr(native, "told"):
-        native.told.clear()
-    else:
-        native.not_kept.cache_clear()
+    native.told.clear()
 
 
 @pytest.fixture
@@ -222,6 +219,29 @@ def test_an_access_list(base, monkeypatch):
     assert base.stat().st_mode & 0o777 == 0o770
     with pytest.warns(RuntimeWarning, match="others can write to"):
         assert answer() == OWN
+
+
+@needs_root
+@pytest.mark.parametrize("which", ["base", "last", "file", "shared"])
+def test_owners_without_a_number(which, base, monkeypatch):
+    """In a container of an ordinary user the machine's root shows as nobody. They may own what leads to the cache, where
+    not everyone can make a folder, but neither the cache nor what is in it."""
+    monkeypatch.setattr(cache, "_unnamed", lambda: SOMEONE)
+    chosen = {"last": place(base), "file": planted(base)}.get(which, base)
+    os.chown(chosen, SOMEONE, -1)
+    if which == "shared":
+        base.parent.chmod(0o1777)
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always")
+        assert answer() == (PLANTED if which == "base" else OWN)
+    assert bool(warned) == (which in {"last", "shared"})
+
+
+def test_users_without_a_number():
+    """Where every user has a number, as outside of containers, nobody is only nobody."""
+    whole = Path("/proc/self/uid_map").read_text().split() == ["0", "0", "4294967295"]
+    nobody = int(Path("/proc/sys/kernel/overflowuid").read_text())
+    assert cache._unnamed() == (None if whole else nobody)
 
 
 @pytest.mark.parametrize("home", ["/dev/null", "", "unknown"])

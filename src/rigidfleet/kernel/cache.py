@@ -77,8 +77,7 @@ def opened(file: str | Path) -> Generator[IO[bytes]]:
         found = os.fstat(stream.fileno())
         if not stat.S_ISREG(found.st_mode):
             raise PermissionError(errno.EACCES, f"{file} is no file")
-        _refuse_foreign(file, found)
-        _refuse_written_by_others(file, found)
+        _refuse(file, found)
         yield stream
 
 
@@ -114,10 +113,10 @@ def not_kept(error: OSError) -> None:
 def _private(folder: Path) -> Path:
     """Return the real path of a folder into which nobody else can put anything; what is missing of it is made.
 
-    Links are followed by hand, from the root down. Each folder on the way belongs to this user or root, and either
-    nobody else can write to it, or its sticky bit keeps others from renaming what is not theirs; the next step is such
-    a folder or link again. So nobody else can change where the way leads, neither before it is used nor after. To the
-    last folder nobody else can write at all: a sticky bit would let them add to it.
+    Links are followed by hand, from the root down, whose owner could do anything anyway. Of each folder on the way
+    either nobody else can write to it, or its sticky bit keeps others from renaming what is not theirs; and what comes
+    next, folder or link, belongs to this user or root. So nobody else can change where the way leads, neither before it
+    is used nor after. To the last folder nobody else can write at all: a sticky bit would let them add to it.
 
     Raises
     ------
@@ -130,15 +129,11 @@ def _private(folder: Path) -> Path:
         folder.mkdir(parents=True, exist_ok=True)
         return folder
     at, rest, links = Path("/"), list(folder.parts[:0:-1]), 0
-    while True:
-        found = os.lstat(at)
-        if not stat.S_ISDIR(found.st_mode):
-            raise NotADirectoryError(errno.ENOTDIR, f"{at} is no folder")
-        _refuse_foreign(at, found)
-        if not (rest and found.st_mode & stat.S_ISVTX):
-            _refuse_written_by_others(at, found)
-        if not rest:
-            return at
+    while rest:
+        here = os.lstat(at)
+        shared = _others_write(at, here)
+        if shared and not here.st_mode & stat.S_ISVTX:
+            raise _open_to_others(at)
         if (step := rest.pop()) == "..":
             at = at.parent
             continue
@@ -149,29 +144,69 @@ def _private(folder: Path) -> Path:
             with suppress(FileExistsError):  # made by another process at this moment
                 os.mkdir(there, 0o700)
             found = os.lstat(there)
+        if not (_own(found) or (found.st_uid == _unnamed() and not shared)):
+            raise _foreign(there)
         if stat.S_ISLNK(found.st_mode):
-            _refuse_foreign(there, found)
             if (links := links + 1) > _LINKS:
                 raise OSError(errno.ELOOP, f"{there} is a link that leads in a circle")
             target = Path(os.readlink(there))
             at = Path("/") if target.is_absolute() else at
             rest += reversed(target.parts[target.is_absolute() :])
-        else:
+        elif stat.S_ISDIR(found.st_mode):
             at = there
+        else:
+            raise NotADirectoryError(errno.ENOTDIR, f"{there} is no folder")
+    _refuse(at, os.lstat(at))
+    return at
 
 
-def _refuse_foreign(path: str | Path, found: os.stat_result) -> None:
-    """Refuse what belongs to neither this user nor root."""
-    if _OWNERS and found.st_uid not in (0, os.geteuid()):
-        raise PermissionError(errno.EACCES, f"{path} belongs to another user")
+def _refuse(path: str | Path, found: os.stat_result) -> None:
+    """Refuse a file, or the last folder, that others have written or can write.
+
+    Raises
+    ------
+    PermissionError
+    """
+    if not _own(found):
+        raise _foreign(path)
+    if _others_write(path, found):
+        raise _open_to_others(path)
 
 
-def _refuse_written_by_others(path: str | Path, found: os.stat_result) -> None:
-    """Refuse what others can write, if only those of a group."""
+def _foreign(path: str | Path) -> OSError:
+    return PermissionError(errno.EACCES, f"{path} belongs to another user")
+
+
+def _open_to_others(path: str | Path) -> OSError:
+    remedy = f"`chmod go-w {shlex.quote(str(path))}`"
+    return PermissionError(errno.EACCES, f"others can write to {path}, which {remedy} ends")
+
+
+def _own(found: os.stat_result) -> bool:
+    """Whether something belongs to this user or to root."""
+    return not _OWNERS or found.st_uid in (0, os.geteuid())
+
+
+@cache
+def _unnamed() -> int | None:
+    """Who all users are that have no number where this process runs, root of the machine among them; None if all have.
+
+    So it is in containers of ordinary users (Apptainer, for one). What such an owner has in a folder that others cannot
+    write, is taken for root's on the way to the last folder, which has to be this user's.
+    """
+    try:
+        first, _, count = Path("/proc/self/uid_map").read_text().split()[:3]
+        nobody = int(Path("/proc/sys/kernel/overflowuid").read_text())
+    except (OSError, ValueError):
+        return None
+    return None if (int(first), int(count)) == (0, 2**32 - 1) else nobody
+
+
+def _others_write(path: str | Path, found: os.stat_result) -> bool:
+    """Whether others can write something, if only those of a group."""
     mode = found.st_mode
-    if _OWNERS and (mode & stat.S_IWOTH or (mode & stat.S_IWGRP and not _own_group(path, found))):
-        why = f"others can write to {path}, which `chmod go-w {shlex.quote(str(path))}` ends"
-        raise PermissionError(errno.EACCES, why)
+    group = mode & stat.S_IWGRP and not _own_group(path, found)
+    return _OWNERS and bool(mode & stat.S_IWOTH or group)
 
 
 def _own_group(path: str | Path, found: os.stat_result) -> bool:
