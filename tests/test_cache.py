@@ -224,7 +224,7 @@ def test_an_access_list(base, monkeypatch):
 @needs_root
 @pytest.mark.parametrize("which", ["base", "last", "file", "shared"])
 def test_owners_without_a_number(which, base, monkeypatch):
-    """In a container of an ordinary user the machine's root shows as nobody. They may own what leads to the cache, where
+    """In a container of an ordinary user the machine's root shows as nobody, who may own what leads to the cache where
     not everyone can make a folder, but neither the cache nor what is in it."""
     monkeypatch.setattr(cache, "_unnamed", lambda: SOMEONE)
     chosen = {"last": place(base), "file": planted(base)}.get(which, base)
