@@ -862,25 +862,48 @@ def test_no_color(capsys, monkeypatch):
         assert ("\x1b[1;31m" in capsys.readouterr().err) is coloured
 
 
-def test_progress_words():
+def test_progress_words(monkeypatch):
     """Progress says the time flown, the speed against real time, the time left and the phase."""
+    monkeypatch.setattr(screen, "perf_counter", lambda: 0.0)
     watch = screen.FlightWatch()
     watch.update(Progress(0.0, 90.0, "WP0", 1.0))
     assert watch._words() == "0.0 of 90 s  WP0"
     watch.update(Progress(30.0, 90.0, "WP3", 3.0))
     assert watch._words() == "30.0 of 90 s  x15  0:04 left  WP3"
-    watch.update(Progress(30.5, 90.0, "WP3", 62.0))
-    assert watch._words() == "30.5 of 90 s  x0.5  1:59 left  WP3"
+    watch.update(Progress(30.5, 90.0, "WP3", 23.0))
+    assert watch._words() == "30.5 of 90 s  x0.03  39:40 left  WP3"
+    watch.update(Progress(90.0, 90.0, "WP3", 24.0))
+    assert watch._words() == "90.0 of 90 s  WP3"
+
+
+def test_progress_of_phases_that_differ(monkeypatch):
+    """A phase flown in no time says nothing of the next one: the time left grows while a flight stands still."""
+    now = 0.0
+    monkeypatch.setattr(screen, "perf_counter", lambda: now)
+    monkeypatch.setattr(screen, "_SELDOM", 1e9)
+    watch = screen.FlightWatch()
+    watch.update(Progress(0.0, 81.0, "take off", 0.0))
+    now = 0.1
+    watch.update(Progress(12.0, 81.0, "sphere", 0.1, planning=True))
+    assert watch._words() == "12.0 of 81 s  sphere  (planning)"
+    now = 4.0
+    assert watch._words() == "12.0 of 81 s  x3.0  0:23 left  sphere  (planning)"
+    now = 10.2  # by now what was flown in no time is long ago
+    assert watch._words() == "12.0 of 81 s  sphere  (planning)"
 
 
 def test_progress_leaves_compiling_out(monkeypatch):
     """The speed is that of flying: time without news, while the kernel compiles, does not count."""
-    clock = iter([0.0, 0.0, 0.1, 12.0, 12.5])
-    monkeypatch.setattr(screen, "perf_counter", lambda: next(clock))
+    now = 0.0
+    monkeypatch.setattr(screen, "perf_counter", lambda: now)
     monkeypatch.setattr(screen, "_SELDOM", 1e9)
     watch = screen.FlightWatch()
     watch.compiling()
     watch.update(Progress(0.0, 90.0, "WP0", 0.1))
+    now = 12.0
     watch.update(Progress(10.0, 90.0, "WP0", 12.0))
-    watch.update(Progress(20.0, 90.0, "WP1", 12.5))
-    assert watch._words() == "20.0 of 90 s  x20  0:04 left  WP1"
+    now = 12.9
+    watch.update(Progress(20.0, 90.0, "WP1", 12.9))
+    now = 13.4
+    watch.update(Progress(24.0, 90.0, "WP1", 13.4))
+    assert watch._words() == "24.0 of 90 s  x10  0:07 left  WP1"

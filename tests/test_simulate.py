@@ -1,6 +1,7 @@
 """Whole flights: phases and switches, the paper's missions, their failures, users' own forces."""
 
 import re
+import time
 from functools import cache
 from itertools import pairwise
 from typing import Any
@@ -187,6 +188,23 @@ def test_progress_is_reported():
     assert len(seen) >= 1
     assert all(p.t_end == 10.0 and p.phase in {"establish 1", "hold 2"} for p in seen)
     assert all(a.t <= b.t and a.wall <= b.wall for a, b in pairwise(seen))
+
+
+def test_progress_of_a_slow_phase_after_a_quick_one():
+    """However quick a phase was, the next one is announced while it is planned, and heard of while it is flown."""
+    seen: list[Progress] = []
+
+    def slow(t, r, v):
+        time.sleep(0.002 if t > 6.0 else 0.0)
+        return 0 * r + np.sin(20.0 * t)
+
+    simulate(
+        a_mission(establish(), {"kind": "hold", "duration": 0.5}), progress=seen.append, force=slow
+    )
+    second = [p for p in seen if p.phase == "hold 2"]
+    assert (second[0].t, second[0].planning) == (6.0, True)
+    assert not any(p.planning for p in second[1:])
+    assert sum(6.0 < p.t < 6.5 for p in second) >= 2
 
 
 def test_all_missions_fly_with_one_compiled_kernel():

@@ -1,5 +1,6 @@
 """Sweeps: what varies, the same rows however they are flown, the store, the summary, the command."""
 
+import io
 import json
 import math
 import os
@@ -16,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rich.console import Console
 from scipy import stats
 
 from rigidfleet import cli, screen
@@ -26,7 +28,7 @@ from rigidfleet.sweep.conduct import SweepProgress
 from rigidfleet.sweep.ends import starts
 from rigidfleet.sweep.engine import GROUP, fly_runs
 from rigidfleet.sweep.figures import over_two, plot
-from rigidfleet.sweep.summary import drivers, rate, summarise
+from rigidfleet.sweep.summary import Example, drivers, rate, summarise
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "gain_study.toml"
 PAIR: dict[str, Any] = {
@@ -634,7 +636,9 @@ def made(n: int = 400, runs: int | None = None) -> Table:
     metrics |= {"thrust": thrust, "separation": 3.0 - 2.0 * codes[:, 1] + 0.1 * codes[:, 0]}
     passed = thrust <= 14.0
     reason = np.where(passed, "", "thrust, speed").astype(object)
-    return Table(found, np.arange(n), passed, reason, reason, codes, metrics, np.full(n, 0.1))
+    return Table(
+        found, np.arange(n), passed, reason, reason.copy(), codes, metrics, np.full(n, 0.1)
+    )
 
 
 def test_wilsons_interval():
@@ -683,6 +687,72 @@ def test_words_have_a_rate_each(tmp_path):
     }
     assert {d.varied for d in found.drivers} == {"agents.mass"}
     assert load(tmp_path)["constraint.solver"].values.tolist() == ["exact", "exact", "pinv", "pinv"]
+
+
+def shown(table: Table, width: int) -> str:
+    """The summary as a terminal of some columns shows it."""
+    text = io.StringIO()
+    Console(width=width, file=text).print(summarise(table))
+    return text.getvalue()
+
+
+def cells(text: str) -> dict[str, list[str]]:
+    """What stands beside each metric."""
+    lines = [line.split() for line in text.split("failed check", maxsplit=1)[0].splitlines()]
+    return {words[0]: words[2:] for words in lines if words and words[0] in METRICS}
+
+
+def everything() -> Table:
+    """A table with every metric, numbers of all sizes and signs, and runs that fail for every kind of reason."""
+    table, n = made(), 400
+    table.detail[:] = [reason and f"{reason}: too much" for reason in table.reason]
+    scale = 10.0 ** np.linspace(-9, 7, n)
+    for k, name in enumerate(METRICS):
+        table.metrics[name] = np.roll(scale, 17 * k) * (-1.0) ** k * 1.2345
+    table.reason[3], table.detail[3] = "mission", "agents.mass = -1.0: must be positive"
+    table.reason[4], table.detail[4] = "error", "ZeroDivisionError: division by zero"
+    return table
+
+
+@pytest.mark.parametrize("width", [60, 80, 100, 1000])
+def test_no_number_is_cut(width):
+    """However narrow the screen, each number shown is whole: two digits of the percentile, or three."""
+    table = everything()
+    found, text = summarise(table), shown(table, width)
+    assert all(len(line) <= width for line in text.splitlines())
+    assert "…" not in text
+    assert set(cells(text)) == set(METRICS)
+    for name, numbers in cells(text).items():
+        assert len(numbers) == 7 if width >= 100 else len(numbers) >= 3
+        those = {3: [0, 3, 6], 5: [0, 2, 3, 4, 6], 7: range(7)}[len(numbers)]
+        percentiles = [found.percentiles[name][k] for k in those]
+        np.testing.assert_allclose([float(x) for x in numbers], percentiles, rtol=0.05)
+
+
+def test_all_percentiles_fit_eighty_columns():
+    """On the usual eighty columns all percentiles are shown, of whatever metrics there are."""
+    table = made()
+    for name in METRICS:
+        table.metrics[name] = np.linspace(1.234e-8, 6.543, 400)
+    assert {len(numbers) for numbers in cells(shown(table, 80)).values()} == {7}
+
+
+def test_reasons_are_explained():
+    """Each reason of failure comes with a run that failed by it first, in words, or with its number alone."""
+    table = everything()
+    found = summarise(table)
+    fails = int(np.flatnonzero(table.reason == "thrust, speed")[0])
+    assert found.examples == {
+        "mission": Example(3, "agents.mass = -1.0: must be positive"),
+        "error": Example(4, "ZeroDivisionError: division by zero"),
+        "thrust": Example(fails, "thrust, speed: too much"),
+        "speed": Example(fails, ""),
+    }
+    text = shown(table, 1000)
+    assert "mission refused" in text
+    assert "run 3: agents.mass = -1.0: must be positive" in text
+    assert "program error" in text
+    assert json.loads(found.json())["examples"]["mission"]["run"] == 3
 
 
 def test_dataset(flown, tmp_path):

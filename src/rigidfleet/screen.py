@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import sys
+from collections import deque
 from collections.abc import Iterable
 from functools import cache
 from io import TextIOWrapper
@@ -29,6 +30,9 @@ _WIDE = 1000
 _SELDOM = 10.0
 #: A flight is heard of several times a second: when not for so long, it compiles [s].
 _SILENCE = 1.0
+#: The speed of a flight is that of the last so many seconds, once there has been one of them: phases differ a
+#: thousandfold, and while one is planned nothing moves.
+_RECENT, _KNOWN = 10.0, 1.0
 COMPILING = "Compiling the flight kernel (once, about 15 s)"
 
 
@@ -193,35 +197,39 @@ class FlightWatch(_Screen):
     def __init__(self) -> None:
         super().__init__()
         self.heard = self.begun
-        self.base: Progress | None = None
-        self.last: Progress | None = None
+        self.recent: deque[Progress] = deque()
 
     def update(self, progress: Progress) -> None:
         """Take note of how far the flight is."""
         now = perf_counter()
-        if self.base is None or (self.cold and now - self.heard > _SILENCE):
-            self.base = progress  # the speed is that of flying, without that of compiling
-        self.last, self.heard = progress, now
+        if self.cold and now - self.heard > _SILENCE:
+            self.recent.clear()  # the speed is that of flying, without that of compiling
+        self.recent.append(progress)
+        self.heard = now
         self.tell(now)
 
     def __rich__(self) -> RenderableType:
-        now = perf_counter()
-        if self.last is None or (self.cold and now - self.heard > _SILENCE):
+        if not self.recent or (self.cold and perf_counter() - self.heard > _SILENCE):
             return self.waiting()
-        return self.bar(self.last.t_end, self.last.t)
+        last = self.recent[-1]
+        return self.bar(last.t_end, last.t)
 
     def _words(self) -> str:
         """Time flown, speed against real time, time left, phase."""
-        if self.base is None or self.last is None:
+        if not self.recent:
             return ""
-        t, t_end = self.last.t, self.last.t_end
-        words = [f"{t:.1f} of {t_end:g} s"]
-        if (wall := self.last.wall - self.base.wall) > 0 and (
-            speed := (t - self.base.t) / wall
-        ) > 0:
-            left = round((t_end - t) / speed)
-            words += [f"x{speed:.{0 if speed >= 10 else 1}f}", f"{left // 60}:{left % 60:02} left"]
-        return "  ".join([*words, self.last.phase])
+        last = self.recent[-1]
+        wall = last.wall + perf_counter() - self.heard  # also while it stands still
+        while len(self.recent) > 1 and self.recent[1].wall <= wall - _RECENT:
+            self.recent.popleft()
+        words = [f"{last.t:.1f} of {last.t_end:g} s"]
+        took, flown = wall - self.recent[0].wall, last.t - self.recent[0].t
+        if took >= _KNOWN and flown > 0.0 and last.t < last.t_end:
+            speed = flown / took
+            left = round((last.t_end - last.t) / speed)
+            digits = ".0f" if speed >= 9.95 else ".1f" if speed >= 0.1 else ".1g"
+            words += [f"x{speed:{digits}}", f"{left // 60}:{left % 60:02} left"]
+        return "  ".join([*words, last.phase, *(["(planning)"] if last.planning else [])])
 
 
 class SweepWatch(_Screen):

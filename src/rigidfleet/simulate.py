@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 #: The integrator returns to Python after so many steps, or fewer: as many as take this long [s of
 #: wall time], often enough for Ctrl-C and progress whatever the size of the formation.
 _STEPS, _PAUSE = 2000, 0.05
+#: So many at the start of a phase, whose steps may take a thousand times as long as those of the one before.
+_FIRST_STEPS = 10
 #: Residual of an iterative solve, as a share of the integrator's tolerance; the relative one within bounds.
 _RESIDUAL, _LEAST, _MOST_RESIDUAL = 1e-3, 1e-13, 1e-8
 #: Below this share of a velocity's tolerance, the error of an acceleration, times a second, is nothing.
@@ -54,6 +56,7 @@ class Progress:
     t_end: float  # mission time at the end, settling phases at their longest [s]
     phase: str
     wall: float  # time taken so far [s]
+    planning: bool = False  # the phase has not begun to be flown
 
 
 @dataclass(frozen=True)
@@ -206,7 +209,7 @@ class Flight:
         self.ending = ""
         self.started = self.reported = clock.perf_counter()
         self.count = np.zeros(3, dtype=np.int64)
-        self.steps = 10  # at a time; more as soon as it is known how long they take
+        self.steps = _FIRST_STEPS  # at a time; more as soon as it is known how long they take
         self.solves: dict[solvers.Method, large.Counts] = {}
 
     def fly(self) -> None:
@@ -220,6 +223,9 @@ class Flight:
     # -- one phase --------------------------------------------------------------------------------
 
     def _phase(self, index: int, phase: Phase) -> None:
+        if index:
+            self._report(self.now.t, phase, planning=True)
+        self.steps = _FIRST_STEPS
         leg = self._begin(index, phase)
         record = PhaseRecord(
             phase.name, phase.kind, phase.control, leg.plan.formation, leg.t, leg.t,
@@ -415,7 +421,7 @@ class Flight:
                 if leg.solver is not None:
                     leg.solver.check()
                 self._watch(leg, last=False)
-                self._report(leg)
+                self._report(leg.t, leg.phase)
                 if status == records.PAUSED and self._stalled(leg):
                     break
         finally:
@@ -563,13 +569,13 @@ class Flight:
         flown = leg.t - self.now.t
         return steps > most_steps(flown)
 
-    def _report(self, leg: Leg) -> None:
+    def _report(self, t: float, phase: Phase, *, planning: bool = False) -> None:
         wall = clock.perf_counter()
-        if self.progress is not None and (wall - self.reported > _REPORT or len(self.pieces) == 0):
+        at_once = planning or len(self.pieces) == 0
+        if self.progress is not None and (at_once or wall - self.reported > _REPORT):
             self.reported = wall
-            self.progress(
-                Progress(leg.t, self.mission.latest_end, leg.phase.name, wall - self.started)
-            )
+            t_end = self.mission.latest_end
+            self.progress(Progress(t, t_end, phase.name, wall - self.started, planning))
 
     # -- the record -------------------------------------------------------------------------------
 

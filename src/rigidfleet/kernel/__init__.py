@@ -6,5 +6,5 @@ everything it reads, a `Workspace` everything it writes. Flights call its machin
 the modules of the physics themselves imports Numba.
 """
 
-from rigidfleet.kernel.native import cache_directory as cache_directory
+from rigidfleet.kernel.cache import cache_directory as cache_directory
 from rigidfleet.kernel.native import is_compiled as is_compiled

@@ -3,8 +3,8 @@
 Numba translates the integrator, the recorder, the monitor and all they call to LLVM's language. What is then called
 from nowhere else may be rearranged at will, and is optimised once, together.
 
-As a program (``python -m rigidfleet.kernel.build``) it writes the code to standard output. Most of the time goes into
-the translation, so that a second process does its half of it meanwhile.
+In a process of its own (`native.build_process`) it writes the code to standard output. Most of the time goes into the
+translation, so that a second process does its half of it meanwhile.
 """
 
 import pickle
@@ -32,7 +32,6 @@ _HOT = (
     "blend_slots", "distance_references", "right_side", "solve_multipliers", "assemble", "cholesky",
     "cholesky_solve", "apply_multipliers",
 )  # fmt: skip
-_NAME = "rigidfleet.kernel.build"
 #: Passes that simplify each function that Numba has translated, before any is put into another.
 _QUICK = ("sroa", "simplify_cfg", "instruction_combine", "simplify_cfg")
 
@@ -195,8 +194,9 @@ class _SecondProcess:
     """
 
     def __init__(self) -> None:
-        command = [sys.executable, "-m", _NAME, "half"]
-        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+        self._process = subprocess.Popen(
+            native.build_process(half=True), cwd=native.ELSEWHERE, stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        )  # fmt: skip
         for function, arguments in _halves()[1].items():
             function._cache = self._Half(self, function.__name__, arguments)
 
@@ -238,16 +238,13 @@ class _SecondProcess:
             """Nothing is kept."""
 
 
-def _main() -> None:
+def main(*, half: bool) -> None:
+    """Write the machine code to standard output; or only what the second process does."""
     output = sys.stdout.buffer
     _translate_only()
-    if sys.argv[1:] == ["half"]:
+    if half:
         pickle.dump(_translated(), output)
         output.flush()
         pickle.dump([_object(*module) for module in pickle.load(sys.stdin.buffer)], output)
         return
     output.write(native.joined(machine_code(_SecondProcess())))
-
-
-if __name__ == "__main__":
-    _main()

@@ -4,17 +4,25 @@ Numba's own cache does not notice a change in a callee that lives in another fil
 folder is keyed here by a digest of all sources of the kernel.
 """
 
-from collections.abc import Callable, Generator
-from contextlib import contextmanager
+import sys
+from collections.abc import Callable
+from pathlib import Path
 from types import FunctionType
 from typing import Any, TypeVar
 
 import numba
 from numba import types
-from numba.core.caching import FunctionCache
+from numba.core.caching import (
+    CompileResultCacheImpl,
+    FunctionCache,
+    IndexDataCacheFile,
+    NullCache,
+    UserProvidedCacheLocator,
+)
+from numba.core.ccallback import CFunc
 from numba.extending import intrinsic
 
-from rigidfleet.kernel.native import cache_directory, not_kept
+from rigidfleet.kernel.cache import cache_directory, not_kept, opened, replacing
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -30,7 +38,7 @@ OPTIONS: dict[str, Any] = {
 }
 #: Where Numba is to optimise nothing (see `rigidfleet.kernel.native`), code is neither kept nor inlined yet.
 _OPTIMISES = numba.config.OPT > 0
-_CACHED = OPTIONS | {"cache": _OPTIMISES, "no_cfunc_wrapper": True}
+_CACHED = OPTIONS | {"no_cfunc_wrapper": True}
 
 
 def compiled(function: F) -> F:
@@ -55,12 +63,9 @@ def compiled_for_c(function: Any, name: str, *, arguments: int, **instead: Any) 
     """
     signature = types.void(*[types.CPointer(types.float64)] * arguments)
     copy = _copy(function, name, instead)
-    with _own_cache():
-        try:
-            made = numba.cfunc(signature, cache=True, nopython=True)(copy)
-        except OSError as error:
-            not_kept(error.strerror)
-            made = numba.cfunc(signature, nopython=True)(copy)
+    made = CFunc(copy, (signature.args, signature.return_type), {}, {"nopython": True})
+    made._cache = _cache(copy)
+    made.compile()
     _STAYING.append(made)
     return made.address
 
@@ -102,33 +107,87 @@ def call_recorder(_context, address, p, w, stretch, record):
     return types.int64(types.int64, p, w, types.int64, types.int64), generate
 
 
-_CACHE = cache_directory()
+class _Place(UserProvidedCacheLocator):
+    """Where a function is kept: among the rest of the kernel."""
+
+    def __init__(self, function: FunctionType) -> None:
+        self._py_file, self._lineno = (
+            function.__code__.co_filename,
+            function.__code__.co_firstlineno,
+        )
+        self._cache_path = str(cache_directory())
+
+    def ensure_cache_path(self) -> None:
+        cache_directory()
 
 
-@contextmanager
-def _own_cache() -> Generator[None]:
-    """Let Numba use the kernel's folder; its other users keep theirs."""
-    before = numba.config.CACHE_DIR
-    numba.config.CACHE_DIR = str(_CACHE)
-    try:
-        yield
-    finally:
-        numba.config.CACHE_DIR = before
+class _Form(CompileResultCacheImpl):
+    """In which form it is kept. Numba itself would ask the environment, and the current folder, for a place."""
+
+    def __init__(self, function: FunctionType) -> None:
+        self._lineno = function.__code__.co_firstlineno
+        self._locator = _Place(function)
+        name = f"{Path(function.__code__.co_filename).stem}.{function.__qualname__}"
+        self._filename_base = self.get_filename_base(name, getattr(sys, "abiflags", ""))
+
+
+class _Files(IndexDataCacheFile):
+    """Numba's files, which are pickles: those that others could have written are not there.
+
+    Between the look at a file and Numba's own nobody else can put another in its place, see `cache_directory`.
+    """
+
+    def _load_index(self) -> Any:
+        try:
+            with opened(self._index_path):
+                return super()._load_index()
+        except OSError:
+            return {}
+
+    def _load_data(self, name: str) -> Any:
+        with opened(self._data_path(name)):
+            return super()._load_data(name)
+
+    def _open_for_write(self, filepath: str) -> Any:
+        return replacing(filepath)
 
 
 class _Cache(FunctionCache):
     """Numba's cache of a function, on a disk that may be full: what cannot be kept is compiled again."""
 
-    def save_overload(self, sig, data):
+    _impl_class = _Form
+
+    def __init__(self, function: FunctionType) -> None:
+        super().__init__(function)
+        base, stamp = self._impl.filename_base, self._impl.locator.get_source_stamp()
+        self._cache_file = _Files(self._cache_path, base, stamp)
+
+    def save_overload(self, sig: Any, data: Any) -> None:
         try:
             super().save_overload(sig, data)
         except OSError as error:
-            not_kept(error.strerror)
+            not_kept(error)
+
+
+class _NoCache(NullCache):
+    """None, and why."""
+
+    def __init__(self, error: OSError) -> None:
+        self._error = error
+
+    def save_overload(self, *_: Any) -> None:
+        not_kept(self._error)
+
+
+def _cache(function: Any) -> _Cache | _NoCache:
+    try:
+        return _Cache(function)
+    except OSError as error:
+        return _NoCache(error)
 
 
 def _cached(function: F, options: dict[str, Any]) -> F:
-    with _own_cache():
-        dispatcher = numba.njit(**options)(function)
-        if options["cache"]:
-            dispatcher._cache = _Cache(function)
+    dispatcher = numba.njit(**options)(function)
+    if _OPTIMISES:
+        dispatcher._cache = _cache(function)
     return dispatcher

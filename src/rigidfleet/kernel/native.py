@@ -11,13 +11,12 @@ import ctypes
 import hashlib
 import os
 import struct
+import subprocess
 import sys
-import tempfile
 import threading
-import warnings
 from collections.abc import Sequence
+from contextlib import suppress
 from functools import cache
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigidfleet.kernel import program as k
+from rigidfleet.kernel.cache import cache_directory, not_kept, opened, replacing, told
 from rigidfleet.kernel.program import Array, Program, Workspace
 from rigidfleet.kernel.records import (
     Integrator,
@@ -219,6 +219,7 @@ class _Code(NamedTuple):
     watch: Any
     recorder: int  # address of record
     engine: Any  # keeps the code
+    unkept: list[bytes] | None  # what other processes cannot find in the cache
 
 
 _loading = threading.Lock()
@@ -235,11 +236,13 @@ def _code() -> _Code:
 
 
 def _load() -> _Code:
-    file = _file()
-    parts = _read(file)
-    if parts is None:
-        parts = _compile()
-        _write(file, parts)
+    if (parts := _read()) is not None:
+        return _linked(parts)
+    parts = _compile()
+    return _linked(parts, None if _write(parts) else parts)
+
+
+def _linked(parts: Sequence[bytes], unkept: list[bytes] | None = None) -> _Code:
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), target_machine())
@@ -248,7 +251,27 @@ def _load() -> _Code:
     engine.finalize_object()
     kind = ctypes.CFUNCTYPE(ctypes.c_int64, *(ctypes.c_int64,) * 4)
     addresses = [engine.get_function_address(name) for name in ENTRIES]
-    return _Code(*map(kind, addresses), addresses[1], engine)
+    return _Code(*map(kind, addresses), addresses[1], engine, unkept)
+
+
+class Inheritance(NamedTuple):
+    """What a process that this one starts is not to compile again, nor to warn of again."""
+
+    code: list[bytes] | None
+    told: bool
+
+
+def bequeath() -> Inheritance:
+    """What this process has that those it starts cannot find in the cache; to be sent to them alone."""
+    return Inheritance(_loaded[0].unkept if _loaded else None, told.is_set())
+
+
+def inherit(given: Inheritance) -> None:
+    """Take over what the process that started this one has."""
+    if given.told:
+        told.set()
+    if given.code is not None:
+        _loaded.append(_linked(given.code, given.code))
 
 
 def _compile() -> list[bytes]:
@@ -257,19 +280,36 @@ def _compile() -> list[bytes]:
     There Numba is told to translate alone: it would optimise each function before all of them together are, and
     take twice as long.
     """
-    import subprocess
-
+    # Nobody reads of the many versions that Numba tries, least of all in colours.
+    quiet = {"NUMBA_OPT": "0", "NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING": "1"}
     if sys.executable:
-        command = [sys.executable, "-m", "rigidfleet.kernel.build"]
-        # Nobody reads of the many versions that Numba tries, least of all in colours.
-        quiet = {"NUMBA_OPT": "0", "NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING": "1"}
-        environment = os.environ | quiet
-        done = subprocess.run(command, env=environment, capture_output=True, check=False)
-        if done.returncode == 0 and (parts := _separated(done.stdout)) is not None:
-            return parts
+        with suppress(OSError):
+            done = subprocess.run(
+                build_process(), env=os.environ | quiet, cwd=ELSEWHERE, capture_output=True, check=False
+            )  # fmt: skip
+            if done.returncode == 0 and (parts := _separated(done.stdout)) is not None:
+                return parts
     from rigidfleet.kernel.build import machine_code
 
     return machine_code()
+
+
+#: Where the processes that compile are: Numba takes settings from a file that it finds where it is.
+ELSEWHERE = os.path.abspath(os.sep)
+_BUILD = "import sys; sys.path[:] = sys.argv[1:]; from rigidfleet.kernel import build; build.main(half={})"
+_FLAGS = {"isolated": "-I", "ignore_environment": "-E", "no_user_site": "-s", "no_site": "-S"}
+
+
+def build_process(*, half: bool = False) -> list[str]:
+    """Command of a process that compiles: it imports what this one would, but nothing from the current folder.
+
+    An interactive Python, or one given its code by ``-c``, has the current folder on its path as ``""``. That goes;
+    any other folder on the path has been asked for. Last comes the one that this package is from.
+    """
+    flags = [flag for name, flag in _FLAGS.items() if getattr(sys.flags, name)]
+    path = [os.path.abspath(folder) for folder in sys.path if isinstance(folder, str) and folder]
+    home = str(Path(__file__).resolve().parents[2])
+    return [sys.executable, *flags, "-P", "-c", _BUILD.format(half), *path, home]
 
 
 def target_machine() -> Any:
@@ -283,7 +323,13 @@ def target_machine() -> Any:
 
 
 def _file() -> Path:
-    """Where the machine code is kept: by kind of machine."""
+    """Where the machine code is kept: by kind of machine.
+
+    Raises
+    ------
+    OSError
+        As `cache_directory` does.
+    """
     machine = f"{llvm.get_process_triple()} {llvm.get_host_cpu_name()} {llvm.get_host_cpu_features().flatten()}"
     return cache_directory() / f"flight-{hashlib.sha256(machine.encode()).hexdigest()[:16]}.o"
 
@@ -307,56 +353,30 @@ def _separated(data: bytes) -> list[bytes] | None:
     return parts
 
 
-def _read(file: Path) -> list[bytes] | None:
+def _read() -> list[bytes] | None:
+    """Machine code that is kept, if there is any that may be run."""
     try:
-        return _separated(file.read_bytes())
+        with opened(_file()) as stream:
+            return _separated(stream.read())
     except OSError:
         return None
 
 
-def _write(file: Path, parts: Sequence[bytes]) -> None:
+def _write(parts: Sequence[bytes]) -> bool:
     """Keep machine code, or warn that it will be compiled again."""
-    part = file.with_suffix(f".{os.getpid()}")
     try:
-        part.write_bytes(joined(parts))
-        part.replace(file)
+        with replacing(_file()) as stream:
+            stream.write(joined(parts))
     except OSError as error:
-        part.unlink(missing_ok=True)
-        not_kept(error.strerror)
-
-
-@cache
-def not_kept(why: str) -> None:
-    """Warn that what is compiled cannot be written to the cache; once, not for each function."""
-    warnings.warn(
-        f"the compiled flight kernel cannot be kept in {cache_directory()}: {why}. It will be compiled again by"
-        " the next process",
-        RuntimeWarning,
-        stacklevel=3,
-    )
+        not_kept(error)
+        return False
+    return True
 
 
 def is_compiled() -> bool:
     """Return whether the machine code is in the cache, so that nothing has to be compiled."""
-    return _file().exists()
-
-
-def cache_directory() -> Path:
-    """Return the folder of the compiled kernel: one per state of its sources, Numba and Python.
-
-    The base is ``NUMBA_CACHE_DIR`` if set, else ``XDG_CACHE_HOME`` or ``~/.cache``; a folder that
-    cannot be written falls back to the system's temporary folder.
-    """
-    digest = hashlib.sha256(f"{version('numba')} {sys.version}".encode())
-    for source in sorted(Path(__file__).parent.glob("*.py")):
-        digest.update(source.read_bytes())
-    base = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME") or "~/.cache"
-    for root in (Path(base).expanduser(), Path(tempfile.gettempdir())):
-        folder = root / "rigidfleet" / f"kernel-{digest.hexdigest()[:16]}"
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError:
-            continue
-        if os.access(folder, os.W_OK):
-            return folder
-    return folder
+    try:
+        with opened(_file()):
+            return True
+    except OSError:
+        return False

@@ -9,7 +9,7 @@ from time import perf_counter
 from rigidfleet.errors import MissionError
 from rigidfleet.sweep.definition import Sweep
 from rigidfleet.sweep.metrics import METRICS, measure
-from rigidfleet.sweep.row import Row, refusal
+from rigidfleet.sweep.row import BROKEN, Row, refusal
 
 #: Runs are flown in groups of so many consecutive ones, the first of which is a multiple of it.
 GROUP = 8
@@ -49,6 +49,6 @@ def _fly(sweep: Sweep, run: int) -> Row:
     except Exception as error:  # one run that breaks must not end a hundred thousand others
         if isinstance(error.__context__ or error.__cause__, KeyboardInterrupt):
             raise  # Ctrl-C, as the compiler gives it back
-        reason, detail = "error", f"{type(error).__name__}: {error}"
+        reason, detail = BROKEN, f"{type(error).__name__}: {error}"
     wall = perf_counter() - begun
     return Row(run, not reason, reason, " ".join(detail.split()), codes, metrics, wall)

@@ -15,7 +15,8 @@ from rigidfleet.errors import RigidfleetError
 from rigidfleet.figures import style as st
 from rigidfleet.figures import write_figure
 from rigidfleet.sweep.dataset import explained
-from rigidfleet.sweep.metrics import METRICS
+from rigidfleet.sweep.metrics import METRICS, readable
+from rigidfleet.sweep.row import called
 from rigidfleet.sweep.store import Table
 from rigidfleet.sweep.summary import drivers, outcomes, rate, summarise, varied
 from rigidfleet.sweep.variation import Geomspace, LogUniform
@@ -108,7 +109,7 @@ def outcome(table: Table) -> Figure | None:
         right.grid(visible=False)
         right.tick_params(bottom=False, labelbottom=False)
         return fig
-    names = [name.replace("_", " ") for name in reasons]
+    names = [called(reason) for reason in reasons]
     bars = right.barh(names, list(reasons.values()), color=FAILED, height=0.65)
     right.bar_label(bars, padding=3, fontsize=8)
     right.grid(visible=False, axis="y")
@@ -313,20 +314,14 @@ def _label(metric: str) -> str:
 
 
 def _unit(metric: str) -> str:
-    return _readable(METRICS[metric].unit)
-
-
-def _readable(unit: str) -> str:
-    """A unit as the other figures write it: m/s^2 for m s-2."""
-    words = {"1": "-", "m s-1": "m/s", "m s-2": "m/s²", "deg s-1": "deg/s"}
-    return words.get(unit, unit)
+    return readable(METRICS[metric].unit)
 
 
 def _axis_label(table: Table, name: str) -> str:
     column = next(c for c in table.sweep.columns if c.name == name)
     unit, _ = explained(table.sweep, column)
     how = {"set": "", "add": ", added", "scale": ", factor"}[column.variation.change]
-    return f"{name}{how} [{_readable(unit)}]"
+    return f"{name}{how} [{readable(unit)}]"
 
 
 def _limits(table: Table) -> dict[str, float]:

@@ -47,6 +47,12 @@ METRICS: dict[str, Metric] = {
 }
 
 
+def readable(unit: str) -> str:
+    """A unit as it is shown: m/s² for m s-2."""
+    words = {"1": "-", "m s-1": "m/s", "m s-2": "m/s²", "deg s-1": "deg/s"}
+    return words.get(unit, unit)
+
+
 def measure(result: Result, verdict: Verdict) -> dict[str, float]:
     """Value of every metric of a flight; NaN where it does not apply."""
     phases = verdict.phases

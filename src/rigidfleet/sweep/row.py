@@ -6,6 +6,10 @@ from dataclasses import dataclass
 
 from rigidfleet.errors import MissionError
 
+#: Reasons that are no checks: what varies makes the mission wrong; the program itself failed.
+REFUSED, BROKEN = "mission", "error"
+_CALLED = {REFUSED: "mission refused", BROKEN: "program error"}
+
 
 @dataclass(frozen=True)
 class Row:
@@ -15,7 +19,7 @@ class Row:
     ----------
     run : its number, from 0
     passed : whether it passed its verdict
-    reason : the checks that failed, with commas; "mission" for one that cannot be flown; else ""
+    reason : the checks that failed, with commas; `REFUSED` or `BROKEN` for one that was not flown; else ""
     detail : the first failure in words
     codes : value of every column of the sweep, as `Variation.code` has it
     metrics : value of each of `METRICS`, NaN where it does not apply
@@ -35,4 +39,9 @@ def refusal(error: MissionError) -> tuple[str, str]:
     """Reason and detail of a run whose mission cannot be."""
     first = error.findings[0]
     words = f"{first.key} = {first.value!r}: {first.problem}"
-    return "mission", " ".join(words.split())
+    return REFUSED, " ".join(words.split())
+
+
+def called(reason: str) -> str:
+    """What a reason is called in tables and figures."""
+    return _CALLED.get(reason, reason.replace("_", " "))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -12,12 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigidfleet.result import plain
-from rigidfleet.sweep.metrics import METRICS
+from rigidfleet.sweep.metrics import METRICS, readable
+from rigidfleet.sweep.row import called
 from rigidfleet.sweep.store import Table
 from rigidfleet.sweep.variation import is_number
 
 if TYPE_CHECKING:
-    from rich.console import RenderableType
+    from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
+    from rich.table import Table as Grid
 
 Floats = NDArray[np.float64]
 
@@ -45,6 +48,14 @@ class Rate:
 
 
 @dataclass(frozen=True)
+class Example:
+    """A run, and why it failed; the words are empty where it fails another check before."""
+
+    run: int
+    detail: str
+
+
+@dataclass(frozen=True)
 class Driver:
     """Spearman's rank correlation of what varies with an outcome, and how likely chance gives as much."""
 
@@ -64,6 +75,7 @@ class Summary:
     runs, flown : runs asked for, and those there are
     success : rate of flights that passed
     reasons : how many runs failed each check; a run may fail several
+    examples : of each reason the first run, and why it failed
     percentiles : of each metric that applies, in the order of `PERCENTILES`
     drivers : rank correlations of every varied number with success and every metric, strongest first
     by_value : success rate at each value of what varies by words
@@ -75,6 +87,7 @@ class Summary:
     flown: int
     success: Rate
     reasons: dict[str, int]
+    examples: dict[str, Example]
     percentiles: dict[str, list[float]]
     drivers: list[Driver]
     by_value: dict[str, dict[str, Rate]]
@@ -119,10 +132,24 @@ def summarise(table: Table) -> Summary:
         len(table.run),
         rate(table.passed),
         dict(Counter(failed).most_common()),
+        _examples(table),
         percentiles,
         drivers(table),
         by_value,
     )
+
+
+def _examples(table: Table) -> dict[str, Example]:
+    """An example of each reason: if there is one, a run that fails by it first, as the words are of the first."""
+    told: dict[str, Example] = {}
+    others: dict[str, Example] = {}
+    for run, reasons, detail in zip(table.run.tolist(), table.reason, table.detail, strict=True):
+        first, *rest = reasons.split(", ")
+        told.setdefault(first, Example(run, detail))
+        for reason in rest:
+            others.setdefault(reason, Example(run, ""))
+    told.pop("", None)
+    return others | told
 
 
 def rate(passed: NDArray[np.bool_]) -> Rate:
@@ -187,38 +214,79 @@ def _differs(values: Floats, relative: float = 0.0, absolute: float = 0.0) -> bo
 # -- in words ----------------------------------------------------------------------------------------
 
 
-def _rendered(summary: Summary) -> RenderableType:
-    from rich.box import SIMPLE_HEAD
-    from rich.console import Group
-    from rich.table import Table as Grid
-    from rich.text import Text
+#: Percentiles that are shown: on a narrow screen the inner ones are left out, so that none is cut.
+_HEADS = dict(
+    zip(PERCENTILES, ("least", "5 %", "25 %", "median", "75 %", "95 %", "most"), strict=True)
+)
+_UNBOUND = 1000  # columns
+#: First, the space between columns goes.
+_CHOICES = (1, PERCENTILES), (0, PERCENTILES), (1, (0, 25, 50, 75, 100)), (1, (0, 50, 100))
 
-    def grid(*columns: str) -> Grid:
-        table = Grid(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold")
-        for k, column in enumerate(columns):
-            table.add_column(column, justify="right" if k else "left", no_wrap=True)
-        return table
+
+def _short(x: float) -> str:
+    """Three digits of a number, or two and a power of ten, in six places and a sign."""
+    size = abs(x)
+    if size >= 99_999.5 or 0.0 < size < 0.01:
+        digits, power = f"{x:.1e}".split("e")
+        return f"{digits}e{int(power)}"
+    return f"{x:.0f}" if size >= 999.5 else f"{x:.3g}"
+
+
+def _grid(*columns: str, words: Sequence[str] = (), space: int = 1) -> Grid:
+    """A table without rows. Where it is too wide, its first column and ``words`` are wrapped, and no number is cut."""
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table as Grid
+
+    table = Grid(box=SIMPLE_HEAD, pad_edge=False, padding=(0, space, 0, 0), header_style="bold")
+    for k, column in enumerate(columns):
+        wraps = k == 0 or column in words
+        table.add_column(
+            column, justify="left" if wraps else "right", no_wrap=not wraps, overflow="fold"
+        )
+    return table
+
+
+class _Percentiles:
+    """The table of metrics, with as many percentiles as there is room for."""
+
+    def __init__(self, summary: Summary) -> None:
+        self.summary = summary
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        unbound = options.update_width(_UNBOUND)
+        for space, shown in _CHOICES:
+            table = _grid("metric", "unit", *(_HEADS[p] for p in shown), space=space)
+            for name, values in self.summary.percentiles.items():
+                cells = (_short(x) for p, x in zip(PERCENTILES, values, strict=True) if p in shown)
+                table.add_row(name, readable(METRICS[name].unit), *cells)
+            if console.measure(table, options=unbound).maximum <= options.max_width:
+                break
+        yield table
+
+
+def _rendered(summary: Summary) -> RenderableType:
+    from rich.console import Group
+    from rich.text import Text
 
     s = summary.success
     head = Text.assemble((summary.name, "bold"), f"  {summary.flown} of {summary.runs} runs")
-    metrics = grid("metric", "unit", *("least", "5 %", "25 %", "median", "75 %", "95 %", "most"))
-    for name, values in summary.percentiles.items():
-        metrics.add_row(name, METRICS[name].unit, *(f"{x:.4g}" for x in values))
-    shown: list[RenderableType] = [head, metrics]
+    shown: list[RenderableType] = [head, _Percentiles(summary)]
     if summary.reasons:
-        reasons = grid("failed check", "runs", "of all")
+        reasons = _grid("failed check", "runs", "of all", "for example", words=("for example",))
         for reason, count in summary.reasons.items():
-            reasons.add_row(reason, str(count), f"{100 * count / s.of:.3g} %")
+            example = summary.examples[reason]
+            words = Text(f"run {example.run}{': ' if example.detail else ''}{example.detail}")
+            reasons.add_row(called(reason), str(count), f"{100 * count / s.of:.3g} %", words)
         shown.append(reasons)
     strong = [d for d in summary.drivers if d.chance < _CHANCE]
     failing = [d for d in strong if d.outcome == "success"]
     if strong:
-        rank = grid("what varies", "outcome", "rank correlation")
+        rank = _grid("what varies", "outcome", "rank correlation")
         for d in (failing + [d for d in strong if d not in failing])[:_SHOWN]:
             rank.add_row(d.varied, d.outcome, f"{d.correlation:+.2f}")
         shown.append(rank)
     for name, rates in summary.by_value.items():
-        values = grid(name, "passed", "95 % interval")
+        values = _grid(name, "passed", "95 % interval")
         for word, r in rates.items():
             values.add_row(
                 word, f"{100 * r.rate:.3g} %", f"{100 * r.low:.3g} to {100 * r.high:.3g} %"

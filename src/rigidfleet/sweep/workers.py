@@ -10,13 +10,17 @@ from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import contextmanager
 from multiprocessing import connection
-from typing import Any
+from multiprocessing.context import SpawnContext, SpawnProcess
+from typing import TYPE_CHECKING, Any
 
 from rigidfleet import __version__
 from rigidfleet.errors import RigidfleetError
 from rigidfleet.sweep.definition import shared
 from rigidfleet.sweep.engine import fly_runs
 from rigidfleet.sweep.row import Row
+
+if TYPE_CHECKING:
+    from rigidfleet.kernel.native import Inheritance
 
 #: An executor, and how many chunks it works on at the same time.
 Crew = tuple[Executor, Callable[[], int]]
@@ -42,9 +46,13 @@ def chunk(sweep: str, version: str, runs: Sequence[int]) -> list[Row]:
 @contextmanager
 def processes(count: int) -> Generator[Crew]:
     """Persistent processes on this machine; they end with this one, however it ends."""
+    from rigidfleet.kernel.native import bequeath
+
     before = set(multiprocessing.active_children())
-    context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(count, mp_context=context, initializer=_begin)
+    with _safe_path():  # of the process that looks after semaphores
+        pool = ProcessPoolExecutor(
+            count, mp_context=_Context(), initializer=_begin, initargs=(bequeath(),)
+        )
     try:
         yield pool, lambda: count
     finally:
@@ -53,10 +61,45 @@ def processes(count: int) -> Generator[Crew]:
             process.terminate()
 
 
-def _begin() -> None:
-    """Leave Ctrl-C to the process that started this one, and end when it does."""
+class _Process(SpawnProcess):
+    @staticmethod
+    def _Popen(process_obj: Any) -> Any:  # noqa: N802
+        with _safe_path():
+            return SpawnProcess._Popen(process_obj)
+
+
+class _Context(SpawnContext):
+    """Processes that start as new ones, and import nothing from the current folder while they do.
+
+    Until it is told the path of its parent, such a process would look for every module there first, even for those of
+    the standard library.
+    """
+
+    Process = _Process
+
+
+@contextmanager
+def _safe_path() -> Generator[None]:
+    """Keep the current folder off the path of Python processes that are started meanwhile."""
+    name = "PYTHONSAFEPATH"
+    before = os.environ.get(name)
+    os.environ[name] = "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[name]
+        else:
+            os.environ[name] = before
+
+
+def _begin(given: Inheritance) -> None:
+    """Leave Ctrl-C to the process that started this one, end when it does, and compile nothing that it has."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_follow, daemon=True).start()
+    from rigidfleet.kernel.native import inherit
+
+    inherit(given)
 
 
 def _follow() -> None:

@@ -1,0 +1,485 @@
+"""The cache of compiled code: what is run is what this user wrote."""
+
+import grp
+import os
+import pickle
+import pwd
+import struct
+import subprocess
+import sys
+import tempfile
+import threading
+import warnings
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import llvmlite.binding as llvm
+import pytest
+
+from rigidfleet.kernel import cache, cache_directory, compiled, is_compiled, native
+
+PLANTED, OWN = 666, 1
+SOMEONE = 12345
+ROOT = os.geteuid() == 0
+COMMAND = Path(sys.executable).with_name("rigidfleet")
+needs_root = pytest.mark.skipif(not ROOT, reason="only root can give files to others")
+
+
+def code(answer: int) -> bytes:
+    """Machine code with the kernel's two entries, which return a number."""
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    text = "define i64 @{}(i64, i64, i64, i64) {{ ret i64 {} }}"
+    module = llvm.parse_assembly("\n".join(text.format(e, answer) for e in native.ENTRIES))
+    return native.target_machine().emit_object(module)
+
+
+def answer() -> int:
+    """Which machine code a new process would call."""
+    found = native._load()
+    return found.integrate(0, 0, 0, 0)
+
+
+def forget() -> None:
+    """Let the next warning be the first."""
+    native.told.clear()
+
+
+@pytest.fixture
+def base(tmp_path, monkeypatch) -> Iterator[Path]:
+    """A base of the cache in which code is planted that would be run; what is compiled anew is `OWN`."""
+    folder = tmp_path / "base"
+    folder.mkdir(0o700)
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(folder))
+    monkeypatch.setattr(native, "_compile", lambda: [code(OWN)])
+    monkeypatch.setattr(native, "_loaded", [])
+    file = native._file()
+    file.write_bytes(native.joined([code(PLANTED)]))
+    file.chmod(0o600)
+    forget()
+    yield folder
+    forget()
+
+
+def place(base: Path) -> Path:
+    """The kernel's folder in a base."""
+    return base / "rigidfleet" / cache_directory().name
+
+
+def planted(base: Path) -> Path:
+    (file,) = base.glob("rigidfleet/kernel-*/flight-*.o")
+    return file
+
+
+def test_what_this_user_wrote_is_run(base):
+    """Machine code in folders that this user alone can write is loaded, and nothing is compiled."""
+    assert is_compiled()
+    assert answer() == PLANTED
+
+
+@pytest.mark.parametrize("which", ["base", "between", "last"])
+@pytest.mark.parametrize("right", [0o777, 0o770])
+def test_a_folder_that_others_can_write(which, right, base, monkeypatch):
+    """Machine code is not run from a folder that others can write, or one under such a folder; a warning says which,
+    and how to keep what was compiled."""
+    folder = {"base": base, "between": base / "rigidfleet", "last": place(base)}[which]
+    monkeypatch.setattr(
+        grp, "getgrgid", lambda gid: SimpleNamespace(gr_gid=gid, gr_name="crew", gr_mem=[])
+    )
+    folder.chmod(right)
+    assert not is_compiled()
+    with pytest.warns(RuntimeWarning) as warned:
+        assert answer() == OWN
+    (only,) = warned
+    text = str(only.message)
+    assert f"others can write to {folder}, which `chmod go-w {folder}` ends" in text
+    assert "NUMBA_CACHE_DIR" in text
+    folder.chmod(0o700)
+    assert answer() == PLANTED
+
+
+def test_a_sticky_folder_that_others_can_write(base):
+    """In a folder such as /tmp the next one may be this user's; but the last must not be such a folder."""
+    base.chmod(0o1777)
+    assert answer() == PLANTED
+    place(base).chmod(0o1777)
+    with pytest.warns(RuntimeWarning, match="others can write to"):
+        assert answer() == OWN
+
+
+@needs_root
+@pytest.mark.parametrize("which", ["base", "between", "last", "file"])
+def test_what_belongs_to_others(which, base):
+    """Machine code that belongs to another user, or lies in their folder, is not run."""
+    chosen = {
+        "base": base,
+        "between": base / "rigidfleet",
+        "last": place(base),
+        "file": planted(base),
+    }[which]
+    os.chown(chosen, SOMEONE, -1)
+    assert not is_compiled()
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always")
+        assert answer() == OWN
+    if which == "file":  # in a folder of one's own it is replaced
+        assert not warned
+        assert answer() == OWN
+        assert planted(base).stat().st_uid == os.geteuid()
+    else:
+        assert f"{chosen} belongs to another user" in str(warned[0].message)
+
+
+def test_a_file_that_others_can_write(base):
+    """Machine code that others could have written is compiled again, and kept as one's own."""
+    planted(base).chmod(0o666)
+    assert answer() == OWN
+    assert planted(base).stat().st_mode & 0o777 == 0o600
+    assert answer() == OWN
+
+
+@pytest.mark.parametrize("kind", ["link", "pipe", "folder"])
+def test_what_is_no_file(kind, base, tmp_path):
+    """A link, a pipe or a folder in place of the machine code is neither followed nor waited for."""
+    file = planted(base)
+    file.rename(tmp_path / "elsewhere")
+    if kind == "link":
+        file.symlink_to(tmp_path / "elsewhere")
+    elif kind == "pipe":
+        os.mkfifo(file)
+    else:
+        file.mkdir()
+    assert not is_compiled()
+    with pytest.warns(RuntimeWarning) if kind == "folder" else warnings.catch_warnings():
+        assert answer() == OWN
+
+
+def test_own_links_are_followed(base, tmp_path, monkeypatch):
+    """A cache may be reached by links of this user, absolute and relative; the folder that they lead to counts."""
+    (tmp_path / "one").symlink_to(base)
+    (tmp_path / "two").symlink_to("one/../one")
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "two"))
+    assert cache_directory() == place(base).resolve()
+    assert answer() == PLANTED
+    base.chmod(0o777)
+    with pytest.warns(RuntimeWarning, match=f"others can write to {base}"):
+        assert answer() == OWN
+
+
+@needs_root
+def test_links_of_others_are_not_followed(base, tmp_path, monkeypatch):
+    """In a folder such as /tmp anyone can make a link: it leads nowhere, even to what is this user's."""
+    public = tmp_path / "public"
+    public.mkdir()
+    public.chmod(0o1777)
+    (public / "cache").symlink_to(base)
+    os.chown(public / "cache", SOMEONE, -1, follow_symlinks=False)
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(public / "cache"))
+    with pytest.warns(RuntimeWarning, match="public/cache belongs to another user"):
+        assert answer() == OWN
+
+
+def test_a_circle_of_links(base, tmp_path, monkeypatch):
+    """Links in a circle are an end, not a hang."""
+    (tmp_path / "circle").symlink_to("circle")
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "circle"))
+    with pytest.warns(RuntimeWarning, match="circle is a link that leads in a circle"):
+        assert answer() == OWN
+
+
+@pytest.mark.parametrize(("name", "members", "allowed"), [
+    ("pilot", [], True), ("pilot", ["pilot"], True), ("pilot", ["pilot", "eve"], False), ("crew", [], False),
+])  # fmt: skip
+def test_a_group_of_ones_own(name, members, allowed, base, monkeypatch):
+    """A folder that a group can write is this user's alone where the group is: of their name, and of no one else."""
+    group, me = base.stat().st_gid, SimpleNamespace(pw_name="pilot", pw_gid=base.stat().st_gid)
+    monkeypatch.setattr(pwd, "getpwuid", lambda _: me)
+    found = SimpleNamespace(gr_gid=group, gr_name=name, gr_mem=members)
+    monkeypatch.setattr(grp, "getgrgid", lambda _: found)
+    base.chmod(0o775)
+    with warnings.catch_warnings() if allowed else pytest.warns(RuntimeWarning):
+        assert answer() == (PLANTED if allowed else OWN)
+
+
+def test_an_access_list(base, monkeypatch):
+    """Where a list gives another user the right to write, the group's being one's own does not count."""
+    entries = [(0x01, 7, -1), (0x02, 7, SOMEONE), (0x04, 5, -1), (0x10, 7, -1), (0x20, 0, -1)]
+    data = struct.pack("<I", 2) + b"".join(struct.pack("<HHi", *entry) for entry in entries)
+    try:
+        os.setxattr(base, "system.posix_acl_access", data)
+    except (OSError, AttributeError):
+        pytest.skip("no access lists here")
+    me = SimpleNamespace(pw_name="pilot", pw_gid=base.stat().st_gid)
+    own = SimpleNamespace(gr_gid=base.stat().st_gid, gr_name="pilot", gr_mem=[])
+    monkeypatch.setattr(pwd, "getpwuid", lambda _: me)
+    monkeypatch.setattr(grp, "getgrgid", lambda _: own)
+    assert base.stat().st_mode & 0o777 == 0o770
+    with pytest.warns(RuntimeWarning, match="others can write to"):
+        assert answer() == OWN
+
+
+@needs_root
+@pytest.mark.parametrize("which", ["base", "last", "file", "shared"])
+def test_owners_without_a_number(which, base, monkeypatch):
+    """In a container of an ordinary user the machine's root shows as nobody, who may own what leads to the cache where
+    not everyone can make a folder, but neither the cache nor what is in it."""
+    monkeypatch.setattr(cache, "_unnamed", lambda: SOMEONE)
+    chosen = {"last": place(base), "file": planted(base)}.get(which, base)
+    os.chown(chosen, SOMEONE, -1)
+    if which == "shared":
+        base.parent.chmod(0o1777)
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always")
+        assert answer() == (PLANTED if which == "base" else OWN)
+    assert bool(warned) == (which in {"last", "shared"})
+
+
+def test_users_without_a_number():
+    """Where every user has a number, as outside of containers, nobody is only nobody."""
+    whole = Path("/proc/self/uid_map").read_text().split() == ["0", "0", "4294967295"]
+    nobody = int(Path("/proc/sys/kernel/overflowuid").read_text())
+    assert cache._unnamed() == (None if whole else nobody)
+
+
+@pytest.mark.parametrize("home", ["/dev/null", "", "unknown"])
+def test_no_home(home, base, tmp_path, monkeypatch):
+    """Without a home folder nothing is read from the temporary folder, where anyone may plant; one warning says so."""
+    if home == "":  # on a machine whose root folder this user cannot write
+        monkeypatch.setattr(os, "mkdir", refused)
+    monkeypatch.setenv("TMPDIR", str(base))
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    for name in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    if home == "unknown":
+        monkeypatch.delenv("HOME")
+        monkeypatch.setattr(pwd, "getpwuid", nobody)
+    else:
+        monkeypatch.setenv("HOME", home)
+    why = {
+        "/dev/null": "/dev/null is no folder",
+        "": "Permission denied",
+        "unknown": "there is no home",
+    }[home]
+    with pytest.warns(RuntimeWarning, match=why):
+        assert answer() == OWN
+    assert compiled.compiled(lambda x: x + 1.0)(1.0) == 2.0  # and no second warning
+
+
+def refused(*_: object, **__: object) -> None:
+    raise PermissionError(13, "Permission denied")
+
+
+def nobody(_: int) -> None:
+    raise KeyError
+
+
+def test_a_relative_path(base, monkeypatch):
+    """A cache that is named relative to the current folder is none: whoever made that folder would have filled it."""
+    monkeypatch.setenv("NUMBA_CACHE_DIR", base.name)
+    monkeypatch.chdir(base.parent)
+    with pytest.warns(RuntimeWarning, match="the path is not absolute"):
+        assert answer() == OWN
+
+
+def test_what_is_made_is_private(tmp_path, monkeypatch):
+    """Folders and files of the cache are this user's alone, though whatever else they make is everybody's."""
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "a" / "b"))
+    monkeypatch.setattr(native, "_compile", lambda: [code(OWN)])
+    before = os.umask(0)
+    try:
+        assert answer() == OWN
+        assert compiled.compiled(lambda x: 2.0 * x)(1.0) == 2.0
+    finally:
+        os.umask(before)
+    made = list((tmp_path / "a").rglob("*"))
+    assert {path.suffix for path in made if path.is_file()} >= {".o", ".nbi", ".nbc"}
+    assert all(path.stat().st_mode & 0o077 == 0 for path in [tmp_path / "a", *made])
+
+
+def test_writers_at_the_same_time(base):
+    """However many write the machine code at the same time, who reads it finds one of them whole."""
+    ours = [[bytes([k]) * 200_000] for k in range(4)]
+    native._write(ours[0])
+    writers = [
+        threading.Thread(target=lambda k=k: [native._write(ours[k]) for _ in range(50)])
+        for k in range(4)
+    ]
+    for writer in writers:
+        writer.start()
+    while any(writer.is_alive() for writer in writers):
+        assert native._read() in ours
+    assert [file.name for file in place(base).iterdir()] == [planted(base).name]
+
+
+# -- Numba's pickles ---------------------------------------------------------------------------------
+
+
+class Hostile:
+    def __init__(self, mark: Path) -> None:
+        self.mark = mark
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Path.write_text, (self.mark, "executed")
+
+
+def double(x):
+    return 2.0 * x
+
+
+@pytest.mark.parametrize("suffix", [".nbi", ".nbc"])
+@pytest.mark.parametrize("which", ["folder", "file", "owner"])
+def test_planted_pickles(suffix, which, tmp_path, monkeypatch):
+    """What Numba keeps is not unpickled where others could have written it, nor what belongs to them."""
+    if which == "owner" and not ROOT:
+        pytest.skip("only root can give files to others")
+    base, mark = tmp_path / "base", tmp_path / "mark"
+    base.mkdir(0o700)
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(base))
+    monkeypatch.setattr(compiled, "_CACHE", cache_directory(), raising=False)
+    assert compiled.compiled(double)(1.0) == 2.0
+    (file,) = base.rglob("*double*" + suffix)
+    file.write_bytes(pickle.dumps(Hostile(mark)))
+    with suppress(Exception):  # a pickle of one's own is read
+        compiled.compiled(double)(1.0)
+    assert mark.exists()
+    mark.unlink()
+    forget()
+    file.write_bytes(pickle.dumps(Hostile(mark)))
+    if which == "owner":
+        os.chown(file, SOMEONE, -1)
+    else:
+        (base if which == "folder" else file).chmod(0o777)
+    with pytest.warns(RuntimeWarning) if which == "folder" else warnings.catch_warnings():
+        assert compiled.compiled(double)(1.0) == 2.0
+    assert not mark.exists()
+
+
+# -- processes that are started ----------------------------------------------------------------------
+
+#: Names that a process looks for as it starts, as it starts another, and as it compiles.
+NAMES = (
+    "copy",
+    "numba",
+    "pickle",
+    "multiprocessing",
+    "selectors",
+    "random",
+    "sitecustomize",
+    "usercustomize",
+)
+
+
+@pytest.fixture
+def hostile(tmp_path) -> Path:
+    """A folder with modules of well-known names, which leave a mark and end the process."""
+    folder = tmp_path / "hostile"
+    folder.mkdir()
+    for name in NAMES:
+        text = f"import os\nopen({str(folder / 'mark')!r}, 'a').write({name!r})\nos._exit(3)\n"
+        (folder / f"{name}.py").write_text(text)
+    return folder
+
+
+def run(*command: object, cwd: Path, **environment: str) -> subprocess.CompletedProcess[str]:
+    env = os.environ | environment
+    return subprocess.run(
+        [*map(str, command)], cwd=cwd, env=env, capture_output=True, text=True, check=False
+    )
+
+
+@pytest.mark.long
+def test_compiling_in_a_hostile_folder(hostile, tmp_path):
+    """While the kernel is compiled no module of the current folder is run, and none of its settings read."""
+    cache = tmp_path / "cache"
+    (hostile / ".numba_config.yaml").write_text("disable_jit: 1\n")
+    asked = [COMMAND, "run", "establish-triangle", "--no-figures", "--out", tmp_path / "out"]
+    done = run(*asked, cwd=hostile, NUMBA_CACHE_DIR=str(cache))
+    assert done.returncode == 0, done.stderr
+    assert not (hostile / "mark").exists()
+    assert len([*cache.rglob("flight-*.o")]) == 1
+
+
+IMPORTS = (
+    "import sys; sys.path[:] = sys.argv[1:]; import copy, numba, rigidfleet, extra; print(sys.path)"
+)
+
+
+@pytest.mark.parametrize("way", ["added", "relative", "PYTHONPATH"])
+def test_a_build_process_imports_what_its_parent_does(way, hostile, tmp_path, monkeypatch):
+    """A process that compiles finds what its parent finds, by absolute paths, and nothing in the current folder."""
+    (tmp_path / "libraries").mkdir()
+    (tmp_path / "libraries" / "extra.py").touch()
+    monkeypatch.chdir(hostile)
+    given = "../libraries" if way == "relative" else str(tmp_path / "libraries")
+    monkeypatch.setattr(sys, "path", ["", *sys.path, given])
+    monkeypatch.setattr(native, "_BUILD", IMPORTS)
+    done = run(
+        *native.build_process(),
+        cwd=hostile,
+        **({"PYTHONPATH": given} if way == "PYTHONPATH" else {}),
+    )
+    assert done.returncode == 0, done.stderr
+    assert not (hostile / "mark").exists()
+    path = eval(done.stdout)
+    assert all(map(os.path.isabs, path))
+    assert str(hostile) not in path
+    assert str(tmp_path / "libraries") in path
+
+
+def test_a_build_process_heeds_its_parents_flags():
+    """A Python that leaves out the user's packages and the environment starts one that does, too."""
+    code = "from rigidfleet.kernel import native; print(native.build_process()[1:-1])"
+    done = subprocess.run(
+        [sys.executable, "-sE", "-c", code], capture_output=True, text=True, check=True
+    )
+    assert {"-s", "-E", "-P"} <= set(eval(done.stdout))
+
+
+WORKER = """
+from rigidfleet.sweep import workers
+if __name__ == "__main__":
+    with workers.processes(1) as (pool, _):
+        print(pool.submit(abs, -3).result())
+"""
+
+
+def test_workers_in_a_hostile_folder(hostile, tmp_path):
+    """Workers of a sweep, and what looks after them, run no module of the current folder as they start."""
+    script = tmp_path / "script.py"
+    script.write_text(WORKER)
+    done = run(sys.executable, script, cwd=hostile)
+    assert not (hostile / "mark").exists()
+    assert done.stdout == "3\n", done.stderr
+
+
+def test_workers_compile_nothing_that_cannot_be_kept(base, monkeypatch):
+    """Where nothing can be kept, processes that are started get the machine code from the one that compiled it."""
+    base.chmod(0o777)
+    with pytest.warns(RuntimeWarning):
+        assert native._code().integrate(0, 0, 0, 0) == OWN
+    given = pickle.loads(pickle.dumps(native.bequeath()))
+    forget()
+    monkeypatch.setattr(native, "_loaded", [])
+    monkeypatch.setattr(native, "_compile", refused)
+    native.inherit(given)
+    assert native._code().integrate(0, 0, 0, 0) == OWN
+    assert compiled.compiled(lambda x: 3.0 * x)(1.0) == 3.0  # and do not warn again
+    assert native.bequeath() == given
+
+
+@pytest.mark.long
+def test_one_warning_for_a_sweep(tmp_path):
+    """A sweep on two processes whose kernel cannot be kept compiles it once, warns once, and passes."""
+    base = tmp_path / "base"
+    base.mkdir()
+    base.chmod(0o777)
+    vary = ["--vary", "agents.position.*.* += normal(0, 0.1)", "--runs", "48", "--workers", "2"]
+    asked = [COMMAND, "sweep", "narrow-passage", *vary, "--no-figures", "--out", tmp_path / "out"]
+    done = run(*asked, cwd=tmp_path, NUMBA_CACHE_DIR=str(base))
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.count("cannot be kept") == 1
+    assert "2 workers" in done.stderr
+    assert not [*base.iterdir()]
