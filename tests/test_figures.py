@@ -185,7 +185,7 @@ def test_every_flight_can_be_drawn(flight):
     """Each figure draws without a warning: one agent, no edges, no obstacles, stopped, only NaN."""
     few = {"samples": 31} | FLIGHTS.get(flight, {})
     result = nothing_known() if flight == "nothing known" else a_flight(**few)
-    for name in figures.figure_names(disturbed=True):
+    for name in figures.figure_names():
         figure = drawn(name, result)
         assert isinstance(figure, Figure), name
         assert figure.axes or name == "formations", name
@@ -193,7 +193,7 @@ def test_every_flight_can_be_drawn(flight):
 
 def test_axes_have_units(triangle):
     """Each quantity on an axis has its unit in brackets."""
-    for name in figures.figure_names(disturbed=True):
+    for name in figures.figure_names():
         for ax in getattr(figures, name)(triangle).axes:
             for label in (ax.get_xlabel(), ax.get_ylabel()):
                 assert not label or label.endswith("]"), (name, label)
@@ -206,7 +206,7 @@ def test_an_agent_has_the_same_colour_in_every_figure(cube):
     """Lines, discs and legend entries of agent k have the k-th colour wherever they appear."""
     colours = figures.agent_colours(8)
     seen = set()
-    for name in figures.figure_names(disturbed=True):
+    for name in figures.figure_names():
         figure = getattr(figures, name)(cube)
         for k, colour in enumerate(colours):
             for artist in by_gid(figure, f"agent-{k + 1}"):
@@ -582,7 +582,7 @@ def test_files_appear_in_both_formats(triangle, tmp_path):
     """Each figure is a PNG of 150 to 200 dpi and an SVG whose text is text."""
     paths = figures.plot(triangle, tmp_path / "new" / "folder")
     assert {p.name for p in paths} == {
-        f"{name}.{kind}" for name in figures.figure_names(disturbed=True) for kind in ("png", "svg")
+        f"{name}.{kind}" for name in figures.figure_names() for kind in ("png", "svg")
     }
     assert sorted(p.name for p in (tmp_path / "new" / "folder").iterdir()) == sorted(
         p.name for p in paths

@@ -366,8 +366,7 @@ _CAPTIONS = {
 
 def _figures(result: Result) -> list[dict[str, str]]:
     """All figures but the summary, which has a page of its own."""
-    names = figures.figure_names(disturbed=result.disturbance_force is not None)
-    return [_figure(result, name) for name in names if name != "summary"]
+    return [_figure(result, name) for name in figures.figure_names(result) if name != "summary"]
 
 
 def _figure(result: Result, name: str) -> dict[str, str]:
