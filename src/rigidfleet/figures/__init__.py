@@ -36,6 +36,7 @@ from rigidfleet.result import Result
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+    from matplotlib.transforms import Bbox
 
 __all__ = [
     "FORMATS",
@@ -64,6 +65,7 @@ _FIGURES: dict[str, Callable[[Result], Figure]] = {
 }  # fmt: skip
 #: Formats that figures are written in.
 FORMATS = ("png", "svg", "pdf")
+_MARGIN = 0.05  # [in] around a figure that is cut close
 
 
 def figure_names(result: Result | None = None) -> list[str]:
@@ -155,11 +157,24 @@ def _rendered(figure: Figure, kind: str, *, close: bool = False) -> bytes:
     metadata: dict[str, Any] = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}
     buffer = io.BytesIO()
     with settings():
-        box = "tight" if close else None
+        box = _ink(figure) if close else None
         figure.savefig(buffer, format=kind, metadata=metadata.get(kind), bbox_inches=box)
     # The layout is found; drawing again need not look for it.
     figure.set_layout_engine("none")
     return buffer.getvalue()
+
+
+def _ink(figure: Figure) -> Bbox:
+    """What is drawn on, and a little around it [in]; by matplotlib's own reckoning empty axes count, too."""
+    from matplotlib.transforms import Bbox
+
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="rgba", dpi=figure.dpi)
+    width, height = (figure.get_size_inches() * figure.dpi).astype(int).tolist()
+    drawn = (np.frombuffer(buffer.getvalue(), np.uint8).reshape(height, width, 4) < 255).any(axis=2)
+    across, down = np.flatnonzero(drawn.any(axis=0)), np.flatnonzero(drawn.any(axis=1))
+    ends = [[across[0], height - down[-1] - 1], [across[-1] + 1, height - down[0]]]
+    return Bbox(np.array(ends) / figure.dpi).padded(_MARGIN)
 
 
 def _write(path: Path, data: bytes) -> None:

@@ -26,6 +26,7 @@ _PAIRS = 5e7  # distances of pairs that are looked at, in all
 _SMALLEST = 1e-12  # error that is drawn on a logarithmic axis [m]; below is rounding
 _IDLE = 1e-6  # force [N] or way [m] below which there is nothing to draw but rounding
 _LOW = 0.45  # share of its height that a row has left in which nothing happens
+_TOLD = 0.7  # and one that holds words alone
 
 
 # -- edges -------------------------------------------------------------------------------------------
@@ -395,7 +396,9 @@ def constraint_force(result: Result) -> Figure:
         return f"edge {result.edge_labels[k]}"
 
     force, tension = np.linalg.norm(result.constraint_force, axis=2), -result.multiplier
-    shares = [_LOW if np.nanmax(np.abs(v), initial=0.0) <= _IDLE else 1.0 for v in (force, tension)]
+    shares = [
+        _TOLD if np.nanmax(np.abs(v), initial=0.0) <= _IDLE else 1.0 for v in (force, tension)
+    ]
     fig, axes = st.time_figure(result, "Constraint force", 2, shares=shares)
     above, below = axes[:, 0]
     above.set_ylabel(r"force $|f_C|$ [N]")
@@ -498,7 +501,7 @@ def draw_error(ax: Axes, result: Result) -> list[Line2D]:
     large = seen[seen > _SMALLEST]
     if len(large):
         ax.set_ylim(max(_SMALLEST, 0.5 * float(large.min())), 3 * float(large.max()))
-        if len(large) < len(seen):
+        if ax.get_ylim()[0] == _SMALLEST and len(large) < len(seen):
             st.words(
                 ax,
                 f"rounding below {_SMALLEST:g} m is not drawn",

@@ -237,11 +237,13 @@ def limit(ax: Axes, value: float, label: str, colour: str = ALERT) -> None:
     """Line of a limit, with its name on it."""
     ax.axhline(value, color=colour, linewidth=1.0, linestyle=(0, (6, 2)), zorder=2.5, gid="limit")
     along = ("axes fraction", "data")
-    words(ax, label, [
-        ((x, value), along, (0, 2 if va == "bottom" else -2), ha, va)
-        for x, ha in ((0.995, "right"), (0.5, "center"), (0.005, "left"), (0.75, "center"), (0.25, "center"))
-        for va in ("bottom", "top")
-    ], color=colour)  # fmt: skip
+    sides = ((0.995, "right"), (0.5, "center"), (0.005, "left"), (0.75, "center"), (0.25, "center"))
+    along: list[Place] = [
+        ((x, value), ("axes fraction", "data"), (0, away), ha, va)
+        for x, ha in sides
+        for va, away in (("bottom", 2), ("top", -2))
+    ]
+    words(ax, label, [*along, *corners()], color=colour)
 
 
 # -- words that cover nothing --------------------------------------------------------------------------
