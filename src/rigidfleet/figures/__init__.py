@@ -171,8 +171,9 @@ def _ink(figure: Figure) -> Bbox:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="rgba", dpi=figure.dpi)
     width, height = (figure.get_size_inches() * figure.dpi).astype(int).tolist()
-    drawn = (np.frombuffer(buffer.getvalue(), np.uint8).reshape(height, width, 4) < 255).any(axis=2)
-    across, down = np.flatnonzero(drawn.any(axis=0)), np.flatnonzero(drawn.any(axis=1))
+    colours = np.frombuffer(buffer.getvalue(), np.uint8).reshape(height, width, 4)
+    drawn = colours.min(axis=2) < 255
+    across, down = (np.flatnonzero(np.any(drawn, axis=axis)) for axis in (0, 1))
     ends = [[across[0], height - down[-1] - 1], [across[-1] + 1, height - down[0]]]
     return Bbox(np.array(ends) / figure.dpi).padded(_MARGIN)
 

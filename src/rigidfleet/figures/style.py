@@ -301,7 +301,7 @@ def place_words(fig: Figure) -> None:
             best, chosen = math.inf, places[0]
             for place in places:
                 _move(label, place)
-                covered = _covered(ax, label.get_window_extent().padded(1.0), others)
+                covered = _covered(ax, label.get_window_extent().padded(2.0), others)
                 if covered < best:
                     best, chosen = covered, place
                 if not covered:
