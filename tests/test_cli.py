@@ -646,7 +646,7 @@ def test_interrupt_inside_the_compiler(capsys, simulate):
 def plot(monkeypatch):
     """Draw figures in no time."""
 
-    def draw(result, folder, *, formats, names, titles):
+    def draw(result, folder, *, formats, names, titles=True):
         Path(folder).mkdir(exist_ok=True)
         for name, kind in itertools.product(names, formats):
             write(Path(folder, f"{name}.{kind}"), "drawn" if titles else "bare")
