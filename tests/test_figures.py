@@ -504,10 +504,11 @@ def test_what_is_cut_off_is_marked():
 
 def test_nothing_drawn_leaves_its_axes_unmarked():
     """Curves of forces leave their axes only beneath a mark, in whole flights and in those that broke down."""
-    thrust = 9.8 + np.geomspace(1e-3, 1e6, 181)[:, None] * [1.0, 0.3, 0.1]
+    thrust = 9.8 + np.geomspace(1e-3, 1e3, 181)[:, None] * [1.0, 0.3, 0.1]
+    thrust[-1] = 1e7, 1e6, -1e7
     for complete in (True, False):
         ending = "" if complete else "singular"
-        flight = a_flight(thrust=thrust, multiplier=thrust - 3e5, complete=complete, ending=ending)
+        flight = a_flight(thrust=thrust, multiplier=thrust, complete=complete, ending=ending)
         for name in ("inputs", "constraint_force", "summary"):
             figure = drawn(name, flight)
             for ax in figure.axes:
@@ -812,6 +813,11 @@ def test_an_incomplete_flight_says_so_without_titles(tmp_path):
     )
     assert "incomplete, stopped at 20.00 s" in words
     assert "Thrust of each agent" not in words
+    with style.titles(shown=False):
+        figure = drawn("inputs", stopped)
+    assert figure._suptitle is not None
+    warning = figure._suptitle.get_window_extent().corners()
+    assert not any(overlap(warning, corners(label)) for label in by_gid(figure, "phase"))
 
 
 def test_pdf_is_written(triangle, tmp_path):

@@ -402,7 +402,8 @@ def constraint_force(result: Result) -> Figure:
     fig, axes = st.time_figure(result, "Constraint force", 2, shares=shares)
     above, below = axes[:, 0]
     above.set_ylabel(r"force $|f_C|$ [N]")
-    _from_none(above, result, force, "N")
+    if _from_none(above, result, force, "N"):
+        st.agents_legend(above, result.n_agents)
     below.set_ylabel(r"tension $-\lambda$ [N]")
     if not len(result.edges):
         st.note(below, "no edges")
@@ -416,16 +417,16 @@ def constraint_force(result: Result) -> Figure:
     return fig
 
 
-def _from_none(ax: Axes, result: Result, values: Floats, unit: str) -> None:
-    """Each agent's values (K, N) from zero, with the greatest in words."""
+def _from_none(ax: Axes, result: Result, values: Floats, unit: str) -> bool:
+    """Each agent's values (K, N) from zero, with the greatest in words; whether there was anything to draw."""
     if _idle(ax, result, values, unit, _agent):
-        return
+        return False
     st.agent_lines(ax, result, values)
-    st.agents_legend(ax, result.n_agents)
     top = _sane(result, values)
     if top > 0.0:
         ax.set_ylim(-0.04 * top, 1.12 * top)
     _extremes(ax, result, values, unit, _agent)
+    return True
 
 
 @styled
@@ -438,7 +439,8 @@ def disturbance(result: Result) -> Figure:
         st.note(above, "still air")
     else:
         force = np.where(result.left, np.linalg.norm(result.disturbance_force, axis=2), np.nan)
-        _from_none(above, result, force, "N")
+        if _from_none(above, result, force, "N"):
+            st.agents_legend(above, result.n_agents)
     below.set_ylabel("from the slot [m]")
     off = np.linalg.norm(result.position - result.slot_position, axis=2)
     if np.isfinite(off).any():

@@ -189,7 +189,9 @@ def heading(fig: Figure, title: str, words: str, colour: str = GREY) -> None:
     if not _titled.get():
         if colour == ALERT:
             look: dict[str, Any] = {"ha": "right", "va": "top", "fontsize": 9, "color": colour}
-            fig.suptitle(words, x=0.988, y=top, parse_math=False, **look)
+            warning = fig.suptitle(words, x=0.988, parse_math=False, **look)
+            if fig.get_layout_engine() is None:
+                warning.set_y(top)
         return
     title_text = fig.suptitle(
         title, x=0.012, ha="left", va="top", fontsize=11, fontweight="bold", parse_math=False

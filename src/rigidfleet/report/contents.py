@@ -357,7 +357,7 @@ _CAPTIONS = {
     "attitude": "Attitude of the formation as a body: flown, reference (dashed) and waypoints (rings).",
     "inputs": "Thrust of each vehicle under its limit, and enlarged.",
     "constraint_force": "Force that holds the distances, and the tension of each edge; below zero it pushes.",
-    "constraint_error": "Error |c| of each distance held, its length less its reference; and of all pairs against the slots.",
+    "constraint_error": "Error |c| of each distance held, length less reference; and of all pairs against the slots.",
     "clearance": "Room between surfaces, with the limits.",
     "formations": "Formations with their edges and body axes.",
     "disturbance": "Force of the air on each vehicle, and how far each is from its slot.",
