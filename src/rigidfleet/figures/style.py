@@ -55,6 +55,8 @@ _ROUNDING = 1e-9  # deviations below are not worth a word
 
 #: Where words may stand: a point and what it is measured in, an offset [points] from it, alignment.
 Place = tuple[tuple[float, float], Any, tuple[float, float], str, str]
+#: Along an axes' width: its ends and middle first.
+_ALONG = ((0.995, "right"), (0.5, "center"), (0.005, "left"), (0.75, "center"), (0.25, "center"))
 _places: WeakKeyDictionary[Annotation, Sequence[Place]] = WeakKeyDictionary()
 _titled: ContextVar[bool] = ContextVar("titled", default=True)
 
@@ -238,11 +240,9 @@ def reference(ax: Axes, t: Floats, y: Floats) -> Line2D:
 def limit(ax: Axes, value: float, label: str, colour: str = ALERT) -> None:
     """Line of a limit, with its name on it."""
     ax.axhline(value, color=colour, linewidth=1.0, linestyle=(0, (6, 2)), zorder=2.5, gid="limit")
-    along = ("axes fraction", "data")
-    sides = ((0.995, "right"), (0.5, "center"), (0.005, "left"), (0.75, "center"), (0.25, "center"))
     along: list[Place] = [
         ((x, value), ("axes fraction", "data"), (0, away), ha, va)
-        for x, ha in sides
+        for x, ha in _ALONG
         for va, away in (("bottom", 2), ("top", -2))
     ]
     words(ax, label, [*along, *corners()], color=colour)
@@ -267,8 +267,8 @@ def corners() -> list[Place]:
     return [
         ((x, y), "axes fraction", (0, -3 if va == "top" else 3), ha, va)
         for y, va in ((1.0, "top"), (0.0, "bottom"))
-        for x, ha in ((0.995, "right"), (0.5, "center"), (0.005, "left"), (0.75, "center"), (0.25, "center"))
-    ]  # fmt: skip
+        for x, ha in _ALONG
+    ]
 
 
 def around(x: float, y: float) -> list[Place]:
