@@ -646,10 +646,10 @@ def test_interrupt_inside_the_compiler(capsys, simulate):
 def plot(monkeypatch):
     """Draw figures in no time."""
 
-    def draw(result, folder, *, formats, names):
+    def draw(result, folder, *, formats, names, titles=True):
         Path(folder).mkdir(exist_ok=True)
         for name, kind in itertools.product(names, formats):
-            write(Path(folder, f"{name}.{kind}"), "drawn")
+            write(Path(folder, f"{name}.{kind}"), "drawn" if titles else "bare")
 
     monkeypatch.setattr("rigidfleet.figures.plot", draw)
 
@@ -658,9 +658,32 @@ def test_run_draws(capsys, plot):
     """Figures are drawn into a folder of their own, each as PNG and SVG."""
     assert cli.main(["run", "short.toml"]) == cli.PASSED
     found = {p.name for p in Path("flights/short/figures").iterdir()}
-    assert found == {f"{name}.{kind}" for name in figure_names() for kind in ("png", "svg")}
+    known = figure_names(Result.load("flights/short/short.nc"))
+    assert found == {f"{name}.{kind}" for name in known for kind in ("png", "svg")}
     where = os.path.join("flights", "short", "figures") + os.sep
     assert f"Figures  {where} ({len(found)} files)" in capsys.readouterr().out
+
+
+def test_formats_and_titles_of_figures(capsys, plot):
+    """--format, repeated, says which files are drawn, --no-titles how; what was drawn before is replaced or kept."""
+    figures = Path("flights/short/figures")
+    options = ["--format", "pdf", "--format", "svg", "--no-titles"]
+    assert cli.main(["run", "short.toml", *options]) == cli.PASSED
+    known = figure_names(Result.load("flights/short/short.nc"))
+    assert {p.name for p in figures.iterdir()} == {
+        f"{n}.{k}" for n in known for k in ("pdf", "svg")
+    }
+    assert {p.read_text(encoding="utf-8") for p in figures.iterdir()} == {"bare"}
+    assert f"({2 * len(known)} files)" in capsys.readouterr().out
+    assert cli.main(["run", "short.toml"]) == cli.BAD_INPUT, "the PDFs are files of that flight"
+    assert cli.main(["report", "flights/short/short.nc", "--format", "png"]) == cli.PASSED
+    assert (figures / "cm.png").read_text(encoding="utf-8") == "drawn"
+    assert (figures / "cm.svg").read_text(encoding="utf-8") == "bare"
+    assert cli.main(["run", "short.toml", "--force", "--format", "png"]) == cli.PASSED
+    assert {p.suffix for p in figures.iterdir()} == {".png"}
+    capsys.readouterr()
+    assert cli.main(["run", "short.toml", "--format", "bmp"]) == cli.BAD_INPUT
+    assert '"png", "svg", "pdf"' in capsys.readouterr().err
 
 
 @pytest.mark.long
@@ -671,7 +694,8 @@ def test_demo(folder):
         assert done.returncode == cli.PASSED, done.stderr
     figures = folder / "flights" / "narrow-passage" / "figures"
     found = {path.name for path in figures.iterdir() if path.stat().st_size > 10_000}
-    assert found == {f"{name}.{kind}" for name in figure_names() for kind in ("png", "svg")}
+    known = figure_names(Result.load(figures.parent / "narrow-passage.nc"))
+    assert found == {f"{name}.{kind}" for name in known for kind in ("png", "svg")}
 
 
 def test_report(capsys, plot):
@@ -693,7 +717,8 @@ def test_report(capsys, plot):
         (figures / "cm.png", "drawn"),
     ):
         assert path.read_text(encoding="utf-8") == text
-    assert len(list(figures.iterdir())) == 2 * len(figure_names())
+    known = figure_names(Result.load("flights/short/short.nc"))
+    assert len(list(figures.iterdir())) == 2 * len(known)
 
 
 def test_report_force(capsys, plot):

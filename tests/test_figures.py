@@ -3,7 +3,7 @@ import subprocess
 import sys
 import warnings
 import xml.etree.ElementTree as ET
-from itertools import combinations
+from itertools import combinations, pairwise
 from typing import Any
 
 import matplotlib as mpl
@@ -163,6 +163,39 @@ def by_gid(figure: Any, gid: str) -> list[Any]:
     return figure.findobj(lambda artist: artist.get_gid() == gid)
 
 
+def struck(figure: Any) -> list[str]:
+    """Words inside axes that a line, a band or other words run through, as the picture is drawn."""
+    figure.draw_without_rendering()
+    found = []
+    for ax in figure.axes:
+        labels = [
+            t for t in ax.texts if t.get_text() and t.get_visible() and t.get_gid() != "phase"
+        ]
+        for text in labels:
+            box = text.get_window_extent()
+            x, y = [np.linspace(*ends, 60) for ends in zip(*box.corners()[[0, 3]], strict=True)]
+            for line in ax.lines:
+                # Sampled every half a pixel or so, which the code under test does not do.
+                p = line.get_transform().transform(np.column_stack(line.get_data(orig=False)))
+                if line.get_linestyle() == "None":
+                    q = p
+                else:
+                    steps = [
+                        np.linspace(a, b, 2 + int(min(4000, 2 * np.abs(b - a).max())))
+                        for a, b in pairwise(p) if np.isfinite([a, b]).all()
+                    ]  # fmt: skip
+                    q = np.concatenate([np.zeros((0, 2)), *steps])
+                inside = (q > [x[0], y[0]]) & (q < [x[-1], y[-1]])
+                if inside.all(axis=1).any():
+                    found.append(f"{text.get_text()!r} by a line")
+            for other in labels:
+                if other is not text and overlap(
+                    box.corners(), other.get_window_extent().corners()
+                ):
+                    found.append(f"{text.get_text()!r} by {other.get_text()!r}")
+    return found
+
+
 def texts(figure: Any) -> list[str]:
     return [text.get_text() for text in figure.findobj(Text) if text.get_visible()]
 
@@ -185,7 +218,7 @@ def test_every_flight_can_be_drawn(flight):
     """Each figure draws without a warning: one agent, no edges, no obstacles, stopped, only NaN."""
     few = {"samples": 31} | FLIGHTS.get(flight, {})
     result = nothing_known() if flight == "nothing known" else a_flight(**few)
-    for name in figures.figure_names(disturbed=True):
+    for name in figures.figure_names():
         figure = drawn(name, result)
         assert isinstance(figure, Figure), name
         assert figure.axes or name == "formations", name
@@ -193,7 +226,7 @@ def test_every_flight_can_be_drawn(flight):
 
 def test_axes_have_units(triangle):
     """Each quantity on an axis has its unit in brackets."""
-    for name in figures.figure_names(disturbed=True):
+    for name in figures.figure_names():
         for ax in getattr(figures, name)(triangle).axes:
             for label in (ax.get_xlabel(), ax.get_ylabel()):
                 assert not label or label.endswith("]"), (name, label)
@@ -206,7 +239,7 @@ def test_an_agent_has_the_same_colour_in_every_figure(cube):
     """Lines, discs and legend entries of agent k have the k-th colour wherever they appear."""
     colours = figures.agent_colours(8)
     seen = set()
-    for name in figures.figure_names(disturbed=True):
+    for name in figures.figure_names():
         figure = getattr(figures, name)(cube)
         for k, colour in enumerate(colours):
             for artist in by_gid(figure, f"agent-{k + 1}"):
@@ -397,6 +430,132 @@ def test_clearance_shows_limits_and_the_worst(triangle):
     )
 
 
+def near_a_limit(share: float, *, level: float) -> Result:
+    """A flight whose clearance dips to a level [m] at a share of its time, close above contact, as in a narrow gap."""
+    t = np.linspace(0.0, 20.0, 181)
+    room = 9.0 - (9.0 - level) * np.clip(1.6 - 8 * np.abs(t / 20.0 - share), 0.0, 1.0)
+    return a_flight(separation=room, clearance=room)
+
+
+@pytest.mark.parametrize("level", [0.05, 0.6, 1.5, 3.0])
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.76, 1.0])
+@pytest.mark.parametrize("name", ["clearance", "summary"])
+def test_no_line_runs_through_words(name, share, level):
+    """Least values and names of limits stand clear of curves, limits and each other, wherever the least one is."""
+    figure = getattr(figures, name)(near_a_limit(share, level=level))
+    if name == "summary":  # its views in space are pictures, not curves
+        for ax in figure.axes[:2]:
+            ax.remove()
+    assert struck(figure) == []
+
+
+@pytest.mark.parametrize("top", [9.9, 12.0, 22.0, 23.4, 30.0])
+def test_no_curve_runs_through_words_of_forces(top):
+    """Peaks and limits are told where no curve runs, whether thrust is far below its limit, at it, or above."""
+    t = np.linspace(0.0, 20.0, 181)[:, None]
+    thrust = 9.8 + (top - 9.8) * np.abs(np.sin(t + [0.0, 0.4, 1.1]))
+    assert struck(figures.inputs(a_flight(thrust=thrust))) == []
+    pull = (thrust - 9.8)[:, :, None] * [1.0, 0.0, 0.0]
+    assert struck(figures.constraint_force(a_flight(constraint_force=pull))) == []
+
+
+def test_a_force_that_is_rounding_is_told_in_words():
+    """A constraint force of 3e-8 N is no line along zero in empty axes: the figure says what it is, whose and when."""
+    force, tension = np.zeros((181, 3, 3)), np.zeros((181, 3))
+    force[100, 2, 0], tension[90, 1] = 3.03e-8, -2e-8
+    figure = figures.constraint_force(a_flight(constraint_force=force, multiplier=tension))
+    t = np.linspace(0.0, 20.0, 181)
+    assert f"none but rounding: at most 3.03e-08 N, agent 3 at {t[100]:.2f} s" in texts(figure)
+    assert f"none but rounding: at most 2e-08 N, edge 1-3 at {t[90]:.2f} s" in texts(figure)
+    assert not any(ax.yaxis.get_tick_params()["labelleft"] for ax in figure.axes)
+
+
+def test_a_small_force_fills_its_axes():
+    """A constraint force of 2e-5 N has axes of its size."""
+    force = np.zeros((181, 3, 3))
+    force[:, 1, 0] = np.linspace(2e-5, 1e-5, 181)
+    (above, _) = figures.constraint_force(a_flight(constraint_force=force)).axes
+    assert 2e-5 < above.get_ylim()[1] < 3e-5
+
+
+def test_what_is_cut_off_is_marked():
+    """A peak of 730 N that the axes cut off has a mark there and its height beside; others have none."""
+    thrust = np.full((181, 3), 9.8)
+    thrust[-1, 1] = 730.0
+    pull = 0.1 * np.ones((181, 3))
+    pull[-1, 2] = -5e3
+    flight = a_flight(thrust=thrust, multiplier=pull, complete=False, ending="singular")
+    for name, expected in (("inputs", 2), ("summary", 1)):
+        figure = getattr(figures, name)(flight)
+        marks = by_gid(figure, "cut")
+        assert len(marks) == expected
+        for mark in marks:
+            t, y = mark.get_xydata()[0]
+            assert t == 20.0
+            assert y == mark.axes.get_ylim()[1] < 100
+        assert texts(figure).count("cut off: peak 730 N: agent 2 at 20.00 s") == expected
+    (mark,) = by_gid(figures.constraint_force(flight), "cut")
+    assert mark.get_marker() == "^"
+    assert "cut off: peak 5e+03 N: edge 2-3 at 20.00 s" in texts(figures.constraint_force(flight))
+    whole = a_flight(thrust=np.minimum(thrust, 20.0))
+    for name in ("inputs", "constraint_force", "summary"):
+        assert by_gid(getattr(figures, name)(whole), "cut") == []
+
+
+def test_nothing_drawn_leaves_its_axes_unmarked():
+    """Curves of forces leave their axes only beneath a mark, in whole flights and in those that broke down."""
+    thrust = 9.8 + np.geomspace(1e-3, 1e3, 181)[:, None] * [1.0, 0.3, 0.1]
+    thrust[-1] = 1e7, 1e6, -1e7
+    for complete in (True, False):
+        ending = "" if complete else "singular"
+        flight = a_flight(thrust=thrust, multiplier=thrust, complete=complete, ending=ending)
+        for name in ("inputs", "constraint_force", "summary"):
+            figure = drawn(name, flight)
+            for ax in figure.axes:
+                low, high = ax.get_ylim()
+                marks = {m.get_marker() for m in ax.lines if m.get_gid() == "cut"}
+                curves_ = [x for x in ax.lines if x.get_gid() != "cut" and len(x.get_ydata()) > 9]
+                beyond = {
+                    side
+                    for x in curves_
+                    for side, out in (
+                        ("^", np.nanmax(x.get_ydata()) > high), ("v", np.nanmin(x.get_ydata()) < low)
+                    )
+                    if out
+                }  # fmt: skip
+                assert ax.name == "3d" or beyond <= marks, (name, complete, ax.get_ylabel())
+
+
+def test_what_stands_still_is_told_in_words(triangle):
+    """Of a height of 3 m that never changes the figure says so, in a low row, without a scale of rounding errors."""
+    place = np.broadcast_to([0.0, 0.0, 3.0], (181, 3)).copy()
+    place[:, 0] = triangle.time
+    place[:, 2] += 4e-8 * np.sin(triangle.time)
+    speed = np.broadcast_to([1.0, 0.0, 0.0], (181, 3))
+    phases = [("establish", 20.0)]
+    flight = a_flight(
+        cm=place, cm_velocity=speed, cm_reference=place, cm_velocity_reference=speed, phases=phases
+    )
+    figure = drawn("cm", flight)
+    assert "3 m throughout, within 4e-08" in texts(figure)
+    assert "1 m/s throughout" in texts(figure)
+    assert texts(figure).count("0 m/s throughout") == 2
+    x, speed_x, y, _, z, _ = figure.axes
+    assert list(z.get_yticks()) == [3.0]
+    assert y.bbox.height == pytest.approx(z.bbox.height)
+    assert z.bbox.height < 0.6 * x.bbox.height == pytest.approx(0.6 * speed_x.bbox.height)
+    moving = a_flight(cm=place + 0.01 * np.sin(triangle.time)[:, None], phases=phases)
+    assert not any("m throughout" in text for text in texts(figures.cm(moving)))
+
+
+def test_the_key_of_the_summary_reads_as_words():
+    """Phases without names are told by kind, not "1 establish 1", and a dot parts each from the next."""
+    phases = [("establish 1", 6.0), ("WP0: clear the ground", 7.0), ("fly 3", 7.0)]
+    words = " ".join(texts(figures.summary(a_flight(phases=phases))))
+    plain = words.replace("\N{NO-BREAK SPACE}", " ")
+    assert "Phases:  1 establish  ·  2 WP0: clear the ground  ·  3 fly" in plain
+
+
 def test_room_below_counts_only_agents_above_each_other():
     """Two spheres of 0.25 m, 2 m above each other: 1.5 m of room; side by side: none to speak of."""
     result = a_flight(n=2, formation=None, samples=2)
@@ -568,11 +727,21 @@ def test_every_formation_of_the_mission_is_drawn():
     assert {"shape", "row", "triangle, 3 edges", "line, 3 edges"} <= set(words)
 
 
-def test_still_air_has_no_figure_of_its_own(tmp_path):
-    """Where no air moves, the figure of its force is left out, and drawn when asked for."""
+def test_a_flight_has_no_empty_figures(tmp_path):
+    """Figures with nothing to show are left out, and say why when they are asked for."""
     calm = a_flight(disturbance_force=None)
-    assert "disturbance.svg" not in {p.name for p in figures.plot(calm, tmp_path, formats=["svg"])}
+    files = {p.stem for p in figures.plot(calm, tmp_path, formats=["svg"])}
+    assert files == set(figures.figure_names()) - {"disturbance"}
     assert "still air" in texts(figures.disturbance(calm))
+    unknown = np.full((181, 4), np.nan)
+    free = a_flight(n=4, formation=None, attitude=unknown, attitude_reference=unknown)
+    missing = set(figures.figure_names()) - set(figures.figure_names(free))
+    assert missing == {
+        "distances", "attitude", "constraint_force", "constraint_error", "formations",
+    }  # fmt: skip
+    assert "no body frame attached" in texts(figures.attitude(free))
+    alone = a_flight(n=1, formation=None, mission={"obstacles": [], "limits": {}})
+    assert "clearance" not in figures.figure_names(alone)
 
 
 # -- files
@@ -582,7 +751,7 @@ def test_files_appear_in_both_formats(triangle, tmp_path):
     """Each figure is a PNG of 150 to 200 dpi and an SVG whose text is text."""
     paths = figures.plot(triangle, tmp_path / "new" / "folder")
     assert {p.name for p in paths} == {
-        f"{name}.{kind}" for name in figures.figure_names(disturbed=True) for kind in ("png", "svg")
+        f"{name}.{kind}" for name in figures.figure_names() for kind in ("png", "svg")
     }
     assert sorted(p.name for p in (tmp_path / "new" / "folder").iterdir()) == sorted(
         p.name for p in paths
@@ -607,6 +776,58 @@ def test_names_and_formats_choose(triangle, tmp_path):
     paths = figures.plot(triangle, tmp_path, formats=["svg"], names=["cm", "distances"])
     assert [p.name for p in paths] == ["cm.svg", "distances.svg"]
     assert sorted(tmp_path.iterdir()) == sorted(paths)
+
+
+@pytest.mark.parametrize("name", ["inputs", "summary", "trajectory", "formations"])
+def test_titles_may_be_left_out(triangle, tmp_path, name):
+    """Without titles neither title nor mission is drawn, what is drawn fills the picture, and all else is the same."""
+    with_, without = (
+        figures.plot(triangle, tmp_path / str(on), names=[name], formats=["svg", "png"], titles=on)
+        for on in (True, False)
+    )
+    words, rest = (
+        [t for e in ET.parse(p[0]).iter() if e.tag.endswith("}text") for t in e.itertext()]
+        for p in (with_, without)
+    )
+    gone = list(words)
+    for word in rest:
+        gone.remove(word)
+    title = "A made-up flight" if name == "summary" else None
+    assert len(gone) == 2
+    assert "made-up" in gone
+    assert title is None or title in gone
+    with Image.open(without[1]) as image:
+        ink = np.asarray(image.convert("L")) < 250
+        rows = np.flatnonzero(ink.any(axis=1))
+        assert rows[0] < 40
+        assert image.height - rows[-1] < 40
+    assert "A made-up flight" in texts(figures.summary(triangle)), "titles are back afterwards"
+
+
+def test_an_incomplete_flight_says_so_without_titles(tmp_path):
+    """That a flight stopped is no title: it is on the figure all the same."""
+    stopped = a_flight(complete=False, ending="singular")
+    (path,) = figures.plot(stopped, tmp_path, names=["inputs"], formats=["svg"], titles=False)
+    words = " ".join(
+        "".join(e.itertext()) for e in ET.parse(path).iter() if e.tag.endswith("}text")
+    )
+    assert "incomplete, stopped at 20.00 s" in words
+    assert "Thrust of each agent" not in words
+    with style.titles(shown=False):
+        figure = drawn("inputs", stopped)
+    assert figure._suptitle is not None
+    warning = figure._suptitle.get_window_extent().corners()
+    assert not any(overlap(warning, corners(label)) for label in by_gid(figure, "phase"))
+
+
+def test_pdf_is_written(triangle, tmp_path):
+    """A PDF begins as one and ends as one, and is the same when written again."""
+    (first,) = figures.plot(triangle, tmp_path / "a", names=["inputs"], formats=["pdf"])
+    (second,) = figures.plot(triangle, tmp_path / "b", names=["inputs"], formats=["pdf"])
+    data = first.read_bytes()
+    assert data.startswith(b"%PDF-")
+    assert data.rstrip().endswith(b"%%EOF")
+    assert data == second.read_bytes()
 
 
 @pytest.mark.parametrize(

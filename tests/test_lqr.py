@@ -8,6 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 from scipy.interpolate import PPoly
+from scipy.linalg import expm, solve_continuous_are
+from scipy.optimize import brentq
 
 from rigidfleet.lqr import (
     closed_loop_response,
@@ -266,6 +268,227 @@ def test_what_is_kept_is_not_handed_out():
     assert np.abs(stiffer - before).max() > 0.1
 
 
+# -- cross weights, and weights that are not positive
+
+# The case of Drake's finite_horizon_linear_quadratic_regulator_test: Q - N R^-1 N^T is indefinite.
+DRAKE = {"Q": np.eye(2), "R": np.array([[4.12]]), "N": np.array([[2.2], [1.3]])}
+
+
+def indefinite_system(seed, n=4, m=2, more=0.0):
+    """A, B, Q, R, N of which Q and Q - N R^-1 N^T have negative eigenvalues; ``more`` is added to Q."""
+    rng = np.random.default_rng(seed)
+    C = rng.normal(size=(n, n))
+    Q, R = C + C.T + more * np.eye(n), np.diag(rng.uniform(0.5, 2, m))
+    return rng.normal(size=(n, n)), rng.normal(size=(n, m)), Q, R, rng.normal(size=(n, m))
+
+
+def riccati(t, P, A, B, Q, R, N):
+    """dP/dtau, flat, as it stands in textbooks."""
+    P = P.reshape(A.shape)
+    return (A.T @ P + P @ A - (P @ B + N) @ np.linalg.solve(R, B.T @ P + N.T) + Q).ravel()
+
+
+def escape(S, A, B, Q, R, N, most):
+    """When the Riccati equation from S first grows beyond all bounds: its linear form turns singular."""
+    F = A - B @ np.linalg.solve(R, N.T)
+    W = Q - N @ np.linalg.solve(R, N.T)
+    H = np.block([[F, -B @ np.linalg.solve(R, B.T)], [-W, -F.T]])
+
+    start = np.vstack([np.eye(len(A)), S])
+    step = most / 4000
+    once, state = expm(-H * step), start
+    for k in range(4000):
+        if np.linalg.det((state := once @ state)[: len(A)]) <= 0.0:
+            return brentq(
+                lambda t: np.linalg.det((expm(-H * t) @ start)[: len(A)]),
+                k * step, (k + 1) * step, xtol=1e-14, rtol=1e-14,
+            )  # fmt: skip
+    return None
+
+
+def told(error):
+    """The time that an error message names [s]."""
+    return float(str(error.value).split("time to go of ")[1].split(" s")[0])
+
+
+def test_drakes_case_of_a_cross_weight():
+    """With N = (2.2, 1.3), Drake's claims hold: 40 s from zero lead to its infinite horizon, which stays."""
+    K, P = infinite_horizon(A, B, **DRAKE)
+    # By hand: (p12 + n1)^2 = r q1, (p22 + n2)^2 = r (q2 + 2 p12), p11 = (p12 + n1)(p22 + n2)/r.
+    k1 = np.sqrt(4.12)
+    k2 = np.sqrt(4.12 * (1 + 2 * (k1 - 2.2)))
+    assert K[0] == pytest.approx(np.array([k1, k2]) / 4.12, rel=1e-14)
+    assert (
+        pytest.approx(np.array([[k1 * k2 / 4.12, k1 - 2.2], [k1 - 2.2, k2 - 1.3]]), rel=1e-13) == P
+    )
+    from_zero, gain = finite_horizon(A, B, S=np.zeros((2, 2)), time_to_go=40.0, **DRAKE)
+    assert pytest.approx(P, abs=1e-5) == from_zero
+    assert pytest.approx(K, abs=1e-5) == gain
+    stays, gain = finite_horizon(A, B, S=P, time_to_go=2.0, **DRAKE)
+    assert pytest.approx(P, abs=1e-12) == stays
+    assert pytest.approx(K, abs=1e-12) == gain
+
+
+def test_two_inputs_with_a_cross_weight():
+    """The infinite horizon of Drake's affine case, two inputs and a full N, is python-control's."""
+    system = (
+        np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[5.0, 6.0], [7.0, 8.0]]),
+        np.array([[0.8, 0.7], [0.7, 0.9]]), np.array([[1.4, 0.2], [0.2, 1.2]]),
+    )  # fmt: skip
+    N = np.array([[0.1, 0.2], [0.3, 0.4]])
+    K_control, P_control, _ = control.lqr(*system, N)
+    K, P = infinite_horizon(*system, N=N)
+    assert pytest.approx(K_control, rel=1e-9) == K
+    assert pytest.approx(P_control, rel=1e-9) == P
+    later = finite_horizon(*system, P, 70.0, N=N)[0]
+    assert pytest.approx(P, rel=1e-12) == later
+
+
+def test_infinite_horizon_of_any_weights():
+    """Of 60 random Q and N of either sign, those with a stabilising solution have SciPy's; others are refused."""
+    solved = 0
+    for seed in range(60):
+        system = A4, B4, Q4, R4, N4 = indefinite_system(seed, more=2.0)
+        try:
+            expected = solve_continuous_are(A4, B4, Q4, R4, s=N4)
+            K = np.linalg.solve(R4, B4.T @ expected + N4.T)
+            # It also returns what solves nothing.
+            exists = np.abs(riccati(0.0, expected, *system)).max() < 1e-8
+            exists &= np.linalg.eigvals(A4 - B4 @ K).real.max() < 0.0
+        except np.linalg.LinAlgError:
+            exists = False
+        if not exists:
+            with pytest.raises(ValueError, match="imaginary axis"):
+                infinite_horizon(A4, B4, Q4, R4, N=N4)
+            continue
+        solved += 1
+        gain, P = infinite_horizon(A4, B4, Q4, R4, N=N4)
+        assert pytest.approx(expected, rel=1e-8, abs=1e-8) == P
+        assert pytest.approx(K, rel=1e-8, abs=1e-8) == gain
+    assert 20 <= solved <= 40
+
+
+def test_substitution_is_the_cross_weight():
+    """In the input u + R^-1 N^T x there is no N, Q is indefinite, and cost and flight are the same."""
+    R, N = DRAKE["R"], DRAKE["N"]
+    F, W = A - B @ N.T / R, DRAKE["Q"] - N @ N.T / R
+    assert np.linalg.eigvalsh(W)[0] < -0.1
+    K, P = infinite_horizon(A, B, **DRAKE)
+    K_v, P_v = infinite_horizon(F, B, W, R)
+    assert pytest.approx(P, rel=1e-12) == P_v
+    assert pytest.approx(K - N.T / R, rel=1e-12) == K_v
+    x0, t = np.array([1.0, -0.5]), np.linspace(0.0, 3.0, 7)
+    x, u = closed_loop_response(A, B, **DRAKE, S=[5.0, 1.0], T=3.0, x0=x0, times=t)
+    x_v, v = closed_loop_response(F, B, W, R, [5.0, 1.0], 3.0, x0, t)
+    assert pytest.approx(x, abs=1e-13) == x_v
+    assert pytest.approx(v - x @ N / R, abs=1e-12) == u
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    st.floats(-2.0, 2.0), st.floats(-3.0, 3.0), st.floats(0.1, 10.0), st.floats(0.1, 10.0),
+    st.floats(0.1, 4.0),
+)  # fmt: skip
+def test_of_a_double_integrator_a_cross_weight_is_another_weight(n1, n2, r, q1, tau):
+    """N = (n1, n2) is Q22 - 2 n1, S12 + n1 and S22 + n2: x a and v a are rates, but for -v^2."""
+    q2 = 2.0 * abs(n1) + 0.5
+    P, K = finite_horizon(A, B, [q1, q2], r, [9.0, 9.0], tau, N=[n1, n2])
+    end = np.array([[0.0, n1], [n1, n2]])
+    P_other, K_other = finite_horizon(A, B, [q1, q2 - 2.0 * n1], r, np.diag([9.0, 9.0]) + end, tau)
+    size = np.abs(P_other).max()
+    assert pytest.approx(P_other - end, abs=1e-11 * size) == P
+    assert pytest.approx(K_other, abs=1e-11 * size / r) == K
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_any_weights_follow_the_riccati_equation(seed):
+    """As long as the cost has a minimum, P is what integrating the Riccati equation gives."""
+    system = indefinite_system(seed)
+    S4 = np.diag([3.0, 0.0, -0.5, 1.0])
+    T = 0.9 * (escape(S4, *system, 4.0) or 4.0)
+    times = np.linspace(0.0, T, 5)
+    expected = solve_ivp(
+        riccati, (0.0, T), S4.ravel(), "DOP853", times, args=system, rtol=1e-12, atol=1e-12
+    ).y.T
+    P, _ = finite_horizon(*system[:4], S4, times, N=system[4])
+    assert pytest.approx(expected.reshape(P.shape), rel=1e-8, abs=1e-8) == P
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_a_cost_without_minimum_is_refused_with_its_time(seed):
+    """The Riccati equation's escape is told to 1e-8; just before it all is well, and from it on all is refused."""
+    system, S4 = indefinite_system(seed), np.diag([1.0, 0.0, 0.0, 2.0])
+    expected = escape(S4, *system, 6.0)
+    if expected is None:
+        assert np.isfinite(finite_horizon(*system[:4], S4, [3.0, 6.0], N=system[4])[0]).all()
+        return
+    P, _ = finite_horizon(*system[:4], S4, expected * (1 - 1e-6), N=system[4])
+    assert np.linalg.eigvalsh(P)[0] < -1e4
+    for beyond in (expected * (1 + 1e-6), 2 * expected, 1e3 * expected):
+        with pytest.raises(ValueError, match="no minimum") as error:
+            finite_horizon(*system[:4], S4, [0.1 * expected, beyond], N=system[4])
+        assert told(error) == pytest.approx(expected, rel=1e-8)
+        with pytest.raises(ValueError, match="no minimum"):
+            closed_loop_response(*system[:4], S4, beyond, np.ones(4), [0.0], N=system[4])
+
+
+@pytest.mark.parametrize("seed", [3, 14, 77])
+@pytest.mark.parametrize("S1", [0.0, 5.0])
+def test_escapes_in_closed_form(seed, S1):
+    """x' = a x + u with q < -a^2 escapes when its tangent does, however far beyond the horizon reaches."""
+    a, q = np.random.default_rng(seed).uniform([0.1, -20.0], [0.9, -1.0])
+    # P = a - w tan(w tau + phase), of the angular velocity w.
+    w = np.sqrt(-q - a * a)
+    expected = (np.pi / 2 - np.arctan((a - S1) / w)) / w
+    for T in (1.001 * expected, 1e6):
+        with pytest.raises(ValueError, match="no minimum") as error:
+            finite_horizon([[a]], [[1.0]], [q], [1.0], [S1], T)
+        assert told(error) == pytest.approx(expected, rel=1e-9)
+    P, _ = finite_horizon([[a]], [[1.0]], [q], [1.0], [S1], 0.9 * expected)
+    phase = np.arctan((a - S1) / w)
+    assert P[0, 0] == pytest.approx(a - w * np.tan(0.9 * w * expected + phase), rel=1e-10)
+
+
+def test_the_last_weight_with_an_infinite_horizon():
+    """Q22 = -2 sqrt(Q11 R) puts a double eigenvalue on the axis, and is refused; a millionth more is not."""
+    with pytest.raises(ValueError, match="eigenvalue 1i on the imaginary axis"):
+        infinite_horizon(A, B, [1.0, -2.0], 1.0)
+    K, _ = infinite_horizon(A, B, [1.0, -2.0 + 1e-6], 1.0)
+    assert K[0] == pytest.approx([1.0, 1e-3], rel=1e-6)
+    assert double_integrator_gains([1.0, -2.0 + 1e-6], 1.0) == pytest.approx(tuple(K[0]), rel=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_no_cost_that_is_positive_is_refused(seed):
+    """Where [[Q, N], [N^T, R]] is positive semi-definite, even of rank one, horizons of any length are solved."""
+    rng = np.random.default_rng(seed)
+    C = rng.normal(size=(1, 3))
+    Q, N, R = C[:, :2].T @ C[:, :2], C[:, :2].T @ C[:, 2:], C[:, 2:].T @ C[:, 2:]
+    P, _ = finite_horizon(A, B, Q, R, [1.0, 0.0], [0.0, 1.0, 1e2], N=N)
+    assert np.linalg.eigvalsh(P).min() > -1e-9 * np.abs(P).max()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_cost_with_a_cross_weight_is_what_the_motion_costs(seed):
+    """x0^T P x0 / 2 is the cost of the optimal motion, its cross term included, by Gauss-Legendre quadrature."""
+    A4, B4, Q4, R4, N4 = system = indefinite_system(seed)
+    S4, x0 = np.diag([1.0, 2.0, 30.0, 0.0]), np.array([1.0, -2.0, 0.5, 3.0])
+    T = min(1.5, 0.8 * (escape(S4, *system, 4.0) or 4.0))
+    node, share = np.polynomial.legendre.leggauss(60)
+    times = np.append(0.5 * T * (node + 1.0), T)
+    x, u = closed_loop_response(A4, B4, Q4, R4, S4, T, x0, times, N=N4)
+    running = np.einsum("ki,ij,kj->k", x, Q4, x) + np.einsum("ki,ij,kj->k", u, R4, u)
+    running += 2.0 * np.einsum("ki,ij,kj->k", x, N4, u)
+    cost = 0.5 * (x[-1] @ S4 @ x[-1] + 0.5 * T * share @ running[:-1])
+    P, _ = finite_horizon(A4, B4, Q4, R4, S4, T, N=N4)
+    assert cost == pytest.approx(0.5 * x0 @ P @ x0, rel=1e-9)
+    flown = solve_ivp(
+        lambda t, y: A4 @ y - B4 @ finite_horizon(A4, B4, Q4, R4, S4, T - t, N=N4)[1] @ y,
+        (0.0, T), x0, "DOP853", rtol=1e-10, atol=1e-10,
+    ).y[:, -1]  # fmt: skip
+    assert x[-1] == pytest.approx(flown, abs=1e-7)
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
@@ -273,11 +496,14 @@ def test_what_is_kept_is_not_handed_out():
         (lambda: infinite_horizon(A, [[1.0], [0.0]], [1.0, 1.0], 1.0), "does not reach"),
         (lambda: infinite_horizon(A, B, [1.0, 1.0], 0.0), "R must be positive"),
         (lambda: infinite_horizon(A, B, [[1.0, 0.5], [0.0, 1.0]], 1.0), "symmetric"),
-        (lambda: infinite_horizon(A, B, [1.0, -1.0], 1.0), "Q must not be negative"),
+        (lambda: infinite_horizon(A, B, [1.0, -3.0], 1.0), "no least value .* swing at"),
+        (lambda: infinite_horizon(A, B, [1.0, 1.0], 1.0, N=[[1.0, 2.0]]), r"N must be \(2, 1\)"),
+        (lambda: infinite_horizon(A, B, [1.0, 1.0], 1.0, N=[1.0, np.nan]), "N must be finite"),
+        (lambda: double_integrator_gains([4.0, -4.0], 1.0), r"Q\[1\] must be greater than .* -4$"),
         (lambda: infinite_horizon(A, B, [1.0, np.inf], 1.0), "Q must be finite"),
         (lambda: infinite_horizon(A, B, [1.0], 1.0), r"Q must be \(2, 2\)"),
         (lambda: infinite_horizon(A[:1], B, [1.0, 1.0], 1.0), r"A must be \(n, n\)"),
-        (lambda: infinite_horizon(A * np.nan, B, [1.0, 1.0], 1.0), "A and B must be finite"),
+        (lambda: infinite_horizon(A * np.nan, B, [1.0, 1.0], 1.0), "A, B and N must be finite"),
         (lambda: double_integrator_gains([0.0, 1.0], 1.0), r"Q\[0\] > 0"),
         (lambda: finite_horizon(A, B, [1.0, 1.0], 1.0, S, [1.0, -0.1]), "not negative"),
         (lambda: closed_loop_response(A, B, [1, 1], 1, S, 2.0, np.zeros(3), [0.0]), "2 rows"),

@@ -110,7 +110,7 @@ def test_page_is_whole(calm, tmp_path):
     path = tmp_path / "report.html"
     report(calm, path)
     page = Page(path.read_text(encoding="utf-8"))
-    assert len(page.sources) == len(figures.figure_names()) + 1  # and the answer of the gains
+    assert len(page.sources) == len(figures.figure_names(calm)) + 1  # and the answer of the gains
     for source in page.sources:
         head, _, data = source.partition(",")
         assert head == "data:image/svg+xml;base64"

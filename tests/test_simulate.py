@@ -1187,3 +1187,15 @@ def test_a_result_knows_the_mission_that_was_flown():
     """Not one read again: what has been made of it once, edges and slots assigned, serves the verdict, too."""
     mission = load_mission("establish-triangle")
     assert simulate(mission).mission is mission
+
+
+@pytest.mark.parametrize("kind", ["hold", "reshape"])
+def test_what_stays_flies_to_rest_by_its_end(kind):
+    """After a waypoint passed at 2 m/s, 9 s of hold or reshape swing 4/27 v T beyond it, and end on it at rest."""
+    stay = {"kind": kind, "duration": 9.0} | ({} if kind == "hold" else {"formation": "triangle"})
+    passed = {"kind": "fly", "position": [20.0, 5.0, 5.0], "velocity": [2.0, 0.0, 0.0]}
+    result = simulate(a_mission(establish(), passed | {"duration": 10.0}, stay))
+    rows = result.samples(2)
+    assert np.max(result.cm[rows, 0]) - 20.0 == pytest.approx(4 / 27 * 2.0 * 9.0, abs=0.02)
+    np.testing.assert_allclose(result.cm[rows][-1], [20.0, 5.0, 5.0], rtol=0, atol=1e-3)
+    np.testing.assert_allclose(result.cm_velocity[rows][-1], 0.0, atol=1e-2)

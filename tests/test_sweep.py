@@ -803,6 +803,20 @@ def test_a_map_shows_rates_where_the_runs_are():
         over_two(found, ["agents.mas", "agents.radius"])
 
 
+def test_figures_without_titles(tmp_path):
+    """Without titles a sweep's figures name neither themselves nor the sweep, and PDF is one of their formats."""
+    files = plot(made(), tmp_path, formats=["svg", "pdf"], titles=False)
+    assert {p.suffix for p in files} == {".svg", ".pdf"}
+    for path in files:
+        if path.suffix == ".pdf":
+            assert path.read_bytes().startswith(b"%PDF-")
+            continue
+        words = path.read_text(encoding="utf-8")
+        assert not any(
+            title in words for title in ("Outcome", "Metrics of all runs", " runs</text>")
+        )
+
+
 def test_little_is_drawn_as_well(tmp_path):
     """A sweep without failures, of a single run, or stopped early, draws what there is."""
     for table in (made(1), made(3), made(5, runs=50)):

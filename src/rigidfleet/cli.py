@@ -42,6 +42,10 @@ if TYPE_CHECKING:
 
 PASSED, FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 
+#: A format of figures, and those drawn unless others are asked for.
+Format = Literal["png", "svg", "pdf"]
+_DRAWN: tuple[Format, ...] = ("png", "svg")
+
 #: A design of so many agents is compared with all pairs; one of more than the latter is judged by the ends of its
 #: spectrum alone.
 _COMPARED, _DENSE = 60, 200
@@ -104,6 +108,8 @@ def run(
     out: Path | None = None,
     force: bool = False,
     no_figures: bool = False,
+    format: list[Format] | None = None,
+    no_titles: bool = False,
     replay: bool = False,
     csv: bool = False,
     json: bool = False,
@@ -121,6 +127,10 @@ def run(
         Replace the files of an earlier flight; without it they are kept and nothing is flown.
     no_figures : bool
         Draw no figures; "rigidfleet report" can do so later.
+    format : list
+        Format of the figures, png and svg if not given; may be repeated: --format pdf --format png.
+    no_titles : bool
+        Draw figures without titles, for a paper with captions.
     replay : bool
         Also write replay.html: the flight to be watched in a browser.
     csv : bool
@@ -159,7 +169,7 @@ def run(
             if replay:
                 _write_replay(result, files.replay)
             if not no_figures:
-                _draw(result, files.figures, quiet=quiet)
+                _draw(result, files.figures, format, titles=not no_titles, quiet=quiet)
         except KeyboardInterrupt:
             interrupted = True
     if not (json or quiet):
@@ -508,6 +518,8 @@ def report(
     out: Path | None = None,
     force: bool = False,
     no_figures: bool = False,
+    format: list[Format] | None = None,
+    no_titles: bool = False,
     json: bool = False,
     quiet: bool = False,
 ) -> int:
@@ -528,6 +540,10 @@ def report(
         Replace files that are there already; without it they are kept.
     no_figures : bool
         Write no files of figures; those in the report are drawn in any case.
+    format : list
+        Format of these files, png and svg if not given; may be repeated: --format pdf --format png.
+    no_titles : bool
+        Draw these files without titles, for a paper with captions.
     json : bool
         Print the verdict as JSON; of several flights a list of them.
     quiet : bool
@@ -560,12 +576,13 @@ def report(
     else:
         if not (json or quiet):
             screen.out().print(verdicts[0])
-        drawn = [] if no_figures else files.figures
+        drawn = [] if no_figures else _of_formats(files.figures, format)
         made = [files.verdict, files.report, *drawn]
         kept = [] if force else [path for path in made if path.exists()]
         if files.verdict not in kept:
             write_file(files.verdict, (verdicts[0].json() + "\n").encode())
-        _draw(records[0], [path for path in drawn if path not in kept], quiet=quiet)
+        left = [path for path in drawn if path not in kept]
+        _draw(records[0], left, format, titles=not no_titles, quiet=quiet)
         if files.report not in kept:
             _write_report(records, verdicts, files.report, quiet=quiet)
         if not (json or quiet):
@@ -714,6 +731,8 @@ def sweep(
     map_: Annotated[tuple[str, str] | None, Parameter(name="--map")] = None,
     metric: str = "",
     no_figures: bool = False,
+    format: list[Format] | None = None,
+    no_titles: bool = False,
     json: bool = False,
     quiet: bool = False,
 ) -> int:
@@ -750,6 +769,10 @@ def sweep(
         What the map shows: success or a metric.
     no_figures : bool
         Draw no figures.
+    format : list
+        Format of the figures, png and svg if not given; may be repeated: --format pdf --format png.
+    no_titles : bool
+        Draw figures without titles, for a paper with captions.
     json : bool
         Print the summary as JSON.
     quiet : bool
@@ -789,7 +812,10 @@ def sweep(
 
         shown = screen.err().is_interactive and not quiet
         with screen.err().status("Drawing the figures") if shown else nullcontext():
-            drawn = plot(table, folder / "figures", over=map_ or (), metric=metric)
+            drawn = plot(
+                table, folder / "figures", formats=format or _DRAWN, over=map_ or (), metric=metric,
+                titles=not no_titles,
+            )  # fmt: skip
     if not (json or quiet):
         screen.out().print(f"\nRuns     {folder / store.FILE}", soft_wrap=True)
         screen.out().print(f"Summary  {folder / 'summary.json'}", soft_wrap=True)
@@ -893,22 +919,35 @@ def _heeding_interrupts() -> Generator[None]:
         signal.signal(signal.SIGINT, before)
 
 
-def _draw(result: Result, figures: Iterable[Path], *, quiet: bool = False) -> None:
+def _of_formats(figures: Iterable[Path], formats: Iterable[Format] | None) -> list[Path]:
+    """Those of the figures' files that are of the formats asked for."""
+    kinds = {f".{kind}" for kind in formats or _DRAWN}
+    return [path for path in figures if path.suffix in kinds]
+
+
+def _draw(
+    result: Result,
+    figures: Iterable[Path],
+    kinds: Iterable[Format] | None,
+    *,
+    titles: bool,
+    quiet: bool = False,
+) -> None:
     """Draw figures, each to the file of its name, of which the flight has something to show."""
     from rigidfleet.figures import figure_names, plot
 
-    names = figure_names(disturbed=result.disturbance_force is not None)
+    names = figure_names(result)
     formats: dict[Path, list[str]] = {}
-    for path in figures:
+    for path in _of_formats(figures, kinds):
         if path.stem not in names:
             continue
         formats.setdefault(path.with_suffix(""), []).append(path.suffix[1:])
     shown = screen.err().is_interactive and not quiet
     with screen.err().status("Drawing the figures") if shown else nullcontext() as status:
-        for n, (path, kinds) in enumerate(formats.items(), start=1):
+        for n, (path, wanted) in enumerate(formats.items(), start=1):
             if status is not None:
                 status.update(f"Drawing figure {n} of {len(formats)}: {path.name}")
-            plot(result, path.parent, names=[path.name], formats=kinds)
+            plot(result, path.parent, names=[path.name], formats=wanted, titles=titles)
 
 
 def _write_report(

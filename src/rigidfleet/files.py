@@ -35,12 +35,12 @@ class Files:
     @property
     def figures(self) -> list[Path]:
         """All figures there may be."""
-        from rigidfleet.figures import figure_names
+        from rigidfleet.figures import FORMATS, figure_names
 
         return [
             self.folder / "figures" / f"{name}.{kind}"
-            for name in figure_names(disturbed=True)
-            for kind in ("png", "svg")
+            for name in figure_names()
+            for kind in FORMATS
         ]
 
     @property

@@ -1,12 +1,21 @@
 """Linear quadratic regulators: infinite and finite horizon, and the exact motions they make.
 
-For x' = A x + B u and the paper's cost (Table 2)
+For x' = A x + B u and the paper's cost (Table 2), here with a cross weight N (n, m),
 
-    J = 1/2 x(T)^T S x(T) + 1/2 int_0^T (x^T Q x + u^T R u) dt
+    J = 1/2 x(T)^T S x(T) + 1/2 int_0^T (x^T Q x + 2 x^T N u + u^T R u) dt
 
-the optimal input is u = -K x, K = R^-1 B^T P, where P(T - t) solves the Riccati equation back
-from P(0) = S. Weights are symmetric matrices, or lists of their diagonals. Each axis of a
-formation is a double integrator: x = (position, velocity), u the acceleration.
+the optimal input is u = -K x, K = R^-1 (B^T P + N^T), where P(T - t) solves the Riccati equation
+
+    dP/dtau = A^T P + P A - (P B + N) R^-1 (B^T P + N^T) + Q
+
+back from P(0) = S. Q, R and S are symmetric matrices, or lists of their diagonals; N is the N of
+python-control and Drake, the ``s`` of `scipy.linalg.solve_continuous_are`, and zero unless given.
+R is positive definite. Q, S and Q - N R^-1 N^T need not be: what is refused is a cost without a
+bounded minimum (see Willems 1971, doi:10.1109/TAC.1971.1099831).
+
+Each axis of a formation is a double integrator: x = (position, velocity), u the acceleration. Of
+one, N = (n1, n2) says nothing that Q and S cannot: x u and v u are the rates of x v and v^2/2 but for
+a -v^2, so that it is the same as Q22 - 2 n1, S12 + n1 and S22 + n2 without N.
 """
 
 import math
@@ -24,18 +33,25 @@ Key = tuple[tuple[int, ...], bytes]
 # sweep, and often from phase to phase.
 _KEPT = 512
 
+# A weight is negative where it is so by more than this part of its greatest entry.
+_ROUNDING = 1e-12
+
 # The double integrator.
 _A = np.array([[0.0, 1.0], [0.0, 0.0]])
 _B = np.array([[0.0], [1.0]])
 
 
-def infinite_horizon(A: ArrayLike, B: ArrayLike, Q: ArrayLike, R: ArrayLike) -> tuple[Array, Array]:
+def infinite_horizon(
+    A: ArrayLike, B: ArrayLike, Q: ArrayLike, R: ArrayLike, *, N: ArrayLike | None = None
+) -> tuple[Array, Array]:
     """Gain K (m, n) and cost P (n, n) for T to infinity: u = -K x.
 
-    P is the stabilising solution of A^T P + P A - P B R^-1 B^T P + Q = 0. ValueError where the
-    weights or shapes are wrong, or no gain both stabilises and is optimal.
+    P is the Riccati equation's stabilising rest point: the least cost of all inputs that bring x to
+    rest. ValueError where the weights or shapes are wrong, no input brings x to rest, or none does so
+    at least cost.
     """
-    A, B, Q, R = _system(A, B, Q, R)
+    A, B, Q, R, N = _system(A, B, Q, R, N)
+    F, G, W = _reduced(A, B, Q, R, N)
     for s in np.linalg.eigvals(A):
         mode = A - s * np.eye(len(A))
         if s.real >= 0.0 and np.linalg.matrix_rank(np.hstack([mode, B])) < len(A):
@@ -43,38 +59,50 @@ def infinite_horizon(A: ArrayLike, B: ArrayLike, Q: ArrayLike, R: ArrayLike) -> 
                 f"the input B does not reach the motion of A with eigenvalue {s:.3g}, which does not"
                 " settle by itself: no gain stabilises it"
             )
-        if s.real == 0.0 and np.linalg.matrix_rank(np.vstack([mode, Q])) < len(A):
+        if s.real == 0.0 and not N.any() and np.linalg.matrix_rank(np.vstack([mode, Q])) < len(A):
             raise ValueError(
                 f"Q does not weigh the motion of A with eigenvalue {s:.3g}, so that an infinite"
                 " horizon leaves it where it is: weigh it (for a double integrator the position,"
                 " Q[0] > 0), or use a finite horizon"
             )
     # The closed loop has the stable half of the Hamiltonian's eigenvalues, which are +- each other.
-    modes = np.linalg.eigvals(_hamiltonian(A, B @ _solve(R, B.T), Q))
+    H = _hamiltonian(F, G, W)
+    modes = np.linalg.eigvals(H)
     slowest = np.abs(modes.real).min()
-    if not slowest > 1e-12 * np.abs(modes).max():
+    start = np.eye(len(A))
+    if not _positive(W):
+        start = _stable_subspace(H)
+    elif not slowest > 1e-12 * np.abs(modes).max():
         raise ValueError(
             "the Riccati equation has no stabilising solution within rounding: bring the entries of"
             " Q and R closer together, or use a finite horizon"
         )
     # Over 40 of the slowest time constants the cost to go forgets what it is at the end.
-    P = _cost_to_go(A, B, Q, R, np.eye(len(A)), np.array(40.0 / slowest))
-    return _solve(R, B.T @ P), P
+    P = _cost_to_go(F, G, W, start, np.array(40.0 / slowest))
+    return _solve(R, B.T @ P + N.T), P
 
 
 def finite_horizon(
-    A: ArrayLike, B: ArrayLike, Q: ArrayLike, R: ArrayLike, S: ArrayLike, time_to_go: ArrayLike
+    A: ArrayLike,
+    B: ArrayLike,
+    Q: ArrayLike,
+    R: ArrayLike,
+    S: ArrayLike,
+    time_to_go: ArrayLike,
+    *,
+    N: ArrayLike | None = None,
 ) -> tuple[Array, Array]:
     """Cost P (..., n, n) and gain K (..., m, n) at times to go T - t (...) [s]: u = -K x.
 
     From the exponential of the Hamiltonian matrix, taken over a short step and doubled in a form
     that keeps every part positive, so that horizons of any length neither overflow nor cancel.
-    With Q = 0 it is P = Phi^T (S^-1 + W)^-1 Phi. ValueError where a time to go is negative.
+    With Q = 0 it is P = Phi^T (S^-1 + W)^-1 Phi. ValueError where a time to go is negative, or so long
+    that the cost has no minimum: it says from which time on.
     """
-    A, B, Q, R = _system(A, B, Q, R)
+    A, B, Q, R, N = _system(A, B, Q, R, N)
     S = _weight("S", S, len(A))
-    P = _cost_to_go(A, B, Q, R, S, _times("time_to_go", time_to_go))
-    return P, _solve(R, B.T @ P)
+    P = _cost_to_go(*_reduced(A, B, Q, R, N), S, _times("time_to_go", time_to_go))
+    return P, _solve(R, B.T @ P + N.T)
 
 
 def closed_loop_response(
@@ -86,37 +114,47 @@ def closed_loop_response(
     T: float,
     x0: ArrayLike,
     times: ArrayLike,
+    *,
+    N: ArrayLike | None = None,
 ) -> tuple[Array, Array]:
     """Optimal states x (K, n, ...) and inputs u (K, m, ...) at times (K,) [s] in [0, T] from x0 (n, ...).
 
     The solution of the Hamiltonian's boundary problem, not an integration: every time stands for
-    itself. ValueError where a time lies outside [0, T].
+    itself. ValueError where a time lies outside [0, T], or the cost over T has no minimum.
     """
     A, x0 = np.asarray(A, dtype=float), np.asarray(x0, dtype=float)
+    N = np.zeros(np.shape(B)) if N is None else N
     if x0.shape[:1] != A.shape[:1]:
         raise ValueError(f"x0 must have {len(A)} rows, one per state, not the shape {x0.shape}")
-    x, u = _responses(*map(_key, (A, B, Q, R, S, T, times)))
+    x, u = _responses(*map(_key, (A, B, Q, R, N, S, T, times)))
     return np.tensordot(x, x0, axes=1), np.tensordot(u, x0, axes=1)
 
 
 def double_integrator_gains(Q: ArrayLike, R: ArrayLike) -> tuple[float, float]:
     """Infinite-horizon gains k1 [1/s^2], k2 [1/s] of a double integrator: u = -k1 x - k2 v.
 
-    In closed form: k1 = sqrt(q1/r), k2 = sqrt(q2/r + 2 k1), whatever couples the two in Q.
+    In closed form: k1 = sqrt(q1/r), k2 = sqrt(q2/r + 2 k1), whatever couples the two in Q. ValueError
+    unless q1 and q2/r + 2 k1 are positive.
     """
     return _gains(_key(Q), _key(R))
 
 
 @lru_cache(_KEPT)
 def _gains(Q_key: Key, R_key: Key) -> tuple[float, float]:
-    _, _, Q, R = _system(_A, _B, _array(Q_key), _array(R_key))
+    _, _, Q, R, _ = _system(_A, _B, _array(Q_key), _array(R_key))
     if not Q[0, 0] > 0.0:
         raise ValueError(
             "an infinite horizon needs a weight on the position, Q[0] > 0: without one nothing"
             " draws a resting vehicle to its target; or use a finite horizon"
         )
     k1 = math.sqrt(Q[0, 0] / R[0, 0])
-    return k1, math.sqrt(Q[1, 1] / R[0, 0] + 2.0 * k1)
+    square = Q[1, 1] / R[0, 0] + 2.0 * k1
+    if not square > 0.0:
+        raise ValueError(
+            f"a weight of {Q[1, 1]:g} on the velocity rewards to swing without end: Q[1] must be"
+            f" greater than -2 sqrt(Q[0] R) = {-2.0 * k1 * R[0, 0]:g}"
+        )
+    return k1, math.sqrt(square)
 
 
 def finite_horizon_trajectory(
@@ -177,7 +215,7 @@ def knots(
 @lru_cache(_KEPT)
 def _knots(T: float, Q_key: Key, R_key: Key, S_key: Key, tolerance: float) -> Array:
     S = _array(S_key)
-    _, _, Q, R = _system(_A, _B, _array(Q_key), _array(R_key))
+    _, _, Q, R, _ = _system(_A, _B, _array(Q_key), _array(R_key))
     fastest = np.abs(np.linalg.eigvals(_hamiltonian(_A, _B @ _solve(R, _B.T), Q))).max()
     inside = np.array([0.25, 0.5, 0.75])
     powers = np.arange(6)
@@ -240,17 +278,18 @@ def _quintics(h: Array, x: ArrayLike, v: ArrayLike, a: ArrayLike) -> Array:
 
 @lru_cache(_KEPT)
 def _responses(*keys: Key) -> tuple[Array, Array]:
-    """States (K, n, n) and inputs (K, m, n) from each state alone; of A, B, Q, R, S, T and times."""
+    """States (K, n, n) and inputs (K, m, n) from each state alone; of A, B, Q, R, N, S, T and times."""
     *system, S, T, times = map(_array, keys)
-    A, B, Q, R = _system(*system)
+    A, B, Q, R, N = _system(*system)
     S = _weight("S", S, len(A))
     t, T = _times("times", times), float(_times("T", T))
     if t.ndim != 1 or np.any(t > T * (1.0 + 1e-12)):
         raise ValueError(f"times must be a list of times between 0 and T = {T} s")
-    P = _cost_to_go(A, B, Q, R, S, np.maximum(T - t, 0.0))
-    Phi, W, _ = _propagate(A, B @ _solve(R, B.T), Q, t)
-    x = _solve(np.eye(len(A)) + W @ P, Phi)
-    return x, -_solve(R, B.T @ P @ x)
+    reduced = _reduced(A, B, Q, R, N)
+    P = _cost_to_go(*reduced, S, np.maximum(T - t, 0.0))
+    X, Phi, W, _ = _flow(*reduced, S, t, T)
+    x = _solve(np.eye(len(A)) + W @ (P - X), Phi)
+    return x, -_solve(R, (B.T @ P + N.T) @ x)
 
 
 @lru_cache(_KEPT)
@@ -259,10 +298,9 @@ def _cost_at_rest(Q: Key, R: Key) -> Array:
 
     Its Riccati equation has a solution in closed form, exact whatever the weights.
     """
-    _, _, weights, effort = _system(_A, _B, _array(Q), _array(R))
+    _, _, weights, effort, _ = _system(_A, _B, _array(Q), _array(R))
     (a, b), (_, d), r = *weights.tolist(), float(effort[0, 0])
-    if not a > 0.0:
-        return infinite_horizon(_A, _B, weights, effort)[1]  # says what is wrong
+    _gains(Q, R)  # says what is wrong, if anything is
     cross = math.sqrt(a) * math.sqrt(r)
     last = math.sqrt(r) * math.sqrt(d + 2.0 * cross)
     return np.array([[cross * last / r - b, cross], [cross, last]])
@@ -278,24 +316,107 @@ def _array(key: Key) -> Array:
     return np.frombuffer(data).reshape(shape)
 
 
-def _cost_to_go(A: Array, B: Array, Q: Array, R: Array, S: Array, tau: Array) -> Array:
+def _reduced(A: Array, B: Array, Q: Array, R: Array, N: Array) -> tuple[Array, Array, Array]:
+    """The same problem without N, in the input u + R^-1 N^T x: its A, B R^-1 B^T and Q."""
+    G = B @ _solve(R, B.T)
+    if not N.any():
+        return A, G, Q
+    rest = Q - N @ _solve(R, N.T)
+    value, vector = np.linalg.eigh(0.5 * (rest + rest.T))
+    if -_ROUNDING * np.abs(Q).max() <= value[0] < 0.0:  # of zero, what rounding has left
+        value = value.clip(min=0.0)
+    return A - B @ _solve(R, N.T), G, (vector * value) @ vector.T
+
+
+def _positive(weight: Array) -> bool:
+    """Whether a weight is positive semi-definite, to rounding."""
+    return bool(np.linalg.eigvalsh(weight)[0] >= -_ROUNDING * np.abs(weight).max())
+
+
+def _cost_to_go(A: Array, G: Array, Q: Array, S: Array, tau: Array) -> Array:
     """P (..., n, n) at times to go tau (...)."""
-    Phi, W, V = _propagate(A, B @ _solve(R, B.T), Q, tau)
-    P = V + _transposed(Phi) @ _solve(np.eye(len(A)) + S @ W, S @ Phi)
+    X, Phi, W, V = _flow(A, G, Q, S, tau, tau.max(initial=0.0))
+    D = S - X
+    P = X + V + _transposed(Phi) @ _solve(np.eye(len(A)) + D @ W, D @ Phi)
     return 0.5 * (P + _transposed(P))
 
 
-def _propagate(A: Array, G: Array, Q: Array, tau: Array) -> tuple[Array, Array, Array]:
+def _flow(
+    A: Array, G: Array, Q: Array, S: Array, tau: Array, T: float
+) -> tuple[Array, Array, Array, Array]:
+    """X (n, n) and Phi, W, V (..., n, n) over tau (...), as `_propagate` has them of P - X.
+
+    ValueError where P, from S, does not exist at all times to go up to T.
+    """
+    if _positive(Q) and _positive(S):
+        return np.zeros_like(Q), *_propagate(A, G, Q, tau, _rate(A, G, Q))[:3]
+    # P - S starts from zero. Its Phi, W and V therefore exist exactly as long as P does.
+    GS = G @ S
+    A, Q = A - GS, A.T @ S + S @ A - S @ GS + Q
+    rate = float(np.linalg.norm(A, 2) + np.sqrt(np.linalg.norm(G, 2) * np.linalg.norm(Q, 2)))
+
+    def escaped(t: float) -> bool:
+        return bool(_propagate(A, G, Q, np.array(t), rate)[3])
+
+    if escaped(T):
+        low, high = 0.0, T
+        while high - low > 1e-12 * high:
+            middle = 0.5 * (low + high)
+            low, high = (low, middle) if escaped(middle) else (middle, high)
+        raise ValueError(
+            f"the cost has no minimum over {high:.10g} s or longer: its Riccati equation grows"
+            f" beyond all bounds at a time to go of {high:.10g} s. Shorten the horizon, or make Q or S"
+            " greater or N less, so that the cost cannot fall below all bounds"
+        )
+    return S, *_propagate(A, G, Q, tau, rate)[:3]
+
+
+def _stable_subspace(H: Array) -> Array:
+    """P (n, n), to some digits, from the stable half of a Hamiltonian matrix (2 n, 2 n).
+
+    ValueError where an eigenvalue lies on the imaginary axis, within rounding of the matrix.
+    """
+    from scipy.linalg import schur
+
+    n = len(H) // 2
+    near = min(np.linalg.eigvals(H), key=lambda s: abs(s.real))
+    # Rounding moves a double eigenvalue far off the axis: how near a singular matrix is tells, not the eigenvalue.
+    g, q = np.linalg.norm(H[:n, n:], 2), np.linalg.norm(H[n:, :n], 2)
+    scale = np.repeat([1.0, math.sqrt(q / g) if g > 0.0 else 1.0], n)
+    balanced = H * scale / scale[:, None]
+    least = np.linalg.svd(balanced - 1j * near.imag * np.eye(2 * n), compute_uv=False)[-1]
+    if not least > 8 * n * np.finfo(float).eps * np.linalg.norm(balanced, 2):
+        raise ValueError(
+            "the cost has no least value over an infinite horizon: its Hamiltonian matrix has the"
+            f" eigenvalue {abs(near.imag):.6g}i on the imaginary axis, so that to swing at"
+            f" {abs(near.imag):.6g} rad/s costs nothing or less. Make Q greater or N less, or use a"
+            " finite horizon"
+        )
+    vectors = schur(balanced, sort="lhp")[1][:, :n] * scale[:, None]
+    P = _solve(vectors[:n].T, vectors[n:].T)
+    return 0.5 * (P + P.T)
+
+
+def _rate(A: Array, G: Array, Q: Array) -> float:
+    """Of the fastest motion of a Hamiltonian system [1/s]."""
+    return float(np.abs(np.linalg.eigvals(_hamiltonian(A, G, Q))).max())
+
+
+def _propagate(
+    A: Array, G: Array, Q: Array, tau: Array, rate: float
+) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
     """Phi, W, V (..., n, n): x(tau) = Phi x(0) - W y(tau), y(0) = V x(0) + Phi^T y(tau).
 
     The flow of the Hamiltonian system x' = A x - G y, y' = -Q x - A^T y over tau, solved for what
     is known of its boundary problem. Its exponential would grow as fast as y does; these do not:
     W and V grow from zero, never shrink, and Phi tends to the closed loop's transition.
+
+    Also returned: where the solution V of the Riccati equation that starts from zero has grown beyond
+    all bounds by tau (...), which takes an indefinite Q; the three are then without meaning.
     """
     n = len(A)
     identity = np.eye(n)
     backward = -_hamiltonian(A, G, Q)
-    rate = np.abs(np.linalg.eigvals(backward)).max()
     with np.errstate(divide="ignore"):
         doublings = np.ceil(np.log2(2.0 * rate * tau)).clip(min=0.0)
     # Taylor's series, for every entry keeps its own leading power of the step: a Pade approximant
@@ -309,8 +430,16 @@ def _propagate(A: Array, G: Array, Q: Array, tau: Array) -> tuple[Array, Array, 
     D = -_solve(identity + E[..., :n, :n], E[..., :n, :n])
     W = E[..., :n, n:] + D @ E[..., :n, n:]
     V = E[..., n:, :n] + E[..., n:, :n] @ D
+    escaped, watched = np.zeros(tau.shape, dtype=bool), not _positive(Q)
     for k in range(int(doublings.max(initial=0.0))):
         more = doublings > k
+        if watched:
+            # Over a further step V becomes (1 + V w)^-1 V and more, w from 0 to W: as w only grows, it has
+            # passed a singular 1 + V w by the end if and only if 1 + V W has an eigenvalue that is not positive.
+            more &= ~escaped
+            passed = np.linalg.eigvals(W[more] @ V[more]).real.min(axis=-1, initial=0.0) <= -1.0
+            escaped[more] = passed
+            more &= ~escaped
         d, w, v = D[more], W[more], V[more]
         phi, wv = identity + d, w @ v
         turn = _solve(identity + wv, np.concatenate([wv, w @ _transposed(phi)], axis=-1))
@@ -318,7 +447,7 @@ def _propagate(A: Array, G: Array, Q: Array, tau: Array) -> tuple[Array, Array, 
         D[more] = 2.0 * d + d @ d - phi @ loss @ phi
         W[more] = w + phi @ reach
         V[more] = v + _transposed(phi) @ v @ (phi - loss @ phi)
-    return identity + D, W, V
+    return identity + D, W, V, escaped
 
 
 def _hamiltonian(A: Array, G: Array, Q: Array) -> Array:
@@ -334,22 +463,27 @@ def _transposed(M: Array) -> Array:
 
 
 def _system(
-    A: ArrayLike, B: ArrayLike, Q: ArrayLike, R: ArrayLike
-) -> tuple[Array, Array, Array, Array]:
-    """A (n, n), B (n, m), Q (n, n) >= 0 and R (m, m) > 0, checked."""
+    A: ArrayLike, B: ArrayLike, Q: ArrayLike, R: ArrayLike, N: ArrayLike | None = None
+) -> tuple[Array, Array, Array, Array, Array]:
+    """A (n, n), B (n, m), Q (n, n), R (m, m) > 0 and N (n, m), checked."""
     A, B = np.asarray(A, dtype=float), np.asarray(B, dtype=float)
     if A.ndim != 2 or A.shape[0] != A.shape[1] or B.ndim != 2 or len(B) != len(A):
         raise ValueError(f"A must be (n, n) and B (n, m), not {A.shape} and {B.shape}")
-    if not (np.all(np.isfinite(A)) and np.all(np.isfinite(B))):
-        raise ValueError("A and B must be finite")
+    N = np.zeros(B.shape) if N is None else np.asarray(N, dtype=float)
+    if N.shape == (len(A),) and B.shape[1] == 1:
+        N = N[:, None]
+    if N.shape != B.shape:
+        raise ValueError(f"N must be {B.shape}, as B is, not {N.shape}")
+    if not all(np.all(np.isfinite(M)) for M in (A, B, N)):
+        raise ValueError("A, B and N must be finite")
     R = _weight("R", R, B.shape[1])
     if np.linalg.eigvalsh(R)[0] <= 0.0:
         raise ValueError("R must be positive definite: every input has to cost something")
-    return A, B, _weight("Q", Q, len(A)), R
+    return A, B, _weight("Q", Q, len(A)), R, N
 
 
 def _weight(name: str, value: ArrayLike, n: int) -> Array:
-    """A symmetric positive semi-definite weight (n, n), from it or its diagonal."""
+    """A symmetric weight (n, n), from it or its diagonal."""
     weight = np.asarray(value, dtype=float)
     if weight.shape == (n,) or (n == 1 and weight.shape == ()):
         weight = np.diag(weight.reshape(n))
@@ -357,13 +491,10 @@ def _weight(name: str, value: ArrayLike, n: int) -> Array:
         raise ValueError(f"{name} must be ({n}, {n}) or its diagonal ({n},), not {weight.shape}")
     if not np.all(np.isfinite(weight)):
         raise ValueError(f"{name} must be finite; a very large weight asks for a value exactly")
-    size = np.abs(weight).max()
-    if np.abs(weight - weight.T).max() > 1e-12 * size:
+    if np.abs(weight - weight.T).max() > 1e-12 * np.abs(weight).max():
         raise ValueError(
             f"{name} must be symmetric; use ({name} + {name}^T)/2, which costs the same"
         )
-    if np.linalg.eigvalsh(weight)[0] < -1e-12 * size:
-        raise ValueError(f"{name} must not be negative in any direction: it is a cost")
     return weight
 
 

@@ -15,6 +15,8 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from rigidfleet.errors import ResultError
 from rigidfleet.figures.curves import (
     attitude,
@@ -29,12 +31,15 @@ from rigidfleet.figures.curves import (
 from rigidfleet.figures.page import summary
 from rigidfleet.figures.space import formations, trajectory
 from rigidfleet.figures.style import agent_colours, settings
+from rigidfleet.figures.style import titles as shown_titles
 from rigidfleet.result import Result
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+    from matplotlib.transforms import Bbox
 
 __all__ = [
+    "FORMATS",
     "agent_colours",
     "attitude",
     "clearance",
@@ -58,15 +63,28 @@ _FIGURES: dict[str, Callable[[Result], Figure]] = {
         clearance, formations, disturbance,
     )
 }  # fmt: skip
-_FORMATS = ("png", "svg", "pdf")
+#: Formats that figures are written in.
+FORMATS = ("png", "svg", "pdf")
+_MARGIN = 0.05  # [in] around a figure that is cut close
 
 
-def figure_names(*, disturbed: bool = False) -> list[str]:
-    """Names of the figures of every flight, which are also the names of the functions that draw them.
+def figure_names(result: Result | None = None) -> list[str]:
+    """Names of all figures, which are also the names of the functions that draw them.
 
-    With ``disturbed``, also those of flights in moving air.
+    Of a flight, those in which it has something to show.
     """
-    return [name for name in _FIGURES if disturbed or name != "disturbance"]
+    if result is None:
+        return list(_FIGURES)
+    empty = {
+        "distances": not len(result.edges),
+        "attitude": not np.isfinite([result.attitude, result.attitude_reference]).any(),
+        "constraint_force": not len(result.edges),
+        "formations": not result.mission.formations,
+        "clearance": result.n_agents == 1 and not result.mission.obstacles,
+        "disturbance": result.disturbance_force is None,
+    }
+    empty["constraint_error"] = empty["distances"] and empty["formations"]
+    return [name for name in _FIGURES if not empty.get(name)]
 
 
 def plot(
@@ -75,6 +93,7 @@ def plot(
     *,
     formats: Iterable[str] = ("png", "svg"),
     names: Iterable[str] | None = None,
+    titles: bool = True,
 ) -> list[Path]:
     """Draw a flight and write each figure to ``folder/NAME.FORMAT``, whole or not at all.
 
@@ -83,6 +102,8 @@ def plot(
     folder : made if it does not exist; files of these names in it are replaced
     formats : of png, svg (text stays text) and pdf
     names : of `figure_names`; by default all that there is something to draw in
+    titles : with a title and the mission's name above each, or cut close to what is drawn, for a
+        paper that says so itself; that a flight is incomplete stands above it in any case
 
     Returns
     -------
@@ -95,19 +116,22 @@ def plot(
     ResultError
         A file cannot be written, or the mission inside the result cannot be read.
     """
-    formats = _known("format", formats, _FORMATS)
-    if names is None:
-        names = figure_names(disturbed=result.disturbance_force is not None)
-    names = _known("figure", names, _FIGURES)
-    return [
-        path
-        for name in names
-        for path in write_figure(_FIGURES[name](result), Path(folder), name, formats)
-    ]
+    formats = _known("format", formats, FORMATS)
+    names = _known("figure", figure_names(result) if names is None else names, _FIGURES)
+    paths = []
+    for name in names:
+        with shown_titles(shown=titles):
+            figure = _FIGURES[name](result)
+        paths += write_figure(figure, Path(folder), name, formats, close=not titles)
+    return paths
 
 
-def write_figure(figure: Figure, folder: Path, name: str, formats: Iterable[str]) -> list[Path]:
+def write_figure(
+    figure: Figure, folder: Path, name: str, formats: Iterable[str], *, close: bool = False
+) -> list[Path]:
     """Write a figure to ``folder/NAME.FORMAT``, each file whole or not at all; returns the files.
+
+    With ``close``, cut close to what is drawn.
 
     Raises
     ------
@@ -116,7 +140,7 @@ def write_figure(figure: Figure, folder: Path, name: str, formats: Iterable[str]
     """
     paths = {kind: folder / f"{name}.{kind}" for kind in formats}
     for kind, path in paths.items():
-        _write(path, _rendered(figure, kind))
+        _write(path, _rendered(figure, kind, close=close))
     return list(paths.values())
 
 
@@ -128,15 +152,30 @@ def _known(what: str, asked: Iterable[str], known: Iterable[str]) -> list[str]:
     return asked
 
 
-def _rendered(figure: Figure, kind: str) -> bytes:
+def _rendered(figure: Figure, kind: str, *, close: bool = False) -> bytes:
     # No date inside, so that the same flight gives the same file.
     metadata: dict[str, Any] = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}
     buffer = io.BytesIO()
     with settings():
-        figure.savefig(buffer, format=kind, metadata=metadata.get(kind))
+        box = _ink(figure) if close else None
+        figure.savefig(buffer, format=kind, metadata=metadata.get(kind), bbox_inches=box)
     # The layout is found; drawing again need not look for it.
     figure.set_layout_engine("none")
     return buffer.getvalue()
+
+
+def _ink(figure: Figure) -> Bbox:
+    """What is drawn on, and a little around it [in]; by matplotlib's own reckoning empty axes count, too."""
+    from matplotlib.transforms import Bbox
+
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="rgba", dpi=figure.dpi)
+    width, height = (figure.get_size_inches() * figure.dpi).astype(int).tolist()
+    colours = np.frombuffer(buffer.getvalue(), np.uint8).reshape(height, width, 4)
+    drawn = colours.min(axis=2) < 255
+    across, down = (np.flatnonzero(np.any(drawn, axis=axis)) for axis in (0, 1))
+    ends = [[across[0], height - down[-1] - 1], [across[-1] + 1, height - down[0]]]
+    return Bbox(np.array(ends) / figure.dpi).padded(_MARGIN)
 
 
 def _write(path: Path, data: bytes) -> None:

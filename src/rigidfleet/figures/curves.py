@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 SINGLE = 6  # so many edges have a colour each; more share one by their lengths
 _PAIRS = 5e7  # distances of pairs that are looked at, in all
 _SMALLEST = 1e-12  # error that is drawn on a logarithmic axis [m]; below is rounding
+_IDLE = 1e-6  # force [N] or way [m] below which there is nothing to draw but rounding
+_LOW = 0.45  # share of its height that a row has left in which nothing happens
+_TOLD = 0.7  # and one that holds words alone
 
 
 # -- edges -------------------------------------------------------------------------------------------
@@ -167,6 +170,7 @@ def _components(
 ) -> None:
     """A row for each of three components: flown and reference (K, 3), targets (time, [3])."""
     for i, ax in enumerate(axes):
+        asked = np.array([goal[i] for _, goal in targets], dtype=float)
         st.line(ax, result.time, flown[:, i], color=st.FLOWN, linewidth=2.4)
         st.reference(ax, result.time, wanted[:, i])
         for t, goal in targets:
@@ -175,7 +179,15 @@ def _components(
                 markeredgewidth=1.0, zorder=4, clip_on=False,
             )  # fmt: skip
         ax.set_ylabel(f"{names[i]} [{unit}]")
-        widen(ax, 0.1)
+        if not st.still(ax, np.concatenate([flown[:, i], wanted[:, i], asked]), unit):
+            widen(ax, 0.1)
+
+
+def _shares(*columns: tuple[Floats, Floats]) -> list[float]:
+    """Share of its height for each of three rows: less where nothing moves, of (flown, wanted) of each column."""
+    return [
+        _LOW if all(st.is_still(f[:, i], w[:, i]) for f, w in columns) else 1.0 for i in range(3)
+    ]
 
 
 def widen(ax: Axes, least: float) -> None:
@@ -206,7 +218,8 @@ def _targets(result: Result, key: str) -> list[tuple[float, Any]]:
 @styled
 def cm(result: Result) -> Figure:
     """Position and velocity of the centre of mass with their references and waypoints."""
-    fig, axes = st.time_figure(result, "Centre of mass", 3, 2, height=1.5)
+    columns = (result.cm, result.cm_reference), (result.cm_velocity, result.cm_velocity_reference)
+    fig, axes = st.time_figure(result, "Centre of mass", 3, 2, height=1.5, shares=_shares(*columns))
     places, speeds = _targets(result, "position"), _targets(result, "velocity")
     _components(result, axes[:, 0], result.cm, result.cm_reference, places, ("x", "y", "z"), "m")
     _components(
@@ -254,13 +267,12 @@ def attitude(result: Result) -> Figure:
         st.note(axes[0, 0], "no body frame attached")
         st.name_phases(fig, axes[0], result)
         return fig
-    fig, axes = st.time_figure(result, title, 3, 2, height=1.5)
+    turned = np.degrees(result.rates), np.degrees(result.rates_reference)
+    shares = _shares((flown, wanted), turned)
+    fig, axes = st.time_figure(result, title, 3, 2, height=1.5, shares=shares)
     _components(result, axes[:, 0], flown, wanted, targets, ("roll", "pitch", "yaw"), "deg")
     turning = [(t, np.degrees(rates)) for t, rates in _targets(result, "rates")]
-    _components(
-        result, axes[:, 1], np.degrees(result.rates), np.degrees(result.rates_reference), turning,
-        ("p", "q", "r"), "deg/s",
-    )  # fmt: skip
+    _components(result, axes[:, 1], *turned, turning, ("p", "q", "r"), "deg/s")
     references = _reference_handle(wanted, result.rates_reference)
     _whole_legend(axes[0, 1], references, targets=bool(targets or turning))
     st.name_phases(fig, axes[0], result)
@@ -292,6 +304,7 @@ def draw_thrust(ax: Axes, result: Result) -> None:
         st.limit(ax, value, label, colour)
     top = max([*(value for value, *_ in limits), _sane(result, result.thrust)])
     ax.set_ylim(0, 1.12 * top if top > 0 else 1.0)
+    _extremes(ax, result, result.thrust, "N", _agent, always=False)
 
 
 def _sane(result: Result, values: Floats) -> float:
@@ -312,24 +325,58 @@ def inputs(result: Result) -> Figure:
     draw_thrust(above, result)
     st.agent_lines(below, result, result.thrust)
     below.set_ylabel("enlarged [N]")
-    _within(below, result, result.thrust)
-    widen(below, 0.1)
-    _peak(below, result, result.thrust)
+    if not st.still(below, result.thrust, "N"):
+        _within(below, result, result.thrust)
+        widen(below, 0.1)
+        _extremes(below, result, result.thrust, "N", _agent)
     st.agents_legend(above, result.n_agents)
     st.name_phases(fig, [above], result)
     return fig
 
 
-def _peak(ax: Axes, result: Result, values: Floats, unit: str = "N") -> None:
-    """Write the greatest of the agents' values (K, N) into a corner."""
-    known = np.where(np.isfinite(values), values, -np.inf)
-    k, i = np.unravel_index(int(known.argmax()), known.shape)
-    if np.isfinite(known[k, i]):
-        words = f"peak {known[k, i]:.3g} {unit}: agent {i + 1} at {result.time[k]:.2f} s"
-        ax.text(
-            0.995, 0.97, words, transform=ax.transAxes, ha="right", va="top", fontsize=7.5,
-            path_effects=st.halo(),
-        )  # fmt: skip
+def _agent(i: int) -> str:
+    return f"agent {i + 1}"
+
+
+def _extremes(
+    ax: Axes,
+    result: Result,
+    values: Floats,
+    unit: str,
+    who: Callable[[int], str],
+    *,
+    always: bool = True,
+) -> None:
+    """Write the greatest of values (K, n) into the axes, and mark what it cuts off at top and bottom.
+
+    Without ``always``, only what is cut off.
+    """
+    low, high = ax.get_ylim()
+    for sign, edge, marker in ((1.0, high, "^"), (-1.0, low, "v")):
+        size = np.where(np.isfinite(values), sign * values, -np.inf)
+        k, i = np.unravel_index(int(size.argmax()), size.shape)
+        cut = size[k, i] > sign * edge
+        if not np.isfinite(size[k, i]) or not (cut or (always and sign > 0)):
+            continue
+        told = f"peak {values[k, i]:.3g} {unit}: {who(int(i))} at {result.time[k]:.2f} s"
+        if not cut:
+            st.words(ax, told, st.corners())
+            continue
+        t = result.time[int((size > sign * edge).any(axis=1).argmax())]
+        look: dict[str, Any] = {"color": st.ALERT, "markersize": 5, "clip_on": False, "zorder": 6}
+        ax.plot(t, edge, marker, **look, gid="cut")
+        st.words(ax, f"cut off: {told}", [*st.around(t, edge), *st.corners()], color=st.ALERT)
+
+
+def _idle(ax: Axes, result: Result, values: Floats, unit: str, who: Callable[[int], str]) -> bool:
+    """If values (K, n) are nothing but rounding, say so in the axes; whether that is so."""
+    size = np.where(np.isfinite(values), np.abs(values), -np.inf)
+    k, i = np.unravel_index(int(size.argmax()), size.shape) if size.size else (0, 0)
+    if not size.size or not np.isfinite(size[k, i]) or size[k, i] > _IDLE:
+        return False
+    where = f", {who(int(i))} at {result.time[k]:.2f} s" if size[k, i] else ""
+    st.note(ax, f"none but rounding: at most {size[k, i]:.3g} {unit}{where}")
+    return True
 
 
 def _within(ax: Axes, result: Result, values: Floats) -> None:
@@ -344,26 +391,42 @@ def _within(ax: Axes, result: Result, values: Floats) -> None:
 @styled
 def constraint_force(result: Result) -> Figure:
     """Constraint force |f_C| on each agent and tension of each edge."""
-    fig, axes = st.time_figure(result, "Constraint force", 2)
+
+    def edge(k: int) -> str:
+        return f"edge {result.edge_labels[k]}"
+
+    force, tension = np.linalg.norm(result.constraint_force, axis=2), -result.multiplier
+    shares = [
+        _TOLD if np.nanmax(np.abs(v), initial=0.0) <= _IDLE else 1.0 for v in (force, tension)
+    ]
+    fig, axes = st.time_figure(result, "Constraint force", 2, shares=shares)
     above, below = axes[:, 0]
-    force = np.linalg.norm(result.constraint_force, axis=2)
-    st.agent_lines(above, result, force)
     above.set_ylabel(r"force $|f_C|$ [N]")
-    top = max(_sane(result, force), 1e-3)
-    above.set_ylim(-0.04 * top, 1.1 * top)
-    _peak(above, result, force)
+    if _from_none(above, result, force, "N"):
+        st.agents_legend(above, result.n_agents)
     below.set_ylabel(r"tension $-\lambda$ [N]")
-    if len(result.edges):
-        edge_lines(below, result, -result.multiplier)
-        _within(below, result, -result.multiplier)
-        below.axhline(0.0, color=st.FAINT, linewidth=0.6, zorder=1)
-        st.legend(below, edge_handles(result))
-    else:
+    if not len(result.edges):
         st.note(below, "no edges")
-    widen(below, 1e-3)
-    st.agents_legend(above, result.n_agents)
+    elif not _idle(below, result, tension, "N", edge):
+        edge_lines(below, result, tension)
+        below.axhline(0.0, color=st.FAINT, linewidth=0.6, zorder=1)
+        _within(below, result, tension)
+        _extremes(below, result, tension, "N", edge, always=False)
+        st.legend(below, edge_handles(result))
     st.name_phases(fig, [above], result)
     return fig
+
+
+def _from_none(ax: Axes, result: Result, values: Floats, unit: str) -> bool:
+    """Each agent's values (K, N) from zero, with the greatest in words; whether there was anything to draw."""
+    if _idle(ax, result, values, unit, _agent):
+        return False
+    st.agent_lines(ax, result, values)
+    top = _sane(result, values)
+    if top > 0.0:
+        ax.set_ylim(-0.04 * top, 1.12 * top)
+    _extremes(ax, result, values, unit, _agent)
+    return True
 
 
 @styled
@@ -376,16 +439,12 @@ def disturbance(result: Result) -> Figure:
         st.note(above, "still air")
     else:
         force = np.where(result.left, np.linalg.norm(result.disturbance_force, axis=2), np.nan)
-        st.agent_lines(above, result, force)
-        above.set_ylim(0, 1.12 * max(_sane(result, force), 1e-3))
-        _peak(above, result, force)
-        st.legend(above, st.agent_handles(result.n_agents))
+        if _from_none(above, result, force, "N"):
+            st.agents_legend(above, result.n_agents)
     below.set_ylabel("from the slot [m]")
     off = np.linalg.norm(result.position - result.slot_position, axis=2)
     if np.isfinite(off).any():
-        st.agent_lines(below, result, off)
-        below.set_ylim(0, 1.12 * max(_sane(result, off), 1e-3))
-        _peak(below, result, off, "m")
+        _from_none(below, result, off, "m")
     else:
         st.note(below, "no slots are tracked")
     st.name_phases(fig, [above], result)
@@ -422,27 +481,38 @@ def draw_error(ax: Axes, result: Result) -> list[Line2D]:
     """Errors |c| of the edges, the greatest, and that of all pairs; returns legend entries of the last two."""
     from matplotlib.lines import Line2D
 
-    ax.set_ylabel("constraint error [m]")
+    ax.set_ylabel(r"error $|c|$ of an edge [m]")
     size, shape = np.abs(result.constraint), shape_error(result)
     handles = []
     if np.isfinite(shape).any():
         look: dict[str, Any] = {"color": st.FLOWN, "linewidth": 2.0, "zorder": 1.9}
         known = np.isfinite(shape) if result.n_agents > st.MANY else slice(None)
         st.line(ax, result.time[known], shape[known], **look)
-        handles.append(Line2D([], [], label="all pairs", **look))
+        handles.append(Line2D([], [], label="all pairs, to the slots", **look))
     if np.isfinite(size).any():
         edge_lines(ax, result, size, linewidth=0.6, alpha=0.7)
         look = {"color": st.INK, "linewidth": 1.3}
         st.line(ax, result.time, np.fmax.reduce(size, axis=1), **look)
-        handles.append(Line2D([], [], label="greatest |c|", **look))
+        handles.append(Line2D([], [], label="greatest |c| of an edge", **look))
     if not handles:
         st.note(ax, "no edges, no slots")
         return []
     ax.set_yscale("log", nonpositive="clip")
     seen = np.concatenate([size.ravel(), shape])
-    seen = seen[np.isfinite(seen) & (seen > _SMALLEST)]
-    if len(seen):
-        ax.set_ylim(max(_SMALLEST, 0.5 * float(seen.min())), 3 * float(seen.max()))
+    seen = seen[np.isfinite(seen)]
+    large = seen[seen > _SMALLEST]
+    if len(large):
+        ax.set_ylim(max(_SMALLEST, 0.5 * float(large.min())), 3 * float(large.max()))
+        if ax.get_ylim()[0] == _SMALLEST and len(large) < len(seen):
+            st.words(
+                ax,
+                f"rounding below {_SMALLEST:g} m is not drawn",
+                st.corners()[::-1],
+                color=st.GREY,
+            )
+    else:
+        ax.set_ylim(_SMALLEST, 1.0)
+        st.note(ax, f"none but rounding: at most {seen.max():.1g} m")
     return handles
 
 
@@ -480,13 +550,7 @@ def _mark_least(ax: Axes, result: Result, values: Floats, who: str) -> None:
     ax.plot(
         t, value, "o", markersize=5, markerfacecolor="none", markeredgecolor=st.INK, clip_on=False
     )
-    share = (t - result.time[0]) / max(result.time[-1] - result.time[0], 1e-9)
-    ax.annotate(
-        f"{value:.3g} m at {t:.2f} s{who}", (t, value), (5 if share < 0.25 else -5 if share > 0.75 else 0, -6),
-        ha="left" if share < 0.25 else "right" if share > 0.75 else "center", va="top",
-        textcoords="offset points",
-        fontsize=7.5, parse_math=False, path_effects=st.halo(),
-    )  # fmt: skip
+    st.words(ax, f"{value:.3g} m at {t:.2f} s{who}", st.around(t, value))
 
 
 def _separated(result: Result) -> str:
@@ -534,7 +598,7 @@ def draw_clearance(ax: Axes, result: Result) -> None:
 
 def _from_zero(ax: Axes, values: Floats) -> None:
     low, high = float(np.nanmin(values)), float(np.nanmax(values))
-    room = 0.18 * max(high, -low, 0.1)
+    room = 0.25 * max(high, -low, 0.1)
     ax.set_ylim(min(low, 0.0) - room, max(high, 0.0) + room)
 
 

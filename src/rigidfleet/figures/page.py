@@ -42,7 +42,8 @@ def _draw_attitude(ax: Axes, result: Result) -> None:
         st.reference(ax, result.time, wanted[:, i])
         handles.append(Line2D([], [], label=name, **look))
     _legend_above(ax, handles)
-    curves.widen(ax, 0.1)
+    if not st.still(ax, np.concatenate([flown, wanted]), "deg"):
+        curves.widen(ax, 0.1)
 
 
 @styled
@@ -67,7 +68,7 @@ def summary(result: Result) -> Figure:
     _draw_attitude(angles, result)
     curves.draw_thrust(thrust, result)
     (curves.draw_clearance if result.mission.obstacles else curves.draw_separation)(room, result)
-    key = textwrap.wrap(st.number_phases(fig, over_time, result), 150)
+    key = textwrap.wrap("Phases:  " + st.number_phases(fig, over_time, result), 150)
     entries = space.handles(result, view)
     fig.legend(handles=entries, loc="center", ncols=len(entries), bbox_to_anchor=(0.5, 0.075))
     fig.text(

@@ -580,7 +580,8 @@ def _draw_axes(ax: Axes, axes: Floats, length: float, *, taken: bool) -> None:
         if np.hypot(*tip[:2]) < 1e-6 * length:
             words = f"⊙ {label}" if taken else label
             place: dict[str, Any] = {"textcoords": "offset points", "ha": "right", "va": "top"}
-            ax.annotate(words, (0, 0), (-9, -9), fontsize=9.5, gid="body-axis", **place)
+            place["bbox"] = {"facecolor": "white", "edgecolor": "none", "pad": 0.5, "alpha": 0.8}
+            ax.annotate(words, (0, 0), (-9, -9), fontsize=9.5, gid="body-axis", zorder=7, **place)
             if not taken:
                 ring: dict[str, Any] = {"markerfacecolor": "white", "markeredgecolor": st.INK}
                 ax.plot(0, 0, "o", markersize=9, zorder=7, **ring)

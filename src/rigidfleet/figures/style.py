@@ -6,9 +6,11 @@ import math
 import warnings
 from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import wraps
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +21,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
-    from matplotlib.text import Text
+    from matplotlib.text import Annotation, Text
+    from matplotlib.transforms import Bbox
 
 Floats = NDArray[np.float64]
 Draw = Callable[[Result], "Figure"]
@@ -46,6 +49,16 @@ _POINTS = 3000  # samples of a line; more would be drawn over each other
 #: Of more agents or edges than this the spread is drawn, not each of them.
 MANY = 200
 _ENTRIES = 12  # of a legend
+#: What varies by less is told in words; drawn, its rounding errors would fill an axes. [m, m/s, deg, deg/s, N]
+STILL = 1e-3
+_ROUNDING = 1e-9  # deviations below are not worth a word
+
+#: Where words may stand: a point and what it is measured in, an offset [points] from it, alignment.
+Place = tuple[tuple[float, float], Any, tuple[float, float], str, str]
+#: Along an axes' width: its ends and middle first.
+_ALONG = ((0.995, "right"), (0.5, "center"), (0.005, "left"), (0.75, "center"), (0.25, "center"))
+_places: WeakKeyDictionary[Annotation, Sequence[Place]] = WeakKeyDictionary()
+_titled: ContextVar[bool] = ContextVar("titled", default=True)
 
 _RC: dict[str, Any] = {
     "font.family": "sans-serif",
@@ -106,9 +119,21 @@ def styled(draw: Draw) -> Draw:
     @wraps(draw)
     def drawn(result: Result) -> Figure:
         with settings():
-            return draw(result)
+            figure = draw(result)
+            place_words(figure)
+            return figure
 
     return drawn
+
+
+@contextmanager
+def titles(*, shown: bool) -> Generator[None]:
+    """Figures drawn inside have a title and the name of their mission, or none."""
+    before = _titled.set(shown)
+    try:
+        yield
+    finally:
+        _titled.reset(before)
 
 
 def agent_colours(n: int) -> list[str]:
@@ -131,13 +156,19 @@ def scale(n: int) -> list[str]:
 
 
 def time_figure(
-    result: Result, title: str, rows: int, columns: int = 1, height: float = 2.1
+    result: Result,
+    title: str,
+    rows: int,
+    columns: int = 1,
+    height: float = 2.1,
+    shares: Sequence[float] | None = None,
 ) -> tuple[Figure, Any]:
-    """Figure of rows x columns axes (object array) that share time; `height` of a row [in]."""
+    """Figure of rows x columns axes (object array) that share time; `height` of a row [in], or its share of that."""
     from matplotlib.figure import Figure
 
-    fig = Figure(figsize=(WIDTH, 1.3 + height * rows), layout="constrained")
-    axes = fig.subplots(rows, columns, sharex=True, squeeze=False)
+    shares = [1.0] * rows if shares is None else shares
+    fig = Figure(figsize=(WIDTH, 1.3 + height * sum(shares)), layout="constrained")
+    axes = fig.subplots(rows, columns, sharex=True, squeeze=False, height_ratios=shares)
     head(fig, result, title)
     for ax in axes.flat:
         over_time(ax, result)
@@ -155,8 +186,15 @@ def head(fig: Figure, result: Result, title: str) -> None:
 
 
 def heading(fig: Figure, title: str, words: str, colour: str = GREY) -> None:
-    """Title at the left, words at the right."""
+    """Title at the left, words at the right; without titles only words that warn."""
     top = 1 - _PAD / fig.get_figheight()
+    if not _titled.get():
+        if colour == ALERT:
+            look: dict[str, Any] = {"ha": "right", "va": "top", "fontsize": 9, "color": colour}
+            warning = fig.suptitle(words, x=0.988, parse_math=False, **look)
+            if fig.get_layout_engine() is None:
+                warning.set_y(top)
+        return
     title_text = fig.suptitle(
         title, x=0.012, ha="left", va="top", fontsize=11, fontweight="bold", parse_math=False
     )
@@ -202,10 +240,124 @@ def reference(ax: Axes, t: Floats, y: Floats) -> Line2D:
 def limit(ax: Axes, value: float, label: str, colour: str = ALERT) -> None:
     """Line of a limit, with its name on it."""
     ax.axhline(value, color=colour, linewidth=1.0, linestyle=(0, (6, 2)), zorder=2.5, gid="limit")
-    ax.annotate(
-        label, (0.995, value), (0, 2), xycoords=("axes fraction", "data"), va="bottom", ha="right",
-        textcoords="offset points", fontsize=7.5, color=colour, path_effects=halo(),
+    along: list[Place] = [
+        ((x, value), ("axes fraction", "data"), (0, away), ha, va)
+        for x, ha in _ALONG
+        for va, away in (("bottom", 2), ("top", -2))
+    ]
+    words(ax, label, [*along, *corners()], color=colour)
+
+
+# -- words that cover nothing --------------------------------------------------------------------------
+
+
+def words(ax: Axes, text: str, places: Sequence[Place], **look: Any) -> None:
+    """Words in an axes, which stand at the first of their places where they cover no line and no other words."""
+    (x, y), units, offset, ha, va = places[0]
+    label = ax.annotate(
+        text, (x, y), offset, xycoords=units, textcoords="offset points", ha=ha, va=va, fontsize=7.5,
+        path_effects=halo(), parse_math=False, annotation_clip=False, zorder=6, gid="words", **look,
     )  # fmt: skip
+    label.set_in_layout(False)
+    _places[label] = places
+
+
+def corners() -> list[Place]:
+    """Places along the top of an axes, then along its bottom."""
+    return [
+        ((x, y), "axes fraction", (0, -3 if va == "top" else 3), ha, va)
+        for y, va in ((1.0, "top"), (0.0, "bottom"))
+        for x, ha in _ALONG
+    ]
+
+
+def around(x: float, y: float) -> list[Place]:
+    """Places round a point of the data, near ones first, those below first."""
+    sides = (("center", 0.0), ("left", 1.0), ("right", -1.0))
+    near: list[Place] = [
+        ((x, y), "data", (6 * side, sign * away), ha, "top" if sign < 0 else "bottom")
+        for away in (6, 13, 22)
+        for sign in (-1, 1)
+        for ha, side in sides
+    ]
+    beside: list[Place] = [((x, y), "data", (8 * s, 0), ha, "center") for ha, s in sides[1:]]
+    return near[:6] + beside + near[6:]
+
+
+def place_words(fig: Figure) -> None:
+    """Move `words` to where they cover nothing, or least."""
+    every = [(text, places) for text, places in _places.items() if text.get_figure() is fig]
+    engine = fig.get_layout_engine()
+    if engine is not None and every:
+        engine.execute(fig)
+    for ax in fig.axes:
+        labels = [(text, places) for text, places in every if text.axes is ax]
+        waiting = {text for text, _ in labels}
+        for label, places in labels:
+            waiting.remove(label)
+            # Phase names stand outside; words that have no place yet are in nobody's way.
+            others = [
+                text.get_window_extent() for text in ax.texts
+                if text is not label and text not in waiting and text.get_gid() != "phase"
+            ]  # fmt: skip
+            best, chosen = math.inf, places[0]
+            for place in places:
+                _move(label, place)
+                covered = _covered(ax, label.get_window_extent().padded(2.0), others)
+                if covered < best:
+                    best, chosen = covered, place
+                if not covered:
+                    break
+            _move(label, chosen)
+
+
+def _move(label: Annotation, place: Place) -> None:
+    label.xy, label.xycoords, offset, ha, va = place
+    label.set_position(offset)
+    label.set(ha=ha, va=va)
+
+
+def _covered(ax: Axes, box: Bbox, others: Sequence[Bbox]) -> int:
+    """How much a box [pixels] covers: lines, bands, other boxes; most of all, what is not in the axes."""
+    n = sum(box.overlaps(other) for other in others)
+    for line in ax.lines:
+        path = line.get_transform().transform_path(line.get_path())
+        if line.get_linestyle() in ("None", ""):
+            n += int(box.padded(3.0).count_contains(path.vertices) > 0)
+        else:
+            n += bool(path.intersects_bbox(box, filled=False))
+    for band in ax.collections:
+        for path in band.get_paths():
+            n += bool(band.get_transform().transform_path(path).intersects_bbox(box, filled=True))
+    inside = ax.bbox.padded(1.0)
+    if not (inside.contains(box.x0, box.y0) and inside.contains(box.x1, box.y1)):
+        n += 100
+    return n
+
+
+def still(ax: Axes, values: Floats, unit: str) -> bool:
+    """Of what does not vary, write the value into its axes; whether that is so."""
+    known = values[np.isfinite(values)]
+    if not len(known) or np.ptp(known) > STILL:
+        return False
+    value = round(float(known.max() + known.min()) / 2, 3) + 0.0
+    off = float(np.abs(known - value).max())
+    told = f"{value:.6g} {unit} throughout" + (f", within {off:.1g}" if off > _ROUNDING else "")
+    ax.set_ylim(value - 1.0, value + 1.0)
+    ax.set_yticks([value], [f"{value:.6g}"])
+    words(
+        ax,
+        told,
+        [((0.5, value), ("axes fraction", "data"), (0, 5), "center", "bottom")],
+        color=GREY,
+    )
+    return True
+
+
+def is_still(*values: Floats) -> bool:
+    """Whether all that is known of some values stays the same, or nothing is known."""
+    known = np.concatenate([v[np.isfinite(v)] for v in values])
+    return not len(known) or float(np.ptp(known)) <= STILL
 
 
 def halo() -> list[Any]:
@@ -333,8 +485,12 @@ def number_phases(fig: Figure, axes: Iterable[Axes], result: Result) -> str:
                 label.remove()
             else:
                 right = box.x1
-    names = (f"{i + 1} {clean(p.name)}" for i, p in enumerate(result.phases))
-    return "   ".join(name.replace(" ", "\N{NO-BREAK SPACE}") for name in names)
+    # A phase without a name has its kind and number for one.
+    names = (
+        f"{i + 1} {clean(p.kind if p.name == f'{p.kind} {i + 1}' else p.name)}"
+        for i, p in enumerate(result.phases)
+    )
+    return "  ·  ".join(name.replace(" ", "\N{NO-BREAK SPACE}") for name in names)
 
 
 def _upright(ax: Axes, result: Result) -> list[Text]:

@@ -357,7 +357,7 @@ _CAPTIONS = {
     "attitude": "Attitude of the formation as a body: flown, reference (dashed) and waypoints (rings).",
     "inputs": "Thrust of each vehicle under its limit, and enlarged.",
     "constraint_force": "Force that holds the distances, and the tension of each edge; below zero it pushes.",
-    "constraint_error": "Errors of the distances held, and of all pairs against the slots.",
+    "constraint_error": "Error |c| of each distance held, length less reference; and of all pairs against the slots.",
     "clearance": "Room between surfaces, with the limits.",
     "formations": "Formations with their edges and body axes.",
     "disturbance": "Force of the air on each vehicle, and how far each is from its slot.",
@@ -366,8 +366,7 @@ _CAPTIONS = {
 
 def _figures(result: Result) -> list[dict[str, str]]:
     """All figures but the summary, which has a page of its own."""
-    names = figures.figure_names(disturbed=result.disturbance_force is not None)
-    return [_figure(result, name) for name in names if name != "summary"]
+    return [_figure(result, name) for name in figures.figure_names(result) if name != "summary"]
 
 
 def _figure(result: Result, name: str) -> dict[str, str]:

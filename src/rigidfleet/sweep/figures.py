@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigidfleet.errors import RigidfleetError
+from rigidfleet.figures import FORMATS, write_figure
 from rigidfleet.figures import style as st
-from rigidfleet.figures import write_figure
 from rigidfleet.sweep.dataset import explained
 from rigidfleet.sweep.metrics import METRICS, readable
 from rigidfleet.sweep.row import called
@@ -46,13 +46,16 @@ def plot(
     formats: Iterable[str] = ("png", "svg"),
     over: Sequence[str] = (),
     metric: str = "",
+    titles: bool = True,
 ) -> list[Path]:
     """Draw a sweep, each figure to ``folder/NAME.FORMAT``, whole or not at all.
 
     Parameters
     ----------
+    formats : of png, svg and pdf
     over : the two paths that the map is over; the two that matter most when absent
     metric : what it shows: success, or one of `METRICS`; success when absent, if any run failed
+    titles : with a title and the sweep's name above each, or cut close to what is drawn
 
     Raises
     ------
@@ -70,13 +73,13 @@ def plot(
     }
     files = []
     for name in _NAMES:
-        with st.settings():
+        with st.settings(), st.titles(shown=titles):
             figure = draw[name](table)
         if figure is None:
-            for kind in formats:
+            for kind in FORMATS:
                 Path(folder, f"{name}.{kind}").unlink(missing_ok=True)
             continue
-        files += write_figure(figure, Path(folder), name, formats)
+        files += write_figure(figure, Path(folder), name, formats, close=not titles)
     return files
 
 

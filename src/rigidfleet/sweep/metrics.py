@@ -23,8 +23,8 @@ class Metric:
 METRICS: dict[str, Metric] = {
     "shape_end": Metric("m", "shape error at the end: worst of all pairs against the slots"),
     "shape": Metric("m", "worst shape error at the end of a phase"),
-    "constraint_end": Metric("m", "greatest constraint error |c| at the end"),
-    "constraint": Metric("m", "greatest constraint error |c|"),
+    "constraint_end": Metric("m", "greatest constraint error |c| = |L - d| at the end"),
+    "constraint": Metric("m", "greatest constraint error |c| = |L - d|"),
     "handed": Metric("1", "1: right-handed at the end of every phase; 0: mirrored"),
     "flip": Metric("deg", "greatest angle of a plane or line from where it should point"),
     "waypoint_position": Metric("m", "greatest miss of a waypoint"),
