@@ -42,9 +42,7 @@ def machine_code(second: "_SecondProcess | None" = None) -> list[bytes]:
     All their arguments are addresses of named tuples. They integrate, and return what `flight.integrate` does,
     record, and watch, as `monitor.watch` does. The ``second`` process, if there is one, does part of the work.
     """
-    program, workspace, integrator, stretch, record, watching = (
-        pointer(typeof(x)) for x in native.examples()
-    )
+    program, workspace, integrator, stretch, record, _ = _pointers()
 
     def integrate_stretch(p, w, state, s):
         call = stretch(s)
@@ -58,24 +56,38 @@ def machine_code(second: "_SecondProcess | None" = None) -> list[bytes]:
         flight.record(call.times, call.samples, program(p), workspace(w), call.dy, record(out))
         return 0
 
-    def watch_trail(p, w, state, found):
-        return monitor.watch(program(p), workspace(w), integrator(state), watching(found))
-
     if second is not None:
         for function, arguments in _halves()[0].items():  # before what waits for the second
             function.compile(arguments)
-    compiled = cfunc(types.int64(*(types.int64,) * 4), **OPTIONS)
-    modules = []
-    for function, name in zip(
-        (integrate_stretch, record_stretch, watch_trail), native.ENTRIES, strict=True
-    ):
-        made = compiled(function)
-        modules.append((made.inspect_llvm(), made.native_name, name))
+    integrate, recorder = (
+        _module(function, name)
+        for function, name in zip((integrate_stretch, record_stretch), native.ENTRIES, strict=False)
+    )
     if second is not None:
-        second.optimise(modules[1:])
-    code = _object(*modules[0])
+        second.optimise(recorder)
+    code = _object(*integrate)
     rest = None if second is None else second.optimised()
-    return [code, *(rest or [_object(*module) for module in modules[1:]])]
+    return [code, *(rest or (_object(*recorder), _monitor()))]
+
+
+def _monitor() -> bytes:
+    """Object code of the monitor, which shares nothing with the rest."""
+    program, workspace, integrator, _, _, watching = _pointers()
+
+    def watch_trail(p, w, state, found):
+        return monitor.watch(program(p), workspace(w), integrator(state), watching(found))
+
+    return _object(*_module(watch_trail, native.ENTRIES[2]))
+
+
+def _pointers() -> list[Any]:
+    return [pointer(typeof(x)) for x in native.examples()]
+
+
+def _module(function: Any, name: str) -> tuple[str, str, str]:
+    """What `_object` makes code of: all that a C function of four addresses calls, its symbol, and its ``name``."""
+    made = cfunc(types.int64(*(types.int64,) * 4), **OPTIONS)(function)
+    return made.inspect_llvm(), made.native_name, name
 
 
 def _object(text: str, symbol: str, name: str) -> bytes:
@@ -188,7 +200,7 @@ def _translated() -> dict[str, bytes]:
 
 
 class _SecondProcess:
-    """The second process: it translates its half, and optimises two of the three modules.
+    """The second process: it translates its half, and makes two of the three objects.
 
     Whatever comes to nothing there is done here.
     """
@@ -205,15 +217,15 @@ class _SecondProcess:
         """Its half, by the names of functions."""
         return self._answer() or {}
 
-    def optimise(self, modules: list[tuple[str, str, str]]) -> None:
-        """Ask for the objects of modules, see `_object`."""
+    def optimise(self, module: tuple[str, str, str]) -> None:
+        """Ask for the object of a module, see `_object`."""
         assert self._process.stdin is not None
         if self.translated:
             with suppress(OSError), self._process.stdin as stream:
-                pickle.dump(modules, stream)
+                pickle.dump(module, stream)
 
-    def optimised(self) -> list[bytes] | None:
-        """The objects asked for."""
+    def optimised(self) -> tuple[bytes, bytes] | None:
+        """The object asked for, and that of the monitor."""
         return self._answer()
 
     def _answer(self) -> Any:
@@ -245,6 +257,7 @@ def main(*, half: bool) -> None:
     if half:
         pickle.dump(_translated(), output)
         output.flush()
-        pickle.dump([_object(*module) for module in pickle.load(sys.stdin.buffer)], output)
+        watch = _monitor()
+        pickle.dump((_object(*pickle.load(sys.stdin.buffer)), watch), output)
         return
     output.write(native.joined(machine_code(_SecondProcess())))
