@@ -47,10 +47,12 @@ def assess(result: Result) -> Verdict:
     `WAYPOINT_TOLERANCE`; if agents collide with each other or an obstacle; or if one of the mission's
     limits is passed. The flight's worst values are reported in any case.
 
-    Limits are held against the samples of the result: the geofence against the agents' centres,
-    separation and clearance against their surfaces (distance minus radii), and so `separation_below`,
-    the vertical room between two agents whose spheres overlap as seen from above. A vehicle that the mission
-    loses counts in none of this from then on, except that it must not hit those that are left.
+    Limits hold in continuous time, as the record's extremes tell, and at the samples, which are computed
+    anew from positions and forces; the worse counts, and a record that contradicts its samples fails. The
+    geofence holds for the agents' centres, separation and clearance for their surfaces (distance minus
+    radii), and so `separation_below`, the vertical room between two agents whose spheres overlap as seen from
+    above. A vehicle that the mission loses counts in none of this from then on, except that it must not hit
+    those that are left.
 
     Raises
     ------
