@@ -318,6 +318,16 @@ class Result:
         first, last = np.searchsorted(self.phase, [index, index + 1])
         return slice(int(first), int(last))
 
+    def extreme(self, name: str) -> Extremum | None:
+        """Worst value of a quantity in the whole flight, in continuous time; None if it is not known.
+
+        Names are those of `PhaseRecord.extremes`.
+        """
+        every = [p.extremes[name] for p in self.phases if name in p.extremes]
+        sign = -1.0 if name in _LEAST or name.startswith("clearance") else 1.0
+        size = (lambda x: abs(x.value)) if name == "tension" else (lambda x: sign * x.value)
+        return max(every, key=size, default=None)
+
     def save(self, path: str | Path) -> None:
         """Write the result to a netCDF-4 file, whole or not at all.
 
@@ -438,6 +448,8 @@ VARIABLES: dict[str, Variable] = {
 #: Those that a flight need not have.
 _OPTIONAL = {f.name for f in fields(Result) if f.name in VARIABLES and f.default is None}
 _INTEGERS = {name for name in VARIABLES if _HINTS[name].__origin__ == Ints}
+#: Quantities whose least value is the worst; of clearances, too.
+_LEAST = frozenset(("separation", "separation_below", "lost", "lowest"))
 #: Attribute by which a file is known as a result.
 _MARK = "rigidfleet_schema_version"
 #: Bytes of a chunk at most: as much as HDF5's cache holds.

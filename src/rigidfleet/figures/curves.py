@@ -12,7 +12,7 @@ from rigidfleet import attitude as att
 from rigidfleet import geometry
 from rigidfleet.figures import style as st
 from rigidfleet.figures.style import Floats, styled
-from rigidfleet.result import Result
+from rigidfleet.result import Extremum, Result
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -304,7 +304,7 @@ def draw_thrust(ax: Axes, result: Result) -> None:
         st.limit(ax, value, label, colour)
     top = max([*(value for value, *_ in limits), _sane(result, result.thrust)])
     ax.set_ylim(0, 1.12 * top if top > 0 else 1.0)
-    _extremes(ax, result, result.thrust, "N", _agent, always=False)
+    _extremes(ax, result, result.thrust, "N", _agent, name="thrust", always=False)
 
 
 def _sane(result: Result, values: Floats) -> float:
@@ -328,7 +328,7 @@ def inputs(result: Result) -> Figure:
     if not st.still(below, result.thrust, "N"):
         _within(below, result, result.thrust)
         widen(below, 0.1)
-        _extremes(below, result, result.thrust, "N", _agent)
+        _extremes(below, result, result.thrust, "N", _agent, name="thrust")
     st.agents_legend(above, result.n_agents)
     st.name_phases(fig, [above], result)
     return fig
@@ -338,6 +338,10 @@ def _agent(i: int) -> str:
     return f"agent {i + 1}"
 
 
+def _edge(x: Extremum) -> str:
+    return f"edge {x.who + 1}-{x.other + 1}"
+
+
 def _extremes(
     ax: Axes,
     result: Result,
@@ -345,12 +349,14 @@ def _extremes(
     unit: str,
     who: Callable[[int], str],
     *,
+    name: str = "",
     always: bool = True,
 ) -> None:
     """Write the greatest of values (K, n) into the axes, and mark what it cuts off at top and bottom.
 
-    Without ``always``, only what is cut off.
+    That between samples, too, if the record has it by ``name``. Without ``always``, only what is cut off.
     """
+    between = result.extreme(name)
     low, high = ax.get_ylim()
     for sign, edge, marker in ((1.0, high, "^"), (-1.0, low, "v")):
         size = np.where(np.isfinite(values), sign * values, -np.inf)
@@ -358,8 +364,16 @@ def _extremes(
         cut = size[k, i] > sign * edge
         if not np.isfinite(size[k, i]) or not (cut or (always and sign > 0)):
             continue
-        told = f"peak {values[k, i]:.3g} {unit}: {who(int(i))} at {result.time[k]:.2f} s"
+        peak, when, whose = float(values[k, i]), float(result.time[k]), who(int(i))
+        if between is not None and sign > 0 and between.value > peak:
+            peak, when = between.value, between.time
+            whose = _edge(between) if between.other >= 0 else _agent(between.who)
+        told = f"peak {peak:.3g} {unit}: {whose} at {when:.2f} s"
         if not cut:
+            if peak > values[k, i] and peak < high:
+                ax.plot(
+                    when, peak, "o", markersize=4, markerfacecolor="none", markeredgecolor=st.INK
+                )
             st.words(ax, told, st.corners())
             continue
         t = result.time[int((size > sign * edge).any(axis=1).argmax())]
@@ -402,7 +416,7 @@ def constraint_force(result: Result) -> Figure:
     fig, axes = st.time_figure(result, "Constraint force", 2, shares=shares)
     above, below = axes[:, 0]
     above.set_ylabel(r"force $|f_C|$ [N]")
-    if _from_none(above, result, force, "N"):
+    if _from_none(above, result, force, "N", "constraint_force"):
         st.agents_legend(above, result.n_agents)
     below.set_ylabel(r"tension $-\lambda$ [N]")
     if not len(result.edges):
@@ -411,13 +425,13 @@ def constraint_force(result: Result) -> Figure:
         edge_lines(below, result, tension)
         below.axhline(0.0, color=st.FAINT, linewidth=0.6, zorder=1)
         _within(below, result, tension)
-        _extremes(below, result, tension, "N", edge, always=False)
+        _extremes(below, result, tension, "N", edge, name="tension", always=False)
         st.legend(below, edge_handles(result))
     st.name_phases(fig, [above], result)
     return fig
 
 
-def _from_none(ax: Axes, result: Result, values: Floats, unit: str) -> bool:
+def _from_none(ax: Axes, result: Result, values: Floats, unit: str, name: str = "") -> bool:
     """Each agent's values (K, N) from zero, with the greatest in words; whether there was anything to draw."""
     if _idle(ax, result, values, unit, _agent):
         return False
@@ -425,7 +439,7 @@ def _from_none(ax: Axes, result: Result, values: Floats, unit: str) -> bool:
     top = _sane(result, values)
     if top > 0.0:
         ax.set_ylim(-0.04 * top, 1.12 * top)
-    _extremes(ax, result, values, unit, _agent)
+    _extremes(ax, result, values, unit, _agent, name=name)
     return True
 
 
@@ -540,31 +554,33 @@ def room_below(result: Result) -> Floats:
     return np.where(np.isfinite(least), least, np.nan)
 
 
-def _mark_least(ax: Axes, result: Result, values: Floats, who: str) -> None:
-    """Ring the least value and say how much, when and who."""
+def _mark_least(ax: Axes, result: Result, values: Floats, name: str) -> None:
+    """Ring the least value, between samples, too, and say how much, when and who."""
     known = np.where(np.isfinite(values), values, np.inf)
     k = int(known.argmin())
     if not np.isfinite(known[k]):
         return
-    t, value = result.time[k], values[k]
+    t, value, pair = float(result.time[k]), float(values[k]), None
+    between = result.extreme(name)
+    if between is not None and between.value <= value:
+        t, value, pair = between.time, between.value, (between.who, between.other)
+    elif name == "separation":
+        pair = tuple(result.separation_pair[k])
+    elif name == "clearance":
+        pair = result.clearance_agent[k], result.clearance_obstacle[k]
     ax.plot(
         t, value, "o", markersize=5, markerfacecolor="none", markeredgecolor=st.INK, clip_on=False
     )
+    who = "" if pair is None else _who(result, name, *map(int, pair))
     st.words(ax, f"{value:.3g} m at {t:.2f} s{who}", st.around(t, value))
 
 
-def _separated(result: Result) -> str:
-    known = np.where(np.isfinite(result.separation), result.separation, np.inf)
-    i, j = result.separation_pair[int(known.argmin())] + 1
-    return f", agents {min(i, j)} and {max(i, j)}"
-
-
-def _cleared(result: Result) -> str:
-    k = int(np.where(np.isfinite(result.clearance), result.clearance, np.inf).argmin())
-    agent, obstacle = int(result.clearance_agent[k]), int(result.clearance_obstacle[k])
-    if agent < 0 or not 0 <= obstacle < len(result.mission.obstacles):
+def _who(result: Result, name: str, first: int, second: int) -> str:
+    if name != "clearance":
+        return f", agents {min(first, second) + 1} and {max(first, second) + 1}"
+    if first < 0 or not 0 <= second < len(result.mission.obstacles):
         return ""
-    return f", agent {agent + 1} to {st.clean(result.mission.obstacles[obstacle].name)}"
+    return f", agent {first + 1} to {st.clean(result.mission.obstacles[second].name)}"
 
 
 def draw_separation(ax: Axes, result: Result) -> None:
@@ -579,7 +595,7 @@ def draw_separation(ax: Axes, result: Result) -> None:
     st.limit(
         ax, 0.0 if least is None else least, "contact" if least is None else f"limit {least:g} m"
     )
-    _mark_least(ax, result, values, _separated(result))
+    _mark_least(ax, result, values, "separation")
     _from_zero(ax, values)
 
 
@@ -592,7 +608,7 @@ def draw_clearance(ax: Axes, result: Result) -> None:
         return
     st.line(ax, result.time, values, color=st.TONES[0])
     st.limit(ax, 0.0, "contact")
-    _mark_least(ax, result, values, _cleared(result))
+    _mark_least(ax, result, values, "clearance")
     _from_zero(ax, values)
 
 
@@ -608,7 +624,7 @@ def draw_below(ax: Axes, result: Result, least: float) -> None:
     values = room_below(result)
     if np.isfinite(values).any():
         st.line(ax, result.time, values, color=st.TONES[0])
-        _mark_least(ax, result, values, "")
+        _mark_least(ax, result, values, "separation_below")
         _from_zero(ax, np.append(values, least))
     else:
         ax.text(
