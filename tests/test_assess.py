@@ -112,6 +112,23 @@ def pulse(shape: tuple[int, ...], at: tuple[int, ...], value: float) -> Any:
     return x
 
 
+# -- attitudes
+
+
+@pytest.mark.parametrize(("commanded", "passes"), [(0.0, True), (2.0, False)])
+def test_an_attitude_that_is_commanded_decides_over_the_integrated_frame(commanded, passes):
+    """A plane that lies as commanded has not flipped, wherever the integrated frame has gone; and else it has."""
+    mission = a_mission(TRIANGLE, 3)
+    p = slots(mission, "triangle")
+    asked = att.quaternion_from_dcm(att.dcm_from_euler([commanded, 0.0, 0.0]))
+    frame = att.quaternion_from_dcm(att.dcm_from_euler([1.6, 0.0, 0.0]))
+    quaternions = {
+        "attitude_reference": np.tile(asked, (5, 1)), "frame": np.tile(frame, (5, 1))
+    }  # fmt: skip
+    verdict = assess(flown(mission, p + HEIGHT, **quaternions))
+    assert failures(verdict) == (set() if passes else {"flip"})
+
+
 # -- shapes
 
 

@@ -51,7 +51,7 @@ def a_flight(rng: np.random.Generator) -> dict[str, Any]:
     target = rng.uniform(-3, 3, (n, 3)) * 10.0 ** rng.uniform(-2, 0) + [0, 0, 10]
     direction = rng.standard_normal((n, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    meet = rng.uniform(0.3, 1.2)
+    meet = rng.uniform(0.1, 0.7)
     velocity = speed * direction
     force = rng.uniform(-4, 4, 3)
     if rng.random() < 0.3:
@@ -75,7 +75,7 @@ def a_flight(rng: np.random.Generator) -> dict[str, Any]:
             "geofence": {"min": [-20.0, -20.0, 0.0], "max": [20.0, 20.0, 20.0]},
             "separation_below": 0.1,
         },
-        "phases": [{"kind": "hold", "control": "open", "until": 1.5, "input_force": force.tolist()}],
+        "phases": [{"kind": "hold", "control": "open", "until": 0.8, "input_force": force.tolist()}],
         "integrator": {"rtol": float(10.0 ** rng.uniform(-9, -3))},
         "output_step": float(rng.choice([0.05, 0.5])),
     }  # fmt: skip

@@ -370,7 +370,9 @@ def _extremes(
             whose = _edge(between) if between.other >= 0 else _agent(between.who)
         told = f"peak {peak:.3g} {unit}: {whose} at {when:.2f} s"
         if not cut:
-            if peak > values[k, i] and peak < high:
+            if high <= peak < 1.5 * high:
+                ax.set_ylim(low, peak + 0.05 * (peak - low))
+            if peak > values[k, i]:
                 ax.plot(
                     when, peak, "o", markersize=4, markerfacecolor="none", markeredgecolor=st.INK
                 )
