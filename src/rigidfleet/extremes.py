@@ -82,20 +82,22 @@ class Extremes:
         self.standing = (start <= PAD).astype(np.int64)
         self.pairs = self.columns = self.struck = np.zeros((0, 2), dtype=np.int64)
         self.spare, self.moved = np.zeros(2), np.zeros(2)
+        self.trail = records.NO_TRAIL
         self._list_all()
 
-    def begin(self, state: records.Integrator) -> None:
-        """Watch what an integrator leaves in its trail from now on."""
-        self._watch(state.trail)
-
-    def _watch(self, trail: records.Trail) -> None:
+    def begin(self, states: int, edges: int) -> records.Trail:
+        """Begin to watch an integrator of so many states, which is to leave its steps in this trail."""
+        if self.trail.points.shape[2] == states and len(self.trail.start) == 3 * self.n + 2 * edges:
+            return self.trail
+        self.trail = trail = records.trail(states, self.n, edges)
         found = records.monitor(
-            self.radius, self.boxes, self.fence, trail.points.shape[2], trail.gauge.shape[1],
+            self.radius, self.boxes, self.fence, states, len(trail.start),
             worst=self.worst, when=self.when, who=self.who, sign=self.sign, left=self.left,
             standing=self.standing, low=self.low, pad=PAD, pairs=self.pairs, columns=self.columns,
             struck=self.struck,
         )  # fmt: skip
         self.monitor = native.Watch(found)
+        return trail
 
     def lose(self, lost: NDArray[np.bool_]) -> None:
         """Go on without the vehicles ``lost`` (N,), which the others must not be hit by."""
@@ -104,6 +106,7 @@ class Extremes:
         struck = np.stack(np.meshgrid(gone, left, indexing="ij"), axis=-1).reshape(-1, 2)
         self.struck = np.ascontiguousarray(struck)
         self._list_all()
+        self.trail = records.NO_TRAIL  # others are watched from now on
 
     def take(
         self, program: Program, work: Workspace, state: records.Integrator, *, last: bool

@@ -85,9 +85,12 @@ def assemble(
     motion = joined("motion")
     wrench = np.concatenate([f_u.sum(axis=1), np.cross(x, f_u).sum(axis=1)], axis=1)
     asked = joined("wrench")
-    closeness = geometry.closeness(r, mission.agents.radius, mission.obstacles, left)
-    separation, pair, clearance, agent, obstacle = closeness
-    _put_extremes(phases, time, closeness)
+    radius = mission.agents.radius
+    room, nearest = geometry.rooms(r, radius, mission.obstacles)
+    room[~left] = np.inf
+    separation, pair = geometry.separation_of_left(r, radius, left)
+    clearance, agent, obstacle = geometry.least_room(room, nearest)
+    _put_extremes(phases, time, (separation, pair, clearance, agent, obstacle))
     edges = mission.edges
     distance = np.linalg.norm(r[:, edges[:, 0]] - r[:, edges[:, 1]], axis=2)
     if not left.all():

@@ -263,7 +263,6 @@ class Flight:
         work, solver = self._equip(plan)
         y = self._pack(plan)
         state = self._integrator(plan, y, self.now.t)
-        self.extremes.begin(state)
         if solver is not None:
             scale = self._tolerances(plan, len(y)) + state.rtol * np.abs(y)
             state.clock[1] = _first_step(plan.program, work, state, scale, t_end - self.now.t)
@@ -315,11 +314,9 @@ class Flight:
         return tolerance_of_velocity(given, self.now.r, self.masses, beta, large=large)
 
     def _integrator(self, plan: PhasePlan, y: Array, t: float) -> records.Integrator:
-        rtol, trail = (
-            self.mission.integrator.rtol,
-            records.trail(len(y), len(self.masses), len(plan.edges)),
-        )
-        return records.integrator(y, t, rtol=rtol, atol=self._tolerances(plan, len(y)), trail=trail)
+        rtol, trail = self.mission.integrator.rtol, self.extremes.begin(len(y), len(plan.edges))
+        atol = self._tolerances(plan, len(y))
+        return records.integrator(y, t, rtol=rtol, atol=atol, trail=trail)
 
     def _count(self, leg: Leg) -> None:
         """Add up what a leg, or its part up to a loss, has taken."""
@@ -379,7 +376,6 @@ class Flight:
         y = np.concatenate([y[: 6 * n], integral])
         leg.state = self._integrator(leg.plan, y, leg.t)
         leg.workspace, leg.solver = self._equip(leg.plan)
-        self.extremes.begin(leg.state)
         if own:
             return leg.plan.program
         held = without(program, kept, self.lost, large=leg.plan.method != "dense")

@@ -70,6 +70,31 @@ class Fit:
         return angle_between(self.points, att.dcm_from_quaternion(quaternion).T @ self.axis)
 
 
+class Quantity:
+    """Values (K, ...) at samples: whose they are, by sample and place, and what makes them worse."""
+
+    def __init__(self, values: Floats, who: Callable[..., str], sense: Callable[..., Any]) -> None:
+        self.values, self.who, self.sense = values, who, sense
+        #: The worst of each sample (K,); -infinity where none is finite.
+        self.rank = self._ranked(sense(values))
+        if not np.isfinite(self.rank).all():
+            self.rank = self._ranked(sense(np.where(np.isfinite(values), values, np.nan)))
+
+    @staticmethod
+    def _ranked(values: Floats) -> Floats:
+        if values.ndim > 1:  # along the agents, of which there are few, it takes longer
+            values = np.fmax.reduce(np.ascontiguousarray(values.T), axis=0, initial=-np.inf)
+        return np.where(np.isnan(values), -np.inf, values)
+
+    def at(self, k: int) -> tuple[float, tuple[int, ...]]:
+        """The worst of sample k, and its place."""
+        if self.values.ndim == 1:
+            return float(self.values[k]), ()
+        row = self.values[k]
+        i = int(np.where(np.isfinite(row), self.sense(row), -np.inf).argmax())
+        return float(row[i]), (i,)
+
+
 class Flight:
     """Measures a result, phase by phase: at its samples, computed anew from positions and forces, and between them."""
 
@@ -79,23 +104,38 @@ class Flight:
         self.fits: dict[int, Fit] = {}
         self.left = result.left
         radius, obstacles = self.mission.agents.radius, self.mission.obstacles
-        #: Separation, pair, clearance, agent and obstacle at samples (K, ...), see `geometry.closeness`.
-        self.close = geometry.closeness(result.position, radius, obstacles, self.left)
+        #: Room of each agent to obstacles, and the nearest one (K, N).
+        self.room, self.nearest = geometry.rooms(result.position, radius, obstacles)
+        if not self.left.all():
+            self.room[~self.left] = np.inf
+        #: Separation, pair, clearance, agent and obstacle at samples (K, ...).
+        self.close = (
+            *geometry.separation_of_left(result.position, radius, self.left),
+            *geometry.least_room(self.room, self.nearest),
+        )
         thrust = _length(result.input_force + result.constraint_force)
         if self.mission.agents.saturate:
             thrust = np.minimum(thrust, self.mission.agents.thrust_limit)
         self.thrust = self.of_left(np.maximum(thrust, result.thrust))
-        self.measured: dict[str, tuple[Floats, Callable[..., str]]] = {
-            "constraint": (np.abs(result.constraint), self.edge),
-            "separation": (self.close[0], self.pair),
-            "clearance": (self.close[2], self.obstacle),
-            "thrust": (self.thrust, self.agent),
-            "speed": (self.of_left(_length(result.velocity)), self.agent),
-            "acceleration": (self.of_left(_length(result.acceleration)), self.agent),
-            "constraint_force": (self.of_left(_length(result.constraint_force)), self.agent),
-            "tension": (-result.multiplier, self.edge),
-            "singular_value": (result.singular_value, lambda k: ""),
+        self.measured: dict[str, Quantity] = {
+            name: Quantity(values, who, SENSE[name])
+            for name, values, who in (
+                ("constraint", np.abs(result.constraint), self.edge),
+                ("separation", self.close[0], self.pair),
+                ("clearance", self.close[2], self.obstacle),
+                ("thrust", self.thrust, self.agent),
+                ("speed", self.of_left(_length(result.velocity)), self.agent),
+                ("acceleration", self.of_left(_length(result.acceleration)), self.agent),
+                ("constraint_force", self.of_left(_length(result.constraint_force)), self.agent),
+                ("tension", -result.multiplier, self.edge),
+                ("singular_value", result.singular_value, lambda k: ""),
+            )
         }
+        #: The worst of each quantity at the samples of each phase.
+        self.sampled = [
+            {name: self.worst_sample(q, result.samples(k)) for name, q in self.measured.items()}
+            for k in range(len(result.phases))
+        ]
 
     def of_left(self, values: Floats) -> Floats:
         """Values (K, N), NaN of agents that are lost."""
@@ -133,26 +173,21 @@ class Flight:
         return float(self.result.time[int(np.argmax(broken))]) if broken.any() else math.inf
 
     def extreme(
-        self,
-        values: Floats,
-        who: Callable[..., str],
-        sense: Callable[..., Any] = lambda x: x,
-        samples: slice = slice(None),
+        self, values: Floats, who: Callable[..., str], sense: Callable[..., Any] = lambda x: x
     ) -> Extreme | None:
         """Where sense(values) is greatest; values (K, ...), of which only the finite ones count."""
-        part = values[samples]
-        if not part.size:
+        return self.worst_sample(Quantity(values, who, sense), slice(0, len(values)))
+
+    def worst_sample(self, quantity: Quantity, samples: slice) -> Extreme | None:
+        """The worst of a quantity among some samples; None where nothing is known of it."""
+        rank = quantity.rank[samples]
+        if not len(rank):
             return None
-        rank = sense(part)
-        at = int(rank.argmax())
-        if not np.isfinite(rank.flat[at]):  # rarely: infinity and NaN are first
-            rank = np.where(np.isfinite(part), rank, -np.inf)
-            at = int(rank.argmax())
-            if rank.flat[at] == -np.inf:
-                return None
-        where = np.unravel_index(at, rank.shape)
-        k = (samples.start or 0) + int(where[0])
-        return Extreme(float(part[where]), who=who(k, *map(int, where[1:])), **self.at(k))
+        k = samples.start + int(rank.argmax())
+        if quantity.rank[k] == -np.inf:
+            return None
+        value, at = quantity.at(k)
+        return Extreme(value, who=quantity.who(k, *at), **self.at(k))
 
     # -- between samples ------------------------------------------------------------------------------
 
@@ -170,7 +205,7 @@ class Flight:
             who = self.beside(x.who, x.other)
         else:
             who = self.agent(0, x.who)
-        return Extreme(x.value, x.time, who, phase.name)
+        return Extreme(abs(x.value) if name == "constraint" else x.value, x.time, who, phase.name)
 
     def worst(
         self, name: str, sampled: Extreme | None, sense: Callable[..., Any] = lambda x: x
@@ -210,11 +245,8 @@ class Flight:
 
         A vehicle within `PAD` of an obstacle since the start, or until the end, stands on it.
         """
-        result, time = self.result, self.result.time
-        room, nearest = geometry.rooms(
-            result.position, self.mission.agents.radius, self.mission.obstacles
-        )
-        room = self.of_left(room)
+        time = self.result.time
+        room, nearest = self.of_left(self.room), self.nearest
         off = room > PAD
         first = np.where(off.any(axis=0), off.argmax(axis=0), len(time))
         last = np.where(off.any(axis=0), len(time) - 1 - off[::-1].argmax(axis=0), len(time))
@@ -261,8 +293,7 @@ class Flight:
     def contradictions(self) -> Iterator[tuple[str, float]]:
         """What in the record does not follow from its own positions and forces: in words, and when [s]."""
         result, time = self.result, self.result.time
-        i, j = result.edges.T
-        length = _length(result.position[:, i] - result.position[:, j])
+        length = geometry.lengths(result.position, result.edges).T
         rounding = 1e-9 * (1.0 + float(np.nanmax(np.abs(result.position), initial=0.0)))
         with np.errstate(invalid="ignore"):  # infinity where there is nothing to be near
             stored = {
@@ -284,8 +315,7 @@ class Flight:
                 x = phase.extremes.get(name)
                 if x is None or samples.stop == samples.start:
                     continue
-                sense, (values, who) = SENSE[name], self.measured[name]
-                sampled = self.extreme(values, who, sense, samples)
+                sense, sampled = SENSE[name], self.sampled[index][name]
                 if sampled is None:
                     continue
                 slack = rounding + share * abs(sampled.value)
@@ -315,11 +345,8 @@ class Flight:
                 fit = self.fits[index] = Fit(p[left], slots[left], left)
                 flip = self.flip(fit, record, last)
         extremes = {
-            name: _worse(
-                [self.extreme(values, who, SENSE[name], samples), self.between(name, index)],
-                SENSE[name],
-            )
-            for name, (values, who) in self.measured.items()
+            name: _worse([self.sampled[index][name], self.between(name, index)], q.sense)
+            for name, q in self.measured.items()
         }
         return PhaseVerdict(
             name=record.name,
@@ -386,7 +413,10 @@ class Flight:
 
 def _worse(every: Iterable[Extreme | None], sense: Callable[..., Any]) -> Extreme | None:
     """The worst of those there are; of equals the first."""
-    return max((e for e in every if e is not None), key=lambda e: sense(e.value), default=None)
+    found = [e for e in every if e is not None]
+    return (
+        max(found, key=lambda e: sense(e.value)) if len(found) > 1 else found[0] if found else None
+    )
 
 
 def _length(x: Floats) -> Floats:

@@ -205,29 +205,38 @@ def from_box(x, y, z, box, normal):
 
 
 @compiled
-def nearest_box(points, box, floor, pieces, normal):
-    """Least distance of a curve with control points (5, 3) from a box, if below ``floor``, and where."""
+def beyond_plane(piece, box, normal):
+    """A bound from below on the distance from a box of a curve with control points (15,).
+
+    The tangent plane at any point will do: the middle control point is near the curve.
+    """
+    x, y, z = piece[6], piece[7], piece[8]
+    distance, least = from_box(x, y, z, box, normal), 0.0
+    a, b, c = normal[0], normal[1], normal[2]
+    for k in range(0, 15, 3):
+        least = min(least, a * (piece[k] - x) + b * (piece[k + 1] - y) + c * (piece[k + 2] - z))
+    return distance + least
+
+
+@compiled
+def nearest_box(curve, box, floor, pieces, normal):
+    """Least distance of a curve with control points (5, 3) from a box, if below ``floor``, and where; else -1."""
     best, at, top, count, close = floor, -1.0, 0, 0, CLOSE
     for k in range(5):
         for q in range(3):
-            pieces[0, 3 * k + q] = points[k, q]
-            close = max(close, _ROUNDING * abs(points[k, q]))
+            pieces[0, 3 * k + q] = curve[k, q]
+    if not beyond_plane(pieces[0], box, normal) < floor:
+        return best, at
     pieces[0, 15], pieces[0, 16] = 0.0, 1.0
+    for k in range(15):
+        close = max(close, _ROUNDING * abs(pieces[0, k]))
     while top >= 0:
         piece, count = pieces[top], count + 1
         for k in (0, 4):
             distance = from_box(piece[3 * k], piece[3 * k + 1], piece[3 * k + 2], box, normal)
             if distance < best:
                 best, at = distance, piece[15] + (piece[16] if k == 4 else 0.0)
-        # The tangent plane at any point will do: the middle control point is near the curve.
-        bound = from_box(piece[6], piece[7], piece[8], box, normal)
-        least = 0.0
-        for k in range(5):
-            along = 0.0
-            for q in range(3):
-                along += normal[q] * (piece[3 * k + q] - piece[6 + q])
-            least = min(least, along)
-        bound += least
+        bound = beyond_plane(piece, box, normal)
         if bound < best - close and count > _MOST:
             best, at = bound, piece[15]
         if not bound < best - close or piece[16] <= _SHORTEST:
@@ -438,12 +447,21 @@ def watch_obstacles(i, curve, t, h, last, monitor):
     known to fly: it may be landing. What it comes to is kept apart until it is off again.
     """
     radius, standing = monitor.radius[i], monitor.standing[i] != 0
-    low, high = monitor.low, math.inf
+    low, normal = monitor.low, monitor.room[2]
+    x, y, z, span = curve[2, 0], curve[2, 1], curve[2, 2], 0.0
+    for k in range(5):
+        a, b, c = curve[k, 0] - x, curve[k, 1] - y, curve[k, 2] - z
+        span = max(span, a * a + b * b + c * c)
+    span = math.sqrt(span)
     for b in range(monitor.boxes.shape[0]):
         box = monitor.boxes[b]
         own = min(low[i, 0], monitor.worst[FLYING]) if not standing else monitor.worst[STANDING]
         floor = max(own, monitor.worst[CLEARANCE]) + radius
-        value, at = nearest_box(curve, box, floor, monitor.pieces, monitor.room[2])
+        far = max(0.0, box[0] - x, x - box[3]) ** 2 + max(0.0, box[1] - y, y - box[4]) ** 2
+        far += max(0.0, box[2] - z, z - box[5]) ** 2
+        if far >= (floor + span) ** 2 and floor + span > 0.0:  # from all of it
+            continue
+        value, at = nearest_box(curve, box, floor, monitor.pieces, normal)
         if at >= 0.0:
             value -= radius
             take(CLEARANCE, value, t + at * h, i, b, monitor)
@@ -451,15 +469,17 @@ def watch_obstacles(i, curve, t, h, last, monitor):
                 take(STANDING, value, t + at * h, i, b, monitor)
             elif value < low[i, 0]:
                 low[i, 0], low[i, 1], low[i, 2] = value, t + at * h, float(b)
-        if last:
-            end = from_box(curve[4, 0], curve[4, 1], curve[4, 2], box, monitor.room[2]) - radius
-            high = min(high, end)
-    if last and high > monitor.pad:
-        if standing:
-            monitor.standing[i] = 0
-        elif low[i, 0] < math.inf:
-            take(FLYING, low[i, 0], low[i, 1], i, int(low[i, 2]), monitor)
-            low[i, 0] = math.inf
+    if not last or not (standing or low[i, 0] < math.inf):
+        return
+    for b in range(monitor.boxes.shape[0]):
+        end = from_box(curve[4, 0], curve[4, 1], curve[4, 2], monitor.boxes[b], normal)
+        if end - radius <= monitor.pad:
+            return
+    if standing:
+        monitor.standing[i] = 0
+    else:
+        take(FLYING, low[i, 0], low[i, 1], i, int(low[i, 2]), monitor)
+        low[i, 0] = math.inf
 
 
 @compiled

@@ -23,7 +23,7 @@ LEAST_ERROR = math.log(1e-4)
     THRUST_MARGIN, ACCELERATION, CONSTRAINT_FORCE, TENSION, CONSTRAINT,
 ) = range(16)  # fmt: skip
 #: Bytes of a trail, about: the integrator pauses when it is full.
-_TRAIL = 1 << 20
+_TRAIL = 1 << 19
 
 
 class Trail(NamedTuple):
@@ -39,7 +39,7 @@ class Trail(NamedTuple):
 
 
 def trail(states: int, agents: int, edges: int) -> Trail:
-    """Allocate a trail of a megabyte, or of two steps."""
+    """Allocate a trail of half a megabyte, or of two steps."""
     row = 5 * states + 3 * agents + 2 * edges
     rows = max(2, _TRAIL // (8 * row))
     gauge = 3 * agents + 2 * edges
@@ -47,7 +47,8 @@ def trail(states: int, agents: int, edges: int) -> Trail:
     return Trail(*(np.empty(shape) for shape in shapes))
 
 
-_NO_TRAIL = Trail(np.zeros((0, 2)), np.zeros((0, 5, 0)), np.zeros((0, 0)), np.zeros(0))
+#: Where no steps are kept.
+NO_TRAIL = Trail(np.zeros((0, 2)), np.zeros((0, 5, 0)), np.zeros((0, 0)), np.zeros(0))
 
 
 class Monitor(NamedTuple):
@@ -125,7 +126,7 @@ def integrator(
     rtol: float,
     atol: Array,
     step: float = 1e-3,
-    trail: Trail = _NO_TRAIL,
+    trail: Trail = NO_TRAIL,
 ) -> Integrator:
     """Start an integration from state ``y`` (n,) at time t [s] with a first step [s] to try.
 
