@@ -49,16 +49,17 @@ def separation(r: Array, radius: ArrayLike) -> tuple[Array, Ints]:
                 least[k : k + 1], near = _closest_of_many(r[k : k + 1, who], radius[who])
                 pair[k] = who[near[0]]
         return least, pair
-    every, samples = np.stack(np.triu_indices(n, 1), axis=1), np.arange(len(r))
-    some = max(1, _ELEMENTS // (3 * max(1, len(r))))
-    for first in range(0, len(every), some):
-        pairs = every[first : first + some]
-        room = lengths(r, pairs) - radius[pairs].sum(axis=1)[:, None]
+    x, samples = np.ascontiguousarray(r.transpose(2, 1, 0)), np.arange(len(r))
+    for i in range(n - 1):  # rows of samples, which is faster than rows of agents
+        d = x[:, i + 1 :] - x[:, i : i + 1]
+        d *= d
+        room = np.sqrt(d[0] + d[1] + d[2]) - (radius[i] + radius[i + 1 :])[:, None]
         np.copyto(room, np.inf, where=np.isnan(room))
         j = room.argmin(axis=0)
         room = room[j, samples]
         closer = room < least
-        least[closer], pair[closer] = room[closer], pairs[j[closer]]
+        least[closer] = room[closer]
+        pair[closer, 0], pair[closer, 1] = i, i + 1 + j[closer]
     return least, pair
 
 
@@ -145,19 +146,22 @@ def headroom(
     n = r.shape[1]
     radius = np.asarray(radius, dtype=float)
     least, pair = np.full(len(r), np.inf), np.full((len(r), 2), -1)
-    if among is not None:
+    if among is not None and not among.all():
         r = np.where(among[:, :, None], r, np.nan)
     if n > _MANY:
         for k, points in enumerate(r):
             least[k], pair[k] = _lowest(points, radius)
         return least, pair
+    x, samples = np.ascontiguousarray(r.transpose(2, 1, 0)), np.arange(len(r))
     for i in range(n - 1):
-        apart, radii = r[:, i + 1 :] - r[:, i : i + 1], radius[i] + radius[i + 1 :]
-        overlap = apart[:, :, 0] ** 2 + apart[:, :, 1] ** 2 <= radii**2
-        room = np.where(overlap, abs(apart[:, :, 2]) - radii, np.inf)
-        room[np.isnan(room)] = np.inf  # who is nowhere is below nobody
-        j = room.argmin(axis=1)
-        room = room[np.arange(len(r)), j]
+        d, radii = x[:, i + 1 :] - x[:, i : i + 1], (radius[i] + radius[i + 1 :])[:, None]
+        overlap = d[0] * d[0] + d[1] * d[1] <= radii**2
+        if not overlap.any():  # who is nowhere is below nobody
+            continue
+        room = np.where(overlap, abs(d[2]) - radii, np.inf)
+        np.copyto(room, np.inf, where=np.isnan(room))
+        j = room.argmin(axis=0)
+        room = room[j, samples]
         lower = room < least
         least[lower] = room[lower]
         pair[lower, 0], pair[lower, 1] = i, i + 1 + j[lower]

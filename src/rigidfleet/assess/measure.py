@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -34,6 +35,9 @@ THIN = 1e-3
 #: forces of a large formation are known at the ends of steps alone.
 _SLACK = {"separation": 0.0, "clearance": 0.0, "speed": 1e-9, "thrust": 0.05, "acceleration": 0.5}
 
+#: Bytes of slots up to which what is known of their shape is kept, for the next phase or flight.
+_KEPT = 100_000
+
 #: Agents up to which a shape that is not the intended one is asked whether it is rigid.
 _JUDGED = 200
 
@@ -42,15 +46,17 @@ class Fit:
     """A formation as flown at one sample, p (N, 3), against its slots (N, 3)."""
 
     def __init__(self, p: Floats, slots: Floats, who: Ints | None = None) -> None:
-        self.error, pair, self.flown, self.intended, self.shortest = _all_pairs(p, slots)
+        known = (
+            _shape(slots.tobytes()) if slots.nbytes < _KEPT else _shape.__wrapped__(slots.tobytes())
+        )
+        #: Slots' dimension; direction of a line or normal of a plane, in their axes; their shortest distance [m].
+        self.dimension, self.axis, self.shortest = known
+        self.error, pair, self.flown, self.intended = _all_pairs(p, slots)
         #: The pair with the greatest error, by the numbers ``who`` (N,) of the agents.
         self.pair = pair if who is None else (int(who[pair[0]]), int(who[pair[1]]))
         p, slots = shapes.centred(p), shapes.centred(slots)
-        self.dimension = shapes.dimension(slots, THIN)
         self.mirrored = self.dimension == 3 and bool(np.linalg.det(p.T @ slots) < 0)
-        axes = np.linalg.svd(slots, full_matrices=False)[2]
-        #: Direction of a line or normal of a plane, in the slots' axes, and where it points in the world.
-        self.axis: Floats = axes[0] if self.dimension == 1 else axes[2]
+        #: Where the axis points in the world.
         self.points: Floats = shapes.kabsch(p, slots) @ self.axis
         self.in_order: bool | None = None
         if self.dimension == 1 and len(p) > 2:
@@ -424,8 +430,18 @@ def _length(x: Floats) -> Floats:
     return np.sqrt(np.einsum("...a,...a->...", x, x))
 
 
-def _all_pairs(p: Floats, slots: Floats) -> tuple[float, tuple[int, int], float, float, float]:
-    """Worst error of a distance: error, pair, flown, intended; and the shortest intended [m].
+@lru_cache(64)
+def _shape(slots: bytes) -> tuple[int, Floats, float]:
+    """Dimension of slots (N, 3), the direction of a line or the normal of a plane, and the shortest distance [m]."""
+    points = np.frombuffer(slots).reshape(-1, 3)
+    centred = shapes.centred(points)
+    dimension = shapes.dimension(centred, THIN)
+    axes = np.linalg.svd(centred, full_matrices=False)[2]
+    return dimension, axes[0] if dimension == 1 else axes[2], float(shapes.nearest(points).min())
+
+
+def _all_pairs(p: Floats, slots: Floats) -> tuple[float, tuple[int, int], float, float]:
+    """Worst error of a distance: error, pair, flown, intended [m].
 
     Of all pairs, but few are looked at: no error is greater than the sum of how far both agents are off their slots,
     however those are laid onto them, as they are or mirrored. Less than rounding counts for nothing.
@@ -448,7 +464,7 @@ def _all_pairs(p: Floats, slots: Floats) -> tuple[float, tuple[int, int], float,
         if error[j] > worst[0]:
             pair = (int(min(i, others[j])), int(max(i, others[j])))
             worst = (float(error[j]), pair, float(flown[j]), float(intended[j]))
-    return *worst, float(shapes.nearest(slots).min())
+    return worst
 
 
 def is_rigid(p: Floats, edges: Ints) -> bool:
