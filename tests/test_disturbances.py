@@ -170,7 +170,7 @@ def test_the_constraint_law_is_not_told():
     only its feedback: 0.12 m, or 4 mm with poles five times as fast, where tracking alone loses 0.53 m."""
     air = {"wind": [2.0, 1.0, 0.0], "drag": 0.25, "gusts": FIRST | {"intensity": 1.7}}
     phases = [
-        FLY[0] | {"duration": 6.0},
+        FLY[0] | {"duration": 6.0, "attitude": "free"},
         FLY[1] | {"position": [35.0, 5.0, 25.0], "duration": 20.0},
     ]
     tables: dict[str, Any] = {"phases": phases, "agents": {"mass": 1.0}}
