@@ -32,9 +32,9 @@ from rigidfleet.assess import assess
 from rigidfleet.errors import FlightError
 from rigidfleet.geometry import smallest_singular_value
 from rigidfleet.mission import Mission, load_mission, mission_names
-from rigidfleet.route import align_slots
 from rigidfleet.result import Result
 from rigidfleet.rigidity import Verdict, analyse, jacobian
+from rigidfleet.route import align_slots
 from rigidfleet.simulate import simulate
 
 Floats = NDArray[np.float64]

@@ -223,6 +223,12 @@ SHAPES: dict[str, Shape] = {
 }
 
 
+#: Polygons by name, and the agents that make them.
+POLYGONS = {
+    "pentagon": 5, "heptagon": 7, "octagon": 8, "nonagon": 9, "decagon": 10, "hendecagon": 11, "dodecagon": 12,
+}  # fmt: skip
+
+
 def slots(shape: str, size: float | Sequence[float], n: int) -> Floats:
     """Slots of a named shape of `n` agents, geometric centre at 0.
 
@@ -831,7 +837,7 @@ def assigned(
     by assigning the slots and turning them to the agents (Kabsch) until nothing changes. The safest has the most room
     between surfaces among the shortest, others of that kind, whose turn differs from the one given, and the order
     given; among all but equal ones the shorter is taken, and never less room than the shortest has. The order given is
-    kept where nothing is better. Many agents try fewer attitudes: two assignments in all from some 1,600 on.
+    kept where nothing is better. Many agents try fewer attitudes: two assignments in all from some 1,000 on.
     """
     p, q = centred(start), centred(slots)
     n = len(p)
@@ -867,7 +873,7 @@ def assigned(
 
 
 #: Pairs of agents that are looked at together; work on assignments, N^3 each, in some seconds.
-_PAIRS, _WORK = 200_000, 4e9
+_PAIRS, _WORK = 200_000, 2e9
 #: From one attitude so many assignments at most.
 _ROUNDS = 20
 

@@ -887,7 +887,8 @@ def _obstacles(mission: Mission, found: Preflight) -> Iterator[Remark]:
         for leg in found.legs:
             room, agent, _ = geometry.clearance(leg.position, radius, [thing])
             k = int(room.argmin())
-            if room[k] < worst.get(leg.exact, (np.inf,))[0]:
+            # Of as near ones the first: rounding and a rest's last millimetre count for nothing.
+            if room[k] < worst.get(leg.exact, (np.inf,))[0] - 1e-3:
                 worst[leg.exact] = float(room[k]), float(leg.time[k]), int(agent[k]), leg.phase
         if worst:
             room, t, i, _ = min(worst.values())
@@ -991,15 +992,15 @@ def _assigned(mission: Mission, found: Preflight) -> Iterator[Remark]:
     slots = mission.formation_slots(first.formation) if first is not None else None
     if first is None or slots is None or not 2 <= mission.n_agents <= _COMPARED:
         return
+    index, masses = mission.phases.index(first), np.array(mission.agents.mass)
+    if index >= len(found.legs):
+        return
     for name in ("as it is", "shortest", "safe"):
-        other = mission
+        other, leg = mission, found.legs[index]
         if name not in ("as it is", mission.assignment):
             other = Mission.from_dict(mission.to_dict() | {"assignment": name}, mission.origin)
-        (*_, leg), known = planned(other, mission.phases.index(first) + 1)
-        if not known:
-            return
+            leg = planned(other, index + 1)[0][index]
         assert leg.ways is not None  # it shapes
-        masses = np.array(mission.agents.mass)
         x = leg.position - (masses @ leg.position)[:, None] / masses.sum()
         way = float(np.linalg.norm(np.diff(x, axis=0), axis=2).sum())
         room = shapes.nearest_way(*leg.ways, mission.agents.radius)[0]
