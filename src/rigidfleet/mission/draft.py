@@ -24,6 +24,10 @@ _APART = 1.2
 #: Up to so many agents start below their slots or beside them; more, of which some fly above others, on a grid
 #: with this room [m], which is more than the root of 2 of what their radii and the separation take.
 _FEW, _WIDE = 20, 1.5
+#: A formation settles for so long after its change, and stays so long at the end [s].
+_SETTLE, _HOLD = 2, 3
+#: Places of agents that a new mission stores, or so.
+_STORED = 2e6
 #: More agents are held by their slots alone; edges between all pairs would be too many.
 _ALL_PAIRS, _MOST = 40, 2000
 #: Where comments beside keys begin.
@@ -91,6 +95,8 @@ def draft(
     if not below:  # some are on the way far across
         way = float(np.linalg.norm(np.ptp(np.vstack([slots, start - centre]), axis=0)))
     blend = max(4, _blend(way))
+    climb, flights = _time(aloft - centre), _flights(aloft, waypoints)
+    lasts = climb + blend + _SETTLE + sum(time for _, time in flights) + _HOLD
     limit = math.ceil(_LIFT * mass * 9.81) if thrust_limit is None else thrust_limit
     extent = json.dumps([float(x) for x in size]) if len(size) > 1 else f"{size[0]:g}"
     if _is_box(shape, size):
@@ -111,15 +117,15 @@ def draft(
         separation=f"{min(0.5, nearest / 6):.3g}",
         # In a shape in space that is small, or of many, some pass below others, whatever one does.
         below="" if below and (shapes.dimension(slots) < 3 or nearest >= 3.0) else "# ",
-        assignment="" if below else _ASSIGNED,
+        keys=("" if below else _ASSIGNED) + _output_step(n, lasts),
         aloft=_row(aloft),
         blend=""
         if blend == 4
         else f"blend = {blend}.0                       # [s] of the change of shape\n",
-        establish=f"{blend + 2}.0",
-        climb=_time(aloft - centre),
+        establish=f"{blend + _SETTLE}.0",
+        climb=f"{climb}.0",
     )
-    return _aligned(head + "".join(_flights(aloft, waypoints)) + _TAIL)
+    return _aligned(head + "".join(text for text, _ in flights) + _TAIL)
 
 
 def shape_known(shape: str) -> None:
@@ -181,21 +187,28 @@ def _blend(way: float) -> int:
     return math.ceil(max(35 / 16 * way / _SPEED, math.sqrt(7.52 * way / _ACCELERATION)))
 
 
-def _flights(at: Floats, waypoints: Sequence[Sequence[float]]) -> list[str]:
-    """A phase for each waypoint, on the way from where the formation is."""
+def _output_step(n: int, lasts: float) -> str:
+    """The key, where so many agents would fill the disk by default in a mission that lasts so long [s]."""
+    step = math.ceil(20 * lasts * n / _STORED) / 20
+    return "" if step <= 0.05 else f"output_step = {step:g}                # [s] between samples\n"
+
+
+def _flights(at: Floats, waypoints: Sequence[Sequence[float]]) -> list[tuple[str, int]]:
+    """A phase for each waypoint, on the way from where the formation is, and how long it takes [s]."""
     found = []
     for waypoint in waypoints:
         to = np.asarray(waypoint, dtype=float)
-        found.append(_FLY.format(position=_row(to), time=_time(to - at)))
+        time = _time(to - at)
+        found.append((_FLY.format(position=_row(to), time=f"{time}.0"), time))
         at = to
     return found
 
 
-def _time(way: Floats) -> str:
+def _time(way: Floats) -> int:
     """A time [s] for a way (3,) [m] from rest to rest, within the speed and acceleration chosen."""
     distance = float(np.linalg.norm(way))
     least = max(1.5 * distance / _SPEED, math.sqrt(6.0 * distance / _ACCELERATION))
-    return f"{max(4, math.ceil(least))}.0"
+    return max(4, math.ceil(least))
 
 
 def _aligned(text: str) -> str:
@@ -224,7 +237,7 @@ _HEAD = """\
 schema_version = 1
 name = "{name}"                   # results go to flights/NAME
 title = "{title}"
-{assignment}
+{keys}
 [agents]
 mass = {mass}                        # [kg] one number for all, or a list
 position = [                      # [m] where they stand at the start
