@@ -479,6 +479,7 @@ def new(
     """
     from rigidfleet.mission import Mission
     from rigidfleet.mission import draft as drafts
+    from rigidfleet.preflight import preflight
     from rigidfleet.result import write_file
 
     given: dict[str, Any] = {
@@ -497,6 +498,11 @@ def new(
     except ValueError as error:
         raise RigidfleetError(str(error)) from None
     mission = Mission.from_toml(text, str(file))
+    fails = [r.text for r in preflight(mission, search=False).remarks if r.level == "fails"]
+    if fails:
+        raise RigidfleetError(
+            f"{file}: is not written, as it would fail: {'; '.join(fails)}. Change what you ask for."
+        )
     write_file(file, text.encode())
     if json:
         screen.print_json({"file": str(file)} | _facts(mission))
