@@ -43,8 +43,7 @@ def test_other_numbers_fly_and_pass(asked):
 
 def checked(shape, agents):
     """What the check of a new mission says will fail, with the agents."""
-    sizes = {} if shape != "helix" else {"size": [4.0]}
-    mission = Mission.from_toml(draft("new", shape=shape, agents=agents, **sizes))
+    mission = Mission.from_toml(draft("new", shape=shape, agents=agents))
     remarks = preflight(mission, search=False).remarks
     return mission.n_agents, [r.text for r in remarks if r.level == "fails"]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import permutations
 from typing import Any
 
 import numpy as np
@@ -152,8 +153,6 @@ def test_ways_are_straight_and_shortest_where_the_attitude_is_known():
         position = planned(mission)[0][0].position
         ways = position[-1] - position[0]
         there = about_centre(slots) @ turned.T
-        from itertools import permutations
-
         least = min(
             np.sum((there[list(order)] - about_centre(start)) ** 2)
             for order in permutations(range(6))
@@ -434,12 +433,14 @@ def test_a_free_attitude_is_the_nearest():
     assert result.phases[0].target is None
 
 
-def test_distances_alone_have_a_free_attitude():
-    """Without slots tracked nothing turns the agents: a turned tetrahedron stays as it is turned."""
+@pytest.mark.parametrize("control", ["open", "slots"])
+def test_distances_alone_have_a_free_attitude(control):
+    """Nothing turns agents that track no slots, or slots without axes: a turned tetrahedron stays as it is turned."""
     slots = shapes.slots("tetrahedron", 4.0, 4)
     turned = world(40.0, 10.0, 75.0)
     start = slots @ turned.T + [0, 0, 20]
-    mission = fly({"a": {"slots": slots.tolist()}}, start, [establish("a", control="open")])
+    form = {"slots": slots.tolist()} if control == "open" else {"distances": [4.0] * 6}
+    mission = fly({"a": form}, start, [establish("a", control=control, reference="distances")])
     result = simulate(mission)
     assert off(result, slots, turned) < 1e-6
     assert result.phases[0].target is None
@@ -475,6 +476,7 @@ def test_a_grid_is_established_level():
 @pytest.mark.parametrize(
     ("keys", "key", "words"),
     [
+        ({"formation": "d", "attitude": "drawn"}, "attitude", "drawn in no axes"),
         ({"attitude": "free", "yaw_deg": 10.0}, "yaw_deg", "attitude = 'free' asks for none"),
         ({"control": "open", "yaw_deg": 10.0}, "yaw_deg", "no effect with control 'open'"),
         ({"control": "open", "attitude": "drawn"}, "attitude", "no effect with control 'open'"),
@@ -484,7 +486,12 @@ def test_a_grid_is_established_level():
 def test_attitudes_that_cannot_be(keys, key, words):
     """An attitude that would not be flown is refused, with its key and the reason."""
     with pytest.raises(MissionError) as caught:
-        fly({"a": {"slots": SPATIAL}}, start_for(SPATIAL), [establish("a", **keys)])
+        forms = {"a": {"slots": SPATIAL}, "d": {"distances": pdist(np.array(SPATIAL)).tolist()}}
+        fly(
+            forms,
+            start_for(SPATIAL),
+            [{"kind": "establish", "duration": 5.0, "formation": "a"} | keys],
+        )
     (finding,) = caught.value.findings
     assert finding.key == f"phases[1].{key}"
     assert words in f"{finding.problem}"

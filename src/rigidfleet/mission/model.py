@@ -193,11 +193,14 @@ class Mission(Contents):
     def free_attitude(self, phase: Phase) -> bool:
         """Whether nothing steers the attitude in which a phase takes its formation.
 
-        That of distances alone, and of slots where the phase asks for it by name.
+        Forces between agents do not. Slots do, unless the phase asks for that by name, or what is established is given
+        by distances alone, which have no axes.
         """
-        return phase.control != "slots" or (
-            isinstance(phase, Establish) and phase.attitude == "free"
-        )
+        if phase.control != "slots" or not isinstance(phase, Establish):
+            return phase.control != "slots"
+        if phase.attitude_deg is not None:
+            return False
+        return phase.attitude == "free" or not self.formations[phase.formation].knows_slots
 
     def _slots(self, name: str) -> Floats | None:
         """Slots (N, 3) [m] of a formation in their own order; made once."""

@@ -250,6 +250,18 @@ def _formations(
             if isinstance(p, Reshape) and held == "":
                 problem = "there is no formation yet to change from"
                 notes.add((*path, "kind"), problem, "use kind = 'establish' for the first")
+            drawn = notes.data["phases"][k].get("attitude") == "drawn"
+            if (
+                drawn
+                and form is not None
+                and not form.knows_slots
+                and notes.right(path, "attitude")
+            ):
+                problem = (
+                    f"formation '{p.formation}' has distances alone, which are drawn in no axes"
+                )
+                remedy = "remove it, give the formation slots, or ask for angles by yaw_deg"
+                notes.add((*path, "attitude"), problem, remedy)
             if n is not None and form is not None and sound(notes, p.formation):
                 _blendable(notes, p, form, n, path)
                 if held == "" and "agents" in parts:

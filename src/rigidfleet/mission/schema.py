@@ -511,9 +511,9 @@ class Establish(Attitude, Shaping):
     kind: Literal["establish"] = Field(description="take a formation")
     attitude: Literal["drawn", "free"] = Field(
         "drawn",
-        description="drawn: tracked slots lie as they are drawn, in the world's axes or those of [body_frame], or at "
-        "the angles asked for last, here or before; free: as they lie nearest to the agents. Of a formation that no "
-        "slots are tracked of, it is always free",
+        description="drawn: the slots tracked lie as they are drawn, in the world's axes or those of [body_frame], or "
+        "at the angles asked for last, here or in a phase before; free: as they lie nearest to the agents, as always "
+        "where no slots are tracked, and of a formation given by distances unless it asks for angles",
     )
 
 
