@@ -485,13 +485,10 @@ def test_a_grid_is_established_level():
 )
 def test_attitudes_that_cannot_be(keys, key, words):
     """An attitude that would not be flown is refused, with its key and the reason."""
+    forms = {"a": {"slots": SPATIAL}, "d": {"distances": pdist(np.array(SPATIAL)).tolist()}}
+    phase = {"kind": "establish", "duration": 5.0, "formation": "a"} | keys
     with pytest.raises(MissionError) as caught:
-        forms = {"a": {"slots": SPATIAL}, "d": {"distances": pdist(np.array(SPATIAL)).tolist()}}
-        fly(
-            forms,
-            start_for(SPATIAL),
-            [{"kind": "establish", "duration": 5.0, "formation": "a"} | keys],
-        )
+        fly(forms, start_for(SPATIAL), [phase])
     (finding,) = caught.value.findings
     assert finding.key == f"phases[1].{key}"
     assert words in f"{finding.problem}"

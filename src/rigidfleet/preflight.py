@@ -671,14 +671,11 @@ def _separation(mission: Mission, found: Preflight) -> Iterator[Remark]:
     least = np.inf, 0.0, (0, 0)
     for number, leg in enumerate(found.legs):
         ends: list[tuple[float, float, tuple[int, ...]]] = []
-        if leg.ways is None:
-            room, pair = geometry.separation(leg.position, radius)
-            k = int(room.argmin())
-            ends.append((float(room[k]), float(leg.time[k]), tuple(pair[k].tolist())))
-        else:
-            for k, places in ((0, leg.ways[0]), (-1, leg.ways[1])):
-                room, who, _ = shapes.nearest_way(places, places, radius)
-                ends.append((room, float(leg.time[k]), who))
+        positions = leg.position if leg.ways is None else np.array(leg.ways)
+        rooms, pairs = geometry.separation(positions, radius)
+        for k in [int(rooms.argmin())] if leg.ways is None else [0, -1]:
+            ends.append((float(rooms[k]), float(leg.time[k]), tuple(pairs[k].tolist())))
+        if leg.ways is not None:
             room, who, share = shapes.nearest_way(*leg.ways, radius)
             crossing = room, _time_of(mission, leg, number, share), who
             least = min(least, crossing)
@@ -695,7 +692,7 @@ def _separation(mission: Mission, found: Preflight) -> Iterator[Remark]:
         found.room = least[0], least[1], _agents(least[2])
     for exact, (room, t, who, phase) in worst.items():
         if room <= 0 or room < limit - _SLACK:
-            text = f"{_near(who, room, t, phase, limit, exact=exact)}"
+            text = _near(who, room, t, phase, limit, exact=exact)
             guess = "" if exact else "; distances lead there, and the way is a guess"
             yield Remark("fails" if exact else "note", "collision", text + guess)
 
