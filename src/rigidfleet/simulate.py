@@ -707,8 +707,9 @@ def _target(mission: Mission, phase: Phase, plan: PhasePlan) -> dict[str, Any] |
     if not (isinstance(phase, Fly | Turn) or lies) or plan.goal is None:
         return None
     turns = lies or phase.attitude_deg is not None
+    shaped = plan.program.reference.t0 + plan.program.reference.T_b
     return {
-        "time": plan.arrival,
+        "time": max(plan.arrival, shaped) if lies else plan.arrival,
         "position": plan.goal.r.tolist() if isinstance(phase, Fly) else None,
         "velocity": plan.goal.v.tolist() if isinstance(phase, Fly) else None,
         "attitude": att.quaternion_from_dcm(plan.goal.T).tolist() if turns else None,
