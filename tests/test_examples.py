@@ -73,4 +73,4 @@ def test_gusts(example):
     assert alone["pair"] == pytest.approx(0.26, abs=0.01)
     assert blind["pair"] == pytest.approx(0.082, abs=0.005)
     # What all agents feel alike, f_C cannot answer.
-    assert told["slot"] > 0.8 * alone["slot"]
+    assert told["slot"] > 0.7 * alone["slot"]
