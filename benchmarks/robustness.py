@@ -32,9 +32,9 @@ from rigidfleet.assess import assess
 from rigidfleet.errors import FlightError
 from rigidfleet.geometry import smallest_singular_value
 from rigidfleet.mission import Mission, load_mission, mission_names
-from rigidfleet.plan import align_slots
 from rigidfleet.result import Result
 from rigidfleet.rigidity import Verdict, analyse, jacobian
+from rigidfleet.route import align_slots
 from rigidfleet.simulate import simulate
 
 Floats = NDArray[np.float64]
@@ -302,7 +302,7 @@ def beside(case: Case) -> Case:
 
 def assigned(case: Case) -> Case:
     """The same start, each agent where the slots are nearer: as assignment = "shortest" has it."""
-    order = shapes.assigned(case.start, case.slots, np.ones(case.n))
+    order = shapes.assigned(case.start, case.slots).order
     return replace(case, start=case.start[np.argsort(order)])
 
 

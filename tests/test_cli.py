@@ -302,6 +302,11 @@ def test_new_json(capsys):
     ("tokens", "words"),
     [
         (["--shape", "trangle"], "did you mean 'triangle'"),
+        (["--shape", "pentagon"], "did you mean 'polygon' with 5 agents?"),
+        (["--agents", "2.5"], "Invalid value for --agents: '2.5' is no whole number."),
+        (["--agents", "1e400"], "is no whole number"),
+        (["--thrust-limit", "5"], "it would fail: agent 1 needs"),
+        (["--shape", "sphere", "--agents", "300", "--to", "9", "9", "9"], "reaches 22.6 m below"),
         (["--mass", "-1"], "agents.mass = -1"),
         (["--to", "1", "2"], "requires"),
     ],
@@ -311,6 +316,24 @@ def test_new_that_cannot_be(capsys, tokens, words):
     assert cli.main(["new", "mine", *tokens]) == cli.BAD_INPUT
     assert words in " ".join(capsys.readouterr().err.split())
     assert not Path("mine.toml").exists()
+
+
+@pytest.mark.parametrize(
+    "tokens",
+    [
+        ["sweep", "two-agents", "--vary", "gravity=9,10", "--runs", "2.5"],
+        ["sweep", "two-agents", "--vary", "gravity=9,10", "--seed", "1.5"],
+        ["sweep", "two-agents", "--vary", "gravity=9,10", "--workers", "1.5"],
+        ["design", "sphere", "--agents", "12.5"],
+        ["live", "two-agents", "--port", "80.5"],
+    ],
+)
+def test_a_whole_number_is_not_rounded(capsys, tokens):
+    """Wherever a count is asked for, a fraction is one clear error."""
+    assert cli.main(tokens) == cli.BAD_INPUT
+    err = capsys.readouterr().err
+    assert f"'{tokens[-1]}' is no whole number." in err
+    assert err.count("error") == 1
 
 
 def test_new_into_no_folder(capsys):

@@ -170,7 +170,7 @@ def test_the_constraint_law_is_not_told():
     only its feedback: 0.12 m, or 4 mm with poles five times as fast, where tracking alone loses 0.53 m."""
     air = {"wind": [2.0, 1.0, 0.0], "drag": 0.25, "gusts": FIRST | {"intensity": 1.7}}
     phases = [
-        FLY[0] | {"duration": 6.0},
+        FLY[0] | {"duration": 6.0, "attitude": "free"},
         FLY[1] | {"position": [35.0, 5.0, 25.0], "duration": 20.0},
     ]
     tables: dict[str, Any] = {"phases": phases, "agents": {"mass": 1.0}}
@@ -419,6 +419,74 @@ def test_a_users_controller_flies_those_left():
     assert not result.thrust[k, 1].any()
     np.testing.assert_allclose(result.acceleration[k, 1, 2], -G, atol=1e-9)
     assert np.nanmax(np.linalg.norm(result.position - result.slot_position, axis=2)) < 0.1
+
+
+FOUR = [[0.0, 0.0, 20.0], [4.0, 0.0, 20.0], [1.0, 3.5, 20.5], [1.5, 1.0, 23.0]]
+SLENDER = [[0.0, 0.0, 20.0], [4.0, 0.0, 20.0], [2.0, 0.9, 20.0], [2.0, 0.4, 21.0]]
+MANY = [
+    [3.0 * x, 3.0 * y, 30.0 + 3.0 * z + 0.2 * x * y]
+    for x in range(4)
+    for y in range(4)
+    for z in range(4)
+]
+
+
+@pytest.mark.parametrize("controlled", [False, True], ids=["law", "controller"])
+@pytest.mark.parametrize(
+    ("places", "constraint"),
+    [
+        (FOUR, {"damping": 0.5}),
+        (SLENDER, {"damping": "auto"}),
+        (FOUR, {"solver": "spectral", "threshold": 3.0}),
+        pytest.param(MANY, {"damping": 0.5}, marks=pytest.mark.long),
+    ],
+    ids=["damped", "auto", "spectral", "many"],
+)
+@pytest.mark.parametrize("when", [0.1, 0.5 + 1e-7], ids=["before", "within"])
+def test_the_lost_count_for_nothing_in_the_law(places, constraint, when, controlled):
+    """Those left fly as if the lost, ten times as heavy, had never been there: the mean mass is that of those left.
+
+    It is lost before the formation is taken, or as soon as that has begun. The other mission lacks it, its slot and its
+    edges.
+    """
+    n = len(places)
+    masses = np.linspace(0.8, 1.5, n)
+    masses[-1] = 10.0
+    slots = np.array(places) * [1.02, 0.97, 1.0]
+    near = np.linalg.norm(slots[:, None] - slots, axis=2) < (9.0 if n == 4 else 4.0)
+    edges = np.argwhere(np.triu(near, 1)) + 1
+    change = {
+        "kind": "establish", "formation": "f", "reference": "squares", "blend": 2.0, "duration": 3.0,
+        "control": "slots" if controlled else "open",
+    }  # fmt: skip
+
+    def flown(who, lost):
+        formation = {
+            "slots": slots[:who].tolist(),
+            "edges": edges[(edges <= who).all(axis=1)].tolist(),
+        }
+        agents = {"mass": masses[:who].tolist(), "position": places[:who]}
+        return mission(
+            lost, phases=[{"kind": "hold", "control": "open", "duration": 0.5}, change], agents=agents,
+            formations={"f": formation}, constraint=constraint, integrator={"rtol": 1e-10, "atol": 1e-12},
+        )  # fmt: skip
+
+    def push(now):
+        """By forces that know no slot: what is left of the flight is the law's."""
+        force = np.zeros((len(now.masses), 3))
+        force[:, 2] = now.masses * G
+        force[: n - 1, 0] += 0.05 * np.arange(n - 1)
+        return force
+
+    pair = flown(n, {"lost": [{"agent": n, "time": when}]}), flown(n - 1, {})
+    with_loss, without = (
+        simulate(m, controller=push if controlled else None, rate=20.0) for m in pair
+    )
+    assert with_loss.complete
+    assert without.complete
+    end = with_loss.position[-1, : n - 1] - with_loss.position[-1, :1]
+    wanted = without.position[-1] - without.position[-1, :1]
+    np.testing.assert_allclose(end, wanted, rtol=0, atol=2e-7)
 
 
 # -- the same again

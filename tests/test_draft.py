@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 
 from rigidfleet.assess import assess
+from rigidfleet.errors import MissionError
 from rigidfleet.formation import SHAPES
 from rigidfleet.mission import Mission
 from rigidfleet.mission.draft import agents_for, draft, shape_for
+from rigidfleet.preflight import preflight
 from rigidfleet.simulate import simulate
 
 
@@ -37,6 +39,52 @@ def test_other_numbers_fly_and_pass(asked):
     """So does one of few or many agents, small or long, light, or with several waypoints."""
     verdict = assess(simulate(Mission.from_toml(draft("new", **asked))))
     assert verdict.passed, verdict.summary
+
+
+def checked(shape, agents):
+    """What the check of a new mission says will fail, with the agents."""
+    mission = Mission.from_toml(draft("new", shape=shape, agents=agents))
+    remarks = preflight(mission, search=False).remarks
+    return mission.n_agents, [r.text for r in remarks if r.level == "fails"]
+
+
+#: Where something changes: tables of edges, starts on a grid, the least that shells take.
+COUNTS = [*range(1, 26), 36, 39, 40, 41, 42, 64, 100, 121, 150, 200, 250, 299, 300]
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_every_shape_passes_its_check(shape):
+    """A new mission passes its own check at the fewest agents that its shape takes, some more, and three hundred."""
+    taken = SHAPES[shape].agents
+    some = {n for n in (taken.start, taken.start + 1, 20, 21, 41, 300) if n in taken}
+    for n in sorted(some):
+        assert checked(shape, n) == (n, [])
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("shape", SHAPES)
+def test_every_shape_passes_its_check_at_every_count(shape):
+    """At every count of a ladder to 300, and at the most that it takes."""
+    for n in [count for count in [*COUNTS, 1000, 2000] if count in SHAPES[shape].agents]:
+        assert checked(shape, n) == (n, [])
+
+
+@pytest.mark.parametrize(("shape", "agents"), [("sphere", 60), ("helix", 90), ("shells", 70)])
+def test_many_in_space_fly_and_pass(shape, agents):
+    """Shapes in space of many, which start on a grid, fly and pass as they are drafted."""
+    verdict = assess(simulate(Mission.from_toml(draft("new", shape=shape, agents=agents))))
+    assert verdict.passed, verdict.summary
+
+
+@pytest.mark.parametrize(("word", "agents"), [("pentagon", 5), ("Octagon", 8), ("dodecagn", 12)])
+def test_polygons_by_their_names(word, agents):
+    """The name of a polygon leads to the shape, and to its number of agents."""
+    with pytest.raises(ValueError, match=f"'polygon' with {agents} agents"):
+        draft("new", shape=word)
+    data = Mission.from_toml(draft("new")).to_dict()
+    data["formations"]["triangle"]["shape"] = word
+    with pytest.raises(MissionError, match=f"'polygon' with {agents} agents"):
+        Mission.from_dict(data)
 
 
 def test_what_is_asked_is_what_is_written():

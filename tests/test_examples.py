@@ -67,10 +67,10 @@ def test_gusts(example):
     numbers = example.main()
     told, alone, blind = (numbers[f"gusts{s}"] for s in ("", ", tracking alone", ", f_C on board"))
     assert numbers["calm"]["f_C"] < 1e-9
-    assert told["f_C"] == pytest.approx(0.53, abs=0.02)
-    assert blind["f_C"] == pytest.approx(0.49, abs=0.02)
+    assert told["f_C"] == pytest.approx(0.47, abs=0.02)
+    assert blind["f_C"] == pytest.approx(0.44, abs=0.02)
     assert told["pair"] < 1e-5
-    assert alone["pair"] == pytest.approx(0.24, abs=0.01)
-    assert blind["pair"] == pytest.approx(0.088, abs=0.005)
+    assert alone["pair"] == pytest.approx(0.26, abs=0.01)
+    assert blind["pair"] == pytest.approx(0.082, abs=0.005)
     # What all agents feel alike, f_C cannot answer.
-    assert told["slot"] > 0.8 * alone["slot"]
+    assert told["slot"] > 0.7 * alone["slot"]

@@ -7,7 +7,7 @@ import pytest
 
 from rigidfleet.assess import assess
 from rigidfleet.figures.graph import graphs
-from rigidfleet.formation import assigned, complete_graph, distances, slots, straight_way
+from rigidfleet.formation import assigned, complete_graph, distances, kabsch, nearest_way, slots
 from rigidfleet.mission import Mission, load_mission, mission_names
 from rigidfleet.preflight import STARTS, planned, preflight
 from rigidfleet.simulate import simulate
@@ -258,30 +258,41 @@ def test_shortest_assignment():
     cube = slots("cube", 4.0, 8)
     shuffled = rng.permutation(8)
     start = cube[shuffled] @ np.linalg.qr(rng.normal(size=(3, 3)))[0] + [9, 9, 9]
-    order = assigned(start, cube, np.ones(8))
-    way, room = straight_way(start, cube[order], np.ones(8), np.full(8, 0.25))
-    assert way < 1e-6
+    order, turn = assigned(start, cube)
+    there = cube[order] @ turn.T
+    np.testing.assert_allclose(there, start - start.mean(axis=0), atol=1e-6)
+    room, pair, _ = nearest_way(start, there, np.full(8, 0.25))
     assert room == pytest.approx(3.5)
+    assert distances(cube[order], [pair]) == pytest.approx(4.0)
 
 
 def test_given_assignment_is_kept():
     """Where nothing is shorter the order of the mission stays, however symmetric the shape."""
     cube = slots("cube", 4.0, 8)
-    np.testing.assert_array_equal(assigned(cube, cube, np.ones(8)), np.arange(8))
-    np.testing.assert_array_equal(assigned(cube, cube, np.ones(8), np.full(8, 0.25)), np.arange(8))
+    for turn in (None, np.eye(3)):
+        for radius in (None, np.full(8, 0.25)):
+            order, turned = assigned(cube, cube, turn=turn, radius=radius)
+            np.testing.assert_array_equal(order, np.arange(8))
+            np.testing.assert_allclose(turned, np.eye(3), atol=1e-12)
 
 
 def test_safe_assignment():
     """The safe one never leaves less room than the shortest or the given."""
     rng = np.random.default_rng(2)
-    cube, m, radius = slots("cube", 4.0, 8), np.ones(8), np.full(8, 0.25)
-    for _ in range(10):
-        start = rng.uniform(0, 8, (8, 3))
-        rooms = [
-            straight_way(start, cube[order], m, radius)[1]
-            for order in (np.arange(8), assigned(start, cube, m), assigned(start, cube, m, radius))
-        ]
-        assert rooms[2] >= max(rooms) - 0.01
+    cube, radius = slots("cube", 4.0, 8), np.full(8, 0.25)
+    for turn in (None, np.eye(3)):
+        for _ in range(10):
+            start = rng.uniform(0, 8, (8, 3))
+            given, shortest, safe = (
+                nearest_way(start, cube[order] @ turned.T, radius)[0]
+                for order, turned in (
+                    (np.arange(8), kabsch(start, cube)),
+                    assigned(start, cube, turn=turn),
+                    assigned(start, cube, turn=turn, radius=radius),
+                )
+            )
+            assert safe >= shortest
+            assert safe >= given - 0.01
 
 
 @pytest.mark.parametrize("assignment", ["given", "shortest", "safe"])

@@ -30,7 +30,9 @@ def directions(p, edges) -> np.ndarray:
 def solver_of(p, edges, masses, law, *, sweep=False, tolerance=1e-13) -> large.LargeSolver:
     """A solver in the state p (N, 3)."""
     law = k.Law(3.0, 12**0.5, 8.0, law, 0.03, 3, 0.1, 1e-12, 0.0)
-    vehicles = k.Vehicles(masses, 1.0 / masses, float(masses.sum()), masses, False, 9.81)
+    vehicles = k.Vehicles(
+        masses, 1.0 / masses, float(masses.sum()), float(masses.mean()), masses, False, 9.81
+    )
     work = k.workspace(len(p), len(edges), large=True)
     work.r[:] = p
     work.u[:] = directions(p, edges)

@@ -50,6 +50,12 @@ _DRAWN: tuple[Format, ...] = ("png", "svg")
 #: spectrum alone.
 _COMPARED, _DENSE = 60, 200
 
+
+def _exact(_type: Any, tokens: Sequence[Any]) -> int:
+    """A whole number as it is written: none is rounded."""
+    return _whole(tokens[0].value)
+
+
 app = App(
     name="rigidfleet",
     help="Fly many air vehicles as one rigid body: simulate, judge and draw formation flights.",
@@ -282,7 +288,7 @@ def design(
     shape: str,
     /,
     *,
-    agents: int | None = None,
+    agents: Annotated[int | None, Parameter(converter=_exact)] = None,
     size: Annotated[list[float] | None, Parameter(consume_multiple=True)] = None,
     extra: str = "0",
     sensing_range: Annotated[float | None, Parameter(name="--range")] = None,
@@ -444,7 +450,7 @@ def new(
     /,
     *,
     shape: str | None = None,
-    agents: int | None = None,
+    agents: Annotated[int | None, Parameter(converter=_exact)] = None,
     size: Annotated[list[float] | None, Parameter(consume_multiple=True)] = None,
     mass: float | None = None,
     thrust_limit: float | None = None,
@@ -483,6 +489,7 @@ def new(
     """
     from rigidfleet.mission import Mission
     from rigidfleet.mission import draft as drafts
+    from rigidfleet.preflight import preflight
     from rigidfleet.result import write_file
 
     given: dict[str, Any] = {
@@ -501,6 +508,11 @@ def new(
     except ValueError as error:
         raise RigidfleetError(str(error)) from None
     mission = Mission.from_toml(text, str(file))
+    fails = [r.text for r in preflight(mission, search=False).remarks if r.level == "fails"]
+    if fails:
+        raise RigidfleetError(
+            f"{file}: is not written, as it would fail: {'; '.join(fails)}. Change what you ask for."
+        )
     write_file(file, text.encode())
     if json:
         screen.print_json({"file": str(file)} | _facts(mission))
@@ -620,7 +632,13 @@ def replay(result: Path, /, *, out: Path | None = None, force: bool = False) -> 
 
 
 @app.command(sort_key=8)
-def live(mission: str, /, *, port: int = 0, no_browser: bool = False) -> int:
+def live(
+    mission: str,
+    /,
+    *,
+    port: Annotated[int, Parameter(converter=_exact)] = 0,
+    no_browser: bool = False,
+) -> int:
     """Fly a mission's vehicles by hand, in the browser, in real time.
 
     Parameters
@@ -696,7 +714,9 @@ def _ask(name: str) -> tuple[str, dict[str, Any]]:
     asked["size"] = [answer("Edge length [m]", f"{drafts.SIZE:g}", number)]
     asked["mass"] = answer("Mass of each [kg]", f"{drafts.MASS:g}", number)
     there = " ".join(f"{x:g}" for x in drafts.WAYPOINT)
-    asked["waypoints"] = [answer("Fly to x y z [m]", there, point)]
+    waypoint = answer("Fly to x y z [m]", there, point)
+    if waypoint != drafts.WAYPOINT:  # of which a large shape takes a higher one
+        asked["waypoints"] = [waypoint]
     return name, asked
 
 
@@ -708,7 +728,10 @@ def _number(text: str) -> float:
 
 
 def _whole(text: str) -> int:
-    number = _number(text)
+    try:
+        return int(text)  # every digit of a large one counts
+    except ValueError:
+        number = _number(text)
     if not (math.isfinite(number) and number == round(number)):
         raise ValueError(f"'{text}' is no whole number.")
     return int(number)
@@ -720,12 +743,12 @@ def sweep(
     /,
     *,
     vary: list[str] | None = None,
-    runs: int | None = None,
-    seed: int | None = None,
+    runs: Annotated[int | None, Parameter(converter=_exact)] = None,
+    seed: Annotated[int | None, Parameter(converter=_exact)] = None,
     out: Path | None = None,
     force: bool = False,
     ends: bool = False,
-    workers: int | None = None,
+    workers: Annotated[int | None, Parameter(converter=_exact)] = None,
     cluster: str | None = None,
     summary: bool = False,
     map_: Annotated[tuple[str, str] | None, Parameter(name="--map")] = None,

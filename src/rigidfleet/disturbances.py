@@ -103,16 +103,24 @@ def _places(mission: Mission) -> Array:
 
 
 def without(
-    program: k.Program, edges: NDArray[np.bool_], lost: NDArray[np.bool_], *, large: bool = False
+    program: k.Program,
+    edges: NDArray[np.bool_],
+    lost: NDArray[np.bool_],
+    mu: float,
+    *,
+    large: bool = False,
 ) -> k.Program:
     """A program for those that are left: ``edges`` (m,) kept of its own, agents ``lost`` (N,) without thrust.
 
-    In the laws the lost count for nothing: their masses there are `NOTHING`. Newton's law keeps them.
+    In the laws the lost count for nothing: their masses there are `NOTHING`, and the mean mass, on whose scale the
+    damping ``mu`` of those left stands, is theirs. Newton's law keeps the lost.
     """
     m = np.where(lost, NOTHING, program.vehicles.m)
+    mean = float(m[~lost].mean()) if not lost.all() else 1.0
     reference, control = program.reference, program.control
     return program._replace(
-        vehicles=program.vehicles._replace(m=m, inverse=1.0 / m, M=float(m.sum())),
+        vehicles=program.vehicles._replace(m=m, inverse=1.0 / m, M=float(m.sum()), mean=mean),
+        law=program.law._replace(mu=mu),
         graph=k.graph(program.graph.edges[edges], m, large=large),
         reference=reference._replace(d0=reference.d0[edges], d1=reference.d1[edges]),
         control=control._replace(force=np.where(lost[:, None], 0.0, control.force)),

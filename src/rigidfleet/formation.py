@@ -223,6 +223,12 @@ SHAPES: dict[str, Shape] = {
 }
 
 
+#: Polygons by name, and the agents that make them.
+POLYGONS = {
+    "pentagon": 5, "heptagon": 7, "octagon": 8, "nonagon": 9, "decagon": 10, "hendecagon": 11, "dodecagon": 12,
+}  # fmt: skip
+
+
 def slots(shape: str, size: float | Sequence[float], n: int) -> Floats:
     """Slots of a named shape of `n` agents, geometric centre at 0.
 
@@ -766,62 +772,110 @@ def _nearest_fit(u: Floats, s: Floats, vt: Floats, near: Floats, tol: float) -> 
 # -- who takes which slot ----------------------------------------------------------------------------
 
 
-def straight_way(
-    start: ArrayLike, slots: ArrayLike, masses: ArrayLike, radius: ArrayLike
-) -> tuple[float, float]:
-    """Total way [m] and least room between surfaces [m] of agents that go straight to their slots.
+class Assigned(NamedTuple):
+    """Who takes which slot, and how the slots lie before those that the agents come from while they blend."""
 
-    The slots (N, 3) are turned onto the agents (Kabsch, weighted by mass), and all arrive together.
+    order: Ints  # (N,) slot of each agent, from 0
+    turn: Floats  # (3, 3) rotation of the slots; they are blended as it turns them, and by no other
+
+
+def nearest_way(
+    start: ArrayLike, end: ArrayLike, radius: ArrayLike | None = None
+) -> tuple[float, tuple[int, int], float]:
+    """Least room between agents that go straight from start to end (N, 3) [m], all in step.
+
+    Exact, in closed form, over all pairs and the whole way; memory grows with N alone.
+
+    Returns
+    -------
+    room : between two surfaces [m] (between centres without radii (N,)); infinite for one agent
+    pair : the two agents, from 0
+    share : of the way at which they are nearest, in [0, 1]
     """
-    p, q = _about_cm(start, masses), _about_cm(slots, masses)
-    q = q @ kabsch(p, q, masses).T
-    i, j = np.triu_indices(len(p), 1)
-    r = np.asarray(radius, dtype=np.float64)
-    x, dx = p[i] - p[j], (q - p)[i] - (q - p)[j]
-    # Nearest on the way: a line from x to x + dx past zero.
-    s = np.clip(-(x * dx).sum(axis=1) / np.maximum((dx**2).sum(axis=1), 1e-300), 0.0, 1.0)
-    room = np.linalg.norm(x + s[:, None] * dx, axis=1) - r[i] - r[j]
-    return float(np.linalg.norm(q - p, axis=1).sum()), float(room.min(initial=np.inf))
+    p, q = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
+    n = len(p)
+    r = np.zeros(n) if radius is None else np.asarray(radius, dtype=np.float64)
+    best = np.inf, (0, 0), 0.0
+    rows = max(1, _PAIRS // n)
+    for first in range(0, n - 1, rows):
+        i = np.arange(first, min(first + rows, n - 1))
+        x = p[i, None] - p[first + 1 :]
+        y = q[i, None] - q[first + 1 :] - x
+        # Nearest on the way: a line from x to x + y past zero.
+        xy, yy = (x * y).sum(axis=2), (y * y).sum(axis=2)
+        s = np.clip(-xy / np.maximum(yy, 1e-300), 0.0, 1.0)
+        room = np.linalg.norm(x + s[..., None] * y, axis=2) - r[i, None] - r[first + 1 :]
+        room[np.tri(*room.shape, -1, dtype=np.bool_)] = np.inf  # each pair once
+        k, j = np.unravel_index(int(room.argmin()), room.shape)
+        if room[k, j] < best[0]:
+            best = float(room[k, j]), (int(i[k]), first + 1 + int(j)), float(s[k, j])
+    return best
 
 
 def assigned(
-    start: ArrayLike, slots: ArrayLike, masses: ArrayLike, radius: ArrayLike | None = None
-) -> Ints:
-    """Slot (N,) that each agent is to take: the shortest way, or with radii the safest among some.
+    start: ArrayLike,
+    slots: ArrayLike,
+    *,
+    turn: ArrayLike | None = None,
+    radius: ArrayLike | None = None,
+) -> Assigned:
+    """Slots (N, 3) that agents at start (N, 3) [m] are to take, and how these are turned meanwhile.
 
-    From several attitudes in turn the slots are assigned by least squared distances
-    (`scipy.optimize.linear_sum_assignment`) and turned to the agents again (Kabsch), until nothing changes. The
-    shortest has the least sum of squares. The safest has the most room between agents on straight ways, among
-    these and the given one; all but equal room counts as equal, and then the shorter is taken. The order
-    given is kept where nothing is better.
+    The turn is chosen first and the order last, by the least sum of squared ways to slots that are turned already:
+    then two agents come no nearer than D / sqrt(2) on straight ways in step with each other, D the least distance
+    of both shapes, as long as the turn flown is the one returned. For if i and j took each other's slots, the
+    squares would grow or stay, which says x . y >= 0 for x = p_i - p_j and y = q_i - q_j, the slots as turned. So
+    |(1 - s) x + s y|^2 >= (1 - s)^2 |x|^2 + s^2 |y|^2 >= D^2 / 2. Agents count alike here, whatever their masses:
+    squares weighted by mass prove nothing. Nor do the centres matter, since x and y know none.
+
+    Parameters
+    ----------
+    turn : (3, 3) the rotation of the slots in which they are to be reached; any will do where it is not given
+    radius : (N,) [m] asks for the safest in place of the shortest
+
+    The shortest has the least squares for the turn given; or else among some, found from several attitudes in turn
+    by assigning the slots and turning them to the agents (Kabsch) until nothing changes. The safest has the most room
+    between surfaces among the shortest, others of that kind, whose turn differs from the one given, and the order
+    given; among all but equal ones the shorter is taken, and never less room than the shortest has. The order given is
+    kept where nothing is better. Many agents try fewer attitudes: two assignments in all from some 1,000 on.
     """
-    p, q = _about_cm(start, masses), centred(slots)
+    p, q = centred(start), centred(slots)
     n = len(p)
-    given = np.arange(n)
-    found = {tuple(given.tolist()): given}
-    for turn in [kabsch(p, _about_cm(q, masses), masses), *_attitudes()]:
-        order = _settled(p, q, masses, turn)
-        found[tuple(order.tolist())] = order
-    m = np.asarray(masses, dtype=np.float64)[:, None]
+    given, scale = np.arange(n), float((p**2).sum() + (q**2).sum())
+    fits = Assigned(given, kabsch(p, q))
+    options = [fits]
+    if turn is not None:
+        fixed = np.asarray(turn, dtype=np.float64)
+        short = Assigned(_nearest_slots(p, q @ fixed.T), fixed)
+        options = [short, Assigned(given, fixed)] + ([] if radius is None else [fits])
+    if turn is None or radius is not None:
+        left = max(1, int(_WORK / n**3))
+        for attitude in [fits.turn, *_attitudes()]:
+            if left > 0:
+                option, used = _settled(p, q, attitude, min(left, _ROUNDS))
+                options.append(option)
+                left -= used
 
-    def squares(order: Ints) -> float:
-        x = _about_cm(q[order], masses)
-        return float((m * (x @ kabsch(p, x, masses).T - p) ** 2).sum())
+    def worth(option: Assigned) -> tuple[float, bool, float]:
+        to, swing = option.turn, 0.0
+        if turn is not None:
+            to, swing = fixed, float(np.linalg.norm(option.turn - fixed))
+        squares = float(((q[option.order] @ to.T - p) ** 2).sum()) / max(scale, 1e-300)
+        return round(squares, 12), bool((option.order != given).any()), swing
 
-    def worth(order: Ints) -> tuple[float, float, bool]:
-        room = 0.0 if radius is None else straight_way(p, q[order], masses, radius)[1]
-        return -round(room, 2), round(squares(order), 9), bool((order != given).any())
+    straight = [o for o in options if turn is None or o.turn is fixed]
+    shortest = min(straight, key=worth)
+    if radius is None:
+        return shortest
+    room = {id(o): nearest_way(p, q[o.order] @ o.turn.T, radius)[0] for o in options}
+    safe = [o for o in options if room[id(o)] >= room[id(shortest)]]
+    return min(safe, key=lambda o: (-round(room[id(o)], 2), *worth(o)))
 
-    return min(found.values(), key=worth)
 
-
-def assigned_upright(start: ArrayLike, slots: ArrayLike, masses: ArrayLike) -> Ints:
-    """Slot (N,) that each agent is to take by the least squared way, without turning the slots.
-
-    On straight ways of least squares, in step with each other, no two agents come nearer than 0.7 times
-    (one over the root of 2) the least distance of both shapes (Turpin, Michael and Kumar, 2014).
-    """
-    return _nearest_slots(_about_cm(start, masses), centred(slots))
+#: Pairs of agents that are looked at together; work on assignments, N^3 each, in some seconds.
+_PAIRS, _WORK = 200_000, 2e9
+#: From one attitude so many assignments at most.
+_ROUNDS = 20
 
 
 def _nearest_slots(p: Floats, q: Floats) -> Ints:
@@ -836,17 +890,19 @@ def _nearest_slots(p: Floats, q: Floats) -> Ints:
     return linear_sum_assignment(-near)[1]
 
 
-def _settled(p: Floats, q: Floats, masses: ArrayLike, turn: Floats) -> Ints:
-    """Slots q (N, 3) assigned to agents p and turned onto them in turns, until nothing changes."""
-    order = np.arange(len(p))
-    for _ in range(20):
-        new = _nearest_slots(p, q @ turn.T)
-        same = bool((new == order).all())
-        order = new
-        if same:
-            break
-        turn = kabsch(p, _about_cm(q[order], masses), masses)
-    return order
+def _settled(p: Floats, q: Floats, turn: Floats, most: int) -> tuple[Assigned, int]:
+    """Slots q (N, 3) assigned to agents p and turned onto them in turns, until nothing changes.
+
+    Each lessens the same sum of squares; the last is an assignment. Also how many there were, ``most`` at most.
+    """
+    order = _nearest_slots(p, q @ turn.T)
+    for used in range(1, most):
+        turned = kabsch(p, q[order])
+        new = _nearest_slots(p, q @ turned.T)
+        if (new == order).all():
+            return Assigned(order, turned), used + 1
+        order, turn = new, turned
+    return Assigned(order, turn), most
 
 
 def _attitudes() -> list[Floats]:
@@ -858,8 +914,3 @@ def _attitudes() -> list[Floats]:
             if np.linalg.det(R) > 0:
                 turns.append(R)
     return turns
-
-
-def _about_cm(points: ArrayLike, masses: ArrayLike) -> Floats:
-    p, m = np.asarray(points, dtype=np.float64), np.asarray(masses, dtype=np.float64)
-    return p - m @ p / m.sum()

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from rigidfleet.kernel import body, constraint, references
 from rigidfleet.kernel import program as k
-from rigidfleet.plan import about_cm, align_slots
+from rigidfleet.route import about_cm, align_slots
 
 Array = NDArray[np.float64]
 
@@ -196,7 +196,9 @@ def _schedule(
 
 
 def _vehicles(m: Array) -> k.Vehicles:
-    return k.Vehicles(m, 1.0 / m, float(m.sum()), np.full(len(m), np.inf), False, 0.0)
+    return k.Vehicles(
+        m, 1.0 / m, float(m.sum()), float(m.mean()), np.full(len(m), np.inf), False, 0.0
+    )
 
 
 def _masses_and_points(masses: ArrayLike, points: ArrayLike) -> tuple[Array, Array]:

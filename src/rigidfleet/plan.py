@@ -19,13 +19,13 @@ from rigidfleet.mission import Establish, Fly, Mission, Phase, Regulator, Reshap
 from rigidfleet.route import (
     Pose,
     Situation,
-    about_cm,
     align_slots,
     attach,
     goal_of,
     led_by,
     legs,
     slots_about_cm,
+    slots_before,
 )
 
 Array = NDArray[np.float64]
@@ -50,6 +50,7 @@ class PhasePlan:
     arrival: float  # when the goal is to be reached [s]
     frame: Array | None  # attitude (3, 3) of the mean-axis frame at the start
     method: solvers.Method  # how the multipliers are solved for
+    held: str | None  # the formation, if the agents are in it at the start
 
 
 def plan_phase(mission: Mission, phase: Phase, now: Situation, t_end: float) -> PhasePlan:
@@ -59,7 +60,7 @@ def plan_phase(mission: Mission, phase: Phase, now: Situation, t_end: float) -> 
     name = phase.formation if shaping else now.formation
     edges = mission.formation_edges(name) if name else np.zeros((0, 2), dtype=np.int64)
     target = slots_about_cm(mission, name, masses)
-    frame, now = attach(mission, phase, now, masses, target)
+    frame, now, turned = attach(mission, phase, now, masses, target)
 
     d1 = mission.formation_distances(name) if name else np.zeros(0)
     if not shaping:
@@ -67,7 +68,7 @@ def plan_phase(mission: Mission, phase: Phase, now: Situation, t_end: float) -> 
     d0 = now.reference.of(edges, shapes.distances(now.r, edges))
     # Slots are blended wherever the shape leads; where distances lead, slots only follow if tracked.
     left = masses if now.lost is None else np.where(now.lost, 0.0, masses)
-    before = now.slots if now.slots is not None else about_cm(now.r, left)
+    before = slots_before(mission, now, left)
     after = target if shaping and target is not None else before
     kind, T_b = k.CONSTANT, 0.0
     if shaping:
@@ -75,7 +76,9 @@ def plan_phase(mission: Mission, phase: Phase, now: Situation, t_end: float) -> 
         kind = _KINDS[led_by(mission, phase, before, target)]
     elif phase.control == "slots" and np.allclose(d1, shapes.distances(before, edges), rtol=1e-12):
         kind = k.SLOTS
-    dp, turn = align_slots(before, after, left) if shaping else (np.zeros_like(before), np.zeros(3))
+    dp, turn = np.zeros_like(before), np.zeros(3)
+    if shaping:
+        dp, turn = align_slots(before, after, left, turned)
     reference = k.Reference(kind, now.t, T_b, d0, d1, before, dp, turn)
 
     goal, arrival = goal_of(phase, now, t_end)
@@ -89,17 +92,18 @@ def plan_phase(mission: Mission, phase: Phase, now: Situation, t_end: float) -> 
         moves = isinstance(phase, Fly | Turn)
         feedback = _feedback(mission, goal, now.t, arrival, moves=moves)
     method = solvers.choose(len(masses), edges, mission.constraint.solver)
+    held = _held(mission, name, now) if method == "dense" else None
     program = k.Program(
         body_formulation=mission.formulation == "body",
         has_frame=frame is not None,
         vehicles=k.Vehicles(
-            masses, 1.0 / masses, float(masses.sum()), np.array(mission.agents.thrust_limit),
-            mission.agents.saturate, mission.gravity,
+            masses, 1.0 / masses, float(masses.sum()), float(masses.mean()),
+            np.array(mission.agents.thrust_limit), mission.agents.saturate, mission.gravity,
         ),
         graph=_graph(edges.tobytes(), masses.tobytes(), large=method != "dense"),
         law=_law(
             mission,
-            _held(mission, name, now.r) if method == "dense" else None,
+            mission.damping(held, now.lost),
             damped=phase.control != "slots" and len(edges) > 0,
         ),
         reference=reference,
@@ -112,7 +116,7 @@ def plan_phase(mission: Mission, phase: Phase, now: Situation, t_end: float) -> 
     slots = (
         after if phase.control != "open" or kind == k.SLOTS else target if shaping else now.slots
     )
-    return PhasePlan(program, edges, slots, name, d1, goal, arrival, frame, method)
+    return PhasePlan(program, edges, slots, name, d1, goal, arrival, frame, method, held)
 
 
 @lru_cache(64)
@@ -122,19 +126,22 @@ def _graph(edges: bytes, masses: bytes, *, large: bool) -> k.Graph:
     return k.graph(pairs, np.frombuffer(masses), large=large)
 
 
-def _held(mission: Mission, name: str | None, r: Array) -> str | None:
-    """The formation, if agents at r (N, 3) [m] are in it: all pairs within a tenth of the shortest."""
+def _held(mission: Mission, name: str | None, now: Situation) -> str | None:
+    """The formation, if the agents left are in it: all pairs within a tenth of the shortest."""
     slots = mission.formation_slots(name) if name else None
-    if slots is None or len(slots) < 2:
+    if slots is None:
+        return None
+    left = slice(None) if now.lost is None else ~now.lost
+    slots, r = slots[left], now.r[left]
+    if len(slots) < 2:
         return None
     pairs = shapes.complete_graph(len(slots))
     wanted = shapes.distances(slots, pairs)
-    return (
-        name if np.abs(shapes.distances(r, pairs) - wanted).max() <= _NEAR * wanted.min() else None
-    )
+    near = np.abs(shapes.distances(r, pairs) - wanted).max() <= _NEAR * wanted.min()
+    return name if near else None
 
 
-def _law(mission: Mission, name: str | None, *, damped: bool) -> k.Law:
+def _law(mission: Mission, mu: float, *, damped: bool) -> k.Law:
     c = mission.constraint
     pid = c.stabilisation == "pid"
     return k.Law(
@@ -142,7 +149,7 @@ def _law(mission: Mission, name: str | None, *, damped: bool) -> k.Law:
         beta=c.beta if pid else 0.0,
         gamma=c.gamma if pid else 0.0,
         solver=_SOLVERS[c.solver],
-        mu=mission.damping(name),
+        mu=mu,
         iterations=c.iterations,
         s0=c.threshold,
         cutoff=c.cutoff,

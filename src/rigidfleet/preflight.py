@@ -44,6 +44,7 @@ from rigidfleet.route import (
     led_by,
     legs,
     slots_about_cm,
+    slots_before,
 )
 
 Array = NDArray[np.float64]
@@ -56,8 +57,8 @@ STARTS = 40
 _SAMPLES, _STEP, _MOST = 201, 0.05, 2001
 #: So much of the shortest distance may be missed: the verdict's own tolerance of a shape.
 _TOLERANCE = 0.01
-#: Another assignment is worth a note if it saves this share of the way.
-_WORTH = 0.05
+#: Another assignment is worth a note if it saves this share of the way, and some centimetres [m].
+_WORTH, _SHORT = 0.05, 0.1
 #: Equations up to which rigidity, and forces at a jump, are judged by a dense decomposition.
 _DENSE = 600
 #: Assignments of so many agents are compared, in a second or so.
@@ -92,6 +93,9 @@ class Leg:
     time : (K,) [s] of the mission
     position, acceleration : (K, N, 3) [m, m/s^2]
     exact : whether the reference is followed as planned, up to control; False: a guess
+    ways : where the shape changes, the agents' places (N, 3) [m] before and after, from the centre, in a frame that
+        turns with them: in it they go straight, and all in step
+    shapes : names of the formations before (None: none) and after
     """
 
     phase: str
@@ -99,6 +103,8 @@ class Leg:
     position: Array
     acceleration: Array
     exact: bool
+    ways: tuple[Array, Array] | None = None
+    shapes: tuple[str | None, str | None] = (None, None)
 
     @property
     def velocity(self) -> Array:
@@ -510,18 +516,15 @@ def _drift(mission: Mission) -> Iterator[Remark]:
 # -- the way -----------------------------------------------------------------------------------------
 
 
-def planned(mission: Mission) -> tuple[list[Leg], bool]:
-    """The way of all agents, a leg for each phase, and whether it is known to its end."""
+def planned(mission: Mission, phases: int | None = None) -> tuple[list[Leg], bool]:
+    """The way of all agents, a leg for each phase or so many, and whether it is known to its end."""
     masses = np.array(mission.agents.mass)
-    frame = None
-    if mission.body_frame is not None:
-        b = mission.body_frame
-        frame = att.dcm_from_euler(np.deg2rad([b.roll_deg, b.pitch_deg, b.yaw_deg]))
+    frame = None if mission.body_frame is None else mission.drawn_attitude
     now = Situation(
         0.0, np.array(mission.agents.position), np.array(mission.agents.velocity), frame=frame
     )
     way: list[Leg] = []
-    for phase, (begin, end) in zip(mission.phases, _spans(mission), strict=True):
+    for phase, (begin, end) in list(zip(mission.phases, _spans(mission), strict=True))[:phases]:
         name = phase.formation if isinstance(phase, Establish | Reshape) else now.formation
         target = slots_about_cm(mission, name, masses)
         if isinstance(phase, Establish | Reshape) and target is None:
@@ -530,14 +533,15 @@ def planned(mission: Mission) -> tuple[list[Leg], bool]:
         before = now.slots if now.slots is not None else now.r
         count = min(max(_SAMPLES, int((end - begin) / _STEP) + 1), _MOST)
         time = np.linspace(begin, end, count)
-        position, now = _leg(mission, phase, now, masses, target, time)
+        names = now.formation, name
+        position, ways, now = _leg(mission, phase, now, masses, target, time)
         guess = (
             isinstance(phase, Establish | Reshape)
             and phase.control != "slots"
             and led_by(mission, phase, before, target) != "shape"
         )
         acceleration = _rate(_rate(position, time), time)
-        way.append(Leg(phase.name, time, position, acceleration, not guess))
+        way.append(Leg(phase.name, time, position, acceleration, not guess, ways, names))
     return way, True
 
 
@@ -548,20 +552,23 @@ def _leg(
     masses: Array,
     target: Array | None,
     time: Array,
-) -> tuple[Array, Situation]:
-    """Positions (K, N, 3) of all agents over a phase, and the situation at its end."""
+) -> tuple[Array, tuple[Array, Array] | None, Situation]:
+    """Positions (K, N, 3) of all agents over a phase, their `Leg.ways`, and the situation at its end."""
     t0, t_end = time[0], time[-1]
     shaping = isinstance(phase, Establish | Reshape)
-    frame, now = attach(mission, phase, now, masses, target)
+    frame, now, turned = attach(mission, phase, now, masses, target)
     s = _septic((time - t0) / phase.blend) if shaping else np.zeros(len(time))
     if phase.control == "open":
         x = about_cm(now.r, masses)
         after = x
         if shaping and target is not None:
-            after = target @ shapes.kabsch(x, target, masses).T
+            # Turned as the blend has it, and with that as the agents lie.
+            slots = slots_before(mission, now, masses)
+            after = target @ turned.T @ shapes.kabsch(x, slots, masses).T
         cm, v = masses @ now.r / masses.sum(), masses @ now.v / masses.sum()
         a = np.array(phase.input_force) * len(masses) / masses.sum()
         tau = (time - t0)[:, None]
+        ways = x, after
         shape = x + s[:, None, None] * (after - x)
         position = shape + (cm + tau * v + 0.5 * tau**2 * a)[:, None]
         v_end = np.tile(v + a * (t_end - t0), (len(masses), 1))
@@ -575,7 +582,10 @@ def _leg(
         r, T, v_cm, omega = _body(mission, now.pose, goal, arrival, time)
         before = now.slots
         after = target if shaping and target is not None else before
-        dp, turn = align_slots(before, after, masses) if shaping else (0.0 * before, np.zeros(3))
+        dp, turn = 0.0 * before, np.zeros(3)
+        if shaping:
+            dp, turn = align_slots(before, after, masses, turned)
+        ways = before, before + dp
         p = before + s[:, None, None] * dp
         p = p @ att.dcm_from_rotation_vector(s[:, None] * turn)
         position = r[:, None] + p @ T
@@ -587,7 +597,7 @@ def _leg(
             now, r=position[-1], v=velocity, slots=after, pose=tracked, goal=goal, frame=frame
         )
     name = phase.formation if isinstance(phase, Establish | Reshape) else now.formation
-    return position, replace(now, t=t_end, formation=name)
+    return position, ways if shaping else None, replace(now, t=t_end, formation=name)
 
 
 def _body(
@@ -653,30 +663,85 @@ def _rate(x: Array, time: Array) -> Array:
 
 
 def _separation(mission: Mission, found: Preflight) -> Iterator[Remark]:
+    """Room between vehicles: where it is least, and each change of formation on which ways cross."""
     if mission.n_agents < 2:
         return
     radius, limit = np.array(mission.agents.radius), mission.limits.separation or 0.0
     worst: dict[bool, tuple[float, float, tuple[int, ...], str]] = {}
-    for leg in found.legs:
-        room, pair = geometry.separation(leg.position, radius)
-        k = int(room.argmin())
-        # Where agents start is known, whatever leads them from there.
-        for exact, at in ((leg.exact, k), (True, 0)) if leg is found.legs[0] else ((leg.exact, k),):
-            if exact not in worst or room[at] < worst[exact][0]:
-                who = tuple(pair[at].tolist())
-                worst[exact] = float(room[at]), float(leg.time[at]), who, leg.phase
-    if worst:
-        least = min(worst.values())
+    least = np.inf, 0.0, (0, 0)
+    for number, leg in enumerate(found.legs):
+        ends: list[tuple[float, float, tuple[int, ...]]] = []
+        positions = leg.position if leg.ways is None else np.array(leg.ways)
+        rooms, pairs = geometry.separation(positions, radius)
+        for k in [int(rooms.argmin())] if leg.ways is None else [0, -1]:
+            ends.append((float(rooms[k]), float(leg.time[k]), tuple(pairs[k].tolist())))
+        if leg.ways is not None:
+            room, who, share = shapes.nearest_way(*leg.ways, radius)
+            crossing = room, _time_of(mission, leg, number, share), who
+            least = min(least, crossing)
+            beyond = room <= 0 or room < limit - _SLACK
+            if beyond and room < min(ends)[0] - _SLACK:
+                yield _crossing(mission, number, leg, crossing, limit)
+        for k, at in enumerate(ends):
+            least = min(least, at)
+            # Where agents start is known, whatever leads them from there.
+            exact = leg.exact or (number == 0 and k == 0 and leg.ways is not None)
+            if exact not in worst or at[0] < worst[exact][0]:
+                worst[exact] = *at, leg.phase
+    if np.isfinite(least[0]):
         found.room = least[0], least[1], _agents(least[2])
     for exact, (room, t, who, phase) in worst.items():
-        if room > 0 and room >= limit - _SLACK:
-            continue
-        if room <= 0:
-            text = f"{_agents(who)} {'' if exact else 'may '}collide at {t:.2f} s, in '{phase}'"
-        else:
-            text = f"{_agents(who)} come within {room:.2f} m at {t:.2f} s, in '{phase}' (limit {limit:g} m)"
-        guess = "" if exact else "; distances lead there, and the way is a guess"
-        yield Remark("fails" if exact else "note", "collision", text + guess)
+        if room <= 0 or room < limit - _SLACK:
+            text = _near(who, room, t, phase, limit, exact=exact)
+            guess = "" if exact else "; distances lead there, and the way is a guess"
+            yield Remark("fails" if exact else "note", "collision", text + guess)
+
+
+def _near(
+    who: tuple[int, ...], room: float, t: float, phase: str, limit: float, *, exact: bool
+) -> str:
+    if room <= 0:
+        return f"{_agents(who)} {'' if exact else 'may '}collide at {t:.2f} s, in '{phase}'"
+    return f"{_agents(who)} come within {room:.2f} m at {t:.2f} s, in '{phase}' (limit {limit:g} m)"
+
+
+def _time_of(mission: Mission, leg: Leg, number: int, share: float) -> float:
+    """When [s] agents have gone this share of their ways."""
+    blend = getattr(mission.phases[number], "blend", 0.0)
+    tau = np.linspace(0.0, 1.0, 2001)
+    return float(leg.time[0] + blend * np.interp(share, _septic(tau), tau))
+
+
+def _crossing(
+    mission: Mission, number: int, leg: Leg, at: tuple[float, float, tuple[int, ...]], limit: float
+) -> Remark:
+    """Agents whose straight ways from one formation to the next bring them too near."""
+    (room, t, who), (before, after) = at, leg.shapes
+    needed = sum(mission.agents.radius[i] for i in who) + limit
+    origin = "the start" if before is None else f"'{before}'"
+    text = (
+        f"{_near(who, room, t, leg.phase, limit, exact=leg.exact)}: their ways from {origin} to '{after}' cross,"
+        f" {max(0.0, room + needed - limit):.2f} m from centre to centre. "
+    )
+    assert after is not None  # something is shaped
+    assert leg.ways is not None
+    apart = min(float(shapes.nearest(places).min()) for places in leg.ways)
+    flown = [p.formation for p in mission.phases[:number] if isinstance(p, Establish | Reshape)]
+    spaced = f"keep slots {math.sqrt(2) * needed:.2f} m apart or more (here {apart:.2f} m)"
+    promised = mission.assigned_turn(before, after) is not None
+    if promised:
+        text += f"{spaced[0].upper()}{spaced[1:]}"
+    elif mission.assignment == "each" and after in flown:
+        text += (
+            f"Its slots were assigned on another way: give '{after}' a second table [formations.NAME], to be assigned"
+            " on this one"
+        )
+    else:
+        text += 'Assign slots to those who are near: assignment = "each"'
+    if not promised and apart < math.sqrt(2) * needed:
+        text += f"; and {spaced}"
+    guess = "" if leg.exact else ". Distances lead there, and the way is a guess"
+    return Remark("fails" if leg.exact else "note", "collision", text + guess)
 
 
 def _below(mission: Mission, found: Preflight) -> Iterator[Remark]:
@@ -819,7 +884,8 @@ def _obstacles(mission: Mission, found: Preflight) -> Iterator[Remark]:
         for leg in found.legs:
             room, agent, _ = geometry.clearance(leg.position, radius, [thing])
             k = int(room.argmin())
-            if room[k] < worst.get(leg.exact, (np.inf,))[0]:
+            # Of as near ones the first: rounding and a rest's last millimetre count for nothing.
+            if room[k] < worst.get(leg.exact, (np.inf,))[0] - 1e-3:
                 worst[leg.exact] = float(room[k]), float(leg.time[k]), int(agent[k]), leg.phase
         if worst:
             room, t, i, _ = min(worst.values())
@@ -828,8 +894,26 @@ def _obstacles(mission: Mission, found: Preflight) -> Iterator[Remark]:
             if room <= 0:
                 verb = "hits" if exact else "may hit"
                 text = f"agent {i + 1} {verb} '{thing.name}' at {t:.2f} s, in '{phase}'"
+                if not isinstance(thing, Box):
+                    text += _too_low(mission, found, phase, thing.height)
                 yield Remark("fails" if exact else "note", "obstacle", text)
     yield from _gaps(mission, found, radius)
+
+
+def _too_low(mission: Mission, found: Preflight, phase: str, ground: float) -> str:
+    """Why a vehicle is at or below the ground [m] in a phase, and how high its formation is to fly."""
+    leg = next(leg for leg in found.legs if leg.phase == phase)
+    masses, radius = np.array(mission.agents.mass), np.array(mission.agents.radius)
+    z = leg.position[..., 2]
+    cm = z @ masses / masses.sum()
+    k, i = np.unravel_index(int((z - radius).argmin()), z.shape)
+    deep, below = ground + radius[i] - z[k, i], cm[k] - z[k, i]
+    high = float((ground + radius + cm[:, None] - z)[k].max())
+    return (
+        f": its centre comes to z = {z[k, i]:.2f} m with a radius of {radius[i]:g} m, {deep:.2f} m too low, as its slot"
+        f" is then {below:.2f} m below the centre of mass at z = {cm[k]:.2f} m. Keep the centre of mass at z ="
+        f" {math.ceil(100 * high + 1e-6) / 100:.2f} m or more, or turn the formation so that its slots lie higher"
+    )
 
 
 def _gaps(mission: Mission, found: Preflight, radius: Array) -> Iterator[Remark]:
@@ -905,19 +989,23 @@ def _assigned(mission: Mission, found: Preflight) -> Iterator[Remark]:
     slots = mission.formation_slots(first.formation) if first is not None else None
     if first is None or slots is None or not 2 <= mission.n_agents <= _COMPARED:
         return
-    masses, radius = np.array(mission.agents.mass), np.array(mission.agents.radius)
-    start = np.array(mission.agents.position)
-    identity = np.arange(len(slots))
-    for name, order in (
-        ("as it is", identity),
-        ("shortest", shapes.assigned(start, slots, masses)),
-        ("safe", shapes.assigned(start, slots, masses, radius)),
-    ):
-        way, room = shapes.straight_way(start, slots[order], masses, radius)
-        taken = mission.assigned_slots[first.formation][order]
-        found.assignments[name] = Assignment(tuple(taken.tolist()), way, room)
+    index, masses = mission.phases.index(first), np.array(mission.agents.mass)
+    if index >= len(found.legs):
+        return
+    for name in ("as it is", "shortest", "safe"):
+        other, leg = mission, found.legs[index]
+        if name not in ("as it is", mission.assignment):
+            other = Mission.from_dict(mission.to_dict() | {"assignment": name}, mission.origin)
+            leg = planned(other, index + 1)[0][index]
+        assert leg.ways is not None  # it shapes
+        x = leg.position - (masses @ leg.position)[:, None] / masses.sum()
+        way = float(np.linalg.norm(np.diff(x, axis=0), axis=2).sum())
+        room = shapes.nearest_way(*leg.ways, mission.agents.radius)[0]
+        order = tuple(other.assigned_slots[first.formation].tolist())
+        found.assignments[name] = Assignment(order, way, room)
+    radius = np.array(mission.agents.radius)
     now, short, safe = found.assignments.values()
-    if short.way < (1 - _WORTH) * now.way:
+    if short.way < (1 - _WORTH) * now.way - _SHORT:
         text = (
             f"another assignment to slots is shorter: {short.way:.1f} m in all, not {now.way:.1f} m"
         )

@@ -86,7 +86,8 @@ class PhaseRecord:
     formation : name of the formation held or approached, None if there is none yet
     t_start, t_end : mission time [s]
     settled : for a phase that ends by settling: whether it did; None for one that ends at a time
-    target : for fly and turn: {"time" [s], "position" [m], "velocity" [m/s], "attitude" quaternion, "rates" [rad/s]},
+    target : for fly and turn, and for an establishment in an attitude that is not free: {"time" [s], "position" [m],
+        "velocity" [m/s], "attitude" quaternion, "rates" [rad/s]},
         each but the time None where nothing is asked
     extremes : worst values of the phase in continuous time, by name: separation, clearance, separation_below, lost (a
         lost vehicle to one that is left), geofence (beyond it), lowest, highest [m]; speed [m/s]; acceleration [m/s^2];

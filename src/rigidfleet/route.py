@@ -54,6 +54,7 @@ class Pose:
     v: Array
     T: Array
     omega: Array  # body axes [rad/s]
+    named: bool = False  # whether a phase has asked for this attitude by name
 
 
 @dataclass
@@ -96,27 +97,40 @@ def slots_about_cm(mission: Mission, name: str | None, masses: Array) -> Array |
 
 def attach(
     mission: Mission, phase: Phase, now: Situation, masses: Array, target: Array | None
-) -> tuple[Array | None, Situation]:
-    """Attach the body frame where a phase needs one; return the frame to integrate, if any.
+) -> tuple[Array | None, Situation, Array]:
+    """Attach the body frame where a phase needs one, and say how the slots wanted lie in it meanwhile.
 
-    Slots fitted to the agents (Kabsch) give the attitude; where nothing is established yet and
-    the phase shapes nothing, the agents themselves are the slots, in the world's axes. Lost
-    vehicles count in neither; the virtual body keeps their slots.
+    Slots fitted to the agents (Kabsch) give the attitude. Where nothing is established yet, the agents themselves
+    are the slots, in the axes in which formations are drawn. A formation that is established takes axes of its own:
+    those in which it is to lie, or, if its attitude is free, those in which it lies nearest. Lost vehicles count in
+    neither; the virtual body keeps their slots.
+
+    Returns
+    -------
+    frame : the one to integrate, if any
+    now : the situation, attached
+    turn : (3, 3) rotation of the slots wanted, in which they are blended (`align_slots`): the one for which they
+        were assigned, or else that which brings them nearest to the slots before
     """
     masses = masses if now.lost is None else np.where(now.lost, 0.0, masses)
     shaping = isinstance(phase, Establish | Reshape)
     frame = now.frame
-    near = frame if frame is not None else now.pose.T if now.pose is not None else np.eye(3)
-    fit = now.slots if now.slots is not None else target if shaping else None
+    establishes = isinstance(phase, Establish) and target is not None
+    given = mission.assigned_turn(now.formation, phase.formation) if shaping else None
     if phase.control == "open":
         if mission.formulation == "body" and frame is None:
             frame = np.eye(3)
-        return frame, now
+        return frame, now, _turn(given, slots_before(mission, now, masses), target, masses)
     x = about_cm(now.r, masses)
     if phase.control == "slots" and now.pose is not None:
         pose = now.pose  # the reference goes on from where it is
     else:
-        T = near if fit is None else shapes.kabsch(x, fit, masses, near=near.T).T
+        fit = now.slots
+        near = frame if frame is not None else now.pose.T if now.pose is not None else np.eye(3)
+        if fit is not None:
+            T = shapes.kabsch(x, fit, masses, near=near.T).T
+        else:
+            T = near if mission.body_frame is not None else mission.drawn_attitude
         pose = Pose(masses @ now.r / masses.sum(), masses @ now.v / masses.sum(), T, np.zeros(3))
         pose.omega = body_rates(now.r, now.v, masses, T)
         if now.lost is not None and fit is not None:
@@ -126,16 +140,38 @@ def attach(
             x = x + T.T @ centre
     slots = now.slots if now.slots is not None else x @ pose.T.T
     goal = now.goal or replace(pose, v=np.zeros(3), omega=np.zeros(3))
-    if isinstance(phase, Establish) and target is not None:
-        # A formation is established as it lies nearest: its axes are attached to the agents, and
-        # turned to where they are wanted by a later phase.
-        R = shapes.kabsch(slots, target, masses)
-        slots = slots @ R
-        pose = replace(pose, T=R.T @ pose.T, omega=R.T @ pose.omega)
-        goal = replace(goal, T=pose.T)
+    turn = np.eye(3)
+    if establishes:
+        # New axes, in the old ones: `axes` takes vectors from new to old.
+        free = mission.free_attitude(phase)
+        if free:
+            axes = _turn(given, slots, target, masses)
+        else:
+            asked = mission.establish_attitude(phase, goal.T if goal.named else None)
+            steady = now.pose is not None and goal.named and np.array_equal(goal.T, asked)
+            axes = np.eye(3) if steady else pose.T @ asked.T
+        slots = slots @ axes
+        pose = replace(pose, T=axes.T @ pose.T, omega=axes.T @ pose.omega)
+        goal = replace(goal, T=pose.T if free else asked, named=not free)
+        given = None if given is None else axes.T @ given
+    if shaping:
+        turn = _turn(given, slots, target, masses)
     if phase.control == "body" or (mission.formulation == "body" and frame is None):
         frame = pose.T
-    return frame, replace(now, pose=pose, slots=slots, goal=goal)
+    return frame, replace(now, pose=pose, slots=slots, goal=goal), turn
+
+
+def slots_before(mission: Mission, now: Situation, masses: Array) -> Array:
+    """Slots (N, 3) [m] that a phase begins with; where there are none, the agents, as formations are drawn."""
+    if now.slots is not None:
+        return now.slots
+    return about_cm(now.r, masses) @ mission.drawn_attitude.T
+
+
+def _turn(given: Array | None, before: Array, after: Array | None, masses: Array) -> Array:
+    if after is None:
+        return np.eye(3)
+    return shapes.kabsch(before, after, masses) if given is None else given
 
 
 def led_by(
@@ -167,14 +203,16 @@ def led_by(
     return "squares" if same_hand else "shape"
 
 
-def align_slots(before: Array, after: Array, masses: Array) -> tuple[Array, Array]:
+def align_slots(
+    before: Array, after: Array, masses: Array, turn: Array | None = None
+) -> tuple[Array, Array]:
     """What a blend adds to the slots, and by which rotation vector it turns them meanwhile.
 
-    The new slots are turned onto the old ones first (Kabsch, weighted by mass): the straight
-    blend then has no angular momentum in its own frame, and moves the agents least. The turn
-    brings them back, so that the body axes keep their meaning.
+    The new slots are turned first, by ``turn`` (3, 3), or else onto the old ones (Kabsch, weighted by mass), in
+    which the straight blend has no angular momentum in its own frame, and moves the agents least. A turn back
+    meanwhile keeps what the body axes mean; distances know nothing of it.
     """
-    R = shapes.kabsch(before, after, masses)
+    R = shapes.kabsch(before, after, masses) if turn is None else turn
     return after @ R.T - before, att.rotation_vector_from_dcm(R)  # log of R^T
 
 
@@ -190,10 +228,11 @@ def goal_of(phase: Phase, now: Situation, t_end: float) -> tuple[Pose | None, fl
     arrival = t_end if phase.travel is None else now.t + phase.travel
     angles = phase.attitude_deg
     T = goal.T if angles is None else att.dcm_from_euler(np.deg2rad(angles))
+    named = goal.named or angles is not None
     r, v = goal.r, np.zeros(3)
     if isinstance(phase, Fly):
         r, v = np.array(phase.position), np.array(phase.velocity)
-    return Pose(r, v, T, np.deg2rad(phase.rates_deg_s)), arrival
+    return Pose(r, v, T, np.deg2rad(phase.rates_deg_s), named), arrival
 
 
 @dataclass

@@ -23,9 +23,10 @@ from rigidfleet.extremes import Extremes
 from rigidfleet.kernel import native, records
 from rigidfleet.kernel import program as k
 from rigidfleet.mission import Establish, Fly, Mission, Phase, Reshape, Settle, Turn
-from rigidfleet.plan import PhasePlan, Pose, Situation, about_cm, plan_phase
+from rigidfleet.plan import PhasePlan, plan_phase
 from rigidfleet.record import Piece, assemble
 from rigidfleet.result import PhaseRecord, Result
+from rigidfleet.route import Pose, Situation, about_cm
 
 if TYPE_CHECKING:
     from rigidfleet.kernel import large  # imports the compiler, which only large formations need
@@ -229,7 +230,8 @@ class Flight:
         leg = self._begin(index, phase)
         record = PhaseRecord(
             phase.name, phase.kind, phase.control, leg.plan.formation, leg.t, leg.t,
-            settled=None if phase.settle is None else False, target=_target(phase, leg.plan),
+            settled=None if phase.settle is None else False,
+            target=_target(self.mission, phase, leg.plan),
         )  # fmt: skip
         self.phases.append(record)
         try:
@@ -378,7 +380,8 @@ class Flight:
         leg.workspace, leg.solver = self._equip(leg.plan)
         if own:
             return leg.plan.program
-        held = without(program, kept, self.lost, large=leg.plan.method != "dense")
+        mu = leg.plan.program.law.mu
+        held = without(program, kept, self.lost, mu, large=leg.plan.method != "dense")
         leg.held = held._replace(graph=leg.plan.program.graph)
         return leg.held
 
@@ -387,7 +390,8 @@ class Flight:
         kept = ~np.any(self.lost[plan.edges], axis=1)
         plan.edges, plan.distances = plan.edges[kept], plan.distances[kept]
         plan.method = solvers.choose(len(self.masses), plan.edges, self.mission.constraint.solver)
-        plan.program = without(plan.program, kept, self.lost, large=plan.method != "dense")
+        mu = self.mission.damping(plan.held, self.lost)
+        plan.program = without(plan.program, kept, self.lost, mu, large=plan.method != "dense")
         return kept
 
     def _stretch(self, leg: Leg, program: k.Program, t_end: float) -> None:
@@ -679,15 +683,17 @@ def _end(phase: Phase, start: float) -> float:
     return start + (phase.duration or (phase.settle or Settle()).timeout)
 
 
-def _target(phase: Phase, plan: PhasePlan) -> dict[str, Any] | None:
-    """What a fly or turn phase is to reach, for the record."""
-    if not isinstance(phase, Fly | Turn) or plan.goal is None:
+def _target(mission: Mission, phase: Phase, plan: PhasePlan) -> dict[str, Any] | None:
+    """What a fly or turn phase is to reach, or the attitude of a formation established, for the record."""
+    lies = isinstance(phase, Establish) and not mission.free_attitude(phase)
+    if not (isinstance(phase, Fly | Turn) or lies) or plan.goal is None:
         return None
-    turns = phase.attitude_deg is not None
+    turns = lies or phase.attitude_deg is not None
+    shaped = plan.program.reference.t0 + plan.program.reference.T_b
     return {
-        "time": plan.arrival,
+        "time": max(plan.arrival, shaped) if lies else plan.arrival,
         "position": plan.goal.r.tolist() if isinstance(phase, Fly) else None,
         "velocity": plan.goal.v.tolist() if isinstance(phase, Fly) else None,
         "attitude": att.quaternion_from_dcm(plan.goal.T).tolist() if turns else None,
-        "rates": plan.goal.omega.tolist() if turns else None,
+        "rates": plan.goal.omega.tolist() if turns and not lies else None,
     }

@@ -85,7 +85,7 @@ def assemble(u, graph, scale, shift, A):
 def solve_multipliers(vehicles, graph, law, w):
     """Multipliers w.multiplier (m,) [N] for w.b; NaN where A is singular and the law exact.
 
-    On the eigenvalues w of mbar A (mbar the mean mass), each law is mbar phi(w) b with
+    On the eigenvalues w of mbar A (mbar the mean mass of those left), each law is mbar phi(w) b with
     exact      1/w, the paper's;
     iterated   (1 - (mu/(w + mu))^k)/w, Tikhonov regularisation iterated k times;
     spectral   1/(w + nu), nu = (s0/4)(1 - w/s0)^2 for w < s0, else 0;
@@ -98,7 +98,7 @@ def solve_multipliers(vehicles, graph, law, w):
     m = vehicles.m
     n = graph.edges.shape[0]
     b, y = w.b, w.multiplier
-    mbar = vehicles.M / m.shape[0]
+    mbar = vehicles.mean
     if w.A.shape[0] < n:
         solve_at_agents(m, mbar, graph.edges, law, w)
         return

@@ -73,7 +73,7 @@ class LargeSolver:
     def __post_init__(self) -> None:
         vehicles, law = self.vehicles, self.law
         n = len(vehicles.m)
-        self.mbar = vehicles.M / n
+        self.mbar = vehicles.mean
         iterated = law.solver == ITERATED
         self.mu, self.iterations = (law.mu, law.iterations) if iterated else (_EXACT_MU, 2)
         self.a, self.rest = np.zeros((n, 3)), np.zeros(len(self.edges))

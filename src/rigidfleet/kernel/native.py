@@ -187,7 +187,7 @@ def examples() -> tuple[Program, Workspace, Integrator, Stretch, Record, Monitor
     program = Program(
         body_formulation=False,
         has_frame=False,
-        vehicles=k.Vehicles(one, one, 1.0, one, False, 0.0),
+        vehicles=k.Vehicles(one, one, 1.0, 1.0, one, False, 0.0),
         graph=k.graph(np.zeros((0, 2), dtype=np.int64), one),
         law=k.Law(0.0, 0.0, 0.0, k.ITERATED, 0.0, 0, 0.0, 0.0, 0.0),
         reference=k.Reference(k.CONSTANT, 0.0, 0.0, none, none, places, places, np.zeros(3)),

@@ -28,6 +28,7 @@ class Vehicles(NamedTuple):
     m: Array  # (N,) mass [kg]
     inverse: Array  # (N,) of it [1/kg]
     M: float  # their sum [kg]
+    mean: float  # mean mass of those that have not been lost [kg], the laws' unit of mass
     thrust_limit: Array  # (N,) [N], inf where unlimited
     saturate: bool  # clip the thrust at its limit
     g: float  # gravity along -z [m/s^2]

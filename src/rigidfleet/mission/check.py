@@ -13,7 +13,7 @@ from typing import Any
 from rigidfleet.errors import MissionError
 from rigidfleet.formation import SHAPES
 from rigidfleet.mission import disturbances, formations, phases
-from rigidfleet.mission.notes import Notes, near, unknown_key
+from rigidfleet.mission.notes import Notes, near_shape, unknown_key
 from rigidfleet.mission.schema import (
     Agents,
     Allocation,
@@ -100,7 +100,7 @@ def _placed(notes: Notes, agents: Any) -> Any:
     try:
         return agents | {"position": start.points().tolist()}
     except ValueError as error:
-        known = "" if start.shape in SHAPES else near(start.shape, SHAPES)
+        known = "" if start.shape in SHAPES else near_shape(start.shape)
         remedy = known or "change the shape, its size, or the number of agents"
         notes.add((*path, "shape"), str(error), remedy)
         return None

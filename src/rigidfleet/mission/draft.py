@@ -11,7 +11,7 @@ import numpy as np
 
 from rigidfleet import formation as shapes
 from rigidfleet.formation import Floats
-from rigidfleet.mission.notes import near
+from rigidfleet.mission.notes import near_shape
 
 #: Chosen for a mission that says nothing of them: vehicle [kg], [m], shape [m], where it flies [m].
 MASS, RADIUS, SIZE, WAYPOINT = 1.2, 0.25, 4.0, (20.0, 10.0, 10.0)
@@ -21,6 +21,13 @@ _LIFT = 2.2
 _SPEED, _ACCELERATION = 4.0, 1.2
 #: Room between vehicles on the ground, centre to centre [m].
 _APART = 1.2
+#: Up to so many agents start below their slots or beside them; more, of which some fly above others, on a grid
+#: with this room [m], which is more than the root of 2 of what their radii and the separation take.
+_FEW, _WIDE = 20, 1.5
+#: A formation settles for so long after its change, and stays so long at the end [s].
+_SETTLE, _HOLD = 2, 3
+#: Places of agents that a new mission stores, or so.
+_STORED = 2e6
 #: More agents are held by their slots alone; edges between all pairs would be too many.
 _ALL_PAIRS, _MOST = 40, 2000
 #: Where comments beside keys begin.
@@ -35,12 +42,14 @@ def draft(
     size: Sequence[float] = (SIZE,),
     mass: float = MASS,
     thrust_limit: float | None = None,
-    waypoints: Sequence[Sequence[float]] = (WAYPOINT,),
+    waypoints: Sequence[Sequence[float]] | None = None,
     file: str = "",
 ) -> str:
     """TOML text of a mission: take off, form a shape, fly it to waypoints, hold.
 
-    What is wrong with its numbers is found when it is checked.
+    What is wrong with its numbers is found when it is checked; a draft of no more than a shape and a number of agents
+    flies. Agents stand below their slots, or where slots are above others, on a grid, and take the slots that are
+    nearest.
 
     Parameters
     ----------
@@ -49,14 +58,14 @@ def draft(
     size : edge length of the shape [m], or three of them
     mass : of each agent [kg]
     thrust_limit : of each agent [N]; by default 2.2 times its weight
-    waypoints : of the centre of mass [m], in turn
+    waypoints : of the centre of mass [m], in turn; by default one, high enough
     file : its name, for the comments
 
     Raises
     ------
     ValueError
-        The shape is unknown, or takes another number of agents or sizes; there are too many agents,
-        or a number is not finite.
+        The shape is unknown, or takes another number of agents or sizes; there are too many agents; a number is not
+        finite; or a waypoint is too near to the ground.
     """
     if shape is None:
         shape = shape_for(agents)
@@ -64,15 +73,30 @@ def draft(
     n = agents_for(shape) if agents is None else agents
     if n > _MOST:
         raise ValueError(f"{n} agents are more than {_MOST}, the most that a new mission takes")
-    if not np.isfinite([thrust_limit or 0.0, mass, *size, *np.ravel(waypoints)]).all():
+    if not np.isfinite([thrust_limit or 0.0, mass, *size, *np.ravel(waypoints or ())]).all():
         raise ValueError("masses, sizes, limits and waypoints must be finite")
     slots = shapes.slots(shape, list(size) * (3 if _is_box(shape, size) else 1), n)
-    pairs = shapes.distances(slots, shapes.complete_graph(n))
-    nearest = float(pairs.min()) if n > 1 else SIZE
-    start = _start(slots, min(_APART, nearest))
+    nearest = float(shapes.nearest(slots).min()) if n > 1 else SIZE
+    radius = min(RADIUS, nearest / 4)
+    start, below = _start(slots, min(_APART, nearest))
+    low = float(-slots[:, 2].min()) + radius
     height = max(5.0, math.ceil(np.ptp(slots[:, 2]) + 3.0))
+    if waypoints is None:
+        waypoints = [(*WAYPOINT[:2], max(WAYPOINT[2], math.ceil(low + 3.0)))]
+    for number, waypoint in enumerate(waypoints, start=1):
+        if waypoint[2] < low:
+            raise ValueError(
+                f"waypoint {number} is {waypoint[2]:g} m high, and the {shape} reaches {low:.3g} m below its centre:"
+                f" fly it to z = {math.ceil(low + 0.5)} m or higher"
+            )
     centre = start.mean(axis=0)
     aloft = np.array([centre[0], centre[1], height])
+    way = float(np.linalg.norm(slots - (start - centre), axis=1).max())
+    if not below:  # some are on the way far across
+        way = float(np.linalg.norm(np.ptp(np.vstack([slots, start - centre]), axis=0)))
+    blend = max(4, _blend(way))
+    climb, flights = _time(aloft - centre), _flights(aloft, waypoints)
+    lasts = climb + blend + _SETTLE + sum(time for _, time in flights) + _HOLD
     limit = math.ceil(_LIFT * mass * 9.81) if thrust_limit is None else thrust_limit
     extent = json.dumps([float(x) for x in size]) if len(size) > 1 else f"{size[0]:g}"
     if _is_box(shape, size):
@@ -83,7 +107,7 @@ def draft(
         file=file or f"{name}.toml",
         mass=f"{mass:g}",
         start=_rows(start),
-        radius=f"{min(RADIUS, nearest / 4):.3g}",
+        radius=f"{radius:.3g}",
         thrust=f"{limit:g}",
         shape=shape,
         size=extent,
@@ -91,19 +115,23 @@ def draft(
         takes=shapes.agents_taken(shape),
         text=shapes.SHAPES[shape].text,
         separation=f"{min(0.5, nearest / 6):.3g}",
-        # Of a small shape in space those below are near, whatever one does.
-        below="# " if shapes.dimension(slots) == 3 and nearest < 3.0 else "",
+        # In a shape in space that is small, or of many, some pass below others, whatever one does.
+        below="" if below and (shapes.dimension(slots) < 3 or nearest >= 3.0) else "# ",
+        keys=("" if below else _ASSIGNED) + _output_step(n, lasts),
         aloft=_row(aloft),
-        climb=_time(aloft - centre),
+        blend=""
+        if blend == 4
+        else f"blend = {blend}.0                       # [s] of the change of shape\n",
+        establish=f"{blend + _SETTLE}.0",
+        climb=f"{climb}.0",
     )
-    return _aligned(head + "".join(_flights(aloft, waypoints)) + _TAIL)
+    return _aligned(head + "".join(text for text, _ in flights) + _TAIL)
 
 
 def shape_known(shape: str) -> None:
     """ValueError, with a near one, where there is no such shape."""
     if shape not in shapes.SHAPES:
-        remedy = near(shape, shapes.SHAPES) or f"known shapes: {', '.join(shapes.SHAPES)}"
-        raise ValueError(f"there is no shape {shape!r}: {remedy}")
+        raise ValueError(f"there is no shape {shape!r}: {near_shape(shape)}")
 
 
 def shape_for(agents: int | None) -> str:
@@ -124,8 +152,19 @@ def _is_box(shape: str, size: Sequence[float]) -> bool:
     return len(size) == 1 and shapes.SHAPES[shape].sizes == 3
 
 
-def _start(slots: Floats, apart: float) -> Floats:
-    """Places (N, 3) [m] on the ground, each under its slot; those above others stand further out."""
+def _start(slots: Floats, apart: float) -> tuple[Floats, bool]:
+    """Places (N, 3) [m] on the ground, and whether each is under its slot.
+
+    Of up to `_FEW` agents those above others stand further out; of more, all on a grid.
+    """
+    n = len(slots)
+    across = slots * [1.0, 1.0, 0.0]
+    ground = np.array([0.0, 0.0, 0.3])
+    if n == 1 or shapes.nearest(across).min() >= apart * (1 - 1e-9):
+        return across + ground, True
+    if n > _FEW:
+        # Straight ways to slots that are nearest take room (docs/many.md): a grid as wide as that.
+        return shapes.slots("grid", max(_WIDE, apart), n) + ground, False
     order = np.argsort(slots[:, 2], kind="stable")
     placed: list[Floats] = []
     start = np.empty_like(slots)
@@ -137,24 +176,39 @@ def _start(slots: Floats, apart: float) -> Floats:
             place = place + 0.5 * apart * out
         placed.append(place)
         start[i] = [*place, 0.3]
-    return start
+    return start, True
 
 
-def _flights(at: Floats, waypoints: Sequence[Sequence[float]]) -> list[str]:
-    """A phase for each waypoint, on the way from where the formation is."""
+def _blend(way: float) -> int:
+    """Length [s] of a blend over so long a way [m], within the speed and acceleration chosen.
+
+    The septic's greatest rate is 35/16 of the mean, its second derivative at most 7.52.
+    """
+    return math.ceil(max(35 / 16 * way / _SPEED, math.sqrt(7.52 * way / _ACCELERATION)))
+
+
+def _output_step(n: int, lasts: float) -> str:
+    """The key, where so many agents would fill the disk by default in a mission that lasts so long [s]."""
+    step = math.ceil(20 * lasts * n / _STORED) / 20
+    return "" if step <= 0.05 else f"output_step = {step:g}                # [s] between samples\n"
+
+
+def _flights(at: Floats, waypoints: Sequence[Sequence[float]]) -> list[tuple[str, int]]:
+    """A phase for each waypoint, on the way from where the formation is, and how long it takes [s]."""
     found = []
     for waypoint in waypoints:
         to = np.asarray(waypoint, dtype=float)
-        found.append(_FLY.format(position=_row(to), time=_time(to - at)))
+        time = _time(to - at)
+        found.append((_FLY.format(position=_row(to), time=f"{time}.0"), time))
         at = to
     return found
 
 
-def _time(way: Floats) -> str:
+def _time(way: Floats) -> int:
     """A time [s] for a way (3,) [m] from rest to rest, within the speed and acceleration chosen."""
     distance = float(np.linalg.norm(way))
     least = max(1.5 * distance / _SPEED, math.sqrt(6.0 * distance / _ACCELERATION))
-    return f"{max(4, math.ceil(least))}.0"
+    return max(4, math.ceil(least))
 
 
 def _aligned(text: str) -> str:
@@ -183,7 +237,7 @@ _HEAD = """\
 schema_version = 1
 name = "{name}"                   # results go to flights/NAME
 title = "{title}"
-
+{keys}
 [agents]
 mass = {mass}                        # [kg] one number for all, or a list
 position = [                      # [m] where they stand at the start
@@ -224,8 +278,10 @@ duration = {climb}
 [[phases]]                        # take the formation
 kind = "establish"
 formation = "{shape}"
-duration = 6.0
+{blend}duration = {establish}
 """
+
+_ASSIGNED = 'assignment = "each"               # who takes which slot: the least squared ways\n'
 
 _NO_EDGES = (
     "edges = []  # held by tracking alone; between so many, list those that count: [[1, 2], ...]\n"

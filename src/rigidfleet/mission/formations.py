@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from itertools import islice
 
 from rigidfleet import formation as shapes
-from rigidfleet.mission.notes import Keys, Notes, near
+from rigidfleet.mission.notes import Keys, Notes, near_shape
 from rigidfleet.mission.schema import Formation
 
 #: So many contradictions among distances are shown one by one.
@@ -83,8 +83,7 @@ def _formation(notes: Notes, form: Formation, n: int | None, path: Keys) -> None
 
 def _shape(notes: Notes, form: Formation, shape: str, n: int | None, path: Keys) -> None:
     if shape not in shapes.SHAPES:
-        remedy = near(shape, shapes.SHAPES) or f"known shapes: {', '.join(shapes.SHAPES)}"
-        notes.add((*path, "shape"), "unknown shape", remedy)
+        notes.add((*path, "shape"), "unknown shape", near_shape(shape))
     elif form.size is None:
         if notes.right(path, "size"):
             notes.add((*path, "size"), "is missing", "add size, the edge length [m]")

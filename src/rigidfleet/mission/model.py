@@ -10,15 +10,25 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import PrivateAttr
 
 from rigidfleet import geometry
+from rigidfleet.attitude import dcm_from_euler
 from rigidfleet.errors import Finding, MissionError
-from rigidfleet.formation import Floats, Ints, assigned, assigned_upright, distances
+from rigidfleet.formation import Floats, Ints, assigned, distances
 from rigidfleet.mission.check import check
 from rigidfleet.mission.notes import near
 from rigidfleet.mission.phases import latest_end
-from rigidfleet.mission.schema import DRAG, Contents, Establish, Reshape, Start
+from rigidfleet.mission.schema import (
+    DRAG,
+    Contents,
+    Establish,
+    Phase,
+    Reshape,
+    Start,
+    Steering,
+)
 from rigidfleet.mission.toml import to_toml
 
 _SHIPPED = resources.files("rigidfleet") / "missions"
@@ -94,35 +104,103 @@ class Mission(Contents):
         first = np.unique(pairs[:, 0] * self.n_agents + pairs[:, 1], return_index=True)[1]
         return pairs[np.sort(first)]
 
-    @cached_property
+    @property
     def assigned_slots(self) -> dict[str, Ints]:
         """Slot (N,) of each formation that each agent takes, from 0, as `assignment` has it.
 
         By "shortest" and "safe" the same in all formations; by "each" what is nearest to where the agents are
         when the formation is first flown.
         """
-        n, masses = self.n_agents, self.agents.mass
-        given = dict.fromkeys(self.formations, np.arange(n))
-        if self.assignment == "given" or n < 2:
-            return given
-        flown = [p.formation for p in self.phases if isinstance(p, Establish | Reshape)]
-        if self.assignment == "each":
-            found: dict[str, Ints] = {}
-            places = np.array(self.agents.position)
-            for name in flown:
-                slots = self._slots(name)
-                if slots is None:
-                    continue
-                if name not in found:
-                    found[name] = assigned_upright(places, slots, masses)
-                places = slots[found[name]]
-            return given | found
-        first = next((p.formation for p in self.phases if isinstance(p, Establish)), None)
-        slots = None if first is None else self._slots(first)
-        if slots is None:
-            return given
-        radius = self.agents.radius if self.assignment == "safe" else None
-        return dict.fromkeys(self.formations, assigned(self.agents.position, slots, masses, radius))
+        return self._assigned[0]
+
+    def assigned_turn(self, before: str | None, after: str) -> Floats | None:
+        """Rotation (3, 3) of a formation's slots onto those ``before``, if slots were assigned on this way.
+
+        Both are in their own axes; None before is the start, in the axes in which formations are drawn. Slots that
+        are assigned are flown with this rotation, or what their assignment promises does not hold.
+        """
+        return self._assigned[1].get((before, after))
+
+    @cached_property
+    def _assigned(self) -> tuple[dict[str, Ints], dict[tuple[str | None, str | None], Floats]]:
+        """Slots of each formation (N,), and the rotations by which they were found, by formations before and after.
+
+        Where slots are tracked to an attitude that is known beforehand, ways are straight, and nothing turns.
+        """
+        orders = dict.fromkeys(self.formations, np.arange(self.n_agents))
+        turns: dict[tuple[str | None, str | None], Floats] = {}
+        if self.assignment == "given" or self.n_agents < 2:
+            return orders, turns
+        before: str | None = None
+        known = True  # where agents are to each other, which distances alone do not tell
+        asked: Floats | None = None  # attitude asked for by name
+        lies: Floats | None = self.drawn_attitude  # that of the axes of `places`, where it is known
+        places = np.array(self.agents.position) @ self.drawn_attitude.T
+        flown: set[str] = set()
+        for p in self.phases:
+            if isinstance(p, Steering) and (angles := p.attitude_deg) is not None:
+                lies = asked = dcm_from_euler(np.deg2rad(angles))
+            if not isinstance(p, Establish | Reshape):
+                continue
+            axes: Floats | None = np.eye(3)  # of this formation, in those of the one before
+            if self.free_attitude(p):
+                axes = lies = None
+                asked = None if p.control == "slots" else asked
+            elif isinstance(p, Establish):
+                asked = self.establish_attitude(p, asked)
+                axes = None if lies is None else lies @ asked.T
+                lies = asked
+            slots = self._slots(p.formation)
+            if slots is None:
+                known = False
+            elif p.formation not in flown:
+                radius = self.agents.radius if self.assignment == "safe" else None
+                order, turn = assigned(places, slots, turn=axes, radius=radius)
+                if self.assignment != "each":
+                    return dict.fromkeys(self.formations, order), {(before, p.formation): turn}
+                orders[p.formation] = order
+                if known:
+                    turns.setdefault((before, p.formation), turn)
+                    turns.setdefault((p.formation, before), turn.T)  # as long as the way there
+            if slots is not None:
+                places, known = slots[orders[p.formation]], True
+            if self.assignment != "each":
+                break
+            flown.add(p.formation)
+            before = p.formation
+        return orders, turns
+
+    @cached_property
+    def drawn_attitude(self) -> Floats:
+        """Attitude (3, 3), world to body, in which formations are drawn: the world's axes, or [body_frame]."""
+        b = self.body_frame
+        return (
+            np.eye(3)
+            if b is None
+            else dcm_from_euler(np.deg2rad([b.roll_deg, b.pitch_deg, b.yaw_deg]))
+        )
+
+    def establish_attitude(self, phase: Establish, asked: Floats | None) -> Floats:
+        """Attitude (3, 3) in which a formation is established that is not free.
+
+        By the phase's own angles, or as ``asked`` for by name before, or else as it is drawn.
+        """
+        angles = phase.attitude_deg
+        if angles is not None:
+            return dcm_from_euler(np.deg2rad(angles))
+        return self.drawn_attitude if asked is None else asked
+
+    def free_attitude(self, phase: Phase) -> bool:
+        """Whether nothing steers the attitude in which a phase takes its formation.
+
+        Forces between agents do not. Slots do, unless the phase asks for that by name, or what is established is given
+        by distances alone, which have no axes.
+        """
+        if phase.control != "slots" or not isinstance(phase, Establish):
+            return phase.control != "slots"
+        if phase.attitude_deg is not None:
+            return False
+        return phase.attitude == "free" or not self.formations[phase.formation].knows_slots
 
     def _slots(self, name: str) -> Floats | None:
         """Slots (N, 3) [m] of a formation in their own order; made once."""
@@ -157,22 +235,25 @@ class Mission(Contents):
         assert slots is not None  # checked: without distances there are a shape or slots
         return distances(slots, self.formation_edges(name))
 
-    def damping(self, name: str | None) -> float:
+    def damping(self, name: str | None, lost: NDArray[np.bool_] | None = None) -> float:
         """Damping mu [-] of the iterated solve while a formation is held; ``name`` None: on the way.
 
-        "auto" is a quarter of the smallest non-zero eigenvalue w of mbar J M^-1 J^T at the
-        formation, at most 0.03; and 0.03 on the way to one, or where there are no slots.
+        "auto" is a quarter of the smallest non-zero eigenvalue w of mbar J M^-1 J^T at the formation, of the vehicles
+        that are not ``lost`` (N,), at most 0.03; and 0.03 on the way to one, or where there are no slots.
         """
         given = self.constraint.damping
         if given != "auto":
             return given
         slots = self.formation_slots(name) if name else None
-        if name is None or slots is None or not len(self.formation_edges(name)):
+        if name is None or slots is None:
             return _DAMPING[1]
+        left = np.ones(self.n_agents, dtype=np.bool_) if lost is None else ~lost
         edges = self.formation_edges(name)
-        if min(len(edges), 3 * self.n_agents) > _DENSE:
+        edges = (np.cumsum(left) - 1)[edges[left[edges].all(axis=1)]]
+        if not len(edges) or min(len(edges), 3 * int(left.sum())) > _DENSE:
             return _DAMPING[1]
-        index = geometry.smallest_singular_value(slots[None], edges, self.agents.mass)[0]
+        masses = np.array(self.agents.mass)[left]
+        index = geometry.smallest_singular_value(slots[left][None], edges, masses)[0]
         return float(np.clip(index**2 / 4, *_DAMPING))
 
     @property

@@ -11,6 +11,7 @@ from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
 from pydantic import ValidationError
 
 from rigidfleet.errors import Finding
+from rigidfleet.formation import POLYGONS, SHAPES
 from rigidfleet.mission.schema import Part
 from rigidfleet.mission.toml import toml_key
 
@@ -110,6 +111,15 @@ def near(word: object, known: Iterable[str]) -> str:
     words = {k.lower(): k for k in known}
     match = difflib.get_close_matches(str(word).lower(), words, n=1, cutoff=0.55)
     return f"did you mean '{words[match[0]]}'?" if match else ""
+
+
+def near_shape(word: object) -> str:
+    """Which named shape is meant by a word that is none, or which there are."""
+    match = near(word, [*SHAPES, *POLYGONS])
+    meant = next((name for name in POLYGONS if f"'{name}'" in match), None)
+    if meant is not None:
+        return f"did you mean 'polygon' with {POLYGONS[meant]} agents?"
+    return match or f"known shapes: {', '.join(SHAPES)}"
 
 
 def unknown_key(key: object, known: Iterable[str]) -> tuple[str, str]:

@@ -12,6 +12,7 @@ from rigidfleet.mission.formations import agents as agents_text
 from rigidfleet.mission.formations import sound
 from rigidfleet.mission.notes import Keys, Notes, near
 from rigidfleet.mission.schema import (
+    ANGLES,
     Agents,
     AnyPhase,
     Establish,
@@ -212,11 +213,24 @@ def _controls(notes: Notes, found: Sequence[AnyPhase | None]) -> None:
         if p.control != "open" and any(p.input_force):
             problem = f"has no effect with control '{p.control}'"
             notes.add((*path, "input_force"), problem, "remove it, or use control = 'open'")
-        angles = ("yaw_deg", "pitch_deg", "roll_deg")
-        if isinstance(p, Turn) and p.attitude_deg is None and notes.right(path, *angles):
-            notes.add(
-                path, "turns to no angle", f"give {', '.join(angles)} or some of them", p.name
-            )
+        if isinstance(p, Establish) and notes.right(path, "attitude", *ANGLES):
+            _attitude(notes, p, path)
+        if isinstance(p, Turn) and p.attitude_deg is None and notes.right(path, *ANGLES):
+            remedy = f"give {', '.join(reversed(ANGLES))} or some of them"
+            notes.add(path, "turns to no angle", remedy, p.name)
+
+
+def _attitude(notes: Notes, p: Establish, path: Keys) -> None:
+    """An attitude that is asked for is one that is flown."""
+    given = notes.data["phases"][path[1]]
+    angles = [key for key in ANGLES if key in given]
+    if p.attitude == "free" and angles:
+        problem = "is asked for, and attitude = 'free' asks for none"
+        notes.add((*path, angles[0]), problem, "remove one of them")
+    elif p.control != "slots" and (angles or given.get("attitude") == "drawn"):
+        problem = f"has no effect with control '{p.control}', which leaves the attitude free"
+        remedy = "use control = 'slots', or remove it and turn the formation in a later phase"
+        notes.add((*path, *(angles or ["attitude"])[:1]), problem, remedy)
 
 
 def _formations(
@@ -236,6 +250,18 @@ def _formations(
             if isinstance(p, Reshape) and held == "":
                 problem = "there is no formation yet to change from"
                 notes.add((*path, "kind"), problem, "use kind = 'establish' for the first")
+            drawn = notes.data["phases"][k].get("attitude") == "drawn"
+            if (
+                drawn
+                and form is not None
+                and not form.knows_slots
+                and notes.right(path, "attitude")
+            ):
+                problem = (
+                    f"formation '{p.formation}' has distances alone, which are drawn in no axes"
+                )
+                remedy = "remove it, give the formation slots, or ask for angles by yaw_deg"
+                notes.add((*path, "attitude"), problem, remedy)
             if n is not None and form is not None and sound(notes, p.formation):
                 _blendable(notes, p, form, n, path)
                 if held == "" and "agents" in parts:

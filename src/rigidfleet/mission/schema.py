@@ -29,6 +29,8 @@ HUGE = 1e15
 #: linear in the speed; flights identified some 0.4 to 0.5 /s along two axes of a quadrotor (Faessler, Franchi,
 #: Scaramuzza, Robotics and Automation Letters 3, 2018), and a vehicle with more mass on each rotor has less.
 DRAG = 0.3
+#: Keys of an attitude, 3-2-1 Euler angles.
+ANGLES = ("roll_deg", "pitch_deg", "yaw_deg")
 
 Number = Annotated[float, Strict(), Field(ge=-HUGE, le=HUGE)]
 Positive = Annotated[float, Strict(), Field(gt=0, le=HUGE)]
@@ -466,6 +468,30 @@ class AnyPhase(Part):
     )
 
 
+class Attitude(Part):
+    """Angles of an attitude; when one is given, the others are 0."""
+
+    roll_deg: Number | None = Field(None, description="roll on arrival [deg], 3-2-1 Euler angles")
+    pitch_deg: Number | None = Field(None, description="pitch on arrival [deg]")
+    yaw_deg: Number | None = Field(
+        None, description="yaw on arrival [deg]; when one angle is given, the others are 0"
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _complete(cls, data: Any) -> Any:
+        if isinstance(data, dict) and any(angle in data for angle in ANGLES):
+            return dict.fromkeys(ANGLES, 0.0) | data
+        return data
+
+    @property
+    def attitude_deg(self) -> tuple[float, float, float] | None:
+        """Commanded (roll, pitch, yaw) [deg]; None to keep the attitude commanded before."""
+        if self.roll_deg is None or self.pitch_deg is None or self.yaw_deg is None:
+            return None
+        return self.roll_deg, self.pitch_deg, self.yaw_deg
+
+
 class Shaping(AnyPhase):
     """A phase that changes the formation."""
 
@@ -479,10 +505,16 @@ class Shaping(AnyPhase):
     blend: Positive = Field(4.0, description="length of the blend [s], from the phase's start")
 
 
-class Establish(Shaping):
+class Establish(Attitude, Shaping):
     """Take a formation from wherever the agents are, and attach the body frame to it."""
 
     kind: Literal["establish"] = Field(description="take a formation")
+    attitude: Literal["drawn", "free"] = Field(
+        "drawn",
+        description="drawn: the slots tracked lie as they are drawn, in the world's axes or those of [body_frame], or "
+        "at the angles asked for last, here or in a phase before; free: as they lie nearest to the agents, as always "
+        "where no slots are tracked, and of a formation given by distances unless it asks for angles",
+    )
 
 
 class Reshape(Shaping):
@@ -491,35 +523,15 @@ class Reshape(Shaping):
     kind: Literal["reshape"] = Field(description="change the formation")
 
 
-class Steering(AnyPhase):
+class Steering(Attitude, AnyPhase):
     """A phase that may change the attitude."""
 
     travel: Positive | None = Field(
         None, description="from the start to the arrival [s]; when absent, the whole phase"
     )
-    roll_deg: Number | None = Field(None, description="roll on arrival [deg], 3-2-1 Euler angles")
-    pitch_deg: Number | None = Field(None, description="pitch on arrival [deg]")
-    yaw_deg: Number | None = Field(
-        None, description="yaw on arrival [deg]; when one angle is given, the others are 0"
-    )
     rates_deg_s: Vector = Field(
         (0.0, 0.0, 0.0), description="body rates [p, q, r] on arrival [deg/s]"
     )
-
-    @model_validator(mode="before")
-    @classmethod
-    def _complete(cls, data: Any) -> Any:
-        angles = ("roll_deg", "pitch_deg", "yaw_deg")
-        if isinstance(data, dict) and any(angle in data for angle in angles):
-            return dict.fromkeys(angles, 0.0) | data
-        return data
-
-    @property
-    def attitude_deg(self) -> tuple[float, float, float] | None:
-        """Commanded (roll, pitch, yaw) [deg]; None to keep the attitude commanded before."""
-        if self.roll_deg is None or self.pitch_deg is None or self.yaw_deg is None:
-            return None
-        return self.roll_deg, self.pitch_deg, self.yaw_deg
 
 
 class Fly(Steering):

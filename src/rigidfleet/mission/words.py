@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from rigidfleet.mission.schema import Establish, Fly, Hold, Phase, Reshape
+from rigidfleet.mission.schema import Establish, Fly, Hold, Phase, Reshape, Steering
 
 
 def goal(phase: Phase) -> str:
     """What a phase leads to; "" for a hold."""
     if isinstance(phase, Hold):
         return ""
-    if isinstance(phase, Establish | Reshape):
+    if isinstance(phase, Reshape):
         return phase.formation
     parts = []
+    if isinstance(phase, Establish):
+        parts.append(phase.formation)
     if isinstance(phase, Fly):
         parts.append(_vector(phase.position, "m"))
         if any(phase.velocity):
@@ -21,7 +23,7 @@ def goal(phase: Phase) -> str:
     if phase.attitude_deg is not None:
         angles = zip(("roll", "pitch", "yaw"), phase.attitude_deg, strict=True)
         parts += [f"{name} {angle:g}°" for name, angle in angles if angle or name == "yaw"]
-    if any(phase.rates_deg_s):
+    if isinstance(phase, Steering) and any(phase.rates_deg_s):
         parts.append(_vector(phase.rates_deg_s, "°/s"))
     return ", ".join(parts)
 
