@@ -230,8 +230,10 @@ def check(
     """
     from rigidfleet.mission import ending, goal, load_mission
 
+    watch = screen.CheckWatch(mission)
     try:
-        found = load_mission(mission)
+        with watch:
+            found = load_mission(mission)
     except MissionError as error:
         if not json:
             raise
@@ -243,7 +245,8 @@ def check(
         return BAD_INPUT
     from rigidfleet.preflight import preflight
 
-    ahead = preflight(found, search=realisations)
+    with watch:
+        ahead = preflight(found, search=realisations, progress=watch.update)
     if figure is not None:
         from rigidfleet.figures.graph import draw_graphs
 
