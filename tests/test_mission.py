@@ -879,7 +879,7 @@ def test_unknown_missions_are_near_known_ones(name, remedy):
         (b"a = 1\na = 2\n", "at line 2"),
         (b"\x89PNG\r\n\x1a\n\0\0", "is not UTF-8 text (byte 1)"),
         ("name = 'Zürich'".encode("latin-1"), "is not UTF-8 text (byte 10)"),
-        (b"a = " + b"[" * 100_000, "cannot be read as TOML"),
+        (b"a = " + b"[" * 100_000, "brackets are nested 9 deep at line 1"),
         (b"a = " + b"1" * 10_000, "cannot be read as TOML"),
     ],
 )
@@ -903,7 +903,7 @@ def test_paths_that_are_no_files(tmp_path):
 @pytest.mark.skipif(not os.path.exists("/dev/zero"), reason="needs an endless device")
 def test_endless_files_end(monkeypatch):
     """A file larger than any mission is refused before it fills memory."""
-    monkeypatch.setattr("rigidfleet.mission.model._LARGEST", 2**20)
+    monkeypatch.setattr("rigidfleet.mission.bounds.BYTES", 2**20)
     assert "larger than 1 MiB" in fails(load_mission, "/dev/zero").problem
 
 
