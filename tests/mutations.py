@@ -20,6 +20,7 @@ import sys
 import tempfile
 import time
 import tomllib
+import traceback
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -29,7 +30,7 @@ import numpy as np
 
 KINDS = ("check", "run", "result")
 #: Time of a case [s] and memory of all [bytes]; the kernel's own code and its libraries take half a GB of it.
-SECONDS, MEMORY = {"check": 30, "run": 120, "result": 30}, 3 << 30
+SECONDS, MEMORY = {"check": 60, "run": 120, "result": 90}, 3 << 30
 #: Longer flights are not flown: they end, but not soon.
 LONGEST, MOST = 150.0, 60
 SHIPPED = Path(__file__).parents[1] / "src" / "rigidfleet" / "missions"
@@ -96,8 +97,17 @@ def a_mission(dice: Dice) -> bytes:
     names = sorted(path.name for path in SHIPPED.glob("*.toml"))
     name = dice.one([n for n in names if n != "show-1000.toml"] * 5 + ["show-1000.toml"])
     text = (SHIPPED / name).read_text()
-    how = dice.upto(10)
-    if how < 6:
+    how = dice.upto(14)
+    if how >= 10:
+        data = tomllib.loads(text)
+        for _ in range(1 + dice.upto(4)):
+            here, key = dice.one(list(numbers_in(data)))
+            here[key] = dice.one([
+                here[key] * dice.one([-1, 0, 0.01, 0.1, 0.5, 0.9, 1.1, 2, 5, 20, 1000]),
+                dice.one([1e-15, 1e-6, 1e-3, 1.0, 50.0, 1e3, 1e4, 1e6, 1e7, 1e8, 1e12, 1e15]),
+            ])  # fmt: skip
+        text = written(data)
+    elif how < 6:
         data = tomllib.loads(text)
         for _ in range(dice.one([1, 1, 2, 3])):
             changed(data, dice)
@@ -133,6 +143,15 @@ def a_mission(dice: Dice) -> bytes:
             raw[dice.upto(len(raw))] = dice.upto(256)
         return bytes(raw[: dice.upto(len(raw))]) if not dice.upto(4) else bytes(raw)
     return text.encode("utf-8", "replace")
+
+
+def numbers_in(data: Any) -> Iterator[tuple[Any, Any]]:
+    """Each number of plain data, as what holds it and its key there."""
+    for key, value in data.items() if isinstance(data, dict) else enumerate(data):
+        if isinstance(value, dict | list):
+            yield from numbers_in(value)
+        elif isinstance(value, float | int) and not isinstance(value, bool):
+            yield data, key
 
 
 def changed(data: Any, dice: Dice) -> None:
@@ -245,9 +264,9 @@ def spoil_attribute(file: Any, dice: Dice) -> None:
     if not dice.upto(8):
         return
     file.attrs[name] = dice.one([
-        0, 1, -1, 2, 1.5, math.nan, 10**6, np.arange(5), np.zeros((2, 2)), np.array(["a", "b"], dtype=object), "", "null",
-        "[]", "{}", "1", '"a"', "[" * 3000, '{"steps": "a"}', "NaN", "1e999", np.bytes_(b"\xff\xfe"), np.complex128(1j),
-        b"\xed\xb2\x80", "x" * 40_000, np.zeros(0), "[null]", "[{}]", "[1, [2]]",
+        0, 1, -1, 2, 1.5, math.nan, 10**6, np.arange(5), np.zeros((2, 2)), np.array(["a", "b"], dtype=object), "",
+        "null", "[]", "{}", "1", '"a"', "[" * 3000, '{"steps": "a"}', "NaN", "1e999", np.bytes_(b"\xff\xfe"),
+        np.complex128(1j), b"\xed\xb2\x80", "x" * 40_000, np.zeros(0), "[null]", "[{}]", "[1, [2]]",
     ])  # fmt: skip
 
 
@@ -314,45 +333,57 @@ def tried(kind: str, seed: int, folder: Path, whole: bytes) -> dict[str, Any]:
     """What the command makes of a case: how it ends, and what is wrong with that."""
     dice = Dice(KINDS.index(kind), seed)
     out, err = io.StringIO(), io.StringIO()
-    calls: list[list[str]]
-    if kind == "result":
-        path = folder / "case.nc"
-        path.write_bytes(a_result(whole, dice))
-        # A page or a report of what loads, or one of its figures: each takes long.
-        calls = [["report", str(path), "--no-figures", "--force"], ["replay", str(path), "--force"]]
-        calls = [calls[dice.upto(2)]] if dice.upto(4) else [["report", str(path), "--force"]]
-    else:
-        path = folder / "case.toml"
-        path.write_bytes(a_mission(dice))
-        calls = [["check", str(path)]]
-        if kind == "run":
-            if long(path):
-                return {"code": "long", "fault": ""}
-            calls = [["run", str(path), "--no-figures", "--force", "--out", str(folder / "out")]]
+    path = folder / ("case.nc" if kind == "result" else "case.toml")
+    path.write_bytes(a_result(whole, dice) if kind == "result" else a_mission(dice))
+    if kind == "run" and long(path):
+        return {"code": "long", "fault": ""}
+    call = {
+        "check": ["check", str(path)],
+        "run": ["run", str(path), "--no-figures", "--force", "--out", str(folder / "out")],
+        "result": dice.one(
+            [[]] * 12 + [["replay", str(path), "--force"]] * 4 + [["report", str(path), "--force"]]
+        ),
+    }[kind]
     from rigidfleet.cli import main
 
-    fault, code = "", 0
-    for call in calls:
-        begun = time.process_time()
-        try:
-            with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-                code = main(call)
-        except BaseException as error:
-            import traceback
+    begun = time.process_time()
+    try:
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+            code = main(call) if call else seen(path, dice)
+    except BaseException as error:
+        at = traceback.extract_tb(error.__traceback__)[-1]
+        fault = f"{type(error).__name__}: {error} ({Path(at.filename).name}:{at.lineno})"[:300]
+        return {"code": "raised", "fault": fault, "told": ""}
+    took, told, fault = time.process_time() - begun, err.getvalue(), ""
+    if code not in (0, 1, 2):
+        fault = f"exit code {code}"
+    elif "Traceback" in told or "fault of rigidfleet" in told:
+        fault = told[-400:]
+    elif code == 2 and "error: " not in told:
+        fault = "exit code 2 without an error"
+    elif took > SECONDS[kind] / 2:
+        fault = f"{took:.0f} s"
+    return {"code": code, "fault": fault, "told": told[:200]}
 
-            at = traceback.extract_tb(error.__traceback__)[-1]
-            fault = f"{type(error).__name__}: {error} ({Path(at.filename).name}:{at.lineno})"[:300]
-            break
-        told = err.getvalue()
-        if code not in (0, 1, 2):
-            fault = f"exit code {code}"
-        elif "Traceback" in told or "fault of rigidfleet" in told:
-            fault = told[-400:]
-        elif code == 2 and "error: " not in told:
-            fault = "exit code 2 without an error"
-        elif time.process_time() - begun > SECONDS[kind] / 2:
-            fault = f"{time.process_time() - begun:.0f} s"
-    return {"code": code, "fault": fault, "told": err.getvalue()[:200]}
+
+def seen(path: Path, dice: Dice) -> int:
+    """Judge a result and draw one of its figures, as `report` would all of them; the exit code that it would have."""
+    from rigidfleet.assess import assess
+    from rigidfleet.errors import ResultError
+    from rigidfleet.figures import figure_names, plot
+    from rigidfleet.result import Result
+
+    try:
+        result = Result.load(path)
+        verdict = assess(result)
+    except ResultError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    verdict.json()
+    result.to_csv(path.with_suffix(".csv"))
+    names = figure_names(disturbed=result.disturbance_force is not None)
+    plot(result, path.parent / "figures", names=[dice.one(names)], formats=["png"])
+    return 0 if verdict.passed else 1
 
 
 def long(path: Path) -> bool:
@@ -362,7 +393,7 @@ def long(path: Path) -> bool:
 
     try:
         found = load_mission(path)
-    except (MissionError, Exception):
+    except MissionError:
         return False
     return found.latest_end > LONGEST or found.n_agents > MOST
 

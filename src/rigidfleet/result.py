@@ -289,6 +289,9 @@ class Result:
             who = getattr(self, name)
             if who.size and not least <= who.min() <= who.max() < n:
                 raise ValueError(f"{name} names agents outside of {least} to {n - 1}")
+        for name in (name for name, v in VARIABLES.items() if "quaternion" in v.dims):
+            if not getattr(self, name).any(axis=1).all():
+                raise ValueError(f"{name} has a quaternion of length zero")
         if (self.edges[:, 0] == self.edges[:, 1]).any():
             raise ValueError("edges joins an agent to itself")
 

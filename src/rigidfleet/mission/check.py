@@ -169,7 +169,7 @@ def _agents(notes: Notes, parts: dict[str, Any]) -> None:
     for i, j in formations.coincident(agents.position):
         problem = f"agent {j + 1} starts where agent {i + 1} does"
         notes.add(("agents", "position", j), problem, "start them apart", agents.position[j])
-    if max(agents.mass) > bounds.MASS_RATIO * min(agents.mass):
+    if max(agents.mass, default=1.0) > bounds.MASS_RATIO * min(agents.mass, default=1.0):
         problem = f"the heaviest vehicle has more than {bounds.MASS_RATIO:g} times the mass of the lightest"
         notes.add(("agents", "mass"), problem, "give masses in kg")
     above = [limit for limit in agents.thrust_limit if bounds.FORCE.most < limit < math.inf]

@@ -119,11 +119,6 @@ def _shape(notes: Notes, form: Formation, shape: str, n: int | None, path: Keys)
         if far > bounds.LENGTH.most:
             problem = f"slots of {n:,} agents reach out to {far:.3g} m, farther than {bounds.LENGTH.most:g}"
             notes.add((*path, "size"), problem, "lower it")
-        elif twins := coincident(slots):
-            problem = (
-                f"slots {twins[0][0] + 1} and {twins[0][1] + 1} of {n:,} agents are at one place"
-            )
-            notes.add((*path, "size"), problem, "change it")
 
 
 def _edges(notes: Notes, form: Formation, n: int, path: Keys) -> None:
