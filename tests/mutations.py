@@ -419,13 +419,14 @@ def work(kind: str, first: int, count: int, whole: Path | None) -> None:
 
     # A phase may take only so many steps, that a case takes a second and no minute.
     accuracy._STALLED, accuracy._STALLED_RATE = 3000, 0.0
+    seconds = float(os.environ.get("MUTATIONS_SECONDS", SECONDS[kind]))
     lines = os.fdopen(os.dup(1), "w", buffering=1)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         flight = b"" if whole is None else whole.read_bytes()
         for seed in range(first, first + count):
             lines.write(json.dumps({"seed": seed}) + "\n")
-            faulthandler.dump_traceback_later(SECONDS[kind], exit=True)
+            faulthandler.dump_traceback_later(seconds, exit=True)
             found = tried(kind, seed, folder, flight)
             faulthandler.cancel_dump_traceback_later()
             lines.write(json.dumps({"seed": seed} | found) + "\n")

@@ -158,7 +158,12 @@ def test_every_number_of_the_format_has_bounds():
                 walk(value, path)
 
     walk(json_schema(), "")
-    hidden = {"mass", "radius", "thrust_limit", ".properties.schema_version"}  # their models say what their schema leaves out
+    hidden = {
+        "mass",
+        "radius",
+        "thrust_limit",
+        ".properties.schema_version",
+    }  # their models say what their schema leaves out
     assert {re.sub(r".*\.properties\.(\w+)\..*", r"\1", path) for path in free} <= hidden
     for key, least, most in (
         ("mass", 1e-7, 1e10),

@@ -15,9 +15,9 @@ from dataclasses import MISSING, dataclass, fields
 from types import NoneType, UnionType
 from typing import (
     TYPE_CHECKING,
+    Annotated,
     Any,
     Literal,
-    Required,
     Union,
     get_args,
     get_origin,
@@ -85,7 +85,7 @@ def typed(value: Any, kind: Any, where: str) -> Any:
     """Plain data as a type says that it is: of dataclasses, typed dictionaries, lists, literals and finite numbers.
 
     Dataclasses are made; a tuple stays a list. Keys that a dataclass or a closed dictionary does not name, and
-    numbers where text is due, are no such data.
+    numbers where text is due, are no such data. Of ``Annotated[A, B]`` it is B, where there is anything.
 
     Raises
     ------
@@ -95,14 +95,14 @@ def typed(value: Any, kind: Any, where: str) -> Any:
     origin, inner = get_origin(kind), get_args(kind)
     if kind is Any:
         return value
+    if origin is Annotated:  # plain data to all others, and to a file what stands beside
+        return None if value is None else typed(value, inner[1], where)
     if origin in (Union, UnionType):
         return (
             None
             if value is None
             else typed(value, next(k for k in inner if k is not NoneType), where)
         )
-    if origin is Required:
-        return typed(value, inner[0], where)
     if origin is Literal and isinstance(value, str) and value in inner:
         return value
     if kind is float and isinstance(value, int | float) and not isinstance(value, bool):
@@ -118,7 +118,7 @@ def typed(value: Any, kind: Any, where: str) -> Any:
     elif isinstance(value, dict):
         if origin is dict:
             return {key: typed(item, inner[1], f"{where}.{key}") for key, item in value.items()}
-        hints = get_type_hints(kind)
+        hints = get_type_hints(kind, include_extras=True)
         needed = getattr(kind, "__required_keys__", None)
         if needed is None:  # a dataclass
             needed = {f.name for f in fields(kind) if f.default is MISSING}

@@ -27,7 +27,6 @@ from typing import (
     Any,
     Literal,
     NamedTuple,
-    Required,
     Self,
     TypedDict,
     get_type_hints,
@@ -73,10 +72,13 @@ LABELS: dict[str, tuple[str, ...]] = {
 _Three = tuple[float, float, float]
 
 
-class Target(TypedDict, total=False):
+class _Moment(TypedDict):
+    time: float
+
+
+class Target(_Moment, total=False):
     """Where a phase leads: its time [s], and what it asks for then."""
 
-    time: Required[float]
     position: _Three | None
     velocity: _Three | None
     attitude: tuple[float, float, float, float] | None
@@ -118,7 +120,7 @@ class PhaseRecord:
     t_start: float
     t_end: float
     settled: bool | None = None
-    target: Target | None = None
+    target: Annotated[dict[str, Any] | None, Target] = None
 
 
 @cache
