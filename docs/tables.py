@@ -140,6 +140,7 @@ def _bounds() -> str:
         ("slots of all formations together", f"{bounds.SLOTS:,}"),
         ('edges of a formation, `"complete"`', f"{bounds.EDGES:,}"),
         ("edges of a formation, all others", f"{most}"),
+        ("pairs of agents that touch, if all are as large as the largest", f"{bounds.TOUCHING:,}"),
         ("phases", f"{bounds.PHASES:,}"),
         ("obstacles", f"{bounds.OBSTACLES:,}"),
         ("the heaviest vehicle over the lightest", f"{bounds.MASS_RATIO:g}"),

@@ -418,7 +418,7 @@ def work(kind: str, first: int, count: int, whole: Path | None) -> None:
     from rigidfleet import accuracy
 
     # A phase may take only so many steps, that a case takes a second and no minute.
-    accuracy._STALLED, accuracy._STALLED_RATE = 3000, 0.0
+    vars(accuracy).update(_STALLED=3000, _STALLED_RATE=0.0)
     seconds = float(os.environ.get("MUTATIONS_SECONDS", SECONDS[kind]))
     lines = os.fdopen(os.dup(1), "w", buffering=1)
     with tempfile.TemporaryDirectory() as name:

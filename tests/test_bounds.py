@@ -84,6 +84,7 @@ BEYOND = [
     (HEAD + listed(2).replace("[1,", "[1e15,") + HOLD, "agents.position[2][1]", "must be <= 1e+08"),
     (HEAD + listed(2).replace("1.0", "[1e-3, 1e8]") + HOLD, "agents.mass", "1e+09 times the mass"),
     (HEAD + agents(4) + HOLD + GUSTS + "length = 9.0\nairspeed = 1e-9\n", "disturbances.gusts.airspeed", ">= 1e-06"),
+    (HEAD + agents(20_000) + "radius = 1e8\n" + HOLD, "agents.radius", "199,990,000 pairs of agents touch"),
     (
         HEAD + "[agents]\nmass = 1\nposition = {shape = 'line', size = 1, count = 1}\n"
         + formation("line", 1.0, "'tree'") + ESTABLISH, "formations.f.edges", "1 points have no three edges",
@@ -181,7 +182,7 @@ def test_points_at_one_place_are_found():
     """Among random points those nearer than half a micrometre to an earlier one are found, as all pairs say."""
     rng = np.random.default_rng(3)
     for n in (2, 5, 60, 900):
-        p = rng.uniform(-1e-5, 1e-5, (n, 3)) * [1, 1, rng.integers(2)]
+        p = rng.uniform(-1e-5, 1e-5, (n, 3)) * [1.0, 1.0, float(rng.integers(2))]
         p[n // 2] = p[0] + [3e-7, 0, 0]
         apart = np.linalg.norm(p[:, None] - p, axis=2) + np.tri(n).T
         close = (apart < 5e-7).any()

@@ -375,13 +375,18 @@ def neighbours(points: ArrayLike, reach: float = REACH) -> Ints:
 
 def count_neighbours(points: ArrayLike, reach: float = REACH) -> int:
     """How many edges `neighbours` would find, without making them."""
-    from scipy.spatial import KDTree
-
     p = np.asarray(points, dtype=np.float64)
     if len(p) < 2:
         return 0
-    tree = KDTree(p)
-    return (int(tree.count_neighbors(tree, _within(p, reach))) - len(p)) // 2
+    return count_within(p, _within(p, reach))
+
+
+def count_within(points: ArrayLike, distance: float) -> int:
+    """How many pairs of points (N, 3) are no farther apart than a distance [m], without making them."""
+    from scipy.spatial import KDTree
+
+    tree = KDTree(points)
+    return (int(tree.count_neighbors(tree, distance)) - tree.n) // 2
 
 
 def _within(p: Floats, reach: float) -> float:

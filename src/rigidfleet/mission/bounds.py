@@ -39,6 +39,8 @@ OBSTACLES = 1000
 EDGES, EDGES_EACH = 20_000, 32
 #: Slots of all formations together.
 SLOTS = 5_000_000
+#: Pairs of agents whose spheres, all as large as the largest, touch at the start or in a formation.
+TOUCHING = 5_000_000
 #: Agents where each is compared with each: assigned to slots, or correlated by distance.
 ALL_PAIRS = 5000
 

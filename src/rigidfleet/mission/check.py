@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from rigidfleet.errors import MissionError
-from rigidfleet.formation import SHAPES
+from rigidfleet.formation import SHAPES, count_within
 from rigidfleet.mission import bounds, disturbances, formations, phases
 from rigidfleet.mission.notes import Keys, Notes, near
 from rigidfleet.mission.schema import (
@@ -69,6 +69,8 @@ def check(data: Mapping[str, Any], origin: str) -> dict[str, Any]:
     n = _count(data)
     parts["obstacles"] = _obstacles(notes)
     parts["formations"] = formations.check(notes, n)
+    if not notes.findings and n is not None:
+        _touching(notes, parts, n)
     parts["phases"] = phases.check(notes, parts, n)
     disturbances.check(notes, parts, n)
     if notes.findings:
@@ -187,6 +189,26 @@ def _agents(notes: Notes, parts: dict[str, Any]) -> None:
         notes.add(
             ("agents", "saturate"), "there is no limit to cut off at", "give thrust_limit [N]"
         )
+
+
+def _touching(notes: Notes, parts: dict[str, Any], n: int) -> None:
+    """Refuse spheres so large that lists of all that touch would fill memory."""
+    if n * (n - 1) // 2 <= bounds.TOUCHING:
+        return
+    agents: Agents = parts["agents"]
+    places = {"at the start": np.array(agents.position)}
+    for name, form in parts["formations"].items():
+        slots = form.slot_array(n)
+        places |= {} if slots is None else {f"in '{name}'": slots}
+    for where, points in places.items():
+        pairs = count_within(points, 2 * max(agents.radius))
+        if pairs > bounds.TOUCHING:
+            problem = (
+                f"{pairs:,} pairs of agents touch {where}, more than {bounds.TOUCHING:,}, if all are as large as the"
+                " largest"
+            )
+            notes.add(("agents", "radius"), problem, "lower it, or keep them apart")
+            return
 
 
 def _gains(notes: Notes, parts: dict[str, Any]) -> None:

@@ -115,6 +115,7 @@ def _shape(notes: Notes, form: Formation, shape: str, n: int | None, path: Keys)
             remedy = "change the shape, its size, or the number of agents"
             notes.add((*path, "shape"), str(error), remedy)
             return
+        assert slots is not None  # a shape has them
         far = float(np.abs(slots).max())
         if far > bounds.LENGTH.most:
             problem = f"slots of {n:,} agents reach out to {far:.3g} m, farther than {bounds.LENGTH.most:g}"
