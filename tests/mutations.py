@@ -260,7 +260,8 @@ def spoil_attribute(file: Any, dice: Dice) -> None:
                 ["", "\udc80".encode("utf-8", "surrogatepass").decode("latin-1")]
             )
         return
-    del file.attrs[name]
+    if name in file.attrs:
+        del file.attrs[name]
     if not dice.upto(8):
         return
     file.attrs[name] = dice.one([
