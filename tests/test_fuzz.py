@@ -308,6 +308,7 @@ def test_the_fuzzer_finds_what_there_is(tmp_path: Path, monkeypatch: pytest.Monk
     for body, words in (
         ("raise IndexError('here')", "IndexError: here"),
         ("import time; time.sleep(99)", "Timeout"),
+        ("while True: pass", "cli.py"),
         ("import numpy; numpy.ones((1 << 20, 1 << 12))", "MemoryError"),
         ("return 7", "exit code 7"),
         ("return 2", "exit code 2 without an error"),
@@ -317,6 +318,6 @@ def test_the_fuzzer_finds_what_there_is(tmp_path: Path, monkeypatch: pytest.Monk
         (tmp_path / "rigidfleet" / "accuracy.py").write_text("")
         (tmp_path / "rigidfleet" / "cli.py").write_text(f"def main(_):\n    {body}\n")
         monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-        monkeypatch.setenv("MUTATIONS_SECONDS", "3")
+        monkeypatch.setenv("MUTATIONS_SECONDS", "1")
         (case,) = mutations.attack("check", 0, 1)
         assert words in case["fault"]
