@@ -572,10 +572,10 @@ def planned(mission: Mission) -> tuple[list[Leg], bool]:
     way: list[Leg] = []
     most = _samples_of(mission)
     # Of more than can be looked at with the fewest samples, the first ones.
-    legs_ = len(mission.phases) if most >= _FEWEST else most * len(mission.phases) // _FEWEST
+    possible = len(mission.phases) if most >= _FEWEST else most * len(mission.phases) // _FEWEST
     most = max(most, _FEWEST)
     for phase, (begin, end) in zip(mission.phases, _spans(mission), strict=True):
-        if len(way) == legs_:
+        if len(way) == possible:
             return way, False
         name = phase.formation if isinstance(phase, Establish | Reshape) else now.formation
         target = slots_about_cm(mission, name, masses)
@@ -876,12 +876,12 @@ def _step_thrust(mission: Mission, found: Preflight) -> Iterator[Remark]:
 
 def _obstacles(mission: Mission, found: Preflight) -> Iterator[Remark]:
     """Room to each obstacle; of many, to all that may be touched and to the nearest."""
-    radius, legs_ = np.array(mission.agents.radius), found.legs
-    if not (mission.obstacles and legs_):
+    radius, way = np.array(mission.agents.radius), found.legs
+    if not (mission.obstacles and way):
         return
     # What a leg stays within, and how far that is from each obstacle (L, B): nobody is nearer.
     within = np.array(
-        [[leg.position.min(axis=(0, 1)), leg.position.max(axis=(0, 1))] for leg in legs_]
+        [[leg.position.min(axis=(0, 1)), leg.position.max(axis=(0, 1))] for leg in way]
     )
     far = np.stack([_beyond(within, thing) for thing in mission.obstacles], axis=1) - radius.max()
     held, met, skipped = 0, 0, []
@@ -894,7 +894,7 @@ def _obstacles(mission: Mission, found: Preflight) -> Iterator[Remark]:
             break
         worst: dict[bool, tuple[float, float, int, str]] = {}
         for k in np.argsort(far[:, b], kind="stable").tolist():
-            leg = legs_[k]
+            leg = way[k]
             if far[k, b] >= worst.get(leg.exact, (np.inf,))[0]:
                 continue
             held, met = held + leg.position[:, :, 0].size, met + 1

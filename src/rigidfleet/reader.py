@@ -97,12 +97,9 @@ def typed(value: Any, kind: Any, where: str) -> Any:
         return value
     if origin is Annotated:  # plain data to all others, and to a file what stands beside
         return None if value is None else typed(value, inner[1], where)
-    if origin in (Union, UnionType):
-        return (
-            None
-            if value is None
-            else typed(value, next(k for k in inner if k is not NoneType), where)
-        )
+    if origin in (Union, UnionType):  # with None, all of them
+        some = next(k for k in inner if k is not NoneType)
+        return None if value is None else typed(value, some, where)
     if origin is Literal and isinstance(value, str) and value in inner:
         return value
     if kind is float and isinstance(value, int | float) and not isinstance(value, bool):
@@ -137,7 +134,11 @@ _HUGE = 1e300
 
 
 def _is_text(value: str) -> bool:
-    return not any("\ud800" <= sign <= "\udfff" for sign in value)
+    try:
+        value.encode()
+    except UnicodeEncodeError:  # half a character
+        return False
+    return True
 
 
 def _short(value: Any) -> str:
