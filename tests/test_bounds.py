@@ -250,7 +250,7 @@ def test_a_gap_is_between_the_nearest_two():
 @pytest.mark.parametrize(
     ("text", "topics"),
     [
-        (HEAD + agents(200) + HOLD * 1000, {"way"}),
+        (HEAD + agents(200, "output_step = 1.0\n") + HOLD * 1000, {"way"}),
         (HEAD + agents(200) + boxes(1000, 0.1) + HOLD * 20, set()),
         (HEAD + agents(4) + HOLD * 1000, set()),
         (HEAD + agents(1000, "output_step = 5.0\n") + "".join(
