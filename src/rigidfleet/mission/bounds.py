@@ -47,13 +47,13 @@ ALL_PAIRS = 5000
 # -- how large ---------------------------------------------------------------------------------------
 
 LENGTH = Bound(1e-6, 1e8, "m")
-TIME = Bound(1e-6, 1e7, "s")
+TIME = Bound(1e-6, 1e9, "s")
 SPEED = Bound(1e-6, 1e6, "m/s")
 ACCELERATION = Bound(1e-6, 1e6, "m/s^2")
 MASS = Bound(1e-6, 1e9, "kg")
 FORCE = Bound(1e-9, 1e12, "N")
 ANGLE = Bound(1e-6, 1e6, "deg or deg/s")
-GAIN = Bound(1e-6, 1e4, "1/s")
+GAIN = Bound(1e-6, 1e6, "1/s")
 WEIGHT = Bound(1e-15, 1e15, "")
 TOLERANCE = Bound(1e-15, 1e8, "m, m/s")
 #: The heaviest vehicle over the lightest.
