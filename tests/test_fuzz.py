@@ -61,7 +61,9 @@ WILD = st.one_of(
 )
 SIZES = st.sampled_from([1e-6, 1e-3, 0.1, 1.0, 4.0, 4.0, 4.0, 50.0, 1e4, 1e8])
 #: What is allowed where a number has to be positive.
-POSITIVE = st.sampled_from([1e-300, 1e-15, 1e-9, 1e-6, 1e-3, 0.1, 1.0, 10.0, 1e2, 1e3, 1e4, 1e6, 1e15])
+POSITIVE = st.sampled_from(
+    [1e-300, 1e-15, 1e-9, 1e-6, 1e-3, 0.1, 1.0, 10.0, 1e2, 1e3, 1e4, 1e6, 1e15]
+)
 UNITS = st.floats(-1, 1, allow_subnormal=False)
 SHAPES = {1: ["line"], 2: ["line"], 3: ["line", "triangle", "polygon"], 4: ["square", "pyramid"]}
 
