@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from rigidfleet.formation import SHAPES, agents_taken
-from rigidfleet.mission import json_schema
+from rigidfleet.mission import bounds, json_schema
 from rigidfleet.result import LABELS, VARIABLES
 from rigidfleet.sweep import METRICS
 
@@ -24,7 +24,10 @@ def render(page: str) -> str:
 
     def table(match: re.Match[str]) -> str:
         name = match[1]
-        special = {"result": _result, "shapes": _shapes, "metrics": _metrics}
+        special = {
+            "result": _result, "shapes": _shapes, "metrics": _metrics, "bounds": _bounds,
+            "magnitudes": _magnitudes,
+        }  # fmt: skip
         text = special[name]() if name in special else _keys(schema, name)
         return f"<!-- table: {name} -->\n{text}\n<!-- end -->"
 
@@ -121,6 +124,38 @@ def _result() -> str:
     ]
     along = "; ".join(f"`{dim}`: {', '.join(names)}" for dim, names in LABELS.items())
     return f"{_table(('variable', 'dimensions', 'unit', 'meaning'), rows)}\n\n{along}."
+
+
+def _bounds() -> str:
+    """How much of everything a mission may have."""
+    most = f"{bounds.EDGES:,}, or {bounds.EDGES_EACH} for each agent if that is more"
+    rows = [
+        ("text of a mission", f"{bounds.BYTES >> 20} MiB"),
+        ("brackets within brackets, parts of a dotted key", f"{bounds.DEPTH}"),
+        ("keys", f"{bounds.KEYS:,}"),
+        ("entries in lists", f"{bounds.ENTRIES:,}"),
+        ("agents", f"{bounds.AGENTS:,}"),
+        ('agents where `assignment` is not `"given"`', f"{bounds.ALL_PAIRS:,}"),
+        ("formations", f"{bounds.FORMATIONS:,}"),
+        ("slots of all formations together", f"{bounds.SLOTS:,}"),
+        ('edges of a formation, `"complete"`', f"{bounds.EDGES:,}"),
+        ("edges of a formation, all others", f"{most}"),
+        ("pairs of agents that touch, if all are as large as the largest", f"{bounds.TOUCHING:,}"),
+        ("phases", f"{bounds.PHASES:,}"),
+        ("obstacles", f"{bounds.OBSTACLES:,}"),
+        ("the heaviest vehicle over the lightest", f"{bounds.MASS_RATIO:g}"),
+    ]
+    return _table(("what", "at most"), rows)
+
+
+def _magnitudes() -> str:
+    """How large each quantity may be."""
+    rows = [
+        (name.lower().replace("_", " "), f"{b.least:g}", f"{b.most:g}", b.unit)
+        for name, b in vars(bounds).items()
+        if isinstance(b, bounds.Bound)
+    ]
+    return _table(("quantity", "least, where it must be > 0", "most", "unit"), rows)
 
 
 def _metrics() -> str:

@@ -581,11 +581,30 @@ def test_errors_of_a_flight(capsys, simulate):
     assert capsys.readouterr().err == "error: there is no wind today\n"
 
 
-def test_bugs_are_not_hidden(simulate):
-    """An unexpected error is a bug, and is shown as one."""
+def test_bugs_are_not_hidden(capsys, monkeypatch, simulate):
+    """An unexpected error is shown as the fault of the program that it is, with its place; all of it to developers."""
     simulate(lambda *_, **__: 1 // 0)
+    assert cli.main(["run", "short.toml", "--quiet"]) == cli.BAD_INPUT
+    told = capsys.readouterr().err
+    assert told.startswith("error: ZeroDivisionError in test_cli.py, line ")
+    assert "a fault of rigidfleet, not of yours" in told
+    flags = type("Flags", (), {"dev_mode": True})
+    monkeypatch.setattr(
+        "rigidfleet.cli.sys", type("Sys", (), {"flags": flags, "stderr": sys.stderr})
+    )
     with pytest.raises(ZeroDivisionError):
         cli.main(["run", "short.toml", "--quiet"])
+
+
+def test_full_memory_is_no_fault(capsys, simulate):
+    """What does not fit into memory is said in a sentence, with a remedy."""
+
+    def grow(*_, **__):
+        raise MemoryError
+
+    simulate(grow)
+    assert cli.main(["run", "short.toml", "--quiet"]) == cli.BAD_INPUT
+    assert "too little memory" in capsys.readouterr().err
 
 
 def test_first_compile(capsys, monkeypatch):

@@ -1,15 +1,20 @@
-"""Missions that nobody would write: they fly, or fail with a verdict, or are refused with a reason.
+"""Missions and results that nobody would write: they are taken, fail with a verdict, or are refused with a reason.
 
 Hypothesis writes them: sound missions of every kind, and the same with some of their values exchanged
 for huge, tiny, negative, missing or senseless ones. Nothing may end in a traceback, hang, or come back
 with numbers that are not finite and a verdict that is content.
+
+Beside them `mutations.py` changes shipped missions and a result's file in structure, values, types, sizes and bytes,
+and gives them to the command, each within a limit of time and memory.
 """
 
 import json
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
+import mutations
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -56,7 +61,9 @@ WILD = st.one_of(
 )
 SIZES = st.sampled_from([1e-6, 1e-3, 0.1, 1.0, 4.0, 4.0, 4.0, 50.0, 1e4, 1e8])
 #: What is allowed where a number has to be positive.
-POSITIVE = st.sampled_from([1e-300, 1e-15, 1e-9, 1e-6, 1e-3, 0.1, 1.0, 10.0, 1e3, 1e6, 1e9, 1e15])
+POSITIVE = st.sampled_from(
+    [1e-300, 1e-15, 1e-9, 1e-6, 1e-3, 0.1, 1.0, 10.0, 1e2, 1e3, 1e4, 1e6, 1e15]
+)
 UNITS = st.floats(-1, 1, allow_subnormal=False)
 SHAPES = {1: ["line"], 2: ["line"], 3: ["line", "triangle", "polygon"], 4: ["square", "pyramid"]}
 
@@ -269,3 +276,50 @@ def test_no_mission_ends_in_a_traceback(data: Data):
 def test_none_of_two_thousand_does(data: Data):
     """The same for 2,000 missions."""
     outcome(data)
+
+
+# -- what the command makes of files ---------------------------------------------------------------
+
+
+def faults(kind: str, count: int, folder: Path) -> list[str]:
+    """What was no good end, of so many cases; a process that hangs, dies or fills its memory ends none well."""
+    whole = None
+    if kind == "result":
+        mutations.a_flight(folder)
+        whole = folder / "whole.nc"
+    found = list(mutations.attack(kind, 0, count, whole))
+    assert len(found) == count
+    return [f"{kind} {case['seed']}: {case['fault']}" for case in found if case["fault"]]
+
+
+@pytest.mark.parametrize(("kind", "count"), [("check", 30), ("run", 20), ("result", 12)])
+def test_no_file_ends_in_a_traceback(tmp_path: Path, kind: str, count: int):
+    """Each of some changed files ends in an exit code of 0, 1 or 2 and in words, within its time and memory."""
+    assert not faults(kind, count, tmp_path)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("kind", "count"), [("check", 600), ("run", 400), ("result", 200)])
+def test_none_of_many_files_does(tmp_path: Path, kind: str, count: int):
+    """The same of twelve hundred files."""
+    assert not faults(kind, count, tmp_path)
+
+
+def test_the_fuzzer_finds_what_there_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """A traceback, a hang, a full memory and a wrong exit code in the command are each found as a fault."""
+    for body, words in (
+        ("raise IndexError('here')", "IndexError: here"),
+        ("import time; time.sleep(99)", "Timeout"),
+        ("while True: pass", "cli.py"),
+        ("import numpy; numpy.ones((1 << 20, 1 << 12))", "MemoryError"),
+        ("return 7", "exit code 7"),
+        ("return 2", "exit code 2 without an error"),
+    ):
+        (tmp_path / "rigidfleet").mkdir(exist_ok=True)
+        (tmp_path / "rigidfleet" / "__init__.py").write_text("")
+        (tmp_path / "rigidfleet" / "accuracy.py").write_text("")
+        (tmp_path / "rigidfleet" / "cli.py").write_text(f"def main(_):\n    {body}\n")
+        monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+        monkeypatch.setenv("MUTATIONS_SECONDS", "1")
+        (case,) = mutations.attack("check", 0, 1)
+        assert words in case["fault"]

@@ -215,7 +215,7 @@ def test_a_foreign_netcdf_file_is_no_result(tmp_path):
 
 def test_a_newer_format_is_refused(tmp_path, monkeypatch):
     """A file of a later format is not half understood: a newer version is asked for."""
-    monkeypatch.setattr("rigidfleet.result.SCHEMA_VERSION", 2)
+    monkeypatch.setattr("rigidfleet.result.SCHEMA_VERSION", 3)
     a_result().save(tmp_path / "a.nc")
     monkeypatch.undo()
     assert "Use a newer version" in refusal(tmp_path / "a.nc")

@@ -22,6 +22,7 @@ import math
 import os
 import signal
 import sys
+import traceback
 import warnings
 from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import contextmanager, nullcontext
@@ -101,6 +102,16 @@ def main(tokens: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         screen.err().print("Interrupted", style="yellow")
         return INTERRUPTED
+    except MemoryError:
+        screen.complain(
+            "There is too little memory for this. Use fewer agents, edges or samples, or a larger machine."
+        )
+        return BAD_INPUT
+    except Exception as error:
+        if sys.flags.dev_mode:
+            raise
+        screen.complain(_own_fault(error))
+        return BAD_INPUT
 
 
 # -- commands ----------------------------------------------------------------------------------------
@@ -246,8 +257,10 @@ def check(
     """
     from rigidfleet.mission import ending, goal, load_mission
 
+    watch = screen.CheckWatch(mission)
     try:
-        found = load_mission(mission)
+        with watch:
+            found = load_mission(mission)
     except MissionError as error:
         if not json:
             raise
@@ -259,7 +272,8 @@ def check(
         return BAD_INPUT
     from rigidfleet.preflight import preflight
 
-    ahead = preflight(found, search=realisations)
+    with watch:
+        ahead = preflight(found, search=realisations, progress=watch.update)
     if figure is not None:
         from rigidfleet.figures.graph import draw_graphs
 
@@ -1052,6 +1066,18 @@ def _counted(mission: Mission) -> str:
         f"{most}{mission.latest_end:g} s",
     )
     return ", ".join(counts)
+
+
+def _own_fault(error: Exception) -> str:
+    """What to say of an error that nobody has foreseen."""
+    *_, at = traceback.extract_tb(error.__traceback__)
+    text = f"{type(error).__name__} in {Path(at.filename).name}, line {at.lineno}: {error}".rstrip(
+        ": "
+    )
+    return (
+        f"{text}\n    this is a fault of rigidfleet, not of yours: please report it, with the file that led to it"
+        " (python -X dev -m rigidfleet ... shows all of it)"
+    )
 
 
 def _usage(error: CycloptsError) -> str:

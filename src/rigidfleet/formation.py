@@ -259,7 +259,13 @@ def slots(shape: str, size: float | Sequence[float], n: int) -> Floats:
         raise ValueError(f"shape {shape!r} takes {wanted}")
     if not (np.isfinite(sizes).all() and (sizes > 0).all()):
         raise ValueError(f"shape {shape!r} needs sizes > 0 m, not {size}")
-    return centred(form.make(sizes, n))
+    return _slots(shape, tuple(sizes.tolist()), n).copy()
+
+
+@lru_cache(8)
+def _slots(shape: str, sizes: tuple[float, ...], n: int) -> Floats:
+    """Slots as `slots` returns them, made once: those of many agents take seconds."""
+    return centred(SHAPES[shape].make(np.array(sizes), n))
 
 
 def agents_taken(shape: str) -> str:
@@ -369,10 +375,35 @@ def neighbours(points: ArrayLike, reach: float = REACH) -> Ints:
     p = np.asarray(points, dtype=np.float64)
     if len(p) < 2:
         return np.zeros((0, 2), dtype=np.int64)
-    tree = KDTree(p)
-    spacing = float(np.median(nearest(p)))
-    pairs = tree.query_pairs(reach * spacing * (1 + 1e-9), output_type="ndarray")
+    pairs = KDTree(p).query_pairs(_within(p, reach), output_type="ndarray")
     return pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))].astype(np.int64)
+
+
+def count_neighbours(points: ArrayLike, reach: float = REACH) -> int:
+    """How many edges `neighbours` would find, without making them."""
+    p = np.asarray(points, dtype=np.float64)
+    if len(p) < 2:
+        return 0
+    return count_within(p, _within(p, reach))
+
+
+def count_within(points: ArrayLike, distance: float) -> int:
+    """How many pairs of points (N, 3) are no farther apart than a distance [m], without making them."""
+    from scipy.spatial import KDTree
+
+    tree = KDTree(points)
+    return (int(tree.count_neighbors(tree, distance)) - tree.n) // 2
+
+
+def _within(p: Floats, reach: float) -> float:
+    """How far [m] neighbours of points (N, 3) are at most."""
+    return reach * float(np.median(nearest(p))) * (1 + 1e-9)
+
+
+def spans_space(points: ArrayLike) -> None:
+    """ValueError, with a reason, where `joined` and `coarse_to_fine` have no edges for points (N, 3)."""
+    p = np.asarray(points, dtype=np.float64)
+    _spanning_first(p, np.arange(len(p)))
 
 
 def joined(points: ArrayLike) -> Ints:
@@ -516,6 +547,8 @@ def _halves(p: Floats) -> Ints:
 
 def _spanning_first(p: Floats, order: Ints) -> Ints:
     """The order (N,) with four points in front that span space, each the earliest that will do."""
+    if len(p) < 4:
+        raise ValueError(f"{len(p)} points have no three edges each, four at least do")
     x = p[order] - p[order[0]]
     x = x / np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-300)
     found = [0, 1]
@@ -649,10 +682,11 @@ def slots_from_distances(
     """
     e = np.asarray(edges, dtype=np.int64).reshape(-1, 2)
     given = np.asarray(lengths, dtype=np.float64)
+    pairs = n * (n - 1) // 2
+    if len(e) < pairs or len({(min(i, j), max(i, j)) for i, j in e.tolist()}) < pairs:
+        return None
     d = np.zeros((n, n))
     d[e[:, 0], e[:, 1]] = d[e[:, 1], e[:, 0]] = given
-    if len({(min(i, j), max(i, j)) for i, j in e.tolist()}) < n * (n - 1) // 2:
-        return None
     centring = np.eye(n) - 1 / n
     value, vector = np.linalg.eigh(-0.5 * centring @ d**2 @ centring)
     # An eigenvalue is a squared extent: what rounding alone leaves is no thickness.

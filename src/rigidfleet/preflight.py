@@ -9,9 +9,8 @@ on them is a note.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import combinations
 from typing import Any, Literal
 
 import numpy as np
@@ -20,7 +19,7 @@ from numpy.typing import NDArray
 from rigidfleet import attitude as att
 from rigidfleet import formation as shapes
 from rigidfleet import gains, geometry, lqr, solvers
-from rigidfleet.mission import Box, Establish, Mission, Phase, Reshape
+from rigidfleet.mission import Box, Establish, Ground, Mission, Phase, Reshape
 from rigidfleet.mission.disturbances import intensity
 from rigidfleet.rigidity import (
     Kind,
@@ -59,6 +58,14 @@ _SAMPLES, _STEP, _MOST = 201, 0.05, 2001
 _TOLERANCE = 0.01
 #: Another assignment is worth a note if it saves this share of the way, and some centimetres [m].
 _WORTH, _SHORT = 0.05, 0.1
+#: What a check may take, as what takes about 4 s on a usual machine: places of agents looked at on the way, work on
+#: formations [s], agents' places held against obstacles, legs against obstacles, places against gaps. Counted and not
+#: timed, so that a check finds the same on any machine; what is left out is said.
+_PLACES, _FORMING, _HELD, _MET, _PASSED = 4_000_000, 4.0, 40_000_000, 50_000, 100_000_000
+#: A leg has so many samples at least; so many obstacles are told of, the nearest, and things in one note.
+_FEWEST, _NEAREST, _TOLD = 11, 20, 6
+#: Beyond so many agents those near each other are found by a tree (`geometry.separation`).
+_MANY = 200
 #: Equations up to which rigidity, and forces at a jump, are judged by a dense decomposition.
 _DENSE = 600
 #: Assignments of so many agents are compared, in a second or so.
@@ -117,7 +124,8 @@ class FormationCheck:
     """One formation: its rigidity, and other shapes that its distances allow, where looked for.
 
     `held_by` is "slots" if they are tracked in every phase that flies it, else "distances"; `method` how its
-    constraint force is solved for. A large one has a `spectrum` in place of its rigidity.
+    constraint force is solved for. A large one has a `spectrum` in place of its rigidity; one of very many is
+    `skipped`.
     """
 
     name: str
@@ -126,6 +134,7 @@ class FormationCheck:
     realisations: Realisations | None = None
     method: solvers.Method = "dense"
     spectrum: Spectrum | None = None
+    skipped: bool = False
 
 
 @dataclass(frozen=True)
@@ -283,20 +292,28 @@ class Preflight:
         }
 
 
-def preflight(mission: Mission, *, search: bool | None = None) -> Preflight:
+def preflight(
+    mission: Mission,
+    *,
+    search: bool | None = None,
+    progress: Callable[[str], None] = lambda _: None,
+) -> Preflight:
     """Check a mission that is right in itself for what it will meet.
 
     Parameters
     ----------
     search : for other shapes with the same distances, `STARTS` random starts a formation; default: for up to
         `SEARCHED` agents
+    progress : called with what is looked at next, in words
     """
     search = mission.n_agents <= SEARCHED if search is None else search
-    formations = [_formation(mission, name, search=search) for name in mission.formations]
+    formations = _formations(mission, search=search, progress=progress)
+    progress("the way")
     way, known = planned(mission)
     found = Preflight(formations, _gains(mission, formations), way)
     if not known:
         found.judged_to = float(way[-1].time[-1]) if way else 0.0
+    progress("what is on the way")
     found.remarks = [
         *_formation_remarks(mission, formations),
         *_gain_remarks(mission, found),
@@ -309,10 +326,10 @@ def preflight(mission: Mission, *, search: bool | None = None) -> Preflight:
         *_limits(mission, found),
     ]
     if not known:
-        text = (
-            f"the way is judged to {found.judged_to:g} s: what follows is led by distances that fix no places"
-            " before it flies"
-        )
+        why = "what follows is led by distances that fix no places before it flies"
+        if len(way) < len(mission.phases) and _samples_of(mission) < _FEWEST:
+            why = "so many agents in so many phases take too long to look at"
+        text = f"the way is judged to {found.judged_to:g} s: {why}"
         found.remarks.append(Remark("note", "way", text))
     return found
 
@@ -320,8 +337,36 @@ def preflight(mission: Mission, *, search: bool | None = None) -> Preflight:
 # -- formations --------------------------------------------------------------------------------------
 
 
-def _formation(mission: Mission, name: str, *, search: bool) -> FormationCheck:
-    held = _held_by(mission, name)
+def _formations(
+    mission: Mission, *, search: bool, progress: Callable[[str], None]
+) -> list[FormationCheck]:
+    """All formations in their order; those flown are judged first, as far as time goes."""
+    held = {name: _held_by(mission, name) for name in mission.formations}
+    left, found = _FORMING, {}
+    for k, name in enumerate(sorted(held, key=lambda name: held[name] == "nothing"), start=1):
+        progress(f"formation '{name}', {k} of {len(held)}")
+        work = _work(mission, name, search=search)
+        if k > 1 and work > left:
+            edges = mission.formation_edges(name)
+            method = solvers.choose(mission.n_agents, edges, mission.constraint.solver)
+            found[name] = FormationCheck(name, None, held[name], method=method, skipped=True)
+        else:
+            left -= work
+            found[name] = _formation(mission, name, held[name], search=search)
+    return [found[name] for name in mission.formations]
+
+
+def _work(mission: Mission, name: str, *, search: bool) -> float:
+    """About how long it takes to judge a formation [s]."""
+    n, m = mission.n_agents, len(mission.formation_edges(name))
+    if min(m, 3 * n) > _DENSE:
+        return 5e-4 * n if n <= LANCZOS else 0.0
+    return 0.1 * search + 5e-10 * min(m, 3 * n) ** 2 * max(m, 3 * n) + 2e-3
+
+
+def _formation(
+    mission: Mission, name: str, held: Literal["slots", "distances", "nothing"], *, search: bool
+) -> FormationCheck:
     slots, edges = mission.formation_slots(name), mission.formation_edges(name)
     method = solvers.choose(mission.n_agents, edges, mission.constraint.solver)
     if slots is None or not len(edges):
@@ -362,9 +407,13 @@ def _contradiction(mission: Mission, name: str) -> tuple[int, float] | None:
 
 def _formation_remarks(mission: Mission, formations: list[FormationCheck]) -> Iterator[Remark]:
     exact = mission.constraint.solver == "exact"
+    if skipped := [f.name for f in formations if f.skipped]:
+        text = f"so many formations take too long to judge: {_some(skipped)} passed over"
+        yield Remark("note", "formation", text)
+    if idle := [f.name for f in formations if f.held_by == "nothing"]:
+        yield Remark("note", "formation", f"{_some(idle)} flown in no phase")
     for f in formations:
         if f.held_by == "nothing":
-            yield Remark("note", "formation", f"'{f.name}' is flown in no phase")
             continue
         alone = f.held_by == "distances"
         if (off := _contradiction(mission, f.name)) is not None:
@@ -524,14 +573,20 @@ def planned(mission: Mission, phases: int | None = None) -> tuple[list[Leg], boo
         0.0, np.array(mission.agents.position), np.array(mission.agents.velocity), frame=frame
     )
     way: list[Leg] = []
+    most = _samples_of(mission)
+    # Of more than can be looked at with the fewest samples, the first ones.
+    possible = len(mission.phases) if most >= _FEWEST else most * len(mission.phases) // _FEWEST
+    most = max(most, _FEWEST)
     for phase, (begin, end) in list(zip(mission.phases, _spans(mission), strict=True))[:phases]:
+        if len(way) == possible:
+            return way, False
         name = phase.formation if isinstance(phase, Establish | Reshape) else now.formation
         target = slots_about_cm(mission, name, masses)
         if isinstance(phase, Establish | Reshape) and target is None:
             return way, False
         now = replace(now, t=begin)
         before = now.slots if now.slots is not None else now.r
-        count = min(max(_SAMPLES, int((end - begin) / _STEP) + 1), _MOST)
+        count = min(max(_SAMPLES, int((end - begin) / _STEP) + 1), _MOST, most)
         time = np.linspace(begin, end, count)
         names = now.formation, name
         position, ways, now = _leg(mission, phase, now, masses, target, time)
@@ -543,6 +598,13 @@ def planned(mission: Mission, phases: int | None = None) -> tuple[list[Leg], boo
         acceleration = _rate(_rate(position, time), time)
         way.append(Leg(phase.name, time, position, acceleration, not guess, ways, names))
     return way, True
+
+
+def _samples_of(mission: Mission) -> int:
+    """Samples of each leg that can be looked at: below `_MANY` agents each is held against each."""
+    n = mission.n_agents
+    each = n * max(1.0, n / 25) if n <= _MANY else n
+    return int(_PLACES / each) // len(mission.phases)
 
 
 def _leg(
@@ -878,26 +940,68 @@ def _step_thrust(mission: Mission, found: Preflight) -> Iterator[Remark]:
 
 
 def _obstacles(mission: Mission, found: Preflight) -> Iterator[Remark]:
-    radius = np.array(mission.agents.radius)
-    for thing in mission.obstacles:
+    """Room to each obstacle; of many, to all that may be touched and to the nearest."""
+    radius, way = np.array(mission.agents.radius), found.legs
+    if not (mission.obstacles and way):
+        return
+    # What a leg stays within, and how far that is from each obstacle (L, B): nobody is nearer.
+    within = np.array(
+        [[leg.position.min(axis=(0, 1)), leg.position.max(axis=(0, 1))] for leg in way]
+    )
+    far = np.stack([_beyond(within, thing) for thing in mission.obstacles], axis=1) - radius.max()
+    held, met, skipped = 0, 0, []
+    near = np.argsort(far.min(axis=0), kind="stable")
+    shown: dict[int, tuple[float, float, int, str]] = {}
+    remarks: dict[int, list[Remark]] = {}
+    for rank, b in enumerate(near.tolist()):
+        thing = mission.obstacles[b]
+        if rank >= _NEAREST and far[:, b].min() > 0:
+            break
         worst: dict[bool, tuple[float, float, int, str]] = {}
-        for leg in found.legs:
+        for k in np.argsort(far[:, b], kind="stable").tolist():
+            leg = way[k]
+            if far[k, b] >= worst.get(leg.exact, (np.inf,))[0]:
+                continue
+            held, met = held + leg.position[:, :, 0].size, met + 1
+            if held > _HELD or met > _MET:
+                break
             room, agent, _ = geometry.clearance(leg.position, radius, [thing])
-            k = int(room.argmin())
+            at = int(room.argmin())
             # Of as near ones the first: rounding and a rest's last millimetre count for nothing.
-            if room[k] < worst.get(leg.exact, (np.inf,))[0] - 1e-3:
-                worst[leg.exact] = float(room[k]), float(leg.time[k]), int(agent[k]), leg.phase
+            if room[at] < worst.get(leg.exact, (np.inf,))[0] - 1e-3:
+                worst[leg.exact] = float(room[at]), float(leg.time[at]), int(agent[at]), leg.phase
+        if held > _HELD or met > _MET:
+            skipped = near[rank:][far[:, near[rank:]].min(axis=0) <= 0].tolist()
+            break
         if worst:
-            room, t, i, _ = min(worst.values())
-            found.clearance.append((thing.name, room, t, f"agent {i + 1}"))
+            shown[b] = min(worst.values())
         for exact, (room, t, i, phase) in worst.items():
             if room <= 0:
                 verb = "hits" if exact else "may hit"
                 text = f"agent {i + 1} {verb} '{thing.name}' at {t:.2f} s, in '{phase}'"
                 if not isinstance(thing, Box):
                     text += _too_low(mission, found, phase, thing.height)
-                yield Remark("fails" if exact else "note", "obstacle", text)
+                remark = Remark("fails" if exact else "note", "obstacle", text)
+                remarks.setdefault(b, []).append(remark)
+    for b in sorted(shown):
+        room, t, i, _ = shown[b]
+        found.clearance.append((mission.obstacles[b].name, room, t, f"agent {i + 1}"))
+    for b in sorted(remarks):
+        yield from remarks[b]
+    if skipped:
+        names = [mission.obstacles[b].name for b in sorted(skipped)]
+        text = f"so many obstacles on the way take too long to look at: {_some(names)} passed over"
+        yield Remark("note", "obstacle", text)
     yield from _gaps(mission, found, radius)
+
+
+def _beyond(within: Array, thing: Box | Ground) -> Array:
+    """How far (L,) [m] boxes (L, 2, 3), lowest and highest corners, are from an obstacle at least."""
+    low, high = within[:, 0], within[:, 1]
+    if isinstance(thing, Box):
+        apart = np.maximum(np.maximum(low - thing.max, thing.min - high), 0.0)
+        return np.linalg.norm(apart, axis=1)
+    return np.maximum(low[:, 2] - thing.height, 0.0)
 
 
 def _too_low(mission: Mission, found: Preflight, phase: str, ground: float) -> str:
@@ -917,40 +1021,54 @@ def _too_low(mission: Mission, found: Preflight, phase: str, ground: float) -> s
 
 
 def _gaps(mission: Mission, found: Preflight, radius: Array) -> Iterator[Remark]:
-    """Gaps between two boxes that the formation's centre passes, and how much of each it takes."""
+    """Gaps between two boxes that the formation's centre passes, and how much of each it takes.
+
+    Of boxes on either side of the centre, seen along an axis, the nearest two make the gap.
+    """
     masses = np.array(mission.agents.mass)
     boxes = [thing for thing in mission.obstacles if isinstance(thing, Box)]
-    for a, b in combinations(boxes, 2):
+    if len(boxes) < 2:
+        return
+    low, high = np.array([box.min for box in boxes]), np.array([box.max for box in boxes])
+    least: dict[tuple[int, int, int], tuple[float, float, str]] = {}
+    looked, to = 0, math.inf
+    for leg in found.legs:
+        looked += len(leg.time) * len(boxes)
+        if looked > _PASSED:
+            to = float(leg.time[0])
+            break
+        cm = np.einsum("i,kia->ka", masses, leg.position) / masses.sum()
+        between = (cm[:, None] > low) & (cm[:, None] < high)
         for axis in range(3):
-            one, two = (a, b) if a.max[axis] <= b.min[axis] else (b, a)
-            wide = two.min[axis] - one.max[axis]
             rest = [k for k in range(3) if k != axis]
-            low, high = np.maximum(a.min, b.min)[rest], np.minimum(a.max, b.max)[rest]
-            if wide <= 0 or (low >= high).any():
+            beside = between[:, :, rest].all(axis=2)
+            if not beside.any():
                 continue
-            least: tuple[float, float, str] | None = None
-            for leg in found.legs:
-                cm = np.einsum("i,kia->ka", masses, leg.position) / masses.sum()
-                inside = ((cm[:, rest] > low) & (cm[:, rest] < high)).all(axis=1)
-                inside &= (cm[:, axis] > one.max[axis]) & (cm[:, axis] < two.min[axis])
-                if not inside.any():
-                    continue
-                along = leg.position[inside][:, :, axis]
+            at = cm[:, axis, None]
+            below = np.where(beside & (high[:, axis] < at), high[:, axis], -np.inf)
+            above = np.where(beside & (low[:, axis] > at), low[:, axis], np.inf)
+            sides = np.column_stack([below.argmax(axis=1), above.argmin(axis=1)])
+            inside = np.isfinite(below.max(axis=1)) & np.isfinite(above.min(axis=1))
+            for one, two in np.unique(sides[inside], axis=0).tolist():
+                when = inside & (sides == [one, two]).all(axis=1)
+                along = leg.position[when][:, :, axis]
                 takes = (along + radius).max(axis=1) - (along - radius).min(axis=1)
-                k = int(takes.argmax())
-                if least is None or takes[k] > least[0]:
-                    least = float(takes[k]), float(leg.time[inside][k]), leg.phase
-            if least is None:
-                continue
-            takes, t, phase = least
-            between = f"'{one.name}' and '{two.name}'"
-            found.gaps.append((between, wide, takes, t))
-            if takes > wide:
-                text = (
-                    f"the gap between {between} is {wide:.2f} m wide, and the formation takes {takes:.2f} m"
-                    f" in its attitude at {t:.2f} s, in '{phase}': turn or reshape it before"
-                )
-                yield Remark("fails", "obstacle", text)
+                k, key = int(takes.argmax()), (one, two, axis)
+                if key not in least or takes[k] > least[key][0]:
+                    least[key] = float(takes[k]), float(leg.time[when][k]), leg.phase
+    for (one, two, axis), (takes, t, phase) in sorted(least.items()):
+        between = f"'{boxes[one].name}' and '{boxes[two].name}'"
+        wide = float(low[two, axis] - high[one, axis])
+        found.gaps.append((between, wide, takes, t))
+        if takes > wide:
+            text = (
+                f"the gap between {between} is {wide:.2f} m wide, and the formation takes {takes:.2f} m"
+                f" in its attitude at {t:.2f} s, in '{phase}': turn or reshape it before"
+            )
+            yield Remark("fails", "obstacle", text)
+    if math.isfinite(to):
+        text = f"gaps between so many obstacles are looked at to {to:g} s: more would take too long"
+        yield Remark("note", "obstacle", text)
 
 
 def _limits(mission: Mission, found: Preflight) -> Iterator[Remark]:
@@ -1025,6 +1143,8 @@ def _formation_words(f: FormationCheck) -> str:
         if f.spectrum.free:
             return f"{text}; flexible to first order, {f.spectrum.free} motions or more"
         return f"{text}; rigid, index {f.spectrum.index:.3g}, condition {f.spectrum.condition:.3g}"
+    if f.skipped:
+        return f"{held}; solved by {solvers.WORDS[f.method]}; passed over, not judged"
     if r is None and f.method != "dense":
         return f"{held}; solved by {solvers.WORDS[f.method]}; too large to judge its rigidity"
     if r is None:
@@ -1069,6 +1189,13 @@ def _gain_words(g: GainsCheck) -> str:
         name, force = max(g.force.items(), key=lambda item: item[1])
         text += f"; 1 cm of sudden error asks for up to {force / 100:.2g} N ('{name}')"
     return text
+
+
+def _some(names: Sequence[str]) -> str:
+    """The first of some names, how many there are besides, and whether they "is" or "are"."""
+    text = ", ".join(f"'{name}'" for name in names[:_TOLD])
+    more = f" and {len(names) - _TOLD:,} more" if len(names) > _TOLD else ""
+    return f"{text}{more} {'is' if len(names) == 1 else 'are'}"
 
 
 def _agents(who: tuple[int, ...]) -> str:

@@ -21,7 +21,16 @@ from datetime import UTC, datetime
 from functools import cache, cached_property
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Self, get_type_hints
+from typing import (
+    TYPE_CHECKING,
+    Annotated,
+    Any,
+    Literal,
+    NamedTuple,
+    Self,
+    TypedDict,
+    get_type_hints,
+)
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +45,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 #: Version of the file format; files with a higher one are refused.
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 
 
 class Variable(NamedTuple):
@@ -58,6 +67,36 @@ LABELS: dict[str, tuple[str, ...]] = {
     "wrench": ("Fx", "Fy", "Fz", "tau_x", "tau_y", "tau_z"),
     "end": ("first", "second"),
 }
+
+
+_Three = tuple[float, float, float]
+
+
+class _Moment(TypedDict):
+    time: float
+
+
+class Target(_Moment, total=False):
+    """Where a phase leads: its time [s], and what it asks for then."""
+
+    position: _Three | None
+    velocity: _Three | None
+    attitude: tuple[float, float, float, float] | None
+    rates: _Three | None
+
+
+class Statistics(TypedDict, total=False):
+    """What the integrator counted; other keys may stand beside them."""
+
+    __others__: Any
+    evaluations: int
+    steps: int
+    rejected: int
+    wall_s: float
+    simulated_s: float
+    rtol: float
+    atol: float
+    solvers: dict[str, dict[str, float]]
 
 
 #: A vehicle so near an obstacle since the start, or until the end, stands on it [m].
@@ -104,11 +143,13 @@ class PhaseRecord:
     t_start: float
     t_end: float
     settled: bool | None = None
-    target: dict[str, Any] | None = None
-    extremes: dict[str, Extremum] = field(default_factory=dict)
+    target: Annotated[dict[str, Any] | None, Target] = None
+    extremes: Annotated[dict[str, Extremum], dict[str, tuple[float, float, int, int]]] = field(
+        default_factory=dict
+    )
 
     def __post_init__(self) -> None:
-        self.extremes = {name: Extremum(*x) for name, x in self.extremes.items()}
+        self.extremes = {name: Extremum(*x) for name, x in (self.extremes or {}).items()}
 
 
 @cache
@@ -272,6 +313,23 @@ class Result:
             raise ValueError("time is not finite and strictly increasing")
         if self.phase.min() < 0 or self.phase.max() >= len(self.phases):
             raise ValueError(f"phase has indices outside of 0 to {len(self.phases) - 1}")
+        if (np.diff(self.phase) < 0).any():
+            raise ValueError("phase goes back to an earlier one")
+        n = sizes["agent"]
+        for name, least in (("edges", 0), ("separation_pair", -1), ("clearance_agent", -1)):
+            who = getattr(self, name)
+            if who.size and not least <= who.min() <= who.max() < n:
+                raise ValueError(f"{name} names agents outside of {least} to {n - 1}")
+        for phase in self.phases:
+            for name, x in phase.extremes.items():
+                others = range(-1, 1 << 32) if name.startswith("clearance") else range(-1, n)
+                if x.who not in range(n) or x.other not in others:
+                    raise ValueError(f"an extreme of {name} names agents outside of 0 to {n - 1}")
+        for name in (name for name, v in VARIABLES.items() if "quaternion" in v.dims):
+            if not getattr(self, name).any(axis=1).all():
+                raise ValueError(f"{name} has a quaternion of length zero")
+        if (self.edges[:, 0] == self.edges[:, 1]).any():
+            raise ValueError("edges joins an agent to itself")
 
     def __repr__(self) -> str:
         end = "complete" if self.complete else f"incomplete: {self.ending or 'stopped'}"
@@ -302,11 +360,31 @@ class Result:
         from rigidfleet.mission import Mission
 
         try:
-            return Mission.from_toml(self.mission_text, "mission of the result")
+            mission = Mission.from_toml(self.mission_text, "mission of the result")
         except MissionError as error:
             made = self.versions.get("rigidfleet", "an unknown version")
             message = f"the mission inside the result cannot be read (it was made by rigidfleet {made}):\n{error}"
             raise ResultError(message) from error
+        if wrong := self._foreign(mission):
+            raise ResultError(
+                f"the mission inside the result is of another flight: {wrong}. Fly it again, or use another copy."
+            )
+        return mission
+
+    def _foreign(self, mission: Mission) -> str:
+        """What of the arrays is not of a mission; "" if nothing is."""
+        if mission.n_agents != self.n_agents:
+            return f"it has {mission.n_agents} agents, the arrays have {self.n_agents}"
+        if not np.array_equal(mission.edges, self.edges):
+            return "its formations have other edges than the arrays"
+        named = [
+            x.other for p in self.phases for n, x in p.extremes.items() if n.startswith("clear")
+        ]
+        named.append(int(self.clearance_obstacle.max()))
+        if max(named) >= max(len(mission.obstacles), 1) or (named[:-1] and min(named[:-1]) < 0):
+            return "it has fewer obstacles than the arrays name"
+        unknown = {p.formation for p in self.phases} - {None, *mission.formations}
+        return f"it has no formation {min(map(repr, unknown))}" if unknown else ""
 
     @cached_property
     def left(self) -> NDArray[np.bool_]:
@@ -357,6 +435,8 @@ class Result:
             return cls(**_parse(path, data))
         except ResultError:
             raise
+        except MemoryError as error:
+            raise ResultError(f"{path}: memory is too small for this result.") from error
         except Exception as error:  # damage inside may show itself as almost any error
             raise ResultError(
                 f"{path}: this result is damaged ({_one_line(error)}). Fly its mission again, or use another copy."
@@ -451,6 +531,17 @@ _OPTIONAL = {f.name for f in fields(Result) if f.name in VARIABLES and f.default
 _INTEGERS = {name for name in VARIABLES if _HINTS[name].__origin__ == Ints}
 #: Quantities whose least value is the worst; of clearances, too.
 _LEAST = frozenset(("separation", "separation_below", "lost", "lowest"))
+#: Attributes of a file, and what each is: a number, text, or JSON of a type.
+_ATTRIBUTES: dict[str, Any] = {
+    "mission_text": str,
+    "complete": int,
+    "ending": str,
+    "phases": list[PhaseRecord],
+    "statistics": Statistics,
+    "versions": dict[str, str],
+    "platform": str,
+    "created": str,
+}
 #: Attribute by which a file is known as a result.
 _MARK = "rigidfleet_schema_version"
 #: Bytes of a chunk at most: as much as HDF5's cache holds.
@@ -536,27 +627,29 @@ def _read(path: Path) -> bytes:
 
 
 def _parse(path: Path, data: bytes) -> dict[str, Any]:
-    """Arguments of `Result` from a file's content."""
-    import h5netcdf
+    """Arguments of `Result` from a file's content, checked against their declarations."""
+    from rigidfleet import reader
 
-    with h5netcdf.File(io.BytesIO(data), "r") as file:
+    due = {
+        name: reader.Array(variable.dims, name in _INTEGERS, name in _OPTIONAL)
+        for name, variable in VARIABLES.items()
+    }
+    with reader.opened(data) as file:
         if _MARK not in file.attrs:
             raise ResultError(
                 f"{path}: is a netCDF-4 or HDF5 file, but no result of rigidfleet. "
                 "Name a result of `rigidfleet run`."
             )
-        if file.attrs[_MARK] > SCHEMA_VERSION:
+        made = reader.attribute(file, _MARK, int)
+        if made > SCHEMA_VERSION:
             raise ResultError(
-                f"{path}: was written in format {file.attrs[_MARK]}, and this version of rigidfleet reads up to "
+                f"{path}: was written in format {made}, and this version of rigidfleet reads up to "
                 f"{SCHEMA_VERSION}. Use a newer version."
             )
-        attributes = {key: file.attrs[key] for key in ("ending", "platform", "created")}
-        decoded = {key: json.loads(file.attrs[key]) for key in ("statistics", "versions")}
-        return {
-            **{name: file.variables[name][...] for name in VARIABLES if name in file.variables},
-            **attributes,
-            **decoded,
-            "mission_text": file.attrs["mission"],
-            "complete": bool(file.attrs["complete"]),
-            "phases": [PhaseRecord(**phase) for phase in json.loads(file.attrs["phases"])],
+        attributes = {
+            key: reader.attribute(file, "mission" if key == "mission_text" else key, kind)
+            for key, kind in _ATTRIBUTES.items()
         }
+        sizes = {dim: len(names) for dim, names in LABELS.items()}
+        arrays = reader.arrays(file, due, sizes, len(data))
+    return arrays | attributes | {"complete": bool(attributes["complete"])}

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import sys
+import threading
 from collections import deque
 from collections.abc import Iterable
 from functools import cache
@@ -28,6 +29,8 @@ if TYPE_CHECKING:
 _WIDE = 1000
 #: Where there is no terminal to draw a bar on, a line says so often how far a flight is [s].
 _SELDOM = 10.0
+#: A check that takes longer says what it looks at [s].
+_PATIENCE = 5.0
 #: A flight is heard of several times a second: when not for so long, it compiles [s].
 _SILENCE = 1.0
 #: The speed of a flight is that of the last so many seconds, once there has been one of them: phases differ a
@@ -189,6 +192,32 @@ class _Screen:
 
     def _words(self) -> str:
         return ""
+
+
+class CheckWatch:
+    """Says every few seconds what a check looks at; of most, which are done before, nothing."""
+
+    def __init__(self, what: str) -> None:
+        self.what, self.stage, self.begun = what, "reading", perf_counter()
+
+    def __enter__(self) -> Self:
+        self.done = threading.Event()
+        self.thread = threading.Thread(target=self._tell, daemon=True)
+        self.thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.done.set()
+        self.thread.join()
+
+    def update(self, stage: str) -> None:
+        """Take note of what is looked at next."""
+        self.stage = stage
+
+    def _tell(self) -> None:
+        while not self.done.wait(_PATIENCE):
+            text = f"Checking {self.what}: {self.stage}, {perf_counter() - self.begun:.0f} s"
+            err().print(text, soft_wrap=True)
 
 
 class FlightWatch(_Screen):

@@ -39,10 +39,16 @@ def second_order(white: Array, step: float, tau: float) -> Array:
 
     Parameters: white samples (K, 2, ...), two of them for each sample; their step and tau [s].
     """
+    from scipy.special import gammainc
+
     s = step / tau
     A = math.exp(-s) * np.array([[1.0, 0.0], [s, 1.0]])
     P = np.array([[1.0, 0.5], [0.5, 0.5]])  # stationary
-    start, root = np.linalg.cholesky(P), np.linalg.cholesky(P - A @ P @ A.T)
+    # P - A P A^T in incomplete gamma functions: in differences a short step would cancel to nothing.
+    q11, q12, q22 = gammainc([1, 2, 3], 2.0 * s) * [1.0, 0.5, 0.5]
+    low = q12 / math.sqrt(q11)
+    root = np.array([[math.sqrt(q11), 0.0], [low, math.sqrt(q22 - low**2)]])
+    start = np.linalg.cholesky(P)
     z = np.einsum("ab,kb...->ka...", root, white)
     z[0] = np.tensordot(start, white[0], 1)
     for k in range(1, len(z)):

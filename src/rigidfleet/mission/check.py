@@ -10,10 +10,12 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
 from rigidfleet.errors import MissionError
-from rigidfleet.formation import SHAPES
-from rigidfleet.mission import disturbances, formations, phases
-from rigidfleet.mission.notes import Notes, near_shape, unknown_key
+from rigidfleet.formation import SHAPES, count_within
+from rigidfleet.mission import bounds, disturbances, formations, phases
+from rigidfleet.mission.notes import Keys, Notes, near_shape
 from rigidfleet.mission.schema import (
     Agents,
     Allocation,
@@ -58,12 +60,17 @@ def check(data: Mapping[str, Any], origin: str) -> dict[str, Any]:
         With a finding for everything that is not.
     """
     notes = Notes(data, origin)
+    _numbers(notes)
+    if notes.findings:  # what follows would take long
+        raise MissionError(notes.findings)
     parts = _tables(notes)
     for judge in (_agents, _gains, _regulators, _tracking, _allocation, _geofence):
         judge(notes, parts)
     n = _count(data)
     parts["obstacles"] = _obstacles(notes)
     parts["formations"] = formations.check(notes, n)
+    if not notes.findings and n is not None:
+        _touching(notes, parts, n)
     parts["phases"] = phases.check(notes, parts, n)
     disturbances.check(notes, parts, n)
     if notes.findings:
@@ -71,11 +78,40 @@ def check(data: Mapping[str, Any], origin: str) -> dict[str, Any]:
     return parts
 
 
+def _numbers(notes: Notes) -> None:
+    """Refuse more of anything than a mission may have, before it is looked at."""
+
+    def bounded(path: Keys, given: object, most: int, remedy: str) -> None:
+        if isinstance(given, list | dict) and len(given) > most:
+            notes.add(path, f"has {len(given):,} entries, more than {most:,}", remedy, None)
+
+    for key, most, remedy in (
+        ("formations", bounds.FORMATIONS, "fly them in several missions"),
+        ("phases", bounds.PHASES, "fly them in several missions"),
+        ("obstacles", bounds.OBSTACLES, "join those that touch, and leave out those out of reach"),
+    ):
+        bounded((key,), notes.data.get(key), most, remedy)
+    agents = notes.data.get("agents")
+    for key, given in agents.items() if isinstance(agents, dict) else ():
+        bounded(("agents", key), given, bounds.AGENTS, "fly fewer vehicles")
+    n, forms = _count(notes.data) or 0, notes.data.get("formations")
+    if isinstance(forms, dict) and len(forms) > 1 and n * len(forms) > bounds.SLOTS:
+        problem = f"{len(forms)} of {n:,} agents have {n * len(forms):,} slots, more than {bounds.SLOTS:,}"
+        notes.add(("formations",), problem, "use fewer formations, or fewer agents", None)
+    assignment = notes.data.get("assignment", "given")
+    if assignment != "given" and n > bounds.ALL_PAIRS:
+        problem = f"compares each agent with each slot, too many for {n:,} agents"
+        remedy = (
+            f"use 'given' beyond {bounds.ALL_PAIRS:,} agents, and number them as they are to go"
+        )
+        notes.add(("assignment",), problem, remedy)
+
+
 def _tables(notes: Notes) -> dict[str, Any]:
     """The header's keys and the tables, without those of which nothing can be made."""
     for key in notes.data:
         if key not in Contents.model_fields:
-            notes.add((key,), *unknown_key(key, Contents.model_fields))
+            notes.unknown((key,), Contents.model_fields)
     own = {key: value for key, value in notes.data.items() if key in Header.model_fields}
     header = notes.validate(Header, own, ())
     parts = {key: getattr(header, key) for key in Header.model_fields} if header else {}
@@ -98,7 +134,12 @@ def _placed(notes: Notes, agents: Any) -> Any:
     if start is None or not notes.right((), *path[:1]):
         return None
     try:
-        return agents | {"position": start.points().tolist()}
+        points = start.points()
+        if not np.abs(points).max() <= bounds.LENGTH.most:
+            problem = f"agents would start farther than {bounds.LENGTH.most:g} m from the origin"
+            notes.add(path, problem, "lower size, count or centre")
+            return None
+        return agents | {"position": points.tolist()}
     except ValueError as error:
         known = "" if start.shape in SHAPES else near_shape(start.shape)
         remedy = known or "change the shape, its size, or the number of agents"
@@ -112,7 +153,8 @@ def _count(data: Mapping[str, Any]) -> int | None:
     position = agents.get("position") if isinstance(agents, dict) else None
     if isinstance(position, dict):
         count = position.get("count")
-        return count if isinstance(count, int) and count > 0 else None
+        whole = isinstance(count, int) and not isinstance(count, bool)
+        return count if whole and 0 < count <= bounds.AGENTS else None
     return len(position) if isinstance(position, list) and position else None
 
 
@@ -128,7 +170,17 @@ def _agents(notes: Notes, parts: dict[str, Any]) -> None:
             notes.add(("agents", key), problem, f"give one for each agent, {n} in all")
     for i, j in formations.coincident(agents.position):
         problem = f"agent {j + 1} starts where agent {i + 1} does"
-        notes.add(("agents", "position", j), problem, "start them apart")
+        notes.add(("agents", "position", j), problem, "start them apart", agents.position[j])
+    if max(agents.mass, default=1.0) > bounds.MASS_RATIO * min(agents.mass, default=1.0):
+        problem = f"the heaviest vehicle has more than {bounds.MASS_RATIO:g} times the mass of the lightest"
+        notes.add(("agents", "mass"), problem, "give masses in kg")
+    above = [limit for limit in agents.thrust_limit if bounds.FORCE.most < limit < math.inf]
+    if above:
+        notes.add(
+            ("agents", "thrust_limit"),
+            f"must be <= {bounds.FORCE.most:g}",
+            "leave it out for no limit",
+        )
     written = notes.data["agents"].get("thrust_limit", 0.0)
     if math.inf in (written if isinstance(written, list) else [written]):
         notes.add(("agents", "thrust_limit"), "is not finite", "leave it out for no limit")
@@ -137,6 +189,26 @@ def _agents(notes: Notes, parts: dict[str, Any]) -> None:
         notes.add(
             ("agents", "saturate"), "there is no limit to cut off at", "give thrust_limit [N]"
         )
+
+
+def _touching(notes: Notes, parts: dict[str, Any], n: int) -> None:
+    """Refuse spheres so large that lists of all that touch would fill memory."""
+    if n * (n - 1) // 2 <= bounds.TOUCHING:
+        return
+    agents: Agents = parts["agents"]
+    places = {"at the start": np.array(agents.position)}
+    for name, form in parts["formations"].items():
+        slots = form.slot_array(n)
+        places |= {} if slots is None else {f"in '{name}'": slots}
+    for where, points in places.items():
+        pairs = count_within(points, 2 * max(agents.radius))
+        if pairs > bounds.TOUCHING:
+            problem = (
+                f"{pairs:,} pairs of agents touch {where}, more than {bounds.TOUCHING:,}, if all are as large as the"
+                " largest"
+            )
+            notes.add(("agents", "radius"), problem, "lower it, or keep them apart")
+            return
 
 
 def _gains(notes: Notes, parts: dict[str, Any]) -> None:

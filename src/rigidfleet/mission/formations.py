@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from itertools import islice
 
+import numpy as np
+from numpy.typing import ArrayLike
+
 from rigidfleet import formation as shapes
+from rigidfleet.mission import bounds
 from rigidfleet.mission.notes import Keys, Notes, near_shape
 from rigidfleet.mission.schema import Formation
 
 #: So many contradictions among distances are shown one by one.
 _SHOWN = 6
-#: Edges of a formation at most: all pairs of 200 agents. Ten thousand have fifty million.
-_MOST_EDGES = 20_000
 #: Triangles and tetrahedra among distances are judged up to about so many.
 _MOST_CLIQUES = 5e6
 
@@ -37,13 +39,28 @@ def sound(notes: Notes, name: str) -> bool:
     return notes.right(("formations",), name)
 
 
-def coincident(points: Sequence[Sequence[float]]) -> Iterator[tuple[int, int]]:
-    """Pairs (first, later) of points within a nanometre of each other."""
-    seen: dict[tuple[float, ...], int] = {}
-    for j, point in enumerate(points):
-        i = seen.setdefault(tuple(round(x, 9) for x in point), j)
-        if i != j:
-            yield i, j
+def coincident(points: ArrayLike) -> list[tuple[int, int]]:
+    """Pairs (first, later) of points (N, 3) [m] nearer to each other than half the least length."""
+    p, apart = np.asarray(points, dtype=np.float64), bounds.LENGTH.least / 2
+    # By cells first: a tree of many equal points is none, and looks at all pairs.
+    cell = np.round(p / apart)
+    order = np.lexsort(cell.T)
+    new = np.append(True, (np.diff(cell[order], axis=0) != 0).any(axis=1))
+    first = np.empty(len(p), dtype=np.int64)
+    first[order] = order[np.flatnonzero(new)[np.cumsum(new) - 1]]
+    later = np.flatnonzero(first != np.arange(len(p)))
+    if not len(later) and len(p) > 1:
+        later = np.flatnonzero(shapes.nearest(p) < apart)[1:]
+        for j in later:
+            away = np.linalg.norm(p - p[j], axis=1)
+            away[j] = np.inf
+            first[j] = away.argmin()
+    return [(int(first[j]), int(j)) for j in later if first[j] < j]
+
+
+def most_edges(n: int) -> int:
+    """Edges that a formation of n agents may have."""
+    return max(bounds.EDGES, bounds.EDGES_EACH * n)
 
 
 def agents(indices: Iterable[int], between: str = ", ") -> str:
@@ -64,11 +81,14 @@ def _formation(notes: Notes, form: Formation, n: int | None, path: Keys) -> None
         _shape(notes, form, form.shape, n, path)
     if n is None:
         return
-    edges = n * (n - 1) // 2
-    if form.edges == "complete" and edges > _MOST_EDGES:
-        problem = f"are {edges:,} for {n:,} agents, more than {_MOST_EDGES:,}"
+    edges = n * (n - 1) // 2 if form.edges == "complete" else len(form.edges)
+    # Edges between all pairs are given to few agents: their law is solved densely.
+    most = bounds.EDGES if form.edges == "complete" else most_edges(n)
+    if edges > most:
+        problem = f"are {edges:,} for {n:,} agents, more than {most:,}"
         remedy = "use 'neighbours', or a list of pairs; 3 N - 6 edges, and some more, hold a shape"
-        notes.add((*path, "edges"), problem, remedy, "complete")
+        value = "complete" if form.edges == "complete" else None
+        notes.add((*path, "edges"), problem, remedy, value)
     if form.slots is not None:
         if len(form.slots) != n:
             problem = f"has {len(form.slots)} slots for {n} agents"
@@ -89,10 +109,16 @@ def _shape(notes: Notes, form: Formation, shape: str, n: int | None, path: Keys)
             notes.add((*path, "size"), "is missing", "add size, the edge length [m]")
     elif n is not None:
         try:
-            shapes.slots(shape, form.size, n)
+            slots = form.slot_array(n)
         except ValueError as error:
             remedy = "change the shape, its size, or the number of agents"
             notes.add((*path, "shape"), str(error), remedy)
+            return
+        assert slots is not None  # a shape has them
+        far = float(np.abs(slots).max())
+        if far > bounds.LENGTH.most:
+            problem = f"slots of {n:,} agents reach out to {far:.3g} m, farther than {bounds.LENGTH.most:g}"
+            notes.add((*path, "size"), problem, "lower it")
 
 
 def _edges(notes: Notes, form: Formation, n: int, path: Keys) -> None:
@@ -121,8 +147,18 @@ def _graph(notes: Notes, form: Formation, n: int, path: Keys) -> None:
         remedy = "list the pairs, or give shape and size and no distances"
         notes.add(path, "needs places, and distances that are theirs", remedy)
         return
+    slots = form.slot_array(n)
+    assert slots is not None  # there are a shape or slots
+    if form.edges == "neighbours":
+        many = shapes.count_neighbours(slots, form.reach)
+        if many > most_edges(n):
+            problem = f"joins {many:,} pairs of {n:,} agents, more than {most_edges(n):,}"
+            notes.add(
+                (*above, "reach"), problem, "lower it; 1.9 takes second neighbours", form.reach
+            )
+        return
     try:
-        form.edge_array(n)
+        shapes.spans_space(slots)
     except ValueError as error:
         notes.add(path, str(error), "use 'neighbours', or give a list of pairs")
 
@@ -134,7 +170,9 @@ def _distances(notes: Notes, form: Formation, lengths: Sequence[float], n: int, 
         order = "12, 13, ..., 23, ..." if form.edges == "complete" else "that of edges"
         notes.add(path, problem, f"give one for each edge, in the order {order}", None)
         return
-    cliques = len(edges) * (2 * len(edges) / n) ** 2
+    # Those that two ends of an edge have in common are at most the neighbours of either.
+    degree = np.bincount(edges.ravel(), minlength=n)
+    cliques = (degree[edges].min(axis=1, initial=n).astype(float) ** 2).sum()
     found = shapes.unrealisable(edges, lengths) if cliques < _MOST_CLIQUES else []
     names = [
         f"d{agents(e, '' if n < 10 else '-')} = {d:g}" for e, d in zip(edges, lengths, strict=True)

@@ -17,6 +17,7 @@ from rigidfleet import geometry
 from rigidfleet.attitude import dcm_from_euler
 from rigidfleet.errors import Finding, MissionError
 from rigidfleet.formation import Floats, Ints, assigned, distances
+from rigidfleet.mission import bounds
 from rigidfleet.mission.check import check
 from rigidfleet.mission.notes import near
 from rigidfleet.mission.phases import latest_end
@@ -32,8 +33,6 @@ from rigidfleet.mission.schema import (
 from rigidfleet.mission.toml import to_toml
 
 _SHIPPED = resources.files("rigidfleet") / "missions"
-#: A device or a video given by mistake is noticed before memory is full.
-_LARGEST = 64 * 2**20
 #: Least and greatest damping that "auto" takes: below, rounding shows; docs/robustness.md has the table.
 _DAMPING = (1e-5, 0.03)
 #: Beyond so many equations eigenvalues take too long; the greatest damping is taken.
@@ -75,6 +74,8 @@ class Mission(Contents):
         except TypeError as error:
             remedy = "use numbers, strings, lists and dicts"
             raise MissionError([Finding(origin, "", None, str(error), remedy)]) from None
+        except RecursionError:
+            raise _unread(origin, "is nested without end", "use the keys of a mission") from None
         return cls.from_toml(text, origin)
 
     def to_dict(self) -> dict[str, Any]:
@@ -344,7 +345,7 @@ def read_text(path: str | Path) -> str:
     origin = str(path)
     try:
         with open(path, "rb") as file:
-            data = file.read(_LARGEST + 1)
+            data = file.read(bounds.BYTES + 1)
     except FileNotFoundError:
         raise MissionError([_not_found(origin)]) from None
     except IsADirectoryError:
@@ -353,8 +354,10 @@ def read_text(path: str | Path) -> str:
         raise _unread(origin, "may not be read", "change its permissions") from None
     except (OSError, ValueError) as error:
         raise _unread(origin, f"cannot be read ({error})", "name a mission file") from None
-    if len(data) > _LARGEST:
-        raise _unread(origin, f"is larger than {_LARGEST >> 20} MiB", "name a mission file (TOML)")
+    if len(data) > bounds.BYTES:
+        raise _unread(
+            origin, f"is larger than {bounds.BYTES >> 20} MiB", "name a mission file (TOML)"
+        )
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -378,12 +381,14 @@ def parse_toml(text: str, origin: str) -> dict[str, Any]:
     Raises
     ------
     MissionError
-        It is no TOML.
+        It is no TOML, or beyond the bounds of a mission's text.
     """
+    if beyond := bounds.excess(text):
+        raise _unread(origin, beyond, "make it smaller; docs/missions.md lists the bounds")
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         problem, remedy = f"is not valid TOML: {error}", "correct the line; toml.io has the format"
-    except (ValueError, RecursionError) as error:  # thousands of digits, or of brackets
+    except ValueError as error:  # thousands of digits
         problem, remedy = f"cannot be read as TOML: {error}", "correct it; toml.io has the format"
     raise _unread(origin, problem, remedy)

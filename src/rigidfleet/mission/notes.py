@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import re
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from types import UnionType
 from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
@@ -18,6 +19,11 @@ from rigidfleet.mission.toml import toml_key
 Keys = tuple[str | int, ...]
 P = TypeVar("P", bound=Part)
 
+#: So many findings of one kind are told one by one; the others are counted.
+_TOLD = 8
+_UNKNOWN = "unknown key"
+#: Any place in a list.
+_ANY = -1
 #: For required keys that are wrong, so that the rest of their table can still be checked.
 _STAND_IN: dict[str, Any] = {"mass": 1.0, "position": (0.0, 0.0, 0.0), "formation": ""}
 
@@ -32,19 +38,39 @@ class Notes:
         self.data = data
         self.origin = origin
         self._findings: dict[tuple[str, str], Finding] = {}
+        self._told: Counter[Keys] = Counter()
         self._wrong: set[Keys] = set()
 
     @property
     def findings(self) -> list[Finding]:
-        """What has been found, without repetition."""
-        return list(self._findings.values())
+        """What has been found, without repetition: of a list with many faults of one kind the first ones."""
+        more = [
+            Finding(
+                self.origin, _key(kind), None, f"{n - _TOLD:,} more of this kind", "correct all"
+            )
+            for kind, n in self._told.items()
+            if n > _TOLD
+        ]
+        return [*self._findings.values(), *more]
 
     def add(self, path: Keys, problem: str, remedy: str, *value: object) -> None:
         """Record a finding. Its value is what the user wrote at the path, unless one is given."""
-        shown = value[0] if value else look_up(self.data, path)
-        key = _key(path)
-        self._findings.setdefault((key, problem), Finding(self.origin, key, shown, problem, remedy))
         self._wrong |= {path[:k] for k in range(1, len(path) + 1)}
+        key = _key(path)
+        if (key, problem) in self._findings:
+            return
+        kind = _kind(path, problem)
+        if problem == _UNKNOWN or _ANY in kind:
+            self._told[kind] += 1
+            if self._told[kind] > _TOLD:
+                return
+        shown = value[0] if value else look_up(self.data, path)
+        self._findings[key, problem] = Finding(self.origin, key, shown, problem, remedy)
+
+    def unknown(self, path: Keys, known: Iterable[str]) -> None:
+        """Record that a table knows no such key; what was meant takes long to guess, and is for the first ones."""
+        guess = self._told[_kind(path, _UNKNOWN)] < _TOLD
+        self.add(path, *(unknown_key(path[-1], known) if guess else (_UNKNOWN, "")))
 
     def right(self, path: Keys, *keys: str) -> bool:
         """Whether nothing has been found so far at or below these keys of a table."""
@@ -89,7 +115,10 @@ class Notes:
             return  # entries that are wrong themselves were not counted
         if path == ("lqr", "attitude") and error["loc"] != path[1:]:
             return  # inherited from lqr, where it has been found
-        self.add(path, *_explain(error, path, owner))
+        if error["type"] == "extra_forbidden":
+            self.unknown(path, owner.model_fields)
+        else:
+            self.add(path, *_explain(error, path, owner))
 
 
 #: Words for what is called "none".
@@ -125,12 +154,22 @@ def near_shape(word: object) -> str:
 def unknown_key(key: object, known: Iterable[str]) -> tuple[str, str]:
     """Problem and remedy of a key that is not one of the known."""
     names = list(known)
-    return "unknown key", near(key, names) or f"remove it; known keys: {', '.join(names)}"
+    return _UNKNOWN, near(key, names) or f"remove it; known keys: {', '.join(names)}"
 
 
 def _key(path: Keys) -> str:
-    steps = (f"[{step + 1}]" if isinstance(step, int) else f".{toml_key(step)}" for step in path)
-    return "".join(steps).removeprefix(".")
+    def step(at: str | int) -> str:
+        if isinstance(at, int):
+            return "[*]" if at == _ANY else f"[{at + 1}]"
+        return f".{toml_key(at)}"
+
+    return "".join(map(step, path)).removeprefix(".")
+
+
+def _kind(path: Keys, problem: str) -> Keys:
+    """What findings are counted by: their place in any table of a list, and all keys unknown to a table as one."""
+    path = path[:-1] if problem == _UNKNOWN else path
+    return tuple(_ANY if isinstance(step, int) else step for step in path)
 
 
 def _model_at(owner: type[Part], key: object) -> type[Part]:
@@ -160,8 +199,6 @@ def _explain(error: Any, path: Keys, owner: type[Part]) -> tuple[str, str]:
     field = owner.model_fields.get(name)
     meaning = f"{name}: {field.description}" if field and field.description else ""
     match kind:
-        case "extra_forbidden":
-            return unknown_key(name, owner.model_fields)
         case "missing":
             return "is missing", f"add {meaning or name}"
         case "literal_error":
@@ -169,6 +206,8 @@ def _explain(error: Any, path: Keys, owner: type[Part]) -> tuple[str, str]:
             return f"must be {context['expected']}", near(
                 error["input"], words
             ) or f"use {'none' if error['input'] in _OFF and 'none' in words else words[0]}"
+        case "greater_than_equal" if 0 < context["ge"] < 1 and not error["input"] > 0:
+            return "must be > 0", meaning
         case "too_short" if context["min_length"] == 1:
             return "is empty", meaning
         case "too_short" | "too_long":

@@ -36,8 +36,8 @@ _KINDS: dict[str, type[AnyPhase]] = {
 }
 _ENDINGS = ("until", "duration", "settle")
 _MOST_SAMPLES = 1_000_000
-#: Numbers in a result at most: 2 GB of them.
-_MOST_NUMBERS = 2.5e8
+#: Numbers in a result at most: 4 GB of them.
+_MOST_NUMBERS = 5e8
 
 
 def check(notes: Notes, parts: Mapping[str, Any], n: int | None) -> tuple[AnyPhase, ...]:
@@ -177,9 +177,12 @@ def _blend(notes: Notes, p: Shaping, longest: float | None, path: Keys) -> None:
 
 def _samples(notes: Notes, parts: Mapping[str, Any], end: float | None, n: int | None) -> None:
     step = parts.get("output_step")
-    if not step or not end or not notes.right((), "output_step"):
+    if not step or not end or not notes.right((), "output_step", "formations"):
         return
     forms = parts["formations"].values()
+    # One each step, and two at each switch of phases.
+    switches = 2 * len(tables(notes, "phases"))
+    samples = end / step + switches
     about = {"complete": (n or 0) ** 2 // 2, "neighbours": 9 * (n or 0)}
     edges = sum(
         about.get(form.edges, 3 * (n or 0)) if isinstance(form.edges, str) else len(form.edges)
@@ -192,10 +195,17 @@ def _samples(notes: Notes, parts: Mapping[str, Any], end: float | None, n: int |
     elif end / step > _MOST_SAMPLES:
         problem = f"{end / step:.2g} samples would be stored, more than {_MOST_SAMPLES:,}"
         notes.add(("output_step",), problem, f"use {end / _MOST_SAMPLES:.2g} s or more", step)
-    elif end / step * numbers > _MOST_NUMBERS:
-        problem = f"{end / step * numbers * 8e-9:.2g} GB would be stored, more than {_MOST_NUMBERS * 8e-9:g}"
-        least = end * numbers / _MOST_NUMBERS
-        notes.add(("output_step",), problem, f"use {least:.2g} s or more, or fewer edges", step)
+    elif samples * numbers > _MOST_NUMBERS:
+        problem = (
+            f"{samples * numbers * 8e-9:.2g} GB would be stored, more than {_MOST_NUMBERS * 8e-9:g}"
+        )
+        least = _MOST_NUMBERS / numbers - switches
+        remedy = (
+            f"use {end / least:.2g} s or more, or fewer edges"
+            if least > 0
+            else "use fewer agents, edges or phases"
+        )
+        notes.add(("output_step",), problem, remedy, step)
 
 
 def _controls(notes: Notes, found: Sequence[AnyPhase | None]) -> None:

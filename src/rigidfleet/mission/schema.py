@@ -22,6 +22,20 @@ from pydantic import (
 
 from rigidfleet import formation as shapes
 from rigidfleet.formation import Floats, Ints
+from rigidfleet.mission import bounds
+from rigidfleet.mission.bounds import (
+    ACCELERATION,
+    ANGLE,
+    FORCE,
+    GAIN,
+    LENGTH,
+    MASS,
+    SPEED,
+    TIME,
+    TOLERANCE,
+    WEIGHT,
+    Bound,
+)
 
 #: No quantity in SI units is larger here, and the sixth power of a length is still a float.
 HUGE = 1e15
@@ -34,14 +48,46 @@ ANGLES = ("roll_deg", "pitch_deg", "yaw_deg")
 
 Number = Annotated[float, Strict(), Field(ge=-HUGE, le=HUGE)]
 Positive = Annotated[float, Strict(), Field(gt=0, le=HUGE)]
-NonNegative = Annotated[float, Strict(), Field(ge=0, le=HUGE)]
-Limit = Annotated[float, Strict(), Field(gt=0, allow_inf_nan=True)]
+
+
+def _signed(bound: Bound, power: int = 1) -> Any:
+    return Field(ge=-(bound.most**power), le=bound.most**power)
+
+
+def _positive(bound: Bound) -> Any:
+    return Field(ge=bound.least, le=bound.most)
+
+
+def _from_zero(bound: Bound) -> Any:
+    return Field(ge=0, le=bound.most)
+
+
+Coordinate = Annotated[float, Strict(), _signed(LENGTH)]
+Length = Annotated[float, Strict(), _positive(LENGTH)]
+Room = Annotated[float, Strict(), _from_zero(LENGTH)]
+Time = Annotated[float, Strict(), _positive(TIME)]
+Dwell = Annotated[float, Strict(), _from_zero(TIME)]
+Speed = Annotated[float, Strict(), _positive(SPEED)]
+Spread = Annotated[float, Strict(), _from_zero(SPEED)]
+Acceleration = Annotated[float, Strict(), _positive(ACCELERATION)]
+Mass = Annotated[float, Strict(), _positive(MASS)]
+Angle = Annotated[float, Strict(), _signed(ANGLE)]
+Gain = Annotated[float, Strict(), _signed(GAIN)]
+Weight = Annotated[float, Strict(), _from_zero(WEIGHT)]
+Cost = Annotated[float, Strict(), _positive(WEIGHT)]
+Tolerance = Annotated[float, Strict(), _positive(TOLERANCE)]
+#: Infinity is found later, with a remedy of its own.
+Limit = Annotated[float, Strict(), Field(ge=FORCE.least, allow_inf_nan=True)]
 Whole = Annotated[int, Strict(), Field(ge=-(2**31), lt=2**31)]
 Flag = Annotated[bool, Strict()]
-Vector = Annotated[tuple[Number, ...], Field(min_length=3, max_length=3)]
-Weights = Annotated[tuple[NonNegative, ...], Field(min_length=2, max_length=2)]
+_Three = Field(min_length=3, max_length=3)
+Vector = Annotated[tuple[Coordinate, ...], _Three]
+Velocity = Annotated[tuple[Annotated[float, Strict(), _signed(SPEED)], ...], _Three]
+Force = Annotated[tuple[Annotated[float, Strict(), _signed(FORCE)], ...], _Three]
+Rates = Annotated[tuple[Angle, ...], _Three]
+Weights = Annotated[tuple[Weight, ...], Field(min_length=2, max_length=2)]
 
-_Extent = Annotated[tuple[Positive, ...], Field(min_length=3, max_length=3)]
+_Extent = Annotated[tuple[Length, ...], _Three]
 _Pair = Annotated[tuple[Whole, ...], Field(min_length=2, max_length=2)]
 
 
@@ -50,7 +96,7 @@ def _form(value: object) -> str:
 
 
 Size = Annotated[
-    Annotated[Positive, Tag("one")] | Annotated[_Extent, Tag("list")], Discriminator(_form)
+    Annotated[Length, Tag("one")] | Annotated[_Extent, Tag("list")], Discriminator(_form)
 ]
 Edges = Annotated[
     Annotated[Literal["complete", "neighbours", "joined", "tree"], Tag("one")]
@@ -59,16 +105,15 @@ Edges = Annotated[
 ]
 
 Damping = Annotated[
-    Annotated[Positive, Tag("one")] | Annotated[Literal["auto"], Tag("word")],
+    Annotated[Tolerance, Tag("one")] | Annotated[Literal["auto"], Tag("word")],
     Discriminator(lambda value: "word" if isinstance(value, str) else "one"),
 ]
 
 
-_Error = Annotated[float, Strict(), Field(gt=-1, le=HUGE)]
-_Three = Field(min_length=3, max_length=3)
+_Error = Annotated[float, Strict(), Field(gt=-1, le=bounds.MASS_RATIO)]
 Seed = Annotated[int, Strict(), Field(ge=0, lt=2**31)]
 PerAgent = Annotated[
-    Annotated[NonNegative, Tag("one")] | Annotated[tuple[NonNegative, ...], Tag("list")],
+    Annotated[Weight, Tag("one")] | Annotated[tuple[Weight, ...], Tag("list")],
     Discriminator(_form),
 ]
 PerAgentError = Annotated[
@@ -76,13 +121,13 @@ PerAgentError = Annotated[
     Discriminator(_form),
 ]
 PerAxis = Annotated[
-    Annotated[NonNegative, Tag("one")] | Annotated[tuple[NonNegative, ...], _Three, Tag("list")],
+    Annotated[Spread, Tag("one")] | Annotated[tuple[Spread, ...], _Three, Tag("list")],
     Discriminator(_form),
 ]
 
 
-def _number_or_list(lowest: str) -> WithJsonSchema:
-    number = {"type": "number", lowest: 0}
+def _number_or_list(least: float) -> WithJsonSchema:
+    number = {"type": "number", "minimum": least}
     return WithJsonSchema({"anyOf": [number, {"type": "array", "items": number}]})
 
 
@@ -101,7 +146,7 @@ class Start(Part):
         json_schema_extra={"enum": [*shapes.SHAPES]},
     )
     size: Size = Field(description="edge length of the shape [m], or its sizes")
-    count: Annotated[int, Strict(), Field(ge=1, le=1_000_000)] = Field(
+    count: Annotated[int, Strict(), Field(ge=1, le=bounds.AGENTS)] = Field(
         description="number of agents"
     )
     centre: Vector = Field((0.0, 0.0, 0.0), description="where its centre is [x, y, z] [m]")
@@ -120,20 +165,20 @@ class Start(Part):
 class Agents(Part):
     """The vehicles, as point masses. Once checked, each field has one entry for each agent."""
 
-    mass: Annotated[tuple[Positive, ...], _number_or_list("exclusiveMinimum")] = Field(
+    mass: Annotated[tuple[Mass, ...], _number_or_list(MASS.least)] = Field(
         description="mass [kg], > 0: a number for all agents, or a list with one for each"
     )
     position: Annotated[tuple[Vector, ...], Field(min_length=1)] = Field(
         description="initial position [x, y, z] of each agent [m], world frame ENU (z up); or a table, the "
         "shape in which they start"
     )
-    velocity: tuple[Vector, ...] = Field(
+    velocity: tuple[Velocity, ...] = Field(
         (), description="initial velocity of each agent [m/s]; at rest when absent"
     )
-    radius: Annotated[tuple[NonNegative, ...], _number_or_list("minimum")] = Field(
+    radius: Annotated[tuple[Room, ...], _number_or_list(0)] = Field(
         (0.25,), description="radius of the sphere that must touch nothing [m]: a number or a list"
     )
-    thrust_limit: Annotated[tuple[Limit, ...], _number_or_list("exclusiveMinimum")] = Field(
+    thrust_limit: Annotated[tuple[Limit, ...], _number_or_list(FORCE.least)] = Field(
         (math.inf,),
         description="greatest thrust |f_u + f_C| [N]: a number or a list; unlimited when absent",
     )
@@ -158,9 +203,9 @@ class Agents(Part):
 class Constraint(Part):
     """The constraint force: feedback of the error c = L - d, and the solve for the multipliers."""
 
-    alpha: Number = Field(3.0, description="feedback 2 alpha of dc/dt [1/s], > 0")
-    beta: Number = Field(math.sqrt(12), description="feedback beta^2 of c; beta [1/s], > 0")
-    gamma: Number = Field(
+    alpha: Gain = Field(3.0, description="feedback 2 alpha of dc/dt [1/s], > 0")
+    beta: Gain = Field(math.sqrt(12), description="feedback beta^2 of c; beta [1/s], > 0")
+    gamma: Annotated[float, Strict(), _signed(GAIN, 3)] = Field(
         8.0, description="feedback of the integral of c [1/s^3], >= 0, below 2 alpha beta^2"
     )
     stabilisation: Literal["pid", "none"] = Field(
@@ -179,12 +224,12 @@ class Constraint(Part):
     iterations: Annotated[int, Strict(), Field(ge=1, le=100)] = Field(
         3, description="number k of iterations of the iterated solver, 1 to 100"
     )
-    threshold: Positive = Field(0.1, description="s0 of the spectral solver [-], > 0")
+    threshold: Tolerance = Field(0.1, description="s0 of the spectral solver [-], > 0")
     cutoff: Annotated[float, Strict(), Field(gt=0, lt=1)] = Field(
         1e-3,
         description="cut-off of the pinv solver, in parts of the largest w, in (0, 1); smooth below",
     )
-    deformation_damping: NonNegative = Field(
+    deformation_damping: Annotated[float, Strict(), _from_zero(GAIN)] = Field(
         1.0, description="damping of deformation while no slots are tracked [1/s], >= 0"
     )
 
@@ -196,7 +241,7 @@ class Regulator(Part):
         "finite", description="finite: S weighs the arrival; infinite: Q and R alone"
     )
     Q: Weights = Field((0.0, 0.0), description="weights [error, rate error], >= 0")
-    R: Positive = Field(1.0, description="weight of the acceleration, > 0")
+    R: Cost = Field(1.0, description="weight of the acceleration, > 0")
     S: Weights = Field((1e3, 1e2), description="weights on arrival [error, rate error], >= 0")
 
 
@@ -223,7 +268,7 @@ class Tracking(Part):
     Q: Weights = Field(
         (4.0, 4.0), description="weights [position error, velocity error], the first > 0"
     )
-    R: Positive = Field(1.0, description="weight of the acceleration, > 0")
+    R: Cost = Field(1.0, description="weight of the acceleration, > 0")
 
 
 class Allocation(Part):
@@ -243,17 +288,17 @@ class Integrator(Part):
     rtol: Annotated[float, Strict(), Field(gt=0, le=0.1)] = Field(
         1e-8, description="relative tolerance [-]"
     )
-    atol: Positive = Field(1e-10, description="absolute tolerance [m, m/s]")
-    atol_velocity: Positive | None = Field(
+    atol: Tolerance = Field(1e-10, description="absolute tolerance [m, m/s]")
+    atol_velocity: Tolerance | None = Field(
         None,
         description="that of velocities [m/s]; when absent atol, and in a large formation that of places times beta",
     )
-    atol_integral: Positive | None = Field(
+    atol_integral: Tolerance | None = Field(
         None,
         description="that of the integrals of c [m s]; when absent atol, and rtol times the distance besides where "
         "a large formation is not solved densely",
     )
-    atol_attitude: Positive | None = Field(
+    atol_attitude: Tolerance | None = Field(
         None, description="that of the frame's quaternion [-]; atol when absent"
     )
 
@@ -261,9 +306,9 @@ class Integrator(Part):
 class BodyFrame(Part):
     """Attach the body frame at t = 0 with this attitude, not when a formation is established."""
 
-    roll_deg: Number = Field(0.0, description="roll [deg], 3-2-1 Euler angles")
-    pitch_deg: Number = Field(0.0, description="pitch [deg]")
-    yaw_deg: Number = Field(0.0, description="yaw [deg]")
+    roll_deg: Angle = Field(0.0, description="roll [deg], 3-2-1 Euler angles")
+    pitch_deg: Angle = Field(0.0, description="pitch [deg]")
+    yaw_deg: Angle = Field(0.0, description="yaw [deg]")
 
 
 class Formation(Part):
@@ -288,11 +333,11 @@ class Formation(Part):
         description="pairs of agents, counted from 1; 'complete': every pair; 'neighbours': those within reach; "
         "'joined': each to three nearer to the centre; 'tree': each to three before it, far ones first; 3 N - 6 in all",
     )
-    reach: Positive = Field(
+    reach: Length = Field(
         shapes.REACH,
         description="how far edges 'neighbours' reach, in distances of nearest neighbours: 1.9 takes the second, too",
     )
-    distances: tuple[Positive, ...] | None = Field(
+    distances: tuple[Length, ...] | None = Field(
         None, description="length of each edge [m]; when absent, those of the slots"
     )
 
@@ -336,7 +381,7 @@ class Ground(Part):
 
     kind: Literal["ground"] = Field(description="everything below a height")
     name: str = Field("", description="what to call it; 'ground' when absent")
-    height: Number = Field(0.0, description="height of the ground [m]")
+    height: Coordinate = Field(0.0, description="height of the ground [m]")
 
 
 class Geofence(Part):
@@ -349,12 +394,12 @@ class Geofence(Part):
 class Limits(Part):
     """What the verdict holds each agent to."""
 
-    speed: Positive | None = Field(None, description="greatest speed [m/s]")
-    acceleration: Positive | None = Field(None, description="greatest acceleration [m/s^2]")
-    separation: NonNegative | None = Field(
+    speed: Speed | None = Field(None, description="greatest speed [m/s]")
+    acceleration: Acceleration | None = Field(None, description="greatest acceleration [m/s^2]")
+    separation: Room | None = Field(
         None, description="least room between agents [m]: centre distance minus radii"
     )
-    separation_below: NonNegative | None = Field(
+    separation_below: Room | None = Field(
         None, description="least room [m] to an agent straight below: height minus radii (downwash)"
     )
     geofence: Geofence | None = Field(None, description="box that no agent may leave")
@@ -372,9 +417,7 @@ class Gusts(Part):
         description="standard deviation [m/s]: a number, or [along the wind, across, vertical]; by altitude and "
         "wind speed when absent",
     )
-    time_scale: Positive | None = Field(
-        None, description="correlation time of first-order gusts [s]"
-    )
+    time_scale: Time | None = Field(None, description="correlation time of first-order gusts [s]")
     length: Size | None = Field(
         None,
         description="scale length of Dryden's gusts [m]: a number, or [along the wind, across, vertical]",
@@ -384,14 +427,14 @@ class Gusts(Part):
         description="in place of length: height above ground [m] from which MIL-F-8785C has the lengths, 3.048 to "
         "304.8",
     )
-    airspeed: Positive | None = Field(
+    airspeed: Speed | None = Field(
         None,
         description="speed at which Dryden's gusts pass by [m/s]; the wind's when absent",
     )
     correlation: Annotated[float, Strict(), Field(ge=0, le=1)] | None = Field(
         None, description="correlation of any two agents' gusts [-], 0 to 1; 0 when absent"
     )
-    correlation_length: Positive | None = Field(
+    correlation_length: Length | None = Field(
         None,
         description="in place of correlation: it is exp(-distance / this length [m]), of the slots of the first "
         "formation established",
@@ -402,10 +445,10 @@ class Gusts(Part):
 class Noise(Part):
     """Errors of what each vehicle measures of itself, normal, independent, new at a sensor's rate."""
 
-    position: NonNegative = Field(
+    position: Room = Field(
         0.0, description="standard deviation of each component of the position [m]"
     )
-    velocity: NonNegative = Field(
+    velocity: Spread = Field(
         0.0, description="standard deviation of each component of the velocity [m/s]"
     )
     rate: Annotated[float, Strict(), Field(gt=0, le=1000)] = Field(
@@ -418,13 +461,13 @@ class Lost(Part):
     """A vehicle lost: from then on without thrust and without edges."""
 
     agent: Whole = Field(description="which one, counted from 1")
-    time: Positive = Field(description="mission time [s], > 0")
+    time: Time = Field(description="mission time [s], > 0")
 
 
 class Disturbances(Part):
     """What disturbs the flight, and is told to no law."""
 
-    wind: Vector = Field((0.0, 0.0, 0.0), description="steady wind [m/s], where the air goes to")
+    wind: Velocity = Field((0.0, 0.0, 0.0), description="steady wind [m/s], where the air goes to")
     drag: PerAgent | None = Field(
         None,
         description="force of the air for each m/s of velocity through it [N s/m]: a number or a list; when absent, "
@@ -444,17 +487,17 @@ class Disturbances(Part):
 class Settle(Part):
     """A phase ends once its error has stayed within a tolerance."""
 
-    tolerance: Positive = Field(1e-3, description="greatest error [m]")
-    dwell: NonNegative = Field(1.0, description="how long the error must stay within it [s]")
-    timeout: Positive = Field(60.0, description="after this long the mission fails [s]")
+    tolerance: Tolerance = Field(1e-3, description="greatest error [m]")
+    dwell: Dwell = Field(1.0, description="how long the error must stay within it [s]")
+    timeout: Time = Field(60.0, description="after this long the mission fails [s]")
 
 
 class AnyPhase(Part):
     """What every phase has. It ends by exactly one of until, duration and settle."""
 
     name: str = Field("", description="what to call it, unique; its kind and number when absent")
-    until: Positive | None = Field(None, description="ending: at this mission time [s]")
-    duration: Positive | None = Field(None, description="ending: after this long [s]")
+    until: Time | None = Field(None, description="ending: at this mission time [s]")
+    duration: Time | None = Field(None, description="ending: after this long [s]")
     settle: Settle | None = Field(None, description="ending: when settled")
     control: Literal["open", "slots", "body"] = Field(
         "slots",
@@ -462,7 +505,7 @@ class AnyPhase(Part):
         "wrench on the virtual body. Default slots; in architecture 'body', open to establish and "
         "body otherwise",
     )
-    input_force: Vector = Field(
+    input_force: Force = Field(
         (0.0, 0.0, 0.0),
         description="force on each agent besides the weight balance [N], control 'open' only",
     )
@@ -471,9 +514,9 @@ class AnyPhase(Part):
 class Attitude(Part):
     """Angles of an attitude; when one is given, the others are 0."""
 
-    roll_deg: Number | None = Field(None, description="roll on arrival [deg], 3-2-1 Euler angles")
-    pitch_deg: Number | None = Field(None, description="pitch on arrival [deg]")
-    yaw_deg: Number | None = Field(
+    roll_deg: Angle | None = Field(None, description="roll on arrival [deg], 3-2-1 Euler angles")
+    pitch_deg: Angle | None = Field(None, description="pitch on arrival [deg]")
+    yaw_deg: Angle | None = Field(
         None, description="yaw on arrival [deg]; when one angle is given, the others are 0"
     )
 
@@ -502,7 +545,7 @@ class Shaping(AnyPhase):
         "squares that blend; distances, so if that leads through space to the slots (always, of a "
         "formation without), else as shape; step, at once as in the paper",
     )
-    blend: Positive = Field(4.0, description="length of the blend [s], from the phase's start")
+    blend: Time = Field(4.0, description="length of the blend [s], from the phase's start")
 
 
 class Establish(Attitude, Shaping):
@@ -526,10 +569,10 @@ class Reshape(Shaping):
 class Steering(Attitude, AnyPhase):
     """A phase that may change the attitude."""
 
-    travel: Positive | None = Field(
+    travel: Time | None = Field(
         None, description="from the start to the arrival [s]; when absent, the whole phase"
     )
-    rates_deg_s: Vector = Field(
+    rates_deg_s: Rates = Field(
         (0.0, 0.0, 0.0), description="body rates [p, q, r] on arrival [deg/s]"
     )
 
@@ -539,7 +582,7 @@ class Fly(Steering):
 
     kind: Literal["fly"] = Field(description="fly to a waypoint")
     position: Vector = Field(description="centre of mass on arrival [x, y, z] [m]")
-    velocity: Vector = Field((0.0, 0.0, 0.0), description="its velocity on arrival [m/s]")
+    velocity: Velocity = Field((0.0, 0.0, 0.0), description="its velocity on arrival [m/s]")
 
 
 class Turn(Steering):
@@ -583,8 +626,10 @@ class Header(Part):
         "squared way from the start to the first formation established; safe, most room on the way; each, least "
         "squared way anew at each change, without turning the shapes",
     )
-    gravity: NonNegative = Field(9.81, description="gravity [m/s^2], >= 0")
-    output_step: Positive = Field(0.05, description="time between samples of the result [s]")
+    gravity: Annotated[float, Strict(), _from_zero(ACCELERATION)] = Field(
+        9.81, description="gravity [m/s^2], >= 0"
+    )
+    output_step: Time = Field(0.05, description="time between samples of the result [s]")
 
 
 class Contents(Header):
