@@ -144,9 +144,7 @@ class LivePlayer extends Player {
     this.speed = story.speed;
     part("speed").value = String(story.speed);
     this.writeStory(info);
-    const name = story.paused ? "Play" : "Pause";
-    part("play").innerHTML = ICONS[name];
-    part("play").setAttribute("aria-label", name);
+    this.mark(!story.paused);
     for (const button of this.choices.children) {
       const mine = button.dataset.formation;
       button.setAttribute("aria-pressed", String(mine === story.formation));

@@ -31,9 +31,6 @@ _FAREWELL = 1.0  # that pages have to hear of the end [s]
 _FASTEST, _TURNING, _STRONGEST = 50.0, 3.0, 20.0  # that a hand may ask for [m/s, rad/s, N/kg]
 _WAITING = 64  # messages for a page that is slow; then it misses some
 
-#: Allows the page to talk with where it came from.
-_POLICY = "; connect-src 'self'"
-
 
 class Session:
     """One flight by hand, and the pages that show it.
@@ -90,7 +87,7 @@ class Session:
                 **self.story(),
             }
         script, style = (read(f"live.{kind}", "rigidfleet.live") for kind in ("js", "css"))
-        return page(info, start=script, style=style, policy=_POLICY)
+        return page(info, start=script, style=style, connect="'self'")
 
     def story(self) -> dict[str, Any]:
         """What changes now and then."""

@@ -2,10 +2,6 @@
 // The page around the picture: time line, speed, cameras, plots, keys.
 
 const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 4, 8, 16];
-const ICONS = {
-  Play: '<svg viewBox="0 0 14 14" aria-hidden="true"><path d="M2.5 1 13 7 2.5 13z"/></svg>',
-  Pause: '<svg viewBox="0 0 14 14" aria-hidden="true"><path d="M2 1h3.6v12H2zM8.4 1H12v12H8.4z"/></svg>',
-};
 const SHOWN = { edges: "edges", trails: "trails", slots: "slots", axes: "body axes", names: "names" };
 const SLOW = 1 / 24; // seconds a picture: above, the resolution is lowered
 
@@ -307,11 +303,15 @@ class Player {
 
   play(on) {
     this.playing = on && this.recording.end > this.recording.start;
-    const name = this.playing ? "Pause" : "Play";
-    part("play").innerHTML = ICONS[name];
-    part("play").setAttribute("aria-label", name);
+    this.mark(this.playing);
     this.slow = 0;
     this.stale = true;
+  }
+
+  /** Say on the button what it will do next. */
+  mark(playing) {
+    part("play").setAttribute("aria-label", playing ? "Pause" : "Play");
+    part("play").classList.toggle("playing", playing);
   }
 
   seek(time) {
