@@ -302,12 +302,19 @@ def server():
         session.stop()
 
 
-def ask(server: Server, method: str, path: str, body: str | None = None, **headers: str):
-    """Status and text of an answer; a path without / is in the session's folder."""
+def ask(server: Server, method: str, path: str, body: str | None = None, **headers: str | None):
+    """Status and text of an answer; a path without / is in the session's folder.
+
+    The origin is that of the page, if it is not given (None: none is sent).
+    """
     where = urlsplit(server.url)
+    given = {"Origin": f"http://{where.netloc}"} | headers
     with closing(http.client.HTTPConnection(where.netloc, timeout=5)) as connection:
         connection.request(
-            method, path if path.startswith("/") else where.path + path, body, headers
+            method,
+            path if path.startswith("/") else where.path + path,
+            body,
+            {name: value for name, value in given.items() if value is not None},
         )
         answer = connection.getresponse()
         return answer.status, answer.read().decode()
@@ -327,17 +334,58 @@ def test_page(server):
     [
         pytest.param("/", {}, id="no secret"),
         pytest.param("", {"Host": "evil.example"}, id="another host"),
+        pytest.param("", {"Host": "evil.example:{port}"}, id="another host at our port"),
+        pytest.param("", {"Host": "127.0.0.1.evil.example:{port}"}, id="a host like ours"),
+        pytest.param("", {"Host": "127.0.0.1"}, id="another port"),
+        pytest.param("", {"Host": ""}, id="no host"),
         pytest.param("", {"Origin": "http://evil.example"}, id="from another page"),
+        pytest.param("", {"Origin": "http://127.0.0.1:1"}, id="from another port"),
+        pytest.param("", {"Origin": "https://127.0.0.1:{port}"}, id="from another scheme"),
+        pytest.param("", {"Origin": "127.0.0.1:{port}"}, id="from no origin at all"),
+        pytest.param("", {"Origin": "http://localhost:{port}"}, id="from our other name"),
         pytest.param("", {"Origin": "null"}, id="from a file"),
     ],
 )
 def test_others_are_refused(server, path, headers):
-    """Without the secret, under another name, or from another page, nothing is to be had."""
+    """Without the secret, under another name (rebound to us), or from another page, nothing is to be had."""
+    headers = {k: v.replace("{port}", str(server.http.server_port)) for k, v in headers.items()}
+    paused = server.http.RequestHandlerClass.session.paused
     assert ask(server, "GET", path, **headers)[0] == 403
-    assert (
-        ask(server, "POST", path if path == "/" else "command", '{"pause": true}', **headers)[0]
-        == 403
-    )
+    command = path if path == "/" else "command"
+    for method in ("POST", "PUT", "OPTIONS", "HEAD"):
+        assert ask(server, method, command, '{"pause": true}', **headers)[0] == 403
+    assert server.http.RequestHandlerClass.session.paused == paused
+
+
+def test_commands_say_where_they_come_from(server):
+    """A command without an origin, which no page of today sends, is refused; a page may be asked for without."""
+    assert ask(server, "GET", "", Origin=None)[0] == 200
+    assert ask(server, "POST", "command", '{"pause": false}', Origin=None)[0] == 403
+    assert ask(server, "POST", "command", '{"pause": false}')[0] == 204
+
+
+def test_two_hosts(server):
+    """A request that names two hosts is refused, whichever of them a server in between would have taken."""
+    port = server.http.server_port
+    hosts = [f"Host: 127.0.0.1:{port}", "Host: evil.example"]
+    for order in (hosts, hosts[::-1]):
+        lines = [f"GET {urlsplit(server.url).path} HTTP/1.1", *order, "", ""]
+        with socket.create_connection(("127.0.0.1", port), timeout=5) as connection:
+            connection.sendall("\r\n".join(lines).encode())
+            assert b" 403 " in connection.recv(100)
+
+
+def test_answers_stay_here(server):
+    """No other page may frame an answer, and none is kept, sniffed, or told of in a referrer."""
+    where = urlsplit(server.url)
+    with closing(http.client.HTTPConnection(where.netloc, timeout=5)) as connection:
+        connection.request("GET", where.path)
+        said = connection.getresponse().headers
+    assert said["Content-Security-Policy"] == "frame-ancestors 'none'"
+    assert said["Cache-Control"] == "no-store"
+    assert said["Referrer-Policy"] == "no-referrer"
+    assert said["X-Content-Type-Options"] == "nosniff"
+    assert "Python" not in said["Server"]
 
 
 def test_only_this_machine(server):
@@ -384,7 +432,8 @@ def test_stops_from_the_page():
 
         def end() -> None:
             with closing(http.client.HTTPConnection(where.netloc, timeout=10)) as control:
-                control.request("POST", f"{where.path}command", '{"stop": true}')
+                origin = {"Origin": f"http://{where.netloc}"}
+                control.request("POST", f"{where.path}command", '{"stop": true}', origin)
                 control.getresponse().read()
 
         threads.extend([threading.Thread(target=listen), threading.Timer(0.5, end)])
