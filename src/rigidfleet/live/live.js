@@ -51,7 +51,6 @@ class LivePlayer extends Player {
     }
     const label = element("label", card, { class: "lever" }, "force");
     this.strength = element("input", label, { type: "range", min: "0.5", max: "8", step: "0.5", value: "3", id: "strength" });
-    element("p", card, {}, "Keys: W A S D move, R F up and down, Q E turn; space pauses");
     const controls = part("controls"), before = part("cameras");
     const add = (id, text, title, deed) => {
       const button = element("button", controls, { type: "button", id, title }, text);
@@ -136,6 +135,12 @@ class LivePlayer extends Player {
     order({ gust: [0, 1].map((s) => forward * f[s] + left * l[s]).concat(0), strength: Number(this.strength.value) });
   }
 
+  resize() {
+    super.resize();
+    part("fly").style.bottom = `${part("bar").offsetHeight + 28}px`;
+    part("fly").style.maxHeight = `calc(100vh - ${part("bar").offsetHeight + part("head").offsetHeight + 56}px)`;
+  }
+
   // -- what the flight says --
 
   hear(story) {
@@ -166,6 +171,11 @@ class LivePlayer extends Player {
 
   speeds() {
     return this.recording.info.speeds;
+  }
+
+  keys() {
+    const own = [["W A S D", "move the target: away, left, back, right"], ["R F", "raise, lower it"], ["Q E", "turn it left, right"]];
+    return [...own, ...super.keys().map(([keys, deed]) => [keys, keys === "space" ? "pause, go on" : deed])];
   }
 
   toggle() {

@@ -17,13 +17,14 @@ from rigidfleet import attitude as att
 from rigidfleet.live.pilot import TICK, Pilot
 from rigidfleet.mission import Mission
 from rigidfleet.replay.page import page, read
-from rigidfleet.replay.scene import describe, observe, weight
+from rigidfleet.replay.scene import describe, observe, sight, weight
 from rigidfleet.result import plain
 
 SPEEDS = (0.25, 0.5, 1.0, 2.0, 4.0)
 #: Full colour of an edge, as a share of a vehicle's weight.
 _TENSION = 0.2
 _EDGES = 3000  # drawn at most
+_AROUND = 20.0  # the overview holds at least so much around the start, and what stands near it [m]
 _LATE = 0.3  # so much lost time is made up for, no more [s]
 #: After the last page is closed, another may be opened for so long [s].
 _PATIENCE = 4.0
@@ -67,10 +68,8 @@ class Session:
                 {"name": name, "width": c.values[0].size if c.values.ndim > 1 else 1}
                 for name, c in columns.items()
             ]
-            near = np.concatenate(
-                [np.array(self.mission.agents.position)]
-                + [np.array([o.min, o.max]) for o in self.mission.obstacles if o.kind == "box"]
-            )
+            start = np.array(self.mission.agents.position)
+            near = sight(self.mission, start.min(axis=0) - _AROUND, start.max(axis=0) + _AROUND)
             info = describe(self.mission, self.mission.edges[self.shown], self.tension) | {
                 "columns": [*widths, {"name": "target", "width": 7}],
                 "count": 0,
@@ -79,8 +78,10 @@ class Session:
                 "beyond": True,
                 "note": "",
                 "middle": (near.min(axis=0) + near.max(axis=0)) / 2,
-                "extent": float(np.linalg.norm(np.ptp(near, axis=0))) / 2 + 1.0,
+                "extent": float(np.linalg.norm(np.ptp(near, axis=0))) / 2,
                 "path": False,
+                "camera": "follow",
+                "sight": near,
                 "azimuth": -1.1,
                 "formations": self.pilot.formations,
                 "speeds": SPEEDS,
