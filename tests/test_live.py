@@ -445,7 +445,7 @@ def test_stops_from_the_page():
         thread.join(5)
     assert heard[0].startswith("event: story")
     assert heard[0].count("event: sample") > 3
-    assert heard[0].endswith("event: end\ndata: \n\n")
+    assert heard[0].endswith('event: end\ndata: ""\n\n')
 
 
 @pytest.mark.long

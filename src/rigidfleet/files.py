@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -99,6 +100,28 @@ class Files:
             self.folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise unwritable(self.folder, error) from error
+
+    def make_new_folder(self) -> Files:
+        """Make a folder that was not there: this one, or where that is taken, one with a number.
+
+        Raises
+        ------
+        ResultError
+            It cannot be made.
+        """
+        for count in itertools.count(1):
+            folder = self.folder
+            if count > 1:
+                folder = folder.with_name(f"{folder.name}-{count}")
+            try:
+                folder.parent.mkdir(parents=True, exist_ok=True)
+                folder.mkdir()
+            except FileExistsError:
+                continue
+            except OSError as error:
+                raise unwritable(folder, error) from error
+            break
+        return Files(folder, self.name)
 
     def forget(self) -> None:
         """Remove what was made from an earlier result."""

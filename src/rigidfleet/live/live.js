@@ -8,10 +8,15 @@ const HANDS = { // keys and the lever that each pushes: forward, left, up; roll,
   q: ["turn", 2, 1], e: ["turn", 2, -1],
 };
 
-/** Ask the flight for something. */
-function order(command) {
-  return fetch("command", { method: "POST", body: JSON.stringify(command) }).catch(() => {});
+/** Ask the flight for something; say why it is not done. */
+async function order(command) {
+  const answer = await fetch("command", { method: "POST", body: JSON.stringify(command) }).catch(() => null);
+  if (!answer || answer.ok) return;
+  part("ending").textContent = await answer.text();
+  part("ending").hidden = false;
 }
+
+const FAREWELL = "The flight has ended. This page can be closed.";
 
 class LivePlayer extends Player {
   constructor(recording) {
@@ -51,6 +56,7 @@ class LivePlayer extends Player {
     }
     const label = element("label", card, { class: "lever" }, "force");
     this.strength = element("input", label, { type: "range", min: "0.5", max: "8", step: "0.5", value: "3", id: "strength" });
+    element("p", card, {}, "Keys: W A S D move, R F up and down, Q E turn; space pauses");
     const controls = part("controls"), before = part("cameras");
     const add = (id, text, title, deed) => {
       const button = element("button", controls, { type: "button", id, title }, text);
@@ -158,9 +164,9 @@ class LivePlayer extends Player {
   }
 
   /** What was flown can still be looked at. */
-  end() {
+  end(words) {
     this.over = true;
-    part("ending").textContent = "The flight has ended. This page can be closed.";
+    part("ending").textContent = [FAREWELL, words].filter(Boolean).join(" ");
     part("ending").hidden = false;
     for (const id of ["fly", "play", "speed", "now", "again", "end"]) part(id).hidden = true;
     this.resize();
@@ -269,16 +275,16 @@ function main() {
       throw error;
     }
   });
-  const over = () => {
+  const over = (words) => {
     source.close();
-    if (player) player.end();
-    else say("The flight has ended. This page can be closed.");
+    if (player) player.end(words);
+    else say(FAREWELL);
   };
-  source.addEventListener("end", over);
+  source.addEventListener("end", (event) => over(JSON.parse(event.data)));
   source.addEventListener("open", () => clearTimeout(lost));
   source.addEventListener("error", () => {
     clearTimeout(lost);
-    lost = setTimeout(over, 3000);
+    lost = setTimeout(() => over(""), 3000);
   });
 }
 

@@ -16,7 +16,7 @@ from threading import Thread
 from types import TracebackType
 from typing import Self
 
-from rigidfleet.errors import FlightError
+from rigidfleet.errors import FlightError, RigidfleetError
 from rigidfleet.live.session import Session
 
 _HOST = "127.0.0.1"
@@ -111,7 +111,7 @@ class _Handler(BaseHTTPRequestHandler):
             if not isinstance(asked, dict):
                 raise ValueError("a command is an object")
             self.session.command(asked)
-        except ValueError as error:
+        except (ValueError, RigidfleetError) as error:
             self._answer(HTTPStatus.BAD_REQUEST, str(error))
         else:
             self._answer(HTTPStatus.NO_CONTENT, "")
@@ -162,7 +162,7 @@ class _Handler(BaseHTTPRequestHandler):
                 except queue.Empty:
                     message = b": still here\n\n"
                 if message is None:
-                    self._send(b"event: end\ndata: \n\n")
+                    self._send(f"event: end\ndata: {json.dumps(self.session.farewell)}\n\n".encode())
                     return
                 if not self._send(message):
                     return

@@ -8,7 +8,7 @@ import math
 import queue
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,7 @@ from rigidfleet.live.pilot import TICK, Pilot
 from rigidfleet.mission import Mission
 from rigidfleet.replay.page import page, read
 from rigidfleet.replay.scene import describe, observe, sight, weight
-from rigidfleet.result import plain
+from rigidfleet.result import Result, plain
 
 SPEEDS = (0.25, 0.5, 1.0, 2.0, 4.0)
 #: Full colour of an edge, as a share of a vehicle's weight.
@@ -37,11 +37,13 @@ class Session:
     """One flight by hand, and the pages that show it.
 
     `run` flies in real time while anybody looks, until `stop`; other threads call `command`, `join`
-    and `leave`.
+    and `leave`. Each flight that somebody has seen is handed to ``landed`` when it ends, which returns
+    what its pages are to say of that.
     """
 
-    def __init__(self, mission: Mission) -> None:
-        self.mission = mission
+    def __init__(self, mission: Mission, landed: Callable[[Result], str] | None = None) -> None:
+        self.mission, self.landed = mission, landed
+        self.farewell = ""
         self.shown = np.arange(min(len(mission.edges), _EDGES))
         self.tension = _TENSION * weight(mission)
         self.lock = threading.RLock()
@@ -57,6 +59,11 @@ class Session:
         self.pilot = Pilot(self.mission)
         self.flights += 1
         self.result = self.pilot.step()
+
+    def land(self) -> None:
+        """Hand over what was flown."""
+        if self.pilot.ticks > 1 and self.landed is not None:
+            self.farewell = self.landed(self.pilot.result())
 
     # -- pages ------------------------------------------------------------------------------------
 
@@ -172,6 +179,7 @@ class Session:
                 case {"speed": float(speed) | int(speed)} if speed in SPEEDS:
                     self.speed = float(speed)
                 case {"again": True}:
+                    self.land()
                     self.begin()
                 case {"stop": True}:
                     self.stop()
@@ -190,14 +198,21 @@ class Session:
             self._run()
         finally:
             self.stop()
-            with self.lock:
-                for messages in self.pages:
-                    with messages.mutex:
-                        messages.queue.clear()
-                    messages.put(None)
-            end = time.monotonic() + _FAREWELL
-            while self.pages and time.monotonic() < end:
-                time.sleep(0.02)
+            try:
+                with self.lock:
+                    self.land()
+            finally:
+                self._say_goodbye()
+
+    def _say_goodbye(self) -> None:
+        with self.lock:
+            for messages in self.pages:
+                with messages.mutex:
+                    messages.queue.clear()
+                messages.put(None)
+        end = time.monotonic() + _FAREWELL
+        while self.pages and time.monotonic() < end:
+            time.sleep(0.02)
 
     def _run(self) -> None:
         told: dict[str, Any] = {}
