@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -109,19 +108,18 @@ class Files:
         ResultError
             It cannot be made.
         """
-        for count in itertools.count(1):
-            folder = self.folder
-            if count > 1:
-                folder = folder.with_name(f"{folder.name}-{count}")
-            try:
-                folder.parent.mkdir(parents=True, exist_ok=True)
-                folder.mkdir()
-            except FileExistsError:
-                continue
-            except OSError as error:
-                raise unwritable(folder, error) from error
-            break
-        return Files(folder, self.name)
+        folder, count = self.folder, 1
+        try:
+            folder.parent.mkdir(parents=True, exist_ok=True)
+            while True:
+                try:
+                    folder.mkdir()
+                    return Files(folder, self.name)
+                except FileExistsError:
+                    count += 1
+                    folder = self.folder.with_name(f"{self.folder.name}-{count}")
+        except OSError as error:
+            raise unwritable(folder, error) from error
 
     def forget(self) -> None:
         """Remove what was made from an earlier result."""

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigidfleet.errors import MissionError
-from rigidfleet.mission import Mission, Phase
+from rigidfleet.mission import Establish, Mission, Phase, Reshape
 from rigidfleet.record import Piece
 from rigidfleet.replay.pack import Floats
 from rigidfleet.result import PhaseRecord, Result
@@ -168,7 +168,9 @@ def as_flown(
     for record in flown:
         seen[record.name] += 1
         count = seen[record.name]
-        records.append(replace(record, name=f"{record.name} ({count})" if count > 1 else record.name))
+        records.append(
+            replace(record, name=f"{record.name} ({count})" if count > 1 else record.name)
+        )
     data = mission.to_dict()
     data.pop("source", None)  # it reproduces no figure any more
     data["name"] = f"{mission.name.removesuffix('-live')}-live"
@@ -193,11 +195,11 @@ def as_flown(
 
 def _written(phase: Phase, record: PhaseRecord) -> dict[str, Any]:
     """A phase as it stands in a mission, from its start to the end that it had."""
-    told = {"kind": record.kind, "name": record.name, "until": record.t_end}
+    told: dict[str, Any] = {"kind": record.kind, "name": record.name, "until": record.t_end}
     told["control"] = record.control
-    if record.kind != "hold":
-        told["formation"] = record.formation
-        told["blend"] = min(getattr(phase, "blend"), record.t_end - record.t_start)
+    if isinstance(phase, Establish | Reshape):
+        told["formation"] = phase.formation
+        told["blend"] = min(phase.blend, record.t_end - record.t_start)
     return told
 
 

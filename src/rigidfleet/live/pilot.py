@@ -181,7 +181,9 @@ class Pilot(Flight):
         kept = self.archive.pieces()
         flown = self.phases[: kept[-1].phase + 1]
         given, ending, shown = self.mission, self.ending, self.phases
-        self.mission, self.phases = as_flown(given, self.asked[: len(flown)], flown, self.archive.step)
+        self.mission, self.phases = as_flown(
+            given, self.asked[: len(flown)], flown, self.archive.step
+        )
         self.pieces = kept
         if not ending and self.busy:
             self.ending = f"ended by hand on the way to '{self.formation}'"

@@ -162,7 +162,9 @@ class _Handler(BaseHTTPRequestHandler):
                 except queue.Empty:
                     message = b": still here\n\n"
                 if message is None:
-                    self._send(f"event: end\ndata: {json.dumps(self.session.farewell)}\n\n".encode())
+                    self._send(
+                        f"event: end\ndata: {json.dumps(self.session.farewell)}\n\n".encode()
+                    )
                     return
                 if not self._send(message):
                     return
