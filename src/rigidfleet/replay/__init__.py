@@ -117,7 +117,7 @@ def _story(result: Result, time: Floats) -> dict[str, Any]:
         ],
         "ending": "" if result.complete else result.ending or "stopped",
         "camera": "overview",
-        "sight": seen,
+        "sight": seen[8:],  # besides the flight itself
         "middle": (least + most) / 2,
         "extent": max(float(np.linalg.norm(most - least)) / 2, reach, 1e-6),
         "path": far,

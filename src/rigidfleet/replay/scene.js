@@ -20,6 +20,7 @@ const rgb = (hex) => [1, 3, 5].map((k) => parseInt(hex.slice(k, k + 2), 16) / 25
 const CAMERAS = ["follow", "overview", "top"];
 const STEEP = 0.62; // elevation of the overview
 const MARGIN = 1.06; // around what the overview holds
+const PLACES = 2000; // of the flight that it looks at
 
 /** Unit vectors of a view from an azimuth and an elevation: to its right, upwards, and back to the eye. */
 function viewAxes(azimuth, elevation) {
@@ -29,8 +30,12 @@ function viewAxes(azimuth, elevation) {
 }
 
 class Camera {
-  constructor(info) {
+  constructor(recording) {
+    const { info, columns, count } = recording, n = info.radius.length;
     this.info = info;
+    this.sight = [...info.sight]; // what the overview holds
+    const every = Math.max(1, Math.ceil((count * n) / PLACES));
+    for (let k = 0; k < count * n; k += every) this.sight.push(columns.position.subarray(3 * k, 3 * k + 3));
     this.fov = (36 * Math.PI) / 180;
     this.centre = [0, 0]; // of the part of the page that nothing covers, and the part's size: shares of half the page
     this.free = [1, 1];
@@ -60,13 +65,13 @@ class Camera {
     this.pan = add(this.pan, add(scaled(right, -dx * s), scaled(up, dy * s)));
   }
 
-  /** Where to look, and from how far, to have all of `info.sight` in the free part of the page. */
+  /** Where to look, and from how far, to have the whole flight and what stands near it in the free part of the page. */
   overview(aspect) {
-    const { right, up, back } = viewAxes(this.info.azimuth, STEEP), { middle, sight } = this.info;
+    const { right, up, back } = viewAxes(this.info.azimuth, STEEP), { middle } = this.info;
     const wide = Math.tan(this.fov / 2) * aspect * this.free[0], high = Math.tan(this.fov / 2) * this.free[1];
     // Of each side of the picture, the distance from which the outermost point lies on its border.
     let [l, r, b, t] = [-Infinity, -Infinity, -Infinity, -Infinity];
-    for (const p of sight) {
+    for (const p of this.sight) {
       const away = sub(p, middle), x = dot(away, right) / wide, y = dot(away, up) / high, z = dot(away, back);
       [l, r, b, t] = [Math.max(l, z - x), Math.max(r, z + x), Math.max(b, z - y), Math.max(t, z + y)];
     }
@@ -136,7 +141,7 @@ class Scene {
     this.renderer = new Renderer(canvas);
     this.labels = new Labels(labels);
     this.show = { edges: true, trails: true, slots: true, axes: true, names: true };
-    this.camera = new Camera(info);
+    this.camera = new Camera(recording);
     this.crowd = this.n > CROWD;
     const upload = (mesh) => this.renderer.upload(mesh);
     this.meshes = {

@@ -61,20 +61,20 @@ def observe(result: Result, shown: Ints, tension: float) -> dict[str, Column]:
 
 
 def sight(mission: Mission, low: Floats, high: Floats) -> Floats:
-    """Points (P, 3) [m] that an overview has in sight: corners of a flight's box and of the obstacles near it.
+    """Points (P, 3) [m] that an overview has in sight: 8 corners of a flight's box, then those of obstacles near it.
 
     Of what reaches further from the flight than the flight is long, the part that is near; ``low`` and
     ``high`` (3,) are the flight's least and greatest coordinates [m].
     """
     reach = max(float(np.linalg.norm(high - low)), 1e-6)
-    seen = [(low, high)]
+    seen = []
     for box in mission.obstacles:
         if box.kind == "box":
             near = np.maximum(box.min, low - reach), np.minimum(box.max, high + reach)
             seen += [near] if (near[0] <= near[1]).all() else []
     if len(seen) > _BOXES:
         seen = [(np.min([a for a, _ in seen], axis=0), np.max([b for _, b in seen], axis=0))]
-    ends = np.array(seen)  # (boxes, 2, 3)
+    ends = np.array([(low, high), *seen])  # (1 + boxes, 2, 3)
     pick = np.indices((2, 2, 2)).reshape(3, 8)  # corners
     return np.stack([ends[:, pick[a], a] for a in range(3)], axis=2).reshape(-1, 3)
 
