@@ -35,7 +35,9 @@ class Camera {
     this.info = info;
     this.sight = [...info.sight]; // what the overview holds
     const every = Math.max(1, Math.ceil((count * n) / PLACES));
-    for (let k = 0; k < count * n; k += every) this.sight.push(columns.position.subarray(3 * k, 3 * k + 3));
+    for (let k = 0; k < count; k += every) {
+      for (let i = k * n; i < (k + 1) * n; i++) this.sight.push(columns.position.subarray(3 * i, 3 * i + 3));
+    }
     this.fov = (36 * Math.PI) / 180;
     this.centre = [0, 0]; // of the part of the page that nothing covers, and the part's size: shares of half the page
     this.free = [1, 1];
