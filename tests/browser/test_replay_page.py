@@ -347,7 +347,7 @@ def test_opens_on_the_overview(show, eight, size):
     page.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", device)
     try:
         page.wait(f"return document.documentElement.clientWidth === {size[0]}")
-        page.run("replay.scene.camera.shown = null; replay.scene.draw(0, 10)")
+        page.run("replay.resize(); replay.scene.camera.shown = null; replay.scene.draw(0, 10)")
         assert page.run("return replay.scene.camera.mode") == "overview"
         free = page.run(
             "const p = document.getElementById('panel'), b = document.getElementById('bar');"

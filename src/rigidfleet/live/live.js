@@ -143,6 +143,7 @@ class LivePlayer extends Player {
 
   resize() {
     super.resize();
+    if (!part("fly")) return; // not built yet
     part("fly").style.bottom = `${part("bar").offsetHeight + 28}px`;
     part("fly").style.maxHeight = `calc(100vh - ${part("bar").offsetHeight + part("head").offsetHeight + 56}px)`;
   }

@@ -218,7 +218,9 @@ class Player {
     this.plots = info.plots.map((plot) => new Plot(part("plots"), plot, recording, go));
     this.axes = { plots: new TimeAxis(part("moments"), 36), slider: new TimeAxis(part("times"), 55) };
     this.listen();
-    new ResizeObserver(() => this.resize()).observe(document.documentElement);
+    this.resize();
+    const changes = new ResizeObserver(() => this.resize());
+    for (const box of [document.documentElement, part("bar")]) changes.observe(box);
     this.follow();
     requestAnimationFrame((now) => {
       this.last = now;
