@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import ziamath
+from mkdocs.config.config_options import ExtraScriptValue
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
@@ -227,8 +228,18 @@ _SIZE, _EM = 24.0, 20.0
 # -- the finished site -------------------------------------------------------------------------------
 
 
+def on_config(config: MkDocsConfig) -> MkDocsConfig:
+    """Let pages that are opened as files search: the browser gives those no workers (see search.js)."""
+    config.extra["polyfills"] = [ExtraScriptValue("search.js")]
+    return config
+
+
 def on_post_build(config: MkDocsConfig) -> None:
-    """Fail if a page would load something from another host."""
+    """Write the index of the search as a script; fail if a page would load something from another host."""
+    found = Path(config.site_dir) / "search" / "search_index.json"
+    found.with_suffix(".js").write_text(
+        f"var __index = {found.read_text(encoding='utf-8')}", encoding="utf-8"
+    )
     loads = re.compile(
         r'<(?:script|img|iframe|source|video|audio|embed)\b[^>]*?\bsrc="((?:https?:)?//[^"]+)"'
         r'|<link\b(?![^>]*rel="canonical")[^>]*?\bhref="((?:https?:)?//[^"]+)"'

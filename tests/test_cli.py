@@ -816,7 +816,7 @@ def test_live(capsys, monkeypatch):
     """A live flight says where it is to be seen, and opens the browser unless told not to."""
     asked = []
 
-    def fly(mission, *, port, browser, ready):
+    def fly(mission, *, port, browser, ready, landed):
         asked.append((mission.name, port, browser))
         ready("http://127.0.0.1:1/secret/")
 

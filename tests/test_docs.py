@@ -301,3 +301,54 @@ def test_five_lines_of_the_readme(tmp_path, monkeypatch):
     assert len([line for line in code.splitlines() if line.strip()]) == 5
     exec(compile(code.replace("narrow-passage", "square"), "README.md", "exec"), {})
     assert list(tmp_path.rglob("*.png"))
+
+
+# -- pictures ----------------------------------------------------------------------------------------
+
+
+def test_pictures_that_look_the_same_are_kept(tmp_path, monkeypatch):
+    """A picture that differs in digits that nobody sees stays as it was to the byte; another replaces it."""
+    import io
+
+    import numpy as np
+    from PIL import Image
+
+    monkeypatch.syspath_prepend(ROOT / "docs")
+    keep_or_write = script("picture").keep_or_write
+    drawing = '<svg><path id="p{}" d="M {:.6f} 5.04 L 1e-05 -2"/>{}</svg>'
+    path = tmp_path / "drawing.svg"
+    for name, x, words, kept in (
+        ("0123456789", 36.334414, "", False),
+        ("abcdef0123", 36.334418, "", True),
+        ("0123456789", 36.434418, "", False),
+        ("0123456789", 36.434418, "<g/>", False),
+    ):
+        before = path.read_bytes() if path.exists() else b""
+        new = drawing.format(name, x, words).encode()
+        keep_or_write(path, new)
+        assert path.read_bytes() == (before if kept else new)
+    pixels = np.full((20, 30, 3), 200, dtype=np.uint8)
+    path = tmp_path / "picture.png"
+    for change, kept in ((0, False), (3, True), (60, False)):
+        pixels[4, 4] = 200 - change
+        buffer = io.BytesIO()
+        Image.fromarray(pixels).save(buffer, "png")
+        before = path.read_bytes() if path.exists() else b""
+        keep_or_write(path, buffer.getvalue())
+        assert path.read_bytes() == (before if kept else buffer.getvalue())
+
+
+@pytest.mark.long
+def test_drawings_are_those_that_are_kept(tmp_path, monkeypatch):
+    """Drawn anew on this machine, no drawing of the documents changes."""
+    import shutil
+
+    monkeypatch.syspath_prepend(ROOT / "docs")
+    picture = script("picture")
+    monkeypatch.setattr(picture, "IMAGES", tmp_path)
+    kept = {path.name: path.read_bytes() for path in (ROOT / "docs" / "images").glob("*.svg")}
+    for name in kept:
+        shutil.copy(ROOT / "docs" / "images" / name, tmp_path / name)
+    picture.drawings()
+    changed = [path.name for path in tmp_path.iterdir() if kept.get(path.name) != path.read_bytes()]
+    assert changed == []

@@ -18,13 +18,17 @@ import numpy as np
 import pytest
 
 from rigidfleet import attitude as att
-from rigidfleet.errors import FlightError
+from rigidfleet import cli
+from rigidfleet.assess import assess
+from rigidfleet.errors import FlightError, ResultError
 from rigidfleet.live import live
 from rigidfleet.live import session as sessions
 from rigidfleet.live.pilot import TICK, Gust, Pilot
 from rigidfleet.live.server import Server
 from rigidfleet.live.session import Session
-from rigidfleet.mission import Mission, load_mission
+from rigidfleet.mission import Mission, load_mission, mission_names
+from rigidfleet.replay import html_page as replay_page
+from rigidfleet.result import Result
 from rigidfleet.simulate import StoppedError
 
 TRIANGLE = load_mission("narrow-passage")  # triangle and line
@@ -194,6 +198,149 @@ def test_cannot_go_on(monkeypatch):
     assert after is before
 
 
+# -- what is kept of a flight
+
+
+def by_hand(pilot: Pilot, seconds: float, change: float = math.inf) -> list:
+    """Records of all ticks of a lively hand, which takes the other formation at a time."""
+    rng, records = np.random.default_rng(2), []
+    for k in range(round(seconds / TICK)):
+        if k % 8 == 0:
+            pilot.steer(rng.normal(size=3), 0.3 * rng.normal(size=3))
+        if k == round(change / TICK) if math.isfinite(change) else False:
+            pilot.change(next(name for name in pilot.formations if name != pilot.formation))
+        records.append(pilot.step())
+    return records
+
+
+def test_flight_is_kept(tmp_path):
+    """What flew is a result like any other: every tick as it was shown, phases as flown; judged, drawn and loaded."""
+    pilot = Pilot(TRIANGLE)
+    records = by_hand(pilot, 14.0, change=7.0)
+    result = pilot.result()
+    assert result.complete
+    assert [p.name for p in result.phases] == ["establish triangle", "change to line"]
+    assert [p.name for p in result.mission.phases] == ["establish triangle", "change to line"]
+    assert result.phases[1].t_start == pytest.approx(7.0, abs=TICK + 1e-9)
+    assert result.mission.name == "narrow-passage-live"
+    for record in records:
+        k = int(np.abs(result.time - record.time[-1]).argmin())
+        assert result.time[k] == record.time[-1]
+        for name in ("position", "velocity", "thrust", "attitude", "multiplier", "external_force"):
+            shown, kept = getattr(record, name)[-1], getattr(result, name)[k]
+            np.testing.assert_allclose(kept, shown, atol=1e-12, err_msg=name)
+    # Positions are the integral of the velocities that are kept, so that nothing is missing in between.
+    moved = np.cumsum(
+        np.diff(result.time)[:, None, None] * (result.velocity[1:] + result.velocity[:-1]) / 2,
+        axis=0,
+    )
+    np.testing.assert_allclose(result.position[1:] - result.position[0], moved, atol=5e-3)
+    result.save(tmp_path / "flight.nc")
+    loaded = Result.load(tmp_path / "flight.nc")
+    assert assess(loaded).summary == assess(result).summary
+    checks = {f.check: f for f in assess(loaded).findings}
+    assert checks["complete"].passed
+    assert checks["shape"].passed
+    assert "by hand" in loaded.mission.title
+    assert "change to line" in replay_page(loaded)
+
+
+@pytest.mark.parametrize("step", [0.01, 0.03, 0.1])
+def test_kept_at_the_output_step(step):
+    """Samples come at the mission's output step, whatever the ticks are, and phases end on one."""
+    pilot = Pilot(mission(output_step=step))
+    by_hand(pilot, 6.0, change=1.0)
+    result = pilot.result()
+    wanted = np.arange(0, round(6.0 / step) + 1) * step
+    away = np.abs(result.time[:, None] - wanted).min(axis=0)
+    assert away.max() < 1e-9
+    for p in result.phases:
+        assert np.abs(result.time - p.t_end).min() < 1e-12
+    assert result.mission.output_step == step
+
+
+def test_kept_in_bounded_memory():
+    """A long flight is kept ever coarser: within its bound, and with the worst moments and the ends of phases."""
+    pilot = Pilot(TRIANGLE)
+    pilot.archive.most = 20_000.0
+    records = by_hand(pilot, 40.0, change=20.0)
+    kept = sum(sum(x.size for x in p.record) for p in pilot.archive.pieces())
+    assert kept < 25_000  # with ends and worst moments
+    assert pilot.archive.step > 0.05
+    result = pilot.result()
+    assert len(result.time) < 250
+    assert np.diff(result.time).max() < 2 * pilot.archive.step
+    for name, sense in (("separation", np.min), ("clearance", np.min), ("thrust", np.max)):
+        kept = getattr(result, name)
+        seen = [
+            kept[0],
+            *(getattr(r, name)[-1] for r in records),
+        ]  # the start is before the first tick
+        assert sense(kept) == pytest.approx(sense([sense(x) for x in seen]), abs=1e-12), name
+    for p in result.phases:
+        assert np.abs(result.time - p.t_end).min() < 1e-12
+
+
+def test_ended_on_the_way():
+    """A flight that is ended while a formation is taken is incomplete, and says so."""
+    pilot = Pilot(TRIANGLE)
+    by_hand(pilot, 7.0, change=5.0)
+    result = pilot.result()
+    assert not result.complete
+    assert result.ending == "ended by hand on the way to 'line'"
+    assert not assess(result).passed
+
+
+def test_again_and_again():
+    """A formation taken twice is two phases of two names."""
+    pilot = Pilot(TRIANGLE)
+    for name in ("line", "triangle", "line"):
+        pilot.change(name)
+        flown(pilot, 5.0)
+    names = [p.name for p in pilot.result().mission.phases]
+    assert names == [
+        "establish triangle", "change to line", "change to triangle", "change to line (2)"
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("assignment", ["given", "shortest", "each"])
+def test_slots_are_those_flown(assignment):
+    """In the mission of a flight each agent has the slot that it flew to, however slots were assigned."""
+    pilot = Pilot(mission(assignment=assignment))
+    by_hand(pilot, 6.0)
+    result = pilot.result()
+    slots = result.mission.formation_slots("triangle")
+    assert slots is not None
+    flown_to = result.position[-1] - result.cm[-1]
+    T = att.dcm_from_quaternion(result.attitude[-1])
+    np.testing.assert_allclose(slots @ T, flown_to, atol=1e-5)
+
+
+def test_lost_by_hand():
+    """Of vehicles that the mission loses, the flight's mission loses those that were lost."""
+    lost = [{"agent": 1, "time": 2.5}, {"agent": 2, "time": 5.0}]
+    pilot = Pilot(mission(disturbances={"lost": lost}))
+    flown(pilot, 4.0)
+    result = pilot.result()
+    assert result.mission.lost_at.tolist() == [2.5, math.inf, math.inf]
+    assert result.left[-1].tolist() == [False, True, True]
+    assert np.isnan(result.distance[-1]).sum() == 2  # its edges are gone
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", [n for n in mission_names() if n != "show-1000"])
+def test_every_mission_by_hand(name):
+    """A flight by hand in any mission that ships is kept as a result that can be judged."""
+    try:
+        pilot = Pilot(load_mission(name))
+    except FlightError:
+        return
+    by_hand(pilot, 8.0)
+    result = pilot.result()
+    assert result.mission.name == f"{name}-live"
+    assert assess(result).phases[0].name == result.phases[0].name
+
+
 # -- the session
 
 
@@ -302,12 +449,19 @@ def server():
         session.stop()
 
 
-def ask(server: Server, method: str, path: str, body: str | None = None, **headers: str):
-    """Status and text of an answer; a path without / is in the session's folder."""
+def ask(server: Server, method: str, path: str, body: str | None = None, **headers: str | None):
+    """Status and text of an answer; a path without / is in the session's folder.
+
+    The origin is that of the page, if it is not given (None: none is sent).
+    """
     where = urlsplit(server.url)
+    given = {"Origin": f"http://{where.netloc}"} | headers
     with closing(http.client.HTTPConnection(where.netloc, timeout=5)) as connection:
         connection.request(
-            method, path if path.startswith("/") else where.path + path, body, headers
+            method,
+            path if path.startswith("/") else where.path + path,
+            body,
+            {name: value for name, value in given.items() if value is not None},
         )
         answer = connection.getresponse()
         return answer.status, answer.read().decode()
@@ -327,17 +481,58 @@ def test_page(server):
     [
         pytest.param("/", {}, id="no secret"),
         pytest.param("", {"Host": "evil.example"}, id="another host"),
+        pytest.param("", {"Host": "evil.example:{port}"}, id="another host at our port"),
+        pytest.param("", {"Host": "127.0.0.1.evil.example:{port}"}, id="a host like ours"),
+        pytest.param("", {"Host": "127.0.0.1"}, id="another port"),
+        pytest.param("", {"Host": ""}, id="no host"),
         pytest.param("", {"Origin": "http://evil.example"}, id="from another page"),
+        pytest.param("", {"Origin": "http://127.0.0.1:1"}, id="from another port"),
+        pytest.param("", {"Origin": "https://127.0.0.1:{port}"}, id="from another scheme"),
+        pytest.param("", {"Origin": "127.0.0.1:{port}"}, id="from no origin at all"),
+        pytest.param("", {"Origin": "http://localhost:{port}"}, id="from our other name"),
         pytest.param("", {"Origin": "null"}, id="from a file"),
     ],
 )
 def test_others_are_refused(server, path, headers):
-    """Without the secret, under another name, or from another page, nothing is to be had."""
+    """Without the secret, under another name (rebound to us), or from another page, nothing is to be had."""
+    headers = {k: v.replace("{port}", str(server.http.server_port)) for k, v in headers.items()}
+    paused = server.http.RequestHandlerClass.session.paused
     assert ask(server, "GET", path, **headers)[0] == 403
-    assert (
-        ask(server, "POST", path if path == "/" else "command", '{"pause": true}', **headers)[0]
-        == 403
-    )
+    command = path if path == "/" else "command"
+    for method in ("POST", "PUT", "OPTIONS", "HEAD"):
+        assert ask(server, method, command, '{"pause": true}', **headers)[0] == 403
+    assert server.http.RequestHandlerClass.session.paused == paused
+
+
+def test_commands_say_where_they_come_from(server):
+    """A command without an origin, which no page of today sends, is refused; a page may be asked for without."""
+    assert ask(server, "GET", "", Origin=None)[0] == 200
+    assert ask(server, "POST", "command", '{"pause": false}', Origin=None)[0] == 403
+    assert ask(server, "POST", "command", '{"pause": false}')[0] == 204
+
+
+def test_two_hosts(server):
+    """A request that names two hosts is refused, whichever of them a server in between would have taken."""
+    port = server.http.server_port
+    hosts = [f"Host: 127.0.0.1:{port}", "Host: evil.example"]
+    for order in (hosts, hosts[::-1]):
+        lines = [f"GET {urlsplit(server.url).path} HTTP/1.1", *order, "", ""]
+        with socket.create_connection(("127.0.0.1", port), timeout=5) as connection:
+            connection.sendall("\r\n".join(lines).encode())
+            assert b" 403 " in connection.recv(100)
+
+
+def test_answers_stay_here(server):
+    """No other page may frame an answer, and none is kept, sniffed, or told of in a referrer."""
+    where = urlsplit(server.url)
+    with closing(http.client.HTTPConnection(where.netloc, timeout=5)) as connection:
+        connection.request("GET", where.path)
+        said = connection.getresponse().headers
+    assert said["Content-Security-Policy"] == "frame-ancestors 'none'"
+    assert said["Cache-Control"] == "no-store"
+    assert said["Referrer-Policy"] == "no-referrer"
+    assert said["X-Content-Type-Options"] == "nosniff"
+    assert "Python" not in said["Server"]
 
 
 def test_only_this_machine(server):
@@ -384,7 +579,8 @@ def test_stops_from_the_page():
 
         def end() -> None:
             with closing(http.client.HTTPConnection(where.netloc, timeout=10)) as control:
-                control.request("POST", f"{where.path}command", '{"stop": true}')
+                origin = {"Origin": f"http://{where.netloc}"}
+                control.request("POST", f"{where.path}command", '{"stop": true}', origin)
                 control.getresponse().read()
 
         threads.extend([threading.Thread(target=listen), threading.Timer(0.5, end)])
@@ -396,7 +592,120 @@ def test_stops_from_the_page():
         thread.join(5)
     assert heard[0].startswith("event: story")
     assert heard[0].count("event: sample") > 3
-    assert heard[0].endswith("event: end\ndata: \n\n")
+    assert heard[0].endswith('event: end\ndata: ""\n\n')
+
+
+class Visitor:
+    """A page that looks on for some seconds, sends commands, and hears the end."""
+
+    def __init__(self, *commands: str, seconds: float = 1.0) -> None:
+        self.commands, self.seconds = commands, seconds
+        self.heard = ""
+
+    def __call__(self, url: str) -> bool:
+        where = urlsplit(url)
+
+        def listen() -> None:
+            with closing(http.client.HTTPConnection(where.netloc, timeout=20)) as stream:
+                stream.request("GET", f"{where.path}stream")
+                self.heard = stream.getresponse().read().decode()
+
+        def tell() -> None:
+            for command in self.commands:
+                time.sleep(self.seconds)
+                with closing(http.client.HTTPConnection(where.netloc, timeout=20)) as control:
+                    origin = {"Origin": f"http://{where.netloc}"}
+                    control.request("POST", f"{where.path}command", command, origin)
+                    assert control.getresponse().status == 204
+
+        self.threads = [threading.Thread(target=listen), threading.Thread(target=tell)]
+        for thread in self.threads:
+            thread.start()
+        return True
+
+    @property
+    def farewell(self) -> str:
+        for thread in self.threads:
+            thread.join(10)
+        return json.loads(self.heard.rpartition("event: end\ndata: ")[2])
+
+
+def test_saved_at_the_end(tmp_path, monkeypatch, capsys):
+    """`live` saves each flight in a folder of its own, keeps what is there, and tells where; it can be reported."""
+    monkeypatch.chdir(tmp_path)
+    visitor = Visitor('{"again": true}', '{"stop": true}')
+    monkeypatch.setattr("webbrowser.open", visitor)
+    assert cli.main(["live", "narrow-passage"]) == 0
+    first, second = (
+        tmp_path / "flights" / f"narrow-passage-live{number}" / "narrow-passage-live.nc"
+        for number in ("", "-2")
+    )
+    assert str(second.relative_to(tmp_path)) in visitor.farewell
+    assert str(first.relative_to(tmp_path)) in capsys.readouterr().out
+    assert first.with_name("verdict.json").exists()
+    before = first.read_bytes(), second.read_bytes()
+    monkeypatch.setattr("webbrowser.open", Visitor('{"stop": true}'))
+    assert cli.main(["live", "narrow-passage"]) == 0
+    assert (tmp_path / "flights" / "narrow-passage-live-3" / "narrow-passage-live.nc").exists()
+    assert (first.read_bytes(), second.read_bytes()) == before
+    assert cli.main(["replay", str(second)]) == 0
+    assert (second.parent / "replay.html").exists()
+
+
+@pytest.mark.long
+def test_reported(tmp_path):
+    """A flight by hand can be reported, with its own phases in the tables."""
+    pilot = Pilot(TRIANGLE)
+    by_hand(pilot, 12.0, change=5.0)
+    pilot.result().save(tmp_path / "flight.nc")
+    assert cli.main(["report", str(tmp_path / "flight.nc"), "--no-figures", "--quiet"]) == 0
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "change to line" in text
+    assert "at 12 s" in text
+
+
+def test_nothing_flown_nothing_saved(tmp_path, monkeypatch):
+    """A flight that nobody has looked at leaves no file."""
+    monkeypatch.chdir(tmp_path)
+
+    def interrupt(url: str) -> bool:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("webbrowser.open", interrupt)
+    assert cli.main(["live", "narrow-passage"]) == 0
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_nowhere_to_save(tmp_path):
+    """Where a flight could not be saved, nothing is flown: the command says so at once."""
+    (tmp_path / "file").write_text("")
+    assert cli.main(["live", "narrow-passage", "--out", str(tmp_path / "file" / "folder")]) == 2
+
+
+def test_disk_full():
+    """A flight begun anew whose forerunner cannot be saved goes on, and its page hears why."""
+    session = Session(TRIANGLE)
+    flown(session.pilot, 0.2)
+    pilot = session.pilot
+
+    def full(_: Result) -> str:
+        raise ResultError("flights: cannot be written (no space left on device)")
+
+    session.landed = full
+    with Server(session) as server:
+        status, words = ask(server, "POST", "command", '{"again": true}')
+    assert status == 400
+    assert "no space left" in words
+    assert session.pilot is pilot
+
+
+def test_python_gets_the_flight():
+    """`live` returns the flight."""
+    visitor = Visitor('{"stop": true}', seconds=0.8)
+    result = live(TRIANGLE, browser=False, ready=visitor)
+    assert result is not None
+    assert result.time[-1] > 0.3
+    assert visitor.farewell == ""
 
 
 @pytest.mark.long

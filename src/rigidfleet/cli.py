@@ -650,15 +650,19 @@ def live(
     mission: str,
     /,
     *,
+    out: Path | None = None,
     port: Annotated[int, Parameter(converter=_exact)] = 0,
     no_browser: bool = False,
 ) -> int:
-    """Fly a mission's vehicles by hand, in the browser, in real time.
+    """Fly a mission's vehicles by hand, in the browser, in real time; each flight is saved when it ends.
 
     Parameters
     ----------
     mission : str
         A shipped mission or a mission file: its vehicles, formations, gains and obstacles.
+    out : Path
+        Folder for the files: NAME-live.nc and verdict.json; flights/NAME-live if not given. Where it is taken,
+        a number is added, and nothing is replaced.
     port : int
         Port on this machine, which alone can reach it; any that is free if not given.
     no_browser : bool
@@ -670,14 +674,29 @@ def live(
     flown = load_mission(mission)
     if not is_compiled():
         screen.err().print(screen.COMPILING)
+    from rigidfleet.assess import assess
     from rigidfleet.live import live as fly
+    from rigidfleet.result import write_file
+
+    place = Files(out or Path("flights", f"{flown.name.removesuffix('-live')}-live"), "")
+    place.try_out()
+
+    def landed(result: Result) -> str:
+        files = Files(place.folder, result.mission.name).make_new_folder()
+        result.save(files.result)
+        verdict = assess(result)
+        write_file(files.verdict, (verdict.json() + "\n").encode())
+        screen.out().print(verdict)
+        screen.out().print()
+        _list(files)
+        return f"It is saved in {files.result}."
 
     def ready(url: str) -> None:
         screen.out().print(f"Flying {flown.name} at {url}", soft_wrap=True)
         screen.err().print("Ctrl-C ends the flight, and so does closing its page")
 
     with _heeding_interrupts():
-        fly(flown, port=port, browser=not no_browser, ready=ready)
+        fly(flown, port=port, browser=not no_browser, ready=ready, landed=landed)
     return PASSED
 
 

@@ -100,6 +100,27 @@ class Files:
         except OSError as error:
             raise unwritable(self.folder, error) from error
 
+    def make_new_folder(self) -> Files:
+        """Make a folder that was not there: this one, or where that is taken, one with a number.
+
+        Raises
+        ------
+        ResultError
+            It cannot be made.
+        """
+        folder, count = self.folder, 1
+        try:
+            folder.parent.mkdir(parents=True, exist_ok=True)
+            while True:
+                try:
+                    folder.mkdir()
+                    return Files(folder, self.name)
+                except FileExistsError:
+                    count += 1
+                    folder = self.folder.with_name(f"{self.folder.name}-{count}")
+        except OSError as error:
+            raise unwritable(folder, error) from error
+
     def forget(self) -> None:
         """Remove what was made from an earlier result."""
         for path in self.derived:

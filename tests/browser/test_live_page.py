@@ -131,6 +131,32 @@ def test_pause_and_speed(page, session):
     until(lambda: session.speed == 0.25)
 
 
+def test_space_after_a_click(page, session):
+    """Space pauses, whatever was clicked before: a formation's button is not pressed again."""
+    from selenium.webdriver import ActionChains
+
+    page.click("[data-formation=line]")
+    page.wait(
+        "return document.querySelector('[data-formation=line]').getAttribute('aria-pressed') === 'true'"
+    )
+    page.click("[data-formation=triangle]")
+    page.wait("return document.querySelector('[data-formation=triangle]').className === 'waiting'")
+    page.click("[data-formation=line]")
+    until(lambda: session.pilot.waiting is None)
+    session.pilot.change("triangle")
+    ActionChains(page.driver).send_keys(" ").perform()
+    until(lambda: session.paused)
+    assert session.pilot.waiting == "triangle"  # pressed again, the button would have cancelled it
+
+
+def test_keys_are_listed(page, session):
+    """The list of keys has those that fly."""
+    page.click("#keys")
+    words = page.text("#help-list")
+    assert "W A S D" in words
+    assert "Q E" in words
+
+
 def test_look_back(page, session):
     """The slider looks back while the flight goes on; Live returns to the present."""
     page.wait("return replay.recording.end > replay.recording.start + 2")
@@ -176,6 +202,23 @@ def test_end(page, session):
         "const s = document.getElementById('scrub'); s.value = s.min; s.dispatchEvent(new Event('input'))"
     )
     page.wait("return replay.scene.state.time === replay.recording.start")
+
+
+def test_end_says_where(browser):
+    """At its end the page says where the flight is saved."""
+    session = Session(
+        load_mission("narrow-passage"), lambda result: "It is saved in <b>flights</b>/x.nc."
+    )
+    thread = threading.Thread(target=session.run)
+    thread.start()
+    with Server(session) as server:
+        browser.open(server.url)
+        browser.wait("return replay.recording.end > 1")
+        browser.click("#end")
+        browser.wait("return document.getElementById('ending').textContent.includes('It is saved')")
+        assert browser.text("#ending").endswith("It is saved in <b>flights</b>/x.nc.")
+        browser.driver.get("about:blank")
+    thread.join(5)
 
 
 def test_tab_closed(session, browser, monkeypatch):

@@ -8,9 +8,12 @@ import numpy as np
 import pytest
 from chromium import started
 from sample_flights import swarm
+from test_policy import HOSTILE, flight
 
 from rigidfleet import attitude as att
+from rigidfleet.mission import Mission
 from rigidfleet.replay import replay
+from rigidfleet.report import report
 
 pytestmark = pytest.mark.long
 
@@ -53,6 +56,55 @@ def test_may_not_ask(show, eight):
     )
     assert refused == "TypeError"
     assert any("Content Security Policy" in line for line in page.heard())
+
+
+def test_may_not_make_scripts(show, eight):
+    """Nothing that a page is told becomes a script: neither mark-up made of text, nor an element, nor a handler."""
+    page = show(eight)
+    for deed in (
+        "document.body.innerHTML = '<img src=x onerror=window.hacked=1>'",
+        "const s = document.createElement('script'); s.textContent = 'window.hacked = 1'; document.body.append(s)",
+        "document.body.setAttribute('onclick', 'window.hacked = 1'); document.body.click()",
+        "const f = document.createElement('iframe'); f.srcdoc = '<script>parent.hacked = 1</script>';"
+        "document.body.append(f)",
+        "setTimeout('window.hacked = 1', 0)",
+    ):
+        page.run(f"try {{ {deed} }} catch (error) {{ window.refused = String(error) }}")
+        time.sleep(0.1)
+        assert page.run("return window.hacked === undefined"), deed
+        assert page.heard() != [] or page.run("return Boolean(window.refused)"), deed
+    assert page.run("return document.images.length") == 0
+
+
+@pytest.mark.parametrize("hostile", [*HOSTILE])
+def test_hostile_words(show, hostile):
+    """Whatever stands in a mission, the page shows it as it stands, and does nothing else."""
+    page = show(flight(lambda place: f"{place} {hostile}"), "t=6&camera=overview")
+    assert page.run("return window.hacked === undefined")
+    assert page.heard() == []
+    assert page.text("#title") == f"title {hostile}"
+    assert page.text("#phase-name") == f"second {hostile}"
+    assert page.text("#phases button") == f"first {hostile}"
+    assert page.run("return document.getElementById('ending').title") == f"ending {hostile}"
+    assert page.run("return document.querySelectorAll('img, iframe, b').length") == 0
+
+
+@pytest.mark.parametrize("several", [False, True])
+def test_hostile_report(browser, tmp_path, several):
+    """A report of hostile words draws all its pictures and colours, and its policy refuses none of its own parts."""
+    words = " ".join(HOSTILE)
+    result = flight(lambda place: f"{place} {words}")
+    report([result] * 2 if several else result, tmp_path / "report.html")
+    browser.open((tmp_path / "report.html").as_uri(), ready="document.readyState === 'complete'")
+    assert browser.run("return window.hacked === undefined")
+    assert browser.heard() == []
+    assert browser.run("return [...document.images].every((i) => i.naturalWidth > 0)")
+    assert words in browser.text("main")
+    colour = "return getComputedStyle(document.querySelector('.swatch rect')).fill"
+    assert browser.run(colour) == "rgb(0, 114, 178)"
+    assert (
+        browser.run("return document.querySelector('.swatch').getBoundingClientRect().width") == 11
+    )
 
 
 def test_words(show, eight):
@@ -127,6 +179,56 @@ def test_pause_and_play(show, eight):
     page.wait(f"return replay.time > {t}")
     page.press(" ")
     assert page.run("return replay.playing") is False
+
+
+@pytest.mark.parametrize("clicked", ["#more", "[data-mode=top]", "[data-show=edges]", "#play"])
+def test_space_after_a_click(show, eight, clicked):
+    """Space plays and pauses, whatever was clicked before: what was clicked is not pressed again."""
+    from selenium.webdriver import ActionChains
+
+    page = show(eight)
+    look = (
+        "return [getComputedStyle(document.getElementById('panel')).display, replay.scene.camera.mode,"
+        "replay.scene.show.edges]"
+    )
+    page.click(clicked)
+    before, playing = page.run(look), page.run("return replay.playing")
+    ActionChains(page.driver).send_keys(" ").perform()
+    assert page.run("return replay.playing") is not playing
+    assert page.run(look) == before
+
+
+def test_keys_reach_everything(show, eight):
+    """What is reached by the Tab key is pressed by space, as everywhere."""
+    from selenium.webdriver import ActionChains
+    from selenium.webdriver.common.keys import Keys
+
+    page = show(eight)
+    page.run("document.getElementById('speed').focus()")
+    for _ in range(9):
+        if page.run("return document.activeElement.dataset.mode") == "top":
+            break
+        ActionChains(page.driver).send_keys(Keys.TAB).perform()
+    assert page.run("return document.activeElement.dataset.mode") == "top"
+    ActionChains(page.driver).send_keys(" ").perform()
+    assert page.run("return [replay.scene.camera.mode, replay.playing]") == ["top", False]
+
+
+def test_keys_are_listed(show, eight):
+    """A button and the ? key list the keys; each that is listed does something, and Escape closes the list."""
+    from selenium.webdriver import ActionChains
+    from selenium.webdriver.common.keys import Keys
+
+    page = show(eight)
+    page.click("#keys")
+    assert page.run("return document.getElementById('help').open")
+    words = page.text("#help-list")
+    for key in ("space", "← →", "[ ]", "Home End", "− +", "1 2 3", "p", "?"):
+        assert key in words
+    ActionChains(page.driver).send_keys(Keys.ESCAPE).perform()
+    assert not page.run("return document.getElementById('help').open")
+    ActionChains(page.driver).send_keys("?").perform()
+    assert page.run("return document.getElementById('help').open")
 
 
 def test_ends(show, eight):
@@ -220,7 +322,7 @@ def test_address(show, eight):
 
 def test_follows(show, eight):
     """The camera keeps the centre of mass in the middle of what the panels leave free, and all in sight."""
-    page = show(eight)
+    page = show(eight, "t=0&camera=follow")
     for t in (0.0, 30.0, 60.0, 90.0):
         page.run(
             "replay.seek(arguments[0]); replay.scene.camera.shown = null; replay.scene.draw(arguments[0], 10)",
@@ -235,6 +337,113 @@ def test_follows(show, eight):
             x, y, _ = page.run("return replay.scene.renderer.project(arguments[0])", r.tolist())
             assert 0 < x < free[0]
             assert 0 < y < free[1]
+
+
+@pytest.mark.parametrize("size", [(1400, 900), (400, 800)])
+def test_opens_on_the_overview(show, eight, size):
+    """A flight opens on all of itself with the obstacles near it, on a wide screen and on a small one."""
+    page = show(eight, "")
+    device = {"width": size[0], "height": size[1], "deviceScaleFactor": 1, "mobile": False}
+    page.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", device)
+    try:
+        page.wait(f"return document.documentElement.clientWidth === {size[0]}")
+        page.run("replay.resize(); replay.scene.camera.shown = null; replay.scene.draw(0, 10)")
+        assert page.run("return replay.scene.camera.mode") == "overview"
+        free = page.run(
+            "const p = document.getElementById('panel'), b = document.getElementById('bar');"
+            "return [p.offsetWidth ? p.offsetLeft : innerWidth, b.offsetTop]"
+        )
+        hall = [[x, y, z] for x in (-8.0, 8.0) for y in (45.0, 60.0) for z in (0.0, 9.0)]
+        flown = eight.position[::100].reshape(-1, 3).tolist()
+        places = page.run(
+            "return arguments[0].map((p) => replay.scene.renderer.project(p))", hall + flown
+        )
+        x, y, _ = np.array(places).T
+        assert 0 < x.min() < x.max() < free[0]
+        assert 0 < y.min() < y.max() < free[1]
+        # And it fills what is free, in one direction at least.
+        assert max((x.max() - x.min()) / free[0], (y.max() - y.min()) / free[1]) > 0.8
+    finally:
+        page.driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+
+
+def test_north_is_up(show, eight):
+    """From above, north is up and east to the right, whatever the flight's direction; the compass says so."""
+    page = show(eight, "t=30&camera=top")
+    cm, north, east = page.run(
+        "const p = Array.from(replay.scene.state.cm), see = (v) => replay.scene.renderer.project(add(p, v));"
+        "return [see([0, 0, 0]), see([0, 3, 0]), see([3, 0, 0])]"
+    )
+    assert north[0] == pytest.approx(cm[0], abs=0.5)
+    assert north[1] < cm[1] - 20
+    assert east[1] == pytest.approx(cm[1], abs=0.5)
+    assert east[0] > cm[0] + 20
+    turned = "return document.getElementById('compass').style.transform"
+    assert page.run(turned).startswith("rotate(0") or "e-17" in page.run(turned)
+
+
+def test_numbers_beside_the_curves(show, eight):
+    """No number stands on a curve; below, round times stand where their moments are."""
+    page = show(eight)
+    overlaps = page.run(
+        "const box = (e) => e.getBoundingClientRect();"
+        "return [...document.querySelectorAll('.plot')].flatMap((p) => [...p.querySelectorAll('.scale span')]"
+        ".filter((s) => s.textContent && box(s).right > box(p.querySelector('canvas')).left))"
+        ".length"
+    )
+    assert overlaps == 0
+    assert page.run(
+        "return [...document.querySelectorAll('.plot .scale span')].every((s) => s.textContent)"
+    )
+    ticks = page.run(
+        "const area = document.querySelector('.plot .area').getBoundingClientRect();"
+        "return [...document.querySelectorAll('#moments span')].map((s) => [s.textContent,"
+        "(document.getElementById('moments').getBoundingClientRect().left + parseFloat(s.style.left) / 100 *"
+        "document.getElementById('moments').clientWidth - area.left) / area.width])"
+    )
+    assert [words for words, _ in ticks] == ["0", "20", "40", "60", "80 s"]
+    np.testing.assert_allclose([x for _, x in ticks], np.arange(0, 90, 20) / 90, atol=0.01)
+    # The slider's own axis: at a time that is written, its knob stands over the word.
+    assert "50" in page.text("#times")
+
+
+def test_limits_of_each(show):
+    """Where limits differ, each vehicle's is drawn in its colour, and passing its own one is an alarm."""
+    result = swarm(3, 10.0)
+    data = result.mission.to_dict()
+    data["agents"]["thrust_limit"] = [11.0, 12.5, 14.0]
+    result = swarm(3, 10.0, mission_text=Mission.from_dict(data).text)
+    page = show(result)
+    rows = page.run(
+        "const plot = replay.plots[0]; return plot.limits.map(({ value, colour }) => [value, colour])"
+    )
+    assert [value for value, _ in rows] == [11.0, 12.5, 14.0]
+    assert len({colour for _, colour in rows}) == 3
+    # Dashes of each colour are on the canvas.
+    pixels = page.run(
+        "const c = document.querySelector('.plot canvas'), seen = {};"
+        "const d = c.getContext('2d').getImageData(0, 0, c.width, c.height).data;"
+        "for (let k = 0; k < d.length; k += 4) {"
+        "  const key = [d[k], d[k + 1], d[k + 2]].join();"
+        "  seen[key] = (seen[key] ?? 0) + 1;"
+        "}"
+        "return seen"
+    )
+    for _, colour in rows:
+        near = [int(colour[k : k + 2], 16) for k in (1, 3, 5)]
+        found = sum(
+            count
+            for key, count in pixels.items()
+            if np.abs(np.array(key.split(","), int) - near).max() < 60
+        )
+        assert found > 40, colour
+    alarm = (
+        "const plot = replay.plots[0]; plot.point(0, { [plot.plot.column]: arguments[0] });"
+        "return plot.value.style.color"
+    )
+    assert page.run(alarm, [10.9, 12.4, 13.9]) == ""
+    assert page.run(alarm, [11.1, 9.0, 9.0]) != ""
+    assert page.run(alarm, [9.0, 9.0, 14.1]) != ""
 
 
 def test_cameras(show, eight):
@@ -278,7 +487,7 @@ def test_turn_and_zoom(show, eight):
         40, 0
     ).release().key_up("\ue008").perform()
     assert page.run(look)[3:] != [0, 0, 0]
-    page.click("[data-mode=follow]")
+    page.click("[data-mode=overview]")
     assert page.run(look) == before
 
 
@@ -397,7 +606,7 @@ def test_unusual(show, flight):
     """One vehicle, a tenth of a second, a flight that stopped, hundreds: each is shown without an error."""
     result = swarm(flight.pop("n"), flight.pop("seconds", 10.0), **flight)
     page = show(result, "")
-    page.wait("return replay.pictures > 2")
+    page.wait("return replay.pictures > 0 && replay.time > 0")
     assert page.heard() == []
     if not result.complete:
         assert page.text("#ending") == "Incomplete: the flight <b>stopped</b>"

@@ -8,10 +8,15 @@ const HANDS = { // keys and the lever that each pushes: forward, left, up; roll,
   q: ["turn", 2, 1], e: ["turn", 2, -1],
 };
 
-/** Ask the flight for something. */
-function order(command) {
-  return fetch("command", { method: "POST", body: JSON.stringify(command) }).catch(() => {});
+/** Ask the flight for something; say why it is not done. */
+async function order(command) {
+  const answer = await fetch("command", { method: "POST", body: JSON.stringify(command) }).catch(() => null);
+  if (!answer || answer.ok) return;
+  part("ending").textContent = await answer.text();
+  part("ending").hidden = false;
 }
+
+const FAREWELL = "The flight has ended. This page can be closed.";
 
 class LivePlayer extends Player {
   constructor(recording) {
@@ -136,6 +141,13 @@ class LivePlayer extends Player {
     order({ gust: [0, 1].map((s) => forward * f[s] + left * l[s]).concat(0), strength: Number(this.strength.value) });
   }
 
+  resize() {
+    super.resize();
+    if (!part("fly")) return; // not built yet
+    part("fly").style.bottom = `${part("bar").offsetHeight + 28}px`;
+    part("fly").style.maxHeight = `calc(100vh - ${part("bar").offsetHeight + part("head").offsetHeight + 56}px)`;
+  }
+
   // -- what the flight says --
 
   hear(story) {
@@ -144,9 +156,7 @@ class LivePlayer extends Player {
     this.speed = story.speed;
     part("speed").value = String(story.speed);
     this.writeStory(info);
-    const name = story.paused ? "Play" : "Pause";
-    part("play").innerHTML = ICONS[name];
-    part("play").setAttribute("aria-label", name);
+    this.mark(!story.paused);
     for (const button of this.choices.children) {
       const mine = button.dataset.formation;
       button.setAttribute("aria-pressed", String(mine === story.formation));
@@ -155,9 +165,9 @@ class LivePlayer extends Player {
   }
 
   /** What was flown can still be looked at. */
-  end() {
+  end(words) {
     this.over = true;
-    part("ending").textContent = "The flight has ended. This page can be closed.";
+    part("ending").textContent = [FAREWELL, words].filter(Boolean).join(" ");
     part("ending").hidden = false;
     for (const id of ["fly", "play", "speed", "now", "again", "end"]) part(id).hidden = true;
     this.resize();
@@ -168,6 +178,11 @@ class LivePlayer extends Player {
 
   speeds() {
     return this.recording.info.speeds;
+  }
+
+  keys() {
+    const own = [["W A S D", "move the target: away, left, back, right"], ["R F", "raise, lower it"], ["Q E", "turn it left, right"]];
+    return [...own, ...super.keys().map(([keys, deed]) => [keys, keys === "space" ? "pause, go on" : deed])];
   }
 
   toggle() {
@@ -261,16 +276,16 @@ function main() {
       throw error;
     }
   });
-  const over = () => {
+  const over = (words) => {
     source.close();
-    if (player) player.end();
-    else say("The flight has ended. This page can be closed.");
+    if (player) player.end(words);
+    else say(FAREWELL);
   };
-  source.addEventListener("end", over);
+  source.addEventListener("end", (event) => over(JSON.parse(event.data)));
   source.addEventListener("open", () => clearTimeout(lost));
   source.addEventListener("error", () => {
     clearTimeout(lost);
-    lost = setTimeout(over, 3000);
+    lost = setTimeout(() => over(""), 3000);
   });
 }
 

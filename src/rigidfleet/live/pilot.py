@@ -7,7 +7,7 @@ laws that fly it are the mission's own.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from rigidfleet import lqr
 from rigidfleet.errors import FlightError
 from rigidfleet.kernel import native
 from rigidfleet.kernel import program as k
+from rigidfleet.live.archive import Archive, as_flown, rows
 from rigidfleet.mission import Establish, Hold, Mission, Phase, Reshape
 from rigidfleet.record import assemble
 from rigidfleet.replay.pack import Floats
@@ -32,6 +33,7 @@ _FOLLOW = 1.3
 #: ... whose acceleration grows within this time [s].
 _RISE = 0.15
 _ACCELERATION, _TURN = 3.0, 1.5  # of the reference at most [m/s^2, rad/s^2]
+_FINEST = 1e-3  # between samples that are kept [s]
 #: A hand that is not heard of for so long has let go [s of mission time].
 _GRIP = 0.6
 
@@ -101,6 +103,9 @@ class Pilot(Flight):
         self.waiting: str | None = None
         self.by_body = mission.architecture == "body"
         self.fastest = 0.7 * mission.limits.speed if mission.limits.speed else math.inf
+        self.archive = Archive(max(mission.output_step, _FINEST))
+        self.asked: list[Phase] = []  # what each phase was begun as
+        self.ticks = 0
         self.leg = self._take(self._first(), establish=True)
         self.pose = self._reference()
         self.a, self.alpha = np.zeros(3), np.zeros(3)
@@ -147,6 +152,7 @@ class Pilot(Flight):
         A flight that cannot go on sets ``ending``, and stays where it is.
         """
         self.pieces.clear()
+        self.ticks += 1
         try:
             if not self.busy:
                 if self.waiting is not None:
@@ -155,15 +161,41 @@ class Pilot(Flight):
                 elif self.leg.phase.control == "open":
                     self.leg = self._hold()
             self._follow(TICK)
-            self._integrate(self.leg, self.leg.plan.program, self.t + TICK)
+            self._integrate(self.leg, self.leg.plan.program, self.ticks * TICK)
         except StoppedError as stop:
             self.ending = str(stop)
         self.phases[-1].t_end = self.t
         if self.pieces or self.last is None:
-            result = assemble(self.mission, self.phases, self.pieces, ending="", statistics={})
+            end = [rows(self.pieces[-1], [-1])] if self.pieces else []
+            phases = [replace(p, extremes={}) for p in self.phases]  # of one moment alone
+            result = assemble(self.mission, phases, end, ending="", statistics={})
             result.mission = self.mission  # which need not be parsed again
             self.last = result
+            self.archive.add(self.pieces, result)
         return self.last
+
+    def result(self) -> Result:
+        """The record of the whole flight, at the mission's output step or, of a long one, coarser.
+
+        Its mission has the phases as they were flown.
+        """
+        self._watch(self.leg, last=True)
+        self.phases[-1].extremes = self.extremes.so_far()
+        kept = self.archive.pieces()
+        flown = self.phases[: kept[-1].phase + 1]
+        given, ending, shown = self.mission, self.ending, self.phases
+        self.mission, self.phases = as_flown(
+            given, self.asked[: len(flown)], flown, self.archive.step
+        )
+        self.pieces = kept
+        if not ending and self.busy:
+            self.ending = f"ended by hand on the way to '{self.formation}'"
+        try:
+            result = super().result()
+        finally:
+            self.mission, self.phases, self.ending, self.pieces = given, shown, ending, []
+        result.statistics["simulated_s"] = float(result.time[-1])
+        return result
 
     # -- legs -------------------------------------------------------------------------------------
 
@@ -198,9 +230,13 @@ class Pilot(Flight):
 
     def _fly(self, phase: Phase) -> Leg:
         if self.phases:
+            self._watch(self.leg, last=True)
+            self.phases[-1].extremes = self.extremes.phase()
+            self._count(self.leg)
             self._arrive(self.leg)
         leg = self._begin(len(self.phases), phase)
         native.closed_loop(leg.t, leg.state.y, leg.state.K[0], leg.plan.program, leg.workspace)
+        self.asked.append(phase)
         control, name = phase.control, leg.plan.formation
         self.phases.append(PhaseRecord(phase.name, phase.kind, control, name, leg.t, leg.t))
         return leg
@@ -209,7 +245,12 @@ class Pilot(Flight):
         """A hand sees for itself whether a formation has flipped."""
 
     def _samples(self, leg: Leg, t_end: float) -> Floats:
-        return np.array([t_end])
+        """Multiples of the archive's step in (t, t_end], the end, and the start of a phase."""
+        step = self.archive.step
+        low, high = math.floor(leg.t / step + 1e-9) + 1, math.floor(t_end / step + 1e-9) + 1
+        grid = np.arange(low, high) * step
+        start = [] if self.archive.begun(leg.index) else [leg.t and np.nextafter(leg.t, math.inf)]
+        return np.concatenate([start, grid[grid < t_end - 1e-9], [t_end]])
 
     # -- the reference ----------------------------------------------------------------------------
 
@@ -244,6 +285,7 @@ class Pilot(Flight):
         phi, omega, alpha = _pulled(away, pose.omega, self.alpha, h, _TURN)
         if leg.phase.control != "open":
             leg.plan.program = self._program(leg, h, (r, v, a), (phi, omega, alpha))
+            self.count[0] += leg.state.count[0]
             leg.state.count[0] = 0  # another law: its derivative is not known yet
             T = att.dcm_from_rotation_vector(phi) @ pose.T
             self.pose = Pose(pose.r + r, v, T, omega)

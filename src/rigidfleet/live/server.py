@@ -1,7 +1,8 @@
 """A session on this machine's own address: a page, a stream of events, commands.
 
-Only this machine reaches it. Its address holds a secret, and requests that name another host are
-refused, so that other pages in the same browser can neither see nor fly it.
+Only this machine reaches it. Its address holds a secret, and requests that name another host or come
+from another origin are refused, so that other pages in the same browser can neither see nor fly it,
+under whatever name they reach this machine.
 """
 
 from __future__ import annotations
@@ -15,12 +16,21 @@ from threading import Thread
 from types import TracebackType
 from typing import Self
 
-from rigidfleet.errors import FlightError
+from rigidfleet.errors import FlightError, RigidfleetError
 from rigidfleet.live.session import Session
 
 _HOST = "127.0.0.1"
 _LARGEST = 10_000  # bytes of a command
 _SILENCE = 1.0  # after which a word is sent to learn whether anybody listens [s]
+#: With every answer. The page has a policy of its own; a frame around it only a header can forbid.
+_HEADERS = {
+    "Cache-Control": "no-store",
+    "Content-Security-Policy": "frame-ancestors 'none'",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",  # the address holds the secret
+    "X-Content-Type-Options": "nosniff",
+}
 
 
 class Server:
@@ -68,11 +78,19 @@ class _Handler(BaseHTTPRequestHandler):
     session: Session
     base: str
     port: int
+    server_version, sys_version = "rigidfleet", ""
+
+    def parse_request(self) -> bool:
+        """Read a request; of whatever method, it is answered only if our page asks."""
+        if not super().parse_request():
+            return False
+        if self._ours():
+            return True
+        self._answer(HTTPStatus.FORBIDDEN, "open the address that the program has printed")
+        return False
 
     def do_GET(self) -> None:
         """Send the page, or its stream."""
-        if not self._ours():
-            return
         if self.path == self.base:
             self._answer(HTTPStatus.OK, self.session.html(), "text/html; charset=utf-8")
         elif self.path == f"{self.base}stream":
@@ -82,8 +100,6 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_POST(self) -> None:
         """Do what a page asks."""
-        if not self._ours():
-            return
         if self.path != f"{self.base}command":
             self._answer(HTTPStatus.NOT_FOUND, "there is nothing here")
             return
@@ -95,7 +111,7 @@ class _Handler(BaseHTTPRequestHandler):
             if not isinstance(asked, dict):
                 raise ValueError("a command is an object")
             self.session.command(asked)
-        except ValueError as error:
+        except (ValueError, RigidfleetError) as error:
             self._answer(HTTPStatus.BAD_REQUEST, str(error))
         else:
             self._answer(HTTPStatus.NO_CONTENT, "")
@@ -104,23 +120,26 @@ class _Handler(BaseHTTPRequestHandler):
         """Say nothing: the terminal is the user's."""
 
     def _ours(self) -> bool:
-        """Is it our page that asks? Everything else is refused."""
+        """Is it our page that asks, at our own address? A command says where it comes from."""
+        asked, origins = self.headers.get_all("Host", []), self.headers.get_all("Origin", [])
         hosts = {f"{name}:{self.port}" for name in (_HOST, "localhost")}
-        origin = self.headers.get("Origin")
-        ours = self.headers.get("Host") in hosts and self.path.startswith(self.base)
-        if ours and (origin is None or origin.removeprefix("http://") in hosts):
-            return True
-        self._answer(HTTPStatus.FORBIDDEN, "open the address that the program has printed")
-        return False
+        if len(asked) != 1 or asked[0] not in hosts or not self.path.startswith(self.base):
+            return False
+        return origins == [f"http://{asked[0]}"] or (not origins and self.command == "GET")
 
     def _answer(self, status: HTTPStatus, text: str, kind: str = "text/plain") -> None:
         data = text.encode()
         self.send_response(status)
         self.send_header("Content-Type", kind)
         self.send_header("Content-Length", str(len(data)))
-        self.send_header("Cache-Control", "no-store")
         self.end_headers()
         self._send(data)
+
+    def end_headers(self) -> None:
+        """Send the headers: nobody keeps what we say, frames it, or takes it for something else."""
+        for name, value in _HEADERS.items():
+            self.send_header(name, value)
+        super().end_headers()
 
     def _send(self, data: bytes) -> bool:
         """Send; False if nobody listens any more."""
@@ -134,7 +153,6 @@ class _Handler(BaseHTTPRequestHandler):
     def _stream(self) -> None:
         self.send_response(HTTPStatus.OK)
         self.send_header("Content-Type", "text/event-stream")
-        self.send_header("Cache-Control", "no-store")
         self.end_headers()
         messages = self.session.join()
         try:
@@ -144,7 +162,9 @@ class _Handler(BaseHTTPRequestHandler):
                 except queue.Empty:
                     message = b": still here\n\n"
                 if message is None:
-                    self._send(b"event: end\ndata: \n\n")
+                    self._send(
+                        f"event: end\ndata: {json.dumps(self.session.farewell)}\n\n".encode()
+                    )
                     return
                 if not self._send(message):
                     return

@@ -8,7 +8,7 @@ import math
 import queue
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -17,13 +17,14 @@ from rigidfleet import attitude as att
 from rigidfleet.live.pilot import TICK, Pilot
 from rigidfleet.mission import Mission
 from rigidfleet.replay.page import page, read
-from rigidfleet.replay.scene import describe, observe, weight
-from rigidfleet.result import plain
+from rigidfleet.replay.scene import describe, observe, sight, weight
+from rigidfleet.result import Result, plain
 
 SPEEDS = (0.25, 0.5, 1.0, 2.0, 4.0)
 #: Full colour of an edge, as a share of a vehicle's weight.
 _TENSION = 0.2
 _EDGES = 3000  # drawn at most
+_AROUND = 20.0  # the overview holds at least so much around the start, and what stands near it [m]
 _LATE = 0.3  # so much lost time is made up for, no more [s]
 #: After the last page is closed, another may be opened for so long [s].
 _PATIENCE = 4.0
@@ -31,19 +32,18 @@ _FAREWELL = 1.0  # that pages have to hear of the end [s]
 _FASTEST, _TURNING, _STRONGEST = 50.0, 3.0, 20.0  # that a hand may ask for [m/s, rad/s, N/kg]
 _WAITING = 64  # messages for a page that is slow; then it misses some
 
-#: Allows the page to talk with where it came from.
-_POLICY = "; connect-src 'self'"
-
 
 class Session:
     """One flight by hand, and the pages that show it.
 
     `run` flies in real time while anybody looks, until `stop`; other threads call `command`, `join`
-    and `leave`.
+    and `leave`. Each flight that somebody has seen is handed to ``landed`` when it ends, which returns
+    what its pages are to say of that.
     """
 
-    def __init__(self, mission: Mission) -> None:
-        self.mission = mission
+    def __init__(self, mission: Mission, landed: Callable[[Result], str] | None = None) -> None:
+        self.mission, self.landed = mission, landed
+        self.farewell = ""
         self.shown = np.arange(min(len(mission.edges), _EDGES))
         self.tension = _TENSION * weight(mission)
         self.lock = threading.RLock()
@@ -60,6 +60,11 @@ class Session:
         self.flights += 1
         self.result = self.pilot.step()
 
+    def land(self) -> None:
+        """Hand over what was flown."""
+        if self.pilot.ticks > 1 and self.landed is not None:
+            self.farewell = self.landed(self.pilot.result())
+
     # -- pages ------------------------------------------------------------------------------------
 
     def html(self) -> str:
@@ -70,10 +75,8 @@ class Session:
                 {"name": name, "width": c.values[0].size if c.values.ndim > 1 else 1}
                 for name, c in columns.items()
             ]
-            near = np.concatenate(
-                [np.array(self.mission.agents.position)]
-                + [np.array([o.min, o.max]) for o in self.mission.obstacles if o.kind == "box"]
-            )
+            start = np.array(self.mission.agents.position)
+            near = sight(self.mission, start.min(axis=0) - _AROUND, start.max(axis=0) + _AROUND)
             info = describe(self.mission, self.mission.edges[self.shown], self.tension) | {
                 "columns": [*widths, {"name": "target", "width": 7}],
                 "count": 0,
@@ -82,15 +85,17 @@ class Session:
                 "beyond": True,
                 "note": "",
                 "middle": (near.min(axis=0) + near.max(axis=0)) / 2,
-                "extent": float(np.linalg.norm(np.ptp(near, axis=0))) / 2 + 1.0,
+                "extent": float(np.linalg.norm(np.ptp(near, axis=0))) / 2,
                 "path": False,
+                "camera": "follow",
+                "sight": near,
                 "azimuth": -1.1,
                 "formations": self.pilot.formations,
                 "speeds": SPEEDS,
                 **self.story(),
             }
         script, style = (read(f"live.{kind}", "rigidfleet.live") for kind in ("js", "css"))
-        return page(info, start=script, style=style, policy=_POLICY)
+        return page(info, start=script, style=style, connect="'self'")
 
     def story(self) -> dict[str, Any]:
         """What changes now and then."""
@@ -174,6 +179,7 @@ class Session:
                 case {"speed": float(speed) | int(speed)} if speed in SPEEDS:
                     self.speed = float(speed)
                 case {"again": True}:
+                    self.land()
                     self.begin()
                 case {"stop": True}:
                     self.stop()
@@ -192,14 +198,21 @@ class Session:
             self._run()
         finally:
             self.stop()
-            with self.lock:
-                for messages in self.pages:
-                    with messages.mutex:
-                        messages.queue.clear()
-                    messages.put(None)
-            end = time.monotonic() + _FAREWELL
-            while self.pages and time.monotonic() < end:
-                time.sleep(0.02)
+            try:
+                with self.lock:
+                    self.land()
+            finally:
+                self._say_goodbye()
+
+    def _say_goodbye(self) -> None:
+        with self.lock:
+            for messages in self.pages:
+                with messages.mutex:
+                    messages.queue.clear()
+                messages.put(None)
+        end = time.monotonic() + _FAREWELL
+        while self.pages and time.monotonic() < end:
+            time.sleep(0.02)
 
     def _run(self) -> None:
         told: dict[str, Any] = {}

@@ -14,7 +14,7 @@ import numpy as np
 
 from rigidfleet.replay.pack import Column, Floats, pack
 from rigidfleet.replay.page import page, read
-from rigidfleet.replay.scene import describe, observe, size, weight
+from rigidfleet.replay.scene import describe, observe, sight, size, weight
 from rigidfleet.result import write_file
 
 if TYPE_CHECKING:
@@ -99,6 +99,8 @@ def _story(result: Result, time: Floats) -> dict[str, Any]:
     """What the page says of a flight that is over."""
     low, high = result.position.min(axis=(0, 1)), result.position.max(axis=(0, 1))
     extent, reach = float(np.linalg.norm(high - low)) / 2, size(result)
+    seen = sight(result.mission, low, high)
+    least, most = seen.min(axis=0), seen.max(axis=0)
     way = (result.cm[-1] - result.cm[0])[:2]
     far = float(np.linalg.norm(way)) > 2 * reach
     story = {
@@ -114,8 +116,10 @@ def _story(result: Result, time: Floats) -> dict[str, Any]:
             for phase in result.phases
         ],
         "ending": "" if result.complete else result.ending or "stopped",
-        "middle": (low + high) / 2,
-        "extent": max(extent, reach, 1e-6),
+        "camera": "overview",
+        "sight": seen[8:],  # besides the flight itself
+        "middle": (least + most) / 2,
+        "extent": max(float(np.linalg.norm(most - least)) / 2, reach, 1e-6),
         "path": far,
         # Seen from behind and from the side, where there is a way.
         "azimuth": math.atan2(-way[1], -way[0]) + 0.6 if far else -1.1,

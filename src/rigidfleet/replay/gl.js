@@ -22,10 +22,8 @@ function unit(a) {
 }
 
 /** Clip coordinates from world coordinates, column by column: a camera at `eye` that sees `target` at `centre`. */
-function viewMatrix({ eye, target, fov, near, far, centre }, aspect) {
-  const back = unit(sub(eye, target));
-  const right = unit(cross(Math.abs(back[2]) > 0.9999 ? [0, 1, 0] : [0, 0, 1], back));
-  const up = cross(back, right);
+function viewMatrix({ eye, target, right, fov, near, far, centre }, aspect) {
+  const back = unit(sub(eye, target)), up = cross(back, right);
   const f = 1 / Math.tan(fov / 2), A = (far + near) / (near - far), B = (2 * far * near) / (near - far);
   const row = (v, s) => [v[0] * s, v[1] * s, v[2] * s, -dot(v, eye) * s];
   const x = row(right, f / aspect), y = row(up, f), z = row(back, 1);
@@ -431,7 +429,7 @@ class Renderer {
     return { array, copies, corners: mesh.corners.length };
   }
 
-  /** Begin a picture seen by a camera {eye, target, centre (clip coordinates), fov, near, far, fog}. */
+  /** Begin a picture seen by a camera {eye, target, right, centre (clip coordinates), fov, near, far, fog}. */
   begin(camera) {
     const { gl, canvas } = this, ratio = this.scale * Math.min(window.devicePixelRatio || 1, 2);
     const width = Math.max(1, Math.round(canvas.clientWidth * ratio));

@@ -8,15 +8,14 @@ import re
 from importlib import resources
 from typing import Any
 
+from rigidfleet.policy import content_policy
 from rigidfleet.result import plain
 
 _SCRIPTS = ("gl.js", "recording.js", "scene.js", "player.js")
-#: What a page may load: nothing but itself.
-_POLICY = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data:"
 
 
 def page(
-    info: dict[str, Any], *, start: str, data: str = "", style: str = "", policy: str = ""
+    info: dict[str, Any], *, start: str, data: str = "", style: str = "", connect: str = "'none'"
 ) -> str:
     """A page that shows what ``info`` describes.
 
@@ -25,16 +24,19 @@ def page(
     info : plain data and arrays; see ``describe`` and recording.js
     start : script that starts the player
     data : packed samples, as ``start`` reads them
-    style, policy : added to what every page has
+    style : added to what every page has
+    connect : whom the page may talk to; see `content_policy`
     """
+    style = read("page.css") + style
+    script = "\n".join([*map(read, _SCRIPTS), start])
     fill = {
-        "policy": _POLICY + policy,
+        "policy": content_policy(style=style, script=script, connect=connect),
         "title": html.escape(f"{info['name']} – rigidfleet"),
-        "style": read("page.css") + style,
+        "style": style,
         # No mark-up inside: a user's words must not end the script.
         "info": json.dumps(plain(info), ensure_ascii=False).replace("<", "\\u003c"),
         "data": data,
-        "script": "\n".join([*map(read, _SCRIPTS), start]),
+        "script": script,
     }
     return re.sub(r"\{(\w+)\}", lambda match: fill[match[1]], read("page.html"))
 

@@ -2,11 +2,20 @@
 // The page around the picture: time line, speed, cameras, plots, keys.
 
 const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 4, 8, 16];
-const ICONS = {
-  Play: '<svg viewBox="0 0 14 14" aria-hidden="true"><path d="M2.5 1 13 7 2.5 13z"/></svg>',
-  Pause: '<svg viewBox="0 0 14 14" aria-hidden="true"><path d="M2 1h3.6v12H2zM8.4 1H12v12H8.4z"/></svg>',
-};
+const KEYS = [
+  ["space", "play, pause"],
+  ["← →", "back, on by 1 s; with Shift by 0.1 s"],
+  ["[ ]", "phase before, phase after"],
+  ["Home End", "start, end"],
+  ["− +", "slower, faster"],
+  ["1 2 3", "follow the formation; see the whole flight; from above, north up"],
+  ["p", "show or hide the panel"],
+  ["?", "this list"],
+  ["drag", "turn the view; with Shift or the right button move it"],
+  ["wheel", "zoom; on a touch screen with two fingers"],
+];
 const SHOWN = { edges: "edges", trails: "trails", slots: "slots", axes: "body axes", names: "names" };
+const ALERT = "#b00020";
 const SLOW = 1 / 24; // seconds a picture: above, the resolution is lowered
 
 const part = (id) => document.getElementById(id);
@@ -33,9 +42,48 @@ function withUnit(x, unit) {
   return size > 1.5e-6 ? `${digits(1e6 * x)} µm` : "≤ 1 µm";
 }
 
+// -- time -----------------------------------------------------------------------------------------------
+
+/** Round times from one to another, at most so many. */
+function roundTimes(first, last, most) {
+  const least = (last - first) / Math.max(most, 1), power = Math.pow(10, Math.floor(Math.log10(least)));
+  if (!(least > 0)) return [first];
+  const step = power * [1, 2, 5, 10].find((k) => k * power >= least * (1 - 1e-9)), found = [];
+  for (let k = Math.ceil(first / step - 1e-6); k * step <= last + 1e-6 * step; k++) found.push(k * step);
+  return found;
+}
+
+/** Times written along a line. */
+class TimeAxis {
+  /** Words take about `room` pixels. */
+  constructor(box, room) {
+    this.box = box;
+    this.room = room;
+  }
+
+  /** Write round times from the first to the last; returns them. */
+  draw(first, last) {
+    const { box } = this, wide = box.clientWidth, times = roundTimes(first, last, wide / this.room);
+    const spans = times.map((time, k) => {
+      const span = document.createElement("span"), share = last > first ? (time - first) / (last - first) : 0;
+      span.textContent = `${Number(time.toFixed(3))}${k === times.length - 1 ? " s" : ""}`;
+      span.style.left = `${100 * share}%`;
+      // Words at an end stay inside.
+      if (share * wide < 14) span.className = "first";
+      else if ((1 - share) * wide < 14) span.className = "last";
+      return span;
+    });
+    box.replaceChildren(...spans);
+    return times;
+  }
+}
+
 // -- plots ----------------------------------------------------------------------------------------------
 
-/** One quantity over time: `plot` {title, unit, column, colours, worst, limit, least, log, floor}. */
+/**
+ * One quantity over time: `plot` {title, unit, column, colours, worst, limits, least, log, floor}. Each line has
+ * its colour and its limit, null for none.
+ */
 class Plot {
   constructor(parent, plot, recording, seek) {
     this.plot = plot;
@@ -43,7 +91,9 @@ class Plot {
     const box = element("div", parent, { class: "plot" }), header = element("header", box);
     element("h2", header, {}, plot.title);
     this.value = element("output", header);
-    this.area = element("div", box, { class: "area", title: "Click to go there" });
+    const frame = element("div", box, { class: "frame" }), scale = element("div", frame, { class: "scale" });
+    this.ends = [element("span", scale), element("span", scale)]; // beside the lines, never on them
+    this.area = element("div", frame, { class: "area", title: "Click to go there" });
     this.canvas = element("canvas", this.area);
     this.cursor = element("div", this.area, { class: "cursor" });
     const go = (event) => seek(Math.max(0, Math.min(event.offsetX / this.area.clientWidth, 1)));
@@ -74,8 +124,15 @@ class Plot {
     }
   }
 
-  /** Draw the samples from the first to the last. */
-  draw(first, last) {
+  /** Limits drawn: {value, colour}; of each line in its colour, or one for all. */
+  get limits() {
+    const { limits, colours } = this.plot, known = limits.filter((limit) => limit !== null);
+    if (known.every((limit) => limit === known[0])) return known.slice(0, 1).map((value) => ({ value, colour: ALERT }));
+    return limits.map((value, line) => ({ value, colour: colours[line % colours.length] })).filter(({ value }) => value !== null);
+  }
+
+  /** Draw the samples from the first to the last, over marks at shares of the width. */
+  draw(first, last, marks = []) {
     const { plot, canvas, area } = this, ratio = Math.min(window.devicePixelRatio || 1, 2);
     const width = area.clientWidth, height = area.clientHeight;
     if (!width || last < first) return;
@@ -92,8 +149,9 @@ class Plot {
     const y = plot.log ? (v) => Math.log10(Math.max(v, plot.floor)) : (v) => v;
     if (plot.log) [low, high] = [y(low), Math.max(y(high), y(low) + 1)];
     else {
-      // A limit is shown if the flight comes anywhere near it.
-      if (plot.limit !== null && plot.limit < high + 1.5 * (high - low) + 1e-9) high = Math.max(high, plot.limit);
+      // A limit is shown if the flight comes anywhere near it; of several limits also one further off.
+      const { limits } = this, near = Math.max(high + 1.5 * (high - low) + 1e-9, limits.length > 1 ? 3 * high : 0);
+      for (const { value } of limits) if (value < near) high = Math.max(high, value);
       if (plot.least !== null && plot.least > low - 1.5 * (high - low) - 1e-9) low = Math.min(low, plot.least);
       if (low > 0 && low < 0.6 * high) low = 0;
       const least = 0.02 * Math.max(Math.abs(high), Math.abs(low), 1e-3);
@@ -102,13 +160,16 @@ class Plot {
     const place = (v) => 3 + (1 - (y(v) - low) / (high - low)) * (height - 6);
     pen.fillStyle = "rgb(255 255 255 / 70%)";
     pen.fillRect(0, 0, width, height);
-    for (const bound of [plot.limit, plot.least]) {
-      if (bound === null || place(bound) < 0 || place(bound) > height) continue;
-      pen.strokeStyle = "#b00020";
+    pen.fillStyle = "#dde3e8";
+    for (const share of marks) pen.fillRect(Math.round(share * (width - 1)), 0, 1, height);
+    const bounds = plot.least === null ? this.limits : [...this.limits, { value: plot.least, colour: ALERT }];
+    for (const { value, colour } of bounds) {
+      if (place(value) < 0 || place(value) > height) continue;
+      pen.strokeStyle = colour;
       pen.setLineDash([5, 3]);
       pen.beginPath();
-      pen.moveTo(0, place(bound));
-      pen.lineTo(width, place(bound));
+      pen.moveTo(0, place(value));
+      pen.lineTo(width, place(value));
       pen.stroke();
       pen.setLineDash([]);
     }
@@ -124,25 +185,16 @@ class Plot {
       });
       pen.stroke();
     }
-    pen.font = "10px system-ui, sans-serif";
-    pen.textAlign = "right";
-    for (const [v, at] of [[high, 10], [low, height - 3]]) {
-      const name = withUnit(plot.log ? Math.pow(10, v) : v, plot.unit);
-      const { width: wide } = pen.measureText(name);
-      pen.fillStyle = "rgb(255 255 255 / 80%)";
-      pen.fillRect(width - 5 - wide, at - 9, wide + 4, 11);
-      pen.fillStyle = "#66717d";
-      pen.fillText(name, width - 3, at);
-    }
+    [high, low].forEach((v, k) => (this.ends[k].textContent = withUnit(plot.log ? Math.pow(10, v) : v, plot.unit)));
   }
 
   point(share, state) {
-    const { plot } = this, values = Array.from(state[plot.column]).filter(Number.isFinite);
+    const { plot } = this, all = Array.from(state[plot.column]), values = all.filter(Number.isFinite);
     this.cursor.style.transform = `translateX(${(share * this.area.clientWidth).toFixed(1)}px)`;
     const worst = values.length ? (plot.worst === "least" ? Math.min(...values) : Math.max(...values)) : NaN;
     const text = withUnit(plot.log ? Math.max(worst, plot.floor) : worst, plot.unit);
     if (this.value.textContent !== text) this.value.textContent = text;
-    const limit = plot.limit !== null && worst > plot.limit, least = plot.least !== null && worst < plot.least;
+    const limit = all.some((value, line) => plot.limits[line] !== null && value > plot.limits[line]), least = plot.least !== null && worst < plot.least;
     this.value.style.color = limit || least ? "var(--alert)" : "";
   }
 }
@@ -164,8 +216,11 @@ class Player {
     this.write(info);
     const go = (share) => this.seek(this.span()[0] + share * (this.span()[1] - this.span()[0]));
     this.plots = info.plots.map((plot) => new Plot(part("plots"), plot, recording, go));
+    this.axes = { plots: new TimeAxis(part("moments"), 36), slider: new TimeAxis(part("times"), 55) };
     this.listen();
-    new ResizeObserver(() => this.resize()).observe(document.documentElement);
+    this.resize();
+    const changes = new ResizeObserver(() => this.resize());
+    for (const box of [document.documentElement, part("bar")]) changes.observe(box);
     this.follow();
     requestAnimationFrame((now) => {
       this.last = now;
@@ -181,7 +236,7 @@ class Player {
     for (const speed of this.speeds()) element("option", part("speed"), { value: String(speed) }, `${speed}×`);
     part("speed").value = "1";
     for (const mode of CAMERAS) {
-      const title = { follow: "Follow the formation (1)", overview: "See the whole flight (2)", top: "See from above (3)" }[mode];
+      const title = { follow: "Follow the formation (1)", overview: "See the whole flight (2)", top: "See from above, north up (3)" }[mode];
       element("button", part("cameras"), { type: "button", title, "data-mode": mode }, mode[0].toUpperCase() + mode.slice(1))
         .addEventListener("click", () => this.look(mode));
     }
@@ -195,12 +250,21 @@ class Player {
       });
     }
     if (info.edges.length) this.writeScale(info);
-    this.look("follow");
+    for (const [keys, deed] of this.keys()) {
+      element("dt", part("help-list"), {}, keys);
+      element("dd", part("help-list"), {}, deed);
+    }
+    this.look(info.camera);
     part("more").setAttribute("aria-pressed", String(part("panel").offsetWidth > 0));
   }
 
   speeds() {
     return SPEEDS;
+  }
+
+  /** What keys do. */
+  keys() {
+    return KEYS;
   }
 
   /** What is known of the flight as a whole. */
@@ -236,6 +300,16 @@ class Player {
     part("scrub").addEventListener("input", (event) => this.seek(Number(event.target.value)));
     part("speed").addEventListener("change", (event) => this.hasten(Number(event.target.value)));
     part("more").addEventListener("click", () => this.panel());
+    part("keys").addEventListener("click", () => this.help());
+    part("help-close").addEventListener("click", () => this.help());
+    // What was pressed by a mouse or a finger gives the keys back to the flight, or space would press it again;
+    // what was reached by keys keeps them.
+    for (const name of ["click", "change"]) {
+      document.addEventListener(name, () => {
+        const at = document.activeElement, opening = name === "click" && at.tagName === "SELECT";
+        if (!opening && at.id !== "view" && !at.matches(":focus-visible")) at.blur();
+      });
+    }
     document.addEventListener("keydown", (event) => this.key(event));
     window.addEventListener("hashchange", () => this.follow());
     this.steer(part("view"));
@@ -277,11 +351,12 @@ class Player {
 
   key(event) {
     if (event.ctrlKey || event.metaKey || event.altKey || event.target.tagName === "SELECT") return;
+    if (part("help").open && event.key !== "?") return;
     const step = event.shiftKey ? 0.1 : 1, { phases } = this.recording.info, now = this.recording.phaseAt(this.time);
     const speeds = this.speeds();
     const speed = (by) => this.hasten(speeds[Math.max(0, Math.min(speeds.indexOf(this.speed) + by, speeds.length - 1))]);
     const deeds = {
-      " ": () => event.target.tagName !== "BUTTON" && this.toggle(),
+      " ": () => !event.target.matches("button, [type=checkbox]") && this.toggle(),
       k: () => this.toggle(),
       ArrowLeft: () => this.seek(this.time - step),
       ArrowRight: () => this.seek(this.time + step),
@@ -292,6 +367,7 @@ class Player {
       "+": () => speed(1), "=": () => speed(1), "-": () => speed(-1),
       1: () => this.look("follow"), 2: () => this.look("overview"), 3: () => this.look("top"),
       p: () => this.panel(),
+      "?": () => this.help(),
     };
     const deed = deeds[event.key];
     if (!deed || deed() === false) return;
@@ -307,11 +383,15 @@ class Player {
 
   play(on) {
     this.playing = on && this.recording.end > this.recording.start;
-    const name = this.playing ? "Pause" : "Play";
-    part("play").innerHTML = ICONS[name];
-    part("play").setAttribute("aria-label", name);
+    this.mark(this.playing);
     this.slow = 0;
     this.stale = true;
+  }
+
+  /** Say on the button what it will do next. */
+  mark(playing) {
+    part("play").setAttribute("aria-label", playing ? "Pause" : "Play");
+    part("play").classList.toggle("playing", playing);
   }
 
   seek(time) {
@@ -336,6 +416,13 @@ class Player {
     panel.classList.toggle("dismissed", !hidden);
     part("more").setAttribute("aria-pressed", String(hidden));
     this.resize();
+  }
+
+  /** Show or hide the list of keys. */
+  help() {
+    const help = part("help");
+    if (help.open) help.close();
+    else help.showModal();
   }
 
   /** Go where the address asks: `#t=52` shows that moment, `&camera=top`, `&speed=2`; it then stands still. */
@@ -365,8 +452,10 @@ class Player {
   }
 
   redraw() {
-    const [first, last] = this.span().map((time) => this.recording.nearest(time));
-    for (const plot of this.plots) plot.draw(first, last);
+    const { recording, axes } = this, [start, end] = this.span(), shares = [];
+    for (const time of axes.plots.draw(start, end)) shares.push(end > start ? (time - start) / (end - start) : 0);
+    axes.slider.draw(recording.start, recording.end);
+    for (const plot of this.plots) plot.draw(recording.nearest(start), recording.nearest(end), shares);
   }
 
   // -- from picture to picture --
@@ -409,6 +498,8 @@ class Player {
   tell() {
     const { recording, scene, time } = this, { info } = recording, { state } = scene, phase = info.phases[state.phase];
     const write = (id, text) => part(id).textContent !== text && (part(id).textContent = text);
+    const { azimuth } = scene.camera;
+    part("compass").style.transform = `rotate(${Math.atan2(Math.cos(azimuth), -Math.sin(azimuth))}rad)`;
     write("time", `${time.toFixed(1)} s`);
     write("number", `${state.phase + 1}/${info.phases.length}`);
     write("phase-name", phase?.name ?? "");

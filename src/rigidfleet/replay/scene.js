@@ -18,22 +18,38 @@ const rgb = (hex) => [1, 3, 5].map((k) => parseInt(hex.slice(k, k + 2), 16) / 25
 // -- the camera ---------------------------------------------------------------------------------------
 
 const CAMERAS = ["follow", "overview", "top"];
+const STEEP = 0.62; // elevation of the overview
+const MARGIN = 1.06; // around what the overview holds
+const PLACES = 2000; // of the flight that it looks at
+
+/** Unit vectors of a view from an azimuth and an elevation: to its right, upwards, and back to the eye. */
+function viewAxes(azimuth, elevation) {
+  const c = Math.cos(elevation), back = [c * Math.cos(azimuth), c * Math.sin(azimuth), Math.sin(elevation)];
+  const right = [-Math.sin(azimuth), Math.cos(azimuth), 0];
+  return { right, up: cross(back, right), back };
+}
 
 class Camera {
-  constructor(info) {
+  constructor(recording) {
+    const { info, columns, count } = recording, n = info.radius.length;
     this.info = info;
+    this.sight = [...info.sight]; // what the overview holds
+    const every = Math.max(1, Math.ceil((count * n) / PLACES));
+    for (let k = 0; k < count; k += every) {
+      for (let i = k * n; i < (k + 1) * n; i++) this.sight.push(columns.position.subarray(3 * i, 3 * i + 3));
+    }
     this.fov = (36 * Math.PI) / 180;
     this.centre = [0, 0]; // of the part of the page that nothing covers, and the part's size: shares of half the page
     this.free = [1, 1];
-    this.use("follow", true);
+    this.use(info.camera, true);
     this.pan = [0, 0, 0];
   }
 
   /** Look from where a mode looks from; a moving picture goes there smoothly, unless `now`. */
   use(mode, now = false) {
     this.mode = mode;
-    this.azimuth = this.info.azimuth;
-    this.elevation = mode === "top" ? 1.55 : mode === "overview" ? 0.62 : 0.4;
+    this.azimuth = mode === "top" ? -Math.PI / 2 : this.info.azimuth; // from above, north is up
+    this.elevation = mode === "top" ? Math.PI / 2 : mode === "overview" ? STEEP : 0.4;
     this.zoom = 1;
     this.pan = [0, 0, 0];
     if (now) this.shown = null;
@@ -41,41 +57,58 @@ class Camera {
 
   turn(dx, dy) {
     this.azimuth -= dx;
-    this.elevation = Math.max(-0.15, Math.min(this.elevation + dy, 1.55));
+    this.elevation = Math.max(-0.15, Math.min(this.elevation + dy, Math.PI / 2));
   }
 
   /** Move what is looked at across the screen by shares of its height. */
   shift(dx, dy) {
-    const { eye, target } = this, back = unit(sub(eye, target));
-    const right = unit(cross([0, 0, 1], back)), up = cross(back, right);
+    const { eye, target, right } = this, up = cross(unit(sub(eye, target)), right);
     const s = 2 * Math.tan(this.fov / 2) * length(sub(eye, target));
     this.pan = add(this.pan, add(scaled(right, -dx * s), scaled(up, dy * s)));
+  }
+
+  /** Where to look, and from how far, to have the whole flight and what stands near it in the free part of the page. */
+  overview(aspect) {
+    const { right, up, back } = viewAxes(this.info.azimuth, STEEP), { middle } = this.info;
+    const wide = Math.tan(this.fov / 2) * aspect * this.free[0], high = Math.tan(this.fov / 2) * this.free[1];
+    // Of each side of the picture, the distance from which the outermost point lies on its border.
+    let [l, r, b, t] = [-Infinity, -Infinity, -Infinity, -Infinity];
+    for (const p of this.sight) {
+      const away = sub(p, middle), x = dot(away, right) / wide, y = dot(away, up) / high, z = dot(away, back);
+      [l, r, b, t] = [Math.max(l, z - x), Math.max(r, z + x), Math.max(b, z - y), Math.max(t, z + y)];
+    }
+    const target = add(middle, add(scaled(right, (wide * (r - l)) / 2), scaled(up, (high * (t - b)) / 2)));
+    return { target, distance: MARGIN * Math.max((l + r) / 2, (b + t) / 2, 1e-6) };
   }
 
   /** Be where it ought to be `wait` seconds after the last picture; true while still on its way. */
   update(recording, state, aspect, wait) {
     const { info } = this, narrow = Math.tan(this.fov / 2) * Math.min(aspect * this.free[0], this.free[1]);
-    let target = info.middle, reach = info.extent;
-    if (this.mode !== "overview") {
+    let target, distance;
+    if (this.mode === "overview") ({ target, distance } = this.overview(aspect));
+    else {
       // Room for the formation as it will be soon, so that a change of shape does not leave the picture.
       const [k] = recording.place(state.time), rate = info.step > 0 ? 1 / info.step : 0;
+      let reach = 0;
       target = state.cm;
-      reach = 0;
       for (let ahead = -1; ahead <= 2; ahead += 0.25) {
         const at = Math.max(0, Math.min(k + Math.round(ahead * rate), recording.count - 1));
         reach = Math.max(reach, recording.reachAt(at));
       }
-      reach *= this.mode === "top" ? 1.6 : 1.08;
+      distance = (reach * (this.mode === "top" ? 1.6 : 1.08)) / Math.sin(Math.atan(narrow));
     }
     const wanted = {
-      distance: (reach * this.zoom) / Math.sin(Math.atan(narrow)),
+      distance: distance * this.zoom,
       azimuth: this.azimuth,
       elevation: this.elevation,
       target: add(target, this.pan),
     };
     // What moves with the formation stays with it; only what is left of a change of view fades.
     const s = this.shown ?? { ...wanted, off: [0, 0, 0], mode: this.mode };
-    if (s.mode !== this.mode) s.off = sub(s.target, wanted.target);
+    if (s.mode !== this.mode) {
+      s.off = sub(s.target, wanted.target);
+      s.azimuth -= 2 * Math.PI * Math.round((s.azimuth - wanted.azimuth) / (2 * Math.PI)); // the short way round
+    }
     const keep = Math.exp(-wait / 0.16), slow = Math.exp(-wait / 0.45);
     s.mode = this.mode;
     s.off = scaled(s.off, keep);
@@ -84,9 +117,10 @@ class Camera {
     s.elevation = wanted.elevation + (s.elevation - wanted.elevation) * keep;
     s.distance = wanted.distance * Math.pow(s.distance / wanted.distance, slow);
     this.shown = s;
-    const ce = Math.cos(s.elevation);
+    const { right, back } = viewAxes(s.azimuth, s.elevation);
     this.target = s.target;
-    this.eye = add(s.target, scaled([ce * Math.cos(s.azimuth), ce * Math.sin(s.azimuth), Math.sin(s.elevation)], s.distance));
+    this.right = right;
+    this.eye = add(s.target, scaled(back, s.distance));
     if (info.solid) this.eye[2] = Math.max(this.eye[2], info.ground + 0.02 * s.distance + 0.05);
     this.distance = s.distance;
     this.near = s.distance * 0.02;
@@ -109,7 +143,7 @@ class Scene {
     this.renderer = new Renderer(canvas);
     this.labels = new Labels(labels);
     this.show = { edges: true, trails: true, slots: true, axes: true, names: true };
-    this.camera = new Camera(info);
+    this.camera = new Camera(recording);
     this.crowd = this.n > CROWD;
     const upload = (mesh) => this.renderer.upload(mesh);
     this.meshes = {
@@ -395,8 +429,10 @@ class Labels {
     wanted.sort((a, b) => rank(a) - rank(b) || a.far - b.far);
     let used = 0;
     for (const label of wanted) {
-      const half = 3.4 * label.text.length + 3;
-      if (label.x < -half || label.x > box.clientWidth + half || label.y < 0 || label.y > box.clientHeight + 9) continue;
+      const half = 3.4 * label.text.length + 3, wide = box.clientWidth;
+      if (label.x < -half || label.x > wide + half || label.y < 0 || label.y > box.clientHeight + 9) continue;
+      // Words of what is in sight are, too.
+      if (label.x > 0 && label.x < wide && wide > 2 * half) label.x = Math.max(half, Math.min(label.x, wide - half));
       const covers = (t) => Math.abs(t.x - label.x) < t.half + half && Math.abs(t.y - label.y) < 13;
       if (label.kind !== "agent" && label.kind !== "axis" && taken.some(covers)) continue;
       taken.push({ ...label, half });

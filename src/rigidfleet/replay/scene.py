@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from rigidfleet.result import Result
 
 _LINES = 12  # in a plot at most; of more agents the least and the greatest
+_BOXES = 200  # that an overview fits one by one; more together
 _FLOOR = 1e-6  # least constraint error that is told apart from none [m]
 
 
@@ -59,6 +60,25 @@ def observe(result: Result, shown: Ints, tension: float) -> dict[str, Column]:
     }
 
 
+def sight(mission: Mission, low: Floats, high: Floats) -> Floats:
+    """Points (P, 3) [m] that an overview has in sight: 8 corners of a flight's box, then those of obstacles near it.
+
+    Of what reaches further from the flight than the flight is long, the part that is near; ``low`` and
+    ``high`` (3,) are the flight's least and greatest coordinates [m].
+    """
+    reach = max(float(np.linalg.norm(high - low)), 1e-6)
+    seen = []
+    for box in mission.obstacles:
+        if box.kind == "box":
+            near = np.maximum(box.min, low - reach), np.minimum(box.max, high + reach)
+            seen += [near] if (near[0] <= near[1]).all() else []
+    if len(seen) > _BOXES:
+        seen = [(np.min([a for a, _ in seen], axis=0), np.max([b for _, b in seen], axis=0))]
+    ends = np.array([(low, high), *seen])  # (1 + boxes, 2, 3)
+    pick = np.indices((2, 2, 2)).reshape(3, 8)  # corners
+    return np.stack([ends[:, pick[a], a] for a in range(3)], axis=2).reshape(-1, 3)
+
+
 def thrust_directions(force: Floats, mass: Floats) -> Floats:
     """Unit vectors (..., N, 3) along the thrust, which a vehicle's rotors must point along.
 
@@ -84,18 +104,16 @@ def weight(mission: Mission) -> float:
 def _plots(mission: Mission) -> list[dict[str, Any]]:
     """Quantities drawn over time; ``column`` holds the samples of each."""
     n, limits = mission.n_agents, mission.limits
-    each = agent_colours(n) if n <= _LINES else ["#8FA3B8", "#20262D"]
     basic = {
         "unit": "m",
         "colours": ["#20262D"],
         "worst": "greatest",
-        "limit": None,
+        "limits": [None],
         "least": None,
         "log": False,
         "floor": _FLOOR,
     }
-    thrust = {"unit": "N", "colours": each, "limit": min(mission.agents.thrust_limit)}
-    plots = [{"title": "Greatest thrust", "column": "thrust plot", **thrust}]
+    plots = [{"column": "thrust plot", **_thrust_plot(mission)}]
     if len(mission.edges):
         plots.append({"title": "Constraint error", "column": "error plot", "log": True})
     least = {"worst": "least", "least": limits.separation}
@@ -106,11 +124,41 @@ def _plots(mission: Mission) -> list[dict[str, Any]]:
     return [basic | plot for plot in plots]
 
 
+def _alike(mission: Mission) -> list[Ints] | None:
+    """Vehicles whose greatest thrust is one line, as they have one limit; None of too many limits."""
+    limits = np.array(mission.agents.thrust_limit)
+    if len(limits) <= _LINES:
+        return [np.array([i]) for i in range(len(limits))]
+    known = np.unique(limits)
+    return [np.flatnonzero(limits == x) for x in known] if len(known) <= _LINES else None
+
+
+def _thrust_plot(mission: Mission) -> dict[str, Any]:
+    """Lines of thrust, each under its own limit."""
+    alike, limits = _alike(mission), mission.agents.thrust_limit
+    title, grey = "Greatest thrust", ["#8FA3B8", "#20262D"]
+    if alike is None:  # as many limits: shares of them
+        limit: dict[str, Any] = {"unit": "%", "colours": grey, "limits": [None, 100.0]}
+        return {"title": f"{title}, of its limit", **limit}
+    if len(alike) == 1 < len(limits):  # a crowd with one limit: the least and the greatest
+        return {"title": title, "unit": "N", "colours": grey, "limits": [None, limits[0]]}
+    own = [limits[int(who[0])] for who in alike]
+    return {"title": title, "unit": "N", "colours": agent_colours(len(alike)), "limits": own}
+
+
+def _thrust_lines(mission: Mission, thrust: Floats) -> Floats:
+    """Samples (K, lines) of `_thrust_plot`."""
+    alike = _alike(mission)
+    if alike is None:
+        thrust = 100.0 * thrust / np.array(mission.agents.thrust_limit)
+    elif len(alike) > 1 or thrust.shape[1] == 1:
+        return np.stack([thrust[:, who].max(axis=1) for who in alike], axis=1)
+    return np.stack([thrust.min(axis=1), thrust.max(axis=1)], axis=1)
+
+
 def _plotted(result: Result) -> dict[str, Column]:
     """Samples of each plot."""
-    thrust = result.thrust
-    if result.n_agents > _LINES:
-        thrust = np.stack([thrust.min(axis=1), thrust.max(axis=1)], axis=1)
+    thrust = _thrust_lines(result.mission, result.thrust)
     # Where no edge is active there is no error.
     error = np.where(np.isnan(result.constraint), -1.0, np.abs(result.constraint))
     error = error.max(axis=1, initial=-1.0)

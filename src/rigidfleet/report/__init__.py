@@ -56,6 +56,7 @@ def html_page(
     """The page that `report` writes."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
+    from rigidfleet.policy import content_policy
     from rigidfleet.report.contents import contents
     from rigidfleet.result import Result
 
@@ -67,4 +68,9 @@ def html_page(
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    return environment.get_template("page.html").render(contents(flights, labels, verdicts))
+    style = environment.get_template("style.css").render()
+    return environment.get_template("page.html").render(
+        contents(flights, labels, verdicts),
+        policy=content_policy(style=style),
+        style=style,
+    )
