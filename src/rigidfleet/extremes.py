@@ -121,11 +121,14 @@ class Extremes:
             flags[:3] = rows, rows, 2 if last else 1
         self.monitor(program, work, state)
 
+    def so_far(self) -> dict[str, Extremum]:
+        """Extremes of the phase under way, by name."""
+        every = ((name, self._extremum(name, k)) for name, k in _NAMES.items())
+        return {name: x for name, x in every if x is not None}
+
     def phase(self) -> dict[str, Extremum]:
         """Extremes of the phase that ends, by name; the next one begins."""
-        found = {
-            name: x for name, k in _NAMES.items() if (x := self._extremum(name, k)) is not None
-        }
+        found = self.so_far()
         self.worst[list(_NAMES.values())] = np.inf
         return found
 
