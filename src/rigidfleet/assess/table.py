@@ -32,6 +32,10 @@ def rendered(verdict: Verdict) -> RenderableType:
         Text.assemble((verdict.mission, "bold"), f"  {verdict.title}"),
         _table(_PHASE, phases),
     ]
+    if any(row[2] for row in phases):
+        shown.append(
+            Text("|c|: an edge's length less that commanded; the greatest of all edges.", "dim")
+        )
     if waypoints:
         shown.append(_table(_WAYPOINT, waypoints))
     shown.append(_table(_CHECK, [_check(f) for f in verdict.findings], left=("who or where", "")))
