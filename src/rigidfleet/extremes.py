@@ -81,7 +81,7 @@ class Extremes:
         start, _ = geometry.rooms(np.array(agents.position), self.radius, mission.obstacles)
         self.standing = (start <= PAD).astype(np.int64)
         self.pairs = self.columns = self.struck = np.zeros((0, 2), dtype=np.int64)
-        self.spare, self.moved = np.zeros(2), np.zeros(2)
+        self.spare, self.moved = 0.0, np.zeros(2)
         self.trail = records.NO_TRAIL
         self._list_all()
 
@@ -168,46 +168,50 @@ class Extremes:
 
     def _step(self, program: Program, work: Workspace, state: records.Integrator, row: int) -> None:
         """Watch the distances of one step, in pieces so short that the pairs listed are all that matter."""
-        t, h = state.trail.clock[row]
-        points = state.trail.points[row]
+        (t, h), points = state.trail.clock[row], state.trail.points[row]
         moved = self._moves(program, points)
-        if (self.moved + moved > self.spare).any():
-            self._list(program, points[0])
-        short = float((moved[: 1 + self.stacks] / self.spare[: 1 + self.stacks]).max())
-        pieces = min(_PIECES, max(1, math.ceil(short)))
-        flags = self.monitor.monitor.flags
+        if not np.isfinite(self.moved).all():
+            self._list(program, points[0], 0.0)
+        pieces = min(_PIECES, max(1, math.ceil(float(moved.max()) / self.spare)))
         if pieces == 1:
-            self.moved += moved
-            flags[:3] = row, row + 1, 0
+            self._ready(program, points, moved)[:3] = row, row + 1, 0
             self.monitor(program, work, state)
             return
         gauge, none = state.trail.gauge[:0], state.trail.start
         for k in range(pieces):
             part = _FROM_KNOTS @ (_bernstein((k + _KNOTS) / pieces) @ points)
-            moved = self._moves(program, part)
-            if (self.moved + moved > self.spare).any():
-                self._list(program, part[0])
-                flags = self.monitor.monitor.flags
-            self.moved += moved
+            self._ready(program, part, self._moves(program, part))[:3] = 0, 1, 0
             clock = np.array([[t + k * h / pieces, h / pieces]])
             trail = records.Trail(clock, np.ascontiguousarray(part[None]), gauge, none)
-            flags[:3] = 0, 1, 0
             self.monitor(program, work, state._replace(trail=trail))
 
-    def _list(self, program: Program, y: Array) -> None:
-        """List the pairs that are near each other at a state (n,), or below one another."""
+    def _ready(self, program: Program, points: Array, moved: Array) -> Ints:
+        """List pairs anew if others may come as near over these points (5, n); returns the monitor's flags."""
+        if (self.moved + moved > self.spare).any():
+            self._list(program, points[0], float(moved.max()))
+        self.moved += moved
+        return self.monitor.monitor.flags
+
+    def _list(self, program: Program, y: Array, moves: float) -> None:
+        """List the pairs that are near each other at a state (n,), or below one another.
+
+        The list is good until others may have come nearer by ``moves`` [m], at least.
+        """
         from scipy.spatial import KDTree
 
         who = np.flatnonzero(self.left)
+        self.spare, self.moved[:] = math.inf, 0.0
+        if len(who) < 2:
+            return
         x = y[: 3 * self.n].reshape(-1, 3)[who]
         widest = 2.0 * float(self.radius[who].max())
         tree = KDTree(x, balanced_tree=False, compact_nodes=False)
         near, j = tree.query(x, k=2)
         rooms = near[:, 1] - self.radius[who] - self.radius[who[j[:, 1]]]
-        spare = _SPARE * max(float(np.median(near[:, 1])), 1e-6)
+        spare = max(_SPARE * float(np.median(near[:, 1])), 1.01 * moves, 1e-6)
         least = min(float(rooms.min()), float(self.worst[records.SEPARATION]))
         pairs = who[tree.query_pairs(least + widest + spare, output_type="ndarray")]
-        self.spare[:], self.moved[:] = spare, 0.0
+        self.spare, self.moved[:] = spare, 0.0
         self.pairs = np.ascontiguousarray(np.sort(pairs, axis=1))
         if self.stacks:
             if program.body_formulation:
