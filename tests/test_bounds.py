@@ -279,3 +279,10 @@ def test_the_bounds_are_those_of_the_documents():
     """A million agents in a formation of three edges each may be asked for by count."""
     assert limits.AGENTS >= 1_000_000
     assert 3 * limits.AGENTS <= limits.EDGES_EACH * limits.AGENTS
+
+
+@pytest.mark.parametrize("quotes", ['"""a""""', '"""a"""""', "'''a''''", '"""\\""""'])
+@pytest.mark.parametrize("deep", ["[" * 5000 + "]" * 5000, "{" + ".".join("a" * 5000) + " = 1}"])
+def test_a_string_that_ends_in_quotes_hides_nothing(quotes, deep):
+    """TOML lets a string of several lines end in quotes of its own; what comes after it is looked at."""
+    assert "deep" in excess(f"note = [{quotes}, {deep}]\n")

@@ -428,3 +428,125 @@ def test_a_record_without_extremes_says_so():
     result.phases[1].extremes = {}
     (note,) = assess(result).notes
     assert "judged at samples alone, up to 0.01 s apart" in note
+
+
+# -- what was found wrong once
+
+
+def held(agents: dict[str, Any], until: float, **tables: Any) -> Mission:
+    """Vehicles that nothing holds together."""
+    hold = [{"kind": "hold", "control": "open", "until": until}]
+    data = {"schema_version": 1, "name": "held", "agents": agents, "phases": hold}
+    return Mission.from_dict(data | tables)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_large_fleet_that_converges_is_watched(seed):
+    """Of vehicles that fly straight through one point, or nearly, the closed form is the least separation."""
+    n, until = 45, 5.0
+    rng = np.random.default_rng(seed)
+    g = rng.normal(size=(n, 3))
+    g *= 10 * rng.uniform(0.5, 1, (n, 1)) / np.linalg.norm(g, axis=1)[:, None]
+    w = (0.5 * rng.normal(size=(n, 3)) - g) / (0.5 * until)
+    i, j = np.triu_indices(n, 1)
+    x, v = (g[i] - g[j]), (w[i] - w[j])
+    t = np.clip(-(x * v).sum(axis=1) / (v * v).sum(axis=1), 0.0, until)
+    least = np.linalg.norm(x + t[:, None] * v, axis=1)
+    agents = {"mass": 1.0, "position": (g + [0, 0, 20]).tolist(), "velocity": w.tolist()}
+    agents["radius"] = 0.0
+    result = simulate(held(agents, until))
+    k = int(least.argmin())
+    found = result.extreme("separation")
+    assert found is not None
+    assert found.value == pytest.approx(least[k], abs=CLOSE)
+    assert (found.who, found.other) == (i[k], j[k])
+    assert found.time == pytest.approx(t[k], abs=1e-3)
+
+
+def test_vehicles_at_one_place_cost_no_eternity():
+    """Pairs a millionth of a metre apart do not cut a flight into millions of pieces; one left is alone."""
+    rng = np.random.default_rng(0)
+    pairs = np.repeat(rng.uniform(0, 10, (30, 3)), 2, axis=0) + [0, 0, 20]
+    pairs[1::2, 0] += 2e-6
+    velocity = np.repeat(rng.normal(size=(30, 3)), 2, axis=0)
+    agents = {"mass": 1.0, "position": pairs.tolist(), "velocity": velocity.tolist()}
+    agents["radius"] = 0.0
+    lost = [{"agent": i + 1, "time": 1.0} for i in range(59)]
+    result = simulate(held(agents, 2.0, disturbances={"lost": lost}))
+    found = result.extreme("separation")
+    assert found is not None
+    assert found.value == pytest.approx(2e-6, abs=1e-8)
+
+
+@pytest.mark.parametrize(("speed", "until", "off"), [(100.0, 100.0, 1e-3), (1000.0, 1000.0, 0.1)])
+def test_long_fast_steps_know_a_short_distance(speed, until, off):
+    """Two that come from a thousand kilometres away pass each other as near as the closed form says."""
+    t = 0.6137 * until
+    agents = {
+        "mass": 1.0, "radius": 0.4 * off, "position": [[-speed * t, 0, 10], [speed * t, off, 10]],
+        "velocity": [[speed, 0, 0], [-speed, 0, 0]],
+    }  # fmt: skip
+    result = simulate(held(agents, until, output_step=until / 7))
+    found = result.extreme("separation")
+    assert found is not None
+    assert found.value == pytest.approx(0.2 * off, abs=CLOSE)
+    assert not any(f.check == "record" for f in assess(result).findings)
+
+
+def test_who_is_lost_behind_a_wall_has_flown_through_it():
+    """A vehicle that passes a thin wall and is lost just behind it has not landed there."""
+    agents = {
+        "mass": 1.0, "position": [[0, 30, 5.25], [-20.2, 0, 10]], "velocity": [[0, 0, 0], [20, 0, 0]],
+        "radius": [0.25, 0.05],
+    }  # fmt: skip
+    wall = {"kind": "box", "name": "wall", "min": [-0.005, -5, 0], "max": [0.005, 5, 20]}
+    lost = {"lost": [{"agent": 2, "time": 1.0135}]}
+    mission = held(agents, 2.0, obstacles=[{"kind": "ground"}, wall], disturbances=lost)
+    failed = {f.check for f in assess(simulate(mission)).findings if not f.passed}
+    assert failed == {"clearance"}
+
+
+def test_times_that_begin_after_take_off_make_no_collision():
+    """Who stood on the ground before the first sample has not hit it."""
+    one = {"mass": 1.0, "position": [[0, 0, 0.25]], "radius": 0.25}
+    mission = held(one, 4.0, obstacles=[{"kind": "ground"}])
+    mission = Mission.from_dict(
+        mission.to_dict()
+        | {"phases": [mission.to_dict()["phases"][0] | {"input_force": [0, 0, 1.0]}]}
+    )
+    assert assess(simulate(mission, times=[1.0, 2.0, 3.0, 4.0])).passed
+
+
+def test_a_pulse_between_steps_is_no_contradiction():
+    """A user's force that the steps have not seen is in the samples, and the record holds."""
+    agents = {"mass": 1.0, "position": [[0, 0, 5], [5, 0, 5]]}
+    force = {"force": lambda t, r, v: np.ones_like(r) * 4 * np.exp(-(((t - 5) / 0.02) ** 2))}
+    assert assess(simulate(held(agents, 10.0), **force)).passed
+
+
+def test_an_extreme_that_is_taken_away_is_missed():
+    """A record that tells only part of what happened between its samples contradicts itself."""
+    result = simulate(two())
+    del result.phases[0].extremes["separation"]
+    failed = {f.check for f in assess(result).findings if not f.passed}
+    assert failed == {"record"}
+
+
+def test_a_list_of_pairs_ends_with_its_phase():
+    """Who came near in one phase does not hide who comes near in the next."""
+    rng = np.random.default_rng(3)
+    grid = np.array([[10.0 * (i % 8), 10.0 * (i // 8), 10.0] for i in range(48)])
+    near = np.array([[0, 0, 50], [0.6, 0, 50], [40, 0, 50], [45.65, 0, 50], [0, 40, 70]])
+    velocity = np.zeros((53, 3))
+    velocity[49, 0], velocity[51, 0] = -0.02, -0.1
+    velocity += 1e-3 * rng.normal(size=velocity.shape)
+    agents = {
+        "mass": 1.0, "radius": 0.25, "position": np.vstack([grid, near]).tolist(),
+        "velocity": velocity.tolist(),
+    }  # fmt: skip
+    phases = [
+        {"kind": "hold", "control": "open", "duration": 2.0, "name": name} for name in ("a", "b")
+    ]
+    data = {"schema_version": 1, "name": "two", "agents": agents, "phases": phases}
+    verdict = assess(simulate(Mission.from_dict(data)))
+    assert not any(f.check == "record" for f in verdict.findings)

@@ -25,8 +25,10 @@ Ints = NDArray[np.int64]
 _FEW = 40
 #: Pairs are listed so far beyond those that matter, in parts of the agents' spacing.
 _SPARE = 0.5
-#: A step of a large fleet is cut into so many pieces at most.
-_PIECES = 4096
+#: And at least so far, in parts of the fleet's size over the root of its number: some may be at one place.
+_LEAST = 0.1
+#: Pieces of a step are no shorter than this part of it.
+_SHORTEST = 2.0**-20
 #: What the monitor keeps with the other sign.
 _GREATEST = frozenset(
     ("geofence", "highest", "speed", "thrust", "thrust_margin", "acceleration", "constraint_force", "tension",
@@ -101,6 +103,13 @@ class Extremes:
 
     def lose(self, lost: NDArray[np.bool_]) -> None:
         """Go on without the vehicles ``lost`` (N,), which the others must not be hit by."""
+        for i in np.flatnonzero(lost & self.left & (self.low[:, 0] < np.inf)):
+            # Near an obstacle when it was lost, and not landing any more.
+            value, t, b = self.low[i]
+            if value < self.worst[records.FLYING]:
+                self.worst[records.FLYING], self.when[records.FLYING] = value, t
+                self.who[records.FLYING] = i, int(b)
+            self.low[i, 0] = np.inf
         self.left[:] = ~lost
         gone, left = np.flatnonzero(lost), np.flatnonzero(~lost)
         struck = np.stack(np.meshgrid(gone, left, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -130,6 +139,7 @@ class Extremes:
         """Extremes of the phase that ends, by name; the next one begins."""
         found = self.so_far()
         self.worst[list(_NAMES.values())] = np.inf
+        self.moved[:] = np.inf  # pairs were listed for a worst that counts no more
         return found
 
     def flight(self, phases: Sequence[PhaseRecord]) -> None:
@@ -168,29 +178,27 @@ class Extremes:
 
     def _step(self, program: Program, work: Workspace, state: records.Integrator, row: int) -> None:
         """Watch the distances of one step, in pieces so short that the pairs listed are all that matter."""
-        (t, h), points = state.trail.clock[row], state.trail.points[row]
-        moved = self._moves(program, points)
-        if not np.isfinite(self.moved).all():
-            self._list(program, points[0], 0.0)
-        pieces = min(_PIECES, max(1, math.ceil(float(moved.max()) / self.spare)))
-        if pieces == 1:
-            self._ready(program, points, moved)[:3] = row, row + 1, 0
-            self.monitor(program, work, state)
-            return
+        (start, length), whole = state.trail.clock[row], state.trail.points[row]
         gauge, none = state.trail.gauge[:0], state.trail.start
-        for k in range(pieces):
-            part = _FROM_KNOTS @ (_bernstein((k + _KNOTS) / pieces) @ points)
-            self._ready(program, part, self._moves(program, part))[:3] = 0, 1, 0
-            clock = np.array([[t + k * h / pieces, h / pieces]])
-            trail = records.Trail(clock, np.ascontiguousarray(part[None]), gauge, none)
+        pieces: list[tuple[float, float, Array]] = [(start, length, whole)]
+        while pieces:
+            t, h, points = pieces.pop()
+            moved = self._moves(program, points)
+            if (self.moved + moved > self.spare).any():
+                self._list(program, points[0], 0.0)
+            if moved.max() > self.spare:
+                if h > _SHORTEST * length:
+                    halves = (
+                        _FROM_KNOTS @ (_bernstein((_KNOTS + k) / 2.0) @ points) for k in (0, 1)
+                    )
+                    first, second = map(np.ascontiguousarray, halves)
+                    pieces += [(t + 0.5 * h, 0.5 * h, second), (t, 0.5 * h, first)]
+                    continue
+                self._list(program, points[0], float(moved.max()))
+            self.moved += moved
+            self.monitor.monitor.flags[:3] = 0, 1, 0
+            trail = records.Trail(np.array([[t, h]]), points[None], gauge, none)
             self.monitor(program, work, state._replace(trail=trail))
-
-    def _ready(self, program: Program, points: Array, moved: Array) -> Ints:
-        """List pairs anew if others may come as near over these points (5, n); returns the monitor's flags."""
-        if (self.moved + moved > self.spare).any():
-            self._list(program, points[0], float(moved.max()))
-        self.moved += moved
-        return self.monitor.monitor.flags
 
     def _list(self, program: Program, y: Array, moves: float) -> None:
         """List the pairs that are near each other at a state (n,), or below one another.
@@ -200,18 +208,21 @@ class Extremes:
         from scipy.spatial import KDTree
 
         who = np.flatnonzero(self.left)
-        self.spare, self.moved[:] = math.inf, 0.0
-        if len(who) < 2:
-            return
         x = y[: 3 * self.n].reshape(-1, 3)[who]
+        if len(who) < 2:
+            self.pairs = self.columns = np.zeros((0, 2), dtype=np.int64)
+            self._watch_listed(math.inf)
+            return
         widest = 2.0 * float(self.radius[who].max())
         tree = KDTree(x, balanced_tree=False, compact_nodes=False)
         near, j = tree.query(x, k=2)
-        rooms = near[:, 1] - self.radius[who] - self.radius[who[j[:, 1]]]
-        spare = max(_SPARE * float(np.median(near[:, 1])), 1.01 * moves, 1e-6)
+        # Of two at one place either may be its own nearest.
+        other = np.where(j[:, 1] == np.arange(len(who)), j[:, 0], j[:, 1])
+        rooms = near[:, 1] - self.radius[who] - self.radius[who[other]]
+        size = float(np.linalg.norm(np.ptp(x, axis=0))) / math.sqrt(len(who))
+        spare = max(_SPARE * float(np.median(near[:, 1])), _LEAST * size, 1.01 * moves, 1e-6)
         least = min(float(rooms.min()), float(self.worst[records.SEPARATION]))
         pairs = who[tree.query_pairs(least + widest + spare, output_type="ndarray")]
-        self.spare, self.moved[:] = spare, 0.0
         self.pairs = np.ascontiguousarray(np.sort(pairs, axis=1))
         if self.stacks:
             if program.body_formulation:
@@ -220,10 +231,14 @@ class Extremes:
             flat = KDTree(x[:, :2], balanced_tree=False, compact_nodes=False)
             columns = who[flat.query_pairs(widest + spare, output_type="ndarray")]
             self.columns = np.ascontiguousarray(np.sort(columns, axis=1))
-        flags = self.monitor.monitor.flags.copy()
+        self._watch_listed(spare)
+
+    def _watch_listed(self, spare: float) -> None:
+        """Watch the pairs listed, which are all that matter until others have come nearer by ``spare`` [m]."""
+        self.spare, self.moved[:] = spare, 0.0
         before = self.monitor.monitor
         self.monitor = native.Watch(
-            before._replace(pairs=self.pairs, columns=self.columns, flags=flags)
+            before._replace(pairs=self.pairs, columns=self.columns, flags=before.flags.copy())
         )
 
     def _moves(self, program: Program, points: Array) -> Array:
@@ -249,7 +264,8 @@ class Extremes:
         if program.body_formulation:
             q = points[:, 6 * self.n + len(program.graph.edges) :][:, :4]
             rates = 4.0 * np.linalg.norm(np.diff(q, axis=0), axis=1).max()
-            tilt = 2.0 * float(rates) / max(float(np.linalg.norm(q, axis=1).min()) - 0.1, 0.1)
+            size = max(float(np.linalg.norm(q, axis=1).min()) - 0.1, 0.1)
+            tilt = 2.0 * float(rates) / size + float(np.linalg.norm(spin))
         widest = 2.0 * math.sqrt(float(np.einsum("kia,kia->ki", x, x).max()))
         return np.array([moved, moved + tilt * widest if self.stacks else 0.0])
 

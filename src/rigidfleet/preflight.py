@@ -593,7 +593,8 @@ def planned(mission: Mission, phases: int | None = None) -> tuple[list[Leg], boo
         guess = (
             isinstance(phase, Establish | Reshape)
             and phase.control != "slots"
-            and led_by(mission, phase, before, target) != "shape"
+            # A shape that forces alone hold may lag behind its slots.
+            and (phase.control == "body" or led_by(mission, phase, before, target) != "shape")
         )
         acceleration = _rate(_rate(position, time), time)
         way.append(Leg(phase.name, time, position, acceleration, not guess, ways, names))

@@ -320,11 +320,11 @@ class Result:
             who = getattr(self, name)
             if who.size and not least <= who.min() <= who.max() < n:
                 raise ValueError(f"{name} names agents outside of {least} to {n - 1}")
-        for phase in self.phases:
-            for name, x in phase.extremes.items():
-                others = range(-1, 1 << 32) if name.startswith("clearance") else range(-1, n)
-                if x.who not in range(n) or x.other not in others:
-                    raise ValueError(f"an extreme of {name} names agents outside of 0 to {n - 1}")
+        for name, x in (pair for phase in self.phases for pair in phase.extremes.items()):
+            of_pair = not name.startswith("clearance")  # which names an obstacle
+            alone = of_pair and not (-1 <= x.other < n and x.other != x.who)
+            if alone or x.who not in range(n):
+                raise ValueError(f"an extreme of {name} names agents that are not two of {n}")
         for name in (name for name, v in VARIABLES.items() if "quaternion" in v.dims):
             if not getattr(self, name).any(axis=1).all():
                 raise ValueError(f"{name} has a quaternion of length zero")
@@ -380,8 +380,10 @@ class Result:
         named = [
             x.other for p in self.phases for n, x in p.extremes.items() if n.startswith("clear")
         ]
-        named.append(int(self.clearance_obstacle.max()))
-        if max(named) >= max(len(mission.obstacles), 1) or (named[:-1] and min(named[:-1]) < 0):
+        obstacles = range(len(mission.obstacles))
+        if self.clearance_obstacle.max() >= max(len(obstacles), 1) or not set(named) <= set(
+            obstacles
+        ):
             return "it has fewer obstacles than the arrays name"
         unknown = {p.formation for p in self.phases} - {None, *mission.formations}
         return f"it has no formation {min(map(repr, unknown))}" if unknown else ""

@@ -256,7 +256,8 @@ def _since(flight: Flight, name: str, sampled: Floats) -> str:
 def _clearances(flight: Flight) -> Iterator[Finding]:
     """Obstacles in flight; and apart from that, those on which vehicles stand at the start and at the end."""
     found = {name: e for name, e in flight.clearances().items() if e is not None}
-    e = min(found.values(), key=lambda e: e.value)
+    every = [*found.values(), flight.worst_clearance("clearance")]
+    e = min((e for e in every if e is not None), key=lambda e: e.value)
     hit = e.value < -_CONTACT
     if not hit:
         e = found.pop("clearance_flight", None)
@@ -265,7 +266,7 @@ def _clearances(flight: Flight) -> Iterator[Finding]:
         words = f"{agent} comes within {value(e.value, 'm')} of '{obstacle}' at {e.when:.2f} s"
         if hit or e.value <= 0:
             since = _since(flight, "clearance", flight.close[2])
-            depth = f"by {value(-e.value, 'm')} at {e.when:.2f} s"
+            depth = f"by {value(abs(e.value), 'm')} at {e.when:.2f} s"
             words = f"obstacles are hit, first {since}; {agent} is deepest in '{obstacle}', {depth}"
         yield _bounded("clearance", e, "m", 0.0, words, passed=e.value > 0, at_least=True)
     for name, when in (("clearance_start", "since the start"), ("clearance_end", "at the end")):

@@ -31,9 +31,9 @@ Ints = NDArray[np.int64]
 #: leave a flat shape 3e-4 thick.
 THIN = 1e-3
 
-#: By so much of it a sample may be worse than the worst of its phase, before the record contradicts itself: the
-#: forces of a large formation are known at the ends of steps alone.
-_SLACK = {"separation": 0.0, "clearance": 0.0, "speed": 1e-9, "thrust": 0.05, "acceleration": 0.5}
+#: By so much of it a sample may be worse than the worst of its phase before the record contradicts itself. Of forces
+#: that cannot be said: those of large formations are known at the ends of steps alone, a user's may fall between them.
+_SLACK = {"separation": 0.0, "clearance": 0.0, "speed": 1e-9}
 
 #: Bytes of slots up to which what is known of their shape is kept, for the next phase or flight.
 _KEPT = 100_000
@@ -256,13 +256,16 @@ class Flight:
         off = room > PAD
         first = np.where(off.any(axis=0), off.argmax(axis=0), len(time))
         last = np.where(off.any(axis=0), len(time) - 1 - off[::-1].argmax(axis=0), len(time))
+        last = np.where(self.left[-1], last, len(time))  # who is lost does not land
         k = np.arange(len(time))[:, None]
         parts = {
             "clearance_start": k < first,
             "clearance_flight": (k >= first) & (k <= last),
             "clearance_end": (k >= first) & (k > last),
         }
-        if not (parts["clearance_start"].any() or parts["clearance_end"].any()):
+        told = {name for p in self.result.phases for name in p.extremes}
+        stands = parts["clearance_start"].any() or parts["clearance_end"].any()
+        if not (stands or told & {"clearance_start", "clearance_end"}):
             # All fly, all the time.
             return {"clearance_flight": self.worst_clearance("clearance")}
         found = {}
@@ -317,6 +320,16 @@ class Flight:
                 yield words, float(time[k])
         for index, phase in enumerate(result.phases):
             samples = result.samples(index)
+            if samples.stop > samples.start and phase.extremes:
+                due = ["speed", "lowest", "highest", "thrust"]
+                due += ["separation"] if self.left[samples.start].sum() > 1 else []
+                due += ["clearance"] if self.mission.obstacles else []
+                due += ["geofence"] if self.mission.limits.geofence is not None else []
+                if lacking := [name for name in due if name not in phase.extremes]:
+                    words = (
+                        f"it does not tell the {lacking[0]} of phase '{phase.name}' between samples"
+                    )
+                    yield words, float(time[samples.start])
             for name, share in _SLACK.items():
                 x = phase.extremes.get(name)
                 if x is None or samples.stop == samples.start:

@@ -132,50 +132,68 @@ def halve(piece, left):
 
 @compiled
 def square(points, sign, out):
-    """Bernstein coefficients (9,) of sign |r|^2 of a curve with control points (5, 3)."""
+    """Bernstein coefficients (9,) of sign |r|^2 of a curve with control points (15,)."""
     for k in range(9):
         out[k] = 0.0
     for i in range(5):
         for j in range(5):
             dot = 0.0
             for q in range(3):
-                dot += points[i, q] * points[j, q]
+                dot += points[3 * i + q] * points[3 * j + q]
             out[i + j] += sign * _SQUARE[i, j] * dot
 
 
 @compiled
 def length_at(points, x):
-    """|r| of a curve with control points (5, 3) at x."""
+    """|r| of a curve with control points (15,) at x."""
     rest, total = 1.0 - x, 0.0
     for q in range(3):
-        value = rest**4 * points[0, q] + x**4 * points[4, q]
-        value += 4.0 * x * rest * (rest * rest * points[1, q] + x * x * points[3, q])
-        value += 6.0 * x * x * rest * rest * points[2, q]
+        value = rest**4 * points[q] + x**4 * points[12 + q]
+        value += 4.0 * x * rest * (rest * rest * points[3 + q] + x * x * points[9 + q])
+        value += 6.0 * x * x * rest * rest * points[6 + q]
         total += value * value
     return math.sqrt(total)
 
 
 @compiled
-def shortest(points, floor, work):
-    """Least |r| of a curve with control points (5, 3), if below ``floor``, and where; else ``floor`` and -1."""
-    best, at = floor, -1.0
-    start, middle, along = 0.0, 0.0, math.inf
-    for q in range(3):
-        start += points[0, q] * points[0, q]
-        middle += points[2, q] * points[2, q]
+def shortest(curve, floor, work, pieces):
+    """Least |r| of a curve with control points (5, 3), if below ``floor``, and where; else ``floor`` and -1.
+
+    A squared length of some meters knows one of a millimetre to rounding alone: of long pieces both halves are looked
+    at again once it is known how short they come.
+    """
+    best, at, top = floor, -1.0, 0
     for k in range(5):
-        dot = 0.0
         for q in range(3):
-            dot += points[2, q] * points[k, q]
-        along = min(along, dot)
-    start, middle = math.sqrt(start), math.sqrt(middle)
-    if start < best:
-        best, at = start, 0.0
-    if middle > 0.0 and not along < best * middle:
-        return best, at
-    square(points, 1.0, work[0])
-    _, found = lowest(work, 8, best * best)
-    return (length_at(points, found), found) if found >= 0.0 else (best, at)
+            pieces[0, 3 * k + q] = curve[k, q]
+    pieces[0, 15], pieces[0, 16] = 0.0, 1.0
+    while top >= 0:
+        piece = pieces[top]
+        middle, along, size = 0.0, math.inf, 0.0
+        for q in range(3):
+            middle += piece[6 + q] * piece[6 + q]
+        for k in range(5):
+            dot, far = 0.0, 0.0
+            for q in range(3):
+                dot += piece[6 + q] * piece[3 * k + q]
+                far += piece[3 * k + q] * piece[3 * k + q]
+            along, size = min(along, dot), max(size, far)
+        top -= 1
+        if middle > 0.0 and not along < best * math.sqrt(middle):
+            continue
+        start = length_at(piece, 0.0)
+        if start < best:
+            best, at = start, piece[15]
+        square(piece, 1.0, work[0])
+        _, found = lowest(work, 8, best * best)
+        if found >= 0.0:
+            length = length_at(piece, found)
+            if length < best:
+                best, at = length, piece[15] + found * piece[16]
+        if _ROUNDING * size > CLOSE * max(2.0 * best, 1e-5) and piece[16] > _SHORTEST:
+            halve(piece, pieces[top + 2])
+            top += 2
+    return best, at
 
 
 @compiled
@@ -405,7 +423,7 @@ def watch_pairs(kind, pairs, points, t, h, monitor):
         between(points, i, j, d)
         radii = radius[i] + radius[j]
         floor = monitor.worst[kind] + radii
-        value, at = shortest(d, floor, monitor.work)
+        value, at = shortest(d, floor, monitor.work, monitor.pieces)
         if at >= 0.0:
             take(kind, value - radii, t + at * h, i, j, monitor)
 
@@ -510,11 +528,15 @@ def watch_distances(row, p, state, monitor):
                 fastest = max(fastest, size)
             greatest = -monitor.worst[SPEED]  # -inf at first
             if not fastest <= greatest * abs(greatest):
-                square(curve, -1.0, monitor.work[0])
+                piece = monitor.pieces[0]
+                for k in range(5):
+                    for q in range(3):
+                        piece[3 * k + q] = curve[k, q]
+                square(piece, -1.0, monitor.work[0])
                 floor = -greatest * abs(greatest)
                 _, at = lowest(monitor.work, 8, floor)
                 if at >= 0.0:
-                    take(SPEED, -length_at(curve, at), start + at * h, i, -1, monitor)
+                    take(SPEED, -length_at(piece, at), start + at * h, i, -1, monitor)
             in_world(points, i, 0, p, monitor, curve)
             watch_coordinate(LOWEST, curve, 2, 1.0, 0.0, start, h, i, monitor)
             watch_coordinate(HIGHEST, curve, 2, -1.0, 0.0, start, h, i, monitor)

@@ -64,8 +64,9 @@ _QUOTED = r'"(?:[^"\\\n]|\\[^\n])*+"?' + r"|'[^'\n]*+'?"
 _NEXT = rf"[ \t]*+\.[ \t]*+(?:{_BARE}|{_QUOTED})"
 #: What may hide a bracket or a dot, what is deep, and nothing else: numbers are passed over.
 _TOKENS = re.compile(
-    r'"""(?:[^"\\]|\\.|"(?!""))*+(?:""")?'
-    r"|'''(?:[^']|'(?!''))*+(?:''')?"
+    # A string of several lines may end in one or two quotes of its own.
+    r'"""(?:[^"\\]|\\.|"(?!""))*+(?:"{3,5})?'
+    r"|'''(?:[^']|'(?!''))*+(?:'{3,5})?"
     r"|#[^\n]*+"
     rf"|(?P<key>(?:{_QUOTED})(?:{_NEXT})*+|(?<![A-Za-z0-9_.\-]){_BARE}(?:{_NEXT}){{2,}}+)"
     r"|(?P<open>[\[{])|(?P<shut>[\]}])",

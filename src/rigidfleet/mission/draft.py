@@ -102,7 +102,7 @@ def draft(
     if _is_box(shape, size):
         extent = json.dumps([float(size[0])] * 3)
     head = _HEAD.format(
-        name=name,
+        name=json.dumps(name, ensure_ascii=False),
         title=f"{n} vehicles fly as a {shape}" if n > 1 else "One vehicle flies",
         file=file or f"{name}.toml",
         mass=f"{mass:g}",
@@ -235,7 +235,7 @@ _HEAD = """\
 # Units are SI; x is east, y north, z up; agents count from 1. A key that is wrong is an error with a remedy.
 
 schema_version = 1
-name = "{name}"                   # results go to flights/NAME
+name = {name}                   # results go to flights/NAME
 title = "{title}"
 {keys}
 [agents]

@@ -391,4 +391,6 @@ def parse_toml(text: str, origin: str) -> dict[str, Any]:
         problem, remedy = f"is not valid TOML: {error}", "correct the line; toml.io has the format"
     except ValueError as error:  # thousands of digits
         problem, remedy = f"cannot be read as TOML: {error}", "correct it; toml.io has the format"
+    except RecursionError:
+        problem, remedy = "is nested without end", "use the keys of a mission"
     raise _unread(origin, problem, remedy)
