@@ -36,7 +36,7 @@ _SILENCE = 1.0
 #: The speed of a flight is that of the last so many seconds, once there has been one of them: phases differ a
 #: thousandfold, and while one is planned nothing moves.
 _RECENT, _KNOWN = 10.0, 1.0
-COMPILING = "Compiling the flight kernel (once, about 15 s)"
+COMPILING = "Compiling the flight kernel (once, about 20 s)"
 
 
 def out() -> Console:

@@ -63,11 +63,8 @@ def machine_code(second: "_SecondProcess | None" = None) -> list[bytes]:
         _module(function, name)
         for function, name in zip((integrate_stretch, record_stretch), native.ENTRIES, strict=False)
     )
-    if second is not None:
-        second.optimise(recorder)
-    code = _object(*integrate)
-    rest = None if second is None else second.optimised()
-    return [code, *(rest or (_object(*recorder), _monitor()))]
+    codes = [_object(*integrate), _object(*recorder)]
+    return [*codes, (second and second.monitor()) or _monitor()]
 
 
 def _monitor() -> bytes:
@@ -200,14 +197,14 @@ def _translated() -> dict[str, bytes]:
 
 
 class _SecondProcess:
-    """The second process: it translates its half, and makes two of the three objects.
+    """The second process: it translates its half, and makes the monitor.
 
     Whatever comes to nothing there is done here.
     """
 
     def __init__(self) -> None:
         self._process = subprocess.Popen(
-            native.build_process(half=True), cwd=native.ELSEWHERE, stdin=subprocess.PIPE, stdout=subprocess.PIPE
+            native.build_process(half=True), cwd=native.ELSEWHERE, stdout=subprocess.PIPE
         )  # fmt: skip
         for function, arguments in _halves()[1].items():
             function._cache = self._Half(self, function.__name__, arguments)
@@ -217,16 +214,9 @@ class _SecondProcess:
         """Its half, by the names of functions."""
         return self._answer() or {}
 
-    def optimise(self, module: tuple[str, str, str]) -> None:
-        """Ask for the object of a module, see `_object`."""
-        assert self._process.stdin is not None
-        if self.translated:
-            with suppress(OSError), self._process.stdin as stream:
-                pickle.dump(module, stream)
-
-    def optimised(self) -> tuple[bytes, bytes] | None:
-        """The object asked for, and that of the monitor."""
-        return self._answer()
+    def monitor(self) -> bytes | None:
+        """The object of the monitor."""
+        return self._answer() if self.translated else None
 
     def _answer(self) -> Any:
         assert self._process.stdout is not None
@@ -257,7 +247,6 @@ def main(*, half: bool) -> None:
     if half:
         pickle.dump(_translated(), output)
         output.flush()
-        watch = _monitor()
-        pickle.dump((_object(*pickle.load(sys.stdin.buffer)), watch), output)
+        pickle.dump(_monitor(), output)
         return
     output.write(native.joined(machine_code(_SecondProcess())))

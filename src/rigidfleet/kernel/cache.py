@@ -101,7 +101,7 @@ def not_kept(error: OSError) -> None:
         told.set()
         warnings.warn(
             f"the compiled flight kernel cannot be kept in {_named()}: {error.strerror or error}. Every process"
-            " compiles it again, which takes about 15 s, until NUMBA_CACHE_DIR names a folder that you alone can write",
+            " compiles it again, which takes about 20 s, until NUMBA_CACHE_DIR names a folder that you alone can write",
             RuntimeWarning,
             stacklevel=3,
         )
