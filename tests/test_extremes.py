@@ -520,8 +520,11 @@ def test_times_that_begin_after_take_off_make_no_collision():
 def test_a_pulse_between_steps_is_no_contradiction():
     """A user's force that the steps have not seen is in the samples, and the record holds."""
     agents = {"mass": 1.0, "position": [[0, 0, 5], [5, 0, 5]]}
-    force = {"force": lambda t, r, v: np.ones_like(r) * 4 * np.exp(-(((t - 5) / 0.02) ** 2))}
-    assert assess(simulate(held(agents, 10.0), **force)).passed
+
+    def pulse(t: float, r: Any, v: Any) -> Any:
+        return np.ones_like(r) * 4 * np.exp(-(((t - 5) / 0.02) ** 2))
+
+    assert assess(simulate(held(agents, 10.0), force=pulse)).passed
 
 
 def test_an_extreme_that_is_taken_away_is_missed():

@@ -64,7 +64,8 @@ def machine_code(second: "_SecondProcess | None" = None) -> list[bytes]:
         for function, name in zip((integrate_stretch, record_stretch), native.ENTRIES, strict=False)
     )
     codes = [_object(*integrate), _object(*recorder)]
-    return [*codes, (second and second.monitor()) or _monitor()]
+    made = None if second is None else second.monitor()
+    return [*codes, made or _monitor()]
 
 
 def _monitor() -> bytes:
