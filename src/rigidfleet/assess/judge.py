@@ -131,7 +131,7 @@ def _shapes(flight: Flight, phases: list[PhaseVerdict]) -> Iterator[Finding]:
         shaping = p.kind in ("establish", "reshape") or i == len(phases) - 1
         if not (shaping and p.finished) or p.formation is None:
             continue
-        last = flight.result.samples(i).stop - 1
+        last = flight.samples[i].stop - 1
         edges, _ = flight.edges(p.formation, last)
         held = False
         if p.distances is not None:

@@ -109,6 +109,8 @@ class Flight:
         self.labels = result.edge_labels
         self.fits: dict[int, Fit] = {}
         self.left = result.left
+        #: Samples of each phase.
+        self.samples = [result.samples(k) for k in range(len(result.phases))]
         radius, obstacles = self.mission.agents.radius, self.mission.obstacles
         #: Room of each agent to obstacles, and the nearest one (K, N).
         self.room, self.nearest = geometry.rooms(result.position, radius, obstacles)
@@ -139,7 +141,7 @@ class Flight:
         }
         #: The worst of each quantity at the samples of each phase.
         self.sampled = [
-            {name: self.worst_sample(q, result.samples(k)) for name, q in self.measured.items()}
+            {name: self.worst_sample(q, self.samples[k]) for name, q in self.measured.items()}
             for k in range(len(result.phases))
         ]
 
@@ -319,7 +321,7 @@ class Flight:
                 words = f"its {name} is up to {value(worst, unit)} off what its own samples give"
                 yield words, float(time[k])
         for index, phase in enumerate(result.phases):
-            samples = result.samples(index)
+            samples = self.samples[index]
             if samples.stop > samples.start and phase.extremes:
                 due = ["speed", "lowest", "highest", "thrust"]
                 due += ["separation"] if self.left[samples.start].sum() > 1 else []
@@ -349,7 +351,7 @@ class Flight:
 
     def phase(self, index: int, record: PhaseRecord) -> PhaseVerdict:
         """Numbers of a phase."""
-        result, samples = self.result, self.result.samples(index)
+        result, samples = self.result, self.samples[index]
         flown, last = samples.stop > samples.start, samples.stop - 1
         finished = flown and (result.complete or index < len(result.phases) - 1)
         fit = distances = flip = constraint = None
