@@ -130,29 +130,27 @@ def agrees(mission: Mission, result: Result, steps: Steps, spacing: float) -> in
     return touched
 
 
-def test_random_flights_are_judged_by_what_happens_between_samples(monkeypatch):
-    """Of random flights that touch or graze, none passes that touches, and none fails that does not."""
-    rng, touched = np.random.default_rng(1), 0
-    for _ in range(60):
+def touches(monkeypatch: pytest.MonkeyPatch, seed: int, count: int, spacing: float) -> int:
+    """How many things are touched in random flights, each of which agrees with its fine samples."""
+    rng, touched = np.random.default_rng(seed), 0
+    for _ in range(count):
         mission = Mission.from_dict(a_flight(rng))
         with monkeypatch.context() as patch:
             steps = Steps(patch)
             result = simulate(mission)
-        touched += agrees(mission, result, steps, 1e-4)
-    assert 20 < touched < 100
+        touched += agrees(mission, result, steps, spacing)
+    return touched
+
+
+def test_random_flights_are_judged_by_what_happens_between_samples(monkeypatch):
+    """Of random flights that touch or graze, none passes that touches, and none fails that does not."""
+    assert 20 < touches(monkeypatch, 1, 60, 1e-4) < 100
 
 
 @pytest.mark.long
 def test_two_thousand_random_flights_are_judged_by_what_happens_between_samples(monkeypatch):
     """As above, 2,000 of them, against samples every 1e-5 s."""
-    rng, touched = np.random.default_rng(2), 0
-    for _ in range(2000):
-        mission = Mission.from_dict(a_flight(rng))
-        with monkeypatch.context() as patch:
-            steps = Steps(patch)
-            result = simulate(mission)
-        touched += agrees(mission, result, steps, 1e-5)
-    assert 700 < touched < 3500
+    assert 700 < touches(monkeypatch, 2, 2000, 1e-5) < 3500
 
 
 # -- forces, large fleets, formulations

@@ -53,16 +53,6 @@ _NAMES = {
 }
 _OF_FLIGHT = {"clearance_start": records.STANDING, "clearance_flight": records.FLYING}
 
-_KNOTS = np.linspace(0.0, 1.0, 5)
-
-
-def _bernstein(x: Array) -> Array:
-    """Bernstein polynomials (..., 5) of fourth degree at x (...)."""
-    return np.stack([math.comb(4, k) * x**k * (1.0 - x) ** (4 - k) for k in range(5)], axis=-1)
-
-
-_FROM_KNOTS = np.linalg.inv(_bernstein(_KNOTS))
-
 
 class Extremes:
     """Watches a flight, and tells what the worst of each phase was."""
@@ -189,7 +179,8 @@ class Extremes:
             if moved.max() > self.spare:
                 if h > _SHORTEST * length:
                     halves = (
-                        _FROM_KNOTS @ (_bernstein((_KNOTS + k) / 2.0) @ points) for k in (0, 1)
+                        records.FROM_KNOTS @ (records.bernstein((records.KNOTS + k) / 2.0) @ points)
+                        for k in (0, 1)
                     )
                     first, second = map(np.ascontiguousarray, halves)
                     pieces += [(t + 0.5 * h, 0.5 * h, second), (t, 0.5 * h, first)]

@@ -256,7 +256,7 @@ def _since(flight: Flight, name: str, sampled: Floats) -> str:
 def _clearances(flight: Flight) -> Iterator[Finding]:
     """Obstacles in flight; and apart from that, those on which vehicles stand at the start and at the end."""
     found = {name: e for name, e in flight.clearances().items() if e is not None}
-    every = [*found.values(), flight.worst_clearance("clearance")]
+    every = [*found.values(), flight.worst_clearance()]
     e = min((e for e in every if e is not None), key=lambda e: e.value)
     hit = e.value < -_CONTACT
     if not hit:

@@ -269,7 +269,7 @@ class Flight:
         stands = parts["clearance_start"].any() or parts["clearance_end"].any()
         if not (stands or told & {"clearance_start", "clearance_end"}):
             # All fly, all the time.
-            return {"clearance_flight": self.worst_clearance("clearance")}
+            return {"clearance_flight": self.worst_clearance()}
         found = {}
         for name, part in parts.items():
             values = np.where(part, room, np.nan)
@@ -279,11 +279,10 @@ class Flight:
             found[name] = self.worst(name, sampled, lambda x: -x)
         return found
 
-    def worst_clearance(self, name: str) -> Extreme | None:
+    def worst_clearance(self) -> Extreme | None:
         """Least room to an obstacle [m] of all vehicles, standing ones among them."""
-        return self.worst(
-            name, self.extreme(self.close[2], self.obstacle, lambda x: -x), lambda x: -x
-        )
+        sampled = self.extreme(self.close[2], self.obstacle, np.negative)
+        return self.worst("clearance", sampled, np.negative)
 
     def fallen_on(self) -> Extreme | None:
         """Least room [m] between a lost agent and one that is left; None if none is lost."""

@@ -28,8 +28,10 @@ from rigidfleet.kernel.records import (
     CONSTRAINT,
     CONSTRAINT_FORCE,
     FLYING,
+    FROM_KNOTS,
     GEOFENCE,
     HIGHEST,
+    KNOTS,
     LOST,
     LOWEST,
     SEPARATION,
@@ -54,12 +56,6 @@ _TURN = 0.1
 #: Evaluations that a greatest force is looked for with, at most.
 _TRIES = 12
 
-_KNOTS = np.linspace(0.0, 1.0, 5)
-#: Bernstein polynomials (5, 5) at the knots, and from values there to coefficients.
-_BERNSTEIN = np.array(
-    [[math.comb(4, k) * x**k * (1 - x) ** (4 - k) for k in range(5)] for x in _KNOTS]
-)
-_FROM_KNOTS = np.linalg.inv(_BERNSTEIN)
 #: Coefficients of a square: C(4, i) C(4, j) / C(8, i + j).
 _SQUARE = np.array(
     [[math.comb(4, i) * math.comb(4, j) / math.comb(8, i + j) for j in range(5)] for i in range(5)]
@@ -345,7 +341,7 @@ def attitudes(points, part, parts, p, monitor):
     state = monitor.room[0]
     for k in range(5):
         basis, pose = monitor.basis[k], monitor.poses[k]
-        weights((part + _KNOTS[k]) / parts, basis)
+        weights((part + KNOTS[k]) / parts, basis)
         size = 0.0
         for s in range(10):
             state[s] = 0.0
@@ -400,7 +396,7 @@ def in_world(points, i, moving, p, monitor, out):
         for q in range(3):
             out[k, q] = 0.0
             for j in range(5):
-                out[k, q] += _FROM_KNOTS[k, j] * at[j, q]
+                out[k, q] += FROM_KNOTS[k, j] * at[j, q]
 
 
 # -- distances ---------------------------------------------------------------------------------------

@@ -26,6 +26,18 @@ LEAST_ERROR = math.log(1e-4)
 _TRAIL = 1 << 19
 
 
+#: Five points of a step, and from values there to Bernstein coefficients (5, 5).
+KNOTS = np.linspace(0.0, 1.0, 5)
+
+
+def bernstein(x: Array) -> Array:
+    """Bernstein polynomials (..., 5) of fourth degree at x (...)."""
+    return np.stack([math.comb(4, k) * x**k * (1.0 - x) ** (4 - k) for k in range(5)], axis=-1)
+
+
+FROM_KNOTS = np.linalg.inv(bernstein(KNOTS))
+
+
 class Trail(NamedTuple):
     """Steps as they were flown, for whoever looks between samples; no rows, and none are kept.
 
