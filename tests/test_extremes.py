@@ -1,6 +1,7 @@
 """Extremes in continuous time, against the same steps and continuous extension sampled finely."""
 
 import math
+import time
 from typing import Any
 
 import numpy as np
@@ -551,3 +552,31 @@ def test_a_list_of_pairs_ends_with_its_phase():
     data = {"schema_version": 1, "name": "two", "agents": agents, "phases": phases}
     verdict = assess(simulate(Mission.from_dict(data)))
     assert not any(f.check == "record" for f in verdict.findings)
+
+
+def test_distances_of_a_thousand_kilometres_cost_no_eternity():
+    """Among lengths known to a micrometre the search ends there; the flight itself fails, and says why."""
+    far = 5e7
+    mission = Mission.from_dict({
+        "schema_version": 1, "name": "far", "architecture": "body", "formulation": "body",
+        "agents": {"mass": 1.0, "position": [
+            [-12.0, -474467.8, 0.0], [0.0, far, far], [far, -far, -far],
+            [24589534.9, -56608243.2, 0.0], [0.0, -far, 1.0], [0.0, 70110346.2, 1.0],
+        ]},
+        "constraint": {"solver": "iterated"},
+        "formations": {"a": {"slots": [
+            [1.96, 0.07, 0.0], [0.0, 1.28, 0.0], [1.28, -3.47, 0.0],
+            [-0.39, 0.0, 0.0], [4.0, -2.0, -2.0], [0.0, -4.0, -4.0],
+        ]}, "b": {"slots": [
+            [1.96, 0.07, 0.0], [0.0, 1.28, 0.0], [1.28, -3.47, 0.0],
+            [-0.39, 0.0, 0.0], [4.0, -2.0, -2.0], [0.0, -4.0, -4.0],
+        ]}},
+        "phases": [
+            {"kind": "turn", "travel": 2e-6, "yaw_deg": 1e6, "pitch_deg": 0.0,
+             "settle": {"tolerance": 4.0, "dwell": 0.1, "timeout": 2.0}},
+            {"kind": "hold", "duration": 2.0},
+        ],
+    })  # fmt: skip
+    begun = time.process_time()
+    assert "step size has fallen" in simulate(mission).ending
+    assert time.process_time() - begun < 60.0

@@ -158,13 +158,13 @@ def shortest(curve, floor, work, pieces):
     A squared length of some meters knows one of a millimetre to rounding alone: of long pieces both halves are looked
     at again once it is known how short they come.
     """
-    best, at, top = floor, -1.0, 0
+    best, at, top, count = floor, -1.0, 0, 0
     for k in range(5):
         for q in range(3):
             pieces[0, 3 * k + q] = curve[k, q]
     pieces[0, 15], pieces[0, 16] = 0.0, 1.0
     while top >= 0:
-        piece = pieces[top]
+        piece, count = pieces[top], count + 1
         middle, along, size = 0.0, math.inf, 0.0
         for q in range(3):
             middle += piece[6 + q] * piece[6 + q]
@@ -186,7 +186,11 @@ def shortest(curve, floor, work, pieces):
             length = length_at(piece, found)
             if length < best:
                 best, at = length, piece[15] + found * piece[16]
-        if _ROUNDING * size > CLOSE * max(2.0 * best, 1e-5) and piece[16] > _SHORTEST:
+        close = max(CLOSE, _ROUNDING * math.sqrt(size))  # what a length is known to at all
+        known = _ROUNDING * size <= close * max(2.0 * best, 1e-5)
+        if count > _MOST and not known and along < best * math.sqrt(middle):
+            best, at = along / math.sqrt(middle), piece[15]
+        elif not known and piece[16] > _SHORTEST:
             halve(piece, pieces[top + 2])
             top += 2
     return best, at
