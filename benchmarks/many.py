@@ -30,13 +30,13 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from rigidfleet import formation as shapes
-from rigidfleet.assess.measure import Fit
-from rigidfleet.design import GRAPHS as DESIGNS
+from rigidfleet.assessment.measure import Fit
+from rigidfleet.formation import shapes
 from rigidfleet.mission import Mission, load_mission
+from rigidfleet.planning.solvers import WORDS
 from rigidfleet.rigidity import spectrum
-from rigidfleet.simulate import simulate
-from rigidfleet.solvers import WORDS
+from rigidfleet.rigidity.design import GRAPHS as DESIGNS
+from rigidfleet.simulation.flight import simulate
 
 SPACING, DURATION, RATE = 2.0, 20.0, 0.1  # [m], [s], [rad/s]
 LOAD = 0.05  # on an agent of the sheet, greatest [N]

@@ -27,15 +27,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rigidfleet import formation as shapes
-from rigidfleet.assess import assess
+from rigidfleet.assessment import assess
 from rigidfleet.errors import FlightError
-from rigidfleet.geometry import smallest_singular_value
+from rigidfleet.formation import shapes
+from rigidfleet.math.proximity import smallest_singular_value
 from rigidfleet.mission import Mission, load_mission, mission_names
+from rigidfleet.planning.reference import align_slots
 from rigidfleet.result import Result
 from rigidfleet.rigidity import Verdict, analyse, jacobian
-from rigidfleet.route import align_slots
-from rigidfleet.simulate import simulate
+from rigidfleet.simulation.flight import simulate
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

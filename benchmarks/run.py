@@ -27,17 +27,18 @@ from rich.console import Console
 from rich.table import Table
 from scipy_peer import Literal, Peer, constant, squared
 
-from rigidfleet import formation as shapes
-from rigidfleet.ensemble import establish
-from rigidfleet.kernel import native, records
-from rigidfleet.kernel.program import workspace
-from rigidfleet.kernel.trace import Code, Trace
+from rigidfleet.formation import shapes
+from rigidfleet.kernel import records
+from rigidfleet.kernel.engine import native
+from rigidfleet.kernel.engine.tracer import Code, Trace
+from rigidfleet.kernel.problem import workspace
 from rigidfleet.mission import Mission, load_mission
-from rigidfleet.plan import plan_phase
-from rigidfleet.route import Situation
-from rigidfleet.simulate import simulate
+from rigidfleet.planning.plan import plan_phase
+from rigidfleet.planning.reference import Situation
+from rigidfleet.simulation.ensemble import establish
+from rigidfleet.simulation.flight import simulate
 from rigidfleet.sweep import Sweep, fly
-from rigidfleet.sweep.engine import fly_runs
+from rigidfleet.sweep.run import fly_runs
 
 TOLERANCE = 1e-8
 DURATION, SAMPLES = 20.0, 200

@@ -5,9 +5,9 @@
 
 from collections import Counter
 
-from rigidfleet.design import design
-from rigidfleet.formation import CUBE_EDGES, complete_graph, slots
+from rigidfleet.formation.shapes import CUBE_EDGES, complete_graph, slots
 from rigidfleet.rigidity import Kind, Verdict, analyse, realisations
+from rigidfleet.rigidity.design import design
 
 SHAPES = [
     ("triangle", 4.0, 3),

@@ -10,9 +10,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
 
-from rigidfleet import attitude, gains, physics
-from rigidfleet.figures.style import DASHES, FAINT, FLOWN, GREY, INK, PALETTE, TONES
-from rigidfleet.formation import complete_graph, kabsch, slots
+from rigidfleet import physics
+from rigidfleet.formation.shapes import complete_graph, kabsch, slots
+from rigidfleet.math import attitude
+from rigidfleet.math import pid as gains
+from rigidfleet.plotting.style import DASHES, FAINT, FLOWN, GREY, INK, PALETTE, TONES
 
 BLUE, ORANGE, GREEN, RED = PALETTE[:4]
 PALE = "#F4F7FA"

@@ -15,8 +15,8 @@ from PIL import Image
 from shapes import SHAPES
 
 import rigidfleet as rf
-from rigidfleet.figures import write_figure
-from rigidfleet.figures.style import settings
+from rigidfleet.plotting import write_figure
+from rigidfleet.plotting.style import settings
 from rigidfleet.sweep import Sweep, fly
 from rigidfleet.sweep.figures import over_two
 

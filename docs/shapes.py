@@ -9,14 +9,14 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import rigidfleet as rf
-from rigidfleet import gains
-from rigidfleet.design import design
-from rigidfleet.figures import space
-from rigidfleet.figures.graph import graphs
-from rigidfleet.figures.style import DASHES, FLOWN, GREY, INK, PALETTE
-from rigidfleet.formation import CUBE_EDGES, slots
+from rigidfleet.formation.shapes import CUBE_EDGES, slots
+from rigidfleet.math import pid as gains
 from rigidfleet.mission import Mission
+from rigidfleet.plotting import space
+from rigidfleet.plotting.graph import graphs
+from rigidfleet.plotting.style import DASHES, FLOWN, GREY, INK, PALETTE
 from rigidfleet.rigidity import Kind, analyse, realisations
+from rigidfleet.rigidity.design import design
 
 BLUE, ORANGE, GREEN, RED = PALETTE[:4]
 

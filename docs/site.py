@@ -71,7 +71,7 @@ def _page_of(source: str) -> str:
 def _paper_figures() -> dict[str, bytes]:
     """Every figure of the paper that a mission draws: file name and SVG."""
     import rigidfleet as rf
-    from rigidfleet import figures
+    from rigidfleet import plotting as figures
 
     found: dict[str, bytes] = {}
     flown: dict[str, Any] = {}

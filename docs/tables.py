@@ -10,7 +10,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from rigidfleet.formation import SHAPES, agents_taken
+from rigidfleet.formation.shapes import SHAPES, agents_taken
 from rigidfleet.mission import bounds, json_schema
 from rigidfleet.result import LABELS, VARIABLES
 from rigidfleet.sweep import METRICS

@@ -11,7 +11,7 @@ import numpy as np
 
 import rigidfleet as rf
 from rigidfleet import physics
-from rigidfleet.formation import complete_graph, distances
+from rigidfleet.formation.shapes import complete_graph, distances
 from rigidfleet.mission import Mission
 
 COUNTED = 12.0  # [s] what is measured comes after this

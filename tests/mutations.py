@@ -348,7 +348,7 @@ def tried(kind: str, seed: int, folder: Path, whole: bytes) -> dict[str, Any]:
             [[]] * 33 + [["replay", str(path), "--force"]] * 6 + [["report", str(path), "--force"]]
         ),
     }[kind]
-    from rigidfleet.cli import main
+    from rigidfleet.cli.app import main
 
     begun = time.process_time()
     try:
@@ -372,9 +372,9 @@ def tried(kind: str, seed: int, folder: Path, whole: bytes) -> dict[str, Any]:
 
 def seen(path: Path, dice: Dice) -> int:
     """Judge a result and draw one of its figures, as `report` would all of them; the exit code that it would have."""
-    from rigidfleet.assess import assess
+    from rigidfleet.assessment import assess
     from rigidfleet.errors import ResultError
-    from rigidfleet.figures import figure_names, plot
+    from rigidfleet.plotting import figure_names, plot
     from rigidfleet.result import Result
 
     try:
@@ -405,7 +405,7 @@ def long(path: Path) -> bool:
 def a_flight(folder: Path) -> bytes:
     """A result that is right."""
     from rigidfleet.mission import Mission, mission_text
-    from rigidfleet.simulate import simulate
+    from rigidfleet.simulation.flight import simulate
 
     data = tomllib.loads(mission_text("narrow-passage"))
     data["output_step"] = 1.0
@@ -419,7 +419,7 @@ def work(kind: str, first: int, count: int, whole: Path | None) -> None:
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     os.environ["OPENBLAS_NUM_THREADS"] = "1"
     warnings.simplefilter("ignore")
-    from rigidfleet import accuracy
+    from rigidfleet.planning import tolerances as accuracy
 
     # A phase may take only so many steps, that a case takes a second and no minute.
     vars(accuracy).update(_STALLED=3000, _STALLED_RATE=0.0)

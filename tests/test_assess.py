@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from rigidfleet import attitude as att
-from rigidfleet import formation as shapes
-from rigidfleet.assess import SHAPE_TOLERANCE, Finding, Verdict, assess
-from rigidfleet.assess.measure import Fit
-from rigidfleet.geometry import clearance, separation
+from rigidfleet.assessment import SHAPE_TOLERANCE, Finding, Verdict, assess
+from rigidfleet.assessment.measure import Fit
+from rigidfleet.formation import shapes
+from rigidfleet.math import attitude as att
+from rigidfleet.math.proximity import clearance, separation
 from rigidfleet.mission import Mission
 from rigidfleet.result import LABELS, VARIABLES, PhaseRecord, Result
 
@@ -725,7 +725,7 @@ def test_names_in_a_mission_are_not_markup():
 def test_judging_is_light():
     """Neither rich nor the compiler nor any plotting is imported to judge a flight."""
     code = (
-        "import sys, rigidfleet.assess; "
+        "import sys, rigidfleet.assessment; "
         "heavy = {'rich', 'numba', 'scipy', 'pydantic', 'h5netcdf', 'matplotlib'} & set(sys.modules); "
         "sys.exit(str(heavy) if heavy else 0)"
     )

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from rigidfleet.attitude import (
+from rigidfleet.math.attitude import (
     angle_between,
     dcm_from_euler,
     dcm_from_quaternion,

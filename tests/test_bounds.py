@@ -6,13 +6,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rigidfleet import cli, screen, turbulence
+from rigidfleet.cli import app as cli
+from rigidfleet.cli import console as screen
 from rigidfleet.errors import MissionError
+from rigidfleet.math import turbulence
 from rigidfleet.mission import Mission, json_schema, mission_names, mission_text
 from rigidfleet.mission import bounds as limits
 from rigidfleet.mission.bounds import excess
 from rigidfleet.mission.formations import coincident
-from rigidfleet.preflight import preflight
+from rigidfleet.preflight.check import preflight
 
 HEAD = 'schema_version = 1\nname = "a"\n'
 HOLD = "[[phases]]\nkind = 'hold'\nduration = 10.0\n"
@@ -270,7 +272,7 @@ def test_a_long_check_says_what_it_does(tmp_path: Path, monkeypatch, capsys):
     assert cli.main(["check", str(tmp_path / "a.toml")]) != cli.BAD_INPUT
     assert "Checking" not in capsys.readouterr().err
     monkeypatch.setattr(screen, "_PATIENCE", 0.05)
-    monkeypatch.setattr("rigidfleet.preflight._gains", lambda *_: time.sleep(0.5) or 1 // 0)
+    monkeypatch.setattr("rigidfleet.preflight.check._gains", lambda *_: time.sleep(0.5) or 1 // 0)
     cli.main(["check", str(tmp_path / "a.toml")])
     assert re.search(r"Checking .*a.toml: the way, \d+ s", capsys.readouterr().err)
 

@@ -19,7 +19,10 @@ from typing import Any
 import llvmlite.binding as llvm
 import pytest
 
-from rigidfleet.kernel import cache, cache_directory, compiled, is_compiled, native
+from rigidfleet.kernel import cache_directory, is_compiled
+from rigidfleet.kernel.compiler import cache
+from rigidfleet.kernel.compiler import jit as compiled
+from rigidfleet.kernel.engine import native
 
 PLANTED, OWN = 666, 1
 SOMEONE = 12345

@@ -16,16 +16,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rigidfleet import cli, screen
-from rigidfleet.design import design
+from rigidfleet.cli import app as cli
+from rigidfleet.cli import console as screen
 from rigidfleet.errors import FlightError
-from rigidfleet.figures import figure_names
-from rigidfleet.formation import SHAPES, neighbours
-from rigidfleet.formation import slots as slots_of
+from rigidfleet.formation.shapes import SHAPES, neighbours
+from rigidfleet.formation.shapes import slots as slots_of
 from rigidfleet.mission import mission_names, mission_text
+from rigidfleet.plotting import figure_names
 from rigidfleet.result import Result
 from rigidfleet.rigidity import jacobian, spectrum
-from rigidfleet.simulate import Progress
+from rigidfleet.rigidity.design import design
+from rigidfleet.simulation.flight import Progress
 
 TRIANGLE = """
 schema_version = 1
@@ -71,7 +72,7 @@ def simulate(monkeypatch):
     """Replace the simulation by another function."""
 
     def replace(function):
-        monkeypatch.setattr(sys.modules["rigidfleet.simulate"], "simulate", function)
+        monkeypatch.setattr(sys.modules["rigidfleet.simulation.flight"], "simulate", function)
 
     return replace
 
@@ -105,7 +106,7 @@ def test_help_is_light():
     heavy = {"numpy", "scipy", "numba", "pydantic", "matplotlib", "h5py", "h5netcdf", "xarray"}
     code = f"""if True:
         import sys
-        from rigidfleet.cli import main
+        from rigidfleet.cli.app import main
         for tokens in [], ["--help"], ["run", "--help"], ["--version"], ["fly"]:
             main(tokens)
         sys.exit(", ".join(sorted({heavy!r} & set(sys.modules))) or None)
@@ -590,7 +591,7 @@ def test_bugs_are_not_hidden(capsys, monkeypatch, simulate):
     assert "a fault of rigidfleet, not of yours" in told
     flags = type("Flags", (), {"dev_mode": True})
     monkeypatch.setattr(
-        "rigidfleet.cli.sys", type("Sys", (), {"flags": flags, "stderr": sys.stderr})
+        "rigidfleet.cli.app.sys", type("Sys", (), {"flags": flags, "stderr": sys.stderr})
     )
     with pytest.raises(ZeroDivisionError):
         cli.main(["run", "short.toml", "--quiet"])
@@ -658,7 +659,7 @@ def test_interrupt_of_drawing(capsys, monkeypatch):
     def draw(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("rigidfleet.figures.plot", draw)
+    monkeypatch.setattr("rigidfleet.plotting.plot", draw)
     assert cli.main(["run", "short.toml"]) == cli.INTERRUPTED
     assert capsys.readouterr().err.startswith("Interrupted: the flight is saved in flights")
     assert Result.load("flights/short/short.nc").complete
@@ -693,7 +694,7 @@ def plot(monkeypatch):
         for name, kind in itertools.product(names, formats):
             write(Path(folder, f"{name}.{kind}"), "drawn" if titles else "bare")
 
-    monkeypatch.setattr("rigidfleet.figures.plot", draw)
+    monkeypatch.setattr("rigidfleet.plotting.plot", draw)
 
 
 def test_run_draws(capsys, plot):
@@ -820,7 +821,7 @@ def test_live(capsys, monkeypatch):
         asked.append((mission.name, port, browser))
         ready("http://127.0.0.1:1/secret/")
 
-    monkeypatch.setattr(import_module("rigidfleet.live"), "live", fly)
+    monkeypatch.setattr(import_module("rigidfleet.web.live"), "live", fly)
     assert cli.main(["live", "short.toml"]) == cli.PASSED
     assert cli.main(["live", "narrow-passage", "--port", "8000", "--no-browser"]) == cli.PASSED
     assert asked == [("short", 0, True), ("narrow-passage", 8000, False)]

@@ -7,9 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
-from rigidfleet import formation as f
-from rigidfleet.design import design, limits, mission_fragment
+from rigidfleet.formation import shapes as f
 from rigidfleet.rigidity import Verdict, analyse, full_rank, jacobian
+from rigidfleet.rigidity.design import design, limits, mission_fragment
 
 CUBE = f.slots("cube", 4.0, 8)
 BEST_CUBE = (3 - np.sqrt(5)) / 2  # 0.38197

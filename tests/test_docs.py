@@ -11,11 +11,11 @@ from types import ModuleType
 
 import pytest
 
-from rigidfleet.assess import assess
+from rigidfleet.assessment import assess
 from rigidfleet.errors import MissionError
-from rigidfleet.figures import figure_names
 from rigidfleet.mission import Mission, mission_names, mission_text
-from rigidfleet.simulate import simulate
+from rigidfleet.plotting import figure_names
+from rigidfleet.simulation.flight import simulate
 
 ROOT = Path(__file__).parents[1]
 PAGES = [
@@ -122,7 +122,7 @@ def test_finite_horizons_need_an_arrival(ending):
 
 def test_first_flight(tmp_path, monkeypatch, capsys):
     """The commands of the first flight do what the page says, up to the flight that hits the wall."""
-    from rigidfleet.cli import main
+    from rigidfleet.cli.app import main
 
     monkeypatch.chdir(tmp_path)
     text = page("first-flight.md")
@@ -164,7 +164,7 @@ def test_controller_page(capsys):
 
 def test_sweep_page(tmp_path, monkeypatch, capsys):
     """The lines, the file and the code of the page on sweeps are right, and fly."""
-    from rigidfleet.cli import main
+    from rigidfleet.cli.app import main
     from rigidfleet.sweep import Sweep
 
     monkeypatch.chdir(tmp_path)
@@ -272,7 +272,7 @@ def test_links_lead_somewhere(path):
 
 def test_commands_are_documented(capsys):
     """Every command and option of `rigidfleet` stands in missions.md, and no other option."""
-    from rigidfleet.cli import main
+    from rigidfleet.cli.app import main
 
     text = page("missions.md").split("\n## Commands")[1].split("\n## ")[0]
     options = set()

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from rigidfleet.assess import assess
+from rigidfleet.assessment import assess
 from rigidfleet.errors import MissionError
-from rigidfleet.formation import SHAPES
+from rigidfleet.formation.shapes import SHAPES
 from rigidfleet.mission import Mission
 from rigidfleet.mission.draft import agents_for, draft, shape_for
-from rigidfleet.preflight import preflight
-from rigidfleet.simulate import simulate
+from rigidfleet.preflight.check import preflight
+from rigidfleet.simulation.flight import simulate
 
 
 @pytest.mark.parametrize("shape", SHAPES)

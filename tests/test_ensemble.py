@@ -1,11 +1,11 @@
-"""Many flights at once: `rigidfleet.ensemble` and `rigidfleet.kernel.ensemble`."""
+"""Many flights at once: `rigidfleet.simulation.ensemble` and `rigidfleet.kernel.engine.batch`."""
 
 import numpy as np
 import pytest
 
-from rigidfleet.ensemble import establish
 from rigidfleet.mission import Mission, load_mission
-from rigidfleet.simulate import simulate
+from rigidfleet.simulation.ensemble import establish
+from rigidfleet.simulation.flight import simulate
 
 
 def table_1(end: float = 10.0) -> Mission:

@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from rigidfleet import formation, lqr, physics
-from rigidfleet.assess import assess
-from rigidfleet.attitude import dcm_from_rotation_vector, triangle_frame
-from rigidfleet.geometry import smallest_singular_value
+from rigidfleet import physics
+from rigidfleet.assessment import assess
+from rigidfleet.formation import shapes as formation
+from rigidfleet.math import lqr
+from rigidfleet.math.attitude import dcm_from_rotation_vector, triangle_frame
+from rigidfleet.math.proximity import smallest_singular_value
 from rigidfleet.mission import Mission, load_mission
-from rigidfleet.simulate import simulate
+from rigidfleet.simulation.flight import simulate
 
 Array = NDArray[np.float64]
 

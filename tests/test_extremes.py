@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rigidfleet import extremes as watching
-from rigidfleet import geometry
-from rigidfleet.assess import assess
+from rigidfleet.assessment import assess
 from rigidfleet.errors import FlightError
-from rigidfleet.geometry import headroom, rooms
+from rigidfleet.math import proximity as geometry
+from rigidfleet.math.proximity import headroom, rooms
 from rigidfleet.mission import Mission, load_mission
 from rigidfleet.result import Extremum, Result
-from rigidfleet.simulate import FlightInterrupted, simulate
+from rigidfleet.simulation import extremes as watching
+from rigidfleet.simulation.flight import FlightInterrupted, simulate
 
 CLOSE = 1e-6
 

@@ -13,9 +13,11 @@ from typing import Any
 
 import pytest
 
-from rigidfleet import cli, screen
+from rigidfleet.cli import app as cli
+from rigidfleet.cli import console as screen
 from rigidfleet.errors import ResultError
-from rigidfleet.kernel import compiled, native
+from rigidfleet.kernel.compiler import jit as compiled
+from rigidfleet.kernel.engine import native
 from rigidfleet.result import Result
 
 MISSION = """
@@ -124,7 +126,9 @@ def test_no_permission(
 ):
     """What may not be read or written is said before anything is flown, and stays as it is."""
     monkeypatch.setattr(
-        sys.modules["rigidfleet.simulate"], "simulate", lambda *_, **__: pytest.fail("it flew")
+        sys.modules["rigidfleet.simulation.flight"],
+        "simulate",
+        lambda *_, **__: pytest.fail("it flew"),
     )
     folder.chmod(0o755)
     Path("secret.toml").write_text(MISSION, encoding="utf-8")

@@ -15,11 +15,12 @@ from matplotlib.lines import Line2D
 from matplotlib.text import Text
 from PIL import Image
 
-from rigidfleet import attitude as att
-from rigidfleet import figures, geometry
+from rigidfleet import plotting as figures
 from rigidfleet.errors import ResultError
-from rigidfleet.figures import curves, space, style
+from rigidfleet.math import attitude as att
+from rigidfleet.math import proximity as geometry
 from rigidfleet.mission import Mission
+from rigidfleet.plotting import curves, space, style
 from rigidfleet.result import VARIABLES, PhaseRecord, Result
 
 START = [[1.0, 6.0, 3.0], [8.0, 3.0, 3.0], [7.0, 6.0, 3.0]]
@@ -881,9 +882,9 @@ def test_drawing_leaves_matplotlib_alone(triangle, tmp_path):
 def test_matplotlib_waits_until_something_is_drawn():
     """Importing the figures imports no matplotlib, and drawing no pyplot."""
     code = (
-        "import sys, rigidfleet.figures as f\n"
+        "import sys, rigidfleet.plotting as f\n"
         "assert 'matplotlib' not in sys.modules\n"
-        "from rigidfleet.figures.style import settings\n"
+        "from rigidfleet.plotting.style import settings\n"
         "with settings(): pass\n"
         "import matplotlib.figure, mpl_toolkits.mplot3d.art3d\n"
         "assert 'matplotlib.pyplot' not in sys.modules\n"

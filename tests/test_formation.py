@@ -6,10 +6,10 @@ from hypothesis.extra.numpy import arrays
 from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
 
-from rigidfleet import formation as f
 from rigidfleet.errors import MissionError
+from rigidfleet.formation import shapes as f
+from rigidfleet.planning.solvers import sweep_steps
 from rigidfleet.rigidity import jacobian, spectrum
-from rigidfleet.solvers import sweep_steps
 
 NAMED = [
     ("line", 4.0, 3),

@@ -20,11 +20,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from rigidfleet import accuracy
-from rigidfleet.assess import assess
+from rigidfleet.assessment import assess
 from rigidfleet.errors import FlightError, MissionError
 from rigidfleet.mission import Mission
-from rigidfleet.simulate import simulate
+from rigidfleet.planning import tolerances as accuracy
+from rigidfleet.simulation.flight import simulate
 
 Data = dict[str, Any]
 
@@ -317,7 +317,7 @@ def test_the_fuzzer_finds_what_there_is(tmp_path: Path, monkeypatch: pytest.Monk
     ):
         (tmp_path / "rigidfleet").mkdir(exist_ok=True)
         (tmp_path / "rigidfleet" / "__init__.py").write_text("")
-        (tmp_path / "rigidfleet" / "accuracy.py").write_text("")
+        (tmp_path / "rigidfleet" / "planning/tolerances.py").write_text("")
         (tmp_path / "rigidfleet" / "cli.py").write_text(f"def main(_):\n    {body}\n")
         monkeypatch.setenv("PYTHONPATH", str(tmp_path))
         monkeypatch.setenv("MUTATIONS_SECONDS", "1")

@@ -7,7 +7,14 @@ import pytest
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
-from rigidfleet.gains import error_response, is_stable, overshoot, poles, settling_time, triple_pole
+from rigidfleet.math.pid import (
+    error_response,
+    is_stable,
+    overshoot,
+    poles,
+    settling_time,
+    triple_pole,
+)
 
 CASE = json.loads((Path(__file__).parent / "data/reference_pid_unit_response.json").read_text())
 

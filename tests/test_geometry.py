@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from rigidfleet import formation, geometry
+from rigidfleet.formation import shapes as formation
+from rigidfleet.math import proximity as geometry
 from rigidfleet.mission import Box, Ground
 
 seeds = st.integers(0, 2**32 - 1)

@@ -8,10 +8,12 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from rigidfleet import attitude, gains, physics
+from rigidfleet import physics
+from rigidfleet.math import attitude
+from rigidfleet.math import pid as gains
 from rigidfleet.mission import Mission, load_mission
 from rigidfleet.result import Result
-from rigidfleet.simulate import simulate
+from rigidfleet.simulation.flight import simulate
 
 SOLVERS = ["iterated", "spectral", "exact", "pinv"]
 TIMES = np.linspace(0.0, 4.0, 9)

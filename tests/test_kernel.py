@@ -12,22 +12,23 @@ import pytest
 from numba import types
 from scipy.spatial.transform import Rotation
 
-from rigidfleet import attitude, physics
+from rigidfleet import physics
 from rigidfleet.kernel import (
-    body,
     cache_directory,
     constraint,
     control,
     is_compiled,
     linalg,
-    native,
     records,
     references,
 )
-from rigidfleet.kernel import program as k
+from rigidfleet.kernel import problem as k
+from rigidfleet.kernel import rigid_body as body
+from rigidfleet.kernel.engine import native
+from rigidfleet.math import attitude
 from rigidfleet.mission import Mission
-from rigidfleet.plan import Situation, plan_phase
-from rigidfleet.simulate import simulate
+from rigidfleet.planning.plan import Situation, plan_phase
+from rigidfleet.simulation.flight import simulate
 
 # Central differences of sixth order: errors of h^6 and eps/h.
 STENCIL = np.array([-1, 9, -45, 0, 45, -9, 1]) / 60

@@ -1,4 +1,4 @@
-"""Eight numbers in one: `rigidfleet.kernel.lanes`."""
+"""Eight numbers in one: `rigidfleet.kernel.compiler.simd`."""
 
 import math
 
@@ -6,7 +6,7 @@ import numba
 import numpy as np
 import pytest
 
-from rigidfleet.kernel.lanes import (
+from rigidfleet.kernel.compiler.simd import (
     blocks,
     pack,
     rough_inverse,

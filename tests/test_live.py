@@ -17,19 +17,19 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 
-from rigidfleet import attitude as att
-from rigidfleet import cli
-from rigidfleet.assess import assess
+from rigidfleet.assessment import assess
+from rigidfleet.cli import app as cli
 from rigidfleet.errors import FlightError, ResultError
-from rigidfleet.live import live
-from rigidfleet.live import session as sessions
-from rigidfleet.live.pilot import TICK, Gust, Pilot
-from rigidfleet.live.server import Server
-from rigidfleet.live.session import Session
+from rigidfleet.math import attitude as att
 from rigidfleet.mission import Mission, load_mission, mission_names
-from rigidfleet.replay import html_page as replay_page
 from rigidfleet.result import Result
-from rigidfleet.simulate import StoppedError
+from rigidfleet.simulation.flight import StoppedError
+from rigidfleet.web.live import live
+from rigidfleet.web.live import session as sessions
+from rigidfleet.web.live.pilot import TICK, Gust, Pilot
+from rigidfleet.web.live.server import Server
+from rigidfleet.web.live.session import Session
+from rigidfleet.web.replay import html_page as replay_page
 
 TRIANGLE = load_mission("narrow-passage")  # triangle and line
 
@@ -715,7 +715,7 @@ def test_python_gets_the_flight():
 def test_ctrl_c():
     """Ctrl-C ends the flight at once, without a trace of an error."""
     code = (
-        "from rigidfleet.mission import load_mission; from rigidfleet.live import live\n"
+        "from rigidfleet.mission import load_mission; from rigidfleet.web.live import live\n"
         "live(load_mission('narrow-passage'), browser=False, ready=lambda url: print(url, flush=True))\n"
         "print('landed')"
     )

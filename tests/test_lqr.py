@@ -11,7 +11,7 @@ from scipy.interpolate import PPoly
 from scipy.linalg import expm, solve_continuous_are
 from scipy.optimize import brentq
 
-from rigidfleet.lqr import (
+from rigidfleet.math.lqr import (
     closed_loop_response,
     double_integrator_gains,
     finite_horizon,

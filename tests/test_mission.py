@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rigidfleet import formation
 from rigidfleet.errors import MissionError
+from rigidfleet.formation import shapes as formation
 from rigidfleet.mission import (
     Box,
     Fly,

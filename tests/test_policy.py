@@ -1,4 +1,4 @@
-"""What the pages that are written hold of users' words, and what they may do: policy.py, and all that uses it."""
+"""What the pages that are written hold of users' words, and what they may do: web/policy.py, and all that uses it."""
 
 import base64
 import hashlib
@@ -11,13 +11,13 @@ from importlib import resources
 import pytest
 from sample_flights import swarm
 
-from rigidfleet import figures
-from rigidfleet.live.session import Session
+from rigidfleet import plotting as figures
 from rigidfleet.mission import Mission
-from rigidfleet.policy import content_policy
-from rigidfleet.replay import html_page as replay_page
-from rigidfleet.report import html_page as report_page
+from rigidfleet.reporting import html_page as report_page
 from rigidfleet.result import PhaseRecord, Result
+from rigidfleet.web.live.session import Session
+from rigidfleet.web.policy import content_policy
+from rigidfleet.web.replay import html_page as replay_page
 
 #: What has been got through into pages elsewhere: ends of elements, handlers, comments, templates, odd lines.
 HOSTILE = (

@@ -5,12 +5,19 @@ import sys
 import numpy as np
 import pytest
 
-from rigidfleet.assess import assess
-from rigidfleet.figures.graph import graphs
-from rigidfleet.formation import assigned, complete_graph, distances, kabsch, nearest_way, slots
+from rigidfleet.assessment import assess
+from rigidfleet.formation.shapes import (
+    assigned,
+    complete_graph,
+    distances,
+    kabsch,
+    nearest_way,
+    slots,
+)
 from rigidfleet.mission import Mission, load_mission, mission_names
-from rigidfleet.preflight import STARTS, planned, preflight
-from rigidfleet.simulate import simulate
+from rigidfleet.plotting.graph import graphs
+from rigidfleet.preflight.check import STARTS, planned, preflight
+from rigidfleet.simulation.flight import simulate
 
 #: Missions of which something fails in flight, and what says so before.
 FAILING = {
@@ -89,7 +96,7 @@ def test_no_compiler():
     code = """
 import sys
 from rigidfleet.mission import load_mission
-from rigidfleet.preflight import preflight
+from rigidfleet.preflight.check import preflight
 preflight(load_mission("cube-passage"))
 assert not {"numba", "rigidfleet.kernel", "matplotlib"} & set(sys.modules)
 """

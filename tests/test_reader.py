@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from sample_flights import swarm
 
-from rigidfleet import cli
+from rigidfleet.cli import app as cli
 from rigidfleet.errors import ResultError
 from rigidfleet.mission import mission_text
 from rigidfleet.result import _ATTRIBUTES, VARIABLES, Result

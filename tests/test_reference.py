@@ -11,7 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rigidfleet import attitude, gains, lqr, physics, simulate
+from rigidfleet import physics, simulate
+from rigidfleet.math import attitude, lqr
+from rigidfleet.math import pid as gains
 from rigidfleet.mission import Mission
 
 CASES = json.loads((Path(__file__).parent / "data" / "reference_cases.json").read_text())["cases"]

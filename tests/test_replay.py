@@ -11,10 +11,10 @@ import pytest
 from sample_flights import swarm
 
 from rigidfleet.errors import ResultError
-from rigidfleet.figures import agent_colours
-from rigidfleet.replay import html_page, replay
-from rigidfleet.replay.pack import Column, pack
-from rigidfleet.replay.scene import thrust_directions
+from rigidfleet.plotting import agent_colours
+from rigidfleet.web.replay import html_page, replay
+from rigidfleet.web.replay.pack import Column, pack
+from rigidfleet.web.replay.scene import thrust_directions
 
 EIGHT = swarm(8, 90.0)
 
@@ -182,7 +182,7 @@ def test_tension_scale(share, tension, beyond):
 
 def test_too_many_edges(monkeypatch):
     """Of too many edges the shortest are drawn, and the page says so."""
-    monkeypatch.setattr(import_module("rigidfleet.replay"), "_EDGES", 10)
+    monkeypatch.setattr(import_module("rigidfleet.web.replay"), "_EDGES", 10)
     info, columns = parts(html_page(EIGHT))
     assert len(info["edges"]) == columns["tension"].shape[1] == 10
     assert "10 shortest of 17 edges" in info["note"]

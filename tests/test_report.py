@@ -10,14 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rigidfleet import figures
-from rigidfleet.assess import Extreme, Safety, assess, safety
+from rigidfleet import plotting as figures
+from rigidfleet.assessment import Extreme, Safety, assess, safety
 from rigidfleet.errors import ResultError
 from rigidfleet.mission import Mission
-from rigidfleet.report import gains, html_page, report
-from rigidfleet.report.contents import contents
+from rigidfleet.reporting import gains, html_page, report
+from rigidfleet.reporting.contents import contents
 from rigidfleet.result import Result
-from rigidfleet.simulate import simulate
+from rigidfleet.simulation.flight import simulate
 
 TOML = """
 schema_version = 1

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from rigidfleet import formation as f
-from rigidfleet.geometry import smallest_singular_value
+from rigidfleet.formation import shapes as f
+from rigidfleet.math.proximity import smallest_singular_value
 from rigidfleet.rigidity import Kind, Verdict, analyse, full_rank, jacobian, realisations
 
 RIGID, STABLE = Verdict.INFINITESIMALLY_RIGID, Verdict.PRESTRESS_STABLE

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rigidfleet import formation
+from rigidfleet.formation import shapes as formation
 from rigidfleet.rigidity import Verdict, analyse
 
 

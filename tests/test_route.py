@@ -10,12 +10,12 @@ import pytest
 from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
 
-from rigidfleet import formation as shapes
-from rigidfleet.assess import assess
+from rigidfleet.assessment import assess
 from rigidfleet.errors import MissionError
+from rigidfleet.formation import shapes
 from rigidfleet.mission import Mission, mission_text
-from rigidfleet.preflight import planned, preflight
-from rigidfleet.simulate import simulate
+from rigidfleet.preflight.check import planned, preflight
+from rigidfleet.simulation.flight import simulate
 
 #: What the flown may be nearer than the planned [m]: tracking is exact but for the integrator's error, 1e-8 of
 #: some ten meters.

@@ -10,16 +10,18 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
-from rigidfleet import attitude, formation, lqr, physics
-from rigidfleet.assess import assess
+from rigidfleet import physics
+from rigidfleet.assessment import assess
 from rigidfleet.errors import FlightError
-from rigidfleet.kernel import program
+from rigidfleet.formation import shapes as formation
+from rigidfleet.kernel import problem as program
+from rigidfleet.math import attitude, lqr
 from rigidfleet.mission import Establish, Mission, load_mission, mission_names
-from rigidfleet.plan import plan_phase
+from rigidfleet.planning.plan import plan_phase
+from rigidfleet.planning.reference import ByEdge, Situation, led_by
 from rigidfleet.result import Result
 from rigidfleet.rigidity import jacobian
-from rigidfleet.route import ByEdge, Situation, led_by
-from rigidfleet.simulate import FlightInterrupted, Observation, Progress, simulate
+from rigidfleet.simulation.flight import FlightInterrupted, Observation, Progress, simulate
 
 Data = dict[str, Any]
 

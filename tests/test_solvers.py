@@ -6,13 +6,14 @@ from importlib import import_module
 import numpy as np
 import pytest
 
-from rigidfleet import formation as shapes
-from rigidfleet import solvers
-from rigidfleet.kernel import large, sparse
-from rigidfleet.kernel import program as k
+from rigidfleet.formation import shapes
+from rigidfleet.kernel import problem as k
+from rigidfleet.kernel.large import block_cholesky as sparse
+from rigidfleet.kernel.large import solver as large
 from rigidfleet.mission import Mission
+from rigidfleet.planning import solvers
 from rigidfleet.rigidity import jacobian
-from rigidfleet.simulate import simulate
+from rigidfleet.simulation.flight import simulate
 
 
 def lattice(side: int, *, seed: int = 0) -> np.ndarray:
@@ -342,7 +343,9 @@ def test_velocities_are_held_to_what_places_are():
 def test_large_formations_do_not_creep_into_a_phase(monkeypatch):
     """Their first step is found from two evaluations: fewer steps, and the same flight."""
     found = simulate(flight("exact", "joined"))
-    monkeypatch.setattr(import_module("rigidfleet.simulate"), "_first_step", lambda *_: 1e-3)
+    monkeypatch.setattr(
+        import_module("rigidfleet.simulation.flight"), "_first_step", lambda *_: 1e-3
+    )
     crept = simulate(flight("exact", "joined"))
     assert found.statistics["steps"] <= crept.statistics["steps"] - 2
     assert found.statistics["rejected"] <= crept.statistics["rejected"]

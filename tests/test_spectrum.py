@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rigidfleet import formation as shapes
+from rigidfleet.formation import shapes
 from rigidfleet.rigidity import analyse, jacobian, spectrum
 
 

@@ -1,4 +1,4 @@
-"""The kernel's source as straight-line code: `rigidfleet.kernel.trace` and `kernel.straight`."""
+"""The kernel's source as straight-line code: `rigidfleet.kernel.engine.tracer` and `kernel.straight`."""
 
 from typing import Any
 
@@ -6,13 +6,15 @@ import numba
 import numpy as np
 import pytest
 
-from rigidfleet.kernel import native, program, straight
-from rigidfleet.kernel.lanes import pack, unpack
-from rigidfleet.kernel.program import Program
-from rigidfleet.kernel.trace import Code, Trace, UnfitError, elimination_order, structure
+from rigidfleet.kernel import problem as program
+from rigidfleet.kernel.compiler.simd import pack, unpack
+from rigidfleet.kernel.engine import codegen as straight
+from rigidfleet.kernel.engine import native
+from rigidfleet.kernel.engine.tracer import Code, Trace, UnfitError, elimination_order, structure
+from rigidfleet.kernel.problem import Program
 from rigidfleet.mission import Mission
-from rigidfleet.plan import plan_phase
-from rigidfleet.route import Situation
+from rigidfleet.planning.plan import plan_phase
+from rigidfleet.planning.reference import Situation
 
 #: What a program is made of: its agents, and what differs from the default.
 CASES: dict[str, tuple[int, dict[str, Any]]] = {

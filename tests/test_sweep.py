@@ -20,14 +20,15 @@ import pytest
 from rich.console import Console
 from scipy import stats
 
-from rigidfleet import cli, screen
+from rigidfleet.cli import app as cli
+from rigidfleet.cli import console as screen
 from rigidfleet.errors import ResultError, RigidfleetError, SweepError
 from rigidfleet.mission import Mission
 from rigidfleet.sweep import METRICS, Sweep, Table, fly, load, read
-from rigidfleet.sweep.conduct import SweepProgress
-from rigidfleet.sweep.ends import starts
-from rigidfleet.sweep.engine import GROUP, fly_runs
 from rigidfleet.sweep.figures import over_two, plot
+from rigidfleet.sweep.final_states import starts
+from rigidfleet.sweep.run import GROUP, fly_runs
+from rigidfleet.sweep.runner import SweepProgress
 from rigidfleet.sweep.summary import Example, drivers, rate, summarise
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "gain_study.toml"
@@ -228,8 +229,8 @@ def test_a_file_is_checked_like_a_mission(tmp_path):
 
 def test_metrics_are_those_of_the_verdict(tmp_path):
     """A row has what simulate and assess say of the varied mission."""
-    from rigidfleet.assess import assess
-    from rigidfleet.simulate import simulate
+    from rigidfleet.assessment import assess
+    from rigidfleet.simulation.flight import simulate
 
     found = sweep(runs=3)
     (row,) = fly_runs(found, [2])
@@ -264,7 +265,7 @@ def flown(tmp_path_factory) -> Table:
 
 def test_rows_are_the_same_for_any_number_of_workers(flown, tmp_path, monkeypatch):
     """Processes give the rows of one process, bit for bit."""
-    monkeypatch.setattr("rigidfleet.sweep.conduct._WORTH", 0.0)
+    monkeypatch.setattr("rigidfleet.sweep.runner._WORTH", 0.0)
     seen: list[SweepProgress] = []
     table = fly(sweep(), tmp_path, workers=2, progress=seen.append)
     assert numbers(table) == numbers(flown)
@@ -329,7 +330,7 @@ def test_what_is_no_store(tmp_path):
 
 def test_a_group_is_never_split():
     """Chunks are whole groups of eight consecutive runs, whatever is missing."""
-    from rigidfleet.sweep.conduct import _Sweeping
+    from rigidfleet.sweep.runner import _Sweeping
 
     class Gaps:
         def there(self):
@@ -399,7 +400,7 @@ def test_ends_are_the_same_however_they_are_flown(ends, tmp_path, monkeypatch):
     """Bit for bit: after interruptions, with runs added, and by processes."""
     fly(by_ends(runs=6), tmp_path / "a", workers=1)
     assert numbers(fly(by_ends(), tmp_path / "a", workers=1)) == numbers(ends)
-    monkeypatch.setattr("rigidfleet.sweep.conduct._WORTH", 0.0)
+    monkeypatch.setattr("rigidfleet.sweep.runner._WORTH", 0.0)
     assert numbers(fly(by_ends(), tmp_path / "b", workers=2)) == numbers(ends)
     with pytest.raises(ResultError, match="it differs in: what is judged"):
         fly(Sweep.of(Mission.from_dict(TETRAHEDRON), STARTS, runs=20, seed=3), tmp_path / "a")
@@ -552,7 +553,7 @@ def test_a_killed_worker_is_replaced(flown, tmp_path, monkeypatch):
     """A worker process killed in mid-run costs its chunk some time, and nothing else."""
     import multiprocessing
 
-    monkeypatch.setattr("rigidfleet.sweep.conduct._WORTH", 0.0)
+    monkeypatch.setattr("rigidfleet.sweep.runner._WORTH", 0.0)
     killed: list[int] = []
 
     def kill(progress: SweepProgress) -> None:

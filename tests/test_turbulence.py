@@ -6,7 +6,7 @@ from scipy import signal
 from scipy.interpolate import CubicSpline
 from scipy.linalg import solve_continuous_lyapunov
 
-from rigidfleet import turbulence as tb
+from rigidfleet.math import turbulence as tb
 
 TAU, STEP = 0.7, 0.1
 

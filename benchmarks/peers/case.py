@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 from scipy.spatial import ConvexHull
 
-from rigidfleet import formation as shapes
+from rigidfleet.formation import shapes
 from rigidfleet.mission import Mission, load_mission
 
 Array = NDArray[np.float64]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rigidfleet import formation as shapes
+from rigidfleet.formation import shapes
 
 from .case import DURATION, STEPS, AbsentError, Array, Case, Flight, Peer, timed
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from rigidfleet import __version__
-from rigidfleet.simulate import simulate
+from rigidfleet.simulation.flight import simulate
 
 from .case import TOLERANCES, Array, Case, Flight, Peer, timed
 

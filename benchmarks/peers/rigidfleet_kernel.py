@@ -6,7 +6,7 @@ import numpy as np
 from run import compiled_flight
 
 from rigidfleet import __version__
-from rigidfleet.simulate import simulate
+from rigidfleet.simulation.flight import simulate
 
 from .case import DURATION, TOLERANCES, Array, Case, Flight, Peer, timed
 

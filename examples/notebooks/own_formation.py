@@ -8,11 +8,11 @@
 import numpy as np
 
 import rigidfleet as rf
-from rigidfleet import figures
-from rigidfleet.design import design
-from rigidfleet.formation import complete_graph
+from rigidfleet import plotting as figures
+from rigidfleet.formation.shapes import complete_graph
 from rigidfleet.mission import Mission
 from rigidfleet.rigidity import analyse
+from rigidfleet.rigidity.design import design
 
 # %% [markdown]
 # ## The shape

@@ -6,7 +6,8 @@
 
 # %%
 import rigidfleet as rf
-from rigidfleet import figures, gains
+from rigidfleet import plotting as figures
+from rigidfleet.math import pid as gains
 
 # %% [markdown]
 # ## Table 1: a triangle, a line, a triangle

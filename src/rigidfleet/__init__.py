@@ -4,20 +4,18 @@ The names below are loaded on first use, so that ``import rigidfleet`` and ``rig
 wait neither for the compiler nor for the plotting library.
 """
 
-import sys
 from importlib import import_module
-from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from rigidfleet.assess import assess
-    from rigidfleet.figures import plot
-    from rigidfleet.live import live
+    from rigidfleet.assessment import assess
     from rigidfleet.mission import load_mission
-    from rigidfleet.replay import replay
-    from rigidfleet.report import report
+    from rigidfleet.plotting import plot
+    from rigidfleet.reporting import report
     from rigidfleet.result import Result
-    from rigidfleet.simulate import simulate
+    from rigidfleet.simulation.flight import simulate
+    from rigidfleet.web.live import live
+    from rigidfleet.web.replay import replay
 
 __version__ = "0.1.0"
 
@@ -35,13 +33,13 @@ __all__ = [
 
 _HOME = {
     "Result": "result",
-    "assess": "assess",
-    "live": "live",
+    "assess": "assessment",
+    "live": "web.live",
     "load_mission": "mission",
-    "plot": "figures",
-    "replay": "replay",
-    "report": "report",
-    "simulate": "simulate",
+    "plot": "plotting",
+    "replay": "web.replay",
+    "report": "reporting",
+    "simulate": "simulation.flight",
 }
 
 
@@ -55,15 +53,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
-
-
-class _Package(ModuleType):
-    def __setattr__(self, name: str, value: object) -> None:
-        # Importing the submodule `simulate` makes Python bind it over the function of that name.
-        if _HOME.get(name) == name and isinstance(value, ModuleType):
-            value = getattr(value, name)
-        super().__setattr__(name, value)
-
-
-sys.modules[__name__].__class__ = _Package
+    return __all__

@@ -2,7 +2,7 @@
 
 import sys
 
-from rigidfleet.cli import main
+from rigidfleet.cli.app import main
 
 if __name__ == "__main__":
     sys.exit(main())

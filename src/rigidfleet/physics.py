@@ -11,9 +11,10 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rigidfleet.kernel import body, constraint, references
-from rigidfleet.kernel import program as k
-from rigidfleet.route import about_cm, align_slots
+from rigidfleet.kernel import constraint, references
+from rigidfleet.kernel import problem as k
+from rigidfleet.kernel import rigid_body as body
+from rigidfleet.planning.reference import about_cm, align_slots
 
 Array = NDArray[np.float64]
 

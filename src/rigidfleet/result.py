@@ -35,8 +35,8 @@ from typing import (
 import numpy as np
 from numpy.typing import NDArray
 
-from rigidfleet import attitude
 from rigidfleet.errors import MissionError, ResultError
+from rigidfleet.math import attitude
 
 if TYPE_CHECKING:
     from rigidfleet.mission import Mission
@@ -630,7 +630,7 @@ def _read(path: Path) -> bytes:
 
 def _parse(path: Path, data: bytes) -> dict[str, Any]:
     """Arguments of `Result` from a file's content, checked against their declarations."""
-    from rigidfleet import reader
+    from rigidfleet import _reader as reader
 
     due = {
         name: reader.Array(variable.dims, name in _INTEGERS, name in _OPTIONAL)

@@ -21,7 +21,7 @@ def browser(tmp_path_factory) -> Iterator[Browser]:
 @pytest.fixture(scope="session")
 def show(browser, tmp_path_factory) -> Callable[..., Browser]:
     """Open the replay of a result; `where` is the part of the address after #."""
-    from rigidfleet.replay import replay
+    from rigidfleet.web.replay import replay
 
     folder = tmp_path_factory.mktemp("pages")
     written: dict[int, Path] = {}

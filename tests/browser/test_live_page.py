@@ -9,10 +9,10 @@ from collections.abc import Iterator
 import pytest
 from chromium import Browser
 
-from rigidfleet.live import session as sessions
-from rigidfleet.live.server import Server
-from rigidfleet.live.session import Session
 from rigidfleet.mission import load_mission
+from rigidfleet.web.live import session as sessions
+from rigidfleet.web.live.server import Server
+from rigidfleet.web.live.session import Session
 
 pytestmark = pytest.mark.long
 

@@ -10,10 +10,10 @@ from chromium import started
 from sample_flights import swarm
 from test_policy import HOSTILE, flight
 
-from rigidfleet import attitude as att
+from rigidfleet.math import attitude as att
 from rigidfleet.mission import Mission
-from rigidfleet.replay import replay
-from rigidfleet.report import report
+from rigidfleet.reporting import report
+from rigidfleet.web.replay import replay
 
 pytestmark = pytest.mark.long
 

@@ -1,10 +1,10 @@
 """The physics, compiled: constraint force, body frame, closed loop, integrator.
 
-The kernel knows arrays, not missions: a `Program` (see `rigidfleet.kernel.program`) holds
+The kernel knows arrays, not missions: a `Program` (see `rigidfleet.kernel.problem`) holds
 everything it reads, a `Workspace` everything it writes. Flights call its machine code by
-`rigidfleet.kernel.native`, which needs the compiler only where that is not in the cache; to import
+`rigidfleet.kernel.engine.native`, which needs the compiler only where that is not in the cache; to import
 the modules of the physics themselves imports Numba.
 """
 
-from rigidfleet.kernel.cache import cache_directory as cache_directory
-from rigidfleet.kernel.native import is_compiled as is_compiled
+from rigidfleet.kernel.compiler.cache import cache_directory as cache_directory
+from rigidfleet.kernel.engine.native import is_compiled as is_compiled

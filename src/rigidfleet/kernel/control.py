@@ -2,7 +2,10 @@
 
 import math
 
-from rigidfleet.kernel.body import (
+from rigidfleet.kernel.compiler.jit import compiled, inlined
+from rigidfleet.kernel.problem import BODY, LOCAL, SLOTS
+from rigidfleet.kernel.references import blend_slots
+from rigidfleet.kernel.rigid_body import (
     allocate,
     damp_deformation,
     mean_axes,
@@ -10,9 +13,6 @@ from rigidfleet.kernel.body import (
     multiply_transposed,
     rotation_vector,
 )
-from rigidfleet.kernel.compiled import compiled, inlined
-from rigidfleet.kernel.program import BODY, LOCAL, SLOTS
-from rigidfleet.kernel.references import blend_slots
 
 
 @compiled

@@ -2,7 +2,7 @@
 
 import math
 
-from rigidfleet.kernel.compiled import compiled
+from rigidfleet.kernel.compiler.jit import compiled
 
 
 @compiled

@@ -19,9 +19,9 @@ import math
 
 import numpy as np
 
-from rigidfleet.kernel.compiled import call_recorder, compiled
+from rigidfleet.kernel.compiler.jit import call_recorder, compiled
+from rigidfleet.kernel.compiler.pointers import by_address
 from rigidfleet.kernel.gauge import read_gauge
-from rigidfleet.kernel.pointers import by_address
 from rigidfleet.kernel.records import (
     ACCELERATION,
     CLEARANCE,

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rigidfleet.kernel.program import Array, padded, zeros
+from rigidfleet.kernel.problem import Array, padded, zeros
 
 #: What an integration returns.
 FINISHED, PAUSED, COLLAPSED = range(3)

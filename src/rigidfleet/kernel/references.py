@@ -2,8 +2,8 @@
 
 import math
 
-from rigidfleet.kernel.compiled import compiled
-from rigidfleet.kernel.program import SLOTS, SQUARED
+from rigidfleet.kernel.compiler.jit import compiled
+from rigidfleet.kernel.problem import SLOTS, SQUARED
 
 
 @compiled

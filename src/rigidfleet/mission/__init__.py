@@ -6,6 +6,7 @@ paper: agents, edges, phases, and so the places in a key such as `phases[3].unti
 `Mission` hands to code count agents from 0.
 """
 
+from rigidfleet.mission.describe import ending, goal
 from rigidfleet.mission.model import (
     Mission,
     json_schema,
@@ -32,7 +33,6 @@ from rigidfleet.mission.schema import (
     Settle,
     Turn,
 )
-from rigidfleet.mission.words import ending, goal
 
 __all__ = [
     "Box",

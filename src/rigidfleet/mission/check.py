@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from rigidfleet.errors import MissionError
-from rigidfleet.formation import SHAPES, count_within
+from rigidfleet.formation.shapes import SHAPES, count_within
 from rigidfleet.mission import bounds, disturbances, formations, phases
-from rigidfleet.mission.notes import Keys, Notes, near_shape
+from rigidfleet.mission.findings import Keys, Notes, near_shape
 from rigidfleet.mission.schema import (
     Agents,
     Allocation,

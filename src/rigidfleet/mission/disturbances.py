@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from rigidfleet.formation import Floats
-from rigidfleet.mission.notes import Notes
+from rigidfleet.formation.shapes import Floats
+from rigidfleet.mission.findings import Notes
 from rigidfleet.mission.phases import latest_end
 from rigidfleet.mission.schema import Disturbances, Gusts
 
@@ -37,7 +37,7 @@ def gust_step(gusts: Gusts, wind: float) -> float:
 def intensity(gusts: Gusts, wind: float) -> Floats:
     """Standard deviations (3,) [m/s] of gusts along a steady wind [m/s], across it and vertical."""
     if gusts.intensity is None:
-        from rigidfleet.turbulence import low_altitude
+        from rigidfleet.math.turbulence import low_altitude
 
         return low_altitude(gusts.altitude or 0.0, wind)[0]
     return np.broadcast_to(np.array(gusts.intensity, dtype=np.float64), 3)

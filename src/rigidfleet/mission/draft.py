@@ -9,9 +9,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rigidfleet import formation as shapes
-from rigidfleet.formation import Floats
-from rigidfleet.mission.notes import near_shape
+from rigidfleet.formation import shapes
+from rigidfleet.formation.shapes import Floats
+from rigidfleet.mission.findings import near_shape
 
 #: Chosen for a mission that says nothing of them: vehicle [kg], [m], shape [m], where it flies [m].
 MASS, RADIUS, SIZE, WAYPOINT = 1.2, 0.25, 4.0, (20.0, 10.0, 10.0)
@@ -53,7 +53,7 @@ def draft(
 
     Parameters
     ----------
-    shape : of `rigidfleet.formation.SHAPES`; by default one that takes so many agents
+    shape : of `rigidfleet.formation.shapes.SHAPES`; by default one that takes so many agents
     agents : how many; by default as many as the shape needs
     size : edge length of the shape [m], or three of them
     mass : of each agent [kg]

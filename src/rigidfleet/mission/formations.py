@@ -8,9 +8,9 @@ from itertools import islice
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigidfleet import formation as shapes
+from rigidfleet.formation import shapes
 from rigidfleet.mission import bounds
-from rigidfleet.mission.notes import Keys, Notes, near_shape
+from rigidfleet.mission.findings import Keys, Notes, near_shape
 from rigidfleet.mission.schema import Formation
 
 #: So many contradictions among distances are shown one by one.

@@ -13,13 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import PrivateAttr
 
-from rigidfleet import geometry
-from rigidfleet.attitude import dcm_from_euler
+from rigidfleet._toml import to_toml
 from rigidfleet.errors import Finding, MissionError
-from rigidfleet.formation import Floats, Ints, assigned, distances
+from rigidfleet.formation.shapes import Floats, Ints, assigned, distances
+from rigidfleet.math import proximity as geometry
+from rigidfleet.math.attitude import dcm_from_euler
 from rigidfleet.mission import bounds
 from rigidfleet.mission.check import check
-from rigidfleet.mission.notes import near
+from rigidfleet.mission.findings import near
 from rigidfleet.mission.phases import latest_end
 from rigidfleet.mission.schema import (
     DRAG,
@@ -30,7 +31,6 @@ from rigidfleet.mission.schema import (
     Start,
     Steering,
 )
-from rigidfleet.mission.toml import to_toml
 
 _SHIPPED = resources.files("rigidfleet") / "missions"
 #: Least and greatest damping that "auto" takes: below, rounding shows; docs/robustness.md has the table.

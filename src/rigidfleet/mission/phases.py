@@ -7,10 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from rigidfleet import formation as shapes
+from rigidfleet._toml import toml_key
+from rigidfleet.formation import shapes
+from rigidfleet.mission.findings import Keys, Notes, near
 from rigidfleet.mission.formations import agents as agents_text
 from rigidfleet.mission.formations import sound
-from rigidfleet.mission.notes import Keys, Notes, near
 from rigidfleet.mission.schema import (
     ANGLES,
     Agents,
@@ -25,7 +26,6 @@ from rigidfleet.mission.schema import (
     Steering,
     Turn,
 )
-from rigidfleet.mission.toml import toml_key
 
 _KINDS: dict[str, type[AnyPhase]] = {
     "establish": Establish,

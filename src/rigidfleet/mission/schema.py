@@ -20,8 +20,8 @@ from pydantic import (
     model_validator,
 )
 
-from rigidfleet import formation as shapes
-from rigidfleet.formation import Floats, Ints
+from rigidfleet.formation import shapes
+from rigidfleet.formation.shapes import Floats, Ints
 from rigidfleet.mission import bounds
 from rigidfleet.mission.bounds import (
     ACCELERATION,

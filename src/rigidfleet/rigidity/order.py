@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rigidfleet.formation import Floats, Ints, kabsch
+from rigidfleet.formation.shapes import Floats, Ints, kabsch
 from rigidfleet.rigidity.framework import Framework, jacobian, sparse
 
 #: A stress blocks all flexes when its least energy is more than this times its largest.

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigidfleet.formation import Floats, Ints, kabsch
+from rigidfleet.formation.shapes import Floats, Ints, kabsch
 from rigidfleet.rigidity.analysis import checked
 from rigidfleet.rigidity.framework import Framework
 

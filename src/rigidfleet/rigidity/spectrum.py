@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigidfleet.formation import Floats, Ints
+from rigidfleet.formation.shapes import Floats, Ints
 from rigidfleet.rigidity.framework import ZERO
 
 #: So many eigenvalues are looked for at the lower end, besides those of rigid motions.

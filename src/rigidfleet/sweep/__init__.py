@@ -7,10 +7,10 @@ fly(sweep, "sweeps/masses")
 data = load("sweeps/masses")  # an xarray dataset
 """
 
-from rigidfleet.sweep.conduct import SweepProgress, fly
 from rigidfleet.sweep.dataset import load
 from rigidfleet.sweep.definition import Sweep
 from rigidfleet.sweep.metrics import METRICS
+from rigidfleet.sweep.runner import SweepProgress, fly
 from rigidfleet.sweep.store import Table, read
 
 __all__ = ["METRICS", "Sweep", "SweepProgress", "Table", "fly", "load", "read"]

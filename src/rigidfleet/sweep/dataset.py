@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rigidfleet.sweep import paths
+from rigidfleet.sweep import keypaths as paths
 from rigidfleet.sweep.definition import Column, Sweep
 from rigidfleet.sweep.metrics import METRICS
 from rigidfleet.sweep.store import read

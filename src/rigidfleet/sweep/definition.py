@@ -21,11 +21,11 @@ from pydantic import Field, Strict
 from rigidfleet import __version__
 from rigidfleet.errors import MissionError, SweepError
 from rigidfleet.mission import Mission, load_mission, mission_names
+from rigidfleet.mission.findings import Keys, Notes, unknown_key
 from rigidfleet.mission.model import parse_toml, read_text
-from rigidfleet.mission.notes import Keys, Notes, unknown_key
 from rigidfleet.mission.phases import kind, tables
 from rigidfleet.mission.schema import Part
-from rigidfleet.sweep import paths
+from rigidfleet.sweep import keypaths as paths
 from rigidfleet.sweep.variation import (
     KINDS,
     Drawn,
@@ -323,7 +323,7 @@ def _checked(
         if by_ends and found is not None and whole is not None:
             _moves_starts(notes, k, found, whole)
     if by_ends and mission is not None:
-        from rigidfleet.ensemble import unfit
+        from rigidfleet.simulation.ensemble import unfit
 
         if (why := unfit(mission)) is not None:
             notes.add(("judged",), why, _WHOLE, "ends")

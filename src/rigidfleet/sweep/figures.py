@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigidfleet.errors import RigidfleetError
-from rigidfleet.figures import FORMATS, write_figure
-from rigidfleet.figures import style as st
+from rigidfleet.plotting import FORMATS, write_figure
+from rigidfleet.plotting import style as st
 from rigidfleet.sweep.dataset import explained
 from rigidfleet.sweep.metrics import METRICS, readable
-from rigidfleet.sweep.row import called
+from rigidfleet.sweep.record import called
 from rigidfleet.sweep.store import Table
 from rigidfleet.sweep.summary import drivers, outcomes, rate, summarise, varied
 from rigidfleet.sweep.variation import Geomspace, LogUniform

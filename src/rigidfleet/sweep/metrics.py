@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from rigidfleet.assess import Verdict
+    from rigidfleet.assessment import Verdict
     from rigidfleet.result import Result
 
 

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from rigidfleet.errors import ResultError
 from rigidfleet.sweep.definition import Sweep
 from rigidfleet.sweep.metrics import METRICS
-from rigidfleet.sweep.row import Row
+from rigidfleet.sweep.record import Row
 
 FILE = "sweep.db"
 #: Locked by the process that writes; the lock ends with it, however it ends.

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from rigidfleet.result import plain
 from rigidfleet.sweep.metrics import METRICS, readable
-from rigidfleet.sweep.row import called
+from rigidfleet.sweep.record import called
 from rigidfleet.sweep.store import Table
 from rigidfleet.sweep.variation import is_number
 

@@ -19,7 +19,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, Strict
 
-from rigidfleet.mission.notes import near
+from rigidfleet.mission.findings import near
 from rigidfleet.mission.schema import Number, Part, Positive
 
 #: The line's sign for each way to change.

@@ -16,11 +16,11 @@ from typing import TYPE_CHECKING, Any
 from rigidfleet import __version__
 from rigidfleet.errors import RigidfleetError
 from rigidfleet.sweep.definition import shared
-from rigidfleet.sweep.engine import fly_runs
-from rigidfleet.sweep.row import Row
+from rigidfleet.sweep.record import Row
+from rigidfleet.sweep.run import fly_runs
 
 if TYPE_CHECKING:
-    from rigidfleet.kernel.native import Inheritance
+    from rigidfleet.kernel.engine.native import Inheritance
 
 #: An executor, and how many chunks it works on at the same time.
 Crew = tuple[Executor, Callable[[], int]]
@@ -46,7 +46,7 @@ def chunk(sweep: str, version: str, runs: Sequence[int]) -> list[Row]:
 @contextmanager
 def processes(count: int) -> Generator[Crew]:
     """Persistent processes on this machine; they end with this one, however it ends."""
-    from rigidfleet.kernel.native import bequeath
+    from rigidfleet.kernel.engine.native import bequeath
 
     before = set(multiprocessing.active_children())
     with _safe_path():  # of the process that looks after semaphores
@@ -97,7 +97,7 @@ def _begin(given: Inheritance) -> None:
     """Leave Ctrl-C to the process that started this one, end when it does, and compile nothing that it has."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_follow, daemon=True).start()
-    from rigidfleet.kernel.native import inherit
+    from rigidfleet.kernel.engine.native import inherit
 
     inherit(given)
 

@@ -1,0 +1,406 @@
+"""What holds and what does not: the checks of a flight, and what is worth a note."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+
+from rigidfleet.assessment.measure import Flight, Floats, angle_between, is_rigid
+from rigidfleet.assessment.verdict import (
+    DIP,
+    FLIPPED,
+    SHAPE_TOLERANCE,
+    WAYPOINT_TOLERANCE,
+    Extreme,
+    Finding,
+    PhaseVerdict,
+    Verdict,
+    names,
+    value,
+)
+from rigidfleet.result import Result
+
+# Rounding on a limit is not beyond it.
+_SLACK = 1e-9
+# A vehicle that stands on an obstacle touches it by no more than this [m].
+_CONTACT = 1e-6
+#: A moment further than this from every sample has not been seen [s]: at 10 m/s, a waypoint's tolerance.
+_UNSEEN = 0.01
+
+
+def findings(flight: Flight, verdict: Verdict) -> Iterator[Finding]:
+    """Every check of a flight: of one that can fail in several phases all that do, else the worst."""
+    yield _complete(flight.result)
+    yield from _record(flight)
+    yield from _unseen(flight.result)
+    candidates = [
+        *_settled(verdict.phases),
+        *_shapes(flight, verdict.phases),
+        *_waypoints(verdict.phases),
+    ]
+    yield from _failures_or_worst(candidates)
+    worst = verdict.worst
+    if "separation" in worst:
+        yield _separation(flight, worst["separation"])
+    if "clearance" in worst:
+        yield from _clearances(flight)
+    if not flight.left.all():
+        yield _lost(flight)
+    limits = flight.mission.limits
+    if limits.separation_below is not None:
+        yield _downwash(flight, limits.separation_below)
+    if limits.geofence is not None:
+        yield _geofence(flight, np.array(limits.geofence.min), np.array(limits.geofence.max))
+    yield _bounded("speed", worst.get("speed"), "m/s", limits.speed)
+    yield _bounded("acceleration", worst.get("acceleration"), "m/s^2", limits.acceleration)
+    yield from _thrust(flight, worst.get("thrust"))
+    units = {"constraint": "m", "constraint_force": "N", "tension": "N", "singular_value": ""}
+    yield from (_bounded(name, worst[name], units[name], None) for name in units if name in worst)
+
+
+def _failures_or_worst(candidates: Iterable[Finding]) -> Iterator[Finding]:
+    """Of the findings of each check all that fail, or else the one nearest to its limit."""
+    by_check: dict[str, list[Finding]] = {}
+    for finding in candidates:
+        by_check.setdefault(finding.check, []).append(finding)
+    for found in by_check.values():
+        failed = [finding for finding in found if not finding.passed]
+        yield from failed or [max(found, key=lambda f: (f.worst or 0.0) / (f.limit or 1.0))]
+
+
+def _complete(result: Result) -> Finding:
+    end = float(result.time[-1])
+    lost = ~np.isfinite(result.position).all(axis=2)
+    if lost.any():
+        bad = float(result.time[int(np.argmax(np.any(lost, axis=1)))])
+        who = names(np.flatnonzero(np.any(lost, axis=0)))
+        words = f"the position of {who} is not finite, first at {bad:.2f} s"
+        return Finding("complete", False, words, when=bad, who=who)
+    if result.complete:
+        return Finding("complete", True, f"flown to its end at {end:.2f} s", when=end)
+    words = f"incomplete, it ends at {end:.2f} s: {result.ending or 'it was stopped'}"
+    return Finding("complete", False, words, when=end, phase=result.phases[-1].name)
+
+
+def _record(flight: Flight) -> Iterator[Finding]:
+    """A record that contradicts itself has been changed, and proves nothing."""
+    found = list(flight.contradictions())
+    if found:
+        words, when = found[0]
+        more = f", and {len(found) - 1} more like that" if len(found) > 1 else ""
+        words = f"the record contradicts itself: {words}{more}. Fly the mission again"
+        yield Finding("record", False, words, when=when)
+
+
+def _unseen(result: Result) -> Iterator[Finding]:
+    """Ends of shaping phases and waypoints of which no sample tells: they are not judged, nor passed."""
+    last = len(result.phases) - 1
+    for i, p in enumerate(result.phases):
+        if not result.complete and i == last:
+            continue
+        moments = {"waypoint": p.target["time"] if p.target is not None else None}
+        if p.kind in ("establish", "reshape") or i == last:
+            moments["end"] = p.t_end
+        for what, t in moments.items():
+            if t is None:
+                continue
+            seen = result.time[result.samples(i)]
+            away = float(np.abs(seen - min(t, p.t_end)).min(initial=np.inf))
+            if away > _UNSEEN:
+                nearest = (
+                    f"the nearest sample is {away:.2g} s from it"
+                    if len(seen)
+                    else "it has no sample"
+                )
+                words = f"the {what} of phase '{p.name}' ({t:.2f} s) is not judged: {nearest}. Record it, too"
+                yield Finding("samples", False, words, away, _UNSEEN, "s", when=t, phase=p.name)
+
+
+def _settled(phases: list[PhaseVerdict]) -> Iterator[Finding]:
+    for p in phases:
+        if p.settled is not None:
+            how = "settled after" if p.settled else "did not settle within"
+            words = f"phase '{p.name}' {how} {p.t_end - p.t_start:.2f} s"
+            yield Finding("settled", p.settled, words, when=p.t_end, phase=p.name)
+
+
+def _shapes(flight: Flight, phases: list[PhaseVerdict]) -> Iterator[Finding]:
+    """Whether formations are what they should be, where they should be by then."""
+    for i, p in enumerate(phases):
+        shaping = p.kind in ("establish", "reshape") or i == len(phases) - 1
+        if not (shaping and p.finished) or p.formation is None:
+            continue
+        last = flight.samples[i].stop - 1
+        edges, _ = flight.edges(p.formation, last)
+        held = False
+        if p.distances is not None:
+            limit = SHAPE_TOLERANCE * float(flight.mission.formation_distances(p.formation).min())
+            held = p.distances <= limit
+            words = f"{value(p.distances, 'm')} off (limit {value(limit, 'm')})"
+            words = f"the worst of the {len(edges)} edges of '{p.formation}' is {words}"
+            yield _at_end(p, "distances", held, words, p.distances, limit, "m")
+        if i not in flight.fits:
+            continue
+        fit = flight.fits[i]
+        passed = fit.error <= fit.limit
+        who = names(fit.pair)
+        words = (
+            f"{who} are {value(fit.flown, 'm')} apart instead of {value(fit.intended, 'm')}"
+            f" (limit {value(fit.limit, 'm')} off)"
+        )
+        if held and not passed:
+            left = flight.left[last]
+            form = flight.mission.formations[p.formation].shape
+            wanted = f"no {form}" if form else f"not the shape of '{p.formation}'"
+            place = np.cumsum(left) - 1  # of each agent among those left
+            rigid = is_rigid(flight.result.position[last][left], place[edges])
+            state = "rigid, but" if rigid else "held by its edges, but"
+            words = f"'{p.formation}' is {state} {wanted}: all {len(edges)} edges hold, yet {words}"
+        elif not passed:
+            words = f"'{p.formation}' is not reached: {words}"
+        else:
+            words = f"'{p.formation}' is reached: {words}"
+        yield _at_end(p, "shape", passed, words, fit.error, fit.limit, "m", who=who)
+        if fit.in_order is not None:
+            words = f"the agents of '{p.formation}' are {'' if fit.in_order else 'not '}in order"
+            yield _at_end(p, "order", fit.in_order, words)
+        if not passed:
+            continue  # of another shape, a hand or a side says nothing
+        if p.handedness is not None:
+            words = "its own mirror image" if fit.mirrored else "of the right hand"
+            yield _at_end(p, "handedness", p.handedness, f"'{p.formation}' is {words}")
+        if p.flip is not None:
+            what = "normal" if fit.dimension == 2 else "direction"
+            flipped = "has flipped" if p.flip > FLIPPED else "lies well"
+            words = f"{what} is {value(p.flip, 'deg')} from where it should point"
+            words = f"'{p.formation}' {flipped}: its {words}"
+            yield _at_end(p, "flip", p.flip <= FLIPPED, words, p.flip, FLIPPED, "deg")
+
+
+def _at_end(
+    p: PhaseVerdict,
+    check: str,
+    passed: bool,
+    words: str,
+    worst: float | None = None,
+    limit: float | None = None,
+    unit: str = "",
+    who: str = "",
+) -> Finding:
+    """A finding about the end of a phase."""
+    words = f"at the end of phase '{p.name}' ({p.t_end:.2f} s) {words}"
+    return Finding(check, passed, words, worst, limit, unit, when=p.t_end, who=who, phase=p.name)
+
+
+def _waypoints(phases: list[PhaseVerdict]) -> Iterator[Finding]:
+    for name, limit in WAYPOINT_TOLERANCE.items():
+        unit = {"position": "m", "velocity": "m/s", "attitude": "deg", "rates": "deg/s"}[name]
+        for p in phases:
+            miss = getattr(p.waypoint, name) if p.waypoint is not None else None
+            if p.waypoint is not None and miss is not None:
+                when, passed = p.waypoint.time, miss <= limit
+                words = f"{'met' if passed else 'missed'}, {value(miss, unit)} off in {name}"
+                words = f"the waypoint of phase '{p.name}' is {words} (limit {limit:g} {unit})"
+                check = f"waypoint_{name}"
+                yield Finding(check, passed, words, miss, limit, unit, when=when, phase=p.name)
+
+
+def _bounded(
+    check: str,
+    e: Extreme | None,
+    unit: str,
+    limit: float | None,
+    words: str = "",
+    *,
+    passed: bool | None = None,
+    at_least: bool = False,
+) -> Finding:
+    """A worst value against its limit, if it has one."""
+    if e is None:
+        words = words or f"no {check} to judge"
+        return Finding(check, True, words, None, limit, unit, at_least, judged=limit is not None)
+    if not words:
+        name = check.replace("_", " ").replace("value", "value of J")
+        who = f", {e.who}," if e.who else ""
+        bound = "" if limit is None else f" (limit {limit:g} {unit})"
+        extreme = "smallest" if check == "singular_value" else "greatest"
+        words = f"{extreme} {name} {value(e.value, unit)}{who} at {e.when:.2f} s{bound}"
+    if passed is None:
+        passed = limit is None or e.value <= limit + _SLACK * max(1.0, abs(limit))
+    return Finding(
+        check, passed, words, e.value, limit, unit, at_least, e.when, e.who, e.phase, limit is not None
+    )  # fmt: skip
+
+
+def _separation(flight: Flight, e: Extreme) -> Finding:
+    limit = flight.mission.limits.separation or 0.0
+    passed = e.value > 0 and e.value >= limit - _SLACK
+    words = f"{e.who} come within {value(e.value, 'm')} of each other at {e.when:.2f} s"
+    words += f" (limit {limit:g} m)"
+    if e.value <= 0:
+        since = _since(flight, "separation", flight.close[0])
+        depth = f"by {value(-e.value, 'm')} at {e.when:.2f} s"
+        words = f"agents collide, first {since}; {e.who} overlap the most, {depth}"
+    return _bounded("separation", e, "m", limit, words, passed=passed, at_least=True)
+
+
+def _since(flight: Flight, name: str, sampled: Floats) -> str:
+    """When something first fell to zero, as far as samples and the worst of each phase tell."""
+    phases = range(len(flight.result.phases))
+    times = [e.when for k in phases if (e := flight.between(name, k)) is not None and e.value <= 0]
+    first = flight.first(sampled <= 0)
+    return f"by {min(times):.2f} s" if times and min(times) < first else f"at {first:.2f} s"
+
+
+def _clearances(flight: Flight) -> Iterator[Finding]:
+    """Obstacles in flight; and apart from that, those on which vehicles stand at the start and at the end."""
+    found = {name: e for name, e in flight.clearances().items() if e is not None}
+    every = [*found.values(), flight.worst_clearance()]
+    e = min((e for e in every if e is not None), key=lambda e: e.value)
+    hit = e.value < -_CONTACT
+    if not hit:
+        e = found.pop("clearance_flight", None)
+    if e is not None:
+        agent, obstacle = e.who.split(", ", 1)
+        words = f"{agent} comes within {value(e.value, 'm')} of '{obstacle}' at {e.when:.2f} s"
+        if hit or e.value <= 0:
+            since = _since(flight, "clearance", flight.close[2])
+            depth = f"by {value(abs(e.value), 'm')} at {e.when:.2f} s"
+            words = f"obstacles are hit, first {since}; {agent} is deepest in '{obstacle}', {depth}"
+        yield _bounded("clearance", e, "m", 0.0, words, passed=e.value > 0, at_least=True)
+    for name, when in (("clearance_start", "since the start"), ("clearance_end", "at the end")):
+        if name in found and not hit:
+            e = found[name]
+            agent, obstacle = e.who.split(", ", 1)
+            how = "in contact with" if e.value <= _CONTACT else f"{value(e.value, 'm')} above"
+            words = f"{agent} stands {how} '{obstacle}' {when} ({e.when:.2f} s)"
+            yield _bounded(name, e, "m", 0.0, words, passed=True, at_least=True)
+
+
+def _lost(flight: Flight) -> Finding:
+    """Vehicles that the mission loses: who is left is judged, and that nobody is hit."""
+    who = np.flatnonzero(~flight.left[-1])
+    when = flight.mission.lost_at[who]
+    told = ", ".join(f"agent {i + 1} at {t:.2f} s" for i, t in zip(who, when, strict=True))
+    e = flight.fallen_on()
+    if e is None:
+        return _bounded("lost", e, "m", 0.0, f"lost: {told}", at_least=True)
+    words = (
+        f"lost: {told}; while they fall, {e.who} come within {value(e.value, 'm')} of each other"
+    )
+    if e.value <= 0:
+        words = f"lost: {told}; {e.who} collide"
+    words += f" at {e.when:.2f} s"
+    return _bounded("lost", e, "m", 0.0, words, passed=e.value > 0, at_least=True)
+
+
+def _downwash(flight: Flight, limit: float) -> Finding:
+    e = flight.below()
+    if e is None:
+        return _bounded("separation_below", e, "m", limit, "nobody is below another", at_least=True)
+    passed = e.value >= limit - _SLACK
+    words = f"{e.who} fly one below the other with {value(e.value, 'm')} between them"
+    words += f" at {e.when:.2f} s (limit {limit:g} m)"
+    return _bounded("separation_below", e, "m", limit, words, passed=passed, at_least=True)
+
+
+def _geofence(flight: Flight, low: Floats, high: Floats) -> Finding:
+    e = flight.outside(low, high)
+    assert e is not None
+    words = f"{e.who} comes within {value(-e.value, 'm')} of the geofence at {e.when:.2f} s"
+    if e.value > 0:
+        words = f"{e.who} leaves the geofence by {value(e.value, 'm')} at {e.when:.2f} s"
+    return _bounded("geofence", e, "m", 0.0, words)
+
+
+def _thrust(flight: Flight, e: Extreme | None) -> Iterator[Finding]:
+    """The vehicle that comes nearest to its own thrust limit; and the greatest thrust, where another one has that."""
+    beyond = flight.nearest_to_limit()
+    if e is None or beyond is None:
+        yield _bounded("thrust", e, "N", None)
+        return
+    limits = flight.mission.agents.thrust_limit
+
+    def limit(who: str) -> float:
+        return float(limits[int(who.removeprefix("agent ")) - 1])
+
+    if e.value - limit(e.who) < beyond.value:
+        yield _bounded("thrust_peak", e, "N", None)
+        most = limit(beyond.who)
+        e = Extreme(beyond.value + most, beyond.when, beyond.who, beyond.phase)
+    yield _bounded("thrust", e, "N", limit(e.who))
+
+
+# -- notes -------------------------------------------------------------------------------------------
+
+
+def notes(flight: Flight, phases: list[PhaseVerdict]) -> Iterator[str]:
+    """What fails nothing and yet should be known."""
+    yield from _dips(flight)
+    yield from _turned_over(flight, phases)
+    yield from _fallen(flight)
+    agents = flight.mission.agents
+    if agents.saturate:
+        full = flight.thrust >= np.array(agents.thrust_limit) * (1 - 1e-6)
+        if full.any():
+            who, since = names(np.flatnonzero(full.any(axis=0))), flight.first(full.max(axis=1))
+            yield f"the thrust of {who} is cut off at its limit, first at {since:.2f} s"
+    yield from _sampled(flight)
+
+
+def _sampled(flight: Flight) -> Iterator[str]:
+    """A record that does not say what happens between its samples."""
+    flown = np.unique(flight.result.phase)
+    if any(not flight.result.phases[k].extremes for k in flown):
+        step = float(np.diff(flight.result.time).max(initial=0.0))
+        yield (
+            f"judged at samples alone, up to {step:.3g} s apart: the record does not tell what happens"
+            " between them"
+        )
+
+
+def _fallen(flight: Flight) -> Iterator[str]:
+    """What becomes of vehicles that are lost."""
+    grounds = [o.height for o in flight.mission.obstacles if o.kind == "ground"]
+    radius = flight.mission.agents.radius
+    for i in np.flatnonzero(~flight.left[-1]):
+        r = flight.result.position[:, i]
+        words = f"agent {i + 1}, lost at {flight.mission.lost_at[i]:.2f} s,"
+        down = r[:, 2] <= max(grounds) + radius[i] if grounds else np.zeros(len(r), dtype=np.bool_)
+        down &= ~flight.left[:, i]
+        if down.any():
+            x, y, _ = r[-1]
+            yield f"{words} hits the ground at {flight.first(down):.2f} s and lies at ({x:.1f}, {y:.1f}) m"
+        else:
+            yield f"{words} has fallen to z = {r[-1, 2]:.1f} m when the flight ends"
+
+
+def _dips(flight: Flight) -> Iterator[str]:
+    """Agents below z = 0 where neither ground nor geofence would tell."""
+    mission, z = flight.mission, flight.of_left(flight.result.position[..., 2])
+    if mission.limits.geofence is not None or any(o.kind == "ground" for o in mission.obstacles):
+        return
+    low = np.flatnonzero((z < -DIP).any(axis=0))
+    e = flight.height(lowest=True)
+    if e is not None and e.value < -DIP:
+        others = f" ({names(low)} are below 0 at times)" if len(low) > 1 else ""
+        words = f"dips to z = {e.value:.2f} m at {e.when:.2f} s{others}"
+        yield f"{e.who} {words}; the mission has no ground"
+
+
+def _turned_over(flight: Flight, phases: list[PhaseVerdict]) -> Iterator[str]:
+    """Planar formations that come back with another side up where nothing commands an attitude."""
+    seen: dict[str, tuple[Floats, float]] = {}
+    for i, p in enumerate(phases):
+        fit = flight.fits.get(i)
+        if fit is None or p.formation is None or fit.dimension != 2 or p.flip is not None:
+            continue
+        if not p.finished or fit.error > fit.limit:
+            continue
+        normal, since = seen.setdefault(p.formation, (fit.points, p.t_end))
+        if angle_between(normal, fit.points) > FLIPPED:
+            yield (
+                f"'{p.formation}' lies with its other side up at {p.t_end:.2f} s than at {since:.2f} s;"
+                " nothing commands its attitude"
+            )

@@ -1,0 +1,506 @@
+"""What was flown, in numbers: shapes against their slots, waypoints, extremes at samples and between them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigidfleet.assessment.verdict import (
+    SENSE,
+    SHAPE_TOLERANCE,
+    Extreme,
+    PhaseVerdict,
+    Waypoint,
+    names,
+    value,
+)
+from rigidfleet.formation import shapes
+from rigidfleet.math import attitude as att
+from rigidfleet.math import proximity as geometry
+from rigidfleet.result import PAD, PhaseRecord, Result
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+#: Slots thinner than this, relative to their length, are planar or straight: distances of seven digits
+#: leave a flat shape 3e-4 thick.
+THIN = 1e-3
+
+#: By so much of it a sample may be worse than the worst of its phase before the record contradicts itself. Of forces
+#: that cannot be said: those of large formations are known at the ends of steps alone, a user's may fall between them.
+_SLACK = {"separation": 0.0, "clearance": 0.0, "speed": 1e-9}
+
+#: Bytes of slots up to which what is known of their shape is kept, for the next phase or flight.
+_KEPT = 100_000
+
+#: Agents up to which a shape that is not the intended one is asked whether it is rigid.
+_JUDGED = 200
+
+
+class Fit:
+    """A formation as flown at one sample, p (N, 3), against its slots (N, 3)."""
+
+    def __init__(self, p: Floats, slots: Floats, who: Ints | None = None) -> None:
+        known = (
+            _shape(slots.tobytes()) if slots.nbytes < _KEPT else _shape.__wrapped__(slots.tobytes())
+        )
+        #: Slots' dimension; direction of a line or normal of a plane, in their axes; their shortest distance [m].
+        self.dimension, self.axis, self.shortest = known
+        self.error, pair, self.flown, self.intended = _all_pairs(p, slots)
+        #: The pair with the greatest error, by the numbers ``who`` (N,) of the agents.
+        self.pair = pair if who is None else (int(who[pair[0]]), int(who[pair[1]]))
+        p, slots = shapes.centred(p), shapes.centred(slots)
+        self.mirrored = self.dimension == 3 and bool(np.linalg.det(p.T @ slots) < 0)
+        #: Where the axis points in the world.
+        self.points: Floats = shapes.kabsch(p, slots) @ self.axis
+        self.in_order: bool | None = None
+        if self.dimension == 1 and len(p) > 2:
+            asked = np.argsort(slots @ self.axis).tolist()
+            flown = np.argsort(p @ np.linalg.svd(p, full_matrices=False)[2][0]).tolist()
+            self.in_order = flown in (asked, asked[::-1])
+
+    @property
+    def limit(self) -> float:
+        """Greatest error of a pair [m]."""
+        return SHAPE_TOLERANCE * self.shortest
+
+    def angle_from(self, quaternion: Floats) -> float:
+        """Angle [deg] from where the axis would point in an attitude (4,); NaN where there is none."""
+        if not np.isfinite(quaternion).all():
+            return math.nan
+        return angle_between(self.points, att.dcm_from_quaternion(quaternion).T @ self.axis)
+
+
+class Quantity:
+    """Values (K, ...) at samples: whose they are, by sample and place, and what makes them worse."""
+
+    def __init__(self, values: Floats, who: Callable[..., str], sense: Callable[..., Any]) -> None:
+        self.values, self.who, self.sense = values, who, sense
+        #: The worst of each sample (K,); -infinity where none is finite.
+        self.rank = self._ranked(sense(values))
+        if not np.isfinite(self.rank).all():
+            self.rank = self._ranked(sense(np.where(np.isfinite(values), values, np.nan)))
+
+    @staticmethod
+    def _ranked(values: Floats) -> Floats:
+        if values.ndim > 1:  # along the agents, of which there are few, it takes longer
+            values = np.fmax.reduce(np.ascontiguousarray(values.T), axis=0, initial=-np.inf)
+        return np.where(np.isnan(values), -np.inf, values)
+
+    def at(self, k: int) -> tuple[float, tuple[int, ...]]:
+        """The worst of sample k, and its place."""
+        if self.values.ndim == 1:
+            return float(self.values[k]), ()
+        row = self.values[k]
+        i = int(np.where(np.isfinite(row), self.sense(row), -np.inf).argmax())
+        return float(row[i]), (i,)
+
+
+class Flight:
+    """Measures a result, phase by phase: at its samples, computed anew from positions and forces, and between them."""
+
+    def __init__(self, result: Result) -> None:
+        self.result, self.mission = result, result.mission
+        self.labels = result.edge_labels
+        self.fits: dict[int, Fit] = {}
+        self.left = result.left
+        #: Samples of each phase.
+        self.samples = [result.samples(k) for k in range(len(result.phases))]
+        radius, obstacles = self.mission.agents.radius, self.mission.obstacles
+        #: Room of each agent to obstacles, and the nearest one (K, N).
+        self.room, self.nearest = geometry.rooms(result.position, radius, obstacles)
+        if not self.left.all():
+            self.room[~self.left] = np.inf
+        #: Separation, pair, clearance, agent and obstacle at samples (K, ...).
+        self.close = (
+            *geometry.separation_of_left(result.position, radius, self.left),
+            *geometry.least_room(self.room, self.nearest),
+        )
+        thrust = _length(result.input_force + result.constraint_force)
+        if self.mission.agents.saturate:
+            thrust = np.minimum(thrust, self.mission.agents.thrust_limit)
+        self.thrust = self.of_left(np.maximum(thrust, result.thrust))
+        self.measured: dict[str, Quantity] = {
+            name: Quantity(values, who, SENSE[name])
+            for name, values, who in (
+                ("constraint", np.abs(result.constraint), self.edge),
+                ("separation", self.close[0], self.pair),
+                ("clearance", self.close[2], self.obstacle),
+                ("thrust", self.thrust, self.agent),
+                ("speed", self.of_left(_length(result.velocity)), self.agent),
+                ("acceleration", self.of_left(_length(result.acceleration)), self.agent),
+                ("constraint_force", self.of_left(_length(result.constraint_force)), self.agent),
+                ("tension", -result.multiplier, self.edge),
+                ("singular_value", result.singular_value, lambda k: ""),
+            )
+        }
+        #: The worst of each quantity at the samples of each phase.
+        self.sampled = [
+            {name: self.worst_sample(q, self.samples[k]) for name, q in self.measured.items()}
+            for k in range(len(result.phases))
+        ]
+
+    def of_left(self, values: Floats) -> Floats:
+        """Values (K, N), NaN of agents that are lost."""
+        return values if self.left.all() else np.where(self.left, values, np.nan)
+
+    def agent(self, _k: int, i: int) -> str:
+        """Name of agent i (from 0), at whichever sample."""
+        return f"agent {i + 1}"
+
+    def edge(self, _k: int, e: int) -> str:
+        """Name of edge e (from 0), at whichever sample."""
+        return f"edge {self.labels[e]}"
+
+    def pair(self, k: int) -> str:
+        """The two agents that are nearest to each other at sample k."""
+        return names(np.sort(self.close[1][k]))
+
+    def obstacle(self, k: int) -> str:
+        """The agent that is nearest to an obstacle at sample k, and the obstacle."""
+        return self.beside(int(self.close[3][k]), int(self.close[4][k]))
+
+    def beside(self, agent: int, obstacle: int) -> str:
+        """Name of an agent and of an obstacle, from 0."""
+        return f"agent {agent + 1}, {self.mission.obstacles[obstacle].name}"
+
+    def at(self, k: int) -> dict[str, Any]:
+        """When sample k is, and in which phase."""
+        return {
+            "when": float(self.result.time[k]),
+            "phase": self.result.phases[self.result.phase[k]].name,
+        }
+
+    def first(self, broken: NDArray[np.bool_]) -> float:
+        """Time [s] of the first sample at which something is broken; infinity if it never is."""
+        return float(self.result.time[int(np.argmax(broken))]) if broken.any() else math.inf
+
+    def extreme(
+        self, values: Floats, who: Callable[..., str], sense: Callable[..., Any] = lambda x: x
+    ) -> Extreme | None:
+        """Where sense(values) is greatest; values (K, ...), of which only the finite ones count."""
+        return self.worst_sample(Quantity(values, who, sense), slice(0, len(values)))
+
+    def worst_sample(self, quantity: Quantity, samples: slice) -> Extreme | None:
+        """The worst of a quantity among some samples; None where nothing is known of it."""
+        rank = quantity.rank[samples]
+        if not len(rank):
+            return None
+        k = samples.start + int(rank.argmax())
+        if quantity.rank[k] == -np.inf:
+            return None
+        value, at = quantity.at(k)
+        return Extreme(value, who=quantity.who(k, *at), **self.at(k))
+
+    # -- between samples ------------------------------------------------------------------------------
+
+    def between(self, name: str, index: int) -> Extreme | None:
+        """What the record says a phase comes to in continuous time; None where it does not say."""
+        phase = self.result.phases[index]
+        x = phase.extremes.get(name)
+        if x is None:
+            return None
+        if name in ("separation", "separation_below", "lost"):
+            who = names(sorted((x.who, x.other)))
+        elif name in ("tension", "constraint"):
+            who = f"edge {x.who + 1}-{x.other + 1}"
+        elif name.startswith("clearance"):
+            who = self.beside(x.who, x.other)
+        else:
+            who = self.agent(0, x.who)
+        return Extreme(abs(x.value) if name == "constraint" else x.value, x.time, who, phase.name)
+
+    def worst(
+        self, name: str, sampled: Extreme | None, sense: Callable[..., Any] = lambda x: x
+    ) -> Extreme | None:
+        """The worst of a flight: that of its samples, or that between them."""
+        every = [self.between(name, k) for k in range(len(self.result.phases))]
+        return _worse([sampled, *every], sense)
+
+    def below(self) -> Extreme | None:
+        """Least vertical room [m] between two agents of which one is below the other."""
+        least, pair = geometry.headroom(self.result.position, self.mission.agents.radius, self.left)
+        sampled = self.extreme(least, lambda k: names(pair[k]), lambda x: -x)
+        return self.worst("separation_below", sampled, lambda x: -x)
+
+    def outside(self, low: Floats, high: Floats) -> Extreme | None:
+        """How far [m] an agent's centre comes out of a box with these corners; negative inside."""
+        r = self.result.position
+        beyond = self.of_left(np.maximum(low - r, r - high).max(axis=2))
+        return self.worst("geofence", self.extreme(beyond, self.agent))
+
+    def height(self, *, lowest: bool) -> Extreme | None:
+        """Least or greatest altitude [m] of an agent's centre."""
+        z, sense = (
+            self.of_left(self.result.position[..., 2]),
+            np.negative if lowest else np.positive,
+        )
+        name = "lowest" if lowest else "highest"
+        return self.worst(name, self.extreme(z, self.agent, sense), sense)
+
+    def nearest_to_limit(self) -> Extreme | None:
+        """Thrust less its limit [N], of the agent that comes nearest to its own, or furthest beyond."""
+        most = np.array(self.mission.agents.thrust_limit)
+        return self.worst("thrust_margin", self.extreme(self.thrust - most, self.agent))
+
+    def clearances(self) -> dict[str, Extreme | None]:
+        """Least room to obstacles [m] in flight, and of who stands on one from the start, or at the end.
+
+        A vehicle within `PAD` of an obstacle since the start, or until the end, stands on it.
+        """
+        time = self.result.time
+        room, nearest = self.of_left(self.room), self.nearest
+        off = room > PAD
+        first = np.where(off.any(axis=0), off.argmax(axis=0), len(time))
+        last = np.where(off.any(axis=0), len(time) - 1 - off[::-1].argmax(axis=0), len(time))
+        last = np.where(self.left[-1], last, len(time))  # who is lost does not land
+        k = np.arange(len(time))[:, None]
+        parts = {
+            "clearance_start": k < first,
+            "clearance_flight": (k >= first) & (k <= last),
+            "clearance_end": (k >= first) & (k > last),
+        }
+        told = {name for p in self.result.phases for name in p.extremes}
+        stands = parts["clearance_start"].any() or parts["clearance_end"].any()
+        if not (stands or told & {"clearance_start", "clearance_end"}):
+            # All fly, all the time.
+            return {"clearance_flight": self.worst_clearance()}
+        found = {}
+        for name, part in parts.items():
+            values = np.where(part, room, np.nan)
+            sampled = self.extreme(
+                values, lambda k, i: self.beside(i, int(nearest[k, i])), lambda x: -x
+            )
+            found[name] = self.worst(name, sampled, lambda x: -x)
+        return found
+
+    def worst_clearance(self) -> Extreme | None:
+        """Least room to an obstacle [m] of all vehicles, standing ones among them."""
+        sampled = self.extreme(self.close[2], self.obstacle, np.negative)
+        return self.worst("clearance", sampled, np.negative)
+
+    def fallen_on(self) -> Extreme | None:
+        """Least room [m] between a lost agent and one that is left; None if none is lost."""
+        r, radius = self.result.position, np.array(self.mission.agents.radius)
+        least, who = np.full(len(r), np.nan), np.zeros((len(r), 2), dtype=np.int64)
+        for i in np.flatnonzero(~self.left[-1]):
+            room = np.linalg.norm(r - r[:, [i]], axis=2) - radius - radius[i]
+            room = np.where(self.left & ~self.left[:, [i]], room, np.inf)
+            j = room.argmin(axis=1)
+            room = np.where(self.left[:, i], np.nan, room[np.arange(len(r)), j])
+            closer = np.fmin(room, least) != least
+            closer &= np.isfinite(room)
+            least[closer] = room[closer]
+            who[closer] = np.column_stack([np.full(len(r), i), j])[closer]
+        sampled = self.extreme(least, lambda k: names(who[k]), lambda x: -x)
+        return self.worst("lost", sampled, lambda x: -x)
+
+    def contradictions(self) -> Iterator[tuple[str, float]]:
+        """What in the record does not follow from its own positions and forces: in words, and when [s]."""
+        result, time = self.result, self.result.time
+        length = geometry.lengths(result.position, result.edges).T
+        rounding = 1e-9 * (1.0 + float(np.nanmax(np.abs(result.position), initial=0.0)))
+        with np.errstate(invalid="ignore"):  # infinity where there is nothing to be near
+            stored = {
+                "separation": (result.separation - self.close[0], "m"),
+                "clearance": (result.clearance - self.close[2], "m"),
+                "distance": (np.abs(result.distance - length), "m"),
+                "thrust": (self.thrust - result.thrust, "N"),
+            }
+        for name, (off, unit) in stored.items():
+            wrong = off > (rounding if unit == "m" else 1e-6)
+            if wrong.any():
+                k = int(np.argmax(wrong.reshape(len(time), -1).any(axis=1)))
+                worst = float(off[wrong].max())
+                words = f"its {name} is up to {value(worst, unit)} off what its own samples give"
+                yield words, float(time[k])
+        for index, phase in enumerate(result.phases):
+            samples = self.samples[index]
+            if samples.stop > samples.start and phase.extremes:
+                due = ["speed", "lowest", "highest", "thrust"]
+                due += ["separation"] if self.left[samples.start].sum() > 1 else []
+                due += ["clearance"] if self.mission.obstacles else []
+                due += ["geofence"] if self.mission.limits.geofence is not None else []
+                if lacking := [name for name in due if name not in phase.extremes]:
+                    words = (
+                        f"it does not tell the {lacking[0]} of phase '{phase.name}' between samples"
+                    )
+                    yield words, float(time[samples.start])
+            for name, share in _SLACK.items():
+                x = phase.extremes.get(name)
+                if x is None or samples.stop == samples.start:
+                    continue
+                sense, sampled = SENSE[name], self.sampled[index][name]
+                if sampled is None:
+                    continue
+                slack = rounding + share * abs(sampled.value)
+                if sense(sampled.value) > sense(x.value) + slack or not (
+                    phase.t_start - 1e-9 <= x.time <= phase.t_end + 1e-9
+                ):
+                    words = (
+                        f"its {name.replace('_', ' ')} of phase '{phase.name}' is said to come to"
+                    )
+                    words += f" {value(x.value)} at {x.time:.2f} s, and a sample shows {value(sampled.value)}"
+                    yield words, sampled.when
+
+    def phase(self, index: int, record: PhaseRecord) -> PhaseVerdict:
+        """Numbers of a phase."""
+        result, samples = self.result, self.samples[index]
+        flown, last = samples.stop > samples.start, samples.stop - 1
+        finished = flown and (result.complete or index < len(result.phases) - 1)
+        fit = distances = flip = constraint = None
+        if flown:
+            constraint = _greatest(result.constraint[last])
+        if flown and record.formation is not None:
+            p, left = result.position[last], np.flatnonzero(self.left[last])
+            slots = self.mission.formation_slots(record.formation)
+            edges, intended = self.edges(record.formation, last)
+            distances = _greatest(shapes.distances(p, edges) - intended)
+            if slots is not None and len(left) > 1 and np.isfinite(p).all():
+                fit = self.fits[index] = Fit(p[left], slots[left], left)
+                flip = self.flip(fit, record, last)
+        extremes = {
+            name: _worse([self.sampled[index][name], self.between(name, index)], q.sense)
+            for name, q in self.measured.items()
+        }
+        return PhaseVerdict(
+            name=record.name,
+            kind=record.kind,
+            control=record.control,
+            formation=record.formation,
+            t_start=record.t_start,
+            t_end=record.t_end,
+            settled=record.settled,
+            finished=finished,
+            constraint=constraint,
+            distances=distances,
+            shape=None if fit is None else fit.error,
+            handedness=None if fit is None or fit.dimension < 3 else not fit.mirrored,
+            flip=flip,
+            order=None if fit is None else fit.in_order,
+            waypoint=self.waypoint(record, samples) if finished else None,
+            worst={name: found for name, found in extremes.items() if found is not None},
+        )
+
+    def edges(self, formation: str, k: int) -> tuple[Ints, Floats]:
+        """Edges (m, 2) of a formation between agents left at sample k, and their lengths (m,) [m]."""
+        edges = self.mission.formation_edges(formation)
+        kept = self.left[k][edges].all(axis=1)
+        return edges[kept], self.mission.formation_distances(formation)[kept]
+
+    def flip(self, fit: Fit, record: PhaseRecord, k: int) -> float | None:
+        """Angle [deg] of a line or plane from where it should point at sample k; None if nothing says."""
+        # An attitude that is commanded decides; the integrated frame is where a plane should lie if none is.
+        if fit.dimension == 2:
+            references = [self.result.attitude_reference[k], self.result.frame[k]]
+        elif fit.dimension == 1 and record.control == "slots":
+            # Only tracked slots steer a line; else it keeps the direction of what it was folded from.
+            references = [self.result.attitude_reference[k]]
+        else:
+            return None
+        return next((a for q in references if math.isfinite(a := fit.angle_from(q))), None)
+
+    def waypoint(self, record: PhaseRecord, samples: slice) -> Waypoint | None:
+        """Miss at the waypoint's time, or at the phase's end if it settles before."""
+        target = record.target
+        if target is None:
+            return None
+        result = self.result
+        k = samples.start + int(np.abs(result.time[samples] - target["time"]).argmin())
+
+        def miss(name: str, flown: Floats) -> float | None:
+            asked = target.get(name)
+            if asked is None or not np.isfinite(flown).all():
+                return None
+            if name == "attitude":
+                return math.degrees(float(att.angle_between(flown, asked)))
+            return float(np.linalg.norm(flown - np.asarray(asked)))
+
+        rates = miss("rates", result.rates[k])
+        return Waypoint(
+            time=float(result.time[k]),
+            position=miss("position", result.cm[k]),
+            velocity=miss("velocity", result.cm_velocity[k]),
+            attitude=miss("attitude", result.attitude[k]),
+            rates=None if rates is None else math.degrees(rates),
+        )
+
+
+def _worse(every: Iterable[Extreme | None], sense: Callable[..., Any]) -> Extreme | None:
+    """The worst of those there are; of equals the first."""
+    found = [e for e in every if e is not None]
+    return (
+        max(found, key=lambda e: sense(e.value)) if len(found) > 1 else found[0] if found else None
+    )
+
+
+def _length(x: Floats) -> Floats:
+    """Lengths (...) of vectors (..., 3)."""
+    return np.sqrt(np.einsum("...a,...a->...", x, x))
+
+
+@lru_cache(64)
+def _shape(slots: bytes) -> tuple[int, Floats, float]:
+    """Dimension of slots (N, 3), the direction of a line or the normal of a plane, and the shortest distance [m]."""
+    points = np.frombuffer(slots).reshape(-1, 3)
+    centred = shapes.centred(points)
+    dimension = shapes.dimension(centred, THIN)
+    axes = np.linalg.svd(centred, full_matrices=False)[2]
+    return dimension, axes[0] if dimension == 1 else axes[2], float(shapes.nearest(points).min())
+
+
+def _all_pairs(p: Floats, slots: Floats) -> tuple[float, tuple[int, int], float, float]:
+    """Worst error of a distance: error, pair, flown, intended [m].
+
+    Of all pairs, but few are looked at: no error is greater than the sum of how far both agents are off their slots,
+    however those are laid onto them, as they are or mirrored. Less than rounding counts for nothing.
+    """
+    x, q = shapes.centred(p), shapes.centred(slots)
+    U, _, Vt = np.linalg.svd(q.T @ x)
+    off = np.linalg.norm(x - q @ (U @ Vt), axis=1)
+    order = np.argsort(-off, kind="stable")
+    ranked, rounding = -off[order], 1e-12 * float(np.abs(q).max())
+    worst = (-1.0, (0, 0), 0.0, 0.0)
+    for k, i in enumerate(order[:-1]):
+        last = int(np.searchsorted(ranked, off[i] - worst[0] - rounding))
+        if last <= k + 1:
+            break
+        others = np.sort(order[k + 1 : last])
+        flown = np.linalg.norm(p[others] - p[i], axis=1)
+        intended = np.linalg.norm(slots[others] - slots[i], axis=1)
+        error = np.abs(flown - intended)
+        j = int(error.argmax())
+        if error[j] > worst[0]:
+            pair = (int(min(i, others[j])), int(max(i, others[j])))
+            worst = (float(error[j]), pair, float(flown[j]), float(intended[j]))
+    return worst
+
+
+def is_rigid(p: Floats, edges: Ints) -> bool:
+    """Whether edges (m, 2) at positions (N, 3) are infinitesimally rigid in space: rank J = 3N - 6.
+
+    Of more than `_JUDGED` agents that is not claimed: it would take longer than all else.
+    """
+    if len(p) > _JUDGED:
+        return False
+    i, j = edges.T
+    u = p[i] - p[j]
+    J = np.zeros((len(edges), len(p), 3))
+    rows = np.arange(len(edges))
+    J[rows, i], J[rows, j] = u, -u
+    return np.linalg.matrix_rank(J.reshape(len(edges), -1), rtol=1e-6) == 3 * len(p) - 6
+
+
+def _greatest(values: Floats) -> float | None:
+    values = np.abs(values[np.isfinite(values)])
+    return float(values.max()) if len(values) else None
+
+
+def angle_between(a: Floats, b: Floats) -> float:
+    """Angle [deg] between two vectors."""
+    return math.degrees(math.atan2(float(np.linalg.norm(np.cross(a, b))), float(a @ b)))

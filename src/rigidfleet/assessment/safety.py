@@ -1,0 +1,115 @@
+"""The safety page of a flight: how close, how fast, how high, how hard, each against its limit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rigidfleet.assessment.measure import Flight
+from rigidfleet.assessment.verdict import Extreme, Finding, Verdict
+from rigidfleet.result import Result
+
+
+@dataclass(frozen=True, slots=True)
+class Safety:
+    """The worst of one quantity.
+
+    Attributes
+    ----------
+    quantity : its name, and `text`, what it measures
+    unit : of the worst value and of its limit
+    at_least : whether the limit is the least value allowed, not the greatest
+    limit : None where the mission sets none
+    worst : None where there is nothing to measure
+    passed : whether the limit is kept; True where there is none
+    """
+
+    quantity: str
+    text: str
+    unit: str
+    at_least: bool
+    limit: float | None
+    worst: Extreme | None
+    passed: bool
+
+    @property
+    def margin(self) -> float | None:
+        """What is left to the limit, in `unit`; negative beyond it."""
+        if self.limit is None or self.worst is None:
+            return None
+        rest = self.limit - self.worst.value
+        return -rest if self.at_least else rest
+
+    @property
+    def used(self) -> float | None:
+        """Share of a greatest allowed value that is used up: 1 at the limit."""
+        if self.at_least or not self.limit or self.worst is None:
+            return None
+        return self.worst.value / self.limit
+
+
+def safety(result: Result, verdict: Verdict) -> list[Safety]:
+    """Worst values of a flight that was judged, quantity by quantity, with limits or without.
+
+    Limits are those of the verdict; the altitude's are those of the geofence.
+    """
+    flight = Flight(result)
+    found = {finding.check: finding for finding in verdict.findings}
+    return [
+        _row(
+            "proximity", "least room between two vehicles' surfaces",
+            found.get("separation"), "m", at_least=True,
+        ),
+        _row(
+            "downwash", "least height between surfaces where one vehicle is below another",
+            found.get("separation_below"), "m", at_least=True, worst=flight.below(),
+        ),
+        _row("speed", "greatest speed of a vehicle", found.get("speed"), "m/s"),
+        _row("acceleration", "greatest acceleration of a vehicle", found.get("acceleration"), "m/s²"),
+        *_altitudes(flight),
+        _row(
+            "geofence", "least room to the fence from inside, centres of the vehicles",
+            _from_inside(found.get("geofence")), "m", at_least=True,
+        ),
+        _row("thrust", "greatest thrust of a vehicle", found.get("thrust"), "N"),
+        _row(
+            "clearance", "least room to an obstacle or the ground",
+            found.get("clearance"), "m", at_least=True,
+        ),
+    ]  # fmt: skip
+
+
+def _row(
+    quantity: str,
+    text: str,
+    finding: Finding | None,
+    unit: str,
+    *,
+    at_least: bool = False,
+    worst: Extreme | None = None,
+) -> Safety:
+    if finding is None:
+        return Safety(quantity, text, unit, at_least, None, worst, True)
+    if finding.worst is not None and finding.when is not None:
+        worst = Extreme(finding.worst, finding.when, finding.who, finding.phase)
+    limit = finding.limit if finding.limit is not None and np.isfinite(finding.limit) else None
+    return Safety(quantity, text, unit, at_least, limit, worst, finding.passed)
+
+
+def _from_inside(finding: Finding | None) -> Finding | None:
+    """The geofence's finding with the room inside it as its worst value, not how far outside."""
+    if finding is None or finding.worst is None:
+        return finding
+    return replace(finding, worst=-finding.worst)
+
+
+def _altitudes(flight: Flight) -> list[Safety]:
+    fence = flight.mission.limits.geofence
+    lowest, highest = flight.height(lowest=True), flight.height(lowest=False)
+    floor, ceiling = (None, None) if fence is None else (fence.min[2], fence.max[2])
+    rows = [
+        Safety("lowest", "least altitude of a vehicle's centre", "m", True, floor, lowest, True),
+        Safety("highest", "greatest altitude of one", "m", False, ceiling, highest, True),
+    ]
+    return [replace(row, passed=row.margin is None or row.margin >= -1e-9) for row in rows]

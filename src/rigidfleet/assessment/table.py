@@ -1,0 +1,75 @@
+"""A verdict for the eye: tables of phases, waypoints and checks, notes, and the verdict in words."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rich.box import SIMPLE_HEAD
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from rigidfleet.assessment.verdict import Finding, Verdict, value
+
+_PHASE = ["phase\n", "end\n[s]", "|c| at end\n[m]", "worst |c|\n[m]", "shape off\n[m]", "apart\n[m]",
+          "clear\n[m]", "thrust\n[N]"]  # fmt: skip
+_WAYPOINT = ["waypoint\n", "at\n[s]", "off by\n[m]", "\n[m/s]", "\n[deg]", "\n[deg/s]"]
+_CHECK = ["check", "worst", "limit", "at [s]", "who or where", ""]
+
+
+def rendered(verdict: Verdict) -> RenderableType:
+    """What rich prints of a verdict."""
+    phases, waypoints = [], []
+    for p in verdict.phases:
+        worst = [p.worst.get(name) for name in ("constraint", "separation", "clearance", "thrust")]
+        c, *rest = [None if e is None else e.value for e in worst]
+        phases.append([p.name, f"{p.t_end:.2f}", *map(_number, (p.constraint, c, p.shape, *rest))])
+        if p.waypoint is not None:
+            w = p.waypoint
+            misses = (w.position, w.velocity, w.attitude, w.rates)
+            waypoints.append([p.name, f"{w.time:.2f}", *map(_number, misses)])
+    shown: list[RenderableType] = [
+        Text.assemble((verdict.mission, "bold"), f"  {verdict.title}"),
+        _table(_PHASE, phases),
+    ]
+    if any(row[2] for row in phases):
+        shown.append(
+            Text("|c|: an edge's length less that commanded; the greatest of all edges.", "dim")
+        )
+    if waypoints:
+        shown.append(_table(_WAYPOINT, waypoints))
+    shown.append(_table(_CHECK, [_check(f) for f in verdict.findings], left=("who or where", "")))
+    shown += [Text(f"Note: {note}.", "yellow") for note in verdict.notes]
+    return Group(*shown, Text(verdict.summary, "bold green" if verdict.passed else "bold red"))
+
+
+def _table(
+    heads: Sequence[str], rows: Sequence[Sequence[str | Text]], left: Sequence[str] = ()
+) -> Table:
+    """A table whose first column is words, without the columns in which nothing stands."""
+    kept = [k for k in range(len(heads)) if any(row[k] for row in rows)]
+    table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold")
+    for k in kept:
+        words = k == 0 or heads[k] in left
+        table.add_column(Text(heads[k]), justify="left" if words else "right", no_wrap=not words)
+    for row in rows:
+        table.add_row(*(Text(x) if isinstance(x, str) else x for x in (row[k] for k in kept)))
+    return table
+
+
+def _check(f: Finding) -> list[str | Text]:
+    mark = Text("ok", "green") if f.passed else Text("FAILED", "bold red")
+    when = "" if f.when is None else f"{f.when:.2f}"
+    name, who = f.check.replace("_", " "), f.who or f.phase
+    return [name, _number(f.worst, f.unit), _bound(f), when, who, mark if f.judged else ""]
+
+
+def _bound(f: Finding) -> str:
+    if f.limit is None:
+        return ""
+    sign = (">=" if f.limit else ">") if f.at_least else "<="
+    return f"{sign} {value(f.limit, f.unit)}"
+
+
+def _number(x: float | None, unit: str = "") -> str:
+    return "" if x is None else value(x, unit)

@@ -1,0 +1,301 @@
+"""What the command shows: what was asked for on standard output, progress and errors on standard error.
+
+Colours and animation are for terminals; what goes to a file or a pipe has its rows whole.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+from collections import deque
+from collections.abc import Iterable
+from functools import cache
+from io import TextIOWrapper
+from time import perf_counter
+from typing import IO, TYPE_CHECKING, Self
+
+from rigidfleet.errors import MissionError
+
+if TYPE_CHECKING:
+    from rich.console import Console, RenderableType
+    from rich.live import Live
+    from rich.table import Table
+
+    from rigidfleet.simulation.flight import Progress
+    from rigidfleet.sweep import SweepProgress
+
+#: Columns of a table that goes to a file or a pipe, where no row may be broken.
+_WIDE = 1000
+#: Where there is no terminal to draw a bar on, a line says so often how far a flight is [s].
+_SELDOM = 10.0
+#: A check that takes longer says what it looks at [s].
+_PATIENCE = 5.0
+#: A flight is heard of several times a second: when not for so long, it compiles [s].
+_SILENCE = 1.0
+#: The speed of a flight is that of the last so many seconds, once there has been one of them: phases differ a
+#: thousandfold, and while one is planned nothing moves.
+_RECENT, _KNOWN = 10.0, 1.0
+COMPILING = "Compiling the flight kernel (once, about 20 s)"
+
+
+def out() -> Console:
+    """For what was asked for."""
+    return console(stderr=False)
+
+
+def err() -> Console:
+    """For progress and errors."""
+    return console(stderr=True)
+
+
+@cache
+def console(*, stderr: bool, width: int | None = None) -> Console:
+    """Return the one console for standard output or error; of its own width, or of a given one."""
+    from rich.console import Console
+
+    class Polite(Console):
+        def on_broken_pipe(self) -> None:
+            # The reader has had enough, as `head` has: go on without it, the exit code still counts.
+            self.quiet = True
+            hang_up(self.file)
+
+    return Polite(stderr=stderr, width=width, markup=False, highlight=False, emoji=False)
+
+
+def prepare_streams() -> None:
+    """Make sure that there is somewhere to write to, and that any sign can be written."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:  # closed by `>&-`
+            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
+        elif isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="replace")  # a sign that the terminal lacks becomes "?"
+
+
+def hang_up(stream: IO[str]) -> None:
+    """Send nowhere what is still to be written to a stream."""
+    with open(os.devnull, "wb") as nowhere:
+        os.dup2(nowhere.fileno(), stream.fileno())
+
+
+def print_exactly(text: str) -> None:
+    """Print text for other programs: in UTF-8, no line changed."""
+    try:
+        sys.stdout.flush()
+        sys.stdout.buffer.write(text.encode())
+        sys.stdout.buffer.flush()
+    except BrokenPipeError:
+        hang_up(sys.stdout)
+
+
+def print_json(data: object) -> None:
+    """Print data as JSON."""
+    import json
+
+    print_exactly(json.dumps(data, ensure_ascii=False, indent=2, default=str) + "\n")
+
+
+def complain(error: object) -> None:
+    """Print an error; of a mission, each of its findings."""
+    from rich.text import Text
+
+    for finding in error.findings if isinstance(error, MissionError) else [error]:
+        err().print(Text.assemble(("error: ", "bold red"), str(finding)), soft_wrap=True)
+
+
+def warn(message: object, *_where: object) -> None:
+    """Show a warning as the line that it is, not with the place in the source that gave it."""
+    err().print(f"warning: {message}", style="yellow", soft_wrap=True, highlight=False)
+
+
+def table(*columns: str) -> Table:
+    """Return an empty table without lines."""
+    from rich.table import Table
+
+    return Table(*columns, box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold")
+
+
+def print_table(rows: RenderableType) -> None:
+    """Print a table, or what is made of tables: as wide as the screen, or, without one, as it is."""
+    wide = out() if out().is_terminal else console(stderr=False, width=_WIDE)
+    wide.print(rows)
+
+
+def print_words(rows: Iterable[tuple[str, str]]) -> None:
+    """Print facts under headings, wrapped to the screen, a heading that repeats only once."""
+    from rich.table import Table
+    from rich.text import Text
+
+    table, before = Table.grid(padding=(0, 2, 0, 0)), ""
+    table.add_column(no_wrap=True, max_width=24)
+    table.add_column(overflow="fold")
+    for heading, text in rows:
+        style = "bold red" if heading == "fails" else "bold"
+        table.add_row(Text("" if heading == before else heading, style=style), Text(text))
+        before = heading
+    out().print(table)
+
+
+class _Screen:
+    """Shows what goes on: on a terminal as it changes, and elsewhere by a line now and then."""
+
+    def __init__(self) -> None:
+        self.console = err()
+        self.live: Live | None = None
+        self.begun = self.told = perf_counter()
+        self.cold = False
+
+    def __enter__(self) -> Self:
+        if self.console.is_interactive:
+            from rich.live import Live
+            from rich.spinner import Spinner
+
+            self.spinner = Spinner("dots")
+            self.live = Live(self, console=self.console, transient=True, refresh_per_second=10)
+            self.live.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self.live is not None:
+            self.live.stop()
+
+    def __rich__(self) -> RenderableType:
+        return ""
+
+    def compiling(self) -> None:
+        """Expect the kernel to be compiled, on the way, in several parts."""
+        self.cold, self.begun = True, perf_counter()
+        if self.live is None:
+            self.console.print(COMPILING)
+
+    def waiting(self) -> RenderableType:
+        """What is shown before there is anything to show."""
+        text = COMPILING if self.cold else "Starting"
+        self.spinner.update(text=f"{text}: {perf_counter() - self.begun:.0f} s")
+        return self.spinner
+
+    def bar(self, total: float, done: float) -> RenderableType:
+        """How much of it is done, and the words."""
+        from rich.progress_bar import ProgressBar
+        from rich.table import Table
+
+        row = Table.grid(padding=(0, 1))
+        row.add_row(ProgressBar(total, done, width=30), self._words())
+        return row
+
+    def tell(self, now: float) -> None:
+        """Print a line where nothing moves, if the last one was long ago."""
+        if self.live is None and now - self.told > _SELDOM:
+            self.told = now
+            self.console.print(self._words())
+
+    def _words(self) -> str:
+        return ""
+
+
+class CheckWatch:
+    """Says every few seconds what a check looks at; of most, which are done before, nothing."""
+
+    def __init__(self, what: str) -> None:
+        self.what, self.stage, self.begun = what, "reading", perf_counter()
+
+    def __enter__(self) -> Self:
+        self.done = threading.Event()
+        self.thread = threading.Thread(target=self._tell, daemon=True)
+        self.thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.done.set()
+        self.thread.join()
+
+    def update(self, stage: str) -> None:
+        """Take note of what is looked at next."""
+        self.stage = stage
+
+    def _tell(self) -> None:
+        while not self.done.wait(_PATIENCE):
+            text = f"Checking {self.what}: {self.stage}, {perf_counter() - self.begun:.0f} s"
+            err().print(text, soft_wrap=True)
+
+
+class FlightWatch(_Screen):
+    """Shows how a flight goes on."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.heard = self.begun
+        self.recent: deque[Progress] = deque()
+
+    def update(self, progress: Progress) -> None:
+        """Take note of how far the flight is."""
+        now = perf_counter()
+        if self.cold and now - self.heard > _SILENCE:
+            self.recent.clear()  # the speed is that of flying, without that of compiling
+        self.recent.append(progress)
+        self.heard = now
+        self.tell(now)
+
+    def __rich__(self) -> RenderableType:
+        if not self.recent or (self.cold and perf_counter() - self.heard > _SILENCE):
+            return self.waiting()
+        last = self.recent[-1]
+        return self.bar(last.t_end, last.t)
+
+    def _words(self) -> str:
+        """Time flown, speed against real time, time left, phase."""
+        if not self.recent:
+            return ""
+        last = self.recent[-1]
+        wall = last.wall + perf_counter() - self.heard  # also while it stands still
+        while len(self.recent) > 1 and self.recent[1].wall <= wall - _RECENT:
+            self.recent.popleft()
+        words = [f"{last.t:.1f} of {last.t_end:g} s"]
+        took, flown = wall - self.recent[0].wall, last.t - self.recent[0].t
+        if took >= _KNOWN and flown > 0.0 and last.t < last.t_end:
+            speed = flown / took
+            left = round((last.t_end - last.t) / speed)
+            digits = ".0f" if speed >= 9.95 else ".1f" if speed >= 0.1 else ".1g"
+            words += [f"x{speed:{digits}}", f"{left // 60}:{left % 60:02} left"]
+        return "  ".join([*words, last.phase, *(["(planning)"] if last.planning else [])])
+
+
+class SweepWatch(_Screen):
+    """Shows how a sweep goes on."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.base: SweepProgress | None = None
+        self.last: SweepProgress | None = None
+
+    def update(self, progress: SweepProgress) -> None:
+        """Take note of how far the sweep is."""
+        if progress.flown and (self.base is None or self.base.workers != progress.workers):
+            self.base = progress  # the rate is that of these workers, without their start
+        self.last = progress
+        self.tell(perf_counter())
+
+    def __rich__(self) -> RenderableType:
+        if self.base is None or self.last is None:
+            return self.waiting()
+        return self.bar(self.last.runs, self.last.done)
+
+    def _words(self) -> str:
+        """Runs flown, rate, time left, failures."""
+        if self.base is None or self.last is None:
+            return ""
+        p = self.last
+        words = [f"{p.done} of {p.runs} runs"]
+        if (wall := p.wall - self.base.wall) > 0 and (flown := p.flown - self.base.flown) > 0:
+            rate = flown / wall
+            left = round((p.runs - p.done) / rate)
+            words += [f"{rate:.3g} runs/s", f"{left // 60}:{left % 60:02} left"]
+        words += [f"{p.failed} failed"] if p.failed else []
+        words += [f"{count(p.workers, 'worker')}"] if p.workers > 1 else []
+        return "  ".join(words)
+
+
+def count(n: int, noun: str) -> str:
+    """A number of things in words."""
+    return f"{n} {noun}{'' if n == 1 else 's'}"

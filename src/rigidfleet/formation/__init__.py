@@ -1,0 +1,1 @@
+"""Formations before they fly: shapes, graphs, distances, assignment and point files."""

@@ -1,0 +1,230 @@
+"""Where compiled code is kept, and which of it is run: none that another user can have written.
+
+Machine code and Numba's pickles do whatever whoever wrote them likes. They are kept, and read again, only in a folder
+of this user (or of root) into which nobody else can put anything, not even by putting another folder in place of one
+above it.
+"""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import os
+import shlex
+import stat
+import sys
+import tempfile
+import threading
+import warnings
+from collections.abc import Generator
+from contextlib import contextmanager, suppress
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import IO
+
+#: Whether rights are owners and modes. Windows has lists instead, which keep a user's own folders from others.
+_OWNERS = hasattr(os, "geteuid")
+#: As many links as Linux follows before it takes them for a loop.
+_LINKS = 40
+_ACL = "system.posix_acl_access"
+#: Whether this process, or the one that began it, has warned.
+told = threading.Event()
+
+
+def cache_directory() -> Path:
+    """Return the folder of the compiled kernel, made if need be: one per state of its sources, Numba and Python.
+
+    It is in ``NUMBA_CACHE_DIR`` if that is set, else in ``XDG_CACHE_HOME`` or ``~/.cache``.
+
+    Raises
+    ------
+    OSError
+        It cannot be made, or others could put something there; ``strerror`` says where, and what to do.
+    """
+    return _private(_named())
+
+
+def _named() -> Path:
+    """The folder, as the environment names it."""
+    base = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    return Path(os.path.expanduser(base), "rigidfleet", f"kernel-{_digest()}")
+
+
+@cache
+def _digest() -> str:
+    digest = hashlib.sha256(f"{version('numba')} {sys.version}".encode())
+    for source in sorted(Path(__file__).parents[1].rglob("*.py")):
+        digest.update(source.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+@contextmanager
+def opened(file: str | Path) -> Generator[IO[bytes]]:
+    """A file of the cache, to be read: the very one that was looked at, wherever its name leads meanwhile.
+
+    Raises
+    ------
+    OSError
+        It is not there, or others could have written it.
+    """
+
+    def descriptor(path: str, flags: int) -> int:
+        more = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
+        return os.open(path, flags | more)
+
+    with open(file, "rb", opener=descriptor) as stream:
+        found = os.fstat(stream.fileno())
+        if not stat.S_ISREG(found.st_mode):
+            raise PermissionError(errno.EACCES, f"{file} is no file")
+        _refuse(file, found)
+        yield stream
+
+
+@contextmanager
+def replacing(file: str | Path) -> Generator[IO[bytes]]:
+    """A new file for this user alone, which takes the place of the old one as soon as it is whole."""
+    descriptor, part = tempfile.mkstemp(dir=Path(file).parent, prefix=".", suffix=".part")
+    try:
+        with open(descriptor, "wb") as stream:
+            yield stream
+        os.replace(part, file)
+    except BaseException:
+        with suppress(OSError):
+            os.unlink(part)
+        raise
+
+
+def not_kept(error: OSError) -> None:
+    """Warn that what is compiled cannot be kept; once, whatever the functions and reasons."""
+    if not told.is_set():
+        told.set()
+        warnings.warn(
+            f"the compiled flight kernel cannot be kept in {_named()}: {error.strerror or error}. Every process"
+            " compiles it again, which takes about 20 s, until NUMBA_CACHE_DIR names a folder that you alone can write",
+            RuntimeWarning,
+            stacklevel=3,
+        )
+
+
+# -- who can write ------------------------------------------------------------------------------------
+
+
+def _private(folder: Path) -> Path:
+    """Return the real path of a folder into which nobody else can put anything; what is missing of it is made.
+
+    Links are followed by hand, from the root down, whose owner could do anything anyway. Of each folder on the way
+    either nobody else can write to it, or its sticky bit keeps others from renaming what is not theirs; and what comes
+    next, folder or link, belongs to this user or root. So nobody else can change where the way leads, neither before it
+    is used nor after. To the last folder nobody else can write at all: a sticky bit would let them add to it.
+
+    Raises
+    ------
+    OSError
+    """
+    if not folder.is_absolute():
+        why = "the path is not absolute" if folder.parts[0] != "~" else "there is no home folder"
+        raise FileNotFoundError(errno.ENOENT, why)
+    if not _OWNERS:
+        folder.mkdir(parents=True, exist_ok=True)
+        return folder
+    at, rest, links = Path("/"), list(folder.parts[:0:-1]), 0
+    while rest:
+        here = os.lstat(at)
+        shared = _others_write(at, here)
+        if shared and not here.st_mode & stat.S_ISVTX:
+            raise _open_to_others(at)
+        if (step := rest.pop()) == "..":
+            at = at.parent
+            continue
+        there = at / step
+        try:
+            found = os.lstat(there)
+        except FileNotFoundError:
+            with suppress(FileExistsError):  # made by another process at this moment
+                os.mkdir(there, 0o700)
+            found = os.lstat(there)
+        if not (_own(found) or (found.st_uid == _unnamed() and not shared)):
+            raise _foreign(there)
+        if stat.S_ISLNK(found.st_mode):
+            if (links := links + 1) > _LINKS:
+                raise OSError(errno.ELOOP, f"{there} is a link that leads in a circle")
+            target = Path(os.readlink(there))
+            at = Path("/") if target.is_absolute() else at
+            rest += reversed(target.parts[target.is_absolute() :])
+        elif stat.S_ISDIR(found.st_mode):
+            at = there
+        else:
+            raise NotADirectoryError(errno.ENOTDIR, f"{there} is no folder")
+    _refuse(at, os.lstat(at))
+    return at
+
+
+def _refuse(path: str | Path, found: os.stat_result) -> None:
+    """Refuse a file, or the last folder, that others have written or can write.
+
+    Raises
+    ------
+    PermissionError
+    """
+    if not _own(found):
+        raise _foreign(path)
+    if _others_write(path, found):
+        raise _open_to_others(path)
+
+
+def _foreign(path: str | Path) -> OSError:
+    return PermissionError(errno.EACCES, f"{path} belongs to another user")
+
+
+def _open_to_others(path: str | Path) -> OSError:
+    remedy = f"`chmod go-w {shlex.quote(str(path))}`"
+    return PermissionError(errno.EACCES, f"others can write to {path}, which {remedy} ends")
+
+
+def _own(found: os.stat_result) -> bool:
+    """Whether something belongs to this user or to root."""
+    return not _OWNERS or found.st_uid in (0, os.geteuid())
+
+
+@cache
+def _unnamed() -> int | None:
+    """Who all users are that have no number where this process runs, root of the machine among them; None if all have.
+
+    So it is in containers of ordinary users (Apptainer, for one). What such an owner has in a folder that others cannot
+    write, is taken for root's on the way to the last folder, which has to be this user's.
+    """
+    try:
+        first, _, count = Path("/proc/self/uid_map").read_text().split()[:3]
+        nobody = int(Path("/proc/sys/kernel/overflowuid").read_text())
+    except (OSError, ValueError):
+        return None
+    return None if (int(first), int(count)) == (0, 2**32 - 1) else nobody
+
+
+def _others_write(path: str | Path, found: os.stat_result) -> bool:
+    """Whether others can write something, if only those of a group."""
+    mode = found.st_mode
+    group = mode & stat.S_IWGRP and not _own_group(path, found)
+    return _OWNERS and bool(mode & stat.S_IWOTH or group)
+
+
+def _own_group(path: str | Path, found: os.stat_result) -> bool:
+    """Whether the group of a file has its owner alone.
+
+    On systems that give each user a group of the same name, whatever a user makes may be writable for that group.
+    """
+    import grp
+    import pwd
+
+    with suppress(OSError, AttributeError):
+        if _ACL in os.listxattr(
+            path
+        ):  # then the rights of the group are the most that anyone on the list has
+            return False
+    try:
+        owner, group = pwd.getpwuid(found.st_uid), grp.getgrgid(found.st_gid)
+    except KeyError:
+        return False
+    same = owner.pw_gid == group.gr_gid and owner.pw_name == group.gr_name
+    return same and {owner.pw_name}.issuperset(group.gr_mem)

@@ -1,0 +1,193 @@
+"""How the kernel is compiled: the same options everywhere, and a cache that notices every change.
+
+Numba's own cache does not notice a change in a callee that lives in another file, so the cache
+folder is keyed here by a digest of all sources of the kernel.
+"""
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import FunctionType
+from typing import Any, TypeVar
+
+import numba
+from numba import types
+from numba.core.caching import (
+    CompileResultCacheImpl,
+    FunctionCache,
+    IndexDataCacheFile,
+    NullCache,
+    UserProvidedCacheLocator,
+)
+from numba.core.ccallback import CFunc
+from numba.extending import intrinsic
+
+from rigidfleet.kernel.compiler.cache import cache_directory, not_kept, opened, replacing
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+OPTIONS: dict[str, Any] = {
+    "nogil": True,
+    "error_model": "numpy",  # division by zero gives infinity
+    # Sums may be reordered and fused, but NaN and infinity keep their meaning: the integrator has
+    # to see them to reject a step.
+    "fastmath": {"reassoc", "contract", "arcp", "nsz"},
+    # Without reference counts, which cost more than the physics: whoever calls keeps the arrays
+    # alive. The compiler then refuses any function that would allocate.
+    "_nrt": False,
+}
+#: Where Numba is to optimise nothing (see `rigidfleet.kernel.engine.native`), code is neither kept nor inlined yet.
+_OPTIMISES = numba.config.OPT > 0
+_CACHED = OPTIONS | {"no_cfunc_wrapper": True}
+
+
+def compiled(function: F) -> F:
+    """Compile for the flight: cached on disk, without the GIL, without allocation."""
+    return _cached(function, _CACHED)
+
+
+def inlined(function: F) -> F:
+    """Compile into each caller: for what every evaluation of a flight goes through."""
+    return _cached(function, _CACHED | {"forceinline": _OPTIMISES})
+
+
+def compiled_copy(function: Any, name: str, **instead: Any) -> Any:
+    """Compile a compiled function's source once more, with other functions in place of some it calls."""
+    return _cached(_copy(function.py_func, name, instead), _CACHED)
+
+
+def compiled_for_c(function: Any, name: str, *, arguments: int, **instead: Any) -> int:
+    """Compile a copy of a function of so many pointers to float64; return its address.
+
+    Both it and the copy stay as long as the process does.
+    """
+    signature = types.void(*[types.CPointer(types.float64)] * arguments)
+    copy = _copy(function, name, instead)
+    made = CFunc(copy, (signature.args, signature.return_type), {}, {"nopython": True})
+    made._cache = _cache(copy)
+    made.compile()
+    _STAYING.append(made)
+    return made.address
+
+
+_STAYING: list[Any] = []
+
+
+def _copy(function: FunctionType, name: str, instead: dict[str, Any]) -> FunctionType:
+    copy = FunctionType(function.__code__, function.__globals__ | instead, name)
+    copy.__module__, copy.__qualname__ = function.__module__, name
+    return copy
+
+
+@intrinsic
+def call_solver(_context, address):
+    """Call the C function at ``address``: void()."""
+    from llvmlite import ir
+
+    def generate(context, builder, signature, arguments):
+        kind = ir.FunctionType(ir.VoidType(), [])
+        builder.call(builder.inttoptr(arguments[0], kind.as_pointer()), [])
+        return context.get_dummy_value()
+
+    return types.void(types.int64), generate
+
+
+@intrinsic
+def call_recorder(_context, address, p, w, stretch, record):
+    """Call `native`'s recorder at ``address``: int64(program, workspace, stretch, record), all of them addresses."""
+    from llvmlite import ir
+
+    def generate(context, builder, signature, arguments):
+        word = ir.IntType(64)
+        kind = ir.FunctionType(word, [word] * 4)
+        function, p, w, *rest = arguments
+        words = [builder.ptrtoint(x, word) for x in (p, w)]
+        return builder.call(builder.inttoptr(function, kind.as_pointer()), [*words, *rest])
+
+    return types.int64(types.int64, p, w, types.int64, types.int64), generate
+
+
+class _Place(UserProvidedCacheLocator):
+    """Where a function is kept: among the rest of the kernel."""
+
+    def __init__(self, function: FunctionType) -> None:
+        self._py_file, self._lineno = (
+            function.__code__.co_filename,
+            function.__code__.co_firstlineno,
+        )
+        self._cache_path = str(cache_directory())
+
+    def ensure_cache_path(self) -> None:
+        cache_directory()
+
+
+class _Form(CompileResultCacheImpl):
+    """In which form it is kept. Numba itself would ask the environment, and the current folder, for a place."""
+
+    def __init__(self, function: FunctionType) -> None:
+        self._lineno = function.__code__.co_firstlineno
+        self._locator = _Place(function)
+        name = f"{Path(function.__code__.co_filename).stem}.{function.__qualname__}"
+        self._filename_base = self.get_filename_base(name, getattr(sys, "abiflags", ""))
+
+
+class _Files(IndexDataCacheFile):
+    """Numba's files, which are pickles: those that others could have written are not there.
+
+    Between the look at a file and Numba's own nobody else can put another in its place, see `cache_directory`.
+    """
+
+    def _load_index(self) -> Any:
+        try:
+            with opened(self._index_path):
+                return super()._load_index()
+        except OSError:
+            return {}
+
+    def _load_data(self, name: str) -> Any:
+        with opened(self._data_path(name)):
+            return super()._load_data(name)
+
+    def _open_for_write(self, filepath: str) -> Any:
+        return replacing(filepath)
+
+
+class _Cache(FunctionCache):
+    """Numba's cache of a function, on a disk that may be full: what cannot be kept is compiled again."""
+
+    _impl_class = _Form
+
+    def __init__(self, function: FunctionType) -> None:
+        super().__init__(function)
+        base, stamp = self._impl.filename_base, self._impl.locator.get_source_stamp()
+        self._cache_file = _Files(self._cache_path, base, stamp)
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        try:
+            super().save_overload(sig, data)
+        except OSError as error:
+            not_kept(error)
+
+
+class _NoCache(NullCache):
+    """None, and why."""
+
+    def __init__(self, error: OSError) -> None:
+        self._error = error
+
+    def save_overload(self, *_: Any) -> None:
+        not_kept(self._error)
+
+
+def _cache(function: Any) -> _Cache | _NoCache:
+    try:
+        return _Cache(function)
+    except OSError as error:
+        return _NoCache(error)
+
+
+def _cached(function: F, options: dict[str, Any]) -> F:
+    dispatcher = numba.njit(**options)(function)
+    if _OPTIMISES:
+        dispatcher._cache = _cache(function)
+    return dispatcher

@@ -1,0 +1,166 @@
+"""Named tuples by their address: what the compiled functions read them through.
+
+A `Program` or `Workspace` holds some three hundred numbers, most of them addresses and sizes of arrays. Passed by
+value, every call would copy them all, and the compiler would take as long over the copies as over the physics.
+A `Pointer` is the address of a named tuple laid out in words of eight bytes: a number takes one word (a value of
+lanes eight), an array those of its data and of its shape, a tuple within it those of its fields. Reading a field
+loads its words, which never change while compiled code runs, and the compiler knows that.
+"""
+
+import hashlib
+from typing import Any
+
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.core.typing.templates import AttributeTemplate
+from numba.extending import (
+    infer_getattr,
+    intrinsic,
+    lower_getattr_generic,
+    models,
+    register_model,
+)
+
+from rigidfleet.kernel.compiler.simd import WIDTH, lanes
+
+_WORD = ir.IntType(64)
+_ADDRESS = _WORD.as_pointer()
+#: So much of a named tuple may be read before it is needed [bytes]: of more there is no room in registers.
+_AHEAD = 256
+
+
+class Pointer(types.Type):
+    """The type of the address of a named tuple of type ``to``."""
+
+    def __init__(self, to: types.BaseNamedTuple) -> None:
+        self.to = to
+        # Names of types become part of the functions' names: in full, they would be most of the code.
+        digest = hashlib.sha256(str(to).encode()).hexdigest()[:12]
+        super().__init__(name=f"{to.instance_class.__name__}At{digest}")
+
+
+@register_model(Pointer)
+class _Model(models.PrimitiveModel):
+    def __init__(self, manager: Any, kind: Any) -> None:
+        super().__init__(manager, kind, _ADDRESS)
+        self._size = 8 * _words(kind.to)
+
+    def from_argument(self, _builder: Any, value: Any) -> Any:
+        """Say of an argument that it is there, so that reading may begin before it is needed."""
+        value.attributes.dereferenceable = min(self._size, _AHEAD)
+        value.attributes.align = 8
+        return value
+
+
+def _words(kind: types.Type) -> int:
+    """How many words a value takes."""
+    if isinstance(kind, types.BaseNamedTuple):
+        return sum(map(_words, kind.types))
+    if isinstance(kind, types.Array):
+        return 1 + kind.ndim
+    return WIDTH if kind == lanes else 1
+
+
+def _field(kind: types.BaseNamedTuple, name: str) -> tuple[types.Type, int]:
+    """Type and first word of a field."""
+    k = kind.fields.index(name)
+    return kind.types[k], sum(map(_words, kind.types[:k]))
+
+
+@infer_getattr
+class _Attribute(AttributeTemplate):
+    key = Pointer
+
+    def generic_resolve(self, kind: Any, name: str) -> types.Type:
+        found, _ = _field(kind.to, name)
+        return Pointer(found) if isinstance(found, types.BaseNamedTuple) else found
+
+
+@lower_getattr_generic(Pointer)
+def _read(context: Any, builder: Any, kind: Any, address: Any, name: str) -> Any:
+    found, first = _field(kind.to, name)
+    if isinstance(found, types.BaseNamedTuple):
+        return _at(builder, address, first)
+    if isinstance(found, types.Array):
+        array = context.make_array(found)(context, builder)
+        array.data = _load(builder, address, first, array.data.type)
+        shape = [_load(builder, address, first + 1 + k) for k in range(found.ndim)]
+        return _described(context, builder, found, array, shape)
+    if found == types.boolean:
+        return builder.trunc(_load(builder, address, first), ir.IntType(1))
+    return _load(builder, address, first, context.get_value_type(found))
+
+
+def _at(builder: Any, address: Any, word: int) -> Any:
+    return builder.gep(address, [ir.Constant(_WORD, word)], inbounds=True)
+
+
+def _load(builder: Any, address: Any, word: int, kind: ir.Type = _WORD) -> Any:
+    place = builder.bitcast(_at(builder, address, word), kind.as_pointer())
+    loaded = builder.load(place, align=8)
+    loaded.set_metadata("invariant.load", builder.module.add_metadata([]))
+    return loaded
+
+
+def _described(context: Any, builder: Any, kind: types.Array, array: Any, shape: list[Any]) -> Any:
+    """A C-contiguous array without owner, which has its address, of its shape."""
+    size = ir.Constant(_WORD, context.get_abi_sizeof(context.get_data_type(kind.dtype)))
+    strides, count, step = [], ir.Constant(_WORD, 1), size
+    for n in reversed(shape):
+        strides.insert(0, step)
+        step, count = builder.mul(step, n), builder.mul(count, n)
+    array.itemsize, array.nitems = size, count
+    array.shape = cgutils.pack_array(builder, shape)
+    array.strides = cgutils.pack_array(builder, strides)
+    return array._getvalue()
+
+
+def pointer(to: types.BaseNamedTuple) -> Any:
+    """Return the compiled function that takes an address, an int64, for that of a named tuple."""
+
+    @intrinsic
+    def take(_context, address):
+        def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+            return builder.inttoptr(args[0], _ADDRESS)
+
+        return Pointer(to)(address), generate
+
+    return take
+
+
+@intrinsic
+def by_address(_context, x):
+    """A named tuple's address: of one passed by value, that of a copy on the caller's stack; others as they are."""
+    if not isinstance(x, types.BaseNamedTuple):
+        return x(x), lambda _context, _builder, _sig, args: args[0]
+
+    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        room = cgutils.alloca_once(builder, _WORD, size=_words(x))
+        _store(context, builder, x, args[0], room, 0)
+        # The address comes out of an empty piece of assembly: what is read through it cannot be read before
+        # all has been stored.
+        kind = ir.FunctionType(_ADDRESS, [_ADDRESS])
+        empty = ir.InlineAsm(kind, "", "=r,0,~{memory}", side_effect=True)
+        return builder.call(empty, [room])
+
+    return Pointer(x)(x), generate
+
+
+def _store(context: Any, builder: Any, kind: Any, value: Any, room: Any, word: int) -> None:
+    """Lay a value down from a word on."""
+    if isinstance(kind, types.BaseNamedTuple):
+        for k, part in enumerate(kind.types):
+            _store(context, builder, part, builder.extract_value(value, k), room, word)
+            word += _words(part)
+        return
+    parts = [value]
+    if isinstance(kind, types.Array):
+        array = context.make_array(kind)(context, builder, value)
+        shape = cgutils.unpack_tuple(builder, array.shape)
+        parts = [builder.ptrtoint(array.data, _WORD), *shape]
+    elif kind == types.boolean:
+        parts = [builder.zext(value, _WORD)]
+    for k, part in enumerate(parts):
+        place = builder.bitcast(_at(builder, room, word + k), part.type.as_pointer())
+        builder.store(part, place, align=8)

@@ -1,0 +1,88 @@
+"""What a mission disturbs a flight by: wind, gusts, noise, wrong masses, vehicles lost.
+
+The laws work on what vehicles measure and believe, Newton's law on the truth. `sense` puts the
+measured state in the place of the true one, before the laws; `disturb` puts the true one back,
+after them, and adds what no vehicle knows.
+"""
+
+from rigidfleet.kernel.compiler.jit import compiled
+
+# A lost vehicle on the ground: critically damped contact of this natural frequency [1/s], damped from
+# this depth [m] on. It stops within a meter from 40 m/s, and asks for no shorter steps than a flight does.
+_CONTACT, _SOFT = 20.0, 0.01
+
+
+@compiled
+def spline(t, step, table, out):
+    """Cubic B-spline with coefficients table (K, N, 3), knots every `step` [s] from 0, into out (N, 3).
+
+    Twice continuously differentiable; constant before the first and behind the last knot.
+    """
+    last = table.shape[0] - 4
+    x = min(max(t / step, 0.0), last + 1.0)
+    j = min(int(x), last)
+    s = x - j
+    rest = 1.0 - s
+    b0, b3 = rest * rest * rest / 6.0, s * s * s / 6.0
+    b1 = 2.0 / 3.0 - s * s * (1.0 - 0.5 * s)
+    b2 = 2.0 / 3.0 - rest * rest * (1.0 - 0.5 * rest)
+    for i in range(out.shape[0]):
+        for q in range(3):
+            out[i, q] = (
+                b0 * table[j, i, q]
+                + b1 * table[j + 1, i, q]
+                + b2 * table[j + 2, i, q]
+                + b3 * table[j + 3, i, q]
+            )
+
+
+@compiled
+def exchange(a, b):
+    """Exchange the contents of a and b, (N, 3) both."""
+    for i in range(a.shape[0]):
+        for q in range(3):
+            a[i, q], b[i, q] = b[i, q], a[i, q]
+
+
+@compiled
+def sense(t, disturbance, w):
+    """Measured states into w.r and w.v, and the true ones into w.r_seen and w.v_seen meanwhile."""
+    if disturbance.noise_r.shape[0] > 0:
+        spline(t, disturbance.noise_step, disturbance.noise_r, w.r_seen)
+        spline(t, disturbance.noise_step, disturbance.noise_v, w.v_seen)
+        for i in range(w.r.shape[0]):
+            for q in range(3):
+                r, v = w.r[i, q], w.v[i, q]
+                w.r[i, q], w.v[i, q] = r + w.r_seen[i, q], v + w.v_seen[i, q]
+                w.r_seen[i, q], w.v_seen[i, q] = r, v
+
+
+@compiled
+def disturb(t, m, g, disturbance, w):
+    """True states back into w.r and w.v, true forces into w.f_E; w.f_D (N, 3) [N] is that of the air.
+
+    f_D = drag (wind + gust - v), linear in the velocity through the air. Gravity acts on true masses, not on
+    those believed, m (N,). A lost vehicle has no thrust, and comes to rest on the ground.
+    """
+    if disturbance.noise_r.shape[0] > 0:
+        exchange(w.r, w.r_seen)
+        exchange(w.v, w.v_seen)
+    if disturbance.gust.shape[0] > 0:
+        spline(t, disturbance.gust_step, disturbance.gust, w.f_D)
+    else:
+        for i in range(m.shape[0]):
+            w.f_D[i, 0], w.f_D[i, 1], w.f_D[i, 2] = 0.0, 0.0, 0.0
+    for i in range(m.shape[0]):
+        drag, true = disturbance.drag[i], disturbance.m[i]
+        for q in range(3):
+            w.f_D[i, q] = drag * (disturbance.wind[q] + w.f_D[i, q] - w.v[i, q])
+            w.f_E[i, q] += w.f_D[i, q]
+        w.f_E[i, 2] -= (true - m[i]) * g
+        if disturbance.lost[i]:
+            # Where the contact carries the weight, the vehicle is to touch the ground.
+            deep = max(0.0, disturbance.floor[i] + g / _CONTACT**2 - w.r[i, 2])
+            damping = 2.0 * _CONTACT * true * min(1.0, deep / _SOFT)
+            for q in range(3):
+                w.f_u[i, q] = 0.0
+                w.f_E[i, q] -= damping * w.v[i, q]
+            w.f_E[i, 2] += _CONTACT**2 * true * deep

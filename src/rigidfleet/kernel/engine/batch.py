@@ -1,0 +1,219 @@
+"""Many flights of one program: eight of them to a vector, vectors shared out over the cores."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigidfleet.kernel.compiler.jit import compiled
+from rigidfleet.kernel.compiler.simd import WIDTH, LaneArray, pack, unpack
+from rigidfleet.kernel.engine import native
+from rigidfleet.kernel.engine.codegen import integrate, straight
+from rigidfleet.kernel.problem import (
+    EXACT,
+    ITERATED,
+    OPEN,
+    SLOTS,
+    Array,
+    Program,
+    padded,
+    workspace,
+)
+from rigidfleet.kernel.records import FINISHED, LEAST_ERROR, integrator
+
+Numbers = NDArray[np.int64]
+
+#: A range of flights is begun by whichever thread is free, so many ranges to a thread.
+_RANGES = 4
+#: What a flight tries first [s].
+_FIRST_STEP = 1e-3
+#: Equations of a solve up to which straight-line code is made: its length grows with their cube.
+_MOST_EQUATIONS = 36
+
+
+@compiled
+def fly(p, state, t0, t_end, step, starts, before, ends, status, evaluations, max_steps, fresh):
+    """Integrate vectors of eight flights from ``starts`` (G, n) at t0 to ``t_end`` [s], into ``ends``.
+
+    ``before`` (G, m) [m] are the distances from which the references of each are blended. What
+    `integrate` returns goes into ``status`` (G,), the calls of the right-hand side into
+    ``evaluations`` (G,); p, a `Straight`, and state are overwritten. ``fresh`` is true; written
+    here, the compiler would take it for another type.
+    """
+    unsampled = state.clock[:0]
+    for g in range(starts.shape[0]):
+        for q in range(starts.shape[1]):
+            state.y[q] = starts[g, q]
+        for k in range(before.shape[1]):
+            p.before[k] = before[g, k]
+        state.clock[0], state.clock[1], state.clock[2] = t0, step, LEAST_ERROR
+        for q in range(4):
+            state.count[q] = 0
+        status[g] = integrate(p, p, state, t_end, fresh, unsampled, ends[:0], max_steps)
+        evaluations[g] = state.count[0]
+        for q in range(starts.shape[1]):
+            ends[g, q] = state.y[q]
+
+
+@dataclass(frozen=True)
+class Ends:
+    """Where flights have come to.
+
+    Attributes
+    ----------
+    y : (B, n) states
+    finished : (B,) whether the end was reached; the state is the last good one where not
+    evaluations : (B,) calls of the right-hand side; flights of a vector share theirs
+    """
+
+    y: Array
+    finished: NDArray[np.bool_]
+    evaluations: NDArray[np.int64]
+
+
+def fits(program: Program) -> bool:
+    """Return whether straight-line code can be made of a program, and is worth it.
+
+    Its branches must not depend on the state, and its code must not be too long to be compiled.
+    """
+    edges, agents = len(program.graph.edges), len(program.vehicles.m)
+    equations = min(edges, 3 * agents) if program.law.solver == ITERATED else edges
+    return (
+        program.control.kind == OPEN
+        and program.law.solver in (ITERATED, EXACT)
+        and program.reference.kind != SLOTS
+        and not (program.has_frame or program.body_formulation or program.disturbance.active)
+        and program.external == 0
+        and equations <= _MOST_EQUATIONS
+    )
+
+
+def fly_all(
+    program: Program,
+    starts: Array,
+    before: Array,
+    times: tuple[float, float],
+    *,
+    rtol: float,
+    atol: Array,
+    max_steps: int,
+    vectors: bool,
+    threads: int,
+) -> Ends:
+    """Fly one program from many starts.
+
+    Parameters
+    ----------
+    program : of every flight
+    starts : (B, n) states at ``times[0]``
+    before : (B, m) distances from which references are blended [m]
+    times : start and end [s]
+    rtol, atol : relative tolerance, and the absolute one (n,) of each state
+    max_steps : after so many of them a flight has failed
+    vectors : whether eight flights share a vector, its steps and its fate: should one of them be
+        rejected for good, all eight are flown again alone. Flight k lies in vector k // 8 however
+        many threads there are, so results do not depend on ``threads``.
+    threads : how many run at a time
+
+    Raises
+    ------
+    ValueError
+        The program does not fit vectors, see `fits`.
+    """
+    if not vectors:
+        return _fly_alone(program, starts, before, times, rtol, atol, max_steps, threads)
+    if not fits(program):
+        raise ValueError(
+            "flights of this program cannot share vectors: fly them with vectors=False"
+        )
+    count, n = starts.shape
+    ready = straight(program)
+
+    def packed(x: Array) -> LaneArray:
+        if count % WIDTH:  # places left over in the last vector repeat the last flight
+            x = x[np.minimum(np.arange(padded(count)), count - 1)]
+        return pack(x.reshape(len(x) // WIDTH, WIDTH, x.shape[1]).swapaxes(1, 2))
+
+    def begin() -> Callable[..., None]:
+        state = integrator(np.zeros(n), 0.0, rtol=rtol, atol=atol)
+        K = np.zeros((*state.K.shape[:1], n, WIDTH))
+        K[-1] = atol[:, None]
+        state = state._replace(y=pack(np.zeros((n, WIDTH))), K=pack(K))
+        own = ready._replace(before=ready.before.copy(), time=ready.time.copy())
+
+        def work(*part: Any) -> None:
+            fly(own, state, *times, _FIRST_STEP, *part, max_steps, True)
+
+        return work
+
+    found = _share(begin, packed(starts), packed(before), threads)
+    y = unpack(found.y).swapaxes(1, 2).reshape(-1, n)[:count]
+    finished = np.repeat(found.finished, WIDTH)[:count]
+    evaluations = np.repeat(found.evaluations, WIDTH)[:count]
+    lost = ~finished
+    if lost.any():
+        again = _fly_alone(
+            program, starts[lost], before[lost], times, rtol, atol, max_steps, threads
+        )
+        y[lost], finished[lost], evaluations[lost] = again.y, again.finished, again.evaluations
+    return Ends(y, finished, evaluations)
+
+
+def _fly_alone(
+    program: Program,
+    starts: Array,
+    before: Array,
+    times: tuple[float, float],
+    rtol: float,
+    atol: Array,
+    max_steps: int,
+    threads: int,
+) -> Ends:
+    def begin() -> Callable[..., None]:
+        d0 = program.reference.d0.copy()
+        own = program._replace(reference=program.reference._replace(d0=d0))
+        w = workspace(len(program.vehicles.m), len(d0), solver=program.law.solver)
+        unsampled = np.zeros(0), np.zeros((0, starts.shape[1]))
+
+        def work(
+            starts: Array, before: Array, ends: Array, status: Numbers, evaluations: Numbers
+        ) -> None:
+            for k, start in enumerate(starts):
+                d0[:] = before[k]
+                state = integrator(start, times[0], rtol=rtol, atol=atol, step=_FIRST_STEP)
+                status[k] = native.integrate(own, w, state, times[1], True, *unsampled, max_steps)
+                ends[k], evaluations[k] = state.y, state.count[0]
+
+        return work
+
+    return _share(begin, starts, before, threads)
+
+
+def _share(
+    begin: Callable[[], Callable[..., None]], starts: Array, before: Array, threads: int
+) -> Ends:
+    """Share the flights, or vectors of them, out over threads, each with its own of what `begin` makes."""
+    count = len(starts)
+    threads = min(threads, count)
+    ends = np.empty_like(starts)
+    status, evaluations = np.empty(count, dtype=np.int64), np.empty(count, dtype=np.int64)
+    size = max(1, -(-count // (threads * _RANGES)))
+    ranges = iter(range(0, count, size))
+
+    def work() -> None:
+        fly_part = begin()
+        for first in ranges:
+            part = slice(first, first + size)
+            fly_part(starts[part], before[part], ends[part], status[part], evaluations[part])
+
+    with ThreadPoolExecutor(max(1, threads - 1)) as pool:  # this thread works, too
+        jobs = [pool.submit(work) for _ in range(threads - 1)]
+        work()
+        for job in jobs:
+            job.result()
+    return Ends(ends, status == FINISHED, evaluations)

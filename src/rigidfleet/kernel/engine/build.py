@@ -1,0 +1,255 @@
+"""From the kernel's functions to machine code that needs no compiler to be called.
+
+Numba translates the integrator, the recorder, the monitor and all they call to LLVM's language. What is then called
+from nowhere else may be rearranged at will, and is optimised once, together.
+
+In a process of its own (`native.build_process`) it writes the code to standard output. Most of the time goes into the
+translation, so that a second process does its half of it meanwhile.
+"""
+
+import pickle
+import re
+import subprocess
+import sys
+from contextlib import suppress
+from functools import cached_property
+from typing import Any
+
+import llvmlite.binding as llvm
+from numba import cfunc, typeof, types
+from numba.core import codegen, compiler, cpu, serialize
+
+from rigidfleet.kernel import constraint, control, disturbances, monitor
+from rigidfleet.kernel import dopri5 as flight
+from rigidfleet.kernel import rigid_body as body
+from rigidfleet.kernel.compiler.jit import OPTIONS
+from rigidfleet.kernel.compiler.pointers import Pointer, pointer
+from rigidfleet.kernel.engine import native
+
+_Functions = dict[Any, tuple[types.Type, ...]]
+#: What every evaluation of a flight goes through: its calls would take a tenth of a small formation's time.
+_HOT = (
+    "closed_loop", "input_law", "constraint_force", "accelerate", "mean_axes", "centre_of_mass", "inertia",
+    "inertia_inverse", "multiply", "damp_deformation", "reference_motion", "desired_agents", "local_law", "septic",
+    "blend_slots", "distance_references", "right_side", "solve_multipliers", "assemble", "cholesky",
+    "cholesky_solve", "apply_multipliers",
+)  # fmt: skip
+#: Passes that simplify each function that Numba has translated, before any is put into another.
+_QUICK = ("sroa", "simplify_cfg", "instruction_combine", "simplify_cfg")
+
+
+def machine_code(second: "_SecondProcess | None" = None) -> list[bytes]:
+    """Object code of the three C functions that `native` calls, `native.ENTRIES`.
+
+    All their arguments are addresses of named tuples. They integrate, and return what `flight.integrate` does,
+    record, and watch, as `monitor.watch` does. The ``second`` process, if there is one, does part of the work.
+    """
+    program, workspace, integrator, stretch, record, _ = _pointers()
+
+    def integrate_stretch(p, w, state, s):
+        call = stretch(s)
+        return flight.integrate(
+            program(p), workspace(w), integrator(state), call.t_end, call.fresh, call.times, call.samples,
+            call.max_steps,
+        )  # fmt: skip
+
+    def record_stretch(p, w, s, out):
+        call = stretch(s)
+        flight.record(call.times, call.samples, program(p), workspace(w), call.dy, record(out))
+        return 0
+
+    if second is not None:
+        for function, arguments in _halves()[0].items():  # before what waits for the second
+            function.compile(arguments)
+    integrate, recorder = (
+        _module(function, name)
+        for function, name in zip((integrate_stretch, record_stretch), native.ENTRIES, strict=False)
+    )
+    codes = [_object(*integrate), _object(*recorder)]
+    made = None if second is None else second.monitor()
+    return [*codes, made or _monitor()]
+
+
+def _monitor() -> bytes:
+    """Object code of the monitor, which shares nothing with the rest."""
+    program, workspace, integrator, _, _, watching = _pointers()
+
+    def watch_trail(p, w, state, found):
+        return monitor.watch(program(p), workspace(w), integrator(state), watching(found))
+
+    return _object(*_module(watch_trail, native.ENTRIES[2]))
+
+
+def _pointers() -> list[Any]:
+    return [pointer(typeof(x)) for x in native.examples()]
+
+
+def _module(function: Any, name: str) -> tuple[str, str, str]:
+    """What `_object` makes code of: all that a C function of four addresses calls, its symbol, and its ``name``."""
+    made = cfunc(types.int64(*(types.int64,) * 4), **OPTIONS)(function)
+    return made.inspect_llvm(), made.native_name, name
+
+
+def _object(text: str, symbol: str, name: str) -> bytes:
+    """Object code of a module of which ``symbol`` alone, now called ``name``, is called from outside."""
+    module = _simplified(text, symbol, name)
+    builder = _passes(3)
+    builder.getModulePassManager().run(module, builder)
+    for function in module.functions:
+        if function.is_declaration and function.name.startswith(("numba_", "NRT_", "Py")):
+            raise RuntimeError(
+                f"the kernel needs {function.name}, which only Numba's own callers have"
+            )
+    return native.target_machine().emit_object(module)
+
+
+def _simplified(text: str, symbol: str, name: str) -> llvm.ModuleRef:
+    """Return a module of which ``symbol`` alone, now called ``name``, is called from outside."""
+    # Of the arguments only addresses of named tuples are said to be dereferenceable; nobody writes there.
+    module = llvm.parse_assembly(re.sub(r"(?=dereferenceable\(\d+\))", "readonly ", text))
+    hot = tuple(f"{len(name)}{name}B" for name in _HOT)  # as in the names that Numba gives
+    for thing in (*module.functions, *module.global_variables):
+        if thing.name == symbol:
+            thing.name, thing.linkage = name, "external"
+        elif not thing.is_declaration:
+            thing.linkage = "internal"
+            if thing.is_function and any(name in thing.name for name in hot):
+                thing.add_function_attribute("alwaysinline")
+    # A few quick passes leave a third of the work to the many.
+    quick = llvm.create_new_module_pass_manager()
+    for add in _QUICK:
+        getattr(quick, f"add_{add}_pass")()
+    quick.run(module, _passes(1))
+    return module
+
+
+def _passes(level: int) -> Any:
+    options = llvm.create_pipeline_tuning_options(speed_level=level)
+    options.loop_vectorization = False  # loops are short; the integrator's sums are of vectors
+    return llvm.create_pass_builder(native.target_machine(), options)
+
+
+# -- two processes -----------------------------------------------------------------------------------
+
+
+def _translate_only() -> None:
+    """Keep Numba from all that nobody needs: machine code of each function, and of each a module with all it calls."""
+
+    def executable(_context: Any, library: Any, function: Any, environment: Any) -> Any:
+        name, module = function.qualname.split(".")[-1], function.lookup_module()
+        return cpu._dynfunc.make_function(module, name, "", 0, environment, (library,))
+
+    def finalize(library: Any) -> None:
+        library._finalized = True
+
+    def whole(library: Any) -> str:
+        module, seen, rest = library._final_module.clone(), {library}, [library]
+        while rest:
+            for other in rest.pop()._linking_libraries:
+                if other not in seen:
+                    seen.add(other)
+                    rest.append(other)
+                    module.link_in(other._final_module, preserve=True)
+        return str(module)
+
+    cpu.CPUContext.get_executable = executable
+    codegen.CPUCodeLibrary.finalize = finalize
+    codegen.CPUCodeLibrary.get_llvm_str = whole
+    codegen.JITCodeLibrary._finalize_specific = lambda _library: None
+    codegen.JITCPUCodegen.set_env = lambda _codegen, _name, _environment: None
+
+
+def _halves() -> tuple[_Functions, _Functions]:
+    """Functions, and the types of their arguments: those that this process begins with, those of the second."""
+    example, work, _, _, out, _ = native.examples()
+    p, w, record = (Pointer(typeof(x)) for x in (example, work, out))
+    disturbance = Pointer(typeof(example.disturbance))
+    number, row, places = types.float64, typeof(example.vehicles.m), typeof(work.r)
+    own = {
+        constraint.constraint_force: (number, row, row, p, w),
+        flight.accelerate: (row, p, w),
+        flight.body_derivatives: (row, row, p, w),
+        flight.keep: (number, p, w, types.int64, record),
+        disturbances.disturb: (number, row, number, disturbance, w),
+        disturbances.sense: (number, disturbance, w),
+        body.allocate: (
+            places, row, number, row, row, row, types.int64, places, places, places, places, places, places
+        ),
+    }  # fmt: skip
+    others = {
+        control.local_law: (number, p, w),
+        control.body_law: (number, p, w),
+        body.mean_axes: (places, places, row, number, w),
+        flight.world_states: (row, p, w),
+    }
+    return own, others
+
+
+def _translated() -> dict[str, bytes]:
+    """The second half, each function as Numba would keep it, but simplified already."""
+    done = {}
+    for function, arguments in _halves()[1].items():
+        function.compile(arguments)
+        result = function.overloads[arguments]
+        symbol = result.fndesc.llvm_func_name
+        module = _simplified(result.library.get_llvm_str(), symbol, symbol)
+        result.library.serialize_using_object_code = result.library.serialize_using_bitcode
+        result.library._final_module = module
+        done[function.__name__] = serialize.dumps(result._reduce())
+    return done
+
+
+class _SecondProcess:
+    """The second process: it translates its half, and makes the monitor.
+
+    Whatever comes to nothing there is done here.
+    """
+
+    def __init__(self) -> None:
+        self._process = subprocess.Popen(
+            native.build_process(half=True), cwd=native.ELSEWHERE, stdout=subprocess.PIPE
+        )  # fmt: skip
+        for function, arguments in _halves()[1].items():
+            function._cache = self._Half(self, function.__name__, arguments)
+
+    @cached_property
+    def translated(self) -> dict[str, bytes]:
+        """Its half, by the names of functions."""
+        return self._answer() or {}
+
+    def monitor(self) -> bytes | None:
+        """The object of the monitor."""
+        return self._answer() if self.translated else None
+
+    def _answer(self) -> Any:
+        assert self._process.stdout is not None
+        with suppress(EOFError, pickle.UnpicklingError):
+            return pickle.load(self._process.stdout)
+
+    class _Half:
+        """What Numba takes for a function's cache."""
+
+        def __init__(self, process: "_SecondProcess", name: str, arguments: Any) -> None:
+            self._process, self._name, self._arguments = process, name, arguments
+
+        def load_overload(self, arguments: Any, context: Any) -> Any:
+            """What the other process has made; None has Numba translate it here."""
+            done = self._process.translated.get(self._name)
+            if done is None or arguments != self._arguments:
+                return None
+            return compiler.CompileResult._rebuild(context, *pickle.loads(done))
+
+        def save_overload(self, *_: Any) -> None:
+            """Nothing is kept."""
+
+
+def main(*, half: bool) -> None:
+    """Write the machine code to standard output; or only what the second process does."""
+    output = sys.stdout.buffer
+    _translate_only()
+    if half:
+        pickle.dump(_translated(), output)
+        output.flush()
+        pickle.dump(_monitor(), output)
+        return
+    output.write(native.joined(machine_code(_SecondProcess())))

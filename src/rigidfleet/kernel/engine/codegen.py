@@ -1,0 +1,206 @@
+"""Eight flights of one program at a time, through straight-line code made for it.
+
+The right-hand side is written out by `rigidfleet.kernel.engine.tracer` and compiled for each structure of a
+program (its graph, its law, which of its numbers are equal) once; the integrator is that of single
+flights, compiled for vectors once and for all.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Any, NamedTuple
+
+import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
+
+from rigidfleet.kernel import dopri5 as flight
+from rigidfleet.kernel.compiler import simd as lanes
+from rigidfleet.kernel.compiler.jit import compiled_copy, compiled_for_c, inlined
+from rigidfleet.kernel.compiler.simd import VECTOR, WIDTH, LaneArray
+from rigidfleet.kernel.engine.tracer import Code, Symbol, Trace, structure
+from rigidfleet.kernel.problem import Array, Program
+from rigidfleet.kernel.records import STATE, TRIAL
+from rigidfleet.kernel.references import septic
+
+
+class Straight(NamedTuple):
+    """A program as straight-line code takes it; ``before`` and ``time`` are overwritten in flight."""
+
+    address: int  # of the code
+    uniform: Array  # (U,) what comes of the program's numbers
+    before: LaneArray  # (m,) distances from which references are blended [m]
+    time: Array  # (3,) blend of the references, and two derivatives
+    t0: float  # [s]
+    T_b: float  # [s]
+
+
+def straight(program: Program) -> Straight:
+    """Prepare a program for `integrate`; compiles its code where that is new on this machine.
+
+    Raises
+    ------
+    UnfitError
+        The program has branches that depend on the state.
+    """
+    description, numbers, _ = structure(program)
+    name = hashlib.sha256(description).hexdigest()[:16]
+    if name not in _KNOWN:
+        code = Code(Trace(program))
+        _KNOWN[name] = code, _compile(code, name)
+    code, address = _KNOWN[name]
+    reference = program.reference
+    before = lanes.pack(np.zeros((len(program.graph.edges), WIDTH)))
+    return Straight(address, code.values(numbers), before, np.zeros(3), reference.t0, reference.T_b)
+
+
+_KNOWN: dict[str, tuple[Code, int]] = {}
+
+
+@intrinsic
+def _call_code(_context, address, y, dy, uniform, before, time):
+    """Call straight-line code with the data of five arrays."""
+
+    def generate(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
+        pointer = ir.DoubleType().as_pointer()
+        data = [
+            builder.bitcast(context.make_array(kind)(context, builder, value).data, pointer)
+            for kind, value in zip(sig.args[1:], arguments[1:], strict=True)
+        ]
+        kind = ir.FunctionType(ir.VoidType(), [pointer] * len(data))
+        builder.call(builder.inttoptr(arguments[0], kind.as_pointer()), data)
+        return context.get_dummy_value()
+
+    return types.void(types.int64, y, dy, uniform, before, time), generate
+
+
+@inlined
+def _closed_loop(t, y, dy, p, w):
+    p.time[0], p.time[1], p.time[2] = septic(t, p.t0, p.T_b)
+    _call_code(p.address, y, dy, p.uniform, p.before, p.time)
+
+
+@inlined
+def _advance(k, stage, a, h):
+    """As `flight.advance`, without terms that weigh nothing: of vectors, each costs time."""
+    a0, a1, a2 = h * a[stage, 0], h * a[stage, 1], h * a[stage, 2]
+    a3, a4, a5 = h * a[stage, 3], h * a[stage, 4], h * a[stage, 5]
+    if stage <= 1:
+        for q in range(k.shape[1]):
+            k[TRIAL, q] = k[STATE, q] + a0 * k[0, q]
+    elif stage == 2:
+        for q in range(k.shape[1]):
+            k[TRIAL, q] = k[STATE, q] + a0 * k[0, q] + a1 * k[1, q]
+    elif stage == 3:
+        for q in range(k.shape[1]):
+            k[TRIAL, q] = (k[STATE, q] + a0 * k[0, q]) + (a1 * k[1, q] + a2 * k[2, q])
+    elif stage == 4:
+        for q in range(k.shape[1]):
+            k[TRIAL, q] = (k[STATE, q] + a0 * k[0, q] + a1 * k[1, q]) + (
+                a2 * k[2, q] + a3 * k[3, q]
+            )
+    elif stage == 5:
+        for q in range(k.shape[1]):
+            k[TRIAL, q] = (k[STATE, q] + a0 * k[0, q] + a1 * k[1, q]) + (
+                a2 * k[2, q] + a3 * k[3, q] + a4 * k[4, q]
+            )
+    else:
+        for q in range(k.shape[1]):
+            k[TRIAL, q] = (k[STATE, q] + a0 * k[0, q] + a2 * k[2, q]) + (
+                a3 * k[3, q] + a4 * k[4, q] + a5 * k[5, q]
+            )
+
+
+@inlined
+def _keep_step(t, h, p, w, state):
+    """Flights of an ensemble leave no trail."""
+
+
+@inlined
+def _keep_start(p, w, state):
+    """Nor any forces."""
+
+
+#: As `flight.integrate`; p is a `Straight`, w is not used, arrays hold lanes.
+integrate = compiled_copy(
+    flight.integrate,
+    "integrate_straight",
+    closed_loop=_closed_loop,
+    advance=_advance,
+    keep_start=_keep_start,
+    keep_step=_keep_step,
+)
+
+
+def _lines(y, dy, uniform, before, time):
+    """Straight-line code: each copy of `_derivative` has its own."""
+    raise NotImplementedError
+
+
+def _derivative(y, dy, uniform, before, time):
+    _lines(y, dy, uniform, before, time)
+
+
+def _compile(code: Code, name: str) -> int:
+    """Compile straight-line code, or find it compiled on disk; return its address."""
+
+    @intrinsic
+    def lines(_context, y, dy, uniform, before, time):
+        def generate(context: Any, builder: Any, _sig: Any, arguments: Any) -> Any:
+            builder.call(_emit(builder.module, code), arguments)
+            return context.get_dummy_value()
+
+        return types.void(y, dy, uniform, before, time), generate
+
+    return compiled_for_c(_derivative, f"derivative_{name}", arguments=5, _lines=lines)
+
+
+def _emit(module: ir.Module, code: Code) -> ir.Function:
+    """Write the code as a function of pointers to y, dy, uniform, before and time."""
+    pointer = ir.DoubleType().as_pointer()
+    function = ir.Function(module, ir.FunctionType(ir.VoidType(), [pointer] * 5), "straight_line")
+    function.linkage = "internal"
+    function.attributes.add("noinline")
+    for argument in function.args:
+        argument.add_attribute("noalias")
+    y, dy, uniform, before, time = function.args
+    builder = ir.IRBuilder(function.append_basic_block())
+    values: dict[int, ir.Value] = {}
+
+    def element(array: ir.Value, index: int) -> ir.Value:
+        vectors = builder.bitcast(array, VECTOR.as_pointer())
+        return builder.gep(vectors, [ir.Constant(ir.IntType(64), index)])
+
+    def scalar(array: ir.Value, index: int) -> ir.Value:
+        place = builder.gep(array, [ir.Constant(ir.IntType(64), index)])
+        return lanes.in_all(builder, builder.load(place))
+
+    inputs = {x.serial: index for index, x in enumerate(code.inputs)}
+
+    def value(x: Symbol | float) -> ir.Value:
+        """Of what is computed, or loaded where it is first needed."""
+        if not isinstance(x, Symbol):
+            return lanes.number(x)
+        if x.serial not in values:
+            if x.serial in inputs:
+                found = scalar(uniform, inputs[x.serial])
+            elif x.operation == "time":
+                found = scalar(time, x.arguments[0])
+            else:
+                array = {"y": y, "before": before}[x.operation]
+                found = builder.load(element(array, x.arguments[0]), align=8)
+            values[x.serial] = found
+        return values[x.serial]
+
+    for x in code.lines:
+        values[x.serial] = lanes.BUILD[x.operation](builder, *map(value, x.arguments))
+    whole = [builder.fcmp_ordered(">", value(x), lanes.number(0.0)) for x in code.positive]
+    for index, x in enumerate(code.outputs):
+        found = value(x)
+        if index == 0:  # one state without a derivative is enough
+            for good in whole:
+                found = builder.select(good, found, lanes.number(float("nan")))
+        builder.store(found, element(dy, index), align=8)
+    builder.ret_void()
+    return function

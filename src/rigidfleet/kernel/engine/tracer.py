@@ -1,0 +1,374 @@
+"""The closed loop of one program as straight-line code, written out by the kernel's own source.
+
+The functions of the kernel are run once, in plain Python, with symbols for numbers. What they do to
+them is written down: no loop, index or branch is left, products with zero are gone, what is computed
+twice is computed once, and what depends on masses and gains alone is computed before the flight.
+`rigidfleet.kernel.engine.codegen` compiles the rest for eight flights at a time.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from types import FunctionType, SimpleNamespace
+from typing import Any
+
+import numpy as np
+from numba.core.dispatcher import Dispatcher
+from numpy.typing import NDArray
+
+from rigidfleet.kernel import dopri5 as flight
+from rigidfleet.kernel.problem import EXACT, ITERATED, Array, Graph, Program, workspace
+
+#: From where a symbol gets its value, in the order in which they are known: numbers of the program;
+#: numbers of the flight, of the moment, and of its state.
+UNIFORM, FLIGHT, TIME, STATE = range(4)
+_SOURCES = {"uniform": UNIFORM, "before": FLIGHT, "time": TIME, "y": STATE}
+
+_EVALUATE: dict[str, Callable[..., Any]] = {
+    "add": lambda a, b: a + b,
+    "sub": lambda a, b: a - b,
+    "mul": lambda a, b: a * b,
+    "neg": lambda a: -a,
+    "inverse": lambda a: 1.0 / a,
+    "inverse_root": lambda a: 1.0 / np.sqrt(a),
+    "root": lambda a, _: np.sqrt(a),
+    "max": max,
+    "min": min,
+    "abs": abs,
+    "where_positive": lambda x, a, b: a if x > 0.0 else b,
+}
+
+
+class UnfitError(ValueError):
+    """A branch or an operation that straight-line code has none for."""
+
+
+class Symbol:
+    """A number that is not known yet: what it is computed by, from which symbols or numbers."""
+
+    __slots__ = ("arguments", "known", "operation", "serial", "trace")
+
+    def __init__(self, trace: Trace, operation: str, arguments: tuple[Any, ...]) -> None:
+        self.trace, self.operation, self.arguments = trace, operation, arguments
+        self.serial = len(trace.made)
+        given = [x.known for x in arguments if isinstance(x, Symbol)]
+        self.known = _SOURCES[operation] if operation in _SOURCES else max(given, default=UNIFORM)
+
+    def __add__(self, other: Any) -> Any:
+        return self.trace.add(self, other)
+
+    def __radd__(self, other: Any) -> Any:
+        return self.trace.add(other, self)
+
+    def __sub__(self, other: Any) -> Any:
+        return self.trace.subtract(self, other)
+
+    def __rsub__(self, other: Any) -> Any:
+        return self.trace.subtract(other, self)
+
+    def __mul__(self, other: Any) -> Any:
+        return self.trace.multiply(self, other)
+
+    def __rmul__(self, other: Any) -> Any:
+        return self.trace.multiply(other, self)
+
+    def __truediv__(self, other: Any) -> Any:
+        return self.trace.multiply(self, self.trace.inverse(other))
+
+    def __rtruediv__(self, other: Any) -> Any:
+        return self.trace.multiply(other, self.trace.inverse(self))
+
+    def __neg__(self) -> Any:
+        return self.trace.subtract(0.0, self)
+
+    def __abs__(self) -> Any:
+        return self.trace.symbol("abs", self)
+
+    def __gt__(self, other: Any) -> bool:
+        """Whether it is positive: known of the program's numbers, taken for granted of others."""
+        if other != 0.0:
+            raise UnfitError("a comparison with another number than zero")
+        if self.operation == "uniform":
+            return self.trace.known_positive(self)
+        self.trace.positive.append(self)
+        return True
+
+    def __bool__(self) -> bool:
+        raise UnfitError("a branch that depends on the state")
+
+
+class Trace:
+    """What the kernel does to the numbers of one program.
+
+    Its edges are taken in another order, in which the factor of A fills up little; states, outputs
+    and distances keep theirs.
+
+    Parameters
+    ----------
+    program : of an open-loop flight of distances
+
+    Attributes
+    ----------
+    made : symbols, each by what makes it
+    outputs : (n,) the derivative of the state, symbols or numbers
+    positive : symbols taken for positive; where one is not, the state has no derivative
+
+    Raises
+    ------
+    UnfitError
+        The program has branches that depend on the state.
+    """
+
+    def __init__(self, program: Program) -> None:
+        if program.law.solver not in (ITERATED, EXACT):
+            raise UnfitError("a law that goes on where its matrix has no factor")
+        self.made: dict[tuple[Any, ...], Symbol] = {}
+        self.positive: list[Symbol] = []
+        _, self._values, which = structure(program)
+        self._numbers = iter(which.tolist())
+        n, m = len(program.vehicles.m), len(program.graph.edges)
+        states = np.arange(6 * n + m)
+        states[6 * n :] += (order := elimination_order(program.graph.edges)) - np.arange(m)
+        work = workspace(n, m, solver=program.law.solver)
+        w = type(work)(*(np.full(x.shape, 0.0, dtype=object) for x in work))
+        y = np.array([self.symbol("y", q) for q in states.tolist()], dtype=object)
+        before = [self.symbol("before", k) for k in order.tolist()]
+        p = _used(program)
+        p = p._replace(**{name: self._symbolic(getattr(p, name)) for name in _PARTS})
+        d0, d1 = np.array(before, dtype=object), p.reference.d1[order]
+        p = p._replace(graph=_ordered(p.graph, order), reference=p.reference._replace(d0=d0, d1=d1))
+        dy = np.full(len(y), 0.0, dtype=object)
+        self._plain(flight.closed_loop)(0.0, y, dy, p, w)
+        self.outputs: list[Any] = dy[np.argsort(states)].tolist()
+
+    def known_positive(self, x: Symbol) -> bool:
+        """Whether a number of the program is positive: `structure` tells apart those that are not."""
+        return bool(self._values[x.arguments[0]] > 0.0)
+
+    def symbol(self, operation: str, *arguments: Any) -> Symbol:
+        """Return the one symbol of an operation on arguments."""
+        key = operation, *((x.serial,) if isinstance(x, Symbol) else x for x in arguments)
+        if key not in self.made:
+            self.made[key] = Symbol(self, operation, arguments)
+        return self.made[key]
+
+    def add(self, a: Any, b: Any) -> Any:
+        """Return a + b."""
+        if _is(a, 0.0):
+            return b
+        if _is(b, 0.0):
+            return a
+        return self.symbol("add", a, b)
+
+    def subtract(self, a: Any, b: Any) -> Any:
+        """Return a - b."""
+        if a is b:
+            return 0.0
+        if _is(b, 0.0):
+            return a
+        if not _is(a, 0.0):
+            return self.symbol("sub", a, b)
+        return b.arguments[0] if b.operation == "neg" else self.symbol("neg", b)
+
+    def multiply(self, a: Any, b: Any) -> Any:
+        """Return a b."""
+        for x, y in ((a, b), (b, a)):
+            if _is(x, 0.0):
+                return 0.0
+            if _is(x, 1.0):
+                return y
+            if _is(x, -1.0):
+                return self.subtract(0.0, y)
+        # So that x y and y x are one.
+        swap = isinstance(b, Symbol) and (not isinstance(a, Symbol) or b.serial < a.serial)
+        return self.symbol("mul", b, a) if swap else self.symbol("mul", a, b)
+
+    def inverse(self, x: Any) -> Any:
+        """Return 1 / x."""
+        if not isinstance(x, Symbol):
+            return 1.0 / x
+        if x.operation == "root":
+            return x.arguments[1]
+        return self.symbol("inverse", x)
+
+    def root(self, x: Any) -> Any:
+        """Return the root of x."""
+        if not isinstance(x, Symbol):
+            return math.sqrt(x)
+        return self.symbol("root", x, self.symbol("inverse_root", x))
+
+    def _symbolic(self, x: Any) -> Any:
+        """Replace numbers by symbols, equal ones by one; 0 and 1 stay."""
+        if isinstance(x, tuple):
+            return type(x)(*map(self._symbolic, x))
+        if isinstance(x, np.ndarray):
+            plain = [self._symbolic(value) for value in x.ravel().tolist()]
+            return np.array(plain, dtype=object).reshape(x.shape)
+        if not isinstance(x, float):
+            return x
+        index = next(self._numbers)
+        return x if x in (0.0, 1.0) else self.symbol("uniform", index)
+
+    def _plain(self, function: Dispatcher) -> Callable[..., Any]:
+        """The function as Python runs it, and all that it calls, with mathematics for symbols."""
+        some = lambda operation: (  # noqa: E731
+            lambda a, b: self.symbol(operation, a, b) if _any(a, b) else _EVALUATE[operation](a, b)
+        )
+        mathematics = SimpleNamespace(sqrt=self.root, nan=math.nan, inf=math.inf)
+        instead = {
+            "math": mathematics,
+            "max": some("max"),
+            "min": some("min"),
+            "septic": lambda *_: tuple(self.symbol("time", k) for k in range(3)),
+            "where_positive": lambda x, a, b: self.symbol("where_positive", x, a, b),
+            "surely_positive": lambda _: False,  # not known
+        }
+        worlds: dict[int, dict[str, Any]] = {}
+
+        def rebuilt(function: Dispatcher) -> FunctionType:
+            source = function.py_func.__globals__
+            if id(source) not in worlds:
+                world = worlds[id(source)] = dict(source)
+                calls = {k: v for k, v in source.items() if isinstance(v, Dispatcher)}
+                world.update({k: rebuilt(v) for k, v in calls.items()})
+                world.update(instead)
+            return FunctionType(function.py_func.__code__, worlds[id(source)])
+
+        return rebuilt(function)
+
+
+class Code:
+    """Straight-line code of a trace: what is to be computed, in which order.
+
+    Attributes
+    ----------
+    outputs : (n,) symbols or numbers
+    positive : symbols that have to be positive
+    lines : symbols that are computed in flight, each after what it needs
+    inputs : (U,) symbols of the program's numbers alone that the others use
+    """
+
+    def __init__(self, trace: Trace) -> None:
+        self.outputs = trace.outputs
+        self.positive = [x for x in trace.positive if x.known > UNIFORM]
+        self.lines: list[Symbol] = []
+        self._uniform: list[Symbol] = []
+        self._seen: set[int] = set()
+        for x in (*self.positive, *self.outputs):
+            self._need(x)
+        self.lines = sorted(
+            (x for x in self.lines if x.operation not in _SOURCES), key=lambda x: x.serial
+        )
+        used = [x for line in self.lines for x in line.arguments] + self.outputs
+        inputs = [x for x in used if isinstance(x, Symbol) and x.known == UNIFORM]
+        self.inputs = list({x.serial: x for x in inputs}.values())
+
+    def values(self, numbers: Array) -> Array:
+        """Values (U,) of the inputs where the program's different numbers are these, by `structure`."""
+        found: dict[int, float] = {}
+        with np.errstate(all="ignore"):
+            for x in self._uniform:
+                if x.operation == "uniform":
+                    found[x.serial] = numbers[x.arguments[0]]
+                else:
+                    given = (found[a.serial] if isinstance(a, Symbol) else a for a in x.arguments)
+                    found[x.serial] = _EVALUATE[x.operation](*given)
+        return np.array([found[x.serial] for x in self.inputs])
+
+    def _need(self, wanted: Any) -> None:
+        """List all that a symbol needs; without recursion, as chains are long."""
+        stack = [wanted]
+        while stack:
+            x = stack.pop()
+            if not isinstance(x, Symbol) or x.serial in self._seen:
+                continue
+            missing = [
+                a for a in x.arguments if isinstance(a, Symbol) and a.serial not in self._seen
+            ]
+            if missing:
+                stack += [x, *missing]
+                continue
+            self._seen.add(x.serial)
+            (self._uniform if x.known == UNIFORM else self.lines).append(x)
+
+
+def structure(program: Program) -> tuple[bytes, Array, NDArray[np.int64]]:
+    """All that straight-line code depends on: programs with equal structures share it.
+
+    Returns it, the different numbers that the program flies by, in the order of their first
+    appearance, and for each number, in the order of `Trace`, which of them it is.
+    """
+    numbers: list[Array] = []
+    others: list[Any] = [program.has_frame, program.body_formulation, program.external]
+    used = _used(program)
+    for name in _PARTS:
+        _sort_out(getattr(used, name), numbers, others)
+    together = np.concatenate(numbers)
+    _, first, which = np.unique(together, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    rank = np.empty(len(order), dtype=np.int64)
+    rank[order] = np.arange(len(order))
+    values, which = together[first[order]], rank[which]
+    kinds = np.select([values == 0.0, values == 1.0, values > 0.0], [0, 1, 2], 3)
+    return repr((others, which.tolist(), kinds.tolist())).encode(), values, which
+
+
+def elimination_order(edges: NDArray[np.integer]) -> NDArray[np.int64]:
+    """Order (m,) of edges (m, 2) in which to factor J M^-1 J^T: least degree first."""
+    at: dict[int, set[int]] = {}
+    for k, ends in enumerate(edges.tolist()):
+        for agent in ends:
+            at.setdefault(agent, set()).add(k)
+    near = {k: set().union(*(at[i] for i in ends)) - {k} for k, ends in enumerate(edges.tolist())}
+    order = []
+    while near:
+        k = min(near, key=lambda k: (len(near[k]), k))
+        order.append(k)
+        neighbours = near.pop(k)
+        for l in neighbours:
+            near[l] = (near[l] | neighbours) - {k, l}
+    return np.array(order, dtype=np.int64)
+
+
+def _ordered(graph: Graph, order: NDArray[np.int64]) -> Graph:
+    pairs = np.sort(np.argsort(order)[graph.pairs.astype(np.int64)], axis=1)[:, ::-1]
+    return graph._replace(edges=graph.edges[order], pairs=pairs, diagonal=graph.diagonal[order])
+
+
+# Parts of a program that open-loop flights of distances use.
+_PARTS = ("vehicles", "graph", "law", "reference", "control", "disturbance")
+
+
+def _used(program: Program) -> Program:
+    """The program without what such flights have no use for; the kernel would stumble over it."""
+    none: Any = None
+    reference = program.reference._replace(t0=none, T_b=none, d0=none, p0=none, dp=none, turn=none)
+    fields = ("active", "inverse")
+    disturbance = program.disturbance
+    disturbance = disturbance._replace(**{f: none for f in disturbance._fields if f not in fields})
+    return program._replace(
+        reference=reference, disturbance=disturbance, motion=none, feedback=none
+    )
+
+
+def _sort_out(x: Any, numbers: list[Array], others: list[Any]) -> None:
+    """List the real numbers of a part; all the rest of it, with the shapes of arrays, apart."""
+    if isinstance(x, tuple):
+        for field in x:
+            _sort_out(field, numbers, others)
+    elif isinstance(x, np.ndarray) and x.dtype == np.float64:
+        numbers.append(x.ravel())
+        others.append(x.shape)
+    elif isinstance(x, float):
+        numbers.append(np.array([x]))
+    else:
+        others.append(x.tolist() if isinstance(x, np.ndarray) else x)
+
+
+def _is(x: Any, number: float) -> bool:
+    return not isinstance(x, Symbol) and x == number
+
+
+def _any(*values: Any) -> bool:
+    return any(isinstance(x, Symbol) for x in values)

@@ -1,0 +1,1 @@
+"""Multipliers of large formations: sparse factorisations and when they apply."""

@@ -1,0 +1,273 @@
+"""What one phase of a flight is made of, as arrays: read by the kernel, written by `plan`.
+
+Short names are the paper's; every array is C-contiguous float64 (edges: uint32). N agents, m edges.
+"""
+
+import math
+from itertools import accumulate
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+# Multiplier solves (`Law.solver`).
+ITERATED, SPECTRAL, EXACT, PINV = range(4)
+# Distance references (`Reference.kind`).
+CONSTANT, SQUARED, SLOTS = range(3)
+# Input laws (`Control.kind`).
+OPEN, LOCAL, BODY = range(3)
+# Allocation of a wrench (`Control.allocation`), the last three with the paper's H.
+RIGID, PINV_EQUAL, PINV_INERTIA, PINV_INERTIA_FORCE = range(4)
+
+
+class Vehicles(NamedTuple):
+    """The agents: point masses."""
+
+    m: Array  # (N,) mass [kg]
+    inverse: Array  # (N,) of it [1/kg]
+    M: float  # their sum [kg]
+    mean: float  # mean mass of those that have not been lost [kg], the laws' unit of mass
+    thrust_limit: Array  # (N,) [N], inf where unlimited
+    saturate: bool  # clip the thrust at its limit
+    g: float  # gravity along -z [m/s^2]
+
+
+class Graph(NamedTuple):
+    """The constraint graph, and which of its edges meet at an agent.
+
+    ``pairs[p] = (k, l)``, k > l, are the edges that share an agent and ``weight[p]`` is what
+    that agent adds to ``A = J M^-1 J^T``: ``A[k, l] = weight[p] * (u_k . u_l)``.
+    """
+
+    edges: NDArray[np.uint32]  # (m, 2), agents from 0; unsigned, which makes an index cheaper
+    pairs: NDArray[np.uint32]  # (P, 2)
+    weight: Array  # (P,) +-1/m_i [1/kg]
+    diagonal: Array  # (m,) of A: 1/m_i + 1/m_j [1/kg]
+    solver: int = 0  # address of what solves for the multipliers of a large formation (`large`)
+
+
+class Law(NamedTuple):
+    """Baumgarte gains and how the multipliers are solved for."""
+
+    alpha: float  # [1/s]
+    beta: float  # [1/s]
+    gamma: float  # [1/s^3]
+    solver: int
+    mu: float  # Tikhonov damping, on the scale of the eigenvalues of mbar A
+    iterations: int
+    s0: float  # spectral damping starts below this eigenvalue of mbar A
+    cutoff: float  # of pinv, in parts of the largest eigenvalue
+    k_def: float  # deformation damping [1/s]
+
+
+class Reference(NamedTuple):
+    """Desired shape or distances, blended from one to another over [t0, t0 + T_b]."""
+
+    kind: int
+    t0: float  # [s]
+    T_b: float  # [s]
+    d0: Array  # (m,) distances before [m]
+    d1: Array  # (m,) distances after [m]
+    p0: Array  # (N, 3) slots before, body axes [m]
+    dp: Array  # (N, 3) what the blend adds to them [m]
+    turn: Array  # (3,) rotation vector by which the slots turn meanwhile [rad]
+
+
+class Motion(NamedTuple):
+    """Reference motion of the virtual body: piecewise quintics of CM and attitude.
+
+    Channels 0-2 are the CM [m], 3-5 the rotation vector phi [rad] of the body relative to the
+    attitude ``T1``: body -> world is ``T1^T Exp(phi)``.
+    """
+
+    knots: Array  # (n + 1,) [s]
+    coefficients: Array  # (n, 6, 6): piece, channel, power of (t - knots[piece])
+    T1: Array  # (3, 3) world -> body
+
+
+class Feedback(NamedTuple):
+    """LQR on the virtual body: gain tables over the time to go, and the moving target."""
+
+    to_go: Array  # (n,) increasing, from 0 [s]
+    gain: Array  # (n, 4): position [1/s^2], velocity [1/s]; attitude, rate
+    slope: Array  # (n, 4) their derivatives by the time to go
+    arrival: float  # T [s]
+    r: Array  # (3,) target at T [m]
+    v: Array  # (3,) [m/s]
+    T1: Array  # (3, 3) target attitude at T, world -> body
+    omega: Array  # (3,) target rates, body axes [rad/s]
+    hold: Array  # (4,) gains after T
+
+
+class Control(NamedTuple):
+    """Input law of a phase."""
+
+    kind: int
+    force: Array  # (N, 3) open loop: input force, weight balance included [N]
+    k1: float  # local LQR [1/s^2]
+    k2: float  # [1/s]
+    allocation: int
+
+
+class Disturbance(NamedTuple):
+    """What acts on the flight and is told to no law; see `rigidfleet.kernel.disturbances`.
+
+    Gusts and noise are cubic B-splines over time, by their coefficients; empty where there are none.
+    """
+
+    active: bool  # whether there is any; `inverse` counts always
+    m: Array  # (N,) true mass [kg]
+    inverse: Array  # (N,) of it [1/kg]
+    drag: Array  # (N,) [N s/m]
+    wind: Array  # (3,) steady, world [m/s]
+    gust_step: float  # between knots [s]
+    gust: Array  # (K, N, 3) [m/s]
+    noise_step: float  # [s]
+    noise_r: Array  # (K', N, 3) of the measured position [m]
+    noise_v: Array  # (K', N, 3) of the measured velocity [m/s]
+    lost: NDArray[np.bool_]  # (N,) without thrust
+    floor: Array  # (N,) height at which a lost vehicle comes to rest [m]
+
+
+class Program(NamedTuple):
+    """One phase of a flight."""
+
+    body_formulation: bool
+    has_frame: bool  # the mean-axis quaternion is among the states
+    vehicles: Vehicles
+    graph: Graph
+    law: Law
+    reference: Reference
+    motion: Motion
+    feedback: Feedback
+    control: Control
+    external: int  # address of a force callback, 0 for none
+    disturbance: Disturbance
+
+
+class Workspace(NamedTuple):
+    """Everything the right-hand side writes; after a call it holds the values at that state."""
+
+    r: Array  # (N, 3) position, world [m]
+    v: Array  # (N, 3) velocity [m/s]
+    r_seen: Array  # (N, 3) position as measured [m], where there is noise
+    v_seen: Array  # (N, 3) velocity as measured [m/s], where there is noise
+    u: Array  # (m, 3) unit vectors of the edges
+    L: Array  # (m,) lengths [m]
+    d: Array  # (m,) references [m]
+    d_dot: Array  # (m,) [m/s]
+    d_ddot: Array  # (m,) [m/s^2]
+    c: Array  # (m,) constraints [m]
+    b: Array  # (m,) right side of the multiplier equation [m/s^2]
+    A: Array  # (m, m) J M^-1 J^T, or (3N, 3N) J^T J; its lower triangle is factored in place
+    V: Array  # (m, m) eigenvectors, where a law needs them
+    w: Array  # (m,) eigenvalues; work
+    multiplier: Array  # (m,) [N]
+    f_E: Array  # (N, 3) gravity, the user's force and disturbances [N]
+    f_u: Array  # (N, 3) input [N]
+    f_C: Array  # (N, 3) constraint force [N]
+    f_D: Array  # (N, 3) force of the air, part of f_E, where there are disturbances [N]
+    a: Array  # (N, 3) acceleration [m/s^2]
+    p: Array  # (N, 3) slots, body axes [m]
+    p_dot: Array  # (N, 3)
+    p_ddot: Array  # (N, 3)
+    r_ref: Array  # (N, 3) desired positions, world [m]
+    v_ref: Array  # (N, 3)
+    a_ref: Array  # (N, 3)
+    cm: Array  # (5, 3): CM position, velocity; omega, h, world axes; omega, body axes
+    I: Array  # (3, 3) inertia about the CM, world axes [kg m^2]
+    I_inv: Array  # (3, 3) its pseudo-inverse
+    T: Array  # (3, 3) world -> body, of the frame among the states
+    body: Array  # (8, 3) reference motion: r, v, a of the CM; omega, omega_dot; phi, its rates
+    gain: Array  # (4,)
+    E: Array  # (3, 3) a relative rotation
+    T_ref: Array  # (3, 3) world -> body, of the reference motion
+    wrench: Array  # (6,) asked of the agents: force, torque about the CM, world [N, N m]
+    H: Array  # (3N, 3N) normal matrix of the paper's H; work
+    H_V: Array  # (3N, 3N)
+    H_w: Array  # (2, 3N): right side, eigenvalues
+
+
+def zeros(*shape: int) -> Array:
+    """Zeros that begin with a cache line: whether rows straddle lines costs up to a tenth."""
+    size = math.prod(shape)
+    room = np.zeros(size + 8)
+    skip = -room.ctypes.data // room.itemsize % 8
+    return room[skip : skip + size].reshape(shape)
+
+
+def workspace(
+    n: int, m: int, *, with_h: bool = False, solver: int | None = None, large: bool = False
+) -> Workspace:
+    """Allocate a workspace for N = ``n`` agents and ``m`` edges.
+
+    One for the iterated ``solver`` alone has the smaller of the two systems it may solve, in the
+    edges or in the agents' coordinates; one of a ``large`` formation has none.
+    """
+    size = 0 if large else min(m, 3 * n) if solver == ITERATED else m
+    vectors = 0 if large or solver in (ITERATED, EXACT) else m
+    k = 3 * n if with_h else 0
+    agents, edges, space = (n, 3), (m,), (3, 3)
+    w = Workspace(
+        **_side_by_side(
+            r=agents, v=agents, r_seen=agents, v_seen=agents, u=(m, 3), L=edges, d=edges,
+            d_dot=edges, d_ddot=edges, c=edges, b=edges, A=(size, size), V=(vectors, vectors),
+            w=edges, multiplier=edges, f_E=agents, f_u=agents, f_C=agents, f_D=agents, a=agents,
+            p=agents, p_dot=agents, p_ddot=agents, r_ref=agents, v_ref=agents, a_ref=agents,
+            cm=(5, 3), I=space, I_inv=space, T=space, body=(8, 3), gain=(4,), E=space, T_ref=space,
+            wrench=(6,), H=(k, k), H_V=(k, k), H_w=(2, k),
+        )
+    )  # fmt: skip
+    w.T[:] = w.T_ref[:] = np.eye(3)
+    return w
+
+
+def padded(count: int) -> int:
+    """``count`` rounded up to eights: of numbers to a cache line, and of flights or states to a value of `lanes`."""
+    return -(-count // 8) * 8
+
+
+def _side_by_side(**shapes: tuple[int, ...]) -> dict[str, Array]:
+    """Arrays of zeros, each of which begins with a cache line."""
+    sizes = [math.prod(shape) for shape in shapes.values()]
+    ends = list(accumulate(map(padded, sizes)))
+    room = zeros(ends[-1])
+    return {
+        name: room[end - padded(size) :][:size].reshape(shape)
+        for (name, shape), size, end in zip(shapes.items(), sizes, ends, strict=True)
+    }
+
+
+def calm(masses: Array) -> Disturbance:
+    """No disturbance of agents with these masses (N,) [kg]."""
+    n = len(masses)
+    none = zeros(0, n, 3)
+    return Disturbance(
+        False, masses, 1.0 / masses, np.zeros(n), np.zeros(3), 1.0, none, 1.0, none, none, np.zeros(n, dtype=np.bool_),
+        np.full(n, -np.inf),
+    )  # fmt: skip
+
+
+def graph(ends: NDArray[np.integer], masses: Array, *, large: bool = False) -> Graph:
+    """Prepare a constraint graph: edges (m, 2) with agents from 0, (N,) masses [kg].
+
+    A ``large`` one, which is not solved densely, needs no pairs of edges.
+    """
+    edges = np.ascontiguousarray(ends, dtype=np.uint32).reshape(-1, 2)
+    if large:
+        return Graph(edges, np.zeros((0, 2), dtype=np.uint32), np.zeros(0), np.zeros(0))
+    parts = []
+    for agent in np.unique(edges):
+        k, end = np.nonzero(edges == agent)
+        sign = 1.0 - 2.0 * end
+        p, q = np.tril_indices(len(k), -1)
+        parts.append(np.stack([k[p], k[q], sign[p] * sign[q] / masses[agent]]))
+    found = np.concatenate(parts, axis=1) if parts else np.zeros((3, 0))
+    # Edges that share both agents meet twice.
+    met, where = np.unique(found[:2].T.astype(np.uint32), axis=0, return_inverse=True)
+    weight = np.zeros(len(met))
+    np.add.at(weight, where.ravel(), found[2])
+    diagonal = (1.0 / masses)[edges].sum(axis=1)
+    return Graph(edges, np.ascontiguousarray(met).reshape(-1, 2), weight, diagonal)

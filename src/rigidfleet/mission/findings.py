@@ -1,0 +1,237 @@
+"""Findings about a mission while it is checked, and pydantic's errors in the words of the format."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from types import UnionType
+from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
+
+from pydantic import ValidationError
+
+from rigidfleet._toml import toml_key
+from rigidfleet.errors import Finding
+from rigidfleet.formation.shapes import POLYGONS, SHAPES
+from rigidfleet.mission.schema import Part
+
+Keys = tuple[str | int, ...]
+P = TypeVar("P", bound=Part)
+
+#: So many findings of one kind are told one by one; the others are counted.
+_TOLD = 8
+_UNKNOWN = "unknown key"
+#: Any place in a list.
+_ANY = -1
+#: For required keys that are wrong, so that the rest of their table can still be checked.
+_STAND_IN: dict[str, Any] = {"mass": 1.0, "position": (0.0, 0.0, 0.0), "formation": ""}
+
+
+class Notes:
+    """Findings about one mission, each at a path of keys in its data.
+
+    Everything a user reads counts from 1, so `phases[2]` is the second phase: ("phases", 1) here.
+    """
+
+    def __init__(self, data: Mapping[str, Any], origin: str) -> None:
+        self.data = data
+        self.origin = origin
+        self._findings: dict[tuple[str, str], Finding] = {}
+        self._told: Counter[Keys] = Counter()
+        self._wrong: set[Keys] = set()
+
+    @property
+    def findings(self) -> list[Finding]:
+        """What has been found, without repetition: of a list with many faults of one kind the first ones."""
+        more = [
+            Finding(
+                self.origin, _key(kind), None, f"{n - _TOLD:,} more of this kind", "correct all"
+            )
+            for kind, n in self._told.items()
+            if n > _TOLD
+        ]
+        return [*self._findings.values(), *more]
+
+    def add(self, path: Keys, problem: str, remedy: str, *value: object) -> None:
+        """Record a finding. Its value is what the user wrote at the path, unless one is given."""
+        self._wrong |= {path[:k] for k in range(1, len(path) + 1)}
+        key = _key(path)
+        if (key, problem) in self._findings:
+            return
+        kind = _kind(path, problem)
+        if problem == _UNKNOWN or _ANY in kind:
+            self._told[kind] += 1
+            if self._told[kind] > _TOLD:
+                return
+        shown = value[0] if value else look_up(self.data, path)
+        self._findings[key, problem] = Finding(self.origin, key, shown, problem, remedy)
+
+    def unknown(self, path: Keys, known: Iterable[str]) -> None:
+        """Record that a table knows no such key; what was meant takes long to guess, and is for the first ones."""
+        guess = self._told[_kind(path, _UNKNOWN)] < _TOLD
+        self.add(path, *(unknown_key(path[-1], known) if guess else (_UNKNOWN, "")))
+
+    def right(self, path: Keys, *keys: str) -> bool:
+        """Whether nothing has been found so far at or below these keys of a table."""
+        return not any((*path, key) in self._wrong for key in keys)
+
+    def validate(self, kind: type[P], data: Any, path: Keys) -> P | None:
+        """A table as its model, with a finding for each structural error.
+
+        Keys with errors are left out of it, so that the checks that follow can judge the others;
+        None if that leaves no model.
+        """
+        if not isinstance(data, dict):
+            self.add(path, "must be a table", f"write [{_key(path)}] and its keys below it")
+            return None
+        try:
+            return kind.model_validate(data)
+        except ValidationError as error:
+            errors = error.errors(include_url=False)
+        for error in errors:
+            self._structural(error, kind, path)
+        wrong = {error["loc"][0] for error in errors}
+        rest = {key: value for key, value in data.items() if key not in wrong}
+        stand_in = {key: value for key, value in _STAND_IN.items() if key in kind.model_fields}
+        try:
+            return kind.model_validate(stand_in | rest)
+        except ValidationError:
+            return None
+
+    def _structural(self, error: Any, kind: type[Part], prefix: Keys) -> None:
+        """Record one of pydantic's errors."""
+        here, path, owner, inner = look_up(self.data, prefix, {}), prefix, kind, kind
+        for step in error["loc"]:
+            if isinstance(here, dict) and (step in here or error["type"] == "missing"):
+                owner, here = inner, here.get(step)
+                inner = _model_at(owner, step)
+            elif isinstance(here, list) and isinstance(step, int):
+                here = here[step]
+            else:
+                continue  # pydantic's name for a choice, or a number that stands for all agents
+            path = (*path, step)
+        if error["type"] == "too_short" and len(here) > error["ctx"]["actual_length"]:
+            return  # entries that are wrong themselves were not counted
+        if path == ("lqr", "attitude") and error["loc"] != path[1:]:
+            return  # inherited from lqr, where it has been found
+        if error["type"] == "extra_forbidden":
+            self.unknown(path, owner.model_fields)
+        else:
+            self.add(path, *_explain(error, path, owner))
+
+
+#: Words for what is called "none".
+_OFF = ("off", "no", "never", "disabled", False)
+
+
+def look_up(data: Any, path: Keys, default: Any = None) -> Any:
+    """What is at a path of keys, or the default."""
+    for step in path:
+        try:
+            data = data[step]
+        except (KeyError, IndexError, TypeError):
+            return default
+    return data
+
+
+def near(word: object, known: Iterable[str]) -> str:
+    """'did you mean ...?' where a known word is near, else ''."""
+    words = {k.lower(): k for k in known}
+    match = difflib.get_close_matches(str(word).lower(), words, n=1, cutoff=0.55)
+    return f"did you mean '{words[match[0]]}'?" if match else ""
+
+
+def near_shape(word: object) -> str:
+    """Which named shape is meant by a word that is none, or which there are."""
+    match = near(word, [*SHAPES, *POLYGONS])
+    meant = next((name for name in POLYGONS if f"'{name}'" in match), None)
+    if meant is not None:
+        return f"did you mean 'polygon' with {POLYGONS[meant]} agents?"
+    return match or f"known shapes: {', '.join(SHAPES)}"
+
+
+def unknown_key(key: object, known: Iterable[str]) -> tuple[str, str]:
+    """Problem and remedy of a key that is not one of the known."""
+    names = list(known)
+    return _UNKNOWN, near(key, names) or f"remove it; known keys: {', '.join(names)}"
+
+
+def _key(path: Keys) -> str:
+    def step(at: str | int) -> str:
+        if isinstance(at, int):
+            return "[*]" if at == _ANY else f"[{at + 1}]"
+        return f".{toml_key(at)}"
+
+    return "".join(map(step, path)).removeprefix(".")
+
+
+def _kind(path: Keys, problem: str) -> Keys:
+    """What findings are counted by: their place in any table of a list, and all keys unknown to a table as one."""
+    path = path[:-1] if problem == _UNKNOWN else path
+    return tuple(_ANY if isinstance(step, int) else step for step in path)
+
+
+def _model_at(owner: type[Part], key: object) -> type[Part]:
+    """The model of a key, or its owner where it has none."""
+    field = owner.model_fields.get(str(key))
+    return (model_of(field.annotation) if field else None) or owner
+
+
+def model_of(annotation: Any) -> type[Part] | None:
+    """The first model in an annotation such as `Settle | None`, None where there is none."""
+    return next(_models(annotation), None)
+
+
+def _models(annotation: Any) -> Iterator[type[Part]]:
+    """Models in an annotation such as `Settle | None` or `tuple[Lost, ...]`."""
+    if get_origin(annotation) in (Union, UnionType, Annotated, tuple):
+        for choice in get_args(annotation):
+            yield from _models(choice)
+    elif isinstance(annotation, type) and issubclass(annotation, Part):
+        yield annotation
+
+
+def _explain(error: Any, path: Keys, owner: type[Part]) -> tuple[str, str]:
+    """Problem and remedy."""
+    kind, context = error["type"], error.get("ctx", {})
+    name = next((step for step in reversed(path) if isinstance(step, str)), "")
+    field = owner.model_fields.get(name)
+    meaning = f"{name}: {field.description}" if field and field.description else ""
+    match kind:
+        case "missing":
+            return "is missing", f"add {meaning or name}"
+        case "literal_error":
+            words = _words(context["expected"])
+            return f"must be {context['expected']}", near(
+                error["input"], words
+            ) or f"use {'none' if error['input'] in _OFF and 'none' in words else words[0]}"
+        case "greater_than_equal" if 0 < context["ge"] < 1 and not error["input"] > 0:
+            return "must be > 0", meaning
+        case "too_short" if context["min_length"] == 1:
+            return "is empty", meaning
+        case "too_short" | "too_long":
+            count = context.get("min_length", context.get("max_length"))
+            return f"must have {count} numbers, not {context['actual_length']}", meaning
+    problem = _PROBLEMS.get(kind, error["msg"][:1].lower() + error["msg"][1:])
+    return problem.format_map(context), meaning
+
+
+def _words(expected: str) -> Sequence[str]:
+    return re.findall(r"'([^']*)'", expected) or [expected]
+
+
+_PROBLEMS = {
+    "float_type": "must be a number",
+    "int_type": "must be a whole number",
+    "bool_type": "must be true or false",
+    "string_type": "must be a string",
+    "tuple_type": "must be a list",
+    "model_type": "must be a table",
+    "finite_number": "must be finite",
+    "greater_than": "must be > {gt:g}",
+    "greater_than_equal": "must be >= {ge:g}",
+    "less_than": "must be < {lt:g}",
+    "less_than_equal": "must be <= {le:g}",
+    "string_pattern_mismatch": "has characters that it may not have",
+}

@@ -1,0 +1,1 @@
+"""What is known of a flight before it: each phase's plan, its references, disturbances and tolerances."""

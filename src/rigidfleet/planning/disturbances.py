@@ -1,0 +1,128 @@
+"""From a mission's disturbances to what the kernel flies through: tables over time.
+
+Everything random is drawn before the flight, from generators that the mission seeds: the same mission is the same
+flight, bit for bit, and a longer one meets the same gusts and noise.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigidfleet.kernel import problem as k
+from rigidfleet.math import turbulence
+from rigidfleet.mission import Establish, Gusts, Mission
+from rigidfleet.mission.disturbances import gust_step, intensity
+
+if TYPE_CHECKING:
+    from rigidfleet.kernel.problem import Array
+
+#: Mass of a lost vehicle in the laws [kg]: it counts for nothing, and yet divides nothing by zero.
+NOTHING = 1e-20
+
+
+def disturbance(mission: Mission) -> k.Disturbance:
+    """What acts on a mission besides its laws, from its start to its latest end; no vehicle lost yet."""
+    d = mission.disturbances
+    calm = k.calm(np.array(mission.agents.mass))
+    if d is None:
+        return calm
+    wind = np.array(d.wind)
+    grounds = [thing.height for thing in mission.obstacles if thing.kind == "ground"]
+    out = calm._replace(
+        active=True,
+        m=mission.true_mass,
+        inverse=1.0 / mission.true_mass,
+        drag=mission.drag,
+        wind=wind,
+        floor=max(grounds, default=-math.inf) + np.array(mission.agents.radius),
+    )
+    if d.gusts is not None:
+        step = gust_step(d.gusts, float(np.linalg.norm(wind)))
+        out = out._replace(gust_step=step, gust=_table(_gusts(mission, d.gusts, wind, step)))
+    if d.noise is not None:
+        step = 1.0 / d.noise.rate
+        shape = (_knots(mission, step), 2, mission.n_agents, 3)
+        white = np.random.default_rng((1, d.noise.seed)).standard_normal(shape)
+        r, v = d.noise.position * white[:, 0], d.noise.velocity * white[:, 1]
+        out = out._replace(noise_step=step, noise_r=_table(r), noise_v=_table(v))
+    return out
+
+
+def _knots(mission: Mission, step: float) -> int:
+    return math.ceil(mission.latest_end / step) + 2
+
+
+def _table(samples: Array) -> Array:
+    """Coefficients of a spline, in the one layout that the kernel is compiled for."""
+    return np.ascontiguousarray(turbulence.spline_coefficients(samples))
+
+
+def _gusts(mission: Mission, gusts: Gusts, wind: Array, step: float) -> Array:
+    """Velocity of the air (K, N, 3) [m/s] at each agent, world axes, without the steady wind."""
+    n, speed = mission.n_agents, float(np.linalg.norm(wind))
+    rng = np.random.default_rng((0, gusts.seed))
+    white = rng.standard_normal((_knots(mission, step), 2, n + 1, 3))
+    if gusts.correlation_length is not None:
+        white = turbulence.correlate_by_distance(
+            white[..., :n, :], _places(mission), gusts.correlation_length
+        )
+    else:
+        white = turbulence.correlate_evenly(white, gusts.correlation or 0.0)
+    if gusts.model == "first-order":
+        assert gusts.time_scale is not None  # checked on entry
+        u = turbulence.first_order(white[:, 0], step, gusts.time_scale)
+    else:
+        if gusts.altitude is not None:
+            _, length = turbulence.low_altitude(gusts.altitude, speed)
+        else:
+            length = np.broadcast_to(np.array(gusts.length, dtype=np.float64), 3)
+        tau = length / (gusts.airspeed or speed)
+        u = np.empty(white[:, 0].shape)
+        u[..., 0] = turbulence.first_order(white[:, 0, :, 0], step, tau[0])
+        for axis in (1, 2):
+            u[..., axis] = turbulence.second_order(white[..., axis], step, tau[axis])
+    return (intensity(gusts, speed) * u) @ _wind_axes(wind)
+
+
+def _wind_axes(wind: Array) -> Array:
+    """Unit vectors (3, 3), a row each, along the wind over ground, across it to the left, and up."""
+    along = math.hypot(wind[0], wind[1])
+    c, s = (wind[0] / along, wind[1] / along) if along > 0.0 else (1.0, 0.0)
+    return np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _places(mission: Mission) -> Array:
+    """Where agents are to each other (N, 3) [m]: in the first formation established, or else at the start."""
+    names = (p.formation for p in mission.phases if isinstance(p, Establish))
+    slots = next((s for s in map(mission.formation_slots, names) if s is not None), None)
+    return np.array(mission.agents.position) if slots is None else slots
+
+
+def without(
+    program: k.Program,
+    edges: NDArray[np.bool_],
+    lost: NDArray[np.bool_],
+    mu: float,
+    *,
+    large: bool = False,
+) -> k.Program:
+    """A program for those that are left: ``edges`` (m,) kept of its own, agents ``lost`` (N,) without thrust.
+
+    In the laws the lost count for nothing: their masses there are `NOTHING`, and the mean mass, on whose scale the
+    damping ``mu`` of those left stands, is theirs. Newton's law keeps the lost.
+    """
+    m = np.where(lost, NOTHING, program.vehicles.m)
+    mean = float(m[~lost].mean()) if not lost.all() else 1.0
+    reference, control = program.reference, program.control
+    return program._replace(
+        vehicles=program.vehicles._replace(m=m, inverse=1.0 / m, M=float(m.sum()), mean=mean),
+        law=program.law._replace(mu=mu),
+        graph=k.graph(program.graph.edges[edges], m, large=large),
+        reference=reference._replace(d0=reference.d0[edges], d1=reference.d1[edges]),
+        control=control._replace(force=np.where(lost[:, None], 0.0, control.force)),
+        disturbance=program.disturbance._replace(lost=lost.copy()),
+    )

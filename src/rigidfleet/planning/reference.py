@@ -1,0 +1,280 @@
+"""Where a mission leads: poses of the virtual body, what a phase starts from and steers to.
+
+The plan of a flight, and a check before it, are made from these. Nothing here flies or compiles.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigidfleet.formation import shapes
+from rigidfleet.math import attitude as att
+from rigidfleet.math import lqr
+from rigidfleet.mission import Establish, Fly, Mission, Phase, Regulator, Reshape, Turn
+
+Array = NDArray[np.float64]
+
+#: A phase that ends by settling and steers nowhere brings the body to rest within this time [s].
+_REST_WITHIN = 10.0
+
+
+@dataclass(frozen=True)
+class ByEdge:
+    """A number for each edge that has been in force: values (m,), by the edges' keys (m,) in ascending order."""
+
+    keys: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    values: Array = field(default_factory=lambda: np.zeros(0))
+
+    def of(self, edges: NDArray[np.int64], other: Array | float) -> Array:
+        """Values (m,) of edges (m, 2), i < j; ``other`` (m,) where an edge is new."""
+        keys = self._keys(edges)
+        at = np.searchsorted(self.keys, keys)
+        known = np.append(self.keys, -1)[at] == keys
+        return np.where(known, np.append(self.values, 0.0)[at], other)
+
+    def updated(self, edges: NDArray[np.int64], values: Array) -> ByEdge:
+        """These and those of edges (m, 2), i < j, of which the latter count where there are both."""
+        keys, first = np.unique(np.concatenate([self._keys(edges), self.keys]), return_index=True)
+        return ByEdge(keys, np.concatenate([values, self.values])[first])
+
+    @staticmethod
+    def _keys(edges: NDArray[np.int64]) -> NDArray[np.int64]:
+        return (edges[:, 0] << 32) + edges[:, 1]
+
+
+@dataclass
+class Pose:
+    """Where the virtual body is, or is to be: CM [m], attitude T (world -> body), their rates."""
+
+    r: Array
+    v: Array
+    T: Array
+    omega: Array  # body axes [rad/s]
+    named: bool = False  # whether a phase has asked for this attitude by name
+
+
+@dataclass
+class Situation:
+    """The state at a switch, and what was commanded up to it."""
+
+    t: float
+    r: Array  # (N, 3) [m]
+    v: Array  # (N, 3) [m/s]
+    integral: ByEdge = field(default_factory=ByEdge)  # of c [m s]
+    reference: ByEdge = field(default_factory=ByEdge)  # distances commanded last [m]
+    frame: Array | None = None  # attitude (3, 3) of the integrated mean-axis frame
+    formation: str | None = None  # the one taken last
+    slots: Array | None = None  # (N, 3) commanded last, about the CM, body axes [m]
+    pose: Pose | None = None  # commanded last; None where nothing was
+    goal: Pose | None = None  # what to stay at
+    lost: NDArray[np.bool_] | None = None  # (N,) vehicles that fly no more; None: none
+
+
+def about_cm(points: Array, masses: Array) -> Array:
+    """Points (N, 3) [m] relative to their centre of mass."""
+    return points - masses @ points / masses.sum()
+
+
+def body_rates(r: Array, v: Array, masses: Array, T: Array) -> Array:
+    """Mean-axis rates omega = I^+ h (3,) [rad/s] of agents r, v (N, 3), in the axes of T (3, 3)."""
+    if len(masses) == 1:
+        return np.zeros(3)  # of a point; not what rounding makes of it
+    x, y = about_cm(r, masses), about_cm(v, masses)
+    inertia = np.einsum("i,ij,ij->", masses, x, x) * np.eye(3) - (masses[:, None] * x).T @ x
+    h = masses @ np.cross(x, y)
+    return T @ np.linalg.pinv(inertia, 1e-9, hermitian=True) @ h
+
+
+def slots_about_cm(mission: Mission, name: str | None, masses: Array) -> Array | None:
+    """Slots (N, 3) [m] of a formation about their centre of mass; None where there are none."""
+    slots = mission.formation_slots(name) if name else None
+    return None if slots is None else about_cm(slots, masses)
+
+
+def attach(
+    mission: Mission, phase: Phase, now: Situation, masses: Array, target: Array | None
+) -> tuple[Array | None, Situation, Array]:
+    """Attach the body frame where a phase needs one, and say how the slots wanted lie in it meanwhile.
+
+    Slots fitted to the agents (Kabsch) give the attitude. Where nothing is established yet, the agents themselves
+    are the slots, in the axes in which formations are drawn. A formation that is established takes axes of its own:
+    those in which it is to lie, or, if its attitude is free, those in which it lies nearest. Lost vehicles count in
+    neither; the virtual body keeps their slots.
+
+    Returns
+    -------
+    frame : the one to integrate, if any
+    now : the situation, attached
+    turn : (3, 3) rotation of the slots wanted, in which they are blended (`align_slots`): the one for which they
+        were assigned, or else that which brings them nearest to the slots before
+    """
+    masses = masses if now.lost is None else np.where(now.lost, 0.0, masses)
+    shaping = isinstance(phase, Establish | Reshape)
+    frame = now.frame
+    establishes = isinstance(phase, Establish) and target is not None
+    given = mission.assigned_turn(now.formation, phase.formation) if shaping else None
+    if phase.control == "open":
+        if mission.formulation == "body" and frame is None:
+            frame = np.eye(3)
+        return frame, now, _turn(given, slots_before(mission, now, masses), target, masses)
+    x = about_cm(now.r, masses)
+    if phase.control == "slots" and now.pose is not None:
+        pose = now.pose  # the reference goes on from where it is
+    else:
+        fit = now.slots
+        near = frame if frame is not None else now.pose.T if now.pose is not None else np.eye(3)
+        if fit is not None:
+            T = shapes.kabsch(x, fit, masses, near=near.T).T
+        else:
+            T = near if mission.body_frame is not None else mission.drawn_attitude
+        pose = Pose(masses @ now.r / masses.sum(), masses @ now.v / masses.sum(), T, np.zeros(3))
+        pose.omega = body_rates(now.r, now.v, masses, T)
+        if now.lost is not None and fit is not None:
+            centre = masses @ fit / masses.sum()  # of those left, from the body's origin
+            pose.r = pose.r - T.T @ centre
+            pose.v = pose.v - T.T @ np.cross(pose.omega, centre)
+            x = x + T.T @ centre
+    slots = now.slots if now.slots is not None else x @ pose.T.T
+    goal = now.goal or replace(pose, v=np.zeros(3), omega=np.zeros(3))
+    turn = np.eye(3)
+    if establishes:
+        # New axes, in the old ones: `axes` takes vectors from new to old.
+        free = mission.free_attitude(phase)
+        if free:
+            axes = _turn(given, slots, target, masses)
+        else:
+            asked = mission.establish_attitude(phase, goal.T if goal.named else None)
+            steady = now.pose is not None and goal.named and np.array_equal(goal.T, asked)
+            axes = np.eye(3) if steady else pose.T @ asked.T
+        slots = slots @ axes
+        pose = replace(pose, T=axes.T @ pose.T, omega=axes.T @ pose.omega)
+        goal = replace(goal, T=pose.T if free else asked, named=not free)
+        given = None if given is None else axes.T @ given
+    if shaping:
+        turn = _turn(given, slots, target, masses)
+    if phase.control == "body" or (mission.formulation == "body" and frame is None):
+        frame = pose.T
+    return frame, replace(now, pose=pose, slots=slots, goal=goal), turn
+
+
+def slots_before(mission: Mission, now: Situation, masses: Array) -> Array:
+    """Slots (N, 3) [m] that a phase begins with; where there are none, the agents, as formations are drawn."""
+    if now.slots is not None:
+        return now.slots
+    return about_cm(now.r, masses) @ mission.drawn_attitude.T
+
+
+def _turn(given: Array | None, before: Array, after: Array | None, masses: Array) -> Array:
+    if after is None:
+        return np.eye(3)
+    return shapes.kabsch(before, after, masses) if given is None else given
+
+
+def led_by(
+    mission: Mission, phase: Establish | Reshape, before: Array, target: Array | None
+) -> Literal["shape", "squares", "step"]:
+    """What leads the distances of a phase: its reference, and which of two if that is "distances".
+
+    Blended squares of distances are those of points in space, and know no hand. They lead to the slots if an
+    affine map without reflection takes the agents there, as their blend then is that of the map: up to four
+    agents of the right hand, and any number in a stretched shape. Elsewhere the slots are blended, if the
+    formation is given by some, with these distances; slots from distances have a hand that nobody asked for.
+
+    Parameters: agents or slots before, and slots wanted (N, 3) [m], if there are any.
+    """
+    if phase.reference != "distances":
+        return phase.reference
+    if target is None or not mission.formations[phase.formation].knows_slots:
+        return "squares"
+    edges = mission.formation_edges(phase.formation)
+    asked = mission.formation_distances(phase.formation)
+    if not np.allclose(shapes.distances(target, edges), asked, rtol=1e-3):
+        return "squares"
+    start, goal = shapes.centred(before), shapes.centred(target)
+    if shapes.dimension(np.hstack([start, goal])) > 3:
+        return "shape"
+    if shapes.dimension(goal) < 3:
+        return "squares"
+    same_hand = shapes.dimension(start) == 3 and np.linalg.det(start.T @ goal) > 0
+    return "squares" if same_hand else "shape"
+
+
+def align_slots(
+    before: Array, after: Array, masses: Array, turn: Array | None = None
+) -> tuple[Array, Array]:
+    """What a blend adds to the slots, and by which rotation vector it turns them meanwhile.
+
+    The new slots are turned first, by ``turn`` (3, 3), or else onto the old ones (Kabsch, weighted by mass), in
+    which the straight blend has no angular momentum in its own frame, and moves the agents least. A turn back
+    meanwhile keeps what the body axes mean; distances know nothing of it.
+    """
+    R = shapes.kabsch(before, after, masses) if turn is None else turn
+    return after @ R.T - before, att.rotation_vector_from_dcm(R)  # log of R^T
+
+
+def goal_of(phase: Phase, now: Situation, t_end: float) -> tuple[Pose | None, float]:
+    """The pose to be at, and when."""
+    goal = now.goal
+    if goal is None:
+        return None, t_end
+    if not isinstance(phase, Fly | Turn):
+        # Nothing says when what stays must have come to rest: by the end, if that is known.
+        arrival = t_end if phase.settle is None else min(t_end, now.t + _REST_WITHIN)
+        return replace(goal, v=np.zeros(3), omega=np.zeros(3)), arrival
+    arrival = t_end if phase.travel is None else now.t + phase.travel
+    angles = phase.attitude_deg
+    T = goal.T if angles is None else att.dcm_from_euler(np.deg2rad(angles))
+    named = goal.named or angles is not None
+    r, v = goal.r, np.zeros(3)
+    if isinstance(phase, Fly):
+        r, v = np.array(phase.position), np.array(phase.velocity)
+    return Pose(r, v, T, np.deg2rad(phase.rates_deg_s), named), arrival
+
+
+@dataclass
+class Legs:
+    """The LQR flights of the virtual body to its goal: of its CM, and of its attitude phi."""
+
+    regulators: tuple[Regulator, Regulator]
+    begin: tuple[tuple[Array, Array], tuple[Array, Array]]  # (r, v), (phi, phi_dot)
+    end: tuple[tuple[Array, Array], tuple[Array, Array]]
+    T: float  # [s]
+
+    def sample(self, k: int, times: Array) -> tuple[Array, Array, Array]:
+        """Position, rate and second derivative (K, 3) of one of the two at times (K,) in [0, T]."""
+        law = self.regulators[k]
+        if law.horizon == "finite":
+            return lqr.finite_horizon_trajectory(
+                times, self.begin[k], self.end[k], self.T, law.Q, law.R, law.S
+            )
+        return lqr.infinite_horizon_trajectory(
+            times, self.begin[k], self.end[k], self.T, law.Q, law.R
+        )
+
+    def sample_rest(
+        self, mission: Mission, k: int, state: tuple[Array, Array], rest: float, times: Array
+    ) -> tuple[Array, Array, Array]:
+        """The same at times (K,) in [0, rest] after arrival in a state, where tracking gains take over."""
+        r, v = self.end[k]
+        Q, R = mission.tracking.Q, mission.tracking.R
+        return lqr.infinite_horizon_trajectory(times, state, (r + v * rest, v), rest, Q, R)
+
+
+def legs(mission: Mission, start: Pose, goal: Pose, T: float) -> Legs:
+    """Flights of the virtual body from one pose to another within T [s].
+
+    The attitude is regulated as the rotation vector phi from the goal to the body: three more
+    double integrators, phi'' their input, exact for a turn about one axis.
+    """
+    phi = att.rotation_vector_from_dcm(start.T @ goal.T.T)  # start = goal Exp(phi)
+    phi_dot = att.rotation_vector_rate(phi, start.omega)
+    return Legs(
+        (mission.lqr, mission.lqr.attitude),
+        ((start.r, start.v), (phi, phi_dot)),
+        ((goal.r, goal.v), (np.zeros(3), goal.omega)),
+        T,
+    )

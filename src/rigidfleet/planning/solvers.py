@@ -1,0 +1,132 @@
+"""Which solve gives the constraint force of a formation, and what can be known of it before a flight.
+
+Small systems are solved densely. Where the law is the exact one and each agent is joined to three before it,
+two sweeps over the agents do (`rigidfleet.kernel.large.elimination`); other large ones are solved on the vertex graph
+(`rigidfleet.kernel.large.block_cholesky`). Nothing here flies or compiles.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Method = Literal["dense", "sweep", "nodes"]
+
+#: Equations from which on the vertex graph is faster than a dense factor, and from which on the sweep is.
+FROM_NODES, FROM_SWEEP = 180, 60
+#: Equations of a dense solve at most: beyond, one evaluation takes seconds.
+MOST_DENSE = 2000
+#: What each method is called in reports.
+WORDS: dict[Method, str] = {
+    "dense": "dense factor",
+    "sweep": "sweep of 3x3 solves",
+    "nodes": "conjugate gradients on the vertex graph, with a kept factor",
+}
+
+
+def equations(n: int, m: int, solver: str) -> int:
+    """Size of the dense system of ``m`` edges between ``n`` agents under a law."""
+    return min(m, 3 * n) if solver == "iterated" else m
+
+
+def choose(n: int, edges: Ints, solver: str) -> Method:
+    """The solve for ``n`` agents, edges (m, 2) and a law (`Constraint.solver`).
+
+    Laws that need eigenvalues ("spectral", "pinv") are solved densely whatever the size.
+    """
+    size = equations(n, len(edges), solver)
+    if solver == "exact" and size >= FROM_SWEEP and sweep_steps(n, edges) is not None:
+        return "sweep"
+    return "nodes" if solver in ("iterated", "exact") and size >= FROM_NODES else "dense"
+
+
+def sweep_steps(n: int, edges: Ints) -> Ints | None:
+    """An order (n, 4) in which each agent is joined to three before it: agent, its edges (-1: none).
+
+    The first three have none, one and two. None where there is no such order. Agents with three edges left
+    are taken off as long as there are any: whatever the order, that finds it if there is one.
+    """
+    if n < 3 or len(edges) != 3 * n - 6:
+        return None
+    return _steps(n, np.ascontiguousarray(edges, dtype=np.int64).tobytes())
+
+
+@lru_cache(maxsize=4)
+def _steps(n: int, data: bytes) -> Ints | None:
+    edges = np.frombuffer(data, dtype=np.int64).reshape(-1, 2)
+    later = edges.max(axis=1)
+    if (np.bincount(later, minlength=n) == np.minimum(np.arange(n), 3)).all():
+        # As they are counted: then what is near in the order is near in memory.
+        steps = np.full((n, 4), -1)
+        steps[:, 0] = np.arange(n)
+        mine = np.argsort(later, kind="stable")
+        steps[1, 1], steps[2, 1:3], steps[3:, 1:] = mine[0], mine[1:3], mine[3:].reshape(-1, 3)
+        return steps
+    ends = np.concatenate([edges[:, 0], edges[:, 1]])
+    by_agent = np.argsort(ends, kind="stable") % len(edges)
+    start = np.searchsorted(np.sort(ends), np.arange(n + 1)).tolist()
+    meets, pairs = by_agent.tolist(), edges.tolist()
+    degree = np.bincount(ends, minlength=n).tolist()
+    gone = [False] * len(edges)
+    steps = np.full((n, 4), -1)
+    ready = [i for i in range(n) if degree[i] <= 3]
+    at, taken = n, [False] * n
+    while ready:
+        # Agents in waves, and in each by their number: near agents stay near in memory.
+        wave, ready = sorted(ready, reverse=True), []
+        for i in wave:
+            if degree[i] > 3 or taken[i]:
+                continue
+            mine = [k for k in meets[start[i] : start[i + 1]] if not gone[k]]
+            if len(mine) != min(3, at - 1):
+                return None
+            at -= 1
+            taken[i] = True
+            steps[at, 0], steps[at, 1 : 1 + len(mine)] = i, mine
+            for k in mine:
+                gone[k] = True
+                j = pairs[k][1] if pairs[k][0] == i else pairs[k][0]
+                degree[j] -= 1
+                if degree[j] == 3 or (degree[j] < 3 and not taken[j]):
+                    ready.append(j)
+    return steps if at == 0 else None
+
+
+def dissection(points: Floats, edges: Ints, leaf: int = 16) -> Ints:
+    """Order (N,) to eliminate agents in: geometric nested dissection (George, 1973) of points (N, 3).
+
+    Halves across the longest extent, then the agents that part them. What is left of ``leaf`` or fewer stays
+    as it is.
+    """
+    n = len(points)
+    both = np.concatenate([edges, edges[:, ::-1]])
+    both = both[np.argsort(both[:, 0], kind="stable")]
+    start = np.searchsorted(both[:, 0], np.arange(n + 1))
+    other = both[:, 1]
+    beyond = np.zeros(n, dtype=bool)
+    order: list[Ints] = []  # from the last eliminated to the first
+    todo = [np.arange(n)]
+    while todo:
+        some = todo.pop()
+        x = points[some]
+        axis = int(np.ptp(x, axis=0).argmax()) if len(some) else 0
+        far = x[:, axis] > np.median(x[:, axis]) if len(some) > leaf else np.zeros(0, bool)
+        if not far.any():
+            order.append(some[::-1])
+            continue
+        near, far_half = some[~far], some[far]
+        beyond[far_half] = True
+        counts = start[near + 1] - start[near]
+        of = np.repeat(np.arange(len(near)), counts)
+        at = np.arange(len(of)) - np.repeat(np.cumsum(counts) - counts, counts) + start[near][of]
+        parting = np.zeros(len(near), dtype=bool)
+        parting[of[beyond[other[at]]]] = True
+        beyond[far_half] = False
+        order.append(near[parting][::-1])
+        todo += [near[~parting], far_half]
+    return np.concatenate(order)[::-1].copy() if order else np.zeros(0, np.int64)

@@ -1,0 +1,195 @@
+"""Pictures of a flight, drawn with matplotlib from its `Result` alone.
+
+`plot` writes them to files; each function of the same name as a figure returns it as a matplotlib
+`Figure`, to be shown in a notebook or changed. An agent has the same colour in all of them
+(`agent_colours`), told apart by colour-blind eyes too. Nothing here touches pyplot or the user's
+settings of matplotlib.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import secrets
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rigidfleet.errors import ResultError
+from rigidfleet.plotting.curves import (
+    attitude,
+    clearance,
+    cm,
+    constraint_error,
+    constraint_force,
+    distances,
+    disturbance,
+    inputs,
+)
+from rigidfleet.plotting.page import summary
+from rigidfleet.plotting.space import formations, trajectory
+from rigidfleet.plotting.style import agent_colours, settings
+from rigidfleet.plotting.style import titles as shown_titles
+from rigidfleet.result import Result
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from matplotlib.transforms import Bbox
+
+__all__ = [
+    "FORMATS",
+    "agent_colours",
+    "attitude",
+    "clearance",
+    "cm",
+    "constraint_error",
+    "constraint_force",
+    "distances",
+    "disturbance",
+    "figure_names",
+    "formations",
+    "inputs",
+    "plot",
+    "summary",
+    "trajectory",
+]
+
+_FIGURES: dict[str, Callable[[Result], Figure]] = {
+    draw.__name__: draw
+    for draw in (
+        summary, trajectory, distances, cm, attitude, inputs, constraint_force, constraint_error,
+        clearance, formations, disturbance,
+    )
+}  # fmt: skip
+#: Formats that figures are written in.
+FORMATS = ("png", "svg", "pdf")
+_MARGIN = 0.05  # [in] around a figure that is cut close
+
+
+def figure_names(result: Result | None = None) -> list[str]:
+    """Names of all figures, which are also the names of the functions that draw them.
+
+    Of a flight, those in which it has something to show.
+    """
+    if result is None:
+        return list(_FIGURES)
+    empty = {
+        "distances": not len(result.edges),
+        "attitude": not np.isfinite([result.attitude, result.attitude_reference]).any(),
+        "constraint_force": not len(result.edges),
+        "formations": not result.mission.formations,
+        "clearance": result.n_agents == 1 and not result.mission.obstacles,
+        "disturbance": result.disturbance_force is None,
+    }
+    empty["constraint_error"] = empty["distances"] and empty["formations"]
+    return [name for name in _FIGURES if not empty.get(name)]
+
+
+def plot(
+    result: Result,
+    folder: str | Path,
+    *,
+    formats: Iterable[str] = ("png", "svg"),
+    names: Iterable[str] | None = None,
+    titles: bool = True,
+) -> list[Path]:
+    """Draw a flight and write each figure to ``folder/NAME.FORMAT``, whole or not at all.
+
+    Parameters
+    ----------
+    folder : made if it does not exist; files of these names in it are replaced
+    formats : of png, svg (text stays text) and pdf
+    names : of `figure_names`; by default all that there is something to draw in
+    titles : with a title and the mission's name above each, or cut close to what is drawn, for a
+        paper that says so itself; that a flight is incomplete stands above it in any case
+
+    Returns
+    -------
+    The files written.
+
+    Raises
+    ------
+    ValueError
+        A format or a name is unknown.
+    ResultError
+        A file cannot be written, or the mission inside the result cannot be read.
+    """
+    formats = _known("format", formats, FORMATS)
+    names = _known("figure", figure_names(result) if names is None else names, _FIGURES)
+    paths = []
+    for name in names:
+        with shown_titles(shown=titles):
+            figure = _FIGURES[name](result)
+        paths += write_figure(figure, Path(folder), name, formats, close=not titles)
+    return paths
+
+
+def write_figure(
+    figure: Figure, folder: Path, name: str, formats: Iterable[str], *, close: bool = False
+) -> list[Path]:
+    """Write a figure to ``folder/NAME.FORMAT``, each file whole or not at all; returns the files.
+
+    With ``close``, cut close to what is drawn.
+
+    Raises
+    ------
+    ResultError
+        A file cannot be written.
+    """
+    paths = {kind: folder / f"{name}.{kind}" for kind in formats}
+    for kind, path in paths.items():
+        _write(path, _rendered(figure, kind, close=close))
+    return list(paths.values())
+
+
+def _known(what: str, asked: Iterable[str], known: Iterable[str]) -> list[str]:
+    asked = [asked] if isinstance(asked, str) else list(dict.fromkeys(asked))
+    for name in asked:
+        if name not in known:
+            raise ValueError(f"there is no {what} {name!r}; known: {', '.join(known)}")
+    return asked
+
+
+def _rendered(figure: Figure, kind: str, *, close: bool = False) -> bytes:
+    # No date inside, so that the same flight gives the same file.
+    metadata: dict[str, Any] = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}
+    buffer = io.BytesIO()
+    with settings():
+        box = _ink(figure) if close else None
+        figure.savefig(buffer, format=kind, metadata=metadata.get(kind), bbox_inches=box)
+    # The layout is found; drawing again need not look for it.
+    figure.set_layout_engine("none")
+    return buffer.getvalue()
+
+
+def _ink(figure: Figure) -> Bbox:
+    """What is drawn on, and a little around it [in]; by matplotlib's own reckoning empty axes count, too."""
+    from matplotlib.transforms import Bbox
+
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="rgba", dpi=figure.dpi)
+    width, height = (figure.get_size_inches() * figure.dpi).astype(int).tolist()
+    colours = np.frombuffer(buffer.getvalue(), np.uint8).reshape(height, width, 4)
+    drawn = colours.min(axis=2) < 255
+    across, down = (np.flatnonzero(np.any(drawn, axis=axis)) for axis in (0, 1))
+    ends = [[across[0], height - down[-1] - 1], [across[-1] + 1, height - down[0]]]
+    return Bbox(np.array(ends) / figure.dpi).padded(_MARGIN)
+
+
+def _write(path: Path, data: bytes) -> None:
+    part = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            part.write_bytes(data)
+            os.replace(part, path)
+        except BaseException:
+            part.unlink(missing_ok=True)
+            raise
+    except OSError as error:
+        reason = error.strerror or error
+        raise ResultError(
+            f"{path}: the figure cannot be written: {reason}. Choose another folder."
+        ) from error

@@ -1,0 +1,105 @@
+"""Graphs of a mission's formations before it flies: redundant edges dashed, free motions as arrows."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rigidfleet.formation import shapes
+from rigidfleet.plotting import space
+from rigidfleet.plotting import style as st
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from rigidfleet.mission import Mission
+    from rigidfleet.rigidity import Rigidity
+
+_FORMATS = (".png", ".svg", ".pdf")
+#: The longest arrow of a free motion, relative to the size of the shape.
+_ARROW = 0.35
+#: So many free motions are drawn in one picture; more would hide each other.
+_DRAWN = 3
+
+
+def graphs(mission: Mission, judged: Mapping[str, Rigidity | None]) -> Figure:
+    """Graph of each formation with its verdict; the first free motions as arrows, each of one tone."""
+    from matplotlib.figure import Figure
+
+    names = list(mission.formations)
+    columns = min(max(len(names), 1), 3)
+    rows = math.ceil(max(len(names), 1) / columns)
+    with st.settings():
+        fig = Figure(figsize=(max(3.4 * columns, 6.0), 0.4 + 3.6 * rows))
+        height = (1 - 0.3 / fig.get_figheight()) / rows
+        for k, name in enumerate(names):
+            row, column = divmod(k, columns)
+            x, y = column / columns, (rows - 1 - row) * height + 0.2 / fig.get_figheight()
+            ax = fig.add_axes((x + 0.04 / columns, y, 0.92 / columns, 0.8 * height))
+            _draw(ax, mission, name, judged.get(name))
+    return fig
+
+
+def draw_graphs(mission: Mission, judged: Mapping[str, Rigidity | None], path: Path) -> None:
+    """Write `graphs` to a file, whole or not at all.
+
+    Raises
+    ------
+    ResultError
+        The file's name does not end in .png, .svg or .pdf, or it cannot be written.
+    """
+    from rigidfleet.errors import ResultError
+    from rigidfleet.plotting import _rendered, _write
+
+    if path.suffix not in _FORMATS:
+        known = ", ".join(_FORMATS)
+        raise ResultError(f"{path}: no format of a figure. Give a name that ends in {known}.")
+    _write(path, _rendered(graphs(mission, judged), path.suffix[1:]))
+
+
+def _draw(ax: Axes, mission: Mission, name: str, rigidity: Rigidity | None) -> None:
+    p, placed = space.sketch_places(mission, name)
+    p = p - p.mean(axis=0)
+    edges, lengths = mission.formation_edges(name), mission.formation_distances(name)
+    extent = float(np.ptp(p)) or 1.0
+    flat = shapes.dimension(p, 1e-3) < 3 and float(np.ptp(p[:, 2])) < 1e-3 * extent
+    sideways = flat and rigidity is not None and any(f.motion[:, 2].any() for f in rigidity.flexes)
+    R = np.eye(3) if flat and not sideways else space.camera(-70.0, 30.0 if flat else 16.0)
+    redundant = set() if rigidity is None else set(rigidity.redundant.tolist())
+    colours = [st.FLOWN if k in redundant else st.GREY for k in range(len(edges))]
+    dashed = [k in redundant for k in range(len(edges))]
+    few = len(edges) <= 12
+    space.draw_graph(ax, p @ R.T, edges, colours, lengths if few else None, dashed=dashed)
+    told = f"{len(edges)} edges" + ("" if placed else "; they fix no places")
+    if rigidity is not None:
+        told = f"{rigidity.verdict}, rank {rigidity.rank} of {rigidity.needed}, {told}"
+        told += f", {len(redundant)} redundant" if redundant else ""
+        _arrows(ax, p, R, rigidity)
+    ax.set_title(f"{st.clean(name)}\n", fontweight="bold", parse_math=False)
+    ax.text(
+        0.5, 1.02, told, transform=ax.transAxes, ha="center", va="bottom", fontsize=7, color=st.GREY
+    )
+
+
+def _arrows(ax: Axes, p: Any, R: Any, rigidity: Rigidity) -> None:
+    """Free motions, seen along the last row of R (3, 3)."""
+    size = float(np.linalg.norm(p, axis=1).max()) or 1.0
+    tones = (st.ALERT, st.PALETTE[0], st.PALETTE[2])
+    for n, flex in enumerate(rigidity.flexes[:_DRAWN]):
+        step = flex.motion * (_ARROW * size / np.linalg.norm(flex.motion, axis=1).max())
+        begin, end = p @ R.T, (p + step) @ R.T
+        for i in flex.agents:
+            if np.linalg.norm((end - begin)[i, :2]) < 0.1 * size:
+                continue
+            arrow = {
+                "arrowstyle": "-|>", "color": tones[n], "linewidth": 1.4, "shrinkA": 0,
+                "gid": f"flex-{n + 1}-{i + 1}",
+            }  # fmt: skip
+            ax.annotate(
+                "", end[i, :2], begin[i, :2], arrowprops=arrow, zorder=4, annotation_clip=False
+            )

@@ -1,0 +1,78 @@
+"""One page that tells a flight: paths, distances, attitude, thrust, clearance."""
+
+from __future__ import annotations
+
+import textwrap
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rigidfleet.plotting import curves, space
+from rigidfleet.plotting import style as st
+from rigidfleet.plotting.style import styled
+from rigidfleet.result import Result
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+def _legend_above(ax: Axes, handles: list[Any]) -> None:
+    ax.legend(
+        handles=handles, loc="lower right", bbox_to_anchor=(1.0, 1.06), ncols=len(handles),
+        columnspacing=1.2,
+    )  # fmt: skip
+
+
+def _draw_attitude(ax: Axes, result: Result) -> None:
+    """Three Euler angles in one axes, dark to light; where there are none, the constraint error."""
+    from matplotlib.lines import Line2D
+
+    flown, wanted, _ = curves.flown_and_wanted_euler(result)
+    if not np.isfinite(flown).any():
+        entries = curves.draw_error(ax, result)
+        if entries:
+            _legend_above(ax, entries)
+        return
+    ax.set_ylabel("attitude [deg]")
+    handles = []
+    for i, (name, width) in enumerate((("roll", 1.2), ("pitch", 1.8), ("yaw", 2.4))):
+        look: dict[str, Any] = {"color": st.TONES[i], "linewidth": width, "zorder": 2.3 - 0.1 * i}
+        st.line(ax, result.time, flown[:, i], **look)
+        st.reference(ax, result.time, wanted[:, i])
+        handles.append(Line2D([], [], label=name, **look))
+    _legend_above(ax, handles)
+    if not st.still(ax, np.concatenate([flown, wanted]), "deg"):
+        curves.widen(ax, 0.1)
+
+
+@styled
+def summary(result: Result) -> Figure:
+    """Trajectory, top view, distances, attitude, thrust and clearance on one page."""
+    from matplotlib.figure import Figure
+
+    fig = Figure(figsize=(11.4, 7.0))
+    st.head(fig, result, st.clean(result.mission.title, 80) or "Flight")
+    view = space.scene(result)
+    space.draw_space(fig, result, view, (0.0, 0.49, 0.41, 0.47))
+    space.draw_above(fig.add_axes((0.45, 0.56, 0.22, 0.36)), result, view)
+    lengths = fig.add_axes((0.73, 0.56, 0.255, 0.345))
+    angles, thrust, room = (fig.add_axes((x, 0.165, 0.27, 0.285)) for x in (0.05, 0.385, 0.715))
+    over_time = (lengths, angles, thrust, room)
+    for ax in over_time:
+        st.over_time(ax, result)
+        ax.set_xlabel("time [s]")
+    curves.draw_distances(lengths, result)
+    if 0 < len(result.edges) <= curves.SINGLE:
+        _legend_above(lengths, curves.edge_handles(result))
+    _draw_attitude(angles, result)
+    curves.draw_thrust(thrust, result)
+    (curves.draw_clearance if result.mission.obstacles else curves.draw_separation)(room, result)
+    key = textwrap.wrap("Phases:  " + st.number_phases(fig, over_time, result), 150)
+    entries = space.handles(result, view)
+    fig.legend(handles=entries, loc="center", ncols=len(entries), bbox_to_anchor=(0.5, 0.075))
+    fig.text(
+        0.5, 0.05, "\n".join(key[:3]), ha="center", va="top", fontsize=7.5, color=st.GREY,
+        parse_math=False,
+    )  # fmt: skip
+    return fig

@@ -1,0 +1,618 @@
+"""Figures in space: the trajectory among the obstacles, and the formations' graphs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+
+from rigidfleet.formation import shapes
+from rigidfleet.plotting import curves
+from rigidfleet.plotting import style as st
+from rigidfleet.plotting.style import Floats, styled
+from rigidfleet.result import Result
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from mpl_toolkits.mplot3d import Axes3D
+
+    from rigidfleet.mission import Mission
+
+_BOX = "#9A9184"
+_GROUND = "#E9E6DF"
+_ELEVATION = 24.0  # of the camera [deg]
+_TRAIL = 1500  # points of an agent's path
+_LINES = 2000  # edges that are drawn among paths
+
+
+# -- what there is to see ------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Paths, formations and surroundings of a flight, cut to what can be drawn."""
+
+    paths: Floats  # (K', N, 3) [m]
+    centre: Floats  # (K', 3) path of the centre of mass [m]
+    shots: list[int]  # samples at which the formation is drawn
+    low: Floats  # (3,) corners of the space shown [m]
+    high: Floats
+    floor: float  # height on which shadows fall [m]
+    ground: bool  # whether that is the ground
+    boxes: list[tuple[str, Floats, Floats]]  # name and corners [m]
+    waypoints: list[tuple[str, Floats]]
+
+
+def scene(result: Result) -> Scene:
+    """What a trajectory's figure shows."""
+    mission, r = result.mission, result.position
+    rows = np.flatnonzero(np.isfinite(r).all(axis=(1, 2)))
+    thin = rows[st.some(len(rows), _TRAIL if r.shape[1] <= st.MANY else _TRAIL // 10)]
+    waypoints = _waypoints(result)
+    seen = np.concatenate(
+        [r[thin].reshape(-1, 3), *(w[1][None] for w in waypoints), np.zeros((0, 3))]
+    )
+    if not len(seen):
+        seen = np.zeros((1, 3))
+    low, high = seen.min(axis=0), seen.max(axis=0)
+    heights = [o.height for o in mission.obstacles if o.kind == "ground"]
+    near = float((high - low).max()) + 5.0
+    if heights and max(heights) > low[2] - near:
+        low[2] = min(low[2], max(heights))
+    else:
+        heights = []
+    boxes = []
+    for o in mission.obstacles:
+        if o.kind == "box":
+            # Of a large box only what stands near the flight is shown.
+            a = np.clip(np.array(o.min), low - near, high + near)
+            b = np.clip(np.array(o.max), low - near, high + near)
+            if (b > a).all():
+                boxes.append((o.name, a, b))
+    low = np.minimum.reduce([low, *(a for _, a, _ in boxes)])
+    high = np.maximum.reduce([high, *(b for _, _, b in boxes)])
+    # Room around it, and no direction so thin that it cannot be seen.
+    size = float((high - low).max()) or 2.0
+    lack = np.maximum(0.3 * size - (high - low), 0.08 * size) / 2
+    floor = max(heights) if heights else low[2] - lack[2]
+    high = high + lack
+    low = np.array([low[0] - lack[0], low[1] - lack[1], min(floor, low[2])])
+    return Scene(
+        r[thin],
+        result.cm[thin],
+        _shots(result, rows),
+        low,
+        high,
+        floor,
+        bool(heights),
+        boxes,
+        waypoints,
+    )
+
+
+def _waypoints(result: Result) -> list[tuple[str, Floats]]:
+    """Short name and place of each waypoint, once for each place."""
+    found: dict[tuple[float, ...], str] = {}
+    for phase in result.phases:
+        target = phase.target or {}
+        if target.get("position") is not None and phase.kind == "fly":
+            place = tuple(np.round(np.asarray(target["position"], dtype=float), 6).tolist())
+            found.setdefault(place, st.clean(phase.name.split(":")[0], 12))
+    return [(name, np.array(place)) for place, name in found.items()]
+
+
+def _shots(result: Result, rows: Any) -> list[int]:
+    """Samples at which the formation is drawn: both ends, ends of phases, and some on the way.
+
+    None where it would cover one that is there already.
+    """
+    if not len(rows):
+        return []
+    r = result.position
+    about = r[rows] - r[rows].mean(axis=1, keepdims=True)
+    size = 2 * float(np.median(np.linalg.norm(about, axis=2).max(axis=1))) or 1e-9
+    path = float(np.linalg.norm(np.diff(r[rows].mean(axis=1), axis=0), axis=1).sum())
+    ends = [result.samples(i).stop - 1 for i in range(len(result.phases))]
+    usable = set(rows.tolist())
+    kept = [int(rows[0])]
+
+    def keep(candidates: list[int], gap: float) -> None:
+        for k in candidates:
+            apart = [np.sqrt(np.mean(np.sum((r[k] - r[j]) ** 2, axis=1))) for j in kept]
+            if k in usable and min(apart) > gap:
+                kept.append(k)
+
+    keep([int(rows[-1])], 1e-3 * size)
+    keep(ends, 0.3 * size)
+    keep(rows[st.some(len(rows), 80)].tolist(), max(1.2 * size, path / 14))
+    return sorted(kept)
+
+
+def _corners(low: Floats, high: Floats) -> Floats:
+    return np.array(list(product(*zip(low, high, strict=True))))
+
+
+def _faces(low: Floats, high: Floats) -> list[Floats]:
+    c = _corners(low, high)
+    sides = [(0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (1, 3, 7, 5)]
+    return [c[list(side)] for side in sides]
+
+
+def _segments(result: Result, shots: list[int]) -> Floats:
+    """Edges active at samples as segments (n, 2, 3)."""
+    drawn = [result.position[k][result.edges[np.isfinite(result.constraint[k])]] for k in shots]
+    return np.concatenate([np.zeros((0, 2, 3)), *drawn])
+
+
+# -- paths ---------------------------------------------------------------------------------------------
+
+
+def _draw_paths(ax: Axes, result: Result, view: Scene, axes: int) -> None:
+    """Paths, agents where the formation is drawn, start, end and waypoints, in 2 or 3 axes."""
+    shots = view.shots
+    if result.n_agents > st.MANY:
+        _draw_many(ax, result, view, axes)
+        return
+    for i, colour in enumerate(st.agent_colours(result.n_agents)):
+        path: dict[str, Any] = {"color": colour, "linewidth": 0.8, "alpha": 0.9, "zorder": 3}
+        ax.plot(*view.paths[:, i, :axes].T, **path, gid=f"agent-{i + 1}")
+        r = result.position[shots, i, :axes].T
+        ax.plot(*r, **_dot(colour, 3), zorder=5)
+        ax.plot(*r[:, :1], **_dot(colour, 5, hollow=True), zorder=6, gid="start")
+        ax.plot(*r[:, -1:], **_dot(colour, 5, marker="s"), zorder=6, gid="end")
+    for _, place in view.waypoints:
+        ax.plot(*place[:axes, None], **_CROSS, zorder=7)
+
+
+def _draw_many(ax: Axes, result: Result, view: Scene, axes: int) -> None:
+    """Paths of some of many agents, and all of them where the formation is drawn."""
+    colours = np.array(st.agent_colours(result.n_agents))
+    for i in st.some(result.n_agents, st.MANY):
+        ax.plot(*view.paths[:, i, :axes].T, color=colours[i], linewidth=0.4, alpha=0.5, zorder=3)
+    first, last = view.shots[0], view.shots[-1]
+    for k in view.shots:
+        r = result.position[k, :, :axes].T
+        hollow = k == first != last
+        look: dict[str, Any] = {"c": "white" if hollow else colours, "edgecolors": colours}
+        look |= {"marker": "s" if k == last else "o", "linewidths": 0.5 if hollow else 0.0}
+        ax.scatter(*r, s=4 if k in (first, last) else 3, **look, zorder=6 if hollow else 5)
+    for _, place in view.waypoints:
+        ax.plot(*place[:axes, None], **_CROSS, zorder=7)
+
+
+def _dot(colour: str, size: float, *, hollow: bool = False, marker: str = "o") -> dict[str, Any]:
+    return {
+        "linestyle": "", "marker": marker, "markersize": size,
+        "markerfacecolor": "white" if hollow else colour,
+        "markeredgecolor": colour, "markeredgewidth": 1.2 if hollow else 0.0,
+    }  # fmt: skip
+
+
+_CROSS: dict[str, Any] = {
+    "linestyle": "", "marker": "+", "markersize": 7, "color": st.INK, "markeredgewidth": 1.3,
+}  # fmt: skip
+
+
+# -- three dimensions --------------------------------------------------------------------------------
+
+
+def draw_space(
+    fig: Figure, result: Result, view: Scene, rect: tuple[float, float, float, float]
+) -> Axes3D:
+    """Trajectory in three dimensions, to one scale on all axes, as large as `rect` of the figure allows."""
+    from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
+
+    ax = cast("Axes3D", fig.add_axes(rect, projection="3d"))
+    ax.computed_zorder = False
+    ax.set_proj_type("ortho")
+    low, high = view.low, view.high
+    ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
+    _plain_axes(ax)
+    if view.ground:
+        flat = _corners(low, high)[[0, 2, 6, 4]]
+        flat[:, 2] = view.floor
+        ax.add_collection3d(Poly3DCollection([flat], facecolor=_GROUND, alpha=0.8, zorder=0))
+    for _, a, b in view.boxes:
+        faces: dict[str, Any] = {
+            "facecolor": _BOX,
+            "edgecolor": _BOX,
+            "linewidth": 0.5,
+            "alpha": 0.22,
+        }
+        ax.add_collection3d(Poly3DCollection(_faces(a, b), **faces, zorder=2, gid="obstacle"))
+    shadow = np.full(len(view.centre), view.floor)
+    ax.plot(*view.centre[:, :2].T, shadow, color=st.FAINT, linewidth=1.0, zorder=1)
+    edges = _segments(result, view.shots)
+    if 0 < len(edges) <= _LINES:
+        ax.add_collection3d(Line3DCollection(edges, colors=st.INK, linewidths=0.6, zorder=4))
+    _draw_paths(ax, result, view, 3)
+    for name, (x, y, z) in view.waypoints:
+        ax.text(
+            x, y, z, f"  {name}", fontsize=7.5, zorder=8, va="bottom", parse_math=False,
+            path_effects=st.halo(),
+        )  # fmt: skip
+    ax.view_init(_ELEVATION, _azimuth(view))
+    _fit(fig, ax, view, rect)
+    _name_axes(fig, ax, view)
+    return ax
+
+
+def _plain_axes(ax: Axes3D) -> None:
+    from matplotlib.ticker import MaxNLocator
+
+    spans = [np.ptp(ax.get_xlim()), np.ptp(ax.get_ylim()), np.ptp(ax.get_zlim())]
+    for axis, span in zip((ax.xaxis, ax.yaxis, ax.zaxis), spans, strict=True):
+        axis.set_major_locator(MaxNLocator(max(2, round(6 * span / max(spans)))))
+        axis.set_tick_params(labelsize=7, pad=-1, color=st.FAINT)
+    ax.set_box_aspect([float(s) for s in spans])
+    ax.patch.set_visible(False)
+
+
+def _azimuth(view: Scene) -> float:
+    """Azimuth [deg] from which the path is spread out most; x still runs right, y away from us."""
+    points = np.concatenate([view.paths.reshape(-1, 3), view.centre])
+    points = points[np.isfinite(points).all(axis=1)]
+
+    def spread(azimuth: float) -> float:
+        seen = points @ camera(azimuth, _ELEVATION)[:2].T
+        return float(np.linalg.det(np.cov(seen, rowvar=False)))
+
+    # Of views that show about as much, the one nearest to the middle.
+    candidates = sorted(range(-75, -14, 5), key=lambda a: abs(a + 55))
+    if len(points) < 3:
+        return candidates[0]
+    most = max(spread(a) for a in candidates)
+    return next(a for a in candidates if spread(a) >= 0.85 * most)
+
+
+def _on_screen(ax: Axes3D, points: Floats) -> Floats:
+    """Places (n, 2) [pixels] of points (n, 3)."""
+    from mpl_toolkits.mplot3d.proj3d import proj_transform
+
+    x, y, _ = proj_transform(*points.T, ax.get_proj())
+    return ax.transData.transform(np.column_stack([x, y]))
+
+
+def _name_axes(fig: Figure, ax: Axes3D, view: Scene) -> None:
+    """Names of the axes at a fixed distance from them; matplotlib's own wander off with the zoom."""
+    (x0, y0, z0), (x1, y1, z1) = view.low, view.high
+    edges = {
+        "x [m]": [(x0, y0, z0), (x1, y0, z0)],
+        "y [m]": [(x1, y0, z0), (x1, y1, z0)],
+        "z [m]": [(x1, y1, z0), (x1, y1, z1)],
+    }
+    for name, edge in edges.items():
+        a, b = _on_screen(ax, np.array(edge))
+        along = (b - a) / max(float(np.linalg.norm(b - a)), 1e-9)
+        outward = np.array([along[1], -along[0]])
+        x, y = fig.transFigure.inverted().transform((a + b) / 2 + 0.33 * fig.dpi * outward)
+        angle = math.degrees(math.atan2(along[1], along[0]))
+        fig.text(x, y, name, ha="center", va="center", rotation=angle, fontsize=8)
+
+
+def _fit(fig: Figure, ax: Axes3D, view: Scene, rect: tuple[float, float, float, float]) -> None:
+    """Zoom and shift so that the box of the axes with its labels fills `rect` (left, bottom, width, height)."""
+    from matplotlib.transforms import Bbox
+
+    size = fig.get_size_inches() * fig.dpi
+    left, bottom, width, height = np.array(rect) * np.tile(size, 2)
+    margin = 0.42 * fig.dpi  # of tick and axis labels
+    side = max(width, height)
+    spans = [float(s) for s in view.high - view.low]
+    corners = _corners(view.low, view.high)
+
+    def place(x: float, y: float) -> None:
+        ax.set_position(Bbox.from_bounds(x, y, side, side).transformed(fig.transFigure.inverted()))
+        ax.apply_aspect()
+
+    place(left, bottom)
+    extent = np.ptp(_on_screen(ax, corners), axis=0)
+    zoom = min((width - 2 * margin) / extent[0], (height - 2 * margin) / extent[1])
+    ax.set_box_aspect(spans, zoom=zoom)
+    place(left, bottom)
+    now = _on_screen(ax, corners)
+    middle = (now.min(axis=0) + now.max(axis=0)) / 2
+    place(left + (left + width / 2 - middle[0]), bottom + (bottom + height / 2 - middle[1]))
+
+
+# -- from above --------------------------------------------------------------------------------------
+
+
+def draw_above(ax: Axes, result: Result, view: Scene) -> None:
+    """Trajectory from above, to one scale on both axes."""
+    from matplotlib.collections import LineCollection
+
+    ax.set(xlim=(view.low[0], view.high[0]), ylim=(view.low[1], view.high[1]))
+    ax.set(xlabel="x [m]", ylabel="y [m]")
+    ax.set_aspect("equal", adjustable="box")
+    ax.apply_aspect()
+    for name, low, high in view.boxes:
+        _outline(ax, low, high, name, facecolor=_BOX, alpha=0.3, linewidth=0)
+    fence = result.mission.limits.geofence
+    if fence is not None:
+        look: dict[str, Any] = {"fill": False, "edgecolor": st.ALERT, "linestyle": (0, (6, 2))}
+        _outline(ax, np.array(fence.min), np.array(fence.max), "", **look, gid="geofence")
+    edges = _segments(result, view.shots)[..., :2]
+    edges = edges if len(edges) <= _LINES else edges[:0]  # they would hide everything
+    ax.add_collection(LineCollection(list(edges), colors=st.INK, linewidths=0.6, zorder=4))
+    _draw_paths(ax, result, view, 2)
+    over: dict[tuple[float, float], list[str]] = {}
+    for name, (x, y, _) in view.waypoints:
+        over.setdefault((x, y), []).append(name)
+    for (x, y), names in over.items():
+        ax.annotate(
+            ", ".join(names), (x, y), (5, 4), textcoords="offset points", fontsize=7.5, zorder=8,
+            parse_math=False, path_effects=st.halo(),
+        )  # fmt: skip
+
+
+def _outline(ax: Axes, low: Floats, high: Floats, name: str, **look: Any) -> None:
+    """Box from above, with its name if that fits."""
+    from matplotlib.patches import Rectangle
+
+    (x, y), (width, depth) = low[:2].tolist(), (high - low)[:2].tolist()
+    box = ax.add_patch(Rectangle((x, y), width, depth, zorder=1, **look))
+    label = ax.text(
+        x + width / 2, y, st.clean(name, 20), fontsize=6.5, color=st.GREY, ha="center",
+        va="bottom", zorder=1.5, parse_math=False,
+    )  # fmt: skip
+    if label.get_window_extent().width > box.get_window_extent().width:
+        label.remove()
+
+
+def handles(result: Result, view: Scene) -> list[Any]:
+    """Legend entries of a trajectory."""
+    from matplotlib.lines import Line2D
+
+    marks = [
+        Line2D([], [], **_dot(st.GREY, 5, hollow=True), label="start"),
+        Line2D([], [], **_dot(st.GREY, 5, marker="s"), label="end"),
+    ]
+    if view.waypoints:
+        marks.append(Line2D([], [], **_CROSS, label="waypoint"))
+    return [*st.agent_handles(result.n_agents, marker="o", markersize=4), *marks]
+
+
+@styled
+def trajectory(result: Result) -> Figure:
+    """Trajectory in three dimensions and from above, with the formation drawn at chosen times."""
+    from matplotlib.figure import Figure
+
+    fig = Figure(figsize=(10.5, 6.2))
+    st.head(fig, result, "Trajectory")
+    view = scene(result)
+    draw_space(fig, result, view, (0.0, 0.07, 0.6, 0.87))
+    above = fig.add_axes((0.66, 0.16, 0.32, 0.74))
+    draw_above(above, result, view)
+    above.set_anchor("C")
+    entries = handles(result, view)
+    fig.legend(
+        handles=entries,
+        loc="lower center",
+        ncols=min(len(entries), 11),
+        borderaxespad=0.8,
+        columnspacing=1.4,
+    )
+    return fig
+
+
+# -- formations --------------------------------------------------------------------------------------
+
+
+def sketch_places(mission: Mission, name: str) -> tuple[Floats, bool]:
+    """Places (N, 3) [m] at which a formation's graph is drawn, and whether they are its slots.
+
+    Distances that fix no shape are spread out by classical scaling of the shortest paths in the graph.
+    """
+    slots = mission.formation_slots(name)
+    if slots is not None:
+        return slots, True
+    n, edges = mission.n_agents, mission.formation_edges(name)
+    lengths = mission.formation_distances(name)
+    d = np.full((n, n), np.inf)
+    np.fill_diagonal(d, 0.0)
+    d[edges[:, 0], edges[:, 1]] = d[edges[:, 1], edges[:, 0]] = lengths
+    for k in range(n):
+        d = np.minimum(d, d[:, k : k + 1] + d[k : k + 1])
+    d[np.isinf(d)] = 1.5 * d[np.isfinite(d)].max(initial=1.0)  # parts that no edge joins
+    centring = np.eye(n) - 1 / n
+    value, vector = np.linalg.eigh(-0.5 * centring @ d**2 @ centring)
+    places = np.zeros((n, 3))
+    places[:, : min(n, 3)] = (vector * np.sqrt(np.maximum(value, 0)))[:, ::-1][:, :3]
+    return places, False
+
+
+@styled
+def formations(result: Result) -> Figure:
+    """Constraint graph and body axes of each formation of the mission."""
+    from matplotlib.figure import Figure
+
+    names = list(result.mission.formations)
+    columns = min(max(len(names), 1), 3)
+    rows = math.ceil(max(len(names), 1) / columns)
+    fig = Figure(figsize=(max(3.4 * columns, 6.0), 0.5 + 3.5 * rows))
+    st.head(fig, result, "Formations")
+    if not names:
+        fig.text(0.5, 0.45, "the mission has no formation", ha="center", color=st.GREY)
+    legend = len(result.edges) > curves.SINGLE and bool(names)
+    top, bottom = 1 - 0.45 / fig.get_figheight(), 0.7 * legend / fig.get_figheight()
+    for k, name in enumerate(names):
+        row, column = divmod(k, columns)
+        height = (top - bottom) / rows
+        rect = (column / columns, top - (row + 1) * height, 1 / columns, height)
+        _sketch(fig, rect, result, name)
+    if legend:
+        entries = curves.edge_handles(result)
+        fig.legend(
+            handles=entries,
+            loc="lower center",
+            ncols=min(int(fig.get_figwidth() / 2.2), len(entries)),
+            borderaxespad=0.8,
+        )
+    return fig
+
+
+def _sketch(
+    fig: Figure, rect: tuple[float, float, float, float], result: Result, name: str
+) -> None:
+    mission = result.mission
+    p, placed = sketch_places(mission, name)
+    edges = mission.formation_edges(name)
+    lengths = mission.formation_distances(name)
+    masses = np.array(mission.agents.mass)
+    origin = masses @ p / masses.sum()
+    flat = shapes.dimension(p, 1e-3) < 3 and float(np.ptp(p[:, 2])) < 1e-3 * max(
+        1e-9, float(np.ptp(p))
+    )
+    x, y, w, h = rect
+    given = mission.formations[name]
+    words = given.shape or ("slots" if given.slots is not None else "by distances")
+    fig.text(
+        x + w / 2, y + 0.95 * h, st.clean(name), ha="center", fontweight="bold", parse_math=False
+    )
+    told = f"{words}, {len(edges)} edge{'s' if len(edges) != 1 else ''}"
+    told += "" if placed else "; they fix no places"
+    fig.text(x + w / 2, y + 0.89 * h, told, ha="center", fontsize=7.5, color=st.GREY)
+    ax = fig.add_axes((x + 0.06 * w, y + 0.04 * h, 0.88 * w, 0.8 * h))
+    turned = p - origin
+    axes = np.eye(3)
+    if not flat:
+        R = camera(-70.0, 16.0)
+        turned, axes = turned @ R.T, axes @ R.T
+    colours = {k: g.colour for g in curves.edge_groups(result) for k in g.edges}
+    index = {edge: k for k, edge in enumerate(map(tuple, result.edges.tolist()))}
+    of_edge = [colours[index[edge]] for edge in map(tuple, edges.tolist())]
+    draw_graph(ax, turned, edges, of_edge, lengths if len(edges) <= curves.SINGLE else None)
+    if placed and len(p) > 1:
+        reach = float(np.linalg.norm(turned, axis=1).max())
+        taken = bool(np.linalg.norm(turned, axis=1).min() < 0.1 * reach)
+        length = (0.3, 0.3, 0.42, 0.5)[shapes.dimension(p, 1e-3)] * reach
+        _draw_axes(ax, axes, length, taken=taken)
+
+
+def draw_graph(
+    ax: Axes,
+    p: Floats,
+    edges: Any,
+    colours: list[str],
+    lengths: Floats | None,
+    *,
+    dashed: Sequence[bool] = (),
+) -> None:
+    """Agents at p (N, 3), seen along the last axis, as numbered discs, with edges and their lengths [m]."""
+    n = len(p)
+    room = 1.25 * float(np.abs(p[:, :2]).max()) or 1.0
+    ax.set(xlim=(-room, room), ylim=(-room, room), aspect="equal")
+    ax.axis("off")
+    if n > st.MANY:
+        _draw_mesh(ax, p, edges, colours)
+        return
+    for e in np.argsort(p[edges, 2].mean(axis=1)) if len(edges) else []:
+        i, j = edges[e]
+        a, b = p[i], p[j]
+        # The middle of a diagonal is where others meet, and the body axes.
+        middle = a + (b - a) * (0.5 if np.hypot(*(a + b)[:2]) > 0.3 * room else 0.28)
+        others = np.delete(p, [i, j], axis=0)
+        path = np.array([a, b])[:, :2]
+        if len(others) and _distance_to(others, a, b).min() < 0.02 * room:
+            # Straight, it would run through another agent.
+            across = np.array([a[1] - b[1], b[0] - a[0]]) * -0.22
+            s = np.linspace(0, 1, 40)[:, None]
+            path = (1 - s) * a[:2] + s * b[:2] + 4 * s * (1 - s) * across
+            middle = np.append((a + b)[:2] / 2 + across, 0.0)
+        dash: Any = st.DASHES if dashed and dashed[e] else "-"
+        look: dict[str, Any] = {"color": colours[e], "linewidth": 1.6, "linestyle": dash}
+        ax.plot(*path.T, **look, zorder=2, gid=f"edge-{i + 1}-{j + 1}")
+        if lengths is not None:
+            x, y = middle[:2]
+            ax.text(
+                x, y, f"{lengths[e]:.3g} m", fontsize=7.5, ha="center", va="center", zorder=3,
+                bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.0},
+            )  # fmt: skip
+    size = 14.0 if n <= 12 else 60.0 / math.sqrt(n)
+    for i in np.argsort(p[:, 2]):
+        colour = st.agent_colours(n)[i]
+        x, y = p[i, :2]
+        ax.plot(x, y, **_dot(colour, size), zorder=5, gid=f"agent-{i + 1}")
+        if size > 7:
+            ax.text(
+                x, y, str(i + 1), fontsize=0.6 * size, color=_readable_on(colour), ha="center",
+                va="center_baseline", zorder=6, fontweight="bold",
+            )  # fmt: skip
+
+
+def _draw_mesh(ax: Axes, p: Floats, edges: Any, colours: list[str]) -> None:
+    """A graph of many agents: what is behind first and fainter."""
+    from matplotlib.collections import LineCollection
+    from matplotlib.colors import to_rgba_array
+
+    depth = p[:, 2] - p[:, 2].min()
+    depth = (
+        0.15 + 0.85 * depth / max(float(depth.max()), 1e-9) if np.ptp(p[:, 2]) else 1 + 0 * depth
+    )
+    if len(edges):
+        near = depth[edges].mean(axis=1)
+        order = np.argsort(near)
+        look = to_rgba_array(colours)
+        look[:, 3] = near
+        lines = LineCollection(list(p[edges[order]][:, :, :2]), colors=look[order], linewidths=0.5)
+        lines.set_gid("edges")
+        ax.add_collection(lines)
+    order = np.argsort(p[:, 2])
+    dots = to_rgba_array(st.agent_colours(len(p)))
+    dots[:, 3] = depth
+    ax.scatter(*p[order, :2].T, s=2000 / len(p) + 1, c=dots[order], linewidths=0, zorder=3)
+
+
+def _draw_axes(ax: Axes, axes: Floats, length: float, *, taken: bool) -> None:
+    """Body axes from the centre of mass; rows of `axes` (3, 3) as seen, the last column towards us.
+
+    An axis towards us is a ring with a point, beside the centre where an agent has `taken` that.
+    """
+    tips = length * axes
+    for tip, name in zip(tips, "xyz", strict=True):
+        label = f"${name}_b$"
+        if np.hypot(*tip[:2]) < 1e-6 * length:
+            words = f"⊙ {label}" if taken else label
+            place: dict[str, Any] = {"textcoords": "offset points", "ha": "right", "va": "top"}
+            place["bbox"] = {"facecolor": "white", "edgecolor": "none", "pad": 0.5, "alpha": 0.8}
+            ax.annotate(words, (0, 0), (-9, -9), fontsize=9.5, gid="body-axis", zorder=7, **place)
+            if not taken:
+                ring: dict[str, Any] = {"markerfacecolor": "white", "markeredgecolor": st.INK}
+                ax.plot(0, 0, "o", markersize=9, zorder=7, **ring)
+                ax.plot(0, 0, "o", markersize=2.5, color=st.INK, zorder=8)
+            continue
+        ax.annotate(
+            "", tip[:2], (0, 0), zorder=4,
+            arrowprops={"arrowstyle": "-|>", "color": st.INK, "linewidth": 1.3, "shrinkA": 0, "shrinkB": 0},
+        )  # fmt: skip
+        ax.annotate(
+            label, 1.1 * tip[:2], ha="center", va="center", zorder=7, fontsize=9.5, gid="body-axis",
+            bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.5, "alpha": 0.8},
+        )  # fmt: skip
+
+
+def camera(azimuth: float, elevation: float) -> Floats:
+    """Rows right, up, and towards us of a camera at these angles [deg]."""
+    a, e = math.radians(azimuth), math.radians(elevation)
+    out = np.array([math.cos(a) * math.cos(e), math.sin(a) * math.cos(e), math.sin(e)])
+    right = np.array([-math.sin(a), math.cos(a), 0.0])
+    return np.array([right, np.cross(out, right), out])
+
+
+def _distance_to(points: Floats, a: Floats, b: Floats) -> Floats:
+    """Distances of points (n, 3) from the segment a b."""
+    along = b - a
+    s = np.clip((points - a) @ along / max(float(along @ along), 1e-300), 0.0, 1.0)
+    return np.linalg.norm(points - a - s[:, None] * along, axis=1)
+
+
+def _readable_on(colour: str) -> str:
+    from matplotlib.colors import to_rgb
+
+    return "white" if float(np.dot(to_rgb(colour), (0.299, 0.587, 0.114))) < 0.6 else st.INK

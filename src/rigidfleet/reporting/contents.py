@@ -1,0 +1,394 @@
+"""What stands on the page: plain data for its templates."""
+
+from __future__ import annotations
+
+import math
+from base64 import b64encode
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rigidfleet import __version__
+from rigidfleet import plotting as figures
+from rigidfleet.assessment import Safety, Verdict, assess, safety
+from rigidfleet.assessment.verdict import value
+from rigidfleet.mission import ending, goal
+from rigidfleet.plotting.style import clean
+from rigidfleet.reporting import gains, overlay
+
+if TYPE_CHECKING:
+    from rigidfleet.mission import Mission
+    from rigidfleet.result import Result
+
+#: Vehicles with a row each; of more, those that need the most thrust.
+_VEHICLES = 24
+#: Keys in which missions differ that are shown.
+_KEYS = 40
+#: Numbers that differ by less, relative to the larger, are the same.
+_SAME = 1e-3
+
+
+def contents(
+    flights: Sequence[Result], labels: Sequence[str] | None, verdicts: Sequence[Verdict] | None
+) -> dict[str, Any]:
+    """Everything on the page.
+
+    Raises
+    ------
+    ValueError
+        There is no flight, or not one label and verdict for each.
+    """
+    if not flights:
+        raise ValueError("a report needs a result")
+    names = list(labels) if labels is not None else _named(flights)
+    judged = list(verdicts) if verdicts is not None else [assess(flight) for flight in flights]
+    if not len(names) == len(judged) == len(flights):
+        raise ValueError(f"{len(flights)} results need as many labels and verdicts")
+    missions = [flight.mission for flight in flights]
+    several = len(flights) > 1
+    colours = figures.agent_colours(len(flights))
+    found = [_flight(*each) for each in zip(flights, judged, names, colours, strict=True)]
+    response = overlay.response(missions, names)
+    return {
+        "title": " · ".join(names),
+        "several": several,
+        "flights": found,
+        "figures": [] if several else _figures(flights[0]),
+        "passed": all(verdict.passed for verdict in judged),
+        "safety": _safety_table(flights, judged),
+        "numbers": _numbers(flights, judged) if several else [],
+        "keys": _keys(missions) if several else [],
+        "overlays": _overlays(flights, names) if several else [],
+        "response": None if response is None else _embedded(response),
+        "version": __version__,
+    }
+
+
+def _named(flights: Sequence[Result]) -> list[str]:
+    """Names of the missions, numbered where two are the same."""
+    names = [flight.mission.name for flight in flights]
+    count = Counter(names)
+    seen: Counter[str] = Counter()
+    found = []
+    for name in names:
+        seen[name] += 1
+        found.append(f"{name} ({seen[name]})" if count[name] > 1 else name)
+    return found
+
+
+# -- one flight --------------------------------------------------------------------------------------
+
+
+def _flight(result: Result, verdict: Verdict, label: str, colour: str) -> dict[str, Any]:
+    mission = result.mission
+    judged = [finding for finding in verdict.findings if finding.judged]
+    failed = [finding for finding in judged if not finding.passed]
+    return {
+        "label": label,
+        "colour": colour,
+        "name": mission.name,
+        "title": mission.title,
+        "source": mission.source,
+        "passed": verdict.passed,
+        "head": _head(len(judged), len(failed)),
+        "words": [f.message for f in failed] if failed else [verdict.summary.partition("; ")[2]],
+        "notes": verdict.notes,
+        "facts": _facts(result),
+        "checks": [_check(finding) for finding in verdict.findings],
+        "phases": _phases(result, verdict),
+        "vehicles": _vehicles(result),
+        "vehicles_left_out": max(0, result.n_agents - _VEHICLES),
+        "summary": _figure(result, "summary"),
+        "gains": gains.explained(mission),
+        "versions": _versions(result),
+        "text": result.mission_text,
+    }
+
+
+def _head(judged: int, failed: int) -> str:
+    return f"{failed} of {judged} checks failed" if failed else f"all {judged} checks hold"
+
+
+def _facts(result: Result) -> list[tuple[str, str]]:
+    mission = result.mission
+    mass = sorted(set(mission.agents.mass))
+    masses = f"{mass[0]:g} kg" if len(mass) == 1 else f"{mass[0]:g} to {mass[-1]:g} kg"
+    forms = [
+        f"{name} ({len(mission.formation_edges(name))} edges)" for name in mission.formations
+    ]  # fmt: skip
+    return [
+        ("vehicles", f"{result.n_agents}, {masses}"),
+        ("formations", ", ".join(forms) or "none"),
+        ("control", mission.architecture),
+        ("flown", f"{result.time[-1]:.4g} s, {len(result.phases)} phases"),
+        ("simulated", result.created.replace("T", " ").replace("+00:00", " UTC")),
+    ]
+
+
+def _check(finding: Any) -> dict[str, Any]:
+    sign = "≤" if not finding.at_least else "≥" if finding.limit else ">"
+    return {
+        "name": finding.check.replace("_", " "),
+        "worst": "" if finding.worst is None else value(finding.worst, finding.unit),
+        "limit": "" if finding.limit is None else f"{sign} {value(finding.limit, finding.unit)}",
+        "when": "" if finding.when is None else f"{finding.when:.2f}",
+        "who": finding.who or finding.phase,
+        "state": "failed" if not finding.passed else "ok" if finding.judged else "",
+    }
+
+
+def _phases(result: Result, verdict: Verdict) -> list[dict[str, str]]:
+    planned = {phase.name: phase for phase in result.mission.phases}
+    rows = []
+    for number, p in enumerate(verdict.phases, start=1):
+        phase, w = planned.get(p.name), p.waypoint
+        worst = {name: value(e.value) for name, e in p.worst.items()}
+        rows.append(
+            {
+                "number": str(number),
+                "name": p.name,
+                "kind": p.kind,
+                "to": "" if phase is None else goal(phase),
+                "ends": "" if phase is None else ending(phase),
+                "control": p.control,
+                "flown": f"{p.t_start:.2f} to {p.t_end:.2f}",
+                "miss": "" if w is None or w.position is None else value(w.position),
+                "shape": "" if p.shape is None else value(p.shape),
+                **{k: worst.get(k, "") for k in ("separation", "clearance", "thrust", "speed")},
+            }
+        )
+    return rows
+
+
+def _vehicles(result: Result) -> list[dict[str, str]]:
+    """Extremes of each vehicle; of too many, of those that need the most thrust."""
+    n, mission = result.n_agents, result.mission
+    with np.errstate(invalid="ignore"):
+        thrust = np.nan_to_num(result.thrust).max(axis=0)
+        speed = np.nan_to_num(np.linalg.norm(result.velocity, axis=2)).max(axis=0)
+        acceleration = np.nan_to_num(np.linalg.norm(result.acceleration, axis=2)).max(axis=0)
+    z = result.position[..., 2]
+    way = np.linalg.norm(np.diff(result.position, axis=0), axis=2).sum(axis=0)
+    shown = np.arange(n) if n <= _VEHICLES else np.sort(np.argsort(-thrust)[:_VEHICLES])
+    colours = figures.agent_colours(n)
+    limits = mission.agents.thrust_limit
+    return [
+        {
+            "name": str(i + 1),
+            "colour": colours[i],
+            "mass": f"{mission.agents.mass[i]:g}",
+            "thrust": value(float(thrust[i])),
+            "used": f"{100 * thrust[i] / limits[i]:.0f} %" if math.isfinite(limits[i]) else "",
+            "speed": value(float(speed[i])),
+            "acceleration": value(float(acceleration[i])),
+            "low": value(float(np.nanmin(z[:, i]))),
+            "high": value(float(np.nanmax(z[:, i]))),
+            "way": value(float(way[i])),
+        }
+        for i in shown.tolist()
+    ]
+
+
+def _versions(result: Result) -> list[tuple[str, str]]:
+    known = result.statistics
+    found = [(name, version) for name, version in result.versions.items()]
+    found.append(("platform", result.platform))
+    for name, key, form in (
+        ("steps of the integrator", "steps", "{}"),
+        ("of these rejected", "rejected", "{}"),
+        ("relative tolerance", "rtol", "{:g}"),
+        ("absolute tolerance", "atol", "{:g}"),
+        ("time to simulate", "wall_s", "{:.3g} s"),
+    ):
+        if known.get(key) is not None:
+            found.append((name, form.format(known[key])))
+    return found
+
+
+# -- the safety page ---------------------------------------------------------------------------------
+
+
+def _safety_table(flights: Sequence[Result], verdicts: Sequence[Verdict]) -> list[dict[str, Any]]:
+    """A row for each quantity with a cell for each flight."""
+    columns = [safety(*each) for each in zip(flights, verdicts, strict=True)]
+    return [
+        {
+            "name": rows[0].quantity,
+            "text": rows[0].text,
+            "cells": [_safety_cell(row) for row in rows],
+        }
+        for rows in zip(*columns, strict=True)
+    ]
+
+
+def _safety_cell(row: Safety) -> dict[str, Any]:
+    margin, used = row.margin, row.used
+    state = "free" if row.limit is None else "ok" if row.passed else "failed"
+    left = ""
+    if margin is not None:
+        left = f"{value(abs(margin), row.unit)} {'left' if margin >= 0 else 'beyond'}"
+    nothing = {"downwash": "never one below another", "geofence": "no fence"}
+    return {
+        "state": state,
+        "sign": "≤" if not row.at_least else "≥" if row.limit else ">",
+        "limit": "" if row.limit is None else value(row.limit, row.unit),
+        "worst": "" if row.worst is None else value(row.worst.value, row.unit),
+        "nothing": nothing.get(row.quantity, "nothing to measure") if row.worst is None else "",
+        "left": left,
+        "used": None if used is None else min(max(used, 0.0), 1.0),
+        "when": "" if row.worst is None else f"{row.worst.when:.2f} s",
+        "who": "" if row.worst is None else row.worst.who,
+        "phase": "" if row.worst is None else row.worst.phase,
+    }
+
+
+# -- what differs ------------------------------------------------------------------------------------
+
+
+def _numbers(flights: Sequence[Result], verdicts: Sequence[Verdict]) -> list[dict[str, Any]]:
+    """Numbers of the flights side by side, and whether they differ."""
+
+    def worst(name: str, _: Result, verdict: Verdict) -> float | None:
+        extreme = verdict.worst.get(name)
+        return None if extreme is None else extreme.value
+
+    def misses(_: Result, verdict: Verdict) -> float | None:
+        found = [p.waypoint.position for p in verdict.phases if p.waypoint is not None]
+        return max((miss for miss in found if miss is not None), default=None)
+
+    measures: list[tuple[str, str, Callable[[Result, Verdict], float | None]]] = [
+        ("length of the flight", "s", lambda r, _: float(r.time[-1])),
+        ("checks that failed", "", lambda _, v: float(sum(not f.passed for f in v.findings))),
+        ("greatest miss of a waypoint", "m", misses),
+        ("greatest miss of a slot", "m", lambda r, _: _greatest(overlay.slot_error(r))),
+        ("greatest constraint error", "m", partial(worst, "constraint")),
+        ("least room between vehicles", "m", partial(worst, "separation")),
+        ("least clearance", "m", partial(worst, "clearance")),
+        ("greatest speed", "m/s", partial(worst, "speed")),
+        ("greatest acceleration", "m/s²", partial(worst, "acceleration")),
+        ("greatest thrust", "N", partial(worst, "thrust")),
+        ("mean thrust of a vehicle", "N", lambda r, _: _mean(r)),
+        ("greatest constraint force", "N", partial(worst, "constraint_force")),
+    ]
+    rows = []
+    for name, unit, measure in measures:
+        found = [measure(*each) for each in zip(flights, verdicts, strict=True)]
+        if all(x is None for x in found):
+            continue
+        rows.append(
+            {
+                "name": name,
+                "unit": unit,
+                "cells": ["–" if x is None else value(abs(x) if "error" in name else x) for x in found],
+                "change": [_change(found[0], x) for x in found],
+                "same": all(_same(found[0], x) for x in found),
+            }
+        )  # fmt: skip
+    return rows
+
+
+def _greatest(values: Any) -> float | None:
+    known = values[np.isfinite(values)]
+    return float(known.max()) if len(known) else None
+
+
+def _mean(result: Result) -> float | None:
+    """Mean thrust of a vehicle over time [N]."""
+    mean = result.thrust.mean(axis=1)
+    length = float(result.time[-1] - result.time[0])
+    if not length or not np.isfinite(mean).all():
+        return None
+    return float(np.trapezoid(mean, result.time)) / length
+
+
+def _same(a: float | None, b: float | None) -> bool:
+    if a is None or b is None:
+        return a is b
+    return math.isclose(a, b, rel_tol=_SAME, abs_tol=1e-9)
+
+
+def _change(first: float | None, x: float | None) -> str:
+    """How a number differs from that of the first flight, where that says something."""
+    if first is None or x is None or _same(first, x) or abs(first) < 1e-6:
+        return ""
+    percent = 100 * (x - first) / abs(first)
+    if abs(percent) >= 300:
+        return f"×{x / first:.2g}" if 0 < x / first < 100 else ""
+    return f"{percent:+.0f} %".replace("-", "−") if abs(percent) >= 0.5 else ""
+
+
+def _keys(missions: Sequence[Mission]) -> list[dict[str, Any]]:
+    """Keys of the mission files that are not the same in all."""
+    flat = [dict(_flat(mission.to_dict())) for mission in missions]
+    rows = []
+    for key in dict.fromkeys(key for one in flat for key in one):
+        values = [one.get(key, "") for one in flat]
+        if key != "name" and len(set(values)) > 1:
+            rows.append({"key": key, "values": [clean(v, 60) for v in values]})
+    if len(rows) > _KEYS:
+        more = {"key": f"and {len(rows) - _KEYS} more keys", "values": ["…"] * len(missions)}
+        rows = [*rows[:_KEYS], more]
+    return rows
+
+
+def _flat(data: Any, key: str = "") -> Iterator[tuple[str, str]]:
+    """Keys as messages write them (phases[2].until), and their values as text."""
+    if isinstance(data, Mapping):
+        for name, item in data.items():
+            yield from _flat(item, f"{key}.{name}" if key else str(name))
+    elif isinstance(data, list) and data and all(isinstance(item, Mapping) for item in data):
+        for number, item in enumerate(data, start=1):
+            yield from _flat(item, f"{key}[{number}]")
+    else:
+        yield key, str(data)
+
+
+# -- figures -----------------------------------------------------------------------------------------
+
+_CAPTIONS = {
+    "summary": "The flight on one page.",
+    "trajectory": "Paths of the vehicles, and the formation at chosen moments.",
+    "distances": "Distances that are held, and what they should be (dashed).",
+    "cm": "Centre of mass: flown, reference (dashed) and waypoints (rings).",
+    "attitude": "Attitude of the formation as a body: flown, reference (dashed) and waypoints (rings).",
+    "inputs": "Thrust of each vehicle under its limit, and enlarged.",
+    "constraint_force": "Force that holds the distances, and the tension of each edge; below zero it pushes.",
+    "constraint_error": "Error |c| of each distance held, length less reference; and of all pairs against the slots.",
+    "clearance": "Room between surfaces, with the limits.",
+    "formations": "Formations with their edges and body axes.",
+    "disturbance": "Force of the air on each vehicle, and how far each is from its slot.",
+}  # fmt: skip
+
+
+def _figures(result: Result) -> list[dict[str, str]]:
+    """All figures but the summary, which has a page of its own."""
+    return [_figure(result, name) for name in figures.figure_names(result) if name != "summary"]
+
+
+def _figure(result: Result, name: str) -> dict[str, str]:
+    with TemporaryDirectory() as folder:
+        figures.plot(result, folder, formats=["svg"], names=[name])
+        svg = Path(folder, f"{name}.svg").read_bytes()
+    return _picture(name, svg, _CAPTIONS.get(name, ""))
+
+
+def _picture(name: str, svg: bytes, caption: str) -> dict[str, str]:
+    return {"name": name.replace("_", " "), "image": _embedded(svg), "caption": caption}
+
+
+def _embedded(svg: bytes) -> str:
+    # As an image its names and styles stay its own; blanks between words are kept, as they were drawn.
+    svg = svg.replace(b"</style>", b" text{white-space:pre}</style>", 1)
+    return f"data:image/svg+xml;base64,{b64encode(svg).decode()}"
+
+
+def _overlays(flights: Sequence[Result], labels: Sequence[str]) -> list[dict[str, str]]:
+    return [
+        _picture("paths", overlay.paths(flights, labels), "Where the formations flew."),
+        _picture("over time", overlay.over_time(flights, labels), "The worst of all vehicles at each time."),
+    ]  # fmt: skip

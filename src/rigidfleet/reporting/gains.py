@@ -1,0 +1,149 @@
+"""Gains in words: what a mission's feedback does to an error."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from rigidfleet.math import lqr
+from rigidfleet.math import pid as gains
+
+if TYPE_CHECKING:
+    from rigidfleet.mission import Mission, Regulator
+
+_SOLVERS = {
+    "iterated": "iterated Tikhonov: the force stays bounded where distances are redundant",
+    "spectral": "spectral damping: the exact law unless distances are nearly redundant",
+    "exact": "the paper's inverse, which has no value where distances are redundant",
+    "pinv": "the pseudo-inverse, which lets go smoothly of what lies below its cut-off",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """One thing about the gains: what, its value, and what that means."""
+
+    what: str
+    value: str
+    meaning: str
+
+
+def explained(mission: Mission) -> list[Line]:
+    """The gains of a mission, one by one."""
+    return [*_constraint(mission), *_tracking(mission), *_regulators(mission)]
+
+
+def response(mission: Mission, t: list[float]) -> list[float] | None:
+    """Error c(t)/c(0) of a distance that starts at rest; None without stabilisation."""
+    c = mission.constraint
+    if c.stabilisation == "none":
+        return None
+    return gains.error_response(c.alpha, c.beta, c.gamma, 1.0, 0.0, 0.0, t)[0].tolist()
+
+
+def settling(mission: Mission) -> float | None:
+    """Time [s] in which an error of a distance falls to 2 %; None where it never does."""
+    c = mission.constraint
+    if c.stabilisation == "none":
+        return None
+    try:
+        return gains.settling_time(c.alpha, c.beta, c.gamma)
+    except ValueError:
+        return None
+
+
+def _constraint(mission: Mission) -> list[Line]:
+    c = mission.constraint
+    found = []
+    if c.stabilisation == "none":
+        found.append(Line("constraint force", "no feedback", "errors of distances stay and grow"))
+    else:
+        gain = f"α = {c.alpha:.4g} /s, β = {c.beta:.4g} /s, γ = {c.gamma:.4g} /s³"
+        poles = ", ".join(_pole(s) for s in gains.poles(c.alpha, c.beta, c.gamma))
+        found += [
+            Line("constraint feedback", gain, "an error c of a distance obeys c‴ + 2α c″ + β² c′ + γ c = 0"),
+            Line("its poles", f"{poles} /s", "all on the left: every error dies out"),
+        ]  # fmt: skip
+        if c.gamma > 0:
+            margin = 2 * c.alpha * c.beta**2 / c.gamma
+            meaning = f"γ may grow to {margin:.3g} times its value before an error grows (2αβ² > γ)"
+            found.append(Line("stability margin", f"{margin:.3g}", meaning))
+        settled = settling(mission)
+        if settled is not None:
+            beyond = 100 * gains.overshoot(c.alpha, c.beta, c.gamma)
+            why = "its integral has to return to zero" if c.gamma > 0 else "there is no integral"
+            found += [
+                Line("settling", f"{settled:.3g} s", "until an error is below 2 % for good"),
+                Line("overshoot", f"{beyond:.3g} %", f"how far an error passes zero: {why}"),
+            ]
+    setting = {
+        "iterated": f"μ = {_damping(mission)}, {c.iterations} iterations",
+        "spectral": f"s₀ = {c.threshold:g}",
+        "exact": "",
+        "pinv": f"cut-off {c.cutoff:g} of the largest w",
+    }[c.solver]
+    value = f"{c.solver} ({setting})" if setting else c.solver
+    found.append(Line("solver", value, _SOLVERS[c.solver]))
+    if any(phase.control != "slots" for phase in mission.phases):
+        rate = f"{c.deformation_damping:g} /s"
+        meaning = "what distances do not see dies out at this rate while no slots are tracked"
+        found.append(Line("deformation damping", rate, meaning))
+    return found
+
+
+def _damping(mission: Mission) -> str:
+    """Damping of the iterated solve: of all formations, if it follows them."""
+    every = [mission.damping(name) for name in mission.formations] or [mission.damping(None)]
+    low, high = f"{min(every):.2g}", f"{max(every):.2g}"
+    return low if low == high else f"{low} to {high}"
+
+
+def _tracking(mission: Mission) -> list[Line]:
+    if not any(phase.control == "slots" for phase in mission.phases):
+        return []
+    t = mission.tracking
+    k1, k2 = lqr.double_integrator_gains(t.Q, t.R)
+    meaning = f"each vehicle follows its slot: {_second_order(k1, k2)}"
+    return [Line("tracking", f"k₁ = {k1:.3g} /s², k₂ = {k2:.3g} /s", meaning)]
+
+
+def _regulators(mission: Mission) -> list[Line]:
+    if not any(phase.kind in ("fly", "turn") for phase in mission.phases):
+        return []
+    pairs = (("centre of mass", mission.lqr), ("attitude", mission.lqr.attitude))
+    return [_regulator(name, regulator) for name, regulator in pairs]
+
+
+def _regulator(name: str, regulator: Regulator) -> Line:
+    if regulator.horizon == "infinite":
+        k1, k2 = lqr.double_integrator_gains(regulator.Q, regulator.R)
+        value = f"k₁ = {k1:.3g} /s², k₂ = {k2:.3g} /s"
+        return Line(f"{name}, infinite horizon", value, _second_order(k1, k2))
+    q, r, s = (_weights(w) for w in (regulator.Q, (regulator.R,), regulator.S))
+    meaning = "gains rise towards the arrival, where S weighs position and velocity"
+    if not any(regulator.Q):
+        meaning = "the least acceleration that arrives, as S weighs it, in position and velocity"
+    return Line(f"{name}, finite horizon", f"Q = {q}, R = {r}, S = {s}", meaning)
+
+
+def _second_order(k1: float, k2: float) -> str:
+    """What x'' = -k1 x - k2 x' does."""
+    omega = math.sqrt(k1)
+    zeta = k2 / (2 * omega)
+    slowest = omega * (zeta - math.sqrt(zeta**2 - 1)) if zeta > 1 else omega * zeta
+    return (
+        f"an error swings at {omega:.3g} rad/s with damping ratio {zeta:.2f}, "
+        f"and falls to 2 % in about {4 / slowest:.2g} s"
+    )
+
+
+def _pole(s: complex) -> str:
+    if abs(s.imag) < 1e-9 * abs(s):
+        return f"{s.real:.3g}"
+    return f"{s.real:.3g} {'+' if s.imag > 0 else '−'} {abs(s.imag):.3g}i"
+
+
+def _weights(values: tuple[float, ...]) -> str:
+    text = ", ".join(f"{v:g}" for v in values)
+    return text if len(values) == 1 else f"diag({text})"

@@ -1,0 +1,146 @@
+"""Figures of several flights over each other, a colour for each flight; and the answer of the gains."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rigidfleet.plotting import style as st
+from rigidfleet.reporting import gains
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from rigidfleet.mission import Mission
+    from rigidfleet.result import Result
+
+Floats = st.Floats
+
+_WIDTHS = (2.6, 0.9)  # of lines, first flight to last: each shows under the next
+
+
+def paths(flights: Sequence[Result], labels: Sequence[str]) -> bytes:
+    """Way of the centre of mass from above, and its height over time; an SVG."""
+    from matplotlib.figure import Figure
+
+    with st.settings():
+        fig = Figure(figsize=(st.WIDTH, 3.6), layout="constrained")
+        above, height = fig.subplots(1, 2)
+        for flight, look in zip(flights, _looks(flights), strict=True):
+            above.plot(flight.cm[:, 0], flight.cm[:, 1], **look)
+            st.line(height, flight.time, flight.cm[:, 2], **look)
+        above.set(xlabel="x, east [m]", ylabel="y, north [m]", title="centre of mass from above")
+        above.set_aspect("equal", adjustable="datalim")
+        above.margins(0.05)
+        height.set(xlabel="time [s]", ylabel="z [m]", title="its height")
+        _key(fig, flights, labels)
+        return _svg(fig)
+
+
+def over_time(flights: Sequence[Result], labels: Sequence[str]) -> bytes:
+    """Closeness, thrust, speed and errors over time; an SVG."""
+    from matplotlib.figure import Figure
+
+    panels: list[tuple[str, Callable[[Result], Floats], bool]] = [
+        ("least room between vehicles [m]", lambda r: _finite(r.separation), False),
+        ("greatest thrust [N]", lambda r: _greatest(r.thrust), False),
+        ("greatest speed [m/s]", lambda r: _greatest(np.linalg.norm(r.velocity, axis=2)), False),
+        ("greatest miss of a slot [m]", slot_error, True),
+        ("greatest constraint error [m]", lambda r: _greatest(np.abs(r.constraint)), True),
+    ]
+    if any(flight.mission.obstacles for flight in flights):
+        panels.insert(1, ("least clearance [m]", lambda r: _finite(r.clearance), False))
+    with st.settings():
+        rows = (len(panels) + 1) // 2
+        fig = Figure(figsize=(st.WIDTH, 0.6 + 1.9 * rows), layout="constrained")
+        axes = fig.subplots(rows, 2, sharex=True, squeeze=False).ravel()
+        for ax, (name, values, logarithmic) in zip(axes, panels, strict=False):
+            known = [
+                _panel(ax, flight, values(flight), look)
+                for flight, look in zip(flights, _looks(flights), strict=True)
+            ]
+            ax.set_title(name)
+            if not any(known):
+                st.note(ax, "nothing to show")
+            elif logarithmic:
+                ax.set_yscale("log", nonpositive="clip")
+                ax.set_ylim(bottom=max(ax.get_ylim()[0], 1e-12))
+            elif ax.get_ylim()[0] > 0:
+                ax.set_ylim(bottom=0)
+        for ax in axes[len(panels) :]:
+            ax.set_visible(False)
+        for ax in axes[len(panels) - 2 : len(panels)]:
+            ax.set_xlabel("time [s]")
+            ax.tick_params(labelbottom=True)
+        _key(fig, flights, labels)
+        return _svg(fig)
+
+
+def response(missions: Sequence[Mission], labels: Sequence[str]) -> bytes | None:
+    """What an error of a distance does that starts at rest, under each mission's gains; an SVG."""
+    from matplotlib.figure import Figure
+
+    times = [s for m in missions if (s := gains.settling(m)) is not None]
+    if not times:
+        return None
+    t = np.linspace(0.0, 1.6 * max(times), 400)
+    with st.settings():
+        fig = Figure(figsize=(st.WIDTH, 2.2), layout="constrained")
+        ax = fig.subplots()
+        ax.axhspan(-0.02, 0.02, color=st.BAND, linewidth=0)
+        for mission, look in zip(missions, _looks(missions), strict=True):
+            error = gains.response(mission, t.tolist())
+            if error is not None:
+                ax.plot(t, error, **look)
+        ax.axhline(0.0, color=st.GREY, linewidth=0.6)
+        ax.set(xlabel="time [s]", ylabel="error c(t) / c(0)", xlim=(0, t[-1]))
+        if len(missions) > 1:
+            _key(fig, missions, labels)
+        return _svg(fig)
+
+
+def slot_error(result: Result) -> Floats:
+    """Greatest distance (K,) [m] of an agent from its slot; NaN where there is none."""
+    return _greatest(np.linalg.norm(result.position - result.slot_position, axis=2))
+
+
+def _panel(ax: Axes, flight: Result, values: Floats, look: dict[str, Any]) -> bool:
+    """Draw one flight's line; whether there was anything to draw."""
+    st.line(ax, flight.time, values, **look)
+    return bool(np.isfinite(values).any())
+
+
+def _finite(values: Floats) -> Floats:
+    return np.where(np.isfinite(values), values, np.nan)
+
+
+def _greatest(values: Floats) -> Floats:
+    """Greatest of values (K, n) at each sample; NaN where there are none."""
+    return np.fmax.reduce(_finite(values), axis=1, initial=np.nan)
+
+
+def _looks(flights: Sequence[object]) -> list[dict[str, Any]]:
+    """Colour and width of each flight's lines."""
+    widths = np.linspace(*_WIDTHS, len(flights)) if len(flights) > 1 else [1.6]
+    colours = st.agent_colours(len(flights))
+    return [{"color": c, "linewidth": float(w)} for c, w in zip(colours, widths, strict=True)]
+
+
+def _key(fig: Figure, flights: Sequence[object], labels: Sequence[str]) -> None:
+    from matplotlib.lines import Line2D
+
+    handles = [
+        Line2D([], [], label=st.clean(label), **look)
+        for label, look in zip(labels, _looks(flights), strict=True)
+    ]
+    fig.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), 4))
+
+
+def _svg(fig: Figure) -> bytes:
+    buffer = io.BytesIO()
+    fig.savefig(buffer, format="svg", metadata={"Date": None})
+    return buffer.getvalue()

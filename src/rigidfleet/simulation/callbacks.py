@@ -1,0 +1,93 @@
+"""Functions of a user's own: asked for forces, checked, and called from the kernel."""
+
+from __future__ import annotations
+
+import ctypes
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rigidfleet.errors import FlightError
+
+if TYPE_CHECKING:
+    from rigidfleet.kernel.problem import Array
+
+Force = Callable[[float, "Array", "Array"], ArrayLike]
+
+
+def asked(
+    who: str, t: float, n: int, function: Callable[..., ArrayLike], *arguments: object
+) -> Array:
+    """Forces (N, 3) [N] that a user's function gives, or an error that says what came instead."""
+    try:
+        f = function(*arguments)
+    except Exception as error:
+        words = f"{who} raised {type(error).__name__} at t = {t:.3f} s: {error}"
+        raise FlightError(words) from error
+    return _checked(f, n, who, t)
+
+
+def _checked(f: ArrayLike, n: int, who: str, t: float) -> Array:
+    """Forces (N, 3) [N] from a user's function, or an error that says what came instead."""
+    if np.iscomplexobj(f):
+        raise FlightError(
+            f"{who} returned complex numbers at t = {t:.3f} s; return an array ({n}, 3) of forces [N]"
+        )
+    try:
+        force = np.array(f, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise FlightError(
+            f"{who} returned {f!r} at t = {t:.3f} s; return an array ({n}, 3) of forces [N]"
+        ) from None
+    if force.shape != (n, 3):
+        raise FlightError(
+            f"{who} returned an array of shape {force.shape} at t = {t:.3f} s; return ({n}, 3), a row for"
+            " each agent [N]"
+        )
+    if not np.isfinite(force).all():
+        raise FlightError(f"{who} returned a force that is not finite at t = {t:.3f} s")
+    return np.ascontiguousarray(force)
+
+
+class ExternalForce:
+    """A user's force as a C function that the kernel can call.
+
+    An exception cannot pass through compiled code: it is kept, the force becomes NaN, the step is
+    rejected, and `check` raises it once the kernel has returned.
+    """
+
+    _SIGNATURE = ctypes.CFUNCTYPE(
+        None, ctypes.c_double, *(ctypes.POINTER(ctypes.c_double),) * 3, ctypes.c_ssize_t
+    )
+
+    def __init__(self, force: Force, n: int) -> None:
+        self.error: BaseException | None = None
+        self._keep: Any = force  # whatever owns the code must live as long as its address
+        address = getattr(force, "address", None)
+        if address is not None:  # a Numba cfunc
+            self.address = int(address)
+            return
+
+        def call(t: float, r: Any, v: Any, f: Any, count: int) -> None:
+            arrays = [np.ctypeslib.as_array(a, (count, 3)) for a in (r, v, f)]
+            try:
+                if self.error is None:
+                    arrays[2][:] = asked(
+                        "the force", t, n, force, t, arrays[0].copy(), arrays[1].copy()
+                    )
+                    return
+            except BaseException as error:
+                self.error = error
+            arrays[2][:] = math.nan
+
+        self._keep = self._SIGNATURE(call)
+        self.address = int(ctypes.cast(self._keep, ctypes.c_void_p).value or 0)
+
+    def check(self) -> None:
+        """Raise what the user's function raised, and listen to it again."""
+        error, self.error = self.error, None
+        if error is not None:
+            raise error

@@ -1,0 +1,134 @@
+"""Why a flight cannot go on: when, where, and what to try."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from rigidfleet.kernel.engine import native
+from rigidfleet.mission import Establish, Reshape
+from rigidfleet.planning import solvers
+
+if TYPE_CHECKING:
+    from rigidfleet.kernel.problem import Array
+    from rigidfleet.mission import Mission
+    from rigidfleet.simulation.flight import Leg
+
+#: What to do about errors that nothing takes back.
+_FEEDBACK = '; without feedback errors grow: stabilisation = "pid" takes them back'
+
+
+def diagnose(mission: Mission, leg: Leg, *, own_force: bool, collapsed: bool) -> str:
+    """Say when, where and why the integrator could not go on, and what to try.
+
+    ``own_force``: whether a function of the user's acts on the agents; ``collapsed``: whether the step size has
+    fallen to nothing, in place of too many steps.
+    """
+
+    def remedy() -> str:
+        return _remedy(mission, leg, own_force=own_force, collapsed=collapsed)
+
+    count, h = leg.state.count, float(leg.state.clock[1])
+    if collapsed:
+        what = f"the step size has fallen to {h:.1g} s"
+    else:
+        what = f"{count[1] + count[2]} steps have been taken in it, the last of {h:.1g} s"
+    head = f"the flight cannot go on at t = {leg.t:.3f} s, in phase '{leg.phase.name}': {what}"
+    if not len(leg.plan.edges):
+        return f"{head}. {remedy()}"
+    if leg.solver is not None:
+        lost, failed = leg.solver.counts.fallbacks, leg.solver.counts.failures
+        return (
+            f"{head}; solved by {solvers.WORDS[leg.plan.method]}, which lost a pivot {lost} times and found no"
+            f" solution {failed} times. {remedy()}"
+        )
+    J, closest, length = _jacobian(leg, mission.n_agents)
+    edge = "-".join(str(int(a) + 1) for a in leg.plan.edges[closest])
+    if not np.isfinite(J).all():
+        return (
+            f"{head}, because agents {edge.replace('-', ' and ')} are at one place: along the edge"
+            f" {edge} between them, {length:.2g} m long, no force has a direction, and none of the"
+            " singular values of the constraint Jacobian J is defined. Let their paths not cross:"
+            " exchange their slots, or start them elsewhere"
+        )
+    values = np.linalg.svd(J, compute_uv=False)
+    where = (
+        f"singular value {len(values)} of {len(values)} of the constraint Jacobian J is"
+        f" {values[-1]:.2g} (the largest is {values[0]:.2g}; the shortest edge {edge} is"
+        f" {length:.3g} m)"
+    )
+    solver = mission.constraint.solver
+    if solver in ("exact", "pinv"):
+        bound = "no bound" if solver == "exact" else "no bound but that of its cut-off"
+        return (
+            f'{head}, and {where}. The force of solver "{solver}" has {bound} where one of them'
+            f' vanishes. Use solver = "iterated" (or "spectral"){_smoother(mission, leg)}'
+        )
+    return f"{head}, and {where}. {remedy()}"
+
+
+def _smoother(mission: Mission, leg: Leg) -> str:
+    """What else helps a law without bound: a smooth reference, feedback; "" where both are there."""
+    words = ""
+    if isinstance(leg.phase, Establish | Reshape) and leg.phase.reference == "step":
+        slots = mission.formation_slots(leg.phase.formation)
+        smooth = "distances" if slots is None else "shape"
+        words += f', with a reference that moves smoothly: reference = "{smooth}"'
+    if mission.constraint.stabilisation == "none":
+        words += _FEEDBACK
+    return words
+
+
+def _remedy(mission: Mission, leg: Leg, *, own_force: bool, collapsed: bool) -> str:
+    """What to try where J is not to blame."""
+    beyond = leg.t + 1e-9 * max(1.0, leg.t)  # what happens at leg.t shows a moment later
+    native.closed_loop(
+        beyond, leg.state.y, np.empty_like(leg.state.y), leg.plan.program, leg.workspace
+    )
+    w = leg.workspace
+    names = {"input force": w.f_u, "constraint force": w.f_C, "external force": w.f_E}
+    lost = [name for name, f in names.items() if not np.isfinite(f).all()]
+    if "external force" in lost and own_force:
+        bad = np.flatnonzero(~np.isfinite(w.f_E).all(axis=1))
+        return f"The force of your own is not finite on agent {bad[0] + 1}: mend that function"
+    if lost:
+        return f"The {lost[0]} is not finite. Look for a gain, a distance or a mass far too large"
+    if mission.constraint.stabilisation == "none" and np.abs(w.c).max(initial=0.0) > 1e-3:
+        k = int(np.abs(w.c).argmax())
+        i, j = leg.plan.edges[k] + 1
+        return f"The distance {i}-{j} is {w.c[k]:+.3g} m off{_FEEDBACK}"
+    name, f = max(names.items(), key=lambda item: float(np.abs(item[1]).max()))
+    agent = int(np.abs(f).max(axis=1).argmax())
+    size = math.hypot(*f[agent])  # no square of it overflows
+    if collapsed:
+        return (
+            f"The greatest force is the {name} on agent {agent + 1}, {size:.3g} N. Look for what"
+            " makes it jump: a force of your own, or a mass, gain or distance far too large or"
+            " small; and for tolerances near 1e-15"
+        )
+    return (
+        f"The greatest force is the {name} on agent {agent + 1}, {size:.3g} N. Steps as short as"
+        " this come from gains (constraint, tracking, lqr) far above 1e3 /s, from a damping far"
+        " below 1e-6, or from tolerances that are too tight (integrator.rtol, atol): relax them;"
+        " or the phase is too long"
+    )
+
+
+def _jacobian(leg: Leg, n: int) -> tuple[Array, int, float]:
+    """J (m, 3N) where the integrator is, its shortest edge and that edge's length [m]."""
+    edges = leg.plan.edges
+    native.closed_loop(
+        leg.t, leg.state.y, np.empty_like(leg.state.y), leg.plan.program, leg.workspace
+    )
+    r = leg.workspace.r
+    u = r[edges[:, 0]] - r[edges[:, 1]]
+    lengths = np.linalg.norm(u, axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u /= lengths[:, None]
+    J = np.zeros((len(edges), n, 3))
+    rows = np.arange(len(edges))
+    J[rows, edges[:, 0]], J[rows, edges[:, 1]] = u, -u
+    closest = int(lengths.argmin())
+    return J.reshape(len(edges), -1), closest, float(lengths[closest])

@@ -1,0 +1,216 @@
+"""Establish a formation from many starts at once: a hundred thousand flights in some seconds.
+
+For a gain study or a Monte Carlo study of the constraint law itself. What varies here are the starts alone, what
+comes out is where the agents are when phases end; `rigidfleet.sweep` flies so, too, if only ends are to be judged,
+and else varies anything in any mission and judges whole flights.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rigidfleet.kernel.compiler.simd import WIDTH
+from rigidfleet.kernel.engine import batch as ensemble
+from rigidfleet.mission import Establish, Mission, Phase, Reshape
+from rigidfleet.planning.plan import plan_phase
+from rigidfleet.planning.reference import Situation
+from rigidfleet.planning.solvers import choose
+from rigidfleet.planning.tolerances import absolute_tolerances, most_steps, tolerance_of_velocity
+
+if TYPE_CHECKING:
+    from rigidfleet.kernel.problem import Array
+
+
+@dataclass(frozen=True)
+class Ensemble:
+    """Where B flights have ended.
+
+    Attributes
+    ----------
+    position, velocity : (B, N, 3) at the end, world axes [m, m/s]
+    error : (B,) the largest error of a distance that the last formation asks for [m]
+    finished : (B,) whether a flight has reached the end; the rest holds its last good state
+    evaluations : (B,) of the right-hand side
+    ends : position (B, N, 3) at the end of each phase [m]; of a flight that is not finished, its last good one
+    vectors : whether eight flights shared a vector
+    """
+
+    position: Array
+    velocity: Array
+    error: Array
+    finished: NDArray[np.bool_]
+    evaluations: NDArray[np.int64]
+    ends: tuple[Array, ...]
+    vectors: bool
+
+
+def establish(
+    mission: Mission,
+    position: ArrayLike,
+    velocity: ArrayLike | None = None,
+    *,
+    vectors: bool | None = None,
+    threads: int | None = None,
+) -> Ensemble:
+    """Fly a mission of open-loop phases from many starts.
+
+    Parameters
+    ----------
+    mission : all of its phases are flown under squares or steps (``reference``; "distances" where that is squares
+        from anywhere, without slots or with three agents), with ``control = "open"``, and end at a time, like those
+        of Table 1; tolerances, gains and masses are the mission's. A damping of "auto" is 0.03 throughout, as
+        flights of one phase are not all in their formation, or none
+    position, velocity : (B, N, 3) at the start, world axes [m, m/s]; at rest without velocities
+    vectors : whether eight flights share a vector of the machine, and their steps, through code made for the
+        mission's graph: seven times as fast, and compiled in seconds. By default in each phase that
+        `rigidfleet.kernel.engine.batch.fits`; True asks for it in all of them.
+    threads : by default one for each core. Results do not depend on it, bit for bit.
+
+    Raises
+    ------
+    ValueError
+        The mission has other phases, axes or assignments, or disturbances, or too many edges for the dense solve; or
+        the shapes of the starts do not fit it.
+    """
+    r = _starts("position", position, mission.n_agents)
+    v = np.zeros_like(r) if velocity is None else _starts("velocity", velocity, mission.n_agents)
+    if v.shape != r.shape:
+        raise ValueError(f"velocity {v.shape} and position {r.shape} must have one shape")
+    if (why := unfit(mission)) is not None:
+        raise ValueError(f"{why}; vary such missions by `rigidfleet.sweep`")
+    flights = _Flights(mission, r, v)
+    ends = []
+    for phase in mission.phases:
+        if flights.finished.any():
+            flights.fly(phase, vectors, threads or os.cpu_count() or 1)
+        ends.append(flights.r)
+    return Ensemble(
+        flights.r,
+        flights.v,
+        flights.error,
+        flights.finished,
+        flights.evaluations,
+        tuple(ends),
+        flights.vectors,
+    )
+
+
+def unfit(mission: Mission) -> str | None:
+    """Why a mission cannot be flown by `establish`; None if it can."""
+    for index, phase in enumerate(mission.phases):
+        if phase.control != "open" or phase.settle or not _alike(mission, phase):
+            return (
+                f"phase {index + 1} '{phase.name}' is not flown open-loop under squares or steps to a given time, which"
+                " is all that an ensemble flies"
+            )
+        if isinstance(phase, Establish | Reshape):
+            edges = mission.formation_edges(phase.formation)
+            if choose(mission.n_agents, edges, mission.constraint.solver) != "dense":
+                return (
+                    f"an ensemble solves densely, and '{phase.formation}' has too many edges for that"
+                    f" ({len(edges)})"
+                )
+    if mission.formulation != "inertial":
+        return f'an ensemble flies in world axes, and the mission in formulation = "{mission.formulation}"'
+    if mission.assignment != "given":
+        return f'in an ensemble agents take the slots as given, and the mission has assignment = "{mission.assignment}"'
+    if mission.disturbances is not None:
+        return "an ensemble flies in calm air, and the mission has [disturbances]"
+    return None
+
+
+class _Flights:
+    """Where all flights are, and what their phases hand on."""
+
+    def __init__(self, mission: Mission, r: Array, v: Array) -> None:
+        self.mission, self.r, self.v = mission, r, v
+        count = len(r)
+        # One plan for all: without slots, only the distances it starts from are a flight's own.
+        self.now = Situation(0.0, r[0], v[0])
+        self.integral: dict[tuple[int, int], Array] = {}
+        self.finished = np.ones(count, dtype=bool)
+        self.evaluations = np.zeros(count, dtype=np.int64)
+        self.error = np.zeros(count)
+        self.vectors = True
+
+    def fly(self, phase: Phase, vectors: bool | None, threads: int) -> None:
+        """Fly one phase, and keep its ends."""
+        now, (count, n) = self.now, self.r.shape[:2]
+        t_end = now.t + (phase.duration or 0.0) if phase.until is None else phase.until
+        plan = plan_phase(self.mission, phase, now, t_end)
+        law = plan.program.law._replace(mu=self.mission.damping(None))
+        program = plan.program._replace(law=law)
+        edges = [(int(i), int(j)) for i, j in plan.edges]
+        before = now.reference.of(plan.edges, _lengths(self.r, plan.edges))
+        sums = [self.integral.get(edge, np.zeros(count)) for edge in edges]
+        y = np.column_stack([self.r.reshape(count, -1), self.v.reshape(count, -1), *sums])
+        places, given = _places(self.finished), self.mission.integrator
+        velocity = tolerance_of_velocity(given, now.r, program.vehicles.m, law.beta, large=False)
+        shared = ensemble.fits(program) if vectors is None else vectors
+        ends = ensemble.fly_all(
+            program,
+            y[places],
+            before[places],
+            (now.t, t_end),
+            rtol=given.rtol,
+            atol=absolute_tolerances(given, y.shape[1], velocity, plan.distances, large=False),
+            max_steps=most_steps(t_end - now.t),
+            vectors=shared,
+            threads=threads,
+        )
+        self.vectors &= shared
+        y[self.finished] = ends.y[self.finished]
+        self.evaluations[self.finished] += ends.evaluations[self.finished]
+        self.finished &= ends.finished
+        self.r, self.v = (x.reshape(count, n, 3) for x in np.split(y[:, : 6 * n], 2, axis=1))
+        self.integral |= dict(zip(edges, y[:, 6 * n :].T, strict=True))
+        known = now.reference.updated(plan.edges, plan.distances)
+        self.now = replace(
+            now, t=t_end, reference=known, formation=plan.formation, slots=plan.slots
+        )
+        self.error = off(self.r, plan.edges, plan.distances)
+
+
+def _alike(mission: Mission, phase: Phase) -> bool:
+    """Whether a phase is led by squares or steps from anywhere, so that one plan serves all flights."""
+    if not isinstance(phase, Establish | Reshape):
+        return True
+    bare = mission.n_agents <= 3 or not mission.formations[phase.formation].knows_slots
+    return phase.reference in ("squares", "step") or (phase.reference == "distances" and bare)
+
+
+def _starts(name: str, values: ArrayLike, agents: int) -> Array:
+    starts = np.array(values, dtype=float)
+    if starts.ndim != 3 or starts.shape[1:] != (agents, 3) or not len(starts):
+        raise ValueError(f"{name} must be (B, {agents}, 3) for {agents} agents, not {starts.shape}")
+    if not np.isfinite(starts).all():
+        raise ValueError(
+            f"{name} of flight {np.argwhere(~np.isfinite(starts))[0][0]} is not finite"
+        )
+    return starts
+
+
+def _places(finished: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Which flight takes each place: whoever is out lends it to a neighbour, so that the others keep theirs."""
+    places = np.arange(len(finished))
+    for k in np.flatnonzero(~finished):
+        first = k - k % WIDTH
+        near = np.flatnonzero(finished[first : first + WIDTH])
+        places[k] = first + near[0] if len(near) else np.flatnonzero(finished)[0]
+    return places
+
+
+def off(r: Array, edges: NDArray[np.integer], asked: Array) -> Array:
+    """Greatest error (B,) [m] of edges (m, 2) that are to be ``asked`` (m,) long, at positions (B, N, 3)."""
+    return np.abs(_lengths(r, edges) - asked).max(axis=1, initial=0.0)
+
+
+def _lengths(r: Array, edges: NDArray[np.integer]) -> Array:
+    """Lengths (B, m) of edges [m]."""
+    way = r[:, edges[:, 0]] - r[:, edges[:, 1]]
+    return np.sqrt(np.einsum("bka,bka->bk", way, way))

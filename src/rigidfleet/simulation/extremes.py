@@ -1,0 +1,269 @@
+"""The extremes of a flight in continuous time: the kernel's monitor, from phase to phase.
+
+`rigidfleet.kernel.monitor` says how they are found. Here is what it watches: all pairs of a small fleet; of a large
+one those near each other, listed anew before any other pair can have come as near.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigidfleet.kernel import records
+from rigidfleet.kernel.engine import native
+from rigidfleet.kernel.problem import Array, Program, Workspace
+from rigidfleet.math import attitude as att
+from rigidfleet.math import proximity as geometry
+from rigidfleet.mission import Box, Ground, Mission
+from rigidfleet.result import PAD, Extremum, PhaseRecord
+
+Ints = NDArray[np.int64]
+
+#: Agents up to which all pairs are watched.
+_FEW = 40
+#: Pairs are listed so far beyond those that matter, in parts of the agents' spacing.
+_SPARE = 0.5
+#: And at least so far, in parts of the fleet's size over the root of its number: some may be at one place.
+_LEAST = 0.1
+#: Pieces of a step are no shorter than this part of it.
+_SHORTEST = 2.0**-20
+#: What the monitor keeps with the other sign.
+_GREATEST = frozenset(
+    ("geofence", "highest", "speed", "thrust", "thrust_margin", "acceleration", "constraint_force", "tension",
+     "constraint")
+)  # fmt: skip
+#: Quantities by name; the two clearances apart belong to the whole flight.
+_NAMES = {
+    "separation": records.SEPARATION,
+    "lost": records.LOST,
+    "separation_below": records.SEPARATION_BELOW,
+    "clearance": records.CLEARANCE,
+    "geofence": records.GEOFENCE,
+    "lowest": records.LOWEST,
+    "highest": records.HIGHEST,
+    "speed": records.SPEED,
+    "thrust": records.THRUST,
+    "thrust_margin": records.THRUST_MARGIN,
+    "acceleration": records.ACCELERATION,
+    "constraint_force": records.CONSTRAINT_FORCE,
+    "tension": records.TENSION,
+    "constraint": records.CONSTRAINT,
+}
+_OF_FLIGHT = {"clearance_start": records.STANDING, "clearance_flight": records.FLYING}
+
+
+class Extremes:
+    """Watches a flight, and tells what the worst of each phase was."""
+
+    def __init__(self, mission: Mission) -> None:
+        agents, limits = mission.agents, mission.limits
+        self.n = mission.n_agents
+        self.radius = np.array(agents.radius, dtype=float)
+        self.boxes = np.array([_corners(thing) for thing in mission.obstacles]).reshape(-1, 6)
+        fence = limits.geofence
+        self.fence = np.array([] if fence is None else [*fence.min, *fence.max]).reshape(-1, 6)
+        self.stacks = self.n <= _FEW or limits.separation_below is not None
+        count = records.CONSTRAINT + 1
+        self.worst, self.when = np.full(count, np.inf), np.zeros(count)
+        self.who, self.sign = np.full((count, 2), -1), np.zeros(1)
+        self.left = np.ones(self.n, dtype=np.bool_)
+        self.low = np.full((self.n, 3), np.inf)
+        start, _ = geometry.rooms(np.array(agents.position), self.radius, mission.obstacles)
+        self.standing = (start <= PAD).astype(np.int64)
+        self.pairs = self.columns = self.struck = np.zeros((0, 2), dtype=np.int64)
+        self.spare, self.moved = 0.0, np.zeros(2)
+        self.trail = records.NO_TRAIL
+        self._list_all()
+
+    def begin(self, states: int, edges: int) -> records.Trail:
+        """Begin to watch an integrator of so many states, which is to leave its steps in this trail."""
+        if self.trail.points.shape[2] == states and len(self.trail.start) == 3 * self.n + 2 * edges:
+            return self.trail
+        self.trail = trail = records.trail(states, self.n, edges)
+        found = records.monitor(
+            self.radius, self.boxes, self.fence, states, len(trail.start),
+            worst=self.worst, when=self.when, who=self.who, sign=self.sign, left=self.left,
+            standing=self.standing, low=self.low, pad=PAD, pairs=self.pairs, columns=self.columns,
+            struck=self.struck,
+        )  # fmt: skip
+        self.monitor = native.Watch(found)
+        return trail
+
+    def lose(self, lost: NDArray[np.bool_]) -> None:
+        """Go on without the vehicles ``lost`` (N,), which the others must not be hit by."""
+        for i in np.flatnonzero(lost & self.left & (self.low[:, 0] < np.inf)):
+            # Near an obstacle when it was lost, and not landing any more.
+            value, t, b = self.low[i]
+            if value < self.worst[records.FLYING]:
+                self.worst[records.FLYING], self.when[records.FLYING] = value, t
+                self.who[records.FLYING] = i, int(b)
+            self.low[i, 0] = np.inf
+        self.left[:] = ~lost
+        gone, left = np.flatnonzero(lost), np.flatnonzero(~lost)
+        struck = np.stack(np.meshgrid(gone, left, indexing="ij"), axis=-1).reshape(-1, 2)
+        self.struck = np.ascontiguousarray(struck)
+        self._list_all()
+        self.trail = records.NO_TRAIL  # others are watched from now on
+
+    def take(
+        self, program: Program, work: Workspace, state: records.Integrator, *, last: bool
+    ) -> None:
+        """Take the steps in the trail into account; the ``last`` ones of a stretch are not followed by others."""
+        flags, rows = self.monitor.monitor.flags, int(state.count[4])
+        flags[:3] = flags[3], rows, 2 if last else 1
+        if self.n > _FEW:
+            for row in range(int(flags[3]), rows):
+                self._step(program, work, state, row)
+            flags = self.monitor.monitor.flags
+            flags[:3] = rows, rows, 2 if last else 1
+        self.monitor(program, work, state)
+
+    def so_far(self) -> dict[str, Extremum]:
+        """Extremes of the phase under way, by name."""
+        every = ((name, self._extremum(name, k)) for name, k in _NAMES.items())
+        return {name: x for name, x in every if x is not None}
+
+    def phase(self) -> dict[str, Extremum]:
+        """Extremes of the phase that ends, by name; the next one begins."""
+        found = self.so_far()
+        self.worst[list(_NAMES.values())] = np.inf
+        self.moved[:] = np.inf  # pairs were listed for a worst that counts no more
+        return found
+
+    def flight(self, phases: Sequence[PhaseRecord]) -> None:
+        """Tell the phases of a flight that has ended its clearance in flight, and of who stands on an obstacle."""
+        ends = np.where(self.left & (self.standing == 0), self.low[:, 0], np.inf)
+        i = int(ends.argmin())
+        found = {name: self._extremum(name, k) for name, k in _OF_FLIGHT.items()}
+        if ends[i] < np.inf:
+            t, b = self.low[i, 1:]
+            found["clearance_end"] = Extremum(float(ends[i]), float(t), i, int(b))
+        for name, x in found.items():
+            if x is not None:
+                last = [p for p in phases if p.t_start <= x.time] or phases
+                last[-1].extremes[name] = x
+
+    def _extremum(self, name: str, k: int) -> Extremum | None:
+        value = float(self.worst[k])
+        if not math.isfinite(value):
+            return None
+        if name in _GREATEST:
+            value = -value
+        if name == "tension":
+            value *= float(self.sign[0])
+        return Extremum(value, float(self.when[k]), *map(int, self.who[k]))
+
+    # -- large fleets ---------------------------------------------------------------------------------
+
+    def _list_all(self) -> None:
+        """List all pairs, if they are few; else none yet."""
+        self.moved[:] = np.inf
+        if self.n <= _FEW:
+            i, j = np.triu_indices(self.n, 1)
+            both = self.left[i] & self.left[j]
+            self.pairs = np.stack([i[both], j[both]], axis=1)
+            self.columns = self.pairs
+
+    def _step(self, program: Program, work: Workspace, state: records.Integrator, row: int) -> None:
+        """Watch the distances of one step, in pieces so short that the pairs listed are all that matter."""
+        (start, length), whole = state.trail.clock[row], state.trail.points[row]
+        gauge, none = state.trail.gauge[:0], state.trail.start
+        pieces: list[tuple[float, float, Array]] = [(start, length, whole)]
+        while pieces:
+            t, h, points = pieces.pop()
+            moved = self._moves(program, points)
+            if (self.moved + moved > self.spare).any():
+                self._list(program, points[0], 0.0)
+            if moved.max() > self.spare:
+                if h > _SHORTEST * length:
+                    halves = (
+                        records.FROM_KNOTS @ (records.bernstein((records.KNOTS + k) / 2.0) @ points)
+                        for k in (0, 1)
+                    )
+                    first, second = map(np.ascontiguousarray, halves)
+                    pieces += [(t + 0.5 * h, 0.5 * h, second), (t, 0.5 * h, first)]
+                    continue
+                self._list(program, points[0], float(moved.max()))
+            self.moved += moved
+            self.monitor.monitor.flags[:3] = 0, 1, 0
+            trail = records.Trail(np.array([[t, h]]), points[None], gauge, none)
+            self.monitor(program, work, state._replace(trail=trail))
+
+    def _list(self, program: Program, y: Array, moves: float) -> None:
+        """List the pairs that are near each other at a state (n,), or below one another.
+
+        The list is good until others may have come nearer by ``moves`` [m], at least.
+        """
+        from scipy.spatial import KDTree
+
+        who = np.flatnonzero(self.left)
+        x = y[: 3 * self.n].reshape(-1, 3)[who]
+        if len(who) < 2:
+            self.pairs = self.columns = np.zeros((0, 2), dtype=np.int64)
+            self._watch_listed(math.inf)
+            return
+        widest = 2.0 * float(self.radius[who].max())
+        tree = KDTree(x, balanced_tree=False, compact_nodes=False)
+        near, j = tree.query(x, k=2)
+        # Of two at one place either may be its own nearest.
+        other = np.where(j[:, 1] == np.arange(len(who)), j[:, 0], j[:, 1])
+        rooms = near[:, 1] - self.radius[who] - self.radius[who[other]]
+        size = float(np.linalg.norm(np.ptp(x, axis=0))) / math.sqrt(len(who))
+        spare = max(_SPARE * float(np.median(near[:, 1])), _LEAST * size, 1.01 * moves, 1e-6)
+        least = min(float(rooms.min()), float(self.worst[records.SEPARATION]))
+        pairs = who[tree.query_pairs(least + widest + spare, output_type="ndarray")]
+        self.pairs = np.ascontiguousarray(np.sort(pairs, axis=1))
+        if self.stacks:
+            if program.body_formulation:
+                q = y[6 * self.n + len(program.graph.edges) :][:4]
+                x = x @ att.dcm_from_quaternion(q / np.linalg.norm(q))
+            flat = KDTree(x[:, :2], balanced_tree=False, compact_nodes=False)
+            columns = who[flat.query_pairs(widest + spare, output_type="ndarray")]
+            self.columns = np.ascontiguousarray(np.sort(columns, axis=1))
+        self._watch_listed(spare)
+
+    def _watch_listed(self, spare: float) -> None:
+        """Watch the pairs listed, which are all that matter until others have come nearer by ``spare`` [m]."""
+        self.spare, self.moved[:] = spare, 0.0
+        before = self.monitor.monitor
+        self.monitor = native.Watch(
+            before._replace(pairs=self.pairs, columns=self.columns, flags=before.flags.copy())
+        )
+
+    def _moves(self, program: Program, points: Array) -> Array:
+        """By how much [m] over a step (5, n) any two agents' distance may change, and that as seen from above (2,).
+
+        With r_i' = any rigid motion + u_i, the rate of a distance is at most |u_i| + |u_j|, and |u_i| no more than
+        its greatest Bernstein coefficient. The rotation taken is the one that leaves least. Seen from above, all
+        that tilts counts besides.
+        """
+        x = points[:, : 3 * self.n].reshape(5, -1, 3)[:, self.left]
+        x = x - x.mean(axis=1, keepdims=True)
+        middle, way = 0.5 * (x[0] + x[4]), x[4] - x[0]
+        inertia = np.einsum("ia,ia->", middle, middle) * np.eye(3) - middle.T @ middle
+        spin = np.linalg.pinv(inertia, 1e-9, hermitian=True) @ np.cross(middle, way).sum(axis=0)
+        rise = 4.0 * np.diff(x, axis=0)
+        share = np.arange(5)[:, None, None] / 4.0
+        rate = np.zeros_like(x)
+        rate[1:] += share[1:] * rise
+        rate[:-1] += (1.0 - share[:-1]) * rise
+        rate -= np.cross(spin, x)
+        moved = 2.0 * math.sqrt(float(np.einsum("kia,kia->ki", rate, rate).max()))
+        tilt = math.hypot(spin[0], spin[1])
+        if program.body_formulation:
+            q = points[:, 6 * self.n + len(program.graph.edges) :][:, :4]
+            rates = 4.0 * np.linalg.norm(np.diff(q, axis=0), axis=1).max()
+            size = max(float(np.linalg.norm(q, axis=1).min()) - 0.1, 0.1)
+            tilt = 2.0 * float(rates) / size + float(np.linalg.norm(spin))
+        widest = 2.0 * math.sqrt(float(np.einsum("kia,kia->ki", x, x).max()))
+        return np.array([moved, moved + tilt * widest if self.stacks else 0.0])
+
+
+def _corners(thing: Box | Ground) -> list[float]:
+    """Corners of an obstacle (6,); the ground is a box without sides and bottom."""
+    if thing.kind == "ground":
+        return [-math.inf] * 3 + [math.inf, math.inf, thing.height]
+    return [*thing.min, *thing.max]

@@ -1,0 +1,242 @@
+"""From the kernel's samples to a `Result`: attitude, rates, closeness, one time line."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rigidfleet.math import attitude as att
+from rigidfleet.math import proximity as geometry
+from rigidfleet.result import PhaseRecord, Result
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from rigidfleet.kernel.problem import Array
+    from rigidfleet.kernel.records import Record
+    from rigidfleet.math.proximity import Ints
+    from rigidfleet.mission import Mission
+
+
+#: Edges, or coordinates, up to which the smallest singular value of J is recorded.
+_SINGULAR = 400
+#: The work spent on them in a phase, as (size of J)^3 times samples: some tenths of a second; and samples at least.
+_WORK, _LEAST = 400_000_000, 9
+
+
+@dataclass
+class Piece:
+    """Samples of a phase, or of part of one, as the kernel gave them."""
+
+    phase: int
+    time: Array  # (K,) [s]
+    record: Record
+    integral: Array  # (K, m) [m s]
+    frame: Array  # (K, 4)
+    edges: Ints  # (m, 2) of this phase
+    attached: bool  # whether the slots carry the body frame
+
+
+def assemble(
+    mission: Mission,
+    phases: Sequence[PhaseRecord],
+    pieces: Sequence[Piece],
+    *,
+    ending: str,
+    statistics: dict[str, Any],
+) -> Result:
+    """Join the pieces of a flight and compute what follows from positions and forces."""
+    pieces = [p for p in pieces if len(p.time)]
+    time = np.concatenate([p.time for p in pieces])
+    left = time[:, None] <= mission.lost_at  # (K, N)
+    masses = np.where(left, np.array(mission.agents.mass), 0.0)
+    M = masses.sum(axis=1)[:, None]
+
+    def joined(name: str) -> Array:
+        return np.concatenate([getattr(p.record, name) for p in pieces])
+
+    r, v = joined("r"), joined("v")
+    f_u, f_C = joined("f_u"), joined("f_C")
+    thrust = np.linalg.norm(f_u + f_C, axis=2)
+    if mission.agents.saturate:  # what was flown, not what was asked
+        thrust = np.minimum(thrust, mission.agents.thrust_limit)
+    cm, cm_velocity = (np.einsum("ki,kia->ka", masses, z) / M for z in (r, v))
+    x, y = r - cm[:, None], v - cm_velocity[:, None]
+    slots = joined("p")
+    centre = np.einsum("ki,kia->ka", masses, slots) / M  # of those left; else the body's origin
+    attitude, line = _attitudes(
+        pieces, x, slots - centre[:, None], masses, framed=mission.body_frame is not None
+    )
+    T = np.full((len(r), 3, 3), np.nan)
+    attached = np.isfinite(attitude[:, 0])
+    T[attached] = att.dcm_from_quaternion(attitude[attached])
+    T_ref = joined("T_ref")
+    attitude_reference = np.full((len(r), 4), np.nan)
+    commanded = np.isfinite(T_ref[:, 0, 0])
+    attitude_reference[commanded] = att.quaternion_from_dcm(T_ref[commanded])
+    omega = geometry.mean_axis_rates(x, y, masses, line)
+    lacking = attached & ~left.all(axis=1)
+    offset = np.einsum("kab,ka->kb", T[lacking], centre[lacking])
+    cm[lacking] -= offset
+    cm_velocity[lacking] -= np.cross(omega[lacking], offset)
+    motion = joined("motion")
+    wrench = np.concatenate([f_u.sum(axis=1), np.cross(x, f_u).sum(axis=1)], axis=1)
+    asked = joined("wrench")
+    radius = mission.agents.radius
+    room, nearest = geometry.rooms(r, radius, mission.obstacles)
+    room[~left] = np.inf
+    separation, pair = geometry.separation_of_left(r, radius, left)
+    clearance, agent, obstacle = geometry.least_room(room, nearest)
+    _put_extremes(phases, time, (separation, pair, clearance, agent, obstacle))
+    edges = mission.edges
+    distance = np.linalg.norm(r[:, edges[:, 0]] - r[:, edges[:, 1]], axis=2)
+    if not left.all():
+        distance[~left[:, edges].all(axis=2)] = np.nan
+    columns = [_columns(p.edges, edges) for p in pieces]
+
+    def by_edge(name: str) -> Array:
+        return _by_edge(pieces, columns, name, len(edges))
+
+    reference = by_edge("d")
+    noisy = mission.disturbances is not None and mission.disturbances.noise is not None
+    return Result(
+        time=time,
+        phase=np.concatenate([np.full(len(p.time), p.phase) for p in pieces]),
+        position=r,
+        velocity=v,
+        acceleration=joined("a"),
+        slot_position=np.where(left[:, :, None], joined("r_ref"), np.nan),
+        input_force=f_u,
+        constraint_force=f_C,
+        external_force=joined("f_E"),
+        thrust=thrust,
+        cm=cm,
+        cm_velocity=cm_velocity,
+        cm_reference=motion[:, :3],
+        cm_velocity_reference=motion[:, 3:],
+        attitude=attitude,
+        attitude_reference=att.unwrap_quaternion(attitude_reference),
+        frame=att.unwrap_quaternion(np.concatenate([p.frame for p in pieces])),
+        rates=np.einsum("kab,kb->ka", T, omega),
+        rates_reference=joined("rates"),
+        wrench_asked=np.where(np.isfinite(motion[:, :1]), asked, wrench),
+        wrench_achieved=wrench,
+        edges=edges,
+        distance=distance,
+        distance_reference=reference,
+        distance_rate_reference=by_edge("d_dot"),
+        constraint=distance - reference if noisy else by_edge("c"),
+        integral=by_edge("integral"),
+        multiplier=by_edge("multiplier"),
+        singular_value=_singular_values(pieces),
+        separation=separation,
+        separation_pair=pair,
+        clearance=clearance,
+        clearance_agent=agent,
+        clearance_obstacle=obstacle,
+        disturbance_force=joined("f_D") if mission.drag.any() else None,
+        measured_position=joined("r_seen") if noisy else None,
+        measured_velocity=joined("v_seen") if noisy else None,
+        phases=list(phases),
+        mission_text=mission.text,
+        complete=not ending,
+        ending=ending,
+        statistics=statistics,
+    )
+
+
+def _put_extremes(phases: Sequence[PhaseRecord], time: Array, closeness: tuple[Any, ...]) -> None:
+    """What a phase comes to between samples stands at the sample behind it."""
+    separation, pair, clearance, agent, obstacle = closeness
+    for phase in phases:
+        for name, values in (("separation", separation), ("clearance", clearance)):
+            x = phase.extremes.get(name)
+            if x is None:
+                continue
+            k = min(int(np.searchsorted(time, x.time)), len(time) - 1)
+            if x.value < values[k]:
+                values[k] = x.value
+                if name == "separation":
+                    pair[k] = x.who, x.other
+                else:
+                    agent[k], obstacle[k] = x.who, x.other
+
+
+def _attitudes(
+    pieces: Sequence[Piece], x: Array, p: Array, masses: Array, *, framed: bool
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Attitude quaternions (K, 4) of the formation's slots p (K, N, 3), fitted to x by masses (K, N).
+
+    And where the slots are a line (K,).
+
+    Without slots, that of the integrated frame, if the mission attaches one (``framed``).
+    """
+    quaternions, line = np.full((len(x), 4), np.nan), np.zeros(len(x), dtype=np.bool_)
+    fitted = np.zeros(len(x), dtype=bool)
+    T = np.empty((len(x), 3, 3))
+    last = np.eye(3)
+    start = 0
+    for piece in pieces:
+        rows = slice(start, start + len(piece.time))
+        start = rows.stop
+        if not piece.attached:
+            if framed:
+                quaternions[rows] = piece.frame
+            continue
+        near = piece.record.T_ref
+        if np.isnan(near[0, 0, 0]):
+            near = last
+        who = masses[rows.start] > 0.0
+        T[rows], line[rows] = geometry.fit_attitudes(
+            x[rows][:, who], p[rows][:, who], masses[rows.start, who], near
+        )
+        last = T[rows][-1]
+        fitted[rows] = True
+    if fitted.any():
+        quaternions[fitted] = att.quaternion_from_dcm(T[fitted])
+    return att.unwrap_quaternion(quaternions), line
+
+
+def _by_edge(
+    pieces: Sequence[Piece], columns: Sequence[Ints | slice], name: str, count: int
+) -> Array:
+    """A quantity of the edges (K, m), NaN while an edge is not active."""
+    rows = []
+    for piece, places in zip(pieces, columns, strict=True):
+        values = piece.integral if name == "integral" else getattr(piece.record, name)
+        full = np.full((len(piece.time), count), np.nan)
+        full[:, places] = values
+        rows.append(full)
+    return np.concatenate(rows)
+
+
+def _columns(some: Ints, edges: Ints) -> Ints | slice:
+    """Where some edges are among all, (m, 2) both."""
+    if np.array_equal(some, edges):
+        return slice(None)
+    key = edges.max(initial=0) + 1
+    keys = edges[:, 0] * key + edges[:, 1]
+    order = np.argsort(keys)
+    return order[np.searchsorted(keys[order], some[:, 0] * key + some[:, 1])]
+
+
+def _singular_values(pieces: Sequence[Piece]) -> Array:
+    """Smallest non-zero singular value of J (K,); NaN where a sample would take longer than a flight.
+
+    In formations of some tens of agents it is that of some samples in each phase, and linear between them.
+    """
+    return np.concatenate([_singular(p.record.r, p.edges) for p in pieces])
+
+
+def _singular(r: Array, edges: Ints) -> Array:
+    """That of one phase, of positions r (K, N, 3)."""
+    size = min(len(edges), 3 * r.shape[1])
+    if size > _SINGULAR:
+        return np.full(len(r), np.nan)
+    count = min(len(r), max(_LEAST, _WORK // max(size, 1) ** 3))
+    some = np.unique(np.linspace(0, len(r) - 1, count).round().astype(np.int64))
+    found = geometry.smallest_singular_value(r[some], edges)
+    return np.interp(np.arange(len(r)), some, found)

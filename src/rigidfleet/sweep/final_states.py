@@ -1,0 +1,176 @@
+"""Runs of which only the ends of their phases are judged: eight to a vector, thousands in a second.
+
+For starts that vary under open-loop phases, see `rigidfleet.simulation.ensemble`. Nothing on the way is recorded or
+judged.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import lru_cache
+from time import perf_counter
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rigidfleet.assessment import SHAPE_TOLERANCE
+from rigidfleet.assessment.measure import THIN
+from rigidfleet.errors import MissionError
+from rigidfleet.formation.shapes import centred, complete_graph, dimension, distances
+from rigidfleet.mission import Establish, Mission, Reshape
+from rigidfleet.mission.formations import coincident
+from rigidfleet.mission.schema import HUGE
+from rigidfleet.simulation.ensemble import Ensemble, establish, off
+from rigidfleet.sweep.metrics import METRICS
+from rigidfleet.sweep.record import Row, refusal
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from rigidfleet.sweep.definition import Sweep
+
+    Floats = NDArray[np.float64]
+    Flags = NDArray[np.bool_]
+
+#: Agents whose extent along an axis is less than this part of the longest may be flat: their mission decides.
+_CLEARLY = 1e-5
+#: What fails in flight, in words, by its name and in the order of a verdict.
+_WORDS = {
+    "complete": "the flight cannot go on; flown alone, its mission says when, where and why",
+    "distances": "an edge of a formation is not reached where its phase ends",
+    "shape": "a formation is not reached where its phase ends",
+    "handedness": "a formation is reached as its own mirror image",
+}
+
+
+def fly_ends(sweep: Sweep, runs: Sequence[int]) -> list[Row]:
+    """Fly whole groups of runs and judge where their phases end.
+
+    A run passes if it is flown to its end and takes each of its formations: "distances", "shape" and "handedness"
+    as `rigidfleet.assess` has them. Of the metrics there are those of the shape, and the evaluations, which the
+    eight of a vector share.
+    """
+    _prepare(sweep)
+    begun = perf_counter()
+    values = [sweep.values(run) for run in runs]
+    r, v = starts(sweep, values)
+    refused = _refused(sweep, runs, r, v)
+    out = list(refused)
+    r[out], v[out] = sweep.mission.agents.position, sweep.mission.agents.velocity
+    found = establish(sweep.mission, r, v)
+    wrong, metrics = _judged(sweep.mission, found)
+    failed = {"complete": ~found.finished} | {k: found.finished & x for k, x in wrong.items()}
+    wall = (perf_counter() - begun) / len(runs)
+    rows = []
+    for k, (run, drawn) in enumerate(zip(runs, values, strict=True)):
+        codes = tuple(c.variation.code(x) for c, x in zip(sweep.columns, drawn, strict=True))
+        if k in refused:
+            unknown = dict.fromkeys(METRICS, math.nan)
+            rows.append(Row(run, False, *refused[k], codes, unknown, wall))
+            continue
+        reasons = [name for name, which in failed.items() if which[k]]
+        detail = _WORDS[reasons[0]] if reasons else ""
+        known = {name: float(metrics[name][k]) if name in metrics else math.nan for name in METRICS}
+        rows.append(Row(run, not reasons, ", ".join(reasons), detail, codes, known, wall))
+    return rows
+
+
+def starts(sweep: Sweep, values: Sequence[Sequence[Any]]) -> tuple[Floats, Floats]:
+    """Positions and velocities (B, N, 3) [m, m/s] at the start of runs with these values of the columns (B, D)."""
+    agents, count = sweep.mission.agents, len(values)
+    found = {
+        "position": np.tile(np.array(agents.position, dtype=float), (count, 1, 1)),
+        "velocity": np.tile(np.array(agents.velocity, dtype=float), (count, 1, 1)),
+    }
+    with np.errstate(over="ignore", invalid="ignore"):  # refused in time
+        for column, drawn in zip(sweep.columns, np.array(values, dtype=float).T, strict=True):
+            _, name, *inner = column.keys
+            place = found[str(name)][(slice(None), *map(int, inner))]
+            by = drawn.reshape(-1, *(1,) * (place.ndim - 1))
+            match column.variation.change:
+                case "add":
+                    place += by
+                case "scale":
+                    place *= by
+                case _:
+                    place[:] = by
+    return found["position"], found["velocity"]
+
+
+@lru_cache(maxsize=4)
+def _prepare(sweep: Sweep) -> None:
+    """Fly the mission's own start once: what has to be compiled then counts to no run's time."""
+    agents = sweep.mission.agents
+    establish(sweep.mission, [agents.position], [agents.velocity])
+
+
+def _refused(sweep: Sweep, runs: Sequence[int], r: Floats, v: Floats) -> dict[int, tuple[str, str]]:
+    """Reason and detail of runs (by their place among them) that are no missions; the doubtful are asked one by one."""
+    bounded = np.all(np.abs(np.concatenate([r, v], axis=1)) <= HUGE, axis=(1, 2))
+    r, v = (np.where(bounded[:, None, None], x, 0.0) for x in (r, v))
+    apart = [not any(coincident(points)) for points in r.tolist()]
+    found = {}
+    for k in np.flatnonzero(~(bounded & apart & _spread(sweep.mission, r, v))):
+        try:
+            Mission.from_dict(sweep.varied(runs[k]))
+        except MissionError as error:
+            found[int(k)] = refusal(error)
+    return found
+
+
+def _spread(mission: Mission, r: Floats, v: Floats) -> Flags:
+    """Whether agents and their velocities clearly span as many dimensions as any formation asks for (B,)."""
+    asked = [
+        mission.formation_slots(p.formation)
+        for p in mission.phases
+        if isinstance(p, Establish | Reshape)
+    ]
+    needed = max((dimension(slots) for slots in asked if slots is not None), default=0)
+    if not needed:
+        return np.ones(len(r), dtype=bool)
+    x = np.concatenate([z - z.mean(axis=1, keepdims=True) for z in (r, v)], axis=1)
+    extent = np.linalg.eigvalsh(x.swapaxes(1, 2) @ x)  # squared, in ascending order
+    return np.asarray(extent[:, 3 - needed] > _CLEARLY**2 * extent[:, 2])
+
+
+def _judged(mission: Mission, flown: Ensemble) -> tuple[dict[str, Flags], dict[str, Floats]]:
+    """What fails (B,), and metrics (B,)."""
+    count = len(flown.finished)
+    wrong = {name: np.zeros(count, dtype=bool) for name in ("distances", "shape", "handedness")}
+    metrics = {"shape": np.full(count, np.nan), "handed": np.full(count, np.nan)}
+    formation, t, last = None, 0.0, len(mission.phases) - 1
+    for index, (phase, r) in enumerate(zip(mission.phases, flown.ends, strict=True)):
+        shaping = isinstance(phase, Establish | Reshape)
+        length = phase.duration if phase.until is None else phase.until - t
+        t += length or 0.0
+        formation = phase.formation if shaping else formation
+        if formation is None:
+            continue
+        judged = shaping or index == last
+        asked = mission.formation_distances(formation)
+        wide = off(r, mission.formation_edges(formation), asked)
+        blending = shaping and phase.reference != "step" and phase.blend > (length or 0.0)
+        if index == last and not blending and len(asked):
+            metrics["constraint_end"] = wide
+        if judged:
+            wrong["distances"] |= wide > SHAPE_TOLERANCE * asked.min(initial=math.inf)
+        slots = mission.formation_slots(formation)
+        if slots is None or len(slots) < 2:
+            continue
+        pairs = complete_graph(len(slots))
+        intended = distances(slots, pairs)
+        metrics["shape_end"] = error = off(r, pairs, intended)
+        metrics["shape"] = np.fmax(metrics["shape"], error)
+        misshapen = error > SHAPE_TOLERANCE * intended.min()
+        mirrored = np.zeros(count, dtype=bool)
+        if dimension(slots, THIN) == 3:
+            x = r - r.mean(axis=1, keepdims=True)
+            mirrored = np.linalg.det(x.swapaxes(1, 2) @ centred(slots)) < 0.0
+            metrics["handed"] = np.fmin(metrics["handed"], np.where(mirrored, 0.0, 1.0))
+        if judged:
+            wrong["shape"] |= misshapen
+            wrong["handedness"] |= mirrored & ~misshapen
+    metrics["flown"] = np.full(count, mission.latest_end)
+    metrics = {name: np.where(flown.finished, x, np.nan) for name, x in metrics.items()}
+    return wrong, metrics | {"evaluations": flown.evaluations.astype(float)}

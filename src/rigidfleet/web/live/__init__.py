@@ -1,0 +1,66 @@
+"""Fly the virtual body by hand, in the browser, while it is simulated in real time."""
+
+from __future__ import annotations
+
+import webbrowser
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from rigidfleet.web.live.server import Server
+from rigidfleet.web.live.session import Session
+
+if TYPE_CHECKING:
+    from rigidfleet.mission import Mission
+    from rigidfleet.result import Result
+
+__all__ = ["live"]
+
+
+def live(
+    mission: Mission,
+    *,
+    port: int = 0,
+    browser: bool = True,
+    ready: Callable[[str], object] | None = None,
+    landed: Callable[[Result], str] | None = None,
+) -> Result | None:
+    """Fly a mission's vehicles by hand, until the page is closed or Ctrl-C is pressed.
+
+    The vehicles establish the mission's first formation; from then on the page moves and turns the
+    target of the virtual body, changes formations and sends gusts, and the mission's laws fly it.
+
+    Parameters
+    ----------
+    port : on which this machine, and it alone, serves the page; 0 for any that is free
+    browser : open the page in the user's browser
+    ready : called with the page's address once it is served
+    landed : called with each flight when it ends (one begun anew ends the one before), to save it; what it
+        returns is said on the page
+
+    Returns
+    -------
+    Result
+        The last flight, its phases as they were flown; None if nobody has looked.
+
+    Raises
+    ------
+    FlightError
+        No formation of the mission has slots, or the port cannot be used.
+    """
+    flown: list[Result] = []
+
+    def keep(result: Result) -> str:
+        flown[:] = [result]
+        return landed(result) if landed is not None else ""
+
+    session = Session(mission, keep)
+    with Server(session, port) as server:
+        try:
+            if ready is not None:
+                ready(server.url)
+            if browser:
+                webbrowser.open(server.url)
+            session.run()
+        except KeyboardInterrupt:
+            pass
+    return flown[0] if flown else None

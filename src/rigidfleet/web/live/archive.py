@@ -1,0 +1,210 @@
+"""What has flown by hand, kept as it comes: at even steps, in bounded memory, worst moments included."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigidfleet.errors import MissionError
+from rigidfleet.mission import Establish, Mission, Phase, Reshape
+from rigidfleet.result import PhaseRecord, Result
+from rigidfleet.simulation.recording import Piece
+from rigidfleet.web.replay.pack import Floats
+
+#: Numbers kept at most, 8 bytes each: 10 minutes of 50 vehicles with 144 edges at 0.05 s. Beyond, every second
+#: sample goes, and the step doubles.
+_MOST = 3.0e7
+_JOINED = 256  # ticks that become one piece: few large arrays in place of many small ones
+
+
+@dataclass
+class Leg:
+    """Samples of a phase, as long as no vehicle is lost.
+
+    Its start, its end, and its worst moments (nearest, hardest) are kept whatever the step is.
+    """
+
+    pieces: list[Piece] = field(default_factory=list)
+    last: Piece | None = None
+    worst: dict[str, tuple[float, Piece]] = field(default_factory=dict)
+
+
+class Archive:
+    """Samples of a flight that goes on tick by tick.
+
+    Attributes
+    ----------
+    step : between the samples kept [s]; at first that of the mission
+    """
+
+    def __init__(self, step: float, most: float = _MOST) -> None:
+        self.step, self.most = step, most
+        self.legs: dict[tuple[int, int], Leg] = {}  # by phase and number of edges
+        self.size = 0.0
+
+    def add(self, pieces: Sequence[Piece], told: Result) -> None:
+        """Keep what a tick has flown; ``told`` is the record of its end."""
+        for piece in pieces:
+            key = (piece.phase, len(piece.edges))
+            fresh, leg = key not in self.legs, self.legs.setdefault(key, Leg())
+            leg.last = rows(piece, [-1])
+            keep = self._even(piece.time)
+            keep[0] |= fresh
+            if keep.any():
+                leg.pieces.append(rows(piece, keep))
+                self.size += _numbers(leg.pieces[-1])
+            if len(leg.pieces) >= _JOINED and len(leg.pieces[-1].time) < _JOINED:
+                leg.pieces = _joined(leg.pieces)
+        if pieces:
+            self._note(self.legs[pieces[-1].phase, len(pieces[-1].edges)], told)
+        while self.size > self.most:
+            self._thin()
+
+    def pieces(self) -> list[Piece]:
+        """All that is kept, in order of time."""
+        found = []
+        for leg in self.legs.values():
+            extra = [leg.last, *(piece for _, piece in leg.worst.values())]
+            pieces = [*leg.pieces, *(piece for piece in extra if piece is not None)]
+            found.append(_sorted(_join(pieces)))
+        return found
+
+    def begun(self, phase: int) -> bool:
+        """Whether there is a sample of a phase."""
+        return any(key[0] == phase for key in self.legs)
+
+    def _note(self, leg: Leg, told: Result) -> None:
+        """Keep the moment of a tick's end if it is a worst one of its phase."""
+        assert leg.last is not None
+        worst = {
+            "separation": -float(told.separation[-1]),
+            "clearance": -float(told.clearance[-1]),
+            "thrust": float(np.max(told.thrust[-1])),
+            "speed": float(np.linalg.norm(told.velocity[-1], axis=1).max()),
+        }
+        for name, value in worst.items():
+            if value > leg.worst.get(name, (-np.inf, None))[0]:
+                leg.worst[name] = (value, leg.last)
+
+    def _even(self, time: Floats) -> NDArray[np.bool_]:
+        """Which times are multiples of the step."""
+        away = time / self.step
+        return np.abs(away - np.round(away)) * self.step < 1e-6
+
+    def _thin(self) -> None:
+        """Twice the step, half of the samples."""
+        self.step *= 2.0
+        self.size = 0.0
+        for leg in self.legs.values():
+            pieces = _joined(leg.pieces)
+            keep = self._even(pieces[0].time)
+            keep[0] = True  # the start
+            leg.pieces = [rows(pieces[0], keep)]
+            self.size += _numbers(leg.pieces[0])
+        self.most = max(self.most, 2.0 * self.size if self.size > 0.5 * self.most else 0.0)
+
+
+def _numbers(piece: Piece) -> float:
+    return float(sum(x.size for x in piece.record) + piece.integral.size + piece.frame.size)
+
+
+def rows(piece: Piece, which: NDArray[np.bool_] | list[int]) -> Piece:
+    """Some samples of a piece."""
+    record = type(piece.record)(*(x[which] for x in piece.record))
+    return Piece(
+        piece.phase, piece.time[which], record, piece.integral[which], piece.frame[which], piece.edges,
+        piece.attached,
+    )  # fmt: skip
+
+
+def _joined(pieces: list[Piece]) -> list[Piece]:
+    return [_join(pieces)] if len(pieces) > 1 else pieces
+
+
+def _join(pieces: list[Piece]) -> Piece:
+    """Pieces of one phase as one."""
+    first, record = pieces[0], type(pieces[0].record)
+    fields = (np.concatenate(each) for each in zip(*(p.record for p in pieces), strict=True))
+    return Piece(
+        first.phase,
+        np.concatenate([p.time for p in pieces]),
+        record(*fields),
+        np.concatenate([p.integral for p in pieces]),
+        np.concatenate([p.frame for p in pieces]),
+        first.edges,
+        first.attached,
+    )
+
+
+def _sorted(piece: Piece) -> Piece:
+    """In order of time, each once."""
+    _, first = np.unique(piece.time, return_index=True)
+    return rows(piece, first.tolist())
+
+
+# -- the mission that was flown ----------------------------------------------------------------------
+
+
+def as_flown(
+    mission: Mission, asked: Sequence[Phase], flown: Sequence[PhaseRecord], step: float
+) -> tuple[Mission, list[PhaseRecord]]:
+    """The mission whose phases are those ``flown`` by hand, and their records under its names.
+
+    Where that would be no mission (as where slots and distances contradict each other, which a hand may fly),
+    it has the phases that it was given with: no flight is lost for them.
+
+    Parameters
+    ----------
+    asked : what each phase was begun as
+    step : between samples [s]
+    """
+    seen: Counter[str] = Counter()
+    records = []
+    for record in flown:
+        seen[record.name] += 1
+        count = seen[record.name]
+        records.append(
+            replace(record, name=f"{record.name} ({count})" if count > 1 else record.name)
+        )
+    data = mission.to_dict()
+    data.pop("source", None)  # it reproduces no figure any more
+    data["name"] = f"{mission.name.removesuffix('-live')}-live"
+    data["title"] = f"{mission.title or mission.name}, flown by hand"
+    as_given = dict(data)
+    end = records[-1].t_end
+    data["output_step"] = min(step, end)
+    if mission.assignment != "given":
+        # Who takes which slot followed from phases that were not flown.
+        data["assignment"] = "given"
+        data["formations"] = {name: _written_out(mission, name) for name in mission.formations}
+    data["phases"] = [_written(*each) for each in zip(asked, records, strict=True)]
+    disturbed = data.get("disturbances", {})
+    if "lost" in disturbed:
+        left = [lost for lost in disturbed["lost"] if lost["time"] < end]
+        data["disturbances"] = disturbed | {"lost": left}
+    try:
+        return Mission.from_dict(data), records
+    except MissionError:
+        return Mission.from_dict(as_given), records
+
+
+def _written(phase: Phase, record: PhaseRecord) -> dict[str, Any]:
+    """A phase as it stands in a mission, from its start to the end that it had."""
+    told: dict[str, Any] = {"kind": record.kind, "name": record.name, "until": record.t_end}
+    told["control"] = record.control
+    if isinstance(phase, Establish | Reshape):
+        told["formation"] = phase.formation
+        told["blend"] = min(phase.blend, record.t_end - record.t_start)
+    return told
+
+
+def _written_out(mission: Mission, name: str) -> dict[str, Any]:
+    """A formation with slots and edges in the order of the agents."""
+    edges = (mission.formation_edges(name) + 1).tolist()
+    given = mission.formations[name].distances
+    return {"slots": mission.formation_slots(name), "edges": edges, "distances": given}

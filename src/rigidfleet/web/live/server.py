@@ -1,0 +1,172 @@
+"""A session on this machine's own address: a page, a stream of events, commands.
+
+Only this machine reaches it. Its address holds a secret, and requests that name another host or come
+from another origin are refused, so that other pages in the same browser can neither see nor fly it,
+under whatever name they reach this machine.
+"""
+
+from __future__ import annotations
+
+import json
+import queue
+import secrets
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from threading import Thread
+from types import TracebackType
+from typing import Self
+
+from rigidfleet.errors import FlightError, RigidfleetError
+from rigidfleet.web.live.session import Session
+
+_HOST = "127.0.0.1"
+_LARGEST = 10_000  # bytes of a command
+_SILENCE = 1.0  # after which a word is sent to learn whether anybody listens [s]
+#: With every answer. The page has a policy of its own; a frame around it only a header can forbid.
+_HEADERS = {
+    "Cache-Control": "no-store",
+    "Content-Security-Policy": "frame-ancestors 'none'",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",  # the address holds the secret
+    "X-Content-Type-Options": "nosniff",
+}
+
+
+class Server:
+    """Serves a session while its context lasts.
+
+    Raises
+    ------
+    FlightError
+        The port cannot be used.
+    """
+
+    def __init__(self, session: Session, port: int = 0) -> None:
+        class Handler(_Handler):
+            pass
+
+        Handler.session, Handler.base = session, f"/{secrets.token_urlsafe(12)}/"
+        try:
+            self.http = ThreadingHTTPServer((_HOST, port), Handler)
+        except (OSError, OverflowError) as error:
+            why = getattr(error, "strerror", None) or error
+            raise FlightError(
+                f"port {port} cannot be used ({why}). Name another, or none to have a free one chosen"
+            ) from error
+        self.http.daemon_threads = True
+        Handler.port = self.http.server_port
+        self.url = f"http://{_HOST}:{Handler.port}{Handler.base}"
+        self.thread = Thread(target=self.http.serve_forever, args=(0.1,), daemon=True)
+
+    def __enter__(self) -> Self:
+        self.thread.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.http.shutdown()
+        self.http.server_close()
+        self.thread.join()
+
+
+class _Handler(BaseHTTPRequestHandler):
+    session: Session
+    base: str
+    port: int
+    server_version, sys_version = "rigidfleet", ""
+
+    def parse_request(self) -> bool:
+        """Read a request; of whatever method, it is answered only if our page asks."""
+        if not super().parse_request():
+            return False
+        if self._ours():
+            return True
+        self._answer(HTTPStatus.FORBIDDEN, "open the address that the program has printed")
+        return False
+
+    def do_GET(self) -> None:
+        """Send the page, or its stream."""
+        if self.path == self.base:
+            self._answer(HTTPStatus.OK, self.session.html(), "text/html; charset=utf-8")
+        elif self.path == f"{self.base}stream":
+            self._stream()
+        else:
+            self._answer(HTTPStatus.NOT_FOUND, "there is nothing here")
+
+    def do_POST(self) -> None:
+        """Do what a page asks."""
+        if self.path != f"{self.base}command":
+            self._answer(HTTPStatus.NOT_FOUND, "there is nothing here")
+            return
+        try:
+            length = int(self.headers.get("Content-Length", ""))
+            if not 0 < length <= _LARGEST:
+                raise ValueError("a command is shorter")
+            asked = json.loads(self.rfile.read(length))
+            if not isinstance(asked, dict):
+                raise ValueError("a command is an object")
+            self.session.command(asked)
+        except (ValueError, RigidfleetError) as error:
+            self._answer(HTTPStatus.BAD_REQUEST, str(error))
+        else:
+            self._answer(HTTPStatus.NO_CONTENT, "")
+
+    def log_message(self, format: str, *args: object) -> None:
+        """Say nothing: the terminal is the user's."""
+
+    def _ours(self) -> bool:
+        """Is it our page that asks, at our own address? A command says where it comes from."""
+        asked, origins = self.headers.get_all("Host", []), self.headers.get_all("Origin", [])
+        hosts = {f"{name}:{self.port}" for name in (_HOST, "localhost")}
+        if len(asked) != 1 or asked[0] not in hosts or not self.path.startswith(self.base):
+            return False
+        return origins == [f"http://{asked[0]}"] or (not origins and self.command == "GET")
+
+    def _answer(self, status: HTTPStatus, text: str, kind: str = "text/plain") -> None:
+        data = text.encode()
+        self.send_response(status)
+        self.send_header("Content-Type", kind)
+        self.send_header("Content-Length", str(len(data)))
+        self.end_headers()
+        self._send(data)
+
+    def end_headers(self) -> None:
+        """Send the headers: nobody keeps what we say, frames it, or takes it for something else."""
+        for name, value in _HEADERS.items():
+            self.send_header(name, value)
+        super().end_headers()
+
+    def _send(self, data: bytes) -> bool:
+        """Send; False if nobody listens any more."""
+        try:
+            self.wfile.write(data)
+            self.wfile.flush()
+        except OSError:
+            return False
+        return True
+
+    def _stream(self) -> None:
+        self.send_response(HTTPStatus.OK)
+        self.send_header("Content-Type", "text/event-stream")
+        self.end_headers()
+        messages = self.session.join()
+        try:
+            while True:
+                try:
+                    message = messages.get(timeout=_SILENCE)
+                except queue.Empty:
+                    message = b": still here\n\n"
+                if message is None:
+                    self._send(
+                        f"event: end\ndata: {json.dumps(self.session.farewell)}\n\n".encode()
+                    )
+                    return
+                if not self._send(message):
+                    return
+        finally:
+            self.session.leave(messages)

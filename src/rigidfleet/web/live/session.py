@@ -1,0 +1,258 @@
+"""A live flight and those who look at it: real time, commands in, pictures out."""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+import queue
+import threading
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from rigidfleet.math import attitude as att
+from rigidfleet.mission import Mission
+from rigidfleet.result import Result, plain
+from rigidfleet.web.live.pilot import TICK, Pilot
+from rigidfleet.web.replay.page import page, read
+from rigidfleet.web.replay.scene import describe, observe, sight, weight
+
+SPEEDS = (0.25, 0.5, 1.0, 2.0, 4.0)
+#: Full colour of an edge, as a share of a vehicle's weight.
+_TENSION = 0.2
+_EDGES = 3000  # drawn at most
+_AROUND = 20.0  # the overview holds at least so much around the start, and what stands near it [m]
+_LATE = 0.3  # so much lost time is made up for, no more [s]
+#: After the last page is closed, another may be opened for so long [s].
+_PATIENCE = 4.0
+_FAREWELL = 1.0  # that pages have to hear of the end [s]
+_FASTEST, _TURNING, _STRONGEST = 50.0, 3.0, 20.0  # that a hand may ask for [m/s, rad/s, N/kg]
+_WAITING = 64  # messages for a page that is slow; then it misses some
+
+
+class Session:
+    """One flight by hand, and the pages that show it.
+
+    `run` flies in real time while anybody looks, until `stop`; other threads call `command`, `join`
+    and `leave`. Each flight that somebody has seen is handed to ``landed`` when it ends, which returns
+    what its pages are to say of that.
+    """
+
+    def __init__(self, mission: Mission, landed: Callable[[Result], str] | None = None) -> None:
+        self.mission, self.landed = mission, landed
+        self.farewell = ""
+        self.shown = np.arange(min(len(mission.edges), _EDGES))
+        self.tension = _TENSION * weight(mission)
+        self.lock = threading.RLock()
+        self.pages: set[queue.Queue[bytes | None]] = set()
+        self.stopped = threading.Event()
+        self.paused, self.speed, self.pace = False, 1.0, 1.0
+        self.left = math.inf  # when the last page was closed
+        self.flights = 0
+        self.begin()
+
+    def begin(self) -> None:
+        """Begin anew."""
+        self.pilot = Pilot(self.mission)
+        self.flights += 1
+        self.result = self.pilot.step()
+
+    def land(self) -> None:
+        """Hand over what was flown."""
+        if self.pilot.ticks > 1 and self.landed is not None:
+            self.farewell = self.landed(self.pilot.result())
+
+    # -- pages ------------------------------------------------------------------------------------
+
+    def html(self) -> str:
+        """The page."""
+        with self.lock:
+            columns = observe(self.result, self.shown, self.tension)
+            widths = [
+                {"name": name, "width": c.values[0].size if c.values.ndim > 1 else 1}
+                for name, c in columns.items()
+            ]
+            start = np.array(self.mission.agents.position)
+            near = sight(self.mission, start.min(axis=0) - _AROUND, start.max(axis=0) + _AROUND)
+            info = describe(self.mission, self.mission.edges[self.shown], self.tension) | {
+                "columns": [*widths, {"name": "target", "width": 7}],
+                "count": 0,
+                "start": 0.0,
+                "step": TICK,
+                "beyond": True,
+                "note": "",
+                "middle": (near.min(axis=0) + near.max(axis=0)) / 2,
+                "extent": float(np.linalg.norm(np.ptp(near, axis=0))) / 2,
+                "path": False,
+                "camera": "follow",
+                "sight": near,
+                "azimuth": -1.1,
+                "formations": self.pilot.formations,
+                "speeds": SPEEDS,
+                **self.story(),
+            }
+        script, style = (read(f"live.{kind}", "rigidfleet.web.live") for kind in ("js", "css"))
+        return page(info, start=script, style=style, connect="'self'")
+
+    def story(self) -> dict[str, Any]:
+        """What changes now and then."""
+        pilot = self.pilot
+        return {
+            "phases": [
+                {"name": p.name, "start": p.t_start, "end": p.t_end, "position": None}
+                for p in pilot.phases
+            ],
+            "ending": pilot.ending,
+            "formation": pilot.formation,
+            "waiting": pilot.waiting,
+            "busy": pilot.busy,
+            "paused": self.paused,
+            "speed": self.speed,
+            "pace": self.pace,
+            "flight": self.flights,
+        }
+
+    def join(self) -> queue.Queue[bytes | None]:
+        """A page's messages: events of a stream, None at the end."""
+        messages: queue.Queue[bytes | None] = queue.Queue(_WAITING)
+        with self.lock:
+            self.pages.add(messages)
+            self.left = math.inf
+            messages.put(_event("story", json.dumps(plain(self.story()))))
+        return messages
+
+    def leave(self, messages: queue.Queue[bytes | None]) -> None:
+        """A page was closed."""
+        with self.lock:
+            self.pages.discard(messages)
+            if not self.pages:
+                self.left = time.monotonic()
+
+    def _tell(self, message: bytes) -> None:
+        with self.lock:
+            for messages in self.pages:
+                try:
+                    messages.put_nowait(message)
+                except queue.Full:
+                    continue
+
+    def _picture(self) -> bytes:
+        """The last sample as numbers: time and the columns of the page, one after the other."""
+        target = self.pilot.target
+        columns = observe(self.result, self.shown, self.tension).values()
+        values = [
+            [self.result.time[-1]],
+            *(c.values.ravel() for c in columns),
+            target.r,
+            att.quaternion_from_dcm(target.attitude),
+        ]
+        numbers = np.concatenate(values).astype("<f4")
+        return _event("sample", base64.b64encode(numbers.tobytes()).decode("ascii"))
+
+    # -- commands ---------------------------------------------------------------------------------
+
+    def command(self, asked: Mapping[str, Any]) -> None:
+        """Do what a page asks.
+
+        Raises
+        ------
+        ValueError
+            It asks for something else.
+        """
+        with self.lock:
+            match asked:
+                case {"move": move, "turn": turn}:
+                    self.pilot.steer(_vector(move, _FASTEST), _vector(turn, _TURNING))
+                case {"formation": str(name)} if name in self.pilot.formations:
+                    self.pilot.change(name)
+                case {"gust": direction, "strength": strength}:
+                    strength = _number(strength, _STRONGEST)
+                    direction = _vector(direction, 1.0)
+                    if not direction.any():
+                        raise ValueError("a gust needs a direction")
+                    self.pilot.gust(direction, strength)
+                case {"pause": bool(paused)}:
+                    self.paused = paused
+                case {"speed": float(speed) | int(speed)} if speed in SPEEDS:
+                    self.speed = float(speed)
+                case {"again": True}:
+                    self.land()
+                    self.begin()
+                case {"stop": True}:
+                    self.stop()
+                case _:
+                    raise ValueError(f"no such command: {json.dumps(asked)[:100]}")
+
+    def stop(self) -> None:
+        """End the flight."""
+        self.stopped.set()
+
+    # -- real time --------------------------------------------------------------------------------
+
+    def run(self) -> None:
+        """Fly until stopped, or until the last page has been closed for a while."""
+        try:
+            self._run()
+        finally:
+            self.stop()
+            try:
+                with self.lock:
+                    self.land()
+            finally:
+                self._say_goodbye()
+
+    def _say_goodbye(self) -> None:
+        with self.lock:
+            for messages in self.pages:
+                with messages.mutex:
+                    messages.queue.clear()
+                messages.put(None)
+        end = time.monotonic() + _FAREWELL
+        while self.pages and time.monotonic() < end:
+            time.sleep(0.02)
+
+    def _run(self) -> None:
+        told: dict[str, Any] = {}
+        due = measured = time.monotonic()
+        flown = 0
+        while not self.stopped.is_set():
+            now = time.monotonic()
+            if now - self.left > _PATIENCE:
+                return
+            if now - measured > 1.0:
+                self.pace = round(flown * TICK / (now - measured) / self.speed, 1)
+                measured, flown = now, 0
+            with self.lock:
+                if self.pages and not (self.paused or self.pilot.ending):
+                    self.result = self.pilot.step()
+                    flown += 1
+                    self._tell(self._picture())
+                else:
+                    self.pace = 1.0
+                story = self.story()
+            # The end of the phase under way moves on; that alone is no news.
+            news = story | {"phases": len(story["phases"])}
+            if news != told:
+                told = news
+                self._tell(_event("story", json.dumps(plain(story))))
+            due = max(due + TICK / self.speed, now - _LATE)
+            self.stopped.wait(max(0.0, due - time.monotonic()))
+
+
+def _event(name: str, data: str) -> bytes:
+    return f"event: {name}\ndata: {data}\n\n".encode()
+
+
+def _number(value: Any, most: float) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise ValueError("a finite number is needed")
+    return min(max(float(value), -most), most)
+
+
+def _vector(value: Any, most: float) -> np.ndarray:
+    if not isinstance(value, list) or len(value) != 3:
+        raise ValueError("three numbers are needed")
+    return np.array([_number(x, most) for x in value])

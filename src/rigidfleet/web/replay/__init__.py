@@ -1,0 +1,140 @@
+"""A flight in the browser: one page that works offline, to look at and to send.
+
+`replay` writes it. The page holds its own small renderer (WebGL 2) and asks nothing of any network;
+its parts lie beside this module.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rigidfleet.result import write_file
+from rigidfleet.web.replay.pack import Column, Floats, pack
+from rigidfleet.web.replay.page import page, read
+from rigidfleet.web.replay.scene import describe, observe, sight, size, weight
+
+if TYPE_CHECKING:
+    from rigidfleet.math.proximity import Ints
+    from rigidfleet.result import Result
+
+__all__ = ["html_page", "replay"]
+
+_RATE = 30.0  # samples [Hz] at most: the page draws smooth curves through them
+_SAMPLES = 3_000_000  # of all agents together; longer flights have fewer in a second
+_EDGES = 3000  # drawn at most: more would hide what they hold
+#: Shares of a vehicle's weight that the full colour of an edge stands for at least, and at most.
+_IDLE, _HEAVY = 0.005, 2.0
+
+
+def replay(result: Result, path: str | Path) -> None:
+    """Write a flight as one HTML file that plays it, offline, in any browser of today.
+
+    An existing file is replaced, whole or not at all.
+
+    Raises
+    ------
+    ResultError
+        The file cannot be written, or the mission inside the result cannot be read.
+    """
+    write_file(Path(path), html_page(result).encode())
+
+
+def html_page(result: Result) -> str:
+    """The page that `replay` writes."""
+    time, shown = _times(result), _edges(result)
+    most = float(np.nanmax(np.abs(result.multiplier[:, shown]), initial=0.0))
+    scale = weight(result.mission)
+    tension = min(max(most, _IDLE * scale), _HEAVY * scale)
+    columns = observe(result, shown, tension)
+    described, data = pack(
+        {name: Column(_sampled(result, c.values, time), c.step) for name, c in columns.items()}
+    )
+    info = describe(result.mission, result.edges[shown], tension) | _story(result, time)
+    info |= {"columns": described, "count": len(time), "beyond": most > tension}
+    return page(
+        info | {"note": _note(result, shown, tension, most)}, start=read("replay.js"), data=data
+    )
+
+
+def _times(result: Result) -> Floats:
+    """Even times (K,) [s] from start to end, about as dense as the result is where that is seldom."""
+    first, last = float(result.time[0]), float(result.time[-1])
+    gaps = np.diff(result.time)
+    gaps = gaps[gaps > 1e-9 * max(1.0, last - first)]
+    if not len(gaps):
+        return np.array([first])
+    least = max(1.0 / _RATE, (last - first) * result.n_agents / _SAMPLES)
+    count = math.ceil((last - first) / max(least, float(np.median(gaps))) - 1e-6)
+    return np.linspace(first, last, count + 1)
+
+
+def _sampled(result: Result, values: Floats, time: Floats) -> Floats:
+    """Values (K, ...) of the result at other times, straight between its samples.
+
+    Between a value and none, the earlier sample counts.
+    """
+    if len(result.time) == 1:
+        return values
+    k = np.clip(np.searchsorted(result.time, time, side="right") - 1, 0, len(result.time) - 2)
+    share = (time - result.time[k]) / (result.time[k + 1] - result.time[k])
+    share = share.reshape(-1, *(1,) * (values.ndim - 1))
+    low, high = values[k], values[k + 1]
+    between = (1.0 - share) * low + share * high
+    return np.where(np.isfinite(between), between, np.where(share < 1.0, low, high))
+
+
+def _edges(result: Result) -> Ints:
+    """Indices of the edges drawn: all, or of too many the shortest."""
+    if len(result.edges) <= _EDGES:
+        return np.arange(len(result.edges))
+    typical = np.median(result.distance[:: max(1, len(result.time) // 50)], axis=0)
+    return np.sort(np.argsort(typical, kind="stable")[:_EDGES])
+
+
+def _story(result: Result, time: Floats) -> dict[str, Any]:
+    """What the page says of a flight that is over."""
+    low, high = result.position.min(axis=(0, 1)), result.position.max(axis=(0, 1))
+    extent, reach = float(np.linalg.norm(high - low)) / 2, size(result)
+    seen = sight(result.mission, low, high)
+    least, most = seen.min(axis=0), seen.max(axis=0)
+    way = (result.cm[-1] - result.cm[0])[:2]
+    far = float(np.linalg.norm(way)) > 2 * reach
+    story = {
+        "start": float(time[0]),
+        "step": float(time[1] - time[0]) if len(time) > 1 else 0.0,
+        "phases": [
+            {
+                "name": phase.name,
+                "start": phase.t_start,
+                "end": phase.t_end,
+                "position": (phase.target or {}).get("position"),
+            }
+            for phase in result.phases
+        ],
+        "ending": "" if result.complete else result.ending or "stopped",
+        "camera": "overview",
+        "sight": seen[8:],  # besides the flight itself
+        "middle": (least + most) / 2,
+        "extent": max(float(np.linalg.norm(most - least)) / 2, reach, 1e-6),
+        "path": far,
+        # Seen from behind and from the side, where there is a way.
+        "azimuth": math.atan2(-way[1], -way[0]) + 0.6 if far else -1.1,
+    }
+    if not any(o.kind == "ground" for o in result.mission.obstacles):
+        # A grid to see motion against; far up there, it goes along.
+        lowest = float(low[2])
+        story["ground"] = 0.0 if 0.0 <= lowest <= 4 * (extent + reach) else lowest - reach
+    return story
+
+
+def _note(result: Result, shown: Ints, tension: float, most: float) -> str:
+    words = []
+    if len(shown) < len(result.edges):
+        words.append(f"The {len(shown)} shortest of {len(result.edges)} edges are drawn.")
+    if len(shown) and most < tension:
+        words.append(f"No edge carries more than {max(most, 0.001):.2g} N.")
+    return " ".join(words)
