@@ -9,14 +9,13 @@ from __future__ import annotations
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from rigidfleet.kernel import constraint, references
 from rigidfleet.kernel import problem as k
 from rigidfleet.kernel import rigid_body as body
 from rigidfleet.planning.reference import about_cm, align_slots
-
-Array = NDArray[np.float64]
+from rigidfleet.typing import Floats, Ints
 
 _SOLVERS = {"iterated": k.ITERATED, "spectral": k.SPECTRAL, "exact": k.EXACT, "pinv": k.PINV}
 _SPLITS = {"equal": k.PINV_EQUAL, "inertia": k.PINV_INERTIA, "inertia+force": k.PINV_INERTIA_FORCE}
@@ -25,10 +24,10 @@ _SPLITS = {"equal": k.PINV_EQUAL, "inertia": k.PINV_INERTIA, "inertia+force": k.
 class ConstraintForce(NamedTuple):
     """What holds a formation together at one instant."""
 
-    f_C: Array  # (N, 3) force on each agent [N]
-    multiplier: Array  # (m,) lambda [N]; the tension of an edge is -lambda
-    c: Array  # (m,) constraint error L - d [m]
-    c_dot: Array  # (m,) [m/s]
+    f_C: Floats  # (N, 3) force on each agent [N]
+    multiplier: Floats  # (m,) lambda [N]; the tension of an edge is -lambda
+    c: Floats  # (m,) constraint error L - d [m]
+    c_dot: Floats  # (m,) [m/s]
 
 
 def constraint_force(
@@ -104,7 +103,7 @@ def allocate(
     *,
     method: Literal["rigid", "pinv"] = "rigid",
     torque_split: Literal["equal", "inertia", "inertia+force"] = "equal",
-) -> Array:
+) -> Floats:
     """Input force (N, 3) [N] of every agent for a wrench on the virtual body (input decoupling).
 
     ``rigid`` is exact: f_i = m_i (F/M + alpha x x_i + omega x (omega x x_i)) with
@@ -134,7 +133,7 @@ def allocate(
     return f
 
 
-def wrench(x: ArrayLike, masses: ArrayLike, f: ArrayLike) -> Array:
+def wrench(x: ArrayLike, masses: ArrayLike, f: ArrayLike) -> Floats:
     """Wrench (6,) of forces f (N, 3) [N] at x (N, 3) [m]: sum, and torque about the CM [N, N m]."""
     m, x = _masses_and_points(masses, x)
     f = _full(f, x.shape, "f")
@@ -151,7 +150,7 @@ def shape_schedule(
     blend: float = 4.0,
     masses: ArrayLike | None = None,
     align: bool = False,
-) -> tuple[Array, Array, Array]:
+) -> tuple[Floats, Floats, Floats]:
     """Distances d (K, m) [m] of slots blended from p0 to p1 (N, 3), and two derivatives.
 
     p = p0 + (p1 - p0) s, s the septic over [start, start + blend] [s], and d_ij = |p_i - p_j|.
@@ -169,7 +168,7 @@ def shape_schedule(
 
 def distance_schedule(
     d0: ArrayLike, d1: ArrayLike, times: ArrayLike, *, start: float = 0.0, blend: float = 4.0
-) -> tuple[Array, Array, Array]:
+) -> tuple[Floats, Floats, Floats]:
     """Distances d (K, m) [m] blended in d^2 from d0 to d1 (m,), and two derivatives.
 
     d = sqrt(d0^2 + (d1^2 - d0^2) s): realisable throughout for up to four agents.
@@ -183,9 +182,7 @@ def distance_schedule(
     return _schedule(ref, np.zeros((len(d0), 2), dtype=np.int64), times)
 
 
-def _schedule(
-    ref: k.Reference, edges: NDArray[np.int64], times: ArrayLike
-) -> tuple[Array, Array, Array]:
+def _schedule(ref: k.Reference, edges: Ints, times: ArrayLike) -> tuple[Floats, Floats, Floats]:
     t = np.atleast_1d(np.asarray(times, dtype=float))
     p = np.zeros((3, *ref.p0.shape))
     out = np.zeros((3, len(t), len(edges)))
@@ -196,13 +193,13 @@ def _schedule(
     return out[0], out[1], out[2]
 
 
-def _vehicles(m: Array) -> k.Vehicles:
+def _vehicles(m: Floats) -> k.Vehicles:
     return k.Vehicles(
         m, 1.0 / m, float(m.sum()), float(m.mean()), np.full(len(m), np.inf), False, 0.0
     )
 
 
-def _masses_and_points(masses: ArrayLike, points: ArrayLike) -> tuple[Array, Array]:
+def _masses_and_points(masses: ArrayLike, points: ArrayLike) -> tuple[Floats, Floats]:
     r = np.array(points, dtype=float, order="C")
     if r.ndim != 2 or r.shape[1] != 3:
         raise ValueError(f"positions must be (N, 3), not {r.shape}")
@@ -212,7 +209,7 @@ def _masses_and_points(masses: ArrayLike, points: ArrayLike) -> tuple[Array, Arr
     return m, r
 
 
-def _full(value: ArrayLike, shape: tuple[int, ...], name: str) -> Array:
+def _full(value: ArrayLike, shape: tuple[int, ...], name: str) -> Floats:
     try:
         # A copy: a view that cannot be written is another type, and compiles the call once more.
         return np.array(np.broadcast_to(np.asarray(value, dtype=float), shape), order="C")
@@ -220,7 +217,7 @@ def _full(value: ArrayLike, shape: tuple[int, ...], name: str) -> Array:
         raise ValueError(f"{name} must be {shape}, not {np.shape(value)}") from None
 
 
-def _edges(edges: ArrayLike, n: int) -> NDArray[np.int64]:
+def _edges(edges: ArrayLike, n: int) -> Ints:
     e = np.ascontiguousarray(edges, dtype=np.int64).reshape(-1, 2)
     if len(e) and (e.min() < 0 or e.max() >= n or (e[:, 0] == e[:, 1]).any()):
         raise ValueError(f"edges must join two different agents between 0 and {n - 1}")

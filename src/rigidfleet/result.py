@@ -33,16 +33,14 @@ from typing import (
 )
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rigidfleet.errors import MissionError, ResultError
 from rigidfleet.math import attitude
+from rigidfleet.typing import Bools, Floats, Ints
 
 if TYPE_CHECKING:
     from rigidfleet.mission import Mission
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 #: Version of the file format; files with a higher one are refused.
 SCHEMA_VERSION = 2
@@ -389,7 +387,7 @@ class Result:
         return f"it has no formation {min(map(repr, unknown))}" if unknown else ""
 
     @cached_property
-    def left(self) -> NDArray[np.bool_]:
+    def left(self) -> Bools:
         """Which agents are left (K, N): not lost by then, as the mission has it."""
         return self.time[:, None] <= self.mission.lost_at
 

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from rigidfleet.assessment.measure import Flight, Floats, angle_between, is_rigid
+from rigidfleet.assessment.measure import Flight, angle_between, is_rigid
 from rigidfleet.assessment.verdict import (
     DIP,
     FLIPPED,
@@ -20,6 +20,7 @@ from rigidfleet.assessment.verdict import (
     value,
 )
 from rigidfleet.result import Result
+from rigidfleet.typing import Floats
 
 # Rounding on a limit is not beyond it.
 _SLACK = 1e-9

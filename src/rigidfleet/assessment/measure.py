@@ -8,7 +8,6 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rigidfleet.assessment.verdict import (
     SENSE,
@@ -23,9 +22,7 @@ from rigidfleet.formation import shapes
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity as geometry
 from rigidfleet.result import PAD, PhaseRecord, Result
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from rigidfleet.typing import Bools, Floats, Ints
 
 #: Slots thinner than this, relative to their length, are planar or straight: distances of seven digits
 #: leave a flat shape 3e-4 thick.
@@ -176,7 +173,7 @@ class Flight:
             "phase": self.result.phases[self.result.phase[k]].name,
         }
 
-    def first(self, broken: NDArray[np.bool_]) -> float:
+    def first(self, broken: Bools) -> float:
         """Time [s] of the first sample at which something is broken; infinity if it never is."""
         return float(self.result.time[int(np.argmax(broken))]) if broken.any() else math.inf
 

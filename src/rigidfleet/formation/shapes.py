@@ -15,12 +15,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from rigidfleet.errors import Finding, MissionError
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from rigidfleet.typing import Floats, Ints
 
 #: Relative tolerance within which given distances must be realisable. Flat and straight shapes sit exactly
 #: on the limit, so distances need about seven digits: 5.656854, not 5.657.

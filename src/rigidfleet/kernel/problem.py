@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from rigidfleet.typing import Bools, Edges, Floats
 
 # Multiplier solves (`Law.solver`).
 ITERATED, SPECTRAL, EXACT, PINV = range(4)
@@ -25,11 +25,11 @@ RIGID, PINV_EQUAL, PINV_INERTIA, PINV_INERTIA_FORCE = range(4)
 class Vehicles(NamedTuple):
     """The agents: point masses."""
 
-    m: Array  # (N,) mass [kg]
-    inverse: Array  # (N,) of it [1/kg]
+    m: Floats  # (N,) mass [kg]
+    inverse: Floats  # (N,) of it [1/kg]
     M: float  # their sum [kg]
     mean: float  # mean mass of those that have not been lost [kg], the laws' unit of mass
-    thrust_limit: Array  # (N,) [N], inf where unlimited
+    thrust_limit: Floats  # (N,) [N], inf where unlimited
     saturate: bool  # clip the thrust at its limit
     g: float  # gravity along -z [m/s^2]
 
@@ -41,10 +41,10 @@ class Graph(NamedTuple):
     that agent adds to ``A = J M^-1 J^T``: ``A[k, l] = weight[p] * (u_k . u_l)``.
     """
 
-    edges: NDArray[np.uint32]  # (m, 2), agents from 0; unsigned, which makes an index cheaper
-    pairs: NDArray[np.uint32]  # (P, 2)
-    weight: Array  # (P,) +-1/m_i [1/kg]
-    diagonal: Array  # (m,) of A: 1/m_i + 1/m_j [1/kg]
+    edges: Edges  # (m, 2), agents from 0; unsigned, which makes an index cheaper
+    pairs: Edges  # (P, 2)
+    weight: Floats  # (P,) +-1/m_i [1/kg]
+    diagonal: Floats  # (m,) of A: 1/m_i + 1/m_j [1/kg]
     solver: int = 0  # address of what solves for the multipliers of a large formation (`large`)
 
 
@@ -68,11 +68,11 @@ class Reference(NamedTuple):
     kind: int
     t0: float  # [s]
     T_b: float  # [s]
-    d0: Array  # (m,) distances before [m]
-    d1: Array  # (m,) distances after [m]
-    p0: Array  # (N, 3) slots before, body axes [m]
-    dp: Array  # (N, 3) what the blend adds to them [m]
-    turn: Array  # (3,) rotation vector by which the slots turn meanwhile [rad]
+    d0: Floats  # (m,) distances before [m]
+    d1: Floats  # (m,) distances after [m]
+    p0: Floats  # (N, 3) slots before, body axes [m]
+    dp: Floats  # (N, 3) what the blend adds to them [m]
+    turn: Floats  # (3,) rotation vector by which the slots turn meanwhile [rad]
 
 
 class Motion(NamedTuple):
@@ -82,30 +82,30 @@ class Motion(NamedTuple):
     attitude ``T1``: body -> world is ``T1^T Exp(phi)``.
     """
 
-    knots: Array  # (n + 1,) [s]
-    coefficients: Array  # (n, 6, 6): piece, channel, power of (t - knots[piece])
-    T1: Array  # (3, 3) world -> body
+    knots: Floats  # (n + 1,) [s]
+    coefficients: Floats  # (n, 6, 6): piece, channel, power of (t - knots[piece])
+    T1: Floats  # (3, 3) world -> body
 
 
 class Feedback(NamedTuple):
     """LQR on the virtual body: gain tables over the time to go, and the moving target."""
 
-    to_go: Array  # (n,) increasing, from 0 [s]
-    gain: Array  # (n, 4): position [1/s^2], velocity [1/s]; attitude, rate
-    slope: Array  # (n, 4) their derivatives by the time to go
+    to_go: Floats  # (n,) increasing, from 0 [s]
+    gain: Floats  # (n, 4): position [1/s^2], velocity [1/s]; attitude, rate
+    slope: Floats  # (n, 4) their derivatives by the time to go
     arrival: float  # T [s]
-    r: Array  # (3,) target at T [m]
-    v: Array  # (3,) [m/s]
-    T1: Array  # (3, 3) target attitude at T, world -> body
-    omega: Array  # (3,) target rates, body axes [rad/s]
-    hold: Array  # (4,) gains after T
+    r: Floats  # (3,) target at T [m]
+    v: Floats  # (3,) [m/s]
+    T1: Floats  # (3, 3) target attitude at T, world -> body
+    omega: Floats  # (3,) target rates, body axes [rad/s]
+    hold: Floats  # (4,) gains after T
 
 
 class Control(NamedTuple):
     """Input law of a phase."""
 
     kind: int
-    force: Array  # (N, 3) open loop: input force, weight balance included [N]
+    force: Floats  # (N, 3) open loop: input force, weight balance included [N]
     k1: float  # local LQR [1/s^2]
     k2: float  # [1/s]
     allocation: int
@@ -118,17 +118,17 @@ class Disturbance(NamedTuple):
     """
 
     active: bool  # whether there is any; `inverse` counts always
-    m: Array  # (N,) true mass [kg]
-    inverse: Array  # (N,) of it [1/kg]
-    drag: Array  # (N,) [N s/m]
-    wind: Array  # (3,) steady, world [m/s]
+    m: Floats  # (N,) true mass [kg]
+    inverse: Floats  # (N,) of it [1/kg]
+    drag: Floats  # (N,) [N s/m]
+    wind: Floats  # (3,) steady, world [m/s]
     gust_step: float  # between knots [s]
-    gust: Array  # (K, N, 3) [m/s]
+    gust: Floats  # (K, N, 3) [m/s]
     noise_step: float  # [s]
-    noise_r: Array  # (K', N, 3) of the measured position [m]
-    noise_v: Array  # (K', N, 3) of the measured velocity [m/s]
-    lost: NDArray[np.bool_]  # (N,) without thrust
-    floor: Array  # (N,) height at which a lost vehicle comes to rest [m]
+    noise_r: Floats  # (K', N, 3) of the measured position [m]
+    noise_v: Floats  # (K', N, 3) of the measured velocity [m/s]
+    lost: Bools  # (N,) without thrust
+    floor: Floats  # (N,) height at which a lost vehicle comes to rest [m]
 
 
 class Program(NamedTuple):
@@ -150,47 +150,47 @@ class Program(NamedTuple):
 class Workspace(NamedTuple):
     """Everything the right-hand side writes; after a call it holds the values at that state."""
 
-    r: Array  # (N, 3) position, world [m]
-    v: Array  # (N, 3) velocity [m/s]
-    r_seen: Array  # (N, 3) position as measured [m], where there is noise
-    v_seen: Array  # (N, 3) velocity as measured [m/s], where there is noise
-    u: Array  # (m, 3) unit vectors of the edges
-    L: Array  # (m,) lengths [m]
-    d: Array  # (m,) references [m]
-    d_dot: Array  # (m,) [m/s]
-    d_ddot: Array  # (m,) [m/s^2]
-    c: Array  # (m,) constraints [m]
-    b: Array  # (m,) right side of the multiplier equation [m/s^2]
-    A: Array  # (m, m) J M^-1 J^T, or (3N, 3N) J^T J; its lower triangle is factored in place
-    V: Array  # (m, m) eigenvectors, where a law needs them
-    w: Array  # (m,) eigenvalues; work
-    multiplier: Array  # (m,) [N]
-    f_E: Array  # (N, 3) gravity, the user's force and disturbances [N]
-    f_u: Array  # (N, 3) input [N]
-    f_C: Array  # (N, 3) constraint force [N]
-    f_D: Array  # (N, 3) force of the air, part of f_E, where there are disturbances [N]
-    a: Array  # (N, 3) acceleration [m/s^2]
-    p: Array  # (N, 3) slots, body axes [m]
-    p_dot: Array  # (N, 3)
-    p_ddot: Array  # (N, 3)
-    r_ref: Array  # (N, 3) desired positions, world [m]
-    v_ref: Array  # (N, 3)
-    a_ref: Array  # (N, 3)
-    cm: Array  # (5, 3): CM position, velocity; omega, h, world axes; omega, body axes
-    I: Array  # (3, 3) inertia about the CM, world axes [kg m^2]
-    I_inv: Array  # (3, 3) its pseudo-inverse
-    T: Array  # (3, 3) world -> body, of the frame among the states
-    body: Array  # (8, 3) reference motion: r, v, a of the CM; omega, omega_dot; phi, its rates
-    gain: Array  # (4,)
-    E: Array  # (3, 3) a relative rotation
-    T_ref: Array  # (3, 3) world -> body, of the reference motion
-    wrench: Array  # (6,) asked of the agents: force, torque about the CM, world [N, N m]
-    H: Array  # (3N, 3N) normal matrix of the paper's H; work
-    H_V: Array  # (3N, 3N)
-    H_w: Array  # (2, 3N): right side, eigenvalues
+    r: Floats  # (N, 3) position, world [m]
+    v: Floats  # (N, 3) velocity [m/s]
+    r_seen: Floats  # (N, 3) position as measured [m], where there is noise
+    v_seen: Floats  # (N, 3) velocity as measured [m/s], where there is noise
+    u: Floats  # (m, 3) unit vectors of the edges
+    L: Floats  # (m,) lengths [m]
+    d: Floats  # (m,) references [m]
+    d_dot: Floats  # (m,) [m/s]
+    d_ddot: Floats  # (m,) [m/s^2]
+    c: Floats  # (m,) constraints [m]
+    b: Floats  # (m,) right side of the multiplier equation [m/s^2]
+    A: Floats  # (m, m) J M^-1 J^T, or (3N, 3N) J^T J; its lower triangle is factored in place
+    V: Floats  # (m, m) eigenvectors, where a law needs them
+    w: Floats  # (m,) eigenvalues; work
+    multiplier: Floats  # (m,) [N]
+    f_E: Floats  # (N, 3) gravity, the user's force and disturbances [N]
+    f_u: Floats  # (N, 3) input [N]
+    f_C: Floats  # (N, 3) constraint force [N]
+    f_D: Floats  # (N, 3) force of the air, part of f_E, where there are disturbances [N]
+    a: Floats  # (N, 3) acceleration [m/s^2]
+    p: Floats  # (N, 3) slots, body axes [m]
+    p_dot: Floats  # (N, 3)
+    p_ddot: Floats  # (N, 3)
+    r_ref: Floats  # (N, 3) desired positions, world [m]
+    v_ref: Floats  # (N, 3)
+    a_ref: Floats  # (N, 3)
+    cm: Floats  # (5, 3): CM position, velocity; omega, h, world axes; omega, body axes
+    I: Floats  # (3, 3) inertia about the CM, world axes [kg m^2]
+    I_inv: Floats  # (3, 3) its pseudo-inverse
+    T: Floats  # (3, 3) world -> body, of the frame among the states
+    body: Floats  # (8, 3) reference motion: r, v, a of the CM; omega, omega_dot; phi, its rates
+    gain: Floats  # (4,)
+    E: Floats  # (3, 3) a relative rotation
+    T_ref: Floats  # (3, 3) world -> body, of the reference motion
+    wrench: Floats  # (6,) asked of the agents: force, torque about the CM, world [N, N m]
+    H: Floats  # (3N, 3N) normal matrix of the paper's H; work
+    H_V: Floats  # (3N, 3N)
+    H_w: Floats  # (2, 3N): right side, eigenvalues
 
 
-def zeros(*shape: int) -> Array:
+def zeros(*shape: int) -> Floats:
     """Zeros that begin with a cache line: whether rows straddle lines costs up to a tenth."""
     size = math.prod(shape)
     room = np.zeros(size + 8)
@@ -229,7 +229,7 @@ def padded(count: int) -> int:
     return -(-count // 8) * 8
 
 
-def _side_by_side(**shapes: tuple[int, ...]) -> dict[str, Array]:
+def _side_by_side(**shapes: tuple[int, ...]) -> dict[str, Floats]:
     """Arrays of zeros, each of which begins with a cache line."""
     sizes = [math.prod(shape) for shape in shapes.values()]
     ends = list(accumulate(map(padded, sizes)))
@@ -240,7 +240,7 @@ def _side_by_side(**shapes: tuple[int, ...]) -> dict[str, Array]:
     }
 
 
-def calm(masses: Array) -> Disturbance:
+def calm(masses: Floats) -> Disturbance:
     """No disturbance of agents with these masses (N,) [kg]."""
     n = len(masses)
     none = zeros(0, n, 3)
@@ -250,7 +250,7 @@ def calm(masses: Array) -> Disturbance:
     )  # fmt: skip
 
 
-def graph(ends: NDArray[np.integer], masses: Array, *, large: bool = False) -> Graph:
+def graph(ends: NDArray[np.integer], masses: Floats, *, large: bool = False) -> Graph:
     """Prepare a constraint graph: edges (m, 2) with agents from 0, (N,) masses [kg].
 
     A ``large`` one, which is not solved densely, needs no pairs of edges.

@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rigidfleet.kernel.problem import Array, padded, zeros
+from rigidfleet.kernel.problem import padded, zeros
+from rigidfleet.typing import Bools, Floats, Ints
 
 #: What an integration returns.
 FINISHED, PAUSED, COLLAPSED = range(3)
@@ -30,7 +31,7 @@ _TRAIL = 1 << 19
 KNOTS = np.linspace(0.0, 1.0, 5)
 
 
-def bernstein(x: Array) -> Array:
+def bernstein(x: Floats) -> Floats:
     """Bernstein polynomials (..., 5) of fourth degree at x (...)."""
     return np.stack([math.comb(4, k) * x**k * (1.0 - x) ** (4 - k) for k in range(5)], axis=-1)
 
@@ -44,10 +45,10 @@ class Trail(NamedTuple):
     ``points`` are the Bernstein coefficients of the continuous extension, a polynomial of fourth degree.
     """
 
-    clock: Array  # (S, 2) start [s], length [s]
-    points: Array  # (S, 5, n)
-    gauge: Array  # (S, 3N + 2m) at the end, see `gauge.read_gauge`
-    start: Array  # (3N + 2m,) at the start of the first step, behind a jump
+    clock: Floats  # (S, 2) start [s], length [s]
+    points: Floats  # (S, 5, n)
+    gauge: Floats  # (S, 3N + 2m) at the end, see `gauge.read_gauge`
+    start: Floats  # (3N + 2m,) at the start of the first step, behind a jump
 
 
 def trail(states: int, agents: int, edges: int) -> Trail:
@@ -66,39 +67,39 @@ NO_TRAIL = Trail(np.zeros((0, 2)), np.zeros((0, 5, 0)), np.zeros((0, 0)), np.zer
 class Monitor(NamedTuple):
     """Worst values of a phase, in continuous time, and what they are looked for with; see `kernel.monitor`."""
 
-    worst: Array  # (16,) by quantity; infinity where there is none yet
-    when: Array  # (16,) [s]
-    who: NDArray[np.int64]  # (16, 2) agents; agent and obstacle; agents of an edge; -1: nobody
-    sign: Array  # (1,) of the greatest tension
-    radius: Array  # (N,) [m]
-    left: NDArray[np.bool_]  # (N,) who is judged: not lost
-    standing: NDArray[np.int64]  # (N,) whether an agent stands on an obstacle since the start
-    low: Array  # (N, 3) clearance, time and obstacle of who may be landing; infinity: nobody
+    worst: Floats  # (16,) by quantity; infinity where there is none yet
+    when: Floats  # (16,) [s]
+    who: Ints  # (16, 2) agents; agent and obstacle; agents of an edge; -1: nobody
+    sign: Floats  # (1,) of the greatest tension
+    radius: Floats  # (N,) [m]
+    left: Bools  # (N,) who is judged: not lost
+    standing: Ints  # (N,) whether an agent stands on an obstacle since the start
+    low: Floats  # (N, 3) clearance, time and obstacle of who may be landing; infinity: nobody
     pad: float  # who is so near an obstacle may stand on it [m]
-    boxes: Array  # (B, 6) corners of obstacles; of the ground infinite
-    fence: Array  # (F, 6) corners of the geofence, if there is one
-    pairs: NDArray[np.int64]  # (P, 2) whose separation is watched
-    struck: NDArray[np.int64]  # (P', 2) of a lost agent and one that is left
-    columns: NDArray[np.int64]  # (P'', 2) who may be below one another
-    flags: NDArray[np.int64]  # (4,) see `monitor.watch`
+    boxes: Floats  # (B, 6) corners of obstacles; of the ground infinite
+    fence: Floats  # (F, 6) corners of the geofence, if there is one
+    pairs: Ints  # (P, 2) whose separation is watched
+    struck: Ints  # (P', 2) of a lost agent and one that is left
+    columns: Ints  # (P'', 2) who may be below one another
+    flags: Ints  # (4,) see `monitor.watch`
     recorder: int  # address of the recorder, with its arguments: `time` and `states` to evaluate at
     stretch: int
     record: int
-    time: Array  # (1,) [s]
-    states: Array  # (1, n)
-    gauge: Array  # (3, 3N + 2m) forces before the first step, and at points within
-    places: Array  # (N, 5, 3) where agents are over a step: control points [m]
-    curve: Array  # (5, 3) of one pair
-    work: Array  # (40, 11) polynomials
-    pieces: Array  # (40, 17) curves
-    basis: Array  # (5, 5)
-    poses: Array  # (5, 15) attitude, centre and its velocity at knots
-    knots: Array  # (5, 3)
-    room: Array  # (3, 10)
+    time: Floats  # (1,) [s]
+    states: Floats  # (1, n)
+    gauge: Floats  # (3, 3N + 2m) forces before the first step, and at points within
+    places: Floats  # (N, 5, 3) where agents are over a step: control points [m]
+    curve: Floats  # (5, 3) of one pair
+    work: Floats  # (40, 11) polynomials
+    pieces: Floats  # (40, 17) curves
+    basis: Floats  # (5, 5)
+    poses: Floats  # (5, 15) attitude, centre and its velocity at knots
+    knots: Floats  # (5, 3)
+    room: Floats  # (3, 10)
 
 
 def monitor(
-    radius: Array, boxes: Array, fence: Array, states: int, gauge: int, **given: Any
+    radius: Floats, boxes: Floats, fence: Floats, states: int, gauge: int, **given: Any
 ) -> Monitor:
     """Begin to watch: nothing is known yet, and no pairs are listed but those ``given`` among the fields."""
     n, none = len(radius), np.zeros((0, 2), dtype=np.int64)
@@ -121,9 +122,9 @@ def monitor(
 class Integrator(NamedTuple):
     """State of an integration, so that it can pause and go on."""
 
-    y: Array  # (n,) state at `clock[0]`
-    K: Array  # (10, n padded to eights) stages, K[0] the derivative at y; y, trial, tolerance
-    clock: Array  # (3,) t [s], next step h [s], logarithm of the last error
+    y: Floats  # (n,) state at `clock[0]`
+    K: Floats  # (10, n padded to eights) stages, K[0] the derivative at y; y, trial, tolerance
+    clock: Floats  # (3,) t [s], next step h [s], logarithm of the last error
     count: NDArray[
         np.int64
     ]  # (5,) evaluations, accepted, rejected, samples written, steps in the trail
@@ -132,11 +133,11 @@ class Integrator(NamedTuple):
 
 
 def integrator(
-    y: Array,
+    y: Floats,
     t: float,
     *,
     rtol: float,
-    atol: Array,
+    atol: Floats,
     step: float = 1e-3,
     trail: Trail = NO_TRAIL,
 ) -> Integrator:
@@ -159,34 +160,34 @@ class Stretch(NamedTuple):
     t_end: float  # time to land on [s]
     fresh: bool  # whether the derivative at the start is not known: after a start or a switch
     max_steps: int  # pause after so many
-    times: Array  # (K,) [s], increasing
-    samples: Array  # (K, n) states there: written, or, by the recorder, read
-    dy: Array  # (n,) the recorder's derivative
+    times: Floats  # (K,) [s], increasing
+    samples: Floats  # (K, n) states there: written, or, by the recorder, read
+    dy: Floats  # (n,) the recorder's derivative
 
 
 class Record(NamedTuple):
     """What is recorded, one row per sample."""
 
-    r: Array  # (K, N, 3)
-    v: Array
-    a: Array
-    f_E: Array
-    f_u: Array
-    f_C: Array
-    r_ref: Array
-    c: Array  # (K, m)
-    L: Array
-    d: Array
-    d_dot: Array
-    multiplier: Array
-    p: Array  # (K, N, 3) slots
-    motion: Array  # (K, 6) CM reference position and velocity
-    rates: Array  # (K, 3) reference rates, body axes
-    T_ref: Array  # (K, 3, 3)
-    wrench: Array  # (K, 6)
-    r_seen: Array  # (K, N, 3) as measured
-    v_seen: Array
-    f_D: Array
+    r: Floats  # (K, N, 3)
+    v: Floats
+    a: Floats
+    f_E: Floats
+    f_u: Floats
+    f_C: Floats
+    r_ref: Floats
+    c: Floats  # (K, m)
+    L: Floats
+    d: Floats
+    d_dot: Floats
+    multiplier: Floats
+    p: Floats  # (K, N, 3) slots
+    motion: Floats  # (K, 6) CM reference position and velocity
+    rates: Floats  # (K, 3) reference rates, body axes
+    T_ref: Floats  # (K, 3, 3)
+    wrench: Floats  # (K, 6)
+    r_seen: Floats  # (K, N, 3) as measured
+    v_seen: Floats
+    f_D: Floats
 
 
 def recorder(k: int, n: int, m: int) -> Record:

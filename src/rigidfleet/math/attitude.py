@@ -13,12 +13,12 @@ attitude before its frame is attached.
 """
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from rigidfleet.typing import Floats
 
 
-def dcm_from_quaternion(q: ArrayLike) -> Array:
+def dcm_from_quaternion(q: ArrayLike) -> Floats:
     """Direction cosines T(q) (..., 3, 3), world to body, of quaternions (..., 4).
 
     The quaternions need not be of unit length. ValueError where one is zero.
@@ -33,7 +33,7 @@ def dcm_from_quaternion(q: ArrayLike) -> Array:
     return _matrices(rows)
 
 
-def _products() -> Array:
+def _products() -> Floats:
     """4 q q^T - 1 (4, 4) of a rotation T (3, 3), which is linear in T: the map (9, 16)."""
     N = np.zeros((3, 3, 4, 4))
     for i in range(3):
@@ -51,7 +51,7 @@ def _products() -> Array:
 _PRODUCTS = _products()
 
 
-def quaternion_from_dcm(T: ArrayLike) -> Array:
+def quaternion_from_dcm(T: ArrayLike) -> Floats:
     """Unit quaternions (..., 4) with q0 >= 0 of direction cosines (..., 3, 3).
 
     By the branch of the largest component, so that nothing small is divided by. ValueError where
@@ -71,7 +71,7 @@ def quaternion_from_dcm(T: ArrayLike) -> Array:
     return _scalar_positive(_unit(N[np.arange(len(N)), largest].reshape(*T.shape[:-2], 4)))
 
 
-def dcm_from_euler(euler: ArrayLike) -> Array:
+def dcm_from_euler(euler: ArrayLike) -> Floats:
     """Direction cosines (..., 3, 3) of Euler angles (..., 3) = (roll, pitch, yaw) [rad]."""
     angles = np.moveaxis(_vectors("euler", euler, 3), -1, 0)
     sr, sp, sy = np.sin(angles)
@@ -84,7 +84,7 @@ def dcm_from_euler(euler: ArrayLike) -> Array:
     return _matrices(rows)
 
 
-def euler_from_dcm(T: ArrayLike) -> Array:
+def euler_from_dcm(T: ArrayLike) -> Floats:
     """Euler angles (..., 3) = (roll, pitch, yaw) [rad] of direction cosines (..., 3, 3).
 
     Roll and yaw lie in [-pi, pi], pitch in [-pi/2, pi/2]. At pitch = +-90 deg only the sum or
@@ -103,7 +103,7 @@ def euler_from_dcm(T: ArrayLike) -> Array:
     return np.stack([np.where(locked, 0.0, roll), pitch, yaw], axis=-1)
 
 
-def quaternion_from_euler(euler: ArrayLike) -> Array:
+def quaternion_from_euler(euler: ArrayLike) -> Floats:
     """Unit quaternions (..., 4) with q0 >= 0 of Euler angles (..., 3) = (roll, pitch, yaw) [rad]."""
     half = 0.5 * np.moveaxis(_vectors("euler", euler, 3), -1, 0)
     sr, sp, sy = np.sin(half)
@@ -117,12 +117,12 @@ def quaternion_from_euler(euler: ArrayLike) -> Array:
     return _scalar_positive(np.stack(q, axis=-1))
 
 
-def euler_from_quaternion(q: ArrayLike) -> Array:
+def euler_from_quaternion(q: ArrayLike) -> Floats:
     """Euler angles (..., 3) = (roll, pitch, yaw) [rad] of quaternions (..., 4); see `euler_from_dcm`."""
     return euler_from_dcm(dcm_from_quaternion(q))
 
 
-def quaternion_rate(q: ArrayLike, omega: ArrayLike) -> Array:
+def quaternion_rate(q: ArrayLike, omega: ArrayLike) -> Floats:
     """Rate (..., 4) [1/s] of quaternions (..., 4) at body rates omega (..., 3) = (p, q, r) [rad/s].
 
     qdot = 1/2 Omega(omega) q (Eq. 21 of the paper); the same as 1/2 q (0, omega), and as
@@ -133,7 +133,7 @@ def quaternion_rate(q: ArrayLike, omega: ArrayLike) -> Array:
     return 0.5 * quaternion_multiply(q, np.concatenate([zero, omega], axis=-1))
 
 
-def quaternion_multiply(p: ArrayLike, q: ArrayLike) -> Array:
+def quaternion_multiply(p: ArrayLike, q: ArrayLike) -> Floats:
     """Hamilton's product p q (..., 4): T(p q) = T(q) T(p), first p, then q from there."""
     p0, p1, p2, p3 = np.moveaxis(_vectors("p", p, 4), -1, 0)
     q0, q1, q2, q3 = np.moveaxis(_vectors("q", q, 4), -1, 0)
@@ -146,12 +146,12 @@ def quaternion_multiply(p: ArrayLike, q: ArrayLike) -> Array:
     return np.stack(product, axis=-1)
 
 
-def quaternion_conjugate(q: ArrayLike) -> Array:
+def quaternion_conjugate(q: ArrayLike) -> Floats:
     """Conjugate (q0, -q1, -q2, -q3) (..., 4): T of it is the transpose, body to world."""
     return _vectors("q", q, 4) * np.array([1.0, -1.0, -1.0, -1.0])
 
 
-def unwrap_quaternion(q: ArrayLike) -> Array:
+def unwrap_quaternion(q: ArrayLike) -> Floats:
     """Choose the signs of a time series (..., K, 4) so that neighbours never jump to -q.
 
     Keeps the first sample's sign; a gap of NaN is bridged from the last sample before it.
@@ -167,7 +167,7 @@ def unwrap_quaternion(q: ArrayLike) -> Array:
     return q * np.concatenate([np.ones_like(q[..., :1, 0]), sign], axis=-1)[..., None]
 
 
-def angle_between(p: ArrayLike, q: ArrayLike) -> Array:
+def angle_between(p: ArrayLike, q: ArrayLike) -> Floats:
     """Angle (...) [rad] in [0, pi] of the rotation that takes attitude p into q, both (..., 4).
 
     Exact to rounding for small angles too, where an arc cosine keeps half of the digits.
@@ -177,7 +177,7 @@ def angle_between(p: ArrayLike, q: ArrayLike) -> Array:
     return 4.0 * np.arctan2(np.minimum(apart, together), np.maximum(apart, together))
 
 
-def quaternion_from_rotation_vector(phi: ArrayLike) -> Array:
+def quaternion_from_rotation_vector(phi: ArrayLike) -> Floats:
     """Unit quaternions (..., 4) of rotation vectors phi (..., 3) [rad]; q0 < 0 beyond half a turn."""
     phi = _vectors("phi", phi, 3)
     x = np.linalg.norm(phi, axis=-1, keepdims=True)
@@ -186,7 +186,7 @@ def quaternion_from_rotation_vector(phi: ArrayLike) -> Array:
     return np.concatenate([np.cos(0.5 * x), ratio * phi], axis=-1)
 
 
-def rotation_vector_from_quaternion(q: ArrayLike) -> Array:
+def rotation_vector_from_quaternion(q: ArrayLike) -> Floats:
     """Rotation vectors (..., 3) [rad], at most pi long, of quaternions (..., 4).
 
     Of the two vectors of half a turn it gives the one along (q1, q2, q3).
@@ -198,17 +198,17 @@ def rotation_vector_from_quaternion(q: ArrayLike) -> Array:
     return vector * np.where(tiny, 2.0, 2.0 * np.arctan2(n, q[..., :1]) / np.where(tiny, 1.0, n))
 
 
-def dcm_from_rotation_vector(phi: ArrayLike) -> Array:
+def dcm_from_rotation_vector(phi: ArrayLike) -> Floats:
     """Direction cosines T = exp(-[phi x]) (..., 3, 3) of rotation vectors phi (..., 3) [rad]."""
     return dcm_from_quaternion(quaternion_from_rotation_vector(phi))
 
 
-def rotation_vector_from_dcm(T: ArrayLike) -> Array:
+def rotation_vector_from_dcm(T: ArrayLike) -> Floats:
     """Rotation vectors (..., 3) [rad], at most pi long, of direction cosines (..., 3, 3)."""
     return rotation_vector_from_quaternion(quaternion_from_dcm(T))
 
 
-def rotation_vector_rate(phi: ArrayLike, omega: ArrayLike) -> Array:
+def rotation_vector_rate(phi: ArrayLike, omega: ArrayLike) -> Floats:
     """Rate (..., 3) [rad/s] of rotation vectors phi (..., 3) [rad] at body rates omega (..., 3) [rad/s].
 
     phi_dot = omega + phi x omega / 2 + k phi x (phi x omega), k = (1 - x/2 cot(x/2))/x^2,
@@ -224,7 +224,7 @@ def rotation_vector_rate(phi: ArrayLike, omega: ArrayLike) -> Array:
     return omega + 0.5 * turn + k * np.cross(phi, turn)
 
 
-def triangle_frame(r: ArrayLike, masses: ArrayLike | None = None) -> Array:
+def triangle_frame(r: ArrayLike, masses: ArrayLike | None = None) -> Floats:
     """Body frame of a triangle by the paper's recipe ("Body Frame Attachment"): T (..., 3, 3).
 
     x points from the centre of mass to agent 3, y along r_1 - r_2 made orthogonal to x, and
@@ -251,8 +251,8 @@ def triangle_frame(r: ArrayLike, masses: ArrayLike | None = None) -> Array:
     return np.stack([x, np.cross(z, x), z], axis=-2)
 
 
-def _vectors(name: str, value: ArrayLike, *shape: int) -> Array:
-    """Array of floats whose last axes have this shape."""
+def _vectors(name: str, value: ArrayLike, *shape: int) -> Floats:
+    """Floats of floats whose last axes have this shape."""
     array = np.asarray(value, dtype=float)
     if array.shape[-len(shape) :] != shape:
         wanted = ", ".join(["...", *map(str, shape)])
@@ -260,13 +260,13 @@ def _vectors(name: str, value: ArrayLike, *shape: int) -> Array:
     return array
 
 
-def _matrices(rows: list[list[Array]]) -> Array:
+def _matrices(rows: list[list[Floats]]) -> Floats:
     """Matrices (..., 3, 3) of entries (...)."""
     entries = np.array(rows)
     return np.ascontiguousarray(entries.transpose(*range(2, entries.ndim), 0, 1))
 
 
-def _unit(q: ArrayLike) -> Array:
+def _unit(q: ArrayLike) -> Floats:
     q = _vectors("q", q, 4)
     norm = np.sqrt((q * q).sum(axis=-1, keepdims=True))
     if (norm == 0.0).any():
@@ -276,5 +276,5 @@ def _unit(q: ArrayLike) -> Array:
     return q / norm
 
 
-def _scalar_positive(q: Array) -> Array:
+def _scalar_positive(q: Floats) -> Floats:
     return np.where(q[..., :1] < 0.0, -q, q)

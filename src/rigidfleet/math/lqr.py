@@ -22,9 +22,9 @@ import math
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from rigidfleet.typing import Bools, Floats
 
 # An array as what it is kept under: its shape and contents.
 Key = tuple[tuple[int, ...], bytes]
@@ -43,7 +43,7 @@ _B = np.array([[0.0], [1.0]])
 
 def infinite_horizon(
     A: ArrayLike, B: ArrayLike, Q: ArrayLike, R: ArrayLike, *, N: ArrayLike | None = None
-) -> tuple[Array, Array]:
+) -> tuple[Floats, Floats]:
     """Gain K (m, n) and cost P (n, n) for T to infinity: u = -K x.
 
     P is the Riccati equation's stabilising rest point: the least cost of all inputs that bring x to
@@ -91,7 +91,7 @@ def finite_horizon(
     time_to_go: ArrayLike,
     *,
     N: ArrayLike | None = None,
-) -> tuple[Array, Array]:
+) -> tuple[Floats, Floats]:
     """Cost P (..., n, n) and gain K (..., m, n) at times to go T - t (...) [s]: u = -K x.
 
     From the exponential of the Hamiltonian matrix, taken over a short step and doubled in a form
@@ -116,7 +116,7 @@ def closed_loop_response(
     times: ArrayLike,
     *,
     N: ArrayLike | None = None,
-) -> tuple[Array, Array]:
+) -> tuple[Floats, Floats]:
     """Optimal states x (K, n, ...) and inputs u (K, m, ...) at times (K,) [s] in [0, T] from x0 (n, ...).
 
     The solution of the Hamiltonian's boundary problem, not an integration: every time stands for
@@ -159,13 +159,13 @@ def _gains(Q_key: Key, R_key: Key) -> tuple[float, float]:
 
 def finite_horizon_trajectory(
     times: ArrayLike,
-    start: tuple[ArrayLike, ArrayLike] | Array,
-    target: tuple[ArrayLike, ArrayLike] | Array,
+    start: tuple[ArrayLike, ArrayLike] | Floats,
+    target: tuple[ArrayLike, ArrayLike] | Floats,
     T: float,
     Q: ArrayLike,
     R: ArrayLike,
     S: ArrayLike,
-) -> tuple[Array, Array, Array]:
+) -> tuple[Floats, Floats, Floats]:
     """Flight of a double integrator to a moving target: x, v, a (K, ...) at times (K,) [s] in [0, T].
 
     ``start`` = (x, v) at t = 0 and ``target`` = (x, v) at t = T [m, m/s], any shape, one entry
@@ -182,12 +182,12 @@ def finite_horizon_trajectory(
 
 def infinite_horizon_trajectory(
     times: ArrayLike,
-    start: tuple[ArrayLike, ArrayLike] | Array,
-    target: tuple[ArrayLike, ArrayLike] | Array,
+    start: tuple[ArrayLike, ArrayLike] | Floats,
+    target: tuple[ArrayLike, ArrayLike] | Floats,
     T: float,
     Q: ArrayLike,
     R: ArrayLike,
-) -> tuple[Array, Array, Array]:
+) -> tuple[Floats, Floats, Floats]:
     """The same flight under the infinite-horizon regulator, its gains constant.
 
     The target is where it moves at t = T; one that rests makes T nothing but the end of ``times``.
@@ -198,7 +198,7 @@ def infinite_horizon_trajectory(
 
 def knots(
     T: float, Q: ArrayLike, R: ArrayLike, S: ArrayLike | None = None, tolerance: float = 1e-10
-) -> Array:
+) -> Floats:
     """Knots (n + 1,) [s] from 0 to T between which quintics represent a flight of a double integrator.
 
     Position and velocity deviate by at most ``tolerance``, relative to the largest they reach, from
@@ -213,7 +213,7 @@ def knots(
 
 
 @lru_cache(_KEPT)
-def _knots(T: float, Q_key: Key, R_key: Key, S_key: Key, tolerance: float) -> Array:
+def _knots(T: float, Q_key: Key, R_key: Key, S_key: Key, tolerance: float) -> Floats:
     S = _array(S_key)
     _, _, Q, R, _ = _system(_A, _B, _array(Q_key), _array(R_key))
     fastest = np.abs(np.linalg.eigvals(_hamiltonian(_A, _B @ _solve(R, _B.T), Q))).max()
@@ -246,7 +246,7 @@ def _knots(T: float, Q_key: Key, R_key: Key, S_key: Key, tolerance: float) -> Ar
     return np.unique(np.concatenate(result))
 
 
-def quintic_pieces(times: ArrayLike, x: ArrayLike, v: ArrayLike, a: ArrayLike) -> Array:
+def quintic_pieces(times: ArrayLike, x: ArrayLike, v: ArrayLike, a: ArrayLike) -> Floats:
     """Quintics that meet x, v, a (n + 1, ...) at the times (n + 1,) [s]: coefficients (n, ..., 6).
 
     x(t) = sum_p coefficients[i, ..., p] (t - times[i])^p for times[i] <= t <= times[i + 1], with two
@@ -264,7 +264,7 @@ def quintic_pieces(times: ArrayLike, x: ArrayLike, v: ArrayLike, a: ArrayLike) -
     return _quintics(np.diff(t), (x[:-1], x[1:]), (v[:-1], v[1:]), (a[:-1], a[1:]))
 
 
-def _quintics(h: Array, x: ArrayLike, v: ArrayLike, a: ArrayLike) -> Array:
+def _quintics(h: Floats, x: ArrayLike, v: ArrayLike, a: ArrayLike) -> Floats:
     """Coefficients (n, ..., 6) from both ends' (2, n, ...) values, widths h (n,)."""
     (x0, x1), (v0, v1), (a0, a1) = (np.asarray(z) for z in (x, v, a))
     h = h.reshape(-1, *[1] * (x0.ndim - 1))
@@ -277,7 +277,7 @@ def _quintics(h: Array, x: ArrayLike, v: ArrayLike, a: ArrayLike) -> Array:
 
 
 @lru_cache(_KEPT)
-def _responses(*keys: Key) -> tuple[Array, Array]:
+def _responses(*keys: Key) -> tuple[Floats, Floats]:
     """States (K, n, n) and inputs (K, m, n) from each state alone; of A, B, Q, R, N, S, T and times."""
     *system, S, T, times = map(_array, keys)
     A, B, Q, R, N = _system(*system)
@@ -293,7 +293,7 @@ def _responses(*keys: Key) -> tuple[Array, Array]:
 
 
 @lru_cache(_KEPT)
-def _cost_at_rest(Q: Key, R: Key) -> Array:
+def _cost_at_rest(Q: Key, R: Key) -> Floats:
     """P (2, 2) of the double integrator's infinite horizon, as `infinite_horizon` has it.
 
     Its Riccati equation has a solution in closed form, exact whatever the weights.
@@ -311,12 +311,14 @@ def _key(value: ArrayLike) -> Key:
     return array.shape, array.tobytes()
 
 
-def _array(key: Key) -> Array:
+def _array(key: Key) -> Floats:
     shape, data = key
     return np.frombuffer(data).reshape(shape)
 
 
-def _reduced(A: Array, B: Array, Q: Array, R: Array, N: Array) -> tuple[Array, Array, Array]:
+def _reduced(
+    A: Floats, B: Floats, Q: Floats, R: Floats, N: Floats
+) -> tuple[Floats, Floats, Floats]:
     """The same problem without N, in the input u + R^-1 N^T x: its A, B R^-1 B^T and Q."""
     G = B @ _solve(R, B.T)
     if not N.any():
@@ -328,12 +330,12 @@ def _reduced(A: Array, B: Array, Q: Array, R: Array, N: Array) -> tuple[Array, A
     return A - B @ _solve(R, N.T), G, (vector * value) @ vector.T
 
 
-def _positive(weight: Array) -> bool:
+def _positive(weight: Floats) -> bool:
     """Whether a weight is positive semi-definite, to rounding."""
     return bool(np.linalg.eigvalsh(weight)[0] >= -_ROUNDING * np.abs(weight).max())
 
 
-def _cost_to_go(A: Array, G: Array, Q: Array, S: Array, tau: Array) -> Array:
+def _cost_to_go(A: Floats, G: Floats, Q: Floats, S: Floats, tau: Floats) -> Floats:
     """P (..., n, n) at times to go tau (...)."""
     X, Phi, W, V = _flow(A, G, Q, S, tau, tau.max(initial=0.0))
     D = S - X
@@ -342,8 +344,8 @@ def _cost_to_go(A: Array, G: Array, Q: Array, S: Array, tau: Array) -> Array:
 
 
 def _flow(
-    A: Array, G: Array, Q: Array, S: Array, tau: Array, T: float
-) -> tuple[Array, Array, Array, Array]:
+    A: Floats, G: Floats, Q: Floats, S: Floats, tau: Floats, T: float
+) -> tuple[Floats, Floats, Floats, Floats]:
     """X (n, n) and Phi, W, V (..., n, n) over tau (...), as `_propagate` has them of P - X.
 
     ValueError where P, from S, does not exist at all times to go up to T.
@@ -371,7 +373,7 @@ def _flow(
     return S, *_propagate(A, G, Q, tau, rate)[:3]
 
 
-def _stable_subspace(H: Array) -> Array:
+def _stable_subspace(H: Floats) -> Floats:
     """P (n, n), to some digits, from the stable half of a Hamiltonian matrix (2 n, 2 n).
 
     ValueError where an eigenvalue lies on the imaginary axis, within rounding of the matrix.
@@ -397,14 +399,14 @@ def _stable_subspace(H: Array) -> Array:
     return 0.5 * (P + P.T)
 
 
-def _rate(A: Array, G: Array, Q: Array) -> float:
+def _rate(A: Floats, G: Floats, Q: Floats) -> float:
     """Of the fastest motion of a Hamiltonian system [1/s]."""
     return float(np.abs(np.linalg.eigvals(_hamiltonian(A, G, Q))).max())
 
 
 def _propagate(
-    A: Array, G: Array, Q: Array, tau: Array, rate: float
-) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
+    A: Floats, G: Floats, Q: Floats, tau: Floats, rate: float
+) -> tuple[Floats, Floats, Floats, Bools]:
     """Phi, W, V (..., n, n): x(tau) = Phi x(0) - W y(tau), y(0) = V x(0) + Phi^T y(tau).
 
     The flow of the Hamiltonian system x' = A x - G y, y' = -Q x - A^T y over tau, solved for what
@@ -450,21 +452,21 @@ def _propagate(
     return identity + D, W, V, escaped
 
 
-def _hamiltonian(A: Array, G: Array, Q: Array) -> Array:
+def _hamiltonian(A: Floats, G: Floats, Q: Floats) -> Floats:
     return np.block([[A, -G], [-Q, -A.T]])
 
 
-def _solve(M: Array, b: Array) -> Array:
+def _solve(M: Floats, b: Floats) -> Floats:
     return np.linalg.solve(M, b).astype(float, copy=False)
 
 
-def _transposed(M: Array) -> Array:
+def _transposed(M: Floats) -> Floats:
     return np.swapaxes(M, -1, -2)
 
 
 def _system(
     A: ArrayLike, B: ArrayLike, Q: ArrayLike, R: ArrayLike, N: ArrayLike | None = None
-) -> tuple[Array, Array, Array, Array, Array]:
+) -> tuple[Floats, Floats, Floats, Floats, Floats]:
     """A (n, n), B (n, m), Q (n, n), R (m, m) > 0 and N (n, m), checked."""
     A, B = np.asarray(A, dtype=float), np.asarray(B, dtype=float)
     if A.ndim != 2 or A.shape[0] != A.shape[1] or B.ndim != 2 or len(B) != len(A):
@@ -482,7 +484,7 @@ def _system(
     return A, B, _weight("Q", Q, len(A)), R, N
 
 
-def _weight(name: str, value: ArrayLike, n: int) -> Array:
+def _weight(name: str, value: ArrayLike, n: int) -> Floats:
     """A symmetric weight (n, n), from it or its diagonal."""
     weight = np.asarray(value, dtype=float)
     if weight.shape == (n,) or (n == 1 and weight.shape == ()):
@@ -498,7 +500,7 @@ def _weight(name: str, value: ArrayLike, n: int) -> Array:
     return weight
 
 
-def _times(name: str, value: ArrayLike) -> Array:
+def _times(name: str, value: ArrayLike) -> Floats:
     t = np.asarray(value, dtype=float)
     if not np.all(np.isfinite(t)) or np.any(t < 0.0):
         raise ValueError(f"{name} must be finite and not negative [s]")

@@ -12,7 +12,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Array = NDArray[np.float64]
+from rigidfleet.typing import Floats
 
 
 def is_stable(alpha: float, beta: float, gamma: float) -> bool:
@@ -60,7 +60,7 @@ def error_response(
     cdot0: ArrayLike,
     I0: ArrayLike,
     t: ArrayLike,
-) -> tuple[Array, Array, Array]:
+) -> tuple[Floats, Floats, Floats]:
     """Error c [m], its rate [m/s] and its integral I [m s] at times t [s] after c0, cdot0 and I0.
 
     The matrix exponential of the error's equation: exact for repeated poles, for gamma = 0 and for
@@ -108,13 +108,13 @@ def overshoot(alpha: float, beta: float, gamma: float) -> float:
     return -least
 
 
-def _companion(alpha: float, beta: float, gamma: float) -> tuple[float, Array]:
+def _companion(alpha: float, beta: float, gamma: float) -> tuple[float, Floats]:
     """Rate p [1/s] and matrix A: d/d(pt) (p I, c, c'/p) = A (p I, c, c'/p), entries of order one."""
     p = max(abs(alpha), abs(beta), abs(gamma) ** (1 / 3)) or 1.0
     return p, np.array([[0, 1, 0], [0, 0, 1], [-gamma / p**3, -((beta / p) ** 2), -2 * alpha / p]])
 
 
-def _exponential(A: Array, x: Array) -> Array:
+def _exponential(A: Floats, x: Floats) -> Floats:
     """e^(A x) (..., n, n) for x (...): Taylor's series of a step |A x| <= 1/2, then doubled.
 
     Much faster on many small matrices than `scipy.linalg.expm`. What is doubled is e^(A x) - 1:
@@ -134,7 +134,7 @@ def _exponential(A: Array, x: Array) -> Array:
     return np.eye(len(A)) + D
 
 
-def _time_grid(alpha: float, beta: float, gamma: float, tolerance: float) -> Array:
+def _time_grid(alpha: float, beta: float, gamma: float, tolerance: float) -> Floats:
     """Times from 0 until |c| is below tolerance for good, dense enough to see every swing."""
     if not is_stable(alpha, beta, gamma):
         raise ValueError(

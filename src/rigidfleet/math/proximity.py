@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+
+from rigidfleet.typing import Bools, Floats, Ints
 
 if TYPE_CHECKING:
     from rigidfleet.mission import Box, Ground
 
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 # Slots thinner than this, relative to their length, are a line to an attitude fit.
 _THIN = 1e-3
@@ -30,7 +30,7 @@ _SPARE = 1.2
 _ELEMENTS = 8_000_000
 
 
-def separation(r: Array, radius: ArrayLike) -> tuple[Array, Ints]:
+def separation(r: Floats, radius: ArrayLike) -> tuple[Floats, Ints]:
     """Least room between two agents' surfaces (K,) [m], and the pair (K, 2) that has it.
 
     Parameters: r (K, N, 3) [m], radius (N,) [m]. One agent alone: infinity and (-1, -1).
@@ -63,7 +63,7 @@ def separation(r: Array, radius: ArrayLike) -> tuple[Array, Ints]:
     return least, pair
 
 
-def lengths(r: Array, pairs: Ints) -> Array:
+def lengths(r: Floats, pairs: Ints) -> Floats:
     """Distances (m, K) [m] of pairs (m, 2) of agents r (K, N, 3): a row for each pair, which is faster."""
     x = np.ascontiguousarray(r.transpose(2, 1, 0))
     d = x[:, pairs[:, 0]]
@@ -72,7 +72,7 @@ def lengths(r: Array, pairs: Ints) -> Array:
     return np.sqrt(d[0] + d[1] + d[2])
 
 
-def _closest_of_many(r: Array, radius: Array) -> tuple[Array, Ints]:
+def _closest_of_many(r: Floats, radius: Floats) -> tuple[Floats, Ints]:
     """`separation` of many agents r (K, N, 3), all of them somewhere, in O(N) or O(N log N) a sample.
 
     A tree finds the pairs near each other at one sample. They serve the next samples, too, for as long as no other
@@ -99,10 +99,10 @@ class _Near(NamedTuple):
     """Pairs of agents (2, m), i < j, each with both radii (m,); all others have more room than ``beyond`` [m]."""
 
     pairs: Ints
-    radii: Array
+    radii: Floats
     beyond: float
 
-    def rooms(self, p: Array) -> Array:
+    def rooms(self, p: Floats) -> Floats:
         """Room (m,) [m] between the surfaces of the pairs, of agents p (3, N)."""
         x = p.take(self.pairs[0], axis=1)
         x -= p.take(self.pairs[1], axis=1)
@@ -110,7 +110,7 @@ class _Near(NamedTuple):
         return np.sqrt(x[0] + x[1] + x[2]) - self.radii
 
 
-def _near(p: Array, radius: Array) -> _Near:
+def _near(p: Floats, radius: Floats) -> _Near:
     """The pairs of agents p (3, N) that are not much farther apart than the closest two."""
     from scipy.spatial import KDTree
 
@@ -128,16 +128,14 @@ def _near(p: Array, radius: Array) -> _Near:
     return _Near(np.ascontiguousarray(pairs[:, near]), found.radii[near], beyond)
 
 
-def _moved(before: Array, after: Array) -> float:
+def _moved(before: Floats, after: Floats) -> float:
     """The farthest way [m] of an agent, from (3, N) to (3, N), within the motion of all as one body."""
     U, _, Vt = np.linalg.svd(after @ before.T)
     way = after - (U @ Vt) @ before  # a reflection keeps distances, too
     return float(np.sqrt(np.einsum("ai,ai->i", way, way).max()))
 
 
-def headroom(
-    r: Array, radius: ArrayLike, among: NDArray[np.bool_] | None = None
-) -> tuple[Array, Ints]:
+def headroom(r: Floats, radius: ArrayLike, among: Bools | None = None) -> tuple[Floats, Ints]:
     """Least height between two agents of which one is below the other (K,) [m], and the pair (K, 2).
 
     Below is who overlaps as seen from above. Infinity and (-1, -1) where nobody is. r (K, N, 3) [m],
@@ -168,7 +166,7 @@ def headroom(
     return least, pair
 
 
-def _lowest(r: Array, radius: Array) -> tuple[float, Ints]:
+def _lowest(r: Floats, radius: Floats) -> tuple[float, Ints]:
     """Least height between two of many agents (N, 3) of which one is below the other, and the pair."""
     from scipy.spatial import KDTree
 
@@ -186,8 +184,8 @@ def _lowest(r: Array, radius: Array) -> tuple[float, Ints]:
 
 
 def clearance(
-    r: Array, radius: ArrayLike, obstacles: Sequence[Box | Ground]
-) -> tuple[Array, Ints, Ints]:
+    r: Floats, radius: ArrayLike, obstacles: Sequence[Box | Ground]
+) -> tuple[Floats, Ints, Ints]:
     """Least room to an obstacle (K,) [m], and the agent and the obstacle (K,) that have it.
 
     Negative where they overlap; infinity, -1 and -1 without obstacles. r (K, N, 3), radius (N,).
@@ -195,14 +193,14 @@ def clearance(
     return least_room(*rooms(r, radius, obstacles))
 
 
-def least_room(room: Array, nearest: Ints) -> tuple[Array, Ints, Ints]:
+def least_room(room: Floats, nearest: Ints) -> tuple[Floats, Ints, Ints]:
     """The least of the `rooms` (K, N) of each sample (K,), and the agent and the obstacle (K,) that have it."""
     agent, samples = room.argmin(axis=1), np.arange(len(room))
     obstacle = nearest[samples, agent]
     return room[samples, agent], np.where(obstacle < 0, -1, agent), obstacle
 
 
-def separation_of_left(r: Array, radius: ArrayLike, left: NDArray[np.bool_]) -> tuple[Array, Ints]:
+def separation_of_left(r: Floats, radius: ArrayLike, left: Bools) -> tuple[Floats, Ints]:
     """`separation` among the agents ``left`` (K, N) at each sample."""
     radius = np.asarray(radius, dtype=float)
     if left.all():
@@ -215,7 +213,7 @@ def separation_of_left(r: Array, radius: ArrayLike, left: NDArray[np.bool_]) -> 
     return least, pair
 
 
-def rooms(r: Array, radius: ArrayLike, obstacles: Sequence[Box | Ground]) -> tuple[Array, Ints]:
+def rooms(r: Floats, radius: ArrayLike, obstacles: Sequence[Box | Ground]) -> tuple[Floats, Ints]:
     """Least room (..., N) [m] of agents r (..., N, 3) to an obstacle, and the obstacle; infinity and -1 without."""
     radius = np.asarray(radius, dtype=float)
     least, nearest = np.full(r.shape[:-1], np.inf), np.full(r.shape[:-1], -1)
@@ -239,9 +237,7 @@ def rooms(r: Array, radius: ArrayLike, obstacles: Sequence[Box | Ground]) -> tup
     return least, nearest
 
 
-def fit_attitudes(
-    x: Array, p: Array, masses: Array, near: Array
-) -> tuple[Array, NDArray[np.bool_]]:
+def fit_attitudes(x: Floats, p: Floats, masses: Floats, near: Floats) -> tuple[Floats, Bools]:
     """Attitude T (K, 3, 3), world -> body, of slots fitted to agents at each of K samples (Kabsch).
 
     Also returns where the slots are one line (K,). So are narrow slots, if the attitude expected is known, where
@@ -288,7 +284,7 @@ def fit_attitudes(
     return T, line
 
 
-def _long_axes(p: Array) -> tuple[Array, Array, Array]:
+def _long_axes(p: Floats) -> tuple[Floats, Floats, Floats]:
     """Second and first singular value (K,) of points p (K, N, 3), and the direction (K, 3) of the first.
 
     Of points so wide that they are no line, two others whose ratio says so.
@@ -311,20 +307,20 @@ def _long_axes(p: Array) -> tuple[Array, Array, Array]:
     return np.broadcast_to(width, K), np.broadcast_to(long, K), np.broadcast_to(axis, (K, 3))
 
 
-def _turn_lines(x: Array, p: Array, axis: Array, near: Array) -> Array:
+def _turn_lines(x: Floats, p: Floats, axis: Floats, near: Floats) -> Floats:
     """Attitudes (K, 3, 3) of lines, from ``near`` by the smallest rotation that brings each axis home."""
     now = np.einsum("kba,kb->ka", near, axis)
     return near @ _smallest_turns(now, _directions(x, p, axis)).swapaxes(1, 2)
 
 
-def _directions(x: Array, p: Array, axis: Array) -> Array:
+def _directions(x: Floats, p: Floats, axis: Floats) -> Floats:
     """Where the long axis (K, 3) of slots p points among agents x (K, N, 3): unit vectors, or zero."""
     there = np.einsum("ki,kia->ka", np.einsum("kia,ka->ki", p, axis), x)
     length = np.linalg.norm(there, axis=1)
     return there / np.where(length == 0.0, 1.0, length)[:, None]
 
 
-def _smallest_turns(now: Array, there: Array) -> Array:
+def _smallest_turns(now: Floats, there: Floats) -> Floats:
     """Smallest rotations (K, 3, 3) from unit vectors to others (K, 3); none to or from zero."""
     # 1 + c of their angle's cosine c, in digits that are good up to half a turn; of zero vectors it does not matter.
     near = 0.5 * ((now + there) ** 2).sum(axis=1)
@@ -339,7 +335,7 @@ def _smallest_turns(now: Array, there: Array) -> Array:
     return R
 
 
-def mean_axis_rates(x: Array, y: Array, masses: Array, line: ArrayLike = False) -> Array:
+def mean_axis_rates(x: Floats, y: Floats, masses: Floats, line: ArrayLike = False) -> Floats:
     """Angular velocity omega = I^+ h (K, 3) [rad/s], world axes, of agents about their CM.
 
     x, y (K, N, 3): positions and velocities about the CM [m, m/s]; masses (N,) or (K, N); line (K,):
@@ -363,7 +359,7 @@ def mean_axis_rates(x: Array, y: Array, masses: Array, line: ArrayLike = False) 
     return np.where(np.count_nonzero(masses, axis=1)[:, None] > 1, omega, 0.0)
 
 
-def smallest_singular_value(r: Array, edges: Ints, masses: ArrayLike | None = None) -> Array:
+def smallest_singular_value(r: Floats, edges: Ints, masses: ArrayLike | None = None) -> Floats:
     """Smallest non-zero singular value (K,) of the constraint Jacobian J at r (K, N, 3).
 
     Zero means below 1e-7 of the largest. NaN without edges. With ``masses`` the Jacobian is

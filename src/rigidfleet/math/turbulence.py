@@ -9,14 +9,14 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from rigidfleet.typing import Floats
 
 _FOOT = 0.3048  # [m]
 
 
-def first_order(white: Array, step: float, tau: float) -> Array:
+def first_order(white: Floats, step: float, tau: float) -> Floats:
     """Gauss-Markov process (K, ...) of unit variance and autocorrelation exp(-|t| / tau).
 
     x_{k+1} = a x_k + sqrt(1 - a^2) e_k with a = exp(-step / tau), stationary from the start (Uhlenbeck and
@@ -30,7 +30,7 @@ def first_order(white: Array, step: float, tau: float) -> Array:
     return x
 
 
-def second_order(white: Array, step: float, tau: float) -> Array:
+def second_order(white: Floats, step: float, tau: float) -> Floats:
     """Dryden's transverse process (K, ...), unit variance, autocorrelation exp(-s) (1 - s / 2), s = |t| / tau.
 
     Its spectrum is that of (1 + sqrt(3) tau s) / (1 + tau s)^2, the lateral and vertical filter of MIL-F-8785C. In
@@ -56,7 +56,7 @@ def second_order(white: Array, step: float, tau: float) -> Array:
     return (math.sqrt(3.0) * z[:, 0] + (1.0 - math.sqrt(3.0)) * z[:, 1]) / math.sqrt(2.0)
 
 
-def low_altitude(height: float, wind: float) -> tuple[Array, Array]:
+def low_altitude(height: float, wind: float) -> tuple[Floats, Floats]:
     """Intensities (3,) [m/s] and lengths (3,) [m] of Dryden's gusts near the ground, by MIL-F-8785C.
 
     Along the wind, across and vertical, h in feet: sigma_w = 0.1 W, sigma_u = sigma_v = sigma_w / (0.177 + 0.000823
@@ -74,13 +74,13 @@ def low_altitude(height: float, wind: float) -> tuple[Array, Array]:
     )
 
 
-def correlate_evenly(white: Array, correlation: float) -> Array:
+def correlate_evenly(white: Floats, correlation: float) -> Floats:
     """Samples (..., N, 3) of which any two agents' have the same correlation, from (..., N + 1, 3)."""
     own, common = white[..., :-1, :], white[..., -1:, :]
     return math.sqrt(1.0 - correlation) * own + math.sqrt(correlation) * common
 
 
-def correlate_by_distance(white: Array, points: ArrayLike, length: float) -> Array:
+def correlate_by_distance(white: Floats, points: ArrayLike, length: float) -> Floats:
     """Samples (..., N, 3) correlated by exp(-distance / length) of the agents' places (N, 3) [m]."""
     p = np.asarray(points, dtype=np.float64)
     apart = np.linalg.norm(p[:, None] - p[None], axis=2)
@@ -89,7 +89,7 @@ def correlate_by_distance(white: Array, points: ArrayLike, length: float) -> Arr
     return np.einsum("ij,...jq->...iq", np.linalg.cholesky(C), white)
 
 
-def spline_coefficients(samples: Array) -> Array:
+def spline_coefficients(samples: Floats) -> Floats:
     """Coefficients (K + 2, ...) of the natural cubic B-spline through samples (K, ...), K >= 2, on even knots."""
     from scipy.linalg import solve_banded
 

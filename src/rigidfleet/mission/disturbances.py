@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from rigidfleet.formation.shapes import Floats
 from rigidfleet.mission.findings import Notes
 from rigidfleet.mission.phases import latest_end
 from rigidfleet.mission.schema import Disturbances, Gusts
+from rigidfleet.typing import Floats
 
 _TABLE = "disturbances"
 _GUSTS = (_TABLE, "gusts")

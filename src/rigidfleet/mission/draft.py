@@ -10,8 +10,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from rigidfleet.formation import shapes
-from rigidfleet.formation.shapes import Floats
 from rigidfleet.mission.findings import near_shape
+from rigidfleet.typing import Floats
 
 #: Chosen for a mission that says nothing of them: vehicle [kg], [m], shape [m], where it flies [m].
 MASS, RADIUS, SIZE, WAYPOINT = 1.2, 0.25, 4.0, (20.0, 10.0, 10.0)

@@ -10,12 +10,11 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import PrivateAttr
 
 from rigidfleet._toml import to_toml
 from rigidfleet.errors import Finding, MissionError
-from rigidfleet.formation.shapes import Floats, Ints, assigned, distances
+from rigidfleet.formation.shapes import assigned, distances
 from rigidfleet.math import proximity as geometry
 from rigidfleet.math.attitude import dcm_from_euler
 from rigidfleet.mission import bounds
@@ -31,6 +30,7 @@ from rigidfleet.mission.schema import (
     Start,
     Steering,
 )
+from rigidfleet.typing import Bools, Floats, Ints
 
 _SHIPPED = resources.files("rigidfleet") / "missions"
 #: Least and greatest damping that "auto" takes: below, rounding shows; docs/robustness.md has the table.
@@ -236,7 +236,7 @@ class Mission(Contents):
         assert slots is not None  # checked: without distances there are a shape or slots
         return distances(slots, self.formation_edges(name))
 
-    def damping(self, name: str | None, lost: NDArray[np.bool_] | None = None) -> float:
+    def damping(self, name: str | None, lost: Bools | None = None) -> float:
         """Damping mu [-] of the iterated solve while a formation is held; ``name`` None: on the way.
 
         "auto" is a quarter of the smallest non-zero eigenvalue w of mbar J M^-1 J^T at the formation, of the vehicles

@@ -21,7 +21,6 @@ from pydantic import (
 )
 
 from rigidfleet.formation import shapes
-from rigidfleet.formation.shapes import Floats, Ints
 from rigidfleet.mission import bounds
 from rigidfleet.mission.bounds import (
     ACCELERATION,
@@ -36,6 +35,7 @@ from rigidfleet.mission.bounds import (
     WEIGHT,
     Bound,
 )
+from rigidfleet.typing import Floats, Ints
 
 #: No quantity in SI units is larger here, and the sixth power of a length is still a float.
 HUGE = 1e15

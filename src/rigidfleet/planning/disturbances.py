@@ -7,18 +7,14 @@ flight, bit for bit, and a longer one meets the same gusts and noise.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rigidfleet.kernel import problem as k
 from rigidfleet.math import turbulence
 from rigidfleet.mission import Establish, Gusts, Mission
 from rigidfleet.mission.disturbances import gust_step, intensity
-
-if TYPE_CHECKING:
-    from rigidfleet.kernel.problem import Array
+from rigidfleet.typing import Bools, Floats
 
 #: Mass of a lost vehicle in the laws [kg]: it counts for nothing, and yet divides nothing by zero.
 NOTHING = 1e-20
@@ -56,12 +52,12 @@ def _knots(mission: Mission, step: float) -> int:
     return math.ceil(mission.latest_end / step) + 2
 
 
-def _table(samples: Array) -> Array:
+def _table(samples: Floats) -> Floats:
     """Coefficients of a spline, in the one layout that the kernel is compiled for."""
     return np.ascontiguousarray(turbulence.spline_coefficients(samples))
 
 
-def _gusts(mission: Mission, gusts: Gusts, wind: Array, step: float) -> Array:
+def _gusts(mission: Mission, gusts: Gusts, wind: Floats, step: float) -> Floats:
     """Velocity of the air (K, N, 3) [m/s] at each agent, world axes, without the steady wind."""
     n, speed = mission.n_agents, float(np.linalg.norm(wind))
     rng = np.random.default_rng((0, gusts.seed))
@@ -88,14 +84,14 @@ def _gusts(mission: Mission, gusts: Gusts, wind: Array, step: float) -> Array:
     return (intensity(gusts, speed) * u) @ _wind_axes(wind)
 
 
-def _wind_axes(wind: Array) -> Array:
+def _wind_axes(wind: Floats) -> Floats:
     """Unit vectors (3, 3), a row each, along the wind over ground, across it to the left, and up."""
     along = math.hypot(wind[0], wind[1])
     c, s = (wind[0] / along, wind[1] / along) if along > 0.0 else (1.0, 0.0)
     return np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-def _places(mission: Mission) -> Array:
+def _places(mission: Mission) -> Floats:
     """Where agents are to each other (N, 3) [m]: in the first formation established, or else at the start."""
     names = (p.formation for p in mission.phases if isinstance(p, Establish))
     slots = next((s for s in map(mission.formation_slots, names) if s is not None), None)
@@ -104,8 +100,8 @@ def _places(mission: Mission) -> Array:
 
 def without(
     program: k.Program,
-    edges: NDArray[np.bool_],
-    lost: NDArray[np.bool_],
+    edges: Bools,
+    lost: Bools,
     mu: float,
     *,
     large: bool = False,

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rigidfleet.formation import shapes
 from rigidfleet.kernel import problem as k
@@ -28,8 +27,7 @@ from rigidfleet.planning.reference import (
     slots_about_cm,
     slots_before,
 )
-
-Array = NDArray[np.float64]
+from rigidfleet.typing import Floats, Ints
 
 _SOLVERS = {"iterated": k.ITERATED, "spectral": k.SPECTRAL, "exact": k.EXACT, "pinv": k.PINV}
 _KINDS = {"shape": k.SLOTS, "squares": k.SQUARED, "step": k.CONSTANT}
@@ -43,13 +41,13 @@ class PhasePlan:
     """A phase, ready to fly."""
 
     program: k.Program
-    edges: NDArray[np.int64]  # (m, 2), from 0
-    slots: Array | None  # (N, 3) at the end, about the CM, body axes [m]
+    edges: Ints  # (m, 2), from 0
+    slots: Floats | None  # (N, 3) at the end, about the CM, body axes [m]
     formation: str | None
-    distances: Array  # (m,) at the end [m]
+    distances: Floats  # (m,) at the end [m]
     goal: Pose | None
     arrival: float  # when the goal is to be reached [s]
-    frame: Array | None  # attitude (3, 3) of the mean-axis frame at the start
+    frame: Floats | None  # attitude (3, 3) of the mean-axis frame at the start
     method: solvers.Method  # how the multipliers are solved for
     held: str | None  # the formation, if the agents are in it at the start
 
@@ -158,7 +156,7 @@ def _law(mission: Mission, mu: float, *, damped: bool) -> k.Law:
     )
 
 
-def _control(mission: Mission, phase: Phase, masses: Array) -> k.Control:
+def _control(mission: Mission, phase: Phase, masses: Floats) -> k.Control:
     kind = {"open": k.OPEN, "slots": k.LOCAL, "body": k.BODY}[phase.control]
     force = np.tile(np.array(phase.input_force), (len(masses), 1))
     force[:, 2] += masses * mission.gravity
@@ -202,7 +200,7 @@ def _motion(
     return k.Motion(knots, np.ascontiguousarray(coefficients), np.ascontiguousarray(goal.T))
 
 
-def _knots(law: Regulator, T: float) -> Array:
+def _knots(law: Regulator, T: float) -> Floats:
     return lqr.knots(T, law.Q, law.R, law.S if law.horizon == "finite" else None)
 
 
@@ -225,7 +223,7 @@ def _feedback(
     )  # fmt: skip
 
 
-def _gains(law: Regulator, to_go: Array) -> tuple[Array, Array]:
+def _gains(law: Regulator, to_go: Floats) -> tuple[Floats, Floats]:
     """Gains (K, 2) of one axis over the time to go (K,) [s], and their slopes (Riccati equation)."""
     if law.horizon == "infinite":
         gain = np.tile(lqr.double_integrator_gains(law.Q, law.R), (len(to_go), 1))

@@ -9,14 +9,12 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rigidfleet.formation import shapes
 from rigidfleet.math import attitude as att
 from rigidfleet.math import lqr
 from rigidfleet.mission import Establish, Fly, Mission, Phase, Regulator, Reshape, Turn
-
-Array = NDArray[np.float64]
+from rigidfleet.typing import Bools, Floats, Ints
 
 #: A phase that ends by settling and steers nowhere brings the body to rest within this time [s].
 _REST_WITHIN = 10.0
@@ -26,23 +24,23 @@ _REST_WITHIN = 10.0
 class ByEdge:
     """A number for each edge that has been in force: values (m,), by the edges' keys (m,) in ascending order."""
 
-    keys: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    values: Array = field(default_factory=lambda: np.zeros(0))
+    keys: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    values: Floats = field(default_factory=lambda: np.zeros(0))
 
-    def of(self, edges: NDArray[np.int64], other: Array | float) -> Array:
+    def of(self, edges: Ints, other: Floats | float) -> Floats:
         """Values (m,) of edges (m, 2), i < j; ``other`` (m,) where an edge is new."""
         keys = self._keys(edges)
         at = np.searchsorted(self.keys, keys)
         known = np.append(self.keys, -1)[at] == keys
         return np.where(known, np.append(self.values, 0.0)[at], other)
 
-    def updated(self, edges: NDArray[np.int64], values: Array) -> ByEdge:
+    def updated(self, edges: Ints, values: Floats) -> ByEdge:
         """These and those of edges (m, 2), i < j, of which the latter count where there are both."""
         keys, first = np.unique(np.concatenate([self._keys(edges), self.keys]), return_index=True)
         return ByEdge(keys, np.concatenate([values, self.values])[first])
 
     @staticmethod
-    def _keys(edges: NDArray[np.int64]) -> NDArray[np.int64]:
+    def _keys(edges: Ints) -> Ints:
         return (edges[:, 0] << 32) + edges[:, 1]
 
 
@@ -50,10 +48,10 @@ class ByEdge:
 class Pose:
     """Where the virtual body is, or is to be: CM [m], attitude T (world -> body), their rates."""
 
-    r: Array
-    v: Array
-    T: Array
-    omega: Array  # body axes [rad/s]
+    r: Floats
+    v: Floats
+    T: Floats
+    omega: Floats  # body axes [rad/s]
     named: bool = False  # whether a phase has asked for this attitude by name
 
 
@@ -62,24 +60,24 @@ class Situation:
     """The state at a switch, and what was commanded up to it."""
 
     t: float
-    r: Array  # (N, 3) [m]
-    v: Array  # (N, 3) [m/s]
+    r: Floats  # (N, 3) [m]
+    v: Floats  # (N, 3) [m/s]
     integral: ByEdge = field(default_factory=ByEdge)  # of c [m s]
     reference: ByEdge = field(default_factory=ByEdge)  # distances commanded last [m]
-    frame: Array | None = None  # attitude (3, 3) of the integrated mean-axis frame
+    frame: Floats | None = None  # attitude (3, 3) of the integrated mean-axis frame
     formation: str | None = None  # the one taken last
-    slots: Array | None = None  # (N, 3) commanded last, about the CM, body axes [m]
+    slots: Floats | None = None  # (N, 3) commanded last, about the CM, body axes [m]
     pose: Pose | None = None  # commanded last; None where nothing was
     goal: Pose | None = None  # what to stay at
-    lost: NDArray[np.bool_] | None = None  # (N,) vehicles that fly no more; None: none
+    lost: Bools | None = None  # (N,) vehicles that fly no more; None: none
 
 
-def about_cm(points: Array, masses: Array) -> Array:
+def about_cm(points: Floats, masses: Floats) -> Floats:
     """Points (N, 3) [m] relative to their centre of mass."""
     return points - masses @ points / masses.sum()
 
 
-def body_rates(r: Array, v: Array, masses: Array, T: Array) -> Array:
+def body_rates(r: Floats, v: Floats, masses: Floats, T: Floats) -> Floats:
     """Mean-axis rates omega = I^+ h (3,) [rad/s] of agents r, v (N, 3), in the axes of T (3, 3)."""
     if len(masses) == 1:
         return np.zeros(3)  # of a point; not what rounding makes of it
@@ -89,15 +87,15 @@ def body_rates(r: Array, v: Array, masses: Array, T: Array) -> Array:
     return T @ np.linalg.pinv(inertia, 1e-9, hermitian=True) @ h
 
 
-def slots_about_cm(mission: Mission, name: str | None, masses: Array) -> Array | None:
+def slots_about_cm(mission: Mission, name: str | None, masses: Floats) -> Floats | None:
     """Slots (N, 3) [m] of a formation about their centre of mass; None where there are none."""
     slots = mission.formation_slots(name) if name else None
     return None if slots is None else about_cm(slots, masses)
 
 
 def attach(
-    mission: Mission, phase: Phase, now: Situation, masses: Array, target: Array | None
-) -> tuple[Array | None, Situation, Array]:
+    mission: Mission, phase: Phase, now: Situation, masses: Floats, target: Floats | None
+) -> tuple[Floats | None, Situation, Floats]:
     """Attach the body frame where a phase needs one, and say how the slots wanted lie in it meanwhile.
 
     Slots fitted to the agents (Kabsch) give the attitude. Where nothing is established yet, the agents themselves
@@ -161,21 +159,21 @@ def attach(
     return frame, replace(now, pose=pose, slots=slots, goal=goal), turn
 
 
-def slots_before(mission: Mission, now: Situation, masses: Array) -> Array:
+def slots_before(mission: Mission, now: Situation, masses: Floats) -> Floats:
     """Slots (N, 3) [m] that a phase begins with; where there are none, the agents, as formations are drawn."""
     if now.slots is not None:
         return now.slots
     return about_cm(now.r, masses) @ mission.drawn_attitude.T
 
 
-def _turn(given: Array | None, before: Array, after: Array | None, masses: Array) -> Array:
+def _turn(given: Floats | None, before: Floats, after: Floats | None, masses: Floats) -> Floats:
     if after is None:
         return np.eye(3)
     return shapes.kabsch(before, after, masses) if given is None else given
 
 
 def led_by(
-    mission: Mission, phase: Establish | Reshape, before: Array, target: Array | None
+    mission: Mission, phase: Establish | Reshape, before: Floats, target: Floats | None
 ) -> Literal["shape", "squares", "step"]:
     """What leads the distances of a phase: its reference, and which of two if that is "distances".
 
@@ -204,8 +202,8 @@ def led_by(
 
 
 def align_slots(
-    before: Array, after: Array, masses: Array, turn: Array | None = None
-) -> tuple[Array, Array]:
+    before: Floats, after: Floats, masses: Floats, turn: Floats | None = None
+) -> tuple[Floats, Floats]:
     """What a blend adds to the slots, and by which rotation vector it turns them meanwhile.
 
     The new slots are turned first, by ``turn`` (3, 3), or else onto the old ones (Kabsch, weighted by mass), in
@@ -240,11 +238,11 @@ class Legs:
     """The LQR flights of the virtual body to its goal: of its CM, and of its attitude phi."""
 
     regulators: tuple[Regulator, Regulator]
-    begin: tuple[tuple[Array, Array], tuple[Array, Array]]  # (r, v), (phi, phi_dot)
-    end: tuple[tuple[Array, Array], tuple[Array, Array]]
+    begin: tuple[tuple[Floats, Floats], tuple[Floats, Floats]]  # (r, v), (phi, phi_dot)
+    end: tuple[tuple[Floats, Floats], tuple[Floats, Floats]]
     T: float  # [s]
 
-    def sample(self, k: int, times: Array) -> tuple[Array, Array, Array]:
+    def sample(self, k: int, times: Floats) -> tuple[Floats, Floats, Floats]:
         """Position, rate and second derivative (K, 3) of one of the two at times (K,) in [0, T]."""
         law = self.regulators[k]
         if law.horizon == "finite":
@@ -256,8 +254,8 @@ class Legs:
         )
 
     def sample_rest(
-        self, mission: Mission, k: int, state: tuple[Array, Array], rest: float, times: Array
-    ) -> tuple[Array, Array, Array]:
+        self, mission: Mission, k: int, state: tuple[Floats, Floats], rest: float, times: Floats
+    ) -> tuple[Floats, Floats, Floats]:
         """The same at times (K,) in [0, rest] after arrival in a state, where tracking gains take over."""
         r, v = self.end[k]
         Q, R = mission.tracking.Q, mission.tracking.R

@@ -11,10 +11,9 @@ from functools import lru_cache
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from rigidfleet.typing import Floats, Ints
+
 Method = Literal["dense", "sweep", "nodes"]
 
 #: Equations from which on the vertex graph is faster than a dense factor, and from which on the sweep is.

@@ -5,14 +5,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rigidfleet.planning.reference import about_cm
+from rigidfleet.typing import Floats
 
 if TYPE_CHECKING:
     from rigidfleet.mission.schema import Integrator
 
-Array = NDArray[np.float64]
 
 #: A phase has stalled that took more steps than these and those for each second of mission time, or
 #: more than the last in all. A step of 1 ms is already that of gains above 1e3 /s.
@@ -25,8 +24,8 @@ def most_steps(flown: float) -> int:
 
 
 def absolute_tolerances(
-    given: Integrator, size: int, velocity: Array, distances: Array, *, large: bool
-) -> Array:
+    given: Integrator, size: int, velocity: Floats, distances: Floats, *, large: bool
+) -> Floats:
     """Absolute tolerances (size,) of the states, class by class.
 
     The integral of c is in its law what a distance is, times a second; but it stays near zero, where
@@ -53,8 +52,8 @@ def absolute_tolerances(
 
 
 def tolerance_of_velocity(
-    given: Integrator, r: Array, masses: Array, beta: float, *, large: bool
-) -> Array:
+    given: Integrator, r: Floats, masses: Floats, beta: float, *, large: bool
+) -> Floats:
     """Absolute tolerance (N,) of velocities [m/s] of agents at r (N, 3) [m].
 
     The law takes errors back at the rate beta [1/s]: one of a velocity becomes one of a place 1/beta of it. In

@@ -11,8 +11,9 @@ import numpy as np
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity as geometry
 from rigidfleet.plotting import style as st
-from rigidfleet.plotting.style import Floats, styled
+from rigidfleet.plotting.style import styled
 from rigidfleet.result import Extremum, Result
+from rigidfleet.typing import Floats
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

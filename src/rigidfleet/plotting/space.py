@@ -13,8 +13,9 @@ import numpy as np
 from rigidfleet.formation import shapes
 from rigidfleet.plotting import curves
 from rigidfleet.plotting import style as st
-from rigidfleet.plotting.style import Floats, styled
+from rigidfleet.plotting.style import styled
 from rigidfleet.result import Result
+from rigidfleet.typing import Floats
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rigidfleet.result import Result
+from rigidfleet.typing import Floats
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from matplotlib.text import Annotation, Text
     from matplotlib.transforms import Bbox
 
-Floats = NDArray[np.float64]
 Draw = Callable[[Result], "Figure"]
 
 #: Colours of the first twelve agents: of Okabe and Ito's set those that stand out on white, then

@@ -14,7 +14,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rigidfleet.formation import shapes
 from rigidfleet.math import attitude as att
@@ -48,8 +47,7 @@ from rigidfleet.rigidity import (
     spectrum,
 )
 from rigidfleet.rigidity.spectrum import MOST as LANCZOS
-
-Array = NDArray[np.float64]
+from rigidfleet.typing import Floats
 
 #: Formations of up to so many agents are searched for other shapes of the same distances.
 SEARCHED = 12
@@ -109,15 +107,15 @@ class Leg:
     """
 
     phase: str
-    time: Array
-    position: Array
-    acceleration: Array
+    time: Floats
+    position: Floats
+    acceleration: Floats
     exact: bool
-    ways: tuple[Array, Array] | None = None
+    ways: tuple[Floats, Floats] | None = None
     shapes: tuple[str | None, str | None] = (None, None)
 
     @property
-    def velocity(self) -> Array:
+    def velocity(self) -> Floats:
         """(K, N, 3) [m/s]."""
         return _rate(self.position, self.time)
 
@@ -495,7 +493,7 @@ def _other_shapes(mission: Mission, f: FormationCheck, *, alone: bool) -> Iterat
         yield Remark("note", "formation", text)
 
 
-def _flattens(start: Array, slots: Array) -> bool:
+def _flattens(start: Floats, slots: Floats) -> bool:
     """Whether four agents are all in one plane on the way from a start to slots in space (4, 3)."""
     if len(slots) != 4 or shapes.dimension(slots) < 3:
         return False
@@ -615,10 +613,10 @@ def _leg(
     mission: Mission,
     phase: Phase,
     now: Situation,
-    masses: Array,
-    target: Array | None,
-    time: Array,
-) -> tuple[Array, tuple[Array, Array] | None, Situation]:
+    masses: Floats,
+    target: Floats | None,
+    time: Floats,
+) -> tuple[Floats, tuple[Floats, Floats] | None, Situation]:
     """Positions (K, N, 3) of all agents over a phase, their `Leg.ways`, and the situation at its end."""
     t0, t_end = time[0], time[-1]
     shaping = isinstance(phase, Establish | Reshape)
@@ -667,8 +665,8 @@ def _leg(
 
 
 def _body(
-    mission: Mission, start: Pose, goal: Pose, arrival: float, time: Array
-) -> tuple[Array, Array, Array, Array]:
+    mission: Mission, start: Pose, goal: Pose, arrival: float, time: Floats
+) -> tuple[Floats, Floats, Floats, Floats]:
     """CM (K, 3) [m], attitude T (K, 3, 3) of the virtual body, and its velocities [m/s, rad/s] at the end."""
     t0, rest = time[0], time[-1] - arrival
     flights = legs(mission, start, goal, arrival - t0)
@@ -715,13 +713,13 @@ def _settling(mission: Mission) -> float:
         return 0.0
 
 
-def _septic(x: Array) -> Array:
+def _septic(x: Floats) -> Floats:
     """The blend of slots over x = (t - t0) / T_b, as the kernel's references have it."""
     x = np.clip(x, 0.0, 1.0)
     return x**4 * (35.0 - x * (84.0 - x * (70.0 - 20.0 * x)))
 
 
-def _rate(x: Array, time: Array) -> Array:
+def _rate(x: Floats, time: Floats) -> Floats:
     return np.gradient(x, time, axis=0, edge_order=2)
 
 
@@ -999,7 +997,7 @@ def _obstacles(mission: Mission, found: Preflight) -> Iterator[Remark]:
     yield from _gaps(mission, found, radius)
 
 
-def _beyond(within: Array, thing: Box | Ground) -> Array:
+def _beyond(within: Floats, thing: Box | Ground) -> Floats:
     """How far (L,) [m] boxes (L, 2, 3), lowest and highest corners, are from an obstacle at least."""
     low, high = within[:, 0], within[:, 1]
     if isinstance(thing, Box):
@@ -1024,7 +1022,7 @@ def _too_low(mission: Mission, found: Preflight, phase: str, ground: float) -> s
     )
 
 
-def _gaps(mission: Mission, found: Preflight, radius: Array) -> Iterator[Remark]:
+def _gaps(mission: Mission, found: Preflight, radius: Floats) -> Iterator[Remark]:
     """Gaps between two boxes that the formation's centre passes, and how much of each it takes.
 
     Of boxes on either side of the centre, seen along an axis, the nearest two make the gap.

@@ -16,8 +16,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rigidfleet.formation.shapes import (
-    Floats,
-    Ints,
     coarse_to_fine,
     complete_graph,
     dimension,
@@ -26,6 +24,7 @@ from rigidfleet.formation.shapes import (
     neighbours,
 )
 from rigidfleet.rigidity import full_rank, jacobian, rigid_motions
+from rigidfleet.typing import Floats, Ints
 
 #: How near to the smallest eigenvalue the barrier of the exchange comes, step by step.
 _BARRIERS = (0.0, 0.5, 0.8, 0.95)

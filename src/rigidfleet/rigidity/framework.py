@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigidfleet.formation.shapes import Floats, Ints
+from rigidfleet.typing import Floats, Ints
 
 #: Singular values below this times the largest are zero: points rounded to seven digits count as flat.
 ZERO = 1e-7

@@ -14,8 +14,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from rigidfleet.formation.shapes import Floats, Ints, kabsch
+from rigidfleet.formation.shapes import kabsch
 from rigidfleet.rigidity.framework import Framework, jacobian, sparse
+from rigidfleet.typing import Floats, Ints
 
 #: A stress blocks all flexes when its least energy is more than this times its largest.
 _DEFINITE = 1e-7

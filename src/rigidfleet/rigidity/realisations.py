@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigidfleet.formation.shapes import Floats, Ints, kabsch
+from rigidfleet.formation.shapes import kabsch
 from rigidfleet.rigidity.analysis import checked
 from rigidfleet.rigidity.framework import Framework
+from rigidfleet.typing import Floats, Ints
 
 #: Shapes whose all-pairs distances agree within this times their size are one.
 _ALIKE = 1e-3

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigidfleet.formation.shapes import Floats, Ints
 from rigidfleet.rigidity.framework import ZERO
+from rigidfleet.typing import Floats, Ints
 
 #: So many eigenvalues are looked for at the lower end, besides those of rigid motions.
 _LOWEST = 6

@@ -5,22 +5,20 @@ from __future__ import annotations
 import ctypes
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from rigidfleet.errors import FlightError
+from rigidfleet.typing import Floats
 
-if TYPE_CHECKING:
-    from rigidfleet.kernel.problem import Array
-
-Force = Callable[[float, "Array", "Array"], ArrayLike]
+Force = Callable[[float, "Floats", "Floats"], ArrayLike]
 
 
 def asked(
     who: str, t: float, n: int, function: Callable[..., ArrayLike], *arguments: object
-) -> Array:
+) -> Floats:
     """Forces (N, 3) [N] that a user's function gives, or an error that says what came instead."""
     try:
         f = function(*arguments)
@@ -30,7 +28,7 @@ def asked(
     return _checked(f, n, who, t)
 
 
-def _checked(f: ArrayLike, n: int, who: str, t: float) -> Array:
+def _checked(f: ArrayLike, n: int, who: str, t: float) -> Floats:
     """Forces (N, 3) [N] from a user's function, or an error that says what came instead."""
     if np.iscomplexobj(f):
         raise FlightError(

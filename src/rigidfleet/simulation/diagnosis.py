@@ -10,9 +10,9 @@ import numpy as np
 from rigidfleet.kernel.engine import native
 from rigidfleet.mission import Establish, Reshape
 from rigidfleet.planning import solvers
+from rigidfleet.typing import Floats
 
 if TYPE_CHECKING:
-    from rigidfleet.kernel.problem import Array
     from rigidfleet.mission import Mission
     from rigidfleet.simulation.flight import Leg
 
@@ -116,7 +116,7 @@ def _remedy(mission: Mission, leg: Leg, *, own_force: bool, collapsed: bool) -> 
     )
 
 
-def _jacobian(leg: Leg, n: int) -> tuple[Array, int, float]:
+def _jacobian(leg: Leg, n: int) -> tuple[Floats, int, float]:
     """J (m, 3N) where the integrator is, its shortest edge and that edge's length [m]."""
     edges = leg.plan.edges
     native.closed_loop(

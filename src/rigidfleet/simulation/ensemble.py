@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,9 +20,7 @@ from rigidfleet.planning.plan import plan_phase
 from rigidfleet.planning.reference import Situation
 from rigidfleet.planning.solvers import choose
 from rigidfleet.planning.tolerances import absolute_tolerances, most_steps, tolerance_of_velocity
-
-if TYPE_CHECKING:
-    from rigidfleet.kernel.problem import Array
+from rigidfleet.typing import Bools, Floats, Ints
 
 
 @dataclass(frozen=True)
@@ -40,12 +37,12 @@ class Ensemble:
     vectors : whether eight flights shared a vector
     """
 
-    position: Array
-    velocity: Array
-    error: Array
-    finished: NDArray[np.bool_]
-    evaluations: NDArray[np.int64]
-    ends: tuple[Array, ...]
+    position: Floats
+    velocity: Floats
+    error: Floats
+    finished: Bools
+    evaluations: Ints
+    ends: tuple[Floats, ...]
     vectors: bool
 
 
@@ -127,12 +124,12 @@ def unfit(mission: Mission) -> str | None:
 class _Flights:
     """Where all flights are, and what their phases hand on."""
 
-    def __init__(self, mission: Mission, r: Array, v: Array) -> None:
+    def __init__(self, mission: Mission, r: Floats, v: Floats) -> None:
         self.mission, self.r, self.v = mission, r, v
         count = len(r)
         # One plan for all: without slots, only the distances it starts from are a flight's own.
         self.now = Situation(0.0, r[0], v[0])
-        self.integral: dict[tuple[int, int], Array] = {}
+        self.integral: dict[tuple[int, int], Floats] = {}
         self.finished = np.ones(count, dtype=bool)
         self.evaluations = np.zeros(count, dtype=np.int64)
         self.error = np.zeros(count)
@@ -184,7 +181,7 @@ def _alike(mission: Mission, phase: Phase) -> bool:
     return phase.reference in ("squares", "step") or (phase.reference == "distances" and bare)
 
 
-def _starts(name: str, values: ArrayLike, agents: int) -> Array:
+def _starts(name: str, values: ArrayLike, agents: int) -> Floats:
     starts = np.array(values, dtype=float)
     if starts.ndim != 3 or starts.shape[1:] != (agents, 3) or not len(starts):
         raise ValueError(f"{name} must be (B, {agents}, 3) for {agents} agents, not {starts.shape}")
@@ -195,7 +192,7 @@ def _starts(name: str, values: ArrayLike, agents: int) -> Array:
     return starts
 
 
-def _places(finished: NDArray[np.bool_]) -> NDArray[np.int64]:
+def _places(finished: Bools) -> Ints:
     """Which flight takes each place: whoever is out lends it to a neighbour, so that the others keep theirs."""
     places = np.arange(len(finished))
     for k in np.flatnonzero(~finished):
@@ -205,12 +202,12 @@ def _places(finished: NDArray[np.bool_]) -> NDArray[np.int64]:
     return places
 
 
-def off(r: Array, edges: NDArray[np.integer], asked: Array) -> Array:
+def off(r: Floats, edges: NDArray[np.integer], asked: Floats) -> Floats:
     """Greatest error (B,) [m] of edges (m, 2) that are to be ``asked`` (m,) long, at positions (B, N, 3)."""
     return np.abs(_lengths(r, edges) - asked).max(axis=1, initial=0.0)
 
 
-def _lengths(r: Array, edges: NDArray[np.integer]) -> Array:
+def _lengths(r: Floats, edges: NDArray[np.integer]) -> Floats:
     """Lengths (B, m) of edges [m]."""
     way = r[:, edges[:, 0]] - r[:, edges[:, 1]]
     return np.sqrt(np.einsum("bka,bka->bk", way, way))

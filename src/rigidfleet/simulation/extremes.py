@@ -10,17 +10,15 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rigidfleet.kernel import records
 from rigidfleet.kernel.engine import native
-from rigidfleet.kernel.problem import Array, Program, Workspace
+from rigidfleet.kernel.problem import Program, Workspace
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity as geometry
 from rigidfleet.mission import Box, Ground, Mission
 from rigidfleet.result import PAD, Extremum, PhaseRecord
-
-Ints = NDArray[np.int64]
+from rigidfleet.typing import Bools, Floats
 
 #: Agents up to which all pairs are watched.
 _FEW = 40
@@ -92,7 +90,7 @@ class Extremes:
         self.monitor = native.Watch(found)
         return trail
 
-    def lose(self, lost: NDArray[np.bool_]) -> None:
+    def lose(self, lost: Bools) -> None:
         """Go on without the vehicles ``lost`` (N,), which the others must not be hit by."""
         for i in np.flatnonzero(lost & self.left & (self.low[:, 0] < np.inf)):
             # Near an obstacle when it was lost, and not landing any more.
@@ -171,7 +169,7 @@ class Extremes:
         """Watch the distances of one step, in pieces so short that the pairs listed are all that matter."""
         (start, length), whole = state.trail.clock[row], state.trail.points[row]
         gauge, none = state.trail.gauge[:0], state.trail.start
-        pieces: list[tuple[float, float, Array]] = [(start, length, whole)]
+        pieces: list[tuple[float, float, Floats]] = [(start, length, whole)]
         while pieces:
             t, h, points = pieces.pop()
             moved = self._moves(program, points)
@@ -192,7 +190,7 @@ class Extremes:
             trail = records.Trail(np.array([[t, h]]), points[None], gauge, none)
             self.monitor(program, work, state._replace(trail=trail))
 
-    def _list(self, program: Program, y: Array, moves: float) -> None:
+    def _list(self, program: Program, y: Floats, moves: float) -> None:
         """List the pairs that are near each other at a state (n,), or below one another.
 
         The list is good until others may have come nearer by ``moves`` [m], at least.
@@ -233,7 +231,7 @@ class Extremes:
             before._replace(pairs=self.pairs, columns=self.columns, flags=before.flags.copy())
         )
 
-    def _moves(self, program: Program, points: Array) -> Array:
+    def _moves(self, program: Program, points: Floats) -> Floats:
         """By how much [m] over a step (5, n) any two agents' distance may change, and that as seen from above (2,).
 
         With r_i' = any rigid motion + u_i, the rate of a distance is at most |u_i| + |u_j|, and |u_i| no more than

@@ -10,7 +10,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from rigidfleet.errors import FlightError
 from rigidfleet.kernel import problem as k
@@ -28,10 +28,12 @@ from rigidfleet.simulation.callbacks import ExternalForce, Force, asked
 from rigidfleet.simulation.diagnosis import diagnose
 from rigidfleet.simulation.extremes import Extremes
 from rigidfleet.simulation.recording import Piece, assemble
+from rigidfleet.typing import Bools, Floats
 
 if TYPE_CHECKING:
     from rigidfleet.kernel.large import solver as large
-    from rigidfleet.kernel.problem import Array
+
+    pass
 
 #: The integrator returns to Python after so many steps, or fewer: as many as take this long [s of
 #: wall time], often enough for Ctrl-C and progress whatever the size of the formation.
@@ -70,12 +72,12 @@ class Observation:
 
     t: float  # [s]
     phase: str
-    position: Array  # [m]
-    velocity: Array  # [m/s]
-    reference_position: Array  # desired [m]
-    reference_velocity: Array  # [m/s]
-    reference_acceleration: Array  # [m/s^2]
-    masses: Array  # (N,) [kg]
+    position: Floats  # [m]
+    velocity: Floats  # [m/s]
+    reference_position: Floats  # desired [m]
+    reference_velocity: Floats  # [m/s]
+    reference_acceleration: Floats  # [m/s^2]
+    masses: Floats  # (N,) [kg]
     gravity: float  # [m/s^2]
 
 
@@ -303,20 +305,20 @@ class Flight:
             p.vehicles, p.graph.edges, p.law, work, steps, order, residual, floor
         )
 
-    def _tolerances(self, plan: PhasePlan, size: int) -> Array:
+    def _tolerances(self, plan: PhasePlan, size: int) -> Floats:
         """Absolute tolerances (size,) of the states."""
         given, large = self.mission.integrator, plan.method != "dense"
         return absolute_tolerances(
             given, size, self._atol_velocity(plan), plan.distances, large=large
         )
 
-    def _atol_velocity(self, plan: PhasePlan) -> Array:
+    def _atol_velocity(self, plan: PhasePlan) -> Floats:
         """Absolute tolerance (N,) of velocities [m/s]."""
         given, beta = self.mission.integrator, plan.program.law.beta
         large = plan.method != "dense"
         return tolerance_of_velocity(given, self.now.r, self.masses, beta, large=large)
 
-    def _integrator(self, plan: PhasePlan, y: Array, t: float) -> records.Integrator:
+    def _integrator(self, plan: PhasePlan, y: Floats, t: float) -> records.Integrator:
         rtol, trail = self.mission.integrator.rtol, self.extremes.begin(len(y), len(plan.edges))
         atol = self._tolerances(plan, len(y))
         return records.integrator(y, t, rtol=rtol, atol=atol, trail=trail)
@@ -366,7 +368,7 @@ class Flight:
             else:
                 self._stretch(leg, program, min(t_end, float(coming.min())))
 
-    def _lose(self, leg: Leg, program: k.Program, now: NDArray[np.bool_]) -> k.Program:
+    def _lose(self, leg: Leg, program: k.Program, now: Bools) -> k.Program:
         """Go on without the vehicles that are lost ``now`` (N,); returns what is flown of a program."""
         self._watch(leg, last=True)
         self.lost = self.lost | now
@@ -386,7 +388,7 @@ class Flight:
         leg.held = held._replace(graph=leg.plan.program.graph)
         return leg.held
 
-    def _release(self, plan: PhasePlan) -> NDArray[np.bool_]:
+    def _release(self, plan: PhasePlan) -> Bools:
         """Take a plan's edges to lost vehicles away; returns which are kept."""
         kept = ~np.any(self.lost[plan.edges], axis=1)
         plan.edges, plan.distances = plan.edges[kept], plan.distances[kept]
@@ -438,7 +440,7 @@ class Flight:
                 diagnose(self.mission, leg, own_force=own_force, collapsed=collapsed)
             )
 
-    def _samples(self, leg: Leg, t_end: float) -> Array:
+    def _samples(self, leg: Leg, t_end: float) -> Floats:
         """Times to record in (t, t_end]: multiples of the output step, the phase's two ends, its arrival.
 
         The start of a phase is recorded one representable number after the switch, and so is what
@@ -507,7 +509,7 @@ class Flight:
 
     # -- states -----------------------------------------------------------------------------------
 
-    def _pack(self, plan: PhasePlan) -> Array:
+    def _pack(self, plan: PhasePlan) -> Floats:
         """The kernel's state vector at the switch."""
         now, masses = self.now, self.masses
         integral = now.integral.of(plan.edges, 0.0)
@@ -580,7 +582,7 @@ class Flight:
 
     # -- the record -------------------------------------------------------------------------------
 
-    def _record(self, leg: Leg, program: k.Program, times: Array, samples: Array) -> None:
+    def _record(self, leg: Leg, program: k.Program, times: Floats, samples: Floats) -> None:
         """Evaluate forces and references at the samples and keep them."""
         plan, w = leg.plan, leg.workspace
         n, m = len(self.masses), len(plan.edges)
@@ -623,7 +625,7 @@ class Flight:
 
 
 def _first_step(
-    program: k.Program, work: k.Workspace, state: records.Integrator, scale: Array, longest: float
+    program: k.Program, work: k.Workspace, state: records.Integrator, scale: Floats, longest: float
 ) -> float:
     """First step [s] to try in a large formation, from two evaluations; at most the ``longest``.
 
@@ -631,7 +633,7 @@ def _first_step(
     tolerance of each state. Steps that grow from a small one cost a large formation more.
     """
 
-    def size(x: Array) -> float:
+    def size(x: Floats) -> float:
         return float(np.sqrt(np.mean((x / scale) ** 2)))
 
     t, y = float(state.clock[0]), state.y
@@ -664,7 +666,7 @@ def _check_size(mission: Mission, phase: Phase) -> None:
         )
 
 
-def _times(times: ArrayLike, end: float) -> Array:
+def _times(times: ArrayLike, end: float) -> Floats:
     """Times [s] to record, sorted; those that rounding has put behind the end are at the end."""
     t = np.unique(np.asarray(times, dtype=float))
     if not (len(t) and t[0] >= 0.0 and t[-1] <= end * (1.0 + 1e-12)):

@@ -11,13 +11,11 @@ import numpy as np
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity as geometry
 from rigidfleet.result import PhaseRecord, Result
+from rigidfleet.typing import Bools, Floats, Ints
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from rigidfleet.kernel.problem import Array
     from rigidfleet.kernel.records import Record
-    from rigidfleet.math.proximity import Ints
+
     from rigidfleet.mission import Mission
 
 
@@ -32,10 +30,10 @@ class Piece:
     """Samples of a phase, or of part of one, as the kernel gave them."""
 
     phase: int
-    time: Array  # (K,) [s]
+    time: Floats  # (K,) [s]
     record: Record
-    integral: Array  # (K, m) [m s]
-    frame: Array  # (K, 4)
+    integral: Floats  # (K, m) [m s]
+    frame: Floats  # (K, 4)
     edges: Ints  # (m, 2) of this phase
     attached: bool  # whether the slots carry the body frame
 
@@ -55,7 +53,7 @@ def assemble(
     masses = np.where(left, np.array(mission.agents.mass), 0.0)
     M = masses.sum(axis=1)[:, None]
 
-    def joined(name: str) -> Array:
+    def joined(name: str) -> Floats:
         return np.concatenate([getattr(p.record, name) for p in pieces])
 
     r, v = joined("r"), joined("v")
@@ -97,7 +95,7 @@ def assemble(
         distance[~left[:, edges].all(axis=2)] = np.nan
     columns = [_columns(p.edges, edges) for p in pieces]
 
-    def by_edge(name: str) -> Array:
+    def by_edge(name: str) -> Floats:
         return _by_edge(pieces, columns, name, len(edges))
 
     reference = by_edge("d")
@@ -148,7 +146,7 @@ def assemble(
     )
 
 
-def _put_extremes(phases: Sequence[PhaseRecord], time: Array, closeness: tuple[Any, ...]) -> None:
+def _put_extremes(phases: Sequence[PhaseRecord], time: Floats, closeness: tuple[Any, ...]) -> None:
     """What a phase comes to between samples stands at the sample behind it."""
     separation, pair, clearance, agent, obstacle = closeness
     for phase in phases:
@@ -166,8 +164,8 @@ def _put_extremes(phases: Sequence[PhaseRecord], time: Array, closeness: tuple[A
 
 
 def _attitudes(
-    pieces: Sequence[Piece], x: Array, p: Array, masses: Array, *, framed: bool
-) -> tuple[Array, NDArray[np.bool_]]:
+    pieces: Sequence[Piece], x: Floats, p: Floats, masses: Floats, *, framed: bool
+) -> tuple[Floats, Bools]:
     """Attitude quaternions (K, 4) of the formation's slots p (K, N, 3), fitted to x by masses (K, N).
 
     And where the slots are a line (K,).
@@ -202,7 +200,7 @@ def _attitudes(
 
 def _by_edge(
     pieces: Sequence[Piece], columns: Sequence[Ints | slice], name: str, count: int
-) -> Array:
+) -> Floats:
     """A quantity of the edges (K, m), NaN while an edge is not active."""
     rows = []
     for piece, places in zip(pieces, columns, strict=True):
@@ -223,7 +221,7 @@ def _columns(some: Ints, edges: Ints) -> Ints | slice:
     return order[np.searchsorted(keys[order], some[:, 0] * key + some[:, 1])]
 
 
-def _singular_values(pieces: Sequence[Piece]) -> Array:
+def _singular_values(pieces: Sequence[Piece]) -> Floats:
     """Smallest non-zero singular value of J (K,); NaN where a sample would take longer than a flight.
 
     In formations of some tens of agents it is that of some samples in each phase, and linear between them.
@@ -231,7 +229,7 @@ def _singular_values(pieces: Sequence[Piece]) -> Array:
     return np.concatenate([_singular(p.record.r, p.edges) for p in pieces])
 
 
-def _singular(r: Array, edges: Ints) -> Array:
+def _singular(r: Floats, edges: Ints) -> Floats:
     """That of one phase, of positions r (K, N, 3)."""
     size = min(len(edges), 3 * r.shape[1])
     if size > _SINGULAR:

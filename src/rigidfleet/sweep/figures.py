@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rigidfleet.errors import RigidfleetError
 from rigidfleet.plotting import FORMATS, write_figure
@@ -20,13 +19,13 @@ from rigidfleet.sweep.record import called
 from rigidfleet.sweep.store import Table
 from rigidfleet.sweep.summary import drivers, outcomes, rate, summarise, varied
 from rigidfleet.sweep.variation import Geomspace, LogUniform
+from rigidfleet.typing import Floats, Ints
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
-Floats = NDArray[np.float64]
 
 PASSED, FAILED = "#56B4E9", "#D55E00"
 _COLUMNS = 4  # of small axes at most
@@ -378,7 +377,7 @@ def _log_ticks(axis: Axis, x: Floats) -> None:
     axis.set_ticks([], minor=True)
 
 
-def _cells(x: Floats, scale: str) -> tuple[Floats, NDArray[np.int64]]:
+def _cells(x: Floats, scale: str) -> tuple[Floats, Ints]:
     """Edges of cells along an axis, and the cell of each run: of few values each has one of its own."""
     distinct = np.unique(x)
     if len(distinct) <= _VALUES:

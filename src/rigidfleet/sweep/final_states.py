@@ -24,14 +24,11 @@ from rigidfleet.mission.schema import HUGE
 from rigidfleet.simulation.ensemble import Ensemble, establish, off
 from rigidfleet.sweep.metrics import METRICS
 from rigidfleet.sweep.record import Row, refusal
+from rigidfleet.typing import Bools, Floats
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from rigidfleet.sweep.definition import Sweep
 
-    Floats = NDArray[np.float64]
-    Flags = NDArray[np.bool_]
 
 #: Agents whose extent along an axis is less than this part of the longest may be flat: their mission decides.
 _CLEARLY = 1e-5
@@ -119,7 +116,7 @@ def _refused(sweep: Sweep, runs: Sequence[int], r: Floats, v: Floats) -> dict[in
     return found
 
 
-def _spread(mission: Mission, r: Floats, v: Floats) -> Flags:
+def _spread(mission: Mission, r: Floats, v: Floats) -> Bools:
     """Whether agents and their velocities clearly span as many dimensions as any formation asks for (B,)."""
     asked = [
         mission.formation_slots(p.formation)
@@ -134,7 +131,7 @@ def _spread(mission: Mission, r: Floats, v: Floats) -> Flags:
     return np.asarray(extent[:, 3 - needed] > _CLEARLY**2 * extent[:, 2])
 
 
-def _judged(mission: Mission, flown: Ensemble) -> tuple[dict[str, Flags], dict[str, Floats]]:
+def _judged(mission: Mission, flown: Ensemble) -> tuple[dict[str, Bools], dict[str, Floats]]:
     """What fails (B,), and metrics (B,)."""
     count = len(flown.finished)
     wrong = {name: np.zeros(count, dtype=bool) for name in ("distances", "shape", "handedness")}

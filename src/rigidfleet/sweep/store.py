@@ -24,6 +24,7 @@ from rigidfleet.errors import ResultError
 from rigidfleet.sweep.definition import Sweep
 from rigidfleet.sweep.metrics import METRICS
 from rigidfleet.sweep.record import Row
+from rigidfleet.typing import Bools, Floats, Ints
 
 FILE = "sweep.db"
 #: Locked by the process that writes; the lock ends with it, however it ends.
@@ -49,13 +50,13 @@ class Table:
     """
 
     sweep: Sweep
-    run: NDArray[np.int64]
-    passed: NDArray[np.bool_]
+    run: Ints
+    passed: Bools
     reason: NDArray[np.object_]
     detail: NDArray[np.object_]
-    codes: NDArray[np.float64]
-    metrics: dict[str, NDArray[np.float64]]
-    wall: NDArray[np.float64]
+    codes: Floats
+    metrics: dict[str, Floats]
+    wall: Floats
 
     @property
     def complete(self) -> bool:
@@ -118,7 +119,7 @@ class Store:
         with _explained(self.path), self._transaction():
             self.db.executemany(f"INSERT OR REPLACE INTO runs VALUES ({marks})", entries)
 
-    def there(self) -> NDArray[np.bool_]:
+    def there(self) -> Bools:
         """Which of the sweep's runs are there (runs,)."""
         found = np.zeros(self.runs, dtype=bool)
         with _explained(self.path):

@@ -10,19 +10,18 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rigidfleet.result import plain
 from rigidfleet.sweep.metrics import METRICS, readable
 from rigidfleet.sweep.record import called
 from rigidfleet.sweep.store import Table
 from rigidfleet.sweep.variation import is_number
+from rigidfleet.typing import Bools, Floats
 
 if TYPE_CHECKING:
     from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
     from rich.table import Table as Grid
 
-Floats = NDArray[np.float64]
 
 PERCENTILES = (0, 5, 25, 50, 75, 95, 100)
 #: What the intervals of rates hold [-].
@@ -152,7 +151,7 @@ def _examples(table: Table) -> dict[str, Example]:
     return others | told
 
 
-def rate(passed: NDArray[np.bool_]) -> Rate:
+def rate(passed: Bools) -> Rate:
     """Rate of what passed, with its Wilson interval; between 0 and 1 where there is nothing."""
     from scipy.stats import binomtest
 

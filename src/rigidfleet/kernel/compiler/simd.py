@@ -28,6 +28,8 @@ from numba.extending import (
 )
 from numpy.typing import NDArray
 
+from rigidfleet.typing import Floats
+
 #: Lanes of a value.
 WIDTH = 8
 # Products and sums may be fused, but not reordered: what a lane gets never depends on the compiler.
@@ -66,8 +68,8 @@ class LaneArray(np.ndarray):
     """An array of `lanes`, made by `pack` and read by `unpack`."""
 
 
-def pack(values: NDArray[np.float64]) -> LaneArray:
-    """Array (...) of lanes from float64 (..., 8), a copy that is aligned as vectors like it."""
+def pack(values: Floats) -> LaneArray:
+    """Floats (...) of lanes from float64 (..., 8), a copy that is aligned as vectors like it."""
     values = np.asarray(values, dtype=np.float64)
     room = np.empty(values.size + WIDTH)
     skip = -room.ctypes.data // room.itemsize % WIDTH
@@ -77,7 +79,7 @@ def pack(values: NDArray[np.float64]) -> LaneArray:
     return flat.view(kind).reshape(values.shape[:-1]).view(LaneArray)
 
 
-def unpack(array: NDArray[Any]) -> NDArray[np.float64]:
+def unpack(array: NDArray[Any]) -> Floats:
     """View an array (...) of lanes as float64 (..., 8)."""
     plain = array.view(np.ndarray)
     return plain.reshape(plain.shape + (1,)).view(np.float64)

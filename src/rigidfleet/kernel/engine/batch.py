@@ -8,25 +8,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rigidfleet.kernel.compiler.jit import compiled
 from rigidfleet.kernel.compiler.simd import WIDTH, LaneArray, pack, unpack
 from rigidfleet.kernel.engine import native
 from rigidfleet.kernel.engine.codegen import integrate, straight
-from rigidfleet.kernel.problem import (
-    EXACT,
-    ITERATED,
-    OPEN,
-    SLOTS,
-    Array,
-    Program,
-    padded,
-    workspace,
-)
+from rigidfleet.kernel.problem import EXACT, ITERATED, OPEN, SLOTS, Program, padded, workspace
 from rigidfleet.kernel.records import FINISHED, LEAST_ERROR, integrator
-
-Numbers = NDArray[np.int64]
+from rigidfleet.typing import Bools, Floats, Ints
 
 #: A range of flights is begun by whichever thread is free, so many ranges to a thread.
 _RANGES = 4
@@ -71,9 +60,9 @@ class Ends:
     evaluations : (B,) calls of the right-hand side; flights of a vector share theirs
     """
 
-    y: Array
-    finished: NDArray[np.bool_]
-    evaluations: NDArray[np.int64]
+    y: Floats
+    finished: Bools
+    evaluations: Ints
 
 
 def fits(program: Program) -> bool:
@@ -95,12 +84,12 @@ def fits(program: Program) -> bool:
 
 def fly_all(
     program: Program,
-    starts: Array,
-    before: Array,
+    starts: Floats,
+    before: Floats,
     times: tuple[float, float],
     *,
     rtol: float,
-    atol: Array,
+    atol: Floats,
     max_steps: int,
     vectors: bool,
     threads: int,
@@ -134,7 +123,7 @@ def fly_all(
     count, n = starts.shape
     ready = straight(program)
 
-    def packed(x: Array) -> LaneArray:
+    def packed(x: Floats) -> LaneArray:
         if count % WIDTH:  # places left over in the last vector repeat the last flight
             x = x[np.minimum(np.arange(padded(count)), count - 1)]
         return pack(x.reshape(len(x) // WIDTH, WIDTH, x.shape[1]).swapaxes(1, 2))
@@ -166,11 +155,11 @@ def fly_all(
 
 def _fly_alone(
     program: Program,
-    starts: Array,
-    before: Array,
+    starts: Floats,
+    before: Floats,
     times: tuple[float, float],
     rtol: float,
-    atol: Array,
+    atol: Floats,
     max_steps: int,
     threads: int,
 ) -> Ends:
@@ -181,7 +170,7 @@ def _fly_alone(
         unsampled = np.zeros(0), np.zeros((0, starts.shape[1]))
 
         def work(
-            starts: Array, before: Array, ends: Array, status: Numbers, evaluations: Numbers
+            starts: Floats, before: Floats, ends: Floats, status: Ints, evaluations: Ints
         ) -> None:
             for k, start in enumerate(starts):
                 d0[:] = before[k]
@@ -195,7 +184,7 @@ def _fly_alone(
 
 
 def _share(
-    begin: Callable[[], Callable[..., None]], starts: Array, before: Array, threads: int
+    begin: Callable[[], Callable[..., None]], starts: Floats, before: Floats, threads: int
 ) -> Ends:
     """Share the flights, or vectors of them, out over threads, each with its own of what `begin` makes."""
     count = len(starts)

@@ -20,18 +20,19 @@ from rigidfleet.kernel.compiler import simd as lanes
 from rigidfleet.kernel.compiler.jit import compiled_copy, compiled_for_c, inlined
 from rigidfleet.kernel.compiler.simd import VECTOR, WIDTH, LaneArray
 from rigidfleet.kernel.engine.tracer import Code, Symbol, Trace, structure
-from rigidfleet.kernel.problem import Array, Program
+from rigidfleet.kernel.problem import Program
 from rigidfleet.kernel.records import STATE, TRIAL
 from rigidfleet.kernel.references import septic
+from rigidfleet.typing import Floats
 
 
 class Straight(NamedTuple):
     """A program as straight-line code takes it; ``before`` and ``time`` are overwritten in flight."""
 
     address: int  # of the code
-    uniform: Array  # (U,) what comes of the program's numbers
+    uniform: Floats  # (U,) what comes of the program's numbers
     before: LaneArray  # (m,) distances from which references are blended [m]
-    time: Array  # (3,) blend of the references, and two derivatives
+    time: Floats  # (3,) blend of the references, and two derivatives
     t0: float  # [s]
     T_b: float  # [s]
 

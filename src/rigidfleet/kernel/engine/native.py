@@ -22,11 +22,10 @@ from typing import Any, NamedTuple
 
 import llvmlite.binding as llvm
 import numpy as np
-from numpy.typing import NDArray
 
 from rigidfleet.kernel import problem as k
 from rigidfleet.kernel.compiler.cache import cache_directory, not_kept, opened, replacing, told
-from rigidfleet.kernel.problem import Array, Program, Workspace
+from rigidfleet.kernel.problem import Program, Workspace
 from rigidfleet.kernel.records import (
     Integrator,
     Monitor,
@@ -36,6 +35,7 @@ from rigidfleet.kernel.records import (
     monitor,
     recorder,
 )
+from rigidfleet.typing import Floats, Ints
 
 #: What the machine code is called, its arguments being addresses: int64(program, workspace, integrator, stretch),
 #: int64(program, workspace, stretch, record) and int64(program, workspace, integrator, monitor). Each comes in an
@@ -49,8 +49,8 @@ def integrate(
     state: Integrator,
     t_end: float,
     fresh: bool,
-    times: Array,
-    samples: Array,
+    times: Floats,
+    samples: Floats,
     max_steps: int,
 ) -> int:
     """Integrate to ``t_end`` [s], see `rigidfleet.kernel.dopri5.integrate`."""
@@ -58,7 +58,7 @@ def integrate(
     return _call(_code().integrate, _packed(program), _packed(workspace), _packed(state), stretch)
 
 
-def record(program: Program, workspace: Workspace, times: Array, samples: Array) -> Record:
+def record(program: Program, workspace: Workspace, times: Floats, samples: Floats) -> Record:
     """Forces and references at states ``samples`` (K, n) at ``times`` (K,) [s]."""
     n, m = len(program.vehicles.m), len(program.graph.edges)
     out = recorder(len(times), n, m)
@@ -86,7 +86,7 @@ class Watch:
         return _call(_code().watch, *packed, self._packed)
 
 
-def closed_loop(t: float, y: Array, dy: Array, program: Program, workspace: Workspace) -> None:
+def closed_loop(t: float, y: Floats, dy: Floats, program: Program, workspace: Workspace) -> None:
     """Right-hand side dy (n,) at time t [s] and state y (n,), see `rigidfleet.kernel.dopri5.closed_loop`."""
     stretch = Stretch(0.0, False, 0, np.array([t]), y.reshape(1, -1), dy)
     packed = _packed(program), _packed(workspace), _pack(stretch), _packed(_UNRECORDED)
@@ -104,7 +104,7 @@ class _Packed(NamedTuple):
     """A named tuple in words, and the tuple itself, which keeps its arrays."""
 
     of: Any
-    words: NDArray[np.int64]
+    words: Ints
     address: int
 
 

@@ -18,7 +18,8 @@ from numba.core.dispatcher import Dispatcher
 from numpy.typing import NDArray
 
 from rigidfleet.kernel import dopri5 as flight
-from rigidfleet.kernel.problem import EXACT, ITERATED, Array, Graph, Program, workspace
+from rigidfleet.kernel.problem import EXACT, ITERATED, Graph, Program, workspace
+from rigidfleet.typing import Floats, Ints
 
 #: From where a symbol gets its value, in the order in which they are known: numbers of the program;
 #: numbers of the flight, of the moment, and of its state.
@@ -264,7 +265,7 @@ class Code:
         inputs = [x for x in used if isinstance(x, Symbol) and x.known == UNIFORM]
         self.inputs = list({x.serial: x for x in inputs}.values())
 
-    def values(self, numbers: Array) -> Array:
+    def values(self, numbers: Floats) -> Floats:
         """Values (U,) of the inputs where the program's different numbers are these, by `structure`."""
         found: dict[int, float] = {}
         with np.errstate(all="ignore"):
@@ -293,13 +294,13 @@ class Code:
             (self._uniform if x.known == UNIFORM else self.lines).append(x)
 
 
-def structure(program: Program) -> tuple[bytes, Array, NDArray[np.int64]]:
+def structure(program: Program) -> tuple[bytes, Floats, Ints]:
     """All that straight-line code depends on: programs with equal structures share it.
 
     Returns it, the different numbers that the program flies by, in the order of their first
     appearance, and for each number, in the order of `Trace`, which of them it is.
     """
-    numbers: list[Array] = []
+    numbers: list[Floats] = []
     others: list[Any] = [program.has_frame, program.body_formulation, program.external]
     used = _used(program)
     for name in _PARTS:
@@ -314,7 +315,7 @@ def structure(program: Program) -> tuple[bytes, Array, NDArray[np.int64]]:
     return repr((others, which.tolist(), kinds.tolist())).encode(), values, which
 
 
-def elimination_order(edges: NDArray[np.integer]) -> NDArray[np.int64]:
+def elimination_order(edges: NDArray[np.integer]) -> Ints:
     """Order (m,) of edges (m, 2) in which to factor J M^-1 J^T: least degree first."""
     at: dict[int, set[int]] = {}
     for k, ends in enumerate(edges.tolist()):
@@ -331,7 +332,7 @@ def elimination_order(edges: NDArray[np.integer]) -> NDArray[np.int64]:
     return np.array(order, dtype=np.int64)
 
 
-def _ordered(graph: Graph, order: NDArray[np.int64]) -> Graph:
+def _ordered(graph: Graph, order: Ints) -> Graph:
     pairs = np.sort(np.argsort(order)[graph.pairs.astype(np.int64)], axis=1)[:, ::-1]
     return graph._replace(edges=graph.edges[order], pairs=pairs, diagonal=graph.diagonal[order])
 
@@ -352,7 +353,7 @@ def _used(program: Program) -> Program:
     )
 
 
-def _sort_out(x: Any, numbers: list[Array], others: list[Any]) -> None:
+def _sort_out(x: Any, numbers: list[Floats], others: list[Any]) -> None:
     """List the real numbers of a part; all the rest of it, with the shapes of arrays, apart."""
     if isinstance(x, tuple):
         for field in x:

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigidfleet.kernel.compiler.jit import compiled
-
-Ints = NDArray[np.int64]
+from rigidfleet.typing import Ints
 
 
 class Pattern(NamedTuple):

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from rigidfleet.kernel.compiler.jit import compiled
 from rigidfleet.kernel.rigid_body import centre_of_mass, inertia, inertia_inverse
+from rigidfleet.typing import Edges, Ints
 
 # The triple product of three unit vectors that counts as a lost pivot.
 LOST = 1e-6
@@ -22,13 +23,13 @@ LOST = 1e-6
 class Order(NamedTuple):
     """The order of the sweep: agents, each with its edges to three before it; what is lacking is 0."""
 
-    agent: NDArray[np.uint32]  # (N,)
-    edge: NDArray[np.uint32]  # (N, 3): none, one, two, then three each
-    other: NDArray[np.uint32]  # (N, 3) the agents at their other ends
+    agent: Edges  # (N,)
+    edge: Edges  # (N, 3): none, one, two, then three each
+    other: Edges  # (N, 3) the agents at their other ends
     sign: NDArray[np.int8]  # (N, 3) 1 where u of the edge points towards the agent, else -1
 
 
-def order(steps: NDArray[np.int64], edges: NDArray[np.integer]) -> Order:
+def order(steps: Ints, edges: NDArray[np.integer]) -> Order:
     """Prepare an order from steps (N, 4), an agent and its edges (-1: none), and edges (m, 2)."""
     agent, edge = steps[:, 0], np.maximum(steps[:, 1:], 0)
     ends = edges[edge].astype(np.int64)

@@ -12,14 +12,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rigidfleet.kernel.large import block_cholesky as sparse
 from rigidfleet.kernel.large import elimination as tree
-from rigidfleet.kernel.problem import ITERATED, Array, Law, Vehicles, Workspace
-
-Ints = NDArray[np.int64]
-Edges = NDArray[np.uint32]
+from rigidfleet.kernel.problem import ITERATED, Law, Vehicles, Workspace
+from rigidfleet.typing import Edges, Floats, Ints
 
 #: A kept factor is renewed when the iterations beyond those of a new one have taken as long as making one; or when a
 #: single solve needs more than this many, and, without fill, so many times as many as at first.
@@ -165,9 +162,9 @@ class LargeSolver:
         count = np.diff(self.pattern.column).astype(float)
         self.worth = 0.75 * float((count**2).sum() / count.sum())
         self.fresh, self.wasted = 0, 0.0  # iterations that a new factor needs, and those beyond
-        self.axes: Array | None = None  # of the marks when the factor was made; None: no factor
+        self.axes: Floats | None = None  # of the marks when the factor was made; None: no factor
 
-    def _system(self, number: int) -> Array | None:
+    def _system(self, number: int) -> Floats | None:
         """The solution x (N, 3) of K x = g, that system of an evaluation; None where there is none.
 
         By the kept factor, or by a new one if that has become stale, from past solutions of that system on.
@@ -201,7 +198,7 @@ class LargeSolver:
             if taken > _MOST or not np.isfinite(x).all():
                 x[:] = 0.0
 
-    def _gradients(self, x: Array, within: float, most: int) -> int:
+    def _gradients(self, x: Floats, within: float, most: int) -> int:
         w, p, m = self.workspace, self.pattern, self.vehicles.m
         assert p is not None
         taken = sparse.conjugate_gradients(
@@ -241,7 +238,7 @@ class LargeSolver:
             mu = max(10.0 * mu, 1e-3)
 
 
-def _far_apart(r: Array) -> Ints:
+def _far_apart(r: Floats) -> Ints:
     """Three agents (3,) far from each other and from one line: they tell how the formation has turned."""
     i = int(((r - r.mean(axis=0)) ** 2).sum(axis=1).argmax())
     j = int(((r - r[i]) ** 2).sum(axis=1).argmax())
@@ -249,7 +246,7 @@ def _far_apart(r: Array) -> Ints:
     return np.array([i, j, k])
 
 
-def _axes(a: list[float], b: list[float], c: list[float]) -> Array:
+def _axes(a: list[float], b: list[float], c: list[float]) -> Floats:
     """Rows of a rotation (3, 3) that goes with three points; the identity on a line."""
     x = [q - p for p, q in zip(a, b, strict=True)]
     z = _cross(x, [q - p for p, q in zip(a, c, strict=True)])

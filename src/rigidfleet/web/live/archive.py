@@ -8,13 +8,12 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rigidfleet.errors import MissionError
 from rigidfleet.mission import Establish, Mission, Phase, Reshape
 from rigidfleet.result import PhaseRecord, Result
 from rigidfleet.simulation.recording import Piece
-from rigidfleet.web.replay.pack import Floats
+from rigidfleet.typing import Bools, Floats
 
 #: Numbers kept at most, 8 bytes each: 10 minutes of 50 vehicles with 144 edges at 0.05 s. Beyond, every second
 #: sample goes, and the step doubles.
@@ -91,7 +90,7 @@ class Archive:
             if value > leg.worst.get(name, (-np.inf, None))[0]:
                 leg.worst[name] = (value, leg.last)
 
-    def _even(self, time: Floats) -> NDArray[np.bool_]:
+    def _even(self, time: Floats) -> Bools:
         """Which times are multiples of the step."""
         away = time / self.step
         return np.abs(away - np.round(away)) * self.step < 1e-6
@@ -113,7 +112,7 @@ def _numbers(piece: Piece) -> float:
     return float(sum(x.size for x in piece.record) + piece.integral.size + piece.frame.size)
 
 
-def rows(piece: Piece, which: NDArray[np.bool_] | list[int]) -> Piece:
+def rows(piece: Piece, which: Bools | list[int]) -> Piece:
     """Some samples of a piece."""
     record = type(piece.record)(*(x[which] for x in piece.record))
     return Piece(

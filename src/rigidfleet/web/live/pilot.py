@@ -22,8 +22,8 @@ from rigidfleet.planning.reference import Pose
 from rigidfleet.result import PhaseRecord, Result
 from rigidfleet.simulation.flight import Flight, Leg, StoppedError
 from rigidfleet.simulation.recording import assemble
+from rigidfleet.typing import Floats
 from rigidfleet.web.live.archive import Archive, as_flown, rows
-from rigidfleet.web.replay.pack import Floats
 
 TICK = 0.05  # between looks at what the hand asks for [s]
 _BLEND = 4.0  # from one formation to another [s]

@@ -13,12 +13,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rigidfleet.result import write_file
-from rigidfleet.web.replay.pack import Column, Floats, pack
+from rigidfleet.typing import Floats, Ints
+from rigidfleet.web.replay.pack import Column, pack
 from rigidfleet.web.replay.page import page, read
 from rigidfleet.web.replay.scene import describe, observe, sight, size, weight
 
 if TYPE_CHECKING:
-    from rigidfleet.math.proximity import Ints
+    pass
     from rigidfleet.result import Result
 
 __all__ = ["html_page", "replay"]

@@ -13,9 +13,8 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from rigidfleet.typing import Floats
 
 #: Stands for NaN; one below the least that is kept of a number.
 _MISSING = -(2**31)

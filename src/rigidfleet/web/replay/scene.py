@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rigidfleet.plotting import agent_colours
-from rigidfleet.web.replay.pack import Column, Floats
+from rigidfleet.typing import Floats, Ints
+from rigidfleet.web.replay.pack import Column
 
 if TYPE_CHECKING:
-    from rigidfleet.math.proximity import Ints
+    pass
     from rigidfleet.mission import Mission
     from rigidfleet.result import Result
 
