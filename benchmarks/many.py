@@ -31,7 +31,8 @@ from rich.console import Console
 from rich.table import Table
 
 from rigidfleet.assessment.measure import Fit
-from rigidfleet.formation import shapes
+from rigidfleet.formation import distance_geometry, shapes
+from rigidfleet.math import rigid_body
 from rigidfleet.mission import Mission, load_mission
 from rigidfleet.planning.solvers import WORDS
 from rigidfleet.rigidity import spectrum
@@ -119,7 +120,7 @@ def graph(shape: str, n: int, edges: str, reach: float | None) -> dict[str, Any]
     ends = spectrum(p, pairs, np.ones(n))
     return {
         "shape": shape, "agents": n, "graph": edges, "reach": reach, "edges": len(pairs),
-        "longest": float(shapes.distances(p, pairs).max()) / SPACING,
+        "longest": float(distance_geometry.distances(p, pairs).max()) / SPACING,
         "index": ends.index, "condition": ends.condition if ends.w > 0 else None,
     }  # fmt: skip
 
@@ -201,9 +202,9 @@ def fly(kind: str, n: int) -> Flown:
         result = simulate(flown, force=force)
         times.append((time.perf_counter() - wall, time.process_time() - processor))
     last = result.position[-1]
-    error = np.abs(shapes.distances(last, edges) - flown.formation_distances("f")).max()
-    thickness = np.linalg.svd(shapes.centred(last), full_matrices=False)[2][2]
-    off = shapes.centred(last) @ thickness
+    error = np.abs(distance_geometry.distances(last, edges) - flown.formation_distances("f")).max()
+    thickness = np.linalg.svd(rigid_body.centred(last), full_matrices=False)[2][2]
+    off = rigid_body.centred(last) @ thickness
     return Flown(
         kind, n, len(edges), ", ".join(result.statistics["solvers"]) or "dense",
         *(median(column) for column in zip(*times, strict=True)), [wall for wall, _ in times],

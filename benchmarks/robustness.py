@@ -29,7 +29,8 @@ from numpy.typing import NDArray
 
 from rigidfleet.assessment import assess
 from rigidfleet.errors import FlightError
-from rigidfleet.formation import shapes
+from rigidfleet.formation import assignment, distance_geometry, graphs, shapes
+from rigidfleet.math import rigid_body
 from rigidfleet.math.proximity import smallest_singular_value
 from rigidfleet.mission import Mission, load_mission, mission_names
 from rigidfleet.planning.reference import align_slots
@@ -72,7 +73,7 @@ class Case:
     @property
     def dimension(self) -> int:
         """1, 2 or 3: of the formation."""
-        return shapes.dimension(self.slots, 1e-3)
+        return distance_geometry.dimension(self.slots, 1e-3)
 
 
 @dataclass(frozen=True)
@@ -175,7 +176,7 @@ def shipped(seed: int) -> list[Case]:
                 continue
             edges = mission.formation_edges(name)
             rng = np.random.default_rng([seed, len(found)])
-            own = None if len(edges) == len(shapes.complete_graph(len(slots))) else edges
+            own = None if len(edges) == len(graphs.complete_graph(len(slots))) else edges
             case = Case(f"{mission.name}: {name}", slots, start(slots, rng), own)
             found.setdefault(np.round(slots, 6).tobytes(), case)
     return list(found.values())
@@ -194,7 +195,7 @@ def random_case(k: int, seed: int, agents: int | None = None) -> Case:
     side = 1.6 * SPACING * n ** (1 / d) * np.exp(rng.uniform(-0.5, 0.5, d))
     slots = np.zeros((n, 3))
     slots[:, :d] = scattered(rng, n, side, SPACING)
-    return Case(f"{_WHERE[d]} {k}", shapes.centred(slots), start(slots, rng))
+    return Case(f"{_WHERE[d]} {k}", rigid_body.centred(slots), start(slots, rng))
 
 
 def start(slots: Floats, rng: np.random.Generator) -> Floats:
@@ -244,8 +245,8 @@ def named() -> dict[str, list[Case]]:
     return {
         kind: [
             Case(f"{name}, {k}", slots, start(slots, np.random.default_rng([7, k])),
-                 shapes.complete_graph(len(slots)) if kind == "flat" else None)
-            for name, slots in ((name, shapes.centred(p)) for name, p in some.items())
+                 graphs.complete_graph(len(slots)) if kind == "flat" else None)
+            for name, slots in ((name, rigid_body.centred(p)) for name, p in some.items())
             for k in range(2)
         ]
         for kind, some in kinds.items()
@@ -260,7 +261,7 @@ def _beam(stations: int) -> Floats:
 
 def edges_of(case: Case, graph: str) -> Ints:
     """Edges of a formation: as few as its dimension needs, half as many more, or all."""
-    complete = shapes.complete_graph(case.n)
+    complete = graphs.complete_graph(case.n)
     if graph == "complete":
         return complete
     rng = np.random.default_rng(case.n)
@@ -294,7 +295,7 @@ def _spread(u: Floats, d: int) -> float:
 def beside(case: Case) -> Case:
     """The same formation, its agents a tenth of its shortest distance beside their slots."""
     rng = np.random.default_rng(case.n)
-    offset = 0.1 * shapes.distances(case.slots, shapes.complete_graph(case.n)).min()
+    offset = 0.1 * distance_geometry.distances(case.slots, graphs.complete_graph(case.n)).min()
     return replace(
         case, start=case.slots + offset * rng.normal(size=case.slots.shape) + [0.0, 0.0, 20.0]
     )
@@ -302,7 +303,7 @@ def beside(case: Case) -> Case:
 
 def assigned(case: Case) -> Case:
     """The same start, each agent where the slots are nearer: as assignment = "shortest" has it."""
-    order = shapes.assigned(case.start, case.slots).order
+    order = assignment.assigned(case.start, case.slots).order
     return replace(case, start=case.start[np.argsort(order)])
 
 
@@ -311,7 +312,7 @@ def singular_on_the_way(case: Case, edges: Ints) -> int:
 
     J and the six rigid motions make a square matrix: its determinant changes sign there.
     """
-    before, after = shapes.centred(case.start), shapes.centred(case.slots)
+    before, after = rigid_body.centred(case.start), rigid_body.centred(case.slots)
     dp = align_slots(before, after, np.ones(case.n))[0]
     signs = []
     for s in np.linspace(0.0, 1.0, 200):
@@ -392,7 +393,9 @@ def judged(case: Case, edges: Ints, result: Result) -> str:
         return "mirrored" if mirrored(case, r) else "intended"
     if flexible(case.slots.tobytes(), edges.tobytes()):
         return "flexible"
-    error = np.abs(shapes.distances(r, edges) - shapes.distances(case.slots, edges)).max()
+    error = np.abs(
+        distance_geometry.distances(r, edges) - distance_geometry.distances(case.slots, edges)
+    ).max()
     return "other" if error <= TOLERANCE * _shortest(case) else "unmet"
 
 
@@ -413,13 +416,15 @@ def mirrored(case: Case, r: Floats) -> bool:
 
 def worst_pair(case: Case, r: Floats) -> float:
     """Greatest error of a distance between two agents, relative to the shortest one."""
-    every = shapes.complete_graph(case.n)
-    error = np.abs(shapes.distances(r, every) - shapes.distances(case.slots, every))
+    every = graphs.complete_graph(case.n)
+    error = np.abs(
+        distance_geometry.distances(r, every) - distance_geometry.distances(case.slots, every)
+    )
     return float(error.max() / _shortest(case))
 
 
 def _shortest(case: Case) -> float:
-    return float(shapes.distances(case.slots, shapes.complete_graph(case.n)).min())
+    return float(distance_geometry.distances(case.slots, graphs.complete_graph(case.n)).min())
 
 
 def large_tetrahedron(slots: Floats) -> list[int]:

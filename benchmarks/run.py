@@ -27,7 +27,7 @@ from rich.console import Console
 from rich.table import Table
 from scipy_peer import Literal, Peer, constant, squared
 
-from rigidfleet.formation import shapes
+from rigidfleet.formation import distance_geometry
 from rigidfleet.kernel import records
 from rigidfleet.kernel.engine import native
 from rigidfleet.kernel.engine.tracer import Code, Trace
@@ -103,7 +103,7 @@ def peer(mission: Mission, kind: type[Peer]) -> Peer:
     rows = np.arange(len(edges))
     B[rows, edges[:, 0]], B[rows, edges[:, 1]] = 1.0, -1.0
     steps = mission.phases[0].reference == "step"
-    d0 = shapes.distances(r0, edges)
+    d0 = distance_geometry.distances(r0, edges)
     return kind(
         r0=r0,
         m=m,

@@ -5,7 +5,8 @@
 
 from collections import Counter
 
-from rigidfleet.formation.shapes import CUBE_EDGES, complete_graph, slots
+from rigidfleet.formation.graphs import CUBE_EDGES, complete_graph
+from rigidfleet.formation.shapes import slots
 from rigidfleet.rigidity import Kind, Verdict, analyse, realisations
 from rigidfleet.rigidity.design import design
 

@@ -11,9 +11,11 @@ from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
 
 from rigidfleet import physics
-from rigidfleet.formation.shapes import complete_graph, kabsch, slots
+from rigidfleet.formation.graphs import complete_graph
+from rigidfleet.formation.shapes import slots
 from rigidfleet.math import attitude
 from rigidfleet.math import pid as gains
+from rigidfleet.math.rigid_body import kabsch
 from rigidfleet.plotting.style import DASHES, FAINT, FLOWN, GREY, INK, PALETTE, TONES
 
 BLUE, ORANGE, GREEN, RED = PALETTE[:4]

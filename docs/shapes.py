@@ -9,7 +9,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import rigidfleet as rf
-from rigidfleet.formation.shapes import CUBE_EDGES, slots
+from rigidfleet.formation.graphs import CUBE_EDGES
+from rigidfleet.formation.shapes import slots
 from rigidfleet.math import pid as gains
 from rigidfleet.mission import Mission
 from rigidfleet.plotting import space

@@ -11,7 +11,8 @@ import numpy as np
 
 import rigidfleet as rf
 from rigidfleet import physics
-from rigidfleet.formation.shapes import complete_graph, distances
+from rigidfleet.formation.distance_geometry import distances
+from rigidfleet.formation.graphs import complete_graph
 from rigidfleet.mission import Mission
 
 COUNTED = 12.0  # [s] what is measured comes after this

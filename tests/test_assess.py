@@ -13,7 +13,7 @@ from rich.console import Console
 
 from rigidfleet.assessment import SHAPE_TOLERANCE, Finding, Verdict, assess
 from rigidfleet.assessment.measure import Fit
-from rigidfleet.formation import shapes
+from rigidfleet.formation import distance_geometry, graphs, shapes
 from rigidfleet.math import attitude as att
 from rigidfleet.math.proximity import clearance, separation
 from rigidfleet.mission import Mission
@@ -179,8 +179,8 @@ def test_rigid_but_no_cube():
     """All 18 edges hold and the shape is another: the verdict says rigid, but no cube."""
     # Table 4 of the paper as printed, its pair (d45, d48) swapped: a skewed shape. Solved here by Newton.
     base = shapes.slots("cube", 4.0, 8)
-    edges = shapes.CUBE_EDGES
-    length = shapes.distances(base, edges)
+    edges = graphs.CUBE_EDGES
+    length = distance_geometry.distances(base, edges)
     swap = [(edges == e).all(axis=1).argmax() for e in [(3, 4), (3, 7)]]
     length[swap] = length[swap[::-1]]
     p = np.random.default_rng(0).normal(size=(8, 3)) * 0.5 + base
@@ -191,7 +191,7 @@ def test_rigid_but_no_cube():
         J = np.zeros((18, 8, 3))
         J[range(18), i], J[range(18), j] = u / L[:, None], -u / L[:, None]
         p -= 0.5 * (np.linalg.pinv(J.reshape(18, 24)) @ (L - length)).reshape(8, 3)
-    assert np.abs(shapes.distances(p, edges) - length).max() < 1e-9
+    assert np.abs(distance_geometry.distances(p, edges) - length).max() < 1e-9
     form = {
         "shape": "cube",
         "size": 4.0,
@@ -745,8 +745,10 @@ def test_worst_pair_is_that_of_all_pairs(flown):
         "scattered": rng.normal(size=slots.shape),
     }[flown]
     fit = Fit(p @ att.dcm_from_euler([0.3, -0.2, 1.0]) + [5.0, -3.0, 20.0], slots)
-    pairs = shapes.complete_graph(250)
-    error = np.abs(shapes.distances(p, pairs) - shapes.distances(slots, pairs))
+    pairs = graphs.complete_graph(250)
+    error = np.abs(
+        distance_geometry.distances(p, pairs) - distance_geometry.distances(slots, pairs)
+    )
     i, j = fit.pair
     assert fit.error == pytest.approx(error.max(), abs=1e-10)
     assert fit.flown == pytest.approx(np.linalg.norm(p[i] - p[j]))

@@ -19,7 +19,8 @@ import pytest
 from rigidfleet.cli import app as cli
 from rigidfleet.cli import console as screen
 from rigidfleet.errors import FlightError
-from rigidfleet.formation.shapes import SHAPES, neighbours
+from rigidfleet.formation.graphs import neighbours
+from rigidfleet.formation.shapes import SHAPES
 from rigidfleet.formation.shapes import slots as slots_of
 from rigidfleet.mission import mission_names, mission_text
 from rigidfleet.plotting import figure_names

@@ -7,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
+from rigidfleet.formation import distance_geometry, graphs
 from rigidfleet.formation import shapes as f
 from rigidfleet.rigidity import Verdict, analyse, full_rank, jacobian
 from rigidfleet.rigidity.design import design, limits, mission_fragment
@@ -27,27 +28,27 @@ def test_designed_cube_beats_the_paper():
     assert len(edges) == 18
     assert result.verdict is Verdict.INFINITESIMALLY_RIGID
     assert result.w == pytest.approx(BEST_CUBE)
-    assert index(CUBE, f.CUBE_EDGES) == pytest.approx(0.2586, abs=5e-5)
+    assert index(CUBE, graphs.CUBE_EDGES) == pytest.approx(0.2586, abs=5e-5)
 
 
 @pytest.mark.long
 def test_designed_cube_is_the_best_of_all():
     """Of all 13 123 110 graphs of 18 edges, looked at one by one up to symmetry, none has a greater w."""
-    edges = f.complete_graph(8)
+    edges = graphs.complete_graph(8)
     number = {pair: k for k, pair in enumerate(map(tuple, edges.tolist()))}
     ones = np.array([k.bit_count() for k in range(1 << 14)])
     halves = [np.flatnonzero(ones == k).astype(np.uint32) for k in range(15)]
-    graphs = np.concatenate(
+    chosen = np.concatenate(
         [((halves[k][:, None] << 14) | halves[18 - k]).ravel() for k in range(4, 15)]
     )
-    assert len(graphs) == 13_123_110
-    least, bits = graphs.copy(), np.arange(1 << 14)[:, None] >> np.arange(14) & 1
+    assert len(chosen) == 13_123_110
+    least, bits = chosen.copy(), np.arange(1 << 14)[:, None] >> np.arange(14) & 1
     for axes, signs in product(permutations(range(3)), product([1, -1], repeat=3)):
         to = [int(((CUBE - q) ** 2).sum(axis=1).argmin()) for q in CUBE[:, axes] * signs]
         image = [1 << number[min(to[i], to[j]), max(to[i], to[j])] for i, j in edges.tolist()]
         low = (bits @ np.array(image[:14])).astype(np.uint32)
         high = (bits @ np.array(image[14:])).astype(np.uint32)
-        np.minimum(least, low[graphs & 0x3FFF] | high[graphs >> 14], out=least)
+        np.minimum(least, low[chosen & 0x3FFF] | high[chosen >> 14], out=least)
     J, best = jacobian(CUBE, edges), 0.0
     distinct = np.unique(least)
     for some in np.array_split(distinct, 20):
@@ -62,7 +63,7 @@ def test_small_designs_are_the_best_of_all(dimension):
     p = np.zeros((5, 3))
     p[:, :dimension] = np.random.default_rng(dimension).normal(size=(5, dimension))
     m = full_rank(5, dimension)
-    J = jacobian(p[:, :dimension], f.complete_graph(5))
+    J = jacobian(p[:, :dimension], graphs.complete_graph(5))
     every = np.array(list(combinations(range(10), m)))
     w = np.linalg.svd(J[every], compute_uv=False)[:, -1].max() ** 2
     assert index(p, design(p)) == pytest.approx(w)
@@ -86,13 +87,13 @@ def test_more_edges_are_no_worse():
     """Each redundant edge keeps or raises the index of the cube; all 28 have w = 1."""
     w = [index(CUBE, design(CUBE, extra=k)) for k in (0, 1, 2, 4, 7)]
     assert all(b >= a - 1e-9 for a, b in pairwise(w))
-    assert design(CUBE, extra="complete").tolist() == f.complete_graph(8).tolist()
+    assert design(CUBE, extra="complete").tolist() == graphs.complete_graph(8).tolist()
 
 
 def test_edges_stay_within_sensing_range():
     """No edge is longer than vehicles can sense: face diagonals, but no space diagonals."""
     edges = design(CUBE, sensing_range=5.7)
-    assert f.distances(CUBE, edges).max() < 5.7
+    assert distance_geometry.distances(CUBE, edges).max() < 5.7
     assert analyse(CUBE, edges).verdict is Verdict.INFINITESIMALLY_RIGID
 
 
@@ -135,7 +136,7 @@ def test_limits_of_flat_shapes(name, n, words):
     """What distances do not hold is what the analysis finds free, for every graph."""
     p = f.slots(name, 4.0, n)
     assert words in limits(p)
-    assert f"leaves {len(analyse(p, f.complete_graph(n)).flexes)} motion" in limits(p)
+    assert f"leaves {len(analyse(p, graphs.complete_graph(n)).flexes)} motion" in limits(p)
 
 
 @pytest.mark.parametrize("p", [CUBE, CUBE[:3], CUBE[:2], CUBE[:1]])

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from rigidfleet import physics
 from rigidfleet.assessment import assess
+from rigidfleet.formation import distance_geometry, graphs
 from rigidfleet.formation import shapes as formation
-from rigidfleet.math import lqr
+from rigidfleet.math import lqr, rigid_body
 from rigidfleet.math.attitude import dcm_from_rotation_vector, triangle_frame
 from rigidfleet.math.proximity import smallest_singular_value
 from rigidfleet.mission import Mission, load_mission
@@ -84,7 +85,7 @@ def decoupling(x: Array) -> Array:
 def test_sum_over_all_agents():
     """Eq. 1: internal forces cancel in pairs if summed to N; to N - 1, those of agent N are lost."""
     rng = np.random.default_rng(2)
-    r, edges = rng.normal(size=(4, 3)) * 3, formation.complete_graph(4)
+    r, edges = rng.normal(size=(4, 3)) * 3, graphs.complete_graph(4)
     held = physics.constraint_force(r, np.zeros_like(r), np.ones(4), edges, 4.0)
     pair = np.zeros((4, 4, 3))
     for (i, j), pull in zip(edges, held.multiplier, strict=True):
@@ -104,7 +105,7 @@ def test_degrees_of_freedom():
             r[:, :dimension] = rng.normal(size=(n, dimension))
             # n points span n - 1 dimensions at most.
             rank = {1: n - 1, 2: 2 * n - 3, 3: 3 * n - 6}[min(dimension, n - 1)]
-            J = jacobian(r, formation.complete_graph(n))
+            J = jacobian(r, graphs.complete_graph(n))
             assert np.linalg.matrix_rank(J, tol=1e-9) == rank
 
 
@@ -116,7 +117,7 @@ def test_right_number_of_edges_is_not_enough():
     r = np.random.default_rng(4).normal(size=(8, 3))
     assert len(edges) == 18
     assert np.linalg.matrix_rank(jacobian(r, edges), tol=1e-9) == 17
-    assert np.linalg.matrix_rank(jacobian(CUBE, formation.CUBE_EDGES), tol=1e-9) == 18
+    assert np.linalg.matrix_rank(jacobian(CUBE, graphs.CUBE_EDGES), tol=1e-9) == 18
 
 
 def test_not_square():
@@ -124,7 +125,7 @@ def test_not_square():
     m = np.array([0.5, 1.0, 2.0])
     rng = np.random.default_rng(5)
     r, v = TRIANGLE, rng.normal(size=(3, 3))
-    edges = formation.complete_graph(3)
+    edges = graphs.complete_graph(3)
     J = jacobian(r, edges)
     force = physics.constraint_force(
         r, v, m, edges, 4.0, alpha=0, beta=0, gamma=0, solver="exact"
@@ -139,7 +140,7 @@ def test_not_square():
 def test_moving_references_do_work():
     """Eq. 8: constraint forces do no work while the distances rest; once they move, they do."""
     rng = np.random.default_rng(6)
-    r, edges, d_dot = TRIANGLE, formation.complete_graph(3), np.array([0.3, -0.1, 0.2])
+    r, edges, d_dot = TRIANGLE, graphs.complete_graph(3), np.array([0.3, -0.1, 0.2])
     J = jacobian(r, edges)
     rigid = np.cross(rng.normal(size=3), r) + rng.normal(size=3)
     powers = []
@@ -165,7 +166,7 @@ def test_moving_references_do_work():
 def test_singular_where_the_paper_flies(shape, n, edges, rank):
     """Eq. 12: J M^-1 J^T is singular on the line, the square and the hexagon."""
     r = formation.slots(shape, 4.0, n)
-    e = formation.complete_graph(n) if edges == "complete" else np.array(edges)
+    e = graphs.complete_graph(n) if edges == "complete" else np.array(edges)
     A = jacobian(r, e) @ jacobian(r, e).T
     assert len(e) == 3 * n - 6
     assert np.linalg.matrix_rank(A, tol=1e-9) == rank
@@ -175,7 +176,7 @@ def test_near_the_line():
     """Eq. 12: at an offset h from the 4-8-4 line, the least eigenvalue of A falls as h^2 / 8."""
     for h in (1e-1, 1e-2):
         r = np.array([[-4.0, 0, 0], [0, h, 0], [4.0, 0, 0]])
-        value = float(smallest_singular_value(r[None], formation.complete_graph(3))[0]) ** 2
+        value = float(smallest_singular_value(r[None], graphs.complete_graph(3))[0]) ** 2
         assert value == pytest.approx(h**2 / 8, rel=1e-2)
 
 
@@ -337,14 +338,14 @@ def test_table_4_is_no_cube():
     edges = printed.formation_edges("cube").tolist()
     given = dict(zip(map(tuple, edges), printed.formation_distances("cube"), strict=True))
     diagonal = 4 * math.sqrt(2)
-    of_cube = dict(zip(map(tuple, edges), formation.distances(CUBE, edges), strict=True))
+    of_cube = dict(zip(map(tuple, edges), distance_geometry.distances(CUBE, edges), strict=True))
     wrong = {e for e in given if abs(given[e] - of_cube[e]) > 1e-9}
     assert wrong == {(3, 4), (3, 7)}
     assert (of_cube[3, 4], of_cube[3, 7]) == pytest.approx((diagonal, 4.0))
     assert (given[3, 4], given[3, 7]) == pytest.approx((4.0, diagonal))
     result = simulate(printed)
     end = result.position[-1]
-    longest = formation.distances(end, formation.complete_graph(8)).max()
+    longest = distance_geometry.distances(end, graphs.complete_graph(8)).max()
     assert np.abs(result.constraint[-1]).max() < 1e-6
     assert longest == pytest.approx(7.70, abs=0.005)
     assert longest > 4 * math.sqrt(3) + 0.7
@@ -353,9 +354,11 @@ def test_table_4_is_no_cube():
 def test_distances_do_not_fix_a_shape():
     """Section V: all distances of the cube hold in its mirror image, which no rotation makes of it."""
     mirrored = CUBE * [1, 1, -1]
-    every = formation.complete_graph(8)
-    assert formation.distances(mirrored, every) == pytest.approx(formation.distances(CUBE, every))
-    R = formation.kabsch(mirrored, CUBE)
+    every = graphs.complete_graph(8)
+    assert distance_geometry.distances(mirrored, every) == pytest.approx(
+        distance_geometry.distances(CUBE, every)
+    )
+    R = rigid_body.kabsch(mirrored, CUBE)
     assert np.linalg.norm(mirrored - CUBE @ R.T, axis=1).max() > 2.0
 
 

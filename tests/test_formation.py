@@ -7,7 +7,9 @@ from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
 
 from rigidfleet.errors import MissionError
+from rigidfleet.formation import distance_geometry, graphs, point_files
 from rigidfleet.formation import shapes as f
+from rigidfleet.math import rigid_body
 from rigidfleet.planning.solvers import sweep_steps
 from rigidfleet.rigidity import jacobian, spectrum
 
@@ -126,9 +128,9 @@ def test_cube_counts_counter_clockwise_from_below():
 
 def test_paper_edges_of_cube_are_sides_and_face_diagonals():
     """The 18 edges of Table 4 are 12 sides and one diagonal of each face, as a rigid cube needs."""
-    d = np.sort(f.distances(f.slots("cube", 4.0, 8), f.CUBE_EDGES))
+    d = np.sort(distance_geometry.distances(f.slots("cube", 4.0, 8), graphs.CUBE_EDGES))
     np.testing.assert_allclose(d, [4.0] * 12 + [4 * np.sqrt(2)] * 6)
-    assert len({tuple(e) for e in f.CUBE_EDGES.tolist()}) == 18
+    assert len({tuple(e) for e in graphs.CUBE_EDGES.tolist()}) == 18
 
 
 @pytest.mark.parametrize(("n", "height"), [(4, np.sqrt(2 / 3)), (5, np.sqrt(1 / 2))])
@@ -174,7 +176,7 @@ def test_points_are_read(tmp_path, text):
     """Commas, semicolons or blanks; names, comments, two columns, a byte-order mark: all the same points."""
     path = tmp_path / "points.csv"
     path.write_bytes(text.encode())
-    np.testing.assert_array_equal(f.read_points(path), [[0, 0, 0], [4, 0, 0], [0, 4, 0]])
+    np.testing.assert_array_equal(point_files.read_points(path), [[0, 0, 0], [4, 0, 0], [0, 4, 0]])
 
 
 @pytest.mark.parametrize(
@@ -195,7 +197,7 @@ def test_files_without_points_are_refused(tmp_path, text, message):
     path = tmp_path / "points.csv"
     path.write_bytes(text)
     with pytest.raises(MissionError, match=message):
-        f.read_points(path)
+        point_files.read_points(path)
 
 
 def test_all_wrong_lines_are_named(tmp_path):
@@ -203,16 +205,16 @@ def test_all_wrong_lines_are_named(tmp_path):
     path = tmp_path / "points.csv"
     path.write_text("0,0,0\na,b,c\n1,2,3,4\n")
     with pytest.raises(MissionError) as caught:
-        f.read_points(path)
+        point_files.read_points(path)
     assert [finding.key for finding in caught.value.findings] == ["line 2", "line 3"]
 
 
 def test_missing_files_and_directories_are_refused(tmp_path):
     """A file that cannot be opened is named."""
     with pytest.raises(MissionError, match=r"none\.csv: cannot be read: no such file"):
-        f.read_points(tmp_path / "none.csv")
+        point_files.read_points(tmp_path / "none.csv")
     with pytest.raises(MissionError, match="cannot be read: is a directory"):
-        f.read_points(tmp_path)
+        point_files.read_points(tmp_path)
 
 
 # -- edges, distances, dimension
@@ -220,14 +222,14 @@ def test_missing_files_and_directories_are_refused(tmp_path):
 
 def test_complete_graph_is_in_lexical_order():
     """Edges run 12, 13, 14, 23, 24, 34, the order in which distances are given."""
-    assert f.complete_graph(4).tolist() == [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]]
-    assert f.complete_graph(1).shape == (0, 2)
+    assert graphs.complete_graph(4).tolist() == [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]]
+    assert graphs.complete_graph(1).shape == (0, 2)
 
 
 def test_distances_agree_with_scipy():
     """Distances over the complete graph are SciPy's pdist, in its order."""
     p = points(1, 6, 3)
-    np.testing.assert_allclose(f.distances(p, f.complete_graph(6)), pdist(p))
+    np.testing.assert_allclose(distance_geometry.distances(p, graphs.complete_graph(6)), pdist(p))
 
 
 @pytest.mark.parametrize(
@@ -237,22 +239,22 @@ def test_distances_agree_with_scipy():
 def test_dimension(shape, n, want):
     """A line has dimension 1 and a square 2, wherever they lie; rounding does not add one."""
     far = f.slots(shape, 4.0, n) @ rotation(3).T + [1e3, -2e3, 50.0]
-    assert f.dimension(far) == want
+    assert distance_geometry.dimension(far) == want
 
 
 @given(SEEDS)
 def test_handedness_follows_rotations_and_flips_in_mirrors(seed):
     """Turning a shape keeps its hand, mirroring changes it."""
     p, R = points(seed, 5, 3), rotation(seed)
-    hand = f.handedness(p)
+    hand = distance_geometry.handedness(p)
     assert hand in (-1, 1)
-    assert f.handedness(p @ R.T) == hand
-    assert f.handedness(p * [1, -1, 1]) == -hand
+    assert distance_geometry.handedness(p @ R.T) == hand
+    assert distance_geometry.handedness(p * [1, -1, 1]) == -hand
 
 
 def test_flat_shapes_have_no_hand():
     """A planar shape is its own mirror image, turned over."""
-    assert f.handedness(f.slots("hexagon", 4.0, 6)) == 0
+    assert distance_geometry.handedness(f.slots("hexagon", 4.0, 6)) == 0
 
 
 # -- distances that exist
@@ -263,15 +265,15 @@ def test_measured_distances_exist(seed, n, dimension):
     """Distances measured between points, be they on a line or in a plane, are never refused."""
     p = points(seed, n, 3)
     p[:, dimension:] = 0
-    edges = f.complete_graph(n)
-    assert f.unrealisable(edges, f.distances(p, edges)) == []
+    edges = graphs.complete_graph(n)
+    assert distance_geometry.unrealisable(edges, distance_geometry.distances(p, edges)) == []
 
 
 def test_triangle_inequality():
     """4-8-4 is a line and exists; 4-8.1-4 does not, by 0.1 m."""
-    edges = f.complete_graph(3)
-    assert f.unrealisable(edges, [4, 8, 4]) == []
-    (found,) = f.unrealisable(edges, [4, 8.1, 4])
+    edges = graphs.complete_graph(3)
+    assert distance_geometry.unrealisable(edges, [4, 8, 4]) == []
+    (found,) = distance_geometry.unrealisable(edges, [4, 8.1, 4])
     assert found.agents == (0, 1, 2)
     assert found.excess == pytest.approx(0.1)
 
@@ -281,10 +283,10 @@ def test_cayley_menger(d):
     """Quadruples whose faces exist are refused where the 5 x 5 Cayley-Menger determinant is negative."""
     squares = np.zeros((5, 5))
     squares[0, 1:] = squares[1:, 0] = 1
-    i, j = f.complete_graph(4).T + 1
+    i, j = graphs.complete_graph(4).T + 1
     squares[i, j] = squares[j, i] = d**2
     determinant = np.linalg.det(squares)  # 288 V^2
-    found = f.unrealisable(f.complete_graph(4), d)
+    found = distance_geometry.unrealisable(graphs.complete_graph(4), d)
     if determinant < -1e-2:
         assert [v.agents for v in found] == [(0, 1, 2, 3)]
         assert found[0].excess == pytest.approx(determinant / 288)
@@ -294,15 +296,17 @@ def test_cayley_menger(d):
 
 def test_only_complete_quadruples_are_judged():
     """Without one of its six distances a quadruple is free to exist."""
-    edges = f.complete_graph(4)
+    edges = graphs.complete_graph(4)
     d = [4, 4, 4, 4, 4, 7.5]
-    assert len(f.unrealisable(edges, d)) == 1
-    assert f.unrealisable(edges[[0, 1, 2, 3, 5]], np.array(d)[[0, 1, 2, 3, 5]]) == []
+    assert len(distance_geometry.unrealisable(edges, d)) == 1
+    assert (
+        distance_geometry.unrealisable(edges[[0, 1, 2, 3, 5]], np.array(d)[[0, 1, 2, 3, 5]]) == []
+    )
 
 
 def test_edges_may_be_written_either_way():
     """Edge 21 is edge 12."""
-    assert len(f.unrealisable([[1, 0], [2, 0], [2, 1]], [4, 9, 4])) == 1
+    assert len(distance_geometry.unrealisable([[1, 0], [2, 0], [2, 1]], [4, 9, 4])) == 1
 
 
 # -- slots from distances
@@ -311,33 +315,33 @@ def test_edges_may_be_written_either_way():
 @pytest.mark.parametrize(("shape", "size", "n"), NAMED)
 def test_slots_come_back_from_distances(shape, size, n):
     """A complete set of distances gives the shape back, in its own handedness."""
-    want, edges = f.slots(shape, size, n), f.complete_graph(n)
-    got = f.slots_from_distances(n, edges, f.distances(want, edges))
+    want, edges = f.slots(shape, size, n), graphs.complete_graph(n)
+    got = distance_geometry.slots_from_distances(n, edges, distance_geometry.distances(want, edges))
     assert got is not None
     np.testing.assert_allclose(got.mean(axis=0), 0, atol=1e-12)
-    R = f.kabsch(want, got)
+    R = rigid_body.kabsch(want, got)
     np.testing.assert_allclose(got @ R.T, want, atol=1e-12)
 
 
 @pytest.mark.parametrize(("shape", "n"), [("line", 3), ("triangle", 3)])
 def test_slots_from_distances_lie_as_the_named_shapes(shape, n):
     """Table 1 gives distances alone: its triangle and line come out where the paper puts them."""
-    want, edges = f.slots(shape, 4.0, n), f.complete_graph(n)
-    got = f.slots_from_distances(n, edges, f.distances(want, edges))
+    want, edges = f.slots(shape, 4.0, n), graphs.complete_graph(n)
+    got = distance_geometry.slots_from_distances(n, edges, distance_geometry.distances(want, edges))
     assert got is not None
     np.testing.assert_allclose(got, want, atol=1e-12)
 
 
 def test_incomplete_distances_give_no_slots():
     """One missing distance leaves the shape open."""
-    edges = f.complete_graph(4)[:-1]
-    assert f.slots_from_distances(4, edges, np.ones(5)) is None
+    edges = graphs.complete_graph(4)[:-1]
+    assert distance_geometry.slots_from_distances(4, edges, np.ones(5)) is None
 
 
 def test_distances_of_four_dimensions_are_refused():
     """Five agents that are all 1 m apart need a fourth dimension."""
     with pytest.raises(ValueError, match="no points in space"):
-        f.slots_from_distances(5, f.complete_graph(5), np.ones(10))
+        distance_geometry.slots_from_distances(5, graphs.complete_graph(5), np.ones(10))
 
 
 # -- Kabsch
@@ -350,7 +354,7 @@ def test_kabsch_agrees_with_scipy(seed):
     w = np.random.default_rng(seed).random(5) + 0.1
     centre = (w[:, None] * np.stack([target, source])).sum(axis=1) / w.sum()
     want, _ = Rotation.align_vectors(target - centre[0], source - centre[1], weights=w)
-    np.testing.assert_allclose(f.kabsch(target, source, w), want.as_matrix(), atol=1e-7)
+    np.testing.assert_allclose(rigid_body.kabsch(target, source, w), want.as_matrix(), atol=1e-7)
 
 
 @given(SEEDS)
@@ -359,14 +363,14 @@ def test_kabsch_finds_the_rotation_of_moved_points(seed):
     R = rotation(seed)
     for shape, n in (("cube", 8), ("hexagon", 6)):
         p = f.slots(shape, 4.0, n)
-        np.testing.assert_allclose(f.kabsch(p @ R.T + [9, 8, 7], p), R, atol=1e-12)
+        np.testing.assert_allclose(rigid_body.kabsch(p @ R.T + [9, 8, 7], p), R, atol=1e-12)
 
 
 @given(SEEDS, SEEDS)
 def test_line_turns_minimally(seed, near_seed):
     """On a line the fit is the shortest rotation from the guide: no spin about the line."""
     p, T, near = f.slots("line", 4.0, 3), rotation(seed), rotation(near_seed)
-    R = f.kabsch(p @ T.T, p, near=near)
+    R = rigid_body.kabsch(p @ T.T, p, near=near)
     np.testing.assert_allclose(R[:, 0], T[:, 0], atol=1e-12)
     # The shortest turn takes the guide's x axis to the line by the angle between them, and no more.
     turned = Rotation.from_matrix(R @ near.T).magnitude()
@@ -379,7 +383,7 @@ def test_mirrored_cube_fits_as_near_as_possible(seed):
     """A mirrored cube fits many ways equally well: the nearest to the guide is a proper rotation."""
     near, p = rotation(seed), f.slots("cube", 2.0, 8)
     mirrored = p * [1, 1, -1]
-    R = f.kabsch(mirrored, p, near=near)
+    R = rigid_body.kabsch(mirrored, p, near=near)
     assert np.linalg.det(R) == pytest.approx(1)
     best = np.sum((mirrored - p @ R.T) ** 2)
     others = Rotation.random(500, random_state=np.random.RandomState(seed)).as_matrix()
@@ -396,16 +400,18 @@ def test_mirrored_cube_fits_as_near_as_possible(seed):
 def test_point_keeps_the_guide():
     """Coincident points have no attitude: the guide stands."""
     near = rotation(5)
-    np.testing.assert_array_equal(f.kabsch(np.zeros((3, 3)), np.zeros((3, 3)), near=near), near)
+    np.testing.assert_array_equal(
+        rigid_body.kabsch(np.zeros((3, 3)), np.zeros((3, 3)), near=near), near
+    )
 
 
 def test_kabsch_takes_samples_at_once():
     """Samples along leading axes are fitted each by itself, degenerate ones among them."""
     line, triangle = f.slots("line", 4.0, 3), f.slots("triangle", 4.0, 3)
     targets = np.stack([triangle @ rotation(1).T, line @ rotation(2).T, triangle])
-    many = f.kabsch(targets, triangle)
+    many = rigid_body.kabsch(targets, triangle)
     for target, R in zip(targets, many, strict=True):
-        np.testing.assert_allclose(R, f.kabsch(target, triangle), atol=1e-12)
+        np.testing.assert_allclose(R, rigid_body.kabsch(target, triangle), atol=1e-12)
 
 
 # -- graphs of many -------------------------------------------------------------------------------
@@ -417,11 +423,11 @@ def test_neighbours_reach_so_many_spacings():
     p = np.stack(np.meshgrid(3.0 * side, 3.0 * side, 3.0 * side, indexing="ij"), axis=-1)
     p = p.reshape(-1, 3)
     for reach, lengths in ((1.1, [1]), (1.5, [1, 2]), (1.9, [1, 2, 3])):
-        edges = f.neighbours(p, reach)
-        squares = np.unique((f.distances(p, edges) / 3.0).round(9) ** 2)
+        edges = graphs.neighbours(p, reach)
+        squares = np.unique((distance_geometry.distances(p, edges) / 3.0).round(9) ** 2)
         np.testing.assert_allclose(squares, lengths)
         assert len(np.unique(edges, axis=0)) == len(edges)
-    degree = np.bincount(f.neighbours(p, 1.9).ravel())
+    degree = np.bincount(graphs.neighbours(p, 1.9).ravel())
     assert degree.max() == 26
 
 
@@ -429,7 +435,7 @@ def test_neighbours_reach_so_many_spacings():
 def test_joined_is_minimally_rigid(n):
     """Three edges each, from the centre outwards: 3N - 6 in all, of full rank."""
     p = np.random.default_rng(n).normal(size=(n, 3))
-    edges = f.joined(p)
+    edges = graphs.joined(p)
     assert edges.shape == (3 * n - 6, 2)
     assert np.linalg.matrix_rank(jacobian(p, edges)) == 3 * n - 6
 
@@ -438,7 +444,7 @@ def test_joined_is_minimally_rigid(n):
 def test_trees_are_minimally_rigid(n):
     """3N - 6 edges of full rank, each agent joined to three of those that come before; of chains of length log N."""
     p = f.slots("sphere", 2.0, n)
-    edges = f.coarse_to_fine(p)
+    edges = graphs.coarse_to_fine(p)
     assert len(np.unique(edges, axis=0)) == 3 * n - 6
     assert (edges[:, 0] < edges[:, 1]).all()
     assert np.linalg.matrix_rank(jacobian(p, edges)) == 3 * n - 6
@@ -456,27 +462,28 @@ def test_trees_hold_lattices_better_and_shells_at_all():
     side = np.arange(8.0)
     lattice = np.stack(np.meshgrid(side, side, side, indexing="ij"), axis=-1).reshape(-1, 3)
     tree, joined = (
-        spectrum(lattice, graph(lattice), np.ones(512)) for graph in (f.coarse_to_fine, f.joined)
+        spectrum(lattice, graph(lattice), np.ones(512))
+        for graph in (graphs.coarse_to_fine, graphs.joined)
     )
     assert tree.index > 3 * joined.index
     assert tree.condition < joined.condition / 2
     shell = f.slots("sphere", 2.0, 500)
-    assert spectrum(shell, f.joined(shell), np.ones(500)).free > 0
-    assert spectrum(shell, f.coarse_to_fine(shell), np.ones(500)).index > 0.01
+    assert spectrum(shell, graphs.joined(shell), np.ones(500)).free > 0
+    assert spectrum(shell, graphs.coarse_to_fine(shell), np.ones(500)).index > 0.01
 
 
 @pytest.mark.parametrize("n", [40, 41, 300])
 def test_shells_are_two_spheres_one_size_apart(n):
     """Nobody is nearer than `size`, not even to the other skin, which lies at that distance; two hold more than one."""
     p = f.slots("shells", 2.0, n)
-    apart = f.distances(p, f.complete_graph(n))
+    apart = distance_geometry.distances(p, graphs.complete_graph(n))
     assert apart.min() == pytest.approx(2.0)
     radius = np.sort(np.linalg.norm(p - p.mean(axis=0), axis=1))
     jump = int(np.diff(radius).argmax())
     assert 2.0 - 0.1 < radius[jump + 1] - radius[jump] < 2.6
     if n == 300:
         one = f.slots("sphere", 2.0, n)
-        two, single = (spectrum(x, f.neighbours(x), np.ones(n)).index for x in (p, one))
+        two, single = (spectrum(x, graphs.neighbours(x), np.ones(n)).index for x in (p, one))
         assert two > 1.4 * single
 
 
@@ -484,7 +491,7 @@ def test_joined_of_a_lattice_has_good_pivots():
     """On a lattice, whose points lie in planes, no agent is joined within a plane."""
     side = np.arange(6.0)
     p = np.stack(np.meshgrid(side, side, side, indexing="ij"), axis=-1).reshape(-1, 3)
-    edges = f.joined(p)
+    edges = graphs.joined(p)
     assert np.linalg.svd(jacobian(p, edges), compute_uv=False)[-1] > 0.01
     with pytest.raises(ValueError, match="need slots"):
-        f.joined(p[:36])
+        graphs.joined(p[:36])

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from rigidfleet.formation import distance_geometry, graphs
 from rigidfleet.formation import shapes as formation
 from rigidfleet.math import proximity as geometry
 from rigidfleet.mission import Box, Ground
@@ -293,15 +294,15 @@ HEXAGON_EDGES = np.array(
     [(0, 1), (1, 2), (2, 3), (3, 4), (4, 5), (0, 5), (0, 2), (1, 3), (2, 4), (3, 5), (0, 4), (1, 5)]
 )
 PRINTED = {  # slots, edges, rank of J
-    "pair": (formation.slots("line", 4.0, 2), formation.complete_graph(2), 1),
-    "triangle": (formation.slots("triangle", 4.0, 3), formation.complete_graph(3), 3),
-    "line": (LINE, formation.complete_graph(3), 2),
-    "square": (formation.slots("square", 4.0, 4), formation.complete_graph(4), 5),
+    "pair": (formation.slots("line", 4.0, 2), graphs.complete_graph(2), 1),
+    "triangle": (formation.slots("triangle", 4.0, 3), graphs.complete_graph(3), 3),
+    "line": (LINE, graphs.complete_graph(3), 2),
+    "square": (formation.slots("square", 4.0, 4), graphs.complete_graph(4), 5),
     "cycle": (formation.slots("square", 4.0, 4), CYCLE, 4),
-    "tetrahedron": (formation.slots("pyramid", 4.0, 4), formation.complete_graph(4), 6),
+    "tetrahedron": (formation.slots("pyramid", 4.0, 4), graphs.complete_graph(4), 6),
     "hexagon": (formation.slots("hexagon", 4.0, 6), HEXAGON_EDGES, 9),
-    "cube": (CUBE, formation.CUBE_EDGES, 18),
-    "complete cube": (CUBE, formation.complete_graph(8), 18),
+    "cube": (CUBE, graphs.CUBE_EDGES, 18),
+    "complete cube": (CUBE, graphs.complete_graph(8), 18),
 }
 
 
@@ -319,7 +320,7 @@ def test_weighted_singular_values_are_those_of_the_law():
     """With masses, the squares are the eigenvalues of mbar J M^-1 J^T, which the solvers see."""
     rng = np.random.default_rng(0)
     r, m = rng.normal(size=(4, 5, 3)), rng.uniform(0.5, 2.0, 5)
-    edges = formation.complete_graph(5)[:8]
+    edges = graphs.complete_graph(5)[:8]
     found = geometry.smallest_singular_value(r, edges, m)
     for k in range(4):
         J = jacobian(r[k], edges)
@@ -338,7 +339,7 @@ def test_the_line_shows_in_the_singular_value():
     """An offset h from the line of three leaves lambda_min = h^2/8, so sigma = h/sqrt(8)."""
     for h in (1e-1, 1e-2, 1e-3):
         r = LINE + [[0, 0, 0], [0, h, 0], [0, 0, 0]]
-        sigma = geometry.smallest_singular_value(r[None], formation.complete_graph(3))[0]
+        sigma = geometry.smallest_singular_value(r[None], graphs.complete_graph(3))[0]
         assert sigma == pytest.approx(h / np.sqrt(8), rel=5e-3)
 
 
@@ -363,7 +364,7 @@ def test_ranks_are_pyrigis(name):
     found = geometry.smallest_singular_value(points[None], edges)[0]
     assert found == pytest.approx(values[generic - 1], rel=1e-9)
     # Planar and straight shapes lose rank: at most 2 N - 3 and N - 1 of what a generic shape has.
-    dimension = formation.dimension(r)
+    dimension = distance_geometry.dimension(r)
     assert rank <= {1: n - 1, 2: 2 * n - 3, 3: 3 * n - 6}[dimension]
 
 

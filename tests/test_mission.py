@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rigidfleet.errors import MissionError
+from rigidfleet.formation import distance_geometry, graphs
 from rigidfleet.formation import shapes as formation
 from rigidfleet.mission import (
     Box,
@@ -121,7 +122,7 @@ def test_shipped_mission_is_in_order(name):
 def test_cube_missions_have_corrected_table_4(name):
     """The 18 edges are the paper's, with d45 a diagonal and d48 a side."""
     mission = load_mission(name)
-    np.testing.assert_array_equal(mission.formation_edges("cube"), formation.CUBE_EDGES)
+    np.testing.assert_array_equal(mission.formation_edges("cube"), graphs.CUBE_EDGES)
     length = {
         tuple(e): d
         for e, d in zip(
@@ -137,7 +138,7 @@ def test_cube_missions_have_corrected_table_4(name):
 def test_table_4_as_printed_keeps_its_swapped_pair():
     """As printed d45 is 4 m and d48 a diagonal, and the shape that is meant is still the cube."""
     mission = load_mission("establish-cube-as-printed")
-    off = mission.formation_distances("cube") - formation.distances(
+    off = mission.formation_distances("cube") - distance_geometry.distances(
         slots(mission, "cube"), mission.formation_edges("cube")
     )
     swapped = mission.formation_edges("cube")[np.abs(off) > 1e-9]
@@ -223,7 +224,7 @@ def test_edges_are_the_union_of_all_formations():
     base = load_mission("cube-passage").to_dict()
     base["formations"]["cuboid"]["edges"] += [[8, 1]]
     edges = Mission.from_dict(base).edges
-    np.testing.assert_array_equal(edges, [*formation.CUBE_EDGES.tolist(), [0, 7]])
+    np.testing.assert_array_equal(edges, [*graphs.CUBE_EDGES.tolist(), [0, 7]])
 
 
 def test_slots_are_centred_and_derived_from_distances():
@@ -308,10 +309,10 @@ def test_graphs_have_names():
     """'neighbours', 'joined' and 'tree' are the graphs that the functions of those names make."""
     p = formation.slots("sphere", 2.0, 30)
     for form, want in (
-        ({"edges": "neighbours"}, formation.neighbours(p)),
-        ({"edges": "neighbours", "reach": 1.2}, formation.neighbours(p, 1.2)),
-        ({"edges": "joined"}, formation.joined(p)),
-        ({"edges": "tree"}, formation.coarse_to_fine(p)),
+        ({"edges": "neighbours"}, graphs.neighbours(p)),
+        ({"edges": "neighbours", "reach": 1.2}, graphs.neighbours(p, 1.2)),
+        ({"edges": "joined"}, graphs.joined(p)),
+        ({"edges": "tree"}, graphs.coarse_to_fine(p)),
     ):
         np.testing.assert_array_equal(Mission.from_dict(large(**form)).formation_edges("f"), want)
 
@@ -357,7 +358,7 @@ def test_slots_are_assigned_anew_at_each_change():
         places = slots
     slots = mission.formation_slots("f")
     assert slots is not None
-    between = formation.distances(slots, mission.formation_edges("f"))
+    between = distance_geometry.distances(slots, mission.formation_edges("f"))
     np.testing.assert_allclose(between, mission.formation_distances("f"))
 
 
@@ -717,7 +718,7 @@ def test_tetrahedra_are_judged():
 def test_contradictions_of_five_agents_are_found():
     """Distances of which every four exist, but not all together, are refused."""
     p = formation.slots("pyramid", 4.0, 5)
-    d = formation.distances(p, formation.complete_graph(5))
+    d = distance_geometry.distances(p, graphs.complete_graph(5))
     base = load_mission("pyramid").to_dict()
     base["formations"]["pyramid"] = {"distances": d.tolist()}
     assert Mission.from_dict(base).formation_slots("pyramid") is not None

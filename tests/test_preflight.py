@@ -6,14 +6,11 @@ import numpy as np
 import pytest
 
 from rigidfleet.assessment import assess
-from rigidfleet.formation.shapes import (
-    assigned,
-    complete_graph,
-    distances,
-    kabsch,
-    nearest_way,
-    slots,
-)
+from rigidfleet.formation.assignment import assigned, nearest_way
+from rigidfleet.formation.distance_geometry import distances
+from rigidfleet.formation.graphs import complete_graph
+from rigidfleet.formation.shapes import slots
+from rigidfleet.math.rigid_body import kabsch
 from rigidfleet.mission import Mission, load_mission, mission_names
 from rigidfleet.plotting.graph import graphs
 from rigidfleet.preflight.check import STARTS, planned, preflight

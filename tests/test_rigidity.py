@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
+from rigidfleet.formation import distance_geometry, graphs
 from rigidfleet.formation import shapes as f
 from rigidfleet.math.proximity import smallest_singular_value
 from rigidfleet.rigidity import Kind, Verdict, analyse, full_rank, jacobian, realisations
@@ -20,7 +21,7 @@ SPREAD = np.array([[-1, -2, -3], [2, 1, 0.5], [0.3, 2, 1], [1.5, -0.7, 2], [-2, 
 
 def graph(seed, n, share):
     """Some of the edges between n agents."""
-    edges = f.complete_graph(n)
+    edges = graphs.complete_graph(n)
     return edges[np.random.default_rng(seed).random(len(edges)) < share]
 
 
@@ -46,7 +47,7 @@ def double_banana(seed=0):
 def blocks(result, p):
     """Whether the stress is in balance and has positive energy on every flex."""
     J = jacobian(p, result.edges)
-    omega = result.stress / f.distances(p, result.edges)
+    omega = result.stress / distance_geometry.distances(p, result.edges)
     i, j = result.edges.T
     step = np.array([flex.motion[i] - flex.motion[j] for flex in result.flexes])
     energy = np.einsum("k,akx,bkx->ab", omega, step, step)
@@ -59,7 +60,7 @@ def blocks(result, p):
 
 def test_cube_of_paper_is_infinitesimally_rigid():
     """The 18 edges of the paper's cube are independent, and w = 0.2586."""
-    result = analyse(f.slots("cube", 4.0, 8), f.CUBE_EDGES)
+    result = analyse(f.slots("cube", 4.0, 8), graphs.CUBE_EDGES)
     assert result.verdict is RIGID
     assert (result.rank, result.reachable, result.needed) == (18, 18, 18)
     assert result.w == pytest.approx(0.2586, abs=5e-5)
@@ -88,9 +89,9 @@ def test_double_banana_is_flexible_with_as_many_edges():
 )
 def test_flat_shapes_are_at_best_prestress_stable(name, n, edges, rank, flexes):
     """4-8-4, the square and the hexagon reach ranks 2, 5 and 9: a self-stress holds them, no more."""
-    p, graph = f.slots(name, 4.0, n), f.complete_graph(n)
+    p, graph = f.slots(name, 4.0, n), graphs.complete_graph(n)
     if edges < len(graph):  # the hexagon without its long diagonals
-        graph = graph[f.distances(p, graph) < 7.9]
+        graph = graph[distance_geometry.distances(p, graph) < 7.9]
     result = analyse(p, graph)
     assert (len(graph), result.rank, result.reachable, len(result.flexes)) == (
         edges,
@@ -125,14 +126,14 @@ def test_few_agents(n, edges, verdict):
 def test_shipped_index_is_that_of_a_flight():
     """The index is the smallest non-zero singular value of J M^-1/2 sqrt(mbar), as recorded in flight."""
     p, masses = f.slots("cube", 4.0, 8), np.linspace(0.5, 2, 8)
-    want = smallest_singular_value(p[None], f.CUBE_EDGES, masses)[0]
-    assert analyse(p, f.CUBE_EDGES, masses=masses).index == pytest.approx(want)
+    want = smallest_singular_value(p[None], graphs.CUBE_EDGES, masses)[0]
+    assert analyse(p, graphs.CUBE_EDGES, masses=masses).index == pytest.approx(want)
 
 
 def test_force_and_offset_are_reached():
     """In the weakest direction J^T A^-1 b has the norm |b| m / index, and the displacement is |c| / index."""
     p = f.slots("cube", 4.0, 8)
-    result, J = analyse(p, f.CUBE_EDGES), jacobian(p, f.CUBE_EDGES)
+    result, J = analyse(p, graphs.CUBE_EDGES), jacobian(p, graphs.CUBE_EDGES)
     b = np.linalg.svd(J)[0][:, -1]
     A = J @ J.T / 2.0
     assert np.linalg.norm(J.T @ np.linalg.solve(A, b)) == pytest.approx(result.force(1.0, mass=2.0))
@@ -167,7 +168,7 @@ def test_polyhedron_without_an_edge_moves_on():
 def test_complete_graphs_are_rigid(seed, n, dimension):
     """All distances determine a shape: rigid in space, prestress-stable where flat (Connelly, 1982)."""
     p = shape(seed, n, dimension)
-    result = analyse(p, f.complete_graph(n))
+    result = analyse(p, graphs.complete_graph(n))
     assert result.rank == result.reachable == full_rank(n, dimension)
     assert result.verdict is (RIGID if n <= dimension + 1 or dimension == 3 else STABLE)
     if result.stress is not None:
@@ -189,9 +190,17 @@ def test_verdicts_of_small_formations(seed, n, dimension, share):
     if result.verdict is STABLE:
         assert blocks(result, p)
     if result.deformed is not None:
-        want, pairs = f.distances(p, edges), f.complete_graph(n)
-        np.testing.assert_allclose(f.distances(result.deformed, edges), want, atol=1e-9)
-        assert np.abs(f.distances(result.deformed, pairs) - f.distances(p, pairs)).max() > 1e-6
+        want, pairs = distance_geometry.distances(p, edges), graphs.complete_graph(n)
+        np.testing.assert_allclose(
+            distance_geometry.distances(result.deformed, edges), want, atol=1e-9
+        )
+        assert (
+            np.abs(
+                distance_geometry.distances(result.deformed, pairs)
+                - distance_geometry.distances(p, pairs)
+            ).max()
+            > 1e-6
+        )
 
 
 @given(SEEDS, st.integers(3, 8), st.integers(1, 3), st.floats(0.3, 1), st.floats(0.01, 100))
@@ -244,7 +253,7 @@ def test_flexes_name_the_few():
 def test_loose_agent_on_a_flat_shape():
     """Where J is singular because of a rigid part, a loose agent is found by following its motion."""
     p = np.vstack([f.slots("square", 4.0, 4), [[6, 0.5, 0]]])
-    result = analyse(p, [*f.complete_graph(4).tolist(), [1, 4], [2, 4]])
+    result = analyse(p, [*graphs.complete_graph(4).tolist(), [1, 4], [2, 4]])
     assert result.verdict is FLEXIBLE
     assert result.deformed is not None
     assert result.within is not None
@@ -254,16 +263,16 @@ def test_loose_agent_on_a_flat_shape():
 def test_sheet_folds_along_its_lines():
     """A grid of crossed squares keeps its plane to second order in no way: it folds along any grid line."""
     p = f.slots("grid", 1.0, 16)
-    edges = f.complete_graph(16)
-    result = analyse(p, edges[f.distances(p, edges) < 1.5])
+    edges = graphs.complete_graph(16)
+    result = analyse(p, edges[distance_geometry.distances(p, edges) < 1.5])
     assert result.verdict is FLEXIBLE
-    braced = analyse(p, edges[f.distances(p, edges) < 2.3])
+    braced = analyse(p, edges[distance_geometry.distances(p, edges) < 2.3])
     assert braced.verdict is STABLE
 
 
 def test_barely_rigid_says_so():
     """Three agents a hair off a line are rigid in name; the reason warns."""
-    result = analyse([[-4, 0, 0], [0, 1e-3, 0], [4, 0, 0]], f.complete_graph(3))
+    result = analyse([[-4, 0, 0], [0, 1e-3, 0], [4, 0, 0]], graphs.complete_graph(3))
     assert result.verdict is RIGID
     assert "large forces" in result.reason
 
@@ -280,10 +289,12 @@ def test_flexes_of_more_agents_hold_none_of_fewer():
 @pytest.mark.parametrize("kind", ["complete", "near", "few", "line", "plane"])
 def test_hundred_agents_of_any_graph(kind):
     """Of 100 agents, rank and flexes add up to what the shape can reach, whatever the graph."""
-    p, edges = shape(1, 100, {"line": 1, "plane": 2}.get(kind, 3)), f.complete_graph(100)
+    p, edges = shape(1, 100, {"line": 1, "plane": 2}.get(kind, 3)), graphs.complete_graph(100)
     if kind != "complete":
-        reach = np.quantile(f.distances(p, edges), {"near": 0.1, "few": 0.03}.get(kind, 0.15))
-        edges = edges[f.distances(p, edges) <= reach]
+        reach = np.quantile(
+            distance_geometry.distances(p, edges), {"near": 0.1, "few": 0.03}.get(kind, 0.15)
+        )
+        edges = edges[distance_geometry.distances(p, edges) <= reach]
     result = analyse(p, edges)
     assert result.agents == 100
     assert result.rank + len(result.flexes) == 300 - (5 if kind == "line" else 6)  # rigid motions
@@ -309,12 +320,12 @@ def test_what_is_no_framework_is_refused(slots, edges, message):
 def test_space_must_hold_the_shape():
     """A spatial shape has no rigidity in a plane."""
     with pytest.raises(ValueError, match="dimension 3 does not fit into a plane"):
-        analyse(SPREAD, f.complete_graph(5), space=2)
+        analyse(SPREAD, graphs.complete_graph(5), space=2)
 
 
 def test_data_counts_from_one():
     """Plain data for JSON name agents and edges as messages do."""
-    data = analyse(f.slots("square", 4.0, 4), f.complete_graph(4)).data()
+    data = analyse(f.slots("square", 4.0, 4), graphs.complete_graph(4)).data()
     assert data["redundant"][0] == [1, 2]
     assert data["flexes"][0]["agents"] == [1]
     assert data["verdict"] == "prestress-stable"
@@ -386,35 +397,37 @@ def test_named_frameworks_of_pyrigi(pyrigi, name, arguments, verdict):
 def test_cube_of_paper_has_folded_twins():
     """The 18 distances of the cube have solutions with coincident agents, found far more often than the cube."""
     p = f.slots("cube", 4.0, 8)
-    found = realisations(p, f.CUBE_EDGES)
+    found = realisations(p, graphs.CUBE_EDGES)
     assert found.found[0].kind is Kind.SAME
     assert not found.unique
     folded = [r for r in found.found if r.kind is Kind.COINCIDENT]
     assert sum(r.found for r in folded) > found.converged / 2
     for r in found.found:
-        got = f.distances(r.slots, f.CUBE_EDGES)
-        np.testing.assert_allclose(got, f.distances(p, f.CUBE_EDGES), atol=1e-6)
+        got = distance_geometry.distances(r.slots, graphs.CUBE_EDGES)
+        np.testing.assert_allclose(
+            got, distance_geometry.distances(p, graphs.CUBE_EDGES), atol=1e-6
+        )
 
 
 @pytest.mark.parametrize("n", [5, 8])
 def test_all_distances_leave_only_the_mirror_image(n):
     """With all pairs prescribed there is nothing but the shape and its mirror image."""
     p = shape(n, n, 3)
-    found = realisations(p, f.complete_graph(n), starts=60)
+    found = realisations(p, graphs.complete_graph(n), starts=60)
     assert {r.kind for r in found.found} == {Kind.SAME, Kind.MIRRORED}
     assert found.unique
 
 
 def test_flat_shapes_are_their_own_mirror_images():
     """A hexagon turned over is the hexagon."""
-    found = realisations(f.slots("hexagon", 4.0, 6), f.complete_graph(6), starts=40)
+    found = realisations(f.slots("hexagon", 4.0, 6), graphs.complete_graph(6), starts=40)
     assert [r.kind for r in found.found] == [Kind.SAME]
 
 
 def test_bipyramid_folds_over():
     """Two tetrahedra on one triangle: the tips on either side, or on the same side and coincident."""
     p = np.array([[1, 0, 0], [-0.5, 0.9, 0], [-0.5, -0.9, 0], [0, 0, 1.5], [0, 0, -1.5]])
-    edges = [e for e in f.complete_graph(5).tolist() if e != [3, 4]]
+    edges = [e for e in graphs.complete_graph(5).tolist() if e != [3, 4]]
     found = realisations(p, edges, starts=60)
     assert {r.kind for r in found.found} == {Kind.SAME, Kind.MIRRORED, Kind.COINCIDENT}
     assert all(r.rigid for r in found.found)
@@ -423,7 +436,7 @@ def test_bipyramid_folds_over():
 def test_start_decides_the_side():
     """From near the shape one gets there; from near its mirror image, to that."""
     p = shape(2, 4, 3)
-    edges = f.complete_graph(4)
+    edges = graphs.complete_graph(4)
     for side, kind in ((1, Kind.SAME), (-1, Kind.MIRRORED)):
         start = p * [1, 1, side] + 0.05 * shape(3, 4, 3)
         found = realisations(p, edges, starts=20, start=start)
@@ -434,18 +447,18 @@ def test_start_decides_the_side():
 def test_search_is_repeatable():
     """The same seed finds the same shapes as often."""
     p = f.slots("cube", 4.0, 8)
-    one, two = (realisations(p, f.CUBE_EDGES, starts=50, seed=4).data() for _ in range(2))
+    one, two = (realisations(p, graphs.CUBE_EDGES, starts=50, seed=4).data() for _ in range(2))
     assert one == two
 
 
 @pytest.mark.parametrize("n", [1, 2, 3])
 def test_few_agents_have_one_shape(n):
     """Up to three agents, all distances leave one shape."""
-    found = realisations(SPREAD[:n], f.complete_graph(n), starts=10)
+    found = realisations(SPREAD[:n], graphs.complete_graph(n), starts=10)
     assert [r.kind for r in found.found] == [Kind.SAME]
 
 
 def test_start_must_fit():
     """A start of the wrong size is refused."""
     with pytest.raises(ValueError, match=r"start must be \(5, 3\)"):
-        realisations(SPREAD, f.complete_graph(5), start=np.zeros((4, 3)))
+        realisations(SPREAD, graphs.complete_graph(5), start=np.zeros((4, 3)))

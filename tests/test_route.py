@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from rigidfleet.assessment import assess
 from rigidfleet.errors import MissionError
-from rigidfleet.formation import shapes
+from rigidfleet.formation import assignment, shapes
 from rigidfleet.mission import Mission, mission_text
 from rigidfleet.preflight.check import planned, preflight
 from rigidfleet.simulation.flight import simulate
@@ -148,8 +148,8 @@ def test_ways_are_straight_and_shortest_where_the_attitude_is_known():
     slots, start = scattered(rng, 6), scattered(rng, 6)
     turned = world(20.0, -35.0, 110.0)
     phases = [establish("a", roll_deg=20.0, pitch_deg=-35.0, yaw_deg=110.0)]
-    for assignment in ("shortest", "each"):
-        mission = fly({"a": slots}, start, phases, assignment=assignment)
+    for rule in ("shortest", "each"):
+        mission = fly({"a": slots}, start, phases, assignment=rule)
         position = planned(mission)[0][0].position
         ways = position[-1] - position[0]
         there = about_centre(slots) @ turned.T
@@ -232,7 +232,7 @@ def test_the_safest_has_as_much_room_as_the_shortest(turn):
         start, slots, radius = scattered(rng, 12), scattered(rng, 12), rng.uniform(0.0, 0.5, 12)
         rooms = []
         for way in (None, radius):
-            order, turned = shapes.assigned(start, slots, turn=turn, radius=way)
+            order, turned = assignment.assigned(start, slots, turn=turn, radius=way)
             x, y = about_centre(start), about_centre(slots)[order] @ turned.T
             s = np.linspace(0.0, 1.0, 2001)[:, None, None]
             between = [pdist(p) for p in (1 - s) * x + s * y]
@@ -246,7 +246,7 @@ def test_nearest_way():
     rng = np.random.default_rng(8)
     for n in (2, 3, 40):
         p, q, radius = rng.normal(size=(n, 3)), rng.normal(size=(n, 3)), rng.uniform(0, 0.2, n)
-        room, (i, j), share = shapes.nearest_way(p, q, radius)
+        room, (i, j), share = assignment.nearest_way(p, q, radius)
         s = np.linspace(0.0, 1.0, 10_001)[:, None, None]
         x = (1 - s) * p + s * q
         k, m = np.triu_indices(n, 1)
@@ -254,7 +254,7 @@ def test_nearest_way():
         assert room == pytest.approx(all_rooms.min(), abs=1e-6)
         at = (1 - share) * (p[i] - p[j]) + share * (q[i] - q[j])
         assert np.linalg.norm(at) - radius[i] - radius[j] == pytest.approx(room, abs=1e-12)
-    assert shapes.nearest_way(p[:1], q[:1])[0] == np.inf
+    assert assignment.nearest_way(p[:1], q[:1])[0] == np.inf
 
 
 # -- what check says of ways that cross --------------------------------------------------------------
@@ -451,8 +451,8 @@ def test_a_tracked_reshape_keeps_the_attitude():
     other = (np.array(SPATIAL) @ world(0, 0, 160).T + np.eye(5, 3)).tolist()
     turn = {"kind": "turn", "yaw_deg": 50.0, "duration": 8.0}
     phases = [establish("a"), turn, reshape("b"), {"kind": "hold", "duration": 6.0}]
-    for assignment in ("given", "each"):
-        mission = fly({"a": SPATIAL, "b": other}, start_for(SPATIAL), phases, assignment=assignment)
+    for rule in ("given", "each"):
+        mission = fly({"a": SPATIAL, "b": other}, start_for(SPATIAL), phases, assignment=rule)
         result = simulate(mission)
         slots = np.array(other)[mission.assigned_slots["b"]]
         assert off(result, slots, world(yaw=50)) < 1e-3

@@ -13,6 +13,7 @@ from scipy.spatial import KDTree
 from rigidfleet import physics
 from rigidfleet.assessment import assess
 from rigidfleet.errors import FlightError
+from rigidfleet.formation import distance_geometry, graphs
 from rigidfleet.formation import shapes as formation
 from rigidfleet.kernel import problem as program
 from rigidfleet.math import attitude, lqr
@@ -281,7 +282,7 @@ def test_distances_lead_by_squares_where_an_affine_map_leads_to_the_slots(slots,
     plan = plan_phase(mission, phase, Situation(0.0, start @ turn, 0 * start), 6.0)
     assert plan.program.reference.kind == {"squares": program.SQUARED, "shape": program.SLOTS}[by]
     result = simulate(mission)
-    wanted = formation.distances(slots, result.edges)
+    wanted = distance_geometry.distances(slots, result.edges)
     np.testing.assert_allclose(result.distance_reference[0], result.distance[0], rtol=1e-12)
     np.testing.assert_allclose(result.distance_reference[-1], wanted, rtol=1e-12)
     assert assess(result).passed
@@ -297,7 +298,7 @@ def test_distances_lead_by_squares_where_an_affine_map_leads_to_the_slots(slots,
 def test_distances_that_are_not_the_slots_are_led_by_squares():
     """Squares blend distances beside a shape that has others, and those without any, which ask for no hand."""
     start = CUBE + np.eye(8, 3)
-    other = formation.distances(1.1 * CUBE, formation.complete_graph(8))
+    other = distance_geometry.distances(1.1 * CUBE, graphs.complete_graph(8))
     for form in ({"shape": "cube", "size": 4.0, "distances": other}, {"distances": other}):
         mission = a_mission(
             establish(formation="f", reference="distances"),
@@ -660,11 +661,11 @@ def test_steps_are_gentler_by_spectral_damping():
 def test_the_corrected_cube_is_a_cube():
     """All 28 pairs of the corrected Table 4 are those of a cube to 1e-6 m at the end."""
     result = flown("establish-cube")
-    pairs = formation.complete_graph(8)
-    cube = formation.distances(formation.slots("cube", 4.0, 8), pairs)
-    found = formation.distances(result.position[-1], pairs)
+    pairs = graphs.complete_graph(8)
+    cube = distance_geometry.distances(formation.slots("cube", 4.0, 8), pairs)
+    found = distance_geometry.distances(result.position[-1], pairs)
     np.testing.assert_allclose(found, cube, rtol=0, atol=1e-6)
-    assert formation.handedness(result.position[-1]) == 1
+    assert distance_geometry.handedness(result.position[-1]) == 1
     assert result.position[:, :, 2].min() == pytest.approx(-0.6, abs=0.1)  # no ground in it
 
 
@@ -672,7 +673,7 @@ def test_the_printed_cube_is_rigid_but_no_cube():
     """Table 4 as printed: every constraint is met, the longest pair is 7.70 m, not 6.93 m."""
     result = flown("establish-cube-as-printed")
     assert np.abs(result.constraint[-1]).max() < 1e-6
-    longest = formation.distances(result.position[-1], formation.complete_graph(8)).max()
+    longest = distance_geometry.distances(result.position[-1], graphs.complete_graph(8)).max()
     assert longest == pytest.approx(7.70, abs=0.01)
 
 
@@ -681,13 +682,13 @@ def test_the_appendix_reaches_its_shapes(name):
     """All pairs, not only the constrained ones, end at the shape that was meant."""
     result = flown(name)
     mission = result.mission
-    pairs = formation.complete_graph(mission.n_agents)
+    pairs = graphs.complete_graph(mission.n_agents)
     (form,) = mission.formations
     slots = mission.formation_slots(form)
     assert slots is not None
-    wanted = formation.distances(slots, pairs)
+    wanted = distance_geometry.distances(slots, pairs)
     np.testing.assert_allclose(
-        formation.distances(result.position[-1], pairs), wanted, rtol=0, atol=1e-6
+        distance_geometry.distances(result.position[-1], pairs), wanted, rtol=0, atol=1e-6
     )
     assert pull(result).max() < 15.0
 
@@ -1070,10 +1071,13 @@ def test_scipy_integrates_the_same_law_to_the_same_flight():
     from scipy.integrate import solve_ivp
 
     mission = load_mission("establish-triangle")
-    edges = formation.complete_graph(3)
+    edges = graphs.complete_graph(3)
     i, j = edges.T
     start = np.array(mission.agents.position)
-    goals = [formation.distances(start, edges), *np.array([[4, 4, 4], [4, 8, 4], [4, 4, 4]])]
+    goals = [
+        distance_geometry.distances(start, edges),
+        *np.array([[4, 4, 4], [4, 8, 4], [4, 4, 4]]),
+    ]
     switches = [0.0, 6.0, 13.0, 20.0]
     times = np.array([2.0, 6.0, 8.0, 10.0, 13.0, 15.0, 20.0])
     states = {}

@@ -6,7 +6,7 @@ from importlib import import_module
 import numpy as np
 import pytest
 
-from rigidfleet.formation import shapes
+from rigidfleet.formation import graphs, shapes
 from rigidfleet.kernel import problem as k
 from rigidfleet.kernel.large import block_cholesky as sparse
 from rigidfleet.kernel.large import solver as large
@@ -63,7 +63,7 @@ def rng():
 def test_sweep_vertex_graph_and_dense_factor_agree_on_the_exact_law(side, rng):
     """Undamped, of unequal masses, the three solves agree to 1e-9 where A is well conditioned."""
     p = lattice(side)
-    edges, masses = shapes.joined(p), rng.uniform(0.5, 2.0, len(p))
+    edges, masses = graphs.joined(p), rng.uniform(0.5, 2.0, len(p))
     b = rng.normal(size=len(edges))
     A = gram(p, edges, masses)
     assert np.linalg.cond(A) < 1e5
@@ -78,7 +78,7 @@ def test_sweep_vertex_graph_and_dense_factor_agree_on_the_exact_law(side, rng):
 def test_vertex_graph_is_the_damped_law_of_redundant_edges(reach, rng):
     """Iterated Tikhonov on the vertex graph is its definition in edge space, of unequal masses."""
     p = lattice(5)
-    edges, masses = shapes.neighbours(p, reach), rng.uniform(0.5, 2.0, len(p))
+    edges, masses = graphs.neighbours(p, reach), rng.uniform(0.5, 2.0, len(p))
     b, mbar, mu = rng.normal(size=len(edges)), masses.mean(), 0.03
     regular = mbar * gram(p, edges, masses) + mu * np.eye(len(edges))
     y = np.zeros(len(edges))
@@ -91,7 +91,7 @@ def test_vertex_graph_is_the_damped_law_of_redundant_edges(reach, rng):
 def test_factor_is_kept_while_the_formation_turns(rng):
     """One factor serves a formation turned by any angle; one that has changed its shape gets a new one."""
     p = shapes.slots("sphere", 1.0, 200)
-    edges = shapes.neighbours(p)
+    edges = graphs.neighbours(p)
     solver = solver_of(p, edges, np.ones(200), k.ITERATED, tolerance=1e-10)
     b = rng.normal(size=len(edges))
     before = solved(solver, b)
@@ -114,7 +114,7 @@ def test_factor_is_kept_while_the_formation_turns(rng):
 def test_a_solve_starts_from_the_best_of_past_solutions(rng):
     """What past solutions span is found at once, though they repeat themselves; of others what is nearest to it."""
     p = lattice(4)
-    edges, masses = shapes.neighbours(p, 1.5), rng.uniform(0.5, 2.0, 64)
+    edges, masses = graphs.neighbours(p, 1.5), rng.uniform(0.5, 2.0, 64)
     u, mbar, mu = directions(p, edges), masses.mean(), 0.03
     J = jacobian(p, edges)
     K = mbar * J.T @ J + mu * np.diag(np.repeat(masses, 3))
@@ -135,7 +135,7 @@ def test_a_solve_starts_from_the_best_of_past_solutions(rng):
 def test_solves_along_a_motion_take_fewer_iterations(rng):
     """As a formation bends smoothly, past solutions leave less for conjugate gradients to find."""
     p = shapes.slots("sphere", 1.0, 200)
-    edges, b = shapes.neighbours(p), rng.normal(size=len(shapes.neighbours(p)))
+    edges, b = graphs.neighbours(p), rng.normal(size=len(graphs.neighbours(p)))
     taken = {}
     for past in (True, False):
         solver = solver_of(p, edges, np.ones(200), k.ITERATED, tolerance=1e-8)
@@ -152,7 +152,7 @@ def test_solves_along_a_motion_take_fewer_iterations(rng):
 def test_pattern_without_fill_solves_as_well(rng, monkeypatch):
     """Where a complete factor would fill up, an incomplete one preconditions, with more iterations."""
     p = lattice(6)
-    edges, masses = shapes.neighbours(p, 1.5), np.ones(216)
+    edges, masses = graphs.neighbours(p, 1.5), np.ones(216)
     b = rng.normal(size=len(edges))
     full = solver_of(p, edges, masses, k.ITERATED)
     want = solved(full, b)
@@ -168,7 +168,7 @@ def test_pattern_without_fill_solves_as_well(rng, monkeypatch):
 def test_factor_is_that_of_the_matrix(rng):
     """L L^T is K, block by block, in the order of the dissection."""
     p = lattice(4)
-    edges, masses = shapes.neighbours(p, 1.5), rng.uniform(0.5, 2.0, 64)
+    edges, masses = graphs.neighbours(p, 1.5), rng.uniform(0.5, 2.0, 64)
     found = sparse.pattern(64, edges, solvers.dissection(p, edges), 1e9)
     blocks, at = np.empty((len(found.row), 9)), np.empty(64, dtype=np.int64)
     u = directions(p, edges)
@@ -190,7 +190,7 @@ def test_factor_is_that_of_the_matrix(rng):
 def test_a_lost_pivot_falls_back_and_is_counted(rng):
     """Where an agent lies in a plane with its three, the sweep has no pivot; the vertex graph goes on."""
     p = lattice(3)
-    edges = shapes.joined(p)
+    edges = graphs.joined(p)
     steps = solvers.sweep_steps(27, edges)
     assert steps is not None
     i, mine = steps[-1, 0], steps[-1, 1:]
@@ -208,7 +208,7 @@ def test_a_lost_pivot_falls_back_and_is_counted(rng):
 def test_what_is_not_finite_has_no_solution(rng):
     """NaN goes in, NaN comes out, and the next solve is none the worse."""
     p = lattice(4)
-    edges = shapes.neighbours(p, 1.5)
+    edges = graphs.neighbours(p, 1.5)
     solver = solver_of(p, edges, np.ones(64), k.ITERATED)
     b = rng.normal(size=len(edges))
     want = solved(solver, b)
@@ -233,18 +233,18 @@ def test_what_is_not_finite_has_no_solution(rng):
 def test_solve_is_chosen_by_size_law_and_graph(n, count, law, method):
     """Small ones and laws with eigenvalues are dense, exact ones of three edges each swept."""
     p = lattice(round(n ** (1 / 3)))
-    graphs = {
-        "complete": lambda: shapes.complete_graph(n),
-        "joined": lambda: shapes.joined(p),
-        "neighbours": lambda: shapes.neighbours(p, 1.5),
+    made = {
+        "complete": lambda: graphs.complete_graph(n),
+        "joined": lambda: graphs.joined(p),
+        "neighbours": lambda: graphs.neighbours(p, 1.5),
     }
-    assert solvers.choose(n, graphs[count](), law) == method
+    assert solvers.choose(n, made[count](), law) == method
 
 
 def test_order_of_the_sweep_is_found_whatever_the_numbers(rng):
     """Each agent comes after the three it is joined to, and every edge once; a cube's graph has no such order."""
     p = lattice(5)
-    edges = shapes.joined(p)
+    edges = graphs.joined(p)
     for order in (np.arange(125), rng.permutation(125)):
         renamed = np.sort(order[edges], axis=1)
         steps = solvers.sweep_steps(125, renamed)
@@ -255,20 +255,20 @@ def test_order_of_the_sweep_is_found_whatever_the_numbers(rng):
             others = [renamed[e].sum() - i for e in mine if e >= 0]
             assert len(others) == min(s, 3)
             assert all(place[j] < s for j in others)
-    assert solvers.sweep_steps(8, shapes.CUBE_EDGES) is None
+    assert solvers.sweep_steps(8, graphs.CUBE_EDGES) is None
 
 
 def test_dissection_orders_every_agent_once():
     """A permutation, of coincident points, too."""
     p = np.repeat(lattice(3), 2, axis=0)
-    assert sorted(solvers.dissection(p, shapes.complete_graph(54))) == list(range(54))
+    assert sorted(solvers.dissection(p, graphs.complete_graph(54))) == list(range(54))
 
 
 def flight(law: str, kind: str, **integrator) -> Mission:
     """64 agents on a lattice, 2 cm off, that turn and are pushed."""
     p = lattice(4, seed=2)
     rest = np.rint(p)
-    edges = shapes.joined(rest) if kind == "joined" else shapes.neighbours(rest, 1.5)
+    edges = graphs.joined(rest) if kind == "joined" else graphs.neighbours(rest, 1.5)
     return Mission.from_dict(
         {
             "schema_version": 1,

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 from scipy.spatial import ConvexHull
 
-from rigidfleet.formation import shapes
+from rigidfleet.formation import distance_geometry, shapes
 from rigidfleet.mission import Mission, load_mission
 
 Array = NDArray[np.float64]
@@ -57,7 +57,7 @@ class Case:
 
     def error(self, r: Array) -> float:
         """The largest error of a distance at positions r (N, 3) [m]."""
-        return float(np.abs(shapes.distances(r, self.edges) - self.d).max())
+        return float(np.abs(distance_geometry.distances(r, self.edges) - self.d).max())
 
     def lengths(self, step: float) -> Array:
         """Lengths (K, m) [m] that the law gives the edges at 0, step, ...: the error's equation is linear."""
@@ -67,7 +67,7 @@ class Case:
         for _ in range(round(DURATION / step) + 1):
             phi.append(x[0])
             x = E @ x
-        return self.d + np.outer(phi, shapes.distances(self.r, self.edges) - self.d)
+        return self.d + np.outer(phi, distance_geometry.distances(self.r, self.edges) - self.d)
 
 
 #: One flight: the seconds it took, and positions (N, 3) at the end [m].

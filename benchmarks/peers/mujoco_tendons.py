@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rigidfleet.formation import shapes
+from rigidfleet.formation import distance_geometry
 
 from .case import DURATION, STEPS, AbsentError, Array, Case, Flight, Peer, timed
 
@@ -59,7 +59,7 @@ def _xml(case: Case, step: float) -> str:
         for k, (i, j) in enumerate(edges)
     )
     # An equality holds a tendon's length beyond that at the start.
-    change = (case.d - shapes.distances(case.r, case.edges)).tolist()
+    change = (case.d - distance_geometry.distances(case.r, case.edges)).tolist()
     equalities = "".join(
         f'<tendon tendon1="t{k}" polycoef="{x!r} 0 0 0 0" solref="{-(beta**2)!r} {-2 * alpha!r}"'
         ' solimp="0.9999 0.9999 0.001"/>'

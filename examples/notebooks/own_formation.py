@@ -9,7 +9,7 @@ import numpy as np
 
 import rigidfleet as rf
 from rigidfleet import plotting as figures
-from rigidfleet.formation.shapes import complete_graph
+from rigidfleet.formation.graphs import complete_graph
 from rigidfleet.mission import Mission
 from rigidfleet.rigidity import analyse
 from rigidfleet.rigidity.design import design

@@ -18,8 +18,9 @@ from rigidfleet.assessment.verdict import (
     names,
     value,
 )
-from rigidfleet.formation import shapes
+from rigidfleet.formation import distance_geometry
 from rigidfleet.math import attitude as att
+from rigidfleet.math import proximity, rigid_body
 from rigidfleet.math import proximity as geometry
 from rigidfleet.result import PAD, PhaseRecord, Result
 from rigidfleet.typing import Bools, Floats, Ints
@@ -51,10 +52,10 @@ class Fit:
         self.error, pair, self.flown, self.intended = _all_pairs(p, slots)
         #: The pair with the greatest error, by the numbers ``who`` (N,) of the agents.
         self.pair = pair if who is None else (int(who[pair[0]]), int(who[pair[1]]))
-        p, slots = shapes.centred(p), shapes.centred(slots)
+        p, slots = rigid_body.centred(p), rigid_body.centred(slots)
         self.mirrored = self.dimension == 3 and bool(np.linalg.det(p.T @ slots) < 0)
         #: Where the axis points in the world.
-        self.points: Floats = shapes.kabsch(p, slots) @ self.axis
+        self.points: Floats = rigid_body.kabsch(p, slots) @ self.axis
         self.in_order: bool | None = None
         if self.dimension == 1 and len(p) > 2:
             asked = np.argsort(slots @ self.axis).tolist()
@@ -357,7 +358,7 @@ class Flight:
             p, left = result.position[last], np.flatnonzero(self.left[last])
             slots = self.mission.formation_slots(record.formation)
             edges, intended = self.edges(record.formation, last)
-            distances = _greatest(shapes.distances(p, edges) - intended)
+            distances = _greatest(distance_geometry.distances(p, edges) - intended)
             if slots is not None and len(left) > 1 and np.isfinite(p).all():
                 fit = self.fits[index] = Fit(p[left], slots[left], left)
                 flip = self.flip(fit, record, last)
@@ -445,10 +446,10 @@ def _length(x: Floats) -> Floats:
 def _shape(slots: bytes) -> tuple[int, Floats, float]:
     """Dimension of slots (N, 3), the direction of a line or the normal of a plane, and the shortest distance [m]."""
     points = np.frombuffer(slots).reshape(-1, 3)
-    centred = shapes.centred(points)
-    dimension = shapes.dimension(centred, THIN)
+    centred = rigid_body.centred(points)
+    dimension = distance_geometry.dimension(centred, THIN)
     axes = np.linalg.svd(centred, full_matrices=False)[2]
-    return dimension, axes[0] if dimension == 1 else axes[2], float(shapes.nearest(points).min())
+    return dimension, axes[0] if dimension == 1 else axes[2], float(proximity.nearest(points).min())
 
 
 def _all_pairs(p: Floats, slots: Floats) -> tuple[float, tuple[int, int], float, float]:
@@ -457,7 +458,7 @@ def _all_pairs(p: Floats, slots: Floats) -> tuple[float, tuple[int, int], float,
     Of all pairs, but few are looked at: no error is greater than the sum of how far both agents are off their slots,
     however those are laid onto them, as they are or mirrored. Less than rounding counts for nothing.
     """
-    x, q = shapes.centred(p), shapes.centred(slots)
+    x, q = rigid_body.centred(p), rigid_body.centred(slots)
     U, _, Vt = np.linalg.svd(q.T @ x)
     off = np.linalg.norm(x - q @ (U @ Vt), axis=1)
     order = np.argsort(-off, kind="stable")

@@ -341,7 +341,7 @@ def design(
     json : bool
         Print all of it as JSON.
     """
-    from rigidfleet.formation.shapes import CUBE_EDGES, REACH, complete_graph
+    from rigidfleet.formation.graphs import CUBE_EDGES, REACH, complete_graph
     from rigidfleet.result import write_file
     from rigidfleet.rigidity import design as designs
 
@@ -413,7 +413,7 @@ def _judged(slots: Any, edges: Any) -> tuple[dict[str, Any], tuple[str, ...]]:
     """How a graph holds slots (N, 3): as data, and as the cells of a row of `design`."""
     import numpy as np
 
-    from rigidfleet.formation.shapes import distances
+    from rigidfleet.formation.distance_geometry import distances
     from rigidfleet.rigidity import analyse, jacobian, spectrum
 
     longest = f"{distances(slots, edges).max(initial=0.0):.3g} m"
@@ -444,7 +444,9 @@ def _points(shape: str, agents: int | None, size: list[float] | None) -> tuple[s
     ValueError
         The shape takes other numbers of agents or sizes, or an option has no effect on a file.
     """
-    from rigidfleet.formation.shapes import SHAPES, agents_taken, centred, read_points, slots
+    from rigidfleet.formation.point_files import read_points
+    from rigidfleet.formation.shapes import SHAPES, agents_taken, slots
+    from rigidfleet.math.rigid_body import centred
 
     if shape in SHAPES:
         form = SHAPES[shape]

@@ -388,3 +388,19 @@ def smallest_singular_value(r: Floats, edges: Ints, masses: ArrayLike | None = N
     w = np.linalg.eigvalsh(gram)
     w[w < 1e-14 * w[:, -1:]] = np.inf
     return np.sqrt(w.min(axis=1))
+
+
+#: See `_TRIED`.
+_FEW = 400
+
+
+def nearest(points: ArrayLike) -> Floats:
+    """Distance (N,) [m] of each of N points (N, 3) to the nearest other."""
+    p = np.asarray(points, dtype=np.float64)
+    if len(p) <= _FEW:
+        apart = np.linalg.norm(p[:, None] - p, axis=2)
+        np.fill_diagonal(apart, np.inf)
+        return apart.min(axis=1)
+    from scipy.spatial import KDTree
+
+    return KDTree(p).query(p, k=2)[0][:, 1]

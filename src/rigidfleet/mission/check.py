@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 
 from rigidfleet.errors import MissionError
-from rigidfleet.formation.shapes import SHAPES, count_within
+from rigidfleet.formation.graphs import count_within
+from rigidfleet.formation.shapes import SHAPES
 from rigidfleet.mission import bounds, disturbances, formations, phases
 from rigidfleet.mission.findings import Keys, Notes, near_shape
 from rigidfleet.mission.schema import (

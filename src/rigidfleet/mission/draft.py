@@ -9,7 +9,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rigidfleet.formation import shapes
+from rigidfleet.formation import distance_geometry, shapes
+from rigidfleet.math import proximity
 from rigidfleet.mission.findings import near_shape
 from rigidfleet.typing import Floats
 
@@ -76,7 +77,7 @@ def draft(
     if not np.isfinite([thrust_limit or 0.0, mass, *size, *np.ravel(waypoints or ())]).all():
         raise ValueError("masses, sizes, limits and waypoints must be finite")
     slots = shapes.slots(shape, list(size) * (3 if _is_box(shape, size) else 1), n)
-    nearest = float(shapes.nearest(slots).min()) if n > 1 else SIZE
+    nearest = float(proximity.nearest(slots).min()) if n > 1 else SIZE
     radius = min(RADIUS, nearest / 4)
     start, below = _start(slots, min(_APART, nearest))
     low = float(-slots[:, 2].min()) + radius
@@ -116,7 +117,7 @@ def draft(
         text=shapes.SHAPES[shape].text,
         separation=f"{min(0.5, nearest / 6):.3g}",
         # In a shape in space that is small, or of many, some pass below others, whatever one does.
-        below="" if below and (shapes.dimension(slots) < 3 or nearest >= 3.0) else "# ",
+        below="" if below and (distance_geometry.dimension(slots) < 3 or nearest >= 3.0) else "# ",
         keys=("" if below else _ASSIGNED) + _output_step(n, lasts),
         aloft=_row(aloft),
         blend=""
@@ -160,7 +161,7 @@ def _start(slots: Floats, apart: float) -> tuple[Floats, bool]:
     n = len(slots)
     across = slots * [1.0, 1.0, 0.0]
     ground = np.array([0.0, 0.0, 0.3])
-    if n == 1 or shapes.nearest(across).min() >= apart * (1 - 1e-9):
+    if n == 1 or proximity.nearest(across).min() >= apart * (1 - 1e-9):
         return across + ground, True
     if n > _FEW:
         # Straight ways to slots that are nearest take room (docs/many.md): a grid as wide as that.

@@ -8,7 +8,8 @@ from itertools import islice
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigidfleet.formation import shapes
+from rigidfleet.formation import distance_geometry, graphs, shapes
+from rigidfleet.math import proximity
 from rigidfleet.mission import bounds
 from rigidfleet.mission.findings import Keys, Notes, near_shape
 from rigidfleet.mission.schema import Formation
@@ -50,7 +51,7 @@ def coincident(points: ArrayLike) -> list[tuple[int, int]]:
     first[order] = order[np.flatnonzero(new)[np.cumsum(new) - 1]]
     later = np.flatnonzero(first != np.arange(len(p)))
     if not len(later) and len(p) > 1:
-        later = np.flatnonzero(shapes.nearest(p) < apart)[1:]
+        later = np.flatnonzero(proximity.nearest(p) < apart)[1:]
         for j in later:
             away = np.linalg.norm(p - p[j], axis=1)
             away[j] = np.inf
@@ -150,7 +151,7 @@ def _graph(notes: Notes, form: Formation, n: int, path: Keys) -> None:
     slots = form.slot_array(n)
     assert slots is not None  # there are a shape or slots
     if form.edges == "neighbours":
-        many = shapes.count_neighbours(slots, form.reach)
+        many = graphs.count_neighbours(slots, form.reach)
         if many > most_edges(n):
             problem = f"joins {many:,} pairs of {n:,} agents, more than {most_edges(n):,}"
             notes.add(
@@ -158,7 +159,7 @@ def _graph(notes: Notes, form: Formation, n: int, path: Keys) -> None:
             )
         return
     try:
-        shapes.spans_space(slots)
+        graphs.spans_space(slots)
     except ValueError as error:
         notes.add(path, str(error), "use 'neighbours', or give a list of pairs")
 
@@ -173,7 +174,7 @@ def _distances(notes: Notes, form: Formation, lengths: Sequence[float], n: int, 
     # Those that two ends of an edge have in common are at most the neighbours of either.
     degree = np.bincount(edges.ravel(), minlength=n)
     cliques = (degree[edges].min(axis=1, initial=n).astype(float) ** 2).sum()
-    found = shapes.unrealisable(edges, lengths) if cliques < _MOST_CLIQUES else []
+    found = distance_geometry.unrealisable(edges, lengths) if cliques < _MOST_CLIQUES else []
     names = [
         f"d{agents(e, '' if n < 10 else '-')} = {d:g}" for e, d in zip(edges, lengths, strict=True)
     ]
@@ -193,6 +194,6 @@ def _distances(notes: Notes, form: Formation, lengths: Sequence[float], n: int, 
         notes.add(path, problem, "correct those above first", None)
     if not found:
         try:
-            shapes.slots_from_distances(n, edges, lengths)
+            distance_geometry.slots_from_distances(n, edges, lengths)
         except ValueError as error:
             notes.add(path, str(error), "change them, or give shape and size", None)

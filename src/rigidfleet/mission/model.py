@@ -14,7 +14,8 @@ from pydantic import PrivateAttr
 
 from rigidfleet._toml import to_toml
 from rigidfleet.errors import Finding, MissionError
-from rigidfleet.formation.shapes import assigned, distances
+from rigidfleet.formation.assignment import assigned
+from rigidfleet.formation.distance_geometry import distances
 from rigidfleet.math import proximity as geometry
 from rigidfleet.math.attitude import dcm_from_euler
 from rigidfleet.mission import bounds

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from rigidfleet._toml import toml_key
-from rigidfleet.formation import shapes
+from rigidfleet.formation import distance_geometry
+from rigidfleet.math import rigid_body
 from rigidfleet.mission.findings import Keys, Notes, near
 from rigidfleet.mission.formations import agents as agents_text
 from rigidfleet.mission.formations import sound
@@ -305,7 +306,7 @@ def _blendable(notes: Notes, p: Shaping, form: Formation, n: int, path: Keys) ->
         notes.add((*path, "reference"), problem, remedy, p.reference)
     elif form.distances is not None:
         edges = form.edge_array(n)
-        between = shapes.distances(slots, edges)
+        between = distance_geometry.distances(slots, edges)
         for k in np.flatnonzero(np.abs(between - form.distances) > 1e-3 * between):
             problem = f"the slots of agents {agents_text(edges[k])} are {between[k]:.7g} m apart"
             remedy = f"correct it, or fly {p.name} by reference = 'distances'"
@@ -319,9 +320,9 @@ def _reachable(notes: Notes, p: Shaping, form: Formation, agents: Agents, path: 
     if any(p.input_force) and len(set(agents.mass)) > 1:
         return  # the same force moves unequal masses apart
     target = form.slot_array(len(agents.position))
-    motion = [shapes.centred(agents.position), shapes.centred(agents.velocity)]
-    start = shapes.dimension(np.vstack([*motion, *(-m for m in motion)]))
-    if target is not None and start < shapes.dimension(target):
+    motion = [rigid_body.centred(agents.position), rigid_body.centred(agents.velocity)]
+    start = distance_geometry.dimension(np.vstack([*motion, *(-m for m in motion)]))
+    if target is not None and start < distance_geometry.dimension(target):
         where = ("point", "line", "plane")[start]
         problem = f"the agents start on one {where}, which forces between them cannot leave"
         remedy = f"move a start off the {where}, or use control = 'slots'"

@@ -20,7 +20,8 @@ from pydantic import (
     model_validator,
 )
 
-from rigidfleet.formation import shapes
+from rigidfleet.formation import distance_geometry, graphs, shapes
+from rigidfleet.math import rigid_body
 from rigidfleet.mission import bounds
 from rigidfleet.mission.bounds import (
     ACCELERATION,
@@ -334,7 +335,7 @@ class Formation(Part):
         "'joined': each to three nearer to the centre; 'tree': each to three before it, far ones first; 3 N - 6 in all",
     )
     reach: Length = Field(
-        shapes.REACH,
+        graphs.REACH,
         description="how far edges 'neighbours' reach, in distances of nearest neighbours: 1.9 takes the second, too",
     )
     distances: tuple[Length, ...] | None = Field(
@@ -344,13 +345,13 @@ class Formation(Part):
     def edge_array(self, n: int) -> Ints:
         """Edges (m, 2), counted from 0, i < j."""
         if self.edges == "complete":
-            return shapes.complete_graph(n)
+            return graphs.complete_graph(n)
         if isinstance(self.edges, str):
             slots = self.slot_array(n)
             assert slots is not None  # checked: there are a shape or slots
             if self.edges == "neighbours":
-                return shapes.neighbours(slots, self.reach)
-            return shapes.joined(slots) if self.edges == "joined" else shapes.coarse_to_fine(slots)
+                return graphs.neighbours(slots, self.reach)
+            return graphs.joined(slots) if self.edges == "joined" else graphs.coarse_to_fine(slots)
         return np.sort(np.array(self.edges, dtype=np.int64).reshape(-1, 2) - 1, axis=1)
 
     @property
@@ -363,8 +364,8 @@ class Formation(Part):
         if self.shape is not None and self.size is not None:
             return shapes.slots(self.shape, self.size, n)
         if self.slots is not None:
-            return shapes.centred(self.slots)
-        return shapes.slots_from_distances(n, self.edge_array(n), self.distances or ())
+            return rigid_body.centred(self.slots)
+        return distance_geometry.slots_from_distances(n, self.edge_array(n), self.distances or ())
 
 
 class Box(Part):

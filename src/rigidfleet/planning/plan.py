@@ -11,7 +11,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from rigidfleet.formation import shapes
+from rigidfleet.formation import distance_geometry, graphs
 from rigidfleet.kernel import problem as k
 from rigidfleet.math import lqr
 from rigidfleet.mission import Establish, Fly, Mission, Phase, Regulator, Reshape, Turn
@@ -64,7 +64,7 @@ def plan_phase(mission: Mission, phase: Phase, now: Situation, t_end: float) -> 
     d1 = mission.formation_distances(name) if name else np.zeros(0)
     if not shaping:
         d1 = now.reference.of(edges, d1)
-    d0 = now.reference.of(edges, shapes.distances(now.r, edges))
+    d0 = now.reference.of(edges, distance_geometry.distances(now.r, edges))
     # Slots are blended wherever the shape leads; where distances lead, slots only follow if tracked.
     left = masses if now.lost is None else np.where(now.lost, 0.0, masses)
     before = slots_before(mission, now, left)
@@ -73,7 +73,9 @@ def plan_phase(mission: Mission, phase: Phase, now: Situation, t_end: float) -> 
     if shaping:
         T_b = 0.0 if phase.reference == "step" else phase.blend
         kind = _KINDS[led_by(mission, phase, before, target)]
-    elif phase.control == "slots" and np.allclose(d1, shapes.distances(before, edges), rtol=1e-12):
+    elif phase.control == "slots" and np.allclose(
+        d1, distance_geometry.distances(before, edges), rtol=1e-12
+    ):
         kind = k.SLOTS
     dp, turn = np.zeros_like(before), np.zeros(3)
     if shaping:
@@ -134,9 +136,9 @@ def _held(mission: Mission, name: str | None, now: Situation) -> str | None:
     slots, r = slots[left], now.r[left]
     if len(slots) < 2:
         return None
-    pairs = shapes.complete_graph(len(slots))
-    wanted = shapes.distances(slots, pairs)
-    near = np.abs(shapes.distances(r, pairs) - wanted).max() <= _NEAR * wanted.min()
+    pairs = graphs.complete_graph(len(slots))
+    wanted = distance_geometry.distances(slots, pairs)
+    near = np.abs(distance_geometry.distances(r, pairs) - wanted).max() <= _NEAR * wanted.min()
     return name if near else None
 
 

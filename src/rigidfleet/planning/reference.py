@@ -10,9 +10,9 @@ from typing import Literal
 
 import numpy as np
 
-from rigidfleet.formation import shapes
+from rigidfleet.formation import distance_geometry
 from rigidfleet.math import attitude as att
-from rigidfleet.math import lqr
+from rigidfleet.math import lqr, rigid_body
 from rigidfleet.mission import Establish, Fly, Mission, Phase, Regulator, Reshape, Turn
 from rigidfleet.typing import Bools, Floats, Ints
 
@@ -126,7 +126,7 @@ def attach(
         fit = now.slots
         near = frame if frame is not None else now.pose.T if now.pose is not None else np.eye(3)
         if fit is not None:
-            T = shapes.kabsch(x, fit, masses, near=near.T).T
+            T = rigid_body.kabsch(x, fit, masses, near=near.T).T
         else:
             T = near if mission.body_frame is not None else mission.drawn_attitude
         pose = Pose(masses @ now.r / masses.sum(), masses @ now.v / masses.sum(), T, np.zeros(3))
@@ -169,7 +169,7 @@ def slots_before(mission: Mission, now: Situation, masses: Floats) -> Floats:
 def _turn(given: Floats | None, before: Floats, after: Floats | None, masses: Floats) -> Floats:
     if after is None:
         return np.eye(3)
-    return shapes.kabsch(before, after, masses) if given is None else given
+    return rigid_body.kabsch(before, after, masses) if given is None else given
 
 
 def led_by(
@@ -190,14 +190,14 @@ def led_by(
         return "squares"
     edges = mission.formation_edges(phase.formation)
     asked = mission.formation_distances(phase.formation)
-    if not np.allclose(shapes.distances(target, edges), asked, rtol=1e-3):
+    if not np.allclose(distance_geometry.distances(target, edges), asked, rtol=1e-3):
         return "squares"
-    start, goal = shapes.centred(before), shapes.centred(target)
-    if shapes.dimension(np.hstack([start, goal])) > 3:
+    start, goal = rigid_body.centred(before), rigid_body.centred(target)
+    if distance_geometry.dimension(np.hstack([start, goal])) > 3:
         return "shape"
-    if shapes.dimension(goal) < 3:
+    if distance_geometry.dimension(goal) < 3:
         return "squares"
-    same_hand = shapes.dimension(start) == 3 and np.linalg.det(start.T @ goal) > 0
+    same_hand = distance_geometry.dimension(start) == 3 and np.linalg.det(start.T @ goal) > 0
     return "squares" if same_hand else "shape"
 
 
@@ -210,7 +210,7 @@ def align_slots(
     which the straight blend has no angular momentum in its own frame, and moves the agents least. A turn back
     meanwhile keeps what the body axes mean; distances know nothing of it.
     """
-    R = shapes.kabsch(before, after, masses) if turn is None else turn
+    R = rigid_body.kabsch(before, after, masses) if turn is None else turn
     return after @ R.T - before, att.rotation_vector_from_dcm(R)  # log of R^T
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rigidfleet.formation import shapes
+from rigidfleet.formation import distance_geometry
 from rigidfleet.plotting import space
 from rigidfleet.plotting import style as st
 
@@ -67,7 +67,7 @@ def _draw(ax: Axes, mission: Mission, name: str, rigidity: Rigidity | None) -> N
     p = p - p.mean(axis=0)
     edges, lengths = mission.formation_edges(name), mission.formation_distances(name)
     extent = float(np.ptp(p)) or 1.0
-    flat = shapes.dimension(p, 1e-3) < 3 and float(np.ptp(p[:, 2])) < 1e-3 * extent
+    flat = distance_geometry.dimension(p, 1e-3) < 3 and float(np.ptp(p[:, 2])) < 1e-3 * extent
     sideways = flat and rigidity is not None and any(f.motion[:, 2].any() for f in rigidity.flexes)
     R = np.eye(3) if flat and not sideways else space.camera(-70.0, 30.0 if flat else 16.0)
     redundant = set() if rigidity is None else set(rigidity.redundant.tolist())

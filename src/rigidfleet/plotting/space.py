@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from rigidfleet.formation import shapes
+from rigidfleet.formation import distance_geometry
 from rigidfleet.plotting import curves
 from rigidfleet.plotting import style as st
 from rigidfleet.plotting.style import styled
@@ -467,7 +467,7 @@ def _sketch(
     lengths = mission.formation_distances(name)
     masses = np.array(mission.agents.mass)
     origin = masses @ p / masses.sum()
-    flat = shapes.dimension(p, 1e-3) < 3 and float(np.ptp(p[:, 2])) < 1e-3 * max(
+    flat = distance_geometry.dimension(p, 1e-3) < 3 and float(np.ptp(p[:, 2])) < 1e-3 * max(
         1e-9, float(np.ptp(p))
     )
     x, y, w, h = rect
@@ -492,7 +492,7 @@ def _sketch(
     if placed and len(p) > 1:
         reach = float(np.linalg.norm(turned, axis=1).max())
         taken = bool(np.linalg.norm(turned, axis=1).min() < 0.1 * reach)
-        length = (0.3, 0.3, 0.42, 0.5)[shapes.dimension(p, 1e-3)] * reach
+        length = (0.3, 0.3, 0.42, 0.5)[distance_geometry.dimension(p, 1e-3)] * reach
         _draw_axes(ax, axes, length, taken=taken)
 
 

@@ -15,9 +15,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from rigidfleet.formation import shapes
+from rigidfleet.formation import assignment, distance_geometry
 from rigidfleet.math import attitude as att
-from rigidfleet.math import lqr
+from rigidfleet.math import lqr, proximity, rigid_body
 from rigidfleet.math import pid as gains
 from rigidfleet.math import proximity as geometry
 from rigidfleet.mission import Box, Establish, Ground, Mission, Phase, Reshape
@@ -401,7 +401,7 @@ def _contradiction(mission: Mission, name: str) -> tuple[int, float] | None:
     if slots is None or not len(edges):
         return None
     given = mission.formation_distances(name)
-    error = np.abs(shapes.distances(slots, edges) - given)
+    error = np.abs(distance_geometry.distances(slots, edges) - given)
     worst = int(error.argmax())
     return (worst, float(error[worst])) if error[worst] > _TOLERANCE * given.min() else None
 
@@ -495,7 +495,7 @@ def _other_shapes(mission: Mission, f: FormationCheck, *, alone: bool) -> Iterat
 
 def _flattens(start: Floats, slots: Floats) -> bool:
     """Whether four agents are all in one plane on the way from a start to slots in space (4, 3)."""
-    if len(slots) != 4 or shapes.dimension(slots) < 3:
+    if len(slots) != 4 or distance_geometry.dimension(slots) < 3:
         return False
     return bool(np.linalg.det((start[1:] - start[0]).T @ (slots[1:] - slots[0])) < 0)
 
@@ -628,7 +628,7 @@ def _leg(
         if shaping and target is not None:
             # Turned as the blend has it, and with that as the agents lie.
             slots = slots_before(mission, now, masses)
-            after = target @ turned.T @ shapes.kabsch(x, slots, masses).T
+            after = target @ turned.T @ rigid_body.kabsch(x, slots, masses).T
         cm, v = masses @ now.r / masses.sum(), masses @ now.v / masses.sum()
         a = np.array(phase.input_force) * len(masses) / masses.sum()
         tau = (time - t0)[:, None]
@@ -740,7 +740,7 @@ def _separation(mission: Mission, found: Preflight) -> Iterator[Remark]:
         for k in [int(rooms.argmin())] if leg.ways is None else [0, -1]:
             ends.append((float(rooms[k]), float(leg.time[k]), tuple(pairs[k].tolist())))
         if leg.ways is not None:
-            room, who, share = shapes.nearest_way(*leg.ways, radius)
+            room, who, share = assignment.nearest_way(*leg.ways, radius)
             crossing = room, _time_of(mission, leg, number, share), who
             least = min(least, crossing)
             beyond = room <= 0 or room < limit - _SLACK
@@ -789,7 +789,7 @@ def _crossing(
     )
     assert after is not None  # something is shaped
     assert leg.ways is not None
-    apart = min(float(shapes.nearest(places).min()) for places in leg.ways)
+    apart = min(float(proximity.nearest(places).min()) for places in leg.ways)
     flown = [p.formation for p in mission.phases[:number] if isinstance(p, Establish | Reshape)]
     spaced = f"keep slots {math.sqrt(2) * needed:.2f} m apart or more (here {apart:.2f} m)"
     promised = mission.assigned_turn(before, after) is not None
@@ -926,7 +926,7 @@ def _step_thrust(mission: Mission, found: Preflight) -> Iterator[Remark]:
         edges = mission.formation_edges(phase.formation)
         if min(len(edges), 3 * mission.n_agents) > _DENSE:
             continue
-        error = shapes.distances(r, edges) - mission.formation_distances(phase.formation)
+        error = distance_geometry.distances(r, edges) - mission.formation_distances(phase.formation)
         J = jacobian(r, edges)
         root = np.repeat(1 / np.sqrt(masses), 3)
         f = np.linalg.lstsq(J * root, -(c.beta**2) * error, rcond=1e-7)[0] / root
@@ -1120,7 +1120,7 @@ def _assigned(mission: Mission, found: Preflight) -> Iterator[Remark]:
         assert leg.ways is not None  # it shapes
         x = leg.position - (masses @ leg.position)[:, None] / masses.sum()
         way = float(np.linalg.norm(np.diff(x, axis=0), axis=2).sum())
-        room = shapes.nearest_way(*leg.ways, mission.agents.radius)[0]
+        room = assignment.nearest_way(*leg.ways, mission.agents.radius)[0]
         order = tuple(other.assigned_slots[first.formation].tolist())
         found.assignments[name] = Assignment(order, way, room)
     radius = np.array(mission.agents.radius)

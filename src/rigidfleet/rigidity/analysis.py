@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigidfleet.formation.shapes import dimension
+from rigidfleet.formation.distance_geometry import dimension
 from rigidfleet.rigidity.framework import Flex, Framework, jacobian, localised
 from rigidfleet.rigidity.order import StressEnergy, blocking_stress, finite_flex
 from rigidfleet.typing import Floats, Ints

@@ -15,14 +15,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigidfleet.formation.shapes import (
-    coarse_to_fine,
-    complete_graph,
-    dimension,
-    distances,
-    joined,
-    neighbours,
-)
+from rigidfleet.formation.distance_geometry import dimension, distances
+from rigidfleet.formation.graphs import coarse_to_fine, complete_graph, joined, neighbours
 from rigidfleet.rigidity import full_rank, jacobian, rigid_motions
 from rigidfleet.typing import Floats, Ints
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rigidfleet.formation.shapes import kabsch
+from rigidfleet.math.rigid_body import kabsch
 from rigidfleet.rigidity.framework import Framework, jacobian, sparse
 from rigidfleet.typing import Floats, Ints
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigidfleet.formation.shapes import kabsch
+from rigidfleet.math.rigid_body import kabsch
 from rigidfleet.rigidity.analysis import checked
 from rigidfleet.rigidity.framework import Framework
 from rigidfleet.typing import Floats, Ints

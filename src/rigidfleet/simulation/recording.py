@@ -15,7 +15,6 @@ from rigidfleet.typing import Bools, Floats, Ints
 
 if TYPE_CHECKING:
     from rigidfleet.kernel.records import Record
-
     from rigidfleet.mission import Mission
 
 

@@ -17,7 +17,9 @@ import numpy as np
 from rigidfleet.assessment import SHAPE_TOLERANCE
 from rigidfleet.assessment.measure import THIN
 from rigidfleet.errors import MissionError
-from rigidfleet.formation.shapes import centred, complete_graph, dimension, distances
+from rigidfleet.formation.distance_geometry import dimension, distances
+from rigidfleet.formation.graphs import complete_graph
+from rigidfleet.math.rigid_body import centred
 from rigidfleet.mission import Establish, Mission, Reshape
 from rigidfleet.mission.formations import coincident
 from rigidfleet.mission.schema import HUGE

@@ -1,0 +1,183 @@
+"""Distances and points: which distances points have, and which points distances have."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from itertools import combinations, islice
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rigidfleet.math.rigid_body import centred
+from rigidfleet.typing import Floats, Ints
+
+#: Relative tolerance within which given distances must be realisable. Flat and straight shapes sit exactly
+#: on the limit, so distances need about seven digits: 5.656854, not 5.657.
+REALISABLE = 1e-6
+
+
+def distances(points: ArrayLike, edges: ArrayLike) -> Floats:
+    """Lengths (m,) [m] of edges (m, 2) between points (N, 3)."""
+    p = np.asarray(points, dtype=np.float64)
+    e = np.asarray(edges, dtype=np.int64).reshape(-1, 2)
+    return np.linalg.norm(p[e[:, 0]] - p[e[:, 1]], axis=1)
+
+
+def dimension(points: ArrayLike, tol: float = 1e-6) -> int:
+    """0 for a point, 1 for a line, 2 for a plane, 3 for a spatial shape.
+
+    `tol` is relative: a shape is flat when it is `tol` times as thick as it is long (in the sense of the
+    singular values of its centred points).
+    """
+    s = np.linalg.svd(centred(points), compute_uv=False)
+    rounding = 1e-12 * np.abs(points).max(initial=0.0)
+    return int(np.count_nonzero(s > max(tol * s[0], rounding)))
+
+
+class Violation(NamedTuple):
+    """Given distances which no points in space have."""
+
+    agents: tuple[int, ...]
+    edges: tuple[int, ...]
+    excess: float
+    """Triangle: by how much the longest side is too long [m]. Tetrahedron: its squared volume [m^6], < 0."""
+
+
+def unrealisable(edges: ArrayLike, lengths: ArrayLike, tol: float = REALISABLE) -> list[Violation]:
+    """Every triangle and tetrahedron among the given distances that does not exist in space.
+
+    A triangle whose three sides are given must meet the triangle inequality; a quadruple with all six
+    distances, and faces that exist, must have a Cayley-Menger determinant 288 V^2 >= 0. Both hold within
+    `tol` of their own size, so that straight (4-8-4) and flat shapes pass. Other quadruples are not judged,
+    and more agents than four may contradict each other where every four agree.
+    """
+    pairs = np.sort(np.asarray(edges, dtype=np.int64).reshape(-1, 2), axis=1).tolist()
+    index = {(i, j): k for k, (i, j) in enumerate(pairs)}
+    length = np.asarray(lengths, dtype=np.float64)
+    after: dict[int, set[int]] = {i: set() for pair in pairs for i in pair}
+    for i, j in pairs:
+        after[i].add(j)
+
+    found: list[Violation] = []
+    for agents, sides in _measured(_cliques(after, 3), index):
+        a = length[sides]
+        excess = 2 * a.max(axis=1) - a.sum(axis=1)
+        for t in np.flatnonzero(excess > tol * a.max(axis=1)):
+            found.append(Violation(agents[t], tuple(sides[t].tolist()), float(excess[t])))
+    broken = {v.agents for v in found}
+    for agents, sides in _measured(_cliques(after, 4), index):
+        d2 = length[sides] ** 2
+        volume2 = _squared_volume(*d2.T)
+        for q in np.flatnonzero(volume2 < -tol * d2.max(axis=1) ** 3):
+            if not any(face in broken for face in combinations(agents[q], 3)):
+                found.append(Violation(agents[q], tuple(sides[q].tolist()), float(volume2[q])))
+    return found
+
+
+def _cliques(after: dict[int, set[int]], size: int) -> Iterator[tuple[int, ...]]:
+    """Agents i < j < ... of which every two share an edge."""
+
+    def extend(clique: tuple[int, ...], common: set[int]) -> Iterator[tuple[int, ...]]:
+        if len(clique) == size:
+            yield clique
+            return
+        for i in sorted(common):
+            yield from extend((*clique, i), common & after[i])
+
+    return extend((), set(after))
+
+
+def _measured(
+    cliques: Iterator[tuple[int, ...]], index: dict[tuple[int, int], int]
+) -> Iterator[tuple[list[tuple[int, ...]], Ints]]:
+    """Some thousands of cliques at a time, each with the numbers of its edges 12, 13, ..., 23, ..."""
+    while agents := list(islice(cliques, 4096)):
+        yield agents, np.array([[index[i, j] for i, j in combinations(c, 2)] for c in agents])
+
+
+def _squared_volume(a: Floats, b: Floats, c: Floats, ab: Floats, ac: Floats, bc: Floats) -> Floats:
+    """Squared volume of tetrahedra from squared lengths 12, 13, 14, 23, 24, 34 (Cayley-Menger / 288)."""
+    # Gram matrix of the three edges from the first agent, doubled: its determinant is 288 V^2.
+    x, y, z = a + b - ab, a + c - ac, b + c - bc
+    return (8 * a * b * c + 2 * x * y * z - 2 * (a * z**2 + b * y**2 + c * x**2)) / 288
+
+
+def slots_from_distances(
+    n: int, edges: ArrayLike, lengths: ArrayLike, tol: float = REALISABLE
+) -> Floats | None:
+    """Slots (n, 3) [m] of a *complete* set of distances (classical multidimensional scaling).
+
+    Distances know neither attitude nor mirror image; both follow a convention in which the paper's triangle
+    comes out as it attaches it, and every named shape with its own handedness: x points from the centre
+    to the last agent, y along r1 - r2 made orthogonal to x, and of a spatial shape that mirror image is taken
+    whose first four agents that span space, a < b < c < d, have (b - a) x (c - a) . (d - a) > 0.
+
+    Returns None where a distance is missing, since the shape is then not determined.
+
+    Raises
+    ------
+    ValueError
+        No points in space have these distances, within `tol` of the largest.
+    """
+    e = np.asarray(edges, dtype=np.int64).reshape(-1, 2)
+    given = np.asarray(lengths, dtype=np.float64)
+    pairs = n * (n - 1) // 2
+    if len(e) < pairs or len({(min(i, j), max(i, j)) for i, j in e.tolist()}) < pairs:
+        return None
+    d = np.zeros((n, n))
+    d[e[:, 0], e[:, 1]] = d[e[:, 1], e[:, 0]] = given
+    centring = np.eye(n) - 1 / n
+    value, vector = np.linalg.eigh(-0.5 * centring @ d**2 @ centring)
+    # An eigenvalue is a squared extent: what rounding alone leaves is no thickness.
+    top = np.where(value[-3:] > 1e-12 * value[-1], value[-3:], 0.0)[::-1]
+    p = np.zeros((n, 3))
+    p[:, : len(top)] = vector[:, -3:][:, ::-1] * np.sqrt(top)
+    error = float(np.abs(distances(p, e) - given).max(initial=0.0))
+    # Near a flat shape, an error e in a distance moves points by sqrt(e): judged by distances, not by volume.
+    if error > np.sqrt(tol) * d.max(initial=0.0) or value[0] < -tol * n * d.max(initial=0.0) ** 2:
+        raise ValueError(
+            f"no points in space have these distances (nearest set is {error:.3g} m off)"
+        )
+    return _conventional(p)
+
+
+def _conventional(p: Floats) -> Floats:
+    """Turn and mirror centred points (N, 3) to the convention of `slots_from_distances`."""
+    x = _first_direction(p[::-1], p)
+    if x is None:
+        return p
+    across = p - np.outer(p @ x, x)
+    y = _first_direction((a - b for a, b in combinations(across, 2)), p)
+    if y is None:
+        return np.outer(p @ x, [1.0, 0.0, 0.0])
+    out = p @ np.column_stack([x, y, np.cross(x, y)])
+    return out * [1, 1, -1] if handedness(out) < 0 else out
+
+
+def _first_direction(vectors: Iterable[Floats], p: Floats) -> Floats | None:
+    """Unit vector along the first of the vectors that is not small beside the shape of p."""
+    small = 1e-6 * np.abs(p).max(initial=0.0)
+    return next((v / np.linalg.norm(v) for v in vectors if np.linalg.norm(v) > small), None)
+
+
+def handedness(points: ArrayLike, tol: float = 1e-6) -> int:
+    """+1 or -1 for a spatial shape and its mirror image, 0 for a planar one.
+
+    The sign of (b - a) x (c - a) . (d - a) for the first four agents a < b < c < d that span space, and so the
+    same for every rotation of the shape.
+    """
+    p = np.asarray(points, dtype=np.float64)
+    size = float(np.abs(p - p.mean(axis=0)).max(initial=0.0))
+    basis: list[Floats] = []
+    for q in p[1:] - p[0]:
+        rest = q.copy()
+        for b in basis:
+            rest -= (rest @ b) * b
+        length = np.linalg.norm(rest)
+        if length <= tol * size:
+            continue
+        if len(basis) == 2:
+            return int(np.sign(np.cross(basis[0], basis[1]) @ q))
+        basis.append(rest / length)
+    return 0
