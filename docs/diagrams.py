@@ -13,8 +13,7 @@ from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
 from rigidfleet import physics
 from rigidfleet.formation.graphs import complete_graph
 from rigidfleet.formation.shapes import slots
-from rigidfleet.math import attitude
-from rigidfleet.math import pid as gains
+from rigidfleet.math import attitude, pid
 from rigidfleet.math.rigid_body import kabsch
 from rigidfleet.plotting.style import DASHES, FAINT, FLOWN, GREY, INK, PALETTE, TONES
 
@@ -270,7 +269,7 @@ def overshoot() -> Figure:
         (left, 8.0, r"with an integral ($\gamma=8$)"),
         (right, 0.0, r"without ($\gamma=0$)"),
     ):
-        c, _, integral = gains.error_response(3.0, np.sqrt(12.0), gamma, 1.0, 0.0, 0.0, t)
+        c, _, integral = pid.error_response(3.0, np.sqrt(12.0), gamma, 1.0, 0.0, 0.0, t)
         ax.fill_between(t, c, 0, where=c > 0, color=BLUE, alpha=0.15, linewidth=0)
         ax.fill_between(t, c, 0, where=c < 0, color=RED, alpha=0.25, linewidth=0)
         ax.plot(t, c, color=BLUE, linewidth=2, label="error $c$")

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 import rigidfleet as rf
 from rigidfleet.formation.graphs import CUBE_EDGES
 from rigidfleet.formation.shapes import slots
-from rigidfleet.math import pid as gains
+from rigidfleet.math import pid
 from rigidfleet.mission import Mission
 from rigidfleet.plotting import space
 from rigidfleet.plotting.graph import graphs
@@ -178,7 +178,7 @@ def slow_modes() -> Figure:
             mu = min(0.03, w / 4) if tied else 0.03
             g = 1 - (mu / (w + mu)) ** 3
             alpha = 3.0 * g + 0.5 * (1 - g)  # the deformation damping, as far as it is not undone
-            c = gains.error_response(alpha, np.sqrt(12 * g), 8 * g, 1.0, 0.0, 0.0, t)[0]
+            c = pid.error_response(alpha, np.sqrt(12 * g), 8 * g, 1.0, 0.0, 0.0, t)[0]
             ax.plot(t, c, color=colour, linewidth=1.8, label=f"$w$ = {w:g}")
         ax.axhline(0, color=GREY, linewidth=0.7)
         ax.set(xlabel="time [s]", title=title)

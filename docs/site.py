@@ -71,7 +71,7 @@ def _page_of(source: str) -> str:
 def _paper_figures() -> dict[str, bytes]:
     """Every figure of the paper that a mission draws: file name and SVG."""
     import rigidfleet as rf
-    from rigidfleet import plotting as figures
+    from rigidfleet import plotting
 
     found: dict[str, bytes] = {}
     flown: dict[str, Any] = {}
@@ -82,7 +82,7 @@ def _paper_figures() -> dict[str, bytes]:
                 if file not in found:
                     if mission not in flown:
                         flown[mission] = rf.simulate(rf.load_mission(mission))
-                    found[file] = notebook.svg(getattr(figures, name)(flown[mission]))
+                    found[file] = notebook.svg(getattr(plotting, name)(flown[mission]))
     return found
 
 

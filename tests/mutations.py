@@ -419,10 +419,11 @@ def work(kind: str, first: int, count: int, whole: Path | None) -> None:
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     os.environ["OPENBLAS_NUM_THREADS"] = "1"
     warnings.simplefilter("ignore")
-    from rigidfleet.planning import tolerances as accuracy
+
+    from rigidfleet.planning import tolerances
 
     # A phase may take only so many steps, that a case takes a second and no minute.
-    vars(accuracy).update(_STALLED=3000, _STALLED_RATE=0.0)
+    vars(tolerances).update(_STALLED=3000, _STALLED_RATE=0.0)
     faulthandler.register(signal.SIGPROF, chain=True)  # says where it was, and ends it
     seconds = float(os.environ.get("MUTATIONS_SECONDS", SECONDS[kind]))
     lines = os.fdopen(os.dup(1), "w", buffering=1)

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from rigidfleet.cli import app as cli
-from rigidfleet.cli import console as screen
+from rigidfleet.cli import console
 from rigidfleet.errors import MissionError
 from rigidfleet.math import turbulence
 from rigidfleet.mission import Mission, json_schema, mission_names, mission_text
 from rigidfleet.mission import bounds as limits
 from rigidfleet.mission.bounds import excess
 from rigidfleet.mission.formations import coincident
-from rigidfleet.preflight.check import preflight
+from rigidfleet.preflight.check import check
 
 HEAD = 'schema_version = 1\nname = "a"\n'
 HOLD = "[[phases]]\nkind = 'hold'\nduration = 10.0\n"
@@ -208,7 +208,7 @@ def test_short_steps_of_slow_gusts_stay_gusts():
 def checked(text: str) -> tuple[set[str], str]:
     """Topics of notes about what was passed over, and all words, of a check within 10 s of processor time."""
     begun = time.process_time()
-    found = preflight(Mission.from_toml(text))
+    found = check(Mission.from_toml(text))
     words = "\n".join(text for _, text in found.words())
     assert time.process_time() - begun < 10.0
     over = ("passed over", "take too long", "would take too long")
@@ -231,7 +231,7 @@ def test_a_check_of_many_obstacles_tells_of_the_nearest():
     assert len(re.findall(r"m to 'box \d+'", words)) == 20
     fly = "[[phases]]\nkind = 'fly'\nposition = [200, 1.5, 1.5]\nduration = 60.0\n"
     one = "[agents]\nmass = 1.0\nposition = [[-3.0, 1.5, 1.5]]\n"
-    found = preflight(Mission.from_toml(HEAD + one + boxes(100) + fly))
+    found = check(Mission.from_toml(HEAD + one + boxes(100) + fly))
     hit = {int(k) for r in found.remarks for k in re.findall(r"hits 'box (\d+)'", r.text)}
     assert hit == set(range(1, 101))
 
@@ -242,7 +242,7 @@ def test_a_gap_is_between_the_nearest_two():
         f"[[obstacles]]\nkind = 'box'\nmin = [{x}, -9, -9]\nmax = [{x + 1}, 9, 9]\n"
         for x in (-9, 20, -4, 8)
     )
-    found = preflight(Mission.from_toml(HEAD + agents(4) + walls + HOLD))
+    found = check(Mission.from_toml(HEAD + agents(4) + walls + HOLD))
     assert [(between, wide) for between, wide, _, _ in found.gaps] == [
         ("'box 3' and 'box 4'", 11.0)
     ]
@@ -271,8 +271,10 @@ def test_a_long_check_says_what_it_does(tmp_path: Path, monkeypatch, capsys):
     (tmp_path / "a.toml").write_text(HEAD + agents(4) + formation("square", 3.0) + ESTABLISH)
     assert cli.main(["check", str(tmp_path / "a.toml")]) != cli.BAD_INPUT
     assert "Checking" not in capsys.readouterr().err
-    monkeypatch.setattr(screen, "_PATIENCE", 0.05)
-    monkeypatch.setattr("rigidfleet.preflight.check._gains", lambda *_: time.sleep(0.5) or 1 // 0)
+    monkeypatch.setattr(console, "_PATIENCE", 0.05)
+    monkeypatch.setattr(
+        "rigidfleet.preflight.check.check_gains", lambda *_: time.sleep(0.5) or 1 // 0
+    )
     cli.main(["check", str(tmp_path / "a.toml")])
     assert re.search(r"Checking .*a.toml: the way, \d+ s", capsys.readouterr().err)
 

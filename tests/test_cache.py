@@ -19,10 +19,10 @@ from typing import Any
 import llvmlite.binding as llvm
 import pytest
 
-from rigidfleet.kernel import cache_directory, is_compiled
-from rigidfleet.kernel.compiler import cache
-from rigidfleet.kernel.compiler import jit as compiled
+from rigidfleet.kernel.compiler import cache, jit
+from rigidfleet.kernel.compiler.cache import cache_directory
 from rigidfleet.kernel.engine import native
+from rigidfleet.kernel.engine.native import is_compiled
 
 PLANTED, OWN = 666, 1
 SOMEONE = 12345
@@ -268,7 +268,7 @@ def test_no_home(home, base, tmp_path, monkeypatch):
     }[home]
     with pytest.warns(RuntimeWarning, match=why):
         assert answer() == OWN
-    assert compiled.compiled(lambda x: x + 1.0)(1.0) == 2.0  # and no second warning
+    assert jit.compiled(lambda x: x + 1.0)(1.0) == 2.0  # and no second warning
 
 
 def refused(*_: object, **__: object) -> None:
@@ -294,7 +294,7 @@ def test_what_is_made_is_private(tmp_path, monkeypatch):
     before = os.umask(0)
     try:
         assert answer() == OWN
-        assert compiled.compiled(lambda x: 2.0 * x)(1.0) == 2.0
+        assert jit.compiled(lambda x: 2.0 * x)(1.0) == 2.0
     finally:
         os.umask(before)
     made = list((tmp_path / "a").rglob("*"))
@@ -341,12 +341,12 @@ def test_planted_pickles(suffix, which, tmp_path, monkeypatch):
     base, mark = tmp_path / "base", tmp_path / "mark"
     base.mkdir(0o700)
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(base))
-    monkeypatch.setattr(compiled, "_CACHE", cache_directory(), raising=False)
-    assert compiled.compiled(double)(1.0) == 2.0
+    monkeypatch.setattr(jit, "_CACHE", cache_directory(), raising=False)
+    assert jit.compiled(double)(1.0) == 2.0
     (file,) = base.rglob("*double*" + suffix)
     file.write_bytes(pickle.dumps(Hostile(mark)))
     with suppress(Exception):  # a pickle of one's own is read
-        compiled.compiled(double)(1.0)
+        jit.compiled(double)(1.0)
     assert mark.exists()
     mark.unlink()
     forget()
@@ -356,7 +356,7 @@ def test_planted_pickles(suffix, which, tmp_path, monkeypatch):
     else:
         (base if which == "folder" else file).chmod(0o777)
     with pytest.warns(RuntimeWarning) if which == "folder" else warnings.catch_warnings():
-        assert compiled.compiled(double)(1.0) == 2.0
+        assert jit.compiled(double)(1.0) == 2.0
     assert not mark.exists()
 
 
@@ -469,7 +469,7 @@ def test_workers_compile_nothing_that_cannot_be_kept(base, monkeypatch):
     monkeypatch.setattr(native, "_compile", refused)
     native.inherit(given)
     assert native._code().integrate(0, 0, 0, 0) == OWN
-    assert compiled.compiled(lambda x: 3.0 * x)(1.0) == 3.0  # and do not warn again
+    assert jit.compiled(lambda x: 3.0 * x)(1.0) == 3.0  # and do not warn again
     assert native.bequeath() == given
 
 

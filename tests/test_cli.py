@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from rigidfleet.cli import app as cli
-from rigidfleet.cli import console as screen
+from rigidfleet.cli import console
 from rigidfleet.errors import FlightError
 from rigidfleet.formation.graphs import neighbours
 from rigidfleet.formation.shapes import SHAPES
@@ -62,10 +62,10 @@ def folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name in ("NO_COLOR", "FORCE_COLOR", "COLUMNS"):
         monkeypatch.delenv(name, raising=False)
-    screen.console.cache_clear()
+    console.console.cache_clear()
     Path("short.toml").write_text(TRIANGLE, encoding="utf-8")
     yield tmp_path
-    screen.console.cache_clear()
+    console.console.cache_clear()
 
 
 @pytest.fixture
@@ -613,7 +613,7 @@ def test_first_compile(capsys, monkeypatch):
     """A first compile says on standard error that it compiles, and a later flight does not."""
     words = "Compiling the flight kernel"
     for compiled in (False, True):
-        monkeypatch.setattr("rigidfleet.kernel.is_compiled", lambda c=compiled: c)
+        monkeypatch.setattr("rigidfleet.kernel.engine.native.is_compiled", lambda c=compiled: c)
         assert cli.main(["run", "short.toml", "--no-figures", "--force"]) == cli.PASSED
         assert (words in capsys.readouterr().err) is not compiled
 
@@ -926,15 +926,15 @@ def test_no_color(capsys, monkeypatch):
     monkeypatch.setenv("FORCE_COLOR", "1")
     for value, coloured in (("", True), ("1", False)):
         monkeypatch.setenv("NO_COLOR", value)
-        screen.console.cache_clear()
+        console.console.cache_clear()
         cli.main(["run", "sqare"])
         assert ("\x1b[1;31m" in capsys.readouterr().err) is coloured
 
 
 def test_progress_words(monkeypatch):
     """Progress says the time flown, the speed against real time, the time left and the phase."""
-    monkeypatch.setattr(screen, "perf_counter", lambda: 0.0)
-    watch = screen.FlightWatch()
+    monkeypatch.setattr(console, "perf_counter", lambda: 0.0)
+    watch = console.FlightWatch()
     watch.update(Progress(0.0, 90.0, "WP0", 1.0))
     assert watch._words() == "0.0 of 90 s  WP0"
     watch.update(Progress(30.0, 90.0, "WP3", 3.0))
@@ -948,9 +948,9 @@ def test_progress_words(monkeypatch):
 def test_progress_of_phases_that_differ(monkeypatch):
     """A phase flown in no time says nothing of the next one: the time left grows while a flight stands still."""
     now = 0.0
-    monkeypatch.setattr(screen, "perf_counter", lambda: now)
-    monkeypatch.setattr(screen, "_SELDOM", 1e9)
-    watch = screen.FlightWatch()
+    monkeypatch.setattr(console, "perf_counter", lambda: now)
+    monkeypatch.setattr(console, "_SELDOM", 1e9)
+    watch = console.FlightWatch()
     watch.update(Progress(0.0, 81.0, "take off", 0.0))
     now = 0.1
     watch.update(Progress(12.0, 81.0, "sphere", 0.1, planning=True))
@@ -964,9 +964,9 @@ def test_progress_of_phases_that_differ(monkeypatch):
 def test_progress_leaves_compiling_out(monkeypatch):
     """The speed is that of flying: time without news, while the kernel compiles, does not count."""
     now = 0.0
-    monkeypatch.setattr(screen, "perf_counter", lambda: now)
-    monkeypatch.setattr(screen, "_SELDOM", 1e9)
-    watch = screen.FlightWatch()
+    monkeypatch.setattr(console, "perf_counter", lambda: now)
+    monkeypatch.setattr(console, "_SELDOM", 1e9)
+    watch = console.FlightWatch()
     watch.compiling()
     watch.update(Progress(0.0, 90.0, "WP0", 0.1))
     now = 12.0

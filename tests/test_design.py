@@ -7,12 +7,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
-from rigidfleet.formation import distance_geometry, graphs
-from rigidfleet.formation import shapes as f
+from rigidfleet.formation import distance_geometry, graphs, shapes
 from rigidfleet.rigidity import Verdict, analyse, full_rank, jacobian
 from rigidfleet.rigidity.design import design, limits, mission_fragment
 
-CUBE = f.slots("cube", 4.0, 8)
+CUBE = shapes.slots("cube", 4.0, 8)
 BEST_CUBE = (3 - np.sqrt(5)) / 2  # 0.38197
 
 
@@ -109,7 +108,7 @@ def test_short_range_says_what_would_do():
 )
 def test_designed_spheres_are_no_worse_than_their_hulls(n):
     """A triangulated sphere is rigid; the designed graph, with as many edges, has at least its index."""
-    p = f.slots("sphere", 4.0, n)
+    p = shapes.slots("sphere", 4.0, n)
     triangles = ConvexHull(p).simplices.tolist()
     hull = sorted({pair for t in triangles for pair in combinations(sorted(t), 2)})
     edges = design(p)
@@ -134,7 +133,7 @@ def test_same_seed_same_graph():
 )
 def test_limits_of_flat_shapes(name, n, words):
     """What distances do not hold is what the analysis finds free, for every graph."""
-    p = f.slots(name, 4.0, n)
+    p = shapes.slots(name, 4.0, n)
     assert words in limits(p)
     assert f"leaves {len(analyse(p, graphs.complete_graph(n)).flexes)} motion" in limits(p)
 
@@ -158,7 +157,7 @@ def test_bad_requests_are_refused():
 @pytest.mark.parametrize("name", ["cube", "my shape", '1.5 "m"'])
 def test_fragment_is_toml_of_a_formation(name):
     """The fragment reads back as the formation it was made of, whatever its name."""
-    p = f.slots("icosahedron", 3.0, 12)
+    p = shapes.slots("icosahedron", 3.0, 12)
     edges = design(p)
     table = tomllib.loads(mission_fragment(name, p, edges))["formations"][name]
     assert table["slots"] == p.tolist()

@@ -8,7 +8,7 @@ from rigidfleet.errors import MissionError
 from rigidfleet.formation.shapes import SHAPES
 from rigidfleet.mission import Mission
 from rigidfleet.mission.draft import agents_for, draft, shape_for
-from rigidfleet.preflight.check import preflight
+from rigidfleet.preflight.check import check
 from rigidfleet.simulation.flight import simulate
 
 
@@ -44,7 +44,7 @@ def test_other_numbers_fly_and_pass(asked):
 def checked(shape, agents):
     """What the check of a new mission says will fail, with the agents."""
     mission = Mission.from_toml(draft("new", shape=shape, agents=agents))
-    remarks = preflight(mission, search=False).remarks
+    remarks = check(mission, search=False).remarks
     return mission.n_agents, [r.text for r in remarks if r.level == "fails"]
 
 

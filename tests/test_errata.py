@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from rigidfleet import physics
 from rigidfleet.assessment import assess
-from rigidfleet.formation import distance_geometry, graphs
-from rigidfleet.formation import shapes as formation
+from rigidfleet.formation import distance_geometry, graphs, shapes
 from rigidfleet.math import lqr, rigid_body
 from rigidfleet.math.attitude import dcm_from_rotation_vector, triangle_frame
 from rigidfleet.math.proximity import smallest_singular_value
@@ -21,8 +20,8 @@ from rigidfleet.simulation.flight import simulate
 
 Array = NDArray[np.float64]
 
-TRIANGLE = formation.slots("triangle", 4.0, 3)
-CUBE = formation.slots("cube", 4.0, 8)
+TRIANGLE = shapes.slots("triangle", 4.0, 3)
+CUBE = shapes.slots("cube", 4.0, 8)
 
 
 class Moving:
@@ -165,7 +164,7 @@ def test_moving_references_do_work():
 )  # fmt: skip
 def test_singular_where_the_paper_flies(shape, n, edges, rank):
     """Eq. 12: J M^-1 J^T is singular on the line, the square and the hexagon."""
-    r = formation.slots(shape, 4.0, n)
+    r = shapes.slots(shape, 4.0, n)
     e = graphs.complete_graph(n) if edges == "complete" else np.array(edges)
     A = jacobian(r, e) @ jacobian(r, e).T
     assert len(e) == 3 * n - 6

@@ -9,7 +9,7 @@ import pytest
 
 from rigidfleet.assessment import assess
 from rigidfleet.errors import FlightError
-from rigidfleet.math import proximity as geometry
+from rigidfleet.math import proximity
 from rigidfleet.math.proximity import headroom, rooms
 from rigidfleet.mission import Mission, load_mission
 from rigidfleet.result import Extremum, Result
@@ -248,7 +248,7 @@ def test_pairs_of_a_large_fleet_that_are_not_listed_are_not_the_nearest(formulat
         found = assess(some).worst[name]
         assert found.value == pytest.approx(worst[name].value, abs=1e-8)
         assert found.when == pytest.approx(worst[name].when, abs=2e-3)
-    below = geometry.headroom(fine.position, mission.agents.radius)[0].min()
+    below = proximity.headroom(fine.position, mission.agents.radius)[0].min()
     stacks = [p.extremes.get("separation_below") for p in some.phases]
     least = min(x.value for x in stacks if x is not None)
     assert below - 0.02 < least < below + CLOSE

@@ -14,9 +14,9 @@ from typing import Any
 import pytest
 
 from rigidfleet.cli import app as cli
-from rigidfleet.cli import console as screen
+from rigidfleet.cli import console
 from rigidfleet.errors import ResultError
-from rigidfleet.kernel.compiler import jit as compiled
+from rigidfleet.kernel.compiler import jit
 from rigidfleet.kernel.engine import native
 from rigidfleet.result import Result
 
@@ -61,7 +61,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder to stand in, with a mission."""
     monkeypatch.chdir(tmp_path)
     Path("pair.toml").write_text(MISSION, encoding="utf-8")
-    screen.console.cache_clear()
+    console.console.cache_clear()
     return tmp_path
 
 
@@ -178,7 +178,7 @@ def test_kill_in_the_middle_of_a_write(flown: bytes):
 def test_a_full_disk_while_the_kernel_is_kept():
     """A kernel that cannot be written to its cache flies all the same; a warning names the folder and the reason."""
     native.told.clear()
-    double: Any = compiled.compiled(lambda x: 2.0 * x)
+    double: Any = jit.compiled(lambda x: 2.0 * x)
     limit = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (16, limit[1]))
     try:

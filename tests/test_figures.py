@@ -15,10 +15,10 @@ from matplotlib.lines import Line2D
 from matplotlib.text import Text
 from PIL import Image
 
-from rigidfleet import plotting as figures
+from rigidfleet import plotting
 from rigidfleet.errors import ResultError
 from rigidfleet.math import attitude as att
-from rigidfleet.math import proximity as geometry
+from rigidfleet.math import proximity
 from rigidfleet.mission import Mission
 from rigidfleet.plotting import curves, space, style
 from rigidfleet.result import VARIABLES, PhaseRecord, Result
@@ -92,8 +92,8 @@ def a_flight(
     }  # fmt: skip
     force = np.zeros((samples, n, 3)) + [0, 0, 9.81]
     pull = np.sin(t)[:, None, None] * (r - r.mean(axis=1, keepdims=True))
-    separation, pair = geometry.separation(r, flown.agents.radius)
-    clearance, agent, obstacle = geometry.clearance(r, flown.agents.radius, flown.obstacles)
+    separation, pair = proximity.separation(r, flown.agents.radius)
+    clearance, agent, obstacle = proximity.clearance(r, flown.agents.radius, flown.obstacles)
     arrays: dict[str, Any] = {**blank} | {
         "time": t, "phase": np.minimum(np.searchsorted(ends, t, "right"), len(ends) - 1),
         "position": r, "slot_position": target, "cm": r.mean(axis=1),
@@ -155,7 +155,7 @@ def nothing_known(samples: int = 30) -> Result:
 
 
 def drawn(name: str, result: Result) -> Any:
-    figure = getattr(figures, name)(result)
+    figure = getattr(plotting, name)(result)
     figure.draw_without_rendering()
     return figure
 
@@ -219,7 +219,7 @@ def test_every_flight_can_be_drawn(flight):
     """Each figure draws without a warning: one agent, no edges, no obstacles, stopped, only NaN."""
     few = {"samples": 31} | FLIGHTS.get(flight, {})
     result = nothing_known() if flight == "nothing known" else a_flight(**few)
-    for name in figures.figure_names():
+    for name in plotting.figure_names():
         figure = drawn(name, result)
         assert isinstance(figure, Figure), name
         assert figure.axes or name == "formations", name
@@ -227,8 +227,8 @@ def test_every_flight_can_be_drawn(flight):
 
 def test_axes_have_units(triangle):
     """Each quantity on an axis has its unit in brackets."""
-    for name in figures.figure_names():
-        for ax in getattr(figures, name)(triangle).axes:
+    for name in plotting.figure_names():
+        for ax in getattr(plotting, name)(triangle).axes:
             for label in (ax.get_xlabel(), ax.get_ylabel()):
                 assert not label or label.endswith("]"), (name, label)
 
@@ -238,10 +238,10 @@ def test_axes_have_units(triangle):
 
 def test_an_agent_has_the_same_colour_in_every_figure(cube):
     """Lines, discs and legend entries of agent k have the k-th colour wherever they appear."""
-    colours = figures.agent_colours(8)
+    colours = plotting.agent_colours(8)
     seen = set()
-    for name in figures.figure_names():
-        figure = getattr(figures, name)(cube)
+    for name in plotting.figure_names():
+        figure = getattr(plotting, name)(cube)
         for k, colour in enumerate(colours):
             for artist in by_gid(figure, f"agent-{k + 1}"):
                 marked = artist.get_marker() not in ("", "None")
@@ -279,7 +279,7 @@ def cielab(rgb: np.ndarray) -> np.ndarray:
 def test_colours_stay_apart_to_colour_blind_eyes(eyes, n):
     """Any two agents' colours differ by more than 12 in CIELAB, for each kind of colour vision."""
     seen = []
-    for colour in figures.agent_colours(n):
+    for colour in plotting.agent_colours(n):
         c = np.array(to_rgb(colour))
         linear = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
         seen.append(cielab(np.clip(np.array(VISION[eyes]) @ linear, 0, 1)))
@@ -289,7 +289,7 @@ def test_colours_stay_apart_to_colour_blind_eyes(eyes, n):
 
 def test_many_agents_all_have_colours_of_their_own():
     """Beyond the palette, colours are still distinct."""
-    assert len(set(figures.agent_colours(100))) == 100
+    assert len(set(plotting.agent_colours(100))) == 100
 
 
 # -- phases
@@ -365,7 +365,7 @@ def test_names_stand_upright_where_they_fit(triangle):
 
 def test_the_summary_says_which_phase_has_which_number(triangle):
     """The summary numbers the phases and has the key to the numbers."""
-    words = " ".join(texts(figures.summary(triangle))).replace("\N{NO-BREAK SPACE}", " ")
+    words = " ".join(texts(plotting.summary(triangle))).replace("\N{NO-BREAK SPACE}", " ")
     assert "1 establish" in words
     assert "2 fly 1" in words
 
@@ -384,7 +384,7 @@ def test_a_name_may_hold_anything(tmp_path):
     result = a_flight(phases=phases)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        for path in figures.plot(result, tmp_path, names=["distances", "summary"]):
+        for path in plotting.plot(result, tmp_path, names=["distances", "summary"]):
             if path.suffix == ".svg":
                 words = " ".join(ET.parse(path).getroot().itertext())
                 assert "$x^{" in words
@@ -407,27 +407,27 @@ def test_the_thrust_limit_is_drawn(triangle):
 def test_each_thrust_limit_is_drawn_and_none_where_there_is_none():
     """Different limits have a line each, an agent's own in its colour; without limits there is none."""
     agents = {"mass": 1.0, "position": START, "thrust_limit": [20.0, 20.0, 30.0]}
-    figure = figures.inputs(a_flight(mission={"agents": agents}))
+    figure = plotting.inputs(a_flight(mission={"agents": agents}))
     lines = {x.get_ydata()[0]: to_hex(x.get_color()) for x in by_gid(figure, "limit")}
-    assert lines == {20.0: style.ALERT.lower(), 30.0: figures.agent_colours(3)[2].lower()}
+    assert lines == {20.0: style.ALERT.lower(), 30.0: plotting.agent_colours(3)[2].lower()}
     assert "limit of 1, 2 20 N" in texts(figure)
-    free = figures.inputs(a_flight(mission=FREE))
+    free = plotting.inputs(a_flight(mission=FREE))
     assert not by_gid(free, "limit")
 
 
 def test_clearance_shows_limits_and_the_worst(triangle):
     """The separation's limit, contact with obstacles, and the least value with when and who."""
-    figure = figures.clearance(a_flight(mission=FENCED))
+    figure = plotting.clearance(a_flight(mission=FENCED))
     assert sorted(x.get_ydata()[0] for x in by_gid(figure, "limit")) == [0.0, 0.5, 1.0]
     k = int(triangle.separation.argmin())
     i, j = sorted(triangle.separation_pair[k] + 1)
     words = f"{triangle.separation[k]:.3g} m at {triangle.time[k]:.2f} s, agents {i} and {j}"
-    assert words in texts(figures.clearance(triangle))
+    assert words in texts(plotting.clearance(triangle))
     k = int(triangle.clearance.argmin())
     thing = triangle.mission.obstacles[triangle.clearance_obstacle[k]].name
     assert any(
         text.endswith(f"agent {triangle.clearance_agent[k] + 1} to {thing}")
-        for text in texts(figures.clearance(triangle))
+        for text in texts(plotting.clearance(triangle))
     )
 
 
@@ -443,7 +443,7 @@ def near_a_limit(share: float, *, level: float) -> Result:
 @pytest.mark.parametrize("name", ["clearance", "summary"])
 def test_no_line_runs_through_words(name, share, level):
     """Least values and names of limits stand clear of curves, limits and each other, wherever the least one is."""
-    figure = getattr(figures, name)(near_a_limit(share, level=level))
+    figure = getattr(plotting, name)(near_a_limit(share, level=level))
     if name == "summary":  # its views in space are pictures, not curves
         for ax in figure.axes[:2]:
             ax.remove()
@@ -455,16 +455,16 @@ def test_no_curve_runs_through_words_of_forces(top):
     """Peaks and limits are told where no curve runs, whether thrust is far below its limit, at it, or above."""
     t = np.linspace(0.0, 20.0, 181)[:, None]
     thrust = 9.8 + (top - 9.8) * np.abs(np.sin(t + [0.0, 0.4, 1.1]))
-    assert struck(figures.inputs(a_flight(thrust=thrust))) == []
+    assert struck(plotting.inputs(a_flight(thrust=thrust))) == []
     pull = (thrust - 9.8)[:, :, None] * [1.0, 0.0, 0.0]
-    assert struck(figures.constraint_force(a_flight(constraint_force=pull))) == []
+    assert struck(plotting.constraint_force(a_flight(constraint_force=pull))) == []
 
 
 def test_a_force_that_is_rounding_is_told_in_words():
     """A constraint force of 3e-8 N is no line along zero in empty axes: the figure says what it is, whose and when."""
     force, tension = np.zeros((181, 3, 3)), np.zeros((181, 3))
     force[100, 2, 0], tension[90, 1] = 3.03e-8, -2e-8
-    figure = figures.constraint_force(a_flight(constraint_force=force, multiplier=tension))
+    figure = plotting.constraint_force(a_flight(constraint_force=force, multiplier=tension))
     t = np.linspace(0.0, 20.0, 181)
     assert f"none but rounding: at most 3.03e-08 N, agent 3 at {t[100]:.2f} s" in texts(figure)
     assert f"none but rounding: at most 2e-08 N, edge 1-3 at {t[90]:.2f} s" in texts(figure)
@@ -475,7 +475,7 @@ def test_a_small_force_fills_its_axes():
     """A constraint force of 2e-5 N has axes of its size."""
     force = np.zeros((181, 3, 3))
     force[:, 1, 0] = np.linspace(2e-5, 1e-5, 181)
-    (above, _) = figures.constraint_force(a_flight(constraint_force=force)).axes
+    (above, _) = plotting.constraint_force(a_flight(constraint_force=force)).axes
     assert 2e-5 < above.get_ylim()[1] < 3e-5
 
 
@@ -487,7 +487,7 @@ def test_what_is_cut_off_is_marked():
     pull[-1, 2] = -5e3
     flight = a_flight(thrust=thrust, multiplier=pull, complete=False, ending="singular")
     for name, expected in (("inputs", 2), ("summary", 1)):
-        figure = getattr(figures, name)(flight)
+        figure = getattr(plotting, name)(flight)
         marks = by_gid(figure, "cut")
         assert len(marks) == expected
         for mark in marks:
@@ -495,12 +495,12 @@ def test_what_is_cut_off_is_marked():
             assert t == 20.0
             assert y == mark.axes.get_ylim()[1] < 100
         assert texts(figure).count("cut off: peak 730 N: agent 2 at 20.00 s") == expected
-    (mark,) = by_gid(figures.constraint_force(flight), "cut")
+    (mark,) = by_gid(plotting.constraint_force(flight), "cut")
     assert mark.get_marker() == "^"
-    assert "cut off: peak 5e+03 N: edge 2-3 at 20.00 s" in texts(figures.constraint_force(flight))
+    assert "cut off: peak 5e+03 N: edge 2-3 at 20.00 s" in texts(plotting.constraint_force(flight))
     whole = a_flight(thrust=np.minimum(thrust, 20.0))
     for name in ("inputs", "constraint_force", "summary"):
-        assert by_gid(getattr(figures, name)(whole), "cut") == []
+        assert by_gid(getattr(plotting, name)(whole), "cut") == []
 
 
 def test_nothing_drawn_leaves_its_axes_unmarked():
@@ -546,13 +546,13 @@ def test_what_stands_still_is_told_in_words(triangle):
     assert y.bbox.height == pytest.approx(z.bbox.height)
     assert z.bbox.height < 0.6 * x.bbox.height == pytest.approx(0.6 * speed_x.bbox.height)
     moving = a_flight(cm=place + 0.01 * np.sin(triangle.time)[:, None], phases=phases)
-    assert not any("m throughout" in text for text in texts(figures.cm(moving)))
+    assert not any("m throughout" in text for text in texts(plotting.cm(moving)))
 
 
 def test_the_key_of_the_summary_reads_as_words():
     """Phases without names are told by kind, not "1 establish 1", and a dot parts each from the next."""
     phases = [("establish 1", 6.0), ("WP0: clear the ground", 7.0), ("fly 3", 7.0)]
-    words = " ".join(texts(figures.summary(a_flight(phases=phases))))
+    words = " ".join(texts(plotting.summary(a_flight(phases=phases))))
     plain = words.replace("\N{NO-BREAK SPACE}", " ")
     assert "Phases:  1 establish  ·  2 WP0: clear the ground  ·  3 fly" in plain
 
@@ -582,7 +582,7 @@ def test_every_edge_has_a_line_and_few_legend_entries(cube):
 
 def test_few_edges_have_names(triangle):
     """The triangle's edges each have their entry, agents counted from 1."""
-    assert legend_of(figures.distances(triangle).axes[0]) == ["1-2", "1-3", "2-3", "reference"]
+    assert legend_of(plotting.distances(triangle).axes[0]) == ["1-2", "1-3", "2-3", "reference"]
 
 
 def test_euler_angles_do_not_jump():
@@ -631,7 +631,7 @@ def test_a_flight_that_breaks_down_is_still_readable():
     """A thrust of 1e6 N in the last sample does not flatten what was flown before."""
     thrust = np.full((181, 3), 9.8)
     thrust[-1] = 1e6
-    wild = figures.inputs(a_flight(thrust=thrust, complete=False, ending="singular"))
+    wild = plotting.inputs(a_flight(thrust=thrust, complete=False, ending="singular"))
     assert all(ax.get_ylim()[1] < 50 for ax in wild.axes)
     assert any("1e+06 N" in text for text in texts(wild))
     assert any("incomplete, stopped at 20.00 s" in text for text in texts(wild))
@@ -684,11 +684,11 @@ def test_the_formation_is_drawn_at_both_ends_and_not_on_top_of_itself(triangle):
 
 def test_a_flight_without_edges_still_draws_its_agents():
     """Without any edge there are paths, starts and ends, in both views."""
-    figure = figures.trajectory(a_flight(n=4, formation=None))
+    figure = plotting.trajectory(a_flight(n=4, formation=None))
     for k in range(4):
         assert len(by_gid(figure, f"agent-{k + 1}")) == 2
     assert len(by_gid(figure, "start")) == len(by_gid(figure, "end")) == 8
-    assert "no edges" in texts(figures.distances(a_flight(n=4, formation=None)))
+    assert "no edges" in texts(plotting.distances(a_flight(n=4, formation=None)))
 
 
 def test_a_huge_obstacle_does_not_shrink_the_flight():
@@ -724,25 +724,25 @@ def test_a_graph_without_slots_is_spread_out():
 def test_every_formation_of_the_mission_is_drawn():
     """A mission with two formations has both sketches, also of the one never flown."""
     both = {"shape": TRIANGLE, "row": {"shape": "line", "size": 4.0}}
-    words = texts(figures.formations(a_flight(mission={"formations": both})))
+    words = texts(plotting.formations(a_flight(mission={"formations": both})))
     assert {"shape", "row", "triangle, 3 edges", "line, 3 edges"} <= set(words)
 
 
 def test_a_flight_has_no_empty_figures(tmp_path):
     """Figures with nothing to show are left out, and say why when they are asked for."""
     calm = a_flight(disturbance_force=None)
-    files = {p.stem for p in figures.plot(calm, tmp_path, formats=["svg"])}
-    assert files == set(figures.figure_names()) - {"disturbance"}
-    assert "still air" in texts(figures.disturbance(calm))
+    files = {p.stem for p in plotting.plot(calm, tmp_path, formats=["svg"])}
+    assert files == set(plotting.figure_names()) - {"disturbance"}
+    assert "still air" in texts(plotting.disturbance(calm))
     unknown = np.full((181, 4), np.nan)
     free = a_flight(n=4, formation=None, attitude=unknown, attitude_reference=unknown)
-    missing = set(figures.figure_names()) - set(figures.figure_names(free))
+    missing = set(plotting.figure_names()) - set(plotting.figure_names(free))
     assert missing == {
         "distances", "attitude", "constraint_force", "constraint_error", "formations",
     }  # fmt: skip
-    assert "no body frame attached" in texts(figures.attitude(free))
+    assert "no body frame attached" in texts(plotting.attitude(free))
     alone = a_flight(n=1, formation=None, mission={"obstacles": [], "limits": {}})
-    assert "clearance" not in figures.figure_names(alone)
+    assert "clearance" not in plotting.figure_names(alone)
 
 
 # -- files
@@ -750,9 +750,9 @@ def test_a_flight_has_no_empty_figures(tmp_path):
 
 def test_files_appear_in_both_formats(triangle, tmp_path):
     """Each figure is a PNG of 150 to 200 dpi and an SVG whose text is text."""
-    paths = figures.plot(triangle, tmp_path / "new" / "folder")
+    paths = plotting.plot(triangle, tmp_path / "new" / "folder")
     assert {p.name for p in paths} == {
-        f"{name}.{kind}" for name in figures.figure_names() for kind in ("png", "svg")
+        f"{name}.{kind}" for name in plotting.figure_names() for kind in ("png", "svg")
     }
     assert sorted(p.name for p in (tmp_path / "new" / "folder").iterdir()) == sorted(
         p.name for p in paths
@@ -774,7 +774,7 @@ def test_files_appear_in_both_formats(triangle, tmp_path):
 
 def test_names_and_formats_choose(triangle, tmp_path):
     """Only the figures and formats asked for are written, in the order asked."""
-    paths = figures.plot(triangle, tmp_path, formats=["svg"], names=["cm", "distances"])
+    paths = plotting.plot(triangle, tmp_path, formats=["svg"], names=["cm", "distances"])
     assert [p.name for p in paths] == ["cm.svg", "distances.svg"]
     assert sorted(tmp_path.iterdir()) == sorted(paths)
 
@@ -783,7 +783,7 @@ def test_names_and_formats_choose(triangle, tmp_path):
 def test_titles_may_be_left_out(triangle, tmp_path, name):
     """Without titles neither title nor mission is drawn, what is drawn fills the picture, and all else is the same."""
     with_, without = (
-        figures.plot(triangle, tmp_path / str(on), names=[name], formats=["svg", "png"], titles=on)
+        plotting.plot(triangle, tmp_path / str(on), names=[name], formats=["svg", "png"], titles=on)
         for on in (True, False)
     )
     words, rest = (
@@ -802,13 +802,13 @@ def test_titles_may_be_left_out(triangle, tmp_path, name):
         rows = np.flatnonzero(ink.any(axis=1))
         assert rows[0] < 40
         assert image.height - rows[-1] < 40
-    assert "A made-up flight" in texts(figures.summary(triangle)), "titles are back afterwards"
+    assert "A made-up flight" in texts(plotting.summary(triangle)), "titles are back afterwards"
 
 
 def test_an_incomplete_flight_says_so_without_titles(tmp_path):
     """That a flight stopped is no title: it is on the figure all the same."""
     stopped = a_flight(complete=False, ending="singular")
-    (path,) = figures.plot(stopped, tmp_path, names=["inputs"], formats=["svg"], titles=False)
+    (path,) = plotting.plot(stopped, tmp_path, names=["inputs"], formats=["svg"], titles=False)
     words = " ".join(
         "".join(e.itertext()) for e in ET.parse(path).iter() if e.tag.endswith("}text")
     )
@@ -823,8 +823,8 @@ def test_an_incomplete_flight_says_so_without_titles(tmp_path):
 
 def test_pdf_is_written(triangle, tmp_path):
     """A PDF begins as one and ends as one, and is the same when written again."""
-    (first,) = figures.plot(triangle, tmp_path / "a", names=["inputs"], formats=["pdf"])
-    (second,) = figures.plot(triangle, tmp_path / "b", names=["inputs"], formats=["pdf"])
+    (first,) = plotting.plot(triangle, tmp_path / "a", names=["inputs"], formats=["pdf"])
+    (second,) = plotting.plot(triangle, tmp_path / "b", names=["inputs"], formats=["pdf"])
     data = first.read_bytes()
     assert data.startswith(b"%PDF-")
     assert data.rstrip().endswith(b"%%EOF")
@@ -837,16 +837,16 @@ def test_pdf_is_written(triangle, tmp_path):
 def test_an_unknown_name_is_refused_before_anything_is_drawn(triangle, tmp_path, wrong, known):
     """An unknown figure or format is named, with those there are, and nothing is written."""
     with pytest.raises(ValueError, match=known):
-        figures.plot(triangle, tmp_path, **wrong)
+        plotting.plot(triangle, tmp_path, **wrong)
     assert not list(tmp_path.iterdir())
 
 
 def test_the_same_flight_gives_the_same_files(tmp_path):
     """Drawn twice, also with other settings of matplotlib in between, the files are equal byte by byte."""
     names = ["trajectory", "inputs"]
-    first = figures.plot(a_flight(), tmp_path / "a", names=names)
+    first = plotting.plot(a_flight(), tmp_path / "a", names=names)
     with mpl.rc_context({"font.size": 30, "axes.facecolor": "black", "svg.fonttype": "path"}):
-        second = figures.plot(a_flight(), tmp_path / "b", names=names)
+        second = plotting.plot(a_flight(), tmp_path / "b", names=names)
     for a, b in zip(first, second, strict=True):
         assert a.read_bytes() == b.read_bytes(), a.name
 
@@ -860,7 +860,7 @@ def test_a_failure_leaves_the_old_file(triangle, tmp_path, monkeypatch):
 
     monkeypatch.setattr("os.replace", full)
     with pytest.raises(ResultError, match=r"cm\.png.*No space left"):
-        figures.plot(triangle, tmp_path, names=["cm"], formats=["png"])
+        plotting.plot(triangle, tmp_path, names=["cm"], formats=["png"])
     assert [p.name for p in tmp_path.iterdir()] == ["cm.png"]
     assert (tmp_path / "cm.png").read_bytes() == b"old"
 
@@ -869,13 +869,13 @@ def test_a_folder_that_is_a_file_is_reported(triangle, tmp_path):
     """A file in the way of the folder is an error for the user, not a traceback."""
     (tmp_path / "x").write_text("here")
     with pytest.raises(ResultError, match="cannot be written"):
-        figures.plot(triangle, tmp_path / "x", names=["cm"], formats=["png"])
+        plotting.plot(triangle, tmp_path / "x", names=["cm"], formats=["png"])
 
 
 def test_drawing_leaves_matplotlib_alone(triangle, tmp_path):
     """Settings are as before, and the backend is not chosen for the user."""
     before = dict(mpl.rcParams)
-    figures.plot(triangle, tmp_path, names=["distances", "trajectory"], formats=["png"])
+    plotting.plot(triangle, tmp_path, names=["distances", "trajectory"], formats=["png"])
     assert dict(mpl.rcParams) == before
 
 
@@ -905,7 +905,7 @@ def many():
 
 def test_of_many_agents_the_spread_is_drawn(many):
     """Bands from least to greatest instead of lines: at each time they enclose every agent's thrust."""
-    ax = figures.inputs(many).axes[0]
+    ax = plotting.inputs(many).axes[0]
     (band,) = [c for c in ax.collections if c.get_gid() == "spread"]
     edge = np.array(band.get_paths()[0].vertices)
     for k in (3, 20, 37):
@@ -915,10 +915,10 @@ def test_of_many_agents_the_spread_is_drawn(many):
     assert len(ax.lines) < 10
 
 
-@pytest.mark.parametrize("name", figures.figure_names())
+@pytest.mark.parametrize("name", plotting.figure_names())
 def test_figures_of_many_agents_are_light(many, name):
     """No figure has an artist for every agent or edge, but for paths."""
-    fig = getattr(figures, name)(many)
+    fig = getattr(plotting, name)(many)
     assert sum(len(ax.lines) for ax in fig.axes) <= 2 * style.MANY + 40
 
 

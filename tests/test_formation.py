@@ -7,8 +7,7 @@ from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
 
 from rigidfleet.errors import MissionError
-from rigidfleet.formation import distance_geometry, graphs, point_files
-from rigidfleet.formation import shapes as f
+from rigidfleet.formation import distance_geometry, graphs, point_files, shapes
 from rigidfleet.math import rigid_body
 from rigidfleet.planning.solvers import sweep_steps
 from rigidfleet.rigidity import jacobian, spectrum
@@ -52,7 +51,7 @@ def rotation(seed):
 @pytest.mark.parametrize(("shape", "size", "n"), NAMED)
 def test_shape_is_centred(shape, size, n):
     """Every named shape has a slot for each agent, about its geometric centre."""
-    p = f.slots(shape, size, n)
+    p = shapes.slots(shape, size, n)
     assert p.shape == (n, 3)
     np.testing.assert_allclose(p.mean(axis=0), 0, atol=1e-15)
 
@@ -60,7 +59,7 @@ def test_shape_is_centred(shape, size, n):
 @pytest.mark.parametrize(("shape", "size", "n"), NAMED)
 def test_size_is_edge_length(shape, size, n):
     """The shortest distance in a shape is its size, the smallest of them for a cuboid."""
-    assert pdist(f.slots(shape, size, n)).min() == pytest.approx(np.min(size))
+    assert pdist(shapes.slots(shape, size, n)).min() == pytest.approx(np.min(size))
 
 
 @pytest.mark.parametrize(
@@ -74,7 +73,7 @@ def test_size_is_edge_length(shape, size, n):
 )
 def test_regular_solids(shape, n, edges):
     """Vertices on one sphere, as many shortest distances as the solid has edges, counted from below."""
-    p = f.slots(shape, 4.0, n)
+    p = shapes.slots(shape, 4.0, n)
     d = pdist(p)
     assert np.count_nonzero(d < d.min() + 1e-9) == edges
     np.testing.assert_allclose(np.linalg.norm(p, axis=1), np.linalg.norm(p[0]))
@@ -83,7 +82,7 @@ def test_regular_solids(shape, n, edges):
 
 def test_v_flies_point_first():
     """Agent 1 leads on x; the wings trail at 45 degrees, left (+y) first."""
-    p = f.slots("v", np.sqrt(2), 5)
+    p = shapes.slots("v", np.sqrt(2), 5)
     np.testing.assert_allclose(
         p - p[0], [[0, 0, 0], [-1, 1, 0], [-1, -1, 0], [-2, 2, 0], [-2, -2, 0]]
     )
@@ -91,44 +90,44 @@ def test_v_flies_point_first():
 
 def test_grid_fills_rows():
     """Seven agents stand in rows of three along x; the last row has one."""
-    p = f.slots("grid", 2.0, 7)
+    p = shapes.slots("grid", 2.0, 7)
     assert (p - p[0])[[1, 3, 6]].tolist() == [[2, 0, 0], [0, 2, 0], [0, 4, 0]]
 
 
 def test_helix_has_its_sizes():
     """Radius, rise per turn and the distance of neighbours are those asked for."""
-    p = f.slots("helix", [4.0, 3.0, 2.0], 9)
+    p = shapes.slots("helix", [4.0, 3.0, 2.0], 9)
     axis = p[:, :2] - (p[:, :2] - 0)[0] + [4, 0]
     np.testing.assert_allclose(np.linalg.norm(axis, axis=1), 4)
     np.testing.assert_allclose(np.linalg.norm(np.diff(p, axis=0), axis=1), 2)
     turn = np.unwrap(np.arctan2(axis[:, 1], axis[:, 0]))
     np.testing.assert_allclose(p[:, 2] - p[0, 2], 3 * turn / (2 * np.pi))
     with pytest.raises(ValueError, match=r"at most 8\.139 m"):
-        f.slots("helix", [4.0, 3.0, 9.0], 3)
+        shapes.slots("helix", [4.0, 3.0, 9.0], 3)
 
 
 def test_line_is_4_8_4():
     """Three agents on a line are -4, 0 and 4 m along x: the 4-8-4 of Table 1."""
-    assert f.slots("line", 4.0, 3).tolist() == [[-4, 0, 0], [0, 0, 0], [4, 0, 0]]
+    assert shapes.slots("line", 4.0, 3).tolist() == [[-4, 0, 0], [0, 0, 0], [4, 0, 0]]
 
 
 def test_triangle_lies_as_paper_attaches_it():
     """x points to agent 3, y runs along r1 - r2."""
     a, h = 4.0, 2 * np.sqrt(3)
     want = [[-h / 3, a / 2, 0], [-h / 3, -a / 2, 0], [2 * h / 3, 0, 0]]
-    np.testing.assert_allclose(f.slots("triangle", a, 3), want, atol=1e-15)
+    np.testing.assert_allclose(shapes.slots("triangle", a, 3), want, atol=1e-15)
 
 
 def test_cube_counts_counter_clockwise_from_below():
     """Agents 1-4 are counter-clockwise from (-, -, -) at the bottom, 5-8 above them."""
-    p = f.slots("cube", 2.0, 8)
+    p = shapes.slots("cube", 2.0, 8)
     assert p[:4].tolist() == [[-1, -1, -1], [1, -1, -1], [1, 1, -1], [-1, 1, -1]]
     np.testing.assert_array_equal(p[4:] - p[:4], np.tile([0, 0, 2], (4, 1)))
 
 
 def test_paper_edges_of_cube_are_sides_and_face_diagonals():
     """The 18 edges of Table 4 are 12 sides and one diagonal of each face, as a rigid cube needs."""
-    d = np.sort(distance_geometry.distances(f.slots("cube", 4.0, 8), graphs.CUBE_EDGES))
+    d = np.sort(distance_geometry.distances(shapes.slots("cube", 4.0, 8), graphs.CUBE_EDGES))
     np.testing.assert_allclose(d, [4.0] * 12 + [4 * np.sqrt(2)] * 6)
     assert len({tuple(e) for e in graphs.CUBE_EDGES.tolist()}) == 18
 
@@ -136,7 +135,7 @@ def test_paper_edges_of_cube_are_sides_and_face_diagonals():
 @pytest.mark.parametrize(("n", "height"), [(4, np.sqrt(2 / 3)), (5, np.sqrt(1 / 2))])
 def test_pyramid_has_equal_edges(n, height):
     """A pyramid's apex is one size from each agent of its base."""
-    p = f.slots("pyramid", 1.0, n)
+    p = shapes.slots("pyramid", 1.0, n)
     np.testing.assert_allclose(np.linalg.norm(p[:-1] - p[-1], axis=1), 1)
     assert p[-1, 2] - p[0, 2] == pytest.approx(height)
 
@@ -157,7 +156,7 @@ def test_pyramid_has_equal_edges(n, height):
 def test_impossible_shapes_are_refused(shape, size, n, message):
     """A shape that does not exist, or not for so many agents, says so."""
     with pytest.raises(ValueError, match=message):
-        f.slots(shape, size, n)
+        shapes.slots(shape, size, n)
 
 
 # -- points from files
@@ -238,7 +237,7 @@ def test_distances_agree_with_scipy():
 )
 def test_dimension(shape, n, want):
     """A line has dimension 1 and a square 2, wherever they lie; rounding does not add one."""
-    far = f.slots(shape, 4.0, n) @ rotation(3).T + [1e3, -2e3, 50.0]
+    far = shapes.slots(shape, 4.0, n) @ rotation(3).T + [1e3, -2e3, 50.0]
     assert distance_geometry.dimension(far) == want
 
 
@@ -254,7 +253,7 @@ def test_handedness_follows_rotations_and_flips_in_mirrors(seed):
 
 def test_flat_shapes_have_no_hand():
     """A planar shape is its own mirror image, turned over."""
-    assert distance_geometry.handedness(f.slots("hexagon", 4.0, 6)) == 0
+    assert distance_geometry.handedness(shapes.slots("hexagon", 4.0, 6)) == 0
 
 
 # -- distances that exist
@@ -315,7 +314,7 @@ def test_edges_may_be_written_either_way():
 @pytest.mark.parametrize(("shape", "size", "n"), NAMED)
 def test_slots_come_back_from_distances(shape, size, n):
     """A complete set of distances gives the shape back, in its own handedness."""
-    want, edges = f.slots(shape, size, n), graphs.complete_graph(n)
+    want, edges = shapes.slots(shape, size, n), graphs.complete_graph(n)
     got = distance_geometry.slots_from_distances(n, edges, distance_geometry.distances(want, edges))
     assert got is not None
     np.testing.assert_allclose(got.mean(axis=0), 0, atol=1e-12)
@@ -326,7 +325,7 @@ def test_slots_come_back_from_distances(shape, size, n):
 @pytest.mark.parametrize(("shape", "n"), [("line", 3), ("triangle", 3)])
 def test_slots_from_distances_lie_as_the_named_shapes(shape, n):
     """Table 1 gives distances alone: its triangle and line come out where the paper puts them."""
-    want, edges = f.slots(shape, 4.0, n), graphs.complete_graph(n)
+    want, edges = shapes.slots(shape, 4.0, n), graphs.complete_graph(n)
     got = distance_geometry.slots_from_distances(n, edges, distance_geometry.distances(want, edges))
     assert got is not None
     np.testing.assert_allclose(got, want, atol=1e-12)
@@ -362,14 +361,14 @@ def test_kabsch_finds_the_rotation_of_moved_points(seed):
     """Points that were turned and shifted are turned back, flat ones, too."""
     R = rotation(seed)
     for shape, n in (("cube", 8), ("hexagon", 6)):
-        p = f.slots(shape, 4.0, n)
+        p = shapes.slots(shape, 4.0, n)
         np.testing.assert_allclose(rigid_body.kabsch(p @ R.T + [9, 8, 7], p), R, atol=1e-12)
 
 
 @given(SEEDS, SEEDS)
 def test_line_turns_minimally(seed, near_seed):
     """On a line the fit is the shortest rotation from the guide: no spin about the line."""
-    p, T, near = f.slots("line", 4.0, 3), rotation(seed), rotation(near_seed)
+    p, T, near = shapes.slots("line", 4.0, 3), rotation(seed), rotation(near_seed)
     R = rigid_body.kabsch(p @ T.T, p, near=near)
     np.testing.assert_allclose(R[:, 0], T[:, 0], atol=1e-12)
     # The shortest turn takes the guide's x axis to the line by the angle between them, and no more.
@@ -381,7 +380,7 @@ def test_line_turns_minimally(seed, near_seed):
 @given(SEEDS)
 def test_mirrored_cube_fits_as_near_as_possible(seed):
     """A mirrored cube fits many ways equally well: the nearest to the guide is a proper rotation."""
-    near, p = rotation(seed), f.slots("cube", 2.0, 8)
+    near, p = rotation(seed), shapes.slots("cube", 2.0, 8)
     mirrored = p * [1, 1, -1]
     R = rigid_body.kabsch(mirrored, p, near=near)
     assert np.linalg.det(R) == pytest.approx(1)
@@ -407,7 +406,7 @@ def test_point_keeps_the_guide():
 
 def test_kabsch_takes_samples_at_once():
     """Samples along leading axes are fitted each by itself, degenerate ones among them."""
-    line, triangle = f.slots("line", 4.0, 3), f.slots("triangle", 4.0, 3)
+    line, triangle = shapes.slots("line", 4.0, 3), shapes.slots("triangle", 4.0, 3)
     targets = np.stack([triangle @ rotation(1).T, line @ rotation(2).T, triangle])
     many = rigid_body.kabsch(targets, triangle)
     for target, R in zip(targets, many, strict=True):
@@ -443,7 +442,7 @@ def test_joined_is_minimally_rigid(n):
 @pytest.mark.parametrize("n", [4, 5, 13, 200])
 def test_trees_are_minimally_rigid(n):
     """3N - 6 edges of full rank, each agent joined to three of those that come before; of chains of length log N."""
-    p = f.slots("sphere", 2.0, n)
+    p = shapes.slots("sphere", 2.0, n)
     edges = graphs.coarse_to_fine(p)
     assert len(np.unique(edges, axis=0)) == 3 * n - 6
     assert (edges[:, 0] < edges[:, 1]).all()
@@ -467,7 +466,7 @@ def test_trees_hold_lattices_better_and_shells_at_all():
     )
     assert tree.index > 3 * joined.index
     assert tree.condition < joined.condition / 2
-    shell = f.slots("sphere", 2.0, 500)
+    shell = shapes.slots("sphere", 2.0, 500)
     assert spectrum(shell, graphs.joined(shell), np.ones(500)).free > 0
     assert spectrum(shell, graphs.coarse_to_fine(shell), np.ones(500)).index > 0.01
 
@@ -475,14 +474,14 @@ def test_trees_hold_lattices_better_and_shells_at_all():
 @pytest.mark.parametrize("n", [40, 41, 300])
 def test_shells_are_two_spheres_one_size_apart(n):
     """Nobody is nearer than `size`, not even to the other skin, which lies at that distance; two hold more than one."""
-    p = f.slots("shells", 2.0, n)
+    p = shapes.slots("shells", 2.0, n)
     apart = distance_geometry.distances(p, graphs.complete_graph(n))
     assert apart.min() == pytest.approx(2.0)
     radius = np.sort(np.linalg.norm(p - p.mean(axis=0), axis=1))
     jump = int(np.diff(radius).argmax())
     assert 2.0 - 0.1 < radius[jump + 1] - radius[jump] < 2.6
     if n == 300:
-        one = f.slots("sphere", 2.0, n)
+        one = shapes.slots("sphere", 2.0, n)
         two, single = (spectrum(x, graphs.neighbours(x), np.ones(n)).index for x in (p, one))
         assert two > 1.4 * single
 

@@ -23,7 +23,7 @@ from hypothesis import strategies as st
 from rigidfleet.assessment import assess
 from rigidfleet.errors import FlightError, MissionError
 from rigidfleet.mission import Mission
-from rigidfleet.planning import tolerances as accuracy
+from rigidfleet.planning import tolerances
 from rigidfleet.simulation.flight import simulate
 
 Data = dict[str, Any]
@@ -228,8 +228,8 @@ NUMBERS = [
 @pytest.fixture(autouse=True)
 def _short(monkeypatch: pytest.MonkeyPatch) -> None:
     """A phase may take only so many steps, that a case takes a second and no minute."""
-    monkeypatch.setattr(accuracy, "_STALLED", 3000)
-    monkeypatch.setattr(accuracy, "_STALLED_RATE", 0.0)
+    monkeypatch.setattr(tolerances, "_STALLED", 3000)
+    monkeypatch.setattr(tolerances, "_STALLED_RATE", 0.0)
 
 
 def outcome(data: Data) -> str:
@@ -310,7 +310,7 @@ def test_the_fuzzer_finds_what_there_is(tmp_path: Path, monkeypatch: pytest.Monk
     for body, words in (
         ("raise IndexError('here')", "IndexError: here"),
         ("import time; time.sleep(99)", "Timeout"),
-        ("while True: pass", "cli.py"),
+        ("while True: pass", "app.py"),
         ("import numpy; numpy.ones((1 << 20, 1 << 12))", "MemoryError"),
         ("return 7", "exit code 7"),
         ("return 2", "exit code 2 without an error"),

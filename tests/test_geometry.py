@@ -8,9 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from rigidfleet.formation import distance_geometry, graphs
-from rigidfleet.formation import shapes as formation
-from rigidfleet.math import proximity as geometry
+from rigidfleet.formation import distance_geometry, graphs, shapes
+from rigidfleet.math import proximity
 from rigidfleet.mission import Box, Ground
 
 seeds = st.integers(0, 2**32 - 1)
@@ -25,7 +24,7 @@ def test_separation_is_the_least_over_all_pairs(seed, n):
     """At each sample, centre distance minus both radii, least over pairs; the pair is named."""
     rng = np.random.default_rng(seed)
     r, radius = rng.normal(size=(5, n, 3)) * 3, rng.uniform(0.1, 1.0, n)
-    least, pair = geometry.separation(r, radius)
+    least, pair = proximity.separation(r, radius)
     for k in range(5):
         room = {
             (i, j): np.linalg.norm(r[k, i] - r[k, j]) - radius[i] - radius[j]
@@ -43,7 +42,7 @@ def test_separation_of_many_is_the_least_over_all_pairs_while_they_move_and_mix(
     rng = np.random.default_rng(2)
     n = 300
     radius = np.full(n, 0.1) if sizes == "equal" else rng.uniform(0.1, 0.5, n)
-    shape = formation.slots("sphere", 2.0, n)
+    shape = shapes.slots("sphere", 2.0, n)
     velocity = rng.normal(size=shape.shape)
     r = np.empty((24, n, 3))
     for k in range(24):
@@ -51,7 +50,7 @@ def test_separation_of_many_is_the_least_over_all_pairs_while_they_move_and_mix(
         r[k] = turned + 5.0 * k + rng.uniform(-0.03, 0.03, shape.shape)
         r[k] += max(0, k - 12) * velocity
     r[20, 7] = np.nan
-    least, pair = geometry.separation(r, radius)
+    least, pair = proximity.separation(r, radius)
     for k in range(24):
         apart = np.linalg.norm(r[k, :, None] - r[k], axis=2) - radius - radius[:, None]
         apart[np.tril_indices(n)] = np.inf
@@ -62,7 +61,7 @@ def test_separation_of_many_is_the_least_over_all_pairs_while_they_move_and_mix(
 
 def test_one_agent_is_apart_from_nobody():
     """Without a pair the separation is infinite and names nobody."""
-    least, pair = geometry.separation(np.zeros((2, 1, 3)), [0.5])
+    least, pair = proximity.separation(np.zeros((2, 1, 3)), [0.5])
     np.testing.assert_array_equal(least, [np.inf, np.inf])
     np.testing.assert_array_equal(pair, -1)
 
@@ -84,7 +83,7 @@ BOX = Box(kind="box", name="wall", min=(1.0, 2.0, 3.0), max=(4.0, 6.0, 8.0))
 def test_clearance_of_a_box(point, room):
     """Distance to the box's nearest point minus the radius; inside, minus the depth as well."""
     r = np.array([[[50.0, 50.0, 50.0], point]])
-    least, agent, obstacle = geometry.clearance(r, [0.25, 0.25], [BOX])
+    least, agent, obstacle = proximity.clearance(r, [0.25, 0.25], [BOX])
     assert least[0] == pytest.approx(room - 0.25, abs=1e-14)
     assert (agent[0], obstacle[0]) == (1, 0)
 
@@ -95,7 +94,7 @@ def test_clearance_of_a_box_is_the_distance_to_its_nearest_point(seed):
     """Outside, no point of the box is nearer than the one a projection finds."""
     rng = np.random.default_rng(seed)
     r = rng.uniform(-10, 15, (20, 1, 3))
-    least, _, _ = geometry.clearance(r, [0.0], [BOX])
+    least, _, _ = proximity.clearance(r, [0.0], [BOX])
     low, high = np.array(BOX.min), np.array(BOX.max)
     nearest = np.clip(r[:, 0], low, high)
     distance = np.linalg.norm(r[:, 0] - nearest, axis=1)
@@ -114,7 +113,7 @@ def test_clearance_names_the_nearest_of_several_obstacles():
             [[2.0, 20.0, 9.0], [20.0, 0.0, 0.3]],  # agent 1 in the ground
         ]
     )
-    least, agent, obstacle = geometry.clearance(r, [0.1, 0.2], [ground, BOX])
+    least, agent, obstacle = proximity.clearance(r, [0.1, 0.2], [ground, BOX])
     np.testing.assert_allclose(least, [0.6, 0.0, -0.4], rtol=0, atol=1e-14)
     np.testing.assert_array_equal(agent, [0, 0, 1])
     np.testing.assert_array_equal(obstacle, [0, 1, 0])
@@ -122,7 +121,7 @@ def test_clearance_names_the_nearest_of_several_obstacles():
 
 def test_no_obstacle_is_clear():
     """Without obstacles the clearance is infinite and names nothing."""
-    least, agent, obstacle = geometry.clearance(np.zeros((2, 3, 3)), [0.1] * 3, [])
+    least, agent, obstacle = proximity.clearance(np.zeros((2, 3, 3)), [0.1] * 3, [])
     np.testing.assert_array_equal(least, np.inf)
     np.testing.assert_array_equal(np.concatenate([agent, obstacle]), -1)
 
@@ -150,7 +149,7 @@ def test_fit_finds_the_attitude_of_turned_slots(name, seed):
     p -= m @ p / m.sum()
     T = Rotation.random(4, random_state=rng).as_matrix()
     x = np.einsum("kba,ib->kia", T, p)
-    found, _ = geometry.fit_attitudes(x, np.broadcast_to(p, x.shape), m, EYE)
+    found, _ = proximity.fit_attitudes(x, np.broadcast_to(p, x.shape), m, EYE)
     np.testing.assert_allclose(found, T, rtol=0, atol=1e-12)
 
 
@@ -165,7 +164,7 @@ def test_fit_of_a_deformed_shape_is_scipys(seed):
     T = Rotation.random(random_state=rng)
     x = T.inv().apply(p) + rng.normal(size=p.shape) * 0.2
     x -= m @ x / m.sum()
-    found = geometry.fit_attitudes(x[None], p[None], m, EYE)[0][0]
+    found = proximity.fit_attitudes(x[None], p[None], m, EYE)[0][0]
     expected = Rotation.align_vectors(p, x, weights=m)[0].as_matrix()
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-10)
 
@@ -176,7 +175,7 @@ def test_a_mirror_image_gets_a_rotation_all_the_same():
     p = shape("spatial", rng)
     p -= p.mean(axis=0)
     x = p * [1, 1, -1]
-    T = geometry.fit_attitudes(x[None], p[None], np.ones(5), EYE)[0][0]
+    T = proximity.fit_attitudes(x[None], p[None], np.ones(5), EYE)[0][0]
     assert np.linalg.det(T) == pytest.approx(1.0, abs=1e-12)
     np.testing.assert_allclose(T @ T.T, EYE, rtol=0, atol=1e-12)
     assert np.abs(x @ T.T - p).max() > 0.5
@@ -195,7 +194,7 @@ def test_a_line_takes_the_attitude_nearest_to_the_one_expected(seed):
     near = Rotation.random(3, random_state=rng).as_matrix()
     small = Rotation.from_rotvec(rng.normal(size=(3, 3)) * 0.3).as_matrix()
     x = turned_line(small @ near)
-    found, _ = geometry.fit_attitudes(x, np.broadcast_to(LINE, x.shape), np.ones(3), near)
+    found, _ = proximity.fit_attitudes(x, np.broadcast_to(LINE, x.shape), np.ones(3), near)
     np.testing.assert_allclose(
         np.einsum("kab,kib->kia", found, x), np.broadcast_to(LINE, x.shape), atol=1e-12
     )
@@ -217,13 +216,13 @@ def test_a_line_is_followed_from_sample_to_sample():
     roll = Rotation.from_rotvec([0.7, 0, 0]).as_matrix()
     T = roll @ Rotation.from_euler("z", -yaw[:, None]).as_matrix()
     x = turned_line(T)
-    found, _ = geometry.fit_attitudes(x, np.broadcast_to(LINE, x.shape), np.ones(3), T[0])
+    found, _ = proximity.fit_attitudes(x, np.broadcast_to(LINE, x.shape), np.ones(3), T[0])
     np.testing.assert_allclose(found, T, rtol=0, atol=1e-10)
 
 
 def test_a_line_turned_about_by_half_a_turn_has_an_attitude():
     """Where every axis across the line would do, one is taken: a rotation that brings the line home."""
-    found = geometry.fit_attitudes(-LINE[None], LINE[None], np.ones(3), EYE)[0][0]
+    found = proximity.fit_attitudes(-LINE[None], LINE[None], np.ones(3), EYE)[0][0]
     np.testing.assert_allclose(-LINE @ found.T, LINE, rtol=0, atol=1e-12)
     assert np.linalg.det(found) == pytest.approx(1.0, abs=1e-12)
 
@@ -234,7 +233,7 @@ def test_lines_that_are_nearly_reversed_have_attitudes(short):
     towards = np.array([np.cos(np.pi - short), np.sin(np.pi - short), 0.0])
     x = np.outer(LINE[:, 0], towards)
     for near in (EYE, EYE[None]):
-        T = geometry.fit_attitudes(x[None], LINE[None], np.ones(3), near)[0][0]
+        T = proximity.fit_attitudes(x[None], LINE[None], np.ones(3), near)[0][0]
         np.testing.assert_allclose(T @ T.T, EYE, rtol=0, atol=1e-7)
         np.testing.assert_allclose(LINE @ T, x, rtol=0, atol=1e-6)
         assert np.linalg.det(T) > 0
@@ -242,20 +241,20 @@ def test_lines_that_are_nearly_reversed_have_attitudes(short):
 
 def test_attitude_goes_on_through_a_line():
     """A triangle that folds into a line and opens again keeps its attitude all the way."""
-    triangle = formation.slots("triangle", 4.0, 3)
+    triangle = shapes.slots("triangle", 4.0, 3)
     s = np.concatenate([np.linspace(1, 0, 30), np.linspace(0, 1, 30)])[:, None, None]
     p = LINE[[0, 1, 2]] * (1 - s) + triangle * s
     p -= p.mean(axis=1, keepdims=True)
     T = Rotation.from_euler("ZYX", [50, 20, -30], degrees=True).as_matrix().T
     x = p @ T
-    found, _ = geometry.fit_attitudes(x, p, np.ones(3), T)
+    found, _ = proximity.fit_attitudes(x, p, np.ones(3), T)
     np.testing.assert_allclose(found, np.broadcast_to(T, found.shape), rtol=0, atol=1e-9)
 
 
 def test_one_agent_has_the_attitude_expected():
     """A point has no attitude of its own."""
     near = Rotation.from_euler("z", [[0.3], [0.4]]).as_matrix()
-    found, _ = geometry.fit_attitudes(np.zeros((2, 1, 3)), np.zeros((2, 1, 3)), np.ones(1), near)
+    found, _ = proximity.fit_attitudes(np.zeros((2, 1, 3)), np.zeros((2, 1, 3)), np.ones(1), near)
     np.testing.assert_array_equal(found, near)
 
 
@@ -268,7 +267,7 @@ def test_mean_axis_rates_are_those_of_the_rigid_motion(seed, n):
     x = rng.normal(size=(3, n, 3)) * 2
     x -= np.einsum("i,kia->ka", m, x)[:, None] / m.sum()
     omega = rng.normal(size=(3, 3))
-    found = geometry.mean_axis_rates(x, np.cross(omega[:, None], x), m)
+    found = proximity.mean_axis_rates(x, np.cross(omega[:, None], x), m)
     if n == 1:
         omega = np.zeros((3, 3))
     elif n == 2:
@@ -289,18 +288,18 @@ def jacobian(r: np.ndarray, edges: np.ndarray) -> np.ndarray:
 
 
 CYCLE = np.array([(0, 1), (1, 2), (2, 3), (0, 3)])
-CUBE = formation.slots("cube", 4.0, 8)
+CUBE = shapes.slots("cube", 4.0, 8)
 HEXAGON_EDGES = np.array(
     [(0, 1), (1, 2), (2, 3), (3, 4), (4, 5), (0, 5), (0, 2), (1, 3), (2, 4), (3, 5), (0, 4), (1, 5)]
 )
 PRINTED = {  # slots, edges, rank of J
-    "pair": (formation.slots("line", 4.0, 2), graphs.complete_graph(2), 1),
-    "triangle": (formation.slots("triangle", 4.0, 3), graphs.complete_graph(3), 3),
+    "pair": (shapes.slots("line", 4.0, 2), graphs.complete_graph(2), 1),
+    "triangle": (shapes.slots("triangle", 4.0, 3), graphs.complete_graph(3), 3),
     "line": (LINE, graphs.complete_graph(3), 2),
-    "square": (formation.slots("square", 4.0, 4), graphs.complete_graph(4), 5),
-    "cycle": (formation.slots("square", 4.0, 4), CYCLE, 4),
-    "tetrahedron": (formation.slots("pyramid", 4.0, 4), graphs.complete_graph(4), 6),
-    "hexagon": (formation.slots("hexagon", 4.0, 6), HEXAGON_EDGES, 9),
+    "square": (shapes.slots("square", 4.0, 4), graphs.complete_graph(4), 5),
+    "cycle": (shapes.slots("square", 4.0, 4), CYCLE, 4),
+    "tetrahedron": (shapes.slots("pyramid", 4.0, 4), graphs.complete_graph(4), 6),
+    "hexagon": (shapes.slots("hexagon", 4.0, 6), HEXAGON_EDGES, 9),
     "cube": (CUBE, graphs.CUBE_EDGES, 18),
     "complete cube": (CUBE, graphs.complete_graph(8), 18),
 }
@@ -312,7 +311,7 @@ def test_smallest_singular_value_is_the_last_above_the_rank(name):
     r, edges, rank = PRINTED[name]
     values = np.linalg.svd(jacobian(r, edges), compute_uv=False)
     assert np.linalg.matrix_rank(jacobian(r, edges), 1e-9) == rank
-    found = geometry.smallest_singular_value(r[None], edges)
+    found = proximity.smallest_singular_value(r[None], edges)
     assert found[0] == pytest.approx(values[rank - 1], rel=1e-9)
 
 
@@ -321,7 +320,7 @@ def test_weighted_singular_values_are_those_of_the_law():
     rng = np.random.default_rng(0)
     r, m = rng.normal(size=(4, 5, 3)), rng.uniform(0.5, 2.0, 5)
     edges = graphs.complete_graph(5)[:8]
-    found = geometry.smallest_singular_value(r, edges, m)
+    found = proximity.smallest_singular_value(r, edges, m)
     for k in range(4):
         J = jacobian(r[k], edges)
         w = np.linalg.eigvalsh(m.mean() * (J / np.repeat(m, 3)) @ J.T)
@@ -330,7 +329,7 @@ def test_weighted_singular_values_are_those_of_the_law():
 
 def test_without_edges_there_is_no_singular_value():
     """No edge, no Jacobian: NaN at every sample."""
-    found = geometry.smallest_singular_value(np.zeros((3, 2, 3)), np.zeros((0, 2), dtype=np.int64))
+    found = proximity.smallest_singular_value(np.zeros((3, 2, 3)), np.zeros((0, 2), dtype=np.int64))
     assert np.isnan(found).all()
     assert found.shape == (3,)
 
@@ -339,7 +338,7 @@ def test_the_line_shows_in_the_singular_value():
     """An offset h from the line of three leaves lambda_min = h^2/8, so sigma = h/sqrt(8)."""
     for h in (1e-1, 1e-2, 1e-3):
         r = LINE + [[0, 0, 0], [0, h, 0], [0, 0, 0]]
-        sigma = geometry.smallest_singular_value(r[None], graphs.complete_graph(3))[0]
+        sigma = proximity.smallest_singular_value(r[None], graphs.complete_graph(3))[0]
         assert sigma == pytest.approx(h / np.sqrt(8), rel=5e-3)
 
 
@@ -361,7 +360,7 @@ def test_ranks_are_pyrigis(name):
     )
     assert rigid == (generic == max(3 * n - 6, n - 1))
     values = np.linalg.svd(jacobian(points, edges), compute_uv=False)
-    found = geometry.smallest_singular_value(points[None], edges)[0]
+    found = proximity.smallest_singular_value(points[None], edges)[0]
     assert found == pytest.approx(values[generic - 1], rel=1e-9)
     # Planar and straight shapes lose rank: at most 2 N - 3 and N - 1 of what a generic shape has.
     dimension = distance_geometry.dimension(r)
@@ -376,12 +375,12 @@ def test_a_bent_line_has_no_attitude_about_itself():
     off = rng.normal(size=(20, 3, 3)) * 0.2
     x = np.einsum("kba,ib->kia", T, p) + off
     x -= x.mean(axis=1, keepdims=True)
-    found, line = geometry.fit_attitudes(x, np.broadcast_to(p, x.shape), np.ones(3), T)
+    found, line = proximity.fit_attitudes(x, np.broadcast_to(p, x.shape), np.ones(3), T)
     assert line.all()
     away = np.einsum("kab,kcb->kac", found, T)
     assert np.degrees(np.arccos((np.trace(away, axis1=1, axis2=2) - 1) / 2)).max() < 10
     y = rng.normal(size=x.shape)
-    omega = geometry.mean_axis_rates(x, y - y.mean(axis=1, keepdims=True), np.ones(3), line)
+    omega = proximity.mean_axis_rates(x, y - y.mean(axis=1, keepdims=True), np.ones(3), line)
     axis = np.linalg.svd(x)[2][:, 0]
     assert np.abs(np.einsum("ka,ka->k", omega, axis)).max() < 1e-9
 
@@ -393,7 +392,7 @@ def test_a_narrow_shape_that_fits_keeps_its_attitude():
     T = Rotation.random(20, random_state=rng).as_matrix()
     x = np.einsum("kba,ib->kia", T, p) + rng.normal(size=(20, 3, 3)) * 1e-3
     x -= x.mean(axis=1, keepdims=True)
-    found, line = geometry.fit_attitudes(x, np.broadcast_to(p, x.shape), np.ones(3), T)
+    found, line = proximity.fit_attitudes(x, np.broadcast_to(p, x.shape), np.ones(3), T)
     assert not line.any()
     np.testing.assert_allclose(found, T, rtol=0, atol=0.03)
 
@@ -404,7 +403,7 @@ def test_headroom_is_the_least_height_above_another(n: int):
     rng = np.random.default_rng(7)
     r, radius = rng.uniform(0, 6, (5, n, 3)), rng.uniform(0.1, 0.6, n)
     r[:, 4] = np.nan  # who has left is below nobody
-    room, pair = geometry.headroom(r, radius)
+    room, pair = proximity.headroom(r, radius)
     for k in range(5):
         found = [
             (abs(r[k, i, 2] - r[k, j, 2]) - radius[i] - radius[j], i, j)
@@ -413,6 +412,6 @@ def test_headroom_is_the_least_height_above_another(n: int):
             if np.hypot(*(r[k, i] - r[k, j])[:2]) <= radius[i] + radius[j]
         ]
         assert (room[k], *pair[k]) == pytest.approx(min(found))
-    room, pair = geometry.headroom(np.array([[[0.0, 0, 0], [9, 0, 0]]]), [0.1, 0.1])
+    room, pair = proximity.headroom(np.array([[[0.0, 0, 0], [9, 0, 0]]]), [0.1, 0.1])
     assert np.isinf(room[0])
     assert pair.tolist() == [[-1, -1]]

@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from rigidfleet import physics
-from rigidfleet.math import attitude
-from rigidfleet.math import pid as gains
+from rigidfleet.math import attitude, pid
 from rigidfleet.mission import Mission, load_mission
 from rigidfleet.result import Result
 from rigidfleet.simulation.flight import simulate
@@ -118,7 +117,7 @@ def test_errors_follow_their_closed_form(seed, n, p, ringing):
     rng = np.random.default_rng(seed)
     edges = complete(n)[:9]  # of five agents, all but one: ten are redundant
     r = spread(rng, n)
-    alpha, beta, gamma = gains.triple_pole(p)
+    alpha, beta, gamma = pid.triple_pole(p)
     if ringing:
         beta *= 1.5
     d = lengths(r + rng.uniform(-0.15, 0.15, (n, 3)), edges)
@@ -141,7 +140,7 @@ def test_errors_follow_their_closed_form(seed, n, p, ringing):
     u /= np.linalg.norm(u, axis=1)[:, None]
     v = data["agents"]["velocity"]
     c_dot = np.einsum("ka,ka->k", u, v[edges[:, 0]] - v[edges[:, 1]])
-    c, _, integral = gains.error_response(
+    c, _, integral = pid.error_response(
         alpha, beta, gamma, lengths(r, edges) - d, c_dot, 0.0, TIMES
     )
     np.testing.assert_allclose(result.constraint, c, rtol=0, atol=1e-8)

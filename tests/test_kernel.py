@@ -14,17 +14,28 @@ from scipy.spatial.transform import Rotation
 
 from rigidfleet import physics
 from rigidfleet.kernel import (
-    cache_directory,
     constraint,
     control,
-    is_compiled,
     linalg,
     records,
     references,
+    rigid_body,
 )
-from rigidfleet.kernel import problem as k
-from rigidfleet.kernel import rigid_body as body
+from rigidfleet.kernel.compiler.cache import cache_directory
 from rigidfleet.kernel.engine import native
+from rigidfleet.kernel.engine.native import is_compiled
+from rigidfleet.kernel.problem import (
+    EXACT,
+    SLOTS,
+    SQUARED,
+    Feedback,
+    Law,
+    Program,
+    Reference,
+    Workspace,
+    workspace,
+)
+from rigidfleet.kernel.problem import graph as kernel_graph
 from rigidfleet.math import attitude
 from rigidfleet.mission import Mission
 from rigidfleet.planning.plan import Situation, plan_phase
@@ -65,7 +76,7 @@ def a_mission(**changes: Any) -> Mission:
     return Mission.from_dict(data | changes)
 
 
-def a_program(mission: Mission, index: int = 0, now: Situation | None = None) -> k.Program:
+def a_program(mission: Mission, index: int = 0, now: Situation | None = None) -> Program:
     """The program of a phase, begun at the mission's initial state unless told otherwise."""
     phase = mission.phases[index]
     if now is None:
@@ -116,7 +127,7 @@ def test_slots_and_distances_move_as_their_derivatives_say(turn):
     edges = np.array([(i, j) for i in range(n) for j in range(i + 1, n)])
     zero = np.zeros(0)
     p0, dp = random_vectors(1, n, 3.0), random_vectors(2, n)
-    ref = k.Reference(k.SLOTS, 0.5, 4.0, zero, zero, p0, dp, np.array(turn))
+    ref = Reference(SLOTS, 0.5, 4.0, zero, zero, p0, dp, np.array(turn))
 
     def slots(t: float) -> np.ndarray:
         p = np.zeros((3, n, 3))
@@ -143,8 +154,8 @@ def test_slots_and_distances_move_as_their_derivatives_say(turn):
 
 def test_squared_distances_move_as_their_derivatives_say():
     """Distances blended in their squares, against finite differences; still before and after."""
-    ref = k.Reference(
-        k.SQUARED, 6.0, 4.0, np.array([4.0, 4.0]), np.array([4.0, 8.0]), *np.zeros((2, 0, 3)),
+    ref = Reference(
+        SQUARED, 6.0, 4.0, np.array([4.0, 4.0]), np.array([4.0, 8.0]), *np.zeros((2, 0, 3)),
         np.zeros(3),
     )  # fmt: skip
 
@@ -202,7 +213,7 @@ def test_rotation_vector_is_exact_at_every_angle(angle, seed):
     given = angle * axis / np.linalg.norm(axis)
     R = Rotation.from_rotvec(given).as_matrix()
     phi = np.zeros(3)
-    body.rotation_vector(R, phi)
+    rigid_body.rotation_vector(R, phi)
     if angle > math.pi - 1e-7:  # the axis of half a turn has no sign
         phi *= np.sign(phi @ given)
     # 1e-15 of the matrix is that much of the angle; near zero that is all it holds.
@@ -215,8 +226,8 @@ def test_attitude_and_its_rate_are_those_of_the_attitude_module():
         q = np.random.default_rng(seed).normal(size=4)
         omega = random_vectors(seed + 10, 1)[0]
         T, rate = np.zeros((3, 3)), np.zeros(4)
-        body.attitude_matrix(q, T)
-        body.quaternion_rate(q, omega, rate)
+        rigid_body.attitude_matrix(q, T)
+        rigid_body.quaternion_rate(q, omega, rate)
         np.testing.assert_allclose(T, attitude.dcm_from_quaternion(q), rtol=0, atol=1e-15)
         np.testing.assert_allclose(rate, attitude.quaternion_rate(q, omega), rtol=0, atol=1e-15)
 
@@ -313,9 +324,9 @@ def test_inertia_and_its_pseudo_inverse(name):
     r = BODIES[name]
     m = 1.3 + 0.1 * np.arange(len(r))
     cm, I, inverse = np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3))
-    body.centre_of_mass(r, m, m.sum(), cm)
-    body.inertia(r, m, cm, I)
-    body.inertia_inverse(I, inverse)
+    rigid_body.centre_of_mass(r, m, m.sum(), cm)
+    rigid_body.inertia(r, m, cm, I)
+    rigid_body.inertia_inverse(I, inverse)
     np.testing.assert_allclose(cm, m @ r / m.sum(), rtol=1e-15)
     np.testing.assert_allclose(I, inertia_of(about_cm(r, m), m), rtol=0, atol=1e-13)
     expected = np.linalg.pinv(I, 1e-9, hermitian=True)
@@ -328,8 +339,8 @@ def test_mean_axes_carry_all_angular_momentum(name):
     r = BODIES[name]
     m = 1.3 + 0.1 * np.arange(len(r))
     v = random_vectors(9, len(r))
-    w = k.workspace(len(r), 0)
-    body.mean_axes(r, v, m, m.sum(), w)
+    w = workspace(len(r), 0)
+    rigid_body.mean_axes(r, v, m, m.sum(), w)
     x, y = about_cm(r, m), about_cm(v, m)
     rest = y - np.cross(w.cm[2], x)
     np.testing.assert_allclose(m @ np.cross(x, rest), 0, atol=1e-13)
@@ -343,12 +354,12 @@ def test_deformation_damping_leaves_rigid_motion_alone(name):
     r = BODIES[name]
     m = 1.3 + 0.1 * np.arange(len(r))
     omega, v_cm = random_vectors(5, 2)
-    w = k.workspace(len(r), 0)
+    w = workspace(len(r), 0)
     rigid = v_cm + np.cross(omega, about_cm(r, m))
     for v, still in ((rigid, True), (rigid + random_vectors(6, len(r)), len(r) == 1)):
         f = np.zeros_like(r)
-        body.mean_axes(r, v, m, m.sum(), w)
-        body.damp_deformation(r, v, m, 2.0, w.cm, f)
+        rigid_body.mean_axes(r, v, m, m.sum(), w)
+        rigid_body.damp_deformation(r, v, m, 2.0, w.cm, f)
         np.testing.assert_allclose(f.sum(axis=0), 0, atol=1e-13)
         np.testing.assert_allclose(np.cross(r, f).sum(axis=0), 0, atol=1e-12)
         assert bool(np.abs(f).max() < 1e-13) is still
@@ -554,10 +565,10 @@ def test_only_edges_that_share_an_agent_are_assembled():
     r = random_vectors(8, 6, 2.0)
     edges = np.array([(0, 1), (2, 1), (2, 3), (3, 0), (5, 4), (1, 5)])
     m = np.random.default_rng(1).uniform(0.5, 2.0, 6)
-    graph = k.graph(edges, m)
-    w = k.workspace(6, 6)
+    graph = kernel_graph(edges, m)
+    w = workspace(6, 6)
     at_rest = np.zeros((6, 3))
-    law = k.Law(1.0, 1.0, 0.0, k.EXACT, 0.0, 1, 0.0, 0.0, 0.0)
+    law = Law(1.0, 1.0, 0.0, EXACT, 0.0, 1, 0.0, 0.0, 0.0)
     constraint.right_side(r, at_rest, np.zeros(6), at_rest, graph.edges, law, w)
     constraint.assemble(w.u, graph, 1.7, 0.3, w.A)
     J = jacobian(r, edges)
@@ -569,7 +580,7 @@ def test_only_edges_that_share_an_agent_are_assembled():
 # -- the closed loop -------------------------------------------------------------------------------
 
 
-def a_flight_with_a_turn() -> tuple[k.Program, k.Workspace]:
+def a_flight_with_a_turn() -> tuple[Program, Workspace]:
     """A reshaping that turns its slots on a body that moves and turns: every term is at work."""
     mission = a_mission(
         formations={
@@ -593,10 +604,10 @@ def a_flight_with_a_turn() -> tuple[k.Program, k.Workspace]:
     now = Situation(0.0, np.array(mission.agents.position), np.zeros((3, 3)))
     fly = plan_phase(mission, mission.phases[1], now, 5.0).program
     shape = random_vectors(3, 3, 2.0)
-    ref = k.Reference(
-        k.SLOTS, 0.0, 4.0, np.zeros(3), np.zeros(3), shape, random_vectors(4, 3), np.array([0.3, 0.9, -0.4])
+    ref = Reference(
+        SLOTS, 0.0, 4.0, np.zeros(3), np.zeros(3), shape, random_vectors(4, 3), np.array([0.3, 0.9, -0.4])
     )  # fmt: skip
-    return fly._replace(reference=ref), k.workspace(3, 0)
+    return fly._replace(reference=ref), workspace(3, 0)
 
 
 def test_desired_agents_move_as_their_derivatives_say():
@@ -634,7 +645,7 @@ def test_gains_are_interpolated_over_the_time_to_go():
     to_go, powers = np.array([0.0, 1.0, 3.0]), np.array([[1.0, 2.0, -1.0, 0.5]])
     gain = np.tile(to_go[:, None] ** np.arange(4) @ powers.T, 4)  # a cubic, met exactly
     slope = np.tile(np.polyval([1.5, -2.0, 2.0], to_go)[:, None], 4)
-    feedback = k.Feedback(
+    feedback = Feedback(
         to_go, gain, slope, 10.0, *np.zeros((2, 3)), np.eye(3), np.zeros(3), np.full(4, -1.0)
     )
     out = np.zeros(4)
@@ -648,7 +659,7 @@ def test_gains_are_interpolated_over_the_time_to_go():
 # -- the integrator --------------------------------------------------------------------------------
 
 
-def a_dumbbell() -> tuple[k.Program, k.Workspace, Any]:
+def a_dumbbell() -> tuple[Program, Workspace, Any]:
     """Two unequal masses that turn about each other at a fixed distance, and their exact motion."""
     m, d, omega = np.array([1.0, 2.0]), 4.0, 1.3
     mission = a_mission(
@@ -669,7 +680,7 @@ def a_dumbbell() -> tuple[k.Program, k.Workspace, Any]:
         q = [math.cos(omega * t / 2), 0.0, 0.0, math.sin(omega * t / 2)]
         return np.concatenate([r.ravel(), v.ravel(), [0.0], q])
 
-    return program, k.workspace(2, 1), exact
+    return program, workspace(2, 1), exact
 
 
 def fixed_steps(h: float, t_end: float, sampled: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -738,7 +749,7 @@ def test_a_flight_that_pauses_goes_on_as_if_it_had_not(pause):
 
     def fly(steps: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
         state = records.integrator(y0, 0.0, rtol=1e-8, atol=np.full(21, 1e-10))
-        samples, w, pauses, fresh = np.zeros((121, 21)), k.workspace(3, 3), 0, True
+        samples, w, pauses, fresh = np.zeros((121, 21)), workspace(3, 3), 0, True
         while native.integrate(program, w, state, 6.0, fresh, times, samples, steps):
             fresh = False
             pauses += 1
@@ -825,7 +836,7 @@ def test_the_kernel_refuses_other_types(change):
     wrong = {"type": r.astype(np.float32), "order": np.asfortranarray(r), "dimensions": r.ravel()}
     other = program._replace(control=program.control._replace(force=wrong[change]))
     with pytest.raises(TypeError):
-        native.closed_loop(0.0, np.zeros(21), np.zeros(21), other, k.workspace(3, 3))
+        native.closed_loop(0.0, np.zeros(21), np.zeros(21), other, workspace(3, 3))
 
 
 # -- a user's force --------------------------------------------------------------------------------

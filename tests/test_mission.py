@@ -13,8 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rigidfleet.errors import MissionError
-from rigidfleet.formation import distance_geometry, graphs
-from rigidfleet.formation import shapes as formation
+from rigidfleet.formation import distance_geometry, graphs, shapes
 from rigidfleet.mission import (
     Box,
     Fly,
@@ -274,7 +273,7 @@ def test_agents_may_start_in_a_shape():
     mission = Mission.from_dict(
         changed(("agents/position", shape)) | {"formations": {}, "phases": HELD}
     )
-    np.testing.assert_allclose(mission.agents.position, formation.slots("grid", 2.0, 7) + [1, 2, 3])
+    np.testing.assert_allclose(mission.agents.position, shapes.slots("grid", 2.0, 7) + [1, 2, 3])
     assert len(mission.agents.mass) == mission.n_agents == 7
     assert mission.to_dict()["agents"]["position"] == shape
 
@@ -307,7 +306,7 @@ def large(**form) -> dict[str, Any]:
 
 def test_graphs_have_names():
     """'neighbours', 'joined' and 'tree' are the graphs that the functions of those names make."""
-    p = formation.slots("sphere", 2.0, 30)
+    p = shapes.slots("sphere", 2.0, 30)
     for form, want in (
         ({"edges": "neighbours"}, graphs.neighbours(p)),
         ({"edges": "neighbours", "reach": 1.2}, graphs.neighbours(p, 1.2)),
@@ -717,7 +716,7 @@ def test_tetrahedra_are_judged():
 
 def test_contradictions_of_five_agents_are_found():
     """Distances of which every four exist, but not all together, are refused."""
-    p = formation.slots("pyramid", 4.0, 5)
+    p = shapes.slots("pyramid", 4.0, 5)
     d = distance_geometry.distances(p, graphs.complete_graph(5))
     base = load_mission("pyramid").to_dict()
     base["formations"]["pyramid"] = {"distances": d.tolist()}

@@ -11,7 +11,7 @@ from importlib import resources
 import pytest
 from sample_flights import swarm
 
-from rigidfleet import plotting as figures
+from rigidfleet import plotting
 from rigidfleet.mission import Mission
 from rigidfleet.reporting import html_page as report_page
 from rigidfleet.result import PhaseRecord, Result
@@ -105,7 +105,7 @@ def quick(monkeypatch):
 
     from pathlib import Path
 
-    monkeypatch.setattr(figures, "plot", lambda r, folder, **k: draw(r, Path(folder), **k))
+    monkeypatch.setattr(plotting, "plot", lambda r, folder, **k: draw(r, Path(folder), **k))
 
 
 class Parts(html.parser.HTMLParser):

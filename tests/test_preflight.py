@@ -12,8 +12,10 @@ from rigidfleet.formation.graphs import complete_graph
 from rigidfleet.formation.shapes import slots
 from rigidfleet.math.rigid_body import kabsch
 from rigidfleet.mission import Mission, load_mission, mission_names
+from rigidfleet.planning.preview import preview
 from rigidfleet.plotting.graph import graphs
-from rigidfleet.preflight.check import STARTS, planned, preflight
+from rigidfleet.preflight.check import check
+from rigidfleet.preflight.formations import STARTS
 from rigidfleet.simulation.flight import simulate
 
 #: Missions of which something fails in flight, and what says so before.
@@ -54,7 +56,7 @@ def failures(found):
 )
 def test_shipped_missions(name):
     """What passes in flight passes before it, and what fails is found before, for the right reason."""
-    found = preflight(load_mission(name))
+    found = check(load_mission(name))
     assert found.passed == (name not in FAILING)
     if name in FAILING:
         assert FAILING[name] in failures(found)
@@ -66,7 +68,7 @@ def test_planned_way_is_the_flown(name):
     """The way is planned within 4 cm of where all agents fly, phase by phase, wherever slots are tracked."""
     flown = load_mission(name)
     record = simulate(flown)
-    way, known = planned(flown)
+    way, known = preview(flown)
     assert known
     for leg, phase in zip(way, flown.phases, strict=True):
         if phase.control != "slots":
@@ -83,7 +85,7 @@ def test_planned_way_is_the_flown(name):
 def test_thrust_is_that_flown():
     """The greatest planned thrust is the greatest flown, within a percent."""
     flown = load_mission("cube-passage")
-    found = preflight(flown)
+    found = check(flown)
     assert found.thrust is not None
     assert found.thrust[0] == pytest.approx(simulate(flown).thrust.max(), rel=0.01)
 
@@ -93,9 +95,9 @@ def test_no_compiler():
     code = """
 import sys
 from rigidfleet.mission import load_mission
-from rigidfleet.preflight.check import preflight
-preflight(load_mission("cube-passage"))
-assert not {"numba", "rigidfleet.kernel", "matplotlib"} & set(sys.modules)
+from rigidfleet.preflight.check import check
+check(load_mission("cube-passage"))
+assert not {"numba", "llvmlite", "rigidfleet.kernel.engine", "matplotlib"} & set(sys.modules)
 """
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
@@ -106,7 +108,7 @@ def test_flexible_formations(control, fails):
     phases = [{"kind": "establish", "formation": "square", "control": control, "until": 5.0}]
     sides = {"edges": [[1, 2], [2, 3], [3, 4], [1, 4]]}
     raised = [*SQUARE[:3], [0, 4, 6]]
-    found = preflight(mission(raised, square=sides, phases=phases))
+    found = check(mission(raised, square=sides, phases=phases))
     assert failures(found) == fails
     assert any("'square' is flexible" in remark.text for remark in found.remarks)
 
@@ -114,22 +116,22 @@ def test_flexible_formations(control, fails):
 def test_collisions():
     """Agents that change places through each other collide on paper; other slots save the way."""
     crossed = [SQUARE[1], SQUARE[0], SQUARE[2], SQUARE[3]]
-    found = preflight(mission(crossed))
+    found = check(mission(crossed))
     assert "collision" in failures(found)
     topics = {remark.topic for remark in found.remarks}
     assert "assignment" in topics
     assert found.assignments["shortest"].way < 0.1
-    assert preflight(mission()).passed
+    assert check(mission()).passed
 
 
 def test_collisions_on_a_guessed_way_are_notes():
     """Where only distances lead, nobody knows the way: what is found there fails nothing."""
     crossed = [SQUARE[1], SQUARE[0], SQUARE[2], SQUARE[3]]
     step = {"kind": "establish", "formation": "square", "control": "open", "until": 5.0}
-    found = preflight(mission(crossed, phases=[step | {"reference": "distances"}]))
+    found = check(mission(crossed, phases=[step | {"reference": "distances"}]))
     assert any(r.topic == "collision" and "may" in r.text for r in found.remarks)
     assert "collision" not in failures(found)
-    assert "collision" in failures(preflight(mission(crossed, phases=[step])))
+    assert "collision" in failures(check(mission(crossed, phases=[step])))
 
 
 @pytest.mark.parametrize("reference", ["shape", "distances"])
@@ -140,7 +142,7 @@ def test_four_agents_on_the_other_side_of_the_mirror(reference):
 
     def noted(start: np.ndarray, **phase: str) -> bool:
         forms = {"four": {"shape": "tetrahedron", "size": 4.0}}
-        found = preflight(mission(start.tolist(), formations=forms, phases=[away | phase]))
+        found = check(mission(start.tolist(), formations=forms, phases=[away | phase]))
         return any("mirror image" in remark.text for remark in found.remarks)
 
     offset = [[0.5, 0, 9], [0, 0, 9], [0, 0.5, 9], [0, 0, 9]]
@@ -154,7 +156,7 @@ def test_agents_that_start_in_each_other():
     """Where agents start is no guess."""
     step = {"kind": "establish", "formation": "square", "control": "open", "until": 5.0}
     near = [[0, 0, 5], [0.3, 0, 5], [4, 4, 5], [0, 4, 6]]
-    found = preflight(mission(near, phases=[step | {"reference": "distances"}]))
+    found = check(mission(near, phases=[step | {"reference": "distances"}]))
     assert "collision" in failures(found)
 
 
@@ -171,18 +173,18 @@ def test_agents_that_start_in_each_other():
 )
 def test_limits(tables, topic):
     """Each limit that the plan itself breaks is found, and nothing else."""
-    assert failures(preflight(mission(**tables))) == {topic}
+    assert failures(check(mission(**tables))) == {topic}
 
 
 def test_downwash():
     """One vehicle below another is a note; with a limit on it, it fails."""
     tall = [[0, 0, 5], [4, 0, 5], [0, 0, 9], [4, 0, 9]]
     phases = [{"kind": "fly", "position": [10, 0, 7], "until": 10.0}]
-    found = preflight(mission(tall, phases=phases))
+    found = check(mission(tall, phases=phases))
     (note,) = [remark for remark in found.remarks if remark.topic == "downwash"]
     assert note.text.startswith("agent 1 is below agent 3, 3.50 m")
     limited = mission(tall, phases=phases, limits={"separation_below": 4.0})
-    assert failures(preflight(limited)) == {"downwash"}
+    assert failures(check(limited)) == {"downwash"}
 
 
 @pytest.mark.parametrize(("yaw", "fits"), [(0.0, False), (90.0, True)])
@@ -199,7 +201,7 @@ def test_gaps(yaw, fits):
         {"kind": "fly", "position": [0, 30, 5], "until": 40.0},
     ]
     start = [[-3, 0, 5], [0, 0, 5], [3, 0, 5]]
-    found = preflight(mission(start, formations={"line": line}, phases=phases, obstacles=walls))
+    found = check(mission(start, formations={"line": line}, phases=phases, obstacles=walls))
     ((between, wide, takes, _),) = found.gaps
     assert between == "'left' and 'right'"
     assert wide == 4.0
@@ -226,7 +228,7 @@ def test_steps_are_judged_by_force():
     apart = [[0, 0, 5], [8, 0, 5]]
     need = np.hypot(24.0, 9.81)
     for limit, fails in ((need + 0.1, set()), (need - 0.1, {"thrust"})):
-        found = preflight(mission(apart, agents={"thrust_limit": limit}, **tables))
+        found = check(mission(apart, agents={"thrust_limit": limit}, **tables))
         assert failures(found) == fails
 
 
@@ -237,7 +239,7 @@ def test_way_that_nobody_knows():
         {"kind": "hold", "until": 2.0},
         {"kind": "establish", "formation": "ring", "reference": "distances", "control": "open", "until": 9.0},
     ]  # fmt: skip
-    found = preflight(mission(formations={"ring": some}, phases=phases))
+    found = check(mission(formations={"ring": some}, phases=phases))
     assert found.judged_to == 2.0
     assert [leg.phase for leg in found.legs] == ["hold 1"]
     assert found.formations[0].rigidity is None
@@ -246,11 +248,11 @@ def test_way_that_nobody_knows():
 def test_realisations_are_sought_for_few():
     """Other shapes are looked for up to twelve agents, unless it is asked for or forbidden."""
     cube = load_mission("establish-cube")
-    found = preflight(cube).formations[0].realisations
+    found = check(cube).formations[0].realisations
     assert found is not None
     assert found.starts == STARTS
     assert not found.unique
-    assert preflight(cube, search=False).formations[0].realisations is None
+    assert check(cube, search=False).formations[0].realisations is None
 
 
 # -- assignment --------------------------------------------------------------------------------------
@@ -305,7 +307,7 @@ def test_assignment_of_a_mission(assignment):
     crossed = [SQUARE[1], SQUARE[0], SQUARE[2], SQUARE[3]]
     sides = {"edges": [[1, 2], [2, 3], [3, 4], [1, 4], [1, 3]]}
     flown = mission(crossed, square=sides, assignment=assignment)
-    assert preflight(flown).passed == (assignment != "given")
+    assert check(flown).passed == (assignment != "given")
     verdict = assess(simulate(flown))
     assert verdict.passed == (assignment != "given")
     edges, lengths = flown.formation_edges("square"), flown.formation_distances("square")
@@ -335,12 +337,12 @@ def test_figure_shows_flexes_and_redundant_edges():
     """Redundant edges are dashed, and the agents of a flex have arrows."""
     phases = [{"kind": "establish", "formation": "square", "until": 5.0}]
     whole = mission(phases=phases)
-    judged = {f.name: f.rigidity for f in preflight(whole).formations}
+    judged = {f.name: f.rigidity for f in check(whole).formations}
     (ax,) = graphs(whole, judged).axes
     assert {line.get_linestyle() for line in ax.lines if "edge" in str(line.get_gid())} == {"--"}
     assert any("flex-1" in gid for gid in arrows(ax))
     triangle = load_mission("single-waypoint")
-    judged = {f.name: f.rigidity for f in preflight(triangle).formations}
+    judged = {f.name: f.rigidity for f in check(triangle).formations}
     (ax,) = graphs(triangle, judged).axes
     assert {line.get_linestyle() for line in ax.lines if "edge" in str(line.get_gid())} == {"-"}
     assert not arrows(ax)
@@ -357,7 +359,7 @@ def test_disturbances_and_their_thrust_are_told():
         "noise": {"position": 0.01, "velocity": 0.02},
     }
     disturbed = mission(disturbances=steady | random)
-    found = preflight(disturbed)
+    found = check(disturbed)
     d = found.disturbed
     assert d is not None
     m = np.array(disturbed.agents.mass)
@@ -382,7 +384,7 @@ def test_disturbances_and_their_thrust_are_told():
 
 def test_losses_are_told_and_judged_as_if_flown_on():
     """A vehicle to be lost is named with its time, and a note says that its way is judged to the end."""
-    found = preflight(mission(disturbances={"lost": [{"agent": 3, "time": 7.5}]}))
+    found = check(mission(disturbances={"lost": [{"agent": 3, "time": 7.5}]}))
     assert "agent 3 is lost at 7.5 s" in dict(found.words())["disturbances"]
     assert any("as if agent 3 flew on" in remark.text for remark in found.remarks)
     assert found.passed
@@ -390,7 +392,7 @@ def test_losses_are_told_and_judged_as_if_flown_on():
 
 def test_calm_missions_tell_of_no_disturbances():
     """Without [disturbances] there is no line about them."""
-    found = preflight(mission())
+    found = check(mission())
     assert found.disturbed is None
     assert "disturbances" not in dict(found.words())
     assert found.data()["disturbances"] is None
@@ -463,7 +465,7 @@ def test_published_formations(name, control):
         formations={"shape": formation},
         phases=[{"kind": "establish", "formation": "shape", "until": 15.0, "control": control}],
     )
-    found = preflight(flown)
+    found = check(flown)
     rigidity = found.formations[0].rigidity
     assert rigidity is not None
     assert rigidity.verdict == in_space

@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from rigidfleet import physics, simulate
-from rigidfleet.math import attitude, lqr
-from rigidfleet.math import pid as gains
+from rigidfleet.math import attitude, lqr, pid
 from rigidfleet.mission import Mission
 
 CASES = json.loads((Path(__file__).parent / "data" / "reference_cases.json").read_text())["cases"]
@@ -166,7 +165,7 @@ def test_multipliers_at_the_reference_states(name):
 def test_unit_response_of_the_error():
     """The error's closed form, at a triple pole, is the reference's."""
     spec, expected = CASES["01_pid_unit_response"].values()
-    c, _, _ = gains.error_response(
+    c, _, _ = pid.error_response(
         spec["alpha"], spec["beta"], spec["gamma"], spec["c0"], spec["cdot0"], spec["I0"],
         expected["t"],
     )  # fmt: skip

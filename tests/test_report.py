@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rigidfleet import plotting as figures
+from rigidfleet import plotting
 from rigidfleet.assessment import Extreme, Safety, assess, safety
 from rigidfleet.errors import ResultError
 from rigidfleet.mission import Mission
@@ -68,7 +68,7 @@ def quick(monkeypatch):
         for name in names:
             Path(folder, f"{name}.svg").write_text(f"<svg>{name}</svg>", encoding="utf-8")
 
-    monkeypatch.setattr(figures, "plot", draw)
+    monkeypatch.setattr(plotting, "plot", draw)
 
 
 def worst(row: Safety) -> Extreme:
@@ -110,7 +110,7 @@ def test_page_is_whole(calm, tmp_path):
     path = tmp_path / "report.html"
     report(calm, path)
     page = Page(path.read_text(encoding="utf-8"))
-    assert len(page.sources) == len(figures.figure_names(calm)) + 1  # and the answer of the gains
+    assert len(page.sources) == len(plotting.figure_names(calm)) + 1  # and the answer of the gains
     for source in page.sources:
         head, _, data = source.partition(",")
         assert head == "data:image/svg+xml;base64"

@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from rigidfleet.formation import distance_geometry, graphs
-from rigidfleet.formation import shapes as f
+from rigidfleet.formation import distance_geometry, graphs, shapes
 from rigidfleet.math.proximity import smallest_singular_value
 from rigidfleet.rigidity import Kind, Verdict, analyse, full_rank, jacobian, realisations
 
@@ -60,7 +59,7 @@ def blocks(result, p):
 
 def test_cube_of_paper_is_infinitesimally_rigid():
     """The 18 edges of the paper's cube are independent, and w = 0.2586."""
-    result = analyse(f.slots("cube", 4.0, 8), graphs.CUBE_EDGES)
+    result = analyse(shapes.slots("cube", 4.0, 8), graphs.CUBE_EDGES)
     assert result.verdict is RIGID
     assert (result.rank, result.reachable, result.needed) == (18, 18, 18)
     assert result.w == pytest.approx(0.2586, abs=5e-5)
@@ -89,7 +88,7 @@ def test_double_banana_is_flexible_with_as_many_edges():
 )
 def test_flat_shapes_are_at_best_prestress_stable(name, n, edges, rank, flexes):
     """4-8-4, the square and the hexagon reach ranks 2, 5 and 9: a self-stress holds them, no more."""
-    p, graph = f.slots(name, 4.0, n), graphs.complete_graph(n)
+    p, graph = shapes.slots(name, 4.0, n), graphs.complete_graph(n)
     if edges < len(graph):  # the hexagon without its long diagonals
         graph = graph[distance_geometry.distances(p, graph) < 7.9]
     result = analyse(p, graph)
@@ -107,7 +106,7 @@ def test_flat_shapes_are_at_best_prestress_stable(name, n, edges, rank, flexes):
 
 def test_square_without_one_edge_folds():
     """Five edges hold a square in its plane; in space it folds about the diagonal, and one agent moves."""
-    result = analyse(f.slots("square", 4.0, 4), [[0, 1], [1, 2], [2, 3], [0, 3], [0, 2]])
+    result = analyse(shapes.slots("square", 4.0, 4), [[0, 1], [1, 2], [2, 3], [0, 3], [0, 2]])
     assert result.verdict is FLEXIBLE
     assert [flex.agents for flex in result.flexes] == [(1,)]
     assert result.within is not None
@@ -125,14 +124,14 @@ def test_few_agents(n, edges, verdict):
 
 def test_shipped_index_is_that_of_a_flight():
     """The index is the smallest non-zero singular value of J M^-1/2 sqrt(mbar), as recorded in flight."""
-    p, masses = f.slots("cube", 4.0, 8), np.linspace(0.5, 2, 8)
+    p, masses = shapes.slots("cube", 4.0, 8), np.linspace(0.5, 2, 8)
     want = smallest_singular_value(p[None], graphs.CUBE_EDGES, masses)[0]
     assert analyse(p, graphs.CUBE_EDGES, masses=masses).index == pytest.approx(want)
 
 
 def test_force_and_offset_are_reached():
     """In the weakest direction J^T A^-1 b has the norm |b| m / index, and the displacement is |c| / index."""
-    p = f.slots("cube", 4.0, 8)
+    p = shapes.slots("cube", 4.0, 8)
     result, J = analyse(p, graphs.CUBE_EDGES), jacobian(p, graphs.CUBE_EDGES)
     b = np.linalg.svd(J)[0][:, -1]
     A = J @ J.T / 2.0
@@ -252,7 +251,7 @@ def test_flexes_name_the_few():
 
 def test_loose_agent_on_a_flat_shape():
     """Where J is singular because of a rigid part, a loose agent is found by following its motion."""
-    p = np.vstack([f.slots("square", 4.0, 4), [[6, 0.5, 0]]])
+    p = np.vstack([shapes.slots("square", 4.0, 4), [[6, 0.5, 0]]])
     result = analyse(p, [*graphs.complete_graph(4).tolist(), [1, 4], [2, 4]])
     assert result.verdict is FLEXIBLE
     assert result.deformed is not None
@@ -262,7 +261,7 @@ def test_loose_agent_on_a_flat_shape():
 
 def test_sheet_folds_along_its_lines():
     """A grid of crossed squares keeps its plane to second order in no way: it folds along any grid line."""
-    p = f.slots("grid", 1.0, 16)
+    p = shapes.slots("grid", 1.0, 16)
     edges = graphs.complete_graph(16)
     result = analyse(p, edges[distance_geometry.distances(p, edges) < 1.5])
     assert result.verdict is FLEXIBLE
@@ -279,7 +278,7 @@ def test_barely_rigid_says_so():
 
 def test_flexes_of_more_agents_hold_none_of_fewer():
     """A square of four sides: agent 1 leaves the plane, and apart from that 1, 2 and 4 shear within it."""
-    result = analyse(f.slots("square", 4.0, 4), [[0, 1], [1, 2], [2, 3], [0, 3]])
+    result = analyse(shapes.slots("square", 4.0, 4), [[0, 1], [1, 2], [2, 3], [0, 3]])
     fold, shear = result.flexes
     assert (fold.agents, shear.agents) == ((0,), (0, 1, 3))
     np.testing.assert_allclose(np.abs(fold.motion[0]), [0, 0, 1], atol=1e-12)
@@ -325,7 +324,7 @@ def test_space_must_hold_the_shape():
 
 def test_data_counts_from_one():
     """Plain data for JSON name agents and edges as messages do."""
-    data = analyse(f.slots("square", 4.0, 4), graphs.complete_graph(4)).data()
+    data = analyse(shapes.slots("square", 4.0, 4), graphs.complete_graph(4)).data()
     assert data["redundant"][0] == [1, 2]
     assert data["flexes"][0]["agents"] == [1]
     assert data["verdict"] == "prestress-stable"
@@ -396,7 +395,7 @@ def test_named_frameworks_of_pyrigi(pyrigi, name, arguments, verdict):
 
 def test_cube_of_paper_has_folded_twins():
     """The 18 distances of the cube have solutions with coincident agents, found far more often than the cube."""
-    p = f.slots("cube", 4.0, 8)
+    p = shapes.slots("cube", 4.0, 8)
     found = realisations(p, graphs.CUBE_EDGES)
     assert found.found[0].kind is Kind.SAME
     assert not found.unique
@@ -420,7 +419,7 @@ def test_all_distances_leave_only_the_mirror_image(n):
 
 def test_flat_shapes_are_their_own_mirror_images():
     """A hexagon turned over is the hexagon."""
-    found = realisations(f.slots("hexagon", 4.0, 6), graphs.complete_graph(6), starts=40)
+    found = realisations(shapes.slots("hexagon", 4.0, 6), graphs.complete_graph(6), starts=40)
     assert [r.kind for r in found.found] == [Kind.SAME]
 
 
@@ -446,7 +445,7 @@ def test_start_decides_the_side():
 
 def test_search_is_repeatable():
     """The same seed finds the same shapes as often."""
-    p = f.slots("cube", 4.0, 8)
+    p = shapes.slots("cube", 4.0, 8)
     one, two = (realisations(p, graphs.CUBE_EDGES, starts=50, seed=4).data() for _ in range(2))
     assert one == two
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rigidfleet.formation import shapes as formation
+from rigidfleet.formation import shapes
 from rigidfleet.rigidity import Verdict, analyse
 
 
@@ -66,7 +66,7 @@ def test_what_ends_elsewhere_is_noticed():
 
 def test_the_judge_tells_the_ends_apart():
     """A shape as meant, its mirror image, one folded with equal lengths, one whose lengths are not met."""
-    slots = formation.slots("pyramid", 4.0, 5)
+    slots = shapes.slots("pyramid", 4.0, 5)
     case = table.Case("pyramid", slots, slots)
     nine = np.array([[0, 1], [1, 2], [2, 3], [0, 3], [0, 2], [0, 4], [1, 4], [2, 4], [3, 4]])
     folded = slots.copy()

@@ -14,7 +14,8 @@ from rigidfleet.assessment import assess
 from rigidfleet.errors import MissionError
 from rigidfleet.formation import assignment, shapes
 from rigidfleet.mission import Mission, mission_text
-from rigidfleet.preflight.check import planned, preflight
+from rigidfleet.planning.preview import preview
+from rigidfleet.preflight.check import check
 from rigidfleet.simulation.flight import simulate
 
 #: What the flown may be nearer than the planned [m]: tracking is exact but for the integrator's error, 1e-8 of
@@ -91,7 +92,7 @@ def least_and_promised(mission: Mission, legs: list[np.ndarray]) -> list[tuple[f
 
 def planned_ways(seed: int) -> list[tuple[float, float]]:
     mission = random_reshape(seed)
-    return least_and_promised(mission, [leg.position for leg in planned(mission)[0]])
+    return least_and_promised(mission, [leg.position for leg in preview(mission)[0]])
 
 
 def flown_ways(seed: int) -> list[tuple[float, float]]:
@@ -137,7 +138,7 @@ def test_the_first_establishment_keeps_its_room(assignment, attitude):
             data["phases"][0]["roll_deg"] = 70.0 * seed
         del data["formations"]["two"]
         mission = Mission.from_dict(data)
-        legs = [leg.position for leg in planned(mission)[0]]
+        legs = [leg.position for leg in preview(mission)[0]]
         ((least, promised),) = least_and_promised(mission, legs)
         assert least >= promised * (1 - 1e-12), seed
 
@@ -150,7 +151,7 @@ def test_ways_are_straight_and_shortest_where_the_attitude_is_known():
     phases = [establish("a", roll_deg=20.0, pitch_deg=-35.0, yaw_deg=110.0)]
     for rule in ("shortest", "each"):
         mission = fly({"a": slots}, start, phases, assignment=rule)
-        position = planned(mission)[0][0].position
+        position = preview(mission)[0][0].position
         ways = position[-1] - position[0]
         there = about_centre(slots) @ turned.T
         least = min(
@@ -173,7 +174,7 @@ def test_slots_are_assigned_for_the_masses_that_are_flown():
         mission = fly(
             {"a": slots}, start, [establish("a")], assignment="each", agents={"mass": masses}
         )
-        ways = planned(mission)[0][0].ways
+        ways = preview(mission)[0][0].ways
         assert ways is not None
         x, y = (np.asarray(p)[:, None] - np.asarray(p) for p in ways)
         assert (np.sum(x * y, axis=2) >= -1e-12).all()
@@ -185,7 +186,7 @@ def test_the_way_back_keeps_its_room():
     a, b = scattered(rng, 20), scattered(rng, 20)
     phases = [establish("a"), reshape("b"), reshape("a", name="again")]
     mission = fly({"a": a, "b": b}, a, phases, assignment="each", agents={"radius": 0.0})
-    legs = planned(mission)[0]
+    legs = preview(mission)[0]
     promised = min(pdist(a).min(), pdist(b).min()) / np.sqrt(2)
     assert min(pdist(p).min() for leg in legs[1:] for p in leg.position) >= promised
 
@@ -199,7 +200,7 @@ def test_a_grid_becomes_a_standing_wall(assignment):
     """A grid of 25 turns into a wall of 25 that stands, and nobody passes through anybody, by any assignment."""
     phases = [establish("grid"), reshape("wall"), {"kind": "hold", "duration": 1.0}]
     mission = fly({"grid": GRID, "wall": WALL}, GRID, phases, assignment=assignment)
-    assert preflight(mission).passed
+    assert check(mission).passed
     result = simulate(mission)
     verdict = assess(result)
     assert verdict.passed, verdict.summary
@@ -265,7 +266,7 @@ ALOFT = (np.array(FIVE) + [0, 0, 9]).tolist()
 
 
 def collisions(mission: Mission) -> list[str]:
-    return [r.text for r in preflight(mission).remarks if r.topic == "collision"]
+    return [r.text for r in check(mission).remarks if r.topic == "collision"]
 
 
 def test_ways_that_cross_are_found():
@@ -276,7 +277,7 @@ def test_ways_that_cross_are_found():
     assert text.startswith("agents 2 and 3 collide at 7.00 s, in 'swap'")
     assert "their ways from 'a' to 'b' cross, 0.0" in text
     assert 'assignment = "each"' in text
-    assert not preflight(mission).passed
+    assert not check(mission).passed
     cured = Mission.from_dict(mission.to_dict() | {"assignment": "each"})
     assert not collisions(cured)
 
@@ -301,7 +302,7 @@ def test_ways_nearer_than_the_limit_are_found():
         {"a": square, "b": turned}, start, phases, assignment="each", limits={"separation": 1.4}
     )
     texts = collisions(mission)
-    ways = planned(mission)[0][1].ways
+    ways = preview(mission)[0][1].ways
     assert ways is not None
     s = np.linspace(0, 1, 2001)[:, None, None]
     room = min(pdist(p).min() for p in (1 - s) * ways[0] + s * ways[1]) - 0.2
@@ -338,7 +339,7 @@ def test_a_vehicle_that_would_end_underground():
         down = {"kind": "fly", "name": "land", "position": [0.0, 0, z], "duration": 9.0}
         return fly({"a": slots}, start, [establish("a"), down], obstacles=ground)
 
-    (text,) = [r.text for r in preflight(land(0.2)).remarks if r.topic == "obstacle"]
+    (text,) = [r.text for r in check(land(0.2)).remarks if r.topic == "obstacle"]
     # The third slot is 1 m below the centre of mass, its radius 0.1 m.
     assert text.startswith(
         "agent 3 hits 'ground' at 14.00 s, in 'land': its centre comes to z = -0.80 m"
@@ -346,7 +347,7 @@ def test_a_vehicle_that_would_end_underground():
     assert "0.90 m too low" in text
     assert "1.00 m below the centre of mass at z = 0.20 m" in text
     assert "z = 1.10 m or more" in text or "z = 1.11 m or more" in text
-    assert preflight(land(1.12)).passed
+    assert check(land(1.12)).passed
 
 
 # -- the attitude in which a formation is established ------------------------------------------------
@@ -404,7 +405,7 @@ def test_a_formation_is_established_as_it_is_drawn(keys, before, turned, formula
 
 
 def planned_end_is_flown(mission: Mission, result: Any) -> bool:
-    legs, known = planned(mission)
+    legs, known = preview(mission)
     end = about_centre(legs[-1].position[-1])
     return known and bool(np.abs(end - about_centre(result.position[-1])).max() < 1e-3)
 
@@ -467,7 +468,7 @@ def test_a_grid_is_established_level():
     form = {"shape": "grid", "size": 3.0, "edges": []}
     ground = [{"kind": "ground"}]
     mission = fly({"a": form}, start, [establish("a"), down], obstacles=ground)
-    assert preflight(mission).passed
+    assert check(mission).passed
     result = simulate(mission)
     assert assess(result).passed
     assert np.ptp(result.position[-1, :, 2]) < 1e-3

@@ -13,9 +13,8 @@ from scipy.spatial import KDTree
 from rigidfleet import physics
 from rigidfleet.assessment import assess
 from rigidfleet.errors import FlightError
-from rigidfleet.formation import distance_geometry, graphs
-from rigidfleet.formation import shapes as formation
-from rigidfleet.kernel import problem as program
+from rigidfleet.formation import distance_geometry, graphs, shapes
+from rigidfleet.kernel.problem import SLOTS, SQUARED
 from rigidfleet.math import attitude, lqr
 from rigidfleet.mission import Establish, Mission, load_mission, mission_names
 from rigidfleet.planning.plan import plan_phase
@@ -129,7 +128,7 @@ def test_recorded_velocities_are_the_positions_rates():
 def test_edges_that_are_not_active_are_not_numbers():
     """Each formation has its own edges: references and multipliers of the others' are NaN."""
     edges = {"open": [[1, 2], [2, 3]], "closed": [[1, 2], [1, 3]]}
-    slots = formation.slots("triangle", 4.0, 3)
+    slots = shapes.slots("triangle", 4.0, 3)
     mission = a_mission(
         establish(formation="open", until=5.0),
         {"kind": "reshape", "formation": "closed", "duration": 5.0},
@@ -233,10 +232,10 @@ def test_a_show_of_a_thousand_vehicles():
 
 # -- what leads the distances ----------------------------------------------------------------------
 
-TETRAHEDRON = formation.slots("tetrahedron", 4.0, 4)
-CUBE = formation.slots("cube", 4.0, 8)
-NINE = formation.slots("grid", 4.0, 9)
-SQUARE = formation.slots("square", 4.0, 4)
+TETRAHEDRON = shapes.slots("tetrahedron", 4.0, 4)
+CUBE = shapes.slots("cube", 4.0, 8)
+NINE = shapes.slots("grid", 4.0, 9)
+SQUARE = shapes.slots("square", 4.0, 4)
 SHEAR = np.array([[2.0, 0.5, 0.0], [0.0, 1.0, 0.3], [0.0, 0.0, 0.7]])
 
 
@@ -280,7 +279,7 @@ def test_distances_lead_by_squares_where_an_affine_map_leads_to_the_slots(slots,
     phase = mission.phases[0]
     assert leader(mission, start @ turn) == by
     plan = plan_phase(mission, phase, Situation(0.0, start @ turn, 0 * start), 6.0)
-    assert plan.program.reference.kind == {"squares": program.SQUARED, "shape": program.SLOTS}[by]
+    assert plan.program.reference.kind == {"squares": SQUARED, "shape": SLOTS}[by]
     result = simulate(mission)
     wanted = distance_geometry.distances(slots, result.edges)
     np.testing.assert_allclose(result.distance_reference[0], result.distance[0], rtol=1e-12)
@@ -539,7 +538,7 @@ def test_damping_follows_a_slender_shape_once_it_is_taken():
 
 def test_a_law_without_feedback_is_told_of_it():
     """Lengths that drift into a line end a flight whose diagnosis names the feedback that is missing."""
-    triangle = formation.slots("triangle", 4.0, 3)
+    triangle = shapes.slots("triangle", 4.0, 3)
     velocity = np.array([[0, 0.5, 0], [0, -0.5, 0], [-1.5, 0, 0]])
     agents = {"mass": 1.0, "position": triangle + [0, 0, 9.0], "velocity": velocity}
     law = {"solver": "exact", "stabilisation": "none", "deformation_damping": 0.0}
@@ -662,7 +661,7 @@ def test_the_corrected_cube_is_a_cube():
     """All 28 pairs of the corrected Table 4 are those of a cube to 1e-6 m at the end."""
     result = flown("establish-cube")
     pairs = graphs.complete_graph(8)
-    cube = distance_geometry.distances(formation.slots("cube", 4.0, 8), pairs)
+    cube = distance_geometry.distances(shapes.slots("cube", 4.0, 8), pairs)
     found = distance_geometry.distances(result.position[-1], pairs)
     np.testing.assert_allclose(found, cube, rtol=0, atol=1e-6)
     assert distance_geometry.handedness(result.position[-1]) == 1

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from rigidfleet.formation import graphs, shapes
-from rigidfleet.kernel import problem as k
-from rigidfleet.kernel.large import block_cholesky as sparse
+from rigidfleet.kernel.large import block_cholesky
 from rigidfleet.kernel.large import solver as large
+from rigidfleet.kernel.problem import EXACT, ITERATED, Law, Vehicles, workspace
 from rigidfleet.mission import Mission
 from rigidfleet.planning import solvers
 from rigidfleet.rigidity import jacobian
@@ -30,11 +30,11 @@ def directions(p, edges) -> np.ndarray:
 
 def solver_of(p, edges, masses, law, *, sweep=False, tolerance=1e-13) -> large.LargeSolver:
     """A solver in the state p (N, 3)."""
-    law = k.Law(3.0, 12**0.5, 8.0, law, 0.03, 3, 0.1, 1e-12, 0.0)
-    vehicles = k.Vehicles(
+    law = Law(3.0, 12**0.5, 8.0, law, 0.03, 3, 0.1, 1e-12, 0.0)
+    vehicles = Vehicles(
         masses, 1.0 / masses, float(masses.sum()), float(masses.mean()), masses, False, 9.81
     )
-    work = k.workspace(len(p), len(edges), large=True)
+    work = workspace(len(p), len(edges), large=True)
     work.r[:] = p
     work.u[:] = directions(p, edges)
     steps = solvers.sweep_steps(len(p), edges) if sweep else None
@@ -68,8 +68,8 @@ def test_sweep_vertex_graph_and_dense_factor_agree_on_the_exact_law(side, rng):
     A = gram(p, edges, masses)
     assert np.linalg.cond(A) < 1e5
     dense = np.linalg.solve(A, b)
-    swept = solved(solver_of(p, edges, masses, k.EXACT, sweep=True), b)
-    nodes = solved(solver_of(p, edges, masses, k.EXACT), b)
+    swept = solved(solver_of(p, edges, masses, EXACT, sweep=True), b)
+    nodes = solved(solver_of(p, edges, masses, EXACT), b)
     np.testing.assert_allclose(swept, dense, rtol=0, atol=1e-12 * np.abs(dense).max())
     np.testing.assert_allclose(nodes, dense, rtol=0, atol=1e-9 * np.abs(dense).max())
 
@@ -84,7 +84,7 @@ def test_vertex_graph_is_the_damped_law_of_redundant_edges(reach, rng):
     y = np.zeros(len(edges))
     for _ in range(3):
         y = np.linalg.solve(regular, mbar * b + mu * y)
-    found = solved(solver_of(p, edges, masses, k.ITERATED), b)
+    found = solved(solver_of(p, edges, masses, ITERATED), b)
     np.testing.assert_allclose(found, y, rtol=0, atol=1e-9 * np.abs(y).max())
 
 
@@ -92,7 +92,7 @@ def test_factor_is_kept_while_the_formation_turns(rng):
     """One factor serves a formation turned by any angle; one that has changed its shape gets a new one."""
     p = shapes.slots("sphere", 1.0, 200)
     edges = graphs.neighbours(p)
-    solver = solver_of(p, edges, np.ones(200), k.ITERATED, tolerance=1e-10)
+    solver = solver_of(p, edges, np.ones(200), ITERATED, tolerance=1e-10)
     b = rng.normal(size=len(edges))
     before = solved(solver, b)
     c, s = np.cos(2.0), np.sin(2.0)
@@ -124,10 +124,10 @@ def test_a_solve_starts_from_the_best_of_past_solutions(rng):
     wanted = 3.0 * past[0] + 0.5 * past[1]
     x, gram = np.full((64, 3), np.nan), np.empty((4, 6))
     g = (K @ wanted.ravel()).reshape(64, 3)
-    sparse.project(u, edges, masses, mbar, mu, g, past, gram, x)
+    block_cholesky.project(u, edges, masses, mbar, mu, g, past, gram, x)
     np.testing.assert_allclose(x, wanted, atol=1e-9)
     g = rng.normal(size=(64, 3))
-    sparse.project(u, edges, masses, mbar, mu, g, past, gram, x)
+    block_cholesky.project(u, edges, masses, mbar, mu, g, past, gram, x)
     rest = g - (K @ x.ravel()).reshape(64, 3)
     np.testing.assert_allclose((past * rest).sum(axis=(1, 2)), 0.0, atol=1e-9)
 
@@ -138,7 +138,7 @@ def test_solves_along_a_motion_take_fewer_iterations(rng):
     edges, b = graphs.neighbours(p), rng.normal(size=len(graphs.neighbours(p)))
     taken = {}
     for past in (True, False):
-        solver = solver_of(p, edges, np.ones(200), k.ITERATED, tolerance=1e-8)
+        solver = solver_of(p, edges, np.ones(200), ITERATED, tolerance=1e-8)
         for step in range(12):
             bent = p * [1.0, 1.0, 1.0 + 0.002 * step]
             solver.workspace.r[:], solver.workspace.u[:] = bent, directions(bent, edges)
@@ -154,10 +154,10 @@ def test_pattern_without_fill_solves_as_well(rng, monkeypatch):
     p = lattice(6)
     edges, masses = graphs.neighbours(p, 1.5), np.ones(216)
     b = rng.normal(size=len(edges))
-    full = solver_of(p, edges, masses, k.ITERATED)
+    full = solver_of(p, edges, masses, ITERATED)
     want = solved(full, b)
     monkeypatch.setattr(large, "_FILL", 0.0)
-    lean = solver_of(p, edges, masses, k.ITERATED)
+    lean = solver_of(p, edges, masses, ITERATED)
     np.testing.assert_allclose(solved(lean, b), want, atol=1e-9 * np.abs(want).max())
     assert full.pattern is not None
     assert lean.pattern is not None
@@ -169,11 +169,15 @@ def test_factor_is_that_of_the_matrix(rng):
     """L L^T is K, block by block, in the order of the dissection."""
     p = lattice(4)
     edges, masses = graphs.neighbours(p, 1.5), rng.uniform(0.5, 2.0, 64)
-    found = sparse.pattern(64, edges, solvers.dissection(p, edges), 1e9)
+    found = block_cholesky.pattern(64, edges, solvers.dissection(p, edges), 1e9)
     blocks, at = np.empty((len(found.row), 9)), np.empty(64, dtype=np.int64)
     u = directions(p, edges)
-    sparse.assemble(u, edges, masses, 1.3, 0.1, found.place, found.column, found.of_edge, blocks)
-    assert sparse.factor(found.column, found.row, found.first, found.left, found.block, blocks, at)
+    block_cholesky.assemble(
+        u, edges, masses, 1.3, 0.1, found.place, found.column, found.of_edge, blocks
+    )
+    assert block_cholesky.factor(
+        found.column, found.row, found.first, found.left, found.block, blocks, at
+    )
     L = np.zeros((64, 3, 64, 3))
     column = np.repeat(np.arange(64), np.diff(found.column))
     L[found.row, :, column] = blocks.reshape(-1, 3, 3)
@@ -196,7 +200,7 @@ def test_a_lost_pivot_falls_back_and_is_counted(rng):
     i, mine = steps[-1, 0], steps[-1, 1:]
     a, b, c = (int(x) for x in edges[mine].sum(axis=1) - i)
     p[i] = 0.5 * p[a] + 0.2 * p[b] + 0.3 * p[c]
-    solver = solver_of(p, edges, np.ones(27), k.EXACT, sweep=True, tolerance=1e-12)
+    solver = solver_of(p, edges, np.ones(27), EXACT, sweep=True, tolerance=1e-12)
     # A right side that some motion has, so that the singular system has a solution.
     found = solved(solver, jacobian(p, edges) @ rng.normal(size=81))
     assert solver.counts.fallbacks == 1
@@ -209,7 +213,7 @@ def test_what_is_not_finite_has_no_solution(rng):
     """NaN goes in, NaN comes out, and the next solve is none the worse."""
     p = lattice(4)
     edges = graphs.neighbours(p, 1.5)
-    solver = solver_of(p, edges, np.ones(64), k.ITERATED)
+    solver = solver_of(p, edges, np.ones(64), ITERATED)
     b = rng.normal(size=len(edges))
     want = solved(solver, b)
     assert np.isnan(solved(solver, b * np.nan)).all()

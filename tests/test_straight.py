@@ -6,12 +6,10 @@ import numba
 import numpy as np
 import pytest
 
-from rigidfleet.kernel import problem as program
 from rigidfleet.kernel.compiler.simd import pack, unpack
-from rigidfleet.kernel.engine import codegen as straight
-from rigidfleet.kernel.engine import native
+from rigidfleet.kernel.engine import codegen, native
 from rigidfleet.kernel.engine.tracer import Code, Trace, UnfitError, elimination_order, structure
-from rigidfleet.kernel.problem import Program
+from rigidfleet.kernel.problem import Program, workspace
 from rigidfleet.mission import Mission
 from rigidfleet.planning.plan import plan_phase
 from rigidfleet.planning.reference import Situation
@@ -63,7 +61,7 @@ def make(agents: int, data: dict[str, Any]) -> tuple[Program, np.ndarray]:
 def derivative(p: Program, y: np.ndarray, t: float) -> np.ndarray:
     """dy/dt by the compiled kernel of single flights."""
     n, m = len(p.vehicles.m), len(p.graph.edges)
-    w = program.workspace(n, m, solver=p.law.solver)
+    w = workspace(n, m, solver=p.law.solver)
     out = native.record(p, w, np.array([t]), y[None])
     return np.concatenate([out.v[0].ravel(), out.a[0].ravel(), out.c[0]])
 
@@ -71,12 +69,12 @@ def derivative(p: Program, y: np.ndarray, t: float) -> np.ndarray:
 @numba.njit(error_model="numpy")
 def call(p, y, dy, t):
     """dy/dt by straight-line code, of eight states."""
-    straight._closed_loop(t, y, dy, p, None)
+    codegen._closed_loop(t, y, dy, p, None)
 
 
 def in_lanes(p: Program, y: np.ndarray, t: float) -> np.ndarray:
     """dy/dt (8, n) of states y (8, n)."""
-    ready = straight.straight(p)
+    ready = codegen.straight(p)
     before = pack(np.repeat(p.reference.d0[:, None], 8, axis=1))
     dy = pack(np.zeros_like(y.T))
     call(ready._replace(before=before), pack(y.T), dy, t)

@@ -21,7 +21,7 @@ from rich.console import Console
 from scipy import stats
 
 from rigidfleet.cli import app as cli
-from rigidfleet.cli import console as screen
+from rigidfleet.cli import console
 from rigidfleet.errors import ResultError, RigidfleetError, SweepError
 from rigidfleet.mission import Mission
 from rigidfleet.sweep import METRICS, Sweep, Table, fly, load, read
@@ -830,7 +830,7 @@ def test_little_is_drawn_as_well(tmp_path):
 @pytest.fixture
 def folder(tmp_path, monkeypatch) -> Path:
     monkeypatch.chdir(tmp_path)
-    screen.console.cache_clear()
+    console.console.cache_clear()
     Path("pair.toml").write_text(MISSION.text)
     return tmp_path
 
@@ -869,7 +869,7 @@ def test_command(folder, capsys):
 
 def test_progress_words():
     """Progress says the runs flown, their rate without starts, the time left and the failures."""
-    watch = screen.SweepWatch()
+    watch = console.SweepWatch()
     assert watch._words() == ""
     watch.update(SweepProgress(0, 5000, 0, 0, 0.0, 1))
     watch.update(SweepProgress(8, 5000, 8, 0, 20.0, 1))

@@ -8,7 +8,7 @@
 import numpy as np
 
 import rigidfleet as rf
-from rigidfleet import plotting as figures
+from rigidfleet import plotting
 from rigidfleet.formation.graphs import complete_graph
 from rigidfleet.mission import Mission
 from rigidfleet.rigidity import analyse
@@ -80,10 +80,10 @@ mission = Mission.from_dict(
 result = rf.simulate(mission)
 verdict = rf.assess(result)
 print(verdict.summary)
-figures.trajectory(result)
+plotting.trajectory(result)
 
 # %%
-figures.clearance(result)
+plotting.clearance(result)
 
 # %% [markdown]
 # ## To send it on

@@ -6,8 +6,8 @@
 
 # %%
 import rigidfleet as rf
-from rigidfleet import plotting as figures
-from rigidfleet.math import pid as gains
+from rigidfleet import plotting
+from rigidfleet.math import pid
 
 # %% [markdown]
 # ## Table 1: a triangle, a line, a triangle
@@ -18,7 +18,7 @@ from rigidfleet.math import pid as gains
 # %%
 triangle = rf.simulate(rf.load_mission("establish-triangle"))
 print(rf.assess(triangle).summary)
-figures.distances(triangle)
+plotting.distances(triangle)
 
 # %% [markdown]
 # The paper's distances *jump*, and its law inverts a matrix that has no inverse on the line. Flown as
@@ -35,7 +35,7 @@ print(printed.ending)
 
 # %%
 p = 2.0
-print(f"gains {gains.triple_pole(p)}, overshoot {gains.overshoot(*gains.triple_pole(p)):.1%}")
+print(f"gains {pid.triple_pole(p)}, overshoot {pid.overshoot(*pid.triple_pole(p)):.1%}")
 print(f"foretold {6.0 + 1.618 / p:.2f} s, flown {printed.phases[-1].t_end:.2f} s")
 
 # %% [markdown]
@@ -47,10 +47,10 @@ print(f"foretold {6.0 + 1.618 / p:.2f} s, flown {printed.phases[-1].t_end:.2f} s
 # %%
 waypoint = rf.simulate(rf.load_mission("single-waypoint"))
 print(rf.assess(waypoint).summary)
-figures.cm(waypoint)
+plotting.cm(waypoint)
 
 # %%
-figures.attitude(waypoint)
+plotting.attitude(waypoint)
 
 # %% [markdown]
 # ## Table 3: the narrow passage
@@ -61,7 +61,7 @@ figures.attitude(waypoint)
 # %%
 passage = rf.simulate(rf.load_mission("narrow-passage"))
 print(rf.assess(passage).summary)
-figures.trajectory(passage)
+plotting.trajectory(passage)
 
 # %% [markdown]
 # ## Table 4: a cube that is none
@@ -74,4 +74,4 @@ for name in ("establish-cube-as-printed", "establish-cube"):
     cube = rf.simulate(rf.load_mission(name))
     error = abs(cube.constraint[-1]).max()
     print(f"{name}: greatest error of a distance {error:.1e} m\n{rf.assess(cube).summary}\n")
-figures.formations(cube)
+plotting.formations(cube)

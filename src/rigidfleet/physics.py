@@ -11,14 +11,29 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigidfleet.kernel import constraint, references
-from rigidfleet.kernel import problem as k
-from rigidfleet.kernel import rigid_body as body
+from rigidfleet.kernel import constraint, references, rigid_body
+from rigidfleet.kernel.problem import (
+    EXACT,
+    ITERATED,
+    PINV,
+    PINV_EQUAL,
+    PINV_INERTIA,
+    PINV_INERTIA_FORCE,
+    RIGID,
+    SLOTS,
+    SPECTRAL,
+    SQUARED,
+    Law,
+    Reference,
+    Vehicles,
+    workspace,
+)
+from rigidfleet.kernel.problem import graph as kernel_graph
 from rigidfleet.planning.reference import about_cm, align_slots
 from rigidfleet.typing import Floats, Ints
 
-_SOLVERS = {"iterated": k.ITERATED, "spectral": k.SPECTRAL, "exact": k.EXACT, "pinv": k.PINV}
-_SPLITS = {"equal": k.PINV_EQUAL, "inertia": k.PINV_INERTIA, "inertia+force": k.PINV_INERTIA_FORCE}
+_SOLVERS = {"iterated": ITERATED, "spectral": SPECTRAL, "exact": EXACT, "pinv": PINV}
+_SPLITS = {"equal": PINV_EQUAL, "inertia": PINV_INERTIA, "inertia+force": PINV_INERTIA_FORCE}
 
 
 class ConstraintForce(NamedTuple):
@@ -70,14 +85,14 @@ def constraint_force(
     """
     m, r = _masses_and_points(masses, r)
     n = len(m)
-    graph = k.graph(_edges(edges, n), m)
+    graph = kernel_graph(_edges(edges, n), m)
     e = len(graph.edges)
     if solver not in _SOLVERS:
         raise ValueError(f"unknown solver {solver!r}; choose one of {', '.join(_SOLVERS)}")
-    w = k.workspace(n, e)
+    w = workspace(n, e)
     w.d[:], w.d_dot[:], w.d_ddot[:] = d, d_dot, d_ddot
     v, f = _full(v, (n, 3), "v"), _full(f_E, (n, 3), "f_E")
-    law = k.Law(
+    law = Law(
         float(alpha), float(beta), float(gamma), _SOLVERS[solver], float(damping), int(iterations),
         float(threshold), float(cutoff), 0.0,
     )  # fmt: skip
@@ -122,13 +137,13 @@ def allocate(
             f" torque_split one of {', '.join(_SPLITS)}"
         )
     n = len(m)
-    w = k.workspace(n, 0, with_h=method == "pinv")
-    body.inertia(x, m, np.zeros(3), w.I)
-    body.inertia_inverse(w.I, w.I_inv)
+    w = workspace(n, 0, with_h=method == "pinv")
+    rigid_body.inertia(x, m, np.zeros(3), w.I)
+    rigid_body.inertia_inverse(w.I, w.I_inv)
     f = np.zeros((n, 3))
-    body.allocate(
+    rigid_body.allocate(
         x, m, m.sum(), _full(F, (3,), "F"), _full(tau, (3,), "tau"), _full(omega, (3,), "omega"),
-        k.RIGID if method == "rigid" else _SPLITS[torque_split], w.I, w.I_inv, f, w.H, w.H_V, w.H_w,
+        RIGID if method == "rigid" else _SPLITS[torque_split], w.I, w.I_inv, f, w.H, w.H_V, w.H_w,
     )  # fmt: skip
     return f
 
@@ -162,7 +177,7 @@ def shape_schedule(
     p1 = _full(p1, p0.shape, "p1")
     dp = align_slots(about_cm(p0, m), about_cm(p1, m), m)[0] if align else p1 - p0
     zero = np.zeros(0)
-    ref = k.Reference(k.SLOTS, float(start), float(blend), zero, zero, p0, dp, np.zeros(3))
+    ref = Reference(SLOTS, float(start), float(blend), zero, zero, p0, dp, np.zeros(3))
     return _schedule(ref, _edges(edges, len(p0)), times)
 
 
@@ -175,26 +190,26 @@ def distance_schedule(
     """
     d0 = np.atleast_1d(np.asarray(d0, dtype=float))
     d1 = _full(d1, d0.shape, "d1")
-    ref = k.Reference(
-        k.SQUARED, float(start), float(blend), d0, d1, np.zeros((0, 3)), np.zeros((0, 3)),
+    ref = Reference(
+        SQUARED, float(start), float(blend), d0, d1, np.zeros((0, 3)), np.zeros((0, 3)),
         np.zeros(3),
     )  # fmt: skip
     return _schedule(ref, np.zeros((len(d0), 2), dtype=np.int64), times)
 
 
-def _schedule(ref: k.Reference, edges: Ints, times: ArrayLike) -> tuple[Floats, Floats, Floats]:
+def _schedule(ref: Reference, edges: Ints, times: ArrayLike) -> tuple[Floats, Floats, Floats]:
     t = np.atleast_1d(np.asarray(times, dtype=float))
     p = np.zeros((3, *ref.p0.shape))
     out = np.zeros((3, len(t), len(edges)))
     for row, time in enumerate(t):
-        if ref.kind == k.SLOTS:
+        if ref.kind == SLOTS:
             references.blend_slots(time, ref, *p)
         references.distance_references(time, ref, edges, *p, *out[:, row])
     return out[0], out[1], out[2]
 
 
-def _vehicles(m: Floats) -> k.Vehicles:
-    return k.Vehicles(
+def _vehicles(m: Floats) -> Vehicles:
+    return Vehicles(
         m, 1.0 / m, float(m.sum()), float(m.mean()), np.full(len(m), np.inf), False, 0.0
     )
 

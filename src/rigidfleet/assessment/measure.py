@@ -21,7 +21,6 @@ from rigidfleet.assessment.verdict import (
 from rigidfleet.formation import distance_geometry
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity, rigid_body
-from rigidfleet.math import proximity as geometry
 from rigidfleet.result import PAD, PhaseRecord, Result
 from rigidfleet.typing import Bools, Floats, Ints
 
@@ -111,13 +110,13 @@ class Flight:
         self.samples = [result.samples(k) for k in range(len(result.phases))]
         radius, obstacles = self.mission.agents.radius, self.mission.obstacles
         #: Room of each agent to obstacles, and the nearest one (K, N).
-        self.room, self.nearest = geometry.rooms(result.position, radius, obstacles)
+        self.room, self.nearest = proximity.rooms(result.position, radius, obstacles)
         if not self.left.all():
             self.room[~self.left] = np.inf
         #: Separation, pair, clearance, agent and obstacle at samples (K, ...).
         self.close = (
-            *geometry.separation_of_left(result.position, radius, self.left),
-            *geometry.least_room(self.room, self.nearest),
+            *proximity.separation_of_left(result.position, radius, self.left),
+            *proximity.least_room(self.room, self.nearest),
         )
         thrust = _length(result.input_force + result.constraint_force)
         if self.mission.agents.saturate:
@@ -222,7 +221,9 @@ class Flight:
 
     def below(self) -> Extreme | None:
         """Least vertical room [m] between two agents of which one is below the other."""
-        least, pair = geometry.headroom(self.result.position, self.mission.agents.radius, self.left)
+        least, pair = proximity.headroom(
+            self.result.position, self.mission.agents.radius, self.left
+        )
         sampled = self.extreme(least, lambda k: names(pair[k]), lambda x: -x)
         return self.worst("separation_below", sampled, lambda x: -x)
 
@@ -301,7 +302,7 @@ class Flight:
     def contradictions(self) -> Iterator[tuple[str, float]]:
         """What in the record does not follow from its own positions and forces: in words, and when [s]."""
         result, time = self.result, self.result.time
-        length = geometry.lengths(result.position, result.edges).T
+        length = proximity.lengths(result.position, result.edges).T
         rounding = 1e-9 * (1.0 + float(np.nanmax(np.abs(result.position), initial=0.0)))
         with np.errstate(invalid="ignore"):  # infinity where there is nothing to be near
             stored = {

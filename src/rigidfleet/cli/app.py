@@ -271,7 +271,7 @@ def check(
         ]
         screen.print_json({"mission": mission, "right": False, "findings": findings})
         return BAD_INPUT
-    from rigidfleet.preflight.check import preflight
+    from rigidfleet.preflight.check import check as preflight
 
     with watch:
         ahead = preflight(found, search=realisations, progress=watch.update)
@@ -506,7 +506,7 @@ def new(
     """
     from rigidfleet.mission import Mission
     from rigidfleet.mission import draft as drafts
-    from rigidfleet.preflight.check import preflight
+    from rigidfleet.preflight.check import check as preflight
     from rigidfleet.result import write_file
 
     given: dict[str, Any] = {
@@ -671,7 +671,7 @@ def live(
     no_browser : bool
         Only print the address.
     """
-    from rigidfleet.kernel import is_compiled
+    from rigidfleet.kernel.engine.native import is_compiled
     from rigidfleet.mission import load_mission
 
     flown = load_mission(mission)
@@ -924,7 +924,7 @@ def _fly_sweep(
     watch: screen.SweepWatch | None,
 ) -> Any:
     """Fly a sweep; returns the table of its rows."""
-    from rigidfleet.kernel import is_compiled
+    from rigidfleet.kernel.engine.native import is_compiled
     from rigidfleet.sweep import fly
 
     if watch is not None and not is_compiled():
@@ -944,7 +944,7 @@ def _fly_sweep(
 
 def _fly(mission: Mission, watch: screen.FlightWatch | None) -> tuple[Result, bool]:
     """Result of a mission, and whether the flight was interrupted."""
-    from rigidfleet.kernel import is_compiled
+    from rigidfleet.kernel.engine.native import is_compiled
 
     if watch is not None and not is_compiled():
         watch.compiling()

@@ -5,6 +5,3 @@ everything it reads, a `Workspace` everything it writes. Flights call its machin
 `rigidfleet.kernel.engine.native`, which needs the compiler only where that is not in the cache; to import
 the modules of the physics themselves imports Numba.
 """
-
-from rigidfleet.kernel.compiler.cache import cache_directory as cache_directory
-from rigidfleet.kernel.engine.native import is_compiled as is_compiled

@@ -12,7 +12,8 @@ the named solves differ only in what they do there.
 
 import math
 
-from rigidfleet.kernel.compiler.jit import call_solver, compiled, inlined
+from rigidfleet.kernel.compiler.calls import call_solver
+from rigidfleet.kernel.compiler.jit import compiled, inlined
 from rigidfleet.kernel.linalg import cholesky, cholesky_solve, jacobi_eigen
 from rigidfleet.kernel.problem import EXACT, ITERATED, PINV, SPECTRAL
 from rigidfleet.kernel.references import distance_references

@@ -19,7 +19,8 @@ import math
 
 import numpy as np
 
-from rigidfleet.kernel.compiler.jit import call_recorder, compiled
+from rigidfleet.kernel.compiler.calls import call_recorder
+from rigidfleet.kernel.compiler.jit import compiled
 from rigidfleet.kernel.compiler.pointers import by_address
 from rigidfleet.kernel.gauge import read_gauge
 from rigidfleet.kernel.records import (

@@ -2,16 +2,17 @@
 
 import math
 
-from rigidfleet.kernel.compiler.jit import compiled
-from rigidfleet.kernel.problem import SLOTS, SQUARED
+from rigidfleet.kernel.compiler.jit import compiled, inlined
+from rigidfleet.kernel.problem import SLOTS, SQUARED, septic_polynomial
+
+blend = inlined(septic_polynomial)
 
 
 @compiled
 def septic(t, t0, T_b):
     """Blend s from 0 to 1 over [t0, t0 + T_b] with three vanishing derivatives at either end.
 
-    s = 35 tau^4 - 84 tau^5 + 70 tau^6 - 20 tau^7. Returns s, ds/dt [1/s], d2s/dt2 [1/s^2];
-    T_b = 0 is a step.
+    Returns s, ds/dt [1/s], d2s/dt2 [1/s^2]; T_b = 0 is a step.
     """
     if t >= t0 + T_b:
         return 1.0, 0.0, 0.0
@@ -19,8 +20,8 @@ def septic(t, t0, T_b):
         return 0.0, 0.0, 0.0
     x = (t - t0) / T_b
     rest = 1.0 - x
-    s = x**4 * (35.0 - x * (84.0 - x * (70.0 - 20.0 * x)))
-    return s, 140.0 * (x * rest) ** 3 / T_b, 420.0 * (x * rest) ** 2 * (rest - x) / T_b**2
+    rate, second = 140.0 * (x * rest) ** 3, 420.0 * (x * rest) ** 2 * (rest - x)
+    return blend(x), rate / T_b, second / T_b**2
 
 
 @compiled

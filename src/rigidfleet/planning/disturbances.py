@@ -10,7 +10,8 @@ import math
 
 import numpy as np
 
-from rigidfleet.kernel import problem as k
+from rigidfleet.kernel.problem import Disturbance, Program, graph
+from rigidfleet.kernel.problem import calm as kernel_calm
 from rigidfleet.math import turbulence
 from rigidfleet.mission import Establish, Gusts, Mission
 from rigidfleet.mission.disturbances import gust_step, intensity
@@ -20,10 +21,10 @@ from rigidfleet.typing import Bools, Floats
 NOTHING = 1e-20
 
 
-def disturbance(mission: Mission) -> k.Disturbance:
+def disturbance(mission: Mission) -> Disturbance:
     """What acts on a mission besides its laws, from its start to its latest end; no vehicle lost yet."""
     d = mission.disturbances
-    calm = k.calm(np.array(mission.agents.mass))
+    calm = kernel_calm(np.array(mission.agents.mass))
     if d is None:
         return calm
     wind = np.array(d.wind)
@@ -99,13 +100,13 @@ def _places(mission: Mission) -> Floats:
 
 
 def without(
-    program: k.Program,
+    program: Program,
     edges: Bools,
     lost: Bools,
     mu: float,
     *,
     large: bool = False,
-) -> k.Program:
+) -> Program:
     """A program for those that are left: ``edges`` (m,) kept of its own, agents ``lost`` (N,) without thrust.
 
     In the laws the lost count for nothing: their masses there are `NOTHING`, and the mean mass, on whose scale the
@@ -117,7 +118,7 @@ def without(
     return program._replace(
         vehicles=program.vehicles._replace(m=m, inverse=1.0 / m, M=float(m.sum()), mean=mean),
         law=program.law._replace(mu=mu),
-        graph=k.graph(program.graph.edges[edges], m, large=large),
+        graph=graph(program.graph.edges[edges], m, large=large),
         reference=reference._replace(d0=reference.d0[edges], d1=reference.d1[edges]),
         control=control._replace(force=np.where(lost[:, None], 0.0, control.force)),
         disturbance=program.disturbance._replace(lost=lost.copy()),

@@ -12,7 +12,32 @@ from functools import lru_cache
 import numpy as np
 
 from rigidfleet.formation import distance_geometry, graphs
-from rigidfleet.kernel import problem as k
+from rigidfleet.kernel.problem import (
+    BODY,
+    CONSTANT,
+    EXACT,
+    ITERATED,
+    LOCAL,
+    OPEN,
+    PINV,
+    PINV_EQUAL,
+    PINV_INERTIA,
+    PINV_INERTIA_FORCE,
+    RIGID,
+    SLOTS,
+    SPECTRAL,
+    SQUARED,
+    Control,
+    Feedback,
+    Graph,
+    Law,
+    Motion,
+    Program,
+    Reference,
+    Vehicles,
+    calm,
+    graph,
+)
 from rigidfleet.math import lqr
 from rigidfleet.mission import Establish, Fly, Mission, Phase, Regulator, Reshape, Turn
 from rigidfleet.planning import solvers
@@ -29,18 +54,18 @@ from rigidfleet.planning.reference import (
 )
 from rigidfleet.typing import Floats, Ints
 
-_SOLVERS = {"iterated": k.ITERATED, "spectral": k.SPECTRAL, "exact": k.EXACT, "pinv": k.PINV}
-_KINDS = {"shape": k.SLOTS, "squares": k.SQUARED, "step": k.CONSTANT}
+_SOLVERS = {"iterated": ITERATED, "spectral": SPECTRAL, "exact": EXACT, "pinv": PINV}
+_KINDS = {"shape": SLOTS, "squares": SQUARED, "step": CONSTANT}
 #: A formation is held from where all pairs are right within this part of the shortest distance.
 _NEAR = 0.1
-_SPLITS = {"equal": k.PINV_EQUAL, "inertia": k.PINV_INERTIA, "inertia+force": k.PINV_INERTIA_FORCE}
+_SPLITS = {"equal": PINV_EQUAL, "inertia": PINV_INERTIA, "inertia+force": PINV_INERTIA_FORCE}
 
 
 @dataclass
 class PhasePlan:
     """A phase, ready to fly."""
 
-    program: k.Program
+    program: Program
     edges: Ints  # (m, 2), from 0
     slots: Floats | None  # (N, 3) at the end, about the CM, body axes [m]
     formation: str | None
@@ -69,18 +94,18 @@ def plan_phase(mission: Mission, phase: Phase, now: Situation, t_end: float) -> 
     left = masses if now.lost is None else np.where(now.lost, 0.0, masses)
     before = slots_before(mission, now, left)
     after = target if shaping and target is not None else before
-    kind, T_b = k.CONSTANT, 0.0
+    kind, T_b = CONSTANT, 0.0
     if shaping:
         T_b = 0.0 if phase.reference == "step" else phase.blend
         kind = _KINDS[led_by(mission, phase, before, target)]
     elif phase.control == "slots" and np.allclose(
         d1, distance_geometry.distances(before, edges), rtol=1e-12
     ):
-        kind = k.SLOTS
+        kind = SLOTS
     dp, turn = np.zeros_like(before), np.zeros(3)
     if shaping:
         dp, turn = align_slots(before, after, left, turned)
-    reference = k.Reference(kind, now.t, T_b, d0, d1, before, dp, turn)
+    reference = Reference(kind, now.t, T_b, d0, d1, before, dp, turn)
 
     goal, arrival = goal_of(phase, now, t_end)
     motion, feedback = _REST, _NO_FEEDBACK
@@ -94,10 +119,10 @@ def plan_phase(mission: Mission, phase: Phase, now: Situation, t_end: float) -> 
         feedback = _feedback(mission, goal, now.t, arrival, moves=moves)
     method = solvers.choose(len(masses), edges, mission.constraint.solver)
     held = _held(mission, name, now) if method == "dense" else None
-    program = k.Program(
+    program = Program(
         body_formulation=mission.formulation == "body",
         has_frame=frame is not None,
-        vehicles=k.Vehicles(
+        vehicles=Vehicles(
             masses, 1.0 / masses, float(masses.sum()), float(masses.mean()),
             np.array(mission.agents.thrust_limit), mission.agents.saturate, mission.gravity,
         ),
@@ -112,19 +137,17 @@ def plan_phase(mission: Mission, phase: Phase, now: Situation, t_end: float) -> 
         feedback=feedback,
         control=_control(mission, phase, masses),
         external=0,
-        disturbance=k.calm(masses),
+        disturbance=calm(masses),
     )  # fmt: skip
-    slots = (
-        after if phase.control != "open" or kind == k.SLOTS else target if shaping else now.slots
-    )
+    slots = after if phase.control != "open" or kind == SLOTS else target if shaping else now.slots
     return PhasePlan(program, edges, slots, name, d1, goal, arrival, frame, method, held)
 
 
 @lru_cache(64)
-def _graph(edges: bytes, masses: bytes, *, large: bool) -> k.Graph:
+def _graph(edges: bytes, masses: bytes, *, large: bool) -> Graph:
     """The constraint graph, which the kernel only reads: most phases have the one before."""
     pairs = np.frombuffer(edges, dtype=np.int64).reshape(-1, 2).copy()
-    return k.graph(pairs, np.frombuffer(masses), large=large)
+    return graph(pairs, np.frombuffer(masses), large=large)
 
 
 def _held(mission: Mission, name: str | None, now: Situation) -> str | None:
@@ -142,10 +165,10 @@ def _held(mission: Mission, name: str | None, now: Situation) -> str | None:
     return name if near else None
 
 
-def _law(mission: Mission, mu: float, *, damped: bool) -> k.Law:
+def _law(mission: Mission, mu: float, *, damped: bool) -> Law:
     c = mission.constraint
     pid = c.stabilisation == "pid"
-    return k.Law(
+    return Law(
         alpha=c.alpha if pid else 0.0,
         beta=c.beta if pid else 0.0,
         gamma=c.gamma if pid else 0.0,
@@ -158,18 +181,18 @@ def _law(mission: Mission, mu: float, *, damped: bool) -> k.Law:
     )
 
 
-def _control(mission: Mission, phase: Phase, masses: Floats) -> k.Control:
-    kind = {"open": k.OPEN, "slots": k.LOCAL, "body": k.BODY}[phase.control]
+def _control(mission: Mission, phase: Phase, masses: Floats) -> Control:
+    kind = {"open": OPEN, "slots": LOCAL, "body": BODY}[phase.control]
     force = np.tile(np.array(phase.input_force), (len(masses), 1))
     force[:, 2] += masses * mission.gravity
     k1, k2 = lqr.double_integrator_gains(mission.tracking.Q, mission.tracking.R)
     allocation = mission.allocation
-    method = k.RIGID if allocation.method == "rigid" else _SPLITS[allocation.torque_split]
-    return k.Control(kind, force, k1, k2, method)
+    method = RIGID if allocation.method == "rigid" else _SPLITS[allocation.torque_split]
+    return Control(kind, force, k1, k2, method)
 
 
-_REST = k.Motion(np.zeros(2), np.zeros((1, 6, 6)), np.eye(3))
-_NO_FEEDBACK = k.Feedback(
+_REST = Motion(np.zeros(2), np.zeros((1, 6, 6)), np.eye(3))
+_NO_FEEDBACK = Feedback(
     np.zeros(0), np.zeros((0, 4)), np.zeros((0, 4)), 0.0, np.zeros(3), np.zeros(3), np.eye(3), np.zeros(3),
     np.zeros(4),
 )  # fmt: skip
@@ -177,7 +200,7 @@ _NO_FEEDBACK = k.Feedback(
 
 def _motion(
     mission: Mission, start: Pose, goal: Pose, t0: float, arrival: float, t_end: float
-) -> k.Motion:
+) -> Motion:
     """LQR of the virtual body from one pose to another, as the trajectory it makes.
 
     From arrival to ``t_end`` the tracking gains take over, or what the finite horizon has left of
@@ -199,16 +222,14 @@ def _motion(
     knots = np.concatenate([t0 + times, arrival + after[1:]])
     coefficients = np.concatenate(pieces, axis=1)
     # Another layout of an array would be another type, and compile the kernel once more.
-    return k.Motion(knots, np.ascontiguousarray(coefficients), np.ascontiguousarray(goal.T))
+    return Motion(knots, np.ascontiguousarray(coefficients), np.ascontiguousarray(goal.T))
 
 
 def _knots(law: Regulator, T: float) -> Floats:
     return lqr.knots(T, law.Q, law.R, law.S if law.horizon == "finite" else None)
 
 
-def _feedback(
-    mission: Mission, goal: Pose, t0: float, arrival: float, *, moves: bool
-) -> k.Feedback:
+def _feedback(mission: Mission, goal: Pose, t0: float, arrival: float, *, moves: bool) -> Feedback:
     """LQR on the virtual body itself: gain tables to a waypoint, tracking gains where it stays."""
     hold = lqr.double_integrator_gains(mission.tracking.Q, mission.tracking.R) * 2
     to_go, gain, slope = np.zeros(0), np.zeros((0, 4)), np.zeros((0, 4))
@@ -219,7 +240,7 @@ def _feedback(
         to_go = np.concatenate([[0.0], np.geomspace(min(1e-6, 1e-3 * horizon), horizon, 1000)])
         tables = [_gains(law, to_go) for law in (mission.lqr, mission.lqr.attitude)]
         gain, slope = (np.concatenate(columns, axis=1) for columns in zip(*tables, strict=True))
-    return k.Feedback(
+    return Feedback(
         to_go, np.ascontiguousarray(gain), np.ascontiguousarray(slope), arrival, goal.r, goal.v,
         np.ascontiguousarray(goal.T), goal.omega, np.array(hold),
     )  # fmt: skip

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rigidfleet.math import attitude as att
-from rigidfleet.math import proximity as geometry
+from rigidfleet.math import proximity
 from rigidfleet.plotting import style as st
 from rigidfleet.plotting.style import styled
 from rigidfleet.result import Extremum, Result
@@ -553,7 +553,7 @@ def constraint_error(result: Result) -> Figure:
 def room_below(result: Result) -> Floats:
     """Least vertical room (K,) [m] between agents whose spheres overlap seen from above; NaN if none."""
     radius = result.mission.agents.radius
-    least = geometry.headroom(result.position, radius, result.left)[0]
+    least = proximity.headroom(result.position, radius, result.left)[0]
     return np.where(np.isfinite(least), least, np.nan)
 
 

@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rigidfleet import __version__
-from rigidfleet import plotting as figures
+from rigidfleet import __version__, plotting
 from rigidfleet.assessment import Safety, Verdict, assess, safety
 from rigidfleet.assessment.verdict import value
 from rigidfleet.mission import ending, goal
@@ -51,7 +50,7 @@ def contents(
         raise ValueError(f"{len(flights)} results need as many labels and verdicts")
     missions = [flight.mission for flight in flights]
     several = len(flights) > 1
-    colours = figures.agent_colours(len(flights))
+    colours = plotting.agent_colours(len(flights))
     found = [_flight(*each) for each in zip(flights, judged, names, colours, strict=True)]
     response = overlay.response(missions, names)
     return {
@@ -175,7 +174,7 @@ def _vehicles(result: Result) -> list[dict[str, str]]:
     z = result.position[..., 2]
     way = np.linalg.norm(np.diff(result.position, axis=0), axis=2).sum(axis=0)
     shown = np.arange(n) if n <= _VEHICLES else np.sort(np.argsort(-thrust)[:_VEHICLES])
-    colours = figures.agent_colours(n)
+    colours = plotting.agent_colours(n)
     limits = mission.agents.thrust_limit
     return [
         {
@@ -367,12 +366,12 @@ _CAPTIONS = {
 
 def _figures(result: Result) -> list[dict[str, str]]:
     """All figures but the summary, which has a page of its own."""
-    return [_figure(result, name) for name in figures.figure_names(result) if name != "summary"]
+    return [_figure(result, name) for name in plotting.figure_names(result) if name != "summary"]
 
 
 def _figure(result: Result, name: str) -> dict[str, str]:
     with TemporaryDirectory() as folder:
-        figures.plot(result, folder, formats=["svg"], names=[name])
+        plotting.plot(result, folder, formats=["svg"], names=[name])
         svg = Path(folder, f"{name}.svg").read_bytes()
     return _picture(name, svg, _CAPTIONS.get(name, ""))
 

@@ -6,8 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from rigidfleet.math import lqr
-from rigidfleet.math import pid as gains
+from rigidfleet.math import lqr, pid
 
 if TYPE_CHECKING:
     from rigidfleet.mission import Mission, Regulator
@@ -39,7 +38,7 @@ def response(mission: Mission, t: list[float]) -> list[float] | None:
     c = mission.constraint
     if c.stabilisation == "none":
         return None
-    return gains.error_response(c.alpha, c.beta, c.gamma, 1.0, 0.0, 0.0, t)[0].tolist()
+    return pid.error_response(c.alpha, c.beta, c.gamma, 1.0, 0.0, 0.0, t)[0].tolist()
 
 
 def settling(mission: Mission) -> float | None:
@@ -48,7 +47,7 @@ def settling(mission: Mission) -> float | None:
     if c.stabilisation == "none":
         return None
     try:
-        return gains.settling_time(c.alpha, c.beta, c.gamma)
+        return pid.settling_time(c.alpha, c.beta, c.gamma)
     except ValueError:
         return None
 
@@ -60,7 +59,7 @@ def _constraint(mission: Mission) -> list[Line]:
         found.append(Line("constraint force", "no feedback", "errors of distances stay and grow"))
     else:
         gain = f"α = {c.alpha:.4g} /s, β = {c.beta:.4g} /s, γ = {c.gamma:.4g} /s³"
-        poles = ", ".join(_pole(s) for s in gains.poles(c.alpha, c.beta, c.gamma))
+        poles = ", ".join(_pole(s) for s in pid.poles(c.alpha, c.beta, c.gamma))
         found += [
             Line("constraint feedback", gain, "an error c of a distance obeys c‴ + 2α c″ + β² c′ + γ c = 0"),
             Line("its poles", f"{poles} /s", "all on the left: every error dies out"),
@@ -71,7 +70,7 @@ def _constraint(mission: Mission) -> list[Line]:
             found.append(Line("stability margin", f"{margin:.3g}", meaning))
         settled = settling(mission)
         if settled is not None:
-            beyond = 100 * gains.overshoot(c.alpha, c.beta, c.gamma)
+            beyond = 100 * pid.overshoot(c.alpha, c.beta, c.gamma)
             why = "its integral has to return to zero" if c.gamma > 0 else "there is no integral"
             found += [
                 Line("settling", f"{settled:.3g} s", "until an error is below 2 % for good"),

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rigidfleet.kernel.compiler.simd import WIDTH
-from rigidfleet.kernel.engine import batch as ensemble
+from rigidfleet.kernel.engine import batch
 from rigidfleet.mission import Establish, Mission, Phase, Reshape
 from rigidfleet.planning.plan import plan_phase
 from rigidfleet.planning.reference import Situation
@@ -148,8 +148,8 @@ class _Flights:
         y = np.column_stack([self.r.reshape(count, -1), self.v.reshape(count, -1), *sums])
         places, given = _places(self.finished), self.mission.integrator
         velocity = tolerance_of_velocity(given, now.r, program.vehicles.m, law.beta, large=False)
-        shared = ensemble.fits(program) if vectors is None else vectors
-        ends = ensemble.fly_all(
+        shared = batch.fits(program) if vectors is None else vectors
+        ends = batch.fly_all(
             program,
             y[places],
             before[places],

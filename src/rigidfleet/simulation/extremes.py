@@ -15,7 +15,7 @@ from rigidfleet.kernel import records
 from rigidfleet.kernel.engine import native
 from rigidfleet.kernel.problem import Program, Workspace
 from rigidfleet.math import attitude as att
-from rigidfleet.math import proximity as geometry
+from rigidfleet.math import proximity
 from rigidfleet.mission import Box, Ground, Mission
 from rigidfleet.result import PAD, Extremum, PhaseRecord
 from rigidfleet.typing import Bools, Floats
@@ -69,7 +69,7 @@ class Extremes:
         self.who, self.sign = np.full((count, 2), -1), np.zeros(1)
         self.left = np.ones(self.n, dtype=np.bool_)
         self.low = np.full((self.n, 3), np.inf)
-        start, _ = geometry.rooms(np.array(agents.position), self.radius, mission.obstacles)
+        start, _ = proximity.rooms(np.array(agents.position), self.radius, mission.obstacles)
         self.standing = (start <= PAD).astype(np.int64)
         self.pairs = self.columns = self.struck = np.zeros((0, 2), dtype=np.int64)
         self.spare, self.moved = 0.0, np.zeros(2)

@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rigidfleet.errors import FlightError
-from rigidfleet.kernel import problem as k
 from rigidfleet.kernel import records
 from rigidfleet.kernel.engine import native
+from rigidfleet.kernel.problem import LOCAL, OPEN, RIGID, Program, Workspace
+from rigidfleet.kernel.problem import workspace as kernel_workspace
 from rigidfleet.math import attitude as att
 from rigidfleet.mission import Establish, Fly, Mission, Phase, Reshape, Settle, Turn
 from rigidfleet.planning import solvers
@@ -162,12 +163,12 @@ class Leg:
     index: int
     phase: Phase
     plan: PhasePlan
-    workspace: k.Workspace
+    workspace: Workspace
     state: records.Integrator
     t_end: float  # [s] at the latest
     asked: int = 0  # how often the user's controller has been
-    held: k.Program | None = None  # with its force
-    flown: k.Program | None = None  # what the steps in the trail were flown by
+    held: Program | None = None  # with its force
+    flown: Program | None = None  # what the steps in the trail were flown by
     solver: large.LargeSolver | None = (
         None  # of the multipliers, where that is not the kernel itself
     )
@@ -273,13 +274,13 @@ class Flight:
             state.clock[1] = _first_step(plan.program, work, state, scale, t_end - self.now.t)
         return Leg(index, phase, plan, work, state, t_end, solver=solver)
 
-    def _equip(self, plan: PhasePlan) -> tuple[k.Workspace, large.LargeSolver | None]:
+    def _equip(self, plan: PhasePlan) -> tuple[Workspace, large.LargeSolver | None]:
         """Workspace of a plan, and what solves for its multipliers where that is not the kernel itself."""
         program, dense = plan.program, plan.method == "dense"
-        work = k.workspace(
+        work = kernel_workspace(
             len(self.masses),
             len(plan.edges),
-            with_h=program.control.allocation != k.RIGID,
+            with_h=program.control.allocation != RIGID,
             solver=program.law.solver,
             large=not dense,
         )
@@ -289,7 +290,7 @@ class Flight:
         plan.program = program._replace(graph=program.graph._replace(solver=solver.address))
         return work, solver
 
-    def _large(self, plan: PhasePlan, work: k.Workspace) -> large.LargeSolver:
+    def _large(self, plan: PhasePlan, work: Workspace) -> large.LargeSolver:
         """What solves for the multipliers of a large formation, in one phase."""
         from rigidfleet.kernel.large import solver as large
 
@@ -343,7 +344,7 @@ class Flight:
                 leg.asked += 1
             self._integrate(leg, leg.held, min(start + leg.asked / self.rate, t_end))
 
-    def _controlled(self, leg: Leg, controller: Controller) -> k.Program:
+    def _controlled(self, leg: Leg, controller: Controller) -> Program:
         """Ask the user's controller; return the phase's program with its force held."""
         plan, w, y = leg.plan, leg.workspace, leg.state.y
         native.closed_loop(leg.t, y, np.empty_like(y), plan.program, w)
@@ -354,9 +355,9 @@ class Flight:
             w.a_ref.copy(), self.masses.copy(), self.mission.gravity,
         )  # fmt: skip
         f = asked("the controller", leg.t, self.mission.n_agents, controller, seen)
-        return plan.program._replace(control=plan.program.control._replace(kind=k.OPEN, force=f))
+        return plan.program._replace(control=plan.program.control._replace(kind=OPEN, force=f))
 
-    def _integrate(self, leg: Leg, program: k.Program, t_end: float) -> None:
+    def _integrate(self, leg: Leg, program: Program, t_end: float) -> None:
         """Integrate to ``t_end`` [s] through the times at which vehicles are lost.
 
         ``program`` may hold a user's force in place of the phase's own input law.
@@ -368,7 +369,7 @@ class Flight:
             else:
                 self._stretch(leg, program, min(t_end, float(coming.min())))
 
-    def _lose(self, leg: Leg, program: k.Program, now: Bools) -> k.Program:
+    def _lose(self, leg: Leg, program: Program, now: Bools) -> Program:
         """Go on without the vehicles that are lost ``now`` (N,); returns what is flown of a program."""
         self._watch(leg, last=True)
         self.lost = self.lost | now
@@ -397,7 +398,7 @@ class Flight:
         plan.program = without(plan.program, kept, self.lost, mu, large=plan.method != "dense")
         return kept
 
-    def _stretch(self, leg: Leg, program: k.Program, t_end: float) -> None:
+    def _stretch(self, leg: Leg, program: Program, t_end: float) -> None:
         """Integrate to ``t_end`` [s] and record the samples on the way."""
         state = leg.state
         fresh = state.count[0] == 0 or program is not leg.plan.program
@@ -490,10 +491,10 @@ class Flight:
         plan, w = leg.plan, leg.workspace
         native.closed_loop(leg.t, leg.state.y, np.empty_like(leg.state.y), plan.program, w)
         errors = [np.abs(w.c).max(initial=0.0)]
-        local = plan.program.control.kind == k.LOCAL
+        local = plan.program.control.kind == LOCAL
         if local:
             errors.append(np.linalg.norm(w.r - w.r_ref, axis=1)[~self.lost].max())
-        tracks = plan.program.control.kind != k.OPEN
+        tracks = plan.program.control.kind != OPEN
         if tracks and plan.goal is not None and plan.slots is not None:
             goal, since = plan.goal, leg.t - plan.arrival  # it moves on
             left = np.where(self.lost, 0.0, self.masses)
@@ -532,7 +533,7 @@ class Flight:
             q = state.y[6 * n + m : 6 * n + m + 4]
             frame = att.dcm_from_quaternion(q / np.linalg.norm(q))
         pose = None
-        if plan.program.control.kind == k.LOCAL:
+        if plan.program.control.kind == LOCAL:
             pose = Pose(w.body[0].copy(), w.body[1].copy(), w.T_ref.copy(), w.body[3].copy())
         self.now = replace(
             self.now,
@@ -582,7 +583,7 @@ class Flight:
 
     # -- the record -------------------------------------------------------------------------------
 
-    def _record(self, leg: Leg, program: k.Program, times: Floats, samples: Floats) -> None:
+    def _record(self, leg: Leg, program: Program, times: Floats, samples: Floats) -> None:
         """Evaluate forces and references at the samples and keep them."""
         plan, w = leg.plan, leg.workspace
         n, m = len(self.masses), len(plan.edges)
@@ -602,7 +603,7 @@ class Flight:
             q = samples[:, 6 * n + m : 6 * n + m + 4]
             frame = q / np.linalg.norm(q, axis=1, keepdims=True)
         # A frame is attached from the first establishment on, or wherever something is tracked.
-        attached = self.now.slots is not None or plan.program.control.kind != k.OPEN
+        attached = self.now.slots is not None or plan.program.control.kind != OPEN
         integral = samples[:, 6 * n : 6 * n + m]
         self.pieces.append(Piece(leg.index, times, out, integral, frame, plan.edges, attached))
 
@@ -625,7 +626,7 @@ class Flight:
 
 
 def _first_step(
-    program: k.Program, work: k.Workspace, state: records.Integrator, scale: Floats, longest: float
+    program: Program, work: Workspace, state: records.Integrator, scale: Floats, longest: float
 ) -> float:
     """First step [s] to try in a large formation, from two evaluations; at most the ``longest``.
 

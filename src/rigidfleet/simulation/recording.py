@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rigidfleet.math import attitude as att
-from rigidfleet.math import proximity as geometry
+from rigidfleet.math import proximity
 from rigidfleet.result import PhaseRecord, Result
 from rigidfleet.typing import Bools, Floats, Ints
 
@@ -74,7 +74,7 @@ def assemble(
     attitude_reference = np.full((len(r), 4), np.nan)
     commanded = np.isfinite(T_ref[:, 0, 0])
     attitude_reference[commanded] = att.quaternion_from_dcm(T_ref[commanded])
-    omega = geometry.mean_axis_rates(x, y, masses, line)
+    omega = proximity.mean_axis_rates(x, y, masses, line)
     lacking = attached & ~left.all(axis=1)
     offset = np.einsum("kab,ka->kb", T[lacking], centre[lacking])
     cm[lacking] -= offset
@@ -83,10 +83,10 @@ def assemble(
     wrench = np.concatenate([f_u.sum(axis=1), np.cross(x, f_u).sum(axis=1)], axis=1)
     asked = joined("wrench")
     radius = mission.agents.radius
-    room, nearest = geometry.rooms(r, radius, mission.obstacles)
+    room, nearest = proximity.rooms(r, radius, mission.obstacles)
     room[~left] = np.inf
-    separation, pair = geometry.separation_of_left(r, radius, left)
-    clearance, agent, obstacle = geometry.least_room(room, nearest)
+    separation, pair = proximity.separation_of_left(r, radius, left)
+    clearance, agent, obstacle = proximity.least_room(room, nearest)
     _put_extremes(phases, time, (separation, pair, clearance, agent, obstacle))
     edges = mission.edges
     distance = np.linalg.norm(r[:, edges[:, 0]] - r[:, edges[:, 1]], axis=2)
@@ -187,7 +187,7 @@ def _attitudes(
         if np.isnan(near[0, 0, 0]):
             near = last
         who = masses[rows.start] > 0.0
-        T[rows], line[rows] = geometry.fit_attitudes(
+        T[rows], line[rows] = proximity.fit_attitudes(
             x[rows][:, who], p[rows][:, who], masses[rows.start, who], near
         )
         last = T[rows][-1]
@@ -235,5 +235,5 @@ def _singular(r: Floats, edges: Ints) -> Floats:
         return np.full(len(r), np.nan)
     count = min(len(r), max(_LEAST, _WORK // max(size, 1) ** 3))
     some = np.unique(np.linspace(0, len(r) - 1, count).round().astype(np.int64))
-    found = geometry.smallest_singular_value(r[some], edges)
+    found = proximity.smallest_singular_value(r[some], edges)
     return np.interp(np.arange(len(r)), some, found)

@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rigidfleet.sweep import keypaths as paths
+from rigidfleet.sweep import keypaths
 from rigidfleet.sweep.definition import Column, Sweep
 from rigidfleet.sweep.metrics import METRICS
 from rigidfleet.sweep.store import read
@@ -66,7 +66,7 @@ def load(folder: str | Path) -> xarray.Dataset:
 
 def explained(sweep: Sweep, column: Column) -> tuple[str, str]:
     """Unit and meaning of what a column varies."""
-    text = paths.meaning(sweep.mission, column.keys)
+    text = keypaths.meaning(sweep.mission, column.keys)
     units = _UNIT.findall(text)
     unit = "1" if column.variation.change == "scale" or not units else units[-1].replace("-", "1")
     return unit, f"{_ROLE[column.variation.change]}{text}"

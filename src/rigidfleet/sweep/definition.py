@@ -25,7 +25,7 @@ from rigidfleet.mission.findings import Keys, Notes, unknown_key
 from rigidfleet.mission.model import parse_toml, read_text
 from rigidfleet.mission.phases import kind, tables
 from rigidfleet.mission.schema import Part
-from rigidfleet.sweep import keypaths as paths
+from rigidfleet.sweep import keypaths
 from rigidfleet.sweep.variation import (
     KINDS,
     Drawn,
@@ -74,7 +74,7 @@ class Column:
     @property
     def name(self) -> str:
         """Its path, counted from 1."""
-        return paths.name_of(self.keys)
+        return keypaths.name_of(self.keys)
 
 
 class Sweep:
@@ -211,7 +211,7 @@ class Sweep:
     @cached_property
     def whole(self) -> dict[str, Any]:
         """The mission with every default filled in."""
-        return paths.whole_document(self.mission)
+        return keypaths.whole_document(self.mission)
 
     @cached_property
     def columns(self) -> list[Column]:
@@ -220,7 +220,7 @@ class Sweep:
             Column(v, keys, grid)
             for v in self.variations
             for grid in [v.grid if isinstance(v, Gridded) else None]
-            for keys in paths.expand(self.whole, v.path)
+            for keys in keypaths.expand(self.whole, v.path)
         ]
 
     def values(self, run: int) -> list[Any]:
@@ -272,7 +272,9 @@ def is_sweep_file(path: str | Path) -> bool:
 
 def apply(document: dict[str, Any], whole: Mapping[str, Any], column: Column, value: Any) -> None:
     """Change a document by a column's value: every number at its place alike."""
-    integral = all(isinstance(x, int) for x in paths.numbers(paths.look_up(whole, column.keys)))
+    integral = all(
+        isinstance(x, int) for x in keypaths.numbers(keypaths.look_up(whole, column.keys))
+    )
 
     def changed(there: Any) -> Any:
         match column.variation.change:
@@ -285,9 +287,9 @@ def apply(document: dict[str, Any], whole: Mapping[str, Any], column: Column, va
         return round(new) if integral and math.isfinite(new) else new
 
     def replaced(there: Any) -> Any:
-        return paths.mapped(there, changed) if is_number(value) else value
+        return keypaths.mapped(there, changed) if is_number(value) else value
 
-    paths.change(document, whole, column.keys, replaced)
+    keypaths.change(document, whole, column.keys, replaced)
 
 
 # -- the check ---------------------------------------------------------------------------------------
@@ -310,7 +312,7 @@ def _checked(
     own = {key: value for key, value in data.items() if key in Header.model_fields}
     header = notes.validate(Header, own, ())
     by_ends = header is not None and header.judged == "ends"
-    whole = None if mission is None else paths.whole_document(mission)
+    whole = None if mission is None else keypaths.whole_document(mission)
     variations = []
     for k, entry in enumerate(tables(notes, "vary")):
         if k in wrong:
@@ -362,8 +364,8 @@ def _fits(
         return
     where = ("vary", k, "path")
     try:
-        places = paths.expand(whole, path)
-    except paths.PathError as error:
+        places = keypaths.expand(whole, path)
+    except keypaths.PathError as error:
         notes.add(where, error.problem, error.remedy, path)
         return
     if v is None:
@@ -371,7 +373,7 @@ def _fits(
     values = getattr(v, "values", None)
     numeric = values is None or all(map(is_number, values))
     for keys in places:
-        leaves = paths.numbers(paths.look_up(whole, keys))
+        leaves = keypaths.numbers(keypaths.look_up(whole, keys))
         absent = any(x is None for x in leaves)
         table = next((x for x in leaves if isinstance(x, dict)), None)
         if table is not None:
@@ -392,8 +394,8 @@ def _moves_starts(notes: Notes, k: int, v: Variation, whole: dict[str, Any]) -> 
     values = getattr(v, "values", ())
     starts = ("agents", "position"), ("agents", "velocity")
     try:
-        places = paths.expand(whole, v.path)
-    except paths.PathError:
+        places = keypaths.expand(whole, v.path)
+    except keypaths.PathError:
         return  # said already
     if any(keys[:2] not in starts for keys in places) or not all(map(is_number, values)):
         problem = (

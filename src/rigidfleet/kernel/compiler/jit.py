@@ -20,7 +20,6 @@ from numba.core.caching import (
     UserProvidedCacheLocator,
 )
 from numba.core.ccallback import CFunc
-from numba.extending import intrinsic
 
 from rigidfleet.kernel.compiler.cache import cache_directory, not_kept, opened, replacing
 
@@ -77,34 +76,6 @@ def _copy(function: FunctionType, name: str, instead: dict[str, Any]) -> Functio
     copy = FunctionType(function.__code__, function.__globals__ | instead, name)
     copy.__module__, copy.__qualname__ = function.__module__, name
     return copy
-
-
-@intrinsic
-def call_solver(_context, address):
-    """Call the C function at ``address``: void()."""
-    from llvmlite import ir
-
-    def generate(context, builder, signature, arguments):
-        kind = ir.FunctionType(ir.VoidType(), [])
-        builder.call(builder.inttoptr(arguments[0], kind.as_pointer()), [])
-        return context.get_dummy_value()
-
-    return types.void(types.int64), generate
-
-
-@intrinsic
-def call_recorder(_context, address, p, w, stretch, record):
-    """Call `native`'s recorder at ``address``: int64(program, workspace, stretch, record), all of them addresses."""
-    from llvmlite import ir
-
-    def generate(context, builder, signature, arguments):
-        word = ir.IntType(64)
-        kind = ir.FunctionType(word, [word] * 4)
-        function, p, w, *rest = arguments
-        words = [builder.ptrtoint(x, word) for x in (p, w)]
-        return builder.call(builder.inttoptr(function, kind.as_pointer()), [*words, *rest])
-
-    return types.int64(types.int64, p, w, types.int64, types.int64), generate
 
 
 class _Place(UserProvidedCacheLocator):

@@ -19,9 +19,16 @@ import llvmlite.binding as llvm
 from numba import cfunc, typeof, types
 from numba.core import codegen, compiler, cpu, serialize
 
-from rigidfleet.kernel import constraint, control, disturbances, monitor
-from rigidfleet.kernel import dopri5 as flight
-from rigidfleet.kernel import rigid_body as body
+from rigidfleet.kernel import (
+    constraint,
+    control,
+    disturbances,
+    dopri5,
+    dynamics,
+    monitor,
+    recorder,
+    rigid_body,
+)
 from rigidfleet.kernel.compiler.jit import OPTIONS
 from rigidfleet.kernel.compiler.pointers import Pointer, pointer
 from rigidfleet.kernel.engine import native
@@ -41,31 +48,29 @@ _QUICK = ("sroa", "simplify_cfg", "instruction_combine", "simplify_cfg")
 def machine_code(second: "_SecondProcess | None" = None) -> list[bytes]:
     """Object code of the three C functions that `native` calls, `native.ENTRIES`.
 
-    All their arguments are addresses of named tuples. They integrate, and return what `flight.integrate` does,
+    All their arguments are addresses of named tuples. They integrate, and return what `dopri5.integrate` does,
     record, and watch, as `monitor.watch` does. The ``second`` process, if there is one, does part of the work.
     """
     program, workspace, integrator, stretch, record, _ = _pointers()
 
     def integrate_stretch(p, w, state, s):
         call = stretch(s)
-        return flight.integrate(
+        return dopri5.integrate(
             program(p), workspace(w), integrator(state), call.t_end, call.fresh, call.times, call.samples,
             call.max_steps,
         )  # fmt: skip
 
     def record_stretch(p, w, s, out):
         call = stretch(s)
-        flight.record(call.times, call.samples, program(p), workspace(w), call.dy, record(out))
+        recorder.record(call.times, call.samples, program(p), workspace(w), call.dy, record(out))
         return 0
 
     if second is not None:
         for function, arguments in _halves()[0].items():  # before what waits for the second
             function.compile(arguments)
-    integrate, recorder = (
-        _module(function, name)
-        for function, name in zip((integrate_stretch, record_stretch), native.ENTRIES, strict=False)
-    )
-    codes = [_object(*integrate), _object(*recorder)]
+    functions = zip((integrate_stretch, record_stretch), native.ENTRIES, strict=False)
+    modules = [_module(function, name) for function, name in functions]
+    codes = [_object(*module) for module in modules]
     made = None if second is None else second.monitor()
     return [*codes, made or _monitor()]
 
@@ -167,20 +172,20 @@ def _halves() -> tuple[_Functions, _Functions]:
     number, row, places = types.float64, typeof(example.vehicles.m), typeof(work.r)
     own = {
         constraint.constraint_force: (number, row, row, p, w),
-        flight.accelerate: (row, p, w),
-        flight.body_derivatives: (row, row, p, w),
-        flight.keep: (number, p, w, types.int64, record),
+        dynamics.accelerate: (row, p, w),
+        dynamics.body_derivatives: (row, row, p, w),
+        recorder.record_sample: (number, p, w, types.int64, record),
         disturbances.disturb: (number, row, number, disturbance, w),
         disturbances.sense: (number, disturbance, w),
-        body.allocate: (
+        rigid_body.allocate: (
             places, row, number, row, row, row, types.int64, places, places, places, places, places, places
         ),
     }  # fmt: skip
     others = {
         control.local_law: (number, p, w),
         control.body_law: (number, p, w),
-        body.mean_axes: (places, places, row, number, w),
-        flight.world_states: (row, p, w),
+        rigid_body.mean_axes: (places, places, row, number, w),
+        dynamics.world_states: (row, p, w),
     }
     return own, others
 

@@ -15,8 +15,8 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from rigidfleet.kernel import dopri5 as flight
-from rigidfleet.kernel.compiler import simd as lanes
+from rigidfleet.kernel import dopri5
+from rigidfleet.kernel.compiler import simd
 from rigidfleet.kernel.compiler.jit import compiled_copy, compiled_for_c, inlined
 from rigidfleet.kernel.compiler.simd import VECTOR, WIDTH, LaneArray
 from rigidfleet.kernel.engine.tracer import Code, Symbol, Trace, structure
@@ -52,7 +52,7 @@ def straight(program: Program) -> Straight:
         _KNOWN[name] = code, _compile(code, name)
     code, address = _KNOWN[name]
     reference = program.reference
-    before = lanes.pack(np.zeros((len(program.graph.edges), WIDTH)))
+    before = simd.pack(np.zeros((len(program.graph.edges), WIDTH)))
     return Straight(address, code.values(numbers), before, np.zeros(3), reference.t0, reference.T_b)
 
 
@@ -84,7 +84,7 @@ def _closed_loop(t, y, dy, p, w):
 
 @inlined
 def _advance(k, stage, a, h):
-    """As `flight.advance`, without terms that weigh nothing: of vectors, each costs time."""
+    """As `dopri5.advance`, without terms that weigh nothing: of vectors, each costs time."""
     a0, a1, a2 = h * a[stage, 0], h * a[stage, 1], h * a[stage, 2]
     a3, a4, a5 = h * a[stage, 3], h * a[stage, 4], h * a[stage, 5]
     if stage <= 1:
@@ -123,9 +123,9 @@ def _keep_start(p, w, state):
     """Nor any forces."""
 
 
-#: As `flight.integrate`; p is a `Straight`, w is not used, arrays hold lanes.
+#: As `dopri5.integrate`; p is a `Straight`, w is not used, arrays hold lanes.
 integrate = compiled_copy(
-    flight.integrate,
+    dopri5.integrate,
     "integrate_straight",
     closed_loop=_closed_loop,
     advance=_advance,
@@ -175,14 +175,14 @@ def _emit(module: ir.Module, code: Code) -> ir.Function:
 
     def scalar(array: ir.Value, index: int) -> ir.Value:
         place = builder.gep(array, [ir.Constant(ir.IntType(64), index)])
-        return lanes.in_all(builder, builder.load(place))
+        return simd.in_all(builder, builder.load(place))
 
     inputs = {x.serial: index for index, x in enumerate(code.inputs)}
 
     def value(x: Symbol | float) -> ir.Value:
         """Of what is computed, or loaded where it is first needed."""
         if not isinstance(x, Symbol):
-            return lanes.number(x)
+            return simd.number(x)
         if x.serial not in values:
             if x.serial in inputs:
                 found = scalar(uniform, inputs[x.serial])
@@ -195,13 +195,13 @@ def _emit(module: ir.Module, code: Code) -> ir.Function:
         return values[x.serial]
 
     for x in code.lines:
-        values[x.serial] = lanes.BUILD[x.operation](builder, *map(value, x.arguments))
-    whole = [builder.fcmp_ordered(">", value(x), lanes.number(0.0)) for x in code.positive]
+        values[x.serial] = simd.BUILD[x.operation](builder, *map(value, x.arguments))
+    whole = [builder.fcmp_ordered(">", value(x), simd.number(0.0)) for x in code.positive]
     for index, x in enumerate(code.outputs):
         found = value(x)
         if index == 0:  # one state without a derivative is enough
             for good in whole:
-                found = builder.select(good, found, lanes.number(float("nan")))
+                found = builder.select(good, found, simd.number(float("nan")))
         builder.store(found, element(dy, index), align=8)
     builder.ret_void()
     return function

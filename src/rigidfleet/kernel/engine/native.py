@@ -23,9 +23,24 @@ from typing import Any, NamedTuple
 import llvmlite.binding as llvm
 import numpy as np
 
-from rigidfleet.kernel import problem as k
 from rigidfleet.kernel.compiler.cache import cache_directory, not_kept, opened, replacing, told
-from rigidfleet.kernel.problem import Program, Workspace
+from rigidfleet.kernel.problem import (
+    CONSTANT,
+    ITERATED,
+    OPEN,
+    RIGID,
+    Control,
+    Feedback,
+    Law,
+    Motion,
+    Program,
+    Reference,
+    Vehicles,
+    Workspace,
+    calm,
+    graph,
+)
+from rigidfleet.kernel.problem import workspace as kernel_workspace
 from rigidfleet.kernel.records import (
     Integrator,
     Monitor,
@@ -87,7 +102,7 @@ class Watch:
 
 
 def closed_loop(t: float, y: Floats, dy: Floats, program: Program, workspace: Workspace) -> None:
-    """Right-hand side dy (n,) at time t [s] and state y (n,), see `rigidfleet.kernel.dopri5.closed_loop`."""
+    """Right-hand side dy (n,) at time t [s] and state y (n,), see `rigidfleet.kernel.dynamics.closed_loop`."""
     stretch = Stretch(0.0, False, 0, np.array([t]), y.reshape(1, -1), dy)
     packed = _packed(program), _packed(workspace), _pack(stretch), _packed(_UNRECORDED)
     _call(_code().record, *packed)
@@ -187,23 +202,23 @@ def examples() -> tuple[Program, Workspace, Integrator, Stretch, Record, Monitor
     program = Program(
         body_formulation=False,
         has_frame=False,
-        vehicles=k.Vehicles(one, one, 1.0, 1.0, one, False, 0.0),
-        graph=k.graph(np.zeros((0, 2), dtype=np.int64), one),
-        law=k.Law(0.0, 0.0, 0.0, k.ITERATED, 0.0, 0, 0.0, 0.0, 0.0),
-        reference=k.Reference(k.CONSTANT, 0.0, 0.0, none, none, places, places, np.zeros(3)),
-        motion=k.Motion(np.zeros(2), np.zeros((1, 6, 6)), frame),
-        feedback=k.Feedback(
+        vehicles=Vehicles(one, one, 1.0, 1.0, one, False, 0.0),
+        graph=graph(np.zeros((0, 2), dtype=np.int64), one),
+        law=Law(0.0, 0.0, 0.0, ITERATED, 0.0, 0, 0.0, 0.0, 0.0),
+        reference=Reference(CONSTANT, 0.0, 0.0, none, none, places, places, np.zeros(3)),
+        motion=Motion(np.zeros(2), np.zeros((1, 6, 6)), frame),
+        feedback=Feedback(
             none, np.zeros((0, 4)), np.zeros((0, 4)), 0.0, *np.zeros((2, 3)), frame, np.zeros(3), np.zeros(4)
         ),
-        control=k.Control(k.OPEN, places, 0.0, 0.0, k.RIGID),
+        control=Control(OPEN, places, 0.0, 0.0, RIGID),
         external=0,
-        disturbance=k.calm(one),
+        disturbance=calm(one),
     )  # fmt: skip
     state = integrator(np.zeros(6), 0.0, rtol=0.0, atol=np.ones(6))
     stretch = Stretch(0.0, False, 0, none, np.zeros((0, 6)), none)
     nowhere = np.zeros((0, 6))
     watching = monitor(one, nowhere, nowhere, 6, 3)
-    return program, k.workspace(1, 0), state, stretch, _UNRECORDED, watching
+    return program, kernel_workspace(1, 0), state, stretch, _UNRECORDED, watching
 
 
 _NOTHING = np.zeros(0)

@@ -17,7 +17,7 @@ import numpy as np
 from numba.core.dispatcher import Dispatcher
 from numpy.typing import NDArray
 
-from rigidfleet.kernel import dopri5 as flight
+from rigidfleet.kernel import dynamics
 from rigidfleet.kernel.problem import EXACT, ITERATED, Graph, Program, workspace
 from rigidfleet.typing import Floats, Ints
 
@@ -140,7 +140,7 @@ class Trace:
         d0, d1 = np.array(before, dtype=object), p.reference.d1[order]
         p = p._replace(graph=_ordered(p.graph, order), reference=p.reference._replace(d0=d0, d1=d1))
         dy = np.full(len(y), 0.0, dtype=object)
-        self._plain(flight.closed_loop)(0.0, y, dy, p, w)
+        self._plain(dynamics.closed_loop)(0.0, y, dy, p, w)
         self.outputs: list[Any] = dy[np.argsort(states)].tolist()
 
     def known_positive(self, x: Symbol) -> bool:

@@ -13,8 +13,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from rigidfleet.kernel.large import block_cholesky as sparse
-from rigidfleet.kernel.large import elimination as tree
+from rigidfleet.kernel.large import block_cholesky, elimination
 from rigidfleet.kernel.problem import ITERATED, Law, Vehicles, Workspace
 from rigidfleet.typing import Edges, Floats, Ints
 
@@ -76,8 +75,10 @@ class LargeSolver:
         self.mu, self.iterations = (law.mu, law.iterations) if iterated else (_EXACT_MU, 2)
         self.a, self.rest = np.zeros((n, 3)), np.zeros(len(self.edges))
         self.least = self.mu * self.mbar * self.floor * math.sqrt(n)
-        self.sweep = None if self.steps is None else tree.order(self.steps, self.edges)
-        self.pattern: sparse.Pattern | None = None  # where the sweep does, it is never needed
+        self.sweep = None if self.steps is None else elimination.order(self.steps, self.edges)
+        self.pattern: block_cholesky.Pattern | None = (
+            None  # where the sweep does, it is never needed
+        )
         # An exception cannot pass through compiled code; the multipliers become NaN instead.
         self._call = ctypes.CFUNCTYPE(None)(self._solve)
         self.address = int(ctypes.cast(self._call, ctypes.c_void_p).value or 0)
@@ -103,10 +104,10 @@ class LargeSolver:
         if self.sweep is not None:
             # Where deformation is damped, the kernel knows the mean axes already.
             known = self.law.k_def > 0.0
-            pivot = tree.solve(
+            pivot = elimination.solve(
                 w.u, w.b, w.r, vehicles.m, vehicles.M, self.sweep, known, w.cm[0], w.I, w.I_inv, self.a, w.multiplier
             )  # fmt: skip
-            if pivot > tree.LOST:
+            if pivot > elimination.LOST:
                 return
             self.counts.fallbacks += 1
         if not np.isfinite(w.b).all() or not self._on_vertex_graph():
@@ -129,27 +130,27 @@ class LargeSolver:
         iterated = self.law.solver == ITERATED
         for k in range(self.iterations):
             self.g[:] = 0.0
-            sparse.pull(w.u, edges, self.rest, self.mbar, self.g)
+            block_cholesky.pull(w.u, edges, self.rest, self.mbar, self.g)
             x = self._system(k)
             if x is None:
                 return False
-            sparse.stretch(w.u, edges, x, -1.0, self.rest)
+            block_cholesky.stretch(w.u, edges, x, -1.0, self.rest)
             if iterated:
                 y += (self.mbar / self.mu) * self.rest
             else:
                 a += x
         for k in range(0 if iterated else self.iterations):
             self.g[:] = m[:, None] * a
-            sparse.pull(w.u, edges, y, -1.0, self.g)
+            block_cholesky.pull(w.u, edges, y, -1.0, self.g)
             x = self._system(self.iterations + k)
             if x is None:
                 return False
-            sparse.stretch(w.u, edges, x, self.mbar, y)
+            block_cholesky.stretch(w.u, edges, x, self.mbar, y)
         return True
 
     def _prepare(self) -> None:
         n, edges = len(self.a), self.edges
-        self.pattern = sparse.pattern(n, edges, self.order(), _FILL)
+        self.pattern = block_cholesky.pattern(n, edges, self.order(), _FILL)
         self.L, self.place = np.zeros((len(self.pattern.row), 9)), np.empty(n, dtype=np.int64)
         # To precondition, seven digits do, unless next to nothing is added to the rigid motions.
         self.kept = self.L.astype(np.float32) if self.mu > _EXACT_MU else self.L
@@ -171,9 +172,9 @@ class LargeSolver:
         """
         w, x, past = self.workspace, self.x, self.past[number]
         # A residual r is an error r/mu of the force.
-        within = max(self.tolerance * math.sqrt(sparse.inner(self.g, self.g)), self.least)
+        within = max(self.tolerance * math.sqrt(block_cholesky.inner(self.g, self.g)), self.least)
         self.counts.solves += 1
-        sparse.project(
+        block_cholesky.project(
             w.u, self.edges, self.vehicles.m, self.mbar, self.mu, self.g, past, self.gram, x
         )
         while True:
@@ -201,7 +202,7 @@ class LargeSolver:
     def _gradients(self, x: Floats, within: float, most: int) -> int:
         w, p, m = self.workspace, self.pattern, self.vehicles.m
         assert p is not None
-        taken = sparse.conjugate_gradients(
+        taken = block_cholesky.conjugate_gradients(
             w.u, self.edges, m, self.mbar, self.mu, self.turned, p.place, p.column, p.row,
             self.kept, self.g, x, within, most, self.work,
         )  # fmt: skip
@@ -221,7 +222,7 @@ class LargeSolver:
         self.axes, self.turned = self.now, np.eye(3)
         mu = self.mu
         for _ in range(12):
-            sparse.assemble(
+            block_cholesky.assemble(
                 w.u,
                 self.edges,
                 m,
@@ -232,7 +233,7 @@ class LargeSolver:
                 p.of_edge,
                 self.L,
             )
-            if sparse.factor(p.column, p.row, p.first, p.left, p.block, self.L, self.place):
+            if block_cholesky.factor(p.column, p.row, p.first, p.left, p.block, self.L, self.place):
                 self.kept[:] = self.L
                 return
             mu = max(10.0 * mu, 1e-3)

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from rigidfleet.errors import FlightError
-from rigidfleet.kernel import problem as k
 from rigidfleet.kernel.engine import native
+from rigidfleet.kernel.problem import LOCAL, Motion, Program
 from rigidfleet.math import attitude as att
 from rigidfleet.math import lqr
 from rigidfleet.mission import Establish, Hold, Mission, Phase, Reshape
@@ -257,7 +257,7 @@ class Pilot(Flight):
     def _reference(self) -> Pose:
         """The pose that the first leg begins with."""
         w, plan = self.leg.workspace, self.leg.plan
-        if plan.program.control.kind == k.LOCAL:
+        if plan.program.control.kind == LOCAL:
             return Pose(w.body[0].copy(), w.body[1].copy(), w.T_ref.copy(), w.body[3].copy())
         T = plan.frame if plan.frame is not None else np.eye(3)
         cm = self.masses @ w.r / self.masses.sum()
@@ -297,7 +297,7 @@ class Pilot(Flight):
         h: float,
         move: tuple[Floats, Floats, Floats],
         turn: tuple[Floats, Floats, Floats],
-    ) -> k.Program:
+    ) -> Program:
         """The leg's program with a reference that leads from the pose now to that after a tick."""
         pose, t, program = self.pose, leg.t, leg.plan.program
         wind = self._windy(t)
@@ -315,7 +315,7 @@ class Pilot(Flight):
         x_ddot = np.array([[*self.a, *self.alpha], [*a, *(alpha + 0.5 * np.cross(phi, alpha))]])
         times = np.array([t, t + h])
         pieces = np.ascontiguousarray(lqr.quintic_pieces(times, x, x_dot, x_ddot))
-        motion = k.Motion(times, pieces, np.ascontiguousarray(pose.T))
+        motion = Motion(times, pieces, np.ascontiguousarray(pose.T))
         return program._replace(motion=motion, external=external)
 
     # -- wind -------------------------------------------------------------------------------------

@@ -1,0 +1,64 @@
+"""What a sample keeps: forces and references at a state."""
+
+from rigidfleet.kernel.compiler.jit import compiled
+from rigidfleet.kernel.dynamics import closed_loop
+from rigidfleet.kernel.problem import BODY, LOCAL, OPEN
+from rigidfleet.kernel.references import blend_slots
+
+
+@compiled
+def copy(a, out):
+    """Copy a into out, both two-dimensional."""
+    for i in range(a.shape[0]):
+        for j in range(a.shape[1]):
+            out[i, j] = a[i, j]
+
+
+@compiled
+def record(times, samples, p, w, dy, out):
+    """Evaluate the closed loop at the sampled states and record_sample its forces and references.
+
+    Without rows in ``out``, what the last evaluation leaves in the workspace is all that was asked for.
+    """
+    for k in range(times.shape[0]):
+        closed_loop(times[k], samples[k], dy, p, w)
+        if k < out.r.shape[0]:
+            record_sample(times[k], p, w, k, out)
+
+
+@compiled
+def record_sample(t, p, w, k, out):
+    """Copy what the closed loop has left in the workspace at time t [s] into row k of a record."""
+    kind = p.control.kind
+    for i in range(w.c.shape[0]):
+        out.c[k, i], out.L[k, i], out.multiplier[k, i] = w.c[i], w.L[i], w.multiplier[i]
+        out.d[k, i], out.d_dot[k, i] = w.d[i], w.d_dot[i]
+    copy(w.r, out.r[k])
+    copy(w.v, out.v[k])
+    copy(w.a, out.a[k])
+    copy(w.f_E, out.f_E[k])
+    copy(w.f_u, out.f_u[k])
+    copy(w.f_C, out.f_C[k])
+    if p.disturbance.active:
+        copy(w.f_D, out.f_D[k])
+        if p.disturbance.noise_r.shape[0] > 0:
+            copy(w.r_seen, out.r_seen[k])
+            copy(w.v_seen, out.v_seen[k])
+    for q in range(6):
+        out.wrench[k, q] = w.wrench[q]
+    # Where only distances are blended, their slots still say how the formation lies.
+    blend_slots(t, p.reference, w.p, w.p_dot, w.p_ddot)
+    copy(w.p, out.p[k])
+    if kind != OPEN:
+        copy(w.T_ref, out.T_ref[k])
+    if kind == LOCAL:
+        copy(w.r_ref, out.r_ref[k])
+        for q in range(3):
+            out.motion[k, q], out.motion[k, 3 + q] = w.body[0, q], w.body[1, q]
+            out.rates[k, q] = w.body[3, q]
+    elif kind == BODY:
+        since = t - p.feedback.arrival
+        for q in range(3):
+            out.motion[k, q] = p.feedback.r[q] + p.feedback.v[q] * since
+            out.motion[k, 3 + q] = p.feedback.v[q]
+            out.rates[k, q] = p.feedback.omega[q]

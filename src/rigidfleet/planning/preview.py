@@ -1,0 +1,232 @@
+"""The trajectory that a mission plans, before anything flies."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rigidfleet.kernel.problem import septic_polynomial
+from rigidfleet.math import attitude as att
+from rigidfleet.math import pid, rigid_body
+from rigidfleet.mission import Establish, Mission, Phase, Reshape
+from rigidfleet.planning.reference import (
+    Pose,
+    Situation,
+    about_cm,
+    align_slots,
+    attach,
+    goal_of,
+    led_by,
+    legs,
+    slots_about_cm,
+    slots_before,
+)
+from rigidfleet.typing import Floats
+
+#: Samples of a leg: so many, or one each so many seconds, within bounds.
+_SAMPLES = 201
+
+
+_STEP = 0.05
+
+
+_MOST = 2001
+
+
+#: A phase has at least so many samples.
+FEWEST_SAMPLES = 11
+#: Beyond so many agents those near each other are found by a tree (`proximity.separation`).
+MANY = 200
+#: Places of agents that a preview computes. Its limit is counted, not timed: it is the same on any machine.
+_PLACES = 4_000_000
+
+
+@dataclass(frozen=True)
+class PlannedPhase:
+    """The planned way of all agents through one phase.
+
+    Attributes
+    ----------
+    time : (K,) [s] of the mission
+    position, acceleration : (K, N, 3) [m, m/s^2]
+    exact : whether the reference is followed as planned, up to control; False: a guess
+    ways : where the shape changes, the agents' places (N, 3) [m] before and after, from the centre, in a frame that
+        turns with them: in it they go straight, and all in step
+    shapes : names of the formations before (None: none) and after
+    """
+
+    phase: str
+    time: Floats
+    position: Floats
+    acceleration: Floats
+    exact: bool
+    ways: tuple[Floats, Floats] | None = None
+    shapes: tuple[str | None, str | None] = (None, None)
+
+    @property
+    def velocity(self) -> Floats:
+        """(K, N, 3) [m/s]."""
+        return _rate(self.position, self.time)
+
+
+def preview(mission: Mission, phases: int | None = None) -> tuple[list[PlannedPhase], bool]:
+    """The way of all agents, a leg for each phase or so many, and whether it is known to its end."""
+    masses = np.array(mission.agents.mass)
+    frame = None if mission.body_frame is None else mission.drawn_attitude
+    now = Situation(
+        0.0, np.array(mission.agents.position), np.array(mission.agents.velocity), frame=frame
+    )
+    way: list[PlannedPhase] = []
+    most = samples_per_phase(mission)
+    # Of more than can be looked at with the fewest samples, the first ones.
+    possible = (
+        len(mission.phases)
+        if most >= FEWEST_SAMPLES
+        else most * len(mission.phases) // FEWEST_SAMPLES
+    )
+    most = max(most, FEWEST_SAMPLES)
+    for phase, (begin, end) in list(zip(mission.phases, phase_spans(mission), strict=True))[
+        :phases
+    ]:
+        if len(way) == possible:
+            return way, False
+        name = phase.formation if isinstance(phase, Establish | Reshape) else now.formation
+        target = slots_about_cm(mission, name, masses)
+        if isinstance(phase, Establish | Reshape) and target is None:
+            return way, False
+        now = replace(now, t=begin)
+        before = now.slots if now.slots is not None else now.r
+        count = min(max(_SAMPLES, int((end - begin) / _STEP) + 1), _MOST, most)
+        time = np.linspace(begin, end, count)
+        names = now.formation, name
+        position, ways, now = _leg(mission, phase, now, masses, target, time)
+        guess = (
+            isinstance(phase, Establish | Reshape)
+            and phase.control != "slots"
+            # A shape that forces alone hold may lag behind its slots.
+            and (phase.control == "body" or led_by(mission, phase, before, target) != "shape")
+        )
+        acceleration = _rate(_rate(position, time), time)
+        way.append(PlannedPhase(phase.name, time, position, acceleration, not guess, ways, names))
+    return way, True
+
+
+def samples_per_phase(mission: Mission) -> int:
+    """Samples of each leg that can be looked at: below `MANY` agents each is held against each."""
+    n = mission.n_agents
+    each = n * max(1.0, n / 25) if n <= MANY else n
+    return int(_PLACES / each) // len(mission.phases)
+
+
+def _leg(
+    mission: Mission,
+    phase: Phase,
+    now: Situation,
+    masses: Floats,
+    target: Floats | None,
+    time: Floats,
+) -> tuple[Floats, tuple[Floats, Floats] | None, Situation]:
+    """Positions (K, N, 3) of all agents over a phase, their `PlannedPhase.ways`, and the situation at its end."""
+    t0, t_end = time[0], time[-1]
+    shaping = isinstance(phase, Establish | Reshape)
+    frame, now, turned = attach(mission, phase, now, masses, target)
+    s = septic((time - t0) / phase.blend) if shaping else np.zeros(len(time))
+    if phase.control == "open":
+        x = about_cm(now.r, masses)
+        after = x
+        if shaping and target is not None:
+            # Turned as the blend has it, and with that as the agents lie.
+            slots = slots_before(mission, now, masses)
+            after = target @ turned.T @ rigid_body.kabsch(x, slots, masses).T
+        cm, v = masses @ now.r / masses.sum(), masses @ now.v / masses.sum()
+        a = np.array(phase.input_force) * len(masses) / masses.sum()
+        tau = (time - t0)[:, None]
+        ways = x, after
+        shape = x + s[:, None, None] * (after - x)
+        position = shape + (cm + tau * v + 0.5 * tau**2 * a)[:, None]
+        v_end = np.tile(v + a * (t_end - t0), (len(masses), 1))
+        slots = target if shaping else now.slots
+        now = replace(now, r=position[-1], v=v_end, slots=slots, pose=None, frame=frame)
+    else:
+        assert now.pose is not None  # attached above
+        assert now.slots is not None
+        goal, arrival = goal_of(phase, now, t_end)
+        assert goal is not None
+        r, T, v_cm, omega = _body(mission, now.pose, goal, arrival, time)
+        before = now.slots
+        after = target if shaping and target is not None else before
+        dp, turn = 0.0 * before, np.zeros(3)
+        if shaping:
+            dp, turn = align_slots(before, after, masses, turned)
+        ways = before, before + dp
+        p = before + s[:, None, None] * dp
+        p = p @ att.dcm_from_rotation_vector(s[:, None] * turn)
+        position = r[:, None] + p @ T
+        pose = Pose(r[-1], v_cm, T[-1], omega)
+        velocity = v_cm + np.cross(omega, after) @ T[-1]
+        tracked = pose if phase.control == "slots" else None
+        frame = T[-1] if frame is not None else None
+        now = replace(
+            now, r=position[-1], v=velocity, slots=after, pose=tracked, goal=goal, frame=frame
+        )
+    name = phase.formation if isinstance(phase, Establish | Reshape) else now.formation
+    return position, ways if shaping else None, replace(now, t=t_end, formation=name)
+
+
+def _body(
+    mission: Mission, start: Pose, goal: Pose, arrival: float, time: Floats
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """CM (K, 3) [m], attitude T (K, 3, 3) of the virtual body, and its velocities [m/s, rad/s] at the end."""
+    t0, rest = time[0], time[-1] - arrival
+    flights = legs(mission, start, goal, arrival - t0)
+    under_way = time <= arrival
+    found = []
+    for i in range(2):
+        x, rate, _ = flights.sample(i, np.append(time[under_way] - t0, arrival - t0))
+        x_end = (x[-1], rate[-1])
+        x = x[:-1]
+        if rest > 0.0 and not under_way.all():
+            after = flights.sample_rest(mission, i, x_end, rest, time[~under_way] - arrival)
+            x, rate = np.concatenate([x, after[0]]), after[1]
+        found.append((x, rate[-1]))
+    (r, v), (phi, phi_dot) = found
+    # Where phi is small at the end, its rate is the body's.
+    return r, att.dcm_from_rotation_vector(phi) @ goal.T, v, phi_dot
+
+
+def phase_spans(mission: Mission) -> list[tuple[float, float]]:
+    """Start and end [s] of each phase; what ends by settling is taken to settle soon, at most at its timeout."""
+    t, spans = 0.0, []
+    settling = _settling(mission)
+    for phase in mission.phases:
+        begin = t
+        if phase.until is not None:
+            t = phase.until
+        elif phase.duration is not None:
+            t = begin + phase.duration
+        elif phase.settle is not None:
+            least = max(getattr(phase, "blend", 0.0), getattr(phase, "travel", None) or 0.0)
+            t = begin + min(phase.settle.timeout, least + settling + phase.settle.dwell)
+        spans.append((begin, max(t, begin + 1e-6)))
+        t = spans[-1][1]
+    return spans
+
+
+def _settling(mission: Mission) -> float:
+    c = mission.constraint
+    if c.stabilisation == "none":
+        return 0.0
+    try:
+        return pid.settling_time(c.alpha, c.beta, c.gamma)
+    except ValueError:
+        return 0.0
+
+
+def _rate(x: Floats, time: Floats) -> Floats:
+    return np.gradient(x, time, axis=0, edge_order=2)
+
+
+def septic(x: Floats) -> Floats:
+    """Blend of slots from 0 to 1 over x = (t - t0) / T_b, 0 before and 1 after."""
+    return septic_polynomial(np.clip(x, 0.0, 1.0))

@@ -1,0 +1,54 @@
+"""Which assignment is shortest, and which leaves most room."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from rigidfleet.formation import assignment
+from rigidfleet.mission import Establish, Mission
+from rigidfleet.planning.preview import preview
+from rigidfleet.preflight.findings import Assignment, Preflight, Remark
+
+#: Another assignment is worth a note if it saves this share of the way, and some centimetres [m].
+_WORTH = 0.05
+
+
+_SHORT = 0.1
+
+
+#: Assignments of so many agents are compared, in a second or so.
+_COMPARED = 200
+
+
+def assignment_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
+    """Whether other agents in the slots of the first formation would be better off."""
+    first = next((p for p in mission.phases if isinstance(p, Establish)), None)
+    slots = mission.formation_slots(first.formation) if first is not None else None
+    if first is None or slots is None or not 2 <= mission.n_agents <= _COMPARED:
+        return
+    index, masses = mission.phases.index(first), np.array(mission.agents.mass)
+    if index >= len(found.legs):
+        return
+    for name in ("as it is", "shortest", "safe"):
+        other, leg = mission, found.legs[index]
+        if name not in ("as it is", mission.assignment):
+            other = Mission.from_dict(mission.to_dict() | {"assignment": name}, mission.origin)
+            leg = preview(other, index + 1)[0][index]
+        assert leg.ways is not None  # it shapes
+        x = leg.position - (masses @ leg.position)[:, None] / masses.sum()
+        way = float(np.linalg.norm(np.diff(x, axis=0), axis=2).sum())
+        room = assignment.nearest_way(*leg.ways, mission.agents.radius)[0]
+        order = tuple(other.assigned_slots[first.formation].tolist())
+        found.assignments[name] = Assignment(order, way, room)
+    radius = np.array(mission.agents.radius)
+    now, short, safe = found.assignments.values()
+    if short.way < (1 - _WORTH) * now.way - _SHORT:
+        text = (
+            f"another assignment to slots is shorter: {short.way:.1f} m in all, not {now.way:.1f} m"
+        )
+        yield Remark("note", "assignment", text + ' (assignment = "shortest")')
+    if safe.room > now.room + 0.05 and now.room < 2 * radius.max():
+        text = f"another one is safer: {safe.room:.2f} m between agents on the way instead of {now.room:.2f} m"
+        yield Remark("note", "assignment", text + ' (assignment = "safe")')

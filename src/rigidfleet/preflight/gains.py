@@ -1,0 +1,75 @@
+"""Stabilisation gains: stability, settling and the forces that an error costs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+
+from rigidfleet.math import pid
+from rigidfleet.mission import Establish, Mission
+from rigidfleet.planning.preview import phase_spans
+from rigidfleet.preflight.findings import TOLERANCE, FormationCheck, GainsCheck, Preflight, Remark
+
+
+def check_gains(mission: Mission, formations: list[FormationCheck]) -> GainsCheck:
+    """Stability, settling time and overshoot of the stabilisation, and its force per metre of error."""
+    c = mission.constraint
+    stabilised = c.stabilisation == "pid"
+    alpha, beta, gamma = (c.alpha, c.beta, c.gamma) if stabilised else (0.0, 0.0, 0.0)
+    settling = over = None
+    if stabilised:
+        try:
+            settling = pid.settling_time(alpha, beta, gamma)
+            over = pid.overshoot(alpha, beta, gamma)
+        except ValueError:
+            pass  # it rings for a thousand cycles: said in a remark
+    mass = float(np.mean(mission.agents.mass))
+    force = {
+        f.name: f.rigidity.force(beta**2, mass)
+        for f in formations
+        if f.rigidity is not None and f.rigidity.rank
+    }
+    margin = 2 * alpha * beta**2 / gamma if gamma > 0 else math.inf
+    return GainsCheck(stabilised, margin, settling, over, force)
+
+
+def gain_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
+    """Gains that are unstable or slow where distances lead the flight."""
+    g, phases = found.gains, mission.phases
+    if all(phase.control == "slots" for phase in phases) or not len(mission.edges):
+        return
+    if not g.stabilised:
+        yield from _drift(mission)
+    elif g.settling_time is None:
+        yield Remark("note", "gains", "the gains ring for more than a thousand cycles: raise alpha")
+    elif g.settling_time > max(b - a for a, b in phase_spans(mission)):
+        text = (
+            f"errors of length take {g.settling_time:.3g} s to settle, longer than any phase lasts"
+        )
+        yield Remark("note", "gains", text)
+
+
+def _drift(mission: Mission) -> Iterator[Remark]:
+    """Without feedback an error of length goes on at the rate that it has."""
+    text = "no feedback (stabilisation = 'none'): errors of length stay, and grow at their rates"
+    first = mission.phases[0]
+    if not isinstance(first, Establish):
+        yield Remark("note", "gains", text)
+        return
+    r, v = np.array(mission.agents.position), np.array(mission.agents.velocity)
+    edges, d = (
+        mission.formation_edges(first.formation),
+        mission.formation_distances(first.formation),
+    )
+    i, j = edges.T
+    x = r[i] - r[j]
+    L = np.linalg.norm(x, axis=1)
+    c_dot = ((v[i] - v[j]) * x).sum(axis=1) / L
+    end = phase_spans(mission)[0][1]
+    error = np.abs(L - d) if first.reference == "step" else np.abs(c_dot) * first.blend / 2
+    error = np.abs(np.where(first.reference == "step", L - d + c_dot * end, error))
+    fails = error.max() > TOLERANCE * d.min()
+    text += f"; by {end:g} s they reach {error.max():.2g} m"
+    yield Remark("fails" if fails else "note", "gains", text)

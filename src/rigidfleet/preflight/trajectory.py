@@ -1,0 +1,398 @@
+"""On the planned trajectory: collisions, downwash, thrust, obstacles, limits."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+
+from rigidfleet.formation import assignment, distance_geometry
+from rigidfleet.math import lqr, proximity
+from rigidfleet.mission import Box, Establish, Ground, Mission, Reshape
+from rigidfleet.mission.disturbances import intensity
+from rigidfleet.planning.preview import PlannedPhase, septic
+from rigidfleet.preflight.findings import DENSE, SLACK, Disturbed, Preflight, Remark, agents, some
+from rigidfleet.rigidity import (
+    jacobian,
+)
+from rigidfleet.typing import Floats
+
+#: Agents' places held against obstacles, phases against obstacles, places against gaps.
+_HELD = 40_000_000
+
+
+_MET = 50_000
+
+
+_PASSED = 100_000_000
+
+
+#: So many obstacles are told of, the nearest.
+_NEAREST = 20
+
+
+#: A steady distance from the slots beyond this is worth a note [m]: the verdict's tolerance of a waypoint.
+_OFFSET = 0.1
+
+
+def separation_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
+    """Room between vehicles: where it is least, and each change of formation on which ways cross."""
+    if mission.n_agents < 2:
+        return
+    radius, limit = np.array(mission.agents.radius), mission.limits.separation or 0.0
+    worst: dict[bool, tuple[float, float, tuple[int, ...], str]] = {}
+    least = np.inf, 0.0, (0, 0)
+    for number, leg in enumerate(found.legs):
+        ends: list[tuple[float, float, tuple[int, ...]]] = []
+        positions = leg.position if leg.ways is None else np.array(leg.ways)
+        rooms, pairs = proximity.separation(positions, radius)
+        for k in [int(rooms.argmin())] if leg.ways is None else [0, -1]:
+            ends.append((float(rooms[k]), float(leg.time[k]), tuple(pairs[k].tolist())))
+        if leg.ways is not None:
+            room, who, share = assignment.nearest_way(*leg.ways, radius)
+            crossing = room, _time_of(mission, leg, number, share), who
+            least = min(least, crossing)
+            beyond = room <= 0 or room < limit - SLACK
+            if beyond and room < min(ends)[0] - SLACK:
+                yield _crossing(mission, number, leg, crossing, limit)
+        for k, at in enumerate(ends):
+            least = min(least, at)
+            # Where agents start is known, whatever leads them from there.
+            exact = leg.exact or (number == 0 and k == 0 and leg.ways is not None)
+            if exact not in worst or at[0] < worst[exact][0]:
+                worst[exact] = *at, leg.phase
+    if np.isfinite(least[0]):
+        found.room = least[0], least[1], agents(least[2])
+    for exact, (room, t, who, phase) in worst.items():
+        if room <= 0 or room < limit - SLACK:
+            text = _near(who, room, t, phase, limit, exact=exact)
+            guess = "" if exact else "; distances lead there, and the way is a guess"
+            yield Remark("fails" if exact else "note", "collision", text + guess)
+
+
+def _near(
+    who: tuple[int, ...], room: float, t: float, phase: str, limit: float, *, exact: bool
+) -> str:
+    if room <= 0:
+        return f"{agents(who)} {'' if exact else 'may '}collide at {t:.2f} s, in '{phase}'"
+    return f"{agents(who)} come within {room:.2f} m at {t:.2f} s, in '{phase}' (limit {limit:g} m)"
+
+
+def _time_of(mission: Mission, leg: PlannedPhase, number: int, share: float) -> float:
+    """When [s] agents have gone this share of their ways."""
+    blend = getattr(mission.phases[number], "blend", 0.0)
+    tau = np.linspace(0.0, 1.0, 2001)
+    return float(leg.time[0] + blend * np.interp(share, septic(tau), tau))
+
+
+def _crossing(
+    mission: Mission,
+    number: int,
+    leg: PlannedPhase,
+    at: tuple[float, float, tuple[int, ...]],
+    limit: float,
+) -> Remark:
+    """Agents whose straight ways from one formation to the next bring them too near."""
+    (room, t, who), (before, after) = at, leg.shapes
+    needed = sum(mission.agents.radius[i] for i in who) + limit
+    origin = "the start" if before is None else f"'{before}'"
+    text = (
+        f"{_near(who, room, t, leg.phase, limit, exact=leg.exact)}: their ways from {origin} to '{after}' cross,"
+        f" {max(0.0, room + needed - limit):.2f} m from centre to centre. "
+    )
+    assert after is not None  # something is shaped
+    assert leg.ways is not None
+    apart = min(float(proximity.nearest(places).min()) for places in leg.ways)
+    flown = [p.formation for p in mission.phases[:number] if isinstance(p, Establish | Reshape)]
+    spaced = f"keep slots {math.sqrt(2) * needed:.2f} m apart or more (here {apart:.2f} m)"
+    promised = mission.assigned_turn(before, after) is not None
+    if promised:
+        text += f"{spaced[0].upper()}{spaced[1:]}"
+    elif mission.assignment == "each" and after in flown:
+        text += (
+            f"Its slots were assigned on another way: give '{after}' a second table [formations.NAME], to be assigned"
+            " on this one"
+        )
+    else:
+        text += 'Assign slots to those who are near: assignment = "each"'
+    if not promised and apart < math.sqrt(2) * needed:
+        text += f"; and {spaced}"
+    guess = "" if leg.exact else ". Distances lead there, and the way is a guess"
+    return Remark("fails" if leg.exact else "note", "collision", text + guess)
+
+
+def downwash_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
+    """One vehicle in the downwash of another."""
+    radius, limit = np.array(mission.agents.radius), mission.limits.separation_below
+    worst: dict[bool, tuple[float, float, tuple[int, ...], str]] = {}
+    for leg in found.legs:
+        room, pair = proximity.headroom(leg.position, radius)
+        k = int(room.argmin())
+        if room[k] < worst.get(leg.exact, (np.inf,))[0]:
+            low, high = sorted(pair[k].tolist(), key=lambda i: leg.position[k, i, 2])
+            worst[leg.exact] = float(room[k]), float(leg.time[k]), (low, high), leg.phase
+    for exact, (room, t, (low, high), phase) in worst.items():
+        text = f"agent {low + 1} is below agent {high + 1}, {max(room, 0.0):.2f} m from it at {t:.2f} s, in '{phase}'"
+        if limit is None:
+            yield Remark("note", "downwash", text)
+        elif room < limit - SLACK:
+            text += f" (limit {limit:g} m)"
+            yield Remark("fails" if exact else "note", "downwash", text)
+
+
+def thrust_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
+    """Thrust that the planned trajectory asks for beyond a limit."""
+    masses, limits = np.array(mission.agents.mass), np.array(mission.agents.thrust_limit)
+    weight = np.array([0.0, 0.0, mission.gravity])
+    best: tuple[float, float, str, float, str, bool] | None = None
+    for leg in found.legs:
+        force = masses * np.linalg.norm(leg.acceleration + weight, axis=2)
+        over = force - limits if np.isfinite(limits).any() else force
+        k, i = np.unravel_index(int(over.argmax()), over.shape)
+        share = force[k, i] - (limits[i] if math.isfinite(limits[i]) else 0.0)
+        at = (float(force[k, i]), float(leg.time[k]), f"agent {i + 1}", float(limits[i]))
+        if best is None or share > best[0] - (best[3] if math.isfinite(best[3]) else 0.0):
+            best = (*at, leg.phase, leg.exact)
+    if best is not None:
+        found.thrust = best[:4]
+        force, t, who, limit, phase, exact = best
+        if force > limit * (1 + 1e-3):
+            text = f"{who} needs {force:.1f} N at {t:.2f} s, in '{phase}', and has {limit:g} N"
+            yield Remark("fails" if exact else "note", "thrust", text)
+    yield from _step_thrust(mission, found)
+
+
+def disturbance_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
+    """What wind, gusts, noise and wrong masses ask for, as far as it follows from the planned way."""
+    d = mission.disturbances
+    if d is None or not found.legs:
+        return
+    believed, true, drag = np.array(mission.agents.mass), mission.true_mass, mission.drag
+    wind, up = np.array(d.wind), np.array([0.0, 0.0, 1.0])
+    g, speed = mission.gravity, float(np.linalg.norm(d.wind))
+    k1, k2 = lqr.double_integrator_gains(mission.tracking.Q, mission.tracking.R)
+    sigma = 0.0 if d.gusts is None else float(intensity(d.gusts, speed).max())
+    gusts = 3 * sigma * drag
+    noise = np.zeros(len(believed))
+    if d.noise is not None:
+        noise = 3 * believed * math.hypot(k1 * d.noise.position, k2 * d.noise.velocity)
+    limits = np.array(mission.agents.thrust_limit)
+    worst, most = -math.inf, (0.0, 0.0, "", math.inf)
+    for leg in found.legs:
+        force = true[:, None] * (leg.acceleration + g * up)
+        force -= drag[:, None] * (wind - leg.velocity)
+        need = np.linalg.norm(force, axis=2) + gusts + noise
+        over = need - np.where(np.isfinite(limits), limits, 0.0)
+        k, i = np.unravel_index(int(over.argmax()), over.shape)
+        if over[k, i] > worst:
+            worst = float(over[k, i])
+            most = float(need[k, i]), float(leg.time[k]), f"agent {i + 1}", float(limits[i])
+    steady = drag[:, None] * wind - ((true - believed) * g)[:, None] * up
+    off = np.linalg.norm(steady, axis=1) / (k1 * believed)
+    far = int(off.argmax())
+    lost = tuple((lost.agent - 1, lost.time) for lost in d.lost)
+    found.disturbed = Disturbed(
+        float((drag * speed).max()), float(gusts.max()), float((np.abs(true - believed) * g).max()),
+        float(noise.max()), most, (float(off[far]), f"agent {far + 1}"), lost,
+    )  # fmt: skip
+    if most[0] > most[3]:
+        text = f"disturbed, {most[2]} may need {most[0]:.1f} N at {most[1]:.2f} s, and has {most[3]:g} N"
+        yield Remark("note", "thrust", text)
+    if off[far] > _OFFSET and any(phase.control == "slots" for phase in mission.phases):
+        text = (
+            f"what is steady in the disturbances holds agent {far + 1} {off[far]:.2f} m off its slot, as tracking"
+            f" has no integral; a greater first weight in tracking.Q shortens it (now {mission.tracking.Q[0]:g})"
+        )
+        yield Remark("note", "disturbances", text)
+    if lost:
+        text = f"the way is judged as if {agents(tuple(i for i, _ in lost))} flew on to its end"
+        yield Remark("note", "disturbances", text)
+
+
+def _step_thrust(mission: Mission, found: Preflight) -> Iterator[Remark]:
+    """Forces that references ask for which jump: J M^-1 J^T lambda = -beta^2 c at the jump."""
+    c, masses = mission.constraint, np.array(mission.agents.mass)
+    if c.stabilisation == "none":
+        return
+    limits = np.array(mission.agents.thrust_limit)
+    starts = [np.array(mission.agents.position), *(leg.position[-1] for leg in found.legs)]
+    for phase, r in zip(mission.phases, starts, strict=False):
+        if not (isinstance(phase, Establish | Reshape) and phase.reference == "step"):
+            continue
+        edges = mission.formation_edges(phase.formation)
+        if min(len(edges), 3 * mission.n_agents) > DENSE:
+            continue
+        error = distance_geometry.distances(r, edges) - mission.formation_distances(phase.formation)
+        J = jacobian(r, edges)
+        root = np.repeat(1 / np.sqrt(masses), 3)
+        f = np.linalg.lstsq(J * root, -(c.beta**2) * error, rcond=1e-7)[0] / root
+        f = f.reshape(-1, 3) + masses[:, None] * [0.0, 0.0, mission.gravity]
+        need = np.linalg.norm(f, axis=1)
+        i = int((need - np.where(np.isfinite(limits), limits, 0.0)).argmax())
+        if need[i] > limits[i]:
+            text = (
+                f"the step to '{phase.formation}' in '{phase.name}' asks agent {i + 1} for {need[i]:.0f} N, and it has"
+                f" {limits[i]:g} N. Blend: reference = 'shape' or 'distances'"
+            )
+            yield Remark("fails" if c.solver in ("exact", "pinv") else "note", "thrust", text)
+
+
+def obstacle_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
+    """Room to each obstacle; of many, to all that may be touched and to the nearest."""
+    radius, way = np.array(mission.agents.radius), found.legs
+    if not (mission.obstacles and way):
+        return
+    # What a leg stays within, and how far that is from each obstacle (L, B): nobody is nearer.
+    within = np.array(
+        [[leg.position.min(axis=(0, 1)), leg.position.max(axis=(0, 1))] for leg in way]
+    )
+    far = np.stack([_beyond(within, thing) for thing in mission.obstacles], axis=1) - radius.max()
+    held, met, skipped = 0, 0, []
+    near = np.argsort(far.min(axis=0), kind="stable")
+    shown: dict[int, tuple[float, float, int, str]] = {}
+    remarks: dict[int, list[Remark]] = {}
+    for rank, b in enumerate(near.tolist()):
+        thing = mission.obstacles[b]
+        if rank >= _NEAREST and far[:, b].min() > 0:
+            break
+        worst: dict[bool, tuple[float, float, int, str]] = {}
+        for k in np.argsort(far[:, b], kind="stable").tolist():
+            leg = way[k]
+            if far[k, b] >= worst.get(leg.exact, (np.inf,))[0]:
+                continue
+            held, met = held + leg.position[:, :, 0].size, met + 1
+            if held > _HELD or met > _MET:
+                break
+            room, agent, _ = proximity.clearance(leg.position, radius, [thing])
+            at = int(room.argmin())
+            # Of as near ones the first: rounding and a rest's last millimetre count for nothing.
+            if room[at] < worst.get(leg.exact, (np.inf,))[0] - 1e-3:
+                worst[leg.exact] = float(room[at]), float(leg.time[at]), int(agent[at]), leg.phase
+        if held > _HELD or met > _MET:
+            skipped = near[rank:][far[:, near[rank:]].min(axis=0) <= 0].tolist()
+            break
+        if worst:
+            shown[b] = min(worst.values())
+        for exact, (room, t, i, phase) in worst.items():
+            if room <= 0:
+                verb = "hits" if exact else "may hit"
+                text = f"agent {i + 1} {verb} '{thing.name}' at {t:.2f} s, in '{phase}'"
+                if not isinstance(thing, Box):
+                    text += _too_low(mission, found, phase, thing.height)
+                remark = Remark("fails" if exact else "note", "obstacle", text)
+                remarks.setdefault(b, []).append(remark)
+    for b in sorted(shown):
+        room, t, i, _ = shown[b]
+        found.clearance.append((mission.obstacles[b].name, room, t, f"agent {i + 1}"))
+    for b in sorted(remarks):
+        yield from remarks[b]
+    if skipped:
+        names = [mission.obstacles[b].name for b in sorted(skipped)]
+        text = f"so many obstacles on the way take too long to look at: {some(names)} passed over"
+        yield Remark("note", "obstacle", text)
+    yield from _gaps(mission, found, radius)
+
+
+def _beyond(within: Floats, thing: Box | Ground) -> Floats:
+    """How far (L,) [m] boxes (L, 2, 3), lowest and highest corners, are from an obstacle at least."""
+    low, high = within[:, 0], within[:, 1]
+    if isinstance(thing, Box):
+        apart = np.maximum(np.maximum(low - thing.max, thing.min - high), 0.0)
+        return np.linalg.norm(apart, axis=1)
+    return np.maximum(low[:, 2] - thing.height, 0.0)
+
+
+def _too_low(mission: Mission, found: Preflight, phase: str, ground: float) -> str:
+    """Why a vehicle is at or below the ground [m] in a phase, and how high its formation is to fly."""
+    leg = next(leg for leg in found.legs if leg.phase == phase)
+    masses, radius = np.array(mission.agents.mass), np.array(mission.agents.radius)
+    z = leg.position[..., 2]
+    cm = z @ masses / masses.sum()
+    k, i = np.unravel_index(int((z - radius).argmin()), z.shape)
+    deep, below = ground + radius[i] - z[k, i], cm[k] - z[k, i]
+    high = float((ground + radius + cm[:, None] - z)[k].max())
+    return (
+        f": its centre comes to z = {z[k, i]:.2f} m with a radius of {radius[i]:g} m, {deep:.2f} m too low, as its slot"
+        f" is then {below:.2f} m below the centre of mass at z = {cm[k]:.2f} m. Keep the centre of mass at z ="
+        f" {math.ceil(100 * high + 1e-6) / 100:.2f} m or more, or turn the formation so that its slots lie higher"
+    )
+
+
+def _gaps(mission: Mission, found: Preflight, radius: Floats) -> Iterator[Remark]:
+    """Gaps between two boxes that the formation's centre passes, and how much of each it takes.
+
+    Of boxes on either side of the centre, seen along an axis, the nearest two make the gap.
+    """
+    masses = np.array(mission.agents.mass)
+    boxes = [thing for thing in mission.obstacles if isinstance(thing, Box)]
+    if len(boxes) < 2:
+        return
+    low, high = np.array([box.min for box in boxes]), np.array([box.max for box in boxes])
+    least: dict[tuple[int, int, int], tuple[float, float, str]] = {}
+    looked, to = 0, math.inf
+    for leg in found.legs:
+        looked += len(leg.time) * len(boxes)
+        if looked > _PASSED:
+            to = float(leg.time[0])
+            break
+        cm = np.einsum("i,kia->ka", masses, leg.position) / masses.sum()
+        between = (cm[:, None] > low) & (cm[:, None] < high)
+        for axis in range(3):
+            rest = [k for k in range(3) if k != axis]
+            beside = between[:, :, rest].all(axis=2)
+            if not beside.any():
+                continue
+            at = cm[:, axis, None]
+            below = np.where(beside & (high[:, axis] < at), high[:, axis], -np.inf)
+            above = np.where(beside & (low[:, axis] > at), low[:, axis], np.inf)
+            sides = np.column_stack([below.argmax(axis=1), above.argmin(axis=1)])
+            inside = np.isfinite(below.max(axis=1)) & np.isfinite(above.min(axis=1))
+            for one, two in np.unique(sides[inside], axis=0).tolist():
+                when = inside & (sides == [one, two]).all(axis=1)
+                along = leg.position[when][:, :, axis]
+                takes = (along + radius).max(axis=1) - (along - radius).min(axis=1)
+                k, key = int(takes.argmax()), (one, two, axis)
+                if key not in least or takes[k] > least[key][0]:
+                    least[key] = float(takes[k]), float(leg.time[when][k]), leg.phase
+    for (one, two, axis), (takes, t, phase) in sorted(least.items()):
+        between = f"'{boxes[one].name}' and '{boxes[two].name}'"
+        wide = float(low[two, axis] - high[one, axis])
+        found.gaps.append((between, wide, takes, t))
+        if takes > wide:
+            text = (
+                f"the gap between {between} is {wide:.2f} m wide, and the formation takes {takes:.2f} m"
+                f" in its attitude at {t:.2f} s, in '{phase}': turn or reshape it before"
+            )
+            yield Remark("fails", "obstacle", text)
+    if math.isfinite(to):
+        text = f"gaps between so many obstacles are looked at to {to:g} s: more would take too long"
+        yield Remark("note", "obstacle", text)
+
+
+def limit_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
+    """Geofence, speed and acceleration beyond their limits on the planned trajectory."""
+    limits = mission.limits
+    for leg in found.legs:
+        for what, values, limit, unit in (
+            ("speed", leg.velocity, limits.speed, "m/s"),
+            ("acceleration", leg.acceleration, limits.acceleration, "m/s^2"),
+        ):
+            if limit is None:
+                continue
+            size = np.linalg.norm(values, axis=2)
+            k, i = np.unravel_index(int(size.argmax()), size.shape)
+            if size[k, i] > limit * (1 + 1e-3):
+                text = (
+                    f"agent {i + 1} reaches {size[k, i]:.3g} {unit} at {leg.time[k]:.2f} s, in '{leg.phase}'"
+                    f" (limit {limit:g} {unit})"
+                )
+                yield Remark("fails" if leg.exact else "note", what, text)
+        if limits.geofence is not None:
+            low, high = np.array(limits.geofence.min), np.array(limits.geofence.max)
+            out = np.maximum(low - leg.position, leg.position - high).max(axis=2)
+            k, i = np.unravel_index(int(out.argmax()), out.shape)
+            if out[k, i] > SLACK:
+                by, t = float(out[k, i]), float(leg.time[k])
+                text = f"agent {i + 1} leaves the geofence by {by:.2f} m at {t:.2f} s, in '{leg.phase}'"
+                yield Remark("fails" if leg.exact else "note", "geofence", text)
