@@ -814,7 +814,7 @@ def test_half_a_kernel_is_none(tmp_path, monkeypatch):
 def test_the_kernel_is_translated_once(helped):
     """Two processes translate each function for the types that the others ask for; one does it alone if it must."""
     code = f"""
-from rigidfleet.kernel import build
+from rigidfleet.kernel.engine import build
 build._translate_only()
 second = build._SecondProcess()
 if not {helped}:
