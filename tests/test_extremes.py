@@ -1,6 +1,7 @@
 """Extremes in continuous time, against the same steps and continuous extension sampled finely."""
 
 import math
+import sys
 import time
 from typing import Any
 
@@ -331,6 +332,77 @@ def test_a_controller_and_saturation_are_watched():
     )
     assert greatest(result, "thrust") == pytest.approx(10.2, abs=1e-9)
     assert greatest(result, "speed") >= forces(result)["speed"] - 1e-9
+
+
+# -- formations whose multipliers are iterated
+
+
+def a_sphere(solver: str = "iterated", **tables: Any) -> Mission:
+    """A grid of 150 becomes a sphere held by distances of neighbours, and turns."""
+    position = {"shape": "grid", "size": 2.0, "count": 150, "centre": [0.0, 0.0, 30.0]}
+    return Mission.from_dict(
+        {
+            "schema_version": 1,
+            "name": "sphere",
+            "agents": {"mass": 0.3, "radius": 0.1, "position": position},
+            "assignment": "each",
+            "integrator": {"rtol": 1e-6, "atol": 1e-6},
+            "constraint": {"solver": solver},
+            "formations": {"sphere": {"shape": "sphere", "size": 2.0, "edges": "neighbours"}},
+            "phases": [
+                {"kind": "establish", "formation": "sphere", "blend": 3.0, "duration": 3.5},
+                {"kind": "turn", "yaw_deg": 60.0, "duration": 1.0},
+            ],
+            "output_step": 0.5,
+        }
+        | tables
+    )
+
+
+@pytest.mark.parametrize("solver", ["iterated", "exact"])
+def test_forces_of_a_large_formation_are_found_between_steps(solver):
+    """As fine samples about each greatest force tell it, to 1e-5, or 1e-6 of the thrust."""
+    mission = a_sphere(solver)
+    result = simulate(mission)
+    (method,) = result.statistics["solvers"]
+    assert method == "nodes"
+    first = result.phases[0].extremes
+    for name in ("thrust", "acceleration", "constraint_force", "tension"):
+        x, wide = first[name], np.linspace(-0.1, 0.1, 101)
+        fine = forces(simulate(mission, times=x.time + wide * 1e-2))[name]
+        around = forces(simulate(mission, times=x.time + wide))[name]
+        slack = 1e-5 * fine + 1e-6 * first["thrust"].value
+        assert abs(x.value) == pytest.approx(fine, abs=slack), name
+        assert abs(x.value) >= around - slack, name
+
+
+@pytest.mark.parametrize("form", ["inertial", "body"])
+def test_to_watch_a_large_formation_does_not_change_its_flight(form, monkeypatch):
+    """Positions and forces at samples are bit for bit those of a flight that nobody watches."""
+    mission = a_sphere(formulation=form)
+    watched = simulate(mission)
+    assert watched.phases[0].extremes
+
+    def pass_over(extremes: Any, program: Any, work: Any, state: Any, *, last: bool) -> None:
+        state.count[4] = 0
+
+    monkeypatch.setattr(watching.Extremes, "take", pass_over)
+    alone = simulate(mission)
+    assert not alone.phases[0].extremes
+    assert (watched.position == alone.position).all()
+    assert (watched.thrust == alone.thrust).all()
+    assert watched.statistics["solvers"] == alone.statistics["solvers"]
+
+
+def test_extremes_of_a_large_formation_depend_on_no_pause_and_no_sample(monkeypatch):
+    """Whether the integrator pauses after each step or hardly ever, and whatever is recorded: the same to the bit."""
+    every = [simulate(a_sphere()), simulate(a_sphere(), times=[0.0, 1.0])]
+    module = sys.modules[simulate.__module__]
+    monkeypatch.setattr(module, "_FIRST_STEPS", 1)
+    monkeypatch.setattr(module, "_STEPS", 1)
+    every.append(simulate(a_sphere()))
+    found = [[p.extremes for p in result.phases] for result in every]
+    assert found[0] == found[1] == found[2]
 
 
 # -- what the verdict makes of them

@@ -29,7 +29,7 @@ from rigidfleet.typing import Bools, Floats, Ints
 THIN = 1e-3
 
 #: By so much of it a sample may be worse than the worst of its phase before the record contradicts itself. Of forces
-#: that cannot be said: those of large formations are known at the ends of steps alone, a user's may fall between them.
+#: that cannot be said: they are found between steps where the ends show a peak, and a user's may fall between them.
 _SLACK = {"separation": 0.0, "clearance": 0.0, "speed": 1e-9}
 
 #: Bytes of slots up to which what is known of their shape is kept, for the next phase or flight.

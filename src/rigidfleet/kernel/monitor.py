@@ -12,7 +12,11 @@ quartics through five points of each step, of steps cut so short that they are w
 
 Forces are known where the law is evaluated: at the end of each step, and on both sides of a jump. Where an end is
 higher than both its neighbours, the law is evaluated in between, until the parabola through three of its values has no
-more to give.
+more to give: to 1e-5 of the value. That also holds of large formations, whose multipliers are iterated, but for
+constraint forces and tensions below a tenth of the greatest thrust: these are told to 1e-6 of that thrust, which is
+what the solver's residual leaves of them. Their evaluations go to a solver of the monitor's own (`LargeSolver.aside`),
+since one remembers what it is asked: the flight is the same to the bit, and as the order of evaluations does not
+depend on where the trail is cut, so are the extremes.
 """
 
 import math
@@ -44,8 +48,8 @@ from rigidfleet.kernel.records import (
     THRUST_MARGIN,
 )
 
-#: A least value is found to this much [m, m/s], and a greatest force to so much of it.
-CLOSE, _CLOSE_FORCE = 1e-9, 1e-7
+#: A least value is found to this much [m, m/s], and a greatest force to so much of it, or so much if iterated.
+CLOSE, _CLOSE_FORCE, _CLOSE_ITERATED = 1e-9, 1e-7, 1e-6
 #: Pieces of a step are no shorter than this.
 _SHORTEST = 2.0**-32
 #: So many pieces of a step are looked at, at most.
@@ -54,8 +58,8 @@ _MOST = 10_000
 _ROUNDING = 4e-15
 #: In the body formulation a step is cut into pieces that turn no further than this [rad].
 _TURN = 0.1
-#: Evaluations that a greatest force is looked for with, at most.
-_TRIES = 12
+#: Nor is a peak of forces looked for between points nearer than this part of where it is.
+_NARROW = 1e-3
 
 #: Coefficients of a square: C(4, i) C(4, j) / C(8, i + j).
 _SQUARE = np.array(
@@ -579,6 +583,8 @@ def judge_forces(values, t, p, monitor):
 def worst_of(c, p, monitor):
     """The greatest value found so far of what entry c of a gauge is one of."""
     n, m = p.vehicles.m.shape[0], p.graph.edges.shape[0]
+    if c < 3 * n and not monitor.left[c % n]:
+        return math.inf
     if c < n:
         limit = p.vehicles.thrust_limit[c]
         beyond = limit - monitor.worst[THRUST_MARGIN] if limit < math.inf else math.inf
@@ -609,36 +615,77 @@ def evaluate(t, row, p, w, state, monitor, values):
 
 
 @compiled
-def refine(c, row, ta, tb, tc, a, b, v, p, w, state, monitor):
-    """Look for the greatest |value| of entry c of a gauge between ta and tc, from its values a, b, v at ta < tb < tc.
+def promise(c, a, b, v, ta, tb, tc, p, monitor):
+    """What the parabola through |values| a, b, v of entry c at ta < tb < tc promises beyond the worst, and where.
 
-    Steps go to the top of the parabola through the three, as long as that is worth more than rounding.
+    As a part of that worst; twice the rise to its top counts. Not positive: nothing.
     """
-    values = monitor.gauge[2]
-    for _ in range(_TRIES):
-        left, right = (b - a) / (tb - ta), (v - b) / (tc - tb)
-        bend = (right - left) / (tc - ta)
-        if not bend < 0.0:
+    left, right = (b - a) / (tb - ta), (v - b) / (tc - tb)
+    bend = (right - left) / (tc - ta)
+    if not (left >= 0.0 and right <= 0.0 and bend < 0.0):
+        return 0.0, tb
+    top = 0.5 * (ta + tb) - 0.5 * left / bend
+    gain = -bend * (top - tb) ** 2
+    worst = worst_of(c, p, monitor)
+    close = _CLOSE_FORCE * worst
+    if p.graph.solver != 0:
+        # A residual leaves of constraint forces and tensions what is a part of the greatest force.
+        n, m = p.vehicles.m.shape[0], p.graph.edges.shape[0]
+        within = 2 * n <= c < 3 * n + m
+        close = _CLOSE_ITERATED * (max(worst, -monitor.worst[THRUST]) if within else worst)
+    beyond = b + 2.0 * gain - worst - close
+    if not beyond > 0.0:
+        return 0.0, tb
+    short = 1e-3 * (tc - ta)  # a point too near another tells nothing
+    if abs(top - tb) < short:
+        top = tb + short if tc - tb > tb - ta else tb - short
+    return beyond / worst, top
+
+
+@compiled
+def look_between(before, middle, after, row, ta, tb, tc, p, w, state, monitor):
+    """Look for the greatest forces between ta and tc, of gauges at ta < tb < tc.
+
+    The law is evaluated where the parabola through three neighbouring values of an entry promises most, and all
+    entries are judged there: of thousands that rise and fall together, a few evaluations do for all. That ends when
+    no parabola has more to give.
+    """
+    at, rank, values = monitor.instants, monitor.rank, monitor.nodes
+    best, top = 0.0, tb
+    for c in range(middle.shape[0]):
+        a, b, v = abs(before[c]), abs(middle[c]), abs(after[c])
+        if b >= a and b >= v:
+            more, x = promise(c, a, b, v, ta, tb, tc, p, monitor)
+            if more > best:
+                best, top = more, x
+    if best == 0.0:
+        return
+    for c in range(middle.shape[0]):
+        values[0, c], values[1, c], values[2, c] = before[c], middle[c], after[c]
+    for k in range(3):
+        at[k], rank[k] = ta if k == 0 else tb if k == 1 else tc, k
+    for count in range(3, at.shape[0]):
+        evaluate(
+            top, row if top <= end_of(row, state) else row + 1, p, w, state, monitor, values[count]
+        )
+        k = count
+        while at[rank[k - 1]] > top:
+            rank[k] = rank[k - 1]
+            k -= 1
+        at[count], rank[k] = top, count
+        best = 0.0
+        for k in range(1, count):
+            i, j, l = rank[k - 1], rank[k], rank[k + 1]
+            if at[l] - at[i] < _NARROW * (tc - ta):
+                continue
+            for c in range(middle.shape[0]):
+                a, b, v = abs(values[i, c]), abs(values[j, c]), abs(values[l, c])
+                if b >= a and b >= v:
+                    more, x = promise(c, a, b, v, at[i], at[j], at[l], p, monitor)
+                    if more > best:
+                        best, top = more, x
+        if best == 0.0:
             return
-        top = 0.5 * (ta + tb) - 0.5 * left / bend
-        gain = -bend * (top - tb) ** 2
-        if b + 2.0 * gain <= worst_of(c, p, monitor) * (1.0 + _CLOSE_FORCE):
-            return
-        short = 1e-3 * (tc - ta)  # a point too near another tells nothing
-        if abs(top - tb) < short:
-            top = tb + short if tc - tb > tb - ta else tb - short
-        evaluate(top, row if top <= end_of(row, state) else row + 1, p, w, state, monitor, values)
-        new = abs(values[c])
-        if new > b:
-            if top > tb:
-                ta, a = tb, b
-            else:
-                tc, v = tb, b
-            tb, b = top, new
-        elif top > tb:
-            tc, v = top, new
-        else:
-            ta, a = top, new
 
 
 @compiled
@@ -653,17 +700,13 @@ def watch_middle(row, before, after, p, w, state, monitor):
     start, end = state.trail.clock[row, 0], end_of(row, state)
     middle, values = 0.5 * (start + end), monitor.gauge[1]
     evaluate(middle, row, p, w, state, monitor, values)
-    for c in range(values.shape[0]):
-        a, b, v = abs(before[c]), abs(values[c]), abs(after[c])
-        if b > a and b > v:
-            refine(c, row, start, middle, end, a, b, v, p, w, state, monitor)
+    look_between(before, values, after, row, start, middle, end, p, w, state, monitor)
 
 
 @compiled
 def watch_forces(p, w, state, monitor, rows, last):
     """Forces over the steps of a trail; the ``last`` of a stretch has nobody to wait for."""
     trail, before = state.trail, monitor.gauge[0]
-    inside = p.graph.solver == 0  # a large formation's solver remembers what it is asked
     for row in range(rows):
         new = row > 0 or monitor.flags[3] == 0
         start, end = trail.clock[row, 0], end_of(row, state)
@@ -675,16 +718,11 @@ def watch_forces(p, w, state, monitor, rows, last):
             judge_forces(before, start, p, monitor)
         if new:
             judge_forces(after, end, p, monitor)
-        if not inside:
-            continue
         if row == 0 and new:
             watch_middle(0, before, after, p, w, state, monitor)
         if row + 1 < rows:
             then, until = trail.gauge[row + 1], end_of(row + 1, state)
-            for c in range(after.shape[0]):
-                a, b, v = abs(a_row[c]), abs(after[c]), abs(then[c])
-                if b >= a and b >= v and b > a + v - b:
-                    refine(c, row, start, end, until, a, b, v, p, w, state, monitor)
+            look_between(a_row, after, then, row, start, end, until, p, w, state, monitor)
         elif last and (row > 0 or not new):
             watch_middle(row, a_row, after, p, w, state, monitor)
 

@@ -25,6 +25,8 @@ LEAST_ERROR = math.log(1e-4)
 ) = range(16)  # fmt: skip
 #: Bytes of a trail, about: the integrator pauses when it is full.
 _TRAIL = 1 << 19
+#: Points that a greatest force is looked for with, at most.
+_NODES = 27
 
 
 #: Five points of a step, and from values there to Bernstein coefficients (5, 5).
@@ -87,7 +89,10 @@ class Monitor(NamedTuple):
     record: int
     time: Floats  # (1,) [s]
     states: Floats  # (1, n)
-    gauge: Floats  # (3, 3N + 2m) forces before the first step, and at points within
+    gauge: Floats  # (2, 3N + 2m) forces before the first step, and in the middle of one
+    nodes: Floats  # (27, 3N + 2m) forces at points of two steps
+    instants: Floats  # (27,) [s] when
+    rank: Ints  # (27,) them in order
     places: Floats  # (N, 5, 3) where agents are over a step: control points [m]
     curve: Floats  # (5, 3) of one pair
     work: Floats  # (40, 11) polynomials
@@ -111,7 +116,9 @@ def monitor(
         "low": np.full((n, 3), np.inf), "pad": 0.0, "pairs": none, "struck": none, "columns": none,
         "flags": np.zeros(4, dtype=np.int64),
         "recorder": 0, "stretch": 0, "record": 0, "time": np.zeros(1),
-        "states": np.zeros((1, states)), "gauge": np.zeros((3, gauge)),
+        "states": np.zeros((1, states)), "gauge": np.zeros((2, gauge)),
+        "nodes": np.empty((_NODES, gauge)), "instants": np.zeros(_NODES),
+        "rank": np.zeros(_NODES, dtype=np.int64),
         "places": np.zeros((n, 5, 3)), "curve": np.zeros((5, 3)), "work": np.zeros((40, 11)),
         "pieces": np.zeros((40, 17)), "basis": np.zeros((5, 5)), "poses": np.zeros((5, 15)),
         "knots": np.zeros((5, 3)), "room": np.zeros((3, 10)),

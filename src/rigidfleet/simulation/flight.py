@@ -6,7 +6,7 @@ import math
 import time as clock
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -178,6 +178,12 @@ class Leg:
         """Mission time reached [s]."""
         return float(self.state.clock[0])
 
+    def check(self) -> None:
+        """Raise what has come up within the solver of the multipliers, or the monitor's."""
+        if self.solver is not None:
+            self.solver.check()
+            self.solver.aside.check()
+
 
 class Flight:
     """One flight under way; `simulate` flies one of a mission's phases, others may fly on."""
@@ -250,6 +256,7 @@ class Flight:
             if leg.state.count[0] or leg.t > self.now.t:
                 self._arrive(leg)
             record.t_end = self.now.t
+            leg.check()
         if phase.settle is not None and not record.settled:
             raise StoppedError(
                 f"phase '{phase.name}' did not settle within {phase.settle.timeout:g} s: at t ="
@@ -300,7 +307,7 @@ class Flight:
         given = self.mission.integrator
         residual = min(max(_RESIDUAL * given.rtol, _LEAST), _MOST_RESIDUAL)
         floor = _FLOOR * float(self._atol_velocity(plan).min())  # of a step of a second
-        order = partial(solvers.dissection, points, edges)
+        order = cache(partial(solvers.dissection, points, edges))
         p = plan.program
         return large.LargeSolver(
             p.vehicles, p.graph.edges, p.law, work, steps, order, residual, floor
@@ -372,6 +379,7 @@ class Flight:
     def _lose(self, leg: Leg, program: Program, now: Bools) -> Program:
         """Go on without the vehicles that are lost ``now`` (N,); returns what is flown of a program."""
         self._watch(leg, last=True)
+        leg.check()
         self.lost = self.lost | now
         self.now.lost = self.lost
         self.extremes.lose(self.lost)
@@ -404,7 +412,10 @@ class Flight:
         fresh = state.count[0] == 0 or program is not leg.plan.program
         if fresh:
             self._watch(leg, last=True)
-        leg.flown = program
+            leg.flown = program
+            if leg.solver is not None:  # it remembers what it is asked: the monitor has another
+                graph = program.graph._replace(solver=leg.solver.aside.address)
+                leg.flown = program._replace(graph=graph)
         times = self._samples(leg, t_end)
         samples = np.empty((len(times), len(state.y)))
         state.count[3] = 0
@@ -422,8 +433,7 @@ class Flight:
                 fresh = False
                 if self.external is not None:
                     self.external.check()
-                if leg.solver is not None:
-                    leg.solver.check()
+                leg.check()
                 self._watch(leg, last=False)
                 self._report(leg.t, leg.phase)
                 if status == records.PAUSED and self._stalled(leg):

@@ -9,7 +9,8 @@ from __future__ import annotations
 import ctypes
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -91,6 +92,11 @@ class LargeSolver:
                 self.solve()
         except BaseException as error:
             self.error = error
+
+    @cached_property
+    def aside(self) -> LargeSolver:
+        """Another one of the same equations, in the same workspace: what it is asked, this one does not remember."""
+        return replace(self, counts=Counts(), error=None)
 
     def check(self) -> None:
         """Raise what has come up within the kernel."""
