@@ -7,6 +7,8 @@ wait neither for the compiler nor for the plotting library.
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from rigidfleet._version import __version__ as __version__
+
 if TYPE_CHECKING:
     from rigidfleet.assessment import assess
     from rigidfleet.mission import load_mission
@@ -17,7 +19,6 @@ if TYPE_CHECKING:
     from rigidfleet.web.live import live
     from rigidfleet.web.replay import replay
 
-__version__ = "0.1.0"
 
 __all__ = [
     "Result",

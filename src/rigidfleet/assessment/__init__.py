@@ -10,17 +10,17 @@ count from 1.
 
 from rigidfleet.assessment.checks import findings, notes
 from rigidfleet.assessment.measure import Flight
-from rigidfleet.assessment.safety import Safety, safety
-from rigidfleet.assessment.verdict import (
+from rigidfleet.assessment.outcome import (
     FLIPPED,
     SHAPE_TOLERANCE,
     WAYPOINT_TOLERANCE,
     Extreme,
     Finding,
     PhaseVerdict,
-    Verdict,
     Waypoint,
 )
+from rigidfleet.assessment.safety import Safety, safety
+from rigidfleet.assessment.verdict import Verdict
 from rigidfleet.result import Result
 
 __all__ = [

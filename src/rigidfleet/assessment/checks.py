@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 
 from rigidfleet.assessment.measure import Flight, angle_between, is_rigid
-from rigidfleet.assessment.verdict import (
+from rigidfleet.assessment.outcome import (
     DIP,
     FLIPPED,
     SHAPE_TOLERANCE,
@@ -15,10 +15,10 @@ from rigidfleet.assessment.verdict import (
     Extreme,
     Finding,
     PhaseVerdict,
-    Verdict,
     names,
     value,
 )
+from rigidfleet.assessment.verdict import Verdict
 from rigidfleet.result import Result
 from rigidfleet.typing import Floats
 

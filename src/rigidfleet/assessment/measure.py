@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from rigidfleet.assessment.verdict import (
+from rigidfleet.assessment.outcome import (
     SENSE,
     SHAPE_TOLERANCE,
     Extreme,

@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rigidfleet.assessment.measure import Flight
-from rigidfleet.assessment.verdict import Extreme, Finding, Verdict
+from rigidfleet.assessment.outcome import Extreme, Finding
+from rigidfleet.assessment.verdict import Verdict
 from rigidfleet.result import Result
 
 

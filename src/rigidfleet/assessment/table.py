@@ -9,7 +9,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from rigidfleet.assessment.verdict import Finding, Verdict, value
+from rigidfleet.assessment.outcome import Finding, PhaseVerdict, value
 
 _PHASE = ["phase\n", "end\n[s]", "|c| at end\n[m]", "worst |c|\n[m]", "shape off\n[m]", "apart\n[m]",
           "clear\n[m]", "thrust\n[N]"]  # fmt: skip
@@ -17,10 +17,15 @@ _WAYPOINT = ["waypoint\n", "at\n[s]", "off by\n[m]", "\n[m/s]", "\n[deg]", "\n[d
 _CHECK = ["check", "worst", "limit", "at [s]", "who or where", ""]
 
 
-def rendered(verdict: Verdict) -> RenderableType:
-    """What rich prints of a verdict."""
+def rendered(
+    head: Text,
+    phase_verdicts: Sequence[PhaseVerdict],
+    checks: Sequence[Finding],
+    last: Sequence[Text],
+) -> RenderableType:
+    """What rich prints of a verdict: its head, a table of phases, of waypoints and of checks, and its last lines."""
     phases, waypoints = [], []
-    for p in verdict.phases:
+    for p in phase_verdicts:
         worst = [p.worst.get(name) for name in ("constraint", "separation", "clearance", "thrust")]
         c, *rest = [None if e is None else e.value for e in worst]
         phases.append([p.name, f"{p.t_end:.2f}", *map(_number, (p.constraint, c, p.shape, *rest))])
@@ -29,7 +34,7 @@ def rendered(verdict: Verdict) -> RenderableType:
             misses = (w.position, w.velocity, w.attitude, w.rates)
             waypoints.append([p.name, f"{w.time:.2f}", *map(_number, misses)])
     shown: list[RenderableType] = [
-        Text.assemble((verdict.mission, "bold"), f"  {verdict.title}"),
+        head,
         _table(_PHASE, phases),
     ]
     if any(row[2] for row in phases):
@@ -38,9 +43,8 @@ def rendered(verdict: Verdict) -> RenderableType:
         )
     if waypoints:
         shown.append(_table(_WAYPOINT, waypoints))
-    shown.append(_table(_CHECK, [_check(f) for f in verdict.findings], left=("who or where", "")))
-    shown += [Text(f"Note: {note}.", "yellow") for note in verdict.notes]
-    return Group(*shown, Text(verdict.summary, "bold green" if verdict.passed else "bold red"))
+    shown.append(_table(_CHECK, [_check(f) for f in checks], left=("who or where", "")))
+    return Group(*shown, *last)
 
 
 def _table(

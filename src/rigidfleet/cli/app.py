@@ -31,7 +31,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
 from cyclopts import App, CycloptsError, Parameter, UnusedCliTokensError
 
-from rigidfleet import __version__
+from rigidfleet._version import __version__
 from rigidfleet.cli import console as screen
 from rigidfleet.cli.outputs import Files, taken
 from rigidfleet.errors import MissionError, RigidfleetError

@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from rigidfleet.typing import Bools, Floats, Ints
-
-if TYPE_CHECKING:
-    from rigidfleet.mission import Box, Ground
-
 
 # Slots thinner than this, relative to their length, are a line to an attitude fit.
 _THIN = 1e-3
@@ -28,6 +24,15 @@ _ASKED = 256
 _SPARE = 1.2
 # Numbers in a temporary array at most.
 _ELEMENTS = 8_000_000
+
+
+class Obstacle(Protocol):
+    """What a vehicle must not touch: a box along the world's axes, or a half space as one with infinite sides."""
+
+    @property
+    def corners(self) -> tuple[float, ...]:
+        """Lowest and highest corner (6,) [m]."""
+        ...
 
 
 def separation(r: Floats, radius: ArrayLike) -> tuple[Floats, Ints]:
@@ -184,7 +189,7 @@ def _lowest(r: Floats, radius: Floats) -> tuple[float, Ints]:
 
 
 def clearance(
-    r: Floats, radius: ArrayLike, obstacles: Sequence[Box | Ground]
+    r: Floats, radius: ArrayLike, obstacles: Sequence[Obstacle]
 ) -> tuple[Floats, Ints, Ints]:
     """Least room to an obstacle (K,) [m], and the agent and the obstacle (K,) that have it.
 
@@ -213,7 +218,7 @@ def separation_of_left(r: Floats, radius: ArrayLike, left: Bools) -> tuple[Float
     return least, pair
 
 
-def rooms(r: Floats, radius: ArrayLike, obstacles: Sequence[Box | Ground]) -> tuple[Floats, Ints]:
+def rooms(r: Floats, radius: ArrayLike, obstacles: Sequence[Obstacle]) -> tuple[Floats, Ints]:
     """Least room (..., N) [m] of agents r (..., N, 3) to an obstacle, and the obstacle; infinity and -1 without."""
     radius = np.asarray(radius, dtype=float)
     least, nearest = np.full(r.shape[:-1], np.inf), np.full(r.shape[:-1], -1)
@@ -221,16 +226,16 @@ def rooms(r: Floats, radius: ArrayLike, obstacles: Sequence[Box | Ground]) -> tu
         np.ascontiguousarray(np.moveaxis(r, -1, 0)) if obstacles else r
     )  # axis by axis is faster
     for k, thing in enumerate(obstacles):
-        if thing.kind == "ground":
-            room = places[2] - thing.height - radius
-        else:
-            outside, inside = np.zeros(r.shape[:-1]), np.full(r.shape[:-1], -np.inf)
-            for x, low, high in zip(places, thing.min, thing.max, strict=True):
-                beyond = np.maximum(low - x, x - high)  # positive outside
-                np.maximum(inside, beyond, out=inside)
-                np.maximum(beyond, 0.0, out=beyond)
-                outside += beyond * beyond
-            room = np.sqrt(outside) + np.minimum(inside, 0.0) - radius
+        outside, inside = np.zeros(r.shape[:-1]), np.full(r.shape[:-1], -np.inf)
+        corners = thing.corners
+        for x, low, high in zip(places, corners[:3], corners[3:], strict=True):
+            if low == -np.inf and high == np.inf:
+                continue
+            beyond = np.maximum(low - x, x - high)  # positive outside
+            np.maximum(inside, beyond, out=inside)
+            np.maximum(beyond, 0.0, out=beyond)
+            outside += beyond * beyond
+        room = np.sqrt(outside) + np.minimum(inside, 0.0) - radius
         closer = room < least  # false where it is NaN
         np.copyto(least, room, where=closer)
         np.copyto(nearest, k, where=closer)

@@ -376,6 +376,11 @@ class Box(Part):
     min: Vector = Field(description="lowest corner [x, y, z] [m]")
     max: Vector = Field(description="highest corner [x, y, z] [m]")
 
+    @property
+    def corners(self) -> tuple[float, ...]:
+        """Lowest and highest corner (6,) [m]."""
+        return (*self.min, *self.max)
+
 
 class Ground(Part):
     """Everything below a height."""
@@ -383,6 +388,11 @@ class Ground(Part):
     kind: Literal["ground"] = Field(description="everything below a height")
     name: str = Field("", description="what to call it; 'ground' when absent")
     height: Coordinate = Field(0.0, description="height of the ground [m]")
+
+    @property
+    def corners(self) -> tuple[float, ...]:
+        """Lowest and highest corner (6,) [m] of a box without sides and bottom."""
+        return (*(-math.inf,) * 3, math.inf, math.inf, self.height)
 
 
 class Geofence(Part):

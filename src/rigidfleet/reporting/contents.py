@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rigidfleet import __version__, plotting
+from rigidfleet import plotting
+from rigidfleet._version import __version__
 from rigidfleet.assessment import Safety, Verdict, assess, safety
-from rigidfleet.assessment.verdict import value
+from rigidfleet.assessment.outcome import value
 from rigidfleet.mission import ending, goal
 from rigidfleet.plotting.style import clean
 from rigidfleet.reporting import gains, overlay

@@ -16,7 +16,7 @@ from rigidfleet.kernel.engine import native
 from rigidfleet.kernel.problem import Program, Workspace
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
-from rigidfleet.mission import Box, Ground, Mission
+from rigidfleet.mission import Mission
 from rigidfleet.result import PAD, Extremum, PhaseRecord
 from rigidfleet.typing import Bools, Floats
 
@@ -60,7 +60,7 @@ class Extremes:
         agents, limits = mission.agents, mission.limits
         self.n = mission.n_agents
         self.radius = np.array(agents.radius, dtype=float)
-        self.boxes = np.array([_corners(thing) for thing in mission.obstacles]).reshape(-1, 6)
+        self.boxes = np.array([thing.corners for thing in mission.obstacles]).reshape(-1, 6)
         fence = limits.geofence
         self.fence = np.array([] if fence is None else [*fence.min, *fence.max]).reshape(-1, 6)
         self.stacks = self.n <= _FEW or limits.separation_below is not None
@@ -258,10 +258,3 @@ class Extremes:
             tilt = 2.0 * float(rates) / size + float(np.linalg.norm(spin))
         widest = 2.0 * math.sqrt(float(np.einsum("kia,kia->ki", x, x).max()))
         return np.array([moved, moved + tilt * widest if self.stacks else 0.0])
-
-
-def _corners(thing: Box | Ground) -> list[float]:
-    """Corners of an obstacle (6,); the ground is a box without sides and bottom."""
-    if thing.kind == "ground":
-        return [-math.inf] * 3 + [math.inf, math.inf, thing.height]
-    return [*thing.min, *thing.max]

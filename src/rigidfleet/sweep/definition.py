@@ -18,7 +18,7 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import Field, Strict
 
-from rigidfleet import __version__
+from rigidfleet._version import __version__
 from rigidfleet.errors import MissionError, SweepError
 from rigidfleet.mission import Mission, load_mission, mission_names
 from rigidfleet.mission.findings import Keys, Notes, unknown_key

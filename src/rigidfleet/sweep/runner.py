@@ -13,7 +13,7 @@ from time import perf_counter
 
 import numpy as np
 
-from rigidfleet import __version__
+from rigidfleet._version import __version__
 from rigidfleet.errors import RigidfleetError
 from rigidfleet.sweep import workers as crews
 from rigidfleet.sweep.definition import Sweep

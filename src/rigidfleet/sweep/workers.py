@@ -13,7 +13,7 @@ from multiprocessing import connection
 from multiprocessing.context import SpawnContext, SpawnProcess
 from typing import TYPE_CHECKING, Any
 
-from rigidfleet import __version__
+from rigidfleet._version import __version__
 from rigidfleet.errors import RigidfleetError
 from rigidfleet.sweep.definition import shared
 from rigidfleet.sweep.record import Row
