@@ -31,7 +31,7 @@ from rigidfleet.assessment import assess
 from rigidfleet.errors import FlightError
 from rigidfleet.formation import assignment, distance_geometry, graphs, shapes
 from rigidfleet.math import rigid_body
-from rigidfleet.math.proximity import smallest_singular_value
+from rigidfleet.math.constraint_jacobian import smallest_singular_value
 from rigidfleet.mission import Mission, load_mission, mission_names
 from rigidfleet.planning.reference import align_slots
 from rigidfleet.result import Result

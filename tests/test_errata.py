@@ -14,7 +14,7 @@ from rigidfleet.assessment import assess
 from rigidfleet.formation import distance_geometry, graphs, shapes
 from rigidfleet.math import lqr, rigid_body
 from rigidfleet.math.attitude import dcm_from_rotation_vector, triangle_frame
-from rigidfleet.math.proximity import smallest_singular_value
+from rigidfleet.math.constraint_jacobian import smallest_singular_value
 from rigidfleet.mission import Mission, load_mission
 from rigidfleet.simulation.flight import simulate
 

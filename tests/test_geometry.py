@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from rigidfleet.formation import distance_geometry, graphs, shapes
-from rigidfleet.math import proximity
+from rigidfleet.math import constraint_jacobian, proximity, rigid_body
 from rigidfleet.mission import Box, Ground
 
 seeds = st.integers(0, 2**32 - 1)
@@ -149,7 +149,7 @@ def test_fit_finds_the_attitude_of_turned_slots(name, seed):
     p -= m @ p / m.sum()
     T = Rotation.random(4, random_state=rng).as_matrix()
     x = np.einsum("kba,ib->kia", T, p)
-    found, _ = proximity.fit_attitudes(x, np.broadcast_to(p, x.shape), m, EYE)
+    found, _ = rigid_body.fit_attitudes(x, np.broadcast_to(p, x.shape), m, EYE)
     np.testing.assert_allclose(found, T, rtol=0, atol=1e-12)
 
 
@@ -164,7 +164,7 @@ def test_fit_of_a_deformed_shape_is_scipys(seed):
     T = Rotation.random(random_state=rng)
     x = T.inv().apply(p) + rng.normal(size=p.shape) * 0.2
     x -= m @ x / m.sum()
-    found = proximity.fit_attitudes(x[None], p[None], m, EYE)[0][0]
+    found = rigid_body.fit_attitudes(x[None], p[None], m, EYE)[0][0]
     expected = Rotation.align_vectors(p, x, weights=m)[0].as_matrix()
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-10)
 
@@ -175,7 +175,7 @@ def test_a_mirror_image_gets_a_rotation_all_the_same():
     p = shape("spatial", rng)
     p -= p.mean(axis=0)
     x = p * [1, 1, -1]
-    T = proximity.fit_attitudes(x[None], p[None], np.ones(5), EYE)[0][0]
+    T = rigid_body.fit_attitudes(x[None], p[None], np.ones(5), EYE)[0][0]
     assert np.linalg.det(T) == pytest.approx(1.0, abs=1e-12)
     np.testing.assert_allclose(T @ T.T, EYE, rtol=0, atol=1e-12)
     assert np.abs(x @ T.T - p).max() > 0.5
@@ -194,7 +194,7 @@ def test_a_line_takes_the_attitude_nearest_to_the_one_expected(seed):
     near = Rotation.random(3, random_state=rng).as_matrix()
     small = Rotation.from_rotvec(rng.normal(size=(3, 3)) * 0.3).as_matrix()
     x = turned_line(small @ near)
-    found, _ = proximity.fit_attitudes(x, np.broadcast_to(LINE, x.shape), np.ones(3), near)
+    found, _ = rigid_body.fit_attitudes(x, np.broadcast_to(LINE, x.shape), np.ones(3), near)
     np.testing.assert_allclose(
         np.einsum("kab,kib->kia", found, x), np.broadcast_to(LINE, x.shape), atol=1e-12
     )
@@ -216,13 +216,13 @@ def test_a_line_is_followed_from_sample_to_sample():
     roll = Rotation.from_rotvec([0.7, 0, 0]).as_matrix()
     T = roll @ Rotation.from_euler("z", -yaw[:, None]).as_matrix()
     x = turned_line(T)
-    found, _ = proximity.fit_attitudes(x, np.broadcast_to(LINE, x.shape), np.ones(3), T[0])
+    found, _ = rigid_body.fit_attitudes(x, np.broadcast_to(LINE, x.shape), np.ones(3), T[0])
     np.testing.assert_allclose(found, T, rtol=0, atol=1e-10)
 
 
 def test_a_line_turned_about_by_half_a_turn_has_an_attitude():
     """Where every axis across the line would do, one is taken: a rotation that brings the line home."""
-    found = proximity.fit_attitudes(-LINE[None], LINE[None], np.ones(3), EYE)[0][0]
+    found = rigid_body.fit_attitudes(-LINE[None], LINE[None], np.ones(3), EYE)[0][0]
     np.testing.assert_allclose(-LINE @ found.T, LINE, rtol=0, atol=1e-12)
     assert np.linalg.det(found) == pytest.approx(1.0, abs=1e-12)
 
@@ -233,7 +233,7 @@ def test_lines_that_are_nearly_reversed_have_attitudes(short):
     towards = np.array([np.cos(np.pi - short), np.sin(np.pi - short), 0.0])
     x = np.outer(LINE[:, 0], towards)
     for near in (EYE, EYE[None]):
-        T = proximity.fit_attitudes(x[None], LINE[None], np.ones(3), near)[0][0]
+        T = rigid_body.fit_attitudes(x[None], LINE[None], np.ones(3), near)[0][0]
         np.testing.assert_allclose(T @ T.T, EYE, rtol=0, atol=1e-7)
         np.testing.assert_allclose(LINE @ T, x, rtol=0, atol=1e-6)
         assert np.linalg.det(T) > 0
@@ -247,14 +247,14 @@ def test_attitude_goes_on_through_a_line():
     p -= p.mean(axis=1, keepdims=True)
     T = Rotation.from_euler("ZYX", [50, 20, -30], degrees=True).as_matrix().T
     x = p @ T
-    found, _ = proximity.fit_attitudes(x, p, np.ones(3), T)
+    found, _ = rigid_body.fit_attitudes(x, p, np.ones(3), T)
     np.testing.assert_allclose(found, np.broadcast_to(T, found.shape), rtol=0, atol=1e-9)
 
 
 def test_one_agent_has_the_attitude_expected():
     """A point has no attitude of its own."""
     near = Rotation.from_euler("z", [[0.3], [0.4]]).as_matrix()
-    found, _ = proximity.fit_attitudes(np.zeros((2, 1, 3)), np.zeros((2, 1, 3)), np.ones(1), near)
+    found, _ = rigid_body.fit_attitudes(np.zeros((2, 1, 3)), np.zeros((2, 1, 3)), np.ones(1), near)
     np.testing.assert_array_equal(found, near)
 
 
@@ -267,7 +267,7 @@ def test_mean_axis_rates_are_those_of_the_rigid_motion(seed, n):
     x = rng.normal(size=(3, n, 3)) * 2
     x -= np.einsum("i,kia->ka", m, x)[:, None] / m.sum()
     omega = rng.normal(size=(3, 3))
-    found = proximity.mean_axis_rates(x, np.cross(omega[:, None], x), m)
+    found = rigid_body.mean_axis_rates(x, np.cross(omega[:, None], x), m)
     if n == 1:
         omega = np.zeros((3, 3))
     elif n == 2:
@@ -311,7 +311,7 @@ def test_smallest_singular_value_is_the_last_above_the_rank(name):
     r, edges, rank = PRINTED[name]
     values = np.linalg.svd(jacobian(r, edges), compute_uv=False)
     assert np.linalg.matrix_rank(jacobian(r, edges), 1e-9) == rank
-    found = proximity.smallest_singular_value(r[None], edges)
+    found = constraint_jacobian.smallest_singular_value(r[None], edges)
     assert found[0] == pytest.approx(values[rank - 1], rel=1e-9)
 
 
@@ -320,7 +320,7 @@ def test_weighted_singular_values_are_those_of_the_law():
     rng = np.random.default_rng(0)
     r, m = rng.normal(size=(4, 5, 3)), rng.uniform(0.5, 2.0, 5)
     edges = graphs.complete_graph(5)[:8]
-    found = proximity.smallest_singular_value(r, edges, m)
+    found = constraint_jacobian.smallest_singular_value(r, edges, m)
     for k in range(4):
         J = jacobian(r[k], edges)
         w = np.linalg.eigvalsh(m.mean() * (J / np.repeat(m, 3)) @ J.T)
@@ -329,7 +329,9 @@ def test_weighted_singular_values_are_those_of_the_law():
 
 def test_without_edges_there_is_no_singular_value():
     """No edge, no Jacobian: NaN at every sample."""
-    found = proximity.smallest_singular_value(np.zeros((3, 2, 3)), np.zeros((0, 2), dtype=np.int64))
+    found = constraint_jacobian.smallest_singular_value(
+        np.zeros((3, 2, 3)), np.zeros((0, 2), dtype=np.int64)
+    )
     assert np.isnan(found).all()
     assert found.shape == (3,)
 
@@ -338,7 +340,7 @@ def test_the_line_shows_in_the_singular_value():
     """An offset h from the line of three leaves lambda_min = h^2/8, so sigma = h/sqrt(8)."""
     for h in (1e-1, 1e-2, 1e-3):
         r = LINE + [[0, 0, 0], [0, h, 0], [0, 0, 0]]
-        sigma = proximity.smallest_singular_value(r[None], graphs.complete_graph(3))[0]
+        sigma = constraint_jacobian.smallest_singular_value(r[None], graphs.complete_graph(3))[0]
         assert sigma == pytest.approx(h / np.sqrt(8), rel=5e-3)
 
 
@@ -360,7 +362,7 @@ def test_ranks_are_pyrigis(name):
     )
     assert rigid == (generic == max(3 * n - 6, n - 1))
     values = np.linalg.svd(jacobian(points, edges), compute_uv=False)
-    found = proximity.smallest_singular_value(points[None], edges)[0]
+    found = constraint_jacobian.smallest_singular_value(points[None], edges)[0]
     assert found == pytest.approx(values[generic - 1], rel=1e-9)
     # Planar and straight shapes lose rank: at most 2 N - 3 and N - 1 of what a generic shape has.
     dimension = distance_geometry.dimension(r)
@@ -375,12 +377,12 @@ def test_a_bent_line_has_no_attitude_about_itself():
     off = rng.normal(size=(20, 3, 3)) * 0.2
     x = np.einsum("kba,ib->kia", T, p) + off
     x -= x.mean(axis=1, keepdims=True)
-    found, line = proximity.fit_attitudes(x, np.broadcast_to(p, x.shape), np.ones(3), T)
+    found, line = rigid_body.fit_attitudes(x, np.broadcast_to(p, x.shape), np.ones(3), T)
     assert line.all()
     away = np.einsum("kab,kcb->kac", found, T)
     assert np.degrees(np.arccos((np.trace(away, axis1=1, axis2=2) - 1) / 2)).max() < 10
     y = rng.normal(size=x.shape)
-    omega = proximity.mean_axis_rates(x, y - y.mean(axis=1, keepdims=True), np.ones(3), line)
+    omega = rigid_body.mean_axis_rates(x, y - y.mean(axis=1, keepdims=True), np.ones(3), line)
     axis = np.linalg.svd(x)[2][:, 0]
     assert np.abs(np.einsum("ka,ka->k", omega, axis)).max() < 1e-9
 
@@ -392,7 +394,7 @@ def test_a_narrow_shape_that_fits_keeps_its_attitude():
     T = Rotation.random(20, random_state=rng).as_matrix()
     x = np.einsum("kba,ib->kia", T, p) + rng.normal(size=(20, 3, 3)) * 1e-3
     x -= x.mean(axis=1, keepdims=True)
-    found, line = proximity.fit_attitudes(x, np.broadcast_to(p, x.shape), np.ones(3), T)
+    found, line = rigid_body.fit_attitudes(x, np.broadcast_to(p, x.shape), np.ones(3), T)
     assert not line.any()
     np.testing.assert_allclose(found, T, rtol=0, atol=0.03)
 

@@ -9,7 +9,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from rigidfleet.formation import distance_geometry, graphs, shapes
-from rigidfleet.math.proximity import smallest_singular_value
+from rigidfleet.math.constraint_jacobian import smallest_singular_value
 from rigidfleet.rigidity import Kind, Verdict, analyse, full_rank, jacobian, realisations
 
 RIGID, STABLE = Verdict.INFINITESIMALLY_RIGID, Verdict.PRESTRESS_STABLE

@@ -29,7 +29,8 @@ from rigidfleet.kernel.problem import (
     workspace,
 )
 from rigidfleet.kernel.problem import graph as kernel_graph
-from rigidfleet.planning.reference import about_cm, align_slots
+from rigidfleet.math.rigid_body import about_cm
+from rigidfleet.planning.reference import align_slots
 from rigidfleet.typing import Floats, Ints
 
 _SOLVERS = {"iterated": ITERATED, "spectral": SPECTRAL, "exact": EXACT, "pinv": PINV}

@@ -21,6 +21,7 @@ from rigidfleet.assessment.outcome import (
 from rigidfleet.formation import distance_geometry
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity, rigid_body
+from rigidfleet.math.constraint_jacobian import jacobian
 from rigidfleet.result import PAD, PhaseRecord, Result
 from rigidfleet.typing import Bools, Floats, Ints
 
@@ -487,12 +488,8 @@ def is_rigid(p: Floats, edges: Ints) -> bool:
     """
     if len(p) > _JUDGED:
         return False
-    i, j = edges.T
-    u = p[i] - p[j]
-    J = np.zeros((len(edges), len(p), 3))
-    rows = np.arange(len(edges))
-    J[rows, i], J[rows, j] = u, -u
-    return np.linalg.matrix_rank(J.reshape(len(edges), -1), rtol=1e-6) == 3 * len(p) - 6
+    J = jacobian(p, edges)
+    return bool(np.isfinite(J).all()) and np.linalg.matrix_rank(J, rtol=1e-6) == 3 * len(p) - 6
 
 
 def _greatest(values: Floats) -> float | None:

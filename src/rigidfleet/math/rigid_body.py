@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigidfleet.typing import Floats
+from rigidfleet.typing import Bools, Floats
 
 
 def centred(points: ArrayLike) -> Floats:
@@ -69,3 +69,145 @@ def _nearest_fit(u: Floats, s: Floats, vt: Floats, near: Floats, tol: float) -> 
     n = np.zeros(3)
     n[-equal:] = np.linalg.eigh(overlap + overlap.T)[1][:, 0]
     return (u - 2 * np.outer(u @ n, n)) @ vt
+
+
+# Slots thinner than this, relative to their length, are a line to an attitude fit.
+_THIN = 1e-3
+
+
+# Narrower ones than this are a line where they are not so many times wider than agents are off them.
+_NARROW = 0.1
+
+
+_SURE = 4.0
+
+
+# A turn is half a turn where 1 + cos of its angle is less: 1e-8 rad from it.
+_HALF_TURN = 5e-17
+
+
+def fit_attitudes(x: Floats, p: Floats, masses: Floats, near: Floats) -> tuple[Floats, Bools]:
+    """Attitude T (K, 3, 3), world -> body, of slots fitted to agents at each of K samples (Kabsch).
+
+    Also returns where the slots are one line (K,). So are narrow slots, if the attitude expected is known, where
+    agents are off them by more than their width: how those lie about their long axis is chance.
+
+    Parameters
+    ----------
+    x, p : (K, N, 3) agents about their CM in world axes, and slots in body axes [m]
+    masses : (N,) weights [kg]
+    near : (K, 3, 3) or (3, 3) the attitude expected, which decides what the fit leaves open: the
+        spin of a line about itself. One matrix: each sample's is taken from the sample before.
+    """
+    fit = np.einsum("i,kia,kib->kab", masses, p, x)
+    U, _, Vt = np.linalg.svd(fit)
+    U[:, :, 2] *= np.sign(np.linalg.det(U @ Vt))[:, None]
+    T = U @ Vt
+    weights = np.sqrt(masses)[:, None]
+    width, long, axes = _long_axes(weights * p)
+    line = width <= _THIN * long
+    if near.ndim == 3:
+        thin = np.flatnonzero(width <= _NARROW * long)
+        along = _turn_lines(x[thin], p[thin], axes[thin], near[thin])
+        off = np.linalg.norm(weights * (x[thin] - p[thin] @ along), axis=(1, 2))
+        line[thin] |= width[thin] <= _SURE * off
+        T[thin] = np.where(line[thin, None, None], along, T[thin])
+        return T, line
+    # Out of samples on a line, each turns on from the one before: what turns them is known beforehand.
+    if not line.any():
+        return T, line
+    there = _directions(x, p, axes)
+    follows = line[1:] & line[:-1] & (axes[1:] == axes[:-1]).all(axis=1) & there[:-1].any(axis=1)
+    first = np.flatnonzero(line & ~np.append(False, follows))
+    now = np.concatenate([there[:1], there[:-1]])
+    now[first] = 0.0
+    turns = _smallest_turns(now, there)
+    guess = near
+    for k in range(len(p)):
+        if line[k]:
+            turn = turns[k]
+            if not now[k].any():
+                turn = _smallest_turns((axes[k] @ guess)[None], there[k : k + 1])[0]
+            T[k] = guess @ turn.T
+        guess = T[k]
+    return T, line
+
+
+def _long_axes(p: Floats) -> tuple[Floats, Floats, Floats]:
+    """Second and first singular value (K,) of points p (K, N, 3), and the direction (K, 3) of the first.
+
+    Of points so wide that they are no line, two others whose ratio says so.
+    """
+    # Slots mostly stand still: one decomposition then serves all samples.
+    few = p[:1] if (p == p[:1]).all() else p
+    C = few.swapaxes(1, 2) @ few
+    # Eigenvalues a >= b >= c of C: with s = a + b + c, b >= (ab + ac + bc) / 3s.
+    s = np.trace(C, axis1=1, axis2=2)
+    long = np.sqrt(s)
+    width = np.sqrt(
+        np.maximum(s * s - (C * C).sum(axis=(1, 2)), 0.0) / (6.0 * np.where(s > 0.0, s, 1.0))
+    )
+    axis = np.zeros((len(few), 3))
+    slim = np.flatnonzero(width <= _NARROW * long)
+    if len(slim) and p.shape[1] > 1:
+        _, spread, axes = np.linalg.svd(few[slim], full_matrices=False)
+        long[slim], width[slim], axis[slim] = spread[:, 0], spread[:, 1], axes[:, 0]
+    K = len(p)
+    return np.broadcast_to(width, K), np.broadcast_to(long, K), np.broadcast_to(axis, (K, 3))
+
+
+def _turn_lines(x: Floats, p: Floats, axis: Floats, near: Floats) -> Floats:
+    """Attitudes (K, 3, 3) of lines, from ``near`` by the smallest rotation that brings each axis home."""
+    now = np.einsum("kba,kb->ka", near, axis)
+    return near @ _smallest_turns(now, _directions(x, p, axis)).swapaxes(1, 2)
+
+
+def _directions(x: Floats, p: Floats, axis: Floats) -> Floats:
+    """Where the long axis (K, 3) of slots p points among agents x (K, N, 3): unit vectors, or zero."""
+    there = np.einsum("ki,kia->ka", np.einsum("kia,ka->ki", p, axis), x)
+    length = np.linalg.norm(there, axis=1)
+    return there / np.where(length == 0.0, 1.0, length)[:, None]
+
+
+def _smallest_turns(now: Floats, there: Floats) -> Floats:
+    """Smallest rotations (K, 3, 3) from unit vectors to others (K, 3); none to or from zero."""
+    # 1 + c of their angle's cosine c, in digits that are good up to half a turn; of zero vectors it does not matter.
+    near = 0.5 * ((now + there) ** 2).sum(axis=1)
+    opposite = (near < _HALF_TURN) & now.any(axis=1) & there.any(axis=1)
+    skew = there[:, :, None] * now[:, None, :]  # of now x there, less its transpose
+    skew = skew - skew.swapaxes(1, 2)
+    R = np.eye(3) + skew + skew @ skew / np.where(near < _HALF_TURN, 1.0, near)[:, None, None]
+    for k in np.flatnonzero(opposite):  # half a turn: any axis across the line will do
+        across = np.cross(now[k], np.eye(3)[np.abs(now[k]).argmin()])
+        across /= np.linalg.norm(across)
+        R[k] = 2.0 * np.outer(across, across) - np.eye(3)
+    return R
+
+
+def mean_axis_rates(x: Floats, y: Floats, masses: Floats, line: ArrayLike = False) -> Floats:
+    """Angular velocity omega = I^+ h (K, 3) [rad/s], world axes, of agents about their CM.
+
+    x, y (K, N, 3): positions and velocities about the CM [m, m/s]; masses (N,) or (K, N); line (K,):
+    where they are one, and have no spin about themselves. That of a line bent by some centimetres would be noise.
+    """
+    masses = np.broadcast_to(masses, x.shape[:2])
+    h = np.einsum("ki,kia->ka", masses, np.cross(x, y))
+    C = np.einsum("ki,kia,kib->kab", masses, x, x)
+    inertia = np.trace(C, axis1=1, axis2=2)[:, None, None] * np.eye(3) - C
+    # Far from a line the inverse is the pseudo-inverse, for a third of the time.
+    size = np.trace(inertia, axis1=1, axis2=2)
+    with np.errstate(over="ignore", invalid="ignore"):  # what has no inertia has no rates
+        round_ = ~np.broadcast_to(line, len(x)) & (np.linalg.det(inertia) > 1e-4 * size**3)
+    omega = np.empty((len(x), 3))
+    omega[round_] = np.linalg.solve(inertia[round_], h[round_, :, None])[:, :, 0]
+    rest = ~round_
+    cutoff = np.broadcast_to(np.where(line, _NARROW**2, 1e-9), len(x))[rest]
+    pseudo = np.linalg.pinv(inertia[rest], cutoff, hermitian=True)
+    omega[rest] = np.einsum("kab,kb->ka", pseudo, h[rest])
+    # Of a point none; not what rounding makes of it.
+    return np.where(np.count_nonzero(masses, axis=1)[:, None] > 1, omega, 0.0)
+
+
+def about_cm(points: Floats, masses: Floats) -> Floats:
+    """Points (N, 3) [m] relative to their centre of mass."""
+    return points - masses @ points / masses.sum()

@@ -16,7 +16,7 @@ from rigidfleet._toml import to_toml
 from rigidfleet.errors import Finding, MissionError
 from rigidfleet.formation.assignment import assigned
 from rigidfleet.formation.distance_geometry import distances
-from rigidfleet.math import proximity
+from rigidfleet.math import constraint_jacobian
 from rigidfleet.math.attitude import dcm_from_euler
 from rigidfleet.mission import bounds
 from rigidfleet.mission.check import check
@@ -255,7 +255,7 @@ class Mission(Contents):
         if not len(edges) or min(len(edges), 3 * int(left.sum())) > _DENSE:
             return _DAMPING[1]
         masses = np.array(self.agents.mass)[left]
-        index = proximity.smallest_singular_value(slots[left][None], edges, masses)[0]
+        index = constraint_jacobian.smallest_singular_value(slots[left][None], edges, masses)[0]
         return float(np.clip(index**2 / 4, *_DAMPING))
 
     @property

@@ -9,11 +9,11 @@ import numpy as np
 from rigidfleet.kernel.problem import septic_polynomial
 from rigidfleet.math import attitude as att
 from rigidfleet.math import pid, rigid_body
+from rigidfleet.math.rigid_body import about_cm
 from rigidfleet.mission import Establish, Mission, Phase, Reshape
 from rigidfleet.planning.reference import (
     Pose,
     Situation,
-    about_cm,
     align_slots,
     attach,
     goal_of,

@@ -13,6 +13,7 @@ import numpy as np
 from rigidfleet.formation import distance_geometry
 from rigidfleet.math import attitude as att
 from rigidfleet.math import lqr, rigid_body
+from rigidfleet.math.rigid_body import about_cm, mean_axis_rates
 from rigidfleet.mission import Establish, Fly, Mission, Phase, Regulator, Reshape, Turn
 from rigidfleet.typing import Bools, Floats, Ints
 
@@ -72,21 +73,6 @@ class Situation:
     lost: Bools | None = None  # (N,) vehicles that fly no more; None: none
 
 
-def about_cm(points: Floats, masses: Floats) -> Floats:
-    """Points (N, 3) [m] relative to their centre of mass."""
-    return points - masses @ points / masses.sum()
-
-
-def body_rates(r: Floats, v: Floats, masses: Floats, T: Floats) -> Floats:
-    """Mean-axis rates omega = I^+ h (3,) [rad/s] of agents r, v (N, 3), in the axes of T (3, 3)."""
-    if len(masses) == 1:
-        return np.zeros(3)  # of a point; not what rounding makes of it
-    x, y = about_cm(r, masses), about_cm(v, masses)
-    inertia = np.einsum("i,ij,ij->", masses, x, x) * np.eye(3) - (masses[:, None] * x).T @ x
-    h = masses @ np.cross(x, y)
-    return T @ np.linalg.pinv(inertia, 1e-9, hermitian=True) @ h
-
-
 def slots_about_cm(mission: Mission, name: str | None, masses: Floats) -> Floats | None:
     """Slots (N, 3) [m] of a formation about their centre of mass; None where there are none."""
     slots = mission.formation_slots(name) if name else None
@@ -130,7 +116,7 @@ def attach(
         else:
             T = near if mission.body_frame is not None else mission.drawn_attitude
         pose = Pose(masses @ now.r / masses.sum(), masses @ now.v / masses.sum(), T, np.zeros(3))
-        pose.omega = body_rates(now.r, now.v, masses, T)
+        pose.omega = T @ mean_axis_rates(x[None], about_cm(now.v, masses)[None], masses)[0]
         if now.lost is not None and fit is not None:
             centre = masses @ fit / masses.sum()  # of those left, from the body's origin
             pose.r = pose.r - T.T @ centre

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rigidfleet.planning.reference import about_cm
+from rigidfleet.math.rigid_body import about_cm
 from rigidfleet.typing import Floats
 
 if TYPE_CHECKING:

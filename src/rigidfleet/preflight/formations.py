@@ -10,9 +10,7 @@ import numpy as np
 from rigidfleet.formation import distance_geometry
 from rigidfleet.mission import Establish, Mission, Reshape
 from rigidfleet.planning import solvers
-from rigidfleet.planning.reference import (
-    led_by,
-)
+from rigidfleet.planning.reference import led_by
 from rigidfleet.preflight.findings import DENSE, TOLERANCE, FormationCheck, Remark, agents, some
 from rigidfleet.rigidity import (
     Kind,

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rigidfleet.formation.distance_geometry import dimension
-from rigidfleet.rigidity.framework import Flex, Framework, jacobian, localised
+from rigidfleet.math.constraint_jacobian import jacobian
+from rigidfleet.rigidity.framework import Flex, Framework, localised
 from rigidfleet.rigidity.order import StressEnergy, blocking_stress, finite_flex
 from rigidfleet.typing import Floats, Ints
 

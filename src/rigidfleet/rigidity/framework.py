@@ -11,8 +11,8 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
+from rigidfleet.math.constraint_jacobian import jacobian
 from rigidfleet.typing import Floats, Ints
 
 #: Singular values below this times the largest are zero: points rounded to seven digits count as flat.
@@ -23,18 +23,6 @@ _STILL = 1e-5
 
 #: Squares that have been reduced to this share of themselves have few right digits left.
 _SPENT = 1e-8
-
-
-def jacobian(points: ArrayLike, edges: ArrayLike) -> Floats:
-    """J (m, N d) of edges (m, 2) at points (N, d): unit vector u at i, -u at j."""
-    p = np.asarray(points, dtype=np.float64)
-    e = np.asarray(edges, dtype=np.int64).reshape(-1, 2)
-    u = p[e[:, 0]] - p[e[:, 1]]
-    u /= np.linalg.norm(u, axis=1, keepdims=True)
-    J = np.zeros((len(e), *p.shape))
-    row = np.arange(len(e))
-    J[row, e[:, 0]], J[row, e[:, 1]] = u, -u
-    return J.reshape(len(e), p.size)
 
 
 def rigid_motions(points: Floats) -> Floats:

@@ -14,8 +14,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from rigidfleet.math.constraint_jacobian import jacobian
 from rigidfleet.math.rigid_body import kabsch
-from rigidfleet.rigidity.framework import Framework, jacobian, sparse
+from rigidfleet.rigidity.framework import Framework, sparse
 from rigidfleet.typing import Floats, Ints
 
 #: A stress blocks all flexes when its least energy is more than this times its largest.

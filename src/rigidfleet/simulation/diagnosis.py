@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rigidfleet.kernel.engine import native
+from rigidfleet.math.constraint_jacobian import jacobian
 from rigidfleet.mission import Establish, Reshape
 from rigidfleet.planning import solvers
 from rigidfleet.typing import Floats
@@ -44,7 +45,7 @@ def diagnose(mission: Mission, leg: Leg, *, own_force: bool, collapsed: bool) ->
             f"{head}; solved by {solvers.WORDS[leg.plan.method]}, which lost a pivot {lost} times and found no"
             f" solution {failed} times. {remedy()}"
         )
-    J, closest, length = _jacobian(leg, mission.n_agents)
+    J, closest, length = _jacobian(leg)
     edge = "-".join(str(int(a) + 1) for a in leg.plan.edges[closest])
     if not np.isfinite(J).all():
         return (
@@ -116,19 +117,13 @@ def _remedy(mission: Mission, leg: Leg, *, own_force: bool, collapsed: bool) -> 
     )
 
 
-def _jacobian(leg: Leg, n: int) -> tuple[Floats, int, float]:
+def _jacobian(leg: Leg) -> tuple[Floats, int, float]:
     """J (m, 3N) where the integrator is, its shortest edge and that edge's length [m]."""
     edges = leg.plan.edges
     native.closed_loop(
         leg.t, leg.state.y, np.empty_like(leg.state.y), leg.plan.program, leg.workspace
     )
     r = leg.workspace.r
-    u = r[edges[:, 0]] - r[edges[:, 1]]
-    lengths = np.linalg.norm(u, axis=1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        u /= lengths[:, None]
-    J = np.zeros((len(edges), n, 3))
-    rows = np.arange(len(edges))
-    J[rows, edges[:, 0]], J[rows, edges[:, 1]] = u, -u
+    lengths = np.linalg.norm(r[edges[:, 0]] - r[edges[:, 1]], axis=1)
     closest = int(lengths.argmin())
-    return J.reshape(len(edges), -1), closest, float(lengths[closest])
+    return jacobian(r, edges), closest, float(lengths[closest])

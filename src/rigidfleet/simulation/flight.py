@@ -18,11 +18,12 @@ from rigidfleet.kernel.engine import native
 from rigidfleet.kernel.problem import LOCAL, OPEN, RIGID, Program, Workspace
 from rigidfleet.kernel.problem import workspace as kernel_workspace
 from rigidfleet.math import attitude as att
+from rigidfleet.math.rigid_body import about_cm
 from rigidfleet.mission import Establish, Fly, Mission, Phase, Reshape, Settle, Turn
 from rigidfleet.planning import solvers
 from rigidfleet.planning.disturbances import disturbance, without
 from rigidfleet.planning.plan import PhasePlan, plan_phase
-from rigidfleet.planning.reference import Pose, Situation, about_cm
+from rigidfleet.planning.reference import Pose, Situation
 from rigidfleet.planning.tolerances import absolute_tolerances, most_steps, tolerance_of_velocity
 from rigidfleet.result import PhaseRecord, Result
 from rigidfleet.simulation.callbacks import ExternalForce, Force, asked

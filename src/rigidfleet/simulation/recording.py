@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rigidfleet.math import attitude as att
-from rigidfleet.math import proximity
+from rigidfleet.math import constraint_jacobian, proximity, rigid_body
 from rigidfleet.result import PhaseRecord, Result
 from rigidfleet.typing import Bools, Floats, Ints
 
@@ -74,7 +74,7 @@ def assemble(
     attitude_reference = np.full((len(r), 4), np.nan)
     commanded = np.isfinite(T_ref[:, 0, 0])
     attitude_reference[commanded] = att.quaternion_from_dcm(T_ref[commanded])
-    omega = proximity.mean_axis_rates(x, y, masses, line)
+    omega = rigid_body.mean_axis_rates(x, y, masses, line)
     lacking = attached & ~left.all(axis=1)
     offset = np.einsum("kab,ka->kb", T[lacking], centre[lacking])
     cm[lacking] -= offset
@@ -187,7 +187,7 @@ def _attitudes(
         if np.isnan(near[0, 0, 0]):
             near = last
         who = masses[rows.start] > 0.0
-        T[rows], line[rows] = proximity.fit_attitudes(
+        T[rows], line[rows] = rigid_body.fit_attitudes(
             x[rows][:, who], p[rows][:, who], masses[rows.start, who], near
         )
         last = T[rows][-1]
@@ -235,5 +235,5 @@ def _singular(r: Floats, edges: Ints) -> Floats:
         return np.full(len(r), np.nan)
     count = min(len(r), max(_LEAST, _WORK // max(size, 1) ** 3))
     some = np.unique(np.linspace(0, len(r) - 1, count).round().astype(np.int64))
-    found = proximity.smallest_singular_value(r[some], edges)
+    found = constraint_jacobian.smallest_singular_value(r[some], edges)
     return np.interp(np.arange(len(r)), some, found)

@@ -1,0 +1,54 @@
+"""The constraint Jacobian of distances, J (m, 3N) with rows u_ij and -u_ij (Eq. 5)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rigidfleet.typing import Floats, Ints
+
+# Numbers in a temporary array at most.
+_ELEMENTS = 8_000_000
+
+
+def jacobian(points: ArrayLike, edges: ArrayLike) -> Floats:
+    """J (..., m, N d) of edges (m, 2) at points (..., N, d): a row holds the unit vector u at i and -u at j (Eq. 5).
+
+    A row is not finite where its agents are at one place.
+    """
+    p = np.asarray(points, dtype=np.float64)
+    i, j = np.asarray(edges, dtype=np.int64).reshape(-1, 2).T
+    u = p[..., i, :] - p[..., j, :]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u /= np.linalg.norm(u, axis=-1, keepdims=True)
+    row = np.arange(len(i))
+    # Agents of an edge first, samples last: that way an assignment is one pass.
+    J = np.zeros((len(i), p.shape[-2], *p.shape[:-2], p.shape[-1]))
+    J[row, i] = np.moveaxis(u, -2, 0)
+    J[row, j] = -J[row, i]
+    J = np.moveaxis(J, (0, 1), (-3, -2))
+    return J.reshape(*p.shape[:-2], len(i), p.shape[-2] * p.shape[-1])
+
+
+def smallest_singular_value(r: Floats, edges: Ints, masses: ArrayLike | None = None) -> Floats:
+    """Smallest non-zero singular value (K,) of the constraint Jacobian J at r (K, N, 3).
+
+    Zero means below 1e-7 of the largest. NaN without edges. With ``masses`` the Jacobian is
+    weighted, J M^-1/2 sqrt(mbar), whose squares are the eigenvalues w of mbar A.
+    """
+    if not len(edges):
+        return np.full(len(r), np.nan)
+    # Some samples at a time: J of all of them may not fit into memory.
+    some = max(1, _ELEMENTS // (len(edges) * r.shape[1] * 3))
+    if len(r) > some:
+        parts = [r[k : k + some] for k in range(0, len(r), some)]
+        return np.concatenate([smallest_singular_value(part, edges, masses) for part in parts])
+    J = jacobian(r, edges)
+    if masses is not None:
+        m = np.asarray(masses, dtype=float)
+        J *= np.repeat(np.sqrt(m.mean() / m), 3)
+    # The smaller Gram matrix: a third of the time of a decomposition of J itself.
+    gram = J @ J.swapaxes(1, 2) if J.shape[1] <= J.shape[2] else J.swapaxes(1, 2) @ J
+    w = np.linalg.eigvalsh(gram)
+    w[w < 1e-14 * w[:, -1:]] = np.inf
+    return np.sqrt(w.min(axis=1))
