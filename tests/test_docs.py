@@ -215,7 +215,7 @@ def test_missions_and_figures_exist():
     assert all(f"`{name}`" in page("paper.md") for name in known)
 
 
-HOMES = "kernel|plan|simulate|formation|attitude|lqr|gains|physics|geometry|record|result|assess|mission|figures|errors"
+HOMES = "kernel|planning|simulation|formation|math|physics|rigidity|result|assessment|mission|plotting|errors"
 
 
 @pytest.mark.parametrize("name", ["theory.md", "paper.md"])

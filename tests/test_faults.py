@@ -39,7 +39,7 @@ RUN = ("run", "pair.toml", "--no-figures", "--force")
 #: A process that is killed for good when half of its result is written.
 DYING = """if True:
     import builtins, io, os, signal, sys
-    from rigidfleet import cli
+    from rigidfleet.cli import app as cli
     whole = builtins.open
     def half(path, mode="r", *arguments, **more):
         if mode != "xb":

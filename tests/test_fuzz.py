@@ -315,10 +315,11 @@ def test_the_fuzzer_finds_what_there_is(tmp_path: Path, monkeypatch: pytest.Monk
         ("return 7", "exit code 7"),
         ("return 2", "exit code 2 without an error"),
     ):
-        (tmp_path / "rigidfleet").mkdir(exist_ok=True)
-        (tmp_path / "rigidfleet" / "__init__.py").write_text("")
-        (tmp_path / "rigidfleet" / "planning/tolerances.py").write_text("")
-        (tmp_path / "rigidfleet" / "cli.py").write_text(f"def main(_):\n    {body}\n")
+        for room in ("", "cli", "planning"):
+            (tmp_path / "rigidfleet" / room).mkdir(exist_ok=True)
+            (tmp_path / "rigidfleet" / room / "__init__.py").write_text("")
+        (tmp_path / "rigidfleet" / "planning" / "tolerances.py").write_text("")
+        (tmp_path / "rigidfleet" / "cli" / "app.py").write_text(f"def main(_):\n    {body}\n")
         monkeypatch.setenv("PYTHONPATH", str(tmp_path))
         monkeypatch.setenv("MUTATIONS_SECONDS", "1")
         (case,) = mutations.attack("check", 0, 1)

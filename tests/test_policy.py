@@ -214,7 +214,7 @@ def test_events_are_lines():
 def test_scripts_make_no_mark_up():
     """No script of ours makes mark-up or code out of text, nor holds what would end or hide it in a page."""
     for package in ("replay", "live"):
-        for file in resources.files(f"rigidfleet.{package}").iterdir():
+        for file in resources.files(f"rigidfleet.web.{package}").iterdir():
             if file.name.endswith((".js", ".css")):
                 text = file.read_text(encoding="utf-8")
                 sinks = r"innerHTML|outerHTML|insertAdjacentHTML|document\.write|\beval\b|new Function|</|<!--"
