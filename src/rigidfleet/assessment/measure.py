@@ -119,7 +119,6 @@ class Flight:
 
     def __init__(self, result: Result) -> None:
         self.result, self.mission = result, result.mission
-        self.labels = result.edge_labels
         self.left = result.left
         self.whole = bool(self.left.all())
         #: Samples of each phase.
@@ -173,7 +172,8 @@ class Flight:
 
     def edge(self, _k: int, e: int) -> str:
         """Name of edge e (from 0), at whichever sample."""
-        return f"edge {self.labels[e]}"
+        i, j = self.result.edges[e]
+        return f"edge {i + 1}-{j + 1}"
 
     def pair(self, k: int) -> str:
         """The two agents that are nearest to each other at sample k."""
