@@ -34,7 +34,7 @@ def findings(flight: Flight, verdict: Verdict) -> Iterator[Finding]:
     """Every check of a flight: of one that can fail in several phases all that do, else the worst."""
     yield _complete(flight.result)
     yield from _record(flight)
-    yield from _unseen(flight.result)
+    yield from _unseen(flight)
     candidates = [
         *_settled(verdict.phases),
         *_shapes(flight, verdict.phases),
@@ -72,8 +72,9 @@ def _failures_or_worst(candidates: Iterable[Finding]) -> Iterator[Finding]:
 
 def _complete(result: Result) -> Finding:
     end = float(result.time[-1])
-    lost = ~np.isfinite(result.position).all(axis=2)
-    if lost.any():
+    finite = np.isfinite(result.position)
+    if not finite.all():
+        lost = ~finite.all(axis=2)
         bad = float(result.time[int(np.argmax(np.any(lost, axis=1)))])
         who = names(np.flatnonzero(np.any(lost, axis=0)))
         words = f"the position of {who} is not finite, first at {bad:.2f} s"
@@ -94,8 +95,9 @@ def _record(flight: Flight) -> Iterator[Finding]:
         yield Finding("record", False, words, when=when)
 
 
-def _unseen(result: Result) -> Iterator[Finding]:
+def _unseen(flight: Flight) -> Iterator[Finding]:
     """Ends of shaping phases and waypoints of which no sample tells: they are not judged, nor passed."""
+    result = flight.result
     last = len(result.phases) - 1
     for i, p in enumerate(result.phases):
         if not result.complete and i == last:
@@ -106,7 +108,7 @@ def _unseen(result: Result) -> Iterator[Finding]:
         for what, t in moments.items():
             if t is None:
                 continue
-            seen = result.time[result.samples(i)]
+            seen = result.time[flight.samples[i]]
             away = float(np.abs(seen - min(t, p.t_end)).min(initial=np.inf))
             if away > _UNSEEN:
                 nearest = (
@@ -136,7 +138,7 @@ def _shapes(flight: Flight, phases: list[PhaseVerdict]) -> Iterator[Finding]:
         edges, _ = flight.edges(p.formation, last)
         held = False
         if p.distances is not None:
-            limit = SHAPE_TOLERANCE * float(flight.mission.formation_distances(p.formation).min())
+            limit = SHAPE_TOLERANCE * float(flight.formation(p.formation)[2].min())
             held = p.distances <= limit
             words = f"{value(p.distances, 'm')} off (limit {value(limit, 'm')})"
             words = f"the worst of the {len(edges)} edges of '{p.formation}' is {words}"
@@ -352,8 +354,7 @@ def notes(flight: Flight, phases: list[PhaseVerdict]) -> Iterator[str]:
 
 def _sampled(flight: Flight) -> Iterator[str]:
     """A record that does not say what happens between its samples."""
-    flown = np.unique(flight.result.phase)
-    if any(not flight.result.phases[k].extremes for k in flown):
+    if any(not flight.result.phases[k].extremes for k in flight.flown):
         step = float(np.diff(flight.result.time).max(initial=0.0))
         yield (
             f"judged at samples alone, up to {step:.3g} s apart: the record does not tell what happens"
@@ -379,12 +380,13 @@ def _fallen(flight: Flight) -> Iterator[str]:
 
 def _dips(flight: Flight) -> Iterator[str]:
     """Agents below z = 0 where neither ground nor geofence would tell."""
-    mission, z = flight.mission, flight.of_left(flight.result.position[..., 2])
+    mission = flight.mission
     if mission.limits.geofence is not None or any(o.kind == "ground" for o in mission.obstacles):
         return
-    low = np.flatnonzero((z < -DIP).any(axis=0))
     e = flight.height(lowest=True)
     if e is not None and e.value < -DIP:
+        z = flight.of_left(flight.result.position[..., 2])
+        low = np.flatnonzero((z < -DIP).any(axis=0))
         others = f" ({names(low)} are below 0 at times)" if len(low) > 1 else ""
         words = f"dips to z = {e.value:.2f} m at {e.when:.2f} s{others}"
         yield f"{e.who} {words}; the mission has no ground"

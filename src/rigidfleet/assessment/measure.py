@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator
-from functools import lru_cache
-from typing import Any
+from collections.abc import Callable, Iterator
+from functools import cached_property, lru_cache
+from itertools import pairwise
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -40,26 +41,48 @@ _KEPT = 100_000
 _JUDGED = 200
 
 
+class Laid(NamedTuple):
+    """Slots laid onto agents, of one formation or of many (...)."""
+
+    p: Floats  # (..., N, 3) agents about their centre
+    slots: Floats  # (..., N, 3) about theirs
+    off: Floats  # (..., N) how far agents are off them, as they are or mirrored, whichever fits better
+    mirrored: Bools  # (...) which of the two
+    turn: Floats  # (..., 3, 3) the rotation that fits best, mirrored or not
+
+    @classmethod
+    def of(cls, p: Floats, slots: Floats) -> Laid:
+        """Slots (..., N, 3) laid onto agents p (..., N, 3)."""
+        p, slots = p - p.mean(axis=-2, keepdims=True), slots - slots.mean(axis=-2, keepdims=True)
+        across = p.swapaxes(-1, -2) @ slots
+        U, _, Vt = np.linalg.svd(slots.swapaxes(-1, -2) @ p)
+        off = np.linalg.norm(p - slots @ (U @ Vt), axis=-1)
+        return cls(p, slots, off, np.linalg.det(across) < 0, rigid_body.kabsch(p, slots))
+
+
 class Fit:
     """A formation as flown at one sample, p (N, 3), against its slots (N, 3)."""
 
-    def __init__(self, p: Floats, slots: Floats, who: Ints | None = None) -> None:
+    def __init__(
+        self, p: Floats, slots: Floats, who: Ints | None = None, laid: Laid | None = None
+    ) -> None:
+        laid = Laid.of(p, slots) if laid is None else laid
         known = (
             _shape(slots.tobytes()) if slots.nbytes < _KEPT else _shape.__wrapped__(slots.tobytes())
         )
         #: Slots' dimension; direction of a line or normal of a plane, in their axes; their shortest distance [m].
         self.dimension, self.axis, self.shortest = known
-        self.error, pair, self.flown, self.intended = _all_pairs(p, slots)
+        self.error, pair, self.flown, self.intended = _all_pairs(p, slots, laid)
         #: The pair with the greatest error, by the numbers ``who`` (N,) of the agents.
         self.pair = pair if who is None else (int(who[pair[0]]), int(who[pair[1]]))
-        p, slots = rigid_body.centred(p), rigid_body.centred(slots)
-        self.mirrored = self.dimension == 3 and bool(np.linalg.det(p.T @ slots) < 0)
+        self.mirrored = self.dimension == 3 and bool(laid.mirrored)
         #: Where the axis points in the world.
-        self.points: Floats = rigid_body.kabsch(p, slots) @ self.axis
+        self.points: Floats = laid.turn @ self.axis
         self.in_order: bool | None = None
         if self.dimension == 1 and len(p) > 2:
-            asked = np.argsort(slots @ self.axis).tolist()
-            flown = np.argsort(p @ np.linalg.svd(p, full_matrices=False)[2][0]).tolist()
+            asked = np.argsort(laid.slots @ self.axis).tolist()
+            along = np.linalg.svd(laid.p, full_matrices=False)[2][0]
+            flown = np.argsort(laid.p @ along).tolist()
             self.in_order = flown in (asked, asked[::-1])
 
     @property
@@ -79,24 +102,17 @@ class Quantity:
 
     def __init__(self, values: Floats, who: Callable[..., str], sense: Callable[..., Any]) -> None:
         self.values, self.who, self.sense = values, who, sense
-        #: The worst of each sample (K,); -infinity where none is finite.
-        self.rank = self._ranked(sense(values))
-        if not np.isfinite(self.rank).all():
-            self.rank = self._ranked(sense(np.where(np.isfinite(values), values, np.nan)))
+        rank = np.ascontiguousarray(sense(values)).reshape(len(values), -1)
+        finite = np.isfinite(rank)
+        #: How bad each value is (K, places); -infinity where it is not finite.
+        self.rank = rank if finite.all() else np.where(finite, rank, -np.inf)
 
-    @staticmethod
-    def _ranked(values: Floats) -> Floats:
-        if values.ndim > 1:  # along the agents, of which there are few, it takes longer
-            values = np.fmax.reduce(np.ascontiguousarray(values.T), axis=0, initial=-np.inf)
-        return np.where(np.isnan(values), -np.inf, values)
-
-    def at(self, k: int) -> tuple[float, tuple[int, ...]]:
-        """The worst of sample k, and its place."""
-        if self.values.ndim == 1:
-            return float(self.values[k]), ()
-        row = self.values[k]
-        i = int(np.where(np.isfinite(row), self.sense(row), -np.inf).argmax())
-        return float(row[i]), (i,)
+    def worst(self, starts: Ints) -> list[float]:
+        """How bad the worst is of the samples from each start to the next; the last ones go on to the end."""
+        places = self.rank.shape[1]
+        if not places:
+            return [-math.inf] * len(starts)
+        return np.maximum.reduceat(self.rank.reshape(-1), places * starts).tolist()
 
 
 class Flight:
@@ -104,15 +120,18 @@ class Flight:
 
     def __init__(self, result: Result) -> None:
         self.result, self.mission = result, result.mission
-        self.labels = result.edge_labels
-        self.fits: dict[int, Fit] = {}
         self.left = result.left
+        self.whole = bool(self.left.all())
         #: Samples of each phase.
-        self.samples = [result.samples(k) for k in range(len(result.phases))]
+        ends = np.searchsorted(result.phase, np.arange(len(result.phases) + 1))
+        self.samples = [slice(*pair) for pair in pairwise(ends.tolist())]
+        #: Phases of which there are samples.
+        self.flown = [k for k, s in enumerate(self.samples) if s.stop > s.start]
+        self._formations: dict[str, tuple[Floats | None, Ints, Floats]] = {}
         radius, obstacles = self.mission.agents.radius, self.mission.obstacles
         #: Room of each agent to obstacles, and the nearest one (K, N).
         self.room, self.nearest = proximity.rooms(result.position, radius, obstacles)
-        if not self.left.all():
+        if not self.whole:
             self.room[~self.left] = np.inf
         #: Separation, pair, clearance, agent and obstacle at samples (K, ...).
         self.close = (
@@ -137,15 +156,16 @@ class Flight:
                 ("singular_value", result.singular_value, lambda k: ""),
             )
         }
-        #: The worst of each quantity at the samples of each phase.
-        self.sampled = [
-            {name: self.worst_sample(q, self.samples[k]) for name, q in self.measured.items()}
-            for k in range(len(result.phases))
-        ]
+        starts = np.array([self.samples[k].start for k in self.flown])
+        #: How bad the worst of each quantity is at the samples of each phase flown.
+        self.rank = {
+            name: dict(zip(self.flown, q.worst(starts), strict=True))
+            for name, q in self.measured.items()
+        }
 
     def of_left(self, values: Floats) -> Floats:
         """Values (K, N), NaN of agents that are lost."""
-        return values if self.left.all() else np.where(self.left, values, np.nan)
+        return values if self.whole else np.where(self.left, values, np.nan)
 
     def agent(self, _k: int, i: int) -> str:
         """Name of agent i (from 0), at whichever sample."""
@@ -153,7 +173,8 @@ class Flight:
 
     def edge(self, _k: int, e: int) -> str:
         """Name of edge e (from 0), at whichever sample."""
-        return f"edge {self.labels[e]}"
+        i, j = self.result.edges[e]
+        return f"edge {i + 1}-{j + 1}"
 
     def pair(self, k: int) -> str:
         """The two agents that are nearest to each other at sample k."""
@@ -187,13 +208,14 @@ class Flight:
     def worst_sample(self, quantity: Quantity, samples: slice) -> Extreme | None:
         """The worst of a quantity among some samples; None where nothing is known of it."""
         rank = quantity.rank[samples]
-        if not len(rank):
+        if not rank.size:
             return None
-        k = samples.start + int(rank.argmax())
-        if quantity.rank[k] == -np.inf:
+        k, place = divmod(int(rank.argmax()), rank.shape[1])
+        if rank[k, place] == -np.inf:
             return None
-        value, at = quantity.at(k)
-        return Extreme(value, who=quantity.who(k, *at), **self.at(k))
+        k += samples.start
+        at = () if quantity.values.ndim == 1 else (place,)
+        return Extreme(float(quantity.values[k, *at]), who=quantity.who(k, *at), **self.at(k))
 
     # -- between samples ------------------------------------------------------------------------------
 
@@ -217,8 +239,23 @@ class Flight:
         self, name: str, sampled: Extreme | None, sense: Callable[..., Any] = lambda x: x
     ) -> Extreme | None:
         """The worst of a flight: that of its samples, or that between them."""
-        every = [self.between(name, k) for k in range(len(self.result.phases))]
-        return _worse([sampled, *every], sense)
+        every = {
+            k: sense(p.extremes[name].value)
+            for k, p in enumerate(self.result.phases)
+            if name in p.extremes
+        }
+        between = self.between(name, max(every, key=every.__getitem__)) if every else None
+        if sampled is None or between is None:
+            return sampled or between
+        return between if sense(between.value) > sense(sampled.value) else sampled
+
+    def worst_of(self, name: str, index: int) -> Extreme | None:
+        """The worst of a phase, likewise."""
+        quantity, x = self.measured[name], self.result.phases[index].extremes.get(name)
+        rank = self.rank[name].get(index, -math.inf)
+        if x is not None and rank < quantity.sense(x.value):
+            return self.between(name, index)
+        return None if rank == -math.inf else self.worst_sample(quantity, self.samples[index])
 
     def below(self) -> Extreme | None:
         """Least vertical room [m] between two agents of which one is below the other."""
@@ -255,6 +292,11 @@ class Flight:
         """
         time = self.result.time
         room, nearest = self.of_left(self.room), self.nearest
+        told = {name for p in self.result.phases for name in p.extremes}
+        stands = (~(room[0] > PAD)).any() or (self.left[-1] & ~(room[-1] > PAD)).any()
+        if not (stands or told & {"clearance_start", "clearance_end"}):
+            # All fly, all the time.
+            return {"clearance_flight": self.worst_clearance()}
         off = room > PAD
         first = np.where(off.any(axis=0), off.argmax(axis=0), len(time))
         last = np.where(off.any(axis=0), len(time) - 1 - off[::-1].argmax(axis=0), len(time))
@@ -265,11 +307,6 @@ class Flight:
             "clearance_flight": (k >= first) & (k <= last),
             "clearance_end": (k >= first) & (k > last),
         }
-        told = {name for p in self.result.phases for name in p.extremes}
-        stands = parts["clearance_start"].any() or parts["clearance_end"].any()
-        if not (stands or told & {"clearance_start", "clearance_end"}):
-            # All fly, all the time.
-            return {"clearance_flight": self.worst_clearance()}
         found = {}
         for name, part in parts.items():
             values = np.where(part, room, np.nan)
@@ -281,8 +318,8 @@ class Flight:
 
     def worst_clearance(self) -> Extreme | None:
         """Least room to an obstacle [m] of all vehicles, standing ones among them."""
-        sampled = self.extreme(self.close[2], self.obstacle, np.negative)
-        return self.worst("clearance", sampled, np.negative)
+        q = self.measured["clearance"]
+        return self.worst("clearance", self.worst_sample(q, slice(0, len(q.values))), q.sense)
 
     def fallen_on(self) -> Extreme | None:
         """Least room [m] between a lost agent and one that is left; None if none is lost."""
@@ -332,16 +369,15 @@ class Flight:
                     )
                     yield words, float(time[samples.start])
             for name, share in _SLACK.items():
-                x = phase.extremes.get(name)
-                if x is None or samples.stop == samples.start:
+                x, rank = phase.extremes.get(name), self.rank[name].get(index, -math.inf)
+                if x is None or rank == -math.inf:
                     continue
-                sense, sampled = SENSE[name], self.sampled[index][name]
-                if sampled is None:
-                    continue
-                slack = rounding + share * abs(sampled.value)
-                if sense(sampled.value) > sense(x.value) + slack or not (
+                slack = rounding + share * abs(rank)
+                if rank > SENSE[name](x.value) + slack or not (
                     phase.t_start - 1e-9 <= x.time <= phase.t_end + 1e-9
                 ):
+                    sampled = self.worst_sample(self.measured[name], samples)
+                    assert sampled is not None
                     words = (
                         f"its {name.replace('_', ' ')} of phase '{phase.name}' is said to come to"
                     )
@@ -353,21 +389,15 @@ class Flight:
         result, samples = self.result, self.samples[index]
         flown, last = samples.stop > samples.start, samples.stop - 1
         finished = flown and (result.complete or index < len(result.phases) - 1)
-        fit = distances = flip = constraint = None
+        fit, distances, constraint = self.fits.get(index), None, None
         if flown:
             constraint = _greatest(result.constraint[last])
         if flown and record.formation is not None:
-            p, left = result.position[last], np.flatnonzero(self.left[last])
-            slots = self.mission.formation_slots(record.formation)
             edges, intended = self.edges(record.formation, last)
-            distances = _greatest(distance_geometry.distances(p, edges) - intended)
-            if slots is not None and len(left) > 1 and np.isfinite(p).all():
-                fit = self.fits[index] = Fit(p[left], slots[left], left)
-                flip = self.flip(fit, record, last)
-        extremes = {
-            name: _worse([self.sampled[index][name], self.between(name, index)], q.sense)
-            for name, q in self.measured.items()
-        }
+            distances = _greatest(
+                distance_geometry.distances(result.position[last], edges) - intended
+            )
+        extremes = {name: self.worst_of(name, index) for name in self.measured}
         return PhaseVerdict(
             name=record.name,
             kind=record.kind,
@@ -381,7 +411,7 @@ class Flight:
             distances=distances,
             shape=None if fit is None else fit.error,
             handedness=None if fit is None or fit.dimension < 3 else not fit.mirrored,
-            flip=flip,
+            flip=None if fit is None else self.flip(fit, record, last),
             order=None if fit is None else fit.in_order,
             waypoint=self.waypoint(record, samples) if finished else None,
             worst={name: found for name, found in extremes.items() if found is not None},
@@ -389,9 +419,39 @@ class Flight:
 
     def edges(self, formation: str, k: int) -> tuple[Ints, Floats]:
         """Edges (m, 2) of a formation between agents left at sample k, and their lengths (m,) [m]."""
-        edges = self.mission.formation_edges(formation)
+        _, edges, intended = self.formation(formation)
+        if self.whole:
+            return edges, intended
         kept = self.left[k][edges].all(axis=1)
-        return edges[kept], self.mission.formation_distances(formation)[kept]
+        return edges[kept], intended[kept]
+
+    def formation(self, name: str) -> tuple[Floats | None, Ints, Floats]:
+        """Slots (N, 3) [m] of a formation, None if nobody knows them, its edges (m, 2) and their lengths (m,) [m]."""
+        if name not in self._formations:
+            m = self.mission
+            self._formations[name] = (
+                m.formation_slots(name), m.formation_edges(name), m.formation_distances(name)
+            )  # fmt: skip
+        return self._formations[name]
+
+    @cached_property
+    def fits(self) -> dict[int, Fit]:
+        """Formations at the last sample of each phase; those of as many agents are laid onto their slots at once."""
+        alike: dict[int, list[tuple[int, Floats, Floats, Ints]]] = {}
+        for index in self.flown:
+            name, last = self.result.phases[index].formation, self.samples[index].stop - 1
+            p, left = self.result.position[last], np.flatnonzero(self.left[last])
+            slots = None if name is None else self.formation(name)[0]
+            if slots is not None and len(left) > 1 and np.isfinite(p).all():
+                alike.setdefault(len(left), []).append((index, p[left], slots[left], left))
+        fits = {}
+        for group in alike.values():
+            laid = Laid.of(
+                np.stack([p for _, p, _, _ in group]), np.stack([s for *_, s, _ in group])
+            )
+            for (index, p, slots, left), one in zip(group, zip(*laid, strict=True), strict=True):
+                fits[index] = Fit(p, slots, left, Laid(*one))
+        return fits
 
     def flip(self, fit: Fit, record: PhaseRecord, k: int) -> float | None:
         """Angle [deg] of a line or plane from where it should point at sample k; None if nothing says."""
@@ -431,14 +491,6 @@ class Flight:
         )
 
 
-def _worse(every: Iterable[Extreme | None], sense: Callable[..., Any]) -> Extreme | None:
-    """The worst of those there are; of equals the first."""
-    found = [e for e in every if e is not None]
-    return (
-        max(found, key=lambda e: sense(e.value)) if len(found) > 1 else found[0] if found else None
-    )
-
-
 def _length(x: Floats) -> Floats:
     """Lengths (...) of vectors (..., 3)."""
     return np.sqrt(np.einsum("...a,...a->...", x, x))
@@ -454,25 +506,22 @@ def _shape(slots: bytes) -> tuple[int, Floats, float]:
     return dimension, axes[0] if dimension == 1 else axes[2], float(proximity.nearest(points).min())
 
 
-def _all_pairs(p: Floats, slots: Floats) -> tuple[float, tuple[int, int], float, float]:
+def _all_pairs(p: Floats, slots: Floats, laid: Laid) -> tuple[float, tuple[int, int], float, float]:
     """Worst error of a distance: error, pair, flown, intended [m].
 
     Of all pairs, but few are looked at: no error is greater than the sum of how far both agents are off their slots,
     however those are laid onto them, as they are or mirrored. Less than rounding counts for nothing.
     """
-    x, q = rigid_body.centred(p), rigid_body.centred(slots)
-    U, _, Vt = np.linalg.svd(q.T @ x)
-    off = np.linalg.norm(x - q @ (U @ Vt), axis=1)
+    off, both = laid.off, np.stack([p, slots])
     order = np.argsort(-off, kind="stable")
-    ranked, rounding = -off[order], 1e-12 * float(np.abs(q).max())
+    ranked, rounding = -off[order], 1e-12 * float(np.abs(laid.slots).max())
     worst = (-1.0, (0, 0), 0.0, 0.0)
     for k, i in enumerate(order[:-1]):
         last = int(np.searchsorted(ranked, off[i] - worst[0] - rounding))
         if last <= k + 1:
             break
         others = np.sort(order[k + 1 : last])
-        flown = np.linalg.norm(p[others] - p[i], axis=1)
-        intended = np.linalg.norm(slots[others] - slots[i], axis=1)
+        flown, intended = np.linalg.norm(both[:, others] - both[:, i, None], axis=2)
         error = np.abs(flown - intended)
         j = int(error.argmax())
         if error[j] > worst[0]:
@@ -499,4 +548,6 @@ def _greatest(values: Floats) -> float | None:
 
 def angle_between(a: Floats, b: Floats) -> float:
     """Angle [deg] between two vectors."""
-    return math.degrees(math.atan2(float(np.linalg.norm(np.cross(a, b))), float(a @ b)))
+    (x, y, z), (u, v, w) = a.tolist(), b.tolist()
+    across = np.array([y * w - z * v, z * u - x * w, x * v - y * u])
+    return math.degrees(math.atan2(float(np.linalg.norm(across)), float(a @ b)))

@@ -20,6 +20,8 @@ _ASKED = 256
 
 # Pairs watched are those within so many times what the closest two are apart.
 _SPARE = 1.2
+# Numbers that stay in the processor's cache.
+_CACHED = 60_000
 
 
 class Obstacle(Protocol):
@@ -38,7 +40,7 @@ def separation(r: Floats, radius: ArrayLike) -> tuple[Floats, Ints]:
     """
     n = r.shape[1]
     radius = np.asarray(radius, dtype=float)
-    least, pair = np.full(len(r), np.inf), np.full((len(r), 2), -1)
+    least, pair = np.full(len(r), np.inf), np.full((2, len(r)), -1).T
     if n > _MANY:
         whole = np.isfinite(r.reshape(len(r), -1)).all(axis=1)
         if whole.all():
@@ -50,27 +52,36 @@ def separation(r: Floats, radius: ArrayLike) -> tuple[Floats, Ints]:
                 least[k : k + 1], near = _closest_of_many(r[k : k + 1, who], radius[who])
                 pair[k] = who[near[0]]
         return least, pair
-    x, samples = np.ascontiguousarray(r.transpose(2, 1, 0)), np.arange(len(r))
+    x = np.ascontiguousarray(r.T)
     for i in range(n - 1):  # rows of samples, which is faster than rows of agents
         d = x[:, i + 1 :] - x[:, i : i + 1]
-        d *= d
-        room = np.sqrt(d[0] + d[1] + d[2]) - (radius[i] + radius[i + 1 :])[:, None]
-        np.copyto(room, np.inf, where=np.isnan(room))
-        j = room.argmin(axis=0)
-        room = room[j, samples]
-        closer = room < least
-        least[closer] = room[closer]
-        pair[closer, 0], pair[closer, 1] = i, i + 1 + j[closer]
+        room = _root(d) - (radius[i] + radius[i + 1 :])[:, None]
+        for j in np.flatnonzero((room < least).any(axis=1)).tolist():
+            closer = room[j] < least  # false where it is NaN
+            np.copyto(least, room[j], where=closer)
+            np.copyto(pair[:, 0], i, where=closer)
+            np.copyto(pair[:, 1], i + 1 + j, where=closer)
     return least, pair
 
 
 def lengths(r: Floats, pairs: Ints) -> Floats:
     """Distances (m, K) [m] of pairs (m, 2) of agents r (K, N, 3): a row for each pair, which is faster."""
-    x = np.ascontiguousarray(r.transpose(2, 1, 0))
-    d = x[:, pairs[:, 0]]
-    d -= x[:, pairs[:, 1]]
+    x, found = np.ascontiguousarray(r.T), np.empty((len(pairs), len(r)))
+    some = max(1, _CACHED // (3 * len(r)))
+    for first in range(0, len(pairs), some):
+        i, j = pairs[first : first + some].T
+        d = x[:, i]
+        d -= x[:, j]
+        found[first : first + some] = _root(d)
+    return found
+
+
+def _root(d: Floats) -> Floats:
+    """Lengths (...) of vectors (3, ...), which are overwritten."""
     d *= d
-    return np.sqrt(d[0] + d[1] + d[2])
+    d[0] += d[1]
+    d[0] += d[2]
+    return np.sqrt(d[0])
 
 
 def _closest_of_many(r: Floats, radius: Floats) -> tuple[Floats, Ints]:
@@ -144,26 +155,25 @@ def headroom(r: Floats, radius: ArrayLike, among: Bools | None = None) -> tuple[
     """
     n = r.shape[1]
     radius = np.asarray(radius, dtype=float)
-    least, pair = np.full(len(r), np.inf), np.full((len(r), 2), -1)
+    least, pair = np.full(len(r), np.inf), np.full((2, len(r)), -1).T
     if among is not None and not among.all():
         r = np.where(among[:, :, None], r, np.nan)
     if n > _MANY:
         for k, points in enumerate(r):
             least[k], pair[k] = _lowest(points, radius)
         return least, pair
-    x, samples = np.ascontiguousarray(r.transpose(2, 1, 0)), np.arange(len(r))
+    x = np.ascontiguousarray(r.T)
     for i in range(n - 1):
-        d, radii = x[:, i + 1 :] - x[:, i : i + 1], (radius[i] + radius[i + 1 :])[:, None]
-        overlap = d[0] * d[0] + d[1] * d[1] <= radii**2
-        if not overlap.any():  # who is nowhere is below nobody
-            continue
-        room = np.where(overlap, abs(d[2]) - radii, np.inf)
-        np.copyto(room, np.inf, where=np.isnan(room))
-        j = room.argmin(axis=0)
-        room = room[j, samples]
-        lower = room < least
-        least[lower] = room[lower]
-        pair[lower, 0], pair[lower, 1] = i, i + 1 + j[lower]
+        d, radii = x[:2, i + 1 :] - x[:2, i : i + 1], radius[i] + radius[i + 1 :]
+        d *= d
+        d[0] += d[1]
+        overlap = d[0] <= (radii**2)[:, None]  # who is nowhere is below nobody
+        for j in np.flatnonzero(overlap.any(axis=1)).tolist():
+            room = abs(x[2, i + 1 + j] - x[2, i]) - radii[j]
+            lower = overlap[j] & (room < least)
+            np.copyto(least, room, where=lower)
+            np.copyto(pair[:, 0], i, where=lower)
+            np.copyto(pair[:, 1], i + 1 + j, where=lower)
     return least, pair
 
 
@@ -217,12 +227,12 @@ def separation_of_left(r: Floats, radius: ArrayLike, left: Bools) -> tuple[Float
 def rooms(r: Floats, radius: ArrayLike, obstacles: Sequence[Obstacle]) -> tuple[Floats, Ints]:
     """Least room (..., N) [m] of agents r (..., N, 3) to an obstacle, and the obstacle; infinity and -1 without."""
     radius = np.asarray(radius, dtype=float)
-    least, nearest = np.full(r.shape[:-1], np.inf), np.full(r.shape[:-1], -1)
-    places = (
-        np.ascontiguousarray(np.moveaxis(r, -1, 0)) if obstacles else r
-    )  # axis by axis is faster
+    least, nearest = np.full(r.shape[-2::-1], np.inf), np.full(r.shape[-2::-1], -1)
+    # Axis by axis, and rows of samples, which is faster.
+    places = np.ascontiguousarray(r.T) if obstacles else r.T
+    radius = radius.reshape(-1, *[1] * (r.ndim - 2))
     for k, thing in enumerate(obstacles):
-        outside, inside = np.zeros(r.shape[:-1]), np.full(r.shape[:-1], -np.inf)
+        outside, inside = np.zeros(least.shape), np.full(least.shape, -np.inf)
         corners = thing.corners
         for x, low, high in zip(places, corners[:3], corners[3:], strict=True):
             if low == -np.inf and high == np.inf:
@@ -235,7 +245,7 @@ def rooms(r: Floats, radius: ArrayLike, obstacles: Sequence[Obstacle]) -> tuple[
         closer = room < least  # false where it is NaN
         np.copyto(least, room, where=closer)
         np.copyto(nearest, k, where=closer)
-    return least, nearest
+    return least.T, nearest.T
 
 
 #: See `_TRIED`.
