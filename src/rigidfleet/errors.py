@@ -63,6 +63,10 @@ class ResultError(RigidfleetError):
     """A result that cannot be read or written."""
 
 
+class StoppedError(RigidfleetError):
+    """A flight that cannot go on; the message is the diagnosis. It ends the flight, whose record tells it."""
+
+
 class FlightError(RigidfleetError):
     """A flight that cannot go on, or cannot begin.
 

@@ -6,11 +6,14 @@ and weights, which the kernel only evaluates. What the next phase inherits trave
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import lru_cache
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
+from typing import Any
 
 import numpy as np
 
+from rigidfleet.errors import StoppedError
 from rigidfleet.formation import distance_geometry, graphs
 from rigidfleet.kernel.problem import (
     BODY,
@@ -28,6 +31,7 @@ from rigidfleet.kernel.problem import (
     SPECTRAL,
     SQUARED,
     Control,
+    Disturbance,
     Feedback,
     Graph,
     Law,
@@ -35,12 +39,17 @@ from rigidfleet.kernel.problem import (
     Program,
     Reference,
     Vehicles,
+    Workspace,
     calm,
     graph,
 )
+from rigidfleet.math import attitude as att
 from rigidfleet.math import lqr
-from rigidfleet.mission import Establish, Fly, Mission, Phase, Regulator, Reshape, Turn
+from rigidfleet.math.rigid_body import about_cm
+from rigidfleet.mission import Establish, Fly, Mission, Phase, Regulator, Reshape, Settle, Turn
+from rigidfleet.mission.schema import Constraint, Integrator
 from rigidfleet.planning import solvers
+from rigidfleet.planning.disturbances import without
 from rigidfleet.planning.reference import (
     Pose,
     Situation,
@@ -52,7 +61,8 @@ from rigidfleet.planning.reference import (
     slots_about_cm,
     slots_before,
 )
-from rigidfleet.typing import Floats, Ints
+from rigidfleet.planning.tolerances import absolute_tolerances, tolerance_of_velocity
+from rigidfleet.typing import Bools, Floats, Ints
 
 _SOLVERS = {"iterated": ITERATED, "spectral": SPECTRAL, "exact": EXACT, "pinv": PINV}
 _KINDS = {"shape": SLOTS, "squares": SQUARED, "step": CONSTANT}
@@ -61,25 +71,147 @@ _NEAR = 0.1
 _SPLITS = {"equal": PINV_EQUAL, "inertia": PINV_INERTIA, "inertia+force": PINV_INERTIA_FORCE}
 
 
+#: Residual of an iterative solve, as a share of the integrator's tolerance; the relative one within bounds.
+_RESIDUAL, _LEAST_RESIDUAL, _MOST_RESIDUAL = 1e-3, 1e-13, 1e-8
+#: Below this share of a velocity's tolerance, the error of an acceleration, times a second, is nothing.
+_FLOOR = 3e-2
+
+
 @dataclass
 class PhasePlan:
-    """A phase, ready to fly."""
+    """A phase, ready to fly. It is whole: what flies it needs no mission."""
 
+    phase: Phase
+    start: float  # [s]
+    t_end: float  # [s] at the latest
     program: Program
     edges: Ints  # (m, 2), from 0
     slots: Floats | None  # (N, 3) at the end, about the CM, body axes [m]
     formation: str | None
+    knows_slots: bool  # whether slots of the formation are known, and not its distances alone
     distances: Floats  # (m,) at the end [m]
     goal: Pose | None
     arrival: float  # when the goal is to be reached [s]
     frame: Floats | None  # attitude (3, 3) of the mean-axis frame at the start
+    attached: bool  # whether the slots carry the body frame
+    lies: bool  # whether the formation is to lie as the mission says once it is established
     method: solvers.Method  # how the multipliers are solved for
-    held: str | None  # the formation, if the agents are in it at the start
+    constraint: Constraint  # options of the law
+    integrator: Integrator  # options of the integration
+    damping: Callable[[Bools], float]  # mu of the vehicles left, which are not lost (N,)
+    lost_at: Floats  # (N,) when vehicles are lost [s]
+    masses: Floats  # (N,) as believed, lost vehicles included [kg]
+    before: Situation  # the state that the phase starts from
+
+    @property
+    def large(self) -> bool:
+        """Whether multipliers are solved for by a method of large formations."""
+        return self.method != "dense"
+
+    @property
+    def target(self) -> dict[str, Any] | None:
+        """What a fly or turn phase is to reach, or the attitude of a formation established, for the record."""
+        goal, phase, lies = self.goal, self.phase, self.lies
+        if goal is None or not (isinstance(phase, Fly | Turn) or lies):
+            return None
+        turns = lies or phase.attitude_deg is not None
+        reference = self.program.reference
+        shaped = reference.t0 + reference.T_b
+        return {
+            "time": max(self.arrival, shaped) if lies else self.arrival,
+            "position": goal.r.tolist() if isinstance(phase, Fly) else None,
+            "velocity": goal.v.tolist() if isinstance(phase, Fly) else None,
+            "attitude": att.quaternion_from_dcm(goal.T).tolist() if turns else None,
+            "rates": goal.omega.tolist() if turns and not lies else None,
+        }
+
+    def state(self) -> Floats:
+        """The kernel's state vector (n,) at the start; `rigidfleet.kernel.dynamics` says what it holds."""
+        now, masses = self.before, self.masses
+        integral = now.integral.of(self.edges, 0.0)
+        if self.frame is None:
+            return np.concatenate([now.r.ravel(), now.v.ravel(), integral])
+        q = att.quaternion_from_dcm(self.frame)
+        if not self.program.body_formulation:
+            return np.concatenate([now.r.ravel(), now.v.ravel(), integral, q])
+        x, y = about_cm(now.r, masses) @ self.frame.T, about_cm(now.v, masses) @ self.frame.T
+        cm = (masses @ now.r / masses.sum(), masses @ now.v / masses.sum())
+        return np.concatenate([x.ravel(), y.ravel(), integral, q, *cm])
+
+    def tolerances(self, size: int) -> Floats:
+        """Absolute tolerances (size,) of the states."""
+        velocity = self.velocity_tolerance()
+        return absolute_tolerances(
+            self.integrator, size, velocity, self.distances, large=self.large
+        )
+
+    def velocity_tolerance(self) -> Floats:
+        """Absolute tolerance (N,) of velocities [m/s]."""
+        beta = self.program.law.beta
+        return tolerance_of_velocity(
+            self.integrator, self.before.r, self.masses, beta, large=self.large
+        )
+
+    def residual(self) -> tuple[float, float]:
+        """Relative residual of an iterative solve for the multipliers, and what is nothing of it [m/s^2]."""
+        share = min(max(_RESIDUAL * self.integrator.rtol, _LEAST_RESIDUAL), _MOST_RESIDUAL)
+        return share, _FLOOR * float(self.velocity_tolerance().min())  # of a step of a second
+
+    def release(self, lost: Bools) -> Bools:
+        """Take edges to vehicles ``lost`` (N,) away; return which (m,) are kept."""
+        kept = ~np.any(lost[self.edges], axis=1)
+        self.edges, self.distances = self.edges[kept], self.distances[kept]
+        self.method = solvers.choose(len(lost), self.edges, self.constraint.solver)
+        self.program = without(self.program, kept, lost, self.damping(lost), large=self.large)
+        return kept
+
+    def reached(self, t: float, y: Floats, w: Workspace) -> Situation:
+        """The state that the next phase starts from, after an evaluation at time t [s] and state y (n,) in ``w``."""
+        n, m = len(self.before.r), len(self.edges)
+        frame, pose = self.before.frame, None
+        if self.frame is not None:
+            q = y[6 * n + m : 6 * n + m + 4]
+            frame = att.dcm_from_quaternion(q / np.linalg.norm(q))
+        if self.program.control.kind == LOCAL:
+            pose = Pose(w.body[0].copy(), w.body[1].copy(), w.T_ref.copy(), w.body[3].copy())
+        return replace(
+            self.before,
+            t=t,
+            r=w.r.copy(),
+            v=w.v.copy(),
+            integral=self.before.integral.updated(self.edges, y[6 * n : 6 * n + m]),
+            reference=self.before.reference.updated(self.edges, self.distances),
+            frame=frame,
+            formation=self.formation,
+            slots=self.slots,
+            pose=pose,
+            goal=self.goal,
+        )
 
 
-def plan_phase(mission: Mission, phase: Phase, now: Situation, t_end: float) -> PhasePlan:
-    """Prepare a phase that starts at ``now.t`` and ends at ``t_end`` [s] at the latest."""
-    masses = np.array(mission.agents.mass)
+def plan_phase(
+    mission: Mission,
+    phase: Phase,
+    now: Situation,
+    *,
+    disturbance: Disturbance | None = None,
+    external: int = 0,
+) -> PhasePlan:
+    """Prepare a phase that starts at ``now.t``.
+
+    Parameters
+    ----------
+    disturbance : what acts on the flight and is told to no law; none by default
+    external : address of a force callback, 0 for none
+
+    Raises
+    ------
+    StoppedError
+        The phase has no time left, or would take hours to fly.
+    """
+    t_end = _end(phase, now.t)
+    _check_size(mission, phase)
+    before_switch, masses = now, np.array(mission.agents.mass)
     shaping = isinstance(phase, Establish | Reshape)
     name = phase.formation if shaping else now.formation
     edges = mission.formation_edges(name) if name else np.zeros((0, 2), dtype=np.int64)
@@ -136,11 +268,50 @@ def plan_phase(mission: Mission, phase: Phase, now: Situation, t_end: float) -> 
         motion=motion,
         feedback=feedback,
         control=_control(mission, phase, masses),
-        external=0,
-        disturbance=calm(masses),
+        external=external,
+        disturbance=calm(masses) if disturbance is None else disturbance,
     )  # fmt: skip
     slots = after if phase.control != "open" or kind == SLOTS else target if shaping else now.slots
-    return PhasePlan(program, edges, slots, name, d1, goal, arrival, frame, method, held)
+    plan = PhasePlan(
+        phase, now.t, t_end, program, edges, slots, name, target is not None, d1, goal, arrival, frame,
+        attached=before_switch.slots is not None or phase.control != "open",
+        lies=isinstance(phase, Establish) and not mission.free_attitude(phase), method=method,
+        constraint=mission.constraint, integrator=mission.integrator,
+        damping=partial(mission.damping, held), lost_at=mission.lost_at, masses=masses, before=before_switch,
+    )  # fmt: skip
+    if now.lost is not None and now.lost.any():
+        plan.release(now.lost)
+    return plan
+
+
+def _end(phase: Phase, start: float) -> float:
+    """Time [s] at which a phase ends, at the latest."""
+    if phase.until is not None:
+        if phase.until <= start:
+            raise StoppedError(
+                f"phase '{phase.name}' is to end at {phase.until:g} s, but the phases before it took until"
+                f" {start:.2f} s. Give it a duration in place of until"
+            )
+        return phase.until
+    return start + (phase.duration or (phase.settle or Settle()).timeout)
+
+
+def _check_size(mission: Mission, phase: Phase) -> None:
+    """Refuse a phase that would take hours to fly."""
+    if not isinstance(phase, Establish | Reshape):
+        return
+    n, solver = mission.n_agents, mission.constraint.solver
+    edges = mission.formation_edges(phase.formation)
+    if solvers.choose(n, edges, solver) != "dense":
+        return
+    size = solvers.equations(n, len(edges), solver)
+    if size > solvers.MOST_DENSE:
+        raise StoppedError(
+            f"phase '{phase.name}' takes '{phase.formation}', whose {len(edges):,} edges between"
+            f' {n:,} agents make {size:,} equations for the constraint force, and solver "{solver}" needs'
+            f" their eigenvalues; with more than {solvers.MOST_DENSE:,} a flight takes hours. Use solver ="
+            ' "iterated" (or "exact"), give it fewer edges, or track slots with edges = []'
+        )
 
 
 @lru_cache(64)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,27 @@ from rigidfleet.errors import FlightError
 from rigidfleet.typing import Floats
 
 Force = Callable[[float, "Floats", "Floats"], ArrayLike]
+
+
+@dataclass(frozen=True)
+class Observation:
+    """What a controller sees at a control step; arrays (N, 3) world axes, copies.
+
+    Positions and velocities are as measured, masses as believed.
+    """
+
+    t: float  # [s]
+    phase: str
+    position: Floats  # [m]
+    velocity: Floats  # [m/s]
+    reference_position: Floats  # desired [m]
+    reference_velocity: Floats  # [m/s]
+    reference_acceleration: Floats  # [m/s^2]
+    masses: Floats  # (N,) [kg]
+    gravity: float  # [m/s^2]
+
+
+Controller = Callable[[Observation], ArrayLike]
 
 
 def asked(

@@ -3,25 +3,34 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from rigidfleet.kernel.engine import native
+from rigidfleet.kernel.problem import Workspace
+from rigidfleet.kernel.records import Integrator
 from rigidfleet.math.constraint_jacobian import jacobian
 from rigidfleet.mission import Establish, Reshape
 from rigidfleet.planning import solvers
+from rigidfleet.planning.plan import PhasePlan
 from rigidfleet.typing import Floats
-
-if TYPE_CHECKING:
-    from rigidfleet.mission import Mission
-    from rigidfleet.simulation.flight import Leg
 
 #: What to do about errors that nothing takes back.
 _FEEDBACK = '; without feedback errors grow: stabilisation = "pid" takes them back'
 
 
-def diagnose(mission: Mission, leg: Leg, *, own_force: bool, collapsed: bool) -> str:
+class Place(NamedTuple):
+    """Where a phase under way is."""
+
+    plan: PhasePlan
+    t: float  # [s]
+    state: Integrator
+    workspace: Workspace
+    solver: Any  # of large systems, or None
+
+
+def diagnose(at: Place, *, own_force: bool, collapsed: bool) -> str:
     """Say when, where and why the integrator could not go on, and what to try.
 
     ``own_force``: whether a function of the user's acts on the agents; ``collapsed``: whether the step size has
@@ -29,24 +38,24 @@ def diagnose(mission: Mission, leg: Leg, *, own_force: bool, collapsed: bool) ->
     """
 
     def remedy() -> str:
-        return _remedy(mission, leg, own_force=own_force, collapsed=collapsed)
+        return _remedy(at, own_force=own_force, collapsed=collapsed)
 
-    count, h = leg.state.count, float(leg.state.clock[1])
+    count, h = at.state.count, float(at.state.clock[1])
     if collapsed:
         what = f"the step size has fallen to {h:.1g} s"
     else:
         what = f"{count[1] + count[2]} steps have been taken in it, the last of {h:.1g} s"
-    head = f"the flight cannot go on at t = {leg.t:.3f} s, in phase '{leg.phase.name}': {what}"
-    if not len(leg.plan.edges):
+    head = f"the flight cannot go on at t = {at.t:.3f} s, in phase '{at.plan.phase.name}': {what}"
+    if not len(at.plan.edges):
         return f"{head}. {remedy()}"
-    if leg.solver is not None:
-        lost, failed = leg.solver.counts.fallbacks, leg.solver.counts.failures
+    if at.solver is not None:
+        lost, failed = at.solver.counts.fallbacks, at.solver.counts.failures
         return (
-            f"{head}; solved by {solvers.WORDS[leg.plan.method]}, which lost a pivot {lost} times and found no"
+            f"{head}; solved by {solvers.WORDS[at.plan.method]}, which lost a pivot {lost} times and found no"
             f" solution {failed} times. {remedy()}"
         )
-    J, closest, length = _jacobian(leg)
-    edge = "-".join(str(int(a) + 1) for a in leg.plan.edges[closest])
+    J, closest, length = _jacobian(at)
+    edge = "-".join(str(int(a) + 1) for a in at.plan.edges[closest])
     if not np.isfinite(J).all():
         return (
             f"{head}, because agents {edge.replace('-', ' and ')} are at one place: along the edge"
@@ -60,35 +69,34 @@ def diagnose(mission: Mission, leg: Leg, *, own_force: bool, collapsed: bool) ->
         f" {values[-1]:.2g} (the largest is {values[0]:.2g}; the shortest edge {edge} is"
         f" {length:.3g} m)"
     )
-    solver = mission.constraint.solver
+    solver = at.plan.constraint.solver
     if solver in ("exact", "pinv"):
         bound = "no bound" if solver == "exact" else "no bound but that of its cut-off"
         return (
             f'{head}, and {where}. The force of solver "{solver}" has {bound} where one of them'
-            f' vanishes. Use solver = "iterated" (or "spectral"){_smoother(mission, leg)}'
+            f' vanishes. Use solver = "iterated" (or "spectral"){_smoother(at.plan)}'
         )
     return f"{head}, and {where}. {remedy()}"
 
 
-def _smoother(mission: Mission, leg: Leg) -> str:
+def _smoother(plan: PhasePlan) -> str:
     """What else helps a law without bound: a smooth reference, feedback; "" where both are there."""
     words = ""
-    if isinstance(leg.phase, Establish | Reshape) and leg.phase.reference == "step":
-        slots = mission.formation_slots(leg.phase.formation)
-        smooth = "distances" if slots is None else "shape"
+    if isinstance(plan.phase, Establish | Reshape) and plan.phase.reference == "step":
+        smooth = "shape" if plan.knows_slots else "distances"
         words += f', with a reference that moves smoothly: reference = "{smooth}"'
-    if mission.constraint.stabilisation == "none":
+    if plan.constraint.stabilisation == "none":
         words += _FEEDBACK
     return words
 
 
-def _remedy(mission: Mission, leg: Leg, *, own_force: bool, collapsed: bool) -> str:
+def _remedy(at: Place, *, own_force: bool, collapsed: bool) -> str:
     """What to try where J is not to blame."""
-    beyond = leg.t + 1e-9 * max(1.0, leg.t)  # what happens at leg.t shows a moment later
+    beyond = at.t + 1e-9 * max(1.0, at.t)  # what happens at at.t shows a moment later
     native.closed_loop(
-        beyond, leg.state.y, np.empty_like(leg.state.y), leg.plan.program, leg.workspace
+        beyond, at.state.y, np.empty_like(at.state.y), at.plan.program, at.workspace
     )
-    w = leg.workspace
+    w = at.workspace
     names = {"input force": w.f_u, "constraint force": w.f_C, "external force": w.f_E}
     lost = [name for name, f in names.items() if not np.isfinite(f).all()]
     if "external force" in lost and own_force:
@@ -96,9 +104,9 @@ def _remedy(mission: Mission, leg: Leg, *, own_force: bool, collapsed: bool) -> 
         return f"The force of your own is not finite on agent {bad[0] + 1}: mend that function"
     if lost:
         return f"The {lost[0]} is not finite. Look for a gain, a distance or a mass far too large"
-    if mission.constraint.stabilisation == "none" and np.abs(w.c).max(initial=0.0) > 1e-3:
+    if at.plan.constraint.stabilisation == "none" and np.abs(w.c).max(initial=0.0) > 1e-3:
         k = int(np.abs(w.c).argmax())
-        i, j = leg.plan.edges[k] + 1
+        i, j = at.plan.edges[k] + 1
         return f"The distance {i}-{j} is {w.c[k]:+.3g} m off{_FEEDBACK}"
     name, f = max(names.items(), key=lambda item: float(np.abs(item[1]).max()))
     agent = int(np.abs(f).max(axis=1).argmax())
@@ -117,13 +125,13 @@ def _remedy(mission: Mission, leg: Leg, *, own_force: bool, collapsed: bool) -> 
     )
 
 
-def _jacobian(leg: Leg) -> tuple[Floats, int, float]:
+def _jacobian(at: Place) -> tuple[Floats, int, float]:
     """J (m, 3N) where the integrator is, its shortest edge and that edge's length [m]."""
-    edges = leg.plan.edges
+    edges = at.plan.edges
     native.closed_loop(
-        leg.t, leg.state.y, np.empty_like(leg.state.y), leg.plan.program, leg.workspace
+        at.t, at.state.y, np.empty_like(at.state.y), at.plan.program, at.workspace
     )
-    r = leg.workspace.r
+    r = at.workspace.r
     lengths = np.linalg.norm(r[edges[:, 0]] - r[edges[:, 1]], axis=1)
     closest = int(lengths.argmin())
     return jacobian(r, edges), closest, float(lengths[closest])

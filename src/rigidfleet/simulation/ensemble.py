@@ -138,8 +138,7 @@ class _Flights:
     def fly(self, phase: Phase, vectors: bool | None, threads: int) -> None:
         """Fly one phase, and keep its ends."""
         now, (count, n) = self.now, self.r.shape[:2]
-        t_end = now.t + (phase.duration or 0.0) if phase.until is None else phase.until
-        plan = plan_phase(self.mission, phase, now, t_end)
+        plan = plan_phase(self.mission, phase, now)
         law = plan.program.law._replace(mu=self.mission.damping(None))
         program = plan.program._replace(law=law)
         edges = [(int(i), int(j)) for i, j in plan.edges]
@@ -153,10 +152,10 @@ class _Flights:
             program,
             y[places],
             before[places],
-            (now.t, t_end),
+            (now.t, plan.t_end),
             rtol=given.rtol,
             atol=absolute_tolerances(given, y.shape[1], velocity, plan.distances, large=False),
-            max_steps=most_steps(t_end - now.t),
+            max_steps=most_steps(plan.t_end - now.t),
             vectors=shared,
             threads=threads,
         )
@@ -168,7 +167,7 @@ class _Flights:
         self.integral |= dict(zip(edges, y[:, 6 * n :].T, strict=True))
         known = now.reference.updated(plan.edges, plan.distances)
         self.now = replace(
-            now, t=t_end, reference=known, formation=plan.formation, slots=plan.slots
+            now, t=plan.t_end, reference=known, formation=plan.formation, slots=plan.slots
         )
         self.error = off(self.r, plan.edges, plan.distances)
 

@@ -1,53 +1,39 @@
-"""Fly a mission: run its phases, restart the integrator at every switch, report progress."""
+"""Fly missions: all at once by `simulate`, or step by step by `Flight`."""
 
 from __future__ import annotations
 
 import math
 import time as clock
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import cache, partial
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigidfleet.errors import FlightError
-from rigidfleet.kernel import records
-from rigidfleet.kernel.engine import native
-from rigidfleet.kernel.problem import LOCAL, OPEN, RIGID, Program, Workspace
-from rigidfleet.kernel.problem import workspace as kernel_workspace
+from rigidfleet.errors import FlightError, StoppedError
+from rigidfleet.kernel.problem import LOCAL, Motion
 from rigidfleet.math import attitude as att
-from rigidfleet.math.rigid_body import about_cm
-from rigidfleet.mission import Establish, Fly, Mission, Phase, Reshape, Settle, Turn
-from rigidfleet.planning import solvers
-from rigidfleet.planning.disturbances import disturbance, without
+from rigidfleet.math import lqr
+from rigidfleet.mission import Mission, Phase, as_mission
+from rigidfleet.planning.disturbances import disturbance
 from rigidfleet.planning.plan import PhasePlan, plan_phase
 from rigidfleet.planning.reference import Pose, Situation
-from rigidfleet.planning.tolerances import absolute_tolerances, most_steps, tolerance_of_velocity
 from rigidfleet.result import PhaseRecord, Result
-from rigidfleet.simulation.callbacks import ExternalForce, Force, asked
-from rigidfleet.simulation.diagnosis import diagnose
+from rigidfleet.simulation.active_phase import ActivePhase, Sampler
+from rigidfleet.simulation.as_flown import as_flown, with_phase
+from rigidfleet.simulation.callbacks import Controller, ExternalForce, Force, Observation
 from rigidfleet.simulation.extremes import Extremes
 from rigidfleet.simulation.recording import Piece, assemble
-from rigidfleet.typing import Bools, Floats
+from rigidfleet.simulation.sampling import Sampling, times_asked
+from rigidfleet.typing import Floats
 
 if TYPE_CHECKING:
-    from rigidfleet.kernel.large import solver as large
+    from rigidfleet.kernel.large.solver import Counts  # imports the compiler
 
-    pass
+__all__ = ["Controller", "Flight", "FlightInterrupted", "Observation", "Progress", "simulate"]
 
-#: The integrator returns to Python after so many steps, or fewer: as many as take this long [s of
-#: wall time], often enough for Ctrl-C and progress whatever the size of the formation.
-_STEPS, _PAUSE = 2000, 0.05
-#: So many at the start of a phase, whose steps may take a thousand times as long as those of the one before.
-_FIRST_STEPS = 10
-#: Residual of an iterative solve, as a share of the integrator's tolerance; the relative one within bounds.
-_RESIDUAL, _LEAST, _MOST_RESIDUAL = 1e-3, 1e-13, 1e-8
-#: Below this share of a velocity's tolerance, the error of an acceleration, times a second, is nothing.
-_FLOOR = 3e-2
-#: Where a phase ends by settling, whether it has is asked this often [s].
-_CHECK = 0.1
 #: Progress is reported this often [s of wall time].
 _REPORT = 0.1
 #: A frame further than this from the slots it is attached to has left them [rad].
@@ -65,27 +51,6 @@ class Progress:
     planning: bool = False  # the phase has not begun to be flown
 
 
-@dataclass(frozen=True)
-class Observation:
-    """What a controller sees at a control step; arrays (N, 3) world axes, copies.
-
-    Positions and velocities are as measured, masses as believed.
-    """
-
-    t: float  # [s]
-    phase: str
-    position: Floats  # [m]
-    velocity: Floats  # [m/s]
-    reference_position: Floats  # desired [m]
-    reference_velocity: Floats  # [m/s]
-    reference_acceleration: Floats  # [m/s^2]
-    masses: Floats  # (N,) [kg]
-    gravity: float  # [m/s^2]
-
-
-Controller = Callable[[Observation], ArrayLike]
-
-
 class FlightInterrupted(KeyboardInterrupt):
     """Ctrl-C during a flight; ``result`` holds what was flown."""
 
@@ -95,7 +60,7 @@ class FlightInterrupted(KeyboardInterrupt):
 
 
 def simulate(
-    mission: Mission,
+    mission: Mission | str | Path,
     *,
     controller: Controller | None = None,
     rate: float = 50.0,
@@ -107,7 +72,7 @@ def simulate(
 
     Parameters
     ----------
-    mission : the mission
+    mission : a shipped name, a path or a `Mission`
     controller : in place of the input law wherever slots are tracked: a function of an
         `Observation` that returns the input force (N, 3) [N] of every agent, weight included. It
         is called ``rate`` times a second, its force held in between, as on a vehicle.
@@ -132,583 +97,382 @@ def simulate(
     FlightError
         The controller or the force raised an exception, which is its cause, or returned something
         that is no force; its ``result`` is what had flown, incomplete, or None.
+    MissionError
+        There is no such mission, or it has errors.
     ValueError
         A time to record lies outside of the mission, or the control rate is not positive.
     """
-    run = Flight(mission, controller, rate, force, times, progress)
-    try:
-        run.fly()
-    except KeyboardInterrupt:
-        if not run.pieces:
-            raise
-        run.ending = f"interrupted at t = {run.now.t:.2f} s"
-        raise FlightInterrupted(run.result()) from None
-    except FlightError as error:
-        if run.pieces:
-            run.ending = f"{error}, in phase '{run.phases[-1].name}'"
-            error.result = run.result()
-        raise
-    if not run.pieces:
-        raise FlightError(run.ending or "the flight ended before the first time to record")
-    return run.result()
-
-
-class StoppedError(Exception):
-    """The flight cannot go on; the message is the diagnosis."""
-
-
-@dataclass
-class Leg:
-    """A phase under way."""
-
-    index: int
-    phase: Phase
-    plan: PhasePlan
-    workspace: Workspace
-    state: records.Integrator
-    t_end: float  # [s] at the latest
-    asked: int = 0  # how often the user's controller has been
-    held: Program | None = None  # with its force
-    flown: Program | None = None  # what the steps in the trail were flown by
-    solver: large.LargeSolver | None = (
-        None  # of the multipliers, where that is not the kernel itself
+    flight = Flight(
+        mission, controller=controller, rate=rate, force=force, times=times, progress=progress
     )
-
-    @property
-    def t(self) -> float:
-        """Mission time reached [s]."""
-        return float(self.state.clock[0])
-
-    def check(self) -> None:
-        """Raise what has come up within the solver of the multipliers, or the monitor's."""
-        if self.solver is not None:
-            self.solver.check()
-            self.solver.aside.check()
+    try:
+        while flight.begin():
+            flight.advance()
+    except KeyboardInterrupt:
+        if not flight.pieces:
+            raise
+        ending = f"interrupted at t = {flight.t:.2f} s"
+        raise FlightInterrupted(flight.finish(ending)) from None
+    except FlightError as error:
+        if flight.pieces:
+            error.result = flight.finish(f"{error}, in phase '{flight.phases[-1].name}'")
+        raise
+    return flight.finish()
 
 
 class Flight:
-    """One flight under way; `simulate` flies one of a mission's phases, others may fly on."""
+    """A mission flown step by step.
+
+    `begin` a phase, `advance` it, look, and go on; `finish` returns the record::
+
+        flight = rf.Flight("narrow-passage")
+        while flight.begin():  # the next phase of the mission
+            while flight.advance(0.5):  # half a second, or to the end of the phase
+                print(flight.t, flight.observe().position)
+        result = flight.finish()
+
+    A phase may begin at any time, in place of the mission's next one: ``flight.begin({"kind": "fly", "position":
+    [0, 0, 20], "duration": 8})`` leaves the phase under way where it is and leads from there to another target.
+    Each stop ends a step of the integrator, so that a flight with stops agrees with one without to the integrator's
+    tolerances, not to the last bit.
+
+    Parameters are those of `simulate`.
+
+    Attributes
+    ----------
+    mission : what was given
+    phases : records of the phases begun so far
+    ending : why the flight cannot go on; "" while it can
+    pieces : samples recorded so far
+    """
 
     def __init__(
         self,
-        mission: Mission,
-        controller: Controller | None,
-        rate: float,
-        force: Force | None,
-        times: ArrayLike | None,
-        progress: Callable[[Progress], None] | None,
+        mission: Mission | str | Path,
+        *,
+        controller: Controller | None = None,
+        rate: float = 50.0,
+        force: Force | None = None,
+        times: ArrayLike | None = None,
+        progress: Callable[[Progress], None] | None = None,
+        sampler: Sampler | None = None,
+        flips: bool = False,
     ) -> None:
-        self.mission = mission
-        self.masses = np.array(mission.agents.mass)
-        self.controller, self.rate = controller, rate
-        self.disturbance = disturbance(mission)
-        self.lost = np.zeros(mission.n_agents, dtype=np.bool_)
-        self.external = ExternalForce(force, mission.n_agents) if force is not None else None
-        self.times = None if times is None else _times(times, mission.latest_end)
+        """Take a mission; ``sampler`` and ``flips`` are for programs that steer (see `rigidfleet.web.live`).
+
+        ``sampler`` says which times are recorded (`rigidfleet.simulation.sampling`), and with ``flips`` a formation
+        may flip over.
+        """
+        self.mission = mission = as_mission(mission)
         if not (isinstance(rate, int | float | np.number) and rate > 0.0):
             raise ValueError(f"the control rate must be positive [Hz], not {rate!r}")
-        self.progress = progress
+        self.controller, self.rate, self.progress = controller, rate, progress
+        self.external = ExternalForce(force, mission.n_agents) if force is not None else None
+        asked_for = None if times is None else times_asked(times, mission.latest_end)
+        self.sampler = sampler or Sampling(mission.output_step, asked_for).between
+        self.flips = flips
         frame = None
         if mission.body_frame is not None:
             b = mission.body_frame
             frame = att.dcm_from_euler(np.deg2rad([b.roll_deg, b.pitch_deg, b.yaw_deg]))
-        self.now = Situation(
+        self._now = Situation(
             0.0, np.array(mission.agents.position), np.array(mission.agents.velocity), frame=frame
         )
+        self._disturbance = disturbance(mission)
+        self._extremes = Extremes(mission)
+        self._active: ActivePhase | None = None
+        self._asked: list[Phase] = []  # what each phase was begun as
+        self._following = 0  # of the mission's phases
+        self._started = self._reported = clock.perf_counter()
+        self._count = np.zeros(3, dtype=np.int64)
+        self._solves: dict[str, Counts] = {}
         self.pieces: list[Piece] = []
-        self.extremes = Extremes(mission)
         self.phases: list[PhaseRecord] = []
         self.ending = ""
-        self.started = self.reported = clock.perf_counter()
-        self.count = np.zeros(3, dtype=np.int64)
-        self.steps = _FIRST_STEPS  # at a time; more as soon as it is known how long they take
-        self.solves: dict[solvers.Method, large.Counts] = {}
 
-    def fly(self) -> None:
-        """Run all phases, or as many as can be flown."""
+    # -- what can be seen -------------------------------------------------------------------------
+
+    @property
+    def t(self) -> float:
+        """Mission time reached [s]."""
+        return self._now.t if self._active is None else self._active.t
+
+    @property
+    def plan(self) -> PhasePlan:
+        """Plan of the phase under way: its formation, slots, goal and program."""
+        return self._under_way().plan
+
+    def observe(self) -> Observation:
+        """Where the vehicles are, as measured, and where they should be.
+
+        Raises
+        ------
+        FlightError
+            No phase is under way.
+        """
+        return self._under_way().observe()
+
+    def pose(self) -> Pose:
+        """Where the virtual body is: its reference where slots are tracked, else the agents' own frame."""
+        active = self._under_way()
+        active.evaluate()
+        w, plan = active.workspace, active.plan
+        if plan.program.control.kind == LOCAL:
+            return Pose(w.body[0].copy(), w.body[1].copy(), w.T_ref.copy(), w.body[3].copy())
+        return Pose(w.cm[0].copy(), w.cm[1].copy(), w.T.copy(), np.zeros(3))
+
+    # -- flying -----------------------------------------------------------------------------------
+
+    def begin(self, phase: Phase | Mapping[str, Any] | None = None) -> bool:
+        """Begin a phase: the mission's next one, or another, which takes over from where the flight is.
+
+        Parameters
+        ----------
+        phase : as a table of a mission file, or one of `rigidfleet.mission`'s phases
+
+        Returns
+        -------
+        bool
+            Whether there is something to fly: False at the end of the mission, and where the flight cannot go on
+            (then `ending` says why).
+
+        Raises
+        ------
+        MissionError
+            The phase has errors.
+        FlightError
+            The flight has been finished, or a user's function failed.
+        """
+        if self.ending:
+            return False
+        if phase is None:
+            if self._following >= len(self.mission.phases):
+                return False
+            phase = self.mission.phases[self._following]
+            self._following += 1
+        elif isinstance(phase, Mapping):
+            self._leave()
+            phase = with_phase(self.mission, self._asked, self.phases, phase)
+        self._leave()
+        if self._asked:
+            self._report(phase, planning=True)
         try:
-            for index, phase in enumerate(self.mission.phases):
-                self._phase(index, phase)
+            external = 0 if self.external is None else self.external.address
+            plan = plan_phase(
+                self.mission, phase, self._now, disturbance=self._disturbance, external=external
+            )
+            self._check_frame(plan)
+            self._active = ActivePhase(
+                len(self.phases), plan, extremes=self._extremes, external=self.external,
+                sampler=self.sampler, pieces=self.pieces, pause=lambda _: self._report(phase),
+            )  # fmt: skip
         except StoppedError as stop:
             self.ending = str(stop)
-
-    # -- one phase --------------------------------------------------------------------------------
-
-    def _phase(self, index: int, phase: Phase) -> None:
-        if index:
-            self._report(self.now.t, phase, planning=True)
-        self.steps = _FIRST_STEPS
-        leg = self._begin(index, phase)
-        record = PhaseRecord(
-            phase.name, phase.kind, phase.control, leg.plan.formation, leg.t, leg.t,
-            settled=None if phase.settle is None else False,
-            target=_target(self.mission, phase, leg.plan),
-        )  # fmt: skip
-        self.phases.append(record)
-        try:
-            if phase.settle is not None:
-                record.settled = self._settle(leg, phase.settle)
-            else:
-                self._fly_to(leg, leg.t_end)
-        finally:
-            self._watch(leg, last=True)
-            record.extremes = self.extremes.phase()
-            self._count(leg)
-            if leg.state.count[0] or leg.t > self.now.t:
-                self._arrive(leg)
-            record.t_end = self.now.t
-            leg.check()
-        if phase.settle is not None and not record.settled:
-            raise StoppedError(
-                f"phase '{phase.name}' did not settle within {phase.settle.timeout:g} s: at t ="
-                f" {self.now.t:.2f} s its error was above {phase.settle.tolerance:g} m. Give it a"
-                " longer timeout or a larger tolerance, or see the constraint error to learn why"
-            )
-
-    def _begin(self, index: int, phase: Phase) -> Leg:
-        t_end = _end(phase, self.now.t)
-        _check_size(self.mission, phase)
-        plan = plan_phase(self.mission, phase, self.now, t_end)
-        self._check_frame(index, plan)
-        external = 0 if self.external is None else self.external.address
-        plan.program = plan.program._replace(external=external, disturbance=self.disturbance)
-        if self.lost.any():
-            self._release(plan)
-        work, solver = self._equip(plan)
-        y = self._pack(plan)
-        state = self._integrator(plan, y, self.now.t)
-        if solver is not None:
-            scale = self._tolerances(plan, len(y)) + state.rtol * np.abs(y)
-            state.clock[1] = _first_step(plan.program, work, state, scale, t_end - self.now.t)
-        return Leg(index, phase, plan, work, state, t_end, solver=solver)
-
-    def _equip(self, plan: PhasePlan) -> tuple[Workspace, large.LargeSolver | None]:
-        """Workspace of a plan, and what solves for its multipliers where that is not the kernel itself."""
-        program, dense = plan.program, plan.method == "dense"
-        work = kernel_workspace(
-            len(self.masses),
-            len(plan.edges),
-            with_h=program.control.allocation != RIGID,
-            solver=program.law.solver,
-            large=not dense,
+            return False
+        self._asked.append(phase)
+        self.phases.append(
+            PhaseRecord(
+                phase.name, phase.kind, phase.control, plan.formation, plan.start, plan.start,
+                settled=None if phase.settle is None else False, target=plan.target,
+            )  # fmt: skip
         )
-        if dense:
-            return work, None
-        solver = self._large(plan, work)
-        plan.program = program._replace(graph=program.graph._replace(solver=solver.address))
-        return work, solver
+        return True
 
-    def _large(self, plan: PhasePlan, work: Workspace) -> large.LargeSolver:
-        """What solves for the multipliers of a large formation, in one phase."""
-        from rigidfleet.kernel.large import solver as large
+    def advance(self, duration: float | None = None) -> bool:
+        """Fly on for so long [s], or to the end of the phase.
 
-        edges = plan.edges
-        points = self.now.r if plan.slots is None else plan.slots
-        steps = solvers.sweep_steps(len(points), edges) if plan.method == "sweep" else None
-        given = self.mission.integrator
-        residual = min(max(_RESIDUAL * given.rtol, _LEAST), _MOST_RESIDUAL)
-        floor = _FLOOR * float(self._atol_velocity(plan).min())  # of a step of a second
-        order = cache(partial(solvers.dissection, points, edges))
-        p = plan.program
-        return large.LargeSolver(
-            p.vehicles, p.graph.edges, p.law, work, steps, order, residual, floor
-        )
+        Returns
+        -------
+        bool
+            Whether the phase goes on: False at its end, and where the flight cannot go on (then `ending` says why).
 
-    def _tolerances(self, plan: PhasePlan, size: int) -> Floats:
-        """Absolute tolerances (size,) of the states."""
-        given, large = self.mission.integrator, plan.method != "dense"
-        return absolute_tolerances(
-            given, size, self._atol_velocity(plan), plan.distances, large=large
-        )
-
-    def _atol_velocity(self, plan: PhasePlan) -> Floats:
-        """Absolute tolerance (N,) of velocities [m/s]."""
-        given, beta = self.mission.integrator, plan.program.law.beta
-        large = plan.method != "dense"
-        return tolerance_of_velocity(given, self.now.r, self.masses, beta, large=large)
-
-    def _integrator(self, plan: PhasePlan, y: Floats, t: float) -> records.Integrator:
-        rtol, trail = self.mission.integrator.rtol, self.extremes.begin(len(y), len(plan.edges))
-        atol = self._tolerances(plan, len(y))
-        return records.integrator(y, t, rtol=rtol, atol=atol, trail=trail)
-
-    def _count(self, leg: Leg) -> None:
-        """Add up what a leg, or its part up to a loss, has taken."""
-        self.count += leg.state.count[:3]
-        if leg.solver is not None:
-            counts = leg.solver.counts
-            self.solves.setdefault(leg.plan.method, type(counts)()).add(counts)
-
-    def _fly_to(self, leg: Leg, t_end: float) -> None:
-        """Integrate to ``t_end`` [s] under the phase's input law, or the user's controller."""
-        if self.controller is None or leg.phase.control != "slots":
-            self._integrate(leg, leg.plan.program, t_end)
-            return
-        start = self.now.t
-        while leg.t < t_end:
-            # Control instants count from the phase's start, wherever a stretch of it ends.
-            if leg.held is None or leg.t >= start + leg.asked / self.rate:
-                leg.held = self._controlled(leg, self.controller)
-                leg.asked += 1
-            self._integrate(leg, leg.held, min(start + leg.asked / self.rate, t_end))
-
-    def _controlled(self, leg: Leg, controller: Controller) -> Program:
-        """Ask the user's controller; return the phase's program with its force held."""
-        plan, w, y = leg.plan, leg.workspace, leg.state.y
-        native.closed_loop(leg.t, y, np.empty_like(y), plan.program, w)
-        noisy = len(self.disturbance.noise_r) > 0
-        r, v = (w.r_seen, w.v_seen) if noisy else (w.r, w.v)
-        seen = Observation(
-            leg.t, leg.phase.name, r.copy(), v.copy(), w.r_ref.copy(), w.v_ref.copy(),
-            w.a_ref.copy(), self.masses.copy(), self.mission.gravity,
-        )  # fmt: skip
-        f = asked("the controller", leg.t, self.mission.n_agents, controller, seen)
-        return plan.program._replace(control=plan.program.control._replace(kind=OPEN, force=f))
-
-    def _integrate(self, leg: Leg, program: Program, t_end: float) -> None:
-        """Integrate to ``t_end`` [s] through the times at which vehicles are lost.
-
-        ``program`` may hold a user's force in place of the phase's own input law.
+        Raises
+        ------
+        FlightError
+            No phase is under way, or a user's function failed.
+        ValueError
+            The duration is not positive.
         """
-        while leg.t < t_end:
-            coming = np.where(self.lost, math.inf, self.mission.lost_at)
-            if coming.min() <= leg.t:
-                program = self._lose(leg, program, coming <= leg.t)
-            else:
-                self._stretch(leg, program, min(t_end, float(coming.min())))
-
-    def _lose(self, leg: Leg, program: Program, now: Bools) -> Program:
-        """Go on without the vehicles that are lost ``now`` (N,); returns what is flown of a program."""
-        self._watch(leg, last=True)
-        leg.check()
-        self.lost = self.lost | now
-        self.now.lost = self.lost
-        self.extremes.lose(self.lost)
-        y, own, n = leg.state.y, program is leg.plan.program, len(self.masses)
-        self._count(leg)
-        kept = self._release(leg.plan)
-        integral = y[6 * n : 6 * n + len(kept)][kept]
-        y = np.concatenate([y[: 6 * n], integral])
-        leg.state = self._integrator(leg.plan, y, leg.t)
-        leg.workspace, leg.solver = self._equip(leg.plan)
-        if own:
-            return leg.plan.program
-        mu = leg.plan.program.law.mu
-        held = without(program, kept, self.lost, mu, large=leg.plan.method != "dense")
-        leg.held = held._replace(graph=leg.plan.program.graph)
-        return leg.held
-
-    def _release(self, plan: PhasePlan) -> Bools:
-        """Take a plan's edges to lost vehicles away; returns which are kept."""
-        kept = ~np.any(self.lost[plan.edges], axis=1)
-        plan.edges, plan.distances = plan.edges[kept], plan.distances[kept]
-        plan.method = solvers.choose(len(self.masses), plan.edges, self.mission.constraint.solver)
-        mu = self.mission.damping(plan.held, self.lost)
-        plan.program = without(plan.program, kept, self.lost, mu, large=plan.method != "dense")
-        return kept
-
-    def _stretch(self, leg: Leg, program: Program, t_end: float) -> None:
-        """Integrate to ``t_end`` [s] and record the samples on the way."""
-        state = leg.state
-        fresh = state.count[0] == 0 or program is not leg.plan.program
-        if fresh:
-            self._watch(leg, last=True)
-            leg.flown = program
-            if leg.solver is not None:  # it remembers what it is asked: the monitor has another
-                graph = program.graph._replace(solver=leg.solver.aside.address)
-                leg.flown = program._replace(graph=graph)
-        times = self._samples(leg, t_end)
-        samples = np.empty((len(times), len(state.y)))
-        state.count[3] = 0
-        first = np.nextafter(leg.t, math.inf)
-        status = records.PAUSED
+        active = self._under_way()
+        if duration is not None and not duration > 0.0:
+            raise ValueError(f"the duration must be positive [s], not {duration!r}")
+        plan = active.plan
+        stop = math.inf if duration is None else active.t + duration
+        t_end, settle = min(stop, plan.t_end), plan.phase.settle
+        active.stop = stop
         try:
-            while status == records.PAUSED:
-                begun = clock.perf_counter()
-                status = native.integrate(
-                    program, leg.workspace, state, t_end, fresh, times, samples, self.steps
+            if settle is None:
+                active.fly_to(t_end, self.controller, self.rate)
+            else:
+                step = self.mission.output_step
+                active.settle_by(t_end, settle, self.controller, self.rate, step)
+            self.phases[-1].t_end = active.t
+        except StoppedError as stopped:
+            self.ending = str(stopped)
+            self._leave()
+            return False
+        except BaseException:
+            self._leave()
+            raise
+        if active.settled or active.over:
+            settled = active.settled
+            self._leave()
+            if settle is not None and not settled:
+                self.ending = (
+                    f"phase '{plan.phase.name}' did not settle within {settle.timeout:g} s: at t ="
+                    f" {self.t:.2f} s its error was above {settle.tolerance:g} m. Give it a"
+                    " longer timeout or a larger tolerance, or see the constraint error to learn why"
                 )
-                took = max(clock.perf_counter() - begun, 1e-6)
-                if status == records.PAUSED:
-                    self.steps = min(_STEPS, max(1, int(self.steps * min(_PAUSE / took, 10.0))))
-                fresh = False
-                if self.external is not None:
-                    self.external.check()
-                leg.check()
-                self._watch(leg, last=False)
-                self._report(leg.t, leg.phase)
-                if status == records.PAUSED and self._stalled(leg):
-                    break
-        finally:
-            done = int(state.count[3])
-            if state.count[0] and not state.count[1] and len(times) and times[0] <= first:
-                samples[0], done = state.y, 1  # no step was possible: the start is all there is
-            if done:
-                self._record(leg, program, times[:done], samples[:done])
-        if status != records.FINISHED:
-            collapsed = status == records.COLLAPSED
-            own_force = self.external is not None
-            raise StoppedError(
-                diagnose(self.mission, leg, own_force=own_force, collapsed=collapsed)
-            )
+            return False
+        return True
 
-    def _samples(self, leg: Leg, t_end: float) -> Floats:
-        """Times to record in (t, t_end]: multiples of the output step, the phase's two ends, its arrival.
+    def steer(
+        self,
+        h: float,
+        start: Pose,
+        end: tuple[Floats, Floats, Floats],
+        turn: tuple[Floats, Floats, Floats],
+        *,
+        a: Floats,
+        alpha: Floats,
+        force: bool = True,
+    ) -> None:
+        """Lead the virtual body's reference over the next ``h`` [s], in place of the phase's own.
 
-        The start of a phase is recorded one representable number after the switch, and so is what
-        follows a loss.
+        Parameters
+        ----------
+        start : the reference now, with its acceleration ``a`` [m/s^2] and angular acceleration ``alpha`` [rad/s^2]
+        end : way (3,) [m] from there, velocity and acceleration then
+        turn : rotation vector (3,) [rad] from there, body rates and their derivative then
+        force : whether the user's force acts meanwhile
         """
-        t, first = leg.t, leg.state.count[0] == 0
-        if self.times is not None:
-            before = -math.inf if first and t == 0.0 else t
-            return self.times[(self.times > before) & (self.times <= t_end)]
-        step = self.mission.output_step
-        low, high = math.floor(t / step + 1e-9) + 1, math.floor(t_end / step + 1e-9) + 1
-        grid = np.minimum(np.arange(low, high) * step, t_end)
-        # The two ends of a phase count, its arrival, and losses.
-        lost = self.mission.lost_at
-        for exact in (leg.plan.arrival, leg.t_end, *lost[np.isfinite(lost)]):
-            if t < exact <= t_end:
-                grid = np.sort(np.append(grid[abs(grid - exact) > 1e-9 * step], exact))
-        start = [t if t == 0.0 else np.nextafter(t, math.inf)] if first else []
-        return np.concatenate([start, grid])
-
-    def _watch(self, leg: Leg, *, last: bool) -> None:
-        """Look for extremes in the steps flown; the ``last`` ones under a program are not followed by others."""
-        if leg.state.count[4] and leg.flown is not None:
-            self.extremes.take(leg.flown, leg.workspace, leg.state, last=last)
-
-    def _settle(self, leg: Leg, settle: Settle) -> bool:
-        """Integrate in short stretches until the phase has settled; False if its time was over."""
-        start = self.now.t
-        step = self.mission.output_step
-        step *= max(1.0, round(_CHECK / step))  # stretches end at samples
-        least = start + leg.plan.program.reference.T_b
-        since = math.inf
-        while leg.t < leg.t_end:
-            t = (math.floor(leg.t / step + 1e-9) + 1) * step
-            self._fly_to(leg, min(t, leg.t_end))
-            quiet = leg.t >= least and self._error(leg) <= settle.tolerance
-            since = min(since, leg.t) if quiet else math.inf
-            if leg.t - since >= settle.dwell - 1e-9:
-                return True
-        return False
-
-    def _error(self, leg: Leg) -> float:
-        """Largest error [m] of a constraint, a slot or the goal at the integrator's state.
-
-        The goal's attitude counts by how far it takes a slot.
-        """
-        plan, w = leg.plan, leg.workspace
-        native.closed_loop(leg.t, leg.state.y, np.empty_like(leg.state.y), plan.program, w)
-        errors = [np.abs(w.c).max(initial=0.0)]
-        local = plan.program.control.kind == LOCAL
-        if local:
-            errors.append(np.linalg.norm(w.r - w.r_ref, axis=1)[~self.lost].max())
-        tracks = plan.program.control.kind != OPEN
-        if tracks and plan.goal is not None and plan.slots is not None:
-            goal, since = plan.goal, leg.t - plan.arrival  # it moves on
-            left = np.where(self.lost, 0.0, self.masses)
-            cm = left @ w.r / left.sum()
-            if self.lost.any():  # the virtual body's, as those left show it
-                cm += w.body[0] - left @ w.r_ref / left.sum()
-            errors.append(np.linalg.norm(cm - goal.r - goal.v * since))
-            turned = (w.T_ref if local else w.T) - (
-                att.dcm_from_rotation_vector(goal.omega * since) @ goal.T
+        active = self._under_way()
+        t, program = active.t, active.plan.program
+        external = self.external.address if force and self.external is not None else 0
+        if active.plan.phase.control == "body":
+            feedback = program.feedback._replace(
+                arrival=t, r=start.r, v=start.v, T1=np.ascontiguousarray(start.T), omega=start.omega
             )
-            errors.append(np.linalg.norm(plan.slots @ turned, axis=1).max())
-        return float(max(errors))
+            active.lead(program._replace(feedback=feedback, external=external))
+            return
+        (r, v, a_end), (phi, omega, alpha_end) = end, turn
+        zero = np.zeros(3)
+        rate = att.rotation_vector_rate(phi, omega)
+        x = np.array([[*start.r, *zero], [*(start.r + r), *phi]])
+        x_dot = np.array([[*start.v, *start.omega], [*v, *rate]])
+        x_ddot = np.array([[*a, *alpha], [*a_end, *(alpha_end + 0.5 * np.cross(phi, alpha_end))]])
+        times = np.array([t, t + h])
+        pieces = np.ascontiguousarray(lqr.quintic_pieces(times, x, x_dot, x_ddot))
+        motion = Motion(times, pieces, np.ascontiguousarray(start.T))
+        active.lead(program._replace(motion=motion, external=external))
 
-    # -- states -----------------------------------------------------------------------------------
+    def finish(self, ending: str = "") -> Result:
+        """End the flight; return its record.
 
-    def _pack(self, plan: PhasePlan) -> Floats:
-        """The kernel's state vector at the switch."""
-        now, masses = self.now, self.masses
-        integral = now.integral.of(plan.edges, 0.0)
-        if plan.frame is None:
-            return np.concatenate([now.r.ravel(), now.v.ravel(), integral])
-        q = att.quaternion_from_dcm(plan.frame)
-        if not plan.program.body_formulation:
-            return np.concatenate([now.r.ravel(), now.v.ravel(), integral, q])
-        x, y = about_cm(now.r, masses) @ plan.frame.T, about_cm(now.v, masses) @ plan.frame.T
-        cm = (masses @ now.r / masses.sum(), masses @ now.v / masses.sum())
-        return np.concatenate([x.ravel(), y.ravel(), integral, q, *cm])
+        Where the phases flown are not the mission's, the record's mission has those that were flown.
 
-    def _arrive(self, leg: Leg) -> None:
-        """Make the state the integrator has reached the situation of the next phase."""
-        plan, state, w = leg.plan, leg.state, leg.workspace
-        native.closed_loop(leg.t, state.y, np.empty_like(state.y), plan.program, w)
-        n, m = len(self.masses), len(plan.edges)
-        frame = self.now.frame
-        if plan.frame is not None:
-            q = state.y[6 * n + m : 6 * n + m + 4]
-            frame = att.dcm_from_quaternion(q / np.linalg.norm(q))
-        pose = None
-        if plan.program.control.kind == LOCAL:
-            pose = Pose(w.body[0].copy(), w.body[1].copy(), w.T_ref.copy(), w.body[3].copy())
-        self.now = replace(
-            self.now,
-            t=leg.t,
-            r=w.r.copy(),
-            v=w.v.copy(),
-            integral=self.now.integral.updated(plan.edges, state.y[6 * n : 6 * n + m]),
-            reference=self.now.reference.updated(plan.edges, plan.distances),
-            frame=frame,
-            formation=plan.formation,
-            slots=plan.slots,
-            pose=pose,
-            goal=plan.goal,
-        )
+        Parameters
+        ----------
+        ending : why the flight ends before its mission does; by default what `Flight.ending` says
 
-    # -- diagnosis --------------------------------------------------------------------------------
+        Raises
+        ------
+        FlightError
+            Nothing has been flown.
+        """
+        under_way = self._active is not None
+        cut = under_way and self._asked[-1].settle is None and self.t < self.plan.t_end
+        self._leave()
+        self.ending = ending or self.ending
+        if not self.pieces:
+            raise FlightError(
+                self.ending or "the flight ended before the first time to record"
+            )
+        given = tuple(self.mission.phases)
+        own = tuple(self._asked) == given[: len(self._asked)]
+        whole = own and len(self._asked) == len(given) and not cut
+        if own and not whole and not self.ending:
+            self.ending = f"ended at t = {self.t:.2f} s, before the mission's end"
+        return self.record(self.pieces, None if own else self._asked)
 
-    def _check_frame(self, index: int, plan: PhasePlan) -> None:
+    def record(
+        self,
+        pieces: list[Piece],
+        flown: list[Phase] | None = None,
+        *,
+        step: float | None = None,
+        ending: str | None = None,
+    ) -> Result:
+        """The record of samples: the mission's own, or of phases ``flown`` in place of the mission's."""
+        active = self._active
+        if active is not None:  # the flight may go on
+            active.watch(last=True)
+            self.phases[-1].extremes = self._extremes.so_far()
+        last = max(piece.phase for piece in pieces) + 1
+        mission, phases = self.mission, self.phases[:last]
+        if flown is not None:
+            mission, phases = as_flown(
+                mission, flown[:last], phases, step or self.mission.output_step
+            )
+        self._extremes.flight(phases)
+        evaluations, steps, rejected = (int(c) for c in self._count)
+        statistics = {
+            "evaluations": evaluations, "steps": steps, "rejected": rejected,
+            "wall_s": clock.perf_counter() - self._started, "simulated_s": self.t,
+            "rtol": mission.integrator.rtol, "atol": mission.integrator.atol,
+            "solvers": {method: vars(counts) for method, counts in self._solves.items()},
+        }  # fmt: skip
+        ending = self.ending if ending is None else ending
+        result = assemble(mission, phases, pieces, ending=ending, statistics=statistics)
+        result.mission = mission  # with what it has made already: slots assigned, edges
+        return result
+
+    # -- inside -----------------------------------------------------------------------------------
+
+    def _under_way(self) -> ActivePhase:
+        if self._active is None:
+            why = self.ending or "begin one"
+            raise FlightError(f"no phase is under way: {why}")
+        return self._active
+
+    def _leave(self) -> None:
+        """End the phase under way, where it is."""
+        active = self._active
+        if active is None:
+            return
+        self._active = None
+        active.watch(last=True)
+        record = self.phases[-1]
+        record.extremes = self._extremes.phase()
+        record.settled = active.settled
+        active.count()
+        self._count += active.counted
+        for method, counts in active.solves:
+            self._solves.setdefault(method, type(counts)()).add(counts)
+        self._now = active.end()
+        record.t_end = self._now.t
+
+    def _check_frame(self, plan: PhasePlan) -> None:
         """Stop where the formation has flipped: its slots no longer lie as the frame says."""
-        both = {phase.control for phase in self.mission.phases[max(index - 1, 0) : index + 1]}
-        if both != {"body"} or self.now.frame is None or plan.frame is None:
+        both = {plan.phase.control, *(phase.control for phase in self._asked[-1:])}
+        now = self._now
+        if self.flips or both != {"body"} or now.frame is None or plan.frame is None:
             return
         angle = att.angle_between(
-            att.quaternion_from_dcm(self.now.frame), att.quaternion_from_dcm(plan.frame)
+            att.quaternion_from_dcm(now.frame), att.quaternion_from_dcm(plan.frame)
         )
         if angle > _FLIPPED:
             raise StoppedError(
-                f"the formation '{self.now.formation}' has flipped at t = {self.now.t:.2f} s: its slots lie"
+                f"the formation '{now.formation}' has flipped at t = {now.t:.2f} s: its slots lie"
                 f" {math.degrees(angle):.0f} deg from the body frame that was integrated. Out of a line,"
                 " distances alone do not say to which side a shape unfolds. Track slots through that"
                 ' phase: control = "slots"'
             )
 
-    def _stalled(self, leg: Leg) -> bool:
-        """Whether a phase takes far more steps than its length in time explains."""
-        steps = int(leg.state.count[1] + leg.state.count[2])
-        flown = leg.t - self.now.t
-        return steps > most_steps(flown)
-
-    def _report(self, t: float, phase: Phase, *, planning: bool = False) -> None:
+    def _report(self, phase: Phase, *, planning: bool = False) -> None:
         wall = clock.perf_counter()
-        at_once = planning or len(self.pieces) == 0
-        if self.progress is not None and (at_once or wall - self.reported > _REPORT):
-            self.reported = wall
+        at_once = planning or not self.pieces
+        if self.progress is not None and (at_once or wall - self._reported > _REPORT):
+            self._reported = wall
             t_end = self.mission.latest_end
-            self.progress(Progress(t, t_end, phase.name, wall - self.started, planning))
-
-    # -- the record -------------------------------------------------------------------------------
-
-    def _record(self, leg: Leg, program: Program, times: Floats, samples: Floats) -> None:
-        """Evaluate forces and references at the samples and keep them."""
-        plan, w = leg.plan, leg.workspace
-        n, m = len(self.masses), len(plan.edges)
-        out = native.record(program, w, times, samples)
-        if program is not plan.program:  # flown by a user's controller: the phase's references
-            asked = native.record(plan.program, w, times, samples)
-            out = out._replace(
-                r_ref=asked.r_ref,
-                p=asked.p,
-                motion=asked.motion,
-                rates=asked.rates,
-                T_ref=asked.T_ref,
-                wrench=asked.wrench,
-            )
-        frame = np.full((len(times), 4), np.nan)
-        if plan.frame is not None:
-            q = samples[:, 6 * n + m : 6 * n + m + 4]
-            frame = q / np.linalg.norm(q, axis=1, keepdims=True)
-        # A frame is attached from the first establishment on, or wherever something is tracked.
-        attached = self.now.slots is not None or plan.program.control.kind != OPEN
-        integral = samples[:, 6 * n : 6 * n + m]
-        self.pieces.append(Piece(leg.index, times, out, integral, frame, plan.edges, attached))
-
-    def result(self) -> Result:
-        """The record of what has been flown."""
-        wall = clock.perf_counter() - self.started
-        self.extremes.flight(self.phases)
-        evaluations, steps, rejected = (int(c) for c in self.count)
-        statistics = {
-            "evaluations": evaluations, "steps": steps, "rejected": rejected,
-            "wall_s": wall, "simulated_s": self.now.t,
-            "rtol": self.mission.integrator.rtol, "atol": self.mission.integrator.atol,
-            "solvers": {method: vars(counts) for method, counts in self.solves.items()},
-        }  # fmt: skip
-        result = assemble(
-            self.mission, self.phases, self.pieces, ending=self.ending, statistics=statistics,
-        )  # fmt: skip
-        result.mission = self.mission  # with what it has made already: slots assigned, edges
-        return result
-
-
-def _first_step(
-    program: Program, work: Workspace, state: records.Integrator, scale: Floats, longest: float
-) -> float:
-    """First step [s] to try in a large formation, from two evaluations; at most the ``longest``.
-
-    Hairer, Nørsett and Wanner, Solving Ordinary Differential Equations I, section II.4; ``scale`` (n,) is the
-    tolerance of each state. Steps that grow from a small one cost a large formation more.
-    """
-
-    def size(x: Floats) -> float:
-        return float(np.sqrt(np.mean((x / scale) ** 2)))
-
-    t, y = float(state.clock[0]), state.y
-    slope, later = np.empty_like(y), np.empty_like(y)
-    native.closed_loop(t, y, slope, program, work)
-    first = size(slope)
-    h = min(0.01 * size(y) / max(first, 1e-300), longest)
-    native.closed_loop(t + h, y + h * slope, later, program, work)
-    steepest = max(first, size(later - slope) / h)
-    if not 0.0 < steepest < math.inf:
-        return float(state.clock[1])
-    return min(100.0 * h, (0.01 / steepest) ** 0.2, longest)
-
-
-def _check_size(mission: Mission, phase: Phase) -> None:
-    """Stop before a flight that would take hours."""
-    if not isinstance(phase, Establish | Reshape):
-        return
-    n, solver = mission.n_agents, mission.constraint.solver
-    edges = mission.formation_edges(phase.formation)
-    if solvers.choose(n, edges, solver) != "dense":
-        return
-    size = solvers.equations(n, len(edges), solver)
-    if size > solvers.MOST_DENSE:
-        raise StoppedError(
-            f"phase '{phase.name}' takes '{phase.formation}', whose {len(edges):,} edges between"
-            f' {n:,} agents make {size:,} equations for the constraint force, and solver "{solver}" needs'
-            f" their eigenvalues; with more than {solvers.MOST_DENSE:,} a flight takes hours. Use solver ="
-            ' "iterated" (or "exact"), give it fewer edges, or track slots with edges = []'
-        )
-
-
-def _times(times: ArrayLike, end: float) -> Floats:
-    """Times [s] to record, sorted; those that rounding has put behind the end are at the end."""
-    t = np.unique(np.asarray(times, dtype=float))
-    if not (len(t) and t[0] >= 0.0 and t[-1] <= end * (1.0 + 1e-12)):
-        raise ValueError(f"times to record must lie between 0 and the mission's end, {end:g} s")
-    return np.unique(np.minimum(t, end))
-
-
-def _end(phase: Phase, start: float) -> float:
-    """Time [s] at which a phase ends, at the latest."""
-    if phase.until is not None:
-        if phase.until <= start:
-            raise StoppedError(
-                f"phase '{phase.name}' is to end at {phase.until:g} s, but the phases before it took until"
-                f" {start:.2f} s. Give it a duration in place of until"
-            )
-        return phase.until
-    return start + (phase.duration or (phase.settle or Settle()).timeout)
-
-
-def _target(mission: Mission, phase: Phase, plan: PhasePlan) -> dict[str, Any] | None:
-    """What a fly or turn phase is to reach, or the attitude of a formation established, for the record."""
-    lies = isinstance(phase, Establish) and not mission.free_attitude(phase)
-    if not (isinstance(phase, Fly | Turn) or lies) or plan.goal is None:
-        return None
-    turns = lies or phase.attitude_deg is not None
-    shaped = plan.program.reference.t0 + plan.program.reference.T_b
-    return {
-        "time": max(plan.arrival, shaped) if lies else plan.arrival,
-        "position": plan.goal.r.tolist() if isinstance(phase, Fly) else None,
-        "velocity": plan.goal.v.tolist() if isinstance(phase, Fly) else None,
-        "attitude": att.quaternion_from_dcm(plan.goal.T).tolist() if turns else None,
-        "rates": plan.goal.omega.tolist() if turns and not lies else None,
-    }
+            self.progress(Progress(self.t, t_end, phase.name, wall - self._started, planning))

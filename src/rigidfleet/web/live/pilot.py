@@ -27,6 +27,7 @@ from rigidfleet.web.live.archive import Archive, as_flown, rows
 
 TICK = 0.05  # between looks at what the hand asks for [s]
 _BLEND = 4.0  # from one formation to another [s]
+_ENDLESS = 1e6  # a phase lasts until the hand ends it [s]
 _STEADY = 2.0  # that an establishment by forces alone is left to settle [s]
 #: The reference follows the target like a critically damped oscillator with this frequency [rad/s] ...
 _FOLLOW = 1.3
@@ -75,15 +76,15 @@ class Gust:
         return (self.strength * pulse * masses)[:, None] * self.direction
 
 
-class Pilot(Flight):
+class Pilot:
     """A flight that goes on tick by tick, as it is told.
 
     Attributes
     ----------
+    flight : what flies
     target : where the hand wants the body
     formations : names of those that can be flown
-    formation : the one taken last; ``waiting`` the one to be taken next, None for none
-    ending : why the flight cannot go on, "" while it can
+    waiting : the formation to be taken next, None for none
 
     Raises
     ------
@@ -98,15 +99,17 @@ class Pilot(Flight):
                 f"{mission.name}: cannot be flown by hand, as no formation has slots."
                 " Give one a shape or slots in the mission"
             )
-        super().__init__(mission, None, 50.0, self._wind, None, None)
+        self.mission = mission
+        self.masses = np.array(mission.agents.mass)
+        self.archive = Archive(max(mission.output_step, _FINEST))
+        self.flight = Flight(mission, force=self._wind, sampler=self._samples, flips=True)
         self.gusts: list[Gust] = []
         self.waiting: str | None = None
         self.by_body = mission.architecture == "body"
         self.fastest = 0.7 * mission.limits.speed if mission.limits.speed else math.inf
-        self.archive = Archive(max(mission.output_step, _FINEST))
         self.asked: list[Phase] = []  # what each phase was begun as
         self.ticks = 0
-        self.leg = self._take(self._first(), establish=True)
+        self._take(self._first(), establish=True)
         self.pose = self._reference()
         self.a, self.alpha = np.zeros(3), np.zeros(3)
         self.target = Target(self._up(self.pose.r), att.euler_from_dcm(self.pose.T) * [0, 0, 1])
@@ -115,19 +118,31 @@ class Pilot(Flight):
     @property
     def t(self) -> float:
         """Mission time [s]."""
-        return self.leg.t
+        return self.flight.t
+
+    @property
+    def phases(self) -> list[PhaseRecord]:
+        """Records of the phases begun."""
+        return self.flight.phases
+
+    @property
+    def ending(self) -> str:
+        """Why the flight cannot go on, "" while it can."""
+        return self.flight.ending
 
     @property
     def formation(self) -> str:
         """The formation taken last."""
-        return self.leg.plan.formation or ""
+        return self.phases[-1].formation or ""
 
     @property
     def busy(self) -> bool:
         """Whether the formation is changing."""
-        reference = self.leg.plan.program.reference
-        settle = _STEADY if self.leg.phase.control == "open" else 0.0
-        return self.t < reference.t0 + reference.T_b + settle - 1e-9
+        phase, settle = self.asked[-1], 0.0
+        if phase.control == "open":
+            settle = _STEADY
+        blend = phase.blend if isinstance(phase, Establish | Reshape) else 0.0
+        return self.t < self.phases[-1].t_start + blend + settle - 1e-9
 
     # -- what it can be told ----------------------------------------------------------------------
 
@@ -144,34 +159,32 @@ class Pilot(Flight):
     def gust(self, direction: Floats, strength: float) -> None:
         """Send a gust along ``direction`` (3,), at most ``strength`` [N/kg]."""
         d = direction / np.linalg.norm(direction)
-        self.gusts.append(Gust(self.t, float((self.leg.workspace.r @ d).min()), d, strength))
+        self.gusts.append(Gust(self.t, float((self._places() @ d).min()), d, strength))
 
     def step(self) -> Result:
         """Fly one tick; return the record of its end alone.
 
         A flight that cannot go on sets ``ending``, and stays where it is.
         """
-        self.pieces.clear()
+        flight = self.flight
+        flight.pieces.clear()
         self.ticks += 1
-        try:
-            if not self.busy:
-                if self.waiting is not None:
-                    self.leg = self._take(self.waiting)
-                    self.waiting = None
-                elif self.leg.phase.control == "open":
-                    self.leg = self._hold()
+        if not self.busy:
+            if self.waiting is not None:
+                self._take(self.waiting)
+                self.waiting = None
+            elif self.asked[-1].control == "open":
+                self._hold()
+        if not flight.ending:
             self._follow(TICK)
-            self._integrate(self.leg, self.leg.plan.program, self.ticks * TICK)
-        except StoppedError as stop:
-            self.ending = str(stop)
-        self.phases[-1].t_end = self.t
-        if self.pieces or self.last is None:
-            end = [rows(self.pieces[-1], [-1])] if self.pieces else []
+            flight.advance(self.ticks * TICK - self.t)
+        if flight.pieces or self.last is None:
+            end = [rows(flight.pieces[-1], [-1])] if flight.pieces else []
             phases = [replace(p, extremes={}) for p in self.phases]  # of one moment alone
             result = assemble(self.mission, phases, end, ending="", statistics={})
             result.mission = self.mission  # which need not be parsed again
             self.last = result
-            self.archive.add(self.pieces, result)
+            self.archive.add(flight.pieces, result)
         return self.last
 
     def result(self) -> Result:
@@ -179,93 +192,79 @@ class Pilot(Flight):
 
         Its mission has the phases as they were flown.
         """
-        self._watch(self.leg, last=True)
-        self.phases[-1].extremes = self.extremes.so_far()
-        kept = self.archive.pieces()
-        flown = self.phases[: kept[-1].phase + 1]
-        given, ending, shown = self.mission, self.ending, self.phases
-        self.mission, self.phases = as_flown(
-            given, self.asked[: len(flown)], flown, self.archive.step
-        )
-        self.pieces = kept
+        ending = self.ending
         if not ending and self.busy:
-            self.ending = f"ended by hand on the way to '{self.formation}'"
-        try:
-            result = super().result()
-        finally:
-            self.mission, self.phases, self.ending, self.pieces = given, shown, ending, []
+            ending = f"ended by hand on the way to '{self.formation}'"
+        result = self.flight.record(
+            self.archive.pieces(), self.asked, step=self.archive.step, ending=ending
+        )
         result.statistics["simulated_s"] = float(result.time[-1])
         return result
 
-    # -- legs -------------------------------------------------------------------------------------
+    # -- phases -----------------------------------------------------------------------------------
 
     def _first(self) -> str:
         names = [p.formation for p in self.mission.phases if isinstance(p, Establish | Reshape)]
         return next((n for n in names if n in self.formations), self.formations[0])
 
-    def _take(self, formation: str, *, establish: bool = False) -> Leg:
+    def _take(self, formation: str, *, establish: bool = False) -> None:
         """Establish a formation, or change to it."""
         if establish:
             control = "open" if self.by_body else "slots"
-            return self._fly(
+            self._begin(
                 Establish(
                     kind="establish", name=f"establish {formation}", formation=formation, blend=_BLEND,
-                    duration=_BLEND + _STEADY, control=control,
+                    duration=_ENDLESS, control=control,
                 )
             )  # fmt: skip
+            return
         control = "body" if self.by_body else "slots"
-        return self._fly(
+        self._begin(
             Reshape(
                 kind="reshape", name=f"change to {formation}", formation=formation, blend=_BLEND,
-                duration=_BLEND, control=control,
+                duration=_ENDLESS, control=control,
             )
         )  # fmt: skip
 
-    def _hold(self) -> Leg:
-        leg = self._fly(Hold(kind="hold", name="by hand", duration=_BLEND, control="body"))
-        w = leg.workspace
-        self.pose = Pose(w.cm[0].copy(), w.cm[1].copy(), w.T.copy(), np.zeros(3))
-        self.a, self.alpha = np.zeros(3), np.zeros(3)
-        return leg
+    def _hold(self) -> None:
+        self._begin(Hold(kind="hold", name="by hand", duration=_ENDLESS, control="body"))
+        if not self.ending:
+            self.pose = self.flight.pose()
+            self.a, self.alpha = np.zeros(3), np.zeros(3)
 
-    def _fly(self, phase: Phase) -> Leg:
-        if self.phases:
-            self._watch(self.leg, last=True)
-            self.phases[-1].extremes = self.extremes.phase()
-            self._count(self.leg)
-            self._arrive(self.leg)
-        leg = self._begin(len(self.phases), phase)
-        native.closed_loop(leg.t, leg.state.y, leg.state.K[0], leg.plan.program, leg.workspace)
-        self.asked.append(phase)
-        control, name = phase.control, leg.plan.formation
-        self.phases.append(PhaseRecord(phase.name, phase.kind, control, name, leg.t, leg.t))
-        return leg
+    def _begin(self, phase: Phase) -> None:
+        if self.flight.begin(phase):
+            self.asked.append(phase)
 
-    def _check_frame(self, index: int, plan: Any) -> None:
-        """A hand sees for itself whether a formation has flipped."""
-
-    def _samples(self, leg: Leg, t_end: float) -> Floats:
+    def _samples(self, _plan: PhasePlan, t: float, t_end: float, **_: Any) -> Floats:
         """Multiples of the archive's step in (t, t_end], the end, and the start of a phase."""
         step = self.archive.step
-        low, high = math.floor(leg.t / step + 1e-9) + 1, math.floor(t_end / step + 1e-9) + 1
+        low, high = math.floor(t / step + 1e-9) + 1, math.floor(t_end / step + 1e-9) + 1
         grid = np.arange(low, high) * step
-        start = [] if self.archive.begun(leg.index) else [leg.t and np.nextafter(leg.t, math.inf)]
+        begun = self.archive.begun(len(self.phases) - 1)
+        start = [] if begun else [t and np.nextafter(t, math.inf)]
         return np.concatenate([start, grid[grid < t_end - 1e-9], [t_end]])
+
+    def _places(self) -> Floats:
+        """Where the vehicles are (N, 3) [m]."""
+        return self.flight.observe().position
 
     # -- the reference ----------------------------------------------------------------------------
 
     def _reference(self) -> Pose:
-        """The pose that the first leg begins with."""
-        w, plan = self.leg.workspace, self.leg.plan
-        if plan.program.control.kind == LOCAL:
-            return Pose(w.body[0].copy(), w.body[1].copy(), w.T_ref.copy(), w.body[3].copy())
-        T = plan.frame if plan.frame is not None else np.eye(3)
-        cm = self.masses @ w.r / self.masses.sum()
-        return Pose(cm, self.masses @ w.v / self.masses.sum(), T, np.zeros(3))
+        """The pose that the first phase begins with."""
+        flight, frame = self.flight, self.flight.plan.frame
+        pose = flight.pose()
+        if flight.plan.phase.control == "slots":
+            return pose
+        seen = flight.observe()
+        total = self.masses.sum()
+        cm, v = self.masses @ seen.position / total, self.masses @ seen.velocity / total
+        return Pose(cm, v, frame if frame is not None else np.eye(3), np.zeros(3))
 
     def _up(self, r: Floats) -> Floats:
         """A place (3,) [m] like ``r``, but high enough for the first formation to turn about it."""
-        slots = self.leg.plan.slots
+        slots = self.flight.plan.slots
         assert slots is not None  # every formation that is flown has some
         size = np.linalg.norm(slots, axis=1).max() + max(self.mission.agents.radius)
         ground = max(
@@ -275,7 +274,7 @@ class Pilot(Flight):
 
     def _follow(self, h: float) -> None:
         """Move the target as the hand does, and the reference after it, over the next tick."""
-        target, pose, leg = self.target, self.pose, self.leg
+        target, pose = self.target, self.pose
         if self.t - target.held <= _GRIP:
             target.r += h * target.move
             target.euler += h * target.turn
@@ -283,46 +282,21 @@ class Pilot(Flight):
         away = att.rotation_vector_from_dcm(target.attitude @ pose.T.T)  # axes of the body
         r, v, a = _pulled(target.r - pose.r, pose.v, self.a, h, _ACCELERATION)
         phi, omega, alpha = _pulled(away, pose.omega, self.alpha, h, _TURN)
-        if leg.phase.control != "open":
-            leg.plan.program = self._program(leg, h, (r, v, a), (phi, omega, alpha))
-            self.count[0] += leg.state.count[0]
-            leg.state.count[0] = 0  # another law: its derivative is not known yet
+        if self.asked[-1].control != "open":
+            self.flight.steer(
+                h, pose, (r, v, a), (phi, omega, alpha), a=self.a, alpha=self.alpha, force=self._windy()
+            )
             T = att.dcm_from_rotation_vector(phi) @ pose.T
             self.pose = Pose(pose.r + r, v, T, omega)
             self.a, self.alpha = a, alpha
 
-    def _program(
-        self,
-        leg: Leg,
-        h: float,
-        move: tuple[Floats, Floats, Floats],
-        turn: tuple[Floats, Floats, Floats],
-    ) -> Program:
-        """The leg's program with a reference that leads from the pose now to that after a tick."""
-        pose, t, program = self.pose, leg.t, leg.plan.program
-        wind = self._windy(t)
-        external = self.external.address if wind and self.external is not None else 0
-        if leg.phase.control == "body":
-            feedback = program.feedback._replace(
-                arrival=t, r=pose.r, v=pose.v, T1=np.ascontiguousarray(pose.T), omega=pose.omega
-            )
-            return program._replace(feedback=feedback, external=external)
-        (r, v, a), (phi, omega, alpha) = move, turn
-        zero = np.zeros(3)
-        rate = att.rotation_vector_rate(phi, omega)
-        x = np.array([[*pose.r, *zero], [*(pose.r + r), *phi]])
-        x_dot = np.array([[*pose.v, *pose.omega], [*v, *rate]])
-        x_ddot = np.array([[*self.a, *self.alpha], [*a, *(alpha + 0.5 * np.cross(phi, alpha))]])
-        times = np.array([t, t + h])
-        pieces = np.ascontiguousarray(lqr.quintic_pieces(times, x, x_dot, x_ddot))
-        motion = Motion(times, pieces, np.ascontiguousarray(pose.T))
-        return program._replace(motion=motion, external=external)
-
     # -- wind -------------------------------------------------------------------------------------
 
-    def _windy(self, t: float) -> bool:
+    def _windy(self) -> bool:
         """Forget gusts that have passed; whether there is one left."""
-        r = self.leg.workspace.r
+        if not self.gusts:
+            return False
+        r, t = self._places(), self.t
         self.gusts = [
             g
             for g in self.gusts

@@ -1,0 +1,322 @@
+"""A phase under way: what integrates its plan, watches it and records it. It sees no mission."""
+
+from __future__ import annotations
+
+import math
+import time as clock
+from collections.abc import Callable
+
+import numpy as np
+
+from rigidfleet.errors import StoppedError
+from rigidfleet.kernel import records
+from rigidfleet.kernel.engine import native
+from rigidfleet.kernel.problem import LOCAL, OPEN, Program
+from rigidfleet.math import attitude as att
+from rigidfleet.mission import Settle
+from rigidfleet.planning.disturbances import without
+from rigidfleet.planning.plan import PhasePlan
+from rigidfleet.planning.reference import Situation
+from rigidfleet.planning.tolerances import most_steps
+from rigidfleet.simulation.callbacks import Controller, ExternalForce, Observation, asked
+from rigidfleet.simulation.diagnosis import Place, diagnose
+from rigidfleet.simulation.extremes import Extremes
+from rigidfleet.simulation.recording import Piece
+from rigidfleet.simulation.solver_setup import equip, first_step, integrator
+from rigidfleet.typing import Bools, Floats
+
+#: The integrator returns to Python after so many steps, or fewer: as many as take this long [s of
+#: wall time], often enough for Ctrl-C and progress whatever the size of the formation.
+_STEPS, _PAUSE = 2000, 0.05
+#: So many at the start of a phase, whose steps may take a thousand times as long as those of the one before.
+_FIRST_STEPS = 10
+#: Where a phase ends by settling, whether it has is asked this often [s].
+_CHECK = 0.1
+
+#: Times in (t, t_end] to record, of a plan: sampling(plan, t, t_end, first=..., stop=...).
+Sampler = Callable[..., Floats]
+
+
+class ActivePhase:
+    """A phase under way.
+
+    Attributes
+    ----------
+    plan : what is flown
+    pieces : samples recorded, appended as they come
+    """
+
+    def __init__(
+        self,
+        index: int,
+        plan: PhasePlan,
+        *,
+        extremes: Extremes,
+        external: ExternalForce | None,
+        sampler: Sampler,
+        pieces: list[Piece],
+        pause: Callable[[float], None],
+    ) -> None:
+        self.index, self.plan = index, plan
+        self.extremes, self.external, self.sampler = extremes, external, sampler
+        self.pieces, self.pause = pieces, pause
+        self.lost = np.zeros(len(plan.masses), dtype=np.bool_)
+        if plan.before.lost is not None:
+            self.lost = plan.before.lost
+        self.workspace, self.solver = equip(plan)
+        y = plan.state()
+        trail = extremes.begin(len(y), len(plan.edges))
+        self.state = integrator(plan, y, plan.start, trail)
+        if self.solver is not None:
+            self.state.clock[1] = first_step(plan, self.workspace, self.state)
+        self.asked = 0  # how often the user's controller has been
+        self.held: Program | None = None  # with its force
+        self.flown: Program | None = None  # what the steps in the trail were flown by
+        self.steps = _FIRST_STEPS  # at a time; more as soon as it is known how long they take
+        self.counted = np.zeros(3, dtype=np.int64)  # evaluations, steps and rejections before a loss
+        self.solves: list[tuple[str, object]] = []  # by which method, before a loss
+        self.quiet_since = math.inf  # since when the phase has been settled [s]
+        self.stop = math.inf  # where somebody looks [s]
+        self.begun = False  # whether there are samples since the start, or the last loss
+
+    @property
+    def t(self) -> float:
+        """Mission time reached [s]."""
+        return float(self.state.clock[0])
+
+    @property
+    def over(self) -> bool:
+        """Whether the phase has come to its latest end."""
+        return self.t >= self.plan.t_end
+
+    @property
+    def place(self) -> Place:
+        """Where the phase is, as a diagnosis takes it."""
+        return Place(self.plan, self.t, self.state, self.workspace, self.solver)
+
+    @property
+    def settled(self) -> bool | None:
+        """Whether a phase that ends by settling has; None for others."""
+        settle = self.plan.phase.settle
+        return None if settle is None else self.t - self.quiet_since >= settle.dwell - 1e-9
+
+    # -- flying -----------------------------------------------------------------------------------
+
+    def fly_to(self, t_end: float, controller: Controller | None, rate: float) -> None:
+        """Integrate to ``t_end`` [s] under the phase's input law, or the user's controller, asked at ``rate`` [Hz].
+
+        Raises
+        ------
+        StoppedError
+            The flight cannot go on.
+        """
+        if controller is None or self.plan.phase.control != "slots":
+            self._integrate(self.plan.program, t_end)
+            return
+        start = self.plan.start
+        while self.t < t_end:
+            # Control instants count from the phase's start, wherever a stretch of it ends.
+            if self.held is None or self.t >= start + self.asked / rate:
+                f = asked("the controller", self.t, len(self.lost), controller, self.observe())
+                control = self.plan.program.control._replace(kind=OPEN, force=f)
+                self.held = self.plan.program._replace(control=control)
+                self.asked += 1
+            self._integrate(self.held, min(start + self.asked / rate, t_end))
+
+    def settle_by(
+        self, t_end: float, settle: Settle, controller: Controller | None, rate: float, step: float
+    ) -> None:
+        """Integrate in short stretches, ends of ``step`` [s], until the phase has settled or ``t_end`` [s] is reached."""
+        step *= max(1.0, round(_CHECK / step))  # stretches end at samples
+        least = self.plan.start + self.plan.program.reference.T_b
+        while self.t < t_end and not self.settled:
+            t = (math.floor(self.t / step + 1e-9) + 1) * step
+            self.fly_to(min(t, t_end), controller, rate)
+            if self.t < min(t, self.plan.t_end):
+                return  # between two checks
+            quiet = self.t >= least and self._error() <= settle.tolerance
+            self.quiet_since = min(self.quiet_since, self.t) if quiet else math.inf
+
+    def lead(self, program: Program) -> None:
+        """Go on with another program of the same size, as one whose reference leads elsewhere."""
+        self.plan.program = program
+        self.counted[0] += self.state.count[0]
+        self.state.count[0] = 0  # another law: its derivative is not known yet
+
+    def evaluate(self) -> None:
+        """Evaluate the law where the phase is: forces and references are in the workspace."""
+        y = self.state.y
+        native.closed_loop(self.t, y, np.empty_like(y), self.plan.program, self.workspace)
+
+    def observe(self) -> Observation:
+        """What a controller sees where the phase is."""
+        self.evaluate()
+        w, vehicles = self.workspace, self.plan.program.vehicles
+        noisy = len(self.plan.program.disturbance.noise_r) > 0
+        r, v = (w.r_seen, w.v_seen) if noisy else (w.r, w.v)
+        return Observation(
+            self.t, self.plan.phase.name, r.copy(), v.copy(), w.r_ref.copy(), w.v_ref.copy(),
+            w.a_ref.copy(), self.plan.masses.copy(), vehicles.g,
+        )  # fmt: skip
+
+    def watch(self, *, last: bool) -> None:
+        """Look for extremes in the steps flown; the ``last`` ones under a program are not followed by others."""
+        if self.state.count[4] and self.flown is not None:
+            self.extremes.take(self.flown, self.workspace, self.state, last=last)
+
+    def end(self) -> Situation:
+        """End the phase where it is; return the state that the next one starts from."""
+        self._check()
+        if not (self.state.count[0] or self.t > self.plan.start):
+            return self.plan.before
+        self.evaluate()
+        return self.plan.reached(self.t, self.state.y, self.workspace)
+
+    # -- inside -----------------------------------------------------------------------------------
+
+    def _check(self) -> None:
+        """Raise what has come up within the solver of the multipliers, or the monitor's."""
+        if self.solver is not None:
+            self.solver.check()
+            self.solver.aside.check()
+
+    def _integrate(self, program: Program, t_end: float) -> None:
+        """Integrate to ``t_end`` [s] through the times at which vehicles are lost.
+
+        ``program`` may hold a user's force in place of the phase's own input law.
+        """
+        while self.t < t_end:
+            coming = np.where(self.lost, math.inf, self.plan.lost_at)
+            if coming.min() <= self.t:
+                program = self._lose(program, coming <= self.t)
+            else:
+                self._stretch(program, min(t_end, float(coming.min())))
+
+    def _lose(self, program: Program, now: Bools) -> Program:
+        """Go on without the vehicles that are lost ``now`` (N,); return what is flown of a program."""
+        self.watch(last=True)
+        self._check()
+        self.lost = self.lost | now
+        plan, y, own = self.plan, self.state.y, program is self.plan.program
+        plan.before.lost = self.lost
+        self.extremes.lose(self.lost)
+        n = len(self.lost)
+        self.count()
+        kept = plan.release(self.lost)
+        integral = y[6 * n : 6 * n + len(kept)][kept]
+        rest = y[6 * n + len(kept) :]
+        y = np.concatenate([y[: 6 * n], integral, rest])
+        t, trail = self.t, self.extremes.begin(len(y), len(plan.edges))
+        self.begun = False
+        self.state = integrator(plan, y, t, trail)
+        self.workspace, self.solver = equip(plan)
+        if own:
+            return plan.program
+        mu = plan.program.law.mu
+        held = without(program, kept, self.lost, mu, large=plan.large)
+        self.held = held._replace(graph=plan.program.graph)
+        return self.held
+
+    def count(self) -> None:
+        """Add up what the phase, or its part up to a loss, has taken."""
+        self.counted += self.state.count[:3]
+        if self.solver is not None:
+            self.solves.append((self.plan.method, self.solver.counts))
+
+    def _stretch(self, program: Program, t_end: float) -> None:
+        """Integrate to ``t_end`` [s] and record the samples on the way."""
+        state = self.state
+        fresh = state.count[0] == 0 or program is not self.plan.program
+        if fresh:
+            self.watch(last=True)
+            self.flown = program
+            if self.solver is not None:  # it remembers what it is asked: the monitor has another
+                graph = program.graph._replace(solver=self.solver.aside.address)
+                self.flown = program._replace(graph=graph)
+        times = self.sampler(self.plan, self.t, t_end, first=not self.begun, stop=self.stop)
+        self.begun = True
+        samples = np.empty((len(times), len(state.y)))
+        state.count[3] = 0
+        first = np.nextafter(self.t, math.inf)
+        status = records.PAUSED
+        try:
+            while status == records.PAUSED:
+                begun = clock.perf_counter()
+                status = native.integrate(
+                    program, self.workspace, state, t_end, fresh, times, samples, self.steps
+                )
+                took = max(clock.perf_counter() - begun, 1e-6)
+                if status == records.PAUSED:
+                    self.steps = min(_STEPS, max(1, int(self.steps * min(_PAUSE / took, 10.0))))
+                fresh = False
+                if self.external is not None:
+                    self.external.check()
+                self._check()
+                self.watch(last=False)
+                self.pause(self.t)
+                if status == records.PAUSED and self._stalled():
+                    break
+        finally:
+            done = int(state.count[3])
+            if state.count[0] and not state.count[1] and len(times) and times[0] <= first:
+                samples[0], done = state.y, 1  # no step was possible: the start is all there is
+            if done:
+                self._record(program, times[:done], samples[:done])
+        if status != records.FINISHED:
+            collapsed = status == records.COLLAPSED
+            own_force = self.external is not None
+            raise StoppedError(diagnose(self.place, own_force=own_force, collapsed=collapsed))
+
+    def _stalled(self) -> bool:
+        """Whether the phase takes far more steps than its length in time explains."""
+        steps = int(self.state.count[1] + self.state.count[2])
+        return steps > most_steps(self.t - self.plan.start)
+
+    def _error(self) -> float:
+        """Largest error [m] of a constraint, a slot or the goal at the integrator's state.
+
+        The goal's attitude counts by how far it takes a slot.
+        """
+        plan, w = self.plan, self.workspace
+        self.evaluate()
+        errors = [np.abs(w.c).max(initial=0.0)]
+        local = plan.program.control.kind == LOCAL
+        if local:
+            errors.append(np.linalg.norm(w.r - w.r_ref, axis=1)[~self.lost].max())
+        tracks = plan.program.control.kind != OPEN
+        if tracks and plan.goal is not None and plan.slots is not None:
+            goal, since = plan.goal, self.t - plan.arrival  # it moves on
+            left = np.where(self.lost, 0.0, plan.masses)
+            cm = left @ w.r / left.sum()
+            if self.lost.any():  # the virtual body's, as those left show it
+                cm += w.body[0] - left @ w.r_ref / left.sum()
+            errors.append(np.linalg.norm(cm - goal.r - goal.v * since))
+            turned = (w.T_ref if local else w.T) - (
+                att.dcm_from_rotation_vector(goal.omega * since) @ goal.T
+            )
+            errors.append(np.linalg.norm(plan.slots @ turned, axis=1).max())
+        return float(max(errors))
+
+    def _record(self, program: Program, times: Floats, samples: Floats) -> None:
+        """Evaluate forces and references at the samples and keep them."""
+        plan, w = self.plan, self.workspace
+        n, m = len(plan.masses), len(plan.edges)
+        out = native.record(program, w, times, samples)
+        if program is not plan.program:  # flown by a user's controller: the phase's references
+            planned = native.record(plan.program, w, times, samples)
+            out = out._replace(
+                r_ref=planned.r_ref,
+                p=planned.p,
+                motion=planned.motion,
+                rates=planned.rates,
+                T_ref=planned.T_ref,
+                wrench=planned.wrench,
+            )
+        frame = np.full((len(times), 4), np.nan)
+        if plan.frame is not None:
+            q = samples[:, 6 * n + m : 6 * n + m + 4]
+            frame = q / np.linalg.norm(q, axis=1, keepdims=True)
+        integral = samples[:, 6 * n : 6 * n + m]
+        self.pieces.append(
+            Piece(self.index, times, out, integral, frame, plan.edges, plan.attached)
+        )

@@ -1,0 +1,112 @@
+"""The mission that was flown, where its phases were not those given."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+from rigidfleet.errors import MissionError
+from rigidfleet.mission import Establish, Mission, Phase, Reshape
+from rigidfleet.result import PhaseRecord
+
+
+def as_flown(
+    mission: Mission, asked: Sequence[Phase], flown: Sequence[PhaseRecord], step: float
+) -> tuple[Mission, list[PhaseRecord]]:
+    """The mission whose phases are those ``flown`` by hand, and their records under its names.
+
+    Where that would be no mission (as where slots and distances contradict each other, which a hand may fly),
+    it has the phases that it was given with: no flight is lost for them.
+
+    Parameters
+    ----------
+    asked : what each phase was begun as
+    step : between samples [s]
+    """
+    records = _told_apart(flown)
+    data = mission.to_dict()
+    data.pop("source", None)  # it reproduces no figure any more
+    data["name"] = f"{mission.name.removesuffix('-live')}-live"
+    data["title"] = f"{mission.title or mission.name}, flown by hand"
+    as_given = dict(data)
+    data |= _flown_data(mission, asked, records, step)
+    try:
+        return Mission.from_dict(data), records
+    except MissionError:
+        return Mission.from_dict(as_given), records
+
+
+def with_phase(
+    mission: Mission, asked: Sequence[Phase], flown: Sequence[PhaseRecord], table: Mapping[str, Any]
+) -> Phase:
+    """The phase that a table makes, as in a mission file, after the phases flown so far.
+
+    Raises
+    ------
+    MissionError
+        The table has errors.
+    """
+    data = mission.to_dict()
+    if flown:
+        data |= _flown_data(mission, asked, _told_apart(flown), mission.output_step)
+    else:
+        data["phases"] = []
+    data["phases"] = [*data["phases"], dict(table)]
+    return Mission.from_dict(data, "begin()").phases[-1]
+
+
+def _told_apart(flown: Sequence[PhaseRecord]) -> list[PhaseRecord]:
+    """Records of phases, of which no two have one name."""
+    seen: Counter[str] = Counter()
+    records = []
+    for record in flown:
+        seen[record.name] += 1
+        count = seen[record.name]
+        records.append(
+            replace(record, name=f"{record.name} ({count})" if count > 1 else record.name)
+        )
+    return records
+
+
+def _flown_data(
+    mission: Mission, asked: Sequence[Phase], records: Sequence[PhaseRecord], step: float
+) -> dict[str, Any]:
+    """What a mission file has otherwise where these phases were flown in place of its own."""
+    data: dict[str, Any] = {}
+    end = records[-1].t_end
+    data["output_step"] = min(step, end)
+    if mission.assignment != "given":
+        # Who takes which slot followed from phases that were not flown.
+        data["assignment"] = "given"
+        data["formations"] = {name: _written_out(mission, name) for name in mission.formations}
+    data["phases"] = [_written(*each) for each in zip(asked, records, strict=True)]
+    disturbed = mission.to_dict().get("disturbances", {})
+    if "lost" in disturbed:
+        left = [lost for lost in disturbed["lost"] if lost["time"] < end]
+        data["disturbances"] = disturbed | {"lost": left}
+    return data
+
+
+def _written(phase: Phase, record: PhaseRecord) -> dict[str, Any]:
+    """A phase as it stands in a mission, from its start to the end that it had."""
+    given = phase.model_dump(mode="json", exclude_unset=True)
+    for key in ("duration", "settle"):
+        given.pop(key, None)
+    length = record.t_end - record.t_start
+    if given.get("travel") is not None:
+        given["travel"] = min(given["travel"], length)
+    told: dict[str, Any] = {"kind": record.kind, "name": record.name, "until": record.t_end}
+    told = given | told | {"control": record.control}
+    if isinstance(phase, Establish | Reshape):
+        told["formation"] = phase.formation
+        told["blend"] = min(phase.blend, record.t_end - record.t_start)
+    return told
+
+
+def _written_out(mission: Mission, name: str) -> dict[str, Any]:
+    """A formation with slots and edges in the order of the agents."""
+    edges = (mission.formation_edges(name) + 1).tolist()
+    given = mission.formations[name].distances
+    return {"slots": mission.formation_slots(name), "edges": edges, "distances": given}

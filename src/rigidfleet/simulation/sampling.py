@@ -1,0 +1,52 @@
+"""Which moments of a flight are recorded."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rigidfleet.planning.plan import PhasePlan
+from rigidfleet.typing import Floats
+
+
+class Sampling:
+    """Multiples of a step, the ends of phases, arrivals, losses and stops; or times that were asked for.
+
+    The start of a phase is recorded one representable number after the switch, and so is what follows a loss.
+    """
+
+    def __init__(self, step: float, times: Floats | None = None) -> None:
+        self.step, self.times = step, times
+
+    def between(
+        self, plan: PhasePlan, t: float, t_end: float, *, first: bool, stop: float = math.inf
+    ) -> Floats:
+        """Times in (t, t_end] [s] of a phase; ``first`` after a switch, and ``stop`` where somebody looks."""
+        if self.times is not None:
+            before = -math.inf if first and t == 0.0 else t
+            return self.times[(self.times > before) & (self.times <= t_end)]
+        step = self.step
+        low, high = math.floor(t / step + 1e-9) + 1, math.floor(t_end / step + 1e-9) + 1
+        grid = np.minimum(np.arange(low, high) * step, t_end)
+        lost = plan.lost_at
+        for exact in (plan.arrival, plan.t_end, stop, *lost[np.isfinite(lost)]):
+            if t < exact <= t_end:
+                grid = np.sort(np.append(grid[abs(grid - exact) > 1e-9 * step], exact))
+        start = [t if t == 0.0 else np.nextafter(t, math.inf)] if first else []
+        return np.concatenate([start, grid])
+
+
+def times_asked(times: ArrayLike, end: float) -> Floats:
+    """Times [s] to record, sorted; those that rounding has put behind the end are at the end.
+
+    Raises
+    ------
+    ValueError
+        One lies outside of the mission.
+    """
+    t = np.unique(np.asarray(times, dtype=float))
+    if not (len(t) and t[0] >= 0.0 and t[-1] <= end * (1.0 + 1e-12)):
+        raise ValueError(f"times to record must lie between 0 and the mission's end, {end:g} s")
+    return np.unique(np.minimum(t, end))

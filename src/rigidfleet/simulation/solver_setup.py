@@ -1,0 +1,79 @@
+"""From a plan to what an integrator works with: workspace, solver of large systems, first step."""
+
+from __future__ import annotations
+
+import math
+from functools import cache, partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from rigidfleet.kernel import records
+from rigidfleet.kernel.engine import native
+from rigidfleet.kernel.problem import RIGID, Program, Workspace, workspace
+from rigidfleet.planning import solvers
+from rigidfleet.planning.plan import PhasePlan
+from rigidfleet.typing import Floats
+
+if TYPE_CHECKING:
+    # Imports the compiler, which only large formations need.
+    from rigidfleet.kernel.large.solver import LargeSolver
+
+
+def equip(plan: PhasePlan) -> tuple[Workspace, LargeSolver | None]:
+    """Workspace of a plan, and what solves for its multipliers where that is not the kernel itself."""
+    program = plan.program
+    work = workspace(
+        len(plan.masses),
+        len(plan.edges),
+        with_h=program.control.allocation != RIGID,
+        solver=program.law.solver,
+        large=plan.large,
+    )
+    if not plan.large:
+        return work, None
+    from rigidfleet.kernel.large.solver import LargeSolver
+
+    edges = plan.edges
+    points = plan.before.r if plan.slots is None else plan.slots
+    steps = solvers.sweep_steps(len(points), edges) if plan.method == "sweep" else None
+    order = cache(partial(solvers.dissection, points, edges))
+    solver = LargeSolver(
+        program.vehicles, program.graph.edges, program.law, work, steps, order, *plan.residual()
+    )
+    plan.program = program._replace(graph=program.graph._replace(solver=solver.address))
+    return work, solver
+
+
+def integrator(
+    plan: PhasePlan, y: Floats, t: float, trail: records.Trail
+) -> records.Integrator:
+    """An integrator of a plan at time t [s] and state y (n,), which leaves its steps in a trail."""
+    return records.integrator(
+        y, t, rtol=plan.integrator.rtol, atol=plan.tolerances(len(y)), trail=trail
+    )
+
+
+def first_step(plan: PhasePlan, work: Workspace, state: records.Integrator) -> float:
+    """First step [s] to try in a large formation, from two evaluations.
+
+    Hairer, Nørsett and Wanner, Solving Ordinary Differential Equations I, section II.4. Steps that grow from a small
+    one cost a large formation more.
+    """
+    program: Program = plan.program
+    t, y = float(state.clock[0]), state.y
+    scale = plan.tolerances(len(y)) + state.rtol * np.abs(y)
+
+    def size(x: Floats) -> float:
+        return float(np.sqrt(np.mean((x / scale) ** 2)))
+
+    longest = plan.t_end - plan.start
+    slope, later = np.empty_like(y), np.empty_like(y)
+    native.closed_loop(t, y, slope, program, work)
+    first = size(slope)
+    h = min(0.01 * size(y) / max(first, 1e-300), longest)
+    native.closed_loop(t + h, y + h * slope, later, program, work)
+    steepest = max(first, size(later - slope) / h)
+    if not 0.0 < steepest < math.inf:
+        return float(state.clock[1])
+    return min(100.0 * h, (0.01 / steepest) ** 0.2, longest)
