@@ -14,7 +14,7 @@ from rigidfleet.mission import Mission, json_schema, mission_names, mission_text
 from rigidfleet.mission import bounds as limits
 from rigidfleet.mission.bounds import excess
 from rigidfleet.mission.formations import coincident
-from rigidfleet.preflight.check import preflight
+from rigidfleet.preflight.check import check as preflight
 
 HEAD = 'schema_version = 1\nname = "a"\n'
 HOLD = "[[phases]]\nkind = 'hold'\nduration = 10.0\n"

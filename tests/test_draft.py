@@ -8,7 +8,7 @@ from rigidfleet.errors import MissionError
 from rigidfleet.formation.shapes import SHAPES
 from rigidfleet.mission import Mission
 from rigidfleet.mission.draft import agents_for, draft, shape_for
-from rigidfleet.preflight.check import preflight
+from rigidfleet.preflight.check import check as preflight
 from rigidfleet.simulation.flight import simulate
 
 

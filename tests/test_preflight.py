@@ -16,7 +16,8 @@ from rigidfleet.formation.shapes import (
 )
 from rigidfleet.mission import Mission, load_mission, mission_names
 from rigidfleet.plotting.graph import graphs
-from rigidfleet.preflight.check import STARTS, planned, preflight
+from rigidfleet.preflight.check import STARTS, planned
+from rigidfleet.preflight.check import check as preflight
 from rigidfleet.simulation.flight import simulate
 
 #: Missions of which something fails in flight, and what says so before.
@@ -96,7 +97,7 @@ def test_no_compiler():
     code = """
 import sys
 from rigidfleet.mission import load_mission
-from rigidfleet.preflight.check import preflight
+from rigidfleet.preflight.check import check as preflight
 preflight(load_mission("cube-passage"))
 assert not {"numba", "rigidfleet.kernel", "matplotlib"} & set(sys.modules)
 """

@@ -14,7 +14,8 @@ from rigidfleet.assessment import assess
 from rigidfleet.errors import MissionError
 from rigidfleet.formation import shapes
 from rigidfleet.mission import Mission, mission_text
-from rigidfleet.preflight.check import planned, preflight
+from rigidfleet.preflight.check import check as preflight
+from rigidfleet.preflight.check import planned
 from rigidfleet.simulation.flight import simulate
 
 #: What the flown may be nearer than the planned [m]: tracking is exact but for the integrator's error, 1e-8 of

@@ -256,7 +256,7 @@ def check(
     json : bool
         Print what was found as JSON.
     """
-    from rigidfleet.mission import ending, goal, load_mission
+    from rigidfleet.mission import counted, ending, goal, load_mission
 
     watch = screen.CheckWatch(mission)
     try:
@@ -271,10 +271,10 @@ def check(
         ]
         screen.print_json({"mission": mission, "right": False, "findings": findings})
         return BAD_INPUT
-    from rigidfleet.preflight.check import preflight
+    from rigidfleet.preflight import check as preflight
 
     with watch:
-        ahead = preflight(found, search=realisations, progress=watch.update)
+        ahead = preflight.check(found, search=realisations, progress=watch.update)
     if figure is not None:
         from rigidfleet.plotting.graph import draw_graphs
 
@@ -286,7 +286,7 @@ def check(
     table = screen.table("#", "phase", "kind", "to", "ends", "control")
     for n, phase in enumerate(found.phases, start=1):
         table.add_row(str(n), phase.name, phase.kind, goal(phase), ending(phase), phase.control)
-    screen.out().print(f"{found.name}: right: {_counted(found)}")
+    screen.out().print(f"{found.name}: right: {counted(found)}")
     screen.print_table(table)
     screen.out().print()
     screen.print_words(ahead.words())
@@ -502,9 +502,9 @@ def new(
     json : bool
         Print what was written as JSON. Ask nothing.
     """
-    from rigidfleet.mission import Mission
+    from rigidfleet.mission import Mission, counted
     from rigidfleet.mission import draft as drafts
-    from rigidfleet.preflight.check import preflight
+    from rigidfleet.preflight import check as preflight
     from rigidfleet.result import write_file
 
     given: dict[str, Any] = {
@@ -523,7 +523,7 @@ def new(
     except ValueError as error:
         raise RigidfleetError(str(error)) from None
     mission = Mission.from_toml(text, str(file))
-    fails = [r.text for r in preflight(mission, search=False).remarks if r.level == "fails"]
+    fails = [r.text for r in preflight.check(mission, search=False).remarks if r.level == "fails"]
     if fails:
         raise RigidfleetError(
             f"{file}: is not written, as it would fail: {'; '.join(fails)}. Change what you ask for."
@@ -532,7 +532,7 @@ def new(
     if json:
         screen.print_json({"file": str(file)} | _facts(mission))
     elif not quiet:
-        screen.out().print(f"{file}: {_counted(mission)}", soft_wrap=True)
+        screen.out().print(f"{file}: {counted(mission)}", soft_wrap=True)
         screen.out().print(f"Fly it by: rigidfleet run {file}", soft_wrap=True)
     return PASSED
 
@@ -1074,18 +1074,6 @@ def _facts(mission: Mission) -> dict[str, object]:
         ],
         "latest_end_s": mission.latest_end,
     }
-
-
-def _counted(mission: Mission) -> str:
-    """How much of everything a mission has."""
-    most = "at most " if any(phase.settle for phase in mission.phases) else ""
-    counts = (
-        screen.count(mission.n_agents, "agent"),
-        screen.count(len(mission.formations), "formation"),
-        screen.count(len(mission.phases), "phase"),
-        f"{most}{mission.latest_end:g} s",
-    )
-    return ", ".join(counts)
 
 
 def _own_fault(error: Exception) -> str:

@@ -11,17 +11,19 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rigidfleet import _markup
 from rigidfleet.formation import shapes
 from rigidfleet.math import attitude as att
 from rigidfleet.math import lqr
 from rigidfleet.math import pid as gains
 from rigidfleet.math import proximity as geometry
-from rigidfleet.mission import Box, Establish, Ground, Mission, Phase, Reshape
+from rigidfleet.mission import Box, Establish, Ground, Mission, Phase, Reshape, as_mission
 from rigidfleet.mission.disturbances import intensity
 from rigidfleet.planning import solvers
 from rigidfleet.planning.reference import (
@@ -193,7 +195,15 @@ class Disturbed:
 
 @dataclass
 class Preflight:
-    """All that was found; `remarks` say what of it matters."""
+    """What `check` has found of a mission before it flies; `remarks` say what of it matters.
+
+    >>> import rigidfleet as rf
+    >>> ahead = rf.check("narrow-passage")
+    >>> ahead.passed
+    True
+    >>> for heading, fact in ahead.words():
+    ...     print(heading, fact)
+    """
 
     formations: list[FormationCheck]
     gains: GainsCheck
@@ -211,6 +221,18 @@ class Preflight:
     def passed(self) -> bool:
         """Whether nothing was found that will fail."""
         return all(remark.level != "fails" for remark in self.remarks)
+
+    def __repr__(self) -> str:
+        fails = sum(remark.level == "fails" for remark in self.remarks)
+        notes = len(self.remarks) - fails
+        verdict = f"{fails} will fail" if fails else "nothing found that will fail"
+        return f"<Preflight: {verdict}, {notes} note{'s' * (notes != 1)}>"
+
+    def _repr_html_(self) -> str:
+        """What was found as a notebook shows it: facts, then remarks."""
+        rows = [*self.words(), *((remark.level, remark.text) for remark in self.remarks)]
+        verdict = "nothing found that will fail" if self.passed else "it will fail as it is"
+        return _markup.shown("Check", verdict, ("about", "what was found"), rows)
 
     def words(self) -> Iterator[tuple[str, str]]:
         """All facts, each under a heading: formations, gains, the way. `remarks` come besides."""
@@ -295,20 +317,22 @@ class Preflight:
         }
 
 
-def preflight(
-    mission: Mission,
+def check(
+    mission: Mission | str | Path,
     *,
     search: bool | None = None,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Preflight:
-    """Check a mission that is right in itself for what it will meet.
+    """Find what a mission will meet, before it flies; `rigidfleet check` prints it.
 
     Parameters
     ----------
+    mission : a shipped name, a path or a `Mission`
     search : for other shapes with the same distances, `STARTS` random starts a formation; default: for up to
         `SEARCHED` agents
     progress : called with what is looked at next, in words
     """
+    mission = as_mission(mission)
     search = mission.n_agents <= SEARCHED if search is None else search
     formations = _formations(mission, search=search, progress=progress)
     progress("the way")

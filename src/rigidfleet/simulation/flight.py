@@ -7,6 +7,7 @@ import time as clock
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from rigidfleet.kernel import problem as k
 from rigidfleet.kernel import records
 from rigidfleet.kernel.engine import native
 from rigidfleet.math import attitude as att
-from rigidfleet.mission import Establish, Fly, Mission, Phase, Reshape, Settle, Turn
+from rigidfleet.mission import Establish, Fly, Mission, Phase, Reshape, Settle, Turn, as_mission
 from rigidfleet.planning import solvers
 from rigidfleet.planning.disturbances import disturbance, without
 from rigidfleet.planning.plan import PhasePlan, plan_phase
@@ -91,7 +92,7 @@ class FlightInterrupted(KeyboardInterrupt):
 
 
 def simulate(
-    mission: Mission,
+    mission: Mission | str | Path,
     *,
     controller: Controller | None = None,
     rate: float = 50.0,
@@ -103,7 +104,7 @@ def simulate(
 
     Parameters
     ----------
-    mission : the mission
+    mission : a shipped name, a path or a `Mission`
     controller : in place of the input law wherever slots are tracked: a function of an
         `Observation` that returns the input force (N, 3) [N] of every agent, weight included. It
         is called ``rate`` times a second, its force held in between, as on a vehicle.
@@ -128,10 +129,12 @@ def simulate(
     FlightError
         The controller or the force raised an exception, which is its cause, or returned something
         that is no force; its ``result`` is what had flown, incomplete, or None.
+    MissionError
+        There is no such mission, or it has errors.
     ValueError
         A time to record lies outside of the mission, or the control rate is not positive.
     """
-    run = Flight(mission, controller, rate, force, times, progress)
+    run = Flight(as_mission(mission), controller, rate, force, times, progress)
     try:
         run.fly()
     except KeyboardInterrupt:
