@@ -233,12 +233,17 @@ def test_a_result_whose_mission_cannot_be_read():
     assert "cannot be read" in text
 
 
+def png(figure: Any) -> tuple[bytes, dict[str, int]]:
+    """What a notebook shows of a figure."""
+    return figure._repr_png_()
+
+
 def test_figures_are_pictures(flight):
     """A figure is a PNG of twice the dots that it is shown at, whatever the backend; several are a list."""
-    figures: list[Any] = rf.plot(flight, names=["trajectory", "cm"])
+    figures = rf.plot(flight, names=["trajectory", "cm"])
     assert len(figures) == 2
     for figure in figures:
-        data, size = figure._repr_png_()
+        data, size = png(figure)
         assert data.startswith(b"\x89PNG")
         wide = int.from_bytes(data[16:20], "big")
         assert 1.3 * size["width"] < wide < 2.1 * size["width"]
