@@ -8,10 +8,12 @@ BIN := .venv/bin
 export UV_PYTHON_DOWNLOADS := never
 INSTALL := $(BIN)/uv pip install --quiet --python $(BIN)/python \
 	--constraints constraints.txt --build-constraints constraints.txt --editable .
+# The wheel is built from the sdist, which so proves to be whole.
+BUILD := $(BIN)/uv build --quiet --python $(BIN)/python --build-constraints constraints.txt
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test bench peers robustness docs lint format constraints clean
+.PHONY: help setup demo test bench peers robustness docs package lint format constraints clean
 
 help:  ## Show this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' Makefile
@@ -38,6 +40,10 @@ docs: .venv/.docs  ## Build the site into site/, with every figure on it
 	@$(BIN)/python docs/picture.py
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 	@echo "Open site/index.html"
+
+package: .venv/.uv  ## Build the wheel and the sdist into dist/
+	@rm -rf dist
+	@$(BUILD) --out-dir dist .
 
 lint: .venv/.dev  ## Check style, types and import layers
 	@$(BIN)/ruff check

@@ -121,7 +121,7 @@ def compiled_flight(mission: Mission, tolerance: float = TOLERANCE) -> Callable[
     """The kernel alone: all that is known before the flight is prepared before the clock starts."""
     agents = mission.agents
     now = Situation(0.0, np.array(agents.position), np.array(agents.velocity))
-    plan = plan_phase(mission, mission.phases[0], now, DURATION)
+    plan = plan_phase(mission, mission.phases[0], now)
     work = workspace(len(now.r), len(plan.edges), solver=plan.program.law.solver)
     y = np.concatenate([now.r.ravel(), now.v.ravel(), np.zeros(len(plan.edges))])
     times = np.linspace(0.0, DURATION, SAMPLES)
@@ -280,7 +280,7 @@ def straight_line(mission: Mission) -> int:
     """Operations of an evaluation as straight-line code does them, and its share of a step."""
     r = np.array(mission.agents.position)
     now = Situation(0.0, r, np.zeros_like(r))
-    code = Code(Trace(plan_phase(mission, mission.phases[0], now, DURATION).program))
+    code = Code(Trace(plan_phase(mission, mission.phases[0], now).program))
     return len(code.lines) + share_of_a_step(mission)
 
 

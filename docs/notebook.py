@@ -38,7 +38,7 @@ def cells(source: str) -> Iterator[Cell]:
 
 
 def page(path: Path, pictures: dict[str, bytes]) -> str:
-    """A notebook, run, as Markdown; its pictures, SVG by file name, are added to `pictures`."""
+    """A notebook, run, as Markdown; its pictures and replays, by file name, are added to `pictures`."""
     parts: list[str] = []
     names: dict[str, Any] = {"__name__": "__main__"}
     with TemporaryDirectory() as folder, chdir(folder), warnings.catch_warnings():
@@ -49,17 +49,24 @@ def page(path: Path, pictures: dict[str, bytes]) -> str:
                 continue
             parts.append(f"```python\n{cell.text}\n```")
             printed, value = run(cell.text, names, str(path))
-            if hasattr(value, "savefig"):
-                name = f"{path.stem}-{len(pictures) + 1}.svg"
-                pictures[name] = svg(value)
-                value = None
-                shown = f"![What the cell draws]({name})"
-            else:
-                shown = ""
-            text = printed + ("" if value is None else repr(value))
+            shown: list[str] = []
+            for figure in value if isinstance(value, list) else [value]:
+                if hasattr(figure, "savefig"):
+                    name = f"{path.stem}-{len(pictures) + 1}.svg"
+                    pictures[name] = svg(figure)
+                    shown.append(f"![What the cell draws]({name})")
+            if hasattr(value, "html"):
+                name = f"{path.stem}-{len(pictures) + 1}.html"
+                pictures[name] = value.html.encode()
+                shown.append(
+                    f'<iframe class="replay" src="{name}" title="Replay" sandbox="allow-scripts"></iframe>'
+                )
+            elif hasattr(value, "_repr_html_"):
+                shown.append(value._repr_html_())
+            text = printed if shown or value is None else printed + repr(value)
             if text.strip():
                 parts.append(f"```text\n{text.rstrip()}\n```")
-            parts.append(shown)
+            parts += shown
     return "\n\n".join(part for part in parts if part) + "\n"
 
 

@@ -1,4 +1,4 @@
-"""Write the tables of performance.md, many.md and README.md from what the benchmarks have measured.
+"""Write the tables of performance.md and many.md from what the benchmarks have measured.
 
     python benchmarks/run.py --json bench.json
     python benchmarks/compare.py --json peers.json --figure docs/images/work-precision.png
@@ -19,7 +19,6 @@ from typing import Any
 PAGES = [
     Path(__file__).with_name("performance.md"),
     Path(__file__).with_name("many.md"),
-    Path(__file__).parents[1] / "README.md",
 ]
 Data = dict[str, Any]
 

@@ -1,4 +1,4 @@
-"""Draw the pictures of README and documents into docs/images: `python docs/picture.py`, or `make docs`.
+"""Draw the pictures of the documents into docs/images: `python docs/picture.py`, or `make docs`.
 
 A picture that looks as before is kept to the byte: the last digits of a simulation are those of the machine.
 """
@@ -27,7 +27,7 @@ _POINTS, _LEVELS = 0.02, 24
 
 
 def flight() -> None:
-    """The README's picture, with few colours, as everybody loads it."""
+    """The picture of the first page, with few colours, as everybody loads it."""
     result = rf.simulate(rf.load_mission(MISSION))
     with TemporaryDirectory() as folder:
         (path,) = rf.plot(result, folder, formats=["png"], names=["summary"])

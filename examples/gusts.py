@@ -13,7 +13,6 @@ import rigidfleet as rf
 from rigidfleet import physics
 from rigidfleet.formation.distance_geometry import distances
 from rigidfleet.formation.graphs import complete_graph
-from rigidfleet.mission import Mission
 
 COUNTED = 12.0  # [s] what is measured comes after this
 DRAG = 0.25  # [N s/m] of each vehicle
@@ -36,7 +35,7 @@ def gusts(t, r, v):
 def mission(**formation):
     """Three vehicles in a triangle of 4 m that fly 30 m in 20 s."""
     start = np.array([[1.0, 6.0, 3.0], [8.0, 3.0, 3.0], [7.0, 6.0, 3.0]])
-    return Mission.from_dict(
+    return rf.Mission.from_dict(
         {
             "schema_version": 1,
             "name": "gusts",

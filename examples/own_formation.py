@@ -6,7 +6,6 @@ The dictionary has the keys of a mission file. It is checked as a file is, with 
 import numpy as np
 
 import rigidfleet as rf
-from rigidfleet.mission import Mission
 
 
 def skein(arm, angle_deg=35.0):
@@ -21,7 +20,7 @@ def skein(arm, angle_deg=35.0):
 def mission():
     """Five vehicles, the leader twice as heavy, that start anyhow on the ground."""
     start = np.array([[0, 0, 0.3], [-2, 3, 0.3], [-3, -2, 0.3], [-6, 4, 0.3], [-5, -5, 0.3]])
-    return Mission.from_dict(
+    return rf.Mission.from_dict(
         {
             "schema_version": 1,
             "name": "skein",

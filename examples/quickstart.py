@@ -1,12 +1,11 @@
-"""Load a mission, fly it, look at it, draw it: in five lines."""
+"""Fly a mission, look at it, draw it: in four lines."""
 
 import rigidfleet as rf
 
 
 def main(folder="figures"):
     """Fly the paper's narrow passage and draw it into a folder; return the result."""
-    mission = rf.load_mission("narrow-passage")
-    result = rf.simulate(mission)
+    result = rf.simulate("narrow-passage")
     print(result, rf.assess(result).summary, sep="\n")
     rf.plot(result, folder)
     return result

@@ -294,6 +294,46 @@ def test_commands_are_documented(capsys):
     assert documented - {"--help"} == options - {"--help", "--version"}
 
 
+def test_readme_lists_every_command():
+    """The README's table of commands has each command, once."""
+    from rigidfleet.cli.app import app
+
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    listed = re.findall(r"^\| `rigidfleet ([\w-]+)", text, re.MULTILINE)
+    assert sorted(listed) == sorted(name for name in app if not name.startswith("-"))
+
+
+def test_commands_for_whom(tmp_path, monkeypatch, capsys):
+    """The commands that the README begins with are right, and the quick ones of them run."""
+    import shlex
+
+    from rigidfleet.cli.app import main
+    from rigidfleet.mission import mission_names
+
+    monkeypatch.chdir(tmp_path)
+    text = (ROOT / "README.md").read_text("utf-8").split("\n## For whom")[1].split("\n## ")[0]
+    sweep, show, own = (shlex.split(c) for c in re.findall(r"`([^`]+)` \|$", text, re.MULTILINE))
+    assert sweep[:2] == ["rigidfleet", "sweep"]
+    fewer = [*sweep[1:-1], "2", "--workers", "1", "--no-figures"]
+    assert main(fewer) == 0
+    assert show[:2] == ["rigidfleet", "run"]
+    assert show[2] in mission_names()
+    assert (ROOT / own[1]).exists()
+
+
+def test_moving_picture():
+    """The README's picture moves, is loaded in no time, and is of the first mission that is flown."""
+    from PIL import Image
+
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    (name,) = re.findall(r"\((docs/images/[\w-]+\.gif)\)", text)
+    path = ROOT / name
+    assert path.stem in mission_names()
+    assert path.stat().st_size < 1_000_000
+    with Image.open(path) as picture:
+        assert getattr(picture, "n_frames", 1) > 100
+
+
 def test_five_lines_of_the_readme(tmp_path, monkeypatch):
     """The README's Python is five lines, and draws what it flew."""
     monkeypatch.chdir(tmp_path)

@@ -35,7 +35,7 @@ def test_each_is_run():
 @pytest.mark.long
 @pytest.mark.parametrize("example", ["quickstart"], indirect=True)
 def test_quickstart(example, tmp_path, capsys):
-    """Five lines fly the narrow passage, pass the verdict and draw it."""
+    """Four lines fly the narrow passage, pass the verdict and draw it."""
     result = example.main(tmp_path)
     assert result.complete
     assert "Passed" in capsys.readouterr().out

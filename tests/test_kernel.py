@@ -82,9 +82,7 @@ def a_program(mission: Mission, index: int = 0, now: Situation | None = None) ->
     if now is None:
         agents = mission.agents
         now = Situation(0.0, np.array(agents.position), np.array(agents.velocity))
-    return plan_phase(
-        mission, phase, now, now.t + (phase.duration or 0) or phase.until or 0
-    ).program
+    return plan_phase(mission, phase, now).program
 
 
 def random_vectors(seed: int, n: int, scale: float = 1.0) -> np.ndarray:
@@ -602,7 +600,7 @@ def a_flight_with_a_turn() -> tuple[Program, Workspace]:
         ],
     )
     now = Situation(0.0, np.array(mission.agents.position), np.zeros((3, 3)))
-    fly = plan_phase(mission, mission.phases[1], now, 5.0).program
+    fly = plan_phase(mission, mission.phases[1], now).program
     shape = random_vectors(3, 3, 2.0)
     ref = Reference(
         SLOTS, 0.0, 4.0, np.zeros(3), np.zeros(3), shape, random_vectors(4, 3), np.array([0.3, 0.9, -0.4])

@@ -278,7 +278,7 @@ def test_distances_lead_by_squares_where_an_affine_map_leads_to_the_slots(slots,
     )
     phase = mission.phases[0]
     assert leader(mission, start @ turn) == by
-    plan = plan_phase(mission, phase, Situation(0.0, start @ turn, 0 * start), 6.0)
+    plan = plan_phase(mission, phase, Situation(0.0, start @ turn, 0 * start))
     assert plan.program.reference.kind == {"squares": SQUARED, "shape": SLOTS}[by]
     result = simulate(mission)
     wanted = distance_geometry.distances(slots, result.edges)

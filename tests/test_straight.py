@@ -54,7 +54,7 @@ def make(agents: int, data: dict[str, Any]) -> tuple[Program, np.ndarray]:
         whole["agents"] |= {"thrust_limit": data["thrust_limit"], "saturate": True}
     mission = Mission.from_dict(whole)
     now = Situation(0.0, r, np.zeros_like(r))
-    plan = plan_phase(mission, mission.phases[0], now, 9.0)
+    plan = plan_phase(mission, mission.phases[0], now)
     return plan.program, r
 
 

@@ -10,9 +10,7 @@ import numpy as np
 import rigidfleet as rf
 from rigidfleet import plotting
 from rigidfleet.formation.graphs import complete_graph
-from rigidfleet.mission import Mission
 from rigidfleet.rigidity import analyse
-from rigidfleet.rigidity.design import design
 
 # %% [markdown]
 # ## The shape
@@ -43,7 +41,7 @@ print(f"{len(tempting)} edges, rank {found.rank} of {found.needed}: {found.verdi
 # distances in flight hardly do. `design` chooses edges that hold as firmly as they can:
 
 # %%
-edges = design(slots)
+edges = rf.design(slots)
 chosen = analyse(slots, edges)
 print(f"{len(edges)} edges, rank {chosen.rank} of {chosen.needed}: {chosen.verdict}")
 print(f"index {chosen.index:.3f}, that of the others {found.index:.3f}")
@@ -57,7 +55,7 @@ print(f"index {chosen.index:.3f}, that of the others {found.index:.3f}")
 # %%
 start = slots * [1, 1, 0] + [0, 0, 0.3]
 start[6] += [-2.0, 0, 0]  # it stands behind the one that will be above it
-mission = Mission.from_dict(
+mission = rf.Mission.from_dict(
     {
         "schema_version": 1,
         "name": "arrow",
@@ -75,15 +73,30 @@ mission = Mission.from_dict(
         ],
     }
 )
+mission
+
+# %% [markdown]
+# Before it flies, a check tells what it will meet:
+
+# %%
+rf.check(mission)
 
 # %%
 result = rf.simulate(mission)
-verdict = rf.assess(result)
-print(verdict.summary)
 plotting.trajectory(result)
 
 # %%
+verdict = rf.assess(result)
+verdict
+
+# %%
 plotting.clearance(result)
+
+# %% [markdown]
+# The flight itself, to be turned with the mouse:
+
+# %%
+rf.replay(result)
 
 # %% [markdown]
 # ## To send it on

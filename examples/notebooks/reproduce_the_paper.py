@@ -16,7 +16,7 @@ from rigidfleet.math import pid
 # forces alone.
 
 # %%
-triangle = rf.simulate(rf.load_mission("establish-triangle"))
+triangle = rf.simulate("establish-triangle")
 print(rf.assess(triangle).summary)
 plotting.distances(triangle)
 
@@ -25,7 +25,7 @@ plotting.distances(triangle)
 # printed it cannot arrive:
 
 # %%
-printed = rf.simulate(rf.load_mission("line-singular"))
+printed = rf.simulate("line-singular")
 print(printed.ending)
 
 # %% [markdown]
@@ -45,7 +45,7 @@ print(f"foretold {6.0 + 1.618 / p:.2f} s, flown {printed.phases[-1].t_end:.2f} s
 # attitude.
 
 # %%
-waypoint = rf.simulate(rf.load_mission("single-waypoint"))
+waypoint = rf.simulate("single-waypoint")
 print(rf.assess(waypoint).summary)
 plotting.cm(waypoint)
 
@@ -59,9 +59,12 @@ plotting.attitude(waypoint)
 # and unfolds.
 
 # %%
-passage = rf.simulate(rf.load_mission("narrow-passage"))
+passage = rf.simulate("narrow-passage")
 print(rf.assess(passage).summary)
 plotting.trajectory(passage)
+
+# %%
+rf.replay(passage)
 
 # %% [markdown]
 # ## Table 4: a cube that is none
@@ -71,7 +74,7 @@ plotting.trajectory(passage)
 
 # %%
 for name in ("establish-cube-as-printed", "establish-cube"):
-    cube = rf.simulate(rf.load_mission(name))
+    cube = rf.simulate(name)
     error = abs(cube.constraint[-1]).max()
     print(f"{name}: greatest error of a distance {error:.1e} m\n{rf.assess(cube).summary}\n")
 plotting.formations(cube)

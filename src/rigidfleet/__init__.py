@@ -1,7 +1,12 @@
 """Fly many air vehicles as one rigid body.
 
-The names below are loaded on first use, so that ``import rigidfleet`` and ``rigidfleet --help``
-wait neither for the compiler nor for the plotting library.
+>>> import rigidfleet as rf
+>>> result = rf.simulate("narrow-passage")
+>>> print(rf.assess(result).summary)
+
+What follows is all that most scripts need; the rest is in modules, imported by their names. Everything is
+loaded on first use, so that ``import rigidfleet`` and ``rigidfleet --help`` wait neither for the compiler
+nor for the plotting library.
 """
 
 from importlib import import_module
@@ -10,33 +15,79 @@ from typing import TYPE_CHECKING, Any
 from rigidfleet._version import __version__ as __version__
 
 if TYPE_CHECKING:
-    from rigidfleet.assessment import assess
-    from rigidfleet.mission import load_mission
+    from rigidfleet.assessment import Verdict, assess
+    from rigidfleet.errors import (
+        FlightError,
+        MissionError,
+        ResultError,
+        RigidfleetError,
+        SweepError,
+    )
+    from rigidfleet.mission import Mission, load_mission, mission_names
     from rigidfleet.plotting import plot
+    from rigidfleet.preflight.check import Preflight, check
     from rigidfleet.reporting import report
     from rigidfleet.result import Result
-    from rigidfleet.simulation.flight import simulate
+    from rigidfleet.rigidity.design import design
+    from rigidfleet.simulation.ensemble import Ensemble, establish
+    from rigidfleet.simulation.flight import FlightInterrupted, Observation, Progress, simulate
+    from rigidfleet.sweep import Sweep
     from rigidfleet.web.live import live
     from rigidfleet.web.replay import replay
 
 
 __all__ = [
+    "Ensemble",
+    "FlightError",
+    "FlightInterrupted",
+    "Mission",
+    "MissionError",
+    "Observation",
+    "Preflight",
+    "Progress",
     "Result",
+    "ResultError",
+    "RigidfleetError",
+    "Sweep",
+    "SweepError",
+    "Verdict",
     "__version__",
     "assess",
+    "check",
+    "design",
+    "establish",
     "live",
     "load_mission",
+    "mission_names",
     "plot",
     "replay",
     "report",
     "simulate",
 ]
 
+#: The module of each public name.
 _HOME = {
+    "Ensemble": "simulation.ensemble",
+    "FlightError": "errors",
+    "FlightInterrupted": "simulation.flight",
+    "Mission": "mission",
+    "MissionError": "errors",
+    "Observation": "simulation.flight",
+    "Preflight": "preflight.check",
+    "Progress": "simulation.flight",
     "Result": "result",
+    "ResultError": "errors",
+    "RigidfleetError": "errors",
+    "Sweep": "sweep",
+    "SweepError": "errors",
+    "Verdict": "assessment",
     "assess": "assessment",
+    "check": "preflight.check",
+    "design": "rigidity.design",
+    "establish": "simulation.ensemble",
     "live": "web.live",
     "load_mission": "mission",
+    "mission_names": "mission",
     "plot": "plotting",
     "replay": "web.replay",
     "report": "reporting",

@@ -4,6 +4,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
+#: Letters of a value that a message shows.
+_WIDTH = 60
+
 
 class RigidfleetError(Exception):
     """Base of every error that rigidfleet raises for its user to read."""
@@ -78,6 +81,13 @@ class FlightError(RigidfleetError):
     result: Any = None
 
 
-def _short(value: object, width: int = 60) -> str:
+def wrong_type(asked: str, given: object) -> TypeError:
+    """A TypeError in one sentence: what is asked for, and what was given."""
+    text = " ".join(repr(given).split())
+    shown = text if len(text) <= _WIDTH else text[: _WIDTH - 3] + "..."
+    return TypeError(f"{asked} is asked for, but {shown} ({type(given).__name__}) was given")
+
+
+def _short(value: object, width: int = _WIDTH) -> str:
     text = str(value).lower() if isinstance(value, bool) else repr(value)
     return text if len(text) <= width else text[: width - 3] + "..."

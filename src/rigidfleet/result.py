@@ -20,6 +20,7 @@ from dataclasses import asdict, dataclass, field, fields
 from datetime import UTC, datetime
 from functools import cache, cached_property
 from importlib.metadata import PackageNotFoundError, version
+from inspect import Parameter, Signature
 from pathlib import Path
 from typing import (
     TYPE_CHECKING,
@@ -34,7 +35,8 @@ from typing import (
 
 import numpy as np
 
-from rigidfleet.errors import MissionError, ResultError
+from rigidfleet import _markup
+from rigidfleet.errors import MissionError, ResultError, wrong_type
 from rigidfleet.math import attitude
 from rigidfleet.typing import Bools, Floats, Ints
 
@@ -171,8 +173,19 @@ def _now() -> str:
 
 @dataclass(kw_only=True, eq=False, repr=False)
 class Result:
-    """Record of one flight: K samples in time, N agents, m edges (the union over all formations).
+    """Record of one flight: where every vehicle was, under which forces, and the mission itself.
 
+    `simulate` makes one; `save` writes it to a netCDF-4 file, and `Result.load` reads it back:
+
+    >>> import rigidfleet as rf
+    >>> result = rf.simulate("narrow-passage")
+    >>> result.position.shape  # samples, agents, x y z [m]
+    (1812, 3, 3)
+    >>> result.save("passage.nc")
+    >>> rf.assess(rf.Result.load("passage.nc")).passed
+    True
+
+    Arrays have K samples in time, N agents (from 0) and m edges, the union over all formations.
     At each switch of phases there are two samples, the end of one phase and, one representable number later, the
     start of the next: references and inputs jump there. Each array's dimensions, unit and meaning stand at its
     declaration and in `VARIABLES`; `phases` and the rest say what the flight was.
@@ -335,6 +348,30 @@ class Result:
             f"<Result: {self.n_agents} agents, {len(self.edges)} edges, {len(self.phases)} phases, "
             f"{len(self.time)} samples from {self.time[0]:g} to {self.time[-1]:g} s, {end}>"
         )
+
+    def _repr_html_(self) -> str:
+        """The flight as a notebook shows it: what it is of, and its worst values."""
+        try:
+            name, title = self.mission.name, self.mission.title
+        except ResultError:
+            name, title = "Result", "of a mission that cannot be read"
+        rows = [
+            ("agents", f"{self.n_agents}"),
+            ("edges", f"{len(self.edges)}"),
+            ("phases", ", ".join(phase.name for phase in self.phases)),
+            ("time", f"{self.time[0]:g} to {self.time[-1]:g} s, {len(self.time)} samples"),
+            ("ending", "complete" if self.complete else f"incomplete: {self.ending or 'stopped'}"),
+        ]
+        worst = (
+            ("separation", "least separation", "m"),
+            ("clearance", "least clearance", "m"),
+            ("speed", "greatest speed", "m/s"),
+            ("thrust", "greatest thrust", "N"),
+        )
+        for quantity, words, unit in worst:
+            if (x := self.extreme(quantity)) is not None and math.isfinite(x.value):
+                rows.append((words, f"{x.value:.3g} {unit} at {x.time:.2f} s"))
+        return _markup.shown(name, title, (), rows)
 
     @property
     def n_agents(self) -> int:
@@ -519,6 +556,13 @@ class Result:
         }
 
 
+#: `help` shows it first: forty arrays with their units stand at their declarations, not there.
+_FIELDS = [
+    Parameter("self", Parameter.POSITIONAL_ONLY),
+    Parameter("fields", Parameter.VAR_KEYWORD),
+]
+vars(Result.__init__)["__signature__"] = Signature(_FIELDS)
+
 _HINTS = get_type_hints(Result, include_extras=True)
 #: Dimensions, unit and meaning of each array of a result.
 VARIABLES: dict[str, Variable] = {
@@ -546,6 +590,23 @@ _ATTRIBUTES: dict[str, Any] = {
 _MARK = "rigidfleet_schema_version"
 #: Bytes of a chunk at most: as much as HDF5's cache holds.
 _CHUNK = 1 << 20
+
+
+def as_result(given: Result | str | Path) -> Result:
+    """A flight as a function takes it: a `Result`, or the file of one.
+
+    Raises
+    ------
+    TypeError
+        It is neither.
+    ResultError
+        As `Result.load` does.
+    """
+    if isinstance(given, Result):
+        return given
+    if isinstance(given, str | Path):
+        return Result.load(given)
+    raise wrong_type("a flight (a Result, or the path of one that was saved)", given)
 
 
 def plain(value: Any) -> Any:

@@ -630,3 +630,23 @@ def test_hundreds(show):
     page.run("replay.scene.renderer.effort = 0.5; replay.play(true)")
     pictures = page.run("return replay.pictures")
     page.wait(f"return replay.pictures > {pictures} + 10", 60)
+
+
+def test_in_a_cell_of_a_notebook(browser, eight, tmp_path):
+    """In a sandboxed frame that is hidden at first, the flight is seen as soon as the frame is."""
+    frame = replay(eight)._repr_html_().replace('height="600"', 'height="100%"')
+    page = tmp_path / "cell.html"
+    page.write_text(f'<!doctype html><div id="cell" style="display: none">{frame}</div>', "utf-8")
+    browser.driver.get(page.as_uri())
+    time.sleep(1.0)
+    cell = "document.querySelector('#cell').style.cssText = 'display: block; height: 600px'"
+    browser.run(cell)
+    browser.driver.switch_to.frame(0)
+    try:
+        browser.wait("return Boolean(window.replay)")
+        seen = "return window.replay.scene.camera.shown.distance"
+        browser.wait(f"{seen.replace('return', 'return 0 <')} && {seen[7:]} < 1e4")
+        assert browser.run("return window.origin") == "null"
+        assert not [words for words in browser.heard() if "SEVERE" in words]
+    finally:
+        browser.driver.switch_to.default_content()

@@ -8,6 +8,8 @@ A verdict prints with rich (`console.print(verdict)`) or as JSON (`verdict.json(
 count from 1.
 """
 
+from pathlib import Path
+
 from rigidfleet.assessment.checks import findings, notes
 from rigidfleet.assessment.measure import Flight
 from rigidfleet.assessment.outcome import (
@@ -21,7 +23,7 @@ from rigidfleet.assessment.outcome import (
 )
 from rigidfleet.assessment.safety import Safety, safety
 from rigidfleet.assessment.verdict import Verdict
-from rigidfleet.result import Result
+from rigidfleet.result import Result, as_result
 
 __all__ = [
     "FLIPPED",
@@ -38,8 +40,8 @@ __all__ = [
 ]
 
 
-def assess(result: Result) -> Verdict:
-    """Judge a flight against its mission.
+def assess(result: Result | str | Path) -> Verdict:
+    """Judge a flight against its mission: a `Result`, or the path of one that was saved.
 
     It fails if it is incomplete; if a phase did not settle; if a formation is not reached at the end of
     a phase that shapes (establish, reshape), or not held at the end of the flight, by `SHAPE_TOLERANCE`,
@@ -57,8 +59,9 @@ def assess(result: Result) -> Verdict:
     Raises
     ------
     ResultError
-        The mission inside the result cannot be read.
+        The result, or the mission inside it, cannot be read.
     """
+    result = as_result(result)
     flight = Flight(result)
     phases = [flight.phase(i, record) for i, record in enumerate(result.phases)]
     verdict = Verdict(flight.mission.name, flight.mission.title, [], phases, [])

@@ -43,7 +43,7 @@ def rendered(
         )
     if waypoints:
         shown.append(_table(_WAYPOINT, waypoints))
-    shown.append(_table(_CHECK, [_check(f) for f in checks], left=("who or where", "")))
+    shown.append(_table(_CHECK, [check_row(f) for f in checks], left=("who or where", "")))
     return Group(*shown, *last)
 
 
@@ -61,7 +61,8 @@ def _table(
     return table
 
 
-def _check(f: Finding) -> list[str | Text]:
+def check_row(f: Finding) -> list[str | Text]:
+    """A check as a row: name, worst, limit, when, who or where, and whether it holds."""
     mark = Text("ok", "green") if f.passed else Text("FAILED", "bold red")
     when = "" if f.when is None else f"{f.when:.2f}"
     name, who = f.check.replace("_", " "), f.who or f.phase

@@ -36,7 +36,14 @@ _PRAISE = {
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What `assess` finds: every check, the numbers of each phase, and notes, which fail nothing."""
+    """What `assess` finds: every check, the numbers of each phase, and notes, which fail nothing.
+
+    >>> import rigidfleet as rf
+    >>> verdict = rf.assess(rf.simulate("square"))
+    >>> verdict.passed
+    True
+    >>> print(verdict.summary)
+    """
 
     mission: str
     title: str
@@ -98,6 +105,22 @@ class Verdict:
     def json(self) -> str:
         """The verdict as JSON text."""
         return json.dumps(self.to_dict(), ensure_ascii=False, allow_nan=False, indent=2)
+
+    def __repr__(self) -> str:
+        judged = [finding for finding in self.findings if finding.judged]
+        failed = sum(not finding.passed for finding in judged)
+        ending = f"failed {failed} of {len(judged)}" if failed else f"passed all {len(judged)}"
+        return f"<Verdict {self.mission}: {ending} checks>"
+
+    def _repr_html_(self) -> str:
+        """The verdict as a notebook shows it: what was judged, then words."""
+        from rigidfleet import _markup
+        from rigidfleet.assessment.table import check_row
+
+        rows = [map(str, check_row(finding)) for finding in self.findings if finding.judged]
+        words = "\n".join([self.summary, *(f"Note: {note}." for note in self.notes)])
+        heads = ("check", "worst", "limit", "at [s]", "who or where", "")
+        return _markup.shown(self.mission, self.title, heads, rows, words)
 
     def __rich__(self) -> RenderableType:
         from rich.text import Text

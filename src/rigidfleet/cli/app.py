@@ -256,7 +256,7 @@ def check(
     json : bool
         Print what was found as JSON.
     """
-    from rigidfleet.mission import ending, goal, load_mission
+    from rigidfleet.mission import counted, ending, goal, load_mission
 
     watch = screen.CheckWatch(mission)
     try:
@@ -286,7 +286,7 @@ def check(
     table = screen.table("#", "phase", "kind", "to", "ends", "control")
     for n, phase in enumerate(found.phases, start=1):
         table.add_row(str(n), phase.name, phase.kind, goal(phase), ending(phase), phase.control)
-    screen.out().print(f"{found.name}: right: {_counted(found)}")
+    screen.out().print(f"{found.name}: right: {counted(found)}")
     screen.print_table(table)
     screen.out().print()
     screen.print_words(ahead.words())
@@ -504,7 +504,7 @@ def new(
     json : bool
         Print what was written as JSON. Ask nothing.
     """
-    from rigidfleet.mission import Mission
+    from rigidfleet.mission import Mission, counted
     from rigidfleet.mission import draft as drafts
     from rigidfleet.preflight.check import check as preflight
     from rigidfleet.result import write_file
@@ -534,7 +534,7 @@ def new(
     if json:
         screen.print_json({"file": str(file)} | _facts(mission))
     elif not quiet:
-        screen.out().print(f"{file}: {_counted(mission)}", soft_wrap=True)
+        screen.out().print(f"{file}: {counted(mission)}", soft_wrap=True)
         screen.out().print(f"Fly it by: rigidfleet run {file}", soft_wrap=True)
     return PASSED
 
@@ -1076,18 +1076,6 @@ def _facts(mission: Mission) -> dict[str, object]:
         ],
         "latest_end_s": mission.latest_end,
     }
-
-
-def _counted(mission: Mission) -> str:
-    """How much of everything a mission has."""
-    most = "at most " if any(phase.settle for phase in mission.phases) else ""
-    counts = (
-        screen.count(mission.n_agents, "agent"),
-        screen.count(len(mission.formations), "formation"),
-        screen.count(len(mission.phases), "phase"),
-        f"{most}{mission.latest_end:g} s",
-    )
-    return ", ".join(counts)
 
 
 def _own_fault(error: Exception) -> str:

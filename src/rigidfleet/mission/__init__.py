@@ -6,9 +6,10 @@ paper: agents, edges, phases, and so the places in a key such as `phases[3].unti
 `Mission` hands to code count agents from 0.
 """
 
-from rigidfleet.mission.describe import ending, goal
+from rigidfleet.mission.describe import counted, ending, goal
 from rigidfleet.mission.model import (
     Mission,
+    as_mission,
     json_schema,
     load_mission,
     mission_names,
@@ -53,6 +54,8 @@ __all__ = [
     "Reshape",
     "Settle",
     "Turn",
+    "as_mission",
+    "counted",
     "ending",
     "goal",
     "json_schema",

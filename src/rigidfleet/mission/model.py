@@ -13,13 +13,14 @@ import numpy as np
 from pydantic import PrivateAttr
 
 from rigidfleet._toml import to_toml
-from rigidfleet.errors import Finding, MissionError
+from rigidfleet.errors import Finding, MissionError, wrong_type
 from rigidfleet.formation.assignment import assigned
 from rigidfleet.formation.distance_geometry import distances
 from rigidfleet.math import constraint_jacobian
 from rigidfleet.math.attitude import dcm_from_euler
 from rigidfleet.mission import bounds
 from rigidfleet.mission.check import check
+from rigidfleet.mission.describe import counted
 from rigidfleet.mission.findings import near
 from rigidfleet.mission.phases import latest_end
 from rigidfleet.mission.schema import (
@@ -41,7 +42,12 @@ _DENSE = 1000
 
 
 class Mission(Contents):
-    """A checked mission: make one by `load_mission`, `Mission.from_toml` or `Mission.from_dict`."""
+    """A checked mission: make one by `load_mission`, `Mission.from_toml` or `Mission.from_dict`.
+
+    >>> import rigidfleet as rf
+    >>> rf.load_mission("narrow-passage")  # one that ships; a path reads a file
+    <Mission narrow-passage: 3 agents, 2 formations, 12 phases, 90 s>
+    """
 
     _text: str = PrivateAttr("")
     _origin: str = PrivateAttr("")
@@ -78,6 +84,23 @@ class Mission(Contents):
         except RecursionError:
             raise _unread(origin, "is nested without end", "use the keys of a mission") from None
         return cls.from_toml(text, origin)
+
+    def __repr__(self) -> str:
+        return f"<Mission {self.name}: {counted(self)}>"
+
+    __str__ = __repr__
+
+    def _repr_html_(self) -> str:
+        """The mission as a notebook shows it: its phases, in order."""
+        from rigidfleet import _markup
+        from rigidfleet.mission.describe import ending, goal
+
+        rows = [
+            (n, phase.name, phase.kind, goal(phase), ending(phase), phase.control)
+            for n, phase in enumerate(self.phases, start=1)
+        ]
+        heads = ("#", "phase", "kind", "to", "ends", "control")
+        return _markup.shown(self.name, self.title, heads, rows, counted(self))
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data as it was written: change it, and check it again by `Mission.from_dict`."""
@@ -320,6 +343,23 @@ def load_mission(name_or_path: str | Path) -> Mission:
     if isinstance(name_or_path, str) and name_or_path in mission_names():
         return Mission.from_toml(mission_text(name_or_path), name_or_path)
     return Mission.from_toml(read_text(name_or_path), str(name_or_path))
+
+
+def as_mission(given: Mission | str | Path) -> Mission:
+    """A mission as a function takes it: a `Mission`, the name of a shipped one, or a file.
+
+    Raises
+    ------
+    TypeError
+        It is none of these.
+    MissionError
+        As `load_mission` does.
+    """
+    if isinstance(given, Mission):
+        return given
+    if isinstance(given, str | Path):
+        return load_mission(given)
+    raise wrong_type("a mission (a shipped name, a path or a Mission)", given)
 
 
 def json_schema() -> dict[str, Any]:

@@ -114,7 +114,7 @@ class PhasePlan:
         goal, phase, lies = self.goal, self.phase, self.lies
         if goal is None or not (isinstance(phase, Fly | Turn) or lies):
             return None
-        turns = lies or phase.attitude_deg is not None
+        turns = lies or (isinstance(phase, Fly | Turn) and phase.attitude_deg is not None)
         reference = self.program.reference
         shaped = reference.t0 + reference.T_b
         return {

@@ -1,7 +1,7 @@
 """Pictures of a flight, drawn with matplotlib from its `Result` alone.
 
-`plot` writes them to files; each function of the same name as a figure returns it as a matplotlib
-`Figure`, to be shown in a notebook or changed. An agent has the same colour in all of them
+`plot` writes them to files, or returns them; each function of the same name as a figure returns it as a
+matplotlib `Figure`, to be changed or, as it is, shown by a notebook. An agent has the same colour in all of them
 (`agent_colours`), told apart by colour-blind eyes too. Nothing here touches pyplot or the user's
 settings of matplotlib.
 """
@@ -13,7 +13,7 @@ import os
 import secrets
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
@@ -32,7 +32,7 @@ from rigidfleet.plotting.page import summary
 from rigidfleet.plotting.space import formations, trajectory
 from rigidfleet.plotting.style import agent_colours, settings
 from rigidfleet.plotting.style import titles as shown_titles
-from rigidfleet.result import Result
+from rigidfleet.result import Result, as_result
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -40,6 +40,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "FORMATS",
+    "Figures",
     "agent_colours",
     "attitude",
     "clearance",
@@ -87,19 +88,51 @@ def figure_names(result: Result | None = None) -> list[str]:
     return [name for name in _FIGURES if not empty.get(name)]
 
 
+class Figures(list["Figure"]):
+    """Figures of a flight, which a notebook shows one below the other."""
+
+    def _ipython_display_(self) -> None:
+        from IPython.display import display  # there is one, as it calls
+
+        for figure in self:
+            display(figure)
+
+
+@overload
 def plot(
-    result: Result,
+    result: Result | str | Path,
+    folder: None = None,
+    *,
+    names: Iterable[str] | None = None,
+    titles: bool = True,
+) -> Figures: ...
+
+
+@overload
+def plot(
+    result: Result | str | Path,
     folder: str | Path,
     *,
     formats: Iterable[str] = ("png", "svg"),
     names: Iterable[str] | None = None,
     titles: bool = True,
-) -> list[Path]:
-    """Draw a flight and write each figure to ``folder/NAME.FORMAT``, whole or not at all.
+) -> list[Path]: ...
+
+
+def plot(
+    result: Result | str | Path,
+    folder: str | Path | None = None,
+    *,
+    formats: Iterable[str] = ("png", "svg"),
+    names: Iterable[str] | None = None,
+    titles: bool = True,
+) -> Figures | list[Path]:
+    """Draw a flight: for a notebook, or each figure to ``folder/NAME.FORMAT``, whole or not at all.
 
     Parameters
     ----------
-    folder : made if it does not exist; files of these names in it are replaced
+    result : a flight, or the path of one that was saved
+    folder : made if it does not exist; files of these names in it are replaced. Without one, nothing is written
     formats : of png, svg (text stays text) and pdf
     names : of `figure_names`; by default all that there is something to draw in
     titles : with a title and the mission's name above each, or cut close to what is drawn, for a
@@ -107,7 +140,7 @@ def plot(
 
     Returns
     -------
-    The files written.
+    The files written; without a folder the figures, which a notebook shows.
 
     Raises
     ------
@@ -116,14 +149,18 @@ def plot(
     ResultError
         A file cannot be written, or the mission inside the result cannot be read.
     """
+    result = as_result(result)
     formats = _known("format", formats, FORMATS)
     names = _known("figure", figure_names(result) if names is None else names, _FIGURES)
-    paths = []
+    drawn, paths = Figures(), []
     for name in names:
         with shown_titles(shown=titles):
             figure = _FIGURES[name](result)
-        paths += write_figure(figure, Path(folder), name, formats, close=not titles)
-    return paths
+        if folder is None:
+            drawn.append(figure)
+        else:
+            paths += write_figure(figure, Path(folder), name, formats, close=not titles)
+    return drawn if folder is None else paths
 
 
 def write_figure(

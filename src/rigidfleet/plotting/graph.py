@@ -29,7 +29,7 @@ _DRAWN = 3
 
 def graphs(mission: Mission, judged: Mapping[str, Rigidity | None]) -> Figure:
     """Graph of each formation with its verdict; the first free motions as arrows, each of one tone."""
-    from matplotlib.figure import Figure
+    from rigidfleet.plotting.figure import Figure
 
     names = list(mission.formations)
     columns = min(max(len(names), 1), 3)

@@ -49,7 +49,7 @@ def _draw_attitude(ax: Axes, result: Result) -> None:
 @styled
 def summary(result: Result) -> Figure:
     """Trajectory, top view, distances, attitude, thrust and clearance on one page."""
-    from matplotlib.figure import Figure
+    from rigidfleet.plotting.figure import Figure
 
     fig = Figure(figsize=(11.4, 7.0))
     st.head(fig, result, st.clean(result.mission.title, 80) or "Flight")

@@ -382,7 +382,7 @@ def handles(result: Result, view: Scene) -> list[Any]:
 @styled
 def trajectory(result: Result) -> Figure:
     """Trajectory in three dimensions and from above, with the formation drawn at chosen times."""
-    from matplotlib.figure import Figure
+    from rigidfleet.plotting.figure import Figure
 
     fig = Figure(figsize=(10.5, 6.2))
     st.head(fig, result, "Trajectory")
@@ -431,7 +431,7 @@ def sketch_places(mission: Mission, name: str) -> tuple[Floats, bool]:
 @styled
 def formations(result: Result) -> Figure:
     """Constraint graph and body axes of each formation of the mission."""
-    from matplotlib.figure import Figure
+    from rigidfleet.plotting.figure import Figure
 
     names = list(result.mission.formations)
     columns = min(max(len(names), 1), 3)

@@ -163,7 +163,7 @@ def time_figure(
     shares: Sequence[float] | None = None,
 ) -> tuple[Figure, Any]:
     """Figure of rows x columns axes (object array) that share time; `height` of a row [in], or its share of that."""
-    from matplotlib.figure import Figure
+    from rigidfleet.plotting.figure import Figure
 
     shares = [1.0] * rows if shares is None else shares
     fig = Figure(figsize=(WIDTH, 1.3 + height * sum(shares)), layout="constrained")

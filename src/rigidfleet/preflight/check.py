@@ -9,8 +9,9 @@ on them is a note.
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
-from rigidfleet.mission import Mission
+from rigidfleet.mission import Mission, as_mission
 from rigidfleet.planning.preview import FEWEST_SAMPLES, preview, samples_per_phase
 from rigidfleet.preflight.assignment import assignment_remarks
 from rigidfleet.preflight.findings import Preflight, Remark
@@ -27,19 +28,21 @@ from rigidfleet.preflight.trajectory import (
 
 
 def check(
-    mission: Mission,
+    mission: Mission | str | Path,
     *,
     search: bool | None = None,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Preflight:
-    """Check a mission that is right in itself for what it will meet.
+    """Find what a mission will meet, before it flies; `rigidfleet check` prints it.
 
     Parameters
     ----------
+    mission : a shipped name, a path or a `Mission`
     search : for other shapes with the same distances, `STARTS` random starts a formation; default: for up to
         `SEARCHED` agents
     progress : called with what is looked at next, in words
     """
+    mission = as_mission(mission)
     search = mission.n_agents <= SEARCHED if search is None else search
     formations = check_formations(mission, search=search, progress=progress)
     progress("the way")

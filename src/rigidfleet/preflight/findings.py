@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from rigidfleet import _markup
 from rigidfleet.planning import solvers
 from rigidfleet.planning.preview import PlannedPhase
 from rigidfleet.rigidity import (
@@ -113,7 +114,15 @@ class Disturbed:
 
 @dataclass
 class Preflight:
-    """All that was found; `remarks` say what of it matters."""
+    """What `check` has found of a mission before it flies; `remarks` say what of it matters.
+
+    >>> import rigidfleet as rf
+    >>> ahead = rf.check("narrow-passage")
+    >>> ahead.passed
+    True
+    >>> for heading, fact in ahead.words():
+    ...     print(heading, fact)
+    """
 
     formations: list[FormationCheck]
     gains: GainsCheck
@@ -131,6 +140,18 @@ class Preflight:
     def passed(self) -> bool:
         """Whether nothing was found that will fail."""
         return all(remark.level != "fails" for remark in self.remarks)
+
+    def __repr__(self) -> str:
+        fails = sum(remark.level == "fails" for remark in self.remarks)
+        notes = len(self.remarks) - fails
+        verdict = f"{fails} will fail" if fails else "no problems found"
+        return f"<Preflight: {verdict}, {notes} note{'s' * (notes != 1)}>"
+
+    def _repr_html_(self) -> str:
+        """What was found as a notebook shows it: facts, then remarks."""
+        rows = [*self.words(), *((remark.level, remark.text) for remark in self.remarks)]
+        verdict = "no problems found" if self.passed else "it will fail as it is"
+        return _markup.shown("Check", verdict, ("about", "what was found"), rows)
 
     def words(self) -> Iterator[tuple[str, str]]:
         """All facts, each under a heading: formations, gains, the way. `remarks` come besides."""

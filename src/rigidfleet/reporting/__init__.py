@@ -12,17 +12,17 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rigidfleet.result import write_file
+from rigidfleet.errors import wrong_type
+from rigidfleet.result import Result, as_result, write_file
 
 if TYPE_CHECKING:
     from rigidfleet.assessment import Verdict
-    from rigidfleet.result import Result
 
 __all__ = ["html_page", "report"]
 
 
 def report(
-    results: Result | Sequence[Result],
+    results: Result | str | Path | Sequence[Result | str | Path],
     path: str | Path,
     *,
     labels: Sequence[str] | None = None,
@@ -32,7 +32,7 @@ def report(
 
     Parameters
     ----------
-    results : one or more flights
+    results : one or more flights, each a `Result` or the path of one that was saved
     path : the page; a file that is there is replaced, whole or not at all
     labels : what to call each flight; the name of its mission by default
     verdicts : those of `assess`, if they are there already
@@ -40,7 +40,7 @@ def report(
     Raises
     ------
     ResultError
-        The page cannot be written, or the mission inside a result cannot be read.
+        The page cannot be written, or a result or the mission inside a result cannot be read.
     ValueError
         There is no result, or not one label and verdict for each.
     """
@@ -48,7 +48,7 @@ def report(
 
 
 def html_page(
-    results: Result | Sequence[Result],
+    results: Result | str | Path | Sequence[Result | str | Path],
     *,
     labels: Sequence[str] | None = None,
     verdicts: Sequence[Verdict] | None = None,
@@ -57,10 +57,13 @@ def html_page(
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     from rigidfleet.reporting.contents import contents
-    from rigidfleet.result import Result
     from rigidfleet.web.policy import content_policy
 
-    flights = [results] if isinstance(results, Result) else list(results)
+    if isinstance(results, Result | str | Path):
+        results = [results]
+    elif not isinstance(results, Sequence):
+        raise wrong_type("a flight, or several (a Result or the path of one, or a list)", results)
+    flights = [as_result(result) for result in results]
     environment = Environment(
         loader=PackageLoader("rigidfleet.reporting"),
         autoescape=True,

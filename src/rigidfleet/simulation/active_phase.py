@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time as clock
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -24,6 +25,9 @@ from rigidfleet.simulation.extremes import Extremes
 from rigidfleet.simulation.recording import Piece
 from rigidfleet.simulation.solver_setup import equip, first_step, integrator
 from rigidfleet.typing import Bools, Floats
+
+if TYPE_CHECKING:
+    from rigidfleet.kernel.large.solver import Counts  # imports the compiler
 
 #: The integrator returns to Python after so many steps, or fewer: as many as take this long [s of
 #: wall time], often enough for Ctrl-C and progress whatever the size of the formation.
@@ -73,8 +77,10 @@ class ActivePhase:
         self.held: Program | None = None  # with its force
         self.flown: Program | None = None  # what the steps in the trail were flown by
         self.steps = _FIRST_STEPS  # at a time; more as soon as it is known how long they take
-        self.counted = np.zeros(3, dtype=np.int64)  # evaluations, steps and rejections before a loss
-        self.solves: list[tuple[str, object]] = []  # by which method, before a loss
+        self.counted = np.zeros(
+            3, dtype=np.int64
+        )  # evaluations, steps and rejections before a loss
+        self.solves: list[tuple[str, Counts]] = []  # by which method, before a loss
         self.quiet_since = math.inf  # since when the phase has been settled [s]
         self.stop = math.inf  # where somebody looks [s]
         self.begun = False  # whether there are samples since the start, or the last loss
@@ -126,7 +132,7 @@ class ActivePhase:
     def settle_by(
         self, t_end: float, settle: Settle, controller: Controller | None, rate: float, step: float
     ) -> None:
-        """Integrate in short stretches, ends of ``step`` [s], until the phase has settled or ``t_end`` [s] is reached."""
+        """Integrate until the phase has settled, or to ``t_end`` [s]; checks are at multiples of ``step`` [s]."""
         step *= max(1.0, round(_CHECK / step))  # stretches end at samples
         least = self.plan.start + self.plan.program.reference.T_b
         while self.t < t_end and not self.settled:

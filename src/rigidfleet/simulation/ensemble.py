@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rigidfleet.kernel.compiler.simd import WIDTH
 from rigidfleet.kernel.engine import batch
-from rigidfleet.mission import Establish, Mission, Phase, Reshape
+from rigidfleet.mission import Establish, Mission, Phase, Reshape, as_mission
 from rigidfleet.planning.plan import plan_phase
 from rigidfleet.planning.reference import Situation
 from rigidfleet.planning.solvers import choose
@@ -47,7 +48,7 @@ class Ensemble:
 
 
 def establish(
-    mission: Mission,
+    mission: Mission | str | Path,
     position: ArrayLike,
     velocity: ArrayLike | None = None,
     *,
@@ -58,10 +59,10 @@ def establish(
 
     Parameters
     ----------
-    mission : all of its phases are flown under squares or steps (``reference``; "distances" where that is squares
-        from anywhere, without slots or with three agents), with ``control = "open"``, and end at a time, like those
-        of Table 1; tolerances, gains and masses are the mission's. A damping of "auto" is 0.03 throughout, as
-        flights of one phase are not all in their formation, or none
+    mission : a shipped name, a path or a `Mission`; all of its phases are flown under squares or steps
+        (``reference``; "distances" where that is squares from anywhere, without slots or with three agents), with
+        ``control = "open"``, and end at a time, like those of Table 1; tolerances, gains and masses are the mission's.
+        A damping of "auto" is 0.03 throughout, as flights of one phase are not all in their formation, or none
     position, velocity : (B, N, 3) at the start, world axes [m, m/s]; at rest without velocities
     vectors : whether eight flights share a vector of the machine, and their steps, through code made for the
         mission's graph: seven times as fast, and compiled in seconds. By default in each phase that
@@ -74,6 +75,7 @@ def establish(
         The mission has other phases, axes or assignments, or disturbances, or too many edges for the dense solve; or
         the shapes of the starts do not fit it.
     """
+    mission = as_mission(mission)
     r = _starts("position", position, mission.n_agents)
     v = np.zeros_like(r) if velocity is None else _starts("velocity", velocity, mission.n_agents)
     if v.shape != r.shape:

@@ -270,12 +270,11 @@ class Flight:
             self.ending = str(stop)
             return False
         self._asked.append(phase)
-        self.phases.append(
-            PhaseRecord(
-                phase.name, phase.kind, phase.control, plan.formation, plan.start, plan.start,
-                settled=None if phase.settle is None else False, target=plan.target,
-            )  # fmt: skip
-        )
+        record = PhaseRecord(
+            phase.name, phase.kind, phase.control, plan.formation, plan.start, plan.start,
+            settled=None if phase.settle is None else False, target=plan.target,
+        )  # fmt: skip
+        self.phases.append(record)
         return True
 
     def advance(self, duration: float | None = None) -> bool:
@@ -385,9 +384,7 @@ class Flight:
         self._leave()
         self.ending = ending or self.ending
         if not self.pieces:
-            raise FlightError(
-                self.ending or "the flight ended before the first time to record"
-            )
+            raise FlightError(self.ending or "the flight ended before the first time to record")
         given = tuple(self.mission.phases)
         own = tuple(self._asked) == given[: len(self._asked)]
         whole = own and len(self._asked) == len(given) and not cut
@@ -408,12 +405,11 @@ class Flight:
         if active is not None:  # the flight may go on
             active.watch(last=True)
             self.phases[-1].extremes = self._extremes.so_far()
-        last = max(piece.phase for piece in pieces) + 1
-        mission, phases = self.mission, self.phases[:last]
+        mission, phases = self.mission, self.phases
         if flown is not None:
-            mission, phases = as_flown(
-                mission, flown[:last], phases, step or self.mission.output_step
-            )
+            last = max(piece.phase for piece in pieces) + 1
+            step = step or mission.output_step
+            mission, phases = as_flown(mission, flown[:last], phases[:last], step)
         self._extremes.flight(phases)
         evaluations, steps, rejected = (int(c) for c in self._count)
         statistics = {

@@ -45,9 +45,7 @@ def equip(plan: PhasePlan) -> tuple[Workspace, LargeSolver | None]:
     return work, solver
 
 
-def integrator(
-    plan: PhasePlan, y: Floats, t: float, trail: records.Trail
-) -> records.Integrator:
+def integrator(plan: PhasePlan, y: Floats, t: float, trail: records.Trail) -> records.Integrator:
     """An integrator of a plan at time t [s] and state y (n,), which leaves its steps in a trail."""
     return records.integrator(
         y, t, rtol=plan.integrator.rtol, atol=plan.tolerances(len(y)), trail=trail

@@ -86,7 +86,7 @@ def outcome(table: Table) -> Figure | None:
     """Success rate as the runs come, with its interval, and how many failed which check."""
     if not len(table.run):
         return None
-    from matplotlib.figure import Figure
+    from rigidfleet.plotting.figure import Figure
 
     reasons = summarise(table).reasons
     fig = Figure(figsize=(st.WIDTH, 2.9 + 0.14 * max(0, len(reasons) - 6)), layout="constrained")
@@ -185,7 +185,7 @@ def correlations(table: Table) -> Figure | None:
     found = drivers(table)
     if not found:
         return None
-    from matplotlib.figure import Figure
+    from rigidfleet.plotting.figure import Figure
 
     rows = list(dict.fromkeys(d.varied for d in found))[:_ROWS]
     rows = [name for name in varied(table) if name in rows]
@@ -239,7 +239,7 @@ def over_two(table: Table, over: Sequence[str] = (), metric: str = "") -> Figure
     if unknown or len(over) != 2:
         word, words = unknown[0] if unknown else (" ".join(over), list(numbers))
         raise RigidfleetError(f"map: '{word}' cannot be drawn. Use two of: {', '.join(words)}.")
-    from matplotlib.figure import Figure
+    from rigidfleet.plotting.figure import Figure
 
     values = 100.0 * table.passed if metric == "success" else table.metrics[metric]
     (x, at_x), (y, at_y) = (_cells(numbers[p], _spacing(table, p)) for p in over)
@@ -287,7 +287,7 @@ def _head(fig: Figure, table: Table, title: str) -> None:
 
 def _small(table: Table, title: str, names: Sequence[str]) -> tuple[Figure, list[Axes]]:
     """A small axes for each metric."""
-    from matplotlib.figure import Figure
+    from rigidfleet.plotting.figure import Figure
 
     columns = min(_COLUMNS, max(2, len(names)))
     rows = -(-len(names) // columns)

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import webbrowser
 from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rigidfleet.mission import as_mission
 from rigidfleet.web.live.server import Server
 from rigidfleet.web.live.session import Session
 
@@ -17,7 +19,7 @@ __all__ = ["live"]
 
 
 def live(
-    mission: Mission,
+    mission: Mission | str | Path,
     *,
     port: int = 0,
     browser: bool = True,
@@ -31,6 +33,7 @@ def live(
 
     Parameters
     ----------
+    mission : a shipped name, a path or a `Mission`
     port : on which this machine, and it alone, serves the page; 0 for any that is free
     browser : open the page in the user's browser
     ready : called with the page's address once it is served
@@ -53,7 +56,7 @@ def live(
         flown[:] = [result]
         return landed(result) if landed is not None else ""
 
-    session = Session(mission, keep)
+    session = Session(as_mission(mission), keep)
     with Server(session, port) as server:
         try:
             if ready is not None:

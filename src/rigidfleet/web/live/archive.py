@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from rigidfleet.errors import MissionError
-from rigidfleet.mission import Establish, Mission, Phase, Reshape
-from rigidfleet.result import PhaseRecord, Result
+from rigidfleet.result import Result
 from rigidfleet.simulation.recording import Piece
 from rigidfleet.typing import Bools, Floats
 

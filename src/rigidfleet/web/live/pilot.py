@@ -13,17 +13,15 @@ from typing import Any
 import numpy as np
 
 from rigidfleet.errors import FlightError
-from rigidfleet.kernel.engine import native
-from rigidfleet.kernel.problem import LOCAL, Motion, Program
 from rigidfleet.math import attitude as att
-from rigidfleet.math import lqr
 from rigidfleet.mission import Establish, Hold, Mission, Phase, Reshape
+from rigidfleet.planning.plan import PhasePlan
 from rigidfleet.planning.reference import Pose
 from rigidfleet.result import PhaseRecord, Result
-from rigidfleet.simulation.flight import Flight, Leg, StoppedError
+from rigidfleet.simulation.flight import Flight
 from rigidfleet.simulation.recording import assemble
 from rigidfleet.typing import Floats
-from rigidfleet.web.live.archive import Archive, as_flown, rows
+from rigidfleet.web.live.archive import Archive, rows
 
 TICK = 0.05  # between looks at what the hand asks for [s]
 _BLEND = 4.0  # from one formation to another [s]
@@ -284,7 +282,13 @@ class Pilot:
         phi, omega, alpha = _pulled(away, pose.omega, self.alpha, h, _TURN)
         if self.asked[-1].control != "open":
             self.flight.steer(
-                h, pose, (r, v, a), (phi, omega, alpha), a=self.a, alpha=self.alpha, force=self._windy()
+                h,
+                pose,
+                (r, v, a),
+                (phi, omega, alpha),
+                a=self.a,
+                alpha=self.alpha,
+                force=self._windy(),
             )
             T = att.dcm_from_rotation_vector(phi) @ pose.T
             self.pose = Pose(pose.r + r, v, T, omega)

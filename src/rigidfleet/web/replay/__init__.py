@@ -6,42 +6,77 @@ its parts lie beside this module.
 
 from __future__ import annotations
 
+import html
 import math
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, overload
 
 import numpy as np
 
-from rigidfleet.result import write_file
+from rigidfleet.result import Result, as_result, write_file
 from rigidfleet.typing import Floats, Ints
 from rigidfleet.web.replay.pack import Column, pack
 from rigidfleet.web.replay.page import page, read
 from rigidfleet.web.replay.scene import describe, observe, sight, size, weight
 
-if TYPE_CHECKING:
-    pass
-    from rigidfleet.result import Result
-
-__all__ = ["html_page", "replay"]
+__all__ = ["Replay", "html_page", "replay"]
 
 _RATE = 30.0  # samples [Hz] at most: the page draws smooth curves through them
 _SAMPLES = 3_000_000  # of all agents together; longer flights have fewer in a second
+_HEIGHT = 600  # [px] in a notebook
 _EDGES = 3000  # drawn at most: more would hide what they hold
 #: Shares of a vehicle's weight that the full colour of an edge stands for at least, and at most.
 _IDLE, _HEAVY = 0.005, 2.0
 
 
-def replay(result: Result, path: str | Path) -> None:
-    """Write a flight as one HTML file that plays it, offline, in any browser of today.
+@dataclass(frozen=True, repr=False)
+class Replay:
+    """A flight's page, which a notebook shows in its cell; ``html`` is its text."""
 
-    An existing file is replaced, whole or not at all.
+    html: str
+
+    def __repr__(self) -> str:
+        return f"<Replay: {len(self.html) / 1e6:.1f} MB of HTML; a notebook shows it>"
+
+    def _repr_html_(self) -> str:
+        """The page in a frame of its own, which reaches nothing of the notebook around it."""
+        return (
+            '<iframe title="Replay of the flight" sandbox="allow-scripts" width="100%"'
+            f' height="{_HEIGHT}" style="border:0" srcdoc="{html.escape(self.html)}"></iframe>'
+        )
+
+
+@overload
+def replay(result: Result | str | Path, path: None = None) -> Replay: ...
+
+
+@overload
+def replay(result: Result | str | Path, path: str | Path) -> None: ...
+
+
+def replay(result: Result | str | Path, path: str | Path | None = None) -> Replay | None:
+    """Play a flight: in the cell of a notebook, or as one HTML file for any browser, offline.
+
+    Parameters
+    ----------
+    result : a flight, or the path of one that was saved
+    path : the file; one that is there is replaced, whole or not at all
+
+    Returns
+    -------
+    Without a path, the page, which a notebook shows.
 
     Raises
     ------
     ResultError
-        The file cannot be written, or the mission inside the result cannot be read.
+        The file cannot be written, or the result or the mission inside it cannot be read.
     """
-    write_file(Path(path), html_page(result).encode())
+    page_ = html_page(as_result(result))
+    if path is None:
+        return Replay(page_)
+    write_file(Path(path), page_.encode())
+    return None
 
 
 def html_page(result: Result) -> str:

@@ -438,6 +438,7 @@ class Player {
   resize() {
     // The picture's centre lies in the middle of what is free.
     const { clientWidth: width, clientHeight: height } = document.documentElement, { camera } = this.scene;
+    if (!width || !height) return; // in a frame that is not shown yet
     const beside = (id) => (part(id)?.offsetWidth && width > 760 ? part(id).offsetWidth + 14 : 0);
     const left = beside("fly"), right = beside("panel"), bottom = part("bar").offsetHeight + 14;
     camera.centre = [(left - right) / width, bottom / height];

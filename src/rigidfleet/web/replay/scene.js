@@ -104,6 +104,7 @@ class Camera {
       target: add(target, this.pan),
     };
     // What moves with the formation stays with it; only what is left of a change of view fades.
+    if (!Number.isFinite(Math.log(this.shown?.distance))) this.shown = null; // seen in a frame without room
     const s = this.shown ?? { ...wanted, off: [0, 0, 0], mode: this.mode };
     if (s.mode !== this.mode) {
       s.off = sub(s.target, wanted.target);
