@@ -181,7 +181,7 @@ def test_short_in_words(flight):
     assert repr(mission) in (inspect.getdoc(rf.Mission) or "")
     settling = repr(rf.load_mission("line-singular"))
     assert settling.startswith("<Mission line-singular: 3 agents, ")
-    assert repr(rf.check(mission)) == "<Preflight: nothing found that will fail, 0 notes>"
+    assert repr(rf.check(mission)) == "<Preflight: no problems found, 0 notes>"
     verdict = rf.assess(flight)
     judged = [finding for finding in verdict.findings if finding.judged]
     failed = [finding for finding in judged if not finding.passed]

@@ -8,6 +8,8 @@ from types import ModuleType
 
 import pytest
 
+from rigidfleet import assess
+
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
 
@@ -74,3 +76,14 @@ def test_gusts(example):
     assert blind["pair"] == pytest.approx(0.082, abs=0.005)
     # What all agents feel alike, f_C cannot answer.
     assert told["slot"] > 0.7 * alone["slot"]
+
+
+@pytest.mark.parametrize("example", ["step_by_step"], indirect=True)
+def test_step_by_step(example, capsys):
+    """A target is changed on the way, and the flight passes: the one it left is no waypoint any more."""
+    result = example.main()
+    assert "half way" in capsys.readouterr().out
+    assert result.complete
+    assert [phase.kind for phase in result.phases] == ["establish", "fly", "fly"]
+    assert result.phases[1].target is None
+    assert assess(result).passed

@@ -192,7 +192,7 @@ def test_cannot_go_on(monkeypatch):
     def stop(*_):
         raise StoppedError("too steep")
 
-    monkeypatch.setattr(pilot, "_integrate", stop)
+    monkeypatch.setattr(pilot.flight._active, "fly_to", stop)
     after = pilot.step()
     assert pilot.ending == "too steep"
     assert after is before

@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Ensemble",
+    "Flight",
     "FlightError",
     "FlightInterrupted",
     "Mission",
@@ -68,6 +69,7 @@ __all__ = [
 #: The module of each public name.
 _HOME = {
     "Ensemble": "simulation.ensemble",
+    "Flight": "simulation.flight",
     "FlightError": "errors",
     "FlightInterrupted": "simulation.flight",
     "Mission": "mission",

@@ -251,9 +251,9 @@ class Flight:
             phase = self.mission.phases[self._following]
             self._following += 1
         elif isinstance(phase, Mapping):
-            self._leave()
+            self._leave(changed=True)
             phase = with_phase(self.mission, self._asked, self.phases, phase)
-        self._leave()
+        self._leave(changed=True)
         if self._asked:
             self._report(phase, planning=True)
         try:
@@ -431,8 +431,8 @@ class Flight:
             raise FlightError(f"no phase is under way: {why}")
         return self._active
 
-    def _leave(self) -> None:
-        """End the phase under way, where it is."""
+    def _leave(self, *, changed: bool = False) -> None:
+        """End the phase under way, where it is; a target that was ``changed`` on the way is no waypoint to be met."""
         active = self._active
         if active is None:
             return
@@ -447,6 +447,8 @@ class Flight:
             self._solves.setdefault(method, type(counts)()).add(counts)
         self._now = active.end()
         record.t_end = self._now.t
+        if changed and record.target is not None and record.target["time"] > record.t_end:
+            record.target = None
 
     def _check_frame(self, plan: PhasePlan) -> None:
         """Stop where the formation has flipped: its slots no longer lie as the frame says."""

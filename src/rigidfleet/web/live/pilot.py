@@ -156,6 +156,8 @@ class Pilot:
 
     def gust(self, direction: Floats, strength: float) -> None:
         """Send a gust along ``direction`` (3,), at most ``strength`` [N/kg]."""
+        if self.ending:
+            return
         d = direction / np.linalg.norm(direction)
         self.gusts.append(Gust(self.t, float((self._places() @ d).min()), d, strength))
 

@@ -1,0 +1,149 @@
+"""A flight step by step: as `simulate` flies it, with looks and changes on the way."""
+
+import numpy as np
+import pytest
+
+import rigidfleet as rf
+from rigidfleet.errors import FlightError, MissionError
+
+FLY = {"kind": "fly", "position": [8.0, 0.0, 12.0], "duration": 8.0}
+
+
+@pytest.fixture(scope="module")
+def whole() -> rf.Result:
+    return rf.simulate("narrow-passage")
+
+
+def test_without_stops_a_flight_is_that_of_simulate(whole):
+    """Phase by phase, bit for bit."""
+    flight = rf.Flight("narrow-passage")
+    while flight.begin():
+        assert not flight.advance()
+    result = flight.finish()
+    assert result.complete
+    np.testing.assert_array_equal(result.time, whole.time)
+    np.testing.assert_array_equal(result.position, whole.position)
+    assert [p.extremes for p in result.phases] == [p.extremes for p in whole.phases]
+    assert rf.assess(result).json() == rf.assess(whole).json()
+
+
+def test_stops_change_no_more_than_the_tolerances(whole):
+    """Stops are recorded, and what is seen there is what is recorded there."""
+    flight = rf.Flight("narrow-passage")
+    seen = {}
+    while flight.begin():
+        while flight.advance(0.77):
+            seen[flight.t] = flight.observe()
+    result = flight.finish()
+    assert result.complete
+    both = np.isin(result.time, whole.time)
+    there = np.isin(whole.time, result.time)
+    assert both.sum() > 1700
+    np.testing.assert_allclose(result.position[both], whole.position[there], atol=1e-5)
+    assert len(seen) > 100
+    for t, look in seen.items():
+        k = int(np.flatnonzero(result.time == t)[0])
+        np.testing.assert_allclose(look.position, result.position[k], atol=1e-9)
+    assert rf.assess(result).passed
+
+
+def test_a_phase_that_settles_can_be_stopped():
+    """Whether it has settled is asked at the same moments, wherever somebody looks."""
+    whole = rf.simulate("line-singular")
+    flight = rf.Flight("line-singular")
+    while flight.begin():
+        while flight.advance(0.033):
+            pass
+    result = flight.finish()
+    for one, other in zip(result.phases, whole.phases, strict=True):
+        assert one.t_end == pytest.approx(other.t_end, abs=0.11)
+        assert one.settled == other.settled
+
+
+def test_another_target_on_the_way():
+    """The reference goes on from where it is; the target that was left is no waypoint; the record says what flew."""
+    flight = rf.Flight("narrow-passage")
+    flight.begin()
+    flight.advance()
+    flight.begin(FLY)
+    assert flight.advance(4.0)
+    before = flight.pose()
+    flight.begin(FLY | {"position": [4.0, 6.0, 12.0]})
+    after = flight.pose()
+    np.testing.assert_allclose(after.r, before.r, atol=1e-9)
+    np.testing.assert_allclose(after.v, before.v, atol=1e-9)
+    assert not flight.advance()
+    result = flight.finish()
+    assert result.complete
+    assert rf.assess(result).passed
+    np.testing.assert_allclose(result.cm[-1], [4.0, 6.0, 12.0], atol=1e-3)
+    assert [p.t_end for p in result.phases] == pytest.approx([6.0, 10.0, 18.0])
+    assert len(result.mission.phases) == 3
+
+
+def test_the_mission_goes_on_where_it_was_left():
+    """After a phase of one's own the mission's next one begins."""
+    flight = rf.Flight("square")
+    names = []
+    flight.begin()
+    flight.advance(2.0)
+    flight.begin({"kind": "hold", "duration": 1.0})
+    assert not flight.advance()
+    while flight.begin():
+        names.append(flight.plan.phase.name)
+        flight.advance()
+    assert names == [p.name for p in rf.load_mission("square").phases[1:]]
+
+
+def test_a_flight_that_ends_early_says_so():
+    """Half a mission is an incomplete record, which fails its verdict."""
+    flight = rf.Flight("narrow-passage")
+    flight.begin()
+    flight.advance(2.0)
+    result = flight.finish()
+    assert not result.complete
+    assert "ended at t = 2.00 s" in result.ending
+    assert result.time[-1] == 2.0
+    assert not rf.assess(result).passed
+
+
+def test_a_flight_that_cannot_go_on_says_why():
+    """The diagnosis is in `ending`; nothing begins any more."""
+    flight = rf.Flight("line-singular")
+    while flight.begin():
+        flight.advance()
+    assert "cannot go on" in flight.ending
+    assert not flight.begin({"kind": "hold", "duration": 1.0})
+    assert flight.finish().ending == flight.ending
+
+
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        ({"kind": "orbiting"}, "kind"),
+        (FLY | {"position": [1.0, 2.0]}, "position"),
+        (FLY | {"formation": "no such"}, "formation"),
+        ({"kind": "reshape", "formation": "no such", "duration": 3.0}, "no such"),
+    ],
+)
+def test_a_phase_with_errors_is_refused(table, words):
+    """As in a mission file; the flight goes on."""
+    flight = rf.Flight("narrow-passage")
+    flight.begin()
+    flight.advance()
+    with pytest.raises(MissionError, match=words):
+        flight.begin(table)
+    assert flight.begin(FLY)
+
+
+def test_what_makes_no_sense_is_refused():
+    """No phase under way, a time that is none, nothing flown."""
+    flight = rf.Flight("square")
+    with pytest.raises(FlightError, match="no phase is under way"):
+        flight.advance()
+    with pytest.raises(FlightError, match="before the first time"):
+        flight.finish()
+    flight.begin()
+    for wrong in (0.0, -1.0, float("nan")):
+        with pytest.raises(ValueError, match="duration must be positive"):
+            flight.advance(wrong)
