@@ -44,12 +44,12 @@ LOAD = 0.05  # on an agent of the sheet, greatest [N]
 TOLERANCE = {"rtol": 1e-6, "atol": 1e-5}
 #: Flights of the table: kind, agents, and how many times real time they are to reach.
 FLIGHTS: list[tuple[str, int, float | None]] = [
-    ("lattice, joined, body axes", 1000, None),
-    ("lattice, joined, body axes", 3000, None),
-    ("lattice, joined, body axes", 10_000, 20.0),
-    ("lattice, joined", 10_000, None),
-    ("lattice, joined, from 10 %", 10_000, None),
-    ("lattice, tree, body axes", 10_000, None),
+    ("lattice, henneberg, body axes", 1000, None),
+    ("lattice, henneberg, body axes", 3000, None),
+    ("lattice, henneberg, body axes", 10_000, 20.0),
+    ("lattice, henneberg", 10_000, None),
+    ("lattice, henneberg, from 10 %", 10_000, None),
+    ("lattice, henneberg-multilevel, body axes", 10_000, None),
     ("lattice, neighbours within 1.5", 1000, None),
     ("sphere, triangulated", 500, None),
     ("sphere, triangulated", 2000, 5.0),
@@ -62,21 +62,21 @@ _FAR, _BODY = ", from 10 %", ", body axes"
 #: Graphs of the other table: shape, agents, edges and their reach in spacings.
 GRAPHS: list[tuple[str, int, str, float | None]] = [
     ("lattice", 1000, "neighbours", 1.5),
-    ("lattice", 1000, "joined", None),
-    ("lattice", 1000, "tree", None),
+    ("lattice", 1000, "henneberg", None),
+    ("lattice", 1000, "henneberg-multilevel", None),
     ("sphere", 2000, "neighbours", 1.9),
     ("sphere", 500, "neighbours", 1.9),
-    ("sphere", 500, "joined", None),
-    ("sphere", 500, "tree", None),
+    ("sphere", 500, "henneberg", None),
+    ("sphere", 500, "henneberg-multilevel", None),
     ("shells", 2000, "neighbours", 1.9),
     ("shells", 500, "neighbours", 1.9),
-    ("shells", 500, "tree", None),
+    ("shells", 500, "henneberg-multilevel", None),
     ("helix of show-1000", 1000, "neighbours", 2.1),
     ("helix of show-1000", 1000, "neighbours", 3.05),
-    ("helix of show-1000", 1000, "tree", None),
+    ("helix of show-1000", 1000, "henneberg-multilevel", None),
 ]
 #: Flown if asked for.
-LARGEST = ("lattice, joined, body axes", 100_000, None)
+LARGEST = ("lattice, henneberg, body axes", 100_000, None)
 #: Goals: growth of the time of a step, flatness of the sheet [m], the show from command to verdict [s].
 EXPONENT, FLAT, SHOW = 1.1, 5e-3, 60.0
 ROUNDS = 3
@@ -146,7 +146,7 @@ def mission(kind: str, n: int) -> Mission:
         form["edges"] = triangulated(p)
     elif graph == "neighbours within 1.5":
         form["reach"] = 1.5
-    exact = graph in ("joined", "tree")
+    exact = graph in ("henneberg", "henneberg-multilevel")
     data: dict[str, Any] = {
         "schema_version": 1,
         "name": shape,
@@ -244,7 +244,7 @@ def show() -> dict[str, float]:
 
 
 def growth(rows: list[tuple[Flown, float | None]]) -> float:
-    """The exponent of N in the time of a step on the joined lattice."""
+    """The exponent of N in the time of a step on the henneberg lattice."""
     found = [(r.agents, r.wall / r.steps) for r, _ in rows if r.kind == LARGEST[0]]
     n, t = np.log(np.array([x for x in found if x[0] < LARGEST[1]])).T
     return float(np.polyfit(n, t, 1)[0])

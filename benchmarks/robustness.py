@@ -35,7 +35,7 @@ from rigidfleet.math.constraint_jacobian import smallest_singular_value
 from rigidfleet.mission import Mission, load_mission, mission_names
 from rigidfleet.planning.reference import align_slots
 from rigidfleet.result import Result
-from rigidfleet.rigidity import Verdict, analyse, jacobian
+from rigidfleet.rigidity import RigidityClass, analyse, jacobian
 from rigidfleet.simulation.flight import simulate
 
 Floats = NDArray[np.float64]
@@ -113,7 +113,7 @@ class Outcome:
 def _rows() -> Iterator[Row]:
     graphs = ("minimal", "redundant", "complete")
     for graph in graphs:
-        yield Row(f"slots, {graph}", graph, control="slots")
+        yield Row(f"slots, {graph}", graph, control="tracking")
     for reference in ("shape", "distances", "step"):
         for graph in graphs:
             yield Row(f"{reference}, {graph}", graph, reference=reference)
@@ -403,7 +403,7 @@ def judged(case: Case, edges: Ints, result: Result) -> str:
 def flexible(slots: bytes, edges: bytes) -> bool:
     """Whether a graph is certain to be flexible; each is asked for in several rows."""
     p, graph = np.frombuffer(slots).reshape(-1, 3), np.frombuffer(edges, dtype=np.int64)
-    return analyse(p, graph.reshape(-1, 2)).verdict is Verdict.FLEXIBLE
+    return analyse(p, graph.reshape(-1, 2)).verdict is RigidityClass.FLEXIBLE
 
 
 def mirrored(case: Case, r: Floats) -> bool:

@@ -34,7 +34,7 @@ from rigidfleet.kernel.engine.tracer import Code, Trace
 from rigidfleet.kernel.problem import workspace
 from rigidfleet.mission import Mission, load_mission
 from rigidfleet.planning.plan import plan_phase
-from rigidfleet.planning.reference import Situation
+from rigidfleet.planning.reference import PhaseState
 from rigidfleet.simulation.ensemble import establish
 from rigidfleet.simulation.flight import simulate
 from rigidfleet.sweep import Sweep, fly
@@ -120,9 +120,9 @@ def peer(mission: Mission, kind: type[Peer]) -> Peer:
 def compiled_flight(mission: Mission, tolerance: float = TOLERANCE) -> Callable[[], np.ndarray]:
     """The kernel alone: all that is known before the flight is prepared before the clock starts."""
     agents = mission.agents
-    now = Situation(0.0, np.array(agents.position), np.array(agents.velocity))
+    now = PhaseState(0.0, np.array(agents.position), np.array(agents.velocity))
     plan = plan_phase(mission, mission.phases[0], now)
-    work = workspace(len(now.r), len(plan.edges), solver=plan.program.law.solver)
+    work = workspace(len(now.r), len(plan.edges), solver=plan.problem.law.solver)
     y = np.concatenate([now.r.ravel(), now.v.ravel(), np.zeros(len(plan.edges))])
     times = np.linspace(0.0, DURATION, SAMPLES)
     samples = np.empty((SAMPLES, len(y)))
@@ -131,7 +131,7 @@ def compiled_flight(mission: Mission, tolerance: float = TOLERANCE) -> Callable[
 
     def fly() -> np.ndarray:
         state.y[:], state.clock[:], state.count[:] = start.y, start.clock, start.count
-        native.integrate(plan.program, work, state, DURATION, True, times, samples, 1 << 40)
+        native.integrate(plan.problem, work, state, DURATION, True, times, samples, 1 << 40)
         return samples
 
     return fly
@@ -210,7 +210,7 @@ def ensembles(rounds: int) -> list[Row]:
                 mission,
                 [f"agents.position.*.* += uniform({-SPREAD}, {SPREAD})"],
                 runs=FLIGHTS,
-                judged="ends",
+                evaluate="final",
             )
             alone, vectors, rows_kept, scipy = [], [], [], []
             for k in range(rounds):
@@ -231,7 +231,7 @@ def ensembles(rounds: int) -> list[Row]:
             rows += [
                 Row(title, vectors, scipy, goals[n], True, note, evaluations),
                 Row("  each flight alone", alone, scipy, None, True),
-                Row("  as a sweep by ends", rows_kept, scipy, None, True),
+                Row("  as a sweep by final states", rows_kept, scipy, None, True),
             ]
     return rows
 
@@ -279,8 +279,8 @@ def share_of_a_step(mission: Mission) -> int:
 def straight_line(mission: Mission) -> int:
     """Operations of an evaluation as straight-line code does them, and its share of a step."""
     r = np.array(mission.agents.position)
-    now = Situation(0.0, r, np.zeros_like(r))
-    code = Code(Trace(plan_phase(mission, mission.phases[0], now).program))
+    now = PhaseState(0.0, r, np.zeros_like(r))
+    code = Code(Trace(plan_phase(mission, mission.phases[0], now).problem))
     return len(code.lines) + share_of_a_step(mission)
 
 

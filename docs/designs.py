@@ -7,7 +7,7 @@ from collections import Counter
 
 from rigidfleet.formation.graphs import CUBE_EDGES, complete_graph
 from rigidfleet.formation.shapes import slots
-from rigidfleet.rigidity import Kind, Verdict, analyse, realisations
+from rigidfleet.rigidity import Kind, RigidityClass, analyse, realisations
 from rigidfleet.rigidity.design import design
 
 SHAPES = [
@@ -68,7 +68,7 @@ def main() -> None:
         cells = []
         for edges in graphs:
             result = analyse(p, edges)
-            rigid = result.verdict is Verdict.INFINITESIMALLY_RIGID
+            rigid = result.verdict is RigidityClass.INFINITESIMALLY_RIGID
             cells += [f"{result.w:.4f}", "rigid" if rigid else str(result.verdict)]
         _row(name, n, len(graphs[0]), *cells)
 

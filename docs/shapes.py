@@ -104,7 +104,7 @@ def crossing() -> Figure:
     ways = (
         ("9 edges", nine, "open", RED),
         ("all 10 edges", "complete", "open", GREEN),
-        ("9 edges, slots tracked", nine, "slots", BLUE),
+        ("9 edges, slots tracked", nine, "tracking", BLUE),
     )
     ends = {}
     for name, edges, control, colour in ways:
@@ -128,8 +128,8 @@ def crossing() -> Figure:
         )
         r = result.position
         left.plot(
-            result.time, _height(r), color=colour, linewidth=3.2 if control == "slots" else 1.8,
-            alpha=0.5 if control == "slots" else 1.0, label=name,
+            result.time, _height(r), color=colour, linewidth=3.2 if control == "tracking" else 1.8,
+            alpha=0.5 if control == "tracking" else 1.0, label=name,
         )  # fmt: skip
         ends[name] = r[-1]
     left.axhline(0, color=GREY, linewidth=0.8, linestyle=DASHES)

@@ -37,9 +37,9 @@ def render(page: str) -> str:
 def _keys(schema: dict[str, Any], name: str) -> str:
     """The keys of a table: name, value, default, meaning."""
     whole, _, without = name.partition("-")
-    part = schema if whole == "Header" else schema["$defs"][whole]
+    part = schema if whole == "MissionHeader" else schema["$defs"][whole]
     left_out = set(schema["$defs"][without]["properties"]) if without else set()
-    if whole == "Header":
+    if whole == "MissionHeader":
         left_out |= {key for key, entry in part["properties"].items() if _is_table(entry)}
     if name == "Hold":  # which stands for every kind
         left_out |= {"kind"}

@@ -43,9 +43,10 @@ NUMBERS = [
     1.7e308, math.inf, -math.inf, math.nan, 2**31, 2**63 - 1, -(2**31), 10**6, 10**7, 10**100,
 ]  # fmt: skip
 TEXTS = [
-    "", " ", "a", "é", "x" * 5000, "\\u0000", "../../x", "nan", "complete", "joined", "tree", "neighbours", "open",
-    "slots", "body", "distances", "step", "squares", "line", "grid", "sphere", "helix", "shells", "exact", "pinv",
-    "spectral", "infinite", "shortest", "safe", "each", "inertial", "dryden", "first-order", "[bold]", "<script>",
+    "", " ", "a", "é", "x" * 5000, "\\u0000", "../../x", "nan", "complete", "henneberg", "henneberg-multilevel",
+    "neighbours", "slots", "open", "tracking", "body", "distances", "step", "squares", "line", "grid", "sphere",
+    "helix", "shells", "exact", "pinv", "spectral", "infinite", "shortest", "safe", "each", "inertial",
+    "dryden", "first-order", "[bold]", "<script>",
 ]  # fmt: skip
 LITERALS = [
     "1979-05-27",

@@ -68,8 +68,8 @@ def swarm(n: int, seconds: float, **changes) -> Result:
         "clearance_obstacle": np.zeros(k, int),
     }  # fmt: skip
     phases = [
-        PhaseRecord("establish 1", "establish", "slots", "sheet", 0.0, half),
-        PhaseRecord("<round> & \"round\"</script>", "fly", "slots", "sheet", half, seconds, None, target),
+        PhaseRecord("establish 1", "establish", "tracking", "sheet", 0.0, half),
+        PhaseRecord("<round> & \"round\"</script>", "fly", "tracking", "sheet", half, seconds, None, target),
     ]  # fmt: skip
     text = Mission.from_dict(mission).text
     rest: dict[str, Any] = {"phases": phases, "mission_text": text}

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from rigidfleet.assessment import SHAPE_TOLERANCE, Finding, Verdict, assess
+from rigidfleet.assessment import SHAPE_TOLERANCE, CheckResult, Verdict, assess
 from rigidfleet.assessment.measure import Fit
 from rigidfleet.formation import distance_geometry, graphs, shapes
 from rigidfleet.math import attitude as att
@@ -81,7 +81,7 @@ def flown(mission: Mission, position: Any, **changes: Any) -> Result:
     return Result(**(zero | nothing | given | changes))
 
 
-def found(verdict: Verdict, check: str) -> Finding:
+def found(verdict: Verdict, check: str) -> CheckResult:
     """The one finding of a check."""
     (finding,) = [f for f in verdict.findings if f.check == check]
     return finding
@@ -265,7 +265,7 @@ def test_a_line_out_of_order_fails():
     assert "not in order" in found(verdict, "order").message
 
 
-@pytest.mark.parametrize(("control", "passes"), [("slots", False), ("open", True)])
+@pytest.mark.parametrize(("control", "passes"), [("tracking", False), ("open", True)])
 def test_a_steered_line_must_point_the_right_way(control, passes):
     """Where slots are tracked a line that points backwards has flipped; elsewhere nothing steers it."""
     mission = a_mission(LINE, 3)
@@ -298,9 +298,9 @@ def test_a_lost_shape_fails_at_the_end_of_the_flight_only():
     mission = a_mission(TRIANGLE, 3, phases)
     s = slots(mission, "triangle") + HEIGHT
     records = [
-        PhaseRecord("form", "establish", "slots", "triangle", 0.0, 4.0),
-        PhaseRecord("fly", "hold", "slots", "triangle", 4.0, 7.0),
-        PhaseRecord("stay", "hold", "slots", "triangle", 7.0, 10.0),
+        PhaseRecord("form", "establish", "tracking", "triangle", 0.0, 4.0),
+        PhaseRecord("fly", "hold", "tracking", "triangle", 4.0, 7.0),
+        PhaseRecord("stay", "hold", "tracking", "triangle", 7.0, 10.0),
     ]
     for lost, fails in [(0, True), (1, False), (2, True)]:
         p = np.array([s] * 6)
@@ -338,7 +338,7 @@ def a_waypoint(**miss: float) -> Verdict:
     target |= {"attitude": q.tolist(), "rates": [0.0, 0.0, math.radians(3)]}
     records = [
         PhaseRecord("form", "establish", "open", "triangle", 0.0, 4.0),
-        PhaseRecord("WP1", "fly", "slots", "triangle", 4.0, 10.0, None, target),
+        PhaseRecord("WP1", "fly", "tracking", "triangle", 4.0, 10.0, None, target),
     ]
     times, phase = [0.0, 4.0, 4.1, 7.0, 10.0], [0, 0, 1, 1, 1]
     triangle = slots(mission, "triangle") + HEIGHT
@@ -396,7 +396,7 @@ def two(
     mission = a_mission({}, 2, [{"kind": "hold", "until": 10.0}], limits=limits)
     p = np.array([[[0.0, 0, 10], [10.0, 0, 10]]] * 5)
     p[2, 1] = p[2, 0] + (gap + 0.5) * np.array(direction)
-    record = PhaseRecord("hold", "hold", "slots", None, 0.0, 10.0)
+    record = PhaseRecord("hold", "hold", "tracking", None, 0.0, 10.0)
     return assess(flown(mission, p, phases=[record]))
 
 
@@ -622,7 +622,7 @@ def test_a_phase_never_sampled_has_no_numbers():
     """A phase recorded in the moment the flight stopped is there, without numbers."""
     mission = a_mission(TRIANGLE, 3)
     flight = flown(mission, slots(mission, "triangle") + HEIGHT, complete=False)
-    flight.phases.append(PhaseRecord("next", "hold", "slots", "triangle", 10.0, 10.0))
+    flight.phases.append(PhaseRecord("next", "hold", "tracking", "triangle", 10.0, 10.0))
     last = assess(flight).phases[1]
     assert (last.finished, last.worst, last.shape, last.constraint) == (False, {}, None, None)
 
@@ -630,7 +630,7 @@ def test_a_phase_never_sampled_has_no_numbers():
 def test_one_agent_alone():
     """One agent has no edges, no separation and no shape, and passes."""
     mission = a_mission({}, 1, [{"kind": "hold", "until": 10.0}])
-    record = PhaseRecord("hold", "hold", "slots", None, 0.0, 10.0)
+    record = PhaseRecord("hold", "hold", "tracking", None, 0.0, 10.0)
     flight = flown(mission, [[0.0, 0, 10]], phases=[record], singular_value=np.full(5, np.nan))
     verdict = assess(flight)
     assert verdict.passed
@@ -648,7 +648,7 @@ def test_worst_values_know_when_and_who():
     mission = a_mission(TRIANGLE, 3, phases)
     records = [
         PhaseRecord("form", "establish", "open", "triangle", 0.0, 5.0),
-        PhaseRecord("hold", "hold", "slots", "triangle", 5.0, 10.0),
+        PhaseRecord("hold", "hold", "tracking", "triangle", 5.0, 10.0),
     ]
     verdict = assess(
         flown(
@@ -717,7 +717,7 @@ def test_names_in_a_mission_are_not_markup():
     mission = a_mission(TRIANGLE, 3, [{"name": "[/] [red]", "kind": "hold", "until": 10.0}])
     flight = flown(
         mission, slots(mission, "triangle") + HEIGHT,
-        phases=[PhaseRecord("[/] [red]", "hold", "slots", None, 0.0, 10.0)],
+        phases=[PhaseRecord("[/] [red]", "hold", "tracking", None, 0.0, 10.0)],
     )  # fmt: skip
     assert "[/] [red]" in printed(lambda: assess(flight), width=120)
 

@@ -89,7 +89,8 @@ BEYOND = [
     (HEAD + agents(20_000) + "radius = 1e8\n" + HOLD, "agents.radius", "199,990,000 pairs of agents touch"),
     (
         HEAD + "[agents]\nmass = 1\nposition = {shape = 'line', size = 1, count = 1}\n"
-        + formation("line", 1.0, "'tree'") + ESTABLISH, "formations.f.edges", "1 points have no three edges",
+        + formation("line", 1.0, "'henneberg-multilevel'") + ESTABLISH, "formations.f.edges",
+        "1 points have no three edges",
     ),
 ]  # fmt: skip
 
@@ -209,7 +210,7 @@ def checked(text: str) -> tuple[set[str], str]:
     """Topics of notes about what was passed over, and all words, of a check within 10 s of processor time."""
     begun = time.process_time()
     found = check(Mission.from_toml(text))
-    words = "\n".join(text for _, text in found.words())
+    words = "\n".join(text for _, text in found.describe())
     assert time.process_time() - begun < 10.0
     over = ("passed over", "take too long", "would take too long")
     return {r.topic for r in found.remarks if any(text in r.text for text in over)}, words

@@ -60,7 +60,7 @@ def base(tmp_path, monkeypatch) -> Iterator[Path]:
     monkeypatch.setattr(native, "_compile", lambda: [code(OWN)])
     monkeypatch.setattr(native, "_loaded", [])
     file = native._file()
-    file.write_bytes(native.joined([code(PLANTED)]))
+    file.write_bytes(native.concatenated([code(PLANTED)]))
     file.chmod(0o600)
     forget()
     yield folder

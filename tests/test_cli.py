@@ -185,7 +185,7 @@ def test_check(capsys):
     assert facts[-1] == "narrow-passage: nothing found that will fail"
     assert max(map(len, facts)) <= 80
     assert "infinitesimally rigid" in facts[1]
-    wp2 = "WP2 fly (35, 7.5, 20) m, (2, 0, 0) m/s, yaw 0° at 32 s slots"
+    wp2 = "WP2 fly (35, 7.5, 20) m, (2, 0, 0) m/s, yaw 0° at 32 s tracking"
     assert " ".join(phases[3].split()) == f"4 {wp2}"
 
 
@@ -426,9 +426,9 @@ def test_design_by_a_named_graph(capsys):
     assert graph["condition"] == pytest.approx(ends.condition)
     form = tomllib.loads(found["toml"])["formations"]["shells"]
     assert (form["edges"], form["reach"]) == ("neighbours", 1.8)
-    assert cli.main([*command, "tree"]) == cli.PASSED
+    assert cli.main([*command, "henneberg-multilevel"]) == cli.PASSED
     out, err = capsys.readouterr()
-    assert 'edges = "tree"' in out
+    assert 'edges = "henneberg-multilevel"' in out
     assert "894 of 894" in err
     assert "infinitesimally rigid" in err
 
@@ -456,9 +456,12 @@ def test_design_keeps_files(capsys):
         (["cube", "--edges", "neighbours", "--reach", "0"], "--reach must be a positive number"),
         (["sphere"], "give --agents"),
         (["cube", "--edges", "all"], "no graph is called 'all'"),
-        (["cube", "--edges", "tree", "--reach", "2"], "--reach has no effect"),
-        (["cube", "--edges", "tree", "--extra", "2"], "--extra and --range are of the search"),
-        (["square", "--edges", "joined"], "need slots"),
+        (["cube", "--edges", "henneberg-multilevel", "--reach", "2"], "--reach has no effect"),
+        (
+            ["cube", "--edges", "henneberg-multilevel", "--extra", "2"],
+            "--extra and --range are of the search",
+        ),
+        (["square", "--edges", "henneberg"], "need slots"),
         (["cube", "--agents", "7"], "takes 8 agents"),
         (["blob"], "neither a shape nor a file"),
         (["short.toml", "--size", "4"], "remove --agents and --size"),

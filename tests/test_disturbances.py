@@ -458,7 +458,7 @@ def test_the_lost_count_for_nothing_in_the_law(places, constraint, when, control
     edges = np.argwhere(np.triu(near, 1)) + 1
     change = {
         "kind": "establish", "formation": "f", "reference": "squares", "blend": 2.0, "duration": 3.0,
-        "control": "slots" if controlled else "open",
+        "control": "tracking" if controlled else "open",
     }  # fmt: skip
 
     def flown(who, lost):

@@ -390,5 +390,5 @@ def test_virtual_body_alone_does_not_leave_a_line():
     assert failed
     unfold = next(p for p in data["phases"] if p.get("name") == "unfold")
     assert all(f.phase == "unfold" for f in failed)
-    unfold["control"] = "slots"
+    unfold["control"] = "tracking"
     assert assess(simulate(Mission.from_dict(data))).passed

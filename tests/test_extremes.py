@@ -11,7 +11,7 @@ import pytest
 from rigidfleet.assessment import assess
 from rigidfleet.errors import FlightError
 from rigidfleet.math import proximity
-from rigidfleet.math.proximity import headroom, rooms
+from rigidfleet.math.proximity import headroom, obstacle_clearances
 from rigidfleet.mission import Mission, load_mission
 from rigidfleet.result import Extremum, Result
 from rigidfleet.simulation import extremes as watching
@@ -27,12 +27,12 @@ class Steps:
         self.rows: list[tuple[float, float, np.ndarray]] = []
         take = watching.Extremes.take
 
-        def spy(extremes: Any, program: Any, work: Any, state: Any, *, last: bool) -> None:
+        def spy(extremes: Any, problem: Any, work: Any, state: Any, *, last: bool) -> None:
             seen = int(extremes.monitor.monitor.flags[3])
             for row in range(seen, int(state.count[4])):
                 t, h = state.trail.clock[row]
                 self.rows.append((t, h, state.trail.points[row].copy()))
-            take(extremes, program, work, state, last=last)
+            take(extremes, problem, work, state, last=last)
 
         monkeypatch.setattr(watching.Extremes, "take", spy)
 
@@ -93,7 +93,7 @@ def sampled(mission: Mission, r: np.ndarray) -> dict[str, np.ndarray]:
     beyond = np.maximum(np.array(fence.min) - r, r - np.array(fence.max))
     return {
         "separation": apart.min(axis=1),
-        "clearance": rooms(r, radius, mission.obstacles)[0].min(axis=1),
+        "clearance": obstacle_clearances(r, radius, mission.obstacles)[0].min(axis=1),
         "separation_below": headroom(r, radius)[0],
         "geofence": -beyond.max(axis=(1, 2)),
         "lowest": r[..., 2].min(axis=1),
@@ -224,7 +224,7 @@ def a_crowd(formulation: str) -> Mission:
             "obstacles": [{"kind": "box", "min": [8, -1, 20], "max": [9, 1, 40]}],
             "limits": {"separation_below": 0.2},
             "phases": [
-                {"kind": "establish", "formation": "grid", "duration": 4.0, "control": "slots"},
+                {"kind": "establish", "formation": "grid", "duration": 4.0, "control": "tracking"},
                 {"kind": "turn", "roll_deg": 40.0, "pitch_deg": 20.0, "yaw_deg": 90.0, "duration": 3.0},
             ],
             "output_step": 0.5,
@@ -365,7 +365,7 @@ def test_forces_of_a_large_formation_are_found_between_steps(solver):
     mission = a_sphere(solver)
     result = simulate(mission)
     (method,) = result.statistics["solvers"]
-    assert method == "nodes"
+    assert method == "sparse"
     first = result.phases[0].extremes
     for name in ("thrust", "acceleration", "constraint_force", "tension"):
         x, wide = first[name], np.linspace(-0.1, 0.1, 101)
@@ -383,7 +383,7 @@ def test_to_watch_a_large_formation_does_not_change_its_flight(form, monkeypatch
     watched = simulate(mission)
     assert watched.phases[0].extremes
 
-    def pass_over(extremes: Any, program: Any, work: Any, state: Any, *, last: bool) -> None:
+    def pass_over(extremes: Any, problem: Any, work: Any, state: Any, *, last: bool) -> None:
         state.count[4] = 0
 
     monkeypatch.setattr(watching.Extremes, "take", pass_over)

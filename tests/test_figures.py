@@ -111,7 +111,7 @@ def a_flight(
     }  # fmt: skip
     records = [
         PhaseRecord(
-            name, "fly" if k or formation is None else "establish", "slots",
+            name, "fly" if k or formation is None else "establish", "tracking",
             None if formation is None else "shape", float(a), float(b), None,
             {"time": float(b), "position": [15.0, 15.0, 15.0], "velocity": [0.0, 0.0, 0.0],
              "attitude": q[-1].tolist(), "rates": [0.0, 0.0, 0.0]} if k else None,

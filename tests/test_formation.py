@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from rigidfleet.errors import MissionError
 from rigidfleet.formation import distance_geometry, graphs, point_files, shapes
 from rigidfleet.math import rigid_body
-from rigidfleet.planning.solvers import sweep_steps
+from rigidfleet.planning.solvers import elimination_steps
 from rigidfleet.rigidity import jacobian, spectrum
 
 NAMED = [
@@ -434,7 +434,7 @@ def test_neighbours_reach_so_many_spacings():
 def test_joined_is_minimally_rigid(n):
     """Three edges each, from the centre outwards: 3N - 6 in all, of full rank."""
     p = np.random.default_rng(n).normal(size=(n, 3))
-    edges = graphs.joined(p)
+    edges = graphs.henneberg(p)
     assert edges.shape == (3 * n - 6, 2)
     assert np.linalg.matrix_rank(jacobian(p, edges)) == 3 * n - 6
 
@@ -443,11 +443,11 @@ def test_joined_is_minimally_rigid(n):
 def test_trees_are_minimally_rigid(n):
     """3N - 6 edges of full rank, each agent joined to three of those that come before; of chains of length log N."""
     p = shapes.slots("sphere", 2.0, n)
-    edges = graphs.coarse_to_fine(p)
+    edges = graphs.henneberg_multilevel(p)
     assert len(np.unique(edges, axis=0)) == 3 * n - 6
     assert (edges[:, 0] < edges[:, 1]).all()
     assert np.linalg.matrix_rank(jacobian(p, edges)) == 3 * n - 6
-    steps = sweep_steps(n, edges)
+    steps = elimination_steps(n, edges)
     assert steps is not None
     depth = np.zeros(n, dtype=int)
     for i, *mine in steps.tolist():
@@ -462,13 +462,13 @@ def test_trees_hold_lattices_better_and_shells_at_all():
     lattice = np.stack(np.meshgrid(side, side, side, indexing="ij"), axis=-1).reshape(-1, 3)
     tree, joined = (
         spectrum(lattice, graph(lattice), np.ones(512))
-        for graph in (graphs.coarse_to_fine, graphs.joined)
+        for graph in (graphs.henneberg_multilevel, graphs.henneberg)
     )
     assert tree.index > 3 * joined.index
     assert tree.condition < joined.condition / 2
     shell = shapes.slots("sphere", 2.0, 500)
-    assert spectrum(shell, graphs.joined(shell), np.ones(500)).free > 0
-    assert spectrum(shell, graphs.coarse_to_fine(shell), np.ones(500)).index > 0.01
+    assert spectrum(shell, graphs.henneberg(shell), np.ones(500)).free > 0
+    assert spectrum(shell, graphs.henneberg_multilevel(shell), np.ones(500)).index > 0.01
 
 
 @pytest.mark.parametrize("n", [40, 41, 300])
@@ -490,7 +490,7 @@ def test_joined_of_a_lattice_has_good_pivots():
     """On a lattice, whose points lie in planes, no agent is joined within a plane."""
     side = np.arange(6.0)
     p = np.stack(np.meshgrid(side, side, side, indexing="ij"), axis=-1).reshape(-1, 3)
-    edges = graphs.joined(p)
+    edges = graphs.henneberg(p)
     assert np.linalg.svd(jacobian(p, edges), compute_uv=False)[-1] > 0.01
     with pytest.raises(ValueError, match="need slots"):
-        graphs.joined(p[:36])
+        graphs.henneberg(p[:36])

@@ -26,11 +26,11 @@ from rigidfleet.kernel.engine import native
 from rigidfleet.kernel.engine.native import is_compiled
 from rigidfleet.kernel.problem import (
     EXACT,
-    SLOTS,
+    SHAPE,
     SQUARED,
+    ConstraintLaw,
     Feedback,
-    Law,
-    Program,
+    Problem,
     Reference,
     Workspace,
     workspace,
@@ -38,7 +38,7 @@ from rigidfleet.kernel.problem import (
 from rigidfleet.kernel.problem import graph as kernel_graph
 from rigidfleet.math import attitude
 from rigidfleet.mission import Mission
-from rigidfleet.planning.plan import Situation, plan_phase
+from rigidfleet.planning.plan import PhaseState, plan_phase
 from rigidfleet.simulation.flight import simulate
 
 # Central differences of sixth order: errors of h^6 and eps/h.
@@ -76,13 +76,13 @@ def a_mission(**changes: Any) -> Mission:
     return Mission.from_dict(data | changes)
 
 
-def a_program(mission: Mission, index: int = 0, now: Situation | None = None) -> Program:
-    """The program of a phase, begun at the mission's initial state unless told otherwise."""
+def a_problem(mission: Mission, index: int = 0, now: PhaseState | None = None) -> Problem:
+    """The problem of a phase, begun at the mission's initial state unless told otherwise."""
     phase = mission.phases[index]
     if now is None:
         agents = mission.agents
-        now = Situation(0.0, np.array(agents.position), np.array(agents.velocity))
-    return plan_phase(mission, phase, now).program
+        now = PhaseState(0.0, np.array(agents.position), np.array(agents.velocity))
+    return plan_phase(mission, phase, now).problem
 
 
 def random_vectors(seed: int, n: int, scale: float = 1.0) -> np.ndarray:
@@ -125,7 +125,7 @@ def test_slots_and_distances_move_as_their_derivatives_say(turn):
     edges = np.array([(i, j) for i in range(n) for j in range(i + 1, n)])
     zero = np.zeros(0)
     p0, dp = random_vectors(1, n, 3.0), random_vectors(2, n)
-    ref = Reference(SLOTS, 0.5, 4.0, zero, zero, p0, dp, np.array(turn))
+    ref = Reference(SHAPE, 0.5, 4.0, zero, zero, p0, dp, np.array(turn))
 
     def slots(t: float) -> np.ndarray:
         p = np.zeros((3, n, 3))
@@ -566,7 +566,7 @@ def test_only_edges_that_share_an_agent_are_assembled():
     graph = kernel_graph(edges, m)
     w = workspace(6, 6)
     at_rest = np.zeros((6, 3))
-    law = Law(1.0, 1.0, 0.0, EXACT, 0.0, 1, 0.0, 0.0, 0.0)
+    law = ConstraintLaw(1.0, 1.0, 0.0, EXACT, 0.0, 1, 0.0, 0.0, 0.0)
     constraint.right_side(r, at_rest, np.zeros(6), at_rest, graph.edges, law, w)
     constraint.assemble(w.u, graph, 1.7, 0.3, w.A)
     J = jacobian(r, edges)
@@ -578,7 +578,7 @@ def test_only_edges_that_share_an_agent_are_assembled():
 # -- the closed loop -------------------------------------------------------------------------------
 
 
-def a_flight_with_a_turn() -> tuple[Program, Workspace]:
+def a_flight_with_a_turn() -> tuple[Problem, Workspace]:
     """A reshaping that turns its slots on a body that moves and turns: every term is at work."""
     mission = a_mission(
         formations={
@@ -599,22 +599,22 @@ def a_flight_with_a_turn() -> tuple[Program, Workspace]:
             {"kind": "reshape", "formation": "second", "duration": 5.0},
         ],
     )
-    now = Situation(0.0, np.array(mission.agents.position), np.zeros((3, 3)))
-    fly = plan_phase(mission, mission.phases[1], now).program
+    now = PhaseState(0.0, np.array(mission.agents.position), np.zeros((3, 3)))
+    fly = plan_phase(mission, mission.phases[1], now).problem
     shape = random_vectors(3, 3, 2.0)
     ref = Reference(
-        SLOTS, 0.0, 4.0, np.zeros(3), np.zeros(3), shape, random_vectors(4, 3), np.array([0.3, 0.9, -0.4])
+        SHAPE, 0.0, 4.0, np.zeros(3), np.zeros(3), shape, random_vectors(4, 3), np.array([0.3, 0.9, -0.4])
     )  # fmt: skip
     return fly._replace(reference=ref), workspace(3, 0)
 
 
 def test_desired_agents_move_as_their_derivatives_say():
     """Desired positions of agents on a body that moves, turns and reshapes: velocity, acceleration."""
-    program, w = a_flight_with_a_turn()
+    problem, w = a_flight_with_a_turn()
 
     def desired(t: float) -> np.ndarray:
-        references.blend_slots(t, program.reference, w.p, w.p_dot, w.p_ddot)
-        control.reference_motion(t, program.motion, w)
+        references.blend_slots(t, problem.reference, w.p, w.p_dot, w.p_ddot)
+        control.reference_motion(t, problem.motion, w)
         control.desired_agents(w)
         return np.array([w.r_ref, w.v_ref, w.a_ref])
 
@@ -627,10 +627,10 @@ def test_desired_agents_move_as_their_derivatives_say():
 
 def test_reference_motion_goes_on_after_its_end():
     """After the last knot the body keeps its velocity and its rates, and accelerates no more."""
-    program, w = a_flight_with_a_turn()
-    control.reference_motion(5.0, program.motion, w)
+    problem, w = a_flight_with_a_turn()
+    control.reference_motion(5.0, problem.motion, w)
     end = w.body.copy()
-    control.reference_motion(5.5, program.motion, w)
+    control.reference_motion(5.5, problem.motion, w)
     np.testing.assert_allclose(w.body[0], end[0] + 0.5 * end[1], rtol=0, atol=1e-12)
     np.testing.assert_allclose(w.body[1], end[1], rtol=0, atol=1e-12)
     np.testing.assert_array_equal(w.body[2], np.zeros(3))
@@ -657,7 +657,7 @@ def test_gains_are_interpolated_over_the_time_to_go():
 # -- the integrator --------------------------------------------------------------------------------
 
 
-def a_dumbbell() -> tuple[Program, Workspace, Any]:
+def a_dumbbell() -> tuple[Problem, Workspace, Any]:
     """Two unequal masses that turn about each other at a fixed distance, and their exact motion."""
     m, d, omega = np.array([1.0, 2.0]), 4.0, 1.3
     mission = a_mission(
@@ -667,7 +667,7 @@ def a_dumbbell() -> tuple[Program, Workspace, Any]:
         formations={"shape": {"distances": [d]}},
         body_frame={},
     )
-    program = a_program(mission)._replace(has_frame=True)
+    problem = a_problem(mission)._replace(has_frame=True)
     out = np.array([-2 * d / 3, d / 3])
 
     def exact(t: float) -> np.ndarray:
@@ -678,18 +678,18 @@ def a_dumbbell() -> tuple[Program, Workspace, Any]:
         q = [math.cos(omega * t / 2), 0.0, 0.0, math.sin(omega * t / 2)]
         return np.concatenate([r.ravel(), v.ravel(), [0.0], q])
 
-    return program, workspace(2, 1), exact
+    return problem, workspace(2, 1), exact
 
 
 def fixed_steps(h: float, t_end: float, sampled: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """State at t_end, and the dense output, of the dumbbell in steps of exactly h."""
-    program, w, exact = a_dumbbell()
+    problem, w, exact = a_dumbbell()
     state = records.integrator(exact(0.0), 0.0, rtol=1e6, atol=np.full(17, 1e6))
     samples = np.empty((len(sampled), 17))
     for step in range(round(t_end / h)):
         state.clock[1] = h  # whatever the step control would like
         fresh = step == 0
-        native.integrate(program, w, state, t_end + 1.0, fresh, sampled, samples, 1)
+        native.integrate(problem, w, state, t_end + 1.0, fresh, sampled, samples, 1)
     assert state.clock[0] == pytest.approx(t_end)
     return state.y, samples
 
@@ -723,12 +723,12 @@ def test_order_of_the_dense_output():
 
 def test_error_follows_the_tolerance():
     """A hundred times tighter tolerance makes the flight ten times as exact at the least."""
-    program, w, exact = a_dumbbell()
+    problem, w, exact = a_dumbbell()
     errors = []
     for rtol in (1e-5, 1e-7, 1e-9, 1e-11):
         state = records.integrator(exact(0.0), 0.0, rtol=rtol, atol=np.full(17, rtol / 100))
         status = native.integrate(
-            program, w, state, 5.0, True, np.zeros(0), np.zeros((0, 17)), 100_000
+            problem, w, state, 5.0, True, np.zeros(0), np.zeros((0, 17)), 100_000
         )
         assert status == records.FINISHED
         assert state.clock[0] == 5.0
@@ -741,14 +741,14 @@ def test_error_follows_the_tolerance():
 def test_a_flight_that_pauses_goes_on_as_if_it_had_not(pause):
     """Stopping after any number of steps changes no bit of states, samples or counts."""
     mission = a_mission()
-    program = a_program(mission)
+    problem = a_problem(mission)
     y0 = np.concatenate([np.ravel(mission.agents.position), np.zeros(12)])
     times = np.linspace(0.0, 6.0, 121)
 
     def fly(steps: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
         state = records.integrator(y0, 0.0, rtol=1e-8, atol=np.full(21, 1e-10))
         samples, w, pauses, fresh = np.zeros((121, 21)), workspace(3, 3), 0, True
-        while native.integrate(program, w, state, 6.0, fresh, times, samples, steps):
+        while native.integrate(problem, w, state, 6.0, fresh, times, samples, steps):
             fresh = False
             pauses += 1
         return state.y, samples, state.count, pauses
@@ -829,10 +829,10 @@ assert set(second.translated) == (set(function.__name__ for function in theirs) 
 @pytest.mark.parametrize("change", ["type", "order", "dimensions"])
 def test_the_kernel_refuses_other_types(change):
     """Arrays of another type, layout or dimension than those that the code is made for are an error, not a crash."""
-    program = a_program(a_mission())
-    r = program.control.force
+    problem = a_problem(a_mission())
+    r = problem.control.force
     wrong = {"type": r.astype(np.float32), "order": np.asfortranarray(r), "dimensions": r.ravel()}
-    other = program._replace(control=program.control._replace(force=wrong[change]))
+    other = problem._replace(control=problem.control._replace(force=wrong[change]))
     with pytest.raises(TypeError):
         native.closed_loop(0.0, np.zeros(21), np.zeros(21), other, workspace(3, 3))
 

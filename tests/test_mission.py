@@ -194,7 +194,7 @@ def test_attitude_inherits_weights():
 
 @pytest.mark.parametrize(
     ("architecture", "controls"),
-    [("local", ["slots", "slots", "slots"]), ("body", ["open", "body", "body"])],
+    [("local", ["tracking", "tracking", "tracking"]), ("body", ["open", "body", "body"])],
 )
 def test_control_follows_architecture(architecture, controls):
     """Locally every phase tracks slots; the virtual body is controlled once it is established."""
@@ -305,13 +305,13 @@ def large(**form) -> dict[str, Any]:
 
 
 def test_graphs_have_names():
-    """'neighbours', 'joined' and 'tree' are the graphs that the functions of those names make."""
+    """'neighbours', 'henneberg' and 'henneberg-multilevel' are the graphs that the functions of those names make."""
     p = shapes.slots("sphere", 2.0, 30)
     for form, want in (
         ({"edges": "neighbours"}, graphs.neighbours(p)),
         ({"edges": "neighbours", "reach": 1.2}, graphs.neighbours(p, 1.2)),
-        ({"edges": "joined"}, graphs.joined(p)),
-        ({"edges": "tree"}, graphs.coarse_to_fine(p)),
+        ({"edges": "henneberg"}, graphs.henneberg(p)),
+        ({"edges": "henneberg-multilevel"}, graphs.henneberg_multilevel(p)),
     ):
         np.testing.assert_array_equal(Mission.from_dict(large(**form)).formation_edges("f"), want)
 
@@ -319,13 +319,13 @@ def test_graphs_have_names():
 @pytest.mark.parametrize(
     ("form", "key", "words"),
     [
-        ({"edges": "joined", "reach": 1.5}, "formations.f.reach", "has no effect"),
-        ({"edges": "joined", "shape": "grid"}, "formations.f.edges", "need slots"),
+        ({"edges": "henneberg", "reach": 1.5}, "formations.f.reach", "has no effect"),
+        ({"edges": "henneberg", "shape": "grid"}, "formations.f.edges", "need slots"),
         ({"edges": "neighbours", "distances": [1.0]}, "formations.f.edges", "needs places"),
         (
             {"edges": "all"},
             "formations.f.edges",
-            "must be 'complete', 'neighbours', 'joined' or 'tree'",
+            "must be 'complete', 'neighbours', 'henneberg' or 'henneberg-multilevel'",
         ),
     ],
 )
@@ -497,8 +497,8 @@ def test_missions_cross_processes():
         (("phases/0/formation", "triangel"), "phases[1].formation", "no such", "'triangle'?"),
         (("phases/0/formation", REMOVED), "phases[1].formation", "is missing", "name of the"),
         (("phases/0/kind", "reshape"), "phases[1].kind", "no formation yet", "establish"),
-        (("phases/0/control", "body"), "phases[1].control", "architecture is 'local'", "slots"),
-        (("phases/1/control", "open"), "phases[2].control", "nothing would steer", "slots"),
+        (("phases/0/control", "body"), "phases[1].control", "architecture is 'local'", "tracking"),
+        (("phases/1/control", "open"), "phases[2].control", "nothing would steer", "tracking"),
         (("phases/0/input_force", [1, 0, 0]), "phases[1].input_force", "no effect", "open"),
         (("phases/1/position", REMOVED), "phases[2].position", "is missing", "[m]"),
         (("phases/1", {"kind": "turn", "duration": 3.0}), "phases[2]", "no angle", "yaw_deg"),
@@ -749,7 +749,7 @@ def test_planar_start_cannot_leave_its_plane():
     (finding,) = findings(base=base)
     assert "start on one plane" in finding.problem
     data = changed(
-        ("phases/0/control", "slots"), ("phases/0/input_force", [0.0, 0.0, 0.0]), base=base
+        ("phases/0/control", "tracking"), ("phases/0/input_force", [0.0, 0.0, 0.0]), base=base
     )
     assert Mission.from_dict(data)
 
@@ -926,7 +926,7 @@ JUNK = st.one_of(
     st.integers(),
     st.floats(),
     st.text(max_size=4),
-    st.sampled_from(["open", "slots", "body", "step", "distances", "complete", "cube", "fly"]),
+    st.sampled_from(["open", "tracking", "body", "step", "distances", "complete", "cube", "fly"]),
     st.lists(st.floats(-9, 9), max_size=4),
     st.lists(st.lists(st.integers(-1, 9), max_size=3), max_size=9),
     st.dictionaries(

@@ -65,8 +65,8 @@ def flight(word: Callable[[str], str]) -> Result:
     target = {"time": 10.0, "position": [5.0, 0.0, 5.0]}
     pair = word("pair")
     phases = [
-        PhaseRecord(word("first"), "establish", "slots", pair, 0.0, 5.0),
-        PhaseRecord(word("second"), "fly", "slots", pair, 5.0, 10.0, None, target),
+        PhaseRecord(word("first"), "establish", "tracking", pair, 0.0, 5.0),
+        PhaseRecord(word("second"), "fly", "tracking", pair, 5.0, 10.0, None, target),
     ]
     return swarm(
         2,

@@ -70,13 +70,16 @@ def test_planned_way_is_the_flown(name):
     record = simulate(flown)
     way, known = preview(flown)
     assert known
-    for leg, phase in zip(way, flown.phases, strict=True):
-        if phase.control != "slots":
+    for planned, phase in zip(way, flown.phases, strict=True):
+        if phase.control != "tracking":
             continue
-        inside = (record.time > leg.time[0]) & (record.time < leg.time[-1])
+        inside = (record.time > planned.time[0]) & (record.time < planned.time[-1])
         t = record.time[inside]
         at = np.array(
-            [[np.interp(t, leg.time, x) for x in agent.T] for agent in leg.position.swapaxes(0, 1)]
+            [
+                [np.interp(t, planned.time, x) for x in agent.T]
+                for agent in planned.position.swapaxes(0, 1)
+            ]
         )
         # After an open phase by distances the flight begins a little off the guess.
         assert np.abs(at.transpose(2, 0, 1) - record.position[inside]).max() < 0.04
@@ -102,7 +105,7 @@ assert not {"numba", "llvmlite", "rigidfleet.kernel.engine", "matplotlib"} & set
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
-@pytest.mark.parametrize(("control", "fails"), [("open", {"formation"}), ("slots", set())])
+@pytest.mark.parametrize(("control", "fails"), [("open", {"formation"}), ("tracking", set())])
 def test_flexible_formations(control, fails):
     """A square of four sides fails where distances alone hold it, and is a note where slots do."""
     phases = [{"kind": "establish", "formation": "square", "control": control, "until": 5.0}]
@@ -120,7 +123,7 @@ def test_collisions():
     assert "collision" in failures(found)
     topics = {remark.topic for remark in found.remarks}
     assert "assignment" in topics
-    assert found.assignments["shortest"].way < 0.1
+    assert found.assignments["shortest"].path_length < 0.1
     assert check(mission()).passed
 
 
@@ -241,7 +244,7 @@ def test_way_that_nobody_knows():
     ]  # fmt: skip
     found = check(mission(formations={"ring": some}, phases=phases))
     assert found.judged_to == 2.0
-    assert [leg.phase for leg in found.legs] == ["hold 1"]
+    assert [planned.phase for planned in found.planned_phases] == ["hold 1"]
     assert found.formations[0].rigidity is None
 
 
@@ -370,7 +373,7 @@ def test_disturbances_and_their_thrust_are_told():
     assert d.offset[0] == pytest.approx(np.hypot(1.2 / m[0], 0.981) / 2)
     flown = simulate(disturbed)
     assert flown.thrust.max() < d.thrust[0] < 1.2 * flown.thrust.max()
-    told = dict(found.words())["disturbances"]
+    told = dict(found.describe())["disturbances"]
     for part in (
         "steady wind up to 1.2 N",
         "gusts (3 sigma) up to 0.6 N",
@@ -385,7 +388,7 @@ def test_disturbances_and_their_thrust_are_told():
 def test_losses_are_told_and_judged_as_if_flown_on():
     """A vehicle to be lost is named with its time, and a note says that its way is judged to the end."""
     found = check(mission(disturbances={"lost": [{"agent": 3, "time": 7.5}]}))
-    assert "agent 3 is lost at 7.5 s" in dict(found.words())["disturbances"]
+    assert "agent 3 is lost at 7.5 s" in dict(found.describe())["disturbances"]
     assert any("as if agent 3 flew on" in remark.text for remark in found.remarks)
     assert found.passed
 
@@ -394,7 +397,7 @@ def test_calm_missions_tell_of_no_disturbances():
     """Without [disturbances] there is no line about them."""
     found = check(mission())
     assert found.disturbed is None
-    assert "disturbances" not in dict(found.words())
+    assert "disturbances" not in dict(found.describe())
     assert found.data()["disturbances"] is None
 
 
@@ -453,7 +456,7 @@ PUBLISHED = {
 }
 
 
-@pytest.mark.parametrize("control", ["open", "slots"])
+@pytest.mark.parametrize("control", ["open", "tracking"])
 @pytest.mark.parametrize("name", PUBLISHED)
 def test_published_formations(name, control):
     """Each gets its verdict; by distances alone flexible ones fail the check, by slots none; all of them fly."""

@@ -13,7 +13,7 @@ from sample_flights import swarm
 from rigidfleet.errors import ResultError
 from rigidfleet.plotting import agent_colours
 from rigidfleet.web.replay import html_page, replay
-from rigidfleet.web.replay.pack import Column, pack
+from rigidfleet.web.replay.pack import PackedColumn, pack
 from rigidfleet.web.replay.scene import thrust_directions
 
 EIGHT = swarm(8, 90.0)
@@ -54,7 +54,9 @@ def test_packed_values_return():
     values = rng.normal(scale=50.0, size=(40, 3, 2))
     values[10:20, 1] = np.nan
     values[5, 0, 0] = np.inf
-    described, text = pack({"a": Column(values, 0.01), "b": Column(values[:, 0, 1], 0.5)})
+    described, text = pack(
+        {"a": PackedColumn(values, 0.01), "b": PackedColumn(values[:, 0, 1], 0.5)}
+    )
     assert [(c["name"], c["width"]) for c in described] == [("a", 6), ("b", 1)]
     found = unpacked(described, text, 40)
     a = found["a"].reshape(values.shape)

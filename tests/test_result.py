@@ -56,7 +56,7 @@ def a_result(
     rest: dict[str, Any] = {
         "phases": [
             PhaseRecord("first", "establish", "open", "triangle", 0.0, t[half - 1], settled=True),
-            PhaseRecord("second", "fly", "slots", None, t[half - 1], 20.0, None, target),
+            PhaseRecord("second", "fly", "tracking", None, t[half - 1], 20.0, None, target),
         ],
         "mission_text": MISSION,
         "statistics": {"steps": 12, "wall": 0.1, "compiled": False, "events": [1, None]},

@@ -10,10 +10,10 @@ from scipy.spatial.transform import Rotation
 
 from rigidfleet.formation import distance_geometry, graphs, shapes
 from rigidfleet.math.constraint_jacobian import smallest_singular_value
-from rigidfleet.rigidity import Kind, Verdict, analyse, full_rank, jacobian, realisations
+from rigidfleet.rigidity import Kind, RigidityClass, analyse, full_rank, jacobian, realisations
 
-RIGID, STABLE = Verdict.INFINITESIMALLY_RIGID, Verdict.PRESTRESS_STABLE
-FLEXIBLE, UNDECIDED = Verdict.FLEXIBLE, Verdict.UNDECIDED
+RIGID, STABLE = RigidityClass.INFINITESIMALLY_RIGID, RigidityClass.PRESTRESS_STABLE
+FLEXIBLE, UNDECIDED = RigidityClass.FLEXIBLE, RigidityClass.UNDECIDED
 SEEDS = st.integers(0, 2**32 - 1)
 SPREAD = np.array([[-1, -2, -3], [2, 1, 0.5], [0.3, 2, 1], [1.5, -0.7, 2], [-2, 1.1, -0.4]])
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from rigidfleet.formation import shapes
-from rigidfleet.rigidity import Verdict, analyse
+from rigidfleet.rigidity import RigidityClass, analyse
 
 
 def _benchmark() -> Any:
@@ -89,7 +89,7 @@ def test_nearly_blocked_flexes_are_undecided():
     """A graph whose stress all but blocks every flex gets a verdict, of doubt."""
     case = table.random_case(61, 1)
     result = analyse(case.slots, table.edges_of(case, "redundant"))
-    assert result.verdict is Verdict.UNDECIDED
+    assert result.verdict is RigidityClass.UNDECIDED
 
 
 @pytest.mark.long

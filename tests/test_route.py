@@ -80,19 +80,21 @@ def random_reshape(seed: int) -> Mission:
     )  # fmt: skip
 
 
-def least_and_promised(mission: Mission, legs: list[np.ndarray]) -> list[tuple[float, float]]:
+def least_and_promised(
+    mission: Mission, planned_phases: list[np.ndarray]
+) -> list[tuple[float, float]]:
     """For each change the least distance of all pairs at its samples, and D / sqrt(2)."""
     spacing = [pdist(np.array(mission.agents.position)).min()]
     spacing += [pdist(np.array(form.slots)).min() for form in mission.formations.values()]
     return [
-        (min(pdist(p).min() for p in leg), min(spacing[k : k + 2]) / np.sqrt(2))
-        for k, leg in enumerate(legs)
+        (min(pdist(p).min() for p in planned), min(spacing[k : k + 2]) / np.sqrt(2))
+        for k, planned in enumerate(planned_phases)
     ]
 
 
 def planned_ways(seed: int) -> list[tuple[float, float]]:
     mission = random_reshape(seed)
-    return least_and_promised(mission, [leg.position for leg in preview(mission)[0]])
+    return least_and_promised(mission, [planned.position for planned in preview(mission)[0]])
 
 
 def flown_ways(seed: int) -> list[tuple[float, float]]:
@@ -138,8 +140,8 @@ def test_the_first_establishment_keeps_its_room(assignment, attitude):
             data["phases"][0]["roll_deg"] = 70.0 * seed
         del data["formations"]["two"]
         mission = Mission.from_dict(data)
-        legs = [leg.position for leg in preview(mission)[0]]
-        ((least, promised),) = least_and_promised(mission, legs)
+        planned_phases = [planned.position for planned in preview(mission)[0]]
+        ((least, promised),) = least_and_promised(mission, planned_phases)
         assert least >= promised * (1 - 1e-12), seed
 
 
@@ -186,9 +188,11 @@ def test_the_way_back_keeps_its_room():
     a, b = scattered(rng, 20), scattered(rng, 20)
     phases = [establish("a"), reshape("b"), reshape("a", name="again")]
     mission = fly({"a": a, "b": b}, a, phases, assignment="each", agents={"radius": 0.0})
-    legs = preview(mission)[0]
+    planned_phases = preview(mission)[0]
     promised = min(pdist(a).min(), pdist(b).min()) / np.sqrt(2)
-    assert min(pdist(p).min() for leg in legs[1:] for p in leg.position) >= promised
+    assert (
+        min(pdist(p).min() for planned in planned_phases[1:] for p in planned.position) >= promised
+    )
 
 
 WALL = [[2.0 * (k % 5), 0.0, 2.0 * (k // 5)] for k in range(25)]
@@ -405,8 +409,8 @@ def test_a_formation_is_established_as_it_is_drawn(keys, before, turned, formula
 
 
 def planned_end_is_flown(mission: Mission, result: Any) -> bool:
-    legs, known = preview(mission)
-    end = about_centre(legs[-1].position[-1])
+    planned_phases, known = preview(mission)
+    end = about_centre(planned_phases[-1].position[-1])
     return known and bool(np.abs(end - about_centre(result.position[-1])).max() < 1e-3)
 
 
@@ -434,7 +438,7 @@ def test_a_free_attitude_is_the_nearest():
     assert result.phases[0].target is None
 
 
-@pytest.mark.parametrize("control", ["open", "slots"])
+@pytest.mark.parametrize("control", ["open", "tracking"])
 def test_distances_alone_have_a_free_attitude(control):
     """Nothing turns agents that track no slots, or slots without axes: a turned tetrahedron stays as it is turned."""
     slots = shapes.slots("tetrahedron", 4.0, 4)

@@ -14,11 +14,11 @@ from rigidfleet import physics
 from rigidfleet.assessment import assess
 from rigidfleet.errors import FlightError
 from rigidfleet.formation import distance_geometry, graphs, shapes
-from rigidfleet.kernel.problem import SLOTS, SQUARED
+from rigidfleet.kernel.problem import SHAPE, SQUARED
 from rigidfleet.math import attitude, lqr
 from rigidfleet.mission import Establish, Mission, load_mission, mission_names
 from rigidfleet.planning.plan import plan_phase
-from rigidfleet.planning.reference import ByEdge, Situation, led_by
+from rigidfleet.planning.reference import ByEdge, PhaseState, reference_kind
 from rigidfleet.result import Result
 from rigidfleet.rigidity import jacobian
 from rigidfleet.simulation.flight import FlightInterrupted, Observation, Progress, simulate
@@ -223,7 +223,7 @@ def test_a_show_of_a_thousand_vehicles():
     record = flown("show-1000")
     assert assess(record).passed
     assert record.separation.min() > 1.0
-    assert record.statistics["solvers"]["nodes"]["failures"] == 0
+    assert record.statistics["solvers"]["sparse"]["failures"] == 0
     # All vehicles are alike: each place to land is taken, by whomever it is nearest for.
     away, who = KDTree(record.position[0]).query(record.position[-1])
     assert away.max() < 1e-2
@@ -245,7 +245,7 @@ def leader(mission: Mission, start: np.ndarray) -> str:
     assert isinstance(phase, Establish)
     slots = mission.formation_slots(phase.formation)
     assert slots is not None
-    return led_by(mission, phase, start, slots)
+    return reference_kind(mission, phase, start, slots)
 
 
 @pytest.mark.parametrize(
@@ -278,8 +278,8 @@ def test_distances_lead_by_squares_where_an_affine_map_leads_to_the_slots(slots,
     )
     phase = mission.phases[0]
     assert leader(mission, start @ turn) == by
-    plan = plan_phase(mission, phase, Situation(0.0, start @ turn, 0 * start))
-    assert plan.program.reference.kind == {"squares": SQUARED, "shape": SLOTS}[by]
+    plan = plan_phase(mission, phase, PhaseState(0.0, start @ turn, 0 * start))
+    assert plan.problem.reference.kind == {"squares": SQUARED, "shape": SHAPE}[by]
     result = simulate(mission)
     wanted = distance_geometry.distances(slots, result.edges)
     np.testing.assert_allclose(result.distance_reference[0], result.distance[0], rtol=1e-12)
@@ -763,7 +763,7 @@ def test_body_architecture_diagnoses_the_flip_out_of_a_line():
     result = simulate(Mission.from_dict(data), force=sideways)
     assert not result.complete
     assert result.time[-1] == 79.0
-    for part in ("'triangle' has flipped", "79.00 s", "180 deg", 'control = "slots"'):
+    for part in ("'triangle' has flipped", "79.00 s", "180 deg", 'control = "tracking"'):
         assert part in result.ending
 
 
@@ -772,7 +772,7 @@ def test_tracking_slots_out_of_the_line_avoids_the_flip():
     data: Data = load_mission("narrow-passage").to_dict() | {"architecture": "body"}
     phases = data["phases"]
     (unfold,) = (p for p in phases if p.get("name") == "unfold")
-    unfold["control"] = "slots"
+    unfold["control"] = "tracking"
     result = simulate(Mission.from_dict(data), force=sideways)
     assert result.complete
     assert result.thrust.max() <= 11.0
@@ -788,7 +788,7 @@ def test_both_architectures_fly_one_waypoint_alike():
     np.testing.assert_allclose(local.cm[fly], body.cm[fly], rtol=0, atol=1e-3)
     angle = attitude.angle_between(local.attitude[fly], body.attitude[fly])
     assert np.rad2deg(angle).max() < 0.05
-    assert {p.control for p in local.phases} == {"open", "slots"}
+    assert {p.control for p in local.phases} == {"open", "tracking"}
     assert {p.control for p in body.phases} == {"open", "body"}
 
 

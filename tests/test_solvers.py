@@ -9,7 +9,7 @@ import pytest
 from rigidfleet.formation import graphs, shapes
 from rigidfleet.kernel.large import block_cholesky
 from rigidfleet.kernel.large import solver as large
-from rigidfleet.kernel.problem import EXACT, ITERATED, Law, Vehicles, workspace
+from rigidfleet.kernel.problem import EXACT, ITERATED, ConstraintLaw, Vehicles, workspace
 from rigidfleet.mission import Mission
 from rigidfleet.planning import solvers
 from rigidfleet.rigidity import jacobian
@@ -30,14 +30,14 @@ def directions(p, edges) -> np.ndarray:
 
 def solver_of(p, edges, masses, law, *, sweep=False, tolerance=1e-13) -> large.LargeSolver:
     """A solver in the state p (N, 3)."""
-    law = Law(3.0, 12**0.5, 8.0, law, 0.03, 3, 0.1, 1e-12, 0.0)
+    law = ConstraintLaw(3.0, 12**0.5, 8.0, law, 0.03, 3, 0.1, 1e-12, 0.0)
     vehicles = Vehicles(
         masses, 1.0 / masses, float(masses.sum()), float(masses.mean()), masses, False, 9.81
     )
     work = workspace(len(p), len(edges), large=True)
     work.r[:] = p
     work.u[:] = directions(p, edges)
-    steps = solvers.sweep_steps(len(p), edges) if sweep else None
+    steps = solvers.elimination_steps(len(p), edges) if sweep else None
     order = partial(solvers.dissection, p, edges)
     return large.LargeSolver(vehicles, edges, law, work, steps, order, tolerance)
 
@@ -63,7 +63,7 @@ def rng():
 def test_sweep_vertex_graph_and_dense_factor_agree_on_the_exact_law(side, rng):
     """Undamped, of unequal masses, the three solves agree to 1e-9 where A is well conditioned."""
     p = lattice(side)
-    edges, masses = graphs.joined(p), rng.uniform(0.5, 2.0, len(p))
+    edges, masses = graphs.henneberg(p), rng.uniform(0.5, 2.0, len(p))
     b = rng.normal(size=len(edges))
     A = gram(p, edges, masses)
     assert np.linalg.cond(A) < 1e5
@@ -194,8 +194,8 @@ def test_factor_is_that_of_the_matrix(rng):
 def test_a_lost_pivot_falls_back_and_is_counted(rng):
     """Where an agent lies in a plane with its three, the sweep has no pivot; the vertex graph goes on."""
     p = lattice(3)
-    edges = graphs.joined(p)
-    steps = solvers.sweep_steps(27, edges)
+    edges = graphs.henneberg(p)
+    steps = solvers.elimination_steps(27, edges)
     assert steps is not None
     i, mine = steps[-1, 0], steps[-1, 1:]
     a, b, c = (int(x) for x in edges[mine].sum(axis=1) - i)
@@ -225,11 +225,11 @@ def test_what_is_not_finite_has_no_solution(rng):
     ("n", "count", "law", "method"),
     [
         (8, "complete", "iterated", "dense"),
-        (8, "joined", "exact", "dense"),
-        (64, "joined", "exact", "sweep"),
-        (64, "neighbours", "exact", "nodes"),
-        (64, "joined", "iterated", "nodes"),
-        (64, "neighbours", "iterated", "nodes"),
+        (8, "henneberg", "exact", "dense"),
+        (64, "henneberg", "exact", "elimination"),
+        (64, "neighbours", "exact", "sparse"),
+        (64, "henneberg", "iterated", "sparse"),
+        (64, "neighbours", "iterated", "sparse"),
         (64, "neighbours", "spectral", "dense"),
         (64, "neighbours", "pinv", "dense"),
     ],
@@ -239,7 +239,7 @@ def test_solve_is_chosen_by_size_law_and_graph(n, count, law, method):
     p = lattice(round(n ** (1 / 3)))
     made = {
         "complete": lambda: graphs.complete_graph(n),
-        "joined": lambda: graphs.joined(p),
+        "henneberg": lambda: graphs.henneberg(p),
         "neighbours": lambda: graphs.neighbours(p, 1.5),
     }
     assert solvers.choose(n, made[count](), law) == method
@@ -248,10 +248,10 @@ def test_solve_is_chosen_by_size_law_and_graph(n, count, law, method):
 def test_order_of_the_sweep_is_found_whatever_the_numbers(rng):
     """Each agent comes after the three it is joined to, and every edge once; a cube's graph has no such order."""
     p = lattice(5)
-    edges = graphs.joined(p)
+    edges = graphs.henneberg(p)
     for order in (np.arange(125), rng.permutation(125)):
         renamed = np.sort(order[edges], axis=1)
-        steps = solvers.sweep_steps(125, renamed)
+        steps = solvers.elimination_steps(125, renamed)
         assert steps is not None
         place = np.argsort(steps[:, 0])
         assert sorted(steps[:, 1:][steps[:, 1:] >= 0].tolist()) == list(range(len(edges)))
@@ -259,7 +259,7 @@ def test_order_of_the_sweep_is_found_whatever_the_numbers(rng):
             others = [renamed[e].sum() - i for e in mine if e >= 0]
             assert len(others) == min(s, 3)
             assert all(place[j] < s for j in others)
-    assert solvers.sweep_steps(8, graphs.CUBE_EDGES) is None
+    assert solvers.elimination_steps(8, graphs.CUBE_EDGES) is None
 
 
 def test_dissection_orders_every_agent_once():
@@ -272,7 +272,7 @@ def flight(law: str, kind: str, **integrator) -> Mission:
     """64 agents on a lattice, 2 cm off, that turn and are pushed."""
     p = lattice(4, seed=2)
     rest = np.rint(p)
-    edges = graphs.joined(rest) if kind == "joined" else graphs.neighbours(rest, 1.5)
+    edges = graphs.henneberg(rest) if kind == "henneberg" else graphs.neighbours(rest, 1.5)
     return Mission.from_dict(
         {
             "schema_version": 1,
@@ -302,9 +302,9 @@ def flight(law: str, kind: str, **integrator) -> Mission:
 @pytest.mark.parametrize(
     ("law", "kind", "method"),
     [
-        ("exact", "joined", "sweep"),
-        ("exact", "joined", "nodes"),
-        ("iterated", "neighbours", "nodes"),
+        ("exact", "henneberg", "elimination"),
+        ("exact", "henneberg", "sparse"),
+        ("iterated", "neighbours", "sparse"),
     ],
 )
 def test_flights_are_the_same_whatever_the_solve(law, kind, method, monkeypatch):
@@ -324,20 +324,20 @@ def test_flights_are_the_same_whatever_the_solve(law, kind, method, monkeypatch)
 
 def test_the_integral_does_not_set_the_step(monkeypatch):
     """Held to the tolerance of its distance, the integral of c costs no steps, and no accuracy of the place."""
-    monkeypatch.setattr(solvers, "FROM_SWEEP", 1)
+    monkeypatch.setattr(solvers, "FROM_ELIMINATION", 1)
     strict = simulate(
-        flight("exact", "joined", atol=1e-12, atol_velocity=1e-8, atol_integral=1e-14)
+        flight("exact", "henneberg", atol=1e-12, atol_velocity=1e-8, atol_integral=1e-14)
     )
-    loose = simulate(flight("exact", "joined", atol=1e-12, atol_velocity=1e-8))
+    loose = simulate(flight("exact", "henneberg", atol=1e-12, atol_velocity=1e-8))
     assert loose.statistics["steps"] < 0.8 * strict.statistics["steps"]
     np.testing.assert_allclose(loose.position, strict.position, atol=1e-6)
 
 
 def test_velocities_are_held_to_what_places_are():
     """In large formations, unless told otherwise: fewer steps, and places as near as their own tolerance asks."""
-    best = simulate(flight("exact", "joined", rtol=1e-10, atol=1e-10, atol_velocity=1e-10))
+    best = simulate(flight("exact", "henneberg", rtol=1e-10, atol=1e-10, atol_velocity=1e-10))
     strict, loose = (
-        simulate(flight("exact", "joined", rtol=1e-6, atol=1e-6, **given))
+        simulate(flight("exact", "henneberg", rtol=1e-6, atol=1e-6, **given))
         for given in ({"atol_velocity": 1e-6}, {})
     )
     assert loose.statistics["steps"] < 0.85 * strict.statistics["steps"]
@@ -346,11 +346,11 @@ def test_velocities_are_held_to_what_places_are():
 
 def test_large_formations_do_not_creep_into_a_phase(monkeypatch):
     """Their first step is found from two evaluations: fewer steps, and the same flight."""
-    found = simulate(flight("exact", "joined"))
+    found = simulate(flight("exact", "henneberg"))
     monkeypatch.setattr(
         import_module("rigidfleet.simulation.flight"), "_first_step", lambda *_: 1e-3
     )
-    crept = simulate(flight("exact", "joined"))
+    crept = simulate(flight("exact", "henneberg"))
     assert found.statistics["steps"] <= crept.statistics["steps"] - 2
     assert found.statistics["rejected"] <= crept.statistics["rejected"]
     np.testing.assert_allclose(found.position, crept.position, atol=1e-7)

@@ -7,12 +7,12 @@ from rigidfleet.formation import graphs, shapes
 from rigidfleet.rigidity import analyse, jacobian, spectrum
 
 
-@pytest.mark.parametrize("edges", [graphs.neighbours, graphs.joined])
+@pytest.mark.parametrize("edges", [graphs.neighbours, graphs.henneberg])
 def test_spectrum_is_that_of_the_dense_analysis(edges):
     """Lanczos finds the smallest and the largest eigenvalue of mbar A, of unequal masses."""
     rng = np.random.default_rng(4)
     p, masses = rng.normal(size=(40, 3)), rng.uniform(0.5, 2.0, 40)
-    graph = graphs.complete_graph(40)[::2] if edges is graphs.neighbours else graphs.joined(p)
+    graph = graphs.complete_graph(40)[::2] if edges is graphs.neighbours else graphs.henneberg(p)
     found, dense = spectrum(p, graph, masses), analyse(p, graph, masses=masses)
     assert found.free == 0
     assert found.w == pytest.approx(dense.w, rel=1e-6)
@@ -46,7 +46,7 @@ def test_a_crowd_of_free_motions_is_told_in_time():
     assert found.free > 0
 
 
-@pytest.mark.parametrize("graph", [graphs.neighbours, graphs.coarse_to_fine])
+@pytest.mark.parametrize("graph", [graphs.neighbours, graphs.henneberg_multilevel])
 def test_no_eigenvalue_of_a_shell_is_missed(graph):
     """Next to the six of rigid motions, which are equal, the lowest is found: that of the dense matrix."""
     p = shapes.slots("sphere", 2.0, 300)

@@ -9,12 +9,12 @@ import pytest
 from rigidfleet.kernel.compiler.simd import pack, unpack
 from rigidfleet.kernel.engine import codegen, native
 from rigidfleet.kernel.engine.tracer import Code, Trace, UnfitError, elimination_order, structure
-from rigidfleet.kernel.problem import Program, workspace
+from rigidfleet.kernel.problem import Problem, workspace
 from rigidfleet.mission import Mission
 from rigidfleet.planning.plan import plan_phase
-from rigidfleet.planning.reference import Situation
+from rigidfleet.planning.reference import PhaseState
 
-#: What a program is made of: its agents, and what differs from the default.
+#: What a problem is made of: its agents, and what differs from the default.
 CASES: dict[str, tuple[int, dict[str, Any]]] = {
     "the paper's law": (4, {"constraint": {"solver": "exact", "deformation_damping": 0.0}}),
     "the default law": (5, {}),
@@ -26,8 +26,8 @@ CASES: dict[str, tuple[int, dict[str, Any]]] = {
 }
 
 
-def make(agents: int, data: dict[str, Any]) -> tuple[Program, np.ndarray]:
-    """A program that establishes some shape from some other, and its start (n,)."""
+def make(agents: int, data: dict[str, Any]) -> tuple[Problem, np.ndarray]:
+    """A problem that establishes some shape from some other, and its start (n,)."""
     random = np.random.default_rng(agents)
     slots = random.uniform(-5.0, 5.0, (agents, 3))
     if "line" in data:
@@ -53,12 +53,12 @@ def make(agents: int, data: dict[str, Any]) -> tuple[Program, np.ndarray]:
     if "thrust_limit" in data:
         whole["agents"] |= {"thrust_limit": data["thrust_limit"], "saturate": True}
     mission = Mission.from_dict(whole)
-    now = Situation(0.0, r, np.zeros_like(r))
+    now = PhaseState(0.0, r, np.zeros_like(r))
     plan = plan_phase(mission, mission.phases[0], now)
-    return plan.program, r
+    return plan.problem, r
 
 
-def derivative(p: Program, y: np.ndarray, t: float) -> np.ndarray:
+def derivative(p: Problem, y: np.ndarray, t: float) -> np.ndarray:
     """dy/dt by the compiled kernel of single flights."""
     n, m = len(p.vehicles.m), len(p.graph.edges)
     w = workspace(n, m, solver=p.law.solver)
@@ -72,9 +72,9 @@ def call(p, y, dy, t):
     codegen._closed_loop(t, y, dy, p, None)
 
 
-def in_lanes(p: Program, y: np.ndarray, t: float) -> np.ndarray:
+def in_lanes(p: Problem, y: np.ndarray, t: float) -> np.ndarray:
     """dy/dt (8, n) of states y (8, n)."""
-    ready = codegen.straight(p)
+    ready = codegen.unrolled(p)
     before = pack(np.repeat(p.reference.d0[:, None], 8, axis=1))
     dy = pack(np.zeros_like(y.T))
     call(ready._replace(before=before), pack(y.T), dy, t)

@@ -365,13 +365,15 @@ TETRAHEDRON: dict[str, Any] = {
 STARTS = ["agents.position.*.* += normal(0, 1.5)", "agents.velocity.1 = uniform(-0.1, 0.1)"]
 
 
-def by_ends(*vary: str, mission: dict[str, Any] = TETRAHEDRON, runs: int | None = 20) -> Sweep:
-    return Sweep.of(Mission.from_dict(mission), vary or STARTS, runs=runs, seed=3, judged="ends")
+def by_final_states(
+    *vary: str, mission: dict[str, Any] = TETRAHEDRON, runs: int | None = 20
+) -> Sweep:
+    return Sweep.of(Mission.from_dict(mission), vary or STARTS, runs=runs, seed=3, evaluate="final")
 
 
 @pytest.fixture(scope="module")
 def ends(tmp_path_factory) -> Table:
-    return fly(by_ends(), tmp_path_factory.mktemp("ends"), workers=1)
+    return fly(by_final_states(), tmp_path_factory.mktemp("ends"), workers=1)
 
 
 def test_ends_are_those_of_whole_flights(ends):
@@ -392,23 +394,23 @@ def test_ends_are_those_of_whole_flights(ends):
         np.testing.assert_allclose(ends.metrics[name], of_rows, rtol=0, atol=1e-7)
     assert np.isnan(ends.metrics["thrust"]).all()
     bare = {"tetrahedron": TETRAHEDRON["formations"]["tetrahedron"] | {"edges": []}}
-    (row,) = fly_runs(by_ends(mission=TETRAHEDRON | {"formations": bare}, runs=1), [0])
+    (row,) = fly_runs(by_final_states(mission=TETRAHEDRON | {"formations": bare}, runs=1), [0])
     assert (row.reason, math.isnan(row.metrics["constraint_end"])) == ("shape", True)
 
 
 def test_ends_are_the_same_however_they_are_flown(ends, tmp_path, monkeypatch):
     """Bit for bit: after interruptions, with runs added, and by processes."""
-    fly(by_ends(runs=6), tmp_path / "a", workers=1)
-    assert numbers(fly(by_ends(), tmp_path / "a", workers=1)) == numbers(ends)
+    fly(by_final_states(runs=6), tmp_path / "a", workers=1)
+    assert numbers(fly(by_final_states(), tmp_path / "a", workers=1)) == numbers(ends)
     monkeypatch.setattr("rigidfleet.sweep.runner._WORTH", 0.0)
-    assert numbers(fly(by_ends(), tmp_path / "b", workers=2)) == numbers(ends)
-    with pytest.raises(ResultError, match="it differs in: what is judged"):
+    assert numbers(fly(by_final_states(), tmp_path / "b", workers=2)) == numbers(ends)
+    with pytest.raises(ResultError, match="it differs in: what is evaluated"):
         fly(Sweep.of(Mission.from_dict(TETRAHEDRON), STARTS, runs=20, seed=3), tmp_path / "a")
 
 
 def test_starts_that_cannot_be_are_rows(ends, tmp_path):
     """Agents at one place, or beyond all bounds, or too fast to go on: rows with the reason; others fly as ever."""
-    found = by_ends(
+    found = by_final_states(
         "agents.position.2.1 = grid(0, 3)",
         "agents.position.2.2 = grid(0)",
         "agents.position.1.3 *= grid(1, 1e300)",
@@ -429,7 +431,7 @@ def test_starts_that_are_no_mission_are_told_as_whole_flights_are(tmp_path):
         "agents.position.4.3 += grid(0, 1e-10, 1e-4, 1e8)",
         "agents.position.2.1 = grid(3, 1e-8)",
     )
-    found = by_ends(*vary, runs=None)
+    found = by_final_states(*vary, runs=None)
     rows = fly(found, tmp_path, workers=1)
     whole = fly_runs(Sweep.of(Mission.from_dict(TETRAHEDRON), vary), range(found.runs))
     refused = [row.reason == "mission" for row in whole]
@@ -444,7 +446,7 @@ def test_ends_are_flown_to_the_tolerances_of_the_mission(name, tmp_path):
     given = {"rtol": 1e-6, "atol": 1e-4}
     loose, tight = (TETRAHEDRON | {"integrator": given | more} for more in ({}, {name: 1e-12}))
     few, many = (
-        fly(by_ends(mission=m, runs=8), tmp_path / str(k), workers=1).metrics["evaluations"]
+        fly(by_final_states(mission=m, runs=8), tmp_path / str(k), workers=1).metrics["evaluations"]
         for k, m in enumerate((loose, tight))
     )
     assert (many > 2 * few).all()
@@ -453,35 +455,35 @@ def test_ends_are_flown_to_the_tolerances_of_the_mission(name, tmp_path):
 def test_what_ends_cannot_judge_is_refused(tmp_path):
     """Other missions and other variations are named, with the way out."""
     with pytest.raises(SweepError) as caught:
-        by_ends("agents.mass.* *= normal(1, 0.1)", "agents.position.1.1 = choice(0, 1)")
+        by_final_states("agents.mass.* *= normal(1, 0.1)", "agents.position.1.1 = choice(0, 1)")
     assert [f.key for f in caught.value.findings] == ["vary[1].path"]
-    assert "no --ends" in caught.value.findings[0].remedy
+    assert "no --final-states" in caught.value.findings[0].remedy
     tracked = TETRAHEDRON | {
         "phases": [{"kind": "establish", "formation": "tetrahedron", "until": 9.0}]
     }
     windy = TETRAHEDRON | {"disturbances": {"wind": [1, 0, 0]}}
     for mission, why in ((tracked, "is not flown open-loop"), (windy, "calm air")):
         with pytest.raises(SweepError, match=why):
-            by_ends(mission=mission)
+            by_final_states(mission=mission)
     file = tmp_path / "s.toml"
     file.write_text(
-        'mission = "establish-triangle"\nruns = 3\njudged = "end"\nvary = ["agents.position.*.* += normal(0, 1)"]'
+        'mission = "establish-triangle"\nruns = 3\nevaluate = "end"\nvary = ["agents.position.*.* += normal(0, 1)"]'
     )
-    with pytest.raises(SweepError, match="judged"):
+    with pytest.raises(SweepError, match="evaluate"):
         Sweep.load(file)
-    file.write_text(file.read_text().replace('"end"', '"ends"'))
-    assert Sweep.load(file).judged == "ends"
-    assert Sweep.from_json(Sweep.load(file).json()).judged == "ends"
+    file.write_text(file.read_text().replace('"end"', '"final"'))
+    assert Sweep.load(file).evaluate == "final"
+    assert Sweep.from_json(Sweep.load(file).json()).evaluate == "final"
 
 
 def test_the_command_judges_ends(capsys, tmp_path, monkeypatch):
-    """`--ends` flies starts, says so in the store, and cannot be put on a sweep that is there."""
+    """`--final-states` flies starts, says so in the store, and cannot be put on a sweep that is there."""
     monkeypatch.chdir(tmp_path)
     vary = ["--vary", "agents.position.*.* += normal(0, 0.3)", "--runs", "16", "--no-figures"]
-    assert cli.main(["sweep", "establish-triangle", *vary, "--ends"]) == 0
+    assert cli.main(["sweep", "establish-triangle", *vary, "--final-states"]) == 0
     assert "16 of 16 runs passed" in capsys.readouterr().out
-    assert read(tmp_path / "sweeps" / "establish-triangle").sweep.judged == "ends"
-    assert cli.main(["sweep", "sweeps/establish-triangle", "--ends"]) == 2
+    assert read(tmp_path / "sweeps" / "establish-triangle").sweep.evaluate == "final"
+    assert cli.main(["sweep", "sweeps/establish-triangle", "--final-states"]) == 2
     assert "goes on as it is" in capsys.readouterr().err
 
 

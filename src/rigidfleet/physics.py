@@ -20,10 +20,10 @@ from rigidfleet.kernel.problem import (
     PINV_INERTIA,
     PINV_INERTIA_FORCE,
     RIGID,
-    SLOTS,
+    SHAPE,
     SPECTRAL,
     SQUARED,
-    Law,
+    ConstraintLaw,
     Reference,
     Vehicles,
     workspace,
@@ -93,7 +93,7 @@ def constraint_force(
     w = workspace(n, e)
     w.d[:], w.d_dot[:], w.d_ddot[:] = d, d_dot, d_ddot
     v, f = _full(v, (n, 3), "v"), _full(f_E, (n, 3), "f_E")
-    law = Law(
+    law = ConstraintLaw(
         float(alpha), float(beta), float(gamma), _SOLVERS[solver], float(damping), int(iterations),
         float(threshold), float(cutoff), 0.0,
     )  # fmt: skip
@@ -178,7 +178,7 @@ def shape_schedule(
     p1 = _full(p1, p0.shape, "p1")
     dp = align_slots(about_cm(p0, m), about_cm(p1, m), m)[0] if align else p1 - p0
     zero = np.zeros(0)
-    ref = Reference(SLOTS, float(start), float(blend), zero, zero, p0, dp, np.zeros(3))
+    ref = Reference(SHAPE, float(start), float(blend), zero, zero, p0, dp, np.zeros(3))
     return _schedule(ref, _edges(edges, len(p0)), times)
 
 
@@ -203,7 +203,7 @@ def _schedule(ref: Reference, edges: Ints, times: ArrayLike) -> tuple[Floats, Fl
     p = np.zeros((3, *ref.p0.shape))
     out = np.zeros((3, len(t), len(edges)))
     for row, time in enumerate(t):
-        if ref.kind == SLOTS:
+        if ref.kind == SHAPE:
             references.blend_slots(time, ref, *p)
         references.distance_references(time, ref, edges, *p, *out[:, row])
     return out[0], out[1], out[2]

@@ -121,7 +121,7 @@ class PhaseRecord:
 
     Attributes
     ----------
-    name, kind, control : as in the mission; control is "open", "slots" or "body"
+    name, kind, control : as in the mission; control is "open", "tracking" or "body"
     formation : name of the formation held or approached, None if there is none yet
     t_start, t_end : mission time [s]
     settled : for a phase that ends by settling: whether it did; None for one that ends at a time
@@ -138,7 +138,7 @@ class PhaseRecord:
 
     name: str
     kind: Literal["establish", "fly", "reshape", "turn", "hold"]
-    control: Literal["open", "slots", "body"]
+    control: Literal["open", "tracking", "body"]
     formation: str | None
     t_start: float
     t_end: float

@@ -11,13 +11,13 @@ count from 1.
 from pathlib import Path
 
 from rigidfleet.assessment.checks import findings, notes
-from rigidfleet.assessment.measure import Flight
+from rigidfleet.assessment.measure import Measurements
 from rigidfleet.assessment.outcome import (
     FLIPPED,
     SHAPE_TOLERANCE,
     WAYPOINT_TOLERANCE,
+    CheckResult,
     Extreme,
-    Finding,
     PhaseVerdict,
     Waypoint,
 )
@@ -29,8 +29,8 @@ __all__ = [
     "FLIPPED",
     "SHAPE_TOLERANCE",
     "WAYPOINT_TOLERANCE",
+    "CheckResult",
     "Extreme",
-    "Finding",
     "PhaseVerdict",
     "Safety",
     "Verdict",
@@ -62,9 +62,9 @@ def assess(result: Result | str | Path) -> Verdict:
         The result, or the mission inside it, cannot be read.
     """
     result = as_result(result)
-    flight = Flight(result)
-    phases = [flight.phase(i, record) for i, record in enumerate(result.phases)]
-    verdict = Verdict(flight.mission.name, flight.mission.title, [], phases, [])
-    verdict.findings.extend(findings(flight, verdict))
-    verdict.notes.extend(notes(flight, phases))
+    measured = Measurements(result)
+    phases = [measured.phase(i, record) for i, record in enumerate(result.phases)]
+    verdict = Verdict(measured.mission.name, measured.mission.title, [], phases, [])
+    verdict.findings.extend(findings(measured, verdict))
+    verdict.notes.extend(notes(measured, phases))
     return verdict

@@ -6,14 +6,14 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from rigidfleet.assessment.measure import Flight, angle_between, is_rigid
+from rigidfleet.assessment.measure import Measurements, angle_between, is_rigid
 from rigidfleet.assessment.outcome import (
     DIP,
     FLIPPED,
     SHAPE_TOLERANCE,
     WAYPOINT_TOLERANCE,
+    CheckResult,
     Extreme,
-    Finding,
     PhaseVerdict,
     names,
     value,
@@ -30,39 +30,39 @@ _CONTACT = 1e-6
 _UNSEEN = 0.01
 
 
-def findings(flight: Flight, verdict: Verdict) -> Iterator[Finding]:
+def findings(measured: Measurements, verdict: Verdict) -> Iterator[CheckResult]:
     """Every check of a flight: of one that can fail in several phases all that do, else the worst."""
-    yield _complete(flight.result)
-    yield from _record(flight)
-    yield from _unseen(flight)
+    yield _complete(measured.result)
+    yield from _record(measured)
+    yield from _unseen(measured)
     candidates = [
         *_settled(verdict.phases),
-        *_shapes(flight, verdict.phases),
+        *_shapes(measured, verdict.phases),
         *_waypoints(verdict.phases),
     ]
     yield from _failures_or_worst(candidates)
     worst = verdict.worst
     if "separation" in worst:
-        yield _separation(flight, worst["separation"])
+        yield _separation(measured, worst["separation"])
     if "clearance" in worst:
-        yield from _clearances(flight)
-    if not flight.left.all():
-        yield _lost(flight)
-    limits = flight.mission.limits
+        yield from _clearances(measured)
+    if not measured.left.all():
+        yield _lost(measured)
+    limits = measured.mission.limits
     if limits.separation_below is not None:
-        yield _downwash(flight, limits.separation_below)
+        yield _downwash(measured, limits.separation_below)
     if limits.geofence is not None:
-        yield _geofence(flight, np.array(limits.geofence.min), np.array(limits.geofence.max))
+        yield _geofence(measured, np.array(limits.geofence.min), np.array(limits.geofence.max))
     yield _bounded("speed", worst.get("speed"), "m/s", limits.speed)
     yield _bounded("acceleration", worst.get("acceleration"), "m/s^2", limits.acceleration)
-    yield from _thrust(flight, worst.get("thrust"))
+    yield from _thrust(measured, worst.get("thrust"))
     units = {"constraint": "m", "constraint_force": "N", "tension": "N", "singular_value": ""}
     yield from (_bounded(name, worst[name], units[name], None) for name in units if name in worst)
 
 
-def _failures_or_worst(candidates: Iterable[Finding]) -> Iterator[Finding]:
+def _failures_or_worst(candidates: Iterable[CheckResult]) -> Iterator[CheckResult]:
     """Of the findings of each check all that fail, or else the one nearest to its limit."""
-    by_check: dict[str, list[Finding]] = {}
+    by_check: dict[str, list[CheckResult]] = {}
     for finding in candidates:
         by_check.setdefault(finding.check, []).append(finding)
     for found in by_check.values():
@@ -70,7 +70,7 @@ def _failures_or_worst(candidates: Iterable[Finding]) -> Iterator[Finding]:
         yield from failed or [max(found, key=lambda f: (f.worst or 0.0) / (f.limit or 1.0))]
 
 
-def _complete(result: Result) -> Finding:
+def _complete(result: Result) -> CheckResult:
     end = float(result.time[-1])
     finite = np.isfinite(result.position)
     if not finite.all():
@@ -78,26 +78,26 @@ def _complete(result: Result) -> Finding:
         bad = float(result.time[int(np.argmax(np.any(lost, axis=1)))])
         who = names(np.flatnonzero(np.any(lost, axis=0)))
         words = f"the position of {who} is not finite, first at {bad:.2f} s"
-        return Finding("complete", False, words, when=bad, who=who)
+        return CheckResult("complete", False, words, when=bad, who=who)
     if result.complete:
-        return Finding("complete", True, f"flown to its end at {end:.2f} s", when=end)
+        return CheckResult("complete", True, f"flown to its end at {end:.2f} s", when=end)
     words = f"incomplete, it ends at {end:.2f} s: {result.ending or 'it was stopped'}"
-    return Finding("complete", False, words, when=end, phase=result.phases[-1].name)
+    return CheckResult("complete", False, words, when=end, phase=result.phases[-1].name)
 
 
-def _record(flight: Flight) -> Iterator[Finding]:
+def _record(measured: Measurements) -> Iterator[CheckResult]:
     """A record that contradicts itself has been changed, and proves nothing."""
-    found = list(flight.contradictions())
+    found = list(measured.contradictions())
     if found:
         words, when = found[0]
         more = f", and {len(found) - 1} more like that" if len(found) > 1 else ""
         words = f"the record contradicts itself: {words}{more}. Fly the mission again"
-        yield Finding("record", False, words, when=when)
+        yield CheckResult("record", False, words, when=when)
 
 
-def _unseen(flight: Flight) -> Iterator[Finding]:
+def _unseen(measured: Measurements) -> Iterator[CheckResult]:
     """Ends of shaping phases and waypoints of which no sample tells: they are not judged, nor passed."""
-    result = flight.result
+    result = measured.result
     last = len(result.phases) - 1
     for i, p in enumerate(result.phases):
         if not result.complete and i == last:
@@ -108,7 +108,7 @@ def _unseen(flight: Flight) -> Iterator[Finding]:
         for what, t in moments.items():
             if t is None:
                 continue
-            seen = result.time[flight.samples[i]]
+            seen = result.time[measured.samples[i]]
             away = float(np.abs(seen - min(t, p.t_end)).min(initial=np.inf))
             if away > _UNSEEN:
                 nearest = (
@@ -117,35 +117,35 @@ def _unseen(flight: Flight) -> Iterator[Finding]:
                     else "it has no sample"
                 )
                 words = f"the {what} of phase '{p.name}' ({t:.2f} s) is not judged: {nearest}. Record it, too"
-                yield Finding("samples", False, words, away, _UNSEEN, "s", when=t, phase=p.name)
+                yield CheckResult("samples", False, words, away, _UNSEEN, "s", when=t, phase=p.name)
 
 
-def _settled(phases: list[PhaseVerdict]) -> Iterator[Finding]:
+def _settled(phases: list[PhaseVerdict]) -> Iterator[CheckResult]:
     for p in phases:
         if p.settled is not None:
             how = "settled after" if p.settled else "did not settle within"
             words = f"phase '{p.name}' {how} {p.t_end - p.t_start:.2f} s"
-            yield Finding("settled", p.settled, words, when=p.t_end, phase=p.name)
+            yield CheckResult("settled", p.settled, words, when=p.t_end, phase=p.name)
 
 
-def _shapes(flight: Flight, phases: list[PhaseVerdict]) -> Iterator[Finding]:
+def _shapes(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[CheckResult]:
     """Whether formations are what they should be, where they should be by then."""
     for i, p in enumerate(phases):
         shaping = p.kind in ("establish", "reshape") or i == len(phases) - 1
         if not (shaping and p.finished) or p.formation is None:
             continue
-        last = flight.samples[i].stop - 1
-        edges, _ = flight.edges(p.formation, last)
+        last = measured.samples[i].stop - 1
+        edges, _ = measured.edges(p.formation, last)
         held = False
         if p.distances is not None:
-            limit = SHAPE_TOLERANCE * float(flight.formation(p.formation)[2].min())
+            limit = SHAPE_TOLERANCE * float(measured.formation(p.formation)[2].min())
             held = p.distances <= limit
             words = f"{value(p.distances, 'm')} off (limit {value(limit, 'm')})"
             words = f"the worst of the {len(edges)} edges of '{p.formation}' is {words}"
             yield _at_end(p, "distances", held, words, p.distances, limit, "m")
-        if i not in flight.fits:
+        if i not in measured.fits:
             continue
-        fit = flight.fits[i]
+        fit = measured.fits[i]
         passed = fit.error <= fit.limit
         who = names(fit.pair)
         words = (
@@ -153,11 +153,11 @@ def _shapes(flight: Flight, phases: list[PhaseVerdict]) -> Iterator[Finding]:
             f" (limit {value(fit.limit, 'm')} off)"
         )
         if held and not passed:
-            left = flight.left[last]
-            form = flight.mission.formations[p.formation].shape
+            left = measured.left[last]
+            form = measured.mission.formations[p.formation].shape
             wanted = f"no {form}" if form else f"not the shape of '{p.formation}'"
             place = np.cumsum(left) - 1  # of each agent among those left
-            rigid = is_rigid(flight.result.position[last][left], place[edges])
+            rigid = is_rigid(measured.result.position[last][left], place[edges])
             state = "rigid, but" if rigid else "held by its edges, but"
             words = f"'{p.formation}' is {state} {wanted}: all {len(edges)} edges hold, yet {words}"
         elif not passed:
@@ -190,13 +190,15 @@ def _at_end(
     limit: float | None = None,
     unit: str = "",
     who: str = "",
-) -> Finding:
+) -> CheckResult:
     """A finding about the end of a phase."""
     words = f"at the end of phase '{p.name}' ({p.t_end:.2f} s) {words}"
-    return Finding(check, passed, words, worst, limit, unit, when=p.t_end, who=who, phase=p.name)
+    return CheckResult(
+        check, passed, words, worst, limit, unit, when=p.t_end, who=who, phase=p.name
+    )
 
 
-def _waypoints(phases: list[PhaseVerdict]) -> Iterator[Finding]:
+def _waypoints(phases: list[PhaseVerdict]) -> Iterator[CheckResult]:
     for name, limit in WAYPOINT_TOLERANCE.items():
         unit = {"position": "m", "velocity": "m/s", "attitude": "deg", "rates": "deg/s"}[name]
         for p in phases:
@@ -206,7 +208,7 @@ def _waypoints(phases: list[PhaseVerdict]) -> Iterator[Finding]:
                 words = f"{'met' if passed else 'missed'}, {value(miss, unit)} off in {name}"
                 words = f"the waypoint of phase '{p.name}' is {words} (limit {limit:g} {unit})"
                 check = f"waypoint_{name}"
-                yield Finding(check, passed, words, miss, limit, unit, when=when, phase=p.name)
+                yield CheckResult(check, passed, words, miss, limit, unit, when=when, phase=p.name)
 
 
 def _bounded(
@@ -218,11 +220,13 @@ def _bounded(
     *,
     passed: bool | None = None,
     at_least: bool = False,
-) -> Finding:
+) -> CheckResult:
     """A worst value against its limit, if it has one."""
     if e is None:
         words = words or f"no {check} to judge"
-        return Finding(check, True, words, None, limit, unit, at_least, judged=limit is not None)
+        return CheckResult(
+            check, True, words, None, limit, unit, at_least, judged=limit is not None
+        )
     if not words:
         name = check.replace("_", " ").replace("value", "value of J")
         who = f", {e.who}," if e.who else ""
@@ -231,35 +235,37 @@ def _bounded(
         words = f"{extreme} {name} {value(e.value, unit)}{who} at {e.when:.2f} s{bound}"
     if passed is None:
         passed = limit is None or e.value <= limit + _SLACK * max(1.0, abs(limit))
-    return Finding(
+    return CheckResult(
         check, passed, words, e.value, limit, unit, at_least, e.when, e.who, e.phase, limit is not None
     )  # fmt: skip
 
 
-def _separation(flight: Flight, e: Extreme) -> Finding:
-    limit = flight.mission.limits.separation or 0.0
+def _separation(measured: Measurements, e: Extreme) -> CheckResult:
+    limit = measured.mission.limits.separation or 0.0
     passed = e.value > 0 and e.value >= limit - _SLACK
     words = f"{e.who} come within {value(e.value, 'm')} of each other at {e.when:.2f} s"
     words += f" (limit {limit:g} m)"
     if e.value <= 0:
-        since = _since(flight, "separation", flight.close[0])
+        since = _since(measured, "separation", measured.close[0])
         depth = f"by {value(-e.value, 'm')} at {e.when:.2f} s"
         words = f"agents collide, first {since}; {e.who} overlap the most, {depth}"
     return _bounded("separation", e, "m", limit, words, passed=passed, at_least=True)
 
 
-def _since(flight: Flight, name: str, sampled: Floats) -> str:
+def _since(measured: Measurements, name: str, sampled: Floats) -> str:
     """When something first fell to zero, as far as samples and the worst of each phase tell."""
-    phases = range(len(flight.result.phases))
-    times = [e.when for k in phases if (e := flight.between(name, k)) is not None and e.value <= 0]
-    first = flight.first(sampled <= 0)
+    phases = range(len(measured.result.phases))
+    times = [
+        e.when for k in phases if (e := measured.between(name, k)) is not None and e.value <= 0
+    ]
+    first = measured.first(sampled <= 0)
     return f"by {min(times):.2f} s" if times and min(times) < first else f"at {first:.2f} s"
 
 
-def _clearances(flight: Flight) -> Iterator[Finding]:
+def _clearances(measured: Measurements) -> Iterator[CheckResult]:
     """Obstacles in flight; and apart from that, those on which vehicles stand at the start and at the end."""
-    found = {name: e for name, e in flight.clearances().items() if e is not None}
-    every = [*found.values(), flight.worst_clearance()]
+    found = {name: e for name, e in measured.clearances().items() if e is not None}
+    every = [*found.values(), measured.worst_clearance()]
     e = min((e for e in every if e is not None), key=lambda e: e.value)
     hit = e.value < -_CONTACT
     if not hit:
@@ -268,7 +274,7 @@ def _clearances(flight: Flight) -> Iterator[Finding]:
         agent, obstacle = e.who.split(", ", 1)
         words = f"{agent} comes within {value(e.value, 'm')} of '{obstacle}' at {e.when:.2f} s"
         if hit or e.value <= 0:
-            since = _since(flight, "clearance", flight.close[2])
+            since = _since(measured, "clearance", measured.close[2])
             depth = f"by {value(abs(e.value), 'm')} at {e.when:.2f} s"
             words = f"obstacles are hit, first {since}; {agent} is deepest in '{obstacle}', {depth}"
         yield _bounded("clearance", e, "m", 0.0, words, passed=e.value > 0, at_least=True)
@@ -281,12 +287,12 @@ def _clearances(flight: Flight) -> Iterator[Finding]:
             yield _bounded(name, e, "m", 0.0, words, passed=True, at_least=True)
 
 
-def _lost(flight: Flight) -> Finding:
+def _lost(measured: Measurements) -> CheckResult:
     """Vehicles that the mission loses: who is left is judged, and that nobody is hit."""
-    who = np.flatnonzero(~flight.left[-1])
-    when = flight.mission.lost_at[who]
+    who = np.flatnonzero(~measured.left[-1])
+    when = measured.mission.lost_at[who]
     told = ", ".join(f"agent {i + 1} at {t:.2f} s" for i, t in zip(who, when, strict=True))
-    e = flight.fallen_on()
+    e = measured.fallen_on()
     if e is None:
         return _bounded("lost", e, "m", 0.0, f"lost: {told}", at_least=True)
     words = (
@@ -298,8 +304,8 @@ def _lost(flight: Flight) -> Finding:
     return _bounded("lost", e, "m", 0.0, words, passed=e.value > 0, at_least=True)
 
 
-def _downwash(flight: Flight, limit: float) -> Finding:
-    e = flight.below()
+def _downwash(measured: Measurements, limit: float) -> CheckResult:
+    e = measured.below()
     if e is None:
         return _bounded("separation_below", e, "m", limit, "nobody is below another", at_least=True)
     passed = e.value >= limit - _SLACK
@@ -308,8 +314,8 @@ def _downwash(flight: Flight, limit: float) -> Finding:
     return _bounded("separation_below", e, "m", limit, words, passed=passed, at_least=True)
 
 
-def _geofence(flight: Flight, low: Floats, high: Floats) -> Finding:
-    e = flight.outside(low, high)
+def _geofence(measured: Measurements, low: Floats, high: Floats) -> CheckResult:
+    e = measured.outside(low, high)
     assert e is not None
     words = f"{e.who} comes within {value(-e.value, 'm')} of the geofence at {e.when:.2f} s"
     if e.value > 0:
@@ -317,13 +323,13 @@ def _geofence(flight: Flight, low: Floats, high: Floats) -> Finding:
     return _bounded("geofence", e, "m", 0.0, words)
 
 
-def _thrust(flight: Flight, e: Extreme | None) -> Iterator[Finding]:
+def _thrust(measured: Measurements, e: Extreme | None) -> Iterator[CheckResult]:
     """The vehicle that comes nearest to its own thrust limit; and the greatest thrust, where another one has that."""
-    beyond = flight.nearest_to_limit()
+    beyond = measured.nearest_to_limit()
     if e is None or beyond is None:
         yield _bounded("thrust", e, "N", None)
         return
-    limits = flight.mission.agents.thrust_limit
+    limits = measured.mission.agents.thrust_limit
 
     def limit(who: str) -> float:
         return float(limits[int(who.removeprefix("agent ")) - 1])
@@ -338,65 +344,65 @@ def _thrust(flight: Flight, e: Extreme | None) -> Iterator[Finding]:
 # -- notes -------------------------------------------------------------------------------------------
 
 
-def notes(flight: Flight, phases: list[PhaseVerdict]) -> Iterator[str]:
+def notes(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[str]:
     """What fails nothing and yet should be known."""
-    yield from _dips(flight)
-    yield from _turned_over(flight, phases)
-    yield from _fallen(flight)
-    agents = flight.mission.agents
+    yield from _dips(measured)
+    yield from _turned_over(measured, phases)
+    yield from _fallen(measured)
+    agents = measured.mission.agents
     if agents.saturate:
-        full = flight.thrust >= np.array(agents.thrust_limit) * (1 - 1e-6)
+        full = measured.thrust >= np.array(agents.thrust_limit) * (1 - 1e-6)
         if full.any():
-            who, since = names(np.flatnonzero(full.any(axis=0))), flight.first(full.max(axis=1))
+            who, since = names(np.flatnonzero(full.any(axis=0))), measured.first(full.max(axis=1))
             yield f"the thrust of {who} is cut off at its limit, first at {since:.2f} s"
-    yield from _sampled(flight)
+    yield from _sampled(measured)
 
 
-def _sampled(flight: Flight) -> Iterator[str]:
+def _sampled(measured: Measurements) -> Iterator[str]:
     """A record that does not say what happens between its samples."""
-    if any(not flight.result.phases[k].extremes for k in flight.flown):
-        step = float(np.diff(flight.result.time).max(initial=0.0))
+    if any(not measured.result.phases[k].extremes for k in measured.flown):
+        step = float(np.diff(measured.result.time).max(initial=0.0))
         yield (
             f"judged at samples alone, up to {step:.3g} s apart: the record does not tell what happens"
             " between them"
         )
 
 
-def _fallen(flight: Flight) -> Iterator[str]:
+def _fallen(measured: Measurements) -> Iterator[str]:
     """What becomes of vehicles that are lost."""
-    grounds = [o.height for o in flight.mission.obstacles if o.kind == "ground"]
-    radius = flight.mission.agents.radius
-    for i in np.flatnonzero(~flight.left[-1]):
-        r = flight.result.position[:, i]
-        words = f"agent {i + 1}, lost at {flight.mission.lost_at[i]:.2f} s,"
+    grounds = [o.height for o in measured.mission.obstacles if o.kind == "ground"]
+    radius = measured.mission.agents.radius
+    for i in np.flatnonzero(~measured.left[-1]):
+        r = measured.result.position[:, i]
+        words = f"agent {i + 1}, lost at {measured.mission.lost_at[i]:.2f} s,"
         down = r[:, 2] <= max(grounds) + radius[i] if grounds else np.zeros(len(r), dtype=np.bool_)
-        down &= ~flight.left[:, i]
+        down &= ~measured.left[:, i]
         if down.any():
             x, y, _ = r[-1]
-            yield f"{words} hits the ground at {flight.first(down):.2f} s and lies at ({x:.1f}, {y:.1f}) m"
+            yield f"{words} hits the ground at {measured.first(down):.2f} s and lies at ({x:.1f}, {y:.1f}) m"
         else:
             yield f"{words} has fallen to z = {r[-1, 2]:.1f} m when the flight ends"
 
 
-def _dips(flight: Flight) -> Iterator[str]:
+def _dips(measured: Measurements) -> Iterator[str]:
     """Agents below z = 0 where neither ground nor geofence would tell."""
-    mission = flight.mission
+    mission = measured.mission
     if mission.limits.geofence is not None or any(o.kind == "ground" for o in mission.obstacles):
         return
-    e = flight.height(lowest=True)
+    e = measured.height(lowest=True)
     if e is not None and e.value < -DIP:
-        z = flight.of_left(flight.result.position[..., 2])
+        z = measured.of_left(measured.result.position[..., 2])
         low = np.flatnonzero((z < -DIP).any(axis=0))
         others = f" ({names(low)} are below 0 at times)" if len(low) > 1 else ""
         words = f"dips to z = {e.value:.2f} m at {e.when:.2f} s{others}"
         yield f"{e.who} {words}; the mission has no ground"
 
 
-def _turned_over(flight: Flight, phases: list[PhaseVerdict]) -> Iterator[str]:
+def _turned_over(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[str]:
     """Planar formations that come back with another side up where nothing commands an attitude."""
     seen: dict[str, tuple[Floats, float]] = {}
     for i, p in enumerate(phases):
-        fit = flight.fits.get(i)
+        fit = measured.fits.get(i)
         if fit is None or p.formation is None or fit.dimension != 2 or p.flip is not None:
             continue
         if not p.finished or fit.error > fit.limit:

@@ -115,7 +115,7 @@ class Quantity:
         return np.maximum.reduceat(self.rank.reshape(-1), places * starts).tolist()
 
 
-class Flight:
+class Measurements:
     """Measures a result, phase by phase: at its samples, computed anew from positions and forces, and between them."""
 
     def __init__(self, result: Result) -> None:
@@ -130,13 +130,13 @@ class Flight:
         self._formations: dict[str, tuple[Floats | None, Ints, Floats]] = {}
         radius, obstacles = self.mission.agents.radius, self.mission.obstacles
         #: Room of each agent to obstacles, and the nearest one (K, N).
-        self.room, self.nearest = proximity.rooms(result.position, radius, obstacles)
+        self.room, self.nearest = proximity.obstacle_clearances(result.position, radius, obstacles)
         if not self.whole:
             self.room[~self.left] = np.inf
         #: Separation, pair, clearance, agent and obstacle at samples (K, ...).
         self.close = (
             *proximity.separation_of_left(result.position, radius, self.left),
-            *proximity.least_room(self.room, self.nearest),
+            *proximity.least_clearance(self.room, self.nearest),
         )
         thrust = _length(result.input_force + result.constraint_force)
         if self.mission.agents.saturate:
@@ -458,7 +458,7 @@ class Flight:
         # An attitude that is commanded decides; the integrated frame is where a plane should lie if none is.
         if fit.dimension == 2:
             references = [self.result.attitude_reference[k], self.result.frame[k]]
-        elif fit.dimension == 1 and record.control == "slots":
+        elif fit.dimension == 1 and record.control == "tracking":
             # Only tracked slots steer a line; else it keeps the direction of what it was folded from.
             references = [self.result.attitude_reference[k]]
         else:

@@ -52,7 +52,7 @@ class Extreme:
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class CheckResult:
     """One check.
 
     Attributes

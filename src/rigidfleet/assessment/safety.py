@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rigidfleet.assessment.measure import Flight
-from rigidfleet.assessment.outcome import Extreme, Finding
+from rigidfleet.assessment.measure import Measurements
+from rigidfleet.assessment.outcome import CheckResult, Extreme
 from rigidfleet.assessment.verdict import Verdict
 from rigidfleet.result import Result
 
@@ -55,7 +55,7 @@ def safety(result: Result, verdict: Verdict) -> list[Safety]:
 
     Limits are those of the verdict; the altitude's are those of the geofence.
     """
-    flight = Flight(result)
+    measured = Measurements(result)
     found = {finding.check: finding for finding in verdict.findings}
     return [
         _row(
@@ -64,11 +64,11 @@ def safety(result: Result, verdict: Verdict) -> list[Safety]:
         ),
         _row(
             "downwash", "least height between surfaces where one vehicle is below another",
-            found.get("separation_below"), "m", at_least=True, worst=flight.below(),
+            found.get("separation_below"), "m", at_least=True, worst=measured.below(),
         ),
         _row("speed", "greatest speed of a vehicle", found.get("speed"), "m/s"),
         _row("acceleration", "greatest acceleration of a vehicle", found.get("acceleration"), "m/s²"),
-        *_altitudes(flight),
+        *_altitudes(measured),
         _row(
             "geofence", "least room to the fence from inside, centres of the vehicles",
             _from_inside(found.get("geofence")), "m", at_least=True,
@@ -84,7 +84,7 @@ def safety(result: Result, verdict: Verdict) -> list[Safety]:
 def _row(
     quantity: str,
     text: str,
-    finding: Finding | None,
+    finding: CheckResult | None,
     unit: str,
     *,
     at_least: bool = False,
@@ -98,16 +98,16 @@ def _row(
     return Safety(quantity, text, unit, at_least, limit, worst, finding.passed)
 
 
-def _from_inside(finding: Finding | None) -> Finding | None:
+def _from_inside(finding: CheckResult | None) -> CheckResult | None:
     """The geofence's finding with the room inside it as its worst value, not how far outside."""
     if finding is None or finding.worst is None:
         return finding
     return replace(finding, worst=-finding.worst)
 
 
-def _altitudes(flight: Flight) -> list[Safety]:
-    fence = flight.mission.limits.geofence
-    lowest, highest = flight.height(lowest=True), flight.height(lowest=False)
+def _altitudes(measured: Measurements) -> list[Safety]:
+    fence = measured.mission.limits.geofence
+    lowest, highest = measured.height(lowest=True), measured.height(lowest=False)
     floor, ceiling = (None, None) if fence is None else (fence.min[2], fence.max[2])
     rows = [
         Safety("lowest", "least altitude of a vehicle's centre", "m", True, floor, lowest, True),

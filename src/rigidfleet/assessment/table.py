@@ -9,7 +9,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from rigidfleet.assessment.outcome import Finding, PhaseVerdict, value
+from rigidfleet.assessment.outcome import CheckResult, PhaseVerdict, value
 
 _PHASE = ["phase\n", "end\n[s]", "|c| at end\n[m]", "worst |c|\n[m]", "shape off\n[m]", "apart\n[m]",
           "clear\n[m]", "thrust\n[N]"]  # fmt: skip
@@ -20,7 +20,7 @@ _CHECK = ["check", "worst", "limit", "at [s]", "who or where", ""]
 def rendered(
     head: Text,
     phase_verdicts: Sequence[PhaseVerdict],
-    checks: Sequence[Finding],
+    checks: Sequence[CheckResult],
     last: Sequence[Text],
 ) -> RenderableType:
     """What rich prints of a verdict: its head, a table of phases, of waypoints and of checks, and its last lines."""
@@ -61,7 +61,7 @@ def _table(
     return table
 
 
-def check_row(f: Finding) -> list[str | Text]:
+def check_row(f: CheckResult) -> list[str | Text]:
     """A check as a row: name, worst, limit, when, who or where, and whether it holds."""
     mark = Text("ok", "green") if f.passed else Text("FAILED", "bold red")
     when = "" if f.when is None else f"{f.when:.2f}"
@@ -69,7 +69,7 @@ def check_row(f: Finding) -> list[str | Text]:
     return [name, _number(f.worst, f.unit), _bound(f), when, who, mark if f.judged else ""]
 
 
-def _bound(f: Finding) -> str:
+def _bound(f: CheckResult) -> str:
     if f.limit is None:
         return ""
     sign = (">=" if f.limit else ">") if f.at_least else "<="

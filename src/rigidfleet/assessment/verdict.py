@@ -15,8 +15,8 @@ from rigidfleet.assessment.outcome import (
     SENSE,
     SHAPE_TOLERANCE,
     WAYPOINT_TOLERANCE,
+    CheckResult,
     Extreme,
-    Finding,
     PhaseVerdict,
 )
 
@@ -47,7 +47,7 @@ class Verdict:
 
     mission: str
     title: str
-    findings: list[Finding]
+    findings: list[CheckResult]
     phases: list[PhaseVerdict]
     notes: list[str]
 

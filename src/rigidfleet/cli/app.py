@@ -32,7 +32,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 from cyclopts import App, CycloptsError, Parameter, UnusedCliTokensError
 
 from rigidfleet._version import __version__
-from rigidfleet.cli import console as screen
+from rigidfleet.cli import console
 from rigidfleet.cli.outputs import Files, taken
 from rigidfleet.errors import MissionError, RigidfleetError
 
@@ -80,38 +80,38 @@ def main(tokens: Sequence[str] | None = None) -> int:
         # Imports make a hundred thousand objects that stay: looked through as often as by default, they
         # would take a tenth longer.
         gc.set_threshold(100_000)
-        warnings.showwarning = cast("Any", screen.warn)
+        warnings.showwarning = cast("Any", console.warn)
         # Matrices are small here: threads over them wait for each other, and on a busy machine for long.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    screen.prepare_streams()
+    console.prepare_streams()
     try:
-        return app(tokens, console=screen.out(), error_console=screen.err()) or PASSED
+        return app(tokens, console=console.out(), error_console=console.err()) or PASSED
     except CycloptsError as error:
-        screen.complain(_usage(error))
+        console.complain(_usage(error))
         return BAD_INPUT
     except RigidfleetError as error:
-        screen.complain(error)
+        console.complain(error)
         return BAD_INPUT
     except BrokenPipeError:
-        screen.hang_up(sys.stdout)
+        console.hang_up(sys.stdout)
         return PASSED
     except OSError as error:  # a full disk and the like: no fault of the program
         if error.filename is None:
-            screen.hang_up(sys.stdout)
-        screen.complain(f"{error.filename or 'standard output'}: {error.strerror or error}")
+            console.hang_up(sys.stdout)
+        console.complain(f"{error.filename or 'standard output'}: {error.strerror or error}")
         return BAD_INPUT
     except KeyboardInterrupt:
-        screen.err().print("Interrupted", style="yellow")
+        console.err().print("Interrupted", style="yellow")
         return INTERRUPTED
     except MemoryError:
-        screen.complain(
+        console.complain(
             "There is too little memory for this. Use fewer agents, edges or samples, or a larger machine."
         )
         return BAD_INPUT
     except Exception as error:
         if sys.flags.dev_mode:
             raise
-        screen.complain(_own_fault(error))
+        console.complain(_own_fault(error))
         return BAD_INPUT
 
 
@@ -163,7 +163,7 @@ def run(
     flown = load_mission(mission)
     files = Files(out or Path("flights", flown.name), flown.name)
     files.claim(replace=force)
-    watch = None if quiet else screen.FlightWatch()
+    watch = None if quiet else console.FlightWatch()
     with watch or nullcontext():
         result, interrupted = _fly(flown, watch)
 
@@ -178,9 +178,9 @@ def run(
     verdict = assess(result)
     write_file(files.verdict, (verdict.json() + "\n").encode())
     if json:
-        screen.print_exactly(verdict.json() + "\n")
+        console.print_exactly(verdict.json() + "\n")
     elif not quiet:
-        screen.out().print(verdict)
+        console.out().print(verdict)
     what = "what flew is saved, marked incomplete," if interrupted else "the flight is saved"
     if not interrupted:
         try:
@@ -191,10 +191,12 @@ def run(
         except KeyboardInterrupt:
             interrupted = True
     if not (json or quiet):
-        screen.out().print()
+        console.out().print()
         _list(files)
     if interrupted:
-        screen.err().print(f"Interrupted: {what} in {files.result}", style="yellow", soft_wrap=True)
+        console.err().print(
+            f"Interrupted: {what} in {files.result}", style="yellow", soft_wrap=True
+        )
         return INTERRUPTED
     return PASSED if verdict.passed else FAILED
 
@@ -217,17 +219,17 @@ def missions(
     if print_ and schema:
         raise RigidfleetError("--print and --schema exclude each other. Give one of them.")
     if print_:
-        screen.print_exactly(mission_text(print_))
+        console.print_exactly(mission_text(print_))
     elif schema:
-        screen.print_json(json_schema())
+        console.print_json(json_schema())
     else:
         import tomllib
 
-        table = screen.table("mission", "what it shows", "in the paper")
+        table = console.table("mission", "what it shows", "in the paper")
         for name in mission_names():
             head = tomllib.loads(mission_text(name))
             table.add_row(name, head.get("title", ""), head.get("source", ""))
-        screen.print_table(table)
+        console.print_table(table)
     return PASSED
 
 
@@ -258,7 +260,7 @@ def check(
     """
     from rigidfleet.mission import counted, ending, goal, load_mission
 
-    watch = screen.CheckWatch(mission)
+    watch = console.CheckWatch(mission)
     try:
         with watch:
             found = load_mission(mission)
@@ -269,7 +271,7 @@ def check(
             {"key": f.key, "value": f.value, "problem": f.problem, "remedy": f.remedy}
             for f in error.findings
         ]
-        screen.print_json({"mission": mission, "right": False, "findings": findings})
+        console.print_json({"mission": mission, "right": False, "findings": findings})
         return BAD_INPUT
     from rigidfleet.preflight.check import check as preflight
 
@@ -281,20 +283,20 @@ def check(
         judged = {f.name: f.rigidity for f in ahead.formations}
         draw_graphs(found, judged, figure)
     if json:
-        screen.print_json({"mission": mission, "right": True} | _facts(found) | ahead.data())
+        console.print_json({"mission": mission, "right": True} | _facts(found) | ahead.data())
         return PASSED if ahead.passed else FAILED
-    table = screen.table("#", "phase", "kind", "to", "ends", "control")
+    table = console.table("#", "phase", "kind", "to", "ends", "control")
     for n, phase in enumerate(found.phases, start=1):
         table.add_row(str(n), phase.name, phase.kind, goal(phase), ending(phase), phase.control)
-    screen.out().print(f"{found.name}: right: {counted(found)}")
-    screen.print_table(table)
-    screen.out().print()
-    screen.print_words(ahead.words())
+    console.out().print(f"{found.name}: right: {counted(found)}")
+    console.print_table(table)
+    console.out().print()
+    console.print_words(ahead.describe())
     if ahead.remarks:
-        screen.out().print()
-        screen.print_words((remark.level, remark.text) for remark in ahead.remarks)
+        console.out().print()
+        console.print_words((remark.level, remark.text) for remark in ahead.remarks)
     verdict = "nothing found that will fail" if ahead.passed else "it will fail as it is"
-    screen.out().print(f"\n{found.name}: {verdict}", style=None if ahead.passed else "bold red")
+    console.out().print(f"\n{found.name}: {verdict}", style=None if ahead.passed else "bold red")
     return PASSED if ahead.passed else FAILED
 
 
@@ -331,7 +333,7 @@ def design(
     sensing_range : float
         No edge is longer than this [m].
     edges : str
-        Do not search, but take this graph: complete, neighbours, joined or tree.
+        Do not search, but take this graph: complete, neighbours, henneberg or henneberg-multilevel.
     reach : float
         How far edges "neighbours" reach, in distances of nearest neighbours; 1.9 if not given.
     out : Path
@@ -372,21 +374,21 @@ def design(
         write_file(out, text.encode())
     if json:
         found = {what: data for what, (data, _) in judged.items()}
-        screen.print_json({"name": name, "toml": text, "limits": limits, "graphs": found})
+        console.print_json({"name": name, "toml": text, "limits": limits, "graphs": found})
         return PASSED
-    table = screen.table("graph", "edges", "rank", "index", "cond.", "longest", "verdict")
+    table = console.table("graph", "edges", "rank", "index", "cond.", "longest", "verdict")
     for what, (_, cells) in judged.items():
         table.add_row(what, *cells)
-    console = (
-        screen.out() if out is not None else screen.err()
+    output = (
+        console.out() if out is not None else console.err()
     )  # so that the formation alone can be piped
-    console.print(table)
+    output.print(table)
     if limits:
-        console.print(limits)
+        output.print(limits)
     if out is None:
-        screen.print_exactly(text)
+        console.print_exactly(text)
     else:
-        console.print(f"Formation  {out}", soft_wrap=True)
+        output.print(f"Formation  {out}", soft_wrap=True)
     return PASSED
 
 
@@ -504,8 +506,7 @@ def new(
     json : bool
         Print what was written as JSON. Ask nothing.
     """
-    from rigidfleet.mission import Mission, counted
-    from rigidfleet.mission import draft as drafts
+    from rigidfleet.mission import Mission, counted, draft
     from rigidfleet.preflight.check import check as preflight
     from rigidfleet.result import write_file
 
@@ -514,14 +515,14 @@ def new(
         "thrust_limit": thrust_limit, "waypoints": to,
     }  # fmt: skip
     asked = {key: value for key, value in given.items() if value is not None}
-    if not (asked or quiet or json) and sys.stdin.isatty() and screen.err().is_terminal:
+    if not (asked or quiet or json) and sys.stdin.isatty() and console.err().is_terminal:
         name, asked = _ask(name)
     file = Path(name or "mission")
     file = file if file.suffix == ".toml" else file.with_name(f"{file.name}.toml")
     if file.exists() and not force:
         raise RigidfleetError(f"{file}: exists already and is kept. Replace it by --force.")
     try:
-        text = drafts.draft(file.stem, file=str(file), **asked)
+        text = draft.draft(file.stem, file=str(file), **asked)
     except ValueError as error:
         raise RigidfleetError(str(error)) from None
     mission = Mission.from_toml(text, str(file))
@@ -532,10 +533,10 @@ def new(
         )
     write_file(file, text.encode())
     if json:
-        screen.print_json({"file": str(file)} | _facts(mission))
+        console.print_json({"file": str(file)} | _facts(mission))
     elif not quiet:
-        screen.out().print(f"{file}: {counted(mission)}", soft_wrap=True)
-        screen.out().print(f"Fly it by: rigidfleet run {file}", soft_wrap=True)
+        console.out().print(f"{file}: {counted(mission)}", soft_wrap=True)
+        console.out().print(f"Fly it by: rigidfleet run {file}", soft_wrap=True)
     return PASSED
 
 
@@ -592,19 +593,19 @@ def report(
     verdicts = [assess(record) for record in records]
     if json:
         found = [verdict.to_dict() for verdict in verdicts]
-        screen.print_json(found if others else found[0])
+        console.print_json(found if others else found[0])
     files.make_folder()
     if others:
         labels = _labels(paths, records)
         if not (json or quiet):
             for label, verdict in zip(labels, verdicts, strict=True):
-                screen.out().print(f"{label}: {verdict.summary}", soft_wrap=True)
+                console.out().print(f"{label}: {verdict.summary}", soft_wrap=True)
         _write_report(records, verdicts, page, labels=labels, quiet=quiet)
         if not (json or quiet):
-            screen.out().print(f"\nReport   {page}", soft_wrap=True)
+            console.out().print(f"\nReport   {page}", soft_wrap=True)
     else:
         if not (json or quiet):
-            screen.out().print(verdicts[0])
+            console.out().print(verdicts[0])
         drawn = [] if no_figures else _of_formats(files.figures, format)
         made = [files.verdict, files.report, *drawn]
         kept = [] if force else [path for path in made if path.exists()]
@@ -615,11 +616,11 @@ def report(
         if files.report not in kept:
             _write_report(records, verdicts, files.report, quiet=quiet)
         if not (json or quiet):
-            screen.out().print()
+            console.out().print()
             _list(files)
         if kept and not quiet:
-            screen.err().print(
-                f"{screen.count(len(kept), 'file')} kept as before; --force makes them again"
+            console.err().print(
+                f"{console.count(len(kept), 'file')} kept as before; --force makes them again"
             )
     return PASSED if all(verdict.passed for verdict in verdicts) else FAILED
 
@@ -644,7 +645,7 @@ def replay(result: Path, /, *, out: Path | None = None, force: bool = False) -> 
     if page.exists() and not force:
         raise taken(page)
     _write_replay(record, page)
-    screen.out().print(f"Replay   {page}", soft_wrap=True)
+    console.out().print(f"Replay   {page}", soft_wrap=True)
     return PASSED
 
 
@@ -676,7 +677,7 @@ def live(
 
     flown = load_mission(mission)
     if not is_compiled():
-        screen.err().print(screen.COMPILING)
+        console.err().print(console.COMPILING)
     from rigidfleet.assessment import assess
     from rigidfleet.result import write_file
     from rigidfleet.web.live import live as fly
@@ -689,14 +690,14 @@ def live(
         result.save(files.result)
         verdict = assess(result)
         write_file(files.verdict, (verdict.json() + "\n").encode())
-        screen.out().print(verdict)
-        screen.out().print()
+        console.out().print(verdict)
+        console.out().print()
         _list(files)
         return f"It is saved in {files.result}."
 
     def ready(url: str) -> None:
-        screen.out().print(f"Flying {flown.name} at {url}", soft_wrap=True)
-        screen.err().print("Ctrl-C ends the flight, and so does closing its page")
+        console.out().print(f"Flying {flown.name} at {url}", soft_wrap=True)
+        console.err().print("Ctrl-C ends the flight, and so does closing its page")
 
     with _heeding_interrupts():
         fly(flown, port=port, browser=not no_browser, ready=ready, landed=landed)
@@ -706,20 +707,21 @@ def live(
 def _ask(name: str) -> tuple[str, dict[str, Any]]:
     """Name and contents of a new mission, asked for one by one; an empty answer takes what is offered."""
     from rigidfleet.formation.shapes import SHAPES, agents_taken, slots
-    from rigidfleet.mission import draft as drafts
+    from rigidfleet.mission import draft
 
     def answer(question: str, offered: str, take: Callable[[str], Any]) -> Any:
         while True:
             try:
                 text = (
-                    screen.err().input(f"{question} [{offered}]: ", markup=False).strip() or offered
+                    console.err().input(f"{question} [{offered}]: ", markup=False).strip()
+                    or offered
                 )
             except EOFError:
                 raise RigidfleetError("No answer, so nothing is written. Give options.") from None
             try:
                 return take(text)
             except ValueError as error:
-                screen.err().print(f"  {error}", style="yellow")
+                console.err().print(f"  {error}", style="yellow")
 
     def number(text: str) -> float:
         value = _number(text)
@@ -728,7 +730,7 @@ def _ask(name: str) -> tuple[str, dict[str, Any]]:
         return value
 
     def known(text: str) -> str:
-        drafts.shape_known(text)
+        draft.shape_known(text)
         return text
 
     def count(text: str) -> int:
@@ -744,14 +746,14 @@ def _ask(name: str) -> tuple[str, dict[str, Any]]:
     name = name or answer("Name", "mission", str)
     shape = answer(f"Shape ({', '.join(SHAPES)})", "triangle", known)
     asked: dict[str, Any] = {"shape": shape}
-    usual = drafts.agents_for(shape)
+    usual = draft.agents_for(shape)
     if len(SHAPES[shape].agents) > 1:
         asked["agents"] = answer(f"Vehicles ({agents_taken(shape)})", str(usual), count)
-    asked["size"] = [answer("Edge length [m]", f"{drafts.SIZE:g}", number)]
-    asked["mass"] = answer("Mass of each [kg]", f"{drafts.MASS:g}", number)
-    there = " ".join(f"{x:g}" for x in drafts.WAYPOINT)
+    asked["size"] = [answer("Edge length [m]", f"{draft.SIZE:g}", number)]
+    asked["mass"] = answer("Mass of each [kg]", f"{draft.MASS:g}", number)
+    there = " ".join(f"{x:g}" for x in draft.WAYPOINT)
     waypoint = answer("Fly to x y z [m]", there, point)
-    if waypoint != drafts.WAYPOINT:  # of which a large shape takes a higher one
+    if waypoint != draft.WAYPOINT:  # of which a large shape takes a higher one
         asked["waypoints"] = [waypoint]
     return name, asked
 
@@ -783,7 +785,7 @@ def sweep(
     seed: Annotated[int | None, Parameter(converter=_exact)] = None,
     out: Path | None = None,
     force: bool = False,
-    ends: bool = False,
+    final_states: bool = False,
     workers: Annotated[int | None, Parameter(converter=_exact)] = None,
     cluster: str | None = None,
     summary: bool = False,
@@ -814,7 +816,7 @@ def sweep(
         Folder for sweep.db, summary.json and figures/; sweeps/NAME if not given.
     force : bool
         Replace another sweep in that folder; without it, it is kept and nothing is flown.
-    ends : bool
+    final_states : bool
         Judge where phases end alone: open-loop missions whose starts vary then fly by the thousand in a second.
     workers : int
         Processes on this machine; as many as it has cores if not given.
@@ -846,8 +848,8 @@ def sweep(
         folder = Path(mission)
         table = store.read(folder)
     else:
-        asked, folder = _asked(mission, vary or [], runs, seed, out, ends=ends)
-        watch = None if quiet else screen.SweepWatch()
+        asked, folder = _asked(mission, vary or [], runs, seed, out, final_states=final_states)
+        watch = None if quiet else console.SweepWatch()
         try:
             with watch or nullcontext(), _heeding_interrupts():
                 table = _fly_sweep(asked, folder, workers, cluster, force, watch)
@@ -855,37 +857,43 @@ def sweep(
             done = len(store.read(folder).run) if store.is_store(folder) else 0
             words = f"Interrupted: {done} of {asked.runs} runs are kept in {folder}"
             again = f"Go on by: rigidfleet sweep {folder}"
-            screen.err().print(f"{words}\n{again}", style="yellow", soft_wrap=True)
+            console.err().print(f"{words}\n{again}", style="yellow", soft_wrap=True)
             return INTERRUPTED
     found = summarise(table)
     from rigidfleet.result import write_file
 
     write_file(folder / "summary.json", (found.json() + "\n").encode())
     if json:
-        screen.print_exactly(found.json() + "\n")
+        console.print_exactly(found.json() + "\n")
     elif not quiet:
-        screen.print_table(found)
+        console.print_table(found)
     drawn: list[Path] = []
     if not no_figures:
         from rigidfleet.sweep.figures import plot
 
-        shown = screen.err().is_interactive and not quiet
-        with screen.err().status("Drawing the figures") if shown else nullcontext():
+        shown = console.err().is_interactive and not quiet
+        with console.err().status("Drawing the figures") if shown else nullcontext():
             drawn = plot(
                 table, folder / "figures", formats=format or _DRAWN, over=map_ or (), metric=metric,
                 titles=not no_titles,
             )  # fmt: skip
     if not (json or quiet):
-        screen.out().print(f"\nRuns     {folder / store.FILE}", soft_wrap=True)
-        screen.out().print(f"Summary  {folder / 'summary.json'}", soft_wrap=True)
+        console.out().print(f"\nRuns     {folder / store.FILE}", soft_wrap=True)
+        console.out().print(f"Summary  {folder / 'summary.json'}", soft_wrap=True)
         if drawn:
-            text = f"Figures  {drawn[0].parent}{os.sep} ({screen.count(len(drawn), 'file')})"
-            screen.out().print(text, soft_wrap=True)
+            text = f"Figures  {drawn[0].parent}{os.sep} ({console.count(len(drawn), 'file')})"
+            console.out().print(text, soft_wrap=True)
     return PASSED
 
 
 def _asked(
-    what: str, vary: list[str], runs: int | None, seed: int | None, out: Path | None, *, ends: bool
+    what: str,
+    vary: list[str],
+    runs: int | None,
+    seed: int | None,
+    out: Path | None,
+    *,
+    final_states: bool,
 ) -> tuple[Sweep, Path]:
     """The sweep that is asked for, and its folder."""
     from rigidfleet.mission import mission_names
@@ -893,23 +901,23 @@ def _asked(
     from rigidfleet.sweep.definition import is_sweep_file
 
     if store.is_store(Path(what)):
-        if vary or seed is not None or out is not None or ends:
+        if vary or seed is not None or out is not None or final_states:
             raise RigidfleetError(
-                f"{what}: is a sweep already, and goes on as it is. Remove --vary, --seed, --ends and --out."
+                f"{what}: is a sweep already, and goes on as it is. Remove --vary, --seed, --final-states and --out."
             )
         found = store.read_sweep(Path(what))
         found.runs = runs or found.runs
         return found, Path(what)
-    judged: Literal["ends"] | None = "ends" if ends else None
+    evaluate: Literal["final"] | None = "final" if final_states else None
     if what not in mission_names() and is_sweep_file(what):
-        found = Sweep.load(what, more=vary, runs=runs, seed=seed, judged=judged)
+        found = Sweep.load(what, more=vary, runs=runs, seed=seed, evaluate=evaluate)
     else:
         found = Sweep.of(
             what,
             vary,
             runs=runs,
             seed=seed or 0,
-            judged=judged or "flight",
+            evaluate=evaluate or "flight",
             origin="rigidfleet sweep",
         )
     return found, out or Path("sweeps", found.name)
@@ -921,7 +929,7 @@ def _fly_sweep(
     workers: int | None,
     cluster: str | None,
     force: bool,
-    watch: screen.SweepWatch | None,
+    watch: console.SweepWatch | None,
 ) -> Any:
     """Fly a sweep; returns the table of its rows."""
     from rigidfleet.kernel.engine.native import is_compiled
@@ -942,7 +950,7 @@ def _fly_sweep(
 # -- flying ------------------------------------------------------------------------------------------
 
 
-def _fly(mission: Mission, watch: screen.FlightWatch | None) -> tuple[Result, bool]:
+def _fly(mission: Mission, watch: console.FlightWatch | None) -> tuple[Result, bool]:
     """Result of a mission, and whether the flight was interrupted."""
     from rigidfleet.kernel.engine.native import is_compiled
 
@@ -1001,8 +1009,8 @@ def _draw(
         if path.stem not in names:
             continue
         formats.setdefault(path.with_suffix(""), []).append(path.suffix[1:])
-    shown = screen.err().is_interactive and not quiet
-    with screen.err().status("Drawing the figures") if shown else nullcontext() as status:
+    shown = console.err().is_interactive and not quiet
+    with console.err().status("Drawing the figures") if shown else nullcontext() as status:
         for n, (path, wanted) in enumerate(formats.items(), start=1):
             if status is not None:
                 status.update(f"Drawing figure {n} of {len(formats)}: {path.name}")
@@ -1020,8 +1028,8 @@ def _write_report(
     """Write the page of a flight, or of several."""
     from rigidfleet.reporting import report as write
 
-    shown = screen.err().is_interactive and not quiet
-    with screen.err().status("Writing the report") if shown else nullcontext():
+    shown = console.err().is_interactive and not quiet
+    with console.err().status("Writing the report") if shown else nullcontext():
         write(records, path, labels=labels, verdicts=verdicts)
 
 
@@ -1050,11 +1058,11 @@ def _list(files: Files) -> None:
         ("Replay", files.replay),
     ):
         if path.exists():
-            screen.out().print(f"{what:8} {path}", soft_wrap=True)
+            console.out().print(f"{what:8} {path}", soft_wrap=True)
     drawn = [path for path in files.figures if path.exists()]
     if drawn:
-        text = f"Figures  {drawn[0].parent}{os.sep} ({screen.count(len(drawn), 'file')})"
-        screen.out().print(text, soft_wrap=True)
+        text = f"Figures  {drawn[0].parent}{os.sep} ({console.count(len(drawn), 'file')})"
+        console.out().print(text, soft_wrap=True)
 
 
 # -- a mission in words ------------------------------------------------------------------------------

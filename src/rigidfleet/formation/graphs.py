@@ -70,12 +70,12 @@ def _within(p: Floats, reach: float) -> float:
 
 
 def spans_space(points: ArrayLike) -> None:
-    """ValueError, with a reason, where `joined` and `coarse_to_fine` have no edges for points (N, 3)."""
+    """ValueError, with a reason, where `henneberg` and `henneberg_multilevel` have no edges for points (N, 3)."""
     p = np.asarray(points, dtype=np.float64)
     _spanning_first(p, np.arange(len(p)))
 
 
-def joined(points: ArrayLike) -> Ints:
+def henneberg(points: ArrayLike) -> Ints:
     """3N - 6 edges (m, 2), i < j, that join each of N points in space to three nearer to the centre.
 
     A generically rigid graph by Henneberg's first step, whose exact law is solved in O(N). Of the nearest twelve
@@ -116,13 +116,13 @@ def joined(points: ArrayLike) -> Ints:
     return np.sort(np.concatenate(edges), axis=1).astype(np.int64)
 
 
-def coarse_to_fine(points: ArrayLike) -> Ints:
+def henneberg_multilevel(points: ArrayLike) -> Ints:
     """3N - 6 edges (m, 2), i < j, that join each of N points in space to three before it, far ones first.
 
-    Of the kind that `joined` makes, and solved as fast; but it begins with points far apart, and doubles their
+    Of the kind that `henneberg` makes, and solved as fast; but it begins with points far apart, and doubles their
     number again and again, each new one between those there are, so that no chain of agents is longer than log N.
     Of the twelve nearest before it a point is joined to the three that leave it the stiffest: with the inverse G of
-    their directions, and e of each its own, least sum of |G_k|^2 (1 + e_k). It holds lattices better than `joined`,
+    their directions, and e of each its own, least sum of |G_k|^2 (1 + e_k). It holds lattices better than `henneberg`,
     and shells, which that one leaves flexible; its first edges are as long as the shape.
 
     Raises

@@ -3,7 +3,7 @@
 import math
 
 from rigidfleet.kernel.compiler.jit import compiled, inlined
-from rigidfleet.kernel.problem import BODY, LOCAL, SLOTS
+from rigidfleet.kernel.problem import BODY, SHAPE, TRACKING
 from rigidfleet.kernel.references import blend_slots
 from rigidfleet.kernel.rigid_body import (
     allocate,
@@ -247,9 +247,9 @@ def input_law(t, p, w):
     m, M, control = p.vehicles.m, p.vehicles.M, p.control
     if p.law.k_def > 0.0 or p.has_frame or control.kind == BODY:
         mean_axes(w.r, w.v, m, M, w)
-    if p.reference.kind == SLOTS or control.kind == LOCAL:
+    if p.reference.kind == SHAPE or control.kind == TRACKING:
         blend_slots(t, p.reference, w.p, w.p_dot, w.p_ddot)
-    if control.kind == LOCAL:
+    if control.kind == TRACKING:
         local_law(t, p, w)
     elif control.kind == BODY:
         body_law(t, p, w)

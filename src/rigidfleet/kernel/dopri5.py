@@ -93,7 +93,7 @@ def integrate(p, w, state, t_end, fresh, times, samples, max_steps):
 
     Parameters
     ----------
-    p, w, state : Program, Workspace, Integrator (changed in place)
+    p, w, state : Problem, Workspace, IntegratorState (changed in place)
     t_end : time to land on [s]
     fresh : True at a start or after a switch, where the derivative at y is not known yet
     times, samples : (K,) [s] increasing and (K, n): where to write the dense output; the next

@@ -609,7 +609,7 @@ def evaluate(t, row, p, w, state, monitor, values):
             y[q] += basis[k] * trail.points[row, k, q]
     monitor.time[0] = t
     # The recorder has the law compiled already; without rows to write, it leaves all in the workspace.
-    call_recorder(monitor.recorder, p, w, monitor.stretch, monitor.record)
+    call_recorder(monitor.recorder, p, w, monitor.segment, monitor.record)
     read_gauge(p, w, values)
     judge_forces(values, t, p, monitor)
 
@@ -705,7 +705,7 @@ def watch_middle(row, before, after, p, w, state, monitor):
 
 @compiled
 def watch_forces(p, w, state, monitor, rows, last):
-    """Forces over the steps of a trail; the ``last`` of a stretch has nobody to wait for."""
+    """Forces over the steps of a trail; the ``last`` of a segment has nobody to wait for."""
     trail, before = state.trail, monitor.gauge[0]
     for row in range(rows):
         new = row > 0 or monitor.flags[3] == 0

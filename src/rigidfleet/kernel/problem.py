@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 
 from rigidfleet.typing import Bools, Edges, Floats
 
-# Multiplier solves (`Law.solver`).
+# Multiplier solves (`ConstraintLaw.solver`).
 ITERATED, SPECTRAL, EXACT, PINV = range(4)
 # Distance references (`Reference.kind`).
-CONSTANT, SQUARED, SLOTS = range(3)
+CONSTANT, SQUARED, SHAPE = range(3)
 # Input laws (`Control.kind`).
-OPEN, LOCAL, BODY = range(3)
+OPEN, TRACKING, BODY = range(3)
 # Allocation of a wrench (`Control.allocation`), the last three with the paper's H.
 RIGID, PINV_EQUAL, PINV_INERTIA, PINV_INERTIA_FORCE = range(4)
 
@@ -48,7 +48,7 @@ class Graph(NamedTuple):
     solver: int = 0  # address of what solves for the multipliers of a large formation (`large`)
 
 
-class Law(NamedTuple):
+class ConstraintLaw(NamedTuple):
     """Baumgarte gains and how the multipliers are solved for."""
 
     alpha: float  # [1/s]
@@ -131,14 +131,14 @@ class Disturbance(NamedTuple):
     floor: Floats  # (N,) height at which a lost vehicle comes to rest [m]
 
 
-class Program(NamedTuple):
+class Problem(NamedTuple):
     """One phase of a flight."""
 
     body_formulation: bool
     has_frame: bool  # the mean-axis quaternion is among the states
     vehicles: Vehicles
     graph: Graph
-    law: Law
+    law: ConstraintLaw
     reference: Reference
     motion: Motion
     feedback: Feedback
@@ -245,7 +245,7 @@ def _side_by_side(**shapes: tuple[int, ...]) -> dict[str, Floats]:
     }
 
 
-def calm(masses: Floats) -> Disturbance:
+def no_disturbance(masses: Floats) -> Disturbance:
     """No disturbance of agents with these masses (N,) [kg]."""
     n = len(masses)
     none = zeros(0, n, 3)

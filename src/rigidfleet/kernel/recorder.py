@@ -2,7 +2,7 @@
 
 from rigidfleet.kernel.compiler.jit import compiled
 from rigidfleet.kernel.dynamics import closed_loop
-from rigidfleet.kernel.problem import BODY, LOCAL, OPEN
+from rigidfleet.kernel.problem import BODY, OPEN, TRACKING
 from rigidfleet.kernel.references import blend_slots
 
 
@@ -51,7 +51,7 @@ def record_sample(t, p, w, k, out):
     copy(w.p, out.p[k])
     if kind != OPEN:
         copy(w.T_ref, out.T_ref[k])
-    if kind == LOCAL:
+    if kind == TRACKING:
         copy(w.r_ref, out.r_ref[k])
         for q in range(3):
             out.motion[k, q], out.motion[k, 3 + q] = w.body[0, q], w.body[1, q]

@@ -1,4 +1,4 @@
-"""What the integrator, the recorder and the monitor are told, and what they write: arrays, as in `program`.
+"""What the integrator, the recorder and the monitor are told, and what they write: arrays, as in `problem`.
 
 K samples, N agents, m edges.
 """
@@ -14,7 +14,7 @@ from rigidfleet.typing import Bools, Floats, Ints
 
 #: What an integration returns.
 FINISHED, PAUSED, COLLAPSED = range(3)
-#: Rows of `Integrator.K` after the seven stages.
+#: Rows of `IntegratorState.K` after the seven stages.
 STATE, TRIAL, ATOL = 7, 8, 9
 #: What counts as the last error where there was none, or a smaller one: its logarithm.
 LEAST_ERROR = math.log(1e-4)
@@ -85,7 +85,7 @@ class Monitor(NamedTuple):
     columns: Ints  # (P'', 2) who may be below one another
     flags: Ints  # (4,) see `monitor.watch`
     recorder: int  # address of the recorder, with its arguments: `time` and `states` to evaluate at
-    stretch: int
+    segment: int
     record: int
     time: Floats  # (1,) [s]
     states: Floats  # (1, n)
@@ -115,7 +115,7 @@ def monitor(
         "left": np.ones(n, dtype=np.bool_), "standing": np.zeros(n, dtype=np.int64),
         "low": np.full((n, 3), np.inf), "pad": 0.0, "pairs": none, "struck": none, "columns": none,
         "flags": np.zeros(4, dtype=np.int64),
-        "recorder": 0, "stretch": 0, "record": 0, "time": np.zeros(1),
+        "recorder": 0, "segment": 0, "record": 0, "time": np.zeros(1),
         "states": np.zeros((1, states)), "gauge": np.zeros((2, gauge)),
         "nodes": np.empty((_NODES, gauge)), "instants": np.zeros(_NODES),
         "rank": np.zeros(_NODES, dtype=np.int64),
@@ -126,7 +126,7 @@ def monitor(
     return Monitor(**(fields | given))
 
 
-class Integrator(NamedTuple):
+class IntegratorState(NamedTuple):
     """State of an integration, so that it can pause and go on."""
 
     y: Floats  # (n,) state at `clock[0]`
@@ -147,7 +147,7 @@ def integrator(
     atol: Floats,
     step: float = 1e-3,
     trail: Trail = NO_TRAIL,
-) -> Integrator:
+) -> IntegratorState:
     """Start an integration from state ``y`` (n,) at time t [s] with a first step [s] to try.
 
     ``atol`` (n,) is the absolute tolerance of each state, ``rtol`` the relative one of all. Steps go
@@ -158,10 +158,10 @@ def integrator(
     K[ATOL] = 1.0
     K[ATOL, :n] = atol
     clock, count = np.array([t, step, LEAST_ERROR]), np.zeros(5, dtype=np.int64)
-    return Integrator(y.copy(), K, clock, count, rtol, trail)
+    return IntegratorState(y.copy(), K, clock, count, rtol, trail)
 
 
-class Stretch(NamedTuple):
+class Segment(NamedTuple):
     """How far to integrate, and what to sample on the way."""
 
     t_end: float  # time to land on [s]

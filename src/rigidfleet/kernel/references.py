@@ -3,7 +3,7 @@
 import math
 
 from rigidfleet.kernel.compiler.jit import compiled, inlined
-from rigidfleet.kernel.problem import SLOTS, SQUARED, septic_polynomial
+from rigidfleet.kernel.problem import SHAPE, SQUARED, septic_polynomial
 
 blend = inlined(septic_polynomial)
 
@@ -77,7 +77,7 @@ def distance_references(t, reference, edges, p, p_dot, p_ddot, d, d_dot, d_ddot)
     Constant; blended in d^2, which stays realisable for up to four agents; or those of the
     slots, which are realisable always: d = |p_i - p_j|.
     """
-    if reference.kind == SLOTS:
+    if reference.kind == SHAPE:
         for k in range(edges.shape[0]):
             i, j = edges[k, 0], edges[k, 1]
             dd = dv = vv = da = 0.0

@@ -201,11 +201,11 @@ def clearance(
 
     Negative where they overlap; infinity, -1 and -1 without obstacles. r (K, N, 3), radius (N,).
     """
-    return least_room(*rooms(r, radius, obstacles))
+    return least_clearance(*obstacle_clearances(r, radius, obstacles))
 
 
-def least_room(room: Floats, nearest: Ints) -> tuple[Floats, Ints, Ints]:
-    """The least of the `rooms` (K, N) of each sample (K,), and the agent and the obstacle (K,) that have it."""
+def least_clearance(room: Floats, nearest: Ints) -> tuple[Floats, Ints, Ints]:
+    """Least of the `obstacle_clearances` (K, N) of each sample (K,), and the agent and obstacle (K,) that have it."""
     agent, samples = room.argmin(axis=1), np.arange(len(room))
     obstacle = nearest[samples, agent]
     return room[samples, agent], np.where(obstacle < 0, -1, agent), obstacle
@@ -224,7 +224,9 @@ def separation_of_left(r: Floats, radius: ArrayLike, left: Bools) -> tuple[Float
     return least, pair
 
 
-def rooms(r: Floats, radius: ArrayLike, obstacles: Sequence[Obstacle]) -> tuple[Floats, Ints]:
+def obstacle_clearances(
+    r: Floats, radius: ArrayLike, obstacles: Sequence[Obstacle]
+) -> tuple[Floats, Ints]:
     """Least room (..., N) [m] of agents r (..., N, 3) to an obstacle, and the obstacle; infinity and -1 without."""
     radius = np.asarray(radius, dtype=float)
     least, nearest = np.full(r.shape[-2::-1], np.inf), np.full(r.shape[-2::-1], -1)

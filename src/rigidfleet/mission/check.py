@@ -16,7 +16,7 @@ from rigidfleet.errors import MissionError
 from rigidfleet.formation.graphs import count_within
 from rigidfleet.formation.shapes import SHAPES
 from rigidfleet.mission import bounds, disturbances, formations, phases
-from rigidfleet.mission.findings import Keys, Notes, near_shape
+from rigidfleet.mission.findings import FindingCollector, Keys, near_shape
 from rigidfleet.mission.schema import (
     Agents,
     Allocation,
@@ -27,10 +27,10 @@ from rigidfleet.mission.schema import (
     Disturbances,
     Geofence,
     Ground,
-    Header,
-    Integrator,
+    IntegratorOptions,
     Limits,
     Lqr,
+    MissionHeader,
     Obstacle,
     Part,
     Regulator,
@@ -44,7 +44,7 @@ _TABLES: dict[str, type[Part]] = {
     "lqr": Lqr,
     "tracking": Tracking,
     "allocation": Allocation,
-    "integrator": Integrator,
+    "integrator": IntegratorOptions,
     "body_frame": BodyFrame,
     "limits": Limits,
     "disturbances": Disturbances,
@@ -60,7 +60,7 @@ def check(data: Mapping[str, Any], origin: str) -> dict[str, Any]:
     MissionError
         With a finding for everything that is not.
     """
-    notes = Notes(data, origin)
+    notes = FindingCollector(data, origin)
     _numbers(notes)
     if notes.findings:  # what follows would take long
         raise MissionError(notes.findings)
@@ -79,7 +79,7 @@ def check(data: Mapping[str, Any], origin: str) -> dict[str, Any]:
     return parts
 
 
-def _numbers(notes: Notes) -> None:
+def _numbers(notes: FindingCollector) -> None:
     """Refuse more of anything than a mission may have, before it is looked at."""
 
     def bounded(path: Keys, given: object, most: int, remedy: str) -> None:
@@ -108,14 +108,14 @@ def _numbers(notes: Notes) -> None:
         notes.add(("assignment",), problem, remedy)
 
 
-def _tables(notes: Notes) -> dict[str, Any]:
+def _tables(notes: FindingCollector) -> dict[str, Any]:
     """The header's keys and the tables, without those of which nothing can be made."""
     for key in notes.data:
         if key not in Contents.model_fields:
             notes.unknown((key,), Contents.model_fields)
-    own = {key: value for key, value in notes.data.items() if key in Header.model_fields}
-    header = notes.validate(Header, own, ())
-    parts = {key: getattr(header, key) for key in Header.model_fields} if header else {}
+    own = {key: value for key, value in notes.data.items() if key in MissionHeader.model_fields}
+    header = notes.validate(MissionHeader, own, ())
+    parts = {key: getattr(header, key) for key in MissionHeader.model_fields} if header else {}
     for key, kind in _TABLES.items():
         if key in notes.data:
             data = notes.data[key] if key != "agents" else _placed(notes, notes.data[key])
@@ -126,7 +126,7 @@ def _tables(notes: Notes) -> dict[str, Any]:
     return parts
 
 
-def _placed(notes: Notes, agents: Any) -> Any:
+def _placed(notes: FindingCollector, agents: Any) -> Any:
     """[agents] with positions written out where they are given as a shape; None where that is wrong."""
     if not (isinstance(agents, dict) and isinstance(agents.get("position"), dict)):
         return agents
@@ -159,7 +159,7 @@ def _count(data: Mapping[str, Any]) -> int | None:
     return len(position) if isinstance(position, list) and position else None
 
 
-def _agents(notes: Notes, parts: dict[str, Any]) -> None:
+def _agents(notes: FindingCollector, parts: dict[str, Any]) -> None:
     agents: Agents | None = parts.get("agents")
     if agents is None:
         return
@@ -192,7 +192,7 @@ def _agents(notes: Notes, parts: dict[str, Any]) -> None:
         )
 
 
-def _touching(notes: Notes, parts: dict[str, Any], n: int) -> None:
+def _touching(notes: FindingCollector, parts: dict[str, Any], n: int) -> None:
     """Refuse spheres so large that lists of all that touch would fill memory."""
     if n * (n - 1) // 2 <= bounds.TOUCHING:
         return
@@ -212,7 +212,7 @@ def _touching(notes: Notes, parts: dict[str, Any], n: int) -> None:
             return
 
 
-def _gains(notes: Notes, parts: dict[str, Any]) -> None:
+def _gains(notes: FindingCollector, parts: dict[str, Any]) -> None:
     c: Constraint = parts.get("constraint", Constraint())
     if c.stabilisation == "none":
         return
@@ -237,14 +237,14 @@ _NO_WEIGHT = 1e-12
 _FREE = 1e-15
 
 
-def _regulators(notes: Notes, parts: dict[str, Any]) -> None:
+def _regulators(notes: FindingCollector, parts: dict[str, Any]) -> None:
     lqr: Lqr = parts.get("lqr", Lqr())
     _regulator(notes, lqr, "lqr")
     _regulator(notes, lqr.attitude, "lqr", "attitude")
     _free_input(notes, lqr)
 
 
-def _regulator(notes: Notes, weights: Regulator, *path: str) -> None:
+def _regulator(notes: FindingCollector, weights: Regulator, *path: str) -> None:
     keys = ("horizon", "Q", "S")
     if not (notes.right(("lqr",), *keys) and notes.right(path, *keys)):
         return
@@ -256,7 +256,7 @@ def _regulator(notes: Notes, weights: Regulator, *path: str) -> None:
         notes.add((*path, "S"), problem, "give S = [1e3, 1e2], say", weights.S)
 
 
-def _free_input(notes: Notes, lqr: Lqr) -> None:
+def _free_input(notes: FindingCollector, lqr: Lqr) -> None:
     for weights, name in ((lqr, "lqr"), (lqr.attitude, "lqr.attitude")):
         path, most = tuple(name.split(".")), max(*weights.Q, *weights.S)
         if _FREE * most > weights.R and notes.right(("lqr",), "R") and notes.right(path, "R"):
@@ -264,7 +264,9 @@ def _free_input(notes: Notes, lqr: Lqr) -> None:
             _unbounded(notes, weights.R, most, ("lqr",) if inherited else path, name)
 
 
-def _unbounded(notes: Notes, R: float, most: float, where: tuple[str, ...], name: str) -> None:
+def _unbounded(
+    notes: FindingCollector, R: float, most: float, where: tuple[str, ...], name: str
+) -> None:
     problem = (
         f"is less than {_FREE:g} of the largest weight of {name}, {most:g}:"
         " gains would have no bound"
@@ -272,7 +274,7 @@ def _unbounded(notes: Notes, R: float, most: float, where: tuple[str, ...], name
     notes.add((*where, "R"), problem, f"raise R, or lower the weights of {name}", R)
 
 
-def _tracking(notes: Notes, parts: dict[str, Any]) -> None:
+def _tracking(notes: FindingCollector, parts: dict[str, Any]) -> None:
     tracking: Tracking = parts.get("tracking", Tracking())
     if not notes.right(("tracking",), "Q"):
         return
@@ -283,7 +285,7 @@ def _tracking(notes: Notes, parts: dict[str, Any]) -> None:
         _unbounded(notes, tracking.R, max(tracking.Q), ("tracking",), "tracking")
 
 
-def _allocation(notes: Notes, parts: dict[str, Any]) -> None:
+def _allocation(notes: FindingCollector, parts: dict[str, Any]) -> None:
     allocation: Allocation = parts.get("allocation", Allocation())
     if (
         allocation.method == "rigid"
@@ -294,20 +296,20 @@ def _allocation(notes: Notes, parts: dict[str, Any]) -> None:
         notes.add(("allocation", "torque_split"), problem, "remove it, or use method = 'pinv'")
 
 
-def _geofence(notes: Notes, parts: dict[str, Any]) -> None:
+def _geofence(notes: FindingCollector, parts: dict[str, Any]) -> None:
     fence = parts.get("limits", Limits()).geofence
     if fence is not None:
         _ordered(notes, fence, ("limits", "geofence"))
 
 
-def _ordered(notes: Notes, box: Box | Geofence, path: tuple[str | int, ...]) -> None:
+def _ordered(notes: FindingCollector, box: Box | Geofence, path: tuple[str | int, ...]) -> None:
     for axis, low, high in zip("xyz", box.min, box.max, strict=True):
         if low >= high:
             problem = f"min must be below max, but in {axis} {low:g} >= {high:g} m"
             notes.add(path, problem, "exchange the two", None)
 
 
-def _obstacles(notes: Notes) -> tuple[Obstacle, ...]:
+def _obstacles(notes: FindingCollector) -> tuple[Obstacle, ...]:
     obstacles = []
     for k, data in enumerate(phases.tables(notes, "obstacles")):
         kind = phases.kind(notes, data, ("obstacles", k), _OBSTACLES)

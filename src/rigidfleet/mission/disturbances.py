@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from rigidfleet.mission.findings import Notes
+from rigidfleet.mission.findings import FindingCollector
 from rigidfleet.mission.phases import latest_end
 from rigidfleet.mission.schema import Disturbances, Gusts
 from rigidfleet.typing import Floats
@@ -43,7 +43,7 @@ def intensity(gusts: Gusts, wind: float) -> Floats:
     return np.broadcast_to(np.array(gusts.intensity, dtype=np.float64), 3)
 
 
-def check(notes: Notes, parts: Mapping[str, Any], n: int | None) -> None:
+def check(notes: FindingCollector, parts: Mapping[str, Any], n: int | None) -> None:
     """Find what is wrong with [disturbances]."""
     found: Disturbances | None = parts.get(_TABLE)
     if found is None:
@@ -69,7 +69,7 @@ def check(notes: Notes, parts: Mapping[str, Any], n: int | None) -> None:
         _size(notes, found, wind, n, end)
 
 
-def _gusts(notes: Notes, gusts: Gusts, wind: float, n: int | None) -> None:
+def _gusts(notes: FindingCollector, gusts: Gusts, wind: float, n: int | None) -> None:
     def wrong(key: str, problem: str, remedy: str) -> None:
         if notes.right(_GUSTS, key):
             notes.add((*_GUSTS, key), problem, remedy)
@@ -107,7 +107,11 @@ def _gusts(notes: Notes, gusts: Gusts, wind: float, n: int | None) -> None:
 
 
 def _lost(
-    notes: Notes, found: Disturbances, parts: Mapping[str, Any], n: int | None, end: float | None
+    notes: FindingCollector,
+    found: Disturbances,
+    parts: Mapping[str, Any],
+    n: int | None,
+    end: float | None,
 ) -> None:
     seen: set[int] = set()
     for k, lost in enumerate(found.lost):
@@ -132,7 +136,7 @@ def _lost(
             notes.add((_TABLE, "lost"), problem, f"use {key} = '{possible}'")
 
 
-def _size(notes: Notes, found: Disturbances, wind: float, n: int, end: float) -> None:
+def _size(notes: FindingCollector, found: Disturbances, wind: float, n: int, end: float) -> None:
     """Refuse tables that fit into no memory."""
     if found.gusts is not None and 6 * n * end / gust_step(found.gusts, wind) > _MOST_NUMBERS:
         problem = f"changes too fast for a flight of {n} agents over {end:g} s"

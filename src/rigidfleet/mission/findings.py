@@ -28,7 +28,7 @@ _ANY = -1
 _STAND_IN: dict[str, Any] = {"mass": 1.0, "position": (0.0, 0.0, 0.0), "formation": ""}
 
 
-class Notes:
+class FindingCollector:
     """Findings about one mission, each at a path of keys in its data.
 
     Everything a user reads counts from 1, so `phases[2]` is the second phase: ("phases", 1) here.

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from rigidfleet.formation import distance_geometry, graphs, shapes
 from rigidfleet.math import proximity
 from rigidfleet.mission import bounds
-from rigidfleet.mission.findings import Keys, Notes, near_shape
+from rigidfleet.mission.findings import FindingCollector, Keys, near_shape
 from rigidfleet.mission.schema import Formation
 
 #: So many contradictions among distances are shown one by one.
@@ -20,7 +20,7 @@ _SHOWN = 6
 _MOST_CLIQUES = 5e6
 
 
-def check(notes: Notes, n: int | None) -> dict[str, Formation]:
+def check(notes: FindingCollector, n: int | None) -> dict[str, Formation]:
     """The formations by name, `n` agents each; those with findings are among them."""
     tables = notes.data.get("formations", {})
     if not isinstance(tables, dict):
@@ -35,7 +35,7 @@ def check(notes: Notes, n: int | None) -> dict[str, Formation]:
     return found
 
 
-def sound(notes: Notes, name: str) -> bool:
+def sound(notes: FindingCollector, name: str) -> bool:
     """Whether nothing has been found in a formation."""
     return notes.right(("formations",), name)
 
@@ -69,7 +69,7 @@ def agents(indices: Iterable[int], between: str = ", ") -> str:
     return between.join(str(int(i) + 1) for i in indices)
 
 
-def _formation(notes: Notes, form: Formation, n: int | None, path: Keys) -> None:
+def _formation(notes: FindingCollector, form: Formation, n: int | None, path: Keys) -> None:
     right = notes.right(path, "shape", "size", "slots", "distances")
     if form.shape is not None and form.slots is not None:
         notes.add((*path, "slots"), "a shape has its own slots", "keep shape and size, or slots")
@@ -102,7 +102,7 @@ def _formation(notes: Notes, form: Formation, n: int | None, path: Keys) -> None
         _distances(notes, form, form.distances, n, (*path, "distances"))
 
 
-def _shape(notes: Notes, form: Formation, shape: str, n: int | None, path: Keys) -> None:
+def _shape(notes: FindingCollector, form: Formation, shape: str, n: int | None, path: Keys) -> None:
     if shape not in shapes.SHAPES:
         notes.add((*path, "shape"), "unknown shape", near_shape(shape))
     elif form.size is None:
@@ -122,7 +122,7 @@ def _shape(notes: Notes, form: Formation, shape: str, n: int | None, path: Keys)
             notes.add((*path, "size"), problem, "lower it")
 
 
-def _edges(notes: Notes, form: Formation, n: int, path: Keys) -> None:
+def _edges(notes: FindingCollector, form: Formation, n: int, path: Keys) -> None:
     if isinstance(form.edges, str):
         _graph(notes, form, n, path)
         return
@@ -137,7 +137,7 @@ def _edges(notes: Notes, form: Formation, n: int, path: Keys) -> None:
             notes.add((*path, k), f"is edge {first + 1} again", "remove it, and its distance")
 
 
-def _graph(notes: Notes, form: Formation, n: int, path: Keys) -> None:
+def _graph(notes: FindingCollector, form: Formation, n: int, path: Keys) -> None:
     """A named graph other than 'complete' is made from places."""
     above = path[:-1]
     if form.edges != "neighbours" and "reach" in form.model_fields_set:
@@ -164,7 +164,9 @@ def _graph(notes: Notes, form: Formation, n: int, path: Keys) -> None:
         notes.add(path, str(error), "use 'neighbours', or give a list of pairs")
 
 
-def _distances(notes: Notes, form: Formation, lengths: Sequence[float], n: int, path: Keys) -> None:
+def _distances(
+    notes: FindingCollector, form: Formation, lengths: Sequence[float], n: int, path: Keys
+) -> None:
     edges = form.edge_array(n)
     if len(lengths) != len(edges):
         problem = f"has {len(lengths)} entries for {len(edges)} edges"

@@ -170,7 +170,7 @@ class Mission(Contents):
             axes: Floats | None = np.eye(3)  # of this formation, in those of the one before
             if self.free_attitude(p):
                 axes = lies = None
-                asked = None if p.control == "slots" else asked
+                asked = None if p.control == "tracking" else asked
             elif isinstance(p, Establish):
                 asked = self.establish_attitude(p, asked)
                 axes = None if lies is None else lies @ asked.T
@@ -221,8 +221,8 @@ class Mission(Contents):
         Forces between agents do not. Slots do, unless the phase asks for that by name, or what is established is given
         by distances alone, which have no axes.
         """
-        if phase.control != "slots" or not isinstance(phase, Establish):
-            return phase.control != "slots"
+        if phase.control != "tracking" or not isinstance(phase, Establish):
+            return phase.control != "tracking"
         if phase.attitude_deg is not None:
             return False
         return phase.attitude == "free" or not self.formations[phase.formation].knows_slots

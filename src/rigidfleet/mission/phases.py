@@ -10,7 +10,7 @@ import numpy as np
 from rigidfleet._toml import toml_key
 from rigidfleet.formation import distance_geometry
 from rigidfleet.math import rigid_body
-from rigidfleet.mission.findings import Keys, Notes, near
+from rigidfleet.mission.findings import FindingCollector, Keys, near
 from rigidfleet.mission.formations import agents as agents_text
 from rigidfleet.mission.formations import sound
 from rigidfleet.mission.schema import (
@@ -41,7 +41,7 @@ _MOST_SAMPLES = 1_000_000
 _MOST_NUMBERS = 5e8
 
 
-def check(notes: Notes, parts: Mapping[str, Any], n: int | None) -> tuple[AnyPhase, ...]:
+def check(notes: FindingCollector, parts: Mapping[str, Any], n: int | None) -> tuple[AnyPhase, ...]:
     """The phases; those with findings are among them."""
     found = _phases(notes)
     _names(notes, found)
@@ -62,7 +62,7 @@ def latest_end(phases: Sequence[AnyPhase]) -> float:
     return t
 
 
-def tables(notes: Notes, key: str) -> Sequence[Any]:
+def tables(notes: FindingCollector, key: str) -> Sequence[Any]:
     """An array of tables of the mission."""
     found = notes.data.get(key, [])
     if isinstance(found, list):
@@ -71,7 +71,7 @@ def tables(notes: Notes, key: str) -> Sequence[Any]:
     return []
 
 
-def kind(notes: Notes, data: Any, path: Keys, kinds: Mapping[str, type[Any]]) -> Any:
+def kind(notes: FindingCollector, data: Any, path: Keys, kinds: Mapping[str, type[Any]]) -> Any:
     """The model that a table's `kind` names, or None with a finding."""
     choice = f"use one of {', '.join(kinds)}"
     if not isinstance(data, dict):
@@ -85,7 +85,7 @@ def kind(notes: Notes, data: Any, path: Keys, kinds: Mapping[str, type[Any]]) ->
     return None
 
 
-def _phases(notes: Notes) -> list[AnyPhase | None]:
+def _phases(notes: FindingCollector) -> list[AnyPhase | None]:
     """Each phase with its name and control filled in, None where nothing can be made of it."""
     body = notes.data.get("architecture") == "body"
     found: list[AnyPhase | None] = []
@@ -94,7 +94,7 @@ def _phases(notes: Notes) -> list[AnyPhase | None]:
         if model is None:
             found.append(None)
             continue
-        control = "slots" if not body else "open" if model is Establish else "body"
+        control = "tracking" if not body else "open" if model is Establish else "body"
         given = {"name": f"{data['kind']} {k + 1}", "control": control} | data
         found.append(notes.validate(model, given, ("phases", k)))
     if not found and notes.right((), "phases"):
@@ -102,7 +102,7 @@ def _phases(notes: Notes) -> list[AnyPhase | None]:
     return found
 
 
-def _names(notes: Notes, found: Sequence[AnyPhase | None]) -> None:
+def _names(notes: FindingCollector, found: Sequence[AnyPhase | None]) -> None:
     seen: dict[str, int] = {}
     for k, p in enumerate(found):
         first = seen.setdefault(p.name, k) if p is not None else k
@@ -111,7 +111,7 @@ def _names(notes: Notes, found: Sequence[AnyPhase | None]) -> None:
             notes.add(("phases", k, "name"), problem, "give each phase its own", p.name)
 
 
-def _times(notes: Notes, found: Sequence[AnyPhase | None]) -> float | None:
+def _times(notes: FindingCollector, found: Sequence[AnyPhase | None]) -> float | None:
     """One ending each, in order of time. The latest end [s], None if it cannot be told."""
     first: float | None = 0.0  # earliest and latest start of the phase; None where unknown
     last: float | None = 0.0
@@ -151,7 +151,7 @@ def _times(notes: Notes, found: Sequence[AnyPhase | None]) -> float | None:
     return last
 
 
-def _in_order(notes: Notes, until: float, first: float, last: float, path: Keys) -> None:
+def _in_order(notes: FindingCollector, until: float, first: float, last: float, path: Keys) -> None:
     if until <= first:
         problem = f"the phase begins at {first:g} s and would end before"
         remedy = "until is mission time and grows from phase to phase; duration is a length"
@@ -164,7 +164,7 @@ def _in_order(notes: Notes, until: float, first: float, last: float, path: Keys)
         notes.add((*path, "until"), problem, remedy)
 
 
-def _blend(notes: Notes, p: Shaping, longest: float | None, path: Keys) -> None:
+def _blend(notes: FindingCollector, p: Shaping, longest: float | None, path: Keys) -> None:
     if not notes.right(path, "reference", "blend", *_ENDINGS):
         return
     if p.reference == "step":
@@ -176,7 +176,9 @@ def _blend(notes: Notes, p: Shaping, longest: float | None, path: Keys) -> None:
         notes.add((*path, "blend"), problem, f"use blend <= {longest:g}, or end it later", p.blend)
 
 
-def _samples(notes: Notes, parts: Mapping[str, Any], end: float | None, n: int | None) -> None:
+def _samples(
+    notes: FindingCollector, parts: Mapping[str, Any], end: float | None, n: int | None
+) -> None:
     step = parts.get("output_step")
     if not step or not end or not notes.right((), "output_step", "formations"):
         return
@@ -209,18 +211,18 @@ def _samples(notes: Notes, parts: Mapping[str, Any], end: float | None, n: int |
         notes.add(("output_step",), problem, remedy, step)
 
 
-def _controls(notes: Notes, found: Sequence[AnyPhase | None]) -> None:
+def _controls(notes: FindingCollector, found: Sequence[AnyPhase | None]) -> None:
     local = notes.data.get("architecture", "local") == "local"
     for k, p in enumerate(found):
         path = ("phases", k)
         if p is None or not notes.right(path, "control"):
             continue
         if p.control == "body" and local:
-            remedy = "use control = 'slots', or architecture = 'body' for the mission"
+            remedy = "use control = 'tracking', or architecture = 'body' for the mission"
             notes.add((*path, "control"), "the architecture is 'local'", remedy)
         if p.control == "open" and isinstance(p, Steering):
             problem = f"nothing would steer this {notes.data['phases'][k]['kind']} phase"
-            notes.add((*path, "control"), problem, "use control = 'slots' or 'body'")
+            notes.add((*path, "control"), problem, "use control = 'tracking' or 'body'")
         if p.control != "open" and any(p.input_force):
             problem = f"has no effect with control '{p.control}'"
             notes.add((*path, "input_force"), problem, "remove it, or use control = 'open'")
@@ -231,21 +233,24 @@ def _controls(notes: Notes, found: Sequence[AnyPhase | None]) -> None:
             notes.add(path, "turns to no angle", remedy, p.name)
 
 
-def _attitude(notes: Notes, p: Establish, path: Keys) -> None:
+def _attitude(notes: FindingCollector, p: Establish, path: Keys) -> None:
     """An attitude that is asked for is one that is flown."""
     given = notes.data["phases"][path[1]]
     angles = [key for key in ANGLES if key in given]
     if p.attitude == "free" and angles:
         problem = "is asked for, and attitude = 'free' asks for none"
         notes.add((*path, angles[0]), problem, "remove one of them")
-    elif p.control != "slots" and (angles or given.get("attitude") == "drawn"):
+    elif p.control != "tracking" and (angles or given.get("attitude") == "drawn"):
         problem = f"has no effect with control '{p.control}', which leaves the attitude free"
-        remedy = "use control = 'slots', or remove it and turn the formation in a later phase"
+        remedy = "use control = 'tracking', or remove it and turn the formation in a later phase"
         notes.add((*path, *(angles or ["attitude"])[:1]), problem, remedy)
 
 
 def _formations(
-    notes: Notes, found: Sequence[AnyPhase | None], parts: Mapping[str, Any], n: int | None
+    notes: FindingCollector,
+    found: Sequence[AnyPhase | None],
+    parts: Mapping[str, Any],
+    n: int | None,
 ) -> None:
     """Formations exist, can be blended to, tracked and reached."""
     forms: Mapping[str, Formation] = parts["formations"]
@@ -279,7 +284,7 @@ def _formations(
                     _reachable(notes, p, form, parts["agents"], path)
             held = p.formation
         form = forms.get(held) if held else None
-        tracked = p.control == "slots" and notes.right(path, "control")
+        tracked = p.control == "tracking" and notes.right(path, "control")
         if not tracked or n is None or form is None or not held or not sound(notes, held):
             continue
         if form.slot_array(n) is None:
@@ -288,14 +293,14 @@ def _formations(
             notes.add((*path, "control"), problem, remedy, p.control)
 
 
-def _exists(notes: Notes, name: str, path: Keys) -> None:
+def _exists(notes: FindingCollector, name: str, path: Keys) -> None:
     known = notes.data.get("formations", {})
     if isinstance(known, dict) and name not in known:
         names = f"formations: {', '.join(known)}" if known else "add a table [formations.NAME]"
         notes.add((*path, "formation"), "there is no such formation", near(name, known) or names)
 
 
-def _blendable(notes: Notes, p: Shaping, form: Formation, n: int, path: Keys) -> None:
+def _blendable(notes: FindingCollector, p: Shaping, form: Formation, n: int, path: Keys) -> None:
     """Blending slots needs them, and distances that are theirs."""
     if p.reference != "shape":
         return
@@ -313,7 +318,9 @@ def _blendable(notes: Notes, p: Shaping, form: Formation, n: int, path: Keys) ->
             notes.add(("formations", p.formation, "distances", int(k)), problem, remedy)
 
 
-def _reachable(notes: Notes, p: Shaping, form: Formation, agents: Agents, path: Keys) -> None:
+def _reachable(
+    notes: FindingCollector, p: Shaping, form: Formation, agents: Agents, path: Keys
+) -> None:
     """Forces along the edges cannot leave the line or plane in which the agents start."""
     if p.control != "open" or not notes.right(path, "control", "input_force"):
         return
@@ -325,11 +332,11 @@ def _reachable(notes: Notes, p: Shaping, form: Formation, agents: Agents, path: 
     if target is not None and start < distance_geometry.dimension(target):
         where = ("point", "line", "plane")[start]
         problem = f"the agents start on one {where}, which forces between them cannot leave"
-        remedy = f"move a start off the {where}, or use control = 'slots'"
+        remedy = f"move a start off the {where}, or use control = 'tracking'"
         notes.add((*path, "control"), problem, remedy, p.control)
 
 
-def _arrivals(notes: Notes, found: Sequence[AnyPhase | None], lqr: Lqr) -> None:
+def _arrivals(notes: FindingCollector, found: Sequence[AnyPhase | None], lqr: Lqr) -> None:
     """A finite horizon ends at a time."""
     for k, p in enumerate(found):
         if not isinstance(p, Steering) or p.settle is None or p.travel is not None:

@@ -100,7 +100,7 @@ Size = Annotated[
     Annotated[Length, Tag("one")] | Annotated[_Extent, Tag("list")], Discriminator(_form)
 ]
 Edges = Annotated[
-    Annotated[Literal["complete", "neighbours", "joined", "tree"], Tag("one")]
+    Annotated[Literal["complete", "neighbours", "henneberg", "henneberg-multilevel"], Tag("one")]
     | Annotated[tuple[_Pair, ...], Tag("list")],
     Discriminator(_form),
 ]
@@ -283,7 +283,7 @@ class Allocation(Part):
     )
 
 
-class Integrator(Part):
+class IntegratorOptions(Part):
     """Tolerances of the adaptive integrator."""
 
     rtol: Annotated[float, Strict(), Field(gt=0, le=0.1)] = Field(
@@ -332,7 +332,8 @@ class Formation(Part):
     edges: Edges = Field(
         "complete",
         description="pairs of agents, counted from 1; 'complete': every pair; 'neighbours': those within reach; "
-        "'joined': each to three nearer to the centre; 'tree': each to three before it, far ones first; 3 N - 6 in all",
+        "'henneberg': each to three nearer to the centre; 'henneberg-multilevel': each to three before it, far "
+        "ones first; 3 N - 6 in all",
     )
     reach: Length = Field(
         graphs.REACH,
@@ -351,7 +352,11 @@ class Formation(Part):
             assert slots is not None  # checked: there are a shape or slots
             if self.edges == "neighbours":
                 return graphs.neighbours(slots, self.reach)
-            return graphs.joined(slots) if self.edges == "joined" else graphs.coarse_to_fine(slots)
+            return (
+                graphs.henneberg(slots)
+                if self.edges == "henneberg"
+                else graphs.henneberg_multilevel(slots)
+            )
         return np.sort(np.array(self.edges, dtype=np.int64).reshape(-1, 2) - 1, axis=1)
 
     @property
@@ -510,10 +515,10 @@ class AnyPhase(Part):
     until: Time | None = Field(None, description="ending: at this mission time [s]")
     duration: Time | None = Field(None, description="ending: after this long [s]")
     settle: Settle | None = Field(None, description="ending: when settled")
-    control: Literal["open", "slots", "body"] = Field(
-        "slots",
-        description="open: weight balance and input_force; slots: each agent tracks its slot; body: "
-        "wrench on the virtual body. Default slots; in architecture 'body', open to establish and "
+    control: Literal["open", "tracking", "body"] = Field(
+        "tracking",
+        description="open: weight balance and input_force; tracking: each agent tracks its slot; body: "
+        "wrench on the virtual body. Default tracking; in architecture 'body', open to establish and "
         "body otherwise",
     )
     input_force: Force = Field(
@@ -612,7 +617,7 @@ Phase = Annotated[Establish | Fly | Reshape | Turn | Hold, Field(discriminator="
 Obstacle = Annotated[Box | Ground, Field(discriminator="kind")]
 
 
-class Header(Part):
+class MissionHeader(Part):
     """Keys at the top of a mission file."""
 
     schema_version: Literal[1] = Field(description="version of this format: 1")
@@ -643,7 +648,7 @@ class Header(Part):
     output_step: Time = Field(0.05, description="time between samples of the result [s]")
 
 
-class Contents(Header):
+class Contents(MissionHeader):
     """A whole mission file."""
 
     agents: Agents = Field(description="the vehicles: [agents]")
@@ -657,8 +662,8 @@ class Contents(Header):
     allocation: Allocation = Field(
         default_factory=Allocation, description="from wrench to agents: [allocation]"
     )
-    integrator: Integrator = Field(
-        default_factory=Integrator, description="tolerances: [integrator]"
+    integrator: IntegratorOptions = Field(
+        default_factory=IntegratorOptions, description="tolerances: [integrator]"
     )
     body_frame: BodyFrame | None = Field(
         None, description="attitude of the body frame at t = 0: [body_frame]"

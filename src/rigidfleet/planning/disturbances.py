@@ -10,8 +10,7 @@ import math
 
 import numpy as np
 
-from rigidfleet.kernel.problem import Disturbance, Program, graph
-from rigidfleet.kernel.problem import calm as kernel_calm
+from rigidfleet.kernel.problem import Disturbance, Problem, graph, no_disturbance
 from rigidfleet.math import turbulence
 from rigidfleet.mission import Establish, Gusts, Mission
 from rigidfleet.mission.disturbances import gust_step, intensity
@@ -24,12 +23,12 @@ NOTHING = 1e-20
 def disturbance(mission: Mission) -> Disturbance:
     """What acts on a mission besides its laws, from its start to its latest end; no vehicle lost yet."""
     d = mission.disturbances
-    calm = kernel_calm(np.array(mission.agents.mass))
+    none = no_disturbance(np.array(mission.agents.mass))
     if d is None:
-        return calm
+        return none
     wind = np.array(d.wind)
     grounds = [thing.height for thing in mission.obstacles if thing.kind == "ground"]
-    out = calm._replace(
+    out = none._replace(
         active=True,
         m=mission.true_mass,
         inverse=1.0 / mission.true_mass,
@@ -100,26 +99,26 @@ def _places(mission: Mission) -> Floats:
 
 
 def without(
-    program: Program,
+    problem: Problem,
     edges: Bools,
     lost: Bools,
     mu: float,
     *,
     large: bool = False,
-) -> Program:
-    """A program for those that are left: ``edges`` (m,) kept of its own, agents ``lost`` (N,) without thrust.
+) -> Problem:
+    """A problem for those that are left: ``edges`` (m,) kept of its own, agents ``lost`` (N,) without thrust.
 
     In the laws the lost count for nothing: their masses there are `NOTHING`, and the mean mass, on whose scale the
     damping ``mu`` of those left stands, is theirs. Newton's law keeps the lost.
     """
-    m = np.where(lost, NOTHING, program.vehicles.m)
+    m = np.where(lost, NOTHING, problem.vehicles.m)
     mean = float(m[~lost].mean()) if not lost.all() else 1.0
-    reference, control = program.reference, program.control
-    return program._replace(
-        vehicles=program.vehicles._replace(m=m, inverse=1.0 / m, M=float(m.sum()), mean=mean),
-        law=program.law._replace(mu=mu),
-        graph=graph(program.graph.edges[edges], m, large=large),
+    reference, control = problem.reference, problem.control
+    return problem._replace(
+        vehicles=problem.vehicles._replace(m=m, inverse=1.0 / m, M=float(m.sum()), mean=mean),
+        law=problem.law._replace(mu=mu),
+        graph=graph(problem.graph.edges[edges], m, large=large),
         reference=reference._replace(d0=reference.d0[edges], d1=reference.d1[edges]),
         control=control._replace(force=np.where(lost[:, None], 0.0, control.force)),
-        disturbance=program.disturbance._replace(lost=lost.copy()),
+        disturbance=problem.disturbance._replace(lost=lost.copy()),
     )

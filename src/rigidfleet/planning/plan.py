@@ -1,7 +1,7 @@
 """From a mission and the state at a switch to what the kernel flies: everything known before.
 
-A phase of a mission becomes a `Program`: time functions (blends, piecewise quintics), gain tables
-and weights, which the kernel only evaluates. What the next phase inherits travels in a `Situation`.
+A phase of a mission becomes a `Problem`: time functions (blends, piecewise quintics), gain tables
+and weights, which the kernel only evaluates. What the next phase inherits travels in a `PhaseState`.
 """
 
 from __future__ import annotations
@@ -20,28 +20,28 @@ from rigidfleet.kernel.problem import (
     CONSTANT,
     EXACT,
     ITERATED,
-    LOCAL,
     OPEN,
     PINV,
     PINV_EQUAL,
     PINV_INERTIA,
     PINV_INERTIA_FORCE,
     RIGID,
-    SLOTS,
+    SHAPE,
     SPECTRAL,
     SQUARED,
+    TRACKING,
+    ConstraintLaw,
     Control,
     Disturbance,
     Feedback,
     Graph,
-    Law,
     Motion,
-    Program,
+    Problem,
     Reference,
     Vehicles,
     Workspace,
-    calm,
     graph,
+    no_disturbance,
 )
 from rigidfleet.math import attitude as att
 from rigidfleet.math import lqr
@@ -51,21 +51,21 @@ from rigidfleet.mission.schema import Constraint, Integrator
 from rigidfleet.planning import solvers
 from rigidfleet.planning.disturbances import without
 from rigidfleet.planning.reference import (
+    PhaseState,
     Pose,
-    Situation,
     align_slots,
     attach,
-    goal_of,
-    led_by,
-    legs,
+    body_trajectory,
+    reference_kind,
     slots_about_cm,
     slots_before,
+    target_pose,
 )
 from rigidfleet.planning.tolerances import absolute_tolerances, tolerance_of_velocity
 from rigidfleet.typing import Bools, Floats, Ints
 
 _SOLVERS = {"iterated": ITERATED, "spectral": SPECTRAL, "exact": EXACT, "pinv": PINV}
-_KINDS = {"shape": SLOTS, "squares": SQUARED, "step": CONSTANT}
+_KINDS = {"shape": SHAPE, "squares": SQUARED, "step": CONSTANT}
 #: A formation is held from where all pairs are right within this part of the shortest distance.
 _NEAR = 0.1
 _SPLITS = {"equal": PINV_EQUAL, "inertia": PINV_INERTIA, "inertia+force": PINV_INERTIA_FORCE}
@@ -84,7 +84,7 @@ class PhasePlan:
     phase: Phase
     start: float  # [s]
     t_end: float  # [s] at the latest
-    program: Program
+    problem: Problem
     edges: Ints  # (m, 2), from 0
     slots: Floats | None  # (N, 3) at the end, about the CM, body axes [m]
     formation: str | None
@@ -101,7 +101,7 @@ class PhasePlan:
     damping: Callable[[Bools], float]  # mu of the vehicles left, which are not lost (N,)
     lost_at: Floats  # (N,) when vehicles are lost [s]
     masses: Floats  # (N,) as believed, lost vehicles included [kg]
-    before: Situation  # the state that the phase starts from
+    before: PhaseState  # the state that the phase starts from
 
     @property
     def large(self) -> bool:
@@ -115,7 +115,7 @@ class PhasePlan:
         if goal is None or not (isinstance(phase, Fly | Turn) or lies):
             return None
         turns = lies or (isinstance(phase, Fly | Turn) and phase.attitude_deg is not None)
-        reference = self.program.reference
+        reference = self.problem.reference
         shaped = reference.t0 + reference.T_b
         return {
             "time": max(self.arrival, shaped) if lies else self.arrival,
@@ -132,7 +132,7 @@ class PhasePlan:
         if self.frame is None:
             return np.concatenate([now.r.ravel(), now.v.ravel(), integral])
         q = att.quaternion_from_dcm(self.frame)
-        if not self.program.body_formulation:
+        if not self.problem.body_formulation:
             return np.concatenate([now.r.ravel(), now.v.ravel(), integral, q])
         x, y = about_cm(now.r, masses) @ self.frame.T, about_cm(now.v, masses) @ self.frame.T
         cm = (masses @ now.r / masses.sum(), masses @ now.v / masses.sum())
@@ -147,7 +147,7 @@ class PhasePlan:
 
     def velocity_tolerance(self) -> Floats:
         """Absolute tolerance (N,) of velocities [m/s]."""
-        beta = self.program.law.beta
+        beta = self.problem.law.beta
         return tolerance_of_velocity(
             self.integrator, self.before.r, self.masses, beta, large=self.large
         )
@@ -162,17 +162,17 @@ class PhasePlan:
         kept = ~np.any(lost[self.edges], axis=1)
         self.edges, self.distances = self.edges[kept], self.distances[kept]
         self.method = solvers.choose(len(lost), self.edges, self.constraint.solver)
-        self.program = without(self.program, kept, lost, self.damping(lost), large=self.large)
+        self.problem = without(self.problem, kept, lost, self.damping(lost), large=self.large)
         return kept
 
-    def reached(self, t: float, y: Floats, w: Workspace) -> Situation:
+    def reached(self, t: float, y: Floats, w: Workspace) -> PhaseState:
         """The state that the next phase starts from, after an evaluation at time t [s] and state y (n,) in ``w``."""
         n, m = len(self.before.r), len(self.edges)
         frame, pose = self.before.frame, None
         if self.frame is not None:
             q = y[6 * n + m : 6 * n + m + 4]
             frame = att.dcm_from_quaternion(q / np.linalg.norm(q))
-        if self.program.control.kind == LOCAL:
+        if self.problem.control.kind == TRACKING:
             pose = Pose(w.body[0].copy(), w.body[1].copy(), w.T_ref.copy(), w.body[3].copy())
         return replace(
             self.before,
@@ -192,7 +192,7 @@ class PhasePlan:
 def plan_phase(
     mission: Mission,
     phase: Phase,
-    now: Situation,
+    now: PhaseState,
     *,
     disturbance: Disturbance | None = None,
     external: int = 0,
@@ -229,19 +229,19 @@ def plan_phase(
     kind, T_b = CONSTANT, 0.0
     if shaping:
         T_b = 0.0 if phase.reference == "step" else phase.blend
-        kind = _KINDS[led_by(mission, phase, before, target)]
-    elif phase.control == "slots" and np.allclose(
+        kind = _KINDS[reference_kind(mission, phase, before, target)]
+    elif phase.control == "tracking" and np.allclose(
         d1, distance_geometry.distances(before, edges), rtol=1e-12
     ):
-        kind = SLOTS
+        kind = SHAPE
     dp, turn = np.zeros_like(before), np.zeros(3)
     if shaping:
         dp, turn = align_slots(before, after, left, turned)
     reference = Reference(kind, now.t, T_b, d0, d1, before, dp, turn)
 
-    goal, arrival = goal_of(phase, now, t_end)
+    goal, arrival = target_pose(phase, now, t_end)
     motion, feedback = _REST, _NO_FEEDBACK
-    if phase.control == "slots":
+    if phase.control == "tracking":
         assert now.pose is not None  # attached above
         assert goal is not None
         motion = _motion(mission, now.pose, goal, now.t, arrival, t_end)
@@ -251,7 +251,7 @@ def plan_phase(
         feedback = _feedback(mission, goal, now.t, arrival, moves=moves)
     method = solvers.choose(len(masses), edges, mission.constraint.solver)
     held = _held(mission, name, now) if method == "dense" else None
-    program = Program(
+    problem = Problem(
         body_formulation=mission.formulation == "body",
         has_frame=frame is not None,
         vehicles=Vehicles(
@@ -262,18 +262,18 @@ def plan_phase(
         law=_law(
             mission,
             mission.damping(held, now.lost),
-            damped=phase.control != "slots" and len(edges) > 0,
+            damped=phase.control != "tracking" and len(edges) > 0,
         ),
         reference=reference,
         motion=motion,
         feedback=feedback,
         control=_control(mission, phase, masses),
         external=external,
-        disturbance=calm(masses) if disturbance is None else disturbance,
+        disturbance=no_disturbance(masses) if disturbance is None else disturbance,
     )  # fmt: skip
-    slots = after if phase.control != "open" or kind == SLOTS else target if shaping else now.slots
+    slots = after if phase.control != "open" or kind == SHAPE else target if shaping else now.slots
     plan = PhasePlan(
-        phase, now.t, t_end, program, edges, slots, name, target is not None, d1, goal, arrival, frame,
+        phase, now.t, t_end, problem, edges, slots, name, target is not None, d1, goal, arrival, frame,
         attached=before_switch.slots is not None or phase.control != "open",
         lies=isinstance(phase, Establish) and not mission.free_attitude(phase), method=method,
         constraint=mission.constraint, integrator=mission.integrator,
@@ -321,7 +321,7 @@ def _graph(edges: bytes, masses: bytes, *, large: bool) -> Graph:
     return graph(pairs, np.frombuffer(masses), large=large)
 
 
-def _held(mission: Mission, name: str | None, now: Situation) -> str | None:
+def _held(mission: Mission, name: str | None, now: PhaseState) -> str | None:
     """The formation, if the agents left are in it: all pairs within a tenth of the shortest."""
     slots = mission.formation_slots(name) if name else None
     if slots is None:
@@ -336,10 +336,10 @@ def _held(mission: Mission, name: str | None, now: Situation) -> str | None:
     return name if near else None
 
 
-def _law(mission: Mission, mu: float, *, damped: bool) -> Law:
+def _law(mission: Mission, mu: float, *, damped: bool) -> ConstraintLaw:
     c = mission.constraint
     pid = c.stabilisation == "pid"
-    return Law(
+    return ConstraintLaw(
         alpha=c.alpha if pid else 0.0,
         beta=c.beta if pid else 0.0,
         gamma=c.gamma if pid else 0.0,
@@ -353,7 +353,7 @@ def _law(mission: Mission, mu: float, *, damped: bool) -> Law:
 
 
 def _control(mission: Mission, phase: Phase, masses: Floats) -> Control:
-    kind = {"open": OPEN, "slots": LOCAL, "body": BODY}[phase.control]
+    kind = {"open": OPEN, "tracking": TRACKING, "body": BODY}[phase.control]
     force = np.tile(np.array(phase.input_force), (len(masses), 1))
     force[:, 2] += masses * mission.gravity
     k1, k2 = lqr.double_integrator_gains(mission.tracking.Q, mission.tracking.R)
@@ -378,7 +378,7 @@ def _motion(
     the velocity's error would carry the body away.
     """
     T = arrival - t0
-    flights = legs(mission, start, goal, T)
+    flights = body_trajectory(mission, start, goal, T)
     times = np.unique(np.concatenate([_knots(law, T) for law in flights.regulators]))
     rest = t_end - arrival
     after = lqr.knots(rest, mission.tracking.Q, mission.tracking.R) if rest > 0.0 else np.zeros(1)

@@ -12,19 +12,19 @@ from rigidfleet.math import pid, rigid_body
 from rigidfleet.math.rigid_body import about_cm
 from rigidfleet.mission import Establish, Mission, Phase, Reshape
 from rigidfleet.planning.reference import (
+    PhaseState,
     Pose,
-    Situation,
     align_slots,
     attach,
-    goal_of,
-    led_by,
-    legs,
+    body_trajectory,
+    reference_kind,
     slots_about_cm,
     slots_before,
+    target_pose,
 )
 from rigidfleet.typing import Floats
 
-#: Samples of a leg: so many, or one each so many seconds, within bounds.
+#: Samples of a planned phase: so many, or one each so many seconds, within bounds.
 _SAMPLES = 201
 
 
@@ -71,10 +71,10 @@ class PlannedPhase:
 
 
 def preview(mission: Mission, phases: int | None = None) -> tuple[list[PlannedPhase], bool]:
-    """The way of all agents, a leg for each phase or so many, and whether it is known to its end."""
+    """The way of all agents, one `PlannedPhase` for each phase or so many, and whether it is known to its end."""
     masses = np.array(mission.agents.mass)
     frame = None if mission.body_frame is None else mission.drawn_attitude
-    now = Situation(
+    now = PhaseState(
         0.0, np.array(mission.agents.position), np.array(mission.agents.velocity), frame=frame
     )
     way: list[PlannedPhase] = []
@@ -103,9 +103,11 @@ def preview(mission: Mission, phases: int | None = None) -> tuple[list[PlannedPh
         position, ways, now = _leg(mission, phase, now, masses, target, time)
         guess = (
             isinstance(phase, Establish | Reshape)
-            and phase.control != "slots"
+            and phase.control != "tracking"
             # A shape that forces alone hold may lag behind its slots.
-            and (phase.control == "body" or led_by(mission, phase, before, target) != "shape")
+            and (
+                phase.control == "body" or reference_kind(mission, phase, before, target) != "shape"
+            )
         )
         acceleration = _rate(_rate(position, time), time)
         way.append(PlannedPhase(phase.name, time, position, acceleration, not guess, ways, names))
@@ -113,7 +115,7 @@ def preview(mission: Mission, phases: int | None = None) -> tuple[list[PlannedPh
 
 
 def samples_per_phase(mission: Mission) -> int:
-    """Samples of each leg that can be looked at: below `MANY` agents each is held against each."""
+    """Samples of each planned phase that can be looked at: below `MANY` agents each is held against each."""
     n = mission.n_agents
     each = n * max(1.0, n / 25) if n <= MANY else n
     return int(_PLACES / each) // len(mission.phases)
@@ -122,11 +124,11 @@ def samples_per_phase(mission: Mission) -> int:
 def _leg(
     mission: Mission,
     phase: Phase,
-    now: Situation,
+    now: PhaseState,
     masses: Floats,
     target: Floats | None,
     time: Floats,
-) -> tuple[Floats, tuple[Floats, Floats] | None, Situation]:
+) -> tuple[Floats, tuple[Floats, Floats] | None, PhaseState]:
     """Positions (K, N, 3) of all agents over a phase, their `PlannedPhase.ways`, and the situation at its end."""
     t0, t_end = time[0], time[-1]
     shaping = isinstance(phase, Establish | Reshape)
@@ -151,7 +153,7 @@ def _leg(
     else:
         assert now.pose is not None  # attached above
         assert now.slots is not None
-        goal, arrival = goal_of(phase, now, t_end)
+        goal, arrival = target_pose(phase, now, t_end)
         assert goal is not None
         r, T, v_cm, omega = _body(mission, now.pose, goal, arrival, time)
         before = now.slots
@@ -165,7 +167,7 @@ def _leg(
         position = r[:, None] + p @ T
         pose = Pose(r[-1], v_cm, T[-1], omega)
         velocity = v_cm + np.cross(omega, after) @ T[-1]
-        tracked = pose if phase.control == "slots" else None
+        tracked = pose if phase.control == "tracking" else None
         frame = T[-1] if frame is not None else None
         now = replace(
             now, r=position[-1], v=velocity, slots=after, pose=tracked, goal=goal, frame=frame
@@ -179,7 +181,7 @@ def _body(
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """CM (K, 3) [m], attitude T (K, 3, 3) of the virtual body, and its velocities [m/s, rad/s] at the end."""
     t0, rest = time[0], time[-1] - arrival
-    flights = legs(mission, start, goal, arrival - t0)
+    flights = body_trajectory(mission, start, goal, arrival - t0)
     under_way = time <= arrival
     found = []
     for i in range(2):

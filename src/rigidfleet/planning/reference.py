@@ -57,7 +57,7 @@ class Pose:
 
 
 @dataclass
-class Situation:
+class PhaseState:
     """The state at a switch, and what was commanded up to it."""
 
     t: float
@@ -80,8 +80,8 @@ def slots_about_cm(mission: Mission, name: str | None, masses: Floats) -> Floats
 
 
 def attach(
-    mission: Mission, phase: Phase, now: Situation, masses: Floats, target: Floats | None
-) -> tuple[Floats | None, Situation, Floats]:
+    mission: Mission, phase: Phase, now: PhaseState, masses: Floats, target: Floats | None
+) -> tuple[Floats | None, PhaseState, Floats]:
     """Attach the body frame where a phase needs one, and say how the slots wanted lie in it meanwhile.
 
     Slots fitted to the agents (Kabsch) give the attitude. Where nothing is established yet, the agents themselves
@@ -106,7 +106,7 @@ def attach(
             frame = np.eye(3)
         return frame, now, _turn(given, slots_before(mission, now, masses), target, masses)
     x = about_cm(now.r, masses)
-    if phase.control == "slots" and now.pose is not None:
+    if phase.control == "tracking" and now.pose is not None:
         pose = now.pose  # the reference goes on from where it is
     else:
         fit = now.slots
@@ -145,7 +145,7 @@ def attach(
     return frame, replace(now, pose=pose, slots=slots, goal=goal), turn
 
 
-def slots_before(mission: Mission, now: Situation, masses: Floats) -> Floats:
+def slots_before(mission: Mission, now: PhaseState, masses: Floats) -> Floats:
     """Slots (N, 3) [m] that a phase begins with; where there are none, the agents, as formations are drawn."""
     if now.slots is not None:
         return now.slots
@@ -158,7 +158,7 @@ def _turn(given: Floats | None, before: Floats, after: Floats | None, masses: Fl
     return rigid_body.kabsch(before, after, masses) if given is None else given
 
 
-def led_by(
+def reference_kind(
     mission: Mission, phase: Establish | Reshape, before: Floats, target: Floats | None
 ) -> Literal["shape", "squares", "step"]:
     """What leads the distances of a phase: its reference, and which of two if that is "distances".
@@ -200,7 +200,7 @@ def align_slots(
     return after @ R.T - before, att.rotation_vector_from_dcm(R)  # log of R^T
 
 
-def goal_of(phase: Phase, now: Situation, t_end: float) -> tuple[Pose | None, float]:
+def target_pose(phase: Phase, now: PhaseState, t_end: float) -> tuple[Pose | None, float]:
     """The pose to be at, and when."""
     goal = now.goal
     if goal is None:
@@ -220,7 +220,7 @@ def goal_of(phase: Phase, now: Situation, t_end: float) -> tuple[Pose | None, fl
 
 
 @dataclass
-class Legs:
+class BodyTrajectory:
     """The LQR flights of the virtual body to its goal: of its CM, and of its attitude phi."""
 
     regulators: tuple[Regulator, Regulator]
@@ -248,7 +248,7 @@ class Legs:
         return lqr.infinite_horizon_trajectory(times, state, (r + v * rest, v), rest, Q, R)
 
 
-def legs(mission: Mission, start: Pose, goal: Pose, T: float) -> Legs:
+def body_trajectory(mission: Mission, start: Pose, goal: Pose, T: float) -> BodyTrajectory:
     """Flights of the virtual body from one pose to another within T [s].
 
     The attitude is regulated as the rotation vector phi from the goal to the body: three more
@@ -256,7 +256,7 @@ def legs(mission: Mission, start: Pose, goal: Pose, T: float) -> Legs:
     """
     phi = att.rotation_vector_from_dcm(start.T @ goal.T.T)  # start = goal Exp(phi)
     phi_dot = att.rotation_vector_rate(phi, start.omega)
-    return Legs(
+    return BodyTrajectory(
         (mission.lqr, mission.lqr.attitude),
         ((start.r, start.v), (phi, phi_dot)),
         ((goal.r, goal.v), (np.zeros(3), goal.omega)),

@@ -14,17 +14,17 @@ import numpy as np
 
 from rigidfleet.typing import Floats, Ints
 
-Method = Literal["dense", "sweep", "nodes"]
+Method = Literal["dense", "elimination", "sparse"]
 
 #: Equations from which on the vertex graph is faster than a dense factor, and from which on the sweep is.
-FROM_NODES, FROM_SWEEP = 180, 60
+FROM_SPARSE, FROM_ELIMINATION = 180, 60
 #: Equations of a dense solve at most: beyond, one evaluation takes seconds.
 MOST_DENSE = 2000
 #: What each method is called in reports.
 WORDS: dict[Method, str] = {
     "dense": "dense factor",
-    "sweep": "sweep of 3x3 solves",
-    "nodes": "conjugate gradients on the vertex graph, with a kept factor",
+    "elimination": "elimination by 3x3 solves",
+    "sparse": "conjugate gradients on the vertex graph, with a kept factor",
 }
 
 
@@ -39,12 +39,12 @@ def choose(n: int, edges: Ints, solver: str) -> Method:
     Laws that need eigenvalues ("spectral", "pinv") are solved densely whatever the size.
     """
     size = equations(n, len(edges), solver)
-    if solver == "exact" and size >= FROM_SWEEP and sweep_steps(n, edges) is not None:
-        return "sweep"
-    return "nodes" if solver in ("iterated", "exact") and size >= FROM_NODES else "dense"
+    if solver == "exact" and size >= FROM_ELIMINATION and elimination_steps(n, edges) is not None:
+        return "elimination"
+    return "sparse" if solver in ("iterated", "exact") and size >= FROM_SPARSE else "dense"
 
 
-def sweep_steps(n: int, edges: Ints) -> Ints | None:
+def elimination_steps(n: int, edges: Ints) -> Ints | None:
     """An order (n, 4) in which each agent is joined to three before it: agent, its edges (-1: none).
 
     The first three have none, one and two. None where there is no such order. Agents with three edges left

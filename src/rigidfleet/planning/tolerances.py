@@ -10,7 +10,7 @@ from rigidfleet.math.rigid_body import about_cm
 from rigidfleet.typing import Floats
 
 if TYPE_CHECKING:
-    from rigidfleet.mission.schema import Integrator
+    from rigidfleet.mission.schema import IntegratorOptions
 
 
 #: A phase has stalled that took more steps than these and those for each second of mission time, or
@@ -24,7 +24,7 @@ def most_steps(flown: float) -> int:
 
 
 def absolute_tolerances(
-    given: Integrator, size: int, velocity: Floats, distances: Floats, *, large: bool
+    given: IntegratorOptions, size: int, velocity: Floats, distances: Floats, *, large: bool
 ) -> Floats:
     """Absolute tolerances (size,) of the states, class by class.
 
@@ -52,7 +52,7 @@ def absolute_tolerances(
 
 
 def tolerance_of_velocity(
-    given: Integrator, r: Floats, masses: Floats, beta: float, *, large: bool
+    given: IntegratorOptions, r: Floats, masses: Floats, beta: float, *, large: bool
 ) -> Floats:
     """Absolute tolerance (N,) of velocities [m/s] of agents at r (N, 3) [m].
 

@@ -377,12 +377,12 @@ def _extremes(
                 ax.plot(
                     when, peak, "o", markersize=4, markerfacecolor="none", markeredgecolor=st.INK
                 )
-            st.words(ax, told, st.corners())
+            st.annotate(ax, told, st.corners())
             continue
         t = result.time[int((size > sign * edge).any(axis=1).argmax())]
         look: dict[str, Any] = {"color": st.ALERT, "markersize": 5, "clip_on": False, "zorder": 6}
         ax.plot(t, edge, marker, **look, gid="cut")
-        st.words(ax, f"cut off: {told}", [*st.around(t, edge), *st.corners()], color=st.ALERT)
+        st.annotate(ax, f"cut off: {told}", [*st.around(t, edge), *st.corners()], color=st.ALERT)
 
 
 def _idle(ax: Axes, result: Result, values: Floats, unit: str, who: Callable[[int], str]) -> bool:
@@ -521,7 +521,7 @@ def draw_error(ax: Axes, result: Result) -> list[Line2D]:
     if len(large):
         ax.set_ylim(max(_SMALLEST, 0.5 * float(large.min())), 3 * float(large.max()))
         if ax.get_ylim()[0] == _SMALLEST and len(large) < len(seen):
-            st.words(
+            st.annotate(
                 ax,
                 f"rounding below {_SMALLEST:g} m is not drawn",
                 st.corners()[::-1],
@@ -575,7 +575,7 @@ def _mark_least(ax: Axes, result: Result, values: Floats, name: str) -> None:
         t, value, "o", markersize=5, markerfacecolor="none", markeredgecolor=st.INK, clip_on=False
     )
     who = "" if pair is None else _who(result, name, *map(int, pair))
-    st.words(ax, f"{value:.3g} m at {t:.2f} s{who}", st.around(t, value))
+    st.annotate(ax, f"{value:.3g} m at {t:.2f} s{who}", st.around(t, value))
 
 
 def _who(result: Result, name: str, first: int, second: int) -> str:

@@ -244,13 +244,13 @@ def limit(ax: Axes, value: float, label: str, colour: str = ALERT) -> None:
         for x, ha in _ALONG
         for va, away in (("bottom", 2), ("top", -2))
     ]
-    words(ax, label, [*along, *corners()], color=colour)
+    annotate(ax, label, [*along, *corners()], color=colour)
 
 
 # -- words that cover nothing --------------------------------------------------------------------------
 
 
-def words(ax: Axes, text: str, places: Sequence[Place], **look: Any) -> None:
+def annotate(ax: Axes, text: str, places: Sequence[Place], **look: Any) -> None:
     """Words in an axes, which stand at the first of their places where they cover no line and no other words."""
     (x, y), units, offset, ha, va = places[0]
     label = ax.annotate(
@@ -344,7 +344,7 @@ def still(ax: Axes, values: Floats, unit: str) -> bool:
     told = f"{value:.6g} {unit} throughout" + (f", within {off:.1g}" if off > _ROUNDING else "")
     ax.set_ylim(value - 1.0, value + 1.0)
     ax.set_yticks([value], [f"{value:.6g}"])
-    words(
+    annotate(
         ax,
         told,
         [((0.5, value), ("axes fraction", "data"), (0, 5), "center", "bottom")],

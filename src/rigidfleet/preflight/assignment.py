@@ -29,26 +29,27 @@ def assignment_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     if first is None or slots is None or not 2 <= mission.n_agents <= _COMPARED:
         return
     index, masses = mission.phases.index(first), np.array(mission.agents.mass)
-    if index >= len(found.legs):
+    if index >= len(found.planned_phases):
         return
     for name in ("as it is", "shortest", "safe"):
-        other, leg = mission, found.legs[index]
+        other, planned = mission, found.planned_phases[index]
         if name not in ("as it is", mission.assignment):
             other = Mission.from_dict(mission.to_dict() | {"assignment": name}, mission.origin)
-            leg = preview(other, index + 1)[0][index]
-        assert leg.ways is not None  # it shapes
-        x = leg.position - (masses @ leg.position)[:, None] / masses.sum()
+            planned = preview(other, index + 1)[0][index]
+        assert planned.ways is not None  # it shapes
+        x = planned.position - (masses @ planned.position)[:, None] / masses.sum()
         way = float(np.linalg.norm(np.diff(x, axis=0), axis=2).sum())
-        room = assignment.nearest_way(*leg.ways, mission.agents.radius)[0]
+        room = assignment.nearest_way(*planned.ways, mission.agents.radius)[0]
         order = tuple(other.assigned_slots[first.formation].tolist())
         found.assignments[name] = Assignment(order, way, room)
     radius = np.array(mission.agents.radius)
     now, short, safe = found.assignments.values()
-    if short.way < (1 - _WORTH) * now.way - _SHORT:
-        text = (
-            f"another assignment to slots is shorter: {short.way:.1f} m in all, not {now.way:.1f} m"
-        )
+    if short.path_length < (1 - _WORTH) * now.path_length - _SHORT:
+        text = f"another assignment to slots is shorter: {short.path_length:.1f} m in all, not {now.path_length:.1f} m"
         yield Remark("note", "assignment", text + ' (assignment = "shortest")')
-    if safe.room > now.room + 0.05 and now.room < 2 * radius.max():
-        text = f"another one is safer: {safe.room:.2f} m between agents on the way instead of {now.room:.2f} m"
+    if safe.min_clearance > now.min_clearance + 0.05 and now.min_clearance < 2 * radius.max():
+        text = (
+            f"another one is safer: {safe.min_clearance:.2f} m between agents on the way instead of"
+            f" {now.min_clearance:.2f} m"
+        )
         yield Remark("note", "assignment", text + ' (assignment = "safe")')

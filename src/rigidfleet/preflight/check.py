@@ -2,7 +2,7 @@
 
 The way is the planned reference, sampled: slots that blend, moved by the LQR flights of the virtual body.
 Nothing is integrated, so this takes a fraction of a second and no compiler. Where nothing but distances leads,
-the agents are taken to go straight to their slots, which is a guess: such legs are not `exact`, and what is found
+the agents are taken to go straight to their slots, which is a guess: such phases are not `exact`, and what is found
 on them is a note.
 """
 

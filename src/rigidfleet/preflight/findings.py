@@ -84,8 +84,8 @@ class Assignment:
     """
 
     order: tuple[int, ...]
-    way: float
-    room: float
+    path_length: float
+    min_clearance: float
 
 
 @dataclass(frozen=True)
@@ -120,13 +120,13 @@ class Preflight:
     >>> ahead = rf.check("narrow-passage")
     >>> ahead.passed
     True
-    >>> for heading, fact in ahead.words():
+    >>> for heading, fact in ahead.describe():
     ...     print(heading, fact)
     """
 
     formations: list[FormationCheck]
     gains: GainsCheck
-    legs: list[PlannedPhase]
+    planned_phases: list[PlannedPhase]
     room: tuple[float, float, str] | None = None  # [m], when [s], who
     thrust: tuple[float, float, str, float] | None = None  # [N], when, who, limit
     clearance: list[tuple[str, float, float, str]] = field(default_factory=list)
@@ -153,7 +153,7 @@ class Preflight:
         verdict = "no problems found" if self.passed else "it will fail as it is"
         return _markup.shown("Check", verdict, ("about", "what was found"), rows)
 
-    def words(self) -> Iterator[tuple[str, str]]:
+    def describe(self) -> Iterator[tuple[str, str]]:
         """All facts, each under a heading: formations, gains, the way. `remarks` come besides."""
         for f in self.formations:
             yield f.name, _formation_words(f)
@@ -177,10 +177,11 @@ class Preflight:
             yield "gap", text
         if len(self.assignments) > 1:
             told = [
-                f"{name} {a.way:.1f} m, room {a.room:.2f} m" for name, a in self.assignments.items()
+                f"{name} {a.path_length:.1f} m, room {a.min_clearance:.2f} m"
+                for name, a in self.assignments.items()
             ]
             yield "assignment", f"way in all and least room: {'; '.join(told)}"
-        guessed = [leg.phase for leg in self.legs if not leg.exact]
+        guessed = [planned.phase for planned in self.planned_phases if not planned.exact]
         if guessed:
             names = ", ".join(f"'{name}'" for name in guessed)
             yield "guessed", f"straight ways in {names}, where nothing but distances leads"
@@ -221,7 +222,9 @@ class Preflight:
             },
             "way": {
                 "judged_to_s": self.judged_to if math.isfinite(self.judged_to) else None,
-                "guessed_phases": [leg.phase for leg in self.legs if not leg.exact],
+                "guessed_phases": [
+                    planned.phase for planned in self.planned_phases if not planned.exact
+                ],
                 "separation": _named(("room_m", "time_s", "who"), self.room),
                 "thrust": _named(("thrust_n", "time_s", "who", "limit_n"), self.thrust),
                 "clearance": [
@@ -229,7 +232,11 @@ class Preflight:
                 ],
                 "gaps": [_named(("between", "wide_m", "takes_m", "time_s"), g) for g in self.gaps],
                 "assignments": {
-                    name: {"order": [s + 1 for s in a.order], "way_m": a.way, "room_m": a.room}
+                    name: {
+                        "order": [s + 1 for s in a.order],
+                        "path_length_m": a.path_length,
+                        "min_clearance_m": a.min_clearance,
+                    }
                     for name, a in self.assignments.items()
                 },
             },

@@ -10,11 +10,11 @@ import numpy as np
 from rigidfleet.formation import distance_geometry
 from rigidfleet.mission import Establish, Mission, Reshape
 from rigidfleet.planning import solvers
-from rigidfleet.planning.reference import led_by
+from rigidfleet.planning.reference import reference_kind
 from rigidfleet.preflight.findings import DENSE, TOLERANCE, FormationCheck, Remark, agents, some
 from rigidfleet.rigidity import (
     Kind,
-    Verdict,
+    RigidityClass,
     analyse,
     realisations,
     spectrum,
@@ -72,7 +72,7 @@ def _formation(
         ends = spectrum(slots, edges, mission.agents.mass) if len(slots) <= LANCZOS else None
         return FormationCheck(name, None, held, method=method, spectrum=ends)
     rigidity = analyse(slots, edges, masses=mission.agents.mass)
-    endless = rigidity.verdict is Verdict.FLEXIBLE  # a continuum of other shapes
+    endless = rigidity.verdict is RigidityClass.FLEXIBLE  # a continuum of other shapes
     if not search or endless or contradiction(mission, name) is not None:
         return FormationCheck(name, rigidity, held, method=method)
     start = mission.agents.position
@@ -88,7 +88,7 @@ def _held_by(mission: Mission, name: str) -> Literal["slots", "distances", "noth
         controls |= {phase.control} if now == name else set()
     if not controls:
         return "nothing"
-    return "slots" if controls == {"slots"} else "distances"
+    return "slots" if controls == {"tracking"} else "distances"
 
 
 def contradiction(mission: Mission, name: str) -> tuple[int, float] | None:
@@ -136,15 +136,15 @@ def formation_remarks(mission: Mission, formations: list[FormationCheck]) -> Ite
                 text = f"'{f.name}' has distances that fix no places: its rigidity is not judged"
                 yield Remark("note", "formation", text)
             continue
-        if r.verdict is Verdict.FLEXIBLE:
+        if r.verdict is RigidityClass.FLEXIBLE:
             who = "; ".join(agents(flex.agents) for flex in r.flexes[:4])
             more = f" and {len(r.flexes) - 4} more" if len(r.flexes) > 4 else ""
             text = f"'{f.name}' is flexible: {r.rank} independent distances, {r.needed} hold it; free: {who}{more}"
             held = ". Add edges (rigidfleet design), or track slots" if alone else "; slots hold it"
             yield Remark("fails" if alone else "note", "formation", text + held)
-        elif r.verdict is Verdict.UNDECIDED and alone:
+        elif r.verdict is RigidityClass.UNDECIDED and alone:
             yield Remark("note", "formation", f"'{f.name}' is undecided: {r.reason}")
-        elif r.verdict is Verdict.PRESTRESS_STABLE and alone:
+        elif r.verdict is RigidityClass.PRESTRESS_STABLE and alone:
             where = "line" if r.dimension == 1 else "plane"
             text = f"'{f.name}' is held softly"
             text += f" across its {where}" if r.dimension < 3 else ""
@@ -166,7 +166,7 @@ def _other_shapes(mission: Mission, f: FormationCheck, *, alone: bool) -> Iterat
     start, slots = np.array(mission.agents.position), mission.formation_slots(f.name)
     first, by = mission.phases[0], None
     if isinstance(first, Establish) and first.formation == f.name:
-        by = led_by(mission, first, start, slots)
+        by = reference_kind(mission, first, start, slots)
     end = None if others.leads_to is None else others.found[others.leads_to].kind
     if by == "shape" and slots is not None and _flattens(start, slots):
         text = (

@@ -38,7 +38,7 @@ def check_gains(mission: Mission, formations: list[FormationCheck]) -> GainsChec
 def gain_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     """Gains that are unstable or slow where distances lead the flight."""
     g, phases = found.gains, mission.phases
-    if all(phase.control == "slots" for phase in phases) or not len(mission.edges):
+    if all(phase.control == "tracking" for phase in phases) or not len(mission.edges):
         return
     if not g.stabilised:
         yield from _drift(mission)

@@ -43,25 +43,25 @@ def separation_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     radius, limit = np.array(mission.agents.radius), mission.limits.separation or 0.0
     worst: dict[bool, tuple[float, float, tuple[int, ...], str]] = {}
     least = np.inf, 0.0, (0, 0)
-    for number, leg in enumerate(found.legs):
+    for number, planned in enumerate(found.planned_phases):
         ends: list[tuple[float, float, tuple[int, ...]]] = []
-        positions = leg.position if leg.ways is None else np.array(leg.ways)
+        positions = planned.position if planned.ways is None else np.array(planned.ways)
         rooms, pairs = proximity.separation(positions, radius)
-        for k in [int(rooms.argmin())] if leg.ways is None else [0, -1]:
-            ends.append((float(rooms[k]), float(leg.time[k]), tuple(pairs[k].tolist())))
-        if leg.ways is not None:
-            room, who, share = assignment.nearest_way(*leg.ways, radius)
-            crossing = room, _time_of(mission, leg, number, share), who
+        for k in [int(rooms.argmin())] if planned.ways is None else [0, -1]:
+            ends.append((float(rooms[k]), float(planned.time[k]), tuple(pairs[k].tolist())))
+        if planned.ways is not None:
+            room, who, share = assignment.nearest_way(*planned.ways, radius)
+            crossing = room, _time_of(mission, planned, number, share), who
             least = min(least, crossing)
             beyond = room <= 0 or room < limit - SLACK
             if beyond and room < min(ends)[0] - SLACK:
-                yield _crossing(mission, number, leg, crossing, limit)
+                yield _crossing(mission, number, planned, crossing, limit)
         for k, at in enumerate(ends):
             least = min(least, at)
             # Where agents start is known, whatever leads them from there.
-            exact = leg.exact or (number == 0 and k == 0 and leg.ways is not None)
+            exact = planned.exact or (number == 0 and k == 0 and planned.ways is not None)
             if exact not in worst or at[0] < worst[exact][0]:
-                worst[exact] = *at, leg.phase
+                worst[exact] = *at, planned.phase
     if np.isfinite(least[0]):
         found.room = least[0], least[1], agents(least[2])
     for exact, (room, t, who, phase) in worst.items():
@@ -79,31 +79,31 @@ def _near(
     return f"{agents(who)} come within {room:.2f} m at {t:.2f} s, in '{phase}' (limit {limit:g} m)"
 
 
-def _time_of(mission: Mission, leg: PlannedPhase, number: int, share: float) -> float:
+def _time_of(mission: Mission, planned: PlannedPhase, number: int, share: float) -> float:
     """When [s] agents have gone this share of their ways."""
     blend = getattr(mission.phases[number], "blend", 0.0)
     tau = np.linspace(0.0, 1.0, 2001)
-    return float(leg.time[0] + blend * np.interp(share, septic(tau), tau))
+    return float(planned.time[0] + blend * np.interp(share, septic(tau), tau))
 
 
 def _crossing(
     mission: Mission,
     number: int,
-    leg: PlannedPhase,
+    planned: PlannedPhase,
     at: tuple[float, float, tuple[int, ...]],
     limit: float,
 ) -> Remark:
     """Agents whose straight ways from one formation to the next bring them too near."""
-    (room, t, who), (before, after) = at, leg.shapes
+    (room, t, who), (before, after) = at, planned.shapes
     needed = sum(mission.agents.radius[i] for i in who) + limit
     origin = "the start" if before is None else f"'{before}'"
     text = (
-        f"{_near(who, room, t, leg.phase, limit, exact=leg.exact)}: their ways from {origin} to '{after}' cross,"
-        f" {max(0.0, room + needed - limit):.2f} m from centre to centre. "
+        f"{_near(who, room, t, planned.phase, limit, exact=planned.exact)}: their ways from {origin} to '{after}'"
+        f" cross, {max(0.0, room + needed - limit):.2f} m from centre to centre. "
     )
     assert after is not None  # something is shaped
-    assert leg.ways is not None
-    apart = min(float(proximity.nearest(places).min()) for places in leg.ways)
+    assert planned.ways is not None
+    apart = min(float(proximity.nearest(places).min()) for places in planned.ways)
     flown = [p.formation for p in mission.phases[:number] if isinstance(p, Establish | Reshape)]
     spaced = f"keep slots {math.sqrt(2) * needed:.2f} m apart or more (here {apart:.2f} m)"
     promised = mission.assigned_turn(before, after) is not None
@@ -118,20 +118,25 @@ def _crossing(
         text += 'Assign slots to those who are near: assignment = "each"'
     if not promised and apart < math.sqrt(2) * needed:
         text += f"; and {spaced}"
-    guess = "" if leg.exact else ". Distances lead there, and the way is a guess"
-    return Remark("fails" if leg.exact else "note", "collision", text + guess)
+    guess = "" if planned.exact else ". Distances lead there, and the way is a guess"
+    return Remark("fails" if planned.exact else "note", "collision", text + guess)
 
 
 def downwash_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     """One vehicle in the downwash of another."""
     radius, limit = np.array(mission.agents.radius), mission.limits.separation_below
     worst: dict[bool, tuple[float, float, tuple[int, ...], str]] = {}
-    for leg in found.legs:
-        room, pair = proximity.headroom(leg.position, radius)
+    for planned in found.planned_phases:
+        room, pair = proximity.headroom(planned.position, radius)
         k = int(room.argmin())
-        if room[k] < worst.get(leg.exact, (np.inf,))[0]:
-            low, high = sorted(pair[k].tolist(), key=lambda i: leg.position[k, i, 2])
-            worst[leg.exact] = float(room[k]), float(leg.time[k]), (low, high), leg.phase
+        if room[k] < worst.get(planned.exact, (np.inf,))[0]:
+            low, high = sorted(pair[k].tolist(), key=lambda i: planned.position[k, i, 2])
+            worst[planned.exact] = (
+                float(room[k]),
+                float(planned.time[k]),
+                (low, high),
+                planned.phase,
+            )
     for exact, (room, t, (low, high), phase) in worst.items():
         text = f"agent {low + 1} is below agent {high + 1}, {max(room, 0.0):.2f} m from it at {t:.2f} s, in '{phase}'"
         if limit is None:
@@ -146,14 +151,14 @@ def thrust_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     masses, limits = np.array(mission.agents.mass), np.array(mission.agents.thrust_limit)
     weight = np.array([0.0, 0.0, mission.gravity])
     best: tuple[float, float, str, float, str, bool] | None = None
-    for leg in found.legs:
-        force = masses * np.linalg.norm(leg.acceleration + weight, axis=2)
+    for planned in found.planned_phases:
+        force = masses * np.linalg.norm(planned.acceleration + weight, axis=2)
         over = force - limits if np.isfinite(limits).any() else force
         k, i = np.unravel_index(int(over.argmax()), over.shape)
         share = force[k, i] - (limits[i] if math.isfinite(limits[i]) else 0.0)
-        at = (float(force[k, i]), float(leg.time[k]), f"agent {i + 1}", float(limits[i]))
+        at = (float(force[k, i]), float(planned.time[k]), f"agent {i + 1}", float(limits[i]))
         if best is None or share > best[0] - (best[3] if math.isfinite(best[3]) else 0.0):
-            best = (*at, leg.phase, leg.exact)
+            best = (*at, planned.phase, planned.exact)
     if best is not None:
         found.thrust = best[:4]
         force, t, who, limit, phase, exact = best
@@ -166,7 +171,7 @@ def thrust_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
 def disturbance_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     """What wind, gusts, noise and wrong masses ask for, as far as it follows from the planned way."""
     d = mission.disturbances
-    if d is None or not found.legs:
+    if d is None or not found.planned_phases:
         return
     believed, true, drag = np.array(mission.agents.mass), mission.true_mass, mission.drag
     wind, up = np.array(d.wind), np.array([0.0, 0.0, 1.0])
@@ -179,15 +184,15 @@ def disturbance_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
         noise = 3 * believed * math.hypot(k1 * d.noise.position, k2 * d.noise.velocity)
     limits = np.array(mission.agents.thrust_limit)
     worst, most = -math.inf, (0.0, 0.0, "", math.inf)
-    for leg in found.legs:
-        force = true[:, None] * (leg.acceleration + g * up)
-        force -= drag[:, None] * (wind - leg.velocity)
+    for planned in found.planned_phases:
+        force = true[:, None] * (planned.acceleration + g * up)
+        force -= drag[:, None] * (wind - planned.velocity)
         need = np.linalg.norm(force, axis=2) + gusts + noise
         over = need - np.where(np.isfinite(limits), limits, 0.0)
         k, i = np.unravel_index(int(over.argmax()), over.shape)
         if over[k, i] > worst:
             worst = float(over[k, i])
-            most = float(need[k, i]), float(leg.time[k]), f"agent {i + 1}", float(limits[i])
+            most = float(need[k, i]), float(planned.time[k]), f"agent {i + 1}", float(limits[i])
     steady = drag[:, None] * wind - ((true - believed) * g)[:, None] * up
     off = np.linalg.norm(steady, axis=1) / (k1 * believed)
     far = int(off.argmax())
@@ -199,7 +204,7 @@ def disturbance_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     if most[0] > most[3]:
         text = f"disturbed, {most[2]} may need {most[0]:.1f} N at {most[1]:.2f} s, and has {most[3]:g} N"
         yield Remark("note", "thrust", text)
-    if off[far] > _OFFSET and any(phase.control == "slots" for phase in mission.phases):
+    if off[far] > _OFFSET and any(phase.control == "tracking" for phase in mission.phases):
         text = (
             f"what is steady in the disturbances holds agent {far + 1} {off[far]:.2f} m off its slot, as tracking"
             f" has no integral; a greater first weight in tracking.Q shortens it (now {mission.tracking.Q[0]:g})"
@@ -216,7 +221,10 @@ def _step_thrust(mission: Mission, found: Preflight) -> Iterator[Remark]:
     if c.stabilisation == "none":
         return
     limits = np.array(mission.agents.thrust_limit)
-    starts = [np.array(mission.agents.position), *(leg.position[-1] for leg in found.legs)]
+    starts = [
+        np.array(mission.agents.position),
+        *(planned.position[-1] for planned in found.planned_phases),
+    ]
     for phase, r in zip(mission.phases, starts, strict=False):
         if not (isinstance(phase, Establish | Reshape) and phase.reference == "step"):
             continue
@@ -240,12 +248,12 @@ def _step_thrust(mission: Mission, found: Preflight) -> Iterator[Remark]:
 
 def obstacle_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     """Room to each obstacle; of many, to all that may be touched and to the nearest."""
-    radius, way = np.array(mission.agents.radius), found.legs
+    radius, way = np.array(mission.agents.radius), found.planned_phases
     if not (mission.obstacles and way):
         return
-    # What a leg stays within, and how far that is from each obstacle (L, B): nobody is nearer.
+    # What a phase stays within, and how far that is from each obstacle (L, B): nobody is nearer.
     within = np.array(
-        [[leg.position.min(axis=(0, 1)), leg.position.max(axis=(0, 1))] for leg in way]
+        [[planned.position.min(axis=(0, 1)), planned.position.max(axis=(0, 1))] for planned in way]
     )
     far = np.stack([_beyond(within, thing) for thing in mission.obstacles], axis=1) - radius.max()
     held, met, skipped = 0, 0, []
@@ -258,17 +266,22 @@ def obstacle_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
             break
         worst: dict[bool, tuple[float, float, int, str]] = {}
         for k in np.argsort(far[:, b], kind="stable").tolist():
-            leg = way[k]
-            if far[k, b] >= worst.get(leg.exact, (np.inf,))[0]:
+            planned = way[k]
+            if far[k, b] >= worst.get(planned.exact, (np.inf,))[0]:
                 continue
-            held, met = held + leg.position[:, :, 0].size, met + 1
+            held, met = held + planned.position[:, :, 0].size, met + 1
             if held > _HELD or met > _MET:
                 break
-            room, agent, _ = proximity.clearance(leg.position, radius, [thing])
+            room, agent, _ = proximity.clearance(planned.position, radius, [thing])
             at = int(room.argmin())
             # Of as near ones the first: rounding and a rest's last millimetre count for nothing.
-            if room[at] < worst.get(leg.exact, (np.inf,))[0] - 1e-3:
-                worst[leg.exact] = float(room[at]), float(leg.time[at]), int(agent[at]), leg.phase
+            if room[at] < worst.get(planned.exact, (np.inf,))[0] - 1e-3:
+                worst[planned.exact] = (
+                    float(room[at]),
+                    float(planned.time[at]),
+                    int(agent[at]),
+                    planned.phase,
+                )
         if held > _HELD or met > _MET:
             skipped = near[rank:][far[:, near[rank:]].min(axis=0) <= 0].tolist()
             break
@@ -305,9 +318,9 @@ def _beyond(within: Floats, thing: Box | Ground) -> Floats:
 
 def _too_low(mission: Mission, found: Preflight, phase: str, ground: float) -> str:
     """Why a vehicle is at or below the ground [m] in a phase, and how high its formation is to fly."""
-    leg = next(leg for leg in found.legs if leg.phase == phase)
+    planned = next(planned for planned in found.planned_phases if planned.phase == phase)
     masses, radius = np.array(mission.agents.mass), np.array(mission.agents.radius)
-    z = leg.position[..., 2]
+    z = planned.position[..., 2]
     cm = z @ masses / masses.sum()
     k, i = np.unravel_index(int((z - radius).argmin()), z.shape)
     deep, below = ground + radius[i] - z[k, i], cm[k] - z[k, i]
@@ -331,12 +344,12 @@ def _gaps(mission: Mission, found: Preflight, radius: Floats) -> Iterator[Remark
     low, high = np.array([box.min for box in boxes]), np.array([box.max for box in boxes])
     least: dict[tuple[int, int, int], tuple[float, float, str]] = {}
     looked, to = 0, math.inf
-    for leg in found.legs:
-        looked += len(leg.time) * len(boxes)
+    for planned in found.planned_phases:
+        looked += len(planned.time) * len(boxes)
         if looked > _PASSED:
-            to = float(leg.time[0])
+            to = float(planned.time[0])
             break
-        cm = np.einsum("i,kia->ka", masses, leg.position) / masses.sum()
+        cm = np.einsum("i,kia->ka", masses, planned.position) / masses.sum()
         between = (cm[:, None] > low) & (cm[:, None] < high)
         for axis in range(3):
             rest = [k for k in range(3) if k != axis]
@@ -350,11 +363,11 @@ def _gaps(mission: Mission, found: Preflight, radius: Floats) -> Iterator[Remark
             inside = np.isfinite(below.max(axis=1)) & np.isfinite(above.min(axis=1))
             for one, two in np.unique(sides[inside], axis=0).tolist():
                 when = inside & (sides == [one, two]).all(axis=1)
-                along = leg.position[when][:, :, axis]
+                along = planned.position[when][:, :, axis]
                 takes = (along + radius).max(axis=1) - (along - radius).min(axis=1)
                 k, key = int(takes.argmax()), (one, two, axis)
                 if key not in least or takes[k] > least[key][0]:
-                    least[key] = float(takes[k]), float(leg.time[when][k]), leg.phase
+                    least[key] = float(takes[k]), float(planned.time[when][k]), planned.phase
     for (one, two, axis), (takes, t, phase) in sorted(least.items()):
         between = f"'{boxes[one].name}' and '{boxes[two].name}'"
         wide = float(low[two, axis] - high[one, axis])
@@ -373,10 +386,10 @@ def _gaps(mission: Mission, found: Preflight, radius: Floats) -> Iterator[Remark
 def limit_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     """Geofence, speed and acceleration beyond their limits on the planned trajectory."""
     limits = mission.limits
-    for leg in found.legs:
+    for planned in found.planned_phases:
         for what, values, limit, unit in (
-            ("speed", leg.velocity, limits.speed, "m/s"),
-            ("acceleration", leg.acceleration, limits.acceleration, "m/s^2"),
+            ("speed", planned.velocity, limits.speed, "m/s"),
+            ("acceleration", planned.acceleration, limits.acceleration, "m/s^2"),
         ):
             if limit is None:
                 continue
@@ -384,15 +397,15 @@ def limit_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
             k, i = np.unravel_index(int(size.argmax()), size.shape)
             if size[k, i] > limit * (1 + 1e-3):
                 text = (
-                    f"agent {i + 1} reaches {size[k, i]:.3g} {unit} at {leg.time[k]:.2f} s, in '{leg.phase}'"
+                    f"agent {i + 1} reaches {size[k, i]:.3g} {unit} at {planned.time[k]:.2f} s, in '{planned.phase}'"
                     f" (limit {limit:g} {unit})"
                 )
-                yield Remark("fails" if leg.exact else "note", what, text)
+                yield Remark("fails" if planned.exact else "note", what, text)
         if limits.geofence is not None:
             low, high = np.array(limits.geofence.min), np.array(limits.geofence.max)
-            out = np.maximum(low - leg.position, leg.position - high).max(axis=2)
+            out = np.maximum(low - planned.position, planned.position - high).max(axis=2)
             k, i = np.unravel_index(int(out.argmax()), out.shape)
             if out[k, i] > SLACK:
-                by, t = float(out[k, i]), float(leg.time[k])
-                text = f"agent {i + 1} leaves the geofence by {by:.2f} m at {t:.2f} s, in '{leg.phase}'"
-                yield Remark("fails" if leg.exact else "note", "geofence", text)
+                by, t = float(out[k, i]), float(planned.time[k])
+                text = f"agent {i + 1} leaves the geofence by {by:.2f} m at {t:.2f} s, in '{planned.phase}'"
+                yield Remark("fails" if planned.exact else "note", "geofence", text)

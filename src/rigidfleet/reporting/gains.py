@@ -84,7 +84,7 @@ def _constraint(mission: Mission) -> list[Line]:
     }[c.solver]
     value = f"{c.solver} ({setting})" if setting else c.solver
     found.append(Line("solver", value, _SOLVERS[c.solver]))
-    if any(phase.control != "slots" for phase in mission.phases):
+    if any(phase.control != "tracking" for phase in mission.phases):
         rate = f"{c.deformation_damping:g} /s"
         meaning = "what distances do not see dies out at this rate while no slots are tracked"
         found.append(Line("deformation damping", rate, meaning))
@@ -99,7 +99,7 @@ def _damping(mission: Mission) -> str:
 
 
 def _tracking(mission: Mission) -> list[Line]:
-    if not any(phase.control == "slots" for phase in mission.phases):
+    if not any(phase.control == "tracking" for phase in mission.phases):
         return []
     t = mission.tracking
     k1, k2 = lqr.double_integrator_gains(t.Q, t.R)

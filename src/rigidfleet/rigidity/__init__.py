@@ -1,7 +1,7 @@
 """Rigidity: what distances hold of a shape, what they leave free, and which other shapes they allow."""
 
 from rigidfleet.math.constraint_jacobian import jacobian
-from rigidfleet.rigidity.analysis import Rigidity, Verdict, analyse, full_rank
+from rigidfleet.rigidity.analysis import Rigidity, RigidityClass, analyse, full_rank
 from rigidfleet.rigidity.framework import Flex, rigid_motions
 from rigidfleet.rigidity.realisations import Kind, Realisation, Realisations, realisations
 from rigidfleet.rigidity.spectrum import Spectrum, spectrum
@@ -12,8 +12,8 @@ __all__ = [
     "Realisation",
     "Realisations",
     "Rigidity",
+    "RigidityClass",
     "Spectrum",
-    "Verdict",
     "analyse",
     "full_rank",
     "jacobian",

@@ -16,7 +16,7 @@ from rigidfleet.rigidity.order import StressEnergy, blocking_stress, finite_flex
 from rigidfleet.typing import Floats, Ints
 
 
-class Verdict(StrEnum):
+class RigidityClass(StrEnum):
     """What distances make of a shape."""
 
     INFINITESIMALLY_RIGID = "infinitesimally rigid"
@@ -64,7 +64,7 @@ class Rigidity:
     spare: Ints
     flexes: tuple[Flex, ...]
     index: float
-    verdict: Verdict
+    verdict: RigidityClass
     reason: str
     stress: Floats | None = None
     deformed: Floats | None = None
@@ -78,7 +78,7 @@ class Rigidity:
     @property
     def rigid(self) -> bool:
         """Whether the distances are known to hold the shape against every small motion."""
-        return self.verdict in (Verdict.INFINITESIMALLY_RIGID, Verdict.PRESTRESS_STABLE)
+        return self.verdict in (RigidityClass.INFINITESIMALLY_RIGID, RigidityClass.PRESTRESS_STABLE)
 
     def force(self, b: float, mass: float = 1.0) -> float:
         """Greatest norm of f_C (all agents) [N] that a right side b of norm `b` [m/s^2] asks of the exact law.
@@ -235,18 +235,18 @@ def _index(frame: Framework, masses: ArrayLike | None) -> float:
 
 def _judge(
     frame: Framework, within: Rigidity | None
-) -> tuple[Verdict, str, Floats | None, Floats | None]:
-    """Verdict, reason, blocking stress, deformed shape."""
+) -> tuple[RigidityClass, str, Floats | None, Floats | None]:
+    """Class, reason, blocking stress, deformed shape."""
     k = frame.flexes.shape[1]
     if k == 0:
         reason = "every motion changes a distance"
         if frame.rank and frame.s[-1] < _BARELY:
             reason += f", but one of them hardly (index {frame.s[-1]:.1e}): expect large forces"
-        return Verdict.INFINITESIMALLY_RIGID, reason, None, None
-    if within is not None and within.verdict is Verdict.FLEXIBLE:
+        return RigidityClass.INFINITESIMALLY_RIGID, reason, None, None
+    if within is not None and within.verdict is RigidityClass.FLEXIBLE:
         where = _WHERE[within.dimension]
         return (
-            Verdict.FLEXIBLE,
+            RigidityClass.FLEXIBLE,
             f"flexible already within its own {where}: {within.reason}",
             None,
             None,
@@ -256,16 +256,16 @@ def _judge(
             f"{_count(k, 'motion')} free, and the rank {frame.rank} is the greatest that these edges have "
             "anywhere, so the shape moves on (Asimow and Roth)"
         )
-        return Verdict.FLEXIBLE, reason, None, None
+        return RigidityClass.FLEXIBLE, reason, None, None
     energy = StressEnergy(frame)
     stress, open_flexes, none_exists = blocking_stress(energy)
     if stress is not None:
         reason = f"{_count(k, 'motion')} free to first order; a self-stress blocks all of them"
-        return Verdict.PRESTRESS_STABLE, reason, stress, None
+        return RigidityClass.PRESTRESS_STABLE, reason, stress, None
     bent, goes_on = finite_flex(StressEnergy(frame, frame.flexes @ open_flexes))
     if bent is not None:
         reason = "a finite motion was followed that keeps all distances"
-        return Verdict.FLEXIBLE, reason, None, bent
+        return RigidityClass.FLEXIBLE, reason, None, bent
     reason = (
         f"{_count(k, 'motion')} free to first order; "
         + ("no self-stress blocks all of them" if none_exists else "no blocking stress was found")
@@ -275,7 +275,7 @@ def _judge(
             else "; none was found that goes on to second order, so it is probably rigid, but softly"
         )
     )
-    return Verdict.UNDECIDED, reason, None, None
+    return RigidityClass.UNDECIDED, reason, None, None
 
 
 def _count(k: int, what: str) -> str:

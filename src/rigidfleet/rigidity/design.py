@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rigidfleet.formation.distance_geometry import dimension, distances
-from rigidfleet.formation.graphs import coarse_to_fine, complete_graph, joined, neighbours
+from rigidfleet.formation.graphs import complete_graph, henneberg, henneberg_multilevel, neighbours
 from rigidfleet.rigidity import full_rank, jacobian, rigid_motions
 from rigidfleet.typing import Floats, Ints
 
@@ -116,7 +116,7 @@ def limits(slots: ArrayLike) -> str:
     return (
         f"The shape is {where}: to first order no distance resists motion {free}, which leaves {count} "
         f"motion{'s' * (count != 1)} free whatever the edges. Redundant edges may still block them by a self-stress, "
-        "softly; slots hold them firmly (control = 'slots')."
+        "softly; slots hold them firmly (control = 'tracking')."
     )
 
 
@@ -124,8 +124,8 @@ def limits(slots: ArrayLike) -> str:
 GRAPHS: dict[str, Callable[[Floats, float], Ints]] = {
     "complete": lambda p, _: complete_graph(len(p)),
     "neighbours": neighbours,
-    "joined": lambda p, _: joined(p),
-    "tree": lambda p, _: coarse_to_fine(p),
+    "henneberg": lambda p, _: henneberg(p),
+    "henneberg-multilevel": lambda p, _: henneberg_multilevel(p),
 }
 
 

@@ -12,12 +12,12 @@ import numpy as np
 from rigidfleet.errors import StoppedError
 from rigidfleet.kernel import records
 from rigidfleet.kernel.engine import native
-from rigidfleet.kernel.problem import LOCAL, OPEN, Program
+from rigidfleet.kernel.problem import OPEN, TRACKING, Problem
 from rigidfleet.math import attitude as att
 from rigidfleet.mission import Settle
 from rigidfleet.planning.disturbances import without
 from rigidfleet.planning.plan import PhasePlan
-from rigidfleet.planning.reference import Situation
+from rigidfleet.planning.reference import PhaseState
 from rigidfleet.planning.tolerances import most_steps
 from rigidfleet.simulation.callbacks import Controller, ExternalForce, Observation, asked
 from rigidfleet.simulation.diagnosis import Place, diagnose
@@ -74,8 +74,8 @@ class ActivePhase:
         if self.solver is not None:
             self.state.clock[1] = first_step(plan, self.workspace, self.state)
         self.asked = 0  # how often the user's controller has been
-        self.held: Program | None = None  # with its force
-        self.flown: Program | None = None  # what the steps in the trail were flown by
+        self.held: Problem | None = None  # with its force
+        self.flown: Problem | None = None  # what the steps in the trail were flown by
         self.steps = _FIRST_STEPS  # at a time; more as soon as it is known how long they take
         self.counted = np.zeros(
             3, dtype=np.int64
@@ -116,16 +116,16 @@ class ActivePhase:
         StoppedError
             The flight cannot go on.
         """
-        if controller is None or self.plan.phase.control != "slots":
-            self._integrate(self.plan.program, t_end)
+        if controller is None or self.plan.phase.control != "tracking":
+            self._integrate(self.plan.problem, t_end)
             return
         start = self.plan.start
         while self.t < t_end:
-            # Control instants count from the phase's start, wherever a stretch of it ends.
+            # Control instants count from the phase's start, wherever a segment of it ends.
             if self.held is None or self.t >= start + self.asked / rate:
                 f = asked("the controller", self.t, len(self.lost), controller, self.observe())
-                control = self.plan.program.control._replace(kind=OPEN, force=f)
-                self.held = self.plan.program._replace(control=control)
+                control = self.plan.problem.control._replace(kind=OPEN, force=f)
+                self.held = self.plan.problem._replace(control=control)
                 self.asked += 1
             self._integrate(self.held, min(start + self.asked / rate, t_end))
 
@@ -133,8 +133,8 @@ class ActivePhase:
         self, t_end: float, settle: Settle, controller: Controller | None, rate: float, step: float
     ) -> None:
         """Integrate until the phase has settled, or to ``t_end`` [s]; checks are at multiples of ``step`` [s]."""
-        step *= max(1.0, round(_CHECK / step))  # stretches end at samples
-        least = self.plan.start + self.plan.program.reference.T_b
+        step *= max(1.0, round(_CHECK / step))  # segments end at samples
+        least = self.plan.start + self.plan.problem.reference.T_b
         while self.t < t_end and not self.settled:
             t = (math.floor(self.t / step + 1e-9) + 1) * step
             self.fly_to(min(t, t_end), controller, rate)
@@ -143,22 +143,22 @@ class ActivePhase:
             quiet = self.t >= least and self._error() <= settle.tolerance
             self.quiet_since = min(self.quiet_since, self.t) if quiet else math.inf
 
-    def lead(self, program: Program) -> None:
-        """Go on with another program of the same size, as one whose reference leads elsewhere."""
-        self.plan.program = program
+    def lead(self, problem: Problem) -> None:
+        """Go on with another problem of the same size, as one whose reference leads elsewhere."""
+        self.plan.problem = problem
         self.counted[0] += self.state.count[0]
         self.state.count[0] = 0  # another law: its derivative is not known yet
 
     def evaluate(self) -> None:
         """Evaluate the law where the phase is: forces and references are in the workspace."""
         y = self.state.y
-        native.closed_loop(self.t, y, np.empty_like(y), self.plan.program, self.workspace)
+        native.closed_loop(self.t, y, np.empty_like(y), self.plan.problem, self.workspace)
 
     def observe(self) -> Observation:
         """What a controller sees where the phase is."""
         self.evaluate()
-        w, vehicles = self.workspace, self.plan.program.vehicles
-        noisy = len(self.plan.program.disturbance.noise_r) > 0
+        w, vehicles = self.workspace, self.plan.problem.vehicles
+        noisy = len(self.plan.problem.disturbance.noise_r) > 0
         r, v = (w.r_seen, w.v_seen) if noisy else (w.r, w.v)
         return Observation(
             self.t, self.plan.phase.name, r.copy(), v.copy(), w.r_ref.copy(), w.v_ref.copy(),
@@ -166,11 +166,11 @@ class ActivePhase:
         )  # fmt: skip
 
     def watch(self, *, last: bool) -> None:
-        """Look for extremes in the steps flown; the ``last`` ones under a program are not followed by others."""
+        """Look for extremes in the steps flown; the ``last`` ones under a problem are not followed by others."""
         if self.state.count[4] and self.flown is not None:
             self.extremes.take(self.flown, self.workspace, self.state, last=last)
 
-    def end(self) -> Situation:
+    def end(self) -> PhaseState:
         """End the phase where it is; return the state that the next one starts from."""
         self._check()
         if not (self.state.count[0] or self.t > self.plan.start):
@@ -186,24 +186,24 @@ class ActivePhase:
             self.solver.check()
             self.solver.aside.check()
 
-    def _integrate(self, program: Program, t_end: float) -> None:
+    def _integrate(self, problem: Problem, t_end: float) -> None:
         """Integrate to ``t_end`` [s] through the times at which vehicles are lost.
 
-        ``program`` may hold a user's force in place of the phase's own input law.
+        ``problem`` may hold a user's force in place of the phase's own input law.
         """
         while self.t < t_end:
             coming = np.where(self.lost, math.inf, self.plan.lost_at)
             if coming.min() <= self.t:
-                program = self._lose(program, coming <= self.t)
+                problem = self._lose(problem, coming <= self.t)
             else:
-                self._stretch(program, min(t_end, float(coming.min())))
+                self._segment(problem, min(t_end, float(coming.min())))
 
-    def _lose(self, program: Program, now: Bools) -> Program:
-        """Go on without the vehicles that are lost ``now`` (N,); return what is flown of a program."""
+    def _lose(self, problem: Problem, now: Bools) -> Problem:
+        """Go on without the vehicles that are lost ``now`` (N,); return what is flown of a problem."""
         self.watch(last=True)
         self._check()
         self.lost = self.lost | now
-        plan, y, own = self.plan, self.state.y, program is self.plan.program
+        plan, y, own = self.plan, self.state.y, problem is self.plan.problem
         plan.before.lost = self.lost
         self.extremes.lose(self.lost)
         n = len(self.lost)
@@ -217,10 +217,10 @@ class ActivePhase:
         self.state = integrator(plan, y, t, trail)
         self.workspace, self.solver = equip(plan)
         if own:
-            return plan.program
-        mu = plan.program.law.mu
-        held = without(program, kept, self.lost, mu, large=plan.large)
-        self.held = held._replace(graph=plan.program.graph)
+            return plan.problem
+        mu = plan.problem.law.mu
+        held = without(problem, kept, self.lost, mu, large=plan.large)
+        self.held = held._replace(graph=plan.problem.graph)
         return self.held
 
     def count(self) -> None:
@@ -229,16 +229,16 @@ class ActivePhase:
         if self.solver is not None:
             self.solves.append((self.plan.method, self.solver.counts))
 
-    def _stretch(self, program: Program, t_end: float) -> None:
+    def _segment(self, problem: Problem, t_end: float) -> None:
         """Integrate to ``t_end`` [s] and record the samples on the way."""
         state = self.state
-        fresh = state.count[0] == 0 or program is not self.plan.program
+        fresh = state.count[0] == 0 or problem is not self.plan.problem
         if fresh:
             self.watch(last=True)
-            self.flown = program
+            self.flown = problem
             if self.solver is not None:  # it remembers what it is asked: the monitor has another
-                graph = program.graph._replace(solver=self.solver.aside.address)
-                self.flown = program._replace(graph=graph)
+                graph = problem.graph._replace(solver=self.solver.aside.address)
+                self.flown = problem._replace(graph=graph)
         times = self.sampler(self.plan, self.t, t_end, first=not self.begun, stop=self.stop)
         self.begun = True
         samples = np.empty((len(times), len(state.y)))
@@ -249,7 +249,7 @@ class ActivePhase:
             while status == records.PAUSED:
                 begun = clock.perf_counter()
                 status = native.integrate(
-                    program, self.workspace, state, t_end, fresh, times, samples, self.steps
+                    problem, self.workspace, state, t_end, fresh, times, samples, self.steps
                 )
                 took = max(clock.perf_counter() - begun, 1e-6)
                 if status == records.PAUSED:
@@ -267,7 +267,7 @@ class ActivePhase:
             if state.count[0] and not state.count[1] and len(times) and times[0] <= first:
                 samples[0], done = state.y, 1  # no step was possible: the start is all there is
             if done:
-                self._record(program, times[:done], samples[:done])
+                self._record(problem, times[:done], samples[:done])
         if status != records.FINISHED:
             collapsed = status == records.COLLAPSED
             own_force = self.external is not None
@@ -286,10 +286,10 @@ class ActivePhase:
         plan, w = self.plan, self.workspace
         self.evaluate()
         errors = [np.abs(w.c).max(initial=0.0)]
-        local = plan.program.control.kind == LOCAL
+        local = plan.problem.control.kind == TRACKING
         if local:
             errors.append(np.linalg.norm(w.r - w.r_ref, axis=1)[~self.lost].max())
-        tracks = plan.program.control.kind != OPEN
+        tracks = plan.problem.control.kind != OPEN
         if tracks and plan.goal is not None and plan.slots is not None:
             goal, since = plan.goal, self.t - plan.arrival  # it moves on
             left = np.where(self.lost, 0.0, plan.masses)
@@ -303,13 +303,13 @@ class ActivePhase:
             errors.append(np.linalg.norm(plan.slots @ turned, axis=1).max())
         return float(max(errors))
 
-    def _record(self, program: Program, times: Floats, samples: Floats) -> None:
+    def _record(self, problem: Problem, times: Floats, samples: Floats) -> None:
         """Evaluate forces and references at the samples and keep them."""
         plan, w = self.plan, self.workspace
         n, m = len(plan.masses), len(plan.edges)
-        out = native.record(program, w, times, samples)
-        if program is not plan.program:  # flown by a user's controller: the phase's references
-            planned = native.record(plan.program, w, times, samples)
+        out = native.record(problem, w, times, samples)
+        if problem is not plan.problem:  # flown by a user's controller: the phase's references
+            planned = native.record(plan.problem, w, times, samples)
             out = out._replace(
                 r_ref=planned.r_ref,
                 p=planned.p,

@@ -93,7 +93,7 @@ def _smoother(plan: PhasePlan) -> str:
 def _remedy(at: Place, *, own_force: bool, collapsed: bool) -> str:
     """What to try where J is not to blame."""
     beyond = at.t + 1e-9 * max(1.0, at.t)  # what happens at at.t shows a moment later
-    native.closed_loop(beyond, at.state.y, np.empty_like(at.state.y), at.plan.program, at.workspace)
+    native.closed_loop(beyond, at.state.y, np.empty_like(at.state.y), at.plan.problem, at.workspace)
     w = at.workspace
     names = {"input force": w.f_u, "constraint force": w.f_C, "external force": w.f_E}
     lost = [name for name, f in names.items() if not np.isfinite(f).all()]
@@ -126,7 +126,7 @@ def _remedy(at: Place, *, own_force: bool, collapsed: bool) -> str:
 def _jacobian(at: Place) -> tuple[Floats, int, float]:
     """J (m, 3N) where the integrator is, its shortest edge and that edge's length [m]."""
     edges = at.plan.edges
-    native.closed_loop(at.t, at.state.y, np.empty_like(at.state.y), at.plan.program, at.workspace)
+    native.closed_loop(at.t, at.state.y, np.empty_like(at.state.y), at.plan.problem, at.workspace)
     r = at.workspace.r
     lengths = np.linalg.norm(r[edges[:, 0]] - r[edges[:, 1]], axis=1)
     closest = int(lengths.argmin())

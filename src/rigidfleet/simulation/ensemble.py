@@ -18,7 +18,7 @@ from rigidfleet.kernel.compiler.simd import WIDTH
 from rigidfleet.kernel.engine import batch
 from rigidfleet.mission import Establish, Mission, Phase, Reshape, as_mission
 from rigidfleet.planning.plan import plan_phase
-from rigidfleet.planning.reference import Situation
+from rigidfleet.planning.reference import PhaseState
 from rigidfleet.planning.solvers import choose
 from rigidfleet.planning.tolerances import absolute_tolerances, most_steps, tolerance_of_velocity
 from rigidfleet.typing import Bools, Floats, Ints
@@ -130,7 +130,7 @@ class _Flights:
         self.mission, self.r, self.v = mission, r, v
         count = len(r)
         # One plan for all: without slots, only the distances it starts from are a flight's own.
-        self.now = Situation(0.0, r[0], v[0])
+        self.now = PhaseState(0.0, r[0], v[0])
         self.integral: dict[tuple[int, int], Floats] = {}
         self.finished = np.ones(count, dtype=bool)
         self.evaluations = np.zeros(count, dtype=np.int64)
@@ -141,17 +141,17 @@ class _Flights:
         """Fly one phase, and keep its ends."""
         now, (count, n) = self.now, self.r.shape[:2]
         plan = plan_phase(self.mission, phase, now)
-        law = plan.program.law._replace(mu=self.mission.damping(None))
-        program = plan.program._replace(law=law)
+        law = plan.problem.law._replace(mu=self.mission.damping(None))
+        problem = plan.problem._replace(law=law)
         edges = [(int(i), int(j)) for i, j in plan.edges]
         before = now.reference.of(plan.edges, _lengths(self.r, plan.edges))
         sums = [self.integral.get(edge, np.zeros(count)) for edge in edges]
         y = np.column_stack([self.r.reshape(count, -1), self.v.reshape(count, -1), *sums])
         places, given = _places(self.finished), self.mission.integrator
-        velocity = tolerance_of_velocity(given, now.r, program.vehicles.m, law.beta, large=False)
-        shared = batch.fits(program) if vectors is None else vectors
+        velocity = tolerance_of_velocity(given, now.r, problem.vehicles.m, law.beta, large=False)
+        shared = batch.fits(problem) if vectors is None else vectors
         ends = batch.fly_all(
-            program,
+            problem,
             y[places],
             before[places],
             (now.t, plan.t_end),
@@ -171,7 +171,7 @@ class _Flights:
         self.now = replace(
             now, t=plan.t_end, reference=known, formation=plan.formation, slots=plan.slots
         )
-        self.error = off(self.r, plan.edges, plan.distances)
+        self.error = max_edge_error(self.r, plan.edges, plan.distances)
 
 
 def _alike(mission: Mission, phase: Phase) -> bool:
@@ -203,7 +203,7 @@ def _places(finished: Bools) -> Ints:
     return places
 
 
-def off(r: Floats, edges: NDArray[np.integer], asked: Floats) -> Floats:
+def max_edge_error(r: Floats, edges: NDArray[np.integer], asked: Floats) -> Floats:
     """Greatest error (B,) [m] of edges (m, 2) that are to be ``asked`` (m,) long, at positions (B, N, 3)."""
     return np.abs(_lengths(r, edges) - asked).max(axis=1, initial=0.0)
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from rigidfleet.kernel import records
 from rigidfleet.kernel.engine import native
-from rigidfleet.kernel.problem import Program, Workspace
+from rigidfleet.kernel.problem import Problem, Workspace
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
 from rigidfleet.mission import Mission
@@ -69,7 +69,9 @@ class Extremes:
         self.who, self.sign = np.full((count, 2), -1), np.zeros(1)
         self.left = np.ones(self.n, dtype=np.bool_)
         self.low = np.full((self.n, 3), np.inf)
-        start, _ = proximity.rooms(np.array(agents.position), self.radius, mission.obstacles)
+        start, _ = proximity.obstacle_clearances(
+            np.array(agents.position), self.radius, mission.obstacles
+        )
         self.standing = (start <= PAD).astype(np.int64)
         self.pairs = self.columns = self.struck = np.zeros((0, 2), dtype=np.int64)
         self.spare, self.moved = 0.0, np.zeros(2)
@@ -107,17 +109,17 @@ class Extremes:
         self.trail = records.NO_TRAIL  # others are watched from now on
 
     def take(
-        self, program: Program, work: Workspace, state: records.Integrator, *, last: bool
+        self, problem: Problem, work: Workspace, state: records.IntegratorState, *, last: bool
     ) -> None:
-        """Take the steps in the trail into account; the ``last`` ones of a stretch are not followed by others."""
+        """Take the steps in the trail into account; the ``last`` ones of a segment are not followed by others."""
         flags, rows = self.monitor.monitor.flags, int(state.count[4])
         flags[:3] = flags[3], rows, 2 if last else 1
         if self.n > _FEW:
             for row in range(int(flags[3]), rows):
-                self._step(program, work, state, row)
+                self._step(problem, work, state, row)
             flags = self.monitor.monitor.flags
             flags[:3] = rows, rows, 2 if last else 1
-        self.monitor(program, work, state)
+        self.monitor(problem, work, state)
 
     def so_far(self) -> dict[str, Extremum]:
         """Extremes of the phase under way, by name."""
@@ -165,16 +167,18 @@ class Extremes:
             self.pairs = np.stack([i[both], j[both]], axis=1)
             self.columns = self.pairs
 
-    def _step(self, program: Program, work: Workspace, state: records.Integrator, row: int) -> None:
+    def _step(
+        self, problem: Problem, work: Workspace, state: records.IntegratorState, row: int
+    ) -> None:
         """Watch the distances of one step, in pieces so short that the pairs listed are all that matter."""
         (start, length), whole = state.trail.clock[row], state.trail.points[row]
         gauge, none = state.trail.gauge[:0], state.trail.start
         pieces: list[tuple[float, float, Floats]] = [(start, length, whole)]
         while pieces:
             t, h, points = pieces.pop()
-            moved = self._moves(program, points)
+            moved = self._moves(problem, points)
             if (self.moved + moved > self.spare).any():
-                self._list(program, points[0], 0.0)
+                self._list(problem, points[0], 0.0)
             if moved.max() > self.spare:
                 if h > _SHORTEST * length:
                     halves = (
@@ -184,13 +188,13 @@ class Extremes:
                     first, second = map(np.ascontiguousarray, halves)
                     pieces += [(t + 0.5 * h, 0.5 * h, second), (t, 0.5 * h, first)]
                     continue
-                self._list(program, points[0], float(moved.max()))
+                self._list(problem, points[0], float(moved.max()))
             self.moved += moved
             self.monitor.monitor.flags[:3] = 0, 1, 0
             trail = records.Trail(np.array([[t, h]]), points[None], gauge, none)
-            self.monitor(program, work, state._replace(trail=trail))
+            self.monitor(problem, work, state._replace(trail=trail))
 
-    def _list(self, program: Program, y: Floats, moves: float) -> None:
+    def _list(self, problem: Problem, y: Floats, moves: float) -> None:
         """List the pairs that are near each other at a state (n,), or below one another.
 
         The list is good until others may have come nearer by ``moves`` [m], at least.
@@ -215,8 +219,8 @@ class Extremes:
         pairs = who[tree.query_pairs(least + widest + spare, output_type="ndarray")]
         self.pairs = np.ascontiguousarray(np.sort(pairs, axis=1))
         if self.stacks:
-            if program.body_formulation:
-                q = y[6 * self.n + len(program.graph.edges) :][:4]
+            if problem.body_formulation:
+                q = y[6 * self.n + len(problem.graph.edges) :][:4]
                 x = x @ att.dcm_from_quaternion(q / np.linalg.norm(q))
             flat = KDTree(x[:, :2], balanced_tree=False, compact_nodes=False)
             columns = who[flat.query_pairs(widest + spare, output_type="ndarray")]
@@ -231,7 +235,7 @@ class Extremes:
             before._replace(pairs=self.pairs, columns=self.columns, flags=before.flags.copy())
         )
 
-    def _moves(self, program: Program, points: Floats) -> Floats:
+    def _moves(self, problem: Problem, points: Floats) -> Floats:
         """By how much [m] over a step (5, n) any two agents' distance may change, and that as seen from above (2,).
 
         With r_i' = any rigid motion + u_i, the rate of a distance is at most |u_i| + |u_j|, and |u_i| no more than
@@ -251,8 +255,8 @@ class Extremes:
         rate -= np.cross(spin, x)
         moved = 2.0 * math.sqrt(float(np.einsum("kia,kia->ki", rate, rate).max()))
         tilt = math.hypot(spin[0], spin[1])
-        if program.body_formulation:
-            q = points[:, 6 * self.n + len(program.graph.edges) :][:, :4]
+        if problem.body_formulation:
+            q = points[:, 6 * self.n + len(problem.graph.edges) :][:, :4]
             rates = 4.0 * np.linalg.norm(np.diff(q, axis=0), axis=1).max()
             size = max(float(np.linalg.norm(q, axis=1).min()) - 0.1, 0.1)
             tilt = 2.0 * float(rates) / size + float(np.linalg.norm(spin))

@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rigidfleet.errors import FlightError, StoppedError
-from rigidfleet.kernel.problem import LOCAL, Motion
+from rigidfleet.kernel.problem import TRACKING, Motion
 from rigidfleet.math import attitude as att
 from rigidfleet.math import lqr
 from rigidfleet.mission import Mission, Phase, as_mission
 from rigidfleet.planning.disturbances import disturbance
 from rigidfleet.planning.plan import PhasePlan, plan_phase
-from rigidfleet.planning.reference import Pose, Situation
+from rigidfleet.planning.reference import PhaseState, Pose
 from rigidfleet.result import PhaseRecord, Result
 from rigidfleet.simulation.active_phase import ActivePhase, Sampler
 from rigidfleet.simulation.as_flown import as_flown, with_phase
@@ -158,7 +158,7 @@ class Flight:
         sampler: Sampler | None = None,
         flips: bool = False,
     ) -> None:
-        """Take a mission; ``sampler`` and ``flips`` are for programs that steer (see `rigidfleet.web.live`).
+        """Take a mission; ``sampler`` and ``flips`` are for problems that steer (see `rigidfleet.web.live`).
 
         ``sampler`` says which times are recorded (`rigidfleet.simulation.sampling`), and with ``flips`` a formation
         may flip over.
@@ -175,7 +175,7 @@ class Flight:
         if mission.body_frame is not None:
             b = mission.body_frame
             frame = att.dcm_from_euler(np.deg2rad([b.roll_deg, b.pitch_deg, b.yaw_deg]))
-        self._now = Situation(
+        self._now = PhaseState(
             0.0, np.array(mission.agents.position), np.array(mission.agents.velocity), frame=frame
         )
         self._disturbance = disturbance(mission)
@@ -199,7 +199,7 @@ class Flight:
 
     @property
     def plan(self) -> PhasePlan:
-        """Plan of the phase under way: its formation, slots, goal and program."""
+        """Plan of the phase under way: its formation, slots, goal and problem."""
         return self._under_way().plan
 
     def observe(self) -> Observation:
@@ -217,7 +217,7 @@ class Flight:
         active = self._under_way()
         active.evaluate()
         w, plan = active.workspace, active.plan
-        if plan.program.control.kind == LOCAL:
+        if plan.problem.control.kind == TRACKING:
             return Pose(w.body[0].copy(), w.body[1].copy(), w.T_ref.copy(), w.body[3].copy())
         return Pose(w.cm[0].copy(), w.cm[1].copy(), w.T.copy(), np.zeros(3))
 
@@ -346,13 +346,13 @@ class Flight:
         force : whether the user's force acts meanwhile
         """
         active = self._under_way()
-        t, program = active.t, active.plan.program
+        t, problem = active.t, active.plan.problem
         external = self.external.address if force and self.external is not None else 0
         if active.plan.phase.control == "body":
-            feedback = program.feedback._replace(
+            feedback = problem.feedback._replace(
                 arrival=t, r=start.r, v=start.v, T1=np.ascontiguousarray(start.T), omega=start.omega
             )
-            active.lead(program._replace(feedback=feedback, external=external))
+            active.lead(problem._replace(feedback=feedback, external=external))
             return
         (r, v, a_end), (phi, omega, alpha_end) = end, turn
         zero = np.zeros(3)
@@ -363,7 +363,7 @@ class Flight:
         times = np.array([t, t + h])
         pieces = np.ascontiguousarray(lqr.quintic_pieces(times, x, x_dot, x_ddot))
         motion = Motion(times, pieces, np.ascontiguousarray(start.T))
-        active.lead(program._replace(motion=motion, external=external))
+        active.lead(problem._replace(motion=motion, external=external))
 
     def finish(self, ending: str = "") -> Result:
         """End the flight; return its record.
@@ -464,7 +464,7 @@ class Flight:
                 f"the formation '{now.formation}' has flipped at t = {now.t:.2f} s: its slots lie"
                 f" {math.degrees(angle):.0f} deg from the body frame that was integrated. Out of a line,"
                 " distances alone do not say to which side a shape unfolds. Track slots through that"
-                ' phase: control = "slots"'
+                ' phase: control = "tracking"'
             )
 
     def _report(self, phase: Phase, *, planning: bool = False) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from rigidfleet.kernel import records
 from rigidfleet.kernel.engine import native
-from rigidfleet.kernel.problem import RIGID, Program, Workspace, workspace
+from rigidfleet.kernel.problem import RIGID, Problem, Workspace, workspace
 from rigidfleet.planning import solvers
 from rigidfleet.planning.plan import PhasePlan
 from rigidfleet.typing import Floats
@@ -22,12 +22,12 @@ if TYPE_CHECKING:
 
 def equip(plan: PhasePlan) -> tuple[Workspace, LargeSolver | None]:
     """Workspace of a plan, and what solves for its multipliers where that is not the kernel itself."""
-    program = plan.program
+    problem = plan.problem
     work = workspace(
         len(plan.masses),
         len(plan.edges),
-        with_h=program.control.allocation != RIGID,
-        solver=program.law.solver,
+        with_h=problem.control.allocation != RIGID,
+        solver=problem.law.solver,
         large=plan.large,
     )
     if not plan.large:
@@ -36,29 +36,31 @@ def equip(plan: PhasePlan) -> tuple[Workspace, LargeSolver | None]:
 
     edges = plan.edges
     points = plan.before.r if plan.slots is None else plan.slots
-    steps = solvers.sweep_steps(len(points), edges) if plan.method == "sweep" else None
+    steps = solvers.elimination_steps(len(points), edges) if plan.method == "elimination" else None
     order = cache(partial(solvers.dissection, points, edges))
     solver = LargeSolver(
-        program.vehicles, program.graph.edges, program.law, work, steps, order, *plan.residual()
+        problem.vehicles, problem.graph.edges, problem.law, work, steps, order, *plan.residual()
     )
-    plan.program = program._replace(graph=program.graph._replace(solver=solver.address))
+    plan.problem = problem._replace(graph=problem.graph._replace(solver=solver.address))
     return work, solver
 
 
-def integrator(plan: PhasePlan, y: Floats, t: float, trail: records.Trail) -> records.Integrator:
+def integrator(
+    plan: PhasePlan, y: Floats, t: float, trail: records.Trail
+) -> records.IntegratorState:
     """An integrator of a plan at time t [s] and state y (n,), which leaves its steps in a trail."""
     return records.integrator(
         y, t, rtol=plan.integrator.rtol, atol=plan.tolerances(len(y)), trail=trail
     )
 
 
-def first_step(plan: PhasePlan, work: Workspace, state: records.Integrator) -> float:
+def first_step(plan: PhasePlan, work: Workspace, state: records.IntegratorState) -> float:
     """First step [s] to try in a large formation, from two evaluations.
 
     Hairer, Nørsett and Wanner, Solving Ordinary Differential Equations I, section II.4. Steps that grow from a small
     one cost a large formation more.
     """
-    program: Program = plan.program
+    problem: Problem = plan.problem
     t, y = float(state.clock[0]), state.y
     scale = plan.tolerances(len(y)) + state.rtol * np.abs(y)
 
@@ -67,10 +69,10 @@ def first_step(plan: PhasePlan, work: Workspace, state: records.Integrator) -> f
 
     longest = plan.t_end - plan.start
     slope, later = np.empty_like(y), np.empty_like(y)
-    native.closed_loop(t, y, slope, program, work)
+    native.closed_loop(t, y, slope, problem, work)
     first = size(slope)
     h = min(0.01 * size(y) / max(first, 1e-300), longest)
-    native.closed_loop(t + h, y + h * slope, later, program, work)
+    native.closed_loop(t + h, y + h * slope, later, problem, work)
     steepest = max(first, size(later - slope) / h)
     if not 0.0 < steepest < math.inf:
         return float(state.clock[1])

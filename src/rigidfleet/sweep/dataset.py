@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rigidfleet.sweep import keypaths
-from rigidfleet.sweep.definition import Column, Sweep
+from rigidfleet.sweep.definition import Sweep, SweepColumn
 from rigidfleet.sweep.metrics import METRICS
 from rigidfleet.sweep.store import read
 
@@ -64,7 +64,7 @@ def load(folder: str | Path) -> xarray.Dataset:
     )
 
 
-def explained(sweep: Sweep, column: Column) -> tuple[str, str]:
+def explained(sweep: Sweep, column: SweepColumn) -> tuple[str, str]:
     """Unit and meaning of what a column varies."""
     text = keypaths.meaning(sweep.mission, column.keys)
     units = _UNIT.findall(text)

@@ -21,7 +21,7 @@ from pydantic import Field, Strict
 from rigidfleet._version import __version__
 from rigidfleet.errors import MissionError, SweepError
 from rigidfleet.mission import Mission, load_mission, mission_names
-from rigidfleet.mission.findings import Keys, Notes, unknown_key
+from rigidfleet.mission.findings import FindingCollector, Keys, unknown_key
 from rigidfleet.mission.model import parse_toml, read_text
 from rigidfleet.mission.phases import kind, tables
 from rigidfleet.mission.schema import Part
@@ -36,15 +36,15 @@ from rigidfleet.sweep.variation import (
     is_number,
 )
 
-Judged = Literal["flight", "ends"]
+Evaluate = Literal["flight", "final"]
 
 #: What to do where ends alone cannot be judged.
-_WHOLE = 'judge whole flights: judged = "flight", no --ends'
+_WHOLE = 'judge whole flights: evaluate = "flight", no --final-states'
 #: Least fraction of a distribution, so that no normal number is infinite.
 _LEAST = 2.0**-54
 
 
-class Header(Part):
+class SweepHeader(Part):
     """Keys at the top of a sweep file."""
 
     mission: str = Field(
@@ -56,7 +56,7 @@ class Header(Part):
     seed: Annotated[int, Strict(), Field(ge=0, lt=2**63)] = Field(
         0, description="seed of the random numbers"
     )
-    judged: Judged = Field(
+    evaluate: Evaluate = Field(
         "flight",
         description="what of a run: its whole flight; or where its phases end alone, of open-loop missions whose "
         "starts vary, thousands in a second",
@@ -64,7 +64,7 @@ class Header(Part):
 
 
 @dataclass(frozen=True)
-class Column:
+class SweepColumn:
     """One number that varies: what varies it, where in the mission, and its values if it is gridded."""
 
     variation: Variation
@@ -87,7 +87,7 @@ class Sweep:
     runs : number of runs
     seed : of the random numbers
     name : what to call it
-    judged : what of each run, "flight" or "ends"
+    evaluate : what of each run, "flight" or "final"
     """
 
     def __init__(
@@ -97,10 +97,10 @@ class Sweep:
         runs: int | None,
         seed: int,
         name: str,
-        judged: Judged = "flight",
+        evaluate: Evaluate = "flight",
     ) -> None:
         self.mission, self.variations = mission, tuple(variations)
-        self.seed, self.name, self.judged = seed, name, judged
+        self.seed, self.name, self.evaluate = seed, name, evaluate
         self.runs = runs or math.prod(len(c.grid) for c in self.columns if c.grid is not None)
 
     @classmethod
@@ -111,7 +111,7 @@ class Sweep:
         *,
         runs: int | None = None,
         seed: int = 0,
-        judged: Judged = "flight",
+        evaluate: Evaluate = "flight",
         name: str = "",
         origin: str = "sweep",
     ) -> Self:
@@ -122,7 +122,7 @@ class Sweep:
         vary : a line for each variation, as `agents.mass.* *= normal(1, 0.05)`, or its table
         runs : one for each point of the grid when absent
         seed : of the random numbers
-        judged : "flight", or "ends": where phases end alone, of open-loop missions whose starts vary
+        evaluate : "flight", or "final": where phases end alone, of open-loop missions whose starts vary
         name : that of the mission when absent
         origin : what messages call the sweep
 
@@ -137,10 +137,10 @@ class Sweep:
             mission = load_mission(mission)
         data: dict[str, Any] = {"mission": mission.name, "seed": seed, "vary": list(vary)}
         data |= {} if runs is None else {"runs": runs}
-        data |= {} if judged == "flight" else {"judged": judged}
+        data |= {} if evaluate == "flight" else {"evaluate": evaluate}
         header, variations = _checked(data, origin, mission)
         return cls(
-            mission, variations, header.runs, header.seed, name or mission.name, header.judged
+            mission, variations, header.runs, header.seed, name or mission.name, header.evaluate
         )
 
     @classmethod
@@ -151,14 +151,14 @@ class Sweep:
         more: Iterable[str] = (),
         runs: int | None = None,
         seed: int | None = None,
-        judged: Judged | None = None,
+        evaluate: Evaluate | None = None,
     ) -> Self:
         """Read a sweep file.
 
         Parameters
         ----------
         more : lines of further variations
-        runs, seed, judged : in place of the file's
+        runs, seed, evaluate : in place of the file's
 
         Raises
         ------
@@ -177,12 +177,12 @@ class Sweep:
             mission = load_mission(named if shipped else path.parent / named)
         data |= {} if runs is None else {"runs": runs}
         data |= {} if seed is None else {"seed": seed}
-        data |= {} if judged is None else {"judged": judged}
+        data |= {} if evaluate is None else {"evaluate": evaluate}
         if isinstance(given := data.get("vary", []), list):
             data["vary"] = [*given, *more]
         header, variations = _checked(data, origin, mission)
         assert mission is not None  # else the check has raised
-        return cls(mission, variations, header.runs, header.seed, path.stem, header.judged)
+        return cls(mission, variations, header.runs, header.seed, path.stem, header.evaluate)
 
     @classmethod
     def from_json(cls, text: str) -> Self:
@@ -190,7 +190,7 @@ class Sweep:
         data = json.loads(text)
         variations = [KINDS[entry["kind"]].model_validate(entry) for entry in data["vary"]]
         mission = Mission.from_toml(data["mission"], "mission of the sweep")
-        return cls(mission, variations, data["runs"], data["seed"], data["name"], data["judged"])
+        return cls(mission, variations, data["runs"], data["seed"], data["name"], data["evaluate"])
 
     def json(self) -> str:
         """All of it as JSON text, with the mission inside."""
@@ -214,10 +214,10 @@ class Sweep:
         return keypaths.whole_document(self.mission)
 
     @cached_property
-    def columns(self) -> list[Column]:
+    def columns(self) -> list[SweepColumn]:
         """Every number that varies, in order."""
         return [
-            Column(v, keys, grid)
+            SweepColumn(v, keys, grid)
             for v in self.variations
             for grid in [v.grid if isinstance(v, Gridded) else None]
             for keys in keypaths.expand(self.whole, v.path)
@@ -252,7 +252,7 @@ class Sweep:
             "vary": [v.model_dump() for v in self.variations],
             "runs": self.runs,
             "seed": self.seed,
-            "judged": self.judged,
+            "evaluate": self.evaluate,
         }
 
 
@@ -270,7 +270,9 @@ def is_sweep_file(path: str | Path) -> bool:
         return False
 
 
-def apply(document: dict[str, Any], whole: Mapping[str, Any], column: Column, value: Any) -> None:
+def apply(
+    document: dict[str, Any], whole: Mapping[str, Any], column: SweepColumn, value: Any
+) -> None:
     """Change a document by a column's value: every number at its place alike."""
     integral = all(
         isinstance(x, int) for x in keypaths.numbers(keypaths.look_up(whole, column.keys))
@@ -297,21 +299,21 @@ def apply(document: dict[str, Any], whole: Mapping[str, Any], column: Column, va
 
 def _checked(
     data: dict[str, Any], origin: str, mission: Mission | None
-) -> tuple[Header, list[Variation]]:
+) -> tuple[SweepHeader, list[Variation]]:
     """Header and variations of a sweep that is in order."""
     wrong: dict[int, WrongLine] = {}
     if isinstance(given := data.get("vary"), list):
         parsed = [from_line(entry) if isinstance(entry, str) else entry for entry in given]
         wrong = {k: entry for k, entry in enumerate(parsed) if isinstance(entry, WrongLine)}
         data["vary"] = [given[k] if k in wrong else entry for k, entry in enumerate(parsed)]
-    notes = Notes(data, origin)
-    known = [*Header.model_fields, "vary"]
+    notes = FindingCollector(data, origin)
+    known = [*SweepHeader.model_fields, "vary"]
     for key in data:
         if key not in known:
             notes.add((key,), *unknown_key(key, known))
-    own = {key: value for key, value in data.items() if key in Header.model_fields}
-    header = notes.validate(Header, own, ())
-    by_ends = header is not None and header.judged == "ends"
+    own = {key: value for key, value in data.items() if key in SweepHeader.model_fields}
+    header = notes.validate(SweepHeader, own, ())
+    by_final_states = header is not None and header.evaluate == "final"
     whole = None if mission is None else keypaths.whole_document(mission)
     variations = []
     for k, entry in enumerate(tables(notes, "vary")):
@@ -322,13 +324,13 @@ def _checked(
         if mission is not None and whole is not None:
             _fits(notes, k, entry, found, mission, whole)
         variations += [] if found is None else [found]
-        if by_ends and found is not None and whole is not None:
+        if by_final_states and found is not None and whole is not None:
             _moves_starts(notes, k, found, whole)
-    if by_ends and mission is not None:
+    if by_final_states and mission is not None:
         from rigidfleet.simulation.ensemble import unfit
 
         if (why := unfit(mission)) is not None:
-            notes.add(("judged",), why, _WHOLE, "ends")
+            notes.add(("evaluate",), why, _WHOLE, "final")
     if "vary" not in data or data["vary"] == []:
         notes.add(
             ("vary",), "nothing varies", 'give --vary "agents.mass.* *= normal(1, 0.05)", say'
@@ -341,7 +343,7 @@ def _checked(
     return header, variations
 
 
-def _variation(notes: Notes, entry: Any, k: int) -> Variation | None:
+def _variation(notes: FindingCollector, entry: Any, k: int) -> Variation | None:
     """A variation that is in order by itself."""
     before = len(notes.findings)
     model = kind(notes, entry, ("vary", k), KINDS)
@@ -356,7 +358,12 @@ def _variation(notes: Notes, entry: Any, k: int) -> Variation | None:
 
 
 def _fits(
-    notes: Notes, k: int, entry: Any, v: Variation | None, mission: Mission, whole: dict[str, Any]
+    notes: FindingCollector,
+    k: int,
+    entry: Any,
+    v: Variation | None,
+    mission: Mission,
+    whole: dict[str, Any],
 ) -> None:
     """Whether a variation leads somewhere in the mission, and to what it can vary."""
     path = v.path if v is not None else entry.get("path") if isinstance(entry, dict) else None
@@ -389,7 +396,7 @@ def _fits(
             notes.add(where, f"is no number, but {leaves[0]!r}", remedy, path)
 
 
-def _moves_starts(notes: Notes, k: int, v: Variation, whole: dict[str, Any]) -> None:
+def _moves_starts(notes: FindingCollector, k: int, v: Variation, whole: dict[str, Any]) -> None:
     """Whether a variation moves starts alone, which is all that differs in runs judged by their ends."""
     values = getattr(v, "values", ())
     starts = ("agents", "position"), ("agents", "velocity")
@@ -406,12 +413,17 @@ def _moves_starts(notes: Notes, k: int, v: Variation, whole: dict[str, Any]) -> 
 
 
 def _taken(
-    notes: Notes, where: Keys, v: Variation, keys: Keys, mission: Mission, whole: dict[str, Any]
+    notes: FindingCollector,
+    where: Keys,
+    v: Variation,
+    keys: Keys,
+    mission: Mission,
+    whole: dict[str, Any],
 ) -> None:
     """Whether a mission takes a value where it has had none."""
     middle = v.quantile(0.5) if isinstance(v, Drawn) else v.grid[0] if isinstance(v, Gridded) else 0
     document = mission.to_dict()
-    apply(document, whole, Column(v, keys, None), middle)
+    apply(document, whole, SweepColumn(v, keys, None), middle)
     try:
         Mission.from_dict(document)
     except MissionError as error:

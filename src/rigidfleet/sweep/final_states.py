@@ -23,9 +23,9 @@ from rigidfleet.math.rigid_body import centred
 from rigidfleet.mission import Establish, Mission, Reshape
 from rigidfleet.mission.formations import coincident
 from rigidfleet.mission.schema import HUGE
-from rigidfleet.simulation.ensemble import Ensemble, establish, off
+from rigidfleet.simulation.ensemble import Ensemble, establish, max_edge_error
 from rigidfleet.sweep.metrics import METRICS
-from rigidfleet.sweep.record import Row, refusal
+from rigidfleet.sweep.record import RunRecord, refusal
 from rigidfleet.typing import Bools, Floats
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ _WORDS = {
 }
 
 
-def fly_ends(sweep: Sweep, runs: Sequence[int]) -> list[Row]:
+def fly_final_states(sweep: Sweep, runs: Sequence[int]) -> list[RunRecord]:
     """Fly whole groups of runs and judge where their phases end.
 
     A run passes if it is flown to its end and takes each of its formations: "distances", "shape" and "handedness"
@@ -66,12 +66,12 @@ def fly_ends(sweep: Sweep, runs: Sequence[int]) -> list[Row]:
         codes = tuple(c.variation.code(x) for c, x in zip(sweep.columns, drawn, strict=True))
         if k in refused:
             unknown = dict.fromkeys(METRICS, math.nan)
-            rows.append(Row(run, False, *refused[k], codes, unknown, wall))
+            rows.append(RunRecord(run, False, *refused[k], codes, unknown, wall))
             continue
         reasons = [name for name, which in failed.items() if which[k]]
         detail = _WORDS[reasons[0]] if reasons else ""
         known = {name: float(metrics[name][k]) if name in metrics else math.nan for name in METRICS}
-        rows.append(Row(run, not reasons, ", ".join(reasons), detail, codes, known, wall))
+        rows.append(RunRecord(run, not reasons, ", ".join(reasons), detail, codes, known, wall))
     return rows
 
 
@@ -148,7 +148,7 @@ def _judged(mission: Mission, flown: Ensemble) -> tuple[dict[str, Bools], dict[s
             continue
         judged = shaping or index == last
         asked = mission.formation_distances(formation)
-        wide = off(r, mission.formation_edges(formation), asked)
+        wide = max_edge_error(r, mission.formation_edges(formation), asked)
         blending = shaping and phase.reference != "step" and phase.blend > (length or 0.0)
         if index == last and not blending and len(asked):
             metrics["constraint_end"] = wide
@@ -159,7 +159,7 @@ def _judged(mission: Mission, flown: Ensemble) -> tuple[dict[str, Bools], dict[s
             continue
         pairs = complete_graph(len(slots))
         intended = distances(slots, pairs)
-        metrics["shape_end"] = error = off(r, pairs, intended)
+        metrics["shape_end"] = error = max_edge_error(r, pairs, intended)
         metrics["shape"] = np.fmax(metrics["shape"], error)
         misshapen = error > SHAPE_TOLERANCE * intended.min()
         mirrored = np.zeros(count, dtype=bool)

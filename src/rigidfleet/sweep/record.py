@@ -12,7 +12,7 @@ _CALLED = {REFUSED: "mission refused", BROKEN: "program error"}
 
 
 @dataclass(frozen=True)
-class Row:
+class RunRecord:
     """What is kept of one run.
 
     Attributes

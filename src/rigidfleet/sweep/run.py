@@ -9,26 +9,26 @@ from time import perf_counter
 from rigidfleet.errors import MissionError
 from rigidfleet.sweep.definition import Sweep
 from rigidfleet.sweep.metrics import METRICS, measure
-from rigidfleet.sweep.record import BROKEN, Row, refusal
+from rigidfleet.sweep.record import BROKEN, RunRecord, refusal
 
 #: Runs are flown in groups of so many consecutive ones, the first of which is a multiple of it.
 GROUP = 8
 
 
-def fly_runs(sweep: Sweep, runs: Sequence[int]) -> list[Row]:
+def fly_runs(sweep: Sweep, runs: Sequence[int]) -> list[RunRecord]:
     """Fly whole groups of runs (only the sweep's last may be a part of one) and measure them.
 
     A row depends on the sweep and the run's number alone, but for `wall`. A run that cannot be flown is a
     row with its reason.
     """
-    if sweep.judged == "ends":
-        from rigidfleet.sweep.final_states import fly_ends
+    if sweep.evaluate == "final":
+        from rigidfleet.sweep.final_states import fly_final_states
 
-        return fly_ends(sweep, runs)
+        return fly_final_states(sweep, runs)
     return [_fly(sweep, run) for run in runs]
 
 
-def _fly(sweep: Sweep, run: int) -> Row:
+def _fly(sweep: Sweep, run: int) -> RunRecord:
     from rigidfleet.assessment import assess
     from rigidfleet.mission import Mission
     from rigidfleet.simulation.flight import simulate
@@ -51,4 +51,4 @@ def _fly(sweep: Sweep, run: int) -> Row:
             raise  # Ctrl-C, as the compiler gives it back
         reason, detail = BROKEN, f"{type(error).__name__}: {error}"
     wall = perf_counter() - begun
-    return Row(run, not reason, reason, " ".join(detail.split()), codes, metrics, wall)
+    return RunRecord(run, not reason, reason, " ".join(detail.split()), codes, metrics, wall)

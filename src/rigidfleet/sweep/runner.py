@@ -15,9 +15,9 @@ import numpy as np
 
 from rigidfleet._version import __version__
 from rigidfleet.errors import RigidfleetError
-from rigidfleet.sweep import workers as crews
+from rigidfleet.sweep import workers as pools
 from rigidfleet.sweep.definition import Sweep
-from rigidfleet.sweep.record import Row
+from rigidfleet.sweep.record import RunRecord
 from rigidfleet.sweep.run import GROUP, fly_runs
 from rigidfleet.sweep.store import Store, Table, read
 
@@ -78,8 +78,8 @@ def fly(
     with Store(folder, sweep, replace=replace) as store:
         flight = _Sweeping(sweep, store, progress)
         if cluster is not None:
-            with crews.cluster(cluster) as crew:
-                flight.hand_out(crew)
+            with pools.cluster(cluster) as pool:
+                flight.hand_out(pool)
         else:
             count = _cores() if workers is None else workers
             flight.alone(until_worth=count > 1)
@@ -87,8 +87,8 @@ def fly(
             while flight.missing:
                 before = flight.flown
                 try:
-                    with crews.processes(count) as crew:
-                        flight.hand_out(crew)
+                    with pools.processes(count) as pool:
+                        flight.hand_out(pool)
                 except BrokenExecutor as error:
                     deaths = 1 if flight.flown > before else deaths + 1
                     if deaths >= _DEATHS:
@@ -118,17 +118,17 @@ class _Sweeping:
                 return
             self.keep(fly_runs(self.sweep, self.take(1)))
 
-    def hand_out(self, crew: crews.Crew) -> None:
-        """Fly all that is missing by a crew; what it does not bring back is missing again."""
-        executor, capacity = crew
-        flying: dict[Future[list[Row]], list[int]] = {}
+    def hand_out(self, pool: pools.Pool) -> None:
+        """Fly all that is missing by a pool; what it does not bring back is missing again."""
+        executor, capacity = pool
+        flying: dict[Future[list[RunRecord]], list[int]] = {}
         text = self.sweep.json()
         try:
             while self.missing or flying:
                 self.workers = capacity()
                 while self.missing and len(flying) < _AHEAD * self.workers:
                     runs = self.take(self.workers)
-                    flying[executor.submit(crews.chunk, text, __version__, runs)] = runs
+                    flying[executor.submit(pools.chunk, text, __version__, runs)] = runs
                 for future in wait(flying, _LOOK, FIRST_COMPLETED).done:
                     self.keep(future.result())
                     del flying[future]
@@ -144,7 +144,7 @@ class _Sweeping:
         last = self.sweep.runs
         return [run for g in first for run in range(g * GROUP, min((g + 1) * GROUP, last))]
 
-    def keep(self, rows: list[Row]) -> None:
+    def keep(self, rows: list[RunRecord]) -> None:
         """Put the rows of a chunk into the store."""
         self.store.add(rows)
         self.there[[row.run for row in rows]] = True

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from rigidfleet.errors import ResultError
 from rigidfleet.sweep.definition import Sweep
 from rigidfleet.sweep.metrics import METRICS
-from rigidfleet.sweep.record import Row
+from rigidfleet.sweep.record import RunRecord
 from rigidfleet.typing import Bools, Floats, Ints
 
 FILE = "sweep.db"
@@ -105,7 +105,7 @@ class Store:
         self.db.close()
         self.lock.close()
 
-    def add(self, rows: Iterable[Row]) -> None:
+    def add(self, rows: Iterable[RunRecord]) -> None:
         """Keep rows: all of them or none. Those of a number that is there already take its place."""
         entries = [
             (
@@ -252,7 +252,7 @@ def _difference(there: dict[str, str], identity: str) -> str:
         "mission": "mission",
         "vary": "variations",
         "seed": "seed",
-        "judged": "what is judged",
+        "evaluate": "what is evaluated",
         "version": "version",
     }
     other = [words for key, words in names.items() if old.get(key) != new[key]]

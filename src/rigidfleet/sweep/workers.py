@@ -16,18 +16,18 @@ from typing import TYPE_CHECKING, Any
 from rigidfleet._version import __version__
 from rigidfleet.errors import RigidfleetError
 from rigidfleet.sweep.definition import shared
-from rigidfleet.sweep.record import Row
+from rigidfleet.sweep.record import RunRecord
 from rigidfleet.sweep.run import fly_runs
 
 if TYPE_CHECKING:
     from rigidfleet.kernel.engine.native import Inheritance
 
 #: An executor, and how many chunks it works on at the same time.
-Crew = tuple[Executor, Callable[[], int]]
+Pool = tuple[Executor, Callable[[], int]]
 _CONNECT = 20.0  # [s] to wait for a scheduler
 
 
-def chunk(sweep: str, version: str, runs: Sequence[int]) -> list[Row]:
+def chunk(sweep: str, version: str, runs: Sequence[int]) -> list[RunRecord]:
     """Fly a chunk of a sweep, given as JSON, for another process.
 
     Raises
@@ -44,7 +44,7 @@ def chunk(sweep: str, version: str, runs: Sequence[int]) -> list[Row]:
 
 
 @contextmanager
-def processes(count: int) -> Generator[Crew]:
+def processes(count: int) -> Generator[Pool]:
     """Persistent processes on this machine; they end with this one, however it ends."""
     from rigidfleet.kernel.engine.native import bequeath
 
@@ -110,7 +110,7 @@ def _follow() -> None:
 
 
 @contextmanager
-def cluster(address: str) -> Generator[Crew]:
+def cluster(address: str) -> Generator[Pool]:
     """The workers of a Dask cluster, as many as there are at any time.
 
     Raises

@@ -38,8 +38,8 @@ def call_solver(_context, address):
 
 
 @intrinsic
-def call_recorder(_context, address, p, w, stretch, record):
-    """Call `native`'s recorder at ``address``: int64(program, workspace, stretch, record), all of them addresses."""
+def call_recorder(_context, address, p, w, segment, record):
+    """Call `native`'s recorder at ``address``: int64(problem, workspace, segment, record), all of them addresses."""
     from llvmlite import ir
 
     def generate(context, builder, signature, arguments):

@@ -1,6 +1,6 @@
 """Named tuples by their address: what the compiled functions read them through.
 
-A `Program` or `Workspace` holds some three hundred numbers, most of them addresses and sizes of arrays. Passed by
+A `Problem` or `Workspace` holds some three hundred numbers, most of them addresses and sizes of arrays. Passed by
 value, every call would copy them all, and the compiler would take as long over the copies as over the physics.
 A `Pointer` is the address of a named tuple laid out in words of eight bytes: a number takes one word (a value of
 lanes eight), an array those of its data and of its shape, a tuple within it those of its fields. Reading a field

@@ -1,4 +1,4 @@
-"""Many flights of one program: eight of them to a vector, vectors shared out over the cores."""
+"""Many flights of one problem: eight of them to a vector, vectors shared out over the cores."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import numpy as np
 from rigidfleet.kernel.compiler.jit import compiled
 from rigidfleet.kernel.compiler.simd import WIDTH, LaneArray, pack, unpack
 from rigidfleet.kernel.engine import native
-from rigidfleet.kernel.engine.codegen import integrate, straight
-from rigidfleet.kernel.problem import EXACT, ITERATED, OPEN, SLOTS, Program, padded, workspace
+from rigidfleet.kernel.engine.codegen import integrate, unrolled
+from rigidfleet.kernel.problem import EXACT, ITERATED, OPEN, SHAPE, Problem, padded, workspace
 from rigidfleet.kernel.records import FINISHED, LEAST_ERROR, integrator
 from rigidfleet.typing import Bools, Floats, Ints
 
@@ -31,7 +31,7 @@ def fly(p, state, t0, t_end, step, starts, before, ends, status, evaluations, ma
 
     ``before`` (G, m) [m] are the distances from which the references of each are blended. What
     `integrate` returns goes into ``status`` (G,), the calls of the right-hand side into
-    ``evaluations`` (G,); p, a `Straight`, and state are overwritten. ``fresh`` is true; written
+    ``evaluations`` (G,); p, an `UnrolledProblem`, and state are overwritten. ``fresh`` is true; written
     here, the compiler would take it for another type.
     """
     unsampled = state.clock[:0]
@@ -50,7 +50,7 @@ def fly(p, state, t0, t_end, step, starts, before, ends, status, evaluations, ma
 
 
 @dataclass(frozen=True)
-class Ends:
+class FinalStates:
     """Where flights have come to.
 
     Attributes
@@ -65,25 +65,25 @@ class Ends:
     evaluations: Ints
 
 
-def fits(program: Program) -> bool:
-    """Return whether straight-line code can be made of a program, and is worth it.
+def fits(problem: Problem) -> bool:
+    """Return whether straight-line code can be made of a problem, and is worth it.
 
     Its branches must not depend on the state, and its code must not be too long to be compiled.
     """
-    edges, agents = len(program.graph.edges), len(program.vehicles.m)
-    equations = min(edges, 3 * agents) if program.law.solver == ITERATED else edges
+    edges, agents = len(problem.graph.edges), len(problem.vehicles.m)
+    equations = min(edges, 3 * agents) if problem.law.solver == ITERATED else edges
     return (
-        program.control.kind == OPEN
-        and program.law.solver in (ITERATED, EXACT)
-        and program.reference.kind != SLOTS
-        and not (program.has_frame or program.body_formulation or program.disturbance.active)
-        and program.external == 0
+        problem.control.kind == OPEN
+        and problem.law.solver in (ITERATED, EXACT)
+        and problem.reference.kind != SHAPE
+        and not (problem.has_frame or problem.body_formulation or problem.disturbance.active)
+        and problem.external == 0
         and equations <= _MOST_EQUATIONS
     )
 
 
 def fly_all(
-    program: Program,
+    problem: Problem,
     starts: Floats,
     before: Floats,
     times: tuple[float, float],
@@ -93,12 +93,12 @@ def fly_all(
     max_steps: int,
     vectors: bool,
     threads: int,
-) -> Ends:
-    """Fly one program from many starts.
+) -> FinalStates:
+    """Fly one problem from many starts.
 
     Parameters
     ----------
-    program : of every flight
+    problem : of every flight
     starts : (B, n) states at ``times[0]``
     before : (B, m) distances from which references are blended [m]
     times : start and end [s]
@@ -112,16 +112,16 @@ def fly_all(
     Raises
     ------
     ValueError
-        The program does not fit vectors, see `fits`.
+        The problem does not fit vectors, see `fits`.
     """
     if not vectors:
-        return _fly_alone(program, starts, before, times, rtol, atol, max_steps, threads)
-    if not fits(program):
+        return _fly_alone(problem, starts, before, times, rtol, atol, max_steps, threads)
+    if not fits(problem):
         raise ValueError(
-            "flights of this program cannot share vectors: fly them with vectors=False"
+            "flights of this problem cannot share vectors: fly them with vectors=False"
         )
     count, n = starts.shape
-    ready = straight(program)
+    ready = unrolled(problem)
 
     def packed(x: Floats) -> LaneArray:
         if count % WIDTH:  # places left over in the last vector repeat the last flight
@@ -147,14 +147,14 @@ def fly_all(
     lost = ~finished
     if lost.any():
         again = _fly_alone(
-            program, starts[lost], before[lost], times, rtol, atol, max_steps, threads
+            problem, starts[lost], before[lost], times, rtol, atol, max_steps, threads
         )
         y[lost], finished[lost], evaluations[lost] = again.y, again.finished, again.evaluations
-    return Ends(y, finished, evaluations)
+    return FinalStates(y, finished, evaluations)
 
 
 def _fly_alone(
-    program: Program,
+    problem: Problem,
     starts: Floats,
     before: Floats,
     times: tuple[float, float],
@@ -162,11 +162,11 @@ def _fly_alone(
     atol: Floats,
     max_steps: int,
     threads: int,
-) -> Ends:
+) -> FinalStates:
     def begin() -> Callable[..., None]:
-        d0 = program.reference.d0.copy()
-        own = program._replace(reference=program.reference._replace(d0=d0))
-        w = workspace(len(program.vehicles.m), len(d0), solver=program.law.solver)
+        d0 = problem.reference.d0.copy()
+        own = problem._replace(reference=problem.reference._replace(d0=d0))
+        w = workspace(len(problem.vehicles.m), len(d0), solver=problem.law.solver)
         unsampled = np.zeros(0), np.zeros((0, starts.shape[1]))
 
         def work(
@@ -185,7 +185,7 @@ def _fly_alone(
 
 def _share(
     begin: Callable[[], Callable[..., None]], starts: Floats, before: Floats, threads: int
-) -> Ends:
+) -> FinalStates:
     """Share the flights, or vectors of them, out over threads, each with its own of what `begin` makes."""
     count = len(starts)
     threads = min(threads, count)
@@ -205,4 +205,4 @@ def _share(
         work()
         for job in jobs:
             job.result()
-    return Ends(ends, status == FINISHED, evaluations)
+    return FinalStates(ends, status == FINISHED, evaluations)

@@ -51,24 +51,24 @@ def machine_code(second: "_SecondProcess | None" = None) -> list[bytes]:
     All their arguments are addresses of named tuples. They integrate, and return what `dopri5.integrate` does,
     record, and watch, as `monitor.watch` does. The ``second`` process, if there is one, does part of the work.
     """
-    program, workspace, integrator, stretch, record, _ = _pointers()
+    problem, workspace, integrator, segment, record, _ = _pointers()
 
-    def integrate_stretch(p, w, state, s):
-        call = stretch(s)
+    def integrate_segment(p, w, state, s):
+        call = segment(s)
         return dopri5.integrate(
-            program(p), workspace(w), integrator(state), call.t_end, call.fresh, call.times, call.samples,
+            problem(p), workspace(w), integrator(state), call.t_end, call.fresh, call.times, call.samples,
             call.max_steps,
         )  # fmt: skip
 
-    def record_stretch(p, w, s, out):
-        call = stretch(s)
-        recorder.record(call.times, call.samples, program(p), workspace(w), call.dy, record(out))
+    def record_segment(p, w, s, out):
+        call = segment(s)
+        recorder.record(call.times, call.samples, problem(p), workspace(w), call.dy, record(out))
         return 0
 
     if second is not None:
         for function, arguments in _halves()[0].items():  # before what waits for the second
             function.compile(arguments)
-    functions = zip((integrate_stretch, record_stretch), native.ENTRIES, strict=False)
+    functions = zip((integrate_segment, record_segment), native.ENTRIES, strict=False)
     modules = [_module(function, name) for function, name in functions]
     codes = [_object(*module) for module in modules]
     made = None if second is None else second.monitor()
@@ -77,10 +77,10 @@ def machine_code(second: "_SecondProcess | None" = None) -> list[bytes]:
 
 def _monitor() -> bytes:
     """Object code of the monitor, which shares nothing with the rest."""
-    program, workspace, integrator, _, _, watching = _pointers()
+    problem, workspace, integrator, _, _, watching = _pointers()
 
     def watch_trail(p, w, state, found):
-        return monitor.watch(program(p), workspace(w), integrator(state), watching(found))
+        return monitor.watch(problem(p), workspace(w), integrator(state), watching(found))
 
     return _object(*_module(watch_trail, native.ENTRIES[2]))
 
@@ -257,4 +257,4 @@ def main(*, half: bool) -> None:
         output.flush()
         pickle.dump(_monitor(), output)
         return
-    output.write(native.joined(machine_code(_SecondProcess())))
+    output.write(native.concatenated(machine_code(_SecondProcess())))

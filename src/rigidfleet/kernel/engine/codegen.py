@@ -1,7 +1,7 @@
-"""Eight flights of one program at a time, through straight-line code made for it.
+"""Eight flights of one problem at a time, through straight-line code made for it.
 
 The right-hand side is written out by `rigidfleet.kernel.engine.tracer` and compiled for each structure of a
-program (its graph, its law, which of its numbers are equal) once; the integrator is that of single
+problem (its graph, its law, which of its numbers are equal) once; the integrator is that of single
 flights, compiled for vectors once and for all.
 """
 
@@ -20,40 +20,42 @@ from rigidfleet.kernel.compiler import simd
 from rigidfleet.kernel.compiler.jit import compiled_copy, compiled_for_c, inlined
 from rigidfleet.kernel.compiler.simd import VECTOR, WIDTH, LaneArray
 from rigidfleet.kernel.engine.tracer import Code, Symbol, Trace, structure
-from rigidfleet.kernel.problem import Program
+from rigidfleet.kernel.problem import Problem
 from rigidfleet.kernel.records import STATE, TRIAL
 from rigidfleet.kernel.references import septic
 from rigidfleet.typing import Floats
 
 
-class Straight(NamedTuple):
-    """A program as straight-line code takes it; ``before`` and ``time`` are overwritten in flight."""
+class UnrolledProblem(NamedTuple):
+    """A problem as straight-line code takes it; ``before`` and ``time`` are overwritten in flight."""
 
     address: int  # of the code
-    uniform: Floats  # (U,) what comes of the program's numbers
+    uniform: Floats  # (U,) what comes of the problem's numbers
     before: LaneArray  # (m,) distances from which references are blended [m]
     time: Floats  # (3,) blend of the references, and two derivatives
     t0: float  # [s]
     T_b: float  # [s]
 
 
-def straight(program: Program) -> Straight:
-    """Prepare a program for `integrate`; compiles its code where that is new on this machine.
+def unrolled(problem: Problem) -> UnrolledProblem:
+    """Prepare a problem for `integrate`; compiles its code where that is new on this machine.
 
     Raises
     ------
     UnfitError
-        The program has branches that depend on the state.
+        The problem has branches that depend on the state.
     """
-    description, numbers, _ = structure(program)
+    description, numbers, _ = structure(problem)
     name = hashlib.sha256(description).hexdigest()[:16]
     if name not in _KNOWN:
-        code = Code(Trace(program))
+        code = Code(Trace(problem))
         _KNOWN[name] = code, _compile(code, name)
     code, address = _KNOWN[name]
-    reference = program.reference
-    before = simd.pack(np.zeros((len(program.graph.edges), WIDTH)))
-    return Straight(address, code.values(numbers), before, np.zeros(3), reference.t0, reference.T_b)
+    reference = problem.reference
+    before = simd.pack(np.zeros((len(problem.graph.edges), WIDTH)))
+    return UnrolledProblem(
+        address, code.values(numbers), before, np.zeros(3), reference.t0, reference.T_b
+    )
 
 
 _KNOWN: dict[str, tuple[Code, int]] = {}
@@ -123,7 +125,7 @@ def _keep_start(p, w, state):
     """Nor any forces."""
 
 
-#: As `dopri5.integrate`; p is a `Straight`, w is not used, arrays hold lanes.
+#: As `dopri5.integrate`; p is an `UnrolledProblem`, w is not used, arrays hold lanes.
 integrate = compiled_copy(
     dopri5.integrate,
     "integrate_straight",

@@ -29,39 +29,39 @@ from rigidfleet.kernel.problem import (
     ITERATED,
     OPEN,
     RIGID,
+    ConstraintLaw,
     Control,
     Feedback,
-    Law,
     Motion,
-    Program,
+    Problem,
     Reference,
     Vehicles,
     Workspace,
-    calm,
     graph,
+    no_disturbance,
 )
 from rigidfleet.kernel.problem import workspace as kernel_workspace
 from rigidfleet.kernel.records import (
-    Integrator,
+    IntegratorState,
     Monitor,
     Record,
-    Stretch,
+    Segment,
     integrator,
     monitor,
     recorder,
 )
 from rigidfleet.typing import Floats, Ints
 
-#: What the machine code is called, its arguments being addresses: int64(program, workspace, integrator, stretch),
-#: int64(program, workspace, stretch, record) and int64(program, workspace, integrator, monitor). Each comes in an
+#: What the machine code is called, its arguments being addresses: int64(problem, workspace, integrator, segment),
+#: int64(problem, workspace, segment, record) and int64(problem, workspace, integrator, monitor). Each comes in an
 #: object of its own.
 ENTRIES = "rigidfleet_integrate", "rigidfleet_record", "rigidfleet_watch"
 
 
 def integrate(
-    program: Program,
+    problem: Problem,
     workspace: Workspace,
-    state: Integrator,
+    state: IntegratorState,
     t_end: float,
     fresh: bool,
     times: Floats,
@@ -69,16 +69,16 @@ def integrate(
     max_steps: int,
 ) -> int:
     """Integrate to ``t_end`` [s], see `rigidfleet.kernel.dopri5.integrate`."""
-    stretch = _pack(Stretch(t_end, fresh, max_steps, times, samples, _NOTHING))
-    return _call(_code().integrate, _packed(program), _packed(workspace), _packed(state), stretch)
+    segment = _pack(Segment(t_end, fresh, max_steps, times, samples, _NOTHING))
+    return _call(_code().integrate, _packed(problem), _packed(workspace), _packed(state), segment)
 
 
-def record(program: Program, workspace: Workspace, times: Floats, samples: Floats) -> Record:
+def record(problem: Problem, workspace: Workspace, times: Floats, samples: Floats) -> Record:
     """Forces and references at states ``samples`` (K, n) at ``times`` (K,) [s]."""
-    n, m = len(program.vehicles.m), len(program.graph.edges)
+    n, m = len(problem.vehicles.m), len(problem.graph.edges)
     out = recorder(len(times), n, m)
-    stretch = Stretch(0.0, False, 0, times, samples, np.empty(samples.shape[1]))
-    _call(_code().record, _packed(program), _packed(workspace), _pack(stretch), _pack(out))
+    segment = Segment(0.0, False, 0, times, samples, np.empty(samples.shape[1]))
+    _call(_code().record, _packed(problem), _packed(workspace), _pack(segment), _pack(out))
     return out
 
 
@@ -88,23 +88,23 @@ class Watch:
     def __init__(self, monitor: Monitor) -> None:
         # The recorder evaluates the law, at the monitor's own time and state.
         n = monitor.states.shape[1]
-        stretch = Stretch(0.0, False, 0, monitor.time, monitor.states, np.empty(n))
-        self._kept = _pack(stretch), _pack(_UNRECORDED)
+        segment = Segment(0.0, False, 0, monitor.time, monitor.states, np.empty(n))
+        self._kept = _pack(segment), _pack(_UNRECORDED)
         self.monitor = monitor._replace(
-            recorder=_code().recorder, stretch=self._kept[0].address, record=self._kept[1].address
+            recorder=_code().recorder, segment=self._kept[0].address, record=self._kept[1].address
         )
         self._packed = _pack(self.monitor)
 
-    def __call__(self, program: Program, workspace: Workspace, state: Integrator) -> int:
+    def __call__(self, problem: Problem, workspace: Workspace, state: IntegratorState) -> int:
         """What `rigidfleet.kernel.monitor.watch` returns."""
-        packed = _packed(program), _packed(workspace), _packed(state)
+        packed = _packed(problem), _packed(workspace), _packed(state)
         return _call(_code().watch, *packed, self._packed)
 
 
-def closed_loop(t: float, y: Floats, dy: Floats, program: Program, workspace: Workspace) -> None:
+def closed_loop(t: float, y: Floats, dy: Floats, problem: Problem, workspace: Workspace) -> None:
     """Right-hand side dy (n,) at time t [s] and state y (n,), see `rigidfleet.kernel.dynamics.closed_loop`."""
-    stretch = Stretch(0.0, False, 0, np.array([t]), y.reshape(1, -1), dy)
-    packed = _packed(program), _packed(workspace), _pack(stretch), _packed(_UNRECORDED)
+    segment = Segment(0.0, False, 0, np.array([t]), y.reshape(1, -1), dy)
+    packed = _packed(problem), _packed(workspace), _pack(segment), _packed(_UNRECORDED)
     _call(_code().record, *packed)
 
 
@@ -196,15 +196,15 @@ def _layout(kind: type) -> _Layout:
 
 
 @cache
-def examples() -> tuple[Program, Workspace, Integrator, Stretch, Record, Monitor]:
+def examples() -> tuple[Problem, Workspace, IntegratorState, Segment, Record, Monitor]:
     """One of each named tuple, as small as can be: their fields have the types of all."""
     one, none, places, frame = np.ones(1), np.zeros(0), np.zeros((1, 3)), np.eye(3)
-    program = Program(
+    problem = Problem(
         body_formulation=False,
         has_frame=False,
         vehicles=Vehicles(one, one, 1.0, 1.0, one, False, 0.0),
         graph=graph(np.zeros((0, 2), dtype=np.int64), one),
-        law=Law(0.0, 0.0, 0.0, ITERATED, 0.0, 0, 0.0, 0.0, 0.0),
+        law=ConstraintLaw(0.0, 0.0, 0.0, ITERATED, 0.0, 0, 0.0, 0.0, 0.0),
         reference=Reference(CONSTANT, 0.0, 0.0, none, none, places, places, np.zeros(3)),
         motion=Motion(np.zeros(2), np.zeros((1, 6, 6)), frame),
         feedback=Feedback(
@@ -212,13 +212,13 @@ def examples() -> tuple[Program, Workspace, Integrator, Stretch, Record, Monitor
         ),
         control=Control(OPEN, places, 0.0, 0.0, RIGID),
         external=0,
-        disturbance=calm(one),
+        disturbance=no_disturbance(one),
     )  # fmt: skip
     state = integrator(np.zeros(6), 0.0, rtol=0.0, atol=np.ones(6))
-    stretch = Stretch(0.0, False, 0, none, np.zeros((0, 6)), none)
+    segment = Segment(0.0, False, 0, none, np.zeros((0, 6)), none)
     nowhere = np.zeros((0, 6))
     watching = monitor(one, nowhere, nowhere, 6, 3)
-    return program, kernel_workspace(1, 0), state, stretch, _UNRECORDED, watching
+    return problem, kernel_workspace(1, 0), state, segment, _UNRECORDED, watching
 
 
 _NOTHING = np.zeros(0)
@@ -349,14 +349,14 @@ def _file() -> Path:
     return cache_directory() / f"flight-{hashlib.sha256(machine.encode()).hexdigest()[:16]}.o"
 
 
-def joined(parts: Sequence[bytes]) -> bytes:
+def concatenated(parts: Sequence[bytes]) -> bytes:
     """Objects in one, each after its length, and their digest, so that half of them is never called."""
     code = b"".join(len(part).to_bytes(8, "little") + part for part in parts)
     return code + hashlib.sha256(code).digest()
 
 
 def _separated(data: bytes) -> list[bytes] | None:
-    """Objects that were `joined`; None if they are not whole."""
+    """Objects that were `concatenated`; None if they are not whole."""
     code, digest = data[:-32], data[-32:]
     if not code or hashlib.sha256(code).digest() != digest:
         return None
@@ -381,7 +381,7 @@ def _write(parts: Sequence[bytes]) -> bool:
     """Keep machine code, or warn that it will be compiled again."""
     try:
         with replacing(_file()) as stream:
-            stream.write(joined(parts))
+            stream.write(concatenated(parts))
     except OSError as error:
         not_kept(error)
         return False

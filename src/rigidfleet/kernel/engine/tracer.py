@@ -1,4 +1,4 @@
-"""The closed loop of one program as straight-line code, written out by the kernel's own source.
+"""The closed loop of one problem as straight-line code, written out by the kernel's own source.
 
 The functions of the kernel are run once, in plain Python, with symbols for numbers. What they do to
 them is written down: no loop, index or branch is left, products with zero are gone, what is computed
@@ -18,10 +18,10 @@ from numba.core.dispatcher import Dispatcher
 from numpy.typing import NDArray
 
 from rigidfleet.kernel import dynamics
-from rigidfleet.kernel.problem import EXACT, ITERATED, Graph, Program, workspace
+from rigidfleet.kernel.problem import EXACT, ITERATED, Graph, Problem, workspace
 from rigidfleet.typing import Floats, Ints
 
-#: From where a symbol gets its value, in the order in which they are known: numbers of the program;
+#: From where a symbol gets its value, in the order in which they are known: numbers of the problem;
 #: numbers of the flight, of the moment, and of its state.
 UNIFORM, FLIGHT, TIME, STATE = range(4)
 _SOURCES = {"uniform": UNIFORM, "before": FLIGHT, "time": TIME, "y": STATE}
@@ -87,7 +87,7 @@ class Symbol:
         return self.trace.symbol("abs", self)
 
     def __gt__(self, other: Any) -> bool:
-        """Whether it is positive: known of the program's numbers, taken for granted of others."""
+        """Whether it is positive: known of the problem's numbers, taken for granted of others."""
         if other != 0.0:
             raise UnfitError("a comparison with another number than zero")
         if self.operation == "uniform":
@@ -100,14 +100,14 @@ class Symbol:
 
 
 class Trace:
-    """What the kernel does to the numbers of one program.
+    """What the kernel does to the numbers of one problem.
 
     Its edges are taken in another order, in which the factor of A fills up little; states, outputs
     and distances keep theirs.
 
     Parameters
     ----------
-    program : of an open-loop flight of distances
+    problem : of an open-loop flight of distances
 
     Attributes
     ----------
@@ -118,24 +118,24 @@ class Trace:
     Raises
     ------
     UnfitError
-        The program has branches that depend on the state.
+        The problem has branches that depend on the state.
     """
 
-    def __init__(self, program: Program) -> None:
-        if program.law.solver not in (ITERATED, EXACT):
+    def __init__(self, problem: Problem) -> None:
+        if problem.law.solver not in (ITERATED, EXACT):
             raise UnfitError("a law that goes on where its matrix has no factor")
         self.made: dict[tuple[Any, ...], Symbol] = {}
         self.positive: list[Symbol] = []
-        _, self._values, which = structure(program)
+        _, self._values, which = structure(problem)
         self._numbers = iter(which.tolist())
-        n, m = len(program.vehicles.m), len(program.graph.edges)
+        n, m = len(problem.vehicles.m), len(problem.graph.edges)
         states = np.arange(6 * n + m)
-        states[6 * n :] += (order := elimination_order(program.graph.edges)) - np.arange(m)
-        work = workspace(n, m, solver=program.law.solver)
+        states[6 * n :] += (order := elimination_order(problem.graph.edges)) - np.arange(m)
+        work = workspace(n, m, solver=problem.law.solver)
         w = type(work)(*(np.full(x.shape, 0.0, dtype=object) for x in work))
         y = np.array([self.symbol("y", q) for q in states.tolist()], dtype=object)
         before = [self.symbol("before", k) for k in order.tolist()]
-        p = _used(program)
+        p = _used(problem)
         p = p._replace(**{name: self._symbolic(getattr(p, name)) for name in _PARTS})
         d0, d1 = np.array(before, dtype=object), p.reference.d1[order]
         p = p._replace(graph=_ordered(p.graph, order), reference=p.reference._replace(d0=d0, d1=d1))
@@ -144,7 +144,7 @@ class Trace:
         self.outputs: list[Any] = dy[np.argsort(states)].tolist()
 
     def known_positive(self, x: Symbol) -> bool:
-        """Whether a number of the program is positive: `structure` tells apart those that are not."""
+        """Whether a number of the problem is positive: `structure` tells apart those that are not."""
         return bool(self._values[x.arguments[0]] > 0.0)
 
     def symbol(self, operation: str, *arguments: Any) -> Symbol:
@@ -247,7 +247,7 @@ class Code:
     outputs : (n,) symbols or numbers
     positive : symbols that have to be positive
     lines : symbols that are computed in flight, each after what it needs
-    inputs : (U,) symbols of the program's numbers alone that the others use
+    inputs : (U,) symbols of the problem's numbers alone that the others use
     """
 
     def __init__(self, trace: Trace) -> None:
@@ -266,7 +266,7 @@ class Code:
         self.inputs = list({x.serial: x for x in inputs}.values())
 
     def values(self, numbers: Floats) -> Floats:
-        """Values (U,) of the inputs where the program's different numbers are these, by `structure`."""
+        """Values (U,) of the inputs where the problem's different numbers are these, by `structure`."""
         found: dict[int, float] = {}
         with np.errstate(all="ignore"):
             for x in self._uniform:
@@ -294,15 +294,15 @@ class Code:
             (self._uniform if x.known == UNIFORM else self.lines).append(x)
 
 
-def structure(program: Program) -> tuple[bytes, Floats, Ints]:
-    """All that straight-line code depends on: programs with equal structures share it.
+def structure(problem: Problem) -> tuple[bytes, Floats, Ints]:
+    """All that straight-line code depends on: problems with equal structures share it.
 
-    Returns it, the different numbers that the program flies by, in the order of their first
+    Returns it, the different numbers that the problem flies by, in the order of their first
     appearance, and for each number, in the order of `Trace`, which of them it is.
     """
     numbers: list[Floats] = []
-    others: list[Any] = [program.has_frame, program.body_formulation, program.external]
-    used = _used(program)
+    others: list[Any] = [problem.has_frame, problem.body_formulation, problem.external]
+    used = _used(problem)
     for name in _PARTS:
         _sort_out(getattr(used, name), numbers, others)
     together = np.concatenate(numbers)
@@ -337,18 +337,18 @@ def _ordered(graph: Graph, order: Ints) -> Graph:
     return graph._replace(edges=graph.edges[order], pairs=pairs, diagonal=graph.diagonal[order])
 
 
-# Parts of a program that open-loop flights of distances use.
+# Parts of a problem that open-loop flights of distances use.
 _PARTS = ("vehicles", "graph", "law", "reference", "control", "disturbance")
 
 
-def _used(program: Program) -> Program:
-    """The program without what such flights have no use for; the kernel would stumble over it."""
+def _used(problem: Problem) -> Problem:
+    """The problem without what such flights have no use for; the kernel would stumble over it."""
     none: Any = None
-    reference = program.reference._replace(t0=none, T_b=none, d0=none, p0=none, dp=none, turn=none)
+    reference = problem.reference._replace(t0=none, T_b=none, d0=none, p0=none, dp=none, turn=none)
     fields = ("active", "inverse")
-    disturbance = program.disturbance
+    disturbance = problem.disturbance
     disturbance = disturbance._replace(**{f: none for f in disturbance._fields if f not in fields})
-    return program._replace(
+    return problem._replace(
         reference=reference, disturbance=disturbance, motion=none, feedback=none
     )
 

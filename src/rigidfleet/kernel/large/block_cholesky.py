@@ -225,7 +225,7 @@ def precondition(R, place, column, row, L, r, w, z):
 
 
 @compiled
-def stretch(u, edges, a, scale, out):
+def apply_J(u, edges, a, scale, out):
     """out (m,) += scale J a, for a (N, 3)."""
     for k in range(edges.shape[0]):
         i, j = edges[k, 0], edges[k, 1]
@@ -237,7 +237,7 @@ def stretch(u, edges, a, scale, out):
 
 
 @compiled
-def pull(u, edges, b, scale, out):
+def apply_Jt(u, edges, b, scale, out):
     """out (N, 3) += scale J^T b, for b (m,)."""
     for k in range(edges.shape[0]):
         i, j = edges[k, 0], edges[k, 1]

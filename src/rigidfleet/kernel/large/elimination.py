@@ -21,7 +21,7 @@ LOST = 1e-6
 
 
 class Order(NamedTuple):
-    """The order of the sweep: agents, each with its edges to three before it; what is lacking is 0."""
+    """The order of elimination: agents, each with its edges to three before it; what is lacking is 0."""
 
     agent: Edges  # (N,)
     edge: Edges  # (N, 3): none, one, two, then three each

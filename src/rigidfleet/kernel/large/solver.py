@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 
 from rigidfleet.kernel.large import block_cholesky, elimination
-from rigidfleet.kernel.problem import ITERATED, Law, Vehicles, Workspace
+from rigidfleet.kernel.problem import ITERATED, ConstraintLaw, Vehicles, Workspace
 from rigidfleet.typing import Edges, Floats, Ints
 
 #: A kept factor is renewed when the iterations beyond those of a new one have taken as long as making one; or when a
@@ -39,7 +39,7 @@ class Counts:
     solves: int = 0  # systems solved on the vertex graph
     iterations: int = 0  # of conjugate gradients, in all
     factors: int = 0
-    fallbacks: int = 0  # evaluations in which the sweep lost a pivot
+    fallbacks: int = 0  # evaluations in which elimination lost a pivot
     failures: int = 0  # evaluations without a solution
 
     def add(self, other: Counts) -> None:
@@ -52,14 +52,14 @@ class Counts:
 class LargeSolver:
     """Multipliers of one phase, into its workspace.
 
-    ``steps`` (N, 4) is the order of the sweep, None without one; ``order`` asks for that of elimination (N,), where it
-    is needed; ``tolerance`` is the relative residual of conjugate gradients, and ``floor`` the error of an
-    acceleration [m/s^2] below which none is asked of the damped law.
+    ``steps`` (N, 4) are those of elimination, None where there are none; ``order`` asks for the order (N,) in which
+    the sparse factor takes agents, where it is needed; ``tolerance`` is the relative residual of conjugate
+    gradients, and ``floor`` the error of an acceleration [m/s^2] below which none is asked of the damped law.
     """
 
     vehicles: Vehicles
     edges: Edges
-    law: Law
+    law: ConstraintLaw
     workspace: Workspace
     steps: Ints | None
     order: Callable[[], Ints]
@@ -76,9 +76,9 @@ class LargeSolver:
         self.mu, self.iterations = (law.mu, law.iterations) if iterated else (_EXACT_MU, 2)
         self.a, self.rest = np.zeros((n, 3)), np.zeros(len(self.edges))
         self.least = self.mu * self.mbar * self.floor * math.sqrt(n)
-        self.sweep = None if self.steps is None else elimination.order(self.steps, self.edges)
+        self.elimination = None if self.steps is None else elimination.order(self.steps, self.edges)
         self.pattern: block_cholesky.Pattern | None = (
-            None  # where the sweep does, it is never needed
+            None  # where elimination does, it is never needed
         )
         # An exception cannot pass through compiled code; the multipliers become NaN instead.
         self._call = ctypes.CFUNCTYPE(None)(self._solve)
@@ -107,11 +107,12 @@ class LargeSolver:
     def solve(self) -> None:
         """Multipliers for ``workspace.b``; NaN where there is no solution."""
         w, vehicles = self.workspace, self.vehicles
-        if self.sweep is not None:
+        if self.elimination is not None:
             # Where deformation is damped, the kernel knows the mean axes already.
             known = self.law.k_def > 0.0
             pivot = elimination.solve(
-                w.u, w.b, w.r, vehicles.m, vehicles.M, self.sweep, known, w.cm[0], w.I, w.I_inv, self.a, w.multiplier
+                w.u, w.b, w.r, vehicles.m, vehicles.M, self.elimination, known, w.cm[0], w.I, w.I_inv, self.a,
+                w.multiplier,
             )  # fmt: skip
             if pivot > elimination.LOST:
                 return
@@ -136,22 +137,22 @@ class LargeSolver:
         iterated = self.law.solver == ITERATED
         for k in range(self.iterations):
             self.g[:] = 0.0
-            block_cholesky.pull(w.u, edges, self.rest, self.mbar, self.g)
+            block_cholesky.apply_Jt(w.u, edges, self.rest, self.mbar, self.g)
             x = self._system(k)
             if x is None:
                 return False
-            block_cholesky.stretch(w.u, edges, x, -1.0, self.rest)
+            block_cholesky.apply_J(w.u, edges, x, -1.0, self.rest)
             if iterated:
                 y += (self.mbar / self.mu) * self.rest
             else:
                 a += x
         for k in range(0 if iterated else self.iterations):
             self.g[:] = m[:, None] * a
-            block_cholesky.pull(w.u, edges, y, -1.0, self.g)
+            block_cholesky.apply_Jt(w.u, edges, y, -1.0, self.g)
             x = self._system(self.iterations + k)
             if x is None:
                 return False
-            block_cholesky.stretch(w.u, edges, x, self.mbar, y)
+            block_cholesky.apply_J(w.u, edges, x, self.mbar, y)
         return True
 
     def _prepare(self) -> None:

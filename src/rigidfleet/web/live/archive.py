@@ -18,7 +18,7 @@ _JOINED = 256  # ticks that become one piece: few large arrays in place of many 
 
 
 @dataclass
-class Leg:
+class ArchivedPhase:
     """Samples of a phase, as long as no vehicle is lost.
 
     Its start, its end, and its worst moments (nearest, hardest) are kept whatever the step is.
@@ -39,43 +39,43 @@ class Archive:
 
     def __init__(self, step: float, most: float = _MOST) -> None:
         self.step, self.most = step, most
-        self.legs: dict[tuple[int, int], Leg] = {}  # by phase and number of edges
+        self.phases: dict[tuple[int, int], ArchivedPhase] = {}  # by phase and number of edges
         self.size = 0.0
 
     def add(self, pieces: Sequence[Piece], told: Result) -> None:
         """Keep what a tick has flown; ``told`` is the record of its end."""
         for piece in pieces:
             key = (piece.phase, len(piece.edges))
-            fresh, leg = key not in self.legs, self.legs.setdefault(key, Leg())
-            leg.last = rows(piece, [-1])
+            fresh, archived = key not in self.phases, self.phases.setdefault(key, ArchivedPhase())
+            archived.last = rows(piece, [-1])
             keep = self._even(piece.time)
             keep[0] |= fresh
             if keep.any():
-                leg.pieces.append(rows(piece, keep))
-                self.size += _numbers(leg.pieces[-1])
-            if len(leg.pieces) >= _JOINED and len(leg.pieces[-1].time) < _JOINED:
-                leg.pieces = _joined(leg.pieces)
+                archived.pieces.append(rows(piece, keep))
+                self.size += _numbers(archived.pieces[-1])
+            if len(archived.pieces) >= _JOINED and len(archived.pieces[-1].time) < _JOINED:
+                archived.pieces = _joined(archived.pieces)
         if pieces:
-            self._note(self.legs[pieces[-1].phase, len(pieces[-1].edges)], told)
+            self._note(self.phases[pieces[-1].phase, len(pieces[-1].edges)], told)
         while self.size > self.most:
             self._thin()
 
     def pieces(self) -> list[Piece]:
         """All that is kept, in order of time."""
         found = []
-        for leg in self.legs.values():
-            extra = [leg.last, *(piece for _, piece in leg.worst.values())]
-            pieces = [*leg.pieces, *(piece for piece in extra if piece is not None)]
+        for archived in self.phases.values():
+            extra = [archived.last, *(piece for _, piece in archived.worst.values())]
+            pieces = [*archived.pieces, *(piece for piece in extra if piece is not None)]
             found.append(_sorted(_join(pieces)))
         return found
 
     def begun(self, phase: int) -> bool:
         """Whether there is a sample of a phase."""
-        return any(key[0] == phase for key in self.legs)
+        return any(key[0] == phase for key in self.phases)
 
-    def _note(self, leg: Leg, told: Result) -> None:
+    def _note(self, archived: ArchivedPhase, told: Result) -> None:
         """Keep the moment of a tick's end if it is a worst one of its phase."""
-        assert leg.last is not None
+        assert archived.last is not None
         worst = {
             "separation": -float(told.separation[-1]),
             "clearance": -float(told.clearance[-1]),
@@ -83,8 +83,8 @@ class Archive:
             "speed": float(np.linalg.norm(told.velocity[-1], axis=1).max()),
         }
         for name, value in worst.items():
-            if value > leg.worst.get(name, (-np.inf, None))[0]:
-                leg.worst[name] = (value, leg.last)
+            if value > archived.worst.get(name, (-np.inf, None))[0]:
+                archived.worst[name] = (value, archived.last)
 
     def _even(self, time: Floats) -> Bools:
         """Which times are multiples of the step."""
@@ -95,12 +95,12 @@ class Archive:
         """Twice the step, half of the samples."""
         self.step *= 2.0
         self.size = 0.0
-        for leg in self.legs.values():
-            pieces = _joined(leg.pieces)
+        for archived in self.phases.values():
+            pieces = _joined(archived.pieces)
             keep = self._even(pieces[0].time)
             keep[0] = True  # the start
-            leg.pieces = [rows(pieces[0], keep)]
-            self.size += _numbers(leg.pieces[0])
+            archived.pieces = [rows(pieces[0], keep)]
+            self.size += _numbers(archived.pieces[0])
         self.most = max(self.most, 2.0 * self.size if self.size > 0.5 * self.most else 0.0)
 
 

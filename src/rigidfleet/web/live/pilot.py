@@ -210,7 +210,7 @@ class Pilot:
     def _take(self, formation: str, *, establish: bool = False) -> None:
         """Establish a formation, or change to it."""
         if establish:
-            control = "open" if self.by_body else "slots"
+            control = "open" if self.by_body else "tracking"
             self._begin(
                 Establish(
                     kind="establish", name=f"establish {formation}", formation=formation, blend=_BLEND,
@@ -218,7 +218,7 @@ class Pilot:
                 )
             )  # fmt: skip
             return
-        control = "body" if self.by_body else "slots"
+        control = "body" if self.by_body else "tracking"
         self._begin(
             Reshape(
                 kind="reshape", name=f"change to {formation}", formation=formation, blend=_BLEND,
@@ -255,7 +255,7 @@ class Pilot:
         """The pose that the first phase begins with."""
         flight, frame = self.flight, self.flight.plan.frame
         pose = flight.pose()
-        if flight.plan.phase.control == "slots":
+        if flight.plan.phase.control == "tracking":
             return pose
         seen = flight.observe()
         total = self.masses.sum()

@@ -16,7 +16,7 @@ import numpy as np
 
 from rigidfleet.result import Result, as_result, write_file
 from rigidfleet.typing import Floats, Ints
-from rigidfleet.web.replay.pack import Column, pack
+from rigidfleet.web.replay.pack import PackedColumn, pack
 from rigidfleet.web.replay.page import page, read
 from rigidfleet.web.replay.scene import describe, observe, sight, size, weight
 
@@ -87,7 +87,10 @@ def html_page(result: Result) -> str:
     tension = min(max(most, _IDLE * scale), _HEAVY * scale)
     columns = observe(result, shown, tension)
     described, data = pack(
-        {name: Column(_sampled(result, c.values, time), c.step) for name, c in columns.items()}
+        {
+            name: PackedColumn(_sampled(result, c.values, time), c.step)
+            for name, c in columns.items()
+        }
     )
     info = describe(result.mission, result.edges[shown], tension) | _story(result, time)
     info |= {"columns": described, "count": len(time), "beyond": most > tension}

@@ -20,14 +20,14 @@ from rigidfleet.typing import Floats
 _MISSING = -(2**31)
 
 
-class Column(NamedTuple):
+class PackedColumn(NamedTuple):
     """A quantity over time and the step it is rounded to, both in its unit."""
 
     values: Floats  # (K,) or (K, ...), NaN where there is none
     step: float
 
 
-def pack(columns: Mapping[str, Column]) -> tuple[list[dict[str, Any]], str]:
+def pack(columns: Mapping[str, PackedColumn]) -> tuple[list[dict[str, Any]], str]:
     """Description of each column, in order, and all of them as one text (base64)."""
     described, planes = [], []
     for name, (values, step) in columns.items():

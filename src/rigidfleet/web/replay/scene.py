@@ -8,7 +8,7 @@ import numpy as np
 
 from rigidfleet.plotting import agent_colours
 from rigidfleet.typing import Floats, Ints
-from rigidfleet.web.replay.pack import Column
+from rigidfleet.web.replay.pack import PackedColumn
 
 if TYPE_CHECKING:
     pass
@@ -43,20 +43,20 @@ def describe(mission: Mission, edges: Ints, tension: float) -> dict[str, Any]:
     }
 
 
-def observe(result: Result, shown: Ints, tension: float) -> dict[str, Column]:
+def observe(result: Result, shown: Ints, tension: float) -> dict[str, PackedColumn]:
     """Samples as the page sees them, at the result's times; ``shown`` are the edges drawn."""
     mission = result.mission
     # Fine enough for a view of one vehicle that fills the screen.
     fine = max(size(result), *mission.agents.radius, 1e-9) / 20_000
     force = result.input_force + result.constraint_force
     return {
-        "position": Column(result.position, fine),
-        "thrust": Column(thrust_directions(force, np.array(mission.agents.mass)), 5e-4),
-        "slot": Column(result.slot_position - result.position, fine),
-        "cm": Column(result.cm, fine),
-        "attitude": Column(result.attitude, 1e-4),
-        "reference": Column(result.attitude_reference, 1e-4),
-        "tension": Column(-result.multiplier[:, shown], tension / 1000),
+        "position": PackedColumn(result.position, fine),
+        "thrust": PackedColumn(thrust_directions(force, np.array(mission.agents.mass)), 5e-4),
+        "slot": PackedColumn(result.slot_position - result.position, fine),
+        "cm": PackedColumn(result.cm, fine),
+        "attitude": PackedColumn(result.attitude, 1e-4),
+        "reference": PackedColumn(result.attitude_reference, 1e-4),
+        "tension": PackedColumn(-result.multiplier[:, shown], tension / 1000),
         **_plotted(result),
     }
 
@@ -157,16 +157,16 @@ def _thrust_lines(mission: Mission, thrust: Floats) -> Floats:
     return np.stack([thrust.min(axis=1), thrust.max(axis=1)], axis=1)
 
 
-def _plotted(result: Result) -> dict[str, Column]:
+def _plotted(result: Result) -> dict[str, PackedColumn]:
     """Samples of each plot."""
     thrust = _thrust_lines(result.mission, result.thrust)
     # Where no edge is active there is no error.
     error = np.where(np.isnan(result.constraint), -1.0, np.abs(result.constraint))
     error = error.max(axis=1, initial=-1.0)
     samples = {
-        "thrust plot": Column(thrust, 1e-3),
-        "error plot": Column(np.where(error < 0.0, np.nan, error), _FLOOR),
-        "separation plot": Column(result.separation, 1e-3),
-        "clearance plot": Column(result.clearance, 1e-3),
+        "thrust plot": PackedColumn(thrust, 1e-3),
+        "error plot": PackedColumn(np.where(error < 0.0, np.nan, error), _FLOOR),
+        "separation plot": PackedColumn(result.separation, 1e-3),
+        "clearance plot": PackedColumn(result.clearance, 1e-3),
     }
     return {plot["column"]: samples[plot["column"]] for plot in _plots(result.mission)}
