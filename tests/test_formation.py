@@ -460,12 +460,12 @@ def test_trees_hold_lattices_better_and_shells_at_all():
     """Chains from the centre outwards end soft, and in a shell all of an agent's neighbours lie in its plane."""
     side = np.arange(8.0)
     lattice = np.stack(np.meshgrid(side, side, side, indexing="ij"), axis=-1).reshape(-1, 3)
-    tree, joined = (
+    multilevel, plain = (
         spectrum(lattice, graph(lattice), np.ones(512))
         for graph in (graphs.henneberg_multilevel, graphs.henneberg)
     )
-    assert tree.index > 3 * joined.index
-    assert tree.condition < joined.condition / 2
+    assert multilevel.index > 3 * plain.index
+    assert multilevel.condition < plain.condition / 2
     shell = shapes.slots("sphere", 2.0, 500)
     assert spectrum(shell, graphs.henneberg(shell), np.ones(500)).free > 0
     assert spectrum(shell, graphs.henneberg_multilevel(shell), np.ones(500)).index > 0.01

@@ -215,10 +215,20 @@ def test_a_foreign_netcdf_file_is_no_result(tmp_path):
 
 def test_a_newer_format_is_refused(tmp_path, monkeypatch):
     """A file of a later format is not half understood: a newer version is asked for."""
-    monkeypatch.setattr("rigidfleet.result.SCHEMA_VERSION", 3)
+    monkeypatch.setattr("rigidfleet.result.SCHEMA_VERSION", 4)
     a_result().save(tmp_path / "a.nc")
     monkeypatch.undo()
     assert "Use a newer version" in refusal(tmp_path / "a.nc")
+
+
+def test_an_older_format_is_refused(tmp_path, monkeypatch):
+    """Words have changed since: the message names both formats, and says what to do."""
+    monkeypatch.setattr("rigidfleet.result.SCHEMA_VERSION", 2)
+    a_result().save(tmp_path / "a.nc")
+    monkeypatch.undo()
+    told = refusal(tmp_path / "a.nc")
+    assert "written by an earlier rigidfleet (result format 2); this one reads format 3" in told
+    assert "Fly the mission again" in told
 
 
 @pytest.mark.parametrize("kept", [0.001, 0.1, 0.5, 0.9, 0.9999])

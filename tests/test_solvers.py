@@ -1,4 +1,4 @@
-"""Large formations: the sweep, the vertex graph and the dense factor solve the same law."""
+"""Large formations: elimination, the vertex graph and the dense factor solve the same law."""
 
 from functools import partial
 from importlib import import_module
@@ -8,7 +8,7 @@ import pytest
 
 from rigidfleet.formation import graphs, shapes
 from rigidfleet.kernel.large import block_cholesky
-from rigidfleet.kernel.large import solver as large
+from rigidfleet.kernel.large.solver import LargeSolver
 from rigidfleet.kernel.problem import EXACT, ITERATED, ConstraintLaw, Vehicles, workspace
 from rigidfleet.mission import Mission
 from rigidfleet.planning import solvers
@@ -28,7 +28,7 @@ def directions(p, edges) -> np.ndarray:
     return u / np.linalg.norm(u, axis=1, keepdims=True)
 
 
-def solver_of(p, edges, masses, law, *, sweep=False, tolerance=1e-13) -> large.LargeSolver:
+def solver_of(p, edges, masses, law, *, eliminated=False, tolerance=1e-13) -> LargeSolver:
     """A solver in the state p (N, 3)."""
     law = ConstraintLaw(3.0, 12**0.5, 8.0, law, 0.03, 3, 0.1, 1e-12, 0.0)
     vehicles = Vehicles(
@@ -37,9 +37,9 @@ def solver_of(p, edges, masses, law, *, sweep=False, tolerance=1e-13) -> large.L
     work = workspace(len(p), len(edges), large=True)
     work.r[:] = p
     work.u[:] = directions(p, edges)
-    steps = solvers.elimination_steps(len(p), edges) if sweep else None
+    steps = solvers.elimination_steps(len(p), edges) if eliminated else None
     order = partial(solvers.dissection, p, edges)
-    return large.LargeSolver(vehicles, edges, law, work, steps, order, tolerance)
+    return LargeSolver(vehicles, edges, law, work, steps, order, tolerance)
 
 
 def solved(solver, b) -> np.ndarray:
@@ -68,10 +68,10 @@ def test_sweep_vertex_graph_and_dense_factor_agree_on_the_exact_law(side, rng):
     A = gram(p, edges, masses)
     assert np.linalg.cond(A) < 1e5
     dense = np.linalg.solve(A, b)
-    swept = solved(solver_of(p, edges, masses, EXACT, sweep=True), b)
-    nodes = solved(solver_of(p, edges, masses, EXACT), b)
-    np.testing.assert_allclose(swept, dense, rtol=0, atol=1e-12 * np.abs(dense).max())
-    np.testing.assert_allclose(nodes, dense, rtol=0, atol=1e-9 * np.abs(dense).max())
+    eliminated = solved(solver_of(p, edges, masses, EXACT, eliminated=True), b)
+    sparse = solved(solver_of(p, edges, masses, EXACT), b)
+    np.testing.assert_allclose(eliminated, dense, rtol=0, atol=1e-12 * np.abs(dense).max())
+    np.testing.assert_allclose(sparse, dense, rtol=0, atol=1e-9 * np.abs(dense).max())
 
 
 @pytest.mark.parametrize("reach", [1.5, 1.9])
@@ -156,7 +156,7 @@ def test_pattern_without_fill_solves_as_well(rng, monkeypatch):
     b = rng.normal(size=len(edges))
     full = solver_of(p, edges, masses, ITERATED)
     want = solved(full, b)
-    monkeypatch.setattr(large, "_FILL", 0.0)
+    monkeypatch.setattr("rigidfleet.kernel.large.solver._FILL", 0.0)
     lean = solver_of(p, edges, masses, ITERATED)
     np.testing.assert_allclose(solved(lean, b), want, atol=1e-9 * np.abs(want).max())
     assert full.pattern is not None
@@ -192,7 +192,7 @@ def test_factor_is_that_of_the_matrix(rng):
 
 
 def test_a_lost_pivot_falls_back_and_is_counted(rng):
-    """Where an agent lies in a plane with its three, the sweep has no pivot; the vertex graph goes on."""
+    """Where an agent lies in a plane with its three, elimination has no pivot; the vertex graph goes on."""
     p = lattice(3)
     edges = graphs.henneberg(p)
     steps = solvers.elimination_steps(27, edges)
@@ -200,7 +200,7 @@ def test_a_lost_pivot_falls_back_and_is_counted(rng):
     i, mine = steps[-1, 0], steps[-1, 1:]
     a, b, c = (int(x) for x in edges[mine].sum(axis=1) - i)
     p[i] = 0.5 * p[a] + 0.2 * p[b] + 0.3 * p[c]
-    solver = solver_of(p, edges, np.ones(27), EXACT, sweep=True, tolerance=1e-12)
+    solver = solver_of(p, edges, np.ones(27), EXACT, eliminated=True, tolerance=1e-12)
     # A right side that some motion has, so that the singular system has a solution.
     found = solved(solver, jacobian(p, edges) @ rng.normal(size=81))
     assert solver.counts.fallbacks == 1
@@ -235,7 +235,7 @@ def test_what_is_not_finite_has_no_solution(rng):
     ],
 )
 def test_solve_is_chosen_by_size_law_and_graph(n, count, law, method):
-    """Small ones and laws with eigenvalues are dense, exact ones of three edges each swept."""
+    """Small ones and laws with eigenvalues are dense, exact ones of three edges each eliminated."""
     p = lattice(round(n ** (1 / 3)))
     made = {
         "complete": lambda: graphs.complete_graph(n),
@@ -308,7 +308,7 @@ def flight(law: str, kind: str, **integrator) -> Mission:
     ],
 )
 def test_flights_are_the_same_whatever_the_solve(law, kind, method, monkeypatch):
-    """A flight by sweeps, and one on the vertex graph, is the one with dense factors, and says which it was."""
+    """A flight by elimination, and one on the vertex graph, is the one with dense factors, and says which it was."""
     mission = flight(law, kind)
     found = {}
     for each in ("dense", method):

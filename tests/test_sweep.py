@@ -345,7 +345,7 @@ def test_a_group_is_never_split():
     assert GROUP == 8
 
 
-# -- judged by their ends ----------------------------------------------------------------------------
+# -- evaluated by final states -------------------------------------------------------------------------
 
 TETRAHEDRON: dict[str, Any] = {
     "schema_version": 1,
@@ -452,7 +452,7 @@ def test_ends_are_flown_to_the_tolerances_of_the_mission(name, tmp_path):
     assert (many > 2 * few).all()
 
 
-def test_what_ends_cannot_judge_is_refused(tmp_path):
+def test_what_final_states_cannot_evaluate_is_refused(tmp_path):
     """Other missions and other variations are named, with the way out."""
     with pytest.raises(SweepError) as caught:
         by_final_states("agents.mass.* *= normal(1, 0.1)", "agents.position.1.1 = choice(0, 1)")
@@ -476,7 +476,7 @@ def test_what_ends_cannot_judge_is_refused(tmp_path):
     assert Sweep.from_json(Sweep.load(file).json()).evaluate == "final"
 
 
-def test_the_command_judges_ends(capsys, tmp_path, monkeypatch):
+def test_the_command_evaluates_final_states(capsys, tmp_path, monkeypatch):
     """`--final-states` flies starts, says so in the store, and cannot be put on a sweep that is there."""
     monkeypatch.chdir(tmp_path)
     vary = ["--vary", "agents.position.*.* += normal(0, 0.3)", "--runs", "16", "--no-figures"]

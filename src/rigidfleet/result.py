@@ -44,8 +44,8 @@ if TYPE_CHECKING:
     from rigidfleet.mission import Mission
 
 
-#: Version of the file format; files with a higher one are refused.
-SCHEMA_VERSION = 2
+#: Version of the file format; files of any other are refused.
+SCHEMA_VERSION = 3
 
 
 class Variable(NamedTuple):
@@ -706,6 +706,11 @@ def _parse(path: Path, data: bytes) -> dict[str, Any]:
             raise ResultError(
                 f"{path}: was written in format {made}, and this version of rigidfleet reads up to "
                 f"{SCHEMA_VERSION}. Use a newer version."
+            )
+        if made < SCHEMA_VERSION:
+            raise ResultError(
+                f"{path}: was written by an earlier rigidfleet (result format {made}); this one reads format "
+                f"{SCHEMA_VERSION}. Fly the mission again."
             )
         attributes = {
             key: reader.attribute(file, "mission" if key == "mission_text" else key, kind)

@@ -29,7 +29,7 @@ from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
-from cyclopts import App, CycloptsError, Parameter, UnusedCliTokensError
+from cyclopts import App, CycloptsError, Parameter, UnknownOptionError, UnusedCliTokensError
 
 from rigidfleet._version import __version__
 from rigidfleet.cli import console
@@ -377,6 +377,7 @@ def design(
         console.print_json({"name": name, "toml": text, "limits": limits, "graphs": found})
         return PASSED
     table = console.table("graph", "edges", "rank", "index", "cond.", "longest", "verdict")
+    table.columns[0].no_wrap = True  # a name is not cut
     for what, (_, cells) in judged.items():
         table.add_row(what, *cells)
     output = (
@@ -399,10 +400,12 @@ def _reject(edges: str, reach: float | None, *, searched: bool) -> None:
     ------
     ValueError
     """
+    from rigidfleet._renamed import successor
     from rigidfleet.rigidity.design import GRAPHS
 
     if edges not in GRAPHS:
-        raise ValueError(f"no graph is called {edges!r}; graphs: {', '.join(GRAPHS)}")
+        told = successor("edges", edges) or f"graphs: {', '.join(GRAPHS)}"
+        raise ValueError(f"no graph is called {edges!r}; {told}")
     if searched:
         raise ValueError("--extra and --range are of the search, remove them or --edges")
     if reach is not None and edges != "neighbours":
@@ -431,7 +434,7 @@ def _judged(slots: Any, edges: Any) -> tuple[dict[str, Any], tuple[str, ...]]:
         return data, (str(len(edges)), rank, *cells, str(found.verdict))
     ends = spectrum(slots, edges, [1.0] * len(slots))
     verdict = "flexible to first order" if ends.free else "infinitesimally rigid"
-    rank = "" if ends.free else f"{3 * len(slots) - 6} of {3 * len(slots) - 6}"
+    rank = "" if ends.free else "full"
     cells = (f"{ends.index:.3g}", f"{ends.condition:.3g}", longest)
     data = {"edges": len(edges), "index": ends.index, "w": ends.w, "free": ends.free}
     data["condition"] = ends.condition if ends.w > 0 else None
@@ -817,7 +820,7 @@ def sweep(
     force : bool
         Replace another sweep in that folder; without it, it is kept and nothing is flown.
     final_states : bool
-        Judge where phases end alone: open-loop missions whose starts vary then fly by the thousand in a second.
+        Evaluate where phases end alone: open-loop missions whose starts vary then fly by the thousand in a second.
     workers : int
         Processes on this machine; as many as it has cores if not given.
     cluster : str
@@ -1100,8 +1103,12 @@ def _own_fault(error: Exception) -> str:
 
 def _usage(error: CycloptsError) -> str:
     """What is wrong with the command as typed."""
+    from rigidfleet._renamed import successor
+
     command = " ".join(("rigidfleet", *(error.command_chain or ()), "--help"))
     text = str(error)
     if isinstance(error, UnusedCliTokensError):
         text = f"Unexpected: {' '.join(error.unused_tokens or ())}."
+    if isinstance(error, UnknownOptionError) and (told := successor(error.token.keyword)):
+        text = f"Unknown option: {error.token.keyword}; {told}."
     return f"{text}\n    see `{command}`"

@@ -11,6 +11,7 @@ from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
 
 from pydantic import ValidationError
 
+from rigidfleet._renamed import successor
 from rigidfleet._toml import toml_key
 from rigidfleet.errors import Finding
 from rigidfleet.formation.shapes import POLYGONS, SHAPES
@@ -154,7 +155,8 @@ def near_shape(word: object) -> str:
 def unknown_key(key: object, known: Iterable[str]) -> tuple[str, str]:
     """Problem and remedy of a key that is not one of the known."""
     names = list(known)
-    return _UNKNOWN, near(key, names) or f"remove it; known keys: {', '.join(names)}"
+    told = successor(key) or near(key, names)
+    return _UNKNOWN, told or f"remove it; known keys: {', '.join(names)}"
 
 
 def _key(path: Keys) -> str:
@@ -203,9 +205,9 @@ def _explain(error: Any, path: Keys, owner: type[Part]) -> tuple[str, str]:
             return "is missing", f"add {meaning or name}"
         case "literal_error":
             words = _words(context["expected"])
-            return f"must be {context['expected']}", near(
-                error["input"], words
-            ) or f"use {'none' if error['input'] in _OFF and 'none' in words else words[0]}"
+            told = successor(name, error["input"]) or near(error["input"], words)
+            usual = "none" if error["input"] in _OFF and "none" in words else words[0]
+            return f"must be {context['expected']}", told or f"use {usual}"
         case "greater_than_equal" if 0 < context["ge"] < 1 and not error["input"] > 0:
             return "must be > 0", meaning
         case "too_short" if context["min_length"] == 1:

@@ -47,7 +47,7 @@ from rigidfleet.math import attitude as att
 from rigidfleet.math import lqr
 from rigidfleet.math.rigid_body import about_cm
 from rigidfleet.mission import Establish, Fly, Mission, Phase, Regulator, Reshape, Settle, Turn
-from rigidfleet.mission.schema import Constraint, Integrator
+from rigidfleet.mission.schema import Constraint, IntegratorOptions
 from rigidfleet.planning import solvers
 from rigidfleet.planning.disturbances import without
 from rigidfleet.planning.reference import (
@@ -97,7 +97,7 @@ class PhasePlan:
     lies: bool  # whether the formation is to lie as the mission says once it is established
     method: solvers.Method  # how the multipliers are solved for
     constraint: Constraint  # options of the law
-    integrator: Integrator  # options of the integration
+    integrator: IntegratorOptions  # options of the integration
     damping: Callable[[Bools], float]  # mu of the vehicles left, which are not lost (N,)
     lost_at: Floats  # (N,) when vehicles are lost [s]
     masses: Floats  # (N,) as believed, lost vehicles included [kg]

@@ -1,7 +1,7 @@
 """Which solve gives the constraint force of a formation, and what can be known of it before a flight.
 
 Small systems are solved densely. Where the law is the exact one and each agent is joined to three before it,
-two sweeps over the agents do (`rigidfleet.kernel.large.elimination`); other large ones are solved on the vertex graph
+two passes over the agents do (`rigidfleet.kernel.large.elimination`); other large ones are solved on the vertex graph
 (`rigidfleet.kernel.large.block_cholesky`). Nothing here flies or compiles.
 """
 
@@ -16,7 +16,7 @@ from rigidfleet.typing import Floats, Ints
 
 Method = Literal["dense", "elimination", "sparse"]
 
-#: Equations from which on the vertex graph is faster than a dense factor, and from which on the sweep is.
+#: Equations from which on the vertex graph is faster than a dense factor, and from which on elimination is.
 FROM_SPARSE, FROM_ELIMINATION = 180, 60
 #: Equations of a dense solve at most: beyond, one evaluation takes seconds.
 MOST_DENSE = 2000

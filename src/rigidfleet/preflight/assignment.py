@@ -38,10 +38,10 @@ def assignment_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
             planned = preview(other, index + 1)[0][index]
         assert planned.ways is not None  # it shapes
         x = planned.position - (masses @ planned.position)[:, None] / masses.sum()
-        way = float(np.linalg.norm(np.diff(x, axis=0), axis=2).sum())
-        room = assignment.nearest_way(*planned.ways, mission.agents.radius)[0]
+        length = float(np.linalg.norm(np.diff(x, axis=0), axis=2).sum())
+        clearance = assignment.nearest_way(*planned.ways, mission.agents.radius)[0]
         order = tuple(other.assigned_slots[first.formation].tolist())
-        found.assignments[name] = Assignment(order, way, room)
+        found.assignments[name] = Assignment(order, length, clearance)
     radius = np.array(mission.agents.radius)
     now, short, safe = found.assignments.values()
     if short.path_length < (1 - _WORTH) * now.path_length - _SHORT:

@@ -78,7 +78,7 @@ class GainsCheck:
 
 @dataclass(frozen=True)
 class Assignment:
-    """How agents get to slots: total way [m], and least room between them meanwhile [m].
+    """How agents get to slots: length of all paths [m], and least clearance between agents on them [m].
 
     `order[i]` is the slot that agent i takes, both from 0.
     """
@@ -149,7 +149,7 @@ class Preflight:
 
     def _repr_html_(self) -> str:
         """What was found as a notebook shows it: facts, then remarks."""
-        rows = [*self.words(), *((remark.level, remark.text) for remark in self.remarks)]
+        rows = [*self.describe(), *((remark.level, remark.text) for remark in self.remarks)]
         verdict = "no problems found" if self.passed else "it will fail as it is"
         return _markup.shown("Check", verdict, ("about", "what was found"), rows)
 
@@ -177,10 +177,13 @@ class Preflight:
             yield "gap", text
         if len(self.assignments) > 1:
             told = [
-                f"{name} {a.path_length:.1f} m, room {a.min_clearance:.2f} m"
+                f"{name} {a.path_length:.1f} m, {a.min_clearance:.2f} m"
                 for name, a in self.assignments.items()
             ]
-            yield "assignment", f"way in all and least room: {'; '.join(told)}"
+            yield (
+                "assignment",
+                f"length of all paths, and least clearance on them: {'; '.join(told)}",
+            )
         guessed = [planned.phase for planned in self.planned_phases if not planned.exact]
         if guessed:
             names = ", ".join(f"'{name}'" for name in guessed)

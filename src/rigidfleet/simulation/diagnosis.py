@@ -9,7 +9,7 @@ import numpy as np
 
 from rigidfleet.kernel.engine import native
 from rigidfleet.kernel.problem import Workspace
-from rigidfleet.kernel.records import Integrator
+from rigidfleet.kernel.records import IntegratorState
 from rigidfleet.math.constraint_jacobian import jacobian
 from rigidfleet.mission import Establish, Reshape
 from rigidfleet.planning import solvers
@@ -25,7 +25,7 @@ class Place(NamedTuple):
 
     plan: PhasePlan
     t: float  # [s]
-    state: Integrator
+    state: IntegratorState
     workspace: Workspace
     solver: Any  # of large systems, or None
 

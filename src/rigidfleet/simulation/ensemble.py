@@ -1,8 +1,8 @@
 """Establish a formation from many starts at once: a hundred thousand flights in some seconds.
 
 For a gain study or a Monte Carlo study of the constraint law itself. What varies here are the starts alone, what
-comes out is where the agents are when phases end; `rigidfleet.sweep` flies so, too, if only ends are to be judged,
-and else varies anything in any mission and judges whole flights.
+comes out is where the agents are when phases end; `rigidfleet.sweep` flies so, too, if final states alone are to be
+evaluated, and else varies anything in any mission and judges whole flights.
 """
 
 from __future__ import annotations

@@ -38,8 +38,8 @@ from rigidfleet.sweep.variation import (
 
 Evaluate = Literal["flight", "final"]
 
-#: What to do where ends alone cannot be judged.
-_WHOLE = 'judge whole flights: evaluate = "flight", no --final-states'
+#: What to do where final states alone cannot be evaluated.
+_WHOLE = 'evaluate whole flights: evaluate = "flight", no --final-states'
 #: Least fraction of a distribution, so that no normal number is infinite.
 _LEAST = 2.0**-54
 
@@ -397,7 +397,7 @@ def _fits(
 
 
 def _moves_starts(notes: FindingCollector, k: int, v: Variation, whole: dict[str, Any]) -> None:
-    """Whether a variation moves starts alone, which is all that differs in runs judged by their ends."""
+    """Whether a variation moves starts alone, which is all that differs in runs evaluated by final states."""
     values = getattr(v, "values", ())
     starts = ("agents", "position"), ("agents", "velocity")
     try:
@@ -406,8 +406,8 @@ def _moves_starts(notes: FindingCollector, k: int, v: Variation, whole: dict[str
         return  # said already
     if any(keys[:2] not in starts for keys in places) or not all(map(is_number, values)):
         problem = (
-            "varies more than numbers of agents.position or agents.velocity, in which alone runs judged by their"
-            " ends differ"
+            "varies more than numbers of agents.position or agents.velocity, in which alone runs evaluated by"
+            " their final states differ"
         )
         notes.add(("vary", k, "path"), problem, f"remove it, or {_WHOLE}", v.path)
 

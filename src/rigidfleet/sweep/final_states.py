@@ -1,7 +1,7 @@
-"""Runs of which only the ends of their phases are judged: eight to a vector, thousands in a second.
+"""Runs of which only the final states of their phases are evaluated: eight to a vector, thousands in a second.
 
 For starts that vary under open-loop phases, see `rigidfleet.simulation.ensemble`. Nothing on the way is recorded or
-judged.
+evaluated.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _WORDS = {
 
 
 def fly_final_states(sweep: Sweep, runs: Sequence[int]) -> list[RunRecord]:
-    """Fly whole groups of runs and judge where their phases end.
+    """Fly whole groups of runs and evaluate where their phases end.
 
     A run passes if it is flown to its end and takes each of its formations: "distances", "shape" and "handedness"
     as `rigidfleet.assess` has them. Of the metrics there are those of the shape, and the evaluations, which the
@@ -58,7 +58,7 @@ def fly_final_states(sweep: Sweep, runs: Sequence[int]) -> list[RunRecord]:
     out = list(refused)
     r[out], v[out] = sweep.mission.agents.position, sweep.mission.agents.velocity
     found = establish(sweep.mission, r, v)
-    wrong, metrics = _judged(sweep.mission, found)
+    wrong, metrics = _evaluated(sweep.mission, found)
     failed = {"complete": ~found.finished} | {k: found.finished & x for k, x in wrong.items()}
     wall = (perf_counter() - begun) / len(runs)
     rows = []
@@ -133,7 +133,7 @@ def _spread(mission: Mission, r: Floats, v: Floats) -> Bools:
     return np.asarray(extent[:, 3 - needed] > _CLEARLY**2 * extent[:, 2])
 
 
-def _judged(mission: Mission, flown: Ensemble) -> tuple[dict[str, Bools], dict[str, Floats]]:
+def _evaluated(mission: Mission, flown: Ensemble) -> tuple[dict[str, Bools], dict[str, Floats]]:
     """What fails (B,), and metrics (B,)."""
     count = len(flown.finished)
     wrong = {name: np.zeros(count, dtype=bool) for name in ("distances", "shape", "handedness")}

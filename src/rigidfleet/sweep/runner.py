@@ -119,7 +119,7 @@ class _Sweeping:
             self.keep(fly_runs(self.sweep, self.take(1)))
 
     def hand_out(self, pool: pools.Pool) -> None:
-        """Fly all that is missing by a pool; what it does not bring back is missing again."""
+        """Fly all that is missing by a pool of workers; what it does not bring back is missing again."""
         executor, capacity = pool
         flying: dict[Future[list[RunRecord]], list[int]] = {}
         text = self.sweep.json()

@@ -29,6 +29,8 @@ from rigidfleet.typing import Bools, Floats, Ints
 FILE = "sweep.db"
 #: Locked by the process that writes; the lock ends with it, however it ends.
 _LOCK = "sweep.lock"
+#: Version of the store's format, its `user_version`; the first one has 0.
+_FORMAT = 2
 _COLUMNS = ("passed", "reason", "detail", "wall", "codes", *METRICS)
 #: Little-endian, so that the file reads the same everywhere.
 _CODES = np.dtype("<f8")
@@ -133,6 +135,8 @@ class Store:
         self.db.execute("PRAGMA synchronous = NORMAL")
         identity = json.dumps(sweep.identity, ensure_ascii=False, sort_keys=True)
         with self._transaction():
+            _readable(self.db, self.path.parent)
+            self.db.execute(f"PRAGMA user_version = {_FORMAT}")
             self.db.execute("CREATE TABLE IF NOT EXISTS sweep (key TEXT PRIMARY KEY, value TEXT)")
             self.db.execute(f"CREATE TABLE IF NOT EXISTS runs ({_schema()})")
             there = dict(self.db.execute("SELECT key, value FROM sweep"))
@@ -212,9 +216,27 @@ def _reading(folder: Path) -> Generator[sqlite3.Connection]:
     with _explained(path):
         db = sqlite3.connect(path)
         try:
+            _readable(db, folder)
             yield db
         finally:
             db.close()
+
+
+def _readable(db: sqlite3.Connection, folder: Path) -> None:
+    """ResultError where a store is of another format."""
+    if db.execute("SELECT 1 FROM sqlite_master WHERE name = 'sweep'").fetchone() is None:
+        return  # new
+    made = max(1, db.execute("PRAGMA user_version").fetchone()[0])
+    if made > _FORMAT:
+        raise ResultError(
+            f"{folder}: holds a sweep of format {made}, and this version of rigidfleet reads up to {_FORMAT}. Use a"
+            " newer version, or name another folder by --out."
+        )
+    if made < _FORMAT:
+        raise ResultError(
+            f"{folder}: holds a sweep written by an earlier rigidfleet (sweep format {made}); this one reads format"
+            f" {_FORMAT}. Fly the sweep again: replace it by --force, or name another folder by --out."
+        )
 
 
 @contextmanager

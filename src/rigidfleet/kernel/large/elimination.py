@@ -1,9 +1,9 @@
-"""The exact law by two sweeps of 3x3 solves, O(N): for graphs that join each agent to three earlier ones.
+"""The exact law by two passes of 3x3 solves, O(N): for graphs that join each agent to three earlier ones.
 
 Such a graph (a 3-tree or any other made by Henneberg's first step) has 3N - 6 edges, and where no pivot is
 lost J has full row rank: its null space is the six rigid motions of the *current* shape. So any a_p with
 J a_p = b, plus the rigid motion that restores the balance of momentum, is M^-1 f_C of the exact law;
-A = J M^-1 J^T is neither formed nor factored. A sweep forwards finds a_p, one backwards the multipliers.
+A = J M^-1 J^T is neither formed nor factored. A pass forwards finds a_p, one backwards the multipliers.
 """
 
 import math

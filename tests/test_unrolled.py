@@ -1,4 +1,4 @@
-"""The kernel's source as straight-line code: `rigidfleet.kernel.engine.tracer` and `kernel.straight`."""
+"""The kernel's source as straight-line code: `rigidfleet.kernel.engine.tracer` and `kernel.engine.codegen`."""
 
 from typing import Any
 
