@@ -418,7 +418,7 @@ def test_a_build_process_imports_what_its_parent_does(way, hostile, tmp_path, mo
     monkeypatch.chdir(hostile)
     given = "../libraries" if way == "relative" else str(tmp_path / "libraries")
     monkeypatch.setattr(sys, "path", ["", *sys.path, given])
-    monkeypatch.setattr(native, "_BUILD", IMPORTS)
+    monkeypatch.setattr(objects, "_BUILD", IMPORTS)
     done = run(
         *objects.build_process(),
         cwd=hostile,
@@ -434,7 +434,7 @@ def test_a_build_process_imports_what_its_parent_does(way, hostile, tmp_path, mo
 
 def test_a_build_process_heeds_its_parents_flags():
     """A Python that leaves out the user's packages and the environment starts one that does, too."""
-    code = "from rigidfleet.kernel.engine import native; print(objects.build_process()[1:-1])"
+    code = "from rigidfleet.kernel.engine import objects; print(objects.build_process()[1:-1])"
     done = subprocess.run(
         [sys.executable, "-sE", "-c", code], capture_output=True, text=True, check=True
     )

@@ -61,9 +61,9 @@ def new(
     json : bool
         Print what was written as JSON. Ask nothing.
     """
+    from rigidfleet._files import write_file
     from rigidfleet.mission import Mission, counted, draft
     from rigidfleet.preflight.check import check as preflight
-    from rigidfleet.result import write_file
 
     given: dict[str, Any] = {
         "shape": shape, "agents": agents, "size": size, "mass": mass,

@@ -21,7 +21,8 @@ from typing import Any, NamedTuple
 import llvmlite.binding as llvm
 import numpy as np
 
-from rigidfleet.kernel.compiler.cache import cache_directory, not_kept, opened, replacing, told
+from rigidfleet._files import replacing
+from rigidfleet.kernel.compiler.cache import cache_directory, not_kept, opened, told
 from rigidfleet.kernel.engine.objects import (
     ELSEWHERE,
     ENTRIES,
@@ -204,7 +205,7 @@ def _read() -> list[bytes] | None:
 def _write(parts: Sequence[bytes]) -> bool:
     """Keep machine code, or warn that it will be compiled again."""
     try:
-        with replacing(_file()) as stream:
+        with replacing(_file(), private=True) as stream:
             stream.write(concatenated(parts))
     except OSError as error:
         not_kept(error)
