@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from functools import cached_property
 from importlib import resources
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from pydantic import PrivateAttr
@@ -39,6 +39,16 @@ _SHIPPED = resources.files("rigidfleet") / "missions"
 _DAMPING = (1e-5, 0.03)
 #: Beyond so many equations eigenvalues take too long; the greatest damping is taken.
 _DENSE = 1000
+
+
+class Fleet(NamedTuple):
+    """What all vehicles start from and can bear: read-only arrays, made once."""
+
+    mass: Floats  # (N,) as the laws believe [kg]
+    position: Floats  # (N, 3) at the start [m]
+    velocity: Floats  # (N, 3) at the start [m/s]
+    radius: Floats  # (N,) [m]
+    thrust_limit: Floats  # (N,) [N], infinite where unlimited
 
 
 class Mission(Contents):
@@ -165,7 +175,7 @@ class Mission(Contents):
         known = True  # where agents are to each other, which distances alone do not tell
         asked: Floats | None = None  # attitude asked for by name
         lies: Floats | None = self.drawn_attitude  # that of the axes of `places`, where it is known
-        places = np.array(self.agents.position) @ self.drawn_attitude.T
+        places = self.fleet.position @ self.drawn_attitude.T
         flown: set[str] = set()
         for p in self.phases:
             if isinstance(p, Steering) and (angles := p.attitude_deg) is not None:
@@ -282,7 +292,7 @@ class Mission(Contents):
         edges = (np.cumsum(left) - 1)[edges[left[edges].all(axis=1)]]
         if not len(edges) or min(len(edges), 3 * int(left.sum())) > _DENSE:
             return _DAMPING[1]
-        masses = np.array(self.agents.mass)[left]
+        masses = self.fleet.mass[left]
         index = constraint_jacobian.smallest_singular_value(slots[left][None], edges, masses)[0]
         return float(np.clip(index**2 / 4, *_DAMPING))
 
@@ -292,10 +302,20 @@ class Mission(Contents):
         return latest_end(self.phases)
 
     @cached_property
+    def fleet(self) -> Fleet:
+        """The vehicles as arrays."""
+        fleet = Fleet(
+            *(np.array(getattr(self.agents, name), dtype=float) for name in Fleet._fields)
+        )
+        for values in fleet:
+            values.flags.writeable = False
+        return fleet
+
+    @cached_property
     def true_mass(self) -> Floats:
         """Mass (N,) [kg] that each vehicle has: `agents.mass` is what the laws believe."""
         error = self.disturbances.mass_error if self.disturbances is not None else 0.0
-        return np.array(self.agents.mass) * (1.0 + np.array(error))
+        return self.fleet.mass * (1.0 + np.array(error))
 
     @cached_property
     def drag(self) -> Floats:
@@ -304,7 +324,7 @@ class Mission(Contents):
         if d is None or (d.drag is None and not any(d.wind) and d.gusts is None):
             return np.zeros(self.n_agents)
         if d.drag is None:
-            return DRAG * np.array(self.agents.mass)
+            return DRAG * self.fleet.mass
         return np.broadcast_to(np.array(d.drag, dtype=np.float64), self.n_agents).copy()
 
     @cached_property

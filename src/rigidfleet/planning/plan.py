@@ -211,7 +211,7 @@ def plan_phase(
     """
     t_end = _end(phase, now.t)
     _check_size(mission, phase)
-    before_switch, masses = now, np.array(mission.agents.mass)
+    before_switch, masses = now, mission.fleet.mass.copy()
     shaping = isinstance(phase, Establish | Reshape)
     name = phase.formation if shaping else now.formation
     edges = mission.formation_edges(name) if name else np.zeros((0, 2), dtype=np.int64)
@@ -256,7 +256,7 @@ def plan_phase(
         has_frame=frame is not None,
         vehicles=Vehicles(
             masses, 1.0 / masses, float(masses.sum()), float(masses.mean()),
-            np.array(mission.agents.thrust_limit), mission.agents.saturate, mission.gravity,
+            mission.fleet.thrust_limit.copy(), mission.agents.saturate, mission.gravity,
         ),
         graph=_graph(edges.tobytes(), masses.tobytes(), large=method != "dense"),
         law=_law(

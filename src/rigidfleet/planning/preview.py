@@ -72,11 +72,9 @@ class PlannedPhase:
 
 def preview(mission: Mission, phases: int | None = None) -> tuple[list[PlannedPhase], bool]:
     """The way of all agents, one `PlannedPhase` for each phase or so many, and whether it is known to its end."""
-    masses = np.array(mission.agents.mass)
+    masses = mission.fleet.mass
     frame = None if mission.body_frame is None else mission.drawn_attitude
-    now = PhaseState(
-        0.0, np.array(mission.agents.position), np.array(mission.agents.velocity), frame=frame
-    )
+    now = PhaseState(0.0, mission.fleet.position, mission.fleet.velocity, frame=frame)
     way: list[PlannedPhase] = []
     most = samples_per_phase(mission)
     # Of more than can be looked at with the fewest samples, the first ones.

@@ -467,7 +467,7 @@ def _sketch(
     p, placed = sketch_places(mission, name)
     edges = mission.formation_edges(name)
     lengths = mission.formation_distances(name)
-    masses = np.array(mission.agents.mass)
+    masses = mission.fleet.mass
     origin = masses @ p / masses.sum()
     flat = distance_geometry.dimension(p, 1e-3) < 3 and float(np.ptp(p[:, 2])) < 1e-3 * max(
         1e-9, float(np.ptp(p))

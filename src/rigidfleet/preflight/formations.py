@@ -163,7 +163,7 @@ def _other_shapes(mission: Mission, f: FormationCheck, *, alone: bool) -> Iterat
     others = f.realisations
     if others is None or not alone:
         return
-    start, slots = np.array(mission.agents.position), mission.formation_slots(f.name)
+    start, slots = mission.fleet.position, mission.formation_slots(f.name)
     first, by = mission.phases[0], None
     if isinstance(first, Establish) and first.formation == f.name:
         by = reference_kind(mission, first, start, slots)

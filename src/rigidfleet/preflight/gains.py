@@ -58,7 +58,7 @@ def _drift(mission: Mission) -> Iterator[Remark]:
     if not isinstance(first, Establish):
         yield Remark("note", "gains", text)
         return
-    r, v = np.array(mission.agents.position), np.array(mission.agents.velocity)
+    r, v = mission.fleet.position, mission.fleet.velocity
     edges, d = (
         mission.formation_edges(first.formation),
         mission.formation_distances(first.formation),

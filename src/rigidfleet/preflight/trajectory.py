@@ -40,7 +40,7 @@ def separation_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     """Room between vehicles: where it is least, and each change of formation on which ways cross."""
     if mission.n_agents < 2:
         return
-    radius, limit = np.array(mission.agents.radius), mission.limits.separation or 0.0
+    radius, limit = mission.fleet.radius, mission.limits.separation or 0.0
     worst: dict[bool, tuple[float, float, tuple[int, ...], str]] = {}
     least = np.inf, 0.0, (0, 0)
     for number, planned in enumerate(found.planned_phases):
@@ -124,7 +124,7 @@ def _crossing(
 
 def downwash_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     """One vehicle in the downwash of another."""
-    radius, limit = np.array(mission.agents.radius), mission.limits.separation_below
+    radius, limit = mission.fleet.radius, mission.limits.separation_below
     worst: dict[bool, tuple[float, float, tuple[int, ...], str]] = {}
     for planned in found.planned_phases:
         room, pair = proximity.headroom(planned.position, radius)
@@ -148,7 +148,7 @@ def downwash_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
 
 def thrust_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     """Thrust that the planned trajectory asks for beyond a limit."""
-    masses, limits = np.array(mission.agents.mass), np.array(mission.agents.thrust_limit)
+    masses, limits = mission.fleet.mass, mission.fleet.thrust_limit
     weight = np.array([0.0, 0.0, mission.gravity])
     best: tuple[float, float, str, float, str, bool] | None = None
     for planned in found.planned_phases:
@@ -173,7 +173,7 @@ def disturbance_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     d = mission.disturbances
     if d is None or not found.planned_phases:
         return
-    believed, true, drag = np.array(mission.agents.mass), mission.true_mass, mission.drag
+    believed, true, drag = mission.fleet.mass, mission.true_mass, mission.drag
     wind, up = np.array(d.wind), np.array([0.0, 0.0, 1.0])
     g, speed = mission.gravity, float(np.linalg.norm(d.wind))
     k1, k2 = lqr.double_integrator_gains(mission.tracking.Q, mission.tracking.R)
@@ -182,7 +182,7 @@ def disturbance_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     noise = np.zeros(len(believed))
     if d.noise is not None:
         noise = 3 * believed * math.hypot(k1 * d.noise.position, k2 * d.noise.velocity)
-    limits = np.array(mission.agents.thrust_limit)
+    limits = mission.fleet.thrust_limit
     worst, most = -math.inf, (0.0, 0.0, "", math.inf)
     for planned in found.planned_phases:
         force = true[:, None] * (planned.acceleration + g * up)
@@ -217,12 +217,12 @@ def disturbance_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
 
 def _step_thrust(mission: Mission, found: Preflight) -> Iterator[Remark]:
     """Forces that references ask for which jump: J M^-1 J^T lambda = -beta^2 c at the jump."""
-    c, masses = mission.constraint, np.array(mission.agents.mass)
+    c, masses = mission.constraint, mission.fleet.mass
     if c.stabilisation == "none":
         return
-    limits = np.array(mission.agents.thrust_limit)
+    limits = mission.fleet.thrust_limit
     starts = [
-        np.array(mission.agents.position),
+        mission.fleet.position,
         *(planned.position[-1] for planned in found.planned_phases),
     ]
     for phase, r in zip(mission.phases, starts, strict=False):
@@ -248,7 +248,7 @@ def _step_thrust(mission: Mission, found: Preflight) -> Iterator[Remark]:
 
 def obstacle_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     """Room to each obstacle; of many, to all that may be touched and to the nearest."""
-    radius, way = np.array(mission.agents.radius), found.planned_phases
+    radius, way = mission.fleet.radius, found.planned_phases
     if not (mission.obstacles and way):
         return
     # What a phase stays within, and how far that is from each obstacle (L, B): nobody is nearer.
@@ -319,7 +319,7 @@ def _beyond(within: Floats, thing: Box | Ground) -> Floats:
 def _too_low(mission: Mission, found: Preflight, phase: str, ground: float) -> str:
     """Why a vehicle is at or below the ground [m] in a phase, and how high its formation is to fly."""
     planned = next(planned for planned in found.planned_phases if planned.phase == phase)
-    masses, radius = np.array(mission.agents.mass), np.array(mission.agents.radius)
+    masses, radius = mission.fleet.mass, mission.fleet.radius
     z = planned.position[..., 2]
     cm = z @ masses / masses.sum()
     k, i = np.unravel_index(int((z - radius).argmin()), z.shape)
@@ -337,7 +337,7 @@ def _gaps(mission: Mission, found: Preflight, radius: Floats) -> Iterator[Remark
 
     Of boxes on either side of the centre, seen along an axis, the nearest two make the gap.
     """
-    masses = np.array(mission.agents.mass)
+    masses = mission.fleet.mass
     boxes = [thing for thing in mission.obstacles if isinstance(thing, Box)]
     if len(boxes) < 2:
         return

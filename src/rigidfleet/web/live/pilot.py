@@ -98,7 +98,7 @@ class Pilot:
                 " Give one a shape or slots in the mission"
             )
         self.mission = mission
-        self.masses = np.array(mission.agents.mass)
+        self.masses = mission.fleet.mass
         self.archive = Archive(max(mission.output_step, _FINEST))
         self.flight = Flight(mission, force=self._wind, sampler=self._samples, flips=True)
         self.gusts: list[Gust] = []
