@@ -163,6 +163,8 @@ class Mission(Contents):
         for p in self.phases:
             if p.moves and (angles := p.attitude_deg) is not None:
                 lies = asked = dcm_from_euler(np.deg2rad(angles))
+            if p.turns_away:
+                lies = asked = None
             if (shaping := p.shaping) is None:
                 continue
             name = shaping.formation

@@ -10,6 +10,7 @@ import numpy as np
 from rigidfleet._toml import toml_key
 from rigidfleet.formation import distance_geometry
 from rigidfleet.math import rigid_body
+from rigidfleet.mission import bounds
 from rigidfleet.mission.findings import FindingCollector, Keys, near
 from rigidfleet.mission.formations import agents as agents_text
 from rigidfleet.mission.formations import sound
@@ -21,12 +22,15 @@ from rigidfleet.mission.schema import (
     Establish,
     Formation,
     Lqr,
+    Orbit,
     Shaping,
     Turn,
 )
 
 _ENDINGS = ("until", "duration", "settle")
 _MOST_SAMPLES = 1_000_000
+#: Turns of an orbit at most: beyond, the samples of a preview would miss its circle.
+_MOST_TURNS = 100
 #: Numbers in a result at most: 4 GB of them.
 _MOST_NUMBERS = 5e8
 
@@ -166,9 +170,14 @@ def _blend(notes: FindingCollector, p: Shaping, longest: float | None, path: Key
         if "blend" in p.model_fields_set:
             remedy = "remove it, or use reference = 'shape' or 'distances'"
             notes.add((*path, "blend"), "a step has no blend", remedy)
-    elif longest is not None and p.blend > longest * (1 + 1e-9):
+    else:
+        _blended(notes, p.blend, longest, path)
+
+
+def _blended(notes: FindingCollector, blend: float, longest: float | None, path: Keys) -> None:
+    if longest is not None and blend > longest * (1 + 1e-9):
         problem = f"the phase lasts {longest:g} s, less than its blend"
-        notes.add((*path, "blend"), problem, f"use blend <= {longest:g}, or end it later", p.blend)
+        notes.add((*path, "blend"), problem, f"use blend <= {longest:g}, or end it later", blend)
 
 
 def _samples(
@@ -222,7 +231,8 @@ def _controls(
             notes.add((*path, "control"), "the architecture is 'local'", remedy)
         if p.control == "open" and p.moves:
             problem = f"nothing would steer this {notes.data['phases'][k]['kind']} phase"
-            notes.add((*path, "control"), problem, "use control = 'tracking' or 'body'")
+            others = " or 'body'" if p.body_control == "body" else ""
+            notes.add((*path, "control"), problem, f"use control = 'tracking'{others}")
         if p.control != "open" and any(p.input_force):
             problem = f"has no effect with control '{p.control}'"
             notes.add((*path, "input_force"), problem, "remove it, or use control = 'open'")
@@ -252,9 +262,33 @@ def _establish(notes: FindingCollector, p: Establish, path: Keys, _: float | Non
         notes.add((*path, *(angles or ["attitude"])[:1]), problem, remedy)
 
 
+def _orbit(notes: FindingCollector, p: Orbit, path: Keys, longest: float | None) -> None:
+    """A circle is flown by tracked slots, at a rate, and has an end."""
+    if p.control == "body" and notes.right(path, "control"):
+        problem = "a wrench on the virtual body leads to waypoints, not round a circle"
+        notes.add((*path, "control"), problem, "use control = 'tracking'")
+    if p.settle is not None and notes.right(path, *_ENDINGS):
+        notes.add((*path, "settle"), "an orbit never settles", "end it by duration or until")
+    if notes.right(path, "blend", *_ENDINGS):
+        _blended(notes, p.blend, longest, path)
+    if not notes.right(path, "rate_deg_s", "radius"):
+        return
+    rate, where = abs(np.deg2rad(p.rate_deg_s)), (*path, "rate_deg_s")
+    turns = rate * (longest or 0.0) / (2 * np.pi)
+    if rate == 0.0:
+        notes.add(where, "would circle nothing", "give a rate, or use kind = 'fly' or 'hold'")
+    elif p.radius * rate > bounds.SPEED.most or p.radius * rate**2 > bounds.ACCELERATION.most:
+        problem = f"asks for {p.radius * rate:.2g} m/s and {p.radius * rate**2:.2g} m/s^2"
+        notes.add(where, problem, "use a lower rate, or a smaller radius")
+    elif turns > _MOST_TURNS:
+        problem = f"makes {turns:.4g} turns in {longest:g} s, more than {_MOST_TURNS}"
+        notes.add(where, problem, "use a lower rate, or several phases")
+
+
 #: What can be wrong with one kind alone: its phase, where it is, and its greatest length [s] if that is known.
 _OWN: dict[str, Callable[[FindingCollector, Any, Keys, float | None], None]] = {
     "establish": _establish,
+    "orbit": _orbit,
     "turn": _turn,
 }
 

@@ -528,8 +528,8 @@ class AnyPhase(Part):
     control: Literal["open", "tracking", "body"] = Field(
         "tracking",
         description="open: weight balance and input_force; tracking: each agent tracks its slot; body: "
-        "wrench on the virtual body. Default tracking; in architecture 'body', open to establish and "
-        "body otherwise",
+        "wrench on the virtual body. Default tracking; in architecture 'body', open to establish, "
+        "tracking to orbit and body otherwise",
     )
     input_force: Force = Field(
         (0.0, 0.0, 0.0),
@@ -560,6 +560,11 @@ class AnyPhase(Part):
     def meets(self) -> tuple[str, ...]:
         """Which of position, velocity, attitude and rates the verdict holds it to, at its arrival."""
         return ()
+
+    @property
+    def turns_away(self) -> bool:
+        """Whether it leaves an attitude that nobody has asked for by name."""
+        return False
 
     @property
     def least_time(self) -> float:
@@ -740,11 +745,57 @@ class Hold(AnyPhase):
     kind: Literal["hold"] = Field(description="stay")
 
 
+class Orbit(AnyPhase):
+    """Circle a point on a level circle, at a steady rate, and leave it with the velocity there."""
+
+    moves: ClassVar[bool] = True
+    body_control: ClassVar[str] = "tracking"
+
+    kind: Literal["orbit"] = Field(description="circle a point")
+    centre: Vector = Field(description="centre of the circle, which is level [x, y, z] [m]")
+    radius: Length = Field(description="radius of the circle [m]")
+    rate_deg_s: Angle = Field(
+        description="rate [deg/s], not 0: counter-clockwise seen from above where > 0, clockwise where < 0"
+    )
+    yaw: Literal["fixed", "along"] = Field(
+        "fixed",
+        description="fixed: the attitude commanded before is kept; along: the body turns with the orbit, and shows "
+        "the centre the side that it had there at first",
+    )
+    blend: Time = Field(
+        4.0, description="length of the run-in [s], from where the body is onto the circle"
+    )
+
+    @property
+    def meets(self) -> tuple[str, ...]:
+        """The place on the circle where it ends, and the attitude if that turns."""
+        return ("position", "velocity", *(("attitude", "rates") if self.turns_away else ()))
+
+    @property
+    def turns_away(self) -> bool:
+        """Whether the body turns with the orbit."""
+        return self.yaw == "along"
+
+    @property
+    def least_time(self) -> float:
+        """Length of the run-in [s]."""
+        return self.blend
+
+    @property
+    def leads_to(self) -> str:
+        """The circle."""
+        return f"round {_vector(self.centre, 'm')} at {self.radius:g} m, {self.rate_deg_s:g}°/s"
+
+    def ended(self, length: float) -> dict[str, Any]:
+        """A run-in that is not longer."""
+        return {"blend": min(self.blend, length)}
+
+
 def _vector(values: Sequence[float], unit: str) -> str:
     return f"({', '.join(f'{value:g}' for value in values)}) {unit}"
 
 
-Phase = Annotated[Establish | Fly | Reshape | Turn | Hold, Field(discriminator="kind")]
+Phase = Annotated[Establish | Fly | Reshape | Turn | Orbit | Hold, Field(discriminator="kind")]
 #: Every kind of phase, by its name.
 KINDS: dict[str, type[AnyPhase]] = {
     get_args(model.model_fields["kind"].annotation)[0]: model
