@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from rigidfleet.cli import app as cli
-from rigidfleet.cli import console
+from rigidfleet.cli import codes, console
 from rigidfleet.errors import MissionError
 from rigidfleet.math import turbulence
 from rigidfleet.mission import Mission, json_schema, mission_names, mission_text
@@ -270,7 +270,7 @@ def test_a_check_at_the_bounds_ends(text, topics):
 def test_a_long_check_says_what_it_does(tmp_path: Path, monkeypatch, capsys):
     """A check that takes long says what it looks at on standard error; a short one says nothing."""
     (tmp_path / "a.toml").write_text(HEAD + agents(4) + formation("square", 3.0) + ESTABLISH)
-    assert cli.main(["check", str(tmp_path / "a.toml")]) != cli.BAD_INPUT
+    assert cli.main(["check", str(tmp_path / "a.toml")]) != codes.BAD_INPUT
     assert "Checking" not in capsys.readouterr().err
     monkeypatch.setattr(console, "_PATIENCE", 0.05)
     monkeypatch.setattr(

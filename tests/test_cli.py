@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from rigidfleet.cli import app as cli
-from rigidfleet.cli import console
+from rigidfleet.cli import codes, console
 from rigidfleet.errors import FlightError
 from rigidfleet.formation.graphs import neighbours
 from rigidfleet.formation.shapes import SHAPES
@@ -142,7 +142,7 @@ def test_module_is_the_command():
 )
 def test_bad_input(capsys, tokens, words):
     """Bad input exits with 2 and says on standard error, and there alone, what to do."""
-    assert cli.main(tokens) == cli.BAD_INPUT
+    assert cli.main(tokens) == codes.BAD_INPUT
     out, err = capsys.readouterr()
     assert out == ""
     assert err.startswith("error: ")
@@ -154,7 +154,7 @@ def test_bad_input(capsys, tokens, words):
 
 def test_missions(capsys):
     """Each shipped mission has one line, with its table or figure of the paper."""
-    assert cli.main(["missions"]) == cli.PASSED
+    assert cli.main(["missions"]) == codes.PASSED
     head, *lines = capsys.readouterr().out.splitlines()
     assert "in the paper" in head
     assert [line.split()[0] for line in lines] == mission_names()
@@ -165,19 +165,19 @@ def test_missions(capsys):
 
 def test_missions_print(capfdbinary):
     """A mission is printed as it is shipped, byte for byte."""
-    assert cli.main(["missions", "--print", "narrow-passage"]) == cli.PASSED
+    assert cli.main(["missions", "--print", "narrow-passage"]) == codes.PASSED
     assert capfdbinary.readouterr().out == mission_text("narrow-passage").encode()
 
 
 def test_missions_schema(capsys):
     """The schema is JSON and describes the mission's keys."""
-    assert cli.main(["missions", "--schema"]) == cli.PASSED
+    assert cli.main(["missions", "--schema"]) == codes.PASSED
     assert "phases" in json.loads(capsys.readouterr().out)["properties"]
 
 
 def test_check(capsys):
     """A mission that is right is counted up, and its phases are listed."""
-    assert cli.main(["check", "narrow-passage"]) == cli.PASSED
+    assert cli.main(["check", "narrow-passage"]) == codes.PASSED
     first, _, *lines = capsys.readouterr().out.splitlines()
     assert first == "narrow-passage: right: 3 agents, 2 formations, 12 phases, 90 s"
     phases, facts = lines[: lines.index("")], lines[lines.index("") :]
@@ -195,7 +195,7 @@ def test_check_words(capsys):
         RESTLESS
         + '[[phases]]\nkind = "turn"\nroll_deg = 5\nrates_deg_s = [0, 0, 1]\nduration = 4\n'
     )
-    assert cli.main(["check", write("restless.toml", text)]) == cli.PASSED
+    assert cli.main(["check", write("restless.toml", text)]) == codes.PASSED
     first, _, *phases = capsys.readouterr().out.splitlines()
     assert first.endswith("1 formation, 2 phases, at most 6 s")
     assert "settled, within 2 s" in phases[0]
@@ -205,7 +205,7 @@ def test_check_words(capsys):
 
 def test_check_json(capsys):
     """As JSON, a mission that is right is described in plain data."""
-    assert cli.main(["check", "narrow-passage", "--json"]) == cli.PASSED
+    assert cli.main(["check", "narrow-passage", "--json"]) == codes.PASSED
     found = json.loads(capsys.readouterr().out)
     assert found["right"] is True
     assert (found["agents"], found["latest_end_s"], len(found["phases"])) == (3, 90.0, 12)
@@ -215,25 +215,25 @@ def test_check_json(capsys):
 
 def test_check_that_fails(capsys):
     """What will fail is said, with exit code 1; in JSON, too."""
-    assert cli.main(["check", "establish-cube-as-printed"]) == cli.FAILED
+    assert cli.main(["check", "establish-cube-as-printed"]) == codes.FAILED
     assert "fails  'cube' will be another shape" in capsys.readouterr().out
-    assert cli.main(["check", "establish-cube-as-printed", "--json"]) == cli.FAILED
+    assert cli.main(["check", "establish-cube-as-printed", "--json"]) == codes.FAILED
     assert json.loads(capsys.readouterr().out)["passed"] is False
 
 
 def test_check_realisations(capsys):
     """The search for other shapes is made unless it is forbidden."""
-    assert cli.main(["check", "establish-cube"]) == cli.PASSED
+    assert cli.main(["check", "establish-cube"]) == codes.PASSED
     assert "random starts" in capsys.readouterr().out
-    assert cli.main(["check", "establish-cube", "--no-realisations"]) == cli.PASSED
+    assert cli.main(["check", "establish-cube", "--no-realisations"]) == codes.PASSED
     assert "random starts" not in capsys.readouterr().out
 
 
 def test_check_figure(capsys):
     """The graphs are drawn to the file asked for; one of another kind is refused."""
-    assert cli.main(["check", "square", "--figure", "graph.svg"]) == cli.PASSED
+    assert cli.main(["check", "square", "--figure", "graph.svg"]) == codes.PASSED
     assert "flex-1-" in Path("graph.svg").read_text(encoding="utf-8")
-    assert cli.main(["check", "square", "--figure", "graph.gif"]) == cli.BAD_INPUT
+    assert cli.main(["check", "square", "--figure", "graph.gif"]) == codes.BAD_INPUT
     assert "graph.gif: no format" in capsys.readouterr().err
 
 
@@ -242,7 +242,7 @@ WRONG = TRIANGLE.replace("mass = 1.0", "mass = -1").replace("size = 4.0", "size 
 
 def test_check_wrong(capsys):
     """All errors of a mission are told at once, each with key, value and remedy."""
-    assert cli.main(["check", write("wrong.toml", WRONG)]) == cli.BAD_INPUT
+    assert cli.main(["check", write("wrong.toml", WRONG)]) == codes.BAD_INPUT
     out, err = capsys.readouterr()
     assert out == ""
     assert err.count("error: wrong.toml: ") == 3
@@ -251,7 +251,7 @@ def test_check_wrong(capsys):
 
 def test_check_wrong_json(capsys):
     """As JSON, the errors are on standard output, and the exit code is the same."""
-    assert cli.main(["check", write("wrong.toml", WRONG), "--json"]) == cli.BAD_INPUT
+    assert cli.main(["check", write("wrong.toml", WRONG), "--json"]) == codes.BAD_INPUT
     out, err = capsys.readouterr()
     found = json.loads(out)
     assert err == ""
@@ -265,15 +265,15 @@ def test_check_wrong_json(capsys):
 
 def test_new(capsys):
     """A new mission is written where it says, is right, and is kept unless it is to be replaced."""
-    assert cli.main(["new", "mine", "--shape", "square", "--to", "3", "-4", "9"]) == cli.PASSED
+    assert cli.main(["new", "mine", "--shape", "square", "--to", "3", "-4", "9"]) == codes.PASSED
     assert "mine.toml: 4 agents, 1 formation, 4 phases" in capsys.readouterr().out
-    assert cli.main(["check", "mine.toml"]) == cli.PASSED
+    assert cli.main(["check", "mine.toml"]) == codes.PASSED
     assert "(3, -4, 9) m" in capsys.readouterr().out
     text = Path("mine.toml").read_text(encoding="utf-8")
-    assert cli.main(["new", "mine"]) == cli.BAD_INPUT
+    assert cli.main(["new", "mine"]) == codes.BAD_INPUT
     assert "mine.toml: exists already" in capsys.readouterr().err
     assert Path("mine.toml").read_text(encoding="utf-8") == text
-    assert cli.main(["new", "mine.toml", "--force", "--quiet"]) == cli.PASSED
+    assert cli.main(["new", "mine.toml", "--force", "--quiet"]) == codes.PASSED
     assert capsys.readouterr() == ("", "")
     assert 'shape = "triangle"' in Path("mine.toml").read_text(encoding="utf-8")
 
@@ -281,7 +281,7 @@ def test_new(capsys):
 def test_new_without_a_terminal_asks_nothing():
     """Where nobody can answer, a new mission is that of the defaults."""
     done = command("new")
-    assert done.returncode == cli.PASSED
+    assert done.returncode == codes.PASSED
     assert done.stdout.startswith("mission.toml: 3 agents")
     assert done.stderr == ""
 
@@ -295,7 +295,7 @@ def test_new_names_every_shape(capsys):
 
 def test_new_json(capsys):
     """As JSON, a new mission is described as `check` describes it."""
-    assert cli.main(["new", "mine", "--json", "--agents", "6"]) == cli.PASSED
+    assert cli.main(["new", "mine", "--json", "--agents", "6"]) == codes.PASSED
     found = json.loads(capsys.readouterr().out)
     assert (found["file"], found["agents"], found["formations"]) == ("mine.toml", 6, ["hexagon"])
 
@@ -315,7 +315,7 @@ def test_new_json(capsys):
 )
 def test_new_that_cannot_be(capsys, tokens, words):
     """A mission that would be wrong is not written."""
-    assert cli.main(["new", "mine", *tokens]) == cli.BAD_INPUT
+    assert cli.main(["new", "mine", *tokens]) == codes.BAD_INPUT
     assert words in " ".join(capsys.readouterr().err.split())
     assert not Path("mine.toml").exists()
 
@@ -332,7 +332,7 @@ def test_new_that_cannot_be(capsys, tokens, words):
 )
 def test_a_whole_number_is_not_rounded(capsys, tokens):
     """Wherever a count is asked for, a fraction is one clear error."""
-    assert cli.main(tokens) == cli.BAD_INPUT
+    assert cli.main(tokens) == codes.BAD_INPUT
     err = capsys.readouterr().err
     assert f"'{tokens[-1]}' is no whole number." in err
     assert err.count("error") == 1
@@ -340,7 +340,7 @@ def test_a_whole_number_is_not_rounded(capsys, tokens):
 
 def test_new_into_no_folder(capsys):
     """A folder that is not there is an error that says so."""
-    assert cli.main(["new", "no/folder/mine", "--quiet"]) == cli.BAD_INPUT
+    assert cli.main(["new", "no/folder/mine", "--quiet"]) == codes.BAD_INPUT
     assert "there is no folder" in capsys.readouterr().err
 
 
@@ -390,7 +390,7 @@ CUBE = slots_of("cube", 4.0, 8)
 
 def test_design(capsys):
     """The designed cube beats the paper's 18 edges, and its formation can be flown as printed."""
-    assert cli.main(["design", "cube"]) == cli.PASSED
+    assert cli.main(["design", "cube"]) == codes.PASSED
     out, err = capsys.readouterr()
     rows = {line[:14].strip(): line.split() for line in err.splitlines()[1:]}
     w, w_max = (
@@ -401,13 +401,13 @@ def test_design(capsys):
     assert rows["all pairs"][2] == "28"
     mission = mission_text("establish-cube").split("[formations.cube]")[0]
     phase = '[[phases]]\nkind = "establish"\nformation = "cube"\nuntil = 9\n'
-    assert cli.main(["check", write("mine.toml", mission + out + phase)]) == cli.PASSED
+    assert cli.main(["check", write("mine.toml", mission + out + phase)]) == codes.PASSED
 
 
 def test_design_of_points(capsys):
     """Points from a file get their edges; what distances do not hold of a flat shape is said."""
     Path("flat.csv").write_text("x,y,z\n0,0,0\n4,0,0\n4,4,0\n0,4,0\n", encoding="utf-8")
-    assert cli.main(["design", "flat.csv", "--extra", "complete", "--json"]) == cli.PASSED
+    assert cli.main(["design", "flat.csv", "--extra", "complete", "--json"]) == codes.PASSED
     found = json.loads(capsys.readouterr().out)
     assert found["graphs"]["designed"]["edges"] == 6
     assert "The shape is flat" in found["limits"]
@@ -417,7 +417,7 @@ def test_design_of_points(capsys):
 def test_design_by_a_named_graph(capsys):
     """A graph for many agents is taken by name, judged by its index, and stays a name in the formation."""
     command = ["design", "shells", "--agents", "300", "--size", "2", "--edges"]
-    assert cli.main([*command, "neighbours", "--reach", "1.8", "--json"]) == cli.PASSED
+    assert cli.main([*command, "neighbours", "--reach", "1.8", "--json"]) == codes.PASSED
     found = json.loads(capsys.readouterr().out)
     graph = found["graphs"]["neighbours"]
     slots = slots_of("shells", 2.0, 300)
@@ -426,7 +426,7 @@ def test_design_by_a_named_graph(capsys):
     assert graph["condition"] == pytest.approx(ends.condition)
     form = tomllib.loads(found["toml"])["formations"]["shells"]
     assert (form["edges"], form["reach"]) == ("neighbours", 1.8)
-    assert cli.main([*command, "henneberg-multilevel"]) == cli.PASSED
+    assert cli.main([*command, "henneberg-multilevel"]) == codes.PASSED
     out, err = capsys.readouterr()
     assert 'edges = "henneberg-multilevel"' in out
     words = " ".join(err.split())
@@ -437,10 +437,10 @@ def test_design_by_a_named_graph(capsys):
 def test_design_keeps_files(capsys):
     """A file that is there is kept, unless it is to be replaced."""
     arguments = ["design", "square", "--out", "square.toml"]
-    assert cli.main(arguments) == cli.PASSED
+    assert cli.main(arguments) == codes.PASSED
     assert "Formation  square.toml" in capsys.readouterr().out
-    assert cli.main(arguments) == cli.BAD_INPUT
-    assert cli.main([*arguments, "--force", "--extra", "1"]) == cli.PASSED
+    assert cli.main(arguments) == codes.BAD_INPUT
+    assert cli.main([*arguments, "--force", "--extra", "1"]) == codes.PASSED
     assert Path("square.toml").read_text(encoding="utf-8").count("], [") == 5
 
 
@@ -471,7 +471,7 @@ def test_design_keeps_files(capsys):
 )
 def test_design_of_nothing(arguments, message, capsys):
     """What cannot be designed is refused with a reason."""
-    assert cli.main(["design", *arguments]) == cli.BAD_INPUT
+    assert cli.main(["design", *arguments]) == codes.BAD_INPUT
     assert message in capsys.readouterr().err
 
 
@@ -480,7 +480,7 @@ def test_design_of_nothing(arguments, message, capsys):
 
 def test_run(capsys, folder):
     """A flight leaves its result and verdict in flights/NAME, and says so."""
-    assert cli.main(["run", "short.toml", "--no-figures", "--csv"]) == cli.PASSED
+    assert cli.main(["run", "short.toml", "--no-figures", "--csv"]) == codes.PASSED
     out = capsys.readouterr().out
     home = folder / "flights" / "short"
     assert sorted(p.name for p in home.iterdir()) == ["short.csv", "short.nc", "verdict.json"]
@@ -493,13 +493,13 @@ def test_run(capsys, folder):
 
 def test_run_json(capsys):
     """With --json, standard output is the verdict's file and nothing else."""
-    assert cli.main(["run", "short.toml", "--no-figures", "--json", "--out", "x"]) == cli.PASSED
+    assert cli.main(["run", "short.toml", "--no-figures", "--json", "--out", "x"]) == codes.PASSED
     assert capsys.readouterr().out == Path("x/verdict.json").read_text(encoding="utf-8")
 
 
 def test_run_quiet(capsys):
     """With --quiet, a flight that passes prints nothing at all."""
-    assert cli.main(["run", "short.toml", "--no-figures", "--quiet"]) == cli.PASSED
+    assert cli.main(["run", "short.toml", "--no-figures", "--quiet"]) == codes.PASSED
     assert capsys.readouterr() == ("", "")
 
 
@@ -510,7 +510,7 @@ def test_run_quiet(capsys):
 )
 def test_run_fails_its_verdict(capsys, text, complete, words):
     """A flight that passes a limit, or cannot be flown to its end, exits with 1 and is saved."""
-    assert cli.main(["run", write("bad.toml", text), "--no-figures"]) == cli.FAILED
+    assert cli.main(["run", write("bad.toml", text), "--no-figures"]) == codes.FAILED
     out = capsys.readouterr().out
     assert "Failed" in out
     assert words in " ".join(out.split())
@@ -519,10 +519,10 @@ def test_run_fails_its_verdict(capsys, text, complete, words):
 
 def test_run_keeps_an_existing_result(capsys, simulate):
     """An existing result is kept, and nothing is flown, unless it is to be replaced."""
-    assert cli.main(["run", "short.toml", "--no-figures", "--quiet"]) == cli.PASSED
+    assert cli.main(["run", "short.toml", "--no-figures", "--quiet"]) == codes.PASSED
     before = Path("flights/short/short.nc").read_bytes()
     simulate(lambda *_, **__: pytest.fail("it flew"))
-    assert cli.main(["run", "short.toml"]) == cli.BAD_INPUT
+    assert cli.main(["run", "short.toml"]) == codes.BAD_INPUT
     err = capsys.readouterr().err
     assert "short.nc: exists already" in err
     assert "--force" in err
@@ -533,7 +533,7 @@ def test_run_keeps_the_verdict_of_another_flight(capsys):
     """A verdict.json of another mission in the same folder is not overwritten."""
     Path("shared").mkdir()
     write("shared/verdict.json", "theirs")
-    assert cli.main(["run", "short.toml", "--out", "shared"]) == cli.BAD_INPUT
+    assert cli.main(["run", "short.toml", "--out", "shared"]) == codes.BAD_INPUT
     assert "verdict.json: exists already" in capsys.readouterr().err
     assert Path("shared/verdict.json").read_text(encoding="utf-8") == "theirs"
 
@@ -546,7 +546,7 @@ def test_run_force():
         write(home / name, "earlier")
     for name in ("notes.txt", "figures/mine.png"):
         write(home / name, "mine")
-    assert cli.main(["run", "short.toml", "--no-figures", "--force", "--quiet"]) == cli.PASSED
+    assert cli.main(["run", "short.toml", "--no-figures", "--force", "--quiet"]) == codes.PASSED
     assert Result.load(home / "short.nc").complete
     found = {str(p.relative_to(home)) for p in home.rglob("*") if p.is_file()}
     assert found == {"short.nc", "verdict.json", "notes.txt", os.path.join("figures", "mine.png")}
@@ -556,7 +556,7 @@ def test_run_force():
 def test_run_into_no_folder(capsys, simulate, out):
     """A folder that cannot be written is an error before anything is flown, and leaves nothing."""
     simulate(lambda *_, **__: pytest.fail("it flew"))
-    assert cli.main(["run", "short.toml", "--out", out]) == cli.BAD_INPUT
+    assert cli.main(["run", "short.toml", "--out", out]) == codes.BAD_INPUT
     assert "--out" in capsys.readouterr().err
     assert [p.name for p in Path().iterdir()] == ["short.toml"]
 
@@ -569,7 +569,7 @@ def test_run_on_a_full_disk():
 
     command("run", "short.toml", "--no-figures", "--out", "before")  # leaves what is compiled
     done = command("run", "short.toml", "--no-figures", preexec_fn=shrink)
-    assert done.returncode == cli.BAD_INPUT
+    assert done.returncode == codes.BAD_INPUT
     assert done.stderr.splitlines()[-1].startswith(
         "error: flights/short/short.nc: cannot be written"
     )
@@ -583,14 +583,14 @@ def test_errors_of_a_flight(capsys, simulate):
         raise FlightError("there is no wind today")
 
     simulate(refuse)
-    assert cli.main(["run", "short.toml", "--quiet"]) == cli.BAD_INPUT
+    assert cli.main(["run", "short.toml", "--quiet"]) == codes.BAD_INPUT
     assert capsys.readouterr().err == "error: there is no wind today\n"
 
 
 def test_bugs_are_not_hidden(capsys, monkeypatch, simulate):
     """An unexpected error is shown as the fault of the program that it is, with its place; all of it to developers."""
     simulate(lambda *_, **__: 1 // 0)
-    assert cli.main(["run", "short.toml", "--quiet"]) == cli.BAD_INPUT
+    assert cli.main(["run", "short.toml", "--quiet"]) == codes.BAD_INPUT
     told = capsys.readouterr().err
     assert told.startswith("error: ZeroDivisionError in test_cli.py, line ")
     assert "a fault of rigidfleet, not of yours" in told
@@ -609,7 +609,7 @@ def test_full_memory_is_no_fault(capsys, simulate):
         raise MemoryError
 
     simulate(grow)
-    assert cli.main(["run", "short.toml", "--quiet"]) == cli.BAD_INPUT
+    assert cli.main(["run", "short.toml", "--quiet"]) == codes.BAD_INPUT
     assert "too little memory" in capsys.readouterr().err
 
 
@@ -618,7 +618,7 @@ def test_first_compile(capsys, monkeypatch):
     words = "Compiling the flight kernel"
     for compiled in (False, True):
         monkeypatch.setattr("rigidfleet.kernel.engine.native.is_compiled", lambda c=compiled: c)
-        assert cli.main(["run", "short.toml", "--no-figures", "--force"]) == cli.PASSED
+        assert cli.main(["run", "short.toml", "--no-figures", "--force"]) == codes.PASSED
         assert (words in capsys.readouterr().err) is not compiled
 
 
@@ -646,7 +646,7 @@ def test_interrupt():
             shown += more
     except OSError:  # the terminal's other end is closed
         pass
-    assert process.returncode == cli.INTERRUPTED
+    assert process.returncode == codes.INTERRUPTED
     assert b" of 1e+08 s  x" in shown
     os.close(terminal)
     assert b"Interrupted: what flew is saved" in shown
@@ -665,7 +665,7 @@ def test_interrupt_of_drawing(capsys, monkeypatch):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("rigidfleet.plotting.plot", draw)
-    assert cli.main(["run", "short.toml"]) == cli.INTERRUPTED
+    assert cli.main(["run", "short.toml"]) == codes.INTERRUPTED
     assert capsys.readouterr().err.startswith("Interrupted: the flight is saved in flights")
     assert Result.load("flights/short/short.nc").complete
 
@@ -682,7 +682,7 @@ def test_interrupt_inside_the_compiler(capsys, simulate):
 
     simulate(compile_for_long)
     before = signal.getsignal(signal.SIGINT)
-    assert cli.main(["run", "short.toml", "--quiet"]) == cli.INTERRUPTED
+    assert cli.main(["run", "short.toml", "--quiet"]) == codes.INTERRUPTED
     assert capsys.readouterr().err == "Interrupted\n"
     assert signal.getsignal(signal.SIGINT) is before
 
@@ -704,7 +704,7 @@ def plot(monkeypatch):
 
 def test_run_draws(capsys, plot):
     """Figures are drawn into a folder of their own, each as PNG and SVG."""
-    assert cli.main(["run", "short.toml"]) == cli.PASSED
+    assert cli.main(["run", "short.toml"]) == codes.PASSED
     found = {p.name for p in Path("flights/short/figures").iterdir()}
     known = figure_names(Result.load("flights/short/short.nc"))
     assert found == {f"{name}.{kind}" for name in known for kind in ("png", "svg")}
@@ -716,21 +716,21 @@ def test_formats_and_titles_of_figures(capsys, plot):
     """--format, repeated, says which files are drawn, --no-titles how; what was drawn before is replaced or kept."""
     figures = Path("flights/short/figures")
     options = ["--format", "pdf", "--format", "svg", "--no-titles"]
-    assert cli.main(["run", "short.toml", *options]) == cli.PASSED
+    assert cli.main(["run", "short.toml", *options]) == codes.PASSED
     known = figure_names(Result.load("flights/short/short.nc"))
     assert {p.name for p in figures.iterdir()} == {
         f"{n}.{k}" for n in known for k in ("pdf", "svg")
     }
     assert {p.read_text(encoding="utf-8") for p in figures.iterdir()} == {"bare"}
     assert f"({2 * len(known)} files)" in capsys.readouterr().out
-    assert cli.main(["run", "short.toml"]) == cli.BAD_INPUT, "the PDFs are files of that flight"
-    assert cli.main(["report", "flights/short/short.nc", "--format", "png"]) == cli.PASSED
+    assert cli.main(["run", "short.toml"]) == codes.BAD_INPUT, "the PDFs are files of that flight"
+    assert cli.main(["report", "flights/short/short.nc", "--format", "png"]) == codes.PASSED
     assert (figures / "cm.png").read_text(encoding="utf-8") == "drawn"
     assert (figures / "cm.svg").read_text(encoding="utf-8") == "bare"
-    assert cli.main(["run", "short.toml", "--force", "--format", "png"]) == cli.PASSED
+    assert cli.main(["run", "short.toml", "--force", "--format", "png"]) == codes.PASSED
     assert {p.suffix for p in figures.iterdir()} == {".png"}
     capsys.readouterr()
-    assert cli.main(["run", "short.toml", "--format", "bmp"]) == cli.BAD_INPUT
+    assert cli.main(["run", "short.toml", "--format", "bmp"]) == codes.BAD_INPUT
     assert '"png", "svg", "pdf"' in capsys.readouterr().err
 
 
@@ -739,7 +739,7 @@ def test_demo(folder):
     """The demonstration passes its verdict, may be repeated, and leaves every figure."""
     for _ in range(2):
         done = command("run", "narrow-passage", "--force")
-        assert done.returncode == cli.PASSED, done.stderr
+        assert done.returncode == codes.PASSED, done.stderr
     figures = folder / "flights" / "narrow-passage" / "figures"
     found = {path.name for path in figures.iterdir() if path.stat().st_size > 10_000}
     known = figure_names(Result.load(figures.parent / "narrow-passage.nc"))
@@ -755,7 +755,7 @@ def test_report(capsys, plot):
     figures = Path("flights/short/figures")
     figures.mkdir()
     write(figures / "cm.svg", "earlier")
-    assert cli.main(["report", "flights/short/short.nc"]) == cli.PASSED
+    assert cli.main(["report", "flights/short/short.nc"]) == codes.PASSED
     out, err = capsys.readouterr()
     assert "Passed" in out
     assert "2 files kept" in err
@@ -775,10 +775,10 @@ def test_report_force(capsys, plot):
     verdict = Path("flights/short/verdict.json")
     text = verdict.read_text(encoding="utf-8")
     write(verdict, "earlier")
-    assert cli.main(["report", "flights/short/short.nc", "--out", "deep/down"]) == cli.PASSED
+    assert cli.main(["report", "flights/short/short.nc", "--out", "deep/down"]) == codes.PASSED
     assert Path("deep/down/verdict.json").read_text(encoding="utf-8") == text
     assert verdict.read_text(encoding="utf-8") == "earlier"
-    assert cli.main(["report", "flights/short/short.nc", "--force"]) == cli.PASSED
+    assert cli.main(["report", "flights/short/short.nc", "--force"]) == codes.PASSED
     assert verdict.read_text(encoding="utf-8") == text
     assert "kept" not in capsys.readouterr().err
 
@@ -787,7 +787,7 @@ def test_report_page(capsys, plot):
     """A report is a page beside the result, which is kept, replaced with --force, and gone with its flight."""
     cli.main(["run", "short.toml", "--no-figures", "--quiet"])
     page = Path("flights/short/report.html")
-    assert cli.main(["report", "flights/short/short.nc", "--no-figures"]) == cli.PASSED
+    assert cli.main(["report", "flights/short/short.nc", "--no-figures"]) == codes.PASSED
     assert f"Report   {page}" in capsys.readouterr().out
     assert "Hold a triangle for a second" in page.read_text(encoding="utf-8")
     assert not Path("flights/short/figures").exists()
@@ -802,17 +802,17 @@ def test_report_page(capsys, plot):
 
 def test_replay(capsys, plot):
     """A replay is a page beside the result, which is kept, replaced with --force, and gone with its flight."""
-    assert cli.main(["run", "short.toml", "--no-figures", "--replay"]) == cli.PASSED
+    assert cli.main(["run", "short.toml", "--no-figures", "--replay"]) == codes.PASSED
     page = Path("flights/short/replay.html")
     assert f"Replay   {page}" in capsys.readouterr().out
     write(page, "earlier")
-    assert cli.main(["replay", "flights/short/short.nc"]) == cli.BAD_INPUT
+    assert cli.main(["replay", "flights/short/short.nc"]) == codes.BAD_INPUT
     assert "exists already and is kept" in capsys.readouterr().err
     assert page.read_text(encoding="utf-8") == "earlier"
-    assert cli.main(["replay", "flights/short/short.nc", "--force"]) == cli.PASSED
+    assert cli.main(["replay", "flights/short/short.nc", "--force"]) == codes.PASSED
     assert capsys.readouterr().out == f"Replay   {page}\n"
     assert "Hold a triangle for a second" in page.read_text(encoding="utf-8")
-    assert cli.main(["replay", "flights/short/short.nc", "--out", "to-send.html"]) == cli.PASSED
+    assert cli.main(["replay", "flights/short/short.nc", "--out", "to-send.html"]) == codes.PASSED
     assert Path("to-send.html").read_bytes() == page.read_bytes()
     cli.main(["run", "short.toml", "--no-figures", "--quiet", "--force"])
     assert not page.exists()
@@ -827,8 +827,8 @@ def test_live(capsys, monkeypatch):
         ready("http://127.0.0.1:1/secret/")
 
     monkeypatch.setattr(import_module("rigidfleet.web.live"), "live", fly)
-    assert cli.main(["live", "short.toml"]) == cli.PASSED
-    assert cli.main(["live", "narrow-passage", "--port", "8000", "--no-browser"]) == cli.PASSED
+    assert cli.main(["live", "short.toml"]) == codes.PASSED
+    assert cli.main(["live", "narrow-passage", "--port", "8000", "--no-browser"]) == codes.PASSED
     assert asked == [("short", 0, True), ("narrow-passage", 8000, False)]
     out = capsys.readouterr().out
     assert "Flying short at http://127.0.0.1:1/secret/\n" in out
@@ -843,17 +843,17 @@ def test_live_needs_slots(capsys):
         'shape = "triangle"\nsize = 4.0\n[[phases]]\n', chain + 'control = "open"\n'
     )
     write("chain.toml", text.replace("blend = 0.5", "blend = 1.0"))
-    assert cli.main(["live", "chain.toml", "--no-browser"]) == cli.BAD_INPUT
+    assert cli.main(["live", "chain.toml", "--no-browser"]) == codes.BAD_INPUT
     assert "no formation has slots" in capsys.readouterr().err
 
 
 def test_report_json_and_quiet(capsys, plot):
     """With --json a report prints the verdict's file and nothing else; with --quiet nothing."""
     cli.main(["run", "short.toml", "--no-figures", "--quiet"])
-    assert cli.main(["report", "flights/short/short.nc", "--json"]) == cli.PASSED
+    assert cli.main(["report", "flights/short/short.nc", "--json"]) == codes.PASSED
     verdict = Path("flights/short/verdict.json").read_text(encoding="utf-8")
     assert capsys.readouterr().out == verdict
-    assert cli.main(["report", "flights/short/short.nc", "--quiet"]) == cli.PASSED
+    assert cli.main(["report", "flights/short/short.nc", "--quiet"]) == codes.PASSED
     assert capsys.readouterr() == ("", "")
 
 
@@ -861,7 +861,7 @@ def test_report_of_a_flight_that_failed(plot):
     """The report of a flight that failed its verdict exits with 1."""
     write("bad.toml", SPEEDING)
     cli.main(["run", "bad.toml", "--no-figures", "--quiet"])
-    assert cli.main(["report", "flights/short/short.nc"]) == cli.FAILED
+    assert cli.main(["report", "flights/short/short.nc"]) == codes.FAILED
 
 
 def test_report_of_several(capsys, plot):
@@ -871,7 +871,7 @@ def test_report_of_several(capsys, plot):
     for name in ("short", "bad"):
         cli.main(["run", f"{name}.toml", "--no-figures", "--quiet", "--out", name])
         results.append(f"{name}/short.nc")
-    assert cli.main(["report", *results]) == cli.FAILED
+    assert cli.main(["report", *results]) == codes.FAILED
     out = capsys.readouterr().out
     labels = [os.path.join(name, "short") for name in ("short", "bad")]
     assert f"{labels[0]}: Passed" in out
@@ -880,11 +880,11 @@ def test_report_of_several(capsys, plot):
     text = Path("comparison.html").read_text(encoding="utf-8")
     assert all(label in text for label in labels)
     assert not list(Path().rglob("report.html"))
-    assert cli.main(["report", *results]) == cli.BAD_INPUT
+    assert cli.main(["report", *results]) == codes.BAD_INPUT
     assert "comparison.html: exists already" in capsys.readouterr().err
-    assert cli.main(["report", *results, "--force", "--json"]) == cli.FAILED
+    assert cli.main(["report", *results, "--force", "--json"]) == codes.FAILED
     assert [verdict["passed"] for verdict in json.loads(capsys.readouterr().out)] == [True, False]
-    assert cli.main(["report", *results, "--out", "side/by/side", "--quiet"]) == cli.FAILED
+    assert cli.main(["report", *results, "--out", "side/by/side", "--quiet"]) == codes.FAILED
     assert Path("side/by/side/comparison.html").exists()
 
 
@@ -914,14 +914,14 @@ def test_output_onto_a_full_disk(arguments):
     """Output that cannot be written is one clear error."""
     with open("/dev/full", "w") as full:
         done = command(*arguments, stdout=full)
-    assert done.returncode == cli.BAD_INPUT
+    assert done.returncode == codes.BAD_INPUT
     assert done.stderr == "error: standard output: No space left on device\n"
 
 
 def test_simple_terminal():
     """Signs that the terminal lacks are replaced, and do not end the program."""
     done = command("check", "narrow-passage", PYTHONIOENCODING="ascii")
-    assert done.returncode == cli.PASSED
+    assert done.returncode == codes.PASSED
     assert "yaw 90?" in done.stdout
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from rigidfleet.cli import app as cli
-from rigidfleet.cli import console
+from rigidfleet.cli import codes, console
 from rigidfleet.errors import ResultError
 from rigidfleet.kernel.compiler import jit
 from rigidfleet.kernel.engine import native
@@ -68,14 +68,14 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.fixture
 def flown() -> bytes:
     """An earlier flight's result, byte by byte."""
-    assert cli.main([*RUN, "--quiet"]) == cli.PASSED
+    assert cli.main([*RUN, "--quiet"]) == codes.PASSED
     return (HOME / "pair.nc").read_bytes()
 
 
 def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
     """The one error that a command prints."""
     capsys.readouterr()
-    assert cli.main(list(arguments)) == cli.BAD_INPUT
+    assert cli.main(list(arguments)) == codes.BAD_INPUT
     err = capsys.readouterr().err
     assert err.startswith("error: ")
     assert err.count("error: ") == 1
@@ -171,7 +171,7 @@ def test_kill_in_the_middle_of_a_write(flown: bytes):
     assert (HOME / half).stat().st_size == pytest.approx(len(flown) / 2, rel=0.2)
     with pytest.raises(ResultError, match="damaged"):
         Result.load(HOME / half)
-    assert cli.main([*RUN, "--quiet"]) == cli.PASSED
+    assert cli.main([*RUN, "--quiet"]) == codes.PASSED
     assert Result.load(HOME / "pair.nc").complete
 
 

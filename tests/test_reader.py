@@ -11,6 +11,7 @@ import pytest
 from sample_flights import swarm
 
 from rigidfleet.cli import app as cli
+from rigidfleet.cli import codes
 from rigidfleet.errors import ResultError
 from rigidfleet.mission import mission_text
 from rigidfleet.result import _ATTRIBUTES, VARIABLES, Result
@@ -190,7 +191,7 @@ def test_a_result_holds_its_own_mission(tmp_path, whole, capsys, text, words):
 
     path = spoiled(whole, tmp_path, change)
     for command in ("report", "replay"):
-        assert cli.main([command, str(path)]) == cli.BAD_INPUT
+        assert cli.main([command, str(path)]) == codes.BAD_INPUT
         told = capsys.readouterr().err
         assert words in told
         assert told.count("error:") == 1

@@ -7,6 +7,7 @@ import pytest
 
 from rigidfleet._renamed import RENAMED, successor
 from rigidfleet.cli import app as cli
+from rigidfleet.cli import codes
 from rigidfleet.errors import MissionError, ResultError, SweepError
 from rigidfleet.mission import Mission, load_mission
 from rigidfleet.sweep import Sweep, store
@@ -56,11 +57,11 @@ def test_old_words_of_sweep_files(tmp_path, line, key, new):
 
 def test_old_options(capsys):
     """Of the command: not a guess at another option, but the new name."""
-    assert cli.main(["sweep", "establish-triangle", "--vary", VARY[0], "--ends"]) == cli.BAD_INPUT
+    assert cli.main(["sweep", "establish-triangle", "--vary", VARY[0], "--ends"]) == codes.BAD_INPUT
     told = " ".join(capsys.readouterr().err.split())
     assert "--ends; it is called '--final-states' now" in told
     assert "--runs" not in told
-    assert cli.main(["design", "cube", "--edges", "tree"]) == cli.BAD_INPUT
+    assert cli.main(["design", "cube", "--edges", "tree"]) == codes.BAD_INPUT
     assert "'henneberg-multilevel' now" in " ".join(capsys.readouterr().err.split())
 
 

@@ -21,7 +21,7 @@ from rich.console import Console
 from scipy import stats
 
 from rigidfleet.cli import app as cli
-from rigidfleet.cli import console
+from rigidfleet.cli import codes, console
 from rigidfleet.errors import ResultError, RigidfleetError, SweepError
 from rigidfleet.mission import Mission
 from rigidfleet.sweep import METRICS, Sweep, Table, fly, load, read
@@ -526,7 +526,7 @@ def test_killed_at_any_moment(workers, tmp_path):
         process.kill()
         assert b"Traceback" not in process.communicate()[1]
     assert kills >= 1
-    assert subprocess.run(command(*asked), check=False).returncode == cli.PASSED
+    assert subprocess.run(command(*asked), check=False).returncode == codes.PASSED
     whole = fly(Sweep.of(MISSION, SCATTER, runs=runs), tmp_path / "whole", workers=1)
     assert numbers(read(tmp_path / "killed")) == numbers(whole)
 
@@ -840,13 +840,15 @@ def folder(tmp_path, monkeypatch) -> Path:
 def test_command(folder, capsys):
     """A line flies a sweep; its folder alone goes on with more runs, and is summed up again."""
     line = ["sweep", "pair.toml", "--vary", SCATTER[1], "--workers", "1"]
-    assert cli.main([*line, "--runs", "4"]) == cli.PASSED
+    assert cli.main([*line, "--runs", "4"]) == codes.PASSED
     out = capsys.readouterr().out
     assert "4 of 4 runs passed" in out
     assert Path("sweeps/pair/figures/outcome.png").exists()
-    assert cli.main([*line[:2], "--vary", SCATTER[0], "--runs", "4"]) == cli.BAD_INPUT
+    assert cli.main([*line[:2], "--vary", SCATTER[0], "--runs", "4"]) == codes.BAD_INPUT
     assert "differs in: variations" in capsys.readouterr().err
-    assert cli.main(["sweep", "sweeps/pair", "--runs", "6", "--no-figures", "--json"]) == cli.PASSED
+    assert (
+        cli.main(["sweep", "sweeps/pair", "--runs", "6", "--no-figures", "--json"]) == codes.PASSED
+    )
     assert json.loads(capsys.readouterr().out)["success"]["of"] == 6
     before = Path("sweeps/pair/sweep.db").read_bytes()
     again = [
@@ -858,15 +860,15 @@ def test_command(folder, capsys):
         "agents.mass.1",
         "agents.mass.2",
     ]
-    assert cli.main([*again, "--metric", "thrust"]) == cli.PASSED
+    assert cli.main([*again, "--metric", "thrust"]) == codes.PASSED
     assert capsys.readouterr() == ("", "")
     assert Path("sweeps/pair/sweep.db").read_bytes() == before
     assert "Median: thrust" in Path("sweeps/pair/figures/map.svg").read_text()
-    assert cli.main(["sweep", "pair.toml", "--summary"]) == cli.BAD_INPUT
+    assert cli.main(["sweep", "pair.toml", "--summary"]) == codes.BAD_INPUT
     assert "holds no sweep" in capsys.readouterr().err
-    assert cli.main(["sweep", "sweeps/pair", "--seed", "3"]) == cli.BAD_INPUT
-    assert cli.main(["sweep", "pair.toml", "--runs", "4"]) == cli.BAD_INPUT
-    assert cli.main([*line, "--workers", "0"]) == cli.BAD_INPUT
+    assert cli.main(["sweep", "sweeps/pair", "--seed", "3"]) == codes.BAD_INPUT
+    assert cli.main(["sweep", "pair.toml", "--runs", "4"]) == codes.BAD_INPUT
+    assert cli.main([*line, "--workers", "0"]) == codes.BAD_INPUT
 
 
 def test_progress_words():
@@ -890,7 +892,7 @@ def test_interrupted(folder):
     until(lambda: count(folder / "sweeps" / "pair") > 0, process)  # ty: ignore[invalid-argument-type]
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=60)
-    assert process.returncode == cli.INTERRUPTED
+    assert process.returncode == codes.INTERRUPTED
     kept = len(read(folder / "sweeps" / "pair").run)
     assert f"{kept} of 5000 runs are kept" in err
     assert "rigidfleet sweep sweeps/pair" in err
@@ -900,7 +902,7 @@ def test_the_example_flies(folder, capsys):
     """The sweep file among the examples flies; only unstable gains are refused."""
     assert (
         cli.main(["sweep", str(EXAMPLE), "--runs", "12", "--workers", "1", "--no-figures"])
-        == cli.PASSED
+        == codes.PASSED
     )
     table = read("sweeps/gain_study")
     alpha, gamma = table.codes[:, 0], table.codes[:, 1]

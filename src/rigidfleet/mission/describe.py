@@ -2,24 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
+from rigidfleet.mission.phases import latest_end
 from rigidfleet.mission.schema import Phase
 
-if TYPE_CHECKING:
-    from rigidfleet.mission.model import Mission
 
-
-def counted(mission: Mission) -> str:
+def counted(agents: int, formations: int, phases: Sequence[Phase]) -> str:
     """How much of everything a mission has: 3 agents, 2 formations, 12 phases, 90 s."""
-    parts = [
-        (mission.n_agents, "agent"),
-        (len(mission.formations), "formation"),
-        (len(mission.phases), "phase"),
-    ]
-    most = "at most " if any(phase.settle for phase in mission.phases) else ""
+    parts = [(agents, "agent"), (formations, "formation"), (len(phases), "phase")]
+    most = "at most " if any(phase.settle for phase in phases) else ""
     words = [f"{n} {thing}{'s' * (n != 1)}" for n, thing in parts]
-    return ", ".join([*words, f"{most}{mission.latest_end:g} s"])
+    return ", ".join([*words, f"{most}{latest_end(phases):g} s"])
 
 
 def goal(phase: Phase) -> str:

@@ -385,6 +385,7 @@ def trajectory(result: Result) -> Figure:
     from rigidfleet.plotting.figure import Figure
 
     fig = Figure(figsize=(10.5, 6.2))
+    fig.settings = st.settings
     st.head(fig, result, "Trajectory")
     view = scene(result)
     draw_space(fig, result, view, (0.0, 0.07, 0.6, 0.87))
@@ -437,6 +438,7 @@ def formations(result: Result) -> Figure:
     columns = min(max(len(names), 1), 3)
     rows = math.ceil(max(len(names), 1) / columns)
     fig = Figure(figsize=(max(3.4 * columns, 6.0), 0.5 + 3.5 * rows))
+    fig.settings = st.settings
     st.head(fig, result, "Formations")
     if not names:
         fig.text(0.5, 0.45, "the mission has no formation", ha="center", color=st.GREY)

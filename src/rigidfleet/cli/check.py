@@ -1,0 +1,99 @@
+"""Before a flight: `check`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+
+from rigidfleet.cli import console
+from rigidfleet.errors import MissionError
+
+if TYPE_CHECKING:
+    from rigidfleet.mission import Mission
+from rigidfleet.cli.codes import BAD_INPUT, FAILED, PASSED
+
+
+def check(
+    mission: str,
+    /,
+    *,
+    realisations: Annotated[bool | None, Parameter(negative="--no-realisations")] = None,
+    figure: Path | None = None,
+    json: bool = False,
+) -> int:
+    """Check whether a mission is right, and what it will meet, without flying it.
+
+    Rigidity of its formations, gains, and the planned way: collisions, thrust, gaps.
+
+    Parameters
+    ----------
+    mission : str
+        A shipped mission or a mission file.
+    realisations : bool
+        Search for other shapes with the same distances, 40 random starts for each formation; if
+        neither is given, for up to 12 agents.
+    figure : Path
+        Draw the graphs to this file, .png, .svg or .pdf: redundant edges dashed, flexes as arrows.
+    json : bool
+        Print what was found as JSON.
+    """
+    from rigidfleet.mission import ending, goal, load_mission
+
+    watch = console.CheckWatch(mission)
+    try:
+        with watch:
+            found = load_mission(mission)
+    except MissionError as error:
+        if not json:
+            raise
+        findings = [
+            {"key": f.key, "value": f.value, "problem": f.problem, "remedy": f.remedy}
+            for f in error.findings
+        ]
+        console.print_json({"mission": mission, "right": False, "findings": findings})
+        return BAD_INPUT
+    from rigidfleet.preflight.check import check as preflight
+
+    with watch:
+        ahead = preflight(found, search=realisations, progress=watch.update)
+    if figure is not None:
+        from rigidfleet.plotting.graph import draw_graphs
+
+        judged = {f.name: f.rigidity for f in ahead.formations}
+        draw_graphs(found, judged, figure)
+    if json:
+        console.print_json({"mission": mission, "right": True} | facts(found) | ahead.data())
+        return PASSED if ahead.passed else FAILED
+    table = console.table("#", "phase", "kind", "to", "ends", "control")
+    for n, phase in enumerate(found.phases, start=1):
+        table.add_row(str(n), phase.name, phase.kind, goal(phase), ending(phase), phase.control)
+    console.out().print(f"{found.name}: right: {found.size_in_words}")
+    console.print_table(table)
+    console.out().print()
+    console.print_words(ahead.describe())
+    if ahead.remarks:
+        console.out().print()
+        console.print_words((remark.level, remark.text) for remark in ahead.remarks)
+    verdict = "nothing found that will fail" if ahead.passed else "it will fail as it is"
+    console.out().print(f"\n{found.name}: {verdict}", style=None if ahead.passed else "bold red")
+    return PASSED if ahead.passed else FAILED
+
+
+def facts(mission: Mission) -> dict[str, object]:
+    """A mission in plain data."""
+    from rigidfleet.mission import ending, goal
+
+    return {
+        "name": mission.name,
+        "title": mission.title,
+        "source": mission.source,
+        "agents": mission.n_agents,
+        "formations": list(mission.formations),
+        "phases": [
+            {"name": p.name, "kind": p.kind, "to": goal(p), "ends": ending(p), "control": p.control}
+            for p in mission.phases
+        ],
+        "latest_end_s": mission.latest_end,
+    }

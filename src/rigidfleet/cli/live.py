@@ -1,0 +1,71 @@
+"""Fly by hand: `live`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+
+from rigidfleet.cli import console
+from rigidfleet.cli.arguments import exact
+from rigidfleet.cli.outputs import Files
+
+if TYPE_CHECKING:
+    from rigidfleet.result import Result
+from rigidfleet.cli.codes import PASSED
+from rigidfleet.cli.run import heeding_interrupts, list_files
+
+
+def live(
+    mission: str,
+    /,
+    *,
+    out: Path | None = None,
+    port: Annotated[int, Parameter(converter=exact)] = 0,
+    no_browser: bool = False,
+) -> int:
+    """Fly a mission's vehicles by hand, in the browser, in real time; each flight is saved when it ends.
+
+    Parameters
+    ----------
+    mission : str
+        A shipped mission or a mission file: its vehicles, formations, gains and obstacles.
+    out : Path
+        Folder for the files: NAME-live.nc and verdict.json; flights/NAME-live if not given. Where it is taken,
+        a number is added, and nothing is replaced.
+    port : int
+        Port on this machine, which alone can reach it; any that is free if not given.
+    no_browser : bool
+        Only print the address.
+    """
+    from rigidfleet.kernel.engine.native import is_compiled
+    from rigidfleet.mission import load_mission
+
+    flown = load_mission(mission)
+    if not is_compiled():
+        console.err().print(console.COMPILING)
+    from rigidfleet._files import write_file
+    from rigidfleet.assessment import assess
+    from rigidfleet.web.live import live as fly
+
+    place = Files(out or Path("flights", f"{flown.name.removesuffix('-live')}-live"), "")
+    place.try_out()
+
+    def landed(result: Result) -> str:
+        files = Files(place.folder, result.mission.name).make_new_folder()
+        result.save(files.result)
+        verdict = assess(result)
+        write_file(files.verdict, (verdict.json() + "\n").encode())
+        console.out().print(verdict)
+        console.out().print()
+        list_files(files)
+        return f"It is saved in {files.result}."
+
+    def ready(url: str) -> None:
+        console.out().print(f"Flying {flown.name} at {url}", soft_wrap=True)
+        console.err().print("Ctrl-C ends the flight, and so does closing its page")
+
+    with heeding_interrupts():
+        fly(flown, port=port, browser=not no_browser, ready=ready, landed=landed)
+    return PASSED

@@ -1,0 +1,148 @@
+"""After a flight: `report` and `replay`."""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rigidfleet.cli import console
+from rigidfleet.cli.outputs import Files, taken
+
+if TYPE_CHECKING:
+    from rigidfleet.assessment import Verdict
+    from rigidfleet.result import Result
+from rigidfleet.cli.codes import FAILED, PASSED
+from rigidfleet.cli.run import Format, draw, list_files, of_formats, write_replay
+
+
+def report(
+    result: Path,
+    /,
+    *others: Path,
+    out: Path | None = None,
+    force: bool = False,
+    no_figures: bool = False,
+    format: list[Format] | None = None,
+    no_titles: bool = False,
+    json: bool = False,
+    quiet: bool = False,
+) -> int:
+    """Judge and draw a flight again, and write a report to print and to send.
+
+    Of several flights, write one report that shows them side by side: comparison.html.
+
+    Parameters
+    ----------
+    result : Path
+        Result of a flight, NAME.nc.
+    others : Path
+        Results of more flights, to be compared with it.
+    out : Path
+        Folder for report.html, verdict.json and figures/; that of the result if not given. For
+        comparison.html, the working folder.
+    force : bool
+        Replace files that are there already; without it they are kept.
+    no_figures : bool
+        Write no files of figures; those in the report are drawn in any case.
+    format : list
+        Format of these files, png and svg if not given; may be repeated: --format pdf --format png.
+    no_titles : bool
+        Draw these files without titles, for a paper with captions.
+    json : bool
+        Print the verdict as JSON; of several flights a list of them.
+    quiet : bool
+        Print nothing but errors, and the JSON if asked for.
+    """
+    from rigidfleet._files import write_file
+    from rigidfleet.assessment import assess
+    from rigidfleet.result import Result
+
+    paths = [result, *others]
+    records = [Result.load(path) for path in paths]
+    if others:
+        page = (out or Path()) / "comparison.html"
+        if page.exists() and not force:
+            raise taken(page)
+    files = Files(out or (Path() if others else result.parent), records[0].mission.name)
+    files.try_out()
+    verdicts = [assess(record) for record in records]
+    if json:
+        found = [verdict.to_dict() for verdict in verdicts]
+        console.print_json(found if others else found[0])
+    files.make_folder()
+    if others:
+        labels = labels_of(paths, records)
+        if not (json or quiet):
+            for label, verdict in zip(labels, verdicts, strict=True):
+                console.out().print(f"{label}: {verdict.summary}", soft_wrap=True)
+        write_report(records, verdicts, page, labels=labels, quiet=quiet)
+        if not (json or quiet):
+            console.out().print(f"\nReport   {page}", soft_wrap=True)
+    else:
+        if not (json or quiet):
+            console.out().print(verdicts[0])
+        drawn = [] if no_figures else of_formats(files.figures, format)
+        made = [files.verdict, files.report, *drawn]
+        kept = [] if force else [path for path in made if path.exists()]
+        if files.verdict not in kept:
+            write_file(files.verdict, (verdicts[0].json() + "\n").encode())
+        left = [path for path in drawn if path not in kept]
+        draw(records[0], left, format, titles=not no_titles, quiet=quiet)
+        if files.report not in kept:
+            write_report(records, verdicts, files.report, quiet=quiet)
+        if not (json or quiet):
+            console.out().print()
+            list_files(files)
+        if kept and not quiet:
+            console.err().print(
+                f"{console.count(len(kept), 'file')} kept as before; --force makes them again"
+            )
+    return PASSED if all(verdict.passed for verdict in verdicts) else FAILED
+
+
+def replay(result: Path, /, *, out: Path | None = None, force: bool = False) -> int:
+    """Write a flight as a page to be watched in a browser, and to be sent: it needs no network.
+
+    Parameters
+    ----------
+    result : Path
+        Result of a flight, NAME.nc.
+    out : Path
+        The page; replay.html beside the result if not given.
+    force : bool
+        Replace a page that is there already.
+    """
+    from rigidfleet.result import Result
+
+    record = Result.load(result)
+    page = out or Files(result.parent, record.mission.name).replay
+    if page.exists() and not force:
+        raise taken(page)
+    write_replay(record, page)
+    console.out().print(f"Replay   {page}", soft_wrap=True)
+    return PASSED
+
+
+def write_report(
+    records: list[Result],
+    verdicts: list[Verdict],
+    path: Path,
+    *,
+    labels: list[str] | None = None,
+    quiet: bool = False,
+) -> None:
+    """Write the page of a flight, or of several."""
+    from rigidfleet.reporting import report as write
+
+    shown = console.err().is_interactive and not quiet
+    with console.err().status("Writing the report") if shown else nullcontext():
+        write(records, path, labels=labels, verdicts=verdicts)
+
+
+def labels_of(paths: list[Path], records: list[Result]) -> list[str]:
+    """What to call each of several flights: what tells them apart, and is short."""
+    missions = [record.mission.name for record in records]
+    stems = [path.stem for path in paths]
+    folders = [str(path.parent / path.stem) for path in paths]
+    return next((names for names in (missions, stems) if len({*names}) == len(names)), folders)

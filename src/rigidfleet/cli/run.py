@@ -1,0 +1,231 @@
+"""Fly a mission, and what is said about missions: `run` and `missions`."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Generator, Iterable
+from contextlib import contextmanager, nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from cyclopts import Parameter
+
+from rigidfleet.cli import console
+from rigidfleet.cli.outputs import Files
+from rigidfleet.errors import RigidfleetError
+
+if TYPE_CHECKING:
+    from rigidfleet.mission import Mission
+    from rigidfleet.result import Result
+from rigidfleet.cli.codes import FAILED, INTERRUPTED, PASSED
+
+#: A format of figures, and those drawn unless others are asked for.
+Format = Literal["png", "svg", "pdf"]
+
+
+DRAWN: tuple[Format, ...] = ("png", "svg")
+
+
+def run(
+    mission: str,
+    /,
+    *,
+    out: Path | None = None,
+    force: bool = False,
+    no_figures: bool = False,
+    format: list[Format] | None = None,
+    no_titles: bool = False,
+    replay: bool = False,
+    csv: bool = False,
+    json: bool = False,
+    quiet: bool = False,
+) -> int:
+    """Fly a mission: simulate it, judge it, draw it.
+
+    Parameters
+    ----------
+    mission : str
+        A shipped mission (see "rigidfleet missions") or a mission file.
+    out : Path
+        Folder for the files: NAME.nc, verdict.json and figures/; flights/NAME if not given.
+    force : bool
+        Replace the files of an earlier flight; without it they are kept and nothing is flown.
+    no_figures : bool
+        Draw no figures; "rigidfleet report" can do so later.
+    format : list
+        Format of the figures, png and svg if not given; may be repeated: --format pdf --format png.
+    no_titles : bool
+        Draw figures without titles, for a paper with captions.
+    replay : bool
+        Also write replay.html: the flight to be watched in a browser.
+    csv : bool
+        Also write NAME.csv: time, position, velocity and yaw of each agent.
+    json : bool
+        Print the verdict as JSON.
+    quiet : bool
+        Print nothing but errors, and the JSON if asked for.
+    """
+    from rigidfleet.mission import load_mission
+
+    flown = load_mission(mission)
+    files = Files(out or Path("flights", flown.name), flown.name)
+    files.claim(replace=force)
+    watch = None if quiet else console.FlightWatch()
+    with watch or nullcontext():
+        result, interrupted = fly(flown, watch)
+
+    from rigidfleet._files import write_file
+    from rigidfleet.assessment import assess
+
+    files.make_folder()
+    result.save(files.result)
+    files.forget()
+    if csv:
+        result.to_csv(files.table)
+    verdict = assess(result)
+    write_file(files.verdict, (verdict.json() + "\n").encode())
+    if json:
+        console.print_exactly(verdict.json() + "\n")
+    elif not quiet:
+        console.out().print(verdict)
+    what = "what flew is saved, marked incomplete," if interrupted else "the flight is saved"
+    if not interrupted:
+        try:
+            if replay:
+                write_replay(result, files.replay)
+            if not no_figures:
+                draw(result, files.figures, format, titles=not no_titles, quiet=quiet)
+        except KeyboardInterrupt:
+            interrupted = True
+    if not (json or quiet):
+        console.out().print()
+        list_files(files)
+    if interrupted:
+        console.err().print(
+            f"Interrupted: {what} in {files.result}", style="yellow", soft_wrap=True
+        )
+        return INTERRUPTED
+    return PASSED if verdict.passed else FAILED
+
+
+def missions(
+    *, print_: Annotated[str, Parameter(name="--print")] = "", schema: bool = False
+) -> int:
+    """List the missions that ship with the program.
+
+    Parameters
+    ----------
+    print_ : str
+        Print the file of this mission instead, to be copied and changed.
+    schema : bool
+        Print the JSON schema of mission files instead, for editors.
+    """
+    from rigidfleet.mission import json_schema, mission_names, mission_text
+
+    if print_ and schema:
+        raise RigidfleetError("--print and --schema exclude each other. Give one of them.")
+    if print_:
+        console.print_exactly(mission_text(print_))
+    elif schema:
+        console.print_json(json_schema())
+    else:
+        import tomllib
+
+        table = console.table("mission", "what it shows", "in the paper")
+        for name in mission_names():
+            head = tomllib.loads(mission_text(name))
+            table.add_row(name, head.get("title", ""), head.get("source", ""))
+        console.print_table(table)
+    return PASSED
+
+
+def fly(mission: Mission, watch: console.FlightWatch | None) -> tuple[Result, bool]:
+    """Result of a mission, and whether the flight was interrupted."""
+    from rigidfleet.kernel.engine.native import is_compiled
+
+    if watch is not None and not is_compiled():
+        watch.compiling()
+    from rigidfleet.simulation.flight import FlightInterrupted, simulate
+
+    try:
+        with heeding_interrupts():
+            return simulate(mission, progress=None if watch is None else watch.update), False
+    except FlightInterrupted as stop:
+        return stop.result, True
+
+
+@contextmanager
+def heeding_interrupts() -> Generator[None]:
+    """Ctrl-C inside the compiler may come out of it as any error: make it Ctrl-C again."""
+    interrupted = False
+
+    def note(*_: object) -> None:
+        nonlocal interrupted
+        interrupted = True
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGINT, note)
+    try:
+        yield
+    except Exception:
+        if interrupted:
+            raise KeyboardInterrupt from None
+        raise
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def of_formats(figures: Iterable[Path], formats: Iterable[Format] | None) -> list[Path]:
+    """Those of the figures' files that are of the formats asked for."""
+    kinds = {f".{kind}" for kind in formats or DRAWN}
+    return [path for path in figures if path.suffix in kinds]
+
+
+def draw(
+    result: Result,
+    figures: Iterable[Path],
+    kinds: Iterable[Format] | None,
+    *,
+    titles: bool,
+    quiet: bool = False,
+) -> None:
+    """Draw figures, each to the file of its name, of which the flight has something to show."""
+    from rigidfleet.plotting import figure_names, plot
+
+    names = figure_names(result)
+    formats: dict[Path, list[str]] = {}
+    for path in of_formats(figures, kinds):
+        if path.stem not in names:
+            continue
+        formats.setdefault(path.with_suffix(""), []).append(path.suffix[1:])
+    shown = console.err().is_interactive and not quiet
+    with console.err().status("Drawing the figures") if shown else nullcontext() as status:
+        for n, (path, wanted) in enumerate(formats.items(), start=1):
+            if status is not None:
+                status.update(f"Drawing figure {n} of {len(formats)}: {path.name}")
+            plot(result, path.parent, names=[path.name], formats=wanted, titles=titles)
+
+
+def write_replay(result: Result, path: Path) -> None:
+    """Write the page that plays a flight."""
+    from rigidfleet.web.replay import replay as write
+
+    write(result, path)
+
+
+def list_files(files: Files) -> None:
+    """Print where the files of a flight are."""
+    for what, path in (
+        ("Result", files.result),
+        ("Verdict", files.verdict),
+        ("Table", files.table),
+        ("Report", files.report),
+        ("Replay", files.replay),
+    ):
+        if path.exists():
+            console.out().print(f"{what:8} {path}", soft_wrap=True)
+    drawn = [path for path in files.figures if path.exists()]
+    if drawn:
+        text = f"Figures  {drawn[0].parent}{os.sep} ({console.count(len(drawn), 'file')})"
+        console.out().print(text, soft_wrap=True)

@@ -1,0 +1,190 @@
+"""Fly a mission many times: `sweep`."""
+
+from __future__ import annotations
+
+import os
+from contextlib import nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from cyclopts import Parameter
+
+from rigidfleet.cli import console
+from rigidfleet.cli.arguments import exact
+from rigidfleet.errors import RigidfleetError
+
+if TYPE_CHECKING:
+    from rigidfleet.sweep import Sweep
+from rigidfleet.cli.codes import INTERRUPTED, PASSED
+from rigidfleet.cli.run import DRAWN, Format, heeding_interrupts
+
+
+def sweep(
+    mission: str,
+    /,
+    *,
+    vary: list[str] | None = None,
+    runs: Annotated[int | None, Parameter(converter=exact)] = None,
+    seed: Annotated[int | None, Parameter(converter=exact)] = None,
+    out: Path | None = None,
+    force: bool = False,
+    final_states: bool = False,
+    workers: Annotated[int | None, Parameter(converter=exact)] = None,
+    cluster: str | None = None,
+    summary: bool = False,
+    map_: Annotated[tuple[str, str] | None, Parameter(name="--map")] = None,
+    metric: str = "",
+    no_figures: bool = False,
+    format: list[Format] | None = None,
+    no_titles: bool = False,
+    json: bool = False,
+    quiet: bool = False,
+) -> int:
+    """Fly a mission many times, varied: how many flights pass, and what makes others fail.
+
+    Stopped at any moment, even by kill -9, the same command goes on where it was.
+
+    Parameters
+    ----------
+    mission : str
+        A mission, a sweep file, or the folder of a sweep, to go on with it.
+    vary : str
+        What varies: "PATH = KIND(NUMBERS)", with += to add to and *= to scale what the mission has; may be
+        repeated. KIND is normal, uniform, log-uniform, choice, grid, linspace or geomspace.
+    runs : int
+        Number of runs; one for each point of the grid if not given. More may be added later.
+    seed : int
+        Seed of the random numbers, 0 if not given.
+    out : Path
+        Folder for sweep.db, summary.json and figures/; sweeps/NAME if not given.
+    force : bool
+        Replace another sweep in that folder; without it, it is kept and nothing is flown.
+    final_states : bool
+        Evaluate where phases end alone: open-loop missions whose starts vary then fly by the thousand in a second.
+    workers : int
+        Processes on this machine; as many as it has cores if not given.
+    cluster : str
+        Address of a Dask scheduler, whose workers fly instead.
+    summary : bool
+        Fly nothing; sum up and draw again the sweep of a folder.
+    map_ : str
+        The two paths that the map is drawn over.
+    metric : str
+        What the map shows: success or a metric.
+    no_figures : bool
+        Draw no figures.
+    format : list
+        Format of the figures, png and svg if not given; may be repeated: --format pdf --format png.
+    no_titles : bool
+        Draw figures without titles, for a paper with captions.
+    json : bool
+        Print the summary as JSON.
+    quiet : bool
+        Print nothing but errors, and the JSON if asked for.
+    """
+    from rigidfleet.sweep import store
+    from rigidfleet.sweep.summary import summarise
+
+    if workers is not None and workers < 1:
+        raise RigidfleetError(f"--workers = {workers}: must be at least 1.")
+    if summary:
+        folder = Path(mission)
+        table = store.read(folder)
+    else:
+        asked, folder = _asked(mission, vary or [], runs, seed, out, final_states=final_states)
+        watch = None if quiet else console.SweepWatch()
+        try:
+            with watch or nullcontext(), heeding_interrupts():
+                table = _fly_sweep(asked, folder, workers, cluster, force, watch)
+        except KeyboardInterrupt:
+            done = len(store.read(folder).run) if store.is_store(folder) else 0
+            words = f"Interrupted: {done} of {asked.runs} runs are kept in {folder}"
+            again = f"Go on by: rigidfleet sweep {folder}"
+            console.err().print(f"{words}\n{again}", style="yellow", soft_wrap=True)
+            return INTERRUPTED
+    found = summarise(table)
+    from rigidfleet._files import write_file
+
+    write_file(folder / "summary.json", (found.json() + "\n").encode())
+    if json:
+        console.print_exactly(found.json() + "\n")
+    elif not quiet:
+        console.print_table(found)
+    drawn: list[Path] = []
+    if not no_figures:
+        from rigidfleet.sweep.figures import plot
+
+        shown = console.err().is_interactive and not quiet
+        with console.err().status("Drawing the figures") if shown else nullcontext():
+            drawn = plot(
+                table, folder / "figures", formats=format or DRAWN, over=map_ or (), metric=metric,
+                titles=not no_titles,
+            )  # fmt: skip
+    if not (json or quiet):
+        console.out().print(f"\nRuns     {folder / store.FILE}", soft_wrap=True)
+        console.out().print(f"Summary  {folder / 'summary.json'}", soft_wrap=True)
+        if drawn:
+            text = f"Figures  {drawn[0].parent}{os.sep} ({console.count(len(drawn), 'file')})"
+            console.out().print(text, soft_wrap=True)
+    return PASSED
+
+
+def _asked(
+    what: str,
+    vary: list[str],
+    runs: int | None,
+    seed: int | None,
+    out: Path | None,
+    *,
+    final_states: bool,
+) -> tuple[Sweep, Path]:
+    """The sweep that is asked for, and its folder."""
+    from rigidfleet.mission import mission_names
+    from rigidfleet.sweep import Sweep, store
+    from rigidfleet.sweep.definition import is_sweep_file
+
+    if store.is_store(Path(what)):
+        if vary or seed is not None or out is not None or final_states:
+            raise RigidfleetError(
+                f"{what}: is a sweep already, and goes on as it is. Remove --vary, --seed, --final-states and --out."
+            )
+        found = store.read_sweep(Path(what))
+        found.runs = runs or found.runs
+        return found, Path(what)
+    evaluate: Literal["final"] | None = "final" if final_states else None
+    if what not in mission_names() and is_sweep_file(what):
+        found = Sweep.load(what, more=vary, runs=runs, seed=seed, evaluate=evaluate)
+    else:
+        found = Sweep.of(
+            what,
+            vary,
+            runs=runs,
+            seed=seed or 0,
+            evaluate=evaluate or "flight",
+            origin="rigidfleet sweep",
+        )
+    return found, out or Path("sweeps", found.name)
+
+
+def _fly_sweep(
+    asked: Sweep,
+    folder: Path,
+    workers: int | None,
+    cluster: str | None,
+    force: bool,
+    watch: console.SweepWatch | None,
+) -> Any:
+    """Fly a sweep; returns the table of its rows."""
+    from rigidfleet.kernel.engine.native import is_compiled
+    from rigidfleet.sweep import fly
+
+    if watch is not None and not is_compiled():
+        watch.compiling()
+    return fly(
+        asked,
+        folder,
+        workers=workers,
+        cluster=cluster,
+        replace=force,
+        progress=None if watch is None else watch.update,
+    )
