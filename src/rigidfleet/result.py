@@ -123,9 +123,9 @@ class PhaseRecord:
     formation : name of the formation held or approached, None if there is none yet
     t_start, t_end : mission time [s]
     settled : for a phase that ends by settling: whether it did; None for one that ends at a time
-    target : for fly and turn, and for an establishment in an attitude that is not free: {"time" [s], "position" [m],
-        "velocity" [m/s], "attitude" quaternion, "rates" [rad/s]},
-        each but the time None where nothing is asked
+    target : for phases that lead to a goal of their own, and for an establishment in an attitude that is not free:
+        {"time" [s], "position" [m], "velocity" [m/s], "attitude" quaternion, "rates" [rad/s]}, each but the time None
+        where nothing is asked
     extremes : worst values of the phase in continuous time, by name: separation, clearance, separation_below, lost (a
         lost vehicle to one that is left), geofence (beyond it), lowest, highest [m]; speed [m/s]; acceleration [m/s^2];
         thrust, thrust_margin (thrust less its limit), constraint_force, tension [N]; constraint [m]. In the phases
@@ -135,7 +135,7 @@ class PhaseRecord:
     """
 
     name: str
-    kind: Literal["establish", "fly", "reshape", "turn", "hold"]
+    kind: str
     control: Literal["open", "tracking", "body"]
     formation: str | None
     t_start: float
@@ -406,6 +406,8 @@ class Result:
 
     def _foreign(self, mission: Mission) -> str:
         """What of the arrays is not of a mission; "" if nothing is."""
+        from rigidfleet.mission import KINDS
+
         if mission.n_agents != self.n_agents:
             return f"it has {mission.n_agents} agents, the arrays have {self.n_agents}"
         if not np.array_equal(mission.edges, self.edges):
@@ -418,6 +420,8 @@ class Result:
             obstacles
         ):
             return "it has fewer obstacles than the arrays name"
+        if unknown := {p.kind for p in self.phases} - {*KINDS}:
+            return f"there are no phases of kind {min(map(repr, unknown))}"
         unknown = {p.formation for p in self.phases} - {None, *mission.formations}
         return f"it has no formation {min(map(repr, unknown))}" if unknown else ""
 

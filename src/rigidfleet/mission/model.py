@@ -28,9 +28,7 @@ from rigidfleet.mission.schema import (
     Contents,
     Establish,
     Phase,
-    Reshape,
     Start,
-    Steering,
 )
 from rigidfleet.typing import Bools, Floats, Ints
 
@@ -178,36 +176,39 @@ class Mission(Contents):
         places = self.fleet.position @ self.drawn_attitude.T
         flown: set[str] = set()
         for p in self.phases:
-            if isinstance(p, Steering) and (angles := p.attitude_deg) is not None:
+            if p.moves and (angles := p.attitude_deg) is not None:
                 lies = asked = dcm_from_euler(np.deg2rad(angles))
-            if not isinstance(p, Establish | Reshape):
+            if p.turns_away:
+                lies = asked = None
+            if (shaping := p.shaping) is None:
                 continue
+            name = shaping.formation
             axes: Floats | None = np.eye(3)  # of this formation, in those of the one before
             if self.free_attitude(p):
                 axes = lies = None
                 asked = None if p.control == "tracking" else asked
-            elif isinstance(p, Establish):
-                asked = self.establish_attitude(p, asked)
+            elif (establishing := p.establishing) is not None:
+                asked = self.establish_attitude(establishing, asked)
                 axes = None if lies is None else lies @ asked.T
                 lies = asked
-            slots = self._slots(p.formation)
+            slots = self._slots(name)
             if slots is None:
                 known = False
-            elif p.formation not in flown:
+            elif name not in flown:
                 radius = self.agents.radius if self.assignment == "safe" else None
                 order, turn = assigned(places, slots, turn=axes, radius=radius)
                 if self.assignment != "each":
-                    return dict.fromkeys(self.formations, order), {(before, p.formation): turn}
-                orders[p.formation] = order
+                    return dict.fromkeys(self.formations, order), {(before, name): turn}
+                orders[name] = order
                 if known:
-                    turns.setdefault((before, p.formation), turn)
-                    turns.setdefault((p.formation, before), turn.T)  # as long as the way there
+                    turns.setdefault((before, name), turn)
+                    turns.setdefault((name, before), turn.T)  # as long as the way there
             if slots is not None:
-                places, known = slots[orders[p.formation]], True
+                places, known = slots[orders[name]], True
             if self.assignment != "each":
                 break
-            flown.add(p.formation)
-            before = p.formation
+            flown.add(name)
+            before = name
         return orders, turns
 
     @cached_property
@@ -236,11 +237,12 @@ class Mission(Contents):
         Forces between agents do not. Slots do, unless the phase asks for that by name, or what is established is given
         by distances alone, which have no axes.
         """
-        if phase.control != "tracking" or not isinstance(phase, Establish):
+        taken = phase.establishing
+        if phase.control != "tracking" or taken is None:
             return phase.control != "tracking"
-        if phase.attitude_deg is not None:
+        if taken.attitude_deg is not None:
             return False
-        return phase.attitude == "free" or not self.formations[phase.formation].knows_slots
+        return taken.attitude == "free" or not self.formations[taken.formation].knows_slots
 
     def _slots(self, name: str) -> Floats | None:
         """Slots (N, 3) [m] of a formation in their own order; made once."""

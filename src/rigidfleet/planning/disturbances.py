@@ -12,7 +12,7 @@ import numpy as np
 
 from rigidfleet.kernel.problem import Disturbance, Problem, graph, no_disturbance
 from rigidfleet.math import turbulence
-from rigidfleet.mission import Establish, Gusts, Mission
+from rigidfleet.mission import Gusts, Mission
 from rigidfleet.mission.disturbances import gust_step, intensity
 from rigidfleet.typing import Bools, Floats
 
@@ -93,7 +93,7 @@ def _wind_axes(wind: Floats) -> Floats:
 
 def _places(mission: Mission) -> Floats:
     """Where agents are to each other (N, 3) [m]: in the first formation established, or else at the start."""
-    names = (p.formation for p in mission.phases if isinstance(p, Establish))
+    names = (p.establishing.formation for p in mission.phases if p.establishing is not None)
     slots = next((s for s in map(mission.formation_slots, names) if s is not None), None)
     return mission.fleet.position.copy() if slots is None else slots
 

@@ -101,7 +101,7 @@ def _waypoints(result: Result) -> list[tuple[str, Floats]]:
     found: dict[tuple[float, ...], str] = {}
     for phase in result.phases:
         target = phase.target or {}
-        if target.get("position") is not None and phase.kind == "fly":
+        if target.get("position") is not None:
             place = tuple(np.round(np.asarray(target["position"], dtype=float), 6).tolist())
             found.setdefault(place, st.clean(phase.name.split(":")[0], 12))
     return [(name, np.array(place)) for place, name in found.items()]

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from rigidfleet.formation import assignment
-from rigidfleet.mission import Establish, Mission
+from rigidfleet.mission import Mission
 from rigidfleet.planning.preview import preview
 from rigidfleet.preflight.findings import Assignment, Preflight, Remark
 
@@ -24,7 +24,7 @@ _COMPARED = 200
 
 def assignment_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     """Whether other agents in the slots of the first formation would be better off."""
-    first = next((p for p in mission.phases if isinstance(p, Establish)), None)
+    first = next((p.establishing for p in mission.phases if p.establishing is not None), None)
     slots = mission.formation_slots(first.formation) if first is not None else None
     if first is None or slots is None or not 2 <= mission.n_agents <= _COMPARED:
         return

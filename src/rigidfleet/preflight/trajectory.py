@@ -9,7 +9,7 @@ import numpy as np
 
 from rigidfleet.formation import assignment, distance_geometry
 from rigidfleet.math import lqr, proximity
-from rigidfleet.mission import Box, Establish, Ground, Mission, Reshape
+from rigidfleet.mission import Box, Ground, Mission
 from rigidfleet.mission.disturbances import intensity
 from rigidfleet.planning.preview import PlannedPhase, septic
 from rigidfleet.preflight.findings import DENSE, SLACK, Disturbed, Preflight, Remark, agents, some
@@ -81,7 +81,8 @@ def _near(
 
 def _time_of(mission: Mission, planned: PlannedPhase, number: int, share: float) -> float:
     """When [s] agents have gone this share of their ways."""
-    blend = getattr(mission.phases[number], "blend", 0.0)
+    shaping = mission.phases[number].shaping
+    blend = 0.0 if shaping is None else shaping.blend
     tau = np.linspace(0.0, 1.0, 2001)
     return float(planned.time[0] + blend * np.interp(share, septic(tau), tau))
 
@@ -104,7 +105,7 @@ def _crossing(
     assert after is not None  # something is shaped
     assert planned.ways is not None
     apart = min(float(proximity.nearest(places).min()) for places in planned.ways)
-    flown = [p.formation for p in mission.phases[:number] if isinstance(p, Establish | Reshape)]
+    flown = [p.shaping.formation for p in mission.phases[:number] if p.shaping is not None]
     spaced = f"keep slots {math.sqrt(2) * needed:.2f} m apart or more (here {apart:.2f} m)"
     promised = mission.assigned_turn(before, after) is not None
     if promised:
@@ -226,12 +227,15 @@ def _step_thrust(mission: Mission, found: Preflight) -> Iterator[Remark]:
         *(planned.position[-1] for planned in found.planned_phases),
     ]
     for phase, r in zip(mission.phases, starts, strict=False):
-        if not (isinstance(phase, Establish | Reshape) and phase.reference == "step"):
+        shaping = phase.shaping
+        if shaping is None or shaping.reference != "step":
             continue
-        edges = mission.formation_edges(phase.formation)
+        edges = mission.formation_edges(shaping.formation)
         if min(len(edges), 3 * mission.n_agents) > DENSE:
             continue
-        error = distance_geometry.distances(r, edges) - mission.formation_distances(phase.formation)
+        error = distance_geometry.distances(r, edges) - mission.formation_distances(
+            shaping.formation
+        )
         J = jacobian(r, edges)
         root = np.repeat(1 / np.sqrt(masses), 3)
         f = np.linalg.lstsq(J * root, -(c.beta**2) * error, rcond=1e-7)[0] / root
@@ -240,8 +244,8 @@ def _step_thrust(mission: Mission, found: Preflight) -> Iterator[Remark]:
         i = int((need - np.where(np.isfinite(limits), limits, 0.0)).argmax())
         if need[i] > limits[i]:
             text = (
-                f"the step to '{phase.formation}' in '{phase.name}' asks agent {i + 1} for {need[i]:.0f} N, and it has"
-                f" {limits[i]:g} N. Blend: reference = 'shape' or 'distances'"
+                f"the step to '{shaping.formation}' in '{phase.name}' asks agent {i + 1} for {need[i]:.0f} N, and it"
+                f" has {limits[i]:g} N. Blend: reference = 'shape' or 'distances'"
             )
             yield Remark("fails" if c.solver in ("exact", "pinv") else "note", "thrust", text)
 
