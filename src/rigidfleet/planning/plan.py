@@ -18,16 +18,11 @@ from rigidfleet.formation import distance_geometry, graphs
 from rigidfleet.kernel.problem import (
     BODY,
     CONSTANT,
-    EXACT,
-    ITERATED,
     OPEN,
-    PINV,
-    PINV_EQUAL,
-    PINV_INERTIA,
-    PINV_INERTIA_FORCE,
     RIGID,
     SHAPE,
-    SPECTRAL,
+    SOLVERS,
+    SPLITS,
     SQUARED,
     TRACKING,
     ConstraintLaw,
@@ -63,11 +58,9 @@ from rigidfleet.planning.reference import (
 from rigidfleet.planning.tolerances import absolute_tolerances, tolerance_of_velocity
 from rigidfleet.typing import Bools, Floats, Ints
 
-_SOLVERS = {"iterated": ITERATED, "spectral": SPECTRAL, "exact": EXACT, "pinv": PINV}
 _KINDS = {"shape": SHAPE, "squares": SQUARED, "step": CONSTANT}
 #: A formation is held from where all pairs are right within this part of the shortest distance.
 _NEAR = 0.1
-_SPLITS = {"equal": PINV_EQUAL, "inertia": PINV_INERTIA, "inertia+force": PINV_INERTIA_FORCE}
 
 
 #: Residual of an iterative solve, as a share of the integrator's tolerance; the relative one within bounds.
@@ -343,7 +336,7 @@ def _law(mission: Mission, mu: float, *, damped: bool) -> ConstraintLaw:
         alpha=c.alpha if pid else 0.0,
         beta=c.beta if pid else 0.0,
         gamma=c.gamma if pid else 0.0,
-        solver=_SOLVERS[c.solver],
+        solver=SOLVERS[c.solver],
         mu=mu,
         iterations=c.iterations,
         s0=c.threshold,
@@ -358,7 +351,7 @@ def _control(mission: Mission, phase: Phase, masses: Floats) -> Control:
     force[:, 2] += masses * mission.gravity
     k1, k2 = lqr.double_integrator_gains(mission.tracking.Q, mission.tracking.R)
     allocation = mission.allocation
-    method = RIGID if allocation.method == "rigid" else _SPLITS[allocation.torque_split]
+    method = RIGID if allocation.method == "rigid" else SPLITS[allocation.torque_split]
     return Control(kind, force, k1, k2, method)
 
 
