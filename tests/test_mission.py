@@ -669,7 +669,7 @@ def test_drag_defaults_where_air_moves():
         (
             [("formations/triangle/distances", [4, 4, 4.1])],
             "formations.triangle.distances[3]",
-            "slots of agents 2, 3 are 4 m apart",
+            "slots of agents 2 and 3 are 4 m apart",
         ),
         (
             [("phases/0/reference", "step"), ("phases/0/blend", 2.0)],
@@ -710,7 +710,7 @@ def test_tetrahedra_are_judged():
     square["formations"]["square"] = {"distances": [4, d, 4, 4, d, 4]}
     assert Mission.from_dict(square).formation_slots("square") is not None
     (finding,) = findings(("formations/square/distances", [4, d, 4, 4, d + 0.1, 4]), base=square)
-    assert "agents 1, 2, 3, 4 make no tetrahedron (Cayley-Menger < 0)" in finding.problem
+    assert "agents 1, 2, 3 and 4 make no tetrahedron (Cayley-Menger < 0)" in finding.problem
     assert "d24 = 5.75685" in finding.problem
 
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from itertools import islice
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rigidfleet._text import agent_names
 from rigidfleet.formation import distance_geometry, graphs, shapes
 from rigidfleet.math import proximity
 from rigidfleet.mission import bounds
@@ -62,11 +63,6 @@ def coincident(points: ArrayLike) -> list[tuple[int, int]]:
 def most_edges(n: int) -> int:
     """Edges that a formation of n agents may have."""
     return max(bounds.EDGES, bounds.EDGES_EACH * n)
-
-
-def agents(indices: Iterable[int], between: str = ", ") -> str:
-    """Agents counted from 1."""
-    return between.join(str(int(i) + 1) for i in indices)
 
 
 def _formation(notes: FindingCollector, form: Formation, n: int | None, path: Keys) -> None:
@@ -177,18 +173,18 @@ def _distances(
     degree = np.bincount(edges.ravel(), minlength=n)
     cliques = (degree[edges].min(axis=1, initial=n).astype(float) ** 2).sum()
     found = distance_geometry.unrealisable(edges, lengths) if cliques < _MOST_CLIQUES else []
+    between = "" if n < 10 else "-"
     names = [
-        f"d{agents(e, '' if n < 10 else '-')} = {d:g}" for e, d in zip(edges, lengths, strict=True)
+        f"d{between.join(str(i + 1) for i in e)} = {d:g}"
+        for e, d in zip(edges, lengths, strict=True)
     ]
     for v in islice(found, _SHOWN):
         given = ", ".join(names[k] for k in v.edges)
         if len(v.agents) == 3:
-            problem = f"agents {agents(v.agents)} make no triangle: {given} m"
+            problem = f"{agent_names(v.agents)} make no triangle: {given} m"
             remedy = f"shorten the longest by {v.excess:.4g} m or more, or lengthen the others"
         else:
-            problem = (
-                f"agents {agents(v.agents)} make no tetrahedron (Cayley-Menger < 0): {given} m"
-            )
+            problem = f"{agent_names(v.agents)} make no tetrahedron (Cayley-Menger < 0): {given} m"
             remedy = "change one of the six (flat shapes need 7 digits: 5.656854), or give a shape"
         notes.add(path, problem, remedy, None)
     if len(found) > _SHOWN:

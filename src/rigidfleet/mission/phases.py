@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from rigidfleet._text import agent_names
 from rigidfleet._toml import toml_key
 from rigidfleet.formation import distance_geometry
 from rigidfleet.math import rigid_body
 from rigidfleet.mission.findings import FindingCollector, Keys, near
-from rigidfleet.mission.formations import agents as agents_text
 from rigidfleet.mission.formations import sound
 from rigidfleet.mission.schema import (
     ANGLES,
@@ -313,7 +313,7 @@ def _blendable(notes: FindingCollector, p: Shaping, form: Formation, n: int, pat
         edges = form.edge_array(n)
         between = distance_geometry.distances(slots, edges)
         for k in np.flatnonzero(np.abs(between - form.distances) > 1e-3 * between):
-            problem = f"the slots of agents {agents_text(edges[k])} are {between[k]:.7g} m apart"
+            problem = f"the slots of {agent_names(edges[k])} are {between[k]:.7g} m apart"
             remedy = f"correct it, or fly {p.name} by reference = 'distances'"
             notes.add(("formations", p.formation, "distances", int(k)), problem, remedy)
 

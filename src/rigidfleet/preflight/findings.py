@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from rigidfleet import _markup
+from rigidfleet._text import agent_names
 from rigidfleet.planning import solvers
 from rigidfleet.planning.preview import PlannedPhase
 from rigidfleet.rigidity import (
@@ -291,7 +292,7 @@ def _formation_words(f: FormationCheck) -> str:
         more = ", ..." if len(r.redundant) > 6 else ""
         parts.append(f"{len(r.redundant)} edges of which any one is redundant ({names}{more})")
     if r.flexes:
-        free = "; ".join(agents(flex.agents) for flex in r.flexes[:3])
+        free = "; ".join(agent_names(flex.agents) for flex in r.flexes[:3])
         more = f" and {len(r.flexes) - 3} more" if len(r.flexes) > 3 else ""
         parts.append(f"{len(r.flexes)} free to first order: {free}{more}")
     if r.rank:
@@ -327,14 +328,6 @@ def some(names: Sequence[str]) -> str:
     text = ", ".join(f"'{name}'" for name in names[:_TOLD])
     more = f" and {len(names) - _TOLD:,} more" if len(names) > _TOLD else ""
     return f"{text}{more} {'is' if len(names) == 1 else 'are'}"
-
-
-def agents(who: tuple[int, ...]) -> str:
-    """Agents counted from 1, in words."""
-    names = [str(i + 1) for i in who]
-    if len(names) == 1:
-        return f"agent {names[0]}"
-    return f"agents {', '.join(names[:-1])} and {names[-1]}"
 
 
 def _named(names: tuple[str, ...], values: tuple[Any, ...] | None) -> dict[str, Any] | None:

@@ -7,11 +7,12 @@ from typing import Literal
 
 import numpy as np
 
+from rigidfleet._text import agent_names
 from rigidfleet.formation import distance_geometry
 from rigidfleet.mission import Establish, Mission, Reshape
 from rigidfleet.planning import solvers
 from rigidfleet.planning.reference import reference_kind
-from rigidfleet.preflight.findings import DENSE, TOLERANCE, FormationCheck, Remark, agents, some
+from rigidfleet.preflight.findings import DENSE, TOLERANCE, FormationCheck, Remark, some
 from rigidfleet.rigidity import (
     Kind,
     RigidityClass,
@@ -137,7 +138,7 @@ def formation_remarks(mission: Mission, formations: list[FormationCheck]) -> Ite
                 yield Remark("note", "formation", text)
             continue
         if r.verdict is RigidityClass.FLEXIBLE:
-            who = "; ".join(agents(flex.agents) for flex in r.flexes[:4])
+            who = "; ".join(agent_names(flex.agents) for flex in r.flexes[:4])
             more = f" and {len(r.flexes) - 4} more" if len(r.flexes) > 4 else ""
             text = f"'{f.name}' is flexible: {r.rank} independent distances, {r.needed} hold it; free: {who}{more}"
             held = ". Add edges (rigidfleet design), or track slots" if alone else "; slots hold it"

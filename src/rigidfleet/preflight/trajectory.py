@@ -7,12 +7,13 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from rigidfleet._text import agent_names
 from rigidfleet.formation import assignment, distance_geometry
 from rigidfleet.math import lqr, proximity
 from rigidfleet.mission import Box, Establish, Ground, Mission, Reshape
 from rigidfleet.mission.disturbances import intensity
 from rigidfleet.planning.preview import PlannedPhase, septic
-from rigidfleet.preflight.findings import DENSE, SLACK, Disturbed, Preflight, Remark, agents, some
+from rigidfleet.preflight.findings import DENSE, SLACK, Disturbed, Preflight, Remark, some
 from rigidfleet.rigidity import (
     jacobian,
 )
@@ -63,7 +64,7 @@ def separation_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
             if exact not in worst or at[0] < worst[exact][0]:
                 worst[exact] = *at, planned.phase
     if np.isfinite(least[0]):
-        found.room = least[0], least[1], agents(least[2])
+        found.room = least[0], least[1], agent_names(least[2])
     for exact, (room, t, who, phase) in worst.items():
         if room <= 0 or room < limit - SLACK:
             text = _near(who, room, t, phase, limit, exact=exact)
@@ -75,8 +76,8 @@ def _near(
     who: tuple[int, ...], room: float, t: float, phase: str, limit: float, *, exact: bool
 ) -> str:
     if room <= 0:
-        return f"{agents(who)} {'' if exact else 'may '}collide at {t:.2f} s, in '{phase}'"
-    return f"{agents(who)} come within {room:.2f} m at {t:.2f} s, in '{phase}' (limit {limit:g} m)"
+        return f"{agent_names(who)} {'' if exact else 'may '}collide at {t:.2f} s, in '{phase}'"
+    return f"{agent_names(who)} come within {room:.2f} m at {t:.2f} s, in '{phase}' (limit {limit:g} m)"
 
 
 def _time_of(mission: Mission, planned: PlannedPhase, number: int, share: float) -> float:
@@ -211,7 +212,9 @@ def disturbance_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
         )
         yield Remark("note", "disturbances", text)
     if lost:
-        text = f"the way is judged as if {agents(tuple(i for i, _ in lost))} flew on to its end"
+        text = (
+            f"the way is judged as if {agent_names(tuple(i for i, _ in lost))} flew on to its end"
+        )
         yield Remark("note", "disturbances", text)
 
 
