@@ -137,8 +137,8 @@ def test_no_permission(
     HOME.chmod(0o555)
     try:
         with nobody():
-            assert "secret.toml: may not be read" in refused(capsys, "run", "secret.toml")
-            assert "may not be read" in refused(capsys, "report", str(HOME / "pair.nc"))
+            assert "secret.toml: cannot be read: permission denied" in refused(capsys, "run", "secret.toml")
+            assert "cannot be read: permission denied" in refused(capsys, "report", str(HOME / "pair.nc"))
             assert "pair" in refused(capsys, *RUN)
     finally:
         HOME.chmod(0o755)

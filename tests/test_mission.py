@@ -914,7 +914,7 @@ def test_unreadable_files(monkeypatch):
         raise PermissionError
 
     monkeypatch.setattr("rigidfleet.mission.model.open", refused, raising=False)
-    assert "may not be read" in fails(load_mission, "mine.toml").problem
+    assert "cannot be read: permission denied" in fails(load_mission, "mine.toml").problem
 
 
 # -- robustness
