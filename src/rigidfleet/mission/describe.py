@@ -1,4 +1,4 @@
-"""A mission in words: how much of everything it has; what a phase leads to, and when it ends."""
+"""Describe a mission in words: its size, the target of each phase and when it ends."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 def counted(mission: Mission) -> str:
-    """How much of everything a mission has: 3 agents, 2 formations, 12 phases, 90 s."""
+    """Size of a mission: 3 agents, 2 formations, 12 phases, 90 s."""
     parts = [
         (mission.n_agents, "agent"),
         (len(mission.formations), "formation"),
@@ -24,7 +24,7 @@ def counted(mission: Mission) -> str:
 
 
 def goal(phase: Phase) -> str:
-    """What a phase leads to; "" for a hold."""
+    """Target of a phase: a formation, a waypoint, an attitude; "" for a hold."""
     if isinstance(phase, Hold):
         return ""
     if isinstance(phase, Reshape):
@@ -45,7 +45,7 @@ def goal(phase: Phase) -> str:
 
 
 def ending(phase: Phase) -> str:
-    """When a phase ends."""
+    """Ending of a phase: a time, a duration, or settling with its timeout."""
     if phase.settle is not None:
         return f"settled, within {phase.settle.timeout:g} s"
     return f"at {phase.until:g} s" if phase.until is not None else f"after {phase.duration:g} s"
