@@ -212,7 +212,7 @@ def checked(text: str) -> tuple[set[str], str]:
     found = check(Mission.from_toml(text))
     words = "\n".join(text for _, text in found.describe())
     assert time.process_time() - begun < 10.0
-    over = ("passed over", "take too long", "would take too long")
+    over = ("skipped", "would take too long")
     return {r.topic for r in found.remarks if any(text in r.text for text in over)}, words
 
 
@@ -221,8 +221,8 @@ def test_a_check_of_many_formations_says_what_it_passed_over():
     text = HEAD + agents(8) + formations(200, "cube") + ESTABLISH.replace("'f'", "'f199'")
     topics, words = checked(text)
     assert topics == {"formation"}
-    assert "passed over, not judged" in words
-    assert re.search(r"from 40 random starts", words)
+    assert "skipped, rigidity not checked" in words
+    assert re.search(r"of 40 random starts", words)
 
 
 def test_a_check_of_many_obstacles_tells_of_the_nearest():
@@ -277,7 +277,7 @@ def test_a_long_check_says_what_it_does(tmp_path: Path, monkeypatch, capsys):
         "rigidfleet.preflight.check.check_gains", lambda *_: time.sleep(0.5) or 1 // 0
     )
     cli.main(["check", str(tmp_path / "a.toml")])
-    assert re.search(r"Checking .*a.toml: the way, \d+ s", capsys.readouterr().err)
+    assert re.search(r"Checking .*a.toml: planned paths, \d+ s", capsys.readouterr().err)
 
 
 def test_the_bounds_are_those_of_the_documents():
