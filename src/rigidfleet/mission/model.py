@@ -422,7 +422,7 @@ def _unread(origin: str, problem: str, remedy: str) -> MissionError:
 def _not_found(name: str) -> Finding:
     known = mission_names()
     remedy = near(Path(name).stem, known) or f"shipped missions: {', '.join(known)}"
-    return Finding(name, "", None, "there is no file and no shipped mission of this name", remedy)
+    return Finding(name, "", None, "no such file and no shipped mission of this name", remedy)
 
 
 def parse_toml(text: str, origin: str) -> dict[str, Any]:
