@@ -114,7 +114,13 @@ def test_help_is_light():
     """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    for words in ("0 success", "1 it flew", "2 bad input", "130 interrupted", "--no-figures"):
+    for words in (
+        "0 success",
+        "1 the flight failed",
+        "2 invalid input",
+        "130 interrupted",
+        "--no-figures",
+    ):
         assert words in " ".join(done.stdout.split())
 
 
@@ -348,7 +354,12 @@ def test_new_asks_on_a_terminal(folder):
     """On a terminal a few questions are asked; an answer that cannot be is asked for again."""
     answers = ["asked", "polgon", "polygon", "2", "7", "", "x", "2", "1 2", "10, 5 9"]
     out = on_terminal(["new"], answers)
-    for words in ("did you mean 'polygon'", "3 or more agents, not 2", "'x' is not a number", "Enter three"):
+    for words in (
+        "did you mean 'polygon'",
+        "3 or more agents, not 2",
+        "'x' is not a number",
+        "Enter three",
+    ):
         assert words in out
     text = Path("asked.toml").read_text(encoding="utf-8")
     for line in ('shape = "polygon"', "mass = 2 ", "size = 4 ", "position = [10, 5, 9]"):
@@ -666,7 +677,9 @@ def test_interrupt_of_drawing(capsys, monkeypatch):
 
     monkeypatch.setattr("rigidfleet.plotting.plot", draw)
     assert cli.main(["run", "short.toml"]) == codes.INTERRUPTED
-    assert capsys.readouterr().err.startswith("Interrupted: the complete flight is saved in flights")
+    assert capsys.readouterr().err.startswith(
+        "Interrupted: the complete flight is saved in flights"
+    )
     assert Result.load("flights/short/short.nc").complete
 
 

@@ -72,7 +72,8 @@ def test_words_that_are_not_old():
 
 
 @pytest.mark.parametrize(
-    ("version", "words"), [(0, "an earlier rigidfleet (sweep format 1)"), (9, "Use a newer")]
+    ("version", "words"),
+    [(0, "an earlier version of rigidfleet (sweep format 1)"), (9, "Use a newer")],
 )
 def test_stores_of_other_formats(tmp_path, version, words):
     """Neither read nor flown on with; replaced if asked for."""

@@ -88,7 +88,11 @@ def run(
         console.print_exactly(verdict.json() + "\n")
     elif not quiet:
         console.out().print(verdict)
-    what = "the flight so far is saved, marked incomplete," if interrupted else "the complete flight is saved"
+    what = (
+        "the flight so far is saved, marked incomplete,"
+        if interrupted
+        else "the complete flight is saved"
+    )
     if not interrupted:
         try:
             if replay:
