@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import html
 import json
-import re
 from importlib import resources
 from typing import Any
 
 from rigidfleet.result import plain
 from rigidfleet.web.policy import content_policy
+from rigidfleet.web.template import templates
 
 _SCRIPTS = ("gl.js", "recording.js", "scene.js", "player.js")
 
@@ -29,16 +28,16 @@ def page(
     """
     style = read("page.css") + style
     script = "\n".join([*map(read, _SCRIPTS), start])
-    fill = {
-        "policy": content_policy(style=style, script=script, connect=connect),
-        "title": html.escape(f"{info['name']} – rigidfleet"),
-        "style": style,
+    template = templates("rigidfleet.web.replay", "").get_template("page.html")
+    return template.render(
+        policy=content_policy(style=style, script=script, connect=connect),
+        title=f"{info['name']} – rigidfleet",
+        style=style,
         # No mark-up inside: a user's words must not end the script.
-        "info": json.dumps(plain(info), ensure_ascii=False).replace("<", "\\u003c"),
-        "data": data,
-        "script": script,
-    }
-    return re.sub(r"\{(\w+)\}", lambda match: fill[match[1]], read("page.html"))
+        info=json.dumps(plain(info), ensure_ascii=False).replace("<", "\\u003c"),
+        data=data,
+        script=script,
+    )
 
 
 def read(name: str, package: str = "rigidfleet.web.replay") -> str:
