@@ -1,3 +1,4 @@
+import io
 import itertools
 import json
 import os
@@ -15,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from rigidfleet.cli import app as cli
 from rigidfleet.cli import codes, console
@@ -993,3 +995,30 @@ def test_progress_leaves_compiling_out(monkeypatch):
     now = 13.4
     watch.update(Progress(24.0, 90.0, "WP1", 13.4))
     assert watch._words() == "24.0 of 90 s  x10  0:07 left  WP1"
+
+
+def test_progress_on_a_terminal(monkeypatch):
+    """A terminal shows what is waited for, then per cent, time flown, speed, time left and phase, and is left clean."""
+    now = 0.0
+    monkeypatch.setattr(console, "perf_counter", lambda: now)
+    screen = io.StringIO()
+    watch = console.FlightWatch()
+    watch.console = Console(file=screen, force_terminal=True, width=120, markup=False)
+
+    def drawn() -> str:
+        assert watch.progress is not None
+        screen.truncate(0)
+        watch.progress.refresh()
+        return re.sub(r"\x1b\[[\d;?]*\w", "", screen.getvalue())
+
+    with watch:
+        assert "Starting: 0 s" in drawn()
+        watch.compiling()
+        now = 7.0
+        assert f"{console.COMPILING}: 7 s" in drawn()
+        watch.update(Progress(0.0, 90.0, "[WP0]", 1.0))
+        watch.update(Progress(30.0, 90.0, "[WP0]", 3.0))
+        assert " 33% 30.0 of 90 s  x15  0:04 left  [WP0]" in drawn()
+        now = 9.0
+        assert f" 33% {console.COMPILING}: 9 s" in drawn()
+    assert screen.getvalue().endswith("\x1b[2K")

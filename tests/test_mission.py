@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rigidfleet._toml import to_toml
 from rigidfleet.errors import MissionError
 from rigidfleet.formation import distance_geometry, graphs, shapes
 from rigidfleet.mission import (
@@ -389,6 +390,16 @@ def test_arrays_of_numpy_are_plain_data():
     assert mission.agents.position == ((1, 0, 0), (0, 1, 0), (0, 0, 1))
     assert mission.gravity == 1.62
     assert mission.title == ""
+
+
+def test_points_are_written_one_to_a_line():
+    """A mission written from plain data has each point on a line of its own, and numbers on one line."""
+    data = changed(("agents/position", np.eye(3)), ("agents/mass", [1.0, 2.0, -3e-22]))
+    text = to_toml(data)
+    assert "position = [\n    [1.0, 0.0, 0.0],\n    [0.0, 1.0, 0.0]," in text
+    assert "mass = [1.0, 2.0, -3e-22]\n" in text
+    title = 'of "[\n    1,\n]"'
+    assert tomllib.loads(to_toml({"title": title})) == {"title": title}
 
 
 def test_awkward_names_survive_toml():

@@ -19,10 +19,10 @@ from rigidfleet.errors import MissionError
 
 if TYPE_CHECKING:
     from rich.console import Console, RenderableType
-    from rich.live import Live
+    from rich.progress import Progress
     from rich.table import Table
 
-    from rigidfleet.simulation.flight import Progress
+    from rigidfleet.simulation.flight import Progress as FlightProgress
     from rigidfleet.sweep import SweepProgress
 
 #: Width of a table in a file or a pipe, where rows are not wrapped [characters].
@@ -142,53 +142,58 @@ class _Screen:
 
     def __init__(self) -> None:
         self.console = err()
-        self.live: Live | None = None
+        self.progress: Progress | None = None
         self.begun = self.told = perf_counter()
         self.cold = False
 
     def __enter__(self) -> Self:
         if self.console.is_interactive:
-            from rich.live import Live
-            from rich.spinner import Spinner
+            from rich import progress
+            from rich.table import Column
 
-            self.spinner = Spinner("dots")
-            self.live = Live(self, console=self.console, transient=True, refresh_per_second=10)
-            self.live.start()
+            # The words change while nothing is heard, too: they are asked for whenever the screen is drawn.
+            words = progress.TextColumn(
+                "{task.fields[screen]}", markup=False, table_column=Column()
+            )
+            self.progress = progress.Progress(
+                progress.SpinnerColumn(),
+                progress.BarColumn(bar_width=30),
+                progress.TaskProgressColumn(),
+                words,
+                console=self.console,
+                transient=True,
+            )
+            self.task = self.progress.add_task("", total=None, screen=self)
+            self.progress.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self.live is not None:
-            self.live.stop()
-
-    def __rich__(self) -> RenderableType:
-        return ""
+        if self.progress is not None:
+            self.progress.stop()
 
     def compiling(self) -> None:
         """Announce that the simulator will be compiled, in several parts during the flight."""
         self.cold, self.begun = True, perf_counter()
-        if self.live is None:
+        if self.progress is None:
             self.console.print(COMPILING)
 
-    def waiting(self) -> RenderableType:
-        """Display before there is any progress."""
+    def __str__(self) -> str:
+        """Text on a terminal: progress, or what is waited for before there is any."""
+        if not self._waits():
+            return self._words()
         text = COMPILING if self.cold else "Starting"
-        self.spinner.update(text=f"{text}: {perf_counter() - self.begun:.0f} s")
-        return self.spinner
+        return f"{text}: {perf_counter() - self.begun:.0f} s"
 
-    def bar(self, total: float, done: float) -> RenderableType:
-        """Progress bar and its text."""
-        from rich.progress_bar import ProgressBar
-        from rich.table import Table
-
-        row = Table.grid(padding=(0, 1))
-        row.add_row(ProgressBar(total, done, width=30), self._words())
-        return row
-
-    def tell(self, now: float) -> None:
-        """Print a line if there is no animation and the last line was long ago."""
-        if self.live is None and now - self.told > _SELDOM:
+    def show(self, total: float, done: float, now: float) -> None:
+        """Show the progress; without animation as a line, if the last line was long ago."""
+        if self.progress is not None:
+            self.progress.update(self.task, total=total, completed=done)
+        elif now - self.told > _SELDOM:
             self.told = now
             self.console.print(self._words())
+
+    def _waits(self) -> bool:
+        return True
 
     def _words(self) -> str:
         return ""
@@ -226,22 +231,19 @@ class FlightWatch(_Screen):
     def __init__(self) -> None:
         super().__init__()
         self.heard = self.begun
-        self.recent: deque[Progress] = deque()
+        self.recent: deque[FlightProgress] = deque()
 
-    def update(self, progress: Progress) -> None:
+    def update(self, progress: FlightProgress) -> None:
         """Receive the progress of the flight."""
         now = perf_counter()
         if self.cold and now - self.heard > _SILENCE:
             self.recent.clear()  # measure the speed without the time of compiling
         self.recent.append(progress)
         self.heard = now
-        self.tell(now)
+        self.show(progress.t_end, progress.t, now)
 
-    def __rich__(self) -> RenderableType:
-        if not self.recent or (self.cold and perf_counter() - self.heard > _SILENCE):
-            return self.waiting()
-        last = self.recent[-1]
-        return self.bar(last.t_end, last.t)
+    def _waits(self) -> bool:
+        return not self.recent or (self.cold and perf_counter() - self.heard > _SILENCE)
 
     def _words(self) -> str:
         """Mission time, speed relative to real time, time left, phase."""
@@ -274,12 +276,11 @@ class SweepWatch(_Screen):
         if progress.flown and (self.base is None or self.base.workers != progress.workers):
             self.base = progress  # measure the rate of these workers without their start-up
         self.last = progress
-        self.tell(perf_counter())
+        if not self._waits():
+            self.show(progress.runs, progress.done, perf_counter())
 
-    def __rich__(self) -> RenderableType:
-        if self.base is None or self.last is None:
-            return self.waiting()
-        return self.bar(self.last.runs, self.last.done)
+    def _waits(self) -> bool:
+        return self.base is None or self.last is None
 
     def _words(self) -> str:
         """Finished runs, rate, time left, failures, workers."""
