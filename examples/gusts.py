@@ -1,10 +1,10 @@
 """What gusts do to the constraint force, when each vehicle tracks its slot anyway.
 
-In calm air tracking carries the formation and the constraint force has nothing to do. Gusts push
-each vehicle differently. Four flights: calm; in gusts; in the same gusts by tracking alone (a
+In calm air, tracking alone moves the formation and the constraint force is idle. Gusts push each
+vehicle differently. Four flights: calm; in gusts; in the same gusts by tracking alone (a
 formation without edges); and by a constraint force on board that does not know the gusts. The
-paper's law is given every external force and cancels it at once, as no vehicle can: what its
-stabilisation alone achieves is the last flight.
+paper's law is told every external force and cancels it at once, which no vehicle can do; the last
+flight shows what its stabilisation alone achieves.
 """
 
 import numpy as np
@@ -14,7 +14,7 @@ from rigidfleet import physics
 from rigidfleet.formation.distance_geometry import distances
 from rigidfleet.formation.graphs import complete_graph
 
-COUNTED = 12.0  # [s] what is measured comes after this
+COUNTED = 12.0  # [s] measurements start after this
 DRAG = 0.25  # [N s/m] of each vehicle
 WIND = np.array([2.0, 1.0, 0.0])  # [m/s] mean wind
 GUST = 3.0  # [m/s] amplitude of each component's three waves

@@ -1,7 +1,7 @@
 """Fly your own controller: a plain Python function, called at a control rate like one on a vehicle.
 
-A steady wind gets up while the formation flies to its waypoint. The built-in law (an LQR without
-integral action) is pushed aside by wind / (m k1); a PID in its place brings the formation back.
+A steady wind rises while the formation flies to its waypoint. Under the built-in law (an LQR without
+integral action), the wind displaces the formation by wind / (m k1); a PID brings it back.
 """
 
 import numpy as np

@@ -18,7 +18,7 @@ def skein(arm, angle_deg=35.0):
 
 
 def mission():
-    """Five vehicles, the leader twice as heavy, that start anyhow on the ground."""
+    """Five vehicles, the leader twice as heavy, that start in no order on the ground."""
     start = np.array([[0, 0, 0.3], [-2, 3, 0.3], [-3, -2, 0.3], [-6, 4, 0.3], [-5, -5, 0.3]])
     return rf.Mission.from_dict(
         {

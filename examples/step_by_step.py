@@ -9,7 +9,7 @@ import rigidfleet as rf
 
 
 def main() -> rf.Result:
-    """Form the triangle of the narrow passage, then fly elsewhere than the mission does."""
+    """Form the triangle of the narrow passage, then fly to other targets than the mission's."""
     flight = rf.Flight("narrow-passage")
     flight.begin()  # the mission's first phase
     while flight.advance(1.0):  # False at the phase's end
@@ -17,12 +17,12 @@ def main() -> rf.Result:
         sides = np.linalg.norm(r - np.roll(r, 1, axis=0), axis=1)
         print(f"{flight.t:5.1f} s  sides of the triangle: {sides.round(3)} m")
 
-    # In place of the mission's next phase, a way of our own ...
+    # In place of the mission's next phase, a target of our own ...
     flight.begin({"kind": "fly", "position": [8.0, 0.0, 12.0], "duration": 10.0})
     flight.advance(5.0)
     print(f"{flight.t:5.1f} s  half way at {flight.pose().r.round(1)} m: another target")
 
-    # ... which ends half way, for another target. The reference goes on without a jump.
+    # ... which gives way to another target half way. The reference continues without a jump.
     flight.begin({"kind": "fly", "position": [4.0, 6.0, 12.0], "yaw_deg": 90.0, "duration": 10.0})
     flight.advance()  # to the phase's end
     return flight.finish()

@@ -1,8 +1,8 @@
 # %% [markdown]
 # # A formation of your own
 #
-# From points in space to a flight that is judged: are the distances enough to hold the shape, which are
-# worth having, does it fly, and how close do vehicles come?
+# This notebook goes from points in space to a verdict on their flight: do the distances hold the shape, which
+# edges are best, does the formation fly, and how close do vehicles come?
 
 # %%
 import numpy as np
@@ -15,8 +15,8 @@ from rigidfleet.rigidity import analyse
 # %% [markdown]
 # ## The shape
 #
-# An arrow of seven vehicles: a tip, two barbs on each side, two behind one above the other. Slots are in
-# the body frame, x ahead, z up.
+# The shape is an arrow of seven vehicles: a tip, two barbs on each side, and two behind, one above the
+# other. Slots are in the body frame, x ahead, z up.
 
 # %%
 slots = np.array(
@@ -27,8 +27,8 @@ print(f"{len(slots)} vehicles, {len(complete_graph(len(slots)))} pairs")
 # %% [markdown]
 # ## Is it rigid?
 #
-# It takes at least $3N - 6 = 15$ distances, and not any fifteen. Here each vehicle keeps its distance from
-# the three next in number:
+# A rigid shape needs at least $3N - 6 = 15$ distances, and not any fifteen will do. Here, each vehicle keeps its
+# distance from the next three in number:
 
 # %%
 pairs = complete_graph(len(slots))
@@ -37,8 +37,8 @@ found = analyse(slots, tempting)
 print(f"{len(tempting)} edges, rank {found.rank} of {found.needed}: {found.verdict}")
 
 # %% [markdown]
-# There are enough of them, but two motions change no distance at first: prestress could hold the shape,
-# distances in flight hardly do. `design` chooses edges that hold as firmly as they can:
+# Their number suffices, but two motions change no distance to first order: prestress could hold the shape,
+# but distances in flight hardly do. `design` chooses the edges that hold it best:
 
 # %%
 edges = rf.design(slots)
@@ -49,7 +49,7 @@ print(f"index {chosen.index:.3f}, that of the others {found.index:.3f}")
 # %% [markdown]
 # ## The mission
 #
-# A dictionary has the keys of a mission file, and is checked as one. The vehicles start on the ground,
+# The dictionary has the keys of a mission file, and is checked like one. The vehicles start on the ground,
 # climb, form the arrow, fly, and turn.
 
 # %%
@@ -76,7 +76,7 @@ mission = rf.Mission.from_dict(
 mission
 
 # %% [markdown]
-# Before it flies, a check tells what it will meet:
+# A check says what the mission will meet before it flies:
 
 # %%
 rf.check(mission)
@@ -93,15 +93,15 @@ verdict
 plotting.clearance(result)
 
 # %% [markdown]
-# The flight itself, to be turned with the mouse:
+# This is the flight; turn it with the mouse:
 
 # %%
 rf.replay(result)
 
 # %% [markdown]
-# ## To send it on
+# ## Share it
 #
-# The record of the flight, and a report that anybody can open and print:
+# Save the record of the flight, and a report that anyone can open and print:
 
 # %%
 result.save("arrow.nc")

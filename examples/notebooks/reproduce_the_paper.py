@@ -2,7 +2,7 @@
 # # Reproduce the paper
 #
 # Each simulation of the paper is a mission that ships with rigidfleet. This notebook flies the decisive
-# ones, from the first table to the passage, and shows where the printed law breaks and what flies instead.
+# ones, from the first table to the passage, and shows where the printed law fails and which law flies instead.
 
 # %%
 import rigidfleet as rf
@@ -21,17 +21,17 @@ print(rf.assess(triangle).summary)
 plotting.distances(triangle)
 
 # %% [markdown]
-# The paper's distances *jump*, and its law inverts a matrix that has no inverse on the line. Flown as
-# printed it cannot arrive:
+# The paper's distances *jump*, and its law inverts a matrix that has no inverse on the line. As printed,
+# the law cannot reach the line:
 
 # %%
 printed = rf.simulate("line-singular")
 print(printed.ending)
 
 # %% [markdown]
-# When it ends can be told beforehand. The integral in the law makes an error overshoot, and $d_{13}$
+# The time at which the flight ends is known beforehand. The integral in the law makes an error overshoot, and $d_{13}$
 # cannot exceed $d_{12} + d_{23}$: the flight meets the line as the error first passes zero, $1.618/p$
-# after the step at 6 s, $p$ the rate of the triple pole.
+# after the step at 6 s, where $p$ is the rate of the triple pole.
 
 # %%
 p = 2.0
@@ -67,10 +67,10 @@ plotting.trajectory(passage)
 rf.replay(passage)
 
 # %% [markdown]
-# ## Table 4: a cube that is none
+# ## Table 4: not a cube
 #
 # Eighteen distances hold eight agents. As printed, two of them are swapped: all distances are met, and the
-# shape is rigid, but it is no cube. The verdict, which compares all pairs of agents, notices.
+# shape is rigid, but it is not a cube. The verdict, which compares all pairs of agents, detects this.
 
 # %%
 for name in ("establish-cube-as-printed", "establish-cube"):
