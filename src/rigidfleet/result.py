@@ -12,9 +12,7 @@ from __future__ import annotations
 import io
 import json
 import math
-import os
 import platform
-import secrets
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from datetime import UTC, datetime
@@ -42,7 +40,7 @@ from rigidfleet.typing import Bools, Floats, Ints
 
 if TYPE_CHECKING:
     from rigidfleet.mission import Mission
-
+from rigidfleet._files import why_not, write_file
 
 #: Version of the file format. Files of any other version are rejected.
 SCHEMA_VERSION = 3
@@ -126,9 +124,9 @@ class PhaseRecord:
     formation : name of the formation that is held or approached; None if no formation has been established
     t_start, t_end : mission time [s]
     settled : whether a phase that ends by settling has settled; None for a phase that ends at a time
-    target : for fly and turn phases, and for establish phases with a commanded attitude: {"time" [s], "position" [m],
-        "velocity" [m/s], "attitude" quaternion, "rates" [rad/s]}. Entries other than the time are None if nothing is
-        commanded
+    target : for phases with a goal of their own (fly, turn, orbit), and for establish phases with a commanded
+        attitude: {"time" [s], "position" [m], "velocity" [m/s], "attitude" quaternion, "rates" [rad/s]}. Entries other
+        than the time are None if nothing is commanded
     extremes : worst values of the phase in continuous time, by name: separation, clearance, separation_below, lost
         (distance of a lost vehicle to one that still flies), geofence (distance beyond it), lowest, highest [m];
         speed [m/s]; acceleration [m/s^2]; thrust, thrust_margin (thrust minus its limit), constraint_force, tension
@@ -138,7 +136,7 @@ class PhaseRecord:
     """
 
     name: str
-    kind: Literal["establish", "fly", "reshape", "turn", "hold"]
+    kind: str
     control: Literal["open", "tracking", "body"]
     formation: str | None
     t_start: float
@@ -416,6 +414,8 @@ class Result:
 
     def _foreign(self, mission: Mission) -> str:
         """Describe how the arrays contradict a mission; "" if they agree."""
+        from rigidfleet.mission import KINDS
+
         if mission.n_agents != self.n_agents:
             return f"the mission has {mission.n_agents} agents, the arrays have {self.n_agents}"
         if not np.array_equal(mission.edges, self.edges):
@@ -428,6 +428,8 @@ class Result:
             obstacles
         ):
             return "the arrays name more obstacles than it has"
+        if unknown := {p.kind for p in self.phases} - {*KINDS}:
+            return f"there is no kind of phase {min(map(repr, unknown))}"
         unknown = {p.formation for p in self.phases} - {None, *mission.formations}
         return f"it has no formation {min(map(repr, unknown))}" if unknown else ""
 
@@ -571,20 +573,33 @@ _FIELDS = [
     Parameter("self", Parameter.POSITIONAL_ONLY),
     Parameter("fields", Parameter.VAR_KEYWORD),
 ]
+
+
 vars(Result.__init__)["__signature__"] = Signature(_FIELDS)
 
+
 _HINTS = get_type_hints(Result, include_extras=True)
+
+
 #: Dimensions, unit and meaning of each array of a result.
 VARIABLES: dict[str, Variable] = {
     f.name: _HINTS[f.name].__metadata__[0]
     for f in fields(Result)
     if hasattr(_HINTS[f.name], "__metadata__")
 }
+
+
 #: Variables that a result may lack.
 _OPTIONAL = {f.name for f in fields(Result) if f.name in VARIABLES and f.default is None}
+
+
 _INTEGERS = {name for name in VARIABLES if _HINTS[name].__origin__ == Ints}
+
+
 #: Quantities whose minimum is the worst value. The same holds for all clearances.
 _LEAST = frozenset(("separation", "separation_below", "lost", "lowest"))
+
+
 #: Attributes of a file and their types. Types other than int and str are stored as JSON.
 _ATTRIBUTES: dict[str, Any] = {
     "mission_text": str,
@@ -596,8 +611,12 @@ _ATTRIBUTES: dict[str, Any] = {
     "platform": str,
     "created": str,
 }
+
+
 #: Attribute that identifies a file as a result.
 _MARK = "rigidfleet_schema_version"
+
+
 #: Maximum size of a chunk [bytes]: the size of HDF5's cache.
 _CHUNK = 1 << 20
 
@@ -648,42 +667,6 @@ def _one_line(error: BaseException) -> str:
     return " ".join(str(error).split()) or type(error).__name__
 
 
-# -- files -------------------------------------------------------------------------------------------
-
-
-def write_file(path: Path, data: bytes) -> None:
-    """Write a file without ever leaving a partial one: write a temporary file beside it, then rename that."""
-    target = Path(
-        os.path.realpath(path)
-    )  # write the target of a symbolic link, do not replace the link
-    part = target.with_name(f".{target.name[:200]}.{secrets.token_hex(4)}.part")
-    try:
-        if target.is_dir():
-            raise IsADirectoryError
-        try:
-            with open(part, "xb") as file:
-                file.write(data)
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(part, target)
-        except BaseException:
-            part.unlink(missing_ok=True)
-            raise
-    except OSError as error:
-        raise ResultError(f"{path}: {_why_not(error, 'written', path)}") from error
-
-
-def _why_not(error: OSError, done: str, path: Path) -> str:
-    match error:
-        case IsADirectoryError():
-            return "is a folder. Give the path of a file."
-        case FileNotFoundError() | NotADirectoryError():
-            return f"cannot be {done}: there is no folder {path.parent}. Create it first."
-        case PermissionError():
-            return f"cannot be {done}: permission denied. Choose another folder or change the permissions."
-    return f"cannot be {done}: {error.strerror or error}. Choose another place."
-
-
 def _read(path: Path) -> bytes:
     try:
         data = path.read_bytes()
@@ -692,7 +675,7 @@ def _read(path: Path) -> bytes:
     except IsADirectoryError as error:
         raise ResultError(f"{path}: is a folder. Give the path of a result file in it.") from error
     except OSError as error:
-        raise ResultError(f"{path}: {_why_not(error, 'read', path)}") from error
+        raise ResultError(f"{path}: {why_not(error, 'read', path)}") from error
     if not data.startswith(b"\x89HDF\r\n\x1a\n"):
         what = "is empty" if not data else "is not a netCDF-4 file"
         raise ResultError(f"{path}: {what}. Give the path of a result of `rigidfleet run`.")

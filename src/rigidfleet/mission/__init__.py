@@ -15,6 +15,7 @@ from rigidfleet.mission.model import (
     mission_text,
 )
 from rigidfleet.mission.schema import (
+    KINDS,
     Box,
     Disturbances,
     Establish,
@@ -35,6 +36,7 @@ from rigidfleet.mission.schema import (
 )
 
 __all__ = [
+    "KINDS",
     "Box",
     "Disturbances",
     "Establish",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,34 +11,28 @@ from rigidfleet._text import agent_names
 from rigidfleet._toml import toml_key
 from rigidfleet.formation import distance_geometry
 from rigidfleet.math import rigid_body
+from rigidfleet.mission import bounds
 from rigidfleet.mission.findings import FindingCollector, Keys, near
 from rigidfleet.mission.formations import sound
 from rigidfleet.mission.schema import (
     ANGLES,
+    KINDS,
     Agents,
     AnyPhase,
     Establish,
-    Fly,
     Formation,
-    Hold,
     Lqr,
-    Reshape,
+    Orbit,
     Shaping,
-    Steering,
     Turn,
 )
 
-_KINDS: dict[str, type[AnyPhase]] = {
-    "establish": Establish,
-    "fly": Fly,
-    "reshape": Reshape,
-    "turn": Turn,
-    "hold": Hold,
-}
 _ENDINGS = ("until", "duration", "settle")
 #: Maximum number of samples of a result.
 _MOST_SAMPLES = 1_000_000
-#: Maximum number of values in a result: 4 GB.
+#: Maximum number of turns of an orbit: with more, the samples of the planned path would miss the circle.
+_MOST_TURNS = 100
+#: Numbers in a result at most: 4 GB of them.
 _MOST_NUMBERS = 5e8
 
 
@@ -46,9 +40,9 @@ def check(notes: FindingCollector, parts: Mapping[str, Any], n: int | None) -> t
     """Check the phases and return them, including those with findings."""
     found = _phases(notes)
     _names(notes, found)
-    end = _times(notes, found)
+    end, lengths = _times(notes, found)
     _samples(notes, parts, end, n)
-    _controls(notes, found)
+    _controls(notes, found, lengths)
     _formations(notes, found, parts, n)
     _arrivals(notes, found, parts.get("lqr", Lqr()))
     return tuple(p for p in found if p is not None)
@@ -91,11 +85,11 @@ def _phases(notes: FindingCollector) -> list[AnyPhase | None]:
     body = notes.data.get("architecture") == "body"
     found: list[AnyPhase | None] = []
     for k, data in enumerate(tables(notes, "phases")):
-        model = kind(notes, data, ("phases", k), _KINDS)
+        model = kind(notes, data, ("phases", k), KINDS)
         if model is None:
             found.append(None)
             continue
-        control = "tracking" if not body else "open" if model is Establish else "body"
+        control = model.body_control if body else "tracking"
         given = {"name": f"{data['kind']} {k + 1}", "control": control} | data
         found.append(notes.validate(model, given, ("phases", k)))
     if not found and notes.right((), "phases"):
@@ -117,8 +111,14 @@ def _names(notes: FindingCollector, found: Sequence[AnyPhase | None]) -> None:
             notes.add(("phases", k, "name"), problem, "give each phase its own name", p.name)
 
 
-def _times(notes: FindingCollector, found: Sequence[AnyPhase | None]) -> float | None:
-    """Check that each phase has one ending and that ends increase. Return the latest end [s], None if unknown."""
+def _times(
+    notes: FindingCollector, found: Sequence[AnyPhase | None]
+) -> tuple[float | None, list[float | None]]:
+    """Check that each phase has one ending and that ends increase.
+
+    Returns the latest end and the maximum duration of each phase [s]; None if unknown.
+    """
+    lengths: list[float | None] = [None] * len(found)
     first: float | None = 0.0  # earliest and latest start of the phase; None if unknown
     last: float | None = 0.0
     for k, p in enumerate(found):
@@ -152,12 +152,14 @@ def _times(notes: FindingCollector, found: Sequence[AnyPhase | None]) -> float |
             shortest = p.settle.dwell if p.settle is not None else p.duration
             first = first + (shortest or 0.0) if first is not None else None
             last = last + (longest or 0.0) if last is not None else None
-        if isinstance(p, Shaping):
-            _blend(notes, p, longest, path)
-        elif isinstance(p, Steering) and p.travel and p.travel > (longest or p.travel) * (1 + 1e-9):
+        lengths[k] = longest
+        travel = p.steering.travel if p.steering is not None else None
+        if p.shaping is not None:
+            _blend(notes, p.shaping, longest, path)
+        elif travel and travel > (longest or travel) * (1 + 1e-9):
             problem = f"is longer than the phase, which ends after {longest:g} s"
-            notes.add((*path, "travel"), problem, "reduce travel or end the phase later", p.travel)
-    return last
+            notes.add((*path, "travel"), problem, "reduce travel or end the phase later", travel)
+    return last, lengths
 
 
 def _in_order(notes: FindingCollector, until: float, first: float, last: float, path: Keys) -> None:
@@ -180,10 +182,15 @@ def _blend(notes: FindingCollector, p: Shaping, longest: float | None, path: Key
         if "blend" in p.model_fields_set:
             remedy = "remove it, or use reference = 'shape' or 'distances'"
             notes.add((*path, "blend"), "has no effect with reference 'step'", remedy)
-    elif longest is not None and p.blend > longest * (1 + 1e-9):
+    else:
+        _blended(notes, p.blend, longest, path)
+
+
+def _blended(notes: FindingCollector, blend: float, longest: float | None, path: Keys) -> None:
+    if longest is not None and blend > longest * (1 + 1e-9):
         problem = f"is longer than the phase, which lasts {longest:g} s"
         remedy = f"use blend <= {longest:g} or end the phase later"
-        notes.add((*path, "blend"), problem, remedy, p.blend)
+        notes.add((*path, "blend"), problem, remedy, blend)
 
 
 def _samples(
@@ -221,7 +228,12 @@ def _samples(
         notes.add(("output_step",), problem, remedy, step)
 
 
-def _controls(notes: FindingCollector, found: Sequence[AnyPhase | None]) -> None:
+def _controls(
+    notes: FindingCollector,
+    found: Sequence[AnyPhase | None],
+    lengths: Sequence[float | None],
+) -> None:
+    """Check the control of each phase, and the conditions of its kind."""
     local = notes.data.get("architecture", "local") == "local"
     for k, p in enumerate(found):
         path = ("phases", k)
@@ -230,21 +242,29 @@ def _controls(notes: FindingCollector, found: Sequence[AnyPhase | None]) -> None
         if p.control == "body" and local:
             remedy = "use control = 'tracking', or architecture = 'body' for the mission"
             notes.add((*path, "control"), "requires architecture = 'body'", remedy)
-        if p.control == "open" and isinstance(p, Steering):
-            problem = f"a {notes.data['phases'][k]['kind']} phase needs feedback control"
-            notes.add((*path, "control"), problem, "use control = 'tracking' or 'body'")
+        if p.control == "open" and p.moves:
+            kind_name = notes.data["phases"][k]["kind"]
+            problem = f"kind '{kind_name}' needs feedback control"
+            others = " or 'body'" if p.body_control == "body" else ""
+            notes.add((*path, "control"), problem, f"use control = 'tracking'{others}")
         if p.control != "open" and any(p.input_force):
             problem = f"has no effect with control '{p.control}'"
             notes.add((*path, "input_force"), problem, "remove it or use control = 'open'")
-        if isinstance(p, Establish) and notes.right(path, "attitude", *ANGLES):
-            _attitude(notes, p, path)
-        if isinstance(p, Turn) and p.attitude_deg is None and notes.right(path, *ANGLES):
-            remedy = f"give at least one of {', '.join(reversed(ANGLES))}"
-            notes.add(path, "has no target angle", remedy, p.name)
+        if own := _OWN.get(notes.data["phases"][k]["kind"]):
+            own(notes, p, path, lengths[k])
 
 
-def _attitude(notes: FindingCollector, p: Establish, path: Keys) -> None:
+def _turn(notes: FindingCollector, p: Turn, path: Keys, _: float | None) -> None:
+    """Check that a turn has a target angle."""
+    if p.attitude_deg is None and notes.right(path, *ANGLES):
+        remedy = f"give at least one of {', '.join(reversed(ANGLES))}"
+        notes.add(path, "has no target angle", remedy, p.name)
+
+
+def _establish(notes: FindingCollector, p: Establish, path: Keys, _: float | None) -> None:
     """Check that a commanded attitude has an effect."""
+    if not notes.right(path, "attitude", *ANGLES):
+        return
     given = notes.data["phases"][path[1]]
     angles = [key for key in ANGLES if key in given]
     if p.attitude == "free" and angles:
@@ -256,6 +276,37 @@ def _attitude(notes: FindingCollector, p: Establish, path: Keys) -> None:
             "use control = 'tracking', or remove this key and turn the formation in a later phase"
         )
         notes.add((*path, *(angles or ["attitude"])[:1]), problem, remedy)
+
+
+def _orbit(notes: FindingCollector, p: Orbit, path: Keys, longest: float | None) -> None:
+    """Check that an orbit has tracked slots, a rate within bounds, and an end."""
+    if p.control == "body" and notes.right(path, "control"):
+        problem = "an orbit cannot be flown by a wrench on the virtual body"
+        notes.add((*path, "control"), problem, "use control = 'tracking'")
+    if p.settle is not None and notes.right(path, *_ENDINGS):
+        notes.add((*path, "settle"), "an orbit never settles", "end it by duration or until")
+    if notes.right(path, "blend", *_ENDINGS):
+        _blended(notes, p.blend, longest, path)
+    if not notes.right(path, "rate_deg_s", "radius"):
+        return
+    rate, where = abs(np.deg2rad(p.rate_deg_s)), (*path, "rate_deg_s")
+    turns = rate * (longest or 0.0) / (2 * np.pi)
+    if rate == 0.0:
+        notes.add(where, "must not be 0", "give a rate, or use kind = 'fly' or 'hold'")
+    elif p.radius * rate > bounds.SPEED.most or p.radius * rate**2 > bounds.ACCELERATION.most:
+        problem = f"requires {p.radius * rate:.2g} m/s and {p.radius * rate**2:.2g} m/s^2, beyond the bounds"
+        notes.add(where, problem, "use a lower rate or a smaller radius")
+    elif turns > _MOST_TURNS:
+        problem = f"gives {turns:.4g} turns in {longest:g} s; the maximum is {_MOST_TURNS}"
+        notes.add(where, problem, "use a lower rate or several phases")
+
+
+#: Checks of single kinds. Arguments: the findings, the phase, its path, its maximum duration [s] or None.
+_OWN: dict[str, Callable[[FindingCollector, Any, Keys, float | None], None]] = {
+    "establish": _establish,
+    "orbit": _orbit,
+    "turn": _turn,
+}
 
 
 def _formations(
@@ -270,12 +321,12 @@ def _formations(
     for k, p in enumerate(found):
         path = ("phases", k)
         if p is None or not notes.right(path, "formation", "reference"):
-            held = None if p is None or isinstance(p, Shaping) else held
+            held = None if p is None or p.shaping is not None else held
             continue
-        if isinstance(p, Shaping):
-            _exists(notes, p.formation, path)
-            form = forms.get(p.formation)
-            if isinstance(p, Reshape) and held == "":
+        if (shaping := p.shaping) is not None:
+            _exists(notes, shaping.formation, path)
+            form = forms.get(shaping.formation)
+            if p.establishing is None and held == "":
                 problem = "no formation has been established yet"
                 notes.add(
                     (*path, "kind"), problem, "use kind = 'establish' for the first formation"
@@ -287,16 +338,14 @@ def _formations(
                 and not form.knows_slots
                 and notes.right(path, "attitude")
             ):
-                problem = (
-                    f"formation '{p.formation}' is given by distances alone, which have no axes"
-                )
+                problem = f"formation '{shaping.formation}' is given by distances alone, which have no axes"
                 remedy = "remove it, give the formation slots, or command an attitude by yaw_deg"
                 notes.add((*path, "attitude"), problem, remedy)
-            if n is not None and form is not None and sound(notes, p.formation):
-                _blendable(notes, p, form, n, path)
+            if n is not None and form is not None and sound(notes, shaping.formation):
+                _blendable(notes, shaping, form, n, path)
                 if held == "" and "agents" in parts:
-                    _reachable(notes, p, form, parts["agents"], path)
-            held = p.formation
+                    _reachable(notes, shaping, form, parts["agents"], path)
+            held = shaping.formation
         form = forms.get(held) if held else None
         tracked = p.control == "tracking" and notes.right(path, "control")
         if not tracked or n is None or form is None or not held or not sound(notes, held):
@@ -353,13 +402,14 @@ def _reachable(
 def _arrivals(notes: FindingCollector, found: Sequence[AnyPhase | None], lqr: Lqr) -> None:
     """Check that a regulator with a finite horizon has a time of arrival."""
     for k, p in enumerate(found):
-        if not isinstance(p, Steering) or p.settle is None or p.travel is not None:
+        steering = p.steering if p is not None else None
+        if steering is None or steering.settle is None or steering.travel is not None:
             continue
         if not notes.right((), "lqr"):
             continue
         for key, weights, used in (
-            ("lqr", lqr, isinstance(p, Fly)),
-            ("lqr.attitude", lqr.attitude, p.attitude_deg is not None),
+            ("lqr", lqr, "position" in steering.meets),
+            ("lqr.attitude", lqr.attitude, steering.attitude_deg is not None),
         ):
             if used and weights.horizon == "finite":
                 problem = f"the finite horizon of {key} needs a time of arrival"

@@ -6,7 +6,8 @@ The descriptions document the format: `rigidfleet missions --schema` exports the
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, Literal
+from collections.abc import Sequence
+from typing import Annotated, Any, ClassVar, Literal, get_args
 
 import numpy as np
 from pydantic import (
@@ -531,6 +532,15 @@ class Settle(Part):
 class AnyPhase(Part):
     """Keys of every phase. Exactly one of until, duration and settle ends it."""
 
+    # Properties of a kind. Other modules use these instead of testing for the kind.
+
+    #: Whether the phase takes a formation.
+    shapes: ClassVar[bool] = False
+    #: Whether the phase moves the virtual body to a goal of its own, which needs feedback control.
+    moves: ClassVar[bool] = False
+    #: Default control in architecture "body".
+    body_control: ClassVar[str] = "body"
+
     name: str = Field("", description="unique name; default: its kind and number")
     until: Time | None = Field(None, description="the phase ends at this mission time [s]")
     duration: Time | None = Field(None, description="the phase ends after this time [s]")
@@ -538,13 +548,57 @@ class AnyPhase(Part):
     control: Literal["open", "tracking", "body"] = Field(
         "tracking",
         description="open: weight compensation and input_force; tracking: each agent tracks its slot; body: "
-        "wrench on the virtual body. With architecture 'body' the default is open for establish and body for other "
-        "phases",
+        "wrench on the virtual body. With architecture 'body' the default is open for establish, tracking for "
+        "orbit and body for other phases",
     )
     input_force: Force = Field(
         (0.0, 0.0, 0.0),
         description="force on each agent in addition to weight compensation [N]; only with control 'open'",
     )
+
+    @property
+    def shaping(self) -> Shaping | None:
+        """The phase if it takes a formation, else None."""
+        return None
+
+    @property
+    def establishing(self) -> Establish | None:
+        """The phase if it also attaches the body frame to its formation, else None."""
+        return None
+
+    @property
+    def steering(self) -> Steering | None:
+        """The phase if the regulators of [lqr] steer it to a goal of its own, else None."""
+        return None
+
+    @property
+    def attitude_deg(self) -> tuple[float, float, float] | None:
+        """Commanded (roll, pitch, yaw) [deg]; None keeps the attitude commanded before."""
+        return None
+
+    @property
+    def meets(self) -> tuple[str, ...]:
+        """Which of position, velocity, attitude and rates the verdict checks at the arrival."""
+        return ()
+
+    @property
+    def turns_away(self) -> bool:
+        """Whether the phase ends in an attitude that no key commands."""
+        return False
+
+    @property
+    def least_time(self) -> float:
+        """Duration of its motion [s]. The phase should not end before."""
+        return 0.0
+
+    @property
+    def leads_to(self) -> str:
+        """Target of the phase in words; "" if it stays."""
+        return ""
+
+    def ended(self, length: float) -> dict[str, Any]:
+        """Keys that change if the pilot ends the phase after another duration [s]."""
+        return {}
 
 
 class Attitude(Part):
@@ -571,9 +625,17 @@ class Attitude(Part):
             return None
         return self.roll_deg, self.pitch_deg, self.yaw_deg
 
+    @property
+    def angles(self) -> list[str]:
+        """Commanded angles in words; empty to keep the attitude commanded before."""
+        given = zip(("roll", "pitch", "yaw"), self.attitude_deg or (), strict=False)
+        return [f"{name} {angle:g}°" for name, angle in given if angle or name == "yaw"]
+
 
 class Shaping(AnyPhase):
     """A phase that changes the formation."""
+
+    shapes: ClassVar[bool] = True
 
     formation: str = Field(description="name of the formation to take")
     reference: Literal["shape", "distances", "squares", "step"] = Field(
@@ -583,9 +645,30 @@ class Shaping(AnyPhase):
     )
     blend: Time = Field(4.0, description="duration of the blend from the start of the phase [s]")
 
+    @property
+    def shaping(self) -> Shaping:
+        """The phase itself."""
+        return self
+
+    @property
+    def least_time(self) -> float:
+        """Duration of the blend [s]."""
+        return self.blend
+
+    @property
+    def leads_to(self) -> str:
+        """The formation."""
+        return self.formation
+
+    def ended(self, length: float) -> dict[str, Any]:
+        """The formation, and a blend that is not longer than the phase."""
+        return {"formation": self.formation, "blend": min(self.blend, length)}
+
 
 class Establish(Attitude, Shaping):
     """Take a formation from the current positions of the agents, and attach the body frame to it."""
+
+    body_control: ClassVar[str] = "open"
 
     kind: Literal["establish"] = Field(description="take a formation")
     attitude: Literal["drawn", "free"] = Field(
@@ -594,6 +677,16 @@ class Establish(Attitude, Shaping):
         "world axes or [body_frame]; free: slots have the attitude nearest to the agents. The attitude is always "
         "free if no slots are tracked, or if the formation is given by distances and no angle is commanded",
     )
+
+    @property
+    def establishing(self) -> Establish:
+        """The phase itself."""
+        return self
+
+    @property
+    def leads_to(self) -> str:
+        """The formation and its commanded angles."""
+        return ", ".join([self.formation, *self.angles])
 
 
 class Reshape(Shaping):
@@ -605,12 +698,39 @@ class Reshape(Shaping):
 class Steering(Attitude, AnyPhase):
     """A phase that can change the attitude."""
 
+    moves: ClassVar[bool] = True
+
     travel: Time | None = Field(
         None, description="time from the start to the arrival [s]; default: the whole phase"
     )
     rates_deg_s: Rates = Field(
         (0.0, 0.0, 0.0), description="body rates [p, q, r] at arrival [deg/s]"
     )
+
+    @property
+    def steering(self) -> Steering:
+        """The phase itself."""
+        return self
+
+    @property
+    def meets(self) -> tuple[str, ...]:
+        """The attitude, if one is commanded."""
+        return () if self.attitude_deg is None else ("attitude", "rates")
+
+    @property
+    def least_time(self) -> float:
+        """Time to the arrival [s]."""
+        return self.travel or 0.0
+
+    @property
+    def leads_to(self) -> str:
+        """The commanded angles and rates."""
+        rates = [_vector(self.rates_deg_s, "°/s")] if any(self.rates_deg_s) else []
+        return ", ".join([*self.angles, *rates])
+
+    def ended(self, length: float) -> dict[str, Any]:
+        """A travel time that is not longer than the phase."""
+        return {} if self.travel is None else {"travel": min(self.travel, length)}
 
 
 class Fly(Steering):
@@ -619,6 +739,18 @@ class Fly(Steering):
     kind: Literal["fly"] = Field(description="fly to a waypoint")
     position: Vector = Field(description="centre of mass at arrival [x, y, z] [m]")
     velocity: Velocity = Field((0.0, 0.0, 0.0), description="its velocity at arrival [m/s]")
+
+    @property
+    def meets(self) -> tuple[str, ...]:
+        """Position and velocity, and the attitude if one is commanded."""
+        return ("position", "velocity", *super().meets)
+
+    @property
+    def leads_to(self) -> str:
+        """The waypoint and the attitude."""
+        velocity = [_vector(self.velocity, "m/s")] if any(self.velocity) else []
+        rest = super().leads_to
+        return ", ".join([_vector(self.position, "m"), *velocity, *([rest] if rest else [])])
 
 
 class Turn(Steering):
@@ -633,7 +765,62 @@ class Hold(AnyPhase):
     kind: Literal["hold"] = Field(description="stay at the commanded position and attitude")
 
 
-Phase = Annotated[Establish | Fly | Reshape | Turn | Hold, Field(discriminator="kind")]
+class Orbit(AnyPhase):
+    """Circle a point on a horizontal circle at a constant rate, and leave the circle with the velocity there."""
+
+    moves: ClassVar[bool] = True
+    body_control: ClassVar[str] = "tracking"
+
+    kind: Literal["orbit"] = Field(description="circle a point")
+    centre: Vector = Field(description="centre of the horizontal circle [x, y, z] [m]")
+    radius: Length = Field(description="radius of the circle [m]")
+    rate_deg_s: Angle = Field(
+        description="angular rate [deg/s], not 0; seen from above, > 0 is counter-clockwise and < 0 clockwise"
+    )
+    yaw: Literal["fixed", "along"] = Field(
+        "fixed",
+        description="fixed: keeps the attitude commanded before; along: the body turns with the orbit, with the same "
+        "side towards the centre as at the start",
+    )
+    blend: Time = Field(
+        4.0, description="duration of the entry from the current position onto the circle [s]"
+    )
+
+    @property
+    def meets(self) -> tuple[str, ...]:
+        """Position and velocity on the circle, and the attitude if it turns."""
+        return ("position", "velocity", *(("attitude", "rates") if self.turns_away else ()))
+
+    @property
+    def turns_away(self) -> bool:
+        """Whether the body turns with the orbit."""
+        return self.yaw == "along"
+
+    @property
+    def least_time(self) -> float:
+        """Duration of the entry [s]."""
+        return self.blend
+
+    @property
+    def leads_to(self) -> str:
+        """The circle."""
+        return f"round {_vector(self.centre, 'm')} at {self.radius:g} m, {self.rate_deg_s:g}°/s"
+
+    def ended(self, length: float) -> dict[str, Any]:
+        """An entry that is not longer than the phase."""
+        return {"blend": min(self.blend, length)}
+
+
+def _vector(values: Sequence[float], unit: str) -> str:
+    return f"({', '.join(f'{value:g}' for value in values)}) {unit}"
+
+
+Phase = Annotated[Establish | Fly | Reshape | Turn | Orbit | Hold, Field(discriminator="kind")]
+#: Models of all phases by `kind`.
+KINDS: dict[str, type[AnyPhase]] = {
+    get_args(model.model_fields["kind"].annotation)[0]: model
+    for model in get_args(get_args(Phase)[0])
+}
 Obstacle = Annotated[Box | Ground, Field(discriminator="kind")]
 
 

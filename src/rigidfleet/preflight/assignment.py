@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from rigidfleet.formation import assignment
-from rigidfleet.mission import Establish, Mission
+from rigidfleet.mission import Mission
 from rigidfleet.planning.preview import preview
 from rigidfleet.preflight.findings import Assignment, Preflight, Remark
 
@@ -21,11 +21,11 @@ _COMPARED = 200
 
 def assignment_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     """Notes if another assignment to the slots of the first formation is shorter or safer."""
-    first = next((p for p in mission.phases if isinstance(p, Establish)), None)
+    first = next((p.establishing for p in mission.phases if p.establishing is not None), None)
     slots = mission.formation_slots(first.formation) if first is not None else None
     if first is None or slots is None or not 2 <= mission.n_agents <= _COMPARED:
         return
-    index, masses = mission.phases.index(first), np.array(mission.agents.mass)
+    index, masses = mission.phases.index(first), mission.fleet.mass
     if index >= len(found.planned_phases):
         return
     for name in ("as it is", "shortest", "safe"):
@@ -39,7 +39,7 @@ def assignment_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
         clearance = assignment.nearest_way(*planned.ways, mission.agents.radius)[0]
         order = tuple(other.assigned_slots[first.formation].tolist())
         found.assignments[name] = Assignment(order, length, clearance)
-    radius = np.array(mission.agents.radius)
+    radius = mission.fleet.radius
     now, short, safe = found.assignments.values()
     if short.path_length < (1 - _WORTH) * now.path_length - _SHORT:
         text = (

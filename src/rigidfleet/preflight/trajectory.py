@@ -10,7 +10,7 @@ import numpy as np
 from rigidfleet._text import agent_names
 from rigidfleet.formation import assignment, distance_geometry
 from rigidfleet.math import lqr, proximity
-from rigidfleet.mission import Box, Establish, Ground, Mission, Reshape
+from rigidfleet.mission import Box, Ground, Mission
 from rigidfleet.mission.disturbances import intensity
 from rigidfleet.planning.preview import PlannedPhase, septic
 from rigidfleet.preflight.findings import DENSE, SLACK, Disturbed, Preflight, Remark, some
@@ -35,7 +35,7 @@ def separation_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     """Remarks on the minimum separation, and on each change of formation in which paths cross."""
     if mission.n_agents < 2:
         return
-    radius, limit = np.array(mission.agents.radius), mission.limits.separation or 0.0
+    radius, limit = mission.fleet.radius, mission.limits.separation or 0.0
     worst: dict[bool, tuple[float, float, tuple[int, ...], str]] = {}
     least = np.inf, 0.0, (0, 0)
     for number, planned in enumerate(found.planned_phases):
@@ -78,7 +78,8 @@ def _near(
 
 def _time_of(mission: Mission, planned: PlannedPhase, number: int, share: float) -> float:
     """Time [s] at which agents have flown this fraction of their paths."""
-    blend = getattr(mission.phases[number], "blend", 0.0)
+    shaping = mission.phases[number].shaping
+    blend = 0.0 if shaping is None else shaping.blend
     tau = np.linspace(0.0, 1.0, 2001)
     return float(planned.time[0] + blend * np.interp(share, septic(tau), tau))
 
@@ -101,7 +102,7 @@ def _crossing(
     assert after is not None  # the phase changes the formation
     assert planned.ways is not None
     apart = min(float(proximity.nearest(places).min()) for places in planned.ways)
-    flown = [p.formation for p in mission.phases[:number] if isinstance(p, Establish | Reshape)]
+    flown = [p.shaping.formation for p in mission.phases[:number] if p.shaping is not None]
     spaced = f"place slots at least {math.sqrt(2) * needed:.2f} m apart (now {apart:.2f} m)"
     promised = mission.assigned_turn(before, after) is not None
     if promised:
@@ -123,7 +124,7 @@ def _crossing(
 
 def downwash_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     """Remarks on vehicles in the downwash of another one."""
-    radius, limit = np.array(mission.agents.radius), mission.limits.separation_below
+    radius, limit = mission.fleet.radius, mission.limits.separation_below
     worst: dict[bool, tuple[float, float, tuple[int, ...], str]] = {}
     for planned in found.planned_phases:
         room, pair = proximity.headroom(planned.position, radius)
@@ -147,7 +148,7 @@ def downwash_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
 
 def thrust_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     """Remarks on planned thrust beyond a limit."""
-    masses, limits = np.array(mission.agents.mass), np.array(mission.agents.thrust_limit)
+    masses, limits = mission.fleet.mass, mission.fleet.thrust_limit
     weight = np.array([0.0, 0.0, mission.gravity])
     best: tuple[float, float, str, float, str, bool] | None = None
     for planned in found.planned_phases:
@@ -172,7 +173,7 @@ def disturbance_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     d = mission.disturbances
     if d is None or not found.planned_phases:
         return
-    believed, true, drag = np.array(mission.agents.mass), mission.true_mass, mission.drag
+    believed, true, drag = mission.fleet.mass, mission.true_mass, mission.drag
     wind, up = np.array(d.wind), np.array([0.0, 0.0, 1.0])
     g, speed = mission.gravity, float(np.linalg.norm(d.wind))
     k1, k2 = lqr.double_integrator_gains(mission.tracking.Q, mission.tracking.R)
@@ -181,7 +182,7 @@ def disturbance_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     noise = np.zeros(len(believed))
     if d.noise is not None:
         noise = 3 * believed * math.hypot(k1 * d.noise.position, k2 * d.noise.velocity)
-    limits = np.array(mission.agents.thrust_limit)
+    limits = mission.fleet.thrust_limit
     worst, most = -math.inf, (0.0, 0.0, "", math.inf)
     for planned in found.planned_phases:
         force = true[:, None] * (planned.acceleration + g * up)
@@ -218,21 +219,24 @@ def disturbance_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
 
 def _step_thrust(mission: Mission, found: Preflight) -> Iterator[Remark]:
     """Remarks on the forces at a step of the reference: J M^-1 J^T lambda = -beta^2 c."""
-    c, masses = mission.constraint, np.array(mission.agents.mass)
+    c, masses = mission.constraint, mission.fleet.mass
     if c.stabilisation == "none":
         return
-    limits = np.array(mission.agents.thrust_limit)
+    limits = mission.fleet.thrust_limit
     starts = [
-        np.array(mission.agents.position),
+        mission.fleet.position,
         *(planned.position[-1] for planned in found.planned_phases),
     ]
     for phase, r in zip(mission.phases, starts, strict=False):
-        if not (isinstance(phase, Establish | Reshape) and phase.reference == "step"):
+        shaping = phase.shaping
+        if shaping is None or shaping.reference != "step":
             continue
-        edges = mission.formation_edges(phase.formation)
+        edges = mission.formation_edges(shaping.formation)
         if min(len(edges), 3 * mission.n_agents) > DENSE:
             continue
-        error = distance_geometry.distances(r, edges) - mission.formation_distances(phase.formation)
+        error = distance_geometry.distances(r, edges) - mission.formation_distances(
+            shaping.formation
+        )
         J = jacobian(r, edges)
         root = np.repeat(1 / np.sqrt(masses), 3)
         f = np.linalg.lstsq(J * root, -(c.beta**2) * error, rcond=1e-7)[0] / root
@@ -241,7 +245,7 @@ def _step_thrust(mission: Mission, found: Preflight) -> Iterator[Remark]:
         i = int((need - np.where(np.isfinite(limits), limits, 0.0)).argmax())
         if need[i] > limits[i]:
             text = (
-                f"the step to '{phase.formation}' in '{phase.name}' needs {need[i]:.0f} N from agent {i + 1}"
+                f"the step to '{shaping.formation}' in '{phase.name}' needs {need[i]:.0f} N from agent {i + 1}"
                 f" (limit {limits[i]:g} N). Use reference = 'shape' or 'distances'"
             )
             yield Remark("fails" if c.solver in ("exact", "pinv") else "note", "thrust", text)
@@ -249,7 +253,7 @@ def _step_thrust(mission: Mission, found: Preflight) -> Iterator[Remark]:
 
 def obstacle_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     """Remarks on hit obstacles. Clearances of many obstacles are computed for the near ones only."""
-    radius, way = np.array(mission.agents.radius), found.planned_phases
+    radius, way = mission.fleet.radius, found.planned_phases
     if not (mission.obstacles and way):
         return
     # Bounding box of each phase, and a lower bound (L, B) of its distance to each obstacle.
@@ -320,7 +324,7 @@ def _beyond(within: Floats, thing: Box | Ground) -> Floats:
 def _too_low(mission: Mission, found: Preflight, phase: str, ground: float) -> str:
     """Why a vehicle touches the ground [m] in a phase, and the altitude that its formation needs."""
     planned = next(planned for planned in found.planned_phases if planned.phase == phase)
-    masses, radius = np.array(mission.agents.mass), np.array(mission.agents.radius)
+    masses, radius = mission.fleet.mass, mission.fleet.radius
     z = planned.position[..., 2]
     cm = z @ masses / masses.sum()
     k, i = np.unravel_index(int((z - radius).argmin()), z.shape)
@@ -338,7 +342,7 @@ def _gaps(mission: Mission, found: Preflight, radius: Floats) -> Iterator[Remark
 
     A gap lies between the nearest boxes on both sides of the centre of mass along an axis.
     """
-    masses = np.array(mission.agents.mass)
+    masses = mission.fleet.mass
     boxes = [thing for thing in mission.obstacles if isinstance(thing, Box)]
     if len(boxes) < 2:
         return

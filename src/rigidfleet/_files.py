@@ -1,0 +1,69 @@
+"""Write files without ever leaving a partial one."""
+
+from __future__ import annotations
+
+import os
+import secrets
+from collections.abc import Generator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO
+
+from rigidfleet.errors import ResultError
+
+
+@contextmanager
+def replacing(path: str | Path, *, private: bool = False) -> Generator[IO[bytes]]:
+    """Open a new file that replaces the old one once all data are written.
+
+    Parameters
+    ----------
+    path : path of the file
+    private : whether only this user can read it
+
+    Raises
+    ------
+    OSError
+        The file cannot be written. An old file is unchanged.
+    """
+    target = Path(os.path.realpath(path))  # replaces the target of a symbolic link, not the link
+    part = target.with_name(f".{target.name[:200]}.{secrets.token_hex(4)}.part")
+    if target.is_dir():
+        raise IsADirectoryError
+    mode = 0o600 if private else 0o666
+    try:
+        with open(part, "xb", opener=lambda name, flags: os.open(name, flags, mode)) as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(part, target)
+    except BaseException:
+        part.unlink(missing_ok=True)
+        raise
+
+
+def write_file(path: Path, data: bytes) -> None:
+    """Write a file without ever leaving a partial one.
+
+    Raises
+    ------
+    ResultError
+        The file cannot be written. The message has the cause and the remedy.
+    """
+    try:
+        with replacing(path) as file:
+            file.write(data)
+    except OSError as error:
+        raise ResultError(f"{path}: {why_not(error, 'written', path)}") from error
+
+
+def why_not(error: OSError, done: str, path: Path) -> str:
+    """Cause and remedy of a file that cannot be ``done`` ("read", "written")."""
+    match error:
+        case IsADirectoryError():
+            return "is a folder. Give the path of a file."
+        case FileNotFoundError() | NotADirectoryError():
+            return f"cannot be {done}: there is no folder {path.parent}. Create it first."
+        case PermissionError():
+            return f"cannot be {done}: permission denied. Choose another folder or change the permissions."
+    return f"cannot be {done}: {error.strerror or error}. Choose another place."
