@@ -85,7 +85,7 @@ def test_help_opens_with_sense():
     text = pydoc.plain(pydoc.render_doc(rf.Result))
     head = text.split("\n", 3)[3].splitlines()
     assert head[0] == " |  Result(**fields)"
-    assert "Record of one flight" in head[2]
+    assert "Record of a flight" in head[2]
     opening = "\n".join(head[:14])
     assert all(words in opening for words in ("simulate(", ".save(", "Result.load("))
     assert max(map(len, text.splitlines())) < 160

@@ -1,4 +1,4 @@
-"""Files written whole or not at all."""
+"""Write files without ever leaving a partial one."""
 
 from __future__ import annotations
 
@@ -7,27 +7,26 @@ import secrets
 from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import (
-    IO,
-    TYPE_CHECKING,
-)
+from typing import IO
 
 from rigidfleet.errors import ResultError
-
-if TYPE_CHECKING:
-    pass
 
 
 @contextmanager
 def replacing(path: str | Path, *, private: bool = False) -> Generator[IO[bytes]]:
-    """A new file that takes the place of the old one as soon as it is whole; ``private``: for this user alone.
+    """Open a new file that replaces the old one once all data are written.
+
+    Parameters
+    ----------
+    path : path of the file
+    private : whether only this user can read it
 
     Raises
     ------
     OSError
-        It cannot be written; the old file is as it was.
+        The file cannot be written. An old file is unchanged.
     """
-    target = Path(os.path.realpath(path))  # through a symbolic link, not in place of it
+    target = Path(os.path.realpath(path))  # replaces the target of a symbolic link, not the link
     part = target.with_name(f".{target.name[:200]}.{secrets.token_hex(4)}.part")
     if target.is_dir():
         raise IsADirectoryError
@@ -49,7 +48,7 @@ def write_file(path: Path, data: bytes) -> None:
     Raises
     ------
     ResultError
-        It cannot be written; the message says why and what to do.
+        The file cannot be written. The message has the cause and the remedy.
     """
     try:
         with replacing(path) as file:
@@ -59,7 +58,7 @@ def write_file(path: Path, data: bytes) -> None:
 
 
 def why_not(error: OSError, done: str, path: Path) -> str:
-    """Why a file could not be ``done`` ("read", "written"), and what to do."""
+    """Cause and remedy of a file that cannot be ``done`` ("read", "written")."""
     match error:
         case IsADirectoryError():
             return "is a folder. Give the path of a file."

@@ -124,9 +124,9 @@ class PhaseRecord:
     formation : name of the formation that is held or approached; None if no formation has been established
     t_start, t_end : mission time [s]
     settled : whether a phase that ends by settling has settled; None for a phase that ends at a time
-    target : for phases with a target of their own, and for establish phases with a commanded attitude: {"time" [s],
-        "position" [m], "velocity" [m/s], "attitude" quaternion, "rates" [rad/s]}. Entries other than the time are None
-        if nothing is commanded
+    target : for phases with a goal of their own (fly, turn, orbit), and for establish phases with a commanded
+        attitude: {"time" [s], "position" [m], "velocity" [m/s], "attitude" quaternion, "rates" [rad/s]}. Entries other
+        than the time are None if nothing is commanded
     extremes : worst values of the phase in continuous time, by name: separation, clearance, separation_below, lost
         (distance of a lost vehicle to one that still flies), geofence (distance beyond it), lowest, highest [m];
         speed [m/s]; acceleration [m/s^2]; thrust, thrust_margin (thrust minus its limit), constraint_force, tension
@@ -429,7 +429,7 @@ class Result:
         ):
             return "the arrays name more obstacles than it has"
         if unknown := {p.kind for p in self.phases} - {*KINDS}:
-            return f"there are no phases of kind {min(map(repr, unknown))}"
+            return f"there is no kind of phase {min(map(repr, unknown))}"
         unknown = {p.formation for p in self.phases} - {None, *mission.formations}
         return f"it has no formation {min(map(repr, unknown))}" if unknown else ""
 
@@ -594,6 +594,8 @@ _OPTIONAL = {f.name for f in fields(Result) if f.name in VARIABLES and f.default
 _INTEGERS = {name for name in VARIABLES if _HINTS[name].__origin__ == Ints}
 #: Quantities whose minimum is the worst value. The same holds for all clearances.
 _LEAST = frozenset(("separation", "separation_below", "lost", "lowest"))
+
+
 #: Attributes of a file and their types. Types other than int and str are stored as JSON.
 _ATTRIBUTES: dict[str, Any] = {
     "mission_text": str,
@@ -607,6 +609,8 @@ _ATTRIBUTES: dict[str, Any] = {
 }
 #: Attribute that identifies a file as a result.
 _MARK = "rigidfleet_schema_version"
+
+
 #: Maximum size of a chunk [bytes]: the size of HDF5's cache.
 _CHUNK = 1 << 20
 

@@ -19,7 +19,6 @@ from rigidfleet.assessment.outcome import (
     value,
 )
 from rigidfleet.assessment.verdict import Verdict
-from rigidfleet.mission import KINDS
 from rigidfleet.result import Result
 from rigidfleet.typing import Floats
 
@@ -98,6 +97,8 @@ def _record(measured: Measurements) -> Iterator[CheckResult]:
 
 def _unseen(measured: Measurements) -> Iterator[CheckResult]:
     """Ends of shaping phases and waypoints of which no sample tells: they are not judged, nor passed."""
+    from rigidfleet.mission import KINDS  # takes long to load, and the flight has loaded it
+
     result = measured.result
     last = len(result.phases) - 1
     for i, p in enumerate(result.phases):
@@ -131,6 +132,8 @@ def _settled(phases: list[PhaseVerdict]) -> Iterator[CheckResult]:
 
 def _shapes(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[CheckResult]:
     """Whether formations are what they should be, where they should be by then."""
+    from rigidfleet.mission import KINDS  # takes long to load, and the flight has loaded it
+
     for i, p in enumerate(phases):
         shaping = KINDS[p.kind].shapes or i == len(phases) - 1
         if not (shaping and p.finished) or p.formation is None:

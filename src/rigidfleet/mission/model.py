@@ -40,13 +40,21 @@ _DENSE = 1000
 
 
 class Fleet(NamedTuple):
-    """What all vehicles start from and can bear: read-only arrays, made once."""
+    """Parameters and start states of all vehicles, as read-only arrays.
 
-    mass: Floats  # (N,) as the laws believe [kg]
-    position: Floats  # (N, 3) at the start [m]
-    velocity: Floats  # (N, 3) at the start [m/s]
-    radius: Floats  # (N,) [m]
-    thrust_limit: Floats  # (N,) [N], infinite where unlimited
+    Attributes
+    ----------
+    mass : masses (N,) that the control laws use [kg]
+    position, velocity : states at the start (N, 3) [m, m/s]
+    radius : radii (N,) [m]
+    thrust_limit : maximum thrusts (N,) [N], infinite if unlimited
+    """
+
+    mass: Floats
+    position: Floats
+    velocity: Floats
+    radius: Floats
+    thrust_limit: Floats
 
 
 class Mission(Contents):
@@ -95,7 +103,7 @@ class Mission(Contents):
 
     @property
     def size_in_words(self) -> str:
-        """How much of everything there is: 3 agents, 2 formations, 12 phases, 90 s."""
+        """Size of the mission: 3 agents, 2 formations, 12 phases, 90 s."""
         return counted(self.n_agents, len(self.formations), self.phases)
 
     def __repr__(self) -> str:
@@ -304,7 +312,7 @@ class Mission(Contents):
 
     @cached_property
     def fleet(self) -> Fleet:
-        """The vehicles as arrays."""
+        """Parameters and start states of all vehicles as arrays."""
         fleet = Fleet(
             *(np.array(getattr(self.agents, name), dtype=float) for name in Fleet._fields)
         )

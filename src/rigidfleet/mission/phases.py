@@ -30,7 +30,7 @@ from rigidfleet.mission.schema import (
 _ENDINGS = ("until", "duration", "settle")
 #: Maximum number of samples of a result.
 _MOST_SAMPLES = 1_000_000
-#: Maximum number of turns of an orbit: beyond, the samples of a preview would miss its circle.
+#: Maximum number of turns of an orbit: with more, the samples of the planned path would miss the circle.
 _MOST_TURNS = 100
 #: Maximum number of values in a result: 4 GB.
 _MOST_NUMBERS = 5e8
@@ -116,7 +116,7 @@ def _times(
 ) -> tuple[float | None, list[float | None]]:
     """Check that each phase has one ending and that ends increase.
 
-    Return the latest end and the greatest lengths [s], None if unknown.
+    Returns the latest end and the maximum duration of each phase [s]; None if unknown.
     """
     lengths: list[float | None] = [None] * len(found)
     first: float | None = 0.0  # earliest and latest start of the phase; None if unknown
@@ -233,7 +233,7 @@ def _controls(
     found: Sequence[AnyPhase | None],
     lengths: Sequence[float | None],
 ) -> None:
-    """Who steers, and what a kind alone asks for."""
+    """Check the control of each phase, and the conditions of its kind."""
     local = notes.data.get("architecture", "local") == "local"
     for k, p in enumerate(found):
         path = ("phases", k)
@@ -243,7 +243,8 @@ def _controls(
             remedy = "use control = 'tracking', or architecture = 'body' for the mission"
             notes.add((*path, "control"), "requires architecture = 'body'", remedy)
         if p.control == "open" and p.moves:
-            problem = f"a {notes.data['phases'][k]['kind']} phase needs feedback control"
+            kind_name = notes.data["phases"][k]["kind"]
+            problem = f"kind '{kind_name}' needs feedback control"
             others = " or 'body'" if p.body_control == "body" else ""
             notes.add((*path, "control"), problem, f"use control = 'tracking'{others}")
         if p.control != "open" and any(p.input_force):
@@ -278,9 +279,9 @@ def _establish(notes: FindingCollector, p: Establish, path: Keys, _: float | Non
 
 
 def _orbit(notes: FindingCollector, p: Orbit, path: Keys, longest: float | None) -> None:
-    """A circle is flown by tracked slots, at a rate, and has an end."""
+    """Check that an orbit has tracked slots, a rate within bounds, and an end."""
     if p.control == "body" and notes.right(path, "control"):
-        problem = "a wrench on the virtual body leads to waypoints, not round a circle"
+        problem = "an orbit cannot be flown by a wrench on the virtual body"
         notes.add((*path, "control"), problem, "use control = 'tracking'")
     if p.settle is not None and notes.right(path, *_ENDINGS):
         notes.add((*path, "settle"), "an orbit never settles", "end it by duration or until")
@@ -291,16 +292,16 @@ def _orbit(notes: FindingCollector, p: Orbit, path: Keys, longest: float | None)
     rate, where = abs(np.deg2rad(p.rate_deg_s)), (*path, "rate_deg_s")
     turns = rate * (longest or 0.0) / (2 * np.pi)
     if rate == 0.0:
-        notes.add(where, "would circle nothing", "give a rate, or use kind = 'fly' or 'hold'")
+        notes.add(where, "must not be 0", "give a rate, or use kind = 'fly' or 'hold'")
     elif p.radius * rate > bounds.SPEED.most or p.radius * rate**2 > bounds.ACCELERATION.most:
-        problem = f"asks for {p.radius * rate:.2g} m/s and {p.radius * rate**2:.2g} m/s^2"
-        notes.add(where, problem, "use a lower rate, or a smaller radius")
+        problem = f"requires {p.radius * rate:.2g} m/s and {p.radius * rate**2:.2g} m/s^2, beyond the bounds"
+        notes.add(where, problem, "use a lower rate or a smaller radius")
     elif turns > _MOST_TURNS:
-        problem = f"makes {turns:.4g} turns in {longest:g} s, more than {_MOST_TURNS}"
-        notes.add(where, problem, "use a lower rate, or several phases")
+        problem = f"gives {turns:.4g} turns in {longest:g} s; the maximum is {_MOST_TURNS}"
+        notes.add(where, problem, "use a lower rate or several phases")
 
 
-#: What can be wrong with one kind alone: its phase, where it is, and its greatest length [s] if that is known.
+#: Checks of single kinds. Arguments: the findings, the phase, its path, its maximum duration [s] or None.
 _OWN: dict[str, Callable[[FindingCollector, Any, Keys, float | None], None]] = {
     "establish": _establish,
     "orbit": _orbit,

@@ -532,13 +532,13 @@ class Settle(Part):
 class AnyPhase(Part):
     """Keys of every phase. Exactly one of until, duration and settle ends it."""
 
-    # What a kind is to the rest of the code, which asks for this and not for the kind.
+    # Properties of a kind. Other modules use these instead of testing for the kind.
 
-    #: Whether it takes a formation.
+    #: Whether the phase takes a formation.
     shapes: ClassVar[bool] = False
-    #: Whether it leads the virtual body to a goal of its own, so that somebody has to steer.
+    #: Whether the phase moves the virtual body to a goal of its own, which needs feedback control.
     moves: ClassVar[bool] = False
-    #: Its control in architecture "body", unless another is given.
+    #: Default control in architecture "body".
     body_control: ClassVar[str] = "body"
 
     name: str = Field("", description="unique name; default: its kind and number")
@@ -558,46 +558,46 @@ class AnyPhase(Part):
 
     @property
     def shaping(self) -> Shaping | None:
-        """The phase, if it takes a formation."""
+        """The phase if it takes a formation, else None."""
         return None
 
     @property
     def establishing(self) -> Establish | None:
-        """The phase, if it attaches the body frame to the formation that it takes."""
+        """The phase if it also attaches the body frame to its formation, else None."""
         return None
 
     @property
     def steering(self) -> Steering | None:
-        """The phase, if the regulators of [lqr] lead it to a goal of its own."""
+        """The phase if the regulators of [lqr] steer it to a goal of its own, else None."""
         return None
 
     @property
     def attitude_deg(self) -> tuple[float, float, float] | None:
-        """Commanded (roll, pitch, yaw) [deg]; None to keep the attitude commanded before."""
+        """Commanded (roll, pitch, yaw) [deg]; None keeps the attitude commanded before."""
         return None
 
     @property
     def meets(self) -> tuple[str, ...]:
-        """Which of position, velocity, attitude and rates the verdict holds it to, at its arrival."""
+        """Which of position, velocity, attitude and rates the verdict checks at the arrival."""
         return ()
 
     @property
     def turns_away(self) -> bool:
-        """Whether it leaves an attitude that nobody has asked for by name."""
+        """Whether the phase ends in an attitude that no key commands."""
         return False
 
     @property
     def least_time(self) -> float:
-        """How long its own motion takes [s]: it should not end before."""
+        """Duration of its motion [s]. The phase should not end before."""
         return 0.0
 
     @property
     def leads_to(self) -> str:
-        """What it leads to, in words; "" if it stays."""
+        """Target of the phase in words; "" if it stays."""
         return ""
 
     def ended(self, length: float) -> dict[str, Any]:
-        """Keys that another length [s] changes, where the phase was ended by hand."""
+        """Keys that change if the pilot ends the phase after another duration [s]."""
         return {}
 
 
@@ -627,7 +627,7 @@ class Attitude(Part):
 
     @property
     def angles(self) -> list[str]:
-        """The attitude commanded, in words; empty to keep the one before."""
+        """Commanded angles in words; empty to keep the attitude commanded before."""
         given = zip(("roll", "pitch", "yaw"), self.attitude_deg or (), strict=False)
         return [f"{name} {angle:g}°" for name, angle in given if angle or name == "yaw"]
 
@@ -652,7 +652,7 @@ class Shaping(AnyPhase):
 
     @property
     def least_time(self) -> float:
-        """Length of the blend [s]."""
+        """Duration of the blend [s]."""
         return self.blend
 
     @property
@@ -661,7 +661,7 @@ class Shaping(AnyPhase):
         return self.formation
 
     def ended(self, length: float) -> dict[str, Any]:
-        """The formation, and a blend that is not longer."""
+        """The formation, and a blend that is not longer than the phase."""
         return {"formation": self.formation, "blend": min(self.blend, length)}
 
 
@@ -685,7 +685,7 @@ class Establish(Attitude, Shaping):
 
     @property
     def leads_to(self) -> str:
-        """The formation, and how it is to lie."""
+        """The formation and its commanded angles."""
         return ", ".join([self.formation, *self.angles])
 
 
@@ -724,12 +724,12 @@ class Steering(Attitude, AnyPhase):
 
     @property
     def leads_to(self) -> str:
-        """The attitude, and its rates."""
+        """The commanded angles and rates."""
         rates = [_vector(self.rates_deg_s, "°/s")] if any(self.rates_deg_s) else []
         return ", ".join([*self.angles, *rates])
 
     def ended(self, length: float) -> dict[str, Any]:
-        """An arrival that is not later."""
+        """A travel time that is not longer than the phase."""
         return {} if self.travel is None else {"travel": min(self.travel, length)}
 
 
@@ -742,12 +742,12 @@ class Fly(Steering):
 
     @property
     def meets(self) -> tuple[str, ...]:
-        """The waypoint, and the attitude if one is commanded."""
+        """Position and velocity, and the attitude if one is commanded."""
         return ("position", "velocity", *super().meets)
 
     @property
     def leads_to(self) -> str:
-        """The waypoint, and the attitude."""
+        """The waypoint and the attitude."""
         velocity = [_vector(self.velocity, "m/s")] if any(self.velocity) else []
         rest = super().leads_to
         return ", ".join([_vector(self.position, "m"), *velocity, *([rest] if rest else [])])
@@ -766,29 +766,29 @@ class Hold(AnyPhase):
 
 
 class Orbit(AnyPhase):
-    """Circle a point on a level circle, at a steady rate, and leave it with the velocity there."""
+    """Circle a point on a horizontal circle at a constant rate, and leave the circle with the velocity there."""
 
     moves: ClassVar[bool] = True
     body_control: ClassVar[str] = "tracking"
 
     kind: Literal["orbit"] = Field(description="circle a point")
-    centre: Vector = Field(description="centre of the circle, which is level [x, y, z] [m]")
+    centre: Vector = Field(description="centre of the horizontal circle [x, y, z] [m]")
     radius: Length = Field(description="radius of the circle [m]")
     rate_deg_s: Angle = Field(
-        description="rate [deg/s], not 0: counter-clockwise seen from above where > 0, clockwise where < 0"
+        description="angular rate [deg/s], not 0; seen from above, > 0 is counter-clockwise and < 0 clockwise"
     )
     yaw: Literal["fixed", "along"] = Field(
         "fixed",
-        description="fixed: the attitude commanded before is kept; along: the body turns with the orbit, and shows "
-        "the centre the side that it had there at first",
+        description="fixed: keeps the attitude commanded before; along: the body turns with the orbit, with the same "
+        "side towards the centre as at the start",
     )
     blend: Time = Field(
-        4.0, description="length of the run-in [s], from where the body is onto the circle"
+        4.0, description="duration of the entry from the current position onto the circle [s]"
     )
 
     @property
     def meets(self) -> tuple[str, ...]:
-        """The place on the circle where it ends, and the attitude if that turns."""
+        """Position and velocity on the circle, and the attitude if it turns."""
         return ("position", "velocity", *(("attitude", "rates") if self.turns_away else ()))
 
     @property
@@ -798,7 +798,7 @@ class Orbit(AnyPhase):
 
     @property
     def least_time(self) -> float:
-        """Length of the run-in [s]."""
+        """Duration of the entry [s]."""
         return self.blend
 
     @property
@@ -807,7 +807,7 @@ class Orbit(AnyPhase):
         return f"round {_vector(self.centre, 'm')} at {self.radius:g} m, {self.rate_deg_s:g}°/s"
 
     def ended(self, length: float) -> dict[str, Any]:
-        """A run-in that is not longer."""
+        """An entry that is not longer than the phase."""
         return {"blend": min(self.blend, length)}
 
 
@@ -816,7 +816,7 @@ def _vector(values: Sequence[float], unit: str) -> str:
 
 
 Phase = Annotated[Establish | Fly | Reshape | Turn | Orbit | Hold, Field(discriminator="kind")]
-#: Every kind of phase, by its name.
+#: Models of all phases by `kind`.
 KINDS: dict[str, type[AnyPhase]] = {
     get_args(model.model_fields["kind"].annotation)[0]: model
     for model in get_args(get_args(Phase)[0])
