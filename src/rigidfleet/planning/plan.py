@@ -1,7 +1,7 @@
-"""From a mission and the state at a switch to what the kernel flies: everything known before.
+"""Make the plan of a phase from the mission and the state at the switch.
 
-A phase of a mission becomes a `Problem`: time functions (blends, piecewise quintics), gain tables
-and weights, which the kernel only evaluates. What the next phase inherits travels in a `PhaseState`.
+A phase becomes a `Problem`: time functions (blends, piecewise quintics), gain tables and weights, which the
+kernel only evaluates. A `PhaseState` holds what the next phase inherits.
 """
 
 from __future__ import annotations
@@ -66,20 +66,20 @@ from rigidfleet.typing import Bools, Floats, Ints
 
 _SOLVERS = {"iterated": ITERATED, "spectral": SPECTRAL, "exact": EXACT, "pinv": PINV}
 _KINDS = {"shape": SHAPE, "squares": SQUARED, "step": CONSTANT}
-#: A formation is held from where all pairs are right within this part of the shortest distance.
+#: Greatest error of any pair, as a share of the shortest distance, at which a formation counts as held.
 _NEAR = 0.1
 _SPLITS = {"equal": PINV_EQUAL, "inertia": PINV_INERTIA, "inertia+force": PINV_INERTIA_FORCE}
 
 
-#: Residual of an iterative solve, as a share of the integrator's tolerance; the relative one within bounds.
+#: Residual of an iterative solve, as a share of the integrator's tolerance; the relative residual has bounds.
 _RESIDUAL, _LEAST_RESIDUAL, _MOST_RESIDUAL = 1e-3, 1e-13, 1e-8
-#: Below this share of a velocity's tolerance, the error of an acceleration, times a second, is nothing.
+#: Error of an acceleration that is ignored, as a share of the velocity's tolerance per second.
 _FLOOR = 3e-2
 
 
 @dataclass
 class PhasePlan:
-    """A phase, ready to fly. It is whole: what flies it needs no mission."""
+    """A phase, ready to fly. It holds all that a flight needs, so that no mission is required."""
 
     phase: Phase
     start: float  # [s]
@@ -88,29 +88,29 @@ class PhasePlan:
     edges: Ints  # (m, 2), from 0
     slots: Floats | None  # (N, 3) at the end, about the CM, body axes [m]
     formation: str | None
-    knows_slots: bool  # whether slots of the formation are known, and not its distances alone
+    knows_slots: bool  # whether the formation has slots, not only distances
     distances: Floats  # (m,) at the end [m]
     goal: Pose | None
-    arrival: float  # when the goal is to be reached [s]
+    arrival: float  # time at which the goal is reached [s]
     frame: Floats | None  # attitude (3, 3) of the mean-axis frame at the start
     attached: bool  # whether the slots carry the body frame
-    lies: bool  # whether the formation is to lie as the mission says once it is established
-    method: solvers.Method  # how the multipliers are solved for
+    lies: bool  # whether the mission prescribes the attitude of the established formation
+    method: solvers.Method  # method that solves for the multipliers
     constraint: Constraint  # options of the law
     integrator: IntegratorOptions  # options of the integration
-    damping: Callable[[Bools], float]  # mu of the vehicles left, which are not lost (N,)
-    lost_at: Floats  # (N,) when vehicles are lost [s]
-    masses: Floats  # (N,) as believed, lost vehicles included [kg]
+    damping: Callable[[Bools], float]  # damping mu, from which vehicles are lost (N,)
+    lost_at: Floats  # (N,) times at which vehicles are lost [s]
+    masses: Floats  # (N,) assumed by the laws, lost vehicles included [kg]
     before: PhaseState  # the state that the phase starts from
 
     @property
     def large(self) -> bool:
-        """Whether multipliers are solved for by a method of large formations."""
+        """Whether a method for large formations solves for the multipliers."""
         return self.method != "dense"
 
     @property
     def target(self) -> dict[str, Any] | None:
-        """What a fly or turn phase is to reach, or the attitude of a formation established, for the record."""
+        """The target of a fly or turn phase, or the attitude of an established formation, for the record."""
         goal, phase, lies = self.goal, self.phase, self.lies
         if goal is None or not (isinstance(phase, Fly | Turn) or lies):
             return None
@@ -153,12 +153,12 @@ class PhasePlan:
         )
 
     def residual(self) -> tuple[float, float]:
-        """Relative residual of an iterative solve for the multipliers, and what is nothing of it [m/s^2]."""
+        """Relative and absolute [m/s^2] residual of an iterative solve for the multipliers."""
         share = min(max(_RESIDUAL * self.integrator.rtol, _LEAST_RESIDUAL), _MOST_RESIDUAL)
-        return share, _FLOOR * float(self.velocity_tolerance().min())  # of a step of a second
+        return share, _FLOOR * float(self.velocity_tolerance().min())  # over a step of 1 s
 
     def release(self, lost: Bools) -> Bools:
-        """Take edges to vehicles ``lost`` (N,) away; return which (m,) are kept."""
+        """Remove the edges of vehicles ``lost`` (N,); return which edges (m,) are kept."""
         kept = ~np.any(lost[self.edges], axis=1)
         self.edges, self.distances = self.edges[kept], self.distances[kept]
         self.method = solvers.choose(len(lost), self.edges, self.constraint.solver)
@@ -201,13 +201,13 @@ def plan_phase(
 
     Parameters
     ----------
-    disturbance : what acts on the flight and is told to no law; none by default
-    external : address of a force callback, 0 for none
+    disturbance : disturbances of the flight, which no law knows; none by default
+    external : address of a force callback; 0 for none
 
     Raises
     ------
     StoppedError
-        The phase has no time left, or would take hours to fly.
+        The phase has no time left, or would take hours to simulate.
     """
     t_end = _end(phase, now.t)
     _check_size(mission, phase)
@@ -222,7 +222,7 @@ def plan_phase(
     if not shaping:
         d1 = now.reference.of(edges, d1)
     d0 = now.reference.of(edges, distance_geometry.distances(now.r, edges))
-    # Slots are blended wherever the shape leads; where distances lead, slots only follow if tracked.
+    # Slots are blended if the reference is a shape; if it is distances, slots matter only when tracked.
     left = masses if now.lost is None else np.where(now.lost, 0.0, masses)
     before = slots_before(mission, now, left)
     after = target if shaping and target is not None else before
@@ -289,15 +289,15 @@ def _end(phase: Phase, start: float) -> float:
     if phase.until is not None:
         if phase.until <= start:
             raise StoppedError(
-                f"phase '{phase.name}' is to end at {phase.until:g} s, but the phases before it took until"
-                f" {start:.2f} s. Give it a duration in place of until"
+                f"phase '{phase.name}' is to end at {phase.until:g} s, but the phases before it end at"
+                f" {start:.2f} s. Give it a duration instead of until"
             )
         return phase.until
     return start + (phase.duration or (phase.settle or Settle()).timeout)
 
 
 def _check_size(mission: Mission, phase: Phase) -> None:
-    """Refuse a phase that would take hours to fly."""
+    """Refuse a phase that would take hours to simulate."""
     if not isinstance(phase, Establish | Reshape):
         return
     n, solver = mission.n_agents, mission.constraint.solver
@@ -307,8 +307,8 @@ def _check_size(mission: Mission, phase: Phase) -> None:
     size = solvers.equations(n, len(edges), solver)
     if size > solvers.MOST_DENSE:
         raise StoppedError(
-            f"phase '{phase.name}' takes '{phase.formation}', whose {len(edges):,} edges between"
-            f' {n:,} agents make {size:,} equations for the constraint force, and solver "{solver}" needs'
+            f"phase '{phase.name}' flies '{phase.formation}', whose {len(edges):,} edges between"
+            f' {n:,} agents give {size:,} equations for the constraint force; solver "{solver}" needs'
             f" their eigenvalues; with more than {solvers.MOST_DENSE:,} a flight takes hours. Use solver ="
             ' "iterated" (or "exact"), give it fewer edges, or track slots with edges = []'
         )
@@ -316,13 +316,13 @@ def _check_size(mission: Mission, phase: Phase) -> None:
 
 @lru_cache(64)
 def _graph(edges: bytes, masses: bytes, *, large: bool) -> Graph:
-    """The constraint graph, which the kernel only reads: most phases have the one before."""
+    """The constraint graph, cached because most phases have the same one as the phase before."""
     pairs = np.frombuffer(edges, dtype=np.int64).reshape(-1, 2).copy()
     return graph(pairs, np.frombuffer(masses), large=large)
 
 
 def _held(mission: Mission, name: str | None, now: PhaseState) -> str | None:
-    """The formation, if the agents left are in it: all pairs within a tenth of the shortest."""
+    """The formation, if the remaining agents are in it: all pairs within a tenth of the shortest distance."""
     slots = mission.formation_slots(name) if name else None
     if slots is None:
         return None
@@ -372,10 +372,10 @@ _NO_FEEDBACK = Feedback(
 def _motion(
     mission: Mission, start: Pose, goal: Pose, t0: float, arrival: float, t_end: float
 ) -> Motion:
-    """LQR of the virtual body from one pose to another, as the trajectory it makes.
+    """The trajectory of the virtual body under LQR from one pose to another.
 
-    From arrival to ``t_end`` the tracking gains take over, or what the finite horizon has left of
-    the velocity's error would carry the body away.
+    From arrival to ``t_end`` the tracking gains take over; otherwise the velocity error that the finite
+    horizon leaves would carry the body away.
     """
     T = arrival - t0
     flights = body_trajectory(mission, start, goal, T)
@@ -392,7 +392,7 @@ def _motion(
         pieces.append(piece)
     knots = np.concatenate([t0 + times, arrival + after[1:]])
     coefficients = np.concatenate(pieces, axis=1)
-    # Another layout of an array would be another type, and compile the kernel once more.
+    # An array of another memory layout has another type, and would compile the kernel again.
     return Motion(knots, np.ascontiguousarray(coefficients), np.ascontiguousarray(goal.T))
 
 
@@ -401,12 +401,12 @@ def _knots(law: Regulator, T: float) -> Floats:
 
 
 def _feedback(mission: Mission, goal: Pose, t0: float, arrival: float, *, moves: bool) -> Feedback:
-    """LQR on the virtual body itself: gain tables to a waypoint, tracking gains where it stays."""
+    """LQR of the virtual body itself: gain tables on the way to a waypoint, tracking gains at rest."""
     hold = lqr.double_integrator_gains(mission.tracking.Q, mission.tracking.R) * 2
     to_go, gain, slope = np.zeros(0), np.zeros((0, 4)), np.zeros((0, 4))
     if moves:
-        # Gains grow like 1/tau near arrival, until S bounds them: on a geometric grid cubics keep
-        # them to 1e-8.
+        # Gains grow like 1/tau near arrival, until S bounds them. Cubics on a geometric grid are
+        # exact to 1e-8.
         horizon = arrival - t0
         to_go = np.concatenate([[0.0], np.geomspace(min(1e-6, 1e-3 * horizon), horizon, 1000)])
         tables = [_gains(law, to_go) for law in (mission.lqr, mission.lqr.attitude)]
@@ -425,8 +425,6 @@ def _gains(law: Regulator, to_go: Floats) -> tuple[Floats, Floats]:
     A, B = [[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]]
     P, K = lqr.finite_horizon(A, B, law.Q, np.atleast_2d(law.R), law.S, to_go)
     gain = K[:, 0]
-    with np.errstate(
-        over="ignore", invalid="ignore"
-    ):  # weights without measure: the flight will say so
+    with np.errstate(over="ignore", invalid="ignore"):  # absurd weights: the flight reports them
         slope = np.stack([P[:, 0, 0], 2 * P[:, 0, 1] + law.Q[1]], axis=1) / law.R
         return gain, slope - gain * gain[:, 1:]
