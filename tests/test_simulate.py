@@ -486,7 +486,7 @@ def test_sparse_times_leave_nothing_passed_unseen():
     ("constraint", "changes", "remedy"),
     [
         ({"solver": "exact"}, {}, 'Use solver = "iterated" (or "spectral")$'),
-        ({"solver": "exact"}, {"reference": "step"}, 'smoothly: reference = "shape"$'),
+        ({"solver": "exact"}, {"reference": "step"}, 'a smooth reference: reference = "shape"$'),
     ],
 )
 def test_a_law_without_bound_is_diagnosed_with_what_helps(constraint, changes, remedy):
@@ -554,7 +554,7 @@ def test_distances_without_slots_are_not_told_to_blend_a_shape():
     agents = {"mass": 1.0, "position": [[1, 6, 3], [8, 3, 3], [7, 6, 3], [0, 0, 3]]}
     phase = establish(formation="line", reference="step", until=9.0)
     mission = a_mission(phase, formations=line, agents=agents, constraint={"solver": "exact"})
-    assert simulate(mission).ending.endswith('smoothly: reference = "distances"')
+    assert simulate(mission).ending.endswith('a smooth reference: reference = "distances"')
 
 
 def test_a_stall_says_what_makes_the_steps_short():
@@ -983,11 +983,11 @@ def test_a_controller_flies_phases_that_end_by_settling_too():
 @pytest.mark.parametrize(
     ("returned", "message"),
     [
-        (np.zeros(3), r"array of shape \(3,\) at t = .*; return \(3, 3\)"),
+        (np.zeros(3), r"array of shape \(3,\) at t = .*; return an array \(3, 3\)"),
         (np.zeros((2, 3)), r"array of shape \(2, 3\)"),
         (np.full((3, 3), np.nan), "not finite at t = "),
         (np.full((3, 3), np.inf), "not finite at t = "),
-        (None, r"return \(3, 3\)"),
+        (None, r"return an array \(3, 3\)"),
         (np.zeros((3, 3), dtype=complex), "complex numbers at t = "),
         ("north", "'north' at t = "),
     ],

@@ -11,7 +11,7 @@ from rigidfleet.plotting.style import settings
 
 
 class Figure(figure.Figure):
-    """A figure of matplotlib that is its own picture where it ends a cell, without any magic line."""
+    """A matplotlib figure that a notebook shows at the end of a cell, without a magic command."""
 
     def _repr_png_(self) -> tuple[bytes, dict[str, Any]]:
         """The picture, and the size it is shown at: fine screens have dots to spare."""
