@@ -1,4 +1,4 @@
-"""The page's parts, put together: one file of HTML that needs nothing else."""
+"""Assemble the parts of a page into one self-contained HTML file."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ def page(
     info : plain data and arrays; see ``describe`` and recording.js
     start : script that starts the player
     data : packed samples, as ``start`` reads them
-    style : added to what every page has
-    connect : whom the page may talk to; see `content_policy`
+    style : CSS in addition to that of every page
+    connect : hosts that the page may connect to; see `content_policy`
     """
     style = read("page.css") + style
     script = "\n".join([*map(read, _SCRIPTS), start])
@@ -33,7 +33,7 @@ def page(
         "policy": content_policy(style=style, script=script, connect=connect),
         "title": html.escape(f"{info['name']} – rigidfleet"),
         "style": style,
-        # No mark-up inside: a user's words must not end the script.
+        # No markup inside: a user's text must not end the script.
         "info": json.dumps(plain(info), ensure_ascii=False).replace("<", "\\u003c"),
         "data": data,
         "script": script,
@@ -42,5 +42,5 @@ def page(
 
 
 def read(name: str, package: str = "rigidfleet.web.replay") -> str:
-    """Text of a file that lies in a package."""
+    """Text of a file in a package."""
     return (resources.files(package) / name).read_text(encoding="utf-8")

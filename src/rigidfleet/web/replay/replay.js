@@ -1,5 +1,5 @@
 "use strict";
-// A flight that is over, out of the page itself.
+// A finished flight, read from the page itself.
 
 async function main() {
   try {
