@@ -98,7 +98,7 @@ def test_edges_stay_within_sensing_range():
 
 def test_short_range_says_what_would_do():
     """Along its sides alone a cube does not hold; the message gives the range that does."""
-    with pytest.raises(ValueError, match=r"only 12 of the 18 .*; 5.65685 m would do"):
+    with pytest.raises(ValueError, match=r"only 12 of the 18 .*; 5.65685 m is enough"):
         design(CUBE, sensing_range=4.5)
     assert len(design(CUBE, sensing_range=5.65685425)) == 18
 

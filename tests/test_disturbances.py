@@ -325,7 +325,9 @@ def test_the_others_fly_on_and_meet_the_waypoint():
     assert verdict.passed, verdict.summary
     assert "lost vehicles stay" in verdict.summary
     np.testing.assert_allclose(result.cm[-1], [20.0, 5.0, 25.0], atol=1e-3)
-    assert any("agent 2, lost at 8.00 s, is still falling at z = " in note for note in verdict.notes)
+    assert any(
+        "agent 2, lost at 8.00 s, is still falling at z = " in note for note in verdict.notes
+    )
 
 
 def test_distances_hold_those_left():

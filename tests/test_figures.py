@@ -497,7 +497,9 @@ def test_what_is_cut_off_is_marked():
         assert texts(figure).count("off scale: peak 730 N: agent 2 at 20.00 s") == expected
     (mark,) = by_gid(plotting.constraint_force(flight), "cut")
     assert mark.get_marker() == "^"
-    assert "off scale: peak 5e+03 N: edge 2-3 at 20.00 s" in texts(plotting.constraint_force(flight))
+    assert "off scale: peak 5e+03 N: edge 2-3 at 20.00 s" in texts(
+        plotting.constraint_force(flight)
+    )
     whole = a_flight(thrust=np.minimum(thrust, 20.0))
     for name in ("inputs", "constraint_force", "summary"):
         assert by_gid(getattr(plotting, name)(whole), "cut") == []

@@ -496,7 +496,8 @@ def test_a_law_without_bound_is_diagnosed_with_what_helps(constraint, changes, r
     result = simulate(a_mission(phase, formations=folded, constraint=constraint))
     assert re.search(r"cannot go on at t = \d+\.\d+ s, in phase 'establish 1': ", result.ending)
     assert re.search(
-        r"smallest of the 3 singular values of the constraint Jacobian J is \S+e-\d+ ", result.ending
+        r"smallest of the 3 singular values of the constraint Jacobian J is \S+e-\d+ ",
+        result.ending,
     )
     assert re.search(remedy.replace("(", r"\(").replace(")", r"\)"), result.ending)
 
@@ -566,9 +567,7 @@ def test_a_stall_says_what_makes_the_steps_short():
         r"cannot go on at t = [\d.]+ s, in phase 'establish 1': \d+ steps have", result.ending
     )
     assert "smallest of the 3 singular values" in result.ending
-    assert re.search(
-        r"force on agent \d, \S+ N\. Steps this short come from gains", result.ending
-    )
+    assert re.search(r"force on agent \d, \S+ N\. Steps this short come from gains", result.ending)
 
 
 def test_a_compiled_force_that_is_lost_is_named():

@@ -177,7 +177,11 @@ def _shapes(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[Chec
         if not passed:
             continue  # handedness and side mean nothing for a wrong shape
         if p.handedness is not None:
-            words = "is the mirror image of its slots" if fit.mirrored else "has the intended handedness"
+            words = (
+                "is the mirror image of its slots"
+                if fit.mirrored
+                else "has the intended handedness"
+            )
             yield _at_end(p, "handedness", p.handedness, f"'{p.formation}' {words}")
         if p.flip is not None:
             what = "normal" if fit.dimension == 2 else "direction"
