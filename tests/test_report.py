@@ -191,7 +191,7 @@ def test_side_by_side(calm, hasty, quick):
     assert numbers["least distance between vehicles"]["same"]
     assert len(page["overlays"]) == 2
     text = Page(html_page([calm, hasty], labels=["calm", "hasty"])).text
-    for words in ("2 flights side by side", "What differs", "calm", "hasty", "Passed", "Failed"):
+    for words in ("2 flights side by side", "Differences", "calm", "hasty", "Passed", "Failed"):
         assert words in text
 
 

@@ -41,7 +41,7 @@ class Rigidity:
     dimension : 0 a point, 1 a line, 2 a plane, 3 a spatial shape
     space : dimension of the space in which the agents may move
     rank : of J, the number of independent edges
-    reachable : greatest possible rank of J at slots of this dimension: 3N - 6 in space, 2N - 3 in a plane, N - 1 on a line
+    reachable : greatest rank of J for slots of this dimension: 3N - 6 in space, 2N - 3 in a plane, N - 1 on a line
     needed : rank of an infinitesimally rigid framework: 3N - 6 (N = 2: 1; N = 1: 0) where the space is 3-D
     redundant : edges of which any single one could be removed without loss of rank
     spare : m - rank edges that could be removed together, long ones first

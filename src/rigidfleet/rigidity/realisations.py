@@ -36,7 +36,7 @@ class Realisation:
 
     Attributes
     ----------
-    kind : same; mirror image; folded (other all-pairs distances); coincident (folded, with two agents at the same place)
+    kind : same; mirror image; folded (other all-pairs distances); coincident (folded, two agents at the same place)
     slots : (N, 3) [m], rotated to fit the intended shape
     found : number of starts that led to this shape
     deviation : greatest difference of an all-pairs distance from the intended [m]

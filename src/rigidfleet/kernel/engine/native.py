@@ -1,8 +1,8 @@
 """The compiled kernel, called without the compiler.
 
-`rigidfleet.kernel.engine.build` compiles the integrator, the recorder and the monitor once to machine code. The cache
-keeps it, and it is loaded from there: importing Numba alone takes longer than flying most missions. What the code reads
-and writes it finds through addresses of named tuples, laid out as `rigidfleet.kernel.compiler.pointers` says.
+`rigidfleet.kernel.engine.build` compiles the integrator, the recorder and the monitor once to machine code. The code is
+stored in a cache and loaded from there, because importing Numba alone takes longer than flying most missions. It reads
+and writes through addresses of named tuples, laid out as `rigidfleet.kernel.compiler.pointers` says.
 """
 
 from __future__ import annotations
@@ -52,9 +52,9 @@ from rigidfleet.kernel.records import (
 )
 from rigidfleet.typing import Floats, Ints
 
-#: What the machine code is called, its arguments being addresses: int64(problem, workspace, integrator, segment),
-#: int64(problem, workspace, segment, record) and int64(problem, workspace, integrator, monitor). Each comes in an
-#: object of its own.
+#: Names of the machine code's functions. Their arguments are addresses: int64(problem, workspace, integrator, segment),
+#: int64(problem, workspace, segment, record) and int64(problem, workspace, integrator, monitor). Each function is in
+#: its own object.
 ENTRIES = "rigidfleet_integrate", "rigidfleet_record", "rigidfleet_watch"
 
 
@@ -83,7 +83,7 @@ def record(problem: Problem, workspace: Workspace, times: Floats, samples: Float
 
 
 class Watch:
-    """A monitor at work: takes the extremes of the steps in trails, see `rigidfleet.kernel.monitor.watch`."""
+    """A callable that finds the extremes of the steps in trails, see `rigidfleet.kernel.monitor.watch`."""
 
     def __init__(self, monitor: Monitor) -> None:
         # The recorder evaluates the law, at the monitor's own time and state.
@@ -96,7 +96,7 @@ class Watch:
         self._packed = _pack(self.monitor)
 
     def __call__(self, problem: Problem, workspace: Workspace, state: IntegratorState) -> int:
-        """What `rigidfleet.kernel.monitor.watch` returns."""
+        """Monitor the steps; return what `rigidfleet.kernel.monitor.watch` returns."""
         packed = _packed(problem), _packed(workspace), _packed(state)
         return _call(_code().watch, *packed, self._packed)
 
@@ -112,11 +112,11 @@ def _call(function: Any, *packed: _Packed) -> int:
     return function(*(p.address for p in packed))
 
 
-# -- named tuples in words ---------------------------------------------------------------------------
+# -- named tuples as words ---------------------------------------------------------------------------
 
 
 class _Packed(NamedTuple):
-    """A named tuple in words, and the tuple itself, which keeps its arrays."""
+    """A named tuple as words, and the tuple itself, which keeps its arrays alive."""
 
     of: Any
     words: Ints
@@ -124,7 +124,7 @@ class _Packed(NamedTuple):
 
 
 class _Layout(NamedTuple):
-    """How a named tuple of one type is laid out."""
+    """Memory layout of a type of named tuple."""
 
     code: struct.Struct
     arrays: tuple[tuple[str, int], ...]  # kind of number and dimensions of each
@@ -135,7 +135,7 @@ def _flatten(x: Any, code: list[str], words: list[Any], arrays: list[tuple[str, 
     for value in x:
         if isinstance(value, np.ndarray):
             if not value.flags.c_contiguous:
-                raise TypeError("the kernel takes C-contiguous arrays alone")
+                raise TypeError("the kernel takes only C-contiguous arrays")
             code.append("q" * (1 + value.ndim))
             words += (value.__array_interface__["data"][0], *value.shape)
             arrays.append((value.dtype.char, value.ndim))
@@ -150,7 +150,7 @@ def _flatten(x: Any, code: list[str], words: list[Any], arrays: list[tuple[str, 
 
 
 def _pack(x: Any) -> _Packed:
-    """Lay a named tuple down in words.
+    """Convert a named tuple to words.
 
     Raises
     ------
@@ -164,14 +164,14 @@ def _pack(x: Any) -> _Packed:
     layout = _layout(type(x))
     if tuple(arrays) != layout.arrays or "".join(code) != layout.code.format[1:]:
         raise TypeError(
-            f"this {type(x).__name__} has arrays or numbers of other types than the kernel takes"
+            f"this {type(x).__name__} has arrays or numbers of types that the kernel does not take"
         )
     words = np.frombuffer(layout.code.pack(*values), dtype=np.int64)
     return _Packed(x, words, words.__array_interface__["data"][0])
 
 
 class _Last(threading.local):
-    """The last of each type that a thread has packed: flights call the kernel with the same ones again and again."""
+    """The last tuple of each type packed by a thread: flights call the kernel with the same ones repeatedly."""
 
     def __init__(self) -> None:
         self.packed: dict[type, _Packed] = {}
@@ -197,7 +197,7 @@ def _layout(kind: type) -> _Layout:
 
 @cache
 def examples() -> tuple[Problem, Workspace, IntegratorState, Segment, Record, Monitor]:
-    """One of each named tuple, as small as can be: their fields have the types of all."""
+    """One minimal example of each named tuple; its fields have the types that all have."""
     one, none, places, frame = np.ones(1), np.zeros(0), np.zeros((1, 3)), np.eye(3)
     problem = Problem(
         body_formulation=False,
@@ -233,8 +233,8 @@ class _Code(NamedTuple):
     record: Any
     watch: Any
     recorder: int  # address of record
-    engine: Any  # keeps the code
-    unkept: list[bytes] | None  # what other processes cannot find in the cache
+    engine: Any  # keeps the code alive
+    unkept: list[bytes] | None  # objects that could not be stored in the cache
 
 
 _loading = threading.Lock()
@@ -270,19 +270,19 @@ def _linked(parts: Sequence[bytes], unkept: list[bytes] | None = None) -> _Code:
 
 
 class Inheritance(NamedTuple):
-    """What a process that this one starts is not to compile again, nor to warn of again."""
+    """Code that a child process need not compile again, and warnings that it need not repeat."""
 
     code: list[bytes] | None
     told: bool
 
 
 def bequeath() -> Inheritance:
-    """What this process has that those it starts cannot find in the cache; to be sent to them alone."""
+    """Code of this process that its child processes cannot find in the cache; to be sent only to them."""
     return Inheritance(_loaded[0].unkept if _loaded else None, told.is_set())
 
 
 def inherit(given: Inheritance) -> None:
-    """Take over what the process that started this one has."""
+    """Take over the code and warnings of the parent process."""
     if given.told:
         told.set()
     if given.code is not None:
@@ -290,12 +290,12 @@ def inherit(given: Inheritance) -> None:
 
 
 def _compile() -> list[bytes]:
-    """Compile the kernel, in a process of its own where one can be had.
+    """Compile the kernel, in a separate process if possible.
 
-    There Numba is told to translate alone: it would optimise each function before all of them together are, and
-    take twice as long.
+    In that process Numba only translates. Otherwise it would optimise each function before all are optimised
+    together, and take twice as long.
     """
-    # Nobody reads of the many versions that Numba tries, least of all in colours.
+    # Suppress Numba's coloured messages about the versions that it tries.
     quiet = {"NUMBA_OPT": "0", "NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING": "1"}
     if sys.executable:
         with suppress(OSError):
@@ -309,17 +309,17 @@ def _compile() -> list[bytes]:
     return machine_code()
 
 
-#: Where the processes that compile are: Numba takes settings from a file that it finds where it is.
+#: Working folder of the compiling processes, as Numba reads settings from a file in its working folder.
 ELSEWHERE = os.path.abspath(os.sep)
 _BUILD = "import sys; sys.path[:] = sys.argv[1:]; from rigidfleet.kernel.engine import build; build.main(half={})"
 _FLAGS = {"isolated": "-I", "ignore_environment": "-E", "no_user_site": "-s", "no_site": "-S"}
 
 
 def build_process(*, half: bool = False) -> list[str]:
-    """Command of a process that compiles: it imports what this one would, but nothing from the current folder.
+    """Command of a compiling process, which has the import path of this one without the current folder.
 
-    An interactive Python, or one given its code by ``-c``, has the current folder on its path as ``""``. That goes;
-    any other folder on the path has been asked for. Last comes the one that this package is from.
+    An interactive Python, or one started with ``-c``, has the current folder on its path as ``""``. This entry is
+    removed; all other folders are kept, because the user chose them. The folder of this package comes last.
     """
     flags = [flag for name, flag in _FLAGS.items() if getattr(sys.flags, name)]
     path = [os.path.abspath(folder) for folder in sys.path if isinstance(folder, str) and folder]
@@ -328,7 +328,7 @@ def build_process(*, half: bool = False) -> list[str]:
 
 
 def target_machine() -> Any:
-    """What machine code is made for: this machine."""
+    """The target of the machine code: this machine."""
     return llvm.Target.from_default_triple().create_target_machine(
         cpu=llvm.get_host_cpu_name(), features=llvm.get_host_cpu_features().flatten(), opt=3, jit=True
     )  # fmt: skip
@@ -338,7 +338,7 @@ def target_machine() -> Any:
 
 
 def _file() -> Path:
-    """Where the machine code is kept: by kind of machine.
+    """The cache file of the machine code for this kind of machine.
 
     Raises
     ------
@@ -350,7 +350,7 @@ def _file() -> Path:
 
 
 def concatenated(parts: Sequence[bytes]) -> bytes:
-    """Objects in one, each after its length, and their digest, so that half of them is never called."""
+    """Join objects, each after its length, with a digest, so that an incomplete file is never used."""
     code = b"".join(len(part).to_bytes(8, "little") + part for part in parts)
     return code + hashlib.sha256(code).digest()
 
@@ -369,7 +369,7 @@ def _separated(data: bytes) -> list[bytes] | None:
 
 
 def _read() -> list[bytes] | None:
-    """Machine code that is kept, if there is any that may be run."""
+    """Machine code from the cache, if there is any that is safe to run."""
     try:
         with opened(_file()) as stream:
             return _separated(stream.read())
@@ -378,7 +378,7 @@ def _read() -> list[bytes] | None:
 
 
 def _write(parts: Sequence[bytes]) -> bool:
-    """Keep machine code, or warn that it will be compiled again."""
+    """Store machine code in the cache, or warn that it will be compiled again."""
     try:
         with replacing(_file()) as stream:
             stream.write(concatenated(parts))
