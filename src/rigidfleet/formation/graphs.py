@@ -144,9 +144,8 @@ def henneberg_multilevel(points: ArrayLike) -> Ints:
         near = KDTree(p[order[:done]]).query(p[some], k=min(done, 12))[1]
         at = np.pad(order[near], ((0, 0), (0, 12 - near.shape[1])), constant_values=-1)
         square = _softness(p, some, at, soft)
-        flat = np.flatnonzero(
-            square.min(axis=1) > _FLAT
-        )  # all near points lie in one plane with it
+        # All near points lie in one plane with it
+        flat = np.flatnonzero(square.min(axis=1) > _FLAT)
         if len(flat):
             at[flat] = first[np.arange(12) % len(first)]
             square[flat] = _softness(p, some[flat], at[flat], soft)

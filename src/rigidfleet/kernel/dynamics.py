@@ -59,9 +59,8 @@ def closed_loop(t, y, dy, p, w):
         constraint_force(t, y, dy, p, w)
     if disturbance.active:
         disturb(t, m, g, disturbance, w)
-        if (
-            p.has_frame and disturbance.noise_r.shape[0] > 0
-        ):  # the frame rotates with the true motion of the body
+        # The frame rotates with the true motion of the body
+        if p.has_frame and disturbance.noise_r.shape[0] > 0:
             mean_axes(r, v, m, vehicles.M, w)
     accelerate(dy, p, w)
     if p.body_formulation:

@@ -20,6 +20,9 @@ CONSTANT, SQUARED, SHAPE = range(3)
 OPEN, TRACKING, BODY = range(3)
 # Allocation of a wrench (`Control.allocation`), the last three with the paper's H.
 RIGID, PINV_EQUAL, PINV_INERTIA, PINV_INERTIA_FORCE = range(4)
+#: Their names in missions: solvers, and splits of the torque.
+SOLVERS = {"iterated": ITERATED, "spectral": SPECTRAL, "exact": EXACT, "pinv": PINV}
+SPLITS = {"equal": PINV_EQUAL, "inertia": PINV_INERTIA, "inertia+force": PINV_INERTIA_FORCE}
 
 
 class Vehicles(NamedTuple):
@@ -45,9 +48,7 @@ class Graph(NamedTuple):
     pairs: Edges  # (P, 2)
     weight: Floats  # (P,) +-1/m_i [1/kg]
     diagonal: Floats  # (m,) of A: 1/m_i + 1/m_j [1/kg]
-    solver: int = (
-        0  # address of the function that solves for the multipliers of a large formation (`large`)
-    )
+    solver: int = 0  # address of the multiplier solver of a large formation (`large`)
 
 
 class ConstraintLaw(NamedTuple):

@@ -3,20 +3,27 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 from matplotlib import figure
 
-from rigidfleet.plotting.style import settings
-
 
 class Figure(figure.Figure):
-    """A matplotlib figure that a notebook shows at the end of a cell, without a magic command."""
+    """A matplotlib figure that a notebook shows at the end of a cell, without a magic command.
+
+    Attributes
+    ----------
+    settings : a context in which it is drawn
+    """
+
+    settings: Callable[[], AbstractContextManager[Any]] = nullcontext
 
     def _repr_png_(self) -> tuple[bytes, dict[str, Any]]:
         """The picture, and the size it is shown at: fine screens have dots to spare."""
         buffer = io.BytesIO()
-        with settings():
+        with self.settings():
             self.savefig(buffer, format="png")
         width, height = (int(x) for x in self.get_size_inches() * self.dpi)
         return buffer.getvalue(), {"width": width, "height": height}

@@ -308,9 +308,8 @@ class ActivePhase:
         plan, w = self.plan, self.workspace
         n, m = len(plan.masses), len(plan.edges)
         out = native.record(problem, w, times, samples)
-        if (
-            problem is not plan.problem
-        ):  # flown by a user's controller: take the references of the phase
+        # Flown by a user's controller: take the references of the phase
+        if problem is not plan.problem:
             planned = native.record(plan.problem, w, times, samples)
             out = out._replace(
                 r_ref=planned.r_ref,

@@ -50,7 +50,7 @@ def assemble(
     pieces = [p for p in pieces if len(p.time)]
     time = np.concatenate([p.time for p in pieces])
     left = time[:, None] <= mission.lost_at  # (K, N)
-    masses = np.where(left, np.array(mission.agents.mass), 0.0)
+    masses = np.where(left, mission.fleet.mass, 0.0)
     M = masses.sum(axis=1)[:, None]
 
     def joined(name: str) -> Floats:
@@ -64,9 +64,8 @@ def assemble(
     cm, cm_velocity = (np.einsum("ki,kia->ka", masses, z) / M for z in (r, v))
     x, y = r - cm[:, None], v - cm_velocity[:, None]
     slots = joined("p")
-    centre = (
-        np.einsum("ki,kia->ka", masses, slots) / M
-    )  # of agents still flying; otherwise the body's origin
+    # Of agents still flying; otherwise the body's origin
+    centre = np.einsum("ki,kia->ka", masses, slots) / M
     attitude, line = _attitudes(
         pieces, x, slots - centre[:, None], masses, framed=mission.body_frame is not None
     )

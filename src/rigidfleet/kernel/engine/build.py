@@ -3,8 +3,8 @@
 Numba translates the integrator, the recorder, the monitor and all functions that they call to LLVM's intermediate
 representation. Functions that are not called from outside become internal, and all are optimised once, together.
 
-This runs in a separate process (`native.build_process`), which writes the code to standard output. Translation takes
-most of the time, so a second process translates half of the functions in parallel.
+In a process of its own (`objects.build_process`) it writes the code to standard output. Most of the time goes into the
+translation, so that a second process does its half of it meanwhile.
 """
 
 import pickle
@@ -17,7 +17,6 @@ from typing import Any
 
 import llvmlite.binding as llvm
 from numba import cfunc, typeof, types
-from numba.core import codegen, compiler, cpu, serialize
 
 from rigidfleet.kernel import (
     constraint,
@@ -29,9 +28,10 @@ from rigidfleet.kernel import (
     recorder,
     rigid_body,
 )
+from rigidfleet.kernel.compiler import numba_internals
 from rigidfleet.kernel.compiler.jit import OPTIONS
 from rigidfleet.kernel.compiler.pointers import Pointer, pointer
-from rigidfleet.kernel.engine import native
+from rigidfleet.kernel.engine import objects, packing
 
 _Functions = dict[Any, tuple[types.Type, ...]]
 #: Functions that every evaluation calls, to be inlined; calls would take a tenth of a small formation's time.
@@ -46,7 +46,7 @@ _QUICK = ("sroa", "simplify_cfg", "instruction_combine", "simplify_cfg")
 
 
 def machine_code(second: "_SecondProcess | None" = None) -> list[bytes]:
-    """Object code of the three C functions that `native` calls, `native.ENTRIES`.
+    """Object code of the three C functions that `native` calls, `objects.ENTRIES`.
 
     Their arguments are addresses of named tuples. They integrate (and return what `dopri5.integrate` returns),
     record, and monitor (as `monitor.watch` does). The ``second`` process, if there is one, does part of the work.
@@ -66,11 +66,10 @@ def machine_code(second: "_SecondProcess | None" = None) -> list[bytes]:
         return 0
 
     if second is not None:
-        for function, arguments in _halves()[
-            0
-        ].items():  # before the parts that wait for the second process
+        # Before the parts that wait for the second process
+        for function, arguments in _halves()[0].items():
             function.compile(arguments)
-    functions = zip((integrate_segment, record_segment), native.ENTRIES, strict=False)
+    functions = zip((integrate_segment, record_segment), objects.ENTRIES, strict=False)
     modules = [_module(function, name) for function, name in functions]
     codes = [_object(*module) for module in modules]
     made = None if second is None else second.monitor()
@@ -84,11 +83,11 @@ def _monitor() -> bytes:
     def watch_trail(p, w, state, found):
         return monitor.watch(problem(p), workspace(w), integrator(state), watching(found))
 
-    return _object(*_module(watch_trail, native.ENTRIES[2]))
+    return _object(*_module(watch_trail, objects.ENTRIES[2]))
 
 
 def _pointers() -> list[Any]:
-    return [pointer(typeof(x)) for x in native.examples()]
+    return [pointer(typeof(x)) for x in packing.examples()]
 
 
 def _module(function: Any, name: str) -> tuple[str, str, str]:
@@ -107,7 +106,7 @@ def _object(text: str, symbol: str, name: str) -> bytes:
             raise RuntimeError(
                 f"the kernel needs {function.name}, which is available only to Numba's own callers"
             )
-    return native.target_machine().emit_object(module)
+    return objects.target_machine().emit_object(module)
 
 
 def _simplified(text: str, symbol: str, name: str) -> llvm.ModuleRef:
@@ -132,45 +131,17 @@ def _simplified(text: str, symbol: str, name: str) -> llvm.ModuleRef:
 
 def _passes(level: int) -> Any:
     options = llvm.create_pipeline_tuning_options(speed_level=level)
-    options.loop_vectorization = (
-        False  # loops are short, and the integrator's sums use vectors already
-    )
-    return llvm.create_pass_builder(native.target_machine(), options)
+    # Loops are short, and the integrator's sums use vectors already
+    options.loop_vectorization = False
+    return llvm.create_pass_builder(objects.target_machine(), options)
 
 
 # -- two processes -----------------------------------------------------------------------------------
 
 
-def _translate_only() -> None:
-    """Stop Numba from making unused results: machine code of each function, and a module with all its callees."""
-
-    def executable(_context: Any, library: Any, function: Any, environment: Any) -> Any:
-        name, module = function.qualname.split(".")[-1], function.lookup_module()
-        return cpu._dynfunc.make_function(module, name, "", 0, environment, (library,))
-
-    def finalize(library: Any) -> None:
-        library._finalized = True
-
-    def whole(library: Any) -> str:
-        module, seen, rest = library._final_module.clone(), {library}, [library]
-        while rest:
-            for other in rest.pop()._linking_libraries:
-                if other not in seen:
-                    seen.add(other)
-                    rest.append(other)
-                    module.link_in(other._final_module, preserve=True)
-        return str(module)
-
-    cpu.CPUContext.get_executable = executable
-    codegen.CPUCodeLibrary.finalize = finalize
-    codegen.CPUCodeLibrary.get_llvm_str = whole
-    codegen.JITCodeLibrary._finalize_specific = lambda _library: None
-    codegen.JITCPUCodegen.set_env = lambda _codegen, _name, _environment: None
-
-
 def _halves() -> tuple[_Functions, _Functions]:
     """Functions with the types of their arguments, first those of this process, then those of the second."""
-    example, work, _, _, out, _ = native.examples()
+    example, work, _, _, out, _ = packing.examples()
     p, w, record = (Pointer(typeof(x)) for x in (example, work, out))
     disturbance = Pointer(typeof(example.disturbance))
     number, row, places = types.float64, typeof(example.vehicles.m), typeof(work.r)
@@ -196,16 +167,8 @@ def _halves() -> tuple[_Functions, _Functions]:
 
 def _translated() -> dict[str, bytes]:
     """The second half: each function in the form of Numba's cache, but already simplified."""
-    done = {}
-    for function, arguments in _halves()[1].items():
-        function.compile(arguments)
-        result = function.overloads[arguments]
-        symbol = result.fndesc.llvm_func_name
-        module = _simplified(result.library.get_llvm_str(), symbol, symbol)
-        result.library.serialize_using_object_code = result.library.serialize_using_bitcode
-        result.library._final_module = module
-        done[function.__name__] = serialize.dumps(result._reduce())
-    return done
+    halves = _halves()[1].items()
+    return {f.__name__: numba_internals.portable(f, types_, _simplified) for f, types_ in halves}
 
 
 class _SecondProcess:
@@ -214,12 +177,14 @@ class _SecondProcess:
     Whatever fails there is done in this process.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, shares: bool) -> None:
+        self._shares = shares
         self._process = subprocess.Popen(
-            native.build_process(half=True), cwd=native.ELSEWHERE, stdout=subprocess.PIPE
+            objects.build_process(half=True), cwd=objects.ELSEWHERE, stdout=subprocess.PIPE
         )  # fmt: skip
-        for function, arguments in _halves()[1].items():
-            function._cache = self._Half(self, function.__name__, arguments)
+        for function, arguments in _halves()[1].items() if shares else ():
+            half = self._Half(self, function.__name__, arguments)
+            numba_internals.given_by(function, half)
 
     @cached_property
     def translated(self) -> dict[str, bytes]:
@@ -228,7 +193,8 @@ class _SecondProcess:
 
     def monitor(self) -> bytes | None:
         """The object of the monitor."""
-        return self._answer() if self.translated else None
+        done = self.translated
+        return self._answer() if done or not self._shares else None
 
     def _answer(self) -> Any:
         assert self._process.stdout is not None
@@ -246,19 +212,23 @@ class _SecondProcess:
             done = self._process.translated.get(self._name)
             if done is None or arguments != self._arguments:
                 return None
-            return compiler.CompileResult._rebuild(context, *pickle.loads(done))
+            return numba_internals.received(context, done)
 
         def save_overload(self, *_: Any) -> None:
             """Store nothing."""
 
 
 def main(*, half: bool) -> None:
-    """Write the machine code to standard output; or only what the second process does."""
-    output = sys.stdout.buffer
-    _translate_only()
+    """Write the machine code to standard output; or only what the second process does.
+
+    Numba's internals are used where they are known; else the second process makes the monitor alone.
+    """
+    output, known = sys.stdout.buffer, numba_internals.known()
+    if known:
+        numba_internals.translate_only()
     if half:
-        pickle.dump(_translated(), output)
+        pickle.dump(_translated() if known else {}, output)
         output.flush()
         pickle.dump(_monitor(), output)
         return
-    output.write(native.concatenated(machine_code(_SecondProcess())))
+    output.write(objects.concatenated(machine_code(_SecondProcess(shares=known))))
