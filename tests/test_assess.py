@@ -95,7 +95,7 @@ def failures(verdict: Verdict) -> set[str]:
 def other_notes(verdict: Verdict) -> list[str]:
     """Notes but the last: that these records do not tell what happens between their samples."""
     *notes, last = verdict.notes
-    assert last.startswith("judged at samples alone")
+    assert last.startswith("only samples are judged")
     return notes
 
 
@@ -250,7 +250,7 @@ def test_a_triangle_that_comes_back_upside_down_is_noted(turn, noted):
     assert verdict.passed
     assert len(other_notes(verdict)) == noted
     if noted:
-        assert "with its other side up at 15.00 s than at 5.00 s" in verdict.notes[0]
+        assert "turns over between 5.00 s and 15.00 s" in verdict.notes[0]
 
 
 def test_a_line_out_of_order_fails():
@@ -444,7 +444,7 @@ def test_nobody_below_another_is_fine():
     assert (finding.passed, finding.worst, finding.message) == (
         True,
         None,
-        "nobody is below another",
+        "no agent flies below another",
     )
 
 
@@ -514,7 +514,7 @@ def test_saturated_thrust_is_noted():
     verdict = assess(flown(mission, slots(mission, "triangle") + HEIGHT, thrust=thrust))
     assert verdict.passed
     assert other_notes(verdict) == [
-        "the thrust of agents 1 and 3 is cut off at its limit, first at 2.50 s"
+        "the thrust of agents 1 and 3 saturates at its limit, first at 2.50 s"
     ]
 
 

@@ -90,7 +90,7 @@ BEYOND = [
     (
         HEAD + "[agents]\nmass = 1\nposition = {shape = 'line', size = 1, count = 1}\n"
         + formation("line", 1.0, "'henneberg-multilevel'") + ESTABLISH, "formations.f.edges",
-        "1 points have no three edges",
+        "1 points cannot have three edges",
     ),
 ]  # fmt: skip
 

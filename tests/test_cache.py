@@ -98,7 +98,7 @@ def test_a_folder_that_others_can_write(which, right, base, monkeypatch):
         assert answer() == OWN
     (only,) = warned
     text = str(only.message)
-    assert f"others can write to {folder}, which `chmod go-w {folder}` ends" in text
+    assert f"others can write to {folder}; forbid it with `chmod go-w {folder}`" in text
     assert "NUMBA_CACHE_DIR" in text
     folder.chmod(0o700)
     assert answer() == PLANTED
@@ -189,7 +189,7 @@ def test_a_circle_of_links(base, tmp_path, monkeypatch):
     """Links in a circle are an end, not a hang."""
     (tmp_path / "circle").symlink_to("circle")
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "circle"))
-    with pytest.warns(RuntimeWarning, match="circle is a link that leads in a circle"):
+    with pytest.warns(RuntimeWarning, match="circle is a circular link"):
         assert answer() == OWN
 
 
@@ -262,7 +262,7 @@ def test_no_home(home, base, tmp_path, monkeypatch):
     else:
         monkeypatch.setenv("HOME", home)
     why = {
-        "/dev/null": "/dev/null is no folder",
+        "/dev/null": "/dev/null is not a folder",
         "": "Permission denied",
         "unknown": "there is no home",
     }[home]
@@ -483,6 +483,6 @@ def test_one_warning_for_a_sweep(tmp_path):
     asked = [COMMAND, "sweep", "narrow-passage", *vary, "--no-figures", "--out", tmp_path / "out"]
     done = run(*asked, cwd=tmp_path, NUMBA_CACHE_DIR=str(base))
     assert done.returncode == 0, done.stderr
-    assert done.stderr.count("cannot be kept") == 1
+    assert done.stderr.count("cannot be cached") == 1
     assert "2 workers" in done.stderr
     assert not [*base.iterdir()]

@@ -460,7 +460,7 @@ def test_design_keeps_files(capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["cube", "--range", "3"], "5.65685 m would do"),
+        (["cube", "--range", "3"], "5.65685 m is enough"),
         (["cube", "--extra", "some"], "'some' is not a number"),
         (["cube", "--extra", "-1"], "extra must be >= 0"),
         (["cube", "--extra", "inf"], "'inf' is not a whole number"),

@@ -323,9 +323,11 @@ def test_the_others_fly_on_and_meet_the_waypoint():
     assert np.abs(result.constraint[after][:, edges.index((0, 2))]).max() < 1e-6
     verdict = assess(result)
     assert verdict.passed, verdict.summary
-    assert "vehicles lost keep" in verdict.summary
+    assert "lost vehicles stay" in verdict.summary
     np.testing.assert_allclose(result.cm[-1], [20.0, 5.0, 25.0], atol=1e-3)
-    assert any("agent 2, lost at 8.00 s, has fallen to z = " in note for note in verdict.notes)
+    assert any(
+        "agent 2, lost at 8.00 s, is still falling at z = " in note for note in verdict.notes
+    )
 
 
 def test_distances_hold_those_left():
@@ -388,7 +390,7 @@ def test_falling_on_another_fails_the_verdict():
     assert not verdict.passed
     (failed,) = [f for f in verdict.findings if not f.passed]
     assert failed.check == "lost"
-    assert "agent 1 at 1.00 s; agents 1 and 2 collide at 2." in failed.message
+    assert "agent 1 at 1.00 s; after that, agents 1 and 2 collide at 2." in failed.message
 
 
 def test_losses_at_a_switch_and_while_settling():

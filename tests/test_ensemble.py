@@ -115,7 +115,7 @@ def test_what_it_cannot_fly_is_refused():
     mission = table_1()
     with pytest.raises(ValueError, match=r"position must be \(B, 3, 3\)"):
         establish(mission, np.zeros((2, 4, 3)))
-    with pytest.raises(ValueError, match="one shape"):
+    with pytest.raises(ValueError, match="the same shape"):
         establish(mission, starts(mission, 2), starts(mission, 3))
     windy = Mission.from_dict(mission.to_dict() | {"disturbances": {"wind": [1.0, 0.0, 0.0]}})
     with pytest.raises(ValueError, match="calm air"):

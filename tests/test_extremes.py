@@ -441,7 +441,7 @@ def test_what_a_flight_starts_and_lands_on_is_told_apart():
     assert found["clearance_start"] == pytest.approx(0.05, abs=1e-9)
     assert found["clearance_end"] == pytest.approx(0.03, abs=1e-3)
     assert 0.09 < found["clearance"] < 0.2  # where it comes off, and before it has landed
-    assert "0.05 m above what they start on" in verdict.summary
+    assert "agents start 0.05 m above an obstacle" in verdict.summary
 
 
 def test_contact_at_the_start_is_no_collision():
@@ -496,7 +496,7 @@ def test_a_record_without_extremes_says_so():
     assert assess(result).notes == []
     result.phases[1].extremes = {}
     (note,) = assess(result).notes
-    assert "judged at samples alone, up to 0.01 s apart" in note
+    assert "only samples are judged, up to 0.01 s apart" in note
 
 
 # -- what was found wrong once

@@ -187,7 +187,7 @@ def test_a_full_disk_while_the_kernel_is_kept():
     resource.setrlimit(resource.RLIMIT_FSIZE, (16, limit[1]))
     try:
         with pytest.warns(
-            RuntimeWarning, match=r"cannot be kept in /.*kernel-\w+.*: File too large"
+            RuntimeWarning, match=r"cannot be cached in /.*kernel-\w+.*: File too large"
         ):
             assert double(2.0) == 4.0
     finally:

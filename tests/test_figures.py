@@ -466,8 +466,8 @@ def test_a_force_that_is_rounding_is_told_in_words():
     force[100, 2, 0], tension[90, 1] = 3.03e-8, -2e-8
     figure = plotting.constraint_force(a_flight(constraint_force=force, multiplier=tension))
     t = np.linspace(0.0, 20.0, 181)
-    assert f"none but rounding: at most 3.03e-08 N, agent 3 at {t[100]:.2f} s" in texts(figure)
-    assert f"none but rounding: at most 2e-08 N, edge 1-3 at {t[90]:.2f} s" in texts(figure)
+    assert f"only rounding errors: at most 3.03e-08 N, agent 3 at {t[100]:.2f} s" in texts(figure)
+    assert f"only rounding errors: at most 2e-08 N, edge 1-3 at {t[90]:.2f} s" in texts(figure)
     assert not any(ax.yaxis.get_tick_params()["labelleft"] for ax in figure.axes)
 
 
@@ -494,10 +494,12 @@ def test_what_is_cut_off_is_marked():
             t, y = mark.get_xydata()[0]
             assert t == 20.0
             assert y == mark.axes.get_ylim()[1] < 100
-        assert texts(figure).count("cut off: peak 730 N: agent 2 at 20.00 s") == expected
+        assert texts(figure).count("off scale: peak 730 N: agent 2 at 20.00 s") == expected
     (mark,) = by_gid(plotting.constraint_force(flight), "cut")
     assert mark.get_marker() == "^"
-    assert "cut off: peak 5e+03 N: edge 2-3 at 20.00 s" in texts(plotting.constraint_force(flight))
+    assert "off scale: peak 5e+03 N: edge 2-3 at 20.00 s" in texts(
+        plotting.constraint_force(flight)
+    )
     whole = a_flight(thrust=np.minimum(thrust, 20.0))
     for name in ("inputs", "constraint_force", "summary"):
         assert by_gid(getattr(plotting, name)(whole), "cut") == []

@@ -493,10 +493,10 @@ def test_cost_with_a_cross_weight_is_what_the_motion_costs(seed):
     ("call", "message"),
     [
         (lambda: infinite_horizon(A, B, [0.0, 1.0], 1.0), r"Q\[0\] > 0"),
-        (lambda: infinite_horizon(A, [[1.0], [0.0]], [1.0, 1.0], 1.0), "does not reach"),
+        (lambda: infinite_horizon(A, [[1.0], [0.0]], [1.0, 1.0], 1.0), "does not act on"),
         (lambda: infinite_horizon(A, B, [1.0, 1.0], 0.0), "R must be positive"),
         (lambda: infinite_horizon(A, B, [[1.0, 0.5], [0.0, 1.0]], 1.0), "symmetric"),
-        (lambda: infinite_horizon(A, B, [1.0, -3.0], 1.0), "no least value .* swing at"),
+        (lambda: infinite_horizon(A, B, [1.0, -3.0], 1.0), "no minimum .* oscillation at"),
         (lambda: infinite_horizon(A, B, [1.0, 1.0], 1.0, N=[[1.0, 2.0]]), r"N must be \(2, 1\)"),
         (lambda: infinite_horizon(A, B, [1.0, 1.0], 1.0, N=[1.0, np.nan]), "N must be finite"),
         (lambda: double_integrator_gains([4.0, -4.0], 1.0), r"Q\[1\] must be greater than .* -4$"),

@@ -211,7 +211,7 @@ def test_tension_scale(share, tension, beyond):
     info, _ = parts(html_page(swarm(8, 90.0, multiplier=multiplier)))
     assert info["tension"] == pytest.approx(tension)
     assert info["beyond"] is beyond
-    assert ("No edge carries more" in info["note"]) is (share < 0.005)
+    assert ("No edge carries a force above" in info["note"]) is (share < 0.005)
 
 
 def test_too_many_edges(monkeypatch):

@@ -188,10 +188,10 @@ def test_side_by_side(calm, hasty, quick):
     assert numbers["length of the flight"]["cells"] == ["12", "7"]
     assert not numbers["greatest speed"]["same"]
     assert numbers["greatest speed"]["change"][1].startswith(("+", "×"))
-    assert numbers["least room between vehicles"]["same"]
+    assert numbers["least distance between vehicles"]["same"]
     assert len(page["overlays"]) == 2
     text = Page(html_page([calm, hasty], labels=["calm", "hasty"])).text
-    for words in ("2 flights side by side", "What differs", "calm", "hasty", "Passed", "Failed"):
+    for words in ("2 flights side by side", "Differences", "calm", "hasty", "Passed", "Failed"):
         assert words in text
 
 
@@ -206,7 +206,7 @@ def test_flights_of_one_mission_are_numbered(calm, quick):
 def test_gains_mean_what_they_do():
     """The triple pole overshoots by 24.9 %, may have nine times its gamma, and tracking is what it is."""
     lines = {line.what: line for line in gains.explained(Mission.from_toml(TOML))}
-    assert lines["its poles"].value == "-2, -2, -2 /s"
+    assert lines["poles of the error"].value == "-2, -2, -2 /s"
     assert lines["stability margin"].value == "9"
     assert lines["overshoot"].value == "24.9 %"
     assert lines["tracking"].value == "k₁ = 2 /s², k₂ = 2.83 /s"

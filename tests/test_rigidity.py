@@ -303,7 +303,7 @@ def test_hundred_agents_of_any_graph(kind):
     ("slots", "edges", "message"),
     [
         (SPREAD, [[0, 5]], "edge 1, agents 1 and 6, names an agent"),
-        (SPREAD, [[0, 1], [1, 0]], "is edge 1 again"),
+        (SPREAD, [[0, 1], [1, 0]], "repeats edge 1"),
         (SPREAD, [[2, 2]], "joins an agent to itself"),
         (np.zeros((2, 3)), [[0, 1]], "slots coincide"),
         ([[0, 0, np.nan]], [], "slot 1 is not finite"),

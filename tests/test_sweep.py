@@ -462,7 +462,7 @@ def test_what_final_states_cannot_evaluate_is_refused(tmp_path):
         "phases": [{"kind": "establish", "formation": "tetrahedron", "until": 9.0}]
     }
     windy = TETRAHEDRON | {"disturbances": {"wind": [1, 0, 0]}}
-    for mission, why in ((tracked, "is not flown open-loop"), (windy, "calm air")):
+    for mission, why in ((tracked, "only open-loop phases"), (windy, "calm air")):
         with pytest.raises(SweepError, match=why):
             by_final_states(mission=mission)
     file = tmp_path / "s.toml"

@@ -1,7 +1,7 @@
 """The kernel's physics for a single call: checked arrays in, arrays out.
 
-For notebooks, tests and one's own studies; a flight calls the same compiled functions directly.
-World or body axes alike, as long as all arguments use the same.
+These functions are for notebooks, tests and studies; a flight calls the same compiled functions directly.
+Arguments may be in world or body axes, as long as all use the same axes.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from rigidfleet.typing import Floats, Ints
 
 
 class ConstraintForce(NamedTuple):
-    """What holds a formation together at one instant."""
+    """Constraint force and constraint errors of a formation at one instant."""
 
     f_C: Floats  # (N, 3) force on each agent [N]
     multiplier: Floats  # (m,) lambda [N]; the tension of an edge is -lambda
@@ -126,7 +126,7 @@ def allocate(
     x = np.ascontiguousarray(about_cm(x, m))
     if method not in {"rigid", "pinv"} or torque_split not in SPLITS:
         raise ValueError(
-            f"unknown allocation {method!r} with {torque_split!r}; method is 'rigid' or 'pinv',"
+            f"unknown allocation {method!r} with {torque_split!r}; method must be 'rigid' or 'pinv',"
             f" torque_split one of {', '.join(SPLITS)}"
         )
     n = len(m)
@@ -219,7 +219,7 @@ def _masses_and_points(masses: ArrayLike, points: ArrayLike) -> tuple[Floats, Fl
 
 def _full(value: ArrayLike, shape: tuple[int, ...], name: str) -> Floats:
     try:
-        # A copy: a view that cannot be written is another type, and compiles the call once more.
+        # A copy: a read-only view has another type, and would compile the call again.
         return np.array(np.broadcast_to(np.asarray(value, dtype=float), shape), order="C")
     except ValueError:
         raise ValueError(f"{name} must be {shape}, not {np.shape(value)}") from None

@@ -1,8 +1,9 @@
-"""Verdict on a flight: whether its shapes held, its waypoints were met, and nobody came too close.
+"""Verdict on a flight: whether its shapes held, its waypoints were met, and its agents kept their distance.
 
-`assess` looks at a `Result` and nothing else. A constraint error of zero is not success, as distances
-do not fix a shape: it is judged by *all* pairs of agents against the intended slots, and by what no
-distance can tell, mirror image (spatial shapes), side up (planar ones) and order (lines).
+`assess` reads a `Result` and nothing else. A constraint error of zero is not success, because the distances
+of the edges do not fix a shape. A shape is therefore judged by *all* pairs of agents against the intended
+slots, and by properties that no distance shows: mirror image (spatial shapes), side up (planar shapes) and
+order (lines).
 
 A verdict prints with rich (`console.print(verdict)`) or as JSON (`verdict.json()`). In both, agents
 count from 1.
@@ -41,20 +42,30 @@ __all__ = [
 
 
 def assess(result: Result | str | Path) -> Verdict:
-    """Judge a flight against its mission: a `Result`, or the path of one that was saved.
+    """Judge a flight against its mission.
 
-    It fails if it is incomplete; if a phase did not settle; if a formation is not reached at the end of
-    a phase that shapes (establish, reshape), or not held at the end of the flight, by `SHAPE_TOLERANCE`,
-    or lies mirrored, flipped or out of order there; if a waypoint is missed by more than
-    `WAYPOINT_TOLERANCE`; if agents collide with each other or an obstacle; or if one of the mission's
-    limits is passed. The flight's worst values are reported in any case.
+    The flight fails if
 
-    Limits hold in continuous time, as the record's extremes tell, and at the samples, which are computed
-    anew from positions and forces; the worse counts, and a record that contradicts its samples fails. The
-    geofence holds for the agents' centres, separation and clearance for their surfaces (distance minus
-    radii), and so `separation_below`, the vertical room between two agents whose spheres overlap as seen from
-    above. A vehicle that the mission loses counts in none of this from then on, except that it must not hit
-    those that are left.
+    - it is incomplete, or a phase did not settle;
+    - a formation is off by more than `SHAPE_TOLERANCE`, mirrored, flipped or out of order, at the end of an
+      establish or reshape phase or at the end of the flight;
+    - a waypoint is missed by more than `WAYPOINT_TOLERANCE`;
+    - agents collide with each other or with an obstacle; or
+    - a limit of the mission is exceeded.
+
+    The worst values of the flight are reported in any case.
+
+    Limits are checked in continuous time, from the extremes that the flight recorded, and at the samples, from
+    values recomputed from positions and forces. The worse of the two counts. A record that contradicts its own
+    samples fails.
+
+    The geofence applies to the agents' centres. Separation and clearance apply to their surfaces (distance minus
+    radii). So does `separation_below`: the vertical distance between two agents whose spheres overlap as seen from
+    above. A vehicle that the mission loses is no longer judged from then on, but it must not hit the others.
+
+    Parameters
+    ----------
+    result : the flight's record, or the path of a saved one
 
     Raises
     ------

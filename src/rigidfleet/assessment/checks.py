@@ -1,4 +1,4 @@
-"""What holds and what does not: the checks of a flight, and what is worth a note."""
+"""The checks of a flight, and the notes on it."""
 
 from __future__ import annotations
 
@@ -22,16 +22,20 @@ from rigidfleet.assessment.verdict import Verdict
 from rigidfleet.result import Result
 from rigidfleet.typing import Floats
 
-# Rounding on a limit is not beyond it.
+# Excess over a limit that counts as rounding.
 _SLACK = 1e-9
-# A vehicle that stands on an obstacle touches it by no more than this [m].
+# Greatest overlap of a vehicle that stands on an obstacle [m]; more is a collision.
 _CONTACT = 1e-6
-#: A moment further than this from every sample has not been seen [s]: at 10 m/s, a waypoint's tolerance.
+#: Greatest distance from the nearest sample at which a moment is still judged [s]: at 10 m/s, a vehicle then
+#: flies the tolerance of a waypoint.
 _UNSEEN = 0.01
 
 
 def findings(measured: Measurements, verdict: Verdict) -> Iterator[CheckResult]:
-    """Every check of a flight: of one that can fail in several phases all that do, else the worst."""
+    """All checks of a flight.
+
+    A check made in several phases yields every failure, or the pass nearest to the limit if there is none.
+    """
     yield _complete(measured.result)
     yield from _record(measured)
     yield from _unseen(measured)
@@ -61,7 +65,7 @@ def findings(measured: Measurements, verdict: Verdict) -> Iterator[CheckResult]:
 
 
 def _failures_or_worst(candidates: Iterable[CheckResult]) -> Iterator[CheckResult]:
-    """Of the findings of each check all that fail, or else the one nearest to its limit."""
+    """All failures of each check, or its finding nearest to the limit if none failed."""
     by_check: dict[str, list[CheckResult]] = {}
     for finding in candidates:
         by_check.setdefault(finding.check, []).append(finding)
@@ -80,13 +84,15 @@ def _complete(result: Result) -> CheckResult:
         words = f"the position of {who} is not finite, first at {bad:.2f} s"
         return CheckResult("complete", False, words, when=bad, who=who)
     if result.complete:
-        return CheckResult("complete", True, f"flown to its end at {end:.2f} s", when=end)
-    words = f"incomplete, it ends at {end:.2f} s: {result.ending or 'it was stopped'}"
+        return CheckResult("complete", True, f"the flight reached its end at {end:.2f} s", when=end)
+    words = (
+        f"the flight is incomplete; it ended at {end:.2f} s: {result.ending or 'it was stopped'}"
+    )
     return CheckResult("complete", False, words, when=end, phase=result.phases[-1].name)
 
 
 def _record(measured: Measurements) -> Iterator[CheckResult]:
-    """A record that contradicts itself has been changed, and proves nothing."""
+    """Fail a record that contradicts itself: it has been altered and proves nothing."""
     found = list(measured.contradictions())
     if found:
         words, when = found[0]
@@ -96,7 +102,7 @@ def _record(measured: Measurements) -> Iterator[CheckResult]:
 
 
 def _unseen(measured: Measurements) -> Iterator[CheckResult]:
-    """Ends of shaping phases and waypoints of which no sample tells: they are not judged, nor passed."""
+    """Fail waypoints and ends of shaping phases that no sample is near: they cannot be judged."""
     from rigidfleet.mission import KINDS  # takes long to load, and the flight has loaded it
 
     result = measured.result
@@ -114,11 +120,11 @@ def _unseen(measured: Measurements) -> Iterator[CheckResult]:
             away = float(np.abs(seen - min(t, p.t_end)).min(initial=np.inf))
             if away > _UNSEEN:
                 nearest = (
-                    f"the nearest sample is {away:.2g} s from it"
+                    f"the nearest sample is {away:.2g} s away"
                     if len(seen)
-                    else "it has no sample"
+                    else "the phase has no sample"
                 )
-                words = f"the {what} of phase '{p.name}' ({t:.2f} s) is not judged: {nearest}. Record it, too"
+                words = f"the {what} of phase '{p.name}' ({t:.2f} s) is not judged: {nearest}. Record this time"
                 yield CheckResult("samples", False, words, away, _UNSEEN, "s", when=t, phase=p.name)
 
 
@@ -131,7 +137,7 @@ def _settled(phases: list[PhaseVerdict]) -> Iterator[CheckResult]:
 
 
 def _shapes(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[CheckResult]:
-    """Whether formations are what they should be, where they should be by then."""
+    """Check each formation at the end of the phases that shape it, and at the end of the flight."""
     from rigidfleet.mission import KINDS  # takes long to load, and the flight has loaded it
 
     for i, p in enumerate(phases):
@@ -173,13 +179,17 @@ def _shapes(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[Chec
             words = f"the agents of '{p.formation}' are {'' if fit.in_order else 'not '}in order"
             yield _at_end(p, "order", fit.in_order, words)
         if not passed:
-            continue  # of another shape, a hand or a side says nothing
+            continue  # handedness and side mean nothing for a wrong shape
         if p.handedness is not None:
-            words = "its own mirror image" if fit.mirrored else "of the right hand"
-            yield _at_end(p, "handedness", p.handedness, f"'{p.formation}' is {words}")
+            words = (
+                "is the mirror image of its slots"
+                if fit.mirrored
+                else "has the intended handedness"
+            )
+            yield _at_end(p, "handedness", p.handedness, f"'{p.formation}' {words}")
         if p.flip is not None:
             what = "normal" if fit.dimension == 2 else "direction"
-            flipped = "has flipped" if p.flip > FLIPPED else "lies well"
+            flipped = "has flipped" if p.flip > FLIPPED else "has not flipped"
             words = f"{what} is {value(p.flip, 'deg')} from where it should point"
             words = f"'{p.formation}' {flipped}: its {words}"
             yield _at_end(p, "flip", p.flip <= FLIPPED, words, p.flip, FLIPPED, "deg")
@@ -225,9 +235,9 @@ def _bounded(
     passed: bool | None = None,
     at_least: bool = False,
 ) -> CheckResult:
-    """A worst value against its limit, if it has one."""
+    """Compare a worst value with its limit, if it has one."""
     if e is None:
-        words = words or f"no {check} to judge"
+        words = words or f"the flight has no {check.replace('_', ' ')} to judge"
         return CheckResult(
             check, True, words, None, limit, unit, at_least, judged=limit is not None
         )
@@ -257,7 +267,7 @@ def _separation(measured: Measurements, e: Extreme) -> CheckResult:
 
 
 def _since(measured: Measurements, name: str, sampled: Floats) -> str:
-    """When something first fell to zero, as far as samples and the worst of each phase tell."""
+    """When a quantity first fell to zero, as far as the samples and the worst value of each phase show."""
     phases = range(len(measured.result.phases))
     times = [
         e.when for k in phases if (e := measured.between(name, k)) is not None and e.value <= 0
@@ -267,7 +277,7 @@ def _since(measured: Measurements, name: str, sampled: Floats) -> str:
 
 
 def _clearances(measured: Measurements) -> Iterator[CheckResult]:
-    """Obstacles in flight; and apart from that, those on which vehicles stand at the start and at the end."""
+    """Check the clearance in flight, and separately that of vehicles that stand on an obstacle at start or end."""
     found = {name: e for name, e in measured.clearances().items() if e is not None}
     every = [*found.values(), measured.worst_clearance()]
     e = min((e for e in every if e is not None), key=lambda e: e.value)
@@ -280,7 +290,9 @@ def _clearances(measured: Measurements) -> Iterator[CheckResult]:
         if hit or e.value <= 0:
             since = _since(measured, "clearance", measured.close[2])
             depth = f"by {value(abs(e.value), 'm')} at {e.when:.2f} s"
-            words = f"obstacles are hit, first {since}; {agent} is deepest in '{obstacle}', {depth}"
+            words = (
+                f"agents hit obstacles, first {since}; {agent} is deepest in '{obstacle}', {depth}"
+            )
         yield _bounded("clearance", e, "m", 0.0, words, passed=e.value > 0, at_least=True)
     for name, when in (("clearance_start", "since the start"), ("clearance_end", "at the end")):
         if name in found and not hit:
@@ -292,18 +304,16 @@ def _clearances(measured: Measurements) -> Iterator[CheckResult]:
 
 
 def _lost(measured: Measurements) -> CheckResult:
-    """Vehicles that the mission loses: who is left is judged, and that nobody is hit."""
+    """Check that the vehicles that the mission loses do not hit those still flying."""
     who = np.flatnonzero(~measured.left[-1])
     when = measured.mission.lost_at[who]
     told = ", ".join(f"agent {i + 1} at {t:.2f} s" for i, t in zip(who, when, strict=True))
     e = measured.fallen_on()
     if e is None:
         return _bounded("lost", e, "m", 0.0, f"lost: {told}", at_least=True)
-    words = (
-        f"lost: {told}; while they fall, {e.who} come within {value(e.value, 'm')} of each other"
-    )
+    words = f"lost: {told}; after that, {e.who} come within {value(e.value, 'm')} of each other"
     if e.value <= 0:
-        words = f"lost: {told}; {e.who} collide"
+        words = f"lost: {told}; after that, {e.who} collide"
     words += f" at {e.when:.2f} s"
     return _bounded("lost", e, "m", 0.0, words, passed=e.value > 0, at_least=True)
 
@@ -311,9 +321,10 @@ def _lost(measured: Measurements) -> CheckResult:
 def _downwash(measured: Measurements, limit: float) -> CheckResult:
     e = measured.below()
     if e is None:
-        return _bounded("separation_below", e, "m", limit, "nobody is below another", at_least=True)
+        words = "no agent flies below another"
+        return _bounded("separation_below", e, "m", limit, words, at_least=True)
     passed = e.value >= limit - _SLACK
-    words = f"{e.who} fly one below the other with {value(e.value, 'm')} between them"
+    words = f"{e.who} fly one below the other, {value(e.value, 'm')} apart"
     words += f" at {e.when:.2f} s (limit {limit:g} m)"
     return _bounded("separation_below", e, "m", limit, words, passed=passed, at_least=True)
 
@@ -328,7 +339,7 @@ def _geofence(measured: Measurements, low: Floats, high: Floats) -> CheckResult:
 
 
 def _thrust(measured: Measurements, e: Extreme | None) -> Iterator[CheckResult]:
-    """The vehicle that comes nearest to its own thrust limit; and the greatest thrust, where another one has that."""
+    """Check the vehicle nearest to its own thrust limit; report the greatest thrust if another vehicle has it."""
     beyond = measured.nearest_to_limit()
     if e is None or beyond is None:
         yield _bounded("thrust", e, "N", None)
@@ -349,7 +360,7 @@ def _thrust(measured: Measurements, e: Extreme | None) -> Iterator[CheckResult]:
 
 
 def notes(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[str]:
-    """What fails nothing and yet should be known."""
+    """Facts that fail no check but that a reader should know."""
     yield from _dips(measured)
     yield from _turned_over(measured, phases)
     yield from _fallen(measured)
@@ -359,22 +370,22 @@ def notes(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[str]:
         if full.any():
             who = agent_names(np.flatnonzero(full.any(axis=0)))
             since = measured.first(full.max(axis=1))
-            yield f"the thrust of {who} is cut off at its limit, first at {since:.2f} s"
+            yield f"the thrust of {who} saturates at its limit, first at {since:.2f} s"
     yield from _sampled(measured)
 
 
 def _sampled(measured: Measurements) -> Iterator[str]:
-    """A record that does not say what happens between its samples."""
+    """Note a record that does not say what happens between its samples."""
     if any(not measured.result.phases[k].extremes for k in measured.flown):
         step = float(np.diff(measured.result.time).max(initial=0.0))
         yield (
-            f"judged at samples alone, up to {step:.3g} s apart: the record does not tell what happens"
+            f"only samples are judged, up to {step:.3g} s apart: the record does not say what happens"
             " between them"
         )
 
 
 def _fallen(measured: Measurements) -> Iterator[str]:
-    """What becomes of vehicles that are lost."""
+    """Note where each lost vehicle falls."""
     grounds = [o.height for o in measured.mission.obstacles if o.kind == "ground"]
     radius = measured.mission.agents.radius
     for i in np.flatnonzero(~measured.left[-1]):
@@ -386,11 +397,11 @@ def _fallen(measured: Measurements) -> Iterator[str]:
             x, y, _ = r[-1]
             yield f"{words} hits the ground at {measured.first(down):.2f} s and lies at ({x:.1f}, {y:.1f}) m"
         else:
-            yield f"{words} has fallen to z = {r[-1, 2]:.1f} m when the flight ends"
+            yield f"{words} is still falling at z = {r[-1, 2]:.1f} m when the flight ends"
 
 
 def _dips(measured: Measurements) -> Iterator[str]:
-    """Agents below z = 0 where neither ground nor geofence would tell."""
+    """Note agents below z = 0 if the mission has neither a ground nor a geofence."""
     mission = measured.mission
     if mission.limits.geofence is not None or any(o.kind == "ground" for o in mission.obstacles):
         return
@@ -404,7 +415,7 @@ def _dips(measured: Measurements) -> Iterator[str]:
 
 
 def _turned_over(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[str]:
-    """Planar formations that come back with another side up where nothing commands an attitude."""
+    """Note planar formations that turn over between phases while no attitude is commanded."""
     seen: dict[str, tuple[Floats, float]] = {}
     for i, p in enumerate(phases):
         fit = measured.fits.get(i)
@@ -415,6 +426,6 @@ def _turned_over(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator
         normal, since = seen.setdefault(p.formation, (fit.points, p.t_end))
         if angle_between(normal, fit.points) > FLIPPED:
             yield (
-                f"'{p.formation}' lies with its other side up at {p.t_end:.2f} s than at {since:.2f} s;"
-                " nothing commands its attitude"
+                f"'{p.formation}' turns over between {since:.2f} s and {p.t_end:.2f} s;"
+                " no attitude is commanded"
             )

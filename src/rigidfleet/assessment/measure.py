@@ -1,4 +1,4 @@
-"""What was flown, in numbers: shapes against their slots, waypoints, extremes at samples and between them."""
+"""Measurements of a flight: shapes against their slots, waypoints, extremes at samples and between them."""
 
 from __future__ import annotations
 
@@ -26,33 +26,34 @@ from rigidfleet.math.constraint_jacobian import jacobian
 from rigidfleet.result import PAD, PhaseRecord, Result
 from rigidfleet.typing import Bools, Floats, Ints
 
-#: Slots thinner than this, relative to their length, are planar or straight: distances of seven digits
-#: leave a flat shape 3e-4 thick.
+#: Slots thinner than this, relative to their length, count as planar or straight. Distances of seven digits
+#: give a flat shape a thickness of 3e-4.
 THIN = 1e-3
 
-#: By so much of it a sample may be worse than the worst of its phase before the record contradicts itself. Of forces
-#: that cannot be said: they are found between steps where the ends show a peak, and a user's may fall between them.
+#: Share by which a sample may be worse than the worst value of its phase; beyond it, the record contradicts itself.
+#: Forces have no such bound: a peak is searched only where the ends of a step show one, so that a jump of a user's
+#: force may be missed.
 _SLACK = {"separation": 0.0, "clearance": 0.0, "speed": 1e-9}
 
-#: Bytes of slots up to which what is known of their shape is kept, for the next phase or flight.
+#: Greatest size of slots, in bytes, whose shape is cached for the next phase or flight.
 _KEPT = 100_000
 
-#: Agents up to which a shape that is not the intended one is asked whether it is rigid.
+#: Greatest number of agents for which a wrong shape is tested for rigidity.
 _JUDGED = 200
 
 
 class Laid(NamedTuple):
-    """Slots laid onto agents, of one formation or of many (...)."""
+    """Slots fitted to the agents of one formation, or of many (...)."""
 
-    p: Floats  # (..., N, 3) agents about their centre
-    slots: Floats  # (..., N, 3) about theirs
-    off: Floats  # (..., N) how far agents are off them, as they are or mirrored, whichever fits better
-    mirrored: Bools  # (...) which of the two
-    turn: Floats  # (..., 3, 3) the rotation that fits best, mirrored or not
+    p: Floats  # (..., N, 3) agents, about their centre
+    slots: Floats  # (..., N, 3) slots, about their centre
+    off: Floats  # (..., N) distance of each agent from its slot, mirrored if that fits better
+    mirrored: Bools  # (...) whether mirrored slots fit better
+    turn: Floats  # (..., 3, 3) the best-fitting rotation, without a reflection
 
     @classmethod
     def of(cls, p: Floats, slots: Floats) -> Laid:
-        """Slots (..., N, 3) laid onto agents p (..., N, 3)."""
+        """Fit slots (..., N, 3) to agents p (..., N, 3)."""
         p, slots = p - p.mean(axis=-2, keepdims=True), slots - slots.mean(axis=-2, keepdims=True)
         across = p.swapaxes(-1, -2) @ slots
         U, _, Vt = np.linalg.svd(slots.swapaxes(-1, -2) @ p)
@@ -61,7 +62,7 @@ class Laid(NamedTuple):
 
 
 class Fit:
-    """A formation as flown at one sample, p (N, 3), against its slots (N, 3)."""
+    """A formation as flown at one sample, p (N, 3), compared with its slots (N, 3)."""
 
     def __init__(
         self, p: Floats, slots: Floats, who: Ints | None = None, laid: Laid | None = None
@@ -70,10 +71,10 @@ class Fit:
         known = (
             _shape(slots.tobytes()) if slots.nbytes < _KEPT else _shape.__wrapped__(slots.tobytes())
         )
-        #: Slots' dimension; direction of a line or normal of a plane, in their axes; their shortest distance [m].
+        #: Dimension of the slots; direction of a line or normal of a plane, in their axes; shortest distance [m].
         self.dimension, self.axis, self.shortest = known
         self.error, pair, self.flown, self.intended = _all_pairs(p, slots, laid)
-        #: The pair with the greatest error, by the numbers ``who`` (N,) of the agents.
+        #: The pair with the greatest error, as agent numbers from ``who`` (N,).
         self.pair = pair if who is None else (int(who[pair[0]]), int(who[pair[1]]))
         self.mirrored = self.dimension == 3 and bool(laid.mirrored)
         #: Where the axis points in the world.
@@ -91,24 +92,24 @@ class Fit:
         return SHAPE_TOLERANCE * self.shortest
 
     def angle_from(self, quaternion: Floats) -> float:
-        """Angle [deg] from where the axis would point in an attitude (4,); NaN where there is none."""
+        """Angle [deg] of the axis from its direction in an attitude (4,); NaN without an attitude."""
         if not np.isfinite(quaternion).all():
             return math.nan
         return angle_between(self.points, att.dcm_from_quaternion(quaternion).T @ self.axis)
 
 
 class Quantity:
-    """Values (K, ...) at samples: whose they are, by sample and place, and what makes them worse."""
+    """Values (K, ...) at samples, with the name of their owner and the sense in which they get worse."""
 
     def __init__(self, values: Floats, who: Callable[..., str], sense: Callable[..., Any]) -> None:
         self.values, self.who, self.sense = values, who, sense
         rank = np.ascontiguousarray(sense(values)).reshape(len(values), -1)
         finite = np.isfinite(rank)
-        #: How bad each value is (K, places); -infinity where it is not finite.
+        #: Rank of each value (K, places): greater is worse; -infinity if the value is not finite.
         self.rank = rank if finite.all() else np.where(finite, rank, -np.inf)
 
     def worst(self, starts: Ints) -> list[float]:
-        """How bad the worst is of the samples from each start to the next; the last ones go on to the end."""
+        """Greatest rank among the samples from each start to the next one, or to the end."""
         places = self.rank.shape[1]
         if not places:
             return [-math.inf] * len(starts)
@@ -116,7 +117,7 @@ class Quantity:
 
 
 class Measurements:
-    """Measures a result, phase by phase: at its samples, computed anew from positions and forces, and between them."""
+    """Measures a result phase by phase, at samples (recomputed from positions and forces) and between them."""
 
     def __init__(self, result: Result) -> None:
         self.result, self.mission = result, result.mission
@@ -125,11 +126,11 @@ class Measurements:
         #: Samples of each phase.
         ends = np.searchsorted(result.phase, np.arange(len(result.phases) + 1))
         self.samples = [slice(*pair) for pair in pairwise(ends.tolist())]
-        #: Phases of which there are samples.
+        #: Phases that have samples.
         self.flown = [k for k, s in enumerate(self.samples) if s.stop > s.start]
         self._formations: dict[str, tuple[Floats | None, Ints, Floats]] = {}
         radius, obstacles = self.mission.agents.radius, self.mission.obstacles
-        #: Room of each agent to obstacles, and the nearest one (K, N).
+        #: Clearance of each agent to obstacles [m], and the nearest obstacle (K, N).
         self.room, self.nearest = proximity.obstacle_clearances(result.position, radius, obstacles)
         if not self.whole:
             self.room[~self.left] = np.inf
@@ -157,22 +158,22 @@ class Measurements:
             )
         }
         starts = np.array([self.samples[k].start for k in self.flown])
-        #: How bad the worst of each quantity is at the samples of each phase flown.
+        #: Greatest rank of each quantity at the samples of each phase flown.
         self.rank = {
             name: dict(zip(self.flown, q.worst(starts), strict=True))
             for name, q in self.measured.items()
         }
 
     def of_left(self, values: Floats) -> Floats:
-        """Values (K, N), NaN of agents that are lost."""
+        """Values (K, N), NaN for lost agents."""
         return values if self.whole else np.where(self.left, values, np.nan)
 
     def agent(self, _k: int, i: int) -> str:
-        """Name of agent i (from 0), at whichever sample."""
+        """Name of agent i (from 0), the same at every sample."""
         return f"agent {i + 1}"
 
     def edge(self, _k: int, e: int) -> str:
-        """Name of edge e (from 0), at whichever sample."""
+        """Name of edge e (from 0), the same at every sample."""
         i, j = self.result.edges[e]
         return f"edge {i + 1}-{j + 1}"
 
@@ -181,32 +182,32 @@ class Measurements:
         return agent_names(np.sort(self.close[1][k]))
 
     def obstacle(self, k: int) -> str:
-        """The agent that is nearest to an obstacle at sample k, and the obstacle."""
+        """Names of the agent nearest to an obstacle at sample k, and of that obstacle."""
         return self.beside(int(self.close[3][k]), int(self.close[4][k]))
 
     def beside(self, agent: int, obstacle: int) -> str:
-        """Name of an agent and of an obstacle, from 0."""
+        """Names of an agent and an obstacle, both counted from 0."""
         return f"agent {agent + 1}, {self.mission.obstacles[obstacle].name}"
 
     def at(self, k: int) -> dict[str, Any]:
-        """When sample k is, and in which phase."""
+        """Time [s] and phase of sample k."""
         return {
             "when": float(self.result.time[k]),
             "phase": self.result.phases[self.result.phase[k]].name,
         }
 
     def first(self, broken: Bools) -> float:
-        """Time [s] of the first sample at which something is broken; infinity if it never is."""
+        """Time [s] of the first sample at which ``broken`` holds; infinity if it never does."""
         return float(self.result.time[int(np.argmax(broken))]) if broken.any() else math.inf
 
     def extreme(
         self, values: Floats, who: Callable[..., str], sense: Callable[..., Any] = lambda x: x
     ) -> Extreme | None:
-        """Where sense(values) is greatest; values (K, ...), of which only the finite ones count."""
+        """The finite one of ``values`` (K, ...) whose ``sense`` is greatest."""
         return self.worst_sample(Quantity(values, who, sense), slice(0, len(values)))
 
     def worst_sample(self, quantity: Quantity, samples: slice) -> Extreme | None:
-        """The worst of a quantity among some samples; None where nothing is known of it."""
+        """The worst value of a quantity among some samples; None if none is finite."""
         rank = quantity.rank[samples]
         if not rank.size:
             return None
@@ -220,7 +221,7 @@ class Measurements:
     # -- between samples ------------------------------------------------------------------------------
 
     def between(self, name: str, index: int) -> Extreme | None:
-        """What the record says a phase comes to in continuous time; None where it does not say."""
+        """The recorded extreme of a phase in continuous time; None if the record has none."""
         phase = self.result.phases[index]
         x = phase.extremes.get(name)
         if x is None:
@@ -238,7 +239,7 @@ class Measurements:
     def worst(
         self, name: str, sampled: Extreme | None, sense: Callable[..., Any] = lambda x: x
     ) -> Extreme | None:
-        """The worst of a flight: that of its samples, or that between them."""
+        """The worst value of a flight, at its samples or between them."""
         every = {
             k: sense(p.extremes[name].value)
             for k, p in enumerate(self.result.phases)
@@ -250,7 +251,7 @@ class Measurements:
         return between if sense(between.value) > sense(sampled.value) else sampled
 
     def worst_of(self, name: str, index: int) -> Extreme | None:
-        """The worst of a phase, likewise."""
+        """The worst value of a phase, at its samples or between them."""
         quantity, x = self.measured[name], self.result.phases[index].extremes.get(name)
         rank = self.rank[name].get(index, -math.inf)
         if x is not None and rank < quantity.sense(x.value):
@@ -258,7 +259,7 @@ class Measurements:
         return None if rank == -math.inf else self.worst_sample(quantity, self.samples[index])
 
     def below(self) -> Extreme | None:
-        """Least vertical room [m] between two agents of which one is below the other."""
+        """Least height [m] between two agents, one below the other."""
         least, pair = proximity.headroom(
             self.result.position, self.mission.agents.radius, self.left
         )
@@ -266,7 +267,7 @@ class Measurements:
         return self.worst("separation_below", sampled, lambda x: -x)
 
     def outside(self, low: Floats, high: Floats) -> Extreme | None:
-        """How far [m] an agent's centre comes out of a box with these corners; negative inside."""
+        """Greatest distance [m] of an agent's centre outside a box with these corners; negative inside."""
         r = self.result.position
         beyond = self.of_left(np.maximum(low - r, r - high).max(axis=2))
         return self.worst("geofence", self.extreme(beyond, self.agent))
@@ -281,26 +282,26 @@ class Measurements:
         return self.worst(name, self.extreme(z, self.agent, sense), sense)
 
     def nearest_to_limit(self) -> Extreme | None:
-        """Thrust less its limit [N], of the agent that comes nearest to its own, or furthest beyond."""
+        """Thrust minus limit [N] of the agent nearest to its own limit, or furthest beyond it."""
         most = self.mission.fleet.thrust_limit
         return self.worst("thrust_margin", self.extreme(self.thrust - most, self.agent))
 
     def clearances(self) -> dict[str, Extreme | None]:
-        """Least room to obstacles [m] in flight, and of who stands on one from the start, or at the end.
+        """Least clearance to obstacles [m] in flight, and of vehicles standing on one at the start or end.
 
-        A vehicle within `PAD` of an obstacle since the start, or until the end, stands on it.
+        A vehicle stands on an obstacle while it has been within `PAD` of it since the start, or stays so to the end.
         """
         time = self.result.time
         room, nearest = self.of_left(self.room), self.nearest
         told = {name for p in self.result.phases for name in p.extremes}
         stands = (~(room[0] > PAD)).any() or (self.left[-1] & ~(room[-1] > PAD)).any()
         if not (stands or told & {"clearance_start", "clearance_end"}):
-            # All fly, all the time.
+            # No vehicle ever stands on an obstacle.
             return {"clearance_flight": self.worst_clearance()}
         off = room > PAD
         first = np.where(off.any(axis=0), off.argmax(axis=0), len(time))
         last = np.where(off.any(axis=0), len(time) - 1 - off[::-1].argmax(axis=0), len(time))
-        last = np.where(self.left[-1], last, len(time))  # who is lost does not land
+        last = np.where(self.left[-1], last, len(time))  # lost vehicles do not land
         k = np.arange(len(time))[:, None]
         parts = {
             "clearance_start": k < first,
@@ -317,12 +318,12 @@ class Measurements:
         return found
 
     def worst_clearance(self) -> Extreme | None:
-        """Least room to an obstacle [m] of all vehicles, standing ones among them."""
+        """Least clearance to an obstacle [m] of all vehicles, standing ones included."""
         q = self.measured["clearance"]
         return self.worst("clearance", self.worst_sample(q, slice(0, len(q.values))), q.sense)
 
     def fallen_on(self) -> Extreme | None:
-        """Least room [m] between a lost agent and one that is left; None if none is lost."""
+        """Least clearance [m] between a lost agent and one still flying; None if no agent is lost."""
         r, radius = self.result.position, self.mission.fleet.radius
         least, who = np.full(len(r), np.nan), np.zeros((len(r), 2), dtype=np.int64)
         for i in np.flatnonzero(~self.left[-1]):
@@ -338,7 +339,7 @@ class Measurements:
         return self.worst("lost", sampled, lambda x: -x)
 
     def contradictions(self) -> Iterator[tuple[str, float]]:
-        """What in the record does not follow from its own positions and forces: in words, and when [s]."""
+        """Values of the record that disagree with its own positions and forces: in words, and when [s]."""
         result, time = self.result, self.result.time
         length = proximity.lengths(result.position, result.edges).T
         rounding = 1e-9 * (1.0 + float(np.nanmax(np.abs(result.position), initial=0.0)))
@@ -354,7 +355,9 @@ class Measurements:
             if wrong.any():
                 k = int(np.argmax(wrong.reshape(len(time), -1).any(axis=1)))
                 worst = float(off[wrong].max())
-                words = f"its {name} is up to {value(worst, unit)} off what its own samples give"
+                words = (
+                    f"its {name} is up to {value(worst, unit)} off the value from its own samples"
+                )
                 yield words, float(time[k])
         for index, phase in enumerate(result.phases):
             samples = self.samples[index]
@@ -365,7 +368,7 @@ class Measurements:
                 due += ["geofence"] if self.mission.limits.geofence is not None else []
                 if lacking := [name for name in due if name not in phase.extremes]:
                     words = (
-                        f"it does not tell the {lacking[0]} of phase '{phase.name}' between samples"
+                        f"it lacks the worst '{lacking[0]}' of phase '{phase.name}' between samples"
                     )
                     yield words, float(time[samples.start])
             for name, share in _SLACK.items():
@@ -379,9 +382,9 @@ class Measurements:
                     sampled = self.worst_sample(self.measured[name], samples)
                     assert sampled is not None
                     words = (
-                        f"its {name.replace('_', ' ')} of phase '{phase.name}' is said to come to"
+                        f"its worst {name.replace('_', ' ')} of phase '{phase.name}' is given as"
                     )
-                    words += f" {value(x.value)} at {x.time:.2f} s, and a sample shows {value(sampled.value)}"
+                    words += f" {value(x.value)} at {x.time:.2f} s, but a sample shows {value(sampled.value)}"
                     yield words, sampled.when
 
     def phase(self, index: int, record: PhaseRecord) -> PhaseVerdict:
@@ -418,7 +421,7 @@ class Measurements:
         )
 
     def edges(self, formation: str, k: int) -> tuple[Ints, Floats]:
-        """Edges (m, 2) of a formation between agents left at sample k, and their lengths (m,) [m]."""
+        """Edges (m, 2) of a formation between agents still flying at sample k, and their lengths (m,) [m]."""
         _, edges, intended = self.formation(formation)
         if self.whole:
             return edges, intended
@@ -426,7 +429,7 @@ class Measurements:
         return edges[kept], intended[kept]
 
     def formation(self, name: str) -> tuple[Floats | None, Ints, Floats]:
-        """Slots (N, 3) [m] of a formation, None if nobody knows them, its edges (m, 2) and their lengths (m,) [m]."""
+        """Slots (N, 3) [m] of a formation (None if unknown), its edges (m, 2) and their lengths (m,) [m]."""
         if name not in self._formations:
             m = self.mission
             self._formations[name] = (
@@ -436,7 +439,7 @@ class Measurements:
 
     @cached_property
     def fits(self) -> dict[int, Fit]:
-        """Formations at the last sample of each phase; those of as many agents are laid onto their slots at once."""
+        """Fits of the formations at the end of each phase; those of equally many agents are computed at once."""
         alike: dict[int, list[tuple[int, Floats, Floats, Ints]]] = {}
         for index in self.flown:
             name, last = self.result.phases[index].formation, self.samples[index].stop - 1
@@ -454,19 +457,19 @@ class Measurements:
         return fits
 
     def flip(self, fit: Fit, record: PhaseRecord, k: int) -> float | None:
-        """Angle [deg] of a line or plane from where it should point at sample k; None if nothing says."""
-        # An attitude that is commanded decides; the integrated frame is where a plane should lie if none is.
+        """Angle [deg] of a line or plane from its intended direction at sample k; None if there is none."""
+        # A commanded attitude decides; without one, the integrated frame says how a plane should lie.
         if fit.dimension == 2:
             references = [self.result.attitude_reference[k], self.result.frame[k]]
         elif fit.dimension == 1 and record.control == "tracking":
-            # Only tracked slots steer a line; else it keeps the direction of what it was folded from.
+            # Only tracked slots steer a line; otherwise its direction follows from the shape before.
             references = [self.result.attitude_reference[k]]
         else:
             return None
         return next((a for q in references if math.isfinite(a := fit.angle_from(q))), None)
 
     def waypoint(self, record: PhaseRecord, samples: slice) -> Waypoint | None:
-        """Miss at the waypoint's time, or at the phase's end if it settles before."""
+        """Miss at the waypoint's time, or at the end of the phase if it settles earlier."""
         target = record.target
         if target is None:
             return None
@@ -507,10 +510,10 @@ def _shape(slots: bytes) -> tuple[int, Floats, float]:
 
 
 def _all_pairs(p: Floats, slots: Floats, laid: Laid) -> tuple[float, tuple[int, int], float, float]:
-    """Worst error of a distance: error, pair, flown, intended [m].
+    """Worst error of a distance among all pairs: error, pair, flown, intended [m].
 
-    Of all pairs, but few are looked at: no error is greater than the sum of how far both agents are off their slots,
-    however those are laid onto them, as they are or mirrored. Less than rounding counts for nothing.
+    Few pairs have to be computed: the error of a pair is at most the sum of both agents' distances from their slots,
+    for any fit of the slots, mirrored or not. Improvements below rounding are ignored.
     """
     off, both = laid.off, np.stack([p, slots])
     order = np.argsort(-off, kind="stable")
@@ -533,7 +536,7 @@ def _all_pairs(p: Floats, slots: Floats, laid: Laid) -> tuple[float, tuple[int, 
 def is_rigid(p: Floats, edges: Ints) -> bool:
     """Whether edges (m, 2) at positions (N, 3) are infinitesimally rigid in space: rank J = 3N - 6.
 
-    Of more than `_JUDGED` agents that is not claimed: it would take longer than all else.
+    False for more than `_JUDGED` agents: the rank would take longer than the rest of the verdict.
     """
     if len(p) > _JUDGED:
         return False

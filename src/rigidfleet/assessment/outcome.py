@@ -1,4 +1,4 @@
-"""What checks, phases and waypoints come to."""
+"""The outcome of checks, phases and waypoints."""
 
 from __future__ import annotations
 
@@ -9,25 +9,25 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     pass
 
-#: Greatest error of a distance, relative to the shortest one intended, at the end of a phase that shapes
-#: and of the flight. A shape that is reached is within 1e-3 of it; one folded another way is off by tenths.
+#: Greatest error of a distance, relative to the shortest intended one, at the end of a shaping phase
+#: and of the flight. A shape that is reached has errors below 1e-3; one folded another way, of some tenths.
 SHAPE_TOLERANCE = 0.01
 
 
-#: Greatest miss of a waypoint's position [m], velocity [m/s], attitude [deg] and rates [deg/s]: what an
-#: outdoor vehicle knows of its own state, and far above what a regulator leaves that has met its waypoint.
+#: Greatest miss of a waypoint's position [m], velocity [m/s], attitude [deg] and rates [deg/s]. An outdoor
+#: vehicle knows its own state this well; a regulator that meets its waypoint leaves far smaller errors.
 WAYPOINT_TOLERANCE = {"position": 0.1, "velocity": 0.1, "attitude": 1.0, "rates": 1.0}
 
 
-#: A plane's normal, or a line's direction, is flipped further than this from where it should point [deg].
+#: Angle beyond which a plane's normal, or a line's direction, counts as flipped [deg].
 FLIPPED = 90.0
 
 
-#: An agent lower than this below z = 0 is worth a note where the mission has no ground [m].
+#: Depth below z = 0 from which an agent is noted if the mission has no ground [m].
 DIP = 0.01
 
 
-#: What makes a value of each quantity worse.
+#: Functions that are greater the worse a value of the quantity is.
 SENSE: dict[str, Callable[..., Any]] = {
     "constraint": abs,
     "separation": lambda x: -x,
@@ -58,14 +58,14 @@ class CheckResult:
     Attributes
     ----------
     check : what was checked, in snake_case
-    passed : whether it holds; a quantity without a limit does
+    passed : whether the check holds; always True for a quantity without a limit
     message : the finding in words
     worst, limit : in `unit`; None where there is none
     at_least : whether the limit is the least value allowed, not the greatest
     when : mission time of the worst [s]
     who : agents, edge or obstacle
     phase : name of the phase
-    judged : whether there was anything to hold or fail, not only a value to report
+    judged : whether the check could fail; False for a value that is only reported
     """
 
     check: str
@@ -88,7 +88,7 @@ class CheckResult:
 
 @dataclass(frozen=True, slots=True)
 class Waypoint:
-    """Miss of a waypoint at its time [s]: [m], [m/s], [deg], [deg/s]; None where nothing was asked."""
+    """Miss of a waypoint at its time [s]: [m], [m/s], [deg], [deg/s]; None for what it does not specify."""
 
     time: float
     position: float | None
@@ -103,13 +103,13 @@ class PhaseVerdict:
 
     Attributes
     ----------
-    finished : whether the flight went on to the phase's end
+    finished : whether the flight reached the end of the phase
     constraint : greatest |c| of an edge at the end [m]
     distances : greatest error of an edge against the formation's distance at the end [m]
     shape : greatest error of all pairs against the formation's slots at the end [m]
-    handedness : spatial shapes: False if mirrored
-    flip : angle of a plane's normal, or a line's direction, from where it should point [deg]
-    order : lines: False if the agents are out of order
+    handedness : False if a spatial shape is mirrored
+    flip : angle of a plane's normal, or of a line's direction, from its intended direction [deg]
+    order : False if the agents of a line are out of order
     waypoint : the miss of a waypoint
     worst : extremes by name: constraint |c| [m], separation [m], clearance [m], thrust [N],
         speed [m/s], acceleration [m/s^2], constraint_force [N], tension [N] (negative: a push),
@@ -135,6 +135,6 @@ class PhaseVerdict:
 
 
 def value(x: float, unit: str = "") -> str:
-    """Three digits of a number, and its unit."""
+    """A number to three digits, with its unit."""
     number = f"{x:.3g}" if x == 0 or 1e-3 <= abs(x) < 1e5 else f"{x:.1e}"
     return f"{number} {unit}".rstrip()

@@ -1,4 +1,4 @@
-"""The safety page of a flight: how close, how fast, how high, how hard, each against its limit."""
+"""The safety table of a flight: worst distances, speeds, altitudes and thrusts, each with its limit."""
 
 from __future__ import annotations
 
@@ -14,16 +14,17 @@ from rigidfleet.result import Result
 
 @dataclass(frozen=True, slots=True)
 class Safety:
-    """The worst of one quantity.
+    """The worst value of one quantity.
 
     Attributes
     ----------
-    quantity : its name, and `text`, what it measures
+    quantity : its name
+    text : what it measures
     unit : of the worst value and of its limit
     at_least : whether the limit is the least value allowed, not the greatest
-    limit : None where the mission sets none
-    worst : None where there is nothing to measure
-    passed : whether the limit is kept; True where there is none
+    limit : None if the mission sets none
+    worst : None if there is nothing to measure
+    passed : whether the limit is kept; True if there is none
     """
 
     quantity: str
@@ -36,7 +37,7 @@ class Safety:
 
     @property
     def margin(self) -> float | None:
-        """What is left to the limit, in `unit`; negative beyond it."""
+        """Margin to the limit, in `unit`; negative beyond it."""
         if self.limit is None or self.worst is None:
             return None
         rest = self.limit - self.worst.value
@@ -44,38 +45,38 @@ class Safety:
 
     @property
     def used(self) -> float | None:
-        """Share of a greatest allowed value that is used up: 1 at the limit."""
+        """Worst value as a share of the limit, 1 at the limit; None if the limit is a least value."""
         if self.at_least or not self.limit or self.worst is None:
             return None
         return self.worst.value / self.limit
 
 
 def safety(result: Result, verdict: Verdict) -> list[Safety]:
-    """Worst values of a flight that was judged, quantity by quantity, with limits or without.
+    """Worst value of each quantity of a judged flight, with its limit if there is one.
 
-    Limits are those of the verdict; the altitude's are those of the geofence.
+    Limits are those of the verdict; those of the altitude are the geofence's.
     """
     measured = Measurements(result)
     found = {finding.check: finding for finding in verdict.findings}
     return [
         _row(
-            "proximity", "least room between two vehicles' surfaces",
+            "proximity", "least distance between two vehicles' surfaces",
             found.get("separation"), "m", at_least=True,
         ),
         _row(
-            "downwash", "least height between surfaces where one vehicle is below another",
+            "downwash", "least height between surfaces of two vehicles, one below the other",
             found.get("separation_below"), "m", at_least=True, worst=measured.below(),
         ),
         _row("speed", "greatest speed of a vehicle", found.get("speed"), "m/s"),
         _row("acceleration", "greatest acceleration of a vehicle", found.get("acceleration"), "m/s²"),
         *_altitudes(measured),
         _row(
-            "geofence", "least room to the fence from inside, centres of the vehicles",
+            "geofence", "least distance of a vehicle's centre to the geofence, from inside",
             _from_inside(found.get("geofence")), "m", at_least=True,
         ),
         _row("thrust", "greatest thrust of a vehicle", found.get("thrust"), "N"),
         _row(
-            "clearance", "least room to an obstacle or the ground",
+            "clearance", "least distance of a vehicle's surface to an obstacle or the ground",
             found.get("clearance"), "m", at_least=True,
         ),
     ]  # fmt: skip
@@ -99,7 +100,7 @@ def _row(
 
 
 def _from_inside(finding: CheckResult | None) -> CheckResult | None:
-    """The geofence's finding with the room inside it as its worst value, not how far outside."""
+    """The geofence's finding; its worst value becomes the distance inside the geofence, not outside."""
     if finding is None or finding.worst is None:
         return finding
     return replace(finding, worst=-finding.worst)
@@ -111,6 +112,8 @@ def _altitudes(measured: Measurements) -> list[Safety]:
     floor, ceiling = (None, None) if fence is None else (fence.min[2], fence.max[2])
     rows = [
         Safety("lowest", "least altitude of a vehicle's centre", "m", True, floor, lowest, True),
-        Safety("highest", "greatest altitude of one", "m", False, ceiling, highest, True),
+        Safety(
+            "highest", "greatest altitude of a vehicle's centre", "m", False, ceiling, highest, True
+        ),
     ]
     return [replace(row, passed=row.margin is None or row.margin >= -1e-9) for row in rows]

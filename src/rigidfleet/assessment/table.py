@@ -1,4 +1,4 @@
-"""A verdict for the eye: tables of phases, waypoints and checks, notes, and the verdict in words."""
+"""A verdict on the terminal: tables of phases, waypoints and checks, notes, and the verdict in words."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def rendered(
     checks: Sequence[CheckResult],
     last: Sequence[Text],
 ) -> RenderableType:
-    """What rich prints of a verdict: its head, a table of phases, of waypoints and of checks, and its last lines."""
+    """What rich prints of a verdict: its head, tables of phases, waypoints and checks, and its last lines."""
     phases, waypoints = [], []
     for p in phase_verdicts:
         worst = [p.worst.get(name) for name in ("constraint", "separation", "clearance", "thrust")]
@@ -39,7 +39,10 @@ def rendered(
     ]
     if any(row[2] for row in phases):
         shown.append(
-            Text("|c|: an edge's length less that commanded; the greatest of all edges.", "dim")
+            Text(
+                "|c|: how far an edge's length is off the commanded one; the greatest of all edges.",
+                "dim",
+            )
         )
     if waypoints:
         shown.append(_table(_WAYPOINT, waypoints))
@@ -50,7 +53,7 @@ def rendered(
 def _table(
     heads: Sequence[str], rows: Sequence[Sequence[str | Text]], left: Sequence[str] = ()
 ) -> Table:
-    """A table whose first column is words, without the columns in which nothing stands."""
+    """A table whose first column is text, without its empty columns."""
     kept = [k for k in range(len(heads)) if any(row[k] for row in rows)]
     table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold")
     for k in kept:

@@ -1,4 +1,4 @@
-"""What a verdict is: checks, the numbers of each phase, notes; in words and as JSON."""
+"""The verdict on a flight: its checks, the numbers of each phase and notes, in words and as JSON."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from rigidfleet.assessment.outcome import (
     PhaseVerdict,
 )
 
-#: What a passed verdict says of a check's worst value.
+#: What a passed verdict says about a check's worst value.
 _PRAISE = {
     "shape": "shapes are within {worst}",
     "waypoint_position": "waypoints are met within {worst}",
     "separation": "agents stay {worst} apart",
-    "clearance": "obstacles {worst} away in flight",
-    "clearance_start": "{worst} above what they start on",
-    "clearance_end": "{worst} above what they land on",
-    "lost": "vehicles lost keep {worst} from the others",
+    "clearance": "obstacles stay {worst} away in flight",
+    "clearance_start": "agents start {worst} above an obstacle",
+    "clearance_end": "agents land {worst} above an obstacle",
+    "lost": "lost vehicles stay {worst} away from the others",
     "thrust_peak": "thrust peaks at {worst} ({who})",
     "thrust": "thrust peaks at {worst}",
 }
@@ -36,7 +36,7 @@ _PRAISE = {
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What `assess` finds: every check, the numbers of each phase, and notes, which fail nothing.
+    """What `assess` finds: all checks, the numbers of each phase, and notes, which fail nothing.
 
     >>> import rigidfleet as rf
     >>> verdict = rf.assess(rf.simulate("square"))
@@ -58,7 +58,7 @@ class Verdict:
 
     @property
     def worst(self) -> dict[str, Extreme]:
-        """Extremes of the whole flight, by name as in `PhaseVerdict.worst`."""
+        """Extremes of the whole flight, named as in `PhaseVerdict.worst`."""
         found = {}
         for name, sense in SENSE.items():
             every = [phase.worst[name] for phase in self.phases if name in phase.worst]
@@ -68,7 +68,7 @@ class Verdict:
 
     @property
     def summary(self) -> str:
-        """The verdict in words: what holds, or a line for each check that does not."""
+        """The verdict in words: the worst values of a flight that passed, or a line for each failed check."""
         judged = [finding for finding in self.findings if finding.judged]
         failed = [finding for finding in judged if not finding.passed]
         if failed:
@@ -83,7 +83,7 @@ class Verdict:
         return f"{head}; {', '.join(told)}." if told else f"{head}."
 
     def to_dict(self) -> dict[str, Any]:
-        """The verdict as plain data that JSON can hold; what does not apply is None."""
+        """The verdict as plain data that JSON can hold; None for what does not apply."""
         return plain(
             {
                 "mission": self.mission,
@@ -113,7 +113,7 @@ class Verdict:
         return f"<Verdict {self.mission}: {ending} checks>"
 
     def _repr_html_(self) -> str:
-        """The verdict as a notebook shows it: what was judged, then words."""
+        """The verdict as a notebook shows it: the judged checks, then the summary and notes."""
         from rigidfleet import _markup
         from rigidfleet.assessment.table import check_row
 

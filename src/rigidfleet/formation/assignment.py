@@ -1,4 +1,4 @@
-"""Who takes which slot."""
+"""Assignment of agents to slots."""
 
 from __future__ import annotations
 
@@ -11,30 +11,30 @@ from numpy.typing import ArrayLike
 from rigidfleet.math.rigid_body import centred, kabsch
 from rigidfleet.typing import Floats, Ints
 
-#: Up to so many points distances are compared all with all, and up to so many orders of slots tried, which takes
-#: less time than to import what does it better.
+#: Greatest number of points whose distances are all compared, and of orders of slots that are all tried. This is
+#: faster than importing a better algorithm.
 _TRIED = 6
 
 
 class Assigned(NamedTuple):
-    """Who takes which slot, and how the slots lie before those that the agents come from while they blend."""
+    """The slot of each agent, and the rotation of the slots during the blend."""
 
     order: Ints  # (N,) slot of each agent, from 0
-    turn: Floats  # (3, 3) rotation of the slots; they are blended as it turns them, and by no other
+    turn: Floats  # (3, 3) rotation of the slots; the blend must use this rotation and no other
 
 
 def nearest_way(
     start: ArrayLike, end: ArrayLike, radius: ArrayLike | None = None
 ) -> tuple[float, tuple[int, int], float]:
-    """Least room between agents that go straight from start to end (N, 3) [m], all in step.
+    """Least distance between agents that move straight from start to end (N, 3) [m], all in step.
 
-    Exact, in closed form, over all pairs and the whole way; memory grows with N alone.
+    Exact, in closed form, over all pairs and the whole path; memory grows linearly with N.
 
     Returns
     -------
-    room : between two surfaces [m] (between centres without radii (N,)); infinite for one agent
+    room : distance between surfaces [m] (between centres if no radii (N,) are given); infinite for one agent
     pair : the two agents, from 0
-    share : of the way at which they are nearest, in [0, 1]
+    share : share of the path at which they are nearest, in [0, 1]
     """
     p, q = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
     n = len(p)
@@ -45,7 +45,7 @@ def nearest_way(
         i = np.arange(first, min(first + rows, n - 1))
         x = p[i, None] - p[first + 1 :]
         y = q[i, None] - q[first + 1 :] - x
-        # Nearest on the way: a line from x to x + y past zero.
+        # Nearest point to zero of the segment from x to x + y.
         xy, yy = (x * y).sum(axis=2), (y * y).sum(axis=2)
         s = np.clip(-xy / np.maximum(yy, 1e-300), 0.0, 1.0)
         room = np.linalg.norm(x + s[..., None] * y, axis=2) - r[i, None] - r[first + 1 :]
@@ -63,25 +63,26 @@ def assigned(
     turn: ArrayLike | None = None,
     radius: ArrayLike | None = None,
 ) -> Assigned:
-    """Slots (N, 3) that agents at start (N, 3) [m] are to take, and how these are turned meanwhile.
+    """Assign slots (N, 3) to agents at start (N, 3) [m], and choose the rotation of the slots during the blend.
 
-    The turn is chosen first and the order last, by the least sum of squared ways to slots that are turned already:
-    then two agents come no nearer than D / sqrt(2) on straight ways in step with each other, D the least distance
-    of both shapes, as long as the turn flown is the one returned. For if i and j took each other's slots, the
-    squares would grow or stay, which says x . y >= 0 for x = p_i - p_j and y = q_i - q_j, the slots as turned. So
-    |(1 - s) x + s y|^2 >= (1 - s)^2 |x|^2 + s^2 |y|^2 >= D^2 / 2. Agents count alike here, whatever their masses:
-    squares weighted by mass prove nothing. Nor do the centres matter, since x and y know none.
+    The rotation is chosen first; the order then has the least sum of squared distances to the rotated slots. On
+    straight paths in step, two agents then come no nearer than D / sqrt(2), where D is the least distance of both
+    shapes, if the blend uses the rotation returned. Proof: if i and j exchanged their slots, the sum of squares would
+    not decrease, so x . y >= 0 for x = p_i - p_j and y = q_i - q_j (slots as rotated). Therefore
+    |(1 - s) x + s y|^2 >= (1 - s)^2 |x|^2 + s^2 |y|^2 >= D^2 / 2. All agents have equal weight, whatever their masses,
+    because the proof does not hold for squares weighted by mass. The centres do not matter, as x and y are differences.
 
     Parameters
     ----------
-    turn : (3, 3) the rotation of the slots in which they are to be reached; any will do where it is not given
-    radius : (N,) [m] asks for the safest in place of the shortest
+    turn : (3, 3) prescribed rotation of the slots; any rotation if it is not given
+    radius : (N,) [m] asks for the safest assignment instead of the shortest
 
-    The shortest has the least squares for the turn given; or else among some, found from several attitudes in turn
-    by assigning the slots and turning them to the agents (Kabsch) until nothing changes. The safest has the most room
-    between surfaces among the shortest, others of that kind, whose turn differs from the one given, and the order
-    given; among all but equal ones the shorter is taken, and never less room than the shortest has. The order given is
-    kept where nothing is better. Many agents try fewer attitudes: two assignments in all from some 1,000 on.
+    The shortest assignment has the least sum of squares for the given rotation. Without one, several attitudes are
+    tried: slots are assigned and rotated to the agents (Kabsch) in turns, until nothing changes. The safest assignment
+    has the greatest distance between surfaces among the shortest one, similar ones whose rotation differs from the
+    given one, and the given order. Among nearly equal ones the shorter is taken, and it never has less distance than
+    the shortest. The given order is kept if none is better. For many agents fewer attitudes are tried: two assignments
+    in all from some 1,000 agents on.
     """
     p, q = centred(start), centred(slots)
     n = len(p)
@@ -116,16 +117,16 @@ def assigned(
     return min(safe, key=lambda o: (-round(room[id(o)], 2), *worth(o)))
 
 
-#: Pairs of agents that are looked at together; work on assignments, N^3 each, in some seconds.
+#: Number of pairs processed together; work on assignments, N^3 each, of some seconds.
 _PAIRS, _WORK = 200_000, 2e9
 
 
-#: From one attitude so many assignments at most.
+#: Greatest number of assignments from one attitude.
 _ROUNDS = 20
 
 
 def _nearest_slots(p: Floats, q: Floats) -> Ints:
-    """Of slots q (N, 3) those (N,) that make the sum of squared ways from p least."""
+    """Order (N,) of slots q (N, 3) with the least sum of squared distances from p."""
     near = p @ q.T  # |p|^2 + |q|^2 is the same for every order
     n = len(p)
     if n <= _TRIED:
@@ -137,9 +138,9 @@ def _nearest_slots(p: Floats, q: Floats) -> Ints:
 
 
 def _settled(p: Floats, q: Floats, turn: Floats, most: int) -> tuple[Assigned, int]:
-    """Slots q (N, 3) assigned to agents p and turned onto them in turns, until nothing changes.
+    """Assign slots q (N, 3) to agents p and rotate them onto the agents, in turns, until nothing changes.
 
-    Each lessens the same sum of squares; the last is an assignment. Also how many there were, ``most`` at most.
+    Each step reduces the same sum of squares; the last is an assignment. Also return their number, at most ``most``.
     """
     order = _nearest_slots(p, q @ turn.T)
     for used in range(1, most):
@@ -152,7 +153,7 @@ def _settled(p: Floats, q: Floats, turn: Floats, most: int) -> tuple[Assigned, i
 
 
 def _attitudes() -> list[Floats]:
-    """The 24 rotations of a cube: attitudes to start from."""
+    """The 24 rotations of a cube, as attitudes to start from."""
     turns = []
     for axes in permutations(range(3)):
         for signs in product((1.0, -1.0), repeat=3):

@@ -1,4 +1,4 @@
-"""Distances and points: which distances points have, and which points distances have."""
+"""Distance geometry: from points to distances, and from distances to points."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from rigidfleet.math.rigid_body import centred
 from rigidfleet.typing import Floats, Ints
 
-#: Relative tolerance within which given distances must be realisable. Flat and straight shapes sit exactly
+#: Relative tolerance within which given distances must be realisable. Flat and straight shapes lie exactly
 #: on the limit, so distances need about seven digits: 5.656854, not 5.657.
 REALISABLE = 1e-6
 
@@ -36,7 +36,7 @@ def dimension(points: ArrayLike, tol: float = 1e-6) -> int:
 
 
 class Violation(NamedTuple):
-    """Given distances which no points in space have."""
+    """Given distances that no points in space have."""
 
     agents: tuple[int, ...]
     edges: tuple[int, ...]
@@ -45,12 +45,12 @@ class Violation(NamedTuple):
 
 
 def unrealisable(edges: ArrayLike, lengths: ArrayLike, tol: float = REALISABLE) -> list[Violation]:
-    """Every triangle and tetrahedron among the given distances that does not exist in space.
+    """Find all triangles and tetrahedra among the given distances that do not exist in space.
 
     A triangle whose three sides are given must meet the triangle inequality; a quadruple with all six
     distances, and faces that exist, must have a Cayley-Menger determinant 288 V^2 >= 0. Both hold within
-    `tol` of their own size, so that straight (4-8-4) and flat shapes pass. Other quadruples are not judged,
-    and more agents than four may contradict each other where every four agree.
+    `tol` of their own size, so that straight (4-8-4) and flat shapes pass. Other quadruples are not checked,
+    and distances between more than four agents may be unrealisable even if every four are consistent.
     """
     pairs = np.sort(np.asarray(edges, dtype=np.int64).reshape(-1, 2), axis=1).tolist()
     index = {(i, j): k for k, (i, j) in enumerate(pairs)}
@@ -76,7 +76,7 @@ def unrealisable(edges: ArrayLike, lengths: ArrayLike, tol: float = REALISABLE) 
 
 
 def _cliques(after: dict[int, set[int]], size: int) -> Iterator[tuple[int, ...]]:
-    """Agents i < j < ... of which every two share an edge."""
+    """Agents i < j < ... of which every pair has an edge."""
 
     def extend(clique: tuple[int, ...], common: set[int]) -> Iterator[tuple[int, ...]]:
         if len(clique) == size:
@@ -108,12 +108,12 @@ def slots_from_distances(
 ) -> Floats | None:
     """Slots (n, 3) [m] of a *complete* set of distances (classical multidimensional scaling).
 
-    Distances know neither attitude nor mirror image; both follow a convention in which the paper's triangle
-    comes out as it attaches it, and every named shape with its own handedness: x points from the centre
-    to the last agent, y along r1 - r2 made orthogonal to x, and of a spatial shape that mirror image is taken
-    whose first four agents that span space, a < b < c < d, have (b - a) x (c - a) . (d - a) > 0.
+    Distances determine neither attitude nor handedness; both follow a convention that agrees with the paper's
+    triangle and with the handedness of every named shape. x points from the centre to the last agent, and y along
+    r1 - r2 made orthogonal to x. A spatial shape has the handedness for which its first four agents that span space,
+    a < b < c < d, have (b - a) x (c - a) . (d - a) > 0.
 
-    Returns None where a distance is missing, since the shape is then not determined.
+    Returns None if a distance is missing, since the shape is then not determined.
 
     Raises
     ------
@@ -129,15 +129,15 @@ def slots_from_distances(
     d[e[:, 0], e[:, 1]] = d[e[:, 1], e[:, 0]] = given
     centring = np.eye(n) - 1 / n
     value, vector = np.linalg.eigh(-0.5 * centring @ d**2 @ centring)
-    # An eigenvalue is a squared extent: what rounding alone leaves is no thickness.
+    # An eigenvalue is a squared extent; rounding errors alone are no thickness.
     top = np.where(value[-3:] > 1e-12 * value[-1], value[-3:], 0.0)[::-1]
     p = np.zeros((n, 3))
     p[:, : len(top)] = vector[:, -3:][:, ::-1] * np.sqrt(top)
     error = float(np.abs(distances(p, e) - given).max(initial=0.0))
-    # Near a flat shape, an error e in a distance moves points by sqrt(e): judged by distances, not by volume.
+    # Near a flat shape, an error e in a distance moves points by sqrt(e); therefore distances decide, not the volume.
     if error > np.sqrt(tol) * d.max(initial=0.0) or value[0] < -tol * n * d.max(initial=0.0) ** 2:
         raise ValueError(
-            f"no points in space have these distances (nearest set is {error:.3g} m off)"
+            f"no points in space have these distances (the nearest realisable set is {error:.3g} m off)"
         )
     return _conventional(p)
 
@@ -156,7 +156,7 @@ def _conventional(p: Floats) -> Floats:
 
 
 def _first_direction(vectors: Iterable[Floats], p: Floats) -> Floats | None:
-    """Unit vector along the first of the vectors that is not small beside the shape of p."""
+    """Unit vector along the first of the vectors that is not small relative to the shape p."""
     small = 1e-6 * np.abs(p).max(initial=0.0)
     return next((v / np.linalg.norm(v) for v in vectors if np.linalg.norm(v) > small), None)
 

@@ -1,4 +1,4 @@
-"""Constraint graphs of points: who keeps a distance from whom."""
+"""Constraint graphs of points: which agents share an edge."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from numpy.typing import ArrayLike
 from rigidfleet.math.proximity import nearest
 from rigidfleet.typing import Floats, Ints
 
-#: How far neighbours reach, in spacings: to the second, on a shell or in a lattice.
+#: Reach of neighbours, in spacings: up to second neighbours on a shell or in a lattice.
 REACH = 1.9
 
 
-#: The 18 edges of the paper's cube (its Table 4 with the swapped pair d45, d48 put right), counted from 0.
+#: The 18 edges of the paper's cube (its Table 4 with the swapped pair d45, d48 corrected), counted from 0.
 CUBE_EDGES: Ints = np.array(
     [(0, 1), (0, 3), (0, 4), (0, 5), (1, 2), (1, 3), (1, 5), (1, 6), (2, 3), (2, 6), (2, 7), (3, 4)]
     + [(3, 7), (4, 5), (4, 7), (5, 6), (5, 7), (6, 7)],
@@ -36,8 +36,8 @@ def _complete_graph(n: int) -> Ints:
 def neighbours(points: ArrayLike, reach: float = REACH) -> Ints:
     """Edges (m, 2), i < j, between points (N, 3) no further apart than ``reach`` times their spacing.
 
-    The spacing is the median distance to the nearest point. At 1.9 second neighbours are joined, too, which
-    keeps shells and lattices from folding; at 1.5 a cubic lattice has its diagonals of faces.
+    The spacing is the median distance to the nearest point. At a reach of 1.9, second neighbours are joined, too, which
+    keeps shells and lattices from folding; at 1.5, a cubic lattice has its face diagonals.
     """
     from scipy.spatial import KDTree
 
@@ -49,7 +49,7 @@ def neighbours(points: ArrayLike, reach: float = REACH) -> Ints:
 
 
 def count_neighbours(points: ArrayLike, reach: float = REACH) -> int:
-    """How many edges `neighbours` would find, without making them."""
+    """Number of edges that `neighbours` would return, without building them."""
     p = np.asarray(points, dtype=np.float64)
     if len(p) < 2:
         return 0
@@ -57,7 +57,7 @@ def count_neighbours(points: ArrayLike, reach: float = REACH) -> int:
 
 
 def count_within(points: ArrayLike, distance: float) -> int:
-    """How many pairs of points (N, 3) are no farther apart than a distance [m], without making them."""
+    """Number of pairs of points (N, 3) within a distance [m] of each other, without building them."""
     from scipy.spatial import KDTree
 
     tree = KDTree(points)
@@ -65,12 +65,12 @@ def count_within(points: ArrayLike, distance: float) -> int:
 
 
 def _within(p: Floats, reach: float) -> float:
-    """How far [m] neighbours of points (N, 3) are at most."""
+    """Greatest distance [m] between neighbours among points (N, 3)."""
     return reach * float(np.median(nearest(p))) * (1 + 1e-9)
 
 
 def spans_space(points: ArrayLike) -> None:
-    """ValueError, with a reason, where `henneberg` and `henneberg_multilevel` have no edges for points (N, 3)."""
+    """Raise a ValueError with the reason if `henneberg` and `henneberg_multilevel` have no edges for points (N, 3)."""
     p = np.asarray(points, dtype=np.float64)
     _spanning_first(p, np.arange(len(p)))
 
@@ -78,9 +78,9 @@ def spans_space(points: ArrayLike) -> None:
 def henneberg(points: ArrayLike) -> Ints:
     """3N - 6 edges (m, 2), i < j, that join each of N points in space to three nearer to the centre.
 
-    A generically rigid graph by Henneberg's first step, whose exact law is solved in O(N). Of the nearest twelve
-    points that come earlier those three are taken that span the largest volume of directions. Edges are short, and
-    chains of agents as long as from the centre to the border.
+    Henneberg type-I steps give a generically rigid graph, whose exact law is solved in O(N). Each point is joined to
+    those three of the twelve nearest earlier points whose directions span the largest volume. Edges are short;
+    chains of agents reach from the centre to the border.
 
     Raises
     ------
@@ -99,7 +99,7 @@ def henneberg(points: ArrayLike) -> Ints:
     for some in np.array_split(order[3:], max(1, n // 4000)):
         near = tree.query(p[some], k=min(n, 48))[1]
         later = rank[near] >= rank[some][:, None]
-        lone = np.flatnonzero((~later).sum(axis=1) < 12)  # few of the nearest come before
+        lone = np.flatnonzero((~later).sum(axis=1) < 12)  # few of the nearest points come earlier
         at = np.take_along_axis(near, np.argsort(later, axis=1, kind="stable"), axis=1)[:, :12]
         at = np.pad(at, ((0, 0), (0, 12 - at.shape[1])), constant_values=-1)
         for k in lone:
@@ -110,20 +110,21 @@ def henneberg(points: ArrayLike) -> Ints:
         u, length = _towards(p, some, at)
         a, b, c = (u[:, _TRIPLES[:, k]] for k in range(3))
         volume = np.abs((a * np.cross(b, c)).sum(axis=2))
-        # Of as good triples the shortest.
+        # Among equally good triples, the one with the shortest edges.
         worth = volume.round(3) - 1e-6 * length[:, _TRIPLES].sum(axis=2) / length.max()
         edges.append(_edges_to(some, at, _TRIPLES[worth.argmax(axis=1)]))
     return np.sort(np.concatenate(edges), axis=1).astype(np.int64)
 
 
 def henneberg_multilevel(points: ArrayLike) -> Ints:
-    """3N - 6 edges (m, 2), i < j, that join each of N points in space to three before it, far ones first.
+    """3N - 6 edges (m, 2), i < j, that join each of N points in space to three before it, from coarse to fine.
 
-    Of the kind that `henneberg` makes, and solved as fast; but it begins with points far apart, and doubles their
-    number again and again, each new one between those there are, so that no chain of agents is longer than log N.
-    Of the twelve nearest before it a point is joined to the three that leave it the stiffest: with the inverse G of
-    their directions, and e of each its own, least sum of |G_k|^2 (1 + e_k). It holds lattices better than `henneberg`,
-    and shells, which that one leaves flexible; its first edges are as long as the shape.
+    The graph is of the same kind as `henneberg`'s, and its law is solved as fast. It begins with points far apart and
+    repeatedly doubles their number, each new point between earlier ones, so that no chain of agents is longer than
+    log N. Each point is joined to those three of the twelve nearest earlier points that hold it most stiffly: with
+    the inverse G of their directions, and the softness e_k of each, the sum of |G_k|^2 (1 + e_k) is least. This graph
+    holds lattices better than `henneberg`. It also holds shells, which `henneberg` leaves flexible. Its first edges
+    are as long as the shape.
 
     Raises
     ------
@@ -143,7 +144,8 @@ def henneberg_multilevel(points: ArrayLike) -> Ints:
         near = KDTree(p[order[:done]]).query(p[some], k=min(done, 12))[1]
         at = np.pad(order[near], ((0, 0), (0, 12 - near.shape[1])), constant_values=-1)
         square = _softness(p, some, at, soft)
-        flat = np.flatnonzero(square.min(axis=1) > _FLAT)  # all near ones lie in one plane with it
+        # All near points lie in one plane with it
+        flat = np.flatnonzero(square.min(axis=1) > _FLAT)
         if len(flat):
             at[flat] = first[np.arange(12) % len(first)]
             square[flat] = _softness(p, some[flat], at[flat], soft)
@@ -154,9 +156,9 @@ def henneberg_multilevel(points: ArrayLike) -> Ints:
 
 
 def _softness(p: Floats, some: Ints, at: Ints, soft: Floats) -> Floats:
-    """How soft (k, 220) points (k,) are that are joined to three of those at (k, 12), of which each is so ``soft``.
+    """Softness (k, 220) of points (k,) joined to each triple of those at (k, 12), which have the softness ``soft``.
 
-    Three that lie in a plane with the point, or are not there, give some 1e18.
+    Triples that lie in a plane with the point, or are incomplete, give about 1e18.
     """
     u, _ = _towards(p, some, at)
     a, b, c = (u[:, _TRIPLES[:, k]] for k in range(3))
@@ -167,11 +169,11 @@ def _softness(p: Floats, some: Ints, at: Ints, soft: Floats) -> Floats:
     return np.maximum(square, 1e-6) / np.maximum(volume**2, 1e-24)
 
 
-#: Softer than this is who lies in a plane with all those near.
+#: Softness beyond which a point lies in a plane with all near points.
 _FLAT = 1e12
 
 
-#: Three out of twelve.
+#: All triples out of twelve.
 _TRIPLES = np.array(list(combinations(range(12), 3)))
 
 
@@ -180,7 +182,7 @@ def _triangle_of(order: Ints) -> Ints:
 
 
 def _towards(p: Floats, some: Ints, at: Ints) -> tuple[Floats, Floats]:
-    """Unit vectors (k, 12, 3) from some points (k,) to others (k, 12), and how far; 0 where they are -1: none."""
+    """Unit vectors (k, 12, 3) and distances from points (k,) to others (k, 12); 0 for -1, which means none."""
     x = p[at] - p[some][:, None]
     length = np.linalg.norm(x, axis=2)
     there = (at >= 0) & (length > 0)
@@ -193,7 +195,7 @@ def _edges_to(some: Ints, at: Ints, triple: Ints) -> Ints:
 
 
 def _far_apart(p: Floats, count: int) -> Ints:
-    """So many points, each the farthest from all before it, the first from the centre."""
+    """``count`` points, each the farthest from all before it; the first is the farthest from the centre."""
     away = np.linalg.norm(p - p.mean(axis=0), axis=1)
     found = [int(away.argmax())]
     away = np.linalg.norm(p - p[found[0]], axis=1)
@@ -217,9 +219,11 @@ def _halves(p: Floats) -> Ints:
 
 
 def _spanning_first(p: Floats, order: Ints) -> Ints:
-    """The order (N,) with four points in front that span space, each the earliest that will do."""
+    """The order (N,) with four points that span space moved to the front, each the earliest possible one."""
     if len(p) < 4:
-        raise ValueError(f"{len(p)} points have no three edges each, four at least do")
+        raise ValueError(
+            f"{len(p)} points cannot have three edges each; at least four points are needed"
+        )
     x = p[order] - p[order[0]]
     x = x / np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-300)
     found = [0, 1]
@@ -230,7 +234,7 @@ def _spanning_first(p: Floats, order: Ints) -> Ints:
         fits = np.flatnonzero(size() > 0.2)
         if not len(fits):
             raise ValueError(
-                "points in a plane or on a line have no three edges each; they need slots"
+                "points in a plane or on a line cannot be held by three edges each; they need slots"
             )
         found.append(int(fits[0]))
     return np.concatenate([order[found], np.delete(order, found)])

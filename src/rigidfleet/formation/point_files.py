@@ -12,15 +12,15 @@ from rigidfleet.typing import Floats
 
 
 def read_points(path: str | Path) -> Floats:
-    """Slots (N, 3) [m] from a text file: one agent a line, x, y and z (or x and y, for z = 0).
+    """Slots (N, 3) [m] from a text file: one agent per line, x, y and z (or x and y, for z = 0).
 
-    Numbers are separated by commas, semicolons or blanks; empty lines and what follows `#` are passed over,
-    and so is a first line of names (`x,y,z`).
+    Numbers are separated by commas, semicolons or blanks. Empty lines, text after `#` and a first line of names
+    (`x,y,z`) are ignored.
 
     Raises
     ------
     MissionError
-        The file cannot be read or has no points; with a finding for each line that is none.
+        The file cannot be read or has no points; with a finding for each invalid line.
     """
     lines = _lines(Path(path))
     findings, points, first = [], [], {}
@@ -33,7 +33,7 @@ def read_points(path: str | Path) -> Floats:
             point = [float(field) for field in fields]
         except ValueError:
             point = []
-            problem, remedy = "is no point", "write x, y, z as numbers, with decimal points"
+            problem, remedy = "is not a point", "write x, y, z as numbers, with decimal points"
         if point and len(point) not in (2, 3):
             problem = f"has {len(point)} numbers"
             remedy = "write x, y, z (or x, y); decimal points, not commas"
@@ -42,13 +42,13 @@ def read_points(path: str | Path) -> Floats:
         if not problem:
             at = first.setdefault(tuple(round(x, 9) for x in (*point, 0.0)[:3]), number)
             if at != number:
-                problem, remedy = f"is the point of line {at} again", "keep the slots apart"
+                problem, remedy = f"repeats the point of line {at}", "keep the slots apart"
         if problem:
             findings.append(Finding(str(path), f"line {number}", line.strip(), problem, remedy))
         else:
             points.append((*point, 0.0)[:3])
     if not points and not findings:
-        remedy = "write one agent a line: x, y, z"
+        remedy = "write one agent per line: x, y, z"
         findings.append(Finding(str(path), "", None, "has no points", remedy))
     if findings:
         raise MissionError(findings)
@@ -74,5 +74,5 @@ def _lines(path: Path) -> list[str]:
     except OSError as error:
         problem = f"cannot be read: {(error.strerror or str(error)).lower()}"
     raise MissionError(
-        [Finding(str(path), "", None, problem, "give a text file, one agent a line")]
+        [Finding(str(path), "", None, problem, "give a text file with one agent per line")]
     )

@@ -1,7 +1,7 @@
 """Shapes, edges and the distances between them: what a formation is before it flies.
 
 Agents count from 0 here; a shape is an (N, 3) array of *slots* [m] in the body frame, one per
-agent, with its geometric centre at the origin. Distances alone know neither a mirror image nor an attitude;
+agent, with its geometric centre at the origin. Distances alone determine neither handedness nor attitude;
 slots do.
 """
 
@@ -72,14 +72,14 @@ def _sphere(size: Floats, n: int) -> Floats:
 
 
 def _shells(size: Floats, n: int) -> Floats:
-    """Two concentric spheres, the outer one first, as near to each other as agents on each are."""
+    """Two concentric spheres, the outer one first; their distance is that of neighbours on each sphere."""
 
     def radius(count: int) -> float:
         return float(np.linalg.norm(_sphere(size, count)[0]))
 
-    low, high = n // 2, n - 4  # agents of the outer one: too few, and enough
+    low, high = n // 2, n - 4  # numbers of agents of the outer sphere: too few, and enough
     if radius(high) - radius(n - high) < size[0]:
-        raise ValueError(f"{n} agents are too few for a sphere within a sphere")
+        raise ValueError(f"{n} agents are too few for a sphere inside a sphere")
     while high - low > 1:
         middle = (low + high) // 2
         apart = radius(middle) - radius(n - middle)
@@ -96,8 +96,8 @@ def _helix(size: Floats, n: int) -> Floats:
     low, high = 0.0, np.pi
     if spacing > chord(high):
         raise ValueError(
-            f"a helix of radius {radius:g} m that rises {rise:g} m a turn takes a distance of neighbours of at "
-            f"most {chord(high):.4g} m, half a turn, not {spacing:g}"
+            f"a helix of radius {radius:g} m that rises {rise:g} m per turn allows a distance between neighbours of "
+            f"at most {chord(high):.4g} m (half a turn), not {spacing:g}"
         )
     for _ in range(60):
         middle = (low + high) / 2
@@ -123,7 +123,7 @@ def _octahedron(size: Floats, n: int) -> Floats:
 
 
 def _icosahedron(size: Floats, n: int) -> Floats:
-    # Circumradius R; two rings of five, the upper half a step ahead, at heights -+ R / sqrt 5.
+    # Circumradius R; two rings of five at heights -+ R / sqrt 5, the upper one rotated by half a step.
     R = size[0] * np.sqrt((5 + np.sqrt(5)) / 8)
     ring, height = 2 * R / np.sqrt(5), R / np.sqrt(5)
     return _rings((1, 0, -R, 0), (5, ring, -height, 0), (5, ring, height, np.pi / 5), (1, 0, R, 0))
@@ -142,7 +142,7 @@ def _dodecahedron(size: Floats, n: int) -> Floats:
 
 
 class Shape(NamedTuple):
-    """A named shape: which numbers of agents it takes, how many sizes, and what it looks like."""
+    """A named shape: its numbers of agents, its number of sizes, and its description."""
 
     agents: range
     sizes: int
@@ -200,7 +200,7 @@ SHAPES: dict[str, Shape] = {
 }
 
 
-#: Polygons by name, and the agents that make them.
+#: Polygons by name, with their numbers of agents.
 POLYGONS = {
     "pentagon": 5, "heptagon": 7, "octagon": 8, "nonagon": 9, "decagon": 10, "hendecagon": 11, "dodecagon": 12,
 }  # fmt: skip
@@ -241,12 +241,12 @@ def slots(shape: str, size: float | Sequence[float], n: int) -> Floats:
 
 @lru_cache(8)
 def _slots(shape: str, sizes: tuple[float, ...], n: int) -> Floats:
-    """Slots as `slots` returns them, made once: those of many agents take seconds."""
+    """Slots as `slots` returns them, cached because those of many agents take seconds."""
     return centred(SHAPES[shape].make(np.array(sizes), n))
 
 
 def agents_taken(shape: str) -> str:
-    """How many agents a named shape takes, in words."""
+    """The number of agents of a named shape, in words."""
     taken = SHAPES[shape].agents
     if len(taken) == 1:
         return f"{taken.start} agents"

@@ -6,8 +6,8 @@ Eq. (12) of the paper, with the moving reference fed forward, reads
     b = d_ddot - J_dot r_dot - J M^-1 f_E - 2 alpha c_dot - beta^2 c - gamma int c dt.
 
 Row k of J holds the unit vector u_k of edge (i, j) at i and -u_k at j. The matrix
-A = J M^-1 J^T is singular where a formation lies on a line or in a plane, or has redundant edges:
-the named solves differ only in what they do there.
+A = J M^-1 J^T is singular if a formation lies on a line or in a plane, or has redundant edges.
+The named solvers differ only in how they treat this case.
 """
 
 import math
@@ -84,14 +84,14 @@ def assemble(u, graph, scale, shift, A):
 
 @inlined
 def solve_multipliers(vehicles, graph, law, w):
-    """Multipliers w.multiplier (m,) [N] of Eqs. (11), (12) for w.b; NaN where A is singular and the law exact.
+    """Multipliers w.multiplier (m,) [N] of Eqs. (11), (12) for w.b; NaN if A is singular and the law exact.
 
-    On the eigenvalues w of mbar A (mbar the mean mass of those left), each law is mbar phi(w) b with
+    On the eigenvalues w of mbar A (mbar is the mean mass of the agents still flying), each law is mbar phi(w) b with
     exact      1/w, the paper's;
     iterated   (1 - (mu/(w + mu))^k)/w, Tikhonov regularisation iterated k times;
     spectral   1/(w + nu), nu = (s0/4)(1 - w/s0)^2 for w < s0, else 0;
-    pinv       1/w, and below W = cutoff w_max (3 - 2 w/W) w/W^2, which goes on smoothly to 0, as a
-               jump there would be one of the force.
+    pinv       1/w, and below W = cutoff w_max (3 - 2 w/W) w/W^2, which continues smoothly to 0, because
+               a jump would make the force jump.
     """
     if graph.solver != 0:
         call_solver(graph.solver)
@@ -104,8 +104,8 @@ def solve_multipliers(vehicles, graph, law, w):
         solve_at_agents(m, mbar, graph.edges, law, w)
         return
     mu, iterations = (law.mu, law.iterations) if law.solver == ITERATED else (0.0, 1)
-    # Spectral damping is the exact law wherever all w >= s0, so where mbar A - s0 is definite, too;
-    # pinv wherever all are above its cut-off, of a trace that is no smaller than w_max.
+    # Spectral damping equals the exact law if all w >= s0, that is, if mbar A - s0 is definite. The pseudo-inverse
+    # equals it if all w are above its cut-off; the trace is an upper bound of w_max.
     trials, least = 1, law.s0
     if law.solver == SPECTRAL:
         trials = 2
@@ -134,7 +134,7 @@ def solve_multipliers(vehicles, graph, law, w):
 
 @inlined
 def solve_by_eigenvalues(graph, mbar, law, w):
-    """The laws that are functions of each eigenvalue where no factor exists: pinv and spectral."""
+    """The laws pinv and spectral, as functions of the eigenvalues, if a factor does not exist."""
     n = graph.edges.shape[0]
     b, y = w.b, w.multiplier
     assemble(w.u, graph, mbar, 0.0, w.A)
@@ -159,7 +159,7 @@ def solve_by_eigenvalues(graph, mbar, law, w):
 
 @compiled
 def solve_at_agents(m, mbar, edges, law, w):
-    """The iterated solve in the agents' coordinates, the smaller system where edges are many.
+    """The iterated solve in the agents' coordinates, which is the smaller system if there are many edges.
 
     With K = mbar J^T J + mu M (3N, 3N), each iteration is a += mbar K^-1 J^T (b - J a), and the
     multipliers are lambda = (mbar/mu) sum of the residuals b - J a: f_C = J^T lambda = M a.

@@ -1,4 +1,4 @@
-"""Input laws: the reference motion of the virtual body, local tracking, and LQR on the body."""
+"""Input laws: the reference motion of the virtual body, local tracking, and LQR of the body."""
 
 import math
 
@@ -39,7 +39,7 @@ def body_rates(phi, phi_dot, phi_ddot, omega, omega_dot):
     """Body-axes rates of R = Exp(phi): omega = J_r(phi) phi_dot, and its derivative.
 
     J_r = 1 - a [phi x] + b [phi x]^2, a = (1 - cos x)/x^2, b = (x - sin x)/x^3, x = |phi|; the
-    rates of a and b enter through a'/x and b'/x, all by their series where x is small.
+    rates of a and b enter through a'/x and b'/x, all by their series for small x.
     """
     xx = phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]
     s = phi[0] * phi_dot[0] + phi[1] * phi_dot[1] + phi[2] * phi_dot[2]  # x dx/dt
@@ -91,7 +91,7 @@ def rotate_after(E, T, out):
 def reference_motion(t, motion, w):
     """Reference motion of the virtual body at t into w.body (see `Workspace`) and w.T_ref.
 
-    After the last knot the CM and the attitude move on at the rates they have there.
+    After the last knot, the CM and the attitude continue at the rates they have there.
     """
     knots, body = motion.knots, w.body
     low, high = 0, knots.shape[0] - 1
@@ -123,7 +123,7 @@ def reference_motion(t, motion, w):
 
 @inlined
 def desired_agents(w):
-    """Where each agent should be: r_i = r_cm + T^T p_i and two derivatives, into w.r_ref etc.
+    """Desired position of each agent, r_i = r_cm + T^T p_i, and two derivatives, into w.r_ref etc.
 
     v_i = v_cm + T^T (dp + omega x p), which is Eq. (22),
     a_i = a_cm + T^T (ddp + 2 omega x dp + domega x p + omega x (omega x p)).
@@ -149,7 +149,7 @@ def desired_agents(w):
 def local_law(t, p, w):
     """Local LQR of every agent (paper, section V): f_i = m_i (a_i + g - k1 e_i - k2 de_i).
 
-    For slots w.p at t [s]. Writes w.f_u and, into w.wrench, the wrench that the reference motion itself asks for.
+    For slots w.p at t [s]. Writes w.f_u and, into w.wrench, the wrench of the reference motion itself.
     """
     r, v, m, g, control = w.r, w.v, p.vehicles.m, p.vehicles.g, p.control
     reference_motion(t, p.motion, w)
@@ -176,7 +176,7 @@ def local_law(t, p, w):
 
 @compiled
 def body_gains(t, feedback, out):
-    """Gains (4,) at t: cubics through the table over the time to go; after arrival those held."""
+    """Gains (4,) at t, from cubics through the table over the time to go; after arrival, the holding gains."""
     remaining = feedback.arrival - t
     n = feedback.to_go.shape[0]
     if remaining < 0.0 or n == 0:
@@ -201,7 +201,7 @@ def body_gains(t, feedback, out):
 
 @compiled
 def body_law(t, p, w):
-    """LQR on the virtual body: CM and attitude -> wrench w.wrench, for `allocate` to share.
+    """LQR of the virtual body: from CM and attitude to the wrench w.wrench, which `allocate` distributes.
 
     The target moves: r_wp + v_wp (t - T), and turns at omega_wp. With the attitude error phi,
     body = target Exp(phi): F = M (g - K e), tau = I (-K phi ...) + omega x I omega, world axes.
@@ -240,9 +240,9 @@ def body_law(t, p, w):
 
 @inlined
 def input_law(t, p, w):
-    """Input force w.f_u (N, 3) [N] at t [s] by the phase's law, and what damps deformation, for w.r and w.v.
+    """Input force w.f_u (N, 3) [N] at t [s] by the phase's law, plus the deformation damping, for w.r and w.v.
 
-    On the way come the mean axes (w.cm, w.I) where somebody needs them, and the slots (w.p).
+    Also computes the mean axes (w.cm, w.I), if they are needed, and the slots (w.p).
     """
     m, M, control = p.vehicles.m, p.vehicles.M, p.control
     if p.law.k_def > 0.0 or p.has_frame or control.kind == BODY:

@@ -1,14 +1,14 @@
-"""What a mission disturbs a flight by: wind, gusts, noise, wrong masses, vehicles lost.
+"""Disturbances of a flight: wind, gusts, noise, wrong masses, lost vehicles.
 
-The laws work on what vehicles measure and believe, Newton's law on the truth. `sense` puts the
-measured state in the place of the true one, before the laws; `disturb` puts the true one back,
-after them, and adds what no vehicle knows.
+The control laws use measured states and assumed masses; the equations of motion use the true ones.
+Before the laws, `sense` replaces the true state by the measured one. After them, `disturb` restores the
+true state and adds the forces that no vehicle knows.
 """
 
 from rigidfleet.kernel.compiler.jit import compiled
 
 # A lost vehicle on the ground: critically damped contact of this natural frequency [1/s], damped from
-# this depth [m] on. It stops within a meter from 40 m/s, and asks for no shorter steps than a flight does.
+# this depth [m] on. It stops within a metre from 40 m/s, and needs no shorter steps than a flight.
 _CONTACT, _SOFT = 20.0, 0.01
 
 
@@ -16,7 +16,7 @@ _CONTACT, _SOFT = 20.0, 0.01
 def spline(t, step, table, out):
     """Cubic B-spline with coefficients table (K, N, 3), knots every `step` [s] from 0, into out (N, 3).
 
-    Twice continuously differentiable; constant before the first and behind the last knot.
+    Twice continuously differentiable; constant before the first and after the last knot.
     """
     last = table.shape[0] - 4
     x = min(max(t / step, 0.0), last + 1.0)
@@ -46,7 +46,7 @@ def exchange(a, b):
 
 @compiled
 def sense(t, disturbance, w):
-    """Measured states into w.r and w.v, and the true ones into w.r_seen and w.v_seen meanwhile."""
+    """Write measured states into w.r and w.v, and store the true ones in w.r_seen and w.v_seen meanwhile."""
     if disturbance.noise_r.shape[0] > 0:
         spline(t, disturbance.noise_step, disturbance.noise_r, w.r_seen)
         spline(t, disturbance.noise_step, disturbance.noise_v, w.v_seen)
@@ -59,10 +59,10 @@ def sense(t, disturbance, w):
 
 @compiled
 def disturb(t, m, g, disturbance, w):
-    """True states back into w.r and w.v, true forces into w.f_E; w.f_D (N, 3) [N] is that of the air.
+    """Write true states back into w.r and w.v, true forces into w.f_E, and the aerodynamic force into w.f_D (N, 3) [N].
 
-    f_D = drag (wind + gust - v), linear in the velocity through the air. Gravity acts on true masses, not on
-    those believed, m (N,). A lost vehicle has no thrust, and comes to rest on the ground.
+    f_D = drag (wind + gust - v), linear in the velocity through the air. Gravity acts on the true masses,
+    not on the assumed ones, m (N,). A lost vehicle has no thrust, and comes to rest on the ground.
     """
     if disturbance.noise_r.shape[0] > 0:
         exchange(w.r, w.r_seen)
@@ -79,7 +79,7 @@ def disturb(t, m, g, disturbance, w):
             w.f_E[i, q] += w.f_D[i, q]
         w.f_E[i, 2] -= (true - m[i]) * g
         if disturbance.lost[i]:
-            # Where the contact carries the weight, the vehicle is to touch the ground.
+            # In equilibrium with its weight, the vehicle just touches the ground.
             deep = max(0.0, disturbance.floor[i] + g / _CONTACT**2 - w.r[i, 2])
             damping = 2.0 * _CONTACT * true * min(1.0, deep / _SOFT)
             for q in range(3):

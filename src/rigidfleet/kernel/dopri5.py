@@ -1,4 +1,4 @@
-"""The integrator: Dormand and Prince's pair of fifth and fourth order, its steps kept in a trail."""
+"""The integrator: Dormand and Prince's pair of fifth and fourth order, with its steps recorded in a trail."""
 
 import math
 
@@ -39,7 +39,7 @@ _D = np.array(
 
 @compiled
 def forget_stages(k, first):
-    """Make the stages from ``first`` on zero: NaN left in them would outlive its weight of zero."""
+    """Set the stages from ``first`` on to zero: NaN in them would survive a weight of zero."""
     for s in range(first, 7):
         for q in range(k.shape[1]):
             k[s, q] = spread(0.0)
@@ -48,7 +48,7 @@ def forget_stages(k, first):
 @inlined
 def advance(k, stage, a, h):
     """Write the state of a stage: y + h sum a[stage, s] k_s."""
-    # All six terms at once: stages still to come have no weight, and finite values.
+    # All six terms at once: later stages have weight zero and finite values.
     a0, a1, a2 = h * a[stage, 0], h * a[stage, 1], h * a[stage, 2]
     a3, a4, a5 = h * a[stage, 3], h * a[stage, 4], h * a[stage, 5]
     for q in range(k.shape[1]):
@@ -59,15 +59,15 @@ def advance(k, stage, a, h):
 
 @compiled
 def keep_start(p, w, state):
-    """Leave the forces behind a jump in the trail."""
+    """Record the forces after a jump in the trail."""
     read_gauge(p, w, state.trail.start)
 
 
 @compiled
 def keep_step(t, h, p, w, state):
-    """Leave a step in the trail: its continuous extension by Bernstein coefficients, and the forces at its end.
+    """Record a step in the trail: the Bernstein coefficients of its continuous extension, and the forces at its end.
 
-    With the terms of Hairer's form, y + x (rise + (1 - x) (bend + x (rest + (1 - x) twist))).
+    The terms are those of Hairer's form, y + x (rise + (1 - x) (bend + x (rest + (1 - x) twist))).
     """
     K, row = state.K, state.count[4]
     points = state.trail.points[row]
@@ -94,14 +94,14 @@ def integrate(p, w, state, t_end, fresh, times, samples, max_steps):
     Parameters
     ----------
     p, w, state : Problem, Workspace, IntegratorState (changed in place)
-    t_end : time to land on [s]
-    fresh : True at a start or after a switch, where the derivative at y is not known yet
-    times, samples : (K,) [s] increasing and (K, n): where to write the dense output; the next
+    t_end : time of the end, met exactly [s]
+    fresh : True at a start or after a switch, when the derivative at y is not known yet
+    times, samples : increasing times (K,) [s] and the array (K, n) for the dense output; the next
         index to write is ``state.count[3]``
-    max_steps : pause after so many steps
+    max_steps : number of steps after which to pause
 
-    Returns FINISHED, PAUSED (the trail may be full), or COLLAPSED where the step size fell to nothing
-    (singular constraints, non-finite forces); y and t are then those of the last step that was good.
+    Returns FINISHED, PAUSED (the trail may be full), or COLLAPSED if the step size collapsed (singular
+    constraints, non-finite forces). y and t are then those of the last accepted step.
     """
     p, w, state = by_address(p), by_address(w), by_address(state)
     K, clock, count = state.K, state.clock, state.count
@@ -151,7 +151,7 @@ def integrate(p, w, state, t_end, fresh, times, samples, max_steps):
             continue
         t_new = t + h if t + h < t_end else t_end
         if count[3] < times.shape[0] and times[count[3]] <= t_new:
-            for q in range(n):  # into K[1], which has no weight in the sums
+            for q in range(n):  # into K[1], which has weight zero in the sums
                 d = _D[0] * K[0, q]
                 for s in range(1, 7):
                     d += _D[s] * K[s, q]
@@ -173,7 +173,7 @@ def integrate(p, w, state, t_end, fresh, times, samples, max_steps):
         t = t_new
         first = 1
         count[1] += 1
-        # 0.9 error^-0.17 last^0.04, by logarithms: two powers would take as long as half an evaluation.
+        # 0.9 error^-0.17 last^0.04, by logarithms: two powers would cost half an evaluation.
         error = math.log(max(error, 1e-8))
         h *= min(5.0, max(0.2, 0.9 * math.exp(0.04 * last - 0.17 * error)))
         last = max(error, LEAST_ERROR)

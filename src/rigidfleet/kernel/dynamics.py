@@ -1,4 +1,4 @@
-"""The closed loop: what moves, by Newton's law and the laws of the phase.
+"""The closed loop: equations of motion with the control and constraint laws of the phase.
 
 States: inertial formulation [r (3N), v (3N), int c (m), q (4, if there is a frame)];
 body formulation [x (3N), y (3N), int c (m), q (4), r_cm (3), v_cm (3)], x_i = T (r_i - r_cm),
@@ -59,7 +59,8 @@ def closed_loop(t, y, dy, p, w):
         constraint_force(t, y, dy, p, w)
     if disturbance.active:
         disturb(t, m, g, disturbance, w)
-        if p.has_frame and disturbance.noise_r.shape[0] > 0:  # the frame turns as the body does
+        # The frame rotates with the true motion of the body
+        if p.has_frame and disturbance.noise_r.shape[0] > 0:
             mean_axes(r, v, m, vehicles.M, w)
     accelerate(dy, p, w)
     if p.body_formulation:
@@ -100,7 +101,7 @@ def world_states(y, p, w):
 @compiled
 def turn_back(T, x, origin, out):
     """out_i = origin + T^T x_i (N, 3), of x (3N,)."""
-    # Numbers rather than elements: what is stored could be one of them, for all that the compiler knows.
+    # Scalars instead of elements: for the compiler, the output could alias the elements.
     T00, T01, T02 = T[0, 0], T[0, 1], T[0, 2]
     T10, T11, T12 = T[1, 0], T[1, 1], T[1, 2]
     T20, T21, T22 = T[2, 0], T[2, 1], T[2, 2]

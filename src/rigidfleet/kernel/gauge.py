@@ -1,4 +1,4 @@
-"""What the closed loop has left in its workspace, as the numbers that limits are held against."""
+"""Quantities with limits, read from the workspace of the closed loop."""
 
 import math
 
@@ -25,7 +25,7 @@ def read_gauge(p, w, values):
     for k in range(m):
         values[3 * n + k] = -w.multiplier[k]
         c = w.c[k]
-        if noisy:  # what is true, not what is measured
+        if noisy:  # the true values, not the measured ones
             c = 0.0
             for q in range(3):
                 d = w.r[edges[k, 0], q] - w.r[edges[k, 1], q]

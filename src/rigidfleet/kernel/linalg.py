@@ -7,13 +7,13 @@ from rigidfleet.kernel.compiler.jit import compiled
 
 @compiled
 def where_positive(x, a, b):
-    """Return a where x > 0, else b."""
+    """Return a if x > 0, else b."""
     return a if x > 0.0 else b
 
 
 @compiled
 def surely_positive(x):
-    """Whether x > 0; straight-line code, which cannot know, takes it that it is not (`trace`)."""
+    """Whether x > 0; straight-line code cannot know and assumes that it is not (`tracer`)."""
     return x > 0.0
 
 
@@ -21,9 +21,9 @@ def surely_positive(x):
 def cholesky(A):
     """Factor the lower triangle of A (n, n) = L D L^T in place; the diagonal keeps 1 / D_jj.
 
-    Returns False, and leaves A half done, where A is not positive definite.
+    Returns False, and leaves A unfinished, if A is not positive definite.
     """
-    # By tiles of two rows and two columns: four sums share their loads, a third of the time saved.
+    # In tiles of two rows and two columns: four sums share their loads, which saves a third of the time.
     n = A.shape[0]
     odd = n % 2
     if odd:
@@ -44,7 +44,7 @@ def cholesky(A):
         if not (p > 0.0 and q > 0.0):
             return False
         A[j, j], A[j + 1, j], A[j + 1, j + 1] = inverse, l, 1.0 / q
-        for i in range(j + 2, n, 2):  # L D; D is divided out when it is the turn of rows i, i + 1
+        for i in range(j + 2, n, 2):  # L D; D is divided out when rows i, i + 1 are processed
             s, t, u, v = A[i, j], A[i, j + 1], A[i + 1, j], A[i + 1, j + 1]
             for k in range(j):
                 s -= A[i, k] * A[j, k]
@@ -83,7 +83,7 @@ def jacobi_eigen(A, V, w):
 
     Returns the largest eigenvalue.
 
-    Reads the lower triangle; A is destroyed. Small eigenvalues come out accurate, and nothing is
+    Reads the lower triangle; A is destroyed. Small eigenvalues are accurate, and nothing is
     allocated.
     """
     n = A.shape[0]

@@ -1,22 +1,23 @@
-"""What a flight comes to between samples: extremes over the steps of the integrator, in continuous time.
+"""Find the extremes of a flight in continuous time, over the steps of the integrator.
 
-The integrator leaves every step in its `Trail`: the continuous extension of each state, a polynomial of fourth
-degree, by its Bernstein coefficients (control points), and the forces at the step's end.
+The integrator records every step in its `Trail`: the continuous extension of each state, a polynomial of fourth
+degree, by its Bernstein coefficients (control points), and the forces at the end of the step.
 
-Distances miss nothing. A polynomial in Bernstein form lies in the convex hull of its coefficients, so the least of them
-bounds it from below. A step whose bound is no worse than the worst found so far is done; else it is halved, by de
-Casteljau's algorithm, until the bound of each piece is within `CLOSE` of a value that was attained. Squared distances
-of two agents are polynomials of eighth degree. The distance to a box is convex: it is nowhere below its tangent plane,
-so the least coefficient along the plane's normal bounds it. With the body formulation, positions in the world are the
-quartics through five points of each step, of steps cut so short that they are within 1e-9 of the formation's size.
+Extremes of distances are exact. A polynomial in Bernstein form lies in the convex hull of its coefficients, so the
+least coefficient bounds it from below. If the bound of a step is no worse than the worst value so far, the step is
+done. Otherwise it is halved by de Casteljau's algorithm, until the bound of each piece is within `CLOSE` of an
+attained value. Squared distances of two agents are polynomials of eighth degree. The distance to a box is convex and
+nowhere below its tangent plane, so the least coefficient along the plane's normal bounds it. In the body formulation,
+positions in the world are quartics through five points of each step. The steps are cut so short that these quartics
+are exact to 1e-9 of the formation's size.
 
-Forces are known where the law is evaluated: at the end of each step, and on both sides of a jump. Where an end is
-higher than both its neighbours, the law is evaluated in between, until the parabola through three of its values has no
-more to give: to 1e-5 of the value. That also holds of large formations, whose multipliers are iterated, but for
-constraint forces and tensions below a tenth of the greatest thrust: these are told to 1e-6 of that thrust, which is
-what the solver's residual leaves of them. Their evaluations go to a solver of the monitor's own (`LargeSolver.aside`),
-since one remembers what it is asked: the flight is the same to the bit, and as the order of evaluations does not
-depend on where the trail is cut, so are the extremes.
+Forces are known where the law is evaluated: at the end of each step, and on both sides of a jump. If an end is higher
+than both its neighbours, the law is evaluated in between, until the parabola through three values promises no further
+rise: to 1e-5 of the value. The same holds for large formations, whose multipliers are iterated, with one exception:
+constraint forces and tensions below a tenth of the greatest thrust are found to 1e-6 of that thrust, the accuracy that
+the solver's residual allows. Large formations use a separate solver for these evaluations (`LargeSolver.aside`),
+because a solver keeps state. The flight is therefore the same to the bit with and without a monitor. The extremes
+do not depend on where the trail is cut, because the order of evaluations does not.
 """
 
 import math
@@ -48,17 +49,17 @@ from rigidfleet.kernel.records import (
     THRUST_MARGIN,
 )
 
-#: A least value is found to this much [m, m/s], and a greatest force to so much of it, or so much if iterated.
+#: Accuracy of a least value [m, m/s], and relative accuracy of a greatest force, direct and iterated.
 CLOSE, _CLOSE_FORCE, _CLOSE_ITERATED = 1e-9, 1e-7, 1e-6
-#: Pieces of a step are no shorter than this.
+#: Length of the shortest piece of a step.
 _SHORTEST = 2.0**-32
-#: So many pieces of a step are looked at, at most.
+#: Maximum number of pieces examined per step.
 _MOST = 10_000
-#: Of numbers so much of their size is rounding.
+#: Rounding error, as a share of a number's size.
 _ROUNDING = 4e-15
-#: In the body formulation a step is cut into pieces that turn no further than this [rad].
+#: Greatest rotation of one piece of a step in the body formulation [rad].
 _TURN = 0.1
-#: Nor is a peak of forces looked for between points nearer than this part of where it is.
+#: Least interval in which a peak of forces is searched, as a share of the whole interval.
 _NARROW = 1e-3
 
 #: Coefficients of a square: C(4, i) C(4, j) / C(8, i + j).
@@ -69,11 +70,11 @@ _SQUARE = np.array(
 
 @compiled
 def lowest(work, degree, floor):
-    """Least value of a polynomial over [0, 1], if below ``floor``, and where; else ``floor`` and -1.
+    """Least value of a polynomial over [0, 1] and its place, if below ``floor``; otherwise ``floor`` and -1.
 
-    ``work[0]`` holds its Bernstein coefficients. The value is within `CLOSE` of the least and rounding; of squares,
-    of eighth degree, the root is. After `_MOST` pieces, which no flight has been seen to need, the bound itself
-    counts: too bad rather than too good.
+    ``work[0]`` holds the Bernstein coefficients. The value is exact to `CLOSE` and rounding; for squares, of eighth
+    degree, its root is. After `_MOST` pieces, more than any known flight needs, the bound itself is returned, which
+    errs on the safe side.
     """
     best, at, top, pieces, size = floor, -1.0, 0, 0, 0.0
     start, width = degree + 1, degree + 2
@@ -116,7 +117,7 @@ def lowest(work, degree, floor):
 
 @compiled
 def halve(piece, left):
-    """Halve a curve of control points (15,), start and width: its first half into ``left``, its second stays."""
+    """Halve a curve (15 control points, start and width): write its first half into ``left``, keep the second."""
     half = 0.5 * piece[16]
     left[15], left[16] = piece[15], half
     piece[15] += half
@@ -158,10 +159,10 @@ def length_at(points, x):
 
 @compiled
 def shortest(curve, floor, work, pieces):
-    """Least |r| of a curve with control points (5, 3), if below ``floor``, and where; else ``floor`` and -1.
+    """Least |r| of a curve with control points (5, 3) and its place, if below ``floor``; otherwise ``floor`` and -1.
 
-    A squared length of some meters knows one of a millimetre to rounding alone: of long pieces both halves are looked
-    at again once it is known how short they come.
+    Rounding of a squared length of some metres hides lengths of a millimetre. Therefore both halves of a long piece
+    are examined again once their least length is roughly known.
     """
     best, at, top, count = floor, -1.0, 0, 0
     for k in range(5):
@@ -191,7 +192,7 @@ def shortest(curve, floor, work, pieces):
             length = length_at(piece, found)
             if length < best:
                 best, at = length, piece[15] + found * piece[16]
-        close = max(CLOSE, _ROUNDING * math.sqrt(size))  # what a length is known to at all
+        close = max(CLOSE, _ROUNDING * math.sqrt(size))  # the accuracy that rounding allows
         known = _ROUNDING * size <= close * max(2.0 * best, 1e-5)
         if count > _MOST and not known and along < best * math.sqrt(middle):
             best, at = along / math.sqrt(middle), piece[15]
@@ -203,7 +204,7 @@ def shortest(curve, floor, work, pieces):
 
 @compiled
 def from_box(x, y, z, box, normal):
-    """Signed distance of a point from a box (6,), negative inside, and a normal of a plane that supports it there."""
+    """Signed distance of a point from a box (6,), negative inside; writes the normal of a supporting plane."""
     inside, face = -math.inf, 0
     outside = 0.0
     for q in range(3):
@@ -229,9 +230,9 @@ def from_box(x, y, z, box, normal):
 
 @compiled
 def beyond_plane(piece, box, normal):
-    """A bound from below on the distance from a box of a curve with control points (15,).
+    """Lower bound of the distance between a box and a curve with control points (15,).
 
-    The tangent plane at any point will do: the middle control point is near the curve.
+    The tangent plane at any point gives a bound; the middle control point is near the curve.
     """
     x, y, z = piece[6], piece[7], piece[8]
     distance, least = from_box(x, y, z, box, normal), 0.0
@@ -243,7 +244,7 @@ def beyond_plane(piece, box, normal):
 
 @compiled
 def nearest_box(curve, box, floor, pieces, normal):
-    """Least distance of a curve with control points (5, 3) from a box, if below ``floor``, and where; else -1."""
+    """Least distance of a curve with control points (5, 3) from a box, if below ``floor``, and its place; else -1."""
     best, at, top, count, close = floor, -1.0, 0, 0, CLOSE
     for k in range(5):
         for q in range(3):
@@ -272,7 +273,7 @@ def nearest_box(curve, box, floor, pieces, normal):
 
 @compiled
 def lowest_overlap(points, reach, floor, pieces):
-    """Least |z| of a curve with control points (5, 3) while it is within ``reach`` of the z axis, and where."""
+    """Least |z| of a curve with control points (5, 3) while within ``reach`` of the z axis, and its place."""
     best, at, top, count, close = floor, -1.0, 0, 0, CLOSE
     for k in range(5):
         for q in range(3):
@@ -294,9 +295,7 @@ def lowest_overlap(points, reach, floor, pieces):
         bound = max(0.0, low, -high)
         if apart or not bound < best - close:
             top -= 1
-        elif (
-            piece[16] <= _SHORTEST or count > _MOST
-        ):  # at the brink of an overlap: it counts as one
+        elif piece[16] <= _SHORTEST or count > _MOST:  # at the limit of an overlap: count it as one
             best, at = bound, piece[15]
             top -= 1
         else:
@@ -307,19 +306,19 @@ def lowest_overlap(points, reach, floor, pieces):
 
 @compiled
 def take(kind, key, t, first, second, monitor):
-    """Keep what is worse than the worst of its kind; the less ``key``, the worse."""
+    """Store a value that is worse than the worst one of its kind; a smaller ``key`` is worse."""
     if key < monitor.worst[kind]:
         monitor.worst[kind] = key
         monitor.when[kind] = t
         monitor.who[kind, 0], monitor.who[kind, 1] = first, second
 
 
-# -- where agents are --------------------------------------------------------------------------------
+# -- positions -----------------------------------------------------------------------------------------
 
 
 @compiled
 def angle_of(points, p):
-    """By how much [rad] the body frame turns over a step, at most."""
+    """Upper bound of the rotation [rad] of the body frame over a step."""
     n = p.vehicles.m.shape[0]
     q = 6 * n + p.graph.edges.shape[0]
     fastest, size = 0.0, math.inf
@@ -421,7 +420,7 @@ def between(points, i, j, out):
 
 @compiled
 def watch_pairs(kind, pairs, points, t, h, monitor):
-    """Least room between the surfaces of pairs of agents (P, 2) over a step."""
+    """Least distance between the surfaces of pairs of agents (P, 2) over a step."""
     radius, d = monitor.radius, monitor.curve
     for k in range(pairs.shape[0]):
         i, j = pairs[k, 0], pairs[k, 1]
@@ -435,7 +434,7 @@ def watch_pairs(kind, pairs, points, t, h, monitor):
 
 @compiled
 def watch_stacks(t, h, monitor):
-    """Least height between the surfaces of two agents of which one is below the other."""
+    """Least height between the surfaces of two agents, one below the other, over a step."""
     radius, d = monitor.radius, monitor.curve
     for k in range(monitor.columns.shape[0]):
         i, j = monitor.columns[k, 0], monitor.columns[k, 1]
@@ -464,10 +463,10 @@ def watch_coordinate(kind, curve, axis, sign, offset, t, h, i, monitor):
 
 @compiled
 def watch_obstacles(i, curve, t, h, last, monitor):
-    """Room between agent i's surface and obstacles over a piece of a step; ``last`` is its end's.
+    """Clearance of agent i's surface to obstacles over a piece of a step; ``last`` is the clearance at its end.
 
-    Who has not come off an obstacle by more than ``pad`` since the start stands on it. Who is that near is not yet
-    known to fly: it may be landing. What it comes to is kept apart until it is off again.
+    An agent that has been within ``pad`` of an obstacle since the start stands on it. A flying agent that comes this
+    near may be landing; its clearance is stored separately until it moves away again.
     """
     radius, standing = monitor.radius[i], monitor.standing[i] != 0
     low, normal = monitor.low, monitor.room[2]
@@ -482,7 +481,7 @@ def watch_obstacles(i, curve, t, h, last, monitor):
         floor = max(own, monitor.worst[CLEARANCE]) + radius
         far = max(0.0, box[0] - x, x - box[3]) ** 2 + max(0.0, box[1] - y, y - box[4]) ** 2
         far += max(0.0, box[2] - z, z - box[5]) ** 2
-        if far >= (floor + span) ** 2 and floor + span > 0.0:  # from all of it
+        if far >= (floor + span) ** 2 and floor + span > 0.0:  # far from the whole obstacle
             continue
         value, at = nearest_box(curve, box, floor, monitor.pieces, normal)
         if at >= 0.0:
@@ -507,7 +506,7 @@ def watch_obstacles(i, curve, t, h, last, monitor):
 
 @compiled
 def watch_distances(row, p, state, monitor):
-    """Distances and speeds over one step of the trail."""
+    """Monitor distances and speeds over one step of the trail."""
     trail = state.trail
     points, t, h = trail.points[row], trail.clock[row, 0], trail.clock[row, 1]
     watch_pairs(SEPARATION, monitor.pairs, points, t, h, monitor)
@@ -561,7 +560,7 @@ def watch_distances(row, p, state, monitor):
 
 @compiled
 def judge_forces(values, t, p, monitor):
-    """Take what a gauge (3N + 2m,) shows at time t [s]."""
+    """Take the forces of a gauge (3N + 2m,) at time t [s] into account."""
     n, edges = p.vehicles.m.shape[0], p.graph.edges
     m = edges.shape[0]
     for i in range(n):
@@ -581,7 +580,7 @@ def judge_forces(values, t, p, monitor):
 
 @compiled
 def worst_of(c, p, monitor):
-    """The greatest value found so far of what entry c of a gauge is one of."""
+    """The greatest value so far of the quantity of entry c of a gauge."""
     n, m = p.vehicles.m.shape[0], p.graph.edges.shape[0]
     if c < 3 * n and not monitor.left[c % n]:
         return math.inf
@@ -608,7 +607,7 @@ def evaluate(t, row, p, w, state, monitor, values):
         for k in range(5):
             y[q] += basis[k] * trail.points[row, k, q]
     monitor.time[0] = t
-    # The recorder has the law compiled already; without rows to write, it leaves all in the workspace.
+    # The recorder contains the compiled law; without rows to write, it leaves all values in the workspace.
     call_recorder(monitor.recorder, p, w, monitor.segment, monitor.record)
     read_gauge(p, w, values)
     judge_forces(values, t, p, monitor)
@@ -616,9 +615,10 @@ def evaluate(t, row, p, w, state, monitor, values):
 
 @compiled
 def promise(c, a, b, v, ta, tb, tc, p, monitor):
-    """What the parabola through |values| a, b, v of entry c at ta < tb < tc promises beyond the worst, and where.
+    """Expected excess over the worst value, and its time, from the parabola through |values| a, b, v at ta < tb < tc.
 
-    As a part of that worst; twice the rise to its top counts. Not positive: nothing.
+    The excess of entry c is a share of the worst value, with the rise to the top of the parabola counted twice. It is
+    not positive if there is nothing to expect.
     """
     left, right = (b - a) / (tb - ta), (v - b) / (tc - tb)
     bend = (right - left) / (tc - ta)
@@ -629,14 +629,14 @@ def promise(c, a, b, v, ta, tb, tc, p, monitor):
     worst = worst_of(c, p, monitor)
     close = _CLOSE_FORCE * worst
     if p.graph.solver != 0:
-        # A residual leaves of constraint forces and tensions what is a part of the greatest force.
+        # The solver's residual makes an error of constraint forces and tensions in proportion to the greatest force.
         n, m = p.vehicles.m.shape[0], p.graph.edges.shape[0]
         within = 2 * n <= c < 3 * n + m
         close = _CLOSE_ITERATED * (max(worst, -monitor.worst[THRUST]) if within else worst)
     beyond = b + 2.0 * gain - worst - close
     if not beyond > 0.0:
         return 0.0, tb
-    short = 1e-3 * (tc - ta)  # a point too near another tells nothing
+    short = 1e-3 * (tc - ta)  # points too close together give no information
     if abs(top - tb) < short:
         top = tb + short if tc - tb > tb - ta else tb - short
     return beyond / worst, top
@@ -644,11 +644,11 @@ def promise(c, a, b, v, ta, tb, tc, p, monitor):
 
 @compiled
 def look_between(before, middle, after, row, ta, tb, tc, p, w, state, monitor):
-    """Look for the greatest forces between ta and tc, of gauges at ta < tb < tc.
+    """Search for the greatest forces between ta and tc, from gauges at ta < tb < tc.
 
-    The law is evaluated where the parabola through three neighbouring values of an entry promises most, and all
-    entries are judged there: of thousands that rise and fall together, a few evaluations do for all. That ends when
-    no parabola has more to give.
+    The law is evaluated where the parabola through three neighbouring values of an entry promises most. All entries
+    are judged there: if thousands rise and fall together, a few evaluations are enough. The search ends when no
+    parabola promises a further rise.
     """
     at, rank, values = monitor.instants, monitor.rank, monitor.nodes
     best, top = 0.0, tb
@@ -696,7 +696,7 @@ def end_of(row, state):
 
 @compiled
 def watch_middle(row, before, after, p, w, state, monitor):
-    """Look into a step that a jump, or the end, leaves without a neighbour."""
+    """Search a step that has no neighbour, because of a jump or the end."""
     start, end = state.trail.clock[row, 0], end_of(row, state)
     middle, values = 0.5 * (start + end), monitor.gauge[1]
     evaluate(middle, row, p, w, state, monitor, values)
@@ -705,7 +705,7 @@ def watch_middle(row, before, after, p, w, state, monitor):
 
 @compiled
 def watch_forces(p, w, state, monitor, rows, last):
-    """Forces over the steps of a trail; the ``last`` of a segment has nobody to wait for."""
+    """Monitor forces over the steps of a trail; with ``last``, no further step of the segment follows."""
     trail, before = state.trail, monitor.gauge[0]
     for row in range(rows):
         new = row > 0 or monitor.flags[3] == 0
@@ -727,16 +727,16 @@ def watch_forces(p, w, state, monitor, rows, last):
             watch_middle(row, a_row, after, p, w, state, monitor)
 
 
-# -- all of it ---------------------------------------------------------------------------------------
+# -- entry point ------------------------------------------------------------------------------------
 
 
 @compiled
 def watch(p, w, state, monitor):
     """Take the extremes of the steps in a trail.
 
-    Distances are those of the steps from ``monitor.flags[0]`` to before ``flags[1]``. ``flags[2]`` says what comes
-    then: nothing; forces (1), the last step staying in the trail until its neighbour is known; or forces of all, as
-    none follows (2). ``flags[3]`` is 1 where a step has stayed.
+    Distances are monitored for the steps from ``monitor.flags[0]`` to before ``flags[1]``. ``flags[2]`` chooses the
+    forces: none (0); all but the last step, which stays in the trail until its neighbour is known (1); or all steps,
+    because none follows (2). ``flags[3]`` is 1 if a step has stayed in the trail.
     """
     p, w, state, monitor = by_address(p), by_address(w), by_address(state), by_address(monitor)
     trail, flags = state.trail, monitor.flags
@@ -760,7 +760,7 @@ def watch(p, w, state, monitor):
 
 @compiled
 def copy(a, out):
-    """Copy as many rows as out has, or a."""
+    """Copy rows of a into out, as many as both have."""
     for k in range(min(a.shape[0], out.shape[0])):
         for c in range(a.shape[1]):
             out[k, c] = a[k, c]

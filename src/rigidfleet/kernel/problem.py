@@ -1,4 +1,4 @@
-"""What one phase of a flight is made of, as arrays: read by the kernel, written by `plan`.
+"""One phase of a flight as arrays, written by `plan` and read by the kernel.
 
 Short names are the paper's; every array is C-contiguous float64 (edges: uint32). N agents, m edges.
 """
@@ -31,14 +31,14 @@ class Vehicles(NamedTuple):
     m: Floats  # (N,) mass [kg]
     inverse: Floats  # (N,) of it [1/kg]
     M: float  # their sum [kg]
-    mean: float  # mean mass of those that have not been lost [kg], the laws' unit of mass
-    thrust_limit: Floats  # (N,) [N], inf where unlimited
+    mean: float  # mean mass of the agents not lost [kg]; the laws' unit of mass
+    thrust_limit: Floats  # (N,) [N]; inf if unlimited
     saturate: bool  # clip the thrust at its limit
     g: float  # gravity along -z [m/s^2]
 
 
 class Graph(NamedTuple):
-    """The constraint graph, and which of its edges meet at an agent.
+    """The constraint graph, and the pairs of its edges that share an agent.
 
     ``pairs[p] = (k, l)``, k > l, are the edges that share an agent and ``weight[p]`` is what
     that agent adds to ``A = J M^-1 J^T``: ``A[k, l] = weight[p] * (u_k . u_l)``.
@@ -48,11 +48,11 @@ class Graph(NamedTuple):
     pairs: Edges  # (P, 2)
     weight: Floats  # (P,) +-1/m_i [1/kg]
     diagonal: Floats  # (m,) of A: 1/m_i + 1/m_j [1/kg]
-    solver: int = 0  # address of what solves for the multipliers of a large formation (`large`)
+    solver: int = 0  # address of the multiplier solver of a large formation (`large`)
 
 
 class ConstraintLaw(NamedTuple):
-    """Baumgarte gains and how the multipliers are solved for."""
+    """Baumgarte gains, and options of the multipliers' solver."""
 
     alpha: float  # [1/s]
     beta: float  # [1/s]
@@ -61,7 +61,7 @@ class ConstraintLaw(NamedTuple):
     mu: float  # Tikhonov damping, on the scale of the eigenvalues of mbar A
     iterations: int
     s0: float  # spectral damping starts below this eigenvalue of mbar A
-    cutoff: float  # of pinv, in parts of the largest eigenvalue
+    cutoff: float  # cut-off of pinv, as a share of the largest eigenvalue
     k_def: float  # deformation damping [1/s]
 
 
@@ -75,7 +75,7 @@ class Reference(NamedTuple):
     d1: Floats  # (m,) distances after [m]
     p0: Floats  # (N, 3) slots before, body axes [m]
     dp: Floats  # (N, 3) what the blend adds to them [m]
-    turn: Floats  # (3,) rotation vector by which the slots turn meanwhile [rad]
+    turn: Floats  # (3,) rotation vector by which the slots turn during the blend [rad]
 
 
 class Motion(NamedTuple):
@@ -91,11 +91,11 @@ class Motion(NamedTuple):
 
 
 class Feedback(NamedTuple):
-    """LQR on the virtual body: gain tables over the time to go, and the moving target."""
+    """LQR of the virtual body: gain tables over the time to go, and the moving target."""
 
     to_go: Floats  # (n,) increasing, from 0 [s]
     gain: Floats  # (n, 4): position [1/s^2], velocity [1/s]; attitude, rate
-    slope: Floats  # (n, 4) their derivatives by the time to go
+    slope: Floats  # (n, 4) their derivatives with respect to the time to go
     arrival: float  # T [s]
     r: Floats  # (3,) target at T [m]
     v: Floats  # (3,) [m/s]
@@ -115,12 +115,12 @@ class Control(NamedTuple):
 
 
 class Disturbance(NamedTuple):
-    """What acts on the flight and is told to no law; see `rigidfleet.kernel.disturbances`.
+    """Disturbances of the flight, which no law knows; see `rigidfleet.kernel.disturbances`.
 
-    Gusts and noise are cubic B-splines over time, by their coefficients; empty where there are none.
+    Gusts and noise are coefficients of cubic B-splines over time; empty if there are none.
     """
 
-    active: bool  # whether there is any; `inverse` counts always
+    active: bool  # whether there is any disturbance; `inverse` is always used
     m: Floats  # (N,) true mass [kg]
     inverse: Floats  # (N,) of it [1/kg]
     drag: Floats  # (N,) [N s/m]
@@ -138,7 +138,7 @@ class Problem(NamedTuple):
     """One phase of a flight."""
 
     body_formulation: bool
-    has_frame: bool  # the mean-axis quaternion is among the states
+    has_frame: bool  # whether the mean-axis quaternion is among the states
     vehicles: Vehicles
     graph: Graph
     law: ConstraintLaw
@@ -151,12 +151,12 @@ class Problem(NamedTuple):
 
 
 class Workspace(NamedTuple):
-    """Everything the right-hand side writes; after a call it holds the values at that state."""
+    """Everything that the right-hand side writes; after a call it holds the values at that state."""
 
     r: Floats  # (N, 3) position, world [m]
     v: Floats  # (N, 3) velocity [m/s]
-    r_seen: Floats  # (N, 3) position as measured [m], where there is noise
-    v_seen: Floats  # (N, 3) velocity as measured [m/s], where there is noise
+    r_seen: Floats  # (N, 3) position as measured [m], if there is noise
+    v_seen: Floats  # (N, 3) velocity as measured [m/s], if there is noise
     u: Floats  # (m, 3) unit vectors of the edges
     L: Floats  # (m,) lengths [m]
     d: Floats  # (m,) references [m]
@@ -165,13 +165,13 @@ class Workspace(NamedTuple):
     c: Floats  # (m,) constraints [m]
     b: Floats  # (m,) right side of the multiplier equation [m/s^2]
     A: Floats  # (m, m) J M^-1 J^T, or (3N, 3N) J^T J; its lower triangle is factored in place
-    V: Floats  # (m, m) eigenvectors, where a law needs them
+    V: Floats  # (m, m) eigenvectors, if a law needs them
     w: Floats  # (m,) eigenvalues; work
     multiplier: Floats  # (m,) [N]
     f_E: Floats  # (N, 3) gravity, the user's force and disturbances [N]
     f_u: Floats  # (N, 3) input [N]
     f_C: Floats  # (N, 3) constraint force [N]
-    f_D: Floats  # (N, 3) force of the air, part of f_E, where there are disturbances [N]
+    f_D: Floats  # (N, 3) aerodynamic force, part of f_E, if there are disturbances [N]
     a: Floats  # (N, 3) acceleration [m/s^2]
     p: Floats  # (N, 3) slots, body axes [m]
     p_dot: Floats  # (N, 3)
@@ -187,7 +187,7 @@ class Workspace(NamedTuple):
     gain: Floats  # (4,)
     E: Floats  # (3, 3) a relative rotation
     T_ref: Floats  # (3, 3) world -> body, of the reference motion
-    wrench: Floats  # (6,) asked of the agents: force, torque about the CM, world [N, N m]
+    wrench: Floats  # (6,) commanded: force, torque about the CM, world [N, N m]
     H: Floats  # (3N, 3N) normal matrix of the paper's H; work
     H_V: Floats  # (3N, 3N)
     H_w: Floats  # (2, 3N): right side, eigenvalues
@@ -199,7 +199,7 @@ def septic_polynomial(x):
 
 
 def zeros(*shape: int) -> Floats:
-    """Zeros that begin with a cache line: whether rows straddle lines costs up to a tenth."""
+    """Zeros aligned to a cache line: rows that straddle lines would cost up to a tenth of the time."""
     size = math.prod(shape)
     room = np.zeros(size + 8)
     skip = -room.ctypes.data // room.itemsize % 8
@@ -211,8 +211,8 @@ def workspace(
 ) -> Workspace:
     """Allocate a workspace for N = ``n`` agents and ``m`` edges.
 
-    One for the iterated ``solver`` alone has the smaller of the two systems it may solve, in the
-    edges or in the agents' coordinates; one of a ``large`` formation has none.
+    If ``solver`` is the iterated one, only the smaller of its two systems is allocated, in the edges'
+    or in the agents' coordinates; for a ``large`` formation, none is.
     """
     size = 0 if large else min(m, 3 * n) if solver == ITERATED else m
     vectors = 0 if large or solver in (ITERATED, EXACT) else m
@@ -233,12 +233,12 @@ def workspace(
 
 
 def padded(count: int) -> int:
-    """``count`` rounded up to eights: of numbers to a cache line, and of flights or states to a value of `lanes`."""
+    """``count`` rounded up to a multiple of 8: the numbers in a cache line, and the lanes of a `lanes` value."""
     return -(-count // 8) * 8
 
 
 def _side_by_side(**shapes: tuple[int, ...]) -> dict[str, Floats]:
-    """Arrays of zeros, each of which begins with a cache line."""
+    """Arrays of zeros, each aligned to a cache line."""
     sizes = [math.prod(shape) for shape in shapes.values()]
     ends = list(accumulate(map(padded, sizes)))
     room = zeros(ends[-1])
@@ -249,7 +249,7 @@ def _side_by_side(**shapes: tuple[int, ...]) -> dict[str, Floats]:
 
 
 def no_disturbance(masses: Floats) -> Disturbance:
-    """No disturbance of agents with these masses (N,) [kg]."""
+    """A `Disturbance` without any effect on agents with these masses (N,) [kg]."""
     n = len(masses)
     none = zeros(0, n, 3)
     return Disturbance(
@@ -261,7 +261,7 @@ def no_disturbance(masses: Floats) -> Disturbance:
 def graph(ends: NDArray[np.integer], masses: Floats, *, large: bool = False) -> Graph:
     """Prepare a constraint graph: edges (m, 2) with agents from 0, (N,) masses [kg].
 
-    A ``large`` one, which is not solved densely, needs no pairs of edges.
+    A ``large`` graph is not solved densely and needs no pairs of edges.
     """
     edges = np.ascontiguousarray(ends, dtype=np.uint32).reshape(-1, 2)
     if large:

@@ -1,4 +1,4 @@
-"""What a sample keeps: forces and references at a state."""
+"""Content of a sample: forces and references at a state."""
 
 from rigidfleet.kernel.compiler.jit import compiled
 from rigidfleet.kernel.dynamics import closed_loop
@@ -16,9 +16,9 @@ def copy(a, out):
 
 @compiled
 def record(times, samples, p, w, dy, out):
-    """Evaluate the closed loop at the sampled states and record_sample its forces and references.
+    """Evaluate the closed loop at the sampled states, and record its forces and references.
 
-    Without rows in ``out``, what the last evaluation leaves in the workspace is all that was asked for.
+    Without rows in ``out``, the only result is what the last evaluation leaves in the workspace.
     """
     for k in range(times.shape[0]):
         closed_loop(times[k], samples[k], dy, p, w)
@@ -28,7 +28,7 @@ def record(times, samples, p, w, dy, out):
 
 @compiled
 def record_sample(t, p, w, k, out):
-    """Copy what the closed loop has left in the workspace at time t [s] into row k of a record."""
+    """Copy the values of the closed loop at time t [s] from the workspace into row k of a record."""
     kind = p.control.kind
     for i in range(w.c.shape[0]):
         out.c[k, i], out.L[k, i], out.multiplier[k, i] = w.c[i], w.L[i], w.multiplier[i]
@@ -46,7 +46,7 @@ def record_sample(t, p, w, k, out):
             copy(w.v_seen, out.v_seen[k])
     for q in range(6):
         out.wrench[k, q] = w.wrench[q]
-    # Where only distances are blended, their slots still say how the formation lies.
+    # Even if only distances are blended, the slots give the formation's attitude.
     blend_slots(t, p.reference, w.p, w.p_dot, w.p_ddot)
     copy(w.p, out.p[k])
     if kind != OPEN:

@@ -1,4 +1,4 @@
-"""What the integrator, the recorder and the monitor are told, and what they write: arrays, as in `problem`.
+"""Inputs and outputs of the integrator, the recorder and the monitor: arrays, as in `problem`.
 
 K samples, N agents, m edges.
 """
@@ -12,24 +12,24 @@ from numpy.typing import NDArray
 from rigidfleet.kernel.problem import padded, zeros
 from rigidfleet.typing import Bools, Floats, Ints
 
-#: What an integration returns.
+#: Return values of an integration.
 FINISHED, PAUSED, COLLAPSED = range(3)
 #: Rows of `IntegratorState.K` after the seven stages.
 STATE, TRIAL, ATOL = 7, 8, 9
-#: What counts as the last error where there was none, or a smaller one: its logarithm.
+#: Logarithm of the least value of the last error; also used if there is no last error.
 LEAST_ERROR = math.log(1e-4)
-#: Quantities of a `Monitor`; the less each of its `worst` is, the worse: greatest values are kept with the other sign.
+#: Quantities of a `Monitor`. A smaller value of `worst` is worse; greatest values are stored with the opposite sign.
 (
     SEPARATION, LOST, SEPARATION_BELOW, CLEARANCE, STANDING, FLYING, GEOFENCE, LOWEST, HIGHEST, SPEED, THRUST,
     THRUST_MARGIN, ACCELERATION, CONSTRAINT_FORCE, TENSION, CONSTRAINT,
 ) = range(16)  # fmt: skip
-#: Bytes of a trail, about: the integrator pauses when it is full.
+#: Approximate size of a trail in bytes; the integrator pauses when it is full.
 _TRAIL = 1 << 19
-#: Points that a greatest force is looked for with, at most.
+#: Greatest number of points in a search for a greatest force.
 _NODES = 27
 
 
-#: Five points of a step, and from values there to Bernstein coefficients (5, 5).
+#: Five points of a step, and the matrix (5, 5) from values at these points to Bernstein coefficients.
 KNOTS = np.linspace(0.0, 1.0, 5)
 
 
@@ -42,7 +42,7 @@ FROM_KNOTS = np.linalg.inv(bernstein(KNOTS))
 
 
 class Trail(NamedTuple):
-    """Steps as they were flown, for whoever looks between samples; no rows, and none are kept.
+    """Recorded steps, for extremes between samples; without rows, no steps are recorded.
 
     ``points`` are the Bernstein coefficients of the continuous extension, a polynomial of fourth degree.
     """
@@ -50,7 +50,7 @@ class Trail(NamedTuple):
     clock: Floats  # (S, 2) start [s], length [s]
     points: Floats  # (S, 5, n)
     gauge: Floats  # (S, 3N + 2m) at the end, see `gauge.read_gauge`
-    start: Floats  # (3N + 2m,) at the start of the first step, behind a jump
+    start: Floats  # (3N + 2m,) at the start of the first step, after a jump
 
 
 def trail(states: int, agents: int, edges: int) -> Trail:
@@ -62,27 +62,27 @@ def trail(states: int, agents: int, edges: int) -> Trail:
     return Trail(*(np.empty(shape) for shape in shapes))
 
 
-#: Where no steps are kept.
+#: An empty trail: no steps are recorded.
 NO_TRAIL = Trail(np.zeros((0, 2)), np.zeros((0, 5, 0)), np.zeros((0, 0)), np.zeros(0))
 
 
 class Monitor(NamedTuple):
-    """Worst values of a phase, in continuous time, and what they are looked for with; see `kernel.monitor`."""
+    """Worst values of a phase in continuous time, with the data and work arrays of the search; see `kernel.monitor`."""
 
-    worst: Floats  # (16,) by quantity; infinity where there is none yet
+    worst: Floats  # (16,) by quantity; infinity if there is none yet
     when: Floats  # (16,) [s]
-    who: Ints  # (16, 2) agents; agent and obstacle; agents of an edge; -1: nobody
+    who: Ints  # (16, 2) agents; agent and obstacle; agents of an edge; -1: none
     sign: Floats  # (1,) of the greatest tension
     radius: Floats  # (N,) [m]
-    left: Bools  # (N,) who is judged: not lost
-    standing: Ints  # (N,) whether an agent stands on an obstacle since the start
-    low: Floats  # (N, 3) clearance, time and obstacle of who may be landing; infinity: nobody
-    pad: float  # who is so near an obstacle may stand on it [m]
+    left: Bools  # (N,) whether an agent is monitored: not lost
+    standing: Ints  # (N,) whether an agent has stood on an obstacle since the start
+    low: Floats  # (N, 3) clearance, time and obstacle of agents that may be landing; infinity: none
+    pad: float  # clearance within which an agent may stand on an obstacle [m]
     boxes: Floats  # (B, 6) corners of obstacles; of the ground infinite
     fence: Floats  # (F, 6) corners of the geofence, if there is one
-    pairs: Ints  # (P, 2) whose separation is watched
-    struck: Ints  # (P', 2) of a lost agent and one that is left
-    columns: Ints  # (P'', 2) who may be below one another
+    pairs: Ints  # (P, 2) whose separation is monitored
+    struck: Ints  # (P', 2) of a lost agent and one still flying
+    columns: Ints  # (P'', 2) that may fly one below the other
     flags: Ints  # (4,) see `monitor.watch`
     recorder: int  # address of the recorder, with its arguments: `time` and `states` to evaluate at
     segment: int
@@ -91,9 +91,9 @@ class Monitor(NamedTuple):
     states: Floats  # (1, n)
     gauge: Floats  # (2, 3N + 2m) forces before the first step, and in the middle of one
     nodes: Floats  # (27, 3N + 2m) forces at points of two steps
-    instants: Floats  # (27,) [s] when
-    rank: Ints  # (27,) them in order
-    places: Floats  # (N, 5, 3) where agents are over a step: control points [m]
+    instants: Floats  # (27,) times of these points [s]
+    rank: Ints  # (27,) their order in time
+    places: Floats  # (N, 5, 3) control points of the agents' positions over a step [m]
     curve: Floats  # (5, 3) of one pair
     work: Floats  # (40, 11) polynomials
     pieces: Floats  # (40, 17) curves
@@ -106,7 +106,7 @@ class Monitor(NamedTuple):
 def monitor(
     radius: Floats, boxes: Floats, fence: Floats, states: int, gauge: int, **given: Any
 ) -> Monitor:
-    """Begin to watch: nothing is known yet, and no pairs are listed but those ``given`` among the fields."""
+    """A new monitor without values; pairs are listed only if ``given`` among the fields."""
     n, none = len(radius), np.zeros((0, 2), dtype=np.int64)
     count = CONSTRAINT + 1
     fields: dict[str, Any] = {
@@ -127,7 +127,7 @@ def monitor(
 
 
 class IntegratorState(NamedTuple):
-    """State of an integration, so that it can pause and go on."""
+    """State of an integration, which can pause and continue."""
 
     y: Floats  # (n,) state at `clock[0]`
     K: Floats  # (10, n padded to eights) stages, K[0] the derivative at y; y, trial, tolerance
@@ -150,8 +150,8 @@ def integrator(
 ) -> IntegratorState:
     """Start an integration from state ``y`` (n,) at time t [s] with a first step [s] to try.
 
-    ``atol`` (n,) is the absolute tolerance of each state, ``rtol`` the relative one of all. Steps go
-    into the ``trail``.
+    ``atol`` (n,) is the absolute tolerance of each state, ``rtol`` the relative one of all. Steps are recorded
+    in the ``trail``.
     """
     n = len(y)
     K = zeros(10, padded(n))
@@ -162,18 +162,18 @@ def integrator(
 
 
 class Segment(NamedTuple):
-    """How far to integrate, and what to sample on the way."""
+    """End of an integration, and the samples to write on the way."""
 
-    t_end: float  # time to land on [s]
-    fresh: bool  # whether the derivative at the start is not known: after a start or a switch
-    max_steps: int  # pause after so many
+    t_end: float  # time of the end, met exactly [s]
+    fresh: bool  # whether the derivative at the start is unknown: after a start or a switch
+    max_steps: int  # number of steps after which to pause
     times: Floats  # (K,) [s], increasing
-    samples: Floats  # (K, n) states there: written, or, by the recorder, read
+    samples: Floats  # (K, n) states at these times: written by the integrator, read by the recorder
     dy: Floats  # (n,) the recorder's derivative
 
 
 class Record(NamedTuple):
-    """What is recorded, one row per sample."""
+    """Recorded quantities, one row per sample."""
 
     r: Floats  # (K, N, 3)
     v: Floats

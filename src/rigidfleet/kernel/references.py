@@ -1,4 +1,4 @@
-"""What the formation should be at a time: slots and distances, with two exact derivatives."""
+"""References of the formation over time: slots and distances, with two exact derivatives."""
 
 import math
 
@@ -45,7 +45,7 @@ def blend_slots(t, reference, p, p_dot, p_ddot):
     cos, sin = math.cos(s * angle), math.sin(s * angle)
     w, w_dot = angle * s_dot, angle * s_ddot
     for i in range(p.shape[0]):
-        # The shape without the turn, and its velocity; then both turned by Rodrigues' formula.
+        # The shape and its velocity without the rotation; then both are rotated by Rodrigues' formula.
         x = reference.p0[i, 0] + s * reference.dp[i, 0]
         y = reference.p0[i, 1] + s * reference.dp[i, 1]
         z = reference.p0[i, 2] + s * reference.dp[i, 2]
@@ -74,8 +74,8 @@ def blend_slots(t, reference, p, p_dot, p_ddot):
 def distance_references(t, reference, edges, p, p_dot, p_ddot, d, d_dot, d_ddot):
     """Desired distances d (m,) [m] and two derivatives, by the reference's kind.
 
-    Constant; blended in d^2, which stays realisable for up to four agents; or those of the
-    slots, which are realisable always: d = |p_i - p_j|.
+    They are constant; or blended in d^2, which stays realisable for up to four agents; or those of the
+    slots, d = |p_i - p_j|, which are always realisable.
     """
     if reference.kind == SHAPE:
         for k in range(edges.shape[0]):

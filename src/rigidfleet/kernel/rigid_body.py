@@ -20,7 +20,7 @@ def centre_of_mass(r, m, M, out):
 def inertia(r, m, cm, I):
     """Inertia I (3, 3) [kg m^2] of points r (N, 3) about cm, as in Eq. (19): sum m (|x|^2 1 - x x^T)."""
     a = b = c = d = e = f = 0.0
-    # Of one alone nothing, exactly: what rounding leaves of r - cm would have an inverse.
+    # Exactly zero for a single agent: rounding errors of r - cm would have an inverse.
     for i in range(r.shape[0] if r.shape[0] > 1 else 0):
         x, y, z = r[i, 0] - cm[0], r[i, 1] - cm[1], r[i, 2] - cm[2]
         a += m[i] * (y * y + z * z)
@@ -38,8 +38,8 @@ def inertia(r, m, cm, I):
 def inertia_inverse(I, out):
     """Pseudo-inverse of the inertia of point masses into out (3, 3), relative cut-off 1e-9.
 
-    Points on a line have the eigenvalues 0, c, c with c = trace / 2, so that I^+ = I / c^2; that
-    is the only way in which the inertia of distinct points is singular.
+    Points on a line have the eigenvalues 0, c, c with c = trace / 2, so that I^+ = I / c^2. This is the
+    only case in which the inertia of distinct points is singular.
     """
     a, b, c = I[0, 0], I[0, 1], I[0, 2]
     d, e, f = I[1, 1], I[1, 2], I[2, 2]
@@ -140,7 +140,7 @@ def quaternion_rate(q, omega, out):
 @compiled
 def rotation_vector(R, phi):
     """Log of a rotation matrix R = Exp(phi) into phi (3,) [rad], |phi| <= pi."""
-    # By the quaternion's largest component, which is well conditioned at every angle.
+    # From the quaternion's largest component, which is well conditioned at every angle.
     trace = R[0, 0] + R[1, 1] + R[2, 2]
     if trace >= R[0, 0] and trace >= R[1, 1] and trace >= R[2, 2]:
         w = 1.0 + trace
@@ -163,7 +163,7 @@ def rotation_vector(R, phi):
 
 @compiled
 def allocate_rigid(x, m, M, F, tau, omega, I, I_inv, f):
-    """Share a wrench among agents as a rigid body would: no internal force.
+    """Distribute a wrench among agents as in a rigid body, without internal forces.
 
     f_i = m_i (F/M + alpha x x_i + omega x (omega x x_i)), alpha = I^+ (tau - omega x I omega).
 
@@ -197,7 +197,7 @@ def allocate_pinv(x, m, M, F, tau, split, I, I_inv, f, H, V, work):
     inverse is a pseudo-inverse here, with relative cut-off 1e-12. The torque is split among the
     agents as tau / N (``PINV_EQUAL``), by their share of inertia I_i I^+ tau
     (``PINV_INERTIA``), or that plus x_i x m_i F/M, the torque of their share of the force.
-    The wrench that results differs from the one asked: see theory in the documentation.
+    The resulting wrench differs from the commanded one: see theory in the documentation.
 
     H (3N, 3N), V (3N, 3N) and work (2, 3N) are scratch; other arguments as in `allocate_rigid`.
     """
@@ -248,7 +248,7 @@ def allocate_pinv(x, m, M, F, tau, split, I, I_inv, f, H, V, work):
 
 @compiled
 def allocate(x, m, M, F, tau, omega, method, I, I_inv, f, H, V, work):
-    """Share a wrench among the agents by the named method; see the two functions above."""
+    """Distribute a wrench among the agents by the named method; see the two functions above."""
     if method == RIGID:
         allocate_rigid(x, m, M, F, tau, omega, I, I_inv, f)
     else:

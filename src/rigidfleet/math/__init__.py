@@ -1,1 +1,1 @@
-"""Mathematics that knows no mission: attitudes, LQR, PID gains, turbulence, rigid bodies and distances."""
+"""Mathematics independent of missions: attitudes, LQR, PID gains, turbulence, rigid bodies and distances."""

@@ -1,6 +1,6 @@
 """Attitude: quaternions, direction cosines, Euler angles, rotation vectors.
 
-Conventions, of the paper where it states them:
+Conventions, which are the paper's where it states them:
 
 - A quaternion q = (q0, q1, q2, q3) has its scalar first; T(q) takes world axes to body axes.
 - Euler angles are (roll, pitch, yaw) [rad] of the 3-2-1 sequence, T = R1(roll) R2(pitch) R3(yaw);
@@ -21,7 +21,7 @@ from rigidfleet.typing import Floats
 def dcm_from_quaternion(q: ArrayLike) -> Floats:
     """Direction cosines T(q) (..., 3, 3), world to body, of quaternions (..., 4).
 
-    The quaternions need not be of unit length. ValueError where one is zero.
+    The quaternions need not be of unit length. Raises ValueError if one is zero.
     """
     q = _unit(q)
     q0, q1, q2, q3 = (q[..., k] for k in range(4))
@@ -54,8 +54,8 @@ _PRODUCTS = _products()
 def quaternion_from_dcm(T: ArrayLike) -> Floats:
     """Unit quaternions (..., 4) with q0 >= 0 of direction cosines (..., 3, 3).
 
-    By the branch of the largest component, so that nothing small is divided by. ValueError where
-    T is not a rotation to 1e-6.
+    Computed from the largest component, so that no small number is a divisor. Raises ValueError if T is
+    not a rotation to 1e-6.
     """
     T = _vectors("T", T, 3, 3)
     deviation = T @ T.swapaxes(-1, -2) - np.eye(3)
@@ -88,7 +88,7 @@ def euler_from_dcm(T: ArrayLike) -> Floats:
     """Euler angles (..., 3) = (roll, pitch, yaw) [rad] of direction cosines (..., 3, 3).
 
     Roll and yaw lie in [-pi, pi], pitch in [-pi/2, pi/2]. At pitch = +-90 deg only the sum or
-    difference of roll and yaw exists: roll is then 0. Angles give T back to rounding everywhere.
+    difference of roll and yaw is defined; roll is then 0. The angles always reproduce T to rounding.
     """
     T = _vectors("T", T, 3, 3)
     cos_pitch = np.hypot(T[..., 0, 0], T[..., 0, 1])
@@ -97,7 +97,7 @@ def euler_from_dcm(T: ArrayLike) -> Floats:
     yaw = np.where(
         locked, np.arctan2(-T[..., 1, 0], T[..., 1, 1]), np.arctan2(T[..., 0, 1], T[..., 0, 0])
     )
-    # From T R3(yaw)^T = R1 R2, in which roll stands beside no small cos(pitch).
+    # From T R3(yaw)^T = R1 R2, in which no small cos(pitch) multiplies the roll terms.
     s, c = np.sin(yaw), np.cos(yaw)
     roll = np.arctan2(s * T[..., 2, 0] - c * T[..., 2, 1], c * T[..., 1, 1] - s * T[..., 1, 0])
     return np.stack([np.where(locked, 0.0, roll), pitch, yaw], axis=-1)
@@ -147,14 +147,14 @@ def quaternion_multiply(p: ArrayLike, q: ArrayLike) -> Floats:
 
 
 def quaternion_conjugate(q: ArrayLike) -> Floats:
-    """Conjugate (q0, -q1, -q2, -q3) (..., 4): T of it is the transpose, body to world."""
+    """Conjugate (q0, -q1, -q2, -q3) (..., 4): its T is the transpose, body to world."""
     return _vectors("q", q, 4) * np.array([1.0, -1.0, -1.0, -1.0])
 
 
 def unwrap_quaternion(q: ArrayLike) -> Floats:
     """Choose the signs of a time series (..., K, 4) so that neighbours never jump to -q.
 
-    Keeps the first sample's sign; a gap of NaN is bridged from the last sample before it.
+    The first sample keeps its sign; after a gap of NaN, the last sample before it decides.
     """
     q = _vectors("q", q, 4)
     if q.ndim < 2:
@@ -170,7 +170,7 @@ def unwrap_quaternion(q: ArrayLike) -> Floats:
 def angle_between(p: ArrayLike, q: ArrayLike) -> Floats:
     """Angle (...) [rad] in [0, pi] of the rotation that takes attitude p into q, both (..., 4).
 
-    Exact to rounding for small angles too, where an arc cosine keeps half of the digits.
+    Exact to rounding even for small angles, for which an arc cosine loses half of the digits.
     """
     p, q = _unit(p), _unit(q)
     apart, together = np.linalg.norm(p - q, axis=-1), np.linalg.norm(p + q, axis=-1)
@@ -189,7 +189,7 @@ def quaternion_from_rotation_vector(phi: ArrayLike) -> Floats:
 def rotation_vector_from_quaternion(q: ArrayLike) -> Floats:
     """Rotation vectors (..., 3) [rad], at most pi long, of quaternions (..., 4).
 
-    Of the two vectors of half a turn it gives the one along (q1, q2, q3).
+    For half a turn there are two vectors; the one along (q1, q2, q3) is returned.
     """
     q = _scalar_positive(_unit(q))
     vector = q[..., 1:]
@@ -212,7 +212,7 @@ def rotation_vector_rate(phi: ArrayLike, omega: ArrayLike) -> Floats:
     """Rate (..., 3) [rad/s] of rotation vectors phi (..., 3) [rad] at body rates omega (..., 3) [rad/s].
 
     phi_dot = omega + phi x omega / 2 + k phi x (phi x omega), k = (1 - x/2 cot(x/2))/x^2,
-    x = |phi|. It is singular at whole turns, x = 2 pi; keep |phi| <= pi.
+    x = |phi|. It is singular at full turns, x = 2 pi; keep |phi| <= pi.
     """
     phi, omega = _vectors("phi", phi, 3), _vectors("omega", omega, 3)
     x = np.linalg.norm(phi, axis=-1, keepdims=True)
@@ -229,7 +229,7 @@ def triangle_frame(r: ArrayLike, masses: ArrayLike | None = None) -> Floats:
 
     x points from the centre of mass to agent 3, y along r_1 - r_2 made orthogonal to x, and
     z = x cross y. Positions r (..., 3, 3) [m], one row per agent; masses (3,) [kg], equal by
-    default. ValueError on a line, where the recipe has no y axis.
+    default. Raises ValueError for agents on a line, for which the recipe has no y axis.
     """
     r = _vectors("r", r, 3, 3)
     m = np.ones(3) if masses is None else np.asarray(masses, dtype=float)
@@ -243,8 +243,8 @@ def triangle_frame(r: ArrayLike, masses: ArrayLike | None = None) -> Floats:
     flat = np.linalg.norm(normal, axis=-1) <= 1e-9 * longest**2
     if np.any(flat):
         raise ValueError(
-            "the three agents stand on a line (to 1e-9 of its length), where agent 3 and the side"
-            " 1-2 fix no plane: attach the frame before the line is reached, or fit the slots"
+            "the three agents are on a line (to 1e-9 of its length), so agent 3 and the side 1-2"
+            " define no plane: attach the frame before the line is reached, or fit the slots"
         )
     x = x / np.linalg.norm(x, axis=-1, keepdims=True)
     z = normal / np.linalg.norm(normal, axis=-1, keepdims=True)
@@ -271,7 +271,7 @@ def _unit(q: ArrayLike) -> Floats:
     norm = np.sqrt((q * q).sum(axis=-1, keepdims=True))
     if (norm == 0.0).any():
         raise ValueError(
-            "a quaternion of length zero is no attitude; no turn at all is (1, 0, 0, 0)"
+            "a quaternion of length zero is not an attitude; the identity is (1, 0, 0, 0)"
         )
     return q / norm
 

@@ -7,14 +7,14 @@ from numpy.typing import ArrayLike
 
 from rigidfleet.typing import Floats, Ints
 
-# Numbers in a temporary array at most.
+# Greatest number of values in a temporary array.
 _ELEMENTS = 8_000_000
 
 
 def jacobian(points: ArrayLike, edges: ArrayLike) -> Floats:
     """J (..., m, N d), Eq. (5), of edges (m, 2) at points (..., N, d): a row holds the unit vector u at i and -u at j.
 
-    A row is not finite where its agents are at one place.
+    A row is not finite if its agents are at the same place.
     """
     p = np.asarray(points, dtype=np.float64)
     i, j = np.asarray(edges, dtype=np.int64).reshape(-1, 2).T
@@ -22,7 +22,7 @@ def jacobian(points: ArrayLike, edges: ArrayLike) -> Floats:
     with np.errstate(divide="ignore", invalid="ignore"):
         u /= np.linalg.norm(u, axis=-1, keepdims=True)
     row = np.arange(len(i))
-    # Agents of an edge first, samples last: that way an assignment is one pass.
+    # Agents of an edge first, samples last, so that an assignment is one pass.
     J = np.zeros((len(i), p.shape[-2], *p.shape[:-2], p.shape[-1]))
     J[row, i] = np.moveaxis(u, -2, 0)
     J[row, j] = -J[row, i]
@@ -39,7 +39,7 @@ def smallest_singular_value(r: Floats, edges: Ints, masses: ArrayLike | None = N
     """
     if not len(edges):
         return np.full(len(r), np.nan)
-    # Some samples at a time: J of all of them may not fit into memory.
+    # A few samples at a time: J of all samples may not fit into memory.
     some = max(1, _ELEMENTS // (len(edges) * r.shape[1] * 3))
     if len(r) > some:
         parts = [r[k : k + some] for k in range(0, len(r), some)]
@@ -48,7 +48,7 @@ def smallest_singular_value(r: Floats, edges: Ints, masses: ArrayLike | None = N
     if masses is not None:
         m = np.asarray(masses, dtype=float)
         J *= np.repeat(np.sqrt(m.mean() / m), 3)
-    # The smaller Gram matrix: a third of the time of a decomposition of J itself.
+    # The smaller Gram matrix takes a third of the time of a decomposition of J itself.
     gram = J @ J.swapaxes(1, 2) if J.shape[1] <= J.shape[2] else J.swapaxes(1, 2) @ J
     w = np.linalg.eigvalsh(gram)
     w[w < 1e-14 * w[:, -1:]] = np.inf

@@ -1,4 +1,4 @@
-"""Linear quadratic regulators: infinite and finite horizon, and the exact motions they make.
+"""Linear quadratic regulators with infinite and finite horizon, and their exact closed-loop motions.
 
 For x' = A x + B u and the paper's cost (Table 2), here with a cross weight N (n, m),
 
@@ -10,12 +10,12 @@ the optimal input is u = -K x, K = R^-1 (B^T P + N^T), where P(T - t) solves the
 
 back from P(0) = S. Q, R and S are symmetric matrices, or lists of their diagonals; N is the N of
 python-control and Drake, the ``s`` of `scipy.linalg.solve_continuous_are`, and zero unless given.
-R is positive definite. Q, S and Q - N R^-1 N^T need not be: what is refused is a cost without a
-bounded minimum (see Willems 1971, doi:10.1109/TAC.1971.1099831).
+R must be positive definite. Q, S and Q - N R^-1 N^T need not be; a cost without a bounded minimum is
+refused (see Willems 1971, doi:10.1109/TAC.1971.1099831).
 
-Each axis of a formation is a double integrator: x = (position, velocity), u the acceleration. Of
-one, N = (n1, n2) says nothing that Q and S cannot: x u and v u are the rates of x v and v^2/2 but for
-a -v^2, so that it is the same as Q22 - 2 n1, S12 + n1 and S22 + n2 without N.
+Each axis of a formation is a double integrator: x = (position, velocity), u the acceleration. For a
+double integrator, N = (n1, n2) is equivalent to changes of Q and S: x u + v^2 and v u are the rates of
+x v and v^2/2, so N has the same effect as Q22 - 2 n1, S12 + n1 and S22 + n2.
 """
 
 import math
@@ -26,14 +26,14 @@ from numpy.typing import ArrayLike
 
 from rigidfleet.typing import Bools, Floats
 
-# An array as what it is kept under: its shape and contents.
+# Cache key of an array: its shape and contents.
 Key = tuple[tuple[int, ...], bytes]
 
-# So many results are kept that depend on weights and times alone: they are the same in every run of a
+# Number of cached results that depend on weights and times alone: they are the same in every run of a
 # sweep, and often from phase to phase.
 _KEPT = 512
 
-# A weight is negative where it is so by more than this part of its greatest entry.
+# A weight counts as negative beyond this share of its greatest entry.
 _ROUNDING = 1e-12
 
 # The double integrator.
@@ -46,9 +46,9 @@ def infinite_horizon(
 ) -> tuple[Floats, Floats]:
     """Gain K (m, n) and cost P (n, n) for T to infinity: u = -K x.
 
-    P is the Riccati equation's stabilising rest point: the least cost of all inputs that bring x to
-    rest. ValueError where the weights or shapes are wrong, no input brings x to rest, or none does so
-    at least cost.
+    P is the stabilising stationary solution of the Riccati equation: the least cost of all inputs that bring
+    x to rest. Raises ValueError if the weights or shapes are wrong, no input brings x to rest, or none
+    does so at least cost.
     """
     A, B, Q, R, N = _system(A, B, Q, R, N)
     F, G, W = _reduced(A, B, Q, R, N)
@@ -56,13 +56,13 @@ def infinite_horizon(
         mode = A - s * np.eye(len(A))
         if s.real >= 0.0 and np.linalg.matrix_rank(np.hstack([mode, B])) < len(A):
             raise ValueError(
-                f"the input B does not reach the motion of A with eigenvalue {s:.3g}, which does not"
-                " settle by itself: no gain stabilises it"
+                f"the input B does not act on the motion of A with eigenvalue {s:.3g}, which does not"
+                " decay by itself: no gain stabilises it"
             )
         if s.real == 0.0 and not N.any() and np.linalg.matrix_rank(np.vstack([mode, Q])) < len(A):
             raise ValueError(
-                f"Q does not weigh the motion of A with eigenvalue {s:.3g}, so that an infinite"
-                " horizon leaves it where it is: weigh it (for a double integrator the position,"
+                f"Q does not weigh the motion of A with eigenvalue {s:.3g}, so an infinite horizon"
+                " does not control it: weigh it (for a double integrator the position,"
                 " Q[0] > 0), or use a finite horizon"
             )
     # The closed loop has the stable half of the Hamiltonian's eigenvalues, which are +- each other.
@@ -74,10 +74,10 @@ def infinite_horizon(
         start = _stable_subspace(H)
     elif not slowest > 1e-12 * np.abs(modes).max():
         raise ValueError(
-            "the Riccati equation has no stabilising solution within rounding: bring the entries of"
-            " Q and R closer together, or use a finite horizon"
+            "the Riccati equation has no stabilising solution to rounding: bring the magnitudes of"
+            " the entries of Q and R closer together, or use a finite horizon"
         )
-    # Over 40 of the slowest time constants the cost to go forgets what it is at the end.
+    # Beyond 40 of the slowest time constants, the cost to go no longer depends on its final value.
     P = _cost_to_go(F, G, W, start, np.array(40.0 / slowest))
     return _solve(R, B.T @ P + N.T), P
 
@@ -94,10 +94,10 @@ def finite_horizon(
 ) -> tuple[Floats, Floats]:
     """Cost P (..., n, n) and gain K (..., m, n) at times to go T - t (...) [s]: u = -K x.
 
-    From the exponential of the Hamiltonian matrix, taken over a short step and doubled in a form
-    that keeps every part positive, so that horizons of any length neither overflow nor cancel.
-    With Q = 0 it is P = Phi^T (S^-1 + W)^-1 Phi. ValueError where a time to go is negative, or so long
-    that the cost has no minimum: it says from which time on.
+    The exponential of the Hamiltonian matrix is taken over a short step and doubled in a form that keeps
+    every part positive, so that horizons of any length neither overflow nor cancel. With Q = 0 the cost is
+    P = Phi^T (S^-1 + W)^-1 Phi. Raises ValueError if a time to go is negative, or so long that the cost has
+    no minimum; the message says from which time on.
     """
     A, B, Q, R, N = _system(A, B, Q, R, N)
     S = _weight("S", S, len(A))
@@ -119,8 +119,8 @@ def closed_loop_response(
 ) -> tuple[Floats, Floats]:
     """Optimal states x (K, n, ...) and inputs u (K, m, ...) at times (K,) [s] in [0, T] from x0 (n, ...).
 
-    The solution of the Hamiltonian's boundary problem, not an integration: every time stands for
-    itself. ValueError where a time lies outside [0, T], or the cost over T has no minimum.
+    This is the solution of the Hamiltonian boundary value problem, not an integration: each time is computed
+    on its own. Raises ValueError if a time lies outside [0, T], or the cost over T has no minimum.
     """
     A, x0 = np.asarray(A, dtype=float), np.asarray(x0, dtype=float)
     N = np.zeros(np.shape(B)) if N is None else N
@@ -133,7 +133,7 @@ def closed_loop_response(
 def double_integrator_gains(Q: ArrayLike, R: ArrayLike) -> tuple[float, float]:
     """Infinite-horizon gains k1 [1/s^2], k2 [1/s] of a double integrator: u = -k1 x - k2 v.
 
-    In closed form: k1 = sqrt(q1/r), k2 = sqrt(q2/r + 2 k1), whatever couples the two in Q. ValueError
+    In closed form: k1 = sqrt(q1/r), k2 = sqrt(q2/r + 2 k1), for any coupling in Q. Raises ValueError
     unless q1 and q2/r + 2 k1 are positive.
     """
     return _gains(_key(Q), _key(R))
@@ -144,14 +144,14 @@ def _gains(Q_key: Key, R_key: Key) -> tuple[float, float]:
     _, _, Q, R, _ = _system(_A, _B, _array(Q_key), _array(R_key))
     if not Q[0, 0] > 0.0:
         raise ValueError(
-            "an infinite horizon needs a weight on the position, Q[0] > 0: without one nothing"
-            " draws a resting vehicle to its target; or use a finite horizon"
+            "an infinite horizon needs a weight on the position, Q[0] > 0: without one, a vehicle"
+            " at rest does not move to its target; or use a finite horizon"
         )
     k1 = math.sqrt(Q[0, 0] / R[0, 0])
     square = Q[1, 1] / R[0, 0] + 2.0 * k1
     if not square > 0.0:
         raise ValueError(
-            f"a weight of {Q[1, 1]:g} on the velocity rewards to swing without end: Q[1] must be"
+            f"a weight of {Q[1, 1]:g} on the velocity rewards endless oscillation: Q[1] must be"
             f" greater than -2 sqrt(Q[0] R) = {-2.0 * k1 * R[0, 0]:g}"
         )
     return k1, math.sqrt(square)
@@ -166,11 +166,11 @@ def finite_horizon_trajectory(
     R: ArrayLike,
     S: ArrayLike,
 ) -> tuple[Floats, Floats, Floats]:
-    """Flight of a double integrator to a moving target: x, v, a (K, ...) at times (K,) [s] in [0, T].
+    """Trajectory of a double integrator to a moving target: x, v, a (K, ...) at times (K,) [s] in [0, T].
 
     ``start`` = (x, v) at t = 0 and ``target`` = (x, v) at t = T [m, m/s], any shape, one entry
-    per axis. What is regulated is e = x - (x_target + v_target (t - T)): a target that stands
-    still is missed by far where a velocity is asked for on arrival.
+    per axis. The regulated error is e = x - (x_target + v_target (t - T)). With a final velocity,
+    the regulator follows this moving target, not a fixed point.
     """
     t = _times("times", times)
     x0, v0, x1, v1 = np.broadcast_arrays(*(np.asarray(z, dtype=float) for z in (*start, *target)))
@@ -188,22 +188,22 @@ def infinite_horizon_trajectory(
     Q: ArrayLike,
     R: ArrayLike,
 ) -> tuple[Floats, Floats, Floats]:
-    """The same flight under the infinite-horizon regulator, its gains constant.
+    """The same trajectory under the infinite-horizon regulator, with constant gains.
 
-    The target is where it moves at t = T; one that rests makes T nothing but the end of ``times``.
+    The target position is that at t = T; for a target at rest, T is only the end of ``times``.
     """
-    # The cost of an infinite horizon, as the final weight, is the Riccati equation's rest point.
+    # With the cost of an infinite horizon as final weight, the Riccati equation is stationary.
     return finite_horizon_trajectory(times, start, target, T, Q, R, _cost_at_rest(_key(Q), _key(R)))
 
 
 def knots(
     T: float, Q: ArrayLike, R: ArrayLike, S: ArrayLike | None = None, tolerance: float = 1e-10
 ) -> Floats:
-    """Knots (n + 1,) [s] from 0 to T between which quintics represent a flight of a double integrator.
+    """Knots (n + 1,) [s] from 0 to T between which quintics represent a trajectory of a double integrator.
 
-    Position and velocity deviate by at most ``tolerance``, relative to the largest they reach, from
-    any start: where the flight bends (at the start if Q is large, at the end if S is) pieces are
-    halved. One piece is exact for Q = 0, where the flight is a cubic. S = None: infinite horizon.
+    For any start, position and velocity deviate by at most ``tolerance``, relative to their greatest values.
+    Pieces are halved where the trajectory bends: at the start if Q is large, at the end if S is. One piece is
+    exact for Q = 0, for which the trajectory is a cubic. S = None means an infinite horizon.
     """
     if not (math.isfinite(T) and T > 0):
         raise ValueError(f"the horizon T must be positive [s], not {T}")
@@ -225,11 +225,11 @@ def _knots(T: float, Q_key: Key, R_key: Key, S_key: Key, tolerance: float) -> Fl
     result, largest = [np.zeros(1)], np.zeros((2, 2))
     while left.size:
         t = left[:, None] + width * np.array([0.0, *inside, 1.0])
-        # Two starts span all: at distance 1 with velocity 0, and the converse.
+        # Two starts span all others: position 1 with velocity 0, and position 0 with velocity 1.
         x, a = closed_loop_response(_A, _B, Q, R, S, T, np.eye(2), t.ravel())
         x, a = x.reshape(*t.shape, 2, 2), a.reshape(*t.shape, 2)
         largest = np.maximum(largest, np.abs(x).max(axis=(0, 1)))
-        # In units of the width, so that one set of powers serves all pieces.
+        # In units of the piece's width, so that one set of powers serves all pieces.
         ends = [z[:, [0, -1]] for z in (x[:, :, 0], width * x[:, :, 1], width**2 * a)]
         c = _quintics(np.ones(len(left)), *(z.swapaxes(0, 1) for z in ends))
         quintic = np.stack([c @ u.T, c @ u_dot.T / width], axis=2)
@@ -238,7 +238,7 @@ def _knots(T: float, Q_key: Key, R_key: Key, S_key: Key, tolerance: float) -> Fl
         rounding = 16 * np.finfo(float).eps * largest[0] * np.array([[1.0], [1.0 / width]])
         allowed = tolerance * largest + rounding
         bad = np.any(np.abs(deviation) > allowed.T[..., None], axis=(1, 2, 3))
-        bad &= width * fastest > 1 / 64  # below, only rounding is left
+        bad &= width * fastest > 1 / 64  # narrower pieces contain only rounding
         result.append(left[~bad] + width)
         width *= 0.5
         left = np.concatenate([left[bad], left[bad] + width])
@@ -250,7 +250,7 @@ def quintic_pieces(times: ArrayLike, x: ArrayLike, v: ArrayLike, a: ArrayLike) -
     """Quintics that meet x, v, a (n + 1, ...) at the times (n + 1,) [s]: coefficients (n, ..., 6).
 
     x(t) = sum_p coefficients[i, ..., p] (t - times[i])^p for times[i] <= t <= times[i + 1], with two
-    continuous derivatives. ValueError unless the times increase.
+    continuous derivatives. Raises ValueError unless the times increase.
     """
     t = np.asarray(times, dtype=float)
     x, v, a = (np.asarray(z, dtype=float) for z in (x, v, a))
@@ -268,7 +268,7 @@ def _quintics(h: Floats, x: ArrayLike, v: ArrayLike, a: ArrayLike) -> Floats:
     """Coefficients (n, ..., 6) from both ends' (2, n, ...) values, widths h (n,)."""
     (x0, x1), (v0, v1), (a0, a1) = (np.asarray(z) for z in (x, v, a))
     h = h.reshape(-1, *[1] * (x0.ndim - 1))
-    # What a parabola from the left end misses at the right one.
+    # Errors at the right end of a parabola from the left end.
     x = (x1 - x0 - h * (v0 + 0.5 * h * a0)) / h**3
     v = (v1 - v0 - h * a0) / h**2
     a = (a1 - a0) / h
@@ -296,11 +296,11 @@ def _responses(*keys: Key) -> tuple[Floats, Floats]:
 def _cost_at_rest(Q: Key, R: Key) -> Floats:
     """P (2, 2) of the double integrator's infinite horizon, as `infinite_horizon` has it.
 
-    Its Riccati equation has a solution in closed form, exact whatever the weights.
+    Its Riccati equation has a closed-form solution, which is exact for any weights.
     """
     _, _, weights, effort, _ = _system(_A, _B, _array(Q), _array(R))
     (a, b), (_, d), r = *weights.tolist(), float(effort[0, 0])
-    _gains(Q, R)  # says what is wrong, if anything is
+    _gains(Q, R)  # raises an error if the weights are invalid
     cross = math.sqrt(a) * math.sqrt(r)
     last = math.sqrt(r) * math.sqrt(d + 2.0 * cross)
     return np.array([[cross * last / r - b, cross], [cross, last]])
@@ -319,13 +319,13 @@ def _array(key: Key) -> Floats:
 def _reduced(
     A: Floats, B: Floats, Q: Floats, R: Floats, N: Floats
 ) -> tuple[Floats, Floats, Floats]:
-    """The same problem without N, in the input u + R^-1 N^T x: its A, B R^-1 B^T and Q."""
+    """The same problem without N, for the input u + R^-1 N^T x: its A, B R^-1 B^T and Q."""
     G = B @ _solve(R, B.T)
     if not N.any():
         return A, G, Q
     rest = Q - N @ _solve(R, N.T)
     value, vector = np.linalg.eigh(0.5 * (rest + rest.T))
-    if -_ROUNDING * np.abs(Q).max() <= value[0] < 0.0:  # of zero, what rounding has left
+    if -_ROUNDING * np.abs(Q).max() <= value[0] < 0.0:  # a zero with rounding error
         value = value.clip(min=0.0)
     return A - B @ _solve(R, N.T), G, (vector * value) @ vector.T
 
@@ -348,7 +348,7 @@ def _flow(
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """X (n, n) and Phi, W, V (..., n, n) over tau (...), as `_propagate` has them of P - X.
 
-    ValueError where P, from S, does not exist at all times to go up to T.
+    Raises ValueError if P, starting from S, does not exist at all times to go up to T.
     """
     if _positive(Q) and _positive(S):
         return np.zeros_like(Q), *_propagate(A, G, Q, tau, _rate(A, G, Q))[:3]
@@ -376,22 +376,22 @@ def _flow(
 def _stable_subspace(H: Floats) -> Floats:
     """P (n, n), to some digits, from the stable half of a Hamiltonian matrix (2 n, 2 n).
 
-    ValueError where an eigenvalue lies on the imaginary axis, within rounding of the matrix.
+    Raises ValueError if an eigenvalue lies on the imaginary axis, within rounding of the matrix.
     """
     from scipy.linalg import schur
 
     n = len(H) // 2
     near = min(np.linalg.eigvals(H), key=lambda s: abs(s.real))
-    # Rounding moves a double eigenvalue far off the axis: how near a singular matrix is tells, not the eigenvalue.
+    # Rounding moves a double eigenvalue far off the axis, so the distance to a singular matrix decides.
     g, q = np.linalg.norm(H[:n, n:], 2), np.linalg.norm(H[n:, :n], 2)
     scale = np.repeat([1.0, math.sqrt(q / g) if g > 0.0 else 1.0], n)
     balanced = H * scale / scale[:, None]
     least = np.linalg.svd(balanced - 1j * near.imag * np.eye(2 * n), compute_uv=False)[-1]
     if not least > 8 * n * np.finfo(float).eps * np.linalg.norm(balanced, 2):
         raise ValueError(
-            "the cost has no least value over an infinite horizon: its Hamiltonian matrix has the"
-            f" eigenvalue {abs(near.imag):.6g}i on the imaginary axis, so that to swing at"
-            f" {abs(near.imag):.6g} rad/s costs nothing or less. Make Q greater or N less, or use a"
+            "the cost has no minimum over an infinite horizon: its Hamiltonian matrix has the"
+            f" eigenvalue {abs(near.imag):.6g}i on the imaginary axis, so an oscillation at"
+            f" {abs(near.imag):.6g} rad/s has zero or negative cost. Increase Q or reduce N, or use a"
             " finite horizon"
         )
     vectors = schur(balanced, sort="lhp")[1][:, :n] * scale[:, None]
@@ -400,7 +400,7 @@ def _stable_subspace(H: Floats) -> Floats:
 
 
 def _rate(A: Floats, G: Floats, Q: Floats) -> float:
-    """Of the fastest motion of a Hamiltonian system [1/s]."""
+    """Rate of the fastest motion of a Hamiltonian system [1/s]."""
     return float(np.abs(np.linalg.eigvals(_hamiltonian(A, G, Q))).max())
 
 
@@ -409,20 +409,20 @@ def _propagate(
 ) -> tuple[Floats, Floats, Floats, Bools]:
     """Phi, W, V (..., n, n): x(tau) = Phi x(0) - W y(tau), y(0) = V x(0) + Phi^T y(tau).
 
-    The flow of the Hamiltonian system x' = A x - G y, y' = -Q x - A^T y over tau, solved for what
-    is known of its boundary problem. Its exponential would grow as fast as y does; these do not:
-    W and V grow from zero, never shrink, and Phi tends to the closed loop's transition.
+    The flow of the Hamiltonian system x' = A x - G y, y' = -Q x - A^T y over tau, solved for the unknowns of its
+    boundary value problem. The exponential would grow as fast as y does, but these matrices do not: W and V
+    grow monotonically from zero, and Phi tends to the transition matrix of the closed loop.
 
-    Also returned: where the solution V of the Riccati equation that starts from zero has grown beyond
-    all bounds by tau (...), which takes an indefinite Q; the three are then without meaning.
+    Also returns whether the solution V of the Riccati equation, which starts from zero, has become unbounded by
+    tau (...). This happens only for an indefinite Q; the three matrices are then meaningless.
     """
     n = len(A)
     identity = np.eye(n)
     backward = -_hamiltonian(A, G, Q)
     with np.errstate(divide="ignore"):
         doublings = np.ceil(np.log2(2.0 * rate * tau)).clip(min=0.0)
-    # Taylor's series, for every entry keeps its own leading power of the step: a Pade approximant
-    # would round the small ones (W begins with the third power) to the size of the large.
+    # A Taylor series, because each entry keeps its own leading power of the step. A Pade approximant
+    # would round the small entries (W begins with the third power) relative to the large ones.
     step = backward * (tau * 0.5**doublings)[..., None, None]
     E = term = step
     for k in range(2, 25):
@@ -480,7 +480,7 @@ def _system(
         raise ValueError("A, B and N must be finite")
     R = _weight("R", R, B.shape[1])
     if np.linalg.eigvalsh(R)[0] <= 0.0:
-        raise ValueError("R must be positive definite: every input has to cost something")
+        raise ValueError("R must be positive definite: every input must have a cost")
     return A, B, _weight("Q", Q, len(A)), R, N
 
 
@@ -492,10 +492,10 @@ def _weight(name: str, value: ArrayLike, n: int) -> Floats:
     if weight.shape != (n, n):
         raise ValueError(f"{name} must be ({n}, {n}) or its diagonal ({n},), not {weight.shape}")
     if not np.all(np.isfinite(weight)):
-        raise ValueError(f"{name} must be finite; a very large weight asks for a value exactly")
+        raise ValueError(f"{name} must be finite; use a very large weight to enforce a value")
     if np.abs(weight - weight.T).max() > 1e-12 * np.abs(weight).max():
         raise ValueError(
-            f"{name} must be symmetric; use ({name} + {name}^T)/2, which costs the same"
+            f"{name} must be symmetric; use ({name} + {name}^T)/2, which has the same cost"
         )
     return weight
 

@@ -1,6 +1,6 @@
 """Gains of the constraint's PID stabilisation (Baumgarte) in Eq. (12).
 
-Where the constraints are independent and their references stand still, each error c [m] obeys
+If the constraints are independent and their references constant, each error c [m] obeys
 
     c''' + 2 alpha c'' + beta^2 c' + gamma c = 0,      dI/dt = c,
 
@@ -16,15 +16,15 @@ from rigidfleet.typing import Floats
 
 
 def is_stable(alpha: float, beta: float, gamma: float) -> bool:
-    """Whether every error dies out: alpha, beta > 0, gamma >= 0 and 2 alpha beta^2 > gamma (Hurwitz)."""
+    """Whether every error decays: alpha, beta > 0, gamma >= 0 and 2 alpha beta^2 > gamma (Hurwitz)."""
     return bool(alpha > 0 and beta > 0 and gamma >= 0 and 2 * alpha * beta**2 > gamma)
 
 
 def triple_pole(p: float) -> tuple[float, float, float]:
     """Gains (alpha, beta, gamma) of Eq. (12) that put all three poles at -p [1/s], p > 0.
 
-    From rest then c/c(0) = e^-x (1 + x - x^2), x = p t: the fastest answer without ringing. It
-    overshoots by 5 e^-3 = 24.9 %, and must overshoot, for the integral of c has to return to zero.
+    From rest, c/c(0) = e^-x (1 + x - x^2) with x = p t: the fastest response without oscillation. It
+    overshoots by 5 e^-3 = 24.9 %; overshoot is inevitable, because the integral of c must return to zero.
     """
     if not (math.isfinite(p) and p > 0):
         raise ValueError(f"the pole's rate p must be positive [1/s], not {p}")
@@ -34,8 +34,7 @@ def triple_pole(p: float) -> tuple[float, float, float]:
 def poles(alpha: float, beta: float, gamma: float) -> NDArray[np.complex128]:
     """Poles [1/s] of the error, by increasing real part: three, or two if gamma = 0.
 
-    Poles so close that the rounding of the gains could have split them come out as one repeated
-    pole.
+    Poles so close that rounding of the gains could have split them are returned as one repeated pole.
     """
     polynomial = np.array([1.0, 2 * alpha, beta**2, gamma])
     if gamma == 0:
@@ -63,9 +62,9 @@ def error_response(
 ) -> tuple[Floats, Floats, Floats]:
     """Error c [m], its rate [m/s] and its integral I [m s] at times t [s] after c0, cdot0 and I0.
 
-    The matrix exponential of the error's equation: exact for repeated poles, for gamma = 0 and for
-    unstable gains. t has any shape, c0, cdot0 and I0 broadcast against each other (one entry per
-    edge, say); the results have the shape of t followed by theirs.
+    This is the matrix exponential of the error's equation, exact for repeated poles, for gamma = 0 and for
+    unstable gains. t has any shape; c0, cdot0 and I0 broadcast against each other (for example one entry
+    per edge). The results have the shape of t followed by theirs.
     """
     c0, cdot0, I0 = np.broadcast_arrays(*(np.asarray(z, dtype=float) for z in (c0, cdot0, I0)))
     t = np.asarray(t, dtype=float)
@@ -79,7 +78,7 @@ def error_response(
 def settling_time(alpha: float, beta: float, gamma: float, tolerance: float = 0.02) -> float:
     """Time [s] after which |c| stays below ``tolerance`` of an initial c(0) at rest with I = 0.
 
-    ValueError where the gains are unstable, ring for more than a thousand cycles, or the
+    Raises ValueError if the gains are unstable or oscillate for more than a thousand cycles, or the
     tolerance is not between 0 and 1.
     """
     if not 0.0 < tolerance < 1.0:
@@ -94,9 +93,9 @@ def settling_time(alpha: float, beta: float, gamma: float, tolerance: float = 0.
 
 
 def overshoot(alpha: float, beta: float, gamma: float) -> float:
-    """How far c passes zero, as a fraction of an initial c(0) at rest with I = 0; 0 if it never does.
+    """Overshoot of c past zero, as a fraction of an initial c(0) at rest with I = 0; 0 if there is none.
 
-    ValueError as in `settling_time`.
+    Raises ValueError as `settling_time` does.
     """
     t = _time_grid(alpha, beta, gamma, 1e-9)
     least = 0.0
@@ -115,9 +114,9 @@ def _companion(alpha: float, beta: float, gamma: float) -> tuple[float, Floats]:
 
 
 def _exponential(A: Floats, x: Floats) -> Floats:
-    """e^(A x) (..., n, n) for x (...): Taylor's series of a step |A x| <= 1/2, then doubled.
+    """e^(A x) (..., n, n) for x (...): a Taylor series for |A x| <= 1/2, then repeated doubling.
 
-    Much faster on many small matrices than `scipy.linalg.expm`. What is doubled is e^(A x) - 1:
+    For many small matrices, much faster than `scipy.linalg.expm`. The doubling uses e^(A x) - 1:
     squaring a matrix near 1 doubles its rounding error each time.
     """
     with np.errstate(divide="ignore"):
@@ -135,18 +134,18 @@ def _exponential(A: Floats, x: Floats) -> Floats:
 
 
 def _time_grid(alpha: float, beta: float, gamma: float, tolerance: float) -> Floats:
-    """Times from 0 until |c| is below tolerance for good, dense enough to see every swing."""
+    """Times from 0 until |c| stays below tolerance, dense enough to resolve every oscillation."""
     if not is_stable(alpha, beta, gamma):
         raise ValueError(
             f"alpha = {alpha}, beta = {beta}, gamma = {gamma} are unstable: choose"
             " alpha, beta > 0 and 0 <= gamma < 2 alpha beta^2"
         )
     p, A = _companion(alpha, beta, gamma)
-    first = 1 if gamma == 0 else 0  # without gamma the integral is no part of the error's dynamics
+    first = 1 if gamma == 0 else 0  # without gamma, the integral does not enter the dynamics
     A = A[first:, first:]
     one = np.eye(len(A))
     z0 = one[1 - first]
-    # V = z^T X z only falls, where A^T X + X A = -1, and c^2 <= V / (smallest V at which c = 1).
+    # V = z^T X z with A^T X + X A = -1 only decreases, and c^2 <= V / (smallest V at which c = 1).
     X = np.linalg.solve(np.kron(A.T, one) + np.kron(one, A.T), -one.ravel()).reshape(A.shape)
     bound = np.linalg.inv(X)[1 - first, 1 - first]
     x = 1.0
@@ -156,7 +155,7 @@ def _time_grid(alpha: float, beta: float, gamma: float, tolerance: float) -> Flo
     swings = np.abs(s.imag).max() * x / p / math.pi
     if swings > 2000:
         raise ValueError(
-            f"alpha = {alpha}, beta = {beta}, gamma = {gamma} ring for more than a thousand cycles:"
+            f"alpha = {alpha}, beta = {beta}, gamma = {gamma} oscillate for more than a thousand cycles:"
             " raise alpha, or lower gamma further below 2 alpha beta^2"
         )
     smooth = np.geomspace(1e-3 / np.abs(s).max(), x / p, 600)

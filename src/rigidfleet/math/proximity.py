@@ -1,4 +1,4 @@
-"""How close agents come to each other and to obstacles, and how a formation lies in space."""
+"""Distances between agents' surfaces, and between agents and obstacles."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ from numpy.typing import ArrayLike
 
 from rigidfleet.typing import Bools, Floats, Ints
 
-# Beyond so many agents two that are near each other are found by a tree, not among all pairs.
+# Number of agents beyond which a tree finds near pairs, instead of a search of all pairs.
 _MANY = 200
 
 
-# So many agents are asked for their nearest, to begin with.
+# Number of agents whose nearest neighbours give a first estimate.
 _ASKED = 256
 
 
-# Pairs watched are those within so many times what the closest two are apart.
+# Distance of the pairs listed, as a multiple of the least distance.
 _SPARE = 1.2
-# Numbers that stay in the processor's cache.
+# Number of values that fit into the processor's cache.
 _CACHED = 60_000
 
 
 class Obstacle(Protocol):
-    """What a vehicle must not touch: a box along the world's axes, or a half space as one with infinite sides."""
+    """An obstacle: a box along the world's axes, or a half space as a box with infinite sides."""
 
     @property
     def corners(self) -> tuple[float, ...]:
@@ -34,9 +34,9 @@ class Obstacle(Protocol):
 
 
 def separation(r: Floats, radius: ArrayLike) -> tuple[Floats, Ints]:
-    """Least room between two agents' surfaces (K,) [m], and the pair (K, 2) that has it.
+    """Least distance between two agents' surfaces (K,) [m], and their pair (K, 2).
 
-    Parameters: r (K, N, 3) [m], radius (N,) [m]. One agent alone: infinity and (-1, -1).
+    Parameters: r (K, N, 3) [m], radius (N,) [m]. For a single agent: infinity and (-1, -1).
     """
     n = r.shape[1]
     radius = np.asarray(radius, dtype=float)
@@ -46,18 +46,18 @@ def separation(r: Floats, radius: ArrayLike) -> tuple[Floats, Ints]:
         if whole.all():
             return _closest_of_many(r, radius)
         least[whole], pair[whole] = _closest_of_many(r[whole], radius)
-        for k in np.flatnonzero(~whole):  # who is nowhere hides nobody else
+        for k in np.flatnonzero(~whole):  # agents without a position do not affect the others
             who = np.flatnonzero(np.isfinite(r[k]).all(axis=1))
             if len(who) > 1:
                 least[k : k + 1], near = _closest_of_many(r[k : k + 1, who], radius[who])
                 pair[k] = who[near[0]]
         return least, pair
     x = np.ascontiguousarray(r.T)
-    for i in range(n - 1):  # rows of samples, which is faster than rows of agents
+    for i in range(n - 1):  # rows of samples are faster than rows of agents
         d = x[:, i + 1 :] - x[:, i : i + 1]
         room = _root(d) - (radius[i] + radius[i + 1 :])[:, None]
         for j in np.flatnonzero((room < least).any(axis=1)).tolist():
-            closer = room[j] < least  # false where it is NaN
+            closer = room[j] < least  # false for NaN
             np.copyto(least, room[j], where=closer)
             np.copyto(pair[:, 0], i, where=closer)
             np.copyto(pair[:, 1], i + 1 + j, where=closer)
@@ -85,16 +85,17 @@ def _root(d: Floats) -> Floats:
 
 
 def _closest_of_many(r: Floats, radius: Floats) -> tuple[Floats, Ints]:
-    """`separation` of many agents r (K, N, 3), all of them somewhere, in O(N) or O(N log N) a sample.
+    """`separation` of many agents r (K, N, 3), all finite, in O(N) or O(N log N) per sample.
 
-    A tree finds the pairs near each other at one sample. They serve the next samples, too, for as long as no other
-    pair can have come as near: whatever moves as a whole, agents that have moved by ``moved`` within it
-    have changed no distance by more than twice that.
+    A tree finds the near pairs at one sample. They are used for later samples as long as no other pair can have come
+    as near: apart from rigid motion of the whole, agents that have moved by at most ``moved`` have changed no distance
+    by more than twice that.
     """
     least, pair = np.empty(len(r)), np.empty((len(r), 2), dtype=np.int64)
     near, rest = None, np.zeros((3, 0))
     for k, points in enumerate(r):
-        p = np.ascontiguousarray(points.T)  # sums over agents take a quarter of the time so
+        # In this layout, sums over agents take a quarter of the time
+        p = np.ascontiguousarray(points.T)
         p -= p.mean(axis=1, keepdims=True)
         if near is not None:
             room = near.rooms(p)
@@ -108,14 +109,14 @@ def _closest_of_many(r: Floats, radius: Floats) -> tuple[Floats, Ints]:
 
 
 class _Near(NamedTuple):
-    """Pairs of agents (2, m), i < j, each with both radii (m,); all others have more room than ``beyond`` [m]."""
+    """Near pairs of agents (2, m), i < j, and sums of their radii (m,); all others are ``beyond`` [m] apart or more."""
 
     pairs: Ints
     radii: Floats
     beyond: float
 
     def rooms(self, p: Floats) -> Floats:
-        """Room (m,) [m] between the surfaces of the pairs, of agents p (3, N)."""
+        """Distances (m,) [m] between the surfaces of the pairs, for agents p (3, N)."""
         x = p.take(self.pairs[0], axis=1)
         x -= p.take(self.pairs[1], axis=1)
         x *= x
@@ -126,7 +127,7 @@ def _near(p: Floats, radius: Floats) -> _Near:
     """The pairs of agents p (3, N) that are not much farther apart than the closest two."""
     from scipy.spatial import KDTree
 
-    # A balanced tree takes longer to make than it saves here; and some agents tell how near all may be.
+    # Balancing the tree costs more than it saves here. A few agents give an estimate of the least distance.
     tree = KDTree(p.T, balanced_tree=False, compact_nodes=False)
     some = np.arange(0, len(radius), max(1, len(radius) // _ASKED))
     d, j = tree.query(p.T[some], k=2)
@@ -141,17 +142,17 @@ def _near(p: Floats, radius: Floats) -> _Near:
 
 
 def _moved(before: Floats, after: Floats) -> float:
-    """The farthest way [m] of an agent, from (3, N) to (3, N), within the motion of all as one body."""
+    """Greatest displacement [m] of an agent, from (3, N) to (3, N), after removing the rigid motion of all."""
     U, _, Vt = np.linalg.svd(after @ before.T)
-    way = after - (U @ Vt) @ before  # a reflection keeps distances, too
+    way = after - (U @ Vt) @ before  # a reflection also preserves distances
     return float(np.sqrt(np.einsum("ai,ai->i", way, way).max()))
 
 
 def headroom(r: Floats, radius: ArrayLike, among: Bools | None = None) -> tuple[Floats, Ints]:
-    """Least height between two agents of which one is below the other (K,) [m], and the pair (K, 2).
+    """Least height (K,) [m] between the surfaces of two agents, one below the other, and the pair (K, 2).
 
-    Below is who overlaps as seen from above. Infinity and (-1, -1) where nobody is. r (K, N, 3) [m],
-    radius (N,); ``among`` (K, N): whom to look at, all by default.
+    An agent is below another if they overlap as seen from above. Infinity and (-1, -1) if there is no such pair.
+    r (K, N, 3) [m], radius (N,); ``among`` (K, N) selects agents, all by default.
     """
     n = r.shape[1]
     radius = np.asarray(radius, dtype=float)
@@ -167,7 +168,7 @@ def headroom(r: Floats, radius: ArrayLike, among: Bools | None = None) -> tuple[
         d, radii = x[:2, i + 1 :] - x[:2, i : i + 1], radius[i] + radius[i + 1 :]
         d *= d
         d[0] += d[1]
-        overlap = d[0] <= (radii**2)[:, None]  # who is nowhere is below nobody
+        overlap = d[0] <= (radii**2)[:, None]  # false for agents without a position
         for j in np.flatnonzero(overlap.any(axis=1)).tolist():
             room = abs(x[2, i + 1 + j] - x[2, i]) - radii[j]
             lower = overlap[j] & (room < least)
@@ -178,7 +179,7 @@ def headroom(r: Floats, radius: ArrayLike, among: Bools | None = None) -> tuple[
 
 
 def _lowest(r: Floats, radius: Floats) -> tuple[float, Ints]:
-    """Least height between two of many agents (N, 3) of which one is below the other, and the pair."""
+    """Least height between two of many agents (N, 3), one below the other, and the pair."""
     from scipy.spatial import KDTree
 
     who = np.flatnonzero(np.isfinite(r).all(axis=1))
@@ -197,15 +198,15 @@ def _lowest(r: Floats, radius: Floats) -> tuple[float, Ints]:
 def clearance(
     r: Floats, radius: ArrayLike, obstacles: Sequence[Obstacle]
 ) -> tuple[Floats, Ints, Ints]:
-    """Least room to an obstacle (K,) [m], and the agent and the obstacle (K,) that have it.
+    """Least distance to an obstacle (K,) [m], with the agent and the obstacle (K,).
 
-    Negative where they overlap; infinity, -1 and -1 without obstacles. r (K, N, 3), radius (N,).
+    Negative if they overlap; infinity, -1 and -1 without obstacles. r (K, N, 3), radius (N,).
     """
     return least_clearance(*obstacle_clearances(r, radius, obstacles))
 
 
 def least_clearance(room: Floats, nearest: Ints) -> tuple[Floats, Ints, Ints]:
-    """Least of the `obstacle_clearances` (K, N) of each sample (K,), and the agent and obstacle (K,) that have it."""
+    """Least of the `obstacle_clearances` (K, N) of each sample (K,), with the agent and the obstacle (K,)."""
     agent, samples = room.argmin(axis=1), np.arange(len(room))
     obstacle = nearest[samples, agent]
     return room[samples, agent], np.where(obstacle < 0, -1, agent), obstacle
@@ -227,10 +228,10 @@ def separation_of_left(r: Floats, radius: ArrayLike, left: Bools) -> tuple[Float
 def obstacle_clearances(
     r: Floats, radius: ArrayLike, obstacles: Sequence[Obstacle]
 ) -> tuple[Floats, Ints]:
-    """Least room (..., N) [m] of agents r (..., N, 3) to an obstacle, and the obstacle; infinity and -1 without."""
+    """Least distance (..., N) [m] of agents r (..., N, 3) to an obstacle, and the obstacle; infinity and -1 without."""
     radius = np.asarray(radius, dtype=float)
     least, nearest = np.full(r.shape[-2::-1], np.inf), np.full(r.shape[-2::-1], -1)
-    # Axis by axis, and rows of samples, which is faster.
+    # Axis by axis, in rows of samples, which is faster.
     places = np.ascontiguousarray(r.T) if obstacles else r.T
     radius = radius.reshape(-1, *[1] * (r.ndim - 2))
     for k, thing in enumerate(obstacles):
@@ -244,7 +245,7 @@ def obstacle_clearances(
             np.maximum(beyond, 0.0, out=beyond)
             outside += beyond * beyond
         room = np.sqrt(outside) + np.minimum(inside, 0.0) - radius
-        closer = room < least  # false where it is NaN
+        closer = room < least  # false for NaN
         np.copyto(least, room, where=closer)
         np.copyto(nearest, k, where=closer)
     return least.T, nearest.T

@@ -1,4 +1,4 @@
-"""Rigid bodies: the rotation that fits points to points, and mean axes."""
+"""Rigid bodies: rotations that fit points to points, and mean axes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def kabsch(
     """Rotation R minimising sum_i w_i |target_i - R source_i|^2, both sets taken about their weighted centres.
 
     With slots as source and positions in the world as target, R is body -> world, the transpose of
-    the matrix in Eq. (23). Where several rotations fit equally well (points on a line, a mirrored symmetric
+    the matrix in Eq. (23). If several rotations fit equally well (points on a line, a mirrored symmetric
     shape), the one nearest to `near` is taken, so that a line gets the *minimal* rotation and no spin about itself.
 
     Parameters
@@ -58,8 +58,8 @@ def kabsch(
 def _nearest_fit(u: Floats, s: Floats, vt: Floats, near: Floats, tol: float) -> Floats:
     """Of the rotations that fit as well as U V^T, the one nearest to `near`.
 
-    With the last column of U reversed they are U (1 - 2 n n^T) V^T, n any unit vector among the
-    directions of the equal smallest singular values.
+    With the last column of U reversed, they are U (1 - 2 n n^T) V^T, where n is any unit vector in the span of
+    the equal smallest singular directions.
     """
     if s[0] == 0:
         return near.copy()
@@ -71,33 +71,33 @@ def _nearest_fit(u: Floats, s: Floats, vt: Floats, near: Floats, tol: float) -> 
     return (u - 2 * np.outer(u @ n, n)) @ vt
 
 
-# Slots thinner than this, relative to their length, are a line to an attitude fit.
+# Slots thinner than this, relative to their length, count as a line in an attitude fit.
 _THIN = 1e-3
 
 
-# Narrower ones than this are a line where they are not so many times wider than agents are off them.
+# Slots narrower than the first count as a line unless their width exceeds the agents' errors by the second factor.
 _NARROW = 0.1
 
 
 _SURE = 4.0
 
 
-# A turn is half a turn where 1 + cos of its angle is less: 1e-8 rad from it.
+# A rotation counts as half a turn if 1 + cos of its angle is smaller: within 1e-8 rad.
 _HALF_TURN = 5e-17
 
 
 def fit_attitudes(x: Floats, p: Floats, masses: Floats, near: Floats) -> tuple[Floats, Bools]:
     """Attitude T (K, 3, 3), world -> body, of slots fitted to agents at each of K samples (Kabsch).
 
-    Also returns where the slots are one line (K,). So are narrow slots, if the attitude expected is known, where
-    agents are off them by more than their width: how those lie about their long axis is chance.
+    Also returns whether the slots count as a line (K,). If the expected attitude is known, narrow slots count as a
+    line when the agents' errors exceed their width, because the rotation about the long axis is then random.
 
     Parameters
     ----------
     x, p : (K, N, 3) agents about their CM in world axes, and slots in body axes [m]
     masses : (N,) weights [kg]
-    near : (K, 3, 3) or (3, 3) the attitude expected, which decides what the fit leaves open: the
-        spin of a line about itself. One matrix: each sample's is taken from the sample before.
+    near : (K, 3, 3) or (3, 3) the expected attitude, which decides what the fit leaves open: the spin of a line
+        about itself. With one matrix, each later sample uses the attitude of the sample before.
     """
     fit = np.einsum("i,kia,kib->kab", masses, p, x)
     U, _, Vt = np.linalg.svd(fit)
@@ -113,7 +113,7 @@ def fit_attitudes(x: Floats, p: Floats, masses: Floats, near: Floats) -> tuple[F
         line[thin] |= width[thin] <= _SURE * off
         T[thin] = np.where(line[thin, None, None], along, T[thin])
         return T, line
-    # Out of samples on a line, each turns on from the one before: what turns them is known beforehand.
+    # Each sample on a line continues from the sample before; all rotations between samples are computed first.
     if not line.any():
         return T, line
     there = _directions(x, p, axes)
@@ -136,9 +136,9 @@ def fit_attitudes(x: Floats, p: Floats, masses: Floats, near: Floats) -> tuple[F
 def _long_axes(p: Floats) -> tuple[Floats, Floats, Floats]:
     """Second and first singular value (K,) of points p (K, N, 3), and the direction (K, 3) of the first.
 
-    Of points so wide that they are no line, two others whose ratio says so.
+    For points too wide to be a line, two other values with a ratio that shows this.
     """
-    # Slots mostly stand still: one decomposition then serves all samples.
+    # Slots are mostly constant: one decomposition then serves all samples.
     few = p[:1] if (p == p[:1]).all() else p
     C = few.swapaxes(1, 2) @ few
     # Eigenvalues a >= b >= c of C: with s = a + b + c, b >= (ab + ac + bc) / 3s.
@@ -157,27 +157,27 @@ def _long_axes(p: Floats) -> tuple[Floats, Floats, Floats]:
 
 
 def _turn_lines(x: Floats, p: Floats, axis: Floats, near: Floats) -> Floats:
-    """Attitudes (K, 3, 3) of lines, from ``near`` by the smallest rotation that brings each axis home."""
+    """Attitudes (K, 3, 3) of lines: ``near``, followed by the smallest rotation that aligns each axis."""
     now = np.einsum("kba,kb->ka", near, axis)
     return near @ _smallest_turns(now, _directions(x, p, axis)).swapaxes(1, 2)
 
 
 def _directions(x: Floats, p: Floats, axis: Floats) -> Floats:
-    """Where the long axis (K, 3) of slots p points among agents x (K, N, 3): unit vectors, or zero."""
+    """Direction of the slots' long axis (K, 3) among agents x (K, N, 3): unit vectors, or zero."""
     there = np.einsum("ki,kia->ka", np.einsum("kia,ka->ki", p, axis), x)
     length = np.linalg.norm(there, axis=1)
     return there / np.where(length == 0.0, 1.0, length)[:, None]
 
 
 def _smallest_turns(now: Floats, there: Floats) -> Floats:
-    """Smallest rotations (K, 3, 3) from unit vectors to others (K, 3); none to or from zero."""
-    # 1 + c of their angle's cosine c, in digits that are good up to half a turn; of zero vectors it does not matter.
+    """Smallest rotations (K, 3, 3) from unit vectors to others (K, 3); the identity for zero vectors."""
+    # 1 + c with the cosine c of the angle, accurate up to half a turn; irrelevant for zero vectors.
     near = 0.5 * ((now + there) ** 2).sum(axis=1)
     opposite = (near < _HALF_TURN) & now.any(axis=1) & there.any(axis=1)
     skew = there[:, :, None] * now[:, None, :]  # of now x there, less its transpose
     skew = skew - skew.swapaxes(1, 2)
     R = np.eye(3) + skew + skew @ skew / np.where(near < _HALF_TURN, 1.0, near)[:, None, None]
-    for k in np.flatnonzero(opposite):  # half a turn: any axis across the line will do
+    for k in np.flatnonzero(opposite):  # half a turn: any axis perpendicular to the line
         across = np.cross(now[k], np.eye(3)[np.abs(now[k]).argmin()])
         across /= np.linalg.norm(across)
         R[k] = 2.0 * np.outer(across, across) - np.eye(3)
@@ -189,16 +189,16 @@ def mean_axis_rates(x: Floats, y: Floats, masses: Floats, line: ArrayLike = Fals
 
     h is that of Eq. (17).
 
-    x, y (K, N, 3): positions and velocities about the CM [m, m/s]; masses (N,) or (K, N); line (K,):
-    where they are one, and have no spin about themselves. That of a line bent by some centimetres would be noise.
+    x, y (K, N, 3): positions and velocities about the CM [m, m/s]; masses (N,) or (K, N); line (K,): whether the
+    agents count as a line, without spin about itself. The spin of a line bent by some centimetres would be noise.
     """
     masses = np.broadcast_to(masses, x.shape[:2])
     h = np.einsum("ki,kia->ka", masses, np.cross(x, y))
     C = np.einsum("ki,kia,kib->kab", masses, x, x)
     inertia = np.trace(C, axis1=1, axis2=2)[:, None, None] * np.eye(3) - C
-    # Far from a line the inverse is the pseudo-inverse, for a third of the time.
+    # Far from a line, the inverse equals the pseudo-inverse and takes a third of the time.
     size = np.trace(inertia, axis1=1, axis2=2)
-    with np.errstate(over="ignore", invalid="ignore"):  # what has no inertia has no rates
+    with np.errstate(over="ignore", invalid="ignore"):  # without inertia there are no rates
         round_ = ~np.broadcast_to(line, len(x)) & (np.linalg.det(inertia) > 1e-4 * size**3)
     omega = np.empty((len(x), 3))
     omega[round_] = np.linalg.solve(inertia[round_], h[round_, :, None])[:, :, 0]
@@ -206,7 +206,7 @@ def mean_axis_rates(x: Floats, y: Floats, masses: Floats, line: ArrayLike = Fals
     cutoff = np.broadcast_to(np.where(line, _NARROW**2, 1e-9), len(x))[rest]
     pseudo = np.linalg.pinv(inertia[rest], cutoff, hermitian=True)
     omega[rest] = np.einsum("kab,kb->ka", pseudo, h[rest])
-    # Of a point none; not what rounding makes of it.
+    # A single point has no rates; rounding would give some.
     return np.where(np.count_nonzero(masses, axis=1)[:, None] > 1, omega, 0.0)
 
 

@@ -1,7 +1,7 @@
-"""Random processes of air and sensors, as samples: gusts with a spectrum, correlated between places.
+"""Samples of random processes for gusts and sensor noise, with a spectrum and correlation between places.
 
-Shaping filters are discretised exactly: samples have the covariances of the continuous process, whatever the step,
-from the first on. Randomness comes in as white samples, standard normal, so that who draws them decides on seeds.
+Shaping filters are discretised exactly: from the first sample on, samples have the covariances of the continuous
+process for any step. The input is white standard-normal samples, so that the caller controls the seeds.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ def second_order(white: Floats, step: float, tau: float) -> Floats:
     partial fractions it is y = sqrt(3) z1 + (1 - sqrt(3)) z2 with tau dz1/dt = -z1 + e, tau dz2/dt = -z2 + z1,
     whose transition matrix and covariances are known in closed form.
 
-    Parameters: white samples (K, 2, ...), two of them for each sample; their step and tau [s].
+    Parameters: white samples (K, 2, ...), two for each sample; their step and tau [s].
     """
     from scipy.special import gammainc
 
     s = step / tau
     A = math.exp(-s) * np.array([[1.0, 0.0], [s, 1.0]])
     P = np.array([[1.0, 0.5], [0.5, 0.5]])  # stationary
-    # P - A P A^T in incomplete gamma functions: in differences a short step would cancel to nothing.
+    # P - A P A^T by incomplete gamma functions: for a short step, differences would cancel.
     q11, q12, q22 = gammainc([1, 2, 3], 2.0 * s) * [1.0, 0.5, 0.5]
     low = q12 / math.sqrt(q11)
     root = np.array([[math.sqrt(q11), 0.0], [low, math.sqrt(q22 - low**2)]])
@@ -75,16 +75,16 @@ def low_altitude(height: float, wind: float) -> tuple[Floats, Floats]:
 
 
 def correlate_evenly(white: Floats, correlation: float) -> Floats:
-    """Samples (..., N, 3) of which any two agents' have the same correlation, from (..., N + 1, 3)."""
+    """Samples (..., N, 3) with the same correlation between any two agents, from white samples (..., N + 1, 3)."""
     own, common = white[..., :-1, :], white[..., -1:, :]
     return math.sqrt(1.0 - correlation) * own + math.sqrt(correlation) * common
 
 
 def correlate_by_distance(white: Floats, points: ArrayLike, length: float) -> Floats:
-    """Samples (..., N, 3) correlated by exp(-distance / length) of the agents' places (N, 3) [m]."""
+    """Samples (..., N, 3) with the correlation exp(-distance / length) between agents at points (N, 3) [m]."""
     p = np.asarray(points, dtype=np.float64)
     apart = np.linalg.norm(p[:, None] - p[None], axis=2)
-    # Places that are nearly one would make the matrix singular to rounding.
+    # Nearly coincident places would make the matrix singular to rounding.
     C = np.exp(-apart / length) + 1e-12 * np.eye(len(p))
     return np.einsum("ij,...jq->...iq", np.linalg.cholesky(C), white)
 

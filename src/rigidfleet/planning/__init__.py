@@ -1,1 +1,1 @@
-"""What is known of a flight before it: each phase's plan, its references, disturbances and tolerances."""
+"""What is computed before a flight: the plan of each phase, its references, disturbances and tolerances."""

@@ -1,4 +1,4 @@
-"""Where each kind of phase leads the virtual body, and how it goes there: all that planning knows of kinds.
+"""Goal and trajectory of the virtual body for each kind of phase: all that planning knows about kinds.
 
 A kind of phase that neither stays nor flies by the regulators of [lqr] has a function in `_COURSES`, and a flight of
 its own.
@@ -20,12 +20,12 @@ from rigidfleet.mission.schema import Orbit, Steering
 from rigidfleet.planning.reference import PhaseState, Pose
 from rigidfleet.typing import Floats
 
-#: A phase that ends by settling and steers nowhere brings the body to rest within this time [s].
+#: Time in which a phase that ends by settling, without a target, brings the body to rest [s].
 _REST_WITHIN = 10.0
 
 
 class Flight(Protocol):
-    """How the virtual body goes through a phase: its CM, and its attitude as a rotation vector phi from ``T1``.
+    """Trajectory of the virtual body through a phase: its CM, and its attitude as a rotation vector phi from ``T1``.
 
     The attitude is T = Exp(phi)^T T1, as in `Motion`.
     """
@@ -42,20 +42,20 @@ class Flight(Protocol):
 
 
 class Course(NamedTuple):
-    """Where a phase leads the virtual body."""
+    """Goal and trajectory of the virtual body in a phase."""
 
-    goal: Pose | None  # where it is to be; None where nothing is attached yet
-    arrival: float  # when [s]
-    flight: Flight | None  # how it goes there; None where nothing leads it
+    goal: Pose | None  # pose to reach; None if no frame is attached yet
+    arrival: float  # time to reach it [s]
+    flight: Flight | None  # trajectory to it; None if there is none
 
 
 def course(mission: Mission, phase: Phase, now: PhaseState, t_end: float) -> Course:
-    """Where a phase leads the virtual body from a state to which it is attached, if it ends at ``t_end`` [s]."""
+    """Course of the virtual body in a phase that ends at ``t_end`` [s], from a state with the frame attached."""
     return _COURSES.get(phase.kind, _stay)(mission, phase, now, t_end)
 
 
 def _stay(mission: Mission, phase: Phase, now: PhaseState, t_end: float) -> Course:
-    """To rest at the goal before; by the end, if that is known, as nothing says when."""
+    """Come to rest at the previous goal; by the end, if that is known, because no time is given."""
     arrival = t_end if phase.settle is None else min(t_end, now.t + _REST_WITHIN)
     if now.goal is None:
         return Course(None, t_end, None)
@@ -64,8 +64,8 @@ def _stay(mission: Mission, phase: Phase, now: PhaseState, t_end: float) -> Cour
 
 
 def _steer(mission: Mission, phase: Steering, now: PhaseState, t_end: float) -> Course:
-    """To a waypoint or an attitude, after ``travel`` or by the end."""
-    assert now.goal is not None  # somebody steers
+    """Go to a waypoint or an attitude, within ``travel`` or by the end."""
+    assert now.goal is not None  # a steering phase has a goal
     arrival = t_end if phase.travel is None else now.t + phase.travel
     angles = phase.attitude_deg
     T = now.goal.T if angles is None else att.dcm_from_euler(np.deg2rad(angles))
@@ -78,7 +78,7 @@ def _steer(mission: Mission, phase: Steering, now: PhaseState, t_end: float) -> 
 
 
 def _orbit(mission: Mission, phase: Orbit, now: PhaseState, t_end: float) -> Course:
-    """Round a circle, and on with the velocity there. An attitude that turns along is none asked for by name."""
+    """Fly a circle, and continue with its velocity. An attitude that turns along is not an explicitly specified one."""
     assert now.pose is not None  # slots are tracked
     assert now.goal is not None
     flight = orbit(phase, now.pose, now.goal.T, now.t, t_end)
@@ -101,7 +101,7 @@ def _regulated(
     return Course(goal, arrival, regulated(mission, now.pose, goal, now.t, arrival, t_end))
 
 
-#: What leads the virtual body in a phase of each kind; in all others it comes to rest at the goal before.
+#: Function of each kind of phase that moves the virtual body; in all others, it comes to rest at the previous goal.
 _COURSES: dict[str, Callable[[Mission, Any, PhaseState, float], Course]] = {
     "fly": _steer,
     "orbit": _orbit,
@@ -113,9 +113,9 @@ _COURSES: dict[str, Callable[[Mission, Any, PhaseState, float], Course]] = {
 class RegulatedFlight:
     """LQR of the virtual body from one pose to another, and the tracking gains from arrival to the phase's end.
 
-    Without those, what the finite horizon has left of the velocity's error would carry the body away. The attitude is
-    regulated as the rotation vector phi from the goal to the body: three more double integrators, phi'' their input,
-    exact for a turn about one axis.
+    Without tracking gains, the velocity error that the finite horizon leaves would carry the body away. The attitude
+    is regulated as the rotation vector phi from the goal to the body. This gives three more double integrators with
+    input phi'', which is exact for a rotation about one axis.
     """
 
     regulators: tuple[Regulator, Regulator]
@@ -128,7 +128,7 @@ class RegulatedFlight:
     t_end: float  # [s]
 
     def motion(self) -> Motion:
-        """Quintics between knots that are close enough for the regulators."""
+        """Quintics between knots that are dense enough for the regulators."""
         T, rest = self.arrival - self.t0, self.t_end - self.arrival
         times = np.unique(np.concatenate([_knots(law, T) for law in self.regulators]))
         after = lqr.knots(rest, *self.tracking) if rest > 0.0 else np.zeros(1)
@@ -160,7 +160,7 @@ class RegulatedFlight:
         return r, phi, v, phi_dot
 
     def _under_way(self, k: int, times: Floats) -> tuple[Floats, Floats, Floats]:
-        """Place, rate and second derivative (K, 3) of CM (0) or phi (1) at times (K,) [s] from the start."""
+        """Position, rate and second derivative (K, 3) of CM (0) or phi (1) at times (K,) [s] from the start."""
         law, T = self.regulators[k], self.arrival - self.t0
         begin, end = self.begin[k], self.end[k]
         if law.horizon == "finite":
@@ -179,7 +179,7 @@ class RegulatedFlight:
 def regulated(
     mission: Mission, start: Pose, goal: Pose, t0: float, arrival: float, t_end: float
 ) -> RegulatedFlight:
-    """The regulators' flight from one pose at ``t0`` [s] to another, and on to the phase's end."""
+    """The regulators' trajectory from one pose at ``t0`` [s] to another, and on to the end of the phase."""
     phi = att.rotation_vector_from_dcm(start.T @ goal.T.T)  # start = goal Exp(phi)
     phi_dot = att.rotation_vector_rate(phi, start.omega)
     return RegulatedFlight(
@@ -194,9 +194,9 @@ def regulated(
     )
 
 
-#: Angle of an orbit [rad], and share of its run-in, that a quintic spans: it is right to 2e-11 of the radius.
+#: Angle of an orbit [rad], and share of its run-in, spanned by one quintic; exact to 2e-11 of the radius.
 _ARC, _SHARE = 0.1, 1 / 64
-#: An orbit begins to turn at most so many times as fast as it will.
+#: Greatest initial rate of an orbit, as a multiple of its final rate.
 _FASTEST = 10.0
 
 
@@ -206,18 +206,18 @@ class OrbitFlight:
 
     Over the run-in the septic blend s leads radius and height, and the rate of the angle, to those of the circle. The
     polar motion begins with as much of the body's velocity as it can take without a large rate near the centre. The
-    rest of it carries the body off by h = t (1 - s), which begins with rate 1 and fades. Place, velocity and
-    acceleration are continuous, and from the end of the run-in on the circle is exact. In the same way phi, from the
-    attitude to keep, goes from what it is to nothing, or to the turn that goes with the orbit.
+    rest of the velocity adds a displacement by h = t (1 - s), which begins with rate 1 and fades. Position, velocity
+    and acceleration are continuous, and after the run-in the circle is exact. In the same way, phi (relative to the
+    attitude to keep) goes from its initial value to zero, or to the rotation that follows the orbit.
     """
 
     centre: Floats  # (3,) [m]
     start: tuple[float, float, float]  # radius [m], angle [rad] and height over the centre [m]
     radius: float  # [m]
     rates: tuple[float, float]  # at the start and on the circle [rad/s]
-    carried: Floats  # (6,) velocity of CM and phi at the start that the polar motion lacks
+    carried: Floats  # (6,) part of the initial velocity of CM and phi that the polar motion does not have
     phi: Floats  # (3,) at the start [rad]
-    axis: Floats  # (3,) about which the body turns along, in axes of T1; zero if it does not
+    axis: Floats  # (3,) axis about which the body turns with the orbit, in axes of T1; zero if it does not
     T1: Floats
     blend: float  # [s]
     t0: float  # [s]
@@ -277,7 +277,7 @@ def orbit(phase: Orbit, start: Pose, attitude: Floats, t0: float, t_end: float) 
     centre, rate = np.array(phase.centre), float(np.deg2rad(phase.rate_deg_s))
     x, y, z = (start.r - centre).tolist()
     rho = float(np.hypot(x, y))
-    # v_t / rho outside of the circle, and less inside, where v_t / rho has no bound.
+    # v_t / rho outside the circle, and less inside it, since v_t / rho has no bound there.
     first = float(x * start.v[1] - y * start.v[0]) / max(rho, phase.radius) ** 2
     first = float(np.clip(first, -_FASTEST * abs(rate), _FASTEST * abs(rate)))
     phi = att.rotation_vector_from_dcm(start.T @ attitude.T)
@@ -293,7 +293,7 @@ def orbit(phase: Orbit, start: Pose, attitude: Floats, t0: float, t_end: float) 
 def as_motion(knots: Floats, coefficients: Floats, T1: Floats) -> Motion:
     """Quintics (n, 6, 6) between mission times (n + 1,) [s], for the kernel.
 
-    Another layout of an array would be another type, and compile the kernel once more.
+    An array of another memory layout has another type, and would compile the kernel again.
     """
     return Motion(knots, np.ascontiguousarray(coefficients), np.ascontiguousarray(T1))
 

@@ -1,7 +1,7 @@
-"""From a mission's disturbances to what the kernel flies through: tables over time.
+"""Make tables over time, which the kernel reads, from a mission's disturbances.
 
-Everything random is drawn before the flight, from generators that the mission seeds: the same mission is the same
-flight, bit for bit, and a longer one meets the same gusts and noise.
+All random numbers are drawn before the flight, from generators that the mission seeds. The same mission therefore
+gives the same flight, bit for bit, and a longer one meets the same gusts and noise.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from rigidfleet.mission import Gusts, Mission
 from rigidfleet.mission.disturbances import gust_step, intensity
 from rigidfleet.typing import Bools, Floats
 
-#: Mass of a lost vehicle in the laws [kg]: it counts for nothing, and yet divides nothing by zero.
+#: Mass of a lost vehicle in the control laws [kg]: too small to count, yet nothing is divided by zero.
 NOTHING = 1e-20
 
 
 def disturbance(mission: Mission) -> Disturbance:
-    """What acts on a mission besides its laws, from its start to its latest end; no vehicle lost yet."""
+    """Disturbances of a mission from its start to its latest end, with no vehicle lost yet."""
     d = mission.disturbances
     none = no_disturbance(mission.fleet.mass.copy())
     if d is None:
@@ -53,7 +53,7 @@ def _knots(mission: Mission, step: float) -> int:
 
 
 def _table(samples: Floats) -> Floats:
-    """Coefficients of a spline, in the one layout that the kernel is compiled for."""
+    """Coefficients of a spline, in the only memory layout that the kernel is compiled for."""
     return np.ascontiguousarray(turbulence.spline_coefficients(samples))
 
 
@@ -92,7 +92,7 @@ def _wind_axes(wind: Floats) -> Floats:
 
 
 def _places(mission: Mission) -> Floats:
-    """Where agents are to each other (N, 3) [m]: in the first formation established, or else at the start."""
+    """Relative positions (N, 3) [m] of the agents: in the first formation established, or else at the start."""
     names = (p.establishing.formation for p in mission.phases if p.establishing is not None)
     slots = next((s for s in map(mission.formation_slots, names) if s is not None), None)
     return mission.fleet.position.copy() if slots is None else slots
@@ -106,10 +106,10 @@ def without(
     *,
     large: bool = False,
 ) -> Problem:
-    """A problem for those that are left: ``edges`` (m,) kept of its own, agents ``lost`` (N,) without thrust.
+    """The problem of the remaining agents: only the ``edges`` (m,) kept, and no thrust of the agents ``lost`` (N,).
 
-    In the laws the lost count for nothing: their masses there are `NOTHING`, and the mean mass, on whose scale the
-    damping ``mu`` of those left stands, is theirs. Newton's law keeps the lost.
+    In the control laws, lost agents have the mass `NOTHING`. The mean mass, which scales the damping ``mu``, is that
+    of the remaining agents. The equations of motion keep the lost agents and their masses.
     """
     m = np.where(lost, NOTHING, problem.vehicles.m)
     mean = float(m[~lost].mean()) if not lost.all() else 1.0

@@ -1,7 +1,7 @@
-"""From a mission and the state at a switch to what the kernel flies: everything known before.
+"""Make the plan of a phase from the mission and the state at the switch.
 
-A phase of a mission becomes a `Problem`: time functions (blends, piecewise quintics), gain tables
-and weights, which the kernel only evaluates. What the next phase inherits travels in a `PhaseState`.
+A phase becomes a `Problem`: time functions (blends, piecewise quintics), gain tables and weights, which the
+kernel only evaluates. A `PhaseState` holds what the next phase inherits.
 """
 
 from __future__ import annotations
@@ -59,19 +59,19 @@ from rigidfleet.planning.tolerances import absolute_tolerances, tolerance_of_vel
 from rigidfleet.typing import Bools, Floats, Ints
 
 _KINDS = {"shape": SHAPE, "squares": SQUARED, "step": CONSTANT}
-#: A formation is held from where all pairs are right within this part of the shortest distance.
+#: Greatest error of any pair, as a share of the shortest distance, at which a formation counts as held.
 _NEAR = 0.1
 
 
-#: Residual of an iterative solve, as a share of the integrator's tolerance; the relative one within bounds.
+#: Residual of an iterative solve, as a share of the integrator's tolerance; the relative residual has bounds.
 _RESIDUAL, _LEAST_RESIDUAL, _MOST_RESIDUAL = 1e-3, 1e-13, 1e-8
-#: Below this share of a velocity's tolerance, the error of an acceleration, times a second, is nothing.
+#: Error of an acceleration that is ignored, as a share of the velocity's tolerance per second.
 _FLOOR = 3e-2
 
 
 @dataclass
 class PhasePlan:
-    """A phase, ready to fly. It is whole: what flies it needs no mission."""
+    """A phase, ready to fly. It holds all that a flight needs, so that no mission is required."""
 
     phase: Phase
     start: float  # [s]
@@ -80,24 +80,24 @@ class PhasePlan:
     edges: Ints  # (m, 2), from 0
     slots: Floats | None  # (N, 3) at the end, about the CM, body axes [m]
     formation: str | None
-    knows_slots: bool  # whether slots of the formation are known, and not its distances alone
+    knows_slots: bool  # whether the formation has slots, not only distances
     distances: Floats  # (m,) at the end [m]
     goal: Pose | None
-    arrival: float  # when the goal is to be reached [s]
+    arrival: float  # time at which the goal is reached [s]
     frame: Floats | None  # attitude (3, 3) of the mean-axis frame at the start
     attached: bool  # whether the slots carry the body frame
-    lies: bool  # whether the formation is to lie as the mission says once it is established
-    method: solvers.Method  # how the multipliers are solved for
+    lies: bool  # whether the mission prescribes the attitude of the established formation
+    method: solvers.Method  # method that solves for the multipliers
     constraint: Constraint  # options of the law
     integrator: IntegratorOptions  # options of the integration
-    damping: Callable[[Bools], float]  # mu of the vehicles left, which are not lost (N,)
-    lost_at: Floats  # (N,) when vehicles are lost [s]
-    masses: Floats  # (N,) as believed, lost vehicles included [kg]
+    damping: Callable[[Bools], float]  # damping mu, from which vehicles are lost (N,)
+    lost_at: Floats  # (N,) times at which vehicles are lost [s]
+    masses: Floats  # (N,) assumed by the laws, lost vehicles included [kg]
     before: PhaseState  # the state that the phase starts from
 
     @property
     def large(self) -> bool:
-        """Whether multipliers are solved for by a method of large formations."""
+        """Whether a method for large formations solves for the multipliers."""
         return self.method != "dense"
 
     @property
@@ -145,12 +145,12 @@ class PhasePlan:
         )
 
     def residual(self) -> tuple[float, float]:
-        """Relative residual of an iterative solve for the multipliers, and what is nothing of it [m/s^2]."""
+        """Relative and absolute [m/s^2] residual of an iterative solve for the multipliers."""
         share = min(max(_RESIDUAL * self.integrator.rtol, _LEAST_RESIDUAL), _MOST_RESIDUAL)
-        return share, _FLOOR * float(self.velocity_tolerance().min())  # of a step of a second
+        return share, _FLOOR * float(self.velocity_tolerance().min())  # over a step of 1 s
 
     def release(self, lost: Bools) -> Bools:
-        """Take edges to vehicles ``lost`` (N,) away; return which (m,) are kept."""
+        """Remove the edges of vehicles ``lost`` (N,); return which edges (m,) are kept."""
         kept = ~np.any(lost[self.edges], axis=1)
         self.edges, self.distances = self.edges[kept], self.distances[kept]
         self.method = solvers.choose(len(lost), self.edges, self.constraint.solver)
@@ -193,13 +193,13 @@ def plan_phase(
 
     Parameters
     ----------
-    disturbance : what acts on the flight and is told to no law; none by default
-    external : address of a force callback, 0 for none
+    disturbance : disturbances of the flight, which no law knows; none by default
+    external : address of a force callback; 0 for none
 
     Raises
     ------
     StoppedError
-        The phase has no time left, or would take hours to fly.
+        The phase has no time left, or would take hours to simulate.
     """
     t_end = _end(phase, now.t)
     _check_size(mission, phase)
@@ -214,7 +214,7 @@ def plan_phase(
     if shaping is None:
         d1 = now.reference.of(edges, d1)
     d0 = now.reference.of(edges, distance_geometry.distances(now.r, edges))
-    # Slots are blended wherever the shape leads; where distances lead, slots only follow if tracked.
+    # Slots are blended if the reference is a shape; if it is distances, slots matter only when tracked.
     left = masses if now.lost is None else np.where(now.lost, 0.0, masses)
     before = slots_before(mission, now, left)
     after = target if shaping is not None and target is not None else before
@@ -281,15 +281,15 @@ def _end(phase: Phase, start: float) -> float:
     if phase.until is not None:
         if phase.until <= start:
             raise StoppedError(
-                f"phase '{phase.name}' is to end at {phase.until:g} s, but the phases before it took until"
-                f" {start:.2f} s. Give it a duration in place of until"
+                f"phase '{phase.name}' is to end at {phase.until:g} s, but the phases before it end at"
+                f" {start:.2f} s. Give it a duration instead of until"
             )
         return phase.until
     return start + (phase.duration or (phase.settle or Settle()).timeout)
 
 
 def _check_size(mission: Mission, phase: Phase) -> None:
-    """Refuse a phase that would take hours to fly."""
+    """Refuse a phase that would take hours to simulate."""
     if phase.shaping is None:
         return
     formation = phase.shaping.formation
@@ -301,7 +301,7 @@ def _check_size(mission: Mission, phase: Phase) -> None:
     if size > solvers.MOST_DENSE:
         raise StoppedError(
             f"phase '{phase.name}' takes '{formation}', whose {len(edges):,} edges between"
-            f' {n:,} agents make {size:,} equations for the constraint force, and solver "{solver}" needs'
+            f' {n:,} agents give {size:,} equations for the constraint force; solver "{solver}" needs'
             f" their eigenvalues; with more than {solvers.MOST_DENSE:,} a flight takes hours. Use solver ="
             ' "iterated" (or "exact"), give it fewer edges, or track slots with edges = []'
         )
@@ -309,13 +309,13 @@ def _check_size(mission: Mission, phase: Phase) -> None:
 
 @lru_cache(64)
 def _graph(edges: bytes, masses: bytes, *, large: bool) -> Graph:
-    """The constraint graph, which the kernel only reads: most phases have the one before."""
+    """The constraint graph, cached because most phases have the same one as the phase before."""
     pairs = np.frombuffer(edges, dtype=np.int64).reshape(-1, 2).copy()
     return graph(pairs, np.frombuffer(masses), large=large)
 
 
 def _held(mission: Mission, name: str | None, now: PhaseState) -> str | None:
-    """The formation, if the agents left are in it: all pairs within a tenth of the shortest."""
+    """The formation, if the remaining agents are in it: all pairs within a tenth of the shortest distance."""
     slots = mission.formation_slots(name) if name else None
     if slots is None:
         return None
@@ -363,12 +363,12 @@ _NO_FEEDBACK = Feedback(
 
 
 def _feedback(mission: Mission, goal: Pose, t0: float, arrival: float, *, moves: bool) -> Feedback:
-    """LQR on the virtual body itself: gain tables to a waypoint, tracking gains where it stays."""
+    """LQR of the virtual body itself: gain tables on the way to a waypoint, tracking gains at rest."""
     hold = lqr.double_integrator_gains(mission.tracking.Q, mission.tracking.R) * 2
     to_go, gain, slope = np.zeros(0), np.zeros((0, 4)), np.zeros((0, 4))
     if moves:
-        # Gains grow like 1/tau near arrival, until S bounds them: on a geometric grid cubics keep
-        # them to 1e-8.
+        # Gains grow like 1/tau near arrival, until S bounds them. Cubics on a geometric grid are
+        # exact to 1e-8.
         horizon = arrival - t0
         to_go = np.concatenate([[0.0], np.geomspace(min(1e-6, 1e-3 * horizon), horizon, 1000)])
         tables = [_gains(law, to_go) for law in (mission.lqr, mission.lqr.attitude)]
@@ -387,8 +387,6 @@ def _gains(law: Regulator, to_go: Floats) -> tuple[Floats, Floats]:
     A, B = [[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]]
     P, K = lqr.finite_horizon(A, B, law.Q, np.atleast_2d(law.R), law.S, to_go)
     gain = K[:, 0]
-    with np.errstate(
-        over="ignore", invalid="ignore"
-    ):  # weights without measure: the flight will say so
+    with np.errstate(over="ignore", invalid="ignore"):  # absurd weights: the flight reports them
         slope = np.stack([P[:, 0, 0], 2 * P[:, 0, 1] + law.Q[1]], axis=1) / law.R
         return gain, slope - gain * gain[:, 1:]

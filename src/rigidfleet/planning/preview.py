@@ -1,4 +1,4 @@
-"""The trajectory that a mission plans, before anything flies."""
+"""The planned trajectory of a mission, before any flight."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from rigidfleet.planning.reference import (
 )
 from rigidfleet.typing import Floats
 
-#: Samples of a planned phase: so many, or one each so many seconds, within bounds.
+#: Samples of a planned phase: their number, or the time between them [s], within bounds.
 _SAMPLES = 201
 
 
@@ -33,26 +33,26 @@ _STEP = 0.05
 _MOST = 2001
 
 
-#: A phase has at least so many samples.
+#: Least number of samples of a phase.
 FEWEST_SAMPLES = 11
-#: Beyond so many agents those near each other are found by a tree (`proximity.separation`).
+#: Number of agents beyond which a tree finds those near each other (`proximity.separation`).
 MANY = 200
-#: Places of agents that a preview computes. Its limit is counted, not timed: it is the same on any machine.
+#: Greatest number of positions that a preview computes; counted, not timed, so that it is the same on any machine.
 _PLACES = 4_000_000
 
 
 @dataclass(frozen=True)
 class PlannedPhase:
-    """The planned way of all agents through one phase.
+    """The planned paths of all agents through one phase.
 
     Attributes
     ----------
     time : (K,) [s] of the mission
     position, acceleration : (K, N, 3) [m, m/s^2]
-    exact : whether the reference is followed as planned, up to control; False: a guess
-    ways : where the shape changes, the agents' places (N, 3) [m] before and after, from the centre, in a frame that
-        turns with them: in it they go straight, and all in step
-    shapes : names of the formations before (None: none) and after
+    exact : whether the agents follow the plan, up to control errors; False if it is an estimate
+    ways : if the shape changes, the agents' positions (N, 3) [m] before and after it, about the centre, in a frame
+        that turns with them; in this frame all agents move straight and in step
+    shapes : names of the formations before (None if there is none) and after
     """
 
     phase: str
@@ -70,13 +70,13 @@ class PlannedPhase:
 
 
 def preview(mission: Mission, phases: int | None = None) -> tuple[list[PlannedPhase], bool]:
-    """The way of all agents, one `PlannedPhase` for each phase or so many, and whether it is known to its end."""
+    """One `PlannedPhase` for each phase, or for the first ``phases``, and whether the plan is known to its end."""
     masses = mission.fleet.mass
     frame = None if mission.body_frame is None else mission.drawn_attitude
     now = PhaseState(0.0, mission.fleet.position, mission.fleet.velocity, frame=frame)
     way: list[PlannedPhase] = []
     most = samples_per_phase(mission)
-    # Of more than can be looked at with the fewest samples, the first ones.
+    # If even the fewest samples of all phases are too many, only the first phases.
     possible = (
         len(mission.phases)
         if most >= FEWEST_SAMPLES
@@ -102,7 +102,7 @@ def preview(mission: Mission, phases: int | None = None) -> tuple[list[PlannedPh
         guess = (
             shaping is not None
             and phase.control != "tracking"
-            # A shape that forces alone hold may lag behind its slots.
+            # A shape held by constraint forces alone may lag behind its slots.
             and (
                 phase.control == "body"
                 or reference_kind(mission, shaping, before, target) != "shape"
@@ -114,7 +114,7 @@ def preview(mission: Mission, phases: int | None = None) -> tuple[list[PlannedPh
 
 
 def samples_per_phase(mission: Mission) -> int:
-    """Samples of each planned phase that can be looked at: below `MANY` agents each is held against each."""
+    """Number of samples of each planned phase; below `MANY` agents, every pair is checked."""
     n = mission.n_agents
     each = n * max(1.0, n / 25) if n <= MANY else n
     return int(_PLACES / each) // len(mission.phases)
@@ -137,7 +137,7 @@ def _leg(
         x = about_cm(now.r, masses)
         after = x
         if shaping is not None and target is not None:
-            # Turned as the blend has it, and with that as the agents lie.
+            # Turned by the blend, and then by the attitude of the agents.
             slots = slots_before(mission, now, masses)
             after = target @ turned.T @ rigid_body.kabsch(x, slots, masses).T
         cm, v = masses @ now.r / masses.sum(), masses @ now.v / masses.sum()
@@ -179,7 +179,7 @@ def _leg(
 
 
 def phase_spans(mission: Mission) -> list[tuple[float, float]]:
-    """Start and end [s] of each phase; what ends by settling is taken to settle soon, at most at its timeout."""
+    """Start and end [s] of each phase; a phase that ends by settling is assumed to settle soon, before its timeout."""
     t, spans = 0.0, []
     settling = _settling(mission)
     for phase in mission.phases:

@@ -1,6 +1,6 @@
-"""Where a mission leads: poses of the virtual body, what a phase starts from and steers to.
+"""References of a mission: poses of the virtual body, and the states that phases start from and lead to.
 
-The plan of a flight, and a check before it, are made from these. Nothing here flies or compiles.
+Both the plan of a flight and the check before it use them. Nothing here integrates or compiles.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from rigidfleet.typing import Bools, Floats, Ints
 
 @dataclass(frozen=True)
 class ByEdge:
-    """A number for each edge that has been in force: values (m,), by the edges' keys (m,) in ascending order."""
+    """A number for each edge that has been active: values (m,), sorted by the edges' keys (m,)."""
 
     keys: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     values: Floats = field(default_factory=lambda: np.zeros(0))
 
     def of(self, edges: Ints, other: Floats | float) -> Floats:
-        """Values (m,) of edges (m, 2), i < j; ``other`` (m,) where an edge is new."""
+        """Values (m,) of edges (m, 2), i < j; ``other`` (m,) for new edges."""
         keys = self._keys(edges)
         at = np.searchsorted(self.keys, keys)
         known = np.append(self.keys, -1)[at] == keys
         return np.where(known, np.append(self.values, 0.0)[at], other)
 
     def updated(self, edges: Ints, values: Floats) -> ByEdge:
-        """These and those of edges (m, 2), i < j, of which the latter count where there are both."""
+        """These values, updated with the ``values`` of edges (m, 2), i < j."""
         keys, first = np.unique(np.concatenate([self._keys(edges), self.keys]), return_index=True)
         return ByEdge(keys, np.concatenate([values, self.values])[first])
 
@@ -45,34 +45,34 @@ class ByEdge:
 
 @dataclass
 class Pose:
-    """Where the virtual body is, or is to be: CM [m], attitude T (world -> body), their rates."""
+    """Pose of the virtual body, actual or desired: CM [m], attitude T (world -> body) and their rates."""
 
     r: Floats
     v: Floats
     T: Floats
     omega: Floats  # body axes [rad/s]
-    named: bool = False  # whether a phase has asked for this attitude by name
+    named: bool = False  # whether a phase specifies this attitude explicitly
 
 
 @dataclass
 class PhaseState:
-    """The state at a switch, and what was commanded up to it."""
+    """The state at a switch between phases, and the last commands."""
 
     t: float
     r: Floats  # (N, 3) [m]
     v: Floats  # (N, 3) [m/s]
     integral: ByEdge = field(default_factory=ByEdge)  # of c [m s]
-    reference: ByEdge = field(default_factory=ByEdge)  # distances commanded last [m]
+    reference: ByEdge = field(default_factory=ByEdge)  # distances last commanded [m]
     frame: Floats | None = None  # attitude (3, 3) of the integrated mean-axis frame
-    formation: str | None = None  # the one taken last
-    slots: Floats | None = None  # (N, 3) commanded last, about the CM, body axes [m]
-    pose: Pose | None = None  # commanded last; None where nothing was
-    goal: Pose | None = None  # what to stay at
-    lost: Bools | None = None  # (N,) vehicles that fly no more; None: none
+    formation: str | None = None  # the last one commanded
+    slots: Floats | None = None  # (N, 3) last commanded, about the CM, body axes [m]
+    pose: Pose | None = None  # last commanded; None if there was no command
+    goal: Pose | None = None  # the pose to hold
+    lost: Bools | None = None  # (N,) lost vehicles; None if there are none
 
 
 def slots_about_cm(mission: Mission, name: str | None, masses: Floats) -> Floats | None:
-    """Slots (N, 3) [m] of a formation about their centre of mass; None where there are none."""
+    """Slots (N, 3) [m] of a formation about their centre of mass; None if it has no slots."""
     slots = mission.formation_slots(name) if name else None
     return None if slots is None else about_cm(slots, masses)
 
@@ -80,19 +80,19 @@ def slots_about_cm(mission: Mission, name: str | None, masses: Floats) -> Floats
 def attach(
     mission: Mission, phase: Phase, now: PhaseState, masses: Floats, target: Floats | None
 ) -> tuple[Floats | None, PhaseState, Floats]:
-    """Attach the body frame where a phase needs one, and say how the slots wanted lie in it meanwhile.
+    """Attach the body frame if a phase needs one, and return the rotation of the desired slots in it.
 
-    Slots fitted to the agents (Kabsch) give the attitude, the matrix of Eq. (23). Where nothing is established yet,
-    the agents themselves are the slots, in the axes in which formations are drawn. A formation that is established
-    takes axes of its own: those in which it is to lie, or, if its attitude is free, those in which it lies nearest.
-    Lost vehicles count in neither; the virtual body keeps their slots.
+    Slots fitted to the agents (Kabsch) give the attitude, the matrix of Eq. (23). Before any formation is established,
+    the agents' own positions are the slots, in the axes of the formations' definition. An established formation takes
+    its own axes: those of its prescribed attitude, or, if its attitude is free, the nearest ones. Lost vehicles do not count in
+    the fit; the virtual body keeps their slots.
 
     Returns
     -------
-    frame : the one to integrate, if any
-    now : the situation, attached
-    turn : (3, 3) rotation of the slots wanted, in which they are blended (`align_slots`): the one for which they
-        were assigned, or else that which brings them nearest to the slots before
+    frame : the frame to integrate, if any
+    now : the state, with the frame attached
+    turn : (3, 3) rotation in which the desired slots are blended (`align_slots`): the one for which they were
+        assigned, or else the one that brings them nearest to the slots before
     """
     masses = masses if now.lost is None else np.where(now.lost, 0.0, masses)
     shaping, establishing = phase.shaping, phase.establishing
@@ -105,7 +105,7 @@ def attach(
         return frame, now, _turn(given, slots_before(mission, now, masses), target, masses)
     x = about_cm(now.r, masses)
     if phase.control == "tracking" and now.pose is not None:
-        pose = now.pose  # the reference goes on from where it is
+        pose = now.pose  # the reference continues without a jump
     else:
         fit = now.slots
         near = frame if frame is not None else now.pose.T if now.pose is not None else np.eye(3)
@@ -116,7 +116,7 @@ def attach(
         pose = Pose(masses @ now.r / masses.sum(), masses @ now.v / masses.sum(), T, np.zeros(3))
         pose.omega = T @ mean_axis_rates(x[None], about_cm(now.v, masses)[None], masses)[0]
         if now.lost is not None and fit is not None:
-            centre = masses @ fit / masses.sum()  # of those left, from the body's origin
+            centre = masses @ fit / masses.sum()  # of the remaining agents, from the body's origin
             pose.r = pose.r - T.T @ centre
             pose.v = pose.v - T.T @ np.cross(pose.omega, centre)
             x = x + T.T @ centre
@@ -124,7 +124,7 @@ def attach(
     goal = now.goal or replace(pose, v=np.zeros(3), omega=np.zeros(3))
     turn = np.eye(3)
     if establishing is not None and target is not None:
-        # New axes, in the old ones: `axes` takes vectors from new to old.
+        # The new axes in the old ones: `axes` maps vectors from new to old.
         free = mission.free_attitude(phase)
         if free:
             axes = _turn(given, slots, target, masses)
@@ -144,7 +144,7 @@ def attach(
 
 
 def slots_before(mission: Mission, now: PhaseState, masses: Floats) -> Floats:
-    """Slots (N, 3) [m] that a phase begins with; where there are none, the agents, as formations are drawn."""
+    """Slots (N, 3) [m] that a phase begins with; without any, the agents' positions in the formations' axes."""
     if now.slots is not None:
         return now.slots
     return about_cm(now.r, masses) @ mission.drawn_attitude.T
@@ -159,14 +159,15 @@ def _turn(given: Floats | None, before: Floats, after: Floats | None, masses: Fl
 def reference_kind(
     mission: Mission, phase: Shaping, before: Floats, target: Floats | None
 ) -> Literal["shape", "squares", "step"]:
-    """What leads the distances of a phase: its reference, and which of two if that is "distances".
+    """Kind of reference of a phase's distances: the phase's own, or a choice of two if it is "distances".
 
-    Blended squares of distances are those of points in space, and know no hand. They lead to the slots if an
-    affine map without reflection takes the agents there, as their blend then is that of the map: up to four
-    agents of the right hand, and any number in a stretched shape. Elsewhere the slots are blended, if the
-    formation is given by some, with these distances; slots from distances have a hand that nobody asked for.
+    Blended squared distances belong to points in space, but do not determine handedness. They lead to the slots if an
+    affine map without reflection takes the agents there, because their blend is then the blend of the map. This
+    holds for up to four agents of the intended handedness, and for any number in a stretched shape. Otherwise the
+    slots are blended, if the formation defines slots with these distances. Slots computed from distances do not
+    count, because their handedness is arbitrary.
 
-    Parameters: agents or slots before, and slots wanted (N, 3) [m], if there are any.
+    Parameters: agents or slots before, and desired slots (N, 3) [m], if there are any.
     """
     if phase.reference != "distances":
         return phase.reference
@@ -188,11 +189,11 @@ def reference_kind(
 def align_slots(
     before: Floats, after: Floats, masses: Floats, turn: Floats | None = None
 ) -> tuple[Floats, Floats]:
-    """What a blend adds to the slots, and by which rotation vector it turns them meanwhile.
+    """What a blend adds to the slots, and the rotation vector by which it turns them at the same time.
 
-    The new slots are turned first, by ``turn`` (3, 3), or else onto the old ones (Kabsch, weighted by mass), in
-    which the straight blend has no angular momentum in its own frame, and moves the agents least. A turn back
-    meanwhile keeps what the body axes mean; distances know nothing of it.
+    The new slots are first rotated by ``turn`` (3, 3), or else onto the old ones (Kabsch, weighted by mass). The
+    straight blend then has no angular momentum in its own frame, and moves the agents least. During the blend the
+    slots rotate back, so that the body axes keep their meaning; distances are not affected.
     """
     R = rigid_body.kabsch(before, after, masses) if turn is None else turn
     return after @ R.T - before, att.rotation_vector_from_dcm(R)  # log of R^T

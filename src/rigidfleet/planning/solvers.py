@@ -1,8 +1,8 @@
-"""Which solve gives the constraint force of a formation, and what can be known of it before a flight.
+"""Choose the method that solves for a formation's constraint force, and prepare it before a flight.
 
-Small systems are solved densely. Where the law is the exact one and each agent is joined to three before it,
-two passes over the agents do (`rigidfleet.kernel.large.elimination`); other large ones are solved on the vertex graph
-(`rigidfleet.kernel.large.block_cholesky`). Nothing here flies or compiles.
+Small systems are solved densely. Under the exact law, if each agent is joined to three before it, two passes over the
+agents suffice (`rigidfleet.kernel.large.elimination`). Other large systems are solved on the vertex graph
+(`rigidfleet.kernel.large.block_cholesky`). Nothing here integrates or compiles.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from rigidfleet.typing import Floats, Ints
 
 Method = Literal["dense", "elimination", "sparse"]
 
-#: Equations from which on the vertex graph is faster than a dense factor, and from which on elimination is.
+#: Least numbers of equations for which the vertex graph, and elimination, are faster than a dense factor.
 FROM_SPARSE, FROM_ELIMINATION = 180, 60
-#: Equations of a dense solve at most: beyond, one evaluation takes seconds.
+#: Greatest number of equations of a dense solve; beyond it, one evaluation takes seconds.
 MOST_DENSE = 2000
-#: What each method is called in reports.
+#: Name of each method in reports.
 WORDS: dict[Method, str] = {
     "dense": "dense factor",
     "elimination": "elimination by 3x3 solves",
@@ -34,9 +34,9 @@ def equations(n: int, m: int, solver: str) -> int:
 
 
 def choose(n: int, edges: Ints, solver: str) -> Method:
-    """The solve for ``n`` agents, edges (m, 2) and a law (`Constraint.solver`).
+    """The method for ``n`` agents, edges (m, 2) and a law (`Constraint.solver`).
 
-    Laws that need eigenvalues ("spectral", "pinv") are solved densely whatever the size.
+    Laws that need eigenvalues ("spectral", "pinv") are solved densely at any size.
     """
     size = equations(n, len(edges), solver)
     if solver == "exact" and size >= FROM_ELIMINATION and elimination_steps(n, edges) is not None:
@@ -47,8 +47,8 @@ def choose(n: int, edges: Ints, solver: str) -> Method:
 def elimination_steps(n: int, edges: Ints) -> Ints | None:
     """An order (n, 4) in which each agent is joined to three before it: agent, its edges (-1: none).
 
-    The first three have none, one and two. None where there is no such order. Agents with three edges left
-    are taken off as long as there are any: whatever the order, that finds it if there is one.
+    The first three agents have none, one and two. None if there is no such order. Agents with three remaining edges
+    are removed one after the other; in whatever order, this finds a sequence if there is one.
     """
     if n < 3 or len(edges) != 3 * n - 6:
         return None
@@ -60,7 +60,7 @@ def _steps(n: int, data: bytes) -> Ints | None:
     edges = np.frombuffer(data, dtype=np.int64).reshape(-1, 2)
     later = edges.max(axis=1)
     if (np.bincount(later, minlength=n) == np.minimum(np.arange(n), 3)).all():
-        # As they are counted: then what is near in the order is near in memory.
+        # In the agents' own order, so that neighbours in the sequence are neighbours in memory.
         steps = np.full((n, 4), -1)
         steps[:, 0] = np.arange(n)
         mine = np.argsort(later, kind="stable")
@@ -76,7 +76,7 @@ def _steps(n: int, data: bytes) -> Ints | None:
     ready = [i for i in range(n) if degree[i] <= 3]
     at, taken = n, [False] * n
     while ready:
-        # Agents in waves, and in each by their number: near agents stay near in memory.
+        # In waves, and by number within each wave, so that near agents stay near in memory.
         wave, ready = sorted(ready, reverse=True), []
         for i in wave:
             if degree[i] > 3 or taken[i]:
@@ -99,8 +99,8 @@ def _steps(n: int, data: bytes) -> Ints | None:
 def dissection(points: Floats, edges: Ints, leaf: int = 16) -> Ints:
     """Order (N,) to eliminate agents in: geometric nested dissection (George, 1973) of points (N, 3).
 
-    Halves across the longest extent, then the agents that part them. What is left of ``leaf`` or fewer stays
-    as it is.
+    Recursively: both halves across the longest extent, then the agents that separate them. Parts of ``leaf`` or fewer
+    agents are not divided.
     """
     n = len(points)
     both = np.concatenate([edges, edges[:, ::-1]])
@@ -108,7 +108,7 @@ def dissection(points: Floats, edges: Ints, leaf: int = 16) -> Ints:
     start = np.searchsorted(both[:, 0], np.arange(n + 1))
     other = both[:, 1]
     beyond = np.zeros(n, dtype=bool)
-    order: list[Ints] = []  # from the last eliminated to the first
+    order: list[Ints] = []  # from the last agent eliminated to the first
     todo = [np.arange(n)]
     while todo:
         some = todo.pop()

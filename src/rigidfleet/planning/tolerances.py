@@ -1,4 +1,4 @@
-"""How exactly a phase is flown, and when it takes too many steps to go on."""
+"""Integration tolerances of a phase, and the number of steps beyond which it is stopped."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ if TYPE_CHECKING:
     from rigidfleet.mission.schema import IntegratorOptions
 
 
-#: A phase has stalled that took more steps than these and those for each second of mission time, or
-#: more than the last in all. A step of 1 ms is already that of gains above 1e3 /s.
+#: A phase has stalled if it takes more steps than the first number plus the second per second of mission
+#: time, or more than the third in all. Steps of 1 ms already mean gains above 1e3 /s.
 _STALLED, _STALLED_RATE, _MOST_STEPS = 50_000, 2_000.0, 5_000_000
 
 
 def most_steps(flown: float) -> int:
-    """Steps that a phase may have taken after so long [s]: far more than its length in time explains."""
+    """Greatest number of steps of a phase after ``flown`` [s]: far more than this duration explains."""
     return int(min(_STALLED + _STALLED_RATE * flown, _MOST_STEPS))
 
 
@@ -28,16 +28,16 @@ def absolute_tolerances(
 ) -> Floats:
     """Absolute tolerances (size,) of the states, class by class.
 
-    The integral of c is in its law what a distance is, times a second; but it stays near zero, where
-    a relative tolerance asks for nothing. In large formations it would set the step alone: there it is held
-    to what its own distance is held to, and velocities to what places are.
+    The integral of c enters the law like a distance times 1 s. It stays near zero, where a relative tolerance has
+    no effect, so in large formations it alone would limit the step. There its tolerance is that of its own
+    distance, and the tolerance of a velocity follows from that of the position.
 
     Parameters
     ----------
-    size : number of states: places and velocities (3N each), integrals (m), and what follows them
+    size : number of states: positions and velocities (3N each), integrals (m), and the states after them
     velocity : (N,) of the velocities [m/s], by `tolerance_of_velocity`
     distances : (m,) of the edges [m]
-    large : whether the formation is
+    large : whether the formation is solved for as a large one
     """
     n, m = len(velocity), len(distances)
     atol = np.full(size, given.atol)
@@ -56,8 +56,9 @@ def tolerance_of_velocity(
 ) -> Floats:
     """Absolute tolerance (N,) of velocities [m/s] of agents at r (N, 3) [m].
 
-    The law takes errors back at the rate beta [1/s]: one of a velocity becomes one of a place 1/beta of it. In
-    large formations, unless given, it is therefore beta times the tolerance of the agent's place about the CM.
+    The law corrects errors at the rate beta [1/s], so that a velocity error causes a position error of 1/beta times
+    its size. In large formations, unless given, the tolerance is therefore beta times that of the agent's position
+    about the CM.
     """
     if given.atol_velocity is not None or not large:
         return np.full(len(r), given.atol_velocity or given.atol)

@@ -1,9 +1,9 @@
 """Pictures of a flight, drawn with matplotlib from its `Result` alone.
 
-`plot` writes them to files, or returns them; each function of the same name as a figure returns it as a
-matplotlib `Figure`, to be changed or, as it is, shown by a notebook. An agent has the same colour in all of them
-(`agent_colours`), told apart by colour-blind eyes too. Nothing here touches pyplot or the user's
-settings of matplotlib.
+`plot` writes figures to files, or returns them. Each function with the name of a figure returns it as a
+matplotlib `Figure`, which can be changed, or shown by a notebook. An agent has the same colour in all figures
+(`agent_colours`); the colours are distinct to colour-blind readers, too. Nothing here changes pyplot or the
+user's matplotlib settings.
 """
 
 from __future__ import annotations
@@ -64,15 +64,15 @@ _FIGURES: dict[str, Callable[[Result], Figure]] = {
         clearance, formations, disturbance,
     )
 }  # fmt: skip
-#: Formats that figures are written in.
+#: File formats of figures.
 FORMATS = ("png", "svg", "pdf")
-_MARGIN = 0.05  # [in] around a figure that is cut close
+_MARGIN = 0.05  # [in] around a figure cropped to its content
 
 
 def figure_names(result: Result | None = None) -> list[str]:
-    """Names of all figures, which are also the names of the functions that draw them.
+    """Names of all figures; the functions that draw them have the same names.
 
-    Of a flight, those in which it has something to show.
+    With a result, only the figures in which it has something to show.
     """
     if result is None:
         return list(_FIGURES)
@@ -92,7 +92,7 @@ class Figures(list["Figure"]):
     """Figures of a flight, which a notebook shows one below the other."""
 
     def _ipython_display_(self) -> None:
-        from IPython.display import display  # there is one, as it calls
+        from IPython.display import display  # IPython is there, as it makes this call
 
         for figure in self:
             display(figure)
@@ -127,20 +127,20 @@ def plot(
     names: Iterable[str] | None = None,
     titles: bool = True,
 ) -> Figures | list[Path]:
-    """Draw a flight: for a notebook, or each figure to ``folder/NAME.FORMAT``, whole or not at all.
+    """Draw a flight, for a notebook or as files ``folder/NAME.FORMAT``; each file is written completely or not at all.
 
     Parameters
     ----------
-    result : a flight, or the path of one that was saved
-    folder : made if it does not exist; files of these names in it are replaced. Without one, nothing is written
+    result : a flight, or the path of a saved one
+    folder : created if it does not exist; existing files are replaced. Without a folder, nothing is written
     formats : of png, svg (text stays text) and pdf
-    names : of `figure_names`; by default all that there is something to draw in
-    titles : with a title and the mission's name above each, or cut close to what is drawn, for a
-        paper that says so itself; that a flight is incomplete stands above it in any case
+    names : figures to draw, from `figure_names`; by default all in which there is something to draw
+    titles : whether a title and the mission's name stand above each figure. Without them, the figure is cropped
+        to its content, for a paper with its own captions; a note that the flight is incomplete is always shown
 
     Returns
     -------
-    The files written; without a folder the figures, which a notebook shows.
+    The files written; without a folder, the figures, which a notebook shows.
 
     Raises
     ------
@@ -166,9 +166,9 @@ def plot(
 def write_figure(
     figure: Figure, folder: Path, name: str, formats: Iterable[str], *, close: bool = False
 ) -> list[Path]:
-    """Write a figure to ``folder/NAME.FORMAT``, each file whole or not at all; returns the files.
+    """Write a figure to ``folder/NAME.FORMAT``, each file completely or not at all; return the files.
 
-    With ``close``, cut close to what is drawn.
+    With ``close``, the figure is cropped to its content.
 
     Raises
     ------
@@ -190,19 +190,19 @@ def _known(what: str, asked: Iterable[str], known: Iterable[str]) -> list[str]:
 
 
 def _rendered(figure: Figure, kind: str, *, close: bool = False) -> bytes:
-    # No date inside, so that the same flight gives the same file.
+    # No date in the file, so that the same flight gives the same file.
     metadata: dict[str, Any] = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}
     buffer = io.BytesIO()
     with settings():
         box = _ink(figure) if close else None
         figure.savefig(buffer, format=kind, metadata=metadata.get(kind), bbox_inches=box)
-    # The layout is found; drawing again need not look for it.
+    # The layout is final; do not compute it again.
     figure.set_layout_engine("none")
     return buffer.getvalue()
 
 
 def _ink(figure: Figure) -> Bbox:
-    """What is drawn on, and a little around it [in]; by matplotlib's own reckoning empty axes count, too."""
+    """Bounding box of the drawn content, with a margin [in]; matplotlib's own box includes empty axes."""
     from matplotlib.transforms import Bbox
 
     buffer = io.BytesIO()

@@ -22,12 +22,12 @@ if TYPE_CHECKING:
 
     from rigidfleet.mission import Mission
 
-SINGLE = 6  # so many edges have a colour each; more share one by their lengths
-_PAIRS = 5e7  # distances of pairs that are looked at, in all
-_SMALLEST = 1e-12  # error that is drawn on a logarithmic axis [m]; below is rounding
-_IDLE = 1e-6  # force [N] or way [m] below which there is nothing to draw but rounding
-_LOW = 0.45  # share of its height that a row has left in which nothing happens
-_TOLD = 0.7  # and one that holds words alone
+SINGLE = 6  # greatest number of edges with a colour each; more edges share one by length
+_PAIRS = 5e7  # greatest number of pair distances computed in all
+_SMALLEST = 1e-12  # least error drawn on a logarithmic axis [m]; smaller ones are rounding
+_IDLE = 1e-6  # force [N] or displacement [m] below which there is only rounding
+_LOW = 0.45  # height of a row in which nothing happens, as a share of the full height
+_TOLD = 0.7  # height of a row that holds only text
 
 
 # -- edges -------------------------------------------------------------------------------------------
@@ -35,10 +35,10 @@ _TOLD = 0.7  # and one that holds words alone
 
 @dataclass(frozen=True)
 class EdgeGroup:
-    """Edges that are drawn alike."""
+    """Edges that are drawn in the same way."""
 
     edges: list[int]
-    lengths: tuple[float, ...]  # [m] in each formation in turn, NaN where it is not held
+    lengths: tuple[float, ...]  # [m] in each formation in turn; NaN if the edge is not active
     colour: str
     label: str
 
@@ -46,7 +46,7 @@ class EdgeGroup:
 def edge_groups(result: Result) -> list[EdgeGroup]:
     """Edges grouped by their intended lengths in all formations, short ones dark, long ones light.
 
-    Few edges each make a group of their own.
+    If there are few edges, each is a group of its own.
     """
     mission, m = result.mission, len(result.edges)
     lengths = np.full((m, len(mission.formations)), np.nan)
@@ -72,7 +72,7 @@ def edge_groups(result: Result) -> list[EdgeGroup]:
 
 
 def _by_formation(result: Result, lengths: Floats) -> list[EdgeGroup]:
-    """Of many edges, a group for those of each formation, or of the same formations."""
+    """Groups of many edges: one for each formation, or for each set of formations that share edges."""
     names = list(result.mission.formations)
     kinds, kind = np.unique(np.isfinite(lengths), axis=0, return_inverse=True)
     groups = []
@@ -94,7 +94,7 @@ def _edge_label(result: Result, edges: list[int], lengths: Floats) -> str:
 
 
 def edge_lines(ax: Axes, result: Result, values: Floats, **look: Any) -> None:
-    """A line for each edge, values (K, m), in the colour of its group; of many the spread of each group."""
+    """A line for each edge, values (K, m), in the colour of its group; for many edges, the spread of each group."""
     for group in edge_groups(result):
         if len(result.edges) > st.MANY:
             active = np.isfinite(result.constraint[:, group.edges])
@@ -139,7 +139,7 @@ def draw_distances(ax: Axes, result: Result) -> None:
 
 
 def _distinct(values: Floats) -> list[int]:
-    """Columns of values (K, m), without those that look like one before."""
+    """Columns of values (K, m), without those that look the same as an earlier one."""
     keys = np.round(np.nan_to_num(values[:: max(1, len(values) // 200)], nan=-1.0), 3)
     return sorted(np.unique(keys, axis=1, return_index=True)[1].tolist())
 
@@ -185,14 +185,14 @@ def _components(
 
 
 def _shares(*columns: tuple[Floats, Floats]) -> list[float]:
-    """Share of its height for each of three rows: less where nothing moves, of (flown, wanted) of each column."""
+    """Heights of three rows, smaller if nothing changes; each column is given as (flown, commanded)."""
     return [
         _LOW if all(st.is_still(f[:, i], w[:, i]) for f, w in columns) else 1.0 for i in range(3)
     ]
 
 
 def widen(ax: Axes, least: float) -> None:
-    """Do not blow rounding errors up to the height of an axes."""
+    """Widen the limits so that rounding errors do not fill the axes."""
     low, high = ax.get_ylim()
     if high - low < least:
         middle = (low + high) / 2
@@ -211,7 +211,7 @@ def _whole_legend(ax: Axes, references: list[Line2D], *, targets: bool) -> None:
 
 
 def _targets(result: Result, key: str) -> list[tuple[float, Any]]:
-    """Time [s] and value of what waypoints ask for, as far as the flight came."""
+    """Time [s] and value of the waypoints that the flight reached."""
     found = [(p.target["time"], p.target.get(key)) for p in result.phases if p.target is not None]
     return [(t, value) for t, value in found if value is not None and t <= result.time[-1] + 1e-9]
 
@@ -234,7 +234,7 @@ def cm(result: Result) -> Figure:
 
 
 def euler_deg(quaternions: Floats) -> Floats:
-    """Euler angles (K, 3) [deg] (roll, pitch, yaw) without jumps of a whole turn; NaN where unknown."""
+    """Euler angles (K, 3) [deg] (roll, pitch, yaw) without jumps of a full turn; NaN if unknown."""
     angles = att.euler_from_quaternion(quaternions)
     known = np.isfinite(angles).all(axis=1)
     angles[known] = np.unwrap(angles[known], axis=0)
@@ -242,7 +242,7 @@ def euler_deg(quaternions: Floats) -> Floats:
 
 
 def _nearest_turn(angles: Floats, to: Floats) -> Floats:
-    """Angles [deg] shifted by whole turns to lie near others, where both are known."""
+    """Angles [deg] shifted by full turns to lie near the angles ``to``, where both are known."""
     shift = np.round((to - angles) / 360.0) * 360.0
     return angles + np.where(np.isfinite(shift), shift, 0.0)
 
@@ -284,7 +284,7 @@ def attitude(result: Result) -> Figure:
 
 
 def thrust_limits(mission: Mission) -> list[tuple[float, str, str]]:
-    """Each thrust limit [N] there is, with a label and a colour: the agent's if it is its alone."""
+    """Each distinct thrust limit [N] with a label and a colour; the agent's colour if only one agent has it."""
     limits = mission.fleet.thrust_limit
     colours = st.agent_colours(len(limits))
     found = []
@@ -297,7 +297,7 @@ def thrust_limits(mission: Mission) -> list[tuple[float, str, str]]:
 
 
 def draw_thrust(ax: Axes, result: Result) -> None:
-    """Thrust of each agent under its limit, from zero."""
+    """Thrust of each agent with its limit, from zero."""
     ax.set_ylabel(r"thrust $|f_u + f_C|$ [N]")
     st.agent_lines(ax, result, result.thrust)
     limits = thrust_limits(result.mission)
@@ -309,7 +309,7 @@ def draw_thrust(ax: Axes, result: Result) -> None:
 
 
 def _sane(result: Result, values: Floats) -> float:
-    """Greatest value, or if the flight broke down, the greatest before the peak in which it ended."""
+    """Greatest value; if the flight broke down, the greatest one before the final peak."""
     size = np.abs(values[np.isfinite(values)])
     if not len(size):
         return 0.0
@@ -320,7 +320,7 @@ def _sane(result: Result, values: Floats) -> float:
 
 @styled
 def inputs(result: Result) -> Figure:
-    """Input magnitude |f_u + f_C| of each agent under its limit, and enlarged."""
+    """Thrust |f_u + f_C| of each agent with its limit, and enlarged."""
     fig, axes = st.time_figure(result, "Thrust of each agent", 2)
     above, below = axes[:, 0]
     draw_thrust(above, result)
@@ -353,9 +353,10 @@ def _extremes(
     name: str = "",
     always: bool = True,
 ) -> None:
-    """Write the greatest of values (K, n) into the axes, and mark what it cuts off at top and bottom.
+    """Write the greatest of values (K, n) into the axes, and mark values off the scale at top and bottom.
 
-    That between samples, too, if the record has it by ``name``. Without ``always``, only what is cut off.
+    The greatest value between samples counts, too, if the record has it by ``name``. Without ``always``, only
+    values off the scale are written.
     """
     between = result.extreme(name)
     low, high = ax.get_ylim()
@@ -382,22 +383,22 @@ def _extremes(
         t = result.time[int((size > sign * edge).any(axis=1).argmax())]
         look: dict[str, Any] = {"color": st.ALERT, "markersize": 5, "clip_on": False, "zorder": 6}
         ax.plot(t, edge, marker, **look, gid="cut")
-        st.annotate(ax, f"cut off: {told}", [*st.around(t, edge), *st.corners()], color=st.ALERT)
+        st.annotate(ax, f"off scale: {told}", [*st.around(t, edge), *st.corners()], color=st.ALERT)
 
 
 def _idle(ax: Axes, result: Result, values: Floats, unit: str, who: Callable[[int], str]) -> bool:
-    """If values (K, n) are nothing but rounding, say so in the axes; whether that is so."""
+    """If values (K, n) are only rounding errors, say so in the axes; return whether they are."""
     size = np.where(np.isfinite(values), np.abs(values), -np.inf)
     k, i = np.unravel_index(int(size.argmax()), size.shape) if size.size else (0, 0)
     if not size.size or not np.isfinite(size[k, i]) or size[k, i] > _IDLE:
         return False
     where = f", {who(int(i))} at {result.time[k]:.2f} s" if size[k, i] else ""
-    st.note(ax, f"none but rounding: at most {size[k, i]:.3g} {unit}{where}")
+    st.note(ax, f"only rounding errors: at most {size[k, i]:.3g} {unit}{where}")
     return True
 
 
 def _within(ax: Axes, result: Result, values: Floats) -> None:
-    """Leave the peak in which a flight broke down out of the picture."""
+    """Choose limits that leave out the final peak of a flight that broke down."""
     top = _sane(result, values)
     if top < np.nanmax(np.abs(values), initial=0.0):
         finite = values[np.isfinite(values)]
@@ -435,7 +436,7 @@ def constraint_force(result: Result) -> Figure:
 
 
 def _from_none(ax: Axes, result: Result, values: Floats, unit: str, name: str = "") -> bool:
-    """Each agent's values (K, N) from zero, with the greatest in words; whether there was anything to draw."""
+    """Draw each agent's values (K, N) from zero, and write the greatest; return whether there was anything to draw."""
     if _idle(ax, result, values, unit, _agent):
         return False
     st.agent_lines(ax, result, values)
@@ -448,8 +449,8 @@ def _from_none(ax: Axes, result: Result, values: Floats, unit: str, name: str = 
 
 @styled
 def disturbance(result: Result) -> Figure:
-    """Force of the air |f_D| on each agent, and how far each is from its slot."""
-    fig, axes = st.time_figure(result, "Force of the air, and distance from the slots", 2)
+    """Aerodynamic force |f_D| on each agent, and distance of each agent from its slot."""
+    fig, axes = st.time_figure(result, "Aerodynamic force, and distance from the slots", 2)
     above, below = axes[:, 0]
     above.set_ylabel(r"force $|f_D|$ [N]")
     if result.disturbance_force is None:
@@ -474,7 +475,7 @@ def disturbance(result: Result) -> Figure:
 def shape_error(result: Result) -> Floats:
     """Greatest error (K,) [m] of all pairs' distances against the slots of the phase's formation.
 
-    NaN where the formation has no slots, and of many agents at all but some samples.
+    NaN if the formation has no slots; with many agents, also NaN at most samples.
     """
     error = np.full(len(result.time), np.nan)
     for k, phase in enumerate(result.phases):
@@ -495,7 +496,7 @@ def shape_error(result: Result) -> Floats:
 
 
 def draw_error(ax: Axes, result: Result) -> list[Line2D]:
-    """Errors |c| of the edges, the greatest, and that of all pairs; returns legend entries of the last two."""
+    """Draw the errors |c| of the edges, the greatest, and that of all pairs; return legend entries of the last two."""
     from matplotlib.lines import Line2D
 
     ax.set_ylabel(r"error $|c|$ of an edge [m]")
@@ -505,14 +506,14 @@ def draw_error(ax: Axes, result: Result) -> list[Line2D]:
         look: dict[str, Any] = {"color": st.FLOWN, "linewidth": 2.0, "zorder": 1.9}
         known = np.isfinite(shape) if result.n_agents > st.MANY else slice(None)
         st.line(ax, result.time[known], shape[known], **look)
-        handles.append(Line2D([], [], label="all pairs, to the slots", **look))
+        handles.append(Line2D([], [], label="greatest error of all pairs", **look))
     if np.isfinite(size).any():
         edge_lines(ax, result, size, linewidth=0.6, alpha=0.7)
         look = {"color": st.INK, "linewidth": 1.3}
         st.line(ax, result.time, np.fmax.reduce(size, axis=1), **look)
         handles.append(Line2D([], [], label="greatest |c| of an edge", **look))
     if not handles:
-        st.note(ax, "no edges, no slots")
+        st.note(ax, "neither edges nor slots")
         return []
     ax.set_yscale("log", nonpositive="clip")
     seen = np.concatenate([size.ravel(), shape])
@@ -523,13 +524,13 @@ def draw_error(ax: Axes, result: Result) -> list[Line2D]:
         if ax.get_ylim()[0] == _SMALLEST and len(large) < len(seen):
             st.annotate(
                 ax,
-                f"rounding below {_SMALLEST:g} m is not drawn",
+                f"values below {_SMALLEST:g} m (rounding) are not drawn",
                 st.corners()[::-1],
                 color=st.GREY,
             )
     else:
         ax.set_ylim(_SMALLEST, 1.0)
-        st.note(ax, f"none but rounding: at most {seen.max():.1g} m")
+        st.note(ax, f"only rounding errors: at most {seen.max():.1g} m")
     return handles
 
 
@@ -537,7 +538,7 @@ def draw_error(ax: Axes, result: Result) -> list[Line2D]:
 def constraint_error(result: Result) -> Figure:
     """Constraint errors |c| of the edges and their greatest, and the error of all pairs."""
     fig, axes = st.time_figure(
-        result, "Constraint error, and that of all pairs against the slots", 1, height=3.6
+        result, "Constraint error, and shape error of all pairs against the slots", 1, height=3.6
     )
     ax = axes[0, 0]
     handles = draw_error(ax, result)
@@ -551,14 +552,14 @@ def constraint_error(result: Result) -> Figure:
 
 
 def room_below(result: Result) -> Floats:
-    """Least vertical room (K,) [m] between agents whose spheres overlap seen from above; NaN if none."""
+    """Least height (K,) [m] between agents whose spheres overlap as seen from above; NaN if there are none."""
     radius = result.mission.agents.radius
     least = proximity.headroom(result.position, radius, result.left)[0]
     return np.where(np.isfinite(least), least, np.nan)
 
 
 def _mark_least(ax: Axes, result: Result, values: Floats, name: str) -> None:
-    """Ring the least value, between samples, too, and say how much, when and who."""
+    """Mark the least value, at samples or between them, with its size, time and agents."""
     known = np.where(np.isfinite(values), values, np.inf)
     k = int(known.argmin())
     if not np.isfinite(known[k]):
@@ -587,11 +588,11 @@ def _who(result: Result, name: str, first: int, second: int) -> str:
 
 
 def draw_separation(ax: Axes, result: Result) -> None:
-    """Least room between two agents, with its limit."""
+    """Least distance between the surfaces of two agents, with its limit."""
     ax.set_ylabel("between agents [m]")
     values = np.where(np.isfinite(result.separation), result.separation, np.nan)
     if not np.isfinite(values).any():
-        st.note(ax, "one agent alone" if result.n_agents == 1 else "not known")
+        st.note(ax, "only one agent" if result.n_agents == 1 else "unknown")
         return
     st.line(ax, result.time, values, color=st.TONES[0])
     least = result.mission.limits.separation
@@ -603,11 +604,11 @@ def draw_separation(ax: Axes, result: Result) -> None:
 
 
 def draw_clearance(ax: Axes, result: Result) -> None:
-    """Least room to an obstacle."""
+    """Least distance to an obstacle."""
     ax.set_ylabel("to obstacles [m]")
     values = np.where(np.isfinite(result.clearance), result.clearance, np.nan)
     if not np.isfinite(values).any():
-        st.note(ax, "no obstacles" if not result.mission.obstacles else "not known")
+        st.note(ax, "no obstacles" if not result.mission.obstacles else "unknown")
         return
     st.line(ax, result.time, values, color=st.TONES[0])
     st.limit(ax, 0.0, "contact")
@@ -622,7 +623,7 @@ def _from_zero(ax: Axes, values: Floats) -> None:
 
 
 def draw_below(ax: Axes, result: Result, least: float) -> None:
-    """Least vertical room below an agent, with its limit."""
+    """Least height of an agent above another one, with its limit."""
     ax.set_ylabel("straight below [m]")
     values = room_below(result)
     if np.isfinite(values).any():
@@ -631,7 +632,7 @@ def draw_below(ax: Axes, result: Result, least: float) -> None:
         _from_zero(ax, np.append(values, least))
     else:
         ax.text(
-            0.5, 0.3, "nobody is ever straight below another", transform=ax.transAxes,
+            0.5, 0.3, "no agent is ever straight below another", transform=ax.transAxes,
             ha="center", va="center", color=st.GREY,
         )  # fmt: skip
         ax.set_ylim(0, 1.4 * least or 1.0)
@@ -640,7 +641,7 @@ def draw_below(ax: Axes, result: Result, least: float) -> None:
 
 @styled
 def clearance(result: Result) -> Figure:
-    """Least room between agents, straight below an agent, and to obstacles, with the limits."""
+    """Least distances between agents, straight below an agent and to obstacles, with their limits."""
     mission = result.mission
     panels: list[Callable[[Axes], None]] = []
     if result.n_agents > 1 or not mission.obstacles:

@@ -11,7 +11,7 @@ from matplotlib import figure
 
 
 class Figure(figure.Figure):
-    """A figure of matplotlib that is its own picture where it ends a cell, without any magic line.
+    """A matplotlib figure that a notebook shows at the end of a cell, without a magic command.
 
     Attributes
     ----------

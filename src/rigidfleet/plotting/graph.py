@@ -23,12 +23,12 @@ if TYPE_CHECKING:
 _FORMATS = (".png", ".svg", ".pdf")
 #: The longest arrow of a free motion, relative to the size of the shape.
 _ARROW = 0.35
-#: So many free motions are drawn in one picture; more would hide each other.
+#: Greatest number of free motions drawn in one picture; more would hide each other.
 _DRAWN = 3
 
 
 def graphs(mission: Mission, judged: Mapping[str, Rigidity | None]) -> Figure:
-    """Graph of each formation with its verdict; the first free motions as arrows, each of one tone."""
+    """Graph of each formation with its rigidity; arrows show the first free motions, each in a tone of its own."""
     from rigidfleet.plotting.figure import Figure
 
     names = list(mission.formations)
@@ -47,7 +47,7 @@ def graphs(mission: Mission, judged: Mapping[str, Rigidity | None]) -> Figure:
 
 
 def draw_graphs(mission: Mission, judged: Mapping[str, Rigidity | None], path: Path) -> None:
-    """Write `graphs` to a file, whole or not at all.
+    """Write `graphs` to a file, completely or not at all.
 
     Raises
     ------
@@ -59,7 +59,9 @@ def draw_graphs(mission: Mission, judged: Mapping[str, Rigidity | None], path: P
 
     if path.suffix not in _FORMATS:
         known = ", ".join(_FORMATS)
-        raise ResultError(f"{path}: no format of a figure. Give a name that ends in {known}.")
+        raise ResultError(
+            f"{path}: the name has no figure format. Give a name that ends in {known}."
+        )
     _write(path, _rendered(graphs(mission, judged), path.suffix[1:]))
 
 
@@ -76,7 +78,7 @@ def _draw(ax: Axes, mission: Mission, name: str, rigidity: Rigidity | None) -> N
     dashed = [k in redundant for k in range(len(edges))]
     few = len(edges) <= 12
     space.draw_graph(ax, p @ R.T, edges, colours, lengths if few else None, dashed=dashed)
-    told = f"{len(edges)} edges" + ("" if placed else "; they fix no places")
+    told = f"{len(edges)} edges" + ("" if placed else "; their distances fix no positions")
     if rigidity is not None:
         told = f"{rigidity.verdict}, rank {rigidity.rank} of {rigidity.needed}, {told}"
         told += f", {len(redundant)} redundant" if redundant else ""
@@ -88,7 +90,7 @@ def _draw(ax: Axes, mission: Mission, name: str, rigidity: Rigidity | None) -> N
 
 
 def _arrows(ax: Axes, p: Any, R: Any, rigidity: Rigidity) -> None:
-    """Free motions, seen along the last row of R (3, 3)."""
+    """Draw free motions, seen along the last row of R (3, 3)."""
     size = float(np.linalg.norm(p, axis=1).max()) or 1.0
     tones = (st.ALERT, st.PALETTE[0], st.PALETTE[2])
     for n, flex in enumerate(rigidity.flexes[:_DRAWN]):

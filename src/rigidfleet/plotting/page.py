@@ -1,4 +1,4 @@
-"""One page that tells a flight: paths, distances, attitude, thrust, clearance."""
+"""A summary of a flight on one page: paths, distances, attitude, thrust, clearance."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def _legend_above(ax: Axes, handles: list[Any]) -> None:
 
 
 def _draw_attitude(ax: Axes, result: Result) -> None:
-    """Three Euler angles in one axes, dark to light; where there are none, the constraint error."""
+    """Three Euler angles in one axes, dark to light; without an attitude, the constraint error."""
     from matplotlib.lines import Line2D
 
     flown, wanted, _ = curves.flown_and_wanted_euler(result)

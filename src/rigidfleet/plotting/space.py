@@ -31,26 +31,26 @@ _TRAIL = 1500  # points of an agent's path
 _LINES = 2000  # edges that are drawn among paths
 
 
-# -- what there is to see ------------------------------------------------------------------------------
+# -- the content ------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Scene:
-    """Paths, formations and surroundings of a flight, cut to what can be drawn."""
+    """Paths, formations and surroundings of a flight, limited to what can be drawn."""
 
     paths: Floats  # (K', N, 3) [m]
     centre: Floats  # (K', 3) path of the centre of mass [m]
     shots: list[int]  # samples at which the formation is drawn
     low: Floats  # (3,) corners of the space shown [m]
     high: Floats
-    floor: float  # height on which shadows fall [m]
-    ground: bool  # whether that is the ground
+    floor: float  # height of the plane that shadows fall on [m]
+    ground: bool  # whether this plane is the ground
     boxes: list[tuple[str, Floats, Floats]]  # name and corners [m]
     waypoints: list[tuple[str, Floats]]
 
 
 def scene(result: Result) -> Scene:
-    """What a trajectory's figure shows."""
+    """Content of the trajectory figure."""
     mission, r = result.mission, result.position
     rows = np.flatnonzero(np.isfinite(r).all(axis=(1, 2)))
     thin = rows[st.some(len(rows), _TRAIL if r.shape[1] <= st.MANY else _TRAIL // 10)]
@@ -70,14 +70,14 @@ def scene(result: Result) -> Scene:
     boxes = []
     for o in mission.obstacles:
         if o.kind == "box":
-            # Of a large box only what stands near the flight is shown.
+            # Only the part of a large box that is near the flight is shown.
             a = np.clip(np.array(o.min), low - near, high + near)
             b = np.clip(np.array(o.max), low - near, high + near)
             if (b > a).all():
                 boxes.append((o.name, a, b))
     low = np.minimum.reduce([low, *(a for _, a, _ in boxes)])
     high = np.maximum.reduce([high, *(b for _, _, b in boxes)])
-    # Room around it, and no direction so thin that it cannot be seen.
+    # A margin around it; no direction too thin to see.
     size = float((high - low).max()) or 2.0
     lack = np.maximum(0.3 * size - (high - low), 0.08 * size) / 2
     floor = max(heights) if heights else low[2] - lack[2]
@@ -97,7 +97,7 @@ def scene(result: Result) -> Scene:
 
 
 def _waypoints(result: Result) -> list[tuple[str, Floats]]:
-    """Short name and place of each waypoint, once for each place."""
+    """Short name and position of each waypoint, once for each position."""
     found: dict[tuple[float, ...], str] = {}
     for phase in result.phases:
         target = phase.target or {}
@@ -108,9 +108,9 @@ def _waypoints(result: Result) -> list[tuple[str, Floats]]:
 
 
 def _shots(result: Result, rows: Any) -> list[int]:
-    """Samples at which the formation is drawn: both ends, ends of phases, and some on the way.
+    """Samples at which the formation is drawn: start, end, ends of phases, and some in between.
 
-    None where it would cover one that is there already.
+    Samples whose drawing would cover an earlier one are left out.
     """
     if not len(rows):
         return []
@@ -154,7 +154,7 @@ def _segments(result: Result, shots: list[int]) -> Floats:
 
 
 def _draw_paths(ax: Axes, result: Result, view: Scene, axes: int) -> None:
-    """Paths, agents where the formation is drawn, start, end and waypoints, in 2 or 3 axes."""
+    """Draw paths, agents at the drawn samples, start, end and waypoints, in 2 or 3 axes."""
     shots = view.shots
     if result.n_agents > st.MANY:
         _draw_many(ax, result, view, axes)
@@ -171,7 +171,7 @@ def _draw_paths(ax: Axes, result: Result, view: Scene, axes: int) -> None:
 
 
 def _draw_many(ax: Axes, result: Result, view: Scene, axes: int) -> None:
-    """Paths of some of many agents, and all of them where the formation is drawn."""
+    """Draw paths of some of many agents, and all agents at the drawn samples."""
     colours = np.array(st.agent_colours(result.n_agents))
     for i in st.some(result.n_agents, st.MANY):
         ax.plot(*view.paths[:, i, :axes].T, color=colours[i], linewidth=0.4, alpha=0.5, zorder=3)
@@ -205,7 +205,7 @@ _CROSS: dict[str, Any] = {
 def draw_space(
     fig: Figure, result: Result, view: Scene, rect: tuple[float, float, float, float]
 ) -> Axes3D:
-    """Trajectory in three dimensions, to one scale on all axes, as large as `rect` of the figure allows."""
+    """Draw the trajectory in three dimensions, with one scale on all axes, as large as `rect` of the figure allows."""
     from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
     ax = cast("Axes3D", fig.add_axes(rect, projection="3d"))
@@ -255,7 +255,7 @@ def _plain_axes(ax: Axes3D) -> None:
 
 
 def _azimuth(view: Scene) -> float:
-    """Azimuth [deg] from which the path is spread out most; x still runs right, y away from us."""
+    """Azimuth [deg] at which the path is spread out most; x still points right and y away from the viewer."""
     points = np.concatenate([view.paths.reshape(-1, 3), view.centre])
     points = points[np.isfinite(points).all(axis=1)]
 
@@ -263,7 +263,7 @@ def _azimuth(view: Scene) -> float:
         seen = points @ camera(azimuth, _ELEVATION)[:2].T
         return float(np.linalg.det(np.cov(seen, rowvar=False)))
 
-    # Of views that show about as much, the one nearest to the middle.
+    # Of nearly equivalent views, take the one nearest to the middle.
     candidates = sorted(range(-75, -14, 5), key=lambda a: abs(a + 55))
     if len(points) < 3:
         return candidates[0]
@@ -272,7 +272,7 @@ def _azimuth(view: Scene) -> float:
 
 
 def _on_screen(ax: Axes3D, points: Floats) -> Floats:
-    """Places (n, 2) [pixels] of points (n, 3)."""
+    """Screen positions (n, 2) [pixels] of points (n, 3)."""
     from mpl_toolkits.mplot3d.proj3d import proj_transform
 
     x, y, _ = proj_transform(*points.T, ax.get_proj())
@@ -280,7 +280,7 @@ def _on_screen(ax: Axes3D, points: Floats) -> Floats:
 
 
 def _name_axes(fig: Figure, ax: Axes3D, view: Scene) -> None:
-    """Names of the axes at a fixed distance from them; matplotlib's own wander off with the zoom."""
+    """Name the axes at a fixed distance from them; the distance of matplotlib's own names changes with the zoom."""
     (x0, y0, z0), (x1, y1, z1) = view.low, view.high
     edges = {
         "x [m]": [(x0, y0, z0), (x1, y0, z0)],
@@ -302,7 +302,7 @@ def _fit(fig: Figure, ax: Axes3D, view: Scene, rect: tuple[float, float, float, 
 
     size = fig.get_size_inches() * fig.dpi
     left, bottom, width, height = np.array(rect) * np.tile(size, 2)
-    margin = 0.42 * fig.dpi  # of tick and axis labels
+    margin = 0.42 * fig.dpi  # for tick and axis labels
     side = max(width, height)
     spans = [float(s) for s in view.high - view.low]
     corners = _corners(view.low, view.high)
@@ -325,7 +325,7 @@ def _fit(fig: Figure, ax: Axes3D, view: Scene, rect: tuple[float, float, float, 
 
 
 def draw_above(ax: Axes, result: Result, view: Scene) -> None:
-    """Trajectory from above, to one scale on both axes."""
+    """Draw the trajectory from above, with one scale on both axes."""
     from matplotlib.collections import LineCollection
 
     ax.set(xlim=(view.low[0], view.high[0]), ylim=(view.low[1], view.high[1]))
@@ -339,7 +339,7 @@ def draw_above(ax: Axes, result: Result, view: Scene) -> None:
         look: dict[str, Any] = {"fill": False, "edgecolor": st.ALERT, "linestyle": (0, (6, 2))}
         _outline(ax, np.array(fence.min), np.array(fence.max), "", **look, gid="geofence")
     edges = _segments(result, view.shots)[..., :2]
-    edges = edges if len(edges) <= _LINES else edges[:0]  # they would hide everything
+    edges = edges if len(edges) <= _LINES else edges[:0]  # more would hide everything
     ax.add_collection(LineCollection(list(edges), colors=st.INK, linewidths=0.6, zorder=4))
     _draw_paths(ax, result, view, 2)
     over: dict[tuple[float, float], list[str]] = {}
@@ -353,7 +353,7 @@ def draw_above(ax: Axes, result: Result, view: Scene) -> None:
 
 
 def _outline(ax: Axes, low: Floats, high: Floats, name: str, **look: Any) -> None:
-    """Box from above, with its name if that fits."""
+    """Draw a box from above, with its name if it fits."""
     from matplotlib.patches import Rectangle
 
     (x, y), (width, depth) = low[:2].tolist(), (high - low)[:2].tolist()
@@ -407,9 +407,9 @@ def trajectory(result: Result) -> Figure:
 
 
 def sketch_places(mission: Mission, name: str) -> tuple[Floats, bool]:
-    """Places (N, 3) [m] at which a formation's graph is drawn, and whether they are its slots.
+    """Positions (N, 3) [m] at which a formation's graph is drawn, and whether they are its slots.
 
-    Distances that fix no shape are spread out by classical scaling of the shortest paths in the graph.
+    If the distances fix no shape, classical scaling of the shortest paths in the graph gives positions.
     """
     slots = mission.formation_slots(name)
     if slots is not None:
@@ -421,7 +421,8 @@ def sketch_places(mission: Mission, name: str) -> tuple[Floats, bool]:
     d[edges[:, 0], edges[:, 1]] = d[edges[:, 1], edges[:, 0]] = lengths
     for k in range(n):
         d = np.minimum(d, d[:, k : k + 1] + d[k : k + 1])
-    d[np.isinf(d)] = 1.5 * d[np.isfinite(d)].max(initial=1.0)  # parts that no edge joins
+    # Between components that no edge joins
+    d[np.isinf(d)] = 1.5 * d[np.isfinite(d)].max(initial=1.0)
     centring = np.eye(n) - 1 / n
     value, vector = np.linalg.eigh(-0.5 * centring @ d**2 @ centring)
     places = np.zeros((n, 3))
@@ -479,7 +480,7 @@ def _sketch(
         x + w / 2, y + 0.95 * h, st.clean(name), ha="center", fontweight="bold", parse_math=False
     )
     told = f"{words}, {len(edges)} edge{'s' if len(edges) != 1 else ''}"
-    told += "" if placed else "; they fix no places"
+    told += "" if placed else "; their distances fix no positions"
     fig.text(x + w / 2, y + 0.89 * h, told, ha="center", fontsize=7.5, color=st.GREY)
     ax = fig.add_axes((x + 0.06 * w, y + 0.04 * h, 0.88 * w, 0.8 * h))
     turned = p - origin
@@ -507,7 +508,7 @@ def draw_graph(
     *,
     dashed: Sequence[bool] = (),
 ) -> None:
-    """Agents at p (N, 3), seen along the last axis, as numbered discs, with edges and their lengths [m]."""
+    """Draw agents at p (N, 3), seen along the last axis, as numbered discs, with edges and their lengths [m]."""
     n = len(p)
     room = 1.25 * float(np.abs(p[:, :2]).max()) or 1.0
     ax.set(xlim=(-room, room), ylim=(-room, room), aspect="equal")
@@ -518,12 +519,12 @@ def draw_graph(
     for e in np.argsort(p[edges, 2].mean(axis=1)) if len(edges) else []:
         i, j = edges[e]
         a, b = p[i], p[j]
-        # The middle of a diagonal is where others meet, and the body axes.
+        # In the middle of a diagonal, the label would cover other edges and the body axes.
         middle = a + (b - a) * (0.5 if np.hypot(*(a + b)[:2]) > 0.3 * room else 0.28)
         others = np.delete(p, [i, j], axis=0)
         path = np.array([a, b])[:, :2]
         if len(others) and _distance_to(others, a, b).min() < 0.02 * room:
-            # Straight, it would run through another agent.
+            # A straight edge would run through another agent.
             across = np.array([a[1] - b[1], b[0] - a[0]]) * -0.22
             s = np.linspace(0, 1, 40)[:, None]
             path = (1 - s) * a[:2] + s * b[:2] + 4 * s * (1 - s) * across
@@ -550,7 +551,7 @@ def draw_graph(
 
 
 def _draw_mesh(ax: Axes, p: Floats, edges: Any, colours: list[str]) -> None:
-    """A graph of many agents: what is behind first and fainter."""
+    """Draw a graph of many agents, with the far parts first and fainter."""
     from matplotlib.collections import LineCollection
     from matplotlib.colors import to_rgba_array
 
@@ -573,9 +574,9 @@ def _draw_mesh(ax: Axes, p: Floats, edges: Any, colours: list[str]) -> None:
 
 
 def _draw_axes(ax: Axes, axes: Floats, length: float, *, taken: bool) -> None:
-    """Body axes from the centre of mass; rows of `axes` (3, 3) as seen, the last column towards us.
+    """Draw body axes from the centre of mass; rows of `axes` (3, 3), the last column towards the viewer.
 
-    An axis towards us is a ring with a point, beside the centre where an agent has `taken` that.
+    An axis that points to the viewer is drawn as a ring with a dot, beside the centre if an agent has `taken` it.
     """
     tips = length * axes
     for tip, name in zip(tips, "xyz", strict=True):
@@ -601,7 +602,7 @@ def _draw_axes(ax: Axes, axes: Floats, length: float, *, taken: bool) -> None:
 
 
 def camera(azimuth: float, elevation: float) -> Floats:
-    """Rows right, up, and towards us of a camera at these angles [deg]."""
+    """Unit vectors right, up and towards the viewer (rows) of a camera at these angles [deg]."""
     a, e = math.radians(azimuth), math.radians(elevation)
     out = np.array([math.cos(a) * math.cos(e), math.sin(a) * math.cos(e), math.sin(e)])
     right = np.array([-math.sin(a), math.cos(a), 0.0])

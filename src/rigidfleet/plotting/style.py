@@ -1,4 +1,4 @@
-"""What all figures share: colours, type, the phases along time, lines, legends."""
+"""The common style of all figures: colours, fonts, phases along the time axis, lines, legends."""
 
 from __future__ import annotations
 
@@ -26,35 +26,36 @@ if TYPE_CHECKING:
 
 Draw = Callable[[Result], "Figure"]
 
-#: Colours of the first twelve agents: of Okabe and Ito's set those that stand out on white, then
-#: others as far from all before as can be, to normal and to colour-blind eyes alike.
+#: Colours of the first twelve agents: those of Okabe and Ito's set that stand out on white, then colours as
+#: distinct from these as possible, to normal and to colour-blind vision.
 PALETTE = (
     "#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9",
     "#882255", "#332288", "#999933", "#117733", "#8B0000", "#1A1A1A",
 )  # fmt: skip
 INK, GREY, FAINT = "#222222", "#6B6B6B", "#B5B5B5"
-#: What belongs to no agent: the formation as a whole; and its three components, dark to light.
+#: Colour of the formation as a whole, and of its three components, dark to light.
 FLOWN = "#8FA3B8"
 TONES = ("#1F2A36", "#66798D", "#A9B8C6")
 BAND = "#F1F3F5"
 DASHES = (0, (4, 2.5))
 ALERT = "#B00020"
 
-WIDTH = 9.0  # [in] of a figure over time
-_PAD = 0.07  # [in] around what is drawn
-_SLANT = 38.0  # of phase names that do not fit upright [deg]
-_LONGEST = 28  # letters of a phase name
-_POINTS = 3000  # samples of a line; more would be drawn over each other
-#: Of more agents or edges than this the spread is drawn, not each of them.
+WIDTH = 9.0  # width of a figure over time [in]
+_PAD = 0.07  # margin around the content [in]
+_SLANT = 38.0  # slant of phase names that do not fit horizontally [deg]
+_LONGEST = 28  # greatest length of a phase name
+_POINTS = 3000  # greatest number of samples of a line; more would be drawn over each other
+#: Number of agents or edges beyond which the spread is drawn instead of each line.
 MANY = 200
-_ENTRIES = 12  # of a legend
-#: What varies by less is told in words; drawn, its rounding errors would fill an axes. [m, m/s, deg, deg/s, N]
+_ENTRIES = 12  # greatest number of entries of a legend
+#: Least variation that is drawn; a smaller one is given in words, as rounding errors would fill the axes.
+#: [m, m/s, deg, deg/s, N]
 STILL = 1e-3
-_ROUNDING = 1e-9  # deviations below are not worth a word
+_ROUNDING = 1e-9  # smaller deviations are not mentioned
 
-#: Where words may stand: a point and what it is measured in, an offset [points] from it, alignment.
+#: A possible place of a text: a point and its coordinate system, an offset [points] from it, alignment.
 Place = tuple[tuple[float, float], Any, tuple[float, float], str, str]
-#: Along an axes' width: its ends and middle first.
+#: Positions along the width of an axes, ends and middle first.
 _ALONG = ((0.995, "right"), (0.5, "center"), (0.005, "left"), (0.75, "center"), (0.25, "center"))
 _places: WeakKeyDictionary[Annotation, Sequence[Place]] = WeakKeyDictionary()
 _titled: ContextVar[bool] = ContextVar("titled", default=True)
@@ -96,18 +97,18 @@ _RC: dict[str, Any] = {
     "figure.constrained_layout.w_pad": _PAD,
     "figure.constrained_layout.h_pad": _PAD,
     "savefig.dpi": 160,
-    "svg.fonttype": "none",  # text stays text
+    "svg.fonttype": "none",  # text remains text
     "svg.hashsalt": "rigidfleet",  # the same flight gives the same file
 }
 
 
 @contextmanager
 def settings() -> Generator[None]:
-    """Matplotlib's defaults and ours over them, whatever the user has set; undone at the end."""
+    """Apply matplotlib's defaults and our style, whatever the user has set; restored at the end."""
     import matplotlib.style
 
     with matplotlib.style.context(["default", _RC]), warnings.catch_warnings():
-        # A name in letters that the font lacks shows as boxes in a PNG, and as it is in an SVG.
+        # Letters that the font lacks show as boxes in a PNG, and correctly in an SVG.
         warnings.filterwarnings("ignore", message="Glyph .* missing from font")
         yield
 
@@ -127,7 +128,7 @@ def styled(draw: Draw) -> Draw:
 
 @contextmanager
 def titles(*, shown: bool) -> Generator[None]:
-    """Figures drawn inside have a title and the name of their mission, or none."""
+    """Draw figures in this context with a title and the name of the mission, or without both."""
     before = _titled.set(shown)
     try:
         yield
@@ -136,15 +137,15 @@ def titles(*, shown: bool) -> Generator[None]:
 
 
 def agent_colours(n: int) -> list[str]:
-    """Colour of each of n agents ("#rrggbb"), the same in all figures, apart to colour-blind eyes.
+    """Colour of each of n agents ("#rrggbb"), the same in all figures, distinct to colour-blind readers.
 
-    Up to twelve each have a colour of their own; more lie along the scale of viridis, by number.
+    Up to twelve agents have colours of their own; more agents have colours along viridis, by number.
     """
     return list(PALETTE[:n]) if n <= len(PALETTE) else scale(n)
 
 
 def scale(n: int) -> list[str]:
-    """n colours from dark to light, in an order that colour-blind eyes see too."""
+    """n colours from dark to light, in an order that colour-blind readers can see."""
     from matplotlib import colormaps
     from matplotlib.colors import to_hex
 
@@ -162,7 +163,7 @@ def time_figure(
     height: float = 2.1,
     shares: Sequence[float] | None = None,
 ) -> tuple[Figure, Any]:
-    """Figure of rows x columns axes (object array) that share time; `height` of a row [in], or its share of that."""
+    """Figure with rows x columns axes (object array) that share time; `height` of a row [in], scaled by its share."""
     from rigidfleet.plotting.figure import Figure
 
     shares = [1.0] * rows if shares is None else shares
@@ -178,7 +179,7 @@ def time_figure(
 
 
 def head(fig: Figure, result: Result, title: str) -> None:
-    """Title at the left; the mission and, if it did not end well, when it stopped at the right."""
+    """Title at the left; at the right, the mission and, if the flight is incomplete, when it stopped."""
     words, colour = result.mission.name, GREY
     if not result.complete:
         words, colour = f"{words}: incomplete, stopped at {result.phases[-1].t_end:.2f} s", ALERT
@@ -186,7 +187,7 @@ def head(fig: Figure, result: Result, title: str) -> None:
 
 
 def heading(fig: Figure, title: str, words: str, colour: str = GREY) -> None:
-    """Title at the left, words at the right; without titles only words that warn."""
+    """Title at the left, text at the right; without titles, only a warning text."""
     top = 1 - _PAD / fig.get_figheight()
     if not _titled.get():
         if colour == ALERT:
@@ -198,7 +199,7 @@ def heading(fig: Figure, title: str, words: str, colour: str = GREY) -> None:
     title_text = fig.suptitle(
         title, x=0.012, ha="left", va="top", fontsize=11, fontweight="bold", parse_math=False
     )
-    if fig.get_layout_engine() is None:  # else it finds the place, and keeps the axes clear of it
+    if fig.get_layout_engine() is None:  # a layout engine places it itself, clear of the axes
         title_text.set_y(top)
     fig.text(0.988, top, words, ha="right", va="top", fontsize=9, color=colour, parse_math=False)
 
@@ -215,12 +216,12 @@ def over_time(ax: Axes, result: Result) -> None:
 
 
 def line(ax: Axes, t: Floats, y: Floats, **look: Any) -> Line2D:
-    """Line through samples y (K,) at t (K,), thinned if there are more than anybody sees."""
+    """Line through samples y (K,) at t (K,), thinned if there are more than can be seen."""
     return ax.plot(*thinned(t, y), **look)[0]
 
 
 def thinned(t: Floats, y: Floats, most: int = _POINTS) -> tuple[Floats, Floats]:
-    """At most about `most` samples that look the same: of each stretch the first, least and greatest."""
+    """About `most` samples or fewer that look the same: the first, least and greatest of each interval."""
     if len(t) <= most:
         return t, y
     keep = {0, len(t) - 1}
@@ -233,12 +234,12 @@ def thinned(t: Floats, y: Floats, most: int = _POINTS) -> tuple[Floats, Floats]:
 
 
 def reference(ax: Axes, t: Floats, y: Floats) -> Line2D:
-    """Dashed line of a reference."""
+    """Draw a reference as a dashed line."""
     return line(ax, t, y, color=INK, linewidth=0.8, linestyle=DASHES, zorder=3)
 
 
 def limit(ax: Axes, value: float, label: str, colour: str = ALERT) -> None:
-    """Line of a limit, with its name on it."""
+    """Draw a limit as a line with its name."""
     ax.axhline(value, color=colour, linewidth=1.0, linestyle=(0, (6, 2)), zorder=2.5, gid="limit")
     along: list[Place] = [
         ((x, value), ("axes fraction", "data"), (0, away), ha, va)
@@ -248,11 +249,11 @@ def limit(ax: Axes, value: float, label: str, colour: str = ALERT) -> None:
     annotate(ax, label, [*along, *corners()], color=colour)
 
 
-# -- words that cover nothing --------------------------------------------------------------------------
+# -- text that covers nothing --------------------------------------------------------------------------
 
 
 def annotate(ax: Axes, text: str, places: Sequence[Place], **look: Any) -> None:
-    """Words in an axes, which stand at the first of their places where they cover no line and no other words."""
+    """Write text in an axes, at the first of ``places`` where it covers neither lines nor other text."""
     (x, y), units, offset, ha, va = places[0]
     label = ax.annotate(
         text, (x, y), offset, xycoords=units, textcoords="offset points", ha=ha, va=va, fontsize=7.5,
@@ -272,7 +273,7 @@ def corners() -> list[Place]:
 
 
 def around(x: float, y: float) -> list[Place]:
-    """Places round a point of the data, near ones first, those below first."""
+    """Places around a data point, near ones first, those below first."""
     sides = (("center", 0.0), ("left", 1.0), ("right", -1.0))
     near: list[Place] = [
         ((x, y), "data", (6 * side, sign * away), ha, "top" if sign < 0 else "bottom")
@@ -285,7 +286,7 @@ def around(x: float, y: float) -> list[Place]:
 
 
 def place_words(fig: Figure) -> None:
-    """Move `words` to where they cover nothing, or least."""
+    """Move annotated text to where it covers nothing, or least."""
     every = [(text, places) for text, places in _places.items() if text.get_figure() is fig]
     engine = fig.get_layout_engine()
     if engine is not None and every:
@@ -295,7 +296,7 @@ def place_words(fig: Figure) -> None:
         waiting = {text for text, _ in labels}
         for label, places in labels:
             waiting.remove(label)
-            # Phase names stand outside; words that have no place yet are in nobody's way.
+            # Phase names stand outside; text without a place yet covers nothing.
             others = [
                 text.get_window_extent() for text in ax.texts
                 if text is not label and text not in waiting and text.get_gid() != "phase"
@@ -318,7 +319,7 @@ def _move(label: Annotation, place: Place) -> None:
 
 
 def _covered(ax: Axes, box: Bbox, others: Sequence[Bbox]) -> int:
-    """How much a box [pixels] covers: lines, bands, other boxes; most of all, what is not in the axes."""
+    """Cost of a box [pixels] for what it covers: lines, bands, other boxes; highest for parts outside the axes."""
     n = sum(box.overlaps(other) for other in others)
     for line in ax.lines:
         path = line.get_transform().transform_path(line.get_path())
@@ -336,7 +337,7 @@ def _covered(ax: Axes, box: Bbox, others: Sequence[Bbox]) -> int:
 
 
 def still(ax: Axes, values: Floats, unit: str) -> bool:
-    """Of what does not vary, write the value into its axes; whether that is so."""
+    """If values do not vary, write the value into the axes; return whether this is so."""
     known = values[np.isfinite(values)]
     if not len(known) or np.ptp(known) > STILL:
         return False
@@ -355,26 +356,26 @@ def still(ax: Axes, values: Floats, unit: str) -> bool:
 
 
 def is_still(*values: Floats) -> bool:
-    """Whether all that is known of some values stays the same, or nothing is known."""
+    """Whether all known values are the same, or none is known."""
     known = np.concatenate([v[np.isfinite(v)] for v in values])
     return not len(known) or float(np.ptp(known)) <= STILL
 
 
 def halo() -> list[Any]:
-    """White around letters that stand on lines."""
+    """A white outline of text that stands on lines."""
     from matplotlib.patheffects import withStroke
 
     return [withStroke(linewidth=2.5, foreground="white")]
 
 
 def note(ax: Axes, words: str) -> None:
-    """Words in an axes that has nothing to show."""
+    """Write text in an axes that has nothing to show."""
     ax.text(0.5, 0.5, words, transform=ax.transAxes, ha="center", va="center", color=GREY)
     ax.tick_params(left=False, labelleft=False)
 
 
 def spread(ax: Axes, t: Floats, values: Floats, colour: str) -> None:
-    """Values (K, n) of many as a band from least to greatest, one of nine in ten, and their median."""
+    """Draw many values (K, n) as a band from least to greatest, a band of nine in ten, and their median."""
     known = np.isfinite(values).any(axis=1)
     if not known.any():
         return
@@ -400,9 +401,9 @@ def spread_handles(what: str, colour: str) -> list[Any]:
 
 
 def agent_lines(ax: Axes, result: Result, values: Floats) -> None:
-    """A line for each agent, values (K, N), in its colour; the first widest, so that all show.
+    """A line for each agent, values (K, N), in its colour; the first ones are widest, so that all are visible.
 
-    Of more than `MANY` agents their spread.
+    For more than `MANY` agents, the spread is drawn.
     """
     n = result.n_agents
     if n > MANY:
@@ -448,16 +449,16 @@ def legend(ax: Axes, handles: Sequence[Any], title: str = "") -> None:
 
 
 def clean(name: str, longest: int = _LONGEST) -> str:
-    """A user's name in one printable line, cut if it is long."""
+    """A user's name as one printable line, shortened if it is long."""
     words = " ".join("".join(c if c.isprintable() else " " for c in name).split())
     return words if len(words) <= longest else words[: longest - 1].rstrip() + "…"
 
 
 def name_phases(fig: Figure, axes: Iterable[Axes], result: Result) -> None:
-    """Write the phases' names along the top of axes, where nothing overlaps.
+    """Write the phases' names along the top of axes, without overlaps.
 
-    Upright over each phase if all fit; else slanting, moved apart where phases are short, with a
-    line to where they belong. Where even that is too narrow, the shortest phases go without.
+    If all names fit, each stands horizontally over its phase. Otherwise they are slanted, moved apart where
+    phases are short, with a line to their phase. If even this is too narrow, the shortest phases have no name.
     """
     engine = fig.get_layout_engine()
     if engine is not None:
@@ -469,9 +470,9 @@ def name_phases(fig: Figure, axes: Iterable[Axes], result: Result) -> None:
 
 
 def number_phases(fig: Figure, axes: Iterable[Axes], result: Result) -> str:
-    """Write the phases' numbers along the top of small axes; returns the key to them.
+    """Write the phases' numbers along the top of small axes; return the key to them.
 
-    A number without room is left out.
+    A number that does not fit is left out.
     """
     for ax in axes:
         right = -math.inf
@@ -485,7 +486,7 @@ def number_phases(fig: Figure, axes: Iterable[Axes], result: Result) -> str:
                 label.remove()
             else:
                 right = box.x1
-    # A phase without a name has its kind and number for one.
+    # The default name of a phase is its kind and number.
     names = (
         f"{i + 1} {clean(p.kind if p.name == f'{p.kind} {i + 1}' else p.name)}"
         for i, p in enumerate(result.phases)
@@ -511,7 +512,7 @@ def _upright(ax: Axes, result: Result) -> list[Text]:
 def _slanting(ax: Axes, result: Result) -> list[Text]:
     scale, t0 = _per_second(ax), ax.get_xlim()[0]
     size = 7.5
-    # Lines of text keep apart by their height across the slant.
+    # Slanted texts need a distance that depends on their height and slant.
     pitch = 1.25 * size * ax.figure.dpi / 72 / math.sin(math.radians(_SLANT))
     room = int(scale * np.diff(ax.get_xlim())[0] / pitch)
     longest = sorted(_spans(ax, result), key=lambda span: span[1] - span[2])[:room]
@@ -535,7 +536,7 @@ def _slanting(ax: Axes, result: Result) -> list[Text]:
 
 
 def _spans(ax: Axes, result: Result) -> list[tuple[str, float, float]]:
-    """Name, start and end [s] of each phase, as far as the axes show it."""
+    """Name, start and end [s] of each phase that the axes show."""
     low, high = ax.get_xlim()
     return [
         (p.name, max(p.t_start, low), min(p.t_end, high)) for p in result.phases if p.t_start < high
@@ -543,13 +544,13 @@ def _spans(ax: Axes, result: Result) -> list[tuple[str, float, float]]:
 
 
 def _per_second(ax: Axes) -> float:
-    """Pixels of a second; fewer than there are, as names at the right may narrow the axes."""
+    """Pixels per second, underestimated because names at the right may narrow the axes."""
     return 0.88 * ax.bbox.width / float(np.diff(ax.get_xlim())[0])
 
 
 def _apart(places: Floats, pitch: float) -> Floats:
-    """Ascending places moved as little as possible (least squares) to be `pitch` apart or more."""
-    # Pool adjacent violators on the places less their least distances.
+    """Ascending positions, moved as little as possible (least squares) to be at least `pitch` apart."""
+    # Pool adjacent violators on the positions minus their least distances.
     blocks: list[list[float]] = []
     for value in places - pitch * np.arange(len(places)):
         blocks.append([float(value), 1.0])

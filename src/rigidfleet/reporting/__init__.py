@@ -1,9 +1,8 @@
-"""A flight, or several side by side, as one HTML page that reads and prints well.
+"""A flight, or several side by side, as one HTML page for screen and print.
 
-`report` writes it: the verdict first, then what a show operator asks (how close, how fast, how high, how
-hard, each against its limit), the figures, the mission with its gains and what they mean, and versions.
-The page holds everything itself and asks nothing of any network. Its words and tables are templates
-beside this module; it sees nothing but results.
+`report` writes the page. It shows the verdict first, then a safety table (distances, speed, altitude and thrust,
+each with its limit), the figures, the mission, its gains and their meaning, and versions. The page contains
+everything it needs and loads nothing from a network. Its templates are in this package; its only input is results.
 """
 
 from __future__ import annotations
@@ -33,17 +32,17 @@ def report(
 
     Parameters
     ----------
-    results : one or more flights, each a `Result` or the path of one that was saved
-    path : the page; a file that is there is replaced, whole or not at all
-    labels : what to call each flight; the name of its mission by default
-    verdicts : those of `assess`, if they are there already
+    results : one or more flights, each a `Result` or the path of a saved one
+    path : file of the page; an existing one is replaced, completely or not at all
+    labels : name of each flight; by default the name of its mission
+    verdicts : those of `assess`, if they have been computed already
 
     Raises
     ------
     ResultError
         The page cannot be written, or a result or the mission inside a result cannot be read.
     ValueError
-        There is no result, or not one label and verdict for each.
+        There is no result, or the number of labels or verdicts differs from that of results.
     """
     write_file(Path(path), html_page(results, labels=labels, verdicts=verdicts).encode())
 

@@ -1,4 +1,4 @@
-"""What stands on the page: plain data for its templates."""
+"""Content of the page, as plain data for its templates."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ if TYPE_CHECKING:
     from rigidfleet.mission import Mission
     from rigidfleet.result import Result
 
-#: Vehicles with a row each; of more, those that need the most thrust.
+#: Greatest number of vehicles with a row each; of more vehicles, those with the greatest thrust are shown.
 _VEHICLES = 24
-#: Keys in which missions differ that are shown.
+#: Greatest number of differing mission keys that are shown.
 _KEYS = 40
-#: Numbers that differ by less, relative to the larger, are the same.
+#: Relative difference below which numbers count as the same.
 _SAME = 1e-3
 
 
@@ -41,7 +41,7 @@ def contents(
     Raises
     ------
     ValueError
-        There is no flight, or not one label and verdict for each.
+        There is no flight, or the number of labels or verdicts differs from that of flights.
     """
     if not flights:
         raise ValueError("a report needs a result")
@@ -70,7 +70,7 @@ def contents(
 
 
 def _named(flights: Sequence[Result]) -> list[str]:
-    """Names of the missions, numbered where two are the same."""
+    """Names of the missions, numbered if a name occurs twice."""
     names = [flight.mission.name for flight in flights]
     count = Counter(names)
     seen: Counter[str] = Counter()
@@ -125,7 +125,7 @@ def _facts(result: Result) -> list[tuple[str, str]]:
         ("vehicles", f"{result.n_agents}, {masses}"),
         ("formations", ", ".join(forms) or "none"),
         ("control", mission.architecture),
-        ("flown", f"{result.time[-1]:.4g} s, {len(result.phases)} phases"),
+        ("duration", f"{result.time[-1]:.4g} s, {len(result.phases)} phases"),
         ("simulated", result.created.replace("T", " ").replace("+00:00", " UTC")),
     ]
 
@@ -166,7 +166,7 @@ def _phases(result: Result, verdict: Verdict) -> list[dict[str, str]]:
 
 
 def _vehicles(result: Result) -> list[dict[str, str]]:
-    """Extremes of each vehicle; of too many, of those that need the most thrust."""
+    """Extremes of each vehicle; if there are too many, of those with the greatest thrust."""
     n, mission = result.n_agents, result.mission
     with np.errstate(invalid="ignore"):
         thrust = np.nan_to_num(result.thrust).max(axis=0)
@@ -199,18 +199,18 @@ def _versions(result: Result) -> list[tuple[str, str]]:
     found = [(name, version) for name, version in result.versions.items()]
     found.append(("platform", result.platform))
     for name, key, form in (
-        ("steps of the integrator", "steps", "{}"),
-        ("of these rejected", "rejected", "{}"),
+        ("integrator steps", "steps", "{}"),
+        ("rejected steps", "rejected", "{}"),
         ("relative tolerance", "rtol", "{:g}"),
         ("absolute tolerance", "atol", "{:g}"),
-        ("time to simulate", "wall_s", "{:.3g} s"),
+        ("computing time", "wall_s", "{:.3g} s"),
     ):
         if known.get(key) is not None:
             found.append((name, form.format(known[key])))
     return found
 
 
-# -- the safety page ---------------------------------------------------------------------------------
+# -- safety table -----------------------------------------------------------------------------------
 
 
 def _safety_table(flights: Sequence[Result], verdicts: Sequence[Verdict]) -> list[dict[str, Any]]:
@@ -232,7 +232,7 @@ def _safety_cell(row: Safety) -> dict[str, Any]:
     left = ""
     if margin is not None:
         left = f"{value(abs(margin), row.unit)} {'left' if margin >= 0 else 'beyond'}"
-    nothing = {"downwash": "never one below another", "geofence": "no fence"}
+    nothing = {"downwash": "no vehicle is ever below another", "geofence": "no geofence"}
     return {
         "state": state,
         "sign": "≤" if not row.at_least else "≥" if row.limit else ">",
@@ -251,7 +251,7 @@ def _safety_cell(row: Safety) -> dict[str, Any]:
 
 
 def _numbers(flights: Sequence[Result], verdicts: Sequence[Verdict]) -> list[dict[str, Any]]:
-    """Numbers of the flights side by side, and whether they differ."""
+    """Numbers of the flights side by side, with whether they differ."""
 
     def worst(name: str, _: Result, verdict: Verdict) -> float | None:
         extreme = verdict.worst.get(name)
@@ -263,12 +263,12 @@ def _numbers(flights: Sequence[Result], verdicts: Sequence[Verdict]) -> list[dic
 
     measures: list[tuple[str, str, Callable[[Result, Verdict], float | None]]] = [
         ("length of the flight", "s", lambda r, _: float(r.time[-1])),
-        ("checks that failed", "", lambda _, v: float(sum(not f.passed for f in v.findings))),
-        ("greatest miss of a waypoint", "m", misses),
-        ("greatest miss of a slot", "m", lambda r, _: _greatest(overlay.slot_error(r))),
+        ("failed checks", "", lambda _, v: float(sum(not f.passed for f in v.findings))),
+        ("greatest waypoint miss", "m", misses),
+        ("greatest distance from a slot", "m", lambda r, _: _greatest(overlay.slot_error(r))),
         ("greatest constraint error", "m", partial(worst, "constraint")),
-        ("least room between vehicles", "m", partial(worst, "separation")),
-        ("least clearance", "m", partial(worst, "clearance")),
+        ("least distance between vehicles", "m", partial(worst, "separation")),
+        ("least distance to an obstacle", "m", partial(worst, "clearance")),
         ("greatest speed", "m/s", partial(worst, "speed")),
         ("greatest acceleration", "m/s²", partial(worst, "acceleration")),
         ("greatest thrust", "N", partial(worst, "thrust")),
@@ -313,7 +313,7 @@ def _same(a: float | None, b: float | None) -> bool:
 
 
 def _change(first: float | None, x: float | None) -> str:
-    """How a number differs from that of the first flight, where that says something."""
+    """Change of a number from that of the first flight, if it is meaningful."""
     if first is None or x is None or _same(first, x) or abs(first) < 1e-6:
         return ""
     percent = 100 * (x - first) / abs(first)
@@ -323,7 +323,7 @@ def _change(first: float | None, x: float | None) -> str:
 
 
 def _keys(missions: Sequence[Mission]) -> list[dict[str, Any]]:
-    """Keys of the mission files that are not the same in all."""
+    """Keys of the mission files that differ between missions."""
     flat = [dict(_flat(mission.to_dict())) for mission in missions]
     rows = []
     for key in dict.fromkeys(key for one in flat for key in one):
@@ -337,7 +337,7 @@ def _keys(missions: Sequence[Mission]) -> list[dict[str, Any]]:
 
 
 def _flat(data: Any, key: str = "") -> Iterator[tuple[str, str]]:
-    """Keys as messages write them (phases[2].until), and their values as text."""
+    """Keys in the notation of messages (phases[2].until), and their values as text."""
     if isinstance(data, Mapping):
         for name, item in data.items():
             yield from _flat(item, f"{key}.{name}" if key else str(name))
@@ -351,22 +351,22 @@ def _flat(data: Any, key: str = "") -> Iterator[tuple[str, str]]:
 # -- figures -----------------------------------------------------------------------------------------
 
 _CAPTIONS = {
-    "summary": "The flight on one page.",
-    "trajectory": "Paths of the vehicles, and the formation at chosen moments.",
-    "distances": "Distances that are held, and what they should be (dashed).",
+    "summary": "Summary of the flight on one page.",
+    "trajectory": "Paths of the vehicles, and the formation at selected times.",
+    "distances": "Distances of the active edges, with their references (dashed).",
     "cm": "Centre of mass: flown, reference (dashed) and waypoints (rings).",
-    "attitude": "Attitude of the formation as a body: flown, reference (dashed) and waypoints (rings).",
-    "inputs": "Thrust of each vehicle under its limit, and enlarged.",
-    "constraint_force": "Force that holds the distances, and the tension of each edge; below zero it pushes.",
-    "constraint_error": "Error |c| of each distance held, length less reference; and of all pairs against the slots.",
-    "clearance": "Room between surfaces, with the limits.",
+    "attitude": "Attitude of the formation: flown, reference (dashed) and waypoints (rings).",
+    "inputs": "Thrust of each vehicle with its limit, and enlarged.",
+    "constraint_force": "Constraint force on each vehicle, and tension of each edge (negative: the edge pushes).",
+    "constraint_error": "Constraint error |c| of each edge (length minus reference), and shape error of all pairs.",
+    "clearance": "Distances between surfaces, with the limits.",
     "formations": "Formations with their edges and body axes.",
-    "disturbance": "Force of the air on each vehicle, and how far each is from its slot.",
+    "disturbance": "Aerodynamic force on each vehicle, and distance of each vehicle from its slot.",
 }  # fmt: skip
 
 
 def _figures(result: Result) -> list[dict[str, str]]:
-    """All figures but the summary, which has a page of its own."""
+    """All figures except the summary, which has its own page."""
     return [_figure(result, name) for name in plotting.figure_names(result) if name != "summary"]
 
 
@@ -382,13 +382,13 @@ def _picture(name: str, svg: bytes, caption: str) -> dict[str, str]:
 
 
 def _embedded(svg: bytes) -> str:
-    # As an image its names and styles stay its own; blanks between words are kept, as they were drawn.
+    # An image keeps its ids and styles to itself. Runs of spaces are preserved as drawn.
     svg = svg.replace(b"</style>", b" text{white-space:pre}</style>", 1)
     return f"data:image/svg+xml;base64,{b64encode(svg).decode()}"
 
 
 def _overlays(flights: Sequence[Result], labels: Sequence[str]) -> list[dict[str, str]]:
     return [
-        _picture("paths", overlay.paths(flights, labels), "Where the formations flew."),
-        _picture("over time", overlay.over_time(flights, labels), "The worst of all vehicles at each time."),
+        _picture("paths", overlay.paths(flights, labels), "Paths of the formations' centres of mass."),
+        _picture("over time", overlay.over_time(flights, labels), "Worst value of all vehicles at each time."),
     ]  # fmt: skip

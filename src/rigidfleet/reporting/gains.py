@@ -1,4 +1,4 @@
-"""Gains in words: what a mission's feedback does to an error."""
+"""The gains of a mission in words: how its feedback acts on an error."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ if TYPE_CHECKING:
     from rigidfleet.mission import Mission, Regulator
 
 _SOLVERS = {
-    "iterated": "iterated Tikhonov: the force stays bounded where distances are redundant",
+    "iterated": "iterated Tikhonov: the force stays bounded if distances are redundant",
     "spectral": "spectral damping: the exact law unless distances are nearly redundant",
-    "exact": "the paper's inverse, which has no value where distances are redundant",
-    "pinv": "the pseudo-inverse, which lets go smoothly of what lies below its cut-off",
+    "exact": "the paper's inverse, which does not exist if distances are redundant",
+    "pinv": "the pseudo-inverse, which fades out components below its cut-off",
 }
 
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """One thing about the gains: what, its value, and what that means."""
+    """One property of the gains: its name, its value and its meaning."""
 
     what: str
     value: str
@@ -34,7 +34,7 @@ def explained(mission: Mission) -> list[Line]:
 
 
 def response(mission: Mission, t: list[float]) -> list[float] | None:
-    """Error c(t)/c(0) of a distance that starts at rest; None without stabilisation."""
+    """Error c(t)/c(0) of a distance with c'(0) = 0; None without stabilisation."""
     c = mission.constraint
     if c.stabilisation == "none":
         return None
@@ -42,7 +42,7 @@ def response(mission: Mission, t: list[float]) -> list[float] | None:
 
 
 def settling(mission: Mission) -> float | None:
-    """Time [s] in which an error of a distance falls to 2 %; None where it never does."""
+    """Time [s] in which a distance error falls to 2 %; None if it never does."""
     c = mission.constraint
     if c.stabilisation == "none":
         return None
@@ -56,43 +56,43 @@ def _constraint(mission: Mission) -> list[Line]:
     c = mission.constraint
     found = []
     if c.stabilisation == "none":
-        found.append(Line("constraint force", "no feedback", "errors of distances stay and grow"))
+        found.append(Line("constraint force", "no feedback", "distance errors remain and grow"))
     else:
         gain = f"α = {c.alpha:.4g} /s, β = {c.beta:.4g} /s, γ = {c.gamma:.4g} /s³"
         poles = ", ".join(_pole(s) for s in pid.poles(c.alpha, c.beta, c.gamma))
         found += [
-            Line("constraint feedback", gain, "an error c of a distance obeys c‴ + 2α c″ + β² c′ + γ c = 0"),
-            Line("its poles", f"{poles} /s", "all on the left: every error dies out"),
+            Line("constraint feedback", gain, "a distance error c obeys c‴ + 2α c″ + β² c′ + γ c = 0"),
+            Line("poles of the error", f"{poles} /s", "all have negative real parts: every error decays"),
         ]  # fmt: skip
         if c.gamma > 0:
             margin = 2 * c.alpha * c.beta**2 / c.gamma
-            meaning = f"γ may grow to {margin:.3g} times its value before an error grows (2αβ² > γ)"
+            meaning = f"errors decay until γ reaches {margin:.3g} times its value (2αβ² > γ)"
             found.append(Line("stability margin", f"{margin:.3g}", meaning))
         settled = settling(mission)
         if settled is not None:
             beyond = 100 * pid.overshoot(c.alpha, c.beta, c.gamma)
-            why = "its integral has to return to zero" if c.gamma > 0 else "there is no integral"
+            why = "the integral must return to zero" if c.gamma > 0 else "there is no integral term"
             found += [
-                Line("settling", f"{settled:.3g} s", "until an error is below 2 % for good"),
-                Line("overshoot", f"{beyond:.3g} %", f"how far an error passes zero: {why}"),
+                Line("settling", f"{settled:.3g} s", "time until an error stays below 2 %"),
+                Line("overshoot", f"{beyond:.3g} %", f"an error passes zero by this share: {why}"),
             ]
     setting = {
         "iterated": f"μ = {_damping(mission)}, {c.iterations} iterations",
         "spectral": f"s₀ = {c.threshold:g}",
         "exact": "",
-        "pinv": f"cut-off {c.cutoff:g} of the largest w",
+        "pinv": f"cut-off at {c.cutoff:g} of the largest w",
     }[c.solver]
     value = f"{c.solver} ({setting})" if setting else c.solver
     found.append(Line("solver", value, _SOLVERS[c.solver]))
     if any(phase.control != "tracking" for phase in mission.phases):
         rate = f"{c.deformation_damping:g} /s"
-        meaning = "what distances do not see dies out at this rate while no slots are tracked"
+        meaning = "motions that change no distance decay at this rate while no slots are tracked"
         found.append(Line("deformation damping", rate, meaning))
     return found
 
 
 def _damping(mission: Mission) -> str:
-    """Damping of the iterated solve: of all formations, if it follows them."""
+    """Damping of the iterated solve; its range over all formations if it depends on them."""
     every = [mission.damping(name) for name in mission.formations] or [mission.damping(None)]
     low, high = f"{min(every):.2g}", f"{max(every):.2g}"
     return low if low == high else f"{low} to {high}"
@@ -120,19 +120,21 @@ def _regulator(name: str, regulator: Regulator) -> Line:
         value = f"k₁ = {k1:.3g} /s², k₂ = {k2:.3g} /s"
         return Line(f"{name}, infinite horizon", value, _second_order(k1, k2))
     q, r, s = (_weights(w) for w in (regulator.Q, (regulator.R,), regulator.S))
-    meaning = "gains rise towards the arrival, where S weighs position and velocity"
+    meaning = "gains rise towards arrival, where S weighs errors of position and velocity"
     if not any(regulator.Q):
-        meaning = "the least acceleration that arrives, as S weighs it, in position and velocity"
+        meaning = (
+            "least acceleration to arrive; S weighs errors of position and velocity at arrival"
+        )
     return Line(f"{name}, finite horizon", f"Q = {q}, R = {r}, S = {s}", meaning)
 
 
 def _second_order(k1: float, k2: float) -> str:
-    """What x'' = -k1 x - k2 x' does."""
+    """Behaviour of x'' = -k1 x - k2 x' in words."""
     omega = math.sqrt(k1)
     zeta = k2 / (2 * omega)
     slowest = omega * (zeta - math.sqrt(zeta**2 - 1)) if zeta > 1 else omega * zeta
     return (
-        f"an error swings at {omega:.3g} rad/s with damping ratio {zeta:.2f}, "
+        f"an error oscillates at {omega:.3g} rad/s with damping ratio {zeta:.2f} "
         f"and falls to 2 % in about {4 / slowest:.2g} s"
     )
 

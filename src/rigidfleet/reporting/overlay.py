@@ -1,4 +1,4 @@
-"""Figures of several flights over each other, a colour for each flight; and the answer of the gains."""
+"""Figures that overlay several flights, one colour each, and the response of the gains."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ if TYPE_CHECKING:
 
 Floats = st.Floats
 
-_WIDTHS = (2.6, 0.9)  # of lines, first flight to last: each shows under the next
+_WIDTHS = (2.6, 0.9)  # of lines, first flight to last: each remains visible under the next
 
 
 def paths(flights: Sequence[Result], labels: Sequence[str]) -> bytes:
-    """Way of the centre of mass from above, and its height over time; an SVG."""
+    """Path of the centre of mass from above, and its height over time, as an SVG."""
     from matplotlib.figure import Figure
 
     with st.settings():
@@ -36,24 +36,26 @@ def paths(flights: Sequence[Result], labels: Sequence[str]) -> bytes:
         above.set(xlabel="x, east [m]", ylabel="y, north [m]", title="centre of mass from above")
         above.set_aspect("equal", adjustable="datalim")
         above.margins(0.05)
-        height.set(xlabel="time [s]", ylabel="z [m]", title="its height")
+        height.set(xlabel="time [s]", ylabel="z [m]", title="height of the centre of mass")
         _key(fig, flights, labels)
         return _svg(fig)
 
 
 def over_time(flights: Sequence[Result], labels: Sequence[str]) -> bytes:
-    """Closeness, thrust, speed and errors over time; an SVG."""
+    """Distances, thrust, speed and errors over time, as an SVG."""
     from matplotlib.figure import Figure
 
     panels: list[tuple[str, Callable[[Result], Floats], bool]] = [
-        ("least room between vehicles [m]", lambda r: _finite(r.separation), False),
+        ("least distance between vehicles [m]", lambda r: _finite(r.separation), False),
         ("greatest thrust [N]", lambda r: _greatest(r.thrust), False),
         ("greatest speed [m/s]", lambda r: _greatest(np.linalg.norm(r.velocity, axis=2)), False),
-        ("greatest miss of a slot [m]", slot_error, True),
+        ("greatest distance from a slot [m]", slot_error, True),
         ("greatest constraint error [m]", lambda r: _greatest(np.abs(r.constraint)), True),
     ]
     if any(flight.mission.obstacles for flight in flights):
-        panels.insert(1, ("least clearance [m]", lambda r: _finite(r.clearance), False))
+        panels.insert(
+            1, ("least distance to an obstacle [m]", lambda r: _finite(r.clearance), False)
+        )
     with st.settings():
         rows = (len(panels) + 1) // 2
         fig = Figure(figsize=(st.WIDTH, 0.6 + 1.9 * rows), layout="constrained")
@@ -81,7 +83,7 @@ def over_time(flights: Sequence[Result], labels: Sequence[str]) -> bytes:
 
 
 def response(missions: Sequence[Mission], labels: Sequence[str]) -> bytes | None:
-    """What an error of a distance does that starts at rest, under each mission's gains; an SVG."""
+    """Response of a distance error with c'(0) = 0 under each mission's gains, as an SVG."""
     from matplotlib.figure import Figure
 
     times = [s for m in missions if (s := gains.settling(m)) is not None]
@@ -104,12 +106,12 @@ def response(missions: Sequence[Mission], labels: Sequence[str]) -> bytes | None
 
 
 def slot_error(result: Result) -> Floats:
-    """Greatest distance (K,) [m] of an agent from its slot; NaN where there is none."""
+    """Greatest distance (K,) [m] of an agent from its slot; NaN if there is no slot."""
     return _greatest(np.linalg.norm(result.position - result.slot_position, axis=2))
 
 
 def _panel(ax: Axes, flight: Result, values: Floats, look: dict[str, Any]) -> bool:
-    """Draw one flight's line; whether there was anything to draw."""
+    """Draw one flight's line; return whether there was anything to draw."""
     st.line(ax, flight.time, values, **look)
     return bool(np.isfinite(values).any())
 
@@ -119,7 +121,7 @@ def _finite(values: Floats) -> Floats:
 
 
 def _greatest(values: Floats) -> Floats:
-    """Greatest of values (K, n) at each sample; NaN where there are none."""
+    """Greatest of values (K, n) at each sample; NaN if there are none."""
     return np.fmax.reduce(_finite(values), axis=1, initial=np.nan)
 
 

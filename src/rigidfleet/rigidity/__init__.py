@@ -1,4 +1,4 @@
-"""Rigidity: what distances hold of a shape, what they leave free, and which other shapes they allow."""
+"""Rigidity: which motions of a shape the distances prevent, which remain free, and which other shapes they allow."""
 
 from rigidfleet.math.constraint_jacobian import jacobian
 from rigidfleet.rigidity.analysis import Rigidity, RigidityClass, analyse, full_rank

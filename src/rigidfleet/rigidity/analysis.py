@@ -1,4 +1,4 @@
-"""The verdict on a formation: does it hold its shape by distances alone, why, and what stays free."""
+"""Rigidity of a formation: whether distances alone hold its shape, why, and which motions stay free."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from rigidfleet.typing import Floats, Ints
 
 
 class RigidityClass(StrEnum):
-    """What distances make of a shape."""
+    """How rigid the distances make a shape."""
 
     INFINITESIMALLY_RIGID = "infinitesimally rigid"
     PRESTRESS_STABLE = "prestress-stable"
@@ -25,7 +25,7 @@ class RigidityClass(StrEnum):
     UNDECIDED = "undecided"
 
 
-#: Below this index a formation is rigid in name: 1 mm of error in lengths hides 1 m of displacement.
+#: Index below which a formation is rigid in name only: 1 mm of length error allows 1 m of displacement.
 _BARELY = 1e-3
 
 _WHERE = {0: "point", 1: "line", 2: "plane", 3: "space"}
@@ -33,7 +33,7 @@ _WHERE = {0: "point", 1: "line", 2: "plane", 3: "space"}
 
 @dataclass(frozen=True)
 class Rigidity:
-    """What the distances of some edges hold of a shape, and what they leave free.
+    """Rigidity of a shape under the distances of some edges, and the motions they leave free.
 
     Attributes
     ----------
@@ -41,16 +41,16 @@ class Rigidity:
     dimension : 0 a point, 1 a line, 2 a plane, 3 a spatial shape
     space : dimension of the space in which the agents may move
     rank : of J, the number of independent edges
-    reachable : the most that J can have at slots like these: 3N - 6 in space, 2N - 3 in a plane, N - 1 on a line
+    reachable : greatest rank of J for slots of this dimension: 3N - 6 in space, 2N - 3 in a plane, N - 1 on a line
     needed : rank of an infinitesimally rigid framework: 3N - 6 (N = 2: 1; N = 1: 0) where the space is 3-D
-    redundant : edges any one of which could go without loss of rank
-    spare : edges that could all go at once, m - rank of them, long ones first
+    redundant : edges of which any single one could be removed without loss of rank
+    spare : m - rank edges that could be removed together, long ones first
     flexes : a basis of the motions that change no distance to first order, fewest agents first
     index : smallest non-zero singular value of J M^-1/2 sqrt(mbar), the rigidity index; NaN without edges
-    verdict, reason : and why, in words
-    stress : (m,) blocking self-stress, the largest force 1 N, where one was found
-    deformed : (N, 3) another shape with the same distances, reached by a finite motion, where one was found
-    within : verdict on a flat shape in its own plane, on a straight one in its own line
+    verdict, reason : the class, and its reason in words
+    stress : (m,) blocking self-stress, scaled to a largest force of 1 N, if one was found
+    deformed : (N, 3) another shape with the same distances, reached by a finite motion, if one was found
+    within : rigidity of a flat shape in its own plane, or of a straight one on its own line
     """
 
     agents: int
@@ -81,14 +81,14 @@ class Rigidity:
         return self.verdict in (RigidityClass.INFINITESIMALLY_RIGID, RigidityClass.PRESTRESS_STABLE)
 
     def force(self, b: float, mass: float = 1.0) -> float:
-        """Greatest norm of f_C (all agents) [N] that a right side b of norm `b` [m/s^2] asks of the exact law.
+        """Greatest norm of f_C (all agents) [N] under the exact law for a right side of norm `b` [m/s^2].
 
         |f_C| <= m |b| / index for equal masses: a shape of half the index may need twice the force.
         """
         return mass * b / self.index
 
     def offset(self, error: float) -> float:
-        """Greatest displacement (norm over all agents) [m] behind errors of lengths of norm `error` [m]."""
+        """Greatest displacement (norm over all agents) [m] for length errors of norm `error` [m]."""
         return error / self.index
 
     def data(self) -> dict[str, Any]:
@@ -120,9 +120,9 @@ class Rigidity:
 def analyse(
     slots: ArrayLike, edges: ArrayLike, *, space: int = 3, masses: ArrayLike | None = None
 ) -> Rigidity:
-    """Judge a formation: rank, redundant edges, free motions, rigidity index and verdict.
+    """Analyse a formation: rank, redundant edges, free motions, rigidity index and class.
 
-    The verdict is reached in this order, and each step is a proof up to rounding:
+    The class is determined in this order; each step is a proof up to rounding:
 
     1. no flex: infinitesimally rigid (so rigid);
     2. flexible already within the shape's own plane or line: flexible;
@@ -130,20 +130,20 @@ def analyse(
        1978: near such points the lengths' level sets are manifolds, larger than the rigid motions);
     4. a self-stress with positive energy on every flex: prestress-stable (so rigid);
     5. a finite motion followed numerically, with lengths equal to 1e-12: flexible;
-    6. else undecided.
+    6. otherwise: undecided.
 
     Parameters
     ----------
     slots : (N, 3) [m], or (N, d) with d <= 3
     edges : (m, 2), agents from 0
-    space : the agents move in a space of this dimension; less than 3 holds them in the shape's plane or line
+    space : dimension of the space in which the agents move; below 3, they stay in the shape's plane or line
     masses : (N,) [kg], default equal
 
     Raises
     ------
     ValueError
-        An edge names an agent that there is not, joins an agent to itself or two in one place, or is there
-        twice; a slot is not finite; the shape does not fit into the space; a mass is not positive.
+        An edge names an agent that does not exist, joins an agent to itself or two agents at the same place, or
+        occurs twice; a slot is not finite; the shape does not fit into the space; or a mass is not positive.
     """
     p, e = checked(slots, edges)
     n = len(p)
@@ -178,13 +178,13 @@ def analyse(
 
 
 def full_rank(n: int, d: int) -> int:
-    """Most independent distances of n points that span d dimensions: n d - d (d + 1) / 2 where n > d."""
+    """Greatest number of independent distances of n points that span d dimensions: n d - d (d + 1) / 2 for n > d."""
     d = min(d, max(n - 1, 0))
     return n * d - d * (d + 1) // 2
 
 
 def checked(slots: ArrayLike, edges: ArrayLike) -> tuple[Floats, Ints]:
-    """Slots (N, 3) and edges (m, 2) as arrays; a ValueError where they are no framework."""
+    """Slots (N, 3) and edges (m, 2) as arrays; a ValueError if they are no framework."""
     p = np.asarray(slots, dtype=np.float64)
     if p.ndim != 2 or not len(p) or not 1 <= p.shape[1] <= 3:
         raise ValueError(f"slots must be (N, 3) [m] with N >= 1, not {p.shape}")
@@ -196,12 +196,12 @@ def checked(slots: ArrayLike, edges: ArrayLike) -> tuple[Floats, Ints]:
     for k, (i, j) in enumerate(e.tolist()):
         name = f"edge {k + 1}, agents {i + 1} and {j + 1},"
         if not (0 <= i < len(p) and 0 <= j < len(p)):
-            raise ValueError(f"{name} names an agent that there is not; there are {len(p)}")
+            raise ValueError(f"{name} names an agent that does not exist; there are {len(p)}")
         if i == j:
             raise ValueError(f"{name} joins an agent to itself")
         first = seen.setdefault((min(i, j), max(i, j)), k)
         if first != k:
-            raise ValueError(f"{name} is edge {first + 1} again")
+            raise ValueError(f"{name} repeats edge {first + 1}")
     length = np.linalg.norm(p[e[:, 0]] - p[e[:, 1]], axis=1)
     short = np.flatnonzero(length <= 1e-9 * np.abs(p - p.mean(axis=0)).max())
     if len(short):
@@ -225,7 +225,7 @@ def _index(frame: Framework, masses: ArrayLike | None) -> float:
         return float(frame.s[-1]) if frame.rank else np.nan
     m = np.asarray(masses, dtype=np.float64)
     if m.shape != (len(frame.p),) or not (m > 0).all() or not np.isfinite(m).all():
-        raise ValueError(f"masses must be {len(frame.p)} numbers > 0 kg")
+        raise ValueError(f"masses must be {len(frame.p)} numbers > 0 [kg]")
     if not frame.rank or (m == m[0]).all():
         return _index(frame, None)
     J = jacobian(frame.p, frame.edges)
@@ -241,7 +241,7 @@ def _judge(
     if k == 0:
         reason = "every motion changes a distance"
         if frame.rank and frame.s[-1] < _BARELY:
-            reason += f", but one of them hardly (index {frame.s[-1]:.1e}): expect large forces"
+            reason += f", but one motion hardly does (index {frame.s[-1]:.1e}): expect large forces"
         return RigidityClass.INFINITESIMALLY_RIGID, reason, None, None
     if within is not None and within.verdict is RigidityClass.FLEXIBLE:
         where = _WHERE[within.dimension]
@@ -253,8 +253,8 @@ def _judge(
         )
     if frame.rank == _generic_rank(frame):
         reason = (
-            f"{_count(k, 'motion')} free, and the rank {frame.rank} is the greatest that these edges have "
-            "anywhere, so the shape moves on (Asimow and Roth)"
+            f"{_count(k, 'motion')} free, and {frame.rank} is the greatest rank that these edges have at any "
+            "positions, so the motion is finite (Asimow and Roth)"
         )
         return RigidityClass.FLEXIBLE, reason, None, None
     energy = StressEnergy(frame)
@@ -264,15 +264,15 @@ def _judge(
         return RigidityClass.PRESTRESS_STABLE, reason, stress, None
     bent, goes_on = finite_flex(StressEnergy(frame, frame.flexes @ open_flexes))
     if bent is not None:
-        reason = "a finite motion was followed that keeps all distances"
+        reason = "a finite motion that keeps all distances was found and followed"
         return RigidityClass.FLEXIBLE, reason, None, bent
     reason = (
         f"{_count(k, 'motion')} free to first order; "
         + ("no self-stress blocks all of them" if none_exists else "no blocking stress was found")
         + (
-            "; one goes on to second order, but could not be followed farther"
+            "; one extends to second order, but could not be followed further"
             if goes_on
-            else "; none was found that goes on to second order, so it is probably rigid, but softly"
+            else "; none was found that extends to second order, so the shape is probably rigid, but soft"
         )
     )
     return RigidityClass.UNDECIDED, reason, None, None
@@ -283,7 +283,7 @@ def _count(k: int, what: str) -> str:
 
 
 def _generic_rank(frame: Framework) -> int:
-    """Greatest rank of J over all positions of the agents: that at random ones, almost surely."""
+    """Greatest rank of J over all positions of the agents; random positions have it almost surely."""
     if frame.stresses == 0:
         return frame.rank
     random = np.random.default_rng(1).normal(size=frame.p.shape)

@@ -1,7 +1,7 @@
-"""Choose the edges of a formation: as few as hold the shape, or some more, with the best rigidity index.
+"""Choose the edges of a formation: the fewest that hold the shape, or some more, with the best rigidity index.
 
-Of all graphs that hold a shape with a given number of edges, that one is wanted whose Jacobian has the greatest
-smallest singular value, because forces and displacements behind small errors of lengths grow with its inverse
+Among all graphs that hold a shape with a given number of edges, the best one has the Jacobian with the greatest
+smallest singular value, because forces, and displacements due to small length errors, grow with its inverse
 (`rigidity.Rigidity.force`). In statistics this is the E-optimal design of an experiment. The search
 drops the least useful of all candidates, and then exchanges edges as long as that helps.
 """
@@ -20,19 +20,19 @@ from rigidfleet.formation.graphs import complete_graph, henneberg, henneberg_mul
 from rigidfleet.rigidity import full_rank, jacobian, rigid_motions
 from rigidfleet.typing import Floats, Ints
 
-#: How near to the smallest eigenvalue the barrier of the exchange comes, step by step.
+#: Positions of the exchange's barrier, as shares of the smallest eigenvalue, step by step.
 _BARRIERS = (0.0, 0.5, 0.8, 0.95)
 
 #: Work of a search, in multiplications: a few seconds.
 _WORK = 3e9
 
-#: Eigenvalues below this are those of an edge too few.
+#: Eigenvalues below this count as zero: an edge is missing.
 _SINGULAR = 1e-9
 
-#: So many perturbed designs in a row may bring nothing better before the search ends.
+#: Number of perturbed designs without improvement, in a row, after which the search ends.
 _PATIENCE = 60
 
-#: So many newcomers, those that help most, are tried against all that could go.
+#: Number of candidate edges, the most helpful ones, that are tried against all that could be removed.
 _WORTH = 500
 
 
@@ -43,15 +43,15 @@ def design(
     sensing_range: float | None = None,
     seed: int = 0,
 ) -> Ints:
-    """Edges (m, 2), i < j, in lexical order, that hold a shape with the best rigidity index found.
+    """Edges (m, 2), i < j, in lexical order, that hold a shape, with the best rigidity index found.
 
-    As many as the shape can use, 3N - 6 in space, 2N - 3 in a plane, N - 1 on a line (`limits` says what
-    distances do not hold there), and `extra` redundant ones. With M = sum of a a^T over the chosen rows a of
-    J (less the rigid motions) and w its smallest eigenvalue, edges are exchanged, the best pair at a time, as long
-    as that lowers the barrier potential tr (M - t)^-1, t = 0, then nearer and nearer to w (Batson,
-    Spielman and Srivastava, 2012). The search starts from all candidates thinned out, from Delaunay's
-    triangulation or from the convex hull, whichever is best, and again from perturbed designs while its budget
-    lasts: a tenth of a second for 8 agents, some seconds for 30 to 100.
+    The number of edges is 3N - 6 in space, 2N - 3 in a plane and N - 1 on a line (`limits` says what distances do not
+    hold there), plus `extra` redundant ones. Let M be the sum of a a^T over the chosen rows a of J (without the rigid
+    motions), and w its smallest eigenvalue. Edges are exchanged, the best pair at a time, as long as this lowers the
+    barrier potential tr (M - t)^-1, for t = 0 and then closer and closer to w (Batson, Spielman and Srivastava,
+    2012). The search starts from all candidates thinned out, from Delaunay's triangulation or from the convex hull,
+    whichever is best, and again from perturbed designs while its budget lasts: a tenth of a second for 8 agents, some
+    seconds for 30 to 100.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ def design(
     Raises
     ------
     ValueError
-        Two slots coincide; or no edges within range hold the shape, with the range that would do.
+        Two slots coincide; or no edges within range hold the shape (the message gives a sufficient range).
     """
     p = np.asarray(slots, dtype=np.float64)
     flat = _flat(p)
@@ -105,7 +105,7 @@ def design(
 
 
 def limits(slots: ArrayLike) -> str:
-    """What distances cannot hold of a flat or straight shape, in words; "" for a spatial one."""
+    """Motions of a flat or straight shape that distances cannot prevent, in words; "" for a spatial shape."""
     n, d = len(np.asarray(slots)), dimension(slots)
     if d == 3 or n <= d + 1:
         return ""
@@ -114,13 +114,13 @@ def limits(slots: ArrayLike) -> str:
         2: ("flat", n - 3, "out of the plane"),
     }.get(d, ("a point", 0, ""))
     return (
-        f"The shape is {where}: to first order no distance resists motion {free}, which leaves {count} "
-        f"motion{'s' * (count != 1)} free whatever the edges. Redundant edges may still block them by a self-stress, "
-        "softly; slots hold them firmly (control = 'tracking')."
+        f"The shape is {where}: to first order no distance resists motion {free}, so {count} "
+        f"motion{'s' * (count != 1)} stay{'s' * (count == 1)} free with any edges. Redundant edges can block them by a "
+        "self-stress, but only softly; slots hold them firmly (control = 'tracking')."
     )
 
 
-#: Graphs that have a name in missions, from slots (N, 3) and, of neighbours, their reach in spacings.
+#: Graphs with a name in missions, made from slots (N, 3) and, for neighbours, their reach in spacings.
 GRAPHS: dict[str, Callable[[Floats, float], Ints]] = {
     "complete": lambda p, _: complete_graph(len(p)),
     "neighbours": neighbours,
@@ -134,7 +134,7 @@ def mission_fragment(
 ) -> str:
     """A formation as a part of a mission file, agents counted from 1.
 
-    The name is quoted where TOML asks for it. Slots keep all their digits, since flat shapes need them. ``edges`` may
+    The name is quoted if TOML requires it. Slots keep all digits, because flat shapes need them. ``edges`` may
     be one of `GRAPHS`.
     """
     from rigidfleet._toml import toml_key
@@ -162,7 +162,7 @@ def _flat(p: Floats) -> Floats:
 
 
 def _rows(flat: Floats, edges: Ints) -> Floats:
-    """Rows of J (m, r) in coordinates of the motions that are not rigid."""
+    """Rows of J (m, r) in coordinates of the non-rigid motions."""
     n, d = flat.shape
     rigid = rigid_motions(flat)
     rest = np.linalg.svd(rigid, full_matrices=True)[0][:, rigid.shape[1] :].reshape(n, d, -1)
@@ -194,7 +194,7 @@ def _assert_holds(rows: Floats, length: Floats, reach: float, rank: int) -> None
         low, high = (low, middle) if reached(steps[middle] * (1 + 1e-8)) == rank else (middle, high)
     raise ValueError(
         f"a sensing range of {reach:.6g} m gives only {got} of the {rank} independent edges that "
-        f"hold this shape; {steps[high]:.6g} m would do"
+        f"hold this shape; {steps[high]:.6g} m is enough"
     )
 
 
@@ -217,7 +217,7 @@ def _meshes(flat: Floats, near: Ints) -> list[Ints]:
 
 
 def _thin(rows: Floats, chosen: Ints, wanted: int) -> Ints:
-    """Of the chosen rows those (wanted,) that are left when the least useful go, a tenth of the surplus at a time.
+    """The chosen rows reduced to (wanted,): the least useful are removed, a tenth of the surplus at a time.
 
     Without row a, tr M^-1 grows by |M^-1 a|^2 / (1 - a^T M^-1 a).
     """
@@ -233,14 +233,14 @@ def _thin(rows: Floats, chosen: Ints, wanted: int) -> Ints:
         drop = max(1, int(share * surplus))
         keep = np.sort(np.argsort(loss, kind="stable")[drop:])
         if drop > 1 and _least(A[keep]) < 1e-3 * _least(A):
-            share /= 2  # together they were of use
+            share /= 2  # rank lost: remove fewer at a time
             continue
         chosen = chosen[keep]
     return chosen
 
 
 def _grown(rows: Floats, chosen: Ints, wanted: int) -> Ints:
-    """The chosen rows and the most useful of the others, (wanted,); just any where the chosen ones lack rank."""
+    """The chosen rows and the most useful of the others, (wanted,); arbitrary others if the chosen rows lack rank."""
     while len(chosen) < wanted:
         A = rows[chosen]
         other = np.setdiff1d(np.arange(len(rows)), chosen)
@@ -300,7 +300,7 @@ def _perturbed(rows: Floats, chosen: Ints, rng: np.random.Generator) -> Ints:
     other = np.setdiff1d(np.arange(m), chosen)
     add = min(len(other), int(rng.integers(2, max(3, wanted // 3) + 1)))
     some = np.concatenate([chosen, rng.choice(other, add, replace=False)])
-    # Whatever was added stays unless that loses rank: old edges go first, in random order.
+    # Old edges are removed first, in random order; added ones stay unless rank is lost.
     order = rng.permutation(wanted)
     keep = np.ones(len(some), dtype=bool)
     gone = 0

@@ -1,4 +1,4 @@
-"""First order: the Jacobian of the distances, its rank, stresses and free motions.
+"""First-order rigidity: the Jacobian of the distances, its rank, stresses and free motions.
 
 A framework is points joined by bars: slots and edges. Row k of its Jacobian J holds the unit vector u of edge
 k = (i, j) at i and -u at j, as in the constraint force (theory, section 1); J v are the rates of the lengths.
@@ -18,10 +18,10 @@ from rigidfleet.typing import Floats, Ints
 #: Singular values below this times the largest are zero: points rounded to seven digits count as flat.
 ZERO = 1e-7
 
-#: In a flex whose fastest agent has speed 1, an agent slower than this stands still.
+#: Speed below which an agent counts as at rest in a flex whose fastest agent has speed 1.
 _STILL = 1e-5
 
-#: Squares that have been reduced to this share of themselves have few right digits left.
+#: Share of the original squares below which the remainder has too few correct digits.
 _SPENT = 1e-8
 
 
@@ -44,20 +44,20 @@ class Flex(NamedTuple):
     """A motion that changes no distance of an edge to first order, up to a rigid motion of all agents."""
 
     agents: tuple[int, ...]
-    """Those that move; the others stand still."""
+    """Agents that move; the others are at rest."""
     motion: Floats
     """Velocities (N, 3), the fastest of 1 m/s."""
 
 
 @dataclass(frozen=True)
 class Framework:
-    """Points (N, d) joined by edges (m, 2), and what the singular values of J tell about them.
+    """Points (N, d) joined by edges (m, 2), with the singular value decomposition of J.
 
     Attributes
     ----------
-    span : (m, rank) orthonormal, the range of J; what is orthogonal to it is a self-stress
+    span : (m, rank) orthonormal basis of the range of J; self-stresses are orthogonal to it
     s : (rank,) non-zero singular values of J, descending
-    null : (N d, .) orthonormal, all motions that change no distance, rigid ones among them
+    null : (N d, .) orthonormal basis of all motions that change no distance, including rigid ones
     """
 
     p: Floats
@@ -96,7 +96,7 @@ class Framework:
 
     @property
     def stresses(self) -> int:
-        """Dimension of the space of self-stresses, and the number of edges too many."""
+        """Dimension of the space of self-stresses, which is the number of surplus edges."""
         return len(self.edges) - self.rank
 
     @cached_property
@@ -119,30 +119,30 @@ class Framework:
         return self.null @ u[:, -k:]
 
     def redundant(self) -> Ints:
-        """Edges any one of which could go without loss of rank: those that some self-stress loads."""
+        """Edges of which any single one could be removed without loss of rank: those that some self-stress loads."""
         return np.flatnonzero(1 - (self.span**2).sum(axis=1) > ZERO)
 
     def spare(self) -> Ints:
-        """Edges that could all go at once without loss of rank, long ones first."""
+        """Edges that could all be removed at once without loss of rank, long ones first."""
         if self.stresses == 0:
             return np.zeros(0, dtype=np.int64)
-        # Pivoting takes the largest remainder: a weight makes short edges large. It spans the range all the
-        # same, since each pivot is independent of those before.
+        # Pivoting takes the largest remainder, so weights make short edges come first. The pivots still span the
+        # range, since each is independent of those before.
         weight = self.lengths.min() / self.lengths
         kept = _independent(weight[:, None] * self.span)
         return np.setdiff1d(np.arange(len(self.edges)), kept)
 
 
 def _independent(rows: Floats) -> Ints:
-    """As many independent rows (k,) as there are columns of rows (., k), which has full rank: large ones first.
+    """Indices (k,) of k independent rows of ``rows`` (., k), which has full rank; large rows first.
 
-    QR with column pivoting: each is the row whose part beyond the span of those before is largest.
+    QR with column pivoting: each is the row with the largest part outside the span of those before.
     """
     k = rows.shape[1]
     rest, Q, kept = (rows**2).sum(axis=1), np.zeros((k, k)), np.zeros(k, dtype=np.int64)
     trusted = rest.max(initial=0.0)
     for n in range(k):
-        if rest.max() < _SPENT * trusted:  # what is left of the squares is rounding: anew
+        if rest.max() < _SPENT * trusted:  # only rounding is left of the squares: recompute them
             beyond = rows - rows @ Q[:n].T @ Q[:n]
             rest = (beyond**2).sum(axis=1)
             rest[kept[:n]] = 0.0
@@ -160,11 +160,10 @@ def _independent(rows: Floats) -> Ints:
 def localised(frame: Framework) -> list[tuple[tuple[int, ...], Floats]]:
     """A basis of the flexes, each moving few agents: [(agents, motion (N, d))], fewest first.
 
-    Any flex plus any rigid motion is the same flex, so there is a choice of who stands still. Candidates are
-    the motions of single agents that their edges leave free, and, for each agent, the motion of least
-    sum of speeds in which it moves (by iteratively reweighted least squares: such sums favour
-    motions of few). Of all candidates the greedy choice, fewest agents first, is a basis of the least
-    total number of agents that they allow.
+    A flex plus any rigid motion is the same flex, so which agents are at rest is a choice. Candidates are the motions
+    of single agents that their edges leave free and, for each agent, the motion with the least sum of speeds in which
+    it moves (by iteratively reweighted least squares; this sum favours motions of few agents). The greedy choice among
+    all candidates, fewest agents first, is the basis with the least total number of moving agents.
     """
     n, d = frame.p.shape
     F = frame.flexes
@@ -184,7 +183,7 @@ def localised(frame: Framework) -> list[tuple[tuple[int, ...], Floats]]:
 
 
 def _apart(motions: list[Floats]) -> list[tuple[tuple[int, ...], Floats]]:
-    """Motions (N, d) with the agents that move, fewest first, without what is some fewer agents' own."""
+    """Motions (N, d) with their moving agents, fewest first, without parts that fewer agents already have."""
     out: list[tuple[tuple[int, ...], Floats]] = []
     for motion in sorted(motions, key=lambda f: int(np.count_nonzero(np.any(f, axis=1)))):
         f, moves = motion.copy(), set(np.flatnonzero(np.any(motion, axis=1)).tolist())
@@ -221,7 +220,7 @@ class _Basis:
 
 
 def _single(frame: Framework) -> list[Floats]:
-    """Motions of one agent that all its edges leave free, agents of few edges first."""
+    """Motions of one agent that all its edges leave free; agents with few edges come first."""
     n, d = frame.p.shape
     J = jacobian(frame.p, frame.edges).reshape(-1, n, d)
     degree = np.bincount(frame.edges.ravel(), minlength=n)
@@ -236,17 +235,17 @@ def _single(frame: Framework) -> list[Floats]:
 
 
 def sparse(flexes: Floats, rigid: Floats, n: int, most: int = 1 << 30) -> list[Floats]:
-    """Flexes (N, d) that move few agents: for each agent one of least sum of speeds in which it moves.
+    """Flexes (N, d) that move few agents: for each agent, the one with the least sum of speeds in which it moves.
 
     Parameters
     ----------
     flexes, rigid : (N d, .) orthonormal; any rigid motion may be added to a flex
-    most : take no more agents than this
+    most : greatest number of agents considered
     """
     V = np.column_stack([flexes, rigid])
     blocks = V.reshape(n, len(V) // n, -1)
     part, strength, _ = np.linalg.svd(blocks[:, :, : flexes.shape[1]], full_matrices=False)
-    # Reweighting costs N d k^2 a step: with many agents and flexes, some are left out to stay below a second.
+    # Reweighting costs N d k^2 per step; with many agents and flexes, some are skipped to stay below a second.
     most = min(most, max(8, int(1.5e9 / (20.0 * V.shape[0] * V.shape[1] ** 2))))
     seeds = np.flatnonzero(strength[:, 0] > _STILL)
     found = []
@@ -263,7 +262,7 @@ def sparse(flexes: Floats, rigid: Floats, n: int, most: int = 1 << 30) -> list[F
 
 
 def _cleaned(motion: Floats, V: Floats) -> Floats:
-    """The nearest motion in the span of V in which agents that all but stand still do so."""
+    """The nearest motion in the span of V in which nearly resting agents are at rest."""
     n = len(motion)
     speed = np.linalg.norm(motion, axis=1)
     still = speed <= _STILL * speed.max()

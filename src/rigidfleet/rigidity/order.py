@@ -1,4 +1,4 @@
-"""Beyond first order: whether a self-stress blocks the flexes, or one of them goes on.
+"""Second-order rigidity: whether a self-stress blocks the flexes, or a flex extends to a finite motion.
 
 Connelly and Whiteley, "Second-order rigidity and prestress stability in tensegrity frameworks" (1996): a
 self-stress (forces f_k along the edges, in balance at each agent) with densities omega_k = f_k / L_k gives
@@ -7,7 +7,7 @@ a flex q the energy
     E(q) = sum_k omega_k |q_i - q_j|^2,
 
 quadratic in the flex. If some stress has E > 0 for every flex, the framework is rigid (prestress-stable). If
-E(q) = 0 for every stress, q goes on to second order.
+E(q) = 0 for every stress, q extends to second order.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ from rigidfleet.math.rigid_body import kabsch
 from rigidfleet.rigidity.framework import Framework, sparse
 from rigidfleet.typing import Floats, Ints
 
-#: A stress blocks all flexes when its least energy is more than this times its largest.
+#: A stress blocks all flexes if its least energy exceeds this share of its greatest energy.
 _DEFINITE = 1e-7
 
-#: Lengths that agree within this times the size of the shape are the same.
+#: Lengths that differ by less than this share of the shape's size count as equal.
 _EQUAL = 1e-12
 
-#: A flex is finite when it takes some agent this far, times the size of the shape; a walk along it ends at _FAR.
-#: A rigid framework of order n would be off by about the n-th power of it: far more than _EQUAL.
+#: A flex is finite if it moves an agent this far, as a share of the shape's size; a walk along it ends at _FAR.
+#: A framework rigid at order n would be off by about the n-th power of it, which is far more than _EQUAL.
 _FINITE, _FAR = 0.01, 0.1
 
 
 class StressEnergy:
     """The energies of all self-stresses on flexes of a framework.
 
-    `flexes` (N d, k), orthonormal, are all of them by default.
+    `flexes` (N d, k) are orthonormal; by default all flexes.
     """
 
     def __init__(self, frame: Framework, flexes: Floats | None = None) -> None:
@@ -58,14 +58,14 @@ class StressEnergy:
         return (self._F.transpose(0, 2, 1) @ (omega @ self._F)).sum(axis=0)
 
     def adjoint(self, Y: Floats) -> Floats:
-        """Self-stress (m,) with which every other stress has the inner product <Y, E>."""
+        """The self-stress (m,) whose inner product with any stress is <Y, E> of that stress."""
         G = (self._F @ Y @ self._F.transpose(0, 2, 1)).sum(axis=0)
         diagonal = np.diag(G)
         reach = diagonal[self._i] + diagonal[self._j] - 2 * G[self._i, self._j]
         return self.stress(reach / self._length)
 
     def left_over(self, q: Floats) -> Floats:
-        """What stops a flex with coordinates q at second order (m,): 0 if nothing does."""
+        """Residual (m,) that stops a flex with coordinates q at second order; 0 if nothing stops it."""
         return self.adjoint(np.outer(q, q))
 
     def left_over_rate(self, q: Floats) -> Floats:
@@ -76,17 +76,17 @@ class StressEnergy:
 
 
 def blocking_stress(energy: StressEnergy) -> tuple[Floats | None, Floats, bool]:
-    """A self-stress with positive energy on every flex, or the flexes that may go on.
+    """A self-stress with positive energy on every flex, or the flexes that may extend.
 
     With one independent stress, its eigenvalues decide. With more, minimise the convex function
-    1/2 |(1 - E)_+|^2 over the stresses: it goes to 0 where a blocking stress exists, and is at least 1/2 where
-    none does, because then some Y >= 0 is orthogonal to all E, and |(1 - E)_+| |Y| >= <1 - E, Y> = tr Y >= |Y|.
-    At the minimum (1 - E)_+ is itself such a Y, and its range is where to look for flexes.
+    1/2 |(1 - E)_+|^2 over the stresses: its infimum is 0 if a blocking stress exists, and at least 1/2 if
+    there is none, because then some Y >= 0 is orthogonal to all E, and |(1 - E)_+| |Y| >= <1 - E, Y> = tr Y >= |Y|.
+    At the minimum, (1 - E)_+ is itself such a Y, and flexes are searched in its range.
 
     Returns
     -------
-    stress : (m,), the largest force 1 N, or None
-    flexes : (k, .) orthonormal coordinates of the flexes that no stress found blocks
+    stress : (m,), scaled to a largest force of 1 N, or None
+    flexes : (k, .) orthonormal coordinates of the flexes that the stresses found do not block
     proven : whether it is certain that no stress blocks all
     """
     frame = energy.frame
@@ -138,15 +138,15 @@ def _search(energy: StressEnergy) -> tuple[Floats | None, Floats, bool]:
 
 
 def finite_flex(energy: StressEnergy, starts: int = 8, seed: int = 0) -> tuple[Floats | None, bool]:
-    """The framework bent by a finite motion that keeps all its lengths, (N, d), or None where none is found.
+    """The framework (N, d) deformed by a finite motion that keeps all lengths; None if none is found.
 
-    Flexes that go on to second order are sought near those that move few agents and near random ones; each is
-    then followed, from the framework itself until the shape has changed visibly, with lengths equal to 1e-12.
-    Returned besides: whether a flex was found that goes on to second order.
+    Flexes that extend to second order are searched near those that move few agents and near random ones. Each is
+    followed from the framework until the shape has changed visibly, with lengths equal to 1e-12.
+    Also returns whether a flex was found that extends to second order.
     """
     frame = energy.frame
     if energy.k == 0:
-        return None, False  # a stress all but blocks every flex
+        return None, False  # a stress nearly blocks every flex
     few = sparse(energy.flexes, frame.rigid, energy.n, starts)
     candidates = [energy.flexes.T @ motion.ravel() for motion in few]
     candidates += list(np.random.default_rng(seed).normal(size=(starts, energy.k)))
@@ -164,7 +164,7 @@ def finite_flex(energy: StressEnergy, starts: int = 8, seed: int = 0) -> tuple[F
 
 
 def _second_order(energy: StressEnergy, q: Floats) -> Floats | None:
-    """A flex (k,) near q that goes on to second order: Gauss-Newton on the unit sphere."""
+    """A flex (k,) near q that extends to second order, by Gauss-Newton on the unit sphere."""
     q = q / max(np.linalg.norm(q), 1e-9)
     for _ in range(40):
         rest = energy.left_over(q)
@@ -179,7 +179,7 @@ def _second_order(energy: StressEnergy, q: Floats) -> Floats | None:
 
 
 def _follow(frame: Framework, direction: Floats) -> Floats | None:
-    """The farthest point of a walk on the curve of equal lengths that leaves the framework in a direction."""
+    """The farthest point of a walk along the curve of equal lengths, from the framework in a direction."""
     p = frame.p
     size = np.linalg.norm(p - p.mean(axis=0), axis=1).max()
     step = 2e-3 * size
@@ -205,7 +205,7 @@ def _follow(frame: Framework, direction: Floats) -> Floats | None:
 def restore(p: Floats, edges: Ints, lengths: Floats, tol: float) -> Floats | None:
     """Points near p (N, d) whose edges have the given lengths within tol [m], or None.
 
-    Levenberg-Marquardt with the error itself as damping, which converges quadratically even where J loses rank
+    Levenberg-Marquardt with the error itself as damping, which converges quadratically even if J loses rank
     along the solutions (Yamashita and Fukushima, 2001).
     """
     e = edges
@@ -225,7 +225,7 @@ def restore(p: Floats, edges: Ints, lengths: Floats, tol: float) -> Floats | Non
 
 
 def _aligned(p: Floats, onto: Floats) -> Floats:
-    """Points p (N, d) moved rigidly onto others."""
+    """Points p (N, d) moved rigidly to fit others."""
     space = [(0, 0), (0, 3 - p.shape[1])]
     R = kabsch(np.pad(onto, space), np.pad(p, space))
     x = np.pad(p - p.mean(axis=0), space) @ R.T

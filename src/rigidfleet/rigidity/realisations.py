@@ -1,4 +1,4 @@
-"""Other shapes with the same distances: where else a formation may end while every error goes to zero."""
+"""Other shapes with the same distances, in which a formation may end with every error at zero."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from rigidfleet.rigidity.analysis import checked
 from rigidfleet.rigidity.framework import Framework
 from rigidfleet.typing import Floats, Ints
 
-#: Shapes whose all-pairs distances agree within this times their size are one.
+#: Shapes whose all-pairs distances differ by less than this share of their size count as equal.
 _ALIKE = 1e-3
 
-#: Lengths count as reached within this times the size of the shape.
+#: Error within which lengths count as reached, as a share of the shape's size.
 _REACHED = 1e-9
 
 
@@ -36,12 +36,12 @@ class Realisation:
 
     Attributes
     ----------
-    kind : same; mirror image; folded (other all-pairs distances); coincident (folded with two agents in one place)
-    slots : (N, 3) [m], turned as near as possible to the intended shape
-    found : how many of the starts led here
+    kind : same; mirror image; folded (other all-pairs distances); coincident (folded, two agents at the same place)
+    slots : (N, 3) [m], rotated to fit the intended shape
+    found : number of starts that led to this shape
     deviation : greatest difference of an all-pairs distance from the intended [m]
     closest : least distance between two agents [m]
-    rigid : whether it is infinitesimally rigid; where not, it may be one of a continuum
+    rigid : whether it is infinitesimally rigid; if not, it may be one of a continuum of shapes
     """
 
     kind: Kind
@@ -65,13 +65,13 @@ class Realisation:
 
 @dataclass(frozen=True)
 class Realisations:
-    """What a search from many starts found.
+    """Result of a search from many starts.
 
     Attributes
     ----------
     found : the shapes, the intended one and its mirror image first, then the most frequent first
-    starts, converged : how many starts, and how many of them met all distances
-    leads_to : index into `found` of the shape to which the given start leads; None if to none, or none given
+    starts, converged : number of starts, and number of them that met all distances
+    leads_to : index into `found` of the shape to which the given start leads; None if there is none
     """
 
     found: tuple[Realisation, ...]
@@ -81,7 +81,7 @@ class Realisations:
 
     @property
     def unique(self) -> bool:
-        """Whether the search met nothing but the intended shape and its mirror image."""
+        """Whether the search found only the intended shape and its mirror image."""
         return all(r.kind in (Kind.SAME, Kind.MIRRORED) for r in self.found)
 
     def data(self) -> dict[str, Any]:
@@ -107,16 +107,16 @@ def realisations(
     """Search for all shapes whose edges are as long as those of the slots.
 
     Levenberg-Marquardt runs on (L^2 - d^2)/(2 d) from random positions of the size of the shape, all starts at
-    once. Equal shapes are put together by all-pairs distances and handedness. Nothing found is no proof that
-    there is nothing: the share of starts that met each shape says how thorough the search was.
+    once. Equal shapes are recognised by all-pairs distances and handedness. The search is no proof of completeness:
+    the share of starts that led to each shape shows how thorough it was.
 
     Parameters
     ----------
     slots : (N, 3) [m], the intended shape
     edges : (m, 2), agents from 0
-    starts, seed, iterations : the budget, and what makes it repeatable; 200 starts of 8 agents take a second
-    start : (N, 3) [m] positions from which the distances are to be established; answered by `leads_to`: the
-        squared lengths are led from those at the start to those wanted, as `reference = "squares"` does
+    starts, seed, iterations : budget and seed of the search; 200 starts of 8 agents take a second
+    start : (N, 3) [m] positions from which the distances are established; `leads_to` gives the result. The squared
+        lengths are led from those at the start to the desired ones, as `reference = "squares"` does
 
     Raises
     ------
@@ -156,7 +156,7 @@ def realisations(
 
 
 class _Groups:
-    """Shapes told apart by all-pairs distances and handedness."""
+    """Shapes distinguished by all-pairs distances and handedness."""
 
     def __init__(self, intended: Floats, tol: float) -> None:
         self._intended, self._tol = intended, tol
@@ -164,7 +164,7 @@ class _Groups:
         self.shapes: list[tuple[Floats, int]] = []
 
     def add(self, p: Floats, count: int) -> int:
-        """Count a shape; its number among all."""
+        """Count a shape; return its number."""
         pairs = _pairs(p)
         for k in range(len(self.shapes)):
             q, seen = self.shapes[k]
@@ -176,7 +176,7 @@ class _Groups:
         return len(self.shapes) - 1
 
     def _fits(self, p: Floats, q: Floats) -> bool:
-        # A flat shape is thick by the root of what its distances are off, so the mirror image is told by a wide gap.
+        # Distance errors e make a flat shape sqrt(e) thick, so a wide gap must distinguish a mirror image.
         return bool(np.linalg.norm(_onto(p, q) - q, axis=1).max() <= 30 * self._tol)
 
 
@@ -210,7 +210,7 @@ def _positions(start: ArrayLike, n: int) -> Floats:
 
 
 def _led(start: Floats, e: Ints, length: Floats, tol: float) -> Floats | None:
-    """Where positions (N, 3) end when their squared lengths are led in small steps to those wanted."""
+    """Final positions (N, 3) when the squared lengths are led in small steps to the desired ones."""
     at = start[None]
     now = ((start[e[:, 0]] - start[e[:, 1]]) ** 2).sum(axis=1)
     steps = 50
@@ -223,7 +223,7 @@ def _led(start: Floats, e: Ints, length: Floats, tol: float) -> Floats | None:
 def _descend(
     at: Floats, e: Ints, length: Floats, tol: float, iterations: int
 ) -> tuple[Floats, np.ndarray]:
-    """Levenberg-Marquardt from positions (B, N, 3): the ends, and which of them have the lengths within tol."""
+    """Levenberg-Marquardt from positions (B, N, 3): final positions, and which of them have the lengths within tol."""
     at = at.copy()
     count, n = at.shape[:2]
     ends, done = at.copy(), np.zeros(count, dtype=bool)
@@ -255,5 +255,5 @@ def _descend(
 
 
 def _lack(p: Floats, i: Ints, j: Ints, length: Floats) -> Floats:
-    """(L^2 - d^2) / (2 d) [m], which is smooth where agents meet and L - d near the solution."""
+    """(L^2 - d^2) / (2 d) [m], which is smooth if agents meet, and equals L - d near the solution."""
     return (((p[:, i] - p[:, j]) ** 2).sum(axis=2) - length**2) / (2 * length)

@@ -1,4 +1,4 @@
-"""The index of large formations: the ends of the spectrum of J, without a dense matrix."""
+"""The rigidity index of large formations: both ends of the spectrum of J, without a dense matrix."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from numpy.typing import ArrayLike
 from rigidfleet.rigidity.framework import ZERO
 from rigidfleet.typing import Floats, Ints
 
-#: So many eigenvalues are looked for at the lower end, besides those of rigid motions.
+#: Number of eigenvalues computed at the lower end, besides those of rigid motions.
 _LOWEST = 6
-#: Beyond so many restarts eigenvalues that are not found are taken for zero: some seconds at 2,000 agents.
+#: Number of restarts after which eigenvalues not found count as zero; some seconds at 2,000 agents.
 _MOST_RESTARTS = 300
-#: Beyond so many agents the factor that this takes is too large.
+#: Number of agents beyond which the required factor is too large.
 MOST = 5000
 
 
@@ -22,8 +22,8 @@ MOST = 5000
 class Spectrum:
     """Ends of the spectrum of mbar A, A = J M^-1 J^T.
 
-    ``w`` is the smallest eigenvalue that belongs to no rigid motion, 0 where the formation is flexible to first order;
-    ``free`` counts the other motions that no distance resists, as far as they were looked for.
+    ``w`` is the smallest eigenvalue that belongs to no rigid motion, 0 if the formation is flexible to first order;
+    ``free`` counts the non-rigid motions that no distance resists, as far as they were computed.
     """
 
     w: float
@@ -37,12 +37,12 @@ class Spectrum:
 
     @property
     def condition(self) -> float:
-        """Condition number of A on what distances hold; infinite where the formation is flexible."""
+        """Condition number of A without rigid motions; infinite if the formation is flexible."""
         return self.w_max / self.w if self.w > 0 else np.inf
 
 
 def spectrum(points: ArrayLike, edges: Ints, masses: ArrayLike) -> Spectrum:
-    """Ends of the spectrum of a formation in space, by Lanczos' method, inverted at the lower end.
+    """Both ends of the spectrum of a formation in space, by Lanczos' method, with inversion at the lower end.
 
     Parameters: points (N, 3) [m], edges (m, 2), masses (N,) [kg].
     """
@@ -60,7 +60,7 @@ def spectrum(points: ArrayLike, edges: Ints, masses: ArrayLike) -> Spectrum:
     K = (J.T @ J).tocsc()
     start = np.random.default_rng(0).normal(size=3 * n)
     w_max = float(eigsh(K, k=1, v0=start, return_eigenvectors=False)[0])
-    # A little below zero, where K can be factored. Rigid motions are taken out: six equal values would hide the next.
+    # A shift slightly below zero, where K can be factored. Rigid motions are removed: they would hide the next ones.
     shift = -1e-6 * w_max
     solve, rigid = splu(K - shift * eye_array(3 * n, format="csc")).solve, _rigid(p, share)
 
@@ -74,14 +74,14 @@ def spectrum(points: ArrayLike, edges: Ints, masses: ArrayLike) -> Spectrum:
             K, k=_LOWEST, sigma=shift, OPinv=operator, v0=inverse(start), return_eigenvectors=False, tol=1e-9,
             maxiter=_MOST_RESTARTS,
         )  # fmt: skip
-    except ArpackNoConvergence:  # a crowd of them next to zero cannot be told apart
+    except ArpackNoConvergence:  # many eigenvalues close to zero cannot be separated
         return Spectrum(0.0, w_max, _LOWEST)
     zero = held < (10 * ZERO) ** 2 * w_max
     return Spectrum(0.0 if zero.any() else float(held.min()), w_max, int(np.count_nonzero(zero)))
 
 
 def _rigid(p: Floats, share: Floats) -> Floats:
-    """Orthonormal rigid motions (3N, 6) of points (N, 3), in the coordinates of J M^-1/2; five of a line."""
+    """Orthonormal rigid motions (3N, 6) of points (N, 3), in the coordinates of J M^-1/2; five for a line."""
     x, turns = p - p.mean(axis=0), np.zeros((len(p), 3, 6))
     for k in range(3):
         turns[:, k, k] = 1.0

@@ -1,1 +1,1 @@
-"""Fly missions: one after the other, step by step, or many at once."""
+"""Fly missions: one at a time, step by step, or many at once."""

@@ -1,4 +1,4 @@
-"""A phase under way: what integrates its plan, watches it and records it. It sees no mission."""
+"""A phase under way: integrates its plan, monitors and records it. It knows nothing of the mission."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ from rigidfleet.typing import Bools, Floats
 if TYPE_CHECKING:
     from rigidfleet.kernel.large.solver import Counts  # imports the compiler
 
-#: The integrator returns to Python after so many steps, or fewer: as many as take this long [s of
-#: wall time], often enough for Ctrl-C and progress whatever the size of the formation.
+#: Greatest number of steps, and greatest wall time [s], after which the integrator returns to Python. For any
+#: size of formation, this is often enough for Ctrl-C and progress.
 _STEPS, _PAUSE = 2000, 0.05
-#: So many at the start of a phase, whose steps may take a thousand times as long as those of the one before.
+#: Number of steps at the start of a phase: they may take a thousand times as long as those of the phase before.
 _FIRST_STEPS = 10
-#: Where a phase ends by settling, whether it has is asked this often [s].
+#: Interval between checks whether a phase has settled, if it ends by settling [s].
 _CHECK = 0.1
 
-#: Times in (t, t_end] to record, of a plan: sampling(plan, t, t_end, first=..., stop=...).
+#: Function that gives the times in (t, t_end] to record: sampling(plan, t, t_end, first=..., stop=...).
 Sampler = Callable[..., Floats]
 
 
@@ -46,8 +46,8 @@ class ActivePhase:
 
     Attributes
     ----------
-    plan : what is flown
-    pieces : samples recorded, appended as they come
+    plan : the plan that is flown
+    pieces : samples recorded so far
     """
 
     def __init__(
@@ -73,17 +73,17 @@ class ActivePhase:
         self.state = integrator(plan, y, plan.start, trail)
         if self.solver is not None:
             self.state.clock[1] = first_step(plan, self.workspace, self.state)
-        self.asked = 0  # how often the user's controller has been
-        self.held: Problem | None = None  # with its force
-        self.flown: Problem | None = None  # what the steps in the trail were flown by
-        self.steps = _FIRST_STEPS  # at a time; more as soon as it is known how long they take
+        self.asked = 0  # number of calls of the user's controller
+        self.held: Problem | None = None  # with the controller's force
+        self.flown: Problem | None = None  # the problem of the steps in the trail
+        self.steps = _FIRST_STEPS  # per call of the integrator; more once their duration is known
         self.counted = np.zeros(
             3, dtype=np.int64
         )  # evaluations, steps and rejections before a loss
-        self.solves: list[tuple[str, Counts]] = []  # by which method, before a loss
+        self.solves: list[tuple[str, Counts]] = []  # by method, before a loss
         self.quiet_since = math.inf  # since when the phase has been settled [s]
-        self.stop = math.inf  # where somebody looks [s]
-        self.begun = False  # whether there are samples since the start, or the last loss
+        self.stop = math.inf  # time at which the caller wants a sample [s]
+        self.begun = False  # whether samples exist since the start or the last loss
 
     @property
     def t(self) -> float:
@@ -92,24 +92,24 @@ class ActivePhase:
 
     @property
     def over(self) -> bool:
-        """Whether the phase has come to its latest end."""
+        """Whether the phase has reached its latest end."""
         return self.t >= self.plan.t_end
 
     @property
     def place(self) -> Place:
-        """Where the phase is, as a diagnosis takes it."""
+        """The current state of the phase, for a diagnosis."""
         return Place(self.plan, self.t, self.state, self.workspace, self.solver)
 
     @property
     def settled(self) -> bool | None:
-        """Whether a phase that ends by settling has; None for others."""
+        """Whether the phase has settled; None if it does not end by settling."""
         settle = self.plan.phase.settle
         return None if settle is None else self.t - self.quiet_since >= settle.dwell - 1e-9
 
     # -- flying -----------------------------------------------------------------------------------
 
     def fly_to(self, t_end: float, controller: Controller | None, rate: float) -> None:
-        """Integrate to ``t_end`` [s] under the phase's input law, or the user's controller, asked at ``rate`` [Hz].
+        """Integrate to ``t_end`` [s] under the phase's input law, or the user's controller, called at ``rate`` [Hz].
 
         Raises
         ------
@@ -121,7 +121,7 @@ class ActivePhase:
             return
         start = self.plan.start
         while self.t < t_end:
-            # Control instants count from the phase's start, wherever a segment of it ends.
+            # Control instants are counted from the start of the phase, not from the ends of its segments.
             if self.held is None or self.t >= start + self.asked / rate:
                 f = asked("the controller", self.t, len(self.lost), controller, self.observe())
                 control = self.plan.problem.control._replace(kind=OPEN, force=f)
@@ -132,7 +132,7 @@ class ActivePhase:
     def settle_by(
         self, t_end: float, settle: Settle, controller: Controller | None, rate: float, step: float
     ) -> None:
-        """Integrate until the phase has settled, or to ``t_end`` [s]; checks are at multiples of ``step`` [s]."""
+        """Integrate until the phase has settled, or to ``t_end`` [s]; check at multiples of ``step`` [s]."""
         step *= max(1.0, round(_CHECK / step))  # segments end at samples
         least = self.plan.start + self.plan.problem.reference.T_b
         while self.t < t_end and not self.settled:
@@ -144,18 +144,18 @@ class ActivePhase:
             self.quiet_since = min(self.quiet_since, self.t) if quiet else math.inf
 
     def lead(self, problem: Problem) -> None:
-        """Go on with another problem of the same size, as one whose reference leads elsewhere."""
+        """Continue with another problem of the same size, such as one with a different reference."""
         self.plan.problem = problem
         self.counted[0] += self.state.count[0]
-        self.state.count[0] = 0  # another law: its derivative is not known yet
+        self.state.count[0] = 0  # a different law: its derivative is not known yet
 
     def evaluate(self) -> None:
-        """Evaluate the law where the phase is: forces and references are in the workspace."""
+        """Evaluate the law at the current state; forces and references are then in the workspace."""
         y = self.state.y
         native.closed_loop(self.t, y, np.empty_like(y), self.plan.problem, self.workspace)
 
     def observe(self) -> Observation:
-        """What a controller sees where the phase is."""
+        """What a controller sees at the current state."""
         self.evaluate()
         w, vehicles = self.workspace, self.plan.problem.vehicles
         noisy = len(self.plan.problem.disturbance.noise_r) > 0
@@ -166,12 +166,12 @@ class ActivePhase:
         )  # fmt: skip
 
     def watch(self, *, last: bool) -> None:
-        """Look for extremes in the steps flown; the ``last`` ones under a problem are not followed by others."""
+        """Search the steps flown for extremes; ``last``: no further steps of this problem follow."""
         if self.state.count[4] and self.flown is not None:
             self.extremes.take(self.flown, self.workspace, self.state, last=last)
 
     def end(self) -> PhaseState:
-        """End the phase where it is; return the state that the next one starts from."""
+        """End the phase at its current state; return the state that the next phase starts from."""
         self._check()
         if not (self.state.count[0] or self.t > self.plan.start):
             return self.plan.before
@@ -181,15 +181,15 @@ class ActivePhase:
     # -- inside -----------------------------------------------------------------------------------
 
     def _check(self) -> None:
-        """Raise what has come up within the solver of the multipliers, or the monitor's."""
+        """Raise errors of the multipliers' solver, or of the monitor's solver."""
         if self.solver is not None:
             self.solver.check()
             self.solver.aside.check()
 
     def _integrate(self, problem: Problem, t_end: float) -> None:
-        """Integrate to ``t_end`` [s] through the times at which vehicles are lost.
+        """Integrate to ``t_end`` [s], and remove vehicles at the times at which they are lost.
 
-        ``problem`` may hold a user's force in place of the phase's own input law.
+        ``problem`` may hold a user's force instead of the phase's own input law.
         """
         while self.t < t_end:
             coming = np.where(self.lost, math.inf, self.plan.lost_at)
@@ -199,7 +199,7 @@ class ActivePhase:
                 self._segment(problem, min(t_end, float(coming.min())))
 
     def _lose(self, problem: Problem, now: Bools) -> Problem:
-        """Go on without the vehicles that are lost ``now`` (N,); return what is flown of a problem."""
+        """Continue without the vehicles that are lost ``now`` (N,); return the remaining problem."""
         self.watch(last=True)
         self._check()
         self.lost = self.lost | now
@@ -224,7 +224,7 @@ class ActivePhase:
         return self.held
 
     def count(self) -> None:
-        """Add up what the phase, or its part up to a loss, has taken."""
+        """Add up the evaluations, steps and solves of the phase, or of its part up to a loss."""
         self.counted += self.state.count[:3]
         if self.solver is not None:
             self.solves.append((self.plan.method, self.solver.counts))
@@ -236,7 +236,7 @@ class ActivePhase:
         if fresh:
             self.watch(last=True)
             self.flown = problem
-            if self.solver is not None:  # it remembers what it is asked: the monitor has another
+            if self.solver is not None:  # a solver keeps state: the monitor has its own
                 graph = problem.graph._replace(solver=self.solver.aside.address)
                 self.flown = problem._replace(graph=graph)
         times = self.sampler(self.plan, self.t, t_end, first=not self.begun, stop=self.stop)
@@ -265,7 +265,7 @@ class ActivePhase:
         finally:
             done = int(state.count[3])
             if state.count[0] and not state.count[1] and len(times) and times[0] <= first:
-                samples[0], done = state.y, 1  # no step was possible: the start is all there is
+                samples[0], done = state.y, 1  # no step was possible: record the start alone
             if done:
                 self._record(problem, times[:done], samples[:done])
         if status != records.FINISHED:
@@ -274,14 +274,14 @@ class ActivePhase:
             raise StoppedError(diagnose(self.place, own_force=own_force, collapsed=collapsed))
 
     def _stalled(self) -> bool:
-        """Whether the phase takes far more steps than its length in time explains."""
+        """Whether the phase takes far more steps than its duration explains."""
         steps = int(self.state.count[1] + self.state.count[2])
         return steps > most_steps(self.t - self.plan.start)
 
     def _error(self) -> float:
         """Largest error [m] of a constraint, a slot or the goal at the integrator's state.
 
-        The goal's attitude counts by how far it takes a slot.
+        An attitude error counts as the distance by which it moves a slot.
         """
         plan, w = self.plan, self.workspace
         self.evaluate()
@@ -291,10 +291,10 @@ class ActivePhase:
             errors.append(np.linalg.norm(w.r - w.r_ref, axis=1)[~self.lost].max())
         tracks = plan.problem.control.kind != OPEN
         if tracks and plan.goal is not None and plan.slots is not None:
-            goal, since = plan.goal, self.t - plan.arrival  # it moves on
+            goal, since = plan.goal, self.t - plan.arrival  # the goal moves on after arrival
             left = np.where(self.lost, 0.0, plan.masses)
             cm = left @ w.r / left.sum()
-            if self.lost.any():  # the virtual body's, as those left show it
+            if self.lost.any():  # of the virtual body, from the agents still flying
                 cm += w.body[0] - left @ w.r_ref / left.sum()
             errors.append(np.linalg.norm(cm - goal.r - goal.v * since))
             turned = (w.T_ref if local else w.T) - (
@@ -304,11 +304,12 @@ class ActivePhase:
         return float(max(errors))
 
     def _record(self, problem: Problem, times: Floats, samples: Floats) -> None:
-        """Evaluate forces and references at the samples and keep them."""
+        """Evaluate forces and references at the samples and store them."""
         plan, w = self.plan, self.workspace
         n, m = len(plan.masses), len(plan.edges)
         out = native.record(problem, w, times, samples)
-        if problem is not plan.problem:  # flown by a user's controller: the phase's references
+        # Flown by a user's controller: take the references of the phase
+        if problem is not plan.problem:
             planned = native.record(plan.problem, w, times, samples)
             out = out._replace(
                 r_ref=planned.r_ref,

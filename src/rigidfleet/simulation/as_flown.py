@@ -1,4 +1,4 @@
-"""The mission that was flown, where its phases were not those given."""
+"""The mission that was flown, if its phases differ from those given."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from rigidfleet.result import PhaseRecord
 def as_flown(
     mission: Mission, asked: Sequence[Phase], flown: Sequence[PhaseRecord], step: float
 ) -> tuple[Mission, list[PhaseRecord]]:
-    """The mission whose phases are those ``flown`` by hand, and their records under its names.
+    """The mission with the phases ``flown`` by hand, and their records under its names.
 
-    Where that would be no mission (as where slots and distances contradict each other, which a hand may fly),
-    it has the phases that it was given with: no flight is lost for them.
+    If they make no valid mission (in a flight by hand, slots and distances may contradict each other), the mission
+    keeps its own phases, so that the record of the flight is not lost.
 
     Parameters
     ----------
-    asked : what each phase was begun as
+    asked : each phase as it was begun
     step : between samples [s]
     """
     records = _told_apart(flown)
     data = mission.to_dict()
-    data.pop("source", None)  # it reproduces no figure any more
+    data.pop("source", None)  # it no longer reproduces a figure
     data["name"] = f"{mission.name.removesuffix('-live')}-live"
     data["title"] = f"{mission.title or mission.name}, flown by hand"
     as_given = dict(data)
@@ -41,7 +41,7 @@ def as_flown(
 def with_phase(
     mission: Mission, asked: Sequence[Phase], flown: Sequence[PhaseRecord], table: Mapping[str, Any]
 ) -> Phase:
-    """The phase that a table makes, as in a mission file, after the phases flown so far.
+    """The phase given as a table of a mission file, checked after the phases flown so far.
 
     Raises
     ------
@@ -58,7 +58,7 @@ def with_phase(
 
 
 def _told_apart(flown: Sequence[PhaseRecord]) -> list[PhaseRecord]:
-    """Records of phases, of which no two have one name."""
+    """Records of phases with unique names."""
     seen: Counter[str] = Counter()
     records = []
     for record in flown:
@@ -73,12 +73,12 @@ def _told_apart(flown: Sequence[PhaseRecord]) -> list[PhaseRecord]:
 def _flown_data(
     mission: Mission, asked: Sequence[Phase], records: Sequence[PhaseRecord], step: float
 ) -> dict[str, Any]:
-    """What a mission file has otherwise where these phases were flown in place of its own."""
+    """The data of a mission file, with these phases in place of its own."""
     data: dict[str, Any] = {}
     end = records[-1].t_end
     data["output_step"] = min(step, end)
     if mission.assignment != "given":
-        # Who takes which slot followed from phases that were not flown.
+        # The assignment of agents to slots followed from phases that were not flown.
         data["assignment"] = "given"
         data["formations"] = {name: _written_out(mission, name) for name in mission.formations}
     data["phases"] = [_written(*each) for each in zip(asked, records, strict=True)]
@@ -90,7 +90,7 @@ def _flown_data(
 
 
 def _written(phase: Phase, record: PhaseRecord) -> dict[str, Any]:
-    """A phase as it stands in a mission, from its start to the end that it had."""
+    """A phase as a mission file holds it, from its start to its actual end."""
     given = phase.model_dump(mode="json", exclude_unset=True)
     for key in ("duration", "settle"):
         given.pop(key, None)
@@ -100,7 +100,7 @@ def _written(phase: Phase, record: PhaseRecord) -> dict[str, Any]:
 
 
 def _written_out(mission: Mission, name: str) -> dict[str, Any]:
-    """A formation with slots and edges in the order of the agents."""
+    """A formation with its slots and edges in the order of the agents."""
     edges = (mission.formation_edges(name) + 1).tolist()
     given = mission.formations[name].distances
     return {"slots": mission.formation_slots(name), "edges": edges, "distances": given}

@@ -1,4 +1,4 @@
-"""Functions of a user's own: asked for forces, checked, and called from the kernel."""
+"""A user's functions: called for forces, checked, and made callable from the kernel."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Force = Callable[[float, "Floats", "Floats"], ArrayLike]
 class Observation:
     """What a controller sees at a control step; arrays (N, 3) world axes, copies.
 
-    Positions and velocities are as measured, masses as believed.
+    Positions and velocities are measured, masses are those the control laws assume.
     """
 
     t: float  # [s]
@@ -41,7 +41,7 @@ Controller = Callable[[Observation], ArrayLike]
 def asked(
     who: str, t: float, n: int, function: Callable[..., ArrayLike], *arguments: object
 ) -> Floats:
-    """Forces (N, 3) [N] that a user's function gives, or an error that says what came instead."""
+    """Forces (N, 3) [N] that a user's function returns; an error says what it returned instead."""
     try:
         f = function(*arguments)
     except Exception as error:
@@ -51,7 +51,7 @@ def asked(
 
 
 def _checked(f: ArrayLike, n: int, who: str, t: float) -> Floats:
-    """Forces (N, 3) [N] from a user's function, or an error that says what came instead."""
+    """Forces (N, 3) [N] from a user's function, checked; an error says what it returned instead."""
     if np.iscomplexobj(f):
         raise FlightError(
             f"{who} returned complex numbers at t = {t:.3f} s; return an array ({n}, 3) of forces [N]"
@@ -64,7 +64,7 @@ def _checked(f: ArrayLike, n: int, who: str, t: float) -> Floats:
         ) from None
     if force.shape != (n, 3):
         raise FlightError(
-            f"{who} returned an array of shape {force.shape} at t = {t:.3f} s; return ({n}, 3), a row for"
+            f"{who} returned an array of shape {force.shape} at t = {t:.3f} s; return an array ({n}, 3), a row for"
             " each agent [N]"
         )
     if not np.isfinite(force).all():
@@ -75,7 +75,7 @@ def _checked(f: ArrayLike, n: int, who: str, t: float) -> Floats:
 class ExternalForce:
     """A user's force as a C function that the kernel can call.
 
-    An exception cannot pass through compiled code: it is kept, the force becomes NaN, the step is
+    An exception cannot pass through compiled code. It is stored, the force becomes NaN, the step is
     rejected, and `check` raises it once the kernel has returned.
     """
 
@@ -85,7 +85,7 @@ class ExternalForce:
 
     def __init__(self, force: Force, n: int) -> None:
         self.error: BaseException | None = None
-        self._keep: Any = force  # whatever owns the code must live as long as its address
+        self._keep: Any = force  # the owner of the code must live as long as its address
         address = getattr(force, "address", None)
         if address is not None:  # a Numba cfunc
             self.address = int(address)
@@ -107,7 +107,7 @@ class ExternalForce:
         self.address = int(ctypes.cast(self._keep, ctypes.c_void_p).value or 0)
 
     def check(self) -> None:
-        """Raise what the user's function raised, and listen to it again."""
+        """Raise the error that the user's function raised, and call the function again from then on."""
         error, self.error = self.error, None
         if error is not None:
             raise error

@@ -1,8 +1,8 @@
-"""Establish a formation from many starts at once: a hundred thousand flights in some seconds.
+"""Establish a formation from many starts at once: a hundred thousand flights in a few seconds.
 
-For a gain study or a Monte Carlo study of the constraint law itself. What varies here are the starts alone, what
-comes out is where the agents are when phases end; `rigidfleet.sweep` flies so, too, if final states alone are to be
-evaluated, and else varies anything in any mission and judges whole flights.
+This is for gain studies and Monte Carlo studies of the constraint law itself. Only the starts vary, and only the
+states at the ends of phases are returned. `rigidfleet.sweep` uses this if only final states are evaluated; otherwise
+it varies any key of any mission and judges whole flights.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ from rigidfleet.typing import Bools, Floats, Ints
 
 @dataclass(frozen=True)
 class Ensemble:
-    """Where B flights have ended.
+    """Final states of B flights.
 
     Attributes
     ----------
     position, velocity : (B, N, 3) at the end, world axes [m, m/s]
-    error : (B,) the largest error of a distance that the last formation asks for [m]
-    finished : (B,) whether a flight has reached the end; the rest holds its last good state
-    evaluations : (B,) of the right-hand side
-    ends : position (B, N, 3) at the end of each phase [m]; of a flight that is not finished, its last good one
-    vectors : whether eight flights shared a vector
+    error : (B,) greatest error of a distance of the last formation [m]
+    finished : (B,) whether a flight has reached the end; if not, the other arrays hold its last valid state
+    evaluations : (B,) number of evaluations of the right-hand side
+    ends : position (B, N, 3) at the end of each phase [m]; the last valid one if a flight has not finished
+    vectors : whether eight flights shared a SIMD vector
     """
 
     position: Floats
@@ -59,29 +59,30 @@ def establish(
 
     Parameters
     ----------
-    mission : a shipped name, a path or a `Mission`; all of its phases are flown under squares or steps
-        (``reference``; "distances" where that is squares from anywhere, without slots or with three agents), with
-        ``control = "open"``, and end at a time, like those of Table 1; tolerances, gains and masses are the mission's.
-        A damping of "auto" is 0.03 throughout, as flights of one phase are not all in their formation, or none
-    position, velocity : (B, N, 3) at the start, world axes [m, m/s]; at rest without velocities
-    vectors : whether eight flights share a vector of the machine, and their steps, through code made for the
-        mission's graph: seven times as fast, and compiled in seconds. By default in each phase that
-        `rigidfleet.kernel.engine.batch.fits`; True asks for it in all of them.
-    threads : by default one for each core. Results do not depend on it, bit for bit.
+    mission : a shipped name, a path or a `Mission`. All of its phases must have ``control = "open"``, end at a given
+        time, and blend squared distances or step, like those of Table 1 (``reference``; "distances" counts if it
+        blends squares from any start: without slots, or with three agents). Tolerances, gains and masses are the
+        mission's. A damping of "auto" is 0.03 throughout, because some flights of a phase may be in their formation
+        and others not
+    position, velocity : (B, N, 3) at the start, world axes [m, m/s]; at rest if there is no velocity
+    vectors : whether eight flights share a SIMD vector and the step size, in code generated for the mission's graph:
+        seven times as fast, after a compilation of some seconds. By default this is used in each phase that
+        `rigidfleet.kernel.engine.batch.fits`; True requires it in all phases
+    threads : number of threads, by default one per core; results do not depend on it, bit for bit
 
     Raises
     ------
     ValueError
-        The mission has other phases, axes or assignments, or disturbances, or too many edges for the dense solve; or
-        the shapes of the starts do not fit it.
+        The mission has other phases, axes or assignments, disturbances, or too many edges for the dense solve; or the
+        starts have the wrong shape or are not finite.
     """
     mission = as_mission(mission)
     r = _starts("position", position, mission.n_agents)
     v = np.zeros_like(r) if velocity is None else _starts("velocity", velocity, mission.n_agents)
     if v.shape != r.shape:
-        raise ValueError(f"velocity {v.shape} and position {r.shape} must have one shape")
+        raise ValueError(f"velocity {v.shape} and position {r.shape} must have the same shape")
     if (why := unfit(mission)) is not None:
-        raise ValueError(f"{why}; vary such missions by `rigidfleet.sweep`")
+        raise ValueError(f"{why}; vary such missions with `rigidfleet.sweep`")
     flights = _Flights(mission, r, v)
     ends = []
     for phase in mission.phases:
@@ -104,8 +105,8 @@ def unfit(mission: Mission) -> str | None:
     for index, phase in enumerate(mission.phases):
         if phase.control != "open" or phase.settle or not _alike(mission, phase):
             return (
-                f"phase {index + 1} '{phase.name}' is not flown open-loop under squares or steps to a given time, which"
-                " is all that an ensemble flies"
+                f"phase {index + 1} '{phase.name}' cannot be flown in an ensemble, which flies only open-loop phases"
+                " that blend squares or step and end at a given time"
             )
         if (shaping := phase.shaping) is not None:
             edges = mission.formation_edges(shaping.formation)
@@ -115,21 +116,21 @@ def unfit(mission: Mission) -> str | None:
                     f" ({len(edges)})"
                 )
     if mission.formulation != "inertial":
-        return f'an ensemble flies in world axes, and the mission in formulation = "{mission.formulation}"'
+        return f'an ensemble flies in world axes, but the mission has formulation = "{mission.formulation}"'
     if mission.assignment != "given":
-        return f'in an ensemble agents take the slots as given, and the mission has assignment = "{mission.assignment}"'
+        return f'in an ensemble agents take the slots as given, but the mission has assignment = "{mission.assignment}"'
     if mission.disturbances is not None:
-        return "an ensemble flies in calm air, and the mission has [disturbances]"
+        return "an ensemble flies in calm air, but the mission has [disturbances]"
     return None
 
 
 class _Flights:
-    """Where all flights are, and what their phases hand on."""
+    """States of all flights, and what one phase hands on to the next."""
 
     def __init__(self, mission: Mission, r: Floats, v: Floats) -> None:
         self.mission, self.r, self.v = mission, r, v
         count = len(r)
-        # One plan for all: without slots, only the distances it starts from are a flight's own.
+        # One plan serves all flights: without slots, they differ only in the distances they start from.
         self.now = PhaseState(0.0, r[0], v[0])
         self.integral: dict[tuple[int, int], Floats] = {}
         self.finished = np.ones(count, dtype=bool)
@@ -138,7 +139,7 @@ class _Flights:
         self.vectors = True
 
     def fly(self, phase: Phase, vectors: bool | None, threads: int) -> None:
-        """Fly one phase, and keep its ends."""
+        """Fly one phase and store its final states."""
         now, (count, n) = self.now, self.r.shape[:2]
         plan = plan_phase(self.mission, phase, now)
         law = plan.problem.law._replace(mu=self.mission.damping(None))
@@ -175,7 +176,7 @@ class _Flights:
 
 
 def _alike(mission: Mission, phase: Phase) -> bool:
-    """Whether a phase is led by squares or steps from anywhere, so that one plan serves all flights."""
+    """Whether a phase blends squares or steps from any start, so that one plan serves all flights."""
     if (shaping := phase.shaping) is None:
         return True
     bare = mission.n_agents <= 3 or not mission.formations[shaping.formation].knows_slots
@@ -194,7 +195,7 @@ def _starts(name: str, values: ArrayLike, agents: int) -> Floats:
 
 
 def _places(finished: Bools) -> Ints:
-    """Which flight takes each place: whoever is out lends it to a neighbour, so that the others keep theirs."""
+    """Flight in each place; a flight that is out leaves its place to a neighbour, so that all others keep theirs."""
     places = np.arange(len(finished))
     for k in np.flatnonzero(~finished):
         first = k - k % WIDTH
@@ -204,7 +205,7 @@ def _places(finished: Bools) -> Ints:
 
 
 def max_edge_error(r: Floats, edges: NDArray[np.integer], asked: Floats) -> Floats:
-    """Greatest error (B,) [m] of edges (m, 2) that are to be ``asked`` (m,) long, at positions (B, N, 3)."""
+    """Greatest error (B,) [m] of edges (m, 2) against the lengths ``asked`` (m,) [m], at positions (B, N, 3)."""
     return np.abs(_lengths(r, edges) - asked).max(axis=1, initial=0.0)
 
 

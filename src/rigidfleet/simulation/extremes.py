@@ -1,7 +1,8 @@
-"""The extremes of a flight in continuous time: the kernel's monitor, from phase to phase.
+"""The extremes of a flight in continuous time, found by the kernel's monitor phase by phase.
 
-`rigidfleet.kernel.monitor` says how they are found. Here is what it watches: all pairs of a small fleet; of a large
-one those near each other, listed anew before any other pair can have come as near.
+`rigidfleet.kernel.monitor` says how extremes are found. This module chooses the pairs to monitor: all pairs of a
+small fleet, and the near pairs of a large one. The list of near pairs is renewed before any other pair can have come
+as near.
 """
 
 from __future__ import annotations
@@ -20,20 +21,20 @@ from rigidfleet.mission import Mission
 from rigidfleet.result import PAD, Extremum, PhaseRecord
 from rigidfleet.typing import Bools, Floats
 
-#: Agents up to which all pairs are watched.
+#: Greatest number of agents of which all pairs are monitored.
 _FEW = 40
-#: Pairs are listed so far beyond those that matter, in parts of the agents' spacing.
+#: Distance by which the list reaches beyond the pairs that matter, as a share of the agents' spacing.
 _SPARE = 0.5
-#: And at least so far, in parts of the fleet's size over the root of its number: some may be at one place.
+#: Least such distance, as a share of the fleet's size over the root of its number; agents may be at the same place.
 _LEAST = 0.1
-#: Pieces of a step are no shorter than this part of it.
+#: Shortest piece of a step, as a share of the step.
 _SHORTEST = 2.0**-20
-#: What the monitor keeps with the other sign.
+#: Quantities that the monitor stores with the opposite sign.
 _GREATEST = frozenset(
     ("geofence", "highest", "speed", "thrust", "thrust_margin", "acceleration", "constraint_force", "tension",
      "constraint")
 )  # fmt: skip
-#: Quantities by name; the two clearances apart belong to the whole flight.
+#: Quantities by name; the clearances at the start and the end belong to the whole flight.
 _NAMES = {
     "separation": records.SEPARATION,
     "lost": records.LOST,
@@ -54,7 +55,7 @@ _OF_FLIGHT = {"clearance_start": records.STANDING, "clearance_flight": records.F
 
 
 class Extremes:
-    """Watches a flight, and tells what the worst of each phase was."""
+    """Monitors a flight and reports the worst values of each phase."""
 
     def __init__(self, mission: Mission) -> None:
         agents, limits = mission.agents, mission.limits
@@ -79,7 +80,7 @@ class Extremes:
         self._list_all()
 
     def begin(self, states: int, edges: int) -> records.Trail:
-        """Begin to watch an integrator of so many states, which is to leave its steps in this trail."""
+        """Begin to monitor an integrator with this many states; it must record its steps in the returned trail."""
         if self.trail.points.shape[2] == states and len(self.trail.start) == 3 * self.n + 2 * edges:
             return self.trail
         self.trail = trail = records.trail(states, self.n, edges)
@@ -93,9 +94,9 @@ class Extremes:
         return trail
 
     def lose(self, lost: Bools) -> None:
-        """Go on without the vehicles ``lost`` (N,), which the others must not be hit by."""
+        """Continue without the vehicles ``lost`` (N,), which must not hit the others."""
         for i in np.flatnonzero(lost & self.left & (self.low[:, 0] < np.inf)):
-            # Near an obstacle when it was lost, and not landing any more.
+            # It was near an obstacle when it was lost, and is no longer landing.
             value, t, b = self.low[i]
             if value < self.worst[records.FLYING]:
                 self.worst[records.FLYING], self.when[records.FLYING] = value, t
@@ -106,12 +107,12 @@ class Extremes:
         struck = np.stack(np.meshgrid(gone, left, indexing="ij"), axis=-1).reshape(-1, 2)
         self.struck = np.ascontiguousarray(struck)
         self._list_all()
-        self.trail = records.NO_TRAIL  # others are watched from now on
+        self.trail = records.NO_TRAIL  # other vehicles are monitored from now on
 
     def take(
         self, problem: Problem, work: Workspace, state: records.IntegratorState, *, last: bool
     ) -> None:
-        """Take the steps in the trail into account; the ``last`` ones of a segment are not followed by others."""
+        """Evaluate the steps in the trail; ``last``: no further steps of the segment follow."""
         flags, rows = self.monitor.monitor.flags, int(state.count[4])
         flags[:3] = flags[3], rows, 2 if last else 1
         if self.n > _FEW:
@@ -127,14 +128,14 @@ class Extremes:
         return {name: x for name, x in every if x is not None}
 
     def phase(self) -> dict[str, Extremum]:
-        """Extremes of the phase that ends, by name; the next one begins."""
+        """Extremes of the phase that ends, by name; start those of the next one."""
         found = self.so_far()
         self.worst[list(_NAMES.values())] = np.inf
-        self.moved[:] = np.inf  # pairs were listed for a worst that counts no more
+        self.moved[:] = np.inf  # the list was made for a worst value that no longer counts
         return found
 
     def flight(self, phases: Sequence[PhaseRecord]) -> None:
-        """Tell the phases of a flight that has ended its clearance in flight, and of who stands on an obstacle."""
+        """Give the phases of a finished flight its clearance in flight, and that of vehicles on an obstacle."""
         ends = np.where(self.left & (self.standing == 0), self.low[:, 0], np.inf)
         i = int(ends.argmin())
         found = {name: self._extremum(name, k) for name, k in _OF_FLIGHT.items()}
@@ -159,7 +160,7 @@ class Extremes:
     # -- large fleets ---------------------------------------------------------------------------------
 
     def _list_all(self) -> None:
-        """List all pairs, if they are few; else none yet."""
+        """List all pairs of a small fleet; none of a large one yet."""
         self.moved[:] = np.inf
         if self.n <= _FEW:
             i, j = np.triu_indices(self.n, 1)
@@ -170,7 +171,7 @@ class Extremes:
     def _step(
         self, problem: Problem, work: Workspace, state: records.IntegratorState, row: int
     ) -> None:
-        """Watch the distances of one step, in pieces so short that the pairs listed are all that matter."""
+        """Monitor the distances of one step, in pieces so short that only the listed pairs matter."""
         (start, length), whole = state.trail.clock[row], state.trail.points[row]
         gauge, none = state.trail.gauge[:0], state.trail.start
         pieces: list[tuple[float, float, Floats]] = [(start, length, whole)]
@@ -195,9 +196,9 @@ class Extremes:
             self.monitor(problem, work, state._replace(trail=trail))
 
     def _list(self, problem: Problem, y: Floats, moves: float) -> None:
-        """List the pairs that are near each other at a state (n,), or below one another.
+        """List the pairs that are near each other, or one below the other, at a state (n,).
 
-        The list is good until others may have come nearer by ``moves`` [m], at least.
+        The list is valid at least until distances may have changed by ``moves`` [m].
         """
         from scipy.spatial import KDTree
 
@@ -210,7 +211,7 @@ class Extremes:
         widest = 2.0 * float(self.radius[who].max())
         tree = KDTree(x, balanced_tree=False, compact_nodes=False)
         near, j = tree.query(x, k=2)
-        # Of two at one place either may be its own nearest.
+        # Of two agents at the same place, either may be found as its own nearest one.
         other = np.where(j[:, 1] == np.arange(len(who)), j[:, 0], j[:, 1])
         rooms = near[:, 1] - self.radius[who] - self.radius[who[other]]
         size = float(np.linalg.norm(np.ptp(x, axis=0))) / math.sqrt(len(who))
@@ -228,7 +229,7 @@ class Extremes:
         self._watch_listed(spare)
 
     def _watch_listed(self, spare: float) -> None:
-        """Watch the pairs listed, which are all that matter until others have come nearer by ``spare`` [m]."""
+        """Monitor the listed pairs; no others matter until distances have changed by ``spare`` [m]."""
         self.spare, self.moved[:] = spare, 0.0
         before = self.monitor.monitor
         self.monitor = native.Watch(
@@ -236,11 +237,11 @@ class Extremes:
         )
 
     def _moves(self, problem: Problem, points: Floats) -> Floats:
-        """By how much [m] over a step (5, n) any two agents' distance may change, and that as seen from above (2,).
+        """Bounds (2,) [m] of the change of any distance over a step (5, n), in space and as seen from above.
 
-        With r_i' = any rigid motion + u_i, the rate of a distance is at most |u_i| + |u_j|, and |u_i| no more than
-        its greatest Bernstein coefficient. The rotation taken is the one that leaves least. Seen from above, all
-        that tilts counts besides.
+        With r_i' = any rigid motion + u_i, the rate of a distance is at most |u_i| + |u_j|, and |u_i| is at most its
+        greatest Bernstein coefficient. The rotation is the one that leaves the smallest u_i. As seen from above,
+        tilting rotations change distances, too.
         """
         x = points[:, : 3 * self.n].reshape(5, -1, 3)[:, self.left]
         x = x - x.mean(axis=1, keepdims=True)

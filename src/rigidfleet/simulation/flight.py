@@ -34,25 +34,25 @@ if TYPE_CHECKING:
 
 __all__ = ["Controller", "Flight", "FlightInterrupted", "Observation", "Progress", "simulate"]
 
-#: Progress is reported this often [s of wall time].
+#: Interval between progress reports [s of wall time].
 _REPORT = 0.1
-#: A frame further than this from the slots it is attached to has left them [rad].
+#: Angle beyond which the frame no longer agrees with the slots it is attached to [rad].
 _FLIPPED = math.pi / 2
 
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a flight is."""
+    """How far a flight has come."""
 
     t: float  # mission time reached [s]
-    t_end: float  # mission time at the end, settling phases at their longest [s]
+    t_end: float  # mission time at the end, settling phases counted up to their timeouts [s]
     phase: str
-    wall: float  # time taken so far [s]
-    planning: bool = False  # the phase has not begun to be flown
+    wall: float  # wall time so far [s]
+    planning: bool = False  # whether the phase is still being planned
 
 
 class FlightInterrupted(KeyboardInterrupt):
-    """Ctrl-C during a flight; ``result`` holds what was flown."""
+    """Ctrl-C during a flight; ``result`` holds what had flown."""
 
     def __init__(self, result: Result) -> None:
         super().__init__(result.ending)
@@ -73,34 +73,34 @@ def simulate(
     Parameters
     ----------
     mission : a shipped name, a path or a `Mission`
-    controller : in place of the input law wherever slots are tracked: a function of an
-        `Observation` that returns the input force (N, 3) [N] of every agent, weight included. It
-        is called ``rate`` times a second, its force held in between, as on a vehicle.
+    controller : replaces the input law wherever slots are tracked: a function of an `Observation` that
+        returns the input force (N, 3) [N] of every agent, weight included. It is called ``rate`` times a
+        second; its force is held between calls, as on a vehicle.
     rate : control rate [Hz]
-    force : an external force f(t, r, v) -> (N, 3) [N], world axes, continuous in time, besides
-        gravity. A Numba ``cfunc`` of void(double t, double* r, double* v, double* f, ssize_t n)
-        is called without Python.
-    times : samples [s] to record instead of a multiple of the mission's ``output_step``
-    progress : called some times a second
+    force : an external force f(t, r, v) -> (N, 3) [N] in addition to gravity, world axes, continuous in
+        time. A Numba ``cfunc`` of void(double t, double* r, double* v, double* f, ssize_t n) is called
+        without Python.
+    times : times [s] to record, instead of multiples of the mission's ``output_step``
+    progress : a function that is called a few times a second
 
     Returns
     -------
     Result
-        A flight that fails on its way (a singular constraint, a phase that does not settle) comes
-        back incomplete, with the diagnosis in ``ending``.
+        A flight that cannot go on (a singular constraint, a phase that does not settle) is returned
+        incomplete, with the diagnosis in ``ending``.
 
     Raises
     ------
     FlightInterrupted
-        On Ctrl-C, with the incomplete result; before anything has flown, a plain
+        On Ctrl-C, with the incomplete result. Before anything has flown, it is a plain
         KeyboardInterrupt.
     FlightError
-        The controller or the force raised an exception, which is its cause, or returned something
-        that is no force; its ``result`` is what had flown, incomplete, or None.
+        The controller or the force raised an exception, which is the error's cause, or did not return
+        forces. The error's ``result`` is the incomplete flight, or None.
     MissionError
-        There is no such mission, or it has errors.
+        The mission does not exist, or has errors.
     ValueError
-        A time to record lies outside of the mission, or the control rate is not positive.
+        A time to record lies outside the mission, or the control rate is not positive.
     """
     flight = Flight(
         mission, controller=controller, rate=rate, force=force, times=times, progress=progress
@@ -123,7 +123,7 @@ def simulate(
 class Flight:
     """A mission flown step by step.
 
-    `begin` a phase, `advance` it, look, and go on; `finish` returns the record::
+    `begin` a phase, `advance` it and read its state; `finish` returns the record::
 
         flight = rf.Flight("narrow-passage")
         while flight.begin():  # the next phase of the mission
@@ -131,16 +131,16 @@ class Flight:
                 print(flight.t, flight.observe().position)
         result = flight.finish()
 
-    A phase may begin at any time, in place of the mission's next one: ``flight.begin({"kind": "fly", "position":
-    [0, 0, 20], "duration": 8})`` leaves the phase under way where it is and leads from there to another target.
-    Each stop ends a step of the integrator, so that a flight with stops agrees with one without to the integrator's
-    tolerances, not to the last bit.
+    Any phase may begin at any time, instead of the mission's next one. ``flight.begin({"kind": "fly", "position":
+    [0, 0, 20], "duration": 8})`` ends the phase under way and flies from there to another target. Each stop ends a
+    step of the integrator: a flight with stops agrees with one without stops to the integrator's tolerances, not to
+    the last bit.
 
     Parameters are those of `simulate`.
 
     Attributes
     ----------
-    mission : what was given
+    mission : the mission given
     phases : records of the phases begun so far
     ending : why the flight cannot go on; "" while it can
     pieces : samples recorded so far
@@ -158,10 +158,10 @@ class Flight:
         sampler: Sampler | None = None,
         flips: bool = False,
     ) -> None:
-        """Take a mission; ``sampler`` and ``flips`` are for problems that steer (see `rigidfleet.web.live`).
+        """Take a mission; ``sampler`` and ``flips`` are for flights by hand (see `rigidfleet.web.live`).
 
-        ``sampler`` says which times are recorded (`rigidfleet.simulation.sampling`), and with ``flips`` a formation
-        may flip over.
+        ``sampler`` chooses the times to record (`rigidfleet.simulation.sampling`); ``flips`` allows a formation to
+        flip over.
         """
         self.mission = mission = as_mission(mission)
         if not (isinstance(rate, int | float | np.number) and rate > 0.0):
@@ -181,8 +181,8 @@ class Flight:
         self._disturbance = disturbance(mission)
         self._extremes = Extremes(mission)
         self._active: ActivePhase | None = None
-        self._asked: list[Phase] = []  # what each phase was begun as
-        self._following = 0  # of the mission's phases
+        self._asked: list[Phase] = []  # each phase as it was begun
+        self._following = 0  # index of the mission's next phase
         self._started = self._reported = clock.perf_counter()
         self._count = np.zeros(3, dtype=np.int64)
         self._solves: dict[str, Counts] = {}
@@ -203,7 +203,7 @@ class Flight:
         return self._under_way().plan
 
     def observe(self) -> Observation:
-        """Where the vehicles are, as measured, and where they should be.
+        """Measured and desired states of the vehicles.
 
         Raises
         ------
@@ -213,7 +213,7 @@ class Flight:
         return self._under_way().observe()
 
     def pose(self) -> Pose:
-        """Where the virtual body is: its reference where slots are tracked, else the agents' own frame."""
+        """Pose of the virtual body: its reference if slots are tracked, otherwise the agents' own frame."""
         active = self._under_way()
         active.evaluate()
         w, plan = active.workspace, active.plan
@@ -224,17 +224,17 @@ class Flight:
     # -- flying -----------------------------------------------------------------------------------
 
     def begin(self, phase: Phase | Mapping[str, Any] | None = None) -> bool:
-        """Begin a phase: the mission's next one, or another, which takes over from where the flight is.
+        """Begin a phase at the current state: the mission's next one, or another one.
 
         Parameters
         ----------
-        phase : as a table of a mission file, or one of `rigidfleet.mission`'s phases
+        phase : a table as in a mission file, or a phase of `rigidfleet.mission`
 
         Returns
         -------
         bool
-            Whether there is something to fly: False at the end of the mission, and where the flight cannot go on
-            (then `ending` says why).
+            Whether there is a phase to fly: False at the end of the mission, or if the flight cannot go on (then
+            `ending` says why).
 
         Raises
         ------
@@ -278,12 +278,12 @@ class Flight:
         return True
 
     def advance(self, duration: float | None = None) -> bool:
-        """Fly on for so long [s], or to the end of the phase.
+        """Fly on for a duration [s], or to the end of the phase.
 
         Returns
         -------
         bool
-            Whether the phase goes on: False at its end, and where the flight cannot go on (then `ending` says why).
+            Whether the phase goes on: False at its end, or if the flight cannot go on (then `ending` says why).
 
         Raises
         ------
@@ -320,7 +320,7 @@ class Flight:
                 self.ending = (
                     f"phase '{plan.phase.name}' did not settle within {settle.timeout:g} s: at t ="
                     f" {self.t:.2f} s its error was above {settle.tolerance:g} m. Give it a"
-                    " longer timeout or a larger tolerance, or see the constraint error to learn why"
+                    " longer timeout or a larger tolerance, or look for the cause in the constraint error"
                 )
             return False
         return True
@@ -336,14 +336,14 @@ class Flight:
         alpha: Floats,
         force: bool = True,
     ) -> None:
-        """Lead the virtual body's reference over the next ``h`` [s], in place of the phase's own.
+        """Replace the reference of the virtual body over the next ``h`` [s].
 
         Parameters
         ----------
         start : the reference now, with its acceleration ``a`` [m/s^2] and angular acceleration ``alpha`` [rad/s^2]
-        end : way (3,) [m] from there, velocity and acceleration then
-        turn : rotation vector (3,) [rad] from there, body rates and their derivative then
-        force : whether the user's force acts meanwhile
+        end : displacement (3,) [m] over ``h``, velocity and acceleration at its end
+        turn : rotation vector (3,) [rad] over ``h``, body rates and their derivative at its end
+        force : whether the user's force acts during ``h``
         """
         active = self._under_way()
         t, problem = active.t, active.plan.problem
@@ -368,11 +368,11 @@ class Flight:
     def finish(self, ending: str = "") -> Result:
         """End the flight; return its record.
 
-        Where the phases flown are not the mission's, the record's mission has those that were flown.
+        If the phases flown are not the mission's, the record's mission has the phases flown.
 
         Parameters
         ----------
-        ending : why the flight ends before its mission does; by default what `Flight.ending` says
+        ending : why the flight ends before its mission does; by default `Flight.ending`
 
         Raises
         ------
@@ -400,9 +400,9 @@ class Flight:
         step: float | None = None,
         ending: str | None = None,
     ) -> Result:
-        """The record of samples: the mission's own, or of phases ``flown`` in place of the mission's."""
+        """The record of samples, of the mission's own phases or of the phases ``flown`` instead."""
         active = self._active
-        if active is not None:  # the flight may go on
+        if active is not None:  # the flight can go on
             active.watch(last=True)
             self.phases[-1].extremes = self._extremes.so_far()
         mission, phases = self.mission, self.phases
@@ -420,19 +420,19 @@ class Flight:
         }  # fmt: skip
         ending = self.ending if ending is None else ending
         result = assemble(mission, phases, pieces, ending=ending, statistics=statistics)
-        result.mission = mission  # with what it has made already: slots assigned, edges
+        result.mission = mission  # keeps the slots assigned and edges that it has computed
         return result
 
     # -- inside -----------------------------------------------------------------------------------
 
     def _under_way(self) -> ActivePhase:
         if self._active is None:
-            why = self.ending or "begin one"
+            why = self.ending or "call begin first"
             raise FlightError(f"no phase is under way: {why}")
         return self._active
 
     def _leave(self, *, changed: bool = False) -> None:
-        """End the phase under way, where it is; a target that was ``changed`` on the way is no waypoint to be met."""
+        """End the phase under way; a target that was ``changed`` in flight is not judged as a waypoint."""
         active = self._active
         if active is None:
             return
@@ -451,7 +451,7 @@ class Flight:
             record.target = None
 
     def _check_frame(self, plan: PhasePlan) -> None:
-        """Stop where the formation has flipped: its slots no longer lie as the frame says."""
+        """Stop if the formation has flipped: its slots no longer agree with the body frame."""
         both = {plan.phase.control, *(phase.control for phase in self._asked[-1:])}
         now = self._now
         if self.flips or both != {"body"} or now.frame is None or plan.frame is None:
@@ -461,10 +461,10 @@ class Flight:
         )
         if angle > _FLIPPED:
             raise StoppedError(
-                f"the formation '{now.formation}' has flipped at t = {now.t:.2f} s: its slots lie"
-                f" {math.degrees(angle):.0f} deg from the body frame that was integrated. Out of a line,"
-                " distances alone do not say to which side a shape unfolds. Track slots through that"
-                ' phase: control = "tracking"'
+                f"the formation '{now.formation}' has flipped at t = {now.t:.2f} s: its slots are"
+                f" {math.degrees(angle):.0f} deg from the integrated body frame. When a shape unfolds from"
+                " a line, distances alone do not say to which side. Track slots in that phase:"
+                ' control = "tracking"'
             )
 
     def _report(self, phase: Phase, *, planning: bool = False) -> None:

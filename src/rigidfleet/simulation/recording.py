@@ -1,4 +1,4 @@
-"""From the kernel's samples to a `Result`: attitude, rates, closeness, one time line."""
+"""Make a `Result` from the kernel's samples: attitude, rates, separation and clearance on one time axis."""
 
 from __future__ import annotations
 
@@ -18,15 +18,16 @@ if TYPE_CHECKING:
     from rigidfleet.mission import Mission
 
 
-#: Edges, or coordinates, up to which the smallest singular value of J is recorded.
+#: Greatest number of edges, or of coordinates, for which the smallest singular value of J is recorded.
 _SINGULAR = 400
-#: The work spent on them in a phase, as (size of J)^3 times samples: some tenths of a second; and samples at least.
+#: Greatest work for singular values in a phase, as (size of J)^3 times samples (some tenths of a second), and least
+#: number of samples.
 _WORK, _LEAST = 400_000_000, 9
 
 
 @dataclass
 class Piece:
-    """Samples of a phase, or of part of one, as the kernel gave them."""
+    """Samples of a phase, or of part of one, as the kernel returns them."""
 
     phase: int
     time: Floats  # (K,) [s]
@@ -45,7 +46,7 @@ def assemble(
     ending: str,
     statistics: dict[str, Any],
 ) -> Result:
-    """Join the pieces of a flight and compute what follows from positions and forces."""
+    """Join the pieces of a flight and compute all that follows from positions and forces."""
     pieces = [p for p in pieces if len(p.time)]
     time = np.concatenate([p.time for p in pieces])
     left = time[:, None] <= mission.lost_at  # (K, N)
@@ -58,12 +59,13 @@ def assemble(
     r, v = joined("r"), joined("v")
     f_u, f_C = joined("f_u"), joined("f_C")
     thrust = np.linalg.norm(f_u + f_C, axis=2)
-    if mission.agents.saturate:  # what was flown, not what was asked
+    if mission.agents.saturate:  # the thrust flown, not the commanded one
         thrust = np.minimum(thrust, mission.agents.thrust_limit)
     cm, cm_velocity = (np.einsum("ki,kia->ka", masses, z) / M for z in (r, v))
     x, y = r - cm[:, None], v - cm_velocity[:, None]
     slots = joined("p")
-    centre = np.einsum("ki,kia->ka", masses, slots) / M  # of those left; else the body's origin
+    # Of agents still flying; otherwise the body's origin
+    centre = np.einsum("ki,kia->ka", masses, slots) / M
     attitude, line = _attitudes(
         pieces, x, slots - centre[:, None], masses, framed=mission.body_frame is not None
     )
@@ -146,7 +148,7 @@ def assemble(
 
 
 def _put_extremes(phases: Sequence[PhaseRecord], time: Floats, closeness: tuple[Any, ...]) -> None:
-    """What a phase comes to between samples stands at the sample behind it."""
+    """Enter the extremes between samples at the sample after each."""
     separation, pair, clearance, agent, obstacle = closeness
     for phase in phases:
         for name, values in (("separation", separation), ("clearance", clearance)):
@@ -167,9 +169,9 @@ def _attitudes(
 ) -> tuple[Floats, Bools]:
     """Attitude quaternions (K, 4) of the formation's slots p (K, N, 3), fitted to x by masses (K, N).
 
-    And where the slots are a line (K,).
+    Also whether the slots are a line (K,).
 
-    Without slots, that of the integrated frame, if the mission attaches one (``framed``).
+    Without slots, the attitude is that of the integrated frame, if the mission attaches one (``framed``).
     """
     quaternions, line = np.full((len(x), 4), np.nan), np.zeros(len(x), dtype=np.bool_)
     fitted = np.zeros(len(x), dtype=bool)
@@ -200,7 +202,7 @@ def _attitudes(
 def _by_edge(
     pieces: Sequence[Piece], columns: Sequence[Ints | slice], name: str, count: int
 ) -> Floats:
-    """A quantity of the edges (K, m), NaN while an edge is not active."""
+    """A quantity of the edges (K, m); NaN while an edge is not active."""
     rows = []
     for piece, places in zip(pieces, columns, strict=True):
         values = piece.integral if name == "integral" else getattr(piece.record, name)
@@ -211,7 +213,7 @@ def _by_edge(
 
 
 def _columns(some: Ints, edges: Ints) -> Ints | slice:
-    """Where some edges are among all, (m, 2) both."""
+    """Indices of some edges among all edges, (m, 2) both."""
     if np.array_equal(some, edges):
         return slice(None)
     key = edges.max(initial=0) + 1
@@ -221,15 +223,15 @@ def _columns(some: Ints, edges: Ints) -> Ints | slice:
 
 
 def _singular_values(pieces: Sequence[Piece]) -> Floats:
-    """Smallest non-zero singular value of J (K,); NaN where a sample would take longer than a flight.
+    """Smallest non-zero singular value of J (K,); NaN if the formation is too large to compute it.
 
-    In formations of some tens of agents it is that of some samples in each phase, and linear between them.
+    In formations of some tens of agents it is computed at some samples of each phase, and linear in between.
     """
     return np.concatenate([_singular(p.record.r, p.edges) for p in pieces])
 
 
 def _singular(r: Floats, edges: Ints) -> Floats:
-    """That of one phase, of positions r (K, N, 3)."""
+    """Smallest non-zero singular value of J in one phase (K,), at positions r (K, N, 3)."""
     size = min(len(edges), 3 * r.shape[1])
     if size > _SINGULAR:
         return np.full(len(r), np.nan)

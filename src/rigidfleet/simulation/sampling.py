@@ -12,9 +12,9 @@ from rigidfleet.typing import Floats
 
 
 class Sampling:
-    """Multiples of a step, the ends of phases, arrivals, losses and stops; or times that were asked for.
+    """The times to record: multiples of a step, ends of phases, arrivals, losses and stops; or times given by the user.
 
-    The start of a phase is recorded one representable number after the switch, and so is what follows a loss.
+    The start of a phase is recorded one representable number after the switch; so is the state after a loss.
     """
 
     def __init__(self, step: float, times: Floats | None = None) -> None:
@@ -23,7 +23,7 @@ class Sampling:
     def between(
         self, plan: PhasePlan, t: float, t_end: float, *, first: bool, stop: float = math.inf
     ) -> Floats:
-        """Times in (t, t_end] [s] of a phase; ``first`` after a switch, and ``stop`` where somebody looks."""
+        """Times in (t, t_end] [s] of a phase; ``first`` after a switch; ``stop`` is where the caller stops."""
         if self.times is not None:
             before = -math.inf if first and t == 0.0 else t
             return self.times[(self.times > before) & (self.times <= t_end)]
@@ -39,12 +39,12 @@ class Sampling:
 
 
 def times_asked(times: ArrayLike, end: float) -> Floats:
-    """Times [s] to record, sorted; those that rounding has put behind the end are at the end.
+    """Times [s] to record, sorted; those that rounding puts after the end are moved to the end.
 
     Raises
     ------
     ValueError
-        One lies outside of the mission.
+        A time lies outside the mission.
     """
     t = np.unique(np.asarray(times, dtype=float))
     if not (len(t) and t[0] >= 0.0 and t[-1] <= end * (1.0 + 1e-12)):

@@ -1,4 +1,4 @@
-"""From a plan to what an integrator works with: workspace, solver of large systems, first step."""
+"""Prepare the integration of a plan: workspace, solver of large systems, first step."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def equip(plan: PhasePlan) -> tuple[Workspace, LargeSolver | None]:
-    """Workspace of a plan, and what solves for its multipliers where that is not the kernel itself."""
+    """Workspace of a plan, and the solver for its multipliers if the kernel itself does not solve for them."""
     problem = plan.problem
     work = workspace(
         len(plan.masses),
@@ -48,7 +48,7 @@ def equip(plan: PhasePlan) -> tuple[Workspace, LargeSolver | None]:
 def integrator(
     plan: PhasePlan, y: Floats, t: float, trail: records.Trail
 ) -> records.IntegratorState:
-    """An integrator of a plan at time t [s] and state y (n,), which leaves its steps in a trail."""
+    """An integrator of a plan at time t [s] and state y (n,), which records its steps in a trail."""
     return records.integrator(
         y, t, rtol=plan.integrator.rtol, atol=plan.tolerances(len(y)), trail=trail
     )
@@ -57,8 +57,8 @@ def integrator(
 def first_step(plan: PhasePlan, work: Workspace, state: records.IntegratorState) -> float:
     """First step [s] to try in a large formation, from two evaluations.
 
-    Hairer, Nørsett and Wanner, Solving Ordinary Differential Equations I, section II.4. Steps that grow from a small
-    one cost a large formation more.
+    Hairer, Nørsett and Wanner, Solving Ordinary Differential Equations I, section II.4. Growing from a tiny
+    step would cost a large formation more.
     """
     problem: Problem = plan.problem
     t, y = float(state.clock[0]), state.y

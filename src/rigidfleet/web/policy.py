@@ -1,4 +1,4 @@
-"""What a page that the program writes may do: show itself, and nothing else."""
+"""Content security policy of generated pages: they may show themselves, and nothing else."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import hashlib
 def content_policy(*, style: str, script: str | None = None, connect: str = "'none'") -> str:
     """Content security policy of a page with one `<style>` and, if it has any, one `<script>`.
 
-    Both are named by their digests, so that no words of a user can become a style or a script,
-    whatever they look like; nothing comes from elsewhere, and nothing goes there. The texts must
-    stand between their tags to the letter.
+    The policy names both by their digests, so that no text of a user can become a style or a script.
+    Nothing is loaded from elsewhere or sent elsewhere. The texts must stand between their tags exactly
+    as given.
 
     Parameters
     ----------
     style, script : contents of the two elements; without a script, none runs
-    connect : whom the script may talk to, as the policy names it
+    connect : hosts that the script may connect to, as the policy names them
     """
     allowed = {
         "default-src": "'none'",
@@ -29,7 +29,7 @@ def content_policy(*, style: str, script: str | None = None, connect: str = "'no
         allowed |= {
             "script-src": _digest(script),
             "connect-src": connect,
-            # Text cannot be made into mark-up by any script either.
+            # No script can turn text into markup, either.
             "require-trusted-types-for": "'script'",
             "trusted-types": "'none'",
         }

@@ -1,1 +1,1 @@
-"""Numba's side of the kernel: the decorators, named tuples by address, SIMD values and the cache."""
+"""Compilation of the kernel with Numba: decorators, named tuples by address, SIMD values and the cache."""

@@ -1,8 +1,7 @@
-"""Where compiled code is kept, and which of it is run: none that another user can have written.
+"""The cache of compiled code, which never runs code that another user may have written.
 
-Machine code and Numba's pickles do whatever whoever wrote them likes. They are kept, and read again, only in a folder
-of this user (or of root) into which nobody else can put anything, not even by putting another folder in place of one
-above it.
+Machine code and Numba's pickles can do whatever their author likes. They are stored and read only in a folder of this
+user (or of root) into which nobody else can put anything, not even by replacing a folder above it.
 """
 
 from __future__ import annotations
@@ -22,30 +21,30 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import IO
 
-#: Whether rights are owners and modes. Windows has lists instead, which keep a user's own folders from others.
+#: Whether permissions are owners and modes. Windows has access lists instead, which protect a user's own folders.
 _OWNERS = hasattr(os, "geteuid")
-#: As many links as Linux follows before it takes them for a loop.
+#: Greatest number of links followed, as in Linux; more count as a loop.
 _LINKS = 40
 _ACL = "system.posix_acl_access"
-#: Whether this process, or the one that began it, has warned.
+#: Whether this process or its parent has warned already.
 told = threading.Event()
 
 
 def cache_directory() -> Path:
-    """Return the folder of the compiled kernel, made if need be: one per state of its sources, Numba and Python.
+    """Return the folder of the compiled kernel, created if needed: one per version of its sources, Numba and Python.
 
-    It is in ``NUMBA_CACHE_DIR`` if that is set, else in ``XDG_CACHE_HOME`` or ``~/.cache``.
+    The folder is in ``NUMBA_CACHE_DIR`` if that is set, otherwise in ``XDG_CACHE_HOME`` or ``~/.cache``.
 
     Raises
     ------
     OSError
-        It cannot be made, or others could put something there; ``strerror`` says where, and what to do.
+        The folder cannot be created, or others could write into it; ``strerror`` says where, and what to do.
     """
     return _private(_named())
 
 
 def _named() -> Path:
-    """The folder, as the environment names it."""
+    """The folder named by the environment."""
     base = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME") or "~/.cache"
     return Path(os.path.expanduser(base), "rigidfleet", f"kernel-{_digest()}")
 
@@ -60,7 +59,7 @@ def _digest() -> str:
 
 @contextmanager
 def opened(file: str | Path) -> Generator[IO[bytes]]:
-    """A file of the cache, to be read: the very one that was looked at, wherever its name leads meanwhile.
+    """Open a file of the cache for reading: exactly the file that was checked, even if its name is changed meanwhile.
 
     Raises
     ------
@@ -75,18 +74,18 @@ def opened(file: str | Path) -> Generator[IO[bytes]]:
     with open(file, "rb", opener=descriptor) as stream:
         found = os.fstat(stream.fileno())
         if not stat.S_ISREG(found.st_mode):
-            raise PermissionError(errno.EACCES, f"{file} is no file")
+            raise PermissionError(errno.EACCES, f"{file} is not a file")
         _refuse(file, found)
         yield stream
 
 
 def not_kept(error: OSError) -> None:
-    """Warn that what is compiled cannot be kept; once, whatever the functions and reasons."""
+    """Warn once that compiled code cannot be cached, whatever the function and reason."""
     if not told.is_set():
         told.set()
         warnings.warn(
-            f"the compiled flight kernel cannot be kept in {_named()}: {error.strerror or error}. Every process"
-            " compiles it again, which takes about 20 s, until NUMBA_CACHE_DIR names a folder that you alone can write",
+            f"the compiled flight kernel cannot be cached in {_named()}: {error.strerror or error}. Every process"
+            " compiles it again, which takes about 20 s. Set NUMBA_CACHE_DIR to a folder that only you can write",
             RuntimeWarning,
             stacklevel=3,
         )
@@ -96,12 +95,12 @@ def not_kept(error: OSError) -> None:
 
 
 def _private(folder: Path) -> Path:
-    """Return the real path of a folder into which nobody else can put anything; what is missing of it is made.
+    """Return the real path of a folder into which nobody else can put anything; create it if it is missing.
 
-    Links are followed by hand, from the root down, whose owner could do anything anyway. Of each folder on the way
-    either nobody else can write to it, or its sticky bit keeps others from renaming what is not theirs; and what comes
-    next, folder or link, belongs to this user or root. So nobody else can change where the way leads, neither before it
-    is used nor after. To the last folder nobody else can write at all: a sticky bit would let them add to it.
+    Links are followed by hand from the root, whose owner can do anything anyway. For each folder on the path, either
+    nobody else can write to it, or its sticky bit keeps others from renaming what is not theirs. The next item, folder
+    or link, belongs to this user or root. So nobody else can change where the path leads, neither before nor after it
+    is used. Nobody else can write to the last folder at all; with a sticky bit, others could still add to it.
 
     Raises
     ------
@@ -133,20 +132,20 @@ def _private(folder: Path) -> Path:
             raise _foreign(there)
         if stat.S_ISLNK(found.st_mode):
             if (links := links + 1) > _LINKS:
-                raise OSError(errno.ELOOP, f"{there} is a link that leads in a circle")
+                raise OSError(errno.ELOOP, f"{there} is a circular link")
             target = Path(os.readlink(there))
             at = Path("/") if target.is_absolute() else at
             rest += reversed(target.parts[target.is_absolute() :])
         elif stat.S_ISDIR(found.st_mode):
             at = there
         else:
-            raise NotADirectoryError(errno.ENOTDIR, f"{there} is no folder")
+            raise NotADirectoryError(errno.ENOTDIR, f"{there} is not a folder")
     _refuse(at, os.lstat(at))
     return at
 
 
 def _refuse(path: str | Path, found: os.stat_result) -> None:
-    """Refuse a file, or the last folder, that others have written or can write.
+    """Refuse a file, or the last folder, if others have written it or can write it.
 
     Raises
     ------
@@ -164,7 +163,7 @@ def _foreign(path: str | Path) -> OSError:
 
 def _open_to_others(path: str | Path) -> OSError:
     remedy = f"`chmod go-w {shlex.quote(str(path))}`"
-    return PermissionError(errno.EACCES, f"others can write to {path}, which {remedy} ends")
+    return PermissionError(errno.EACCES, f"others can write to {path}; forbid it with {remedy}")
 
 
 def _own(found: os.stat_result) -> bool:
@@ -174,10 +173,10 @@ def _own(found: os.stat_result) -> bool:
 
 @cache
 def _unnamed() -> int | None:
-    """Who all users are that have no number where this process runs, root of the machine among them; None if all have.
+    """The user id that stands for all users without an id here, including the machine's root; None if all have one.
 
-    So it is in containers of ordinary users (Apptainer, for one). What such an owner has in a folder that others cannot
-    write, is taken for root's on the way to the last folder, which has to be this user's.
+    This happens in containers of ordinary users, such as Apptainer's. On the path to the last folder, items of such an
+    owner count as root's if they are in a folder that others cannot write. The last folder must be this user's.
     """
     try:
         first, _, count = Path("/proc/self/uid_map").read_text().split()[:3]
@@ -188,16 +187,16 @@ def _unnamed() -> int | None:
 
 
 def _others_write(path: str | Path, found: os.stat_result) -> bool:
-    """Whether others can write something, if only those of a group."""
+    """Whether others can write an item, even if only members of a group."""
     mode = found.st_mode
     group = mode & stat.S_IWGRP and not _own_group(path, found)
     return _OWNERS and bool(mode & stat.S_IWOTH or group)
 
 
 def _own_group(path: str | Path, found: os.stat_result) -> bool:
-    """Whether the group of a file has its owner alone.
+    """Whether the owner of a file is the only member of its group.
 
-    On systems that give each user a group of the same name, whatever a user makes may be writable for that group.
+    On systems that give each user a group of the same name, a user's files may be writable for that group.
     """
     import grp
     import pwd
@@ -205,7 +204,7 @@ def _own_group(path: str | Path, found: os.stat_result) -> bool:
     with suppress(OSError, AttributeError):
         if _ACL in os.listxattr(
             path
-        ):  # then the rights of the group are the most that anyone on the list has
+        ):  # with an access list, the group's rights are the upper limit for everyone on it
             return False
     try:
         owner, group = pwd.getpwuid(found.st_uid), grp.getgrgid(found.st_gid)

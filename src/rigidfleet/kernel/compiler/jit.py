@@ -29,14 +29,14 @@ F = TypeVar("F", bound=Callable[..., Any])
 OPTIONS: dict[str, Any] = {
     "nogil": True,
     "error_model": "numpy",  # division by zero gives infinity
-    # Sums may be reordered and fused, but NaN and infinity keep their meaning: the integrator has
-    # to see them to reject a step.
+    # Sums may be reordered and fused, but NaN and infinity keep their meaning: the integrator must
+    # see them to reject a step.
     "fastmath": {"reassoc", "contract", "arcp", "nsz"},
-    # Without reference counts, which cost more than the physics: whoever calls keeps the arrays
+    # Without reference counts, which would cost more than the physics: the caller keeps the arrays
     # alive. The compiler then refuses any function that would allocate.
     "_nrt": False,
 }
-#: Where Numba is to optimise nothing (see `rigidfleet.kernel.engine.native`), code is neither kept nor inlined yet.
+#: Whether Numba only translates (see `rigidfleet.kernel.engine.native`); code is then neither cached nor inlined.
 _OPTIMISES = numba.config.OPT > 0
 _CACHED = OPTIONS | {"no_cfunc_wrapper": True}
 
@@ -47,19 +47,19 @@ def compiled(function: F) -> F:
 
 
 def inlined(function: F) -> F:
-    """Compile into each caller: for what every evaluation of a flight goes through."""
+    """Compile into each caller, for functions that every evaluation of a flight calls."""
     return _cached(function, _CACHED | {"forceinline": _OPTIMISES})
 
 
 def compiled_copy(function: Any, name: str, **instead: Any) -> Any:
-    """Compile a compiled function's source once more, with other functions in place of some it calls."""
+    """Compile the source of a compiled function again, with other functions in place of some that it calls."""
     return _cached(_copy(function.py_func, name, instead), _CACHED)
 
 
 def compiled_for_c(function: Any, name: str, *, arguments: int, **instead: Any) -> int:
-    """Compile a copy of a function of so many pointers to float64; return its address.
+    """Compile a copy of a function with this number of arguments, pointers to float64; return its address.
 
-    Both it and the copy stay as long as the process does.
+    The code and the copy stay alive as long as the process.
     """
     signature = types.void(*[types.CPointer(types.float64)] * arguments)
     copy = _copy(function, name, instead)
@@ -80,7 +80,7 @@ def _copy(function: FunctionType, name: str, instead: dict[str, Any]) -> Functio
 
 
 class _Place(UserProvidedCacheLocator):
-    """Where a function is kept: among the rest of the kernel."""
+    """The cache folder of a function: that of the kernel."""
 
     def __init__(self, function: FunctionType) -> None:
         self._py_file, self._lineno = (
@@ -94,7 +94,7 @@ class _Place(UserProvidedCacheLocator):
 
 
 class _Form(CompileResultCacheImpl):
-    """In which form it is kept. Numba itself would ask the environment, and the current folder, for a place."""
+    """The form in which a function is cached. Numba itself would consult the environment and the current folder."""
 
     def __init__(self, function: FunctionType) -> None:
         self._lineno = function.__code__.co_firstlineno
@@ -104,9 +104,9 @@ class _Form(CompileResultCacheImpl):
 
 
 class _Files(IndexDataCacheFile):
-    """Numba's files, which are pickles: those that others could have written are not there.
+    """Numba's files, which are pickles; files that others could have written count as missing.
 
-    Between the look at a file and Numba's own nobody else can put another in its place, see `cache_directory`.
+    Nobody else can replace a file between this check and Numba's own access, see `cache_directory`.
     """
 
     def _load_index(self) -> Any:
@@ -125,7 +125,7 @@ class _Files(IndexDataCacheFile):
 
 
 class _Cache(FunctionCache):
-    """Numba's cache of a function, on a disk that may be full: what cannot be kept is compiled again."""
+    """Numba's cache of a function, on a disk that may be full: code that cannot be stored is compiled again."""
 
     _impl_class = _Form
 
@@ -142,7 +142,7 @@ class _Cache(FunctionCache):
 
 
 class _NoCache(NullCache):
-    """None, and why."""
+    """No cache, with the reason."""
 
     def __init__(self, error: OSError) -> None:
         self._error = error

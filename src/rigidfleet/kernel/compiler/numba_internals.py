@@ -1,8 +1,8 @@
-"""What is taken from Numba that it does not promise: isolated here, for the versions that it was tested with.
+"""Use of Numba's internals, which are not a stable interface: isolated here, for the tested versions only.
 
-Two things shorten the first run ever: Numba translates the kernel's functions and makes no machine code of each
+They shorten the very first run in two ways: Numba translates the kernel's functions and makes no machine code of each
 (an eighth of the time), and a second process does half of the translation (a third of the time). With any other
-version neither is done: the kernel is then built by Numba's public functions alone, and comes out the same.
+version, neither is done: Numba's public functions alone build the kernel, with the same result.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ TESTED = ("0.68.1",)
 
 
 def known() -> bool:
-    """Whether the installed Numba is one of those."""
+    """Whether the installed version of Numba is one of these."""
     return numba.__version__ in TESTED
 
 
 def translate_only() -> None:
-    """Keep Numba from all that nobody needs: machine code of each function, and of each a module with all it calls."""
+    """Stop Numba from making unused results: machine code of each function, and a module with all its callees."""
 
     def executable(_context: Any, library: Any, function: Any, environment: Any) -> Any:
         name, module = function.qualname.split(".")[-1], function.lookup_module()
@@ -51,9 +51,9 @@ def translate_only() -> None:
 
 
 def portable(function: Any, arguments: Any, simplified: Callable[[str, str, str], Any]) -> bytes:
-    """A function that Numba has translated for ``arguments``, in bytes that `received` takes in another process.
+    """A function that Numba has translated for ``arguments``, as bytes for `received` in another process.
 
-    ``simplified(text, symbol, name)`` is its module as it is to be kept.
+    ``simplified(text, symbol, name)`` returns its module in the form to be stored.
     """
     function.compile(arguments)
     result = function.overloads[arguments]
@@ -65,10 +65,10 @@ def portable(function: Any, arguments: Any, simplified: Callable[[str, str, str]
 
 
 def received(context: Any, done: bytes) -> Any:
-    """What Numba takes for a translated function of its own."""
+    """A function from `portable`, in the form of Numba's own translated functions."""
     return compiler.CompileResult._rebuild(context, *pickle.loads(done))
 
 
 def given_by(function: Any, cache: Any) -> None:
-    """Have a function's translations asked of ``cache``."""
+    """Make Numba look up a function's translations in ``cache``."""
     function._cache = cache

@@ -1,10 +1,10 @@
-"""Named tuples by their address: what the compiled functions read them through.
+"""Named tuples by address, as compiled functions read them.
 
 A `Problem` or `Workspace` holds some three hundred numbers, most of them addresses and sizes of arrays. Passed by
-value, every call would copy them all, and the compiler would take as long over the copies as over the physics.
+value, every call would copy them all, and compiling the copies would take as long as compiling the physics.
 A `Pointer` is the address of a named tuple laid out in words of eight bytes: a number takes one word (a value of
-lanes eight), an array those of its data and of its shape, a tuple within it those of its fields. Reading a field
-loads its words, which never change while compiled code runs, and the compiler knows that.
+lanes takes eight), an array the words of its data address and shape, a nested tuple the words of its fields. Reading a
+field loads its words. They never change while compiled code runs, and the compiler knows this.
 """
 
 import hashlib
@@ -26,7 +26,7 @@ from rigidfleet.kernel.compiler.simd import WIDTH, lanes
 
 _WORD = ir.IntType(64)
 _ADDRESS = _WORD.as_pointer()
-#: So much of a named tuple may be read before it is needed [bytes]: of more there is no room in registers.
+#: Part of a named tuple that may be read in advance [bytes]; there are no registers for more.
 _AHEAD = 256
 
 
@@ -35,7 +35,7 @@ class Pointer(types.Type):
 
     def __init__(self, to: types.BaseNamedTuple) -> None:
         self.to = to
-        # Names of types become part of the functions' names: in full, they would be most of the code.
+        # Names of types become part of the functions' names; full names would be most of the code.
         digest = hashlib.sha256(str(to).encode()).hexdigest()[:12]
         super().__init__(name=f"{to.instance_class.__name__}At{digest}")
 
@@ -47,14 +47,14 @@ class _Model(models.PrimitiveModel):
         self._size = 8 * _words(kind.to)
 
     def from_argument(self, _builder: Any, value: Any) -> Any:
-        """Say of an argument that it is there, so that reading may begin before it is needed."""
+        """Declare that an argument is valid memory, so that reads can be moved forward."""
         value.attributes.dereferenceable = min(self._size, _AHEAD)
         value.attributes.align = 8
         return value
 
 
 def _words(kind: types.Type) -> int:
-    """How many words a value takes."""
+    """Number of words of a value."""
     if isinstance(kind, types.BaseNamedTuple):
         return sum(map(_words, kind.types))
     if isinstance(kind, types.Array):
@@ -104,7 +104,7 @@ def _load(builder: Any, address: Any, word: int, kind: ir.Type = _WORD) -> Any:
 
 
 def _described(context: Any, builder: Any, kind: types.Array, array: Any, shape: list[Any]) -> Any:
-    """A C-contiguous array without owner, which has its address, of its shape."""
+    """A C-contiguous array without owner, from its address and shape."""
     size = ir.Constant(_WORD, context.get_abi_sizeof(context.get_data_type(kind.dtype)))
     strides, count, step = [], ir.Constant(_WORD, 1), size
     for n in reversed(shape):
@@ -117,7 +117,7 @@ def _described(context: Any, builder: Any, kind: types.Array, array: Any, shape:
 
 
 def pointer(to: types.BaseNamedTuple) -> Any:
-    """Return the compiled function that takes an address, an int64, for that of a named tuple."""
+    """Return the compiled function that converts an int64 to the address of a named tuple."""
 
     @intrinsic
     def take(_context, address):
@@ -131,15 +131,15 @@ def pointer(to: types.BaseNamedTuple) -> Any:
 
 @intrinsic
 def by_address(_context, x):
-    """A named tuple's address: of one passed by value, that of a copy on the caller's stack; others as they are."""
+    """The address of a named tuple; one passed by value is copied to the caller's stack first."""
     if not isinstance(x, types.BaseNamedTuple):
         return x(x), lambda _context, _builder, _sig, args: args[0]
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         room = cgutils.alloca_once(builder, _WORD, size=_words(x))
         _store(context, builder, x, args[0], room, 0)
-        # The address comes out of an empty piece of assembly: what is read through it cannot be read before
-        # all has been stored.
+        # The address passes through an empty piece of assembly, so that nothing is read through it before all has
+        # been stored.
         kind = ir.FunctionType(_ADDRESS, [_ADDRESS])
         empty = ir.InlineAsm(kind, "", "=r,0,~{memory}", side_effect=True)
         return builder.call(empty, [room])
@@ -148,7 +148,7 @@ def by_address(_context, x):
 
 
 def _store(context: Any, builder: Any, kind: Any, value: Any, room: Any, word: int) -> None:
-    """Lay a value down from a word on."""
+    """Store a value, beginning at a word."""
     if isinstance(kind, types.BaseNamedTuple):
         for k, part in enumerate(kind.types):
             _store(context, builder, part, builder.extract_value(value, k), room, word)

@@ -1,9 +1,9 @@
-"""Eight numbers in one: a vector of doubles as a Numba value, so that one source serves two ends.
+"""Vectors of eight doubles as Numba values, so that one source serves single flights and batches.
 
 A `lanes` value holds eight doubles; arithmetic, ``max`` and ``abs`` act on each of them. A `LaneArray`
-is an array whose elements are such values. The integrator compiles for them as it stands: eight
-flights in the lanes share their steps. For a single flight, `blocks` looks at eight consecutive
-states as one value, which is how the integrator's sums use the machine's vector registers.
+is an array of such values. The unchanged source of the integrator compiles for them: eight flights in
+the lanes share their steps. For a single flight, `blocks` views eight consecutive states as one value,
+so that the integrator's sums use the machine's vector registers.
 """
 
 import operator
@@ -30,13 +30,13 @@ from numpy.typing import NDArray
 
 from rigidfleet.typing import Floats
 
-#: Lanes of a value.
+#: Number of lanes of a value.
 WIDTH = 8
-# Products and sums may be fused, but not reordered: what a lane gets never depends on the compiler.
+# Products and sums may be fused but not reordered, so that the result of a lane never depends on the compiler.
 _FAST = ("contract", "arcp", "nsz")
 VECTOR = ir.VectorType(ir.DoubleType(), WIDTH)
 _INDEX = ir.IntType(32)
-# Whether the machine estimates eight roots or quotients at once, to 14 bits, and may be asked to.
+# Whether the machine can estimate eight roots or quotients at once, to 14 bits, and this is enabled.
 _ESTIMATES = bool(binding.get_host_cpu_features().get("avx512f")) and not config.CPU_NAME
 
 
@@ -69,7 +69,7 @@ class LaneArray(np.ndarray):
 
 
 def pack(values: Floats) -> LaneArray:
-    """Floats (...) of lanes from float64 (..., 8), a copy that is aligned as vectors like it."""
+    """An array (...) of lanes from float64 (..., 8): a copy, aligned for vectors."""
     values = np.asarray(values, dtype=np.float64)
     room = np.empty(values.size + WIDTH)
     skip = -room.ctypes.data // room.itemsize % WIDTH
@@ -87,12 +87,12 @@ def unpack(array: NDArray[Any]) -> Floats:
 
 @typeof_impl.register(LaneArray)
 def _typeof(value: LaneArray, _context: Any) -> types.Type:
-    # Alignment is not promised, as NumPy promises none; vectors in `pack`'s arrays have it.
+    # Alignment is not declared, because NumPy does not guarantee it; arrays made by `pack` are aligned.
     return types.Array(lanes, value.ndim, "C", aligned=False)
 
 
 def in_all(builder: ir.IRBuilder, number: ir.Value) -> ir.Value:
-    """Build a vector that holds a number in all lanes."""
+    """Build a vector with a number in all lanes."""
     start = ir.Constant(VECTOR, ir.Undefined)
     one = builder.insert_element(start, number, ir.Constant(_INDEX, 0))
     every = ir.Constant(ir.VectorType(_INDEX, WIDTH), [0] * WIDTH)
@@ -106,7 +106,7 @@ def _cast(context: Any, builder: Any, kind: Any, _to: Any, value: Any) -> ir.Val
 
 
 def _operands(context: Any, builder: Any, sig: Any, arguments: Any) -> list[ir.Value]:
-    """Arguments as vectors: a number is spread over the lanes."""
+    """Arguments as vectors; a number is copied to all lanes."""
     return [
         value
         if isinstance(kind, _Lanes)
@@ -116,7 +116,7 @@ def _operands(context: Any, builder: Any, sig: Any, arguments: Any) -> list[ir.V
 
 
 def _register(functions: tuple[Any, ...], arity: int, generate: Any) -> None:
-    """Let functions or operators take lanes, with numbers among them."""
+    """Let functions or operators take lanes, also mixed with numbers."""
 
     class Template(AbstractTemplate):
         def generic(self, args: Any, _kws: Any) -> Any:
@@ -174,10 +174,10 @@ def number(value: float) -> ir.Constant:
 
 
 def inverse(builder: ir.IRBuilder, x: ir.Value) -> ir.Value:
-    """Build 1/x, to the last bit but one; NaN of zero, where the machine estimates quotients.
+    """Build 1/x, exact to the last bit but one; NaN for zero, if the machine estimates quotients.
 
-    Eight quotients take a wide machine as long as sixteen products; its estimate y of 1/x, mended
-    by e + e^2 + e^3 of its error e = 1 - x y, a third of that.
+    Eight quotients take a wide machine as long as sixteen products. Its estimate y of 1/x, corrected
+    by e + e^2 + e^3 with the error e = 1 - x y, takes a third of that.
     """
     if not _ESTIMATES:
         return builder.fdiv(number(1.0), x, flags=_FAST)
@@ -189,7 +189,7 @@ def inverse(builder: ir.IRBuilder, x: ir.Value) -> ir.Value:
 
 @intrinsic
 def rough_inverse(_context, x):
-    """Return lanes of 1/x to four digits; exactly, where the machine has no estimate of quotients."""
+    """Return lanes of 1/x to four digits; exact if the machine has no estimate of quotients."""
 
     def generate(_context: Any, builder: Any, _sig: Any, args: Any) -> ir.Value:
         if _ESTIMATES:
@@ -200,9 +200,9 @@ def rough_inverse(_context, x):
 
 
 def inverse_root(builder: ir.IRBuilder, x: ir.Value) -> ir.Value:
-    """Build 1/sqrt(x), to the last bit but one; NaN of zero, where the machine estimates roots.
+    """Build 1/sqrt(x), exact to the last bit but one; NaN for zero, if the machine estimates roots.
 
-    Of an estimate y, with e = 1 - x y^2: y (1 + e/2 + 3 e^2/8 + 5 e^3/16).
+    From an estimate y, with e = 1 - x y^2: y (1 + e/2 + 3 e^2/8 + 5 e^3/16).
     """
     if not _ESTIMATES:
         root = builder.call(_llvm(builder, "sqrt", 1), [x])
@@ -233,7 +233,7 @@ def _where_positive(builder: ir.IRBuilder, x: ir.Value, a: ir.Value, b: ir.Value
     return builder.select(builder.fcmp_ordered(">", x, number(0.0)), a, b)
 
 
-#: What builds each operation.
+#: Builder of each operation.
 BUILD: dict[str, Any] = {
     "add": partial(arithmetic, name="fadd"),
     "sub": partial(arithmetic, name="fsub"),
@@ -267,7 +267,7 @@ def spread(_context, x):
 
 @intrinsic
 def blocks(_context, array):
-    """Look at float64 (..., n), n a multiple of 8, as lanes (..., n / 8); at lanes as they are."""
+    """View float64 (..., n), n a multiple of 8, as lanes (..., n / 8); lanes are returned unchanged."""
     if array.dtype == lanes:
         same = lambda context, builder, sig, args: impl_ret_borrowed(  # noqa: E731
             context, builder, sig.return_type, args[0]
@@ -295,7 +295,7 @@ def blocks(_context, array):
 
 @intrinsic
 def _fold(_context, x, largest):
-    """Sum over the lanes, or the largest of them if any; NaN where any lane is NaN."""
+    """Sum over the lanes, or the largest one; NaN if any lane is NaN."""
 
     def generate(_context: Any, builder: Any, _sig: Any, args: Any) -> ir.Value:
         def halved(x: ir.Value, combine: Any) -> ir.Value:
@@ -319,7 +319,7 @@ def _fold(_context, x, largest):
 
 
 def total_or_worst(x, states):
-    """Sum over the lanes of x where ``states`` are one flight's, else its worst flight's value."""
+    """Sum over the lanes of x if ``states`` belong to one flight; otherwise the value of the worst flight."""
     raise NotImplementedError("compiled code only")
 
 

@@ -1,4 +1,4 @@
-"""Many flights of one problem: eight of them to a vector, vectors shared out over the cores."""
+"""Many flights of one problem: eight flights per SIMD vector, and vectors distributed over the cores."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from rigidfleet.kernel.problem import EXACT, ITERATED, OPEN, SHAPE, Problem, pad
 from rigidfleet.kernel.records import FINISHED, LEAST_ERROR, integrator
 from rigidfleet.typing import Bools, Floats, Ints
 
-#: A range of flights is begun by whichever thread is free, so many ranges to a thread.
+#: Number of ranges of flights per thread; each range is taken by the next free thread.
 _RANGES = 4
-#: What a flight tries first [s].
+#: First step that a flight tries [s].
 _FIRST_STEP = 1e-3
-#: Equations of a solve up to which straight-line code is made: its length grows with their cube.
+#: Greatest number of equations for straight-line code, whose length grows with their cube.
 _MOST_EQUATIONS = 36
 
 
@@ -29,10 +29,10 @@ _MOST_EQUATIONS = 36
 def fly(p, state, t0, t_end, step, starts, before, ends, status, evaluations, max_steps, fresh):
     """Integrate vectors of eight flights from ``starts`` (G, n) at t0 to ``t_end`` [s], into ``ends``.
 
-    ``before`` (G, m) [m] are the distances from which the references of each are blended. What
-    `integrate` returns goes into ``status`` (G,), the calls of the right-hand side into
-    ``evaluations`` (G,); p, an `UnrolledProblem`, and state are overwritten. ``fresh`` is true; written
-    here, the compiler would take it for another type.
+    ``before`` (G, m) [m] are the distances from which the references of each vector are blended. The
+    return values of `integrate` are written to ``status`` (G,), and the numbers of evaluations of the
+    right-hand side to ``evaluations`` (G,). p, an `UnrolledProblem`, and state are overwritten. ``fresh``
+    is always True; a literal here would have another type for the compiler.
     """
     unsampled = state.clock[:0]
     for g in range(starts.shape[0]):
@@ -51,13 +51,13 @@ def fly(p, state, t0, t_end, step, starts, before, ends, status, evaluations, ma
 
 @dataclass(frozen=True)
 class FinalStates:
-    """Where flights have come to.
+    """Final states of flights.
 
     Attributes
     ----------
     y : (B, n) states
-    finished : (B,) whether the end was reached; the state is the last good one where not
-    evaluations : (B,) calls of the right-hand side; flights of a vector share theirs
+    finished : (B,) whether the end was reached; if not, the state is the last valid one
+    evaluations : (B,) evaluations of the right-hand side; flights of a vector share them
     """
 
     y: Floats
@@ -66,7 +66,7 @@ class FinalStates:
 
 
 def fits(problem: Problem) -> bool:
-    """Return whether straight-line code can be made of a problem, and is worth it.
+    """Return whether straight-line code can be generated for a problem, and is worthwhile.
 
     Its branches must not depend on the state, and its code must not be too long to be compiled.
     """
@@ -98,16 +98,16 @@ def fly_all(
 
     Parameters
     ----------
-    problem : of every flight
+    problem : the problem of all flights
     starts : (B, n) states at ``times[0]``
     before : (B, m) distances from which references are blended [m]
     times : start and end [s]
     rtol, atol : relative tolerance, and the absolute one (n,) of each state
-    max_steps : after so many of them a flight has failed
-    vectors : whether eight flights share a vector, its steps and its fate: should one of them be
-        rejected for good, all eight are flown again alone. Flight k lies in vector k // 8 however
-        many threads there are, so results do not depend on ``threads``.
-    threads : how many run at a time
+    max_steps : number of steps after which a flight has failed
+    vectors : whether eight flights share a SIMD vector and its steps. If one of them fails, all eight are
+        flown again, one by one. Flight k is in vector k // 8 for any number of threads, so results do
+        not depend on ``threads``.
+    threads : number of threads
 
     Raises
     ------
@@ -117,14 +117,12 @@ def fly_all(
     if not vectors:
         return _fly_alone(problem, starts, before, times, rtol, atol, max_steps, threads)
     if not fits(problem):
-        raise ValueError(
-            "flights of this problem cannot share vectors: fly them with vectors=False"
-        )
+        raise ValueError("flights of this problem cannot share vectors; use vectors=False")
     count, n = starts.shape
     ready = unrolled(problem)
 
     def packed(x: Floats) -> LaneArray:
-        if count % WIDTH:  # places left over in the last vector repeat the last flight
+        if count % WIDTH:  # unused lanes of the last vector repeat the last flight
             x = x[np.minimum(np.arange(padded(count)), count - 1)]
         return pack(x.reshape(len(x) // WIDTH, WIDTH, x.shape[1]).swapaxes(1, 2))
 
@@ -186,7 +184,7 @@ def _fly_alone(
 def _share(
     begin: Callable[[], Callable[..., None]], starts: Floats, before: Floats, threads: int
 ) -> FinalStates:
-    """Share the flights, or vectors of them, out over threads, each with its own of what `begin` makes."""
+    """Distribute flights, or vectors of them, over threads; each thread calls `begin` for its own data."""
     count = len(starts)
     threads = min(threads, count)
     ends = np.empty_like(starts)

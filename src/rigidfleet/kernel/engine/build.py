@@ -1,7 +1,7 @@
-"""From the kernel's functions to machine code that needs no compiler to be called.
+"""Compile the kernel's functions to machine code that can be called without the compiler.
 
-Numba translates the integrator, the recorder, the monitor and all they call to LLVM's language. What is then called
-from nowhere else may be rearranged at will, and is optimised once, together.
+Numba translates the integrator, the recorder, the monitor and all functions that they call to LLVM's intermediate
+representation. Functions that are not called from outside become internal, and all are optimised once, together.
 
 In a process of its own (`objects.build_process`) it writes the code to standard output. Most of the time goes into the
 translation, so that a second process does its half of it meanwhile.
@@ -34,22 +34,22 @@ from rigidfleet.kernel.compiler.pointers import Pointer, pointer
 from rigidfleet.kernel.engine import objects, packing
 
 _Functions = dict[Any, tuple[types.Type, ...]]
-#: What every evaluation of a flight goes through: its calls would take a tenth of a small formation's time.
+#: Functions that every evaluation calls, to be inlined; calls would take a tenth of a small formation's time.
 _HOT = (
     "closed_loop", "input_law", "constraint_force", "accelerate", "mean_axes", "centre_of_mass", "inertia",
     "inertia_inverse", "multiply", "damp_deformation", "reference_motion", "desired_agents", "local_law", "septic",
     "blend_slots", "distance_references", "right_side", "solve_multipliers", "assemble", "cholesky",
     "cholesky_solve", "apply_multipliers",
 )  # fmt: skip
-#: Passes that simplify each function that Numba has translated, before any is put into another.
+#: Passes that simplify each translated function before inlining.
 _QUICK = ("sroa", "simplify_cfg", "instruction_combine", "simplify_cfg")
 
 
 def machine_code(second: "_SecondProcess | None" = None) -> list[bytes]:
     """Object code of the three C functions that `native` calls, `objects.ENTRIES`.
 
-    All their arguments are addresses of named tuples. They integrate, and return what `dopri5.integrate` does,
-    record, and watch, as `monitor.watch` does. The ``second`` process, if there is one, does part of the work.
+    Their arguments are addresses of named tuples. They integrate (and return what `dopri5.integrate` returns),
+    record, and monitor (as `monitor.watch` does). The ``second`` process, if there is one, does part of the work.
     """
     problem, workspace, integrator, segment, record, _ = _pointers()
 
@@ -66,7 +66,8 @@ def machine_code(second: "_SecondProcess | None" = None) -> list[bytes]:
         return 0
 
     if second is not None:
-        for function, arguments in _halves()[0].items():  # before what waits for the second
+        # Before the parts that wait for the second process
+        for function, arguments in _halves()[0].items():
             function.compile(arguments)
     functions = zip((integrate_segment, record_segment), objects.ENTRIES, strict=False)
     modules = [_module(function, name) for function, name in functions]
@@ -90,7 +91,7 @@ def _pointers() -> list[Any]:
 
 
 def _module(function: Any, name: str) -> tuple[str, str, str]:
-    """What `_object` makes code of: all that a C function of four addresses calls, its symbol, and its ``name``."""
+    """Input of `_object`: the module of a C function of four addresses, its symbol, and its ``name``."""
     made = cfunc(types.int64(*(types.int64,) * 4), **OPTIONS)(function)
     return made.inspect_llvm(), made.native_name, name
 
@@ -103,16 +104,16 @@ def _object(text: str, symbol: str, name: str) -> bytes:
     for function in module.functions:
         if function.is_declaration and function.name.startswith(("numba_", "NRT_", "Py")):
             raise RuntimeError(
-                f"the kernel needs {function.name}, which only Numba's own callers have"
+                f"the kernel needs {function.name}, which is available only to Numba's own callers"
             )
     return objects.target_machine().emit_object(module)
 
 
 def _simplified(text: str, symbol: str, name: str) -> llvm.ModuleRef:
     """Return a module of which ``symbol`` alone, now called ``name``, is called from outside."""
-    # Of the arguments only addresses of named tuples are said to be dereferenceable; nobody writes there.
+    # Only addresses of named tuples are declared dereferenceable, and these are never written.
     module = llvm.parse_assembly(re.sub(r"(?=dereferenceable\(\d+\))", "readonly ", text))
-    hot = tuple(f"{len(name)}{name}B" for name in _HOT)  # as in the names that Numba gives
+    hot = tuple(f"{len(name)}{name}B" for name in _HOT)  # as in Numba's mangled names
     for thing in (*module.functions, *module.global_variables):
         if thing.name == symbol:
             thing.name, thing.linkage = name, "external"
@@ -120,7 +121,7 @@ def _simplified(text: str, symbol: str, name: str) -> llvm.ModuleRef:
             thing.linkage = "internal"
             if thing.is_function and any(name in thing.name for name in hot):
                 thing.add_function_attribute("alwaysinline")
-    # A few quick passes leave a third of the work to the many.
+    # A few quick passes first reduce the work of the full ones to a third.
     quick = llvm.create_new_module_pass_manager()
     for add in _QUICK:
         getattr(quick, f"add_{add}_pass")()
@@ -130,7 +131,8 @@ def _simplified(text: str, symbol: str, name: str) -> llvm.ModuleRef:
 
 def _passes(level: int) -> Any:
     options = llvm.create_pipeline_tuning_options(speed_level=level)
-    options.loop_vectorization = False  # loops are short; the integrator's sums are of vectors
+    # Loops are short, and the integrator's sums use vectors already
+    options.loop_vectorization = False
     return llvm.create_pass_builder(objects.target_machine(), options)
 
 
@@ -138,7 +140,7 @@ def _passes(level: int) -> Any:
 
 
 def _halves() -> tuple[_Functions, _Functions]:
-    """Functions, and the types of their arguments: those that this process begins with, those of the second."""
+    """Functions with the types of their arguments, first those of this process, then those of the second."""
     example, work, _, _, out, _ = packing.examples()
     p, w, record = (Pointer(typeof(x)) for x in (example, work, out))
     disturbance = Pointer(typeof(example.disturbance))
@@ -164,15 +166,15 @@ def _halves() -> tuple[_Functions, _Functions]:
 
 
 def _translated() -> dict[str, bytes]:
-    """The second half, each function as Numba would keep it, but simplified already."""
+    """The second half: each function in the form of Numba's cache, but already simplified."""
     halves = _halves()[1].items()
     return {f.__name__: numba_internals.portable(f, types_, _simplified) for f, types_ in halves}
 
 
 class _SecondProcess:
-    """The second process: it translates its half, and makes the monitor.
+    """The second process, which translates its half and compiles the monitor.
 
-    Whatever comes to nothing there is done here.
+    Whatever fails there is done in this process.
     """
 
     def __init__(self, *, shares: bool) -> None:
@@ -186,7 +188,7 @@ class _SecondProcess:
 
     @cached_property
     def translated(self) -> dict[str, bytes]:
-        """Its half, by the names of functions."""
+        """Its half of the functions, by name."""
         return self._answer() or {}
 
     def monitor(self) -> bytes | None:
@@ -200,20 +202,20 @@ class _SecondProcess:
             return pickle.load(self._process.stdout)
 
     class _Half:
-        """What Numba takes for a function's cache."""
+        """Acts as the cache of a function for Numba."""
 
         def __init__(self, process: "_SecondProcess", name: str, arguments: Any) -> None:
             self._process, self._name, self._arguments = process, name, arguments
 
         def load_overload(self, arguments: Any, context: Any) -> Any:
-            """What the other process has made; None has Numba translate it here."""
+            """The function from the other process; with None, Numba translates it here."""
             done = self._process.translated.get(self._name)
             if done is None or arguments != self._arguments:
                 return None
             return numba_internals.received(context, done)
 
         def save_overload(self, *_: Any) -> None:
-            """Nothing is kept."""
+            """Store nothing."""
 
 
 def main(*, half: bool) -> None:

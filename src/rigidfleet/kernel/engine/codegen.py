@@ -1,8 +1,8 @@
-"""Eight flights of one problem at a time, through straight-line code made for it.
+"""Fly eight flights of one problem at a time, with straight-line code generated for it.
 
-The right-hand side is written out by `rigidfleet.kernel.engine.tracer` and compiled for each structure of a
-problem (its graph, its law, which of its numbers are equal) once; the integrator is that of single
-flights, compiled for vectors once and for all.
+`rigidfleet.kernel.engine.tracer` generates the code of the right-hand side. It is compiled once for each
+structure of a problem (its graph, its law, which of its numbers are equal). The integrator is that of
+single flights, compiled once for vectors.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from rigidfleet.typing import Floats
 
 
 class UnrolledProblem(NamedTuple):
-    """A problem as straight-line code takes it; ``before`` and ``time`` are overwritten in flight."""
+    """A problem in the form that straight-line code reads; ``before`` and ``time`` are overwritten in flight."""
 
     address: int  # of the code
-    uniform: Floats  # (U,) what comes of the problem's numbers
+    uniform: Floats  # (U,) values that depend on the problem's numbers alone
     before: LaneArray  # (m,) distances from which references are blended [m]
     time: Floats  # (3,) blend of the references, and two derivatives
     t0: float  # [s]
@@ -38,7 +38,7 @@ class UnrolledProblem(NamedTuple):
 
 
 def unrolled(problem: Problem) -> UnrolledProblem:
-    """Prepare a problem for `integrate`; compiles its code where that is new on this machine.
+    """Prepare a problem for `integrate`; compile its code if it is not yet in the cache.
 
     Raises
     ------
@@ -86,7 +86,7 @@ def _closed_loop(t, y, dy, p, w):
 
 @inlined
 def _advance(k, stage, a, h):
-    """As `dopri5.advance`, without terms that weigh nothing: of vectors, each costs time."""
+    """As `dopri5.advance`, without terms of weight zero, since each vector operation costs time."""
     a0, a1, a2 = h * a[stage, 0], h * a[stage, 1], h * a[stage, 2]
     a3, a4, a5 = h * a[stage, 3], h * a[stage, 4], h * a[stage, 5]
     if stage <= 1:
@@ -117,12 +117,12 @@ def _advance(k, stage, a, h):
 
 @inlined
 def _keep_step(t, h, p, w, state):
-    """Flights of an ensemble leave no trail."""
+    """Do nothing: flights of an ensemble record no trail."""
 
 
 @inlined
 def _keep_start(p, w, state):
-    """Nor any forces."""
+    """Do nothing: flights of an ensemble record no forces."""
 
 
 #: As `dopri5.integrate`; p is an `UnrolledProblem`, w is not used, arrays hold lanes.
@@ -182,7 +182,7 @@ def _emit(module: ir.Module, code: Code) -> ir.Function:
     inputs = {x.serial: index for index, x in enumerate(code.inputs)}
 
     def value(x: Symbol | float) -> ir.Value:
-        """Of what is computed, or loaded where it is first needed."""
+        """The value of a symbol, computed already or loaded at its first use."""
         if not isinstance(x, Symbol):
             return simd.number(x)
         if x.serial not in values:

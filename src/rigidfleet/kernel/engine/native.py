@@ -1,8 +1,8 @@
 """The compiled kernel, called without the compiler.
 
-`rigidfleet.kernel.engine.build` compiles the integrator, the recorder and the monitor once to machine code. The cache
-keeps it, and it is loaded from there: importing Numba alone takes longer than flying most missions. What the code reads
-and writes it finds through addresses of named tuples, laid out as `rigidfleet.kernel.compiler.pointers` says.
+`rigidfleet.kernel.engine.build` compiles the integrator, the recorder and the monitor once to machine code. The code is
+stored in a cache and loaded from there, because importing Numba alone takes longer than flying most missions. It reads
+and writes through addresses of named tuples, laid out as `rigidfleet.kernel.compiler.pointers` says.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def record(problem: Problem, workspace: Workspace, times: Floats, samples: Float
 
 
 class Watch:
-    """A monitor at work: takes the extremes of the steps in trails, see `rigidfleet.kernel.monitor.watch`."""
+    """A callable that finds the extremes of the steps in trails, see `rigidfleet.kernel.monitor.watch`."""
 
     def __init__(self, monitor: Monitor) -> None:
         # The recorder evaluates the law, at the monitor's own time and state.
@@ -84,7 +84,7 @@ class Watch:
         self._packed = pack(self.monitor)
 
     def __call__(self, problem: Problem, workspace: Workspace, state: IntegratorState) -> int:
-        """What `rigidfleet.kernel.monitor.watch` returns."""
+        """Monitor the steps; return what `rigidfleet.kernel.monitor.watch` returns."""
         return _call(_code().watch, packed(problem), packed(workspace), packed(state), self._packed)
 
 
@@ -103,8 +103,8 @@ class _Code(NamedTuple):
     record: Any
     watch: Any
     recorder: int  # address of record
-    engine: Any  # keeps the code
-    unkept: list[bytes] | None  # what other processes cannot find in the cache
+    engine: Any  # keeps the code alive
+    unkept: list[bytes] | None  # objects that could not be stored in the cache
 
 
 _loading = threading.Lock()
@@ -142,19 +142,19 @@ def _linked(parts: Sequence[bytes], unkept: list[bytes] | None = None) -> _Code:
 
 
 class Inheritance(NamedTuple):
-    """What a process that this one starts is not to compile again, nor to warn of again."""
+    """Code that a child process need not compile again, and warnings that it need not repeat."""
 
     code: list[bytes] | None
     told: bool
 
 
 def bequeath() -> Inheritance:
-    """What this process has that those it starts cannot find in the cache; to be sent to them alone."""
+    """Code of this process that its child processes cannot find in the cache; to be sent only to them."""
     return Inheritance(_loaded[0].unkept if _loaded else None, told.is_set())
 
 
 def inherit(given: Inheritance) -> None:
-    """Take over what the process that started this one has."""
+    """Take over the code and warnings of the parent process."""
     if given.told:
         told.set()
     if given.code is not None:
@@ -162,12 +162,12 @@ def inherit(given: Inheritance) -> None:
 
 
 def _compile() -> list[bytes]:
-    """Compile the kernel, in a process of its own where one can be had.
+    """Compile the kernel, in a separate process if possible.
 
-    There Numba is told to translate alone: it would optimise each function before all of them together are, and
-    take twice as long.
+    In that process Numba only translates. Otherwise it would optimise each function before all are optimised
+    together, and take twice as long.
     """
-    # Nobody reads of the many versions that Numba tries, least of all in colours.
+    # Suppress Numba's coloured messages about the versions that it tries.
     quiet = {"NUMBA_OPT": "0", "NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING": "1"}
     if sys.executable:
         with suppress(OSError):
@@ -182,7 +182,7 @@ def _compile() -> list[bytes]:
 
 
 def _file() -> Path:
-    """Where the machine code is kept: by kind of machine.
+    """The cache file of the machine code for this kind of machine.
 
     Raises
     ------
@@ -194,7 +194,7 @@ def _file() -> Path:
 
 
 def _read() -> list[bytes] | None:
-    """Machine code that is kept, if there is any that may be run."""
+    """Machine code from the cache, if there is any that is safe to run."""
     try:
         with opened(_file()) as stream:
             return separated(stream.read())
@@ -203,7 +203,7 @@ def _read() -> list[bytes] | None:
 
 
 def _write(parts: Sequence[bytes]) -> bool:
-    """Keep machine code, or warn that it will be compiled again."""
+    """Store machine code in the cache, or warn that it will be compiled again."""
     try:
         with replacing(_file(), private=True) as stream:
             stream.write(concatenated(parts))

@@ -11,13 +11,13 @@ from typing import Any
 
 import llvmlite.binding as llvm
 
-#: What the machine code is called, its arguments being addresses: int64(problem, workspace, integrator, segment),
-#: int64(problem, workspace, segment, record) and int64(problem, workspace, integrator, monitor). Each comes in an
-#: object of its own.
+#: Names of the machine code's functions. Their arguments are addresses: int64(problem, workspace, integrator, segment),
+#: int64(problem, workspace, segment, record) and int64(problem, workspace, integrator, monitor). Each function is in
+#: its own object.
 ENTRIES = "rigidfleet_integrate", "rigidfleet_record", "rigidfleet_watch"
 
 
-#: Where the processes that compile are: Numba takes settings from a file that it finds where it is.
+#: Working folder of the compiling processes, as Numba reads settings from a file in its working folder.
 ELSEWHERE = os.path.abspath(os.sep)
 
 
@@ -28,10 +28,10 @@ _FLAGS = {"isolated": "-I", "ignore_environment": "-E", "no_user_site": "-s", "n
 
 
 def build_process(*, half: bool = False) -> list[str]:
-    """Command of a process that compiles: it imports what this one would, but nothing from the current folder.
+    """Command of a compiling process, which has the import path of this one without the current folder.
 
-    An interactive Python, or one given its code by ``-c``, has the current folder on its path as ``""``. That goes;
-    any other folder on the path has been asked for. Last comes the one that this package is from.
+    An interactive Python, or one started with ``-c``, has the current folder on its path as ``""``. This entry is
+    removed; all other folders are kept, because the user chose them. The folder of this package comes last.
     """
     flags = [flag for name, flag in _FLAGS.items() if getattr(sys.flags, name)]
     path = [os.path.abspath(folder) for folder in sys.path if isinstance(folder, str) and folder]
@@ -40,14 +40,14 @@ def build_process(*, half: bool = False) -> list[str]:
 
 
 def target_machine() -> Any:
-    """What machine code is made for: this machine."""
+    """The target of the machine code: this machine."""
     return llvm.Target.from_default_triple().create_target_machine(
         cpu=llvm.get_host_cpu_name(), features=llvm.get_host_cpu_features().flatten(), opt=3, jit=True
     )  # fmt: skip
 
 
 def concatenated(parts: Sequence[bytes]) -> bytes:
-    """Objects in one, each after its length, and their digest, so that half of them is never called."""
+    """Join objects, each after its length, with a digest, so that an incomplete file is never used."""
     code = b"".join(len(part).to_bytes(8, "little") + part for part in parts)
     return code + hashlib.sha256(code).digest()
 

@@ -39,7 +39,7 @@ from rigidfleet.typing import Ints
 
 
 class Packed(NamedTuple):
-    """A named tuple in words, and the tuple itself, which keeps its arrays."""
+    """A named tuple as words, and the tuple itself, which keeps its arrays alive."""
 
     of: Any
     words: Ints
@@ -47,7 +47,7 @@ class Packed(NamedTuple):
 
 
 class _Layout(NamedTuple):
-    """How a named tuple of one type is laid out."""
+    """Memory layout of a type of named tuple."""
 
     code: struct.Struct
     arrays: tuple[tuple[str, int], ...]  # kind of number and dimensions of each
@@ -58,7 +58,7 @@ def _flatten(x: Any, code: list[str], words: list[Any], arrays: list[tuple[str, 
     for value in x:
         if isinstance(value, np.ndarray):
             if not value.flags.c_contiguous:
-                raise TypeError("the kernel takes C-contiguous arrays alone")
+                raise TypeError("the kernel takes only C-contiguous arrays")
             code.append("q" * (1 + value.ndim))
             words += (value.__array_interface__["data"][0], *value.shape)
             arrays.append((value.dtype.char, value.ndim))
@@ -73,7 +73,7 @@ def _flatten(x: Any, code: list[str], words: list[Any], arrays: list[tuple[str, 
 
 
 def pack(x: Any) -> Packed:
-    """Lay a named tuple down in words.
+    """Convert a named tuple to words.
 
     Raises
     ------
@@ -87,14 +87,14 @@ def pack(x: Any) -> Packed:
     layout = _layout(type(x))
     if tuple(arrays) != layout.arrays or "".join(code) != layout.code.format[1:]:
         raise TypeError(
-            f"this {type(x).__name__} has arrays or numbers of other types than the kernel takes"
+            f"this {type(x).__name__} has arrays or numbers of types that the kernel does not take"
         )
     words = np.frombuffer(layout.code.pack(*values), dtype=np.int64)
     return Packed(x, words, words.__array_interface__["data"][0])
 
 
 class _Last(threading.local):
-    """The last of each type that a thread has packed: flights call the kernel with the same ones again and again."""
+    """The last tuple of each type packed by a thread: flights call the kernel with the same ones repeatedly."""
 
     def __init__(self) -> None:
         self.packed: dict[type, Packed] = {}
@@ -121,7 +121,7 @@ def _layout(kind: type) -> _Layout:
 
 @cache
 def examples() -> tuple[Problem, Workspace, IntegratorState, Segment, Record, Monitor]:
-    """One of each named tuple, as small as can be: their fields have the types of all."""
+    """One minimal example of each named tuple; its fields have the types that all have."""
     one, none, places, frame = np.ones(1), np.zeros(0), np.zeros((1, 3)), np.eye(3)
     problem = Problem(
         body_formulation=False,

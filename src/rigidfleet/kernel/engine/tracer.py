@@ -1,8 +1,8 @@
-"""The closed loop of one problem as straight-line code, written out by the kernel's own source.
+"""The closed loop of one problem as straight-line code, generated from the kernel's own source.
 
-The functions of the kernel are run once, in plain Python, with symbols for numbers. What they do to
-them is written down: no loop, index or branch is left, products with zero are gone, what is computed
-twice is computed once, and what depends on masses and gains alone is computed before the flight.
+The kernel's functions run once in plain Python, with symbols in place of numbers, and all operations on
+the symbols are recorded. The result has no loops, indices, branches, products with zero or repeated
+computations. Whatever depends on masses and gains alone is computed before the flight.
 `rigidfleet.kernel.engine.codegen` compiles the rest for eight flights at a time.
 """
 
@@ -21,7 +21,7 @@ from rigidfleet.kernel import dynamics
 from rigidfleet.kernel.problem import EXACT, ITERATED, Graph, Problem, workspace
 from rigidfleet.typing import Floats, Ints
 
-#: From where a symbol gets its value, in the order in which they are known: numbers of the problem;
+#: Sources of a symbol's value, in the order in which they become known: numbers of the problem;
 #: numbers of the flight, of the moment, and of its state.
 UNIFORM, FLIGHT, TIME, STATE = range(4)
 _SOURCES = {"uniform": UNIFORM, "before": FLIGHT, "time": TIME, "y": STATE}
@@ -42,11 +42,11 @@ _EVALUATE: dict[str, Callable[..., Any]] = {
 
 
 class UnfitError(ValueError):
-    """A branch or an operation that straight-line code has none for."""
+    """A branch or an operation that straight-line code cannot express."""
 
 
 class Symbol:
-    """A number that is not known yet: what it is computed by, from which symbols or numbers."""
+    """An unknown number: the operation that computes it, and its arguments (symbols or numbers)."""
 
     __slots__ = ("arguments", "known", "operation", "serial", "trace")
 
@@ -87,9 +87,9 @@ class Symbol:
         return self.trace.symbol("abs", self)
 
     def __gt__(self, other: Any) -> bool:
-        """Whether it is positive: known of the problem's numbers, taken for granted of others."""
+        """Whether it is positive: known for the problem's numbers, assumed for other symbols."""
         if other != 0.0:
-            raise UnfitError("a comparison with another number than zero")
+            raise UnfitError("a comparison with a number other than zero")
         if self.operation == "uniform":
             return self.trace.known_positive(self)
         self.trace.positive.append(self)
@@ -100,20 +100,20 @@ class Symbol:
 
 
 class Trace:
-    """What the kernel does to the numbers of one problem.
+    """The recorded operations of the kernel on the numbers of one problem.
 
-    Its edges are taken in another order, in which the factor of A fills up little; states, outputs
-    and distances keep theirs.
+    The edges are reordered so that the factor of A has little fill; states, outputs
+    and distances keep their order.
 
     Parameters
     ----------
-    problem : of an open-loop flight of distances
+    problem : an open-loop flight with a distance reference
 
     Attributes
     ----------
-    made : symbols, each by what makes it
+    made : symbols by their operation and arguments
     outputs : (n,) the derivative of the state, symbols or numbers
-    positive : symbols taken for positive; where one is not, the state has no derivative
+    positive : symbols assumed positive; if one is not, the state has no derivative
 
     Raises
     ------
@@ -123,7 +123,7 @@ class Trace:
 
     def __init__(self, problem: Problem) -> None:
         if problem.law.solver not in (ITERATED, EXACT):
-            raise UnfitError("a law that goes on where its matrix has no factor")
+            raise UnfitError("a law that continues if its matrix has no factor")
         self.made: dict[tuple[Any, ...], Symbol] = {}
         self.positive: list[Symbol] = []
         _, self._values, which = structure(problem)
@@ -144,7 +144,7 @@ class Trace:
         self.outputs: list[Any] = dy[np.argsort(states)].tolist()
 
     def known_positive(self, x: Symbol) -> bool:
-        """Whether a number of the problem is positive: `structure` tells apart those that are not."""
+        """Whether a number of the problem is positive; `structure` distinguishes those that are not."""
         return bool(self._values[x.arguments[0]] > 0.0)
 
     def symbol(self, operation: str, *arguments: Any) -> Symbol:
@@ -181,7 +181,7 @@ class Trace:
                 return y
             if _is(x, -1.0):
                 return self.subtract(0.0, y)
-        # So that x y and y x are one.
+        # So that x y and y x are the same symbol.
         swap = isinstance(b, Symbol) and (not isinstance(a, Symbol) or b.serial < a.serial)
         return self.symbol("mul", b, a) if swap else self.symbol("mul", a, b)
 
@@ -200,7 +200,7 @@ class Trace:
         return self.symbol("root", x, self.symbol("inverse_root", x))
 
     def _symbolic(self, x: Any) -> Any:
-        """Replace numbers by symbols, equal ones by one; 0 and 1 stay."""
+        """Replace numbers by symbols, equal numbers by the same one; 0 and 1 stay numbers."""
         if isinstance(x, tuple):
             return type(x)(*map(self._symbolic, x))
         if isinstance(x, np.ndarray):
@@ -212,7 +212,7 @@ class Trace:
         return x if x in (0.0, 1.0) else self.symbol("uniform", index)
 
     def _plain(self, function: Dispatcher) -> Callable[..., Any]:
-        """The function as Python runs it, and all that it calls, with mathematics for symbols."""
+        """The function, and all that it calls, as plain Python functions with mathematics for symbols."""
         some = lambda operation: (  # noqa: E731
             lambda a, b: self.symbol(operation, a, b) if _any(a, b) else _EVALUATE[operation](a, b)
         )
@@ -240,14 +240,14 @@ class Trace:
 
 
 class Code:
-    """Straight-line code of a trace: what is to be computed, in which order.
+    """Straight-line code of a trace: its computations in order.
 
     Attributes
     ----------
     outputs : (n,) symbols or numbers
     positive : symbols that have to be positive
-    lines : symbols that are computed in flight, each after what it needs
-    inputs : (U,) symbols of the problem's numbers alone that the others use
+    lines : symbols computed in flight, each after its arguments
+    inputs : (U,) symbols that depend on the problem's numbers alone and that the lines use
     """
 
     def __init__(self, trace: Trace) -> None:
@@ -266,7 +266,7 @@ class Code:
         self.inputs = list({x.serial: x for x in inputs}.values())
 
     def values(self, numbers: Floats) -> Floats:
-        """Values (U,) of the inputs where the problem's different numbers are these, by `structure`."""
+        """Values (U,) of the inputs for a problem's distinct numbers, as `structure` returns them."""
         found: dict[int, float] = {}
         with np.errstate(all="ignore"):
             for x in self._uniform:
@@ -278,7 +278,7 @@ class Code:
         return np.array([found[x.serial] for x in self.inputs])
 
     def _need(self, wanted: Any) -> None:
-        """List all that a symbol needs; without recursion, as chains are long."""
+        """List everything that a symbol needs, without recursion, because chains are long."""
         stack = [wanted]
         while stack:
             x = stack.pop()
@@ -295,10 +295,10 @@ class Code:
 
 
 def structure(problem: Problem) -> tuple[bytes, Floats, Ints]:
-    """All that straight-line code depends on: problems with equal structures share it.
+    """Everything that straight-line code depends on: problems with equal structures share the code.
 
-    Returns it, the different numbers that the problem flies by, in the order of their first
-    appearance, and for each number, in the order of `Trace`, which of them it is.
+    Returns the structure; the distinct numbers of the problem, in the order of their first appearance;
+    and for each number, in the order of `Trace`, the index of its distinct number.
     """
     numbers: list[Floats] = []
     others: list[Any] = [problem.has_frame, problem.body_formulation, problem.external]
@@ -337,12 +337,12 @@ def _ordered(graph: Graph, order: Ints) -> Graph:
     return graph._replace(edges=graph.edges[order], pairs=pairs, diagonal=graph.diagonal[order])
 
 
-# Parts of a problem that open-loop flights of distances use.
+# Parts of a problem that open-loop flights with a distance reference use.
 _PARTS = ("vehicles", "graph", "law", "reference", "control", "disturbance")
 
 
 def _used(problem: Problem) -> Problem:
-    """The problem without what such flights have no use for; the kernel would stumble over it."""
+    """The problem without the parts that such flights do not use, which the tracer could not handle."""
     none: Any = None
     reference = problem.reference._replace(t0=none, T_b=none, d0=none, p0=none, dp=none, turn=none)
     fields = ("active", "inverse")
@@ -354,7 +354,7 @@ def _used(problem: Problem) -> Problem:
 
 
 def _sort_out(x: Any, numbers: list[Floats], others: list[Any]) -> None:
-    """List the real numbers of a part; all the rest of it, with the shapes of arrays, apart."""
+    """List the real numbers of a part, and separately everything else, including the shapes of arrays."""
     if isinstance(x, tuple):
         for field in x:
             _sort_out(field, numbers, others)

@@ -1,8 +1,8 @@
 """Linear algebra on the vertex graph: K = mbar J^T J + mu M, in 3x3 blocks, without a dense matrix.
 
-K (3N, 3N) has a block for each agent and one for each edge. It is factored as L L^T by blocks in the pattern
-of a `Pattern`, complete or without fill, and that factor, turned with the formation, preconditions conjugate
-gradients long after it was made.
+K (3N, 3N) has a block for each agent and one for each edge. It is factored as L L^T in blocks, in the positions
+of a `Pattern`, with all fill or without. This factor, rotated with the formation, preconditions conjugate
+gradients for many later evaluations.
 """
 
 import math
@@ -16,7 +16,7 @@ from rigidfleet.typing import Ints
 
 
 class Pattern(NamedTuple):
-    """Where the blocks of L are: by columns, the diagonal first, and by rows."""
+    """Positions of the blocks of L: by columns, the diagonal first, and by rows."""
 
     place: Ints  # (N,) column of each agent
     column: Ints  # (N + 1,) first block of each column
@@ -30,7 +30,7 @@ class Pattern(NamedTuple):
 def pattern(n: int, edges: NDArray[np.integer], order: Ints, most: float) -> Pattern:
     """Pattern of L with agents eliminated in ``order`` (N,).
 
-    With more than ``most`` blocks an agent, fill is left out: the pattern is that of K.
+    If there are more than ``most`` blocks per agent, fill is omitted: the pattern is that of K.
     """
     place = np.empty(n, dtype=np.int64)
     place[order] = np.arange(n)
@@ -43,7 +43,7 @@ def pattern(n: int, edges: NDArray[np.integer], order: Ints, most: float) -> Pat
     mark[:], count[:] = -1, 1
     fill = count_blocks(first, left, parent, mark, count, int(most * n))
     if not fill:
-        parent[:] = -1  # nobody inherits
+        parent[:] = -1  # no fill is inherited
         mark[:], count[:] = -1, 1
         count_blocks(first, left, parent, mark, count, 1 << 62)
     column = np.concatenate([[0], np.cumsum(count)]).astype(np.int64)
@@ -79,7 +79,7 @@ def elimination_tree(first, left, parent, ancestor):
 
 @compiled
 def count_blocks(first, left, parent, mark, count, most):
-    """Add the blocks below the diagonal to each column's count (N,); False beyond ``most`` in all."""
+    """Add the blocks below the diagonal to each column's count (N,); return False for more than ``most`` in all."""
     total = 0
     for k in range(parent.shape[0]):
         mark[k] = k
@@ -97,7 +97,7 @@ def count_blocks(first, left, parent, mark, count, most):
 
 @compiled
 def fill_blocks(first, left, parent, mark, free, out):
-    """Write rows and columns of the blocks that `count_blocks` has counted."""
+    """Write the rows and columns of the blocks counted by `count_blocks`."""
     at = 0
     for k in range(parent.shape[0]):
         mark[k] = k
@@ -138,10 +138,10 @@ def assemble(u, edges, m, mbar, mu, place, column, of_edge, L):
 
 @compiled
 def factor(column, row, first, left, block, L, at):
-    """Factor by blocks in place, column after column; False where it is not positive definite.
+    """Factor by blocks in place, column by column; return False if the matrix is not positive definite.
 
-    The diagonal blocks keep the inverses of their pivots. Updates that fall outside of the pattern
-    are dropped: with all fill there are none.
+    The diagonal blocks store the inverses of their pivots. Updates outside the pattern
+    are dropped; with all fill there are none.
     """
     for k in range(at.shape[0]):
         at[k] = -1
@@ -190,7 +190,7 @@ def factor(column, row, first, left, block, L, at):
 
 @compiled
 def precondition(R, place, column, row, L, r, w, z):
-    """z = R (L L^T)^-1 R^T r for (N, 3) arrays: the factor as made, R (3, 3) what it has turned since."""
+    """z = R (L L^T)^-1 R^T r for (N, 3) arrays, where R (3, 3) is the rotation since the factor was made."""
     for i in range(r.shape[0]):
         k = place[i]
         for s in range(3):
@@ -272,10 +272,10 @@ def inner(a, b):
 
 @compiled
 def project(u, edges, m, mbar, mu, g, past, G, x):
-    """x (N, 3) = that combination of past solutions (P, N, 3) which is nearest to the one of K x = g.
+    """x (N, 3) = the combination of past solutions (P, N, 3) that is nearest to the solution of K x = g.
 
-    In the norm of K, so that its residual is orthogonal to all of them (Fischer, 1998). What depends on those
-    before is left out. G (P, P + 2) is scratch.
+    Nearest in the norm of K, so that its residual is orthogonal to all of them (Fischer, 1998). Solutions that depend
+    on earlier ones are skipped. G (P, P + 2) is scratch.
     """
     count = past.shape[0]
     c, scale = G[:, count], G[:, count + 1]
@@ -322,9 +322,9 @@ def project(u, edges, m, mbar, mu, g, past, G, x):
 
 @compiled
 def conjugate_gradients(u, edges, m, mbar, mu, R, place, column, row, L, g, x, within, most, work):
-    """Solve K x = g from x on until |g - K x| <= within, all (N, 3); returns the iterations.
+    """Solve K x = g, starting from x, until |g - K x| <= within, all (N, 3); return the number of iterations.
 
-    More than ``most`` of them means that it has not got there. ``work`` (5, N, 3) is scratch.
+    More than ``most`` iterations mean that it has not converged. ``work`` (5, N, 3) is scratch.
     """
     r, z, q, Kq, w = work[0], work[1], work[2], work[3], work[4]
     n = m.shape[0]

@@ -1,9 +1,9 @@
 """The exact law by two passes of 3x3 solves, O(N): for graphs that join each agent to three earlier ones.
 
-Such a graph (a 3-tree or any other made by Henneberg's first step) has 3N - 6 edges, and where no pivot is
-lost J has full row rank: its null space is the six rigid motions of the *current* shape. So any a_p with
-J a_p = b, plus the rigid motion that restores the balance of momentum, is M^-1 f_C of the exact law;
-A = J M^-1 J^T is neither formed nor factored. A pass forwards finds a_p, one backwards the multipliers.
+Such a graph (a 3-tree, or any other made by Henneberg type-I steps) has 3N - 6 edges. If no pivot is lost, J has
+full row rank, and its null space is the six rigid motions of the *current* shape. So any a_p with J a_p = b, plus the
+rigid motion that restores the balance of momentum, is M^-1 f_C of the exact law. A = J M^-1 J^T is neither formed nor
+factored: a forward pass finds a_p, and a backward pass the multipliers.
 """
 
 import math
@@ -16,12 +16,12 @@ from rigidfleet.kernel.compiler.jit import compiled
 from rigidfleet.kernel.rigid_body import centre_of_mass, inertia, inertia_inverse
 from rigidfleet.typing import Edges, Ints
 
-# The triple product of three unit vectors that counts as a lost pivot.
+# Triple product of three unit vectors below which a pivot counts as lost.
 LOST = 1e-6
 
 
 class Order(NamedTuple):
-    """The order of elimination: agents, each with its edges to three before it; what is lacking is 0."""
+    """The order of elimination: agents, each with its edges to three before it; missing entries are 0."""
 
     agent: Edges  # (N,)
     edge: Edges  # (N, 3): none, one, two, then three each
@@ -41,10 +41,10 @@ def order(steps: Ints, edges: NDArray[np.integer]) -> Order:
 
 @compiled
 def solve(u, b, r, m, M, order, known, cm, I, I_inv, a, multiplier):
-    """Multipliers (m,) of the exact law for b (m,); returns the smallest pivot, and nothing where that is LOST.
+    """Compute multipliers (m,) of the exact law for b (m,) and return the smallest pivot; if LOST, write nothing.
 
-    Of agents r (N, 3) and unit vectors u (m, 3). The centre of mass cm, the inertia I about it and its inverse are
-    computed unless ``known``; a (N, 3) is scratch.
+    The agents are at r (N, 3), with unit vectors u (m, 3). The centre of mass cm, the inertia I about it and its
+    inverse are computed unless ``known``; a (N, 3) is scratch.
     """
     if not known:
         centre_of_mass(r, m, M, cm)
@@ -61,8 +61,8 @@ def solve(u, b, r, m, M, order, known, cm, I, I_inv, a, multiplier):
 def particular(u, b, order, a):
     """Write into a (N, 3) a solution of J a = b, agent by agent; return the smallest pivot.
 
-    With j at the other end, an edge asks for u . a_i = +-b + u . a_j. Where there are fewer than three, the
-    shortest solution is taken.
+    An edge to agent j requires u . a_i = +-b + u . a_j. If an agent has fewer than three edges, the shortest
+    solution is taken.
     """
     agent, edge, other, sign = order.agent, order.edge, order.other, order.sign
     smallest = 1.0
@@ -104,9 +104,9 @@ def particular(u, b, order, a):
 
 @compiled
 def balance(r, m, M, cm, I_inv, a):
-    """From accelerations a (N, 3) make forces M a, less the rigid motion that carries momentum.
+    """Turn accelerations a (N, 3) into forces M a, after removing the rigid motion that carries momentum.
 
-    Then they have no sum, and no torque about cm, the centre of mass of agents r (N, 3).
+    The forces then have zero sum, and zero torque about cm, the centre of mass of agents r (N, 3).
     """
     p0 = p1 = p2 = h0 = h1 = h2 = 0.0
     for i in range(r.shape[0]):
@@ -129,9 +129,9 @@ def balance(r, m, M, cm, I_inv, a):
 
 @compiled
 def pull_back(u, order, f, multiplier):
-    """Multipliers (m,) with J^T lambda = f for forces f (N, 3) in balance, last agent first; f is used up.
+    """Multipliers (m,) with J^T lambda = f for balanced forces f (N, 3), last agent first; f is overwritten.
 
-    Each agent's three edges take its force, and leave the reactions to the agents before.
+    Each agent's three edges carry its force, and pass the reactions to the agents before.
     """
     agent, edge, other, sign = order.agent, order.edge, order.other, order.sign
     for s in range(agent.shape[0] - 1, 0, -1):

@@ -1,7 +1,7 @@
-"""The multiplier solve of large formations: which step of it when, and what to do where one fails.
+"""The multiplier solve of large formations: its sequence of steps, and the fallback if a step fails.
 
-The kernel calls a `LargeSolver` through a C function (`Graph.solver`), as it does a user's force: that costs some
-20 us, and formations this large take much longer. Memory and work grow with the number of edges.
+The kernel calls a `LargeSolver` through a C function (`Graph.solver`), like a user's force. A call costs some 20 us,
+and the solve of a formation this large takes much longer. Memory and work grow with the number of edges.
 """
 
 from __future__ import annotations
@@ -18,22 +18,23 @@ from rigidfleet.kernel.large import block_cholesky, elimination
 from rigidfleet.kernel.problem import ITERATED, ConstraintLaw, Vehicles, Workspace
 from rigidfleet.typing import Edges, Floats, Ints
 
-#: A kept factor is renewed when the iterations beyond those of a new one have taken as long as making one; or when a
-#: single solve needs more than this many, and, without fill, so many times as many as at first.
+#: A stored factor is renewed when the iterations in excess of a new factor's have taken as long as making one. It is
+#: also renewed when a single solve needs more than the first number of iterations and, without fill, more than the
+#: second number times as many as at first.
 _RENEW, _STALE = 12, 1.5
-#: Iterations at most: beyond, the evaluation fails, and the integrator tries a shorter step.
+#: Greatest number of iterations; beyond it, the evaluation fails, and the integrator tries a shorter step.
 _MOST = 1000
-#: Fill of the factor, in blocks an agent, at most. Shells and sheets stay below, thick lattices do not.
+#: Greatest fill of the factor, in blocks per agent. Shells and sheets stay below it; thick lattices do not.
 _FILL = 80.0
-#: Each solve starts from the best combination of the solutions of so many evaluations before.
+#: Number of past solutions whose best combination starts each solve.
 _PAST = 4
-#: Damping with which the exact law is solved on the vertex graph, twice over: it deviates by (mu/w)^2.
+#: Damping of the exact law on the vertex graph, with two iterations: the result deviates by (mu/w)^2.
 _EXACT_MU = 1e-8
 
 
 @dataclass
 class Counts:
-    """What the solves of a flight took."""
+    """Counts of the solves of a flight."""
 
     evaluations: int = 0
     solves: int = 0  # systems solved on the vertex graph
@@ -52,9 +53,9 @@ class Counts:
 class LargeSolver:
     """Multipliers of one phase, Eq. (12), into its workspace.
 
-    ``steps`` (N, 4) are those of elimination, None where there are none; ``order`` asks for the order (N,) in which
-    the sparse factor takes agents, where it is needed; ``tolerance`` is the relative residual of conjugate
-    gradients, and ``floor`` the error of an acceleration [m/s^2] below which none is asked of the damped law.
+    ``steps`` (N, 4) are those of elimination, or None. ``order`` is called for the order (N,) in which the sparse
+    factor eliminates agents, if it is needed. ``tolerance`` is the relative residual of conjugate gradients, and
+    ``floor`` the error of an acceleration [m/s^2] that the damped law may always have.
     """
 
     vehicles: Vehicles
@@ -78,9 +79,9 @@ class LargeSolver:
         self.least = self.mu * self.mbar * self.floor * math.sqrt(n)
         self.elimination = None if self.steps is None else elimination.order(self.steps, self.edges)
         self.pattern: block_cholesky.Pattern | None = (
-            None  # where elimination does, it is never needed
+            None  # not needed as long as elimination succeeds
         )
-        # An exception cannot pass through compiled code; the multipliers become NaN instead.
+        # An exception cannot pass through compiled code; the multipliers become NaN.
         self._call = ctypes.CFUNCTYPE(None)(self._solve)
         self.address = int(ctypes.cast(self._call, ctypes.c_void_p).value or 0)
 
@@ -95,20 +96,20 @@ class LargeSolver:
 
     @cached_property
     def aside(self) -> LargeSolver:
-        """Another one of the same equations, in the same workspace: what it is asked, this one does not remember."""
+        """Another solver of the same equations in the same workspace; its solves leave this one unchanged."""
         return replace(self, counts=Counts(), error=None)
 
     def check(self) -> None:
-        """Raise what has come up within the kernel."""
+        """Raise an error that occurred in a call from the kernel."""
         error, self.error = self.error, None
         if error is not None:
             raise error
 
     def solve(self) -> None:
-        """Multipliers for ``workspace.b``; NaN where there is no solution."""
+        """Solve for the multipliers of ``workspace.b``; NaN if there is no solution."""
         w, vehicles = self.workspace, self.vehicles
         if self.elimination is not None:
-            # Where deformation is damped, the kernel knows the mean axes already.
+            # With deformation damping, the kernel has computed the mean axes already.
             known = self.law.k_def > 0.0
             pivot = elimination.solve(
                 w.u, w.b, w.r, vehicles.m, vehicles.M, self.elimination, known, w.cm[0], w.I, w.I_inv, self.a,
@@ -124,8 +125,8 @@ class LargeSolver:
     def _on_vertex_graph(self) -> bool:
         """Iterated Tikhonov in the agents' coordinates, see `constraint.solve_at_agents`.
 
-        The exact law is that with next to no damping. Its multipliers would be differences of large
-        numbers; they are found from J^T lambda = M a in the same way.
+        The exact law uses the same solve with almost no damping. Its multipliers would be differences of large
+        numbers, so they are found from J^T lambda = M a in the same way.
         """
         w, edges, m = self.workspace, self.edges, self.vehicles.m
         if self.pattern is None:
@@ -159,26 +160,28 @@ class LargeSolver:
         n, edges = len(self.a), self.edges
         self.pattern = block_cholesky.pattern(n, edges, self.order(), _FILL)
         self.L, self.place = np.zeros((len(self.pattern.row), 9)), np.empty(n, dtype=np.int64)
-        # To precondition, seven digits do, unless next to nothing is added to the rigid motions.
+        # Seven digits are enough for preconditioning, unless the damping of the rigid motions is tiny.
         self.kept = self.L.astype(np.float32) if self.mu > _EXACT_MU else self.L
         systems = self.iterations * (1 if self.law.solver == ITERATED else 2)
         self.past, self.taken = np.zeros((systems, _PAST, n, 3)), np.zeros(systems, dtype=int)
         self.x, self.g, self.work = np.zeros((n, 3)), np.zeros((n, 3)), np.empty((5, n, 3))
         self.gram = np.empty((_PAST, _PAST + 2))
         self.marks = _far_apart(self.workspace.r)
-        # A factor takes as long as so many iterations.
+        # Cost of a factor in iterations.
         count = np.diff(self.pattern.column).astype(float)
         self.worth = 0.75 * float((count**2).sum() / count.sum())
-        self.fresh, self.wasted = 0, 0.0  # iterations that a new factor needs, and those beyond
-        self.axes: Floats | None = None  # of the marks when the factor was made; None: no factor
+        self.fresh, self.wasted = 0, 0.0  # iterations with a new factor, and the excess since
+        self.axes: Floats | None = (
+            None  # axes of the marker agents when the factor was made; None: no factor
+        )
 
     def _system(self, number: int) -> Floats | None:
-        """The solution x (N, 3) of K x = g, that system of an evaluation; None where there is none.
+        """The solution x (N, 3) of K x = g for the given system of an evaluation; None if there is none.
 
-        By the kept factor, or by a new one if that has become stale, from past solutions of that system on.
+        Uses the stored factor, or a new one if it has become stale, and starts from past solutions of this system.
         """
         w, x, past = self.workspace, self.x, self.past[number]
-        # A residual r is an error r/mu of the force.
+        # A residual r causes an error r/mu of the force.
         within = max(self.tolerance * math.sqrt(block_cholesky.inner(self.g, self.g)), self.least)
         self.counts.solves += 1
         block_cholesky.project(
@@ -217,12 +220,12 @@ class LargeSolver:
         return taken
 
     def _turn(self) -> None:
-        """Find out how the formation has turned since the factor was made."""
+        """Find the rotation of the formation since the factor was made."""
         self.now = _axes(*self.workspace.r[self.marks].tolist())
         self.turned = np.eye(3) if self.axes is None else self.now.T @ self.axes
 
     def _renew(self) -> None:
-        """Factor K at the current shape, with more damping where a factor without fill needs it."""
+        """Factor K at the current shape, with more damping if a factor without fill needs it."""
         w, p, m = self.workspace, self.pattern, self.vehicles.m
         assert p is not None
         self.counts.factors += 1
@@ -247,7 +250,7 @@ class LargeSolver:
 
 
 def _far_apart(r: Floats) -> Ints:
-    """Three agents (3,) far from each other and from one line: they tell how the formation has turned."""
+    """Three agents (3,) far from each other and from a common line; they show how the formation has rotated."""
     i = int(((r - r.mean(axis=0)) ** 2).sum(axis=1).argmax())
     j = int(((r - r[i]) ** 2).sum(axis=1).argmax())
     k = int((np.cross(r - r[i], r[j] - r[i]) ** 2).sum(axis=1).argmax())
@@ -255,7 +258,7 @@ def _far_apart(r: Floats) -> Ints:
 
 
 def _axes(a: list[float], b: list[float], c: list[float]) -> Floats:
-    """Rows of a rotation (3, 3) that goes with three points; the identity on a line."""
+    """Rows of a rotation (3, 3) attached to three points; the identity if they are on a line."""
     x = [q - p for p, q in zip(a, b, strict=True)]
     z = _cross(x, [q - p for p, q in zip(a, c, strict=True)])
     size, area = math.hypot(*x), math.hypot(*z)

@@ -28,22 +28,22 @@ def live(
 ) -> Result | None:
     """Fly a mission's vehicles by hand, until the page is closed or Ctrl-C is pressed.
 
-    The vehicles establish the mission's first formation; from then on the page moves and turns the
-    target of the virtual body, changes formations and sends gusts, and the mission's laws fly it.
+    The vehicles first establish the mission's first formation. Then the page moves and turns the target of the
+    virtual body, changes formations and sends gusts, while the mission's control laws fly the vehicles.
 
     Parameters
     ----------
     mission : a shipped name, a path or a `Mission`
-    port : on which this machine, and it alone, serves the page; 0 for any that is free
+    port : local port of the page, which only this machine can reach; 0 for any free one
     browser : open the page in the user's browser
     ready : called with the page's address once it is served
-    landed : called with each flight when it ends (one begun anew ends the one before), to save it; what it
-        returns is said on the page
+    landed : called with each flight when it ends, for example to save it; a new flight ends the one before. The
+        text that it returns is shown on the page
 
     Returns
     -------
     Result
-        The last flight, its phases as they were flown; None if nobody has looked.
+        The last flight, with its phases as flown; None if the page was never opened.
 
     Raises
     ------

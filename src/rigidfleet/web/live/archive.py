@@ -1,4 +1,4 @@
-"""What has flown by hand, kept as it comes: at even steps, in bounded memory, worst moments included."""
+"""Samples of a flight by hand, at even steps and in bounded memory, worst moments included."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from rigidfleet.result import Result
 from rigidfleet.simulation.recording import Piece
 from rigidfleet.typing import Bools, Floats
 
-#: Numbers kept at most, 8 bytes each: 10 minutes of 50 vehicles with 144 edges at 0.05 s. Beyond, every second
-#: sample goes, and the step doubles.
+#: Greatest number of values kept, 8 bytes each: 10 minutes of 50 vehicles with 144 edges at 0.05 s. Beyond it,
+#: every second sample is dropped, and the step doubles.
 _MOST = 3.0e7
-_JOINED = 256  # ticks that become one piece: few large arrays in place of many small ones
+_JOINED = 256  # ticks joined into one piece: few large arrays instead of many small ones
 
 
 @dataclass
 class ArchivedPhase:
-    """Samples of a phase, as long as no vehicle is lost.
+    """Samples of a phase, up to the loss of a vehicle.
 
-    Its start, its end, and its worst moments (nearest, hardest) are kept whatever the step is.
+    Its start, its end and its worst moments (least distance, greatest force) are kept at any step.
     """
 
     pieces: list[Piece] = field(default_factory=list)
@@ -30,7 +30,7 @@ class ArchivedPhase:
 
 
 class Archive:
-    """Samples of a flight that goes on tick by tick.
+    """Samples of a flight that advances tick by tick.
 
     Attributes
     ----------
@@ -43,7 +43,7 @@ class Archive:
         self.size = 0.0
 
     def add(self, pieces: Sequence[Piece], told: Result) -> None:
-        """Keep what a tick has flown; ``told`` is the record of its end."""
+        """Store the samples of a tick; ``told`` is the record of its end."""
         for piece in pieces:
             key = (piece.phase, len(piece.edges))
             fresh, archived = key not in self.phases, self.phases.setdefault(key, ArchivedPhase())
@@ -61,7 +61,7 @@ class Archive:
             self._thin()
 
     def pieces(self) -> list[Piece]:
-        """All that is kept, in order of time."""
+        """All stored samples, in order of time."""
         found = []
         for archived in self.phases.values():
             extra = [archived.last, *(piece for _, piece in archived.worst.values())]
@@ -92,7 +92,7 @@ class Archive:
         return np.abs(away - np.round(away)) * self.step < 1e-6
 
     def _thin(self) -> None:
-        """Twice the step, half of the samples."""
+        """Double the step: drop every second sample."""
         self.step *= 2.0
         self.size = 0.0
         for archived in self.phases.values():
@@ -137,6 +137,6 @@ def _join(pieces: list[Piece]) -> Piece:
 
 
 def _sorted(piece: Piece) -> Piece:
-    """In order of time, each once."""
+    """The piece with its samples sorted by time, without duplicates."""
     _, first = np.unique(piece.time, return_index=True)
     return rows(piece, first.tolist())

@@ -1,16 +1,16 @@
-// A flight under way, flown from this page.
+// A live flight, controlled from this page.
 
 import { Player, digits, element, part, say } from "../replay/player.js";
 import { Recording } from "../replay/recording.js";
 
-const KEPT = 12000; // samples at most
-const SPAN = 30; // of the plots [s]
-const HANDS = { // keys and the lever that each pushes: forward, left, up; roll, pitch, yaw
+const KEPT = 12000; // greatest number of samples
+const SPAN = 30; // time range of the plots [s]
+const HANDS = { // each key with the control that it moves: forward, left, up; roll, pitch, yaw
   w: ["move", 0, 1], s: ["move", 0, -1], a: ["move", 1, 1], d: ["move", 1, -1], r: ["move", 2, 1], f: ["move", 2, -1],
   q: ["turn", 2, 1], e: ["turn", 2, -1],
 };
 
-/** Ask the flight for something; say why it is not done. */
+/** Send a command to the flight; show why it is refused. */
 async function order(command) {
   const answer = await fetch("command", { method: "POST", body: JSON.stringify(command) }).catch(() => null);
   if (!answer || answer.ok) return;
@@ -25,7 +25,7 @@ class LivePlayer extends Player {
     super(recording);
     this.hand = { move: [0, 0, 0], turn: [0, 0, 0] };
     this.keys = new Set();
-    this.idle = true; // nothing to tell the flight
+    this.idle = true; // no command to send
     this.build(recording.info);
     this.hear(recording.info);
     this.resize();
@@ -58,22 +58,22 @@ class LivePlayer extends Player {
     }
     const label = element("label", card, { class: "lever" }, "force");
     this.strength = element("input", label, { type: "range", min: "0.5", max: "8", step: "0.5", value: "3", id: "strength" });
-    element("p", card, {}, "Keys: W A S D move, R F up and down, Q E turn; space pauses");
+    element("p", card, {}, "Keys: W A S D move, R F up and down, Q E turn, space pauses");
     const controls = part("controls"), before = part("cameras");
     const add = (id, text, title, deed) => {
       const button = element("button", controls, { type: "button", id, title }, text);
       button.addEventListener("click", deed);
       controls.insertBefore(button, before);
     };
-    add("now", "Live", "Back to the present", () => this.present());
-    add("again", "Again", "Begin anew", () => order({ again: true }));
+    add("now", "Live", "Back to the live flight", () => this.present());
+    add("again", "Restart", "Begin a new flight", () => order({ again: true }));
     add("end", "End", "End the flight", () => order({ stop: true }));
     document.addEventListener("keydown", (event) => this.press(event, true));
     document.addEventListener("keyup", (event) => this.press(event, false));
     window.addEventListener("blur", () => this.keys.clear());
   }
 
-  /** A round pad that moves the target as seen: up is away from the eye. */
+  /** A round pad that moves the target as seen on the screen: up is away from the viewer. */
   pad() {
     const pad = document.createElement("div"), knob = element("i", pad);
     pad.id = "pad";
@@ -96,7 +96,7 @@ class LivePlayer extends Player {
     return pad;
   }
 
-  /** A lever that springs back when it is let go. */
+  /** A slider that springs back when released. */
   lever(parent, name, group, k) {
     const label = element("label", parent, { class: "lever" }, name);
     const input = element("input", label, { type: "range", min: "-1", max: "1", step: "0.02", value: "0", "data-lever": name });
@@ -108,7 +108,7 @@ class LivePlayer extends Player {
     for (const end of ["pointerup", "pointercancel", "blur", "keyup"]) input.addEventListener(end, back);
   }
 
-  // -- the hand --
+  // -- controls --
 
   press(event, down) {
     const key = event.key.toLowerCase();
@@ -123,7 +123,7 @@ class LivePlayer extends Player {
     return [[-Math.cos(a), -Math.sin(a)], [Math.sin(a), -Math.cos(a)]];
   }
 
-  /** Tell the flight what the hand does. */
+  /** Send the state of the controls to the flight. */
   push() {
     const move = [...this.hand.move], turn = [...this.hand.turn], all = { move, turn };
     for (const key of this.keys) {
@@ -150,7 +150,7 @@ class LivePlayer extends Player {
     part("fly").style.maxHeight = `calc(100vh - ${part("bar").offsetHeight + part("head").offsetHeight + 56}px)`;
   }
 
-  // -- what the flight says --
+  // -- messages of the flight --
 
   hear(story) {
     const { info } = this.recording;
@@ -166,7 +166,7 @@ class LivePlayer extends Player {
     }
   }
 
-  /** What was flown can still be looked at. */
+  /** Keep the page usable as a replay after the flight has ended. */
   end(words) {
     this.over = true;
     part("ending").textContent = [FAREWELL, words].filter(Boolean).join(" ");
@@ -176,15 +176,15 @@ class LivePlayer extends Player {
     this.tell();
   }
 
-  // -- instead of what a flight that is over does --
+  // -- differences from a finished flight --
 
   speeds() {
     return this.recording.info.speeds;
   }
 
   keys() {
-    const own = [["W A S D", "move the target: away, left, back, right"], ["R F", "raise, lower it"], ["Q E", "turn it left, right"]];
-    return [...own, ...super.keys().map(([keys, deed]) => [keys, keys === "space" ? "pause, go on" : deed])];
+    const own = [["W A S D", "move the target: away, left, towards you, right"], ["R F", "raise or lower the target"], ["Q E", "turn the target left or right"]];
+    return [...own, ...super.keys().map(([keys, deed]) => [keys, keys === "space" ? "pause or continue" : deed])];
   }
 
   toggle() {
@@ -206,7 +206,7 @@ class LivePlayer extends Player {
     this.stale = true;
   }
 
-  /** Look back; the flight goes on. */
+  /** Look back in time while the flight goes on. */
   seek(time) {
     this.back = true;
     super.seek(time);
@@ -214,7 +214,7 @@ class LivePlayer extends Player {
 
   advance(wait) {
     const { recording } = this, { info } = recording;
-    // A step behind the newest sample, so that there is always one to go to.
+    // One step behind the newest sample, so that there is always a next one.
     const goal = recording.end - info.step;
     if (this.back || Math.abs(goal - this.time) < 1e-3) return;
     this.stale = true;
@@ -234,7 +234,7 @@ class LivePlayer extends Player {
     super.tell();
     const { recording } = this, { info } = recording, last = part("phases").lastElementChild, phase = info.phases.at(-1);
     if (last) last.style.flexGrow = String(Math.max(recording.end - phase.start, 1e-3));
-    const ago = `${digits(recording.end - this.time)} s ago`, slow = info.pace < 0.9 ? `live, at ${info.pace} of its speed` : "live";
+    const ago = `${digits(recording.end - this.time)} s ago`, slow = info.pace < 0.9 ? `live, at ${info.pace}× real time` : "live";
     const now = this.over ? "" : info.paused ? "paused" : slow;
     part("whole").textContent = this.back ? ago : now;
     if (!this.back && !info.busy && !info.ending) part("phase-name").textContent = `holding ${info.formation}`;
@@ -266,7 +266,7 @@ function main() {
   source.addEventListener("sample", (event) => {
     const [time, values] = sample(event.data, info);
     if (!recording.count) info.start = time;
-    // A sample that got lost is made up for, so that times stay even.
+    // A lost sample is replaced, so that times stay even.
     while (recording.count && recording.end + 1.5 * info.step < time) recording.append(values);
     recording.append(values);
     if (recording.count > KEPT) recording.forget(KEPT / 2);

@@ -1,7 +1,7 @@
-"""A flight by hand: the target of the virtual body is moved while the flight goes on.
+"""A flight by hand: the user moves the target of the virtual body during the flight.
 
-Each tick the reference follows the target smoothly, and one piece of a quintic takes it there: the
-laws that fly it are the mission's own.
+In each tick the reference follows the target smoothly along one piece of a quintic. The control laws
+are the mission's own.
 """
 
 from __future__ import annotations
@@ -23,29 +23,29 @@ from rigidfleet.simulation.recording import assemble
 from rigidfleet.typing import Floats
 from rigidfleet.web.live.archive import Archive, rows
 
-TICK = 0.05  # between looks at what the hand asks for [s]
-_BLEND = 4.0  # from one formation to another [s]
-_ENDLESS = 1e6  # a phase lasts until the hand ends it [s]
-_STEADY = 2.0  # that an establishment by forces alone is left to settle [s]
+TICK = 0.05  # time between readings of the user's commands [s]
+_BLEND = 4.0  # duration of a change of formation [s]
+_ENDLESS = 1e6  # duration of a phase that the user ends [s]
+_STEADY = 2.0  # time to settle after establishment by constraint forces alone [s]
 #: The reference follows the target like a critically damped oscillator with this frequency [rad/s] ...
 _FOLLOW = 1.3
-#: ... whose acceleration grows within this time [s].
+#: ... and its acceleration changes over this time [s].
 _RISE = 0.15
-_ACCELERATION, _TURN = 3.0, 1.5  # of the reference at most [m/s^2, rad/s^2]
-_FINEST = 1e-3  # between samples that are kept [s]
-#: A hand that is not heard of for so long has let go [s of mission time].
+_ACCELERATION, _TURN = 3.0, 1.5  # greatest accelerations of the reference [m/s^2, rad/s^2]
+_FINEST = 1e-3  # least time between stored samples [s]
+#: Time without a command after which the controls count as released [s of mission time].
 _GRIP = 0.6
 
 
 @dataclass
 class Target:
-    """Where the hand wants the body to be, and how it moves that."""
+    """The target pose of the body, and its commanded rates."""
 
     r: Floats  # (3,) [m]
     euler: Floats  # (3,) roll, pitch, yaw [rad]
     move: Floats = field(default_factory=lambda: np.zeros(3))  # [m/s]
     turn: Floats = field(default_factory=lambda: np.zeros(3))  # rates of roll, pitch, yaw [rad/s]
-    held: float = -math.inf  # when the hand was last heard of [s]
+    held: float = -math.inf  # time of the last command [s]
 
     @property
     def attitude(self) -> Floats:
@@ -55,15 +55,15 @@ class Target:
 
 @dataclass(frozen=True)
 class Gust:
-    """A front of wind that passes over the formation.
+    """A gust front that passes over the formation.
 
-    Each vehicle feels a force of one smooth pulse, 1 - cos, when the front is over it.
+    Each vehicle feels one smooth pulse of force, 1 - cos, while the front passes it.
     """
 
     start: float  # [s]
-    origin: float  # where the front is then, along its direction [m]
+    origin: float  # position of the front at the start, along its direction [m]
     direction: Floats  # (3,) unit vector
-    strength: float  # of the force at most [N/kg]
+    strength: float  # greatest force [N/kg]
     speed: float = 8.0  # of the front [m/s]
     length: float = 1.6  # of the pulse [s]
 
@@ -75,14 +75,14 @@ class Gust:
 
 
 class Pilot:
-    """A flight that goes on tick by tick, as it is told.
+    """A flight that advances tick by tick under the user's commands.
 
     Attributes
     ----------
-    flight : what flies
-    target : where the hand wants the body
+    flight : the flight
+    target : the target pose of the body
     formations : names of those that can be flown
-    waiting : the formation to be taken next, None for none
+    waiting : the next formation; None if there is none
 
     Raises
     ------
@@ -94,7 +94,7 @@ class Pilot:
         self.formations = [n for n in mission.formations if mission.formation_slots(n) is not None]
         if not self.formations:
             raise FlightError(
-                f"{mission.name}: cannot be flown by hand, as no formation has slots."
+                f"{mission.name}: the mission cannot be flown by hand, because no formation has slots."
                 " Give one a shape or slots in the mission"
             )
         self.mission = mission
@@ -105,7 +105,7 @@ class Pilot:
         self.waiting: str | None = None
         self.by_body = mission.architecture == "body"
         self.fastest = 0.7 * mission.limits.speed if mission.limits.speed else math.inf
-        self.asked: list[Phase] = []  # what each phase was begun as
+        self.asked: list[Phase] = []  # each phase as it was begun
         self.ticks = 0
         self._take(self._first(), establish=True)
         self.pose = self._reference()
@@ -130,7 +130,7 @@ class Pilot:
 
     @property
     def formation(self) -> str:
-        """The formation taken last."""
+        """The current formation, or the one being formed."""
         return self.phases[-1].formation or ""
 
     @property
@@ -142,16 +142,16 @@ class Pilot:
         blend = phase.shaping.blend if phase.shaping is not None else 0.0
         return self.t < self.phases[-1].t_start + blend + settle - 1e-9
 
-    # -- what it can be told ----------------------------------------------------------------------
+    # -- commands --------------------------------------------------------------------------------
 
     def steer(self, move: Floats, turn: Floats) -> None:
-        """Move and turn the target at these rates (3,) [m/s, rad/s] until told otherwise, or not at all."""
+        """Move and turn the target at these rates (3,) [m/s, rad/s] until the next command; zero stops it."""
         speed = float(np.linalg.norm(move))
         self.target.move = move * min(1.0, self.fastest / speed) if speed > 0.0 else move
         self.target.turn, self.target.held = turn, self.t
 
     def change(self, formation: str) -> None:
-        """Take another formation as soon as the one before is taken."""
+        """Change to another formation as soon as the current change is complete."""
         self.waiting = formation if formation != self.formation else None
 
     def gust(self, direction: Floats, strength: float) -> None:
@@ -164,7 +164,7 @@ class Pilot:
     def step(self) -> Result:
         """Fly one tick; return the record of its end alone.
 
-        A flight that cannot go on sets ``ending``, and stays where it is.
+        A flight that cannot go on sets ``ending`` and stops.
         """
         flight = self.flight
         flight.pieces.clear()
@@ -180,15 +180,16 @@ class Pilot:
             flight.advance(self.ticks * TICK - self.t)
         if flight.pieces or self.last is None:
             end = [rows(flight.pieces[-1], [-1])] if flight.pieces else []
-            phases = [replace(p, extremes={}) for p in self.phases]  # of one moment alone
+            # A record of one moment has no extremes
+            phases = [replace(p, extremes={}) for p in self.phases]
             result = assemble(self.mission, phases, end, ending="", statistics={})
-            result.mission = self.mission  # which need not be parsed again
+            result.mission = self.mission  # so that it is not parsed again
             self.last = result
             self.archive.add(flight.pieces, result)
         return self.last
 
     def result(self) -> Result:
-        """The record of the whole flight, at the mission's output step or, of a long one, coarser.
+        """The record of the whole flight, at the mission's output step, or a coarser one for a long flight.
 
         Its mission has the phases as they were flown.
         """
@@ -246,7 +247,7 @@ class Pilot:
         return np.concatenate([start, grid[grid < t_end - 1e-9], [t_end]])
 
     def _places(self) -> Floats:
-        """Where the vehicles are (N, 3) [m]."""
+        """Positions (N, 3) [m] of the vehicles."""
         return self.flight.observe().position
 
     # -- the reference ----------------------------------------------------------------------------
@@ -263,9 +264,9 @@ class Pilot:
         return Pose(cm, v, frame if frame is not None else np.eye(3), np.zeros(3))
 
     def _up(self, r: Floats) -> Floats:
-        """A place (3,) [m] like ``r``, but high enough for the first formation to turn about it."""
+        """A point (3,) [m] at or above ``r``, high enough for the first formation to rotate about it."""
         slots = self.flight.plan.slots
-        assert slots is not None  # every formation that is flown has some
+        assert slots is not None  # every formation flown has slots
         size = np.linalg.norm(slots, axis=1).max() + max(self.mission.agents.radius)
         ground = max(
             (o.height for o in self.mission.obstacles if o.kind == "ground"), default=-np.inf
@@ -273,13 +274,13 @@ class Pilot:
         return np.array([r[0], r[1], max(r[2], ground + size + 0.5)])
 
     def _follow(self, h: float) -> None:
-        """Move the target as the hand does, and the reference after it, over the next tick."""
+        """Move the target as commanded, and the reference after it, over the next tick."""
         target, pose = self.target, self.pose
         if self.t - target.held <= _GRIP:
             target.r += h * target.move
             target.euler += h * target.turn
             target.euler[1] = np.clip(target.euler[1], -1.2, 1.2)  # clear of the poles
-        away = att.rotation_vector_from_dcm(target.attitude @ pose.T.T)  # axes of the body
+        away = att.rotation_vector_from_dcm(target.attitude @ pose.T.T)  # body axes
         r, v, a = _pulled(target.r - pose.r, pose.v, self.a, h, _ACCELERATION)
         phi, omega, alpha = _pulled(away, pose.omega, self.alpha, h, _TURN)
         if self.asked[-1].control != "open":
@@ -299,7 +300,7 @@ class Pilot:
     # -- wind -------------------------------------------------------------------------------------
 
     def _windy(self) -> bool:
-        """Forget gusts that have passed; whether there is one left."""
+        """Remove gusts that have passed; return whether one remains."""
         if not self.gusts:
             return False
         r, t = self._places(), self.t
@@ -320,9 +321,9 @@ class Pilot:
 def _pulled(
     away: Floats, v: Floats, a: Floats, h: float, most: float
 ) -> tuple[Floats, Floats, Floats]:
-    """Way over h [s], and velocity and acceleration then, of what is drawn to a point ``away``.
+    """Displacement over h [s], and final velocity and acceleration, of a reference drawn to a point ``away``.
 
-    Like a critically damped oscillator; its acceleration is at most ``most`` and changes steadily.
+    It moves like a critically damped oscillator, with a continuous acceleration of at most ``most``.
     """
     wanted = _FOLLOW**2 * away - 2 * _FOLLOW * v
     size = float(np.linalg.norm(wanted))

@@ -1,8 +1,8 @@
-"""A session on this machine's own address: a page, a stream of events, commands.
+"""Serve a live session on this machine's own address: a page, a stream of events, commands.
 
-Only this machine reaches it. Its address holds a secret, and requests that name another host or come
-from another origin are refused, so that other pages in the same browser can neither see nor fly it,
-under whatever name they reach this machine.
+Only this machine can reach it. The address holds a secret, and requests that name another host or come
+from another origin are refused. Other pages in the same browser can therefore neither see nor control
+the flight, whatever name they use for this machine.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from rigidfleet.errors import FlightError, RigidfleetError
 from rigidfleet.web.live.session import Session
 
 _HOST = "127.0.0.1"
-_LARGEST = 10_000  # bytes of a command
-_SILENCE = 1.0  # after which a word is sent to learn whether anybody listens [s]
-#: With every answer. The page has a policy of its own; a frame around it only a header can forbid.
+_LARGEST = 10_000  # greatest size of a command [bytes]
+_SILENCE = 1.0  # silence after which a message tests whether the page still listens [s]
+#: Headers of every answer. The page has its own policy, but only a header can forbid frames around it.
 _HEADERS = {
     "Cache-Control": "no-store",
     "Content-Security-Policy": "frame-ancestors 'none'",
@@ -52,7 +52,7 @@ class Server:
         except (OSError, OverflowError) as error:
             why = getattr(error, "strerror", None) or error
             raise FlightError(
-                f"port {port} cannot be used ({why}). Name another, or none to have a free one chosen"
+                f"port {port} cannot be used ({why}). Choose another, or give none to use any free port"
             ) from error
         self.http.daemon_threads = True
         Handler.port = self.http.server_port
@@ -81,12 +81,12 @@ class _Handler(BaseHTTPRequestHandler):
     server_version, sys_version = "rigidfleet", ""
 
     def parse_request(self) -> bool:
-        """Read a request; of whatever method, it is answered only if our page asks."""
+        """Read a request; whatever its method, refuse it unless it comes from our page."""
         if not super().parse_request():
             return False
         if self._ours():
             return True
-        self._answer(HTTPStatus.FORBIDDEN, "open the address that the program has printed")
+        self._answer(HTTPStatus.FORBIDDEN, "open the address that the program printed")
         return False
 
     def do_GET(self) -> None:
@@ -99,17 +99,17 @@ class _Handler(BaseHTTPRequestHandler):
             self._answer(HTTPStatus.NOT_FOUND, "there is nothing here")
 
     def do_POST(self) -> None:
-        """Do what a page asks."""
+        """Execute a command of a page."""
         if self.path != f"{self.base}command":
             self._answer(HTTPStatus.NOT_FOUND, "there is nothing here")
             return
         try:
             length = int(self.headers.get("Content-Length", ""))
             if not 0 < length <= _LARGEST:
-                raise ValueError("a command is shorter")
+                raise ValueError("the command is too long")
             asked = json.loads(self.rfile.read(length))
             if not isinstance(asked, dict):
-                raise ValueError("a command is an object")
+                raise ValueError("a command must be an object")
             self.session.command(asked)
         except (ValueError, RigidfleetError) as error:
             self._answer(HTTPStatus.BAD_REQUEST, str(error))
@@ -117,10 +117,10 @@ class _Handler(BaseHTTPRequestHandler):
             self._answer(HTTPStatus.NO_CONTENT, "")
 
     def log_message(self, format: str, *args: object) -> None:
-        """Say nothing: the terminal is the user's."""
+        """Log nothing: the terminal belongs to the user."""
 
     def _ours(self) -> bool:
-        """Is it our page that asks, at our own address? A command says where it comes from."""
+        """Whether our page sends the request, to our own address; a command also names its origin."""
         asked, origins = self.headers.get_all("Host", []), self.headers.get_all("Origin", [])
         hosts = {f"{name}:{self.port}" for name in (_HOST, "localhost")}
         if len(asked) != 1 or asked[0] not in hosts or not self.path.startswith(self.base):
@@ -136,13 +136,13 @@ class _Handler(BaseHTTPRequestHandler):
         self._send(data)
 
     def end_headers(self) -> None:
-        """Send the headers: nobody keeps what we say, frames it, or takes it for something else."""
+        """Send the headers: no caching, no frames, no guessing of the content type."""
         for name, value in _HEADERS.items():
             self.send_header(name, value)
         super().end_headers()
 
     def _send(self, data: bytes) -> bool:
-        """Send; False if nobody listens any more."""
+        """Send data; return False if the page no longer listens."""
         try:
             self.wfile.write(data)
             self.wfile.flush()

@@ -1,4 +1,4 @@
-"""A live flight and those who look at it: real time, commands in, pictures out."""
+"""A live flight and its pages: real time, commands in, pictures out."""
 
 from __future__ import annotations
 
@@ -23,22 +23,22 @@ from rigidfleet.web.replay.scene import describe, observe, sight, weight
 SPEEDS = (0.25, 0.5, 1.0, 2.0, 4.0)
 #: Full colour of an edge, as a share of a vehicle's weight.
 _TENSION = 0.2
-_EDGES = 3000  # drawn at most
-_AROUND = 20.0  # the overview holds at least so much around the start, and what stands near it [m]
-_LATE = 0.3  # so much lost time is made up for, no more [s]
-#: After the last page is closed, another may be opened for so long [s].
+_EDGES = 3000  # greatest number of edges drawn
+_AROUND = 20.0  # least range around the start that the overview shows, with nearby obstacles [m]
+_LATE = 0.3  # greatest delay that is made up for [s]
+#: Time after the last page is closed in which another may be opened [s].
 _PATIENCE = 4.0
-_FAREWELL = 1.0  # that pages have to hear of the end [s]
-_FASTEST, _TURNING, _STRONGEST = 50.0, 3.0, 20.0  # that a hand may ask for [m/s, rad/s, N/kg]
-_WAITING = 64  # messages for a page that is slow; then it misses some
+_FAREWELL = 1.0  # time for pages to receive the end [s]
+_FASTEST, _TURNING, _STRONGEST = 50.0, 3.0, 20.0  # greatest values of commands [m/s, rad/s, N/kg]
+_WAITING = 64  # greatest number of messages queued for a slow page; further ones are dropped
 
 
 class Session:
     """One flight by hand, and the pages that show it.
 
-    `run` flies in real time while anybody looks, until `stop`; other threads call `command`, `join`
-    and `leave`. Each flight that somebody has seen is handed to ``landed`` when it ends, which returns
-    what its pages are to say of that.
+    `run` flies in real time while a page is open, until `stop`; other threads call `command`, `join`
+    and `leave`. Each flight that a page has shown is passed to ``landed`` when it ends, which returns the
+    text that the pages then show.
     """
 
     def __init__(self, mission: Mission, landed: Callable[[Result], str] | None = None) -> None:
@@ -55,13 +55,13 @@ class Session:
         self.begin()
 
     def begin(self) -> None:
-        """Begin anew."""
+        """Begin a new flight."""
         self.pilot = Pilot(self.mission)
         self.flights += 1
         self.result = self.pilot.step()
 
     def land(self) -> None:
-        """Hand over what was flown."""
+        """Pass the flight to ``landed``."""
         if self.pilot.ticks > 1 and self.landed is not None:
             self.farewell = self.landed(self.pilot.result())
 
@@ -97,7 +97,7 @@ class Session:
         return page(info, start="live/live.js", style=read("live/live.css"), connect="'self'")
 
     def story(self) -> dict[str, Any]:
-        """What changes now and then."""
+        """Information that changes only now and then."""
         pilot = self.pilot
         return {
             "phases": [
@@ -124,7 +124,7 @@ class Session:
         return messages
 
     def leave(self, messages: queue.Queue[bytes | None]) -> None:
-        """A page was closed."""
+        """Remove a page that was closed."""
         with self.lock:
             self.pages.discard(messages)
             if not self.pages:
@@ -154,12 +154,12 @@ class Session:
     # -- commands ---------------------------------------------------------------------------------
 
     def command(self, asked: Mapping[str, Any]) -> None:
-        """Do what a page asks.
+        """Execute a command of a page.
 
         Raises
         ------
         ValueError
-            It asks for something else.
+            The command is unknown or invalid.
         """
         with self.lock:
             match asked:
@@ -183,7 +183,7 @@ class Session:
                 case {"stop": True}:
                     self.stop()
                 case _:
-                    raise ValueError(f"no such command: {json.dumps(asked)[:100]}")
+                    raise ValueError(f"unknown command: {json.dumps(asked)[:100]}")
 
     def stop(self) -> None:
         """End the flight."""
@@ -232,7 +232,7 @@ class Session:
                 else:
                     self.pace = 1.0
                 story = self.story()
-            # The end of the phase under way moves on; that alone is no news.
+            # The end of the phase under way moves all the time; it alone is no reason to send an update.
             news = story | {"phases": len(story["phases"])}
             if news != told:
                 told = news
@@ -247,11 +247,11 @@ def _event(name: str, data: str) -> bytes:
 
 def _number(value: Any, most: float) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise ValueError("a finite number is needed")
+        raise ValueError("the value must be a finite number")
     return min(max(float(value), -most), most)
 
 
 def _vector(value: Any, most: float) -> np.ndarray:
     if not isinstance(value, list) or len(value) != 3:
-        raise ValueError("three numbers are needed")
+        raise ValueError("the value must be a list of three numbers")
     return np.array([_number(x, most) for x in value])

@@ -1,7 +1,7 @@
-"""A flight in the browser: one page that works offline, to look at and to send.
+"""A flight in the browser: one page that works offline and can be sent to others.
 
-`replay` writes it. The page holds its own small renderer (WebGL 2) and asks nothing of any network;
-its parts lie beside this module.
+`replay` writes the page. It contains its own small renderer (WebGL 2) and loads nothing from a network.
+Its parts are in this package.
 """
 
 from __future__ import annotations
@@ -23,11 +23,13 @@ from rigidfleet.web.replay.scene import describe, observe, sight, size, weight
 
 __all__ = ["Replay", "html_page", "replay"]
 
-_RATE = 30.0  # samples [Hz] at most: the page draws smooth curves through them
-_SAMPLES = 3_000_000  # of all agents together; longer flights have fewer in a second
-_HEIGHT = 600  # [px] in a notebook
-_EDGES = 3000  # drawn at most: more would hide what they hold
-#: Shares of a vehicle's weight that the full colour of an edge stands for at least, and at most.
+_RATE = 30.0  # greatest sampling rate [Hz]; the page draws smooth curves through the samples
+_SAMPLES = (
+    3_000_000  # greatest number for all agents together; longer flights have a lower sampling rate
+)
+_HEIGHT = 600  # height in a notebook [px]
+_EDGES = 3000  # greatest number of edges drawn; more would hide the vehicles
+#: Least and greatest tension that the full colour of an edge stands for, as a share of a vehicle's weight.
 _IDLE, _HEAVY = 0.005, 2.0
 
 
@@ -41,7 +43,7 @@ class Replay:
         return f"<Replay: {len(self.html) / 1e6:.1f} MB of HTML; a notebook shows it>"
 
     def _repr_html_(self) -> str:
-        """The page in a frame of its own, which reaches nothing of the notebook around it."""
+        """The page in its own frame, which has no access to the notebook around it."""
         return (
             '<iframe title="Replay of the flight" sandbox="allow-scripts" width="100%"'
             f' height="{_HEIGHT}" style="border:0" srcdoc="{html.escape(self.html)}"></iframe>'
@@ -57,12 +59,12 @@ def replay(result: Result | str | Path, path: str | Path) -> None: ...
 
 
 def replay(result: Result | str | Path, path: str | Path | None = None) -> Replay | None:
-    """Play a flight: in the cell of a notebook, or as one HTML file for any browser, offline.
+    """Replay a flight, in a notebook or as one HTML file for any browser, offline.
 
     Parameters
     ----------
-    result : a flight, or the path of one that was saved
-    path : the file; one that is there is replaced, whole or not at all
+    result : a flight, or the path of a saved one
+    path : the file to write; an existing one is replaced, completely or not at all
 
     Returns
     -------
@@ -100,7 +102,7 @@ def html_page(result: Result) -> str:
 
 
 def _times(result: Result) -> Floats:
-    """Even times (K,) [s] from start to end, about as dense as the result is where that is seldom."""
+    """Even times (K,) [s] from start to end, about as dense as the result if its samples are sparse."""
     first, last = float(result.time[0]), float(result.time[-1])
     gaps = np.diff(result.time)
     gaps = gaps[gaps > 1e-9 * max(1.0, last - first)]
@@ -112,9 +114,9 @@ def _times(result: Result) -> Floats:
 
 
 def _sampled(result: Result, values: Floats, time: Floats) -> Floats:
-    """Values (K, ...) of the result at other times, straight between its samples.
+    """Values (K, ...) of the result at other times, by linear interpolation between samples.
 
-    Between a value and none, the earlier sample counts.
+    Between a value and a missing one, the earlier sample counts.
     """
     if len(result.time) == 1:
         return values
@@ -127,7 +129,7 @@ def _sampled(result: Result, values: Floats, time: Floats) -> Floats:
 
 
 def _edges(result: Result) -> Ints:
-    """Indices of the edges drawn: all, or of too many the shortest."""
+    """Indices of the edges drawn: all, or the shortest if there are too many."""
     if len(result.edges) <= _EDGES:
         return np.arange(len(result.edges))
     typical = np.median(result.distance[:: max(1, len(result.time) // 50)], axis=0)
@@ -135,7 +137,7 @@ def _edges(result: Result) -> Ints:
 
 
 def _story(result: Result, time: Floats) -> dict[str, Any]:
-    """What the page says of a flight that is over."""
+    """Information on the page about a finished flight."""
     low, high = result.position.min(axis=(0, 1)), result.position.max(axis=(0, 1))
     extent, reach = float(np.linalg.norm(high - low)) / 2, size(result)
     seen = sight(result.mission, low, high)
@@ -156,15 +158,15 @@ def _story(result: Result, time: Floats) -> dict[str, Any]:
         ],
         "ending": "" if result.complete else result.ending or "stopped",
         "camera": "overview",
-        "sight": seen[8:],  # besides the flight itself
+        "sight": seen[8:],  # in addition to the flight itself
         "middle": (least + most) / 2,
         "extent": max(float(np.linalg.norm(most - least)) / 2, reach, 1e-6),
         "path": far,
-        # Seen from behind and from the side, where there is a way.
+        # Seen obliquely from behind, if the formation moves.
         "azimuth": math.atan2(-way[1], -way[0]) + 0.6 if far else -1.1,
     }
     if not any(o.kind == "ground" for o in result.mission.obstacles):
-        # A grid to see motion against; far up there, it goes along.
+        # A grid to see motion against; high above the ground, it moves along with the flight.
         lowest = float(low[2])
         story["ground"] = 0.0 if 0.0 <= lowest <= 4 * (extent + reach) else lowest - reach
     return story
@@ -173,7 +175,7 @@ def _story(result: Result, time: Floats) -> dict[str, Any]:
 def _note(result: Result, shown: Ints, tension: float, most: float) -> str:
     words = []
     if len(shown) < len(result.edges):
-        words.append(f"The {len(shown)} shortest of {len(result.edges)} edges are drawn.")
+        words.append(f"Only the {len(shown)} shortest of {len(result.edges)} edges are drawn.")
     if len(shown) and most < tension:
-        words.append(f"No edge carries more than {max(most, 0.001):.2g} N.")
+        words.append(f"No edge carries a force above {max(most, 0.001):.2g} N.")
     return " ".join(words)

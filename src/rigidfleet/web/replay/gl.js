@@ -1,4 +1,4 @@
-// Drawing with WebGL 2: lit meshes in many places, lines of even width, a ground grid. World axes as
+// Drawing with WebGL 2: instances of lit meshes, lines of constant width, a ground grid. World axes as
 // in the flight: x east, y north, z up; lengths in metres, colours [r, g, b, a] from 0 to 1.
 
 export const BACKGROUND = [0.945, 0.957, 0.969];
@@ -113,7 +113,7 @@ export class Mesh {
     return this;
   }
 
-  /** Wall of a ring, lit from above and beside, seen from both sides. */
+  /** Wall of a ring, lit from above and from the side, visible from both sides. */
   guard(centre, radius, height, n, tone) {
     const at = (k, z) => {
       const a = (2 * Math.PI * k) / n;
@@ -158,7 +158,7 @@ export function vehicleMesh() {
   return mesh;
 }
 
-/** The same from afar, a tenth of the work. */
+/** A simpler one for distant vehicles, a tenth of the work. */
 export function smallVehicleMesh() {
   const mesh = new Mesh();
   mesh.prism([0, 0, -0.14], 0.3, 0, 0.42, 4, OWN, Math.PI / 4);
@@ -175,9 +175,9 @@ export function rotorMesh() {
   return mesh;
 }
 
-// -- what is drawn in many places ---------------------------------------------------------------------
+// -- instances ---------------------------------------------------------------------
 
-/** Items in a row of the texture that holds them, 12 words (three texels) each. */
+/** Number of items in a row of their texture; each takes 12 words (three texels). */
 const PER_ROW = 256;
 export const NO_TURN = [1, 0, 0, 0];
 
@@ -196,7 +196,7 @@ class Items {
     this.count = 0;
   }
 
-  /** Where the next item begins. */
+  /** Index at which the next item begins. */
   next() {
     const at = 12 * this.count++;
     if (at + 12 > this.data.length) this.hold(grown(this.data));
@@ -204,7 +204,7 @@ class Items {
   }
 }
 
-/** Places of a mesh: position, colour; scale and quaternion. */
+/** Instances of a mesh: position, colour, scale and quaternion. */
 export class Places extends Items {
   add(p, scale, q, colour, alpha) {
     const at = this.next(), d = this.data, one = typeof scale === "number";
@@ -244,7 +244,7 @@ vec3 fogged(vec3 colour, vec3 place) {
   return mix(colour, u_background, 0.75 * far);
 }`;
 
-// Items come out of a texture: thousands of small instances are slow where no graphics card helps.
+// Items are read from a texture: thousands of small instances are slow without a graphics card.
 const ITEM = `
 precision highp usampler2D;
 uniform usampler2D u_items;
@@ -334,7 +334,7 @@ void main() {
   gl_Position = u_view * vec4(u_centre + vec3(v_place * u_reach, 0.0), 1.0);
 }`;
 
-// Lines that become finer than a pixel fade before they can flicker.
+// Lines thinner than a pixel fade out before they can flicker.
 const GROUND_FRAGMENT = `#version 300 es
 precision highp float;
 uniform vec3 u_base;
@@ -353,7 +353,7 @@ void main() {
   colour = vec4(mix(u_base, vec3(0.66, 0.71, 0.76), line), fade * max(u_solid, line));
 }`;
 
-/** Is there no graphics card behind WebGL? */
+/** Whether WebGL runs in software, without a graphics card. */
 function inSoftware() {
   const gl = document.createElement("canvas").getContext("webgl2");
   const name = String(gl?.getParameter(gl.RENDERER));
@@ -363,7 +363,7 @@ function inSoftware() {
 
 export class Renderer {
   constructor(canvas) {
-    // Smooth borders cost a graphics card nothing, and software four times the work.
+    // Antialiasing is free on a graphics card, and four times the work in software.
     const gl = canvas.getContext("webgl2", { alpha: false, antialias: !inSoftware(), powerPreference: "high-performance" });
     if (!gl) throw new Error("WebGL 2 is not available");
     this.canvas = canvas;
@@ -403,7 +403,7 @@ export class Renderer {
     return { program, uniforms };
   }
 
-  /** A mesh on the graphics card, in as many copies as are drawn at once. */
+  /** A mesh on the graphics card, with the number of copies drawn at once. */
   upload(mesh) {
     const gl = this.gl, array = gl.createVertexArray(), vertices = mesh.data.length / 8;
     const copies = Math.max(1, Math.min(Math.floor(16384 / vertices), PER_ROW));
@@ -453,7 +453,7 @@ export class Renderer {
     gl.uniform1f(this.line.uniforms.u_pixel, ratio);
   }
 
-  /** What follows hides what lies behind it, or (`false`) is only hidden itself; null: neither. */
+  /** Depth mode of later drawing: true tests and writes depth, `false` only tests it, null does neither. */
   depth(writes) {
     const gl = this.gl;
     if (writes === null) gl.disable(gl.DEPTH_TEST);
@@ -512,7 +512,7 @@ export class Renderer {
     gl.drawElements(gl.TRIANGLES, 6 * lines.count, gl.UNSIGNED_INT, 0);
   }
 
-  /** Where a point is on the page [px], and how far ahead [m]; null behind the camera. */
+  /** Position of a point on the page [px] and its distance ahead [m]; null behind the camera. */
   project(p) {
     const m = this.view, w = m[3] * p[0] + m[7] * p[1] + m[11] * p[2] + m[15];
     if (w < this.camera.near) return null;

@@ -1,8 +1,8 @@
-"""Samples of a flight as text inside a page: a tenth of their size, and read there in no time.
+"""Samples of a flight as compressed text inside a page: a tenth of their size, and fast to read.
 
-Each column is rounded to a step far below what can be seen, its second differences along time are
-taken, the bytes of equal weight put side by side, and all is deflated. ``unpack`` in recording.js
-undoes it.
+Each column is rounded to a step too small to see. Then its second differences along time are taken,
+bytes of equal significance are put side by side, and the result is deflated. ``unpack`` in recording.js
+reverses this.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ import numpy as np
 
 from rigidfleet.typing import Floats
 
-#: Stands for NaN; one below the least that is kept of a number.
+#: Stands for NaN; one less than the least valid number.
 _MISSING = -(2**31)
 
 
 class PackedColumn(NamedTuple):
     """A quantity over time and the step it is rounded to, both in its unit."""
 
-    values: Floats  # (K,) or (K, ...), NaN where there is none
+    values: Floats  # (K,) or (K, ...); NaN if there is no value
     step: float
 
 

@@ -1,4 +1,4 @@
-"""The page's parts, put together: one file of HTML that needs nothing else."""
+"""Assemble the parts of a page into one self-contained HTML file."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ def page(
     info : plain data and arrays; see ``describe`` and recording.js
     start : module that starts the player, see `bundle`
     data : packed samples, as ``start`` reads them
-    style : added to what every page has
-    connect : whom the page may talk to; see `content_policy`
+    style : CSS in addition to that of every page
+    connect : hosts that the page may connect to; see `content_policy`
     """
     style = read("replay/page.css") + style
     script = bundle(start)
@@ -37,7 +37,7 @@ def page(
         policy=content_policy(style=style, script=script, connect=connect),
         title=f"{info['name']} – rigidfleet",
         style=style,
-        # No mark-up inside: a user's words must not end the script.
+        # No markup inside: a user's text must not end the script.
         info=json.dumps(plain(info), ensure_ascii=False).replace("<", "\\u003c"),
         data=data,
         script=script,

@@ -1,23 +1,23 @@
-// The page around the picture: time line, speed, cameras, plots, keys.
+// The page around the picture: timeline, speed, cameras, plots, keys.
 
 import { CAMERAS, Scene, tensionColour } from "./scene.js";
 
 const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 4, 8, 16];
 const KEYS = [
-  ["space", "play, pause"],
-  ["← →", "back, on by 1 s; with Shift by 0.1 s"],
-  ["[ ]", "phase before, phase after"],
-  ["Home End", "start, end"],
-  ["− +", "slower, faster"],
-  ["1 2 3", "follow the formation; see the whole flight; from above, north up"],
+  ["space", "play or pause"],
+  ["← →", "back or forward by 1 s; with Shift by 0.1 s"],
+  ["[ ]", "previous or next phase"],
+  ["Home End", "go to the start or end"],
+  ["− +", "slower or faster"],
+  ["1 2 3", "camera: follow the formation, whole flight, from above (north up)"],
   ["p", "show or hide the panel"],
-  ["?", "this list"],
-  ["drag", "turn the view; with Shift or the right button move it"],
-  ["wheel", "zoom; on a touch screen with two fingers"],
+  ["?", "show this list"],
+  ["drag", "rotate the view; with Shift or the right button, move it"],
+  ["wheel", "zoom; on a touch screen, use two fingers"],
 ];
 const SHOWN = { edges: "edges", trails: "trails", slots: "slots", axes: "body axes", names: "names" };
 const ALERT = "#b00020";
-const SLOW = 1 / 24; // seconds a picture: above, the resolution is lowered
+const SLOW = 1 / 24; // seconds per picture above which the resolution is lowered
 
 export const part = (id) => document.getElementById(id);
 
@@ -28,7 +28,7 @@ export function element(tag, parent, attributes = {}, text = "") {
   return made;
 }
 
-/** A number as read on an instrument: three digits, no exponent. */
+/** A number with three digits and no exponent. */
 export function digits(x) {
   const size = Math.abs(x);
   return x.toFixed(size >= 99.95 ? 0 : size >= 9.995 ? 1 : 2).replace("-", "−");
@@ -45,7 +45,7 @@ function withUnit(x, unit) {
 
 // -- time -----------------------------------------------------------------------------------------------
 
-/** Round times from one to another, at most so many. */
+/** Round times between two times, at most a given number. */
 function roundTimes(first, last, most) {
   const least = (last - first) / Math.max(most, 1), power = Math.pow(10, Math.floor(Math.log10(least)));
   if (!(least > 0)) return [first];
@@ -54,22 +54,22 @@ function roundTimes(first, last, most) {
   return found;
 }
 
-/** Times written along a line. */
+/** Time labels along a line. */
 class TimeAxis {
-  /** Words take about `room` pixels. */
+  /** A label takes about `room` pixels. */
   constructor(box, room) {
     this.box = box;
     this.room = room;
   }
 
-  /** Write round times from the first to the last; returns them. */
+  /** Write round times from the first to the last; return them. */
   draw(first, last) {
     const { box } = this, wide = box.clientWidth, times = roundTimes(first, last, wide / this.room);
     const spans = times.map((time, k) => {
       const span = document.createElement("span"), share = last > first ? (time - first) / (last - first) : 0;
       span.textContent = `${Number(time.toFixed(3))}${k === times.length - 1 ? " s" : ""}`;
       span.style.left = `${100 * share}%`;
-      // Words at an end stay inside.
+      // Labels at the ends stay inside.
       if (share * wide < 14) span.className = "first";
       else if ((1 - share) * wide < 14) span.className = "last";
       return span;
@@ -82,8 +82,8 @@ class TimeAxis {
 // -- plots ----------------------------------------------------------------------------------------------
 
 /**
- * One quantity over time: `plot` {title, unit, column, colours, worst, limits, least, log, floor}. Each line has
- * its colour and its limit, null for none.
+ * A plot of one quantity over time: `plot` {title, unit, column, colours, worst, limits, least, log, floor}. Each line has
+ * a colour and a limit, which is null if there is none.
  */
 class Plot {
   constructor(parent, plot, recording, seek) {
@@ -93,8 +93,8 @@ class Plot {
     element("h2", header, {}, plot.title);
     this.value = element("output", header);
     const frame = element("div", box, { class: "frame" }), scale = element("div", frame, { class: "scale" });
-    this.ends = [element("span", scale), element("span", scale)]; // beside the lines, never on them
-    this.area = element("div", frame, { class: "area", title: "Click to go there" });
+    this.ends = [element("span", scale), element("span", scale)]; // beside the lines, never over them
+    this.area = element("div", frame, { class: "area", title: "Click to go to this time" });
     this.canvas = element("canvas", this.area);
     this.cursor = element("div", this.area, { class: "cursor" });
     const go = (event) => seek(Math.max(0, Math.min(event.offsetX / this.area.clientWidth, 1)));
@@ -105,7 +105,7 @@ class Plot {
     this.area.addEventListener("pointermove", (event) => event.buttons && go(event));
   }
 
-  /** Samples of all lines: the least and greatest of each stretch that falls on one pixel. */
+  /** Samples of all lines: the least and greatest of each interval that falls on one pixel. */
   stretch(first, last, pixels, visit) {
     const { plot, recording } = this, data = recording.columns[plot.column], width = recording.widths[plot.column];
     for (let line = 0; line < width; line++) {
@@ -125,7 +125,7 @@ class Plot {
     }
   }
 
-  /** Limits drawn: {value, colour}; of each line in its colour, or one for all. */
+  /** Limits drawn, {value, colour}: one for each line in its colour, or one for all. */
   get limits() {
     const { limits, colours } = this.plot, known = limits.filter((limit) => limit !== null);
     if (known.every((limit) => limit === known[0])) return known.slice(0, 1).map((value) => ({ value, colour: ALERT }));
@@ -150,7 +150,7 @@ class Plot {
     const y = plot.log ? (v) => Math.log10(Math.max(v, plot.floor)) : (v) => v;
     if (plot.log) [low, high] = [y(low), Math.max(y(high), y(low) + 1)];
     else {
-      // A limit is shown if the flight comes anywhere near it; of several limits also one further off.
+      // A limit is shown if the flight comes near it; with several limits, also one further away.
       const { limits } = this, near = Math.max(high + 1.5 * (high - low) + 1e-9, limits.length > 1 ? 3 * high : 0);
       for (const { value } of limits) if (value < near) high = Math.max(high, value);
       if (plot.least !== null && plot.least > low - 1.5 * (high - low) - 1e-9) low = Math.min(low, plot.least);
@@ -229,7 +229,7 @@ export class Player {
     });
   }
 
-  /** Words that stay. */
+  /** Text that does not change. */
   write(info) {
     part("name").textContent = info.name;
     part("title").textContent = info.title;
@@ -237,7 +237,7 @@ export class Player {
     for (const speed of this.speeds()) element("option", part("speed"), { value: String(speed) }, `${speed}×`);
     part("speed").value = "1";
     for (const mode of CAMERAS) {
-      const title = { follow: "Follow the formation (1)", overview: "See the whole flight (2)", top: "See from above, north up (3)" }[mode];
+      const title = { follow: "Follow the formation (1)", overview: "Show the whole flight (2)", top: "View from above, north up (3)" }[mode];
       element("button", part("cameras"), { type: "button", title, "data-mode": mode }, mode[0].toUpperCase() + mode.slice(1))
         .addEventListener("click", () => this.look(mode));
     }
@@ -263,12 +263,12 @@ export class Player {
     return SPEEDS;
   }
 
-  /** What keys do. */
+  /** Keys and their functions. */
   keys() {
     return KEYS;
   }
 
-  /** What is known of the flight as a whole. */
+  /** Information about the whole flight. */
   writeStory(info) {
     part("whole").textContent = `of ${Number(this.recording.end.toFixed(2))} s`;
     part("ending").hidden = !info.ending;
@@ -303,8 +303,8 @@ export class Player {
     part("more").addEventListener("click", () => this.panel());
     part("keys").addEventListener("click", () => this.help());
     part("help-close").addEventListener("click", () => this.help());
-    // What was pressed by a mouse or a finger gives the keys back to the flight, or space would press it again;
-    // what was reached by keys keeps them.
+    // A control clicked with mouse or finger loses the focus, or the space bar would press it again;
+    // a control reached by keyboard keeps it.
     for (const name of ["click", "change"]) {
       document.addEventListener(name, () => {
         const at = document.activeElement, opening = name === "click" && at.tagName === "SELECT";
@@ -314,10 +314,10 @@ export class Player {
     document.addEventListener("keydown", (event) => this.key(event));
     window.addEventListener("hashchange", () => this.follow());
     this.steer(part("view"));
-    this.scene.renderer.canvas.addEventListener("webglcontextlost", () => say("The graphics of this machine failed. Reload the page."));
+    this.scene.renderer.canvas.addEventListener("webglcontextlost", () => say("The graphics driver of this machine failed. Reload the page."));
   }
 
-  /** Drag turns, with the right button or Shift it moves; the wheel or two fingers zoom. */
+  /** Dragging rotates, with the right button or Shift it moves; the wheel or two fingers zoom. */
   steer(view) {
     const { camera } = this.scene, fingers = new Map();
     view.addEventListener("contextmenu", (event) => event.preventDefault());
@@ -375,7 +375,7 @@ export class Player {
     event.preventDefault();
   }
 
-  // -- what can be asked of it --
+  // -- commands --
 
   toggle() {
     if (!this.playing && this.time >= this.recording.end) this.seek(this.recording.start);
@@ -389,7 +389,7 @@ export class Player {
     this.stale = true;
   }
 
-  /** Say on the button what it will do next. */
+  /** Label the button with its next action. */
   mark(playing) {
     part("play").setAttribute("aria-label", playing ? "Pause" : "Play");
     part("play").classList.toggle("playing", playing);
@@ -426,7 +426,7 @@ export class Player {
     else help.showModal();
   }
 
-  /** Go where the address asks: `#t=52` shows that moment, `&camera=top`, `&speed=2`; it then stands still. */
+  /** Apply the address: `#t=52` shows that time, paused; also `&camera=top` and `&speed=2`. */
   follow() {
     const asked = new URLSearchParams(location.hash.slice(1)), t = parseFloat(asked.get("t"));
     if (CAMERAS.includes(asked.get("camera"))) this.look(asked.get("camera"));
@@ -437,7 +437,7 @@ export class Player {
   }
 
   resize() {
-    // The picture's centre lies in the middle of what is free.
+    // The centre of the picture lies in the middle of the free area.
     const { clientWidth: width, clientHeight: height } = document.documentElement, { camera } = this.scene;
     if (!width || !height) return; // in a frame that is not shown yet
     const beside = (id) => (part(id)?.offsetWidth && width > 760 ? part(id).offsetWidth + 14 : 0);
@@ -448,7 +448,7 @@ export class Player {
     this.stale = true;
   }
 
-  /** The times that plots show. */
+  /** The time range of the plots. */
   span() {
     return [this.recording.start, this.recording.end];
   }
@@ -470,12 +470,12 @@ export class Player {
       this.advance(wait);
       this.spare(wait);
     }
-    // A picture at rest is drawn once more, at full resolution.
+    // A still picture is drawn once more at full resolution.
     const { renderer } = this.scene, sharpen = !this.stale && renderer.scale < 1;
     if (!this.stale && !sharpen) return;
     renderer.scale = sharpen ? 1 : renderer.effort;
     this.stale = this.scene.draw(this.time, wait);
-    // Words and sliders need not change with every picture.
+    // Text and sliders need not change with every picture.
     if (!this.playing || now - this.told > 80) {
       this.told = now;
       this.tell();
@@ -488,7 +488,7 @@ export class Player {
     if (this.time >= this.recording.end) this.play(false);
   }
 
-  /** Where pictures come slowly, draw fewer pixels. */
+  /** If drawing is slow, draw fewer pixels. */
   spare(wait) {
     const { renderer } = this.scene;
     this.slow = wait > SLOW ? this.slow + 1 : Math.max(0, this.slow - 1);
@@ -512,7 +512,7 @@ export class Player {
     [...part("phases").children].forEach((button, k) => button.toggleAttribute("aria-current", k === state.phase));
     const [first, last] = this.span(), share = last > first ? (time - first) / (last - first) : 0;
     for (const plot of this.plots) plot.point(share, state);
-    const larger = scene.enlarged > 1.15 ? `Vehicles are drawn ${digits(scene.enlarged)} times as large as they are.` : "";
+    const larger = scene.enlarged > 1.15 ? `Vehicles are drawn ${digits(scene.enlarged)} times their size.` : "";
     write("notes", [info.note, larger].filter(Boolean).join("\n"));
   }
 }

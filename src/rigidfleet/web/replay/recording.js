@@ -1,4 +1,4 @@
-// A flight as samples at even times, and its state at any time between them.
+// A flight as samples at even times, and its state at any time in between.
 
 import { grown, unit } from "./gl.js";
 
@@ -79,7 +79,7 @@ export class Recording {
     return [k, this.count > 1 ? Math.max(0, Math.min(x - k, 1)) : 0];
   }
 
-  /** The state at a time; the object is used again at the next call. */
+  /** The state at a time; the next call reuses the object. */
   at(time) {
     const { state } = this, [k, f] = this.place(time);
     state.time = time;
@@ -98,7 +98,7 @@ export class Recording {
     return k;
   }
 
-  /** Between two samples in a straight line; where one of them has no value, the nearer one. */
+  /** Linear interpolation between two samples; if one has no value, the nearer one. */
   straight(name, k, f, out) {
     const width = out.length, data = this.columns[name], a = k * width, b = this.count > 1 ? a + width : a;
     for (let c = 0; c < width; c++) {
@@ -107,7 +107,7 @@ export class Recording {
     }
   }
 
-  /** Through the samples with a steady slope (Catmull and Rom). */
+  /** Smooth interpolation through the samples (Catmull and Rom). */
   smooth(name, k, f, out) {
     const width = out.length, data = this.columns[name], last = this.count - 1;
     const row = (i) => width * Math.max(0, Math.min(i, last));

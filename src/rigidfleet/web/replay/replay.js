@@ -1,4 +1,4 @@
-// A flight that is over, out of the page itself.
+// A finished flight, read from the page itself.
 
 import { Player, part, say } from "./player.js";
 import { Recording, unpack } from "./recording.js";

@@ -1,4 +1,4 @@
-// What a flight looks like at one moment, and from where it is seen.
+// The picture of a flight at one time, and its camera.
 
 import {
   BACKGROUND, Lines, Mesh, NO_TURN, OWN, Places, Renderer, add, cross, dot, length, mixed,
@@ -9,9 +9,9 @@ import { bodyAxes } from "./recording.js";
 const AXES = [[0.84, 0.15, 0.16], [0.13, 0.58, 0.22], [0.12, 0.36, 0.86]];
 const IDLE = [0.42, 0.47, 0.53], PULL = [0.80, 0.11, 0.09], PUSH = [0.10, 0.33, 0.75];
 const INK = [0.13, 0.15, 0.18], BOX = [0.88, 0.88, 0.87], RIM = [0.50, 0.56, 0.63], FENCE = [0.69, 0, 0.13];
-const SMALLEST = 6, DETAILED = 12; // radius of a vehicle on the screen: at least; with all detail from [px]
+const SMALLEST = 6, DETAILED = 12; // radius of a vehicle on the screen: the least, and that from which all detail is drawn [px]
 const TRAIL = 8; // length of trails [s]
-const CROWD = 60; // where more vehicles fly, each stands out less
+const CROWD = 60; // number of vehicles beyond which each is drawn less prominently
 
 /** Colour of an edge: `share` of the largest tension, from -1 (pushes) to 1 (pulls), by its square root. */
 export function tensionColour(share) {
@@ -24,8 +24,8 @@ const rgb = (hex) => [1, 3, 5].map((k) => parseInt(hex.slice(k, k + 2), 16) / 25
 
 export const CAMERAS = ["follow", "overview", "top"];
 const STEEP = 0.62; // elevation of the overview
-const MARGIN = 1.06; // around what the overview holds
-const PLACES = 2000; // of the flight that it looks at
+const MARGIN = 1.06; // around the content of the overview
+const PLACES = 2000; // positions of the flight that the overview takes into account
 
 /** Unit vectors of a view from an azimuth and an elevation: to its right, upwards, and back to the eye. */
 function viewAxes(azimuth, elevation) {
@@ -38,7 +38,7 @@ class Camera {
   constructor(recording) {
     const { info, columns, count } = recording, n = info.radius.length;
     this.info = info;
-    this.sight = [...info.sight]; // what the overview holds
+    this.sight = [...info.sight]; // points that the overview shows
     const every = Math.max(1, Math.ceil((count * n) / PLACES));
     for (let k = 0; k < count; k += every) {
       for (let i = k * n; i < (k + 1) * n; i++) this.sight.push(columns.position.subarray(3 * i, 3 * i + 3));
@@ -50,7 +50,7 @@ class Camera {
     this.pan = [0, 0, 0];
   }
 
-  /** Look from where a mode looks from; a moving picture goes there smoothly, unless `now`. */
+  /** Set the view of a mode; the picture moves there smoothly, unless `now`. */
   use(mode, now = false) {
     this.mode = mode;
     this.azimuth = mode === "top" ? -Math.PI / 2 : this.info.azimuth; // from above, north is up
@@ -65,18 +65,18 @@ class Camera {
     this.elevation = Math.max(-0.15, Math.min(this.elevation + dy, Math.PI / 2));
   }
 
-  /** Move what is looked at across the screen by shares of its height. */
+  /** Move the point looked at across the screen, in shares of the screen's height. */
   shift(dx, dy) {
     const { eye, target, right } = this, up = cross(unit(sub(eye, target)), right);
     const s = 2 * Math.tan(this.fov / 2) * length(sub(eye, target));
     this.pan = add(this.pan, add(scaled(right, -dx * s), scaled(up, dy * s)));
   }
 
-  /** Where to look, and from how far, to have the whole flight and what stands near it in the free part of the page. */
+  /** Target and distance that show the whole flight and nearby obstacles in the free part of the page. */
   overview(aspect) {
     const { right, up, back } = viewAxes(this.info.azimuth, STEEP), { middle } = this.info;
     const wide = Math.tan(this.fov / 2) * aspect * this.free[0], high = Math.tan(this.fov / 2) * this.free[1];
-    // Of each side of the picture, the distance from which the outermost point lies on its border.
+    // For each side of the picture, the distance at which the outermost point lies on its border.
     let [l, r, b, t] = [-Infinity, -Infinity, -Infinity, -Infinity];
     for (const p of this.sight) {
       const away = sub(p, middle), x = dot(away, right) / wide, y = dot(away, up) / high, z = dot(away, back);
@@ -86,13 +86,13 @@ class Camera {
     return { target, distance: MARGIN * Math.max((l + r) / 2, (b + t) / 2, 1e-6) };
   }
 
-  /** Be where it ought to be `wait` seconds after the last picture; true while still on its way. */
+  /** Move towards the wanted view, `wait` seconds after the last picture; true while still moving. */
   update(recording, state, aspect, wait) {
     const { info } = this, narrow = Math.tan(this.fov / 2) * Math.min(aspect * this.free[0], this.free[1]);
     let target, distance;
     if (this.mode === "overview") ({ target, distance } = this.overview(aspect));
     else {
-      // Room for the formation as it will be soon, so that a change of shape does not leave the picture.
+      // Allow for the formation's size in the near future, so that a change of shape stays in the picture.
       const [k] = recording.place(state.time), rate = info.step > 0 ? 1 / info.step : 0;
       let reach = 0;
       target = state.cm;
@@ -108,7 +108,7 @@ class Camera {
       elevation: this.elevation,
       target: add(target, this.pan),
     };
-    // What moves with the formation stays with it; only what is left of a change of view fades.
+    // The view moves with the formation; only the rest of a change of view fades.
     if (!Number.isFinite(Math.log(this.shown?.distance))) this.shown = null; // seen in a frame without room
     const s = this.shown ?? { ...wanted, off: [0, 0, 0], mode: this.mode };
     if (s.mode !== this.mode) {
@@ -220,7 +220,7 @@ export class Scene {
     return px * this.pixel * length(sub(point, this.camera.eye));
   }
 
-  // -- what stands still --
+  // -- things at rest --
 
   /** Boxes; those between the eye and the vehicles turn into veils. */
   placeBoxes(wait) {
@@ -280,7 +280,7 @@ export class Scene {
     });
   }
 
-  /** The way of the centre of mass through the whole flight. */
+  /** Path of the centre of mass through the whole flight. */
   placePath() {
     const { recording, lines, info } = this;
     if (!info.path || !this.show.trails) return;
@@ -291,13 +291,13 @@ export class Scene {
     }
   }
 
-  // -- what flies --
+  // -- things that move --
 
   placeVehicles(state) {
     const { info, places, n, recording } = this, shade = this.crowd ? 0.2 : 0.28;
     const heading = Number.isNaN(state.attitude[0]) ? [1, 0, 0] : bodyAxes(state.attitude)[0];
     this.enlarged = 1;
-    // Numbers where there is room for them.
+    // Numbers, if there is room for them.
     const room = recording.reachAt(recording.place(state.time)[0]) / this.sized(state.cm, 1);
     const named = this.show.names && n <= 40 && room > 22 * Math.sqrt(n);
     for (let i = 0; i < n; i++) {
@@ -320,7 +320,7 @@ export class Scene {
     }
   }
 
-  /** Where a vehicle ought to be; seen only where it is not there. */
+  /** The slot of a vehicle; visible only if the vehicle is not there. */
   placeGhost(ghosts, p, size, q, error, i) {
     const off = length(error), slot = add(p, error);
     const alpha = Math.max(0, Math.min((off / size - 0.1) / 0.6, 1));
@@ -343,7 +343,7 @@ export class Scene {
     });
   }
 
-  /** The last seconds of every vehicle's way. */
+  /** The last seconds of every vehicle's path. */
   placeTrails(time) {
     const { recording, lines, n, state } = this, { position } = recording.columns;
     const [k] = recording.place(time), step = recording.info.step;
@@ -351,7 +351,7 @@ export class Scene {
     const first = Math.max(0, k - Math.floor(TRAIL / step));
     const every = Math.max(1, Math.ceil(((k - first) * n) / (12000 * this.renderer.effort ** 3)), Math.round(0.06 / step));
     const at = (j, i) => position.subarray(3 * (j * n + i), 3 * (j * n + i) + 3);
-    // Places that do not move along with the time, or the trail would shiver.
+    // Points at fixed times, or the trail would flicker.
     const begin = Math.ceil(first / every) * every;
     const full = this.crowd ? 0.3 : 0.6;
     const fresh = (j) => Math.pow(Math.max(0, 1 - (time - recording.start - j * step) / TRAIL), 1.4) * full;
@@ -363,7 +363,7 @@ export class Scene {
     }
   }
 
-  /** Where the hand wants the body to be, on a live flight. */
+  /** Target pose of the body in a live flight. */
   placeTarget(state) {
     const { lines, places, info, recording } = this, p = Array.from(state.target.subarray(0, 3)), cm = Array.from(state.cm);
     const [k] = recording.place(state.time), size = 0.3 * recording.reachAt(k);
@@ -374,7 +374,7 @@ export class Scene {
     bodyAxes(state.target.subarray(3, 7)).forEach((axis, a) => lines.world.add(p, add(p, scaled(axis, size)), 2, AXES[a], 0.7));
   }
 
-  /** Body axes at the centre of mass, and faintly those commanded where they differ. */
+  /** Body axes at the centre of mass and, faintly, the commanded ones if they differ. */
   placeAxes(state) {
     const { lines, places, recording } = this;
     if (Number.isNaN(state.attitude[0])) return;
@@ -394,7 +394,7 @@ export class Scene {
   }
 }
 
-/** Does the way from a to b meet a box? */
+/** Whether the segment from a to b meets a box. */
 function meets(a, b, low, high) {
   let from = 0, to = 1;
   for (let s = 0; s < 3; s++) {
@@ -410,9 +410,9 @@ function meets(a, b, low, high) {
   return from < to;
 }
 
-// -- words in the picture -----------------------------------------------------------------------------
+// -- labels in the picture -----------------------------------------------------------------------------
 
-/** Labels over the picture; those that would cover an earlier one of their kind are left out. */
+/** Labels over the picture; those that would cover an earlier one are left out. */
 class Labels {
   constructor(box) {
     this.box = box;
@@ -424,7 +424,7 @@ class Labels {
     this.wanted.length = 0;
   }
 
-  /** Words above a point (from `Renderer.project`) by `lift` pixels. */
+  /** A label `lift` pixels above a point (from `Renderer.project`). */
   add(point, text, kind, lift, colour = "") {
     if (point) this.wanted.push({ x: point[0], y: point[1] - lift, far: point[2], text, kind, colour });
   }
@@ -437,7 +437,7 @@ class Labels {
     for (const label of wanted) {
       const half = 3.4 * label.text.length + 3, wide = box.clientWidth;
       if (label.x < -half || label.x > wide + half || label.y < 0 || label.y > box.clientHeight + 9) continue;
-      // Words of what is in sight are, too.
+      // Labels of visible things are kept inside the picture, too.
       if (label.x > 0 && label.x < wide && wide > 2 * half) label.x = Math.max(half, Math.min(label.x, wide - half));
       const covers = (t) => Math.abs(t.x - label.x) < t.half + half && Math.abs(t.y - label.y) < 13;
       if (label.kind !== "agent" && label.kind !== "axis" && taken.some(covers)) continue;

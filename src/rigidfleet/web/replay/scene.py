@@ -1,4 +1,4 @@
-"""What a page shows: of a mission before anything flies, and of samples of a flight."""
+"""Content of a page: from the mission, before the flight, and from samples of the flight."""
 
 from __future__ import annotations
 
@@ -15,13 +15,15 @@ if TYPE_CHECKING:
     from rigidfleet.mission import Mission
     from rigidfleet.result import Result
 
-_LINES = 12  # in a plot at most; of more agents the least and the greatest
-_BOXES = 200  # that an overview fits one by one; more together
-_FLOOR = 1e-6  # least constraint error that is told apart from none [m]
+_LINES = 12  # greatest number of lines in a plot; for more agents, the least and the greatest value
+_BOXES = (
+    200  # greatest number of obstacles that an overview fits one by one; more are fitted together
+)
+_FLOOR = 1e-6  # least constraint error that is distinguished from zero [m]
 
 
 def describe(mission: Mission, edges: Ints, tension: float) -> dict[str, Any]:
-    """The things that stand still, the vehicles, edges (m, 2) and plots.
+    """Description of obstacles, vehicles, edges (m, 2) and plots.
 
     Full colour of an edge stands for ``tension`` [N].
     """
@@ -44,9 +46,9 @@ def describe(mission: Mission, edges: Ints, tension: float) -> dict[str, Any]:
 
 
 def observe(result: Result, shown: Ints, tension: float) -> dict[str, PackedColumn]:
-    """Samples as the page sees them, at the result's times; ``shown`` are the edges drawn."""
+    """Samples for the page, at the result's times; ``shown`` are the edges drawn."""
     mission = result.mission
-    # Fine enough for a view of one vehicle that fills the screen.
+    # Fine enough for a vehicle that fills the screen.
     fine = max(size(result), *mission.agents.radius, 1e-9) / 20_000
     force = result.input_force + result.constraint_force
     return {
@@ -62,10 +64,10 @@ def observe(result: Result, shown: Ints, tension: float) -> dict[str, PackedColu
 
 
 def sight(mission: Mission, low: Floats, high: Floats) -> Floats:
-    """Points (P, 3) [m] that an overview has in sight: 8 corners of a flight's box, then those of obstacles near it.
+    """Points (P, 3) [m] that an overview shows: 8 corners of the flight's box, then those of obstacles near it.
 
-    Of what reaches further from the flight than the flight is long, the part that is near; ``low`` and
-    ``high`` (3,) are the flight's least and greatest coordinates [m].
+    An obstacle is cut at the distance from the flight that equals the flight's length. ``low`` and ``high`` (3,)
+    are the flight's least and greatest coordinates [m].
     """
     reach = max(float(np.linalg.norm(high - low)), 1e-6)
     seen = []
@@ -81,9 +83,9 @@ def sight(mission: Mission, low: Floats, high: Floats) -> Floats:
 
 
 def thrust_directions(force: Floats, mass: Floats) -> Floats:
-    """Unit vectors (..., N, 3) along the thrust, which a vehicle's rotors must point along.
+    """Unit vectors (..., N, 3) along the thrust, in which the vehicles' rotors point.
 
-    Upwards where there is next to no thrust (2 % of the weight on Earth), whose direction is noise.
+    Upwards if the thrust is below 2 % of the weight on Earth, since its direction is then noise.
     """
     strength = np.linalg.norm(force, axis=-1)
     up = np.maximum(0.2 * mass - strength, 0.0)
@@ -103,7 +105,7 @@ def weight(mission: Mission) -> float:
 
 
 def _plots(mission: Mission) -> list[dict[str, Any]]:
-    """Quantities drawn over time; ``column`` holds the samples of each."""
+    """Quantities drawn over time; each has its samples in ``column``."""
     n, limits = mission.n_agents, mission.limits
     basic = {
         "unit": "m",
@@ -126,7 +128,7 @@ def _plots(mission: Mission) -> list[dict[str, Any]]:
 
 
 def _alike(mission: Mission) -> list[Ints] | None:
-    """Vehicles whose greatest thrust is one line, as they have one limit; None of too many limits."""
+    """Groups of vehicles with the same limit, whose greatest thrust is one line; None if there are too many limits."""
     limits = mission.fleet.thrust_limit
     if len(limits) <= _LINES:
         return [np.array([i]) for i in range(len(limits))]
@@ -135,13 +137,15 @@ def _alike(mission: Mission) -> list[Ints] | None:
 
 
 def _thrust_plot(mission: Mission) -> dict[str, Any]:
-    """Lines of thrust, each under its own limit."""
+    """Lines of thrust, each with its own limit."""
     alike, limits = _alike(mission), mission.agents.thrust_limit
     title, grey = "Greatest thrust", ["#8FA3B8", "#20262D"]
-    if alike is None:  # as many limits: shares of them
+    if alike is None:  # too many limits: thrust as a share of the limit
         limit: dict[str, Any] = {"unit": "%", "colours": grey, "limits": [None, 100.0]}
-        return {"title": f"{title}, of its limit", **limit}
-    if len(alike) == 1 < len(limits):  # a crowd with one limit: the least and the greatest
+        return {"title": f"{title}, as share of limit", **limit}
+    if (
+        len(alike) == 1 < len(limits)
+    ):  # many vehicles with one limit: the least and the greatest thrust
         return {"title": title, "unit": "N", "colours": grey, "limits": [None, limits[0]]}
     own = [limits[int(who[0])] for who in alike]
     return {"title": title, "unit": "N", "colours": agent_colours(len(alike)), "limits": own}
@@ -160,7 +164,7 @@ def _thrust_lines(mission: Mission, thrust: Floats) -> Floats:
 def _plotted(result: Result) -> dict[str, PackedColumn]:
     """Samples of each plot."""
     thrust = _thrust_lines(result.mission, result.thrust)
-    # Where no edge is active there is no error.
+    # Without active edges there is no error.
     error = np.where(np.isnan(result.constraint), -1.0, np.abs(result.constraint))
     error = error.max(axis=1, initial=-1.0)
     samples = {
