@@ -84,8 +84,8 @@ def attach(
 
     Slots fitted to the agents (Kabsch) give the attitude, the matrix of Eq. (23). Before any formation is established,
     the agents' own positions are the slots, in the axes of the formations' definition. An established formation takes
-    its own axes: those of its prescribed attitude, or, if its attitude is free, the nearest ones. Lost vehicles do not count in
-    the fit; the virtual body keeps their slots.
+    its own axes: those of its prescribed attitude, or, if its attitude is free, the nearest ones. Lost vehicles do not
+    count in the fit; the virtual body keeps their slots.
 
     Returns
     -------
