@@ -21,7 +21,7 @@ import pytest
 
 from rigidfleet.kernel.compiler import cache, jit
 from rigidfleet.kernel.compiler.cache import cache_directory
-from rigidfleet.kernel.engine import native
+from rigidfleet.kernel.engine import native, objects
 from rigidfleet.kernel.engine.native import is_compiled
 
 PLANTED, OWN = 666, 1
@@ -36,8 +36,8 @@ def code(answer: int) -> bytes:
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     text = "define i64 @{}(i64, i64, i64, i64) {{ ret i64 {} }}"
-    module = llvm.parse_assembly("\n".join(text.format(e, answer) for e in native.ENTRIES))
-    return native.target_machine().emit_object(module)
+    module = llvm.parse_assembly("\n".join(text.format(e, answer) for e in objects.ENTRIES))
+    return objects.target_machine().emit_object(module)
 
 
 def answer() -> int:
@@ -60,7 +60,7 @@ def base(tmp_path, monkeypatch) -> Iterator[Path]:
     monkeypatch.setattr(native, "_compile", lambda: [code(OWN)])
     monkeypatch.setattr(native, "_loaded", [])
     file = native._file()
-    file.write_bytes(native.concatenated([code(PLANTED)]))
+    file.write_bytes(objects.concatenated([code(PLANTED)]))
     file.chmod(0o600)
     forget()
     yield folder
@@ -418,9 +418,9 @@ def test_a_build_process_imports_what_its_parent_does(way, hostile, tmp_path, mo
     monkeypatch.chdir(hostile)
     given = "../libraries" if way == "relative" else str(tmp_path / "libraries")
     monkeypatch.setattr(sys, "path", ["", *sys.path, given])
-    monkeypatch.setattr(native, "_BUILD", IMPORTS)
+    monkeypatch.setattr(objects, "_BUILD", IMPORTS)
     done = run(
-        *native.build_process(),
+        *objects.build_process(),
         cwd=hostile,
         **({"PYTHONPATH": given} if way == "PYTHONPATH" else {}),
     )
@@ -434,7 +434,7 @@ def test_a_build_process_imports_what_its_parent_does(way, hostile, tmp_path, mo
 
 def test_a_build_process_heeds_its_parents_flags():
     """A Python that leaves out the user's packages and the environment starts one that does, too."""
-    code = "from rigidfleet.kernel.engine import native; print(native.build_process()[1:-1])"
+    code = "from rigidfleet.kernel.engine import objects; print(objects.build_process()[1:-1])"
     done = subprocess.run(
         [sys.executable, "-sE", "-c", code], capture_output=True, text=True, check=True
     )

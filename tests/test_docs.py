@@ -86,6 +86,18 @@ def test_first_mission_flies():
     assert verdict.passed, verdict.summary
 
 
+def test_the_example_of_an_orbit_flies():
+    """The orbit of the page is accepted as it stands, and passes its verdict."""
+    (text,) = (b for b in blocks(page("missions.md"), "toml") if 'kind = "orbit"' in b)
+    data = {
+        "schema_version": 1,
+        "name": "orbit",
+        "agents": {"mass": 1.0, "position": [[10, 5, 9], [12, 5, 10]]},
+    } | tomllib.loads(text)
+    verdict = assess(simulate(Mission.from_dict(data)))
+    assert verdict.passed, verdict.summary
+
+
 def test_formations_are_right():
     """The three forms of a formation are accepted as they stand."""
     forms = next(b for b in blocks(page("missions.md"), "toml") if "[formations.skein]" in b)

@@ -21,6 +21,7 @@ from rigidfleet.kernel import (
     references,
     rigid_body,
 )
+from rigidfleet.kernel.compiler import numba_internals
 from rigidfleet.kernel.compiler.cache import cache_directory
 from rigidfleet.kernel.engine import native
 from rigidfleet.kernel.engine.native import is_compiled
@@ -813,8 +814,9 @@ def test_the_kernel_is_translated_once(helped):
     """Two processes translate each function for the types that the others ask for; one does it alone if it must."""
     code = f"""
 from rigidfleet.kernel.engine import build
-build._translate_only()
-second = build._SecondProcess()
+from rigidfleet.kernel.compiler import numba_internals
+numba_internals.translate_only()
+second = build._SecondProcess(shares=True)
 if not {helped}:
     second._process.kill()
 assert len(build.machine_code(second)) == 3
@@ -824,6 +826,35 @@ assert set(second.translated) == (set(function.__name__ for function in theirs) 
 """
     environment = os.environ | {"NUMBA_OPT": "0"}
     subprocess.run([sys.executable, "-c", code], check=True, env=environment)
+
+
+@pytest.mark.long
+def test_a_numba_that_was_not_tested_builds_the_same_kernel():
+    """Where Numba's internals are not known, its public functions alone build the kernel; flights are the same bits."""
+    code = """
+import hashlib, sys
+from rigidfleet.kernel.compiler import numba_internals
+if sys.argv[1] == "other":
+    numba_internals.TESTED = ()
+    assert not numba_internals.known()
+    from rigidfleet.kernel.engine import build, native
+    native._loaded.append(native._linked(build.machine_code(build._SecondProcess(shares=False))))
+import rigidfleet as rf
+print(hashlib.sha256(rf.simulate("establish-triangle").position.tobytes()).hexdigest())
+"""
+    environment = os.environ | {"NUMBA_OPT": "0"}
+    ours, theirs = (
+        subprocess.run(
+            [sys.executable, "-c", code, which], check=True, env=environment, capture_output=True
+        ).stdout
+        for which in ("tested", "other")
+    )
+    assert ours == theirs
+
+
+def test_numba_is_one_that_was_tested():
+    """Who updates Numba tries the build, and names the version beside what is taken from it."""
+    assert numba.__version__ in numba_internals.TESTED
 
 
 @pytest.mark.parametrize("change", ["type", "order", "dimensions"])

@@ -18,6 +18,7 @@ from rigidfleet.mission import (
     Box,
     Fly,
     Mission,
+    goal,
     json_schema,
     load_mission,
     mission_names,
@@ -59,6 +60,11 @@ PLAIN: dict[str, Any] = {
     ],
 }
 REMOVED: Any = object()
+ORBIT = {"kind": "orbit", "centre": [5, 5, 8], "radius": 4.0, "rate_deg_s": 30.0, "duration": 9.0}
+ORBIT_SETTLES = {key: value for key, value in ORBIT.items() if key != "duration"} | {
+    "settle": {"timeout": 3.0},
+    "blend": 2.0,
+}
 
 
 def changed(*edits: tuple[str, Any], base: dict[str, Any] = PLAIN) -> dict[str, Any]:
@@ -200,6 +206,21 @@ def test_control_follows_architecture(architecture, controls):
     """Locally every phase tracks slots; the virtual body is controlled once it is established."""
     mission = Mission.from_dict(changed(("architecture", architecture)))
     assert [p.control for p in mission.phases] == controls
+
+
+def test_an_orbit_tracks_slots_in_both_architectures():
+    """It does so by default, and no wrench on the virtual body can lead it."""
+    body = ("architecture", "body")
+    assert Mission.from_dict(changed(body, ("phases/1", ORBIT))).phases[1].control == "tracking"
+    (finding,) = findings(body, ("phases/1", ORBIT | {"control": "body"}))
+    assert finding.key == "phases[2].control"
+    assert "round a circle" in finding.problem
+
+
+def test_an_orbit_is_told_in_words():
+    """Where it leads to is told as of any phase."""
+    phase = Mission.from_dict(changed(("phases/1", ORBIT))).phases[1]
+    assert goal(phase) == "round (5, 5, 8) m at 4 m, 30°/s"
 
 
 def test_names_default_to_kind_and_number():
@@ -502,6 +523,17 @@ def test_missions_cross_processes():
         (("phases/0/input_force", [1, 0, 0]), "phases[1].input_force", "no effect", "open"),
         (("phases/1/position", REMOVED), "phases[2].position", "is missing", "[m]"),
         (("phases/1", {"kind": "turn", "duration": 3.0}), "phases[2]", "no angle", "yaw_deg"),
+        (("phases/1", ORBIT | {"rate_deg_s": 0.0}), "phases[2].rate_deg_s", "circle nothing", "a rate"),
+        (("phases/1", ORBIT | {"rate_deg_s": 5e3}), "phases[2].rate_deg_s", "more than 100", "lower"),
+        (("phases/1", ORBIT | {"rate_deg_s": 1e6, "radius": 1e4}), "phases[2].rate_deg_s", "m/s^2", "lower"),
+        (("phases/1", ORBIT | {"radius": 0.0}), "phases[2].radius", "must be > 0", "[m]"),
+        (("phases/1", ORBIT | {"radius": -3.0}), "phases[2].radius", "must be > 0", "[m]"),
+        (("phases/1", ORBIT | {"center": [0, 0, 0]}), "phases[2].center", "unknown key", "'centre'?"),
+        (("phases/1", ORBIT | {"blend": 9.5}), "phases[2].blend", "lasts 9 s", "blend <= 9"),
+        (("phases/1", ORBIT | {"yaw": "free"}), "phases[2].yaw", "'fixed' or 'along'", "use fixed"),
+        (("phases/1", ORBIT | {"control": "open"}), "phases[2].control", "would steer", "'tracking'"),
+        (("phases/1", ORBIT | {"control": "body"}), "phases[2].control", "is 'local'", "tracking"),
+        (("phases/1", ORBIT_SETTLES), "phases[2].settle", "never settles", "duration or until"),
         (("output_step", 30.0), "output_step", "ends before the first step", "shorter"),
         (("output_step", 1e-6), "output_step", "samples would be stored", "or more"),
         (("output_step", 0), "output_step", "must be > 0", "[s]"),

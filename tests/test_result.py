@@ -284,7 +284,7 @@ class Disk:
     def __init__(self, error: BaseException, room: int) -> None:
         self.error, self.room = error, room
 
-    def __call__(self, path, mode):
+    def __call__(self, path, mode, **_):
         file = io.FileIO(path, "xb")
         write = file.write
 
@@ -357,7 +357,7 @@ def test_saving_where_nothing_can_be_written_says_why(tmp_path, monkeypatch):
     with pytest.raises(ResultError, match="there is no folder"):
         result.save(tmp_path / "file" / "a.nc")
 
-    def forbidden(*_):
+    def forbidden(*_, **__):
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
 
     monkeypatch.setattr("builtins.open", forbidden)

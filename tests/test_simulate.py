@@ -19,9 +19,10 @@ from rigidfleet.math import attitude, lqr
 from rigidfleet.mission import Establish, Mission, load_mission, mission_names
 from rigidfleet.planning.plan import plan_phase
 from rigidfleet.planning.reference import ByEdge, PhaseState, reference_kind
+from rigidfleet.preflight import check as preflight
 from rigidfleet.result import Result
 from rigidfleet.rigidity import jacobian
-from rigidfleet.simulation.flight import FlightInterrupted, Observation, Progress, simulate
+from rigidfleet.simulation.flight import Flight, FlightInterrupted, Observation, Progress, simulate
 
 Data = dict[str, Any]
 
@@ -1204,3 +1205,107 @@ def test_what_stays_flies_to_rest_by_its_end(kind):
     assert np.max(result.cm[rows, 0]) - 20.0 == pytest.approx(4 / 27 * 2.0 * 9.0, abs=0.02)
     np.testing.assert_allclose(result.cm[rows][-1], [20.0, 5.0, 5.0], rtol=0, atol=1e-3)
     np.testing.assert_allclose(result.cm_velocity[rows][-1], 0.0, atol=1e-2)
+
+
+# -- orbits ----------------------------------------------------------------------------------------
+
+ORBIT: Data = {
+    "kind": "orbit", "centre": [20.0, 5.0, 10.0], "radius": 10.0, "rate_deg_s": 20.0, "duration": 20.0,
+}  # fmt: skip
+PASSING: Data = {
+    "kind": "fly", "position": [5.0, -9.0, 4.0], "velocity": [2.0, 1.0, 0.5], "duration": 8.0,
+    "rates_deg_s": [2.0, -3.0, 8.0], "yaw_deg": 40.0,
+}  # fmt: skip
+
+
+def orbits(*phases: Data, **changes: Any) -> Mission:
+    """The triangle by tracked slots, and then the phases given."""
+    return a_mission(establish(control="tracking"), *phases, **changes)
+
+
+def tracked(result: Result) -> np.ndarray:
+    """Reference of the CM, its velocity, and its acceleration without control's part (K, 9)."""
+    asked = result.input_force.sum(axis=1) / sum(result.mission.agents.mass) - [0.0, 0.0, 9.81]
+    return np.hstack([result.cm_reference, result.cm_velocity_reference, asked])
+
+
+@pytest.mark.parametrize("architecture", ["local", "body"])
+@pytest.mark.parametrize("changes", [{}, {"rate_deg_s": -25.0, "yaw": "along"}])
+def test_an_orbit_keeps_its_radius_and_rate(architecture, changes):
+    """After the run-in the reference stays on the circle, at its rate; what is flown passes check and verdict."""
+    asked = ORBIT | changes
+    mission = orbits(PASSING, asked, architecture=architecture)
+    found, result = preflight.check(mission), simulate(mission)
+    assert found.passed, found.remarks
+    verdict = assess(result)
+    assert verdict.passed, verdict.summary
+    rows = result.samples(2)
+    on = slice(rows.start + int(np.searchsorted(result.time[rows], 18.0)), rows.stop)
+    away, v = result.cm_reference[on] - asked["centre"], result.cm_velocity_reference[on]
+    np.testing.assert_allclose(np.hypot(*away[:, :2].T), 10.0, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(away[:, 2], 0.0, atol=1e-12)
+    rate = np.deg2rad(asked["rate_deg_s"])
+    np.testing.assert_allclose(v, np.cross([0.0, 0.0, rate], away), rtol=0, atol=1e-7)
+    turning = rate if "yaw" in changes else 0.0
+    np.testing.assert_allclose(
+        result.rates[on], np.tile([0.0, 0.0, turning], (len(v), 1)), atol=1e-4
+    )
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "smooth"),
+    [
+        pytest.param(PASSING, ORBIT | {"yaw": "along"}, False, id="from a waypoint in motion"),
+        pytest.param(ORBIT, {"kind": "hold", "duration": 8.0}, False, id="to rest"),
+        pytest.param(
+            ORBIT, ORBIT | {"radius": 6.0, "rate_deg_s": -30.0}, True, id="to another orbit"
+        ),
+    ],
+)
+def test_an_orbit_begins_and_ends_without_a_jump(before, after, smooth):
+    """Place, velocity and attitude of the reference go on at a switch, and from orbit to orbit the acceleration."""
+    result = simulate(orbits(before, after))
+    last_before, first = result.samples(1).stop - 1, result.samples(2).start
+    jump = np.abs(np.diff(tracked(result)[[last_before, first]], axis=0)[0])
+    np.testing.assert_allclose(jump[:6], 0.0, atol=1e-9)
+    if smooth:
+        np.testing.assert_allclose(jump[6:], 0.0, atol=1e-6)
+    turned = attitude.angle_between(*result.attitude_reference[[last_before, first]])
+    assert turned == pytest.approx(0.0, abs=1e-7)
+    v, step = result.cm_velocity_reference[first:], result.time[first + 1] - result.time[first]
+    moved = np.diff(result.cm_reference[first:], axis=0) / step
+    np.testing.assert_allclose(moved[:-1], 0.5 * (v[1:] + v[:-1])[:-1], atol=0.02)
+
+
+def test_an_orbit_that_begins_at_its_centre_spirals_out():
+    """The run-in is smooth from the centre, too, where no angle is told: no agent needs a large thrust."""
+    centre = orbits().agents.position
+    middle = np.mean(centre, axis=0).tolist()
+    mission = orbits(ORBIT | {"centre": middle, "blend": 6.0})
+    assert assess(result := simulate(mission)).passed
+    assert np.max(result.thrust) < 1.5 * 9.81
+
+
+def test_a_check_sees_where_an_orbit_leads():
+    """It finds the box that an orbit meets, and the thrust that a fast one asks for."""
+    box = {"kind": "box", "min": [19.0, 14.0, 9.0], "max": [21.0, 16.0, 11.0]}
+    assert preflight.check(orbits(ORBIT)).passed
+    met = preflight.check(orbits(ORBIT, obstacles=[box]))
+    assert not met.passed
+    agents = {"mass": 1.0, "position": [[1, 6, 3], [8, 3, 3], [7, 6, 3]], "thrust_limit": 15.0}
+    fast = preflight.check(orbits(ORBIT | {"rate_deg_s": 80.0}, agents=agents))
+    assert {remark.topic for remark in fast.remarks if remark.level == "fails"} == {"thrust"}
+    assert fast.thrust is not None
+    assert fast.thrust[0] >= np.hypot(9.81, 10.0 * np.deg2rad(80.0) ** 2) * 0.99
+
+
+def test_an_orbit_may_begin_by_hand():
+    """It begins in place of the mission's next phase, and is recorded with the end that it had."""
+    flight = Flight(orbits())
+    assert flight.begin()
+    assert not flight.advance()
+    assert flight.begin(ORBIT)
+    assert flight.advance(3.0)
+    result = flight.finish()
+    assert [p.kind for p in result.phases] == ["establish", "orbit"]
+    assert result.mission.phases[1].least_time == pytest.approx(3.0)

@@ -1,7 +1,6 @@
 """Large formations: elimination, the vertex graph and the dense factor solve the same law."""
 
 from functools import partial
-from importlib import import_module
 
 import numpy as np
 import pytest
@@ -347,9 +346,7 @@ def test_velocities_are_held_to_what_places_are():
 def test_large_formations_do_not_creep_into_a_phase(monkeypatch):
     """Their first step is found from two evaluations: fewer steps, and the same flight."""
     found = simulate(flight("exact", "henneberg"))
-    monkeypatch.setattr(
-        import_module("rigidfleet.simulation.flight"), "_first_step", lambda *_: 1e-3
-    )
+    monkeypatch.setattr("rigidfleet.simulation.active_phase.first_step", lambda *_: 1e-3)
     crept = simulate(flight("exact", "henneberg"))
     assert found.statistics["steps"] <= crept.statistics["steps"] - 2
     assert found.statistics["rejected"] <= crept.statistics["rejected"]

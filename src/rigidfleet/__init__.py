@@ -30,7 +30,13 @@ if TYPE_CHECKING:
     from rigidfleet.result import Result
     from rigidfleet.rigidity.design import design
     from rigidfleet.simulation.ensemble import Ensemble, establish
-    from rigidfleet.simulation.flight import FlightInterrupted, Observation, Progress, simulate
+    from rigidfleet.simulation.flight import (
+        Flight,
+        FlightInterrupted,
+        Observation,
+        Progress,
+        simulate,
+    )
     from rigidfleet.sweep import Sweep
     from rigidfleet.web.live import live
     from rigidfleet.web.replay import replay

@@ -13,15 +13,10 @@ from numpy.typing import ArrayLike
 
 from rigidfleet.kernel import constraint, references, rigid_body
 from rigidfleet.kernel.problem import (
-    EXACT,
-    ITERATED,
-    PINV,
-    PINV_EQUAL,
-    PINV_INERTIA,
-    PINV_INERTIA_FORCE,
     RIGID,
     SHAPE,
-    SPECTRAL,
+    SOLVERS,
+    SPLITS,
     SQUARED,
     ConstraintLaw,
     Reference,
@@ -32,9 +27,6 @@ from rigidfleet.kernel.problem import graph as kernel_graph
 from rigidfleet.math.rigid_body import about_cm
 from rigidfleet.planning.reference import align_slots
 from rigidfleet.typing import Floats, Ints
-
-_SOLVERS = {"iterated": ITERATED, "spectral": SPECTRAL, "exact": EXACT, "pinv": PINV}
-_SPLITS = {"equal": PINV_EQUAL, "inertia": PINV_INERTIA, "inertia+force": PINV_INERTIA_FORCE}
 
 
 class ConstraintForce(NamedTuple):
@@ -88,13 +80,13 @@ def constraint_force(
     n = len(m)
     graph = kernel_graph(_edges(edges, n), m)
     e = len(graph.edges)
-    if solver not in _SOLVERS:
-        raise ValueError(f"unknown solver {solver!r}; choose one of {', '.join(_SOLVERS)}")
+    if solver not in SOLVERS:
+        raise ValueError(f"unknown solver {solver!r}; choose one of {', '.join(SOLVERS)}")
     w = workspace(n, e)
     w.d[:], w.d_dot[:], w.d_ddot[:] = d, d_dot, d_ddot
     v, f = _full(v, (n, 3), "v"), _full(f_E, (n, 3), "f_E")
     law = ConstraintLaw(
-        float(alpha), float(beta), float(gamma), _SOLVERS[solver], float(damping), int(iterations),
+        float(alpha), float(beta), float(gamma), SOLVERS[solver], float(damping), int(iterations),
         float(threshold), float(cutoff), 0.0,
     )  # fmt: skip
     a = np.ascontiguousarray(f / m[:, None])
@@ -132,10 +124,10 @@ def allocate(
     """
     m, x = _masses_and_points(masses, x)
     x = np.ascontiguousarray(about_cm(x, m))
-    if method not in {"rigid", "pinv"} or torque_split not in _SPLITS:
+    if method not in {"rigid", "pinv"} or torque_split not in SPLITS:
         raise ValueError(
             f"unknown allocation {method!r} with {torque_split!r}; method is 'rigid' or 'pinv',"
-            f" torque_split one of {', '.join(_SPLITS)}"
+            f" torque_split one of {', '.join(SPLITS)}"
         )
     n = len(m)
     w = workspace(n, 0, with_h=method == "pinv")
@@ -144,7 +136,7 @@ def allocate(
     f = np.zeros((n, 3))
     rigid_body.allocate(
         x, m, m.sum(), _full(F, (3,), "F"), _full(tau, (3,), "tau"), _full(omega, (3,), "omega"),
-        RIGID if method == "rigid" else _SPLITS[torque_split], w.I, w.I_inv, f, w.H, w.H_V, w.H_w,
+        RIGID if method == "rigid" else SPLITS[torque_split], w.I, w.I_inv, f, w.H, w.H_V, w.H_w,
     )  # fmt: skip
     return f
 

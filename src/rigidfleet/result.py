@@ -12,9 +12,7 @@ from __future__ import annotations
 import io
 import json
 import math
-import os
 import platform
-import secrets
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from datetime import UTC, datetime
@@ -42,7 +40,7 @@ from rigidfleet.typing import Bools, Floats, Ints
 
 if TYPE_CHECKING:
     from rigidfleet.mission import Mission
-
+from rigidfleet._files import why_not, write_file
 
 #: Version of the file format; files of any other are refused.
 SCHEMA_VERSION = 3
@@ -125,9 +123,9 @@ class PhaseRecord:
     formation : name of the formation held or approached, None if there is none yet
     t_start, t_end : mission time [s]
     settled : for a phase that ends by settling: whether it did; None for one that ends at a time
-    target : for fly and turn, and for an establishment in an attitude that is not free: {"time" [s], "position" [m],
-        "velocity" [m/s], "attitude" quaternion, "rates" [rad/s]},
-        each but the time None where nothing is asked
+    target : for phases that lead to a goal of their own, and for an establishment in an attitude that is not free:
+        {"time" [s], "position" [m], "velocity" [m/s], "attitude" quaternion, "rates" [rad/s]}, each but the time None
+        where nothing is asked
     extremes : worst values of the phase in continuous time, by name: separation, clearance, separation_below, lost (a
         lost vehicle to one that is left), geofence (beyond it), lowest, highest [m]; speed [m/s]; acceleration [m/s^2];
         thrust, thrust_margin (thrust less its limit), constraint_force, tension [N]; constraint [m]. In the phases
@@ -137,7 +135,7 @@ class PhaseRecord:
     """
 
     name: str
-    kind: Literal["establish", "fly", "reshape", "turn", "hold"]
+    kind: str
     control: Literal["open", "tracking", "body"]
     formation: str | None
     t_start: float
@@ -408,6 +406,8 @@ class Result:
 
     def _foreign(self, mission: Mission) -> str:
         """What of the arrays is not of a mission; "" if nothing is."""
+        from rigidfleet.mission import KINDS
+
         if mission.n_agents != self.n_agents:
             return f"it has {mission.n_agents} agents, the arrays have {self.n_agents}"
         if not np.array_equal(mission.edges, self.edges):
@@ -420,6 +420,8 @@ class Result:
             obstacles
         ):
             return "it has fewer obstacles than the arrays name"
+        if unknown := {p.kind for p in self.phases} - {*KINDS}:
+            return f"there are no phases of kind {min(map(repr, unknown))}"
         unknown = {p.formation for p in self.phases} - {None, *mission.formations}
         return f"it has no formation {min(map(repr, unknown))}" if unknown else ""
 
@@ -561,20 +563,33 @@ _FIELDS = [
     Parameter("self", Parameter.POSITIONAL_ONLY),
     Parameter("fields", Parameter.VAR_KEYWORD),
 ]
+
+
 vars(Result.__init__)["__signature__"] = Signature(_FIELDS)
 
+
 _HINTS = get_type_hints(Result, include_extras=True)
+
+
 #: Dimensions, unit and meaning of each array of a result.
 VARIABLES: dict[str, Variable] = {
     f.name: _HINTS[f.name].__metadata__[0]
     for f in fields(Result)
     if hasattr(_HINTS[f.name], "__metadata__")
 }
+
+
 #: Those that a flight need not have.
 _OPTIONAL = {f.name for f in fields(Result) if f.name in VARIABLES and f.default is None}
+
+
 _INTEGERS = {name for name in VARIABLES if _HINTS[name].__origin__ == Ints}
+
+
 #: Quantities whose least value is the worst; of clearances, too.
 _LEAST = frozenset(("separation", "separation_below", "lost", "lowest"))
+
+
 #: Attributes of a file, and what each is: a number, text, or JSON of a type.
 _ATTRIBUTES: dict[str, Any] = {
     "mission_text": str,
@@ -586,8 +601,12 @@ _ATTRIBUTES: dict[str, Any] = {
     "platform": str,
     "created": str,
 }
+
+
 #: Attribute by which a file is known as a result.
 _MARK = "rigidfleet_schema_version"
+
+
 #: Bytes of a chunk at most: as much as HDF5's cache holds.
 _CHUNK = 1 << 20
 
@@ -638,40 +657,6 @@ def _one_line(error: BaseException) -> str:
     return " ".join(str(error).split()) or type(error).__name__
 
 
-# -- files -------------------------------------------------------------------------------------------
-
-
-def write_file(path: Path, data: bytes) -> None:
-    """Write a file whole or not at all: beside its place first, then into it in one step."""
-    target = Path(os.path.realpath(path))  # through a symbolic link, not in place of it
-    part = target.with_name(f".{target.name[:200]}.{secrets.token_hex(4)}.part")
-    try:
-        if target.is_dir():
-            raise IsADirectoryError
-        try:
-            with open(part, "xb") as file:
-                file.write(data)
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(part, target)
-        except BaseException:
-            part.unlink(missing_ok=True)
-            raise
-    except OSError as error:
-        raise ResultError(f"{path}: {_why_not(error, 'written', path)}") from error
-
-
-def _why_not(error: OSError, done: str, path: Path) -> str:
-    match error:
-        case IsADirectoryError():
-            return "is a folder. Name a file."
-        case FileNotFoundError() | NotADirectoryError():
-            return f"cannot be {done}: there is no folder {path.parent}. Make it first."
-        case PermissionError():
-            return f"may not be {done} by you. Choose another folder, or ask for permission."
-    return f"cannot be {done}: {error.strerror or error}. Choose another place."
-
-
 def _read(path: Path) -> bytes:
     try:
         data = path.read_bytes()
@@ -680,7 +665,7 @@ def _read(path: Path) -> bytes:
     except IsADirectoryError as error:
         raise ResultError(f"{path}: is a folder. Name the result file in it.") from error
     except OSError as error:
-        raise ResultError(f"{path}: {_why_not(error, 'read', path)}") from error
+        raise ResultError(f"{path}: {why_not(error, 'read', path)}") from error
     if not data.startswith(b"\x89HDF\r\n\x1a\n"):
         what = "is empty" if not data else "is not a netCDF-4 file"
         raise ResultError(f"{path}: {what}. Name a result of `rigidfleet run`.")

@@ -19,6 +19,7 @@ from rigidfleet.assessment.outcome import (
     value,
 )
 from rigidfleet.assessment.verdict import Verdict
+from rigidfleet.mission import KINDS
 from rigidfleet.result import Result
 from rigidfleet.typing import Floats
 
@@ -103,7 +104,7 @@ def _unseen(measured: Measurements) -> Iterator[CheckResult]:
         if not result.complete and i == last:
             continue
         moments = {"waypoint": p.target["time"] if p.target is not None else None}
-        if p.kind in ("establish", "reshape") or i == last:
+        if KINDS[p.kind].shapes or i == last:
             moments["end"] = p.t_end
         for what, t in moments.items():
             if t is None:
@@ -131,7 +132,7 @@ def _settled(phases: list[PhaseVerdict]) -> Iterator[CheckResult]:
 def _shapes(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[CheckResult]:
     """Whether formations are what they should be, where they should be by then."""
     for i, p in enumerate(phases):
-        shaping = p.kind in ("establish", "reshape") or i == len(phases) - 1
+        shaping = KINDS[p.kind].shapes or i == len(phases) - 1
         if not (shaping and p.finished) or p.formation is None:
             continue
         last = measured.samples[i].stop - 1

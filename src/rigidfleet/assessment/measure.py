@@ -282,7 +282,7 @@ class Measurements:
 
     def nearest_to_limit(self) -> Extreme | None:
         """Thrust less its limit [N], of the agent that comes nearest to its own, or furthest beyond."""
-        most = np.array(self.mission.agents.thrust_limit)
+        most = self.mission.fleet.thrust_limit
         return self.worst("thrust_margin", self.extreme(self.thrust - most, self.agent))
 
     def clearances(self) -> dict[str, Extreme | None]:
@@ -323,7 +323,7 @@ class Measurements:
 
     def fallen_on(self) -> Extreme | None:
         """Least room [m] between a lost agent and one that is left; None if none is lost."""
-        r, radius = self.result.position, np.array(self.mission.agents.radius)
+        r, radius = self.result.position, self.mission.fleet.radius
         least, who = np.full(len(r), np.nan), np.zeros((len(r), 2), dtype=np.int64)
         for i in np.flatnonzero(~self.left[-1]):
             room = np.linalg.norm(r - r[:, [i]], axis=2) - radius - radius[i]

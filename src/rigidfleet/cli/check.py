@@ -39,7 +39,7 @@ def check(
     json : bool
         Print what was found as JSON.
     """
-    from rigidfleet.mission import counted, ending, goal, load_mission
+    from rigidfleet.mission import ending, goal, load_mission
 
     watch = console.CheckWatch(mission)
     try:
@@ -69,7 +69,7 @@ def check(
     table = console.table("#", "phase", "kind", "to", "ends", "control")
     for n, phase in enumerate(found.phases, start=1):
         table.add_row(str(n), phase.name, phase.kind, goal(phase), ending(phase), phase.control)
-    console.out().print(f"{found.name}: right: {counted(found)}")
+    console.out().print(f"{found.name}: right: {found.size_in_words}")
     console.print_table(table)
     console.out().print()
     console.print_words(ahead.describe())

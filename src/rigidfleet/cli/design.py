@@ -67,8 +67,8 @@ def design(
     json : bool
         Print all of it as JSON.
     """
+    from rigidfleet._files import write_file
     from rigidfleet.formation.graphs import CUBE_EDGES, REACH, complete_graph
-    from rigidfleet.result import write_file
     from rigidfleet.rigidity import design as designs
 
     if out is not None and out.exists() and not force:

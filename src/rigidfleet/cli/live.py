@@ -45,8 +45,8 @@ def live(
     flown = load_mission(mission)
     if not is_compiled():
         console.err().print(console.COMPILING)
+    from rigidfleet._files import write_file
     from rigidfleet.assessment import assess
-    from rigidfleet.result import write_file
     from rigidfleet.web.live import live as fly
 
     place = Files(out or Path("flights", f"{flown.name.removesuffix('-live')}-live"), "")

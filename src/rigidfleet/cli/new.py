@@ -61,9 +61,9 @@ def new(
     json : bool
         Print what was written as JSON. Ask nothing.
     """
-    from rigidfleet.mission import Mission, counted, draft
+    from rigidfleet._files import write_file
+    from rigidfleet.mission import Mission, draft
     from rigidfleet.preflight.check import check as preflight
-    from rigidfleet.result import write_file
 
     given: dict[str, Any] = {
         "shape": shape, "agents": agents, "size": size, "mass": mass,
@@ -90,7 +90,7 @@ def new(
     if json:
         console.print_json({"file": str(file)} | facts(mission))
     elif not quiet:
-        console.out().print(f"{file}: {counted(mission)}", soft_wrap=True)
+        console.out().print(f"{file}: {mission.size_in_words}", soft_wrap=True)
         console.out().print(f"Fly it by: rigidfleet run {file}", soft_wrap=True)
     return PASSED
 

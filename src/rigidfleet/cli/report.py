@@ -54,8 +54,9 @@ def report(
     quiet : bool
         Print nothing but errors, and the JSON if asked for.
     """
+    from rigidfleet._files import write_file
     from rigidfleet.assessment import assess
-    from rigidfleet.result import Result, write_file
+    from rigidfleet.result import Result
 
     paths = [result, *others]
     records = [Result.load(path) for path in paths]

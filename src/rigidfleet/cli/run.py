@@ -75,8 +75,8 @@ def run(
     with watch or nullcontext():
         result, interrupted = fly(flown, watch)
 
+    from rigidfleet._files import write_file
     from rigidfleet.assessment import assess
-    from rigidfleet.result import write_file
 
     files.make_folder()
     result.save(files.result)

@@ -20,6 +20,9 @@ CONSTANT, SQUARED, SHAPE = range(3)
 OPEN, TRACKING, BODY = range(3)
 # Allocation of a wrench (`Control.allocation`), the last three with the paper's H.
 RIGID, PINV_EQUAL, PINV_INERTIA, PINV_INERTIA_FORCE = range(4)
+#: Their names in missions: solvers, and splits of the torque.
+SOLVERS = {"iterated": ITERATED, "spectral": SPECTRAL, "exact": EXACT, "pinv": PINV}
+SPLITS = {"equal": PINV_EQUAL, "inertia": PINV_INERTIA, "inertia+force": PINV_INERTIA_FORCE}
 
 
 class Vehicles(NamedTuple):

@@ -16,6 +16,7 @@ from rigidfleet.mission.model import (
     mission_text,
 )
 from rigidfleet.mission.schema import (
+    KINDS,
     Box,
     Disturbances,
     Establish,
@@ -36,6 +37,7 @@ from rigidfleet.mission.schema import (
 )
 
 __all__ = [
+    "KINDS",
     "Box",
     "Disturbances",
     "Establish",

@@ -3,45 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
-from rigidfleet.mission.schema import Establish, Fly, Hold, Phase, Reshape, Steering
-
-if TYPE_CHECKING:
-    from rigidfleet.mission.model import Mission
+from rigidfleet.mission.phases import latest_end
+from rigidfleet.mission.schema import Phase
 
 
-def counted(mission: Mission) -> str:
+def counted(agents: int, formations: int, phases: Sequence[Phase]) -> str:
     """How much of everything a mission has: 3 agents, 2 formations, 12 phases, 90 s."""
-    parts = [
-        (mission.n_agents, "agent"),
-        (len(mission.formations), "formation"),
-        (len(mission.phases), "phase"),
-    ]
-    most = "at most " if any(phase.settle for phase in mission.phases) else ""
+    parts = [(agents, "agent"), (formations, "formation"), (len(phases), "phase")]
+    most = "at most " if any(phase.settle for phase in phases) else ""
     words = [f"{n} {thing}{'s' * (n != 1)}" for n, thing in parts]
-    return ", ".join([*words, f"{most}{mission.latest_end:g} s"])
+    return ", ".join([*words, f"{most}{latest_end(phases):g} s"])
 
 
 def goal(phase: Phase) -> str:
     """What a phase leads to; "" for a hold."""
-    if isinstance(phase, Hold):
-        return ""
-    if isinstance(phase, Reshape):
-        return phase.formation
-    parts = []
-    if isinstance(phase, Establish):
-        parts.append(phase.formation)
-    if isinstance(phase, Fly):
-        parts.append(_vector(phase.position, "m"))
-        if any(phase.velocity):
-            parts.append(_vector(phase.velocity, "m/s"))
-    if phase.attitude_deg is not None:
-        angles = zip(("roll", "pitch", "yaw"), phase.attitude_deg, strict=True)
-        parts += [f"{name} {angle:g}°" for name, angle in angles if angle or name == "yaw"]
-    if isinstance(phase, Steering) and any(phase.rates_deg_s):
-        parts.append(_vector(phase.rates_deg_s, "°/s"))
-    return ", ".join(parts)
+    return phase.leads_to
 
 
 def ending(phase: Phase) -> str:
@@ -49,7 +26,3 @@ def ending(phase: Phase) -> str:
     if phase.settle is not None:
         return f"settled, within {phase.settle.timeout:g} s"
     return f"at {phase.until:g} s" if phase.until is not None else f"after {phase.duration:g} s"
-
-
-def _vector(values: Sequence[float], unit: str) -> str:
-    return f"({', '.join(f'{value:g}' for value in values)}) {unit}"

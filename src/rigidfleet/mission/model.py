@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from functools import cached_property
 from importlib import resources
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from pydantic import PrivateAttr
@@ -28,9 +28,7 @@ from rigidfleet.mission.schema import (
     Contents,
     Establish,
     Phase,
-    Reshape,
     Start,
-    Steering,
 )
 from rigidfleet.typing import Bools, Floats, Ints
 
@@ -39,6 +37,16 @@ _SHIPPED = resources.files("rigidfleet") / "missions"
 _DAMPING = (1e-5, 0.03)
 #: Beyond so many equations eigenvalues take too long; the greatest damping is taken.
 _DENSE = 1000
+
+
+class Fleet(NamedTuple):
+    """What all vehicles start from and can bear: read-only arrays, made once."""
+
+    mass: Floats  # (N,) as the laws believe [kg]
+    position: Floats  # (N, 3) at the start [m]
+    velocity: Floats  # (N, 3) at the start [m/s]
+    radius: Floats  # (N,) [m]
+    thrust_limit: Floats  # (N,) [N], infinite where unlimited
 
 
 class Mission(Contents):
@@ -85,8 +93,13 @@ class Mission(Contents):
             raise _unread(origin, "is nested without end", "use the keys of a mission") from None
         return cls.from_toml(text, origin)
 
+    @property
+    def size_in_words(self) -> str:
+        """How much of everything there is: 3 agents, 2 formations, 12 phases, 90 s."""
+        return counted(self.n_agents, len(self.formations), self.phases)
+
     def __repr__(self) -> str:
-        return f"<Mission {self.name}: {counted(self)}>"
+        return f"<Mission {self.name}: {self.size_in_words}>"
 
     __str__ = __repr__
 
@@ -100,7 +113,7 @@ class Mission(Contents):
             for n, phase in enumerate(self.phases, start=1)
         ]
         heads = ("#", "phase", "kind", "to", "ends", "control")
-        return _markup.shown(self.name, self.title, heads, rows, counted(self))
+        return _markup.shown(self.name, self.title, heads, rows, self.size_in_words)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data as it was written: change it, and check it again by `Mission.from_dict`."""
@@ -160,39 +173,42 @@ class Mission(Contents):
         known = True  # where agents are to each other, which distances alone do not tell
         asked: Floats | None = None  # attitude asked for by name
         lies: Floats | None = self.drawn_attitude  # that of the axes of `places`, where it is known
-        places = np.array(self.agents.position) @ self.drawn_attitude.T
+        places = self.fleet.position @ self.drawn_attitude.T
         flown: set[str] = set()
         for p in self.phases:
-            if isinstance(p, Steering) and (angles := p.attitude_deg) is not None:
+            if p.moves and (angles := p.attitude_deg) is not None:
                 lies = asked = dcm_from_euler(np.deg2rad(angles))
-            if not isinstance(p, Establish | Reshape):
+            if p.turns_away:
+                lies = asked = None
+            if (shaping := p.shaping) is None:
                 continue
+            name = shaping.formation
             axes: Floats | None = np.eye(3)  # of this formation, in those of the one before
             if self.free_attitude(p):
                 axes = lies = None
                 asked = None if p.control == "tracking" else asked
-            elif isinstance(p, Establish):
-                asked = self.establish_attitude(p, asked)
+            elif (establishing := p.establishing) is not None:
+                asked = self.establish_attitude(establishing, asked)
                 axes = None if lies is None else lies @ asked.T
                 lies = asked
-            slots = self._slots(p.formation)
+            slots = self._slots(name)
             if slots is None:
                 known = False
-            elif p.formation not in flown:
+            elif name not in flown:
                 radius = self.agents.radius if self.assignment == "safe" else None
                 order, turn = assigned(places, slots, turn=axes, radius=radius)
                 if self.assignment != "each":
-                    return dict.fromkeys(self.formations, order), {(before, p.formation): turn}
-                orders[p.formation] = order
+                    return dict.fromkeys(self.formations, order), {(before, name): turn}
+                orders[name] = order
                 if known:
-                    turns.setdefault((before, p.formation), turn)
-                    turns.setdefault((p.formation, before), turn.T)  # as long as the way there
+                    turns.setdefault((before, name), turn)
+                    turns.setdefault((name, before), turn.T)  # as long as the way there
             if slots is not None:
-                places, known = slots[orders[p.formation]], True
+                places, known = slots[orders[name]], True
             if self.assignment != "each":
                 break
-            flown.add(p.formation)
-            before = p.formation
+            flown.add(name)
+            before = name
         return orders, turns
 
     @cached_property
@@ -221,11 +237,12 @@ class Mission(Contents):
         Forces between agents do not. Slots do, unless the phase asks for that by name, or what is established is given
         by distances alone, which have no axes.
         """
-        if phase.control != "tracking" or not isinstance(phase, Establish):
+        taken = phase.establishing
+        if phase.control != "tracking" or taken is None:
             return phase.control != "tracking"
-        if phase.attitude_deg is not None:
+        if taken.attitude_deg is not None:
             return False
-        return phase.attitude == "free" or not self.formations[phase.formation].knows_slots
+        return taken.attitude == "free" or not self.formations[taken.formation].knows_slots
 
     def _slots(self, name: str) -> Floats | None:
         """Slots (N, 3) [m] of a formation in their own order; made once."""
@@ -277,7 +294,7 @@ class Mission(Contents):
         edges = (np.cumsum(left) - 1)[edges[left[edges].all(axis=1)]]
         if not len(edges) or min(len(edges), 3 * int(left.sum())) > _DENSE:
             return _DAMPING[1]
-        masses = np.array(self.agents.mass)[left]
+        masses = self.fleet.mass[left]
         index = constraint_jacobian.smallest_singular_value(slots[left][None], edges, masses)[0]
         return float(np.clip(index**2 / 4, *_DAMPING))
 
@@ -287,10 +304,20 @@ class Mission(Contents):
         return latest_end(self.phases)
 
     @cached_property
+    def fleet(self) -> Fleet:
+        """The vehicles as arrays."""
+        fleet = Fleet(
+            *(np.array(getattr(self.agents, name), dtype=float) for name in Fleet._fields)
+        )
+        for values in fleet:
+            values.flags.writeable = False
+        return fleet
+
+    @cached_property
     def true_mass(self) -> Floats:
         """Mass (N,) [kg] that each vehicle has: `agents.mass` is what the laws believe."""
         error = self.disturbances.mass_error if self.disturbances is not None else 0.0
-        return np.array(self.agents.mass) * (1.0 + np.array(error))
+        return self.fleet.mass * (1.0 + np.array(error))
 
     @cached_property
     def drag(self) -> Floats:
@@ -299,7 +326,7 @@ class Mission(Contents):
         if d is None or (d.drag is None and not any(d.wind) and d.gusts is None):
             return np.zeros(self.n_agents)
         if d.drag is None:
-            return DRAG * np.array(self.agents.mass)
+            return DRAG * self.fleet.mass
         return np.broadcast_to(np.array(d.drag, dtype=np.float64), self.n_agents).copy()
 
     @cached_property

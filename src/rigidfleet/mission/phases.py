@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,33 +10,27 @@ import numpy as np
 from rigidfleet._toml import toml_key
 from rigidfleet.formation import distance_geometry
 from rigidfleet.math import rigid_body
+from rigidfleet.mission import bounds
 from rigidfleet.mission.findings import FindingCollector, Keys, near
 from rigidfleet.mission.formations import agents as agents_text
 from rigidfleet.mission.formations import sound
 from rigidfleet.mission.schema import (
     ANGLES,
+    KINDS,
     Agents,
     AnyPhase,
     Establish,
-    Fly,
     Formation,
-    Hold,
     Lqr,
-    Reshape,
+    Orbit,
     Shaping,
-    Steering,
     Turn,
 )
 
-_KINDS: dict[str, type[AnyPhase]] = {
-    "establish": Establish,
-    "fly": Fly,
-    "reshape": Reshape,
-    "turn": Turn,
-    "hold": Hold,
-}
 _ENDINGS = ("until", "duration", "settle")
 _MOST_SAMPLES = 1_000_000
+#: Turns of an orbit at most: beyond, the samples of a preview would miss its circle.
+_MOST_TURNS = 100
 #: Numbers in a result at most: 4 GB of them.
 _MOST_NUMBERS = 5e8
 
@@ -45,9 +39,9 @@ def check(notes: FindingCollector, parts: Mapping[str, Any], n: int | None) -> t
     """The phases; those with findings are among them."""
     found = _phases(notes)
     _names(notes, found)
-    end = _times(notes, found)
+    end, lengths = _times(notes, found)
     _samples(notes, parts, end, n)
-    _controls(notes, found)
+    _controls(notes, found, lengths)
     _formations(notes, found, parts, n)
     _arrivals(notes, found, parts.get("lqr", Lqr()))
     return tuple(p for p in found if p is not None)
@@ -90,11 +84,11 @@ def _phases(notes: FindingCollector) -> list[AnyPhase | None]:
     body = notes.data.get("architecture") == "body"
     found: list[AnyPhase | None] = []
     for k, data in enumerate(tables(notes, "phases")):
-        model = kind(notes, data, ("phases", k), _KINDS)
+        model = kind(notes, data, ("phases", k), KINDS)
         if model is None:
             found.append(None)
             continue
-        control = "tracking" if not body else "open" if model is Establish else "body"
+        control = model.body_control if body else "tracking"
         given = {"name": f"{data['kind']} {k + 1}", "control": control} | data
         found.append(notes.validate(model, given, ("phases", k)))
     if not found and notes.right((), "phases"):
@@ -111,8 +105,11 @@ def _names(notes: FindingCollector, found: Sequence[AnyPhase | None]) -> None:
             notes.add(("phases", k, "name"), problem, "give each phase its own", p.name)
 
 
-def _times(notes: FindingCollector, found: Sequence[AnyPhase | None]) -> float | None:
-    """One ending each, in order of time. The latest end [s], None if it cannot be told."""
+def _times(
+    notes: FindingCollector, found: Sequence[AnyPhase | None]
+) -> tuple[float | None, list[float | None]]:
+    """One ending each, in order of time. The latest end and greatest lengths [s], None if they cannot be told."""
+    lengths: list[float | None] = [None] * len(found)
     first: float | None = 0.0  # earliest and latest start of the phase; None where unknown
     last: float | None = 0.0
     for k, p in enumerate(found):
@@ -143,12 +140,14 @@ def _times(notes: FindingCollector, found: Sequence[AnyPhase | None]) -> float |
             shortest = p.settle.dwell if p.settle is not None else p.duration
             first = first + (shortest or 0.0) if first is not None else None
             last = last + (longest or 0.0) if last is not None else None
-        if isinstance(p, Shaping):
-            _blend(notes, p, longest, path)
-        elif isinstance(p, Steering) and p.travel and p.travel > (longest or p.travel) * (1 + 1e-9):
+        lengths[k] = longest
+        travel = p.steering.travel if p.steering is not None else None
+        if p.shaping is not None:
+            _blend(notes, p.shaping, longest, path)
+        elif travel and travel > (longest or travel) * (1 + 1e-9):
             problem = f"the phase ends before, after {longest:g} s"
-            notes.add((*path, "travel"), problem, "arrive earlier, or end it later", p.travel)
-    return last
+            notes.add((*path, "travel"), problem, "arrive earlier, or end it later", travel)
+    return last, lengths
 
 
 def _in_order(notes: FindingCollector, until: float, first: float, last: float, path: Keys) -> None:
@@ -171,9 +170,14 @@ def _blend(notes: FindingCollector, p: Shaping, longest: float | None, path: Key
         if "blend" in p.model_fields_set:
             remedy = "remove it, or use reference = 'shape' or 'distances'"
             notes.add((*path, "blend"), "a step has no blend", remedy)
-    elif longest is not None and p.blend > longest * (1 + 1e-9):
+    else:
+        _blended(notes, p.blend, longest, path)
+
+
+def _blended(notes: FindingCollector, blend: float, longest: float | None, path: Keys) -> None:
+    if longest is not None and blend > longest * (1 + 1e-9):
         problem = f"the phase lasts {longest:g} s, less than its blend"
-        notes.add((*path, "blend"), problem, f"use blend <= {longest:g}, or end it later", p.blend)
+        notes.add((*path, "blend"), problem, f"use blend <= {longest:g}, or end it later", blend)
 
 
 def _samples(
@@ -211,7 +215,12 @@ def _samples(
         notes.add(("output_step",), problem, remedy, step)
 
 
-def _controls(notes: FindingCollector, found: Sequence[AnyPhase | None]) -> None:
+def _controls(
+    notes: FindingCollector,
+    found: Sequence[AnyPhase | None],
+    lengths: Sequence[float | None],
+) -> None:
+    """Who steers, and what a kind alone asks for."""
     local = notes.data.get("architecture", "local") == "local"
     for k, p in enumerate(found):
         path = ("phases", k)
@@ -220,21 +229,28 @@ def _controls(notes: FindingCollector, found: Sequence[AnyPhase | None]) -> None
         if p.control == "body" and local:
             remedy = "use control = 'tracking', or architecture = 'body' for the mission"
             notes.add((*path, "control"), "the architecture is 'local'", remedy)
-        if p.control == "open" and isinstance(p, Steering):
+        if p.control == "open" and p.moves:
             problem = f"nothing would steer this {notes.data['phases'][k]['kind']} phase"
-            notes.add((*path, "control"), problem, "use control = 'tracking' or 'body'")
+            others = " or 'body'" if p.body_control == "body" else ""
+            notes.add((*path, "control"), problem, f"use control = 'tracking'{others}")
         if p.control != "open" and any(p.input_force):
             problem = f"has no effect with control '{p.control}'"
             notes.add((*path, "input_force"), problem, "remove it, or use control = 'open'")
-        if isinstance(p, Establish) and notes.right(path, "attitude", *ANGLES):
-            _attitude(notes, p, path)
-        if isinstance(p, Turn) and p.attitude_deg is None and notes.right(path, *ANGLES):
-            remedy = f"give {', '.join(reversed(ANGLES))} or some of them"
-            notes.add(path, "turns to no angle", remedy, p.name)
+        if own := _OWN.get(notes.data["phases"][k]["kind"]):
+            own(notes, p, path, lengths[k])
 
 
-def _attitude(notes: FindingCollector, p: Establish, path: Keys) -> None:
+def _turn(notes: FindingCollector, p: Turn, path: Keys, _: float | None) -> None:
+    """A turn leads to an angle."""
+    if p.attitude_deg is None and notes.right(path, *ANGLES):
+        remedy = f"give {', '.join(reversed(ANGLES))} or some of them"
+        notes.add(path, "turns to no angle", remedy, p.name)
+
+
+def _establish(notes: FindingCollector, p: Establish, path: Keys, _: float | None) -> None:
     """An attitude that is asked for is one that is flown."""
+    if not notes.right(path, "attitude", *ANGLES):
+        return
     given = notes.data["phases"][path[1]]
     angles = [key for key in ANGLES if key in given]
     if p.attitude == "free" and angles:
@@ -244,6 +260,37 @@ def _attitude(notes: FindingCollector, p: Establish, path: Keys) -> None:
         problem = f"has no effect with control '{p.control}', which leaves the attitude free"
         remedy = "use control = 'tracking', or remove it and turn the formation in a later phase"
         notes.add((*path, *(angles or ["attitude"])[:1]), problem, remedy)
+
+
+def _orbit(notes: FindingCollector, p: Orbit, path: Keys, longest: float | None) -> None:
+    """A circle is flown by tracked slots, at a rate, and has an end."""
+    if p.control == "body" and notes.right(path, "control"):
+        problem = "a wrench on the virtual body leads to waypoints, not round a circle"
+        notes.add((*path, "control"), problem, "use control = 'tracking'")
+    if p.settle is not None and notes.right(path, *_ENDINGS):
+        notes.add((*path, "settle"), "an orbit never settles", "end it by duration or until")
+    if notes.right(path, "blend", *_ENDINGS):
+        _blended(notes, p.blend, longest, path)
+    if not notes.right(path, "rate_deg_s", "radius"):
+        return
+    rate, where = abs(np.deg2rad(p.rate_deg_s)), (*path, "rate_deg_s")
+    turns = rate * (longest or 0.0) / (2 * np.pi)
+    if rate == 0.0:
+        notes.add(where, "would circle nothing", "give a rate, or use kind = 'fly' or 'hold'")
+    elif p.radius * rate > bounds.SPEED.most or p.radius * rate**2 > bounds.ACCELERATION.most:
+        problem = f"asks for {p.radius * rate:.2g} m/s and {p.radius * rate**2:.2g} m/s^2"
+        notes.add(where, problem, "use a lower rate, or a smaller radius")
+    elif turns > _MOST_TURNS:
+        problem = f"makes {turns:.4g} turns in {longest:g} s, more than {_MOST_TURNS}"
+        notes.add(where, problem, "use a lower rate, or several phases")
+
+
+#: What can be wrong with one kind alone: its phase, where it is, and its greatest length [s] if that is known.
+_OWN: dict[str, Callable[[FindingCollector, Any, Keys, float | None], None]] = {
+    "establish": _establish,
+    "orbit": _orbit,
+    "turn": _turn,
+}
 
 
 def _formations(
@@ -258,12 +305,12 @@ def _formations(
     for k, p in enumerate(found):
         path = ("phases", k)
         if p is None or not notes.right(path, "formation", "reference"):
-            held = None if p is None or isinstance(p, Shaping) else held
+            held = None if p is None or p.shaping is not None else held
             continue
-        if isinstance(p, Shaping):
-            _exists(notes, p.formation, path)
-            form = forms.get(p.formation)
-            if isinstance(p, Reshape) and held == "":
+        if (shaping := p.shaping) is not None:
+            _exists(notes, shaping.formation, path)
+            form = forms.get(shaping.formation)
+            if p.establishing is None and held == "":
                 problem = "there is no formation yet to change from"
                 notes.add((*path, "kind"), problem, "use kind = 'establish' for the first")
             drawn = notes.data["phases"][k].get("attitude") == "drawn"
@@ -273,16 +320,14 @@ def _formations(
                 and not form.knows_slots
                 and notes.right(path, "attitude")
             ):
-                problem = (
-                    f"formation '{p.formation}' has distances alone, which are drawn in no axes"
-                )
+                problem = f"formation '{shaping.formation}' has distances alone, which are drawn in no axes"
                 remedy = "remove it, give the formation slots, or ask for angles by yaw_deg"
                 notes.add((*path, "attitude"), problem, remedy)
-            if n is not None and form is not None and sound(notes, p.formation):
-                _blendable(notes, p, form, n, path)
+            if n is not None and form is not None and sound(notes, shaping.formation):
+                _blendable(notes, shaping, form, n, path)
                 if held == "" and "agents" in parts:
-                    _reachable(notes, p, form, parts["agents"], path)
-            held = p.formation
+                    _reachable(notes, shaping, form, parts["agents"], path)
+            held = shaping.formation
         form = forms.get(held) if held else None
         tracked = p.control == "tracking" and notes.right(path, "control")
         if not tracked or n is None or form is None or not held or not sound(notes, held):
@@ -339,13 +384,14 @@ def _reachable(
 def _arrivals(notes: FindingCollector, found: Sequence[AnyPhase | None], lqr: Lqr) -> None:
     """A finite horizon ends at a time."""
     for k, p in enumerate(found):
-        if not isinstance(p, Steering) or p.settle is None or p.travel is not None:
+        steering = p.steering if p is not None else None
+        if steering is None or steering.settle is None or steering.travel is not None:
             continue
         if not notes.right((), "lqr"):
             continue
         for key, weights, used in (
-            ("lqr", lqr, isinstance(p, Fly)),
-            ("lqr.attitude", lqr.attitude, p.attitude_deg is not None),
+            ("lqr", lqr, "position" in steering.meets),
+            ("lqr.attitude", lqr.attitude, steering.attitude_deg is not None),
         ):
             if used and weights.horizon == "finite":
                 problem = f"the finite horizon of {key} needs a time of arrival"

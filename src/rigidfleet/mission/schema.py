@@ -6,7 +6,8 @@ The descriptions are the documentation of the format: `rigidfleet missions --sch
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, Literal
+from collections.abc import Sequence
+from typing import Annotated, Any, ClassVar, Literal, get_args
 
 import numpy as np
 from pydantic import (
@@ -511,6 +512,15 @@ class Settle(Part):
 class AnyPhase(Part):
     """What every phase has. It ends by exactly one of until, duration and settle."""
 
+    # What a kind is to the rest of the code, which asks for this and not for the kind.
+
+    #: Whether it takes a formation.
+    shapes: ClassVar[bool] = False
+    #: Whether it leads the virtual body to a goal of its own, so that somebody has to steer.
+    moves: ClassVar[bool] = False
+    #: Its control in architecture "body", unless another is given.
+    body_control: ClassVar[str] = "body"
+
     name: str = Field("", description="what to call it, unique; its kind and number when absent")
     until: Time | None = Field(None, description="ending: at this mission time [s]")
     duration: Time | None = Field(None, description="ending: after this long [s]")
@@ -518,13 +528,57 @@ class AnyPhase(Part):
     control: Literal["open", "tracking", "body"] = Field(
         "tracking",
         description="open: weight balance and input_force; tracking: each agent tracks its slot; body: "
-        "wrench on the virtual body. Default tracking; in architecture 'body', open to establish and "
-        "body otherwise",
+        "wrench on the virtual body. Default tracking; in architecture 'body', open to establish, "
+        "tracking to orbit and body otherwise",
     )
     input_force: Force = Field(
         (0.0, 0.0, 0.0),
         description="force on each agent besides the weight balance [N], control 'open' only",
     )
+
+    @property
+    def shaping(self) -> Shaping | None:
+        """The phase, if it takes a formation."""
+        return None
+
+    @property
+    def establishing(self) -> Establish | None:
+        """The phase, if it attaches the body frame to the formation that it takes."""
+        return None
+
+    @property
+    def steering(self) -> Steering | None:
+        """The phase, if the regulators of [lqr] lead it to a goal of its own."""
+        return None
+
+    @property
+    def attitude_deg(self) -> tuple[float, float, float] | None:
+        """Commanded (roll, pitch, yaw) [deg]; None to keep the attitude commanded before."""
+        return None
+
+    @property
+    def meets(self) -> tuple[str, ...]:
+        """Which of position, velocity, attitude and rates the verdict holds it to, at its arrival."""
+        return ()
+
+    @property
+    def turns_away(self) -> bool:
+        """Whether it leaves an attitude that nobody has asked for by name."""
+        return False
+
+    @property
+    def least_time(self) -> float:
+        """How long its own motion takes [s]: it should not end before."""
+        return 0.0
+
+    @property
+    def leads_to(self) -> str:
+        """What it leads to, in words; "" if it stays."""
+        return ""
+
+    def ended(self, length: float) -> dict[str, Any]:
+        """Keys that another length [s] changes, where the phase was ended by hand."""
+        return {}
 
 
 class Attitude(Part):
@@ -550,9 +604,17 @@ class Attitude(Part):
             return None
         return self.roll_deg, self.pitch_deg, self.yaw_deg
 
+    @property
+    def angles(self) -> list[str]:
+        """The attitude commanded, in words; empty to keep the one before."""
+        given = zip(("roll", "pitch", "yaw"), self.attitude_deg or (), strict=False)
+        return [f"{name} {angle:g}°" for name, angle in given if angle or name == "yaw"]
+
 
 class Shaping(AnyPhase):
     """A phase that changes the formation."""
+
+    shapes: ClassVar[bool] = True
 
     formation: str = Field(description="name of the formation to take")
     reference: Literal["shape", "distances", "squares", "step"] = Field(
@@ -563,9 +625,30 @@ class Shaping(AnyPhase):
     )
     blend: Time = Field(4.0, description="length of the blend [s], from the phase's start")
 
+    @property
+    def shaping(self) -> Shaping:
+        """The phase itself."""
+        return self
+
+    @property
+    def least_time(self) -> float:
+        """Length of the blend [s]."""
+        return self.blend
+
+    @property
+    def leads_to(self) -> str:
+        """The formation."""
+        return self.formation
+
+    def ended(self, length: float) -> dict[str, Any]:
+        """The formation, and a blend that is not longer."""
+        return {"formation": self.formation, "blend": min(self.blend, length)}
+
 
 class Establish(Attitude, Shaping):
     """Take a formation from wherever the agents are, and attach the body frame to it."""
+
+    body_control: ClassVar[str] = "open"
 
     kind: Literal["establish"] = Field(description="take a formation")
     attitude: Literal["drawn", "free"] = Field(
@@ -574,6 +657,16 @@ class Establish(Attitude, Shaping):
         "at the angles asked for last, here or in a phase before; free: as they lie nearest to the agents, as always "
         "where no slots are tracked, and of a formation given by distances unless it asks for angles",
     )
+
+    @property
+    def establishing(self) -> Establish:
+        """The phase itself."""
+        return self
+
+    @property
+    def leads_to(self) -> str:
+        """The formation, and how it is to lie."""
+        return ", ".join([self.formation, *self.angles])
 
 
 class Reshape(Shaping):
@@ -585,12 +678,39 @@ class Reshape(Shaping):
 class Steering(Attitude, AnyPhase):
     """A phase that may change the attitude."""
 
+    moves: ClassVar[bool] = True
+
     travel: Time | None = Field(
         None, description="from the start to the arrival [s]; when absent, the whole phase"
     )
     rates_deg_s: Rates = Field(
         (0.0, 0.0, 0.0), description="body rates [p, q, r] on arrival [deg/s]"
     )
+
+    @property
+    def steering(self) -> Steering:
+        """The phase itself."""
+        return self
+
+    @property
+    def meets(self) -> tuple[str, ...]:
+        """The attitude, if one is commanded."""
+        return () if self.attitude_deg is None else ("attitude", "rates")
+
+    @property
+    def least_time(self) -> float:
+        """Time to the arrival [s]."""
+        return self.travel or 0.0
+
+    @property
+    def leads_to(self) -> str:
+        """The attitude, and its rates."""
+        rates = [_vector(self.rates_deg_s, "°/s")] if any(self.rates_deg_s) else []
+        return ", ".join([*self.angles, *rates])
+
+    def ended(self, length: float) -> dict[str, Any]:
+        """An arrival that is not later."""
+        return {} if self.travel is None else {"travel": min(self.travel, length)}
 
 
 class Fly(Steering):
@@ -599,6 +719,18 @@ class Fly(Steering):
     kind: Literal["fly"] = Field(description="fly to a waypoint")
     position: Vector = Field(description="centre of mass on arrival [x, y, z] [m]")
     velocity: Velocity = Field((0.0, 0.0, 0.0), description="its velocity on arrival [m/s]")
+
+    @property
+    def meets(self) -> tuple[str, ...]:
+        """The waypoint, and the attitude if one is commanded."""
+        return ("position", "velocity", *super().meets)
+
+    @property
+    def leads_to(self) -> str:
+        """The waypoint, and the attitude."""
+        velocity = [_vector(self.velocity, "m/s")] if any(self.velocity) else []
+        rest = super().leads_to
+        return ", ".join([_vector(self.position, "m"), *velocity, *([rest] if rest else [])])
 
 
 class Turn(Steering):
@@ -613,7 +745,62 @@ class Hold(AnyPhase):
     kind: Literal["hold"] = Field(description="stay")
 
 
-Phase = Annotated[Establish | Fly | Reshape | Turn | Hold, Field(discriminator="kind")]
+class Orbit(AnyPhase):
+    """Circle a point on a level circle, at a steady rate, and leave it with the velocity there."""
+
+    moves: ClassVar[bool] = True
+    body_control: ClassVar[str] = "tracking"
+
+    kind: Literal["orbit"] = Field(description="circle a point")
+    centre: Vector = Field(description="centre of the circle, which is level [x, y, z] [m]")
+    radius: Length = Field(description="radius of the circle [m]")
+    rate_deg_s: Angle = Field(
+        description="rate [deg/s], not 0: counter-clockwise seen from above where > 0, clockwise where < 0"
+    )
+    yaw: Literal["fixed", "along"] = Field(
+        "fixed",
+        description="fixed: the attitude commanded before is kept; along: the body turns with the orbit, and shows "
+        "the centre the side that it had there at first",
+    )
+    blend: Time = Field(
+        4.0, description="length of the run-in [s], from where the body is onto the circle"
+    )
+
+    @property
+    def meets(self) -> tuple[str, ...]:
+        """The place on the circle where it ends, and the attitude if that turns."""
+        return ("position", "velocity", *(("attitude", "rates") if self.turns_away else ()))
+
+    @property
+    def turns_away(self) -> bool:
+        """Whether the body turns with the orbit."""
+        return self.yaw == "along"
+
+    @property
+    def least_time(self) -> float:
+        """Length of the run-in [s]."""
+        return self.blend
+
+    @property
+    def leads_to(self) -> str:
+        """The circle."""
+        return f"round {_vector(self.centre, 'm')} at {self.radius:g} m, {self.rate_deg_s:g}°/s"
+
+    def ended(self, length: float) -> dict[str, Any]:
+        """A run-in that is not longer."""
+        return {"blend": min(self.blend, length)}
+
+
+def _vector(values: Sequence[float], unit: str) -> str:
+    return f"({', '.join(f'{value:g}' for value in values)}) {unit}"
+
+
+Phase = Annotated[Establish | Fly | Reshape | Turn | Orbit | Hold, Field(discriminator="kind")]
+#: Every kind of phase, by its name.
+KINDS: dict[str, type[AnyPhase]] = {
+    get_args(model.model_fields["kind"].annotation)[0]: model
+    for model in get_args(get_args(Phase)[0])
+}
 Obstacle = Annotated[Box | Ground, Field(discriminator="kind")]
 
 

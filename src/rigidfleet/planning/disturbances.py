@@ -12,7 +12,7 @@ import numpy as np
 
 from rigidfleet.kernel.problem import Disturbance, Problem, graph, no_disturbance
 from rigidfleet.math import turbulence
-from rigidfleet.mission import Establish, Gusts, Mission
+from rigidfleet.mission import Gusts, Mission
 from rigidfleet.mission.disturbances import gust_step, intensity
 from rigidfleet.typing import Bools, Floats
 
@@ -23,7 +23,7 @@ NOTHING = 1e-20
 def disturbance(mission: Mission) -> Disturbance:
     """What acts on a mission besides its laws, from its start to its latest end; no vehicle lost yet."""
     d = mission.disturbances
-    none = no_disturbance(np.array(mission.agents.mass))
+    none = no_disturbance(mission.fleet.mass.copy())
     if d is None:
         return none
     wind = np.array(d.wind)
@@ -34,7 +34,7 @@ def disturbance(mission: Mission) -> Disturbance:
         inverse=1.0 / mission.true_mass,
         drag=mission.drag,
         wind=wind,
-        floor=max(grounds, default=-math.inf) + np.array(mission.agents.radius),
+        floor=max(grounds, default=-math.inf) + mission.fleet.radius,
     )
     if d.gusts is not None:
         step = gust_step(d.gusts, float(np.linalg.norm(wind)))
@@ -93,9 +93,9 @@ def _wind_axes(wind: Floats) -> Floats:
 
 def _places(mission: Mission) -> Floats:
     """Where agents are to each other (N, 3) [m]: in the first formation established, or else at the start."""
-    names = (p.formation for p in mission.phases if isinstance(p, Establish))
+    names = (p.establishing.formation for p in mission.phases if p.establishing is not None)
     slots = next((s for s in map(mission.formation_slots, names) if s is not None), None)
-    return np.array(mission.agents.position) if slots is None else slots
+    return mission.fleet.position.copy() if slots is None else slots
 
 
 def without(

@@ -18,16 +18,11 @@ from rigidfleet.formation import distance_geometry, graphs
 from rigidfleet.kernel.problem import (
     BODY,
     CONSTANT,
-    EXACT,
-    ITERATED,
     OPEN,
-    PINV,
-    PINV_EQUAL,
-    PINV_INERTIA,
-    PINV_INERTIA_FORCE,
     RIGID,
     SHAPE,
-    SPECTRAL,
+    SOLVERS,
+    SPLITS,
     SQUARED,
     TRACKING,
     ConstraintLaw,
@@ -46,29 +41,26 @@ from rigidfleet.kernel.problem import (
 from rigidfleet.math import attitude as att
 from rigidfleet.math import lqr
 from rigidfleet.math.rigid_body import about_cm
-from rigidfleet.mission import Establish, Fly, Mission, Phase, Regulator, Reshape, Settle, Turn
+from rigidfleet.mission import Mission, Phase, Regulator, Settle
 from rigidfleet.mission.schema import Constraint, IntegratorOptions
 from rigidfleet.planning import solvers
+from rigidfleet.planning.courses import course
 from rigidfleet.planning.disturbances import without
 from rigidfleet.planning.reference import (
     PhaseState,
     Pose,
     align_slots,
     attach,
-    body_trajectory,
     reference_kind,
     slots_about_cm,
     slots_before,
-    target_pose,
 )
 from rigidfleet.planning.tolerances import absolute_tolerances, tolerance_of_velocity
 from rigidfleet.typing import Bools, Floats, Ints
 
-_SOLVERS = {"iterated": ITERATED, "spectral": SPECTRAL, "exact": EXACT, "pinv": PINV}
 _KINDS = {"shape": SHAPE, "squares": SQUARED, "step": CONSTANT}
 #: A formation is held from where all pairs are right within this part of the shortest distance.
 _NEAR = 0.1
-_SPLITS = {"equal": PINV_EQUAL, "inertia": PINV_INERTIA, "inertia+force": PINV_INERTIA_FORCE}
 
 
 #: Residual of an iterative solve, as a share of the integrator's tolerance; the relative one within bounds.
@@ -110,17 +102,17 @@ class PhasePlan:
 
     @property
     def target(self) -> dict[str, Any] | None:
-        """What a fly or turn phase is to reach, or the attitude of a formation established, for the record."""
-        goal, phase, lies = self.goal, self.phase, self.lies
-        if goal is None or not (isinstance(phase, Fly | Turn) or lies):
+        """What the phase is to reach, or the attitude of a formation established, for the record."""
+        goal, meets, lies = self.goal, self.phase.meets, self.lies
+        if goal is None or not (meets or lies):
             return None
-        turns = lies or (isinstance(phase, Fly | Turn) and phase.attitude_deg is not None)
+        turns = lies or "attitude" in meets
         reference = self.problem.reference
         shaped = reference.t0 + reference.T_b
         return {
             "time": max(self.arrival, shaped) if lies else self.arrival,
-            "position": goal.r.tolist() if isinstance(phase, Fly) else None,
-            "velocity": goal.v.tolist() if isinstance(phase, Fly) else None,
+            "position": goal.r.tolist() if "position" in meets else None,
+            "velocity": goal.v.tolist() if "velocity" in meets else None,
             "attitude": att.quaternion_from_dcm(goal.T).tolist() if turns else None,
             "rates": goal.omega.tolist() if turns and not lies else None,
         }
@@ -211,44 +203,42 @@ def plan_phase(
     """
     t_end = _end(phase, now.t)
     _check_size(mission, phase)
-    before_switch, masses = now, np.array(mission.agents.mass)
-    shaping = isinstance(phase, Establish | Reshape)
-    name = phase.formation if shaping else now.formation
+    before_switch, masses = now, mission.fleet.mass.copy()
+    shaping = phase.shaping
+    name = shaping.formation if shaping is not None else now.formation
     edges = mission.formation_edges(name) if name else np.zeros((0, 2), dtype=np.int64)
     target = slots_about_cm(mission, name, masses)
     frame, now, turned = attach(mission, phase, now, masses, target)
 
     d1 = mission.formation_distances(name) if name else np.zeros(0)
-    if not shaping:
+    if shaping is None:
         d1 = now.reference.of(edges, d1)
     d0 = now.reference.of(edges, distance_geometry.distances(now.r, edges))
     # Slots are blended wherever the shape leads; where distances lead, slots only follow if tracked.
     left = masses if now.lost is None else np.where(now.lost, 0.0, masses)
     before = slots_before(mission, now, left)
-    after = target if shaping and target is not None else before
+    after = target if shaping is not None and target is not None else before
     kind, T_b = CONSTANT, 0.0
-    if shaping:
-        T_b = 0.0 if phase.reference == "step" else phase.blend
-        kind = _KINDS[reference_kind(mission, phase, before, target)]
+    if shaping is not None:
+        T_b = 0.0 if shaping.reference == "step" else shaping.blend
+        kind = _KINDS[reference_kind(mission, shaping, before, target)]
     elif phase.control == "tracking" and np.allclose(
         d1, distance_geometry.distances(before, edges), rtol=1e-12
     ):
         kind = SHAPE
     dp, turn = np.zeros_like(before), np.zeros(3)
-    if shaping:
+    if shaping is not None:
         dp, turn = align_slots(before, after, left, turned)
     reference = Reference(kind, now.t, T_b, d0, d1, before, dp, turn)
 
-    goal, arrival = target_pose(phase, now, t_end)
+    goal, arrival, flight = course(mission, phase, now, t_end)
     motion, feedback = _REST, _NO_FEEDBACK
     if phase.control == "tracking":
-        assert now.pose is not None  # attached above
-        assert goal is not None
-        motion = _motion(mission, now.pose, goal, now.t, arrival, t_end)
+        assert flight is not None  # attached above
+        motion = flight.motion()
     elif phase.control == "body":
         assert goal is not None
-        moves = isinstance(phase, Fly | Turn)
-        feedback = _feedback(mission, goal, now.t, arrival, moves=moves)
+        feedback = _feedback(mission, goal, now.t, arrival, moves=phase.moves)
     method = solvers.choose(len(masses), edges, mission.constraint.solver)
     held = _held(mission, name, now) if method == "dense" else None
     problem = Problem(
@@ -256,7 +246,7 @@ def plan_phase(
         has_frame=frame is not None,
         vehicles=Vehicles(
             masses, 1.0 / masses, float(masses.sum()), float(masses.mean()),
-            np.array(mission.agents.thrust_limit), mission.agents.saturate, mission.gravity,
+            mission.fleet.thrust_limit.copy(), mission.agents.saturate, mission.gravity,
         ),
         graph=_graph(edges.tobytes(), masses.tobytes(), large=method != "dense"),
         law=_law(
@@ -271,11 +261,13 @@ def plan_phase(
         external=external,
         disturbance=no_disturbance(masses) if disturbance is None else disturbance,
     )  # fmt: skip
-    slots = after if phase.control != "open" or kind == SHAPE else target if shaping else now.slots
+    slots = after
+    if phase.control == "open" and kind != SHAPE:
+        slots = target if shaping is not None else now.slots
     plan = PhasePlan(
         phase, now.t, t_end, problem, edges, slots, name, target is not None, d1, goal, arrival, frame,
         attached=before_switch.slots is not None or phase.control != "open",
-        lies=isinstance(phase, Establish) and not mission.free_attitude(phase), method=method,
+        lies=phase.establishing is not None and not mission.free_attitude(phase), method=method,
         constraint=mission.constraint, integrator=mission.integrator,
         damping=partial(mission.damping, held), lost_at=mission.lost_at, masses=masses, before=before_switch,
     )  # fmt: skip
@@ -298,16 +290,17 @@ def _end(phase: Phase, start: float) -> float:
 
 def _check_size(mission: Mission, phase: Phase) -> None:
     """Refuse a phase that would take hours to fly."""
-    if not isinstance(phase, Establish | Reshape):
+    if phase.shaping is None:
         return
+    formation = phase.shaping.formation
     n, solver = mission.n_agents, mission.constraint.solver
-    edges = mission.formation_edges(phase.formation)
+    edges = mission.formation_edges(formation)
     if solvers.choose(n, edges, solver) != "dense":
         return
     size = solvers.equations(n, len(edges), solver)
     if size > solvers.MOST_DENSE:
         raise StoppedError(
-            f"phase '{phase.name}' takes '{phase.formation}', whose {len(edges):,} edges between"
+            f"phase '{phase.name}' takes '{formation}', whose {len(edges):,} edges between"
             f' {n:,} agents make {size:,} equations for the constraint force, and solver "{solver}" needs'
             f" their eigenvalues; with more than {solvers.MOST_DENSE:,} a flight takes hours. Use solver ="
             ' "iterated" (or "exact"), give it fewer edges, or track slots with edges = []'
@@ -343,7 +336,7 @@ def _law(mission: Mission, mu: float, *, damped: bool) -> ConstraintLaw:
         alpha=c.alpha if pid else 0.0,
         beta=c.beta if pid else 0.0,
         gamma=c.gamma if pid else 0.0,
-        solver=_SOLVERS[c.solver],
+        solver=SOLVERS[c.solver],
         mu=mu,
         iterations=c.iterations,
         s0=c.threshold,
@@ -358,7 +351,7 @@ def _control(mission: Mission, phase: Phase, masses: Floats) -> Control:
     force[:, 2] += masses * mission.gravity
     k1, k2 = lqr.double_integrator_gains(mission.tracking.Q, mission.tracking.R)
     allocation = mission.allocation
-    method = RIGID if allocation.method == "rigid" else _SPLITS[allocation.torque_split]
+    method = RIGID if allocation.method == "rigid" else SPLITS[allocation.torque_split]
     return Control(kind, force, k1, k2, method)
 
 
@@ -367,37 +360,6 @@ _NO_FEEDBACK = Feedback(
     np.zeros(0), np.zeros((0, 4)), np.zeros((0, 4)), 0.0, np.zeros(3), np.zeros(3), np.eye(3), np.zeros(3),
     np.zeros(4),
 )  # fmt: skip
-
-
-def _motion(
-    mission: Mission, start: Pose, goal: Pose, t0: float, arrival: float, t_end: float
-) -> Motion:
-    """LQR of the virtual body from one pose to another, as the trajectory it makes.
-
-    From arrival to ``t_end`` the tracking gains take over, or what the finite horizon has left of
-    the velocity's error would carry the body away.
-    """
-    T = arrival - t0
-    flights = body_trajectory(mission, start, goal, T)
-    times = np.unique(np.concatenate([_knots(law, T) for law in flights.regulators]))
-    rest = t_end - arrival
-    after = lqr.knots(rest, mission.tracking.Q, mission.tracking.R) if rest > 0.0 else np.zeros(1)
-    pieces = []
-    for i in range(2):
-        x = flights.sample(i, times)
-        piece = lqr.quintic_pieces(times, *x)
-        if rest > 0.0:
-            x = flights.sample_rest(mission, i, (x[0][-1], x[1][-1]), rest, after)
-            piece = np.concatenate([piece, lqr.quintic_pieces(after, *x)])
-        pieces.append(piece)
-    knots = np.concatenate([t0 + times, arrival + after[1:]])
-    coefficients = np.concatenate(pieces, axis=1)
-    # Another layout of an array would be another type, and compile the kernel once more.
-    return Motion(knots, np.ascontiguousarray(coefficients), np.ascontiguousarray(goal.T))
-
-
-def _knots(law: Regulator, T: float) -> Floats:
-    return lqr.knots(T, law.Q, law.R, law.S if law.horizon == "finite" else None)
 
 
 def _feedback(mission: Mission, goal: Pose, t0: float, arrival: float, *, moves: bool) -> Feedback:

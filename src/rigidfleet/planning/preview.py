@@ -10,17 +10,16 @@ from rigidfleet.kernel.problem import septic_polynomial
 from rigidfleet.math import attitude as att
 from rigidfleet.math import pid, rigid_body
 from rigidfleet.math.rigid_body import about_cm
-from rigidfleet.mission import Establish, Mission, Phase, Reshape
+from rigidfleet.mission import Mission, Phase
+from rigidfleet.planning.courses import course
 from rigidfleet.planning.reference import (
     PhaseState,
     Pose,
     align_slots,
     attach,
-    body_trajectory,
     reference_kind,
     slots_about_cm,
     slots_before,
-    target_pose,
 )
 from rigidfleet.typing import Floats
 
@@ -72,11 +71,9 @@ class PlannedPhase:
 
 def preview(mission: Mission, phases: int | None = None) -> tuple[list[PlannedPhase], bool]:
     """The way of all agents, one `PlannedPhase` for each phase or so many, and whether it is known to its end."""
-    masses = np.array(mission.agents.mass)
+    masses = mission.fleet.mass
     frame = None if mission.body_frame is None else mission.drawn_attitude
-    now = PhaseState(
-        0.0, np.array(mission.agents.position), np.array(mission.agents.velocity), frame=frame
-    )
+    now = PhaseState(0.0, mission.fleet.position, mission.fleet.velocity, frame=frame)
     way: list[PlannedPhase] = []
     most = samples_per_phase(mission)
     # Of more than can be looked at with the fewest samples, the first ones.
@@ -91,9 +88,10 @@ def preview(mission: Mission, phases: int | None = None) -> tuple[list[PlannedPh
     ]:
         if len(way) == possible:
             return way, False
-        name = phase.formation if isinstance(phase, Establish | Reshape) else now.formation
+        shaping = phase.shaping
+        name = shaping.formation if shaping is not None else now.formation
         target = slots_about_cm(mission, name, masses)
-        if isinstance(phase, Establish | Reshape) and target is None:
+        if shaping is not None and target is None:
             return way, False
         now = replace(now, t=begin)
         before = now.slots if now.slots is not None else now.r
@@ -102,11 +100,12 @@ def preview(mission: Mission, phases: int | None = None) -> tuple[list[PlannedPh
         names = now.formation, name
         position, ways, now = _leg(mission, phase, now, masses, target, time)
         guess = (
-            isinstance(phase, Establish | Reshape)
+            shaping is not None
             and phase.control != "tracking"
             # A shape that forces alone hold may lag behind its slots.
             and (
-                phase.control == "body" or reference_kind(mission, phase, before, target) != "shape"
+                phase.control == "body"
+                or reference_kind(mission, shaping, before, target) != "shape"
             )
         )
         acceleration = _rate(_rate(position, time), time)
@@ -131,13 +130,13 @@ def _leg(
 ) -> tuple[Floats, tuple[Floats, Floats] | None, PhaseState]:
     """Positions (K, N, 3) of all agents over a phase, their `PlannedPhase.ways`, and the situation at its end."""
     t0, t_end = time[0], time[-1]
-    shaping = isinstance(phase, Establish | Reshape)
+    shaping = phase.shaping
     frame, now, turned = attach(mission, phase, now, masses, target)
-    s = septic((time - t0) / phase.blend) if shaping else np.zeros(len(time))
+    s = np.zeros(len(time)) if shaping is None else septic((time - t0) / shaping.blend)
     if phase.control == "open":
         x = about_cm(now.r, masses)
         after = x
-        if shaping and target is not None:
+        if shaping is not None and target is not None:
             # Turned as the blend has it, and with that as the agents lie.
             slots = slots_before(mission, now, masses)
             after = target @ turned.T @ rigid_body.kabsch(x, slots, masses).T
@@ -148,18 +147,20 @@ def _leg(
         shape = x + s[:, None, None] * (after - x)
         position = shape + (cm + tau * v + 0.5 * tau**2 * a)[:, None]
         v_end = np.tile(v + a * (t_end - t0), (len(masses), 1))
-        slots = target if shaping else now.slots
+        slots = target if shaping is not None else now.slots
         now = replace(now, r=position[-1], v=v_end, slots=slots, pose=None, frame=frame)
     else:
-        assert now.pose is not None  # attached above
-        assert now.slots is not None
-        goal, arrival = target_pose(phase, now, t_end)
-        assert goal is not None
-        r, T, v_cm, omega = _body(mission, now.pose, goal, arrival, time)
+        assert now.slots is not None  # attached above
+        goal, _, flight = course(mission, phase, now, t_end)
+        assert flight is not None
+        r, phi, v_cm, omega = flight.sample(
+            time
+        )  # where phi is small at the end, its rate is omega
+        T = att.dcm_from_rotation_vector(phi) @ flight.T1
         before = now.slots
-        after = target if shaping and target is not None else before
+        after = target if shaping is not None and target is not None else before
         dp, turn = 0.0 * before, np.zeros(3)
-        if shaping:
+        if shaping is not None:
             dp, turn = align_slots(before, after, masses, turned)
         ways = before, before + dp
         p = before + s[:, None, None] * dp
@@ -172,29 +173,9 @@ def _leg(
         now = replace(
             now, r=position[-1], v=velocity, slots=after, pose=tracked, goal=goal, frame=frame
         )
-    name = phase.formation if isinstance(phase, Establish | Reshape) else now.formation
-    return position, ways if shaping else None, replace(now, t=t_end, formation=name)
-
-
-def _body(
-    mission: Mission, start: Pose, goal: Pose, arrival: float, time: Floats
-) -> tuple[Floats, Floats, Floats, Floats]:
-    """CM (K, 3) [m], attitude T (K, 3, 3) of the virtual body, and its velocities [m/s, rad/s] at the end."""
-    t0, rest = time[0], time[-1] - arrival
-    flights = body_trajectory(mission, start, goal, arrival - t0)
-    under_way = time <= arrival
-    found = []
-    for i in range(2):
-        x, rate, _ = flights.sample(i, np.append(time[under_way] - t0, arrival - t0))
-        x_end = (x[-1], rate[-1])
-        x = x[:-1]
-        if rest > 0.0 and not under_way.all():
-            after = flights.sample_rest(mission, i, x_end, rest, time[~under_way] - arrival)
-            x, rate = np.concatenate([x, after[0]]), after[1]
-        found.append((x, rate[-1]))
-    (r, v), (phi, phi_dot) = found
-    # Where phi is small at the end, its rate is the body's.
-    return r, att.dcm_from_rotation_vector(phi) @ goal.T, v, phi_dot
+    if shaping is None:
+        return position, None, replace(now, t=t_end)
+    return position, ways, replace(now, t=t_end, formation=shaping.formation)
 
 
 def phase_spans(mission: Mission) -> list[tuple[float, float]]:
@@ -208,8 +189,7 @@ def phase_spans(mission: Mission) -> list[tuple[float, float]]:
         elif phase.duration is not None:
             t = begin + phase.duration
         elif phase.settle is not None:
-            least = max(getattr(phase, "blend", 0.0), getattr(phase, "travel", None) or 0.0)
-            t = begin + min(phase.settle.timeout, least + settling + phase.settle.dwell)
+            t = begin + min(phase.settle.timeout, phase.least_time + settling + phase.settle.dwell)
         spans.append((begin, max(t, begin + 1e-6)))
         t = spans[-1][1]
     return spans

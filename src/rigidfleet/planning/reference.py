@@ -12,13 +12,11 @@ import numpy as np
 
 from rigidfleet.formation import distance_geometry
 from rigidfleet.math import attitude as att
-from rigidfleet.math import lqr, rigid_body
+from rigidfleet.math import rigid_body
 from rigidfleet.math.rigid_body import about_cm, mean_axis_rates
-from rigidfleet.mission import Establish, Fly, Mission, Phase, Regulator, Reshape, Turn
+from rigidfleet.mission import Mission, Phase
+from rigidfleet.mission.schema import Shaping
 from rigidfleet.typing import Bools, Floats, Ints
-
-#: A phase that ends by settling and steers nowhere brings the body to rest within this time [s].
-_REST_WITHIN = 10.0
 
 
 @dataclass(frozen=True)
@@ -97,10 +95,10 @@ def attach(
         were assigned, or else that which brings them nearest to the slots before
     """
     masses = masses if now.lost is None else np.where(now.lost, 0.0, masses)
-    shaping = isinstance(phase, Establish | Reshape)
-    frame = now.frame
-    establishes = isinstance(phase, Establish) and target is not None
-    given = mission.assigned_turn(now.formation, phase.formation) if shaping else None
+    shaping, establishing = phase.shaping, phase.establishing
+    frame, given = now.frame, None
+    if shaping is not None:
+        given = mission.assigned_turn(now.formation, shaping.formation)
     if phase.control == "open":
         if mission.formulation == "body" and frame is None:
             frame = np.eye(3)
@@ -125,20 +123,20 @@ def attach(
     slots = now.slots if now.slots is not None else x @ pose.T.T
     goal = now.goal or replace(pose, v=np.zeros(3), omega=np.zeros(3))
     turn = np.eye(3)
-    if establishes:
+    if establishing is not None and target is not None:
         # New axes, in the old ones: `axes` takes vectors from new to old.
         free = mission.free_attitude(phase)
         if free:
             axes = _turn(given, slots, target, masses)
         else:
-            asked = mission.establish_attitude(phase, goal.T if goal.named else None)
+            asked = mission.establish_attitude(establishing, goal.T if goal.named else None)
             steady = now.pose is not None and goal.named and np.array_equal(goal.T, asked)
             axes = np.eye(3) if steady else pose.T @ asked.T
         slots = slots @ axes
         pose = replace(pose, T=axes.T @ pose.T, omega=axes.T @ pose.omega)
         goal = replace(goal, T=pose.T if free else asked, named=not free)
         given = None if given is None else axes.T @ given
-    if shaping:
+    if shaping is not None:
         turn = _turn(given, slots, target, masses)
     if phase.control == "body" or (mission.formulation == "body" and frame is None):
         frame = pose.T
@@ -159,7 +157,7 @@ def _turn(given: Floats | None, before: Floats, after: Floats | None, masses: Fl
 
 
 def reference_kind(
-    mission: Mission, phase: Establish | Reshape, before: Floats, target: Floats | None
+    mission: Mission, phase: Shaping, before: Floats, target: Floats | None
 ) -> Literal["shape", "squares", "step"]:
     """What leads the distances of a phase: its reference, and which of two if that is "distances".
 
@@ -198,67 +196,3 @@ def align_slots(
     """
     R = rigid_body.kabsch(before, after, masses) if turn is None else turn
     return after @ R.T - before, att.rotation_vector_from_dcm(R)  # log of R^T
-
-
-def target_pose(phase: Phase, now: PhaseState, t_end: float) -> tuple[Pose | None, float]:
-    """The pose to be at, and when."""
-    goal = now.goal
-    if goal is None:
-        return None, t_end
-    if not isinstance(phase, Fly | Turn):
-        # Nothing says when what stays must have come to rest: by the end, if that is known.
-        arrival = t_end if phase.settle is None else min(t_end, now.t + _REST_WITHIN)
-        return replace(goal, v=np.zeros(3), omega=np.zeros(3)), arrival
-    arrival = t_end if phase.travel is None else now.t + phase.travel
-    angles = phase.attitude_deg
-    T = goal.T if angles is None else att.dcm_from_euler(np.deg2rad(angles))
-    named = goal.named or angles is not None
-    r, v = goal.r, np.zeros(3)
-    if isinstance(phase, Fly):
-        r, v = np.array(phase.position), np.array(phase.velocity)
-    return Pose(r, v, T, np.deg2rad(phase.rates_deg_s), named), arrival
-
-
-@dataclass
-class BodyTrajectory:
-    """The LQR flights of the virtual body to its goal: of its CM, and of its attitude phi."""
-
-    regulators: tuple[Regulator, Regulator]
-    begin: tuple[tuple[Floats, Floats], tuple[Floats, Floats]]  # (r, v), (phi, phi_dot)
-    end: tuple[tuple[Floats, Floats], tuple[Floats, Floats]]
-    T: float  # [s]
-
-    def sample(self, k: int, times: Floats) -> tuple[Floats, Floats, Floats]:
-        """Position, rate and second derivative (K, 3) of one of the two at times (K,) in [0, T]."""
-        law = self.regulators[k]
-        if law.horizon == "finite":
-            return lqr.finite_horizon_trajectory(
-                times, self.begin[k], self.end[k], self.T, law.Q, law.R, law.S
-            )
-        return lqr.infinite_horizon_trajectory(
-            times, self.begin[k], self.end[k], self.T, law.Q, law.R
-        )
-
-    def sample_rest(
-        self, mission: Mission, k: int, state: tuple[Floats, Floats], rest: float, times: Floats
-    ) -> tuple[Floats, Floats, Floats]:
-        """The same at times (K,) in [0, rest] after arrival in a state, where tracking gains take over."""
-        r, v = self.end[k]
-        Q, R = mission.tracking.Q, mission.tracking.R
-        return lqr.infinite_horizon_trajectory(times, state, (r + v * rest, v), rest, Q, R)
-
-
-def body_trajectory(mission: Mission, start: Pose, goal: Pose, T: float) -> BodyTrajectory:
-    """Flights of the virtual body from one pose to another within T [s].
-
-    The attitude is regulated as the rotation vector phi from the goal to the body: three more
-    double integrators, phi'' their input, exact for a turn about one axis.
-    """
-    phi = att.rotation_vector_from_dcm(start.T @ goal.T.T)  # start = goal Exp(phi)
-    phi_dot = att.rotation_vector_rate(phi, start.omega)
-    return BodyTrajectory(
-        (mission.lqr, mission.lqr.attitude),
-        ((start.r, start.v), (phi, phi_dot)),
-        ((goal.r, goal.v), (np.zeros(3), goal.omega)),
-        T,
-    )

@@ -285,7 +285,7 @@ def attitude(result: Result) -> Figure:
 
 def thrust_limits(mission: Mission) -> list[tuple[float, str, str]]:
     """Each thrust limit [N] there is, with a label and a colour: the agent's if it is its alone."""
-    limits = np.array(mission.agents.thrust_limit)
+    limits = mission.fleet.thrust_limit
     colours = st.agent_colours(len(limits))
     found = []
     for value in np.unique(limits[np.isfinite(limits)]).tolist():

@@ -36,6 +36,7 @@ def graphs(mission: Mission, judged: Mapping[str, Rigidity | None]) -> Figure:
     rows = math.ceil(max(len(names), 1) / columns)
     with st.settings():
         fig = Figure(figsize=(max(3.4 * columns, 6.0), 0.4 + 3.6 * rows))
+        fig.settings = st.settings
         height = (1 - 0.3 / fig.get_figheight()) / rows
         for k, name in enumerate(names):
             row, column = divmod(k, columns)

@@ -52,6 +52,7 @@ def summary(result: Result) -> Figure:
     from rigidfleet.plotting.figure import Figure
 
     fig = Figure(figsize=(11.4, 7.0))
+    fig.settings = st.settings
     st.head(fig, result, st.clean(result.mission.title, 80) or "Flight")
     view = space.scene(result)
     space.draw_space(fig, result, view, (0.0, 0.49, 0.41, 0.47))

@@ -101,7 +101,7 @@ def _waypoints(result: Result) -> list[tuple[str, Floats]]:
     found: dict[tuple[float, ...], str] = {}
     for phase in result.phases:
         target = phase.target or {}
-        if target.get("position") is not None and phase.kind == "fly":
+        if target.get("position") is not None:
             place = tuple(np.round(np.asarray(target["position"], dtype=float), 6).tolist())
             found.setdefault(place, st.clean(phase.name.split(":")[0], 12))
     return [(name, np.array(place)) for place, name in found.items()]
@@ -385,6 +385,7 @@ def trajectory(result: Result) -> Figure:
     from rigidfleet.plotting.figure import Figure
 
     fig = Figure(figsize=(10.5, 6.2))
+    fig.settings = st.settings
     st.head(fig, result, "Trajectory")
     view = scene(result)
     draw_space(fig, result, view, (0.0, 0.07, 0.6, 0.87))
@@ -437,6 +438,7 @@ def formations(result: Result) -> Figure:
     columns = min(max(len(names), 1), 3)
     rows = math.ceil(max(len(names), 1) / columns)
     fig = Figure(figsize=(max(3.4 * columns, 6.0), 0.5 + 3.5 * rows))
+    fig.settings = st.settings
     st.head(fig, result, "Formations")
     if not names:
         fig.text(0.5, 0.45, "the mission has no formation", ha="center", color=st.GREY)
@@ -465,7 +467,7 @@ def _sketch(
     p, placed = sketch_places(mission, name)
     edges = mission.formation_edges(name)
     lengths = mission.formation_distances(name)
-    masses = np.array(mission.agents.mass)
+    masses = mission.fleet.mass
     origin = masses @ p / masses.sum()
     flat = distance_geometry.dimension(p, 1e-3) < 3 and float(np.ptp(p[:, 2])) < 1e-3 * max(
         1e-9, float(np.ptp(p))

@@ -167,6 +167,7 @@ def time_figure(
 
     shares = [1.0] * rows if shares is None else shares
     fig = Figure(figsize=(WIDTH, 1.3 + height * sum(shares)), layout="constrained")
+    fig.settings = settings
     axes = fig.subplots(rows, columns, sharex=True, squeeze=False, height_ratios=shares)
     head(fig, result, title)
     for ax in axes.flat:

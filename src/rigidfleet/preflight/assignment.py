@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from rigidfleet.formation import assignment
-from rigidfleet.mission import Establish, Mission
+from rigidfleet.mission import Mission
 from rigidfleet.planning.preview import preview
 from rigidfleet.preflight.findings import Assignment, Preflight, Remark
 
@@ -24,11 +24,11 @@ _COMPARED = 200
 
 def assignment_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     """Whether other agents in the slots of the first formation would be better off."""
-    first = next((p for p in mission.phases if isinstance(p, Establish)), None)
+    first = next((p.establishing for p in mission.phases if p.establishing is not None), None)
     slots = mission.formation_slots(first.formation) if first is not None else None
     if first is None or slots is None or not 2 <= mission.n_agents <= _COMPARED:
         return
-    index, masses = mission.phases.index(first), np.array(mission.agents.mass)
+    index, masses = mission.phases.index(first), mission.fleet.mass
     if index >= len(found.planned_phases):
         return
     for name in ("as it is", "shortest", "safe"):
@@ -42,7 +42,7 @@ def assignment_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
         clearance = assignment.nearest_way(*planned.ways, mission.agents.radius)[0]
         order = tuple(other.assigned_slots[first.formation].tolist())
         found.assignments[name] = Assignment(order, length, clearance)
-    radius = np.array(mission.agents.radius)
+    radius = mission.fleet.radius
     now, short, safe = found.assignments.values()
     if short.path_length < (1 - _WORTH) * now.path_length - _SHORT:
         text = f"another assignment to slots is shorter: {short.path_length:.1f} m in all, not {now.path_length:.1f} m"

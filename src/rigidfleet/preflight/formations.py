@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from rigidfleet.formation import distance_geometry
-from rigidfleet.mission import Establish, Mission, Reshape
+from rigidfleet.mission import Mission
 from rigidfleet.planning import solvers
 from rigidfleet.planning.reference import reference_kind
 from rigidfleet.preflight.findings import DENSE, TOLERANCE, FormationCheck, Remark, agents, some
@@ -84,7 +84,7 @@ def _held_by(mission: Mission, name: str) -> Literal["slots", "distances", "noth
     """By what a formation is held in the phases that fly it."""
     now, controls = None, set()
     for phase in mission.phases:
-        now = phase.formation if isinstance(phase, Establish | Reshape) else now
+        now = phase.shaping.formation if phase.shaping is not None else now
         controls |= {phase.control} if now == name else set()
     if not controls:
         return "nothing"
@@ -163,9 +163,9 @@ def _other_shapes(mission: Mission, f: FormationCheck, *, alone: bool) -> Iterat
     others = f.realisations
     if others is None or not alone:
         return
-    start, slots = np.array(mission.agents.position), mission.formation_slots(f.name)
-    first, by = mission.phases[0], None
-    if isinstance(first, Establish) and first.formation == f.name:
+    start, slots = mission.fleet.position, mission.formation_slots(f.name)
+    first, by = mission.phases[0].establishing, None
+    if first is not None and first.formation == f.name:
         by = reference_kind(mission, first, start, slots)
     end = None if others.leads_to is None else others.found[others.leads_to].kind
     if by == "shape" and slots is not None and _flattens(start, slots):

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from rigidfleet.math import pid
-from rigidfleet.mission import Establish, Mission
+from rigidfleet.mission import Mission
 from rigidfleet.planning.preview import phase_spans
 from rigidfleet.preflight.findings import TOLERANCE, FormationCheck, GainsCheck, Preflight, Remark
 
@@ -54,11 +54,11 @@ def gain_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
 def _drift(mission: Mission) -> Iterator[Remark]:
     """Without feedback an error of length goes on at the rate that it has."""
     text = "no feedback (stabilisation = 'none'): errors of length stay, and grow at their rates"
-    first = mission.phases[0]
-    if not isinstance(first, Establish):
+    first = mission.phases[0].establishing
+    if first is None:
         yield Remark("note", "gains", text)
         return
-    r, v = np.array(mission.agents.position), np.array(mission.agents.velocity)
+    r, v = mission.fleet.position, mission.fleet.velocity
     edges, d = (
         mission.formation_edges(first.formation),
         mission.formation_distances(first.formation),

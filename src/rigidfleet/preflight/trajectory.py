@@ -9,7 +9,7 @@ import numpy as np
 
 from rigidfleet.formation import assignment, distance_geometry
 from rigidfleet.math import lqr, proximity
-from rigidfleet.mission import Box, Establish, Ground, Mission, Reshape
+from rigidfleet.mission import Box, Ground, Mission
 from rigidfleet.mission.disturbances import intensity
 from rigidfleet.planning.preview import PlannedPhase, septic
 from rigidfleet.preflight.findings import DENSE, SLACK, Disturbed, Preflight, Remark, agents, some
@@ -40,7 +40,7 @@ def separation_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     """Room between vehicles: where it is least, and each change of formation on which ways cross."""
     if mission.n_agents < 2:
         return
-    radius, limit = np.array(mission.agents.radius), mission.limits.separation or 0.0
+    radius, limit = mission.fleet.radius, mission.limits.separation or 0.0
     worst: dict[bool, tuple[float, float, tuple[int, ...], str]] = {}
     least = np.inf, 0.0, (0, 0)
     for number, planned in enumerate(found.planned_phases):
@@ -81,7 +81,8 @@ def _near(
 
 def _time_of(mission: Mission, planned: PlannedPhase, number: int, share: float) -> float:
     """When [s] agents have gone this share of their ways."""
-    blend = getattr(mission.phases[number], "blend", 0.0)
+    shaping = mission.phases[number].shaping
+    blend = 0.0 if shaping is None else shaping.blend
     tau = np.linspace(0.0, 1.0, 2001)
     return float(planned.time[0] + blend * np.interp(share, septic(tau), tau))
 
@@ -104,7 +105,7 @@ def _crossing(
     assert after is not None  # something is shaped
     assert planned.ways is not None
     apart = min(float(proximity.nearest(places).min()) for places in planned.ways)
-    flown = [p.formation for p in mission.phases[:number] if isinstance(p, Establish | Reshape)]
+    flown = [p.shaping.formation for p in mission.phases[:number] if p.shaping is not None]
     spaced = f"keep slots {math.sqrt(2) * needed:.2f} m apart or more (here {apart:.2f} m)"
     promised = mission.assigned_turn(before, after) is not None
     if promised:
@@ -124,7 +125,7 @@ def _crossing(
 
 def downwash_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     """One vehicle in the downwash of another."""
-    radius, limit = np.array(mission.agents.radius), mission.limits.separation_below
+    radius, limit = mission.fleet.radius, mission.limits.separation_below
     worst: dict[bool, tuple[float, float, tuple[int, ...], str]] = {}
     for planned in found.planned_phases:
         room, pair = proximity.headroom(planned.position, radius)
@@ -148,7 +149,7 @@ def downwash_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
 
 def thrust_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     """Thrust that the planned trajectory asks for beyond a limit."""
-    masses, limits = np.array(mission.agents.mass), np.array(mission.agents.thrust_limit)
+    masses, limits = mission.fleet.mass, mission.fleet.thrust_limit
     weight = np.array([0.0, 0.0, mission.gravity])
     best: tuple[float, float, str, float, str, bool] | None = None
     for planned in found.planned_phases:
@@ -173,7 +174,7 @@ def disturbance_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     d = mission.disturbances
     if d is None or not found.planned_phases:
         return
-    believed, true, drag = np.array(mission.agents.mass), mission.true_mass, mission.drag
+    believed, true, drag = mission.fleet.mass, mission.true_mass, mission.drag
     wind, up = np.array(d.wind), np.array([0.0, 0.0, 1.0])
     g, speed = mission.gravity, float(np.linalg.norm(d.wind))
     k1, k2 = lqr.double_integrator_gains(mission.tracking.Q, mission.tracking.R)
@@ -182,7 +183,7 @@ def disturbance_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     noise = np.zeros(len(believed))
     if d.noise is not None:
         noise = 3 * believed * math.hypot(k1 * d.noise.position, k2 * d.noise.velocity)
-    limits = np.array(mission.agents.thrust_limit)
+    limits = mission.fleet.thrust_limit
     worst, most = -math.inf, (0.0, 0.0, "", math.inf)
     for planned in found.planned_phases:
         force = true[:, None] * (planned.acceleration + g * up)
@@ -217,21 +218,24 @@ def disturbance_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
 
 def _step_thrust(mission: Mission, found: Preflight) -> Iterator[Remark]:
     """Forces that references ask for which jump: J M^-1 J^T lambda = -beta^2 c at the jump."""
-    c, masses = mission.constraint, np.array(mission.agents.mass)
+    c, masses = mission.constraint, mission.fleet.mass
     if c.stabilisation == "none":
         return
-    limits = np.array(mission.agents.thrust_limit)
+    limits = mission.fleet.thrust_limit
     starts = [
-        np.array(mission.agents.position),
+        mission.fleet.position,
         *(planned.position[-1] for planned in found.planned_phases),
     ]
     for phase, r in zip(mission.phases, starts, strict=False):
-        if not (isinstance(phase, Establish | Reshape) and phase.reference == "step"):
+        shaping = phase.shaping
+        if shaping is None or shaping.reference != "step":
             continue
-        edges = mission.formation_edges(phase.formation)
+        edges = mission.formation_edges(shaping.formation)
         if min(len(edges), 3 * mission.n_agents) > DENSE:
             continue
-        error = distance_geometry.distances(r, edges) - mission.formation_distances(phase.formation)
+        error = distance_geometry.distances(r, edges) - mission.formation_distances(
+            shaping.formation
+        )
         J = jacobian(r, edges)
         root = np.repeat(1 / np.sqrt(masses), 3)
         f = np.linalg.lstsq(J * root, -(c.beta**2) * error, rcond=1e-7)[0] / root
@@ -240,15 +244,15 @@ def _step_thrust(mission: Mission, found: Preflight) -> Iterator[Remark]:
         i = int((need - np.where(np.isfinite(limits), limits, 0.0)).argmax())
         if need[i] > limits[i]:
             text = (
-                f"the step to '{phase.formation}' in '{phase.name}' asks agent {i + 1} for {need[i]:.0f} N, and it has"
-                f" {limits[i]:g} N. Blend: reference = 'shape' or 'distances'"
+                f"the step to '{shaping.formation}' in '{phase.name}' asks agent {i + 1} for {need[i]:.0f} N, and it"
+                f" has {limits[i]:g} N. Blend: reference = 'shape' or 'distances'"
             )
             yield Remark("fails" if c.solver in ("exact", "pinv") else "note", "thrust", text)
 
 
 def obstacle_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     """Room to each obstacle; of many, to all that may be touched and to the nearest."""
-    radius, way = np.array(mission.agents.radius), found.planned_phases
+    radius, way = mission.fleet.radius, found.planned_phases
     if not (mission.obstacles and way):
         return
     # What a phase stays within, and how far that is from each obstacle (L, B): nobody is nearer.
@@ -319,7 +323,7 @@ def _beyond(within: Floats, thing: Box | Ground) -> Floats:
 def _too_low(mission: Mission, found: Preflight, phase: str, ground: float) -> str:
     """Why a vehicle is at or below the ground [m] in a phase, and how high its formation is to fly."""
     planned = next(planned for planned in found.planned_phases if planned.phase == phase)
-    masses, radius = np.array(mission.agents.mass), np.array(mission.agents.radius)
+    masses, radius = mission.fleet.mass, mission.fleet.radius
     z = planned.position[..., 2]
     cm = z @ masses / masses.sum()
     k, i = np.unravel_index(int((z - radius).argmin()), z.shape)
@@ -337,7 +341,7 @@ def _gaps(mission: Mission, found: Preflight, radius: Floats) -> Iterator[Remark
 
     Of boxes on either side of the centre, seen along an axis, the nearest two make the gap.
     """
-    masses = np.array(mission.agents.mass)
+    masses = mission.fleet.mass
     boxes = [thing for thing in mission.obstacles if isinstance(thing, Box)]
     if len(boxes) < 2:
         return

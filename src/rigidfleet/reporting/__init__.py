@@ -12,8 +12,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rigidfleet._files import write_file
 from rigidfleet.errors import wrong_type
-from rigidfleet.result import Result, as_result, write_file
+from rigidfleet.result import Result, as_result
 
 if TYPE_CHECKING:
     from rigidfleet.assessment import Verdict

@@ -108,7 +108,7 @@ def _tracking(mission: Mission) -> list[Line]:
 
 
 def _regulators(mission: Mission) -> list[Line]:
-    if not any(phase.kind in ("fly", "turn") for phase in mission.phases):
+    if not any(phase.steering is not None for phase in mission.phases):
         return []
     pairs = (("centre of mass", mission.lqr), ("attitude", mission.lqr.attitude))
     return [_regulator(name, regulator) for name, regulator in pairs]

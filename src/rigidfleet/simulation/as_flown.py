@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 from rigidfleet.errors import MissionError
-from rigidfleet.mission import Establish, Mission, Phase, Reshape
+from rigidfleet.mission import Mission, Phase
 from rigidfleet.result import PhaseRecord
 
 
@@ -94,15 +94,9 @@ def _written(phase: Phase, record: PhaseRecord) -> dict[str, Any]:
     given = phase.model_dump(mode="json", exclude_unset=True)
     for key in ("duration", "settle"):
         given.pop(key, None)
-    length = record.t_end - record.t_start
-    if given.get("travel") is not None:
-        given["travel"] = min(given["travel"], length)
     told: dict[str, Any] = {"kind": record.kind, "name": record.name, "until": record.t_end}
     told = given | told | {"control": record.control}
-    if isinstance(phase, Establish | Reshape):
-        told["formation"] = phase.formation
-        told["blend"] = min(phase.blend, record.t_end - record.t_start)
-    return told
+    return told | phase.ended(record.t_end - record.t_start)
 
 
 def _written_out(mission: Mission, name: str) -> dict[str, Any]:

@@ -11,7 +11,6 @@ from rigidfleet.kernel.engine import native
 from rigidfleet.kernel.problem import Workspace
 from rigidfleet.kernel.records import IntegratorState
 from rigidfleet.math.constraint_jacobian import jacobian
-from rigidfleet.mission import Establish, Reshape
 from rigidfleet.planning import solvers
 from rigidfleet.planning.plan import PhasePlan
 from rigidfleet.typing import Floats
@@ -82,7 +81,8 @@ def diagnose(at: Place, *, own_force: bool, collapsed: bool) -> str:
 def _smoother(plan: PhasePlan) -> str:
     """What else helps a law without bound: a smooth reference, feedback; "" where both are there."""
     words = ""
-    if isinstance(plan.phase, Establish | Reshape) and plan.phase.reference == "step":
+    shaping = plan.phase.shaping
+    if shaping is not None and shaping.reference == "step":
         smooth = "shape" if plan.knows_slots else "distances"
         words += f', with a reference that moves smoothly: reference = "{smooth}"'
     if plan.constraint.stabilisation == "none":

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from rigidfleet.kernel.compiler.simd import WIDTH
 from rigidfleet.kernel.engine import batch
-from rigidfleet.mission import Establish, Mission, Phase, Reshape, as_mission
+from rigidfleet.mission import Mission, Phase, as_mission
 from rigidfleet.planning.plan import plan_phase
 from rigidfleet.planning.reference import PhaseState
 from rigidfleet.planning.solvers import choose
@@ -107,11 +107,11 @@ def unfit(mission: Mission) -> str | None:
                 f"phase {index + 1} '{phase.name}' is not flown open-loop under squares or steps to a given time, which"
                 " is all that an ensemble flies"
             )
-        if isinstance(phase, Establish | Reshape):
-            edges = mission.formation_edges(phase.formation)
+        if (shaping := phase.shaping) is not None:
+            edges = mission.formation_edges(shaping.formation)
             if choose(mission.n_agents, edges, mission.constraint.solver) != "dense":
                 return (
-                    f"an ensemble solves densely, and '{phase.formation}' has too many edges for that"
+                    f"an ensemble solves densely, and '{shaping.formation}' has too many edges for that"
                     f" ({len(edges)})"
                 )
     if mission.formulation != "inertial":
@@ -176,10 +176,10 @@ class _Flights:
 
 def _alike(mission: Mission, phase: Phase) -> bool:
     """Whether a phase is led by squares or steps from anywhere, so that one plan serves all flights."""
-    if not isinstance(phase, Establish | Reshape):
+    if (shaping := phase.shaping) is None:
         return True
-    bare = mission.n_agents <= 3 or not mission.formations[phase.formation].knows_slots
-    return phase.reference in ("squares", "step") or (phase.reference == "distances" and bare)
+    bare = mission.n_agents <= 3 or not mission.formations[shaping.formation].knows_slots
+    return shaping.reference in ("squares", "step") or (shaping.reference == "distances" and bare)
 
 
 def _starts(name: str, values: ArrayLike, agents: int) -> Floats:

@@ -176,7 +176,7 @@ class Flight:
             b = mission.body_frame
             frame = att.dcm_from_euler(np.deg2rad([b.roll_deg, b.pitch_deg, b.yaw_deg]))
         self._now = PhaseState(
-            0.0, np.array(mission.agents.position), np.array(mission.agents.velocity), frame=frame
+            0.0, mission.fleet.position.copy(), mission.fleet.velocity.copy(), frame=frame
         )
         self._disturbance = disturbance(mission)
         self._extremes = Extremes(mission)

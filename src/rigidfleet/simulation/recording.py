@@ -49,7 +49,7 @@ def assemble(
     pieces = [p for p in pieces if len(p.time)]
     time = np.concatenate([p.time for p in pieces])
     left = time[:, None] <= mission.lost_at  # (K, N)
-    masses = np.where(left, np.array(mission.agents.mass), 0.0)
+    masses = np.where(left, mission.fleet.mass, 0.0)
     M = masses.sum(axis=1)[:, None]
 
     def joined(name: str) -> Floats:

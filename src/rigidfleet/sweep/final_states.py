@@ -20,7 +20,7 @@ from rigidfleet.errors import MissionError
 from rigidfleet.formation.distance_geometry import dimension, distances
 from rigidfleet.formation.graphs import complete_graph
 from rigidfleet.math.rigid_body import centred
-from rigidfleet.mission import Establish, Mission, Reshape
+from rigidfleet.mission import Mission
 from rigidfleet.mission.formations import coincident
 from rigidfleet.mission.schema import HUGE
 from rigidfleet.simulation.ensemble import Ensemble, establish, max_edge_error
@@ -121,9 +121,9 @@ def _refused(sweep: Sweep, runs: Sequence[int], r: Floats, v: Floats) -> dict[in
 def _spread(mission: Mission, r: Floats, v: Floats) -> Bools:
     """Whether agents and their velocities clearly span as many dimensions as any formation asks for (B,)."""
     asked = [
-        mission.formation_slots(p.formation)
+        mission.formation_slots(p.shaping.formation)
         for p in mission.phases
-        if isinstance(p, Establish | Reshape)
+        if p.shaping is not None
     ]
     needed = max((dimension(slots) for slots in asked if slots is not None), default=0)
     if not needed:
@@ -140,16 +140,18 @@ def _evaluated(mission: Mission, flown: Ensemble) -> tuple[dict[str, Bools], dic
     metrics = {"shape": np.full(count, np.nan), "handed": np.full(count, np.nan)}
     formation, t, last = None, 0.0, len(mission.phases) - 1
     for index, (phase, r) in enumerate(zip(mission.phases, flown.ends, strict=True)):
-        shaping = isinstance(phase, Establish | Reshape)
+        shaping = phase.shaping
         length = phase.duration if phase.until is None else phase.until - t
         t += length or 0.0
-        formation = phase.formation if shaping else formation
+        formation = shaping.formation if shaping is not None else formation
         if formation is None:
             continue
-        judged = shaping or index == last
+        judged = shaping is not None or index == last
         asked = mission.formation_distances(formation)
         wide = max_edge_error(r, mission.formation_edges(formation), asked)
-        blending = shaping and phase.reference != "step" and phase.blend > (length or 0.0)
+        blending = (
+            shaping is not None and shaping.reference != "step" and shaping.blend > (length or 0.0)
+        )
         if index == last and not blending and len(asked):
             metrics["constraint_end"] = wide
         if judged:

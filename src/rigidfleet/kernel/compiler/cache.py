@@ -13,7 +13,6 @@ import os
 import shlex
 import stat
 import sys
-import tempfile
 import threading
 import warnings
 from collections.abc import Generator
@@ -79,20 +78,6 @@ def opened(file: str | Path) -> Generator[IO[bytes]]:
             raise PermissionError(errno.EACCES, f"{file} is no file")
         _refuse(file, found)
         yield stream
-
-
-@contextmanager
-def replacing(file: str | Path) -> Generator[IO[bytes]]:
-    """A new file for this user alone, which takes the place of the old one as soon as it is whole."""
-    descriptor, part = tempfile.mkstemp(dir=Path(file).parent, prefix=".", suffix=".part")
-    try:
-        with open(descriptor, "wb") as stream:
-            yield stream
-        os.replace(part, file)
-    except BaseException:
-        with suppress(OSError):
-            os.unlink(part)
-        raise
 
 
 def not_kept(error: OSError) -> None:

@@ -21,7 +21,8 @@ from numba.core.caching import (
 )
 from numba.core.ccallback import CFunc
 
-from rigidfleet.kernel.compiler.cache import cache_directory, not_kept, opened, replacing
+from rigidfleet._files import replacing
+from rigidfleet.kernel.compiler.cache import cache_directory, not_kept, opened
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -120,7 +121,7 @@ class _Files(IndexDataCacheFile):
             return super()._load_data(name)
 
     def _open_for_write(self, filepath: str) -> Any:
-        return replacing(filepath)
+        return replacing(filepath, private=True)
 
 
 class _Cache(FunctionCache):

@@ -3,7 +3,7 @@
 Numba translates the integrator, the recorder, the monitor and all they call to LLVM's language. What is then called
 from nowhere else may be rearranged at will, and is optimised once, together.
 
-In a process of its own (`native.build_process`) it writes the code to standard output. Most of the time goes into the
+In a process of its own (`objects.build_process`) it writes the code to standard output. Most of the time goes into the
 translation, so that a second process does its half of it meanwhile.
 """
 
@@ -17,7 +17,6 @@ from typing import Any
 
 import llvmlite.binding as llvm
 from numba import cfunc, typeof, types
-from numba.core import codegen, compiler, cpu, serialize
 
 from rigidfleet.kernel import (
     constraint,
@@ -29,9 +28,10 @@ from rigidfleet.kernel import (
     recorder,
     rigid_body,
 )
+from rigidfleet.kernel.compiler import numba_internals
 from rigidfleet.kernel.compiler.jit import OPTIONS
 from rigidfleet.kernel.compiler.pointers import Pointer, pointer
-from rigidfleet.kernel.engine import native
+from rigidfleet.kernel.engine import objects, packing
 
 _Functions = dict[Any, tuple[types.Type, ...]]
 #: What every evaluation of a flight goes through: its calls would take a tenth of a small formation's time.
@@ -46,7 +46,7 @@ _QUICK = ("sroa", "simplify_cfg", "instruction_combine", "simplify_cfg")
 
 
 def machine_code(second: "_SecondProcess | None" = None) -> list[bytes]:
-    """Object code of the three C functions that `native` calls, `native.ENTRIES`.
+    """Object code of the three C functions that `native` calls, `objects.ENTRIES`.
 
     All their arguments are addresses of named tuples. They integrate, and return what `dopri5.integrate` does,
     record, and watch, as `monitor.watch` does. The ``second`` process, if there is one, does part of the work.
@@ -68,7 +68,7 @@ def machine_code(second: "_SecondProcess | None" = None) -> list[bytes]:
     if second is not None:
         for function, arguments in _halves()[0].items():  # before what waits for the second
             function.compile(arguments)
-    functions = zip((integrate_segment, record_segment), native.ENTRIES, strict=False)
+    functions = zip((integrate_segment, record_segment), objects.ENTRIES, strict=False)
     modules = [_module(function, name) for function, name in functions]
     codes = [_object(*module) for module in modules]
     made = None if second is None else second.monitor()
@@ -82,11 +82,11 @@ def _monitor() -> bytes:
     def watch_trail(p, w, state, found):
         return monitor.watch(problem(p), workspace(w), integrator(state), watching(found))
 
-    return _object(*_module(watch_trail, native.ENTRIES[2]))
+    return _object(*_module(watch_trail, objects.ENTRIES[2]))
 
 
 def _pointers() -> list[Any]:
-    return [pointer(typeof(x)) for x in native.examples()]
+    return [pointer(typeof(x)) for x in packing.examples()]
 
 
 def _module(function: Any, name: str) -> tuple[str, str, str]:
@@ -105,7 +105,7 @@ def _object(text: str, symbol: str, name: str) -> bytes:
             raise RuntimeError(
                 f"the kernel needs {function.name}, which only Numba's own callers have"
             )
-    return native.target_machine().emit_object(module)
+    return objects.target_machine().emit_object(module)
 
 
 def _simplified(text: str, symbol: str, name: str) -> llvm.ModuleRef:
@@ -131,42 +131,15 @@ def _simplified(text: str, symbol: str, name: str) -> llvm.ModuleRef:
 def _passes(level: int) -> Any:
     options = llvm.create_pipeline_tuning_options(speed_level=level)
     options.loop_vectorization = False  # loops are short; the integrator's sums are of vectors
-    return llvm.create_pass_builder(native.target_machine(), options)
+    return llvm.create_pass_builder(objects.target_machine(), options)
 
 
 # -- two processes -----------------------------------------------------------------------------------
 
 
-def _translate_only() -> None:
-    """Keep Numba from all that nobody needs: machine code of each function, and of each a module with all it calls."""
-
-    def executable(_context: Any, library: Any, function: Any, environment: Any) -> Any:
-        name, module = function.qualname.split(".")[-1], function.lookup_module()
-        return cpu._dynfunc.make_function(module, name, "", 0, environment, (library,))
-
-    def finalize(library: Any) -> None:
-        library._finalized = True
-
-    def whole(library: Any) -> str:
-        module, seen, rest = library._final_module.clone(), {library}, [library]
-        while rest:
-            for other in rest.pop()._linking_libraries:
-                if other not in seen:
-                    seen.add(other)
-                    rest.append(other)
-                    module.link_in(other._final_module, preserve=True)
-        return str(module)
-
-    cpu.CPUContext.get_executable = executable
-    codegen.CPUCodeLibrary.finalize = finalize
-    codegen.CPUCodeLibrary.get_llvm_str = whole
-    codegen.JITCodeLibrary._finalize_specific = lambda _library: None
-    codegen.JITCPUCodegen.set_env = lambda _codegen, _name, _environment: None
-
-
 def _halves() -> tuple[_Functions, _Functions]:
     """Functions, and the types of their arguments: those that this process begins with, those of the second."""
-    example, work, _, _, out, _ = native.examples()
+    example, work, _, _, out, _ = packing.examples()
     p, w, record = (Pointer(typeof(x)) for x in (example, work, out))
     disturbance = Pointer(typeof(example.disturbance))
     number, row, places = types.float64, typeof(example.vehicles.m), typeof(work.r)
@@ -192,16 +165,8 @@ def _halves() -> tuple[_Functions, _Functions]:
 
 def _translated() -> dict[str, bytes]:
     """The second half, each function as Numba would keep it, but simplified already."""
-    done = {}
-    for function, arguments in _halves()[1].items():
-        function.compile(arguments)
-        result = function.overloads[arguments]
-        symbol = result.fndesc.llvm_func_name
-        module = _simplified(result.library.get_llvm_str(), symbol, symbol)
-        result.library.serialize_using_object_code = result.library.serialize_using_bitcode
-        result.library._final_module = module
-        done[function.__name__] = serialize.dumps(result._reduce())
-    return done
+    halves = _halves()[1].items()
+    return {f.__name__: numba_internals.portable(f, types_, _simplified) for f, types_ in halves}
 
 
 class _SecondProcess:
@@ -210,12 +175,14 @@ class _SecondProcess:
     Whatever comes to nothing there is done here.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, shares: bool) -> None:
+        self._shares = shares
         self._process = subprocess.Popen(
-            native.build_process(half=True), cwd=native.ELSEWHERE, stdout=subprocess.PIPE
+            objects.build_process(half=True), cwd=objects.ELSEWHERE, stdout=subprocess.PIPE
         )  # fmt: skip
-        for function, arguments in _halves()[1].items():
-            function._cache = self._Half(self, function.__name__, arguments)
+        for function, arguments in _halves()[1].items() if shares else ():
+            half = self._Half(self, function.__name__, arguments)
+            numba_internals.given_by(function, half)
 
     @cached_property
     def translated(self) -> dict[str, bytes]:
@@ -224,7 +191,8 @@ class _SecondProcess:
 
     def monitor(self) -> bytes | None:
         """The object of the monitor."""
-        return self._answer() if self.translated else None
+        done = self.translated
+        return self._answer() if done or not self._shares else None
 
     def _answer(self) -> Any:
         assert self._process.stdout is not None
@@ -242,19 +210,23 @@ class _SecondProcess:
             done = self._process.translated.get(self._name)
             if done is None or arguments != self._arguments:
                 return None
-            return compiler.CompileResult._rebuild(context, *pickle.loads(done))
+            return numba_internals.received(context, done)
 
         def save_overload(self, *_: Any) -> None:
             """Nothing is kept."""
 
 
 def main(*, half: bool) -> None:
-    """Write the machine code to standard output; or only what the second process does."""
-    output = sys.stdout.buffer
-    _translate_only()
+    """Write the machine code to standard output; or only what the second process does.
+
+    Numba's internals are used where they are known; else the second process makes the monitor alone.
+    """
+    output, known = sys.stdout.buffer, numba_internals.known()
+    if known:
+        numba_internals.translate_only()
     if half:
-        pickle.dump(_translated(), output)
+        pickle.dump(_translated() if known else {}, output)
         output.flush()
         pickle.dump(_monitor(), output)
         return
-    output.write(native.concatenated(machine_code(_SecondProcess())))
+    output.write(objects.concatenated(machine_code(_SecondProcess(shares=known))))

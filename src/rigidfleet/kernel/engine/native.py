@@ -10,52 +10,40 @@ from __future__ import annotations
 import ctypes
 import hashlib
 import os
-import struct
 import subprocess
 import sys
 import threading
 from collections.abc import Sequence
 from contextlib import suppress
-from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import llvmlite.binding as llvm
 import numpy as np
 
-from rigidfleet.kernel.compiler.cache import cache_directory, not_kept, opened, replacing, told
-from rigidfleet.kernel.problem import (
-    CONSTANT,
-    ITERATED,
-    OPEN,
-    RIGID,
-    ConstraintLaw,
-    Control,
-    Feedback,
-    Motion,
-    Problem,
-    Reference,
-    Vehicles,
-    Workspace,
-    graph,
-    no_disturbance,
+from rigidfleet._files import replacing
+from rigidfleet.kernel.compiler.cache import cache_directory, not_kept, opened, told
+from rigidfleet.kernel.engine.objects import (
+    ELSEWHERE,
+    ENTRIES,
+    build_process,
+    concatenated,
+    separated,
+    target_machine,
 )
-from rigidfleet.kernel.problem import workspace as kernel_workspace
+from rigidfleet.kernel.engine.packing import NOTHING, UNRECORDED, Packed, pack, packed
+from rigidfleet.kernel.problem import (
+    Problem,
+    Workspace,
+)
 from rigidfleet.kernel.records import (
     IntegratorState,
     Monitor,
     Record,
     Segment,
-    integrator,
-    monitor,
     recorder,
 )
-from rigidfleet.typing import Floats, Ints
-
-#: What the machine code is called, its arguments being addresses: int64(problem, workspace, integrator, segment),
-#: int64(problem, workspace, segment, record) and int64(problem, workspace, integrator, monitor). Each comes in an
-#: object of its own.
-ENTRIES = "rigidfleet_integrate", "rigidfleet_record", "rigidfleet_watch"
+from rigidfleet.typing import Floats
 
 
 def integrate(
@@ -69,8 +57,8 @@ def integrate(
     max_steps: int,
 ) -> int:
     """Integrate to ``t_end`` [s], see `rigidfleet.kernel.dopri5.integrate`."""
-    segment = _pack(Segment(t_end, fresh, max_steps, times, samples, _NOTHING))
-    return _call(_code().integrate, _packed(problem), _packed(workspace), _packed(state), segment)
+    segment = pack(Segment(t_end, fresh, max_steps, times, samples, NOTHING))
+    return _call(_code().integrate, packed(problem), packed(workspace), packed(state), segment)
 
 
 def record(problem: Problem, workspace: Workspace, times: Floats, samples: Floats) -> Record:
@@ -78,7 +66,7 @@ def record(problem: Problem, workspace: Workspace, times: Floats, samples: Float
     n, m = len(problem.vehicles.m), len(problem.graph.edges)
     out = recorder(len(times), n, m)
     segment = Segment(0.0, False, 0, times, samples, np.empty(samples.shape[1]))
-    _call(_code().record, _packed(problem), _packed(workspace), _pack(segment), _pack(out))
+    _call(_code().record, packed(problem), packed(workspace), pack(segment), pack(out))
     return out
 
 
@@ -89,143 +77,25 @@ class Watch:
         # The recorder evaluates the law, at the monitor's own time and state.
         n = monitor.states.shape[1]
         segment = Segment(0.0, False, 0, monitor.time, monitor.states, np.empty(n))
-        self._kept = _pack(segment), _pack(_UNRECORDED)
+        self._kept = pack(segment), pack(UNRECORDED)
         self.monitor = monitor._replace(
             recorder=_code().recorder, segment=self._kept[0].address, record=self._kept[1].address
         )
-        self._packed = _pack(self.monitor)
+        self._packed = pack(self.monitor)
 
     def __call__(self, problem: Problem, workspace: Workspace, state: IntegratorState) -> int:
         """What `rigidfleet.kernel.monitor.watch` returns."""
-        packed = _packed(problem), _packed(workspace), _packed(state)
-        return _call(_code().watch, *packed, self._packed)
+        return _call(_code().watch, packed(problem), packed(workspace), packed(state), self._packed)
 
 
 def closed_loop(t: float, y: Floats, dy: Floats, problem: Problem, workspace: Workspace) -> None:
     """Right-hand side dy (n,) at time t [s] and state y (n,), see `rigidfleet.kernel.dynamics.closed_loop`."""
     segment = Segment(0.0, False, 0, np.array([t]), y.reshape(1, -1), dy)
-    packed = _packed(problem), _packed(workspace), _pack(segment), _packed(_UNRECORDED)
-    _call(_code().record, *packed)
+    _call(_code().record, packed(problem), packed(workspace), pack(segment), packed(UNRECORDED))
 
 
-def _call(function: Any, *packed: _Packed) -> int:
-    return function(*(p.address for p in packed))
-
-
-# -- named tuples in words ---------------------------------------------------------------------------
-
-
-class _Packed(NamedTuple):
-    """A named tuple in words, and the tuple itself, which keeps its arrays."""
-
-    of: Any
-    words: Ints
-    address: int
-
-
-class _Layout(NamedTuple):
-    """How a named tuple of one type is laid out."""
-
-    code: struct.Struct
-    arrays: tuple[tuple[str, int], ...]  # kind of number and dimensions of each
-
-
-def _flatten(x: Any, code: list[str], words: list[Any], arrays: list[tuple[str, int]]) -> None:
-    """Append the words of a named tuple, their kinds, and those of its arrays."""
-    for value in x:
-        if isinstance(value, np.ndarray):
-            if not value.flags.c_contiguous:
-                raise TypeError("the kernel takes C-contiguous arrays alone")
-            code.append("q" * (1 + value.ndim))
-            words += (value.__array_interface__["data"][0], *value.shape)
-            arrays.append((value.dtype.char, value.ndim))
-        elif isinstance(value, tuple):
-            _flatten(value, code, words, arrays)
-        elif isinstance(value, float):
-            code.append("d")
-            words.append(value)
-        else:
-            code.append("q")
-            words.append(int(value))
-
-
-def _pack(x: Any) -> _Packed:
-    """Lay a named tuple down in words.
-
-    Raises
-    ------
-    TypeError
-        Numbers or arrays are not of the types that the kernel is compiled for.
-    """
-    code: list[str] = []
-    values: list[Any] = []
-    arrays: list[tuple[str, int]] = []
-    _flatten(x, code, values, arrays)
-    layout = _layout(type(x))
-    if tuple(arrays) != layout.arrays or "".join(code) != layout.code.format[1:]:
-        raise TypeError(
-            f"this {type(x).__name__} has arrays or numbers of other types than the kernel takes"
-        )
-    words = np.frombuffer(layout.code.pack(*values), dtype=np.int64)
-    return _Packed(x, words, words.__array_interface__["data"][0])
-
-
-class _Last(threading.local):
-    """The last of each type that a thread has packed: flights call the kernel with the same ones again and again."""
-
-    def __init__(self) -> None:
-        self.packed: dict[type, _Packed] = {}
-
-
-_last = _Last()
-
-
-def _packed(x: Any) -> _Packed:
-    found = _last.packed.get(type(x))
-    if found is None or found.of is not x:
-        found = _last.packed[type(x)] = _pack(x)
-    return found
-
-
-@cache
-def _layout(kind: type) -> _Layout:
-    code: list[str] = []
-    arrays: list[tuple[str, int]] = []
-    _flatten(next(x for x in examples() if isinstance(x, kind)), code, [], arrays)
-    return _Layout(struct.Struct("=" + "".join(code)), tuple(arrays))
-
-
-@cache
-def examples() -> tuple[Problem, Workspace, IntegratorState, Segment, Record, Monitor]:
-    """One of each named tuple, as small as can be: their fields have the types of all."""
-    one, none, places, frame = np.ones(1), np.zeros(0), np.zeros((1, 3)), np.eye(3)
-    problem = Problem(
-        body_formulation=False,
-        has_frame=False,
-        vehicles=Vehicles(one, one, 1.0, 1.0, one, False, 0.0),
-        graph=graph(np.zeros((0, 2), dtype=np.int64), one),
-        law=ConstraintLaw(0.0, 0.0, 0.0, ITERATED, 0.0, 0, 0.0, 0.0, 0.0),
-        reference=Reference(CONSTANT, 0.0, 0.0, none, none, places, places, np.zeros(3)),
-        motion=Motion(np.zeros(2), np.zeros((1, 6, 6)), frame),
-        feedback=Feedback(
-            none, np.zeros((0, 4)), np.zeros((0, 4)), 0.0, *np.zeros((2, 3)), frame, np.zeros(3), np.zeros(4)
-        ),
-        control=Control(OPEN, places, 0.0, 0.0, RIGID),
-        external=0,
-        disturbance=no_disturbance(one),
-    )  # fmt: skip
-    state = integrator(np.zeros(6), 0.0, rtol=0.0, atol=np.ones(6))
-    segment = Segment(0.0, False, 0, none, np.zeros((0, 6)), none)
-    nowhere = np.zeros((0, 6))
-    watching = monitor(one, nowhere, nowhere, 6, 3)
-    return problem, kernel_workspace(1, 0), state, segment, _UNRECORDED, watching
-
-
-_NOTHING = np.zeros(0)
-_UNRECORDED = recorder(0, 0, 0)
-
-
-# -- machine code ------------------------------------------------------------------------------------
+def _call(function: Any, *arguments: Packed) -> int:
+    return function(*(a.address for a in arguments))
 
 
 class _Code(NamedTuple):
@@ -238,6 +108,8 @@ class _Code(NamedTuple):
 
 
 _loading = threading.Lock()
+
+
 _loaded: list[_Code] = []
 
 
@@ -302,39 +174,11 @@ def _compile() -> list[bytes]:
             done = subprocess.run(
                 build_process(), env=os.environ | quiet, cwd=ELSEWHERE, capture_output=True, check=False
             )  # fmt: skip
-            if done.returncode == 0 and (parts := _separated(done.stdout)) is not None:
+            if done.returncode == 0 and (parts := separated(done.stdout)) is not None:
                 return parts
     from rigidfleet.kernel.engine.build import machine_code
 
     return machine_code()
-
-
-#: Where the processes that compile are: Numba takes settings from a file that it finds where it is.
-ELSEWHERE = os.path.abspath(os.sep)
-_BUILD = "import sys; sys.path[:] = sys.argv[1:]; from rigidfleet.kernel.engine import build; build.main(half={})"
-_FLAGS = {"isolated": "-I", "ignore_environment": "-E", "no_user_site": "-s", "no_site": "-S"}
-
-
-def build_process(*, half: bool = False) -> list[str]:
-    """Command of a process that compiles: it imports what this one would, but nothing from the current folder.
-
-    An interactive Python, or one given its code by ``-c``, has the current folder on its path as ``""``. That goes;
-    any other folder on the path has been asked for. Last comes the one that this package is from.
-    """
-    flags = [flag for name, flag in _FLAGS.items() if getattr(sys.flags, name)]
-    path = [os.path.abspath(folder) for folder in sys.path if isinstance(folder, str) and folder]
-    home = str(Path(__file__).resolve().parents[3])
-    return [sys.executable, *flags, "-P", "-c", _BUILD.format(half), *path, home]
-
-
-def target_machine() -> Any:
-    """What machine code is made for: this machine."""
-    return llvm.Target.from_default_triple().create_target_machine(
-        cpu=llvm.get_host_cpu_name(), features=llvm.get_host_cpu_features().flatten(), opt=3, jit=True
-    )  # fmt: skip
-
-
-# -- the cache ---------------------------------------------------------------------------------------
 
 
 def _file() -> Path:
@@ -349,30 +193,11 @@ def _file() -> Path:
     return cache_directory() / f"flight-{hashlib.sha256(machine.encode()).hexdigest()[:16]}.o"
 
 
-def concatenated(parts: Sequence[bytes]) -> bytes:
-    """Objects in one, each after its length, and their digest, so that half of them is never called."""
-    code = b"".join(len(part).to_bytes(8, "little") + part for part in parts)
-    return code + hashlib.sha256(code).digest()
-
-
-def _separated(data: bytes) -> list[bytes] | None:
-    """Objects that were `concatenated`; None if they are not whole."""
-    code, digest = data[:-32], data[-32:]
-    if not code or hashlib.sha256(code).digest() != digest:
-        return None
-    parts = []
-    while code:
-        end = 8 + int.from_bytes(code[:8], "little")
-        parts.append(code[8:end])
-        code = code[end:]
-    return parts
-
-
 def _read() -> list[bytes] | None:
     """Machine code that is kept, if there is any that may be run."""
     try:
         with opened(_file()) as stream:
-            return _separated(stream.read())
+            return separated(stream.read())
     except OSError:
         return None
 
@@ -380,7 +205,7 @@ def _read() -> list[bytes] | None:
 def _write(parts: Sequence[bytes]) -> bool:
     """Keep machine code, or warn that it will be compiled again."""
     try:
-        with replacing(_file()) as stream:
+        with replacing(_file(), private=True) as stream:
             stream.write(concatenated(parts))
     except OSError as error:
         not_kept(error)

@@ -98,7 +98,7 @@ class Pilot:
                 " Give one a shape or slots in the mission"
             )
         self.mission = mission
-        self.masses = np.array(mission.agents.mass)
+        self.masses = mission.fleet.mass
         self.archive = Archive(max(mission.output_step, _FINEST))
         self.flight = Flight(mission, force=self._wind, sampler=self._samples, flips=True)
         self.gusts: list[Gust] = []
@@ -139,7 +139,7 @@ class Pilot:
         phase, settle = self.asked[-1], 0.0
         if phase.control == "open":
             settle = _STEADY
-        blend = phase.blend if isinstance(phase, Establish | Reshape) else 0.0
+        blend = phase.shaping.blend if phase.shaping is not None else 0.0
         return self.t < self.phases[-1].t_start + blend + settle - 1e-9
 
     # -- what it can be told ----------------------------------------------------------------------
@@ -204,7 +204,7 @@ class Pilot:
     # -- phases -----------------------------------------------------------------------------------
 
     def _first(self) -> str:
-        names = [p.formation for p in self.mission.phases if isinstance(p, Establish | Reshape)]
+        names = [p.shaping.formation for p in self.mission.phases if p.shaping is not None]
         return next((n for n in names if n in self.formations), self.formations[0])
 
     def _take(self, formation: str, *, establish: bool = False) -> None:

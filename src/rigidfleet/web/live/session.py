@@ -75,7 +75,7 @@ class Session:
                 {"name": name, "width": c.values[0].size if c.values.ndim > 1 else 1}
                 for name, c in columns.items()
             ]
-            start = np.array(self.mission.agents.position)
+            start = self.mission.fleet.position
             near = sight(self.mission, start.min(axis=0) - _AROUND, start.max(axis=0) + _AROUND)
             info = describe(self.mission, self.mission.edges[self.shown], self.tension) | {
                 "columns": [*widths, {"name": "target", "width": 7}],

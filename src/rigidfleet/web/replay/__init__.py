@@ -14,7 +14,8 @@ from typing import Any, overload
 
 import numpy as np
 
-from rigidfleet.result import Result, as_result, write_file
+from rigidfleet._files import write_file
+from rigidfleet.result import Result, as_result
 from rigidfleet.typing import Floats, Ints
 from rigidfleet.web.replay.pack import PackedColumn, pack
 from rigidfleet.web.replay.page import page, read

@@ -51,7 +51,7 @@ def observe(result: Result, shown: Ints, tension: float) -> dict[str, PackedColu
     force = result.input_force + result.constraint_force
     return {
         "position": PackedColumn(result.position, fine),
-        "thrust": PackedColumn(thrust_directions(force, np.array(mission.agents.mass)), 5e-4),
+        "thrust": PackedColumn(thrust_directions(force, mission.fleet.mass), 5e-4),
         "slot": PackedColumn(result.slot_position - result.position, fine),
         "cm": PackedColumn(result.cm, fine),
         "attitude": PackedColumn(result.attitude, 1e-4),
@@ -127,7 +127,7 @@ def _plots(mission: Mission) -> list[dict[str, Any]]:
 
 def _alike(mission: Mission) -> list[Ints] | None:
     """Vehicles whose greatest thrust is one line, as they have one limit; None of too many limits."""
-    limits = np.array(mission.agents.thrust_limit)
+    limits = mission.fleet.thrust_limit
     if len(limits) <= _LINES:
         return [np.array([i]) for i in range(len(limits))]
     known = np.unique(limits)
@@ -151,7 +151,7 @@ def _thrust_lines(mission: Mission, thrust: Floats) -> Floats:
     """Samples (K, lines) of `_thrust_plot`."""
     alike = _alike(mission)
     if alike is None:
-        thrust = 100.0 * thrust / np.array(mission.agents.thrust_limit)
+        thrust = 100.0 * thrust / mission.fleet.thrust_limit
     elif len(alike) > 1 or thrust.shape[1] == 1:
         return np.stack([thrust[:, who].max(axis=1) for who in alike], axis=1)
     return np.stack([thrust.min(axis=1), thrust.max(axis=1)], axis=1)

@@ -1,0 +1,151 @@
+"""Named tuples in words of eight bytes, as machine code reads them; see `rigidfleet.kernel.compiler.pointers`."""
+
+from __future__ import annotations
+
+import struct
+import threading
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rigidfleet.kernel.problem import (
+    CONSTANT,
+    ITERATED,
+    OPEN,
+    RIGID,
+    ConstraintLaw,
+    Control,
+    Feedback,
+    Motion,
+    Problem,
+    Reference,
+    Vehicles,
+    Workspace,
+    graph,
+    no_disturbance,
+)
+from rigidfleet.kernel.problem import workspace as kernel_workspace
+from rigidfleet.kernel.records import (
+    IntegratorState,
+    Monitor,
+    Record,
+    Segment,
+    integrator,
+    monitor,
+    recorder,
+)
+from rigidfleet.typing import Ints
+
+
+class Packed(NamedTuple):
+    """A named tuple in words, and the tuple itself, which keeps its arrays."""
+
+    of: Any
+    words: Ints
+    address: int
+
+
+class _Layout(NamedTuple):
+    """How a named tuple of one type is laid out."""
+
+    code: struct.Struct
+    arrays: tuple[tuple[str, int], ...]  # kind of number and dimensions of each
+
+
+def _flatten(x: Any, code: list[str], words: list[Any], arrays: list[tuple[str, int]]) -> None:
+    """Append the words of a named tuple, their kinds, and those of its arrays."""
+    for value in x:
+        if isinstance(value, np.ndarray):
+            if not value.flags.c_contiguous:
+                raise TypeError("the kernel takes C-contiguous arrays alone")
+            code.append("q" * (1 + value.ndim))
+            words += (value.__array_interface__["data"][0], *value.shape)
+            arrays.append((value.dtype.char, value.ndim))
+        elif isinstance(value, tuple):
+            _flatten(value, code, words, arrays)
+        elif isinstance(value, float):
+            code.append("d")
+            words.append(value)
+        else:
+            code.append("q")
+            words.append(int(value))
+
+
+def pack(x: Any) -> Packed:
+    """Lay a named tuple down in words.
+
+    Raises
+    ------
+    TypeError
+        Numbers or arrays are not of the types that the kernel is compiled for.
+    """
+    code: list[str] = []
+    values: list[Any] = []
+    arrays: list[tuple[str, int]] = []
+    _flatten(x, code, values, arrays)
+    layout = _layout(type(x))
+    if tuple(arrays) != layout.arrays or "".join(code) != layout.code.format[1:]:
+        raise TypeError(
+            f"this {type(x).__name__} has arrays or numbers of other types than the kernel takes"
+        )
+    words = np.frombuffer(layout.code.pack(*values), dtype=np.int64)
+    return Packed(x, words, words.__array_interface__["data"][0])
+
+
+class _Last(threading.local):
+    """The last of each type that a thread has packed: flights call the kernel with the same ones again and again."""
+
+    def __init__(self) -> None:
+        self.packed: dict[type, Packed] = {}
+
+
+_last = _Last()
+
+
+def packed(x: Any) -> Packed:
+    """`pack`, unless the last named tuple of this type that the thread packed is the same one."""
+    found = _last.packed.get(type(x))
+    if found is None or found.of is not x:
+        found = _last.packed[type(x)] = pack(x)
+    return found
+
+
+@cache
+def _layout(kind: type) -> _Layout:
+    code: list[str] = []
+    arrays: list[tuple[str, int]] = []
+    _flatten(next(x for x in examples() if isinstance(x, kind)), code, [], arrays)
+    return _Layout(struct.Struct("=" + "".join(code)), tuple(arrays))
+
+
+@cache
+def examples() -> tuple[Problem, Workspace, IntegratorState, Segment, Record, Monitor]:
+    """One of each named tuple, as small as can be: their fields have the types of all."""
+    one, none, places, frame = np.ones(1), np.zeros(0), np.zeros((1, 3)), np.eye(3)
+    problem = Problem(
+        body_formulation=False,
+        has_frame=False,
+        vehicles=Vehicles(one, one, 1.0, 1.0, one, False, 0.0),
+        graph=graph(np.zeros((0, 2), dtype=np.int64), one),
+        law=ConstraintLaw(0.0, 0.0, 0.0, ITERATED, 0.0, 0, 0.0, 0.0, 0.0),
+        reference=Reference(CONSTANT, 0.0, 0.0, none, none, places, places, np.zeros(3)),
+        motion=Motion(np.zeros(2), np.zeros((1, 6, 6)), frame),
+        feedback=Feedback(
+            none, np.zeros((0, 4)), np.zeros((0, 4)), 0.0, *np.zeros((2, 3)), frame, np.zeros(3), np.zeros(4)
+        ),
+        control=Control(OPEN, places, 0.0, 0.0, RIGID),
+        external=0,
+        disturbance=no_disturbance(one),
+    )  # fmt: skip
+    state = integrator(np.zeros(6), 0.0, rtol=0.0, atol=np.ones(6))
+    segment = Segment(0.0, False, 0, none, np.zeros((0, 6)), none)
+    nowhere = np.zeros((0, 6))
+    watching = monitor(one, nowhere, nowhere, 6, 3)
+    return problem, kernel_workspace(1, 0), state, segment, UNRECORDED, watching
+
+
+NOTHING = np.zeros(0)
+
+
+UNRECORDED = recorder(0, 0, 0)
