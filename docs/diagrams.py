@@ -151,7 +151,7 @@ def constraint_architecture() -> Figure:
     """Constraint forces alone (Fig. 4): control = "open"."""
     fig, ax = canvas(16, 5.0)
     box(ax, 2.0, 3.6, "desired distances\n" r"$d,\ \dot d,\ \ddot d$")
-    box(ax, 6.4, 3.6, "constraint force\n" r"$f_C=J^T\lambda$  (Eq. 12)", w=3.8, colour=RED)
+    box(ax, 6.4, 3.6, "constraint force\n" r"$f_C=J^T\lambda$  Eq. (12)", w=3.8, colour=RED)
     box(ax, 2.0, 1.3, "weight balance\n" r"$f_{u,i}=m_i g$")
     sum_sign(ax, 9.7, 3.6)
     box(ax, 13.0, 3.6, "agents\n" r"$m_i\ddot r_i=f_{E,i}+f_{u,i}+f_{C,i}$", w=4.4)
@@ -168,7 +168,7 @@ def body_architecture() -> Figure:
     fig, ax = canvas(18.4, 6.6)
     box(ax, 1.9, 5.1, "waypoint\n" r"$r_{wp},v_{wp},q_{wp},\omega_{wp}$", w=3.2)
     box(ax, 6.0, 5.1, "LQR on the\nvirtual body", w=2.8, colour=BLUE)
-    box(ax, 9.9, 5.1, "allocation\n(Eq. 24 to 27)", w=2.8, colour=BLUE)
+    box(ax, 9.9, 5.1, "allocation\nEqs. (24)-(27)", w=2.8, colour=BLUE)
     sum_sign(ax, 12.4, 5.1)
     box(ax, 15.6, 5.1, "agents\n" r"$m_i\ddot r_i=f_{E,i}+f_{u,i}+f_{C,i}$", w=4.4)
     box(ax, 9.9, 2.9, "constraint force\n" r"$f_C=J^T\lambda$", w=2.8, colour=RED)

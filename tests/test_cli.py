@@ -1,3 +1,4 @@
+import io
 import itertools
 import json
 import os
@@ -15,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from rigidfleet.cli import app as cli
 from rigidfleet.cli import codes, console
@@ -114,7 +116,13 @@ def test_help_is_light():
     """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    for words in ("0 done", "1 it flew", "2 bad input", "130 interrupted", "--no-figures"):
+    for words in (
+        "0 success",
+        "1 the flight failed",
+        "2 invalid input",
+        "130 interrupted",
+        "--no-figures",
+    ):
         assert words in " ".join(done.stdout.split())
 
 
@@ -130,9 +138,9 @@ def test_module_is_the_command():
         (["rnu"], 'Did you mean "run"'),
         (["run", "short.toml", "--ouut", "x"], "Did you mean --out"),
         (["run"], "MISSION requires an argument"),
-        (["run", "short.toml", "more"], "Unexpected: more"),
+        (["run", "short.toml", "more"], "Unexpected arguments: more"),
         (["missions", "--print"], "--print requires an argument"),
-        (["missions", "--print", "square", "--schema"], "exclude each other"),
+        (["missions", "--print", "square", "--schema"], "cannot be combined"),
         (["missions", "--print", "sqare"], "did you mean 'square'"),
         (["run", "sqare"], "did you mean 'square'"),
         (["check", "nowhere.toml"], "no such file"),
@@ -179,10 +187,10 @@ def test_check(capsys):
     """A mission that is right is counted up, and its phases are listed."""
     assert cli.main(["check", "narrow-passage"]) == codes.PASSED
     first, _, *lines = capsys.readouterr().out.splitlines()
-    assert first == "narrow-passage: right: 3 agents, 2 formations, 12 phases, 90 s"
+    assert first == "narrow-passage: valid: 3 agents, 2 formations, 12 phases, 90 s"
     phases, facts = lines[: lines.index("")], lines[lines.index("") :]
     assert len(phases) == 12
-    assert facts[-1] == "narrow-passage: nothing found that will fail"
+    assert facts[-1] == "narrow-passage: no problems found"
     assert max(map(len, facts)) <= 80
     assert "infinitesimally rigid" in facts[1]
     wp2 = "WP2 fly (35, 7.5, 20) m, (2, 0, 0) m/s, yaw 0° at 32 s tracking"
@@ -216,7 +224,7 @@ def test_check_json(capsys):
 def test_check_that_fails(capsys):
     """What will fail is said, with exit code 1; in JSON, too."""
     assert cli.main(["check", "establish-cube-as-printed"]) == codes.FAILED
-    assert "fails  'cube' will be another shape" in capsys.readouterr().out
+    assert "fails  'cube' will have another shape" in capsys.readouterr().out
     assert cli.main(["check", "establish-cube-as-printed", "--json"]) == codes.FAILED
     assert json.loads(capsys.readouterr().out)["passed"] is False
 
@@ -271,7 +279,7 @@ def test_new(capsys):
     assert "(3, -4, 9) m" in capsys.readouterr().out
     text = Path("mine.toml").read_text(encoding="utf-8")
     assert cli.main(["new", "mine"]) == codes.BAD_INPUT
-    assert "mine.toml: exists already" in capsys.readouterr().err
+    assert "mine.toml: already exists" in capsys.readouterr().err
     assert Path("mine.toml").read_text(encoding="utf-8") == text
     assert cli.main(["new", "mine.toml", "--force", "--quiet"]) == codes.PASSED
     assert capsys.readouterr() == ("", "")
@@ -305,9 +313,9 @@ def test_new_json(capsys):
     [
         (["--shape", "trangle"], "did you mean 'triangle'"),
         (["--shape", "pentagon"], "did you mean 'polygon' with 5 agents?"),
-        (["--agents", "2.5"], "Invalid value for --agents: '2.5' is no whole number."),
-        (["--agents", "1e400"], "is no whole number"),
-        (["--thrust-limit", "5"], "it would fail: agent 1 needs"),
+        (["--agents", "2.5"], "Invalid value for --agents: '2.5' is not a whole number."),
+        (["--agents", "1e400"], "is not a whole number"),
+        (["--thrust-limit", "5"], "the flight would fail: agent 1 needs"),
         (["--shape", "sphere", "--agents", "300", "--to", "9", "9", "9"], "reaches 22.6 m below"),
         (["--mass", "-1"], "agents.mass = -1"),
         (["--to", "1", "2"], "requires"),
@@ -334,7 +342,7 @@ def test_a_whole_number_is_not_rounded(capsys, tokens):
     """Wherever a count is asked for, a fraction is one clear error."""
     assert cli.main(tokens) == codes.BAD_INPUT
     err = capsys.readouterr().err
-    assert f"'{tokens[-1]}' is no whole number." in err
+    assert f"'{tokens[-1]}' is not a whole number." in err
     assert err.count("error") == 1
 
 
@@ -348,7 +356,12 @@ def test_new_asks_on_a_terminal(folder):
     """On a terminal a few questions are asked; an answer that cannot be is asked for again."""
     answers = ["asked", "polgon", "polygon", "2", "7", "", "x", "2", "1 2", "10, 5 9"]
     out = on_terminal(["new"], answers)
-    for words in ("did you mean 'polygon'", "3 or more agents, not 2", "'x' is no number", "Three"):
+    for words in (
+        "did you mean 'polygon'",
+        "3 or more agents, not 2",
+        "'x' is not a number",
+        "Enter three",
+    ):
         assert words in out
     text = Path("asked.toml").read_text(encoding="utf-8")
     for line in ('shape = "polygon"', "mass = 2 ", "size = 4 ", "position = [10, 5, 9]"):
@@ -448,19 +461,19 @@ def test_design_keeps_files(capsys):
     ("arguments", "message"),
     [
         (["cube", "--range", "3"], "5.65685 m would do"),
-        (["cube", "--extra", "some"], "'some' is no number"),
+        (["cube", "--extra", "some"], "'some' is not a number"),
         (["cube", "--extra", "-1"], "extra must be >= 0"),
-        (["cube", "--extra", "inf"], "'inf' is no whole number"),
-        (["cube", "--extra", "1.5"], "'1.5' is no whole number"),
+        (["cube", "--extra", "inf"], "'inf' is not a whole number"),
+        (["cube", "--extra", "1.5"], "'1.5' is not a whole number"),
         (["cube", "--reach", "2"], "--reach has no effect without --edges neighbours"),
         (["cube", "--range", "nan"], "--range must be a positive length"),
         (["cube", "--edges", "neighbours", "--reach", "0"], "--reach must be a positive number"),
         (["sphere"], "give --agents"),
-        (["cube", "--edges", "all"], "no graph is called 'all'"),
+        (["cube", "--edges", "all"], "there is no graph 'all'"),
         (["cube", "--edges", "henneberg-multilevel", "--reach", "2"], "--reach has no effect"),
         (
             ["cube", "--edges", "henneberg-multilevel", "--extra", "2"],
-            "--extra and --range are of the search",
+            "--extra and --range have no effect with --edges",
         ),
         (["square", "--edges", "henneberg"], "need slots"),
         (["cube", "--agents", "7"], "takes 8 agents"),
@@ -524,7 +537,7 @@ def test_run_keeps_an_existing_result(capsys, simulate):
     simulate(lambda *_, **__: pytest.fail("it flew"))
     assert cli.main(["run", "short.toml"]) == codes.BAD_INPUT
     err = capsys.readouterr().err
-    assert "short.nc: exists already" in err
+    assert "short.nc: already exists" in err
     assert "--force" in err
     assert Path("flights/short/short.nc").read_bytes() == before
 
@@ -534,7 +547,7 @@ def test_run_keeps_the_verdict_of_another_flight(capsys):
     Path("shared").mkdir()
     write("shared/verdict.json", "theirs")
     assert cli.main(["run", "short.toml", "--out", "shared"]) == codes.BAD_INPUT
-    assert "verdict.json: exists already" in capsys.readouterr().err
+    assert "verdict.json: already exists" in capsys.readouterr().err
     assert Path("shared/verdict.json").read_text(encoding="utf-8") == "theirs"
 
 
@@ -593,7 +606,7 @@ def test_bugs_are_not_hidden(capsys, monkeypatch, simulate):
     assert cli.main(["run", "short.toml", "--quiet"]) == codes.BAD_INPUT
     told = capsys.readouterr().err
     assert told.startswith("error: ZeroDivisionError in test_cli.py, line ")
-    assert "a fault of rigidfleet, not of yours" in told
+    assert "this is a bug in rigidfleet" in told
     flags = type("Flags", (), {"dev_mode": True})
     monkeypatch.setattr(
         "rigidfleet.cli.app.sys", type("Sys", (), {"flags": flags, "stderr": sys.stderr})
@@ -610,12 +623,12 @@ def test_full_memory_is_no_fault(capsys, simulate):
 
     simulate(grow)
     assert cli.main(["run", "short.toml", "--quiet"]) == codes.BAD_INPUT
-    assert "too little memory" in capsys.readouterr().err
+    assert "not enough memory" in capsys.readouterr().err
 
 
 def test_first_compile(capsys, monkeypatch):
     """A first compile says on standard error that it compiles, and a later flight does not."""
-    words = "Compiling the flight kernel"
+    words = "Compiling the simulator"
     for compiled in (False, True):
         monkeypatch.setattr("rigidfleet.kernel.engine.native.is_compiled", lambda c=compiled: c)
         assert cli.main(["run", "short.toml", "--no-figures", "--force"]) == codes.PASSED
@@ -649,7 +662,7 @@ def test_interrupt():
     assert process.returncode == codes.INTERRUPTED
     assert b" of 1e+08 s  x" in shown
     os.close(terminal)
-    assert b"Interrupted: what flew is saved" in shown
+    assert b"Interrupted: the flight so far is saved" in shown
     assert b"Traceback" not in shown
     assert "incomplete" in printed
     result = Result.load("flights/long/long.nc")
@@ -666,7 +679,9 @@ def test_interrupt_of_drawing(capsys, monkeypatch):
 
     monkeypatch.setattr("rigidfleet.plotting.plot", draw)
     assert cli.main(["run", "short.toml"]) == codes.INTERRUPTED
-    assert capsys.readouterr().err.startswith("Interrupted: the flight is saved in flights")
+    assert capsys.readouterr().err.startswith(
+        "Interrupted: the complete flight is saved in flights"
+    )
     assert Result.load("flights/short/short.nc").complete
 
 
@@ -758,7 +773,7 @@ def test_report(capsys, plot):
     assert cli.main(["report", "flights/short/short.nc"]) == codes.PASSED
     out, err = capsys.readouterr()
     assert "Passed" in out
-    assert "2 files kept" in err
+    assert "2 existing files kept" in err
     for path, text in (
         (verdict, "earlier"),
         (figures / "cm.svg", "earlier"),
@@ -807,7 +822,7 @@ def test_replay(capsys, plot):
     assert f"Replay   {page}" in capsys.readouterr().out
     write(page, "earlier")
     assert cli.main(["replay", "flights/short/short.nc"]) == codes.BAD_INPUT
-    assert "exists already and is kept" in capsys.readouterr().err
+    assert "already exists; use --force to overwrite" in capsys.readouterr().err
     assert page.read_text(encoding="utf-8") == "earlier"
     assert cli.main(["replay", "flights/short/short.nc", "--force"]) == codes.PASSED
     assert capsys.readouterr().out == f"Replay   {page}\n"
@@ -881,7 +896,7 @@ def test_report_of_several(capsys, plot):
     assert all(label in text for label in labels)
     assert not list(Path().rglob("report.html"))
     assert cli.main(["report", *results]) == codes.BAD_INPUT
-    assert "comparison.html: exists already" in capsys.readouterr().err
+    assert "comparison.html: already exists" in capsys.readouterr().err
     assert cli.main(["report", *results, "--force", "--json"]) == codes.FAILED
     assert [verdict["passed"] for verdict in json.loads(capsys.readouterr().out)] == [True, False]
     assert cli.main(["report", *results, "--out", "side/by/side", "--quiet"]) == codes.FAILED
@@ -980,3 +995,30 @@ def test_progress_leaves_compiling_out(monkeypatch):
     now = 13.4
     watch.update(Progress(24.0, 90.0, "WP1", 13.4))
     assert watch._words() == "24.0 of 90 s  x10  0:07 left  WP1"
+
+
+def test_progress_on_a_terminal(monkeypatch):
+    """A terminal shows what is waited for, then per cent, time flown, speed, time left and phase, and is left clean."""
+    now = 0.0
+    monkeypatch.setattr(console, "perf_counter", lambda: now)
+    screen = io.StringIO()
+    watch = console.FlightWatch()
+    watch.console = Console(file=screen, force_terminal=True, width=120, markup=False)
+
+    def drawn() -> str:
+        assert watch.progress is not None
+        screen.truncate(0)
+        watch.progress.refresh()
+        return re.sub(r"\x1b\[[\d;?]*\w", "", screen.getvalue())
+
+    with watch:
+        assert "Starting: 0 s" in drawn()
+        watch.compiling()
+        now = 7.0
+        assert f"{console.COMPILING}: 7 s" in drawn()
+        watch.update(Progress(0.0, 90.0, "[WP0]", 1.0))
+        watch.update(Progress(30.0, 90.0, "[WP0]", 3.0))
+        assert " 33% 30.0 of 90 s  x15  0:04 left  [WP0]" in drawn()
+        now = 9.0
+        assert f" 33% {console.COMPILING}: 9 s" in drawn()
+    assert screen.getvalue().endswith("\x1b[2K")

@@ -214,6 +214,67 @@ def test_nothing_of_the_paper_is_left_out(section, count):
     assert numbers == [str(n + 1) for n in range(count)]
 
 
+EQUATION = re.compile(r"Eq(?:\. \(\d+\)|s\. \(\d+\)(?:(?:-|, | and )\(\d+\))+)")
+
+
+def equations(text: str) -> set[int]:
+    """Numbers of the equations that a text names: Eq. (1), Eqs. (2)-(4), Eqs. (5), (7) and (9)."""
+    numbers = set()
+    for named in EQUATION.findall(text):
+        for first, last in re.findall(r"\((\d+)\)(?:-\((\d+)\))?", named):
+            numbers |= set(range(int(first), int(last or first) + 1))
+    return numbers
+
+
+def docstrings() -> Iterator[tuple[str, str]]:
+    """Dotted name and docstring of every module, class and function of the package."""
+    source = ROOT / "src" / "rigidfleet"
+    for path in sorted(source.rglob("*.py")):
+        name = ".".join(path.relative_to(source).with_suffix("").parts)
+        yield from docstrings_in(ast.parse(path.read_text(encoding="utf-8")), name)
+
+
+def docstrings_in(
+    node: ast.Module | ast.ClassDef | ast.FunctionDef, name: str
+) -> Iterator[tuple[str, str]]:
+    """Dotted name and docstring of a part of the package, and of what it defines."""
+    yield name, ast.get_docstring(node) or ""
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.ClassDef | ast.FunctionDef):
+            yield from docstrings_in(child, f"{name}.{child.name}")
+
+
+def test_equations_name_their_functions_and_functions_their_equations():
+    """Each row of the equations names functions whose docstrings name it; what else names one is in its row."""
+    listed = {
+        int(r[0]): set(re.findall(r"`(\w+\.[\w.]+)`", r[3]))
+        for r in rows("Equations")
+        if r[0].isdigit()
+    }
+    said = {name: equations(text) for name, text in docstrings()}
+    for number, functions in listed.items():
+        assert functions or number in {7, 8, 9}, f"no function for Eq. ({number})"
+        for name in functions:
+            assert number in said[name], f"the docstring of {name} says no Eq. ({number})"
+    for name, numbers in said.items():
+        for number in numbers:
+            # A module may say what one of its functions implements.
+            assert any(f"{f}.".startswith(f"{name}.") for f in listed[number]), (
+                f"{name} says Eq. ({number}), whose row does not name it"
+            )
+
+
+@pytest.mark.parametrize("folder", ["src", "docs", "tests", "examples"])
+def test_equations_are_spelt_alike(folder):
+    """An equation is Eq. (1), several are Eqs. (1)-(3) or Eqs. (1), (2)."""
+    paths = [p for p in (ROOT / folder).rglob("*") if p.suffix in {".py", ".md", ".toml"}]
+    for path in paths:
+        text = path.read_text(encoding="utf-8")
+        other = re.findall(r"\b[Ee]q(?:uation)?s?\.? ?\(?\d.*", EQUATION.sub("", text))
+        assert other == [], path
+    assert paths
+
+
 def test_missions_and_figures_exist():
     """Missions and figures that paper.md names are shipped and drawn; no mission is left out."""
     known = set(mission_names())

@@ -126,7 +126,7 @@ def test_shape_for_agents(agents, shape):
         ({"shape": "trangle"}, "did you mean 'triangle'"),
         ({"shape": "cube", "agents": 3}, "takes 8 agents, not 3"),
         ({"agents": 0}, "not 0"),
-        ({"agents": 10**7}, "more than 2000"),
+        ({"agents": 10**7}, "at most 2000"),
         ({"size": [1.0, 2.0]}, "takes one size"),
         ({"size": [0.0]}, "sizes > 0"),
         ({"waypoints": [(float("nan"), 0.0, 0.0)]}, "finite"),

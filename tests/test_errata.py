@@ -69,7 +69,7 @@ def jacobian(r: Array, edges: NDArray[np.int64]) -> Array:
 
 
 def decoupling(x: Array) -> Array:
-    """The paper's H (3 + 3N, 3N), Eq. 26."""
+    """The paper's H (3 + 3N, 3N), Eq. (26)."""
     n = len(x)
     H = np.zeros((3 + 3 * n, 3 * n))
     for i, (a, b, c) in enumerate(x):
@@ -82,7 +82,7 @@ def decoupling(x: Array) -> Array:
 
 
 def test_sum_over_all_agents():
-    """Eq. 1: internal forces cancel in pairs if summed to N; to N - 1, those of agent N are lost."""
+    """Eq. (1): internal forces cancel in pairs if summed to N; to N - 1, those of agent N are lost."""
     rng = np.random.default_rng(2)
     r, edges = rng.normal(size=(4, 3)) * 3, graphs.complete_graph(4)
     held = physics.constraint_force(r, np.zeros_like(r), np.ones(4), edges, 4.0)
@@ -96,7 +96,7 @@ def test_sum_over_all_agents():
 
 
 def test_degrees_of_freedom():
-    """Eq. 4: J has at most rank 3N - 6 in space, 2N - 3 in a plane, N - 1 on a line; N = 2 has 1."""
+    """Eq. (4): J has at most rank 3N - 6 in space, 2N - 3 in a plane, N - 1 on a line; N = 2 has 1."""
     rng = np.random.default_rng(3)
     for n in (2, 3, 4, 5, 6, 8):
         for dimension in (1, 2, 3):
@@ -109,7 +109,7 @@ def test_degrees_of_freedom():
 
 
 def test_right_number_of_edges_is_not_enough():
-    """After Eq. 4: two bananas hinged at two agents have 3N - 6 = 18 edges, but rank 17."""
+    """After Eq. (4): two bananas hinged at two agents have 3N - 6 = 18 edges, but rank 17."""
     banana = [(i, j) for i in range(5) for j in range(i) if (i, j) != (1, 0)]
     other = [(i + 3 if i > 1 else i, j + 3 if j > 1 else j) for i, j in banana]
     edges = np.array(banana + other)
@@ -120,7 +120,7 @@ def test_right_number_of_edges_is_not_enough():
 
 
 def test_not_square():
-    """Eq. 7: J M^-1 has no inverse; read as a pseudo-inverse, it pushes unequal masses off."""
+    """Eq. (7): J M^-1 has no inverse; read as a pseudo-inverse, it pushes unequal masses off."""
     m = np.array([0.5, 1.0, 2.0])
     rng = np.random.default_rng(5)
     r, v = TRIANGLE, rng.normal(size=(3, 3))
@@ -131,13 +131,13 @@ def test_not_square():
     ).f_C
     JM = J / np.repeat(m, 3)
     assert JM.shape == (3, 9)
-    read = (np.linalg.pinv(JM) @ (JM @ force.ravel())).reshape(3, 3)  # meets Eq. 6 as well
+    read = (np.linalg.pinv(JM) @ (JM @ force.ravel())).reshape(3, 3)  # meets Eq. (6) as well
     assert np.linalg.norm(force.sum(axis=0)) < 1e-12
     assert np.linalg.norm(read.sum(axis=0)) > 0.1
 
 
 def test_moving_references_do_work():
-    """Eq. 8: constraint forces do no work while the distances rest; once they move, they do."""
+    """Eq. (8): constraint forces do no work while the distances rest; once they move, they do."""
     rng = np.random.default_rng(6)
     r, edges, d_dot = TRIANGLE, graphs.complete_graph(3), np.array([0.3, -0.1, 0.2])
     J = jacobian(r, edges)
@@ -163,7 +163,7 @@ def test_moving_references_do_work():
     ],
 )  # fmt: skip
 def test_singular_where_the_paper_flies(shape, n, edges, rank):
-    """Eq. 12: J M^-1 J^T is singular on the line, the square and the hexagon."""
+    """Eq. (12): J M^-1 J^T is singular on the line, the square and the hexagon."""
     r = shapes.slots(shape, 4.0, n)
     e = graphs.complete_graph(n) if edges == "complete" else np.array(edges)
     A = jacobian(r, e) @ jacobian(r, e).T
@@ -172,7 +172,7 @@ def test_singular_where_the_paper_flies(shape, n, edges, rank):
 
 
 def test_near_the_line():
-    """Eq. 12: at an offset h from the 4-8-4 line, the least eigenvalue of A falls as h^2 / 8."""
+    """Eq. (12): at an offset h from the 4-8-4 line, the least eigenvalue of A falls as h^2 / 8."""
     for h in (1e-1, 1e-2):
         r = np.array([[-4.0, 0, 0], [0, h, 0], [4.0, 0, 0]])
         value = float(smallest_singular_value(r[None], graphs.complete_graph(3))[0]) ** 2
@@ -183,7 +183,7 @@ def test_near_the_line():
 
 
 def test_translational_equation():
-    """Eq. 15 and 16: the force term is f_i / m_i - f_cm / M; (f_i - f_cm) / m_i is another number."""
+    """Eqs. (15) and (16): the force term is f_i / m_i - f_cm / M; (f_i - f_cm) / m_i is another number."""
     flight = Moving()
     x, x_dot, x_ddot = flight.derivatives()
     o, F = flight.omega, flight.f.sum(axis=0)
@@ -195,7 +195,7 @@ def test_translational_equation():
 
 
 def test_force_on_the_centre_of_mass_is_the_total():
-    """Eq. 16: f_cm has to hold every force; as the input alone, gravity would bend the formation."""
+    """Eq. (16): f_cm has to hold every force; as the input alone, gravity would bend the formation."""
     flight = Moving()
     x, x_dot, x_ddot = flight.derivatives()
     o = flight.omega
@@ -209,7 +209,7 @@ def test_force_on_the_centre_of_mass_is_the_total():
 
 
 def test_angular_momentum():
-    """Eq. 19: the first term is delta r x m d(delta r)/dt; as printed it is zero, and h lacks it."""
+    """Eq. (19): the first term is delta r x m d(delta r)/dt; as printed it is zero, and h lacks it."""
     flight = Moving()
     x, x_dot, _ = flight.derivatives()
     m, I = flight.m, inertia(x, flight.m)
@@ -222,7 +222,7 @@ def test_angular_momentum():
 
 @pytest.mark.parametrize("equal", [True, False])
 def test_rotational_equation(equal):
-    """Eq. 20: the sum goes around (omega x delta r_i) x m_i delta r_i'; as printed it is another
+    """Eq. (20): the sum goes around (omega x delta r_i) x m_i delta r_i'; as printed it is another
     number for each agent one may read into its free index, and zero where masses are equal.
     """
     flight = Moving(equal=equal)
@@ -245,7 +245,7 @@ def test_rotational_equation(equal):
 
 
 def test_equations_of_motion_depend_on_each_other():
-    """Eq. 16 and 20, both mended, fix 3N of their 3N + 3 unknowns: omega is a choice of frame."""
+    """Eqs. (16) and (20), both mended, fix 3N of their 3N + 3 unknowns: omega is a choice of frame."""
     rng = np.random.default_rng(7)
     for n in (3, 8):
         m = rng.uniform(0.5, 2.0, n)
@@ -273,7 +273,7 @@ def test_triangle_axes():
 
 
 def test_sum_of_inputs():
-    """Eq. 24: the sum of all forces is the force on the centre of mass, not that on agent N."""
+    """Eq. (24): the sum of all forces is the force on the centre of mass, not that on agent N."""
     F, tau = np.array([1.0, -2.0, 30.0]), np.array([0.5, 0.2, -0.3])
     f = physics.allocate(TRIANGLE, np.ones(3), F, tau)
     assert f.sum(axis=0) == pytest.approx(F, abs=1e-12)
@@ -282,7 +282,7 @@ def test_sum_of_inputs():
 
 @pytest.mark.parametrize("slots", [TRIANGLE, CUBE], ids=["triangle", "cube"])
 def test_normal_matrix_is_singular(slots):
-    """Eq. 27: H^T H has no inverse, for forces along m_i delta r_i do nothing that H sees."""
+    """Eq. (27): H^T H has no inverse, for forces along m_i delta r_i do nothing that H sees."""
     m = np.random.default_rng(8).uniform(0.5, 2.0, len(slots))
     for masses in (np.ones(len(slots)), m):
         x = slots - masses @ slots / masses.sum()
@@ -292,7 +292,7 @@ def test_normal_matrix_is_singular(slots):
 
 
 def test_pseudo_inverse_loses_the_wrench():
-    """Eq. 27 with a pseudo-inverse: the triangle gets 0.36 of its lift, the cube 2/3 of its torque."""
+    """Eq. (27) with a pseudo-inverse: the triangle gets 0.36 of its lift, the cube 2/3 of its torque."""
     up, tau = np.array([0, 0, 29.43]), np.array([0.3, -0.2, 0.5])
     zero = np.zeros(3)
     lift = physics.wrench(
@@ -310,7 +310,7 @@ def test_pseudo_inverse_loses_the_wrench():
 
 
 def test_pseudo_inverse_depends_on_the_unit_of_length():
-    """Eq. 27 weighs newtons against newton metres: in decimetres the triangle gets less lift."""
+    """Eq. (27) weighs newtons against newton metres: in decimetres the triangle gets less lift."""
     up = np.array([0, 0, 29.43])
     for unit in (1.0, 0.1):
         x = TRIANGLE / unit

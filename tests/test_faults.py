@@ -113,7 +113,7 @@ def test_a_binary_file(capsys: pytest.CaptureFixture[str]):
 
 def test_a_directory(capsys: pytest.CaptureFixture[str], flown: bytes):
     """A folder in place of a file, or in the way of one, is named; what it holds stays."""
-    assert "flights: is a directory" in refused(capsys, "run", "./flights")
+    assert "flights: is a folder" in refused(capsys, "run", "./flights")
     assert "flights: is a folder" in refused(capsys, "report", "flights")
     Path("taken", "pair.nc", "mine").mkdir(parents=True)
     assert "pair.nc" in refused(capsys, *RUN, "--out", "taken")
@@ -137,8 +137,12 @@ def test_no_permission(
     HOME.chmod(0o555)
     try:
         with nobody():
-            assert "secret.toml: may not be read" in refused(capsys, "run", "secret.toml")
-            assert "may not be read" in refused(capsys, "report", str(HOME / "pair.nc"))
+            assert "secret.toml: cannot be read: permission denied" in refused(
+                capsys, "run", "secret.toml"
+            )
+            assert "cannot be read: permission denied" in refused(
+                capsys, "report", str(HOME / "pair.nc")
+            )
             assert "pair" in refused(capsys, *RUN)
     finally:
         HOME.chmod(0o755)

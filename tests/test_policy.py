@@ -132,7 +132,7 @@ class Parts(html.parser.HTMLParser):
                 what, _, who = rule.partition(" ")
                 assert what not in self.policy
                 self.policy[what] = who
-        self.open = "data" if tag == "script" and "type" in given else tag
+        self.open = "data" if tag == "script" and given.get("type") != "module" else tag
         if self.open in self.inside:
             self.inside[self.open].append("")
 

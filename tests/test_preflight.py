@@ -185,7 +185,7 @@ def test_downwash():
     phases = [{"kind": "fly", "position": [10, 0, 7], "until": 10.0}]
     found = check(mission(tall, phases=phases))
     (note,) = [remark for remark in found.remarks if remark.topic == "downwash"]
-    assert note.text.startswith("agent 1 is below agent 3, 3.50 m")
+    assert note.text.startswith("agent 1 is 3.50 m below agent 3")
     limited = mission(tall, phases=phases, limits={"separation_below": 4.0})
     assert failures(check(limited)) == {"downwash"}
 
@@ -377,8 +377,8 @@ def test_disturbances_and_their_thrust_are_told():
     for part in (
         "steady wind up to 1.2 N",
         "gusts (3 sigma) up to 0.6 N",
-        "of thrust",
-        "offset from slots",
+        "maximum thrust",
+        "offset from its slot",
     ):
         assert part in told, part
     assert any("no integral" in remark.text for remark in found.remarks)

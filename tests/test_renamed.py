@@ -37,7 +37,7 @@ def test_old_values_of_missions(key, value):
     (finding,) = (f for f in refused(key, value) if f.key.endswith(key))
     assert finding.value == value
     assert finding.problem.startswith("must be ")
-    assert f"'{RENAMED[key, value]}' now" in finding.remedy
+    assert f"'{RENAMED[key, value]}'" in finding.remedy
 
 
 @pytest.mark.parametrize(
@@ -52,17 +52,17 @@ def test_old_words_of_sweep_files(tmp_path, line, key, new):
         Sweep.load(file)
     (finding,) = caught.value.findings
     assert finding.key == key
-    assert finding.remedy == f"it is called '{new}' now"
+    assert finding.remedy == f"it is now called '{new}'"
 
 
 def test_old_options(capsys):
     """Of the command: not a guess at another option, but the new name."""
     assert cli.main(["sweep", "establish-triangle", "--vary", VARY[0], "--ends"]) == codes.BAD_INPUT
     told = " ".join(capsys.readouterr().err.split())
-    assert "--ends; it is called '--final-states' now" in told
+    assert "--ends; it is now called '--final-states'" in told
     assert "--runs" not in told
     assert cli.main(["design", "cube", "--edges", "tree"]) == codes.BAD_INPUT
-    assert "'henneberg-multilevel' now" in " ".join(capsys.readouterr().err.split())
+    assert "now called 'henneberg-multilevel'" in " ".join(capsys.readouterr().err.split())
 
 
 def test_words_that_are_not_old():
@@ -72,7 +72,8 @@ def test_words_that_are_not_old():
 
 
 @pytest.mark.parametrize(
-    ("version", "words"), [(0, "an earlier rigidfleet (sweep format 1)"), (9, "Use a newer")]
+    ("version", "words"),
+    [(0, "an earlier version of rigidfleet (sweep format 1)"), (9, "Use a newer")],
 )
 def test_stores_of_other_formats(tmp_path, version, words):
     """Neither read nor flown on with; replaced if asked for."""

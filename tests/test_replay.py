@@ -2,6 +2,7 @@
 
 import base64
 import json
+import posixpath
 import re
 import zlib
 from importlib import import_module
@@ -14,6 +15,7 @@ from rigidfleet.errors import ResultError
 from rigidfleet.plotting import agent_colours
 from rigidfleet.web.replay import html_page, replay
 from rigidfleet.web.replay.pack import PackedColumn, pack
+from rigidfleet.web.replay.page import bundle, read
 from rigidfleet.web.replay.scene import thrust_directions
 
 EIGHT = swarm(8, 90.0)
@@ -74,7 +76,37 @@ def test_alone():
     page = html_page(EIGHT)
     assert re.findall(r"https?://|//cdn|@import|\bsrc\s*=|\bimport\s*\(", page) == []
     assert "content=\"default-src 'none';" in page
-    assert not re.search(r"\{(policy|title|style|info|data|script)\}", page)
+    assert not re.search(r"\{\{ *(policy|title|style|info|data|script)\b", page)
+
+
+@pytest.mark.parametrize("start", ["replay/replay.js", "live/live.js"])
+def test_modules_become_one(start):
+    """Each module stands once, after those that it imports, and none asks for another any more."""
+    text = bundle(start)
+    assert re.findall(r"^(?:import|export)\b.*", text, re.M) == []
+    places = [text.index(line) for line in ("class Renderer", "class Scene", "class Player {")]
+    assert places == sorted(places)
+    assert text.count("class Recording") == 1
+
+
+def test_modules_import_what_there_is():
+    """What a module imports is exported by the other one, and used."""
+    imports = 0
+    for name in (
+        "replay/recording.js",
+        "replay/scene.js",
+        "replay/player.js",
+        "replay/replay.js",
+        "live/live.js",
+    ):
+        text = read(name)
+        for names, target in re.findall(r'^import \{([^}]*)\} from "([^"]*)";$', text, re.M):
+            other = read(posixpath.normpath(f"{name}/../{target}"))
+            for word in re.findall(r"\w+", names):
+                imports += 1
+                assert re.search(rf"^export .*\b{word}\b", other, re.M), f"{target} has no {word}"
+                assert len(re.findall(rf"\b{word}\b", text)) > 1, f"{name} does not use {word}"
+    assert imports > 20
 
 
 def test_users_words_stay_words():

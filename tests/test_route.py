@@ -278,8 +278,8 @@ def test_ways_that_cross_are_found():
     phases = [establish("a"), reshape("b", name="swap", blend=4.0)]
     mission = fly({"a": FIVE, "b": SWAPPED}, ALOFT, phases)
     (text,) = collisions(mission)
-    assert text.startswith("agents 2 and 3 collide at 7.00 s, in 'swap'")
-    assert "their ways from 'a' to 'b' cross, 0.0" in text
+    assert text.startswith("agents 2 and 3 collide at 7.00 s in 'swap'")
+    assert "their paths from 'a' to 'b' cross with 0.0" in text
     assert 'assignment = "each"' in text
     assert not check(mission).passed
     cured = Mission.from_dict(mission.to_dict() | {"assignment": "each"})
@@ -311,9 +311,9 @@ def test_ways_nearer_than_the_limit_are_found():
     s = np.linspace(0, 1, 2001)[:, None, None]
     room = min(pdist(p).min() for p in (1 - s) * ways[0] + s * ways[1]) - 0.2
     (crossing,) = [text for text in texts if "cross" in text]
-    assert f"come within {room:.2f} m" in crossing
+    assert f"have a separation of {room:.2f} m" in crossing
     assert "limit 1.4 m" in crossing
-    assert f"Keep slots {np.sqrt(2) * 1.6:.2f} m apart or more" in crossing
+    assert f"Place slots at least {np.sqrt(2) * 1.6:.2f} m apart" in crossing
 
 
 def test_a_formation_flown_again_from_elsewhere():
@@ -346,11 +346,11 @@ def test_a_vehicle_that_would_end_underground():
     (text,) = [r.text for r in check(land(0.2)).remarks if r.topic == "obstacle"]
     # The third slot is 1 m below the centre of mass, its radius 0.1 m.
     assert text.startswith(
-        "agent 3 hits 'ground' at 14.00 s, in 'land': its centre comes to z = -0.80 m"
+        "agent 3 hits 'ground' at 14.00 s in 'land': its centre is at z = -0.80 m"
     )
     assert "0.90 m too low" in text
     assert "1.00 m below the centre of mass at z = 0.20 m" in text
-    assert "z = 1.10 m or more" in text or "z = 1.11 m or more" in text
+    assert "above z = 1.10 m" in text or "above z = 1.11 m" in text
     assert check(land(1.12)).passed
 
 
@@ -481,8 +481,8 @@ def test_a_grid_is_established_level():
 @pytest.mark.parametrize(
     ("keys", "key", "words"),
     [
-        ({"formation": "d", "attitude": "drawn"}, "attitude", "drawn in no axes"),
-        ({"attitude": "free", "yaw_deg": 10.0}, "yaw_deg", "attitude = 'free' asks for none"),
+        ({"formation": "d", "attitude": "drawn"}, "attitude", "which have no axes"),
+        ({"attitude": "free", "yaw_deg": 10.0}, "yaw_deg", "no effect with attitude = 'free'"),
         ({"control": "open", "yaw_deg": 10.0}, "yaw_deg", "no effect with control 'open'"),
         ({"control": "open", "attitude": "drawn"}, "attitude", "no effect with control 'open'"),
         ({"attitude": "nearest"}, "attitude", "must be 'drawn' or 'free'"),

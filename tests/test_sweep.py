@@ -192,11 +192,11 @@ def test_all_errors_at_once():
     assert "from 1 to 1" in found["vary[4].path"][1]
     assert found["vary[5]"][1] == "did you mean 'normal'?"
     assert found["vary[6]"] == ("normal takes 2 numbers, not 1", "write normal(mean, sd)")
-    assert found["vary[7]"][0] == "is no variation"
-    assert "no number" in found["vary[8].path"][0]
+    assert found["vary[7]"][0] == "is not a valid variation"
+    assert "not a number" in found["vary[8].path"][0]
     assert "is a table" in found["vary[9].path"][0]
-    assert "ends by until and duration" in found["vary[10].path"][0]
-    assert "nothing to add to" in found["vary[11].path"][0]
+    assert "two endings, until and duration" in found["vary[10].path"][0]
+    assert "no value to add to" in found["vary[11].path"][0]
     assert "numbers to add" in found["vary[12].values"][0]
     assert found["vary[13].sdd"][1] == "did you mean 'sd'?"
     assert "vary[13].sd" in found
@@ -320,10 +320,10 @@ def test_two_do_not_write_the_same_sweep(tmp_path):
 
 def test_what_is_no_store(tmp_path):
     """A folder without a sweep, and a file that is none, are named, not overwritten."""
-    with pytest.raises(ResultError, match="holds no sweep"):
+    with pytest.raises(ResultError, match="contains no sweep"):
         read(tmp_path)
     (tmp_path / "sweep.db").write_bytes(b"not a database at all" * 100)
-    with pytest.raises(ResultError, match="is no store"):
+    with pytest.raises(ResultError, match="is damaged or not the store"):
         fly(sweep(runs=3), tmp_path, workers=1)
     assert (tmp_path / "sweep.db").read_bytes().startswith(b"not a database")
 
@@ -484,7 +484,7 @@ def test_the_command_evaluates_final_states(capsys, tmp_path, monkeypatch):
     assert "16 of 16 runs passed" in capsys.readouterr().out
     assert read(tmp_path / "sweeps" / "establish-triangle").sweep.evaluate == "final"
     assert cli.main(["sweep", "sweeps/establish-triangle", "--final-states"]) == 2
-    assert "goes on as it is" in capsys.readouterr().err
+    assert "definition cannot change" in capsys.readouterr().err
 
 
 # -- killed ------------------------------------------------------------------------------------------
@@ -865,7 +865,7 @@ def test_command(folder, capsys):
     assert Path("sweeps/pair/sweep.db").read_bytes() == before
     assert "Median: thrust" in Path("sweeps/pair/figures/map.svg").read_text()
     assert cli.main(["sweep", "pair.toml", "--summary"]) == codes.BAD_INPUT
-    assert "holds no sweep" in capsys.readouterr().err
+    assert "contains no sweep" in capsys.readouterr().err
     assert cli.main(["sweep", "sweeps/pair", "--seed", "3"]) == codes.BAD_INPUT
     assert cli.main(["sweep", "pair.toml", "--runs", "4"]) == codes.BAD_INPUT
     assert cli.main([*line, "--workers", "0"]) == codes.BAD_INPUT
@@ -894,7 +894,7 @@ def test_interrupted(folder):
     _, err = process.communicate(timeout=60)
     assert process.returncode == codes.INTERRUPTED
     kept = len(read(folder / "sweeps" / "pair").run)
-    assert f"{kept} of 5000 runs are kept" in err
+    assert f"{kept} of 5000 runs are saved" in err
     assert "rigidfleet sweep sweeps/pair" in err
 
 

@@ -44,7 +44,7 @@ def replacing(path: str | Path, *, private: bool = False) -> Generator[IO[bytes]
 
 
 def write_file(path: Path, data: bytes) -> None:
-    """Write a file whole or not at all.
+    """Write a file without ever leaving a partial one.
 
     Raises
     ------
@@ -62,9 +62,9 @@ def why_not(error: OSError, done: str, path: Path) -> str:
     """Why a file could not be ``done`` ("read", "written"), and what to do."""
     match error:
         case IsADirectoryError():
-            return "is a folder. Name a file."
+            return "is a folder. Give the path of a file."
         case FileNotFoundError() | NotADirectoryError():
-            return f"cannot be {done}: there is no folder {path.parent}. Make it first."
+            return f"cannot be {done}: there is no folder {path.parent}. Create it first."
         case PermissionError():
-            return f"may not be {done} by you. Choose another folder, or ask for permission."
+            return f"cannot be {done}: permission denied. Choose another folder or change the permissions."
     return f"cannot be {done}: {error.strerror or error}. Choose another place."

@@ -1,7 +1,8 @@
-"""Read netCDF-4 files that may be damaged, or made to do harm: what a file declares is checked before it is read.
+"""Read netCDF-4 files that may be damaged or malicious.
 
-What it shall hold is told by declarations; nothing here knows flights. No array is read before its kind, its shape
-and its size are known to be due, no text before it is text, and nothing from any other file.
+The caller declares what the file must contain; this module knows nothing about flights. Type, shape and size of
+each array are checked against the declaration before the array is read. Text is checked before it is used. Data in
+other files are never read.
 """
 
 from __future__ import annotations
@@ -30,19 +31,19 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     import h5py
 
-#: Numbers in a file at most: 8 GB, twice what a mission may have stored.
+#: Maximum number of values in a file: 8 GB, twice what a mission may store.
 MOST_NUMBERS = 1e9
-#: Bytes that a file may declare for each that it has, and besides: a small file must not ask for all memory.
+#: A file of n bytes may declare at most _DENSE n + _SPARE bytes of arrays, so that a small file cannot fill memory.
 _DENSE, _SPARE = 200, 1 << 20
 
 
 class DamagedError(ValueError):
-    """A file that does not hold what it should; the message says what is wrong, without a full stop."""
+    """A file does not contain what it should. The message says what is wrong, without a full stop."""
 
 
 @dataclass(frozen=True)
 class Array:
-    """What an array of a file is to be: its dimensions, whether of whole numbers, and whether it may be absent."""
+    """Declaration of an array: its dimensions, whether its values are integers, and whether it may be missing."""
 
     dims: tuple[str, ...]
     whole: bool
@@ -50,26 +51,28 @@ class Array:
 
 
 def attribute(file: h5py.File, name: str, kind: Any) -> Any:
-    """An attribute as ``int`` or ``str``; of any other kind, as what its JSON is to be (`typed`).
+    """Return an attribute as ``int`` or ``str``, or the JSON in it as any other type (`typed`).
 
     Raises
     ------
     DamagedError
-        It is missing, or of another kind.
+        The attribute is missing or has another type.
     """
     if name not in file.attrs:
         raise DamagedError(f"attribute {name} is missing")
     value = file.attrs[name]
-    if isinstance(value, np.ndarray) and value.size == 1:  # as other tools write single ones
+    if (
+        isinstance(value, np.ndarray) and value.size == 1
+    ):  # other tools write a scalar as an array of one element
         value = value.reshape(-1)[0]
     if kind is int:
         if not isinstance(value, int | np.integer) or isinstance(value, bool):
-            raise DamagedError(f"attribute {name} is no whole number")
+            raise DamagedError(f"attribute {name} is not a whole number")
         return int(value)
     if isinstance(value, bytes):
         value = value.decode("utf-8", "surrogateescape")
     if not isinstance(value, str):
-        raise DamagedError(f"attribute {name} is no text")
+        raise DamagedError(f"attribute {name} is not text")
     if not _is_text(value):
         raise DamagedError(f"attribute {name} is not UTF-8 text")
     if kind is str:
@@ -77,27 +80,28 @@ def attribute(file: h5py.File, name: str, kind: Any) -> Any:
     try:
         plain = json.loads(value)
     except (ValueError, RecursionError) as error:
-        raise DamagedError(f"attribute {name} is no JSON ({error})") from None
+        raise DamagedError(f"attribute {name} is not valid JSON ({error})") from None
     return typed(plain, kind, f"attribute {name}")
 
 
 def typed(value: Any, kind: Any, where: str) -> Any:
-    """Plain data as a type says that it is: of dataclasses, typed dictionaries, lists, literals and finite numbers.
+    """Check plain data against a type and return it.
 
-    Dataclasses are made; a tuple stays a list. Keys that a dataclass or a closed dictionary does not name, and
-    numbers where text is due, are no such data. Of ``Annotated[A, B]`` it is B, where there is anything.
+    Types are dataclasses, typed dictionaries, lists, tuples, literals, text, integers and finite numbers. A dataclass
+    is constructed; a tuple stays a list. Unknown keys and values of another type are errors, except that a typed
+    dictionary with the key ``__others__`` admits any key. ``Annotated[A, B]`` is checked as B, or may be None.
 
     Raises
     ------
     DamagedError
-        It is not; ``where`` begins the message.
+        The data do not match. The message begins with ``where``.
     """
     origin, inner = get_origin(kind), get_args(kind)
     if kind is Any:
         return value
-    if origin is Annotated:  # plain data to all others, and to a file what stands beside
+    if origin is Annotated:  # A is the type in Python, B the type in a file
         return None if value is None else typed(value, inner[1], where)
-    if origin in (Union, UnionType):  # with None, all of them
+    if origin in (Union, UnionType):  # every union here is `X | None`
         some = next(k for k in inner if k is not NoneType)
         return None if value is None else typed(value, some, where)
     if origin is Literal and isinstance(value, str) and value in inner:
@@ -130,17 +134,17 @@ def typed(value: Any, kind: Any, where: str) -> Any:
                 for key, item in value.items()
             }
             return kind(**made)
-    raise DamagedError(f"{where} is not as it should be: {_short(value)}")
+    raise DamagedError(f"{where} has an invalid value: {_short(value)}")
 
 
-#: Greater numbers are none of a flight.
+#: Maximum magnitude of a number.
 _HUGE = 1e300
 
 
 def _is_text(value: str) -> bool:
     try:
         value.encode()
-    except UnicodeEncodeError:  # half a character
+    except UnicodeEncodeError:  # a lone surrogate
         return False
     return True
 
@@ -153,18 +157,18 @@ def _short(value: Any) -> str:
 def arrays(
     file: h5py.File, declared: Mapping[str, Array], sizes: Mapping[str, int], size: int
 ) -> dict[str, NDArray[Any]]:
-    """Arrays by name, those absent that may be left out.
+    """Return the arrays of a file by name. Optional arrays may be missing.
 
     Parameters
     ----------
-    declared : what each is to be
-    sizes : of dimensions that are known
-    size : of the file [bytes]
+    declared : declaration of each array
+    sizes : sizes of the dimensions that are already known
+    size : size of the file [bytes]
 
     Raises
     ------
     DamagedError
-        One is missing, of another kind or shape, or they are larger together than such a file can hold.
+        An array is missing, has another type or shape, or the arrays are larger than a file of this size can be.
     """
     found, known, numbers = {}, dict(sizes), 0
     for name, due in declared.items():
@@ -185,32 +189,32 @@ def arrays(
             raise DamagedError(f"{name} has shape {shape}, not ({asked})")
         numbers += math.prod(shape)
         if numbers > MOST_NUMBERS or 8 * numbers > _DENSE * size + _SPARE:
-            raise DamagedError(f"{name} is larger than a file of {size:,} bytes holds")
+            raise DamagedError(f"{name} is larger than a file of {size:,} bytes can hold")
         found[name] = data
     return {name: data[...] for name, data in found.items()}
 
 
 def _dataset(file: h5py.File, name: str) -> h5py.Dataset:
-    """A dataset of the file itself: no link, no window on other files."""
+    """Return a dataset that is stored in this file: not a link, not a view of another file."""
     import h5py
 
     if not isinstance(file.get(name, getlink=True), h5py.HardLink):
-        raise DamagedError(f"{name} is a link to elsewhere")
+        raise DamagedError(f"{name} is a link, not an array")
     data = file[name]
     if not isinstance(data, h5py.Dataset):
-        raise DamagedError(f"{name} is no array")
+        raise DamagedError(f"{name} is not an array")
     if data.is_virtual or data.external:
-        raise DamagedError(f"{name} has its numbers in another file")
+        raise DamagedError(f"{name} is stored in another file")
     return data
 
 
 def opened(data: bytes) -> h5py.File:
-    """The content of a file, to be read.
+    """Open the content of a file for reading.
 
     Raises
     ------
     DamagedError
-        The library cannot open it.
+        The HDF5 library cannot open it.
     """
     import h5py
 

@@ -1,11 +1,11 @@
-"""Words of missions, sweep files and the command that were replaced before the first release.
+"""Keys, values and options that were renamed before the first release.
 
-Who still writes one is told its successor.
+A message about an old name gives the new one.
 """
 
 from __future__ import annotations
 
-#: Old word to new: keys and options by themselves, values as (key, value).
+#: Old name to new name. Keys and options are given as text, values as (key, value).
 RENAMED: dict[str | tuple[str, str], str] = {
     ("control", "slots"): "tracking",
     ("edges", "joined"): "henneberg",
@@ -17,6 +17,6 @@ RENAMED: dict[str | tuple[str, str], str] = {
 
 
 def successor(key: object, value: object = None) -> str:
-    """Remedy that names the successor of an old key or option, or of an old value of a key; '' where there is none."""
+    """Return a remedy that gives the new name of a key, an option or a value of a key; '' if it was not renamed."""
     new = RENAMED.get(str(key) if value is None else (str(key), str(value)))
-    return f"it is called '{new}' now" if new is not None else ""
+    return f"it is now called '{new}'" if new is not None else ""

@@ -1,28 +1,28 @@
-"""Errors whose message says what is wrong, where, which value it has, and what to do about it."""
+"""Errors. Every message says what is wrong, where, which value was found, and how to correct it."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
-#: Letters of a value that a message shows.
+#: Maximum number of characters of a value that a message shows.
 _WIDTH = 60
 
 
 class RigidfleetError(Exception):
-    """Base of every error that rigidfleet raises for its user to read."""
+    """Base class of all errors that rigidfleet raises for its users."""
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One thing wrong in a mission.
+    """One error in a mission.
 
     Attributes
     ----------
-    file : the mission file, or "" if the mission came from elsewhere
-    key : dotted path of the entry, counted from 1 (``phases[2].until``), or "" for the whole file
-    value : the value found there, as the user wrote it
+    file : the mission file; "" if the mission did not come from a file
+    key : dotted path of the entry, counted from 1 (``phases[2].until``); "" for the whole file
+    value : the value of this entry, as the user wrote it
     problem : what is wrong, without a full stop
-    remedy : what to do about it, without a full stop
+    remedy : how to correct it, without a full stop
     """
 
     file: str
@@ -39,7 +39,7 @@ class Finding:
 
 
 class MissionError(RigidfleetError):
-    """A mission that cannot be flown; carries everything wrong with it, not only the first thing.
+    """A mission has errors. The exception carries all of them, not only the first.
 
     Attributes
     ----------
@@ -59,33 +59,33 @@ class MissionError(RigidfleetError):
 
 
 class SweepError(MissionError):
-    """A sweep whose definition is wrong; its findings are about the sweep file, or the options."""
+    """The definition of a sweep has errors. The findings refer to the sweep file or to the options."""
 
 
 class ResultError(RigidfleetError):
-    """A result that cannot be read or written."""
+    """A result cannot be read or written."""
 
 
 class StoppedError(RigidfleetError):
-    """A flight that cannot go on; the message is the diagnosis. It ends the flight, whose record tells it."""
+    """A flight cannot continue. The message is the diagnosis; it is stored in the record of the flight."""
 
 
 class FlightError(RigidfleetError):
-    """A flight that cannot go on, or cannot begin.
+    """A flight cannot start or cannot continue.
 
     Attributes
     ----------
-    result : the `Result` of what had flown by then; None where nothing had
+    result : the `Result` up to the failure; None if nothing was flown
     """
 
     result: Any = None
 
 
 def wrong_type(asked: str, given: object) -> TypeError:
-    """A TypeError in one sentence: what is asked for, and what was given."""
+    """Return a TypeError that names what was expected and what was given."""
     text = " ".join(repr(given).split())
     shown = text if len(text) <= _WIDTH else text[: _WIDTH - 3] + "..."
-    return TypeError(f"{asked} is asked for, but {shown} ({type(given).__name__}) was given")
+    return TypeError(f"expected {asked}, got {shown} ({type(given).__name__})")
 
 
 def _short(value: object, width: int = _WIDTH) -> str:

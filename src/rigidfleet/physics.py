@@ -58,7 +58,7 @@ def constraint_force(
     threshold: float = 0.1,
     cutoff: float = 1e-3,
 ) -> ConstraintForce:
-    """Constraint force f_C = J^T lambda (Eq. 12 of the paper, references fed forward).
+    """Constraint force f_C = J^T lambda, Eq. (12) with references fed forward.
 
     Parameters
     ----------
@@ -115,8 +115,8 @@ def allocate(
     """Input force (N, 3) [N] of every agent for a wrench on the virtual body (input decoupling).
 
     ``rigid`` is exact: f_i = m_i (F/M + alpha x x_i + omega x (omega x x_i)) with
-    alpha = I^+ (tau - omega x I omega). ``pinv`` is the paper's H (Eq. 24 to 27) with a
-    pseudo-inverse, for H^T H is always singular; its wrench is not the one asked for, see
+    alpha = I^+ (tau - omega x I omega). ``pinv`` is the paper's H, Eqs. (24)-(27), with
+    a pseudo-inverse, for H^T H is always singular; its wrench is not the one asked for, see
     `wrench`.
 
     Parameters: positions x (N, 3) [m] (taken about their CM), masses (N,) [kg], F (3,) [N], tau
@@ -142,7 +142,7 @@ def allocate(
 
 
 def wrench(x: ArrayLike, masses: ArrayLike, f: ArrayLike) -> Floats:
-    """Wrench (6,) of forces f (N, 3) [N] at x (N, 3) [m]: sum, and torque about the CM [N, N m]."""
+    """Wrench (6,) of forces f (N, 3) [N] at x (N, 3) [m]: sum, Eq. (24), and torque about the CM, Eq. (25) [N, N m]."""
     m, x = _masses_and_points(masses, x)
     f = _full(f, x.shape, "f")
     return np.concatenate([f.sum(axis=0), np.cross(about_cm(x, m), f).sum(axis=0)])

@@ -1,10 +1,10 @@
-"""The one record of a flight: what flew, where, under which forces; saved, loaded, exported.
+"""The record of a flight: states, references and forces over time. It can be saved, loaded and exported.
 
-A `Result` holds NumPy arrays (radians, scalar-first quaternions, agents counted from 0) and is saved as one
-netCDF-4 file, in which each variable carries its unit and its meaning. The file also holds the mission, so
-that a flight can be repeated from its result. NaN stands for "not active" throughout.
+A `Result` contains NumPy arrays (radians, scalar-first quaternions, agents counted from 0). It is saved as one
+netCDF-4 file, in which each variable has its unit and its meaning. The file also contains the mission, so that the
+flight can be repeated from its result. NaN means "not active".
 
-Reading and writing the format needs h5netcdf, which is imported only then.
+h5netcdf reads and writes the file; it is imported only when needed.
 """
 
 from __future__ import annotations
@@ -42,12 +42,12 @@ if TYPE_CHECKING:
     from rigidfleet.mission import Mission
 from rigidfleet._files import why_not, write_file
 
-#: Version of the file format; files of any other are refused.
+#: Version of the file format. Files of any other version are rejected.
 SCHEMA_VERSION = 3
 
 
 class Variable(NamedTuple):
-    """What an array of a result is."""
+    """Declaration of an array of a result: dimensions, unit and meaning."""
 
     dims: tuple[str, ...]
     units: str
@@ -58,7 +58,7 @@ def _v(dims: str, units: str, text: str) -> Variable:
     return Variable(tuple(dims.split()), units, text)
 
 
-#: Length of each dimension that does not depend on the flight, and the names along it.
+#: Labels of each dimension whose length does not depend on the flight.
 LABELS: dict[str, tuple[str, ...]] = {
     "axis": ("x", "y", "z"),
     "quaternion": ("w", "x", "y", "z"),
@@ -75,7 +75,7 @@ class _Moment(TypedDict):
 
 
 class Target(_Moment, total=False):
-    """Where a phase leads: its time [s], and what it asks for then."""
+    """Target of a phase: time of arrival [s] and the state commanded then. None: nothing is commanded."""
 
     position: _Three | None
     velocity: _Three | None
@@ -84,7 +84,7 @@ class Target(_Moment, total=False):
 
 
 class Statistics(TypedDict, total=False):
-    """What the integrator counted; other keys may stand beside them."""
+    """Statistics of the integrator. Other keys are allowed."""
 
     __others__: Any
     evaluations: int
@@ -97,14 +97,15 @@ class Statistics(TypedDict, total=False):
     solvers: dict[str, dict[str, float]]
 
 
-#: A vehicle so near an obstacle since the start, or until the end, stands on it [m].
+#: A vehicle that stays within this distance of an obstacle from the start, or until the end, stands on it [m].
 PAD = 0.1
 
 
 class Extremum(NamedTuple):
     """Worst value of a quantity in continuous time, not only at samples.
 
-    ``who`` has it: an agent, or the first of two, from 0; ``other`` is the second agent, the obstacle, or -1.
+    ``who`` is the agent, or the first of two, counted from 0. ``other`` is the second agent or the obstacle, counted
+    from 0; -1 if there is neither.
     """
 
     value: float
@@ -115,23 +116,23 @@ class Extremum(NamedTuple):
 
 @dataclass(slots=True)
 class PhaseRecord:
-    """One phase as flown.
+    """A phase as flown.
 
     Attributes
     ----------
     name, kind, control : as in the mission; control is "open", "tracking" or "body"
-    formation : name of the formation held or approached, None if there is none yet
+    formation : name of the formation that is held or approached; None if no formation has been established
     t_start, t_end : mission time [s]
-    settled : for a phase that ends by settling: whether it did; None for one that ends at a time
-    target : for phases that lead to a goal of their own, and for an establishment in an attitude that is not free:
-        {"time" [s], "position" [m], "velocity" [m/s], "attitude" quaternion, "rates" [rad/s]}, each but the time None
-        where nothing is asked
-    extremes : worst values of the phase in continuous time, by name: separation, clearance, separation_below, lost (a
-        lost vehicle to one that is left), geofence (beyond it), lowest, highest [m]; speed [m/s]; acceleration [m/s^2];
-        thrust, thrust_margin (thrust less its limit), constraint_force, tension [N]; constraint [m]. In the phases
-        where they are, clearance_start, clearance_flight and clearance_end: of vehicles that stand on an obstacle
-        since the start, of those that fly, and of those that stand on one until the end. Empty if samples alone are
-        known
+    settled : whether a phase that ends by settling has settled; None for a phase that ends at a time
+    target : for phases with a target of their own, and for establish phases with a commanded attitude: {"time" [s],
+        "position" [m], "velocity" [m/s], "attitude" quaternion, "rates" [rad/s]}. Entries other than the time are None
+        if nothing is commanded
+    extremes : worst values of the phase in continuous time, by name: separation, clearance, separation_below, lost
+        (distance of a lost vehicle to one that still flies), geofence (distance beyond it), lowest, highest [m];
+        speed [m/s]; acceleration [m/s^2]; thrust, thrust_margin (thrust minus its limit), constraint_force, tension
+        [N]; constraint [m]. If vehicles stand on obstacles, clearance is also given for those that have stood on one
+        since the start (clearance_start), for those in flight (clearance_flight), and for those that stand on one
+        until the end (clearance_end). Empty if only samples are known
     """
 
     name: str
@@ -171,9 +172,9 @@ def _now() -> str:
 
 @dataclass(kw_only=True, eq=False, repr=False)
 class Result:
-    """Record of one flight: where every vehicle was, under which forces, and the mission itself.
+    """Record of a flight: the states of all vehicles, the forces on them, and the mission.
 
-    `simulate` makes one; `save` writes it to a netCDF-4 file, and `Result.load` reads it back:
+    `simulate` returns one; `save` writes it to a netCDF-4 file, and `Result.load` reads it back:
 
     >>> import rigidfleet as rf
     >>> result = rf.simulate("narrow-passage")
@@ -183,15 +184,15 @@ class Result:
     >>> rf.assess(rf.Result.load("passage.nc")).passed
     True
 
-    Arrays have K samples in time, N agents (from 0) and m edges, the union over all formations.
-    At each switch of phases there are two samples, the end of one phase and, one representable number later, the
-    start of the next: references and inputs jump there. Each array's dimensions, unit and meaning stand at its
-    declaration and in `VARIABLES`; `phases` and the rest say what the flight was.
+    Arrays have K samples in time, N agents (counted from 0) and m edges, the union over all formations.
+    Each change of phase has two samples, because references and inputs jump there: the end of one phase and, one
+    representable number later, the start of the next. `VARIABLES` gives the dimensions, unit and meaning of each
+    array. The other fields describe the flight: its phases, its mission and how it ended.
 
     Raises
     ------
     ValueError
-        An array has the wrong shape, or time does not increase.
+        An array has the wrong shape, an index is out of range, or time does not increase.
     """
 
     time: Annotated[Floats, _v("time", "s", "mission time")]
@@ -210,7 +211,8 @@ class Result:
         Floats, _v("time agent axis", "N", "gravity and disturbances, world axes")
     ]
     thrust: Annotated[
-        Floats, _v("time agent", "N", "thrust |f_u + f_C|, cut off at the limit if it saturates")
+        Floats,
+        _v("time agent", "N", "thrust |f_u + f_C|, clipped at the limit if thrust saturates"),
     ]
 
     cm: Annotated[Floats, _v("time axis", "m", "centre of mass, world axes")]
@@ -232,13 +234,11 @@ class Result:
 
     wrench_asked: Annotated[
         Floats,
-        _v("time wrench", "N or N m", "wrench asked for: force, torque about the centre of mass"),
+        _v("time wrench", "N or N m", "commanded wrench: force, torque about the centre of mass"),
     ]
     wrench_achieved: Annotated[
         Floats,
-        _v(
-            "time wrench", "N or N m", "wrench that results: force, torque about the centre of mass"
-        ),
+        _v("time wrench", "N or N m", "resulting wrench: force, torque about the centre of mass"),
     ]
 
     edges: Annotated[Ints, _v("edge end", "1", "the two agents of each edge, from 0")]
@@ -253,7 +253,7 @@ class Result:
         _v(
             "time",
             "1",
-            "smallest non-zero singular value of the constraint Jacobian J; of many agents at some samples",
+            "smallest non-zero singular value of the constraint Jacobian J; with many agents, at some samples only",
         ),
     ]
 
@@ -262,34 +262,40 @@ class Result:
         _v(
             "time",
             "m",
-            "separation of the nearest two agents: centre distance minus radii; behind the least of a phase, that",
+            "least separation between two agents: centre distance minus radii; the sample after the minimum of a phase "
+            "has that minimum",
         ),
     ]
     separation_pair: Annotated[
-        Ints, _v("time end", "1", "the two agents with it, from 0; -1 for none")
+        Ints, _v("time end", "1", "the two agents with the least separation, from 0; -1 for none")
     ]
     clearance: Annotated[
         Floats,
         _v(
             "time",
             "m",
-            "clearance to the nearest obstacle: distance minus radius; behind the least of a phase, that",
+            "clearance to the nearest obstacle: distance minus radius; the sample after the minimum of a phase has "
+            "that minimum",
         ),
     ]
-    clearance_agent: Annotated[Ints, _v("time", "1", "the agent with it, from 0; -1 for none")]
+    clearance_agent: Annotated[
+        Ints, _v("time", "1", "the agent with the least clearance, from 0; -1 for none")
+    ]
     clearance_obstacle: Annotated[
-        Ints, _v("time", "1", "the obstacle with it, from 0; -1 for none")
+        Ints, _v("time", "1", "the obstacle nearest to an agent, from 0; -1 for none")
     ]
 
     disturbance_force: Annotated[
         Floats | None,
-        _v("time agent axis", "N", "force of the air, part of external_force; absent in still air"),
+        _v(
+            "time agent axis", "N", "force of the air, part of external_force; missing in still air"
+        ),
     ] = None
     measured_position: Annotated[
-        Floats | None, _v("time agent axis", "m", "position as measured; absent without noise")
+        Floats | None, _v("time agent axis", "m", "measured position; missing without noise")
     ] = None
     measured_velocity: Annotated[
-        Floats | None, _v("time agent axis", "m s-1", "velocity as measured; absent without noise")
+        Floats | None, _v("time agent axis", "m s-1", "measured velocity; missing without noise")
     ] = None
 
     phases: list[PhaseRecord]
@@ -314,31 +320,31 @@ class Result:
                 for dim, n in zip(variable.dims, value.shape, strict=True)
             ):
                 dims = ", ".join(variable.dims)
-                raise ValueError(f"{name} ({dims}) has shape {value.shape}, not {asked}")
+                raise ValueError(f"{name} ({dims}) has shape {value.shape}, expected {asked}")
             setattr(self, name, value)
         if sizes["time"] == 0 or sizes["agent"] == 0:
             raise ValueError("a result needs at least one sample and one agent")
         if not (np.isfinite(self.time).all() and (np.diff(self.time) > 0).all()):
-            raise ValueError("time is not finite and strictly increasing")
+            raise ValueError("time must be finite and strictly increasing")
         if self.phase.min() < 0 or self.phase.max() >= len(self.phases):
-            raise ValueError(f"phase has indices outside of 0 to {len(self.phases) - 1}")
+            raise ValueError(f"phase has indices outside 0 to {len(self.phases) - 1}")
         if (np.diff(self.phase) < 0).any():
-            raise ValueError("phase goes back to an earlier one")
+            raise ValueError("phase must not decrease")
         n = sizes["agent"]
         for name, least in (("edges", 0), ("separation_pair", -1), ("clearance_agent", -1)):
             who = getattr(self, name)
             if who.size and not least <= who.min() <= who.max() < n:
-                raise ValueError(f"{name} names agents outside of {least} to {n - 1}")
+                raise ValueError(f"{name} has agents outside {least} to {n - 1}")
         for name, x in (pair for phase in self.phases for pair in phase.extremes.items()):
-            of_pair = not name.startswith("clearance")  # which names an obstacle
+            of_pair = not name.startswith("clearance")  # clearance names an obstacle
             alone = of_pair and not (-1 <= x.other < n and x.other != x.who)
             if alone or x.who not in range(n):
-                raise ValueError(f"an extreme of {name} names agents that are not two of {n}")
+                raise ValueError(f"extreme {name} must name different agents from 0 to {n - 1}")
         for name in (name for name, v in VARIABLES.items() if "quaternion" in v.dims):
             if not getattr(self, name).any(axis=1).all():
-                raise ValueError(f"{name} has a quaternion of length zero")
+                raise ValueError(f"{name} has a quaternion of norm zero")
         if (self.edges[:, 0] == self.edges[:, 1]).any():
-            raise ValueError("edges joins an agent to itself")
+            raise ValueError("an edge joins an agent to itself")
 
     def __repr__(self) -> str:
         end = "complete" if self.complete else f"incomplete: {self.ending or 'stopped'}"
@@ -348,7 +354,7 @@ class Result:
         )
 
     def _repr_html_(self) -> str:
-        """The flight as a notebook shows it: what it is of, and its worst values."""
+        """Show the flight in a notebook: its contents and its worst values."""
         try:
             name, title = self.mission.name, self.mission.title
         except ResultError:
@@ -383,12 +389,12 @@ class Result:
 
     @cached_property
     def mission(self) -> Mission:
-        """The mission flown, parsed from `mission_text` when first asked for.
+        """The mission, parsed from `mission_text` on first access.
 
         Raises
         ------
         ResultError
-            This version of rigidfleet does not take the mission any more.
+            This version of rigidfleet does not accept the mission, or the mission does not match the arrays.
         """
         from rigidfleet.mission import Mission
 
@@ -396,22 +402,24 @@ class Result:
             mission = Mission.from_toml(self.mission_text, "mission of the result")
         except MissionError as error:
             made = self.versions.get("rigidfleet", "an unknown version")
-            message = f"the mission inside the result cannot be read (it was made by rigidfleet {made}):\n{error}"
+            message = (
+                f"the mission in the result cannot be read (written by rigidfleet {made}):\n{error}"
+            )
             raise ResultError(message) from error
         if wrong := self._foreign(mission):
             raise ResultError(
-                f"the mission inside the result is of another flight: {wrong}. Fly it again, or use another copy."
+                f"the mission in the result belongs to another flight: {wrong}. Fly it again or use another copy."
             )
         return mission
 
     def _foreign(self, mission: Mission) -> str:
-        """What of the arrays is not of a mission; "" if nothing is."""
+        """Describe how the arrays contradict a mission; "" if they agree."""
         from rigidfleet.mission import KINDS
 
         if mission.n_agents != self.n_agents:
-            return f"it has {mission.n_agents} agents, the arrays have {self.n_agents}"
+            return f"the mission has {mission.n_agents} agents, the arrays have {self.n_agents}"
         if not np.array_equal(mission.edges, self.edges):
-            return "its formations have other edges than the arrays"
+            return "the edges of its formations differ from those of the arrays"
         named = [
             x.other for p in self.phases for n, x in p.extremes.items() if n.startswith("clear")
         ]
@@ -419,7 +427,7 @@ class Result:
         if self.clearance_obstacle.max() >= max(len(obstacles), 1) or not set(named) <= set(
             obstacles
         ):
-            return "it has fewer obstacles than the arrays name"
+            return "the arrays name more obstacles than it has"
         if unknown := {p.kind for p in self.phases} - {*KINDS}:
             return f"there are no phases of kind {min(map(repr, unknown))}"
         unknown = {p.formation for p in self.phases} - {None, *mission.formations}
@@ -427,17 +435,20 @@ class Result:
 
     @cached_property
     def left(self) -> Bools:
-        """Which agents are left (K, N): not lost by then, as the mission has it."""
+        """Mask (K, N) of the agents that are not lost at the time of each sample."""
         return self.time[:, None] <= self.mission.lost_at
 
     def samples(self, phase: int) -> slice:
-        """Samples of a phase (index from 0; negative ones from the end), empty if it was never reached."""
+        """Slice of the samples of a phase; empty if the phase was not reached.
+
+        The index counts from 0, or from the end if it is negative.
+        """
         index = range(len(self.phases))[phase]
         first, last = np.searchsorted(self.phase, [index, index + 1])
         return slice(int(first), int(last))
 
     def extreme(self, name: str) -> Extremum | None:
-        """Worst value of a quantity in the whole flight, in continuous time; None if it is not known.
+        """Worst value of a quantity over the whole flight, in continuous time; None if unknown.
 
         Names are those of `PhaseRecord.extremes`.
         """
@@ -447,10 +458,9 @@ class Result:
         return max(every, key=size, default=None)
 
     def save(self, path: str | Path) -> None:
-        """Write the result to a netCDF-4 file, whole or not at all.
+        """Write the result to a netCDF-4 file.
 
-        An existing file is replaced at the very end, in one step; until then, and if anything fails, it stays
-        as it is.
+        The file appears in one step once all data are written. If writing fails, an existing file is unchanged.
 
         Raises
         ------
@@ -461,12 +471,12 @@ class Result:
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read a result that `save` has written.
+        """Read a result written by `save`.
 
         Raises
         ------
         ResultError
-            There is no such file, it is no result, it is damaged, or a newer version of rigidfleet wrote it.
+            The file does not exist, is not a result, is damaged, or has another format version.
         """
         path = Path(path)
         data = _read(path)
@@ -475,18 +485,18 @@ class Result:
         except ResultError:
             raise
         except MemoryError as error:
-            raise ResultError(f"{path}: memory is too small for this result.") from error
-        except Exception as error:  # damage inside may show itself as almost any error
+            raise ResultError(f"{path}: there is not enough memory to read this result.") from error
+        except Exception as error:  # a damaged file can cause almost any error
             raise ResultError(
-                f"{path}: this result is damaged ({_one_line(error)}). Fly its mission again, or use another copy."
+                f"{path}: the result is damaged ({_one_line(error)}). Fly its mission again or use another copy."
             ) from error
 
     def to_csv(self, path: str | Path) -> None:
-        """Write time, position, velocity and yaw of each agent as a table, one row for each sample and agent.
+        """Write time, position, velocity and yaw of each agent to a CSV file, one row per sample and agent.
 
-        Columns: time_s, agent (from 1), x_m, y_m, z_m, vx_m_s, vy_m_s, vz_m_s, yaw_deg. The yaw is that of the
-        formation (3-2-1 Euler angles), left empty before a frame is attached. Of the two samples at a switch of
-        phases only the later one is kept. The file is written whole or not at all, as by `save`.
+        Columns: time_s, agent (from 1), x_m, y_m, z_m, vx_m_s, vy_m_s, vz_m_s, yaw_deg. The yaw is that of
+        the formation (3-2-1 Euler angles); it is empty before a body frame is attached. Of the two samples at a change
+        of phase, only the later one is written. Like `save`, this never leaves a partial file.
 
         Raises
         ------
@@ -505,7 +515,7 @@ class Result:
         write_file(Path(path), "".join(lines).encode())
 
     def _netcdf(self) -> bytes:
-        """The file's content. Built in memory, so that a full disk meets a plain write and not the HDF5 library."""
+        """Build the content of the file in memory, so that a full disk is an ordinary write error, not one of HDF5."""
         import h5netcdf
         import h5py
 
@@ -535,14 +545,14 @@ class Result:
                     "i4" if name in _INTEGERS else "f8",
                     data=value,
                     chunks=_chunks(value.shape),
-                    fletcher32=True,  # damage is noticed; compression doubles the time for a seventh of the size
+                    fletcher32=True,  # detects damage; compression would save a seventh of the size and double the time
                 )
                 entry.attrs["units"] = variable.units
                 entry.attrs["long_name"] = variable.text
         return buffer.getvalue()
 
     def _attributes(self) -> dict[str, Any]:
-        # Attributes take text and numbers, but no dict, bool or None: those go in as JSON.
+        # Attributes can be text or numbers, but not dict, bool or None: those are stored as JSON.
         return {
             "Conventions": "CF-1.11",
             "title": "flight of a virtual rigid body formation",
@@ -558,7 +568,7 @@ class Result:
         }
 
 
-#: `help` shows it first: forty arrays with their units stand at their declarations, not there.
+#: Signature that `help` shows first. The forty arrays are left out: their units stand at their declarations.
 _FIELDS = [
     Parameter("self", Parameter.POSITIONAL_ONLY),
     Parameter("fields", Parameter.VAR_KEYWORD),
@@ -577,20 +587,14 @@ VARIABLES: dict[str, Variable] = {
     for f in fields(Result)
     if hasattr(_HINTS[f.name], "__metadata__")
 }
-
-
-#: Those that a flight need not have.
+#: Variables that a result may lack.
 _OPTIONAL = {f.name for f in fields(Result) if f.name in VARIABLES and f.default is None}
 
 
 _INTEGERS = {name for name in VARIABLES if _HINTS[name].__origin__ == Ints}
-
-
-#: Quantities whose least value is the worst; of clearances, too.
+#: Quantities whose minimum is the worst value. The same holds for all clearances.
 _LEAST = frozenset(("separation", "separation_below", "lost", "lowest"))
-
-
-#: Attributes of a file, and what each is: a number, text, or JSON of a type.
+#: Attributes of a file and their types. Types other than int and str are stored as JSON.
 _ATTRIBUTES: dict[str, Any] = {
     "mission_text": str,
     "complete": int,
@@ -601,23 +605,19 @@ _ATTRIBUTES: dict[str, Any] = {
     "platform": str,
     "created": str,
 }
-
-
-#: Attribute by which a file is known as a result.
+#: Attribute that identifies a file as a result.
 _MARK = "rigidfleet_schema_version"
-
-
-#: Bytes of a chunk at most: as much as HDF5's cache holds.
+#: Maximum size of a chunk [bytes]: the size of HDF5's cache.
 _CHUNK = 1 << 20
 
 
 def as_result(given: Result | str | Path) -> Result:
-    """A flight as a function takes it: a `Result`, or the file of one.
+    """Return the `Result` that was given, or read it from its file.
 
     Raises
     ------
     TypeError
-        It is neither.
+        The argument is neither a `Result` nor a path.
     ResultError
         As `Result.load` does.
     """
@@ -625,11 +625,11 @@ def as_result(given: Result | str | Path) -> Result:
         return given
     if isinstance(given, str | Path):
         return Result.load(given)
-    raise wrong_type("a flight (a Result, or the path of one that was saved)", given)
+    raise wrong_type("a flight (a Result or the path of one that was saved)", given)
 
 
 def plain(value: Any) -> Any:
-    """Value as plain JSON data: arrays become lists, NumPy scalars numbers, what is not finite None."""
+    """Convert a value to plain JSON data: arrays to lists, NumPy scalars to numbers, non-finite numbers to None."""
     if isinstance(value, np.ndarray | np.generic):
         value = value.tolist()
     if isinstance(value, float):
@@ -646,7 +646,7 @@ def _json(value: Any) -> str:
 
 
 def _chunks(shape: tuple[int, ...]) -> tuple[int, ...] | None:
-    """Whole rows, as many as fit into `_CHUNK`."""
+    """Shape of a chunk: as many whole rows as fit into `_CHUNK`; None for an empty array."""
     if 0 in shape:
         return None
     row = 8 * math.prod(shape[1:])
@@ -661,19 +661,19 @@ def _read(path: Path) -> bytes:
     try:
         data = path.read_bytes()
     except FileNotFoundError as error:
-        raise ResultError(f"{path}: there is no such file. `rigidfleet run` makes one.") from error
+        raise ResultError(f"{path}: no such file. `rigidfleet run` creates results.") from error
     except IsADirectoryError as error:
-        raise ResultError(f"{path}: is a folder. Name the result file in it.") from error
+        raise ResultError(f"{path}: is a folder. Give the path of a result file in it.") from error
     except OSError as error:
         raise ResultError(f"{path}: {why_not(error, 'read', path)}") from error
     if not data.startswith(b"\x89HDF\r\n\x1a\n"):
         what = "is empty" if not data else "is not a netCDF-4 file"
-        raise ResultError(f"{path}: {what}. Name a result of `rigidfleet run`.")
+        raise ResultError(f"{path}: {what}. Give the path of a result of `rigidfleet run`.")
     return data
 
 
 def _parse(path: Path, data: bytes) -> dict[str, Any]:
-    """Arguments of `Result` from a file's content, checked against their declarations."""
+    """Return the arguments of `Result` from the content of a file, checked against their declarations."""
     from rigidfleet import _reader as reader
 
     due = {
@@ -683,19 +683,19 @@ def _parse(path: Path, data: bytes) -> dict[str, Any]:
     with reader.opened(data) as file:
         if _MARK not in file.attrs:
             raise ResultError(
-                f"{path}: is a netCDF-4 or HDF5 file, but no result of rigidfleet. "
-                "Name a result of `rigidfleet run`."
+                f"{path}: is a netCDF-4 or HDF5 file, but not a result of rigidfleet. "
+                "Give the path of a result of `rigidfleet run`."
             )
         made = reader.attribute(file, _MARK, int)
         if made > SCHEMA_VERSION:
             raise ResultError(
-                f"{path}: was written in format {made}, and this version of rigidfleet reads up to "
+                f"{path}: has result format {made}; this version of rigidfleet reads format "
                 f"{SCHEMA_VERSION}. Use a newer version."
             )
         if made < SCHEMA_VERSION:
             raise ResultError(
-                f"{path}: was written by an earlier rigidfleet (result format {made}); this one reads format "
-                f"{SCHEMA_VERSION}. Fly the mission again."
+                f"{path}: was written by an earlier version of rigidfleet (result format {made}); this version reads "
+                f"format {SCHEMA_VERSION}. Fly the mission again."
             )
         attributes = {
             key: reader.attribute(file, "mission" if key == "mission_text" else key, kind)

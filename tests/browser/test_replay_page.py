@@ -2,7 +2,14 @@
 
 from __future__ import annotations
 
+import re
+import shutil
 import time
+from collections.abc import Iterator
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from importlib import resources
+from threading import Thread
 
 import numpy as np
 import pytest
@@ -13,7 +20,7 @@ from test_policy import HOSTILE, flight
 from rigidfleet.math import attitude as att
 from rigidfleet.mission import Mission
 from rigidfleet.reporting import report
-from rigidfleet.web.replay import replay
+from rigidfleet.web.replay import html_page, replay
 
 pytestmark = pytest.mark.long
 
@@ -140,17 +147,56 @@ def test_state_is_the_flight(show, eight):
         np.testing.assert_allclose(np.reshape(state["thrust"], (-1, 3)), up, atol=5e-3)
 
 
-def test_rotations(show, eight):
+@pytest.fixture
+def served(tmp_path, eight) -> Iterator[str]:
+    """Address of a page that loads the modules as they stand, not put together into one."""
+    with resources.as_file(resources.files("rigidfleet.web")) as web:
+        shutil.copytree(web, tmp_path, ignore=shutil.ignore_patterns("*.py*"), dirs_exist_ok=True)
+    text = re.sub(r"<meta http-equiv=[^>]*>", "", html_page(eight))
+    script = '<script type="module" src="replay/replay.js"></script>'
+    text = re.sub(r'<script type="module">.*?</script>', script, text, flags=re.DOTALL)
+    (tmp_path / "index.html").write_text(text, encoding="utf-8")
+
+    class Silent(SimpleHTTPRequestHandler):
+        def log_message(self, format: str, *args: object) -> None: ...
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), partial(Silent, directory=tmp_path)) as server:
+        thread = Thread(target=server.serve_forever, args=(0.1,), daemon=True)
+        thread.start()
+        yield f"http://127.0.0.1:{server.server_port}/"
+        server.shutdown()
+        thread.join()
+
+
+def test_modules_stand_alone(browser, served):
+    """Each module imports what it uses: the page flies without their being put together."""
+    browser.open(f"{served}#t=10")
+    before = browser.run("return replay.time")
+    browser.click("#play")
+    browser.wait(f"return replay.time > {before} + 0.3")
+    browser.press("1")
+    browser.press("3")
+    time.sleep(0.3)
+    assert browser.heard() == []
+
+
+def test_rotations(browser, served):
     """Axes and quaternions on the page follow the package's conventions."""
-    page = show(eight)
+    browser.open(f"{served}#t=0")
     rng = np.random.default_rng(3)
     q = rng.normal(size=(20, 4))
     q /= np.linalg.norm(q, axis=1, keepdims=True)
-    axes = page.run("return arguments[0].map((q) => bodyAxes(q))", q.tolist())
+    axes, back = browser.driver.execute_async_script(
+        "const [q, done] = arguments;"
+        "Promise.all(['recording', 'gl'].map((name) => import(`./replay/${name}.js`))).then(([recording, gl]) => {"
+        "  const axes = q.map(recording.bodyAxes);"
+        "  done([axes, axes.map((a) => gl.quaternion(...a))]);"
+        "});",
+        q.tolist(),
+    )
     np.testing.assert_allclose(axes, att.dcm_from_quaternion(q), atol=1e-12)
     # The rotation that takes the world's axes to the body's, up to its sign.
-    back = np.array(page.run("return arguments[0].map((a) => quaternion(...a))", axes))
-    turned = np.abs(np.sum(back * q, axis=1))
+    turned = np.abs(np.sum(np.array(back) * q, axis=1))
     np.testing.assert_allclose(turned, 1.0, atol=1e-12)
 
 
@@ -371,7 +417,8 @@ def test_north_is_up(show, eight):
     """From above, north is up and east to the right, whatever the flight's direction; the compass says so."""
     page = show(eight, "t=30&camera=top")
     cm, north, east = page.run(
-        "const p = Array.from(replay.scene.state.cm), see = (v) => replay.scene.renderer.project(add(p, v));"
+        "const p = Array.from(replay.scene.state.cm);"
+        "const see = (v) => replay.scene.renderer.project(p.map((x, i) => x + v[i]));"
         "return [see([0, 0, 0]), see([0, 3, 0]), see([3, 0, 0])]"
     )
     assert north[0] == pytest.approx(cm[0], abs=0.5)
@@ -553,8 +600,8 @@ def test_box_in_the_way(show, eight):
     solid = "replay.scene.draw(10, 10); return replay.scene.fade[0]"
     assert page.run(solid) == 1
     page.run(
-        "const s = replay.scene, at = mixed(s.camera.eye, s.state.cm, 0.5);"
-        "s.info.boxes[0] = { min: sub(at, [1, 1, 1]), max: add(at, [1, 1, 1]) }"
+        "const s = replay.scene, at = Array.from(s.camera.eye, (x, i) => (x + s.state.cm[i]) / 2);"
+        "s.info.boxes[0] = { min: at.map((x) => x - 1), max: at.map((x) => x + 1) }"
     )
     page.run(solid)
     assert page.run(solid) < 0.3
@@ -644,7 +691,7 @@ def test_in_a_cell_of_a_notebook(browser, eight, tmp_path):
     browser.driver.switch_to.frame(0)
     try:
         browser.wait("return Boolean(window.replay)")
-        seen = "return window.replay.scene.camera.shown.distance"
+        seen = "return window.replay.scene.camera.shown?.distance"
         browser.wait(f"{seen.replace('return', 'return 0 <')} && {seen[7:]} < 1e4")
         assert browser.run("return window.origin") == "null"
         assert not [words for words in browser.heard() if "SEVERE" in words]

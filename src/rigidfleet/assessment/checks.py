@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
+from rigidfleet._text import agent_names
 from rigidfleet.assessment.measure import Measurements, angle_between, is_rigid
 from rigidfleet.assessment.outcome import (
     DIP,
@@ -15,7 +16,6 @@ from rigidfleet.assessment.outcome import (
     CheckResult,
     Extreme,
     PhaseVerdict,
-    names,
     value,
 )
 from rigidfleet.assessment.verdict import Verdict
@@ -77,7 +77,7 @@ def _complete(result: Result) -> CheckResult:
     if not finite.all():
         lost = ~finite.all(axis=2)
         bad = float(result.time[int(np.argmax(np.any(lost, axis=1)))])
-        who = names(np.flatnonzero(np.any(lost, axis=0)))
+        who = agent_names(np.flatnonzero(np.any(lost, axis=0)))
         words = f"the position of {who} is not finite, first at {bad:.2f} s"
         return CheckResult("complete", False, words, when=bad, who=who)
     if result.complete:
@@ -148,7 +148,7 @@ def _shapes(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[Chec
             continue
         fit = measured.fits[i]
         passed = fit.error <= fit.limit
-        who = names(fit.pair)
+        who = agent_names(fit.pair)
         words = (
             f"{who} are {value(fit.flown, 'm')} apart instead of {value(fit.intended, 'm')}"
             f" (limit {value(fit.limit, 'm')} off)"
@@ -354,7 +354,8 @@ def notes(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[str]:
     if agents.saturate:
         full = measured.thrust >= np.array(agents.thrust_limit) * (1 - 1e-6)
         if full.any():
-            who, since = names(np.flatnonzero(full.any(axis=0))), measured.first(full.max(axis=1))
+            who = agent_names(np.flatnonzero(full.any(axis=0)))
+            since = measured.first(full.max(axis=1))
             yield f"the thrust of {who} is cut off at its limit, first at {since:.2f} s"
     yield from _sampled(measured)
 
@@ -394,7 +395,7 @@ def _dips(measured: Measurements) -> Iterator[str]:
     if e is not None and e.value < -DIP:
         z = measured.of_left(measured.result.position[..., 2])
         low = np.flatnonzero((z < -DIP).any(axis=0))
-        others = f" ({names(low)} are below 0 at times)" if len(low) > 1 else ""
+        others = f" ({agent_names(low)} are below 0 at times)" if len(low) > 1 else ""
         words = f"dips to z = {e.value:.2f} m at {e.when:.2f} s{others}"
         yield f"{e.who} {words}; the mission has no ground"
 

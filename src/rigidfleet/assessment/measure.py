@@ -10,13 +10,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from rigidfleet._text import agent_names
 from rigidfleet.assessment.outcome import (
     SENSE,
     SHAPE_TOLERANCE,
     Extreme,
     PhaseVerdict,
     Waypoint,
-    names,
     value,
 )
 from rigidfleet.formation import distance_geometry
@@ -178,7 +178,7 @@ class Measurements:
 
     def pair(self, k: int) -> str:
         """The two agents that are nearest to each other at sample k."""
-        return names(np.sort(self.close[1][k]))
+        return agent_names(np.sort(self.close[1][k]))
 
     def obstacle(self, k: int) -> str:
         """The agent that is nearest to an obstacle at sample k, and the obstacle."""
@@ -226,7 +226,7 @@ class Measurements:
         if x is None:
             return None
         if name in ("separation", "separation_below", "lost"):
-            who = names(sorted((x.who, x.other)))
+            who = agent_names(sorted((x.who, x.other)))
         elif name in ("tension", "constraint"):
             who = f"edge {x.who + 1}-{x.other + 1}"
         elif name.startswith("clearance"):
@@ -262,7 +262,7 @@ class Measurements:
         least, pair = proximity.headroom(
             self.result.position, self.mission.agents.radius, self.left
         )
-        sampled = self.extreme(least, lambda k: names(pair[k]), lambda x: -x)
+        sampled = self.extreme(least, lambda k: agent_names(pair[k]), lambda x: -x)
         return self.worst("separation_below", sampled, lambda x: -x)
 
     def outside(self, low: Floats, high: Floats) -> Extreme | None:
@@ -334,7 +334,7 @@ class Measurements:
             closer &= np.isfinite(room)
             least[closer] = room[closer]
             who[closer] = np.column_stack([np.full(len(r), i), j])[closer]
-        sampled = self.extreme(least, lambda k: names(who[k]), lambda x: -x)
+        sampled = self.extreme(least, lambda k: agent_names(who[k]), lambda x: -x)
         return self.worst("lost", sampled, lambda x: -x)
 
     def contradictions(self) -> Iterator[tuple[str, float]]:

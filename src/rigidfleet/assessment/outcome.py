@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -138,11 +138,3 @@ def value(x: float, unit: str = "") -> str:
     """Three digits of a number, and its unit."""
     number = f"{x:.3g}" if x == 0 or 1e-3 <= abs(x) < 1e5 else f"{x:.1e}"
     return f"{number} {unit}".rstrip()
-
-
-def names(agents: Iterable[int]) -> str:
-    """Agents, given from 0, as read: agents 1, 2 and 3."""
-    found = [str(i + 1) for i in agents]
-    if len(found) == 1:
-        return f"agent {found[0]}"
-    return f"agents {', '.join(found[:-1])} and {found[-1]}"

@@ -1,18 +1,17 @@
-"""The command ``rigidfleet``: it parses, calls and prints.
+"""The command ``rigidfleet``: parse the arguments, call the library, print.
 
-What was asked for goes to standard output: verdicts, tables, JSON. Progress and errors go to standard
-error. Colours and animation are for terminals, and `NO_COLOR` is respected.
+Verdicts, tables and JSON go to standard output; progress and errors go to standard error. Colours and animation are
+for terminals only, and `NO_COLOR` is respected.
 
 Exit codes
 ----------
-- 0: done; for `run` and `report`: the flight passed its verdict; for `sweep`: every run is flown,
-  passed or not
-- 1: flew, but failed its verdict, as a flight does that could not be flown to its end; for `check`:
-  something will fail
-- 2: bad input, or files that cannot be read or written
-- 130: interrupted (Ctrl-C); what flew is saved, marked incomplete
+- 0: success; for `run` and `report`: the flight passed its verdict; for `sweep`: all runs are flown, whether they
+  passed or failed
+- 1: the flight failed its verdict or ended early; for `check`: the flight will fail
+- 2: invalid input, or files that cannot be read or written
+- 130: interrupted (Ctrl-C); the flight so far is saved, marked incomplete
 
-Packages that take long to load are imported by the commands that need them.
+Packages that load slowly are imported only by the commands that need them.
 """
 
 from __future__ import annotations
@@ -38,8 +37,8 @@ __all__ = ["BAD_INPUT", "FAILED", "INTERRUPTED", "PASSED", "app", "main"]
 app = App(
     name="rigidfleet",
     help="Fly many air vehicles as one rigid body: simulate, judge and draw formation flights.",
-    help_epilogue="Exit codes: 0 done, or the flight passed; 1 it flew but failed its verdict, or "
-    "will fail (check); 2 bad input; 130 interrupted, what flew is saved.",
+    help_epilogue="Exit codes: 0 success, the flight passed; 1 the flight failed its verdict, or "
+    "will fail (check); 2 invalid input; 130 interrupted, the flight so far is saved.",
     help_format="plaintext",
     version=f"rigidfleet {__version__}",
     version_flags=["--version"],
@@ -58,13 +57,13 @@ for _key, _command in enumerate(_COMMANDS, start=1):
 
 
 def main(tokens: Sequence[str] | None = None) -> int:
-    """Run the command and return its exit code; without `tokens`, on the arguments of the process."""
+    """Run the command with `tokens`, by default the arguments of the process, and return its exit code."""
     if tokens is None:
-        # Imports make a hundred thousand objects that stay: looked through as often as by default, they
-        # would take a tenth longer.
+        # Imports create about 100,000 permanent objects. With the default threshold, garbage collection would make
+        # them 10 % slower.
         gc.set_threshold(100_000)
         warnings.showwarning = cast("Any", console.warn)
-        # Matrices are small here: threads over them wait for each other, and on a busy machine for long.
+        # The matrices are small: several threads would only wait for each other, on a busy machine for long.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     console.prepare_streams()
     try:
@@ -78,7 +77,7 @@ def main(tokens: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         console.hang_up(sys.stdout)
         return PASSED
-    except OSError as error:  # a full disk and the like: no fault of the program
+    except OSError as error:  # a full disk, for example: not a fault of the program
         if error.filename is None:
             console.hang_up(sys.stdout)
         console.complain(f"{error.filename or 'standard output'}: {error.strerror or error}")
@@ -88,7 +87,7 @@ def main(tokens: Sequence[str] | None = None) -> int:
         return INTERRUPTED
     except MemoryError:
         console.complain(
-            "There is too little memory for this. Use fewer agents, edges or samples, or a larger machine."
+            "There is not enough memory. Use fewer agents, edges or samples, or a larger machine."
         )
         return BAD_INPUT
     except Exception as error:
@@ -99,25 +98,25 @@ def main(tokens: Sequence[str] | None = None) -> int:
 
 
 def _own_fault(error: Exception) -> str:
-    """What to say of an error that nobody has foreseen."""
+    """Message for an unexpected error."""
     *_, at = traceback.extract_tb(error.__traceback__)
     text = f"{type(error).__name__} in {Path(at.filename).name}, line {at.lineno}: {error}".rstrip(
         ": "
     )
     return (
-        f"{text}\n    this is a fault of rigidfleet, not of yours: please report it, with the file that led to it"
-        " (python -X dev -m rigidfleet ... shows all of it)"
+        f"{text}\n    this is a bug in rigidfleet: please report it with the input file"
+        " (python -X dev -m rigidfleet ... shows the traceback)"
     )
 
 
 def _usage(error: CycloptsError) -> str:
-    """What is wrong with the command as typed."""
+    """Message for an invalid command line."""
     from rigidfleet._renamed import successor
 
     command = " ".join(("rigidfleet", *(error.command_chain or ()), "--help"))
     text = str(error)
     if isinstance(error, UnusedCliTokensError):
-        text = f"Unexpected: {' '.join(error.unused_tokens or ())}."
+        text = f"Unexpected arguments: {' '.join(error.unused_tokens or ())}."
     if isinstance(error, UnknownOptionError) and (told := successor(error.token.keyword)):
         text = f"Unknown option: {error.token.keyword}; {told}."
     return f"{text}\n    see `{command}`"

@@ -1,4 +1,4 @@
-"""What the command is given, as values."""
+"""Convert arguments of the command to numbers."""
 
 from __future__ import annotations
 
@@ -8,24 +8,36 @@ from typing import Any
 
 
 def exact(_type: Any, tokens: Sequence[Any]) -> int:
-    """A whole number as it is written: none is rounded."""
+    """Converter of cyclopts for a whole number, without rounding."""
     return parse_whole(tokens[0].value)
 
 
 def parse_number(text: str) -> float:
-    """A number as it is written; ValueError with a sentence if it is none."""
+    """Convert text to a number.
+
+    Raises
+    ------
+    ValueError
+        The text is not a number.
+    """
     try:
         return float(text)
     except ValueError:
-        raise ValueError(f"'{text}' is no number.") from None
+        raise ValueError(f"'{text}' is not a number.") from None
 
 
 def parse_whole(text: str) -> int:
-    """A whole number as it is written: none is rounded; ValueError with a sentence if it is none."""
+    """Convert text to a whole number, without rounding.
+
+    Raises
+    ------
+    ValueError
+        The text is not a whole number.
+    """
     try:
-        return int(text)  # every digit of a large one counts
+        return int(text)  # keeps every digit of a large number
     except ValueError:
         number = parse_number(text)
     if not (math.isfinite(number) and number == round(number)):
-        raise ValueError(f"'{text}' is no whole number.")
+        raise ValueError(f"'{text}' is not a whole number.")
     return int(number)

@@ -1,4 +1,4 @@
-"""Before a flight: `check`."""
+"""Check a mission before the flight: `check`."""
 
 from __future__ import annotations
 
@@ -23,21 +23,22 @@ def check(
     figure: Path | None = None,
     json: bool = False,
 ) -> int:
-    """Check whether a mission is right, and what it will meet, without flying it.
+    """Check a mission without flying it.
 
-    Rigidity of its formations, gains, and the planned way: collisions, thrust, gaps.
+    The check finds errors in the file, and problems with the rigidity of formations, the gains and the planned
+    paths: collisions, thrust, gaps.
 
     Parameters
     ----------
     mission : str
         A shipped mission or a mission file.
     realisations : bool
-        Search for other shapes with the same distances, 40 random starts for each formation; if
-        neither is given, for up to 12 agents.
+        Search for other shapes with the same distances, from 40 random starts per formation. By default, search
+        for up to 12 agents.
     figure : Path
-        Draw the graphs to this file, .png, .svg or .pdf: redundant edges dashed, flexes as arrows.
+        Draw the graphs to this file (.png, .svg or .pdf): redundant edges dashed, free motions as arrows.
     json : bool
-        Print what was found as JSON.
+        Print the result as JSON.
     """
     from rigidfleet.mission import ending, goal, load_mission
 
@@ -69,20 +70,20 @@ def check(
     table = console.table("#", "phase", "kind", "to", "ends", "control")
     for n, phase in enumerate(found.phases, start=1):
         table.add_row(str(n), phase.name, phase.kind, goal(phase), ending(phase), phase.control)
-    console.out().print(f"{found.name}: right: {found.size_in_words}")
+    console.out().print(f"{found.name}: valid: {found.size_in_words}")
     console.print_table(table)
     console.out().print()
     console.print_words(ahead.describe())
     if ahead.remarks:
         console.out().print()
         console.print_words((remark.level, remark.text) for remark in ahead.remarks)
-    verdict = "nothing found that will fail" if ahead.passed else "it will fail as it is"
+    verdict = "no problems found" if ahead.passed else "the flight will fail"
     console.out().print(f"\n{found.name}: {verdict}", style=None if ahead.passed else "bold red")
     return PASSED if ahead.passed else FAILED
 
 
 def facts(mission: Mission) -> dict[str, object]:
-    """A mission in plain data."""
+    """Describe a mission as plain data."""
     from rigidfleet.mission import ending, goal
 
     return {

@@ -1,6 +1,6 @@
-"""What the command shows: what was asked for on standard output, progress and errors on standard error.
+"""Output of the command: results on standard output, progress and errors on standard error.
 
-Colours and animation are for terminals; what goes to a file or a pipe has its rows whole.
+Colours and animation are for terminals only. Rows of tables are not wrapped in a file or a pipe.
 """
 
 from __future__ import annotations
@@ -19,44 +19,44 @@ from rigidfleet.errors import MissionError
 
 if TYPE_CHECKING:
     from rich.console import Console, RenderableType
-    from rich.live import Live
+    from rich.progress import Progress
     from rich.table import Table
 
-    from rigidfleet.simulation.flight import Progress
+    from rigidfleet.simulation.flight import Progress as FlightProgress
     from rigidfleet.sweep import SweepProgress
 
-#: Columns of a table that goes to a file or a pipe, where no row may be broken.
+#: Width of a table in a file or a pipe, where rows are not wrapped [characters].
 _WIDE = 1000
-#: Where there is no terminal to draw a bar on, a line says so often how far a flight is [s].
+#: Time between lines of progress if there is no terminal for a progress bar [s].
 _SELDOM = 10.0
-#: A check that takes longer says what it looks at [s].
+#: Time between lines of progress of a check [s].
 _PATIENCE = 5.0
-#: A flight is heard of several times a second: when not for so long, it compiles [s].
+#: A flight reports its progress several times a second. Without a report for this time, it is compiling [s].
 _SILENCE = 1.0
-#: The speed of a flight is that of the last so many seconds, once there has been one of them: phases differ a
-#: thousandfold, and while one is planned nothing moves.
+#: The speed of a flight is the mean of the last _RECENT seconds, shown after _KNOWN seconds. Speeds of phases differ
+#: by a factor of a thousand, and planning a phase takes time.
 _RECENT, _KNOWN = 10.0, 1.0
-COMPILING = "Compiling the flight kernel (once, about 20 s)"
+COMPILING = "Compiling the simulator (first run only, about 20 s)"
 
 
 def out() -> Console:
-    """For what was asked for."""
+    """Console for results."""
     return console(stderr=False)
 
 
 def err() -> Console:
-    """For progress and errors."""
+    """Console for progress and errors."""
     return console(stderr=True)
 
 
 @cache
 def console(*, stderr: bool, width: int | None = None) -> Console:
-    """Return the one console for standard output or error; of its own width, or of a given one."""
+    """Return the shared console for standard output or error, with its own or a given width."""
     from rich.console import Console
 
     class Polite(Console):
         def on_broken_pipe(self) -> None:
-            # The reader has had enough, as `head` has: go on without it, the exit code still counts.
+            # The reader has closed the pipe, as `head` does: go on without output, the exit code still counts.
             self.quiet = True
             hang_up(self.file)
 
@@ -64,23 +64,23 @@ def console(*, stderr: bool, width: int | None = None) -> Console:
 
 
 def prepare_streams() -> None:
-    """Make sure that there is somewhere to write to, and that any sign can be written."""
+    """Open closed standard streams, and replace characters that a terminal lacks."""
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
         if stream is None:  # closed by `>&-`
             setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
         elif isinstance(stream, TextIOWrapper):
-            stream.reconfigure(errors="replace")  # a sign that the terminal lacks becomes "?"
+            stream.reconfigure(errors="replace")  # a character that the terminal lacks becomes "?"
 
 
 def hang_up(stream: IO[str]) -> None:
-    """Send nowhere what is still to be written to a stream."""
+    """Discard further output to a stream."""
     with open(os.devnull, "wb") as nowhere:
         os.dup2(nowhere.fileno(), stream.fileno())
 
 
 def print_exactly(text: str) -> None:
-    """Print text for other programs: in UTF-8, no line changed."""
+    """Print text for other programs: as UTF-8, without wrapping."""
     try:
         sys.stdout.flush()
         sys.stdout.buffer.write(text.encode())
@@ -97,7 +97,7 @@ def print_json(data: object) -> None:
 
 
 def complain(error: object) -> None:
-    """Print an error; of a mission, each of its findings."""
+    """Print an error, or each finding of an error about a mission."""
     from rich.text import Text
 
     for finding in error.findings if isinstance(error, MissionError) else [error]:
@@ -105,25 +105,25 @@ def complain(error: object) -> None:
 
 
 def warn(message: object, *_where: object) -> None:
-    """Show a warning as the line that it is, not with the place in the source that gave it."""
+    """Print a warning as one line, without its place in the source."""
     err().print(f"warning: {message}", style="yellow", soft_wrap=True, highlight=False)
 
 
 def table(*columns: str) -> Table:
-    """Return an empty table without lines."""
+    """Return an empty table without borders."""
     from rich.table import Table
 
     return Table(*columns, box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold")
 
 
 def print_table(rows: RenderableType) -> None:
-    """Print a table, or what is made of tables: as wide as the screen, or, without one, as it is."""
+    """Print tables: wrapped to the width of a terminal, otherwise unwrapped."""
     wide = out() if out().is_terminal else console(stderr=False, width=_WIDE)
     wide.print(rows)
 
 
 def print_words(rows: Iterable[tuple[str, str]]) -> None:
-    """Print facts under headings, wrapped to the screen, a heading that repeats only once."""
+    """Print facts with their headings, wrapped to the terminal. A repeated heading is printed once."""
     from rich.table import Table
     from rich.text import Text
 
@@ -138,64 +138,69 @@ def print_words(rows: Iterable[tuple[str, str]]) -> None:
 
 
 class _Screen:
-    """Shows what goes on: on a terminal as it changes, and elsewhere by a line now and then."""
+    """Progress display: animated on a terminal, otherwise a line from time to time."""
 
     def __init__(self) -> None:
         self.console = err()
-        self.live: Live | None = None
+        self.progress: Progress | None = None
         self.begun = self.told = perf_counter()
         self.cold = False
 
     def __enter__(self) -> Self:
         if self.console.is_interactive:
-            from rich.live import Live
-            from rich.spinner import Spinner
+            from rich import progress
+            from rich.table import Column
 
-            self.spinner = Spinner("dots")
-            self.live = Live(self, console=self.console, transient=True, refresh_per_second=10)
-            self.live.start()
+            # The words change while nothing is heard, too: they are asked for whenever the screen is drawn.
+            words = progress.TextColumn(
+                "{task.fields[screen]}", markup=False, table_column=Column()
+            )
+            self.progress = progress.Progress(
+                progress.SpinnerColumn(),
+                progress.BarColumn(bar_width=30),
+                progress.TaskProgressColumn(),
+                words,
+                console=self.console,
+                transient=True,
+            )
+            self.task = self.progress.add_task("", total=None, screen=self)
+            self.progress.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self.live is not None:
-            self.live.stop()
-
-    def __rich__(self) -> RenderableType:
-        return ""
+        if self.progress is not None:
+            self.progress.stop()
 
     def compiling(self) -> None:
-        """Expect the kernel to be compiled, on the way, in several parts."""
+        """Announce that the simulator will be compiled, in several parts during the flight."""
         self.cold, self.begun = True, perf_counter()
-        if self.live is None:
+        if self.progress is None:
             self.console.print(COMPILING)
 
-    def waiting(self) -> RenderableType:
-        """What is shown before there is anything to show."""
+    def __str__(self) -> str:
+        """Text on a terminal: progress, or what is waited for before there is any."""
+        if not self._waits():
+            return self._words()
         text = COMPILING if self.cold else "Starting"
-        self.spinner.update(text=f"{text}: {perf_counter() - self.begun:.0f} s")
-        return self.spinner
+        return f"{text}: {perf_counter() - self.begun:.0f} s"
 
-    def bar(self, total: float, done: float) -> RenderableType:
-        """How much of it is done, and the words."""
-        from rich.progress_bar import ProgressBar
-        from rich.table import Table
-
-        row = Table.grid(padding=(0, 1))
-        row.add_row(ProgressBar(total, done, width=30), self._words())
-        return row
-
-    def tell(self, now: float) -> None:
-        """Print a line where nothing moves, if the last one was long ago."""
-        if self.live is None and now - self.told > _SELDOM:
+    def show(self, total: float, done: float, now: float) -> None:
+        """Show the progress; without animation as a line, if the last line was long ago."""
+        if self.progress is not None:
+            self.progress.update(self.task, total=total, completed=done)
+        elif now - self.told > _SELDOM:
             self.told = now
             self.console.print(self._words())
+
+    def _waits(self) -> bool:
+        return True
 
     def _words(self) -> str:
         return ""
 
 
 class CheckWatch:
-    """Says every few seconds what a check looks at; of most, which are done before, nothing."""
+    """Print the current step of a long check every few seconds; nothing for a short one."""
 
     def __init__(self, what: str) -> None:
         self.what, self.stage, self.begun = what, "reading", perf_counter()
@@ -211,7 +216,7 @@ class CheckWatch:
         self.thread.join()
 
     def update(self, stage: str) -> None:
-        """Take note of what is looked at next."""
+        """Set the current step."""
         self.stage = stage
 
     def _tell(self) -> None:
@@ -221,34 +226,31 @@ class CheckWatch:
 
 
 class FlightWatch(_Screen):
-    """Shows how a flight goes on."""
+    """Progress display of a flight."""
 
     def __init__(self) -> None:
         super().__init__()
         self.heard = self.begun
-        self.recent: deque[Progress] = deque()
+        self.recent: deque[FlightProgress] = deque()
 
-    def update(self, progress: Progress) -> None:
-        """Take note of how far the flight is."""
+    def update(self, progress: FlightProgress) -> None:
+        """Receive the progress of the flight."""
         now = perf_counter()
         if self.cold and now - self.heard > _SILENCE:
-            self.recent.clear()  # the speed is that of flying, without that of compiling
+            self.recent.clear()  # measure the speed without the time of compiling
         self.recent.append(progress)
         self.heard = now
-        self.tell(now)
+        self.show(progress.t_end, progress.t, now)
 
-    def __rich__(self) -> RenderableType:
-        if not self.recent or (self.cold and perf_counter() - self.heard > _SILENCE):
-            return self.waiting()
-        last = self.recent[-1]
-        return self.bar(last.t_end, last.t)
+    def _waits(self) -> bool:
+        return not self.recent or (self.cold and perf_counter() - self.heard > _SILENCE)
 
     def _words(self) -> str:
-        """Time flown, speed against real time, time left, phase."""
+        """Mission time, speed relative to real time, time left, phase."""
         if not self.recent:
             return ""
         last = self.recent[-1]
-        wall = last.wall + perf_counter() - self.heard  # also while it stands still
+        wall = last.wall + perf_counter() - self.heard  # include the time since the last report
         while len(self.recent) > 1 and self.recent[1].wall <= wall - _RECENT:
             self.recent.popleft()
         words = [f"{last.t:.1f} of {last.t_end:g} s"]
@@ -262,7 +264,7 @@ class FlightWatch(_Screen):
 
 
 class SweepWatch(_Screen):
-    """Shows how a sweep goes on."""
+    """Progress display of a sweep."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -270,19 +272,18 @@ class SweepWatch(_Screen):
         self.last: SweepProgress | None = None
 
     def update(self, progress: SweepProgress) -> None:
-        """Take note of how far the sweep is."""
+        """Receive the progress of the sweep."""
         if progress.flown and (self.base is None or self.base.workers != progress.workers):
-            self.base = progress  # the rate is that of these workers, without their start
+            self.base = progress  # measure the rate of these workers without their start-up
         self.last = progress
-        self.tell(perf_counter())
+        if not self._waits():
+            self.show(progress.runs, progress.done, perf_counter())
 
-    def __rich__(self) -> RenderableType:
-        if self.base is None or self.last is None:
-            return self.waiting()
-        return self.bar(self.last.runs, self.last.done)
+    def _waits(self) -> bool:
+        return self.base is None or self.last is None
 
     def _words(self) -> str:
-        """Runs flown, rate, time left, failures."""
+        """Finished runs, rate, time left, failures, workers."""
         if self.base is None or self.last is None:
             return ""
         p = self.last
@@ -297,5 +298,5 @@ class SweepWatch(_Screen):
 
 
 def count(n: int, noun: str) -> str:
-    """A number of things in words."""
+    """Number and noun, in the plural unless the number is 1."""
     return f"{n} {noun}{'' if n == 1 else 's'}"

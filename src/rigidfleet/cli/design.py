@@ -1,27 +1,21 @@
-"""Choose edges for a shape: `design`."""
+"""Choose the edges of a formation: `design`."""
 
 from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 from cyclopts import Parameter
 
 from rigidfleet.cli import console
 from rigidfleet.cli.arguments import exact, parse_whole
+from rigidfleet.cli.codes import PASSED
 from rigidfleet.errors import RigidfleetError
 
-if TYPE_CHECKING:
-    pass
-from rigidfleet.cli.codes import PASSED
-
-#: A design of so many agents is compared with all pairs; one of more than the latter is judged by the ends of its
-#: spectrum alone.
+#: Maximum number of agents for which a design is compared with all pairs.
 _COMPARED = 60
-
-
-#: See `_COMPARED`.
+#: Maximum number of agents for which rigidity is computed in full; beyond, only the ends of the spectrum.
 _DENSE = 200
 
 
@@ -39,40 +33,40 @@ def design(
     force: bool = False,
     json: bool = False,
 ) -> int:
-    """Choose the edges that hold a shape best, and write the formation for a mission file.
+    """Choose the edges that make a shape most rigid, and write the formation for a mission file.
 
-    As few edges as hold it, of the greatest rigidity index found; compared with all pairs. For more than some
-    hundred agents, where that search would take hours, choose a graph by --edges; its index is reported.
+    The search uses the fewest edges that hold the shape, maximises the rigidity index and compares the result with
+    all pairs. For more than a few hundred agents the search takes hours: choose a graph by --edges instead.
 
     Parameters
     ----------
     shape : str
-        A named shape, or a file of points: x, y, z of one agent a line.
+        A named shape, or a file of points with x, y, z of one agent per line.
     agents : int
-        Number of agents; as many as the shape needs if not given.
+        Number of agents. Default: as many as the shape needs.
     size : float
-        Edge length of a named shape [m], 4 if not given; three for a cuboid or a helix.
+        Edge length of a named shape [m], or three sizes for a cuboid or a helix. Default: 4.
     extra : str
-        Number of redundant edges besides, or "complete" for all.
+        Number of additional, redundant edges, or "complete" for all pairs.
     sensing_range : float
-        No edge is longer than this [m].
+        Maximum length of an edge [m].
     edges : str
-        Do not search, but take this graph: complete, neighbours, henneberg or henneberg-multilevel.
+        Use this graph instead of a search: complete, neighbours, henneberg or henneberg-multilevel.
     reach : float
-        How far edges "neighbours" reach, in distances of nearest neighbours; 1.9 if not given.
+        Maximum length of edges "neighbours", in distances of nearest neighbours. Default: 1.9.
     out : Path
-        Write the formation to this file; else it is printed.
+        Write the formation to this file. Default: print it.
     force : bool
-        Replace that file if it is there already.
+        Overwrite this file.
     json : bool
-        Print all of it as JSON.
+        Print the result as JSON.
     """
     from rigidfleet._files import write_file
     from rigidfleet.formation.graphs import CUBE_EDGES, REACH, complete_graph
     from rigidfleet.rigidity import design as designs
 
     if out is not None and out.exists() and not force:
-        raise RigidfleetError(f"{out}: exists already and is kept. Replace it by --force.")
+        raise RigidfleetError(f"{out}: already exists; use --force to overwrite.")
     try:
         name, slots = _points(shape, agents, size)
         if edges is not None:
@@ -80,7 +74,7 @@ def design(
             kinds = {edges: designs.GRAPHS[edges](slots, REACH if reach is None else reach)}
         else:
             if reach is not None:
-                raise ValueError("--reach has no effect without --edges neighbours, remove it")
+                raise ValueError("--reach has no effect without --edges neighbours; remove it")
             if sensing_range is not None and not sensing_range > 0.0:
                 raise ValueError(f"--range must be a positive length [m], not {sensing_range:g}")
             more = extra if extra == "complete" else parse_whole(extra)
@@ -101,12 +95,11 @@ def design(
         console.print_json({"name": name, "toml": text, "limits": limits, "graphs": found})
         return PASSED
     table = console.table("graph", "edges", "rank", "index", "cond.", "longest", "verdict")
-    table.columns[0].no_wrap = True  # a name is not cut
+    table.columns[0].no_wrap = True
     for what, (_, cells) in judged.items():
         table.add_row(what, *cells)
-    output = (
-        console.out() if out is not None else console.err()
-    )  # so that the formation alone can be piped
+    # Standard output has the formation alone, so that it can be piped.
+    output = console.out() if out is not None else console.err()
     output.print(table)
     if limits:
         output.print(limits)
@@ -118,28 +111,29 @@ def design(
 
 
 def _reject(edges: str, reach: float | None, *, searched: bool) -> None:
-    """Say so where a named graph is none, or goes with options of the search.
+    """Reject an unknown graph, and options that have no effect on it.
 
     Raises
     ------
     ValueError
+        The graph is unknown, or --extra, --range or --reach cannot be combined with it.
     """
     from rigidfleet._renamed import successor
     from rigidfleet.rigidity.design import GRAPHS
 
     if edges not in GRAPHS:
         told = successor("edges", edges) or f"graphs: {', '.join(GRAPHS)}"
-        raise ValueError(f"no graph is called {edges!r}; {told}")
+        raise ValueError(f"there is no graph {edges!r}; {told}")
     if searched:
-        raise ValueError("--extra and --range are of the search, remove them or --edges")
+        raise ValueError("--extra and --range have no effect with --edges; remove them or --edges")
     if reach is not None and edges != "neighbours":
-        raise ValueError(f"--reach has no effect on edges {edges!r}, remove it")
+        raise ValueError(f"--reach has no effect on edges {edges!r}; remove it")
     if reach is not None and not 0.0 < reach < math.inf:
-        raise ValueError(f"--reach must be a positive number of spacings, not {reach:g}")
+        raise ValueError(f"--reach must be a positive number, not {reach:g}")
 
 
 def compare_graph(slots: Any, edges: Any) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """How a graph holds slots (N, 3): as data, and as the cells of a row of `design`."""
+    """Rigidity of slots (N, 3) with a graph: as data, and as cells of a row of the table."""
     import numpy as np
 
     from rigidfleet.formation.distance_geometry import distances
@@ -148,7 +142,7 @@ def compare_graph(slots: Any, edges: Any) -> tuple[dict[str, Any], tuple[str, ..
     longest = f"{distances(slots, edges).max(initial=0.0):.3g} m"
     if len(slots) <= _DENSE:
         found = analyse(slots, edges)
-        # The smallest value counts that is not zero, as in the index.
+        # The smallest non-zero value counts, as in the index.
         held = len(edges) > 0 and found.w > 0
         ratio = float(np.linalg.norm(jacobian(slots, edges), 2) ** 2) / found.w if held else None
         condition = "" if ratio is None else f"{ratio:.3g}"
@@ -166,12 +160,12 @@ def compare_graph(slots: Any, edges: Any) -> tuple[dict[str, Any], tuple[str, ..
 
 
 def _points(shape: str, agents: int | None, size: list[float] | None) -> tuple[str, Any]:
-    """Name and slots (N, 3) [m] of a named shape, or of a file of points.
+    """Name and slots (N, 3) [m] of a named shape or of a file of points.
 
     Raises
     ------
     ValueError
-        The shape takes other numbers of agents or sizes, or an option has no effect on a file.
+        The shape does not suit the number of agents or sizes, or an option has no effect on a file.
     """
     from rigidfleet.formation.point_files import read_points
     from rigidfleet.formation.shapes import SHAPES, agents_taken, slots
@@ -181,10 +175,10 @@ def _points(shape: str, agents: int | None, size: list[float] | None) -> tuple[s
         form = SHAPES[shape]
         count = form.agents.start if agents is None else agents
         if agents is None and len(form.agents) > 1:
-            raise ValueError(f"takes {agents_taken(shape)}, give --agents")
+            raise ValueError(f"takes {agents_taken(shape)}; give --agents")
         return shape, slots(shape, size or [4.0] * form.sizes, count)
     if not Path(shape).exists():
-        raise ValueError(f"neither a shape nor a file; shapes: {', '.join(SHAPES)}")
+        raise ValueError(f"is neither a shape nor a file; shapes: {', '.join(SHAPES)}")
     if agents is not None or size is not None:
-        raise ValueError("a file has its own points, remove --agents and --size")
+        raise ValueError("a file of points determines agents and size; remove --agents and --size")
     return Path(shape).stem, centred(read_points(shape))

@@ -1,4 +1,4 @@
-"""Fly by hand: `live`."""
+"""Fly a mission by hand: `live`."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ def live(
     port: Annotated[int, Parameter(converter=exact)] = 0,
     no_browser: bool = False,
 ) -> int:
-    """Fly a mission's vehicles by hand, in the browser, in real time; each flight is saved when it ends.
+    """Fly the vehicles of a mission by hand in the browser, in real time. Each flight is saved when it ends.
 
     Parameters
     ----------
     mission : str
-        A shipped mission or a mission file: its vehicles, formations, gains and obstacles.
+        A shipped mission or a mission file. Its vehicles, formations, gains and obstacles are used.
     out : Path
-        Folder for the files: NAME-live.nc and verdict.json; flights/NAME-live if not given. Where it is taken,
-        a number is added, and nothing is replaced.
+        Folder for NAME-live.nc and verdict.json. Default: flights/NAME-live. If the folder exists, a number is
+        added to its name.
     port : int
-        Port on this machine, which alone can reach it; any that is free if not given.
+        Port on this machine; other machines cannot connect. Default: any free port.
     no_browser : bool
-        Only print the address.
+        Print the address without opening a browser.
     """
     from rigidfleet.kernel.engine.native import is_compiled
     from rigidfleet.mission import load_mission
@@ -60,11 +60,11 @@ def live(
         console.out().print(verdict)
         console.out().print()
         list_files(files)
-        return f"It is saved in {files.result}."
+        return f"Saved in {files.result}."
 
     def ready(url: str) -> None:
         console.out().print(f"Flying {flown.name} at {url}", soft_wrap=True)
-        console.err().print("Ctrl-C ends the flight, and so does closing its page")
+        console.err().print("To end the flight, press Ctrl-C or close its page")
 
     with heeding_interrupts():
         fly(flown, port=port, browser=not no_browser, ready=ready, landed=landed)

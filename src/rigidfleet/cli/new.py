@@ -1,22 +1,19 @@
-"""Write a mission: `new`."""
+"""Write a new mission: `new`."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 from cyclopts import Parameter
 
 from rigidfleet.cli import console
 from rigidfleet.cli.arguments import exact, parse_number, parse_whole
-from rigidfleet.errors import RigidfleetError
-
-if TYPE_CHECKING:
-    pass
 from rigidfleet.cli.check import facts
 from rigidfleet.cli.codes import PASSED
+from rigidfleet.errors import RigidfleetError
 
 
 def new(
@@ -33,33 +30,33 @@ def new(
     quiet: bool = False,
     json: bool = False,
 ) -> int:
-    """Write a mission to start from: commented, checked, ready to fly.
+    """Write a new mission with comments, checked and ready to fly.
 
-    Without options, on a terminal, it asks a few questions.
+    On a terminal, without options, the command asks a few questions.
 
     Parameters
     ----------
     name : str
-        Name of the mission, which is written to NAME.toml; or a path that ends so.
+        Name of the mission, written to NAME.toml, or the path of the file.
     shape : str
         line, triangle, square, polygon, hexagon, pyramid, cube, cuboid, v, grid, sphere, shells,
         helix, tetrahedron, octahedron, icosahedron or dodecahedron.
     agents : int
-        Number of vehicles; as many as the shape needs if not given.
+        Number of vehicles. Default: as many as the shape needs.
     size : float
-        Edge length of the shape [m]; of a cuboid or a helix one, or three.
+        Edge length of the shape [m]; one or three sizes for a cuboid or a helix.
     mass : float
         Mass of each vehicle [kg].
     thrust_limit : float
-        Greatest thrust of each vehicle [N]; 2.2 times its weight if not given.
+        Maximum thrust of each vehicle [N]. Default: 2.2 times its weight.
     to : float
-        Waypoint to fly to, X Y Z [m]; may be repeated.
+        Waypoint X Y Z [m]; may be repeated.
     force : bool
-        Replace a file that is there already.
+        Overwrite an existing file.
     quiet : bool
-        Print nothing but errors, and the JSON if asked for. Ask nothing.
+        Print only errors, and JSON with --json. Ask no questions.
     json : bool
-        Print what was written as JSON. Ask nothing.
+        Print a description of the mission as JSON. Ask no questions.
     """
     from rigidfleet._files import write_file
     from rigidfleet.mission import Mission, draft
@@ -75,7 +72,7 @@ def new(
     file = Path(name or "mission")
     file = file if file.suffix == ".toml" else file.with_name(f"{file.name}.toml")
     if file.exists() and not force:
-        raise RigidfleetError(f"{file}: exists already and is kept. Replace it by --force.")
+        raise RigidfleetError(f"{file}: already exists; use --force to overwrite.")
     try:
         text = draft.draft(file.stem, file=str(file), **asked)
     except ValueError as error:
@@ -84,19 +81,19 @@ def new(
     fails = [r.text for r in preflight(mission, search=False).remarks if r.level == "fails"]
     if fails:
         raise RigidfleetError(
-            f"{file}: is not written, as it would fail: {'; '.join(fails)}. Change what you ask for."
+            f"{file}: not written, because the flight would fail: {'; '.join(fails)}. Change the options."
         )
     write_file(file, text.encode())
     if json:
         console.print_json({"file": str(file)} | facts(mission))
     elif not quiet:
         console.out().print(f"{file}: {mission.size_in_words}", soft_wrap=True)
-        console.out().print(f"Fly it by: rigidfleet run {file}", soft_wrap=True)
+        console.out().print(f"To fly it: rigidfleet run {file}", soft_wrap=True)
     return PASSED
 
 
 def _ask(name: str) -> tuple[str, dict[str, Any]]:
-    """Name and contents of a new mission, asked for one by one; an empty answer takes what is offered."""
+    """Ask for the name and the numbers of a new mission, one by one. An empty answer accepts the default."""
     from rigidfleet.formation.shapes import SHAPES, agents_taken, slots
     from rigidfleet.mission import draft
 
@@ -108,7 +105,9 @@ def _ask(name: str) -> tuple[str, dict[str, Any]]:
                     or offered
                 )
             except EOFError:
-                raise RigidfleetError("No answer, so nothing is written. Give options.") from None
+                raise RigidfleetError(
+                    "No answer; no file is written. Give options instead."
+                ) from None
             try:
                 return take(text)
             except ValueError as error:
@@ -117,7 +116,7 @@ def _ask(name: str) -> tuple[str, dict[str, Any]]:
     def positive(text: str) -> float:
         value = parse_number(text)
         if not value > 0:
-            raise ValueError("It must be positive.")
+            raise ValueError("Enter a positive number.")
         return value
 
     def known(text: str) -> str:
@@ -131,7 +130,7 @@ def _ask(name: str) -> tuple[str, dict[str, Any]]:
     def point(text: str) -> tuple[float, ...]:
         values = tuple(map(parse_number, text.replace(",", " ").split()))
         if len(values) != 3:
-            raise ValueError("Three numbers: x, y, z.")
+            raise ValueError("Enter three numbers: x, y, z.")
         return values
 
     name = name or answer("Name", "mission", str)
@@ -144,6 +143,6 @@ def _ask(name: str) -> tuple[str, dict[str, Any]]:
     asked["mass"] = answer("Mass of each [kg]", f"{draft.MASS:g}", positive)
     there = " ".join(f"{x:g}" for x in draft.WAYPOINT)
     waypoint = answer("Fly to x y z [m]", there, point)
-    if waypoint != draft.WAYPOINT:  # of which a large shape takes a higher one
+    if waypoint != draft.WAYPOINT:  # the default waypoint is higher for a large shape
         asked["waypoints"] = [waypoint]
     return name, asked

@@ -1,4 +1,4 @@
-"""The files of a flight: where they are, and that nothing is written over unasked."""
+"""Paths of the files of a flight. Existing files are not overwritten unless the user asks for it."""
 
 from __future__ import annotations
 
@@ -12,29 +12,29 @@ from rigidfleet.errors import ResultError
 
 @dataclass(frozen=True)
 class Files:
-    """Where the files of a flight are."""
+    """Paths of the files of a flight."""
 
     folder: Path
     name: str
 
     @property
     def result(self) -> Path:
-        """The flight itself, netCDF."""
+        """Result of the flight, netCDF."""
         return self.folder / f"{self.name}.nc"
 
     @property
     def verdict(self) -> Path:
-        """Its verdict, JSON."""
+        """Verdict, JSON."""
         return self.folder / "verdict.json"
 
     @property
     def table(self) -> Path:
-        """Its samples, CSV."""
+        """Table of the samples, CSV."""
         return self.folder / f"{self.name}.csv"
 
     @property
     def figures(self) -> list[Path]:
-        """All figures there may be."""
+        """All possible figures."""
         from rigidfleet.plotting import FORMATS, figure_names
 
         return [
@@ -45,26 +45,26 @@ class Files:
 
     @property
     def report(self) -> Path:
-        """Its report, HTML."""
+        """Report, HTML."""
         return self.folder / "report.html"
 
     @property
     def replay(self) -> Path:
-        """Its replay, HTML."""
+        """Replay, HTML."""
         return self.folder / "replay.html"
 
     @property
     def derived(self) -> list[Path]:
-        """All that is made from the result."""
+        """All files that are derived from the result."""
         return [self.verdict, self.table, self.report, self.replay, *self.figures]
 
     def claim(self, *, replace: bool) -> None:
-        """Make sure, before anything is flown, that the files of a flight can be written.
+        """Check before a flight that its files can be written.
 
         Raises
         ------
         ResultError
-            There are some already, and they are not to be replaced; or the folder cannot be written.
+            Files exist and must not be overwritten, or the folder cannot be written.
         """
         there = [path for path in (self.result, *self.derived) if path.exists()]
         if there and not replace:
@@ -72,12 +72,12 @@ class Files:
         self.try_out()
 
     def try_out(self) -> None:
-        """Write for a moment into the folder, or into the one that it will be made in.
+        """Test that the folder, or the folder in which it will be created, can be written.
 
         Raises
         ------
         ResultError
-            It cannot be written.
+            The folder cannot be written.
         """
         folder = self.folder.absolute()
         while not os.path.lexists(folder):
@@ -88,12 +88,12 @@ class Files:
             raise unwritable(self.folder, error) from error
 
     def make_folder(self) -> None:
-        """Make the folder, if it is not there.
+        """Create the folder if it does not exist.
 
         Raises
         ------
         ResultError
-            It cannot be made.
+            The folder cannot be created.
         """
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
@@ -101,12 +101,12 @@ class Files:
             raise unwritable(self.folder, error) from error
 
     def make_new_folder(self) -> Files:
-        """Make a folder that was not there: this one, or where that is taken, one with a number.
+        """Create a new folder: this one, or if it exists, one with a number added to its name.
 
         Raises
         ------
         ResultError
-            It cannot be made.
+            The folder cannot be created.
         """
         folder, count = self.folder, 1
         try:
@@ -122,20 +122,19 @@ class Files:
             raise unwritable(folder, error) from error
 
     def forget(self) -> None:
-        """Remove what was made from an earlier result."""
+        """Remove all files that are derived from an earlier result."""
         for path in self.derived:
             path.unlink(missing_ok=True)
 
 
 def taken(path: Path) -> ResultError:
-    """Of a file that is there and shall not be replaced."""
+    """Error about a file that exists and must not be overwritten."""
     return ResultError(
-        f"{path}: exists already and is kept. "
-        "Replace it by --force, or name another place by --out."
+        f"{path}: already exists; use --force to overwrite or --out to choose another place."
     )
 
 
 def unwritable(path: Path, error: OSError) -> ResultError:
-    """Of a place that cannot be written."""
+    """Error about a folder that cannot be written."""
     why = (error.strerror or str(error)).lower()
-    return ResultError(f"{path}: cannot be written ({why}). Name another folder by --out.")
+    return ResultError(f"{path}: cannot be written ({why}). Choose another folder by --out.")

@@ -1,4 +1,4 @@
-"""After a flight: `report` and `replay`."""
+"""Report and replay of a flight: `report` and `replay`."""
 
 from __future__ import annotations
 
@@ -28,31 +28,31 @@ def report(
     json: bool = False,
     quiet: bool = False,
 ) -> int:
-    """Judge and draw a flight again, and write a report to print and to send.
+    """Evaluate and draw a flight again, and write a report to print or to send.
 
-    Of several flights, write one report that shows them side by side: comparison.html.
+    With several flights, write one report that compares them: comparison.html.
 
     Parameters
     ----------
     result : Path
         Result of a flight, NAME.nc.
     others : Path
-        Results of more flights, to be compared with it.
+        Results of further flights to compare.
     out : Path
-        Folder for report.html, verdict.json and figures/; that of the result if not given. For
-        comparison.html, the working folder.
+        Folder for report.html, verdict.json and figures/. Default: the folder of the result, or for
+        comparison.html the current folder.
     force : bool
-        Replace files that are there already; without it they are kept.
+        Overwrite existing files. Without it they are kept.
     no_figures : bool
-        Write no files of figures; those in the report are drawn in any case.
+        Write no figure files. The report has its figures in any case.
     format : list
-        Format of these files, png and svg if not given; may be repeated: --format pdf --format png.
+        Format of the figure files; may be repeated: --format pdf --format png. Default: png and svg.
     no_titles : bool
-        Draw these files without titles, for a paper with captions.
+        Draw the figure files without titles, for papers with captions.
     json : bool
-        Print the verdict as JSON; of several flights a list of them.
+        Print the verdict as JSON; for several flights, a list of verdicts.
     quiet : bool
-        Print nothing but errors, and the JSON if asked for.
+        Print only errors, and JSON with --json.
     """
     from rigidfleet._files import write_file
     from rigidfleet.assessment import assess
@@ -96,22 +96,22 @@ def report(
             list_files(files)
         if kept and not quiet:
             console.err().print(
-                f"{console.count(len(kept), 'file')} kept as before; --force makes them again"
+                f"{console.count(len(kept), 'existing file')} kept; use --force to overwrite"
             )
     return PASSED if all(verdict.passed for verdict in verdicts) else FAILED
 
 
 def replay(result: Path, /, *, out: Path | None = None, force: bool = False) -> int:
-    """Write a flight as a page to be watched in a browser, and to be sent: it needs no network.
+    """Write a page that replays a flight in a browser, without a network connection.
 
     Parameters
     ----------
     result : Path
         Result of a flight, NAME.nc.
     out : Path
-        The page; replay.html beside the result if not given.
+        Path of the page. Default: replay.html beside the result.
     force : bool
-        Replace a page that is there already.
+        Overwrite an existing page.
     """
     from rigidfleet.result import Result
 
@@ -132,7 +132,7 @@ def write_report(
     labels: list[str] | None = None,
     quiet: bool = False,
 ) -> None:
-    """Write the page of a flight, or of several."""
+    """Write the report of one or several flights."""
     from rigidfleet.reporting import report as write
 
     shown = console.err().is_interactive and not quiet
@@ -141,7 +141,7 @@ def write_report(
 
 
 def labels_of(paths: list[Path], records: list[Result]) -> list[str]:
-    """What to call each of several flights: what tells them apart, and is short."""
+    """Short labels that distinguish several flights."""
     missions = [record.mission.name for record in records]
     stems = [path.stem for path in paths]
     folders = [str(path.parent / path.stem) for path in paths]

@@ -1,4 +1,4 @@
-"""Fly a mission, and what is said about missions: `run` and `missions`."""
+"""Fly a mission, and list the shipped ones: `run` and `missions`."""
 
 from __future__ import annotations
 
@@ -20,10 +20,9 @@ if TYPE_CHECKING:
     from rigidfleet.result import Result
 from rigidfleet.cli.codes import FAILED, INTERRUPTED, PASSED
 
-#: A format of figures, and those drawn unless others are asked for.
+#: A format of figures.
 Format = Literal["png", "svg", "pdf"]
-
-
+#: Default formats of figures.
 DRAWN: tuple[Format, ...] = ("png", "svg")
 
 
@@ -41,30 +40,30 @@ def run(
     json: bool = False,
     quiet: bool = False,
 ) -> int:
-    """Fly a mission: simulate it, judge it, draw it.
+    """Fly a mission: simulate it, evaluate it and draw its figures.
 
     Parameters
     ----------
     mission : str
         A shipped mission (see "rigidfleet missions") or a mission file.
     out : Path
-        Folder for the files: NAME.nc, verdict.json and figures/; flights/NAME if not given.
+        Folder for NAME.nc, verdict.json and figures/. Default: flights/NAME.
     force : bool
-        Replace the files of an earlier flight; without it they are kept and nothing is flown.
+        Overwrite the files of an earlier flight. Without it, the command stops before the flight.
     no_figures : bool
-        Draw no figures; "rigidfleet report" can do so later.
+        Draw no figures; "rigidfleet report" can draw them later.
     format : list
-        Format of the figures, png and svg if not given; may be repeated: --format pdf --format png.
+        Format of the figures; may be repeated: --format pdf --format png. Default: png and svg.
     no_titles : bool
-        Draw figures without titles, for a paper with captions.
+        Draw figures without titles, for papers with captions.
     replay : bool
-        Also write replay.html: the flight to be watched in a browser.
+        Also write replay.html, which replays the flight in a browser.
     csv : bool
         Also write NAME.csv: time, position, velocity and yaw of each agent.
     json : bool
         Print the verdict as JSON.
     quiet : bool
-        Print nothing but errors, and the JSON if asked for.
+        Print only errors, and JSON with --json.
     """
     from rigidfleet.mission import load_mission
 
@@ -89,7 +88,11 @@ def run(
         console.print_exactly(verdict.json() + "\n")
     elif not quiet:
         console.out().print(verdict)
-    what = "what flew is saved, marked incomplete," if interrupted else "the flight is saved"
+    what = (
+        "the flight so far is saved, marked incomplete,"
+        if interrupted
+        else "the complete flight is saved"
+    )
     if not interrupted:
         try:
             if replay:
@@ -112,19 +115,19 @@ def run(
 def missions(
     *, print_: Annotated[str, Parameter(name="--print")] = "", schema: bool = False
 ) -> int:
-    """List the missions that ship with the program.
+    """List the shipped missions.
 
     Parameters
     ----------
     print_ : str
-        Print the file of this mission instead, to be copied and changed.
+        Print the file of this mission instead, as a start for your own.
     schema : bool
         Print the JSON schema of mission files instead, for editors.
     """
     from rigidfleet.mission import json_schema, mission_names, mission_text
 
     if print_ and schema:
-        raise RigidfleetError("--print and --schema exclude each other. Give one of them.")
+        raise RigidfleetError("--print and --schema cannot be combined. Give one of them.")
     if print_:
         console.print_exactly(mission_text(print_))
     elif schema:
@@ -141,7 +144,7 @@ def missions(
 
 
 def fly(mission: Mission, watch: console.FlightWatch | None) -> tuple[Result, bool]:
-    """Result of a mission, and whether the flight was interrupted."""
+    """Fly a mission; return its result and whether the flight was interrupted."""
     from rigidfleet.kernel.engine.native import is_compiled
 
     if watch is not None and not is_compiled():
@@ -157,7 +160,7 @@ def fly(mission: Mission, watch: console.FlightWatch | None) -> tuple[Result, bo
 
 @contextmanager
 def heeding_interrupts() -> Generator[None]:
-    """Ctrl-C inside the compiler may come out of it as any error: make it Ctrl-C again."""
+    """Raise KeyboardInterrupt on Ctrl-C even if the compiler turns it into another exception."""
     interrupted = False
 
     def note(*_: object) -> None:
@@ -177,7 +180,7 @@ def heeding_interrupts() -> Generator[None]:
 
 
 def of_formats(figures: Iterable[Path], formats: Iterable[Format] | None) -> list[Path]:
-    """Those of the figures' files that are of the formats asked for."""
+    """Paths of figures that have one of the formats, by default `DRAWN`."""
     kinds = {f".{kind}" for kind in formats or DRAWN}
     return [path for path in figures if path.suffix in kinds]
 
@@ -190,7 +193,7 @@ def draw(
     titles: bool,
     quiet: bool = False,
 ) -> None:
-    """Draw figures, each to the file of its name, of which the flight has something to show."""
+    """Draw the figures that apply to the flight, each to the file of its name."""
     from rigidfleet.plotting import figure_names, plot
 
     names = figure_names(result)
@@ -208,14 +211,14 @@ def draw(
 
 
 def write_replay(result: Result, path: Path) -> None:
-    """Write the page that plays a flight."""
+    """Write the page that replays a flight."""
     from rigidfleet.web.replay import replay as write
 
     write(result, path)
 
 
 def list_files(files: Files) -> None:
-    """Print where the files of a flight are."""
+    """Print the paths of the files of a flight."""
     for what, path in (
         ("Result", files.result),
         ("Verdict", files.verdict),

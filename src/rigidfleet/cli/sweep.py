@@ -1,4 +1,4 @@
-"""Fly a mission many times: `sweep`."""
+"""Fly a mission many times with variations: `sweep`."""
 
 from __future__ import annotations
 
@@ -40,47 +40,48 @@ def sweep(
     json: bool = False,
     quiet: bool = False,
 ) -> int:
-    """Fly a mission many times, varied: how many flights pass, and what makes others fail.
+    """Fly a mission many times with variations: find the success rate and the causes of failure.
 
-    Stopped at any moment, even by kill -9, the same command goes on where it was.
+    If the sweep is stopped, even by kill -9, the same command resumes it.
 
     Parameters
     ----------
     mission : str
-        A mission, a sweep file, or the folder of a sweep, to go on with it.
+        A mission, a sweep file, or the folder of a sweep to resume.
     vary : str
-        What varies: "PATH = KIND(NUMBERS)", with += to add to and *= to scale what the mission has; may be
+        A variation "PATH = KIND(NUMBERS)"; += adds to the value in the mission, *= scales it; may be
         repeated. KIND is normal, uniform, log-uniform, choice, grid, linspace or geomspace.
     runs : int
-        Number of runs; one for each point of the grid if not given. More may be added later.
+        Number of runs; more can be added later. Default: one per point of the grid.
     seed : int
-        Seed of the random numbers, 0 if not given.
+        Seed of the random numbers. Default: 0.
     out : Path
-        Folder for sweep.db, summary.json and figures/; sweeps/NAME if not given.
+        Folder for sweep.db, summary.json and figures/. Default: sweeps/NAME.
     force : bool
-        Replace another sweep in that folder; without it, it is kept and nothing is flown.
+        Overwrite another sweep in this folder. Without it, the command stops before any flight.
     final_states : bool
-        Evaluate where phases end alone: open-loop missions whose starts vary then fly by the thousand in a second.
+        Evaluate only the final states of phases: thousands of runs per second, for open-loop missions with varied
+        start states.
     workers : int
-        Processes on this machine; as many as it has cores if not given.
+        Number of processes on this machine. Default: number of cores.
     cluster : str
-        Address of a Dask scheduler, whose workers fly instead.
+        Address of a Dask scheduler, whose workers fly the runs.
     summary : bool
-        Fly nothing; sum up and draw again the sweep of a folder.
+        Fly nothing; summarise and draw the sweep in a folder again.
     map_ : str
-        The two paths that the map is drawn over.
+        The two paths on the axes of the map.
     metric : str
-        What the map shows: success or a metric.
+        Quantity that the map shows: success or a metric.
     no_figures : bool
         Draw no figures.
     format : list
-        Format of the figures, png and svg if not given; may be repeated: --format pdf --format png.
+        Format of the figures; may be repeated: --format pdf --format png. Default: png and svg.
     no_titles : bool
-        Draw figures without titles, for a paper with captions.
+        Draw figures without titles, for papers with captions.
     json : bool
         Print the summary as JSON.
     quiet : bool
-        Print nothing but errors, and the JSON if asked for.
+        Print only errors, and JSON with --json.
     """
     from rigidfleet.sweep import store
     from rigidfleet.sweep.summary import summarise
@@ -98,8 +99,8 @@ def sweep(
                 table = _fly_sweep(asked, folder, workers, cluster, force, watch)
         except KeyboardInterrupt:
             done = len(store.read(folder).run) if store.is_store(folder) else 0
-            words = f"Interrupted: {done} of {asked.runs} runs are kept in {folder}"
-            again = f"Go on by: rigidfleet sweep {folder}"
+            words = f"Interrupted: {done} of {asked.runs} runs are saved in {folder}"
+            again = f"To resume: rigidfleet sweep {folder}"
             console.err().print(f"{words}\n{again}", style="yellow", soft_wrap=True)
             return INTERRUPTED
     found = summarise(table)
@@ -138,7 +139,7 @@ def _asked(
     *,
     final_states: bool,
 ) -> tuple[Sweep, Path]:
-    """The sweep that is asked for, and its folder."""
+    """Sweep of the command line, and its folder."""
     from rigidfleet.mission import mission_names
     from rigidfleet.sweep import Sweep, store
     from rigidfleet.sweep.definition import is_sweep_file
@@ -146,7 +147,8 @@ def _asked(
     if store.is_store(Path(what)):
         if vary or seed is not None or out is not None or final_states:
             raise RigidfleetError(
-                f"{what}: is a sweep already, and goes on as it is. Remove --vary, --seed, --final-states and --out."
+                f"{what}: is the folder of a sweep, whose definition cannot change. Remove --vary, --seed,"
+                " --final-states and --out."
             )
         found = store.read_sweep(Path(what))
         found.runs = runs or found.runs
@@ -174,7 +176,7 @@ def _fly_sweep(
     force: bool,
     watch: console.SweepWatch | None,
 ) -> Any:
-    """Fly a sweep; returns the table of its rows."""
+    """Fly a sweep and return the table of its rows."""
     from rigidfleet.kernel.engine.native import is_compiled
     from rigidfleet.sweep import fly
 

@@ -1,6 +1,6 @@
 """The constraint force: Baumgarte-stabilised Lagrange multipliers (paper, section III).
 
-Eq. 12 of the paper, with the moving reference fed forward, reads
+Eq. (12) of the paper, with the moving reference fed forward, reads
 
     f_C = J^T lambda,   (J M^-1 J^T) lambda = b,
     b = d_ddot - J_dot r_dot - J M^-1 f_E - 2 alpha c_dot - beta^2 c - gamma int c dt.
@@ -21,7 +21,7 @@ from rigidfleet.kernel.references import distance_references
 
 @inlined
 def constraint_force(t, y, dy, p, w):
-    """f_C (N, 3) [N] at time t [s] for w.r, w.v and the forces w.f_E and w.f_u; and dy of the integral of c."""
+    """f_C (N, 3) [N], Eq. (12), at time t [s] for w.r, w.v, the forces w.f_E and w.f_u; and dy of the integral of c."""
     vehicles, graph = p.vehicles, p.graph
     n, m = vehicles.m.shape[0], graph.edges.shape[0]
     distance_references(t, p.reference, graph.edges, w.p, w.p_dot, w.p_ddot, w.d, w.d_dot, w.d_ddot)
@@ -37,12 +37,12 @@ def constraint_force(t, y, dy, p, w):
 
 @inlined
 def right_side(r, v, integral, a, edges, law, w):
-    """Edges at positions r and velocities v (N, 3), and the bracket of Eq. 12.
+    """Edges at positions r and velocities v (N, 3), and the bracket of Eq. (12).
 
-    Fills w.u (m, 3) with unit vectors and w.L (m,) [m] with lengths (Eq. 3), w.c with the
-    constraints and w.b [m/s^2] with the right side. Jdot v of an edge is
-    (|dv|^2 - (u . dv)^2) / L; ``a`` (N, 3) [m/s^2] is M^-1 f_E, the acceleration by every force
-    but f_C.
+    Fills w.u (m, 3) with unit vectors and w.L (m,) [m] with lengths, w.c with the
+    constraints, Eq. (3), and w.b [m/s^2] with the right side. J v of an edge, Eq. (5), is u . dv;
+    Jdot v, Eq. (6), is (|dv|^2 - (u . dv)^2) / L; ``a`` (N, 3) [m/s^2] is M^-1 f_E, the
+    acceleration by every force but f_C.
     """
     for k in range(edges.shape[0]):
         i, j = edges[k, 0], edges[k, 1]
@@ -67,7 +67,7 @@ def right_side(r, v, integral, a, edges, law, w):
 
 @compiled
 def assemble(u, graph, scale, shift, A):
-    """Lower triangle of A = scale J M^-1 J^T + shift 1 (m, m)."""
+    """Lower triangle of A = scale J M^-1 J^T + shift 1 (m, m), the matrix of Eqs. (11), (12)."""
     pairs, weight = graph.pairs, graph.weight
     n = A.shape[0]
     all_meet = 2 * pairs.shape[0] == n * (n - 1)
@@ -84,7 +84,7 @@ def assemble(u, graph, scale, shift, A):
 
 @inlined
 def solve_multipliers(vehicles, graph, law, w):
-    """Multipliers w.multiplier (m,) [N] for w.b; NaN where A is singular and the law exact.
+    """Multipliers w.multiplier (m,) [N] of Eqs. (11), (12) for w.b; NaN where A is singular and the law exact.
 
     On the eigenvalues w of mbar A (mbar the mean mass of those left), each law is mbar phi(w) b with
     exact      1/w, the paper's;
@@ -210,7 +210,7 @@ def solve_at_agents(m, mbar, edges, law, w):
 
 @compiled
 def apply_multipliers(u, edges, multiplier, f_C):
-    """f_C = J^T lambda (Eq. 10) into f_C (N, 3) [N]: no net force, no net torque."""
+    """f_C = J^T lambda, Eq. (10), into f_C (N, 3) [N]: no net force, no net torque."""
     for i in range(f_C.shape[0]):
         f_C[i, 0], f_C[i, 1], f_C[i, 2] = 0.0, 0.0, 0.0
     for k in range(edges.shape[0]):

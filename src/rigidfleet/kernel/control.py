@@ -125,7 +125,7 @@ def reference_motion(t, motion, w):
 def desired_agents(w):
     """Where each agent should be: r_i = r_cm + T^T p_i and two derivatives, into w.r_ref etc.
 
-    v_i = v_cm + T^T (dp + omega x p),
+    v_i = v_cm + T^T (dp + omega x p), which is Eq. (22),
     a_i = a_cm + T^T (ddp + 2 omega x dp + domega x p + omega x (omega x p)).
     """
     T, o, o_dot = w.T_ref, w.body[3], w.body[4]

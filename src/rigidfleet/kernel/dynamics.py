@@ -25,9 +25,9 @@ from rigidfleet.kernel.rigid_body import (
 def closed_loop(t, y, dy, p, w):
     """Right-hand side dy of the closed loop at time t [s] and state y.
 
-    Newton's law with the constraint force: M dv/dt = f_E + f_u + f_C (Eq. 2), f_u from the input
-    law of the phase, f_C from the multipliers (Eq. 12), both from measured states and believed
-    masses. Everything computed stays in ``w``.
+    Newton's law with the constraint force, Eqs. (1), (2): M dv/dt = f_E + f_u + f_C, f_u from the
+    input law of the phase, f_C by Eq. (12), both from measured states and believed masses.
+    Everything computed stays in ``w``.
     """
     vehicles, graph, disturbance = p.vehicles, p.graph, p.disturbance
     m, g = vehicles.m, vehicles.g
@@ -71,7 +71,7 @@ def closed_loop(t, y, dy, p, w):
 
 @inlined
 def accelerate(dy, p, w):
-    """Newton's law (Eq. 2) with true masses and what the vehicles can give: w.a (N, 3) [m/s^2], and dy of r and v."""
+    """Newton's law, Eqs. (1), (2), with true masses and what vehicles can give: w.a (N, 3) [m/s^2], dy of r and v."""
     vehicles, inverse, v = p.vehicles, p.disturbance.inverse, w.v
     n = inverse.shape[0]
     for i in range(n):
@@ -90,7 +90,7 @@ def accelerate(dy, p, w):
 
 @compiled
 def world_states(y, p, w):
-    """Positions and velocities in world axes from the states of the body formulation."""
+    """Positions and velocities in world axes from the states of the body formulation: v by Eq. (22)."""
     n = p.vehicles.m.shape[0]
     q = 6 * n + p.graph.edges.shape[0]
     turn_back(w.T, y[: 3 * n], y[q + 4 : q + 7], w.r)
@@ -114,15 +114,15 @@ def turn_back(T, x, origin, out):
 
 @compiled
 def body_derivatives(y, dy, p, w):
-    """The paper's equations of motion in the body frame, in their well-posed form.
+    """The paper's equations of motion in the body frame, Eqs. (15), (16), in their well-posed form.
 
     The paper's pair for d2x/dt2 and domega/dt is linearly dependent: omega of a deforming body is
-    a choice of frame. With mean axes, omega = I^+ h, and y_i = dx_i/dt + omega x x_i in place of
-    dx_i/dt, its Eq. 16 reads
+    a choice of frame. With mean axes, omega = I^+ h, and y_i = dx_i/dt + omega x x_i, Eq. (14), in
+    place of dx_i/dt, Eq. (16) reads
 
         dx_i/dt = y_i - omega x x_i,   dy_i/dt = -omega x y_i + T (f_i/m_i - F/M),
 
-    regular on a line too. Substituting y_i gives Eq. 16 back with all its Coriolis terms.
+    regular on a line too. Substituting y_i gives Eq. (16) back with all its Coriolis terms.
     """
     n = p.vehicles.m.shape[0]
     q = 6 * n + p.graph.edges.shape[0]

@@ -360,7 +360,7 @@ def attitudes(points, part, parts, p, monitor):
             size += state[s] * state[s]
         size = 1.0 / math.sqrt(size)
         a, b, c, d = state[0] * size, state[1] * size, state[2] * size, state[3] * size
-        # Columns of T^T, body -> world (Eq. 21's quaternion, scalar first).
+        # Columns of T^T, body -> world (the quaternion of Eq. (21), scalar first).
         pose[0], pose[1], pose[2] = (
             1 - 2 * (c * c + d * d),
             2 * (b * c - a * d),

@@ -18,7 +18,7 @@ def centre_of_mass(r, m, M, out):
 
 @compiled
 def inertia(r, m, cm, I):
-    """Inertia I (3, 3) [kg m^2] of points r (N, 3) about cm: sum m (|x|^2 1 - x x^T)."""
+    """Inertia I (3, 3) [kg m^2] of points r (N, 3) about cm, as in Eq. (19): sum m (|x|^2 1 - x x^T)."""
     a = b = c = d = e = f = 0.0
     # Of one alone nothing, exactly: what rounding leaves of r - cm would have an inverse.
     for i in range(r.shape[0] if r.shape[0] > 1 else 0):
@@ -77,8 +77,9 @@ def multiply_transposed(A, x, out):
 def mean_axes(r, v, m, M, w):
     """Centre of mass, inertia and mean-axis angular velocity omega = I^+ h, world axes.
 
-    In the mean-axis (Tisserand) frame sum m x cross dx/dt = 0, so h = I omega (the paper's h_cm
-    with its misprint mended). Fills w.cm = (r_cm, v_cm, omega, h), w.I and w.I_inv.
+    h = sum x cross m dx/dt, Eq. (17), is of the momenta of Eq. (13). In the mean-axis (Tisserand) frame
+    the first term of Eqs. (18), (19) is zero, and h = I omega: this replaces Eq. (20). Fills
+    w.cm = (r_cm, v_cm, omega, h), w.I and w.I_inv.
     """
     centre_of_mass(r, m, M, w.cm[0])
     centre_of_mass(v, m, M, w.cm[1])
@@ -128,7 +129,7 @@ def attitude_matrix(q, T):
 
 @compiled
 def quaternion_rate(q, omega, out):
-    """Rotational kinematics of the paper: out (4,) = 1/2 Omega(omega) q, omega in body axes."""
+    """Rotational kinematics, Eq. (21): out (4,) = 1/2 Omega(omega) q, omega in body axes."""
     P, Q, R = omega[0], omega[1], omega[2]
     out[0] = 0.5 * (-P * q[1] - Q * q[2] - R * q[3])
     out[1] = 0.5 * (P * q[0] + R * q[2] - Q * q[3])
@@ -190,7 +191,7 @@ def allocate_rigid(x, m, M, F, tau, omega, I, I_inv, f):
 
 @compiled
 def allocate_pinv(x, m, M, F, tau, split, I, I_inv, f, H, V, work):
-    """The paper's input decoupling (Eq. 24-27): f = H^+ [F; tau_1; ...; tau_N].
+    """The paper's input decoupling, Eqs. (24)-(27): f = H^+ [F; tau_1; ...; tau_N].
 
     H^T H is always singular (forces along m_i x_i that sum to zero lie in its null space), so its
     inverse is a pseudo-inverse here, with relative cut-off 1e-12. The torque is split among the

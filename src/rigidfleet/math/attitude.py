@@ -125,7 +125,7 @@ def euler_from_quaternion(q: ArrayLike) -> Floats:
 def quaternion_rate(q: ArrayLike, omega: ArrayLike) -> Floats:
     """Rate (..., 4) [1/s] of quaternions (..., 4) at body rates omega (..., 3) = (p, q, r) [rad/s].
 
-    qdot = 1/2 Omega(omega) q (Eq. 21 of the paper); the same as 1/2 q (0, omega), and as
+    qdot = 1/2 Omega(omega) q, Eq. (21); the same as 1/2 q (0, omega), and as
     Tdot = -[omega x] T.
     """
     omega = _vectors("omega", omega, 3)
@@ -225,7 +225,7 @@ def rotation_vector_rate(phi: ArrayLike, omega: ArrayLike) -> Floats:
 
 
 def triangle_frame(r: ArrayLike, masses: ArrayLike | None = None) -> Floats:
-    """Body frame of a triangle by the paper's recipe ("Body Frame Attachment"): T (..., 3, 3).
+    """Body frame of a triangle by the recipe of the paper, Eq. (23): T (..., 3, 3).
 
     x points from the centre of mass to agent 3, y along r_1 - r_2 made orthogonal to x, and
     z = x cross y. Positions r (..., 3, 3) [m], one row per agent; masses (3,) [kg], equal by

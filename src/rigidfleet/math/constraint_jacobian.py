@@ -1,4 +1,4 @@
-"""The constraint Jacobian of distances, J (m, 3N) with rows u_ij and -u_ij (Eq. 5)."""
+"""The constraint Jacobian of distances, J (m, 3N) with rows u_ij and -u_ij, Eq. (5)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _ELEMENTS = 8_000_000
 
 
 def jacobian(points: ArrayLike, edges: ArrayLike) -> Floats:
-    """J (..., m, N d) of edges (m, 2) at points (..., N, d): a row holds the unit vector u at i and -u at j (Eq. 5).
+    """J (..., m, N d), Eq. (5), of edges (m, 2) at points (..., N, d): a row holds the unit vector u at i and -u at j.
 
     A row is not finite where its agents are at one place.
     """
@@ -33,7 +33,8 @@ def jacobian(points: ArrayLike, edges: ArrayLike) -> Floats:
 def smallest_singular_value(r: Floats, edges: Ints, masses: ArrayLike | None = None) -> Floats:
     """Smallest non-zero singular value (K,) of the constraint Jacobian J at r (K, N, 3).
 
-    Zero means below 1e-7 of the largest. NaN without edges. With ``masses`` the Jacobian is
+    Eq. (4) counts independent constraints: their number is the rank of J. Zero means below
+    1e-7 of the largest. NaN without edges. With ``masses`` the Jacobian is
     weighted, J M^-1/2 sqrt(mbar), whose squares are the eigenvalues w of mbar A.
     """
     if not len(edges):

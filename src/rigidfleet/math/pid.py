@@ -1,4 +1,4 @@
-"""Gains of the constraint's PID stabilisation (Baumgarte; Eq. 12 of the paper).
+"""Gains of the constraint's PID stabilisation (Baumgarte) in Eq. (12).
 
 Where the constraints are independent and their references stand still, each error c [m] obeys
 
@@ -21,7 +21,7 @@ def is_stable(alpha: float, beta: float, gamma: float) -> bool:
 
 
 def triple_pole(p: float) -> tuple[float, float, float]:
-    """Gains (alpha, beta, gamma) that put all three poles at -p [1/s], p > 0.
+    """Gains (alpha, beta, gamma) of Eq. (12) that put all three poles at -p [1/s], p > 0.
 
     From rest then c/c(0) = e^-x (1 + x - x^2), x = p t: the fastest answer without ringing. It
     overshoots by 5 e^-3 = 24.9 %, and must overshoot, for the integral of c has to return to zero.

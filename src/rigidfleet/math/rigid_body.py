@@ -23,9 +23,9 @@ def kabsch(
 ) -> Floats:
     """Rotation R minimising sum_i w_i |target_i - R source_i|^2, both sets taken about their weighted centres.
 
-    With slots as source and positions in the world as target, R is body -> world, the transpose of the paper's
-    T. Where several rotations fit equally well (points on a line, a mirrored symmetric shape), the one nearest
-    to `near` is taken, so that a line gets the *minimal* rotation and no spin about itself.
+    With slots as source and positions in the world as target, R is body -> world, the transpose of
+    the matrix in Eq. (23). Where several rotations fit equally well (points on a line, a mirrored symmetric
+    shape), the one nearest to `near` is taken, so that a line gets the *minimal* rotation and no spin about itself.
 
     Parameters
     ----------
@@ -186,6 +186,8 @@ def _smallest_turns(now: Floats, there: Floats) -> Floats:
 
 def mean_axis_rates(x: Floats, y: Floats, masses: Floats, line: ArrayLike = False) -> Floats:
     """Angular velocity omega = I^+ h (K, 3) [rad/s], world axes, of agents about their CM.
+
+    h is that of Eq. (17).
 
     x, y (K, N, 3): positions and velocities about the CM [m, m/s]; masses (N,) or (K, N); line (K,):
     where they are one, and have no spin about themselves. That of a line bent by some centimetres would be noise.

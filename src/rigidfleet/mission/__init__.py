@@ -1,9 +1,8 @@
-"""Missions: what the user asked for, read from TOML and checked on entry. Data only.
+"""Missions: vehicles, formations, obstacles and phases, read from TOML and checked. Data only.
 
-A mission is checked as a whole, and *all* its errors are raised at once in one `MissionError` whose
-findings name the file, the key, the value and the remedy. What a user sees counts from 1, as in the
-paper: agents, edges, phases, and so the places in a key such as `phases[3].until`. Arrays that
-`Mission` hands to code count agents from 0.
+A mission is checked as a whole. *All* its errors are raised in one `MissionError`, whose findings give the file, the
+key, the value and the remedy. Everything that a user sees counts from 1, as in the paper: agents, edges, phases, and
+the entries in a key such as `phases[3].until`. Arrays that `Mission` returns count agents from 0.
 """
 
 from rigidfleet.mission.describe import counted, ending, goal

@@ -1,7 +1,7 @@
-"""How long, deep, many and large a mission may be: stated once, checked first, listed in the documents.
+"""Bounds on the text, the counts and the numbers of a mission. They are checked first, and docs/missions.md lists them.
 
-Within these bounds the numbers of a mission stay numbers, and what is built from it fits into memory. They are far
-beyond what flies: a length from a micrometre to twice the distance of a geostationary satellite.
+Within these bounds no number overflows, and everything that is built from a mission fits into memory. They are far
+beyond any real mission: lengths range from a micrometre to twice the distance of a geostationary satellite.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 
 class Bound(NamedTuple):
-    """Least and greatest size of a quantity; where it may be zero or negative, the least is of what is not."""
+    """Smallest and largest magnitude of a quantity. The smallest applies only to quantities that must be > 0."""
 
     least: float
     most: float
@@ -20,13 +20,13 @@ class Bound(NamedTuple):
 
 # -- text --------------------------------------------------------------------------------------------
 
-#: Bytes of a file: positions of 400,000 agents. A device or a video given by mistake is noticed, too.
+#: Maximum size of a file [bytes]: the positions of 400,000 agents. It also rejects a device or a video.
 BYTES = 64 * 2**20
-#: Brackets within brackets, and parts of a dotted key. The format itself needs three of each.
+#: Maximum depth of nested brackets, and of the parts of a dotted key. The format itself needs three of each.
 DEPTH = 8
-#: Keys with a value, and tables.
+#: Maximum number of keys and tables.
 KEYS = 50_000
-#: Numbers and strings in lists, and lists.
+#: Maximum number of entries in lists.
 ENTRIES = 10_000_000
 
 # -- how many ----------------------------------------------------------------------------------------
@@ -35,13 +35,14 @@ AGENTS = 1_000_000
 FORMATIONS = 200
 PHASES = 1000
 OBSTACLES = 1000
-#: Edges of a formation, of few agents and for each of many; all pairs of 200 agents are fewer.
+#: Maximum number of edges of a formation: EDGES, or EDGES_EACH per agent if that is more. All pairs of 200 agents are
+#: fewer.
 EDGES, EDGES_EACH = 20_000, 32
-#: Slots of all formations together.
+#: Maximum number of slots of all formations together.
 SLOTS = 5_000_000
-#: Pairs of agents whose spheres, all as large as the largest, touch at the start or in a formation.
+#: Maximum number of pairs of agents that touch at the start or in a formation, if all have the largest radius.
 TOUCHING = 5_000_000
-#: Agents where each is compared with each: assigned to slots, or correlated by distance.
+#: Maximum number of agents where all pairs are compared: assignment to slots.
 ALL_PAIRS = 5000
 
 # -- how large ---------------------------------------------------------------------------------------
@@ -56,15 +57,15 @@ ANGLE = Bound(1e-6, 1e6, "deg or deg/s")
 GAIN = Bound(1e-6, 1e6, "1/s")
 WEIGHT = Bound(1e-15, 1e15, "")
 TOLERANCE = Bound(1e-15, 1e8, "m, m/s")
-#: The heaviest vehicle over the lightest.
+#: Maximum ratio of the largest mass to the smallest.
 MASS_RATIO = 1e9
 
 _BARE = r"[A-Za-z0-9_\-]++"
 _QUOTED = r'"(?:[^"\\\n]|\\[^\n])*+"?' + r"|'[^'\n]*+'?"
 _NEXT = rf"[ \t]*+\.[ \t]*+(?:{_BARE}|{_QUOTED})"
-#: What may hide a bracket or a dot, what is deep, and nothing else: numbers are passed over.
+#: Strings and comments, which may contain brackets and dots; dotted keys; brackets. Everything else is skipped.
 _TOKENS = re.compile(
-    # A string of several lines may end in one or two quotes of its own.
+    # A multi-line string may end in one or two quotes of its own before the closing three.
     r'"""(?:[^"\\]|\\.|"(?!""))*+(?:"{3,5})?'
     r"|'''(?:[^']|'(?!''))*+(?:'{3,5})?"
     r"|#[^\n]*+"
@@ -76,29 +77,29 @@ _PARTS = re.compile(rf"{_BARE}|{_QUOTED}")
 
 
 def excess(text: str) -> str:
-    """What of TOML text is beyond its bounds, in words; "" if nothing is.
+    """Describe how TOML text exceeds the bounds; "" if it does not.
 
-    In one pass and without recursion: a parser need not be asked, which would follow a key however deep.
+    One pass without recursion, before any parser sees the text: a parser would recurse into keys of any depth.
     """
     if len(text) > BYTES:
-        return f"is longer than {BYTES >> 20} MiB"
+        return f"is larger than {BYTES >> 20} MiB"
     for signs, most, what in ("=", KEYS, "keys"), (",[", ENTRIES, "entries in lists"):
         many = sum(text.count(sign) for sign in signs)
         if many > most:
-            return f"has {many:,} {what}, more than {most:,}"
+            return f"has {many:,} {what}; the maximum is {most:,}"
     depth = 0
     for token in _TOKENS.finditer(text):
         if token["open"]:
             depth += 1
-            what, deep = "brackets are nested", depth
+            what, deep = "the depth of brackets", depth
         elif token["shut"]:
             depth = max(depth - 1, 0)
             continue
         elif token["key"]:
-            what, deep = "a dotted key has parts", len(_PARTS.findall(token["key"]))
+            what, deep = "the depth of a dotted key", len(_PARTS.findall(token["key"]))
         else:
             continue
         if deep > DEPTH:
             line = text.count("\n", 0, token.start()) + 1
-            return f"{what} {deep:,} deep at line {line:,}, more than {DEPTH}"
+            return f"{what} is {deep:,} at line {line:,}; the maximum is {DEPTH}"
     return ""

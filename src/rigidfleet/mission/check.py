@@ -1,7 +1,7 @@
-"""Check a mission as a whole: every table by itself, then what only several keys together tell.
+"""Check a mission as a whole: first each table by itself, then conditions that involve several keys.
 
-Each table is judged even where another has errors, so that one look shows all there is to mend. A check
-that would need a key which is wrong itself is passed over.
+A table is checked even if another one has errors, so that one run reports all errors. A check is skipped if it needs
+a key that has an error itself.
 """
 
 from __future__ import annotations
@@ -53,16 +53,16 @@ _OBSTACLES: dict[str, type[Part]] = {"box": Box, "ground": Ground}
 
 
 def check(data: Mapping[str, Any], origin: str) -> dict[str, Any]:
-    """The parts of a mission that is in order, by the fields of `Contents`.
+    """Check the data of a mission and return its parts, by the fields of `Contents`.
 
     Raises
     ------
     MissionError
-        With a finding for everything that is not.
+        With a finding for each error.
     """
     notes = FindingCollector(data, origin)
     _numbers(notes)
-    if notes.findings:  # what follows would take long
+    if notes.findings:  # the other checks would take long
         raise MissionError(notes.findings)
     parts = _tables(notes)
     for judge in (_agents, _gains, _regulators, _tracking, _allocation, _geofence):
@@ -80,36 +80,35 @@ def check(data: Mapping[str, Any], origin: str) -> dict[str, Any]:
 
 
 def _numbers(notes: FindingCollector) -> None:
-    """Refuse more of anything than a mission may have, before it is looked at."""
+    """Find counts beyond the bounds, before anything else is checked."""
 
     def bounded(path: Keys, given: object, most: int, remedy: str) -> None:
         if isinstance(given, list | dict) and len(given) > most:
-            notes.add(path, f"has {len(given):,} entries, more than {most:,}", remedy, None)
+            notes.add(path, f"has {len(given):,} entries; the maximum is {most:,}", remedy, None)
 
     for key, most, remedy in (
-        ("formations", bounds.FORMATIONS, "fly them in several missions"),
-        ("phases", bounds.PHASES, "fly them in several missions"),
-        ("obstacles", bounds.OBSTACLES, "join those that touch, and leave out those out of reach"),
+        ("formations", bounds.FORMATIONS, "split them into several missions"),
+        ("phases", bounds.PHASES, "split them into several missions"),
+        ("obstacles", bounds.OBSTACLES, "merge those that touch, and remove those out of reach"),
     ):
         bounded((key,), notes.data.get(key), most, remedy)
     agents = notes.data.get("agents")
     for key, given in agents.items() if isinstance(agents, dict) else ():
-        bounded(("agents", key), given, bounds.AGENTS, "fly fewer vehicles")
+        bounded(("agents", key), given, bounds.AGENTS, "use fewer agents")
     n, forms = _count(notes.data) or 0, notes.data.get("formations")
     if isinstance(forms, dict) and len(forms) > 1 and n * len(forms) > bounds.SLOTS:
-        problem = f"{len(forms)} of {n:,} agents have {n * len(forms):,} slots, more than {bounds.SLOTS:,}"
+        slots = n * len(forms)
+        problem = f"{len(forms)} formations of {n:,} agents have {slots:,} slots; the maximum is {bounds.SLOTS:,}"
         notes.add(("formations",), problem, "use fewer formations, or fewer agents", None)
     assignment = notes.data.get("assignment", "given")
     if assignment != "given" and n > bounds.ALL_PAIRS:
-        problem = f"compares each agent with each slot, too many for {n:,} agents"
-        remedy = (
-            f"use 'given' beyond {bounds.ALL_PAIRS:,} agents, and number them as they are to go"
-        )
+        problem = f"compares all agents with all slots, which takes too long for {n:,} agents"
+        remedy = f"for more than {bounds.ALL_PAIRS:,} agents use 'given' and order the agents as their slots"
         notes.add(("assignment",), problem, remedy)
 
 
 def _tables(notes: FindingCollector) -> dict[str, Any]:
-    """The header's keys and the tables, without those of which nothing can be made."""
+    """Validate the keys of the header and the tables; invalid ones are left out."""
     for key in notes.data:
         if key not in Contents.model_fields:
             notes.unknown((key,), Contents.model_fields)
@@ -127,7 +126,7 @@ def _tables(notes: FindingCollector) -> dict[str, Any]:
 
 
 def _placed(notes: FindingCollector, agents: Any) -> Any:
-    """[agents] with positions written out where they are given as a shape; None where that is wrong."""
+    """Return [agents] with a shape of `position` replaced by its points; None if the shape has errors."""
     if not (isinstance(agents, dict) and isinstance(agents.get("position"), dict)):
         return agents
     path = ("agents", "position")
@@ -137,8 +136,8 @@ def _placed(notes: FindingCollector, agents: Any) -> Any:
     try:
         points = start.points()
         if not np.abs(points).max() <= bounds.LENGTH.most:
-            problem = f"agents would start farther than {bounds.LENGTH.most:g} m from the origin"
-            notes.add(path, problem, "lower size, count or centre")
+            problem = f"agents start farther than {bounds.LENGTH.most:g} m from the origin"
+            notes.add(path, problem, "reduce size, count or centre")
             return None
         return agents | {"position": points.tolist()}
     except ValueError as error:
@@ -149,7 +148,7 @@ def _placed(notes: FindingCollector, agents: Any) -> Any:
 
 
 def _count(data: Mapping[str, Any]) -> int | None:
-    """Number of agents, as far as it can be told."""
+    """Number of agents; None if it is not known."""
     agents = data.get("agents")
     position = agents.get("position") if isinstance(agents, dict) else None
     if isinstance(position, dict):
@@ -168,32 +167,32 @@ def _agents(notes: FindingCollector, parts: dict[str, Any]) -> None:
         given = len(getattr(agents, key))
         if given != n and notes.right(("agents",), key):
             problem = f"has {given} entries for {n} agents"
-            notes.add(("agents", key), problem, f"give one for each agent, {n} in all")
+            notes.add(("agents", key), problem, f"give one entry per agent, {n} in all")
     for i, j in formations.coincident(agents.position):
-        problem = f"agent {j + 1} starts where agent {i + 1} does"
-        notes.add(("agents", "position", j), problem, "start them apart", agents.position[j])
+        problem = f"agents {i + 1} and {j + 1} start at the same point"
+        notes.add(("agents", "position", j), problem, "move them apart", agents.position[j])
     if max(agents.mass, default=1.0) > bounds.MASS_RATIO * min(agents.mass, default=1.0):
-        problem = f"the heaviest vehicle has more than {bounds.MASS_RATIO:g} times the mass of the lightest"
-        notes.add(("agents", "mass"), problem, "give masses in kg")
+        problem = f"the largest mass is more than {bounds.MASS_RATIO:g} times the smallest"
+        notes.add(("agents", "mass"), problem, "give all masses in kg")
     above = [limit for limit in agents.thrust_limit if bounds.FORCE.most < limit < math.inf]
     if above:
         notes.add(
             ("agents", "thrust_limit"),
             f"must be <= {bounds.FORCE.most:g}",
-            "leave it out for no limit",
+            "omit it for no limit",
         )
     written = notes.data["agents"].get("thrust_limit", 0.0)
     if math.inf in (written if isinstance(written, list) else [written]):
-        notes.add(("agents", "thrust_limit"), "is not finite", "leave it out for no limit")
+        notes.add(("agents", "thrust_limit"), "is not finite", "omit it for no limit")
     unlimited = all(math.isinf(limit) for limit in agents.thrust_limit)
     if agents.saturate and unlimited and notes.right(("agents",), "thrust_limit"):
         notes.add(
-            ("agents", "saturate"), "there is no limit to cut off at", "give thrust_limit [N]"
+            ("agents", "saturate"), "no limit to saturate at is given", "give thrust_limit [N]"
         )
 
 
 def _touching(notes: FindingCollector, parts: dict[str, Any], n: int) -> None:
-    """Refuse spheres so large that lists of all that touch would fill memory."""
+    """Find radii so large that a list of all touching pairs would fill memory."""
     if n * (n - 1) // 2 <= bounds.TOUCHING:
         return
     agents: Agents = parts["agents"]
@@ -205,10 +204,10 @@ def _touching(notes: FindingCollector, parts: dict[str, Any], n: int) -> None:
         pairs = count_within(points, 2 * max(agents.radius))
         if pairs > bounds.TOUCHING:
             problem = (
-                f"{pairs:,} pairs of agents touch {where}, more than {bounds.TOUCHING:,}, if all are as large as the"
-                " largest"
+                f"with the largest radius, {pairs:,} pairs of agents touch {where};"
+                f" the maximum is {bounds.TOUCHING:,}"
             )
-            notes.add(("agents", "radius"), problem, "lower it, or keep them apart")
+            notes.add(("agents", "radius"), problem, "reduce the radius or increase the distances")
             return
 
 
@@ -222,18 +221,18 @@ def _gains(notes: FindingCollector, parts: dict[str, Any]) -> None:
     for key, needed in (("alpha", "> 0"), ("beta", "> 0"), ("gamma", ">= 0")):
         gain = getattr(c, key)
         if gain < 0 or (gain == 0 and key != "gamma"):
-            remedy = f"use a stable gain ({poles}), or stabilisation = 'none' for no feedback"
+            remedy = f"use a stable gain ({poles}) or stabilisation = 'none' for no feedback"
             notes.add(("constraint", key), f"is unstable, must be {needed}", remedy, gain)
     bound = 2 * c.alpha * c.beta**2
     if bound <= c.gamma and notes.right(("constraint",), "alpha", "beta"):
         problem = f"is unstable, must be below 2 alpha beta^2 = {bound:.6g}"
-        remedy = f"lower gamma, or raise alpha or beta ({poles})"
+        remedy = f"lower gamma or raise alpha or beta ({poles})"
         notes.add(("constraint", "gamma"), problem, remedy, c.gamma)
 
 
-#: Weights below this are none: a Riccati equation cannot tell them from zero.
+#: Weights below this value count as zero: the Riccati solution does not depend on them.
 _NO_WEIGHT = 1e-12
-#: An input that costs less than this part of an error costs nothing, and its gains know no bound.
+#: Smallest ratio of the weight R to the largest other weight. Below it, the gains grow without bound.
 _FREE = 1e-15
 
 
@@ -249,11 +248,11 @@ def _regulator(notes: FindingCollector, weights: Regulator, *path: str) -> None:
     if not (notes.right(("lqr",), *keys) and notes.right(path, *keys)):
         return
     if weights.horizon == "infinite" and weights.Q[0] < _NO_WEIGHT:
-        problem = f"an infinite horizon needs a weight > 0 on the error, {_NO_WEIGHT:g} at least"
-        notes.add((*path, "Q"), problem, "give Q = [1.0, 1.0], say", weights.Q)
+        problem = f"an infinite horizon needs a weight of at least {_NO_WEIGHT:g} on the error"
+        notes.add((*path, "Q"), problem, "for example, give Q = [1.0, 1.0]", weights.Q)
     if weights.horizon == "finite" and not any(weights.Q) and not any(weights.S):
-        problem = "with Q and S zero there is nothing to steer for"
-        notes.add((*path, "S"), problem, "give S = [1e3, 1e2], say", weights.S)
+        problem = "with Q and S zero the regulator does nothing"
+        notes.add((*path, "S"), problem, "for example, give S = [1e3, 1e2]", weights.S)
 
 
 def _free_input(notes: FindingCollector, lqr: Lqr) -> None:
@@ -268,10 +267,10 @@ def _unbounded(
     notes: FindingCollector, R: float, most: float, where: tuple[str, ...], name: str
 ) -> None:
     problem = (
-        f"is less than {_FREE:g} of the largest weight of {name}, {most:g}:"
-        " gains would have no bound"
+        f"is less than {_FREE:g} times the largest weight of {name}, {most:g}:"
+        " the gains would be unbounded"
     )
-    notes.add((*where, "R"), problem, f"raise R, or lower the weights of {name}", R)
+    notes.add((*where, "R"), problem, f"raise R or lower the weights of {name}", R)
 
 
 def _tracking(notes: FindingCollector, parts: dict[str, Any]) -> None:
@@ -279,8 +278,8 @@ def _tracking(notes: FindingCollector, parts: dict[str, Any]) -> None:
     if not notes.right(("tracking",), "Q"):
         return
     if tracking.Q[0] < _NO_WEIGHT:
-        problem = f"tracking needs a weight > 0 on the position error, {_NO_WEIGHT:g} at least"
-        notes.add(("tracking", "Q"), problem, "give Q = [4.0, 4.0], say")
+        problem = f"tracking needs a weight of at least {_NO_WEIGHT:g} on the position error"
+        notes.add(("tracking", "Q"), problem, "for example, give Q = [4.0, 4.0]")
     if _FREE * max(tracking.Q) > tracking.R and notes.right(("tracking",), "R"):
         _unbounded(notes, tracking.R, max(tracking.Q), ("tracking",), "tracking")
 
@@ -293,7 +292,7 @@ def _allocation(notes: FindingCollector, parts: dict[str, Any]) -> None:
         and notes.right(("allocation",), "method")
     ):
         problem = "has no effect with method 'rigid'"
-        notes.add(("allocation", "torque_split"), problem, "remove it, or use method = 'pinv'")
+        notes.add(("allocation", "torque_split"), problem, "remove it or use method = 'pinv'")
 
 
 def _geofence(notes: FindingCollector, parts: dict[str, Any]) -> None:
@@ -305,8 +304,8 @@ def _geofence(notes: FindingCollector, parts: dict[str, Any]) -> None:
 def _ordered(notes: FindingCollector, box: Box | Geofence, path: tuple[str | int, ...]) -> None:
     for axis, low, high in zip("xyz", box.min, box.max, strict=True):
         if low >= high:
-            problem = f"min must be below max, but in {axis} {low:g} >= {high:g} m"
-            notes.add(path, problem, "exchange the two", None)
+            problem = f"min must be below max, but {axis} has {low:g} >= {high:g} m"
+            notes.add(path, problem, "swap them", None)
 
 
 def _obstacles(notes: FindingCollector) -> tuple[Obstacle, ...]:

@@ -1,4 +1,4 @@
-"""A mission in words: how much of everything it has; what a phase leads to, and when it ends."""
+"""Describe a mission in words: its size, the target of each phase and when it ends."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from rigidfleet.mission.schema import Phase
 
 
 def counted(agents: int, formations: int, phases: Sequence[Phase]) -> str:
-    """How much of everything a mission has: 3 agents, 2 formations, 12 phases, 90 s."""
+    """Size of a mission: 3 agents, 2 formations, 12 phases, 90 s."""
     parts = [(agents, "agent"), (formations, "formation"), (len(phases), "phase")]
     most = "at most " if any(phase.settle for phase in phases) else ""
     words = [f"{n} {thing}{'s' * (n != 1)}" for n, thing in parts]
@@ -17,12 +17,12 @@ def counted(agents: int, formations: int, phases: Sequence[Phase]) -> str:
 
 
 def goal(phase: Phase) -> str:
-    """What a phase leads to; "" for a hold."""
+    """Target of a phase: a formation, a waypoint, an attitude; "" for a hold."""
     return phase.leads_to
 
 
 def ending(phase: Phase) -> str:
-    """When a phase ends."""
+    """Ending of a phase: a time, a duration, or settling with its timeout."""
     if phase.settle is not None:
         return f"settled, within {phase.settle.timeout:g} s"
     return f"at {phase.until:g} s" if phase.until is not None else f"after {phase.duration:g} s"

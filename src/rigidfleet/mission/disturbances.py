@@ -1,4 +1,4 @@
-"""Check the disturbances of a mission: complete, of the right number, and possible in it."""
+"""Check the disturbances of a mission."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from rigidfleet.typing import Floats
 
 _TABLE = "disturbances"
 _GUSTS = (_TABLE, "gusts")
-#: Correlation by distance takes a matrix of all pairs.
+#: Maximum number of agents with gusts correlated by distance, which needs a matrix of all pairs.
 _MOST_BY_DISTANCE = 2000
-#: Numbers in a table of gusts or noise at most: 2 GB of them.
+#: Maximum number of values in a table of gusts or noise: 2 GB.
 _MOST_NUMBERS = 2.5e8
-#: Knots of gusts: so many in the shortest time scale, and no further apart than this [s]. Of the roughest process, a
-#: first-order one, 99 % of the variance is at frequencies that they resolve.
+#: Gusts have at least _KNOTS knots in the shortest time scale, at most _STEP apart [s]. They resolve 99 % of the
+#: variance of the roughest process, a first-order one.
 _KNOTS, _STEP = 16, 0.1
 
 
 def gust_step(gusts: Gusts, wind: float) -> float:
-    """Time between the knots of gusts [s], in a steady wind [m/s]."""
+    """Time between the knots of gusts [s], in a steady wind of a given speed [m/s]."""
     shortest = gusts.time_scale
     if shortest is None:
         length = gusts.length if gusts.length is not None else gusts.altitude or 1.0
@@ -35,7 +35,7 @@ def gust_step(gusts: Gusts, wind: float) -> float:
 
 
 def intensity(gusts: Gusts, wind: float) -> Floats:
-    """Standard deviations (3,) [m/s] of gusts along a steady wind [m/s], across it and vertical."""
+    """Standard deviations (3,) of gusts [m/s]: along a steady wind of a given speed [m/s], across it, and vertical."""
     if gusts.intensity is None:
         from rigidfleet.math.turbulence import low_altitude
 
@@ -44,7 +44,7 @@ def intensity(gusts: Gusts, wind: float) -> Floats:
 
 
 def check(notes: FindingCollector, parts: Mapping[str, Any], n: int | None) -> None:
-    """Find what is wrong with [disturbances]."""
+    """Find the errors in [disturbances]."""
     found: Disturbances | None = parts.get(_TABLE)
     if found is None:
         return
@@ -53,11 +53,13 @@ def check(notes: FindingCollector, parts: Mapping[str, Any], n: int | None) -> N
         given = getattr(found, key)
         if n is not None and isinstance(given, tuple) and len(given) != n:
             problem = f"has {len(given)} entries for {n} agents"
-            notes.add((_TABLE, key), problem, f"give one for each agent, {n} in all, or a number")
+            notes.add(
+                (_TABLE, key), problem, f"give one entry per agent, {n} in all, or a single number"
+            )
     drag = found.drag if isinstance(found.drag, tuple) else (found.drag,)
     if (wind > 0 or found.gusts is not None) and not any(d is None or d > 0 for d in drag):
-        problem = "without drag, wind and gusts move nothing"
-        notes.add((_TABLE, "drag"), problem, "give a drag > 0 [N s/m], or leave it out")
+        problem = "without drag, wind and gusts have no effect"
+        notes.add((_TABLE, "drag"), problem, "give a drag > 0 [N s/m] or omit it")
     if found.gusts is not None:
         _gusts(notes, found.gusts, wind, n)
     silent = found.noise is not None and not (found.noise.position or found.noise.velocity)
@@ -78,32 +80,33 @@ def _gusts(notes: FindingCollector, gusts: Gusts, wind: float, n: int | None) ->
         return
     if gusts.model == "first-order":
         if gusts.time_scale is None:
-            wrong("time_scale", "is missing", "add the gusts' correlation time [s]")
+            wrong("time_scale", "is missing", "add the correlation time of the gusts [s]")
         for key in ("length", "altitude", "airspeed"):
             if getattr(gusts, key) is not None:
-                remedy = "remove it, or use model = 'dryden'"
+                remedy = "remove it or use model = 'dryden'"
                 wrong(key, "has no effect with model 'first-order'", remedy)
         if gusts.intensity is None:
-            wrong("intensity", "is missing", "add the gusts' standard deviation [m/s]")
+            wrong("intensity", "is missing", "add the standard deviation of the gusts [m/s]")
     else:
         if gusts.time_scale is not None:
-            remedy = "give length or altitude, or use model = 'first-order'"
+            remedy = "give length or altitude instead, or use model = 'first-order'"
             wrong("time_scale", "has no effect with model 'dryden'", remedy)
         if gusts.length is not None and gusts.altitude is not None:
-            wrong("length", "is given, and altitude, too", "give one of them")
+            wrong("length", "is given together with altitude", "give one of them")
         if gusts.length is None and gusts.altitude is None:
-            wrong("length", "is missing", "add length [m], or altitude [m] from which it follows")
+            wrong("length", "is missing", "add length [m], or altitude [m] to derive it")
         if gusts.airspeed is None and wind == 0 and notes.right((_TABLE,), "wind"):
-            problem = "is missing, and there is no wind that would carry the gusts past"
-            wrong("airspeed", problem, "add it [m/s], or a wind")
+            problem = "is missing, and there is no wind to replace it"
+            wrong("airspeed", problem, "add airspeed [m/s] or wind")
         if gusts.intensity is None and (gusts.altitude is None or wind == 0):
-            problem = "is missing; it follows only from altitude together with a wind"
-            wrong("intensity", problem, "add the gusts' standard deviation [m/s]")
+            problem = "is missing; it can be derived only from altitude and wind together"
+            wrong("intensity", problem, "add the standard deviation of the gusts [m/s]")
     if gusts.correlation is not None and gusts.correlation_length is not None:
-        wrong("correlation", "is given, and correlation_length, too", "give one of them")
+        wrong("correlation", "is given together with correlation_length", "give one of them")
     if gusts.correlation_length is not None and n is not None and n > _MOST_BY_DISTANCE:
-        problem = f"takes a matrix of all pairs, too many with {n} agents"
-        wrong("correlation_length", problem, f"use correlation beyond {_MOST_BY_DISTANCE} agents")
+        problem = f"needs a matrix of all pairs, which is too large for {n} agents"
+        remedy = f"for more than {_MOST_BY_DISTANCE} agents use correlation"
+        wrong("correlation_length", problem, remedy)
 
 
 def _lost(
@@ -117,31 +120,34 @@ def _lost(
     for k, lost in enumerate(found.lost):
         path = (_TABLE, "lost", k)
         if n is not None and not 1 <= lost.agent <= n:
-            notes.add((*path, "agent"), "there is no such agent", f"agents count from 1 to {n}")
+            notes.add(
+                (*path, "agent"), "there is no such agent", f"agents are numbered from 1 to {n}"
+            )
         elif lost.agent in seen:
             notes.add((*path, "agent"), "is lost twice", "remove one of the two")
         if end is not None and lost.time >= end:
-            problem = f"is not before the mission's end, {end:g} s"
-            notes.add((*path, "time"), problem, "give an earlier time, or remove it")
+            problem = f"is not before the end of the mission at {end:g} s"
+            notes.add((*path, "time"), problem, "give an earlier time or remove the entry")
         seen.add(lost.agent)
     if n is not None and len(seen) >= n:
-        notes.add((_TABLE, "lost"), "leaves no vehicle", "keep one of them at least")
+        notes.add((_TABLE, "lost"), "all vehicles are lost", "keep at least one")
     for key, possible in (("architecture", "local"), ("formulation", "inertial")):
         if found.lost and parts.get(key) == "body":
             problem = (
-                f"{key} = 'body' cannot lose a vehicle: its states are those of a body of all agents"
+                f"{key} = 'body' does not support lost vehicles: its state describes a body of all agents"
                 if key == "formulation"
-                else "architecture = 'body' cannot lose a vehicle: its wrench is for a body of all agents"
+                else "architecture = 'body' does not support lost vehicles: its wrench is that of a body of all agents"
             )
             notes.add((_TABLE, "lost"), problem, f"use {key} = '{possible}'")
 
 
 def _size(notes: FindingCollector, found: Disturbances, wind: float, n: int, end: float) -> None:
-    """Refuse tables that fit into no memory."""
+    """Find gusts and noise whose tables would not fit into memory."""
     if found.gusts is not None and 6 * n * end / gust_step(found.gusts, wind) > _MOST_NUMBERS:
-        problem = f"changes too fast for a flight of {n} agents over {end:g} s"
-        remedy = "give larger scales (time_scale, length), or fly shorter"
-        notes.add(_GUSTS, problem, remedy, f"{gust_step(found.gusts, wind):.3g} s between knots")
+        problem = f"would need too much memory for {n} agents over {end:g} s"
+        remedy = "increase the scales (time_scale, length) or shorten the flight"
+        notes.add(_GUSTS, problem, remedy, f"{gust_step(found.gusts, wind):.3g} s between samples")
     if found.noise is not None and 6 * n * end * found.noise.rate > _MOST_NUMBERS:
-        problem = f"is too high for a flight of {n} agents over {end:g} s"
-        notes.add((_TABLE, "noise", "rate"), problem, "lower it, or fly shorter", found.noise.rate)
+        problem = f"would need too much memory for {n} agents over {end:g} s"
+        remedy = "lower the rate or shorten the flight"
+        notes.add((_TABLE, "noise", "rate"), problem, remedy, found.noise.rate)

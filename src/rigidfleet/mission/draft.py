@@ -1,4 +1,4 @@
-"""A mission to start from: commented, flyable, and to be changed."""
+"""Write the text of a new mission: it has comments, flies as it is, and is meant to be edited."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from rigidfleet.math import proximity
 from rigidfleet.mission.findings import near_shape
 from rigidfleet.typing import Floats
 
-#: Chosen for a mission that says nothing of them: vehicle [kg], [m], shape [m], where it flies [m].
+#: Defaults of a new mission: mass of a vehicle [kg], its radius [m], size of the shape [m], waypoint [m].
 MASS, RADIUS, SIZE, WAYPOINT = 1.2, 0.25, 4.0, (20.0, 10.0, 10.0)
-#: Thrust over weight of a usual vehicle.
+#: Thrust-to-weight ratio of a typical vehicle.
 _LIFT = 2.2
-#: Speed [m/s] and acceleration [m/s^2] that the times of flights are chosen for.
+#: Speed [m/s] and acceleration [m/s^2] from which the durations of phases are chosen.
 _SPEED, _ACCELERATION = 4.0, 1.2
-#: Room between vehicles on the ground, centre to centre [m].
+#: Distance of vehicles on the ground, centre to centre [m].
 _APART = 1.2
-#: Up to so many agents start below their slots or beside them; more, of which some fly above others, on a grid
-#: with this room [m], which is more than the root of 2 of what their radii and the separation take.
+#: Up to _FEW agents start below their slots, or beside that point if slots lie above each other. More agents with
+#: slots above each other start on a grid with spacing _WIDE [m], more than sqrt(2) (two radii + separation).
 _FEW, _WIDE = 20, 1.5
-#: A formation settles for so long after its change, and stays so long at the end [s].
+#: Time to settle after a change of formation, and duration of the hold at the end [s].
 _SETTLE, _HOLD = 2, 3
-#: Places of agents that a new mission stores, or so.
+#: Approximate number of agent positions that the result of a new mission stores.
 _STORED = 2e6
-#: More agents are held by their slots alone; edges between all pairs would be too many.
+#: More than _ALL_PAIRS agents are held by their slots alone, without edges. _MOST is the maximum number of agents.
 _ALL_PAIRS, _MOST = 40, 2000
-#: Where comments beside keys begin.
+#: Column in which comments beside keys begin.
 _COLUMN = 34
 
 
@@ -46,34 +46,34 @@ def draft(
     waypoints: Sequence[Sequence[float]] | None = None,
     file: str = "",
 ) -> str:
-    """TOML text of a mission: take off, form a shape, fly it to waypoints, hold.
+    """Return the TOML text of a mission: take off, form a shape, fly it to waypoints, hold.
 
-    What is wrong with its numbers is found when it is checked; a draft of no more than a shape and a number of agents
-    flies. Agents stand below their slots, or where slots are above others, on a grid, and take the slots that are
-    nearest.
+    With a shape and a number of agents alone, the mission flies as it is. Other numbers are not validated here but when
+    the mission is checked. Agents start below their slots; where slots lie above each other, many agents start on a
+    grid and take the nearest slots.
 
     Parameters
     ----------
-    shape : of `rigidfleet.formation.shapes.SHAPES`; by default one that takes so many agents
-    agents : how many; by default as many as the shape needs
-    size : edge length of the shape [m], or three of them
-    mass : of each agent [kg]
-    thrust_limit : of each agent [N]; by default 2.2 times its weight
-    waypoints : of the centre of mass [m], in turn; by default one, high enough
-    file : its name, for the comments
+    shape : a name in `rigidfleet.formation.shapes.SHAPES`; by default one that suits the number of agents
+    agents : number of agents; by default as many as the shape needs
+    size : edge length of the shape [m], or its three sizes
+    mass : mass of each agent [kg]
+    thrust_limit : maximum thrust of each agent [N]; by default 2.2 times its weight
+    waypoints : waypoints of the centre of mass [m], in order; by default one that is high enough
+    file : name of the file, for the comments
 
     Raises
     ------
     ValueError
-        The shape is unknown, or takes another number of agents or sizes; there are too many agents; a number is not
-        finite; or a waypoint is too near to the ground.
+        The shape is unknown or does not suit the number of agents or sizes; there are too many agents; a number is
+        not finite; or a waypoint is too close to the ground.
     """
     if shape is None:
         shape = shape_for(agents)
     shape_known(shape)
     n = agents_for(shape) if agents is None else agents
     if n > _MOST:
-        raise ValueError(f"{n} agents are more than {_MOST}, the most that a new mission takes")
+        raise ValueError(f"{n} agents are too many: a new mission has at most {_MOST}")
     if not np.isfinite([thrust_limit or 0.0, mass, *size, *np.ravel(waypoints or ())]).all():
         raise ValueError("masses, sizes, limits and waypoints must be finite")
     slots = shapes.slots(shape, list(size) * (3 if _is_box(shape, size) else 1), n)
@@ -87,13 +87,13 @@ def draft(
     for number, waypoint in enumerate(waypoints, start=1):
         if waypoint[2] < low:
             raise ValueError(
-                f"waypoint {number} is {waypoint[2]:g} m high, and the {shape} reaches {low:.3g} m below its centre:"
-                f" fly it to z = {math.ceil(low + 0.5)} m or higher"
+                f"waypoint {number} is at z = {waypoint[2]:g} m, but the {shape} reaches {low:.3g} m below its centre:"
+                f" use z = {math.ceil(low + 0.5)} m or higher"
             )
     centre = start.mean(axis=0)
     aloft = np.array([centre[0], centre[1], height])
     way = float(np.linalg.norm(slots - (start - centre), axis=1).max())
-    if not below:  # some are on the way far across
+    if not below:  # some agents cross the whole shape
         way = float(np.linalg.norm(np.ptp(np.vstack([slots, start - centre]), axis=0)))
     blend = max(4, _blend(way))
     climb, flights = _time(aloft - centre), _flights(aloft, waypoints)
@@ -116,13 +116,13 @@ def draft(
         takes=shapes.agents_taken(shape),
         text=shapes.SHAPES[shape].text,
         separation=f"{min(0.5, nearest / 6):.3g}",
-        # In a shape in space that is small, or of many, some pass below others, whatever one does.
+        # In a small spatial shape, or one of many agents, some agents pass below others in any case.
         below="" if below and (distance_geometry.dimension(slots) < 3 or nearest >= 3.0) else "# ",
         keys=("" if below else _ASSIGNED) + _output_step(n, lasts),
         aloft=_row(aloft),
         blend=""
         if blend == 4
-        else f"blend = {blend}.0                       # [s] of the change of shape\n",
+        else f"blend = {blend}.0                       # [s] duration of the change of shape\n",
         establish=f"{blend + _SETTLE}.0",
         climb=f"{climb}.0",
     )
@@ -130,33 +130,34 @@ def draft(
 
 
 def shape_known(shape: str) -> None:
-    """ValueError, with a near one, where there is no such shape."""
+    """Raise ValueError, with the most similar name, if there is no such shape."""
     if shape not in shapes.SHAPES:
         raise ValueError(f"there is no shape {shape!r}: {near_shape(shape)}")
 
 
 def shape_for(agents: int | None) -> str:
-    """The shape that a number of agents makes best."""
+    """Return the usual shape for a number of agents."""
     usual = {None: "triangle", 1: "line", 2: "line", 3: "triangle", 4: "square", 6: "hexagon"}
     return usual.get(agents, "cube" if agents == 8 else "polygon")
 
 
 def agents_for(shape: str) -> int:
-    """The number of agents that makes a shape what it looks like."""
+    """Return the usual number of agents of a shape."""
     taken = shapes.SHAPES[shape].agents
     usual = {"line": 3, "polygon": 5, "pyramid": 5, "v": 5, "grid": 9, "sphere": 12, "helix": 12}
     return usual.get(shape, taken.start)
 
 
 def _is_box(shape: str, size: Sequence[float]) -> bool:
-    """Whether one size stands for three."""
+    """Whether one size is given for a shape with three sizes."""
     return len(size) == 1 and shapes.SHAPES[shape].sizes == 3
 
 
 def _start(slots: Floats, apart: float) -> tuple[Floats, bool]:
-    """Places (N, 3) [m] on the ground, and whether each is under its slot.
+    """Return start positions (N, 3) [m] on the ground, and whether each is below, or beside the point below, its slot.
 
-    Of up to `_FEW` agents those above others stand further out; of more, all on a grid.
+    Where slots lie above each other, up to `_FEW` agents move outwards until there is room; more agents start on a
+    grid.
     """
     n = len(slots)
     across = slots * [1.0, 1.0, 0.0]
@@ -164,7 +165,7 @@ def _start(slots: Floats, apart: float) -> tuple[Floats, bool]:
     if n == 1 or proximity.nearest(across).min() >= apart * (1 - 1e-9):
         return across + ground, True
     if n > _FEW:
-        # Straight ways to slots that are nearest take room (docs/many.md): a grid as wide as that.
+        # Straight paths to the nearest slots need this spacing (docs/many.md).
         return shapes.slots("grid", max(_WIDE, apart), n) + ground, False
     order = np.argsort(slots[:, 2], kind="stable")
     placed: list[Floats] = []
@@ -181,21 +182,21 @@ def _start(slots: Floats, apart: float) -> tuple[Floats, bool]:
 
 
 def _blend(way: float) -> int:
-    """Length [s] of a blend over so long a way [m], within the speed and acceleration chosen.
+    """Duration [s] of a blend over a distance [m] that keeps to `_SPEED` and `_ACCELERATION`.
 
-    The septic's greatest rate is 35/16 of the mean, its second derivative at most 7.52.
+    The septic blend has a peak rate of 35/16 times the mean and a peak second derivative of 7.52.
     """
     return math.ceil(max(35 / 16 * way / _SPEED, math.sqrt(7.52 * way / _ACCELERATION)))
 
 
 def _output_step(n: int, lasts: float) -> str:
-    """The key, where so many agents would fill the disk by default in a mission that lasts so long [s]."""
+    """Return the key `output_step` if the default would store too much in a mission of this duration [s]; else ''."""
     step = math.ceil(20 * lasts * n / _STORED) / 20
     return "" if step <= 0.05 else f"output_step = {step:g}                # [s] between samples\n"
 
 
 def _flights(at: Floats, waypoints: Sequence[Sequence[float]]) -> list[tuple[str, int]]:
-    """A phase for each waypoint, on the way from where the formation is, and how long it takes [s]."""
+    """Return a phase for each waypoint and its duration [s]; the first one starts at the position (3,) [m]."""
     found = []
     for waypoint in waypoints:
         to = np.asarray(waypoint, dtype=float)
@@ -206,20 +207,20 @@ def _flights(at: Floats, waypoints: Sequence[Sequence[float]]) -> list[tuple[str
 
 
 def _time(way: Floats) -> int:
-    """A time [s] for a way (3,) [m] from rest to rest, within the speed and acceleration chosen."""
+    """Duration [s] of a rest-to-rest flight by a vector (3,) [m] that keeps to `_SPEED` and `_ACCELERATION`."""
     distance = float(np.linalg.norm(way))
     least = max(1.5 * distance / _SPEED, math.sqrt(6.0 * distance / _ACCELERATION))
     return max(4, math.ceil(least))
 
 
 def _aligned(text: str) -> str:
-    """Text whose comments beside keys begin in one column."""
+    """Align the comments beside keys in one column."""
     beside = re.compile(r"^([^#\n]*[^#\s]) +# ?(.*)$", re.MULTILINE)
     return beside.sub(lambda m: f"{m[1]:<{_COLUMN - 1}} # {m[2]}", text)
 
 
 def _row(values: Sequence[float] | Floats) -> str:
-    # Adding zero takes the sign off a negative zero.
+    # Adding zero removes the sign of a negative zero.
     return f"[{', '.join(f'{round(float(x), 3) + 0.0:g}' for x in values)}]"
 
 
@@ -230,50 +231,50 @@ def _rows(values: Floats) -> str:
 _HEAD = """\
 # {title}.
 #
-# Change any number, and say what you see:
+# Change any number, then check the mission and fly it:
 #     rigidfleet check {file}
 #     rigidfleet run {file}
-# Units are SI; x is east, y north, z up; agents count from 1. A key that is wrong is an error with a remedy.
+# Units are SI; x is east, y north, z up; agents count from 1. An error in a key is reported with its remedy.
 
 schema_version = 1
-name = {name}                   # results go to flights/NAME
+name = {name}                   # results are written to flights/NAME
 title = "{title}"
 {keys}
 [agents]
 mass = {mass}                        # [kg] one number for all, or a list
-position = [                      # [m] where they stand at the start
+position = [                      # [m] initial positions
 {start}]
-radius = {radius}                     # [m] of the sphere around each that must touch nothing
-thrust_limit = {thrust}                # [N] of each; the verdict fails where it is passed
+radius = {radius}                     # [m] radius of the sphere around each agent; spheres must not touch
+thrust_limit = {thrust}                # [N] of each agent; the verdict fails if thrust exceeds it
 
 [formations.{shape}]              # {takes}: {text}
-shape = "{shape}"                 # or slots = [[x, y, z], ...], one for each agent [m]
+shape = "{shape}"                 # or slots = [[x, y, z], ...], one per agent [m]
 size = {size}                          # [m]
 {edges}
-# Another shape to change to in flight: a table [formations.NAME] for it, and a phase
+# To change to another shape in flight, add a table [formations.NAME] and a phase with
 #     kind = "reshape", formation = "NAME", duration = 6.0
 
 [[obstacles]]
 kind = "ground"
 
-# [[obstacles]]                   # a wall that must not be hit
+# [[obstacles]]                   # a wall to avoid
 # kind = "box"
 # min = [8, 4, 0]                 # [m]
 # max = [9, 6, 15]
 
-[limits]                          # what the verdict holds each vehicle to
-separation = {separation}                  # [m] between surfaces
-{below}separation_below = 0.8            # [m] below another, for its downwash
+[limits]                          # limits that the verdict checks
+separation = {separation}                  # [m] minimum distance between surfaces
+{below}separation_below = 0.8            # [m] minimum height above another agent (downwash)
 # speed = 6.0                     # [m/s]
 # acceleration = 4.0              # [m/s^2]
 # geofence = {{min = [-50, -50, 0], max = [50, 50, 30]}}
 
 # -- the flight: phases in order, each ending after its duration [s] ------------------------------
 
-[[phases]]                        # straight up, in the shape of the start
+[[phases]]                        # straight up, in the initial shape
 name = "climb"
 kind = "fly"
-position = {aloft}                # [m] of the centre of mass, here and below
+position = {aloft}                # [m] centre of mass, here and below
 duration = {climb}
 
 [[phases]]                        # take the formation
@@ -282,10 +283,10 @@ formation = "{shape}"
 {blend}duration = {establish}
 """
 
-_ASSIGNED = 'assignment = "each"               # who takes which slot: the least squared ways\n'
+_ASSIGNED = 'assignment = "each"               # each agent takes a near slot: least sum of squared distances\n'
 
 _NO_EDGES = (
-    "edges = []  # held by tracking alone; between so many, list those that count: [[1, 2], ...]\n"
+    "edges = []  # held by tracking alone; to add constraints, list the edges: [[1, 2], ...]\n"
 )
 
 _FLY = """

@@ -1,4 +1,4 @@
-"""Findings about a mission while it is checked, and pydantic's errors in the words of the format."""
+"""Collect the findings of a check, and translate the errors of pydantic into findings."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from rigidfleet.mission.schema import Part
 Keys = tuple[str | int, ...]
 P = TypeVar("P", bound=Part)
 
-#: So many findings of one kind are told one by one; the others are counted.
+#: Maximum number of findings of one kind that are listed; the others are counted.
 _TOLD = 8
 _UNKNOWN = "unknown key"
-#: Any place in a list.
+#: Stands for any index of a list.
 _ANY = -1
-#: For required keys that are wrong, so that the rest of their table can still be checked.
+#: Values for required keys with errors, so that the rest of their table can still be checked.
 _STAND_IN: dict[str, Any] = {"mass": 1.0, "position": (0.0, 0.0, 0.0), "formation": ""}
 
 
 class FindingCollector:
     """Findings about one mission, each at a path of keys in its data.
 
-    Everything a user reads counts from 1, so `phases[2]` is the second phase: ("phases", 1) here.
+    A path counts from 0, a message from 1: ("phases", 1) is reported as `phases[2]`.
     """
 
     def __init__(self, data: Mapping[str, Any], origin: str) -> None:
@@ -44,10 +44,14 @@ class FindingCollector:
 
     @property
     def findings(self) -> list[Finding]:
-        """What has been found, without repetition: of a list with many faults of one kind the first ones."""
+        """All findings without repetition: of many of one kind, the first ones and the number of the others."""
         more = [
             Finding(
-                self.origin, _key(kind), None, f"{n - _TOLD:,} more of this kind", "correct all"
+                self.origin,
+                _key(kind),
+                None,
+                f"{n - _TOLD:,} more of this kind",
+                "correct all of them",
             )
             for kind, n in self._told.items()
             if n > _TOLD
@@ -55,7 +59,7 @@ class FindingCollector:
         return [*self._findings.values(), *more]
 
     def add(self, path: Keys, problem: str, remedy: str, *value: object) -> None:
-        """Record a finding. Its value is what the user wrote at the path, unless one is given."""
+        """Record a finding. Unless a value is given, it is the one that the user wrote at the path."""
         self._wrong |= {path[:k] for k in range(1, len(path) + 1)}
         key = _key(path)
         if (key, problem) in self._findings:
@@ -69,22 +73,21 @@ class FindingCollector:
         self._findings[key, problem] = Finding(self.origin, key, shown, problem, remedy)
 
     def unknown(self, path: Keys, known: Iterable[str]) -> None:
-        """Record that a table knows no such key; what was meant takes long to guess, and is for the first ones."""
+        """Record an unknown key of a table. Only the first ones get a suggestion, as finding one takes long."""
         guess = self._told[_kind(path, _UNKNOWN)] < _TOLD
         self.add(path, *(unknown_key(path[-1], known) if guess else (_UNKNOWN, "")))
 
     def right(self, path: Keys, *keys: str) -> bool:
-        """Whether nothing has been found so far at or below these keys of a table."""
+        """Whether there is no finding so far at or below these keys of a table."""
         return not any((*path, key) in self._wrong for key in keys)
 
     def validate(self, kind: type[P], data: Any, path: Keys) -> P | None:
-        """A table as its model, with a finding for each structural error.
+        """Validate a table and return its model; record a finding for each error.
 
-        Keys with errors are left out of it, so that the checks that follow can judge the others;
-        None if that leaves no model.
+        Keys with errors are left out, so that later checks can use the others. None if that leaves no valid model.
         """
         if not isinstance(data, dict):
-            self.add(path, "must be a table", f"write [{_key(path)}] and its keys below it")
+            self.add(path, "must be a table", f"write [{_key(path)}] with its keys below it")
             return None
         try:
             return kind.model_validate(data)
@@ -110,24 +113,24 @@ class FindingCollector:
             elif isinstance(here, list) and isinstance(step, int):
                 here = here[step]
             else:
-                continue  # pydantic's name for a choice, or a number that stands for all agents
+                continue  # pydantic's name of a union member, or an index into a number that stands for all agents
             path = (*path, step)
         if error["type"] == "too_short" and len(here) > error["ctx"]["actual_length"]:
-            return  # entries that are wrong themselves were not counted
+            return  # pydantic does not count entries with errors of their own
         if path == ("lqr", "attitude") and error["loc"] != path[1:]:
-            return  # inherited from lqr, where it has been found
+            return  # inherited from lqr, where it is reported
         if error["type"] == "extra_forbidden":
             self.unknown(path, owner.model_fields)
         else:
             self.add(path, *_explain(error, path, owner))
 
 
-#: Words for what is called "none".
+#: Values that users write where the format has "none".
 _OFF = ("off", "no", "never", "disabled", False)
 
 
 def look_up(data: Any, path: Keys, default: Any = None) -> Any:
-    """What is at a path of keys, or the default."""
+    """Return the value at a path of keys, or the default."""
     for step in path:
         try:
             data = data[step]
@@ -137,14 +140,14 @@ def look_up(data: Any, path: Keys, default: Any = None) -> Any:
 
 
 def near(word: object, known: Iterable[str]) -> str:
-    """'did you mean ...?' where a known word is near, else ''."""
+    """Return 'did you mean ...?' if a known word is similar, else ''."""
     words = {k.lower(): k for k in known}
     match = difflib.get_close_matches(str(word).lower(), words, n=1, cutoff=0.55)
     return f"did you mean '{words[match[0]]}'?" if match else ""
 
 
 def near_shape(word: object) -> str:
-    """Which named shape is meant by a word that is none, or which there are."""
+    """Suggest a named shape for an unknown name, or list all of them."""
     match = near(word, [*SHAPES, *POLYGONS])
     meant = next((name for name in POLYGONS if f"'{name}'" in match), None)
     if meant is not None:
@@ -153,7 +156,7 @@ def near_shape(word: object) -> str:
 
 
 def unknown_key(key: object, known: Iterable[str]) -> tuple[str, str]:
-    """Problem and remedy of a key that is not one of the known."""
+    """Problem and remedy of an unknown key."""
     names = list(known)
     told = successor(key) or near(key, names)
     return _UNKNOWN, told or f"remove it; known keys: {', '.join(names)}"
@@ -169,24 +172,24 @@ def _key(path: Keys) -> str:
 
 
 def _kind(path: Keys, problem: str) -> Keys:
-    """What findings are counted by: their place in any table of a list, and all keys unknown to a table as one."""
+    """Key by which findings are counted: their path with any index, and one key for all unknown keys of a table."""
     path = path[:-1] if problem == _UNKNOWN else path
     return tuple(_ANY if isinstance(step, int) else step for step in path)
 
 
 def _model_at(owner: type[Part], key: object) -> type[Part]:
-    """The model of a key, or its owner where it has none."""
+    """Model of a key, or its owner if it has none."""
     field = owner.model_fields.get(str(key))
     return (model_of(field.annotation) if field else None) or owner
 
 
 def model_of(annotation: Any) -> type[Part] | None:
-    """The first model in an annotation such as `Settle | None`, None where there is none."""
+    """First model in an annotation such as `Settle | None`; None if there is none."""
     return next(_models(annotation), None)
 
 
 def _models(annotation: Any) -> Iterator[type[Part]]:
-    """Models in an annotation such as `Settle | None` or `tuple[Lost, ...]`."""
+    """Iterate over the models in an annotation such as `Settle | None` or `tuple[Lost, ...]`."""
     if get_origin(annotation) in (Union, UnionType, Annotated, tuple):
         for choice in get_args(annotation):
             yield from _models(choice)
@@ -195,7 +198,7 @@ def _models(annotation: Any) -> Iterator[type[Part]]:
 
 
 def _explain(error: Any, path: Keys, owner: type[Part]) -> tuple[str, str]:
-    """Problem and remedy."""
+    """Problem and remedy of an error of pydantic."""
     kind, context = error["type"], error.get("ctx", {})
     name = next((step for step in reversed(path) if isinstance(step, str)), "")
     field = owner.model_fields.get(name)
@@ -235,5 +238,5 @@ _PROBLEMS = {
     "greater_than_equal": "must be >= {ge:g}",
     "less_than": "must be < {lt:g}",
     "less_than_equal": "must be <= {le:g}",
-    "string_pattern_mismatch": "has characters that it may not have",
+    "string_pattern_mismatch": "has characters that are not allowed",
 }

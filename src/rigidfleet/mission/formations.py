@@ -1,27 +1,28 @@
-"""Check the formations of a mission: shapes, edges and distances that exist."""
+"""Check the formations of a mission: their shapes, edges and distances."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from itertools import islice
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rigidfleet._text import agent_names
 from rigidfleet.formation import distance_geometry, graphs, shapes
 from rigidfleet.math import proximity
 from rigidfleet.mission import bounds
 from rigidfleet.mission.findings import FindingCollector, Keys, near_shape
 from rigidfleet.mission.schema import Formation
 
-#: So many contradictions among distances are shown one by one.
+#: Maximum number of contradictions among distances that are listed.
 _SHOWN = 6
-#: Triangles and tetrahedra among distances are judged up to about so many.
+#: Approximate maximum number of triangles and tetrahedra that are checked among distances.
 _MOST_CLIQUES = 5e6
 
 
 def check(notes: FindingCollector, n: int | None) -> dict[str, Formation]:
-    """The formations by name, `n` agents each; those with findings are among them."""
+    """Check the formations of `n` agents and return them by name, including those with findings."""
     tables = notes.data.get("formations", {})
     if not isinstance(tables, dict):
         notes.add(("formations",), "must be a table", "write [formations.NAME] for each formation")
@@ -36,14 +37,14 @@ def check(notes: FindingCollector, n: int | None) -> dict[str, Formation]:
 
 
 def sound(notes: FindingCollector, name: str) -> bool:
-    """Whether nothing has been found in a formation."""
+    """Whether a formation has no findings."""
     return notes.right(("formations",), name)
 
 
 def coincident(points: ArrayLike) -> list[tuple[int, int]]:
-    """Pairs (first, later) of points (N, 3) [m] nearer to each other than half the least length."""
+    """Pairs (first, later) of points (N, 3) [m] that are closer than half the smallest length."""
     p, apart = np.asarray(points, dtype=np.float64), bounds.LENGTH.least / 2
-    # By cells first: a tree of many equal points is none, and looks at all pairs.
+    # Cells first: a search tree of many equal points degenerates and compares all pairs.
     cell = np.round(p / apart)
     order = np.lexsort(cell.T)
     new = np.append(True, (np.diff(cell[order], axis=0) != 0).any(axis=1))
@@ -60,42 +61,41 @@ def coincident(points: ArrayLike) -> list[tuple[int, int]]:
 
 
 def most_edges(n: int) -> int:
-    """Edges that a formation of n agents may have."""
+    """Maximum number of edges of a formation of n agents."""
     return max(bounds.EDGES, bounds.EDGES_EACH * n)
-
-
-def agents(indices: Iterable[int], between: str = ", ") -> str:
-    """Agents counted from 1."""
-    return between.join(str(int(i) + 1) for i in indices)
 
 
 def _formation(notes: FindingCollector, form: Formation, n: int | None, path: Keys) -> None:
     right = notes.right(path, "shape", "size", "slots", "distances")
     if form.shape is not None and form.slots is not None:
-        notes.add((*path, "slots"), "a shape has its own slots", "keep shape and size, or slots")
+        notes.add(
+            (*path, "slots"), "a shape has its own slots", "give either shape and size or slots"
+        )
     if right and form.shape is None and form.size is not None:
-        notes.add((*path, "size"), "is the size of no shape", "give shape, or remove size")
+        notes.add((*path, "size"), "there is no shape of this size", "give shape or remove size")
     if right and form.shape is form.slots is form.distances is None:
-        problem = "has neither a shape, nor slots, nor distances"
+        problem = "has neither shape nor slots nor distances"
         notes.add(path, problem, f"give shape and size; shapes: {', '.join(shapes.SHAPES)}", None)
     if form.shape is not None:
         _shape(notes, form, form.shape, n, path)
     if n is None:
         return
     edges = n * (n - 1) // 2 if form.edges == "complete" else len(form.edges)
-    # Edges between all pairs are given to few agents: their law is solved densely.
+    # Edges between all pairs are only for few agents: their constraint law is solved densely.
     most = bounds.EDGES if form.edges == "complete" else most_edges(n)
     if edges > most:
-        problem = f"are {edges:,} for {n:,} agents, more than {most:,}"
-        remedy = "use 'neighbours', or a list of pairs; 3 N - 6 edges, and some more, hold a shape"
+        problem = f"{n:,} agents have {edges:,} edges; the maximum is {most:,}"
+        remedy = "use 'neighbours' or a list of pairs; a few more than 3 N - 6 edges hold a shape"
         value = "complete" if form.edges == "complete" else None
         notes.add((*path, "edges"), problem, remedy, value)
     if form.slots is not None:
         if len(form.slots) != n:
             problem = f"has {len(form.slots)} slots for {n} agents"
-            notes.add((*path, "slots"), problem, f"give one for each agent, {n} in all", None)
+            notes.add((*path, "slots"), problem, f"give one slot per agent, {n} in all", None)
         for i, j in coincident(form.slots):
-            notes.add((*path, "slots", j), f"is slot {i + 1} again", "keep the slots apart")
+            notes.add(
+                (*path, "slots", j), f"is the same point as slot {i + 1}", "move the slots apart"
+            )
     if notes.right(path, "edges"):
         _edges(notes, form, n, (*path, "edges"))
     if form.distances is not None and notes.right(path, "edges", "distances"):
@@ -112,14 +112,14 @@ def _shape(notes: FindingCollector, form: Formation, shape: str, n: int | None, 
         try:
             slots = form.slot_array(n)
         except ValueError as error:
-            remedy = "change the shape, its size, or the number of agents"
+            remedy = "change the shape, its size or the number of agents"
             notes.add((*path, "shape"), str(error), remedy)
             return
         assert slots is not None  # a shape has them
         far = float(np.abs(slots).max())
         if far > bounds.LENGTH.most:
-            problem = f"slots of {n:,} agents reach out to {far:.3g} m, farther than {bounds.LENGTH.most:g}"
-            notes.add((*path, "size"), problem, "lower it")
+            problem = f"the slots of {n:,} agents extend to {far:.3g} m; the maximum is {bounds.LENGTH.most:g} m"
+            notes.add((*path, "size"), problem, "reduce the size")
 
 
 def _edges(notes: FindingCollector, form: Formation, n: int, path: Keys) -> None:
@@ -130,38 +130,40 @@ def _edges(notes: FindingCollector, form: Formation, n: int, path: Keys) -> None
     for k, edge in enumerate(form.edges):
         first = seen.setdefault(tuple(sorted(edge)), k)
         if not all(1 <= agent <= n for agent in edge):
-            notes.add((*path, k), f"there are agents 1 to {n}", "correct it; agents count from 1")
+            notes.add(
+                (*path, k), f"has an agent outside 1 to {n}", "correct it; agents count from 1"
+            )
         elif edge[0] == edge[1]:
-            notes.add((*path, k), "joins an agent to itself", "join two agents")
+            notes.add((*path, k), "joins an agent to itself", "join two different agents")
         elif first != k:
-            notes.add((*path, k), f"is edge {first + 1} again", "remove it, and its distance")
+            notes.add((*path, k), f"repeats edge {first + 1}", "remove it and its distance")
 
 
 def _graph(notes: FindingCollector, form: Formation, n: int, path: Keys) -> None:
-    """A named graph other than 'complete' is made from places."""
+    """Check a named graph. All except 'complete' are derived from the slots."""
     above = path[:-1]
     if form.edges != "neighbours" and "reach" in form.model_fields_set:
         notes.add((*above, "reach"), f"has no effect with edges '{form.edges}'", "remove it")
     if form.edges == "complete" or not notes.right(above, "shape", "size", "slots"):
         return
     if form.distances is not None or form.shape is form.slots is None:
-        remedy = "list the pairs, or give shape and size and no distances"
-        notes.add(path, "needs places, and distances that are theirs", remedy)
+        remedy = "list the pairs, or give shape and size and omit distances"
+        notes.add(path, "needs slots, and takes its distances from them", remedy)
         return
     slots = form.slot_array(n)
     assert slots is not None  # there are a shape or slots
     if form.edges == "neighbours":
         many = graphs.count_neighbours(slots, form.reach)
         if many > most_edges(n):
-            problem = f"joins {many:,} pairs of {n:,} agents, more than {most_edges(n):,}"
+            problem = f"joins {many:,} pairs of {n:,} agents; the maximum is {most_edges(n):,}"
             notes.add(
-                (*above, "reach"), problem, "lower it; 1.9 takes second neighbours", form.reach
+                (*above, "reach"), problem, "reduce it; 1.9 includes second neighbours", form.reach
             )
         return
     try:
         graphs.spans_space(slots)
     except ValueError as error:
-        notes.add(path, str(error), "use 'neighbours', or give a list of pairs")
+        notes.add(path, str(error), "use 'neighbours' or give a list of pairs")
 
 
 def _distances(
@@ -171,31 +173,31 @@ def _distances(
     if len(lengths) != len(edges):
         problem = f"has {len(lengths)} entries for {len(edges)} edges"
         order = "12, 13, ..., 23, ..." if form.edges == "complete" else "that of edges"
-        notes.add(path, problem, f"give one for each edge, in the order {order}", None)
+        notes.add(path, problem, f"give one per edge, in the order {order}", None)
         return
-    # Those that two ends of an edge have in common are at most the neighbours of either.
+    # The common neighbours of both ends of an edge are at most the neighbours of either end.
     degree = np.bincount(edges.ravel(), minlength=n)
     cliques = (degree[edges].min(axis=1, initial=n).astype(float) ** 2).sum()
     found = distance_geometry.unrealisable(edges, lengths) if cliques < _MOST_CLIQUES else []
+    between = "" if n < 10 else "-"
     names = [
-        f"d{agents(e, '' if n < 10 else '-')} = {d:g}" for e, d in zip(edges, lengths, strict=True)
+        f"d{between.join(str(i + 1) for i in e)} = {d:g}"
+        for e, d in zip(edges, lengths, strict=True)
     ]
     for v in islice(found, _SHOWN):
         given = ", ".join(names[k] for k in v.edges)
         if len(v.agents) == 3:
-            problem = f"agents {agents(v.agents)} make no triangle: {given} m"
-            remedy = f"shorten the longest by {v.excess:.4g} m or more, or lengthen the others"
+            problem = f"{agent_names(v.agents)} form no triangle: {given} m"
+            remedy = f"shorten the longest by at least {v.excess:.4g} m or lengthen the others"
         else:
-            problem = (
-                f"agents {agents(v.agents)} make no tetrahedron (Cayley-Menger < 0): {given} m"
-            )
-            remedy = "change one of the six (flat shapes need 7 digits: 5.656854), or give a shape"
+            problem = f"{agent_names(v.agents)} form no tetrahedron (Cayley-Menger < 0): {given} m"
+            remedy = "change one of the six (a flat shape needs 7 digits: 5.656854) or give a shape"
         notes.add(path, problem, remedy, None)
     if len(found) > _SHOWN:
-        problem = f"{len(found) - _SHOWN} more triangles or tetrahedra do not exist"
-        notes.add(path, problem, "correct those above first", None)
+        problem = f"{len(found) - _SHOWN} more triangles or tetrahedra are impossible"
+        notes.add(path, problem, "correct the ones above first", None)
     if not found:
         try:
             distance_geometry.slots_from_distances(n, edges, lengths)
         except ValueError as error:
-            notes.add(path, str(error), "change them, or give shape and size", None)
+            notes.add(path, str(error), "change them or give shape and size", None)

@@ -1,4 +1,4 @@
-"""Missions from TOML text, from plain data, from files, and those that ship with the package."""
+"""Read missions from TOML text, from plain data, from files and from the package."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ from rigidfleet.mission.schema import (
 from rigidfleet.typing import Bools, Floats, Ints
 
 _SHIPPED = resources.files("rigidfleet") / "missions"
-#: Least and greatest damping that "auto" takes: below, rounding shows; docs/robustness.md has the table.
+#: Smallest and largest damping that "auto" uses. Below, rounding errors show; docs/robustness.md has the measurements.
 _DAMPING = (1e-5, 0.03)
-#: Beyond so many equations eigenvalues take too long; the greatest damping is taken.
+#: Maximum number of equations for which "auto" computes eigenvalues; beyond, it uses the largest damping.
 _DENSE = 1000
 
 
@@ -50,10 +50,10 @@ class Fleet(NamedTuple):
 
 
 class Mission(Contents):
-    """A checked mission: make one by `load_mission`, `Mission.from_toml` or `Mission.from_dict`.
+    """A checked mission. Create one by `load_mission`, `Mission.from_toml` or `Mission.from_dict`.
 
     >>> import rigidfleet as rf
-    >>> rf.load_mission("narrow-passage")  # one that ships; a path reads a file
+    >>> rf.load_mission("narrow-passage")  # a shipped mission, or the path of a file
     <Mission narrow-passage: 3 agents, 2 formations, 12 phases, 90 s>
     """
 
@@ -64,7 +64,7 @@ class Mission(Contents):
 
     @classmethod
     def from_toml(cls, text: str, origin: str = "<text>") -> Self:
-        """Check a mission given as TOML; `origin` names it in messages.
+        """Check a mission given as TOML text; messages call it `origin`.
 
         Raises
         ------
@@ -77,7 +77,7 @@ class Mission(Contents):
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any], origin: str = "<dict>") -> Self:
-        """Check a mission given as plain data with the keys of the TOML format, NumPy's arrays too.
+        """Check a mission given as a dictionary with the keys of the TOML format; NumPy arrays are allowed.
 
         Raises
         ------
@@ -90,7 +90,7 @@ class Mission(Contents):
             remedy = "use numbers, strings, lists and dicts"
             raise MissionError([Finding(origin, "", None, str(error), remedy)]) from None
         except RecursionError:
-            raise _unread(origin, "is nested without end", "use the keys of a mission") from None
+            raise _unread(origin, "is nested too deeply", "use the keys of a mission") from None
         return cls.from_toml(text, origin)
 
     @property
@@ -104,7 +104,7 @@ class Mission(Contents):
     __str__ = __repr__
 
     def _repr_html_(self) -> str:
-        """The mission as a notebook shows it: its phases, in order."""
+        """Show the mission in a notebook: its phases, in order."""
         from rigidfleet import _markup
         from rigidfleet.mission.describe import ending, goal
 
@@ -116,17 +116,17 @@ class Mission(Contents):
         return _markup.shown(self.name, self.title, heads, rows, self.size_in_words)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data as it was written: change it, and check it again by `Mission.from_dict`."""
+        """Return the mission as a dictionary, as written. Edit it and pass it to `Mission.from_dict`."""
         return tomllib.loads(self._text)
 
     @property
     def text(self) -> str:
-        """The mission's TOML."""
+        """The TOML text of the mission."""
         return self._text
 
     @property
     def origin(self) -> str:
-        """Where the mission was read."""
+        """Where the mission was read from: a path, a name or a description."""
         return self._origin
 
     @property
@@ -136,7 +136,7 @@ class Mission(Contents):
 
     @cached_property
     def edges(self) -> Ints:
-        """Edges (m, 2) of all formations, counted from 0, i < j, in the order of first mention."""
+        """Edges (m, 2) of all formations, agents from 0, i < j, in the order of their first occurrence."""
         all_ = [self.formation_edges(name) for name in self.formations]
         pairs = np.concatenate([np.zeros((0, 2), dtype=np.int64), *all_])
         first = np.unique(pairs[:, 0] * self.n_agents + pairs[:, 1], return_index=True)[1]
@@ -144,35 +144,35 @@ class Mission(Contents):
 
     @property
     def assigned_slots(self) -> dict[str, Ints]:
-        """Slot (N,) of each formation that each agent takes, from 0, as `assignment` has it.
+        """Slot (N,), from 0, that each agent takes in each formation, by the mission's `assignment`.
 
-        By "shortest" and "safe" the same in all formations; by "each" what is nearest to where the agents are
-        when the formation is first flown.
+        With "shortest" and "safe", an agent keeps its slot in all formations. With "each", slots are assigned anew when
+        a formation is first flown, from the positions of the agents at that time.
         """
         return self._assigned[0]
 
     def assigned_turn(self, before: str | None, after: str) -> Floats | None:
-        """Rotation (3, 3) of a formation's slots onto those ``before``, if slots were assigned on this way.
+        """Rotation (3, 3) of a formation's slots onto those ``before``, if slots were assigned for this change.
 
-        Both are in their own axes; None before is the start, in the axes in which formations are drawn. Slots that
-        are assigned are flown with this rotation, or what their assignment promises does not hold.
+        Each formation is in its own axes. ``before`` None means the start positions, in the axes in which formations
+        are drawn. The optimality of an assignment, and the clearance on its paths, hold only with this rotation.
         """
         return self._assigned[1].get((before, after))
 
     @cached_property
     def _assigned(self) -> tuple[dict[str, Ints], dict[tuple[str | None, str | None], Floats]]:
-        """Slots of each formation (N,), and the rotations by which they were found, by formations before and after.
+        """Slots (N,) of each formation, and the rotations used for their assignment, by (before, after).
 
-        Where slots are tracked to an attitude that is known beforehand, ways are straight, and nothing turns.
+        Where slots are tracked to a commanded attitude, paths are straight, and the rotation is given, not optimised.
         """
         orders = dict.fromkeys(self.formations, np.arange(self.n_agents))
         turns: dict[tuple[str | None, str | None], Floats] = {}
         if self.assignment == "given" or self.n_agents < 2:
             return orders, turns
         before: str | None = None
-        known = True  # where agents are to each other, which distances alone do not tell
-        asked: Floats | None = None  # attitude asked for by name
-        lies: Floats | None = self.drawn_attitude  # that of the axes of `places`, where it is known
+        known = True  # relative positions of the agents are known; distances alone do not determine them
+        asked: Floats | None = None  # commanded attitude
+        lies: Floats | None = self.drawn_attitude  # of the axes of `places`; None if unknown
         places = self.fleet.position @ self.drawn_attitude.T
         flown: set[str] = set()
         for p in self.phases:
@@ -183,7 +183,7 @@ class Mission(Contents):
             if (shaping := p.shaping) is None:
                 continue
             name = shaping.formation
-            axes: Floats | None = np.eye(3)  # of this formation, in those of the one before
+            axes: Floats | None = np.eye(3)  # axes of this formation in those of the one before
             if self.free_attitude(p):
                 axes = lies = None
                 asked = None if p.control == "tracking" else asked
@@ -202,7 +202,7 @@ class Mission(Contents):
                 orders[name] = order
                 if known:
                     turns.setdefault((before, name), turn)
-                    turns.setdefault((name, before), turn.T)  # as long as the way there
+                    turns.setdefault((name, before), turn.T)  # the way back has the same length
             if slots is not None:
                 places, known = slots[orders[name]], True
             if self.assignment != "each":
@@ -213,7 +213,7 @@ class Mission(Contents):
 
     @cached_property
     def drawn_attitude(self) -> Floats:
-        """Attitude (3, 3), world to body, in which formations are drawn: the world's axes, or [body_frame]."""
+        """Attitude (3, 3), world to body, in which formations are drawn: world axes, or those of [body_frame]."""
         b = self.body_frame
         return (
             np.eye(3)
@@ -222,9 +222,9 @@ class Mission(Contents):
         )
 
     def establish_attitude(self, phase: Establish, asked: Floats | None) -> Floats:
-        """Attitude (3, 3) in which a formation is established that is not free.
+        """Attitude (3, 3) in which a phase establishes its formation, if the attitude is not free.
 
-        By the phase's own angles, or as ``asked`` for by name before, or else as it is drawn.
+        This is the attitude that the phase commands, else the one commanded before (``asked``), else the drawn one.
         """
         angles = phase.attitude_deg
         if angles is not None:
@@ -232,10 +232,10 @@ class Mission(Contents):
         return self.drawn_attitude if asked is None else asked
 
     def free_attitude(self, phase: Phase) -> bool:
-        """Whether nothing steers the attitude in which a phase takes its formation.
+        """Whether a phase leaves the attitude of its formation free.
 
-        Forces between agents do not. Slots do, unless the phase asks for that by name, or what is established is given
-        by distances alone, which have no axes.
+        Constraint forces do not control the attitude. Tracked slots do, unless the phase has ``attitude = "free"`` or
+        its formation is given by distances alone, which have no axes.
         """
         taken = phase.establishing
         if phase.control != "tracking" or taken is None:
@@ -245,13 +245,13 @@ class Mission(Contents):
         return taken.attitude == "free" or not self.formations[taken.formation].knows_slots
 
     def _slots(self, name: str) -> Floats | None:
-        """Slots (N, 3) [m] of a formation in their own order; made once."""
+        """Slots (N, 3) [m] of a formation in their own order; computed once."""
         if name not in self._made_slots:
             self._made_slots[name] = self.formations[name].slot_array(self.n_agents)
         return self._made_slots[name]
 
     def formation_edges(self, name: str) -> Ints:
-        """Edges (m, 2) of a formation between agents, counted from 0, i < j."""
+        """Edges (m, 2) of a formation, agents from 0, i < j."""
         if name not in self._made_edges:
             edges = self.formations[name].edge_array(self.n_agents)
             if self.assignment != "given":
@@ -262,8 +262,7 @@ class Mission(Contents):
     def formation_slots(self, name: str) -> Floats | None:
         """Slots (N, 3) [m] of a formation about their geometric centre, in the order of the agents.
 
-        Derived from a complete set of distances where no slots are given; None where that is
-        incomplete, too.
+        Without slots, they are derived from the distances; None if the distances are not complete.
         """
         slots = self._slots(name)
         return slots if slots is None else slots[self.assigned_slots[name]]
@@ -274,14 +273,14 @@ class Mission(Contents):
         if given is not None:
             return np.array(given, dtype=np.float64)
         slots = self.formation_slots(name)
-        assert slots is not None  # checked: without distances there are a shape or slots
+        assert slots is not None  # checked: without distances there is a shape or slots
         return distances(slots, self.formation_edges(name))
 
     def damping(self, name: str | None, lost: Bools | None = None) -> float:
-        """Damping mu [-] of the iterated solve while a formation is held; ``name`` None: on the way.
+        """Damping mu [-] of the iterated solver while a formation is held, or during a change if ``name`` is None.
 
-        "auto" is a quarter of the smallest non-zero eigenvalue w of mbar J M^-1 J^T at the formation, of the vehicles
-        that are not ``lost`` (N,), at most 0.03; and 0.03 on the way to one, or where there are no slots.
+        "auto" is a quarter of the smallest non-zero eigenvalue w of mbar J M^-1 J^T at the formation, without the
+        vehicles that are ``lost`` (N,), and at most 0.03. During a change, or without slots, it is 0.03.
         """
         given = self.constraint.damping
         if given != "auto":
@@ -300,7 +299,7 @@ class Mission(Contents):
 
     @property
     def latest_end(self) -> float:
-        """Mission time [s] by which the last phase has ended, if each settling times out."""
+        """Latest mission time [s] at which the last phase ends: each phase that settles takes its full timeout."""
         return latest_end(self.phases)
 
     @cached_property
@@ -315,13 +314,13 @@ class Mission(Contents):
 
     @cached_property
     def true_mass(self) -> Floats:
-        """Mass (N,) [kg] that each vehicle has: `agents.mass` is what the laws believe."""
+        """True mass (N,) [kg] of each vehicle. The control laws use `agents.mass`."""
         error = self.disturbances.mass_error if self.disturbances is not None else 0.0
         return self.fleet.mass * (1.0 + np.array(error))
 
     @cached_property
     def drag(self) -> Floats:
-        """Force of the air (N,) on each vehicle for each m/s of velocity through it [N s/m]."""
+        """Drag coefficient (N,) of each vehicle: force per velocity relative to the air [N s/m]."""
         d = self.disturbances
         if d is None or (d.drag is None and not any(d.wind) and d.gusts is None):
             return np.zeros(self.n_agents)
@@ -331,7 +330,7 @@ class Mission(Contents):
 
     @cached_property
     def lost_at(self) -> Floats:
-        """Time (N,) [s] at which each vehicle is lost; infinite for those that are not."""
+        """Time (N,) [s] at which each vehicle is lost; infinity for those that are not lost."""
         when = np.full(self.n_agents, np.inf)
         for lost in self.disturbances.lost if self.disturbances is not None else ():
             when[lost.agent - 1] = lost.time
@@ -339,18 +338,18 @@ class Mission(Contents):
 
 
 def mission_names() -> list[str]:
-    """Names of the missions that ship with the package, in alphabetical order."""
+    """Names of the shipped missions, in alphabetical order."""
     names = (entry.name for entry in _SHIPPED.iterdir())
     return sorted(name.removesuffix(".toml") for name in names if name.endswith(".toml"))
 
 
 def mission_text(name: str) -> str:
-    """TOML of a shipped mission.
+    """TOML text of a shipped mission.
 
     Raises
     ------
     MissionError
-        There is none of this name.
+        There is no shipped mission of this name.
     """
     if name not in mission_names():
         raise MissionError([_not_found(name)])
@@ -360,12 +359,12 @@ def mission_text(name: str) -> str:
 def load_mission(name_or_path: str | Path) -> Mission:
     """Read and check a mission: a shipped one by its name, or a file.
 
-    A shipped name wins over a file of that name; write `./name` for the file.
+    The name of a shipped mission takes precedence over a file; write `./name` for the file.
 
     Raises
     ------
     MissionError
-        There is no such mission, it cannot be read, or it has errors: all of them, in `findings`.
+        There is no such mission, it cannot be read, or it has errors; `findings` has all of them.
     """
     if isinstance(name_or_path, str) and name_or_path in mission_names():
         return Mission.from_toml(mission_text(name_or_path), name_or_path)
@@ -373,12 +372,12 @@ def load_mission(name_or_path: str | Path) -> Mission:
 
 
 def as_mission(given: Mission | str | Path) -> Mission:
-    """A mission as a function takes it: a `Mission`, the name of a shipped one, or a file.
+    """Return the `Mission` that was given, or load it by its shipped name or path.
 
     Raises
     ------
     TypeError
-        It is none of these.
+        The argument is none of these.
     MissionError
         As `load_mission` does.
     """
@@ -390,12 +389,12 @@ def as_mission(given: Mission | str | Path) -> Mission:
 
 
 def json_schema() -> dict[str, Any]:
-    """JSON schema of the mission format, for editors: every key with its unit and meaning."""
+    """JSON schema of the mission format for editors, with the unit and meaning of every key."""
     draft = {"$schema": "https://json-schema.org/draft/2020-12/schema"}
     schema = Mission.model_json_schema()
     parts = schema["$defs"]
     parts["Start"] = Start.model_json_schema()
-    # Positions are written out before they become those of a model.
+    # A shape of positions is replaced by its points before the model sees it, so the model does not have it.
     position = parts["Agents"]["properties"]["position"]
     listed = {key: position.pop(key) for key in ("type", "items", "minItems")}
     position["anyOf"] = [listed, {"$ref": "#/$defs/Start"}]
@@ -403,12 +402,12 @@ def json_schema() -> dict[str, Any]:
 
 
 def read_text(path: str | Path) -> str:
-    """Text of a mission file, or of one like it.
+    """Text of a mission file or a sweep file.
 
     Raises
     ------
     MissionError
-        It cannot be read.
+        The file cannot be read.
     """
     origin = str(path)
     try:
@@ -417,19 +416,25 @@ def read_text(path: str | Path) -> str:
     except FileNotFoundError:
         raise MissionError([_not_found(origin)]) from None
     except IsADirectoryError:
-        raise _unread(origin, "is a directory", "name a mission file in it") from None
+        raise _unread(origin, "is a folder", "give the path of a mission file in it") from None
     except PermissionError:
-        raise _unread(origin, "may not be read", "change its permissions") from None
+        raise _unread(
+            origin, "cannot be read: permission denied", "change its permissions"
+        ) from None
     except (OSError, ValueError) as error:
-        raise _unread(origin, f"cannot be read ({error})", "name a mission file") from None
+        raise _unread(
+            origin, f"cannot be read ({error})", "give the path of a mission file"
+        ) from None
     if len(data) > bounds.BYTES:
         raise _unread(
-            origin, f"is larger than {bounds.BYTES >> 20} MiB", "name a mission file (TOML)"
+            origin,
+            f"is larger than {bounds.BYTES >> 20} MiB",
+            "give the path of a mission file (TOML)",
         )
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        remedy = "name a mission file (TOML)" if b"\0" in data else "save it as UTF-8"
+        remedy = "give the path of a mission file (TOML)" if b"\0" in data else "save it as UTF-8"
         raise _unread(origin, f"is not UTF-8 text (byte {error.start + 1})", remedy) from None
 
 
@@ -440,25 +445,31 @@ def _unread(origin: str, problem: str, remedy: str) -> MissionError:
 def _not_found(name: str) -> Finding:
     known = mission_names()
     remedy = near(Path(name).stem, known) or f"shipped missions: {', '.join(known)}"
-    return Finding(name, "", None, "there is no such file, nor a shipped mission", remedy)
+    return Finding(name, "", None, "no such file and no shipped mission of this name", remedy)
 
 
 def parse_toml(text: str, origin: str) -> dict[str, Any]:
-    """Plain data of TOML text.
+    """Parse TOML text.
 
     Raises
     ------
     MissionError
-        It is no TOML, or beyond the bounds of a mission's text.
+        The text is not valid TOML or exceeds the bounds on the text of a mission.
     """
     if beyond := bounds.excess(text):
-        raise _unread(origin, beyond, "make it smaller; docs/missions.md lists the bounds")
+        raise _unread(origin, beyond, "reduce it; docs/missions.md lists the bounds")
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        problem, remedy = f"is not valid TOML: {error}", "correct the line; toml.io has the format"
-    except ValueError as error:  # thousands of digits
-        problem, remedy = f"cannot be read as TOML: {error}", "correct it; toml.io has the format"
+        problem, remedy = (
+            f"is not valid TOML: {error}",
+            "correct the line; toml.io describes the format",
+        )
+    except ValueError as error:  # a number of thousands of digits
+        problem, remedy = (
+            f"cannot be read as TOML: {error}",
+            "correct it; toml.io describes the format",
+        )
     except RecursionError:
-        problem, remedy = "is nested without end", "use the keys of a mission"
+        problem, remedy = "is nested too deeply", "use the keys of a mission"
     raise _unread(origin, problem, remedy)

@@ -1,4 +1,4 @@
-"""Check the phases of a mission: in order, long enough, and each possible after the one before."""
+"""Check the phases of a mission: their order, their durations, and whether each can follow the one before."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from rigidfleet._text import agent_names
 from rigidfleet._toml import toml_key
 from rigidfleet.formation import distance_geometry
 from rigidfleet.math import rigid_body
 from rigidfleet.mission import bounds
 from rigidfleet.mission.findings import FindingCollector, Keys, near
-from rigidfleet.mission.formations import agents as agents_text
 from rigidfleet.mission.formations import sound
 from rigidfleet.mission.schema import (
     ANGLES,
@@ -28,15 +28,16 @@ from rigidfleet.mission.schema import (
 )
 
 _ENDINGS = ("until", "duration", "settle")
+#: Maximum number of samples of a result.
 _MOST_SAMPLES = 1_000_000
-#: Turns of an orbit at most: beyond, the samples of a preview would miss its circle.
+#: Maximum number of turns of an orbit: beyond, the samples of a preview would miss its circle.
 _MOST_TURNS = 100
-#: Numbers in a result at most: 4 GB of them.
+#: Maximum number of values in a result: 4 GB.
 _MOST_NUMBERS = 5e8
 
 
 def check(notes: FindingCollector, parts: Mapping[str, Any], n: int | None) -> tuple[AnyPhase, ...]:
-    """The phases; those with findings are among them."""
+    """Check the phases and return them, including those with findings."""
     found = _phases(notes)
     _names(notes, found)
     end, lengths = _times(notes, found)
@@ -48,7 +49,7 @@ def check(notes: FindingCollector, parts: Mapping[str, Any], n: int | None) -> t
 
 
 def latest_end(phases: Sequence[AnyPhase]) -> float:
-    """Mission time [s] by which the last phase has ended, if each settling times out."""
+    """Latest mission time [s] at which the last phase ends: each phase that settles takes its full timeout."""
     t = 0.0
     for p in phases:
         length = p.settle.timeout if p.settle is not None else p.duration or 0.0
@@ -57,16 +58,16 @@ def latest_end(phases: Sequence[AnyPhase]) -> float:
 
 
 def tables(notes: FindingCollector, key: str) -> Sequence[Any]:
-    """An array of tables of the mission."""
+    """Return an array of tables of the mission; empty, with a finding, if it is something else."""
     found = notes.data.get(key, [])
     if isinstance(found, list):
         return found
-    notes.add((key,), "must be an array of tables", f"write [[{key}]] above each")
+    notes.add((key,), "must be an array of tables", f"write [[{key}]] above each table")
     return []
 
 
 def kind(notes: FindingCollector, data: Any, path: Keys, kinds: Mapping[str, type[Any]]) -> Any:
-    """The model that a table's `kind` names, or None with a finding."""
+    """Return the model for the `kind` of a table, or None with a finding."""
     choice = f"use one of {', '.join(kinds)}"
     if not isinstance(data, dict):
         notes.add(path, "must be a table", f"write [[{path[0]}]] above it")
@@ -80,7 +81,7 @@ def kind(notes: FindingCollector, data: Any, path: Keys, kinds: Mapping[str, typ
 
 
 def _phases(notes: FindingCollector) -> list[AnyPhase | None]:
-    """Each phase with its name and control filled in, None where nothing can be made of it."""
+    """Each phase with defaults for name and control; None for a phase that is not valid."""
     body = notes.data.get("architecture") == "body"
     found: list[AnyPhase | None] = []
     for k, data in enumerate(tables(notes, "phases")):
@@ -92,7 +93,12 @@ def _phases(notes: FindingCollector) -> list[AnyPhase | None]:
         given = {"name": f"{data['kind']} {k + 1}", "control": control} | data
         found.append(notes.validate(model, given, ("phases", k)))
     if not found and notes.right((), "phases"):
-        notes.add(("phases",), "there is none", "add [[phases]]: what to do, in order", None)
+        notes.add(
+            ("phases",),
+            "there is no phase",
+            "add [[phases]], one for each step of the flight",
+            None,
+        )
     return found
 
 
@@ -101,16 +107,19 @@ def _names(notes: FindingCollector, found: Sequence[AnyPhase | None]) -> None:
     for k, p in enumerate(found):
         first = seen.setdefault(p.name, k) if p is not None else k
         if p is not None and first != k:
-            problem = f"is the name of phase {first + 1}, too"
-            notes.add(("phases", k, "name"), problem, "give each phase its own", p.name)
+            problem = f"is also the name of phase {first + 1}"
+            notes.add(("phases", k, "name"), problem, "give each phase its own name", p.name)
 
 
 def _times(
     notes: FindingCollector, found: Sequence[AnyPhase | None]
 ) -> tuple[float | None, list[float | None]]:
-    """One ending each, in order of time. The latest end and greatest lengths [s], None if they cannot be told."""
+    """Check that each phase has one ending and that ends increase.
+
+    Return the latest end and the greatest lengths [s], None if unknown.
+    """
     lengths: list[float | None] = [None] * len(found)
-    first: float | None = 0.0  # earliest and latest start of the phase; None where unknown
+    first: float | None = 0.0  # earliest and latest start of the phase; None if unknown
     last: float | None = 0.0
     for k, p in enumerate(found):
         path = ("phases", k)
@@ -119,9 +128,12 @@ def _times(
             continue
         endings = [e for e in _ENDINGS if getattr(p, e) is not None]
         if len(endings) != 1:
-            problem = f"ends by {' and '.join(endings)}" if endings else "has no ending"
+            problem = f"has two endings, {' and '.join(endings)}" if endings else "has no ending"
             notes.add(
-                path, problem, f"give one of {', '.join(_ENDINGS)} (until: mission time)", p.name
+                path,
+                problem,
+                f"give exactly one of {', '.join(_ENDINGS)} (until is a mission time)",
+                p.name,
             )
             first = last = None
             continue
@@ -135,7 +147,7 @@ def _times(
             if p.settle is not None:
                 longest = p.settle.timeout
                 if p.settle.timeout <= p.settle.dwell:
-                    problem = "times out before it can have stayed within tolerance"
+                    problem = "times out before dwell has passed"
                     notes.add((*path, "settle"), problem, "give a timeout longer than dwell")
             shortest = p.settle.dwell if p.settle is not None else p.duration
             first = first + (shortest or 0.0) if first is not None else None
@@ -145,21 +157,21 @@ def _times(
         if p.shaping is not None:
             _blend(notes, p.shaping, longest, path)
         elif travel and travel > (longest or travel) * (1 + 1e-9):
-            problem = f"the phase ends before, after {longest:g} s"
-            notes.add((*path, "travel"), problem, "arrive earlier, or end it later", travel)
+            problem = f"is longer than the phase, which ends after {longest:g} s"
+            notes.add((*path, "travel"), problem, "reduce travel or end the phase later", travel)
     return last, lengths
 
 
 def _in_order(notes: FindingCollector, until: float, first: float, last: float, path: Keys) -> None:
     if until <= first:
-        problem = f"the phase begins at {first:g} s and would end before"
-        remedy = "until is mission time and grows from phase to phase; duration is a length"
+        problem = f"the phase would end before it starts at {first:g} s"
+        remedy = "until is a mission time that increases from phase to phase; duration is a length of time"
         notes.add((*path, "until"), problem, remedy)
     elif until <= last:
         problem = (
-            f"the phase may begin as late as {last:g} s, if the one before takes long to settle"
+            f"the phase may start as late as {last:g} s, when an earlier phase takes long to settle"
         )
-        remedy = "end it by duration, or give the settling a shorter timeout"
+        remedy = "end it by duration, or reduce the timeout of the earlier phase"
         notes.add((*path, "until"), problem, remedy)
 
 
@@ -169,15 +181,16 @@ def _blend(notes: FindingCollector, p: Shaping, longest: float | None, path: Key
     if p.reference == "step":
         if "blend" in p.model_fields_set:
             remedy = "remove it, or use reference = 'shape' or 'distances'"
-            notes.add((*path, "blend"), "a step has no blend", remedy)
+            notes.add((*path, "blend"), "has no effect with reference 'step'", remedy)
     else:
         _blended(notes, p.blend, longest, path)
 
 
 def _blended(notes: FindingCollector, blend: float, longest: float | None, path: Keys) -> None:
     if longest is not None and blend > longest * (1 + 1e-9):
-        problem = f"the phase lasts {longest:g} s, less than its blend"
-        notes.add((*path, "blend"), problem, f"use blend <= {longest:g}, or end it later", blend)
+        problem = f"is longer than the phase, which lasts {longest:g} s"
+        remedy = f"use blend <= {longest:g} or end the phase later"
+        notes.add((*path, "blend"), problem, remedy, blend)
 
 
 def _samples(
@@ -187,7 +200,7 @@ def _samples(
     if not step or not end or not notes.right((), "output_step", "formations"):
         return
     forms = parts["formations"].values()
-    # One each step, and two at each switch of phases.
+    # One per step, and two at each change of phase.
     switches = 2 * len(tables(notes, "phases"))
     samples = end / step + switches
     about = {"complete": (n or 0) ** 2 // 2, "neighbours": 9 * (n or 0)}
@@ -197,15 +210,15 @@ def _samples(
     )
     numbers = 30 * (n or 0) + 8 * edges + 50
     if step > end:
-        problem = f"the mission ends before the first step, at {end:g} s"
-        notes.add(("output_step",), problem, "make it shorter", step)
+        problem = f"is longer than the mission, which ends at {end:g} s"
+        notes.add(("output_step",), problem, "reduce it", step)
     elif end / step > _MOST_SAMPLES:
-        problem = f"{end / step:.2g} samples would be stored, more than {_MOST_SAMPLES:,}"
+        problem = (
+            f"the result would have {end / step:.2g} samples; the maximum is {_MOST_SAMPLES:,}"
+        )
         notes.add(("output_step",), problem, f"use {end / _MOST_SAMPLES:.2g} s or more", step)
     elif samples * numbers > _MOST_NUMBERS:
-        problem = (
-            f"{samples * numbers * 8e-9:.2g} GB would be stored, more than {_MOST_NUMBERS * 8e-9:g}"
-        )
+        problem = f"the result would have {samples * numbers * 8e-9:.2g} GB; the maximum is {_MOST_NUMBERS * 8e-9:g} GB"
         least = _MOST_NUMBERS / numbers - switches
         remedy = (
             f"use {end / least:.2g} s or more, or fewer edges"
@@ -228,37 +241,39 @@ def _controls(
             continue
         if p.control == "body" and local:
             remedy = "use control = 'tracking', or architecture = 'body' for the mission"
-            notes.add((*path, "control"), "the architecture is 'local'", remedy)
+            notes.add((*path, "control"), "requires architecture = 'body'", remedy)
         if p.control == "open" and p.moves:
-            problem = f"nothing would steer this {notes.data['phases'][k]['kind']} phase"
+            problem = f"a {notes.data['phases'][k]['kind']} phase needs feedback control"
             others = " or 'body'" if p.body_control == "body" else ""
             notes.add((*path, "control"), problem, f"use control = 'tracking'{others}")
         if p.control != "open" and any(p.input_force):
             problem = f"has no effect with control '{p.control}'"
-            notes.add((*path, "input_force"), problem, "remove it, or use control = 'open'")
+            notes.add((*path, "input_force"), problem, "remove it or use control = 'open'")
         if own := _OWN.get(notes.data["phases"][k]["kind"]):
             own(notes, p, path, lengths[k])
 
 
 def _turn(notes: FindingCollector, p: Turn, path: Keys, _: float | None) -> None:
-    """A turn leads to an angle."""
+    """Check that a turn has a target angle."""
     if p.attitude_deg is None and notes.right(path, *ANGLES):
-        remedy = f"give {', '.join(reversed(ANGLES))} or some of them"
-        notes.add(path, "turns to no angle", remedy, p.name)
+        remedy = f"give at least one of {', '.join(reversed(ANGLES))}"
+        notes.add(path, "has no target angle", remedy, p.name)
 
 
 def _establish(notes: FindingCollector, p: Establish, path: Keys, _: float | None) -> None:
-    """An attitude that is asked for is one that is flown."""
+    """Check that a commanded attitude has an effect."""
     if not notes.right(path, "attitude", *ANGLES):
         return
     given = notes.data["phases"][path[1]]
     angles = [key for key in ANGLES if key in given]
     if p.attitude == "free" and angles:
-        problem = "is asked for, and attitude = 'free' asks for none"
+        problem = "has no effect with attitude = 'free'"
         notes.add((*path, angles[0]), problem, "remove one of them")
     elif p.control != "tracking" and (angles or given.get("attitude") == "drawn"):
         problem = f"has no effect with control '{p.control}', which leaves the attitude free"
-        remedy = "use control = 'tracking', or remove it and turn the formation in a later phase"
+        remedy = (
+            "use control = 'tracking', or remove this key and turn the formation in a later phase"
+        )
         notes.add((*path, *(angles or ["attitude"])[:1]), problem, remedy)
 
 
@@ -299,9 +314,9 @@ def _formations(
     parts: Mapping[str, Any],
     n: int | None,
 ) -> None:
-    """Formations exist, can be blended to, tracked and reached."""
+    """Check that formations exist and can be blended to, tracked and reached."""
     forms: Mapping[str, Formation] = parts["formations"]
-    held: str | None = ""  # name of the formation held; "" the initial positions; None unknown
+    held: str | None = ""  # name of the formation held; "": initial positions; None: unknown
     for k, p in enumerate(found):
         path = ("phases", k)
         if p is None or not notes.right(path, "formation", "reference"):
@@ -311,8 +326,9 @@ def _formations(
             _exists(notes, shaping.formation, path)
             form = forms.get(shaping.formation)
             if p.establishing is None and held == "":
-                problem = "there is no formation yet to change from"
-                notes.add((*path, "kind"), problem, "use kind = 'establish' for the first")
+                problem = "no formation has been established yet"
+                remedy = "use kind = 'establish' for the first formation"
+                notes.add((*path, "kind"), problem, remedy)
             drawn = notes.data["phases"][k].get("attitude") == "drawn"
             if (
                 drawn
@@ -320,8 +336,8 @@ def _formations(
                 and not form.knows_slots
                 and notes.right(path, "attitude")
             ):
-                problem = f"formation '{shaping.formation}' has distances alone, which are drawn in no axes"
-                remedy = "remove it, give the formation slots, or ask for angles by yaw_deg"
+                problem = f"formation '{shaping.formation}' is given by distances alone, which have no axes"
+                remedy = "remove it, give the formation slots, or command an attitude by yaw_deg"
                 notes.add((*path, "attitude"), problem, remedy)
             if n is not None and form is not None and sound(notes, shaping.formation):
                 _blendable(notes, shaping, form, n, path)
@@ -334,7 +350,7 @@ def _formations(
             continue
         if form.slot_array(n) is None:
             problem = f"formation '{held}' has no slots to track"
-            remedy = f"give formations.{toml_key(held)} a shape or slots, or use another control"
+            remedy = f"give formations.{toml_key(held)} a shape or slots, or change control"
             notes.add((*path, "control"), problem, remedy, p.control)
 
 
@@ -346,7 +362,7 @@ def _exists(notes: FindingCollector, name: str, path: Keys) -> None:
 
 
 def _blendable(notes: FindingCollector, p: Shaping, form: Formation, n: int, path: Keys) -> None:
-    """Blending slots needs them, and distances that are theirs."""
+    """Check that a formation can be reached by blending slots: it has slots, and distances that agree with them."""
     if p.reference != "shape":
         return
     slots = form.slot_array(n)
@@ -358,31 +374,31 @@ def _blendable(notes: FindingCollector, p: Shaping, form: Formation, n: int, pat
         edges = form.edge_array(n)
         between = distance_geometry.distances(slots, edges)
         for k in np.flatnonzero(np.abs(between - form.distances) > 1e-3 * between):
-            problem = f"the slots of agents {agents_text(edges[k])} are {between[k]:.7g} m apart"
-            remedy = f"correct it, or fly {p.name} by reference = 'distances'"
+            problem = f"the slots of {agent_names(edges[k])} are {between[k]:.7g} m apart"
+            remedy = f"correct it, or use reference = 'distances' in phase {p.name}"
             notes.add(("formations", p.formation, "distances", int(k)), problem, remedy)
 
 
 def _reachable(
     notes: FindingCollector, p: Shaping, form: Formation, agents: Agents, path: Keys
 ) -> None:
-    """Forces along the edges cannot leave the line or plane in which the agents start."""
+    """Find starts on a line or plane: forces along the edges cannot move the agents out of it."""
     if p.control != "open" or not notes.right(path, "control", "input_force"):
         return
     if any(p.input_force) and len(set(agents.mass)) > 1:
-        return  # the same force moves unequal masses apart
+        return  # equal forces accelerate unequal masses differently
     target = form.slot_array(len(agents.position))
     motion = [rigid_body.centred(agents.position), rigid_body.centred(agents.velocity)]
     start = distance_geometry.dimension(np.vstack([*motion, *(-m for m in motion)]))
     if target is not None and start < distance_geometry.dimension(target):
         where = ("point", "line", "plane")[start]
-        problem = f"the agents start on one {where}, which forces between them cannot leave"
-        remedy = f"move a start off the {where}, or use control = 'tracking'"
+        problem = f"all agents start on one {where}; forces between them cannot move them off it"
+        remedy = f"move one agent off the {where} or use control = 'tracking'"
         notes.add((*path, "control"), problem, remedy, p.control)
 
 
 def _arrivals(notes: FindingCollector, found: Sequence[AnyPhase | None], lqr: Lqr) -> None:
-    """A finite horizon ends at a time."""
+    """Check that a regulator with a finite horizon has a time of arrival."""
     for k, p in enumerate(found):
         steering = p.steering if p is not None else None
         if steering is None or steering.settle is None or steering.travel is not None:

@@ -1,6 +1,6 @@
-"""What a mission holds: every table of the format, with the unit and meaning of each key.
+"""Schema of a mission: every table of the format, with the unit and meaning of each key.
 
-The descriptions are the documentation of the format: `rigidfleet missions --schema` exports them.
+The descriptions document the format: `rigidfleet missions --schema` exports them, and docs/missions.md has them.
 """
 
 from __future__ import annotations
@@ -39,13 +39,13 @@ from rigidfleet.mission.bounds import (
 )
 from rigidfleet.typing import Floats, Ints
 
-#: No quantity in SI units is larger here, and the sixth power of a length is still a float.
+#: Bound on all numbers: larger than any quantity in SI units here, and its sixth power is still finite.
 HUGE = 1e15
-#: Drag of a vehicle for each kg of its mass [1/s]. At the speeds of formation flight that of rotors leads, which is
-#: linear in the speed; flights identified some 0.4 to 0.5 /s along two axes of a quadrotor (Faessler, Franchi,
-#: Scaramuzza, Robotics and Automation Letters 3, 2018), and a vehicle with more mass on each rotor has less.
+#: Default drag coefficient of a vehicle per mass [1/s]. At the speeds of formation flight, rotor drag dominates, which
+#: is linear in the speed. Identified from flights: 0.4 to 0.5 /s along two axes of a quadrotor (Faessler, Franchi,
+#: Scaramuzza, Robotics and Automation Letters 3, 2018). A vehicle with more mass per rotor has less.
 DRAG = 0.3
-#: Keys of an attitude, 3-2-1 Euler angles.
+#: Keys of an attitude: 3-2-1 Euler angles.
 ANGLES = ("roll_deg", "pitch_deg", "yaw_deg")
 
 Number = Annotated[float, Strict(), Field(ge=-HUGE, le=HUGE)]
@@ -78,7 +78,7 @@ Gain = Annotated[float, Strict(), _signed(GAIN)]
 Weight = Annotated[float, Strict(), _from_zero(WEIGHT)]
 Cost = Annotated[float, Strict(), _positive(WEIGHT)]
 Tolerance = Annotated[float, Strict(), _positive(TOLERANCE)]
-#: Infinity is found later, with a remedy of its own.
+#: Infinity is allowed here; a later check rejects it with its own remedy.
 Limit = Annotated[float, Strict(), Field(ge=FORCE.least, allow_inf_nan=True)]
 Whole = Annotated[int, Strict(), Field(ge=-(2**31), lt=2**31)]
 Flag = Annotated[bool, Strict()]
@@ -134,24 +134,24 @@ def _number_or_list(least: float) -> WithJsonSchema:
 
 
 class Part(BaseModel):
-    """A table of a mission file: frozen, without unknown keys, with finite numbers."""
+    """A table of a mission file: immutable, without unknown keys, with finite numbers."""
 
-    # Tables are validated one by one; a kind that a mission lacks is never prepared.
+    # Tables are validated one by one; the models of tables that a mission lacks are never built.
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, defer_build=True)
 
 
 class Start(Part):
-    """Agents that start in a named shape, in the order of its slots."""
+    """Start positions of the agents on the slots of a named shape, in their order."""
 
     shape: str = Field(
         description=f"named shape: {', '.join(shapes.SHAPES)}",
         json_schema_extra={"enum": [*shapes.SHAPES]},
     )
-    size: Size = Field(description="edge length of the shape [m], or its sizes")
+    size: Size = Field(description="edge length of the shape [m], or its three sizes")
     count: Annotated[int, Strict(), Field(ge=1, le=bounds.AGENTS)] = Field(
         description="number of agents"
     )
-    centre: Vector = Field((0.0, 0.0, 0.0), description="where its centre is [x, y, z] [m]")
+    centre: Vector = Field((0.0, 0.0, 0.0), description="centre of the shape [x, y, z] [m]")
 
     def points(self) -> Floats:
         """Positions (count, 3) [m].
@@ -159,39 +159,42 @@ class Start(Part):
         Raises
         ------
         ValueError
-            The shape is unknown, or takes another number of agents or sizes.
+            The shape is unknown or does not suit the number of agents or sizes.
         """
         return shapes.slots(self.shape, self.size, self.count) + np.array(self.centre)
 
 
 class Agents(Part):
-    """The vehicles, as point masses. Once checked, each field has one entry for each agent."""
+    """The vehicles, as point masses. After the check, each field has one entry per agent."""
 
     mass: Annotated[tuple[Mass, ...], _number_or_list(MASS.least)] = Field(
-        description="mass [kg], > 0: a number for all agents, or a list with one for each"
+        description="mass [kg], > 0: one number for all agents, or a list with one per agent"
     )
     position: Annotated[tuple[Vector, ...], Field(min_length=1)] = Field(
-        description="initial position [x, y, z] of each agent [m], world frame ENU (z up); or a table, the "
-        "shape in which they start"
+        description="initial position [x, y, z] of each agent [m], world axes ENU (z up); or a table with the "
+        "shape in which the agents start"
     )
     velocity: tuple[Velocity, ...] = Field(
-        (), description="initial velocity of each agent [m/s]; at rest when absent"
+        (), description="initial velocity of each agent [m/s]; default: at rest"
     )
     radius: Annotated[tuple[Room, ...], _number_or_list(0)] = Field(
-        (0.25,), description="radius of the sphere that must touch nothing [m]: a number or a list"
+        (0.25,),
+        description="radius of the sphere around an agent that must not touch anything [m]: a number or a list",
     )
     thrust_limit: Annotated[tuple[Limit, ...], _number_or_list(FORCE.least)] = Field(
         (math.inf,),
-        description="greatest thrust |f_u + f_C| [N]: a number or a list; unlimited when absent",
+        description="maximum thrust |f_u + f_C| [N], of input and constraint force together: a number or a list; "
+        "default: unlimited",
     )
     saturate: Flag = Field(
-        False, description="true: thrust is cut off at thrust_limit; false: only judged against it"
+        False,
+        description="true: thrust is clipped at thrust_limit; false: the verdict compares it with thrust_limit",
     )
 
     @model_validator(mode="before")
     @classmethod
     def _spread(cls, data: Any) -> Any:
-        """One number stands for all agents; agents without velocities start at rest."""
+        """Repeat a single number for all agents, and let agents without velocities start at rest."""
         if not (isinstance(data, dict) and isinstance(data.get("position"), list | tuple)):
             return data
         n = len(data["position"])
@@ -203,36 +206,40 @@ class Agents(Part):
 
 
 class Constraint(Part):
-    """The constraint force: feedback of the error c = L - d, and the solve for the multipliers."""
+    """The constraint force: feedback of the constraint c = L - d, and the solver for the multipliers."""
 
-    alpha: Gain = Field(3.0, description="feedback 2 alpha of dc/dt [1/s], > 0")
-    beta: Gain = Field(math.sqrt(12), description="feedback beta^2 of c; beta [1/s], > 0")
+    alpha: Gain = Field(3.0, description="alpha [1/s], > 0; the feedback gain of dc/dt is 2 alpha")
+    beta: Gain = Field(
+        math.sqrt(12), description="beta [1/s], > 0; the feedback gain of c is beta^2"
+    )
     gamma: Annotated[float, Strict(), _signed(GAIN, 3)] = Field(
-        8.0, description="feedback of the integral of c [1/s^3], >= 0, below 2 alpha beta^2"
+        8.0, description="feedback gain of the integral of c [1/s^3], >= 0, < 2 alpha beta^2"
     )
     stabilisation: Literal["pid", "none"] = Field(
-        "pid", description="'none': no feedback at all, the law whose drift the paper discusses"
+        "pid",
+        description="pid: feedback with alpha, beta, gamma; none: no feedback, so constraints drift",
     )
     solver: Literal["iterated", "spectral", "exact", "pinv"] = Field(
         "iterated",
-        description="iterated Tikhonov; spectral damping (gentler under steps); exact, the paper's "
-        "inverse; pinv, the pseudo-inverse",
+        description="iterated: iterated Tikhonov; spectral: spectral damping, smaller forces at steps; exact: the "
+        "paper's inverse; pinv: pseudo-inverse",
     )
     damping: Damping = Field(
         "auto",
-        description="mu of the iterated solver [-], > 0; auto: 0.03, and in phases that begin in their "
-        "formation a quarter of its smallest non-zero w if that is less",
+        description="damping mu of the iterated solver [-], > 0; auto: 0.03, or in phases that start in their "
+        "formation a quarter of its smallest non-zero eigenvalue w if that is less",
     )
     iterations: Annotated[int, Strict(), Field(ge=1, le=100)] = Field(
-        3, description="number k of iterations of the iterated solver, 1 to 100"
+        3, description="number of iterations k of the iterated solver, 1 to 100"
     )
-    threshold: Tolerance = Field(0.1, description="s0 of the spectral solver [-], > 0")
+    threshold: Tolerance = Field(0.1, description="threshold s0 of the spectral solver [-], > 0")
     cutoff: Annotated[float, Strict(), Field(gt=0, lt=1)] = Field(
         1e-3,
-        description="cut-off of the pinv solver, in parts of the largest w, in (0, 1); smooth below",
+        description="cut-off of the pinv solver relative to the largest eigenvalue w, in (0, 1); smaller eigenvalues "
+        "fade out smoothly",
     )
     deformation_damping: Annotated[float, Strict(), _from_zero(GAIN)] = Field(
-        1.0, description="damping of deformation while no slots are tracked [1/s], >= 0"
+        1.0, description="damping of deformation velocities while no slots are tracked [1/s], >= 0"
     )
 
 
@@ -240,19 +247,19 @@ class Regulator(Part):
     """Weights of a linear quadratic regulator for a double integrator, the same on each axis."""
 
     horizon: Literal["finite", "infinite"] = Field(
-        "finite", description="finite: S weighs the arrival; infinite: Q and R alone"
+        "finite", description="finite: arrival at a time, weighted by S; infinite: Q and R alone"
     )
     Q: Weights = Field((0.0, 0.0), description="weights [error, rate error], >= 0")
     R: Cost = Field(1.0, description="weight of the acceleration, > 0")
-    S: Weights = Field((1e3, 1e2), description="weights on arrival [error, rate error], >= 0")
+    S: Weights = Field((1e3, 1e2), description="weights at arrival [error, rate error], >= 0")
 
 
 class Lqr(Regulator):
-    """Regulator of the virtual body: of its centre of mass, and in `lqr.attitude` of its attitude."""
+    """Regulator of the virtual body: its centre of mass and, in `lqr.attitude`, its attitude."""
 
     attitude: Regulator = Field(
         default_factory=Regulator,
-        description="regulator of the attitude; its keys default to those of lqr",
+        description="regulator of the attitude; missing keys are those of lqr",
     )
 
     @model_validator(mode="before")
@@ -265,7 +272,7 @@ class Lqr(Regulator):
 
 
 class Tracking(Part):
-    """Infinite-horizon regulator with which each agent tracks its slot."""
+    """Infinite-horizon regulator by which each agent tracks its slot."""
 
     Q: Weights = Field(
         (4.0, 4.0), description="weights [position error, velocity error], the first > 0"
@@ -274,13 +281,14 @@ class Tracking(Part):
 
 
 class Allocation(Part):
-    """How the wrench on the virtual body is shared among the agents (control 'body')."""
+    """Control allocation: from the wrench on the virtual body to forces on the agents (control 'body')."""
 
     method: Literal["rigid", "pinv"] = Field(
-        "rigid", description="rigid: what a rigid body's points need; pinv: the paper's H"
+        "rigid",
+        description="rigid: the forces that move the agents as points of a rigid body; pinv: the paper's matrix H",
     )
     torque_split: Literal["equal", "inertia", "inertia+force"] = Field(
-        "equal", description="method 'pinv' only: how the torque is split over the agents"
+        "equal", description="only for method 'pinv': how the torque is divided among the agents"
     )
 
 
@@ -293,20 +301,22 @@ class IntegratorOptions(Part):
     atol: Tolerance = Field(1e-10, description="absolute tolerance [m, m/s]")
     atol_velocity: Tolerance | None = Field(
         None,
-        description="that of velocities [m/s]; when absent atol, and in a large formation that of places times beta",
+        description="absolute tolerance of velocities [m/s]; default: atol, in a large formation that of positions "
+        "times beta",
     )
     atol_integral: Tolerance | None = Field(
         None,
-        description="that of the integrals of c [m s]; when absent atol, and rtol times the distance besides where "
-        "a large formation is not solved densely",
+        description="absolute tolerance of the integrals of c [m s]; default: atol, plus rtol times the distance if "
+        "the solver is not dense",
     )
     atol_attitude: Tolerance | None = Field(
-        None, description="that of the frame's quaternion [-]; atol when absent"
+        None,
+        description="absolute tolerance of the quaternion of the body frame [-]; default: atol",
     )
 
 
 class BodyFrame(Part):
-    """Attach the body frame at t = 0 with this attitude, not when a formation is established."""
+    """Attach the body frame at t = 0 with this attitude instead of when a formation is established."""
 
     roll_deg: Angle = Field(0.0, description="roll [deg], 3-2-1 Euler angles")
     pitch_deg: Angle = Field(0.0, description="pitch [deg]")
@@ -314,9 +324,9 @@ class BodyFrame(Part):
 
 
 class Formation(Part):
-    """A shape (named, or slots), the edges that hold it, and their lengths.
+    """A formation: its shape (named or as slots), its edges and their distances.
 
-    The arrays below are about a checked formation of `n` agents.
+    The methods require a checked formation of `n` agents.
     """
 
     shape: str | None = Field(
@@ -325,32 +335,33 @@ class Formation(Part):
         json_schema_extra={"enum": [*shapes.SHAPES]},
     )
     size: Size | None = Field(
-        None, description="edge length of the shape [m]; a cuboid's [x, y, z]"
+        None, description="edge length of the shape [m]; for a cuboid also [x, y, z]"
     )
     slots: tuple[Vector, ...] | None = Field(
-        None, description="instead of a shape: place of each agent in the body frame [m]"
+        None, description="instead of a shape: desired position of each agent in the body frame [m]"
     )
     edges: Edges = Field(
         "complete",
-        description="pairs of agents, counted from 1; 'complete': every pair; 'neighbours': those within reach; "
-        "'henneberg': each to three nearer to the centre; 'henneberg-multilevel': each to three before it, far "
-        "ones first; 3 N - 6 in all",
+        description="list of pairs of agents, counted from 1; 'complete': all pairs; 'neighbours': pairs within reach; "
+        "'henneberg': each agent to three nearer to the centre; 'henneberg-multilevel': each agent to three before "
+        "it, from coarse to fine; both have 3 N - 6 edges",
     )
     reach: Length = Field(
         graphs.REACH,
-        description="how far edges 'neighbours' reach, in distances of nearest neighbours: 1.9 takes the second, too",
+        description="maximum length of edges 'neighbours', in distances of nearest neighbours; 1.9 includes second "
+        "neighbours",
     )
     distances: tuple[Length, ...] | None = Field(
-        None, description="length of each edge [m]; when absent, those of the slots"
+        None, description="length of each edge [m]; default: those between the slots"
     )
 
     def edge_array(self, n: int) -> Ints:
-        """Edges (m, 2), counted from 0, i < j."""
+        """Edges (m, 2), agents from 0, i < j."""
         if self.edges == "complete":
             return graphs.complete_graph(n)
         if isinstance(self.edges, str):
             slots = self.slot_array(n)
-            assert slots is not None  # checked: there are a shape or slots
+            assert slots is not None  # checked: there is a shape or slots
             if self.edges == "neighbours":
                 return graphs.neighbours(slots, self.reach)
             return (
@@ -362,11 +373,11 @@ class Formation(Part):
 
     @property
     def knows_slots(self) -> bool:
-        """Whether it is given by slots, not by distances alone."""
+        """Whether the formation is given by a shape or slots, not by distances alone."""
         return self.shape is not None or self.slots is not None
 
     def slot_array(self, n: int) -> Floats | None:
-        """Slots (n, 3) [m] about their geometric centre; None where distances do not give them."""
+        """Slots (n, 3) [m] about their geometric centre; None if the distances do not determine them."""
         if self.shape is not None and self.size is not None:
             return shapes.slots(self.shape, self.size, n)
         if self.slots is not None:
@@ -375,10 +386,10 @@ class Formation(Part):
 
 
 class Box(Part):
-    """A box along the world's axes."""
+    """A box parallel to the world axes."""
 
-    kind: Literal["box"] = Field(description="a box along the world's axes")
-    name: str = Field("", description="what to call it; 'box' and its number when absent")
+    kind: Literal["box"] = Field(description="a box parallel to the world axes")
+    name: str = Field("", description="name; default: 'box' and its number")
     min: Vector = Field(description="lowest corner [x, y, z] [m]")
     max: Vector = Field(description="highest corner [x, y, z] [m]")
 
@@ -392,125 +403,134 @@ class Ground(Part):
     """Everything below a height."""
 
     kind: Literal["ground"] = Field(description="everything below a height")
-    name: str = Field("", description="what to call it; 'ground' when absent")
+    name: str = Field("", description="name; default: 'ground'")
     height: Coordinate = Field(0.0, description="height of the ground [m]")
 
     @property
     def corners(self) -> tuple[float, ...]:
-        """Lowest and highest corner (6,) [m] of a box without sides and bottom."""
+        """Lowest and highest corner (6,) [m] of a box that is infinite except at the top."""
         return (*(-math.inf,) * 3, math.inf, math.inf, self.height)
 
 
 class Geofence(Part):
-    """The box that no agent may leave."""
+    """A box that no agent may leave."""
 
     min: Vector = Field(description="lowest corner [x, y, z] [m]")
     max: Vector = Field(description="highest corner [x, y, z] [m]")
 
 
 class Limits(Part):
-    """What the verdict holds each agent to."""
+    """Limits that the verdict checks for each agent."""
 
-    speed: Speed | None = Field(None, description="greatest speed [m/s]")
-    acceleration: Acceleration | None = Field(None, description="greatest acceleration [m/s^2]")
+    speed: Speed | None = Field(None, description="maximum speed [m/s]")
+    acceleration: Acceleration | None = Field(None, description="maximum acceleration [m/s^2]")
     separation: Room | None = Field(
-        None, description="least room between agents [m]: centre distance minus radii"
+        None, description="minimum separation of agents [m]: centre distance minus radii"
     )
     separation_below: Room | None = Field(
-        None, description="least room [m] to an agent straight below: height minus radii (downwash)"
+        None,
+        description="minimum separation from an agent straight below [m]: height minus radii (downwash)",
     )
     geofence: Geofence | None = Field(None, description="box that no agent may leave")
 
 
 class Gusts(Part):
-    """Gusts: the velocity of the air beside the steady wind, of each agent, stationary from the start."""
+    """Gusts: the velocity of the air at each agent in addition to the steady wind, stationary from the start."""
 
     model: Literal["first-order", "dryden"] = Field(
-        description="first-order: one correlation time, alike in all directions; dryden: MIL-F-8785C's spectra, "
-        "along the wind, across and vertical"
+        description="first-order: one correlation time for all directions; dryden: spectra of MIL-F-8785C along the "
+        "wind, across it and vertical"
     )
     intensity: PerAxis | None = Field(
         None,
-        description="standard deviation [m/s]: a number, or [along the wind, across, vertical]; by altitude and "
-        "wind speed when absent",
+        description="standard deviation [m/s]: a number, or [along the wind, across, vertical]; default: from altitude "
+        "and wind speed",
     )
     time_scale: Time | None = Field(None, description="correlation time of first-order gusts [s]")
     length: Size | None = Field(
         None,
-        description="scale length of Dryden's gusts [m]: a number, or [along the wind, across, vertical]",
+        description="scale length of Dryden gusts [m]: a number, or [along the wind, across, vertical]",
     )
     altitude: Annotated[float, Strict(), Field(ge=3.048, le=304.8)] | None = Field(
         None,
-        description="in place of length: height above ground [m] from which MIL-F-8785C has the lengths, 3.048 to "
-        "304.8",
+        description="instead of length: height above ground [m], 3.048 to 304.8, which determines the lengths by "
+        "MIL-F-8785C",
     )
     airspeed: Speed | None = Field(
         None,
-        description="speed at which Dryden's gusts pass by [m/s]; the wind's when absent",
+        description="speed at which Dryden gusts pass by [m/s]; default: wind speed",
     )
     correlation: Annotated[float, Strict(), Field(ge=0, le=1)] | None = Field(
-        None, description="correlation of any two agents' gusts [-], 0 to 1; 0 when absent"
+        None, description="correlation of the gusts at any two agents [-], 0 to 1; default: 0"
     )
     correlation_length: Length | None = Field(
         None,
-        description="in place of correlation: it is exp(-distance / this length [m]), of the slots of the first "
-        "formation established",
+        description="instead of correlation: length [m] in correlation = exp(-distance / length), with the distances "
+        "of slots in the first established formation",
     )
-    seed: Seed = Field(0, description="of the random numbers: the same seed, the same gusts")
+    seed: Seed = Field(
+        0, description="seed of the random numbers; the same seed gives the same gusts"
+    )
 
 
 class Noise(Part):
-    """Errors of what each vehicle measures of itself, normal, independent, new at a sensor's rate."""
+    """Measurement noise of each vehicle's own state: normal, independent, sampled at a fixed rate."""
 
     position: Room = Field(
-        0.0, description="standard deviation of each component of the position [m]"
+        0.0, description="standard deviation of each component of the measured position [m]"
     )
     velocity: Spread = Field(
-        0.0, description="standard deviation of each component of the velocity [m/s]"
+        0.0, description="standard deviation of each component of the measured velocity [m/s]"
     )
     rate: Annotated[float, Strict(), Field(gt=0, le=1000)] = Field(
-        50.0, description="measurements each second [Hz], at most 1000"
+        50.0, description="measurements per second [Hz], at most 1000"
     )
-    seed: Seed = Field(0, description="of the random numbers: the same seed, the same noise")
+    seed: Seed = Field(
+        0, description="seed of the random numbers; the same seed gives the same noise"
+    )
 
 
 class Lost(Part):
-    """A vehicle lost: from then on without thrust and without edges."""
+    """Loss of a vehicle: from this time on it has neither thrust nor edges."""
 
-    agent: Whole = Field(description="which one, counted from 1")
-    time: Time = Field(description="mission time [s], > 0")
+    agent: Whole = Field(description="agent that is lost, counted from 1")
+    time: Time = Field(description="mission time of the loss [s], > 0")
 
 
 class Disturbances(Part):
-    """What disturbs the flight, and is told to no law."""
+    """Disturbances of the flight. Control laws and constraint law do not know them."""
 
-    wind: Velocity = Field((0.0, 0.0, 0.0), description="steady wind [m/s], where the air goes to")
+    wind: Velocity = Field(
+        (0.0, 0.0, 0.0),
+        description="velocity of the steady wind [m/s]: the direction in which the air moves",
+    )
     drag: PerAgent | None = Field(
         None,
-        description="force of the air for each m/s of velocity through it [N s/m]: a number or a list; when absent, "
-        "0.3 for each kg of mass if there is wind or a gust, else 0",
+        description="drag force per velocity relative to the air [N s/m]: a number or a list; default: 0.3 per kg of "
+        "mass if there is wind or gusts, else 0",
     )
     mass_error: PerAgentError = Field(
         0.0,
-        description="true mass = mass (1 + mass_error) [-], > -1: a number or a list; the laws work with mass",
+        description="relative error of mass [-], > -1: a number or a list; true mass = mass (1 + mass_error), control "
+        "laws use mass",
     )
     gusts: Gusts | None = Field(None, description="gusts: [disturbances.gusts]")
     noise: Noise | None = Field(None, description="measurement noise: [disturbances.noise]")
     lost: tuple[Lost, ...] = Field(
-        (), description="vehicles lost on the way, `lost = [{ agent = 2, time = 30.0 }]`"
+        (), description="vehicles lost during the flight: `lost = [{ agent = 2, time = 30.0 }]`"
     )
 
 
 class Settle(Part):
-    """A phase ends once its error has stayed within a tolerance."""
+    """The phase ends when its error has stayed within a tolerance for some time."""
 
-    tolerance: Tolerance = Field(1e-3, description="greatest error [m]")
-    dwell: Dwell = Field(1.0, description="how long the error must stay within it [s]")
-    timeout: Time = Field(60.0, description="after this long the mission fails [s]")
+    tolerance: Tolerance = Field(1e-3, description="maximum error [m]")
+    dwell: Dwell = Field(1.0, description="time that the error must stay within tolerance [s]")
+    timeout: Time = Field(60.0, description="time after which the mission fails [s]")
 
 
 class AnyPhase(Part):
-    """What every phase has. It ends by exactly one of until, duration and settle."""
+    """Keys of every phase. Exactly one of until, duration and settle ends it."""
 
     # What a kind is to the rest of the code, which asks for this and not for the kind.
 
@@ -521,19 +541,19 @@ class AnyPhase(Part):
     #: Its control in architecture "body", unless another is given.
     body_control: ClassVar[str] = "body"
 
-    name: str = Field("", description="what to call it, unique; its kind and number when absent")
-    until: Time | None = Field(None, description="ending: at this mission time [s]")
-    duration: Time | None = Field(None, description="ending: after this long [s]")
-    settle: Settle | None = Field(None, description="ending: when settled")
+    name: str = Field("", description="unique name; default: its kind and number")
+    until: Time | None = Field(None, description="the phase ends at this mission time [s]")
+    duration: Time | None = Field(None, description="the phase ends after this time [s]")
+    settle: Settle | None = Field(None, description="the phase ends when its error has settled")
     control: Literal["open", "tracking", "body"] = Field(
         "tracking",
-        description="open: weight balance and input_force; tracking: each agent tracks its slot; body: "
-        "wrench on the virtual body. Default tracking; in architecture 'body', open to establish, "
-        "tracking to orbit and body otherwise",
+        description="open: weight compensation and input_force; tracking: each agent tracks its slot; body: "
+        "wrench on the virtual body. With architecture 'body' the default is open for establish, tracking for "
+        "orbit and body for other phases",
     )
     input_force: Force = Field(
         (0.0, 0.0, 0.0),
-        description="force on each agent besides the weight balance [N], control 'open' only",
+        description="force on each agent in addition to weight compensation [N]; only with control 'open'",
     )
 
     @property
@@ -582,12 +602,13 @@ class AnyPhase(Part):
 
 
 class Attitude(Part):
-    """Angles of an attitude; when one is given, the others are 0."""
+    """Angles of an attitude; if one is given, the default of the others is 0."""
 
-    roll_deg: Angle | None = Field(None, description="roll on arrival [deg], 3-2-1 Euler angles")
-    pitch_deg: Angle | None = Field(None, description="pitch on arrival [deg]")
+    roll_deg: Angle | None = Field(None, description="roll at arrival [deg], 3-2-1 Euler angles")
+    pitch_deg: Angle | None = Field(None, description="pitch at arrival [deg]")
     yaw_deg: Angle | None = Field(
-        None, description="yaw on arrival [deg]; when one angle is given, the others are 0"
+        None,
+        description="yaw at arrival [deg]; if one angle is given, the default of the others is 0",
     )
 
     @model_validator(mode="before")
@@ -599,7 +620,7 @@ class Attitude(Part):
 
     @property
     def attitude_deg(self) -> tuple[float, float, float] | None:
-        """Commanded (roll, pitch, yaw) [deg]; None to keep the attitude commanded before."""
+        """Commanded (roll, pitch, yaw) [deg]; None keeps the attitude commanded before."""
         if self.roll_deg is None or self.pitch_deg is None or self.yaw_deg is None:
             return None
         return self.roll_deg, self.pitch_deg, self.yaw_deg
@@ -619,11 +640,10 @@ class Shaping(AnyPhase):
     formation: str = Field(description="name of the formation to take")
     reference: Literal["shape", "distances", "squares", "step"] = Field(
         "shape",
-        description="how the distances get there: shape, with slots that blend; squares, with their "
-        "squares that blend; distances, so if that leads through space to the slots (always, of a "
-        "formation without), else as shape; step, at once as in the paper",
+        description="how the distances change: shape: slots blend; squares: squared distances blend; distances: as "
+        "squares if that leads to the slots or there are none, else as shape; step: at once, as in the paper",
     )
-    blend: Time = Field(4.0, description="length of the blend [s], from the phase's start")
+    blend: Time = Field(4.0, description="duration of the blend from the start of the phase [s]")
 
     @property
     def shaping(self) -> Shaping:
@@ -646,16 +666,16 @@ class Shaping(AnyPhase):
 
 
 class Establish(Attitude, Shaping):
-    """Take a formation from wherever the agents are, and attach the body frame to it."""
+    """Take a formation from the current positions of the agents, and attach the body frame to it."""
 
     body_control: ClassVar[str] = "open"
 
     kind: Literal["establish"] = Field(description="take a formation")
     attitude: Literal["drawn", "free"] = Field(
         "drawn",
-        description="drawn: the slots tracked lie as they are drawn, in the world's axes or those of [body_frame], or "
-        "at the angles asked for last, here or in a phase before; free: as they lie nearest to the agents, as always "
-        "where no slots are tracked, and of a formation given by distances unless it asks for angles",
+        description="drawn: tracked slots have the attitude commanded here or in an earlier phase, else that of the "
+        "world axes or [body_frame]; free: slots have the attitude nearest to the agents. The attitude is always "
+        "free if no slots are tracked, or if the formation is given by distances and no angle is commanded",
     )
 
     @property
@@ -676,15 +696,15 @@ class Reshape(Shaping):
 
 
 class Steering(Attitude, AnyPhase):
-    """A phase that may change the attitude."""
+    """A phase that can change the attitude."""
 
     moves: ClassVar[bool] = True
 
     travel: Time | None = Field(
-        None, description="from the start to the arrival [s]; when absent, the whole phase"
+        None, description="time from the start to the arrival [s]; default: the whole phase"
     )
     rates_deg_s: Rates = Field(
-        (0.0, 0.0, 0.0), description="body rates [p, q, r] on arrival [deg/s]"
+        (0.0, 0.0, 0.0), description="body rates [p, q, r] at arrival [deg/s]"
     )
 
     @property
@@ -714,11 +734,11 @@ class Steering(Attitude, AnyPhase):
 
 
 class Fly(Steering):
-    """Fly the centre of mass to a waypoint, to arrive after `travel`, or at the phase's end."""
+    """Fly the centre of mass to a waypoint, with arrival after `travel` or at the end of the phase."""
 
     kind: Literal["fly"] = Field(description="fly to a waypoint")
-    position: Vector = Field(description="centre of mass on arrival [x, y, z] [m]")
-    velocity: Velocity = Field((0.0, 0.0, 0.0), description="its velocity on arrival [m/s]")
+    position: Vector = Field(description="centre of mass at arrival [x, y, z] [m]")
+    velocity: Velocity = Field((0.0, 0.0, 0.0), description="its velocity at arrival [m/s]")
 
     @property
     def meets(self) -> tuple[str, ...]:
@@ -734,15 +754,15 @@ class Fly(Steering):
 
 
 class Turn(Steering):
-    """Turn on the spot to an attitude: at least one angle is given."""
+    """Turn on the spot to an attitude. At least one angle is required."""
 
     kind: Literal["turn"] = Field(description="turn on the spot")
 
 
 class Hold(AnyPhase):
-    """Stay."""
+    """Stay at the commanded position and attitude."""
 
-    kind: Literal["hold"] = Field(description="stay")
+    kind: Literal["hold"] = Field(description="stay at the commanded position and attitude")
 
 
 class Orbit(AnyPhase):
@@ -809,25 +829,25 @@ class MissionHeader(Part):
 
     schema_version: Literal[1] = Field(description="version of this format: 1")
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")] = Field(
-        description="short name, which results are filed under: letters, digits, '.', '_', '-'"
+        description="short name, used for the files of results: letters, digits, '.', '_', '-'"
     )
     title: Annotated[str, Field(pattern=r"^[^\r\n]*$")] = Field(
-        "", description="what it shows, in one line"
+        "", description="title of the mission in one line"
     )
-    source: str = Field("", description="table or figure of the paper that it reproduces")
+    source: str = Field("", description="table or figure of the paper that the mission reproduces")
     architecture: Literal["local", "body"] = Field(
         "local", description="local: each agent tracks its slot; body: a wrench on the virtual body"
     )
     formulation: Literal["inertial", "body"] = Field(
         "inertial",
-        description="equations integrated: Newton's, or the paper's in the body frame, of which many agents that turn "
-        "take fewer steps",
+        description="equations of motion: inertial: Newton's; body: the paper's in the body frame, which need fewer "
+        "steps when many agents turn",
     )
     assignment: Literal["given", "shortest", "safe", "each"] = Field(
         "given",
-        description="who takes which slot (and its edges): given, agent 1 slot 1 and so on; shortest, least "
-        "squared way from the start to the first formation established; safe, most room on the way; each, least "
-        "squared way anew at each change, without turning the shapes",
+        description="assignment of agents to slots and their edges: given: agent 1 to slot 1 and so on; shortest: "
+        "least sum of squared distances from the start to the first established formation; safe: most clearance on the "
+        "paths there; each: as shortest, anew at each change of formation, without turning the shapes",
     )
     gravity: Annotated[float, Strict(), _from_zero(ACCELERATION)] = Field(
         9.81, description="gravity [m/s^2], >= 0"
@@ -847,10 +867,10 @@ class Contents(MissionHeader):
         default_factory=Tracking, description="regulator of each agent: [tracking]"
     )
     allocation: Allocation = Field(
-        default_factory=Allocation, description="from wrench to agents: [allocation]"
+        default_factory=Allocation, description="from wrench to forces on agents: [allocation]"
     )
     integrator: IntegratorOptions = Field(
-        default_factory=IntegratorOptions, description="tolerances: [integrator]"
+        default_factory=IntegratorOptions, description="tolerances of the integrator: [integrator]"
     )
     body_frame: BodyFrame | None = Field(
         None, description="attitude of the body frame at t = 0: [body_frame]"
@@ -858,11 +878,13 @@ class Contents(MissionHeader):
     formations: dict[str, Formation] = Field(
         default_factory=dict, description="formations by name: [formations.NAME]"
     )
-    obstacles: tuple[Obstacle, ...] = Field((), description="what not to touch: [[obstacles]]")
-    limits: Limits = Field(default_factory=Limits, description="what to stay within: [limits]")
+    obstacles: tuple[Obstacle, ...] = Field((), description="obstacles: [[obstacles]]")
+    limits: Limits = Field(
+        default_factory=Limits, description="limits that the verdict checks: [limits]"
+    )
     disturbances: Disturbances | None = Field(
-        None, description="wind, gusts, noise, wrong masses, vehicles lost: [disturbances]"
+        None, description="wind, gusts, noise, mass errors, lost vehicles: [disturbances]"
     )
     phases: Annotated[tuple[Phase, ...], Field(min_length=1)] = Field(
-        description="what to do, in order: [[phases]]"
+        description="phases of the flight, in order: [[phases]]"
     )

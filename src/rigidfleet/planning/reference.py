@@ -82,10 +82,10 @@ def attach(
 ) -> tuple[Floats | None, PhaseState, Floats]:
     """Attach the body frame where a phase needs one, and say how the slots wanted lie in it meanwhile.
 
-    Slots fitted to the agents (Kabsch) give the attitude. Where nothing is established yet, the agents themselves
-    are the slots, in the axes in which formations are drawn. A formation that is established takes axes of its own:
-    those in which it is to lie, or, if its attitude is free, those in which it lies nearest. Lost vehicles count in
-    neither; the virtual body keeps their slots.
+    Slots fitted to the agents (Kabsch) give the attitude, the matrix of Eq. (23). Where nothing is established yet,
+    the agents themselves are the slots, in the axes in which formations are drawn. A formation that is established
+    takes axes of its own: those in which it is to lie, or, if its attitude is free, those in which it lies nearest.
+    Lost vehicles count in neither; the virtual body keeps their slots.
 
     Returns
     -------

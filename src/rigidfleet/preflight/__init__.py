@@ -1,1 +1,1 @@
-"""What can be said about a mission before it flies."""
+"""Check a mission before the flight."""

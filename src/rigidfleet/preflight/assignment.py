@@ -1,4 +1,4 @@
-"""Which assignment is shortest, and which leaves most room."""
+"""Compare the assignment of a mission with the shortest and the safest one."""
 
 from __future__ import annotations
 
@@ -11,19 +11,16 @@ from rigidfleet.mission import Mission
 from rigidfleet.planning.preview import preview
 from rigidfleet.preflight.findings import Assignment, Preflight, Remark
 
-#: Another assignment is worth a note if it saves this share of the way, and some centimetres [m].
-_WORTH = 0.05
+#: A shorter assignment is reported if it saves this fraction of the path length and this length besides [m].
+_WORTH, _SHORT = 0.05, 0.1
 
 
-_SHORT = 0.1
-
-
-#: Assignments of so many agents are compared, in a second or so.
+#: Maximum number of agents whose assignments are compared; this takes about a second.
 _COMPARED = 200
 
 
 def assignment_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
-    """Whether other agents in the slots of the first formation would be better off."""
+    """Notes if another assignment to the slots of the first formation is shorter or safer."""
     first = next((p.establishing for p in mission.phases if p.establishing is not None), None)
     slots = mission.formation_slots(first.formation) if first is not None else None
     if first is None or slots is None or not 2 <= mission.n_agents <= _COMPARED:
@@ -36,7 +33,7 @@ def assignment_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
         if name not in ("as it is", mission.assignment):
             other = Mission.from_dict(mission.to_dict() | {"assignment": name}, mission.origin)
             planned = preview(other, index + 1)[0][index]
-        assert planned.ways is not None  # it shapes
+        assert planned.ways is not None  # the phase changes the formation
         x = planned.position - (masses @ planned.position)[:, None] / masses.sum()
         length = float(np.linalg.norm(np.diff(x, axis=0), axis=2).sum())
         clearance = assignment.nearest_way(*planned.ways, mission.agents.radius)[0]
@@ -45,11 +42,14 @@ def assignment_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     radius = mission.fleet.radius
     now, short, safe = found.assignments.values()
     if short.path_length < (1 - _WORTH) * now.path_length - _SHORT:
-        text = f"another assignment to slots is shorter: {short.path_length:.1f} m in all, not {now.path_length:.1f} m"
-        yield Remark("note", "assignment", text + ' (assignment = "shortest")')
+        text = (
+            f'assignment = "shortest" reduces the total path length from {now.path_length:.1f} m to'
+            f" {short.path_length:.1f} m"
+        )
+        yield Remark("note", "assignment", text)
     if safe.min_clearance > now.min_clearance + 0.05 and now.min_clearance < 2 * radius.max():
         text = (
-            f"another one is safer: {safe.min_clearance:.2f} m between agents on the way instead of"
-            f" {now.min_clearance:.2f} m"
+            f'assignment = "safe" increases the minimum clearance on the paths from {now.min_clearance:.2f} m to'
+            f" {safe.min_clearance:.2f} m"
         )
-        yield Remark("note", "assignment", text + ' (assignment = "safe")')
+        yield Remark("note", "assignment", text)

@@ -1,9 +1,9 @@
-"""What a mission will meet, found before it flies: rigidity, gains, and what is on the way.
+"""Check a mission before the flight: rigidity, gains, and the planned paths of the agents.
 
-The way is the planned reference, sampled: slots that blend, moved by the LQR flights of the virtual body.
-Nothing is integrated, so this takes a fraction of a second and no compiler. Where nothing but distances leads,
-the agents are taken to go straight to their slots, which is a guess: such phases are not `exact`, and what is found
-on them is a note.
+The planned paths are samples of the reference: slots that blend, moved by the LQR flights of the virtual body. Nothing
+is integrated, so the check takes a fraction of a second and needs no compiler. In a phase in which only distances
+guide the agents, straight paths to the slots are assumed. Such a phase is not `exact`, and problems on its paths are
+notes.
 """
 
 from __future__ import annotations
@@ -33,24 +33,31 @@ def check(
     search: bool | None = None,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Preflight:
-    """Find what a mission will meet, before it flies; `rigidfleet check` prints it.
+    """Check a mission before the flight. `rigidfleet check` prints the result.
 
     Parameters
     ----------
     mission : a shipped name, a path or a `Mission`
-    search : for other shapes with the same distances, `STARTS` random starts a formation; default: for up to
-        `SEARCHED` agents
-    progress : called with what is looked at next, in words
+    search : whether to search for other shapes with the same distances, from `STARTS` random starts per formation;
+        default: for up to `SEARCHED` agents
+    progress : called with a description of the next step
+
+    Raises
+    ------
+    TypeError
+        ``mission`` is none of these.
+    MissionError
+        The mission cannot be read or has errors.
     """
     mission = as_mission(mission)
     search = mission.n_agents <= SEARCHED if search is None else search
     formations = check_formations(mission, search=search, progress=progress)
-    progress("the way")
+    progress("planned paths")
     way, known = preview(mission)
     found = Preflight(formations, check_gains(mission, formations), way)
     if not known:
         found.judged_to = float(way[-1].time[-1]) if way else 0.0
-    progress("what is on the way")
+    progress("collisions, obstacles and limits")
     found.remarks = [
         *formation_remarks(mission, formations),
         *gain_remarks(mission, found),
@@ -63,9 +70,9 @@ def check(
         *limit_remarks(mission, found),
     ]
     if not known:
-        why = "what follows is led by distances that fix no places before it flies"
+        why = "later positions depend on distances alone and are known only in flight"
         if len(way) < len(mission.phases) and samples_per_phase(mission) < FEWEST_SAMPLES:
-            why = "so many agents in so many phases take too long to look at"
-        text = f"the way is judged to {found.judged_to:g} s: {why}"
+            why = "more agents and phases would take too long"
+        text = f"paths are checked only up to {found.judged_to:g} s: {why}"
         found.remarks.append(Remark("note", "way", text))
     return found

@@ -1,4 +1,4 @@
-"""What a check finds, and how it is put in words."""
+"""Results of a check, and their descriptions in words."""
 
 from __future__ import annotations
 
@@ -8,23 +8,25 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from rigidfleet import _markup
+from rigidfleet._text import agent_names
 from rigidfleet.planning import solvers
 from rigidfleet.planning.preview import PlannedPhase
 from rigidfleet.rigidity import (
+    Kind,
     Realisations,
     Rigidity,
     Spectrum,
 )
 
-#: So many things are named in one note.
+#: Maximum number of names in one remark.
 _TOLD = 6
 
 
-#: So much of the shortest distance may be missed: the verdict's own tolerance of a shape.
+#: Tolerance of distances, relative to the shortest one; the verdict has the same.
 TOLERANCE = 0.01
-#: Equations up to which rigidity, and forces at a jump, are judged by a dense decomposition.
+#: Maximum number of equations for which rigidity, and forces at a step, are computed by a dense decomposition.
 DENSE = 600
-#: Rounding on a limit is not beyond it.
+#: A limit is exceeded only by more than this rounding error.
 SLACK = 1e-9
 
 Level = Literal["fails", "note"]
@@ -32,10 +34,14 @@ Level = Literal["fails", "note"]
 
 @dataclass(frozen=True)
 class Remark:
-    """Something that will fail, or should be known.
+    """A problem that will make the flight fail, or a note.
 
-    `topic` is formation, gains, collision, downwash, assignment, thrust, disturbances, obstacle, geofence, speed
-    or acceleration.
+    Attributes
+    ----------
+    level : "fails" or "note"
+    topic : formation, gains, collision, downwash, assignment, thrust, disturbances, obstacle, geofence, speed,
+        acceleration or way (paths that were not checked)
+    text : the problem or note in words
     """
 
     level: Level
@@ -45,11 +51,18 @@ class Remark:
 
 @dataclass(frozen=True)
 class FormationCheck:
-    """One formation: its rigidity, and other shapes that its distances allow, where looked for.
+    """Check of one formation.
 
-    `held_by` is "slots" if they are tracked in every phase that flies it, else "distances"; `method` how its
-    constraint force is solved for. A large one has a `spectrum` in place of its rigidity; one of very many is
-    `skipped`.
+    Attributes
+    ----------
+    name : name of the formation
+    rigidity : None if it was not computed
+    held_by : "slots" if slots are tracked in every phase with this formation, "distances" if not, "nothing" if no
+        phase has it
+    realisations : other shapes with the same distances; None if they were not searched
+    method : how the constraint force is solved
+    spectrum : of a large formation, instead of its rigidity
+    skipped : whether the formation was not checked because there are too many
     """
 
     name: str
@@ -63,10 +76,15 @@ class FormationCheck:
 
 @dataclass(frozen=True)
 class GainsCheck:
-    """The answer to an error of length: stability, and what it costs.
+    """Response of the constraint law to an error of a distance.
 
-    `margin` is 2 alpha beta^2 / gamma (above 1: stable), `settling_time` [s] to 2 %, `overshoot` a fraction, `force`
-    [N] per metre of error of one distance, at most, by formation.
+    Attributes
+    ----------
+    stabilised : whether there is feedback
+    margin : 2 alpha beta^2 / gamma; above 1 the law is stable
+    settling_time : time to settle to 2 % [s]; None if unknown
+    overshoot : as a fraction; None if unknown
+    force : by formation, maximum force per error of one distance [N/m]
     """
 
     stabilised: bool
@@ -78,9 +96,13 @@ class GainsCheck:
 
 @dataclass(frozen=True)
 class Assignment:
-    """How agents get to slots: length of all paths [m], and least clearance between agents on them [m].
+    """An assignment of agents to slots.
 
-    `order[i]` is the slot that agent i takes, both from 0.
+    Attributes
+    ----------
+    order : slot of each agent, from 0
+    path_length : total length of all paths [m]
+    min_clearance : minimum clearance between agents on them [m]
     """
 
     order: tuple[int, ...]
@@ -90,17 +112,17 @@ class Assignment:
 
 @dataclass(frozen=True)
 class Disturbed:
-    """What the mission's disturbances cost, beside the planned way.
+    """Effects of the disturbances on the planned paths.
 
     Attributes
     ----------
-    air : greatest force of the steady wind on a vehicle at rest [N]
-    gusts : three standard deviations of the gusts' force [N]
-    weight : greatest weight that is not believed in [N]
-    noise : three standard deviations of the thrust that noise asks for where slots are tracked [N]
-    thrust : all of it on the planned way: [N], when [s], who, limit [N]
-    offset : greatest steady distance from a tracked slot [m], and whose
-    lost : who is lost, and when [s]
+    air : maximum force of the steady wind on a vehicle at rest [N]
+    gusts : three standard deviations of the force of the gusts [N]
+    weight : maximum difference between true weight and the weight in the control laws [N]
+    noise : three standard deviations of the thrust due to measurement noise while slots are tracked [N]
+    thrust : maximum thrust on the planned paths with all disturbances: thrust [N], time [s], agent, limit [N]
+    offset : maximum steady distance from a tracked slot [m], and the agent
+    lost : index of each lost vehicle, from 0, and time of the loss [s]
     """
 
     air: float
@@ -114,7 +136,20 @@ class Disturbed:
 
 @dataclass
 class Preflight:
-    """What `check` has found of a mission before it flies; `remarks` say what of it matters.
+    """Result of `check`; `remarks` has the problems and notes.
+
+    Attributes
+    ----------
+    formations, gains : checks of the formations and of the constraint law
+    planned_phases : planned paths of each phase
+    room : minimum separation [m], its time [s] and the agents
+    thrust : maximum planned thrust [N], its time [s], the agent and its limit [N]
+    clearance : of each obstacle: its name, minimum clearance [m], time [s], agent
+    gaps : of each gap: its obstacles, its width [m], the width that the formation needs [m], time [s]
+    assignments : assignments to slots that were compared, by name
+    disturbed : effects of the disturbances; None without disturbances
+    judged_to : mission time [s] up to which paths were checked; infinite if they all were
+    remarks : problems and notes
 
     >>> import rigidfleet as rf
     >>> ahead = rf.check("narrow-passage")
@@ -127,8 +162,8 @@ class Preflight:
     formations: list[FormationCheck]
     gains: GainsCheck
     planned_phases: list[PlannedPhase]
-    room: tuple[float, float, str] | None = None  # [m], when [s], who
-    thrust: tuple[float, float, str, float] | None = None  # [N], when, who, limit
+    room: tuple[float, float, str] | None = None
+    thrust: tuple[float, float, str, float] | None = None
     clearance: list[tuple[str, float, float, str]] = field(default_factory=list)
     gaps: list[tuple[str, float, float, float]] = field(default_factory=list)
     assignments: dict[str, Assignment] = field(default_factory=dict)
@@ -138,23 +173,23 @@ class Preflight:
 
     @property
     def passed(self) -> bool:
-        """Whether nothing was found that will fail."""
+        """Whether no problem was found that will make the flight fail."""
         return all(remark.level != "fails" for remark in self.remarks)
 
     def __repr__(self) -> str:
         fails = sum(remark.level == "fails" for remark in self.remarks)
         notes = len(self.remarks) - fails
-        verdict = f"{fails} will fail" if fails else "no problems found"
+        verdict = f"{fails} problem{'s' * (fails != 1)}" if fails else "no problems found"
         return f"<Preflight: {verdict}, {notes} note{'s' * (notes != 1)}>"
 
     def _repr_html_(self) -> str:
-        """What was found as a notebook shows it: facts, then remarks."""
+        """Show the check in a notebook: facts, then remarks."""
         rows = [*self.describe(), *((remark.level, remark.text) for remark in self.remarks)]
-        verdict = "no problems found" if self.passed else "it will fail as it is"
-        return _markup.shown("Check", verdict, ("about", "what was found"), rows)
+        verdict = "no problems found" if self.passed else "the flight will fail"
+        return _markup.shown("Check", verdict, ("about", "result"), rows)
 
     def describe(self) -> Iterator[tuple[str, str]]:
-        """All facts, each under a heading: formations, gains, the way. `remarks` come besides."""
+        """Facts, each with its heading: formations, gains, planned paths. `remarks` are separate."""
         for f in self.formations:
             yield f.name, _formation_words(f)
         if self.formations:
@@ -162,18 +197,18 @@ class Preflight:
         if self.room is not None:
             yield (
                 "separation",
-                f"{self.room[0]:.2f} m at least, {self.room[2]} at {self.room[1]:.2f} s",
+                f"minimum {self.room[0]:.2f} m, {self.room[2]} at {self.room[1]:.2f} s",
             )
         if self.thrust is not None:
             force, t, who, limit = self.thrust
-            of = f" of {limit:g} N" if math.isfinite(limit) else ", of no limit,"
-            yield "thrust", f"{force:.1f} N{of} planned for {who} at {t:.2f} s"
+            of = f" (limit {limit:g} N)" if math.isfinite(limit) else " (no limit)"
+            yield "thrust", f"maximum {force:.1f} N{of}, {who} at {t:.2f} s"
         if self.disturbed is not None:
             yield "disturbances", _disturbed_words(self.disturbed)
         for name, room, t, who in self.clearance:
             yield "clearance", f"{room:.2f} m to '{name}', {who} at {t:.2f} s"
         for between, wide, takes, t in self.gaps:
-            text = f"{between}: {wide:.2f} m wide, the formation takes {takes:.2f} m at {t:.2f} s"
+            text = f"{between}: {wide:.2f} m wide, the formation needs {takes:.2f} m at {t:.2f} s"
             yield "gap", text
         if len(self.assignments) > 1:
             told = [
@@ -182,12 +217,15 @@ class Preflight:
             ]
             yield (
                 "assignment",
-                f"length of all paths, and least clearance on them: {'; '.join(told)}",
+                f"total path length, minimum clearance: {'; '.join(told)}",
             )
         guessed = [planned.phase for planned in self.planned_phases if not planned.exact]
         if guessed:
             names = ", ".join(f"'{name}'" for name in guessed)
-            yield "guessed", f"straight ways in {names}, where nothing but distances leads"
+            yield (
+                "guessed",
+                f"straight paths are assumed in {names}, where only distances guide the agents",
+            )
 
     def data(self) -> dict[str, Any]:
         """Plain data for JSON, agents and slots counted from 1."""
@@ -250,36 +288,38 @@ def _disturbed_words(d: Disturbed) -> str:
     parts = [
         f"{what} up to {force:.2g} N"
         for what, force in (
-            ("steady wind", d.air), ("gusts (3 sigma)", d.gusts), ("weight not believed in", d.weight),
+            ("steady wind", d.air), ("gusts (3 sigma)", d.gusts), ("weight error", d.weight),
             ("noise (3 sigma)", d.noise),
         )
         if force > 0
     ]  # fmt: skip
     force, t, who, limit = d.thrust
-    of = f" of {limit:g} N" if math.isfinite(limit) else ""
-    parts.append(f"with them {force:.1f} N of thrust{of} for {who} at {t:.2f} s")
+    of = f" (limit {limit:g} N)" if math.isfinite(limit) else ""
+    parts.append(f"maximum thrust with them {force:.1f} N{of}, {who} at {t:.2f} s")
     if d.offset[0] > 0:
-        parts.append(f"steady offset from slots up to {d.offset[0]:.2g} m, {d.offset[1]}")
+        parts.append(f"steady offset from its slot up to {d.offset[0]:.2g} m, {d.offset[1]}")
     parts += [f"agent {i + 1} is lost at {t:g} s" for i, t in d.lost]
     return "; ".join(parts)
 
 
 def _formation_words(f: FormationCheck) -> str:
     r = f.rigidity
-    held = {"slots": "held by slots", "distances": "held by distances", "nothing": "not flown"}[
-        f.held_by
-    ]
+    held = {
+        "slots": "held by slots",
+        "distances": "held by distances",
+        "nothing": "not used in any phase",
+    }[f.held_by]
     if f.spectrum is not None:
         text = f"{held}; solved by {solvers.WORDS[f.method]}"
         if f.spectrum.free:
-            return f"{text}; flexible to first order, {f.spectrum.free} motions or more"
+            return f"{text}; flexible to first order, at least {f.spectrum.free} free motions"
         return f"{text}; rigid, index {f.spectrum.index:.3g}, condition {f.spectrum.condition:.3g}"
     if f.skipped:
-        return f"{held}; solved by {solvers.WORDS[f.method]}; passed over, not judged"
+        return f"{held}; solved by {solvers.WORDS[f.method]}; skipped, rigidity not checked"
     if r is None and f.method != "dense":
-        return f"{held}; solved by {solvers.WORDS[f.method]}; too large to judge its rigidity"
+        return f"{held}; solved by {solvers.WORDS[f.method]}; too large to check its rigidity"
     if r is None:
-        return f"{held}; its distances fix no places, so its rigidity is not judged"
+        return f"{held}; its distances do not determine positions, so its rigidity is not checked"
     if f.method != "dense":
         held += f", solved by {solvers.WORDS[f.method]}"
     parts = [f"{r.verdict}, {held}: {len(r.edges)} edges, rank {r.rank} of {r.needed}"]
@@ -289,20 +329,38 @@ def _formation_words(f: FormationCheck) -> str:
     if len(r.redundant):
         names = ", ".join(f"{i}-{j}" for i, j in (r.edges[r.redundant][:6] + 1).tolist())
         more = ", ..." if len(r.redundant) > 6 else ""
-        parts.append(f"{len(r.redundant)} edges of which any one is redundant ({names}{more})")
+        parts.append(f"{len(r.redundant)} edges, any one of which is redundant ({names}{more})")
     if r.flexes:
-        free = "; ".join(agents(flex.agents) for flex in r.flexes[:3])
+        free = "; ".join(agent_names(flex.agents) for flex in r.flexes[:3])
         more = f" and {len(r.flexes) - 3} more" if len(r.flexes) > 3 else ""
-        parts.append(f"{len(r.flexes)} free to first order: {free}{more}")
+        parts.append(f"{len(r.flexes)} motions free to first order: {free}{more}")
     if r.rank:
         parts.append(
-            f"index {r.index:.3g}, w {r.w:.3g}: behind 1 cm of error up to {r.offset(1.0):.3g} cm of displacement"
+            f"index {r.index:.3g}, w {r.w:.3g}: 1 cm edge error allows {r.offset(1.0):.2g} cm position error"
         )
     if f.realisations is not None:
-        counts = [f"{x.kind} {x.found}" for x in f.realisations.found]
-        most = f", and {len(counts) - 4} more" if len(counts) > 4 else ""
-        parts.append(f"from {f.realisations.starts} random starts: {', '.join(counts[:4])}{most}")
+        parts.append(_realisation_words(f.realisations))
     return "; ".join(parts)
+
+
+#: A realisation as the goal of a random start.
+_GOALS = {
+    Kind.SAME: "this shape",
+    Kind.MIRRORED: "its mirror image",
+    Kind.FOLDED: "a folded shape",
+    Kind.COINCIDENT: "a shape with coincident agents",
+}
+
+
+def _realisation_words(r: Realisations) -> str:
+    """How many random starts reach which shape: 36 of 40 random starts reach this shape, 4 its mirror image."""
+    if not r.found:
+        return f"none of {r.starts} random starts converges"
+    first, *others = [(x.found, _GOALS[x.kind]) for x in r.found]
+    verb = "reaches" if first[0] == 1 else "reach"
+    text = f"{first[0]} of {r.starts} random starts {verb} {first[1]}"
+    text += "".join(f", {count} {goal}" for count, goal in others[:3])
+    return text + (f", and there are {len(others) - 3} more shapes" if len(others) > 3 else "")
 
 
 def _spectral_data(s: Spectrum) -> dict[str, Any]:
@@ -318,23 +376,15 @@ def _gain_words(g: GainsCheck) -> str:
         text += f"; settles to 2 % in {g.settling_time:.3g} s, overshoot {100 * g.overshoot:.0f} %"
     if g.force:
         name, force = max(g.force.items(), key=lambda item: item[1])
-        text += f"; 1 cm of sudden error asks for up to {force / 100:.2g} N ('{name}')"
+        text += f"; a step of 1 cm in an edge error causes up to {force / 100:.2g} N ('{name}')"
     return text
 
 
 def some(names: Sequence[str]) -> str:
-    """The first of some names, how many there are besides, and whether they "is" or "are"."""
+    """First names, the number of the others, and "is" or "are"."""
     text = ", ".join(f"'{name}'" for name in names[:_TOLD])
     more = f" and {len(names) - _TOLD:,} more" if len(names) > _TOLD else ""
     return f"{text}{more} {'is' if len(names) == 1 else 'are'}"
-
-
-def agents(who: tuple[int, ...]) -> str:
-    """Agents counted from 1, in words."""
-    names = [str(i + 1) for i in who]
-    if len(names) == 1:
-        return f"agent {names[0]}"
-    return f"agents {', '.join(names[:-1])} and {names[-1]}"
 
 
 def _named(names: tuple[str, ...], values: tuple[Any, ...] | None) -> dict[str, Any] | None:

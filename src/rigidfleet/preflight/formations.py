@@ -1,4 +1,4 @@
-"""Formations: whether they are rigid, and whether their distances make another shape."""
+"""Check formations: whether they are rigid, and whether other shapes have the same distances."""
 
 from __future__ import annotations
 
@@ -7,11 +7,12 @@ from typing import Literal
 
 import numpy as np
 
+from rigidfleet._text import agent_names
 from rigidfleet.formation import distance_geometry
 from rigidfleet.mission import Mission
 from rigidfleet.planning import solvers
 from rigidfleet.planning.reference import reference_kind
-from rigidfleet.preflight.findings import DENSE, TOLERANCE, FormationCheck, Remark, agents, some
+from rigidfleet.preflight.findings import DENSE, TOLERANCE, FormationCheck, Remark, some
 from rigidfleet.rigidity import (
     Kind,
     RigidityClass,
@@ -22,22 +23,22 @@ from rigidfleet.rigidity import (
 from rigidfleet.rigidity.spectrum import MOST as LANCZOS
 from rigidfleet.typing import Floats
 
-#: Formations of up to so many agents are searched for other shapes of the same distances.
+#: Maximum number of agents for which other shapes with the same distances are searched by default.
 SEARCHED = 12
 
 
-#: So many random starts that search has: enough for what is common, in a tenth of a second.
+#: Number of random starts of this search: enough to find common shapes in a tenth of a second.
 STARTS = 40
 
 
-#: Work on formations [s]. Limits of a check are counted, not timed: it finds the same on any machine.
+#: Maximum work on formations, as an estimated time [s]. The estimate makes a check the same on every machine.
 _FORMING = 4.0
 
 
 def check_formations(
     mission: Mission, *, search: bool, progress: Callable[[str], None]
 ) -> list[FormationCheck]:
-    """All formations in their order; those flown are judged first, as far as time goes."""
+    """Check all formations and return them in their order. Those that are flown have priority if work is limited."""
     held = {name: _held_by(mission, name) for name in mission.formations}
     left, found = _FORMING, {}
     for k, name in enumerate(sorted(held, key=lambda name: held[name] == "nothing"), start=1):
@@ -54,7 +55,7 @@ def check_formations(
 
 
 def _work(mission: Mission, name: str, *, search: bool) -> float:
-    """About how long it takes to judge a formation [s]."""
+    """Estimated time to check a formation [s]."""
     n, m = mission.n_agents, len(mission.formation_edges(name))
     if min(m, 3 * n) > DENSE:
         return 5e-4 * n if n <= LANCZOS else 0.0
@@ -81,7 +82,7 @@ def _formation(
 
 
 def _held_by(mission: Mission, name: str) -> Literal["slots", "distances", "nothing"]:
-    """By what a formation is held in the phases that fly it."""
+    """What holds a formation in the phases that have it."""
     now, controls = None, set()
     for phase in mission.phases:
         now = phase.shaping.formation if phase.shaping is not None else now
@@ -92,7 +93,7 @@ def _held_by(mission: Mission, name: str) -> Literal["slots", "distances", "noth
 
 
 def contradiction(mission: Mission, name: str) -> tuple[int, float] | None:
-    """Edge whose given distance is farthest from that of the slots, and by how much [m], if by much."""
+    """Edge whose given distance differs most from that of the slots, and this error [m]; None within tolerance."""
     slots, edges = mission.formation_slots(name), mission.formation_edges(name)
     if slots is None or not len(edges):
         return None
@@ -103,13 +104,13 @@ def contradiction(mission: Mission, name: str) -> tuple[int, float] | None:
 
 
 def formation_remarks(mission: Mission, formations: list[FormationCheck]) -> Iterator[Remark]:
-    """Formations that are not rigid, contradict themselves, or share their distances with other shapes."""
+    """Remarks on formations that are not rigid, contradict themselves, or share their distances with other shapes."""
     exact = mission.constraint.solver == "exact"
     if skipped := [f.name for f in formations if f.skipped]:
-        text = f"so many formations take too long to judge: {some(skipped)} passed over"
+        text = f"to limit the time of the check, {some(skipped)} skipped"
         yield Remark("note", "formation", text)
     if idle := [f.name for f in formations if f.held_by == "nothing"]:
-        yield Remark("note", "formation", f"{some(idle)} flown in no phase")
+        yield Remark("note", "formation", f"{some(idle)} not used in any phase")
     for f in formations:
         if f.held_by == "nothing":
             continue
@@ -118,48 +119,48 @@ def formation_remarks(mission: Mission, formations: list[FormationCheck]) -> Ite
             i, j = mission.formation_edges(f.name)[off[0]] + 1
             given = mission.formation_distances(f.name)[off[0]]
             text = (
-                f"'{f.name}' will be another shape than its slots: agents {i} and {j} are to be {given:.4g} m"
-                f" apart, their slots are {off[1]:.3g} m off that"
+                f"'{f.name}' will have another shape than its slots: agents {i} and {j} are given {given:.4g} m,"
+                f" which differs from that of their slots by {off[1]:.3g} m"
             )
             yield Remark("fails", "formation", text)
         r = f.rigidity
         if f.spectrum is not None:
             if f.spectrum.free:
-                text = f"'{f.name}' is flexible to first order: {f.spectrum.free} motions or more are free"
+                text = f"'{f.name}' is flexible to first order: at least {f.spectrum.free} motions are free"
                 held = ". Add edges, or track slots" if alone else "; slots hold it"
                 yield Remark("fails" if alone else "note", "formation", text + held)
             continue
         if r is None and mission.formation_slots(f.name) is not None:
-            continue  # too large to judge
+            continue  # too large to check
         if r is None:
             if len(mission.formation_edges(f.name)):
-                text = f"'{f.name}' has distances that fix no places: its rigidity is not judged"
+                text = f"the distances of '{f.name}' do not determine positions: its rigidity is not checked"
                 yield Remark("note", "formation", text)
             continue
         if r.verdict is RigidityClass.FLEXIBLE:
-            who = "; ".join(agents(flex.agents) for flex in r.flexes[:4])
+            who = "; ".join(agent_names(flex.agents) for flex in r.flexes[:4])
             more = f" and {len(r.flexes) - 4} more" if len(r.flexes) > 4 else ""
-            text = f"'{f.name}' is flexible: {r.rank} independent distances, {r.needed} hold it; free: {who}{more}"
+            text = f"'{f.name}' is flexible: {r.rank} of {r.needed} independent distances; free: {who}{more}"
             held = ". Add edges (rigidfleet design), or track slots" if alone else "; slots hold it"
             yield Remark("fails" if alone else "note", "formation", text + held)
         elif r.verdict is RigidityClass.UNDECIDED and alone:
             yield Remark("note", "formation", f"'{f.name}' is undecided: {r.reason}")
         elif r.verdict is RigidityClass.PRESTRESS_STABLE and alone:
             where = "line" if r.dimension == 1 else "plane"
-            text = f"'{f.name}' is held softly"
-            text += f" across its {where}" if r.dimension < 3 else ""
-            yield Remark("note", "formation", f"{text}, by self-stress; slots would hold it firmly")
+            across = f" across its {where}" if r.dimension < 3 else ""
+            text = f"'{f.name}' is only prestress stable{across}; tracked slots hold it firmly"
+            yield Remark("note", "formation", text)
         if exact and alone and len(r.edges) > r.rank:
             text = (
-                f"solver 'exact' has no solution at '{f.name}': {r.rank} of its {len(r.edges)} distances are"
-                " independent there. Use solver = 'iterated'"
+                f"solver 'exact' has no solution at '{f.name}': only {r.rank} of its {len(r.edges)} distances are"
+                " independent. Use solver = 'iterated'"
             )
             yield Remark("fails", "formation", text)
         yield from _other_shapes(mission, f, alone=alone)
 
 
 def _other_shapes(mission: Mission, f: FormationCheck, *, alone: bool) -> Iterator[Remark]:
-    """Shapes with the same distances, where distances alone lead to one."""
+    """Remarks on other shapes with the same distances, if distances alone guide the agents."""
     others = f.realisations
     if others is None or not alone:
         return
@@ -170,28 +171,28 @@ def _other_shapes(mission: Mission, f: FormationCheck, *, alone: bool) -> Iterat
     end = None if others.leads_to is None else others.found[others.leads_to].kind
     if by == "shape" and slots is not None and _flattens(start, slots):
         text = (
-            f"four agents start on the other side of the mirror of '{f.name}' and pass through one plane on their way,"
-            " where distances alone may turn them back, to its mirror image. Exchange two slots, or track slots"
+            f"the agents start with the handedness of the mirror image of '{f.name}' and must pass through a plane,"
+            " where distances alone may return them to the mirror image. Swap two slots or track slots"
         )
         yield Remark("note", "formation", text)
     elif by in ("squares", "step") and end not in (None, Kind.SAME):
         text = (
-            f"from the start, the distances of '{f.name}' lead to a shape that is {end}, not to it"
+            f"from the start positions, the distances of '{f.name}' lead to another shape ({end})"
         )
         yield Remark("note", "formation", text)
     elif not others.unique:
         n = sum(r.kind not in (Kind.SAME, Kind.MIRRORED) for r in others.found)
         share = sum(r.found for r in others.found if r.kind not in (Kind.SAME, Kind.MIRRORED))
-        what = "another shape has" if n == 1 else f"{n} other shapes have"
+        what = "1 other shape has" if n == 1 else f"{n} other shapes have"
         text = (
-            f"{what} the distances of '{f.name}'; {share} of {others.starts} random starts ended there."
-            " Redundant edges or slots rule them out"
+            f"{what} the distances of '{f.name}'; {share} of {others.starts} random starts reach"
+            f" {'it' if n == 1 else 'them'}. Redundant edges or tracked slots prevent this"
         )
         yield Remark("note", "formation", text)
 
 
 def _flattens(start: Floats, slots: Floats) -> bool:
-    """Whether four agents are all in one plane on the way from a start to slots in space (4, 3)."""
+    """Whether straight paths of four agents from a start to spatial slots (4, 3) pass through a plane."""
     if len(slots) != 4 or distance_geometry.dimension(slots) < 3:
         return False
     return bool(np.linalg.det((start[1:] - start[0]).T @ (slots[1:] - slots[0])) < 0)

@@ -1,4 +1,4 @@
-"""Stabilisation gains: stability, settling and the forces that an error costs."""
+"""Check the gains of the constraint law: stability, settling time and forces."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from rigidfleet.preflight.findings import TOLERANCE, FormationCheck, GainsCheck,
 
 
 def check_gains(mission: Mission, formations: list[FormationCheck]) -> GainsCheck:
-    """Stability, settling time and overshoot of the stabilisation, and its force per metre of error."""
+    """Stability, settling time and overshoot of the constraint law, and its force per error of a distance."""
     c = mission.constraint
     stabilised = c.stabilisation == "pid"
     alpha, beta, gamma = (c.alpha, c.beta, c.gamma) if stabilised else (0.0, 0.0, 0.0)
@@ -24,7 +24,7 @@ def check_gains(mission: Mission, formations: list[FormationCheck]) -> GainsChec
             settling = pid.settling_time(alpha, beta, gamma)
             over = pid.overshoot(alpha, beta, gamma)
         except ValueError:
-            pass  # it rings for a thousand cycles: said in a remark
+            pass  # more than a thousand oscillations: `gain_remarks` reports it
     mass = float(np.mean(mission.agents.mass))
     force = {
         f.name: f.rigidity.force(beta**2, mass)
@@ -36,24 +36,24 @@ def check_gains(mission: Mission, formations: list[FormationCheck]) -> GainsChec
 
 
 def gain_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
-    """Gains that are unstable or slow where distances lead the flight."""
+    """Remarks on missing or slow feedback, if distances guide the agents."""
     g, phases = found.gains, mission.phases
     if all(phase.control == "tracking" for phase in phases) or not len(mission.edges):
         return
     if not g.stabilised:
         yield from _drift(mission)
     elif g.settling_time is None:
-        yield Remark("note", "gains", "the gains ring for more than a thousand cycles: raise alpha")
-    elif g.settling_time > max(b - a for a, b in phase_spans(mission)):
-        text = (
-            f"errors of length take {g.settling_time:.3g} s to settle, longer than any phase lasts"
+        yield Remark(
+            "note", "gains", "errors oscillate for more than a thousand cycles: raise alpha"
         )
+    elif g.settling_time > max(b - a for a, b in phase_spans(mission)):
+        text = f"errors of distances need {g.settling_time:.3g} s to settle, longer than any phase"
         yield Remark("note", "gains", text)
 
 
 def _drift(mission: Mission) -> Iterator[Remark]:
-    """Without feedback an error of length goes on at the rate that it has."""
-    text = "no feedback (stabilisation = 'none'): errors of length stay, and grow at their rates"
+    """Remark that without feedback an error of a distance grows at its initial rate."""
+    text = "there is no feedback (stabilisation = 'none'): errors of distances remain and grow at their initial rate"
     first = mission.phases[0].establishing
     if first is None:
         yield Remark("note", "gains", text)

@@ -1,4 +1,4 @@
-"""On the planned trajectory: collisions, downwash, thrust, obstacles, limits."""
+"""Check the planned paths: collisions, downwash, thrust, obstacles, limits."""
 
 from __future__ import annotations
 
@@ -7,37 +7,32 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from rigidfleet._text import agent_names
 from rigidfleet.formation import assignment, distance_geometry
 from rigidfleet.math import lqr, proximity
 from rigidfleet.mission import Box, Ground, Mission
 from rigidfleet.mission.disturbances import intensity
 from rigidfleet.planning.preview import PlannedPhase, septic
-from rigidfleet.preflight.findings import DENSE, SLACK, Disturbed, Preflight, Remark, agents, some
+from rigidfleet.preflight.findings import DENSE, SLACK, Disturbed, Preflight, Remark, some
 from rigidfleet.rigidity import (
     jacobian,
 )
 from rigidfleet.typing import Floats
 
-#: Agents' places held against obstacles, phases against obstacles, places against gaps.
+#: Maximum number of comparisons of agent positions with obstacles.
 _HELD = 40_000_000
-
-
+#: Maximum number of comparisons of phases with obstacles.
 _MET = 50_000
-
-
+#: Maximum number of comparisons of samples with boxes, to find gaps.
 _PASSED = 100_000_000
-
-
-#: So many obstacles are told of, the nearest.
+#: Maximum number of obstacles whose clearance is reported; the nearest ones.
 _NEAREST = 20
-
-
-#: A steady distance from the slots beyond this is worth a note [m]: the verdict's tolerance of a waypoint.
+#: A steady distance from the slots is reported beyond this [m]: the verdict's tolerance of a waypoint.
 _OFFSET = 0.1
 
 
 def separation_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
-    """Room between vehicles: where it is least, and each change of formation on which ways cross."""
+    """Remarks on the minimum separation, and on each change of formation in which paths cross."""
     if mission.n_agents < 2:
         return
     radius, limit = mission.fleet.radius, mission.limits.separation or 0.0
@@ -58,16 +53,18 @@ def separation_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
                 yield _crossing(mission, number, planned, crossing, limit)
         for k, at in enumerate(ends):
             least = min(least, at)
-            # Where agents start is known, whatever leads them from there.
+            # The start positions are known even if the path from there is not.
             exact = planned.exact or (number == 0 and k == 0 and planned.ways is not None)
             if exact not in worst or at[0] < worst[exact][0]:
                 worst[exact] = *at, planned.phase
     if np.isfinite(least[0]):
-        found.room = least[0], least[1], agents(least[2])
+        found.room = least[0], least[1], agent_names(least[2])
     for exact, (room, t, who, phase) in worst.items():
         if room <= 0 or room < limit - SLACK:
             text = _near(who, room, t, phase, limit, exact=exact)
-            guess = "" if exact else "; distances lead there, and the way is a guess"
+            guess = (
+                "" if exact else "; straight paths are assumed, as only distances guide the agents"
+            )
             yield Remark("fails" if exact else "note", "collision", text + guess)
 
 
@@ -75,12 +72,12 @@ def _near(
     who: tuple[int, ...], room: float, t: float, phase: str, limit: float, *, exact: bool
 ) -> str:
     if room <= 0:
-        return f"{agents(who)} {'' if exact else 'may '}collide at {t:.2f} s, in '{phase}'"
-    return f"{agents(who)} come within {room:.2f} m at {t:.2f} s, in '{phase}' (limit {limit:g} m)"
+        return f"{agent_names(who)} {'' if exact else 'may '}collide at {t:.2f} s in '{phase}'"
+    return f"{agent_names(who)} have a separation of {room:.2f} m at {t:.2f} s in '{phase}' (limit {limit:g} m)"
 
 
 def _time_of(mission: Mission, planned: PlannedPhase, number: int, share: float) -> float:
-    """When [s] agents have gone this share of their ways."""
+    """Time [s] at which agents have flown this fraction of their paths."""
     shaping = mission.phases[number].shaping
     blend = 0.0 if shaping is None else shaping.blend
     tau = np.linspace(0.0, 1.0, 2001)
@@ -94,37 +91,39 @@ def _crossing(
     at: tuple[float, float, tuple[int, ...]],
     limit: float,
 ) -> Remark:
-    """Agents whose straight ways from one formation to the next bring them too near."""
+    """Remark on agents whose straight paths from one formation to the next come too close."""
     (room, t, who), (before, after) = at, planned.shapes
     needed = sum(mission.agents.radius[i] for i in who) + limit
     origin = "the start" if before is None else f"'{before}'"
     text = (
-        f"{_near(who, room, t, planned.phase, limit, exact=planned.exact)}: their ways from {origin} to '{after}'"
-        f" cross, {max(0.0, room + needed - limit):.2f} m from centre to centre. "
+        f"{_near(who, room, t, planned.phase, limit, exact=planned.exact)}: their paths from {origin} to '{after}'"
+        f" cross with {max(0.0, room + needed - limit):.2f} m from centre to centre. "
     )
-    assert after is not None  # something is shaped
+    assert after is not None  # the phase changes the formation
     assert planned.ways is not None
     apart = min(float(proximity.nearest(places).min()) for places in planned.ways)
     flown = [p.shaping.formation for p in mission.phases[:number] if p.shaping is not None]
-    spaced = f"keep slots {math.sqrt(2) * needed:.2f} m apart or more (here {apart:.2f} m)"
+    spaced = f"place slots at least {math.sqrt(2) * needed:.2f} m apart (now {apart:.2f} m)"
     promised = mission.assigned_turn(before, after) is not None
     if promised:
         text += f"{spaced[0].upper()}{spaced[1:]}"
     elif mission.assignment == "each" and after in flown:
         text += (
-            f"Its slots were assigned on another way: give '{after}' a second table [formations.NAME], to be assigned"
-            " on this one"
+            f"The slots of '{after}' were assigned in an earlier change: add a second table [formations.NAME] with this"
+            " shape, which is then assigned in this change"
         )
     else:
-        text += 'Assign slots to those who are near: assignment = "each"'
+        text += 'Assign agents to near slots: assignment = "each"'
     if not promised and apart < math.sqrt(2) * needed:
         text += f"; and {spaced}"
-    guess = "" if planned.exact else ". Distances lead there, and the way is a guess"
+    guess = (
+        "" if planned.exact else ". Straight paths are assumed, as only distances guide the agents"
+    )
     return Remark("fails" if planned.exact else "note", "collision", text + guess)
 
 
 def downwash_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
-    """One vehicle in the downwash of another."""
+    """Remarks on vehicles in the downwash of another one."""
     radius, limit = mission.fleet.radius, mission.limits.separation_below
     worst: dict[bool, tuple[float, float, tuple[int, ...], str]] = {}
     for planned in found.planned_phases:
@@ -139,7 +138,7 @@ def downwash_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
                 planned.phase,
             )
     for exact, (room, t, (low, high), phase) in worst.items():
-        text = f"agent {low + 1} is below agent {high + 1}, {max(room, 0.0):.2f} m from it at {t:.2f} s, in '{phase}'"
+        text = f"agent {low + 1} is {max(room, 0.0):.2f} m below agent {high + 1} at {t:.2f} s in '{phase}'"
         if limit is None:
             yield Remark("note", "downwash", text)
         elif room < limit - SLACK:
@@ -148,7 +147,7 @@ def downwash_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
 
 
 def thrust_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
-    """Thrust that the planned trajectory asks for beyond a limit."""
+    """Remarks on planned thrust beyond a limit."""
     masses, limits = mission.fleet.mass, mission.fleet.thrust_limit
     weight = np.array([0.0, 0.0, mission.gravity])
     best: tuple[float, float, str, float, str, bool] | None = None
@@ -164,13 +163,13 @@ def thrust_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
         found.thrust = best[:4]
         force, t, who, limit, phase, exact = best
         if force > limit * (1 + 1e-3):
-            text = f"{who} needs {force:.1f} N at {t:.2f} s, in '{phase}', and has {limit:g} N"
+            text = f"{who} needs {force:.1f} N at {t:.2f} s in '{phase}' (limit {limit:g} N)"
             yield Remark("fails" if exact else "note", "thrust", text)
     yield from _step_thrust(mission, found)
 
 
 def disturbance_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
-    """What wind, gusts, noise and wrong masses ask for, as far as it follows from the planned way."""
+    """Remarks on the effects of wind, gusts, noise and mass errors that follow from the planned paths."""
     d = mission.disturbances
     if d is None or not found.planned_phases:
         return
@@ -203,21 +202,23 @@ def disturbance_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
         float(noise.max()), most, (float(off[far]), f"agent {far + 1}"), lost,
     )  # fmt: skip
     if most[0] > most[3]:
-        text = f"disturbed, {most[2]} may need {most[0]:.1f} N at {most[1]:.2f} s, and has {most[3]:g} N"
+        text = f"with disturbances, {most[2]} may need {most[0]:.1f} N at {most[1]:.2f} s (limit {most[3]:g} N)"
         yield Remark("note", "thrust", text)
     if off[far] > _OFFSET and any(phase.control == "tracking" for phase in mission.phases):
         text = (
-            f"what is steady in the disturbances holds agent {far + 1} {off[far]:.2f} m off its slot, as tracking"
-            f" has no integral; a greater first weight in tracking.Q shortens it (now {mission.tracking.Q[0]:g})"
+            f"steady disturbances hold agent {far + 1} {off[far]:.2f} m off its slot, because tracking has no integral;"
+            f" a larger first weight in tracking.Q reduces the offset (now {mission.tracking.Q[0]:g})"
         )
         yield Remark("note", "disturbances", text)
     if lost:
-        text = f"the way is judged as if {agents(tuple(i for i, _ in lost))} flew on to its end"
+        text = (
+            f"paths are checked as if {agent_names(tuple(i for i, _ in lost))} flew on to the end"
+        )
         yield Remark("note", "disturbances", text)
 
 
 def _step_thrust(mission: Mission, found: Preflight) -> Iterator[Remark]:
-    """Forces that references ask for which jump: J M^-1 J^T lambda = -beta^2 c at the jump."""
+    """Remarks on the forces at a step of the reference: J M^-1 J^T lambda = -beta^2 c."""
     c, masses = mission.constraint, mission.fleet.mass
     if c.stabilisation == "none":
         return
@@ -244,18 +245,18 @@ def _step_thrust(mission: Mission, found: Preflight) -> Iterator[Remark]:
         i = int((need - np.where(np.isfinite(limits), limits, 0.0)).argmax())
         if need[i] > limits[i]:
             text = (
-                f"the step to '{shaping.formation}' in '{phase.name}' asks agent {i + 1} for {need[i]:.0f} N, and it"
-                f" has {limits[i]:g} N. Blend: reference = 'shape' or 'distances'"
+                f"the step to '{shaping.formation}' in '{phase.name}' needs {need[i]:.0f} N from agent {i + 1}"
+                f" (limit {limits[i]:g} N). Use reference = 'shape' or 'distances'"
             )
             yield Remark("fails" if c.solver in ("exact", "pinv") else "note", "thrust", text)
 
 
 def obstacle_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
-    """Room to each obstacle; of many, to all that may be touched and to the nearest."""
+    """Remarks on hit obstacles. Clearances of many obstacles are computed for the near ones only."""
     radius, way = mission.fleet.radius, found.planned_phases
     if not (mission.obstacles and way):
         return
-    # What a phase stays within, and how far that is from each obstacle (L, B): nobody is nearer.
+    # Bounding box of each phase, and a lower bound (L, B) of its distance to each obstacle.
     within = np.array(
         [[planned.position.min(axis=(0, 1)), planned.position.max(axis=(0, 1))] for planned in way]
     )
@@ -278,7 +279,7 @@ def obstacle_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
                 break
             room, agent, _ = proximity.clearance(planned.position, radius, [thing])
             at = int(room.argmin())
-            # Of as near ones the first: rounding and a rest's last millimetre count for nothing.
+            # Among equal minima, take the first one: ignore rounding and the last millimetre of a rest.
             if room[at] < worst.get(planned.exact, (np.inf,))[0] - 1e-3:
                 worst[planned.exact] = (
                     float(room[at]),
@@ -294,7 +295,7 @@ def obstacle_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
         for exact, (room, t, i, phase) in worst.items():
             if room <= 0:
                 verb = "hits" if exact else "may hit"
-                text = f"agent {i + 1} {verb} '{thing.name}' at {t:.2f} s, in '{phase}'"
+                text = f"agent {i + 1} {verb} '{thing.name}' at {t:.2f} s in '{phase}'"
                 if not isinstance(thing, Box):
                     text += _too_low(mission, found, phase, thing.height)
                 remark = Remark("fails" if exact else "note", "obstacle", text)
@@ -306,13 +307,13 @@ def obstacle_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
         yield from remarks[b]
     if skipped:
         names = [mission.obstacles[b].name for b in sorted(skipped)]
-        text = f"so many obstacles on the way take too long to look at: {some(names)} passed over"
+        text = f"to limit the time of the check, {some(names)} skipped"
         yield Remark("note", "obstacle", text)
     yield from _gaps(mission, found, radius)
 
 
 def _beyond(within: Floats, thing: Box | Ground) -> Floats:
-    """How far (L,) [m] boxes (L, 2, 3), lowest and highest corners, are from an obstacle at least."""
+    """Distance (L,) [m] of boxes (L, 2, 3), given by lowest and highest corner, to an obstacle."""
     low, high = within[:, 0], within[:, 1]
     if isinstance(thing, Box):
         apart = np.maximum(np.maximum(low - thing.max, thing.min - high), 0.0)
@@ -321,7 +322,7 @@ def _beyond(within: Floats, thing: Box | Ground) -> Floats:
 
 
 def _too_low(mission: Mission, found: Preflight, phase: str, ground: float) -> str:
-    """Why a vehicle is at or below the ground [m] in a phase, and how high its formation is to fly."""
+    """Why a vehicle touches the ground [m] in a phase, and the altitude that its formation needs."""
     planned = next(planned for planned in found.planned_phases if planned.phase == phase)
     masses, radius = mission.fleet.mass, mission.fleet.radius
     z = planned.position[..., 2]
@@ -330,16 +331,16 @@ def _too_low(mission: Mission, found: Preflight, phase: str, ground: float) -> s
     deep, below = ground + radius[i] - z[k, i], cm[k] - z[k, i]
     high = float((ground + radius + cm[:, None] - z)[k].max())
     return (
-        f": its centre comes to z = {z[k, i]:.2f} m with a radius of {radius[i]:g} m, {deep:.2f} m too low, as its slot"
-        f" is then {below:.2f} m below the centre of mass at z = {cm[k]:.2f} m. Keep the centre of mass at z ="
-        f" {math.ceil(100 * high + 1e-6) / 100:.2f} m or more, or turn the formation so that its slots lie higher"
+        f": its centre is at z = {z[k, i]:.2f} m with a radius of {radius[i]:g} m, {deep:.2f} m too low, because its"
+        f" slot is {below:.2f} m below the centre of mass at z = {cm[k]:.2f} m. Keep it at or above z ="
+        f" {math.ceil(100 * high + 1e-6) / 100:.2f} m, or turn the formation so that this slot is higher"
     )
 
 
 def _gaps(mission: Mission, found: Preflight, radius: Floats) -> Iterator[Remark]:
-    """Gaps between two boxes that the formation's centre passes, and how much of each it takes.
+    """Remarks on gaps between two boxes through which the centre of mass passes.
 
-    Of boxes on either side of the centre, seen along an axis, the nearest two make the gap.
+    A gap lies between the nearest boxes on both sides of the centre of mass along an axis.
     """
     masses = mission.fleet.mass
     boxes = [thing for thing in mission.obstacles if isinstance(thing, Box)]
@@ -378,17 +379,17 @@ def _gaps(mission: Mission, found: Preflight, radius: Floats) -> Iterator[Remark
         found.gaps.append((between, wide, takes, t))
         if takes > wide:
             text = (
-                f"the gap between {between} is {wide:.2f} m wide, and the formation takes {takes:.2f} m"
-                f" in its attitude at {t:.2f} s, in '{phase}': turn or reshape it before"
+                f"the gap between {between} is {wide:.2f} m wide, but the formation needs {takes:.2f} m"
+                f" in its attitude at {t:.2f} s in '{phase}': turn or reshape it before"
             )
             yield Remark("fails", "obstacle", text)
     if math.isfinite(to):
-        text = f"gaps between so many obstacles are looked at to {to:g} s: more would take too long"
+        text = f"gaps between obstacles are checked only up to {to:g} s: more would take too long"
         yield Remark("note", "obstacle", text)
 
 
 def limit_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
-    """Geofence, speed and acceleration beyond their limits on the planned trajectory."""
+    """Remarks on speed, acceleration and geofence beyond their limits."""
     limits = mission.limits
     for planned in found.planned_phases:
         for what, values, limit, unit in (
@@ -401,7 +402,7 @@ def limit_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
             k, i = np.unravel_index(int(size.argmax()), size.shape)
             if size[k, i] > limit * (1 + 1e-3):
                 text = (
-                    f"agent {i + 1} reaches {size[k, i]:.3g} {unit} at {planned.time[k]:.2f} s, in '{planned.phase}'"
+                    f"agent {i + 1} reaches {size[k, i]:.3g} {unit} at {planned.time[k]:.2f} s in '{planned.phase}'"
                     f" (limit {limit:g} {unit})"
                 )
                 yield Remark("fails" if planned.exact else "note", what, text)
@@ -411,5 +412,5 @@ def limit_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
             k, i = np.unravel_index(int(out.argmax()), out.shape)
             if out[k, i] > SLACK:
                 by, t = float(out[k, i]), float(planned.time[k])
-                text = f"agent {i + 1} leaves the geofence by {by:.2f} m at {t:.2f} s, in '{planned.phase}'"
+                text = f"agent {i + 1} leaves the geofence by {by:.2f} m at {t:.2f} s in '{planned.phase}'"
                 yield Remark("fails" if planned.exact else "note", "geofence", text)

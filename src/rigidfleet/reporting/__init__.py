@@ -55,23 +55,16 @@ def html_page(
     verdicts: Sequence[Verdict] | None = None,
 ) -> str:
     """The page that `report` writes."""
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
     from rigidfleet.reporting.contents import contents
     from rigidfleet.web.policy import content_policy
+    from rigidfleet.web.template import templates
 
     if isinstance(results, Result | str | Path):
         results = [results]
     elif not isinstance(results, Sequence):
         raise wrong_type("a flight, or several (a Result or the path of one, or a list)", results)
     flights = [as_result(result) for result in results]
-    environment = Environment(
-        loader=PackageLoader("rigidfleet.reporting"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+    environment = templates("rigidfleet.reporting")
     style = environment.get_template("style.css").render()
     return environment.get_template("page.html").render(
         contents(flights, labels, verdicts),

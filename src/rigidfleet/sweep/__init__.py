@@ -1,10 +1,10 @@
-"""Many flights of one mission: vary anything in it, fly on all cores, see what drives failure.
+"""Sweeps: fly a mission many times with variations, on all cores, and find what causes failures.
 
 from rigidfleet.sweep import Sweep, fly, load
 
 sweep = Sweep.of("narrow-passage", ["agents.mass.* *= normal(1, 0.05)"], runs=200, seed=1)
 fly(sweep, "sweeps/masses")
-data = load("sweeps/masses")  # an xarray dataset
+data = load("sweeps/masses")  # a dataset of xarray
 """
 
 from rigidfleet.sweep.dataset import load

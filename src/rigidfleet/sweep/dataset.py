@@ -1,4 +1,4 @@
-"""A sweep as an xarray dataset."""
+"""Load a sweep as a dataset of xarray."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ _ROLE = {"set": "", "add": "added to: ", "scale": "factor of: "}
 
 
 def load(folder: str | Path) -> xarray.Dataset:
-    """A folder's sweep as one xarray dataset along `run`, with units and meanings; needs xarray.
+    """Load the sweep in a folder as a dataset along `run`, with units and meanings; requires xarray.
 
-    Its variables are what varies, by path (`agents.mass.2`), every metric, `passed`, `reason`, `detail`
-    and `wall`. It may be opened while the sweep goes on: then it has the runs flown so far.
+    Variables are the varied numbers by path (`agents.mass.2`), all metrics, `passed`, `reason`, `detail` and `wall`.
+    While the sweep is running, the dataset has the runs finished so far.
 
     Raises
     ------
     ResultError
-        The folder holds no sweep.
+        The folder does not contain a sweep.
     """
     import xarray as xr
 
@@ -65,7 +65,7 @@ def load(folder: str | Path) -> xarray.Dataset:
 
 
 def explained(sweep: Sweep, column: SweepColumn) -> tuple[str, str]:
-    """Unit and meaning of what a column varies."""
+    """Unit and meaning of the number that a column varies."""
     text = keypaths.meaning(sweep.mission, column.keys)
     units = _UNIT.findall(text)
     unit = "1" if column.variation.change == "scale" or not units else units[-1].replace("-", "1")

@@ -1,7 +1,7 @@
-"""What a sweep is: a mission, what varies in it, how many runs, and a seed; checked as a whole on entry.
+"""Definition of a sweep: a mission, its variations, the number of runs and a seed. It is checked as a whole.
 
-Run k depends on the definition and on k alone: its point of the grid is k modulo the size of the grid,
-and its random numbers come from a Philox stream of its own, keyed by (seed, k).
+Run k depends only on the definition and on k: its grid point is k modulo the size of the grid, and its random numbers
+come from a separate Philox stream, keyed by (seed, k).
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ from rigidfleet.sweep.variation import (
 
 Evaluate = Literal["flight", "final"]
 
-#: What to do where final states alone cannot be evaluated.
+#: Remedy if final states cannot be evaluated alone.
 _WHOLE = 'evaluate whole flights: evaluate = "flight", no --final-states'
-#: Least fraction of a distribution, so that no normal number is infinite.
+#: Smallest fraction at which a distribution is evaluated, so that no normal number is infinite.
 _LEAST = 2.0**-54
 
 
@@ -48,24 +48,24 @@ class SweepHeader(Part):
     """Keys at the top of a sweep file."""
 
     mission: str = Field(
-        description="a shipped mission, or the path of a mission file as seen from this one"
+        description="a shipped mission, or the path of a mission file relative to this file"
     )
     runs: Annotated[int, Strict(), Field(ge=1, le=10**8)] | None = Field(
-        None, description="how many runs; when absent, one for each point of the grid"
+        None, description="number of runs; default: one per point of the grid"
     )
     seed: Annotated[int, Strict(), Field(ge=0, lt=2**63)] = Field(
         0, description="seed of the random numbers"
     )
     evaluate: Evaluate = Field(
         "flight",
-        description="what of a run: its whole flight; or where its phases end alone, of open-loop missions whose "
-        "starts vary, thousands in a second",
+        description="flight: evaluate whole flights; final: evaluate only the final states of phases, thousands of "
+        "runs per second, for open-loop missions with varied start states",
     )
 
 
 @dataclass(frozen=True)
 class SweepColumn:
-    """One number that varies: what varies it, where in the mission, and its values if it is gridded."""
+    """A number that varies: its variation, its place in the mission, and its values if it is on a grid."""
 
     variation: Variation
     keys: Keys
@@ -73,21 +73,21 @@ class SweepColumn:
 
     @property
     def name(self) -> str:
-        """Its path, counted from 1."""
+        """Path of the number, counted from 1."""
         return keypaths.name_of(self.keys)
 
 
 class Sweep:
-    """A checked sweep: make one by `Sweep.of`, or `Sweep.load` from a file.
+    """A checked sweep. Create one by `Sweep.of`, or from a file by `Sweep.load`.
 
     Attributes
     ----------
-    mission : the mission that varies
-    variations : what varies in it
+    mission : the mission to vary
+    variations : its variations
     runs : number of runs
-    seed : of the random numbers
-    name : what to call it
-    evaluate : what of each run, "flight" or "final"
+    seed : seed of the random numbers
+    name : name of the sweep
+    evaluate : what is evaluated of each run: "flight" or "final"
     """
 
     def __init__(
@@ -115,23 +115,24 @@ class Sweep:
         name: str = "",
         origin: str = "sweep",
     ) -> Self:
-        """A sweep of a mission, or of one by its name or path.
+        """Define a sweep of a mission, given as a `Mission`, a shipped name or a path.
 
         Parameters
         ----------
-        vary : a line for each variation, as `agents.mass.* *= normal(1, 0.05)`, or its table
-        runs : one for each point of the grid when absent
-        seed : of the random numbers
-        evaluate : "flight", or "final": where phases end alone, of open-loop missions whose starts vary
-        name : that of the mission when absent
-        origin : what messages call the sweep
+        vary : variations, each a line such as `agents.mass.* *= normal(1, 0.05)` or a table
+        runs : number of runs; default: one per point of the grid
+        seed : seed of the random numbers
+        evaluate : "flight", or "final" to evaluate only the final states of phases, for open-loop missions with
+            varied start states
+        name : name of the sweep; default: the name of the mission
+        origin : name of the sweep in messages
 
         Raises
         ------
         SweepError
             With a finding for each error of the sweep.
         MissionError
-            The mission is wrong.
+            The mission cannot be read or has errors.
         """
         if not isinstance(mission, Mission):
             mission = load_mission(mission)
@@ -157,15 +158,15 @@ class Sweep:
 
         Parameters
         ----------
-        more : lines of further variations
-        runs, seed, evaluate : in place of the file's
+        more : lines of additional variations
+        runs, seed, evaluate : replace those of the file
 
         Raises
         ------
         SweepError
             With a finding for each error of the sweep.
         MissionError
-            The file cannot be read, or its mission is wrong.
+            The file cannot be read, or its mission has errors.
         """
         path = Path(path)
         origin = str(path)
@@ -181,41 +182,41 @@ class Sweep:
         if isinstance(given := data.get("vary", []), list):
             data["vary"] = [*given, *more]
         header, variations = _checked(data, origin, mission)
-        assert mission is not None  # else the check has raised
+        assert mission is not None  # otherwise the check has raised
         return cls(mission, variations, header.runs, header.seed, path.stem, header.evaluate)
 
     @classmethod
     def from_json(cls, text: str) -> Self:
-        """A sweep from what `json` gave."""
+        """Restore a sweep from the output of `json`."""
         data = json.loads(text)
         variations = [KINDS[entry["kind"]].model_validate(entry) for entry in data["vary"]]
         mission = Mission.from_toml(data["mission"], "mission of the sweep")
         return cls(mission, variations, data["runs"], data["seed"], data["name"], data["evaluate"])
 
     def json(self) -> str:
-        """All of it as JSON text, with the mission inside."""
+        """Return the definition as JSON text, including the mission."""
         return json.dumps(self._data(), ensure_ascii=False)
 
     @property
     def identity(self) -> dict[str, Any]:
-        """What a run depends on besides its number; further runs may be added to a sweep."""
+        """Everything on which a run depends besides its number. The number of runs is not included: it may grow."""
         data = self._data()
         del data["runs"], data["name"]
         return data | {"version": __version__}
 
     @cached_property
     def document(self) -> dict[str, Any]:
-        """The mission as written."""
+        """The mission as plain data, as written."""
         return self.mission.to_dict()
 
     @cached_property
     def whole(self) -> dict[str, Any]:
-        """The mission with every default filled in."""
+        """The mission as plain data with all defaults."""
         return keypaths.whole_document(self.mission)
 
     @cached_property
     def columns(self) -> list[SweepColumn]:
-        """Every number that varies, in order."""
+        """All numbers that vary, in order."""
         return [
             SweepColumn(v, keys, grid)
             for v in self.variations
@@ -224,7 +225,7 @@ class Sweep:
         ]
 
     def values(self, run: int) -> list[Any]:
-        """Value of every column in a run, counted from 0."""
+        """Value of every column in a run; runs count from 0."""
         stream = np.random.Philox(np.random.SeedSequence(self.seed, spawn_key=(run,)))
         drawn = sum(column.grid is None for column in self.columns)
         fractions = np.maximum(np.random.Generator(stream).random(drawn), _LEAST).tolist()
@@ -239,7 +240,7 @@ class Sweep:
         return found[::-1]
 
     def varied(self, run: int) -> dict[str, Any]:
-        """The document of a run, not checked yet."""
+        """The mission of a run as plain data, not yet checked."""
         document = copy.deepcopy(self.document)
         for column, value in zip(self.columns, self.values(run), strict=True):
             apply(document, self.whole, column, value)
@@ -258,12 +259,12 @@ class Sweep:
 
 @lru_cache(maxsize=4)
 def shared(text: str) -> Sweep:
-    """A sweep from its JSON, kept for the chunks that follow."""
+    """Restore a sweep from its JSON; cached for the next chunks."""
     return Sweep.from_json(text)
 
 
 def is_sweep_file(path: str | Path) -> bool:
-    """Whether a file is a sweep file and no mission: it names a mission."""
+    """Whether a file is a sweep file, not a mission file: it has the key `mission`."""
     try:
         return "mission" in parse_toml(read_text(path), str(path))
     except MissionError:
@@ -273,7 +274,7 @@ def is_sweep_file(path: str | Path) -> bool:
 def apply(
     document: dict[str, Any], whole: Mapping[str, Any], column: SweepColumn, value: Any
 ) -> None:
-    """Change a document by a column's value: every number at its place alike."""
+    """Apply a value of a column to a document; all numbers at its place change alike."""
     integral = all(
         isinstance(x, int) for x in keypaths.numbers(keypaths.look_up(whole, column.keys))
     )
@@ -300,7 +301,7 @@ def apply(
 def _checked(
     data: dict[str, Any], origin: str, mission: Mission | None
 ) -> tuple[SweepHeader, list[Variation]]:
-    """Header and variations of a sweep that is in order."""
+    """Check a sweep and return its header and variations."""
     wrong: dict[int, WrongLine] = {}
     if isinstance(given := data.get("vary"), list):
         parsed = [from_line(entry) if isinstance(entry, str) else entry for entry in given]
@@ -333,18 +334,20 @@ def _checked(
             notes.add(("evaluate",), why, _WHOLE, "final")
     if "vary" not in data or data["vary"] == []:
         notes.add(
-            ("vary",), "nothing varies", 'give --vary "agents.mass.* *= normal(1, 0.05)", say'
+            ("vary",),
+            "nothing varies",
+            'for example, give --vary "agents.mass.* *= normal(1, 0.05)"',
         )
     gridded = any(isinstance(v, Gridded) for v in variations)
     if "runs" not in data and variations and not gridded:
-        notes.add(("runs",), "is missing", "say how many; only a grid has a number of its own")
+        notes.add(("runs",), "is missing", "give the number of runs; only a grid determines it")
     if notes.findings or header is None:
         raise SweepError(notes.findings)
     return header, variations
 
 
 def _variation(notes: FindingCollector, entry: Any, k: int) -> Variation | None:
-    """A variation that is in order by itself."""
+    """Check a variation by itself; None if it has errors."""
     before = len(notes.findings)
     model = kind(notes, entry, ("vary", k), KINDS)
     found = None if model is None else notes.validate(model, entry, ("vary", k))
@@ -365,7 +368,7 @@ def _fits(
     mission: Mission,
     whole: dict[str, Any],
 ) -> None:
-    """Whether a variation leads somewhere in the mission, and to what it can vary."""
+    """Check that the path of a variation exists in the mission and can take its values."""
     path = v.path if v is not None else entry.get("path") if isinstance(entry, dict) else None
     if not isinstance(path, str):
         return
@@ -384,30 +387,37 @@ def _fits(
         absent = any(x is None for x in leaves)
         table = next((x for x in leaves if isinstance(x, dict)), None)
         if table is not None:
-            notes.add(where, "is a table", f"go on to one of its keys: {', '.join(table)}", path)
+            notes.add(
+                where,
+                "is a table",
+                f"continue the path with one of its keys: {', '.join(table)}",
+                path,
+            )
         elif absent and v.change != "set":
             notes.add(
-                where, f"there is nothing to {v.change} to", "set it, or write it there", path
+                where,
+                f"the mission has no value to {v.change} to",
+                "set the value, or write one in the mission",
+                path,
             )
         elif absent:
             _taken(notes, where, v, keys, mission, whole)
         elif numeric and not all(map(is_number, leaves)):
-            remedy = "vary it by choice or grid of words"
-            notes.add(where, f"is no number, but {leaves[0]!r}", remedy, path)
+            remedy = "vary it by a choice or grid of words"
+            notes.add(where, f"has the value {leaves[0]!r}, which is not a number", remedy, path)
 
 
 def _moves_starts(notes: FindingCollector, k: int, v: Variation, whole: dict[str, Any]) -> None:
-    """Whether a variation moves starts alone, which is all that differs in runs evaluated by final states."""
+    """Check that a variation changes only start states, as the evaluation of final states requires."""
     values = getattr(v, "values", ())
     starts = ("agents", "position"), ("agents", "velocity")
     try:
         places = keypaths.expand(whole, v.path)
     except keypaths.PathError:
-        return  # said already
+        return  # already reported
     if any(keys[:2] not in starts for keys in places) or not all(map(is_number, values)):
         problem = (
-            "varies more than numbers of agents.position or agents.velocity, in which alone runs evaluated by"
-            " their final states differ"
+            "with final states alone, only numbers in agents.position and agents.velocity can vary"
         )
         notes.add(("vary", k, "path"), problem, f"remove it, or {_WHOLE}", v.path)
 
@@ -420,7 +430,7 @@ def _taken(
     mission: Mission,
     whole: dict[str, Any],
 ) -> None:
-    """Whether a mission takes a value where it has had none."""
+    """Check that the mission accepts a value for a key that it does not have."""
     middle = v.quantile(0.5) if isinstance(v, Drawn) else v.grid[0] if isinstance(v, Gridded) else 0
     document = mission.to_dict()
     apply(document, whole, SweepColumn(v, keys, None), middle)
@@ -428,5 +438,5 @@ def _taken(
         Mission.from_dict(document)
     except MissionError as error:
         first = error.findings[0]
-        problem = f"the mission does not take it: {first.key} {first.problem}"
+        problem = f"the mission does not accept a value: {first.key} {first.problem}"
         notes.add(where, problem, first.remedy, v.path)

@@ -1,4 +1,4 @@
-"""Figures of a sweep: outcome, histograms, envelopes, drivers, and a map over two varied numbers."""
+"""Figures of a sweep: outcome, histograms, envelopes, drivers and a map over two varied numbers."""
 
 from __future__ import annotations
 
@@ -28,13 +28,20 @@ if TYPE_CHECKING:
 
 
 PASSED, FAILED = "#56B4E9", "#D55E00"
-_COLUMNS = 4  # of small axes at most
+#: Maximum number of columns of small axes.
+_COLUMNS = 4
+#: Number of bins of a histogram.
 _BINS = 30
-_ENVELOPE = 12  # stretches of an envelope
-_CELLS = 10  # a side of a map of drawn numbers
-_VALUES = 20  # so many values, of a grid, have a cell each
-_ROWS = 14  # varied numbers in the figure of drivers, the strongest
-_LOGARITHMIC = 100.0  # a metric over more than this many times its least has a logarithmic axis
+#: Maximum number of intervals of an envelope.
+_ENVELOPE = 12
+#: Number of cells along a side of a map of random numbers.
+_CELLS = 10
+#: Maximum number of distinct values with a cell each.
+_VALUES = 20
+#: Maximum number of varied numbers in the figure of drivers.
+_ROWS = 14
+#: Ratio of the largest to the smallest value beyond which an axis is logarithmic.
+_LOGARITHMIC = 100.0
 _NAMES = ("outcome", "histograms", "envelopes", "drivers", "map")
 
 
@@ -47,19 +54,19 @@ def plot(
     metric: str = "",
     titles: bool = True,
 ) -> list[Path]:
-    """Draw a sweep, each figure to ``folder/NAME.FORMAT``, whole or not at all.
+    """Draw the figures of a sweep to ``folder/NAME.FORMAT`` and return the paths of the files.
 
     Parameters
     ----------
-    formats : of png, svg and pdf
-    over : the two paths that the map is over; the two that matter most when absent
-    metric : what it shows: success, or one of `METRICS`; success when absent, if any run failed
-    titles : with a title and the sweep's name above each, or cut close to what is drawn
+    formats : any of png, svg and pdf
+    over : the two paths on the axes of the map; default: the two with the strongest correlation
+    metric : quantity of the map: success or one of `METRICS`; default: success if any run failed
+    titles : True: a title and the name of the sweep above each figure; False: no titles and no margins
 
     Raises
     ------
     RigidfleetError
-        A path or a metric is none of the sweep's.
+        The sweep has no such path or metric.
     ResultError
         A file cannot be written.
     """
@@ -83,7 +90,7 @@ def plot(
 
 
 def outcome(table: Table) -> Figure | None:
-    """Success rate as the runs come, with its interval, and how many failed which check."""
+    """Success rate over the number of runs, with its confidence interval, and the failures of each check."""
     if not len(table.run):
         return None
     from rigidfleet.plotting.figure import Figure
@@ -122,7 +129,7 @@ def outcome(table: Table) -> Figure | None:
 
 
 def histograms(table: Table) -> Figure | None:
-    """How every metric is spread, of runs that passed and of those that failed, with its limit."""
+    """Histogram of every metric, for passed and failed runs, with its limit."""
     names = [name for name in outcomes(table) if name != "success"]
     if not names:
         return None
@@ -151,7 +158,7 @@ def histograms(table: Table) -> Figure | None:
 
 
 def envelopes(table: Table) -> Figure | None:
-    """Every metric over the number that drives it most: runs, median, and the middle 90 %."""
+    """Every metric over the number with the strongest correlation: runs, median and the middle 90 %."""
     strongest: dict[str, str] = {}
     for d in drivers(table):
         if d.outcome != "success":
@@ -181,7 +188,7 @@ def envelopes(table: Table) -> Figure | None:
 
 
 def correlations(table: Table) -> Figure | None:
-    """Rank correlation of what varies with success and with every metric."""
+    """Rank correlation of every varied number with success and every metric."""
     found = drivers(table)
     if not found:
         return None
@@ -216,12 +223,12 @@ def correlations(table: Table) -> Figure | None:
 
 
 def over_two(table: Table, over: Sequence[str] = (), metric: str = "") -> Figure | None:
-    """A map of the success rate, or of a metric's median, over two varied numbers.
+    """Map of the success rate, or of the median of a metric, over two varied numbers.
 
     Raises
     ------
     RigidfleetError
-        A path or a metric is none of the sweep's.
+        The sweep has no such path or metric.
     """
     numbers = varied(table)
     if not metric:
@@ -238,7 +245,7 @@ def over_two(table: Table, over: Sequence[str] = (), metric: str = "") -> Figure
     unknown += [(metric, known)] if metric not in known else []
     if unknown or len(over) != 2:
         word, words = unknown[0] if unknown else (" ".join(over), list(numbers))
-        raise RigidfleetError(f"map: '{word}' cannot be drawn. Use two of: {', '.join(words)}.")
+        raise RigidfleetError(f"map: '{word}' cannot be drawn. Choose from: {', '.join(words)}.")
     from rigidfleet.plotting.figure import Figure
 
     values = 100.0 * table.passed if metric == "success" else table.metrics[metric]
@@ -286,7 +293,7 @@ def _head(fig: Figure, table: Table, title: str) -> None:
 
 
 def _small(table: Table, title: str, names: Sequence[str]) -> tuple[Figure, list[Axes]]:
-    """A small axes for each metric."""
+    """Figure with small axes, one for each metric."""
     from rigidfleet.plotting.figure import Figure
 
     columns = min(_COLUMNS, max(2, len(names)))
@@ -327,7 +334,7 @@ def _axis_label(table: Table, name: str) -> str:
 
 
 def _limits(table: Table) -> dict[str, float]:
-    """The mission's own limits that a metric is held to."""
+    """Limits of the mission for metrics, unless they vary."""
     limits, agents = table.sweep.mission.limits, table.sweep.mission.agents
     found = {
         "speed": limits.speed,
@@ -363,13 +370,13 @@ def _ticks(ax: Axes, scale: str) -> None:
 
 
 def _spacing(table: Table, name: str) -> str:
-    """The scale that what varies is spread over evenly."""
+    """Scale on which the varied number is evenly distributed."""
     column = next(c for c in table.sweep.columns if c.name == name)
     return "log" if isinstance(column.variation, LogUniform | Geomspace) else "linear"
 
 
 def _log_ticks(axis: Axis, x: Floats) -> None:
-    """Plain numbers along a logarithmic axis, of which there may be less than a decade."""
+    """Plain tick labels for a logarithmic axis that may span less than a decade."""
     if x.max() > _LOGARITHMIC * x.min():
         return
     ticks = np.geomspace(x.min(), x.max(), 3)
@@ -378,7 +385,7 @@ def _log_ticks(axis: Axis, x: Floats) -> None:
 
 
 def _cells(x: Floats, scale: str) -> tuple[Floats, Ints]:
-    """Edges of cells along an axis, and the cell of each run: of few values each has one of its own."""
+    """Edges of cells along an axis, and the cell of each run. Few distinct values have a cell each."""
     distinct = np.unique(x)
     if len(distinct) <= _VALUES:
         edges = np.arange(len(distinct) + 1, dtype=np.float64) - 0.5
@@ -389,7 +396,10 @@ def _cells(x: Floats, scale: str) -> tuple[Floats, Ints]:
 
 
 def _running(x: Floats, y: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-    """Median and 5th and 95th percentile of y at each value of x, or along stretches of as many runs."""
+    """Centres in x, and 5th percentile, median and 95th percentile of y there.
+
+    The centres are the values of x, or if there are many, intervals with equal numbers of runs.
+    """
     distinct = np.unique(x)
     if len(distinct) <= _ENVELOPE:
         parts = [y[x == v] for v in distinct]

@@ -1,7 +1,7 @@
-"""Runs of which only the final states of their phases are evaluated: eight to a vector, thousands in a second.
+"""Evaluate only the final states of phases: eight runs per SIMD vector, thousands of runs per second.
 
-For starts that vary under open-loop phases, see `rigidfleet.simulation.ensemble`. Nothing on the way is recorded or
-evaluated.
+This is for open-loop phases with varied start states; see `rigidfleet.simulation.ensemble`. Nothing between the ends
+of phases is recorded or evaluated.
 """
 
 from __future__ import annotations
@@ -32,23 +32,23 @@ if TYPE_CHECKING:
     from rigidfleet.sweep.definition import Sweep
 
 
-#: Agents whose extent along an axis is less than this part of the longest may be flat: their mission decides.
+#: Relative extent along an axis below which agents may be in a plane or line; then their mission is checked in full.
 _CLEARLY = 1e-5
-#: What fails in flight, in words, by its name and in the order of a verdict.
+#: Messages of failed checks, in the order of a verdict.
 _WORDS = {
-    "complete": "the flight cannot go on; flown alone, its mission says when, where and why",
-    "distances": "an edge of a formation is not reached where its phase ends",
-    "shape": "a formation is not reached where its phase ends",
-    "handedness": "a formation is reached as its own mirror image",
+    "complete": "the flight stopped early; fly its mission alone to see when, where and why",
+    "distances": "a distance of a formation is not reached at the end of its phase",
+    "shape": "a formation is not reached at the end of its phase",
+    "handedness": "a formation is reached as its mirror image",
 }
 
 
 def fly_final_states(sweep: Sweep, runs: Sequence[int]) -> list[RunRecord]:
-    """Fly whole groups of runs and evaluate where their phases end.
+    """Fly complete groups of runs and evaluate the final states of their phases.
 
-    A run passes if it is flown to its end and takes each of its formations: "distances", "shape" and "handedness"
-    as `rigidfleet.assess` has them. Of the metrics there are those of the shape, and the evaluations, which the
-    eight of a vector share.
+    A run passes if it is flown to its end and reaches each formation: the checks "distances", "shape" and
+    "handedness" are those of `rigidfleet.assess`. The metrics are those of the shape, and the number of evaluations,
+    which the eight runs of a vector share.
     """
     _prepare(sweep)
     begun = perf_counter()
@@ -76,13 +76,13 @@ def fly_final_states(sweep: Sweep, runs: Sequence[int]) -> list[RunRecord]:
 
 
 def starts(sweep: Sweep, values: Sequence[Sequence[Any]]) -> tuple[Floats, Floats]:
-    """Positions and velocities (B, N, 3) [m, m/s] at the start of runs with these values of the columns (B, D)."""
+    """Start positions and velocities (B, N, 3) [m, m/s] of runs with given values of the columns (B, D)."""
     agents, count = sweep.mission.agents, len(values)
     found = {
         "position": np.tile(np.array(agents.position, dtype=float), (count, 1, 1)),
         "velocity": np.tile(np.array(agents.velocity, dtype=float), (count, 1, 1)),
     }
-    with np.errstate(over="ignore", invalid="ignore"):  # refused in time
+    with np.errstate(over="ignore", invalid="ignore"):  # `_refused` finds them
         for column, drawn in zip(sweep.columns, np.array(values, dtype=float).T, strict=True):
             _, name, *inner = column.keys
             place = found[str(name)][(slice(None), *map(int, inner))]
@@ -99,13 +99,13 @@ def starts(sweep: Sweep, values: Sequence[Sequence[Any]]) -> tuple[Floats, Float
 
 @lru_cache(maxsize=4)
 def _prepare(sweep: Sweep) -> None:
-    """Fly the mission's own start once: what has to be compiled then counts to no run's time."""
+    """Fly the unvaried mission once, so that the time of compiling does not count for any run."""
     agents = sweep.mission.agents
     establish(sweep.mission, [agents.position], [agents.velocity])
 
 
 def _refused(sweep: Sweep, runs: Sequence[int], r: Floats, v: Floats) -> dict[int, tuple[str, str]]:
-    """Reason and detail of runs (by their place among them) that are no missions; the doubtful are asked one by one."""
+    """Reason and detail of runs with an invalid mission, by index. Only doubtful missions are checked in full."""
     bounded = np.all(np.abs(np.concatenate([r, v], axis=1)) <= HUGE, axis=(1, 2))
     r, v = (np.where(bounded[:, None, None], x, 0.0) for x in (r, v))
     apart = [not any(coincident(points)) for points in r.tolist()]
@@ -119,7 +119,7 @@ def _refused(sweep: Sweep, runs: Sequence[int], r: Floats, v: Floats) -> dict[in
 
 
 def _spread(mission: Mission, r: Floats, v: Floats) -> Bools:
-    """Whether agents and their velocities clearly span as many dimensions as any formation asks for (B,)."""
+    """Mask (B,): agents and their velocities clearly span as many dimensions as each formation requires."""
     asked = [
         mission.formation_slots(p.shaping.formation)
         for p in mission.phases
@@ -134,7 +134,7 @@ def _spread(mission: Mission, r: Floats, v: Floats) -> Bools:
 
 
 def _evaluated(mission: Mission, flown: Ensemble) -> tuple[dict[str, Bools], dict[str, Floats]]:
-    """What fails (B,), and metrics (B,)."""
+    """Failed checks (B,) and metrics (B,), by name."""
     count = len(flown.finished)
     wrong = {name: np.zeros(count, dtype=bool) for name in ("distances", "shape", "handedness")}
     metrics = {"shape": np.full(count, np.nan), "handed": np.full(count, np.nan)}

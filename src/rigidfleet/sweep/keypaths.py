@@ -1,7 +1,7 @@
-"""Places in a mission's document, addressed as its messages do: `agents.mass.2`, `phases[3].until`.
+"""Paths of keys in a mission, written as in its messages: `agents.mass.2`, `phases[3].until`.
 
-Numbers count from 1; `*` stands for every number or name at its place. A key that the document leaves
-out has its default, and one number for all agents may be addressed as the list it stands for.
+Indices count from 1; `*` stands for every index or name. A key that the mission does not have takes its default. One
+number for all agents can be addressed as a list with an entry per agent.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from rigidfleet.mission import Mission
 from rigidfleet.mission.findings import Keys, model_of
 from rigidfleet.mission.schema import Part
 
-#: Any number or name at its place.
+#: Stands for any index or name.
 ANY = "*"
 _STEP = re.compile(r'"([^"]*)"|\[(\d+|\*)\]|([^.\[\]"]+)')
 
 
 class PathError(ValueError):
-    """A path that leads nowhere: what is wrong, and what to do about it."""
+    """A path that does not exist, with problem and remedy."""
 
     def __init__(self, problem: str, remedy: str) -> None:
         super().__init__(problem, remedy)
@@ -31,21 +31,23 @@ class PathError(ValueError):
 
 
 def name_of(keys: Keys) -> str:
-    """Keys as a path: (`agents`, `mass`, 1) is `agents.mass.2`."""
+    """Keys as a path: (`agents`, `mass`, 1) becomes `agents.mass.2`."""
     return ".".join(str(k + 1) if isinstance(k, int) else toml_key(k) for k in keys)
 
 
 def expand(whole: Mapping[str, Any], path: str) -> list[Keys]:
-    """Every place that a path leads to in a whole document.
+    """Keys of all places that match a path in a document with all defaults.
 
     Raises
     ------
     PathError
-        It leads nowhere.
+        No place matches.
     """
     steps = [quoted or index or word for quoted, index, word in _STEP.findall(path)]
     if not steps or _STEP.sub("", path).strip(".[]"):
-        raise PathError("is no path", "write agents.mass.2, or agents.position.*.3 for every agent")
+        raise PathError(
+            "is not a valid path", "write agents.mass.2, or agents.position.*.3 for every agent"
+        )
     found: list[tuple[Keys, Any]] = [((), whole)]
     for depth, step in enumerate(steps):
         further = [(keys + (k,), inner) for keys, at in found for k, inner in _below(at, step)]
@@ -58,12 +60,12 @@ def expand(whole: Mapping[str, Any], path: str) -> list[Keys]:
 
 
 def whole_document(mission: Mission) -> dict[str, Any]:
-    """A mission's document with every default filled in, and None where there is nothing."""
+    """A mission as plain data with all defaults; None for optional keys without a value."""
     return _filled(mission)
 
 
 def look_up(data: Any, keys: Keys) -> Any:
-    """What is at a place, None where nothing is."""
+    """Value at a place; None if there is none."""
     for k in keys:
         try:
             data = data[k]
@@ -75,7 +77,7 @@ def look_up(data: Any, keys: Keys) -> Any:
 def change(
     document: dict[str, Any], whole: Mapping[str, Any], keys: Keys, by: Callable[[Any], Any]
 ) -> None:
-    """Change in place what a document has at a place, or would have by default, by a function of it."""
+    """Replace a value in a document by a function of it, in place. A missing value is taken from ``whole``."""
     at: Any = document
     for depth, (k, following) in enumerate(zip(keys, (*keys[1:], None), strict=True), start=1):
         if following is None:
@@ -84,23 +86,23 @@ def change(
             return
         table = isinstance(following, str)
         if not isinstance(look_up(at, (k,)), dict if table else list):
-            # A table may go on without what it leaves out; a list needs all its entries.
+            # A table may lack keys; a list needs all its entries.
             at[k] = {} if table else copy.deepcopy(look_up(whole, keys[:depth]))
         at = at[k]
 
 
 def numbers(value: Any) -> list[Any]:
-    """All that is in nested lists, in order."""
+    """Entries of nested lists, in order."""
     return [x for v in value for x in numbers(v)] if isinstance(value, list) else [value]
 
 
 def mapped(value: Any, function: Callable[[Any], Any]) -> Any:
-    """Nested lists with a function applied to all that is in them."""
+    """Apply a function to all entries of nested lists."""
     return [mapped(v, function) for v in value] if isinstance(value, list) else function(value)
 
 
 def meaning(mission: Mission, keys: Keys) -> str:
-    """What the format says of the key at a place, with its unit in brackets."""
+    """Description of a key in the mission format, with its unit in brackets."""
     at: Any = mission
     text = ""
     for k in keys:
@@ -129,7 +131,7 @@ def _filled(value: Any) -> Any:
 
 
 def _defaults(kind: type[Part]) -> dict[str, Any]:
-    """A table that a mission leaves out."""
+    """Defaults of a table that a mission does not have."""
     fields = kind.model_fields.items()
     return {
         name: None if f.is_required() else _filled(f.get_default(call_default_factory=True))
@@ -147,15 +149,15 @@ def _below(at: Any, step: str) -> Iterator[tuple[str | int, Any]]:
 
 
 def _remedy(whole: Mapping[str, Any], at: Any, steps: list[str], depth: int) -> str:
-    """The path that may be meant, else what there is at this depth."""
+    """Suggest a similar path, or list what exists at this depth."""
     rest = steps[depth + 1 :]
     if isinstance(at, dict):
         close = difflib.get_close_matches(steps[depth], [str(k) for k in at], n=1, cutoff=0.55)
         if close:
             return f"did you mean '{'.'.join([*steps[:depth], close[0], *rest])}'?"
     elif isinstance(at, list) and not steps[depth].isdecimal() and rest == []:
-        return f"numbers count from 1 to {len(at)}; * stands for all"
-    # agents.2.mass, where the document has agents.mass.2
+        return f"use an index from 1 to {len(at)}, or * for all"
+    # agents.2.mass instead of agents.mass.2
     turned = [*steps[:depth], *rest, steps[depth]]
     if rest and (steps[depth].isdecimal() or steps[depth] == ANY):
         try:
@@ -167,5 +169,5 @@ def _remedy(whole: Mapping[str, Any], at: Any, steps: list[str], depth: int) -> 
     if isinstance(at, dict):
         return f"keys there: {', '.join(map(str, at))}"
     if isinstance(at, list):
-        return f"numbers count from 1 to {len(at)}; * stands for all"
-    return "it ends there, leave out what follows"
+        return f"use an index from 1 to {len(at)}, or * for all"
+    return "the path ends there; remove the rest"

@@ -1,4 +1,4 @@
-"""What is kept of each run: the one list of a sweep's metrics, and how a verdict gives them."""
+"""Metrics of a sweep: their list, and their values from a verdict."""
 
 from __future__ import annotations
 
@@ -14,32 +14,34 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Metric:
-    """One number of a run: its unit and meaning."""
+    """Unit and meaning of a metric."""
 
     unit: str
     text: str
 
 
 METRICS: dict[str, Metric] = {
-    "shape_end": Metric("m", "shape error at the end: worst of all pairs against the slots"),
-    "shape": Metric("m", "worst shape error at the end of a phase"),
-    "constraint_end": Metric("m", "greatest constraint error |c| = |L - d| at the end"),
-    "constraint": Metric("m", "greatest constraint error |c| = |L - d|"),
+    "shape_end": Metric("m", "shape error at the end: largest error of all pair distances"),
+    "shape": Metric("m", "largest shape error at the end of a phase"),
+    "constraint_end": Metric("m", "largest constraint error |c| = |L - d| at the end"),
+    "constraint": Metric(
+        "m", "largest constraint error |c| = |L - d|: edge length minus reference"
+    ),
     "handed": Metric("1", "1: right-handed at the end of every phase; 0: mirrored"),
-    "flip": Metric("deg", "greatest angle of a plane or line from where it should point"),
-    "waypoint_position": Metric("m", "greatest miss of a waypoint"),
-    "waypoint_velocity": Metric("m s-1", "greatest miss of a waypoint's velocity"),
-    "waypoint_attitude": Metric("deg", "greatest miss of a waypoint's attitude"),
-    "waypoint_rates": Metric("deg s-1", "greatest miss of a waypoint's body rates"),
-    "separation": Metric("m", "least separation of two agents, less radii"),
-    "separation_below": Metric("m", "least height over an agent below, less radii"),
-    "clearance": Metric("m", "least clearance to an obstacle, less radius"),
-    "geofence": Metric("m", "how far an agent leaves the geofence; negative inside"),
-    "thrust": Metric("N", "thrust nearest to, or furthest beyond, its limit; without one the peak"),
-    "speed": Metric("m s-1", "peak speed"),
-    "acceleration": Metric("m s-2", "peak acceleration"),
-    "constraint_force": Metric("N", "peak constraint force on an agent"),
-    "tension": Metric("N", "tension of greatest size in an edge; negative: a push"),
+    "flip": Metric("deg", "largest angle of a plane or line from its intended direction"),
+    "waypoint_position": Metric("m", "largest position error at a waypoint"),
+    "waypoint_velocity": Metric("m s-1", "largest velocity error at a waypoint"),
+    "waypoint_attitude": Metric("deg", "largest attitude error at a waypoint"),
+    "waypoint_rates": Metric("deg s-1", "largest error of body rates at a waypoint"),
+    "separation": Metric("m", "minimum separation of two agents: centre distance minus radii"),
+    "separation_below": Metric("m", "minimum height above another agent minus radii"),
+    "clearance": Metric("m", "minimum clearance to an obstacle: distance minus radius"),
+    "geofence": Metric("m", "maximum distance outside the geofence; negative inside"),
+    "thrust": Metric("N", "thrust closest to or farthest beyond its limit; peak if there is none"),
+    "speed": Metric("m s-1", "maximum speed"),
+    "acceleration": Metric("m s-2", "maximum acceleration"),
+    "constraint_force": Metric("N", "maximum constraint force on an agent"),
+    "tension": Metric("N", "tension of largest magnitude in an edge; negative: compression"),
     "singular_value": Metric("1", "smallest singular value of the constraint Jacobian"),
     "flown": Metric("s", "mission time at the end"),
     "steps": Metric("1", "steps of the integrator"),
@@ -48,13 +50,13 @@ METRICS: dict[str, Metric] = {
 
 
 def readable(unit: str) -> str:
-    """A unit as it is shown: m/s² for m s-2."""
+    """A unit for display: m/s² for m s-2."""
     words = {"1": "-", "m s-1": "m/s", "m s-2": "m/s²", "deg s-1": "deg/s"}
     return words.get(unit, unit)
 
 
 def measure(result: Result, verdict: Verdict) -> dict[str, float]:
-    """Value of every metric of a flight; NaN where it does not apply."""
+    """Value of every metric of a flight; NaN if it does not apply."""
     phases = verdict.phases
     shapes = [p.shape for p in phases if p.shape is not None]
     hands = [float(p.handedness) for p in phases if p.handedness is not None]

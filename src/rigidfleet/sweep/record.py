@@ -1,4 +1,4 @@
-"""What is kept of a run."""
+"""Record of a run."""
 
 from __future__ import annotations
 
@@ -6,24 +6,24 @@ from dataclasses import dataclass
 
 from rigidfleet.errors import MissionError
 
-#: Reasons that are no checks: what varies makes the mission wrong; the program itself failed.
+#: Reasons other than failed checks: the varied mission has errors; the program failed.
 REFUSED, BROKEN = "mission", "error"
 _CALLED = {REFUSED: "mission refused", BROKEN: "program error"}
 
 
 @dataclass(frozen=True)
 class RunRecord:
-    """What is kept of one run.
+    """Record of one run.
 
     Attributes
     ----------
-    run : its number, from 0
-    passed : whether it passed its verdict
-    reason : the checks that failed, with commas; `REFUSED` or `BROKEN` for one that was not flown; else ""
-    detail : the first failure in words
-    codes : value of every column of the sweep, as `Variation.code` has it
-    metrics : value of each of `METRICS`, NaN where it does not apply
-    wall : how long it took [s]
+    run : number of the run, from 0
+    passed : whether the run passed its verdict
+    reason : failed checks, separated by commas; `REFUSED` or `BROKEN` if the run was not flown; "" if it passed
+    detail : message of the first failure
+    codes : value of every column of the sweep, encoded by `Variation.code`
+    metrics : value of each of `METRICS`; NaN if it does not apply
+    wall : wall time of the run [s]
     """
 
     run: int
@@ -36,12 +36,12 @@ class RunRecord:
 
 
 def refusal(error: MissionError) -> tuple[str, str]:
-    """Reason and detail of a run whose mission cannot be."""
+    """Reason and detail of a run whose mission has errors."""
     first = error.findings[0]
     words = f"{first.key} = {first.value!r}: {first.problem}"
     return REFUSED, " ".join(words.split())
 
 
 def called(reason: str) -> str:
-    """What a reason is called in tables and figures."""
+    """Name of a reason in tables and figures."""
     return _CALLED.get(reason, reason.replace("_", " "))

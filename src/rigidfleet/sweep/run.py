@@ -1,4 +1,4 @@
-"""Fly runs of a sweep: one after the other, whole flights; or where they end alone, eight to a vector."""
+"""Fly runs of a sweep: whole flights one by one, or final states alone, eight per vector."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from rigidfleet.sweep.definition import Sweep
 from rigidfleet.sweep.metrics import METRICS, measure
 from rigidfleet.sweep.record import BROKEN, RunRecord, refusal
 
-#: Runs are flown in groups of so many consecutive ones, the first of which is a multiple of it.
+#: Number of consecutive runs in a group. The first run of a group is a multiple of it.
 GROUP = 8
 
 
 def fly_runs(sweep: Sweep, runs: Sequence[int]) -> list[RunRecord]:
-    """Fly whole groups of runs (only the sweep's last may be a part of one) and measure them.
+    """Fly complete groups of runs and measure them. Only the last group of a sweep may be incomplete.
 
-    A row depends on the sweep and the run's number alone, but for `wall`. A run that cannot be flown is a
-    row with its reason.
+    Except for `wall`, a record depends only on the sweep and the number of the run. A run that cannot be flown has a
+    record with the reason.
     """
     if sweep.evaluate == "final":
         from rigidfleet.sweep.final_states import fly_final_states
@@ -46,9 +46,9 @@ def _fly(sweep: Sweep, run: int) -> RunRecord:
         detail = failed[0].message if failed else ""
     except MissionError as error:
         reason, detail = refusal(error)
-    except Exception as error:  # one run that breaks must not end a hundred thousand others
+    except Exception as error:  # one failed run must not end the sweep
         if isinstance(error.__context__ or error.__cause__, KeyboardInterrupt):
-            raise  # Ctrl-C, as the compiler gives it back
+            raise  # Ctrl-C, turned into another exception by the compiler
         reason, detail = BROKEN, f"{type(error).__name__}: {error}"
     wall = perf_counter() - begun
     return RunRecord(run, not reason, reason, " ".join(detail.split()), codes, metrics, wall)

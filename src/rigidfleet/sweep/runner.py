@@ -1,4 +1,4 @@
-"""Fly a sweep: what is still missing, in chunks, by whoever is to fly it, into the store as it comes."""
+"""Fly the missing runs of a sweep in chunks, by any kind of workers, and store each chunk when it is finished."""
 
 from __future__ import annotations
 
@@ -21,28 +21,38 @@ from rigidfleet.sweep.record import RunRecord
 from rigidfleet.sweep.run import GROUP, fly_runs
 from rigidfleet.sweep.store import Store, Table, read
 
-#: A chunk takes about so long [s]: what is lost by kill -9 for each worker, and how often a bar moves.
+#: Approximate duration of a chunk [s]: the work that kill -9 loses per worker, and the interval of progress.
 _CHUNK = 1.0
-#: Processes take a second or two to start: less work than this is done in the one that is there [s].
+#: Work below which no further processes are started, as starting them takes one or two seconds [s].
 _WORTH = 6.0
-#: Chunks given to each worker: one that it flies, and one that waits for it.
+#: Number of chunks per worker: one in work and one waiting.
 _AHEAD = 2
-#: New workers are noticed within [s].
+#: Maximum time until new workers are noticed [s].
 _LOOK = 1.0
-#: Workers that die so often, without any chunk in between, will go on doing so.
+#: Number of deaths of workers, without a finished chunk in between, after which the sweep stops.
 _DEATHS = 3
 
 
 @dataclass(frozen=True)
 class SweepProgress:
-    """How far a sweep is."""
+    """Progress of a sweep.
 
-    done: int  # runs in the store
-    runs: int  # of the sweep
-    flown: int  # since it was last started
-    failed: int  # of these
-    wall: float  # time taken since then [s]
-    workers: int  # that fly
+    Attributes
+    ----------
+    done : number of runs in the store
+    runs : number of runs of the sweep
+    flown : number of runs flown since the sweep was started or resumed
+    failed : number of these that failed
+    wall : time since then [s]
+    workers : number of workers
+    """
+
+    done: int
+    runs: int
+    flown: int
+    failed: int
+    wall: float
+    workers: int
 
 
 def fly(
@@ -54,25 +64,25 @@ def fly(
     replace: bool = False,
     progress: Callable[[SweepProgress], None] | None = None,
 ) -> Table:
-    """Fly a sweep into a folder, or what is missing there of it, and return all of its rows.
+    """Fly the runs of a sweep that are missing in a folder, and return all of its rows.
 
     Parameters
     ----------
-    folder : made if it is not there; its file `sweep.db` keeps every chunk as soon as it is flown
-    workers : processes on this machine; as many as it has cores when absent. Work of a few seconds is
-        done without any. A script that starts processes needs `if __name__ == "__main__":`
-    cluster : address of a Dask scheduler, whose workers fly instead
-    replace : begin anew if the folder has a sweep
+    folder : created if it does not exist; its file `sweep.db` stores every chunk when it is finished
+    workers : number of processes on this machine; default: number of cores. Work of a few seconds is done in this
+        process. A script that starts processes needs `if __name__ == "__main__":`
+    cluster : address of a Dask scheduler, whose workers fly the runs
+    replace : overwrite a sweep that is in the folder
     progress : called after each chunk
 
     Raises
     ------
     ResultError
-        The folder has another sweep, or cannot be written.
+        The folder contains another sweep or cannot be written.
     RigidfleetError
-        No cluster answers, or workers keep dying.
+        The cluster does not answer, or workers keep dying.
     KeyboardInterrupt
-        On Ctrl-C; what has been flown is in the store, and the same call goes on from there.
+        On Ctrl-C. Finished runs are in the store, and the same call resumes the sweep.
     """
     folder = Path(folder)
     with Store(folder, sweep, replace=replace) as store:
@@ -97,14 +107,14 @@ def fly(
 
 
 class _Sweeping:
-    """A sweep under way."""
+    """State of a sweep that is running."""
 
     def __init__(
         self, sweep: Sweep, store: Store, progress: Callable[[SweepProgress], None] | None
     ) -> None:
         self.sweep, self.store, self.progress = sweep, store, progress
         self.there = store.there()
-        # A group is flown as a whole, so that its rows do not depend on when the sweep was stopped.
+        # A group is flown as a whole, so that its records do not depend on when the sweep was stopped.
         self.missing = deque(np.unique(np.flatnonzero(~self.there) // GROUP).tolist())
         self.flown, self.failed = 0, 0
         self.begun, self.workers = perf_counter(), 1
@@ -112,14 +122,14 @@ class _Sweeping:
         self._report()
 
     def alone(self, *, until_worth: bool) -> None:
-        """Fly in this process: all, or until what is left is worth others."""
+        """Fly in this process: all runs, or until the remaining work justifies more processes."""
         while self.missing:
             if until_worth and self.pace * GROUP * len(self.missing) > _WORTH:
                 return
             self.keep(fly_runs(self.sweep, self.take(1)))
 
     def hand_out(self, pool: pools.Pool) -> None:
-        """Fly all that is missing by a pool of workers; what it does not bring back is missing again."""
+        """Fly all missing runs by a pool of workers. Runs that do not come back are missing again."""
         executor, capacity = pool
         flying: dict[Future[list[RunRecord]], list[int]] = {}
         text = self.sweep.json()
@@ -137,7 +147,7 @@ class _Sweeping:
             self.missing.extendleft(sorted(lost, reverse=True))
 
     def take(self, workers: int) -> list[int]:
-        """Runs of the next chunk: whole groups, for about as long as a chunk is to take."""
+        """Runs of the next chunk: complete groups for the duration of a chunk."""
         fair = -(-len(self.missing) // (_AHEAD * workers))
         groups = 1 if self.pace == 0.0 else min(fair, int(_CHUNK / (self.pace * GROUP)))
         first = [self.missing.popleft() for _ in range(max(1, groups))]
@@ -145,7 +155,7 @@ class _Sweeping:
         return [run for g in first for run in range(g * GROUP, min((g + 1) * GROUP, last))]
 
     def keep(self, rows: list[RunRecord]) -> None:
-        """Put the rows of a chunk into the store."""
+        """Store the records of a chunk."""
         self.store.add(rows)
         self.there[[row.run for row in rows]] = True
         self.flown += len(rows)
@@ -163,13 +173,13 @@ class _Sweeping:
 
 
 def _cores() -> int:
-    """Cores that this process may use."""
+    """Number of cores that this process may use."""
     usable = getattr(os, "sched_getaffinity", None)
     return len(usable(0)) if usable is not None else os.cpu_count() or 1
 
 
 def _dying() -> RigidfleetError:
     return RigidfleetError(
-        "the workers die, one after the other. What they flew is kept. Look for too little memory (fly with"
-        " fewer --workers), or, in a script, for a missing `if __name__ == '__main__':`"
+        "the workers keep dying. Finished runs are saved. If memory is short, use fewer --workers; in a script,"
+        " check for a missing `if __name__ == '__main__':`."
     )

@@ -1,8 +1,8 @@
-"""Where a sweep's rows are kept: one SQLite file, written by one process, a transaction for each chunk.
+"""Store of a sweep: one SQLite file, written by one process, with a transaction for each chunk.
 
-SQLite because a chunk that was committed survives kill -9 at any moment and one that was not leaves no
-trace; the run's number is the primary key, so that no run counts twice; it comes with Python; and any
-tool reads it, also while the sweep goes on.
+Why SQLite: a committed chunk survives kill -9 at any moment, and an uncommitted one leaves no trace. The number of the
+run is the primary key, so no run counts twice. SQLite is part of Python, and any tool can read the file, even while
+the sweep is running.
 """
 
 from __future__ import annotations
@@ -27,28 +27,28 @@ from rigidfleet.sweep.record import RunRecord
 from rigidfleet.typing import Bools, Floats, Ints
 
 FILE = "sweep.db"
-#: Locked by the process that writes; the lock ends with it, however it ends.
+#: Locked by the process that writes. The lock ends with the process, even if that is killed.
 _LOCK = "sweep.lock"
-#: Version of the store's format, its `user_version`; the first one has 0.
+#: Version of the format, stored as `user_version`; 0 in files of the first format.
 _FORMAT = 2
 _COLUMNS = ("passed", "reason", "detail", "wall", "codes", *METRICS)
-#: Little-endian, so that the file reads the same everywhere.
+#: Little-endian, so that the file can be read on every machine.
 _CODES = np.dtype("<f8")
 
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of a sweep as arrays, in the order of their numbers.
+    """Rows of a sweep as arrays, in the order of the runs.
 
     Attributes
     ----------
-    sweep : what was flown
-    run : numbers (n,) of the runs that are there, from 0
-    passed : whether each passed (n,)
-    reason, detail : why it did not (n,)
-    codes : value of each column (n, D), as `Variation.code` has it
-    metrics : values (n,) of each metric, NaN where it does not apply
-    wall : how long each took (n,) [s]
+    sweep : definition of the sweep
+    run : numbers (n,) of the finished runs, from 0
+    passed : whether each run passed (n,)
+    reason, detail : failed checks and message of the first one (n,); "" if the run passed
+    codes : value of each column (n, D), encoded by `Variation.code`
+    metrics : values (n,) of each metric; NaN if it does not apply
+    wall : wall time of each run (n,) [s]
     """
 
     sweep: Sweep
@@ -62,17 +62,17 @@ class Table:
 
     @property
     def complete(self) -> bool:
-        """Whether every run is there."""
+        """Whether all runs are finished."""
         return len(self.run) == self.sweep.runs
 
 
 class Store:
-    """The store of one sweep, open for writing: a context.
+    """Store of one sweep, open for writing; a context manager.
 
     Raises
     ------
     ResultError
-        The folder holds another sweep, a file that is none, or cannot be written.
+        The folder contains another sweep or a damaged file, or it cannot be written.
     """
 
     def __init__(self, folder: Path, sweep: Sweep, *, replace: bool = False) -> None:
@@ -108,7 +108,7 @@ class Store:
         self.lock.close()
 
     def add(self, rows: Iterable[RunRecord]) -> None:
-        """Keep rows: all of them or none. Those of a number that is there already take its place."""
+        """Store records, all of them or none. A record replaces an earlier one of the same run."""
         entries = [
             (
                 row.run, int(row.passed), row.reason, row.detail, row.wall,
@@ -122,7 +122,7 @@ class Store:
             self.db.executemany(f"INSERT OR REPLACE INTO runs VALUES ({marks})", entries)
 
     def there(self) -> Bools:
-        """Which of the sweep's runs are there (runs,)."""
+        """Mask (runs,) of the finished runs."""
         found = np.zeros(self.runs, dtype=bool)
         with _explained(self.path):
             numbers = self.db.execute("SELECT run FROM runs WHERE run < ?", (self.runs,))
@@ -145,8 +145,8 @@ class Store:
             if there and json.loads(there["sweep"])["runs"] > sweep.runs:
                 n = json.loads(there["sweep"])["runs"]
                 raise ResultError(
-                    f"{self.path.parent}: holds this sweep with {n} runs, more than {sweep.runs}. Ask for as"
-                    " many, or replace it by --force, or name another folder by --out."
+                    f"{self.path.parent}: has this sweep with {n} runs, more than {sweep.runs}. Use --runs {n} or more,"
+                    " --force to overwrite, or --out to choose another folder."
                 )
             entries = {"identity": identity, "sweep": sweep.json()}
             self.db.executemany("INSERT OR REPLACE INTO sweep VALUES (?, ?)", entries.items())
@@ -163,17 +163,17 @@ class Store:
 
 
 def is_store(folder: Path) -> bool:
-    """Whether a folder holds a sweep."""
+    """Whether a folder contains a sweep."""
     return (folder / FILE).is_file()
 
 
 def read_sweep(folder: Path) -> Sweep:
-    """The sweep of a folder.
+    """Definition of the sweep in a folder.
 
     Raises
     ------
     ResultError
-        There is none.
+        The folder does not contain a sweep.
     """
     with _reading(folder) as db:
         entries = dict(db.execute("SELECT key, value FROM sweep"))
@@ -181,12 +181,12 @@ def read_sweep(folder: Path) -> Sweep:
 
 
 def read(folder: str | Path) -> Table:
-    """All rows of a folder's sweep; also while it is flown.
+    """Read all rows of the sweep in a folder, even while the sweep is running.
 
     Raises
     ------
     ResultError
-        There is no sweep.
+        The folder does not contain a sweep.
     """
     folder = Path(folder)
     sweep = read_sweep(folder)
@@ -212,7 +212,7 @@ def read(folder: str | Path) -> Table:
 def _reading(folder: Path) -> Generator[sqlite3.Connection]:
     path = folder / FILE
     if not path.is_file():
-        raise ResultError(f"{folder}: holds no sweep. `rigidfleet sweep` makes one.")
+        raise ResultError(f"{folder}: contains no sweep. `rigidfleet sweep` creates one.")
     with _explained(path):
         db = sqlite3.connect(path)
         try:
@@ -223,41 +223,44 @@ def _reading(folder: Path) -> Generator[sqlite3.Connection]:
 
 
 def _readable(db: sqlite3.Connection, folder: Path) -> None:
-    """ResultError where a store is of another format."""
+    """Raise ResultError if a store has another format."""
     if db.execute("SELECT 1 FROM sqlite_master WHERE name = 'sweep'").fetchone() is None:
-        return  # new
+        return  # a new file
     made = max(1, db.execute("PRAGMA user_version").fetchone()[0])
     if made > _FORMAT:
         raise ResultError(
-            f"{folder}: holds a sweep of format {made}, and this version of rigidfleet reads up to {_FORMAT}. Use a"
-            " newer version, or name another folder by --out."
+            f"{folder}: has sweep format {made}; this version of rigidfleet reads format {_FORMAT}. Use a newer"
+            " version, or choose another folder by --out."
         )
     if made < _FORMAT:
         raise ResultError(
-            f"{folder}: holds a sweep written by an earlier rigidfleet (sweep format {made}); this one reads format"
-            f" {_FORMAT}. Fly the sweep again: replace it by --force, or name another folder by --out."
+            f"{folder}: was written by an earlier version of rigidfleet (sweep format {made}); this version reads"
+            f" format {_FORMAT}. Fly the sweep again: use --force to overwrite, or --out to choose another folder."
         )
 
 
 @contextmanager
 def _explained(path: Path) -> Generator[None]:
-    """SQLite's errors, and the system's, in words."""
+    """Turn errors of SQLite and of the operating system into ResultError."""
     try:
         yield
     except sqlite3.OperationalError as error:
-        why = "another sweep is writing it" if "locked" in str(error) else str(error)
+        if "locked" in str(error):
+            why, remedy = "another sweep is writing it", "Wait until it ends"
+        else:
+            why, remedy = str(error), "Check the disk"
         raise ResultError(
-            f"{path}: cannot be used: {why}. Wait for it, free the disk, or name another folder by --out."
+            f"{path}: cannot be used: {why}. {remedy}, or choose another folder by --out."
         ) from error
     except (sqlite3.DatabaseError, KeyError, ValueError) as error:
         raise ResultError(
-            f"{path}: is no store of a sweep, or damaged ({error}). Replace it by --force, or name"
-            " another folder by --out."
+            f"{path}: is damaged or not the store of a sweep ({error}). Use --force to overwrite, or --out to choose"
+            " another folder."
         ) from error
     except OSError as error:
         why = (error.strerror or str(error)).lower()
         raise ResultError(
-            f"{path.parent}: cannot be written ({why}). Name another folder by --out."
+            f"{path.parent}: cannot be written ({why}). Choose another folder by --out."
         ) from error
 
 
@@ -268,7 +271,7 @@ def _schema() -> str:
 
 
 def _difference(there: dict[str, str], identity: str) -> str:
-    """What sets the sweep that is there apart from the one asked for."""
+    """Message about the differences between a stored sweep and another definition."""
     old, new = json.loads(there["identity"]), json.loads(identity)
     names = {
         "mission": "mission",
@@ -279,6 +282,6 @@ def _difference(there: dict[str, str], identity: str) -> str:
     }
     other = [words for key, words in names.items() if old.get(key) != new[key]]
     return (
-        f"holds another sweep, it differs in: {', '.join(other)}. It is kept; replace it by --force, or name"
-        " another folder by --out."
+        f"contains another sweep; it differs in: {', '.join(other)}. Use --force to overwrite, or --out to choose"
+        " another folder."
     )

@@ -1,4 +1,4 @@
-"""What a sweep says: success rate with its interval, percentiles, reasons, and what drives failure."""
+"""Summary of a sweep: success rate with its interval, percentiles, reasons of failure, and rank correlations."""
 
 from __future__ import annotations
 
@@ -23,21 +23,23 @@ if TYPE_CHECKING:
     from rich.table import Table as Grid
 
 
+#: Percentiles of metrics.
 PERCENTILES = (0, 5, 25, 50, 75, 95, 100)
-#: What the intervals of rates hold [-].
+#: Confidence level of the intervals of rates [-].
 CONFIDENCE = 0.95
-#: A rank correlation that chance alone gives less often than this is one.
+#: Significance level below which a rank correlation is shown.
 _CHANCE = 0.01
-_SHOWN = 8  # drivers in words
-#: A spread below these, relative and in the unit, is nothing to look into.
+#: Maximum number of rank correlations in the table.
+_SHOWN = 8
+#: A metric whose range is below these limits, relative and absolute (in its unit), counts as constant.
 _SPREAD, _NOISE = 1e-3, 1e-5
-#: Metrics that nobody asks what drives them.
+#: Metrics without correlations.
 ASIDE = ("flown", "steps", "evaluations")
 
 
 @dataclass(frozen=True)
 class Rate:
-    """How many of how many, and the Wilson interval of the rate."""
+    """A rate: count, total, fraction and Wilson interval."""
 
     count: int
     of: int
@@ -48,7 +50,7 @@ class Rate:
 
 @dataclass(frozen=True)
 class Example:
-    """A run, and why it failed; the words are empty where it fails another check before."""
+    """A failed run and its message; the message is empty if it is about another check."""
 
     run: int
     detail: str
@@ -56,7 +58,7 @@ class Example:
 
 @dataclass(frozen=True)
 class Driver:
-    """Spearman's rank correlation of what varies with an outcome, and how likely chance gives as much."""
+    """Spearman's rank correlation of a varied number with an outcome, and its p-value (`chance`)."""
 
     varied: str
     outcome: str
@@ -66,18 +68,18 @@ class Driver:
 
 @dataclass(frozen=True)
 class Summary:
-    """A sweep in numbers.
+    """Summary of a sweep.
 
     Attributes
     ----------
-    name, mission : what was flown
-    runs, flown : runs asked for, and those there are
-    success : rate of flights that passed
-    reasons : how many runs failed each check; a run may fail several
-    examples : of each reason the first run, and why it failed
-    percentiles : of each metric that applies, in the order of `PERCENTILES`
+    name, mission : names of the sweep and of its mission
+    runs, flown : number of runs of the sweep, and number of finished ones
+    success : rate of runs that passed
+    reasons : number of runs that failed each check; a run can fail several
+    examples : for each reason, a run and its message
+    percentiles : values of each metric at `PERCENTILES`
     drivers : rank correlations of every varied number with success and every metric, strongest first
-    by_value : success rate at each value of what varies by words
+    by_value : success rate for each value of a variation that is not numeric
     """
 
     name: str
@@ -110,7 +112,7 @@ class Summary:
 
 
 def summarise(table: Table) -> Summary:
-    """The summary of the rows there are."""
+    """Summarise the finished runs of a sweep."""
     failed = [reason for reasons in table.reason for reason in reasons.split(", ") if reason]
     percentiles = {}
     for name, values in table.metrics.items():
@@ -139,7 +141,7 @@ def summarise(table: Table) -> Summary:
 
 
 def _examples(table: Table) -> dict[str, Example]:
-    """An example of each reason: if there is one, a run that fails by it first, as the words are of the first."""
+    """An example of each reason, preferably a run that fails it first: messages are about the first check."""
     told: dict[str, Example] = {}
     others: dict[str, Example] = {}
     for run, reasons, detail in zip(table.run.tolist(), table.reason, table.detail, strict=True):
@@ -152,7 +154,7 @@ def _examples(table: Table) -> dict[str, Example]:
 
 
 def rate(passed: Bools) -> Rate:
-    """Rate of what passed, with its Wilson interval; between 0 and 1 where there is nothing."""
+    """Success rate with its Wilson interval; NaN with the interval 0 to 1 if there are no runs."""
     from scipy.stats import binomtest
 
     n, k = len(passed), int(passed.sum())
@@ -163,7 +165,7 @@ def rate(passed: Bools) -> Rate:
 
 
 def outcomes(table: Table) -> dict[str, Floats]:
-    """What a run is judged by: success and every metric, where it differs between runs."""
+    """Outcomes of runs: success and every metric, if they differ between runs."""
     found = {"success": table.passed.astype(float)} | table.metrics
     return {
         name: values
@@ -173,7 +175,7 @@ def outcomes(table: Table) -> dict[str, Floats]:
 
 
 def varied(table: Table) -> dict[str, Floats]:
-    """Numbers that vary, by path: not what varies by words."""
+    """Varied numbers by path, without variations that are not numeric."""
     return {
         column.name: table.codes[:, k]
         for k, column in enumerate(table.sweep.columns)
@@ -210,20 +212,21 @@ def _differs(values: Floats, relative: float = 0.0, absolute: float = 0.0) -> bo
     return len(finite) > 1 and bool(np.ptp(finite) > least)
 
 
-# -- in words ----------------------------------------------------------------------------------------
+# -- printed ----------------------------------------------------------------------------------------
 
 
-#: Percentiles that are shown: on a narrow screen the inner ones are left out, so that none is cut.
+#: Headings of percentiles.
 _HEADS = dict(
-    zip(PERCENTILES, ("least", "5 %", "25 %", "median", "75 %", "95 %", "most"), strict=True)
+    zip(PERCENTILES, ("min", "5 %", "25 %", "median", "75 %", "95 %", "max"), strict=True)
 )
-_UNBOUND = 1000  # columns
-#: First, the space between columns goes.
+#: Width at which no table is wrapped [characters].
+_UNBOUND = 1000
+#: Space between columns and percentiles to show, from a wide terminal to a narrow one.
 _CHOICES = (1, PERCENTILES), (0, PERCENTILES), (1, (0, 25, 50, 75, 100)), (1, (0, 50, 100))
 
 
 def _short(x: float) -> str:
-    """Three digits of a number, or two and a power of ten, in six places and a sign."""
+    """A number with three digits, or two digits and a power of ten, in at most six characters and a sign."""
     size = abs(x)
     if size >= 99_999.5 or 0.0 < size < 0.01:
         digits, power = f"{x:.1e}".split("e")
@@ -232,7 +235,7 @@ def _short(x: float) -> str:
 
 
 def _grid(*columns: str, words: Sequence[str] = (), space: int = 1) -> Grid:
-    """A table without rows. Where it is too wide, its first column and ``words`` are wrapped, and no number is cut."""
+    """An empty table. If it is too wide, its first column and the columns in ``words`` are wrapped, never numbers."""
     from rich.box import SIMPLE_HEAD
     from rich.table import Table as Grid
 
@@ -246,7 +249,7 @@ def _grid(*columns: str, words: Sequence[str] = (), space: int = 1) -> Grid:
 
 
 class _Percentiles:
-    """The table of metrics, with as many percentiles as there is room for."""
+    """Table of metrics with as many percentiles as fit on the terminal."""
 
     def __init__(self, summary: Summary) -> None:
         self.summary = summary
@@ -280,7 +283,7 @@ def _rendered(summary: Summary) -> RenderableType:
     strong = [d for d in summary.drivers if d.chance < _CHANCE]
     failing = [d for d in strong if d.outcome == "success"]
     if strong:
-        rank = _grid("what varies", "outcome", "rank correlation")
+        rank = _grid("varied number", "outcome", "rank correlation")
         for d in (failing + [d for d in strong if d not in failing])[:_SHOWN]:
             rank.add_row(d.varied, d.outcome, f"{d.correlation:+.2f}")
         shown.append(rank)

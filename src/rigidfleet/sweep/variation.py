@@ -1,8 +1,8 @@
-"""What varies in a sweep, and how: distributions and grids, as tables of a sweep file or in one line.
+"""Variations of a sweep: distributions and grids, as tables of a sweep file or as lines.
 
 agents.mass = uniform(0.8, 1.2)              one mass for all vehicles
-agents.mass.* *= normal(1, 0.05)             of each vehicle its own, about what the mission has
-agents.position.*.* += normal(0, 0.3)        every coordinate of every start
+agents.mass.* *= normal(1, 0.05)             a factor for the mass of each vehicle
+agents.position.*.* += normal(0, 0.3)        an offset for every coordinate of every start position
 constraint.alpha = geomspace(1, 10, 5)       a grid
 constraint.solver = choice(iterated, exact)
 """
@@ -22,45 +22,45 @@ from pydantic import Field, Strict
 from rigidfleet.mission.findings import near
 from rigidfleet.mission.schema import Number, Part, Positive
 
-#: The line's sign for each way to change.
+#: Signs in a line, and the change that each stands for.
 SIGNS = {"=": "set", "+=": "add", "*=": "scale"}
 
 
 class Variation(Part):
-    """One entry of a sweep: a path in the mission, and the values it takes."""
+    """A variation: a path in the mission, and the values there."""
 
     path: str = Field(
-        description="place in the mission, counted from 1: agents.mass.2; * stands for all, each with a "
-        "value of its own"
+        description="path in the mission, counted from 1: agents.mass.2; * stands for all entries, each with its "
+        "own value"
     )
     change: Literal["set", "add", "scale"] = Field(
         "set",
-        description="set: in place of what the mission has; add: added to it; scale: times it",
+        description="set: replaces the value in the mission; add: is added to it; scale: multiplies it",
     )
 
     def code(self, value: Any) -> float:
-        """A value that it takes, as a number: itself, or its place in a list that is not of numbers."""
+        """Encode a value as a number: the value itself, or its index in a list that is not numeric."""
         return float(value)
 
     def value(self, code: float) -> Any:
-        """The value of a code."""
+        """Decode a value."""
         return code
 
     def wrong(self) -> tuple[str, str, str] | None:
-        """Key, problem and remedy of what only several keys together tell."""
+        """Key, problem and remedy of an error that involves several keys; None if there is none."""
         return None
 
 
 class Drawn(Variation):
-    """A distribution to draw from."""
+    """A distribution."""
 
     @abstractmethod
     def quantile(self, u: float) -> Any:
-        """Value at the fraction u, in (0, 1), of the distribution."""
+        """Value at the fraction u of the distribution, in (0, 1)."""
 
 
 class Gridded(Variation):
-    """Values to take in turn."""
+    """A grid: values taken in turn."""
 
     @property
     @abstractmethod
@@ -71,9 +71,9 @@ class Gridded(Variation):
 class Normal(Drawn):
     """A normal distribution."""
 
-    kind: Literal["normal"] = Field(description="a normal distribution")
-    mean: Number = Field(description="its mean")
-    sd: Positive = Field(description="its standard deviation, > 0")
+    kind: Literal["normal"] = Field(description="normal distribution")
+    mean: Number = Field(description="mean")
+    sd: Positive = Field(description="standard deviation, > 0")
 
     def quantile(self, u: float) -> float:
         """Value at the fraction u."""
@@ -83,9 +83,9 @@ class Normal(Drawn):
 class Uniform(Drawn):
     """A uniform distribution."""
 
-    kind: Literal["uniform"] = Field(description="a uniform distribution")
-    low: Number = Field(description="its lower end")
-    high: Number = Field(description="its upper end, above low")
+    kind: Literal["uniform"] = Field(description="uniform distribution")
+    low: Number = Field(description="lower end")
+    high: Number = Field(description="upper end, > low")
 
     def quantile(self, u: float) -> float:
         """Value at the fraction u."""
@@ -99,9 +99,9 @@ class Uniform(Drawn):
 class LogUniform(Drawn):
     """A distribution whose logarithm is uniform."""
 
-    kind: Literal["log-uniform"] = Field(description="the logarithm is uniform")
-    low: Positive = Field(description="its lower end, > 0")
-    high: Positive = Field(description="its upper end, above low")
+    kind: Literal["log-uniform"] = Field(description="distribution whose logarithm is uniform")
+    low: Positive = Field(description="lower end, > 0")
+    high: Positive = Field(description="upper end, > low")
 
     def quantile(self, u: float) -> float:
         """Value at the fraction u."""
@@ -113,24 +113,28 @@ class LogUniform(Drawn):
 
 
 class _Listed(Variation):
-    """Several values."""
+    """A list of values."""
 
     values: Annotated[tuple[Any, ...], Field(min_length=1)] = Field(
-        description="its values: numbers, words, true or false, lists"
+        description="values: numbers, words, true or false, lists"
     )
 
     def code(self, value: Any) -> float:
-        """A number itself, if all are numbers, else the place of a value among them."""
+        """Encode a value: itself if all values are numbers, else its index."""
         return float(value) if self._numeric else float(self.values.index(value))
 
     def value(self, code: float) -> Any:
-        """The value of a code."""
+        """Decode a value."""
         return code if self._numeric else self.values[int(code)]
 
     def wrong(self) -> tuple[str, str, str] | None:
-        """Words cannot be added."""
+        """Error if values that are not numbers are to be added or scaled."""
         if self.change != "set" and not self._numeric:
-            return "values", f"must be numbers to {self.change}", "give numbers, or set them"
+            return (
+                "values",
+                f"must be numbers to {self.change}",
+                "give numbers or use change = 'set'",
+            )
         return None
 
     @property
@@ -139,9 +143,9 @@ class _Listed(Variation):
 
 
 class Choice(_Listed, Drawn):
-    """One of several values, each as likely."""
+    """One of several values with equal probability."""
 
-    kind: Literal["choice"] = Field(description="one of several values, each as likely")
+    kind: Literal["choice"] = Field(description="one of several values with equal probability")
 
     def quantile(self, u: float) -> Any:
         """Value at the fraction u."""
@@ -149,51 +153,51 @@ class Choice(_Listed, Drawn):
 
 
 class Grid(_Listed, Gridded):
-    """Each of several values in turn."""
+    """A grid of listed values."""
 
-    kind: Literal["grid"] = Field(description="each of several values in turn")
+    kind: Literal["grid"] = Field(description="grid of listed values")
 
     @property
     def grid(self) -> tuple[Any, ...]:
-        """Its values."""
+        """The values."""
         return self.values
 
 
 class _Spaced(Gridded):
-    """Each of several numbers in turn, from one end to the other."""
+    """A grid of spaced numbers, both ends included."""
 
     count: Annotated[int, Strict(), Field(ge=2, le=10**6)] = Field(
-        description="how many numbers, both ends included, >= 2"
+        description="number of values, both ends included, >= 2"
     )
 
 
 class Linspace(_Spaced):
-    """A grid of equal differences."""
+    """A grid with equal differences."""
 
-    kind: Literal["linspace"] = Field(description="a grid of equal differences")
-    low: Number = Field(description="its first number")
-    high: Number = Field(description="its last number")
+    kind: Literal["linspace"] = Field(description="grid with equal differences")
+    low: Number = Field(description="first value")
+    high: Number = Field(description="last value")
 
     @property
     def grid(self) -> tuple[float, ...]:
-        """Its numbers."""
+        """The values."""
         return tuple(np.linspace(self.low, self.high, self.count).tolist())
 
 
 class Geomspace(_Spaced):
-    """A grid of equal ratios."""
+    """A grid with equal ratios."""
 
-    kind: Literal["geomspace"] = Field(description="a grid of equal ratios")
-    low: Positive = Field(description="its first number, > 0")
-    high: Positive = Field(description="its last number, > 0")
+    kind: Literal["geomspace"] = Field(description="grid with equal ratios")
+    low: Positive = Field(description="first value, > 0")
+    high: Positive = Field(description="last value, > 0")
 
     @property
     def grid(self) -> tuple[float, ...]:
-        """Its numbers."""
+        """The values."""
         return tuple(np.geomspace(self.low, self.high, self.count).tolist())
 
 
-#: What `kind` may be, and the keys of each in the order of a line.
+#: Models of variations by `kind`.
 KINDS: dict[str, type[Variation]] = {
     "normal": Normal,
     "uniform": Uniform,
@@ -203,6 +207,7 @@ KINDS: dict[str, type[Variation]] = {
     "linspace": Linspace,
     "geomspace": Geomspace,
 }
+#: Keys of a variation in the order of a line; those that are missing here take a list of values.
 _KEYS = {
     "normal": ("mean", "sd"),
     "uniform": ("low", "high"),
@@ -216,17 +221,17 @@ _FORM = "write PATH = KIND(NUMBERS), as in agents.mass.* *= normal(1, 0.05)"
 
 @dataclass(frozen=True)
 class WrongLine:
-    """What is wrong with a line, and what to do about it."""
+    """Problem and remedy of an invalid line."""
 
     problem: str
     remedy: str
 
 
 def from_line(line: str) -> dict[str, Any] | WrongLine:
-    """The table that a line stands for."""
+    """Parse a line into the table that it stands for."""
     match = _LINE.fullmatch(line)
     if match is None:
-        return WrongLine("is no variation", _FORM)
+        return WrongLine("is not a valid variation", _FORM)
     path, sign, kind, inside = match.groups()
     data = {"path": path, "change": SIGNS[sign], "kind": kind}
     if kind not in KINDS:
@@ -243,12 +248,12 @@ def from_line(line: str) -> dict[str, Any] | WrongLine:
 
 
 def is_number(value: object) -> bool:
-    """Whether a value is a number, which true and false are not."""
+    """Whether a value is a number; true and false are not."""
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def _words(text: str) -> list[str]:
-    """Words between commas that stand in no brackets."""
+    """Split text at commas outside of brackets."""
     words, depth = [""], 0
     for letter in text:
         depth += (letter == "[") - (letter == "]")
@@ -260,7 +265,7 @@ def _words(text: str) -> list[str]:
 
 
 def _value(word: str) -> Any:
-    """A number, true, false or a list; or the word itself, with or without quotes."""
+    """Convert a word to a number, true, false or a list; otherwise return it without quotes."""
     for read in (json.loads, float):
         try:
             return read(word)
@@ -272,4 +277,4 @@ def _value(word: str) -> Any:
 def _ordered(low: float, high: float) -> tuple[str, str, str] | None:
     if low < high:
         return None
-    return "high", f"must be above low = {low:g}", "exchange the two, or set one number by grid"
+    return "high", f"must be above low = {low:g}", "swap the two, or set a single value by grid"

@@ -1,4 +1,4 @@
-"""Who flies: this process, processes beside it, or those of a Dask cluster; and what they are sent."""
+"""Workers of a sweep: processes on this machine or a Dask cluster."""
 
 from __future__ import annotations
 
@@ -22,9 +22,10 @@ from rigidfleet.sweep.run import fly_runs
 if TYPE_CHECKING:
     from rigidfleet.kernel.engine.native import Inheritance
 
-#: An executor, and how many chunks it works on at the same time.
+#: An executor, and a function that returns how many chunks it can fly at the same time.
 Pool = tuple[Executor, Callable[[], int]]
-_CONNECT = 20.0  # [s] to wait for a scheduler
+#: Maximum time to wait for a scheduler [s].
+_CONNECT = 20.0
 
 
 def chunk(sweep: str, version: str, runs: Sequence[int]) -> list[RunRecord]:
@@ -33,23 +34,23 @@ def chunk(sweep: str, version: str, runs: Sequence[int]) -> list[RunRecord]:
     Raises
     ------
     RigidfleetError
-        This process has another version of rigidfleet than the one that asks.
+        The other process has another version of rigidfleet.
     """
     if version != __version__:
         raise RigidfleetError(
-            f"a worker has rigidfleet {__version__}, and this sweep is flown by {version}. Install the same"
-            " version on all machines."
+            f"a worker has rigidfleet {__version__}, but the sweep was started by {version}. Install the same version"
+            " on all machines."
         )
     return fly_runs(shared(sweep), runs)
 
 
 @contextmanager
 def processes(count: int) -> Generator[Pool]:
-    """Persistent processes on this machine; they end with this one, however it ends."""
+    """Start persistent processes on this machine. They end with this process, even if it is killed."""
     from rigidfleet.kernel.engine.native import bequeath
 
     before = set(multiprocessing.active_children())
-    with _safe_path():  # of the process that looks after semaphores
+    with _safe_path():  # for multiprocessing's resource tracker
         pool = ProcessPoolExecutor(
             count, mp_context=_Context(), initializer=_begin, initargs=(bequeath(),)
         )
@@ -69,10 +70,10 @@ class _Process(SpawnProcess):
 
 
 class _Context(SpawnContext):
-    """Processes that start as new ones, and import nothing from the current folder while they do.
+    """Spawn processes that import nothing from the current folder while they start.
 
-    Until it is told the path of its parent, such a process would look for every module there first, even for those of
-    the standard library.
+    Before a spawned process receives the module path of its parent, it would search the current folder first, even for
+    modules of the standard library.
     """
 
     Process = _Process
@@ -80,7 +81,7 @@ class _Context(SpawnContext):
 
 @contextmanager
 def _safe_path() -> Generator[None]:
-    """Keep the current folder off the path of Python processes that are started meanwhile."""
+    """Keep the current folder off the module path of Python processes that are started in this context."""
     name = "PYTHONSAFEPATH"
     before = os.environ.get(name)
     os.environ[name] = "1"
@@ -94,7 +95,7 @@ def _safe_path() -> Generator[None]:
 
 
 def _begin(given: Inheritance) -> None:
-    """Leave Ctrl-C to the process that started this one, end when it does, and compile nothing that it has."""
+    """Prepare a worker: ignore Ctrl-C, end with the parent process, and take compiled code from it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_follow, daemon=True).start()
     from rigidfleet.kernel.engine.native import inherit
@@ -111,7 +112,7 @@ def _follow() -> None:
 
 @contextmanager
 def cluster(address: str) -> Generator[Pool]:
-    """The workers of a Dask cluster, as many as there are at any time.
+    """Use the workers of a Dask cluster. Their number may change.
 
     Raises
     ------
@@ -122,15 +123,15 @@ def cluster(address: str) -> Generator[Pool]:
         from distributed import Client
     except ImportError:
         raise RigidfleetError(
-            'a cluster needs the package distributed. Install it by: pip install "rigidfleet[cluster]"'
+            '--cluster needs the package distributed. Install it: pip install "rigidfleet[cluster]"'
         ) from None
     try:
         client: Any = Client(address, timeout=_CONNECT, set_as_default=False)
     except (OSError, ValueError, TypeError) as error:
         why = str(error) or type(error).__name__
         raise RigidfleetError(
-            f"--cluster {address}: no scheduler answers there ({why}). Start one by `dask scheduler`, and"
-            " give the address that it prints, as tcp://HOST:8786."
+            f"--cluster {address}: no scheduler answers ({why}). Start one by `dask scheduler` and give the address"
+            " that it prints, for example tcp://HOST:8786."
         ) from None
     with client:
         executor = client.get_executor(pure=False)

@@ -50,7 +50,7 @@ class Counts:
 
 @dataclass
 class LargeSolver:
-    """Multipliers of one phase, into its workspace.
+    """Multipliers of one phase, Eq. (12), into its workspace.
 
     ``steps`` (N, 4) are those of elimination, None where there are none; ``order`` asks for the order (N,) in which
     the sparse factor takes agents, where it is needed; ``tolerance`` is the relative residual of conjugate

@@ -1,5 +1,7 @@
-"use strict";
 // A flight under way, flown from this page.
+
+import { Player, digits, element, part, say } from "../replay/player.js";
+import { Recording } from "../replay/recording.js";
 
 const KEPT = 12000; // samples at most
 const SPAN = 30; // of the plots [s]

@@ -94,8 +94,7 @@ class Session:
                 "speeds": SPEEDS,
                 **self.story(),
             }
-        script, style = (read(f"live.{kind}", "rigidfleet.web.live") for kind in ("js", "css"))
-        return page(info, start=script, style=style, connect="'self'")
+        return page(info, start="live/live.js", style=read("live/live.css"), connect="'self'")
 
     def story(self) -> dict[str, Any]:
         """What changes now and then."""

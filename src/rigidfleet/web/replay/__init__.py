@@ -18,7 +18,7 @@ from rigidfleet._files import write_file
 from rigidfleet.result import Result, as_result
 from rigidfleet.typing import Floats, Ints
 from rigidfleet.web.replay.pack import PackedColumn, pack
-from rigidfleet.web.replay.page import page, read
+from rigidfleet.web.replay.page import page
 from rigidfleet.web.replay.scene import describe, observe, sight, size, weight
 
 __all__ = ["Replay", "html_page", "replay"]
@@ -95,9 +95,8 @@ def html_page(result: Result) -> str:
     )
     info = describe(result.mission, result.edges[shown], tension) | _story(result, time)
     info |= {"columns": described, "count": len(time), "beyond": most > tension}
-    return page(
-        info | {"note": _note(result, shown, tension, most)}, start=read("replay.js"), data=data
-    )
+    info |= {"note": _note(result, shown, tension, most)}
+    return page(info, start="replay/replay.js", data=data)
 
 
 def _times(result: Result) -> Floats:

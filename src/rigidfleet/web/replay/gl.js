@@ -1,22 +1,21 @@
-"use strict";
 // Drawing with WebGL 2: lit meshes in many places, lines of even width, a ground grid. World axes as
 // in the flight: x east, y north, z up; lengths in metres, colours [r, g, b, a] from 0 to 1.
 
-const BACKGROUND = [0.945, 0.957, 0.969];
+export const BACKGROUND = [0.945, 0.957, 0.969];
 
 // -- vectors and matrices ---------------------------------------------------------------------------
 
-const add = (a, b) => [a[0] + b[0], a[1] + b[1], a[2] + b[2]];
-const sub = (a, b) => [a[0] - b[0], a[1] - b[1], a[2] - b[2]];
-const scaled = (a, s) => [a[0] * s, a[1] * s, a[2] * s];
-const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-const cross = (a, b) => [
+export const add = (a, b) => [a[0] + b[0], a[1] + b[1], a[2] + b[2]];
+export const sub = (a, b) => [a[0] - b[0], a[1] - b[1], a[2] - b[2]];
+export const scaled = (a, s) => [a[0] * s, a[1] * s, a[2] * s];
+export const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+export const cross = (a, b) => [
   a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0],
 ];
-const length = (a) => Math.hypot(a[0], a[1], a[2]);
-const mixed = (a, b, f) => a.map((x, i) => x + f * (b[i] - x));
+export const length = (a) => Math.hypot(a[0], a[1], a[2]);
+export const mixed = (a, b, f) => a.map((x, i) => x + f * (b[i] - x));
 
-function unit(a) {
+export function unit(a) {
   const l = length(a);
   return l > 0 ? scaled(a, 1 / l) : [0, 0, 1];
 }
@@ -38,7 +37,7 @@ function viewMatrix({ eye, target, right, fov, near, far, centre }, aspect) {
 }
 
 /** Quaternion [w, x, y, z] that turns body to world, from the body's axes x, y, z in the world. */
-function quaternion(x, y, z) {
+export function quaternion(x, y, z) {
   const t = [1 + x[0] + y[1] + z[2], 1 + x[0] - y[1] - z[2], 1 - x[0] + y[1] - z[2], 1 - x[0] - y[1] + z[2]];
   const k = t.indexOf(Math.max(...t)), s = 2 * Math.sqrt(t[k]);
   const a = y[2] - z[1], b = z[0] - x[2], c = x[1] - y[0];
@@ -52,10 +51,10 @@ function quaternion(x, y, z) {
 // -- meshes -------------------------------------------------------------------------------------------
 
 // Tone of a vertex: 0 dark, 1 the colour of the thing, 2 white.
-const DARK = 0, OWN = 1, WHITE = 2;
+export const DARK = 0, OWN = 1, WHITE = 2;
 
 /** Triangles between vertices of position (3), normal (3), tone and opacity. */
-class Mesh {
+export class Mesh {
   constructor() {
     this.data = [];
     this.corners = [];
@@ -147,7 +146,7 @@ const ROTORS = [0, 1, 2, 3].map((k) => {
 });
 
 /** A quadrotor inside a sphere of radius 1, nose along x. */
-function vehicleMesh() {
+export function vehicleMesh() {
   const mesh = new Mesh();
   mesh.prism([0, 0, -0.14], 0.26, 0.17, 0.34, 8, OWN, Math.PI / 8);
   mesh.box([0.14, -0.08, -0.05], [0.37, 0.08, 0.1], WHITE);
@@ -160,7 +159,7 @@ function vehicleMesh() {
 }
 
 /** The same from afar, a tenth of the work. */
-function smallVehicleMesh() {
+export function smallVehicleMesh() {
   const mesh = new Mesh();
   mesh.prism([0, 0, -0.14], 0.3, 0, 0.42, 4, OWN, Math.PI / 4);
   for (const [, x, y] of ROTORS) {
@@ -170,7 +169,7 @@ function smallVehicleMesh() {
   return mesh;
 }
 
-function rotorMesh() {
+export function rotorMesh() {
   const mesh = new Mesh();
   for (const [, x, y] of ROTORS) mesh.ring([x, y, 0.14], 0, 0.39, 14, OWN, [0.1, 0.45]);
   return mesh;
@@ -180,7 +179,7 @@ function rotorMesh() {
 
 /** Items in a row of the texture that holds them, 12 words (three texels) each. */
 const PER_ROW = 256;
-const NO_TURN = [1, 0, 0, 0];
+export const NO_TURN = [1, 0, 0, 0];
 
 class Items {
   constructor() {
@@ -206,7 +205,7 @@ class Items {
 }
 
 /** Places of a mesh: position, colour; scale and quaternion. */
-class Places extends Items {
+export class Places extends Items {
   add(p, scale, q, colour, alpha) {
     const at = this.next(), d = this.data, one = typeof scale === "number";
     d[at] = p[0]; d[at + 1] = p[1]; d[at + 2] = p[2];
@@ -217,7 +216,7 @@ class Places extends Items {
 }
 
 /** Segments: one end, width [px]; the other end; the colours of both. */
-class Lines extends Items {
+export class Lines extends Items {
   add(a, b, width, colour, alpha, alphaB = alpha) {
     const at = this.next(), d = this.data;
     d[at] = a[0]; d[at + 1] = a[1]; d[at + 2] = a[2]; d[at + 3] = width;
@@ -231,7 +230,7 @@ function packed(colour, alpha) {
   return ((alpha * 255) << 24) | ((colour[2] * 255) << 16) | ((colour[1] * 255) << 8) | (colour[0] * 255);
 }
 
-function grown(data) {
+export function grown(data) {
   const larger = new Float32Array(2 * data.length);
   larger.set(data);
   return larger;
@@ -362,7 +361,7 @@ function inSoftware() {
   return /swiftshader|llvmpipe|softpipe|software|basic render/i.test(name);
 }
 
-class Renderer {
+export class Renderer {
   constructor(canvas) {
     // Smooth borders cost a graphics card nothing, and software four times the work.
     const gl = canvas.getContext("webgl2", { alpha: false, antialias: !inSoftware(), powerPreference: "high-performance" });

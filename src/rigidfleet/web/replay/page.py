@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-import html
 import json
+import posixpath
 import re
+from collections.abc import Iterator
 from importlib import resources
 from typing import Any
 
 from rigidfleet.result import plain
 from rigidfleet.web.policy import content_policy
+from rigidfleet.web.template import templates
 
-_SCRIPTS = ("gl.js", "recording.js", "scene.js", "player.js")
+_IMPORT = re.compile(r'^import \{[^}]*\} from "([^"]+)";\n', re.MULTILINE)
+_EXPORT = re.compile(r"^export (?=(?:async function|function|class|const) )", re.MULTILINE)
 
 
 def page(
@@ -22,25 +25,46 @@ def page(
     Parameters
     ----------
     info : plain data and arrays; see ``describe`` and recording.js
-    start : script that starts the player
+    start : module that starts the player, see `bundle`
     data : packed samples, as ``start`` reads them
     style : added to what every page has
     connect : whom the page may talk to; see `content_policy`
     """
-    style = read("page.css") + style
-    script = "\n".join([*map(read, _SCRIPTS), start])
-    fill = {
-        "policy": content_policy(style=style, script=script, connect=connect),
-        "title": html.escape(f"{info['name']} – rigidfleet"),
-        "style": style,
+    style = read("replay/page.css") + style
+    script = bundle(start)
+    template = templates("rigidfleet.web.replay", "").get_template("page.html")
+    return template.render(
+        policy=content_policy(style=style, script=script, connect=connect),
+        title=f"{info['name']} – rigidfleet",
+        style=style,
         # No mark-up inside: a user's words must not end the script.
-        "info": json.dumps(plain(info), ensure_ascii=False).replace("<", "\\u003c"),
-        "data": data,
-        "script": script,
-    }
-    return re.sub(r"\{(\w+)\}", lambda match: fill[match[1]], read("page.html"))
+        info=json.dumps(plain(info), ensure_ascii=False).replace("<", "\\u003c"),
+        data=data,
+        script=script,
+    )
 
 
-def read(name: str, package: str = "rigidfleet.web.replay") -> str:
-    """Text of a file that lies in a package."""
-    return (resources.files(package) / name).read_text(encoding="utf-8")
+def bundle(start: str) -> str:
+    """One module of a JavaScript module and all that it imports: a page that is a file can import nothing.
+
+    Modules import names from each other by relative paths, and share one scope here: what is declared at the top of
+    one has a name of its own.
+    """
+    seen: set[str] = set()
+
+    def parts(name: str) -> Iterator[str]:
+        if name not in seen:
+            seen.add(name)
+            text = read(name)
+            for target in _IMPORT.findall(text):
+                yield from parts(
+                    posixpath.normpath(posixpath.join(posixpath.dirname(name), target))
+                )
+            yield _EXPORT.sub("", _IMPORT.sub("", text))
+
+    return "\n".join(parts(start))
+
+
+def read(name: str) -> str:
+    """Text of a file below the package of the pages."""
+    return (resources.files("rigidfleet.web") / name).read_text(encoding="utf-8")

@@ -1,5 +1,6 @@
-"use strict";
 // The page around the picture: time line, speed, cameras, plots, keys.
+
+import { CAMERAS, Scene, tensionColour } from "./scene.js";
 
 const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 4, 8, 16];
 const KEYS = [
@@ -18,9 +19,9 @@ const SHOWN = { edges: "edges", trails: "trails", slots: "slots", axes: "body ax
 const ALERT = "#b00020";
 const SLOW = 1 / 24; // seconds a picture: above, the resolution is lowered
 
-const part = (id) => document.getElementById(id);
+export const part = (id) => document.getElementById(id);
 
-function element(tag, parent, attributes = {}, text = "") {
+export function element(tag, parent, attributes = {}, text = "") {
   const made = parent.appendChild(document.createElement(tag));
   for (const [name, value] of Object.entries(attributes)) made.setAttribute(name, value);
   if (text) made.textContent = text;
@@ -28,7 +29,7 @@ function element(tag, parent, attributes = {}, text = "") {
 }
 
 /** A number as read on an instrument: three digits, no exponent. */
-function digits(x) {
+export function digits(x) {
   const size = Math.abs(x);
   return x.toFixed(size >= 99.95 ? 0 : size >= 9.995 ? 1 : 2).replace("-", "−");
 }
@@ -201,7 +202,7 @@ class Plot {
 
 // -- the player -----------------------------------------------------------------------------------------
 
-class Player {
+export class Player {
   constructor(recording) {
     const { info } = recording;
     this.recording = recording;
@@ -516,7 +517,7 @@ class Player {
   }
 }
 
-function say(words) {
+export function say(words) {
   part("notice").textContent = words;
   part("notice").hidden = false;
 }

@@ -1,8 +1,9 @@
-"use strict";
 // A flight as samples at even times, and its state at any time between them.
 
+import { grown, unit } from "./gl.js";
+
 /** Read what `pack.py` has written: columns {name, width, step}, one after the other in `text`. */
-async function unpack(text, columns, count) {
+export async function unpack(text, columns, count) {
   const packed = Uint8Array.from(atob(text.trim()), (c) => c.charCodeAt(0));
   const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate"));
   const bytes = new Uint8Array(await new Response(stream).arrayBuffer());
@@ -25,7 +26,7 @@ async function unpack(text, columns, count) {
   return out;
 }
 
-class Recording {
+export class Recording {
   /** `info` describes the flight; `columns` name to samples (count x width); times from info.start by info.step [s]. */
   constructor(info, columns, count) {
     this.info = info;
@@ -133,7 +134,7 @@ class Recording {
 }
 
 /** Axes x, y, z of the body in the world, from the quaternion [w, x, y, z] world to body. */
-function bodyAxes([w, x, y, z]) {
+export function bodyAxes([w, x, y, z]) {
   return [
     [w * w + x * x - y * y - z * z, 2 * (x * y + w * z), 2 * (x * z - w * y)],
     [2 * (x * y - w * z), w * w - x * x + y * y - z * z, 2 * (y * z + w * x)],

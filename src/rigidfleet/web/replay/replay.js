@@ -1,5 +1,7 @@
-"use strict";
 // A flight that is over, out of the page itself.
+
+import { Player, part, say } from "./player.js";
+import { Recording, unpack } from "./recording.js";
 
 async function main() {
   try {

@@ -1,5 +1,10 @@
-"use strict";
 // What a flight looks like at one moment, and from where it is seen.
+
+import {
+  BACKGROUND, Lines, Mesh, NO_TURN, OWN, Places, Renderer, add, cross, dot, length, mixed,
+  quaternion, rotorMesh, scaled, smallVehicleMesh, sub, unit, vehicleMesh,
+} from "./gl.js";
+import { bodyAxes } from "./recording.js";
 
 const AXES = [[0.84, 0.15, 0.16], [0.13, 0.58, 0.22], [0.12, 0.36, 0.86]];
 const IDLE = [0.42, 0.47, 0.53], PULL = [0.80, 0.11, 0.09], PUSH = [0.10, 0.33, 0.75];
@@ -9,7 +14,7 @@ const TRAIL = 8; // length of trails [s]
 const CROWD = 60; // where more vehicles fly, each stands out less
 
 /** Colour of an edge: `share` of the largest tension, from -1 (pushes) to 1 (pulls), by its square root. */
-function tensionColour(share) {
+export function tensionColour(share) {
   return mixed(IDLE, share < 0 ? PUSH : PULL, Math.sqrt(Math.min(Math.abs(share), 1)));
 }
 
@@ -17,7 +22,7 @@ const rgb = (hex) => [1, 3, 5].map((k) => parseInt(hex.slice(k, k + 2), 16) / 25
 
 // -- the camera ---------------------------------------------------------------------------------------
 
-const CAMERAS = ["follow", "overview", "top"];
+export const CAMERAS = ["follow", "overview", "top"];
 const STEEP = 0.62; // elevation of the overview
 const MARGIN = 1.06; // around what the overview holds
 const PLACES = 2000; // of the flight that it looks at
@@ -134,7 +139,7 @@ class Camera {
 
 // -- the scene ----------------------------------------------------------------------------------------
 
-class Scene {
+export class Scene {
   constructor(canvas, labels, recording) {
     const { info } = recording;
     this.recording = recording;

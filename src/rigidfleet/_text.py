@@ -1,0 +1,13 @@
+"""Words that messages of several modules share."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+
+def agent_names(indices: Iterable[int]) -> str:
+    """Agents, counted from 0, as messages name them, counted from 1: "agent 1", "agents 1, 2 and 3"."""
+    numbers = [str(i + 1) for i in indices]
+    if len(numbers) == 1:
+        return f"agent {numbers[0]}"
+    return f"agents {', '.join(numbers[:-1])} and {numbers[-1]}"
