@@ -34,8 +34,10 @@ class Sampling:
         for exact in (plan.arrival, plan.t_end, stop, *lost[np.isfinite(lost)]):
             if t < exact <= t_end:
                 grid = np.sort(np.append(grid[abs(grid - exact) > 1e-9 * step], exact))
-        start = [t if t == 0.0 else np.nextafter(t, math.inf)] if first else []
-        return np.concatenate([start, grid])
+        if not first:
+            return grid
+        start = t if t == 0.0 else np.nextafter(t, math.inf)
+        return np.append(start, grid[grid > start])
 
 
 def times_asked(times: ArrayLike, end: float) -> Floats:
