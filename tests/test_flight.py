@@ -250,3 +250,21 @@ def test_names_may_repeat():
     result = flight.finish()
     names = ["establish 1", "wait", "wait (3)", "wait (2)", "wait (4)"]
     assert [p.name for p in result.mission.phases] == [p.name for p in result.phases] == names
+
+
+def test_an_orbit_left_on_the_way_leads_nowhere_else():
+    """A hold after it comes back to where the orbit was left, as it does in the record's mission."""
+    flight = rf.Flight("narrow-passage")
+    flight.begin()
+    flight.advance()
+    flight.begin(
+        {"kind": "orbit", "centre": [5, 5, 8], "radius": 4, "rate_deg_s": 20, "duration": 30}
+    )
+    flight.advance(8.0)
+    left = flight.pose()
+    flight.begin({"kind": "hold", "duration": 10.0})
+    flight.advance()
+    result = flight.finish()
+    np.testing.assert_allclose(result.cm[-1], left.r, atol=1e-2)
+    again = rf.simulate(result.mission)
+    np.testing.assert_allclose(again.position[-1], result.position[-1], atol=1e-4)

@@ -518,6 +518,8 @@ class AnyPhase(Part):
     shapes: ClassVar[bool] = False
     #: Whether it leads the virtual body to a goal of its own, so that somebody has to steer.
     moves: ClassVar[bool] = False
+    #: Whether it may be left anywhere, and its goal is there; others keep theirs for the phase after.
+    goal_moves: ClassVar[bool] = False
     #: Its control in architecture "body", unless another is given.
     body_control: ClassVar[str] = "body"
 
@@ -749,6 +751,7 @@ class Orbit(AnyPhase):
     """Circle a point on a level circle, at a steady rate, and leave it with the velocity there."""
 
     moves: ClassVar[bool] = True
+    goal_moves: ClassVar[bool] = True
     body_control: ClassVar[str] = "tracking"
 
     kind: Literal["orbit"] = Field(description="circle a point")
