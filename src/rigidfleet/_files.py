@@ -7,15 +7,9 @@ import secrets
 from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import (
-    IO,
-    TYPE_CHECKING,
-)
+from typing import IO
 
 from rigidfleet.errors import ResultError
-
-if TYPE_CHECKING:
-    pass
 
 
 @contextmanager
@@ -28,9 +22,9 @@ def replacing(path: str | Path, *, private: bool = False) -> Generator[IO[bytes]
         It cannot be written; the old file is as it was.
     """
     target = Path(os.path.realpath(path))  # through a symbolic link, not in place of it
-    part = target.with_name(f".{target.name[:200]}.{secrets.token_hex(4)}.part")
     if target.is_dir():
         raise IsADirectoryError
+    part = target.with_name(f".{target.name[:200]}.{secrets.token_hex(4)}.part")
     mode = 0o600 if private else 0o666
     try:
         with open(part, "xb", opener=lambda name, flags: os.open(name, flags, mode)) as file:

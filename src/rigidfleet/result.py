@@ -40,6 +40,7 @@ from rigidfleet.typing import Bools, Floats, Ints
 
 if TYPE_CHECKING:
     from rigidfleet.mission import Mission
+from rigidfleet._arguments import as_path
 from rigidfleet._files import why_not, write_file
 
 #: Version of the file format; files of any other are refused.
@@ -457,7 +458,7 @@ class Result:
         ResultError
             The file cannot be written.
         """
-        write_file(Path(path), self._netcdf())
+        write_file(as_path(path), self._netcdf())
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -468,7 +469,7 @@ class Result:
         ResultError
             There is no such file, it is no result, it is damaged, or a newer version of rigidfleet wrote it.
         """
-        path = Path(path)
+        path = as_path(path)
         data = _read(path)
         try:
             return cls(**_parse(path, data))
@@ -502,7 +503,7 @@ class Result:
             angle = "" if np.isnan(yaw[k]) else f"{yaw[k]:.6f}"
             t = self.time[k]
             lines += [row(t, i, *s, angle) for i, s in enumerate(state[k].tolist(), start=1)]
-        write_file(Path(path), "".join(lines).encode())
+        write_file(as_path(path), "".join(lines).encode())
 
     def _netcdf(self) -> bytes:
         """The file's content. Built in memory, so that a full disk meets a plain write and not the HDF5 library."""

@@ -167,6 +167,11 @@ class Flight:
         self.mission = mission = as_mission(mission)
         if not (isinstance(rate, int | float | np.number) and rate > 0.0):
             raise ValueError(f"the control rate must be positive [Hz], not {rate!r}")
+        for name, function in (("controller", controller), ("progress", progress)):
+            if not (function is None or callable(function)):
+                raise wrong_type(f"a function for {name}", function)
+        if not (force is None or callable(force) or hasattr(force, "address")):
+            raise wrong_type("a function for force", force)
         self.controller, self.rate, self.progress = controller, rate, progress
         self.external = ExternalForce(force, mission.n_agents) if force is not None else None
         asked_for = None if times is None else times_asked(times, mission.latest_end)

@@ -7,6 +7,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rigidfleet._arguments import numbers
 from rigidfleet.planning.plan import PhasePlan
 from rigidfleet.typing import Floats
 
@@ -48,7 +49,7 @@ def times_asked(times: ArrayLike, end: float) -> Floats:
     ValueError
         One lies outside of the mission.
     """
-    t = np.unique(np.asarray(times, dtype=float))
+    t = np.unique(numbers("times to record [s]", times))
     if not (len(t) and t[0] >= 0.0 and t[-1] <= end * (1.0 + 1e-12)):
         raise ValueError(f"times to record must lie between 0 and the mission's end, {end:g} s")
     return np.unique(np.minimum(t, end))

@@ -18,11 +18,12 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import Field, Strict
 
+from rigidfleet._arguments import as_path
 from rigidfleet._version import __version__
-from rigidfleet.errors import MissionError, SweepError
+from rigidfleet.errors import MissionError, SweepError, wrong_type
 from rigidfleet.mission import Mission, load_mission, mission_names
 from rigidfleet.mission.findings import FindingCollector, Keys, unknown_key
-from rigidfleet.mission.model import parse_toml, read_text
+from rigidfleet.mission.model import as_mission, parse_toml, read_text
 from rigidfleet.mission.phases import kind, tables
 from rigidfleet.mission.schema import Part
 from rigidfleet.sweep import keypaths
@@ -133,8 +134,9 @@ class Sweep:
         MissionError
             The mission is wrong.
         """
-        if not isinstance(mission, Mission):
-            mission = load_mission(mission)
+        mission = as_mission(mission)
+        if isinstance(vary, str | bytes) or not isinstance(vary, Iterable):
+            raise wrong_type("a list of variations", vary)
         data: dict[str, Any] = {"mission": mission.name, "seed": seed, "vary": list(vary)}
         data |= {} if runs is None else {"runs": runs}
         data |= {} if evaluate == "flight" else {"evaluate": evaluate}
@@ -167,7 +169,7 @@ class Sweep:
         MissionError
             The file cannot be read, or its mission is wrong.
         """
-        path = Path(path)
+        path = as_path(path)
         origin = str(path)
         data = parse_toml(read_text(path), origin)
         named = data.get("mission")
