@@ -19,6 +19,7 @@ import numpy as np
 from pydantic import Field, Strict
 
 from rigidfleet._arguments import as_path
+from rigidfleet._renamed import successor
 from rigidfleet._version import __version__
 from rigidfleet.errors import MissionError, SweepError, wrong_type
 from rigidfleet.mission import Mission, load_mission, mission_names
@@ -381,6 +382,9 @@ def _fits(
         return
     values = getattr(v, "values", None)
     numeric = values is None or all(map(is_number, values))
+    for word in values or ():
+        if remedy := next(filter(None, (successor(keys[-1], word) for keys in places)), ""):
+            notes.add(("vary", k, "values"), "is no value of the mission format", remedy, word)
     for keys in places:
         leaves = keypaths.numbers(keypaths.look_up(whole, keys))
         absent = any(x is None for x in leaves)
