@@ -416,7 +416,7 @@ def read_text(path: str | Path) -> str:
         It cannot be read.
     """
     origin = str(path)
-    path = as_path(path)
+    as_path(path)  # a number would be an open file
     try:
         with open(path, "rb") as file:
             data = file.read(bounds.BYTES + 1)
