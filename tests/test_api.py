@@ -20,6 +20,8 @@ from test_policy import flight as hostile_flight
 import rigidfleet as rf
 from rigidfleet.result import Result
 
+untyped: Any = rf  # what no type checker looks at
+
 TAKES_MISSION: dict[str, Callable[[Any], Any]] = {
     "simulate": rf.simulate,
     "check": rf.check,
@@ -274,3 +276,47 @@ print(*sorted({"IPython", "numba", "matplotlib"} & set(sys.modules)))
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == []
+
+
+@pytest.mark.parametrize("given", [3, None, b"flight.nc", ["flight.nc"]], ids=repr)
+def test_what_is_no_path(flight, given):
+    """A number is no open file: each function that reads or writes asks for a path in one sentence."""
+    for use in (
+        rf.load_mission, rf.Result.load, rf.Sweep.load, flight.save, flight.to_csv,
+        lambda path: rf.report(flight, path),
+    ):  # fmt: skip
+        with pytest.raises(TypeError, match=r"a path \(a string or a Path\) is asked for"):
+            use(given)
+    with pytest.raises(rf.ResultError, match="is a folder"):
+        flight.save("/")
+
+
+@pytest.mark.parametrize(
+    ("words", "use"),
+    [
+        ("a function for controller", lambda: untyped.Flight("square", controller=3)),
+        ("a function for force", lambda: untyped.Flight("square", force=3)),
+        ("a function for progress", lambda: untyped.Flight("square", progress=3)),
+        ("an array of numbers for times", lambda: untyped.Flight("square", times="soon")),
+        ("an array of numbers for slots", lambda: untyped.design("cube")),
+        ("a number of extra edges", lambda: untyped.design([[0, 0, 0], [1, 0, 0]], extra="all")),
+        (
+            "an array of numbers for position",
+            lambda: untyped.establish("establish-triangle", "here"),
+        ),
+        ("the text of a mission file", lambda: untyped.Mission.from_toml(3)),
+        ("a dict with the keys of a mission", lambda: untyped.Mission.from_dict([1])),
+        ("a shipped name, a path or a Mission", lambda: untyped.Sweep.of(3, [])),
+        (
+            "a list of variations",
+            lambda: untyped.Sweep.of("square", "agents.mass.* *= normal(1, 0.1)"),
+        ),
+    ],
+)
+def test_what_is_no_argument(words, use):
+    """Wrong types are refused at once, in one sentence."""
+    with pytest.raises(TypeError) as caught:
+        use()
+    assert words in str(caught.value)
+    assert "is asked for, but" in str(caught.value)
+    assert "\n" not in str(caught.value)

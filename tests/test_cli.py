@@ -352,6 +352,13 @@ def test_new_into_no_folder(capsys):
     assert "there is no folder" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("name", ["/", "."])
+def test_new_where_a_folder_is(capsys, name):
+    """It is bad input, and no fault of the program."""
+    assert cli.main(["new", name, "--quiet"]) == codes.BAD_INPUT
+    assert f"{name}: is a folder" in capsys.readouterr().err
+
+
 def test_new_asks_on_a_terminal(folder):
     """On a terminal a few questions are asked; an answer that cannot be is asked for again."""
     answers = ["asked", "polgon", "polygon", "2", "7", "", "x", "2", "1 2", "10, 5 9"]

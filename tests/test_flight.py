@@ -5,6 +5,8 @@ import pytest
 
 import rigidfleet as rf
 from rigidfleet.errors import FlightError, MissionError
+from rigidfleet.mission import Mission
+from rigidfleet.mission.schema import Reshape
 
 FLY = {"kind": "fly", "position": [8.0, 0.0, 12.0], "duration": 8.0}
 
@@ -147,3 +149,122 @@ def test_what_makes_no_sense_is_refused():
     for wrong in (0.0, -1.0, float("nan")):
         with pytest.raises(ValueError, match="duration must be positive"):
             flight.advance(wrong)
+    with pytest.raises(TypeError, match="a duration"):
+        flight.advance("1")  # ty: ignore[invalid-argument-type]
+
+
+def test_a_refused_phase_leaves_the_one_under_way(whole):
+    """What was begun flies on to its end, and the record is that of the mission."""
+    flight = rf.Flight("narrow-passage")
+    flight.begin()
+    flight.advance(2.0)
+    with pytest.raises(MissionError, match="position"):
+        flight.begin(FLY | {"position": [1.0, 2.0]})
+    for wrong in ("hold", 3, [FLY]):
+        with pytest.raises(TypeError, match="a phase"):
+            flight.begin(wrong)  # ty: ignore[invalid-argument-type]
+    with pytest.raises(MissionError, match="no such formation"):
+        flight.begin(Reshape(kind="reshape", name="x", formation="no such", duration=3.0))
+    assert flight.t == 2.0
+    assert not flight.advance()
+    assert flight.t == whole.phases[0].t_end
+
+
+def test_a_phase_begun_and_not_flown_leaves_no_trace():
+    """It has no length, so the record and the next phase know nothing of it."""
+    flight = rf.Flight("narrow-passage")
+    flight.begin()
+    flight.begin(FLY)
+    flight.begin(FLY | {"position": [1.0, 2.0, 10.0]})
+    flight.advance()
+    flight.begin({"kind": "hold", "duration": 1.0})
+    result = flight.finish()
+    assert [p.kind for p in result.mission.phases] == [p.kind for p in result.phases] == ["fly"]
+    assert result.complete
+
+
+def test_a_phase_of_the_mission_that_was_cut_short():
+    """The record's mission has the phase as long as it was flown, and flies the same again."""
+    data = rf.load_mission("square").to_dict()
+    data["phases"].append({"kind": "hold", "duration": 1.0})
+    flight = rf.Flight(Mission.from_dict(data))
+    flight.begin()
+    flight.advance(9.0)
+    while flight.begin():
+        flight.advance()
+    result = flight.finish()
+    assert [p.until for p in result.mission.phases] == [9.0, 10.0]
+    again = rf.simulate(result.mission)
+    np.testing.assert_allclose(again.position[-1], result.position[-1], atol=1e-6)
+
+
+def test_a_flight_whose_controller_failed_is_not_complete():
+    """Its mission did not come to its end."""
+
+    def controller(seen):
+        if seen.t > 7.0:
+            raise RuntimeError("broken")
+        return seen.masses[:, None] * [0.0, 0.0, seen.gravity]
+
+    flight = rf.Flight("single-waypoint", controller=controller)
+    while flight.begin() and flight.phases[-1].control != "tracking":
+        flight.advance()
+    with pytest.raises(FlightError, match="broken"):
+        flight.advance()
+    result = flight.finish()
+    assert not result.complete
+    assert "before the mission's end" in result.ending
+
+
+def test_a_finished_flight_is_over():
+    """It flies no further; its record can be asked for again."""
+    flight = rf.Flight("square")
+    flight.begin()
+    flight.advance(0.5)
+    result = flight.finish()
+    for use in (flight.begin, lambda: flight.begin(FLY), flight.advance, flight.observe):
+        with pytest.raises(FlightError, match="the flight is finished"):
+            use()
+    np.testing.assert_array_equal(flight.finish().time, result.time)
+
+
+def test_the_shortest_of_all_phases():
+    """A phase as long as the least step of a number has one sample."""
+    flight = rf.Flight("square")
+    flight.begin()
+    flight.advance(1.0)
+    for _ in range(2):
+        flight.begin({"kind": "hold", "duration": 1.0})
+        flight.advance(np.spacing(1.0))
+    assert np.all(np.diff(flight.finish().time) > 0.0)
+
+
+def test_names_may_repeat():
+    """The record tells phases of one name apart, whatever they were called."""
+    flight = rf.Flight("square")
+    flight.begin()
+    flight.advance()
+    for name in ("wait", "wait", "wait (2)", "wait"):
+        flight.begin({"kind": "hold", "name": name, "duration": 1.0})
+        flight.advance()
+    result = flight.finish()
+    names = ["establish 1", "wait", "wait (3)", "wait (2)", "wait (4)"]
+    assert [p.name for p in result.mission.phases] == [p.name for p in result.phases] == names
+
+
+def test_an_orbit_left_on_the_way_leads_nowhere_else():
+    """A hold after it comes back to where the orbit was left, as it does in the record's mission."""
+    flight = rf.Flight("narrow-passage")
+    flight.begin()
+    flight.advance()
+    flight.begin(
+        {"kind": "orbit", "centre": [5, 5, 8], "radius": 4, "rate_deg_s": 20, "duration": 30}
+    )
+    flight.advance(8.0)
+    left = flight.pose()
+    flight.begin({"kind": "hold", "duration": 10.0})
+    flight.advance()
+    result = flight.finish()
+    np.testing.assert_allclose(result.cm[-1], left.r, atol=1e-2)
+    again = rf.simulate(result.mission)
+    np.testing.assert_allclose(again.position[-1], result.position[-1], atol=1e-4)

@@ -55,6 +55,20 @@ def test_old_words_of_sweep_files(tmp_path, line, key, new):
     assert finding.remedy == f"it is now called '{new}'"
 
 
+@pytest.mark.parametrize("kind", ["choice", "grid"])
+@pytest.mark.parametrize(
+    ("path", "key", "word"),
+    [("phases.1.control", "control", "slots"), ("formations.triangle.edges", "edges", "tree")],
+)
+def test_old_words_of_variations(kind, path, key, word):
+    """They are refused before anything flies, not run by run."""
+    with pytest.raises(SweepError) as caught:
+        Sweep.of("establish-triangle", [f"{path} = {kind}('complete', '{word}')"], runs=2)
+    (finding,) = caught.value.findings
+    assert finding.value == word
+    assert finding.remedy == f"it is called '{RENAMED[key, word]}' now"
+
+
 def test_old_options(capsys):
     """Of the command: not a guess at another option, but the new name."""
     assert cli.main(["sweep", "establish-triangle", "--vary", VARY[0], "--ends"]) == codes.BAD_INPUT

@@ -27,9 +27,9 @@ def replacing(path: str | Path, *, private: bool = False) -> Generator[IO[bytes]
         The file cannot be written. An old file is unchanged.
     """
     target = Path(os.path.realpath(path))  # replaces the target of a symbolic link, not the link
-    part = target.with_name(f".{target.name[:200]}.{secrets.token_hex(4)}.part")
     if target.is_dir():
         raise IsADirectoryError
+    part = target.with_name(f".{target.name[:200]}.{secrets.token_hex(4)}.part")
     mode = 0o600 if private else 0o666
     try:
         with open(part, "xb", opener=lambda name, flags: os.open(name, flags, mode)) as file:

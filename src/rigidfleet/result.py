@@ -40,6 +40,7 @@ from rigidfleet.typing import Bools, Floats, Ints
 
 if TYPE_CHECKING:
     from rigidfleet.mission import Mission
+from rigidfleet._arguments import as_path
 from rigidfleet._files import why_not, write_file
 
 #: Version of the file format. Files of any other version are rejected.
@@ -467,7 +468,7 @@ class Result:
         ResultError
             The file cannot be written.
         """
-        write_file(Path(path), self._netcdf())
+        write_file(as_path(path), self._netcdf())
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -478,7 +479,7 @@ class Result:
         ResultError
             The file does not exist, is not a result, is damaged, or has another format version.
         """
-        path = Path(path)
+        path = as_path(path)
         data = _read(path)
         try:
             return cls(**_parse(path, data))
@@ -512,7 +513,7 @@ class Result:
             angle = "" if np.isnan(yaw[k]) else f"{yaw[k]:.6f}"
             t = self.time[k]
             lines += [row(t, i, *s, angle) for i, s in enumerate(state[k].tolist(), start=1)]
-        write_file(Path(path), "".join(lines).encode())
+        write_file(as_path(path), "".join(lines).encode())
 
     def _netcdf(self) -> bytes:
         """Build the content of the file in memory, so that a full disk is an ordinary write error, not one of HDF5."""

@@ -70,6 +70,8 @@ def new(
     if not (asked or quiet or json) and sys.stdin.isatty() and console.err().is_terminal:
         name, asked = _ask(name)
     file = Path(name or "mission")
+    if not file.name:
+        raise RigidfleetError(f"{file}: is a folder. Name a file.")
     file = file if file.suffix == ".toml" else file.with_name(f"{file.name}.toml")
     if file.exists() and not force:
         raise RigidfleetError(f"{file}: already exists; use --force to overwrite.")

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from pydantic import PrivateAttr
 
+from rigidfleet._arguments import as_path
 from rigidfleet._toml import to_toml
 from rigidfleet.errors import Finding, MissionError, wrong_type
 from rigidfleet.formation.assignment import assigned
@@ -79,6 +80,8 @@ class Mission(Contents):
         MissionError
             With a finding for each error.
         """
+        if not isinstance(text, str):
+            raise wrong_type("the text of a mission file", text)
         mission = cls.model_construct(**check(parse_toml(text, origin), origin))
         mission._text, mission._origin = text, origin
         return mission
@@ -92,6 +95,8 @@ class Mission(Contents):
         MissionError
             With a finding for each error.
         """
+        if not isinstance(data, Mapping):
+            raise wrong_type("a dict with the keys of a mission", data)
         try:
             text = to_toml(data)
         except TypeError as error:
@@ -418,6 +423,7 @@ def read_text(path: str | Path) -> str:
         The file cannot be read.
     """
     origin = str(path)
+    as_path(path)  # a number would be an open file
     try:
         with open(path, "rb") as file:
             data = file.read(bounds.BYTES + 1)

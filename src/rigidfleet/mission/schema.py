@@ -538,6 +538,8 @@ class AnyPhase(Part):
     shapes: ClassVar[bool] = False
     #: Whether the phase moves the virtual body to a goal of its own, which needs feedback control.
     moves: ClassVar[bool] = False
+    #: Whether a phase may be left anywhere, with its goal there. Other phases keep their goal for the next one.
+    goal_moves: ClassVar[bool] = False
     #: Default control in architecture "body".
     body_control: ClassVar[str] = "body"
 
@@ -769,6 +771,7 @@ class Orbit(AnyPhase):
     """Circle a point on a horizontal circle at a constant rate, and leave the circle with the velocity there."""
 
     moves: ClassVar[bool] = True
+    goal_moves: ClassVar[bool] = True
     body_control: ClassVar[str] = "tracking"
 
     kind: Literal["orbit"] = Field(description="circle a point")

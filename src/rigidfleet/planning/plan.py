@@ -160,12 +160,14 @@ class PhasePlan:
     def reached(self, t: float, y: Floats, w: Workspace) -> PhaseState:
         """The state that the next phase starts from, after an evaluation at time t [s] and state y (n,) in ``w``."""
         n, m = len(self.before.r), len(self.edges)
-        frame, pose = self.before.frame, None
+        frame, pose, goal = self.before.frame, None, self.goal
         if self.frame is not None:
             q = y[6 * n + m : 6 * n + m + 4]
             frame = att.dcm_from_quaternion(q / np.linalg.norm(q))
         if self.problem.control.kind == TRACKING:
             pose = Pose(w.body[0].copy(), w.body[1].copy(), w.T_ref.copy(), w.body[3].copy())
+        if self.phase.goal_moves and pose is not None and goal is not None and t < self.t_end:
+            goal = replace(pose, T=pose.T if self.phase.turns_away else goal.T, named=goal.named)
         return replace(
             self.before,
             t=t,
@@ -177,7 +179,7 @@ class PhasePlan:
             formation=self.formation,
             slots=self.slots,
             pose=pose,
-            goal=self.goal,
+            goal=goal,
         )
 
 

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
+from rigidfleet._arguments import as_path
 from rigidfleet.errors import ResultError
 from rigidfleet.plotting.curves import (
     attitude,
@@ -150,16 +151,17 @@ def plot(
         A file cannot be written, or the mission inside the result cannot be read.
     """
     result = as_result(result)
+    target = None if folder is None else as_path(folder)
     formats = _known("format", formats, FORMATS)
     names = _known("figure", figure_names(result) if names is None else names, _FIGURES)
     drawn, paths = Figures(), []
     for name in names:
         with shown_titles(shown=titles):
             figure = _FIGURES[name](result)
-        if folder is None:
+        if target is None:
             drawn.append(figure)
         else:
-            paths += write_figure(figure, Path(folder), name, formats, close=not titles)
+            paths += write_figure(figure, target, name, formats, close=not titles)
     return drawn if folder is None else paths
 
 

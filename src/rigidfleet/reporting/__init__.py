@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rigidfleet._arguments import as_path
 from rigidfleet._files import write_file
 from rigidfleet.errors import wrong_type
 from rigidfleet.result import Result, as_result
@@ -44,7 +45,8 @@ def report(
     ValueError
         There is no result, or the number of labels or verdicts differs from that of results.
     """
-    write_file(Path(path), html_page(results, labels=labels, verdicts=verdicts).encode())
+    target = as_path(path)
+    write_file(target, html_page(results, labels=labels, verdicts=verdicts).encode())
 
 
 def html_page(

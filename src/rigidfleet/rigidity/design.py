@@ -15,6 +15,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rigidfleet._arguments import numbers
+from rigidfleet.errors import wrong_type
 from rigidfleet.formation.distance_geometry import dimension, distances
 from rigidfleet.formation.graphs import complete_graph, henneberg, henneberg_multilevel, neighbours
 from rigidfleet.rigidity import full_rank, jacobian, rigid_motions
@@ -65,7 +67,7 @@ def design(
     ValueError
         Two slots coincide; or no edges within range hold the shape (the message gives a sufficient range).
     """
-    p = np.asarray(slots, dtype=np.float64)
+    p = numbers("slots [m]", slots)
     flat = _flat(p)
     n, d = flat.shape
     edges = complete_graph(n)
@@ -73,6 +75,8 @@ def design(
     if (length <= 1e-9 * length.max(initial=0.0)).any():
         i, j = edges[length.argmin()] + 1
         raise ValueError(f"slots {i} and {j} coincide")
+    if not (extra == "complete" or isinstance(extra, int | np.integer)):
+        raise wrong_type("a number of extra edges, or 'complete',", extra)
     if extra != "complete" and extra < 0:
         raise ValueError(f"extra must be >= 0 or 'complete', not {extra}")
     reach = np.inf if sensing_range is None else sensing_range * (1 + 1e-9)

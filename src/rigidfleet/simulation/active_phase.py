@@ -96,6 +96,11 @@ class ActivePhase:
         return self.t >= self.plan.t_end
 
     @property
+    def flew(self) -> bool:
+        """Whether anything of the phase was flown, or was to be when the flight stopped."""
+        return self.begun or self.t > self.plan.start
+
+    @property
     def place(self) -> Place:
         """The current state of the phase, for a diagnosis."""
         return Place(self.plan, self.t, self.state, self.workspace, self.solver)

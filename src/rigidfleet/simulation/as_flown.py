@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from rigidfleet.errors import MissionError
+from rigidfleet.errors import Finding, MissionError, wrong_type
 from rigidfleet.mission import Mission, Phase
+from rigidfleet.mission.findings import near
+from rigidfleet.mission.schema import KINDS
 from rigidfleet.result import PhaseRecord
 
 
@@ -50,23 +51,59 @@ def with_phase(
     """
     data = mission.to_dict()
     if flown:
-        data |= _flown_data(mission, asked, _told_apart(flown), mission.output_step)
+        # Names may repeat: those of phases before are not the new one's business.
+        before = [replace(record, name=f"before {k}") for k, record in enumerate(flown, start=1)]
+        data |= _flown_data(mission, asked, before, mission.output_step)
     else:
         data["phases"] = []
     data["phases"] = [*data["phases"], dict(table)]
     return Mission.from_dict(data, "begin()").phases[-1]
 
 
+def check_formation(mission: Mission, phase: Phase) -> None:
+    """See that a phase is one, and that the mission has its formation.
+
+    Raises
+    ------
+    TypeError
+        It is no phase.
+    MissionError
+        The mission has no such formation, or the formation has no slots to track.
+    """
+    if not isinstance(phase, tuple(KINDS.values())):
+        raise wrong_type(
+            "a phase (a table as in a mission file, or one of a mission's phases)", phase
+        )
+    shaping = phase.shaping
+    if shaping is None:
+        return
+    name, known = shaping.formation, mission.formations
+    if name not in known:
+        remedy = near(name, known) or f"formations: {', '.join(known)}"
+        problem = "there is no such formation"
+        raise MissionError([Finding("begin()", "formation", name, problem, remedy)])
+    if phase.control == "tracking" and mission.formation_slots(name) is None:
+        problem, remedy = (
+            "has no slots to track",
+            "give it a shape or slots, or use another control",
+        )
+        raise MissionError([Finding("begin()", "formation", name, problem, remedy)])
+
+
 def _told_apart(flown: Sequence[PhaseRecord]) -> list[PhaseRecord]:
     """Records of phases with unique names."""
-    seen: Counter[str] = Counter()
+    taken = {record.name for record in flown}
+    seen: set[str] = set()
     records = []
     for record in flown:
-        seen[record.name] += 1
-        count = seen[record.name]
-        records.append(
-            replace(record, name=f"{record.name} ({count})" if count > 1 else record.name)
-        )
+        name, count = record.name, 1
+        while name in seen:
+            count += 1
+            name = f"{record.name} ({count})"
+            if name in taken:  # by a phase of that name
+                name = record.name
+        seen.add(name)
+        records.append(replace(record, name=name))
     return records
 
 

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rigidfleet._arguments import numbers
 from rigidfleet.kernel.compiler.simd import WIDTH
 from rigidfleet.kernel.engine import batch
 from rigidfleet.mission import Mission, Phase, as_mission
@@ -184,7 +185,7 @@ def _alike(mission: Mission, phase: Phase) -> bool:
 
 
 def _starts(name: str, values: ArrayLike, agents: int) -> Floats:
-    starts = np.array(values, dtype=float)
+    starts = numbers(name, values).copy()
     if starts.ndim != 3 or starts.shape[1:] != (agents, 3) or not len(starts):
         raise ValueError(f"{name} must be (B, {agents}, 3) for {agents} agents, not {starts.shape}")
     if not np.isfinite(starts).all():

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigidfleet.errors import FlightError, StoppedError
+from rigidfleet.errors import FlightError, StoppedError, wrong_type
 from rigidfleet.kernel.problem import TRACKING, Motion
 from rigidfleet.math import attitude as att
 from rigidfleet.math import lqr
@@ -22,7 +22,7 @@ from rigidfleet.planning.plan import PhasePlan, plan_phase
 from rigidfleet.planning.reference import PhaseState, Pose
 from rigidfleet.result import PhaseRecord, Result
 from rigidfleet.simulation.active_phase import ActivePhase, Sampler
-from rigidfleet.simulation.as_flown import as_flown, with_phase
+from rigidfleet.simulation.as_flown import as_flown, check_formation, with_phase
 from rigidfleet.simulation.callbacks import Controller, ExternalForce, Force, Observation
 from rigidfleet.simulation.extremes import Extremes
 from rigidfleet.simulation.recording import Piece, assemble
@@ -38,6 +38,7 @@ __all__ = ["Controller", "Flight", "FlightInterrupted", "Observation", "Progress
 _REPORT = 0.1
 #: Angle beyond which the frame no longer agrees with the slots it is attached to [rad].
 _FLIPPED = math.pi / 2
+_FINISHED = "the flight is finished: make another Flight to fly on"
 
 
 @dataclass(frozen=True)
@@ -166,6 +167,11 @@ class Flight:
         self.mission = mission = as_mission(mission)
         if not (isinstance(rate, int | float | np.number) and rate > 0.0):
             raise ValueError(f"the control rate must be positive [Hz], not {rate!r}")
+        for name, function in (("controller", controller), ("progress", progress)):
+            if not (function is None or callable(function)):
+                raise wrong_type(f"a function for {name}", function)
+        if not (force is None or callable(force) or hasattr(force, "address")):
+            raise wrong_type("a function for force", force)
         self.controller, self.rate, self.progress = controller, rate, progress
         self.external = ExternalForce(force, mission.n_agents) if force is not None else None
         asked_for = None if times is None else times_asked(times, mission.latest_end)
@@ -182,6 +188,8 @@ class Flight:
         self._extremes = Extremes(mission)
         self._active: ActivePhase | None = None
         self._asked: list[Phase] = []  # each phase as it was begun
+        self._cut: set[int] = set()  # phases left before their end
+        self._finished = False
         self._following = 0  # index of the mission's next phase
         self._started = self._reported = clock.perf_counter()
         self._count = np.zeros(3, dtype=np.int64)
@@ -242,7 +250,11 @@ class Flight:
             The phase has errors.
         FlightError
             The flight has been finished, or a user's function failed.
+        TypeError
+            It is no phase.
         """
+        if self._finished:
+            raise FlightError(_FINISHED)
         if self.ending:
             return False
         if phase is None:
@@ -250,9 +262,13 @@ class Flight:
                 return False
             phase = self.mission.phases[self._following]
             self._following += 1
-        elif isinstance(phase, Mapping):
-            self._leave(changed=True)
-            phase = with_phase(self.mission, self._asked, self.phases, phase)
+        elif isinstance(
+            phase, Mapping
+        ):  # checked first: a phase under way goes on where it has errors
+            flown = len(self.phases) - (self._active is not None and not self._active.flew)
+            phase = with_phase(self.mission, self._asked[:flown], self.phases[:flown], phase)
+        else:
+            check_formation(self.mission, phase)
         self._leave(changed=True)
         if self._asked:
             self._report(phase, planning=True)
@@ -293,6 +309,8 @@ class Flight:
             The duration is not positive.
         """
         active = self._under_way()
+        if duration is not None and not isinstance(duration, int | float | np.number):
+            raise wrong_type("a duration [s]", duration)
         if duration is not None and not duration > 0.0:
             raise ValueError(f"the duration must be positive [s], not {duration!r}")
         plan = active.plan
@@ -379,17 +397,17 @@ class Flight:
         FlightError
             Nothing has been flown.
         """
-        under_way = self._active is not None
-        cut = under_way and self._asked[-1].settle is None and self.t < self.plan.t_end
         self._leave()
         self.ending = ending or self.ending
         if not self.pieces:
             raise FlightError(self.ending or "the flight ended before the first time to record")
         given = tuple(self.mission.phases)
-        own = tuple(self._asked) == given[: len(self._asked)]
-        whole = own and len(self._asked) == len(given) and not cut
+        last = len(self._asked) - 1
+        own = tuple(self._asked) == given[: last + 1] and self._cut <= {last}
+        whole = own and last + 1 == len(given) and not self._cut
         if own and not whole and not self.ending:
             self.ending = f"ended at t = {self.t:.2f} s, before the mission's end"
+        self._finished = True
         return self.record(self.pieces, None if own else self._asked)
 
     def record(
@@ -426,6 +444,8 @@ class Flight:
     # -- inside -----------------------------------------------------------------------------------
 
     def _under_way(self) -> ActivePhase:
+        if self._finished:
+            raise FlightError(_FINISHED)
         if self._active is None:
             why = self.ending or "call begin first"
             raise FlightError(f"no phase is under way: {why}")
@@ -437,6 +457,11 @@ class Flight:
         if active is None:
             return
         self._active = None
+        if not active.flew:  # as if it had never begun
+            del self.phases[-1], self._asked[-1]
+            return
+        if not (active.settled or active.over):
+            self._cut.add(len(self.phases) - 1)
         active.watch(last=True)
         record = self.phases[-1]
         record.extremes = self._extremes.phase()

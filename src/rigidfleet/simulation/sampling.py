@@ -7,6 +7,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rigidfleet._arguments import numbers
 from rigidfleet.planning.plan import PhasePlan
 from rigidfleet.typing import Floats
 
@@ -34,8 +35,10 @@ class Sampling:
         for exact in (plan.arrival, plan.t_end, stop, *lost[np.isfinite(lost)]):
             if t < exact <= t_end:
                 grid = np.sort(np.append(grid[abs(grid - exact) > 1e-9 * step], exact))
-        start = [t if t == 0.0 else np.nextafter(t, math.inf)] if first else []
-        return np.concatenate([start, grid])
+        if not first:
+            return grid
+        start = t if t == 0.0 else np.nextafter(t, math.inf)
+        return np.append(start, grid[grid > start])
 
 
 def times_asked(times: ArrayLike, end: float) -> Floats:
@@ -46,7 +49,7 @@ def times_asked(times: ArrayLike, end: float) -> Floats:
     ValueError
         A time lies outside the mission.
     """
-    t = np.unique(np.asarray(times, dtype=float))
+    t = np.unique(numbers("times to record [s]", times))
     if not (len(t) and t[0] >= 0.0 and t[-1] <= end * (1.0 + 1e-12)):
         raise ValueError(f"times to record must lie between 0 and the mission's end, {end:g} s")
     return np.unique(np.minimum(t, end))

@@ -18,11 +18,13 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import Field, Strict
 
+from rigidfleet._arguments import as_path
+from rigidfleet._renamed import successor
 from rigidfleet._version import __version__
-from rigidfleet.errors import MissionError, SweepError
+from rigidfleet.errors import MissionError, SweepError, wrong_type
 from rigidfleet.mission import Mission, load_mission, mission_names
 from rigidfleet.mission.findings import FindingCollector, Keys, unknown_key
-from rigidfleet.mission.model import parse_toml, read_text
+from rigidfleet.mission.model import as_mission, parse_toml, read_text
 from rigidfleet.mission.phases import kind, tables
 from rigidfleet.mission.schema import Part
 from rigidfleet.sweep import keypaths
@@ -134,8 +136,9 @@ class Sweep:
         MissionError
             The mission cannot be read or has errors.
         """
-        if not isinstance(mission, Mission):
-            mission = load_mission(mission)
+        mission = as_mission(mission)
+        if isinstance(vary, str | bytes) or not isinstance(vary, Iterable):
+            raise wrong_type("a list of variations", vary)
         data: dict[str, Any] = {"mission": mission.name, "seed": seed, "vary": list(vary)}
         data |= {} if runs is None else {"runs": runs}
         data |= {} if evaluate == "flight" else {"evaluate": evaluate}
@@ -168,7 +171,7 @@ class Sweep:
         MissionError
             The file cannot be read, or its mission has errors.
         """
-        path = Path(path)
+        path = as_path(path)
         origin = str(path)
         data = parse_toml(read_text(path), origin)
         named = data.get("mission")
@@ -382,6 +385,9 @@ def _fits(
         return
     values = getattr(v, "values", None)
     numeric = values is None or all(map(is_number, values))
+    for word in values or ():
+        if remedy := next(filter(None, (successor(keys[-1], word) for keys in places)), ""):
+            notes.add(("vary", k, "values"), "is no value of the mission format", remedy, word)
     for keys in places:
         leaves = keypaths.numbers(keypaths.look_up(whole, keys))
         absent = any(x is None for x in leaves)

@@ -14,6 +14,7 @@ from typing import Any, overload
 
 import numpy as np
 
+from rigidfleet._arguments import as_path
 from rigidfleet._files import write_file
 from rigidfleet.result import Result, as_result
 from rigidfleet.typing import Floats, Ints
@@ -78,7 +79,7 @@ def replay(result: Result | str | Path, path: str | Path | None = None) -> Repla
     page_ = html_page(as_result(result))
     if path is None:
         return Replay(page_)
-    write_file(Path(path), page_.encode())
+    write_file(as_path(path), page_.encode())
     return None
 
 
