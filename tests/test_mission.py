@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rigidfleet._toml import to_toml
+from rigidfleet._common.toml import to_toml
 from rigidfleet.errors import MissionError
 from rigidfleet.formation import distance_geometry, graphs, shapes
 from rigidfleet.mission import (

@@ -5,7 +5,7 @@ from contextlib import closing
 
 import pytest
 
-from rigidfleet._renamed import RENAMED, successor
+from rigidfleet._common.renamed import RENAMED, successor
 from rigidfleet.cli import app as cli
 from rigidfleet.cli import codes
 from rigidfleet.errors import MissionError, ResultError, SweepError

@@ -33,15 +33,15 @@ from typing import (
 
 import numpy as np
 
-from rigidfleet import _markup
+from rigidfleet._common import markup
 from rigidfleet.errors import MissionError, ResultError, wrong_type
 from rigidfleet.math import attitude
 from rigidfleet.typing import Bools, Floats, Ints
 
 if TYPE_CHECKING:
     from rigidfleet.mission import Mission
-from rigidfleet._arguments import as_path
-from rigidfleet._files import why_not, write_file
+from rigidfleet._common.arguments import as_path
+from rigidfleet._common.files import why_not, write_file
 
 #: Version of the file format. Files of any other version are rejected.
 SCHEMA_VERSION = 3
@@ -376,7 +376,7 @@ class Result:
         for quantity, words, unit in worst:
             if (x := self.extreme(quantity)) is not None and math.isfinite(x.value):
                 rows.append((words, f"{x.value:.3g} {unit} at {x.time:.2f} s"))
-        return _markup.shown(name, title, (), rows)
+        return markup.shown(name, title, (), rows)
 
     @property
     def n_agents(self) -> int:
@@ -679,7 +679,7 @@ def _read(path: Path) -> bytes:
 
 def _parse(path: Path, data: bytes) -> dict[str, Any]:
     """Return the arguments of `Result` from the content of a file, checked against their declarations."""
-    from rigidfleet import _reader as reader
+    from rigidfleet._common import reader
 
     due = {
         name: reader.Array(variable.dims, name in _INTEGERS, name in _OPTIONAL)

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from rigidfleet._text import agent_names
+from rigidfleet._common.text import agent_names
 from rigidfleet.assessment.measure import Measurements, angle_between, is_rigid
 from rigidfleet.assessment.outcome import (
     DIP,

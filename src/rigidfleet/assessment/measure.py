@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rigidfleet._text import agent_names
+from rigidfleet._common.text import agent_names
 from rigidfleet.assessment.outcome import (
     SENSE,
     SHAPE_TOLERANCE,

@@ -114,13 +114,13 @@ class Verdict:
 
     def _repr_html_(self) -> str:
         """The verdict as a notebook shows it: the judged checks, then the summary and notes."""
-        from rigidfleet import _markup
+        from rigidfleet._common import markup
         from rigidfleet.assessment.table import check_row
 
         rows = [map(str, check_row(finding)) for finding in self.findings if finding.judged]
         words = "\n".join([self.summary, *(f"Note: {note}." for note in self.notes)])
         heads = ("check", "worst", "limit", "at [s]", "who or where", "")
-        return _markup.shown(self.mission, self.title, heads, rows, words)
+        return markup.shown(self.mission, self.title, heads, rows, words)
 
     def __rich__(self) -> RenderableType:
         from rich.text import Text

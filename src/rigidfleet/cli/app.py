@@ -111,7 +111,7 @@ def _own_fault(error: Exception) -> str:
 
 def _usage(error: CycloptsError) -> str:
     """Message for an invalid command line."""
-    from rigidfleet._renamed import successor
+    from rigidfleet._common.renamed import successor
 
     command = " ".join(("rigidfleet", *(error.command_chain or ()), "--help"))
     text = str(error)

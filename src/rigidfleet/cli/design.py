@@ -61,7 +61,7 @@ def design(
     json : bool
         Print the result as JSON.
     """
-    from rigidfleet._files import write_file
+    from rigidfleet._common.files import write_file
     from rigidfleet.formation.graphs import CUBE_EDGES, REACH, complete_graph
     from rigidfleet.rigidity import design as designs
 
@@ -118,7 +118,7 @@ def _reject(edges: str, reach: float | None, *, searched: bool) -> None:
     ValueError
         The graph is unknown, or --extra, --range or --reach cannot be combined with it.
     """
-    from rigidfleet._renamed import successor
+    from rigidfleet._common.renamed import successor
     from rigidfleet.rigidity.design import GRAPHS
 
     if edges not in GRAPHS:

@@ -45,7 +45,7 @@ def live(
     flown = load_mission(mission)
     if not is_compiled():
         console.err().print(console.COMPILING)
-    from rigidfleet._files import write_file
+    from rigidfleet._common.files import write_file
     from rigidfleet.assessment import assess
     from rigidfleet.web.live import live as fly
 

@@ -58,7 +58,7 @@ def new(
     json : bool
         Print a description of the mission as JSON. Ask no questions.
     """
-    from rigidfleet._files import write_file
+    from rigidfleet._common.files import write_file
     from rigidfleet.mission import Mission, draft
     from rigidfleet.preflight.check import check as preflight
 

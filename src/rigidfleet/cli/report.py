@@ -54,7 +54,7 @@ def report(
     quiet : bool
         Print only errors, and JSON with --json.
     """
-    from rigidfleet._files import write_file
+    from rigidfleet._common.files import write_file
     from rigidfleet.assessment import assess
     from rigidfleet.result import Result
 

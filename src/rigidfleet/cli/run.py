@@ -74,7 +74,7 @@ def run(
     with watch or nullcontext():
         result, interrupted = fly(flown, watch)
 
-    from rigidfleet._files import write_file
+    from rigidfleet._common.files import write_file
     from rigidfleet.assessment import assess
 
     files.make_folder()

@@ -104,7 +104,7 @@ def sweep(
             console.err().print(f"{words}\n{again}", style="yellow", soft_wrap=True)
             return INTERRUPTED
     found = summarise(table)
-    from rigidfleet._files import write_file
+    from rigidfleet._common.files import write_file
 
     write_file(folder / "summary.json", (found.json() + "\n").encode())
     if json:

@@ -11,8 +11,8 @@ from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
 
 from pydantic import ValidationError
 
-from rigidfleet._renamed import successor
-from rigidfleet._toml import toml_key
+from rigidfleet._common.renamed import successor
+from rigidfleet._common.toml import toml_key
 from rigidfleet.errors import Finding
 from rigidfleet.formation.shapes import POLYGONS, SHAPES
 from rigidfleet.mission.schema import Part

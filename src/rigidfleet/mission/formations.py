@@ -8,7 +8,7 @@ from itertools import islice
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigidfleet._text import agent_names
+from rigidfleet._common.text import agent_names
 from rigidfleet.formation import distance_geometry, graphs, shapes
 from rigidfleet.math import proximity
 from rigidfleet.mission import bounds

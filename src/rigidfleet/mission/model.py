@@ -12,8 +12,8 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from pydantic import PrivateAttr
 
-from rigidfleet._arguments import as_path
-from rigidfleet._toml import to_toml
+from rigidfleet._common.arguments import as_path
+from rigidfleet._common.toml import to_toml
 from rigidfleet.errors import Finding, MissionError, wrong_type
 from rigidfleet.formation.assignment import assigned
 from rigidfleet.formation.distance_geometry import distances
@@ -118,7 +118,7 @@ class Mission(Contents):
 
     def _repr_html_(self) -> str:
         """Show the mission in a notebook: its phases, in order."""
-        from rigidfleet import _markup
+        from rigidfleet._common import markup
         from rigidfleet.mission.describe import ending, goal
 
         rows = [
@@ -126,7 +126,7 @@ class Mission(Contents):
             for n, phase in enumerate(self.phases, start=1)
         ]
         heads = ("#", "phase", "kind", "to", "ends", "control")
-        return _markup.shown(self.name, self.title, heads, rows, self.size_in_words)
+        return markup.shown(self.name, self.title, heads, rows, self.size_in_words)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the mission as a dictionary, as written. Edit it and pass it to `Mission.from_dict`."""

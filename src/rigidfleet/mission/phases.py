@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from rigidfleet._text import agent_names
-from rigidfleet._toml import toml_key
+from rigidfleet._common.text import agent_names
+from rigidfleet._common.toml import toml_key
 from rigidfleet.formation import distance_geometry
 from rigidfleet.math import rigid_body
 from rigidfleet.mission import bounds

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
-from rigidfleet._arguments import as_path
+from rigidfleet._common.arguments import as_path
 from rigidfleet.errors import ResultError
 from rigidfleet.plotting.curves import (
     attitude,

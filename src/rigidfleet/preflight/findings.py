@@ -7,8 +7,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from rigidfleet import _markup
-from rigidfleet._text import agent_names
+from rigidfleet._common import markup
+from rigidfleet._common.text import agent_names
 from rigidfleet.planning import solvers
 from rigidfleet.planning.preview import PlannedPhase
 from rigidfleet.rigidity import (
@@ -186,7 +186,7 @@ class Preflight:
         """Show the check in a notebook: facts, then remarks."""
         rows = [*self.describe(), *((remark.level, remark.text) for remark in self.remarks)]
         verdict = "no problems found" if self.passed else "the flight will fail"
-        return _markup.shown("Check", verdict, ("about", "result"), rows)
+        return markup.shown("Check", verdict, ("about", "result"), rows)
 
     def describe(self) -> Iterator[tuple[str, str]]:
         """Facts, each with its heading: formations, gains, planned paths. `remarks` are separate."""

@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from rigidfleet._text import agent_names
+from rigidfleet._common.text import agent_names
 from rigidfleet.formation import distance_geometry
 from rigidfleet.mission import Mission
 from rigidfleet.planning import solvers

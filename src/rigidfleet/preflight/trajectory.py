@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from rigidfleet._text import agent_names
+from rigidfleet._common.text import agent_names
 from rigidfleet.formation import assignment, distance_geometry
 from rigidfleet.math import lqr, proximity
 from rigidfleet.mission import Box, Ground, Mission

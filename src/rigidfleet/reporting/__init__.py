@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rigidfleet._arguments import as_path
-from rigidfleet._files import write_file
+from rigidfleet._common.arguments import as_path
+from rigidfleet._common.files import write_file
 from rigidfleet.errors import wrong_type
 from rigidfleet.result import Result, as_result
 

@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigidfleet._arguments import numbers
+from rigidfleet._common.arguments import numbers
 from rigidfleet.errors import wrong_type
 from rigidfleet.formation.distance_geometry import dimension, distances
 from rigidfleet.formation.graphs import complete_graph, henneberg, henneberg_multilevel, neighbours
@@ -141,7 +141,7 @@ def mission_fragment(
     The name is quoted if TOML requires it. Slots keep all digits, because flat shapes need them. ``edges`` may
     be one of `GRAPHS`.
     """
-    from rigidfleet._toml import toml_key
+    from rigidfleet._common.toml import toml_key
 
     p = np.asarray(slots, dtype=np.float64) + 0.0  # no -0.0
     lines = [f"[formations.{toml_key(name)}]", "slots = ["]

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rigidfleet._arguments import numbers
+from rigidfleet._common.arguments import numbers
 from rigidfleet.kernel.compiler.simd import WIDTH
 from rigidfleet.kernel.engine import batch
 from rigidfleet.mission import Mission, Phase, as_mission

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigidfleet._arguments import numbers
+from rigidfleet._common.arguments import numbers
 from rigidfleet.planning.plan import PhasePlan
 from rigidfleet.typing import Floats
 

@@ -18,8 +18,8 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import Field, Strict
 
-from rigidfleet._arguments import as_path
-from rigidfleet._renamed import successor
+from rigidfleet._common.arguments import as_path
+from rigidfleet._common.renamed import successor
 from rigidfleet._version import __version__
 from rigidfleet.errors import MissionError, SweepError, wrong_type
 from rigidfleet.mission import Mission, load_mission, mission_names

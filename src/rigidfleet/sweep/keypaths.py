@@ -12,7 +12,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
-from rigidfleet._toml import toml_key
+from rigidfleet._common.toml import toml_key
 from rigidfleet.mission import Mission
 from rigidfleet.mission.findings import Keys, model_of
 from rigidfleet.mission.schema import Part

@@ -21,7 +21,7 @@ from numba.core.caching import (
 )
 from numba.core.ccallback import CFunc
 
-from rigidfleet._files import replacing
+from rigidfleet._common.files import replacing
 from rigidfleet.kernel.compiler.cache import cache_directory, not_kept, opened
 
 F = TypeVar("F", bound=Callable[..., Any])

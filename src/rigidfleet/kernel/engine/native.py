@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import llvmlite.binding as llvm
 import numpy as np
 
-from rigidfleet._files import replacing
+from rigidfleet._common.files import replacing
 from rigidfleet.kernel.compiler.cache import cache_directory, not_kept, opened, told
 from rigidfleet.kernel.engine.objects import (
     ELSEWHERE,

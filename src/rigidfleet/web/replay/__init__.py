@@ -14,8 +14,8 @@ from typing import Any, overload
 
 import numpy as np
 
-from rigidfleet._arguments import as_path
-from rigidfleet._files import write_file
+from rigidfleet._common.arguments import as_path
+from rigidfleet._common.files import write_file
 from rigidfleet.result import Result, as_result
 from rigidfleet.typing import Floats, Ints
 from rigidfleet.web.replay.pack import PackedColumn, pack
