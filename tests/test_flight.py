@@ -268,3 +268,15 @@ def test_an_orbit_left_on_the_way_leads_nowhere_else():
     np.testing.assert_allclose(result.cm[-1], left.r, atol=1e-2)
     again = rf.simulate(result.mission)
     np.testing.assert_allclose(again.position[-1], result.position[-1], atol=1e-4)
+
+
+def test_a_step_can_be_left():
+    """A phase whose distances jump has no blend: phases of one's own follow it, and the record has them."""
+    flight = rf.Flight("line-singular")
+    flight.begin()
+    flight.advance(3.0)
+    flight.begin({"kind": "hold", "control": "open", "duration": 2.0})
+    flight.advance()
+    result = flight.finish()
+    assert [p.kind for p in result.mission.phases] == ["establish", "hold"]
+    assert [p.name for p in result.mission.phases] == [p.name for p in result.phases]

@@ -12,7 +12,9 @@ import pytest
 from sample_flights import swarm
 
 from rigidfleet.errors import ResultError
+from rigidfleet.mission import Mission, load_mission
 from rigidfleet.plotting import agent_colours
+from rigidfleet.simulation.flight import simulate
 from rigidfleet.web.replay import html_page, replay
 from rigidfleet.web.replay.pack import PackedColumn, pack
 from rigidfleet.web.replay.page import bundle, read
@@ -253,6 +255,14 @@ def test_incomplete():
 
 
 # -- the file
+
+
+@pytest.mark.filterwarnings("error")
+def test_one_vehicle_left():
+    """Nothing is near it, and nobody is warned of that."""
+    data = load_mission("two-agents").to_dict()
+    data["disturbances"] = {"lost": [{"agent": 1, "time": 1.5}]}
+    assert len(replay(simulate(Mission.from_dict(data))).html) > 10_000
 
 
 def test_file(tmp_path):

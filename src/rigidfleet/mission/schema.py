@@ -663,8 +663,9 @@ class Shaping(AnyPhase):
         return self.formation
 
     def ended(self, length: float) -> dict[str, Any]:
-        """The formation, and a blend that is not longer than the phase."""
-        return {"formation": self.formation, "blend": min(self.blend, length)}
+        """The formation, and a blend that is not longer than the phase; a step has none."""
+        told = {"formation": self.formation}
+        return told if self.reference == "step" else told | {"blend": min(self.blend, length)}
 
 
 class Establish(Attitude, Shaping):

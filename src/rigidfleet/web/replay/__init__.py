@@ -125,7 +125,8 @@ def _sampled(result: Result, values: Floats, time: Floats) -> Floats:
     share = (time - result.time[k]) / (result.time[k + 1] - result.time[k])
     share = share.reshape(-1, *(1,) * (values.ndim - 1))
     low, high = values[k], values[k + 1]
-    between = (1.0 - share) * low + share * high
+    with np.errstate(invalid="ignore"):  # a separation is infinite where one vehicle is left
+        between = (1.0 - share) * low + share * high
     return np.where(np.isfinite(between), between, np.where(share < 1.0, low, high))
 
 
