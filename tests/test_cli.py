@@ -242,7 +242,7 @@ def test_check_figure(capsys):
     assert cli.main(["check", "square", "--figure", "graph.svg"]) == codes.PASSED
     assert "flex-1-" in Path("graph.svg").read_text(encoding="utf-8")
     assert cli.main(["check", "square", "--figure", "graph.gif"]) == codes.BAD_INPUT
-    assert "graph.gif: no format" in capsys.readouterr().err
+    assert "graph.gif: the name has no figure format" in capsys.readouterr().err
 
 
 WRONG = TRIANGLE.replace("mass = 1.0", "mass = -1").replace("size = 4.0", "size = nan\ncolour = 3")

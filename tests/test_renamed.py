@@ -66,7 +66,7 @@ def test_old_words_of_variations(kind, path, key, word):
         Sweep.of("establish-triangle", [f"{path} = {kind}('complete', '{word}')"], runs=2)
     (finding,) = caught.value.findings
     assert finding.value == word
-    assert finding.remedy == f"it is called '{RENAMED[key, word]}' now"
+    assert finding.remedy == f"it is now called '{RENAMED[key, word]}'"
 
 
 def test_old_options(capsys):
