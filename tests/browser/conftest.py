@@ -24,13 +24,13 @@ def show(browser, tmp_path_factory) -> Callable[..., Browser]:
     from rigidfleet.web.replay import replay
 
     folder = tmp_path_factory.mktemp("pages")
-    written: dict[int, Path] = {}
+    written: dict[int, tuple[Any, Path]] = {}  # with the result, whose id nobody else has meanwhile
 
     def shown(result: Any, where: str = "t=0") -> Browser:
         if id(result) not in written:
-            written[id(result)] = folder / f"{len(written)}.html"
-            replay(result, written[id(result)])
-        browser.open(f"{written[id(result)].as_uri()}#{where}")
+            written[id(result)] = result, folder / f"{len(written)}.html"
+            replay(*written[id(result)])
+        browser.open(f"{written[id(result)][1].as_uri()}#{where}")
         return browser
 
     return shown
