@@ -54,7 +54,7 @@ def test_notebook(path, tmp_path, monkeypatch, shell):
     for code in cells(path):
         assert not code.startswith("%")
         printed, outputs = ran(shell, code)
-        drawn = code.splitlines()[-1].startswith("figures.")
+        drawn = code.splitlines()[-1].startswith("plotting.")
         assert any("image/png" in data for data in outputs) == drawn, code
         out += printed
         shown += outputs
