@@ -76,7 +76,7 @@ def design(
         i, j = edges[length.argmin()] + 1
         raise ValueError(f"slots {i} and {j} coincide")
     if not (extra == "complete" or isinstance(extra, int | np.integer)):
-        raise wrong_type("a number of extra edges, or 'complete',", extra)
+        raise wrong_type("a number of extra edges or 'complete'", extra)
     if extra != "complete" and extra < 0:
         raise ValueError(f"extra must be >= 0 or 'complete', not {extra}")
     reach = np.inf if sensing_range is None else sensing_range * (1 + 1e-9)
