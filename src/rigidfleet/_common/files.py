@@ -19,7 +19,7 @@ def replacing(path: str | Path, *, private: bool = False) -> Generator[IO[bytes]
     Parameters
     ----------
     path : path of the file
-    private : whether only this user can read it
+    private : whether only this user can read it: a file of a cache, which need not outlive a power failure
 
     Raises
     ------
@@ -35,7 +35,8 @@ def replacing(path: str | Path, *, private: bool = False) -> Generator[IO[bytes]
         with open(part, "xb", opener=lambda name, flags: os.open(name, flags, mode)) as file:
             yield file
             file.flush()
-            os.fsync(file.fileno())
+            if not private:
+                os.fsync(file.fileno())
         os.replace(part, target)
     except BaseException:
         part.unlink(missing_ok=True)

@@ -251,7 +251,7 @@ def obstacle_clearances(
     return least.T, nearest.T
 
 
-#: See `_TRIED`.
+#: Number of points up to which all distances are compared: importing what finds neighbours faster takes longer.
 _FEW = 400
 
 

@@ -32,7 +32,7 @@ def as_flown(
     data["name"] = f"{mission.name.removesuffix('-live')}-live"
     data["title"] = f"{mission.title or mission.name}, flown by hand"
     as_given = dict(data)
-    data |= _flown_data(mission, asked, records, step)
+    data |= _flown_data(mission, data, asked, records, step)
     try:
         return Mission.from_dict(data), records
     except MissionError:
@@ -53,7 +53,7 @@ def with_phase(
     if flown:
         # Names may repeat: those of phases before are not the new one's business.
         before = [replace(record, name=f"before {k}") for k, record in enumerate(flown, start=1)]
-        data |= _flown_data(mission, asked, before, mission.output_step)
+        data |= _flown_data(mission, data, asked, before, mission.output_step)
     else:
         data["phases"] = []
     data["phases"] = [*data["phases"], dict(table)]
@@ -108,9 +108,13 @@ def _told_apart(flown: Sequence[PhaseRecord]) -> list[PhaseRecord]:
 
 
 def _flown_data(
-    mission: Mission, asked: Sequence[Phase], records: Sequence[PhaseRecord], step: float
+    mission: Mission,
+    given: Mapping[str, Any],
+    asked: Sequence[Phase],
+    records: Sequence[PhaseRecord],
+    step: float,
 ) -> dict[str, Any]:
-    """The data of a mission file, with these phases in place of its own."""
+    """What differs from the data ``given`` for a mission, with these phases in place of its own."""
     data: dict[str, Any] = {}
     end = records[-1].t_end
     data["output_step"] = min(step, end)
@@ -119,7 +123,7 @@ def _flown_data(
         data["assignment"] = "given"
         data["formations"] = {name: _written_out(mission, name) for name in mission.formations}
     data["phases"] = [_written(*each) for each in zip(asked, records, strict=True)]
-    disturbed = mission.to_dict().get("disturbances", {})
+    disturbed = given.get("disturbances", {})
     if "lost" in disturbed:
         left = [lost for lost in disturbed["lost"] if lost["time"] < end]
         data["disturbances"] = disturbed | {"lost": left}

@@ -210,22 +210,13 @@ class Pilot:
 
     def _take(self, formation: str, *, establish: bool = False) -> None:
         """Establish a formation, or change to it."""
+        common: dict[str, Any] = {"formation": formation, "blend": _BLEND, "duration": _ENDLESS}
         if establish:
-            control = "open" if self.by_body else "tracking"
-            self._begin(
-                Establish(
-                    kind="establish", name=f"establish {formation}", formation=formation, blend=_BLEND,
-                    duration=_ENDLESS, control=control,
-                )
-            )  # fmt: skip
-            return
-        control = "body" if self.by_body else "tracking"
-        self._begin(
-            Reshape(
-                kind="reshape", name=f"change to {formation}", formation=formation, blend=_BLEND,
-                duration=_ENDLESS, control=control,
-            )
-        )  # fmt: skip
+            common["control"] = "open" if self.by_body else "tracking"
+            self._begin(Establish(kind="establish", name=f"establish {formation}", **common))
+        else:
+            common["control"] = "body" if self.by_body else "tracking"
+            self._begin(Reshape(kind="reshape", name=f"change to {formation}", **common))
 
     def _hold(self) -> None:
         self._begin(Hold(kind="hold", name="by hand", duration=_ENDLESS, control="body"))
