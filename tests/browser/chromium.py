@@ -34,7 +34,7 @@ class Browser:
             options.add_argument(flag)
         options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
         self.driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(DRIVER))
-        self.driver.set_script_timeout(30)
+        self.driver.set_script_timeout(60)
 
     def open(self, url: str, ready: str = "window.replay") -> None:
         """Load a page afresh, and wait for it."""
@@ -46,7 +46,7 @@ class Browser:
     def run(self, script: str, *args: Any) -> Any:
         return self.driver.execute_script(script, *args)
 
-    def wait(self, condition: str, seconds: float = 20.0) -> None:
+    def wait(self, condition: str, seconds: float = 60.0) -> None:
         """Wait until a script returns true."""
         end = time.monotonic() + seconds
         while not self.run(condition):

@@ -38,7 +38,7 @@ def page(session, browser) -> Iterator[Browser]:
         browser.driver.get("about:blank")
 
 
-def until(condition, seconds: float = 15.0) -> None:
+def until(condition, seconds: float = 60.0) -> None:
     end = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end
