@@ -15,11 +15,12 @@ import numpy as np
 from rigidfleet.errors import MissionError
 from rigidfleet.formation.graphs import count_within
 from rigidfleet.formation.shapes import SHAPES
-from rigidfleet.mission import bounds, disturbances, formations, phases
+from rigidfleet.mission import bounds, disturbances, formations, phases, vehicles
 from rigidfleet.mission.findings import FindingCollector, Keys, near_shape
 from rigidfleet.mission.schema import (
     Agents,
     Allocation,
+    Autopilot,
     BodyFrame,
     Box,
     Constraint,
@@ -47,6 +48,7 @@ _TABLES: dict[str, type[Part]] = {
     "integrator": IntegratorOptions,
     "body_frame": BodyFrame,
     "limits": Limits,
+    "autopilot": Autopilot,
     "disturbances": Disturbances,
 }
 _OBSTACLES: dict[str, type[Part]] = {"box": Box, "ground": Ground}
@@ -74,6 +76,7 @@ def check(data: Mapping[str, Any], origin: str) -> dict[str, Any]:
         _touching(notes, parts, n)
     parts["phases"] = phases.check(notes, parts, n)
     disturbances.check(notes, parts, n)
+    vehicles.check_flight(notes, parts)
     if notes.findings:
         raise MissionError(notes.findings)
     return parts
@@ -115,9 +118,13 @@ def _tables(notes: FindingCollector) -> dict[str, Any]:
     own = {key: value for key, value in notes.data.items() if key in MissionHeader.model_fields}
     header = notes.validate(MissionHeader, own, ())
     parts = {key: getattr(header, key) for key in MissionHeader.model_fields} if header else {}
+    models = vehicles.check(notes)
+    parts["vehicles"] = models
     for key, kind in _TABLES.items():
         if key in notes.data:
-            data = notes.data[key] if key != "agents" else _placed(notes, notes.data[key])
+            data = notes.data[key]
+            if key == "agents":
+                data = vehicles.equipped(notes, _placed(notes, data), models)
             part = None if data is None else notes.validate(kind, data, (key,))
             parts |= {key: part} if part is not None else {}
     if "agents" not in notes.data:

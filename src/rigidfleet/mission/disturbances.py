@@ -62,13 +62,29 @@ def check(notes: FindingCollector, parts: Mapping[str, Any], n: int | None) -> N
         notes.add((_TABLE, "drag"), problem, "give a drag > 0 [N s/m] or omit it")
     if found.gusts is not None:
         _gusts(notes, found.gusts, wind, n)
-    silent = found.noise is not None and not (found.noise.position or found.noise.velocity)
-    if silent and notes.right((_TABLE, "noise"), "position", "velocity"):
-        notes.add((_TABLE, "noise"), "is zero", "give position [m] or velocity [m/s] > 0")
+    _noise(notes, found)
     end = latest_end(parts["phases"]) if notes.right((), "phases") else None
     _lost(notes, found, parts, n, end)
     if end is not None and n is not None and not notes.findings:
         _size(notes, found, wind, n, end)
+
+
+def _noise(notes: FindingCollector, found: Disturbances) -> None:
+    """Check that noise has an effect, and that only sampled flights have delays."""
+    noise, where = found.noise, (_TABLE, "noise")
+    keys = ("position", "velocity", "delay", "dropped")
+    silent = noise is not None and not any(getattr(noise, key) for key in keys)
+    if silent and notes.right(where, *keys):
+        notes.add(where, "is zero", "give position [m] or velocity [m/s] > 0")
+    if "vehicle" in notes.data.get("agents", {}):
+        return
+    remedy = "give the agents a vehicle; model = 'point' flies points with sampled control"
+    late = [] if noise is None else [k for k in ("delay", "dropped") if getattr(noise, k)]
+    for key in late:
+        notes.add((*where, key), "needs sampled control, which only vehicles have", remedy)
+    if found.links is not None:
+        problem = "needs sampled control, which only vehicles have"
+        notes.add((_TABLE, "links"), problem, remedy, None)
 
 
 def _gusts(notes: FindingCollector, gusts: Gusts, wind: float, n: int | None) -> None:

@@ -31,6 +31,7 @@ from rigidfleet.mission.schema import (
     Phase,
     Start,
 )
+from rigidfleet.mission.vehicles import VehicleModel, resolve
 from rigidfleet.typing import Bools, Floats, Ints
 
 _SHIPPED = resources.files("rigidfleet") / "missions"
@@ -326,6 +327,14 @@ class Mission(Contents):
         return fleet
 
     @cached_property
+    def vehicle_models(self) -> list[VehicleModel] | None:
+        """The vehicle of each agent; None if all are point masses that give any force at once."""
+        if not self.agents.vehicle:
+            return None
+        found = {name: resolve(vehicle) for name, vehicle in self.vehicles.items()}
+        return [found[name] for name in self.agents.vehicle]
+
+    @cached_property
     def true_mass(self) -> Floats:
         """True mass (N,) [kg] of each vehicle. The control laws use `agents.mass`."""
         error = self.disturbances.mass_error if self.disturbances is not None else 0.0
@@ -333,7 +342,12 @@ class Mission(Contents):
 
     @cached_property
     def drag(self) -> Floats:
-        """Drag coefficient (N,) of each vehicle: force per velocity relative to the air [N s/m]."""
+        """Drag coefficient (N,) of each vehicle: force per velocity relative to the air [N s/m].
+
+        Of a quadrotor it is the drag across its rotors' axes near hover.
+        """
+        if self.vehicle_models is not None:
+            return np.array([model.linear_drag[0] for model in self.vehicle_models])
         d = self.disturbances
         if d is None or (d.drag is None and not any(d.wind) and d.gusts is None):
             return np.zeros(self.n_agents)

@@ -128,6 +128,23 @@ PerAxis = Annotated[
 ]
 
 
+Small = Annotated[float, Strict(), Field(ge=1e-15, le=1.0)]
+Coefficient = Annotated[float, Strict(), Field(ge=0, le=1e3)]
+Delay = Annotated[float, Strict(), Field(ge=0, le=10)]
+Share = Annotated[float, Strict(), Field(ge=0, le=0.95)]
+Rate = Annotated[float, Strict(), Field(ge=1, le=100_000)]
+Tilt = Annotated[float, Strict(), Field(gt=0, lt=90)]
+Inertia = Annotated[tuple[Annotated[float, Strict(), Field(ge=1e-9, le=1e6)], ...], _Three]
+BodyDrag = Annotated[tuple[Coefficient, ...], _Three]
+_Two = Field(min_length=2, max_length=2)
+RotorSpeeds = Annotated[tuple[Annotated[float, Strict(), Field(ge=0, le=1e5)], ...], _Two]
+MotorTimes = Annotated[tuple[Annotated[float, Strict(), Field(ge=1e-3, le=10)], ...], _Two]
+AttitudeGains = Annotated[tuple[Annotated[float, Strict(), Field(gt=0, le=1e6)], ...], _Two]
+_NAME_OR_LIST = WithJsonSchema(
+    {"anyOf": [{"type": "string"}, {"type": "array", "items": {"type": "string"}}]}
+)
+
+
 def _number_or_list(least: float) -> WithJsonSchema:
     number = {"type": "number", "minimum": least}
     return WithJsonSchema({"anyOf": [number, {"type": "array", "items": number}]})
@@ -164,11 +181,91 @@ class Start(Part):
         return shapes.slots(self.shape, self.size, self.count) + np.array(self.centre)
 
 
+class Vehicle(Part):
+    """A model of vehicle. Keys that are not given are those of the model; `rigidfleet.mission.vehicles` has them."""
+
+    model: Literal["point", "paper", "px4-sih", "hummingbird", "crazyflie", "x500"] = Field(
+        description="point: a point mass that gives any force at once; the others are quadrotors: paper: the paper's, "
+        "1 kg with four rotors of 5.9 N; px4-sih: PX4's simulation in hardware; hummingbird: AscTec Hummingbird; "
+        "crazyflie: Crazyflie 2; x500: Holybro X500"
+    )
+    mass: Mass | None = Field(None, description="mass [kg]; required for a point")
+    inertia: Inertia | None = Field(
+        None, description="moments of inertia about the body's axes [x, y, z] [kg m^2]"
+    )
+    arm: Length | None = Field(
+        None, description="distance of each rotor from the centre of mass [m]; rotors form an X"
+    )
+    thrust_coefficient: Small | None = Field(
+        None, description="k_f [N s^2/rad^2]: a rotor's thrust is k_f times the square of its speed"
+    )
+    torque_coefficient: Small | None = Field(
+        None,
+        description="k_m [N m s^2/rad^2]: its drag torque is k_m times the square of its speed",
+    )
+    rotor_speed: RotorSpeeds | None = Field(
+        None, description="[least, greatest] speed of a rotor [rad/s]"
+    )
+    motor_time: MotorTimes | None = Field(
+        None,
+        description="time constants of the motors [s]: [up, down], how quickly rotors speed up and slow down",
+    )
+    rotor_drag: Coefficient | None = Field(
+        None,
+        description="k_d [kg/rad]: drag of a rotor per its speed and the air's speed across its axis",
+    )
+    rotor_inflow: Coefficient | None = Field(
+        None, description="k_z [kg/rad]: the same along its axis"
+    )
+    rotor_lift: Coefficient | None = Field(
+        None,
+        description="k_h [kg/m]: additional thrust of a rotor per square of the air's speed across it",
+    )
+    body_drag: BodyDrag | None = Field(
+        None, description="drag of the body per square of the air's speed [x, y, z] [N s^2/m^2]"
+    )
+    attitude_gains: AttitudeGains | None = Field(
+        None,
+        description="[k_R, k_omega] of the attitude control per moment of inertia [1/s^2, 1/s]",
+    )
+    tilt_limit_deg: Tilt | None = Field(
+        None, description="maximum tilt that the attitude control commands [deg]"
+    )
+    thrust_limit: Limit | None = Field(
+        None, description="maximum thrust [N], only for a point; default: unlimited"
+    )
+    drag: Weight | None = Field(
+        None,
+        description="drag force per velocity relative to the air [N s/m], only for a point; default: 0",
+    )
+
+
+class Autopilot(Part):
+    """Sampled control on board: how often each vehicle's computer acts. Only with [vehicles]."""
+
+    rate: Rate = Field(
+        500.0, description="rate of the attitude control [Hz]; commands are held in between"
+    )
+    formation_rate: Rate = Field(
+        100.0,
+        description="rate of the formation's laws [Hz], which give each vehicle its force; rate is a multiple of it",
+    )
+    step: Annotated[float, Strict(), Field(ge=1e-5, le=0.01)] = Field(
+        0.001, description="longest step of the integrator, a fourth-order Runge-Kutta method [s]"
+    )
+
+
 class Agents(Part):
-    """The vehicles, as point masses. After the check, each field has one entry per agent."""
+    """The vehicles of the fleet. After the check, each field has one entry per agent."""
 
     mass: Annotated[tuple[Mass, ...], _number_or_list(MASS.least)] = Field(
-        description="mass [kg], > 0: one number for all agents, or a list with one per agent"
+        description="mass [kg], > 0: one number for all agents, or a list with one per agent; with vehicle, it is the "
+        "vehicle's"
+    )
+    vehicle: Annotated[tuple[str, ...], _NAME_OR_LIST] = Field(
+        (),
+        description="name of a table [vehicles.NAME], or a list with one name per agent; default: point masses that "
+        "give any force at once",
     )
     position: Annotated[tuple[Vector, ...], Field(min_length=1)] = Field(
         description="initial position [x, y, z] of each agent [m], world axes ENU (z up); or a table with the "
@@ -278,6 +375,16 @@ class Tracking(Part):
         (4.0, 4.0), description="weights [position error, velocity error], the first > 0"
     )
     R: Cost = Field(1.0, description="weight of the acceleration, > 0")
+    integral: Annotated[float, Strict(), _from_zero(GAIN)] = Field(
+        0.0,
+        description="gain of the integral of the position error [1/s^3], >= 0; frozen while a vehicle saturates; only "
+        "with [vehicles]",
+    )
+    drag_feedforward: Flag = Field(
+        False,
+        description="true: the drag expected at the desired velocity in still air is added to the force; only with "
+        "[vehicles]",
+    )
 
 
 class Allocation(Part):
@@ -474,7 +581,7 @@ class Gusts(Part):
 
 
 class Noise(Part):
-    """Measurement noise of each vehicle's own state: normal, independent, sampled at a fixed rate."""
+    """Measurement of each vehicle's own state: normal, independent noise, sampled at a fixed rate, and its delay."""
 
     position: Room = Field(
         0.0, description="standard deviation of each component of the measured position [m]"
@@ -485,8 +592,27 @@ class Noise(Part):
     rate: Annotated[float, Strict(), Field(gt=0, le=1000)] = Field(
         50.0, description="measurements per second [Hz], at most 1000"
     )
+    delay: Delay = Field(
+        0.0, description="age of a measurement when the laws use it [s]; only with [vehicles]"
+    )
+    dropped: Share = Field(
+        0.0, description="share of the measurements that are lost, 0 to 0.95; only with [vehicles]"
+    )
     seed: Seed = Field(
         0, description="seed of the random numbers; the same seed gives the same noise"
+    )
+
+
+class Links(Part):
+    """What vehicles know of each other: states sent at a fixed rate, which arrive late or not at all."""
+
+    delay: Delay = Field(0.0, description="age of a state when it arrives [s]")
+    rate: Annotated[float, Strict(), Field(gt=0, le=1000)] = Field(
+        50.0, description="states sent per second [Hz], at most 1000"
+    )
+    dropped: Share = Field(0.0, description="share of the states that are lost, 0 to 0.95")
+    seed: Seed = Field(
+        0, description="seed of the random numbers; the same seed loses the same states"
     )
 
 
@@ -516,6 +642,11 @@ class Disturbances(Part):
     )
     gusts: Gusts | None = Field(None, description="gusts: [disturbances.gusts]")
     noise: Noise | None = Field(None, description="measurement noise: [disturbances.noise]")
+    links: Links | None = Field(
+        None,
+        description="links between vehicles, only with [vehicles]: [disturbances.links]; default: each knows the "
+        "others as they know themselves",
+    )
     lost: tuple[Lost, ...] = Field(
         (), description="vehicles lost during the flight: `lost = [{ agent = 2, time = 30.0 }]`"
     )
@@ -863,6 +994,12 @@ class Contents(MissionHeader):
     """A whole mission file."""
 
     agents: Agents = Field(description="the vehicles: [agents]")
+    vehicles: dict[str, Vehicle] = Field(
+        default_factory=dict, description="models of vehicles by name: [vehicles.NAME]"
+    )
+    autopilot: Autopilot = Field(
+        default_factory=Autopilot, description="sampled control on board: [autopilot]"
+    )
     constraint: Constraint = Field(
         default_factory=Constraint, description="the constraint force: [constraint]"
     )
