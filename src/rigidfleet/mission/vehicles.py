@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from rigidfleet.mission.findings import FindingCollector, near
@@ -70,7 +70,7 @@ class VehicleModel:
     def linear_drag(self) -> tuple[float, float, float]:
         """Drag per velocity relative to the air near hover, along the body's axes [N s/m]."""
         if self.point:
-            return (self.drag,) * 3
+            return self.drag, self.drag, self.drag
         across, along = (4.0 * k * self.hover_speed for k in (self.rotor_drag, self.rotor_inflow))
         return (across, across, along)
 
@@ -174,7 +174,7 @@ def resolve(vehicle: Vehicle) -> VehicleModel:
     own = {key: value for key, (value, _) in MODELS[vehicle.model].items()}
     found = VehicleModel(point=False, **(own | given))
     limit = 4.0 * found.rotor_limit
-    return VehicleModel(**(vars(found) | {"thrust_limit": limit}))
+    return replace(found, thrust_limit=limit)
 
 
 def check(notes: FindingCollector) -> dict[str, Vehicle]:
