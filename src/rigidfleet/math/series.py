@@ -1,0 +1,172 @@
+"""Truncated Taylor series in time: exact derivatives of products, rotations and angles.
+
+A series of order n at a time t is the array of x(t), x'(t), x''(t)/2, ..., x^(n)(t)/n!: axis 0 counts the powers, and
+all other axes are those of x. Sums of series are sums of arrays; the functions here do the rest. The method is
+automatic differentiation by Taylor arithmetic (Griewank, Walther, Evaluating Derivatives, 2nd ed., chapter 13).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from rigidfleet.math import attitude as att
+from rigidfleet.typing import Floats
+
+#: Up to this squared angle, Stumpff functions are summed as series, with this number of terms: exact to rounding.
+_SERIES, _TERMS = 16.0, 24
+
+
+def derivatives(x: Floats) -> Floats:
+    """Derivatives 0 to n (n + 1, ...) of a series; factorials are multiplied in."""
+    return x * _factorials(x)
+
+
+def from_derivatives(x: Floats) -> Floats:
+    """The series of which `derivatives` are ``x`` (n + 1, ...)."""
+    return x / _factorials(x)
+
+
+def _factorials(x: Floats) -> Floats:
+    factorials = [float(math.factorial(k)) for k in range(len(x))]
+    return np.array(factorials).reshape(-1, *(1,) * (x.ndim - 1))
+
+
+def rate(x: Floats) -> Floats:
+    """The series of x', one order shorter."""
+    return x[1:] * np.arange(1.0, len(x)).reshape(-1, *(1,) * (x.ndim - 1))
+
+
+def of_polynomials(coefficients: Floats, x: Floats, orders: int) -> Floats:
+    """Series (orders, K, ...) of polynomials with coefficients (K, ..., P), ascending, at x (K,)."""
+    c = np.moveaxis(np.array(coefficients, dtype=float), -1, 0)
+    x = x.reshape(-1, *(1,) * (c.ndim - 2))
+    powers = len(c)
+    for order in range(min(orders, powers)):  # repeated synthetic division by (t - x)
+        for k in range(powers - 2, order - 1, -1):
+            c[k] += x * c[k + 1]
+    full = np.zeros((orders, *c.shape[1:]))
+    full[: min(orders, powers)] = c[:orders]
+    return full
+
+
+def product(
+    a: Floats, b: Floats, multiply: Callable[[Floats, Floats], Floats] = np.multiply
+) -> Floats:
+    """Series of the product of two series of the same order, by any bilinear ``multiply``, such as `numpy.matmul`."""
+    return np.stack(
+        [sum(multiply(a[i], b[k - i]) for i in range(k + 1)) for k in range(min(len(a), len(b)))]
+    )
+
+
+def rotation(phi: Floats) -> Floats:
+    """Series (n, ..., 3, 3) of R = Exp(phi), body to world, of rotation vectors phi (n, ..., 3) [rad].
+
+    R = 1 + c_1(u) [phi x] + c_2(u) [phi x]^2 with u = |phi|^2 and the Stumpff functions c_k, which are analytic in u,
+    so that no angle is special.
+    """
+    u = product(phi, phi).sum(axis=-1)
+    functions = _stumpff(u[0], 2 * len(phi) + 2)
+    W = cross_matrix(phi)
+    R = product(_compose(1, functions, u)[..., None, None], W)
+    R += product(_compose(2, functions, u)[..., None, None], product(W, W, np.matmul))
+    R[0] += np.eye(3)
+    return R
+
+
+def rotation_vector(R: Floats) -> Floats:
+    """Series (n, ..., 3) of rotation vectors phi [rad], R = Exp(phi), of rotations (n, ..., 3, 3); |phi| < pi.
+
+    The inverse of `rotation`, order by order: coefficient k of R contains that of phi as R [J_r(phi) phi_k x], and
+    otherwise coefficients below k.
+    """
+    phi = np.zeros(R.shape[:-1])
+    phi[0] = att.rotation_vector_from_dcm(np.swapaxes(R[0], -1, -2))
+    for k in range(1, len(R)):
+        lacking = R[k] - rotation(phi[: k + 1])[k]
+        phi[k] = att.rotation_vector_rate(phi[0], _axial(np.swapaxes(R[0], -1, -2) @ lacking))
+    return phi
+
+
+def from_rates(R: Floats, omega: Floats) -> Floats:
+    """Series (n + 1, ..., 3, 3) of a rotation that is R (..., 3, 3), body to world, at body rates omega (n, ..., 3)."""
+    W, found = cross_matrix(omega), [R]
+    for k in range(len(omega)):  # R' = R [omega x]
+        found.append(np.sum([found[i] @ W[k - i] for i in range(k + 1)], axis=0) / (k + 1))
+    return np.stack(found)
+
+
+def body_rates(R: Floats) -> Floats:
+    """Series (n - 1, ..., 3) of the rates [rad/s] in body axes of rotations R (n, ..., 3, 3), body to world."""
+    return _axial(product(np.swapaxes(R, -1, -2)[:-1], rate(R), np.matmul))
+
+
+def angle(y: Floats, x: Floats) -> Floats:
+    """Series of atan2(y, x) [rad]; derivatives where y and x vanish are zero."""
+    found = np.zeros_like(x)
+    found[0] = np.arctan2(y[0], x[0])
+    size = x[0] ** 2 + y[0] ** 2
+    safe = np.where(size > 0.0, size, np.inf)
+    turned, square = (
+        product(x[:-1], rate(y)) - product(y[:-1], rate(x)),
+        product(x, x) + product(y, y),
+    )
+    rates = np.zeros_like(turned)  # angle' (x^2 + y^2) = x y' - y x'
+    for k in range(len(turned)):
+        rates[k] = (turned[k] - sum(rates[i] * square[k - i] for i in range(k))) / safe
+        found[k + 1] = rates[k] / (k + 1)
+    return found
+
+
+def cross_matrix(a: Floats) -> Floats:
+    """Matrices (..., 3, 3) of the cross products a x b with vectors a (..., 3)."""
+    W = np.zeros((*a.shape, 3))
+    W[..., 2, 1], W[..., 0, 2], W[..., 1, 0] = a[..., 0], a[..., 1], a[..., 2]
+    return W - np.swapaxes(W, -1, -2)
+
+
+def _axial(W: Floats) -> Floats:
+    """Vectors (..., 3) of the antisymmetric parts of matrices (..., 3, 3)."""
+    return 0.5 * np.stack(
+        [W[..., 2, 1] - W[..., 1, 2], W[..., 0, 2] - W[..., 2, 0], W[..., 1, 0] - W[..., 0, 1]],
+        axis=-1,
+    )
+
+
+def _stumpff(u: Floats, count: int) -> Floats:
+    """Stumpff functions c_0 to c_(count - 1) (count, ...) of u >= 0: c_k = sum_i (-u)^i / (2 i + k)!."""
+    found = np.zeros((count, *u.shape))
+    near = u < _SERIES
+    small, large = np.where(near, u, 0.0), np.where(near, _SERIES, u)
+    for k in range(count):
+        for i in range(_TERMS, -1, -1):  # Horner
+            found[k] = 1.0 / math.factorial(2 * i + k) - small * found[k]
+    root = np.sqrt(large)
+    closed = [np.cos(root), np.sin(root) / root]
+    for k in range(2, count):
+        closed.append((1.0 / math.factorial(k - 2) - closed[k - 2]) / large)
+    return np.where(near, found, np.stack(closed))
+
+
+def _compose(k: int, functions: Floats, u: Floats) -> Floats:
+    """Series of c_k(u) of a series u, from Stumpff ``functions`` (count, ...) of its value, by Taylor's formula.
+
+    c_k' = (k c_(k+2) - c_(k+1)) / 2 gives every derivative as a sum of Stumpff functions.
+    """
+    change = u.copy()
+    change[0] = 0.0
+    power = np.zeros_like(u)
+    power[0] = 1.0
+    found, terms = np.zeros_like(u), {k: 1.0}
+    for order in range(len(u)):
+        value = sum(weight * functions[j] for j, weight in terms.items())
+        found += value / math.factorial(order) * power
+        power = product(power, change)
+        following: dict[int, float] = {}
+        for j, weight in terms.items():
+            following[j + 2] = following.get(j + 2, 0.0) + 0.5 * j * weight
+            following[j + 1] = following.get(j + 1, 0.0) - 0.5 * weight
+        terms = following
+    return found
