@@ -82,7 +82,7 @@ def _value(entry: dict[str, Any]) -> str:
     return {"integer": "whole number", "boolean": "true, false"}.get(entry["type"], entry["type"])
 
 
-_PLURAL = {"number": "numbers", "integer": "whole numbers"}
+_PLURAL = {"string": "names", "number": "numbers", "integer": "whole numbers"}
 
 
 def _default(entry: dict[str, Any], given: bool) -> str:
