@@ -65,6 +65,7 @@ LABELS: dict[str, tuple[str, ...]] = {
     "quaternion": ("w", "x", "y", "z"),
     "wrench": ("Fx", "Fy", "Fz", "tau_x", "tau_y", "tau_z"),
     "end": ("first", "second"),
+    "rotor": ("front left", "front right", "rear right", "rear left"),
 }
 
 
@@ -131,7 +132,8 @@ class PhaseRecord:
     extremes : worst values of the phase in continuous time, by name: separation, clearance, separation_below, lost
         (distance of a lost vehicle to one that still flies), geofence (distance beyond it), lowest, highest [m];
         speed [m/s]; acceleration [m/s^2]; thrust, thrust_margin (thrust minus its limit), constraint_force, tension
-        [N]; constraint [m]. If vehicles stand on obstacles, clearance is also given for those that have stood on one
+        [N]; constraint [m]; of vehicles also rotor_force [N] (of the rotor nearest to its limit), tilt [rad],
+        tracking_error [m] and saturation (share of the phase). If vehicles stand on obstacles, clearance is also given for those that have stood on one
         since the start (clearance_start), for those in flight (clearance_flight), and for those that stand on one
         until the end (clearance_end). Empty if only samples are known
     """
@@ -299,6 +301,35 @@ class Result:
         Floats | None, _v("time agent axis", "m s-1", "measured velocity; missing without noise")
     ] = None
 
+    vehicle_attitude: Annotated[
+        Floats | None,
+        _v(
+            "time agent quaternion",
+            "1",
+            "attitude of each vehicle, world to body, scalar first; missing without vehicles",
+        ),
+    ] = None
+    vehicle_rates: Annotated[
+        Floats | None,
+        _v(
+            "time agent axis",
+            "rad s-1",
+            "angular velocity of each vehicle, body axes; missing without vehicles",
+        ),
+    ] = None
+    rotor_force: Annotated[
+        Floats | None,
+        _v("time agent rotor", "N", "thrust of each rotor; missing without vehicles"),
+    ] = None
+    saturated: Annotated[
+        Ints | None,
+        _v(
+            "time agent",
+            "1",
+            "1 if a vehicle cannot give what is asked of it, else 0; missing without vehicles",
+        ),
+    ] = None
+
     phases: list[PhaseRecord]
     mission_text: str
     complete: bool = True
@@ -337,12 +368,14 @@ class Result:
             if who.size and not least <= who.min() <= who.max() < n:
                 raise ValueError(f"{name} has agents outside {least} to {n - 1}")
         for name, x in (pair for phase in self.phases for pair in phase.extremes.items()):
-            of_pair = not name.startswith("clearance")  # clearance names an obstacle
+            # A clearance names an obstacle, a rotor's force its rotor
+            of_pair = not name.startswith("clearance") and name != "rotor_force"
             alone = of_pair and not (-1 <= x.other < n and x.other != x.who)
+            alone |= name == "rotor_force" and x.other not in range(4)
             if alone or x.who not in range(n):
                 raise ValueError(f"extreme {name} must name different agents from 0 to {n - 1}")
         for name in (name for name, v in VARIABLES.items() if "quaternion" in v.dims):
-            if not getattr(self, name).any(axis=1).all():
+            if getattr(self, name) is not None and not getattr(self, name).any(axis=-1).all():
                 raise ValueError(f"{name} has a quaternion of norm zero")
         if (self.edges[:, 0] == self.edges[:, 1]).any():
             raise ValueError("an edge joins an agent to itself")
@@ -592,7 +625,7 @@ VARIABLES: dict[str, Variable] = {
 _OPTIONAL = {f.name for f in fields(Result) if f.name in VARIABLES and f.default is None}
 
 
-_INTEGERS = {name for name in VARIABLES if _HINTS[name].__origin__ == Ints}
+_INTEGERS = {name for name in VARIABLES if _HINTS[name].__origin__ in (Ints, Ints | None)}
 #: Quantities whose minimum is the worst value. The same holds for all clearances.
 _LEAST = frozenset(("separation", "separation_below", "lost", "lowest"))
 

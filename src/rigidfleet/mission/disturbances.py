@@ -79,6 +79,9 @@ def _noise(notes: FindingCollector, found: Disturbances) -> None:
     if "vehicle" in notes.data.get("agents", {}):
         return
     remedy = "give the agents a vehicle; model = 'point' flies points with sampled control"
+    for key in ("downwash", "ground_effect"):
+        if getattr(found, key):
+            notes.add((_TABLE, key), "acts on vehicles with rotors alone", "name a vehicle")
     late = [] if noise is None else [k for k in ("delay", "dropped") if getattr(noise, k)]
     for key in late:
         notes.add((*where, key), "needs sampled control, which only vehicles have", remedy)

@@ -224,6 +224,9 @@ class Vehicle(Part):
     body_drag: BodyDrag | None = Field(
         None, description="drag of the body per square of the air's speed [x, y, z] [N s^2/m^2]"
     )
+    rotor_radius: Length | None = Field(
+        None, description="radius of a rotor [m], for downwash and ground effect"
+    )
     attitude_gains: AttitudeGains | None = Field(
         None,
         description="[k_R, k_omega] of the attitude control per moment of inertia [1/s^2, 1/s]",
@@ -646,6 +649,13 @@ class Disturbances(Part):
         None,
         description="links between vehicles, only with [vehicles]: [disturbances.links]; default: each knows the "
         "others as they know themselves",
+    )
+    downwash: Flag = Field(
+        False,
+        description="true: vehicles blow on those below them, as a turbulent jet; only with [vehicles]",
+    )
+    ground_effect: Flag = Field(
+        False, description="true: rotors near the ground give more thrust; only with [vehicles]"
     )
     lost: tuple[Lost, ...] = Field(
         (), description="vehicles lost during the flight: `lost = [{ agent = 2, time = 30.0 }]`"

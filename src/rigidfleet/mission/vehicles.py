@@ -33,6 +33,7 @@ class VehicleModel:
     motor_time : time constants, up and down [s]
     rotor_drag, rotor_inflow, rotor_lift : k_d, k_z [kg/rad] and k_h [kg/m]
     body_drag : along the body's axes [N s^2/m^2]
+    rotor_radius : [m]
     attitude_gains : k_R [1/s^2] and k_omega [1/s], per moment of inertia
     tilt_limit_deg : maximum tilt commanded [deg]
     thrust_limit : maximum thrust [N]; of a quadrotor that of its four rotors
@@ -51,6 +52,7 @@ class VehicleModel:
     rotor_inflow: float = 0.0
     rotor_lift: float = 0.0
     body_drag: tuple[float, ...] = (0.0, 0.0, 0.0)
+    rotor_radius: float = 0.0
     attitude_gains: tuple[float, ...] = (0.0, 0.0)
     tilt_limit_deg: float = 90.0
     thrust_limit: float = math.inf
@@ -92,6 +94,7 @@ MODELS: dict[str, dict[str, tuple[Any, str]]] = {
         "rotor_drag": (1.16e-4, _CHOSEN),
         "rotor_inflow": (1.16e-4, _CHOSEN),
         "rotor_lift": (0.0, _CHOSEN),
+        "rotor_radius": (0.127, _CHOSEN + ": propellers of ten inches"),
         "body_drag": ((0.5e-2, 0.5e-2, 1e-2), _CHOSEN),
         "attitude_gains": ((544.0, 46.64), _CHOSEN),
     },
@@ -106,6 +109,7 @@ MODELS: dict[str, dict[str, tuple[Any, str]]] = {
         "rotor_drag": (0.0, _ROTORPY),
         "rotor_inflow": (0.0, _ROTORPY),
         "rotor_lift": (0.0, _ROTORPY),
+        "rotor_radius": (0.1, _CHOSEN),
         "body_drag": ((1e-2, 1e-2, 1e-2), _ROTORPY),
         "attitude_gains": ((310.0, 57.0), f"{_ROTORPY} SE3Control"),
     },
@@ -120,6 +124,7 @@ MODELS: dict[str, dict[str, tuple[Any, str]]] = {
         "rotor_drag": (1.19e-4, _ROTORPY),
         "rotor_inflow": (2.32e-4, _ROTORPY),
         "rotor_lift": (3.39e-3, _ROTORPY),
+        "rotor_radius": (0.1, _ROTORPY),
         "body_drag": ((0.5e-2, 0.5e-2, 1e-2), _ROTORPY),
         "attitude_gains": ((544.0, 46.64), _ROTORPY),
     },
@@ -134,6 +139,7 @@ MODELS: dict[str, dict[str, tuple[Any, str]]] = {
         "rotor_drag": (1.02506e-6, "Förster 2015"),
         "rotor_inflow": (7.553e-7, "Förster 2015"),
         "rotor_lift": (0.0, _ROTORPY),
+        "rotor_radius": (0.0225, "propellers of 45 mm"),
         "body_drag": ((0.0, 0.0, 0.0), _ROTORPY),
         "attitude_gains": ((310.0, 57.0), _ROTORPY),
     },
@@ -148,6 +154,7 @@ MODELS: dict[str, dict[str, tuple[Any, str]]] = {
         "rotor_drag": (8.06428e-5, "PX4 Gazebo models, x500: rotorDragCoefficient"),
         "rotor_inflow": (0.0, "PX4 Gazebo models, x500: the model has none"),
         "rotor_lift": (0.0, "PX4 Gazebo models, x500: the model has none"),
+        "rotor_radius": (0.128, "PX4 Gazebo models, x500: propellers of ten inches"),
         "body_drag": ((0.0, 0.0, 0.0), "PX4 Gazebo models, x500: the model has none"),
         "attitude_gains": ((310.0, 57.0), f"{_ROTORPY} SE3Control"),
     },

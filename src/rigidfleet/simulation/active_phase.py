@@ -67,12 +67,6 @@ class ActivePhase:
         self.lost = np.zeros(len(plan.masses), dtype=np.bool_)
         if plan.before.lost is not None:
             self.lost = plan.before.lost
-        self.workspace, self.solver = equip(plan)
-        y = plan.state()
-        trail = extremes.begin(len(y), len(plan.edges))
-        self.state = integrator(plan, y, plan.start, trail)
-        if self.solver is not None:
-            self.state.clock[1] = first_step(plan, self.workspace, self.state)
         self.asked = 0  # number of calls of the user's controller
         self.held: Problem | None = None  # with the controller's force
         self.flown: Problem | None = None  # the problem of the steps in the trail
@@ -84,6 +78,15 @@ class ActivePhase:
         self.quiet_since = math.inf  # since when the phase has been settled [s]
         self.stop = math.inf  # time at which the caller wants a sample [s]
         self.begun = False  # whether samples exist since the start or the last loss
+        self._start(plan.state(), plan.start)
+        if self.solver is not None:
+            self.state.clock[1] = first_step(plan, self.workspace, self.state)
+
+    def _start(self, y: Floats, t: float) -> None:
+        """Start to integrate the plan at a state (n,) and time [s]."""
+        self.workspace, self.solver = equip(self.plan)
+        trail = self.extremes.begin(len(y), len(self.plan.edges))
+        self.state = integrator(self.plan, y, t, trail)
 
     @property
     def t(self) -> float:
@@ -217,10 +220,8 @@ class ActivePhase:
         integral = y[6 * n : 6 * n + len(kept)][kept]
         rest = y[6 * n + len(kept) :]
         y = np.concatenate([y[: 6 * n], integral, rest])
-        t, trail = self.t, self.extremes.begin(len(y), len(plan.edges))
         self.begun = False
-        self.state = integrator(plan, y, t, trail)
-        self.workspace, self.solver = equip(plan)
+        self._start(y, self.t)
         if own:
             return plan.problem
         mu = plan.problem.law.mu

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rigidfleet.kernel import records
+from rigidfleet.kernel import fleet, records
 from rigidfleet.kernel.engine import native
 from rigidfleet.kernel.problem import Problem, Workspace
 from rigidfleet.math import attitude as att
@@ -51,6 +51,12 @@ _NAMES = {
     "tension": records.TENSION,
     "constraint": records.CONSTRAINT,
 }
+#: Extremes of a sampled flight by its column, the monitor's quantity, and its sign there.
+_SAMPLED = (
+    (fleet.ACCELERATION, records.ACCELERATION, -1.0),
+    (fleet.LOAD, records.THRUST, -1.0),
+    (fleet.CONSTRAINT_FORCE, records.CONSTRAINT_FORCE, -1.0),
+)
 _OF_FLIGHT = {"clearance_start": records.STANDING, "clearance_flight": records.FLYING}
 
 
@@ -77,6 +83,7 @@ class Extremes:
         self.pairs = self.columns = self.struck = np.zeros((0, 2), dtype=np.int64)
         self.spare, self.moved = 0.0, np.zeros(2)
         self.trail = records.NO_TRAIL
+        self.of_vehicles: dict[str, Extremum] = {}
         self._list_all()
 
     def begin(self, states: int, edges: int) -> records.Trail:
@@ -122,16 +129,68 @@ class Extremes:
             flags[:3] = rows, rows, 2 if last else 1
         self.monitor(problem, work, state)
 
+    def take_path(
+        self, problem: Problem, work: Workspace, state: records.IntegratorState
+    ) -> None:
+        """Evaluate the paths alone of the steps in the trail, not the forces."""
+        rows, flags = int(state.count[4]), self.monitor.monitor.flags
+        if self.n > _FEW:
+            for row in range(rows):
+                self._step(problem, work, state, row)
+            return
+        flags[:3] = 0, rows, 0
+        self.monitor(problem, work, state)
+
+    def take_vehicles(
+        self, state: fleet.SampledState, vehicles: fleet.Quadrotors, lost: Bools, ticks: int
+    ) -> None:
+        """Take the extremes that a sampled flight keeps by itself, of a phase of some ticks so far."""
+        rotors = ~(vehicles.point | lost)
+        for k, kind, sign in _SAMPLED:
+            for i in np.flatnonzero(~lost):
+                self._take(kind, sign * float(state.worst[i, k]), float(state.worst_time[i, k]), int(i))
+        for i in np.flatnonzero(~lost):
+            load = float(state.worst[i, fleet.LOAD])
+            margin, when = float(vehicles.limit[i]) - load, float(state.worst_time[i, fleet.LOAD])
+            self._take(records.THRUST_MARGIN, margin, when, int(i))
+        found: dict[str, Extremum] = {}
+        if rotors.any():
+            peak = np.where(rotors[:, None], state.peak, -1.0)
+            share = peak / vehicles.force[:, 1:]
+            i, j = (int(k) for k in np.unravel_index(int(share.argmax()), share.shape))
+            found["rotor_force"] = Extremum(
+                float(peak[i, j]), float(state.peak_time[i, j]), i, j
+            )
+            upright = np.where(rotors, state.worst[:, fleet.UPRIGHT], 1.0)
+            i = int(upright.argmin())
+            angle = math.acos(min(max(float(upright[i]), -1.0), 1.0))
+            found["tilt"] = Extremum(angle, float(state.worst_time[i, fleet.UPRIGHT]), i, -1)
+        error = np.where(lost, -1.0, state.worst[:, fleet.ERROR])
+        i = int(error.argmax())
+        if error[i] > 0.0:
+            found["tracking_error"] = Extremum(
+                float(error[i]), float(state.worst_time[i, fleet.ERROR]), i, -1
+            )
+        share = np.where(lost, 0.0, state.saturations / max(ticks, 1))
+        i = int(share.argmax())
+        found["saturation"] = Extremum(float(share[i]), float(state.clock[0]), i, -1)
+        self.of_vehicles = found
+
+    def _take(self, kind: int, value: float, t: float, who: int) -> None:
+        if value < self.worst[kind]:
+            self.worst[kind], self.when[kind], self.who[kind] = value, t, (who, -1)
+
     def so_far(self) -> dict[str, Extremum]:
         """Extremes of the phase under way, by name."""
         every = ((name, self._extremum(name, k)) for name, k in _NAMES.items())
-        return {name: x for name, x in every if x is not None}
+        return {name: x for name, x in every if x is not None} | self.of_vehicles
 
     def phase(self) -> dict[str, Extremum]:
         """Extremes of the phase that ends, by name; start those of the next one."""
         found = self.so_far()
         self.worst[list(_NAMES.values())] = np.inf
         self.moved[:] = np.inf  # the list was made for a worst value that no longer counts
+        self.of_vehicles = {}
         return found
 
     def flight(self, phases: Sequence[PhaseRecord]) -> None:

@@ -6,6 +6,7 @@ import math
 import time as clock
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,6 +27,7 @@ from rigidfleet.simulation.as_flown import as_flown, check_formation, with_phase
 from rigidfleet.simulation.callbacks import Controller, ExternalForce, Force, Observation
 from rigidfleet.simulation.extremes import Extremes
 from rigidfleet.simulation.recording import Piece, assemble
+from rigidfleet.simulation.sampled_phase import SampledPhase, Vehicles
 from rigidfleet.simulation.sampling import Sampling, times_asked
 from rigidfleet.typing import Floats
 
@@ -184,7 +186,9 @@ class Flight:
         self._now = PhaseState(
             0.0, mission.fleet.position.copy(), mission.fleet.velocity.copy(), frame=frame
         )
-        self._disturbance = disturbance(mission)
+        self._vehicles = None if mission.vehicle_models is None else Vehicles(mission)
+        # Vehicles meet their disturbances in their own equations of motion.
+        self._disturbance = disturbance(mission) if self._vehicles is None else None
         self._extremes = Extremes(mission)
         self._active: ActivePhase | None = None
         self._asked: list[Phase] = []  # each phase as it was begun
@@ -278,7 +282,10 @@ class Flight:
                 self.mission, phase, self._now, disturbance=self._disturbance, external=external
             )
             self._check_frame(plan)
-            self._active = ActivePhase(
+            make = ActivePhase
+            if self._vehicles is not None:
+                make = partial(SampledPhase, vehicles=self._vehicles)
+            self._active = make(
                 len(self.phases), plan, extremes=self._extremes, external=self.external,
                 sampler=self.sampler, pieces=self.pieces, pause=lambda _: self._report(phase),
             )  # fmt: skip

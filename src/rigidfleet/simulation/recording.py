@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -25,6 +25,16 @@ _SINGULAR = 400
 _WORK, _LEAST = 400_000_000, 9
 
 
+class VehicleSamples(NamedTuple):
+    """Samples of vehicles with sampled control; of points, attitude, rates and rotors are zero."""
+
+    attitude: Floats  # (K, N, 4) world to body, scalar first
+    rates: Floats  # (K, N, 3) body axes [rad/s]
+    rotor_force: Floats  # (K, N, 4) [N]
+    thrust: Floats  # (K, N) [N]
+    saturated: Bools  # (K, N)
+
+
 @dataclass
 class Piece:
     """Samples of a phase, or of part of one, as the kernel returns them."""
@@ -36,6 +46,7 @@ class Piece:
     frame: Floats  # (K, 4)
     edges: Ints  # (m, 2) of this phase
     attached: bool  # whether the slots carry the body frame
+    vehicles: VehicleSamples | None = None
 
 
 def assemble(
@@ -59,6 +70,9 @@ def assemble(
     r, v = joined("r"), joined("v")
     f_u, f_C = joined("f_u"), joined("f_C")
     thrust = np.linalg.norm(f_u + f_C, axis=2)
+    flown = _of_vehicles(pieces)
+    if flown is not None:
+        thrust = flown.thrust
     if mission.agents.saturate:  # the thrust flown, not the commanded one
         thrust = np.minimum(thrust, mission.agents.thrust_limit)
     cm, cm_velocity = (np.einsum("ki,kia->ka", masses, z) / M for z in (r, v))
@@ -100,7 +114,9 @@ def assemble(
         return _by_edge(pieces, columns, name, len(edges))
 
     reference = by_edge("d")
-    noisy = mission.disturbances is not None and mission.disturbances.noise is not None
+    d = mission.disturbances
+    noisy = d is not None and d.noise is not None
+    airy = mission.drag.any() or flown is not None
     return Result(
         time=time,
         phase=np.concatenate([np.full(len(p.time), p.phase) for p in pieces]),
@@ -136,14 +152,31 @@ def assemble(
         clearance=clearance,
         clearance_agent=agent,
         clearance_obstacle=obstacle,
-        disturbance_force=joined("f_D") if mission.drag.any() else None,
+        disturbance_force=joined("f_D") if airy else None,
         measured_position=joined("r_seen") if noisy else None,
         measured_velocity=joined("v_seen") if noisy else None,
+        vehicle_attitude=None if flown is None else flown.attitude,
+        vehicle_rates=None if flown is None else flown.rates,
+        rotor_force=None if flown is None else flown.rotor_force,
+        saturated=None if flown is None else flown.saturated.astype(np.int64),
         phases=list(phases),
         mission_text=mission.text,
         complete=not ending,
         ending=ending,
         statistics=statistics,
+    )
+
+
+def _of_vehicles(pieces: Sequence[Piece]) -> VehicleSamples | None:
+    """The samples of all pieces; None if point masses flew."""
+    found = [piece.vehicles for piece in pieces if piece.vehicles is not None]
+    if not found:
+        return None
+    joined = VehicleSamples(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
+    return joined._replace(
+        attitude=np.stack(
+            [att.unwrap_quaternion(q) for q in joined.attitude.swapaxes(0, 1)], axis=1
+        )
     )
 
 

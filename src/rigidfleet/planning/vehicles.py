@@ -1,0 +1,213 @@
+"""Make what a sampled flight reads, from a mission's vehicles, autopilot and measurements.
+
+Random numbers are drawn in blocks, each from a generator of its own. The same mission therefore gives the same flight,
+bit for bit, however the flight is divided.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+
+import numpy as np
+
+from rigidfleet.kernel import fleet
+from rigidfleet.kernel.problem import TRACKING, Problem, septic_polynomial
+from rigidfleet.math.quadrotor import ROTORS
+from rigidfleet.mission import Mission
+from rigidfleet.mission.vehicles import VehicleModel
+from rigidfleet.planning.derivatives import Yaw, slot_derivatives, yaw_derivatives
+from rigidfleet.planning.disturbances import disturbance
+from rigidfleet.typing import Bools, Floats, Ints
+
+#: Rows of random numbers in a block.
+_BLOCK = 1024
+#: Kinds of random numbers.
+_NOISE, _DROPPED, _UNHEARD = 2, 3, 4
+#: Density of the air at sea level, ICAO standard atmosphere [kg/m^3].
+_DENSITY = 1.225
+#: Time in which a vehicle turns from its yaw at a switch to the yaw asked for [s].
+_TURN_TIME = 3.0
+
+
+def sampled_flight(mission: Mission) -> fleet.Flight:
+    """Vehicles, air, sensing and rates of a mission with vehicles."""
+    models = mission.vehicle_models
+    assert models is not None
+    n, autopilot, d = len(models), mission.autopilot, mission.disturbances
+    made = [kernel_vehicle(model, m) for model, m in zip(models, mission.true_mass, strict=True)]
+    steps = max(1, math.ceil(1.0 / autopilot.rate / autopilot.step - 1e-9))
+    found = fleet.flight(
+        fleet.quadrotors(made, mission.gravity),
+        start=0.0,
+        h=1.0 / (autopilot.rate * steps),
+        steps=steps,
+        every=max(1, round(autopilot.rate / autopilot.formation_rate)),
+    )
+    guidance = fleet.Guidance(
+        np.array([model.linear_drag for model in models]) * mission.tracking.drag_feedforward,
+        np.full((n, 3), mission.tracking.integral),
+    )
+    around = disturbance(mission)
+    grounds = [thing.height for thing in mission.obstacles if thing.kind == "ground"]
+    air = found.air._replace(
+        wind=around.wind,
+        gust_step=around.gust_step,
+        gust=around.gust,
+        downwash=d is not None and d.downwash,
+        ground_effect=d is not None and d.ground_effect and bool(grounds),
+        density=_DENSITY,
+        ground=max(grounds, default=0.0),
+        floor=around.floor,
+    )
+    return found._replace(air=air, guidance=guidance, sensing=_sensing(mission))
+
+
+def kernel_vehicle(model: VehicleModel, mass: float) -> fleet.Vehicle:
+    """The kernel's form of a vehicle with a true mass [kg]."""
+    if model.point:
+        return fleet.Vehicle(
+            m=mass, drag=(model.drag,) * 3, point=True, limit=model.thrust_limit
+        )
+    up, down = model.motor_time
+    k_R, k_omega = model.attitude_gains
+    return fleet.Vehicle(
+        m=mass,
+        inertia=model.inertia,
+        rotors=np.column_stack([model.arm * ROTORS[:, :2], np.zeros(4)]),
+        spin=ROTORS[:, 2],
+        thrust=(0.0, 0.0, model.thrust_coefficient),
+        torque=(0.0, 0.0, model.torque_coefficient),
+        rotor_drag=(model.rotor_drag, model.rotor_inflow),
+        lift=model.rotor_lift,
+        c=model.body_drag,
+        motor=(1.0 / up, 0.0, 1.0 / down, 0.0),
+        speed=model.rotor_speed,
+        k_R=(k_R,) * 3,
+        k_omega=(k_omega,) * 3,
+        tilt=math.radians(model.tilt_limit_deg),
+        radius=model.rotor_radius,
+    )
+
+
+def _sensing(mission: Mission) -> fleet.Sensing:
+    """Rates and delays of measurements and links, in whole ticks of the attitude control."""
+    n, rate, d = mission.n_agents, mission.autopilot.rate, mission.disturbances
+    noise = None if d is None else d.noise
+    links = None if d is None else d.links
+
+    def ticks(seconds: float) -> int:
+        return round(seconds * rate)
+
+    found = fleet.exact_sensing(n)
+    if noise is not None:
+        found = found._replace(
+            every=max(1, round(rate / noise.rate)), delay=np.full(n, ticks(noise.delay))
+        )
+    if links is not None:
+        found = found._replace(
+            linked=True,
+            link_every=max(1, round(rate / links.rate)),
+            link_delay=np.full((n, n), ticks(links.delay)),
+        )
+    return found
+
+
+class TickTables:
+    """Tables of a flight for ranges of ticks: references of the attitude control, noise, dropped measurements."""
+
+    def __init__(self, mission: Mission, flight: fleet.Flight) -> None:
+        d = mission.disturbances
+        self.flight, self.n = flight, mission.n_agents
+        self.rate = mission.autopilot.rate
+        self.noise = None if d is None else d.noise
+        self.links = None if d is None else d.links
+        self.yaw = Yaw()
+
+    def made(self, first: int, last: int, problem: Problem, begun: float, start: Floats) -> fleet.Tables:
+        """Tables for ticks from ``first`` to before ``last``, in a phase begun at a time [s] with yaws (N,) [rad]."""
+        sensing = self.flight.sensing
+        time = np.arange(first, last) / self.rate
+        yaw, jerk, snap = _references(problem, time, self.yaw, begun, start)
+        noise_r = noise_v = np.zeros((0, self.n, 3))
+        dropped = np.zeros((0, self.n), dtype=np.bool_)
+        unheard = np.zeros((0, self.n, self.n), dtype=np.bool_)
+        if self.noise is not None:
+            rows = _rows(first, last, sensing.every)
+            seed = self.noise.seed
+            if self.noise.position or self.noise.velocity:
+                white = _drawn(_NOISE, seed, rows, (2, self.n, 3))
+                noise_r = np.ascontiguousarray(self.noise.position * white[:, 0])
+                noise_v = np.ascontiguousarray(self.noise.velocity * white[:, 1])
+            if self.noise.dropped:
+                dropped = _drawn(_DROPPED, seed, rows, (self.n,)) < self.noise.dropped
+        if self.links is not None and self.links.dropped:
+            rows = _rows(first, last, sensing.link_every)
+            unheard = _drawn(_UNHEARD, self.links.seed, rows, (self.n, self.n)) < self.links.dropped
+        return fleet.Tables(first, last, yaw, jerk, snap, noise_r, noise_v, dropped, unheard)
+
+
+def yaw_at(problem: Problem, t: float, yaw: Yaw, begun: float, start: Floats) -> Floats:
+    """Yaw (N,) [rad] asked of each vehicle at a time [s] of a phase; see `TickTables.made`."""
+    return _references(problem, np.array([t]), yaw, begun, start)[0][0, :, 0]
+
+
+def _references(
+    problem: Problem, time: Floats, yaw: Yaw, begun: float, start: Floats
+) -> tuple[Floats, Floats, Floats]:
+    """Yaw with two derivatives, jerk and snap (K, N, 3) of each vehicle at times (K,) [s].
+
+    A vehicle turns with the formation, or from its yaw at the start of the phase into the one asked for.
+    """
+    n = len(start)
+    if problem.control.kind != TRACKING or not len(time):
+        still = np.zeros((len(time), n, 3))
+        still[..., 0] = start
+        return still, np.zeros((0, n, 3)), np.zeros((0, n, 3))
+    reference, motion = problem.reference, problem.motion
+    found = slot_derivatives(reference, motion, time)
+    whole = np.concatenate([[begun], time])
+    turned = yaw_derivatives(reference, motion, whole, yaw, start if yaw.kind == "along" else None)
+    first, turned = turned[0, 0], turned[1:].swapaxes(1, 2).copy()
+    off = start - first
+    if yaw.kind != "formation":
+        off = (off + np.pi) % (2.0 * np.pi) - np.pi
+        x = np.clip((time - begun) / _TURN_TIME, 0.0, 1.0)
+        rest = np.stack(
+            [
+                1.0 - septic_polynomial(x),
+                -140.0 * (x * (1 - x)) ** 3 / _TURN_TIME,
+                -420.0 * (x * (1 - x)) ** 2 * (1 - 2 * x) / _TURN_TIME**2,
+            ],
+            axis=1,
+        )
+        turned += rest[:, None, :] * off[:, None]
+    else:
+        turned[..., 0] += off
+    jerk, snap = (np.ascontiguousarray(found[:, k]) for k in (3, 4))
+    return np.ascontiguousarray(turned), jerk, snap
+
+
+def _rows(first: int, last: int, every: int) -> Ints:
+    """Which multiples of ``every`` lie between ticks, counted in multiples."""
+    return np.arange(-(-first // every), -(-last // every))
+
+
+def _drawn(kind: int, seed: int, rows: Ints, shape: tuple[int, ...]) -> Floats:
+    """Random numbers (K, *shape) of some rows: normal ones for noise, else uniform ones."""
+    if not len(rows):
+        return np.zeros((0, *shape))
+    blocks = range(int(rows[0]) // _BLOCK, int(rows[-1]) // _BLOCK + 1)
+    found = np.concatenate([_block(kind, seed, block, shape) for block in blocks])
+    begin = int(rows[0]) - blocks[0] * _BLOCK
+    return found[begin : begin + len(rows)]
+
+
+@lru_cache(maxsize=8)
+def _block(kind: int, seed: int, block: int, shape: tuple[int, ...]) -> Floats:
+    random = np.random.default_rng((kind, seed, block))
+    size = (_BLOCK, *shape)
+    return random.standard_normal(size) if kind == _NOISE else random.random(size)
+
+
+__all__ = ["Bools", "TickTables", "kernel_vehicle", "sampled_flight", "yaw_at"]

@@ -1,0 +1,213 @@
+"""A phase flown by vehicles with sampled control: integrates their motion between the ticks of their autopilots."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from rigidfleet.errors import StoppedError
+from rigidfleet.kernel import fleet, records
+from rigidfleet.kernel.engine import native
+from rigidfleet.kernel.engine.sampled import fly_ticks
+from rigidfleet.kernel.problem import Problem
+from rigidfleet.kernel.records import Record
+from rigidfleet.math import attitude as att
+from rigidfleet.mission import Mission
+from rigidfleet.planning.vehicles import TickTables, sampled_flight, yaw_at
+from rigidfleet.simulation.active_phase import ActivePhase
+from rigidfleet.simulation.callbacks import Observation
+from rigidfleet.simulation.diagnosis import diagnose
+from rigidfleet.simulation.recording import Piece, VehicleSamples
+from rigidfleet.simulation.solver_setup import equip, integrator
+from rigidfleet.typing import Bools, Floats
+
+#: Greatest number of ticks in a table, and of steps between two returns to Python.
+_TICKS, _STEPS = 1024, 4000
+
+
+class Vehicles:
+    """The vehicles of a flight, from phase to phase: what they are, where they are, and their yaw."""
+
+    def __init__(self, mission: Mission) -> None:
+        self.flight = sampled_flight(mission)
+        self.tables = TickTables(mission, self.flight)
+        self.mass = mission.fleet.mass
+        yaw = 0.0 if mission.body_frame is None else math.radians(mission.body_frame.yaw_deg)
+        start = mission.fleet
+        self.yaw = np.full(mission.n_agents, yaw)  # asked of each vehicle at the last switch
+        self.S = fleet.hovering(self.flight.vehicles, start.position, start.velocity, yaw)
+        self.state: fleet.SampledState | None = None  # of the phase before
+
+    @property
+    def noisy(self) -> bool:
+        """Whether the law knows anything else than the true states."""
+        return self.tables.noise is not None or self.tables.links is not None
+
+
+class SampledPhase(ActivePhase):
+    """A phase of vehicles with sampled control, under way.
+
+    The law of the plan is evaluated at measured states, at ticks. ``state.y`` holds the true state, in the layout of the
+    continuous flight, whenever the kernel returns.
+    """
+
+    def __init__(self, *arguments: Any, vehicles: Vehicles, **options: Any) -> None:
+        self.vehicles, self.flight = vehicles, vehicles.flight
+        self.tabled: Problem | None = None  # the problem of the tables
+        super().__init__(*arguments, **options)
+
+    def _start(self, y: Floats, t: float) -> None:
+        plan, given = self.plan, self.vehicles
+        n, m = len(plan.masses), len(plan.edges)
+        self.workspace, self.solver = equip(plan)
+        trail = self.extremes.begin(6 * n, m)
+        self.state = integrator(plan, y, t, trail)
+        lost = self.flight.vehicles._replace(lost=self.lost.copy())
+        self.flight = self.flight._replace(vehicles=lost)
+        frame = y[6 * n + m : 6 * n + m + 4] if plan.frame is not None else None
+        begun = fleet.begin(self.flight, given.S, self.workspace, frame=frame)
+        begun.integral[:] = y[6 * n : 6 * n + m]
+        before = given.state
+        if before is not None:
+            begun = before._replace(
+                integral=begun.integral, frame=begun.frame, work=begun.work, peak=begun.peak,
+                peak_time=begun.peak_time, worst=begun.worst, worst_time=begun.worst_time,
+                saturations=begun.saturations,
+            )  # fmt: skip
+        self.sampled = given.state = begun._replace(trail=trail._replace(gauge=trail.gauge[:, :0]))
+        self.first_tick = int(self.sampled.count[fleet.TICKS])
+        self.tabled = None
+
+    # -- flying -----------------------------------------------------------------------------------
+
+    def observe(self) -> Observation:
+        """What a controller sees: measured positions and velocities."""
+        found, seen = super().observe(), self.sampled.seen
+        return replace(found, position=seen[:, :3].copy(), velocity=seen[:, 3:].copy())
+
+    def watch(self, *, last: bool) -> None:
+        """Search the steps flown for extremes."""
+        rows = int(self.sampled.count[fleet.TRAILED])
+        if not rows or self.flown is None:
+            return
+        self.state.count[4] = rows
+        self.extremes.take_path(self.flown, self.workspace, self.state)
+        self.sampled.count[fleet.TRAILED] = self.state.count[4] = 0
+        ticks = int(self.sampled.count[fleet.TICKS]) - self.first_tick
+        self.extremes.take_vehicles(self.sampled, self.flight.vehicles, self.lost, ticks)
+
+    def _segment(self, problem: Problem, t_end: float) -> None:
+        """Fly to ``t_end`` [s] and record the samples on the way."""
+        plan, sampled = self.plan, self.sampled
+        n, m = len(plan.masses), len(plan.edges)
+        self.flown = problem
+        times = self.sampler(plan, self.t, t_end, first=not self.begun, stop=self.stop)
+        self.begun = True
+        call = fleet.segment(n, m, t_end, times, _STEPS)
+        sampled.count[fleet.SAMPLES] = 0
+        status = records.PAUSED
+        try:
+            while status == records.PAUSED:
+                self._supply(problem)
+                status = fly_ticks(problem, self.workspace, self.flight, sampled, call)
+                self._follow()
+                if self.external is not None:
+                    self.external.check()
+                self._check()
+                self.watch(last=False)
+                self.pause(self.t)
+        finally:
+            done = int(sampled.count[fleet.SAMPLES])
+            if done:
+                self._keep(problem, call, done)
+        if status != records.FINISHED or not np.isfinite(sampled.S).all():
+            raise StoppedError(diagnose(self.place, own_force=self.external is not None, collapsed=True))
+
+    def _supply(self, problem: Problem) -> None:
+        """Make tables for the next ticks, if those that there are end here or belong to another reference."""
+        tables, tick = self.flight.tables, int(self.sampled.count[fleet.TICKS])
+        if problem is self.tabled and tables.first <= tick < tables.last:
+            return
+        rate = self.vehicles.tables.rate
+        last = min(tick + _TICKS, math.ceil(self.plan.t_end * rate) + 1)
+        # A user's controller replaces the input, not the reference.
+        made = self.vehicles.tables.made(
+            tick, max(last, tick + 1), self.plan.problem, self.plan.start, self.vehicles.yaw
+        )
+        self.flight, self.tabled = self.flight._replace(tables=made), problem
+
+    def _follow(self) -> None:
+        """Take over the true state, and what it cost."""
+        n, m = len(self.plan.masses), len(self.plan.edges)
+        y, state, sampled = self.state.y, self.state, self.sampled
+        y[: 3 * n], y[3 * n : 6 * n] = sampled.S[:, :3].ravel(), sampled.S[:, 3:6].ravel()
+        y[6 * n : 6 * n + m] = sampled.integral[0]
+        if self.plan.frame is not None:
+            y[6 * n + m : 6 * n + m + 4] = sampled.frame[0]
+        state.clock[0] = sampled.clock[0]
+        state.count[0] = 4 * sampled.count[fleet.STEPS]
+        state.count[1] = sampled.count[fleet.STEPS]
+
+    def end(self) -> Any:
+        """End the phase; the vehicles keep their states."""
+        self.vehicles.yaw = yaw_at(
+            self.plan.problem, self.t, self.vehicles.tables.yaw, self.plan.start, self.vehicles.yaw
+        )
+        self.vehicles.S, self.vehicles.state = self.sampled.S, self.sampled
+        return super().end()
+
+    # -- recording --------------------------------------------------------------------------------
+
+    def _keep(self, problem: Problem, call: fleet.SampledSegment, done: int) -> None:
+        """Store samples: states and forces as flown, references and constraints of the plan."""
+        plan, n = self.plan, len(self.plan.masses)
+        S, times = call.S[:done], call.times[:done]
+        parts = [S[..., :3].reshape(done, -1), S[..., 3:6].reshape(done, -1), call.integral[:done]]
+        frame = np.full((done, 4), np.nan)
+        if plan.frame is not None:
+            frame = call.frame[:done]
+            parts.append(frame)
+        planned = native.record(plan.problem, self.workspace, times, np.concatenate(parts, axis=1))
+        out, kept = _as_flown(planned, call, done, self.flight.vehicles, problem)
+        self.pieces.append(
+            Piece(
+                self.index, times, out, call.integral[:done], frame, plan.edges, plan.attached, kept
+            )
+        )
+        assert out.r.shape[1] == n
+
+
+def _as_flown(
+    planned: Record,
+    call: fleet.SampledSegment,
+    done: int,
+    vehicles: fleet.Quadrotors,
+    problem: Problem,
+) -> tuple[Record, VehicleSamples]:
+    """A record of references with the forces of vehicles, and the samples of the vehicles themselves."""
+    S, a = call.S[:done], call.dS[:done, :, 3:6]
+    k0, k1, k2 = vehicles.thrust.T[..., None]
+    speed = S[..., 13:]
+    rotor = np.where(vehicles.point[:, None], 0.0, k0 + speed * (k1 + k2 * speed))
+    T = att.dcm_from_quaternion(np.where(vehicles.point[:, None], [1.0, 0, 0, 0], S[..., 6:10]))
+    thrust = rotor.sum(axis=2)[..., None] * T[..., 2, :]
+    thrust = np.where(vehicles.point[:, None], call.command[:done, :, :3], thrust)
+    rest = vehicles.m[:, None] * a - thrust
+    air = rest + (vehicles.m * vehicles.g)[:, None] * np.array([0.0, 0.0, 1.0])
+    if problem.external:
+        air = air - (planned.f_E + (problem.vehicles.m * vehicles.g)[:, None] * [0.0, 0.0, 1.0])
+    seen = call.seen[:done]
+    out = planned._replace(
+        a=a, f_E=rest, f_D=air, f_u=call.f_u[:done], f_C=call.f_C[:done],
+        r_seen=seen[..., :3], v_seen=seen[..., 3:],
+    )  # fmt: skip
+    kept = VehicleSamples(
+        S[..., 6:10], S[..., 10:13], rotor, np.linalg.norm(thrust, axis=2), call.saturated[:done]
+    )
+    return out, kept
+
+
+__all__ = ["Bools", "SampledPhase", "Vehicles"]
