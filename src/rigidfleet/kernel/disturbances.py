@@ -5,7 +5,7 @@ Before the laws, `sense` replaces the true state by the measured one. After them
 true state and adds the forces that no vehicle knows.
 """
 
-from rigidfleet.kernel.compiler.jit import compiled
+from rigidfleet.kernel.compiler.jit import compiled, inlined
 
 # A lost vehicle on the ground: critically damped contact of this natural frequency [1/s], damped from
 # this depth [m] on. It stops within a metre from 40 m/s, and needs no shorter steps than a flight.
@@ -57,6 +57,16 @@ def sense(t, disturbance, w):
                 w.r_seen[i, q], w.v_seen[i, q] = r, v
 
 
+@inlined
+def contact(m, g, floor, z):
+    """Damping [N s/m] and upward force [N] of the ground on a lost vehicle of mass m [kg] at height z [m].
+
+    In equilibrium with its weight, the vehicle just touches the ground, at the height ``floor`` [m].
+    """
+    deep = max(0.0, floor + g / _CONTACT**2 - z)
+    return 2.0 * _CONTACT * m * min(1.0, deep / _SOFT), _CONTACT**2 * m * deep
+
+
 @compiled
 def disturb(t, m, g, disturbance, w):
     """Write true states back into w.r and w.v, true forces into w.f_E, and the aerodynamic force into w.f_D (N, 3) [N].
@@ -79,10 +89,8 @@ def disturb(t, m, g, disturbance, w):
             w.f_E[i, q] += w.f_D[i, q]
         w.f_E[i, 2] -= (true - m[i]) * g
         if disturbance.lost[i]:
-            # In equilibrium with its weight, the vehicle just touches the ground.
-            deep = max(0.0, disturbance.floor[i] + g / _CONTACT**2 - w.r[i, 2])
-            damping = 2.0 * _CONTACT * true * min(1.0, deep / _SOFT)
+            damping, lift = contact(true, g, disturbance.floor[i], w.r[i, 2])
             for q in range(3):
                 w.f_u[i, q] = 0.0
                 w.f_E[i, q] -= damping * w.v[i, q]
-            w.f_E[i, 2] += _CONTACT**2 * true * deep
+            w.f_E[i, 2] += lift

@@ -41,6 +41,8 @@ _HOT = (
     "blend_slots", "distance_references", "right_side", "solve_multipliers", "assemble", "cholesky",
     "cholesky_solve", "apply_multipliers",
 )  # fmt: skip
+#: The same of sampled flights.
+_HOT_SAMPLED = "derivative", "attitude_matrix", "quaternion_rate", "contact", "normalise"
 #: Passes that simplify each translated function before inlining.
 _QUICK = ("sroa", "simplify_cfg", "instruction_combine", "simplify_cfg")
 
@@ -51,7 +53,7 @@ def machine_code(second: "_SecondProcess | None" = None) -> list[bytes]:
     Their arguments are addresses of named tuples. They integrate (and return what `dopri5.integrate` returns),
     record, and monitor (as `monitor.watch` does). The ``second`` process, if there is one, does part of the work.
     """
-    problem, workspace, integrator, segment, record, _ = _pointers()
+    problem, workspace, integrator, segment, record, *_ = _pointers()
 
     def integrate_segment(p, w, state, s):
         call = segment(s)
@@ -78,7 +80,7 @@ def machine_code(second: "_SecondProcess | None" = None) -> list[bytes]:
 
 def _monitor() -> bytes:
     """Object code of the monitor, which shares nothing with the rest."""
-    problem, workspace, integrator, _, _, watching = _pointers()
+    problem, workspace, integrator, _, _, watching, *_ = _pointers()
 
     def watch_trail(p, w, state, found):
         return monitor.watch(problem(p), workspace(w), integrator(state), watching(found))
@@ -86,19 +88,36 @@ def _monitor() -> bytes:
     return _object(*_module(watch_trail, objects.ENTRIES[2]))
 
 
+def sampled_code() -> list[bytes]:
+    """Object code of the two C functions of sampled flights, `objects.SAMPLED_ENTRIES`."""
+    from rigidfleet.kernel import quadrotor, sampled_flight
+
+    problem, workspace, *_, flight, state, segment, evaluation = _pointers()
+
+    def fly(p, w, f, s, call):
+        return sampled_flight.fly_ticks(problem(p), workspace(w), flight(f), state(s), segment(call))
+
+    def evaluate(f, call):
+        return quadrotor.evaluate(flight(f), evaluation(call))
+
+    entries = zip((fly, evaluate), (5, 2), objects.SAMPLED_ENTRIES, strict=True)
+    modules = [_module(function, name, arguments) for function, arguments, name in entries]
+    return [_object(*module, hot=_HOT_SAMPLED) for module in modules]
+
+
 def _pointers() -> list[Any]:
     return [pointer(typeof(x)) for x in packing.examples()]
 
 
-def _module(function: Any, name: str) -> tuple[str, str, str]:
-    """Input of `_object`: the module of a C function of four addresses, its symbol, and its ``name``."""
-    made = cfunc(types.int64(*(types.int64,) * 4), **OPTIONS)(function)
+def _module(function: Any, name: str, arguments: int = 4) -> tuple[str, str, str]:
+    """Input of `_object`: the module of a C function of so many addresses, its symbol, and its ``name``."""
+    made = cfunc(types.int64(*(types.int64,) * arguments), **OPTIONS)(function)
     return made.inspect_llvm(), made.native_name, name
 
 
-def _object(text: str, symbol: str, name: str) -> bytes:
+def _object(text: str, symbol: str, name: str, hot: tuple[str, ...] = _HOT) -> bytes:
     """Object code of a module of which ``symbol`` alone, now called ``name``, is called from outside."""
-    module = _simplified(text, symbol, name)
+    module = _simplified(text, symbol, name, hot)
     builder = _passes(3)
     builder.getModulePassManager().run(module, builder)
     for function in module.functions:
@@ -109,17 +128,17 @@ def _object(text: str, symbol: str, name: str) -> bytes:
     return objects.target_machine().emit_object(module)
 
 
-def _simplified(text: str, symbol: str, name: str) -> llvm.ModuleRef:
-    """Return a module of which ``symbol`` alone, now called ``name``, is called from outside."""
+def _simplified(text: str, symbol: str, name: str, hot: tuple[str, ...] = _HOT) -> llvm.ModuleRef:
+    """Return a module of which ``symbol`` alone, now called ``name``, is called from outside; ``hot`` is inlined."""
     # Only addresses of named tuples are declared dereferenceable, and these are never written.
     module = llvm.parse_assembly(re.sub(r"(?=dereferenceable\(\d+\))", "readonly ", text))
-    hot = tuple(f"{len(name)}{name}B" for name in _HOT)  # as in Numba's mangled names
+    inlined = tuple(f"{len(name)}{name}B" for name in hot)  # as in Numba's mangled names
     for thing in (*module.functions, *module.global_variables):
         if thing.name == symbol:
             thing.name, thing.linkage = name, "external"
         elif not thing.is_declaration:
             thing.linkage = "internal"
-            if thing.is_function and any(name in thing.name for name in hot):
+            if thing.is_function and any(name in thing.name for name in inlined):
                 thing.add_function_attribute("alwaysinline")
     # A few quick passes first reduce the work of the full ones to a third.
     quick = llvm.create_new_module_pass_manager()
@@ -141,7 +160,7 @@ def _passes(level: int) -> Any:
 
 def _halves() -> tuple[_Functions, _Functions]:
     """Functions with the types of their arguments, first those of this process, then those of the second."""
-    example, work, _, _, out, _ = packing.examples()
+    example, work, _, _, out, *_ = packing.examples()
     p, w, record = (Pointer(typeof(x)) for x in (example, work, out))
     disturbance = Pointer(typeof(example.disturbance))
     number, row, places = types.float64, typeof(example.vehicles.m), typeof(work.r)
@@ -180,7 +199,7 @@ class _SecondProcess:
     def __init__(self, *, shares: bool) -> None:
         self._shares = shares
         self._process = subprocess.Popen(
-            objects.build_process(half=True), cwd=objects.ELSEWHERE, stdout=subprocess.PIPE
+            objects.build_process("half"), cwd=objects.ELSEWHERE, stdout=subprocess.PIPE
         )  # fmt: skip
         for function, arguments in _halves()[1].items() if shares else ():
             half = self._Half(self, function.__name__, arguments)
@@ -218,15 +237,18 @@ class _SecondProcess:
             """Store nothing."""
 
 
-def main(*, half: bool) -> None:
-    """Write the machine code to standard output; or only what the second process does.
+def main(part: str) -> None:
+    """Write machine code to standard output: of "flight", the "half" of it that the second process makes, or "sampled".
 
     Numba's internals are used where they are known; else the second process makes the monitor alone.
     """
     output, known = sys.stdout.buffer, numba_internals.known()
     if known:
         numba_internals.translate_only()
-    if half:
+    if part == "sampled":
+        output.write(objects.concatenated(sampled_code()))
+        return
+    if part == "half":
         pickle.dump(_translated() if known else {}, output)
         output.flush()
         pickle.dump(_monitor(), output)

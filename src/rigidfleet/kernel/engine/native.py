@@ -26,6 +26,7 @@ from rigidfleet.kernel.compiler.cache import cache_directory, not_kept, opened, 
 from rigidfleet.kernel.engine.objects import (
     ELSEWHERE,
     ENTRIES,
+    SAMPLED_ENTRIES,
     build_process,
     concatenated,
     separated,
@@ -107,10 +108,23 @@ class _Code(NamedTuple):
     unkept: list[bytes] | None  # objects that could not be stored in the cache
 
 
-_loading = threading.Lock()
+class Sampled(NamedTuple):
+    """The second library: sampled flights. Flights of points do not load it."""
+
+    fly_ticks: Any
+    evaluate: Any
+    recorder: int  # address of record
+    engine: Any
+    unkept: list[bytes] | None
+
+
+_loading = threading.RLock()
 
 
 _loaded: list[_Code] = []
+
+
+_sampled: list[Sampled] = []
 
 
 def _code() -> _Code:
@@ -129,16 +143,45 @@ def _load() -> _Code:
     return _linked(parts, None if _write(parts) else parts)
 
 
+def sampled() -> Sampled:
+    """The machine code of sampled flights: from the cache, or compiled."""
+    with _loading:
+        if not _sampled:
+            if (parts := _read("sampled")) is not None:
+                _sampled.append(_linked_sampled(parts))
+            else:
+                parts = _compile("sampled")
+                unkept = None if _write(parts, "sampled") else parts
+                _sampled.append(_linked_sampled(parts, unkept))
+    return _sampled[0]
+
+
+def _linked_sampled(parts: Sequence[bytes], unkept: list[bytes] | None = None) -> Sampled:
+    engine = _engine(parts)
+    fly, evaluate = (engine.get_function_address(name) for name in SAMPLED_ENTRIES)
+    word = ctypes.c_int64
+    return Sampled(
+        ctypes.CFUNCTYPE(word, *(word,) * 5)(fly), ctypes.CFUNCTYPE(word, word, word)(evaluate), _code().recorder,
+        engine, unkept,
+    )  # fmt: skip
+
+
 def _linked(parts: Sequence[bytes], unkept: list[bytes] | None = None) -> _Code:
+    engine = _engine(parts)
+    kind = ctypes.CFUNCTYPE(ctypes.c_int64, *(ctypes.c_int64,) * 4)
+    addresses = [engine.get_function_address(name) for name in ENTRIES]
+    return _Code(*map(kind, addresses), addresses[1], engine, unkept)
+
+
+def _engine(parts: Sequence[bytes]) -> Any:
+    """Load objects of machine code."""
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), target_machine())
     for part in parts:
         engine.add_object_file(llvm.ObjectFileRef.from_data(part))
     engine.finalize_object()
-    kind = ctypes.CFUNCTYPE(ctypes.c_int64, *(ctypes.c_int64,) * 4)
-    addresses = [engine.get_function_address(name) for name in ENTRIES]
-    return _Code(*map(kind, addresses), addresses[1], engine, unkept)
+    return engine
 
 
 class Inheritance(NamedTuple):
@@ -146,11 +189,14 @@ class Inheritance(NamedTuple):
 
     code: list[bytes] | None
     told: bool
+    sampled: list[bytes] | None
 
 
 def bequeath() -> Inheritance:
     """Code of this process that its child processes cannot find in the cache; to be sent only to them."""
-    return Inheritance(_loaded[0].unkept if _loaded else None, told.is_set())
+    return Inheritance(
+        _loaded[0].unkept if _loaded else None, told.is_set(), _sampled[0].unkept if _sampled else None
+    )  # fmt: skip
 
 
 def inherit(given: Inheritance) -> None:
@@ -159,10 +205,12 @@ def inherit(given: Inheritance) -> None:
         told.set()
     if given.code is not None:
         _loaded.append(_linked(given.code, given.code))
+    if given.sampled is not None:
+        _sampled.append(_linked_sampled(given.sampled, given.sampled))
 
 
-def _compile() -> list[bytes]:
-    """Compile the kernel, in a separate process if possible.
+def _compile(part: str = "flight") -> list[bytes]:
+    """Compile the kernel, or its ``part`` "sampled", in a separate process if possible.
 
     In that process Numba only translates. Otherwise it would optimise each function before all are optimised
     together, and take twice as long.
@@ -172,17 +220,17 @@ def _compile() -> list[bytes]:
     if sys.executable:
         with suppress(OSError):
             done = subprocess.run(
-                build_process(), env=os.environ | quiet, cwd=ELSEWHERE, capture_output=True, check=False
+                build_process(part), env=os.environ | quiet, cwd=ELSEWHERE, capture_output=True, check=False
             )  # fmt: skip
             if done.returncode == 0 and (parts := separated(done.stdout)) is not None:
                 return parts
-    from rigidfleet.kernel.engine.build import machine_code
+    from rigidfleet.kernel.engine import build
 
-    return machine_code()
+    return build.sampled_code() if part == "sampled" else build.machine_code()
 
 
-def _file() -> Path:
-    """The cache file of the machine code for this kind of machine.
+def _file(part: str = "flight") -> Path:
+    """The cache file of a part of the machine code for this kind of machine.
 
     Raises
     ------
@@ -190,22 +238,22 @@ def _file() -> Path:
         As `cache_directory` does.
     """
     machine = f"{llvm.get_process_triple()} {llvm.get_host_cpu_name()} {llvm.get_host_cpu_features().flatten()}"
-    return cache_directory() / f"flight-{hashlib.sha256(machine.encode()).hexdigest()[:16]}.o"
+    return cache_directory() / f"{part}-{hashlib.sha256(machine.encode()).hexdigest()[:16]}.o"
 
 
-def _read() -> list[bytes] | None:
+def _read(part: str = "flight") -> list[bytes] | None:
     """Machine code from the cache, if there is any that is safe to run."""
     try:
-        with opened(_file()) as stream:
+        with opened(_file(part)) as stream:
             return separated(stream.read())
     except OSError:
         return None
 
 
-def _write(parts: Sequence[bytes]) -> bool:
+def _write(parts: Sequence[bytes], part: str = "flight") -> bool:
     """Store machine code in the cache, or warn that it will be compiled again."""
     try:
-        with replacing(_file(), private=True) as stream:
+        with replacing(_file(part), private=True) as stream:
             stream.write(concatenated(parts))
     except OSError as error:
         not_kept(error)

@@ -15,28 +15,31 @@ import llvmlite.binding as llvm
 #: int64(problem, workspace, segment, record) and int64(problem, workspace, integrator, monitor). Each function is in
 #: its own object.
 ENTRIES = "rigidfleet_integrate", "rigidfleet_record", "rigidfleet_watch"
+#: Those of the second library, `sampled`: int64(problem, workspace, flight, state, segment) and int64(flight, evaluation).
+SAMPLED_ENTRIES = "rigidfleet_fly_ticks", "rigidfleet_evaluate"
 
 
 #: Working folder of the compiling processes, as Numba reads settings from a file in its working folder.
 ELSEWHERE = os.path.abspath(os.sep)
 
 
-_BUILD = "import sys; sys.path[:] = sys.argv[1:]; from rigidfleet.kernel.engine import build; build.main(half={})"
+_BUILD = "import sys; sys.path[:] = sys.argv[1:]; from rigidfleet.kernel.engine import build; build.main({!r})"
 
 
 _FLAGS = {"isolated": "-I", "ignore_environment": "-E", "no_user_site": "-s", "no_site": "-S"}
 
 
-def build_process(*, half: bool = False) -> list[str]:
-    """Command of a compiling process, which has the import path of this one without the current folder.
+def build_process(part: str = "flight") -> list[str]:
+    """Command of a process that compiles a part (see `build.main`), with the import path of this one.
 
+    The current folder is left out.
     An interactive Python, or one started with ``-c``, has the current folder on its path as ``""``. This entry is
     removed; all other folders are kept, because the user chose them. The folder of this package comes last.
     """
     flags = [flag for name, flag in _FLAGS.items() if getattr(sys.flags, name)]
     path = [os.path.abspath(folder) for folder in sys.path if isinstance(folder, str) and folder]
     home = str(Path(__file__).resolve().parents[3])
-    return [sys.executable, *flags, "-P", "-c", _BUILD.format(half), *path, home]
+    return [sys.executable, *flags, "-P", "-c", _BUILD.format(part), *path, home]
 
 
 def target_machine() -> Any:

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from rigidfleet.kernel import fleet
 from rigidfleet.kernel.problem import (
     CONSTANT,
     ITERATED,
@@ -120,7 +121,10 @@ def _layout(kind: type) -> _Layout:
 
 
 @cache
-def examples() -> tuple[Problem, Workspace, IntegratorState, Segment, Record, Monitor]:
+def examples() -> tuple[
+    Problem, Workspace, IntegratorState, Segment, Record, Monitor, fleet.Flight, fleet.SampledState,
+    fleet.SampledSegment, fleet.Evaluation,
+]:
     """One minimal example of each named tuple; its fields have the types that all have."""
     one, none, places, frame = np.ones(1), np.zeros(0), np.zeros((1, 3)), np.eye(3)
     problem = Problem(
@@ -142,7 +146,15 @@ def examples() -> tuple[Problem, Workspace, IntegratorState, Segment, Record, Mo
     segment = Segment(0.0, False, 0, none, np.zeros((0, 6)), none)
     nowhere = np.zeros((0, 6))
     watching = monitor(one, nowhere, nowhere, 6, 3)
-    return problem, kernel_workspace(1, 0), state, segment, UNRECORDED, watching
+    work = kernel_workspace(1, 0)
+    vehicles = fleet.quadrotors([fleet.Vehicle(1.0, point=True)])
+    flight = fleet.flight(vehicles, start=0.0, h=0.0, steps=1)
+    S = np.zeros((1, fleet.STATES))
+    rotors = np.zeros((1, 4))
+    return (
+        problem, work, state, segment, UNRECORDED, watching, flight, fleet.begin(flight, S, work),
+        fleet.segment(1, 0, 0.0), fleet.Evaluation(S, rotors, places, places, frame, S),
+    )  # fmt: skip
 
 
 NOTHING = np.zeros(0)

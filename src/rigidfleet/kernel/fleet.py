@@ -1,0 +1,399 @@
+"""A fleet of quadrotors and its sampled flight as arrays, read and written by `sampled_flight`.
+
+N vehicles, m edges. World axes are x, y horizontal and z up; body axes are x forward, y left, z up. A quaternion has its
+scalar first, and T(q) takes world axes to body axes, as in `rigidfleet.math.attitude`.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rigidfleet.kernel.problem import Workspace, zeros
+from rigidfleet.kernel.records import NO_TRAIL, Trail
+from rigidfleet.typing import Bools, Floats, Ints
+
+#: State of a vehicle: r (3) [m], v (3) [m/s], q (4), omega (3) [rad/s, body axes], speeds of the rotors (4) [rad/s].
+STATES = 17
+#: What commands the vehicles (`Commands.kind`): the desired forces of the formation law; thrust and attitude; rotors.
+FORCE, ATTITUDE, ROTORS = range(3)
+#: Columns of `SampledState.count`: steps of the grid that are complete, attitude ticks done, law ticks done, samples
+#: written, steps in the trail.
+STEPS, TICKS, LAWS, SAMPLES, TRAILED = range(5)
+#: Columns of `SampledState.worst`: least cosine of the tilt; greatest tracking error [m]; acceleration [m/s^2].
+UPRIGHT, ERROR, ACCELERATION = range(3)
+#: A tick that no flight reaches (`Tables.last`).
+ENDLESS = 1 << 62
+
+
+@dataclass(frozen=True)
+class Vehicle:
+    """One quadrotor, or one ideal point.
+
+    A rotor at speed w [rad/s] has the thrust ``thrust[0] + thrust[1] w + thrust[2] w^2`` [N] and the torque about its
+    axis ``torque[0] + torque[1] w + torque[2] w^2`` [N m]. Its speed follows the command c by
+    ``(c - w) (a + b (c + w))``, with (a, b) = ``motor[:2]`` if it rises and ``motor[2:]`` if it falls; a first-order lag
+    is a = 1/tau, b = 0. A ``point`` delivers any force at once, up to ``limit``; only m, drag and limit matter then.
+
+    Raises
+    ------
+    ValueError
+        The rotors do not span thrust and three torques.
+    """
+
+    m: float  # [kg]
+    inertia: ArrayLike = (1.0, 1.0, 1.0)  # (3,) about the body axes [kg m^2]
+    rotors: ArrayLike = ((1, 1, 0), (1, -1, 0), (-1, -1, 0), (-1, 1, 0))  # (4, 3) [m]
+    spin: ArrayLike = (1, -1, 1, -1)  # (4,) sign of the torque of each rotor on the body
+    thrust: ArrayLike = (0.0, 0.0, 1.0)  # (3,) [N], [N s/rad], [N s^2/rad^2]
+    torque: ArrayLike = (0.0, 0.0, 1.0)  # (3,) [N m], ...
+    rotor_drag: ArrayLike = (0.0, 0.0)  # (2,) in and along the rotor's axis [N s^2/(m rad)]: k_d, k_z
+    lift: float = 0.0  # translational lift of a rotor k_h [N s^2/m^2]
+    c: ArrayLike = (0.0, 0.0, 0.0)  # (3,) parasitic drag, body axes [N s^2/m^2]
+    drag: ArrayLike = (0.0, 0.0, 0.0)  # (3,) linear drag, body axes [N s/m]
+    rotor_inertia: float = 0.0  # of a rotor and its motor about its axis [kg m^2]
+    motor: ArrayLike = (1.0, 0.0, 1.0, 0.0)  # (4,) [1/s], [1/rad], up and down
+    speed: ArrayLike = (0.0, 1.0)  # (2,) least and greatest speed of a rotor [rad/s]
+    k_R: ArrayLike = (1.0, 1.0, 1.0)  # (3,) attitude gain per unit inertia [1/s^2]
+    k_omega: ArrayLike = (1.0, 1.0, 1.0)  # (3,) rate gain per unit inertia [1/s]
+    tilt: float = np.pi  # limit of the thrust vector's tilt [rad]; none from pi/2
+    radius: float = 0.0  # of a rotor [m], for downwash and ground effect; 0: none
+    point: bool = False
+    limit: float = np.inf  # of a point's force [N]
+
+    def thrust_at(self, speed: ArrayLike) -> Floats:
+        """Thrust [N] of a rotor at a speed [rad/s]."""
+        return np.polynomial.polynomial.polyval(np.asarray(speed, dtype=float), self.thrust)
+
+    def speed_at(self, thrust: ArrayLike) -> Floats:
+        """Speed [rad/s] of a rotor with a thrust [N]."""
+        k0, k1, k2 = np.asarray(self.thrust, dtype=float)
+        root = np.sqrt(k1**2 + 4.0 * k2 * (np.asarray(thrust, dtype=float) - k0))
+        return (root - k1) / (2.0 * k2)
+
+    def unmixed(self, g: float) -> Floats:
+        """Matrix (4, 4) from thrust [N] and torque [N m] to the rotors' forces.
+
+        The ratio of a rotor's torque to its thrust is that at hover.
+        """
+        if self.point:
+            return np.zeros((4, 4))
+        hover = self.speed_at(0.25 * self.m * g)
+        ratio = np.polynomial.polynomial.polyval(hover, self.torque) / self.thrust_at(hover)
+        x, y, _ = np.asarray(self.rotors, dtype=float).T
+        mixing = np.stack([np.ones(4), y, -x, ratio * np.asarray(self.spin)])
+        if not np.linalg.matrix_rank(mixing) == 4:
+            raise ValueError(
+                f"rotors at {np.asarray(self.rotors).tolist()} that turn by {np.asarray(self.spin).tolist()} do not span"
+                " thrust and three torques; move one, or turn it the other way"
+            )
+        return np.linalg.inv(mixing)
+
+
+class Quadrotors(NamedTuple):
+    """Vehicles as arrays; see `Vehicle` for meanings and units."""
+
+    m: Floats  # (N,) true mass
+    inertia: Floats  # (N, 3)
+    rotors: Floats  # (N, 4, 3)
+    spin: Floats  # (N, 4)
+    thrust: Floats  # (N, 3)
+    torque: Floats  # (N, 3)
+    rotor_drag: Floats  # (N, 2)
+    lift: Floats  # (N,)
+    c: Floats  # (N, 3)
+    drag: Floats  # (N, 3)
+    rotor_inertia: Floats  # (N,)
+    motor: Floats  # (N, 4)
+    speed: Floats  # (N, 2)
+    force: Floats  # (N, 2) least and greatest thrust of a rotor [N]
+    unmix: Floats  # (N, 4, 4)
+    k_R: Floats  # (N, 3)
+    k_omega: Floats  # (N, 3)
+    tilt: Floats  # (N,)
+    radius: Floats  # (N,)
+    span: Floats  # (N, 2) distance of neighbouring and of opposite rotors [m]
+    point: Bools  # (N,)
+    limit: Floats  # (N,)
+    lost: Bools  # (N,) without thrust
+    g: float  # [m/s^2]
+
+
+class Air(NamedTuple):
+    """What surrounds the vehicles."""
+
+    wind: Floats  # (3,) steady, world [m/s]
+    gust_step: float  # between knots [s]
+    gust: Floats  # (K, N, 3) coefficients of cubic B-splines over time [m/s]; see `disturbances.spline`
+    downwash: bool  # see `aerodynamics.add_downwash`
+    ground_effect: bool  # see `aerodynamics.ground_effect`
+    density: float  # [kg/m^3]
+    ground: float  # height of the ground [m]
+    floor: Floats  # (N,) height at which a lost vehicle comes to rest [m]
+
+
+class Sensing(NamedTuple):
+    """What the formation law knows; attitude, rates and rotor speeds are known to each vehicle at once.
+
+    If ``linked``, vehicle i knows the others by messages of what they have measured, and its forces are those of a law
+    evaluated for what it knows. Otherwise all measured states are known to one law.
+    """
+
+    every: int  # attitude ticks between measurements
+    delay: Ints  # (N,) attitude ticks from a state to its measurement
+    linked: bool
+    link_every: int  # attitude ticks between messages
+    link_delay: Ints  # (N, N) attitude ticks from a measurement of j to its arrival at i, by [i, j]
+
+
+class Guidance(NamedTuple):
+    """What is added to the forces of the formation law, after it: the constraint law would cancel it.
+
+    Both act in phases with tracking.
+    """
+
+    drag: Floats  # (N, 3) linear drag fed forward for the reference velocity, body axes [N s/m]
+    k_i: Floats  # (N, 3) integral gain of the tracking error, world axes [1/s^3]
+
+
+class Tables(NamedTuple):
+    """Values for attitude ticks from ``first`` to before ``last``, where the flight pauses for the next ones.
+
+    A table without rows stands for zeros, or for nothing dropped. K = last - first ticks; a measurement or message takes
+    place at ticks that are a multiple of `Sensing.every` or `Sensing.link_every`, and has a row for each of them.
+    """
+
+    first: int
+    last: int
+    yaw: Floats  # (K, N, 3) yaw [rad], its rate and acceleration
+    jerk: Floats  # (K, N, 3) of the reference [m/s^3]
+    snap: Floats  # (K, N, 3) [m/s^4]
+    noise_r: Floats  # (K', N, 3) of measurements [m]
+    noise_v: Floats  # (K', N, 3) [m/s]
+    dropped: Bools  # (K', N) measurements that fail
+    unheard: Bools  # (K'', N, N) messages of j that do not reach i, by [i, j]
+
+
+class Commands(NamedTuple):
+    """Commands of a user's controller, held until it gives others; with ``kind`` FORCE, the formation law commands."""
+
+    kind: int
+    thrust: Floats  # (N,) along the body's z axis [N]
+    attitude: Floats  # (N, 4) quaternion
+    rates: Floats  # (N, 3) of that attitude, in its own body axes [rad/s]
+    speeds: Floats  # (N, 4) of the rotors [rad/s]
+
+
+class Flight(NamedTuple):
+    """All that a sampled flight reads, beside the `Problem` of its formation law."""
+
+    vehicles: Quadrotors
+    air: Air
+    sensing: Sensing
+    guidance: Guidance
+    tables: Tables
+    commands: Commands
+    start: float  # time of tick 0 [s]
+    h: float  # step of integration [s]
+    steps: int  # steps between attitude ticks
+    every: int  # attitude ticks between evaluations of the formation law
+
+
+class SampledState(NamedTuple):
+    """State of a sampled flight, which can pause at any step and go on to the same bits; all of it is written.
+
+    ``work`` is overwritten by each step and need not be kept.
+    """
+
+    S: Floats  # (N, 17) true states
+    clock: Floats  # (2,) time, and time of the last evaluation of the law [s]
+    count: Ints  # (5,) see `STEPS`
+    integral: Floats  # (1, m) of the constraints [m s]; (N, m) if linked
+    frame: Floats  # (3, 4) mean-axis quaternion at the last evaluation, its rate, and the rate before
+    error: Floats  # (N, 3) integral of the tracking error [m s]
+    f_u: Floats  # (N, 3) input force of the law, held [N]
+    f_C: Floats  # (N, 3) its constraint force [N]
+    force: Floats  # (N, 3) desired force [N]
+    push: Floats  # (N, 3) a user's external force [N]
+    command: Floats  # (N, 4) rotor speeds [rad/s]; force of a point (3) [N], 0
+    saturated: Bools  # (N,) at the last tick
+    seen: Floats  # (N, 6) measured r, v
+    history: Floats  # (D, N, 6) true r, v of the last ticks
+    sent: Floats  # (D, N, 6) measured ones
+    heard: Floats  # (N, N, 6) what i knows of j, if linked; else without rows
+    peak: Floats  # (N, 4) greatest thrust of each rotor [N]
+    peak_time: Floats  # (N, 4) [s]
+    worst: Floats  # (N, 3) see `UPRIGHT`
+    worst_time: Floats  # (N, 3) [s]
+    saturations: Ints  # (N,) number of ticks saturated
+    trail: Trail  # of r and v, (S, 5, 6 N)
+    work: "SampledWork"
+
+
+class SampledWork(NamedTuple):
+    """Work arrays of a sampled flight."""
+
+    y: Floats  # (7, 17) start, trial, four derivatives, end
+    air: Floats  # (3, N, 3) velocity of the air at the start, the middle and the end of a step [m/s]
+    T: Floats  # (3, 3)
+    desired: Floats  # (5, 3) desired attitude (3, 3), its rates and accelerations
+    x: Floats  # (4, 4)
+    law_time: Floats  # (1,)
+    law_state: Floats  # (1, 6 N + m + 4) as `dynamics.closed_loop` reads it
+    law_rate: Floats  # (6 N + m + 4,)
+
+
+class SampledSegment(NamedTuple):
+    """End of a flight, and the samples to write on the way; K rows."""
+
+    t_end: float  # [s]
+    max_steps: int  # after which to pause
+    recorder: int  # address of the recorder, with its arguments
+    segment: int
+    record: int
+    times: Floats  # (K,) [s], increasing
+    S: Floats  # (K, N, 17)
+    dS: Floats  # (K, N, 17) derivative
+    command: Floats  # (K, N, 4)
+    f_u: Floats  # (K, N, 3)
+    f_C: Floats  # (K, N, 3)
+    seen: Floats  # (K, N, 6)
+    air: Floats  # (K, N, 3) velocity of the air [m/s]
+    saturated: Bools  # (K, N)
+    integral: Floats  # (K, m) of the constraints, of the first vehicle's view if linked
+    frame: Floats  # (K, 4)
+
+
+class Evaluation(NamedTuple):
+    """States of vehicles, and their derivatives."""
+
+    S: Floats  # (N, 17)
+    command: Floats  # (N, 4)
+    air: Floats  # (N, 3) [m/s]
+    push: Floats  # (N, 3) [N]
+    T: Floats  # (3, 3) work
+    dS: Floats  # (N, 17), written
+
+
+# -- making them -------------------------------------------------------------------------------------
+
+
+def quadrotors(vehicles: Sequence[Vehicle], g: float = 9.81) -> Quadrotors:
+    """Put vehicles into arrays."""
+
+    def rows(name: str) -> Floats:
+        return np.ascontiguousarray([getattr(v, name) for v in vehicles], dtype=float)
+
+    names = set(Quadrotors._fields) - {"force", "unmix", "span", "point", "lost", "g"}
+    gaps = [
+        np.linalg.norm(np.asarray(v.rotors, dtype=float)[1:] - np.asarray(v.rotors)[0], axis=1)
+        for v in vehicles
+    ]
+    return Quadrotors(
+        **{name: rows(name) for name in names},
+        force=np.array([v.thrust_at(v.speed) for v in vehicles]),
+        unmix=np.array([v.unmixed(g) for v in vehicles]),
+        span=np.array([[gap.min(), gap.max()] for gap in gaps]),
+        point=np.array([v.point for v in vehicles]),
+        lost=np.zeros(len(vehicles), dtype=np.bool_),
+        g=g,
+    )
+
+
+def still_air(n: int) -> Air:
+    """Air at rest, without downwash and ground effect."""
+    return Air(
+        np.zeros(3), 1.0, np.zeros((0, n, 3)), False, False, 1.225, 0.0, np.full(n, -np.inf)
+    )
+
+
+def exact_sensing(n: int) -> Sensing:
+    """States that are known exactly and at once."""
+    return Sensing(1, np.zeros(n, dtype=np.int64), False, 1, np.zeros((n, n), dtype=np.int64))
+
+
+def no_tables(n: int) -> Tables:
+    """No feedforward, yaw 0, no noise, nothing dropped."""
+    none = np.zeros((0, n, 3))
+    return Tables(
+        0, ENDLESS, none, none, none, none, none, np.zeros((0, n), dtype=np.bool_),
+        np.zeros((0, n, n), dtype=np.bool_),
+    )  # fmt: skip
+
+
+def no_commands(n: int) -> Commands:
+    """The formation law commands the vehicles."""
+    return Commands(
+        FORCE, np.zeros(n), np.tile([1.0, 0, 0, 0], (n, 1)), np.zeros((n, 3)), np.zeros((n, 4))
+    )
+
+
+def flight(
+    vehicles: Quadrotors, *, start: float, h: float, steps: int, every: int = 1
+) -> Flight:
+    """A flight in still air with exact sensing; see `Flight`. Replace parts of it by ``_replace``."""
+    n = len(vehicles.m)
+    return Flight(
+        vehicles, still_air(n), exact_sensing(n), Guidance(np.zeros((n, 3)), np.zeros((n, 3))), no_tables(n),
+        no_commands(n), start, h, steps, every,
+    )  # fmt: skip
+
+
+def hovering(vehicles: Quadrotors, r: ArrayLike, v: ArrayLike, yaw: ArrayLike = 0.0) -> Floats:
+    """States (N, 17) at positions and velocities (N, 3), level, with thrust equal to weight.
+
+    ``yaw`` (N,) or one for all [rad].
+    """
+    n = len(vehicles.m)
+    S = zeros(n, STATES)
+    S[:, :3], S[:, 3:6] = r, v
+    S[:, 6], S[:, 9] = np.cos(0.5 * np.asarray(yaw)), np.sin(0.5 * np.asarray(yaw))
+    k0, k1, k2 = vehicles.thrust.T
+    root = np.sqrt(k1**2 + 4.0 * k2 * (0.25 * vehicles.m * vehicles.g - k0))
+    speed = np.clip((root - k1) / (2.0 * k2), *vehicles.speed.T)
+    S[:, 13:] = np.where(vehicles.point, 0.0, speed)[:, None]
+    return S
+
+
+def begin(
+    given: Flight, S: Floats, workspace: Workspace, *, frame: Floats | None = None, rows: int = 0
+) -> SampledState:
+    """State of a flight at its start, from states ``S`` (N, 17); ``rows`` steps fit into the trail."""
+    n, m = len(S), len(workspace.c)
+    sensing = given.sensing
+    depth = 1 + int(sensing.delay.max()) + (int(sensing.link_delay.max()) if sensing.linked else 0)
+    known = np.ascontiguousarray(S[:, :6])
+    past = np.tile(known, (depth, 1, 1))
+    attitude = np.zeros((3, 4))
+    attitude[0] = (1.0, 0.0, 0.0, 0.0) if frame is None else frame
+    size = 6 * n + m + 4
+    worst = np.tile([1.0, 0.0, 0.0], (n, 1))
+    trail = NO_TRAIL
+    if rows:
+        none = np.zeros(0)
+        trail = Trail(np.empty((rows, 2)), np.empty((rows, 5, 6 * n)), np.zeros((rows, 0)), none)
+    return SampledState(
+        S=S.copy(), clock=np.array([given.start, given.start]), count=np.zeros(5, dtype=np.int64),
+        integral=np.zeros((n if sensing.linked else 1, m)), frame=attitude, error=np.zeros((n, 3)),
+        f_u=np.zeros((n, 3)), f_C=np.zeros((n, 3)), force=np.zeros((n, 3)), push=np.zeros((n, 3)),
+        command=np.zeros((n, 4)), saturated=np.zeros(n, dtype=np.bool_), seen=known, history=past, sent=past.copy(),
+        heard=np.tile(known, (n if sensing.linked else 0, 1, 1)), peak=np.zeros((n, 4)), peak_time=np.zeros((n, 4)),
+        worst=worst, worst_time=np.zeros((n, 3)), saturations=np.zeros(n, dtype=np.int64), trail=trail,
+        work=SampledWork(
+            zeros(7, STATES), zeros(3, n, 3), np.eye(3), np.zeros((5, 3)), np.zeros((4, 4)), np.zeros(1),
+            np.zeros((1, size)), np.zeros(size),
+        ),
+    )  # fmt: skip
+
+
+def segment(n: int, m: int, t_end: float, times: ArrayLike = (), max_steps: int = ENDLESS) -> SampledSegment:
+    """A flight to ``t_end`` [s], sampled at ``times`` (K,) [s]."""
+    at = np.ascontiguousarray(times, dtype=float)
+    k = len(at)
+    return SampledSegment(
+        t_end, max_steps, 0, 0, 0, at, np.empty((k, n, STATES)), np.empty((k, n, STATES)), np.empty((k, n, 4)),
+        np.empty((k, n, 3)), np.empty((k, n, 3)), np.empty((k, n, 6)), np.empty((k, n, 3)),
+        np.empty((k, n), dtype=np.bool_), np.empty((k, m)), np.empty((k, 4)),
+    )  # fmt: skip

@@ -1,0 +1,369 @@
+"""The sampled flight of a fleet: measurements, formation law and attitude control at ticks, fixed steps in between.
+
+Tick k is at ``start + k steps h``. At each tick, states are measured; at every ``every``-th tick the formation law gives
+each vehicle a desired force; then attitude control gives it rotor speeds, which are held to the next tick. Between ticks
+the true states follow the equations of motion by the classical Runge-Kutta method with the step h. Gusts are evaluated at
+each stage, downwash once per step.
+"""
+
+import math
+
+from rigidfleet.kernel.aerodynamics import add_downwash, air_velocity
+from rigidfleet.kernel.attitude_control import steer
+from rigidfleet.kernel.compiler.calls import call_recorder
+from rigidfleet.kernel.compiler.jit import compiled
+from rigidfleet.kernel.fleet import (
+    ACCELERATION,
+    ERROR,
+    FORCE,
+    LAWS,
+    SAMPLES,
+    STEPS,
+    TICKS,
+    TRAILED,
+    UPRIGHT,
+)
+from rigidfleet.kernel.problem import TRACKING
+from rigidfleet.kernel.quadrotor import normalise, runge_kutta
+from rigidfleet.kernel.records import COLLAPSED, FINISHED, PAUSED
+from rigidfleet.kernel.rigid_body import (
+    attitude_matrix,
+    mean_axes,
+    multiply,
+    multiply_transposed,
+    quaternion_rate,
+)
+
+#: Times that differ by less than this share of a step are the same.
+_SAME = 1e-9
+
+
+# -- what is known -------------------------------------------------------------------------------------
+
+
+@compiled
+def row_of(k, every, first):
+    """Row of a table for the measurement at tick k, if the table begins with tick ``first``."""
+    return k // every - (first + every - 1) // every
+
+
+@compiled
+def measure(k, flight, state):
+    """Measured states of all vehicles at tick k, into ``state.seen`` and, if vehicles are linked, ``state.heard``."""
+    sensing, tables, depth = flight.sensing, flight.tables, state.history.shape[0]
+    n, now = state.S.shape[0], k % depth
+    for i in range(n):
+        for q in range(6):
+            state.history[now, i, q] = state.S[i, q]
+    if k % sensing.every == 0:
+        u = row_of(k, sensing.every, tables.first)
+        noisy = tables.noise_r.shape[0] > 0
+        for i in range(n):
+            if tables.dropped.shape[0] > 0 and tables.dropped[u, i]:
+                continue
+            then = (k - sensing.delay[i]) % depth
+            for q in range(3):
+                r, v = state.history[then, i, q], state.history[then, i, 3 + q]
+                state.seen[i, q] = r + (tables.noise_r[u, i, q] if noisy else 0.0)
+                state.seen[i, 3 + q] = v + (tables.noise_v[u, i, q] if noisy else 0.0)
+    if sensing.linked:
+        listen(k, flight, state)
+
+
+@compiled
+def listen(k, flight, state):
+    """Messages that arrive at tick k: what vehicle i knows of the others, into ``state.heard[i]``."""
+    sensing, tables, depth = flight.sensing, flight.tables, state.sent.shape[0]
+    n, now = state.S.shape[0], k % depth
+    heard, u = k % sensing.link_every == 0, row_of(k, sensing.link_every, tables.first)
+    for j in range(n):
+        for q in range(6):
+            state.sent[now, j, q] = state.heard[j, j, q] = state.seen[j, q]
+    for i in range(n):
+        for j in range(n):
+            if not heard or i == j or (tables.unheard.shape[0] > 0 and tables.unheard[u, i, j]):
+                continue
+            then = (k - sensing.link_delay[i, j]) % depth
+            for q in range(6):
+                state.heard[i, j, q] = state.sent[then, j, q]
+
+
+# -- the formation law ---------------------------------------------------------------------------------
+
+
+@compiled
+def evaluate_law(t, known, integral, p, w, state, call):
+    """Evaluate the formation law at t [s] for known states (N, 6) and an integral (m,); results are in w."""
+    n, m, y = known.shape[0], integral.shape[0], state.work.law_state[0]
+    for i in range(n):
+        for q in range(3):
+            y[3 * i + q], y[3 * n + 3 * i + q] = known[i, q], known[i, 3 + q]
+    for k in range(m):
+        y[6 * n + k] = integral[k]
+    for q in range(4):
+        y[6 * n + m + q] = state.frame[0, q]
+    state.work.law_time[0] = t
+    call_recorder(call.recorder, p, w, call.segment, call.record)
+
+
+@compiled
+def integrate_constraints(dt, integral, p, w, state):
+    """Add c dt to the integral (m,) of each constraint, unless a vehicle of its edge is saturated."""
+    edges = p.graph.edges
+    for k in range(edges.shape[0]):
+        if not (state.saturated[edges[k, 0]] or state.saturated[edges[k, 1]]):
+            integral[k] += dt * w.c[k]
+
+
+@compiled
+def take_force(i, dt, p, w, flight, state):
+    """Desired force of vehicle i [N] from the law just evaluated, with what is added after it."""
+    vehicles, guidance, T, x = flight.vehicles, flight.guidance, state.work.T, state.work.x
+    m = p.vehicles.m[i]
+    for q in range(3):
+        state.f_u[i, q], state.f_C[i, q] = w.f_u[i, q], w.f_C[i, q]
+        state.force[i, q] = w.f_u[i, q] + w.f_C[i, q]
+        state.push[i, q] = 0.0
+        if p.external != 0:
+            state.push[i, q] = w.f_E[i, q] + (m * p.vehicles.g if q == 2 else 0.0)
+    if p.control.kind == TRACKING:
+        attitude_matrix(state.S[i, 6:10], T)
+        multiply(T, w.v_ref[i], x[0])
+        for q in range(3):
+            x[0, q] *= guidance.drag[i, q]
+        multiply_transposed(T, x[0], x[1])
+        for q in range(3):
+            if not state.saturated[i]:
+                state.error[i, q] += dt * (state.seen[i, q] - w.r_ref[i, q])
+            state.force[i, q] += x[1, q] - m * guidance.k_i[i, q] * state.error[i, q]
+        if not vehicles.lost[i]:
+            e = 0.0
+            for q in range(3):
+                e += (state.S[i, q] - w.r_ref[i, q]) ** 2
+            worse(i, ERROR, math.sqrt(e), state.work.law_time[0], state)
+
+
+@compiled
+def worse(i, kind, value, t, state):
+    """Keep a value of vehicle i and its time if it is the greatest so far."""
+    if value > state.worst[i, kind]:
+        state.worst[i, kind], state.worst_time[i, kind] = value, t
+
+
+@compiled
+def desire(t, p, w, flight, state, call):
+    """Desired forces of all vehicles at t [s]; returns False if the law gives none (a singular law)."""
+    n, dt = state.S.shape[0], flight.every * flight.steps * flight.h
+    advance_frame(t, p, state)
+    linked = flight.sensing.linked
+    for i in range(n if linked else 1):
+        known = state.heard[i] if linked else state.seen
+        integral = state.integral[i]
+        evaluate_law(t, known, integral, p, w, state, call)
+        integrate_constraints(dt, integral, p, w, state)
+        for j in range(n):
+            if j == i or not linked:
+                take_force(j, dt, p, w, flight, state)
+    if p.has_frame:
+        for i in range(n):
+            for q in range(3):
+                w.r[i, q], w.v[i, q] = state.S[i, q], state.S[i, 3 + q]
+        mean_axes(w.r, w.v, p.vehicles.m, p.vehicles.M, w)
+        multiply(w.T, w.cm[2], w.cm[4])
+        for q in range(4):
+            state.frame[2, q] = state.frame[1, q]
+        quaternion_rate(state.frame[0], w.cm[4], state.frame[1])
+    state.clock[1] = t
+    state.count[LAWS] += 1
+    total = 0.0
+    for i in range(n):
+        for q in range(3):
+            total += state.force[i, q]
+    return math.isfinite(total)
+
+
+@compiled
+def advance_frame(t, p, state):
+    """Advance the mean-axis frame from the last evaluation of the law to t [s], by the rates of the last two.
+
+    The frame turns with the true motion. The method of Adams and Bashforth is of second order.
+    """
+    if p.has_frame and state.count[LAWS] > 0:
+        dt, first = t - state.clock[1], state.count[LAWS] == 1
+        for q in range(4):
+            before = state.frame[1, q] if first else state.frame[2, q]
+            state.frame[0, q] += dt * (1.5 * state.frame[1, q] - 0.5 * before)
+        normalise(state.frame[0])
+
+
+@compiled
+def tick(k, t, p, w, flight, state, call):
+    """Measure, desire and steer at tick k, time t [s]; returns False if the law gives no force."""
+    measure(k, flight, state)
+    if flight.commands.kind == FORCE and k % flight.every == 0:
+        if not desire(t, p, w, flight, state, call):
+            return False
+    for i in range(state.S.shape[0]):
+        state.saturated[i] = steer(k, i, flight, state)
+        if state.saturated[i]:
+            state.saturations[i] += 1
+    return True
+
+
+# -- between ticks -------------------------------------------------------------------------------------
+
+
+@compiled
+def advance_vehicle(i, h, flight, state):
+    """Advance vehicle i by h [s] in ``work.y``, from its state to row 6."""
+    for q in range(17):
+        state.work.y[0, q] = state.S[i, q]
+    runge_kutta(i, h, state.command[i], flight.vehicles, flight.air, state.push[i], state.work)
+
+
+@compiled
+def breathe(t, h, flight, state):
+    """Velocity of the air [m/s] over a step, into ``work.air``."""
+    work = state.work
+    air_velocity(t, h, flight.air, work.air)
+    if flight.air.downwash:
+        add_downwash(state.S, flight.vehicles, flight.air.density, work.T, work.air)
+
+
+@compiled
+def write_derivatives(c, t, flight, state, call):
+    """Derivatives of the states of sample c: those at the start of a step without length."""
+    breathe(t, 0.0, flight, state)
+    for i in range(state.S.shape[0]):
+        for q in range(17):
+            state.work.y[0, q] = call.S[c, i, q]
+        runge_kutta(i, 0.0, state.command[i], flight.vehicles, flight.air, state.push[i], state.work)
+        for q in range(17):
+            call.dS[c, i, q] = state.work.y[2, q]
+
+
+@compiled
+def write_samples(t, h, flight, state, call):
+    """Write the samples up to t + h [s]: each is a step of its own from t."""
+    work, count, times = state.work, state.count, call.times
+    while count[SAMPLES] < times.shape[0]:
+        c = count[SAMPLES]
+        x = max(times[c] - t, 0.0)
+        if x > h * (1.0 + _SAME):
+            return
+        x = h if x > h * (1.0 - _SAME) else x
+        breathe(t, x, flight, state)
+        for i in range(state.S.shape[0]):
+            advance_vehicle(i, x, flight, state)
+            for q in range(17):
+                call.S[c, i, q] = work.y[6, q]
+            for q in range(4):
+                call.command[c, i, q] = state.command[i, q]
+            for q in range(3):
+                call.f_u[c, i, q], call.f_C[c, i, q] = state.f_u[i, q], state.f_C[i, q]
+                call.air[c, i, q] = work.air[2, i, q]
+            for q in range(6):
+                call.seen[c, i, q] = state.seen[i, q]
+            call.saturated[c, i] = state.saturated[i]
+        write_derivatives(c, t + x, flight, state, call)
+        for k in range(state.integral.shape[1]):
+            call.integral[c, k] = state.integral[0, k]
+        for q in range(4):
+            call.frame[c, q] = state.frame[0, q] + (t + x - state.clock[1]) * state.frame[1, q]
+        normalise(call.frame[c])
+        count[SAMPLES] = c + 1
+
+
+@compiled
+def keep_path(i, h, work, points):
+    """Bernstein coefficients (5, 6 N) of vehicle i over a step: the quartic through r0, v0, a0, r1, v1, and its rate."""
+    first, end, rate = work.y[0], work.y[6], work.y[2]
+    n = points.shape[1] // 6
+    for q in range(3):
+        r0, v0, a0, r1, v1 = first[q], first[3 + q], rate[3 + q], end[q], end[3 + q]
+        column = 3 * i + q
+        p1, p2, p3 = r0 + 0.25 * h * v0, r0 + 0.5 * h * v0 + h * h * a0 / 12.0, r1 - 0.25 * h * v1
+        points[0, column], points[1, column], points[2, column] = r0, p1, p2
+        points[3, column], points[4, column] = p3, r1
+        d1, d2 = 4.0 * (p2 - p1) / h, 4.0 * (p3 - p2) / h
+        column += 3 * n
+        points[0, column], points[1, column] = v0, 0.25 * (v0 + 3.0 * d1)
+        points[2, column] = 0.5 * (d1 + d2)
+        points[3, column], points[4, column] = 0.25 * (3.0 * d2 + v1), v1
+
+
+@compiled
+def take_extremes(i, t, h, vehicles, state):
+    """Extremes of vehicle i over a step from t [s]: at its end, the acceleration at its start.
+
+    A rotor's speed is monotone while its command is held, so the ends of steps have its greatest thrust. The
+    acceleration of a point jumps at ticks, and is the highest after them.
+    """
+    rate, end = state.work.y[2], state.work.y[6]
+    a = math.sqrt(rate[3] ** 2 + rate[4] ** 2 + rate[5] ** 2)
+    worse(i, ACCELERATION, a, t, state)
+    if vehicles.point[i]:
+        return
+    for j in range(4):
+        w = end[13 + j]
+        force = vehicles.thrust[i, 0] + w * (vehicles.thrust[i, 1] + w * vehicles.thrust[i, 2])
+        if force > state.peak[i, j]:
+            state.peak[i, j], state.peak_time[i, j] = force, t + h
+    upright = 1.0 - 2.0 * (end[7] * end[7] + end[8] * end[8])
+    if upright < state.worst[i, UPRIGHT]:
+        state.worst[i, UPRIGHT], state.worst_time[i, UPRIGHT] = upright, t + h
+
+
+@compiled
+def advance_fleet(t, h, flight, state):
+    """Advance all vehicles from t by h [s], and record the step in the trail, if there is one."""
+    breathe(t, h, flight, state)
+    row, trail = state.count[TRAILED], state.trail
+    kept = trail.clock.shape[0] > 0
+    if kept:
+        trail.clock[row, 0], trail.clock[row, 1] = t, h
+        state.count[TRAILED] = row + 1
+    # The air, with the jets of all at the start of the step, is known already: states can be overwritten one by one
+    for i in range(state.S.shape[0]):
+        advance_vehicle(i, h, flight, state)
+        if not flight.vehicles.lost[i]:
+            take_extremes(i, t, h, flight.vehicles, state)
+        if kept:
+            keep_path(i, h, state.work, trail.points[row])
+        for q in range(17):
+            state.S[i, q] = state.work.y[6, q]
+
+
+@compiled
+def fly_ticks(p, w, flight, state, call):
+    """Fly to ``call.t_end`` [s]; see `fleet` for the arguments.
+
+    Returns FINISHED; PAUSED if the trail is full, the tables end or ``max_steps`` are done; or COLLAPSED if the law gives no
+    force (a singular law): state and time are then those before. A pause changes no bit of the flight, unless ``t_end`` lies
+    between two steps, where it divides one.
+    """
+    count, clock = state.count, state.clock
+    room = state.trail.clock.shape[0]
+    for _ in range(call.max_steps):
+        t, step = clock[0], count[STEPS]
+        if t >= call.t_end - _SAME * flight.h:
+            return FINISHED
+        if room > 0 and count[TRAILED] >= room:
+            return PAUSED
+        k = step // flight.steps
+        if step % flight.steps == 0 and count[TICKS] == k:
+            if k >= flight.tables.last:
+                return PAUSED
+            if not tick(k, t, p, w, flight, state, call):
+                return COLLAPSED
+            count[TICKS] = k + 1
+        grid, until = flight.start + (step + 1) * flight.h, flight.start + step * flight.h
+        whole = grid <= call.t_end + _SAME * flight.h
+        end = grid if whole else call.t_end
+        h = flight.h if whole and t == until else end - t
+        write_samples(t, h, flight, state, call)
+        advance_fleet(t, h, flight, state)
+        clock[0] = end
+        if whole:
+            count[STEPS] = step + 1
+    return PAUSED
