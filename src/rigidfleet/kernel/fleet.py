@@ -22,8 +22,9 @@ FORCE, ATTITUDE, ROTORS = range(3)
 #: Columns of `SampledState.count`: steps of the grid that are complete, attitude ticks done, law ticks done, samples
 #: written, steps in the trail.
 STEPS, TICKS, LAWS, SAMPLES, TRAILED = range(5)
-#: Columns of `SampledState.worst`: least cosine of the tilt; greatest tracking error [m]; acceleration [m/s^2].
-UPRIGHT, ERROR, ACCELERATION = range(3)
+#: Columns of `SampledState.worst`: least cosine of the tilt; greatest tracking error [m], acceleration [m/s^2], thrust
+#: [N] and constraint force [N].
+UPRIGHT, ERROR, ACCELERATION, LOAD, CONSTRAINT_FORCE = range(5)
 #: A tick that no flight reaches (`Tables.last`).
 ENDLESS = 1 << 62
 
@@ -155,6 +156,7 @@ class Guidance(NamedTuple):
     """
 
     drag: Floats  # (N, 3) linear drag fed forward for the reference velocity, body axes [N s/m]
+    c: Floats  # (N, 3) quadratic drag, likewise [N s^2/m^2]
     k_i: Floats  # (N, 3) integral gain of the tracking error, world axes [1/s^3]
 
 
@@ -225,8 +227,8 @@ class SampledState(NamedTuple):
     heard: Floats  # (N, N, 6) what i knows of j, if linked; else without rows
     peak: Floats  # (N, 4) greatest thrust of each rotor [N]
     peak_time: Floats  # (N, 4) [s]
-    worst: Floats  # (N, 3) see `UPRIGHT`
-    worst_time: Floats  # (N, 3) [s]
+    worst: Floats  # (N, 5) see `UPRIGHT`
+    worst_time: Floats  # (N, 5) [s]
     saturations: Ints  # (N,) number of ticks saturated
     trail: Trail  # of r and v, (S, 5, 6 N)
     work: "SampledWork"
@@ -336,7 +338,7 @@ def flight(
     """A flight in still air with exact sensing; see `Flight`. Replace parts of it by ``_replace``."""
     n = len(vehicles.m)
     return Flight(
-        vehicles, still_air(n), exact_sensing(n), Guidance(np.zeros((n, 3)), np.zeros((n, 3))), no_tables(n),
+        vehicles, still_air(n), exact_sensing(n), Guidance(*(np.zeros((n, 3)) for _ in range(3))), no_tables(n),
         no_commands(n), start, h, steps, every,
     )  # fmt: skip
 
@@ -369,7 +371,7 @@ def begin(
     attitude = np.zeros((3, 4))
     attitude[0] = (1.0, 0.0, 0.0, 0.0) if frame is None else frame
     size = 6 * n + m + 4
-    worst = np.tile([1.0, 0.0, 0.0], (n, 1))
+    worst = np.tile([1.0, 0.0, 0.0, 0.0, 0.0], (n, 1))
     trail = NO_TRAIL
     if rows:
         none = np.zeros(0)
@@ -380,7 +382,7 @@ def begin(
         f_u=np.zeros((n, 3)), f_C=np.zeros((n, 3)), force=np.zeros((n, 3)), push=np.zeros((n, 3)),
         command=np.zeros((n, 4)), saturated=np.zeros(n, dtype=np.bool_), seen=known, history=past, sent=past.copy(),
         heard=np.tile(known, (n if sensing.linked else 0, 1, 1)), peak=np.zeros((n, 4)), peak_time=np.zeros((n, 4)),
-        worst=worst, worst_time=np.zeros((n, 3)), saturations=np.zeros(n, dtype=np.int64), trail=trail,
+        worst=worst, worst_time=np.zeros((n, 5)), saturations=np.zeros(n, dtype=np.int64), trail=trail,
         work=SampledWork(
             zeros(7, STATES), zeros(3, n, 3), np.eye(3), np.zeros((5, 3)), np.zeros((4, 4)), np.zeros(1),
             np.zeros((1, size)), np.zeros(size),

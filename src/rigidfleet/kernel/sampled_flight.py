@@ -14,9 +14,11 @@ from rigidfleet.kernel.compiler.calls import call_recorder
 from rigidfleet.kernel.compiler.jit import compiled
 from rigidfleet.kernel.fleet import (
     ACCELERATION,
+    CONSTRAINT_FORCE,
     ERROR,
     FORCE,
     LAWS,
+    LOAD,
     SAMPLES,
     STEPS,
     TICKS,
@@ -119,18 +121,22 @@ def integrate_constraints(dt, integral, p, w, state):
 def take_force(i, dt, p, w, flight, state):
     """Desired force of vehicle i [N] from the law just evaluated, with what is added after it."""
     vehicles, guidance, T, x = flight.vehicles, flight.guidance, state.work.T, state.work.x
-    m = p.vehicles.m[i]
+    m, pull = p.vehicles.m[i], 0.0
     for q in range(3):
         state.f_u[i, q], state.f_C[i, q] = w.f_u[i, q], w.f_C[i, q]
         state.force[i, q] = w.f_u[i, q] + w.f_C[i, q]
+        pull += w.f_C[i, q] * w.f_C[i, q]
         state.push[i, q] = 0.0
         if p.external != 0:
             state.push[i, q] = w.f_E[i, q] + (m * p.vehicles.g if q == 2 else 0.0)
+    if not vehicles.lost[i]:
+        worse(i, CONSTRAINT_FORCE, math.sqrt(pull), state.work.law_time[0], state)
     if p.control.kind == TRACKING:
         attitude_matrix(state.S[i, 6:10], T)
         multiply(T, w.v_ref[i], x[0])
+        speed = math.sqrt(x[0, 0] ** 2 + x[0, 1] ** 2 + x[0, 2] ** 2)
         for q in range(3):
-            x[0, q] *= guidance.drag[i, q]
+            x[0, q] *= guidance.drag[i, q] + speed * guidance.c[i, q]
         multiply_transposed(T, x[0], x[1])
         for q in range(3):
             if not state.saturated[i]:
@@ -302,13 +308,18 @@ def take_extremes(i, t, h, vehicles, state):
     rate, end = state.work.y[2], state.work.y[6]
     a = math.sqrt(rate[3] ** 2 + rate[4] ** 2 + rate[5] ** 2)
     worse(i, ACCELERATION, a, t, state)
+    command, load = state.command[i], 0.0
     if vehicles.point[i]:
+        load = math.sqrt(command[0] ** 2 + command[1] ** 2 + command[2] ** 2)
+        worse(i, LOAD, load, t, state)
         return
     for j in range(4):
         w = end[13 + j]
         force = vehicles.thrust[i, 0] + w * (vehicles.thrust[i, 1] + w * vehicles.thrust[i, 2])
+        load += force
         if force > state.peak[i, j]:
             state.peak[i, j], state.peak_time[i, j] = force, t + h
+    worse(i, LOAD, load, t + h, state)
     upright = 1.0 - 2.0 * (end[7] * end[7] + end[8] * end[8])
     if upright < state.worst[i, UPRIGHT]:
         state.worst[i, UPRIGHT], state.worst_time[i, UPRIGHT] = upright, t + h

@@ -44,8 +44,10 @@ def sampled_flight(mission: Mission) -> fleet.Flight:
         steps=steps,
         every=max(1, round(autopilot.rate / autopilot.formation_rate)),
     )
+    fed = float(mission.tracking.drag_feedforward)
     guidance = fleet.Guidance(
-        np.array([model.linear_drag for model in models]) * mission.tracking.drag_feedforward,
+        fed * np.array([model.linear_drag for model in models]),
+        fed * np.array([model.body_drag for model in models]),
         np.full((n, 3), mission.tracking.integral),
     )
     around = disturbance(mission)
