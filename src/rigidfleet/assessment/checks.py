@@ -18,6 +18,7 @@ from rigidfleet.assessment.outcome import (
     PhaseVerdict,
     value,
 )
+from rigidfleet.assessment.vehicles import vehicle_checks
 from rigidfleet.assessment.verdict import Verdict
 from rigidfleet.result import Result
 from rigidfleet.typing import Floats
@@ -60,6 +61,7 @@ def findings(measured: Measurements, verdict: Verdict) -> Iterator[CheckResult]:
     yield _bounded("speed", worst.get("speed"), "m/s", limits.speed)
     yield _bounded("acceleration", worst.get("acceleration"), "m/s^2", limits.acceleration)
     yield from _thrust(measured, worst.get("thrust"))
+    yield from vehicle_checks(measured)
     units = {"constraint": "m", "constraint_force": "N", "tension": "N", "singular_value": ""}
     yield from (_bounded(name, worst[name], units[name], None) for name in units if name in worst)
 

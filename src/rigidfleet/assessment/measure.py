@@ -142,6 +142,8 @@ class Measurements:
         thrust = _length(result.input_force + result.constraint_force)
         if self.mission.agents.saturate:
             thrust = np.minimum(thrust, self.mission.agents.thrust_limit)
+        if result.rotor_force is not None:  # what was given, not what was asked
+            thrust = result.rotor_force.sum(axis=2)
         self.thrust = self.of_left(np.maximum(thrust, result.thrust))
         self.measured: dict[str, Quantity] = {
             name: Quantity(values, who, SENSE[name])

@@ -31,6 +31,8 @@ _PRAISE = {
     "lost": "lost vehicles stay {worst} away from the others",
     "thrust_peak": "thrust peaks at {worst} ({who})",
     "thrust": "thrust peaks at {worst}",
+    "rotor_force": "rotors peak at {worst} of {limit}",
+    "tracking_error": "vehicles stay within {worst} of their slots",
 }
 
 

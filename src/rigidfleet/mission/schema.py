@@ -542,6 +542,14 @@ class Limits(Part):
         description="minimum separation from an agent straight below [m]: height minus radii (downwash)",
     )
     geofence: Geofence | None = Field(None, description="box that no agent may leave")
+    saturation: Share = Field(
+        0.01,
+        description="maximum share of a phase in which a vehicle cannot give what is asked of it [-], 0 to 0.95",
+    )
+    tracking_error: Length | None = Field(
+        None, description="maximum distance of a vehicle from its slot [m]; only with [vehicles]"
+    )
+    tilt_deg: Tilt | None = Field(None, description="maximum tilt of the thrust [deg]")
 
 
 class Gusts(Part):

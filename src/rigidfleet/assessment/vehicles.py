@@ -1,0 +1,122 @@
+"""Checks of vehicles with rotors: forces of rotors, saturation, tilt and tracking error."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from rigidfleet.assessment.measure import Measurements
+from rigidfleet.assessment.outcome import CheckResult, Extreme, value
+from rigidfleet.math import attitude as att
+from rigidfleet.result import LABELS, Extremum
+from rigidfleet.typing import Floats
+
+#: Share of a limit by which rounding may exceed it.
+_SLACK = 1e-9
+
+
+def vehicle_checks(measured: Measurements) -> Iterator[CheckResult]:
+    """Checks of a flight by vehicles; none of a flight of point masses."""
+    mission, result = measured.mission, measured.result
+    models = mission.vehicle_models
+    if models is None or result.rotor_force is None:
+        return
+    limits = mission.limits
+    rotors = np.array([model.rotor_limit for model in models])
+    if rotors.any():
+        yield from _rotor_force(measured, rotors)
+        share = _worst(measured, "saturation", lambda x: x.value)
+        if share is not None:
+            yield _saturation(share, limits.saturation)
+        tilt = _tilt(measured)
+        if tilt is not None:
+            yield _checked("tilt", tilt, "deg", limits.tilt_deg, "tilts by")
+    error = _worst(measured, "tracking_error", lambda x: x.value)
+    sampled = measured.extreme(
+        measured.of_left(np.linalg.norm(result.position - result.slot_position, axis=2)),
+        measured.agent,
+    )
+    error = max((e for e in (error, sampled) if e is not None), key=lambda e: e.value, default=None)
+    if error is not None:
+        yield _checked("tracking_error", error, "m", limits.tracking_error, "is off its slot by")
+
+
+def _worst(
+    measured: Measurements, name: str, rank: Callable[[Extremum], float]
+) -> Extreme | None:
+    """The worst of the extremes that the phases have recorded."""
+    every = [(p, p.extremes[name]) for p in measured.result.phases if name in p.extremes]
+    if not every:
+        return None
+    phase, x = max(every, key=lambda pair: rank(pair[1]))
+    return Extreme(x.value, x.time, f"agent {x.who + 1}", phase.name)
+
+
+def _rotor_force(measured: Measurements, limits: Floats) -> Iterator[CheckResult]:
+    """The rotor nearest to its limit, from step to step and at samples."""
+    result, names = measured.result, LABELS["rotor"]
+    assert result.rotor_force is not None
+    safe = np.where(limits > 0.0, limits, np.inf)
+    found = [
+        (x.value / safe[x.who], x.value, x.time, x.who, x.other, p.name)
+        for p in result.phases
+        if (x := p.extremes.get("rotor_force")) is not None
+    ]
+    force = np.where(measured.left[..., None], result.rotor_force, 0.0)
+    k, i, j = np.unravel_index(int((force / safe[:, None]).argmax()), force.shape)
+    name = result.phases[result.phase[k]].name
+    found.append(
+        (force[k, i, j] / safe[i], float(force[k, i, j]), float(result.time[k]), int(i), int(j), name)
+    )
+    share, worst, when, i, j, phase = max(found)
+    limit, who = float(limits[i]), f"agent {i + 1}"
+    words = (
+        f"the {names[j]} rotor of {who} gives up to {value(worst, 'N')} at {when:.2f} s"
+        f" (limit {value(limit, 'N')})"
+    )
+    passed = share <= 1.0 + _SLACK
+    yield CheckResult("rotor_force", passed, words, worst, limit, "N", when=when, who=who, phase=phase)
+
+
+def _saturation(e: Extreme, limit: float) -> CheckResult:
+    """Share of a phase in which a vehicle cannot give what is asked of it."""
+    passed = e.value <= limit + _SLACK
+    words = (
+        f"{e.who} cannot give what is asked of it for {100 * e.value:.2g} % of phase '{e.phase}'"
+        f" (limit {100 * limit:.2g} %)"
+    )
+    if e.value == 0.0:
+        words = "no vehicle is asked for more than its rotors give"
+    share = 100 * e.value
+    return CheckResult(
+        "saturation", passed, words, share, 100 * limit, "%", when=e.when, who=e.who, phase=e.phase
+    )
+
+
+def _tilt(measured: Measurements) -> Extreme | None:
+    """The greatest tilt [deg], from step to step and at samples."""
+    result = measured.result
+    assert result.vehicle_attitude is not None
+    up = att.dcm_from_quaternion(result.vehicle_attitude)[..., 2, 2]
+    sampled = measured.extreme(
+        measured.of_left(np.degrees(np.arccos(np.clip(up, -1.0, 1.0)))), measured.agent
+    )
+    between = _worst(measured, "tilt", lambda x: x.value)
+    if between is not None:
+        between = Extreme(math.degrees(between.value), between.when, between.who, between.phase)
+    found = [e for e in (between, sampled) if e is not None]
+    return max(found, key=lambda e: e.value, default=None)
+
+
+def _checked(
+    check: str, e: Extreme, unit: str, limit: float | None, deed: str
+) -> CheckResult:
+    words = f"{e.who} {deed} up to {value(e.value, unit)} at {e.when:.2f} s"
+    words += "" if limit is None else f" (limit {limit:g} {unit})"
+    passed = limit is None or e.value <= limit * (1.0 + _SLACK)
+    return CheckResult(
+        check, passed, words, e.value, limit, unit, when=e.when, who=e.who, phase=e.phase,
+        judged=limit is not None,
+    )  # fmt: skip
