@@ -2,12 +2,17 @@
 
 import numpy as np
 import pytest
+from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
+from rigidfleet.assessment import assess
+from rigidfleet.errors import MissionError
 from rigidfleet.kernel import control, references
 from rigidfleet.kernel.problem import SHAPE, Motion, Reference, workspace
-from rigidfleet.math import series
+from rigidfleet.math import series, splines
+from rigidfleet.mission import Mission, load_mission
 from rigidfleet.planning import derivatives as d
+from rigidfleet.simulation.flight import Flight, simulate
 
 #: Central differences of eighth order.
 _FIRST = np.array([1 / 280, -4 / 105, 1 / 5, -4 / 5, 0, 4 / 5, -1 / 5, 4 / 105, -1 / 280])
@@ -129,3 +134,151 @@ def test_yaw_along_turns_into_the_way_keeps_still_at_rest_and_turns_back():
     np.testing.assert_allclose(yaw[150], yaw[101], atol=1e-9)
     np.testing.assert_allclose(np.cos(found[-1, 0]), -1.0, atol=1e-4)
     assert np.abs(found[:, 1]).max() < 3.0  # rad/s
+
+
+# -- smooth missions -------------------------------------------------------------------------------
+
+
+def a_mission(*phases: dict, **more) -> Mission:
+    """Three vehicles that form a triangle, and then fly these phases smoothly."""
+    data = {
+        "schema_version": 1,
+        "name": "smooth",
+        "smoothness": "jerk",
+        "agents": {"mass": 1.0, "position": [[0, 0, 5], [4, 0, 5], [2, 3, 5]]},
+        "formations": {
+            "triangle": {"shape": "triangle", "size": 4.0},
+            "wide": {"shape": "triangle", "size": 6.0},
+        },
+        "phases": [
+            {"kind": "establish", "formation": "triangle", "duration": 5.0},
+            *phases,
+        ],
+    }
+    return Mission.from_dict(data | more)
+
+
+def ends_of_phases(mission: Mission) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Reference of the slots (5, N, 3) at each switch, before and after it, as flown."""
+    flight, found, last = Flight(mission), [], None
+    while flight.begin():
+        problem, start = flight.plan.problem, flight.plan.start
+        (first,) = d.slot_derivatives(problem.reference, problem.motion, np.array([start]))
+        if last is not None:
+            found.append((last, first))
+        flight.advance()
+        (last,) = d.slot_derivatives(problem.reference, problem.motion, np.array([flight.t]))
+    assert not flight.ending
+    flight.finish()
+    return found
+
+
+WAYS = [
+    {"kind": "fly", "position": [20, 5, 8], "velocity": [2, 1, 0], "yaw_deg": 140.0, "pitch_deg": 30.0,
+     "rates_deg_s": [5, 0, 8], "duration": 9.0},
+    {"kind": "reshape", "formation": "wide", "duration": 6.0},
+    {"kind": "fly", "position": [30, 20, 9], "duration": 9.0},
+    {"kind": "orbit", "centre": [30, 10, 9], "radius": 8.0, "rate_deg_s": 20.0, "duration": 10.0, "yaw": "along"},
+    {"kind": "fly", "position": [0, 0, 9], "duration": 14.0, "yaw_deg": -90.0,
+     "through": [{"position": [20, -10, 12]}, {"position": [5, 10, 7]}]},
+    {"kind": "turn", "yaw_deg": 90.0, "travel": 4.0, "settle": {"tolerance": 0.01, "dwell": 0.5}},
+    {"kind": "fly", "position": [5, 5, 9], "duration": 6.0},
+    {"kind": "orbit", "centre": [5, 0, 9], "radius": 5.0, "rate_deg_s": -25.0, "blend": 3.0, "duration": 4.0},
+    {"kind": "hold", "duration": 8.0},
+]  # fmt: skip
+
+
+def test_acceleration_and_jerk_are_continuous_through_every_switch():
+    """Waypoints with velocity and rates, a change of shape in motion, orbits, points to pass, a settled turn."""
+    mission = a_mission(*WAYS)
+    for number, (before, after) in enumerate(ends_of_phases(mission)):
+        for order, bound in enumerate((1e-9, 1e-9, 1e-8, 1e-7)):
+            error = np.abs(after[order] - before[order]).max()
+            assert error < bound, f"derivative {order} jumps by {error} after phase {number + 1}"
+    verdict = assess(simulate(mission))
+    assert verdict.passed, verdict.summary
+    for waypoint in (phase.waypoint for phase in verdict.phases):
+        if waypoint is not None and waypoint.position is not None:
+            assert waypoint.position < 1e-3
+            assert (waypoint.velocity or 0.0) < 0.03
+
+
+def test_legs_of_the_regulators_jump():
+    """The same switches are not continuous in a mission of the paper: the tests above can fail."""
+    data = load_mission("narrow-passage").to_dict()
+    lqr, smooth = (
+        max(np.abs(after - before)[2].max() for before, after in ends_of_phases(mission)[1:])
+        for mission in (Mission.from_dict(data), Mission.from_dict(data | {"smoothness": "jerk"}))
+    )
+    assert lqr > 2.0
+    assert smooth < 1e-8
+
+
+def test_the_next_way_starts_from_the_reference_wherever_a_phase_is_left():
+    """Left by hand in the middle of a turning flight, the next way begins with its velocity, acceleration and jerk."""
+    mission = a_mission(WAYS[0])
+    flight = Flight(mission)
+    flight.begin()
+    flight.advance()
+    flight.begin()
+    flight.advance(4.3)
+    problem = flight.plan.problem
+    (before,) = d.slot_derivatives(problem.reference, problem.motion, np.array([flight.t]))
+    assert np.linalg.norm(before[3], axis=1).min() > 0.1
+    flight.begin({"kind": "fly", "position": [0, 0, 20], "duration": 8.0, "yaw_deg": 0.0})
+    problem = flight.plan.problem
+    (after,) = d.slot_derivatives(problem.reference, problem.motion, np.array([flight.plan.start]))
+    np.testing.assert_allclose(after[:4], before[:4], rtol=0, atol=1e-8)
+
+
+def test_pieces_of_degree_seven_fly_as_polynomials():
+    """The kernel evaluates pieces of degree 7 and 5 with the same values and derivatives as NumPy's polynomials."""
+    for powers in (6, 8):
+        _, motion = a_reference(powers)
+        w = workspace(4, 0)
+        for t in (0.7, 2.9):
+            control.reference_motion(t, motion, w)
+            low = int(t >= 1.5)
+            for q in range(3):
+                p = np.polynomial.Polynomial(motion.coefficients[low, q])
+                for k in range(3):
+                    expected = (p.deriv(k) if k else p)(t - motion.knots[low])
+                    np.testing.assert_allclose(w.body[k, q], expected, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("changed", "told"),
+    [
+        ({"smoothness": "lqr"}, "through.*needs a smooth mission"),
+        ({"architecture": "body"}, "needs control = 'tracking'"),
+    ],
+)
+def test_what_a_smooth_mission_refuses(changed, told):
+    """Points to pass without smoothness, and regulators of their own with it."""
+    with pytest.raises(MissionError, match=told):
+        a_mission(WAYS[4], **changed)
+
+
+# -- minimum snap ----------------------------------------------------------------------------------
+
+
+def test_minimum_snap_is_the_spline_of_degree_seven():
+    """Through points, it is SciPy's interpolating spline of degree 7 with the same ends."""
+    t, x = np.cumsum([0, 1.3, 0.7, 2.2, 1.1]), random(0, 5, 3)
+    begin, end = random(1, 3, 3), random(2, 3, 3)
+    conditions = [[(k + 1, y[k]) for k in range(3)] for y in (begin, end)]
+    spline = make_interp_spline(t, x, k=7, bc_type=tuple(conditions))
+    pieces = splines.minimum_snap(t, x, begin, end)
+    for piece, u in ((0, 0.4), (1, 0.3), (2, 1.7), (3, 1.0)):
+        x = series.derivatives(series.of_polynomials(pieces[piece][None], np.array([u]), 7))[:, 0]
+        for order in range(7):
+            expected = spline(t[piece] + u, order)
+            np.testing.assert_allclose(x[order], expected, rtol=1e-8, atol=1e-8)
+
+
+def test_minimum_snap_from_rest_to_rest():
+    """One metre in one second, from rest to rest: 35 u^4 - 84 u^5 + 70 u^6 - 20 u^7, and the cost 100800 m^2/s^7."""
+    zero = np.zeros((3, 1))
+    pieces = splines.minimum_snap(np.array([0.0, 1.0]), np.array([[0.0], [1.0]]), zero, zero)
+    np.testing.assert_allclose(pieces[0, 0], [0, 0, 0, 0, 35, -84, 70, -20], atol=1e-12)
+    np.testing.assert_allclose(splines.snap_cost(pieces, np.array([0.0, 1.0])), 100800.0)

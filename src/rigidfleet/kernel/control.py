@@ -104,11 +104,19 @@ def reference_motion(t, motion, w):
         else:
             high = middle
     x = inside - knots[low]
+    powers = motion.coefficients.shape[2]
     for q in range(6):
         c = motion.coefficients[low, q]
-        value = ((((c[5] * x + c[4]) * x + c[3]) * x + c[2]) * x + c[1]) * x + c[0]
-        rate = (((5 * c[5] * x + 4 * c[4]) * x + 3 * c[3]) * x + 2 * c[2]) * x + c[1]
-        second = ((20 * c[5] * x + 12 * c[4]) * x + 6 * c[3]) * x + 2 * c[2]
+        if powers == 6:
+            value = ((((c[5] * x + c[4]) * x + c[3]) * x + c[2]) * x + c[1]) * x + c[0]
+            rate = (((5 * c[5] * x + 4 * c[4]) * x + 3 * c[3]) * x + 2 * c[2]) * x + c[1]
+            second = ((20 * c[5] * x + 12 * c[4]) * x + 6 * c[3]) * x + 2 * c[2]
+        else:
+            value = rate = second = 0.0  # Horner's scheme for a polynomial and two derivatives
+            for k in range(powers - 1, -1, -1):
+                second = second * x + 2.0 * rate
+                rate = rate * x + value
+                value = value * x + c[k]
         if beyond > 0.0:
             value += beyond * rate
             second = 0.0

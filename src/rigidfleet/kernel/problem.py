@@ -79,14 +79,14 @@ class Reference(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """Reference motion of the virtual body: piecewise quintics of CM and attitude.
+    """Reference motion of the virtual body: piecewise polynomials of CM and attitude.
 
     Channels 0-2 are the CM [m], 3-5 the rotation vector phi [rad] of the body relative to the
     attitude ``T1``: body -> world is ``T1^T Exp(phi)``.
     """
 
     knots: Floats  # (n + 1,) [s]
-    coefficients: Floats  # (n, 6, 6): piece, channel, power of (t - knots[piece])
+    coefficients: Floats  # (n, 6, P): piece, channel, power of (t - knots[piece]); quintics (P = 6) are fastest
     T1: Floats  # (3, 3) world -> body
 
 

@@ -37,6 +37,7 @@ from rigidfleet.mission.schema import (
     Regulator,
     Start,
     Tracking,
+    VehicleYaw,
 )
 
 _TABLES: dict[str, type[Part]] = {
@@ -49,6 +50,7 @@ _TABLES: dict[str, type[Part]] = {
     "body_frame": BodyFrame,
     "limits": Limits,
     "autopilot": Autopilot,
+    "yaw": VehicleYaw,
     "disturbances": Disturbances,
 }
 _OBSTACLES: dict[str, type[Part]] = {"box": Box, "ground": Ground}
@@ -67,7 +69,7 @@ def check(data: Mapping[str, Any], origin: str) -> dict[str, Any]:
     if notes.findings:  # the other checks would take long
         raise MissionError(notes.findings)
     parts = _tables(notes)
-    for judge in (_agents, _gains, _regulators, _tracking, _allocation, _geofence):
+    for judge in (_agents, _gains, _regulators, _tracking, _allocation, _geofence, _yaw):
         judge(notes, parts)
     n = _count(data)
     parts["obstacles"] = _obstacles(notes)
@@ -306,6 +308,18 @@ def _geofence(notes: FindingCollector, parts: dict[str, Any]) -> None:
     fence = parts.get("limits", Limits()).geofence
     if fence is not None:
         _ordered(notes, fence, ("limits", "geofence"))
+
+
+def _yaw(notes: FindingCollector, parts: dict[str, Any]) -> None:
+    yaw: VehicleYaw | None = parts.get("yaw")
+    if yaw is None or not notes.right(("yaw",), "kind", "yaw_deg", "point"):
+        return
+    if yaw.kind == "towards" and yaw.point is None:
+        notes.add(("yaw", "point"), "is missing", "add point: the point to look at, [x, y, z] [m]")
+    for key, kind in (("yaw_deg", "fixed"), ("point", "towards")):
+        if key in yaw.model_fields_set and yaw.kind != kind:
+            problem = f"has no effect with kind '{yaw.kind}'"
+            notes.add(("yaw", key), problem, f"remove it or use kind = '{kind}'")
 
 
 def _ordered(notes: FindingCollector, box: Box | Geofence, path: tuple[str | int, ...]) -> None:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 from rigidfleet.mission.phases import latest_end
-from rigidfleet.mission.schema import Phase
+from rigidfleet.mission.schema import AUTO, Phase
 
 
 def counted(agents: int, formations: int, phases: Sequence[Phase]) -> str:
@@ -13,7 +14,9 @@ def counted(agents: int, formations: int, phases: Sequence[Phase]) -> str:
     parts = [(agents, "agent"), (formations, "formation"), (len(phases), "phase")]
     most = "at most " if any(phase.settle for phase in phases) else ""
     words = [f"{n} {thing}{'s' * (n != 1)}" for n, thing in parts]
-    return ", ".join([*words, f"{most}{latest_end(phases):g} s"])
+    end = latest_end(phases)
+    lasts = "as long as its limits ask" if math.isnan(end) else f"{most}{end:g} s"
+    return ", ".join([*words, lasts])
 
 
 def goal(phase: Phase) -> str:
@@ -25,4 +28,6 @@ def ending(phase: Phase) -> str:
     """Ending of a phase: a time, a duration, or settling with its timeout."""
     if phase.settle is not None:
         return f"settled, within {phase.settle.timeout:g} s"
+    if phase.duration == AUTO:
+        return "as soon as the limits allow"
     return f"at {phase.until:g} s" if phase.until is not None else f"after {phase.duration:g} s"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -64,6 +65,10 @@ def check(notes: FindingCollector, parts: Mapping[str, Any], n: int | None) -> N
         _gusts(notes, found.gusts, wind, n)
     _noise(notes, found)
     end = latest_end(parts["phases"]) if notes.right((), "phases") else None
+    if end is not None and math.isnan(
+        end
+    ):  # automatic durations; checked again when they are known
+        end = None
     _lost(notes, found, parts, n, end)
     if end is not None and n is not None and not notes.findings:
         _size(notes, found, wind, n, end)

@@ -144,6 +144,11 @@ class Mission(Contents):
         return self._origin
 
     @property
+    def smooth(self) -> bool:
+        """Whether acceleration and jerk of the references are continuous."""
+        return self.smoothness == "jerk"
+
+    @property
     def n_agents(self) -> int:
         """Number of agents N."""
         return len(self.agents.position)
@@ -313,7 +318,10 @@ class Mission(Contents):
 
     @property
     def latest_end(self) -> float:
-        """Latest mission time [s] at which the last phase ends: each phase that settles takes its full timeout."""
+        """Latest mission time [s] at which the last phase ends: each phase that settles takes its full timeout.
+
+        It is nan while a duration before it is automatic (`rigidfleet.planning.timing.timed`).
+        """
         return latest_end(self.phases)
 
     @cached_property

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -16,15 +18,19 @@ from rigidfleet.mission.findings import FindingCollector, Keys, near
 from rigidfleet.mission.formations import sound
 from rigidfleet.mission.schema import (
     ANGLES,
+    AUTO,
     KINDS,
+    TIMES,
     Agents,
     AnyPhase,
     Establish,
     Formation,
+    Limits,
     Lqr,
     Orbit,
     Shaping,
     Turn,
+    seconds,
 )
 
 _ENDINGS = ("until", "duration", "settle")
@@ -44,15 +50,22 @@ def check(notes: FindingCollector, parts: Mapping[str, Any], n: int | None) -> t
     _samples(notes, parts, end, n)
     _controls(notes, found, lengths)
     _formations(notes, found, parts, n)
-    _arrivals(notes, found, parts.get("lqr", Lqr()))
+    _arrivals(notes, found, parts.get("lqr", Lqr()), smooth=_smooth(parts))
+    for k, p in enumerate(found):
+        if p is not None:
+            _smoothness(notes, p, ("phases", k), smooth=_smooth(parts))
+            _automatic(notes, p, ("phases", k), parts)
     return tuple(p for p in found if p is not None)
 
 
 def latest_end(phases: Sequence[AnyPhase]) -> float:
-    """Latest mission time [s] at which the last phase ends: each phase that settles takes its full timeout."""
+    """Latest mission time [s] at which the last phase ends: each phase that settles takes its full timeout.
+
+    It is nan if it depends on a duration that is automatic.
+    """
     t = 0.0
     for p in phases:
-        length = p.settle.timeout if p.settle is not None else p.duration or 0.0
+        length = p.settle.timeout if p.settle is not None else seconds(p.duration or 0.0)
         t = p.until if p.until is not None else t + length
     return t
 
@@ -137,7 +150,7 @@ def _times(
             )
             first = last = None
             continue
-        longest = p.duration
+        longest: Any = p.duration
         if p.until is not None:
             if first is not None and last is not None:
                 _in_order(notes, p.until, first, last, path)
@@ -149,14 +162,16 @@ def _times(
                 if p.settle.timeout <= p.settle.dwell:
                     problem = "times out before dwell has passed"
                     notes.add((*path, "settle"), problem, "give a timeout longer than dwell")
-            shortest = p.settle.dwell if p.settle is not None else p.duration
+            if longest == AUTO:
+                first = last = longest = None
+            shortest = p.settle.dwell if p.settle is not None else longest
             first = first + (shortest or 0.0) if first is not None else None
             last = last + (longest or 0.0) if last is not None else None
         lengths[k] = longest
-        travel = p.steering.travel if p.steering is not None else None
+        travel = seconds(p.steering.travel or 0.0) if p.steering is not None else 0.0
         if p.shaping is not None:
             _blend(notes, p.shaping, longest, path)
-        elif travel and travel > (longest or travel) * (1 + 1e-9):
+        elif travel and longest is not None and travel > longest * (1 + 1e-9):
             problem = f"is longer than the phase, which ends after {longest:g} s"
             notes.add((*path, "travel"), problem, "reduce travel or end the phase later", travel)
     return last, lengths
@@ -183,7 +198,7 @@ def _blend(notes: FindingCollector, p: Shaping, longest: float | None, path: Key
             remedy = "remove it, or use reference = 'shape' or 'distances'"
             notes.add((*path, "blend"), "has no effect with reference 'step'", remedy)
     else:
-        _blended(notes, p.blend, longest, path)
+        _blended(notes, seconds(p.blend), longest, path)
 
 
 def _blended(notes: FindingCollector, blend: float, longest: float | None, path: Keys) -> None:
@@ -286,7 +301,7 @@ def _orbit(notes: FindingCollector, p: Orbit, path: Keys, longest: float | None)
     if p.settle is not None and notes.right(path, *_ENDINGS):
         notes.add((*path, "settle"), "an orbit never settles", "end it by duration or until")
     if notes.right(path, "blend", *_ENDINGS):
-        _blended(notes, p.blend, longest, path)
+        _blended(notes, seconds(p.blend), longest, path)
     if not notes.right(path, "rate_deg_s", "radius"):
         return
     rate, where = abs(np.deg2rad(p.rate_deg_s)), (*path, "rate_deg_s")
@@ -398,11 +413,90 @@ def _reachable(
         notes.add((*path, "control"), problem, remedy, p.control)
 
 
-def _arrivals(notes: FindingCollector, found: Sequence[AnyPhase | None], lqr: Lqr) -> None:
-    """Check that a regulator with a finite horizon has a time of arrival."""
+def _smooth(parts: Mapping[str, Any]) -> bool:
+    return parts.get("smoothness") == "jerk"
+
+
+def _smoothness(notes: FindingCollector, p: AnyPhase, path: Keys, *, smooth: bool) -> None:
+    """Check that a smooth mission can be smooth, and that others use nothing that only smooth ones have."""
+    if not notes.right((), "smoothness"):
+        return
+    if not smooth:
+        for key in [*p.automatic, *(["through"] if getattr(p, "through", ()) else [])]:
+            problem = "needs a smooth mission" + (" to have a least time" if key in TIMES else "")
+            notes.add((*path, key), problem, "add smoothness = 'jerk' at the top of the mission")
+        return
+    if p.control == "body" and notes.right(path, "control"):
+        problem = "has regulators of its own, which jump at a switch; smoothness = 'jerk' needs control = 'tracking'"
+        remedy = "use control = 'tracking', or remove smoothness"
+        notes.add((*path, "control"), problem, remedy, p.control)
+    shaping = p.shaping
+    if shaping is not None and shaping.reference == "step" and p.control == "tracking":
+        problem = "jumps, but the mission has smoothness = 'jerk'"
+        notes.add((*path, "reference"), problem, "use reference = 'shape' or 'distances'")
+    through = [at.time for at in getattr(p, "through", ())]
+    given = [time for time in through if time is not None]
+    if given and notes.right(path, "through"):
+        _through(notes, p, path, len(through), given)
+
+
+def _through(
+    notes: FindingCollector, p: AnyPhase, path: Keys, points: int, given: Sequence[float]
+) -> None:
+    """Check the times of points to pass."""
+    where = (*path, "through")
+    steering = p.steering
+    arrival = (steering.travel if steering is not None else None) or p.duration
+    if len(given) < points:
+        notes.add(
+            where, "has points with a time and points without one", "give all times or none", None
+        )
+    elif any(b <= a for a, b in itertools.pairwise(given)):
+        notes.add(where, "times must increase from point to point", "order them", None)
+    elif p.automatic:
+        notes.add(where, "has times, but the arrival is automatic", "remove the times", None)
+    elif isinstance(arrival, float) and given[-1] >= arrival:
+        problem = f"passes its last point at {given[-1]:g} s, but arrives at {arrival:g} s"
+        notes.add(where, problem, "pass it earlier or arrive later", None)
+
+
+def _automatic(notes: FindingCollector, p: AnyPhase, path: Keys, parts: Mapping[str, Any]) -> None:
+    """Check that times that follow from the limits have limits to follow from."""
+    keys = [key for key in p.automatic if notes.right(path, key)]
+    if not keys or not _smooth(parts):
+        return
+    where = (*path, keys[0])
+    if p.control != "tracking":
+        problem = f"needs tracked slots to have a least time, not control '{p.control}'"
+        notes.add(where, problem, "use control = 'tracking', or give a time")
+    if p.duration == AUTO and p.steering is None and p.shaping is None:
+        problem = f"a phase of kind '{notes.data['phases'][path[1]]['kind']}' has no least duration"
+        notes.add((*path, "duration"), problem, "give a duration")
+    if p.duration == AUTO and p.steering is not None and p.steering.travel is not None:
+        problem = "has no effect with duration = 'auto', which ends the phase at the arrival"
+        notes.add((*path, "travel"), problem, "remove one of them")
+    limits, agents = parts.get("limits", Limits()), parts.get("agents")
+    bounded = [limits.speed, limits.acceleration, limits.jerk, limits.tilt_deg]
+    limited = agents is None or all(math.isfinite(f) for f in agents.thrust_limit)
+    if not limited and all(limit is None for limit in bounded) and notes.right((), "limits"):
+        problem = "needs a limit that bounds it, and the mission has none"
+        remedy = "give limits.speed, acceleration, jerk or tilt_deg, or agents.thrust_limit"
+        notes.add(where, problem, remedy)
+
+
+def _arrivals(
+    notes: FindingCollector, found: Sequence[AnyPhase | None], lqr: Lqr, *, smooth: bool
+) -> None:
+    """Check that a leg with a finite horizon has a time of arrival."""
     for k, p in enumerate(found):
         steering = p.steering if p is not None else None
         if steering is None or steering.settle is None or steering.travel is not None:
+            continue
+        if smooth and p is not None and p.control == "tracking":
+            problem = "a smooth way needs a time of arrival"
+            notes.add(
+                ("phases", k, "settle"), problem, "give travel, or end by until or duration", None
+            )
             continue
         if not notes.right((), "lqr"):
             continue

@@ -29,6 +29,7 @@ from rigidfleet.mission.bounds import (
     ANGLE,
     FORCE,
     GAIN,
+    JERK,
     LENGTH,
     MASS,
     SPEED,
@@ -45,6 +46,8 @@ HUGE = 1e15
 #: is linear in the speed. Identified from flights: 0.4 to 0.5 /s along two axes of a quadrotor (Faessler, Franchi,
 #: Scaramuzza, Robotics and Automation Letters 3, 2018). A vehicle with more mass per rotor has less.
 DRAG = 0.3
+#: Keys of a phase that may be automatic, and the word for it.
+TIMES, AUTO = ("duration", "travel", "blend"), "auto"
 #: Keys of an attitude: 3-2-1 Euler angles.
 ANGLES = ("roll_deg", "pitch_deg", "yaw_deg")
 
@@ -72,6 +75,7 @@ Dwell = Annotated[float, Strict(), _from_zero(TIME)]
 Speed = Annotated[float, Strict(), _positive(SPEED)]
 Spread = Annotated[float, Strict(), _from_zero(SPEED)]
 Acceleration = Annotated[float, Strict(), _positive(ACCELERATION)]
+Jerk = Annotated[float, Strict(), _positive(JERK)]
 Mass = Annotated[float, Strict(), _positive(MASS)]
 Angle = Annotated[float, Strict(), _signed(ANGLE)]
 Gain = Annotated[float, Strict(), _signed(GAIN)]
@@ -108,6 +112,12 @@ Edges = Annotated[
 
 Damping = Annotated[
     Annotated[Tolerance, Tag("one")] | Annotated[Literal["auto"], Tag("word")],
+    Discriminator(lambda value: "word" if isinstance(value, str) else "one"),
+]
+
+#: A time, or "auto": the least one that keeps the limits.
+Duration = Annotated[
+    Annotated[Time, Tag("one")] | Annotated[Literal["auto"], Tag("word")],
     Discriminator(lambda value: "word" if isinstance(value, str) else "one"),
 ]
 
@@ -530,10 +540,19 @@ class Geofence(Part):
 
 
 class Limits(Part):
-    """Limits that the verdict checks for each agent."""
+    """Limits for each agent: the verdict checks the flight, and `check` the plan of a smooth mission."""
 
     speed: Speed | None = Field(None, description="maximum speed [m/s]")
     acceleration: Acceleration | None = Field(None, description="maximum acceleration [m/s^2]")
+    jerk: Jerk | None = Field(
+        None,
+        description="maximum jerk of the reference [m/s^3]; kept by the plan of a smooth mission",
+    )
+    tilt_deg: Annotated[float, Strict(), Field(gt=0, lt=90)] | None = Field(
+        None,
+        description="maximum tilt of the thrust that the reference needs, from the vertical [deg]; kept by the plan of "
+        "a smooth mission",
+    )
     separation: Room | None = Field(
         None, description="minimum separation of agents [m]: centre distance minus radii"
     )
@@ -549,7 +568,6 @@ class Limits(Part):
     tracking_error: Length | None = Field(
         None, description="maximum distance of a vehicle from its slot [m]; only with [vehicles]"
     )
-    tilt_deg: Tilt | None = Field(None, description="maximum tilt of the thrust [deg]")
 
 
 class Gusts(Part):
@@ -694,7 +712,10 @@ class AnyPhase(Part):
 
     name: str = Field("", description="unique name; default: its kind and number")
     until: Time | None = Field(None, description="the phase ends at this mission time [s]")
-    duration: Time | None = Field(None, description="the phase ends after this time [s]")
+    duration: Duration | None = Field(
+        None,
+        description="the phase ends after this time [s]; auto: as soon as the limits allow (smooth missions)",
+    )
     settle: Settle | None = Field(None, description="the phase ends when its error has settled")
     control: Literal["open", "tracking", "body"] = Field(
         "tracking",
@@ -738,8 +759,13 @@ class AnyPhase(Part):
         return False
 
     @property
+    def automatic(self) -> list[str]:
+        """Keys whose times follow from the limits (`rigidfleet.planning.timing`)."""
+        return [key for key in TIMES if getattr(self, key, None) == AUTO]
+
+    @property
     def least_time(self) -> float:
-        """Duration of its motion [s]. The phase should not end before."""
+        """Duration of its motion [s], nan while it is automatic. The phase should not end before."""
         return 0.0
 
     @property
@@ -794,7 +820,10 @@ class Shaping(AnyPhase):
         description="how the distances change: shape: slots blend; squares: squared distances blend; distances: as "
         "squares if that leads to the slots or there are none, else as shape; step: at once, as in the paper",
     )
-    blend: Time = Field(4.0, description="duration of the blend from the start of the phase [s]")
+    blend: Duration = Field(
+        4.0,
+        description="duration of the blend from the start of the phase [s]; auto: the least that keeps the limits",
+    )
 
     @property
     def shaping(self) -> Shaping:
@@ -804,7 +833,7 @@ class Shaping(AnyPhase):
     @property
     def least_time(self) -> float:
         """Duration of the blend [s]."""
-        return self.blend
+        return seconds(self.blend)
 
     @property
     def leads_to(self) -> str:
@@ -814,7 +843,9 @@ class Shaping(AnyPhase):
     def ended(self, length: float) -> dict[str, Any]:
         """The formation, and a blend that is not longer than the phase; a step has none."""
         told = {"formation": self.formation}
-        return told if self.reference == "step" else told | {"blend": min(self.blend, length)}
+        return (
+            told if self.reference == "step" else told | {"blend": min(seconds(self.blend), length)}
+        )
 
 
 class Establish(Attitude, Shaping):
@@ -852,8 +883,10 @@ class Steering(Attitude, AnyPhase):
 
     moves: ClassVar[bool] = True
 
-    travel: Time | None = Field(
-        None, description="time from the start to the arrival [s]; default: the whole phase"
+    travel: Duration | None = Field(
+        None,
+        description="time from the start to the arrival [s]; default: the whole phase; auto: the least that keeps the "
+        "limits",
     )
     rates_deg_s: Rates = Field(
         (0.0, 0.0, 0.0), description="body rates [p, q, r] at arrival [deg/s]"
@@ -872,7 +905,7 @@ class Steering(Attitude, AnyPhase):
     @property
     def least_time(self) -> float:
         """Time to the arrival [s]."""
-        return self.travel or 0.0
+        return seconds(self.travel or 0.0)
 
     @property
     def leads_to(self) -> str:
@@ -882,7 +915,17 @@ class Steering(Attitude, AnyPhase):
 
     def ended(self, length: float) -> dict[str, Any]:
         """A travel time that is not longer than the phase."""
-        return {} if self.travel is None else {"travel": min(self.travel, length)}
+        return {} if self.travel is None else {"travel": min(seconds(self.travel), length)}
+
+
+class Through(Part):
+    """A point that a `fly` phase passes without a stop."""
+
+    position: Vector = Field(description="centre of mass [x, y, z] [m]")
+    time: Time | None = Field(
+        None,
+        description="time from the start of the phase [s]; default: the times with the least snap",
+    )
 
 
 class Fly(Steering):
@@ -891,6 +934,11 @@ class Fly(Steering):
     kind: Literal["fly"] = Field(description="fly to a waypoint")
     position: Vector = Field(description="centre of mass at arrival [x, y, z] [m]")
     velocity: Velocity = Field((0.0, 0.0, 0.0), description="its velocity at arrival [m/s]")
+    through: tuple[Through, ...] = Field(
+        (),
+        description="points to pass on the way, with the least snap (smooth missions): "
+        "`through = [{ position = [x, y, z], time = 4.0 }]`",
+    )
 
     @property
     def meets(self) -> tuple[str, ...]:
@@ -935,8 +983,10 @@ class Orbit(AnyPhase):
         description="fixed: keeps the attitude commanded before; along: the body turns with the orbit, with the same "
         "side towards the centre as at the start",
     )
-    blend: Time = Field(
-        4.0, description="duration of the entry from the current position onto the circle [s]"
+    blend: Duration = Field(
+        4.0,
+        description="duration of the entry from the current position onto the circle [s]; auto: the least that keeps "
+        "the limits",
     )
 
     @property
@@ -952,7 +1002,7 @@ class Orbit(AnyPhase):
     @property
     def least_time(self) -> float:
         """Duration of the entry [s]."""
-        return self.blend
+        return seconds(self.blend)
 
     @property
     def leads_to(self) -> str:
@@ -961,7 +1011,12 @@ class Orbit(AnyPhase):
 
     def ended(self, length: float) -> dict[str, Any]:
         """An entry that is not longer than the phase."""
-        return {"blend": min(self.blend, length)}
+        return {"blend": min(seconds(self.blend), length)}
+
+
+def seconds(time: float | Literal["auto"]) -> float:
+    """A time [s]; nan if it is automatic."""
+    return math.nan if isinstance(time, str) else time
 
 
 def _vector(values: Sequence[float], unit: str) -> str:
@@ -996,6 +1051,11 @@ class MissionHeader(Part):
         description="equations of motion: inertial: Newton's; body: the paper's in the body frame, which need fewer "
         "steps when many agents turn",
     )
+    smoothness: Literal["lqr", "jerk"] = Field(
+        "lqr",
+        description="way of the virtual body: lqr: legs of the regulators of [lqr], as in the paper, between which the "
+        "acceleration jumps; jerk: acceleration and jerk are continuous, [lqr] is not used",
+    )
     assignment: Literal["given", "shortest", "safe", "each"] = Field(
         "given",
         description="assignment of agents to slots and their edges: given: agent 1 to slot 1 and so on; shortest: "
@@ -1006,6 +1066,18 @@ class MissionHeader(Part):
         9.81, description="gravity [m/s^2], >= 0"
     )
     output_step: Time = Field(0.05, description="time between samples of the result [s]")
+
+
+class VehicleYaw(Part):
+    """Yaw of each vehicle, which no force of a formation depends on."""
+
+    kind: Literal["formation", "fixed", "along", "towards"] = Field(
+        "formation",
+        description="formation: the vehicles turn with the virtual body; fixed: they keep yaw_deg; along: they look "
+        "along their way, and keep their heading while slow; towards: they look at a point",
+    )
+    yaw_deg: Angle = Field(0.0, description="yaw [deg] of kind 'fixed'")
+    point: Vector | None = Field(None, description="the point [x, y, z] [m] of kind 'towards'")
 
 
 class Contents(MissionHeader):
@@ -1041,6 +1113,7 @@ class Contents(MissionHeader):
     limits: Limits = Field(
         default_factory=Limits, description="limits that the verdict checks: [limits]"
     )
+    yaw: VehicleYaw = Field(default_factory=VehicleYaw, description="yaw of each vehicle: [yaw]")
     disturbances: Disturbances | None = Field(
         None, description="wind, gusts, noise, mass errors, lost vehicles: [disturbances]"
     )

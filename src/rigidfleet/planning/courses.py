@@ -6,7 +6,8 @@ its own.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, Protocol
 
@@ -14,9 +15,9 @@ import numpy as np
 
 from rigidfleet.kernel.problem import Motion, septic_polynomial
 from rigidfleet.math import attitude as att
-from rigidfleet.math import lqr
+from rigidfleet.math import lqr, series, splines
 from rigidfleet.mission import Fly, Mission, Phase, Regulator
-from rigidfleet.mission.schema import Orbit, Steering
+from rigidfleet.mission.schema import Orbit, Steering, Through, seconds
 from rigidfleet.planning.reference import PhaseState, Pose
 from rigidfleet.typing import Floats
 
@@ -25,19 +26,10 @@ _REST_WITHIN = 10.0
 
 
 class Flight(Protocol):
-    """Trajectory of the virtual body through a phase: its CM, and its attitude as a rotation vector phi from ``T1``.
-
-    The attitude is T = Exp(phi)^T T1, as in `Motion`.
-    """
-
-    T1: Floats  # (3, 3), world to body
+    """Trajectory of the virtual body through a phase: its CM and its attitude."""
 
     def motion(self) -> Motion:
         """The reference motion of the phase, for the kernel."""
-        ...
-
-    def sample(self, time: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        """CM and phi (K, 3) at mission times (K,) [s], and their rates (3,) at the last of them."""
         ...
 
 
@@ -60,13 +52,13 @@ def _stay(mission: Mission, phase: Phase, now: PhaseState, t_end: float) -> Cour
     if now.goal is None:
         return Course(None, t_end, None)
     goal = replace(now.goal, v=np.zeros(3), omega=np.zeros(3))
-    return _regulated(mission, phase, now, goal, arrival, t_end)
+    return _led(mission, phase, now, goal, arrival, t_end)
 
 
 def _steer(mission: Mission, phase: Steering, now: PhaseState, t_end: float) -> Course:
     """Go to a waypoint or an attitude, within ``travel`` or by the end."""
     assert now.goal is not None  # a steering phase has a goal
-    arrival = t_end if phase.travel is None else now.t + phase.travel
+    arrival = t_end if phase.travel is None else now.t + seconds(phase.travel)
     angles = phase.attitude_deg
     T = now.goal.T if angles is None else att.dcm_from_euler(np.deg2rad(angles))
     named = now.goal.named or angles is not None
@@ -74,21 +66,21 @@ def _steer(mission: Mission, phase: Steering, now: PhaseState, t_end: float) -> 
     if isinstance(phase, Fly):
         r, v = np.array(phase.position), np.array(phase.velocity)
     goal = Pose(r, v, T, np.deg2rad(phase.rates_deg_s), named)
-    return _regulated(mission, phase, now, goal, arrival, t_end)
+    return _led(mission, phase, now, goal, arrival, t_end)
 
 
 def _orbit(mission: Mission, phase: Orbit, now: PhaseState, t_end: float) -> Course:
     """Fly a circle, and continue with its velocity. An attitude that turns along is not an explicitly specified one."""
     assert now.pose is not None  # slots are tracked
     assert now.goal is not None
-    flight = orbit(phase, now.pose, now.goal.T, now.t, t_end)
-    x, rate = (y[0] for y in flight.at(np.array([t_end - now.t]))[:2])
+    flight = orbit(phase, now.pose, now.goal.T, now.t, t_end, smooth=mission.smooth)
+    x, rate, *_ = (y[0] for y in flight.at(np.array([t_end - now.t])))
     T = att.dcm_from_rotation_vector(x[3:]) @ flight.T1
     goal = Pose(x[:3], rate[:3], T, rate[3:], named=now.goal.named and not phase.turns_away)
     return Course(goal, t_end, flight)
 
 
-def _regulated(
+def _led(
     mission: Mission,
     phase: Phase | Steering,
     now: PhaseState,
@@ -98,7 +90,10 @@ def _regulated(
 ) -> Course:
     if phase.control == "open" or now.pose is None:
         return Course(goal, arrival, None)
-    return Course(goal, arrival, regulated(mission, now.pose, goal, now.t, arrival, t_end))
+    if not mission.smooth:
+        return Course(goal, arrival, regulated(mission, now.pose, goal, now.t, arrival, t_end))
+    through = phase.through if isinstance(phase, Fly) else ()
+    return Course(goal, arrival, SmoothFlight(now.pose, goal, now.t, arrival, through))
 
 
 #: Function of each kind of phase that moves the virtual body; in all others, it comes to rest at the previous goal.
@@ -143,22 +138,6 @@ class RegulatedFlight:
         knots = np.concatenate([self.t0 + times, self.arrival + after[1:]])
         return as_motion(knots, np.concatenate(pieces, axis=1), self.T1)
 
-    def sample(self, time: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        """As `Flight.sample`."""
-        T, rest = self.arrival - self.t0, float(time[-1]) - self.arrival
-        under_way = time <= self.arrival
-        found = []
-        for k in range(2):
-            x, rate, _ = self._under_way(k, np.append(time[under_way] - self.t0, T))
-            x_end = (x[-1], rate[-1])
-            x = x[:-1]
-            if rest > 0.0 and not under_way.all():
-                after = self._after(k, x_end, rest, time[~under_way] - self.arrival)
-                x, rate = np.concatenate([x, after[0]]), after[1]
-            found.append((x, rate[-1]))
-        (r, v), (phi, phi_dot) = found
-        return r, phi, v, phi_dot
-
     def _under_way(self, k: int, times: Floats) -> tuple[Floats, Floats, Floats]:
         """Position, rate and second derivative (K, 3) of CM (0) or phi (1) at times (K,) [s] from the start."""
         law, T = self.regulators[k], self.arrival - self.t0
@@ -194,6 +173,57 @@ def regulated(
     )
 
 
+@dataclass
+class SmoothFlight:
+    """From one pose to another with continuous acceleration and jerk, through points if there are any.
+
+    Between two states, CM and phi are polynomials of degree 7; through points, the CM has the least snap. The flight
+    begins with velocity, acceleration and jerk of its start, and arrives with the velocity of its goal, unaccelerated.
+    After the arrival it continues with this velocity.
+    """
+
+    start: Pose
+    goal: Pose
+    t0: float  # [s]
+    arrival: float  # [s]
+    through: Sequence[Through]
+
+    def motion(self) -> Motion:
+        """Pieces of degree 7: one, or one to each point."""
+        start, goal = self.start, self.goal
+        zero, times = np.zeros(3), self.times()
+        points = np.array([start.r, *(at.position for at in self.through), goal.r])
+        end = np.stack([goal.v, zero, zero])
+        cm = splines.minimum_snap(times, points, np.stack([start.v, start.a, start.jerk]), end)
+        phi = np.stack([rotation_of(start, goal.T), np.stack([zero, goal.omega, zero, zero])], 1)
+        turn = splines.septic_pieces(times[[0, -1]], phi)
+        each = np.repeat(turn, len(times) - 1, axis=0)
+        shifted = series.of_polynomials(each, times[:-1], splines.POWERS)
+        turn = np.moveaxis(shifted, 0, -1)
+        return as_motion(self.t0 + times, np.concatenate([cm, turn], axis=1), goal.T)
+
+    def times(self) -> Floats:
+        """Times (n + 1,) [s] from the start at which the flight passes its points, and arrives."""
+        total = self.arrival - self.t0
+        given = [at.time for at in self.through if at.time is not None]
+        if len(given) == len(self.through):
+            return np.array([0.0, *given, total])
+        start = self.start
+        points = np.array([start.r, *(at.position for at in self.through), self.goal.r])
+        end = np.stack([self.goal.v, np.zeros(3), np.zeros(3)])
+        return splines.allocated(points, total, np.stack([start.v, start.a, start.jerk]), end)
+
+
+def rotation_of(start: Pose, T1: Floats) -> Floats:
+    """Rotation vector phi [rad] from an attitude T1 (3, 3) to that of a pose, and three derivatives (4, 3).
+
+    Exp(phi) = T1 T^T, differentiated by the pose's body rates.
+    """
+    omega = series.from_derivatives(np.stack([start.omega, start.alpha, start.alpha_dot]))
+    R = series.from_rates(start.T.T, omega)
+    return series.derivatives(series.rotation_vector(T1 @ R))
+
+
 #: Angle of an orbit [rad], and share of its run-in, spanned by one quintic; exact to 2e-11 of the radius.
 _ARC, _SHARE = 0.1, 1 / 64
 #: Greatest initial rate of an orbit, as a multiple of its final rate.
@@ -206,16 +236,17 @@ class OrbitFlight:
 
     Over the run-in the septic blend s leads radius and height, and the rate of the angle, to those of the circle. The
     polar motion begins with as much of the body's velocity as it can take without a large rate near the centre. The
-    rest of the velocity adds a displacement by h = t (1 - s), which begins with rate 1 and fades. Position, velocity
-    and acceleration are continuous, and after the run-in the circle is exact. In the same way, phi (relative to the
-    attitude to keep) goes from its initial value to zero, or to the rotation that follows the orbit.
+    rest of the velocity adds a displacement by h = t (1 - s), which begins with rate 1 and fades. Position and velocity
+    are continuous, and after the run-in the circle is exact. In the same way, phi (relative to the attitude to keep)
+    goes from its initial value to zero, or to the rotation that follows the orbit. In a smooth mission, displacements
+    by t^2 (1 - s) / 2 and t^3 (1 - s) / 6 add the rest of acceleration and jerk, which are then continuous, too.
     """
 
     centre: Floats  # (3,) [m]
     start: tuple[float, float, float]  # radius [m], angle [rad] and height over the centre [m]
     radius: float  # [m]
     rates: tuple[float, float]  # at the start and on the circle [rad/s]
-    carried: Floats  # (6,) part of the initial velocity of CM and phi that the polar motion does not have
+    carried: Floats  # (1 or 3, 6) initial velocity, acceleration and jerk of CM and phi that the polar motion lacks
     phi: Floats  # (3,) at the start [rad]
     axis: Floats  # (3,) axis about which the body turns with the orbit, in axes of T1; zero if it does not
     T1: Floats
@@ -224,7 +255,7 @@ class OrbitFlight:
     t_end: float  # [s]
 
     def motion(self) -> Motion:
-        """Quintics through the run-in, and through equal arcs of the circle."""
+        """Polynomials through the run-in, and through equal arcs of the circle; in a smooth mission of degree 7."""
         length, fastest = self.t_end - self.t0, max(map(abs, self.rates))
         run_in = min(self.blend, length)
         parts = max(1 / _SHARE, fastest * run_in / _ARC)
@@ -232,47 +263,64 @@ class OrbitFlight:
         if length > run_in:
             arcs = max(1, int(np.ceil(abs(self.rates[1]) * (length - run_in) / _ARC)))
             times = np.concatenate([times, np.linspace(run_in, length, arcs + 1)[1:]])
-        return as_motion(self.t0 + times, lqr.quintic_pieces(times, *self.at(times)), self.T1)
+        x = self.at(times)
+        smooth = len(self.carried) > 1
+        pieces = (
+            splines.septic_pieces(times, np.stack(x))
+            if smooth
+            else lqr.quintic_pieces(times, *x[:3])
+        )
+        return as_motion(self.t0 + times, pieces, self.T1)
 
-    def sample(self, time: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        """As `Flight.sample`."""
-        x, rate, _ = self.at(time - self.t0)
-        return x[:, :3], x[:, 3:], rate[-1, :3], rate[-1, 3:]
-
-    def at(self, tau: Floats) -> tuple[Floats, Floats, Floats]:
-        """CM and phi (K, 6) at times (K,) [s] from the start, and two derivatives."""
+    def at(self, tau: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+        """CM and phi (K, 6) at times (K,) [s] from the start, and three derivatives."""
         T = self.blend
         x = np.clip(tau / T, 0.0, 1.0)
         s, swept = septic_polynomial(x), x**5 * (7.0 - x * (14.0 - x * (10.0 - 2.5 * x)))
         ds, dds = 140.0 * (x * (1 - x)) ** 3 / T, 420.0 * (x * (1 - x)) ** 2 * (1 - 2 * x) / T**2
-        carried = [tau * (1.0 - s), 1.0 - s - tau * ds, -2.0 * ds - tau * dds]
+        ddds = 840.0 * x * (1 - x) * (1 - 5 * x * (1 - x)) / T**3
         # The angle from the start, by the integral of s.
         first, change = self.rates[0], self.rates[1] - self.rates[0]
         turned = first * tau + change * (T * swept + np.maximum(tau - T, 0.0))
-        w, dw = first + change * s, change * ds
+        w, dw, ddw = first + change * s, change * ds, change * dds
         rho0, angle, z = self.start
-        rho, drho, ddrho = (
+        rho, drho, ddrho, dddrho = (
             rho0 + (self.radius - rho0) * s,
-            *((self.radius - rho0) * np.array([ds, dds])),
+            *((self.radius - rho0) * np.array([ds, dds, ddds])),
         )
         out = np.exp(1j * (angle + turned))
+        # Radial and transverse acceleration, and their rates.
+        a, b = ddrho - rho * w**2, 2.0 * drho * w + rho * dw
+        da = dddrho - drho * w**2 - 2.0 * rho * w * dw
+        db = 2.0 * ddrho * w + 3.0 * drho * dw + rho * ddw
         plane = [
             rho * out,
             (drho + 1j * rho * w) * out,
-            (ddrho - rho * w**2 + 1j * (2.0 * drho * w + rho * dw)) * out,
+            (a + 1j * b) * out,
+            (da - w * b + 1j * (db + w * a)) * out,
         ]
         found = []
-        for k, (left, spin) in enumerate([(1.0 - s, turned), (-ds, w), (-dds, dw)]):
+        for k, (left, spin) in enumerate([(1.0 - s, turned), (-ds, w), (-dds, dw), (-ddds, ddw)]):
             xy = plane[k]
             cm = np.stack([xy.real, xy.imag, z * left], axis=1)
             cm = cm + self.centre if k == 0 else cm
             phi = np.outer(left, self.phi) + np.outer(spin, self.axis)
-            found.append(np.concatenate([cm, phi], axis=1) + np.outer(carried[k], self.carried))
-        place, rate, second = found
-        return place, rate, second
+            found.append(np.concatenate([cm, phi], axis=1))
+        fades = [1.0 - s, -ds, -dds, -ddds]
+        for order, rest in enumerate(self.carried, start=1):  # tau^order (1 - s) / order!
+            for k in range(4):  # by Leibniz' rule
+                h = sum(
+                    math.comb(k, j) * tau ** (order - j) / math.factorial(order - j) * fades[k - j]
+                    for j in range(min(k, order) + 1)
+                )
+                found[k] = found[k] + np.outer(h, rest)
+        place, rate, second, third = found
+        return place, rate, second, third
 
 
-def orbit(phase: Orbit, start: Pose, attitude: Floats, t0: float, t_end: float) -> OrbitFlight:
+def orbit(
+    phase: Orbit, start: Pose, attitude: Floats, t0: float, t_end: float, *, smooth: bool = False
+) -> OrbitFlight:
     """The flight of an orbit from a pose at ``t0`` [s], in an ``attitude`` (3, 3) or turning from it."""
     centre, rate = np.array(phase.centre), float(np.deg2rad(phase.rate_deg_s))
     x, y, z = (start.r - centre).tolist()
@@ -284,14 +332,20 @@ def orbit(phase: Orbit, start: Pose, attitude: Floats, t0: float, t_end: float) 
     axis = attitude[:, 2] * phase.turns_away
     carried = np.concatenate([start.v, att.rotation_vector_rate(phi, start.omega) - first * axis])
     carried[:2] -= first * np.array([-y, x])
-    return OrbitFlight(
-        centre, (rho, float(np.arctan2(y, x)), z), phase.radius, (first, rate), carried, phi, axis,
-        attitude, phase.blend, t0, t_end,
+    flight = OrbitFlight(
+        centre, (rho, float(np.arctan2(y, x)), z), phase.radius, (first, rate), carried[None], phi, axis,
+        attitude, seconds(phase.blend), t0, t_end,
     )  # fmt: skip
+    if smooth:
+        polar = replace(flight, carried=np.zeros((0, 6))).at(np.zeros(1))
+        cm = np.stack([start.v, start.a, start.jerk])
+        full = np.concatenate([cm, rotation_of(start, attitude)[1:]], axis=1)
+        flight.carried = full - np.stack(polar[1:])[:, 0]
+    return flight
 
 
 def as_motion(knots: Floats, coefficients: Floats, T1: Floats) -> Motion:
-    """Quintics (n, 6, 6) between mission times (n + 1,) [s], for the kernel.
+    """Polynomials (n, 6, P) between mission times (n + 1,) [s], for the kernel.
 
     An array of another memory layout has another type, and would compile the kernel again.
     """

@@ -42,7 +42,7 @@ from rigidfleet.math import attitude as att
 from rigidfleet.math import lqr
 from rigidfleet.math.rigid_body import about_cm
 from rigidfleet.mission import Mission, Phase, Regulator, Settle
-from rigidfleet.mission.schema import Constraint, IntegratorOptions
+from rigidfleet.mission.schema import Constraint, IntegratorOptions, seconds
 from rigidfleet.planning import solvers
 from rigidfleet.planning.courses import course
 from rigidfleet.planning.disturbances import without
@@ -51,6 +51,7 @@ from rigidfleet.planning.reference import (
     Pose,
     align_slots,
     attach,
+    pose_at,
     reference_kind,
     slots_about_cm,
     slots_before,
@@ -94,6 +95,7 @@ class PhasePlan:
     lost_at: Floats  # (N,) times at which vehicles are lost [s]
     masses: Floats  # (N,) assumed by the laws, lost vehicles included [kg]
     before: PhaseState  # the state that the phase starts from
+    smooth: bool = False  # whether the next phase needs acceleration and jerk of the reference
 
     @property
     def large(self) -> bool:
@@ -166,6 +168,7 @@ class PhasePlan:
             frame = att.dcm_from_quaternion(q / np.linalg.norm(q))
         if self.problem.control.kind == TRACKING:
             pose = Pose(w.body[0].copy(), w.body[1].copy(), w.T_ref.copy(), w.body[3].copy())
+            pose = pose_at(self.problem.motion, t) if self.smooth else pose
         if self.phase.goal_moves and pose is not None and goal is not None and t < self.t_end:
             goal = replace(pose, T=pose.T if self.phase.turns_away else goal.T, named=goal.named)
         return replace(
@@ -222,7 +225,7 @@ def plan_phase(
     after = target if shaping is not None and target is not None else before
     kind, T_b = CONSTANT, 0.0
     if shaping is not None:
-        T_b = 0.0 if shaping.reference == "step" else shaping.blend
+        T_b = 0.0 if shaping.reference == "step" else seconds(shaping.blend)
         kind = _KINDS[reference_kind(mission, shaping, before, target)]
     elif phase.control == "tracking" and np.allclose(
         d1, distance_geometry.distances(before, edges), rtol=1e-12
@@ -272,6 +275,7 @@ def plan_phase(
         lies=phase.establishing is not None and not mission.free_attitude(phase), method=method,
         constraint=mission.constraint, integrator=mission.integrator,
         damping=partial(mission.damping, held), lost_at=mission.lost_at, masses=masses, before=before_switch,
+        smooth=mission.smooth,
     )  # fmt: skip
     if now.lost is not None and now.lost.any():
         plan.release(now.lost)
@@ -287,7 +291,7 @@ def _end(phase: Phase, start: float) -> float:
                 f" {start:.2f} s. Give it a duration instead of until"
             )
         return phase.until
-    return start + (phase.duration or (phase.settle or Settle()).timeout)
+    return start + seconds(phase.duration or (phase.settle or Settle()).timeout)
 
 
 def _check_size(mission: Mission, phase: Phase) -> None:

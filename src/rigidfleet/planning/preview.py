@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
-from rigidfleet.kernel.problem import septic_polynomial
-from rigidfleet.math import attitude as att
+from rigidfleet.kernel.problem import SHAPE, Motion, Reference, septic_polynomial
 from rigidfleet.math import pid, rigid_body
 from rigidfleet.math.rigid_body import about_cm
 from rigidfleet.mission import Mission, Phase
+from rigidfleet.mission.schema import seconds
 from rigidfleet.planning.courses import course
+from rigidfleet.planning.derivatives import slot_derivatives
 from rigidfleet.planning.reference import (
     PhaseState,
-    Pose,
     align_slots,
     attach,
+    pose_at,
     reference_kind,
     slots_about_cm,
     slots_before,
@@ -48,8 +50,9 @@ class PlannedPhase:
     Attributes
     ----------
     time : (K,) [s] of the mission
-    position, acceleration : (K, N, 3) [m, m/s^2]
+    position, velocity, acceleration : (K, N, 3) [m, m/s, m/s^2]
     exact : whether the agents follow the plan, up to control errors; False if it is an estimate
+    leg : the reference from which the paths are computed
     ways : if the shape changes, the agents' positions (N, 3) [m] before and after it, about the centre, in a frame
         that turns with them; in this frame all agents move straight and in step
     shapes : names of the formations before (None if there is none) and after
@@ -58,22 +61,29 @@ class PlannedPhase:
     phase: str
     time: Floats
     position: Floats
+    velocity: Floats
     acceleration: Floats
     exact: bool
+    leg: Leg
     ways: tuple[Floats, Floats] | None = None
     shapes: tuple[str | None, str | None] = (None, None)
 
-    @property
-    def velocity(self) -> Floats:
-        """(K, N, 3) [m/s]."""
-        return _rate(self.position, self.time)
+
+class Leg(NamedTuple):
+    """The reference of a planned phase from ``begin`` to ``end`` [s], and the state at its end."""
+
+    phase: Phase
+    begin: float
+    end: float
+    reference: Reference
+    motion: Motion
+    before: PhaseState
+    after: PhaseState
+    exact: bool
 
 
 def preview(mission: Mission, phases: int | None = None) -> tuple[list[PlannedPhase], bool]:
     """One `PlannedPhase` for each phase, or for the first ``phases``, and whether the plan is known to its end."""
-    masses = mission.fleet.mass
-    frame = None if mission.body_frame is None else mission.drawn_attitude
-    now = PhaseState(0.0, mission.fleet.position, mission.fleet.velocity, frame=frame)
     way: list[PlannedPhase] = []
     most = samples_per_phase(mission)
     # If even the fewest samples of all phases are too many, only the first phases.
@@ -83,34 +93,97 @@ def preview(mission: Mission, phases: int | None = None) -> tuple[list[PlannedPh
         else most * len(mission.phases) // FEWEST_SAMPLES
     )
     most = max(most, FEWEST_SAMPLES)
-    for phase, (begin, end) in list(zip(mission.phases, phase_spans(mission), strict=True))[
-        :phases
-    ]:
-        if len(way) == possible:
+    wanted = mission.phases[:phases]
+    now = at_start(mission)
+    for phase in wanted[:possible]:
+        found = leg(mission, phase, now)
+        if found is None:
             return way, False
-        shaping = phase.shaping
-        name = shaping.formation if shaping is not None else now.formation
-        target = slots_about_cm(mission, name, masses)
-        if shaping is not None and target is None:
-            return way, False
-        now = replace(now, t=begin)
-        before = now.slots if now.slots is not None else now.r
-        count = min(max(_SAMPLES, int((end - begin) / _STEP) + 1), _MOST, most)
-        time = np.linspace(begin, end, count)
-        names = now.formation, name
-        position, ways, now = _leg(mission, phase, now, masses, target, time)
-        guess = (
-            shaping is not None
-            and phase.control != "tracking"
-            # A shape held by constraint forces alone may lag behind its slots.
-            and (
-                phase.control == "body"
-                or reference_kind(mission, shaping, before, target) != "shape"
-            )
-        )
-        acceleration = _rate(_rate(position, time), time)
-        way.append(PlannedPhase(phase.name, time, position, acceleration, not guess, ways, names))
-    return way, True
+        now = found.after
+        way.append(_planned(found, most))
+    return way, len(way) == len(wanted)
+
+
+def _planned(found: Leg, most: int) -> PlannedPhase:
+    """At most ``most`` samples of a leg."""
+    begin, end, reference = found.begin, found.end, found.reference
+    count = min(max(_SAMPLES, int((end - begin) / _STEP) + 1), _MOST, most)
+    time = np.linspace(begin, end, count)
+    position, velocity, acceleration = slot_derivatives(reference, found.motion, time, 3).swapaxes(
+        0, 1
+    )
+    shaping = found.phase.shaping
+    ways = None if shaping is None else (reference.p0, reference.p0 + reference.dp)
+    shapes = found.before.formation, found.after.formation
+    return PlannedPhase(
+        found.phase.name, time, position, velocity, acceleration, found.exact, found, ways, shapes
+    )
+
+
+def at_start(mission: Mission) -> PhaseState:
+    """The state in which a mission starts."""
+    frame = None if mission.body_frame is None else mission.drawn_attitude
+    return PhaseState(0.0, mission.fleet.position, mission.fleet.velocity, frame=frame)
+
+
+def leg(mission: Mission, phase: Phase, now: PhaseState) -> Leg | None:
+    """The planned leg of a phase from the state at its start; None if it depends on distances alone."""
+    masses, shaping = mission.fleet.mass, phase.shaping
+    name = shaping.formation if shaping is not None else now.formation
+    target = slots_about_cm(mission, name, masses)
+    if shaping is not None and target is None:
+        return None
+    before = now
+    t0, t_end = now.t, ending(mission, phase, now.t)
+    slots = now.slots if now.slots is not None else now.r
+    exact = (
+        shaping is None
+        or phase.control == "tracking"
+        # A shape held by constraint forces alone may lag behind its slots.
+        or (phase.control == "open" and reference_kind(mission, shaping, slots, target) == "shape")
+    )
+    frame, now, turned = attach(mission, phase, now, masses, target)
+    blend, turn = (0.0 if shaping is None else seconds(shaping.blend)), np.zeros(3)
+    if phase.control == "open":
+        x = about_cm(now.r, masses)
+        dp = np.zeros_like(x)
+        if shaping is not None and target is not None:
+            # Turned by the blend, and then by the attitude of the agents.
+            fit = rigid_body.kabsch(x, slots_before(mission, now, masses), masses)
+            dp = target @ turned.T @ fit.T - x
+        motion = _thrown(mission, phase, now, t_end)
+        reference = Reference(SHAPE, t0, blend, _NONE, _NONE, x, dp, turn)
+        slots = target if shaping is not None else now.slots
+        after = replace(now, slots=slots, pose=None, frame=frame)
+    else:
+        assert now.slots is not None  # attached above
+        goal, _, flight = course(mission, phase, now, t_end)
+        assert flight is not None
+        motion, dp, slots = flight.motion(), 0.0 * now.slots, now.slots
+        if shaping is not None and target is not None:
+            dp, turn = align_slots(now.slots, target, masses, turned)
+            slots = target
+        reference = Reference(SHAPE, t0, blend, _NONE, _NONE, now.slots, dp, turn)
+        pose = pose_at(motion, t_end)
+        tracked = pose if phase.control == "tracking" else None
+        frame = pose.T if frame is not None else None
+        after = replace(now, slots=slots, pose=tracked, goal=goal, frame=frame)
+    r, v = slot_derivatives(reference, motion, np.array([t_end]), 2)[0]
+    after = replace(after, t=t_end, r=r, v=v, formation=name)
+    return Leg(phase, t0, t_end, reference, motion, before, after, exact)
+
+
+_NONE = np.zeros(0)
+
+
+def _thrown(mission: Mission, phase: Phase, now: PhaseState, t_end: float) -> Motion:
+    """Motion of the CM under the input forces of an open phase."""
+    masses = mission.fleet.mass
+    pieces = np.zeros((1, 6, 3))
+    pieces[0, :3, 0] = masses @ now.r / masses.sum()
+    pieces[0, :3, 1] = masses @ now.v / masses.sum()
+    pieces[0, :3, 2] = 0.5 * np.array(phase.input_force) * len(masses) / masses.sum()
+    return Motion(np.array([now.t, t_end]), pieces, np.eye(3))
 
 
 def samples_per_phase(mission: Mission) -> int:
@@ -120,79 +193,26 @@ def samples_per_phase(mission: Mission) -> int:
     return int(_PLACES / each) // len(mission.phases)
 
 
-def _leg(
-    mission: Mission,
-    phase: Phase,
-    now: PhaseState,
-    masses: Floats,
-    target: Floats | None,
-    time: Floats,
-) -> tuple[Floats, tuple[Floats, Floats] | None, PhaseState]:
-    """Positions (K, N, 3) of all agents over a phase, their `PlannedPhase.ways`, and the situation at its end."""
-    t0, t_end = time[0], time[-1]
-    shaping = phase.shaping
-    frame, now, turned = attach(mission, phase, now, masses, target)
-    s = np.zeros(len(time)) if shaping is None else septic((time - t0) / shaping.blend)
-    if phase.control == "open":
-        x = about_cm(now.r, masses)
-        after = x
-        if shaping is not None and target is not None:
-            # Turned by the blend, and then by the attitude of the agents.
-            slots = slots_before(mission, now, masses)
-            after = target @ turned.T @ rigid_body.kabsch(x, slots, masses).T
-        cm, v = masses @ now.r / masses.sum(), masses @ now.v / masses.sum()
-        a = np.array(phase.input_force) * len(masses) / masses.sum()
-        tau = (time - t0)[:, None]
-        ways = x, after
-        shape = x + s[:, None, None] * (after - x)
-        position = shape + (cm + tau * v + 0.5 * tau**2 * a)[:, None]
-        v_end = np.tile(v + a * (t_end - t0), (len(masses), 1))
-        slots = target if shaping is not None else now.slots
-        now = replace(now, r=position[-1], v=v_end, slots=slots, pose=None, frame=frame)
-    else:
-        assert now.slots is not None  # attached above
-        goal, _, flight = course(mission, phase, now, t_end)
-        assert flight is not None
-        r, phi, v_cm, omega = flight.sample(
-            time
-        )  # where phi is small at the end, its rate is omega
-        T = att.dcm_from_rotation_vector(phi) @ flight.T1
-        before = now.slots
-        after = target if shaping is not None and target is not None else before
-        dp, turn = 0.0 * before, np.zeros(3)
-        if shaping is not None:
-            dp, turn = align_slots(before, after, masses, turned)
-        ways = before, before + dp
-        p = before + s[:, None, None] * dp
-        p = p @ att.dcm_from_rotation_vector(s[:, None] * turn)
-        position = r[:, None] + p @ T
-        pose = Pose(r[-1], v_cm, T[-1], omega)
-        velocity = v_cm + np.cross(omega, after) @ T[-1]
-        tracked = pose if phase.control == "tracking" else None
-        frame = T[-1] if frame is not None else None
-        now = replace(
-            now, r=position[-1], v=velocity, slots=after, pose=tracked, goal=goal, frame=frame
-        )
-    if shaping is None:
-        return position, None, replace(now, t=t_end)
-    return position, ways, replace(now, t=t_end, formation=shaping.formation)
-
-
 def phase_spans(mission: Mission) -> list[tuple[float, float]]:
-    """Start and end [s] of each phase; a phase that ends by settling is assumed to settle soon, before its timeout."""
-    t, spans = 0.0, []
-    settling = _settling(mission)
+    """Start and end [s] of each phase (`ending`)."""
+    spans = []
     for phase in mission.phases:
-        begin = t
-        if phase.until is not None:
-            t = phase.until
-        elif phase.duration is not None:
-            t = begin + phase.duration
-        elif phase.settle is not None:
-            t = begin + min(phase.settle.timeout, phase.least_time + settling + phase.settle.dwell)
-        spans.append((begin, max(t, begin + 1e-6)))
-        t = spans[-1][1]
+        begin = spans[-1][1] if spans else 0.0
+        spans.append((begin, ending(mission, phase, begin)))
     return spans
+
+
+def ending(mission: Mission, phase: Phase, begin: float) -> float:
+    """End [s] of a phase; one that ends by settling is assumed to settle soon, before its timeout."""
+    t = begin
+    if phase.until is not None:
+        t = phase.until
+    elif phase.duration is not None:
+        t = begin + seconds(phase.duration)
+    elif phase.settle is not None:
+        least = phase.least_time + _settling(mission) + phase.settle.dwell
+        t = begin + min(phase.settle.timeout, least)
+    return max(t, begin + 1e-6)
 
 
 def _settling(mission: Mission) -> float:
@@ -203,10 +223,6 @@ def _settling(mission: Mission) -> float:
         return pid.settling_time(c.alpha, c.beta, c.gamma)
     except ValueError:
         return 0.0
-
-
-def _rate(x: Floats, time: Floats) -> Floats:
-    return np.gradient(x, time, axis=0, edge_order=2)
 
 
 def septic(x: Floats) -> Floats:

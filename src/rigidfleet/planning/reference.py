@@ -11,11 +11,13 @@ from typing import Literal
 import numpy as np
 
 from rigidfleet.formation import distance_geometry
+from rigidfleet.kernel.problem import Motion
 from rigidfleet.math import attitude as att
-from rigidfleet.math import rigid_body
+from rigidfleet.math import rigid_body, series
 from rigidfleet.math.rigid_body import about_cm, mean_axis_rates
 from rigidfleet.mission import Mission, Phase
 from rigidfleet.mission.schema import Shaping
+from rigidfleet.planning.derivatives import body_series
 from rigidfleet.typing import Bools, Floats, Ints
 
 
@@ -45,13 +47,33 @@ class ByEdge:
 
 @dataclass
 class Pose:
-    """Pose of the virtual body, actual or desired: CM [m], attitude T (world -> body) and their rates."""
+    """Pose of the virtual body, actual or desired: CM [m], attitude T (world -> body) and their rates.
+
+    Acceleration and jerk are those of a smooth mission's reference; nothing else needs them.
+    """
 
     r: Floats
     v: Floats
     T: Floats
     omega: Floats  # body axes [rad/s]
     named: bool = False  # whether a phase specifies this attitude explicitly
+    a: Floats = field(default_factory=lambda: np.zeros(3))  # [m/s^2]
+    jerk: Floats = field(default_factory=lambda: np.zeros(3))  # [m/s^3]
+    alpha: Floats = field(default_factory=lambda: np.zeros(3))  # of omega, body axes [rad/s^2]
+    alpha_dot: Floats = field(default_factory=lambda: np.zeros(3))  # [rad/s^3]
+
+    def in_axes(self, axes: Floats) -> Pose:
+        """The same pose in new body axes; ``axes`` (3, 3) maps vectors from new to old ones."""
+        rates = {key: axes.T @ getattr(self, key) for key in ("T", "omega", "alpha", "alpha_dot")}
+        return replace(self, **rates)
+
+
+def pose_at(motion: Motion, t: float) -> Pose:
+    """The pose of a reference motion at a time [s], with its acceleration and jerk."""
+    cm, axes = (x[:, 0] for x in body_series(motion, np.array([t])))
+    r, v, a, jerk = series.derivatives(cm)[:4]
+    omega, alpha, alpha_dot = series.derivatives(series.body_rates(axes))[:3]
+    return Pose(r, v, axes[0].T, omega, a=a, jerk=jerk, alpha=alpha, alpha_dot=alpha_dot)
 
 
 @dataclass
@@ -133,7 +155,7 @@ def attach(
             steady = now.pose is not None and goal.named and np.array_equal(goal.T, asked)
             axes = np.eye(3) if steady else pose.T @ asked.T
         slots = slots @ axes
-        pose = replace(pose, T=axes.T @ pose.T, omega=axes.T @ pose.omega)
+        pose = pose.in_axes(axes)
         goal = replace(goal, T=pose.T if free else asked, named=not free)
         given = None if given is None else axes.T @ given
     if shaping is not None:

@@ -68,7 +68,7 @@ def _drift(mission: Mission) -> Iterator[Remark]:
     L = np.linalg.norm(x, axis=1)
     c_dot = ((v[i] - v[j]) * x).sum(axis=1) / L
     end = phase_spans(mission)[0][1]
-    error = np.abs(L - d) if first.reference == "step" else np.abs(c_dot) * first.blend / 2
+    error = np.abs(L - d) if first.reference == "step" else np.abs(c_dot) * first.least_time / 2
     error = np.abs(np.where(first.reference == "step", L - d + c_dot * end, error))
     fails = error.max() > TOLERANCE * d.min()
     text += f"; by {end:g} s they reach {error.max():.2g} m"

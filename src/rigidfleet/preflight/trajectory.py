@@ -46,7 +46,7 @@ def separation_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
             ends.append((float(rooms[k]), float(planned.time[k]), tuple(pairs[k].tolist())))
         if planned.ways is not None:
             room, who, share = assignment.nearest_way(*planned.ways, radius)
-            crossing = room, _time_of(mission, planned, number, share), who
+            crossing = room, _time_of(planned, share), who
             least = min(least, crossing)
             beyond = room <= 0 or room < limit - SLACK
             if beyond and room < min(ends)[0] - SLACK:
@@ -76,10 +76,9 @@ def _near(
     return f"{agent_names(who)} have a separation of {room:.2f} m at {t:.2f} s in '{phase}' (limit {limit:g} m)"
 
 
-def _time_of(mission: Mission, planned: PlannedPhase, number: int, share: float) -> float:
+def _time_of(planned: PlannedPhase, share: float) -> float:
     """Time [s] at which agents have flown this fraction of their paths."""
-    shaping = mission.phases[number].shaping
-    blend = 0.0 if shaping is None else shaping.blend
+    blend = planned.leg.reference.T_b
     tau = np.linspace(0.0, 1.0, 2001)
     return float(planned.time[0] + blend * np.interp(share, septic(tau), tau))
 

@@ -22,7 +22,7 @@ from rigidfleet.formation.graphs import complete_graph
 from rigidfleet.math.rigid_body import centred
 from rigidfleet.mission import Mission
 from rigidfleet.mission.formations import coincident
-from rigidfleet.mission.schema import HUGE
+from rigidfleet.mission.schema import HUGE, seconds
 from rigidfleet.simulation.ensemble import Ensemble, establish, max_edge_error
 from rigidfleet.sweep.metrics import METRICS
 from rigidfleet.sweep.record import RunRecord, refusal
@@ -141,8 +141,8 @@ def _evaluated(mission: Mission, flown: Ensemble) -> tuple[dict[str, Bools], dic
     formation, t, last = None, 0.0, len(mission.phases) - 1
     for index, (phase, r) in enumerate(zip(mission.phases, flown.ends, strict=True)):
         shaping = phase.shaping
-        length = phase.duration if phase.until is None else phase.until - t
-        t += length or 0.0
+        length = seconds(phase.duration or 0.0) if phase.until is None else phase.until - t
+        t += length
         formation = shaping.formation if shaping is not None else formation
         if formation is None:
             continue
@@ -150,7 +150,7 @@ def _evaluated(mission: Mission, flown: Ensemble) -> tuple[dict[str, Bools], dic
         asked = mission.formation_distances(formation)
         wide = max_edge_error(r, mission.formation_edges(formation), asked)
         blending = (
-            shaping is not None and shaping.reference != "step" and shaping.blend > (length or 0.0)
+            shaping is not None and shaping.reference != "step" and shaping.least_time > length
         )
         if index == last and not blending and len(asked):
             metrics["constraint_end"] = wide

@@ -139,7 +139,7 @@ class Pilot:
         phase, settle = self.asked[-1], 0.0
         if phase.control == "open":
             settle = _STEADY
-        blend = phase.shaping.blend if phase.shaping is not None else 0.0
+        blend = phase.shaping.least_time if phase.shaping is not None else 0.0
         return self.t < self.phases[-1].t_start + blend + settle - 1e-9
 
     # -- commands --------------------------------------------------------------------------------

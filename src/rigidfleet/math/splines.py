@@ -1,0 +1,127 @@
+"""Pieces of degree 7: smooth ways between states, and minimum-snap ways through points.
+
+A polynomial of degree 7 meets position, velocity, acceleration and jerk at both of its ends. Among all ways between
+two such states in a given time, it has the least integral of snap^2 (the Euler-Lagrange equation x^(8) = 0; Mellinger
+and Kumar, Minimum snap trajectory generation and control for quadrotors, ICRA 2011).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rigidfleet.math import series
+from rigidfleet.typing import Floats
+
+#: Number of coefficients of a piece.
+POWERS = 8
+#: From what position, velocity, acceleration and jerk lack at the end of a piece of unit length to its coefficients
+#: 4 to 7: the inverse of the rows k! / (k - m)! of u^k, k = 4..7, at u = 1, for the derivatives m = 0..3.
+_ENDS = np.array(
+    [
+        [35.0, -15.0, 2.5, -1 / 6],
+        [-84.0, 39.0, -7.0, 0.5],
+        [70.0, -34.0, 6.5, -0.5],
+        [-20.0, 10.0, -2.0, 1 / 6],
+    ]
+)
+
+
+def septic_pieces(times: Floats, x: Floats) -> Floats:
+    """Pieces of degree 7 (n, ..., 8) between times (n + 1,) [s] that meet derivatives 0 to 3, x (4, n + 1, ...).
+
+    x(t) = sum_p pieces[i, ..., p] (t - times[i])^p for times[i] <= t <= times[i + 1], with three continuous
+    derivatives.
+    """
+    h = np.diff(times).reshape(-1, *(1,) * (x.ndim - 2))
+    a, b = series.from_derivatives(x)[:, :-1], x[:, 1:]
+    scale = np.stack([h**m for m in range(POWERS)])
+    start = a * scale[:4]  # coefficients in u = (t - t0) / h
+    reached = [
+        sum(start[k] * np.prod(np.arange(k, k - m, -1.0)) for k in range(m, 4)) for m in range(4)
+    ]
+    lacking = b * scale[:4] - np.stack(reached)
+    rest = np.tensordot(_ENDS, lacking, 1)
+    return np.moveaxis(np.concatenate([start, rest]) / scale, 0, -1)
+
+
+def minimum_snap(times: Floats, x: Floats, begin: Floats, end: Floats) -> Floats:
+    """Pieces of degree 7 (n, ..., 8) through points x (n + 1, ...) at times (n + 1,) [s] with the least snap.
+
+    Of all ways through the points, with velocity, acceleration and jerk ``begin`` and ``end`` (3, ...) at the ends,
+    this one has the least integral of |snap|^2. It has six continuous derivatives: at the inner points, velocity,
+    acceleration and jerk follow from the continuity of the next three derivatives.
+    """
+    inner, shape = len(times) - 2, x.shape[1:]
+    unit = float(np.diff(times).mean())  # a natural unit of time keeps the equations well scaled
+    full = np.zeros((4, inner + 2, *shape))
+    powers = unit ** np.arange(4.0).reshape(-1, *(1,) * x.ndim)
+    full[0], full[1:, 0], full[1:, -1] = x, begin, end
+    full *= powers
+    t = times / unit
+    if inner > 0:
+        A = np.zeros((inner, 3, 3, inner))  # jumps of three derivatives, by each unknown
+        for m in range(3):
+            for k in range(inner):
+                one = np.zeros((4, inner + 2, 1))
+                one[m + 1, k + 1] = 1.0
+                A[:, :, m, k] = _jumps(t, one)[..., 0]
+        b = -_jumps(t, full).reshape(3 * inner, -1)
+        found = np.linalg.solve(A.reshape(3 * inner, 3 * inner), b)
+        full[1:, 1:-1] = found.reshape(3, inner, *shape)
+    pieces = septic_pieces(t, full)
+    return pieces / unit ** np.arange(POWERS)
+
+
+def _jumps(times: Floats, x: Floats) -> Floats:
+    """Jumps (n - 1, 3, ...) of derivatives 4, 5 and 6 at the inner times, of `septic_pieces`."""
+    pieces = septic_pieces(times, x)
+    ends = series.of_polynomials(pieces[:-1], np.diff(times)[:-1], 7)[4:]
+    starts = np.moveaxis(pieces[1:, ..., 4:7], -1, 0)
+    return np.moveaxis(series.derivatives(_padded(starts) - _padded(ends))[4:], 0, 1)
+
+
+def _padded(x: Floats) -> Floats:
+    return np.concatenate([np.zeros((4, *x.shape[1:])), x])
+
+
+def snap_cost(pieces: Floats, times: Floats) -> float:
+    """Integral of |snap|^2 [m^2/s^7] over pieces (n, ..., 8) between times (n + 1,) [s]."""
+    k = np.arange(4, POWERS)
+    factor = k * (k - 1.0) * (k - 2.0) * (k - 3.0)
+    h = np.diff(times).reshape(-1, *(1,) * (pieces.ndim - 1))
+    c = pieces[..., 4:] * factor * h ** (k - 4.0)
+    weights = 1.0 / (k[:, None] + k - 7.0)
+    return float(
+        np.einsum("...i,ij,...j->...", c, weights, c).reshape(len(h), -1).sum(1) @ h.ravel()
+    )
+
+
+def allocated(x: Floats, total: float, begin: Floats, end: Floats) -> Floats:
+    """Times (n + 1,) [s] from 0 to ``total`` at points x (n + 1, d) that make the snap of `minimum_snap` least.
+
+    From times that grow with the square root of each distance, by a quasi-Newton search (Richter, Bry and Roy, 2013,
+    search the times in the same way).
+    """
+    from scipy.optimize import minimize
+
+    n = len(x) - 1
+    if n == 1:
+        return np.array([0.0, total])
+
+    def times(shares: Floats) -> Floats:
+        parts = np.exp(shares - shares.max())
+        return np.concatenate([[0.0], np.cumsum(parts) * (total / parts.sum())])
+
+    def cost(shares: Floats) -> float:
+        t = times(shares)
+        if np.diff(t).min() < 1e-3 * total / n:
+            return 1e3 * first
+        return float(np.log(snap_cost(minimum_snap(t, x, begin, end), t) + 1e-300))
+
+    way = np.linalg.norm(np.diff(x, axis=0), axis=1)
+    start = 0.5 * np.log(np.maximum(way, 1e-3 * max(float(way.max()), 1e-9)))
+    first = 1.0
+    first = abs(cost(start)) + 1.0
+    found = minimize(cost, start, method="BFGS", options={"gtol": 1e-6})
+    best = found.x if cost(found.x) <= cost(start) else start
+    return times(best)
