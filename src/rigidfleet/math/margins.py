@@ -30,7 +30,7 @@ from rigidfleet.math.constraint_jacobian import filter_factors, jacobian
 from rigidfleet.math.rigid_body import rigid_motions
 from rigidfleet.typing import Floats, Ints
 
-Complexes = NDArray[np.complex128]
+Complexes = NDArray[np.complexfloating]
 
 #: Growth rate [1/s] from which a motion counts as unstable: slower ones double in hours.
 GROWTH = 1e-4
