@@ -32,20 +32,20 @@ from rigidfleet.typing import Floats, Ints
 
 Complexes = NDArray[np.complexfloating]
 
-#: Growth rate [1/s] from which a motion counts as unstable: slower ones double in hours.
+#: Growth rate [1/s] from which a motion counts as unstable, unless another is asked for: slower ones need hours.
 GROWTH = 1e-4
 # Filter factors that differ by less than this share of themselves count as equal; below the second, as 0.
 _ALIKE, _NO_SHARE = 1e-4, 1e-6
 # Relative size of what counts as zero in a subspace, and of eigenvalues w that rounding makes.
 _ROUNDING, _SINGULAR = 1e-8, 1e-12
 # Frequencies [rad/s] that are looked at, and the number of first samples.
-_FREQUENCIES, _SAMPLES = (1e-3, 1e5), 200
+_FREQUENCIES, _SAMPLES = (1e-3, 1e5), 120
 # Loci are followed while they are larger than this: gain margins above its inverse count as infinite.
 _FAINT = 0.02
 # Greatest change of log(locus) between samples.
 _STEP = 0.4
 # Least and greatest rate p of a triple pole that is tried [1/s], ratio of successive trials, relative accuracy.
-_POLES, _RATIO, _ACCURACY = (0.1, 400.0), 1.5, 1e-4
+_POLES, _RATIO, _ACCURACY = (0.1, 400.0), 1.5, 5e-4
 
 
 @dataclass(frozen=True)
@@ -156,18 +156,23 @@ class Loop(NamedTuple):
 
     def gain(self, s: Complexes, law: Feedback) -> Complexes:
         """L (K, n, n) at s (K,)."""
-        k_c = 2 * law.alpha * s + law.beta**2 + law.gamma / s
-        k_t = law.k1 + law.k2 * s + law.ki / s
-        k_d = law.k_def * s
-        k_u = k_t if law.control == "tracking" else k_d
-        # S Q = 0: constraints do not see rigid motions. So K = k_u 1 + (k_c - k_u) S + (rigid - k_u) Q.
-        rigid = k_u if law.control == "tracking" else k_t if law.control == "body" else 0.0 * s
+        k_u, to_k_c, to_rigid = _gains(s, law)[..., None, None]
         heard = np.exp(-s * law.link)[:, None, None]
         S, Q = (heard * X[0] + (1 - heard) * X[1] for X in (self.S, self.Q))
-        K = (k_c - k_u)[:, None, None] * S + (rigid - k_u)[:, None, None] * Q
-        K = K + k_u[:, None, None] * np.eye(len(self.S[0]))
+        K = k_u * np.eye(len(self.S[0])) + to_k_c * S + to_rigid * Q
         G = [lag.response(s, vertical=vertical) / (s * s) for lag, vertical in self.channels]
+        if len(G) == 1:
+            return G[0][:, None, None] * K
         return np.tensordot(np.transpose(G), self.P, axes=1) @ K
+
+
+def _gains(s: Complexes, law: Feedback) -> Complexes:
+    """k_u, and what is added to it on S and on rigid motions Q (3, K): K = k_u 1 + ... S + ... Q, because S Q = 0."""
+    k_c = 2 * law.alpha * s + law.beta**2 + law.gamma / s
+    k_t, k_d = law.k1 + law.k2 * s + law.ki / s, law.k_def * s
+    if law.control == "tracking":
+        return np.stack([k_t, k_c - k_t, 0 * s])
+    return np.stack([k_d, k_c - k_d, (k_t if law.control == "body" else 0 * s) - k_d])
 
 
 @dataclass(frozen=True)
@@ -301,27 +306,27 @@ def _invariant(matrices: list[Floats]) -> list[Floats]:
     return list(found.values())
 
 
-def is_stable(loops: Sequence[Loop], law: Feedback) -> bool:
-    """Whether no motion grows faster than `GROWTH`: Nyquist's criterion on det(1 + L)."""
-    return all(_unstable(loop, law) == 0 for loop in loops)
+def is_stable(loops: Sequence[Loop], law: Feedback, growth: float = GROWTH) -> bool:
+    """Whether no motion grows at a rate of ``growth`` [1/s] > 0 or more: Nyquist's criterion on det(1 + L)."""
+    return all(_unstable(loop, law, growth) == 0 for loop in loops)
 
 
-def _unstable(loop: Loop, law: Feedback) -> int:
-    """Number of roots of det(1 + L) right of `GROWTH`; 1 if a vehicle's attitude itself is unstable."""
+def _unstable(loop: Loop, law: Feedback, growth: float) -> int:
+    """Number of roots of det(1 + L) to the right of ``growth``; 1 if a vehicle's attitude itself is unstable."""
     if not all(lag.stable for lag, _ in loop.channels):
         return 1
     n = len(loop.S[0])
     # From F to F (1 + X), det F turns by sum arg(1 + eig X) < pi if the norm of X is below this.
     near = min(0.7, 2.5 / math.sqrt(n))
-    end = _highest(loop, law, near)
+    end = _highest(loop, law, min(0.7, 2.5 / n))  # from here on, det F turns by less than pi
     if end == 0.0:
         return 0
 
     def returned(omega: Floats) -> Complexes:
-        return np.eye(n) + loop.gain(GROWTH + 1j * omega, law)
+        return np.eye(n) + loop.gain(growth + 1j * omega, law)
 
     # The poles of L at 0 are left of this line. To its right L is analytic and vanishes at infinity.
-    omega = np.append(0.0, np.geomspace(0.1 * GROWTH, end, _SAMPLES))
+    omega = np.append(0.0, np.geomspace(0.1 * growth, end, _SAMPLES))
     F = returned(omega)
     for _ in range(30):
         turn = np.linalg.solve(F[:-1], F[1:])
@@ -334,15 +339,19 @@ def _unstable(loop: Loop, law: Feedback) -> int:
     else:
         return 1  # det(1 + L) = 0 on the line itself
     turned = np.angle(np.linalg.slogdet(turn)[0]).sum()
-    rest = np.angle(np.linalg.slogdet(F[-1])[0])  # the angle that is left beyond, where L is small
+    rest = np.angle(np.linalg.slogdet(F[-1])[0])
     return round(float(rest - turned) / math.pi)
 
 
 def _highest(loop: Loop, law: Feedback, size: float) -> float:
-    """Frequency [rad/s] from which on the norm of L stays below ``size``; 0 if it is nowhere above."""
+    """Frequency [rad/s] from which on the norm of L is below ``size``, by an upper bound; 0 if it is nowhere above."""
     omega = np.geomspace(*_FREQUENCIES, 600)
-    norm = np.linalg.norm(loop.gain(1j * omega, law), axis=(1, 2))
-    above = np.flatnonzero(norm > size)
+    s = 1j * omega
+    each = np.abs([lag.response(s, vertical=vertical) for lag, vertical in loop.channels])
+    k_u, to_k_c, to_rigid = np.abs(_gains(s, law))
+    # The norms of S, Q and of what each vehicle adds to them are at most 1.
+    K = k_u + (to_k_c + to_rigid) * (3.0 if law.link > 0 else 1.0)
+    above = np.flatnonzero(each.max(axis=0) * K > size * omega**2)
     return float(omega[min(above[-1] + 1, len(omega) - 1)]) if len(above) else 0.0
 
 
@@ -350,9 +359,9 @@ def _eigenvalues(A: Complexes) -> Complexes:
     return A[..., 0] if A.shape[-1] == 1 else np.linalg.eigvals(A)
 
 
-def margins(loops: Sequence[Loop], law: Feedback) -> Margins:
-    """Gain, phase and delay margin common to all loops: the smallest of them."""
-    if not is_stable(loops, law):
+def margins(loops: Sequence[Loop], law: Feedback, growth: float = GROWTH) -> Margins:
+    """Gain, phase and delay margin common to all loops: the smallest of them; ``growth`` as in `is_stable`."""
+    if not is_stable(loops, law, growth):
         return Margins(stable=False)
     low, high, phase, delay = 0.0, math.inf, math.pi, math.inf
     for loop in loops:
@@ -409,20 +418,24 @@ def _root(f: Callable[[float], float], a: float, b: float) -> float:
 def _loci(loop: Loop, law: Feedback) -> tuple[Floats, Complexes]:
     """Frequencies (K,) [rad/s], and the logarithms (K, n) of the loci there, each continuous."""
     end = _highest(loop, law, _FAINT)
-    omega = np.geomspace(_FREQUENCIES[0], end, _SAMPLES) if end > _FREQUENCIES[0] else np.zeros(0)
+    if end <= _FREQUENCIES[0]:
+        return np.zeros(0), np.zeros((0, len(loop.S[0])), np.complex128)
+    omega = np.geomspace(_FREQUENCIES[0], end, _SAMPLES)
+    values = _eigenvalues(loop.gain(1j * omega, law))
     for _ in range(12):
-        if not len(omega):
-            break
-        loci = _eigenvalues(loop.gain(1j * omega, law))
-        loci = _followed(np.log(np.where(loci == 0, 1e-300, loci)))
+        loci = _followed(np.log(np.where(values == 0, 1e-300, values)))
         step = np.abs(np.diff(loci, axis=0))
-        # Loci fainter than the threshold all along turn as they please.
-        step[(loci[1:].real < math.log(_FAINT)) & (loci[:-1].real < math.log(_FAINT))] = 0.0
+        # Where loci are fainter than the threshold, they turn as they please.
+        step[np.maximum(loci[1:].real, loci[:-1].real) < math.log(_FAINT)] = 0.0
         coarse = np.flatnonzero(step.max(axis=1) > _STEP)
         if not len(coarse):
             break
-        omega = np.insert(omega, coarse + 1, np.sqrt(omega[coarse] * omega[coarse + 1]))
-    return (omega, loci) if len(omega) else (omega, np.zeros((0, 0), complex))
+        middle = np.sqrt(omega[coarse] * omega[coarse + 1])
+        omega = np.insert(omega, coarse + 1, middle)
+        values = np.insert(values, coarse + 1, _eigenvalues(loop.gain(1j * middle, law)), axis=0)
+    else:
+        loci = _followed(np.log(np.where(values == 0, 1e-300, values)))
+    return omega, loci
 
 
 def _followed(loci: Complexes) -> Complexes:
@@ -437,26 +450,28 @@ def _followed(loci: Complexes) -> Complexes:
     return loci.real + 1j * np.unwrap(loci.imag, axis=0)
 
 
-def largest_pole(loops: Sequence[Loop], law: Feedback, start: float = math.inf) -> float:
+def largest_pole(
+    loops: Sequence[Loop], law: Feedback, most: float = math.inf, growth: float = GROWTH
+) -> float:
     """Rate p [1/s] up to which a triple pole -p of the constraint law keeps the loops stable; infinite if all do.
 
-    ``start`` is a rate that need not be exceeded: of several formations, pass the least so far. 0 if even slow poles
-    are unstable.
+    At most ``most``: of several formations, pass the least so far. 0 if even slow poles are unstable. Rates are tried
+    from slow ones upwards, each half as fast again, so that a narrow unstable range between two may be overlooked.
     """
 
     def stable(p: float) -> bool:
-        return is_stable(loops, law.with_pole(p))
+        return is_stable(loops, law.with_pole(p), growth)
 
+    if most < math.inf and all(stable(most * part) for part in (1.0, 0.5, 0.25)):
+        return most
     low, high = 0.0, _POLES[0]
     while stable(high):
         low, high = high, high * _RATIO
-        if low > start:
-            return start
         if high > _POLES[1]:
-            return start
+            return most
     while high - low > _ACCURACY * high:
         middle = 0.5 * (low + high)
         low, high = (middle, high) if stable(middle) else (low, middle)
         if high < _ACCURACY * _POLES[0]:
             return 0.0
-    return low
+    return min(low, most)

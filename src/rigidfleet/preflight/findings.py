@@ -129,9 +129,11 @@ class MarginsCheck:
         """In words, the tracking first."""
         if self.tracking is not None:
             yield f"tracking: {_margin_words(self.tracking)}"
+        alike: dict[str, list[str]] = {}
         for where, f in self.formations.items():
             pole = f"p up to {f.largest_pole:.3g} /s" if f.largest_pole < math.inf else "any p"
-            yield f"{where}: {_margin_words(f.margins)}; {pole}"
+            alike.setdefault(f"{_margin_words(f.margins)}; {pole}", []).append(where)
+        yield from (f"{', '.join(places)}: {words}" for words, places in alike.items())
 
     def data(self) -> dict[str, Any]:
         """Plain data for JSON."""
