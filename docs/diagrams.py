@@ -14,6 +14,7 @@ from rigidfleet import physics
 from rigidfleet.formation.graphs import complete_graph
 from rigidfleet.formation.shapes import slots
 from rigidfleet.math import attitude, pid
+from rigidfleet.math.constraint_jacobian import filter_factors
 from rigidfleet.math.rigid_body import kabsch
 from rigidfleet.plotting.style import DASHES, FAINT, FLOWN, GREY, INK, PALETTE, TONES
 
@@ -288,18 +289,20 @@ def solvers() -> Figure:
     fig = Figure(figsize=(9.0, 3.0), layout="constrained")
     ax = fig.subplots()
     w = np.geomspace(1e-4, 10.0, 500)
-    mu, s0 = 0.03, 0.1
-    nu = np.where(w < s0, s0 / 4 * (1 - w / s0) ** 2, 0.0)
     ax.loglog(w, 1 / w, color=RED, linewidth=1.6, label="exact: $1/w$")
     ax.loglog(
         w,
-        (1 - (mu / (w + mu)) ** 3) / w,
+        filter_factors(w, "iterated") / w,
         color=BLUE,
         linewidth=2.2,
         label=r"iterated: $\leq k/\mu$ = 100",
     )
     ax.loglog(
-        w, 1 / (w + nu), color=GREEN, linewidth=2.2, label="spectral: exact from $s_0$ = 0.1 on"
+        w,
+        filter_factors(w, "spectral") / w,
+        color=GREEN,
+        linewidth=2.2,
+        label="spectral: exact from $s_0$ = 0.1 on",
     )
     marks = ((1.5, "triangle"), (0.259, "cube"), (0.05, "cuboid"), (8e-4, "line, 8 cm off"))
     for at, name in marks:

@@ -12,6 +12,7 @@ import rigidfleet as rf
 from rigidfleet.formation.graphs import CUBE_EDGES
 from rigidfleet.formation.shapes import slots
 from rigidfleet.math import pid
+from rigidfleet.math.constraint_jacobian import filter_factors
 from rigidfleet.mission import Mission
 from rigidfleet.plotting import space
 from rigidfleet.plotting.graph import graphs
@@ -176,7 +177,7 @@ def slow_modes() -> Figure:
     ):
         for w, colour in ((1.5, INK), (0.05, BLUE), (0.005, GREEN), (5e-4, ORANGE), (5e-5, RED)):
             mu = min(0.03, w / 4) if tied else 0.03
-            g = 1 - (mu / (w + mu)) ** 3
+            g = float(filter_factors(w, "iterated", damping=mu))
             alpha = 3.0 * g + 0.5 * (1 - g)  # the deformation damping, as far as it is not undone
             c = pid.error_response(alpha, np.sqrt(12 * g), 8 * g, 1.0, 0.0, 0.0, t)[0]
             ax.plot(t, c, color=colour, linewidth=1.8, label=f"$w$ = {w:g}")

@@ -30,6 +30,38 @@ def jacobian(points: ArrayLike, edges: ArrayLike) -> Floats:
     return J.reshape(*p.shape[:-2], len(i), p.shape[-2] * p.shape[-1])
 
 
+def filter_factors(
+    w: ArrayLike,
+    solver: str,
+    *,
+    damping: float = 0.03,
+    iterations: int = 3,
+    threshold: float = 0.1,
+    cutoff: float = 1e-3,
+) -> Floats:
+    """Filter factors w phi(w) of a solver (theory, section 3) for eigenvalues w >= 0 of mbar A, in their shape.
+
+    They are the share of the exact law that the solver keeps: 1 where its multipliers are exact, 0 where it has none
+    (Hansen 1998, doi:10.1137/1.9780898719697). "exact" has no solution at w = 0, but the share is 0 there, too.
+
+    Raises
+    ------
+    ValueError
+        The solver is none of those of a mission.
+    """
+    w = np.asarray(w, dtype=np.float64)
+    if solver == "exact":
+        return (w > 0).astype(np.float64)
+    if solver == "iterated":
+        return -np.expm1(iterations * np.log(damping / (w + damping)))
+    if solver == "spectral":
+        return w / (w + 0.25 * threshold * np.maximum(0.0, 1.0 - w / threshold) ** 2)
+    if solver == "pinv":
+        x = np.minimum(w / max(cutoff * w.max(initial=0.0), np.finfo(float).tiny), 1.0)
+        return (3.0 - 2.0 * x) * x * x
+    raise ValueError(f"unknown solver {solver!r}; choose iterated, spectral, exact or pinv")
+
+
 def smallest_singular_value(r: Floats, edges: Ints, masses: ArrayLike | None = None) -> Floats:
     """Smallest non-zero singular value (K,) of the constraint Jacobian J at r (K, N, 3).
 

@@ -14,6 +14,26 @@ def centred(points: ArrayLike) -> Floats:
     return p - p.mean(axis=0)
 
 
+def rigid_motions(points: Floats, masses: Floats | None = None) -> Floats:
+    """Orthonormal basis (N d, t) of translations and rotations of points (N, d).
+
+    With ``masses`` (N,) [kg], motions are weighted by the root of the mass, as in J M^-1/2.
+    """
+    n, d = points.shape
+    m = np.ones(n) if masses is None else masses
+    x = about_cm(points, m)
+    scale = max(np.linalg.norm(x), np.finfo(float).tiny)
+    motions = [np.tile(axis, (n, 1)) / np.sqrt(n) for axis in np.eye(d)]
+    for a in range(d):
+        for b in range(a + 1, d):
+            turn = np.zeros((n, d))
+            turn[:, a], turn[:, b] = -x[:, b] / scale, x[:, a] / scale
+            motions.append(turn)
+    weighted = np.array(motions) * np.sqrt(m / m.mean())[:, None]
+    u, s, _ = np.linalg.svd(weighted.reshape(len(motions), n * d).T, full_matrices=False)
+    return u[:, s > 1e-9]
+
+
 def kabsch(
     target: ArrayLike,
     source: ArrayLike,

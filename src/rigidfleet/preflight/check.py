@@ -8,15 +8,17 @@ notes.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from rigidfleet.math.margins import Lag
 from rigidfleet.mission import Mission, as_mission
 from rigidfleet.planning.preview import FEWEST_SAMPLES, preview, samples_per_phase
 from rigidfleet.preflight.assignment import assignment_remarks
 from rigidfleet.preflight.findings import Preflight, Remark
 from rigidfleet.preflight.formations import SEARCHED, check_formations, formation_remarks
 from rigidfleet.preflight.gains import check_gains, gain_remarks
+from rigidfleet.preflight.margins import check_margins, margin_remarks
 from rigidfleet.preflight.trajectory import (
     disturbance_remarks,
     downwash_remarks,
@@ -31,6 +33,7 @@ def check(
     mission: Mission | str | Path,
     *,
     search: bool | None = None,
+    lags: Sequence[Lag] = (),
     progress: Callable[[str], None] = lambda _: None,
 ) -> Preflight:
     """Check a mission before the flight. `rigidfleet check` prints the result.
@@ -40,6 +43,7 @@ def check(
     mission : a shipped name, a path or a `Mission`
     search : whether to search for other shapes with the same distances, from `STARTS` random starts per formation;
         default: for up to `SEARCHED` agents
+    lags : lag and delay of each vehicle, for the margins of the laws; none by default
     progress : called with a description of the next step
 
     Raises
@@ -57,10 +61,14 @@ def check(
     found = Preflight(formations, check_gains(mission, formations), way)
     if not known:
         found.judged_to = float(way[-1].time[-1]) if way else 0.0
+    if lags:
+        progress("margins")
+        found.margins = check_margins(mission, way, lags)
     progress("collisions, obstacles and limits")
     found.remarks = [
         *formation_remarks(mission, formations),
         *gain_remarks(mission, found),
+        *margin_remarks(found),
         *separation_remarks(mission, found),
         *downwash_remarks(mission, found),
         *assignment_remarks(mission, found),

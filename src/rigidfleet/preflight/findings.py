@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 from rigidfleet._common import markup
 from rigidfleet._common.text import agent_names
+from rigidfleet.math.margins import Margins
 from rigidfleet.planning import solvers
 from rigidfleet.planning.preview import PlannedPhase
 from rigidfleet.rigidity import (
@@ -39,7 +40,7 @@ class Remark:
     Attributes
     ----------
     level : "fails" or "note"
-    topic : formation, gains, collision, downwash, assignment, thrust, disturbances, obstacle, geofence, speed,
+    topic : formation, gains, margins, collision, downwash, assignment, thrust, disturbances, obstacle, geofence, speed,
         acceleration or way (paths that were not checked)
     text : the problem or note in words
     """
@@ -92,6 +93,57 @@ class GainsCheck:
     settling_time: float | None
     overshoot: float | None
     force: dict[str, float]
+
+
+@dataclass(frozen=True)
+class FormationMargins:
+    """Margins of all loops of a formation, or of a way between two: the smallest over its shapes and attitudes.
+
+    Attributes
+    ----------
+    margins : with the gains of the mission
+    largest_pole : rate p [1/s] up to which a triple pole of the constraint law is stable; infinite for no bound
+    """
+
+    margins: Margins
+    largest_pole: float
+
+
+@dataclass(frozen=True)
+class MarginsCheck:
+    """What lag and delay the laws bear.
+
+    Attributes
+    ----------
+    tracking : margins of the vehicles that track their slots, without the constraint law; None if none does. The
+        upper gain margin is the greatest factor on the gains of the tracking
+    formations : by formation, or way between two
+    skipped : whether shapes were left out because there is too much to compute
+    """
+
+    tracking: Margins | None
+    formations: dict[str, FormationMargins]
+    skipped: bool = False
+
+    def describe(self) -> Iterator[str]:
+        """In words, the tracking first."""
+        if self.tracking is not None:
+            yield f"tracking: {_margin_words(self.tracking)}"
+        alike: dict[str, list[str]] = {}
+        for where, f in self.formations.items():
+            pole = f"p up to {f.largest_pole:.3g} /s" if f.largest_pole < math.inf else "any p"
+            alike.setdefault(f"{_margin_words(f.margins)}; {pole}", []).append(where)
+        yield from (f"{', '.join(places)}: {words}" for words, places in alike.items())
+
+    def data(self) -> dict[str, Any]:
+        """Plain data for JSON."""
+        return {
+            "tracking": None if self.tracking is None else _margin_data(self.tracking),
+            "formations": {
+                where: _margin_data(f.margins) | {"largest_p": _finite(f.largest_pole)}
+                for where, f in self.formations.items()
+            },
+        }
 
 
 @dataclass(frozen=True)
@@ -148,6 +200,7 @@ class Preflight:
     gaps : of each gap: its obstacles, its width [m], the width that the formation needs [m], time [s]
     assignments : assignments to slots that were compared, by name
     disturbed : effects of the disturbances; None without disturbances
+    margins : what lag and delay the laws bear; None if vehicles have none
     judged_to : mission time [s] up to which paths were checked; infinite if they all were
     remarks : problems and notes
 
@@ -168,6 +221,7 @@ class Preflight:
     gaps: list[tuple[str, float, float, float]] = field(default_factory=list)
     assignments: dict[str, Assignment] = field(default_factory=dict)
     disturbed: Disturbed | None = None
+    margins: MarginsCheck | None = None
     judged_to: float = math.inf
     remarks: list[Remark] = field(default_factory=list)
 
@@ -194,6 +248,8 @@ class Preflight:
             yield f.name, _formation_words(f)
         if self.formations:
             yield "gains", _gain_words(self.gains)
+        if self.margins is not None:
+            yield from (("margins", text) for text in self.margins.describe())
         if self.room is not None:
             yield (
                 "separation",
@@ -250,6 +306,7 @@ class Preflight:
                 "overshoot": g.overshoot,
                 "force_per_error_n_m": g.force,
             },
+            "margins": None if self.margins is None else self.margins.data(),
             "disturbances": None
             if (d := self.disturbed) is None
             else {
@@ -378,6 +435,29 @@ def _gain_words(g: GainsCheck) -> str:
         name, force = max(g.force.items(), key=lambda item: item[1])
         text += f"; a step of 1 cm in an edge error causes up to {force / 100:.2g} N ('{name}')"
     return text
+
+
+def _margin_words(m: Margins) -> str:
+    if not m.stable:
+        return "unstable"
+    low, high = m.gain
+    upper = f"{high:.3g}" if high < math.inf else "any factor"
+    gain = f"gains times {low:.2g} to {upper}" if low > 0 else f"gains times up to {upper}"
+    delay = f"{1e3 * m.delay:.0f} ms more delay" if m.delay < math.inf else "any delay"
+    return f"stable; bears {delay}, {math.degrees(m.phase):.0f} deg of phase, {gain}"
+
+
+def _margin_data(m: Margins) -> dict[str, Any]:
+    return {
+        "stable": m.stable,
+        "gain": [_finite(g) for g in m.gain],
+        "phase_deg": _finite(math.degrees(m.phase)),
+        "delay_s": _finite(m.delay),
+    }
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
 
 
 def some(names: Sequence[str]) -> str:

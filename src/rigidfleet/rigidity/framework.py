@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidfleet.math.constraint_jacobian import jacobian
+from rigidfleet.math.rigid_body import rigid_motions
 from rigidfleet.typing import Floats, Ints
 
 #: Singular values below this times the largest are zero: points rounded to seven digits count as flat.
@@ -23,21 +24,6 @@ _STILL = 1e-5
 
 #: Share of the original squares below which the remainder has too few correct digits.
 _SPENT = 1e-8
-
-
-def rigid_motions(points: Floats) -> Floats:
-    """Orthonormal basis (N d, t) of translations and rotations of points (N, d)."""
-    n, d = points.shape
-    x = points - points.mean(axis=0)
-    scale = max(np.linalg.norm(x), np.finfo(float).tiny)
-    motions = [np.tile(axis, (n, 1)) / np.sqrt(n) for axis in np.eye(d)]
-    for a in range(d):
-        for b in range(a + 1, d):
-            turn = np.zeros((n, d))
-            turn[:, a], turn[:, b] = -x[:, b] / scale, x[:, a] / scale
-            motions.append(turn)
-    u, s, _ = np.linalg.svd(np.reshape(motions, (len(motions), n * d)).T, full_matrices=False)
-    return u[:, s > 1e-9]
 
 
 class Flex(NamedTuple):

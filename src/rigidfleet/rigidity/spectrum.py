@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rigidfleet.math.rigid_body import rigid_motions
 from rigidfleet.rigidity.framework import ZERO
 from rigidfleet.typing import Floats, Ints
 
@@ -62,7 +63,7 @@ def spectrum(points: ArrayLike, edges: Ints, masses: ArrayLike) -> Spectrum:
     w_max = float(eigsh(K, k=1, v0=start, return_eigenvectors=False)[0])
     # A shift slightly below zero, where K can be factored. Rigid motions are removed: they would hide the next ones.
     shift = -1e-6 * w_max
-    solve, rigid = splu(K - shift * eye_array(3 * n, format="csc")).solve, _rigid(p, share)
+    solve, rigid = splu(K - shift * eye_array(3 * n, format="csc")).solve, rigid_motions(p, m)
 
     def inverse(x: Floats) -> Floats:
         y = solve(x - rigid @ (rigid.T @ x))
@@ -78,13 +79,3 @@ def spectrum(points: ArrayLike, edges: Ints, masses: ArrayLike) -> Spectrum:
         return Spectrum(0.0, w_max, _LOWEST)
     zero = held < (10 * ZERO) ** 2 * w_max
     return Spectrum(0.0 if zero.any() else float(held.min()), w_max, int(np.count_nonzero(zero)))
-
-
-def _rigid(p: Floats, share: Floats) -> Floats:
-    """Orthonormal rigid motions (3N, 6) of points (N, 3), in the coordinates of J M^-1/2; five for a line."""
-    x, turns = p - p.mean(axis=0), np.zeros((len(p), 3, 6))
-    for k in range(3):
-        turns[:, k, k] = 1.0
-        turns[:, :, 3 + k] = np.cross(np.eye(3)[k], x) / np.abs(x).max()
-    U, size, _ = np.linalg.svd((turns / share[:, None, None]).reshape(-1, 6), full_matrices=False)
-    return U[:, size > 1e-9 * size[0]]

@@ -1,0 +1,477 @@
+"""Stability margins of a formation flown by vehicles with lag and delay: exact, for the linear loop.
+
+About a formation at rest, let x be the agents' deviations from their slots, weighted by the root of the mass. The
+constraint law commands M^-1 f_C = M^-1 J^T phi(mbar A) b with b = -J M^-1 (f_E + f_u) - (2 alpha s + beta^2 + gamma/s)
+J r, and f_E + f_u = -M k_u r without gravity, which f_u cancels. With S = phi(mbar A) on the weighted Jacobian, whose
+eigenvalues are the filter factors sigma = w phi(w), the command is therefore
+
+    -K(s) x,   K = (1 - S) k_u + S k_c,   k_c = 2 alpha s + beta^2 + gamma/s :
+
+the law takes the share sigma of the input away, and puts its own feedback in its place. Each vehicle follows with
+its own lag, so that s^2 x = -G K x and the loop is L(s) = G K / s^2, with G diagonal. Horizontal and vertical lags
+differ, and so may vehicles; L is then a matrix. It splits into the subspaces that S and G leave invariant. Lag and
+delay are not approximated. Gain, phase and delay margins are those of a factor common to all loops: they are where the
+eigenvalues of L(j omega), its characteristic loci, meet -1 (MacFarlane and Postlethwaite 1977,
+doi:10.1080/00207177708922216).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rigidfleet.math import pid
+from rigidfleet.math.constraint_jacobian import filter_factors, jacobian
+from rigidfleet.math.rigid_body import rigid_motions
+from rigidfleet.typing import Floats, Ints
+
+Complexes = NDArray[np.complexfloating]
+
+#: Growth rate [1/s] from which a motion counts as unstable, unless another is asked for: slower ones need hours.
+GROWTH = 1e-4
+# Filter factors that differ by less than this share of themselves count as equal; below the second, as 0.
+_ALIKE, _NO_SHARE = 1e-4, 1e-6
+# Relative size of what counts as zero in a subspace, and of eigenvalues w that rounding makes.
+_ROUNDING, _SINGULAR = 1e-8, 1e-12
+# Frequencies [rad/s] that are looked at, and the number of first samples.
+_FREQUENCIES, _SAMPLES = (1e-3, 1e5), 120
+# Loci are followed while they are larger than this: gain margins above its inverse count as infinite.
+_FAINT = 0.02
+# Greatest change of log(locus) between samples.
+_STEP = 0.4
+# Least and greatest rate p of a triple pole that is tried [1/s], ratio of successive trials, relative accuracy.
+_POLES, _RATIO, _ACCURACY = (0.1, 400.0), 1.5, 5e-4
+
+
+@dataclass(frozen=True)
+class Lag:
+    """What lies between a vehicle's commanded and its actual acceleration, linearised at hover.
+
+    The attitude is controlled by torque / inertia = -k_R e_R - k_omega e_omega (Lee, Leok and McClamroch 2010,
+    doi:10.1109/CDC.2010.5717652) through rotors with first-order lag tau. From commanded to actual acceleration,
+    horizontal G = k_R / (tau s^3 + s^2 + k_omega s + k_R), vertical G = 1 / (tau s + 1).
+
+    Attributes
+    ----------
+    k_R, k_omega : attitude gains [1/s^2, 1/s]; not of a point
+    tau : time constant of the rotors [s]
+    delay : age of the states that the law uses [s], transport and computation included
+    rate : of the law [Hz]; its command is held in between (zero-order hold); infinite for a continuous law
+    point : a point that delivers any acceleration at once; delay and rate apply to it, too
+    """
+
+    k_R: float = math.nan
+    k_omega: float = math.nan
+    tau: float = 0.0
+    delay: float = 0.0
+    rate: float = math.inf
+    point: bool = False
+
+    def __post_init__(self) -> None:
+        positive = {"rate": self.rate}
+        if not self.point:
+            positive |= {"k_R": self.k_R, "k_omega": self.k_omega}
+        for name, value in positive.items():
+            if not value > 0:
+                raise ValueError(f"{name} of a vehicle must be positive, not {value}")
+        for name, value in {"tau": self.tau, "delay": self.delay}.items():
+            if not 0 <= value < math.inf:
+                raise ValueError(f"{name} of a vehicle must be finite and >= 0 [s], not {value}")
+
+    @property
+    def stable(self) -> bool:
+        """Whether the attitude loop is stable by itself: k_omega > tau k_R (Hurwitz)."""
+        return self.point or self.k_omega > self.tau * self.k_R
+
+    def response(self, s: Complexes, *, vertical: bool) -> Complexes:
+        """Commanded to actual acceleration at s (K,), with delay and hold. The hold's sidebands are left out."""
+        wait = np.exp(-s * self.delay)
+        if self.rate < math.inf:
+            x = s / self.rate
+            wait = wait * -np.expm1(-x) / x
+        if self.point:
+            return wait
+        if vertical:
+            return wait / (self.tau * s + 1)
+        return wait * self.k_R / (((self.tau * s + 1) * s + self.k_omega) * s + self.k_R)
+
+
+@dataclass(frozen=True)
+class Feedback:
+    """Gains of the laws, as in a mission.
+
+    Attributes
+    ----------
+    alpha, beta, gamma : of the constraint law [1/s, 1/s, 1/s^3]; zeros for none
+    k1, k2, ki : of tracking, or of the virtual body [1/s^2, 1/s, 1/s^3]
+    control : "tracking" of slots, regulation of the virtual "body" (rigid allocation), or "open"
+    k_def : deformation damping where no slots are tracked [1/s]
+    solver, damping, iterations, threshold, cutoff : see `filter_factors`
+    link : age of other vehicles' states beyond that of a vehicle's own [s]
+    """
+
+    alpha: float = 3.0
+    beta: float = 12.0**0.5
+    gamma: float = 8.0
+    k1: float = 2.0
+    k2: float = 8.0**0.5
+    ki: float = 0.0
+    control: Literal["tracking", "body", "open"] = "tracking"
+    k_def: float = 1.0
+    solver: str = "iterated"
+    damping: float = 0.03
+    iterations: int = 3
+    threshold: float = 0.1
+    cutoff: float = 1e-3
+    link: float = 0.0
+
+    def with_pole(self, p: float) -> Feedback:
+        """With all three poles of the constraint law at -p [1/s]."""
+        alpha, beta, gamma = pid.triple_pole(p)
+        return replace(self, alpha=alpha, beta=beta, gamma=gamma)
+
+
+class Loop(NamedTuple):
+    """A part of the loop that no other part acts on, in an orthonormal basis of n directions.
+
+    ``S`` (2, n, n) is the share of the constraint law, and ``Q`` (2, n, n) the projection on rigid motions: whole, and
+    what each vehicle adds of its own state. ``P`` (g, n, n) are the directions of each of the ``channels``: a lag, and
+    whether it is the vertical one.
+    """
+
+    S: Floats
+    Q: Floats
+    P: Floats
+    channels: tuple[tuple[Lag, bool], ...]
+
+    @property
+    def constrained(self) -> bool:
+        """Whether the constraint law has a share in it."""
+        return bool(np.abs(self.S[0]).max() > _NO_SHARE)
+
+    def gain(self, s: Complexes, law: Feedback) -> Complexes:
+        """L (K, n, n) at s (K,)."""
+        k_u, to_k_c, to_rigid = _gains(s, law)[..., None, None]
+        heard = np.exp(-s * law.link)[:, None, None]
+        S, Q = (heard * X[0] + (1 - heard) * X[1] for X in (self.S, self.Q))
+        K = k_u * np.eye(len(self.S[0])) + to_k_c * S + to_rigid * Q
+        G = [lag.response(s, vertical=vertical) / (s * s) for lag, vertical in self.channels]
+        if len(G) == 1:
+            return G[0][:, None, None] * K
+        return np.tensordot(np.transpose(G), self.P, axes=1) @ K
+
+
+def _gains(s: Complexes, law: Feedback) -> Complexes:
+    """k_u, and what is added to it on S and on rigid motions Q (3, K): K = k_u 1 + ... S + ... Q, because S Q = 0."""
+    k_c = 2 * law.alpha * s + law.beta**2 + law.gamma / s
+    k_t, k_d = law.k1 + law.k2 * s + law.ki / s, law.k_def * s
+    if law.control == "tracking":
+        return np.stack([k_t, k_c - k_t, 0 * s])
+    return np.stack([k_d, k_c - k_d, (k_t if law.control == "body" else 0 * s) - k_d])
+
+
+@dataclass(frozen=True)
+class Margins:
+    """Margins of a loop: the smallest of its parts. NaN where the loop is unstable.
+
+    Attributes
+    ----------
+    stable : whether every motion that is fed back decays, or at least does not grow
+    gain : factors on all gains between which it stays stable; 0 and infinity for no bound
+    phase : phase margin [rad]; pi if no locus has unit gain
+    delay : further delay until it is unstable [s]; infinite for no bound
+    """
+
+    stable: bool
+    gain: tuple[float, float] = (math.nan, math.nan)
+    phase: float = math.nan
+    delay: float = math.nan
+
+
+def formation_loops(
+    positions: ArrayLike,
+    edges: ArrayLike,
+    masses: ArrayLike,
+    law: Feedback,
+    lags: Sequence[Lag],
+) -> list[Loop]:
+    """The distinct parts of a formation's loop at rest, for `margins`, `is_stable` and `largest_pole`.
+
+    Gains of the law may change afterwards; the solver, its options, the control and the link may not.
+
+    Parameters
+    ----------
+    positions : (N, 3) [m], z upwards
+    edges : (m, 2) agents from 0
+    masses : (N,) [kg]
+    lags : of each agent
+
+    Raises
+    ------
+    ValueError
+        The number of lags or masses is not that of the agents.
+    """
+    r, m = np.asarray(positions, dtype=np.float64), np.asarray(masses, dtype=np.float64)
+    n = len(r)
+    for name, count in (("lags", len(lags)), ("masses", len(m))):
+        if count != n:
+            raise ValueError(f"{n} agents need {n} {name}, one each, not {count}")
+    S = _shares(r, np.asarray(edges, dtype=np.int64).reshape(-1, 2), m, law)
+    rigid = rigid_motions(r, m)
+    Q = rigid @ rigid.T
+    own = np.kron(np.eye(n), np.ones((3, 3)))  # what a vehicle adds of its own state
+    kinds = [(lag, axis == 2 and not lag.point) for lag in lags for axis in range(3)]
+    channels = tuple(dict.fromkeys(kinds))
+    P = np.stack([np.diag([float(kind == channel) for kind in kinds]) for channel in channels])
+    parts = [S, S * own, Q, Q * own, *P]
+    basis = np.eye(3 * n)
+    if law.control == "open" and law.link == 0:
+        # Nothing feeds rigid motions back, and deformations do not depend on them.
+        basis = np.linalg.svd(Q)[0][:, rigid.shape[1] :]
+    parts = [basis.T @ part @ basis for part in parts]
+    loops = []
+    acting = [0, *([2] if law.control != "tracking" else []), *range(4, len(parts))]
+    if law.link > 0:
+        acting += [1, 3]
+    for V in _invariant([parts[k] for k in acting]):
+        S2, Q2 = ([V.T @ parts[k] @ V for k in pair] for pair in ((0, 1), (2, 3)))
+        P2 = np.stack([V.T @ part @ V for part in parts[4:]])
+        present = np.abs(P2).max(axis=(1, 2)) > _ROUNDING
+        there = tuple(c for c, is_there in zip(channels, present, strict=True) if is_there)
+        loops.append(Loop(np.stack(S2), np.stack(Q2), P2[present], there))
+    return loops
+
+
+def tracking_loops(lags: Sequence[Lag]) -> list[Loop]:
+    """The distinct loops by which single vehicles track their slots: each lag, horizontal and vertical."""
+    zero, one = np.zeros((2, 1, 1)), np.ones((1, 1, 1))
+    kinds = dict.fromkeys((lag, up and not lag.point) for lag in lags for up in (False, True))
+    return [Loop(zero, zero, one, (kind,)) for kind in kinds]
+
+
+def _shares(r: Floats, edges: Ints, m: Floats, law: Feedback) -> Floats:
+    """S (3N, 3N): the law's share of the input, with nearly equal filter factors made equal."""
+    if not len(edges):
+        return np.zeros((r.size, r.size))
+    J = jacobian(r, edges) * np.repeat(np.sqrt(m.mean() / m), 3)
+    w, V = np.linalg.eigh(J.T @ J)
+    w[w < _SINGULAR * w[-1]] = 0.0
+    sigma = filter_factors(
+        w,
+        law.solver,
+        damping=law.damping,
+        iterations=law.iterations,
+        threshold=law.threshold,
+        cutoff=law.cutoff,
+    )
+    sigma[sigma < _NO_SHARE] = 0.0
+    some = sigma > 0
+    sigma[some] = np.exp(np.round(np.log(sigma[some]) / _ALIKE) * _ALIKE)
+    return (V * sigma) @ V.T
+
+
+def _invariant(matrices: list[Floats]) -> list[Floats]:
+    """Orthonormal bases (n, k) of subspaces that symmetric matrices (n, n) leave invariant; of alike ones, one.
+
+    An eigenvector of a random combination lies in a single irreducible subspace but for accidents, which only
+    join subspaces; the matrices, applied to it again and again, span that subspace (Murota et al. 2010,
+    doi:10.1007/s13160-010-0006-9).
+    """
+    random = np.random.default_rng(0).uniform(1.0, 2.0, len(matrices))
+    X = sum(c * A for c, A in zip(random, matrices, strict=True))
+    n = len(X)
+    done, found = np.zeros((n, 0)), {}
+    for v in np.linalg.eigh(X)[1].T:
+        rest = v - done @ (done.T @ v)
+        size = np.linalg.norm(rest)
+        if size < 1e-3:
+            continue
+        V = (rest / size)[:, None]
+        at = 0
+        while at < V.shape[1]:
+            for A in matrices:
+                y = A @ V[:, at]
+                for _ in range(2):  # once leaves rounding errors of the others' size
+                    y = y - V @ (V.T @ y) - done @ (done.T @ y)
+                if (size := np.linalg.norm(y)) > _ROUNDING:
+                    V = np.column_stack([V, y / size])
+            at += 1
+        done = np.column_stack([done, V])
+        found.setdefault(tuple(np.round(np.linalg.eigvalsh(V.T @ X @ V), 6)), V)
+    return list(found.values())
+
+
+def is_stable(loops: Sequence[Loop], law: Feedback, growth: float = GROWTH) -> bool:
+    """Whether no motion grows at a rate of ``growth`` [1/s] > 0 or more: Nyquist's criterion on det(1 + L)."""
+    return all(_unstable(loop, law, growth) == 0 for loop in loops)
+
+
+def _unstable(loop: Loop, law: Feedback, growth: float) -> int:
+    """Number of roots of det(1 + L) to the right of ``growth``; 1 if a vehicle's attitude itself is unstable."""
+    if not all(lag.stable for lag, _ in loop.channels):
+        return 1
+    n = len(loop.S[0])
+    # From F to F (1 + X), det F turns by sum arg(1 + eig X) < pi if the norm of X is below this.
+    near = min(0.7, 2.5 / math.sqrt(n))
+    end = _highest(loop, law, min(0.7, 2.5 / n))  # from here on, det F turns by less than pi
+    if end == 0.0:
+        return 0
+
+    def returned(omega: Floats) -> Complexes:
+        return np.eye(n) + loop.gain(growth + 1j * omega, law)
+
+    # The poles of L at 0 are left of this line. To its right L is analytic and vanishes at infinity.
+    omega = np.append(0.0, np.geomspace(0.1 * growth, end, _SAMPLES))
+    F = returned(omega)
+    for _ in range(30):
+        turn = np.linalg.solve(F[:-1], F[1:])
+        far = np.flatnonzero(np.linalg.norm(turn - np.eye(n), axis=(1, 2)) > near)
+        if not len(far):
+            break
+        middle = 0.5 * (omega[far] + omega[far + 1])
+        omega = np.insert(omega, far + 1, middle)
+        F = np.insert(F, far + 1, returned(middle), axis=0)
+    else:
+        return 1  # det(1 + L) = 0 on the line itself
+    turned = np.angle(np.linalg.slogdet(turn)[0]).sum()
+    rest = np.angle(np.linalg.slogdet(F[-1])[0])
+    return round(float(rest - turned) / math.pi)
+
+
+def _highest(loop: Loop, law: Feedback, size: float) -> float:
+    """Frequency [rad/s] from which on the norm of L is below ``size``, by an upper bound; 0 if it is nowhere above."""
+    omega = np.geomspace(*_FREQUENCIES, 600)
+    s = 1j * omega
+    each = np.abs([lag.response(s, vertical=vertical) for lag, vertical in loop.channels])
+    k_u, to_k_c, to_rigid = np.abs(_gains(s, law))
+    # The norms of S, Q and of what each vehicle adds to them are at most 1.
+    K = k_u + (to_k_c + to_rigid) * (3.0 if law.link > 0 else 1.0)
+    above = np.flatnonzero(each.max(axis=0) * K > size * omega**2)
+    return float(omega[min(above[-1] + 1, len(omega) - 1)]) if len(above) else 0.0
+
+
+def _eigenvalues(A: Complexes) -> Complexes:
+    return A[..., 0] if A.shape[-1] == 1 else np.linalg.eigvals(A)
+
+
+def margins(loops: Sequence[Loop], law: Feedback, growth: float = GROWTH) -> Margins:
+    """Gain, phase and delay margin common to all loops: the smallest of them; ``growth`` as in `is_stable`."""
+    if not is_stable(loops, law, growth):
+        return Margins(stable=False)
+    low, high, phase, delay = 0.0, math.inf, math.pi, math.inf
+    for loop in loops:
+        for _, locus in _loci_at(loop, law, on_axis=True):
+            if 1 / abs(locus) > 1:
+                high = min(high, 1 / abs(locus))
+            else:
+                low = max(low, 1 / abs(locus))
+        for omega, locus in _loci_at(loop, law, on_axis=False):
+            angle = float(np.angle(-locus))
+            phase = min(phase, abs(angle))
+            delay = min(delay, angle % (2 * math.pi) / omega)
+    return Margins(True, (low, high), phase, delay)
+
+
+def _loci_at(loop: Loop, law: Feedback, *, on_axis: bool) -> list[tuple[float, complex]]:
+    """Frequencies [rad/s] at which a locus is negative real (``on_axis``), or has unit gain; and the locus there."""
+    omega, loci = _loci(loop, law)
+    if not len(omega):
+        return []
+
+    def place(z: Complexes) -> Floats:
+        """A number that is whole at a crossing, of log(locus)."""
+        return (z.imag - math.pi) / (2 * math.pi) if on_axis else z.real * 1e-3
+
+    found = []
+    number = place(loci)
+    for k, c in np.argwhere(np.floor(number[:-1]) != np.floor(number[1:])):
+        target = max(np.floor(number[k, c]), np.floor(number[k + 1, c]))
+        ends = np.log(omega[k : k + 2])
+
+        def at(x: float, k: int = k, c: int = c, ends: Floats = ends) -> complex:
+            """log(locus) at log(omega) = x: the eigenvalue nearest to the chord."""
+            part = (x - ends[0]) / (ends[1] - ends[0])
+            guess = (1 - part) * loci[k, c] + part * loci[k + 1, c]
+            z = np.log(
+                _eigenvalues(loop.gain(np.array([1j * math.exp(x)]), law))[0] / np.exp(guess)
+            )
+            return complex(z[np.abs(z).argmin()] + guess)
+
+        x = _root(lambda x, at=at, target=target: float(place(np.array(at(x)))) - target, *ends)
+        found.append((math.exp(x), complex(np.exp(at(x)))))
+    return found
+
+
+def _root(f: Callable[[float], float], a: float, b: float) -> float:
+    from scipy.optimize import brentq
+
+    if f(a) * f(b) > 0:  # a crossing at an end, within rounding
+        return a if abs(f(a)) < abs(f(b)) else b
+    return float(brentq(f, a, b, xtol=1e-12))
+
+
+def _loci(loop: Loop, law: Feedback) -> tuple[Floats, Complexes]:
+    """Frequencies (K,) [rad/s], and the logarithms (K, n) of the loci there, each continuous."""
+    end = _highest(loop, law, _FAINT)
+    if end <= _FREQUENCIES[0]:
+        return np.zeros(0), np.zeros((0, len(loop.S[0])), np.complex128)
+    omega = np.geomspace(_FREQUENCIES[0], end, _SAMPLES)
+    values = _eigenvalues(loop.gain(1j * omega, law))
+    for _ in range(12):
+        loci = _followed(np.log(np.where(values == 0, 1e-300, values)))
+        step = np.abs(np.diff(loci, axis=0))
+        # Where loci are fainter than the threshold, they turn as they please.
+        step[np.maximum(loci[1:].real, loci[:-1].real) < math.log(_FAINT)] = 0.0
+        coarse = np.flatnonzero(step.max(axis=1) > _STEP)
+        if not len(coarse):
+            break
+        middle = np.sqrt(omega[coarse] * omega[coarse + 1])
+        omega = np.insert(omega, coarse + 1, middle)
+        values = np.insert(values, coarse + 1, _eigenvalues(loop.gain(1j * middle, law)), axis=0)
+    else:
+        loci = _followed(np.log(np.where(values == 0, 1e-300, values)))
+    return omega, loci
+
+
+def _followed(loci: Complexes) -> Complexes:
+    """Logarithms (K, n), reordered and unwrapped so that each column is continuous."""
+    from scipy.optimize import linear_sum_assignment
+
+    if loci.shape[1] > 1:
+        for k in range(1, len(loci)):
+            gap = loci[k][None, :] - loci[k - 1][:, None]
+            turned = (gap.imag + math.pi) % (2 * math.pi) - math.pi
+            loci[k] = loci[k][linear_sum_assignment(np.hypot(gap.real, turned))[1]]
+    return loci.real + 1j * np.unwrap(loci.imag, axis=0)
+
+
+def largest_pole(
+    loops: Sequence[Loop], law: Feedback, most: float = math.inf, growth: float = GROWTH
+) -> float:
+    """Rate p [1/s] up to which a triple pole -p of the constraint law keeps the loops stable; infinite if all do.
+
+    At most ``most``: of several formations, pass the least so far. 0 if even slow poles are unstable. Rates are tried
+    from slow ones upwards, each half as fast again, so that a narrow unstable range between two may be overlooked.
+    """
+
+    def stable(p: float) -> bool:
+        return is_stable(loops, law.with_pole(p), growth)
+
+    if most < math.inf and all(stable(most * part) for part in (1.0, 0.5, 0.25)):
+        return most
+    low, high = 0.0, _POLES[0]
+    while stable(high):
+        low, high = high, high * _RATIO
+        if high > _POLES[1]:
+            return most
+    while high - low > _ACCURACY * high:
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if stable(middle) else (low, middle)
+        if high < _ACCURACY * _POLES[0]:
+            return 0.0
+    return min(low, most)

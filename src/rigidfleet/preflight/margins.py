@@ -1,0 +1,179 @@
+"""Check what lag and delay the laws bear, at every shape and attitude that the mission plans."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from rigidfleet.math import lqr
+from rigidfleet.math.margins import (
+    GROWTH,
+    Feedback,
+    Lag,
+    Loop,
+    Margins,
+    formation_loops,
+    largest_pole,
+    margins,
+    tracking_loops,
+)
+from rigidfleet.mission import Mission, Phase
+from rigidfleet.planning.preview import PlannedPhase
+from rigidfleet.preflight.findings import FormationMargins, MarginsCheck, Preflight, Remark
+from rigidfleet.typing import Floats
+
+#: Number of shapes and attitudes that are taken of a phase, both ends included.
+SHAPES = 7
+#: Margins below which a remark is made: 30 degrees and a factor of 2, as is usual in the design of control loops.
+_PHASE, _GAIN = math.radians(30.0), 2.0
+#: Maximum work on margins: sum of the cubes of the sizes of loops, some seconds.
+_WORK = 20_000
+
+
+def check_margins(
+    mission: Mission, way: Sequence[PlannedPhase], lags: Sequence[Lag]
+) -> MarginsCheck:
+    """Margins of the tracking, and of all loops of each formation and of the ways between them.
+
+    Parameters
+    ----------
+    way : the planned phases
+    lags : of each vehicle
+    """
+    tracked = any(phase.control == "tracking" for phase in mission.phases)
+    tracking = margins(tracking_loops(lags), _feedback(mission, None, None)) if tracked else None
+    found: dict[str, FormationMargins] = {}
+    seen: set[tuple[object, ...]] = set()
+    work, skipped = 0, False
+    pairs = list(zip(mission.phases, way, strict=False))
+    for phase, planned in sorted(pairs, key=lambda pair: _changes(pair[1])):  # ways come last
+        name = planned.shapes[1]
+        if name is None or not len(edges := mission.formation_edges(name)):
+            continue
+        law = _feedback(mission, phase, None if _changes(planned) else name)
+        # On a way that ends, slow growth does no harm: weak shapes pass.
+        growth = 1.0 / np.ptp(planned.time) if _changes(planned) else GROWTH
+        for r in _shapes(planned, phase):
+            key = (_where(planned), law, *_seen_from_above(r))
+            if key in seen:
+                continue
+            seen.add(key)
+            loops = formation_loops(r, edges, mission.agents.mass, law, lags)
+            size = sum(len(loop.S[0]) ** 3 for loop in loops)
+            if work + size > _WORK and found:
+                skipped = True
+                continue
+            work += size
+            found[_where(planned)] = _worse(found.get(_where(planned)), loops, law, growth)
+    return MarginsCheck(tracking, found, skipped)
+
+
+def _feedback(mission: Mission, phase: Phase | None, held: str | None) -> Feedback:
+    """The laws of a phase; ``held`` is the formation in which it begins, None if the shape changes."""
+    c = mission.constraint
+    k1, k2 = lqr.double_integrator_gains(mission.tracking.Q, mission.tracking.R)
+    on = float(c.stabilisation == "pid")
+    return Feedback(
+        alpha=on * c.alpha,
+        beta=on * c.beta,
+        gamma=on * c.gamma,
+        k1=k1,
+        k2=k2,
+        control="tracking" if phase is None else phase.control,
+        k_def=c.deformation_damping,
+        solver=c.solver,
+        damping=mission.damping(held),
+        iterations=c.iterations,
+        threshold=c.threshold,
+        cutoff=c.cutoff,
+    )
+
+
+def _changes(planned: PlannedPhase) -> bool:
+    return planned.ways is not None and planned.shapes[0] != planned.shapes[1]
+
+
+def _where(planned: PlannedPhase) -> str:
+    before, after = planned.shapes
+    if not _changes(planned):
+        return f"'{after}'"
+    return f"on the way to '{after}'" if before is None else f"'{before}' to '{after}'"
+
+
+def _shapes(planned: PlannedPhase, phase: Phase) -> Floats:
+    """Positions (SHAPES, N, 3) [m], evenly over the change of shape, or over the phase."""
+    shaping = phase.shaping
+    t, span = planned.time, planned.time[-1] - planned.time[0]
+    if shaping is not None:
+        span = min(span, shaping.blend)
+    at = np.searchsorted(t, t[0] + span * np.linspace(0.0, 1.0, SHAPES))
+    return planned.position[np.minimum(at, len(t) - 1)]
+
+
+def _seen_from_above(r: Floats) -> tuple[bytes, bytes]:
+    """What the loop depends on: all but place and heading, to a millimetre or so."""
+    x = r - r.mean(axis=0)
+    across = x[:, :2] @ x[:, :2].T
+    size = max(float(np.abs(x).max()), 1e-9)
+    rounded = (
+        np.round(part / scale, 3) + 0.0 for part, scale in ((across, size**2), (x[:, 2], size))
+    )
+    first, second = (part.tobytes() for part in rounded)
+    return first, second
+
+
+def _worse(
+    known: FormationMargins | None, loops: Sequence[Loop], law: Feedback, growth: float
+) -> FormationMargins:
+    """The smaller margins of those ``known`` and those of a further shape."""
+    now = margins(loops, law, growth)
+    constrained = [loop for loop in loops if loop.constrained]
+    most = math.inf if known is None else known.largest_pole
+    pole = largest_pole(constrained, law, most, growth) if constrained else most
+    if known is None:
+        return FormationMargins(now, pole)
+    was = known.margins
+    if not (was.stable and now.stable):
+        return FormationMargins(Margins(stable=False), pole)
+    low, high = max(was.gain[0], now.gain[0]), min(was.gain[1], now.gain[1])
+    worst = Margins(True, (low, high), min(was.phase, now.phase), min(was.delay, now.delay))
+    return FormationMargins(worst, pole)
+
+
+def margin_remarks(found: Preflight) -> Iterator[Remark]:
+    """Remarks on loops that lag and delay make unstable, or that have small margins."""
+    if found.margins is None:
+        return
+    tracking, formations = found.margins.tracking, found.margins.formations
+    if tracking is not None and _little(tracking):
+        yield _judged("tracking", tracking, "lower tracking.Q")
+    # Where the tracking alone is unstable, no constraint law is to blame.
+    bad = {where: f for where, f in formations.items() if _little(f.margins)}
+    if bad and (tracking is None or tracking.stable):
+        worst = min(bad.values(), key=lambda f: (f.margins.stable, f.margins.phase))
+        if found.gains.stabilised:
+            pole = min(f.largest_pole for f in bad.values())
+            remedy = f"a triple pole of the constraint law is stable up to p = {pole:.3g} /s"
+        else:
+            remedy = "lower the gains"
+        yield _judged(f"constraint law ({', '.join(bad)})", worst.margins, remedy)
+    if found.margins.skipped:
+        text = "to limit the time of the check, margins leave some shapes out"
+        yield Remark("note", "margins", text)
+
+
+def _little(m: Margins) -> bool:
+    return not m.stable or m.phase < _PHASE or m.gain[1] < _GAIN
+
+
+def _judged(what: str, m: Margins, remedy: str) -> Remark:
+    if not m.stable:
+        text = f"{what}: unstable with the vehicles' lag and delay; {remedy}"
+        return Remark("fails", "margins", text)
+    text = (
+        f"{what}: phase margin {math.degrees(m.phase):.0f} deg, gain margin {m.gain[1]:.2g}; below 30 deg or a"
+        f" factor of 2, errors ring; {remedy}"
+    )
+    return Remark("note", "margins", text)
