@@ -135,8 +135,12 @@ def take_force(i, dt, p, w, flight, state):
         attitude_matrix(state.S[i, 6:10], T)
         multiply(T, w.v_ref[i], x[0])
         speed = math.sqrt(x[0, 0] ** 2 + x[0, 1] ** 2 + x[0, 2] ** 2)
+        faster = 1.0
+        if not vehicles.point[i]:  # drag of rotors grows with their speed, the root of the thrust
+            load = math.sqrt(state.force[i, 0] ** 2 + state.force[i, 1] ** 2 + state.force[i, 2] ** 2)
+            faster = math.sqrt(load / max(m * vehicles.g, 1e-300))
         for q in range(3):
-            x[0, q] *= guidance.drag[i, q] + speed * guidance.c[i, q]
+            x[0, q] *= faster * guidance.drag[i, q] + speed * guidance.c[i, q]
         multiply_transposed(T, x[0], x[1])
         for q in range(3):
             if not state.saturated[i]:

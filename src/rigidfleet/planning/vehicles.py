@@ -26,6 +26,8 @@ _BLOCK = 1024
 _NOISE, _DROPPED, _UNHEARD = 2, 3, 4
 #: Density of the air at sea level, ICAO standard atmosphere [kg/m^3].
 _DENSITY = 1.225
+#: Speed below which the direction of quadratic drag is rounded off [m/s].
+_STILL = 0.1
 #: Time in which a vehicle turns from its yaw at a switch to the yaw asked for [s].
 _TURN_TIME = 3.0
 
@@ -130,7 +132,8 @@ class TickTables:
         """Tables for ticks from ``first`` to before ``last``, in a phase begun at a time [s] with yaws (N,) [rad]."""
         sensing = self.flight.sensing
         time = np.arange(first, last) / self.rate
-        yaw, jerk, snap = _references(problem, time, self.yaw, begun, start)
+        yaw, found = _references(problem, time, self.yaw, begun, start)
+        jerk, snap = self._force_rates(found)
         noise_r = noise_v = np.zeros((0, self.n, 3))
         dropped = np.zeros((0, self.n), dtype=np.bool_)
         unheard = np.zeros((0, self.n, self.n), dtype=np.bool_)
@@ -148,6 +151,25 @@ class TickTables:
             unheard = _drawn(_UNHEARD, self.links.seed, rows, (self.n, self.n)) < self.links.dropped
         return fleet.Tables(first, last, yaw, jerk, snap, noise_r, noise_v, dropped, unheard)
 
+    def _force_rates(self, x: Floats) -> tuple[Floats, Floats]:
+        """Two derivatives (K, N, 3) of the desired force per mass, from those of the reference, (K, 5, N, 3).
+
+        Drag that is fed forward changes the force with the velocity; near level flight body axes are the world's.
+        """
+        if not len(x):
+            return x[:, 0], x[:, 0]
+        v, a, j, s = (x[:, k] for k in (1, 2, 3, 4))
+        guidance, mass = self.flight.guidance, self.flight.vehicles.m[:, None]
+        D, c = guidance.drag / mass, guidance.c / mass
+        jerk, snap = j + D * a, s + D * j
+        if c.any():
+            speed = np.sqrt((v * v).sum(axis=2, keepdims=True) + _STILL**2)
+            faster = (v * a).sum(axis=2, keepdims=True) / speed
+            curve = ((a * a + v * j).sum(axis=2, keepdims=True) - faster**2) / speed
+            jerk += c * (speed * a + faster * v)
+            snap += c * (speed * j + 2.0 * faster * a + curve * v)
+        return np.ascontiguousarray(jerk), np.ascontiguousarray(snap)
+
 
 def yaw_at(problem: Problem, t: float, yaw: Yaw, begun: float, start: Floats) -> Floats:
     """Yaw (N,) [rad] asked of each vehicle at a time [s] of a phase; see `TickTables.made`."""
@@ -156,8 +178,8 @@ def yaw_at(problem: Problem, t: float, yaw: Yaw, begun: float, start: Floats) ->
 
 def _references(
     problem: Problem, time: Floats, yaw: Yaw, begun: float, start: Floats
-) -> tuple[Floats, Floats, Floats]:
-    """Yaw with two derivatives, jerk and snap (K, N, 3) of each vehicle at times (K,) [s].
+) -> tuple[Floats, Floats]:
+    """Yaw with two derivatives (K, N, 3) of each vehicle at times (K,) [s], and its reference (K, 5, N, 3).
 
     A vehicle turns with the formation, or from its yaw at the start of the phase into the one asked for.
     """
@@ -165,7 +187,7 @@ def _references(
     if problem.control.kind != TRACKING or not len(time):
         still = np.zeros((len(time), n, 3))
         still[..., 0] = start
-        return still, np.zeros((0, n, 3)), np.zeros((0, n, 3))
+        return still, np.zeros((0, 5, n, 3))
     reference, motion = problem.reference, problem.motion
     found = slot_derivatives(reference, motion, time)
     whole = np.concatenate([[begun], time])
@@ -186,8 +208,7 @@ def _references(
         turned += rest[:, None, :] * off[:, None]
     else:
         turned[..., 0] += off
-    jerk, snap = (np.ascontiguousarray(found[:, k]) for k in (3, 4))
-    return np.ascontiguousarray(turned), jerk, snap
+    return np.ascontiguousarray(turned), found
 
 
 def _rows(first: int, last: int, every: int) -> Ints:
