@@ -77,11 +77,11 @@ class Vehicle:
     def unmixed(self, g: float) -> Floats:
         """Matrix (4, 4) from thrust [N] and torque [N m] to the rotors' forces.
 
-        The ratio of a rotor's torque to its thrust is that at hover.
+        The ratio of a rotor's torque to its thrust is that at hover; without gravity, that at half the greatest thrust.
         """
         if self.point:
             return np.zeros((4, 4))
-        hover = self.speed_at(0.25 * self.m * g)
+        hover = self.speed_at(0.25 * self.m * g or 0.5 * self.thrust_at(self.speed)[1])
         ratio = np.polynomial.polynomial.polyval(hover, self.torque) / self.thrust_at(hover)
         x, y, _ = np.asarray(self.rotors, dtype=float).T
         mixing = np.stack([np.ones(4), y, -x, ratio * np.asarray(self.spin)])
