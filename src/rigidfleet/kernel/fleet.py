@@ -169,6 +169,7 @@ class Tables(NamedTuple):
 
     first: int
     last: int
+    path: Floats  # (K, N, 6) r, v about which states are measured; see `sampled_flight.measure`
     yaw: Floats  # (K, N, 3) yaw [rad], its rate and acceleration
     jerk: Floats  # (K, N, 3) of the reference [m/s^3]
     snap: Floats  # (K, N, 3) [m/s^4]
@@ -320,7 +321,7 @@ def no_tables(n: int) -> Tables:
     """No feedforward, yaw 0, no noise, nothing dropped."""
     none = np.zeros((0, n, 3))
     return Tables(
-        0, ENDLESS, none, none, none, none, none, np.zeros((0, n), dtype=np.bool_),
+        0, ENDLESS, np.zeros((0, n, 6)), none, none, none, none, none, np.zeros((0, n), dtype=np.bool_),
         np.zeros((0, n, n), dtype=np.bool_),
     )  # fmt: skip
 

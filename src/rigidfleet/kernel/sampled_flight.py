@@ -50,13 +50,23 @@ def row_of(k, every, first):
 
 
 @compiled
+def path_at(k, i, q, tables):
+    """Coordinate q of r, v of vehicle i's path at tick k, or the first one of the table; 0 without paths."""
+    return tables.path[max(k - tables.first, 0), i, q] if tables.path.shape[0] > 0 else 0.0
+
+
+@compiled
 def measure(k, flight, state):
-    """Measured states of all vehicles at tick k, into ``state.seen`` and, if vehicles are linked, ``state.heard``."""
+    """Measured states of all vehicles at tick k, into ``state.seen`` and, if vehicles are linked, ``state.heard``.
+
+    States are kept as what they differ from a path by. A state that is old when it is used is then added to the path of
+    now, not of then: a measurement that carries its time.
+    """
     sensing, tables, depth = flight.sensing, flight.tables, state.history.shape[0]
     n, now = state.S.shape[0], k % depth
     for i in range(n):
         for q in range(6):
-            state.history[now, i, q] = state.S[i, q]
+            state.history[now, i, q] = state.S[i, q] - path_at(k, i, q, tables)
     if k % sensing.every == 0:
         u = row_of(k, sensing.every, tables.first)
         noisy = tables.noise_r.shape[0] > 0
@@ -94,14 +104,15 @@ def listen(k, flight, state):
 
 
 @compiled
-def evaluate_law(t, known, integral, p, w, state, call):
-    """Evaluate the formation law at t [s] for known states (N, 6) and an integral (m,); results are in w."""
+def evaluate_law(k, t, known, integral, p, w, flight, state, call):
+    """Evaluate the formation law at tick k, time t [s], for known states (N, 6) and an integral (m,); results in w."""
     n, m, y = known.shape[0], integral.shape[0], state.work.law_state[0]
     for i in range(n):
         for q in range(3):
-            y[3 * i + q], y[3 * n + 3 * i + q] = known[i, q], known[i, 3 + q]
-    for k in range(m):
-        y[6 * n + k] = integral[k]
+            y[3 * i + q] = known[i, q] + path_at(k, i, q, flight.tables)
+            y[3 * n + 3 * i + q] = known[i, 3 + q] + path_at(k, i, 3 + q, flight.tables)
+    for c in range(m):
+        y[6 * n + c] = integral[c]
     for q in range(4):
         y[6 * n + m + q] = state.frame[0, q]
     state.work.law_time[0] = t
@@ -118,7 +129,7 @@ def integrate_constraints(dt, integral, p, w, state):
 
 
 @compiled
-def take_force(i, dt, p, w, flight, state):
+def take_force(k, i, dt, p, w, flight, state):
     """Desired force of vehicle i [N] from the law just evaluated, with what is added after it."""
     vehicles, guidance, T, x = flight.vehicles, flight.guidance, state.work.T, state.work.x
     m, pull = p.vehicles.m[i], 0.0
@@ -144,7 +155,8 @@ def take_force(i, dt, p, w, flight, state):
         multiply_transposed(T, x[0], x[1])
         for q in range(3):
             if not state.saturated[i]:
-                state.error[i, q] += dt * (state.seen[i, q] - w.r_ref[i, q])
+                known = state.seen[i, q] + path_at(k, i, q, flight.tables)
+                state.error[i, q] += dt * (known - w.r_ref[i, q])
             state.force[i, q] += x[1, q] - m * guidance.k_i[i, q] * state.error[i, q]
         if not vehicles.lost[i]:
             e = 0.0
@@ -161,19 +173,19 @@ def worse(i, kind, value, t, state):
 
 
 @compiled
-def desire(t, p, w, flight, state, call):
-    """Desired forces of all vehicles at t [s]; returns False if the law gives none (a singular law)."""
+def desire(k, t, p, w, flight, state, call):
+    """Desired forces of all vehicles at tick k, time t [s]; returns False if the law gives none (a singular law)."""
     n, dt = state.S.shape[0], flight.every * flight.steps * flight.h
     advance_frame(t, p, state)
     linked = flight.sensing.linked
     for i in range(n if linked else 1):
         known = state.heard[i] if linked else state.seen
         integral = state.integral[i]
-        evaluate_law(t, known, integral, p, w, state, call)
+        evaluate_law(k, t, known, integral, p, w, flight, state, call)
         integrate_constraints(dt, integral, p, w, state)
         for j in range(n):
             if j == i or not linked:
-                take_force(j, dt, p, w, flight, state)
+                take_force(k, j, dt, p, w, flight, state)
     if p.has_frame:
         for i in range(n):
             for q in range(3):
@@ -211,7 +223,7 @@ def tick(k, t, p, w, flight, state, call):
     """Measure, desire and steer at tick k, time t [s]; returns False if the law gives no force."""
     measure(k, flight, state)
     if flight.commands.kind == FORCE and k % flight.every == 0:
-        if not desire(t, p, w, flight, state, call):
+        if not desire(k, t, p, w, flight, state, call):
             return False
     for i in range(state.S.shape[0]):
         state.saturated[i] = steer(k, i, flight, state)
@@ -273,7 +285,7 @@ def write_samples(t, h, flight, state, call):
                 call.f_u[c, i, q], call.f_C[c, i, q] = state.f_u[i, q], state.f_C[i, q]
                 call.air[c, i, q] = work.air[2, i, q]
             for q in range(6):
-                call.seen[c, i, q] = state.seen[i, q]
+                call.seen[c, i, q] = state.seen[i, q] + path_at(count[TICKS] - 1, i, q, flight.tables)
             call.saturated[c, i] = state.saturated[i]
         write_derivatives(c, t + x, flight, state, call)
         for k in range(state.integral.shape[1]):

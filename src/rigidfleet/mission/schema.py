@@ -263,6 +263,11 @@ class Autopilot(Part):
         100.0,
         description="rate of the formation's laws [Hz], which give each vehicle its force; rate is a multiple of it",
     )
+    delay_compensation: Flag = Field(
+        True,
+        description="true: measurements carry their time, and are compared with the reference of that time, while "
+        "slots are tracked; false: with the reference of now",
+    )
     step: Annotated[float, Strict(), Field(ge=1e-5, le=0.01)] = Field(
         0.001, description="longest step of the integrator, a fourth-order Runge-Kutta method [s]"
     )

@@ -127,6 +127,29 @@ class TickTables:
         self.noise = None if d is None else d.noise
         self.links = None if d is None else d.links
         self.yaw = Yaw()
+        self.compensated = mission.autopilot.delay_compensation
+        #: What states were last measured about: the problem of the path, or a point to stay at.
+        self._source: Problem | None = None
+        self._anchor = np.zeros((self.n, 6))
+
+    def start_path(self, problem: Problem, tick: int) -> Floats:
+        """Begin to measure states about another path; return what to add (N, 6) to states measured before.
+
+        While slots are tracked, the path is that of the reference. Otherwise it stays where it is.
+        """
+        before = self._path(tick)
+        if problem.control.kind == TRACKING:
+            self._source = problem
+        else:
+            self._source, self._anchor = None, before
+        return before - self._path(tick)
+
+    def _path(self, tick: int) -> Floats:
+        if self._source is None:
+            return self._anchor
+        time = np.array([tick / self.rate])
+        found = slot_derivatives(self._source.reference, self._source.motion, time, 2)
+        return np.concatenate([found[0, 0], found[0, 1]], axis=1)
 
     def made(self, first: int, last: int, problem: Problem, begun: float, start: Floats) -> fleet.Tables:
         """Tables for ticks from ``first`` to before ``last``, in a phase begun at a time [s] with yaws (N,) [rad]."""
@@ -134,6 +157,11 @@ class TickTables:
         time = np.arange(first, last) / self.rate
         yaw, found = _references(problem, time, self.yaw, begun, start)
         jerk, snap = self._force_rates(found)
+        path = np.zeros((0, self.n, 6))
+        if self.compensated:
+            path = np.tile(self._anchor, (len(time), 1, 1))
+            if len(found):
+                path = np.ascontiguousarray(np.concatenate([found[:, 0], found[:, 1]], axis=2))
         noise_r = noise_v = np.zeros((0, self.n, 3))
         dropped = np.zeros((0, self.n), dtype=np.bool_)
         unheard = np.zeros((0, self.n, self.n), dtype=np.bool_)
@@ -149,7 +177,7 @@ class TickTables:
         if self.links is not None and self.links.dropped:
             rows = _rows(first, last, sensing.link_every)
             unheard = _drawn(_UNHEARD, self.links.seed, rows, (self.n, self.n)) < self.links.dropped
-        return fleet.Tables(first, last, yaw, jerk, snap, noise_r, noise_v, dropped, unheard)
+        return fleet.Tables(first, last, path, yaw, jerk, snap, noise_r, noise_v, dropped, unheard)
 
     def _force_rates(self, x: Floats) -> tuple[Floats, Floats]:
         """Two derivatives (K, N, 3) of the desired force per mass, from those of the reference, (K, 5, N, 3).

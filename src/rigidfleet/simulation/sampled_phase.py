@@ -56,7 +56,7 @@ class SampledPhase(ActivePhase):
 
     def __init__(self, *arguments: Any, vehicles: Vehicles, **options: Any) -> None:
         self.vehicles, self.flight = vehicles, vehicles.flight
-        self.tabled: Problem | None = None  # the problem of the tables
+        self.tabled: Problem | None = None  # the plan's problem for which the tables are
         super().__init__(*arguments, **options)
 
     def _start(self, y: Floats, t: float) -> None:
@@ -85,8 +85,11 @@ class SampledPhase(ActivePhase):
 
     def observe(self) -> Observation:
         """What a controller sees: measured positions and velocities."""
-        found, seen = super().observe(), self.sampled.seen
-        return replace(found, position=seen[:, :3].copy(), velocity=seen[:, 3:].copy())
+        found, seen = super().observe(), self.sampled.seen.copy()
+        tables, tick = self.flight.tables, int(self.sampled.count[fleet.TICKS])
+        if len(tables.path):
+            seen += tables.path[min(max(tick - 1 - tables.first, 0), len(tables.path) - 1)]
+        return replace(found, position=seen[:, :3], velocity=seen[:, 3:])
 
     def watch(self, *, last: bool) -> None:
         """Search the steps flown for extremes."""
@@ -111,7 +114,7 @@ class SampledPhase(ActivePhase):
         status = records.PAUSED
         try:
             while status == records.PAUSED:
-                self._supply(problem)
+                self._supply()
                 status = fly_ticks(problem, self.workspace, self.flight, sampled, call)
                 self._follow()
                 if self.external is not None:
@@ -126,18 +129,19 @@ class SampledPhase(ActivePhase):
         if status != records.FINISHED or not np.isfinite(sampled.S).all():
             raise StoppedError(diagnose(self.place, own_force=self.external is not None, collapsed=True))
 
-    def _supply(self, problem: Problem) -> None:
+    def _supply(self) -> None:
         """Make tables for the next ticks, if those that there are end here or belong to another reference."""
         tables, tick = self.flight.tables, int(self.sampled.count[fleet.TICKS])
-        if problem is self.tabled and tables.first <= tick < tables.last:
+        planned, given = self.plan.problem, self.vehicles.tables
+        if planned is self.tabled and tables.first <= tick < tables.last:
             return
-        rate = self.vehicles.tables.rate
-        last = min(tick + _TICKS, math.ceil(self.plan.t_end * rate) + 1)
-        # A user's controller replaces the input, not the reference.
-        made = self.vehicles.tables.made(
-            tick, max(last, tick + 1), self.plan.problem, self.plan.start, self.vehicles.yaw
-        )
-        self.flight, self.tabled = self.flight._replace(tables=made), problem
+        if planned is not self.tabled and given.compensated:
+            moved = given.start_path(planned, tick)
+            for known in (self.sampled.seen, self.sampled.history, self.sampled.sent, self.sampled.heard):
+                known += moved
+        last = min(tick + _TICKS, math.ceil(self.plan.t_end * given.rate) + 1)
+        made = given.made(tick, max(last, tick + 1), planned, self.plan.start, self.vehicles.yaw)
+        self.flight, self.tabled = self.flight._replace(tables=made), planned
 
     def _follow(self) -> None:
         """Take over the true state, and what it cost."""
