@@ -1,21 +1,30 @@
-"""Write the tables of missions.md and sweep.md: keys of a mission file, variables of a result, metrics.
+"""Write the tables of missions.md, sweep.md and vehicles.md: keys of a mission file, variables of a result, metrics.
 
 `python docs/tables.py` rewrites them in place, each between `<!-- table: NAME -->` and `<!-- end -->`;
 tests/test_docs.py fails where they are out of date. NAME is a table of the JSON schema; `A-B` the keys of A
-which B lacks; `shapes`, `result` and `metrics` what their names say.
+which B lacks; `shapes`, `result`, `metrics` and `margins` what their names say.
 """
 
 import json
+import math
 import re
 from pathlib import Path
 from typing import Any
 
-from rigidfleet.formation.shapes import SHAPES, agents_taken
+from rigidfleet.formation.shapes import SHAPES, agents_taken, slots
+from rigidfleet.math.margins import (
+    Feedback,
+    Lag,
+    formation_loops,
+    largest_pole,
+    margins,
+    tracking_loops,
+)
 from rigidfleet.mission import bounds, json_schema
 from rigidfleet.result import LABELS, VARIABLES
 from rigidfleet.sweep import METRICS
 
-PAGES = [Path(__file__).with_name(name) for name in ("missions.md", "sweep.md")]
+PAGES = [Path(__file__).with_name(name) for name in ("missions.md", "sweep.md", "vehicles.md")]
 
 
 def render(page: str) -> str:
@@ -26,7 +35,7 @@ def render(page: str) -> str:
         name = match[1]
         special = {
             "result": _result, "shapes": _shapes, "metrics": _metrics, "bounds": _bounds,
-            "magnitudes": _magnitudes,
+            "magnitudes": _magnitudes, "margins": _margins,
         }  # fmt: skip
         text = special[name]() if name in special else _keys(schema, name)
         return f"<!-- table: {name} -->\n{text}\n<!-- end -->"
@@ -162,6 +171,44 @@ def _metrics() -> str:
     """The metrics of a sweep: name, unit, meaning."""
     rows = [(f"`{name}`", m.unit, m.text.replace("|", "\\|")) for name, m in METRICS.items()]
     return _table(("metric", "unit", "meaning"), rows)
+
+
+#: Attitude gains [1/s^2, 1/s] and time constant of the rotors [s]; docs/vehicles.md names the sources.
+VEHICLES = {
+    "Hummingbird": (544.0, 46.64, 0.005),
+    "1 kg, after the paper": (544.0, 46.64, 0.02),
+    "PX4 SIH": (310.0, 57.0, 0.05),
+    "Crazyflie": (310.0, 57.0, 0.072),
+}
+
+
+def _margins() -> str:
+    """What lag and delay allow: largest p, and margins of the default gains, of a triangle of 4 m."""
+    law, p, rows = Feedback(), slots("triangle", (4.0,), 3), []
+    for name, (k_R, k_omega, tau) in VEHICLES.items():
+        for delay in (0.0, 0.02, 0.05):
+            lag = Lag(k_R, k_omega, tau, delay, rate=500.0)
+            loops = formation_loops(p, [[0, 1], [0, 2], [1, 2]], [1.0] * 3, law, [lag] * 3)
+            held, alone = margins(loops, law), margins(tracking_loops([lag]), law)
+            rule = 8 / 9 / (k_omega / k_R + tau + delay)
+            rows.append(
+                (
+                    name if delay == 0 else "",
+                    f"{1e3 * delay:.0f}",
+                    f"{largest_pole(loops, law):.2f}",
+                    f"{rule:.1f}",
+                    *(
+                        f"{math.degrees(m.phase):.0f}°, {1e3 * m.delay:.0f} ms"
+                        for m in (held, alone)
+                    ),
+                    f"{alone.gain[1]:.1f}",
+                )
+            )
+    head = (
+        "vehicle", "delay [ms]", "largest p [1/s]", "8/(9τ)", "constraint law at p = 2",
+        "tracking", "its gains, times up to",
+    )  # fmt: skip
+    return _table(head, rows)
 
 
 def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:

@@ -340,9 +340,10 @@ def test_check_tells_margins():
     words = [text for heading, text in found.describe() if heading == "margins"]
     assert words[0].startswith("tracking: stable; bears")
     assert any("'triangle' to 'line'" in text for text in words)
-    law = Feedback(damping=0.03)
+    law, slots = Feedback(damping=0.03), mission.formation_slots("line")
+    assert slots is not None
     alone = formation_loops(
-        mission.formation_slots("line"), mission.formation_edges("line"), np.ones(3), law,
+        slots, mission.formation_edges("line"), np.ones(3), law,
         [delayed(LIGHT, 0.02, 500.0)] * 3,
     )  # fmt: skip
     assert found.margins is not None
