@@ -8,10 +8,9 @@ notes.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
-from rigidfleet.math.margins import Lag
 from rigidfleet.mission import Mission, as_mission
 from rigidfleet.planning.preview import FEWEST_SAMPLES, preview, samples_per_phase
 from rigidfleet.preflight.assignment import assignment_remarks
@@ -27,13 +26,13 @@ from rigidfleet.preflight.trajectory import (
     separation_remarks,
     thrust_remarks,
 )
+from rigidfleet.preflight.vehicles import vehicle_lags
 
 
 def check(
     mission: Mission | str | Path,
     *,
     search: bool | None = None,
-    lags: Sequence[Lag] = (),
     progress: Callable[[str], None] = lambda _: None,
 ) -> Preflight:
     """Check a mission before the flight. `rigidfleet check` prints the result.
@@ -43,7 +42,6 @@ def check(
     mission : a shipped name, a path or a `Mission`
     search : whether to search for other shapes with the same distances, from `STARTS` random starts per formation;
         default: for up to `SEARCHED` agents
-    lags : lag and delay of each vehicle, for the margins of the laws; none by default
     progress : called with a description of the next step
 
     Raises
@@ -61,7 +59,7 @@ def check(
     found = Preflight(formations, check_gains(mission, formations), way)
     if not known:
         found.judged_to = float(way[-1].time[-1]) if way else 0.0
-    if lags:
+    if lags := vehicle_lags(mission):
         progress("margins")
         found.margins = check_margins(mission, way, lags)
     progress("collisions, obstacles and limits")

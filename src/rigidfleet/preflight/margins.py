@@ -75,7 +75,12 @@ def _feedback(mission: Mission, phase: Phase | None, held: str | None) -> Feedba
     c = mission.constraint
     k1, k2 = lqr.double_integrator_gains(mission.tracking.Q, mission.tracking.R)
     on = float(c.stabilisation == "pid")
+    d = mission.disturbances
+    links = None if d is None else d.links
     return Feedback(
+        ki=mission.tracking.integral,
+        # A state waits for half a period on average until it is sent.
+        link=0.0 if links is None else links.delay + 0.5 / links.rate,
         alpha=on * c.alpha,
         beta=on * c.beta,
         gamma=on * c.gamma,
