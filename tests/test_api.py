@@ -185,7 +185,7 @@ def test_short_in_words(flight):
     assert settling.startswith("<Mission line-singular: 3 agents, ")
     assert repr(rf.check(mission)) == "<Preflight: no problems found, 0 notes>"
     verdict = rf.assess(flight)
-    judged = [finding for finding in verdict.findings if finding.judged]
+    judged = [finding for finding in verdict.checks if finding.judged]
     failed = [finding for finding in judged if not finding.passed]
     assert repr(verdict) == f"<Verdict swarm: failed {len(failed)} of {len(judged)} checks>"
     for shown in (flight, verdict, rf.replay(flight)):

@@ -31,7 +31,7 @@ _CONTACT = 1e-6
 _UNSEEN = 0.01
 
 
-def findings(measured: Measurements, verdict: Verdict) -> Iterator[CheckResult]:
+def all_checks(measured: Measurements, verdict: Verdict) -> Iterator[CheckResult]:
     """All checks of a flight.
 
     A check made in several phases yields every failure, or the pass nearest to the limit if there is none.

@@ -59,7 +59,7 @@ class CheckResult:
     ----------
     check : what was checked, in snake_case
     passed : whether the check holds; always True for a quantity without a limit
-    message : the finding in words
+    message : the result in words
     worst, limit : in `unit`; None where there is none
     at_least : whether the limit is the least value allowed, not the greatest
     when : mission time of the worst [s]

@@ -50,7 +50,7 @@ class PlannedPhase:
     time : (K,) [s] of the mission
     position, acceleration : (K, N, 3) [m, m/s^2]
     exact : whether the agents follow the plan, up to control errors; False if it is an estimate
-    ways : if the shape changes, the agents' positions (N, 3) [m] before and after it, about the centre, in a frame
+    path_ends : if the shape changes, the agents' positions (N, 3) [m] before and after it, about the centre, in a frame
         that turns with them; in this frame all agents move straight and in step
     shapes : names of the formations before (None if there is none) and after
     """
@@ -60,7 +60,7 @@ class PlannedPhase:
     position: Floats
     acceleration: Floats
     exact: bool
-    ways: tuple[Floats, Floats] | None = None
+    path_ends: tuple[Floats, Floats] | None = None
     shapes: tuple[str | None, str | None] = (None, None)
 
     @property
@@ -74,7 +74,7 @@ def preview(mission: Mission, phases: int | None = None) -> tuple[list[PlannedPh
     masses = mission.fleet.mass
     frame = None if mission.body_frame is None else mission.drawn_attitude
     now = PhaseState(0.0, mission.fleet.position, mission.fleet.velocity, frame=frame)
-    way: list[PlannedPhase] = []
+    planned: list[PlannedPhase] = []
     most = samples_per_phase(mission)
     # If even the fewest samples of all phases are too many, only the first phases.
     possible = (
@@ -86,19 +86,19 @@ def preview(mission: Mission, phases: int | None = None) -> tuple[list[PlannedPh
     for phase, (begin, end) in list(zip(mission.phases, phase_spans(mission), strict=True))[
         :phases
     ]:
-        if len(way) == possible:
-            return way, False
+        if len(planned) == possible:
+            return planned, False
         shaping = phase.shaping
         name = shaping.formation if shaping is not None else now.formation
         target = slots_about_cm(mission, name, masses)
         if shaping is not None and target is None:
-            return way, False
+            return planned, False
         now = replace(now, t=begin)
         before = now.slots if now.slots is not None else now.r
         count = min(max(_SAMPLES, int((end - begin) / _STEP) + 1), _MOST, most)
         time = np.linspace(begin, end, count)
         names = now.formation, name
-        position, ways, now = _leg(mission, phase, now, masses, target, time)
+        position, path_ends, now = _leg(mission, phase, now, masses, target, time)
         guess = (
             shaping is not None
             and phase.control != "tracking"
@@ -109,8 +109,10 @@ def preview(mission: Mission, phases: int | None = None) -> tuple[list[PlannedPh
             )
         )
         acceleration = _rate(_rate(position, time), time)
-        way.append(PlannedPhase(phase.name, time, position, acceleration, not guess, ways, names))
-    return way, True
+        planned.append(
+            PlannedPhase(phase.name, time, position, acceleration, not guess, path_ends, names)
+        )
+    return planned, True
 
 
 def samples_per_phase(mission: Mission) -> int:
@@ -128,7 +130,7 @@ def _leg(
     target: Floats | None,
     time: Floats,
 ) -> tuple[Floats, tuple[Floats, Floats] | None, PhaseState]:
-    """Positions (K, N, 3) of all agents over a phase, their `PlannedPhase.ways`, and the situation at its end."""
+    """Positions (K, N, 3) of all agents over a phase, their `PlannedPhase.path_ends`, and the situation at its end."""
     t0, t_end = time[0], time[-1]
     shaping = phase.shaping
     frame, now, turned = attach(mission, phase, now, masses, target)
@@ -143,7 +145,7 @@ def _leg(
         cm, v = masses @ now.r / masses.sum(), masses @ now.v / masses.sum()
         a = np.array(phase.input_force) * len(masses) / masses.sum()
         tau = (time - t0)[:, None]
-        ways = x, after
+        path_ends = x, after
         shape = x + s[:, None, None] * (after - x)
         position = shape + (cm + tau * v + 0.5 * tau**2 * a)[:, None]
         v_end = np.tile(v + a * (t_end - t0), (len(masses), 1))
@@ -162,7 +164,7 @@ def _leg(
         dp, turn = 0.0 * before, np.zeros(3)
         if shaping is not None:
             dp, turn = align_slots(before, after, masses, turned)
-        ways = before, before + dp
+        path_ends = before, before + dp
         p = before + s[:, None, None] * dp
         p = p @ att.dcm_from_rotation_vector(s[:, None] * turn)
         position = r[:, None] + p @ T
@@ -175,7 +177,7 @@ def _leg(
         )
     if shaping is None:
         return position, None, replace(now, t=t_end)
-    return position, ways, replace(now, t=t_end, formation=shaping.formation)
+    return position, path_ends, replace(now, t=t_end, formation=shaping.formation)
 
 
 def phase_spans(mission: Mission) -> list[tuple[float, float]]:
