@@ -370,7 +370,7 @@ def fly(case: Case, row: Row) -> Outcome:
     wall = time.perf_counter() - begun
     end = judged(case, edges, result)
     verdict = assess(result)
-    wrong = any(f.check in _SHAPE_CHECKS and not f.passed for f in verdict.findings)
+    wrong = any(f.check in _SHAPE_CHECKS and not f.passed for f in verdict.checks)
     weight = np.array([0.0, 0.0, 9.81])
     force = np.linalg.norm(result.input_force + result.constraint_force - weight, axis=2).max()
     steps = result.statistics["steps"] + result.statistics["rejected"]
@@ -403,7 +403,7 @@ def judged(case: Case, edges: Ints, result: Result) -> str:
 def flexible(slots: bytes, edges: bytes) -> bool:
     """Whether a graph is certain to be flexible; each is asked for in several rows."""
     p, graph = np.frombuffer(slots).reshape(-1, 3), np.frombuffer(edges, dtype=np.int64)
-    return analyse(p, graph.reshape(-1, 2)).verdict is RigidityClass.FLEXIBLE
+    return analyse(p, graph.reshape(-1, 2)).rigidity_class is RigidityClass.FLEXIBLE
 
 
 def mirrored(case: Case, r: Floats) -> bool:

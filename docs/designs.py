@@ -57,9 +57,9 @@ def main() -> None:
         "shape",
         "agents",
         "edges",
-        *["$w$", "verdict"],
-        *["3 more: $w$", "verdict"],
-        *["all: $w$", "verdict"],
+        *["$w$", "class"],
+        *["3 more: $w$", "class"],
+        *["all: $w$", "class"],
     )
     _row(*["---"] * 9)
     for name, size, n in SHAPES:
@@ -68,8 +68,8 @@ def main() -> None:
         cells = []
         for edges in graphs:
             result = analyse(p, edges)
-            rigid = result.verdict is RigidityClass.INFINITESIMALLY_RIGID
-            cells += [f"{result.w:.4f}", "rigid" if rigid else str(result.verdict)]
+            rigid = result.rigidity_class is RigidityClass.INFINITESIMALLY_RIGID
+            cells += [f"{result.w:.4f}", "rigid" if rigid else str(result.rigidity_class)]
         _row(name, n, len(graphs[0]), *cells)
 
 

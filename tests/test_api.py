@@ -185,7 +185,7 @@ def test_short_in_words(flight):
     assert settling.startswith("<Mission line-singular: 3 agents, ")
     assert repr(rf.check(mission)) == "<Preflight: no problems found, 0 notes>"
     verdict = rf.assess(flight)
-    judged = [finding for finding in verdict.findings if finding.judged]
+    judged = [finding for finding in verdict.checks if finding.judged]
     failed = [finding for finding in judged if not finding.passed]
     assert repr(verdict) == f"<Verdict swarm: failed {len(failed)} of {len(judged)} checks>"
     for shown in (flight, verdict, rf.replay(flight)):
@@ -321,3 +321,24 @@ def test_what_is_no_argument(words, use):
     assert str(caught.value).startswith("expected ")
     assert ", got " in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_a_mission_is_not_made_by_its_class():
+    """Keys alone would not be checked as a whole; one sentence says what makes a mission."""
+    for wrong in ({}, {"schema_version": 1, "name": "x"}):
+        with pytest.raises(
+            TypeError, match=r"^a mission is not made by Mission\(\.\.\.\): use load_mission"
+        ):
+            rf.Mission(**wrong)
+    with pytest.raises(TypeError, match="not made by Mission"):
+        rf.Mission("narrow-passage")
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"port": "x"}, {"port": True}, {"port": 80.0}, {"ready": "x"}, {"landed": 3}]
+)
+def test_wrong_arguments_of_live(wrong):
+    """One sentence each, before anything is served."""
+    (name,) = wrong
+    with pytest.raises(TypeError, match=f"^expected a (number|function) for {name}.*, got "):
+        rf.live("square", browser=False, **wrong)

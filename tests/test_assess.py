@@ -83,13 +83,13 @@ def flown(mission: Mission, position: Any, **changes: Any) -> Result:
 
 def found(verdict: Verdict, check: str) -> CheckResult:
     """The one finding of a check."""
-    (finding,) = [f for f in verdict.findings if f.check == check]
+    (finding,) = [f for f in verdict.checks if f.check == check]
     return finding
 
 
 def failures(verdict: Verdict) -> set[str]:
-    assert verdict.passed == all(f.passed for f in verdict.findings)
-    return {f.check for f in verdict.findings if not f.passed}
+    assert verdict.passed == all(f.passed for f in verdict.checks)
+    return {f.check for f in verdict.checks if not f.passed}
 
 
 def other_notes(verdict: Verdict) -> list[str]:
@@ -171,7 +171,7 @@ def test_what_slots_alone_hold_is_judged_by_its_shape(factor, passes):
     mission = a_mission({"triangle": TRIANGLE["triangle"] | {"edges": []}}, 3)
     verdict = assess(flown(mission, factor * slots(mission, "triangle") + HEIGHT))
     assert failures(verdict) == (set() if passes else {"shape"})
-    assert "distances" not in {f.check for f in verdict.findings}
+    assert "distances" not in {f.check for f in verdict.checks}
     assert "is not reached" in found(verdict, "shape").message or passes
 
 
@@ -320,7 +320,7 @@ def test_every_phase_that_fails_is_named():
     records = [PhaseRecord(n, "reshape", "open", "triangle", 0.0, 5.0) for n in ("a", "b")]
     p = slots(mission, "triangle") * 1.2 + HEIGHT
     verdict = assess(flown(mission, p, phases=records, phase=[0, 0, 1, 1, 1]))
-    assert [f.phase for f in verdict.findings if f.check == "shape"] == ["a", "b"]
+    assert [f.phase for f in verdict.checks if f.check == "shape"] == ["a", "b"]
 
 
 # -- waypoints
@@ -383,7 +383,7 @@ def test_a_waypoint_asks_only_for_what_it_names():
     point = verdict.phases[0].waypoint
     assert point is not None
     assert (point.position, point.velocity, point.attitude, point.rates) == (None,) * 4
-    assert not [f for f in verdict.findings if f.check.startswith("waypoint")]
+    assert not [f for f in verdict.checks if f.check.startswith("waypoint")]
 
 
 # -- too close, too fast, too far
@@ -392,7 +392,7 @@ def test_a_waypoint_asks_only_for_what_it_names():
 def two(
     gap: float, direction: tuple[float, float, float] = (1.0, 0.0, 0.0), **limits: Any
 ) -> Verdict:
-    """Two agents of radius 0.25 m that at 5 s have so much room between their surfaces."""
+    """Two agents of radius 0.25 m whose surfaces are so far apart at 5 s."""
     mission = a_mission({}, 2, [{"kind": "hold", "until": 10.0}], limits=limits)
     p = np.array([[[0.0, 0, 10], [10.0, 0, 10]]] * 5)
     p[2, 1] = p[2, 0] + (gap + 0.5) * np.array(direction)
@@ -416,7 +416,7 @@ def test_agents_that_touch_collide(gap, fails):
 
 @pytest.mark.parametrize(("gap", "fails"), [(0.51, False), (0.5, False), (0.49, True)])
 def test_separation_has_a_limit(gap, fails):
-    """Room below the mission's limit fails; exactly the limit holds."""
+    """A separation below the mission's limit fails; exactly the limit holds."""
     verdict = two(gap, separation=0.5)
     assert failures(verdict) == ({"separation"} if fails else set())
 
@@ -433,7 +433,7 @@ def test_separation_has_a_limit(gap, fails):
     ],
 )
 def test_more_room_below_than_beside(gap, direction, fails):
-    """The vertical room counts where spheres overlap seen from above, whoever is on top; not beside."""
+    """The vertical separation counts where spheres overlap seen from above, whoever is on top; not beside."""
     verdict = two(gap, direction, separation_below=1.5)
     assert failures(verdict) == ({"separation_below"} if fails else set())
 
@@ -635,7 +635,7 @@ def test_one_agent_alone():
     verdict = assess(flight)
     assert verdict.passed
     assert {"separation", "shape", "distances", "singular_value"}.isdisjoint(
-        f.check for f in verdict.findings
+        f.check for f in verdict.checks
     )
 
 
@@ -683,7 +683,7 @@ def test_json_holds_everything_and_is_strict():
     data = json.loads(assess(flight).json(), parse_constant=refuse)
     assert data["passed"] is False
     assert data["mission"] == "test"
-    assert {f["check"] for f in data["findings"] if not f["passed"]} == {"distances", "shape"}
+    assert {f["check"] for f in data["checks"] if not f["passed"]} == {"distances", "shape"}
     assert data["phases"][0]["constraint"] is None
     assert data["phases"][0]["worst"]["separation"]["who"].startswith("agents ")
     assert data["tolerances"]["shape"] == SHAPE_TOLERANCE

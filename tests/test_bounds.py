@@ -253,13 +253,13 @@ def test_a_gap_is_between_the_nearest_two():
 @pytest.mark.parametrize(
     ("text", "topics"),
     [
-        (HEAD + agents(200, "output_step = 1.0\n") + HOLD * 1000, {"way"}),
+        (HEAD + agents(200, "output_step = 1.0\n") + HOLD * 1000, {"paths"}),
         (HEAD + agents(200) + boxes(1000, 0.1) + HOLD * 20, set()),
         (HEAD + agents(4) + HOLD * 1000, set()),
         (HEAD + agents(1000, "output_step = 5.0\n") + "".join(
             f"[formations.f{k}]\nshape = 'sphere'\nsize = {k + 1}\nedges = 'neighbours'\n" for k in range(50)
         ) + HOLD, {"formation"}),
-        (HEAD + agents(1_000_000, "output_step = 5.0\n") + formation("grid", 3.0, "[]") + ESTABLISH, {"way"}),
+        (HEAD + agents(1_000_000, "output_step = 5.0\n") + formation("grid", 3.0, "[]") + ESTABLISH, {"paths"}),
     ],
 )  # fmt: skip
 def test_a_check_at_the_bounds_ends(text, topics):

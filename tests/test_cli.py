@@ -218,7 +218,7 @@ def test_check_json(capsys):
     assert found["right"] is True
     assert (found["agents"], found["latest_end_s"], len(found["phases"])) == (3, 90.0, 12)
     assert found["passed"] is True
-    assert found["formations"]["line"]["rigidity"]["verdict"] == "prestress-stable"
+    assert found["formations"]["line"]["rigidity"]["rigidity_class"] == "prestress-stable"
 
 
 def test_check_that_fails(capsys):

@@ -25,7 +25,7 @@ def test_designed_cube_beats_the_paper():
     edges = design(CUBE)
     result = analyse(CUBE, edges)
     assert len(edges) == 18
-    assert result.verdict is RigidityClass.INFINITESIMALLY_RIGID
+    assert result.rigidity_class is RigidityClass.INFINITESIMALLY_RIGID
     assert result.w == pytest.approx(BEST_CUBE)
     assert index(CUBE, graphs.CUBE_EDGES) == pytest.approx(0.2586, abs=5e-5)
 
@@ -93,7 +93,7 @@ def test_edges_stay_within_sensing_range():
     """No edge is longer than vehicles can sense: face diagonals, but no space diagonals."""
     edges = design(CUBE, sensing_range=5.7)
     assert distance_geometry.distances(CUBE, edges).max() < 5.7
-    assert analyse(CUBE, edges).verdict is RigidityClass.INFINITESIMALLY_RIGID
+    assert analyse(CUBE, edges).rigidity_class is RigidityClass.INFINITESIMALLY_RIGID
 
 
 def test_short_range_says_what_would_do():

@@ -388,7 +388,7 @@ def test_falling_on_another_fails_the_verdict():
                 agents={"mass": 1.0, "position": stack})  # fmt: skip
     verdict = assess(simulate(m))
     assert not verdict.passed
-    (failed,) = [f for f in verdict.findings if not f.passed]
+    (failed,) = [f for f in verdict.checks if not f.passed]
     assert failed.check == "lost"
     assert "agent 1 at 1.00 s; after that, agents 1 and 2 collide at 2." in failed.message
 
@@ -533,9 +533,9 @@ def test_the_windy_passage_is_flown_with_room():
     result = simulate(load_mission("windy-passage"))
     verdict = assess(result)
     assert verdict.passed, verdict.summary
-    for finding in verdict.findings:
+    for finding in verdict.checks:
         if finding.limit and not finding.at_least and finding.worst is not None:
             assert finding.worst < 0.8 * finding.limit, finding.message
-    clearance = next(f for f in verdict.findings if f.check == "clearance")
+    clearance = next(f for f in verdict.checks if f.check == "clearance")
     assert clearance.worst is not None
     assert clearance.worst > 1.4

@@ -386,7 +386,7 @@ def test_virtual_body_alone_does_not_leave_a_line():
     data["architecture"] = "body"
     for phase in data["phases"]:
         phase.pop("control", None)
-    failed = [f for f in assess(simulate(Mission.from_dict(data))).findings if not f.passed]
+    failed = [f for f in assess(simulate(Mission.from_dict(data))).checks if not f.passed]
     assert failed
     unfold = next(p for p in data["phases"] if p.get("name") == "unfold")
     assert all(f.phase == "unfold" for f in failed)

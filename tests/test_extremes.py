@@ -121,7 +121,7 @@ def agrees(mission: Mission, result: Result, steps: Steps, spacing: float) -> in
         rate = np.abs(np.diff(values)).max() if len(values) > 1 else 0.0
         assert least >= values[near].min() - rate - CLOSE, (name, x, values[near].min())
     verdict = assess(result)
-    failed = {f.check for f in verdict.findings if not f.passed}
+    failed = {f.check for f in verdict.checks if not f.passed}
     touched = 0
     for name in ("separation", "clearance"):
         least = sampled(mission, r)[name].min()
@@ -201,7 +201,7 @@ def test_a_thrust_limit_is_held_between_samples(step):
     result = simulate(mission)
     assert result.thrust.max() < 11.8
     verdict = assess(result)
-    assert {f.check for f in verdict.findings if not f.passed} == {"thrust"}
+    assert {f.check for f in verdict.checks if not f.passed} == {"thrust"}
     assert verdict.worst["thrust"].value == pytest.approx(11.92, abs=0.01)
 
 
@@ -412,7 +412,7 @@ def test_the_peak_of_unequal_limits_is_told_with_what_comes_nearest_to_one():
         "mass": [2.2, 1.1], "thrust_limit": [30.0, 11.0], "velocity": [[0, 0, 0], [0, 0, 0]]
     }  # fmt: skip
     verdict = assess(simulate(two(agents=agents)))
-    found = {f.check: f for f in verdict.findings}
+    found = {f.check: f for f in verdict.checks}
     assert (found["thrust_peak"].worst, found["thrust_peak"].who) == (2.2 * 9.81, "agent 1")
     assert (found["thrust"].worst, found["thrust"].limit) == (pytest.approx(1.1 * 9.81), 11.0)
     assert verdict.worst["thrust"].value == 2.2 * 9.81
@@ -437,7 +437,7 @@ def test_what_a_flight_starts_and_lands_on_is_told_apart():
     """A vehicle that starts 5 cm above the ground and lands 3 cm above it was 1 m away in between."""
     verdict = above_ground([0.05, 2.0, 1.0, 2.0, 0.03])
     assert verdict.passed
-    found = {f.check: f.worst for f in verdict.findings}
+    found = {f.check: f.worst for f in verdict.checks}
     assert found["clearance_start"] == pytest.approx(0.05, abs=1e-9)
     assert found["clearance_end"] == pytest.approx(0.03, abs=1e-3)
     assert 0.09 < found["clearance"] < 0.2  # where it comes off, and before it has landed
@@ -468,7 +468,7 @@ def test_a_record_that_contradicts_its_own_samples_fails(what, words):
     assert assess(result).passed
     what(result)
     verdict = assess(result)
-    failed = [f for f in verdict.findings if not f.passed]
+    failed = [f for f in verdict.checks if not f.passed]
     assert [f.check for f in failed] == ["record"]
     assert words in failed[0].message
 
@@ -477,7 +477,7 @@ def test_positions_count_and_not_what_is_stored_beside_them():
     """Vehicles moved into each other collide, whatever separation the record states."""
     result = simulate(load_mission("establish-triangle"))
     result.position[50, 1] = result.position[50, 0]
-    failed = {f.check for f in assess(result).findings if not f.passed}
+    failed = {f.check for f in assess(result).checks if not f.passed}
     assert {"separation", "record"} <= failed
 
 
@@ -559,7 +559,7 @@ def test_long_fast_steps_know_a_short_distance(speed, until, off):
     found = result.extreme("separation")
     assert found is not None
     assert found.value == pytest.approx(0.2 * off, abs=CLOSE)
-    assert not any(f.check == "record" for f in assess(result).findings)
+    assert not any(f.check == "record" for f in assess(result).checks)
 
 
 def test_who_is_lost_behind_a_wall_has_flown_through_it():
@@ -571,7 +571,7 @@ def test_who_is_lost_behind_a_wall_has_flown_through_it():
     wall = {"kind": "box", "name": "wall", "min": [-0.005, -5, 0], "max": [0.005, 5, 20]}
     lost = {"lost": [{"agent": 2, "time": 1.0135}]}
     mission = held(agents, 2.0, obstacles=[{"kind": "ground"}, wall], disturbances=lost)
-    failed = {f.check for f in assess(simulate(mission)).findings if not f.passed}
+    failed = {f.check for f in assess(simulate(mission)).checks if not f.passed}
     assert failed == {"clearance"}
 
 
@@ -600,7 +600,7 @@ def test_an_extreme_that_is_taken_away_is_missed():
     """A record that tells only part of what happened between its samples contradicts itself."""
     result = simulate(two())
     del result.phases[0].extremes["separation"]
-    failed = {f.check for f in assess(result).findings if not f.passed}
+    failed = {f.check for f in assess(result).checks if not f.passed}
     assert failed == {"record"}
 
 
@@ -621,7 +621,7 @@ def test_a_list_of_pairs_ends_with_its_phase():
     ]
     data = {"schema_version": 1, "name": "two", "agents": agents, "phases": phases}
     verdict = assess(simulate(Mission.from_dict(data)))
-    assert not any(f.check == "record" for f in verdict.findings)
+    assert not any(f.check == "record" for f in verdict.checks)
 
 
 def test_distances_of_a_thousand_kilometres_cost_no_eternity():

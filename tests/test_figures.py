@@ -560,7 +560,7 @@ def test_the_key_of_the_summary_reads_as_words():
 
 
 def test_room_below_counts_only_agents_above_each_other():
-    """Two spheres of 0.25 m, 2 m above each other: 1.5 m of room; side by side: none to speak of."""
+    """Two spheres of 0.25 m, 2 m above each other: 1.5 m apart; side by side: none to speak of."""
     result = a_flight(n=2, formation=None, samples=2)
     position = np.array([[[0, 0, 0], [0.4, 0, 2.0]], [[0, 0, 0], [0.6, 0, 2.0]]])
     np.testing.assert_allclose(

@@ -6,7 +6,7 @@ import pytest
 import rigidfleet as rf
 from rigidfleet.errors import FlightError, MissionError
 from rigidfleet.mission import Mission
-from rigidfleet.mission.schema import Reshape
+from rigidfleet.mission.schema import Fly, Reshape
 
 FLY = {"kind": "fly", "position": [8.0, 0.0, 12.0], "duration": 8.0}
 
@@ -280,3 +280,39 @@ def test_a_step_can_be_left():
     result = flight.finish()
     assert [p.kind for p in result.mission.phases] == ["establish", "hold"]
     assert [p.name for p in result.mission.phases] == [p.name for p in result.phases]
+
+
+def test_a_phase_begun_is_not_skipped():
+    """A second begin before anything was flown is refused; another phase puts the mission's one off."""
+    flight = rf.Flight("establish-triangle")
+    flight.begin()
+    with pytest.raises(
+        FlightError, match="nothing of phase 'establish 1' has been flown: call advance"
+    ):
+        flight.begin()
+    flight.begin({"kind": "hold", "control": "open", "duration": 1.0})
+    flight.advance()
+    while flight.begin():
+        flight.advance()
+    result = flight.finish()
+    kinds = ["hold", *(p.kind for p in rf.load_mission("establish-triangle").phases)]
+    assert [p.kind for p in result.mission.phases] == [p.kind for p in result.phases] == kinds
+
+
+def test_a_waypoint_that_was_left_is_noted():
+    """Its phase ends where it was left, with the goal that it had; the verdict says that it is not judged."""
+    flight = rf.Flight("narrow-passage")
+    flight.begin()
+    flight.advance()
+    flight.begin(FLY | {"name": "first"})
+    flight.advance(4.0)
+    flight.begin(FLY | {"name": "second", "position": [4.0, 6.0, 12.0]})
+    flight.advance()
+    result = flight.finish()
+    _, first, second = result.mission.phases
+    assert isinstance(first, Fly)
+    assert (list(first.position), first.until) == ([8.0, 0.0, 12.0], 10.0)
+    (note,) = rf.assess(result).notes
+    assert note.startswith("'first' was left at 10.00 s, before its arrival")
+    assert [p.waypoint is None for p in rf.assess(result).phases] == [True, True, False]
+    assert second.name == "second"

@@ -26,14 +26,14 @@ def test_separation_is_the_least_over_all_pairs(seed, n):
     r, radius = rng.normal(size=(5, n, 3)) * 3, rng.uniform(0.1, 1.0, n)
     least, pair = proximity.separation(r, radius)
     for k in range(5):
-        room = {
+        distance = {
             (i, j): np.linalg.norm(r[k, i] - r[k, j]) - radius[i] - radius[j]
             for i in range(n)
             for j in range(i + 1, n)
         }
-        closest = min(room, key=lambda p: room[p])
+        closest = min(distance, key=lambda p: distance[p])
         assert tuple(pair[k]) == closest
-        assert least[k] == pytest.approx(room[closest], abs=1e-14)
+        assert least[k] == pytest.approx(distance[closest], abs=1e-14)
 
 
 @pytest.mark.parametrize("sizes", ["equal", "different"])
@@ -70,7 +70,7 @@ BOX = Box(kind="box", name="wall", min=(1.0, 2.0, 3.0), max=(4.0, 6.0, 8.0))
 
 
 @pytest.mark.parametrize(
-    ("point", "room"),
+    ("point", "distance"),
     [
         ([0.0, 3.0, 4.0], 1.0),  # before a face
         ([7.0, 10.0, 5.0], 5.0),  # beside an edge
@@ -80,11 +80,11 @@ BOX = Box(kind="box", name="wall", min=(1.0, 2.0, 3.0), max=(4.0, 6.0, 8.0))
         ([2.5, 4.0, 7.9], -0.1),
     ],
 )
-def test_clearance_of_a_box(point, room):
+def test_clearance_of_a_box(point, distance):
     """Distance to the box's nearest point minus the radius; inside, minus the depth as well."""
     r = np.array([[[50.0, 50.0, 50.0], point]])
     least, agent, obstacle = proximity.clearance(r, [0.25, 0.25], [BOX])
-    assert least[0] == pytest.approx(room - 0.25, abs=1e-14)
+    assert least[0] == pytest.approx(distance - 0.25, abs=1e-14)
     assert (agent[0], obstacle[0]) == (1, 0)
 
 
@@ -405,7 +405,7 @@ def test_headroom_is_the_least_height_above_another(n: int):
     rng = np.random.default_rng(7)
     r, radius = rng.uniform(0, 6, (5, n, 3)), rng.uniform(0.1, 0.6, n)
     r[:, 4] = np.nan  # who has left is below nobody
-    room, pair = proximity.headroom(r, radius)
+    distance, pair = proximity.headroom(r, radius)
     for k in range(5):
         found = [
             (abs(r[k, i, 2] - r[k, j, 2]) - radius[i] - radius[j], i, j)
@@ -413,7 +413,7 @@ def test_headroom_is_the_least_height_above_another(n: int):
             for j in range(i + 1, n)
             if np.hypot(*(r[k, i] - r[k, j])[:2]) <= radius[i] + radius[j]
         ]
-        assert (room[k], *pair[k]) == pytest.approx(min(found))
-    room, pair = proximity.headroom(np.array([[[0.0, 0, 0], [9, 0, 0]]]), [0.1, 0.1])
-    assert np.isinf(room[0])
+        assert (distance[k], *pair[k]) == pytest.approx(min(found))
+    distance, pair = proximity.headroom(np.array([[[0.0, 0, 0], [9, 0, 0]]]), [0.1, 0.1])
+    assert np.isinf(distance[0])
     assert pair.tolist() == [[-1, -1]]

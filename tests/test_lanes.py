@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from rigidfleet.kernel.compiler.simd import (
-    blocks,
+    filled,
+    in_vectors,
     pack,
     rough_inverse,
-    spread,
     total_or_worst,
     unpack,
 )
@@ -62,11 +62,11 @@ def test_a_number_becomes_a_vector_where_it_meets_one():
 
 
 def test_blocks_are_a_view_of_eight_states_each():
-    """Of float64, blocks share the memory; of lanes, they are the lanes."""
+    """Of float64, vectors share the memory; of lanes, they are the lanes."""
 
     @numba.njit
     def double(x):
-        y = blocks(x)
+        y = in_vectors(x)
         for k in range(y.shape[1]):
             y[1, k] = 2.0 * y[0, k]
         return y.shape[1]
@@ -85,8 +85,8 @@ def test_an_error_is_a_sum_of_one_flight_and_the_worst_of_eight():
 
     @numba.njit
     def error(x):
-        y = blocks(x)
-        squares = spread(0.0)
+        y = in_vectors(x)
+        squares = filled(0.0)
         for k in range(y.shape[0]):
             squares += y[k] * y[k]
         return total_or_worst(squares, x)
@@ -104,7 +104,7 @@ def test_a_rough_inverse_has_four_digits():
 
     @numba.njit
     def weights(x):
-        y = blocks(x)
+        y = in_vectors(x)
         for k in range(y.shape[0]):
             y[k] = rough_inverse(y[k])
 

@@ -238,7 +238,7 @@ def test_flight_is_kept(tmp_path):
     result.save(tmp_path / "flight.nc")
     loaded = Result.load(tmp_path / "flight.nc")
     assert assess(loaded).summary == assess(result).summary
-    checks = {f.check: f for f in assess(loaded).findings}
+    checks = {f.check: f for f in assess(loaded).checks}
     assert checks["complete"].passed
     assert checks["shape"].passed
     assert "by hand" in loaded.mission.title

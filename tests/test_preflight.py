@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rigidfleet.assessment import assess
-from rigidfleet.formation.assignment import assigned, nearest_way
+from rigidfleet.formation.assignment import assigned, closest_approach
 from rigidfleet.formation.distance_geometry import distances
 from rigidfleet.formation.graphs import complete_graph
 from rigidfleet.formation.shapes import slots
@@ -270,8 +270,8 @@ def test_shortest_assignment():
     order, turn = assigned(start, cube)
     there = cube[order] @ turn.T
     np.testing.assert_allclose(there, start - start.mean(axis=0), atol=1e-6)
-    room, pair, _ = nearest_way(start, there, np.full(8, 0.25))
-    assert room == pytest.approx(3.5)
+    separation, pair, _ = closest_approach(start, there, np.full(8, 0.25))
+    assert separation == pytest.approx(3.5)
     assert distances(cube[order], [pair]) == pytest.approx(4.0)
 
 
@@ -286,14 +286,14 @@ def test_given_assignment_is_kept():
 
 
 def test_safe_assignment():
-    """The safe one never leaves less room than the shortest or the given."""
+    """The safe one never brings agents closer together than the shortest or the given."""
     rng = np.random.default_rng(2)
     cube, radius = slots("cube", 4.0, 8), np.full(8, 0.25)
     for turn in (None, np.eye(3)):
         for _ in range(10):
             start = rng.uniform(0, 8, (8, 3))
             given, shortest, safe = (
-                nearest_way(start, cube[order] @ turned.T, radius)[0]
+                closest_approach(start, cube[order] @ turned.T, radius)[0]
                 for order, turned in (
                     (np.arange(8), kabsch(start, cube)),
                     assigned(start, cube, turn=turn),
@@ -471,8 +471,8 @@ def test_published_formations(name, control):
     found = check(flown)
     rigidity = found.formations[0].rigidity
     assert rigidity is not None
-    assert rigidity.verdict == in_space
-    assert (None if rigidity.within is None else rigidity.within.verdict) == within
+    assert rigidity.rigidity_class == in_space
+    assert (None if rigidity.within is None else rigidity.within.rigidity_class) == within
     alone = control == "open" and in_space == FLEXIBLE
     assert failures(found) == ({"formation"} if alone else set())
 

@@ -20,7 +20,6 @@ from vehicle_samples import (
     G,
     begun,
     from_crazyflow,
-    planned,
     random_inputs,
     random_states,
     rotorpy,
@@ -30,7 +29,7 @@ from vehicle_samples import (
 
 from rigidfleet.kernel import aerodynamics, attitude_control, fleet
 from rigidfleet.kernel.engine import sampled
-from rigidfleet.kernel.records import COLLAPSED, FINISHED, PAUSED
+from rigidfleet.kernel.records import FINISHED
 from rigidfleet.math import attitude
 
 HUMMINGBIRD = ROTORPY["hummingbird"]

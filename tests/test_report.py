@@ -123,7 +123,7 @@ def test_verdict_comes_first(calm, hasty, quick):
     assert "Passed" in Page(html_page(calm)).text.split("Safety")[0]
     first = Page(html_page(hasty)).text.split("Safety")[0]
     assert "Failed" in first
-    failed = [f.message for f in assess(hasty).findings if not f.passed]
+    failed = [f.message for f in assess(hasty).checks if not f.passed]
     assert len(failed) == 2
     assert all(message in first for message in failed)
 
@@ -161,7 +161,7 @@ def test_safety_of_a_flight_that_breaks_limits(hasty):
     """What is beyond its limit is so in the verdict and on the safety page alike, ceiling included."""
     verdict = assess(hasty)
     broken = {row.quantity for row in safety(hasty, verdict) if not row.passed}
-    assert {f.check for f in verdict.findings if not f.passed} == {"geofence", "speed"}
+    assert {f.check for f in verdict.checks if not f.passed} == {"geofence", "speed"}
     assert broken == {"geofence", "speed", "highest"}
     assert all((row.margin or 0.0) < 0 for row in safety(hasty, verdict) if not row.passed)
 

@@ -60,7 +60,7 @@ def blocks(result, p):
 def test_cube_of_paper_is_infinitesimally_rigid():
     """The 18 edges of the paper's cube are independent, and w = 0.2586."""
     result = analyse(shapes.slots("cube", 4.0, 8), graphs.CUBE_EDGES)
-    assert result.verdict is RIGID
+    assert result.rigidity_class is RIGID
     assert (result.rank, result.reachable, result.needed) == (18, 18, 18)
     assert result.w == pytest.approx(0.2586, abs=5e-5)
     assert len(result.redundant) == len(result.flexes) == 0
@@ -71,7 +71,7 @@ def test_double_banana_is_flexible_with_as_many_edges():
     p, edges = double_banana()
     result = analyse(p, edges)
     assert (len(edges), result.rank, result.needed) == (18, 17, 18)
-    assert result.verdict is FLEXIBLE
+    assert result.rigidity_class is FLEXIBLE
     assert [flex.agents for flex in result.flexes] in ([(0, 1, 2)], [(5, 6, 7)])
     assert len(result.redundant) == 18
     assert len(result.spare) == 1
@@ -98,28 +98,28 @@ def test_flat_shapes_are_at_best_prestress_stable(name, n, edges, rank, flexes):
         rank,
         flexes,
     )
-    assert result.verdict is STABLE
+    assert result.rigidity_class is STABLE
     assert blocks(result, p)
     assert result.within is not None
-    assert result.within.verdict is RIGID
+    assert result.within.rigidity_class is RIGID
 
 
 def test_square_without_one_edge_folds():
     """Five edges hold a square in its plane; in space it folds about the diagonal, and one agent moves."""
     result = analyse(shapes.slots("square", 4.0, 4), [[0, 1], [1, 2], [2, 3], [0, 3], [0, 2]])
-    assert result.verdict is FLEXIBLE
+    assert result.rigidity_class is FLEXIBLE
     assert [flex.agents for flex in result.flexes] == [(1,)]
     assert result.within is not None
-    assert result.within.verdict is RIGID
+    assert result.within.rigidity_class is RIGID
 
 
 @pytest.mark.parametrize(
-    ("n", "edges", "verdict"),
+    ("n", "edges", "rigidity_class"),
     [(1, [], RIGID), (2, [[0, 1]], RIGID), (2, [], FLEXIBLE), (3, [[0, 1], [1, 2]], FLEXIBLE)],
 )
-def test_few_agents(n, edges, verdict):
+def test_few_agents(n, edges, rigidity_class):
     """One agent is rigid, two need an edge and three need three."""
-    assert analyse(SPREAD[:n], edges).verdict is verdict
+    assert analyse(SPREAD[:n], edges).rigidity_class is rigidity_class
 
 
 def test_shipped_index_is_that_of_a_flight():
@@ -150,7 +150,7 @@ def test_triangulated_convex_polyhedra_are_rigid(n):
     edges = hull(p)
     result = analyse(p, edges)
     assert len(edges) == result.rank == 3 * n - 6
-    assert result.verdict is RIGID
+    assert result.rigidity_class is RIGID
 
 
 def test_polyhedron_without_an_edge_moves_on():
@@ -158,7 +158,7 @@ def test_polyhedron_without_an_edge_moves_on():
     p = shape(3, 10, 3)
     p /= np.linalg.norm(p, axis=1)[:, None]
     result = analyse(p, hull(p)[1:])
-    assert result.verdict is FLEXIBLE
+    assert result.rigidity_class is FLEXIBLE
     assert len(result.flexes) == 1
 
 
@@ -169,7 +169,7 @@ def test_complete_graphs_are_rigid(seed, n, dimension):
     p = shape(seed, n, dimension)
     result = analyse(p, graphs.complete_graph(n))
     assert result.rank == result.reachable == full_rank(n, dimension)
-    assert result.verdict is (RIGID if n <= dimension + 1 or dimension == 3 else STABLE)
+    assert result.rigidity_class is (RIGID if n <= dimension + 1 or dimension == 3 else STABLE)
     if result.stress is not None:
         assert blocks(result, p)
 
@@ -177,16 +177,16 @@ def test_complete_graphs_are_rigid(seed, n, dimension):
 @given(SEEDS, st.integers(4, 15), st.integers(1, 3), st.floats(0, 1))
 @settings(max_examples=40)
 def test_verdicts_of_small_formations(seed, n, dimension, share):
-    """Lines, planes and shapes in space with any edges: each verdict comes with what it rests on."""
+    """Lines, planes and shapes in space with any edges: each rigidity_class comes with what it rests on."""
     p, edges = shape(seed, n, dimension), graph(seed, n, share)
     result = analyse(p, edges)
     assert result.rank == np.linalg.matrix_rank(jacobian(p, edges), tol=1e-6) <= result.reachable
-    assert (result.verdict is RIGID) == (result.rank == result.needed)
+    assert (result.rigidity_class is RIGID) == (result.rank == result.needed)
     assert len(result.flexes) == 3 * n - result.rank - (5 if dimension == 1 else 6)
     for flex in result.flexes:
         assert np.abs(jacobian(p, edges) @ flex.motion.ravel()).max(initial=0) < 1e-6
         assert flex.agents == tuple(np.flatnonzero(flex.motion.any(axis=1)))
-    if result.verdict is STABLE:
+    if result.rigidity_class is STABLE:
         assert blocks(result, p)
     if result.deformed is not None:
         want, pairs = distance_geometry.distances(p, edges), graphs.complete_graph(n)
@@ -205,14 +205,18 @@ def test_verdicts_of_small_formations(seed, n, dimension, share):
 @given(SEEDS, st.integers(3, 8), st.integers(1, 3), st.floats(0.3, 1), st.floats(0.01, 100))
 @settings(max_examples=25)
 def test_verdict_knows_neither_place_nor_size_nor_numbers(seed, n, dimension, share, scale):
-    """Turned, shifted, scaled and renumbered, a formation has the same ranks, index, flexes and verdict."""
+    """Turned, shifted, scaled and renumbered, a formation has the same ranks, index, flexes and rigidity_class."""
     p, edges = shape(seed, n, dimension), graph(seed, n, share)
     R = Rotation.random(random_state=np.random.RandomState(seed)).as_matrix()
     number = np.random.default_rng(seed).permutation(n)
     q = np.empty_like(p)
     q[number] = scale * p @ R.T + [5, -3, 2]
     one, two = analyse(p, edges), analyse(q, number[edges])
-    assert (one.rank, one.dimension, one.verdict) == (two.rank, two.dimension, two.verdict)
+    assert (one.rank, one.dimension, one.rigidity_class) == (
+        two.rank,
+        two.dimension,
+        two.rigidity_class,
+    )
     assert one.index == pytest.approx(two.index, rel=1e-6, nan_ok=True)
     np.testing.assert_array_equal(one.redundant, two.redundant)
     assert [len(x.agents) for x in one.flexes if len(x.agents) == 1] == [
@@ -245,7 +249,7 @@ def test_flexes_name_the_few():
     bodies = [(0, 1, 2, 3), (0, 1, 4, 5), (4, 5, 6, 7)]
     edges = sorted({pair for body in bodies for pair in combinations(body, 2)})
     result = analyse(p, edges)
-    assert result.verdict is FLEXIBLE
+    assert result.rigidity_class is FLEXIBLE
     assert [flex.agents for flex in result.flexes] == [(2, 3), (6, 7)]
 
 
@@ -253,10 +257,10 @@ def test_loose_agent_on_a_flat_shape():
     """Where J is singular because of a rigid part, a loose agent is found by following its motion."""
     p = np.vstack([shapes.slots("square", 4.0, 4), [[6, 0.5, 0]]])
     result = analyse(p, [*graphs.complete_graph(4).tolist(), [1, 4], [2, 4]])
-    assert result.verdict is FLEXIBLE
+    assert result.rigidity_class is FLEXIBLE
     assert result.deformed is not None
     assert result.within is not None
-    assert result.within.verdict is RIGID
+    assert result.within.rigidity_class is RIGID
 
 
 def test_sheet_folds_along_its_lines():
@@ -264,15 +268,15 @@ def test_sheet_folds_along_its_lines():
     p = shapes.slots("grid", 1.0, 16)
     edges = graphs.complete_graph(16)
     result = analyse(p, edges[distance_geometry.distances(p, edges) < 1.5])
-    assert result.verdict is FLEXIBLE
+    assert result.rigidity_class is FLEXIBLE
     braced = analyse(p, edges[distance_geometry.distances(p, edges) < 2.3])
-    assert braced.verdict is STABLE
+    assert braced.rigidity_class is STABLE
 
 
 def test_barely_rigid_says_so():
     """Three agents a hair off a line are rigid in name; the reason warns."""
     result = analyse([[-4, 0, 0], [0, 1e-3, 0], [4, 0, 0]], graphs.complete_graph(3))
-    assert result.verdict is RIGID
+    assert result.rigidity_class is RIGID
     assert "large forces" in result.reason
 
 
@@ -327,13 +331,13 @@ def test_data_counts_from_one():
     data = analyse(shapes.slots("square", 4.0, 4), graphs.complete_graph(4)).data()
     assert data["redundant"][0] == [1, 2]
     assert data["flexes"][0]["agents"] == [1]
-    assert data["verdict"] == "prestress-stable"
-    assert data["within"]["verdict"] == "infinitesimally rigid"
+    assert data["rigidity_class"] == "prestress-stable"
+    assert data["within"]["rigidity_class"] == "infinitesimally rigid"
 
 
 # -- PyRigi's named frameworks
 
-# name, arguments, verdict; from PyRigi's documentation and the papers it cites
+# name, arguments, rigidity_class; from PyRigi's documentation and the papers it cites
 PYRIGI = [
     ("Square", (), FLEXIBLE),
     ("Diamond", (), RIGID),
@@ -374,20 +378,20 @@ def pyrigi():
         yield frameworkDB
 
 
-@pytest.mark.parametrize(("name", "arguments", "verdict"), PYRIGI)
-def test_named_frameworks_of_pyrigi(pyrigi, name, arguments, verdict):
+@pytest.mark.parametrize(("name", "arguments", "rigidity_class"), PYRIGI)
+def test_named_frameworks_of_pyrigi(pyrigi, name, arguments, rigidity_class):
     """Flexes, stresses, infinitesimal rigidity and prestress stability agree with PyRigi's."""
     framework = getattr(pyrigi, name)(*arguments)
     agents, place = framework.graph.vertex_list(), framework.realization(numerical=True)
     slots = np.array([np.ravel(place[v]) for v in agents], dtype=float)
     edges = [[agents.index(i), agents.index(j)] for i, j in framework.graph.edges]
     result = analyse(slots, edges, space=framework.dim)
-    assert result.verdict is verdict
+    assert result.rigidity_class is rigidity_class
     assert len(result.flexes) == len(framework.inf_flexes(numerical=True))
     assert len(edges) - result.rank == len(framework.stresses(numerical=True))
-    assert (result.verdict is RIGID) == framework.is_inf_rigid(numerical=True)
-    if verdict is not UNDECIDED and result.flexes:
-        assert (verdict is STABLE) == framework.is_prestress_stable(numerical=True)
+    assert (result.rigidity_class is RIGID) == framework.is_inf_rigid(numerical=True)
+    if rigidity_class is not UNDECIDED and result.flexes:
+        assert (rigidity_class is STABLE) == framework.is_prestress_stable(numerical=True)
 
 
 # -- other shapes with the same distances

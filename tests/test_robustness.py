@@ -89,7 +89,7 @@ def test_nearly_blocked_flexes_are_undecided():
     """A graph whose stress all but blocks every flex gets a verdict, of doubt."""
     case = table.random_case(61, 1)
     result = analyse(case.slots, table.edges_of(case, "redundant"))
-    assert result.verdict is RigidityClass.UNDECIDED
+    assert result.rigidity_class is RigidityClass.UNDECIDED
 
 
 @pytest.mark.long

@@ -92,12 +92,12 @@ def least_and_promised(
     ]
 
 
-def planned_ways(seed: int) -> list[tuple[float, float]]:
+def planned_paths(seed: int) -> list[tuple[float, float]]:
     mission = random_reshape(seed)
     return least_and_promised(mission, [planned.position for planned in preview(mission)[0]])
 
 
-def flown_ways(seed: int) -> list[tuple[float, float]]:
+def flown_paths(seed: int) -> list[tuple[float, float]]:
     mission = random_reshape(seed)
     result = simulate(mission)
     return least_and_promised(mission, [result.position[result.samples(k)] for k in range(2)])
@@ -107,24 +107,24 @@ def flown_ways(seed: int) -> list[tuple[float, float]]:
 def test_assigned_ways_keep_their_room_as_planned(part):
     """No two vehicles come nearer than D / sqrt(2) on any planned change, D the least distance of both shapes."""
     for seed in range(10 * part, 10 * part + 10):
-        for least, promised in planned_ways(seed):
+        for least, promised in planned_paths(seed):
             assert least >= promised * (1 - 1e-12), seed
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_assigned_ways_keep_their_room_as_flown(seed):
     """Nor on any that is flown, to a micrometre."""
-    for least, promised in flown_ways(seed):
+    for least, promised in flown_paths(seed):
         assert least >= promised - TRACKING
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("part", range(10))
-@pytest.mark.parametrize("ways", [planned_ways, flown_ways])
-def test_assigned_ways_keep_their_room_three_hundred_times(ways, part):
+@pytest.mark.parametrize("paths", [planned_paths, flown_paths])
+def test_assigned_paths_keep_their_separation_three_hundred_times(paths, part):
     """Both over 300 missions of two changes each."""
     for seed in range(30 * part, 30 * part + 30):
-        for least, promised in ways(seed):
+        for least, promised in paths(seed):
             assert least >= promised - TRACKING, seed
 
 
@@ -154,19 +154,19 @@ def test_ways_are_straight_and_shortest_where_the_attitude_is_known():
     for rule in ("shortest", "each"):
         mission = fly({"a": slots}, start, phases, assignment=rule)
         position = preview(mission)[0][0].position
-        ways = position[-1] - position[0]
+        paths = position[-1] - position[0]
         there = about_centre(slots) @ turned.T
         least = min(
             np.sum((there[list(order)] - about_centre(start)) ** 2)
             for order in permutations(range(6))
         )
-        assert np.sum(ways**2) == pytest.approx(least, rel=1e-9)
-        share = np.einsum("kia,ia->ki", position - position[0], ways) / np.sum(ways**2, axis=1)
-        np.testing.assert_allclose(position, position[0] + share[..., None] * ways, atol=1e-9)
+        assert np.sum(paths**2) == pytest.approx(least, rel=1e-9)
+        share = np.einsum("kia,ia->ki", position - position[0], paths) / np.sum(paths**2, axis=1)
+        np.testing.assert_allclose(position, position[0] + share[..., None] * paths, atol=1e-9)
 
 
 def test_slots_are_assigned_for_the_masses_that_are_flown():
-    """Squares of ways count agents alike: of two equal ones to exchange, a heavy one proves nothing.
+    """Squares of paths count agents alike: of two equal ones to exchange, a heavy one proves nothing.
 
     With squares weighted by mass the heavy agent would be sent across the light one's way.
     """
@@ -176,9 +176,9 @@ def test_slots_are_assigned_for_the_masses_that_are_flown():
         mission = fly(
             {"a": slots}, start, [establish("a")], assignment="each", agents={"mass": masses}
         )
-        ways = preview(mission)[0][0].ways
-        assert ways is not None
-        x, y = (np.asarray(p)[:, None] - np.asarray(p) for p in ways)
+        path_ends = preview(mission)[0][0].path_ends
+        assert path_ends is not None
+        x, y = (np.asarray(p)[:, None] - np.asarray(p) for p in path_ends)
         assert (np.sum(x * y, axis=2) >= -1e-12).all()
 
 
@@ -231,38 +231,38 @@ def test_a_safe_assignment_is_bounded(monkeypatch):
 
 @pytest.mark.parametrize("turn", [None, np.eye(3)], ids=["free", "told"])
 def test_the_safest_has_as_much_room_as_the_shortest(turn):
-    """Of random shapes, the assignment "safe" never has less room than "shortest" has, to the last digit."""
+    """Of random shapes, the assignment "safe" never has a smaller separation than "shortest", to the last digit."""
     rng = np.random.default_rng(3)
     for _ in range(20):
         start, slots, radius = scattered(rng, 12), scattered(rng, 12), rng.uniform(0.0, 0.5, 12)
-        rooms = []
+        separations = []
         for way in (None, radius):
             order, turned = assignment.assigned(start, slots, turn=turn, radius=way)
             x, y = about_centre(start), about_centre(slots)[order] @ turned.T
             s = np.linspace(0.0, 1.0, 2001)[:, None, None]
             between = [pdist(p) for p in (1 - s) * x + s * y]
             i, j = np.triu_indices(12, 1)
-            rooms.append((np.array(between) - radius[i] - radius[j]).min())
-        assert rooms[1] >= rooms[0] - 1e-5  # of samples
+            separations.append((np.array(between) - radius[i] - radius[j]).min())
+        assert separations[1] >= separations[0] - 1e-5  # of samples
 
 
-def test_nearest_way():
-    """The least room on straight ways is that of ten thousand samples, with its pair and its moment."""
+def test_closest_approach():
+    """The least separation on straight paths is that of ten thousand samples, with its pair and its moment."""
     rng = np.random.default_rng(8)
     for n in (2, 3, 40):
         p, q, radius = rng.normal(size=(n, 3)), rng.normal(size=(n, 3)), rng.uniform(0, 0.2, n)
-        room, (i, j), share = assignment.nearest_way(p, q, radius)
+        separation, (i, j), share = assignment.closest_approach(p, q, radius)
         s = np.linspace(0.0, 1.0, 10_001)[:, None, None]
         x = (1 - s) * p + s * q
         k, m = np.triu_indices(n, 1)
-        all_rooms = np.linalg.norm(x[:, k] - x[:, m], axis=2) - radius[k] - radius[m]
-        assert room == pytest.approx(all_rooms.min(), abs=1e-6)
+        all_separations = np.linalg.norm(x[:, k] - x[:, m], axis=2) - radius[k] - radius[m]
+        assert separation == pytest.approx(all_separations.min(), abs=1e-6)
         at = (1 - share) * (p[i] - p[j]) + share * (q[i] - q[j])
-        assert np.linalg.norm(at) - radius[i] - radius[j] == pytest.approx(room, abs=1e-12)
-    assert assignment.nearest_way(p[:1], q[:1])[0] == np.inf
+        assert np.linalg.norm(at) - radius[i] - radius[j] == pytest.approx(separation, abs=1e-12)
+    assert assignment.closest_approach(p[:1], q[:1])[0] == np.inf
 
 
-# -- what check says of ways that cross --------------------------------------------------------------
+# -- what check says of paths that cross --------------------------------------------------------------
 
 FIVE = [[0.0, 0, 0], [4, 0, 0], [8, 0, 0], [0, 4, 0], [4, 4, 0]]
 SWAPPED = [FIVE[k] for k in (0, 2, 1, 3, 4)]
@@ -306,12 +306,12 @@ def test_ways_nearer_than_the_limit_are_found():
         {"a": square, "b": turned}, start, phases, assignment="each", limits={"separation": 1.4}
     )
     texts = collisions(mission)
-    ways = preview(mission)[0][1].ways
-    assert ways is not None
+    path_ends = preview(mission)[0][1].path_ends
+    assert path_ends is not None
     s = np.linspace(0, 1, 2001)[:, None, None]
-    room = min(pdist(p).min() for p in (1 - s) * ways[0] + s * ways[1]) - 0.2
+    separation = min(pdist(p).min() for p in (1 - s) * path_ends[0] + s * path_ends[1]) - 0.2
     (crossing,) = [text for text in texts if "cross" in text]
-    assert f"have a separation of {room:.2f} m" in crossing
+    assert f"have a separation of {separation:.2f} m" in crossing
     assert "limit 1.4 m" in crossing
     assert f"Place slots at least {np.sqrt(2) * 1.6:.2f} m apart" in crossing
 
@@ -403,7 +403,7 @@ def test_a_formation_is_established_as_it_is_drawn(keys, before, turned, formula
     asked = np.array([w, x, y, z])
     assert target is not None
     assert abs(abs(np.array(target["attitude"]) @ asked) - 1.0) < 1e-9
-    found = {f.check: f for f in assess(result).findings}
+    found = {f.check: f for f in assess(result).checks}
     assert found["waypoint_attitude"].passed
     assert planned_end_is_flown(mission, result)
 

@@ -34,7 +34,7 @@ print(f"{len(slots)} vehicles, {len(complete_graph(len(slots)))} pairs")
 pairs = complete_graph(len(slots))
 tempting = pairs[pairs[:, 1] - pairs[:, 0] <= 3]
 found = analyse(slots, tempting)
-print(f"{len(tempting)} edges, rank {found.rank} of {found.needed}: {found.verdict}")
+print(f"{len(tempting)} edges, rank {found.rank} of {found.needed}: {found.rigidity_class}")
 
 # %% [markdown]
 # Their number suffices, but two motions change no distance to first order: prestress could hold the shape,
@@ -43,7 +43,7 @@ print(f"{len(tempting)} edges, rank {found.rank} of {found.needed}: {found.verdi
 # %%
 edges = rf.design(slots)
 chosen = analyse(slots, edges)
-print(f"{len(edges)} edges, rank {chosen.rank} of {chosen.needed}: {chosen.verdict}")
+print(f"{len(edges)} edges, rank {chosen.rank} of {chosen.needed}: {chosen.rigidity_class}")
 print(f"index {chosen.index:.3f}, that of the others {found.index:.3f}")
 
 # %% [markdown]

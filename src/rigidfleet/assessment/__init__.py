@@ -11,7 +11,7 @@ count from 1.
 
 from pathlib import Path
 
-from rigidfleet.assessment.checks import findings, notes
+from rigidfleet.assessment.checks import all_checks, notes
 from rigidfleet.assessment.measure import Measurements
 from rigidfleet.assessment.outcome import (
     FLIPPED,
@@ -76,6 +76,6 @@ def assess(result: Result | str | Path) -> Verdict:
     measured = Measurements(result)
     phases = [measured.phase(i, record) for i, record in enumerate(result.phases)]
     verdict = Verdict(measured.mission.name, measured.mission.title, [], phases, [])
-    verdict.findings.extend(findings(measured, verdict))
+    verdict.checks.extend(all_checks(measured, verdict))
     verdict.notes.extend(notes(measured, phases))
     return verdict

@@ -32,7 +32,7 @@ _CONTACT = 1e-6
 _UNSEEN = 0.01
 
 
-def findings(measured: Measurements, verdict: Verdict) -> Iterator[CheckResult]:
+def all_checks(measured: Measurements, verdict: Verdict) -> Iterator[CheckResult]:
     """All checks of a flight.
 
     A check made in several phases yields every failure, or the pass nearest to the limit if there is none.
@@ -363,6 +363,7 @@ def _thrust(measured: Measurements, e: Extreme | None) -> Iterator[CheckResult]:
 
 def notes(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[str]:
     """Facts that fail no check but that a reader should know."""
+    yield from _left(measured)
     yield from _dips(measured)
     yield from _turned_over(measured, phases)
     yield from _fallen(measured)
@@ -374,6 +375,14 @@ def notes(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[str]:
             since = measured.first(full.max(axis=1))
             yield f"the thrust of {who} saturates at its limit, first at {since:.2f} s"
     yield from _sampled(measured)
+
+
+def _left(measured: Measurements) -> Iterator[str]:
+    """Note each phase that was left for another one before it arrived."""
+    result = measured.result
+    for phase, record in zip(result.mission.phases, result.phases, strict=False):
+        if phase.meets and record.target is None and record.settled is None:
+            yield f"'{record.name}' was left at {record.t_end:.2f} s, before its arrival, which is not judged"
 
 
 def _sampled(measured: Measurements) -> Iterator[str]:

@@ -131,13 +131,15 @@ class Measurements:
         self._formations: dict[str, tuple[Floats | None, Ints, Floats]] = {}
         radius, obstacles = self.mission.agents.radius, self.mission.obstacles
         #: Clearance of each agent to obstacles [m], and the nearest obstacle (K, N).
-        self.room, self.nearest = proximity.obstacle_clearances(result.position, radius, obstacles)
+        self.each_clearance, self.nearest = proximity.obstacle_clearances(
+            result.position, radius, obstacles
+        )
         if not self.whole:
-            self.room[~self.left] = np.inf
+            self.each_clearance[~self.left] = np.inf
         #: Separation, pair, clearance, agent and obstacle at samples (K, ...).
         self.close = (
             *proximity.separation_of_left(result.position, radius, self.left),
-            *proximity.least_clearance(self.room, self.nearest),
+            *proximity.least_clearance(self.each_clearance, self.nearest),
         )
         thrust = _length(result.input_force + result.constraint_force)
         if self.mission.agents.saturate:
@@ -294,13 +296,13 @@ class Measurements:
         A vehicle stands on an obstacle while it has been within `PAD` of it since the start, or stays so to the end.
         """
         time = self.result.time
-        room, nearest = self.of_left(self.room), self.nearest
+        clearance, nearest = self.of_left(self.each_clearance), self.nearest
         told = {name for p in self.result.phases for name in p.extremes}
-        stands = (~(room[0] > PAD)).any() or (self.left[-1] & ~(room[-1] > PAD)).any()
+        stands = (~(clearance[0] > PAD)).any() or (self.left[-1] & ~(clearance[-1] > PAD)).any()
         if not (stands or told & {"clearance_start", "clearance_end"}):
             # No vehicle ever stands on an obstacle.
             return {"clearance_flight": self.worst_clearance()}
-        off = room > PAD
+        off = clearance > PAD
         first = np.where(off.any(axis=0), off.argmax(axis=0), len(time))
         last = np.where(off.any(axis=0), len(time) - 1 - off[::-1].argmax(axis=0), len(time))
         last = np.where(self.left[-1], last, len(time))  # lost vehicles do not land
@@ -312,7 +314,7 @@ class Measurements:
         }
         found = {}
         for name, part in parts.items():
-            values = np.where(part, room, np.nan)
+            values = np.where(part, clearance, np.nan)
             sampled = self.extreme(
                 values, lambda k, i: self.beside(i, int(nearest[k, i])), lambda x: -x
             )
@@ -329,13 +331,13 @@ class Measurements:
         r, radius = self.result.position, self.mission.fleet.radius
         least, who = np.full(len(r), np.nan), np.zeros((len(r), 2), dtype=np.int64)
         for i in np.flatnonzero(~self.left[-1]):
-            room = np.linalg.norm(r - r[:, [i]], axis=2) - radius - radius[i]
-            room = np.where(self.left & ~self.left[:, [i]], room, np.inf)
-            j = room.argmin(axis=1)
-            room = np.where(self.left[:, i], np.nan, room[np.arange(len(r)), j])
-            closer = np.fmin(room, least) != least
-            closer &= np.isfinite(room)
-            least[closer] = room[closer]
+            separation = np.linalg.norm(r - r[:, [i]], axis=2) - radius - radius[i]
+            separation = np.where(self.left & ~self.left[:, [i]], separation, np.inf)
+            j = separation.argmin(axis=1)
+            separation = np.where(self.left[:, i], np.nan, separation[np.arange(len(r)), j])
+            closer = np.fmin(separation, least) != least
+            closer &= np.isfinite(separation)
+            least[closer] = separation[closer]
             who[closer] = np.column_stack([np.full(len(r), i), j])[closer]
         sampled = self.extreme(least, lambda k: agent_names(who[k]), lambda x: -x)
         return self.worst("lost", sampled, lambda x: -x)

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    pass
+from typing import Any
 
 #: Greatest error of a distance, relative to the shortest intended one, at the end of a shaping phase
 #: and of the flight. A shape that is reached has errors below 1e-3; one folded another way, of some tenths.
@@ -59,7 +56,7 @@ class CheckResult:
     ----------
     check : what was checked, in snake_case
     passed : whether the check holds; always True for a quantity without a limit
-    message : the finding in words
+    message : the result in words
     worst, limit : in `unit`; None where there is none
     at_least : whether the limit is the least value allowed, not the greatest
     when : mission time of the worst [s]

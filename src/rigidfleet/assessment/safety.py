@@ -57,7 +57,7 @@ def safety(result: Result, verdict: Verdict) -> list[Safety]:
     Limits are those of the verdict; those of the altitude are the geofence's.
     """
     measured = Measurements(result)
-    found = {finding.check: finding for finding in verdict.findings}
+    found = {check.check: check for check in verdict.checks}
     return [
         _row(
             "proximity", "least distance between two vehicles' surfaces",

@@ -49,14 +49,14 @@ class Verdict:
 
     mission: str
     title: str
-    findings: list[CheckResult]
+    checks: list[CheckResult]
     phases: list[PhaseVerdict]
     notes: list[str]
 
     @property
     def passed(self) -> bool:
         """Whether every check holds."""
-        return all(finding.passed for finding in self.findings)
+        return all(check.passed for check in self.checks)
 
     @property
     def worst(self) -> dict[str, Extreme]:
@@ -71,12 +71,12 @@ class Verdict:
     @property
     def summary(self) -> str:
         """The verdict in words: the worst values of a flight that passed, or a line for each failed check."""
-        judged = [finding for finding in self.findings if finding.judged]
-        failed = [finding for finding in judged if not finding.passed]
+        judged = [check for check in self.checks if check.judged]
+        failed = [check for check in judged if not check.passed]
         if failed:
             head = f"Failed: {len(failed)} of {len(judged)} checks."
-            return "\n".join([head, *(f"- {finding.message}" for finding in failed)])
-        found = {f.check: f for f in self.findings if f.worst is not None}
+            return "\n".join([head, *(f"- {check.message}" for check in failed)])
+        found = {f.check: f for f in self.checks if f.worst is not None}
         praise = dict(_PRAISE)
         if "thrust_peak" in found:
             praise["thrust"] = "{who} comes nearest to its limit, at {worst} of {limit}"
@@ -97,7 +97,7 @@ class Verdict:
                     "waypoint": WAYPOINT_TOLERANCE,
                     "flip": FLIPPED,
                 },
-                "findings": [asdict(finding) for finding in self.findings],
+                "checks": [asdict(check) for check in self.checks],
                 "notes": self.notes,
                 "worst": {name: asdict(extreme) for name, extreme in self.worst.items()},
                 "phases": [asdict(phase) for phase in self.phases],
@@ -109,8 +109,8 @@ class Verdict:
         return json.dumps(self.to_dict(), ensure_ascii=False, allow_nan=False, indent=2)
 
     def __repr__(self) -> str:
-        judged = [finding for finding in self.findings if finding.judged]
-        failed = sum(not finding.passed for finding in judged)
+        judged = [check for check in self.checks if check.judged]
+        failed = sum(not check.passed for check in judged)
         ending = f"failed {failed} of {len(judged)}" if failed else f"passed all {len(judged)}"
         return f"<Verdict {self.mission}: {ending} checks>"
 
@@ -119,7 +119,7 @@ class Verdict:
         from rigidfleet._common import markup
         from rigidfleet.assessment.table import check_row
 
-        rows = [map(str, check_row(finding)) for finding in self.findings if finding.judged]
+        rows = [map(str, check_row(check)) for check in self.checks if check.judged]
         words = "\n".join([self.summary, *(f"Note: {note}." for note in self.notes)])
         heads = ("check", "worst", "limit", "at [s]", "who or where", "")
         return markup.shown(self.mission, self.title, heads, rows, words)
@@ -132,4 +132,4 @@ class Verdict:
         head = Text.assemble((self.mission, "bold"), f"  {self.title}")
         notes = [Text(f"Note: {note}.", "yellow") for note in self.notes]
         summary = Text(self.summary, "bold green" if self.passed else "bold red")
-        return rendered(head, self.phases, self.findings, [*notes, summary])
+        return rendered(head, self.phases, self.checks, [*notes, summary])

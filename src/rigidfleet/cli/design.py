@@ -94,7 +94,7 @@ def design(
         found = {what: data for what, (data, _) in judged.items()}
         console.print_json({"name": name, "toml": text, "limits": limits, "graphs": found})
         return PASSED
-    table = console.table("graph", "edges", "rank", "index", "cond.", "longest", "verdict")
+    table = console.table("graph", "edges", "rank", "index", "cond.", "longest", "class")
     table.columns[0].no_wrap = True
     for what, (_, cells) in judged.items():
         table.add_row(what, *cells)
@@ -149,14 +149,19 @@ def compare_graph(slots: Any, edges: Any) -> tuple[dict[str, Any], tuple[str, ..
         cells = (f"{found.index:.4f}", condition, longest)
         rank = f"{found.rank} of {found.needed}"
         data = found.data() | {"condition": ratio}
-        return data, (str(len(edges)), rank, *cells, str(found.verdict))
+        return data, (str(len(edges)), rank, *cells, str(found.rigidity_class))
     ends = spectrum(slots, edges, [1.0] * len(slots))
-    verdict = "flexible to first order" if ends.free else "infinitesimally rigid"
+    rigidity_class = "flexible to first order" if ends.free else "infinitesimally rigid"
     rank = "" if ends.free else "full"
     cells = (f"{ends.index:.3g}", f"{ends.condition:.3g}", longest)
     data = {"edges": len(edges), "index": ends.index, "w": ends.w, "free": ends.free}
     data["condition"] = ends.condition if ends.w > 0 else None
-    return data | {"verdict": verdict}, (f"{len(edges):,}", rank, *cells, verdict)
+    return data | {"rigidity_class": rigidity_class}, (
+        f"{len(edges):,}",
+        rank,
+        *cells,
+        rigidity_class,
+    )
 
 
 def _points(shape: str, agents: int | None, size: list[float] | None) -> tuple[str, Any]:

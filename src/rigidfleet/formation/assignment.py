@@ -23,7 +23,7 @@ class Assigned(NamedTuple):
     turn: Floats  # (3, 3) rotation of the slots; the blend must use this rotation and no other
 
 
-def nearest_way(
+def closest_approach(
     start: ArrayLike, end: ArrayLike, radius: ArrayLike | None = None
 ) -> tuple[float, tuple[int, int], float]:
     """Least distance between agents that move straight from start to end (N, 3) [m], all in step.
@@ -32,7 +32,7 @@ def nearest_way(
 
     Returns
     -------
-    room : distance between surfaces [m] (between centres if no radii (N,) are given); infinite for one agent
+    separation : distance between surfaces [m] (between centres if no radii (N,) are given); infinite for one agent
     pair : the two agents, from 0
     share : share of the path at which they are nearest, in [0, 1]
     """
@@ -48,11 +48,11 @@ def nearest_way(
         # Nearest point to zero of the segment from x to x + y.
         xy, yy = (x * y).sum(axis=2), (y * y).sum(axis=2)
         s = np.clip(-xy / np.maximum(yy, 1e-300), 0.0, 1.0)
-        room = np.linalg.norm(x + s[..., None] * y, axis=2) - r[i, None] - r[first + 1 :]
-        room[np.tri(*room.shape, -1, dtype=np.bool_)] = np.inf  # each pair once
-        k, j = np.unravel_index(int(room.argmin()), room.shape)
-        if room[k, j] < best[0]:
-            best = float(room[k, j]), (int(i[k]), first + 1 + int(j)), float(s[k, j])
+        separation = np.linalg.norm(x + s[..., None] * y, axis=2) - r[i, None] - r[first + 1 :]
+        separation[np.tri(*separation.shape, -1, dtype=np.bool_)] = np.inf  # each pair once
+        k, j = np.unravel_index(int(separation.argmin()), separation.shape)
+        if separation[k, j] < best[0]:
+            best = float(separation[k, j]), (int(i[k]), first + 1 + int(j)), float(s[k, j])
     return best
 
 
@@ -112,9 +112,9 @@ def assigned(
     shortest = min(straight, key=worth)
     if radius is None:
         return shortest
-    room = {id(o): nearest_way(p, q[o.order] @ o.turn.T, radius)[0] for o in options}
-    safe = [o for o in options if room[id(o)] >= room[id(shortest)]]
-    return min(safe, key=lambda o: (-round(room[id(o)], 2), *worth(o)))
+    separation = {id(o): closest_approach(p, q[o.order] @ o.turn.T, radius)[0] for o in options}
+    safe = [o for o in options if separation[id(o)] >= separation[id(shortest)]]
+    return min(safe, key=lambda o: (-round(separation[id(o)], 2), *worth(o)))
 
 
 #: Number of pairs processed together; work on assignments, N^3 each, of some seconds.

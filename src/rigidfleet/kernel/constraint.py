@@ -12,9 +12,9 @@ The named solvers differ only in how they treat this case.
 
 import math
 
-from rigidfleet.kernel.compiler.calls import call_solver
 from rigidfleet.kernel.compiler.jit import compiled, inlined
 from rigidfleet.kernel.linalg import cholesky, cholesky_solve, jacobi_eigen
+from rigidfleet.kernel.outside import call_solver
 from rigidfleet.kernel.problem import EXACT, ITERATED, PINV, SPECTRAL
 from rigidfleet.kernel.references import distance_references
 

@@ -5,8 +5,6 @@ import math
 import numpy as np
 
 from rigidfleet.kernel.compiler.jit import compiled, inlined
-from rigidfleet.kernel.compiler.pointers import by_address
-from rigidfleet.kernel.compiler.simd import blocks, rough_inverse, spread, total_or_worst
 from rigidfleet.kernel.dynamics import closed_loop
 from rigidfleet.kernel.gauge import read_gauge
 from rigidfleet.kernel.records import (
@@ -18,6 +16,7 @@ from rigidfleet.kernel.records import (
     STATE,
     TRIAL,
 )
+from rigidfleet.kernel.vectors import filled, in_vectors, rough_inverse, total_or_worst
 
 # Dormand and Prince's 5(4) pair, with Hairer's fourth-order continuous extension.
 _A = np.zeros((7, 6))
@@ -42,7 +41,7 @@ def forget_stages(k, first):
     """Set the stages from ``first`` on to zero: NaN in them would survive a weight of zero."""
     for s in range(first, 7):
         for q in range(k.shape[1]):
-            k[s, q] = spread(0.0)
+            k[s, q] = filled(0.0)
 
 
 @inlined
@@ -103,13 +102,12 @@ def integrate(p, w, state, t_end, fresh, times, samples, max_steps):
     Returns FINISHED, PAUSED (the trail may be full), or COLLAPSED if the step size collapsed (singular
     constraints, non-finite forces). y and t are then those of the last accepted step.
     """
-    p, w, state = by_address(p), by_address(w), by_address(state)
     K, clock, count = state.K, state.clock, state.count
-    n, room = state.y.shape[0], state.trail.clock.shape[0]
+    n, capacity = state.y.shape[0], state.trail.clock.shape[0]
     y, trial = K[STATE], K[TRIAL]
     for q in range(n):
         y[q] = state.y[q]
-    k = blocks(K)
+    k = in_vectors(K)
     t, h, last = clock[0], clock[1], clock[2]
     if fresh:
         forget_stages(k, 0)
@@ -122,11 +120,11 @@ def integrate(p, w, state, t_end, fresh, times, samples, max_steps):
         while stage < 7:
             advance(k, stage, _A, h)
             closed_loop(t + _C[stage] * h, trial, K[stage], p, w)
-            if stage == 0 and room > 0:
+            if stage == 0 and capacity > 0:
                 keep_start(p, w, state)
             count[0] += 1
             stage += 1
-        squares = spread(0.0)
+        squares = filled(0.0)
         for q in range(k.shape[1]):
             e = h * (
                 (_E[0] * k[0, q] + _E[2] * k[2, q] + _E[3] * k[3, q])
@@ -165,7 +163,7 @@ def integrate(p, w, state, t_end, fresh, times, samples, max_steps):
                 inner = bend + x * (rest + (1.0 - x) * K[1, q])
                 samples[count[3], q] = y[q] + x * (rise + (1.0 - x) * inner)
             count[3] += 1
-        if room > 0:
+        if capacity > 0:
             keep_step(t, h, p, w, state)
         for q in range(k.shape[1]):
             k[STATE, q] = k[TRIAL, q]
@@ -180,7 +178,7 @@ def integrate(p, w, state, t_end, fresh, times, samples, max_steps):
         if t >= t_end:
             status = FINISHED
             break
-        if room > 0 and count[4] == room:
+        if capacity > 0 and count[4] == capacity:
             break
     for q in range(n):
         state.y[q] = y[q]

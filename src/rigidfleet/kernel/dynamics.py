@@ -7,11 +7,11 @@ y_i = T (v_i - v_cm).
 
 import math
 
-from rigidfleet.kernel.compiler.calls import call_external
 from rigidfleet.kernel.compiler.jit import compiled, inlined
 from rigidfleet.kernel.constraint import constraint_force
 from rigidfleet.kernel.control import input_law
 from rigidfleet.kernel.disturbances import disturb, sense
+from rigidfleet.kernel.outside import call_external
 from rigidfleet.kernel.rigid_body import (
     attitude_matrix,
     centre_of_mass,

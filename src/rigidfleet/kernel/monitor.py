@@ -24,10 +24,9 @@ import math
 
 import numpy as np
 
-from rigidfleet.kernel.compiler.calls import call_recorder
 from rigidfleet.kernel.compiler.jit import compiled
-from rigidfleet.kernel.compiler.pointers import by_address
 from rigidfleet.kernel.gauge import read_gauge
+from rigidfleet.kernel.outside import call_recorder
 from rigidfleet.kernel.records import (
     ACCELERATION,
     CLEARANCE,
@@ -346,7 +345,7 @@ def attitudes(points, part, parts, p, monitor):
     """Attitude, centre and its velocity at five knots of a piece of a step, in the body formulation."""
     n = p.vehicles.m.shape[0]
     first = 6 * n + p.graph.edges.shape[0]
-    state = monitor.room[0]
+    state = monitor.scratch[0]
     for k in range(5):
         basis, pose = monitor.basis[k], monitor.poses[k]
         weights((part + KNOTS[k]) / parts, basis)
@@ -389,7 +388,7 @@ def in_world(points, i, moving, p, monitor, out):
             for q in range(3):
                 out[k, q] = points[k, first + q]
         return
-    at, x = monitor.knots, monitor.room[1]
+    at, x = monitor.knots, monitor.scratch[1]
     for k in range(5):
         basis, pose = monitor.basis[k], monitor.poses[k]
         for q in range(3):
@@ -469,7 +468,7 @@ def watch_obstacles(i, curve, t, h, last, monitor):
     near may be landing; its clearance is stored separately until it moves away again.
     """
     radius, standing = monitor.radius[i], monitor.standing[i] != 0
-    low, normal = monitor.low, monitor.room[2]
+    low, normal = monitor.low, monitor.scratch[2]
     x, y, z, span = curve[2, 0], curve[2, 1], curve[2, 2], 0.0
     for k in range(5):
         a, b, c = curve[k, 0] - x, curve[k, 1] - y, curve[k, 2] - z
@@ -738,7 +737,6 @@ def watch(p, w, state, monitor):
     forces: none (0); all but the last step, which stays in the trail until its neighbour is known (1); or all steps,
     because none follows (2). ``flags[3]`` is 1 if a step has stayed in the trail.
     """
-    p, w, state, monitor = by_address(p), by_address(w), by_address(state), by_address(monitor)
     trail, flags = state.trail, monitor.flags
     for row in range(flags[0], flags[1]):
         watch_distances(row, p, state, monitor)

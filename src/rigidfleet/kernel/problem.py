@@ -201,9 +201,9 @@ def septic_polynomial(x):
 def zeros(*shape: int) -> Floats:
     """Zeros aligned to a cache line: rows that straddle lines would cost up to a tenth of the time."""
     size = math.prod(shape)
-    room = np.zeros(size + 8)
-    skip = -room.ctypes.data // room.itemsize % 8
-    return room[skip : skip + size].reshape(shape)
+    memory = np.zeros(size + 8)
+    skip = -memory.ctypes.data // memory.itemsize % 8
+    return memory[skip : skip + size].reshape(shape)
 
 
 def workspace(
@@ -241,9 +241,9 @@ def _side_by_side(**shapes: tuple[int, ...]) -> dict[str, Floats]:
     """Arrays of zeros, each aligned to a cache line."""
     sizes = [math.prod(shape) for shape in shapes.values()]
     ends = list(accumulate(map(padded, sizes)))
-    room = zeros(ends[-1])
+    memory = zeros(ends[-1])
     return {
-        name: room[end - padded(size) :][:size].reshape(shape)
+        name: memory[end - padded(size) :][:size].reshape(shape)
         for (name, shape), size, end in zip(shapes.items(), sizes, ends, strict=True)
     }
 

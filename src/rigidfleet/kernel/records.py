@@ -100,7 +100,7 @@ class Monitor(NamedTuple):
     basis: Floats  # (5, 5)
     poses: Floats  # (5, 15) attitude, centre and its velocity at knots
     knots: Floats  # (5, 3)
-    room: Floats  # (3, 10)
+    scratch: Floats  # (3, 10)
 
 
 def monitor(
@@ -121,7 +121,7 @@ def monitor(
         "rank": np.zeros(_NODES, dtype=np.int64),
         "places": np.zeros((n, 5, 3)), "curve": np.zeros((5, 3)), "work": np.zeros((40, 11)),
         "pieces": np.zeros((40, 17)), "basis": np.zeros((5, 5)), "poses": np.zeros((5, 15)),
-        "knots": np.zeros((5, 3)), "room": np.zeros((3, 10)),
+        "knots": np.zeros((5, 3)), "scratch": np.zeros((3, 10)),
     }  # fmt: skip
     return Monitor(**(fields | given))
 

@@ -55,10 +55,10 @@ def separation(r: Floats, radius: ArrayLike) -> tuple[Floats, Ints]:
     x = np.ascontiguousarray(r.T)
     for i in range(n - 1):  # rows of samples are faster than rows of agents
         d = x[:, i + 1 :] - x[:, i : i + 1]
-        room = _root(d) - (radius[i] + radius[i + 1 :])[:, None]
-        for j in np.flatnonzero((room < least).any(axis=1)).tolist():
-            closer = room[j] < least  # false for NaN
-            np.copyto(least, room[j], where=closer)
+        apart = _root(d) - (radius[i] + radius[i + 1 :])[:, None]
+        for j in np.flatnonzero((apart < least).any(axis=1)).tolist():
+            closer = apart[j] < least  # false for NaN
+            np.copyto(least, apart[j], where=closer)
             np.copyto(pair[:, 0], i, where=closer)
             np.copyto(pair[:, 1], i + 1 + j, where=closer)
     return least, pair
@@ -98,13 +98,13 @@ def _closest_of_many(r: Floats, radius: Floats) -> tuple[Floats, Ints]:
         p = np.ascontiguousarray(points.T)
         p -= p.mean(axis=1, keepdims=True)
         if near is not None:
-            room = near.rooms(p)
-            at = int(room.argmin())
-        if near is None or room[at] > near.beyond - 2.0 * _moved(rest, p):
+            apart = near.separations(p)
+            at = int(apart.argmin())
+        if near is None or apart[at] > near.beyond - 2.0 * _moved(rest, p):
             near, rest = _near(p, radius), p
-            room = near.rooms(p)
-            at = int(room.argmin())
-        least[k], pair[k] = room[at], near.pairs[:, at]
+            apart = near.separations(p)
+            at = int(apart.argmin())
+        least[k], pair[k] = apart[at], near.pairs[:, at]
     return least, pair
 
 
@@ -115,7 +115,7 @@ class _Near(NamedTuple):
     radii: Floats
     beyond: float
 
-    def rooms(self, p: Floats) -> Floats:
+    def separations(self, p: Floats) -> Floats:
         """Distances (m,) [m] between the surfaces of the pairs, for agents p (3, N)."""
         x = p.take(self.pairs[0], axis=1)
         x -= p.take(self.pairs[1], axis=1)
@@ -132,20 +132,20 @@ def _near(p: Floats, radius: Floats) -> _Near:
     some = np.arange(0, len(radius), max(1, len(radius) // _ASKED))
     d, j = tree.query(p.T[some], k=2)
     widest, rounding = 2.0 * float(radius.max()), 1e-9 * float(np.abs(p).max())
-    room = float((d[:, 1] - radius[some] - radius[j[:, 1]]).min())
-    pairs = tree.query_pairs(_SPARE * (room + widest) + rounding, output_type="ndarray").T
+    estimate = float((d[:, 1] - radius[some] - radius[j[:, 1]]).min())
+    pairs = tree.query_pairs(_SPARE * (estimate + widest) + rounding, output_type="ndarray").T
     found = _Near(pairs, radius[pairs].sum(axis=0), 0.0)
-    rooms = found.rooms(p)
-    beyond = _SPARE * (float(rooms.min()) + widest) + rounding - widest
-    near = rooms <= beyond
+    separations = found.separations(p)
+    beyond = _SPARE * (float(separations.min()) + widest) + rounding - widest
+    near = separations <= beyond
     return _Near(np.ascontiguousarray(pairs[:, near]), found.radii[near], beyond)
 
 
 def _moved(before: Floats, after: Floats) -> float:
     """Greatest displacement [m] of an agent, from (3, N) to (3, N), after removing the rigid motion of all."""
     U, _, Vt = np.linalg.svd(after @ before.T)
-    way = after - (U @ Vt) @ before  # a reflection also preserves distances
-    return float(np.sqrt(np.einsum("ai,ai->i", way, way).max()))
+    moved = after - (U @ Vt) @ before  # a reflection also preserves distances
+    return float(np.sqrt(np.einsum("ai,ai->i", moved, moved).max()))
 
 
 def headroom(r: Floats, radius: ArrayLike, among: Bools | None = None) -> tuple[Floats, Ints]:
@@ -170,9 +170,9 @@ def headroom(r: Floats, radius: ArrayLike, among: Bools | None = None) -> tuple[
         d[0] += d[1]
         overlap = d[0] <= (radii**2)[:, None]  # false for agents without a position
         for j in np.flatnonzero(overlap.any(axis=1)).tolist():
-            room = abs(x[2, i + 1 + j] - x[2, i]) - radii[j]
-            lower = overlap[j] & (room < least)
-            np.copyto(least, room, where=lower)
+            height = abs(x[2, i + 1 + j] - x[2, i]) - radii[j]
+            lower = overlap[j] & (height < least)
+            np.copyto(least, height, where=lower)
             np.copyto(pair[:, 0], i, where=lower)
             np.copyto(pair[:, 1], i + 1 + j, where=lower)
     return least, pair
@@ -188,11 +188,11 @@ def _lowest(r: Floats, radius: Floats) -> tuple[float, Ints]:
     near = who[KDTree(r[who, :2]).query_pairs(2.0 * radius.max(), output_type="ndarray")]
     apart, radii = r[near[:, 0]] - r[near[:, 1]], radius[near].sum(axis=1)
     overlap = apart[:, 0] ** 2 + apart[:, 1] ** 2 <= radii**2
-    room = np.where(overlap, abs(apart[:, 2]) - radii, np.inf)
+    height = np.where(overlap, abs(apart[:, 2]) - radii, np.inf)
     if not overlap.any():
         return np.inf, np.array([-1, -1])
-    at = int(room.argmin())
-    return float(room[at]), np.sort(near[at])
+    at = int(height.argmin())
+    return float(height[at]), np.sort(near[at])
 
 
 def clearance(
@@ -205,11 +205,11 @@ def clearance(
     return least_clearance(*obstacle_clearances(r, radius, obstacles))
 
 
-def least_clearance(room: Floats, nearest: Ints) -> tuple[Floats, Ints, Ints]:
+def least_clearance(clearance: Floats, nearest: Ints) -> tuple[Floats, Ints, Ints]:
     """Least of the `obstacle_clearances` (K, N) of each sample (K,), with the agent and the obstacle (K,)."""
-    agent, samples = room.argmin(axis=1), np.arange(len(room))
+    agent, samples = clearance.argmin(axis=1), np.arange(len(clearance))
     obstacle = nearest[samples, agent]
-    return room[samples, agent], np.where(obstacle < 0, -1, agent), obstacle
+    return clearance[samples, agent], np.where(obstacle < 0, -1, agent), obstacle
 
 
 def separation_of_left(r: Floats, radius: ArrayLike, left: Bools) -> tuple[Floats, Ints]:
@@ -244,9 +244,9 @@ def obstacle_clearances(
             np.maximum(inside, beyond, out=inside)
             np.maximum(beyond, 0.0, out=beyond)
             outside += beyond * beyond
-        room = np.sqrt(outside) + np.minimum(inside, 0.0) - radius
-        closer = room < least  # false for NaN
-        np.copyto(least, room, where=closer)
+        clearance = np.sqrt(outside) + np.minimum(inside, 0.0) - radius
+        closer = clearance < least  # false for NaN
+        np.copyto(least, clearance, where=closer)
         np.copyto(nearest, k, where=closer)
     return least.T, nearest.T
 

@@ -64,95 +64,97 @@ def check(data: Mapping[str, Any], origin: str) -> dict[str, Any]:
     MissionError
         With a finding for each error.
     """
-    notes = FindingCollector(data, origin)
-    _numbers(notes)
-    if notes.findings:  # the other checks would take long
-        raise MissionError(notes.findings)
-    parts = _tables(notes)
+    collector = FindingCollector(data, origin)
+    _numbers(collector)
+    if collector.findings:  # the other checks would take long
+        raise MissionError(collector.findings)
+    parts = _tables(collector)
     for judge in (_agents, _gains, _regulators, _tracking, _allocation, _geofence, _yaw):
-        judge(notes, parts)
+        judge(collector, parts)
     n = _count(data)
-    parts["obstacles"] = _obstacles(notes)
-    parts["formations"] = formations.check(notes, n)
-    if not notes.findings and n is not None:
-        _touching(notes, parts, n)
-    parts["phases"] = phases.check(notes, parts, n)
-    disturbances.check(notes, parts, n)
-    vehicles.check_flight(notes, parts)
-    if notes.findings:
-        raise MissionError(notes.findings)
+    parts["obstacles"] = _obstacles(collector)
+    parts["formations"] = formations.check(collector, n)
+    if not collector.findings and n is not None:
+        _touching(collector, parts, n)
+    parts["phases"] = phases.check(collector, parts, n)
+    disturbances.check(collector, parts, n)
+    vehicles.check_flight(collector, parts)
+    if collector.findings:
+        raise MissionError(collector.findings)
     return parts
 
 
-def _numbers(notes: FindingCollector) -> None:
+def _numbers(collector: FindingCollector) -> None:
     """Find counts beyond the bounds, before anything else is checked."""
 
     def bounded(path: Keys, given: object, most: int, remedy: str) -> None:
         if isinstance(given, list | dict) and len(given) > most:
-            notes.add(path, f"has {len(given):,} entries; the maximum is {most:,}", remedy, None)
+            collector.add(
+                path, f"has {len(given):,} entries; the maximum is {most:,}", remedy, None
+            )
 
     for key, most, remedy in (
         ("formations", bounds.FORMATIONS, "split them into several missions"),
         ("phases", bounds.PHASES, "split them into several missions"),
         ("obstacles", bounds.OBSTACLES, "merge those that touch, and remove those out of reach"),
     ):
-        bounded((key,), notes.data.get(key), most, remedy)
-    agents = notes.data.get("agents")
+        bounded((key,), collector.data.get(key), most, remedy)
+    agents = collector.data.get("agents")
     for key, given in agents.items() if isinstance(agents, dict) else ():
         bounded(("agents", key), given, bounds.AGENTS, "use fewer agents")
-    n, forms = _count(notes.data) or 0, notes.data.get("formations")
+    n, forms = _count(collector.data) or 0, collector.data.get("formations")
     if isinstance(forms, dict) and len(forms) > 1 and n * len(forms) > bounds.SLOTS:
         slots = n * len(forms)
         problem = f"{len(forms)} formations of {n:,} agents have {slots:,} slots; the maximum is {bounds.SLOTS:,}"
-        notes.add(("formations",), problem, "use fewer formations, or fewer agents", None)
-    assignment = notes.data.get("assignment", "given")
+        collector.add(("formations",), problem, "use fewer formations, or fewer agents", None)
+    assignment = collector.data.get("assignment", "given")
     if assignment != "given" and n > bounds.ALL_PAIRS:
         problem = f"compares all agents with all slots, which takes too long for {n:,} agents"
         remedy = f"for more than {bounds.ALL_PAIRS:,} agents use 'given' and order the agents as their slots"
-        notes.add(("assignment",), problem, remedy)
+        collector.add(("assignment",), problem, remedy)
 
 
-def _tables(notes: FindingCollector) -> dict[str, Any]:
+def _tables(collector: FindingCollector) -> dict[str, Any]:
     """Validate the keys of the header and the tables; invalid ones are left out."""
-    for key in notes.data:
+    for key in collector.data:
         if key not in Contents.model_fields:
-            notes.unknown((key,), Contents.model_fields)
-    own = {key: value for key, value in notes.data.items() if key in MissionHeader.model_fields}
-    header = notes.validate(MissionHeader, own, ())
+            collector.unknown((key,), Contents.model_fields)
+    own = {key: value for key, value in collector.data.items() if key in MissionHeader.model_fields}
+    header = collector.validate(MissionHeader, own, ())
     parts = {key: getattr(header, key) for key in MissionHeader.model_fields} if header else {}
-    models = vehicles.check(notes)
+    models = vehicles.check(collector)
     parts["vehicles"] = models
     for key, kind in _TABLES.items():
-        if key in notes.data:
-            data = notes.data[key]
+        if key in collector.data:
+            data = collector.data[key]
             if key == "agents":
-                data = vehicles.equipped(notes, _placed(notes, data), models)
-            part = None if data is None else notes.validate(kind, data, (key,))
+                data = vehicles.equipped(collector, _placed(collector, data), models)
+            part = None if data is None else collector.validate(kind, data, (key,))
             parts |= {key: part} if part is not None else {}
-    if "agents" not in notes.data:
-        notes.add(("agents",), "is missing", "add a table [agents] with mass and position")
+    if "agents" not in collector.data:
+        collector.add(("agents",), "is missing", "add a table [agents] with mass and position")
     return parts
 
 
-def _placed(notes: FindingCollector, agents: Any) -> Any:
+def _placed(collector: FindingCollector, agents: Any) -> Any:
     """Return [agents] with a shape of `position` replaced by its points; None if the shape has errors."""
     if not (isinstance(agents, dict) and isinstance(agents.get("position"), dict)):
         return agents
     path = ("agents", "position")
-    start = notes.validate(Start, agents["position"], path)
-    if start is None or not notes.right((), *path[:1]):
+    start = collector.validate(Start, agents["position"], path)
+    if start is None or not collector.right((), *path[:1]):
         return None
     try:
         points = start.points()
         if not np.abs(points).max() <= bounds.LENGTH.most:
             problem = f"agents start farther than {bounds.LENGTH.most:g} m from the origin"
-            notes.add(path, problem, "reduce size, count or centre")
+            collector.add(path, problem, "reduce size, count or centre")
             return None
         return agents | {"position": points.tolist()}
     except ValueError as error:
         known = "" if start.shape in SHAPES else near_shape(start.shape)
         remedy = known or "change the shape, its size, or the number of agents"
-        notes.add((*path, "shape"), str(error), remedy)
+        collector.add((*path, "shape"), str(error), remedy)
         return None
 
 
@@ -167,40 +169,40 @@ def _count(data: Mapping[str, Any]) -> int | None:
     return len(position) if isinstance(position, list) and position else None
 
 
-def _agents(notes: FindingCollector, parts: dict[str, Any]) -> None:
+def _agents(collector: FindingCollector, parts: dict[str, Any]) -> None:
     agents: Agents | None = parts.get("agents")
     if agents is None:
         return
     n = len(agents.position)
     for key in ("mass", "velocity", "radius", "thrust_limit"):
         given = len(getattr(agents, key))
-        if given != n and notes.right(("agents",), key):
+        if given != n and collector.right(("agents",), key):
             problem = f"has {given} entries for {n} agents"
-            notes.add(("agents", key), problem, f"give one entry per agent, {n} in all")
+            collector.add(("agents", key), problem, f"give one entry per agent, {n} in all")
     for i, j in formations.coincident(agents.position):
         problem = f"agents {i + 1} and {j + 1} start at the same point"
-        notes.add(("agents", "position", j), problem, "move them apart", agents.position[j])
+        collector.add(("agents", "position", j), problem, "move them apart", agents.position[j])
     if max(agents.mass, default=1.0) > bounds.MASS_RATIO * min(agents.mass, default=1.0):
         problem = f"the largest mass is more than {bounds.MASS_RATIO:g} times the smallest"
-        notes.add(("agents", "mass"), problem, "give all masses in kg")
+        collector.add(("agents", "mass"), problem, "give all masses in kg")
     above = [limit for limit in agents.thrust_limit if bounds.FORCE.most < limit < math.inf]
     if above:
-        notes.add(
+        collector.add(
             ("agents", "thrust_limit"),
             f"must be <= {bounds.FORCE.most:g}",
             "omit it for no limit",
         )
-    written = notes.data["agents"].get("thrust_limit", 0.0)
+    written = collector.data["agents"].get("thrust_limit", 0.0)
     if math.inf in (written if isinstance(written, list) else [written]):
-        notes.add(("agents", "thrust_limit"), "is not finite", "omit it for no limit")
+        collector.add(("agents", "thrust_limit"), "is not finite", "omit it for no limit")
     unlimited = all(math.isinf(limit) for limit in agents.thrust_limit)
-    if agents.saturate and unlimited and notes.right(("agents",), "thrust_limit"):
-        notes.add(
+    if agents.saturate and unlimited and collector.right(("agents",), "thrust_limit"):
+        collector.add(
             ("agents", "saturate"), "no limit to saturate at is given", "give thrust_limit [N]"
         )
 
 
-def _touching(notes: FindingCollector, parts: dict[str, Any], n: int) -> None:
+def _touching(collector: FindingCollector, parts: dict[str, Any], n: int) -> None:
     """Find radii so large that a list of all touching pairs would fill memory."""
     if n * (n - 1) // 2 <= bounds.TOUCHING:
         return
@@ -216,27 +218,29 @@ def _touching(notes: FindingCollector, parts: dict[str, Any], n: int) -> None:
                 f"with the largest radius, {pairs:,} pairs of agents touch {where};"
                 f" the maximum is {bounds.TOUCHING:,}"
             )
-            notes.add(("agents", "radius"), problem, "reduce the radius or increase the distances")
+            collector.add(
+                ("agents", "radius"), problem, "reduce the radius or increase the distances"
+            )
             return
 
 
-def _gains(notes: FindingCollector, parts: dict[str, Any]) -> None:
+def _gains(collector: FindingCollector, parts: dict[str, Any]) -> None:
     c: Constraint = parts.get("constraint", Constraint())
     if c.stabilisation == "none":
         return
-    if not notes.right(("constraint",), "stabilisation", "alpha", "beta", "gamma"):
+    if not collector.right(("constraint",), "stabilisation", "alpha", "beta", "gamma"):
         return
     poles = "three poles at -p: alpha = 1.5 p, beta = sqrt(3) p, gamma = p^3"
     for key, needed in (("alpha", "> 0"), ("beta", "> 0"), ("gamma", ">= 0")):
         gain = getattr(c, key)
         if gain < 0 or (gain == 0 and key != "gamma"):
             remedy = f"use a stable gain ({poles}) or stabilisation = 'none' for no feedback"
-            notes.add(("constraint", key), f"is unstable, must be {needed}", remedy, gain)
+            collector.add(("constraint", key), f"is unstable, must be {needed}", remedy, gain)
     bound = 2 * c.alpha * c.beta**2
-    if bound <= c.gamma and notes.right(("constraint",), "alpha", "beta"):
+    if bound <= c.gamma and collector.right(("constraint",), "alpha", "beta"):
         problem = f"is unstable, must be below 2 alpha beta^2 = {bound:.6g}"
         remedy = f"lower gamma or raise alpha or beta ({poles})"
-        notes.add(("constraint", "gamma"), problem, remedy, c.gamma)
+        collector.add(("constraint", "gamma"), problem, remedy, c.gamma)
 
 
 #: Weights below this value count as zero: the Riccati solution does not depend on them.
@@ -245,99 +249,103 @@ _NO_WEIGHT = 1e-12
 _FREE = 1e-15
 
 
-def _regulators(notes: FindingCollector, parts: dict[str, Any]) -> None:
+def _regulators(collector: FindingCollector, parts: dict[str, Any]) -> None:
     lqr: Lqr = parts.get("lqr", Lqr())
-    _regulator(notes, lqr, "lqr")
-    _regulator(notes, lqr.attitude, "lqr", "attitude")
-    _free_input(notes, lqr)
+    _regulator(collector, lqr, "lqr")
+    _regulator(collector, lqr.attitude, "lqr", "attitude")
+    _free_input(collector, lqr)
 
 
-def _regulator(notes: FindingCollector, weights: Regulator, *path: str) -> None:
+def _regulator(collector: FindingCollector, weights: Regulator, *path: str) -> None:
     keys = ("horizon", "Q", "S")
-    if not (notes.right(("lqr",), *keys) and notes.right(path, *keys)):
+    if not (collector.right(("lqr",), *keys) and collector.right(path, *keys)):
         return
     if weights.horizon == "infinite" and weights.Q[0] < _NO_WEIGHT:
         problem = f"an infinite horizon needs a weight of at least {_NO_WEIGHT:g} on the error"
-        notes.add((*path, "Q"), problem, "for example, give Q = [1.0, 1.0]", weights.Q)
+        collector.add((*path, "Q"), problem, "for example, give Q = [1.0, 1.0]", weights.Q)
     if weights.horizon == "finite" and not any(weights.Q) and not any(weights.S):
         problem = "with Q and S zero the regulator does nothing"
-        notes.add((*path, "S"), problem, "for example, give S = [1e3, 1e2]", weights.S)
+        collector.add((*path, "S"), problem, "for example, give S = [1e3, 1e2]", weights.S)
 
 
-def _free_input(notes: FindingCollector, lqr: Lqr) -> None:
+def _free_input(collector: FindingCollector, lqr: Lqr) -> None:
     for weights, name in ((lqr, "lqr"), (lqr.attitude, "lqr.attitude")):
         path, most = tuple(name.split(".")), max(*weights.Q, *weights.S)
-        if _FREE * most > weights.R and notes.right(("lqr",), "R") and notes.right(path, "R"):
-            inherited = name != "lqr" and "R" not in notes.data["lqr"].get("attitude", {})
-            _unbounded(notes, weights.R, most, ("lqr",) if inherited else path, name)
+        if (
+            _FREE * most > weights.R
+            and collector.right(("lqr",), "R")
+            and collector.right(path, "R")
+        ):
+            inherited = name != "lqr" and "R" not in collector.data["lqr"].get("attitude", {})
+            _unbounded(collector, weights.R, most, ("lqr",) if inherited else path, name)
 
 
 def _unbounded(
-    notes: FindingCollector, R: float, most: float, where: tuple[str, ...], name: str
+    collector: FindingCollector, R: float, most: float, where: tuple[str, ...], name: str
 ) -> None:
     problem = (
         f"is less than {_FREE:g} times the largest weight of {name}, {most:g}:"
         " the gains would be unbounded"
     )
-    notes.add((*where, "R"), problem, f"raise R or lower the weights of {name}", R)
+    collector.add((*where, "R"), problem, f"raise R or lower the weights of {name}", R)
 
 
-def _tracking(notes: FindingCollector, parts: dict[str, Any]) -> None:
+def _tracking(collector: FindingCollector, parts: dict[str, Any]) -> None:
     tracking: Tracking = parts.get("tracking", Tracking())
-    if not notes.right(("tracking",), "Q"):
+    if not collector.right(("tracking",), "Q"):
         return
     if tracking.Q[0] < _NO_WEIGHT:
         problem = f"tracking needs a weight of at least {_NO_WEIGHT:g} on the position error"
-        notes.add(("tracking", "Q"), problem, "for example, give Q = [4.0, 4.0]")
-    if _FREE * max(tracking.Q) > tracking.R and notes.right(("tracking",), "R"):
-        _unbounded(notes, tracking.R, max(tracking.Q), ("tracking",), "tracking")
+        collector.add(("tracking", "Q"), problem, "for example, give Q = [4.0, 4.0]")
+    if _FREE * max(tracking.Q) > tracking.R and collector.right(("tracking",), "R"):
+        _unbounded(collector, tracking.R, max(tracking.Q), ("tracking",), "tracking")
 
 
-def _allocation(notes: FindingCollector, parts: dict[str, Any]) -> None:
+def _allocation(collector: FindingCollector, parts: dict[str, Any]) -> None:
     allocation: Allocation = parts.get("allocation", Allocation())
     if (
         allocation.method == "rigid"
         and "torque_split" in allocation.model_fields_set
-        and notes.right(("allocation",), "method")
+        and collector.right(("allocation",), "method")
     ):
         problem = "has no effect with method 'rigid'"
-        notes.add(("allocation", "torque_split"), problem, "remove it or use method = 'pinv'")
+        collector.add(("allocation", "torque_split"), problem, "remove it or use method = 'pinv'")
 
 
-def _geofence(notes: FindingCollector, parts: dict[str, Any]) -> None:
+def _geofence(collector: FindingCollector, parts: dict[str, Any]) -> None:
     fence = parts.get("limits", Limits()).geofence
     if fence is not None:
-        _ordered(notes, fence, ("limits", "geofence"))
+        _ordered(collector, fence, ("limits", "geofence"))
 
 
-def _yaw(notes: FindingCollector, parts: dict[str, Any]) -> None:
+def _yaw(collector: FindingCollector, parts: dict[str, Any]) -> None:
     yaw: VehicleYaw | None = parts.get("yaw")
-    if yaw is None or not notes.right(("yaw",), "kind", "yaw_deg", "point"):
+    if yaw is None or not collector.right(("yaw",), "kind", "yaw_deg", "point"):
         return
     if yaw.kind == "towards" and yaw.point is None:
-        notes.add(("yaw", "point"), "is missing", "add point: the point to look at, [x, y, z] [m]")
+        collector.add(("yaw", "point"), "is missing", "add point: the point to look at, [x, y, z] [m]")
     for key, kind in (("yaw_deg", "fixed"), ("point", "towards")):
         if key in yaw.model_fields_set and yaw.kind != kind:
             problem = f"has no effect with kind '{yaw.kind}'"
-            notes.add(("yaw", key), problem, f"remove it or use kind = '{kind}'")
+            collector.add(("yaw", key), problem, f"remove it or use kind = '{kind}'")
 
 
-def _ordered(notes: FindingCollector, box: Box | Geofence, path: tuple[str | int, ...]) -> None:
+def _ordered(collector: FindingCollector, box: Box | Geofence, path: tuple[str | int, ...]) -> None:
     for axis, low, high in zip("xyz", box.min, box.max, strict=True):
         if low >= high:
             problem = f"min must be below max, but {axis} has {low:g} >= {high:g} m"
-            notes.add(path, problem, "swap them", None)
+            collector.add(path, problem, "swap them", None)
 
 
-def _obstacles(notes: FindingCollector) -> tuple[Obstacle, ...]:
+def _obstacles(collector: FindingCollector) -> tuple[Obstacle, ...]:
     obstacles = []
-    for k, data in enumerate(phases.tables(notes, "obstacles")):
-        kind = phases.kind(notes, data, ("obstacles", k), _OBSTACLES)
+    for k, data in enumerate(phases.tables(collector, "obstacles")):
+        kind = phases.kind(collector, data, ("obstacles", k), _OBSTACLES)
         if kind is None:
             continue
         name = "ground" if kind is Ground else f"box {k + 1}"
-        obstacle = notes.validate(kind, {"name": name} | data, ("obstacles", k))
+        obstacle = collector.validate(kind, {"name": name} | data, ("obstacles", k))
         if isinstance(obstacle, Box):
-            _ordered(notes, obstacle, ("obstacles", k))
+            _ordered(collector, obstacle, ("obstacles", k))
         obstacles += [obstacle] if obstacle is not None else []
     return tuple(obstacles)

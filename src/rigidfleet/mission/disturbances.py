@@ -44,7 +44,7 @@ def intensity(gusts: Gusts, wind: float) -> Floats:
     return np.broadcast_to(np.array(gusts.intensity, dtype=np.float64), 3)
 
 
-def check(notes: FindingCollector, parts: Mapping[str, Any], n: int | None) -> None:
+def check(collector: FindingCollector, parts: Mapping[str, Any], n: int | None) -> None:
     """Find the errors in [disturbances]."""
     found: Disturbances | None = parts.get(_TABLE)
     if found is None:
@@ -54,53 +54,53 @@ def check(notes: FindingCollector, parts: Mapping[str, Any], n: int | None) -> N
         given = getattr(found, key)
         if n is not None and isinstance(given, tuple) and len(given) != n:
             problem = f"has {len(given)} entries for {n} agents"
-            notes.add(
+            collector.add(
                 (_TABLE, key), problem, f"give one entry per agent, {n} in all, or a single number"
             )
     drag = found.drag if isinstance(found.drag, tuple) else (found.drag,)
     if (wind > 0 or found.gusts is not None) and not any(d is None or d > 0 for d in drag):
         problem = "without drag, wind and gusts have no effect"
-        notes.add((_TABLE, "drag"), problem, "give a drag > 0 [N s/m] or omit it")
+        collector.add((_TABLE, "drag"), problem, "give a drag > 0 [N s/m] or omit it")
     if found.gusts is not None:
-        _gusts(notes, found.gusts, wind, n)
-    _noise(notes, found)
-    end = latest_end(parts["phases"]) if notes.right((), "phases") else None
+        _gusts(collector, found.gusts, wind, n)
+    _noise(collector, found)
+    end = latest_end(parts["phases"]) if collector.right((), "phases") else None
     if end is not None and math.isnan(
         end
     ):  # automatic durations; checked again when they are known
         end = None
-    _lost(notes, found, parts, n, end)
-    if end is not None and n is not None and not notes.findings:
-        _size(notes, found, wind, n, end)
+    _lost(collector, found, parts, n, end)
+    if end is not None and n is not None and not collector.findings:
+        _size(collector, found, wind, n, end)
 
 
-def _noise(notes: FindingCollector, found: Disturbances) -> None:
+def _noise(collector: FindingCollector, found: Disturbances) -> None:
     """Check that noise has an effect, and that only sampled flights have delays."""
     noise, where = found.noise, (_TABLE, "noise")
     keys = ("position", "velocity", "delay", "dropped")
     silent = noise is not None and not any(getattr(noise, key) for key in keys)
-    if silent and notes.right(where, *keys):
-        notes.add(where, "is zero", "give position [m] or velocity [m/s] > 0")
-    if "vehicle" in notes.data.get("agents", {}):
+    if silent and collector.right(where, *keys):
+        collector.add(where, "is zero", "give position [m] or velocity [m/s] > 0")
+    if "vehicle" in collector.data.get("agents", {}):
         return
     remedy = "give the agents a vehicle; model = 'point' flies points with sampled control"
     for key in ("downwash", "ground_effect"):
         if getattr(found, key):
-            notes.add((_TABLE, key), "acts on vehicles with rotors alone", "name a vehicle")
+            collector.add((_TABLE, key), "acts on vehicles with rotors alone", "name a vehicle")
     late = [] if noise is None else [k for k in ("delay", "dropped") if getattr(noise, k)]
     for key in late:
-        notes.add((*where, key), "needs sampled control, which only vehicles have", remedy)
+        collector.add((*where, key), "needs sampled control, which only vehicles have", remedy)
     if found.links is not None:
         problem = "needs sampled control, which only vehicles have"
-        notes.add((_TABLE, "links"), problem, remedy, None)
+        collector.add((_TABLE, "links"), problem, remedy, None)
 
 
-def _gusts(notes: FindingCollector, gusts: Gusts, wind: float, n: int | None) -> None:
+def _gusts(collector: FindingCollector, gusts: Gusts, wind: float, n: int | None) -> None:
     def wrong(key: str, problem: str, remedy: str) -> None:
-        if notes.right(_GUSTS, key):
-            notes.add((*_GUSTS, key), problem, remedy)
+        if collector.right(_GUSTS, key):
+            collector.add((*_GUSTS, key), problem, remedy)
 
-    if not notes.right(_GUSTS, "model"):
+    if not collector.right(_GUSTS, "model"):
         return
     if gusts.model == "first-order":
         if gusts.time_scale is None:
@@ -119,7 +119,7 @@ def _gusts(notes: FindingCollector, gusts: Gusts, wind: float, n: int | None) ->
             wrong("length", "is given together with altitude", "give one of them")
         if gusts.length is None and gusts.altitude is None:
             wrong("length", "is missing", "add length [m], or altitude [m] to derive it")
-        if gusts.airspeed is None and wind == 0 and notes.right((_TABLE,), "wind"):
+        if gusts.airspeed is None and wind == 0 and collector.right((_TABLE,), "wind"):
             problem = "is missing, and there is no wind to replace it"
             wrong("airspeed", problem, "add airspeed [m/s] or wind")
         if gusts.intensity is None and (gusts.altitude is None or wind == 0):
@@ -134,7 +134,7 @@ def _gusts(notes: FindingCollector, gusts: Gusts, wind: float, n: int | None) ->
 
 
 def _lost(
-    notes: FindingCollector,
+    collector: FindingCollector,
     found: Disturbances,
     parts: Mapping[str, Any],
     n: int | None,
@@ -144,17 +144,17 @@ def _lost(
     for k, lost in enumerate(found.lost):
         path = (_TABLE, "lost", k)
         if n is not None and not 1 <= lost.agent <= n:
-            notes.add(
+            collector.add(
                 (*path, "agent"), "there is no such agent", f"agents are numbered from 1 to {n}"
             )
         elif lost.agent in seen:
-            notes.add((*path, "agent"), "is lost twice", "remove one of the two")
+            collector.add((*path, "agent"), "is lost twice", "remove one of the two")
         if end is not None and lost.time >= end:
             problem = f"is not before the end of the mission at {end:g} s"
-            notes.add((*path, "time"), problem, "give an earlier time or remove the entry")
+            collector.add((*path, "time"), problem, "give an earlier time or remove the entry")
         seen.add(lost.agent)
     if n is not None and len(seen) >= n:
-        notes.add((_TABLE, "lost"), "all vehicles are lost", "keep at least one")
+        collector.add((_TABLE, "lost"), "all vehicles are lost", "keep at least one")
     for key, possible in (("architecture", "local"), ("formulation", "inertial")):
         if found.lost and parts.get(key) == "body":
             problem = (
@@ -162,16 +162,20 @@ def _lost(
                 if key == "formulation"
                 else "architecture = 'body' does not support lost vehicles: its wrench is that of a body of all agents"
             )
-            notes.add((_TABLE, "lost"), problem, f"use {key} = '{possible}'")
+            collector.add((_TABLE, "lost"), problem, f"use {key} = '{possible}'")
 
 
-def _size(notes: FindingCollector, found: Disturbances, wind: float, n: int, end: float) -> None:
+def _size(
+    collector: FindingCollector, found: Disturbances, wind: float, n: int, end: float
+) -> None:
     """Find gusts and noise whose tables would not fit into memory."""
     if found.gusts is not None and 6 * n * end / gust_step(found.gusts, wind) > _MOST_NUMBERS:
         problem = f"would need too much memory for {n} agents over {end:g} s"
         remedy = "increase the scales (time_scale, length) or shorten the flight"
-        notes.add(_GUSTS, problem, remedy, f"{gust_step(found.gusts, wind):.3g} s between samples")
+        collector.add(
+            _GUSTS, problem, remedy, f"{gust_step(found.gusts, wind):.3g} s between samples"
+        )
     if found.noise is not None and 6 * n * end * found.noise.rate > _MOST_NUMBERS:
         problem = f"would need too much memory for {n} agents over {end:g} s"
         remedy = "lower the rate or shorten the flight"
-        notes.add((_TABLE, "noise", "rate"), problem, remedy, found.noise.rate)
+        collector.add((_TABLE, "noise", "rate"), problem, remedy, found.noise.rate)

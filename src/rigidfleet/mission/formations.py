@@ -21,24 +21,26 @@ _SHOWN = 6
 _MOST_CLIQUES = 5e6
 
 
-def check(notes: FindingCollector, n: int | None) -> dict[str, Formation]:
+def check(collector: FindingCollector, n: int | None) -> dict[str, Formation]:
     """Check the formations of `n` agents and return them by name, including those with findings."""
-    tables = notes.data.get("formations", {})
+    tables = collector.data.get("formations", {})
     if not isinstance(tables, dict):
-        notes.add(("formations",), "must be a table", "write [formations.NAME] for each formation")
+        collector.add(
+            ("formations",), "must be a table", "write [formations.NAME] for each formation"
+        )
         return {}
     found = {}
     for name, data in tables.items():
-        form = notes.validate(Formation, data, ("formations", name))
+        form = collector.validate(Formation, data, ("formations", name))
         if form is not None:
             found[name] = form
-            _formation(notes, form, n, ("formations", name))
+            _formation(collector, form, n, ("formations", name))
     return found
 
 
-def sound(notes: FindingCollector, name: str) -> bool:
+def sound(collector: FindingCollector, name: str) -> bool:
     """Whether a formation has no findings."""
-    return notes.right(("formations",), name)
+    return collector.right(("formations",), name)
 
 
 def coincident(points: ArrayLike) -> list[tuple[int, int]]:
@@ -65,19 +67,23 @@ def most_edges(n: int) -> int:
     return max(bounds.EDGES, bounds.EDGES_EACH * n)
 
 
-def _formation(notes: FindingCollector, form: Formation, n: int | None, path: Keys) -> None:
-    right = notes.right(path, "shape", "size", "slots", "distances")
+def _formation(collector: FindingCollector, form: Formation, n: int | None, path: Keys) -> None:
+    right = collector.right(path, "shape", "size", "slots", "distances")
     if form.shape is not None and form.slots is not None:
-        notes.add(
+        collector.add(
             (*path, "slots"), "a shape has its own slots", "give either shape and size or slots"
         )
     if right and form.shape is None and form.size is not None:
-        notes.add((*path, "size"), "there is no shape of this size", "give shape or remove size")
+        collector.add(
+            (*path, "size"), "there is no shape of this size", "give shape or remove size"
+        )
     if right and form.shape is form.slots is form.distances is None:
         problem = "has neither shape nor slots nor distances"
-        notes.add(path, problem, f"give shape and size; shapes: {', '.join(shapes.SHAPES)}", None)
+        collector.add(
+            path, problem, f"give shape and size; shapes: {', '.join(shapes.SHAPES)}", None
+        )
     if form.shape is not None:
-        _shape(notes, form, form.shape, n, path)
+        _shape(collector, form, form.shape, n, path)
     if n is None:
         return
     edges = n * (n - 1) // 2 if form.edges == "complete" else len(form.edges)
@@ -87,68 +93,70 @@ def _formation(notes: FindingCollector, form: Formation, n: int | None, path: Ke
         problem = f"{n:,} agents have {edges:,} edges; the maximum is {most:,}"
         remedy = "use 'neighbours' or a list of pairs; a few more than 3 N - 6 edges hold a shape"
         value = "complete" if form.edges == "complete" else None
-        notes.add((*path, "edges"), problem, remedy, value)
+        collector.add((*path, "edges"), problem, remedy, value)
     if form.slots is not None:
         if len(form.slots) != n:
             problem = f"has {len(form.slots)} slots for {n} agents"
-            notes.add((*path, "slots"), problem, f"give one slot per agent, {n} in all", None)
+            collector.add((*path, "slots"), problem, f"give one slot per agent, {n} in all", None)
         for i, j in coincident(form.slots):
-            notes.add(
+            collector.add(
                 (*path, "slots", j), f"is the same point as slot {i + 1}", "move the slots apart"
             )
-    if notes.right(path, "edges"):
-        _edges(notes, form, n, (*path, "edges"))
-    if form.distances is not None and notes.right(path, "edges", "distances"):
-        _distances(notes, form, form.distances, n, (*path, "distances"))
+    if collector.right(path, "edges"):
+        _edges(collector, form, n, (*path, "edges"))
+    if form.distances is not None and collector.right(path, "edges", "distances"):
+        _distances(collector, form, form.distances, n, (*path, "distances"))
 
 
-def _shape(notes: FindingCollector, form: Formation, shape: str, n: int | None, path: Keys) -> None:
+def _shape(
+    collector: FindingCollector, form: Formation, shape: str, n: int | None, path: Keys
+) -> None:
     if shape not in shapes.SHAPES:
-        notes.add((*path, "shape"), "unknown shape", near_shape(shape))
+        collector.add((*path, "shape"), "unknown shape", near_shape(shape))
     elif form.size is None:
-        if notes.right(path, "size"):
-            notes.add((*path, "size"), "is missing", "add size, the edge length [m]")
+        if collector.right(path, "size"):
+            collector.add((*path, "size"), "is missing", "add size, the edge length [m]")
     elif n is not None:
         try:
             slots = form.slot_array(n)
         except ValueError as error:
             remedy = "change the shape, its size or the number of agents"
-            notes.add((*path, "shape"), str(error), remedy)
+            collector.add((*path, "shape"), str(error), remedy)
             return
         assert slots is not None  # a shape has them
         far = float(np.abs(slots).max())
         if far > bounds.LENGTH.most:
             problem = f"the slots of {n:,} agents extend to {far:.3g} m; the maximum is {bounds.LENGTH.most:g} m"
-            notes.add((*path, "size"), problem, "reduce the size")
+            collector.add((*path, "size"), problem, "reduce the size")
 
 
-def _edges(notes: FindingCollector, form: Formation, n: int, path: Keys) -> None:
+def _edges(collector: FindingCollector, form: Formation, n: int, path: Keys) -> None:
     if isinstance(form.edges, str):
-        _graph(notes, form, n, path)
+        _graph(collector, form, n, path)
         return
     seen: dict[tuple[int, ...], int] = {}
     for k, edge in enumerate(form.edges):
         first = seen.setdefault(tuple(sorted(edge)), k)
         if not all(1 <= agent <= n for agent in edge):
-            notes.add(
+            collector.add(
                 (*path, k), f"has an agent outside 1 to {n}", "correct it; agents count from 1"
             )
         elif edge[0] == edge[1]:
-            notes.add((*path, k), "joins an agent to itself", "join two different agents")
+            collector.add((*path, k), "joins an agent to itself", "join two different agents")
         elif first != k:
-            notes.add((*path, k), f"repeats edge {first + 1}", "remove it and its distance")
+            collector.add((*path, k), f"repeats edge {first + 1}", "remove it and its distance")
 
 
-def _graph(notes: FindingCollector, form: Formation, n: int, path: Keys) -> None:
+def _graph(collector: FindingCollector, form: Formation, n: int, path: Keys) -> None:
     """Check a named graph. All except 'complete' are derived from the slots."""
     above = path[:-1]
     if form.edges != "neighbours" and "reach" in form.model_fields_set:
-        notes.add((*above, "reach"), f"has no effect with edges '{form.edges}'", "remove it")
-    if form.edges == "complete" or not notes.right(above, "shape", "size", "slots"):
+        collector.add((*above, "reach"), f"has no effect with edges '{form.edges}'", "remove it")
+    if form.edges == "complete" or not collector.right(above, "shape", "size", "slots"):
         return
     if form.distances is not None or form.shape is form.slots is None:
         remedy = "list the pairs, or give shape and size and omit distances"
-        notes.add(path, "needs slots, and takes its distances from them", remedy)
+        collector.add(path, "needs slots, and takes its distances from them", remedy)
         return
     slots = form.slot_array(n)
     assert slots is not None  # there are a shape or slots
@@ -156,24 +164,24 @@ def _graph(notes: FindingCollector, form: Formation, n: int, path: Keys) -> None
         many = graphs.count_neighbours(slots, form.reach)
         if many > most_edges(n):
             problem = f"joins {many:,} pairs of {n:,} agents; the maximum is {most_edges(n):,}"
-            notes.add(
+            collector.add(
                 (*above, "reach"), problem, "reduce it; 1.9 includes second neighbours", form.reach
             )
         return
     try:
         graphs.spans_space(slots)
     except ValueError as error:
-        notes.add(path, str(error), "use 'neighbours' or give a list of pairs")
+        collector.add(path, str(error), "use 'neighbours' or give a list of pairs")
 
 
 def _distances(
-    notes: FindingCollector, form: Formation, lengths: Sequence[float], n: int, path: Keys
+    collector: FindingCollector, form: Formation, lengths: Sequence[float], n: int, path: Keys
 ) -> None:
     edges = form.edge_array(n)
     if len(lengths) != len(edges):
         problem = f"has {len(lengths)} entries for {len(edges)} edges"
         order = "12, 13, ..., 23, ..." if form.edges == "complete" else "that of edges"
-        notes.add(path, problem, f"give one per edge, in the order {order}", None)
+        collector.add(path, problem, f"give one per edge, in the order {order}", None)
         return
     # The common neighbours of both ends of an edge are at most the neighbours of either end.
     degree = np.bincount(edges.ravel(), minlength=n)
@@ -192,12 +200,12 @@ def _distances(
         else:
             problem = f"{agent_names(v.agents)} form no tetrahedron (Cayley-Menger < 0): {given} m"
             remedy = "change one of the six (a flat shape needs 7 digits: 5.656854) or give a shape"
-        notes.add(path, problem, remedy, None)
+        collector.add(path, problem, remedy, None)
     if len(found) > _SHOWN:
         problem = f"{len(found) - _SHOWN} more triangles or tetrahedra are impossible"
-        notes.add(path, problem, "correct the ones above first", None)
+        collector.add(path, problem, "correct the ones above first", None)
     if not found:
         try:
             distance_geometry.slots_from_distances(n, edges, lengths)
         except ValueError as error:
-            notes.add(path, str(error), "change them or give shape and size", None)
+            collector.add(path, str(error), "change them or give shape and size", None)

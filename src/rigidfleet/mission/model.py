@@ -72,6 +72,18 @@ class Mission(Contents):
     _made_slots: dict[str, Floats | None] = PrivateAttr(default_factory=dict)
     _made_edges: dict[str, Ints] = PrivateAttr(default_factory=dict)
 
+    def __init__(self, *_: object, **__: object) -> None:
+        """Refuse: keys alone would not be checked as a whole.
+
+        Raises
+        ------
+        TypeError
+        """
+        raise TypeError(
+            "a mission is not made by Mission(...): use load_mission(name or path), Mission.from_toml(text) or"
+            " Mission.from_dict(keys)"
+        )
+
     @classmethod
     def from_toml(cls, text: str, origin: str = "<text>") -> Self:
         """Check a mission given as TOML text; messages call it `origin`.

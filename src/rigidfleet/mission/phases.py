@@ -42,19 +42,21 @@ _MOST_TURNS = 100
 _MOST_NUMBERS = 5e8
 
 
-def check(notes: FindingCollector, parts: Mapping[str, Any], n: int | None) -> tuple[AnyPhase, ...]:
+def check(
+    collector: FindingCollector, parts: Mapping[str, Any], n: int | None
+) -> tuple[AnyPhase, ...]:
     """Check the phases and return them, including those with findings."""
-    found = _phases(notes)
-    _names(notes, found)
-    end, lengths = _times(notes, found)
-    _samples(notes, parts, end, n)
-    _controls(notes, found, lengths)
-    _formations(notes, found, parts, n)
-    _arrivals(notes, found, parts.get("lqr", Lqr()), smooth=_smooth(parts))
+    found = _phases(collector)
+    _names(collector, found)
+    end, lengths = _times(collector, found)
+    _samples(collector, parts, end, n)
+    _controls(collector, found, lengths)
+    _formations(collector, found, parts, n)
+    _arrivals(collector, found, parts.get("lqr", Lqr()), smooth=_smooth(parts))
     for k, p in enumerate(found):
         if p is not None:
-            _smoothness(notes, p, ("phases", k), smooth=_smooth(parts))
-            _automatic(notes, p, ("phases", k), parts)
+            _smoothness(collector, p, ("phases", k), smooth=_smooth(parts))
+            _automatic(collector, p, ("phases", k), parts)
     return tuple(p for p in found if p is not None)
 
 
@@ -70,43 +72,43 @@ def latest_end(phases: Sequence[AnyPhase]) -> float:
     return t
 
 
-def tables(notes: FindingCollector, key: str) -> Sequence[Any]:
+def tables(collector: FindingCollector, key: str) -> Sequence[Any]:
     """Return an array of tables of the mission; empty, with a finding, if it is something else."""
-    found = notes.data.get(key, [])
+    found = collector.data.get(key, [])
     if isinstance(found, list):
         return found
-    notes.add((key,), "must be an array of tables", f"write [[{key}]] above each table")
+    collector.add((key,), "must be an array of tables", f"write [[{key}]] above each table")
     return []
 
 
-def kind(notes: FindingCollector, data: Any, path: Keys, kinds: Mapping[str, type[Any]]) -> Any:
+def kind(collector: FindingCollector, data: Any, path: Keys, kinds: Mapping[str, type[Any]]) -> Any:
     """Return the model for the `kind` of a table, or None with a finding."""
     choice = f"use one of {', '.join(kinds)}"
     if not isinstance(data, dict):
-        notes.add(path, "must be a table", f"write [[{path[0]}]] above it")
+        collector.add(path, "must be a table", f"write [[{path[0]}]] above it")
     elif "kind" not in data:
-        notes.add((*path, "kind"), "is missing", choice)
+        collector.add((*path, "kind"), "is missing", choice)
     elif not isinstance(data["kind"], str) or data["kind"] not in kinds:
-        notes.add((*path, "kind"), "unknown kind", near(data["kind"], kinds) or choice)
+        collector.add((*path, "kind"), "unknown kind", near(data["kind"], kinds) or choice)
     else:
         return kinds[data["kind"]]
     return None
 
 
-def _phases(notes: FindingCollector) -> list[AnyPhase | None]:
+def _phases(collector: FindingCollector) -> list[AnyPhase | None]:
     """Each phase with defaults for name and control; None for a phase that is not valid."""
-    body = notes.data.get("architecture") == "body"
+    body = collector.data.get("architecture") == "body"
     found: list[AnyPhase | None] = []
-    for k, data in enumerate(tables(notes, "phases")):
-        model = kind(notes, data, ("phases", k), KINDS)
+    for k, data in enumerate(tables(collector, "phases")):
+        model = kind(collector, data, ("phases", k), KINDS)
         if model is None:
             found.append(None)
             continue
         control = model.body_control if body else "tracking"
         given = {"name": f"{data['kind']} {k + 1}", "control": control} | data
-        found.append(notes.validate(model, given, ("phases", k)))
-    if not found and notes.right((), "phases"):
-        notes.add(
+        found.append(collector.validate(model, given, ("phases", k)))
+    if not found and collector.right((), "phases"):
+        collector.add(
             ("phases",),
             "there is no phase",
             "add [[phases]], one for each step of the flight",
@@ -115,17 +117,17 @@ def _phases(notes: FindingCollector) -> list[AnyPhase | None]:
     return found
 
 
-def _names(notes: FindingCollector, found: Sequence[AnyPhase | None]) -> None:
+def _names(collector: FindingCollector, found: Sequence[AnyPhase | None]) -> None:
     seen: dict[str, int] = {}
     for k, p in enumerate(found):
         first = seen.setdefault(p.name, k) if p is not None else k
         if p is not None and first != k:
             problem = f"is also the name of phase {first + 1}"
-            notes.add(("phases", k, "name"), problem, "give each phase its own name", p.name)
+            collector.add(("phases", k, "name"), problem, "give each phase its own name", p.name)
 
 
 def _times(
-    notes: FindingCollector, found: Sequence[AnyPhase | None]
+    collector: FindingCollector, found: Sequence[AnyPhase | None]
 ) -> tuple[float | None, list[float | None]]:
     """Check that each phase has one ending and that ends increase.
 
@@ -136,13 +138,13 @@ def _times(
     last: float | None = 0.0
     for k, p in enumerate(found):
         path = ("phases", k)
-        if p is None or not notes.right(path, *_ENDINGS):
+        if p is None or not collector.right(path, *_ENDINGS):
             first = last = None
             continue
         endings = [e for e in _ENDINGS if getattr(p, e) is not None]
         if len(endings) != 1:
             problem = f"has two endings, {' and '.join(endings)}" if endings else "has no ending"
-            notes.add(
+            collector.add(
                 path,
                 problem,
                 f"give exactly one of {', '.join(_ENDINGS)} (until is a mission time)",
@@ -153,7 +155,7 @@ def _times(
         longest: Any = p.duration
         if p.until is not None:
             if first is not None and last is not None:
-                _in_order(notes, p.until, first, last, path)
+                _in_order(collector, p.until, first, last, path)
                 longest = p.until - first
             first = last = p.until
         else:
@@ -161,7 +163,7 @@ def _times(
                 longest = p.settle.timeout
                 if p.settle.timeout <= p.settle.dwell:
                     problem = "times out before dwell has passed"
-                    notes.add((*path, "settle"), problem, "give a timeout longer than dwell")
+                    collector.add((*path, "settle"), problem, "give a timeout longer than dwell")
             if longest == AUTO:
                 first = last = longest = None
             shortest = p.settle.dwell if p.settle is not None else longest
@@ -170,53 +172,57 @@ def _times(
         lengths[k] = longest
         travel = seconds(p.steering.travel or 0.0) if p.steering is not None else 0.0
         if p.shaping is not None:
-            _blend(notes, p.shaping, longest, path)
+            _blend(collector, p.shaping, longest, path)
         elif travel and longest is not None and travel > longest * (1 + 1e-9):
             problem = f"is longer than the phase, which ends after {longest:g} s"
-            notes.add((*path, "travel"), problem, "reduce travel or end the phase later", travel)
+            collector.add(
+                (*path, "travel"), problem, "reduce travel or end the phase later", travel
+            )
     return last, lengths
 
 
-def _in_order(notes: FindingCollector, until: float, first: float, last: float, path: Keys) -> None:
+def _in_order(
+    collector: FindingCollector, until: float, first: float, last: float, path: Keys
+) -> None:
     if until <= first:
         problem = f"the phase would end before it starts at {first:g} s"
         remedy = "until is a mission time that increases from phase to phase; duration is a length of time"
-        notes.add((*path, "until"), problem, remedy)
+        collector.add((*path, "until"), problem, remedy)
     elif until <= last:
         problem = (
             f"the phase may start as late as {last:g} s, when an earlier phase takes long to settle"
         )
         remedy = "end it by duration, or reduce the timeout of the earlier phase"
-        notes.add((*path, "until"), problem, remedy)
+        collector.add((*path, "until"), problem, remedy)
 
 
-def _blend(notes: FindingCollector, p: Shaping, longest: float | None, path: Keys) -> None:
-    if not notes.right(path, "reference", "blend", *_ENDINGS):
+def _blend(collector: FindingCollector, p: Shaping, longest: float | None, path: Keys) -> None:
+    if not collector.right(path, "reference", "blend", *_ENDINGS):
         return
     if p.reference == "step":
         if "blend" in p.model_fields_set:
             remedy = "remove it, or use reference = 'shape' or 'distances'"
-            notes.add((*path, "blend"), "has no effect with reference 'step'", remedy)
+            collector.add((*path, "blend"), "has no effect with reference 'step'", remedy)
     else:
-        _blended(notes, seconds(p.blend), longest, path)
+        _blended(collector, seconds(p.blend), longest, path)
 
 
-def _blended(notes: FindingCollector, blend: float, longest: float | None, path: Keys) -> None:
+def _blended(collector: FindingCollector, blend: float, longest: float | None, path: Keys) -> None:
     if longest is not None and blend > longest * (1 + 1e-9):
         problem = f"is longer than the phase, which lasts {longest:g} s"
         remedy = f"use blend <= {longest:g} or end the phase later"
-        notes.add((*path, "blend"), problem, remedy, blend)
+        collector.add((*path, "blend"), problem, remedy, blend)
 
 
 def _samples(
-    notes: FindingCollector, parts: Mapping[str, Any], end: float | None, n: int | None
+    collector: FindingCollector, parts: Mapping[str, Any], end: float | None, n: int | None
 ) -> None:
     step = parts.get("output_step")
-    if not step or not end or not notes.right((), "output_step", "formations"):
+    if not step or not end or not collector.right((), "output_step", "formations"):
         return
     forms = parts["formations"].values()
     # One per step, and two at each change of phase.
-    switches = 2 * len(tables(notes, "phases"))
+    switches = 2 * len(tables(collector, "phases"))
     samples = end / step + switches
     about = {"complete": (n or 0) ** 2 // 2, "neighbours": 9 * (n or 0)}
     edges = sum(
@@ -226,12 +232,12 @@ def _samples(
     numbers = 30 * (n or 0) + 8 * edges + 50
     if step > end:
         problem = f"is longer than the mission, which ends at {end:g} s"
-        notes.add(("output_step",), problem, "reduce it", step)
+        collector.add(("output_step",), problem, "reduce it", step)
     elif end / step > _MOST_SAMPLES:
         problem = (
             f"the result would have {end / step:.2g} samples; the maximum is {_MOST_SAMPLES:,}"
         )
-        notes.add(("output_step",), problem, f"use {end / _MOST_SAMPLES:.2g} s or more", step)
+        collector.add(("output_step",), problem, f"use {end / _MOST_SAMPLES:.2g} s or more", step)
     elif samples * numbers > _MOST_NUMBERS:
         problem = f"the result would have {samples * numbers * 8e-9:.2g} GB; the maximum is {_MOST_NUMBERS * 8e-9:g} GB"
         least = _MOST_NUMBERS / numbers - switches
@@ -240,80 +246,80 @@ def _samples(
             if least > 0
             else "use fewer agents, edges or phases"
         )
-        notes.add(("output_step",), problem, remedy, step)
+        collector.add(("output_step",), problem, remedy, step)
 
 
 def _controls(
-    notes: FindingCollector,
+    collector: FindingCollector,
     found: Sequence[AnyPhase | None],
     lengths: Sequence[float | None],
 ) -> None:
     """Check the control of each phase, and the conditions of its kind."""
-    local = notes.data.get("architecture", "local") == "local"
+    local = collector.data.get("architecture", "local") == "local"
     for k, p in enumerate(found):
         path = ("phases", k)
-        if p is None or not notes.right(path, "control"):
+        if p is None or not collector.right(path, "control"):
             continue
         if p.control == "body" and local:
             remedy = "use control = 'tracking', or architecture = 'body' for the mission"
-            notes.add((*path, "control"), "requires architecture = 'body'", remedy)
+            collector.add((*path, "control"), "requires architecture = 'body'", remedy)
         if p.control == "open" and p.moves:
-            kind_name = notes.data["phases"][k]["kind"]
+            kind_name = collector.data["phases"][k]["kind"]
             problem = f"kind '{kind_name}' needs feedback control"
             others = " or 'body'" if p.body_control == "body" else ""
-            notes.add((*path, "control"), problem, f"use control = 'tracking'{others}")
+            collector.add((*path, "control"), problem, f"use control = 'tracking'{others}")
         if p.control != "open" and any(p.input_force):
             problem = f"has no effect with control '{p.control}'"
-            notes.add((*path, "input_force"), problem, "remove it or use control = 'open'")
-        if own := _OWN.get(notes.data["phases"][k]["kind"]):
-            own(notes, p, path, lengths[k])
+            collector.add((*path, "input_force"), problem, "remove it or use control = 'open'")
+        if own := _OWN.get(collector.data["phases"][k]["kind"]):
+            own(collector, p, path, lengths[k])
 
 
-def _turn(notes: FindingCollector, p: Turn, path: Keys, _: float | None) -> None:
+def _turn(collector: FindingCollector, p: Turn, path: Keys, _: float | None) -> None:
     """Check that a turn has a target angle."""
-    if p.attitude_deg is None and notes.right(path, *ANGLES):
+    if p.attitude_deg is None and collector.right(path, *ANGLES):
         remedy = f"give at least one of {', '.join(reversed(ANGLES))}"
-        notes.add(path, "has no target angle", remedy, p.name)
+        collector.add(path, "has no target angle", remedy, p.name)
 
 
-def _establish(notes: FindingCollector, p: Establish, path: Keys, _: float | None) -> None:
+def _establish(collector: FindingCollector, p: Establish, path: Keys, _: float | None) -> None:
     """Check that a commanded attitude has an effect."""
-    if not notes.right(path, "attitude", *ANGLES):
+    if not collector.right(path, "attitude", *ANGLES):
         return
-    given = notes.data["phases"][path[1]]
+    given = collector.data["phases"][path[1]]
     angles = [key for key in ANGLES if key in given]
     if p.attitude == "free" and angles:
         problem = "has no effect with attitude = 'free'"
-        notes.add((*path, angles[0]), problem, "remove one of them")
+        collector.add((*path, angles[0]), problem, "remove one of them")
     elif p.control != "tracking" and (angles or given.get("attitude") == "drawn"):
         problem = f"has no effect with control '{p.control}', which leaves the attitude free"
         remedy = (
             "use control = 'tracking', or remove this key and turn the formation in a later phase"
         )
-        notes.add((*path, *(angles or ["attitude"])[:1]), problem, remedy)
+        collector.add((*path, *(angles or ["attitude"])[:1]), problem, remedy)
 
 
-def _orbit(notes: FindingCollector, p: Orbit, path: Keys, longest: float | None) -> None:
+def _orbit(collector: FindingCollector, p: Orbit, path: Keys, longest: float | None) -> None:
     """Check that an orbit has tracked slots, a rate within bounds, and an end."""
-    if p.control == "body" and notes.right(path, "control"):
+    if p.control == "body" and collector.right(path, "control"):
         problem = "an orbit cannot be flown by a wrench on the virtual body"
-        notes.add((*path, "control"), problem, "use control = 'tracking'")
-    if p.settle is not None and notes.right(path, *_ENDINGS):
-        notes.add((*path, "settle"), "an orbit never settles", "end it by duration or until")
-    if notes.right(path, "blend", *_ENDINGS):
-        _blended(notes, seconds(p.blend), longest, path)
-    if not notes.right(path, "rate_deg_s", "radius"):
+        collector.add((*path, "control"), problem, "use control = 'tracking'")
+    if p.settle is not None and collector.right(path, *_ENDINGS):
+        collector.add((*path, "settle"), "an orbit never settles", "end it by duration or until")
+    if collector.right(path, "blend", *_ENDINGS):
+        _blended(collector, seconds(p.blend), longest, path)
+    if not collector.right(path, "rate_deg_s", "radius"):
         return
     rate, where = abs(np.deg2rad(p.rate_deg_s)), (*path, "rate_deg_s")
     turns = rate * (longest or 0.0) / (2 * np.pi)
     if rate == 0.0:
-        notes.add(where, "must not be 0", "give a rate, or use kind = 'fly' or 'hold'")
+        collector.add(where, "must not be 0", "give a rate, or use kind = 'fly' or 'hold'")
     elif p.radius * rate > bounds.SPEED.most or p.radius * rate**2 > bounds.ACCELERATION.most:
         problem = f"requires {p.radius * rate:.2g} m/s and {p.radius * rate**2:.2g} m/s^2, beyond the bounds"
-        notes.add(where, problem, "use a lower rate or a smaller radius")
+        collector.add(where, problem, "use a lower rate or a smaller radius")
     elif turns > _MOST_TURNS:
         problem = f"gives {turns:.4g} turns in {longest:g} s; the maximum is {_MOST_TURNS}"
-        notes.add(where, problem, "use a lower rate or several phases")
+        collector.add(where, problem, "use a lower rate or several phases")
 
 
 #: Checks of single kinds. Arguments: the findings, the phase, its path, its maximum duration [s] or None.
@@ -325,7 +331,7 @@ _OWN: dict[str, Callable[[FindingCollector, Any, Keys, float | None], None]] = {
 
 
 def _formations(
-    notes: FindingCollector,
+    collector: FindingCollector,
     found: Sequence[AnyPhase | None],
     parts: Mapping[str, Any],
     n: int | None,
@@ -335,49 +341,53 @@ def _formations(
     held: str | None = ""  # name of the formation held; "": initial positions; None: unknown
     for k, p in enumerate(found):
         path = ("phases", k)
-        if p is None or not notes.right(path, "formation", "reference"):
+        if p is None or not collector.right(path, "formation", "reference"):
             held = None if p is None or p.shaping is not None else held
             continue
         if (shaping := p.shaping) is not None:
-            _exists(notes, shaping.formation, path)
+            _exists(collector, shaping.formation, path)
             form = forms.get(shaping.formation)
             if p.establishing is None and held == "":
                 problem = "no formation has been established yet"
                 remedy = "use kind = 'establish' for the first formation"
-                notes.add((*path, "kind"), problem, remedy)
-            drawn = notes.data["phases"][k].get("attitude") == "drawn"
+                collector.add((*path, "kind"), problem, remedy)
+            drawn = collector.data["phases"][k].get("attitude") == "drawn"
             if (
                 drawn
                 and form is not None
                 and not form.knows_slots
-                and notes.right(path, "attitude")
+                and collector.right(path, "attitude")
             ):
                 problem = f"formation '{shaping.formation}' is given by distances alone, which have no axes"
                 remedy = "remove it, give the formation slots, or command an attitude by yaw_deg"
-                notes.add((*path, "attitude"), problem, remedy)
-            if n is not None and form is not None and sound(notes, shaping.formation):
-                _blendable(notes, shaping, form, n, path)
+                collector.add((*path, "attitude"), problem, remedy)
+            if n is not None and form is not None and sound(collector, shaping.formation):
+                _blendable(collector, shaping, form, n, path)
                 if held == "" and "agents" in parts:
-                    _reachable(notes, shaping, form, parts["agents"], path)
+                    _reachable(collector, shaping, form, parts["agents"], path)
             held = shaping.formation
         form = forms.get(held) if held else None
-        tracked = p.control == "tracking" and notes.right(path, "control")
-        if not tracked or n is None or form is None or not held or not sound(notes, held):
+        tracked = p.control == "tracking" and collector.right(path, "control")
+        if not tracked or n is None or form is None or not held or not sound(collector, held):
             continue
         if form.slot_array(n) is None:
             problem = f"formation '{held}' has no slots to track"
             remedy = f"give formations.{toml_key(held)} a shape or slots, or change control"
-            notes.add((*path, "control"), problem, remedy, p.control)
+            collector.add((*path, "control"), problem, remedy, p.control)
 
 
-def _exists(notes: FindingCollector, name: str, path: Keys) -> None:
-    known = notes.data.get("formations", {})
+def _exists(collector: FindingCollector, name: str, path: Keys) -> None:
+    known = collector.data.get("formations", {})
     if isinstance(known, dict) and name not in known:
         names = f"formations: {', '.join(known)}" if known else "add a table [formations.NAME]"
-        notes.add((*path, "formation"), "there is no such formation", near(name, known) or names)
+        collector.add(
+            (*path, "formation"), "there is no such formation", near(name, known) or names
+        )
 
 
-def _blendable(notes: FindingCollector, p: Shaping, form: Formation, n: int, path: Keys) -> None:
+def _blendable(
+    collector: FindingCollector, p: Shaping, form: Formation, n: int, path: Keys
+) -> None:
     """Check that a formation can be reached by blending slots: it has slots, and distances that agree with them."""
     if p.reference != "shape":
         return
@@ -385,21 +395,21 @@ def _blendable(notes: FindingCollector, p: Shaping, form: Formation, n: int, pat
     if slots is None:
         problem = f"formation '{p.formation}' has no slots to blend"
         remedy = "give it a shape or slots, or use reference = 'distances'"
-        notes.add((*path, "reference"), problem, remedy, p.reference)
+        collector.add((*path, "reference"), problem, remedy, p.reference)
     elif form.distances is not None:
         edges = form.edge_array(n)
         between = distance_geometry.distances(slots, edges)
         for k in np.flatnonzero(np.abs(between - form.distances) > 1e-3 * between):
             problem = f"the slots of {agent_names(edges[k])} are {between[k]:.7g} m apart"
             remedy = f"correct it, or use reference = 'distances' in phase {p.name}"
-            notes.add(("formations", p.formation, "distances", int(k)), problem, remedy)
+            collector.add(("formations", p.formation, "distances", int(k)), problem, remedy)
 
 
 def _reachable(
-    notes: FindingCollector, p: Shaping, form: Formation, agents: Agents, path: Keys
+    collector: FindingCollector, p: Shaping, form: Formation, agents: Agents, path: Keys
 ) -> None:
     """Find starts on a line or plane: forces along the edges cannot move the agents out of it."""
-    if p.control != "open" or not notes.right(path, "control", "input_force"):
+    if p.control != "open" or not collector.right(path, "control", "input_force"):
         return
     if any(p.input_force) and len(set(agents.mass)) > 1:
         return  # equal forces accelerate unequal masses differently
@@ -410,82 +420,82 @@ def _reachable(
         where = ("point", "line", "plane")[start]
         problem = f"all agents start on one {where}; forces between them cannot move them off it"
         remedy = f"move one agent off the {where} or use control = 'tracking'"
-        notes.add((*path, "control"), problem, remedy, p.control)
+        collector.add((*path, "control"), problem, remedy, p.control)
 
 
 def _smooth(parts: Mapping[str, Any]) -> bool:
     return parts.get("smoothness") == "jerk"
 
 
-def _smoothness(notes: FindingCollector, p: AnyPhase, path: Keys, *, smooth: bool) -> None:
+def _smoothness(collector: FindingCollector, p: AnyPhase, path: Keys, *, smooth: bool) -> None:
     """Check that a smooth mission can be smooth, and that others use nothing that only smooth ones have."""
-    if not notes.right((), "smoothness"):
+    if not collector.right((), "smoothness"):
         return
     if not smooth:
         for key in [*p.automatic, *(["through"] if getattr(p, "through", ()) else [])]:
             problem = "needs a smooth mission" + (" to have a least time" if key in TIMES else "")
-            notes.add((*path, key), problem, "add smoothness = 'jerk' at the top of the mission")
+            collector.add((*path, key), problem, "add smoothness = 'jerk' at the top of the mission")
         return
-    if p.control == "body" and notes.right(path, "control"):
+    if p.control == "body" and collector.right(path, "control"):
         problem = "has regulators of its own, which jump at a switch; smoothness = 'jerk' needs control = 'tracking'"
         remedy = "use control = 'tracking', or remove smoothness"
-        notes.add((*path, "control"), problem, remedy, p.control)
+        collector.add((*path, "control"), problem, remedy, p.control)
     shaping = p.shaping
     if shaping is not None and shaping.reference == "step" and p.control == "tracking":
         problem = "jumps, but the mission has smoothness = 'jerk'"
-        notes.add((*path, "reference"), problem, "use reference = 'shape' or 'distances'")
+        collector.add((*path, "reference"), problem, "use reference = 'shape' or 'distances'")
     through = [at.time for at in getattr(p, "through", ())]
     given = [time for time in through if time is not None]
-    if given and notes.right(path, "through"):
-        _through(notes, p, path, len(through), given)
+    if given and collector.right(path, "through"):
+        _through(collector, p, path, len(through), given)
 
 
 def _through(
-    notes: FindingCollector, p: AnyPhase, path: Keys, points: int, given: Sequence[float]
+    collector: FindingCollector, p: AnyPhase, path: Keys, points: int, given: Sequence[float]
 ) -> None:
     """Check the times of points to pass."""
     where = (*path, "through")
     steering = p.steering
     arrival = (steering.travel if steering is not None else None) or p.duration
     if len(given) < points:
-        notes.add(
+        collector.add(
             where, "has points with a time and points without one", "give all times or none", None
         )
     elif any(b <= a for a, b in itertools.pairwise(given)):
-        notes.add(where, "times must increase from point to point", "order them", None)
+        collector.add(where, "times must increase from point to point", "order them", None)
     elif p.automatic:
-        notes.add(where, "has times, but the arrival is automatic", "remove the times", None)
+        collector.add(where, "has times, but the arrival is automatic", "remove the times", None)
     elif isinstance(arrival, float) and given[-1] >= arrival:
         problem = f"passes its last point at {given[-1]:g} s, but arrives at {arrival:g} s"
-        notes.add(where, problem, "pass it earlier or arrive later", None)
+        collector.add(where, problem, "pass it earlier or arrive later", None)
 
 
-def _automatic(notes: FindingCollector, p: AnyPhase, path: Keys, parts: Mapping[str, Any]) -> None:
+def _automatic(collector: FindingCollector, p: AnyPhase, path: Keys, parts: Mapping[str, Any]) -> None:
     """Check that times that follow from the limits have limits to follow from."""
-    keys = [key for key in p.automatic if notes.right(path, key)]
+    keys = [key for key in p.automatic if collector.right(path, key)]
     if not keys or not _smooth(parts):
         return
     where = (*path, keys[0])
     if p.control != "tracking":
         problem = f"needs tracked slots to have a least time, not control '{p.control}'"
-        notes.add(where, problem, "use control = 'tracking', or give a time")
+        collector.add(where, problem, "use control = 'tracking', or give a time")
     if p.duration == AUTO and p.steering is None and p.shaping is None:
-        problem = f"a phase of kind '{notes.data['phases'][path[1]]['kind']}' has no least duration"
-        notes.add((*path, "duration"), problem, "give a duration")
+        problem = f"a phase of kind '{collector.data['phases'][path[1]]['kind']}' has no least duration"
+        collector.add((*path, "duration"), problem, "give a duration")
     if p.duration == AUTO and p.steering is not None and p.steering.travel is not None:
         problem = "has no effect with duration = 'auto', which ends the phase at the arrival"
-        notes.add((*path, "travel"), problem, "remove one of them")
+        collector.add((*path, "travel"), problem, "remove one of them")
     limits, agents = parts.get("limits", Limits()), parts.get("agents")
     bounded = [limits.speed, limits.acceleration, limits.jerk, limits.tilt_deg]
     limited = agents is None or all(math.isfinite(f) for f in agents.thrust_limit)
-    if not limited and all(limit is None for limit in bounded) and notes.right((), "limits"):
+    if not limited and all(limit is None for limit in bounded) and collector.right((), "limits"):
         problem = "needs a limit that bounds it, and the mission has none"
         remedy = "give limits.speed, acceleration, jerk or tilt_deg, or agents.thrust_limit"
-        notes.add(where, problem, remedy)
+        collector.add(where, problem, remedy)
 
 
 def _arrivals(
-    notes: FindingCollector, found: Sequence[AnyPhase | None], lqr: Lqr, *, smooth: bool
+    collector: FindingCollector, found: Sequence[AnyPhase | None], lqr: Lqr, *, smooth: bool
 ) -> None:
     """Check that a leg with a finite horizon has a time of arrival."""
     for k, p in enumerate(found):
@@ -494,11 +504,11 @@ def _arrivals(
             continue
         if smooth and p is not None and p.control == "tracking":
             problem = "a smooth way needs a time of arrival"
-            notes.add(
+            collector.add(
                 ("phases", k, "settle"), problem, "give travel, or end by until or duration", None
             )
             continue
-        if not notes.right((), "lqr"):
+        if not collector.right((), "lqr"):
             continue
         for key, weights, used in (
             ("lqr", lqr, "position" in steering.meets),
@@ -507,4 +517,4 @@ def _arrivals(
             if used and weights.horizon == "finite":
                 problem = f"the finite horizon of {key} needs a time of arrival"
                 remedy = f"give travel, end by until or duration, or use {key}.horizon = 'infinite'"
-                notes.add(("phases", k, "settle"), problem, remedy, None)
+                collector.add(("phases", k, "settle"), problem, remedy, None)

@@ -69,7 +69,7 @@ def _from_zero(bound: Bound) -> Any:
 
 Coordinate = Annotated[float, Strict(), _signed(LENGTH)]
 Length = Annotated[float, Strict(), _positive(LENGTH)]
-Room = Annotated[float, Strict(), _from_zero(LENGTH)]
+LengthOrZero = Annotated[float, Strict(), _from_zero(LENGTH)]
 Time = Annotated[float, Strict(), _positive(TIME)]
 Dwell = Annotated[float, Strict(), _from_zero(TIME)]
 Speed = Annotated[float, Strict(), _positive(SPEED)]
@@ -292,7 +292,7 @@ class Agents(Part):
     velocity: tuple[Velocity, ...] = Field(
         (), description="initial velocity of each agent [m/s]; default: at rest"
     )
-    radius: Annotated[tuple[Room, ...], _number_or_list(0)] = Field(
+    radius: Annotated[tuple[LengthOrZero, ...], _number_or_list(0)] = Field(
         (0.25,),
         description="radius of the sphere around an agent that must not touch anything [m]: a number or a list",
     )
@@ -558,10 +558,10 @@ class Limits(Part):
         description="maximum tilt of the thrust that the reference needs, from the vertical [deg]; kept by the plan of "
         "a smooth mission",
     )
-    separation: Room | None = Field(
+    separation: LengthOrZero | None = Field(
         None, description="minimum separation of agents [m]: centre distance minus radii"
     )
-    separation_below: Room | None = Field(
+    separation_below: LengthOrZero | None = Field(
         None,
         description="minimum separation from an agent straight below [m]: height minus radii (downwash)",
     )
@@ -617,7 +617,7 @@ class Gusts(Part):
 class Noise(Part):
     """Measurement of each vehicle's own state: normal, independent noise, sampled at a fixed rate, and its delay."""
 
-    position: Room = Field(
+    position: LengthOrZero = Field(
         0.0, description="standard deviation of each component of the measured position [m]"
     )
     velocity: Spread = Field(

@@ -184,55 +184,55 @@ def resolve(vehicle: Vehicle) -> VehicleModel:
     return replace(found, thrust_limit=limit)
 
 
-def check(notes: FindingCollector) -> dict[str, Vehicle]:
+def check(collector: FindingCollector) -> dict[str, Vehicle]:
     """Validate the tables [vehicles.NAME]; invalid ones are left out."""
-    tables = notes.data.get("vehicles", {})
+    tables = collector.data.get("vehicles", {})
     if not isinstance(tables, dict):
-        notes.add(("vehicles",), "is not a table", "write tables [vehicles.NAME]")
+        collector.add(("vehicles",), "is not a table", "write tables [vehicles.NAME]")
         return {}
     found = {}
     for name, data in tables.items():
         path = ("vehicles", name)
         if not isinstance(data, dict):
-            notes.add(path, "is not a table", f"write a table [vehicles.{name}]")
+            collector.add(path, "is not a table", f"write a table [vehicles.{name}]")
             continue
-        vehicle = notes.validate(Vehicle, data, path)
-        if vehicle is not None and _sound(notes, vehicle, path):
+        vehicle = collector.validate(Vehicle, data, path)
+        if vehicle is not None and _sound(collector, vehicle, path):
             found[name] = vehicle
     return found
 
 
-def _sound(notes: FindingCollector, vehicle: Vehicle, path: tuple[str, ...]) -> bool:
+def _sound(collector: FindingCollector, vehicle: Vehicle, path: tuple[str, ...]) -> bool:
     """Whether the keys of a table suit its model, and its vehicle can hover."""
-    before = len(notes.findings)
+    before = len(collector.findings)
     if vehicle.model == "point":
         for key in Vehicle.model_fields:
             if key not in ("model", "mass", *_OF_POINTS) and getattr(vehicle, key) is not None:
-                notes.add(
+                collector.add(
                     (*path, key), "has no effect on a point", "remove it, or name a quadrotor"
                 )
         if vehicle.mass is None:
-            notes.add(path, "a point needs a mass", "add mass [kg]")
-        return len(notes.findings) == before
+            collector.add(path, "a point needs a mass", "add mass [kg]")
+        return len(collector.findings) == before
     for key, other in zip(_OF_POINTS, ("thrust_coefficient", "rotor_drag"), strict=True):
         if getattr(vehicle, key) is not None:
             remedy = f"remove it; a quadrotor has {other}"
-            notes.add((*path, key), "is for points alone", remedy)
-    if len(notes.findings) > before:
+            collector.add((*path, key), "is for points alone", remedy)
+    if len(collector.findings) > before:
         return False
     found = resolve(vehicle)
     low, high = found.rotor_speed
     if low >= high:
-        notes.add((*path, "rotor_speed"), "the least speed is not below the greatest", "swap them")
+        collector.add((*path, "rotor_speed"), "the least speed is not below the greatest", "swap them")
     elif found.thrust_limit <= found.mass * _GRAVITY:
         problem = (
             f"cannot hover: its four rotors give {found.thrust_limit:.3g} N, its weight is "
             f"{found.mass * _GRAVITY:.3g} N"
         )
-        notes.add(path, problem, "reduce mass, or raise thrust_coefficient or rotor_speed", None)
+        collector.add(path, problem, "reduce mass, or raise thrust_coefficient or rotor_speed", None)
     elif low >= found.hover_speed:
         problem = f"the least speed is above the speed in hover, {found.hover_speed:.4g} rad/s"
-        notes.add((*path, "rotor_speed"), problem, "reduce it")
+        collector.add((*path, "rotor_speed"), problem, "reduce it")
     k_R, k_omega = found.attitude_gains
     slowest = max(found.motor_time)
     # Routh's criterion of tau s^3 + s^2 + k_omega s + k_R.
@@ -240,45 +240,45 @@ def _sound(notes: FindingCollector, vehicle: Vehicle, path: tuple[str, ...]) -> 
         problem = (
             f"is unstable with motors of {slowest:g} s: k_omega must exceed {slowest * k_R:.4g} /s"
         )
-        notes.add((*path, "attitude_gains"), problem, "raise k_omega or lower k_R")
-    return len(notes.findings) == before
+        collector.add((*path, "attitude_gains"), problem, "raise k_omega or lower k_R")
+    return len(collector.findings) == before
 
 
-def equipped(notes: FindingCollector, agents: Any, vehicles: Mapping[str, Vehicle]) -> Any:
+def equipped(collector: FindingCollector, agents: Any, vehicles: Mapping[str, Vehicle]) -> Any:
     """The table [agents], with masses and thrust limits of its vehicles; None if they cannot be known."""
     if not isinstance(agents, dict) or "vehicle" not in agents:
         if vehicles and isinstance(agents, dict):
             names = " or ".join(f"'{name}'" for name in list(vehicles)[:3])
             problem = "no agent flies any of the vehicles"
-            notes.add(("vehicles",), problem, f"add vehicle = {names} to [agents]", None)
+            collector.add(("vehicles",), problem, f"add vehicle = {names} to [agents]", None)
         return agents
-    given, tables = agents["vehicle"], notes.data.get("vehicles", {})
+    given, tables = agents["vehicle"], collector.data.get("vehicles", {})
     n = len(agents["position"]) if isinstance(agents.get("position"), list) else 0
     names = [given] * n if isinstance(given, str) else given
     where = ("agents", "vehicle")
     if not (isinstance(names, list) and names and all(isinstance(name, str) for name in names)):
-        notes.add(where, "is not a name or a list of names", 'write vehicle = "NAME"')
+        collector.add(where, "is not a name or a list of names", 'write vehicle = "NAME"')
         return None
     if len(names) != n:
-        notes.add(where, f"has {len(names)} entries for {n} agents", f"give one name, or {n}", None)
+        collector.add(where, f"has {len(names)} entries for {n} agents", f"give one name, or {n}", None)
         return None
     known = tables if isinstance(tables, dict) else {}
     for name in dict.fromkeys(names):
         if name not in known:
             remedy = near(name, known) or f"add a table [vehicles.{name}]"
-            notes.add(where, f"there is no vehicle '{name}'", remedy, name)
+            collector.add(where, f"there is no vehicle '{name}'", remedy, name)
             return None
     for name in dict.fromkeys(known):
         if name not in names:
-            notes.add(("vehicles", name), "no agent flies it", "remove it", None)
+            collector.add(("vehicles", name), "no agent flies it", "remove it", None)
     for key, where_else in (("mass", "mass"), ("thrust_limit", "its rotors")):
         if key in agents:
             problem = f"is given twice: the vehicle has {where_else}"
             remedy = "remove it here; change the vehicle in [vehicles.NAME]"
-            notes.add(("agents", key), problem, remedy)
+            collector.add(("agents", key), problem, remedy)
     if "saturate" in agents:
         problem = "has no effect: vehicles never give more than they can"
-        notes.add(("agents", "saturate"), problem, "remove it")
+        collector.add(("agents", "saturate"), problem, "remove it")
     if not set(names) <= set(vehicles):
         return None  # has errors of its own
     models = {name: resolve(vehicles[name]) for name in set(names)}
@@ -290,10 +290,10 @@ def equipped(notes: FindingCollector, agents: Any, vehicles: Mapping[str, Vehicl
     return {key: value for key, value in agents.items() if key != "saturate"} | own
 
 
-def check_flight(notes: FindingCollector, parts: Mapping[str, Any]) -> None:
+def check_flight(collector: FindingCollector, parts: Mapping[str, Any]) -> None:
     """Find what vehicles cannot have beside them, and rates of the autopilot that do not go together."""
     autopilot: Autopilot = parts.get("autopilot", Autopilot())
-    flown = "vehicle" in notes.data.get("agents", {})
+    flown = "vehicle" in collector.data.get("agents", {})
     if not flown:
         tracking = parts.get("tracking")
         for key in ("integral", "drag_feedforward") if tracking is not None else ():
@@ -302,23 +302,23 @@ def check_flight(notes: FindingCollector, parts: Mapping[str, Any]) -> None:
                 remedy = (
                     "give the agents a vehicle; model = 'point' flies points with sampled control"
                 )
-                notes.add(("tracking", key), problem, remedy)
-        if "autopilot" in notes.data:
+                collector.add(("tracking", key), problem, remedy)
+        if "autopilot" in collector.data:
             problem = "has no effect on point masses that give any force at once"
-            notes.add(("autopilot",), problem, "remove it, or give the agents a vehicle", None)
+            collector.add(("autopilot",), problem, "remove it, or give the agents a vehicle", None)
         return
     ratio = autopilot.rate / autopilot.formation_rate
     if abs(ratio - round(ratio)) > 1e-9 or ratio < 1.0:
         problem = f"is not a whole part of rate, {autopilot.rate:g} Hz"
         low = autopilot.rate / max(1, math.ceil(ratio))
-        notes.add(("autopilot", "formation_rate"), problem, f"use {low:g} Hz, for example")
+        collector.add(("autopilot", "formation_rate"), problem, f"use {low:g} Hz, for example")
     if parts.get("formulation") == "body":
         problem = "formulation = 'body' is that of point masses"
-        notes.add(("formulation",), problem, "use formulation = 'inertial' with vehicles")
-    disturbances = notes.data.get("disturbances", {})
+        collector.add(("formulation",), problem, "use formulation = 'inertial' with vehicles")
+    disturbances = collector.data.get("disturbances", {})
     if isinstance(disturbances, dict) and "drag" in disturbances:
         problem = "is given twice: the vehicles have a drag of their own"
         remedy = (
             "remove it here; change rotor_drag and body_drag (of a point: drag) in [vehicles.NAME]"
         )
-        notes.add(("disturbances", "drag"), problem, remedy)
+        collector.add(("disturbances", "drag"), problem, remedy)

@@ -53,7 +53,7 @@ class PlannedPhase:
     position, velocity, acceleration : (K, N, 3) [m, m/s, m/s^2]
     exact : whether the agents follow the plan, up to control errors; False if it is an estimate
     leg : the reference from which the paths are computed
-    ways : if the shape changes, the agents' positions (N, 3) [m] before and after it, about the centre, in a frame
+    path_ends : if the shape changes, the agents' positions (N, 3) [m] before and after it, about the centre, in a frame
         that turns with them; in this frame all agents move straight and in step
     shapes : names of the formations before (None if there is none) and after
     """
@@ -65,7 +65,7 @@ class PlannedPhase:
     acceleration: Floats
     exact: bool
     leg: Leg
-    ways: tuple[Floats, Floats] | None = None
+    path_ends: tuple[Floats, Floats] | None = None
     shapes: tuple[str | None, str | None] = (None, None)
 
 
@@ -84,7 +84,7 @@ class Leg(NamedTuple):
 
 def preview(mission: Mission, phases: int | None = None) -> tuple[list[PlannedPhase], bool]:
     """One `PlannedPhase` for each phase, or for the first ``phases``, and whether the plan is known to its end."""
-    way: list[PlannedPhase] = []
+    planned: list[PlannedPhase] = []
     most = samples_per_phase(mission)
     # If even the fewest samples of all phases are too many, only the first phases.
     possible = (
@@ -98,10 +98,10 @@ def preview(mission: Mission, phases: int | None = None) -> tuple[list[PlannedPh
     for phase in wanted[:possible]:
         found = leg(mission, phase, now)
         if found is None:
-            return way, False
+            return planned, False
         now = found.after
-        way.append(_planned(found, most))
-    return way, len(way) == len(wanted)
+        planned.append(_planned(found, most))
+    return planned, len(planned) == len(wanted)
 
 
 def _planned(found: Leg, most: int) -> PlannedPhase:

@@ -80,7 +80,7 @@ def _draw(ax: Axes, mission: Mission, name: str, rigidity: Rigidity | None) -> N
     space.draw_graph(ax, p @ R.T, edges, colours, lengths if few else None, dashed=dashed)
     told = f"{len(edges)} edges" + ("" if placed else "; their distances fix no positions")
     if rigidity is not None:
-        told = f"{rigidity.verdict}, rank {rigidity.rank} of {rigidity.needed}, {told}"
+        told = f"{rigidity.rigidity_class}, rank {rigidity.rank} of {rigidity.needed}, {told}"
         told += f", {len(redundant)} redundant" if redundant else ""
         _arrows(ax, p, R, rigidity)
     ax.set_title(f"{st.clean(name)}\n", fontweight="bold", parse_math=False)

@@ -33,10 +33,10 @@ def assignment_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
         if name not in ("as it is", mission.assignment):
             other = Mission.from_dict(mission.to_dict() | {"assignment": name}, mission.origin)
             planned = preview(other, index + 1)[0][index]
-        assert planned.ways is not None  # the phase changes the formation
+        assert planned.path_ends is not None  # the phase changes the formation
         x = planned.position - (masses @ planned.position)[:, None] / masses.sum()
         length = float(np.linalg.norm(np.diff(x, axis=0), axis=2).sum())
-        clearance = assignment.nearest_way(*planned.ways, mission.agents.radius)[0]
+        clearance = assignment.closest_approach(*planned.path_ends, mission.agents.radius)[0]
         order = tuple(other.assigned_slots[first.formation].tolist())
         found.assignments[name] = Assignment(order, length, clearance)
     radius = mission.fleet.radius

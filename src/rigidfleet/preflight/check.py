@@ -55,13 +55,13 @@ def check(
     search = mission.n_agents <= SEARCHED if search is None else search
     formations = check_formations(mission, search=search, progress=progress)
     progress("planned paths")
-    way, known = preview(mission)
-    found = Preflight(formations, check_gains(mission, formations), way)
+    planned, known = preview(mission)
+    found = Preflight(formations, check_gains(mission, formations), planned)
     if not known:
-        found.judged_to = float(way[-1].time[-1]) if way else 0.0
+        found.judged_to = float(planned[-1].time[-1]) if planned else 0.0
     if lags := vehicle_lags(mission):
         progress("margins")
-        found.margins = check_margins(mission, way, lags)
+        found.margins = check_margins(mission, planned, lags)
     progress("collisions, obstacles and limits")
     found.remarks = [
         *formation_remarks(mission, formations),
@@ -77,8 +77,8 @@ def check(
     ]
     if not known:
         why = "later positions depend on distances alone and are known only in flight"
-        if len(way) < len(mission.phases) and samples_per_phase(mission) < FEWEST_SAMPLES:
+        if len(planned) < len(mission.phases) and samples_per_phase(mission) < FEWEST_SAMPLES:
             why = "more agents and phases would take too long"
         text = f"paths are checked only up to {found.judged_to:g} s: {why}"
-        found.remarks.append(Remark("note", "way", text))
+        found.remarks.append(Remark("note", "paths", text))
     return found

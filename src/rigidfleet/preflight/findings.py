@@ -41,7 +41,7 @@ class Remark:
     ----------
     level : "fails" or "note"
     topic : formation, gains, margins, collision, downwash, assignment, thrust, disturbances, obstacle, geofence, speed,
-        acceleration or way (paths that were not checked)
+        acceleration or paths (paths that were not checked)
     text : the problem or note in words
     """
 
@@ -58,7 +58,7 @@ class FormationCheck:
     ----------
     name : name of the formation
     rigidity : None if it was not computed
-    held_by : "slots" if slots are tracked in every phase with this formation, "distances" if not, "nothing" if no
+    held_by : "tracking" if slots are tracked in every phase with this formation, "distances" if not, "nothing" if no
         phase has it
     realisations : other shapes with the same distances; None if they were not searched
     method : how the constraint force is solved
@@ -68,7 +68,7 @@ class FormationCheck:
 
     name: str
     rigidity: Rigidity | None
-    held_by: Literal["slots", "distances", "nothing"]
+    held_by: Literal["tracking", "distances", "nothing"]
     realisations: Realisations | None = None
     method: solvers.Method = "dense"
     spectrum: Spectrum | None = None
@@ -194,7 +194,7 @@ class Preflight:
     ----------
     formations, gains : checks of the formations and of the constraint law
     planned_phases : planned paths of each phase
-    room : minimum separation [m], its time [s] and the agents
+    separation : minimum separation [m], its time [s] and the agents
     thrust : maximum planned thrust [N], its time [s], the agent and its limit [N]
     clearance : of each obstacle: its name, minimum clearance [m], time [s], agent
     gaps : of each gap: its obstacles, its width [m], the width that the formation needs [m], time [s]
@@ -215,7 +215,7 @@ class Preflight:
     formations: list[FormationCheck]
     gains: GainsCheck
     planned_phases: list[PlannedPhase]
-    room: tuple[float, float, str] | None = None
+    separation: tuple[float, float, str] | None = None
     thrust: tuple[float, float, str, float] | None = None
     clearance: list[tuple[str, float, float, str]] = field(default_factory=list)
     gaps: list[tuple[str, float, float, float]] = field(default_factory=list)
@@ -250,10 +250,10 @@ class Preflight:
             yield "gains", _gain_words(self.gains)
         if self.margins is not None:
             yield from (("margins", text) for text in self.margins.describe())
-        if self.room is not None:
+        if self.separation is not None:
             yield (
                 "separation",
-                f"minimum {self.room[0]:.2f} m, {self.room[2]} at {self.room[1]:.2f} s",
+                f"minimum {self.separation[0]:.2f} m, {self.separation[2]} at {self.separation[1]:.2f} s",
             )
         if self.thrust is not None:
             force, t, who, limit = self.thrust
@@ -261,8 +261,8 @@ class Preflight:
             yield "thrust", f"maximum {force:.1f} N{of}, {who} at {t:.2f} s"
         if self.disturbed is not None:
             yield "disturbances", _disturbed_words(self.disturbed)
-        for name, room, t, who in self.clearance:
-            yield "clearance", f"{room:.2f} m to '{name}', {who} at {t:.2f} s"
+        for name, least, t, who in self.clearance:
+            yield "clearance", f"{least:.2f} m to '{name}', {who} at {t:.2f} s"
         for between, wide, takes, t in self.gaps:
             text = f"{between}: {wide:.2f} m wide, the formation needs {takes:.2f} m at {t:.2f} s"
             yield "gap", text
@@ -318,15 +318,15 @@ class Preflight:
                 "offset": _named(("offset_m", "who"), d.offset),
                 "lost": [_named(("agent", "time_s"), (i + 1, t)) for i, t in d.lost],
             },
-            "way": {
+            "paths": {
                 "judged_to_s": self.judged_to if math.isfinite(self.judged_to) else None,
                 "guessed_phases": [
                     planned.phase for planned in self.planned_phases if not planned.exact
                 ],
-                "separation": _named(("room_m", "time_s", "who"), self.room),
+                "separation": _named(("separation_m", "time_s", "who"), self.separation),
                 "thrust": _named(("thrust_n", "time_s", "who", "limit_n"), self.thrust),
                 "clearance": [
-                    _named(("obstacle", "room_m", "time_s", "who"), c) for c in self.clearance
+                    _named(("obstacle", "clearance_m", "time_s", "who"), c) for c in self.clearance
                 ],
                 "gaps": [_named(("between", "wide_m", "takes_m", "time_s"), g) for g in self.gaps],
                 "assignments": {
@@ -362,7 +362,7 @@ def _disturbed_words(d: Disturbed) -> str:
 def _formation_words(f: FormationCheck) -> str:
     r = f.rigidity
     held = {
-        "slots": "held by slots",
+        "tracking": "held by tracking",
         "distances": "held by distances",
         "nothing": "not used in any phase",
     }[f.held_by]
@@ -379,7 +379,7 @@ def _formation_words(f: FormationCheck) -> str:
         return f"{held}; its distances do not determine positions, so its rigidity is not checked"
     if f.method != "dense":
         held += f", solved by {solvers.WORDS[f.method]}"
-    parts = [f"{r.verdict}, {held}: {len(r.edges)} edges, rank {r.rank} of {r.needed}"]
+    parts = [f"{r.rigidity_class}, {held}: {len(r.edges)} edges, rank {r.rank} of {r.needed}"]
     if r.reachable < r.needed:
         where = "line" if r.dimension == 1 else "plane"
         parts[0] += f" ({r.reachable} reachable on a {where})"

@@ -63,7 +63,7 @@ def _work(mission: Mission, name: str, *, search: bool) -> float:
 
 
 def _formation(
-    mission: Mission, name: str, held: Literal["slots", "distances", "nothing"], *, search: bool
+    mission: Mission, name: str, held: Literal["tracking", "distances", "nothing"], *, search: bool
 ) -> FormationCheck:
     slots, edges = mission.formation_slots(name), mission.formation_edges(name)
     method = solvers.choose(mission.n_agents, edges, mission.constraint.solver)
@@ -73,7 +73,7 @@ def _formation(
         ends = spectrum(slots, edges, mission.agents.mass) if len(slots) <= LANCZOS else None
         return FormationCheck(name, None, held, method=method, spectrum=ends)
     rigidity = analyse(slots, edges, masses=mission.agents.mass)
-    endless = rigidity.verdict is RigidityClass.FLEXIBLE  # a continuum of other shapes
+    endless = rigidity.rigidity_class is RigidityClass.FLEXIBLE  # a continuum of other shapes
     if not search or endless or contradiction(mission, name) is not None:
         return FormationCheck(name, rigidity, held, method=method)
     start = mission.agents.position
@@ -81,7 +81,7 @@ def _formation(
     return FormationCheck(name, rigidity, held, others, method)
 
 
-def _held_by(mission: Mission, name: str) -> Literal["slots", "distances", "nothing"]:
+def _held_by(mission: Mission, name: str) -> Literal["tracking", "distances", "nothing"]:
     """What holds a formation in the phases that have it."""
     now, controls = None, set()
     for phase in mission.phases:
@@ -89,7 +89,7 @@ def _held_by(mission: Mission, name: str) -> Literal["slots", "distances", "noth
         controls |= {phase.control} if now == name else set()
     if not controls:
         return "nothing"
-    return "slots" if controls == {"tracking"} else "distances"
+    return "tracking" if controls == {"tracking"} else "distances"
 
 
 def contradiction(mission: Mission, name: str) -> tuple[int, float] | None:
@@ -137,15 +137,15 @@ def formation_remarks(mission: Mission, formations: list[FormationCheck]) -> Ite
                 text = f"the distances of '{f.name}' do not determine positions: its rigidity is not checked"
                 yield Remark("note", "formation", text)
             continue
-        if r.verdict is RigidityClass.FLEXIBLE:
+        if r.rigidity_class is RigidityClass.FLEXIBLE:
             who = "; ".join(agent_names(flex.agents) for flex in r.flexes[:4])
             more = f" and {len(r.flexes) - 4} more" if len(r.flexes) > 4 else ""
             text = f"'{f.name}' is flexible: {r.rank} of {r.needed} independent distances; free: {who}{more}"
             held = ". Add edges (rigidfleet design), or track slots" if alone else "; slots hold it"
             yield Remark("fails" if alone else "note", "formation", text + held)
-        elif r.verdict is RigidityClass.UNDECIDED and alone:
+        elif r.rigidity_class is RigidityClass.UNDECIDED and alone:
             yield Remark("note", "formation", f"'{f.name}' is undecided: {r.reason}")
-        elif r.verdict is RigidityClass.PRESTRESS_STABLE and alone:
+        elif r.rigidity_class is RigidityClass.PRESTRESS_STABLE and alone:
             where = "line" if r.dimension == 1 else "plane"
             across = f" across its {where}" if r.dimension < 3 else ""
             text = f"'{f.name}' is only prestress stable{across}; tracked slots hold it firmly"

@@ -97,7 +97,7 @@ def _feedback(mission: Mission, phase: Phase | None, held: str | None) -> Feedba
 
 
 def _changes(planned: PlannedPhase) -> bool:
-    return planned.ways is not None and planned.shapes[0] != planned.shapes[1]
+    return planned.path_ends is not None and planned.shapes[0] != planned.shapes[1]
 
 
 def _where(planned: PlannedPhase) -> str:

@@ -40,28 +40,28 @@ def separation_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     least = np.inf, 0.0, (0, 0)
     for number, planned in enumerate(found.planned_phases):
         ends: list[tuple[float, float, tuple[int, ...]]] = []
-        positions = planned.position if planned.ways is None else np.array(planned.ways)
-        rooms, pairs = proximity.separation(positions, radius)
-        for k in [int(rooms.argmin())] if planned.ways is None else [0, -1]:
-            ends.append((float(rooms[k]), float(planned.time[k]), tuple(pairs[k].tolist())))
-        if planned.ways is not None:
-            room, who, share = assignment.nearest_way(*planned.ways, radius)
-            crossing = room, _time_of(planned, share), who
+        positions = planned.position if planned.path_ends is None else np.array(planned.path_ends)
+        separations, pairs = proximity.separation(positions, radius)
+        for k in [int(separations.argmin())] if planned.path_ends is None else [0, -1]:
+            ends.append((float(separations[k]), float(planned.time[k]), tuple(pairs[k].tolist())))
+        if planned.path_ends is not None:
+            separation, who, share = assignment.closest_approach(*planned.path_ends, radius)
+            crossing = separation, _time_of(planned, share), who
             least = min(least, crossing)
-            beyond = room <= 0 or room < limit - SLACK
-            if beyond and room < min(ends)[0] - SLACK:
+            beyond = separation <= 0 or separation < limit - SLACK
+            if beyond and separation < min(ends)[0] - SLACK:
                 yield _crossing(mission, number, planned, crossing, limit)
         for k, at in enumerate(ends):
             least = min(least, at)
             # The start positions are known even if the path from there is not.
-            exact = planned.exact or (number == 0 and k == 0 and planned.ways is not None)
+            exact = planned.exact or (number == 0 and k == 0 and planned.path_ends is not None)
             if exact not in worst or at[0] < worst[exact][0]:
                 worst[exact] = *at, planned.phase
     if np.isfinite(least[0]):
-        found.room = least[0], least[1], agent_names(least[2])
-    for exact, (room, t, who, phase) in worst.items():
-        if room <= 0 or room < limit - SLACK:
-            text = _near(who, room, t, phase, limit, exact=exact)
+        found.separation = least[0], least[1], agent_names(least[2])
+    for exact, (separation, t, who, phase) in worst.items():
+        if separation <= 0 or separation < limit - SLACK:
+            text = _near(who, separation, t, phase, limit, exact=exact)
             guess = (
                 "" if exact else "; straight paths are assumed, as only distances guide the agents"
             )
@@ -69,11 +69,11 @@ def separation_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
 
 
 def _near(
-    who: tuple[int, ...], room: float, t: float, phase: str, limit: float, *, exact: bool
+    who: tuple[int, ...], separation: float, t: float, phase: str, limit: float, *, exact: bool
 ) -> str:
-    if room <= 0:
+    if separation <= 0:
         return f"{agent_names(who)} {'' if exact else 'may '}collide at {t:.2f} s in '{phase}'"
-    return f"{agent_names(who)} have a separation of {room:.2f} m at {t:.2f} s in '{phase}' (limit {limit:g} m)"
+    return f"{agent_names(who)} have a separation of {separation:.2f} m at {t:.2f} s in '{phase}' (limit {limit:g} m)"
 
 
 def _time_of(planned: PlannedPhase, share: float) -> float:
@@ -91,16 +91,16 @@ def _crossing(
     limit: float,
 ) -> Remark:
     """Remark on agents whose straight paths from one formation to the next come too close."""
-    (room, t, who), (before, after) = at, planned.shapes
+    (separation, t, who), (before, after) = at, planned.shapes
     needed = sum(mission.agents.radius[i] for i in who) + limit
     origin = "the start" if before is None else f"'{before}'"
     text = (
-        f"{_near(who, room, t, planned.phase, limit, exact=planned.exact)}: their paths from {origin} to '{after}'"
-        f" cross with {max(0.0, room + needed - limit):.2f} m from centre to centre. "
+        f"{_near(who, separation, t, planned.phase, limit, exact=planned.exact)}: their paths from"
+        f" {origin} to '{after}' cross with {max(0.0, separation + needed - limit):.2f} m from centre to centre. "
     )
     assert after is not None  # the phase changes the formation
-    assert planned.ways is not None
-    apart = min(float(proximity.nearest(places).min()) for places in planned.ways)
+    assert planned.path_ends is not None
+    apart = min(float(proximity.nearest(places).min()) for places in planned.path_ends)
     flown = [p.shaping.formation for p in mission.phases[:number] if p.shaping is not None]
     spaced = f"place slots at least {math.sqrt(2) * needed:.2f} m apart (now {apart:.2f} m)"
     promised = mission.assigned_turn(before, after) is not None
@@ -126,21 +126,21 @@ def downwash_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     radius, limit = mission.fleet.radius, mission.limits.separation_below
     worst: dict[bool, tuple[float, float, tuple[int, ...], str]] = {}
     for planned in found.planned_phases:
-        room, pair = proximity.headroom(planned.position, radius)
-        k = int(room.argmin())
-        if room[k] < worst.get(planned.exact, (np.inf,))[0]:
+        height, pair = proximity.headroom(planned.position, radius)
+        k = int(height.argmin())
+        if height[k] < worst.get(planned.exact, (np.inf,))[0]:
             low, high = sorted(pair[k].tolist(), key=lambda i: planned.position[k, i, 2])
             worst[planned.exact] = (
-                float(room[k]),
+                float(height[k]),
                 float(planned.time[k]),
                 (low, high),
                 planned.phase,
             )
-    for exact, (room, t, (low, high), phase) in worst.items():
-        text = f"agent {low + 1} is {max(room, 0.0):.2f} m below agent {high + 1} at {t:.2f} s in '{phase}'"
+    for exact, (height, t, (low, high), phase) in worst.items():
+        text = f"agent {low + 1} is {max(height, 0.0):.2f} m below agent {high + 1} at {t:.2f} s in '{phase}'"
         if limit is None:
             yield Remark("note", "downwash", text)
-        elif room < limit - SLACK:
+        elif height < limit - SLACK:
             text += f" (limit {limit:g} m)"
             yield Remark("fails" if exact else "note", "downwash", text)
 
@@ -276,12 +276,12 @@ def obstacle_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
             held, met = held + planned.position[:, :, 0].size, met + 1
             if held > _HELD or met > _MET:
                 break
-            room, agent, _ = proximity.clearance(planned.position, radius, [thing])
-            at = int(room.argmin())
+            clearance, agent, _ = proximity.clearance(planned.position, radius, [thing])
+            at = int(clearance.argmin())
             # Among equal minima, take the first one: ignore rounding and the last millimetre of a rest.
-            if room[at] < worst.get(planned.exact, (np.inf,))[0] - 1e-3:
+            if clearance[at] < worst.get(planned.exact, (np.inf,))[0] - 1e-3:
                 worst[planned.exact] = (
-                    float(room[at]),
+                    float(clearance[at]),
                     float(planned.time[at]),
                     int(agent[at]),
                     planned.phase,
@@ -291,8 +291,8 @@ def obstacle_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
             break
         if worst:
             shown[b] = min(worst.values())
-        for exact, (room, t, i, phase) in worst.items():
-            if room <= 0:
+        for exact, (clearance, t, i, phase) in worst.items():
+            if clearance <= 0:
                 verb = "hits" if exact else "may hit"
                 text = f"agent {i + 1} {verb} '{thing.name}' at {t:.2f} s in '{phase}'"
                 if not isinstance(thing, Box):
@@ -300,8 +300,8 @@ def obstacle_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
                 remark = Remark("fails" if exact else "note", "obstacle", text)
                 remarks.setdefault(b, []).append(remark)
     for b in sorted(shown):
-        room, t, i, _ = shown[b]
-        found.clearance.append((mission.obstacles[b].name, room, t, f"agent {i + 1}"))
+        clearance, t, i, _ = shown[b]
+        found.clearance.append((mission.obstacles[b].name, clearance, t, f"agent {i + 1}"))
     for b in sorted(remarks):
         yield from remarks[b]
     if skipped:

@@ -86,7 +86,7 @@ def _named(flights: Sequence[Result]) -> list[str]:
 
 def _flight(result: Result, verdict: Verdict, label: str, colour: str) -> dict[str, Any]:
     mission = result.mission
-    judged = [finding for finding in verdict.findings if finding.judged]
+    judged = [check for check in verdict.checks if check.judged]
     failed = [finding for finding in judged if not finding.passed]
     return {
         "label": label,
@@ -99,7 +99,7 @@ def _flight(result: Result, verdict: Verdict, label: str, colour: str) -> dict[s
         "words": [f.message for f in failed] if failed else [verdict.summary.partition("; ")[2]],
         "notes": verdict.notes,
         "facts": _facts(result),
-        "checks": [_check(finding) for finding in verdict.findings],
+        "checks": [_check(check) for check in verdict.checks],
         "phases": _phases(result, verdict),
         "vehicles": _vehicles(result),
         "vehicles_left_out": max(0, result.n_agents - _VEHICLES),
@@ -173,7 +173,7 @@ def _vehicles(result: Result) -> list[dict[str, str]]:
         speed = np.nan_to_num(np.linalg.norm(result.velocity, axis=2)).max(axis=0)
         acceleration = np.nan_to_num(np.linalg.norm(result.acceleration, axis=2)).max(axis=0)
     z = result.position[..., 2]
-    way = np.linalg.norm(np.diff(result.position, axis=0), axis=2).sum(axis=0)
+    path = np.linalg.norm(np.diff(result.position, axis=0), axis=2).sum(axis=0)
     shown = np.arange(n) if n <= _VEHICLES else np.sort(np.argsort(-thrust)[:_VEHICLES])
     colours = plotting.agent_colours(n)
     limits = mission.agents.thrust_limit
@@ -188,7 +188,7 @@ def _vehicles(result: Result) -> list[dict[str, str]]:
             "acceleration": value(float(acceleration[i])),
             "low": value(float(np.nanmin(z[:, i]))),
             "high": value(float(np.nanmax(z[:, i]))),
-            "way": value(float(way[i])),
+            "path": value(float(path[i])),
         }
         for i in shown.tolist()
     ]
@@ -263,7 +263,7 @@ def _numbers(flights: Sequence[Result], verdicts: Sequence[Verdict]) -> list[dic
 
     measures: list[tuple[str, str, Callable[[Result, Verdict], float | None]]] = [
         ("length of the flight", "s", lambda r, _: float(r.time[-1])),
-        ("failed checks", "", lambda _, v: float(sum(not f.passed for f in v.findings))),
+        ("failed checks", "", lambda _, v: float(sum(not f.passed for f in v.checks))),
         ("greatest waypoint miss", "m", misses),
         ("greatest distance from a slot", "m", lambda r, _: _greatest(overlay.slot_error(r))),
         ("greatest constraint error", "m", partial(worst, "constraint")),

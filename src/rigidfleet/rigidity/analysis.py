@@ -47,7 +47,7 @@ class Rigidity:
     spare : m - rank edges that could be removed together, long ones first
     flexes : a basis of the motions that change no distance to first order, fewest agents first
     index : smallest non-zero singular value of J M^-1/2 sqrt(mbar), the rigidity index; NaN without edges
-    verdict, reason : the class, and its reason in words
+    rigidity_class, reason : the class, and its reason in words
     stress : (m,) blocking self-stress, scaled to a largest force of 1 N, if one was found
     deformed : (N, 3) another shape with the same distances, reached by a finite motion, if one was found
     within : rigidity of a flat shape in its own plane, or of a straight one on its own line
@@ -64,7 +64,7 @@ class Rigidity:
     spare: Ints
     flexes: tuple[Flex, ...]
     index: float
-    verdict: RigidityClass
+    rigidity_class: RigidityClass
     reason: str
     stress: Floats | None = None
     deformed: Floats | None = None
@@ -78,7 +78,10 @@ class Rigidity:
     @property
     def rigid(self) -> bool:
         """Whether the distances are known to hold the shape against every small motion."""
-        return self.verdict in (RigidityClass.INFINITESIMALLY_RIGID, RigidityClass.PRESTRESS_STABLE)
+        return self.rigidity_class in (
+            RigidityClass.INFINITESIMALLY_RIGID,
+            RigidityClass.PRESTRESS_STABLE,
+        )
 
     def force(self, b: float, mass: float = 1.0) -> float:
         """Greatest norm of f_C (all agents) [N] under the exact law for a right side of norm `b` [m/s^2].
@@ -109,7 +112,7 @@ class Rigidity:
             ],
             "index": None if np.isnan(self.index) else self.index,
             "w": None if np.isnan(self.index) else self.w,
-            "verdict": str(self.verdict),
+            "rigidity_class": str(self.rigidity_class),
             "reason": self.reason,
             "stress": None if self.stress is None else self.stress.tolist(),
             "deformed": None if self.deformed is None else self.deformed.tolist(),
@@ -156,7 +159,7 @@ def analyse(
     motions = localised(frame)
     to_world = axes[:space]
     flexes = tuple(Flex(agents, motion @ to_world) for agents, motion in motions)
-    verdict, reason, stress, bent = _judge(frame, within)
+    rigidity_class, reason, stress, bent = _judge(frame, within)
     return Rigidity(
         agents=n,
         edges=e,
@@ -169,7 +172,7 @@ def analyse(
         spare=frame.spare(),
         flexes=flexes,
         index=_index(frame, masses),
-        verdict=verdict,
+        rigidity_class=rigidity_class,
         reason=reason,
         stress=stress,
         deformed=None if bent is None else bent @ to_world + p.mean(axis=0),
@@ -243,7 +246,7 @@ def _judge(
         if frame.rank and frame.s[-1] < _BARELY:
             reason += f", but one motion hardly does (index {frame.s[-1]:.1e}): expect large forces"
         return RigidityClass.INFINITESIMALLY_RIGID, reason, None, None
-    if within is not None and within.verdict is RigidityClass.FLEXIBLE:
+    if within is not None and within.rigidity_class is RigidityClass.FLEXIBLE:
         where = _WHERE[within.dimension]
         return (
             RigidityClass.FLEXIBLE,

@@ -272,10 +272,10 @@ class Extremes:
         near, j = tree.query(x, k=2)
         # Of two agents at the same place, either may be found as its own nearest one.
         other = np.where(j[:, 1] == np.arange(len(who)), j[:, 0], j[:, 1])
-        rooms = near[:, 1] - self.radius[who] - self.radius[who[other]]
+        separations = near[:, 1] - self.radius[who] - self.radius[who[other]]
         size = float(np.linalg.norm(np.ptp(x, axis=0))) / math.sqrt(len(who))
         spare = max(_SPARE * float(np.median(near[:, 1])), _LEAST * size, 1.01 * moves, 1e-6)
-        least = min(float(rooms.min()), float(self.worst[records.SEPARATION]))
+        least = min(float(separations.min()), float(self.worst[records.SEPARATION]))
         pairs = who[tree.query_pairs(least + widest + spare, output_type="ndarray")]
         self.pairs = np.ascontiguousarray(np.sort(pairs, axis=1))
         if self.stacks:

@@ -253,7 +253,7 @@ class Flight:
         MissionError
             The phase has errors.
         FlightError
-            The flight has been finished, or a user's function failed.
+            The flight has been finished, nothing of the phase before has been flown, or a user's function failed.
         TypeError
             It is no phase.
         """
@@ -262,6 +262,10 @@ class Flight:
         if self.ending:
             return False
         if phase is None:
+            if self._active is not None and not self._active.flew:
+                raise FlightError(
+                    f"nothing of phase '{self.phases[-1].name}' has been flown: call advance before the next begin"
+                )
             if self._following >= len(self.mission.phases):
                 return False
             phase = self.mission.phases[self._following]
@@ -393,7 +397,8 @@ class Flight:
     def finish(self, ending: str = "") -> Result:
         """End the flight; return its record.
 
-        If the phases flown are not the mission's, the record's mission has the phases flown.
+        If the phases flown are not the mission's, the record's mission has the phases flown. A phase that was left
+        early ends there and keeps its goal, which the flight did not reach and which is not judged.
 
         Parameters
         ----------
@@ -464,7 +469,8 @@ class Flight:
         if active is None:
             return
         self._active = None
-        if not active.flew:  # as if it had never begun
+        if not active.flew:  # as if it had never begun: if it is the mission's, it is still to come
+            self._following -= self._asked[-1] is self.mission.phases[self._following - 1]
             del self.phases[-1], self._asked[-1]
             return
         if not (active.settled or active.over):

@@ -99,10 +99,10 @@ def assemble(
     wrench = np.concatenate([f_u.sum(axis=1), np.cross(x, f_u).sum(axis=1)], axis=1)
     asked = joined("wrench")
     radius = mission.agents.radius
-    room, nearest = proximity.obstacle_clearances(r, radius, mission.obstacles)
-    room[~left] = np.inf
+    each_clearance, nearest = proximity.obstacle_clearances(r, radius, mission.obstacles)
+    each_clearance[~left] = np.inf
     separation, pair = proximity.separation_of_left(r, radius, left)
-    clearance, agent, obstacle = proximity.least_clearance(room, nearest)
+    clearance, agent, obstacle = proximity.least_clearance(each_clearance, nearest)
     _put_extremes(phases, time, (separation, pair, clearance, agent, obstacle))
     edges = mission.edges
     distance = np.linalg.norm(r[:, edges[:, 0]] - r[:, edges[:, 1]], axis=2)

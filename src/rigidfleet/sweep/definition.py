@@ -310,61 +310,61 @@ def _checked(
         parsed = [from_line(entry) if isinstance(entry, str) else entry for entry in given]
         wrong = {k: entry for k, entry in enumerate(parsed) if isinstance(entry, WrongLine)}
         data["vary"] = [given[k] if k in wrong else entry for k, entry in enumerate(parsed)]
-    notes = FindingCollector(data, origin)
+    collector = FindingCollector(data, origin)
     known = [*SweepHeader.model_fields, "vary"]
     for key in data:
         if key not in known:
-            notes.add((key,), *unknown_key(key, known))
+            collector.add((key,), *unknown_key(key, known))
     own = {key: value for key, value in data.items() if key in SweepHeader.model_fields}
-    header = notes.validate(SweepHeader, own, ())
+    header = collector.validate(SweepHeader, own, ())
     by_final_states = header is not None and header.evaluate == "final"
     whole = None if mission is None else keypaths.whole_document(mission)
     variations = []
-    for k, entry in enumerate(tables(notes, "vary")):
+    for k, entry in enumerate(tables(collector, "vary")):
         if k in wrong:
-            notes.add(("vary", k), wrong[k].problem, wrong[k].remedy)
+            collector.add(("vary", k), wrong[k].problem, wrong[k].remedy)
             continue
-        found = _variation(notes, entry, k)
+        found = _variation(collector, entry, k)
         if mission is not None and whole is not None:
-            _fits(notes, k, entry, found, mission, whole)
+            _fits(collector, k, entry, found, mission, whole)
         variations += [] if found is None else [found]
         if by_final_states and found is not None and whole is not None:
-            _moves_starts(notes, k, found, whole)
+            _moves_starts(collector, k, found, whole)
     if by_final_states and mission is not None:
         from rigidfleet.simulation.ensemble import unfit
 
         if (why := unfit(mission)) is not None:
-            notes.add(("evaluate",), why, _WHOLE, "final")
+            collector.add(("evaluate",), why, _WHOLE, "final")
     if "vary" not in data or data["vary"] == []:
-        notes.add(
+        collector.add(
             ("vary",),
             "nothing varies",
             'for example, give --vary "agents.mass.* *= normal(1, 0.05)"',
         )
     gridded = any(isinstance(v, Gridded) for v in variations)
     if "runs" not in data and variations and not gridded:
-        notes.add(("runs",), "is missing", "give the number of runs; only a grid determines it")
-    if notes.findings or header is None:
-        raise SweepError(notes.findings)
+        collector.add(("runs",), "is missing", "give the number of runs; only a grid determines it")
+    if collector.findings or header is None:
+        raise SweepError(collector.findings)
     return header, variations
 
 
-def _variation(notes: FindingCollector, entry: Any, k: int) -> Variation | None:
+def _variation(collector: FindingCollector, entry: Any, k: int) -> Variation | None:
     """Check a variation by itself; None if it has errors."""
-    before = len(notes.findings)
-    model = kind(notes, entry, ("vary", k), KINDS)
-    found = None if model is None else notes.validate(model, entry, ("vary", k))
-    if found is None or len(notes.findings) > before:
+    before = len(collector.findings)
+    model = kind(collector, entry, ("vary", k), KINDS)
+    found = None if model is None else collector.validate(model, entry, ("vary", k))
+    if found is None or len(collector.findings) > before:
         return None
     if (problem := found.wrong()) is not None:
         key, *words = problem
-        notes.add(("vary", k, key), *words, getattr(found, key))
+        collector.add(("vary", k, key), *words, getattr(found, key))
         return None
     return found
 
 
 def _fits(
-    notes: FindingCollector,
+    collector: FindingCollector,
     k: int,
     entry: Any,
     v: Variation | None,
@@ -379,7 +379,7 @@ def _fits(
     try:
         places = keypaths.expand(whole, path)
     except keypaths.PathError as error:
-        notes.add(where, error.problem, error.remedy, path)
+        collector.add(where, error.problem, error.remedy, path)
         return
     if v is None:
         return
@@ -387,33 +387,35 @@ def _fits(
     numeric = values is None or all(map(is_number, values))
     for word in values or ():
         if remedy := next(filter(None, (successor(keys[-1], word) for keys in places)), ""):
-            notes.add(("vary", k, "values"), "is no value of the mission format", remedy, word)
+            collector.add(("vary", k, "values"), "is no value of the mission format", remedy, word)
     for keys in places:
         leaves = keypaths.numbers(keypaths.look_up(whole, keys))
         absent = any(x is None for x in leaves)
         table = next((x for x in leaves if isinstance(x, dict)), None)
         if table is not None:
-            notes.add(
+            collector.add(
                 where,
                 "is a table",
                 f"continue the path with one of its keys: {', '.join(table)}",
                 path,
             )
         elif absent and v.change != "set":
-            notes.add(
+            collector.add(
                 where,
                 f"the mission has no value to {v.change} to",
                 "set the value, or write one in the mission",
                 path,
             )
         elif absent:
-            _taken(notes, where, v, keys, mission, whole)
+            _taken(collector, where, v, keys, mission, whole)
         elif numeric and not all(map(is_number, leaves)):
             remedy = "vary it by a choice or grid of words"
-            notes.add(where, f"has the value {leaves[0]!r}, which is not a number", remedy, path)
+            collector.add(
+                where, f"has the value {leaves[0]!r}, which is not a number", remedy, path
+            )
 
 
-def _moves_starts(notes: FindingCollector, k: int, v: Variation, whole: dict[str, Any]) -> None:
+def _moves_starts(collector: FindingCollector, k: int, v: Variation, whole: dict[str, Any]) -> None:
     """Check that a variation changes only start states, as the evaluation of final states requires."""
     values = getattr(v, "values", ())
     starts = ("agents", "position"), ("agents", "velocity")
@@ -425,11 +427,11 @@ def _moves_starts(notes: FindingCollector, k: int, v: Variation, whole: dict[str
         problem = (
             "with final states alone, only numbers in agents.position and agents.velocity can vary"
         )
-        notes.add(("vary", k, "path"), problem, f"remove it, or {_WHOLE}", v.path)
+        collector.add(("vary", k, "path"), problem, f"remove it, or {_WHOLE}", v.path)
 
 
 def _taken(
-    notes: FindingCollector,
+    collector: FindingCollector,
     where: Keys,
     v: Variation,
     keys: Keys,
@@ -445,4 +447,4 @@ def _taken(
     except MissionError as error:
         first = error.findings[0]
         problem = f"the mission does not accept a value: {first.key} {first.problem}"
-        notes.add(where, problem, first.remedy, v.path)
+        collector.add(where, problem, first.remedy, v.path)

@@ -73,7 +73,7 @@ def measure(result: Result, verdict: Verdict) -> dict[str, float]:
     for name in ("position", "velocity", "attitude", "rates"):
         misses = (getattr(p.waypoint, name) for p in phases if p.waypoint is not None)
         found[f"waypoint_{name}"] = _greatest(misses)
-    checked = {f.check: f.worst for f in verdict.findings if f.worst is not None}
+    checked = {f.check: f.worst for f in verdict.checks if f.worst is not None}
     worst = {name: extreme.value for name, extreme in verdict.worst.items()}
     worst |= {
         name: checked[name]

@@ -41,7 +41,7 @@ def _fly(sweep: Sweep, run: int) -> RunRecord:
         result = simulate(Mission.from_dict(sweep.varied(run), f"run {run}"))
         verdict = assess(result)
         metrics = measure(result, verdict)
-        failed = [f for f in verdict.findings if not f.passed]
+        failed = [f for f in verdict.checks if not f.passed]
         reason = ", ".join(dict.fromkeys(f.check for f in failed))
         detail = failed[0].message if failed else ""
     except MissionError as error:

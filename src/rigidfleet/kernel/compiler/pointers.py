@@ -136,22 +136,22 @@ def by_address(_context, x):
         return x(x), lambda _context, _builder, _sig, args: args[0]
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        room = cgutils.alloca_once(builder, _WORD, size=_words(x))
-        _store(context, builder, x, args[0], room, 0)
+        memory = cgutils.alloca_once(builder, _WORD, size=_words(x))
+        _store(context, builder, x, args[0], memory, 0)
         # The address passes through an empty piece of assembly, so that nothing is read through it before all has
         # been stored.
         kind = ir.FunctionType(_ADDRESS, [_ADDRESS])
         empty = ir.InlineAsm(kind, "", "=r,0,~{memory}", side_effect=True)
-        return builder.call(empty, [room])
+        return builder.call(empty, [memory])
 
     return Pointer(x)(x), generate
 
 
-def _store(context: Any, builder: Any, kind: Any, value: Any, room: Any, word: int) -> None:
+def _store(context: Any, builder: Any, kind: Any, value: Any, memory: Any, word: int) -> None:
     """Store a value, beginning at a word."""
     if isinstance(kind, types.BaseNamedTuple):
         for k, part in enumerate(kind.types):
-            _store(context, builder, part, builder.extract_value(value, k), room, word)
+            _store(context, builder, part, builder.extract_value(value, k), memory, word)
             word += _words(part)
         return
     parts = [value]
@@ -162,5 +162,5 @@ def _store(context: Any, builder: Any, kind: Any, value: Any, room: Any, word: i
     elif kind == types.boolean:
         parts = [builder.zext(value, _WORD)]
     for k, part in enumerate(parts):
-        place = builder.bitcast(_at(builder, room, word + k), part.type.as_pointer())
+        place = builder.bitcast(_at(builder, memory, word + k), part.type.as_pointer())
         builder.store(part, place, align=8)

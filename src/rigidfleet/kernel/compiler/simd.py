@@ -2,7 +2,7 @@
 
 A `lanes` value holds eight doubles; arithmetic, ``max`` and ``abs`` act on each of them. A `LaneArray`
 is an array of such values. The unchanged source of the integrator compiles for them: eight flights in
-the lanes share their steps. For a single flight, `blocks` views eight consecutive states as one value,
+the lanes share their steps. For a single flight, `in_vectors` views eight consecutive states as one value,
 so that the integrator's sums use the machine's vector registers.
 """
 
@@ -71,9 +71,9 @@ class LaneArray(np.ndarray):
 def pack(values: Floats) -> LaneArray:
     """An array (...) of lanes from float64 (..., 8): a copy, aligned for vectors."""
     values = np.asarray(values, dtype=np.float64)
-    room = np.empty(values.size + WIDTH)
-    skip = -room.ctypes.data // room.itemsize % WIDTH
-    flat = room[skip : skip + values.size]
+    memory = np.empty(values.size + WIDTH)
+    skip = -memory.ctypes.data // memory.itemsize % WIDTH
+    flat = memory[skip : skip + values.size]
     flat[:] = values.ravel()
     kind = np.dtype((np.void, WIDTH * flat.itemsize))
     return flat.view(kind).reshape(values.shape[:-1]).view(LaneArray)
@@ -256,7 +256,7 @@ _register((max,), 2, BUILD["max"])
 
 
 @intrinsic
-def spread(_context, x):
+def filled(_context, x):
     """Return lanes that all hold the number x."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
@@ -266,7 +266,7 @@ def spread(_context, x):
 
 
 @intrinsic
-def blocks(_context, array):
+def in_vectors(_context, array):
     """View float64 (..., n), n a multiple of 8, as lanes (..., n / 8); lanes are returned unchanged."""
     if array.dtype == lanes:
         same = lambda context, builder, sig, args: impl_ret_borrowed(  # noqa: E731

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from rigidfleet.kernel.compiler.jit import compiled
+from rigidfleet.kernel.compiler.pointers import by_address
 from rigidfleet.kernel.compiler.simd import WIDTH, LaneArray, pack, unpack
 from rigidfleet.kernel.engine import native
 from rigidfleet.kernel.engine.codegen import integrate, unrolled
@@ -34,6 +35,7 @@ def fly(p, state, t0, t_end, step, starts, before, ends, status, evaluations, ma
     right-hand side to ``evaluations`` (G,). p, an `UnrolledProblem`, and state are overwritten. ``fresh``
     is always True; a literal here would have another type for the compiler.
     """
+    p, state = by_address(p), by_address(state)
     unsampled = state.clock[:0]
     for g in range(starts.shape[0]):
         for q in range(starts.shape[1]):

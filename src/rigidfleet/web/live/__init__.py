@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rigidfleet.errors import wrong_type
 from rigidfleet.mission import as_mission
 from rigidfleet.web.live.server import Server
 from rigidfleet.web.live.session import Session
@@ -49,7 +50,14 @@ def live(
     ------
     FlightError
         No formation of the mission has slots, or the port cannot be used.
+    TypeError
+        The mission, the port or a function is none.
     """
+    if not isinstance(port, int) or isinstance(port, bool):
+        raise wrong_type("a number for port (0 for any free one)", port)
+    for name, function in (("ready", ready), ("landed", landed)):
+        if not (function is None or callable(function)):
+            raise wrong_type(f"a function for {name}", function)
     flown: list[Result] = []
 
     def keep(result: Result) -> str:

@@ -1,0 +1,16 @@
+"""Arithmetic on eight numbers at once, in the machine's vector registers.
+
+A vector holds eight consecutive states of one flight, or the same state of eight flights. ``+``, ``-``, ``*``,
+``abs`` and ``max`` act on each of its numbers.
+
+- ``in_vectors(rows)``: float64 rows (k, n), n a multiple of 8, viewed as vectors (k, n / 8); rows of vectors unchanged;
+- ``filled(x)``: a vector of eight numbers x;
+- ``rough_inverse(v)``: 1/v to four digits, in a fraction of a quotient's time;
+- ``total_or_worst(v, y)``: the sum of a vector's numbers if y are the states of one flight, the greatest if of eight.
+
+These are names of `rigidfleet.kernel.compiler.simd`. Functions around them would cost the integrator some per cent.
+"""
+
+from rigidfleet.kernel.compiler.simd import filled, in_vectors, rough_inverse, total_or_worst
+
+__all__ = ["filled", "in_vectors", "rough_inverse", "total_or_worst"]
