@@ -1,5 +1,8 @@
 """References and their derivatives: what vehicles with attitude are told, and how smooth it is."""
 
+import math
+import re
+
 import numpy as np
 import pytest
 from scipy.interpolate import make_interp_spline
@@ -12,6 +15,11 @@ from rigidfleet.kernel.problem import SHAPE, Motion, Reference, workspace
 from rigidfleet.math import series, splines
 from rigidfleet.mission import Mission, load_mission
 from rigidfleet.planning import derivatives as d
+from rigidfleet.planning.limits import limits_of, reached
+from rigidfleet.planning.preview import Leg, preview
+from rigidfleet.planning.preview import leg as leg_of
+from rigidfleet.planning.timing import broken, timed
+from rigidfleet.preflight.check import check
 from rigidfleet.simulation.flight import Flight, simulate
 
 #: Central differences of eighth order.
@@ -151,7 +159,7 @@ def a_mission(*phases: dict, **more) -> Mission:
             "wide": {"shape": "triangle", "size": 6.0},
         },
         "phases": [
-            {"kind": "establish", "formation": "triangle", "duration": 5.0},
+            {"kind": "establish", "formation": "triangle", "blend": 7.5, "duration": 8.0},
             *phases,
         ],
     }
@@ -282,3 +290,179 @@ def test_minimum_snap_from_rest_to_rest():
     pieces = splines.minimum_snap(np.array([0.0, 1.0]), np.array([[0.0], [1.0]]), zero, zero)
     np.testing.assert_allclose(pieces[0, 0], [0, 0, 0, 0, 35, -84, 70, -20], atol=1e-12)
     np.testing.assert_allclose(splines.snap_cost(pieces, np.array([0.0, 1.0])), 100800.0)
+
+
+# -- limits and least times ------------------------------------------------------------------------
+
+LIMITS = {"speed": 3.0, "acceleration": 1.5, "jerk": 1.5, "tilt_deg": 8.0}
+
+
+def dense(leg: Leg, mission: Mission) -> dict[str, float]:
+    """The greatest share of each limit at 20,001 samples of a leg, from positions alone."""
+    time = np.linspace(leg.begin, leg.end, 20_001)
+    x = d.slot_derivatives(leg.reference, leg.motion, time)
+    force = x[:, 2] + np.array([0.0, 0.0, mission.gravity])
+    across = np.linalg.norm(force[..., :2], axis=-1)
+    found = {
+        "speed": np.linalg.norm(x[:, 1], axis=-1) / LIMITS["speed"],
+        "acceleration": np.linalg.norm(x[:, 2], axis=-1) / LIMITS["acceleration"],
+        "jerk": np.linalg.norm(x[:, 3], axis=-1) / LIMITS["jerk"],
+        "tilt": np.rad2deg(np.arctan(across / force[..., 2])) / LIMITS["tilt_deg"],
+        "thrust": np.linalg.norm(force, axis=-1) / 15.0,
+    }
+    return {name: float(share.max()) for name, share in found.items()}
+
+
+def limited(*phases: dict, **more) -> Mission:
+    """`a_mission` with limits of speed, acceleration, jerk, tilt and thrust."""
+    agents = {"mass": 1.0, "position": [[0, 0, 5], [4, 0, 5], [2, 3, 5]], "thrust_limit": 15.0}
+    return a_mission(*phases, **({"limits": LIMITS, "agents": agents} | more))
+
+
+def test_limits_are_found_between_samples():
+    """What each leg reaches of each limit is that of 20,001 samples, to 1e-3, with its agent and time."""
+    mission = limited(*WAYS)
+    for planned in preview(mission)[0]:
+        leg = planned.leg
+        expected = dense(leg, mission)
+        for x in reached(limits_of(mission), leg.reference, leg.motion, leg.begin, leg.end):
+            share = expected[x.limit.name]
+            assert x.share == pytest.approx(share, rel=1e-3, abs=1e-9)
+            who = np.array([x.agent])
+            at = d.slot_derivatives(leg.reference, leg.motion, np.array([x.time]))[:, :, who]
+            assert x.limit.quantity(at, who)[0, 0] == pytest.approx(x.value, rel=1e-9, abs=1e-12)
+
+
+def test_a_time_that_is_too_short_is_refused_with_the_least_one():
+    """The check names limit, agent, time and least duration; with it the check passes, with 2 % less it does not."""
+    way = {"kind": "fly", "position": [20, 5, 8], "yaw_deg": 90.0, "name": "over there"}
+    told = [
+        r.text
+        for r in check(limited(way | {"duration": 4.0}), search=False).remarks
+        if r.level == "fails"
+    ]
+    assert len(told) == 1
+    found = re.fullmatch(
+        r"agent \d would need [\d.]+ m/s\^3 of jerk at [\d.]+ s in 'over there' \(limit 1.5 m/s\^3\); the least"
+        r" duration of this phase is ([\d.]+) s",
+        told[0],
+    )
+    assert found, told
+    least = float(found[1])
+    assert check(limited(way | {"duration": least}), search=False).passed
+    assert not check(limited(way | {"duration": 0.98 * least}), search=False).passed
+    seven = np.linalg.norm(
+        [20 - 2, 5 - 1, 3]
+    )  # of the CM alone, without the turn: least times of the septic
+    assert least > max(
+        35 / 16 * seven / 3.0, (7.513 * seven / 1.5) ** 0.5, (52.5 * seven / 1.5) ** (1 / 3)
+    )
+
+
+@pytest.mark.parametrize("name", ["speed", "acceleration", "jerk"])
+def test_least_times_from_rest_to_rest(name):
+    """One limit, a straight way: the closed form of the septic blend."""
+    peak = {
+        "speed": 35 / 16,
+        "acceleration": 84 * 5**0.5 / 25,
+        "jerk": 52.5,
+    }[name]
+    power = {"speed": 1.0, "acceleration": 0.5, "jerk": 1 / 3}[name]
+    agents = {"mass": 1.0, "position": [[0, 0, 5], [4, 0, 5], [2, 3, 5]]}
+    here = np.mean(agents["position"], axis=0)
+    phases = [{"kind": "fly", "position": (here + [30, 0, 0]).tolist(), "duration": "auto"}]
+    mission = a_mission(phases=phases, agents=agents, limits={name: 2.0})
+    assert isinstance(duration := timed(mission).phases[0].duration, float)
+    assert duration == pytest.approx((peak * 30 / 2.0) ** power, rel=0.012)
+    assert duration > (peak * 30 / 2.0) ** power
+
+
+AUTO = [
+    {"kind": "fly", "position": [20, 5, 8], "velocity": [2, 1, 0], "yaw_deg": 140.0, "duration": "auto"},
+    {"kind": "fly", "position": [40, 5, 8], "duration": "auto", "through": [{"position": [30, 15, 9]}]},
+    {"kind": "reshape", "formation": "wide", "duration": "auto", "blend": "auto"},
+    {"kind": "orbit", "centre": [40, 15, 8], "radius": 10.0, "rate_deg_s": 10.0, "duration": 60.0, "blend": "auto"},
+    {"kind": "turn", "yaw_deg": 0.0, "travel": "auto", "settle": {"tolerance": 0.01, "dwell": 0.5}},
+    {"kind": "reshape", "formation": "triangle", "duration": "auto", "blend": 9.0},
+]  # fmt: skip
+
+
+def test_automatic_times_keep_the_limits_and_no_shorter_ones_do():
+    """Every kind of automatic time: the flight keeps its limits, and nine tenths of one time would break one."""
+    mission = limited(*AUTO)
+    assert math.isnan(mission.latest_end)
+    resolved = timed(mission)
+    assert resolved.text == mission.text
+    assert math.isfinite(resolved.latest_end)
+    assert check(mission, search=False).passed
+    result = simulate(mission)
+    assert assess(result).passed, assess(result).summary
+    again = simulate(Mission.from_toml(result.mission_text))
+    np.testing.assert_array_equal(again.position, result.position)
+    for k, phase in enumerate(resolved.phases[1:-1], start=1):
+        key = (
+            "blend"
+            if phase.kind in ("reshape", "orbit")
+            else "travel"
+            if phase.kind == "turn"
+            else "duration"
+        )
+        now = preview(resolved, k)[0][-1].leg.after
+        fast = {key: 0.95 * getattr(phase, key)}
+        if phase.kind == "fly" and phase.through:
+            fast["through"] = tuple(
+                at.model_copy(update={"time": 0.95 * (at.time or 0.0)}) for at in phase.through
+            )
+        quick = leg_of(resolved, phase.model_copy(update=fast), now)
+        assert quick is not None
+        assert broken(resolved, quick), f"phase {k + 1} could be shorter"
+
+
+def test_automatic_times_of_a_phase_begun_by_hand():
+    """A phase begun in flight takes its least time from the state at its start."""
+    mission = limited({"kind": "hold", "duration": 30.0})
+    flight = Flight(mission)
+    flight.begin()
+    flight.advance()
+    flight.begin({"kind": "fly", "position": [20, 0, 8], "duration": "auto"})
+    length = flight.plan.t_end - flight.plan.start
+    assert 5.0 < length < 25.0
+    assert not flight.advance()
+    result = flight.finish()
+    assert result.phases[-1].t_end - result.phases[-1].t_start == pytest.approx(length)
+
+
+@pytest.mark.parametrize(
+    ("phase", "more", "told"),
+    [
+        ({"kind": "fly", "position": [9, 0, 8], "duration": "auto"}, {"limits": {}}, "needs a limit that bounds it"),
+        ({"kind": "hold", "duration": "auto"}, {}, "has no least duration"),
+        ({"kind": "turn", "yaw_deg": 9.0, "duration": "auto", "travel": 2.0}, {}, "has no effect with duration"),
+        ({"kind": "fly", "position": [9, 0, 8], "duration": "auto"}, {"smoothness": "lqr"}, "needs a smooth mission"),
+        ({"kind": "fly", "position": [9, 0, 8], "settle": {}}, {}, "needs a time of arrival"),
+        ({"kind": "fly", "position": [9, 0, 8], "duration": 9.0,
+          "through": [{"position": [1, 1, 8], "time": 9.5}]}, {}, "passes its last point at 9.5 s"),
+        ({"kind": "reshape", "formation": "wide", "duration": 9.0, "reference": "step"}, {}, "jumps"),
+    ],
+)  # fmt: skip
+def test_errors_of_automatic_times_and_points(phase, more, told):
+    """Each mistake gets one error that says what to do."""
+    agents = {"mass": 1.0, "position": [[0, 0, 5], [4, 0, 5], [2, 3, 5]]}
+    with pytest.raises(MissionError, match=told) as error:
+        limited(phase, agents=agents, **more)
+    assert len(error.value.findings) == 1
+
+
+def test_a_limit_that_no_time_keeps():
+    """An orbit whose circle itself breaks a limit has no least blend: an error says so."""
+    orbit = {
+        "kind": "orbit",
+        "centre": [5, 0, 8],
+        "radius": 10.0,
+        "rate_deg_s": 40.0,
+        "duration": 30.0,
+    }
+    with pytest.raises(MissionError, match="no time keeps the limits"):
+        timed(limited(orbit | {"blend": "auto"}))
+    told = [r.text for r in check(limited(orbit), search=False).remarks]
+    assert any("no blend of this phase keeps all limits" in text for text in told)

@@ -41,11 +41,12 @@ def check(
         Print the result as JSON.
     """
     from rigidfleet.mission import ending, goal, load_mission
+    from rigidfleet.planning.timing import timed
 
     watch = console.CheckWatch(mission)
     try:
         with watch:
-            found = load_mission(mission)
+            found = timed(load_mission(mission))
     except MissionError as error:
         if not json:
             raise

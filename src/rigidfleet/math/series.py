@@ -17,6 +17,8 @@ from rigidfleet.typing import Floats
 
 #: Up to this squared angle, Stumpff functions are summed as series, with this number of terms: exact to rounding.
 _SERIES, _TERMS = 16.0, 24
+#: 1/k!
+_RECIPROCALS = [1.0 / math.factorial(k) for k in range(64)]
 
 
 def derivatives(x: Floats) -> Floats:
@@ -56,9 +58,13 @@ def product(
     a: Floats, b: Floats, multiply: Callable[[Floats, Floats], Floats] = np.multiply
 ) -> Floats:
     """Series of the product of two series of the same order, by any bilinear ``multiply``, such as `numpy.matmul`."""
-    return np.stack(
-        [sum(multiply(a[i], b[k - i]) for i in range(k + 1)) for k in range(min(len(a), len(b)))]
-    )
+    found = []
+    for k in range(min(len(a), len(b))):
+        total = multiply(a[0], b[k])
+        for i in range(1, k + 1):
+            total = total + multiply(a[i], b[k - i])
+        found.append(total)
+    return np.array(found)
 
 
 def rotation(phi: Floats) -> Floats:
@@ -139,14 +145,19 @@ def _stumpff(u: Floats, count: int) -> Floats:
     """Stumpff functions c_0 to c_(count - 1) (count, ...) of u >= 0: c_k = sum_i (-u)^i / (2 i + k)!."""
     found = np.zeros((count, *u.shape))
     near = u < _SERIES
-    small, large = np.where(near, u, 0.0), np.where(near, _SERIES, u)
-    for k in range(count):
+    small = np.where(near, u, 0.0)
+    for k in (count - 1, count - 2):
         for i in range(_TERMS, -1, -1):  # Horner
-            found[k] = 1.0 / math.factorial(2 * i + k) - small * found[k]
+            found[k] = _RECIPROCALS[2 * i + k] - small * found[k]
+    for k in range(count - 3, -1, -1):  # c_k = 1/k! - u c_(k + 2), downwards for small u
+        found[k] = _RECIPROCALS[k] - small * found[k + 2]
+    if near.all():
+        return found
+    large = np.where(near, _SERIES, u)
     root = np.sqrt(large)
     closed = [np.cos(root), np.sin(root) / root]
-    for k in range(2, count):
-        closed.append((1.0 / math.factorial(k - 2) - closed[k - 2]) / large)
+    for k in range(2, count):  # upwards for large u
+        closed.append((_RECIPROCALS[k - 2] - closed[k - 2]) / large)
     return np.where(near, found, np.stack(closed))
 
 

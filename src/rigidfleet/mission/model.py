@@ -119,6 +119,18 @@ class Mission(Contents):
             raise _unread(origin, "is nested too deeply", "use the keys of a mission") from None
         return cls.from_toml(text, origin)
 
+    def with_phases(self, phases: list[dict[str, Any]]) -> Self:
+        """Return the mission with other tables of phases, checked. It keeps its own text.
+
+        Raises
+        ------
+        MissionError
+            With a finding for each error.
+        """
+        mission = self.from_dict(self.to_dict() | {"phases": phases}, self._origin)
+        mission._text = self._text
+        return mission
+
     @property
     def size_in_words(self) -> str:
         """Size of the mission: 3 agents, 2 formations, 12 phases, 90 s."""

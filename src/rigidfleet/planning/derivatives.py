@@ -70,7 +70,12 @@ def body_series(motion: Motion, time: Floats) -> tuple[Floats, Floats]:
     beyond = time > knots[-1]
     x[0, beyond] += (time - inside)[beyond, None] * x[1, beyond]
     x[2:, beyond] = 0.0
-    return x[..., :3], motion.T1.T @ series.rotation(x[..., 3:])
+    cm, phi = x[..., :3], x[..., 3:]
+    if not phi.any():  # most ways do not turn
+        axes = np.zeros((ORDERS, len(time), 3, 3))
+        axes[0] = motion.T1.T
+        return cm, axes
+    return cm, motion.T1.T @ series.rotation(phi)
 
 
 def blend_series(reference: Reference, time: Floats) -> Floats:

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from rigidfleet.mission import Mission, as_mission
 from rigidfleet.planning.preview import FEWEST_SAMPLES, preview, samples_per_phase
+from rigidfleet.planning.timing import timed
 from rigidfleet.preflight.assignment import assignment_remarks
 from rigidfleet.preflight.findings import Preflight, Remark
 from rigidfleet.preflight.formations import SEARCHED, check_formations, formation_remarks
@@ -51,7 +52,7 @@ def check(
     MissionError
         The mission cannot be read or has errors.
     """
-    mission = as_mission(mission)
+    mission = timed(as_mission(mission))
     search = mission.n_agents <= SEARCHED if search is None else search
     formations = check_formations(mission, search=search, progress=progress)
     progress("planned paths")

@@ -12,6 +12,7 @@ from rigidfleet.formation import assignment, distance_geometry
 from rigidfleet.math import lqr, proximity
 from rigidfleet.mission import Box, Ground, Mission
 from rigidfleet.mission.disturbances import intensity
+from rigidfleet.planning import timing
 from rigidfleet.planning.preview import PlannedPhase, septic
 from rigidfleet.preflight.findings import DENSE, SLACK, Disturbed, Preflight, Remark, some
 from rigidfleet.rigidity import (
@@ -161,7 +162,8 @@ def thrust_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     if best is not None:
         found.thrust = best[:4]
         force, t, who, limit, phase, exact = best
-        if force > limit * (1 + 1e-3):
+        smooth = mission.smooth and exact  # judged with the other limits of the plan
+        if force > limit * (1 + 1e-3) and not smooth:
             text = f"{who} needs {force:.1f} N at {t:.2f} s in '{phase}' (limit {limit:g} N)"
             yield Remark("fails" if exact else "note", "thrust", text)
     yield from _step_thrust(mission, found)
@@ -391,20 +393,10 @@ def limit_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     """Remarks on speed, acceleration and geofence beyond their limits."""
     limits = mission.limits
     for planned in found.planned_phases:
-        for what, values, limit, unit in (
-            ("speed", planned.velocity, limits.speed, "m/s"),
-            ("acceleration", planned.acceleration, limits.acceleration, "m/s^2"),
-        ):
-            if limit is None:
-                continue
-            size = np.linalg.norm(values, axis=2)
-            k, i = np.unravel_index(int(size.argmax()), size.shape)
-            if size[k, i] > limit * (1 + 1e-3):
-                text = (
-                    f"agent {i + 1} reaches {size[k, i]:.3g} {unit} at {planned.time[k]:.2f} s in '{planned.phase}'"
-                    f" (limit {limit:g} {unit})"
-                )
-                yield Remark("fails" if planned.exact else "note", what, text)
+        if mission.smooth and planned.leg.phase.control == "tracking":
+            yield from _broken(mission, planned)
+        else:
+            yield from _sampled(mission, planned)
         if limits.geofence is not None:
             low, high = np.array(limits.geofence.min), np.array(limits.geofence.max)
             out = np.maximum(low - planned.position, planned.position - high).max(axis=2)
@@ -413,3 +405,37 @@ def limit_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
                 by, t = float(out[k, i]), float(planned.time[k])
                 text = f"agent {i + 1} leaves the geofence by {by:.2f} m at {t:.2f} s in '{planned.phase}'"
                 yield Remark("fails" if planned.exact else "note", "geofence", text)
+
+
+def _broken(mission: Mission, planned: PlannedPhase) -> Iterator[Remark]:
+    """Remark on the limit that the reference of a smooth phase breaks most, with the least time that keeps all."""
+    over = timing.broken(mission, planned.leg)
+    if not over:
+        return
+    key, least = timing.least_time(mission, planned.leg)
+    if least is None:
+        remedy = f"no {key} of this phase keeps all limits"
+    else:
+        remedy = f"the least {key} of this phase is {math.ceil(100 * least) / 100:.2f} s"
+    yield Remark(
+        "fails", over[0].limit.name, f"{timing.said(over[0], planned.leg.phase)}; {remedy}"
+    )
+
+
+def _sampled(mission: Mission, planned: PlannedPhase) -> Iterator[Remark]:
+    """Remarks on speed and acceleration of samples beyond their limits."""
+    limits = mission.limits
+    for what, values, limit, unit in (
+        ("speed", planned.velocity, limits.speed, "m/s"),
+        ("acceleration", planned.acceleration, limits.acceleration, "m/s^2"),
+    ):
+        if limit is None:
+            continue
+        size = np.linalg.norm(values, axis=2)
+        k, i = np.unravel_index(int(size.argmax()), size.shape)
+        if size[k, i] > limit * (1 + 1e-3):
+            text = (
+                f"agent {i + 1} reaches {size[k, i]:.3g} {unit} at {planned.time[k]:.2f} s in '{planned.phase}'"
+                f" (limit {limit:g} {unit})"
+            )
+            yield Remark("fails" if planned.exact else "note", what, text)

@@ -21,6 +21,7 @@ from rigidfleet.mission import Mission, Phase, as_mission
 from rigidfleet.planning.plan import plan_phase
 from rigidfleet.planning.reference import PhaseState
 from rigidfleet.planning.solvers import choose
+from rigidfleet.planning.timing import timed
 from rigidfleet.planning.tolerances import absolute_tolerances, most_steps, tolerance_of_velocity
 from rigidfleet.typing import Bools, Floats, Ints
 
@@ -77,7 +78,7 @@ def establish(
         The mission has other phases, axes or assignments, disturbances, or too many edges for the dense solve; or the
         starts have the wrong shape or are not finite.
     """
-    mission = as_mission(mission)
+    mission = timed(as_mission(mission))
     r = _starts("position", position, mission.n_agents)
     v = np.zeros_like(r) if velocity is None else _starts("velocity", velocity, mission.n_agents)
     if v.shape != r.shape:

@@ -21,6 +21,7 @@ from rigidfleet.mission import Mission, Phase, as_mission
 from rigidfleet.planning.disturbances import disturbance
 from rigidfleet.planning.plan import PhasePlan, plan_phase
 from rigidfleet.planning.reference import PhaseState, Pose
+from rigidfleet.planning.timing import timed, with_times
 from rigidfleet.result import PhaseRecord, Result
 from rigidfleet.simulation.active_phase import ActivePhase, Sampler
 from rigidfleet.simulation.as_flown import as_flown, check_formation, with_phase
@@ -166,7 +167,7 @@ class Flight:
         ``sampler`` chooses the times to record (`rigidfleet.simulation.sampling`); ``flips`` allows a formation to
         flip over.
         """
-        self.mission = mission = as_mission(mission)
+        self.mission = mission = timed(as_mission(mission))
         if not (isinstance(rate, int | float | np.number) and rate > 0.0):
             raise ValueError(f"the control rate must be positive [Hz], not {rate!r}")
         for name, function in (("controller", controller), ("progress", progress)):
@@ -278,6 +279,7 @@ class Flight:
         else:
             check_formation(self.mission, phase)
         self._leave(changed=True)
+        phase = with_times(self.mission, phase, self._now, len(self._asked))
         if self._asked:
             self._report(phase, planning=True)
         try:

@@ -1,0 +1,153 @@
+"""How near the reference of a phase comes to the limits of speed, acceleration, jerk, tilt and thrust.
+
+Limits hold for each slot, with the turn and the change of shape included. The greatest share of each limit is searched
+in continuous time: on a grid of at least 128 samples of the phase, 128 of the blend and 16 of each piece, and then, in
+the neighbourhood of the four highest peaks of the grid, on ever finer ones. Values are found to 1e-3 of the limit; the
+tests compare them with dense samples.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from rigidfleet.kernel.problem import Motion, Reference
+from rigidfleet.mission import Mission
+from rigidfleet.planning.derivatives import slot_derivatives
+from rigidfleet.typing import Floats, Ints
+
+#: Samples of a phase and of a blend, of a piece, and of a phase of many pieces in all.
+_PHASE, _PIECE, _MOST = 129, 16, 2048
+#: Peaks of the grid that are refined, and how high they are at least, as a share of the highest one; samples of a
+#: refined peak, and how often it is refined.
+_PEAKS, _HIGH, _FINE, _TIMES = 4, 0.97, 17, 3
+#: Greatest number of positions computed at once.
+_BLOCK = 500_000
+
+
+class Limit(NamedTuple):
+    """A limit of each agent: its key, unit, value (N,), and the quantity (K, N) that it bounds."""
+
+    name: str
+    unit: str
+    most: Floats
+    quantity: Callable[[Floats, Ints], Floats]
+
+
+class Reached(NamedTuple):
+    """The greatest share of a limit that a reference reaches."""
+
+    limit: Limit
+    value: float
+    time: float  # [s]
+    agent: int  # from 0
+
+    @property
+    def share(self) -> float:
+        """Value over limit."""
+        return self.value / float(self.limit.most[self.agent])
+
+
+def limits_of(mission: Mission) -> list[Limit]:
+    """The limits that a mission sets to its references."""
+    given, n = mission.limits, mission.n_agents
+    mass, up = mission.fleet.mass, np.array([0.0, 0.0, mission.gravity])
+
+    def size(order: int) -> Callable[[Floats, Ints], Floats]:
+        return lambda x, _: np.linalg.norm(x[:, order], axis=-1)
+
+    def tilt(x: Floats, _: Ints) -> Floats:
+        force = x[:, 2] + up
+        return np.rad2deg(np.arctan2(np.hypot(force[..., 0], force[..., 1]), force[..., 2]))
+
+    def thrust(x: Floats, who: Ints) -> Floats:
+        return mass[who] * np.linalg.norm(x[:, 2] + up, axis=-1)
+
+    found = [
+        Limit(name, unit, np.full(n, most), quantity)
+        for name, unit, most, quantity in (
+            ("speed", "m/s", given.speed, size(1)),
+            ("acceleration", "m/s^2", given.acceleration, size(2)),
+            ("jerk", "m/s^3", given.jerk, size(3)),
+            ("tilt", "deg", given.tilt_deg, tilt),
+        )
+        if most is not None
+    ]
+    limit = mission.fleet.thrust_limit
+    return [*found, Limit("thrust", "N", limit, thrust)] if np.isfinite(limit).any() else found
+
+
+def reached(
+    limits: list[Limit],
+    reference: Reference,
+    motion: Motion,
+    begin: float,
+    end: float,
+    *,
+    fine: bool = True,
+) -> list[Reached]:
+    """What a reference reaches of each limit between two times [s]; on the grid alone unless ``fine``."""
+    time = _grid(reference, motion, begin, end)
+    n = len(reference.p0)
+    step = max(1, _BLOCK // len(time))
+    best: list[Reached | None] = [None] * len(limits)
+    for first in range(0, n, step):
+        who = np.arange(first, min(first + step, n))
+        x = slot_derivatives(_of(reference, who), motion, time, 4)
+        for k, limit in enumerate(limits):
+            if not np.isfinite(limit.most[who]).any():
+                continue
+            found = _highest(limit, reference, motion, time, x, who, fine=fine)
+            before = best[k]
+            if before is None or found.share > before.share:
+                best[k] = found
+    return [found for found in best if found is not None]
+
+
+def _grid(reference: Reference, motion: Motion, begin: float, end: float) -> Floats:
+    knots = motion.knots[(motion.knots >= begin) & (motion.knots <= end)]
+    each = max(2, min(_PIECE, _MOST // max(len(knots), 1)))
+    shares = np.linspace(0.0, 1.0, each, endpoint=False)
+    inside = (knots[:-1, None] + shares * np.diff(knots)[:, None]).ravel()
+    blend = np.linspace(reference.t0, reference.t0 + reference.T_b, _PHASE)
+    blend = blend[(blend >= begin) & (blend <= end)]
+    return np.unique(np.concatenate([np.linspace(begin, end, _PHASE), inside, knots, blend]))
+
+
+def _of(reference: Reference, who: Ints) -> Reference:
+    return reference._replace(p0=reference.p0[who], dp=reference.dp[who])
+
+
+def _highest(
+    limit: Limit,
+    reference: Reference,
+    motion: Motion,
+    time: Floats,
+    x: Floats,
+    who: Ints,
+    *,
+    fine: bool,
+) -> Reached:
+    """The greatest share of a limit, refined about the highest samples x (K, 4, N, 3) at times (K,)."""
+    shares = limit.quantity(x, who) / limit.most[who]
+    agents = shares.argmax(axis=1)
+    top = shares[np.arange(len(time)), agents]
+    k = int(top.argmax())
+    best = top[k], time[k], int(who[agents[k]])
+    around = np.concatenate([[-np.inf], top, [-np.inf]])
+    high = top >= _HIGH * top[k]
+    peaks = np.flatnonzero(high & (top >= around[:-2]) & (top >= around[2:]))
+    for k in peaks[np.argsort(-top[peaks], kind="stable")][: _PEAKS if fine else 0]:
+        agent = who[agents[k] : agents[k] + 1]
+        low, high = time[max(k - 1, 0)], time[min(k + 1, len(time) - 1)]
+        for _ in range(_TIMES):
+            near = np.linspace(low, high, _FINE)
+            y = slot_derivatives(_of(reference, agent), motion, near, 4)
+            values = (limit.quantity(y, agent) / limit.most[agent])[:, 0]
+            j = int(values.argmax())
+            best = max(best, (values[j], near[j], int(agent[0])))
+            low, high = near[max(j - 1, 0)], near[min(j + 1, _FINE - 1)]
+    share, t, agent = best
+    return Reached(limit, float(share * limit.most[agent]), float(t), agent)

@@ -1,0 +1,223 @@
+"""Least times of the phases of a smooth mission, and the mission with its automatic times replaced by them.
+
+The least time of a phase is the shortest in which its reference keeps every limit of the mission
+(`rigidfleet.planning.limits`), from the planned state at its start.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+from rigidfleet.errors import Finding, MissionError
+from rigidfleet.mission import Fly, Mission, Phase
+from rigidfleet.mission.schema import AUTO, Orbit, Shaping, Steering
+from rigidfleet.planning.courses import SmoothFlight, course
+from rigidfleet.planning.limits import Reached, limits_of, reached
+from rigidfleet.planning.preview import Leg, at_start, leg
+from rigidfleet.planning.reference import PhaseState, attach, slots_about_cm
+
+#: Shortest and longest time tried [s], and the number of times tried.
+_SHORTEST, _LONGEST, _TRIES = 0.1, 1e5, 60
+#: Ratio of a time that is long enough to one that is not, at which the search ends; greatest ratio of two times tried
+#: one after the other; a guess lies so far beyond the solution that it is long enough, and so far within the bounds.
+_CLOSE, _STEP, _NEARLY, _NEAR = 1.006, 4.0, 1.002, 1.005
+#: A time that is more than twice as long has to lower the greatest share of a limit at least to this part of it.
+_STALLED = 0.98
+#: Root of each share that falls in proportion to the time, for ways from rest to rest.
+_POWERS = {"speed": 1.0, "acceleration": 1 / 2, "jerk": 1 / 3, "tilt": 1 / 2, "thrust": 1 / 2}
+#: What automatic times have in reserve, and the unit to which they are rounded up [s].
+_MARGIN, _UNIT = 1.005, 1e-3
+#: Excess over a limit that is ignored.
+SLACK = 1e-3
+
+
+def timed(mission: Mission) -> Mission:
+    """Return a mission with its automatic times replaced by the least ones; itself if it has none.
+
+    Times follow from the planned state at the start of each phase; a phase before that ends by settling is assumed to
+    have arrived. The mission keeps its own text, so that a result repeats from it.
+
+    Raises
+    ------
+    MissionError
+        No time of a phase keeps the limits, its start is not known before the flight, or a phase ends too early for
+        the times before it.
+    """
+    last = max((k for k, phase in enumerate(mission.phases) if phase.automatic), default=None)
+    if last is None:
+        return mission
+    tables = mission.to_dict()["phases"]
+    now = at_start(mission)
+    for k, phase in enumerate(mission.phases[: last + 1]):
+        explicit = with_times(mission, phase, now, k)
+        if explicit is not phase:
+            changed = explicit.model_dump(mode="json", include={*phase.automatic, "through"})
+            tables[k] = tables[k] | {key: x for key, x in changed.items() if x or key != "through"}
+        found = leg(mission, explicit, now)
+        if found is None:
+            raise _unknown(mission, k, mission.phases[last])
+        now = found.after
+    return mission.with_phases(tables)
+
+
+def with_times(mission: Mission, phase: Phase, now: PhaseState, number: int) -> Phase:
+    """A phase with its automatic times replaced by the least ones, from a state at its start.
+
+    Raises
+    ------
+    MissionError
+        No time keeps the limits.
+    """
+    if not phase.automatic:
+        return phase
+    phase = _shared_out(mission, phase, now)
+    if phase.duration == AUTO and phase.shaping is not None and phase.shaping.blend != AUTO:
+        shortest, vary = phase.shaping.least_time, _lasting
+    else:
+        shortest, vary = _SHORTEST, _moving
+    time, worst = _least(mission, lambda t: vary(phase, t), now, shortest)
+    if time is None:
+        key = phase.automatic[0]
+        problem = f"no time keeps the limits of the mission: {said(worst, phase)}"
+        remedy = f"raise limits.{worst.limit.name}, or change the way"
+        path = f"phases[{number + 1}].{key}"
+        raise MissionError([Finding(mission.origin, path, AUTO, problem, remedy)])
+    if time > shortest:
+        time = math.ceil(time * _MARGIN / _UNIT - 1e-9) * _UNIT
+    return vary(phase, round(time, 6))
+
+
+def least_time(mission: Mission, found: Leg) -> tuple[str, float | None]:
+    """The key of a phase that sets the time of its motion, and its least value [s]; None if no time is enough.
+
+    The least time keeps all limits of the mission, and is found to within 1 %.
+    """
+    phase, length = found.phase, found.end - found.begin
+    phase = phase.model_copy(update={"until": None, "settle": None, "duration": length})
+    phase = _shared_out(mission, phase, found.before)
+    time, _ = _least(mission, lambda t: _moving(phase, t), found.before, _SHORTEST)
+    return _key(phase), time
+
+
+def broken(mission: Mission, found: Leg) -> list[Reached]:
+    """Limits that the reference of a planned leg breaks, the worst first."""
+    if found.phase.control != "tracking":
+        return []
+    over = reached(limits_of(mission), found.reference, found.motion, found.begin, found.end)
+    return sorted((x for x in over if x.share > 1.0 + SLACK), key=lambda x: -x.share)
+
+
+def said(worst: Reached, phase: Phase) -> str:
+    """What is reached of a limit, in words."""
+    limit = worst.limit
+    return (
+        f"agent {worst.agent + 1} would need {worst.value:.3g} {limit.unit} of {limit.name} at {worst.time:.2f} s in"
+        f" '{phase.name}' (limit {limit.most[worst.agent]:g} {limit.unit})"
+    )
+
+
+def _least(
+    mission: Mission, vary: Callable[[float], Phase], now: PhaseState, shortest: float
+) -> tuple[float | None, Reached]:
+    """The least time [s] from ``shortest`` on that keeps the limits; if there is none, what breaks them."""
+    limits = limits_of(mission)
+
+    def each(time: float, *, fine: bool = False) -> list[Reached]:
+        found = leg(mission, vary(time), now)
+        assert found is not None  # slots are tracked
+        return reached(limits, found.reference, found.motion, found.begin, found.end, fine=fine)
+
+    def excess(time: float) -> float:
+        """Greatest share of a limit [-], as a power that falls in proportion to the time."""
+        return max(x.share ** _POWERS[x.limit.name] for x in each(time))
+
+    # At rest at both ends, every share falls with a power of the time: from a trial, the first guess is the solution.
+    low, high, time = 0.0, math.inf, max(_TRIAL, shortest)
+    before = math.inf
+    for _ in range(_TRIES):
+        over = excess(time)
+        if time > _STEP / 2 * low > 0.0 and over > _STALLED * before:
+            low = time  # a longer time does not help: the state at the start, or a circle, is beyond the limit
+            break
+        before = over
+        low, high = (time, high) if over > 1.0 else (low, min(high, time))
+        if high <= max(low * _CLOSE, shortest) or low > _LONGEST:
+            break
+        guess = time * min(max(over * _NEARLY, 1 / _STEP), _STEP)
+        time = max(min(max(guess, low * _NEAR), high / _NEAR), shortest)
+    if high == math.inf:
+        return None, max(each(low), key=lambda x: x.share)
+    while (worst := max(each(high, fine=True), key=lambda x: x.share)).share > 1.0 + SLACK:
+        high *= 1.001  # between the samples of the grid
+    return high, worst
+
+
+def _key(phase: Phase) -> str:
+    """The key that sets the time of a phase's motion."""
+    if isinstance(phase, Shaping | Orbit):
+        return "blend"
+    return "travel" if isinstance(phase, Steering) and phase.travel is not None else "duration"
+
+
+def _moving(phase: Phase, time: float) -> Phase:
+    """A phase whose motion takes a time [s]; it does not end before."""
+    key = _key(phase)
+    told: dict[str, Any] = {key: time}
+    if key != "duration":
+        if phase.duration == AUTO:
+            told["duration"] = time
+        elif isinstance(phase.duration, float):
+            told["duration"] = max(phase.duration, time)
+    if isinstance(phase, Fly) and phase.through:
+        before = _arrival(phase)
+        told["through"] = tuple(
+            at.model_copy(update={"time": (at.time or 0.0) * time / before}) for at in phase.through
+        )
+    return phase.model_copy(update=told)
+
+
+def _lasting(phase: Phase, time: float) -> Phase:
+    """A phase that lasts a time [s], whatever the duration of its blend."""
+    return phase.model_copy(update={"duration": time})
+
+
+#: Time of a way [s] for which the times of its points are allocated, before the least one is known.
+_TRIAL = 10.0
+
+
+def _arrival(phase: Fly) -> float:
+    """Time [s] from the start to the arrival; a trial if it is automatic."""
+    time = phase.duration if phase.travel is None else phase.travel
+    return time if isinstance(time, float) else _TRIAL
+
+
+def _shared_out(mission: Mission, phase: Phase, now: PhaseState) -> Phase:
+    """A phase whose points to pass have times, in shares of the whole that then stay."""
+    if not isinstance(phase, Fly) or not phase.through:
+        return phase
+    masses = mission.fleet.mass
+    _, now, _ = attach(mission, phase, now, masses, slots_about_cm(mission, now.formation, masses))
+    end = now.t + _arrival(phase)
+    flight = course(mission, phase.model_copy(update=_until(phase)), now, end).flight
+    assert isinstance(flight, SmoothFlight)
+    times = flight.times()[1:-1].tolist()
+    through = zip(phase.through, times, strict=True)
+    shared = tuple(at.model_copy(update={"time": round(t, 6)}) for at, t in through)
+    return phase.model_copy(update={"through": shared})
+
+
+def _until(phase: Fly) -> dict[str, Any]:
+    return {} if phase.travel is None else {"travel": _arrival(phase)}
+
+
+def _unknown(mission: Mission, number: int, last: Phase) -> MissionError:
+    problem = (
+        "depends on distances alone, so that the starts of later phases are known only in flight"
+    )
+    remedy = f"give the formation a shape or slots, or give '{last.name}' a time"
+    path = f"phases[{number + 1}].formation"
+    shaping = mission.phases[number].shaping
+    name = None if shaping is None else shaping.formation
+    return MissionError([Finding(mission.origin, path, name, problem, remedy)])
