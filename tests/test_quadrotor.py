@@ -69,11 +69,13 @@ def test_derivatives_are_those_of_rotorpy_and_crazyflow():
 
 @pytest.mark.parametrize("name", ROTORPY)
 def test_a_second_of_random_rotor_inputs(name):
-    """One second of random rotor inputs ends where RotorPy, integrated to 1e-12, does; the order of the steps is four."""
+    """One second of random rotor inputs ends where RotorPy, integrated to 1e-12, does; the order is four."""
     given = json.loads(FROZEN.read_text())["flights"][name]
     errors = []
     for h in (2e-3, 1e-3, 5e-4):
-        problem, work, flight, state = begun([ROTORPY[name]], np.zeros((1, 3)), h=h, steps=round(0.02 / h))
+        problem, work, flight, state = begun(
+            [ROTORPY[name]], np.zeros((1, 3)), h=h, steps=round(0.02 / h)
+        )
         flight = by_rotors(flight)
         for k, command in enumerate(given["command"]):
             flight.commands.speeds[0] = command
@@ -113,7 +115,13 @@ def test_many_derivatives_are_those_of_rotorpy(name):
     theirs = [rotorpy_derivative(model, *row) for row in zip(S, command, wind, strict=True)]
     assert relative(derivative(ROTORPY[name], S, command, wind), theirs) < 1e-12
     S, command = random_inputs(ROTORPY[name])
-    assert relative(rotorpy_flight(model, S, command), json.loads(FROZEN.read_text())["flights"][name]["end"]) < 1e-9
+    assert (
+        relative(
+            rotorpy_flight(model, S, command),
+            json.loads(FROZEN.read_text())["flights"][name]["end"],
+        )
+        < 1e-9
+    )
 
 
 # -- closed forms ----------------------------------------------------------------------------------
@@ -296,7 +304,7 @@ def test_downwash_pushes_the_lower_vehicle_down():
 
 
 def test_ground_effect():
-    """The thrust near the ground is that of the published formula, of one rotor far from others, and fades with height."""
+    """The thrust near the ground is that of the published formula, also for one rotor alone, and fades with height."""
     alone = aerodynamics.ground_effect(0.3, 0.2, np.array([1e6, 1e6]))
     assert alone == pytest.approx(1.0 / (1.0 - (0.2 / (4 * 0.3)) ** 2), rel=1e-12)
     vehicle = replace(HUMMINGBIRD, radius=0.1)
@@ -329,7 +337,9 @@ def test_flatness():
         s, c = np.sin(np.array([1.1, 0.7, 1.9]) * t), np.cos(np.array([1.1, 0.7, 1.9]) * t)
         w, A = np.array([1.1, 0.7, 1.9]), np.array([3.0, -2.0, 1.5])
         F = np.array([0.5, 0.2, 9.81]) + A * s
-        yaw = np.array([0.8 * math.sin(0.9 * t), 0.72 * math.cos(0.9 * t), -0.648 * math.sin(0.9 * t)])
+        yaw = np.array(
+            [0.8 * math.sin(0.9 * t), 0.72 * math.cos(0.9 * t), -0.648 * math.sin(0.9 * t)]
+        )
         return F, A * w * c, -A * w * w * s, yaw
 
     def desired(t: float) -> np.ndarray:
@@ -350,7 +360,9 @@ def test_flatness():
         T_dot = np.tensordot(stencil, around[:, :3], 1)
         S = -T_dot @ T.T  # [omega x]
         np.testing.assert_allclose(now[3], [S[2, 1], S[0, 2], S[1, 0]], rtol=0, atol=1e-9)
-        np.testing.assert_allclose(now[4], np.tensordot(stencil, around[:, 3], 1), rtol=0, atol=1e-9)
+        np.testing.assert_allclose(
+            now[4], np.tensordot(stencil, around[:, 3], 1), rtol=0, atol=1e-9
+        )
 
 
 def test_tilt_limit():
@@ -375,9 +387,13 @@ def test_tilt_limit():
 
 
 def test_attitude_torque_vanishes_on_the_way_and_leads_back():
-    """At the desired attitude and rates the torque is that of the motion; a small error meets -k_R e - k_omega e_omega."""
+    """At the desired attitude and rates torque is that of the motion; small errors meet -k_R e_R - k_omega e_omega."""
     rng = np.random.default_rng(3)
-    inertia, k_R, k_omega = np.array([0.01, 0.012, 0.019]), np.array([500.0, 400, 90]), np.array([40.0, 35, 9])
+    inertia, k_R, k_omega = (
+        np.array([0.01, 0.012, 0.019]),
+        np.array([500.0, 400, 90]),
+        np.array([40.0, 35, 9]),
+    )
     T = Rotation.random(rng=rng).as_matrix()
     desired = np.vstack([T, rng.normal(size=(2, 3))])
     tau = np.zeros(3)
@@ -406,21 +422,30 @@ def lexicographic(thrust, tau, B, least, most) -> np.ndarray:
     T = linprog([0, 1], A, np.r_[room, thrust, -thrust], bounds=[(None, None), (0, None)]).x[0]
     yaw = (B[:, 3] * tau[2])[:, None]
     fixed = fixed + each[:, 0] * T
-    k = linprog([-1], np.vstack([yaw, -yaw]), limits - np.r_[fixed, -fixed] + 1e-12, bounds=[(0, 1)]).x[0]
+    k = linprog(
+        [-1], np.vstack([yaw, -yaw]), limits - np.r_[fixed, -fixed] + 1e-12, bounds=[(0, 1)]
+    ).x[0]
     return fixed + k * yaw[:, 0]
 
 
 def test_allocation_keeps_its_priorities():
     """Within limits the wrench is exact; beyond, forces are those of roll and pitch first, then thrust, then yaw."""
     rng, f, saturated = np.random.default_rng(0), np.zeros(4), 0
-    uneven = replace(PAPER, rotors=[[0.2, 0.15, 0], [0.15, -0.2, 0], [-0.2, -0.15, 0], [-0.15, 0.25, 0]])
+    uneven = replace(
+        PAPER, rotors=[[0.2, 0.15, 0], [0.15, -0.2, 0], [-0.2, -0.15, 0], [-0.15, 0.25, 0]]
+    )
     for vehicle in (PAPER, uneven):
         B = vehicle.unmixed(G)
         for _ in range(100):
-            thrust, tau = rng.uniform(-5, 30), rng.normal(size=3) * rng.choice([0.1, 1.0, 3.0]) * [1, 1, 0.2]
+            thrust, tau = (
+                rng.uniform(-5, 30),
+                rng.normal(size=3) * rng.choice([0.1, 1.0, 3.0]) * [1, 1, 0.2],
+            )
             if attitude_control.allocate_rotors(thrust, tau, B, 0.1, 5.9, f):
                 saturated += 1
-                np.testing.assert_allclose(f, lexicographic(thrust, tau, B, 0.1, 5.9), rtol=0, atol=1e-7)
+                np.testing.assert_allclose(
+                    f, lexicographic(thrust, tau, B, 0.1, 5.9), rtol=0, atol=1e-7
+                )
             else:
                 np.testing.assert_allclose(np.linalg.inv(B) @ f, [thrust, *tau], rtol=0, atol=1e-12)
             assert f.min() >= 0.1
@@ -455,4 +480,6 @@ def test_thrust_and_attitude_can_be_commanded():
 def test_rotors_that_cannot_turn_the_vehicle_are_refused():
     """Four rotors that all turn the same way have no yaw torque: an error says so."""
     with pytest.raises(ValueError, match="do not span thrust and three torques"):
-        fleet.quadrotors([replace(PAPER, spin=(1, 1, 1, 1), rotors=np.diag([1.0, 1, 1, 1])[:, :3] * 0)])
+        fleet.quadrotors(
+            [replace(PAPER, spin=(1, 1, 1, 1), rotors=np.diag([1.0, 1, 1, 1])[:, :3] * 0)]
+        )

@@ -144,7 +144,9 @@ def rotorpy(name: str) -> Any:
     return Multirotor(import_module(f"rotorpy.vehicles.{name}_params").quad_params)
 
 
-def rotorpy_derivative(model: Any, S: np.ndarray, command: np.ndarray, wind: np.ndarray) -> np.ndarray:
+def rotorpy_derivative(
+    model: Any, S: np.ndarray, command: np.ndarray, wind: np.ndarray
+) -> np.ndarray:
     """Its derivative (17,) of a state; it puts the scalar of a quaternion last and has the wind among the states."""
     s = np.concatenate([S[:6], S[[7, 8, 9, 6]], S[10:13], wind, S[13:]])
     d = model._s_dot_fn(0.0, s, command)
@@ -188,7 +190,17 @@ def crazyflow_derivative(given: dict[str, Any], S: np.ndarray, command: np.ndarr
     from crazyflow.dynamics.first_principles import dynamics
 
     unit = 2.0 * np.pi / 60.0
-    names = ("mass", "L", "prop_inertia", "J", "rpm2thrust", "rpm2torque", "mixing_matrix", "drag_matrix", "rotor_dyn_coef")
+    names = (
+        "mass",
+        "L",
+        "prop_inertia",
+        "J",
+        "rpm2thrust",
+        "rpm2torque",
+        "mixing_matrix",
+        "drag_matrix",
+        "rotor_dyn_coef",
+    )
     parts = dynamics(
         S[:3], S[[7, 8, 9, 6]], S[3:6], S[10:13], command / unit, S[13:] / unit, gravity_vec=np.array([0, 0, -G]),
         J_inv=np.linalg.inv(given["J"]), **{name: given[name] for name in names},

@@ -133,9 +133,10 @@ class PhaseRecord:
         (distance of a lost vehicle to one that still flies), geofence (distance beyond it), lowest, highest [m];
         speed [m/s]; acceleration [m/s^2]; thrust, thrust_margin (thrust minus its limit), constraint_force, tension
         [N]; constraint [m]; of vehicles also rotor_force [N] (of the rotor nearest to its limit), tilt [rad],
-        tracking_error [m] and saturation (share of the phase). If vehicles stand on obstacles, clearance is also given for those that have stood on one
-        since the start (clearance_start), for those in flight (clearance_flight), and for those that stand on one
-        until the end (clearance_end). Empty if only samples are known
+        tracking_error [m] and saturation (share of the phase). If vehicles stand on obstacles, clearance is also
+        given for those that have stood on one since the start (clearance_start), for those in flight
+        (clearance_flight), and for those that stand on one until the end (clearance_end). Empty if only samples are
+        known
     """
 
     name: str

@@ -9,8 +9,8 @@ from rigidfleet.kernel.rigid_body import attitude_matrix
 # Turbulent jet below a hovering quadrotor: decay and spread of its far field, and its virtual origin in distances of
 # opposite motors (Bauersfeld et al. 2024, arXiv:2403.13321, Eq. (9)).
 _DECAY, _SPREAD, _ORIGIN = 10.11, 0.07668, -5.817
-# Share of the body's lift in the ground effect (Sanchez-Cuevas et al. 2017), and the least height, in radii, at which the
-# formula is used.
+# Share of the body's lift in the ground effect (Sanchez-Cuevas et al. 2017), and the least height, in radii, at which
+# the formula is used.
 _BODY, _LEAST_HEIGHT = 2.0, 0.5
 
 

@@ -7,19 +7,21 @@ the body axes b1, b2, b3; the rates omega [rad/s] and accelerations [rad/s^2] in
 
 import math
 
-from rigidfleet.kernel.compiler.jit import compiled
-from rigidfleet.kernel.fleet import ATTITUDE, ROTORS
+from rigidfleet.kernel.compiler.jit import compiled, inlined
+from rigidfleet.kernel.fleet import ATTITUDE, ROTORS, speed_of
 from rigidfleet.kernel.rigid_body import attitude_matrix
 
 # Least vertical part of a force whose tilt is limited, as a share of the weight: a force downwards has no tilt to keep.
 _LEAST_LIFT = 0.05
 
+_speed = inlined(speed_of)
+
 
 @compiled
 def limit_tilt(F, tilt, weight):
-    """Limit the tilt of a desired force F (3,) [N] to ``tilt`` [rad]: keep its vertical part, shorten the horizontal one.
+    """Limit the tilt of a desired force F (3,) [N] to ``tilt`` [rad]; none from pi/2 on. Returns whether F changed.
 
-    The vertical part is at least a twentieth of the ``weight`` [N]. No limit from pi/2 on. Returns whether F was changed.
+    The vertical part is kept, but is at least a twentieth of the ``weight`` [N]; the horizontal one is shortened.
     """
     if tilt >= 0.5 * math.pi:
         return False
@@ -150,10 +152,8 @@ def allocate_rotors(thrust, tau, B, least, most, f):
 @compiled
 def rotor_speeds(f, curve, limits, out):
     """Speeds out (4,) [rad/s] of rotors with forces f (4,) [N], within limits (2,), by their thrust curve (3,)."""
-    k0, k1, k2 = curve[0], curve[1], curve[2]
     for j in range(4):
-        root = math.sqrt(max(0.0, k1 * k1 + 4.0 * k2 * (f[j] - k0)))
-        out[j] = min(max((root - k1) / (2.0 * k2), limits[0]), limits[1])
+        out[j] = min(max(_speed(f[j], curve[0], curve[1], curve[2]), limits[0]), limits[1])
 
 
 @compiled

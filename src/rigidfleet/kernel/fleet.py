@@ -1,7 +1,7 @@
 """A fleet of quadrotors and its sampled flight as arrays, read and written by `sampled_flight`.
 
-N vehicles, m edges. World axes are x, y horizontal and z up; body axes are x forward, y left, z up. A quaternion has its
-scalar first, and T(q) takes world axes to body axes, as in `rigidfleet.math.attitude`.
+N vehicles, m edges. World axes are x, y horizontal and z up; body axes are x forward, y left, z up. A quaternion has
+its scalar first, and T(q) takes world axes to body axes, as in `rigidfleet.math.attitude`.
 """
 
 from collections.abc import Sequence
@@ -29,14 +29,30 @@ UPRIGHT, ERROR, ACCELERATION, LOAD, CONSTRAINT_FORCE = range(5)
 ENDLESS = 1 << 62
 
 
+def thrust_of(speed, k0, k1, k2):
+    """Thrust [N] (or torque [N m]) of a rotor at a speed [rad/s], by a quadratic curve."""
+    return k0 + speed * (k1 + k2 * speed)
+
+
+def speed_of(thrust, k0, k1, k2):
+    """Speed [rad/s] of a rotor with a thrust [N]: the greater root; that of the least thrust, if it is less."""
+    return (np.sqrt(np.maximum(0.0, k1 * k1 + 4.0 * k2 * (thrust - k0))) - k1) / (2.0 * k2)
+
+
+def _three(values: ArrayLike) -> tuple[float, float, float]:
+    a, b, c = np.asarray(values, dtype=float).tolist()
+    return a, b, c
+
+
 @dataclass(frozen=True)
 class Vehicle:
     """One quadrotor, or one ideal point.
 
     A rotor at speed w [rad/s] has the thrust ``thrust[0] + thrust[1] w + thrust[2] w^2`` [N] and the torque about its
     axis ``torque[0] + torque[1] w + torque[2] w^2`` [N m]. Its speed follows the command c by
-    ``(c - w) (a + b (c + w))``, with (a, b) = ``motor[:2]`` if it rises and ``motor[2:]`` if it falls; a first-order lag
-    is a = 1/tau, b = 0. A ``point`` delivers any force at once, up to ``limit``; only m, drag and limit matter then.
+    ``(c - w) (a + b (c + w))``, with (a, b) = ``motor[:2]`` if it rises and ``motor[2:]`` if it falls; a first-order
+    lag is a = 1/tau, b = 0. A ``point`` delivers any force at once, up to ``limit``; then only m, drag and limit
+    matter.
 
     Raises
     ------
@@ -50,7 +66,10 @@ class Vehicle:
     spin: ArrayLike = (1, -1, 1, -1)  # (4,) sign of the torque of each rotor on the body
     thrust: ArrayLike = (0.0, 0.0, 1.0)  # (3,) [N], [N s/rad], [N s^2/rad^2]
     torque: ArrayLike = (0.0, 0.0, 1.0)  # (3,) [N m], ...
-    rotor_drag: ArrayLike = (0.0, 0.0)  # (2,) in and along the rotor's axis [N s^2/(m rad)]: k_d, k_z
+    rotor_drag: ArrayLike = (
+        0.0,
+        0.0,
+    )  # (2,) in and along the rotor's axis [N s^2/(m rad)]: k_d, k_z
     lift: float = 0.0  # translational lift of a rotor k_h [N s^2/m^2]
     c: ArrayLike = (0.0, 0.0, 0.0)  # (3,) parasitic drag, body axes [N s^2/m^2]
     drag: ArrayLike = (0.0, 0.0, 0.0)  # (3,) linear drag, body axes [N s/m]
@@ -66,13 +85,11 @@ class Vehicle:
 
     def thrust_at(self, speed: ArrayLike) -> Floats:
         """Thrust [N] of a rotor at a speed [rad/s]."""
-        return np.polynomial.polynomial.polyval(np.asarray(speed, dtype=float), self.thrust)
+        return thrust_of(np.asarray(speed, dtype=float), *_three(self.thrust))
 
     def speed_at(self, thrust: ArrayLike) -> Floats:
         """Speed [rad/s] of a rotor with a thrust [N]."""
-        k0, k1, k2 = np.asarray(self.thrust, dtype=float)
-        root = np.sqrt(k1**2 + 4.0 * k2 * (np.asarray(thrust, dtype=float) - k0))
-        return (root - k1) / (2.0 * k2)
+        return speed_of(np.asarray(thrust, dtype=float), *_three(self.thrust))
 
     def unmixed(self, g: float) -> Floats:
         """Matrix (4, 4) from thrust [N] and torque [N m] to the rotors' forces.
@@ -82,13 +99,13 @@ class Vehicle:
         if self.point:
             return np.zeros((4, 4))
         hover = self.speed_at(0.25 * self.m * g or 0.5 * self.thrust_at(self.speed)[1])
-        ratio = np.polynomial.polynomial.polyval(hover, self.torque) / self.thrust_at(hover)
-        x, y, _ = np.asarray(self.rotors, dtype=float).T
-        mixing = np.stack([np.ones(4), y, -x, ratio * np.asarray(self.spin)])
-        if not np.linalg.matrix_rank(mixing) == 4:
+        ratio = thrust_of(hover, *_three(self.torque)) / self.thrust_at(hover)
+        rotors, spin = np.asarray(self.rotors, dtype=float), np.asarray(self.spin, dtype=float)
+        mixing = np.stack([np.ones(4), rotors[:, 1], -rotors[:, 0], ratio * spin])
+        if np.linalg.matrix_rank(mixing) < 4:
             raise ValueError(
-                f"rotors at {np.asarray(self.rotors).tolist()} that turn by {np.asarray(self.spin).tolist()} do not span"
-                " thrust and three torques; move one, or turn it the other way"
+                f"rotors at {rotors.tolist()} that turn by {spin.tolist()} do not span thrust and three torques; move"
+                " one, or turn it the other way"
             )
         return np.linalg.inv(mixing)
 
@@ -163,8 +180,8 @@ class Guidance(NamedTuple):
 class Tables(NamedTuple):
     """Values for attitude ticks from ``first`` to before ``last``, where the flight pauses for the next ones.
 
-    A table without rows stands for zeros, or for nothing dropped. K = last - first ticks; a measurement or message takes
-    place at ticks that are a multiple of `Sensing.every` or `Sensing.link_every`, and has a row for each of them.
+    A table without rows stands for zeros, or for nothing dropped. K = last - first ticks. A measurement or message
+    takes place at multiples of `Sensing.every` or `Sensing.link_every`; their tables have a row for each.
     """
 
     first: int
@@ -214,7 +231,9 @@ class SampledState(NamedTuple):
     clock: Floats  # (2,) time, and time of the last evaluation of the law [s]
     count: Ints  # (5,) see `STEPS`
     integral: Floats  # (1, m) of the constraints [m s]; (N, m) if linked
-    frame: Floats  # (3, 4) mean-axis quaternion at the last evaluation, its rate, and the rate before
+    frame: (
+        Floats  # (3, 4) mean-axis quaternion at the last evaluation, its rate, and the rate before
+    )
     error: Floats  # (N, 3) integral of the tracking error [m s]
     f_u: Floats  # (N, 3) input force of the law, held [N]
     f_C: Floats  # (N, 3) its constraint force [N]
@@ -239,7 +258,9 @@ class SampledWork(NamedTuple):
     """Work arrays of a sampled flight."""
 
     y: Floats  # (7, 17) start, trial, four derivatives, end
-    air: Floats  # (3, N, 3) velocity of the air at the start, the middle and the end of a step [m/s]
+    air: (
+        Floats  # (3, N, 3) velocity of the air at the start, the middle and the end of a step [m/s]
+    )
     T: Floats  # (3, 3)
     desired: Floats  # (5, 3) desired attitude (3, 3), its rates and accelerations
     x: Floats  # (4, 4)
@@ -307,9 +328,7 @@ def quadrotors(vehicles: Sequence[Vehicle], g: float = 9.81) -> Quadrotors:
 
 def still_air(n: int) -> Air:
     """Air at rest, without downwash and ground effect."""
-    return Air(
-        np.zeros(3), 1.0, np.zeros((0, n, 3)), False, False, 1.225, 0.0, np.full(n, -np.inf)
-    )
+    return Air(np.zeros(3), 1.0, np.zeros((0, n, 3)), False, False, 1.225, 0.0, np.full(n, -np.inf))
 
 
 def exact_sensing(n: int) -> Sensing:
@@ -333,9 +352,7 @@ def no_commands(n: int) -> Commands:
     )
 
 
-def flight(
-    vehicles: Quadrotors, *, start: float, h: float, steps: int, every: int = 1
-) -> Flight:
+def flight(vehicles: Quadrotors, *, start: float, h: float, steps: int, every: int = 1) -> Flight:
     """A flight in still air with exact sensing; see `Flight`. Replace parts of it by ``_replace``."""
     n = len(vehicles.m)
     return Flight(
@@ -353,9 +370,7 @@ def hovering(vehicles: Quadrotors, r: ArrayLike, v: ArrayLike, yaw: ArrayLike = 
     S = zeros(n, STATES)
     S[:, :3], S[:, 3:6] = r, v
     S[:, 6], S[:, 9] = np.cos(0.5 * np.asarray(yaw)), np.sin(0.5 * np.asarray(yaw))
-    k0, k1, k2 = vehicles.thrust.T
-    root = np.sqrt(k1**2 + 4.0 * k2 * (0.25 * vehicles.m * vehicles.g - k0))
-    speed = np.clip((root - k1) / (2.0 * k2), *vehicles.speed.T)
+    speed = np.clip(speed_of(0.25 * vehicles.m * vehicles.g, *vehicles.thrust.T), *vehicles.speed.T)
     S[:, 13:] = np.where(vehicles.point, 0.0, speed)[:, None]
     return S
 
@@ -372,7 +387,11 @@ def begin(
     attitude = np.zeros((3, 4))
     attitude[0] = (1.0, 0.0, 0.0, 0.0) if frame is None else frame
     size = 6 * n + m + 4
-    worst = np.tile([1.0, 0.0, 0.0, 0.0, 0.0], (n, 1))
+    curves = given.vehicles.thrust.T[:, :, None]
+    peak = np.where(given.vehicles.point[:, None], 0.0, thrust_of(S[:, 13:], *curves))
+    worst = np.zeros((n, 5))
+    worst[:, UPRIGHT] = 1.0 - 2.0 * (S[:, 7:9] ** 2).sum(axis=1)
+    times = np.full((n, 5), given.start)
     trail = NO_TRAIL
     if rows:
         none = np.zeros(0)
@@ -382,8 +401,8 @@ def begin(
         integral=np.zeros((n if sensing.linked else 1, m)), frame=attitude, error=np.zeros((n, 3)),
         f_u=np.zeros((n, 3)), f_C=np.zeros((n, 3)), force=np.zeros((n, 3)), push=np.zeros((n, 3)),
         command=np.zeros((n, 4)), saturated=np.zeros(n, dtype=np.bool_), seen=known, history=past, sent=past.copy(),
-        heard=np.tile(known, (n if sensing.linked else 0, 1, 1)), peak=np.zeros((n, 4)), peak_time=np.zeros((n, 4)),
-        worst=worst, worst_time=np.zeros((n, 5)), saturations=np.zeros(n, dtype=np.int64), trail=trail,
+        heard=np.tile(known, (n if sensing.linked else 0, 1, 1)), peak=peak, peak_time=times[:, :4].copy(),
+        worst=worst, worst_time=times, saturations=np.zeros(n, dtype=np.int64), trail=trail,
         work=SampledWork(
             zeros(7, STATES), zeros(3, n, 3), np.eye(3), np.zeros((5, 3)), np.zeros((4, 4)), np.zeros(1),
             np.zeros((1, size)), np.zeros(size),
@@ -391,7 +410,9 @@ def begin(
     )  # fmt: skip
 
 
-def segment(n: int, m: int, t_end: float, times: ArrayLike = (), max_steps: int = ENDLESS) -> SampledSegment:
+def segment(
+    n: int, m: int, t_end: float, times: ArrayLike = (), max_steps: int = ENDLESS
+) -> SampledSegment:
     """A flight to ``t_end`` [s], sampled at ``times`` (K,) [s]."""
     at = np.ascontiguousarray(times, dtype=float)
     k = len(at)

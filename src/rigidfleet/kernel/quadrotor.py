@@ -1,18 +1,22 @@
 """Equations of motion of a quadrotor: a rigid body, four rotors with lag, and drag in moving air.
 
-The model is that of RotorPy (Folk, Paulos and Kumar 2023, arXiv:2306.04485) with polynomial curves of thrust and torque,
-linear drag, a quadratic lag of the motors and the rotors' angular momentum, as in crazyflow's `first_principles`.
+The model is that of RotorPy (Folk, Paulos and Kumar 2023, arXiv:2306.04485) with polynomial curves of thrust and
+torque, linear drag, a quadratic lag of the motors and the rotors' angular momentum, as in crazyflow's
+`first_principles`.
 """
 
 import math
 
 from rigidfleet.kernel.aerodynamics import ground_effect
-from rigidfleet.kernel.compiler.jit import compiled
+from rigidfleet.kernel.compiler.jit import compiled, inlined
 from rigidfleet.kernel.disturbances import contact
+from rigidfleet.kernel.fleet import thrust_of
 from rigidfleet.kernel.rigid_body import attitude_matrix, quaternion_rate
 
 #: Rows of `SampledWork.y`.
 _START, _TRIAL, _RATES, _END = 0, 1, 2, 6
+
+_curve = inlined(thrust_of)
 
 
 @compiled
@@ -65,19 +69,27 @@ def derivative(y, command, i, vehicles, around, air, push, T, dy):
         gain = 1.0
         if around.ground_effect:
             gain = ground_effect(y[2] - around.ground, vehicles.radius[i], vehicles.span[i])
-        k0, k1, k2 = gain * vehicles.thrust[i, 0], gain * vehicles.thrust[i, 1], gain * vehicles.thrust[i, 2]
+        k0, k1, k2 = (
+            gain * vehicles.thrust[i, 0],
+            gain * vehicles.thrust[i, 1],
+            gain * vehicles.thrust[i, 2],
+        )
         c0, c1, c2 = vehicles.torque[i, 0], vehicles.torque[i, 1], vehicles.torque[i, 2]
         k_d, k_z, k_h = vehicles.rotor_drag[i, 0], vehicles.rotor_drag[i, 1], vehicles.lift[i]
         for j in range(4):
-            x0, x1, x2 = vehicles.rotors[i, j, 0], vehicles.rotors[i, j, 1], vehicles.rotors[i, j, 2]
+            x0, x1, x2 = (
+                vehicles.rotors[i, j, 0],
+                vehicles.rotors[i, j, 1],
+                vehicles.rotors[i, j, 2],
+            )
             w, spin = y[13 + j], vehicles.spin[i, j]
             u0, u1, u2 = b0 + Q * x2 - R * x1, b1 + R * x0 - P * x2, b2 + P * x1 - Q * x0
             h0, h1 = -k_d * w * u0, -k_d * w * u1
-            h2 = k0 + w * (k1 + k2 * w) + k_h * (u0 * u0 + u1 * u1) - k_z * w * u2
+            h2 = _curve(w, k0, k1, k2) + k_h * (u0 * u0 + u1 * u1) - k_z * w * u2
             F0, F1, F2 = F0 + h0, F1 + h1, F2 + h2
             M0 += x1 * h2 - x2 * h1
             M1 += x2 * h0 - x0 * h2
-            M2 += x0 * h1 - x1 * h0 + spin * (c0 + w * (c1 + c2 * w))
+            M2 += x0 * h1 - x1 * h0 + spin * _curve(w, c0, c1, c2)
             error = command[j] - w
             up = error > 0.0
             linear = vehicles.motor[i, 0] if up else vehicles.motor[i, 2]
@@ -115,7 +127,15 @@ def runge_kutta(i, h, command, vehicles, around, push, work):
     for stage in range(4):
         rate = y[_RATES + stage]
         derivative(
-            y[_TRIAL], command, i, vehicles, around, work.air[(stage + 1) // 2, i], push, work.T, rate
+            y[_TRIAL],
+            command,
+            i,
+            vehicles,
+            around,
+            work.air[(stage + 1) // 2, i],
+            push,
+            work.T,
+            rate,
         )
         weight = h / 6.0 if stage in (0, 3) else h / 3.0
         reach = h if stage == 2 else 0.5 * h

@@ -1,9 +1,9 @@
 """The sampled flight of a fleet: measurements, formation law and attitude control at ticks, fixed steps in between.
 
-Tick k is at ``start + k steps h``. At each tick, states are measured; at every ``every``-th tick the formation law gives
-each vehicle a desired force; then attitude control gives it rotor speeds, which are held to the next tick. Between ticks
-the true states follow the equations of motion by the classical Runge-Kutta method with the step h. Gusts are evaluated at
-each stage, downwash once per step.
+Tick k is at ``start + k steps h``. At each tick, states are measured; at every ``every``-th tick the formation law
+gives each vehicle a desired force; then attitude control gives it rotor speeds, which are held to the next tick.
+Between ticks the true states follow the equations of motion by the classical Runge-Kutta method with the step h. Gusts
+are evaluated at each stage, downwash once per step.
 """
 
 import math
@@ -11,7 +11,7 @@ import math
 from rigidfleet.kernel.aerodynamics import add_downwash, air_velocity
 from rigidfleet.kernel.attitude_control import steer
 from rigidfleet.kernel.compiler.calls import call_recorder
-from rigidfleet.kernel.compiler.jit import compiled
+from rigidfleet.kernel.compiler.jit import compiled, inlined
 from rigidfleet.kernel.fleet import (
     ACCELERATION,
     CONSTRAINT_FORCE,
@@ -24,6 +24,7 @@ from rigidfleet.kernel.fleet import (
     TICKS,
     TRAILED,
     UPRIGHT,
+    thrust_of,
 )
 from rigidfleet.kernel.problem import TRACKING
 from rigidfleet.kernel.quadrotor import normalise, runge_kutta
@@ -38,6 +39,8 @@ from rigidfleet.kernel.rigid_body import (
 
 #: Times that differ by less than this share of a step are the same.
 _SAME = 1e-9
+
+_curve = inlined(thrust_of)
 
 
 # -- what is known -------------------------------------------------------------------------------------
@@ -201,7 +204,7 @@ def desire(k, t, p, w, flight, state, call):
     for i in range(n):
         for q in range(3):
             total += state.force[i, q]
-    return math.isfinite(total)
+    return abs(total) < math.inf
 
 
 @compiled
@@ -222,9 +225,9 @@ def advance_frame(t, p, state):
 def tick(k, t, p, w, flight, state, call):
     """Measure, desire and steer at tick k, time t [s]; returns False if the law gives no force."""
     measure(k, flight, state)
-    if flight.commands.kind == FORCE and k % flight.every == 0:
-        if not desire(k, t, p, w, flight, state, call):
-            return False
+    due = flight.commands.kind == FORCE and k % flight.every == 0
+    if due and not desire(k, t, p, w, flight, state, call):
+        return False
     for i in range(state.S.shape[0]):
         state.saturated[i] = steer(k, i, flight, state)
         if state.saturated[i]:
@@ -259,7 +262,9 @@ def write_derivatives(c, t, flight, state, call):
     for i in range(state.S.shape[0]):
         for q in range(17):
             state.work.y[0, q] = call.S[c, i, q]
-        runge_kutta(i, 0.0, state.command[i], flight.vehicles, flight.air, state.push[i], state.work)
+        runge_kutta(
+            i, 0.0, state.command[i], flight.vehicles, flight.air, state.push[i], state.work
+        )
         for q in range(17):
             call.dS[c, i, q] = state.work.y[2, q]
 
@@ -298,7 +303,7 @@ def write_samples(t, h, flight, state, call):
 
 @compiled
 def keep_path(i, h, work, points):
-    """Bernstein coefficients (5, 6 N) of vehicle i over a step: the quartic through r0, v0, a0, r1, v1, and its rate."""
+    """Bernstein coefficients (5, 6 N) of vehicle i over a step: of the quartic through r0, v0, a0, r1, v1; its rate."""
     first, end, rate = work.y[0], work.y[6], work.y[2]
     n = points.shape[1] // 6
     for q in range(3):
@@ -331,7 +336,7 @@ def take_extremes(i, t, h, vehicles, state):
         return
     for j in range(4):
         w = end[13 + j]
-        force = vehicles.thrust[i, 0] + w * (vehicles.thrust[i, 1] + w * vehicles.thrust[i, 2])
+        force = _curve(w, vehicles.thrust[i, 0], vehicles.thrust[i, 1], vehicles.thrust[i, 2])
         load += force
         if force > state.peak[i, j]:
             state.peak[i, j], state.peak_time[i, j] = force, t + h
@@ -365,9 +370,9 @@ def advance_fleet(t, h, flight, state):
 def fly_ticks(p, w, flight, state, call):
     """Fly to ``call.t_end`` [s]; see `fleet` for the arguments.
 
-    Returns FINISHED; PAUSED if the trail is full, the tables end or ``max_steps`` are done; or COLLAPSED if the law gives no
-    force (a singular law): state and time are then those before. A pause changes no bit of the flight, unless ``t_end`` lies
-    between two steps, where it divides one.
+    Returns FINISHED; PAUSED if the trail is full, the tables end or ``max_steps`` are done; or COLLAPSED if the law
+    gives no force (a singular law): states and time are then those before. A pause changes no bit of the flight, unless
+    ``t_end`` lies between two steps, where it divides one.
     """
     count, clock = state.count, state.clock
     room = state.trail.clock.shape[0]

@@ -50,8 +50,8 @@ class Vehicles:
 class SampledPhase(ActivePhase):
     """A phase of vehicles with sampled control, under way.
 
-    The law of the plan is evaluated at measured states, at ticks. ``state.y`` holds the true state, in the layout of the
-    continuous flight, whenever the kernel returns.
+    The law of the plan is evaluated at measured states, at ticks. Whenever the kernel returns, ``state.y`` holds the
+    true state, in the layout of the continuous flight.
     """
 
     def __init__(self, *arguments: Any, vehicles: Vehicles, **options: Any) -> None:
@@ -70,6 +70,7 @@ class SampledPhase(ActivePhase):
         frame = y[6 * n + m : 6 * n + m + 4] if plan.frame is not None else None
         begun = fleet.begin(self.flight, given.S, self.workspace, frame=frame)
         begun.integral[:] = y[6 * n : 6 * n + m]
+        begun.peak_time[:] = begun.worst_time[:] = t
         before = given.state
         if before is not None:
             begun = before._replace(
@@ -137,8 +138,9 @@ class SampledPhase(ActivePhase):
             return
         if planned is not self.tabled and given.compensated:
             moved = given.start_path(planned, tick)
-            for known in (self.sampled.seen, self.sampled.history, self.sampled.sent, self.sampled.heard):
-                known += moved
+            s = self.sampled
+            for known in (s.seen, s.history, s.sent, s.heard):
+                np.add(known, moved, out=known)
         last = min(tick + _TICKS, math.ceil(self.plan.t_end * given.rate) + 1)
         made = given.made(tick, max(last, tick + 1), planned, self.plan.start, self.vehicles.yaw)
         self.flight, self.tabled = self.flight._replace(tables=made), planned

@@ -42,7 +42,9 @@ _HOT = (
     "cholesky_solve", "apply_multipliers",
 )  # fmt: skip
 #: The same of sampled flights.
-_HOT_SAMPLED = "derivative", "attitude_matrix", "quaternion_rate", "contact", "normalise"
+_HOT_SAMPLED = (
+    "derivative", "attitude_matrix", "quaternion_rate", "contact", "normalise", "thrust_of", "speed_of",
+)  # fmt: skip
 #: Passes that simplify each translated function before inlining.
 _QUICK = ("sroa", "simplify_cfg", "instruction_combine", "simplify_cfg")
 
@@ -95,7 +97,9 @@ def sampled_code() -> list[bytes]:
     problem, workspace, *_, flight, state, segment, evaluation = _pointers()
 
     def fly(p, w, f, s, call):
-        return sampled_flight.fly_ticks(problem(p), workspace(w), flight(f), state(s), segment(call))
+        return sampled_flight.fly_ticks(
+            problem(p), workspace(w), flight(f), state(s), segment(call)
+        )
 
     def evaluate(f, call):
         return quadrotor.evaluate(flight(f), evaluation(call))

@@ -15,7 +15,7 @@ import llvmlite.binding as llvm
 #: int64(problem, workspace, segment, record) and int64(problem, workspace, integrator, monitor). Each function is in
 #: its own object.
 ENTRIES = "rigidfleet_integrate", "rigidfleet_record", "rigidfleet_watch"
-#: Those of the second library, `sampled`: int64(problem, workspace, flight, state, segment) and int64(flight, evaluation).
+#: Those of the second library: int64(problem, workspace, flight, state, segment) and int64(flight, evaluation).
 SAMPLED_ENTRIES = "rigidfleet_fly_ticks", "rigidfleet_evaluate"
 
 

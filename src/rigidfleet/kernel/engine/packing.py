@@ -122,8 +122,16 @@ def _layout(kind: type) -> _Layout:
 
 @cache
 def examples() -> tuple[
-    Problem, Workspace, IntegratorState, Segment, Record, Monitor, fleet.Flight, fleet.SampledState,
-    fleet.SampledSegment, fleet.Evaluation,
+    Problem,
+    Workspace,
+    IntegratorState,
+    Segment,
+    Record,
+    Monitor,
+    fleet.Flight,
+    fleet.SampledState,
+    fleet.SampledSegment,
+    fleet.Evaluation,
 ]:
     """One minimal example of each named tuple; its fields have the types that all have."""
     one, none, places, frame = np.ones(1), np.zeros(0), np.zeros((1, 3)), np.eye(3)

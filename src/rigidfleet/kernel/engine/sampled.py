@@ -1,4 +1,4 @@
-"""Sampled flights by machine code, called without the compiler; the code is that of `rigidfleet.kernel.sampled_flight`."""
+"""Sampled flights by machine code, called without the compiler; see `rigidfleet.kernel.sampled_flight`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,11 @@ from rigidfleet.typing import Floats
 
 
 def fly_ticks(
-    problem: Problem, workspace: Workspace, flight: Flight, state: SampledState, segment: SampledSegment
+    problem: Problem,
+    workspace: Workspace,
+    flight: Flight,
+    state: SampledState,
+    segment: SampledSegment,
 ) -> int:
     """Fly to the end of the segment, see `rigidfleet.kernel.sampled_flight.fly_ticks`.
 
@@ -36,7 +40,11 @@ def fly_ticks(
 
 
 def derivatives(
-    flight: Flight, S: Floats, command: Floats, air: Floats | None = None, push: Floats | None = None
+    flight: Flight,
+    S: Floats,
+    command: Floats,
+    air: Floats | None = None,
+    push: Floats | None = None,
 ) -> Floats:
     """Derivatives (N, 17) of states ``S`` (N, 17), see `rigidfleet.kernel.quadrotor.derivative`.
 
