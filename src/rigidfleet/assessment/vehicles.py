@@ -43,9 +43,7 @@ def vehicle_checks(measured: Measurements) -> Iterator[CheckResult]:
         yield _checked("tracking_error", error, "m", limits.tracking_error, "is off its slot by")
 
 
-def _worst(
-    measured: Measurements, name: str, rank: Callable[[Extremum], float]
-) -> Extreme | None:
+def _worst(measured: Measurements, name: str, rank: Callable[[Extremum], float]) -> Extreme | None:
     """The worst of the extremes that the phases have recorded."""
     every = [(p, p.extremes[name]) for p in measured.result.phases if name in p.extremes]
     if not every:
@@ -68,7 +66,14 @@ def _rotor_force(measured: Measurements, limits: Floats) -> Iterator[CheckResult
     k, i, j = np.unravel_index(int((force / safe[:, None]).argmax()), force.shape)
     name = result.phases[result.phase[k]].name
     found.append(
-        (force[k, i, j] / safe[i], float(force[k, i, j]), float(result.time[k]), int(i), int(j), name)
+        (
+            force[k, i, j] / safe[i],
+            float(force[k, i, j]),
+            float(result.time[k]),
+            int(i),
+            int(j),
+            name,
+        )
     )
     share, worst, when, i, j, phase = max(found)
     limit, who = float(limits[i]), f"agent {i + 1}"
@@ -77,7 +82,9 @@ def _rotor_force(measured: Measurements, limits: Floats) -> Iterator[CheckResult
         f" (limit {value(limit, 'N')})"
     )
     passed = share <= 1.0 + _SLACK
-    yield CheckResult("rotor_force", passed, words, worst, limit, "N", when=when, who=who, phase=phase)
+    yield CheckResult(
+        "rotor_force", passed, words, worst, limit, "N", when=when, who=who, phase=phase
+    )
 
 
 def _saturation(e: Extreme, limit: float) -> CheckResult:
@@ -110,9 +117,7 @@ def _tilt(measured: Measurements) -> Extreme | None:
     return max(found, key=lambda e: e.value, default=None)
 
 
-def _checked(
-    check: str, e: Extreme, unit: str, limit: float | None, deed: str
-) -> CheckResult:
+def _checked(check: str, e: Extreme, unit: str, limit: float | None, deed: str) -> CheckResult:
     words = f"{e.who} {deed} up to {value(e.value, unit)} at {e.when:.2f} s"
     words += "" if limit is None else f" (limit {limit:g} {unit})"
     passed = limit is None or e.value <= limit * (1.0 + _SLACK)

@@ -172,8 +172,7 @@ class Guidance(NamedTuple):
     Both act in phases with tracking.
     """
 
-    drag: Floats  # (N, 3) linear drag fed forward for the reference velocity, body axes [N s/m]
-    c: Floats  # (N, 3) quadratic drag, likewise [N s^2/m^2]
+    drag: Floats  # (N,) share of the drag at the reference velocity, in still air, that is fed forward
     k_i: Floats  # (N, 3) integral gain of the tracking error, world axes [1/s^3]
 
 
@@ -356,7 +355,7 @@ def flight(vehicles: Quadrotors, *, start: float, h: float, steps: int, every: i
     """A flight in still air with exact sensing; see `Flight`. Replace parts of it by ``_replace``."""
     n = len(vehicles.m)
     return Flight(
-        vehicles, still_air(n), exact_sensing(n), Guidance(*(np.zeros((n, 3)) for _ in range(3))), no_tables(n),
+        vehicles, still_air(n), exact_sensing(n), Guidance(np.zeros(n), np.zeros((n, 3))), no_tables(n),
         no_commands(n), start, h, steps, every,
     )  # fmt: skip
 

@@ -132,9 +132,34 @@ def integrate_constraints(dt, integral, p, w, state):
 
 
 @compiled
+def expect_drag(i, v, share, vehicles, state):
+    """Add a share of the drag that vehicle i meets at a velocity v (3,) in still air to its desired force.
+
+    The drag of rotors grows with their speed, which is that of the desired thrust.
+    """
+    T, x, force = state.work.T, state.work.x, state.force[i]
+    attitude_matrix(state.S[i, 6:10], T)
+    multiply(T, v, x[0])
+    speed = math.sqrt(x[0, 0] ** 2 + x[0, 1] ** 2 + x[0, 2] ** 2)
+    across = along = 0.0
+    if not vehicles.point[i]:
+        load = math.sqrt(force[0] ** 2 + force[1] ** 2 + force[2] ** 2)
+        k0, k1, k2 = vehicles.thrust[i, 0], vehicles.thrust[i, 1], vehicles.thrust[i, 2]
+        root = math.sqrt(max(k1 * k1 + 4.0 * k2 * (0.25 * load - k0), 0.0))
+        rotors = 2.0 * (root - k1) / k2  # sum of their speeds
+        across, along = vehicles.rotor_drag[i, 0] * rotors, vehicles.rotor_drag[i, 1] * rotors
+    for q in range(3):
+        rotor = across if q < 2 else along
+        x[0, q] *= share * (rotor + vehicles.drag[i, q] + speed * vehicles.c[i, q])
+    multiply_transposed(T, x[0], x[1])
+    for q in range(3):
+        force[q] += x[1, q]
+
+
+@compiled
 def take_force(k, i, dt, p, w, flight, state):
     """Desired force of vehicle i [N] from the law just evaluated, with what is added after it."""
-    vehicles, guidance, T, x = flight.vehicles, flight.guidance, state.work.T, state.work.x
+    vehicles, guidance = flight.vehicles, flight.guidance
     m, pull = p.vehicles.m[i], 0.0
     for q in range(3):
         state.f_u[i, q], state.f_C[i, q] = w.f_u[i, q], w.f_C[i, q]
@@ -146,21 +171,13 @@ def take_force(k, i, dt, p, w, flight, state):
     if not vehicles.lost[i]:
         worse(i, CONSTRAINT_FORCE, math.sqrt(pull), state.work.law_time[0], state)
     if p.control.kind == TRACKING:
-        attitude_matrix(state.S[i, 6:10], T)
-        multiply(T, w.v_ref[i], x[0])
-        speed = math.sqrt(x[0, 0] ** 2 + x[0, 1] ** 2 + x[0, 2] ** 2)
-        faster = 1.0
-        if not vehicles.point[i]:  # drag of rotors grows with their speed, the root of the thrust
-            load = math.sqrt(state.force[i, 0] ** 2 + state.force[i, 1] ** 2 + state.force[i, 2] ** 2)
-            faster = math.sqrt(load / max(m * vehicles.g, 1e-300))
-        for q in range(3):
-            x[0, q] *= faster * guidance.drag[i, q] + speed * guidance.c[i, q]
-        multiply_transposed(T, x[0], x[1])
+        if guidance.drag[i] > 0.0:
+            expect_drag(i, w.v_ref[i], guidance.drag[i], vehicles, state)
         for q in range(3):
             if not state.saturated[i]:
                 known = state.seen[i, q] + path_at(k, i, q, flight.tables)
                 state.error[i, q] += dt * (known - w.r_ref[i, q])
-            state.force[i, q] += x[1, q] - m * guidance.k_i[i, q] * state.error[i, q]
+            state.force[i, q] -= m * guidance.k_i[i, q] * state.error[i, q]
         if not vehicles.lost[i]:
             e = 0.0
             for q in range(3):
@@ -290,7 +307,9 @@ def write_samples(t, h, flight, state, call):
                 call.f_u[c, i, q], call.f_C[c, i, q] = state.f_u[i, q], state.f_C[i, q]
                 call.air[c, i, q] = work.air[2, i, q]
             for q in range(6):
-                call.seen[c, i, q] = state.seen[i, q] + path_at(count[TICKS] - 1, i, q, flight.tables)
+                call.seen[c, i, q] = state.seen[i, q] + path_at(
+                    count[TICKS] - 1, i, q, flight.tables
+                )
             call.saturated[c, i] = state.saturated[i]
         write_derivatives(c, t + x, flight, state, call)
         for k in range(state.integral.shape[1]):

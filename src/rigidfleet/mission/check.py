@@ -323,7 +323,9 @@ def _yaw(collector: FindingCollector, parts: dict[str, Any]) -> None:
     if yaw is None or not collector.right(("yaw",), "kind", "yaw_deg", "point"):
         return
     if yaw.kind == "towards" and yaw.point is None:
-        collector.add(("yaw", "point"), "is missing", "add point: the point to look at, [x, y, z] [m]")
+        collector.add(
+            ("yaw", "point"), "is missing", "add point: the point to look at, [x, y, z] [m]"
+        )
     for key, kind in (("yaw_deg", "fixed"), ("point", "towards")):
         if key in yaw.model_fields_set and yaw.kind != kind:
             problem = f"has no effect with kind '{yaw.kind}'"

@@ -434,7 +434,9 @@ def _smoothness(collector: FindingCollector, p: AnyPhase, path: Keys, *, smooth:
     if not smooth:
         for key in [*p.automatic, *(["through"] if getattr(p, "through", ()) else [])]:
             problem = "needs a smooth mission" + (" to have a least time" if key in TIMES else "")
-            collector.add((*path, key), problem, "add smoothness = 'jerk' at the top of the mission")
+            collector.add(
+                (*path, key), problem, "add smoothness = 'jerk' at the top of the mission"
+            )
         return
     if p.control == "body" and collector.right(path, "control"):
         problem = "has regulators of its own, which jump at a switch; smoothness = 'jerk' needs control = 'tracking'"
@@ -470,7 +472,9 @@ def _through(
         collector.add(where, problem, "pass it earlier or arrive later", None)
 
 
-def _automatic(collector: FindingCollector, p: AnyPhase, path: Keys, parts: Mapping[str, Any]) -> None:
+def _automatic(
+    collector: FindingCollector, p: AnyPhase, path: Keys, parts: Mapping[str, Any]
+) -> None:
     """Check that times that follow from the limits have limits to follow from."""
     keys = [key for key in p.automatic if collector.right(path, key)]
     if not keys or not _smooth(parts):
@@ -480,7 +484,9 @@ def _automatic(collector: FindingCollector, p: AnyPhase, path: Keys, parts: Mapp
         problem = f"needs tracked slots to have a least time, not control '{p.control}'"
         collector.add(where, problem, "use control = 'tracking', or give a time")
     if p.duration == AUTO and p.steering is None and p.shaping is None:
-        problem = f"a phase of kind '{collector.data['phases'][path[1]]['kind']}' has no least duration"
+        problem = (
+            f"a phase of kind '{collector.data['phases'][path[1]]['kind']}' has no least duration"
+        )
         collector.add((*path, "duration"), problem, "give a duration")
     if p.duration == AUTO and p.steering is not None and p.steering.travel is not None:
         problem = "has no effect with duration = 'auto', which ends the phase at the arrival"

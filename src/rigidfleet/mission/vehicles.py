@@ -223,13 +223,17 @@ def _sound(collector: FindingCollector, vehicle: Vehicle, path: tuple[str, ...])
     found = resolve(vehicle)
     low, high = found.rotor_speed
     if low >= high:
-        collector.add((*path, "rotor_speed"), "the least speed is not below the greatest", "swap them")
+        collector.add(
+            (*path, "rotor_speed"), "the least speed is not below the greatest", "swap them"
+        )
     elif found.thrust_limit <= found.mass * _GRAVITY:
         problem = (
             f"cannot hover: its four rotors give {found.thrust_limit:.3g} N, its weight is "
             f"{found.mass * _GRAVITY:.3g} N"
         )
-        collector.add(path, problem, "reduce mass, or raise thrust_coefficient or rotor_speed", None)
+        collector.add(
+            path, problem, "reduce mass, or raise thrust_coefficient or rotor_speed", None
+        )
     elif low >= found.hover_speed:
         problem = f"the least speed is above the speed in hover, {found.hover_speed:.4g} rad/s"
         collector.add((*path, "rotor_speed"), problem, "reduce it")
@@ -260,7 +264,9 @@ def equipped(collector: FindingCollector, agents: Any, vehicles: Mapping[str, Ve
         collector.add(where, "is not a name or a list of names", 'write vehicle = "NAME"')
         return None
     if len(names) != n:
-        collector.add(where, f"has {len(names)} entries for {n} agents", f"give one name, or {n}", None)
+        collector.add(
+            where, f"has {len(names)} entries for {n} agents", f"give one name, or {n}", None
+        )
         return None
     known = tables if isinstance(tables, dict) else {}
     for name in dict.fromkeys(names):

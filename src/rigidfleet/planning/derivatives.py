@@ -34,7 +34,7 @@ class Yaw(NamedTuple):
 
     kind: Literal["formation", "fixed", "along", "towards"] = "formation"
     angle: float = 0.0
-    point: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    point: tuple[float, ...] = (0.0, 0.0, 0.0)
 
 
 def slot_derivatives(

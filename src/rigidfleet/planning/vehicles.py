@@ -46,10 +46,8 @@ def sampled_flight(mission: Mission) -> fleet.Flight:
         steps=steps,
         every=max(1, round(autopilot.rate / autopilot.formation_rate)),
     )
-    fed = float(mission.tracking.drag_feedforward)
     guidance = fleet.Guidance(
-        fed * np.array([model.linear_drag for model in models]),
-        fed * np.array([model.body_drag for model in models]),
+        np.full(n, float(mission.tracking.drag_feedforward)),
         np.full((n, 3), mission.tracking.integral),
     )
     around = disturbance(mission)
@@ -70,9 +68,7 @@ def sampled_flight(mission: Mission) -> fleet.Flight:
 def kernel_vehicle(model: VehicleModel, mass: float) -> fleet.Vehicle:
     """The kernel's form of a vehicle with a true mass [kg]."""
     if model.point:
-        return fleet.Vehicle(
-            m=mass, drag=(model.drag,) * 3, point=True, limit=model.thrust_limit
-        )
+        return fleet.Vehicle(m=mass, drag=(model.drag,) * 3, point=True, limit=model.thrust_limit)
     up, down = model.motor_time
     k_R, k_omega = model.attitude_gains
     return fleet.Vehicle(
@@ -126,7 +122,9 @@ class TickTables:
         self.rate = mission.autopilot.rate
         self.noise = None if d is None else d.noise
         self.links = None if d is None else d.links
-        self.yaw = Yaw()
+        yaw = mission.yaw
+        self.yaw = Yaw(yaw.kind, math.radians(yaw.yaw_deg), yaw.point or (0.0, 0.0, 0.0))
+        self.linear_drag = np.array([model.linear_drag for model in mission.vehicle_models or ()])
         self.compensated = mission.autopilot.delay_compensation
         #: What states were last measured about: the problem of the path, or a point to stay at.
         self._source: Problem | None = None
@@ -151,7 +149,9 @@ class TickTables:
         found = slot_derivatives(self._source.reference, self._source.motion, time, 2)
         return np.concatenate([found[0, 0], found[0, 1]], axis=1)
 
-    def made(self, first: int, last: int, problem: Problem, begun: float, start: Floats) -> fleet.Tables:
+    def made(
+        self, first: int, last: int, problem: Problem, begun: float, start: Floats
+    ) -> fleet.Tables:
         """Tables for ticks from ``first`` to before ``last``, in a phase begun at a time [s] with yaws (N,) [rad]."""
         sensing = self.flight.sensing
         time = np.arange(first, last) / self.rate
@@ -187,8 +187,9 @@ class TickTables:
         if not len(x):
             return x[:, 0], x[:, 0]
         v, a, j, s = (x[:, k] for k in (1, 2, 3, 4))
-        guidance, mass = self.flight.guidance, self.flight.vehicles.m[:, None]
-        D, c = guidance.drag / mass, guidance.c / mass
+        vehicles = self.flight.vehicles
+        share = (self.flight.guidance.drag / vehicles.m)[:, None]
+        D, c = share * self.linear_drag, share * vehicles.c
         jerk, snap = j + D * a, s + D * j
         if c.any():
             speed = np.sqrt((v * v).sum(axis=2, keepdims=True) + _STILL**2)

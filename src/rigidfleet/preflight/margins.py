@@ -20,6 +20,7 @@ from rigidfleet.math.margins import (
     tracking_loops,
 )
 from rigidfleet.mission import Mission, Phase
+from rigidfleet.mission.schema import seconds
 from rigidfleet.planning.preview import PlannedPhase
 from rigidfleet.preflight.findings import FormationMargins, MarginsCheck, Preflight, Remark
 from rigidfleet.typing import Floats
@@ -112,7 +113,7 @@ def _shapes(planned: PlannedPhase, phase: Phase) -> Floats:
     shaping = phase.shaping
     t, span = planned.time, planned.time[-1] - planned.time[0]
     if shaping is not None:
-        span = min(span, shaping.blend)
+        span = min(span, seconds(shaping.blend))
     at = np.searchsorted(t, t[0] + span * np.linspace(0.0, 1.0, SHAPES))
     return planned.position[np.minimum(at, len(t) - 1)]
 

@@ -21,6 +21,8 @@ def vehicle_lags(mission: Mission) -> list[Lag]:
     return [
         Lag(delay=delay, rate=rate, point=True)
         if model.point
-        else Lag(*model.attitude_gains, max(model.motor_time), delay, rate)
+        else Lag(
+            model.attitude_gains[0], model.attitude_gains[1], max(model.motor_time), delay, rate
+        )
         for model in models
     ]

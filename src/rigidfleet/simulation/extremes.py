@@ -129,9 +129,7 @@ class Extremes:
             flags[:3] = rows, rows, 2 if last else 1
         self.monitor(problem, work, state)
 
-    def take_path(
-        self, problem: Problem, work: Workspace, state: records.IntegratorState
-    ) -> None:
+    def take_path(self, problem: Problem, work: Workspace, state: records.IntegratorState) -> None:
         """Evaluate the paths alone of the steps in the trail, not the forces."""
         rows, flags = int(state.count[4]), self.monitor.monitor.flags
         if self.n > _FEW:
@@ -148,7 +146,9 @@ class Extremes:
         rotors = ~(vehicles.point | lost)
         for k, kind, sign in _SAMPLED:
             for i in np.flatnonzero(~lost):
-                self._take(kind, sign * float(state.worst[i, k]), float(state.worst_time[i, k]), int(i))
+                self._take(
+                    kind, sign * float(state.worst[i, k]), float(state.worst_time[i, k]), int(i)
+                )
         for i in np.flatnonzero(~lost):
             load = float(state.worst[i, fleet.LOAD])
             margin, when = float(vehicles.limit[i]) - load, float(state.worst_time[i, fleet.LOAD])
@@ -158,9 +158,7 @@ class Extremes:
             peak = np.where(rotors[:, None], state.peak, -1.0)
             share = peak / vehicles.force[:, 1:]
             i, j = (int(k) for k in np.unravel_index(int(share.argmax()), share.shape))
-            found["rotor_force"] = Extremum(
-                float(peak[i, j]), float(state.peak_time[i, j]), i, j
-            )
+            found["rotor_force"] = Extremum(float(peak[i, j]), float(state.peak_time[i, j]), i, j)
             upright = np.where(rotors, state.worst[:, fleet.UPRIGHT], 1.0)
             i = int(upright.argmin())
             angle = math.acos(min(max(float(upright[i]), -1.0), 1.0))

@@ -128,7 +128,9 @@ class SampledPhase(ActivePhase):
             if done:
                 self._keep(problem, call, done)
         if status != records.FINISHED or not np.isfinite(sampled.S).all():
-            raise StoppedError(diagnose(self.place, own_force=self.external is not None, collapsed=True))
+            raise StoppedError(
+                diagnose(self.place, own_force=self.external is not None, collapsed=True)
+            )
 
     def _supply(self) -> None:
         """Make tables for the next ticks, if those that there are end here or belong to another reference."""
