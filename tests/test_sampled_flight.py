@@ -92,7 +92,7 @@ def test_a_pause_changes_no_bit():
         if state.count[fleet.TICKS] == chunk["last"]:
             first = chunk["last"]
             rest = {"first": first, "last": min(first + 90, 250)}
-            cut = {name: getattr(tables, name)[first:] for name in ("yaw", "jerk", "snap")}
+            cut = {name: getattr(tables, name)[first:] for name in ("path", "yaw", "jerk", "snap")}
             cut |= {
                 name: getattr(tables, name)[first // 3 :]
                 for name in ("noise_r", "noise_v", "dropped")
