@@ -4,6 +4,7 @@ N vehicles, m edges. World axes are x, y horizontal and z up; body axes are x fo
 its scalar first, and T(q) takes world axes to body axes, as in `rigidfleet.math.attitude`.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -298,6 +299,36 @@ class Evaluation(NamedTuple):
     push: Floats  # (N, 3) [N]
     T: Floats  # (3, 3) work
     dS: Floats  # (N, 17), written
+
+
+# Turbulent jet below a hovering quadrotor: decay and spread of its far field, and its virtual origin in distances of
+# opposite motors (Bauersfeld et al. 2024, arXiv:2403.13321, Eq. (9)).
+_DECAY, _SPREAD, _ORIGIN = 10.11, 0.07668, -5.817
+
+
+def jet_speed(weight, density, radius, span, s, rr):
+    """Speed [m/s] of the air below a hovering quadrotor, along its z axis.
+
+    At a distance s [m] below the vehicle along that axis and r beside it, with l the distance of opposite motors and
+    x = s/l + 5.817 (Bauersfeld et al. 2024, arXiv:2403.13321, Eqs. (1)-(9)),
+
+        U = 10.11 U_H / (x (1 + (sqrt(2) - 1) (r / (0.07668 l x))^2)^2),  U_H^2 = m g / (8 pi density radius^2).
+
+    The fit holds from s = 2.5 l on and for hover; nearer, it is an extrapolation.
+
+    Parameters
+    ----------
+    weight : m g [N]
+    density : of the air [kg/m^3]
+    radius : of a rotor [m]
+    span : distance of opposite motors l [m]
+    s, rr : distance below [m], squared distance beside the axis [m^2]
+    """
+    far = s / span - _ORIGIN
+    width = _SPREAD * span * far
+    profile = 1.0 + (math.sqrt(2.0) - 1.0) * rr / (width * width)
+    hover = math.sqrt(weight / (8.0 * math.pi * density * radius * radius))
+    return hover * _DECAY / (far * profile * profile)
 
 
 # -- making them -------------------------------------------------------------------------------------
