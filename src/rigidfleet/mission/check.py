@@ -67,7 +67,7 @@ def check(data: Mapping[str, Any], origin: str) -> dict[str, Any]:
     if notes.findings:  # the other checks would take long
         raise MissionError(notes.findings)
     parts = _tables(notes)
-    for judge in (_agents, _gains, _regulators, _tracking, _allocation, _geofence, _yaw):
+    for judge in (_agents, _gains, _regulators, _tracking, _allocation, _geofence, _yaw, _planned):
         judge(notes, parts)
     n = _count(data)
     parts["obstacles"] = _obstacles(notes)
@@ -313,6 +313,15 @@ def _yaw(notes: FindingCollector, parts: dict[str, Any]) -> None:
         if key in yaw.model_fields_set and yaw.kind != kind:
             problem = f"has no effect with kind '{yaw.kind}'"
             notes.add(("yaw", key), problem, f"remove it or use kind = '{kind}'")
+
+
+def _planned(notes: FindingCollector, parts: dict[str, Any]) -> None:
+    """Find limits of the plan in a mission whose plan keeps none."""
+    limits = parts.get("limits", Limits())
+    for key in ("jerk", "tilt_deg"):
+        if getattr(limits, key) is not None and parts.get("smoothness") == "lqr":
+            problem = "has no effect: only the plan of a smooth mission keeps it"
+            notes.add(("limits", key), problem, "remove it or add smoothness = 'jerk' at the top")
 
 
 def _ordered(notes: FindingCollector, box: Box | Geofence, path: tuple[str | int, ...]) -> None:
