@@ -175,8 +175,9 @@ def _references(
             states.append(np.full((len(times), 3, n, 3), np.nan))
             angles.append(np.full((len(times), 2, n), np.nan))
             continue
-        first = np.searchsorted(times, [begin for begin, *_ in led[1:]])
-        for time, (_, reference, motion) in zip(np.split(times, first), led, strict=True):
+        spans = sorted(led, key=lambda span: span[0])
+        first = np.searchsorted(times, [begin for begin, *_ in spans[1:]])
+        for time, (_, reference, motion) in zip(np.split(times, first), spans, strict=True):
             if not len(time):
                 continue
             states.append(slot_derivatives(reference, motion, time, 4)[:, 1:])
