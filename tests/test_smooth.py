@@ -441,7 +441,7 @@ def test_automatic_times_of_a_phase_begun_by_hand():
         ({"kind": "fly", "position": [9, 0, 8], "duration": "auto"}, {"limits": {}}, "needs a limit that bounds it"),
         ({"kind": "hold", "duration": "auto"}, {}, "has no least duration"),
         ({"kind": "turn", "yaw_deg": 9.0, "duration": "auto", "travel": 2.0}, {}, "has no effect with duration"),
-        ({"kind": "fly", "position": [9, 0, 8], "duration": "auto"}, {"smoothness": "lqr", "limits": {}}, "needs a smooth mission"),
+        ({"kind": "turn", "yaw_deg": 9.0, "duration": "auto"}, {"smoothness": "lqr", "limits": {}}, "a smooth mission"),
         ({"kind": "fly", "position": [9, 0, 8], "settle": {}}, {}, "needs a time of arrival"),
         ({"kind": "fly", "position": [9, 0, 8], "duration": 9.0,
           "through": [{"position": [1, 1, 8], "time": 9.5}]}, {}, "passes its last point at 9.5 s"),
