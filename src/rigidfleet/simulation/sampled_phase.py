@@ -182,7 +182,15 @@ class SampledPhase(ActivePhase):
         out, kept = _as_flown(planned, call, done, self.flight.vehicles, problem)
         self.pieces.append(
             Piece(
-                self.index, times, out, call.integral[:done], frame, plan.edges, plan.attached, kept
+                self.index,
+                times,
+                out,
+                call.integral[:done],
+                frame,
+                plan.edges,
+                plan.attached,
+                self._led(times),
+                kept,
             )
         )
         assert out.r.shape[1] == n

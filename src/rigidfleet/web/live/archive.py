@@ -113,7 +113,7 @@ def rows(piece: Piece, which: Bools | list[int]) -> Piece:
     record = type(piece.record)(*(x[which] for x in piece.record))
     return Piece(
         piece.phase, piece.time[which], record, piece.integral[which], piece.frame[which], piece.edges,
-        piece.attached,
+        piece.attached, piece.led,
     )  # fmt: skip
 
 
@@ -133,6 +133,7 @@ def _join(pieces: list[Piece]) -> Piece:
         np.concatenate([p.frame for p in pieces]),
         first.edges,
         first.attached,
+        tuple(led for p in pieces for led in p.led),
     )
 
 
