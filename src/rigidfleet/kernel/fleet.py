@@ -302,7 +302,7 @@ class Evaluation(NamedTuple):
 
 
 # Turbulent jet below a hovering quadrotor: decay and spread of its far field, and its virtual origin in distances of
-# opposite motors (Bauersfeld et al. 2024, arXiv:2403.13321, Eq. (9)).
+# opposite motors (Bauersfeld et al. 2024, arXiv:2403.13321, the ninth equation).
 _DECAY, _SPREAD, _ORIGIN = 10.11, 0.07668, -5.817
 
 
@@ -310,7 +310,7 @@ def jet_speed(weight, density, radius, span, s, rr):
     """Speed [m/s] of the air below a hovering quadrotor, along its z axis.
 
     At a distance s [m] below the vehicle along that axis and r beside it, with l the distance of opposite motors and
-    x = s/l + 5.817 (Bauersfeld et al. 2024, arXiv:2403.13321, Eqs. (1)-(9)),
+    x = s/l + 5.817 (Bauersfeld et al. 2024, arXiv:2403.13321),
 
         U = 10.11 U_H / (x (1 + (sqrt(2) - 1) (r / (0.07668 l x))^2)^2),  U_H^2 = m g / (8 pi density radius^2).
 
@@ -414,9 +414,7 @@ def begin(
     depth = 1 + int(sensing.delay.max()) + (int(sensing.link_delay.max()) if sensing.linked else 0)
     known = np.ascontiguousarray(S[:, :6])
     past = np.tile(known, (depth, 1, 1))
-    attitude = np.zeros((3, 4))
-    attitude[0] = (1.0, 0.0, 0.0, 0.0) if frame is None else frame
-    size = 6 * n + m + 4
+    attitude = _frame(frame)
     curves = given.vehicles.thrust.T[:, :, None]
     peak = np.where(given.vehicles.point[:, None], 0.0, thrust_of(S[:, 13:], *curves))
     worst = np.zeros((n, 5))
@@ -433,10 +431,38 @@ def begin(
         command=np.zeros((n, 4)), saturated=np.zeros(n, dtype=np.bool_), seen=known, history=past, sent=past.copy(),
         heard=np.tile(known, (n if sensing.linked else 0, 1, 1)), peak=peak, peak_time=times[:, :4].copy(),
         worst=worst, worst_time=times, saturations=np.zeros(n, dtype=np.int64), trail=trail,
-        work=SampledWork(
-            zeros(7, STATES), zeros(3, n, 3), np.eye(3), np.zeros((5, 3)), np.zeros((4, 4)), np.zeros(1),
-            np.zeros((1, size)), np.zeros(size),
-        ),
+        work=_work(n, m),
+    )  # fmt: skip
+
+
+def renewed(
+    state: SampledState, workspace: Workspace, integral: Floats, *, frame: Floats | None = None
+) -> SampledState:
+    """The same flight under another problem, such as that of the next phase, whose edges may be others.
+
+    With ``integral`` (m,) of its constraints [m s] and its frame, a quaternion (4,). The old state shares arrays with
+    the new one and must not be used further.
+    """
+    state.clock[1], state.count[LAWS] = state.clock[0], 0
+    views, n = len(state.integral), len(state.S)
+    return state._replace(
+        integral=np.tile(np.asarray(integral, dtype=float), (views, 1)), frame=_frame(frame),
+        work=_work(n, len(workspace.c)),
+    )  # fmt: skip
+
+
+def _frame(q: Floats | None) -> Floats:
+    """A frame at the start, which has no rates yet."""
+    rows = np.zeros((3, 4))
+    rows[0] = (1.0, 0.0, 0.0, 0.0) if q is None else q
+    return rows
+
+
+def _work(n: int, m: int) -> SampledWork:
+    size = 6 * n + m + 4
+    return SampledWork(
+        zeros(7, STATES), zeros(3, n, 3), np.eye(3), np.zeros((5, 3)), np.zeros((4, 4)), np.zeros(1),
+        np.zeros((1, size)), np.zeros(size),
     )  # fmt: skip
 
 
