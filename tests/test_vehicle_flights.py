@@ -143,18 +143,12 @@ def test_sampled_points_fly_as_continuous_ones():
     whole = rf.simulate(smooth)
     off = []
     for rate in (100.0, 400.0):
-        mission = changed(
-            "narrow-passage",
-            smoothness="jerk",
-            vehicles={"p": {"model": "point", "mass": 1.0, "thrust_limit": 23.6}},
-            autopilot={"rate": rate, "formation_rate": rate},
-            agents={"vehicle": "p", "position": [[1, 6, 3], [8, 3, 3], [7, 6, 3]], "radius": 0.25},
-        )
-        data = mission.to_dict()
-        data["agents"] = {
-            k: v for k, v in data["agents"].items() if k not in ("mass", "thrust_limit")
+        data = smooth.to_dict() | {
+            "vehicles": {"p": {"model": "point", "mass": 1.0, "thrust_limit": 23.6}},
+            "autopilot": {"rate": rate, "formation_rate": rate},
         }
-        flown = rf.simulate(rf.Mission.from_dict(data))
+        kept = {k: v for k, v in data["agents"].items() if k not in ("mass", "thrust_limit")}
+        flown = rf.simulate(rf.Mission.from_dict(data | {"agents": kept | {"vehicle": "p"}}))
         at = np.searchsorted(whole.time, flown.time[::20]).clip(max=len(whole.time) - 1)
         same = whole.time[at] == flown.time[::20]
         off.append(np.abs(whole.position[at] - flown.position[::20])[same].max())
