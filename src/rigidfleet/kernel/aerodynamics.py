@@ -7,7 +7,7 @@ from rigidfleet.kernel.disturbances import spline
 from rigidfleet.kernel.rigid_body import attitude_matrix
 
 # Turbulent jet below a hovering quadrotor: decay and spread of its far field, and its virtual origin in distances of
-# opposite motors (Bauersfeld et al. 2024, arXiv:2403.13321, Eq. (9)).
+# opposite motors (Bauersfeld et al. 2024, arXiv:2403.13321, the ninth equation).
 _DECAY, _SPREAD, _ORIGIN = 10.11, 0.07668, -5.817
 # Share of the body's lift in the ground effect (Sanchez-Cuevas et al. 2017), and the least height, in radii, at which
 # the formula is used.
@@ -32,7 +32,7 @@ def add_downwash(S, vehicles, density, T, out):
     """Add to the air (3, N, 3) the jets of all vehicles above, at states S (N, 17).
 
     At a distance s [m] below a vehicle along its z axis and r beside that axis, with l the distance of opposite motors
-    and x = s/l + 5.817, air flows along the axis at (Bauersfeld et al. 2024, arXiv:2403.13321, Eqs. (1)-(9))
+    and x = s/l + 5.817, air flows along the axis at (Bauersfeld et al. 2024, arXiv:2403.13321)
 
         U = 10.11 U_H / (x (1 + (sqrt(2) - 1) (r / (0.07668 l x))^2)^2),  U_H^2 = m g / (8 pi density radius^2).
 

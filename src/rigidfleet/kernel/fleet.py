@@ -381,9 +381,7 @@ def begin(
     depth = 1 + int(sensing.delay.max()) + (int(sensing.link_delay.max()) if sensing.linked else 0)
     known = np.ascontiguousarray(S[:, :6])
     past = np.tile(known, (depth, 1, 1))
-    attitude = np.zeros((3, 4))
-    attitude[0] = (1.0, 0.0, 0.0, 0.0) if frame is None else frame
-    size = 6 * n + m + 4
+    attitude = _frame(frame)
     curves = given.vehicles.thrust.T[:, :, None]
     peak = np.where(given.vehicles.point[:, None], 0.0, thrust_of(S[:, 13:], *curves))
     worst = np.zeros((n, 3))
@@ -400,10 +398,38 @@ def begin(
         command=np.zeros((n, 4)), saturated=np.zeros(n, dtype=np.bool_), seen=known, history=past, sent=past.copy(),
         heard=np.tile(known, (n if sensing.linked else 0, 1, 1)), peak=peak, peak_time=times,
         worst=worst, worst_time=times[:, :3].copy(), saturations=np.zeros(n, dtype=np.int64), trail=trail,
-        work=SampledWork(
-            zeros(7, STATES), zeros(3, n, 3), np.eye(3), np.zeros((5, 3)), np.zeros((4, 4)), np.zeros(1),
-            np.zeros((1, size)), np.zeros(size),
-        ),
+        work=_work(n, m),
+    )  # fmt: skip
+
+
+def renewed(
+    state: SampledState, workspace: Workspace, integral: Floats, *, frame: Floats | None = None
+) -> SampledState:
+    """The same flight under another problem, such as that of the next phase, whose edges may be others.
+
+    With ``integral`` (m,) of its constraints [m s] and its frame, a quaternion (4,). The old state shares arrays with
+    the new one and must not be used further.
+    """
+    state.clock[1], state.count[LAWS] = state.clock[0], 0
+    views, n = len(state.integral), len(state.S)
+    return state._replace(
+        integral=np.tile(np.asarray(integral, dtype=float), (views, 1)), frame=_frame(frame),
+        work=_work(n, len(workspace.c)),
+    )  # fmt: skip
+
+
+def _frame(q: Floats | None) -> Floats:
+    """A frame at the start, which has no rates yet."""
+    rows = np.zeros((3, 4))
+    rows[0] = (1.0, 0.0, 0.0, 0.0) if q is None else q
+    return rows
+
+
+def _work(n: int, m: int) -> SampledWork:
+    size = 6 * n + m + 4
+    return SampledWork(
+        zeros(7, STATES), zeros(3, n, 3), np.eye(3), np.zeros((5, 3)), np.zeros((4, 4)), np.zeros(1),
+        np.zeros((1, size)), np.zeros(size),
     )  # fmt: skip
 
 
