@@ -477,9 +477,10 @@ def test_thrust_and_attitude_can_be_commanded():
     np.testing.assert_allclose(call.dS[0, 0, 3:6], expected, rtol=0, atol=1e-4)
 
 
-def test_rotors_that_cannot_turn_the_vehicle_are_refused():
-    """Four rotors that all turn the same way have no yaw torque: an error says so."""
+def test_rotors_that_cannot_turn_or_lift_the_vehicle_are_refused():
+    """Rotors at one place have no torque, and rotors beside the centre of mass cannot hover: errors say so."""
+    aside = np.array([[0.3, 0.1, 0], [0.3, -0.1, 0], [0.1, -0.1, 0], [0.1, 0.1, 0]])
+    with pytest.raises(ValueError, match="cannot hover"):
+        fleet.quadrotors([replace(PAPER, rotors=aside)])
     with pytest.raises(ValueError, match="do not span thrust and three torques"):
-        fleet.quadrotors(
-            [replace(PAPER, spin=(1, 1, 1, 1), rotors=np.diag([1.0, 1, 1, 1])[:, :3] * 0)]
-        )
+        fleet.quadrotors([replace(PAPER, rotors=np.zeros((4, 3)))])

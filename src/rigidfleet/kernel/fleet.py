@@ -56,7 +56,7 @@ class Vehicle:
     Raises
     ------
     ValueError
-        The rotors do not span thrust and three torques.
+        The rotors do not span thrust and three torques, or do not surround the centre of mass.
     """
 
     m: float  # [kg]
@@ -106,7 +106,13 @@ class Vehicle:
                 f"rotors at {rotors.tolist()} that turn by {spin.tolist()} do not span thrust and three torques; move"
                 " one, or turn it the other way"
             )
-        return np.linalg.inv(mixing)
+        inverse = np.linalg.inv(mixing)
+        if not (inverse[:, 0] > 0.0).all():
+            raise ValueError(
+                f"rotors at {rotors.tolist()} cannot hover: one of them would have to pull down; place them around the"
+                " centre of mass"
+            )
+        return inverse
 
 
 class Quadrotors(NamedTuple):
