@@ -11,6 +11,7 @@ import argparse
 import os
 import subprocess
 import sys
+import tempfile
 import time
 from importlib.util import find_spec
 from pathlib import Path
@@ -114,9 +115,11 @@ def crazyflow(n: int) -> float:
     """Vehicle-steps per second of crazyflow on one core."""
     environment = os.environ | {"SCIPY_ARRAY_API": "1", "JAX_PLATFORMS": "cpu"}
     pinned = f"import os; os.sched_setaffinity(0, {{{min(os.sched_getaffinity(0))}}})\n"
-    done = subprocess.run(
-        [sys.executable, "-c", pinned + CRAZYFLOW, str(n)], env=environment, check=True, capture_output=True, text=True
-    )  # fmt: skip
+    with tempfile.TemporaryDirectory() as folder:  # MuJoCo writes a log into the current one
+        done = subprocess.run(
+            [sys.executable, "-c", pinned + CRAZYFLOW, str(n)], env=environment, cwd=folder, check=True,
+            capture_output=True, text=True,
+        )  # fmt: skip
     return float(done.stdout.split("rate")[-1])
 
 

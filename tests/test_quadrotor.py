@@ -95,7 +95,13 @@ def test_frozen_numbers_are_those_of_the_installed_packages(tmp_path):
     made = tmp_path / "frozen.json"
     script = Path(__file__).with_name("vehicle_samples.py")
     environment = os.environ | {"SCIPY_ARRAY_API": "1"}
-    subprocess.run([sys.executable, script, made], check=True, env=environment, capture_output=True)
+    subprocess.run(
+        [sys.executable, script, made],
+        check=True,
+        env=environment,
+        cwd=tmp_path,
+        capture_output=True,
+    )
     new, old = json.loads(made.read_text()), json.loads(FROZEN.read_text())
     assert new["rotorpy"] == old["rotorpy"]
     assert new["crazyflow"] == old["crazyflow"]
