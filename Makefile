@@ -26,7 +26,7 @@ demo: .venv/.core  ## Fly the paper's narrow passage
 test: .venv/.dev  ## Run the tests (MARK= runs the long ones, too)
 	@$(BIN)/python -m pytest -n $(JOBS) -m "$(MARK)"
 
-bench: .venv/.bench  ## Measure the speed, as ratios
+bench: .venv/.bench .venv/.vehicles  ## Measure the speed, as ratios
 	@$(BIN)/python benchmarks/run.py
 	@$(BIN)/python benchmarks/many.py
 	@$(BIN)/python benchmarks/vehicles.py

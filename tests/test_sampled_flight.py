@@ -562,10 +562,16 @@ def test_the_passage_under_rotorpys_law():
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    ("name", "expected"), [("narrow-passage", (0.300, 0.061)), ("cube-passage", (0.300, 0.060))]
-)
-def test_rotorpys_closed_loop(name, expected):
+def test_the_cubes_passage_under_rotorpys_law():
+    """All 90 s of the cube's passage, eight vehicles, are missed as by RotorPy: frozen numbers."""
+    t, *wanted = setpoints("cube-passage")
+    # RotorPy 3.0.0, flown as in `test_rotorpys_closed_loop`, which takes minutes for eight vehicles
+    expected = (0.30012455556, 0.05964278801)
+    assert errors(flown_by_us(PAPER, t, *wanted), wanted[0]) == pytest.approx(expected, rel=1e-5)
+
+
+@pytest.mark.long
+def test_rotorpys_closed_loop():
     """90 s of the passage under RotorPy's SE(3) law at 100 Hz end where RotorPy's do; errors are .300 and .061 m."""
     pytest.importorskip("rotorpy")
     from rotorpy.controllers.quadrotor_control import SE3Control
@@ -576,7 +582,8 @@ def test_rotorpys_closed_loop(name, expected):
         "rotor_speed_max": 1000.0, "tau_m": 0.02, "k_d": 1.16e-4, "k_z": 1.16e-4, "k_h": 0.0,
     }  # fmt: skip
     model, law = type(rotorpy("hummingbird"))(paper), SE3Control(paper)
-    t, *wanted = setpoints(name)
+    expected = (0.300, 0.061)
+    t, *wanted = setpoints("narrow-passage")
     flown = flown_by_us(PAPER, t, *wanted)
     assert errors(flown, wanted[0]) == pytest.approx(expected, abs=6e-4)
     hover = np.full(4, PAPER.speed_at(PAPER.m * G / 4))

@@ -58,7 +58,7 @@ class Vehicle:
     Raises
     ------
     ValueError
-        The rotors do not span thrust and three torques.
+        The rotors do not span thrust and three torques, or do not surround the centre of mass.
     """
 
     m: float  # [kg]
@@ -108,7 +108,13 @@ class Vehicle:
                 f"rotors at {rotors.tolist()} that turn by {spin.tolist()} do not span thrust and three torques; move"
                 " one, or turn it the other way"
             )
-        return np.linalg.inv(mixing)
+        inverse = np.linalg.inv(mixing)
+        if not (inverse[:, 0] > 0.0).all():
+            raise ValueError(
+                f"rotors at {rotors.tolist()} cannot hover: one of them would have to pull down; place them around the"
+                " centre of mass"
+            )
+        return inverse
 
 
 class Quadrotors(NamedTuple):
@@ -231,9 +237,7 @@ class SampledState(NamedTuple):
     clock: Floats  # (2,) time, and time of the last evaluation of the law [s]
     count: Ints  # (5,) see `STEPS`
     integral: Floats  # (1, m) of the constraints [m s]; (N, m) if linked
-    frame: (
-        Floats  # (3, 4) mean-axis quaternion at the last evaluation, its rate, and the rate before
-    )
+    frame: Floats  # (3, 4) mean-axis quaternion at the last evaluation, its rate, the one before
     error: Floats  # (N, 3) integral of the tracking error [m s]
     f_u: Floats  # (N, 3) input force of the law, held [N]
     f_C: Floats  # (N, 3) its constraint force [N]
@@ -258,9 +262,7 @@ class SampledWork(NamedTuple):
     """Work arrays of a sampled flight."""
 
     y: Floats  # (7, 17) start, trial, four derivatives, end
-    air: (
-        Floats  # (3, N, 3) velocity of the air at the start, the middle and the end of a step [m/s]
-    )
+    air: Floats  # (3, N, 3) velocity of the air: start, middle and end of a step [m/s]
     T: Floats  # (3, 3)
     desired: Floats  # (5, 3) desired attitude (3, 3), its rates and accelerations
     x: Floats  # (4, 4)
