@@ -117,6 +117,8 @@ class SampledPhase(ActivePhase):
                 self._supply()
                 status = fly_ticks(problem, self.workspace, self.flight, sampled, call)
                 self._follow()
+                if status == records.FINISHED:  # to a rounding error of the grid of steps
+                    self.state.clock[0] = t_end
                 if self.external is not None:
                     self.external.check()
                 self._check()
