@@ -67,11 +67,12 @@ class Space:
         self.ends = {path: tuple(gain * f for f in _RANGES[path]) for path, gain in own.items()}
 
     def gains(self, x: Sequence[float] | Floats) -> Gains:
-        """The gains at a point x (D,), to four digits."""
-        return {
-            path: float(f"{low * (high / low) ** u:.4g}")
-            for u, (path, (low, high)) in zip(x, self.ends.items(), strict=True)
-        }
+        """The gains at a point x (D,), to four digits; there, the mission's own are whole."""
+        found = {}
+        for u, (path, (low, high)) in zip(x, self.ends.items(), strict=True):
+            gain, own = _rounded(low * (high / low) ** u), self.own[path]
+            found[path] = own if gain == _rounded(own) else gain
+        return found
 
     @property
     def start(self) -> Floats:
@@ -79,6 +80,10 @@ class Space:
         return np.array(
             [math.log(self.own[p] / a) / math.log(b / a) for p, (a, b) in self.ends.items()]
         )
+
+
+def _rounded(gain: float) -> float:
+    return float(f"{gain:.4g}")
 
 
 @dataclass(frozen=True)

@@ -96,6 +96,8 @@ class Tuned:
         words = f"{_WORDS[self.metric].capitalize()}"
         if self.after.gains == self.before.gains:
             return f"{words}: no better gains were found; the mission keeps its own."
+        if not math.isfinite(self.improvement):
+            return f"{words}: unknown, because some flights did not reach their end."
         where = "on new seeds" if self.validation else "in the flights of the search"
         side = "smaller" if self.improvement >= 0 else "larger"
         return f"{words}: {100 * abs(self.improvement):.0f} % {side} {where}."
@@ -154,8 +156,8 @@ class Tuned:
             if math.isfinite(a) and math.isfinite(b):
                 change = f"{100 * (b / a - 1):+.0f} %" if a > 0 else ""
                 rows.append((f"{_WORDS[name]} [m], {which} seeds", f"{a:.4f}", f"{b:.4f}", change))
-        passed = (f"{x.passed} of {x.flights}" for x in (before, after))
-        return [*rows, (f"passed, {which} seeds", *passed, "")]
+        was, now = (f"{x.passed} of {x.flights}" for x in (before, after))
+        return [*rows, (f"passed, {which} seeds", was, now, "")]
 
 
 _MARGINS = {

@@ -45,8 +45,8 @@ OBJECTIVES = {
 }
 STUDY = "study.json"
 _ROUNDS, _VALIDATION = "rounds", "validation"
-#: Size of the population, and the least one that differential evolution takes.
-_POPULATION, _LEAST = 10, 5
+#: Size of the population of the optimiser. It does not depend on the budget, which may grow.
+_POPULATION = 10
 #: Number of generations after which a study ends if margins refuse nearly all gains.
 _GENERATIONS = 500
 #: Cost of a flight that fails its verdict, and of one that ends early, beyond any error [m].
@@ -139,15 +139,20 @@ def _check(mission: Mission, budget: int, options: Mapping[str, Any]) -> None:
         raise RigidfleetError(
             f"margin share = {options['margin_share']}: must be from 0 (stable) to 1 (no smaller margins)."
         )
-    least = _LEAST * options["seeds"]
+    least = _POPULATION * options["seeds"]
     if budget < least:
         raise RigidfleetError(
-            f"budget = {budget}: must be at least {least}, for {_LEAST} candidates on"
+            f"budget = {budget}: must be at least {least}, for {_POPULATION} candidates on"
             f" {options['seeds']} seed{'s' * (options['seeds'] != 1)}. Use fewer seeds or a larger budget."
         )
     if not own_gains(mission):
         raise RigidfleetError(
             f"{mission.name}: has no gains to tune: no phase tracks slots, and no edges are stabilised."
+        )
+    tracked = any(phase.control == "tracking" for phase in mission.phases)
+    if options["objective"].startswith("tracking") and not tracked:
+        raise RigidfleetError(
+            f"objective = {options['objective']!r}: no phase of {mission.name} tracks slots. Use shape."
         )
     if mission.vehicle_models is None and mission.disturbances is None:
         raise RigidfleetError(
@@ -298,12 +303,11 @@ class _Study:
 
         before = self._fly([self.screen.gains], seeds)[0]
         rng = np.random.default_rng(self.seed)
-        size = max(_LEAST, min(_POPULATION, self.budget // seeds.count // 2))
         with suppress(_SpentError):
             differential_evolution(
                 lambda x: math.nan,  # unused: `workers` flies a whole generation
                 [(0.0, 1.0)] * len(self.space.own),
-                init=feasible_points(self.space, self.slack, size, rng),
+                init=feasible_points(self.space, self.slack, _POPULATION, rng),
                 constraints=NonlinearConstraint(
                     lambda x: self.slack(self.space.gains(x)), 0.0, math.inf
                 ),
@@ -315,7 +319,7 @@ class _Study:
                 polish=False,
                 rng=rng,
             )
-        best = min(self.flown.values(), key=self.cost)
+        best = min(self.flown.values(), key=self._cost)
         margins = self.screen.own, self.screen.margins(best.gains)
         refused = sum(slack < 0 for slack in self.slacks.values())
         return Tuned(
@@ -327,19 +331,16 @@ class _Study:
         """Fly the mission's own gains and the best ones on seeds that the search has not seen."""
         if not seeds.count:
             return
-        pair = list({_key(f.gains): f.gains for f in (found.before, found.after)}.values())
+        every, judged = list(self.flown), []
+        pair = {_key(f.gains): f.gains for f in (found.before, found.after)}
         self.flights.total = self.flights.done + len(pair) * seeds.count
-        judged = self.flights.fly(self.mission, pair, seeds, self.folder / _VALIDATION)
+        for key, gains in pair.items():
+            folder = self.folder / _VALIDATION / f"{every.index(key):04}"
+            judged += self.flights.fly(self.mission, [gains], seeds, folder)
         found.validation = judged[0], judged[-1]
 
-    def cost(self, flown: Flown) -> float:
-        """Mean of the objective [m]; more failed flights are worse whatever it is, and early ends are worse still."""
-        errors = np.nan_to_num(flown.values[OBJECTIVES[self.objective]], nan=_FAILED)
-        return float(
-            np.minimum(errors, _FAILED).mean()
-            + _FAILED * (flown.flights - flown.passed)
-            + _ENDED * flown.ended
-        )
+    def _cost(self, flown: Flown) -> float:
+        return cost(flown, OBJECTIVES[self.objective])
 
     def slack(self, gains: Gains) -> float:
         """Slack of the margins; computed once."""
@@ -356,7 +357,7 @@ class _Study:
             raise _SpentError
         if new:
             self._fly(list(new.values()), seeds)
-        return [self.cost(self.flown[_key(g)]) for g in every]
+        return [self._cost(self.flown[_key(g)]) for g in every]
 
     def _fly(self, candidates: list[Gains], seeds: _Seeds) -> list[Flown]:
         """Fly new candidates as the next round."""
@@ -365,6 +366,13 @@ class _Study:
         self.rounds += 1
         self.flown |= {_key(f.gains): f for f in found}
         return found
+
+
+def cost(flown: Flown, metric: str) -> float:
+    """Mean of a metric [m]; more failed flights are worse whatever it is, and early ends are worse still."""
+    errors = np.nan_to_num(flown.values[metric], nan=_FAILED)
+    failed = flown.flights - flown.passed
+    return float(np.minimum(errors, _FAILED).mean()) + _FAILED * failed + _ENDED * flown.ended
 
 
 def _key(gains: Gains) -> tuple[float, ...]:
