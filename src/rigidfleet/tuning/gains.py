@@ -28,7 +28,7 @@ Gains = dict[str, float]
 
 #: Factors on the mission's own gain between which each is searched. The integral of the constraint law is searched
 #: far downwards: it costs phase, and only steady forces need it.
-_RANGES = {
+RANGES = {
     "constraint.alpha": (1 / 4, 4.0),
     "constraint.beta": (1 / 3, 3.0),
     "constraint.gamma": (1 / 30, 3.0),
@@ -64,7 +64,7 @@ class Space:
 
     def __init__(self, own: Gains) -> None:
         self.own = own
-        self.ends = {path: tuple(gain * f for f in _RANGES[path]) for path, gain in own.items()}
+        self.ends = {path: tuple(gain * f for f in RANGES[path]) for path, gain in own.items()}
 
     def gains(self, x: Sequence[float] | Floats) -> Gains:
         """The gains at a point x (D,), to four digits; there, the mission's own are whole."""

@@ -11,6 +11,7 @@ import numpy as np
 
 from rigidfleet.math.margins import Margins
 from rigidfleet.result import plain
+from rigidfleet.sweep.record import called
 from rigidfleet.tuning.gains import Gains
 
 if TYPE_CHECKING:
@@ -33,6 +34,7 @@ class Flown:
     gains : by path in the mission
     passed, ended, flights : numbers of flights that passed their verdict, of those that ended early, of all
     values : values of each metric [m], one for each flight; NaN if it does not apply
+    reasons : number of flights that failed each check
     """
 
     gains: Gains
@@ -40,6 +42,7 @@ class Flown:
     ended: int
     flights: int
     values: dict[str, list[float]]
+    reasons: dict[str, int] = field(default_factory=dict)
 
     def mean(self, metric: str) -> float:
         """Mean of a metric over the flights [m]; NaN if it does not apply."""
@@ -49,6 +52,7 @@ class Flown:
         """Plain data."""
         return {
             "gains": self.gains, "flights": self.flights, "passed": self.passed, "ended_early": self.ended,
+            "failed_checks": self.reasons,
             "mean_m": {name: self.mean(name) for name in self.values}, "values_m": self.values,
         }  # fmt: skip
 
@@ -157,7 +161,11 @@ class Tuned:
                 change = f"{100 * (b / a - 1):+.0f} %" if a > 0 else ""
                 rows.append((f"{_WORDS[name]} [m], {which} seeds", f"{a:.4f}", f"{b:.4f}", change))
         was, now = (f"{x.passed} of {x.flights}" for x in (before, after))
-        return [*rows, (f"passed, {which} seeds", was, now, "")]
+        rows.append((f"passed, {which} seeds", was, now, ""))
+        for reason in {**before.reasons, **after.reasons}:
+            was, now = (str(x.reasons.get(reason, 0)) for x in (before, after))
+            rows.append((f"failed '{called(reason)}', {which} seeds", was, now, ""))
+        return rows
 
 
 _MARGINS = {

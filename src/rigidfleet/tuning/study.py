@@ -13,6 +13,7 @@ from __future__ import annotations
 import json
 import math
 import shutil
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
@@ -264,9 +265,11 @@ def _measured(table: Table, candidates: Sequence[Gains], seeds: int) -> list[Flo
     found = []
     for k, gains in enumerate(candidates):
         rows = slice(k * seeds, (k + 1) * seeds)
-        ended = sum(not _NOT_FLOWN.isdisjoint(r.split(", ")) for r in table.reason[rows])
+        reasons = [reason.split(", ") for reason in table.reason[rows] if reason]
+        ended = sum(not _NOT_FLOWN.isdisjoint(failed) for failed in reasons)
+        failed = dict(Counter(reason for failed in reasons for reason in failed).most_common())
         values = {name: table.metrics[name][rows].tolist() for name in OBJECTIVES.values()}
-        found.append(Flown(gains, int(table.passed[rows].sum()), ended, seeds, values))
+        found.append(Flown(gains, int(table.passed[rows].sum()), ended, seeds, values, failed))
     return found
 
 
