@@ -406,6 +406,8 @@ class Result:
             ("clearance", "least clearance", "m"),
             ("speed", "greatest speed", "m/s"),
             ("thrust", "greatest thrust", "N"),
+            ("rotor_force", "greatest rotor force", "N"),
+            ("tracking_error", "greatest tracking error", "m"),
         )
         for quantity, words, unit in worst:
             if (x := self.extreme(quantity)) is not None and math.isfinite(x.value):
