@@ -7,9 +7,17 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from rigidfleet.typing import Floats
+
 if TYPE_CHECKING:
     from rigidfleet.assessment import Verdict
     from rigidfleet.result import Result
+
+
+#: Greatest number of agents whose pairs are all compared with those of their slots; beyond, edges alone are.
+_PAIRED = 100
 
 
 @dataclass(frozen=True)
@@ -23,6 +31,13 @@ class Metric:
 METRICS: dict[str, Metric] = {
     "shape_end": Metric("m", "shape error at the end: largest error of all pair distances"),
     "shape": Metric("m", "largest shape error at the end of a phase"),
+    "shape_flight": Metric(
+        "m",
+        "largest shape error in flight: of all pairs of tracked slots, else of the edges against their references",
+    ),
+    "shape_rms": Metric("m", "root mean square over time of the largest of these errors"),
+    "tracking_error": Metric("m", "largest distance of a vehicle from its slot"),
+    "tracking_rms": Metric("m", "root mean square over time of the largest of these distances"),
     "constraint_end": Metric("m", "largest constraint error |c| = |L - d| at the end"),
     "constraint": Metric(
         "m", "largest constraint error |c| = |L - d|: edge length minus reference"
@@ -38,6 +53,13 @@ METRICS: dict[str, Metric] = {
     "clearance": Metric("m", "minimum clearance to an obstacle: distance minus radius"),
     "geofence": Metric("m", "maximum distance outside the geofence; negative inside"),
     "thrust": Metric("N", "thrust closest to or farthest beyond its limit; peak if there is none"),
+    "rotor_share": Metric(
+        "1", "rotor force closest to its limit, as a share of it; only of vehicles with rotors"
+    ),
+    "saturation": Metric(
+        "1", "largest share of a phase in which a vehicle is asked for more than its rotors give"
+    ),
+    "tilt": Metric("deg", "maximum tilt of a vehicle with rotors"),
     "speed": Metric("m s-1", "maximum speed"),
     "acceleration": Metric("m s-2", "maximum acceleration"),
     "constraint_force": Metric("N", "maximum constraint force on an agent"),
@@ -70,6 +92,7 @@ def measure(result: Result, verdict: Verdict) -> dict[str, float]:
         "steps": float(result.statistics["steps"]),
         "evaluations": float(result.statistics["evaluations"]),
     }
+    found |= _in_flight(result)
     for name in ("position", "velocity", "attitude", "rates"):
         misses = (getattr(p.waypoint, name) for p in phases if p.waypoint is not None)
         found[f"waypoint_{name}"] = _greatest(misses)
@@ -80,8 +103,57 @@ def measure(result: Result, verdict: Verdict) -> dict[str, float]:
         for name in ("separation_below", "geofence", "thrust")
         if name in checked
     }
+    worst |= _of_rotors(verdict)
     return {name: float((worst | found).get(name, math.nan)) for name in METRICS}
+
+
+def _of_rotors(verdict: Verdict) -> dict[str, float]:
+    """What the checks of vehicles with rotors found; nothing of points."""
+    found = {f.check: (f.worst, f.limit) for f in verdict.checks if f.worst is not None}
+    if "rotor_force" not in found:
+        return {}
+    force, limit = found["rotor_force"]
+    assert limit is not None
+    shares = {"rotor_share": force / limit, "tilt": found["tilt"][0]}
+    if "saturation" in found:
+        shares["saturation"] = found["saturation"][0] / 100.0
+    return shares
 
 
 def _greatest(values: Iterable[float | None]) -> float:
     return max((v for v in values if v is not None), default=math.nan)
+
+
+def _in_flight(result: Result) -> dict[str, float]:
+    """Errors of shape and of tracking at all samples, lost vehicles left out."""
+    r = np.where(result.left[..., None], result.position, np.nan)
+    errors = {
+        "shape_flight": shape_errors(result),
+        "tracking_error": _most(np.linalg.norm(r - result.slot_position, axis=2)),
+    }
+    found = {}
+    for (name, error), mean in zip(errors.items(), ("shape_rms", "tracking_rms"), strict=True):
+        there = error[np.isfinite(error)]
+        found[name] = float(there.max()) if len(there) else math.nan
+        found[mean] = float(np.sqrt(np.mean(there**2))) if len(there) else math.nan
+    return found
+
+
+def shape_errors(result: Result) -> Floats:
+    """Largest error (K,) [m] of a distance at each sample: of all pairs, where slots are tracked, against their slots.
+
+    Elsewhere, and with many agents, it is that of the edges against their references. NaN if there are none.
+    """
+    error = _most(np.abs(result.constraint))
+    n = result.position.shape[1]
+    if n < 2 or n > _PAIRED:
+        return error
+    i, j = np.triu_indices(n, 1)
+    r = np.where(result.left[..., None], result.position, np.nan)
+    flown, asked = (np.linalg.norm(x[:, i] - x[:, j], axis=2) for x in (r, result.slot_position))
+    return np.fmax(error, _most(np.abs(flown - asked)))
+
+
+def _most(values: Floats) -> Floats:
+    """Greatest finite value (K,) of each row (K, M); NaN if there is none."""
+    return np.fmax.reduce(values, axis=1, initial=np.nan)

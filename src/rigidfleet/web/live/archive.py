@@ -112,7 +112,8 @@ def _numbers(piece: Piece) -> float:
 def rows(piece: Piece, which: Bools | list[int]) -> Piece:
     """Some samples of a piece."""
     record = type(piece.record)(*(x[which] for x in piece.record))
-    vehicles = piece.vehicles and VehicleSamples(*(x[which] for x in piece.vehicles))
+    flown = piece.vehicles
+    vehicles = None if flown is None else VehicleSamples._make(x[which] for x in flown)
     return Piece(
         piece.phase, piece.time[which], record, piece.integral[which], piece.frame[which], piece.edges,
         piece.attached, vehicles,
@@ -128,7 +129,9 @@ def _join(pieces: list[Piece]) -> Piece:
     first, record = pieces[0], type(pieces[0].record)
     fields = (np.concatenate(each) for each in zip(*(p.record for p in pieces), strict=True))
     flown = [p.vehicles for p in pieces if p.vehicles is not None]
-    vehicles = VehicleSamples(*map(np.concatenate, zip(*flown, strict=True))) if flown else None
+    vehicles = (
+        VehicleSamples._make(map(np.concatenate, zip(*flown, strict=True))) if flown else None
+    )
     return Piece(
         first.phase,
         np.concatenate([p.time for p in pieces]),
