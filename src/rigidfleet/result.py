@@ -437,6 +437,8 @@ class Result:
             ("clearance", "least clearance", "m"),
             ("speed", "greatest speed", "m/s"),
             ("thrust", "greatest thrust", "N"),
+            ("rotor_force", "greatest rotor force", "N"),
+            ("tracking_error", "greatest tracking error", "m"),
         )
         for quantity, words, unit in worst:
             if (x := self.extreme(quantity)) is not None and math.isfinite(x.value):
@@ -484,6 +486,8 @@ class Result:
 
         if mission.n_agents != self.n_agents:
             return f"the mission has {mission.n_agents} agents, the arrays have {self.n_agents}"
+        if mission.vehicle_models is not None and self.rotor_force is None:
+            return "it flies vehicles with rotors, of which the arrays have none"
         if not np.array_equal(mission.edges, self.edges):
             return "the edges of its formations differ from those of the arrays"
         named = [
