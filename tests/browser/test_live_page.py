@@ -221,6 +221,40 @@ def test_end_says_where(browser):
     thread.join(5)
 
 
+def test_quadrotors(browser):
+    """Quadrotors fly by hand: they and their rotors are drawn and plotted; gusts and changes of formation work."""
+    session = Session(load_mission("passage-quadrotors"))
+    thread = threading.Thread(target=session.run)
+    thread.start()
+    try:
+        with Server(session) as server:
+            browser.open(server.url)
+            browser.wait("return replay.recording.end > 1")
+            titles = browser.run(
+                "return [...document.querySelectorAll('.plot h2')].map((h) => h.textContent)"
+            )
+            assert titles[:2] == ["Rotors, share of limit", "Tracking error"]
+            drawn = (
+                "replay.scene.draw(replay.time, 0); const { turned, small, noses } = replay.scene.places;"
+                "return [turned.count + small.count, noses.count]"
+            )
+            assert browser.run(drawn) == [3, 3]
+            browser.click("[data-formation=line]")
+            until(lambda: session.pilot.formation == "line")
+            browser.run(
+                "[...document.querySelectorAll('#fly button')].find((b) => b.textContent === 'behind').click()"
+            )
+            browser.wait(
+                "return Math.hypot(...replay.recording.at(replay.recording.end).slot) > 0.1"
+            )
+            assert session.pilot.ending == ""
+            assert browser.heard() == []
+            browser.driver.get("about:blank")
+    finally:
+        session.stop()
+        thread.join(5)
+
+
 def test_tab_closed(session, browser, monkeypatch):
     """When the last page is closed, the flight ends."""
     monkeypatch.setattr(sessions, "_PATIENCE", 0.5)

@@ -209,10 +209,9 @@ class Turn(NamedTuple):
 
 def turn_from(problem: Problem, t: float, yaw: Yaw, start: Floats) -> Turn:
     """The turn of vehicles with yaws ``start`` (N,) [rad] at a time [s] of a problem, at which its motion begins."""
-    if problem.control.kind != TRACKING:
+    if problem.control.kind != TRACKING or yaw.kind == "along":
         return Turn(t, start, np.zeros(len(start)))
-    own = start if yaw.kind == "along" else None
-    off = start - yaw_derivatives(problem.reference, problem.motion, np.array([t]), yaw, own)[0, 0]
+    off = start - yaw_derivatives(problem.reference, problem.motion, np.array([t]), yaw)[0, 0]
     if yaw.kind != "formation":
         off = (off + np.pi) % (2.0 * np.pi) - np.pi
     return Turn(t, start, off)
@@ -220,6 +219,8 @@ def turn_from(problem: Problem, t: float, yaw: Yaw, start: Floats) -> Turn:
 
 def yaw_at(problem: Problem, t: float, yaw: Yaw, turn: Turn) -> Floats:
     """Yaw (N,) [rad] asked of each vehicle at a time [s] of a phase."""
+    if t <= turn.begun:
+        return turn.start
     return _references(problem, np.array([t]), yaw, turn)[0][0, :, 0]
 
 

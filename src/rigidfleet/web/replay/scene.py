@@ -78,13 +78,14 @@ def _turned(result: Result) -> dict[str, PackedColumn]:
         force = result.input_force + result.constraint_force
         found["thrust"] = PackedColumn(thrust_directions(force, mission.fleet.mass), 5e-4)
     if known.any():
-        q, force = result.vehicle_attitude, result.rotor_force
+        q, force, saturated = result.vehicle_attitude, result.rotor_force, result.saturated
         assert q is not None
         assert force is not None
+        assert saturated is not None
         share = np.where(known[:, None], force / np.where(known, limits, 1.0)[:, None], 0.0)
         found["turn"] = PackedColumn(_continuous(q), 1e-3)
         found["rotors"] = PackedColumn(share, 0.01)
-        found["saturated"] = PackedColumn((result.saturated != 0) & result.left, 1.0)
+        found["saturated"] = PackedColumn(np.where(result.left, saturated != 0, 0.0), 1.0)
     return found
 
 
