@@ -33,12 +33,12 @@ from rigidfleet.mission.schema import (
     Lqr,
     MissionHeader,
     Obstacle,
-    Part,
     Regulator,
     Start,
     Tracking,
     VehicleYaw,
 )
+from rigidfleet.mission.values import Part
 
 _TABLES: dict[str, type[Part]] = {
     "agents": Agents,
