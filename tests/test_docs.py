@@ -469,7 +469,4 @@ def test_drawings_are_those_that_are_kept(tmp_path, monkeypatch):
 
 def test_every_figure_is_listed():
     """The page of figures lists all that a flight can have, in the order in which they are drawn."""
-    from rigidfleet.plotting import figure_names
-
-    page = (DOCS / "figures.md").read_text(encoding="utf-8")
-    assert re.findall(r"^\| `(\w+)` \|", page, re.MULTILINE) == figure_names()
+    assert re.findall(r"^\| `(\w+)` \|", page("figures.md"), re.MULTILINE) == figure_names()

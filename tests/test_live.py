@@ -91,7 +91,9 @@ def test_quadrotors_follow_the_hand(yaw):
     assert max(map(slot_error, records)) < 0.02
     assert worst(records, "saturated") == 0.0
     assert worst(records, "vehicle_rates") < 1.5
-    turned = att.euler_from_quaternion(records[-1].vehicle_attitude[0])[:, 2]
+    attitude = records[-1].vehicle_attitude
+    assert attitude is not None
+    turned = att.euler_from_quaternion(attitude[0])[:, 2]
     formation = att.euler_from_quaternion(records[-1].attitude)[0, 2]
     wanted = {"formation": formation, "fixed": 0.0}.get(yaw)
     if wanted is not None:

@@ -38,6 +38,7 @@ if TYPE_CHECKING:
         simulate,
     )
     from rigidfleet.sweep import Sweep
+    from rigidfleet.tuning import Tuned, tune
     from rigidfleet.web.live import live
     from rigidfleet.web.replay import replay
 
@@ -57,6 +58,7 @@ __all__ = [
     "RigidfleetError",
     "Sweep",
     "SweepError",
+    "Tuned",
     "Verdict",
     "__version__",
     "assess",
@@ -70,6 +72,7 @@ __all__ = [
     "replay",
     "report",
     "simulate",
+    "tune",
 ]
 
 #: The module of each public name.
@@ -88,6 +91,7 @@ _HOME = {
     "RigidfleetError": "errors",
     "Sweep": "sweep",
     "SweepError": "errors",
+    "Tuned": "tuning",
     "Verdict": "assessment",
     "assess": "assessment",
     "check": "preflight.check",
@@ -100,6 +104,7 @@ _HOME = {
     "replay": "web.replay",
     "report": "reporting",
     "simulate": "simulation.flight",
+    "tune": "tuning",
 }
 
 

@@ -262,3 +262,28 @@ def test_tab_closed(session, browser, monkeypatch):
         browser.open(server.url)
         browser.driver.get("about:blank")
         until(session.stopped.is_set)
+
+
+def test_narrow_pages_keep_the_flight_in_sight(page):
+    """On a telephone the controls lie below the vehicles, without overlap; the panel takes their place."""
+    box = (
+        "(id => { const b = document.getElementById(id).getBoundingClientRect();"
+        " return [b.left, b.top, b.right, b.bottom] })"
+    )
+    page.driver.execute_cdp_cmd(
+        "Emulation.setDeviceMetricsOverride",
+        {"width": 400, "height": 800, "deviceScaleFactor": 1, "mobile": True},
+    )
+    try:
+        page.wait("return innerWidth === 400")
+        page.wait(f"return {box}('fly')[3] < {box}('bar')[1]")
+        _, top, right, _ = page.run(f"return {box}('fly')")
+        assert top > 400
+        assert right <= 400
+        middle = "const { camera } = replay.scene; return innerHeight * (1 - camera.centre[1]) / 2"
+        assert page.run(middle) < top
+        page.click("#more")
+        assert page.run("return document.getElementById('fly').offsetHeight") == 0
+        assert page.run(f"return {box}('panel')[3]") < page.run(f"return {box}('bar')[1]")
+    finally:
+        page.driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})

@@ -601,6 +601,7 @@ def test_quadrotors_turn_as_they_flew(show):
             t,
         )
         assert count == noses == 4
+        assert result.vehicle_attitude is not None
         flown = result.vehicle_attitude[np.searchsorted(result.time, t)]
         np.testing.assert_allclose(np.abs(np.sum(np.array(drawn) * flown, axis=1)), 1.0, atol=1e-3)
 
@@ -622,6 +623,7 @@ def test_rotor_at_its_limit_is_red(show):
     assert np.flatnonzero(red).tolist() == [5]
     assert not ((calm[:, 0] > 200) & (calm[:, 1] < 30)).any()
     k = np.searchsorted(result.time, 7.0)
+    assert result.vehicle_attitude is not None
     away = att.dcm_from_quaternion(result.vehicle_attitude[k, 1]) @ (
         busy[5, 2:] - result.position[k, 1]
     )

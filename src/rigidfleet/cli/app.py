@@ -6,7 +6,7 @@ for terminals only, and `NO_COLOR` is respected.
 Exit codes
 ----------
 - 0: success; for `run` and `report`: the flight passed its verdict; for `sweep`: all runs are flown, whether they
-  passed or failed
+  passed or failed; for `tune`: gains are chosen, perhaps the mission's own
 - 1: the flight failed its verdict or ended early; for `check`: the flight will fail
 - 2: invalid input, or files that cannot be read or written
 - 130: interrupted (Ctrl-C); the flight so far is saved, marked incomplete
@@ -28,7 +28,7 @@ from typing import Any, cast
 from cyclopts import App, CycloptsError, Parameter, UnknownOptionError, UnusedCliTokensError
 
 from rigidfleet._version import __version__
-from rigidfleet.cli import check, console, design, live, new, report, run, sweep
+from rigidfleet.cli import check, console, design, live, new, report, run, sweep, tune
 from rigidfleet.cli.codes import BAD_INPUT, FAILED, INTERRUPTED, PASSED
 from rigidfleet.errors import RigidfleetError
 
@@ -50,7 +50,7 @@ app = App(
 )
 _COMMANDS = (
     run.run, run.missions, check.check, design.design, new.new, report.report, report.replay,
-    live.live, sweep.sweep,
+    live.live, sweep.sweep, tune.tune,
 )  # fmt: skip
 for _key, _command in enumerate(_COMMANDS, start=1):
     app.command(_command, sort_key=_key)

@@ -47,7 +47,9 @@ HUGE = 1e15
 #: Scaramuzza, Robotics and Automation Letters 3, 2018). A vehicle with more mass per rotor has less.
 DRAG = 0.3
 #: Keys of a phase that may be automatic, and the word for it.
-TIMES, AUTO = ("duration", "travel", "blend"), "auto"
+TIMES = ("duration", "travel", "blend")
+#: Value of a time that follows from the limits.
+AUTO = "auto"
 #: Keys of an attitude: 3-2-1 Euler angles.
 ANGLES = ("roll_deg", "pitch_deg", "yaw_deg")
 

@@ -26,7 +26,7 @@ _BLOCK = 1024
 #: Kinds of random numbers.
 _NOISE, _DROPPED, _UNHEARD = 2, 3, 4
 #: Density of the air at sea level, ICAO standard atmosphere [kg/m^3].
-_DENSITY = 1.225
+DENSITY = 1.225
 #: Speed below which the direction of quadratic drag is rounded off [m/s].
 _STILL = 0.1
 #: Time in which a vehicle turns from its yaw at a switch to the yaw asked for [s].
@@ -59,7 +59,7 @@ def sampled_flight(mission: Mission) -> fleet.Flight:
         gust=around.gust,
         downwash=d is not None and d.downwash,
         ground_effect=d is not None and d.ground_effect and bool(grounds),
-        density=_DENSITY,
+        density=DENSITY,
         ground=max(grounds, default=0.0),
         floor=around.floor,
     )

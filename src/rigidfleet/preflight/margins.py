@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -43,9 +44,45 @@ def check_margins(
     way : the planned phases
     lags : of each vehicle
     """
-    tracked = any(phase.control == "tracking" for phase in mission.phases)
-    tracking = margins(tracking_loops(lags), _feedback(mission, None, None)) if tracked else None
+    tracking = tracking_law(mission, lags)
+    laws, skipped = formation_laws(mission, way, lags)
     found: dict[str, FormationMargins] = {}
+    for law in laws:
+        found[law.where] = _worse(found.get(law.where), law.loops, law.law, law.growth)
+    alone = None if tracking is None else margins(tracking.loops, tracking.law)
+    return MarginsCheck(alone, found, skipped)
+
+
+@dataclass(frozen=True)
+class Looped:
+    """Loops of one shape, or of single vehicles, and the law that closes them.
+
+    Attributes
+    ----------
+    where : the formation, or the way between two, in words
+    loops : their distinct parts
+    law : with the gains of the mission
+    growth : rate [1/s] from which a motion counts as unstable
+    """
+
+    where: str
+    loops: list[Loop]
+    law: Feedback
+    growth: float
+
+
+def tracking_law(mission: Mission, lags: Sequence[Lag]) -> Looped | None:
+    """The tracking of single vehicles; None if no phase tracks slots."""
+    if not any(phase.control == "tracking" for phase in mission.phases):
+        return None
+    return Looped("tracking", tracking_loops(lags), _feedback(mission, None, None), GROWTH)
+
+
+def formation_laws(
+    mission: Mission, way: Sequence[PlannedPhase], lags: Sequence[Lag]
+) -> tuple[list[Looped], bool]:
+    """The loops of each formation and of the ways between them, and whether some were left out to limit the work."""
+    found: list[Looped] = []
     seen: set[tuple[object, ...]] = set()
     work, skipped = 0, False
     pairs = list(zip(mission.phases, way, strict=False))
@@ -67,8 +104,8 @@ def check_margins(
                 skipped = True
                 continue
             work += size
-            found[_where(planned)] = _worse(found.get(_where(planned)), loops, law, growth)
-    return MarginsCheck(tracking, found, skipped)
+            found.append(Looped(_where(planned), loops, law, growth))
+    return found, skipped
 
 
 def _feedback(mission: Mission, phase: Phase | None, held: str | None) -> Feedback:

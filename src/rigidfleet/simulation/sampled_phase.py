@@ -71,16 +71,15 @@ class SampledPhase(ActivePhase):
         lost = self.flight.vehicles._replace(lost=self.lost.copy())
         self.flight = self.flight._replace(vehicles=lost)
         frame = y[6 * n + m : 6 * n + m + 4] if plan.frame is not None else None
+        integral, before = y[6 * n : 6 * n + m], given.state
         begun = fleet.begin(self.flight, given.S, self.workspace, frame=frame)
-        begun.integral[:] = y[6 * n : 6 * n + m]
+        if before is None:
+            begun.integral[:] = integral
+        else:  # extremes are those of the phase
+            renewed = fleet.renewed(before, self.workspace, integral, frame=frame)
+            kept = ("peak", "peak_time", "worst", "worst_time", "saturations")
+            begun = renewed._replace(**{name: getattr(begun, name) for name in kept})
         begun.peak_time[:] = begun.worst_time[:] = t
-        before = given.state
-        if before is not None:
-            begun = before._replace(
-                integral=begun.integral, frame=begun.frame, work=begun.work, peak=begun.peak,
-                peak_time=begun.peak_time, worst=begun.worst, worst_time=begun.worst_time,
-                saturations=begun.saturations,
-            )  # fmt: skip
         self.sampled = given.state = begun._replace(trail=trail._replace(gauge=trail.gauge[:, :0]))
         self.first_tick = int(self.sampled.count[fleet.TICKS])
         self.tabled = None
@@ -130,6 +129,8 @@ class SampledPhase(ActivePhase):
                 self._supply()
                 status = fly_ticks(problem, self.workspace, self.flight, sampled, call)
                 self._follow()
+                if status == records.FINISHED:  # to a rounding error of the grid of steps
+                    self.state.clock[0] = t_end
                 if self.external is not None:
                     self.external.check()
                 self._check()
@@ -196,7 +197,15 @@ class SampledPhase(ActivePhase):
         out, kept = _as_flown(planned, call, done, self.flight.vehicles, problem)
         self.pieces.append(
             Piece(
-                self.index, times, out, call.integral[:done], frame, plan.edges, plan.attached, kept
+                self.index,
+                times,
+                out,
+                call.integral[:done],
+                frame,
+                plan.edges,
+                plan.attached,
+                self._led(times),
+                kept,
             )
         )
         assert out.r.shape[1] == n

@@ -103,7 +103,7 @@ class Sweep:
     ) -> None:
         self.mission, self.variations = mission, tuple(variations)
         self.seed, self.name, self.evaluate = seed, name, evaluate
-        self.runs = runs or math.prod(len(c.grid) for c in self.columns if c.grid is not None)
+        self.runs = runs or math.prod(self.grid_sizes.values())
 
     @classmethod
     def of(
@@ -227,19 +227,25 @@ class Sweep:
             for keys in keypaths.expand(self.whole, v.path)
         ]
 
+    @cached_property
+    def grid_sizes(self) -> dict[str | int, int]:
+        """Number of values of each grid, by its column, or by its group if it has one; in order of first occurrence."""
+        return {_axis(c, k): len(c.grid) for k, c in enumerate(self.columns) if c.grid is not None}
+
     def values(self, run: int) -> list[Any]:
         """Value of every column in a run; runs count from 0."""
         stream = np.random.Philox(np.random.SeedSequence(self.seed, spawn_key=(run,)))
         drawn = sum(column.grid is None for column in self.columns)
         fractions = np.maximum(np.random.Generator(stream).random(drawn), _LEAST).tolist()
-        point, found = run, []
-        for column in reversed(self.columns):  # the last grid varies fastest
+        point, places, found = run, {}, []
+        for axis, size in reversed(self.grid_sizes.items()):  # the last grid varies fastest
+            point, places[axis] = divmod(point, size)
+        for k, column in reversed([*enumerate(self.columns)]):
             if column.grid is None:
                 assert isinstance(column.variation, Drawn)
                 found.append(column.variation.quantile(fractions.pop()))
             else:
-                point, place = divmod(point, len(column.grid))
-                found.append(column.grid[place])
+                found.append(column.grid[places[_axis(column, k)]])
         return found[::-1]
 
     def varied(self, run: int) -> dict[str, Any]:
@@ -258,6 +264,11 @@ class Sweep:
             "seed": self.seed,
             "evaluate": self.evaluate,
         }
+
+
+def _axis(column: SweepColumn, k: int) -> str | int:
+    """What grids share that take their values together: their group, or the column's own number."""
+    return getattr(column.variation, "group", "") or k
 
 
 @lru_cache(maxsize=4)
@@ -335,6 +346,7 @@ def _checked(
 
         if (why := unfit(mission)) is not None:
             collector.add(("evaluate",), why, _WHOLE, "final")
+    _same_length(collector, variations)
     if "vary" not in data or data["vary"] == []:
         collector.add(
             ("vary",),
@@ -413,6 +425,18 @@ def _fits(
             collector.add(
                 where, f"has the value {leaves[0]!r}, which is not a number", remedy, path
             )
+
+
+def _same_length(collector: FindingCollector, variations: list[Variation]) -> None:
+    """Check that grids of a group have as many values."""
+    sizes: dict[str, int] = {}
+    for k, v in enumerate(variations):
+        if isinstance(v, Gridded) and v.group:
+            size = sizes.setdefault(v.group, len(v.grid))
+            if len(v.grid) != size:
+                problem = f"has a grid of {len(v.grid)} values here, and one of {size} before"
+                remedy = "give all grids of a group as many values"
+                collector.add(("vary", k, "group"), problem, remedy, v.group)
 
 
 def _moves_starts(collector: FindingCollector, k: int, v: Variation, whole: dict[str, Any]) -> None:

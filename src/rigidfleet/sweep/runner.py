@@ -63,6 +63,7 @@ def fly(
     cluster: str | None = None,
     replace: bool = False,
     progress: Callable[[SweepProgress], None] | None = None,
+    pool: Callable[[], pools.Pool] | None = None,
 ) -> Table:
     """Fly the runs of a sweep that are missing in a folder, and return all of its rows.
 
@@ -74,6 +75,7 @@ def fly(
     cluster : address of a Dask scheduler, whose workers fly the runs
     replace : overwrite a sweep that is in the folder
     progress : called after each chunk
+    pool : instead of workers: returns processes that are kept for several sweeps, called if there is anything to fly
 
     Raises
     ------
@@ -88,17 +90,20 @@ def fly(
     with Store(folder, sweep, replace=replace) as store:
         flight = _Sweeping(sweep, store, progress)
         if cluster is not None:
-            with pools.cluster(cluster) as pool:
-                flight.hand_out(pool)
+            with pools.cluster(cluster) as there:
+                flight.hand_out(there)
+        elif pool is not None:
+            if flight.missing:
+                flight.hand_out(pool())
         else:
-            count = _cores() if workers is None else workers
+            count = cores() if workers is None else workers
             flight.alone(until_worth=count > 1)
             deaths = 0
             while flight.missing:
                 before = flight.flown
                 try:
-                    with pools.processes(count) as pool:
-                        flight.hand_out(pool)
+                    with pools.processes(count) as there:
+                        flight.hand_out(there)
                 except BrokenExecutor as error:
                     deaths = 1 if flight.flown > before else deaths + 1
                     if deaths >= _DEATHS:
@@ -172,7 +177,7 @@ class _Sweeping:
             )
 
 
-def _cores() -> int:
+def cores() -> int:
     """Number of cores that this process may use."""
     usable = getattr(os, "sched_getaffinity", None)
     return len(usable(0)) if usable is not None else os.cpu_count() or 1

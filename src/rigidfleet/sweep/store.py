@@ -30,7 +30,7 @@ FILE = "sweep.db"
 #: Locked by the process that writes. The lock ends with the process, even if that is killed.
 _LOCK = "sweep.lock"
 #: Version of the format, stored as `user_version`; 0 in files of the first format.
-_FORMAT = 2
+_FORMAT = 3
 _COLUMNS = ("passed", "reason", "detail", "wall", "codes", *METRICS)
 #: Little-endian, so that the file can be read on every machine.
 _CODES = np.dtype("<f8")

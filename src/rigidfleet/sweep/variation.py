@@ -62,6 +62,12 @@ class Drawn(Variation):
 class Gridded(Variation):
     """A grid: values taken in turn."""
 
+    group: str = Field(
+        "",
+        description="grids of the same group take their values together, the first with the first; they have as many "
+        "values; default: every grid is combined with all others",
+    )
+
     @property
     @abstractmethod
     def grid(self) -> tuple[Any, ...]:

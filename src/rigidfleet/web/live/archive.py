@@ -116,7 +116,7 @@ def rows(piece: Piece, which: Bools | list[int]) -> Piece:
     vehicles = None if flown is None else VehicleSamples._make(x[which] for x in flown)
     return Piece(
         piece.phase, piece.time[which], record, piece.integral[which], piece.frame[which], piece.edges,
-        piece.attached, vehicles,
+        piece.attached, piece.led, vehicles,
     )  # fmt: skip
 
 
@@ -140,6 +140,7 @@ def _join(pieces: list[Piece]) -> Piece:
         np.concatenate([p.frame for p in pieces]),
         first.edges,
         first.attached,
+        tuple(led for p in pieces for led in p.led),
         vehicles,
     )
 

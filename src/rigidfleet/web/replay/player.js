@@ -441,7 +441,9 @@ export class Player {
     const { clientWidth: width, clientHeight: height } = document.documentElement, { camera } = this.scene;
     if (!width || !height) return; // in a frame that is not shown yet
     const beside = (id) => (part(id)?.offsetWidth && width > 760 ? part(id).offsetWidth + 14 : 0);
-    const left = beside("fly"), right = beside("panel"), bottom = part("bar").offsetHeight + 14;
+    document.documentElement.style.setProperty("--bar", `${part("bar").offsetHeight}px`);
+    const below = part("fly")?.offsetHeight && width <= 760 ? part("fly").offsetHeight + 14 : 0;
+    const left = beside("fly"), right = beside("panel"), bottom = part("bar").offsetHeight + 14 + below;
     camera.centre = [(left - right) / width, bottom / height];
     camera.free = [1 - (left + right) / width, 1 - bottom / height];
     this.redraw();

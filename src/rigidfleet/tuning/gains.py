@@ -1,0 +1,250 @@
+"""Gains that are tuned: which, in what range, with what margins, and how they are written into a mission file."""
+
+from __future__ import annotations
+
+import copy
+import math
+import re
+import tomllib
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from rigidfleet._common.toml import to_toml
+from rigidfleet.math import lqr, pid
+from rigidfleet.math.margins import Feedback, Loop, Margins, margins
+from rigidfleet.mission import Mission
+from rigidfleet.mission.schema import Tracking
+from rigidfleet.planning.preview import preview
+from rigidfleet.planning.timing import timed
+from rigidfleet.preflight.margins import Looped, formation_laws, tracking_law
+from rigidfleet.preflight.vehicles import vehicle_lags
+from rigidfleet.typing import Floats
+
+#: A gain by its path in the mission, as in a variation.
+Gains = dict[str, float]
+
+#: Factors on the mission's own gain between which each is searched. The integral of the constraint law is searched
+#: far downwards: it costs phase, and only steady forces need it.
+RANGES = {
+    "constraint.alpha": (1 / 4, 4.0),
+    "constraint.beta": (1 / 3, 3.0),
+    "constraint.gamma": (1 / 30, 3.0),
+    "tracking.Q.1": (1 / 16, 16.0),
+    "tracking.Q.2": (1 / 16, 16.0),
+    "tracking.integral": (1 / 8, 8.0),
+}
+#: Lower gain margin that always suffices: all gains may fall to half, as `check` asks of the upper one.
+_HALF = 0.5
+#: Number of points that are tried for one of the first population.
+_TRIES = 30
+#: Relative size of rounding errors of margins.
+_ROUNDING = 1e-9
+#: Names of the two laws, as `check` has them.
+TRACKING, CONSTRAINT = "tracking", "constraint law"
+
+
+def own_gains(mission: Mission) -> Gains:
+    """The gains of a mission that can be tuned: those that act on its flight and are not 0."""
+    c, t = mission.constraint, mission.tracking
+    found: Gains = {}
+    if c.stabilisation == "pid" and len(mission.edges):
+        found |= {
+            "constraint.alpha": c.alpha, "constraint.beta": c.beta, "constraint.gamma": c.gamma
+        }  # fmt: skip
+    if any(phase.control == "tracking" for phase in mission.phases):
+        found |= {"tracking.Q.1": t.Q[0], "tracking.Q.2": t.Q[1], "tracking.integral": t.integral}
+    return {path: gain for path, gain in found.items() if gain > 0}
+
+
+class Space:
+    """The box in which gains are searched: one axis for each, from 0 to 1, on a logarithmic scale."""
+
+    def __init__(self, own: Gains) -> None:
+        self.own = own
+        self.ends = {path: tuple(gain * f for f in RANGES[path]) for path, gain in own.items()}
+
+    def gains(self, x: Sequence[float] | Floats) -> Gains:
+        """The gains at a point x (D,), to four digits; there, the mission's own are whole."""
+        found = {}
+        for u, (path, (low, high)) in zip(x, self.ends.items(), strict=True):
+            gain, own = _rounded(low * (high / low) ** u), self.own[path]
+            found[path] = own if gain == _rounded(own) else gain
+        return found
+
+    @property
+    def start(self) -> Floats:
+        """The point (D,) of the mission's own gains."""
+        return np.array(
+            [math.log(self.own[p] / a) / math.log(b / a) for p, (a, b) in self.ends.items()]
+        )
+
+
+def _rounded(gain: float) -> float:
+    return float(f"{gain:.4g}")
+
+
+@dataclass(frozen=True)
+class _Part:
+    """A distinct part of a loop, whichever shapes have it."""
+
+    name: str
+    loop: Loop
+    law: Feedback
+    growth: float
+
+
+class Screen:
+    """Margins of the laws of a mission with other gains, to refuse gains before they fly.
+
+    Attributes
+    ----------
+    own : margins of the mission's own gains, by law; empty for points, which bear any gain
+    """
+
+    def __init__(self, mission: Mission, share: float) -> None:
+        mission = timed(mission)
+        self.mission, self.share = mission, share
+        self.gains = own_gains(mission)
+        lags = vehicle_lags(mission)
+        laws: list[tuple[str, Looped]] = []
+        if lags:
+            tracking = tracking_law(mission, lags)
+            laws += [] if tracking is None else [(TRACKING, tracking)]
+            found, _ = formation_laws(mission, preview(mission)[0], lags)
+            laws += [(CONSTRAINT, law) for law in found]
+        self.parts = _distinct(laws)
+        self.own = self.margins(self.gains)
+
+    def margins(self, gains: Gains) -> dict[str, Margins]:
+        """The smallest margins of each law with some gains."""
+        found: dict[str, Margins] = {}
+        for name, m in self._each(gains):
+            found[name] = _smaller(found[name], m) if name in found else m
+        return found
+
+    def slack(self, gains: Gains) -> float:
+        """By how much the margins exceed what is asked, as a share of the mission's own; negative if they are worse."""
+        c = {key: gains.get(f"constraint.{key}", 0.0) for key in ("alpha", "beta", "gamma")}
+        if "constraint.alpha" in self.gains and not pid.is_stable(**c):
+            return -1.0
+        least = math.inf
+        for name, m in self._each(gains):
+            if not m.stable:
+                return -1.0
+            least = min(least, _ratio(m, self.own[name]) - self.share * (1 - _ROUNDING))
+            if least < 0:
+                break
+        return min(least, 1.0)
+
+    def _each(self, gains: Gains) -> Iterator[tuple[str, Margins]]:
+        """Margins of all parts, with the name of the law of each."""
+        given = self.gains | gains
+        Q = [given.get(f"tracking.Q.{k}", self.mission.tracking.Q[k - 1]) for k in (1, 2)]
+        k1, k2 = lqr.double_integrator_gains(Q, self.mission.tracking.R)
+        new: dict[str, Any] = {"k1": k1, "k2": k2, "ki": given.get("tracking.integral", 0.0)}
+        if "constraint.alpha" in self.gains:
+            new |= {key: given.get(f"constraint.{key}", 0.0) for key in ("alpha", "beta", "gamma")}
+        for part in self.parts:
+            yield part.name, margins([part.loop], replace(part.law, **new), part.growth)
+
+
+def _distinct(laws: Sequence[tuple[str, Looped]]) -> list[_Part]:
+    """The distinct parts of all loops: most shapes have the same, and what decays on the longest way counts."""
+    found: dict[object, _Part] = {}
+    for name, looped in laws:
+        for loop in looped.loops:
+            rounded = ((np.round(x, 9) + 0.0).tobytes() for x in (loop.S, loop.Q, loop.P))
+            key = (name, *rounded, loop.channels, looped.law)
+            if key not in found or looped.growth < found[key].growth:
+                found[key] = _Part(name, loop, looped.law, looped.growth)
+    return sorted(found.values(), key=lambda part: part.loop.S.size)  # the quick ones first
+
+
+def _smaller(a: Margins, b: Margins) -> Margins:
+    """The smaller margins of two loops."""
+    if not (a.stable and b.stable):
+        return Margins(stable=False)
+    gain = max(a.gain[0], b.gain[0]), min(a.gain[1], b.gain[1])
+    return Margins(True, gain, min(a.phase, b.phase), min(a.delay, b.delay))
+
+
+def _ratio(now: Margins, was: Margins) -> float:
+    """The least ratio of margins to those that were, at most 1; 1 if that was unstable."""
+    if not was.stable:
+        return 1.0
+    low = max(was.gain[0], _HALF)
+    pairs = (now.phase, was.phase), (now.delay, was.delay), (now.gain[1], was.gain[1])
+    ratios = [1.0 if a >= b else a / b for a, b in pairs]
+    return min(*ratios, 1.0 if now.gain[0] <= low else low / now.gain[0])
+
+
+def feasible_points(
+    space: Space, slack: Callable[[Gains], float], count: int, rng: np.random.Generator
+) -> Floats:
+    """Points (count, D) whose gains are not refused: the mission's own, and random ones.
+
+    Where margins refuse `_TRIES` points in a row, the next one is drawn towards the mission's own gains.
+    """
+    start = space.start
+    found = [start]
+    while len(found) < count:
+        for _ in range(_TRIES):
+            x = rng.random(len(start))
+            if slack(space.gains(x)) >= 0:
+                break
+        while slack(space.gains(x)) < 0 and np.abs(x - start).max() > 1e-3:
+            x = start + 0.7 * (x - start)
+        found.append(x)
+    return np.array(found)
+
+
+# -- in a file ---------------------------------------------------------------------------------------
+
+
+def with_gains(text: str, gains: Gains) -> str:
+    """The text of a mission with other gains; the rest, comments included, stays where the text allows it."""
+    document = tomllib.loads(text)
+    wanted = copy.deepcopy(document)
+    new = text
+    for table, key, value in _entries(document, gains):
+        wanted.setdefault(table, {})[key] = value
+        new = _with_line(new, table, key, to_toml({key: value}).strip())
+    try:
+        same = tomllib.loads(new) == wanted
+    except tomllib.TOMLDecodeError:
+        same = False
+    return new if same else to_toml(wanted)
+
+
+def _entries(document: dict[str, Any], gains: Gains) -> Iterator[tuple[str, str, Any]]:
+    """Table, key and value of each entry; both weights of Q are one."""
+    Q = list(document.get("tracking", {}).get("Q", Tracking.model_fields["Q"].get_default()))
+    for path, gain in gains.items():
+        table, key, *place = path.split(".")
+        if not place:
+            yield table, key, gain
+            continue
+        Q[int(place[0]) - 1] = gain
+    if any(path.startswith("tracking.Q") for path in gains):
+        yield "tracking", "Q", [float(q) for q in Q]
+
+
+def _with_line(text: str, table: str, key: str, line: str) -> str:
+    """The text with ``line`` in place of a key's, below the table's header, or in a new table at the end."""
+    lines = text.splitlines()
+    head = re.compile(rf"\s*\[\s*{table}\s*\]\s*(#.*)?")
+    at = next((k for k, x in enumerate(lines) if head.fullmatch(x)), None)
+    if at is None:
+        return "\n".join([*lines, "", f"[{table}]", line, ""])
+    last = at
+    for k in range(at + 1, len(lines)):
+        if lines[k].lstrip().startswith("["):
+            break
+        last = k if lines[k].strip() and not lines[k].lstrip().startswith("#") else last
+        if found := re.fullmatch(rf"\s*{key}\s*=[^#]*?(\s*#.*)?", lines[k]):
+            lines[k] = line + (found[1] or "")
+            return "\n".join([*lines, ""])
+    return "\n".join([*lines[: last + 1], line, *lines[last + 1 :], ""])

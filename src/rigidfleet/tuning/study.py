@@ -1,0 +1,443 @@
+"""Tune a mission: an optimiser proposes gains, sweeps over seeds fly them, and other seeds judge the best.
+
+The optimiser is SciPy's differential evolution (Storn and Price 1997, doi:10.1023/A:1008202821328). It compares costs
+and uses nothing else of them, so failed flights can count as worse than all others. It handles margins as constraints:
+gains that violate one are refused before they fly (Lampinen 2002, doi:10.1109/CEC.2002.1004459).
+
+The optimiser starts from a seed, and every generation is a sweep with a folder of its own. A study that is begun again
+therefore proposes the same gains, and finds those that were flown.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from rigidfleet._common.arguments import as_path
+from rigidfleet._common.files import write_file
+from rigidfleet._version import __version__
+from rigidfleet.errors import ResultError, RigidfleetError
+from rigidfleet.mission import Mission
+from rigidfleet.mission.model import as_mission
+from rigidfleet.sweep import Sweep, SweepProgress, Table, fly
+from rigidfleet.sweep.record import BROKEN, REFUSED
+from rigidfleet.sweep.runner import cores
+from rigidfleet.sweep.workers import Pool, processes
+from rigidfleet.tuning.gains import Gains, Screen, Space, feasible_points, own_gains, with_gains
+from rigidfleet.tuning.outcome import Flown, Tuned
+from rigidfleet.typing import Floats
+
+#: What is minimised, and the metric of a sweep that measures it.
+OBJECTIVES = {
+    "shape": "shape_flight",
+    "shape-rms": "shape_rms",
+    "tracking": "tracking_error",
+    "tracking-rms": "tracking_rms",
+}
+STUDY = "study.json"
+_ROUNDS, _VALIDATION = "rounds", "validation"
+#: Size of the population of the optimiser. It does not depend on the budget, which may grow.
+_POPULATION = 10
+#: Number of generations after which a study ends if margins refuse nearly all gains.
+_GENERATIONS = 500
+#: Cost of a flight that fails its verdict, and of one that ends early, beyond any error [m].
+_FAILED, _ENDED = 1e3, 1e6
+#: Reasons of a run without a whole flight.
+_NOT_FLOWN = {"complete", REFUSED, BROKEN}
+#: Work below which no further processes are started [s].
+_WORTH = 6.0
+
+
+def tune(
+    mission: Mission | str | Path,
+    folder: str | Path,
+    *,
+    objective: str = "shape",
+    budget: int = 300,
+    seeds: int = 3,
+    validation: int = 8,
+    seed: int = 0,
+    margin_share: float = 1.0,
+    assume: Mapping[str, Any] | None = None,
+    workers: int | None = None,
+    replace: bool = False,
+    progress: Callable[[SweepProgress], None] | None = None,
+) -> Tuned:
+    """Choose gains of the constraint law and the tracking by flying the mission with its vehicles, delays and noise.
+
+    The cost of gains is the mean of the objective over flights with several seeds of noise and gusts. Gains with fewer
+    failed flights are better, whatever the objective. Gains with smaller margins than the mission's own are refused
+    before they fly. A gain that is 0 stays 0: the mission says which terms its laws have.
+
+    Parameters
+    ----------
+    mission : a shipped name, a path or a `Mission`
+    folder : where flights and results are kept; a study that was stopped goes on there, and nothing is flown twice
+    objective : "shape", the largest shape error of a flight; "tracking", the largest distance from a slot;
+        "shape-rms" and "tracking-rms", root mean squares over time
+    budget : greatest number of flights of the search. A finished study goes on with a greater one
+    seeds, validation : numbers of seeds in the search, and of further ones on which the best gains are judged
+    seed : first of these seeds, and seed of the optimiser
+    margin_share : share of the mission's own margins that has to remain: 1 for no smaller ones, 0 for stability alone
+    assume : tables of a mission that replace keys of this one for the study, such as its disturbances
+    workers : number of processes; default: number of cores. A script needs `if __name__ == "__main__":`
+    replace : delete another study in this folder
+    progress : called as flights are finished
+
+    Raises
+    ------
+    MissionError
+        The mission cannot be read or has errors.
+    ResultError
+        The folder holds another study or a changed file, or cannot be written.
+    RigidfleetError
+        An option is wrong, or there is nothing to tune.
+    KeyboardInterrupt
+        On Ctrl-C. What was flown is kept, and the same call goes on.
+    """
+    given = as_mission(mission)
+    flown = Mission.from_dict(_merged(given.to_dict(), assume or {}), given.origin)
+    paths, random = _seed_paths(flown)
+    seeds, validation = (seeds, validation) if random else (1, 0)
+    options = {
+        "objective": objective, "seeds": seeds, "validation": validation, "seed": seed,
+        "margin_share": margin_share,
+    }  # fmt: skip
+    _check(flown, budget, options)
+    folder = as_path(folder)
+    claim = _Claim(folder, {"version": __version__, "mission": flown.text, **options}, given.name)
+    claim.take(replace=replace)
+    study = _Study(flown, folder, objective, budget, margin_share, seed, progress)
+    with study.flights.processes(cores() if workers is None else workers):
+        found = study.search(_Seeds(paths, range(seed, seed + seeds)))
+        after = _Seeds(paths, range(seed + seeds, seed + seeds + validation))
+        found.text = with_gains(given.text, found.after.gains)
+        if random:
+            study.validate(found, after)
+    claim.write(found)
+    return found
+
+
+def _check(mission: Mission, budget: int, options: Mapping[str, Any]) -> None:
+    """Refuse wrong options, and missions in which there is nothing to tune."""
+    if options["objective"] not in OBJECTIVES:
+        known = ", ".join(OBJECTIVES)
+        raise RigidfleetError(f"objective = {options['objective']!r}: use one of {known}.")
+    for name, least in (("seeds", 1), ("validation", 0), ("seed", 0)):
+        if options[name] < least:
+            raise RigidfleetError(f"{name} = {options[name]}: must be at least {least}.")
+    if not 0 <= options["margin_share"] <= 1:
+        raise RigidfleetError(
+            f"margin share = {options['margin_share']}: must be from 0 (stable) to 1 (no smaller margins)."
+        )
+    least = _POPULATION * options["seeds"]
+    if budget < least:
+        raise RigidfleetError(
+            f"budget = {budget}: must be at least {least}, for {_POPULATION} candidates on"
+            f" {options['seeds']} seed{'s' * (options['seeds'] != 1)}. Use fewer seeds or a larger budget."
+        )
+    if not own_gains(mission):
+        raise RigidfleetError(
+            f"{mission.name}: has no gains to tune: no phase tracks slots, and no edges are stabilised."
+        )
+    tracked = any(phase.control == "tracking" for phase in mission.phases)
+    if options["objective"].startswith("tracking") and not tracked:
+        raise RigidfleetError(
+            f"objective = {options['objective']!r}: no phase of {mission.name} tracks slots. Use shape."
+        )
+    if mission.vehicle_models is None and mission.disturbances is None:
+        raise RigidfleetError(
+            f"{mission.name}: higher gains are always better for points without disturbances. Add [vehicles] or"
+            " [disturbances], or assume them for the study."
+        )
+
+
+def _merged(document: dict[str, Any], assume: Mapping[str, Any]) -> dict[str, Any]:
+    """A document with some of its keys replaced; tables are merged."""
+    found = dict(document)
+    for key, value in assume.items():
+        there = found.get(key)
+        both = isinstance(there, dict) and isinstance(value, Mapping)
+        found[key] = _merged(there, value) if both else value
+    return found
+
+
+def _seed_paths(mission: Mission) -> tuple[list[str], bool]:
+    """Paths of the seeds of a mission, and whether any random number acts on its flight."""
+    d = mission.disturbances
+    if d is None:
+        return [], False
+    noise, gusts, links = d.noise, d.gusts, d.links
+    acting = {
+        "noise": noise is not None and bool(noise.position or noise.velocity or noise.dropped),
+        "gusts": gusts is not None,
+        "links": links is not None and bool(links.dropped),
+    }
+    paths = [f"disturbances.{name}.seed" for name, acts in acting.items() if acts]
+    return paths, bool(paths)
+
+
+@dataclass(frozen=True)
+class _Seeds:
+    """Seeds of flights, the same for noise, gusts and links: each draws its own numbers from them."""
+
+    paths: Sequence[str]
+    numbers: range
+
+    @property
+    def count(self) -> int:
+        return len(self.numbers)
+
+
+class _Flights:
+    """Sweeps of a study, one after the other, by processes that are kept for all of them."""
+
+    def __init__(self, total: int, progress: Callable[[SweepProgress], None] | None) -> None:
+        self.total, self.progress = total, progress
+        self.begun = perf_counter()
+        self.done = self.flown = self.failed = 0
+        self.count, self.first = 1, True
+        self.stack, self.pool = ExitStack(), None
+
+    def processes(self, count: int) -> ExitStack:
+        """Allow a number of processes, which end with the context that is returned."""
+        self.count = count
+        return self.stack
+
+    def fly(
+        self, mission: Mission, candidates: Sequence[Gains], seeds: _Seeds, folder: Path
+    ) -> list[Flown]:
+        """Fly every candidate on every seed, as a sweep in a folder, and return what was measured of each."""
+        vary = [
+            {"path": path, "kind": "grid", "values": [c[path] for c in candidates], "group": "gains"}
+            for path in candidates[0]
+        ]  # fmt: skip
+        vary += [
+            {"path": path, "kind": "grid", "values": list(seeds.numbers), "group": "seeds"}
+            for path in seeds.paths
+        ]
+        sweep = Sweep.of(mission, vary, name=folder.name, origin="rigidfleet tune")
+        last = SweepProgress(0, sweep.runs, 0, 0, 0.0, 1)
+
+        def tell(now: SweepProgress) -> None:
+            nonlocal last
+            last = now
+            self._tell(now)
+
+        # The first sweep is flown here: it compiles what the processes find, and tells how long a flight takes.
+        first, self.first = self.first, False
+        several = self.count > 1 and not first
+        table = fly(
+            sweep, folder, workers=1, progress=tell, pool=self._processes if several else None
+        )
+        self.done, self.flown, self.failed = (
+            self.done + last.done, self.flown + last.flown, self.failed + last.failed
+        )  # fmt: skip
+        if first and np.median(table.wall) * self.total < _WORTH:
+            self.count = 1
+        return _measured(table, candidates, seeds.count)
+
+    def _processes(self) -> Pool:
+        if self.pool is None:
+            self.pool = self.stack.enter_context(processes(self.count))
+        return self.pool
+
+    def _tell(self, now: SweepProgress) -> None:
+        if self.progress is not None:
+            wall = perf_counter() - self.begun
+            done, flown = self.done + now.done, self.flown + now.flown
+            failed = self.failed + now.failed
+            self.progress(SweepProgress(done, self.total, flown, failed, wall, self.count))
+
+
+def _measured(table: Table, candidates: Sequence[Gains], seeds: int) -> list[Flown]:
+    """What was measured of each candidate; its flights are consecutive runs."""
+    found = []
+    for k, gains in enumerate(candidates):
+        rows = slice(k * seeds, (k + 1) * seeds)
+        reasons = [reason.split(", ") for reason in table.reason[rows] if reason]
+        ended = sum(not _NOT_FLOWN.isdisjoint(failed) for failed in reasons)
+        failed = dict(Counter(reason for failed in reasons for reason in failed).most_common())
+        values = {name: table.metrics[name][rows].tolist() for name in OBJECTIVES.values()}
+        found.append(Flown(gains, int(table.passed[rows].sum()), ended, seeds, values, failed))
+    return found
+
+
+class _SpentError(Exception):
+    """The budget does not suffice for another generation."""
+
+
+class _Study:
+    """A study that is running."""
+
+    def __init__(
+        self,
+        mission: Mission,
+        folder: Path,
+        objective: str,
+        budget: int,
+        margin_share: float,
+        seed: int,
+        progress: Callable[[SweepProgress], None] | None,
+    ) -> None:
+        self.mission, self.folder, self.objective = mission, folder, objective
+        self.budget, self.seed = budget, seed
+        self.screen = Screen(mission, margin_share)
+        self.space = Space(self.screen.gains)
+        self.flights = _Flights(budget, progress)
+        #: Candidates that were flown, and slack of the margins of all that were proposed.
+        self.flown: dict[tuple[float, ...], Flown] = {}
+        self.slacks: dict[tuple[float, ...], float] = {}
+        self.rounds = 0
+
+    def search(self, seeds: _Seeds) -> Tuned:
+        """Search for the best gains on some seeds."""
+        from scipy.optimize import NonlinearConstraint, differential_evolution
+
+        before = self._fly([self.screen.gains], seeds)[0]
+        rng = np.random.default_rng(self.seed)
+        with suppress(_SpentError):
+            differential_evolution(
+                lambda x: math.nan,  # unused: `workers` flies a whole generation
+                [(0.0, 1.0)] * len(self.space.own),
+                init=feasible_points(self.space, self.slack, _POPULATION, rng),
+                constraints=NonlinearConstraint(
+                    lambda x: self.slack(self.space.gains(x)), 0.0, math.inf
+                ),
+                workers=lambda _, points: self._costs(points, seeds),
+                updating="deferred",
+                recombination=0.9,
+                maxiter=_GENERATIONS,
+                tol=0.0,
+                polish=False,
+                rng=rng,
+            )
+        best = min(self.flown.values(), key=self._cost)
+        margins = self.screen.own, self.screen.margins(best.gains)
+        refused = sum(slack < 0 for slack in self.slacks.values())
+        return Tuned(
+            self.mission.name, self.objective, OBJECTIVES[self.objective], before, best, margins,
+            len(self.flown) * seeds.count, len(self.flown), refused,
+        )  # fmt: skip
+
+    def validate(self, found: Tuned, seeds: _Seeds) -> None:
+        """Fly the mission's own gains and the best ones on seeds that the search has not seen."""
+        if not seeds.count:
+            return
+        every, judged = list(self.flown), []
+        pair = {_key(f.gains): f.gains for f in (found.before, found.after)}
+        self.flights.total = self.flights.done + len(pair) * seeds.count
+        for key, gains in pair.items():
+            folder = self.folder / _VALIDATION / f"{every.index(key):04}"
+            judged += self.flights.fly(self.mission, [gains], seeds, folder)
+        found.validation = judged[0], judged[-1]
+
+    def _cost(self, flown: Flown) -> float:
+        return cost(flown, OBJECTIVES[self.objective])
+
+    def slack(self, gains: Gains) -> float:
+        """Slack of the margins; computed once."""
+        key = _key(gains)
+        if key not in self.slacks:
+            self.slacks[key] = self.screen.slack(gains)
+        return self.slacks[key]
+
+    def _costs(self, points: Iterable[Floats], seeds: _Seeds) -> list[float]:
+        """Costs of a generation."""
+        every = [self.space.gains(x) for x in points]
+        new = {_key(g): g for g in every if _key(g) not in self.flown}
+        if (len(self.flown) + len(new)) * seeds.count > self.budget:
+            raise _SpentError
+        if new:
+            self._fly(list(new.values()), seeds)
+        return [self._cost(self.flown[_key(g)]) for g in every]
+
+    def _fly(self, candidates: list[Gains], seeds: _Seeds) -> list[Flown]:
+        """Fly new candidates as the next round."""
+        folder = self.folder / _ROUNDS / f"{self.rounds:03}"
+        found = self.flights.fly(self.mission, candidates, seeds, folder)
+        self.rounds += 1
+        self.flown |= {_key(f.gains): f for f in found}
+        return found
+
+
+def cost(flown: Flown, metric: str) -> float:
+    """Mean of a metric [m]; more failed flights are worse whatever it is, and early ends are worse still."""
+    errors = np.nan_to_num(flown.values[metric], nan=_FAILED)
+    failed = flown.flights - flown.passed
+    return float(np.minimum(errors, _FAILED).mean()) + _FAILED * failed + _ENDED * flown.ended
+
+
+def _key(gains: Gains) -> tuple[float, ...]:
+    return tuple(gains.values())
+
+
+class _Claim:
+    """The files of a study: they are never those of another one, and nothing that a user changed is overwritten."""
+
+    def __init__(self, folder: Path, definition: dict[str, Any], name: str) -> None:
+        self.folder, self.definition = folder, definition
+        self.study, self.tuned = folder / STUDY, folder / f"{name}-tuned.toml"
+
+    def take(self, *, replace: bool) -> None:
+        """Check before anything flies that the files can be written, and begin the study."""
+        before = self._before()
+        if replace:
+            for name in (_ROUNDS, _VALIDATION):
+                shutil.rmtree(self.folder / name, ignore_errors=True)
+            before = {}
+        elif before and before.get("definition") != self.definition:
+            old = before.get("definition", {})
+            other = [key for key in self.definition if old.get(key) != self.definition[key]]
+            raise ResultError(
+                f"{self.folder}: contains another study; it differs in: {', '.join(other)}. Use --force to overwrite,"
+                " or --out to choose another folder."
+            )
+        if (
+            not replace
+            and self.tuned.exists()
+            and self.tuned.read_text("utf-8") != before.get("text")
+        ):
+            raise ResultError(
+                f"{self.tuned}: is not what a study wrote; use --force to overwrite or --out to choose another place."
+            )
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            why = (error.strerror or str(error)).lower()
+            raise ResultError(
+                f"{self.folder}: cannot be written ({why}). Choose another folder by --out."
+            ) from error
+        if not before:
+            self._write({"definition": self.definition})
+
+    def write(self, found: Tuned) -> None:
+        """Write the result of the study, and the tuned mission."""
+        write_file(self.tuned, found.text.encode())
+        found.file = self.tuned
+        self._write({"definition": self.definition, **found.to_dict(), "text": found.text})
+
+    def _before(self) -> dict[str, Any]:
+        """What is in the folder."""
+        try:
+            return json.loads(self.study.read_bytes())
+        except FileNotFoundError:
+            return {}
+        except (OSError, ValueError) as error:
+            raise ResultError(
+                f"{self.study}: cannot be read as a study ({error}). Delete it, or choose another folder by --out."
+            ) from error
+
+    def _write(self, data: dict[str, Any]) -> None:
+        text = json.dumps(data, ensure_ascii=False, allow_nan=False, indent=2) + "\n"
+        write_file(self.study, text.encode())
