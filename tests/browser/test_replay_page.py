@@ -590,6 +590,7 @@ def test_vehicles_in_their_colours(show, eight):
 def test_quadrotors_turn_as_they_flew(show):
     """Vehicles with rotors have their own tilt and yaw, not those of the formation, and an arrow ahead."""
     result = quadrotors(4, 20.0)
+    assert result.vehicle_attitude is not None
     page = show(result)
     for t in (2.0, 13.0):
         count, drawn, noses = page.run(
@@ -608,6 +609,7 @@ def test_quadrotors_turn_as_they_flew(show):
 def test_rotor_at_its_limit_is_red(show):
     """The rotor at its limit, and no other, is red, where it is on its vehicle; the panel names the vehicle."""
     result = quadrotors(4, 20.0)
+    assert result.vehicle_attitude is not None
     page = show(result, "t=2")
     # Colours of all discs: four of each vehicle, in the order of the columns.
     discs = (
