@@ -26,9 +26,10 @@ demo: .venv/.core  ## Fly the paper's narrow passage
 test: .venv/.dev  ## Run the tests (MARK= runs the long ones, too)
 	@$(BIN)/python -m pytest -n $(JOBS) -m "$(MARK)"
 
-bench: .venv/.bench  ## Measure the speed, as ratios
+bench: .venv/.bench .venv/.vehicles  ## Measure the speed, as ratios
 	@$(BIN)/python benchmarks/run.py
 	@$(BIN)/python benchmarks/many.py
+	@$(BIN)/python benchmarks/vehicles.py
 
 peers: .venv/.peers  ## Fly beside other programs (Octave, too, if it is on PATH)
 	@$(BIN)/python benchmarks/compare.py
@@ -57,7 +58,7 @@ format: .venv/.dev  ## Rewrite the code in the project's style
 
 constraints: .venv/.dev  ## Choose newer versions of all packages
 	@$(BIN)/uv pip compile --quiet --universal --upgrade --no-header --no-annotate \
-		--all-extras --group dev --group bench --group peers --group docs --group build \
+		--all-extras --group dev --group bench --group peers --group vehicles --group docs --group build \
 		pyproject.toml --output-file constraints.txt
 
 clean:  ## Remove .venv, caches and builds
@@ -77,7 +78,7 @@ clean:  ## Remove .venv, caches and builds
 	@$(INSTALL)
 	@touch $@
 
-.venv/.dev .venv/.bench .venv/.peers .venv/.docs: .venv/.%: .venv/.core
+.venv/.dev .venv/.bench .venv/.peers .venv/.vehicles .venv/.docs: .venv/.%: .venv/.core
 	@echo "Installing what '$*' needs"
 	@$(INSTALL) --group $*
 	@touch $@

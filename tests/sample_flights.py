@@ -1,11 +1,13 @@
 """Flights made up from formulas, for looking at: no simulation, any number of vehicles."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from rigidfleet.math import attitude as att
 from rigidfleet.mission import Mission
-from rigidfleet.result import PhaseRecord, Result
+from rigidfleet.result import LABELS, PhaseRecord, Result
 
 G = 9.81
 
@@ -81,3 +83,30 @@ def _neighbours(slots: np.ndarray) -> np.ndarray:
     apart = np.linalg.norm(slots[:, None] - slots[None], axis=2)
     i, j = np.nonzero(np.triu(apart < 4.5, 1))
     return np.stack([i, j], axis=1)
+
+
+def quadrotors(n: int, seconds: float) -> Result:
+    """The sheet of vehicles flown by quadrotors of which each points its own way and leans by 20 deg.
+
+    Rotors give half of their limit. From a quarter of the time to the middle, the front right one of the second
+    vehicle is at its limit, and the vehicle is saturated. At the middle, quaternions change their signs.
+    """
+    points = swarm(n, seconds)
+    data = points.mission.to_dict()
+    data["vehicles"] = {"quadrotor": {"model": "px4-sih"}}
+    data["agents"] = {"vehicle": "quadrotor", "position": data["agents"]["position"]}
+    mission = Mission.from_dict(data)
+    t = points.time
+    yaw = 0.2 * t[:, None] + np.arange(n)
+    euler = np.stack([0.0 * yaw, np.radians(20.0) + 0.0 * yaw, yaw], axis=2)
+    q = att.quaternion_from_euler(euler.reshape(-1, 3)).reshape(len(t), n, 4)
+    q *= np.where(t < seconds / 2, 1.0, -1.0)[:, None, None]
+    force = np.full((len(t), n, 4), 2.5)
+    busy = (t > seconds / 4) & (t < seconds / 2)
+    force[busy, 1, LABELS["rotor"].index("front right")] = 5.0
+    saturated = np.zeros((len(t), n), dtype=int)
+    saturated[busy, 1] = 1
+    return replace(
+        points, mission_text=mission.text, vehicle_attitude=q, vehicle_rates=np.zeros((len(t), n, 3)),
+        rotor_force=force, saturated=saturated,
+    )  # fmt: skip

@@ -315,7 +315,7 @@ def test_new_json(capsys):
         (["--shape", "pentagon"], "did you mean 'polygon' with 5 agents?"),
         (["--agents", "2.5"], "Invalid value for --agents: '2.5' is not a whole number."),
         (["--agents", "1e400"], "is not a whole number"),
-        (["--thrust-limit", "5"], "the flight would fail: agent 1 needs"),
+        (["--thrust-limit", "5"], "the flight would fail: agent 1 would need"),
         (["--shape", "sphere", "--agents", "300", "--to", "9", "9", "9"], "reaches 22.6 m below"),
         (["--mass", "-1"], "agents.mass = -1"),
         (["--to", "1", "2"], "requires"),

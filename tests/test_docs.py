@@ -466,3 +466,8 @@ def test_drawings_are_those_that_are_kept(tmp_path, monkeypatch):
     picture.drawings()
     changed = [path.name for path in tmp_path.iterdir() if kept.get(path.name) != path.read_bytes()]
     assert changed == []
+
+
+def test_every_figure_is_listed():
+    """The page of figures lists all that a flight can have, in the order in which they are drawn."""
+    assert re.findall(r"^\| `(\w+)` \|", page("figures.md"), re.MULTILINE) == figure_names()

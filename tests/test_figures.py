@@ -3,6 +3,7 @@ import subprocess
 import sys
 import warnings
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 from itertools import combinations, pairwise
 from typing import Any
 
@@ -21,12 +22,13 @@ from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
 from rigidfleet.mission import Mission
 from rigidfleet.plotting import curves, space, style
-from rigidfleet.result import VARIABLES, PhaseRecord, Result
+from rigidfleet.result import LABELS, VARIABLES, PhaseRecord, Result
 
 START = [[1.0, 6.0, 3.0], [8.0, 3.0, 3.0], [7.0, 6.0, 3.0]]
 TRIANGLE = {"shape": "triangle", "size": 4.0}
 CUBE = {"shape": "cube", "size": 4.0}
 BOX = {"kind": "box", "name": "wall", "min": [10.0, 8.0, 0.0], "max": [14.0, 12.0, 6.0]}
+OF_VEHICLES = ("vehicle_attitude", "vehicle_rates", "rotor_force", "saturated")
 OVER_TIME = [
     "distances", "cm", "attitude", "inputs", "constraint_force", "constraint_error", "clearance",
 ]  # fmt: skip
@@ -88,7 +90,7 @@ def a_flight(
     blank = {
         name: np.full([{"time": samples, "agent": n, "edge": len(i), "axis": 3, "quaternion": 4,
                         "wrench": 6, "end": 2}[d] for d in v.dims], np.nan)
-        for name, v in VARIABLES.items()
+        for name, v in VARIABLES.items() if name not in OF_VEHICLES
     }  # fmt: skip
     force = np.zeros((samples, n, 3)) + [0, 0, 9.81]
     pull = np.sin(t)[:, None, None] * (r - r.mean(axis=1, keepdims=True))
@@ -143,13 +145,41 @@ FLIGHTS: dict[str, Any] = {
 }  # fmt: skip
 
 
+def by_quadrotors(models: list[str], *, lost: int | None = None) -> Result:
+    """A made-up flight: agent i tilts by up to 10 i deg, and its rotor i mod 4 gives up to 0.3 + 0.1 i of its limit."""
+    n = len(models)
+    mission: dict[str, Any] = {
+        "vehicles": {
+            model: {"model": model} | ({"mass": 1.0} if model == "point" else {}) for model in models
+        },
+        "agents": {"vehicle": models, "position": START if n == 3 else [[4.0 * i, 0, 3] for i in range(n)]},
+    }  # fmt: skip
+    if lost is not None:
+        mission["disturbances"] = {"lost": [{"agent": lost, "time": 10.0}]}
+    bare = a_flight(n=n, mission=mission, formation={"shape": "line", "size": 2.0})
+    t, who = bare.time, np.arange(n)
+    wave = np.sin(np.pi * t / t[-1]) ** 2
+    tilt = np.radians(10.0 * who) * wave[:, None]
+    q = np.stack([np.cos(tilt / 2), np.sin(tilt / 2), 0 * tilt, 0 * tilt], axis=2)
+    vehicles = bare.mission.vehicle_models
+    assert vehicles is not None
+    limit = np.array([model.rotor_limit for model in vehicles])
+    force = 0.3 * np.broadcast_to(limit[:, None], (len(t), n, 4)).copy()
+    force[:, who, who % 4] += 0.1 * who * limit * wave[:, None]
+    busy = (t[:, None] > 8.0) & (t[:, None] < 9.0) & (who == 1)
+    rates = np.zeros((len(t), n, 3))
+    return replace(
+        bare, vehicle_attitude=q, vehicle_rates=rates, rotor_force=force, saturated=busy.astype(int)
+    )
+
+
 def nothing_known(samples: int = 30) -> Result:
     """A flight of which only time is known: every other number is NaN."""
     result = a_flight(samples=samples)
     unknown = {
         name: np.full_like(getattr(result, name), np.nan)
         for name in VARIABLES
-        if getattr(result, name).dtype == float and name != "time"
+        if name not in OF_VEHICLES and getattr(result, name).dtype == float and name != "time"
     }
     return a_flight(samples=samples, **unknown)
 
@@ -214,11 +244,14 @@ def cube() -> Result:
 # -- every flight can be drawn
 
 
-@pytest.mark.parametrize("flight", [*FLIGHTS, "nothing known"])
+@pytest.mark.parametrize("flight", [*FLIGHTS, "nothing known", "quadrotors and a point"])
 def test_every_flight_can_be_drawn(flight):
-    """Each figure draws without a warning: one agent, no edges, no obstacles, stopped, only NaN."""
+    """Each figure draws without a warning: one agent, no edges, no obstacles, stopped, only NaN, different vehicles."""
     few = {"samples": 31} | FLIGHTS.get(flight, {})
-    result = nothing_known() if flight == "nothing known" else a_flight(**few)
+    if flight == "quadrotors and a point":
+        result = by_quadrotors(["px4-sih", "x500", "point"], lost=2)
+    else:
+        result = nothing_known() if flight == "nothing known" else a_flight(**few)
     for name in plotting.figure_names():
         figure = drawn(name, result)
         assert isinstance(figure, Figure), name
@@ -734,13 +767,14 @@ def test_a_flight_has_no_empty_figures(tmp_path):
     """Figures with nothing to show are left out, and say why when they are asked for."""
     calm = a_flight(disturbance_force=None)
     files = {p.stem for p in plotting.plot(calm, tmp_path, formats=["svg"])}
-    assert files == set(plotting.figure_names()) - {"disturbance"}
+    assert files == set(plotting.figure_names()) - {"disturbance", "rotors", "vehicles"}
     assert "still air" in texts(plotting.disturbance(calm))
     unknown = np.full((181, 4), np.nan)
     free = a_flight(n=4, formation=None, attitude=unknown, attitude_reference=unknown)
     missing = set(plotting.figure_names()) - set(plotting.figure_names(free))
     assert missing == {
         "distances", "attitude", "constraint_force", "constraint_error", "formations",
+        "rotors", "vehicles",
     }  # fmt: skip
     assert "no body frame attached" in texts(plotting.attitude(free))
     alone = a_flight(n=1, formation=None, mission={"obstacles": [], "limits": {}})
@@ -929,3 +963,61 @@ def test_many_edges_are_told_by_formation(many):
     (entry,) = curves.edge_handles(many)
     d = many.mission.formation_distances("shape")
     assert entry.get_label() == f"{len(d)} edges of shape: {d.min():.3g} to {d.max():.3g} m"
+
+
+# -- vehicles with rotors
+
+
+def line_of(ax: Any, agent: int) -> np.ndarray:
+    """Values of an agent's line (counted from 1)."""
+    return ax.findobj(lambda artist: artist.get_gid() == f"agent-{agent}")[0].get_ydata()
+
+
+def test_rotors_of_one_model_stand_beside_their_limit():
+    """Each vehicle's greatest rotor is drawn in newtons with the limit; below, all rotors of the one nearest to it."""
+    result = by_quadrotors(["px4-sih"] * 3)
+    above, below = drawn("rotors", result).axes
+    for i in range(3):
+        assert line_of(above, i + 1).max() == pytest.approx((0.3 + 0.1 * i) * 5.0)
+    assert [line.get_ydata()[0] for line in by_gid(above, "limit")] == [pytest.approx(5.0)]
+    assert "limit 5 N" in texts(above)
+    assert below.get_ylabel() == "rotors of agent 3 [N]"
+    assert [line.get_ydata().max() for line in below.lines[:4]] == pytest.approx(
+        [1.5, 1.5, 2.5, 1.5]
+    )
+    assert [t.get_text() for t in below.get_legend().get_texts()] == list(LABELS["rotor"])
+
+
+def test_rotors_of_different_models_are_shares_of_their_limits():
+    """A large vehicle's newtons do not hide a small one at its limit: shares are drawn, of points and the lost none."""
+    result = by_quadrotors(["x500", "px4-sih", "crazyflie", "point"], lost=2)
+    above, below = drawn("rotors", result).axes
+    shares = [np.nanmax(line_of(above, i + 1)) for i in range(3)]
+    assert shares[::2] == pytest.approx([30.0, 50.0])
+    assert np.isnan(line_of(above, 2)[result.time > 10.0]).all()
+    assert np.isnan(line_of(above, 4)).all()
+    assert "%" in above.get_ylabel()
+    assert below.get_ylabel() == "rotors of agent 3 [N]"
+
+
+def test_tilt_and_saturation_are_those_of_the_vehicles():
+    """Tilt is drawn in degrees, and a vehicle's bar lasts while it is saturated."""
+    result = by_quadrotors(["px4-sih"] * 3)
+    tilt, off, saturated = drawn("vehicles", result).axes
+    assert [line_of(tilt, i + 1).max() for i in range(3)] == pytest.approx([0.0, 10.0, 20.0])
+    error = np.linalg.norm(result.position - result.slot_position, axis=2)
+    np.testing.assert_allclose(line_of(off, 2), error[:, 1])
+    (bar,) = [path for bars in saturated.collections for path in bars.get_paths()]
+    assert result.saturated is not None
+    busy = result.time[result.saturated[:, 1] > 0]
+    x, y = bar.vertices[:, 0], bar.vertices[:, 1]
+    after = result.time[np.searchsorted(result.time, busy[-1]) + 1]
+    assert (x.min(), x.max()) == pytest.approx((busy[0], after))
+    assert round(y.mean()) == 2
+
+
+def test_only_flights_with_rotors_have_their_figures(triangle):
+    """Flights of points have neither figure, and those of quadrotors both."""
+    own = {"rotors", "vehicles"}
+    assert not own & set(plotting.figure_names(triangle))
+    assert own <= set(plotting.figure_names(by_quadrotors(["paper"] * 3)))

@@ -76,6 +76,44 @@ def test_follows_the_hand():
     assert float(away) < 1e-4
 
 
+@pytest.mark.parametrize("yaw", ["formation", "fixed", "along", "towards"])
+def test_quadrotors_follow_the_hand(yaw):
+    """Quadrotors led by hand turn smoothly, stay near their slots, and are asked for no more than their rotors give."""
+    data = load_mission("passage-quadrotors").to_dict()
+    data["yaw"] = {"kind": yaw} | ({"point": [50.0, 0.0, 10.0]} if yaw == "towards" else {})
+    pilot = Pilot(Mission.from_dict(data))
+    flown(pilot, 6.0)
+    records = []
+    for _ in range(120):
+        pilot.steer(np.array([1.5, 0.5, 0.0]), np.array([0.0, 0.0, 0.3]))
+        records.append(pilot.step())
+    assert pilot.ending == ""
+    assert max(map(slot_error, records)) < 0.02
+    assert worst(records, "saturated") == 0.0
+    assert worst(records, "vehicle_rates") < 1.5
+    attitude = records[-1].vehicle_attitude
+    assert attitude is not None
+    turned = att.euler_from_quaternion(attitude[0])[:, 2]
+    formation = att.euler_from_quaternion(records[-1].attitude)[0, 2]
+    wanted = {"formation": formation, "fixed": 0.0}.get(yaw)
+    if wanted is not None:
+        np.testing.assert_allclose(turned, wanted, atol=0.05)
+
+
+def test_quadrotors_by_hand_are_kept():
+    """A flight of quadrotors by hand is kept with their attitudes and rotors, sample by sample, and can be judged."""
+    pilot = Pilot(load_mission("crazyflies"))
+    records = flown(pilot, 5.0)
+    result = pilot.result()
+    last = records[-1]
+    for name in ("vehicle_attitude", "vehicle_rates", "rotor_force", "saturated"):
+        kept = getattr(result, name)
+        assert kept.shape[:2] == result.position.shape[:2]
+        np.testing.assert_array_equal(kept[-1], getattr(last, name)[-1])
+    checks = {check.check for check in assess(result).checks}
+    assert {"rotor_force", "tilt", "tracking_error", "saturation"} <= checks
+
+
 def test_stays_rigid():
     """Whatever the hand does, the formation holds its shape to a micrometre: references are fed forward."""
     pilot = Pilot(TRIANGLE)

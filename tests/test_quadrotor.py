@@ -95,7 +95,13 @@ def test_frozen_numbers_are_those_of_the_installed_packages(tmp_path):
     made = tmp_path / "frozen.json"
     script = Path(__file__).with_name("vehicle_samples.py")
     environment = os.environ | {"SCIPY_ARRAY_API": "1"}
-    subprocess.run([sys.executable, script, made], check=True, env=environment, capture_output=True)
+    subprocess.run(
+        [sys.executable, script, made],
+        check=True,
+        env=environment,
+        cwd=tmp_path,
+        capture_output=True,
+    )
     new, old = json.loads(made.read_text()), json.loads(FROZEN.read_text())
     assert new["rotorpy"] == old["rotorpy"]
     assert new["crazyflow"] == old["crazyflow"]
@@ -477,9 +483,10 @@ def test_thrust_and_attitude_can_be_commanded():
     np.testing.assert_allclose(call.dS[0, 0, 3:6], expected, rtol=0, atol=1e-4)
 
 
-def test_rotors_that_cannot_turn_the_vehicle_are_refused():
-    """Four rotors that all turn the same way have no yaw torque: an error says so."""
+def test_rotors_that_cannot_turn_or_lift_the_vehicle_are_refused():
+    """Rotors at one place have no torque, and rotors beside the centre of mass cannot hover: errors say so."""
+    aside = np.array([[0.3, 0.1, 0], [0.3, -0.1, 0], [0.1, -0.1, 0], [0.1, 0.1, 0]])
+    with pytest.raises(ValueError, match="cannot hover"):
+        fleet.quadrotors([replace(PAPER, rotors=aside)])
     with pytest.raises(ValueError, match="do not span thrust and three torques"):
-        fleet.quadrotors(
-            [replace(PAPER, spin=(1, 1, 1, 1), rotors=np.diag([1.0, 1, 1, 1])[:, :3] * 0)]
-        )
+        fleet.quadrotors([replace(PAPER, rotors=np.zeros((4, 3)))])

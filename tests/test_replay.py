@@ -5,11 +5,12 @@ import json
 import posixpath
 import re
 import zlib
+from dataclasses import replace
 from importlib import import_module
 
 import numpy as np
 import pytest
-from sample_flights import swarm
+from sample_flights import quadrotors, swarm
 
 from rigidfleet.errors import ResultError
 from rigidfleet.mission import Mission, load_mission
@@ -158,6 +159,38 @@ def test_columns_are_the_flight():
     np.testing.assert_allclose(columns["separation plot"], at(EIGHT.separation[:, None]), atol=1e-3)
     error = np.abs(EIGHT.constraint).max(axis=1, keepdims=True)
     np.testing.assert_allclose(columns["error plot"], at(error), atol=2e-6)
+
+
+def test_columns_of_quadrotors():
+    """Vehicles have their own attitude, without jumps of sign, and each rotor its share of the limit."""
+    result = quadrotors(3, 40.0)
+    info, columns = parts(html_page(result))
+    assert info["rotors"] == [True] * 3
+    assert "thrust" not in columns
+    q = columns["turn"].reshape(-1, 3, 4)
+    assert (np.abs(np.diff(q, axis=0)) < 0.01).all()
+    k = np.searchsorted(result.time, info["start"] + info["step"] * np.arange(info["count"]) - 1e-9)
+    assert result.vehicle_attitude is not None
+    same = np.abs(np.sum(q * result.vehicle_attitude[k], axis=2))
+    np.testing.assert_allclose(same, 1.0, atol=5e-3)
+    shares = columns["rotors"].reshape(-1, 3, 4)[300]
+    np.testing.assert_allclose(shares, [[0.5] * 4, [0.5, 1.0, 0.5, 0.5], [0.5] * 4], atol=0.005)
+    assert columns["saturated"][300].tolist() == [0.0, 1.0, 0.0]
+    assert [p["title"] for p in info["plots"]][:2] == ["Rotors, share of limit", "Tracking error"]
+    np.testing.assert_allclose(columns["rotor plot"][300], [50.0, 100.0, 50.0], atol=0.05)
+
+
+def test_points_among_quadrotors_lean_into_their_thrust():
+    """In a mixed fleet points keep the picture of points; all others turn as they flew."""
+    result = quadrotors(3, 10.0)
+    data = result.mission.to_dict()
+    data["vehicles"]["point"] = {"model": "point", "mass": 1.0}
+    data["agents"]["vehicle"] = ["quadrotor", "point", "quadrotor"]
+    info, columns = parts(html_page(replace(result, mission_text=Mission.from_dict(data).text)))
+    assert info["rotors"] == [True, False, True]
+    assert {"turn", "thrust"} <= set(columns)
+    assert columns["rotors"].reshape(-1, 3, 4)[50, 1].tolist() == [0.0] * 4
+    assert np.isnan(columns["rotor plot"][:, 1]).all()
 
 
 def test_jumps_stay_where_they_are():

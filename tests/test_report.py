@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from sample_flights import quadrotors
 
 from rigidfleet import plotting
 from rigidfleet.assessment import Extreme, Safety, assess, safety
@@ -175,6 +176,23 @@ def test_downwash_is_measured_without_a_limit():
     assert row.limit is None
     assert worst(row).value == pytest.approx(1.5)
     assert worst(row).who == "agents 1 and 2"
+
+
+def test_vehicles_with_rotors(calm, quick):
+    """A flight by quadrotors tells models, rotors, tilt, tracking and saturation; beside points, these have none."""
+    result = quadrotors(3, 20.0)
+    rows = {row.quantity: row for row in safety(result, assess(result))}
+    assert list(rows)[-4:] == ["rotor force", "saturation", "tilt", "tracking error"]
+    assert worst(rows["rotor force"]).who == "agent 2"
+    assert rows["rotor force"].used == pytest.approx(1.0)
+    assert worst(rows["tilt"]).value == pytest.approx(20.0)
+    text = Page(html_page(result)).text
+    assert "3 × px4-sih" in text
+    assert "share of rotor limit" in text
+    both = Page(html_page([calm, result])).text
+    assert "flown by points" in both
+    assert "greatest share of a rotor's limit" in both
+    assert "rotor" not in Page(html_page(calm)).text
 
 
 def test_side_by_side(calm, hasty, quick):

@@ -215,7 +215,7 @@ def test_a_foreign_netcdf_file_is_no_result(tmp_path):
 
 def test_a_newer_format_is_refused(tmp_path, monkeypatch):
     """A file of a later format is not half understood: a newer version is asked for."""
-    monkeypatch.setattr("rigidfleet.result.SCHEMA_VERSION", 4)
+    monkeypatch.setattr("rigidfleet.result.SCHEMA_VERSION", 5)
     a_result().save(tmp_path / "a.nc")
     monkeypatch.undo()
     assert "Use a newer version" in refusal(tmp_path / "a.nc")
@@ -223,11 +223,11 @@ def test_a_newer_format_is_refused(tmp_path, monkeypatch):
 
 def test_an_older_format_is_refused(tmp_path, monkeypatch):
     """Words have changed since: the message names both formats, and says what to do."""
-    monkeypatch.setattr("rigidfleet.result.SCHEMA_VERSION", 2)
+    monkeypatch.setattr("rigidfleet.result.SCHEMA_VERSION", 3)
     a_result().save(tmp_path / "a.nc")
     monkeypatch.undo()
     told = refusal(tmp_path / "a.nc")
-    assert "(result format 2); this version reads format 3" in told
+    assert "(result format 3); this version reads format 4" in told
     assert "Fly the mission again" in told
 
 
@@ -369,36 +369,29 @@ def test_saving_where_nothing_can_be_written_says_why(tmp_path, monkeypatch):
 
 
 def test_csv_holds_setpoints_in_order(tmp_path):
-    """A row for each sample and agent, units in the header, yaw in degrees, one row at a switch."""
-    half_turn = np.full((41, 4), np.nan)
-    half_turn[20:] = [math.cos(0.5), 0, 0, math.sin(0.5)]
-    result = a_result(attitude=half_turn)
-    result.to_csv(tmp_path / "a.csv")
+    """A row for each sample and agent, units in the header, 9 digits, empty cells, one row at a switch."""
+    yaw = np.full((41, 4), np.nan)
+    yaw[20:] = 1.0
+    result = a_result(yaw=yaw, yaw_rate=0.0 * yaw)
+    result.to_csv(tmp_path / "a.csv", flown=True)
     with open(tmp_path / "a.csv", newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
-    assert list(rows[0]) == [
-        "time_s",
-        "agent",
-        "x_m",
-        "y_m",
-        "z_m",
-        "vx_m_s",
-        "vy_m_s",
-        "vz_m_s",
-        "yaw_deg",
-    ]
+    axes, parts = "xyz", (("", "m"), ("v", "m_s"), ("a", "m_s2"), ("j", "m_s3"))
+    columns = [f"{name}{axis}_{unit}" for name, unit in parts for axis in axes]
+    assert list(rows[0]) == ["time_s", "agent", *columns, "yaw_rad", "yaw_rate_rad_s"]
     assert len(rows) == 40 * 4
-    assert rows[0]["yaw_deg"] == ""
+    assert rows[0]["yaw_rad"] == ""
     last = rows[-3]
     assert int(last["agent"]) == 2
     assert float(last["time_s"]) == 20
-    state = [float(last[c]) for c in ("x_m", "y_m", "z_m", "vx_m_s", "vy_m_s", "vz_m_s")]
-    np.testing.assert_allclose(state, [*result.position[-1, 1], *result.velocity[-1, 1]], atol=6e-7)
-    assert float(last["yaw_deg"]) == pytest.approx(math.degrees(1), abs=1e-6)
+    state = [float(last[c]) for c in columns[:9]]
+    flown = [x[-1, 1] for x in (result.position, result.velocity, result.acceleration)]
+    np.testing.assert_allclose(state, np.concatenate(flown), rtol=5e-9)
+    assert float(last["yaw_rad"]) == 1.0
     # Of the two samples at the switch the later one stays.
     switch = rows[19 * 4]
-    assert float(switch["x_m"]) == pytest.approx(result.position[20, 0, 0], abs=6e-7)
-    assert float(switch["yaw_deg"]) == pytest.approx(math.degrees(1), abs=1e-6)
+    assert float(switch["x_m"]) == pytest.approx(result.position[20, 0, 0], rel=5e-9)
+    assert float(switch["yaw_rad"]) == 1.0
 
 
 # -- the object

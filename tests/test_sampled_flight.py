@@ -1,7 +1,10 @@
 """The sampled flight of a fleet: pauses, measurements, messages, options of the law, recorded quantities."""
 
+import subprocess
+import sys
 from dataclasses import replace
 from itertools import combinations
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -446,6 +449,66 @@ def test_a_problem_with_disturbances_is_refused():
         sampled.fly_ticks(disturbed, work, flight, state, fleet.segment(1, 0, 1.0))
 
 
+LIBRARIES = """
+import sys
+import rigidfleet as rf
+rf.simulate("establish-triangle")
+from rigidfleet.kernel.engine import native
+assert not native._sampled
+sys.path.insert(0, sys.argv[1])
+from vehicle_samples import PAPER, begun, fleet
+from rigidfleet.kernel.engine import sampled
+problem, work, flight, state = begun([PAPER])
+sampled.fly_ticks(problem, work, flight, state, fleet.segment(1, 0, 0.1))
+assert native._sampled
+assert "numba" not in sys.modules
+"""
+
+
+def test_points_do_not_load_the_code_of_quadrotors():
+    """Point flights leave the second library alone; once it is compiled, quadrotors fly without the compiler."""
+    native.sampled()
+    subprocess.run([sys.executable, "-c", LIBRARIES, str(Path(__file__).parent)], check=True)
+
+
+def test_code_that_cannot_be_kept_is_given_to_child_processes(monkeypatch):
+    """Where nothing can be kept, a child process gets the second library's code, too."""
+    code = native._read("sampled")
+    assert code is not None
+    monkeypatch.setattr(native, "_sampled", [native._linked_sampled(code, code)])
+    given = native.bequeath()
+    monkeypatch.setattr(native, "_sampled", [])
+    monkeypatch.setattr(native, "_loaded", [*native._loaded])
+    native.inherit(given)
+    assert native._sampled[0].unkept == code
+
+
+def test_a_flight_goes_on_under_another_problem():
+    """Phases follow one another: ticks, histories and extremes go on; edges, integral and frame are the new ones."""
+    problem, work, flight, state = planned("cube-passage", 0, SIH)
+    fly(problem, work, flight, state, flight.start + 0.1)
+    other, wide, *_ = planned("cube-passage", 1, SIH)
+    m = len(wide.c)
+    assert m != len(work.c)
+    with pytest.raises(ValueError, match=r"fleet\.renewed"):
+        sampled.fly_ticks(other, wide, flight, state, fleet.segment(8, m, flight.start + 0.2))
+    state = fleet.renewed(state, wide, np.full(m, 0.01))
+    fly(other, wide, flight, state, flight.start + 0.2)
+    assert state.count[fleet.TICKS] == 100
+    np.testing.assert_allclose(state.integral[0], 0.01, rtol=0, atol=5e-3)
+
+
+def test_tables_that_end_too_early_are_refused():
+    """Tables that do not cover their ticks, or are of other vehicles, are an error that names the table."""
+    problem, work, flight, state = begun([PAPER])
+    for rows, n in ((9, 1), (10, 2)):
+        tables = flight.tables._replace(last=10, jerk=np.zeros((rows, n, 3)))
+        with pytest.raises(ValueError, match=r"the table 'jerk'.*needs 10 rows"):
+            sampled.fly_ticks(
+                problem, work, flight._replace(tables=tables), state, fleet.segment(1, 0, 1.0)
+            )
+
+
 # -- RotorPy's closed loop -------------------------------------------------------------------------
 
 
@@ -499,10 +562,16 @@ def test_the_passage_under_rotorpys_law():
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    ("name", "expected"), [("narrow-passage", (0.300, 0.061)), ("cube-passage", (0.300, 0.060))]
-)
-def test_rotorpys_closed_loop(name, expected):
+def test_the_cubes_passage_under_rotorpys_law():
+    """All 90 s of the cube's passage, eight vehicles, are missed as by RotorPy: frozen numbers."""
+    t, *wanted = setpoints("cube-passage")
+    # RotorPy 3.0.0, flown as in `test_rotorpys_closed_loop`, which takes minutes for eight vehicles
+    expected = (0.30012455556, 0.05964278801)
+    assert errors(flown_by_us(PAPER, t, *wanted), wanted[0]) == pytest.approx(expected, rel=1e-5)
+
+
+@pytest.mark.long
+def test_rotorpys_closed_loop():
     """90 s of the passage under RotorPy's SE(3) law at 100 Hz end where RotorPy's do; errors are .300 and .061 m."""
     pytest.importorskip("rotorpy")
     from rotorpy.controllers.quadrotor_control import SE3Control
@@ -513,7 +582,8 @@ def test_rotorpys_closed_loop(name, expected):
         "rotor_speed_max": 1000.0, "tau_m": 0.02, "k_d": 1.16e-4, "k_z": 1.16e-4, "k_h": 0.0,
     }  # fmt: skip
     model, law = type(rotorpy("hummingbird"))(paper), SE3Control(paper)
-    t, *wanted = setpoints(name)
+    expected = (0.300, 0.061)
+    t, *wanted = setpoints("narrow-passage")
     flown = flown_by_us(PAPER, t, *wanted)
     assert errors(flown, wanted[0]) == pytest.approx(expected, abs=6e-4)
     hover = np.full(4, PAPER.speed_at(PAPER.m * G / 4))

@@ -9,17 +9,20 @@ from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
 from rigidfleet.assessment import assess
+from rigidfleet.cli import app as cli
 from rigidfleet.errors import MissionError
 from rigidfleet.kernel import control, references
 from rigidfleet.kernel.problem import SHAPE, Motion, Reference, workspace
 from rigidfleet.math import series, splines
 from rigidfleet.mission import Mission, load_mission
+from rigidfleet.mission.draft import draft
 from rigidfleet.planning import derivatives as d
 from rigidfleet.planning.limits import limits_of, reached
 from rigidfleet.planning.preview import Leg, preview
 from rigidfleet.planning.preview import leg as leg_of
 from rigidfleet.planning.timing import broken, timed
 from rigidfleet.preflight.check import check
+from rigidfleet.result import Result
 from rigidfleet.simulation.flight import Flight, simulate
 
 #: Central differences of eighth order.
@@ -438,11 +441,14 @@ def test_automatic_times_of_a_phase_begun_by_hand():
         ({"kind": "fly", "position": [9, 0, 8], "duration": "auto"}, {"limits": {}}, "needs a limit that bounds it"),
         ({"kind": "hold", "duration": "auto"}, {}, "has no least duration"),
         ({"kind": "turn", "yaw_deg": 9.0, "duration": "auto", "travel": 2.0}, {}, "has no effect with duration"),
-        ({"kind": "fly", "position": [9, 0, 8], "duration": "auto"}, {"smoothness": "lqr"}, "needs a smooth mission"),
+        ({"kind": "turn", "yaw_deg": 9.0, "duration": "auto"}, {"smoothness": "lqr", "limits": {}}, "a smooth mission"),
         ({"kind": "fly", "position": [9, 0, 8], "settle": {}}, {}, "needs a time of arrival"),
         ({"kind": "fly", "position": [9, 0, 8], "duration": 9.0,
           "through": [{"position": [1, 1, 8], "time": 9.5}]}, {}, "passes its last point at 9.5 s"),
         ({"kind": "reshape", "formation": "wide", "duration": 9.0, "reference": "step"}, {}, "jumps"),
+        ({"kind": "hold", "duration": 9.0}, {"smoothness": "lqr", "limits": {"jerk": 2.0}}, "has no effect: only"),
+        ({"kind": "hold", "duration": 9.0}, {"yaw": {"kind": "towards"}}, "the point to look at"),
+        ({"kind": "hold", "duration": 9.0}, {"yaw": {"yaw_deg": 3.0}}, "has no effect with kind 'formation'"),
     ],
 )  # fmt: skip
 def test_errors_of_automatic_times_and_points(phase, more, told):
@@ -466,3 +472,95 @@ def test_a_limit_that_no_time_keeps():
         timed(limited(orbit | {"blend": "auto"}))
     told = [r.text for r in check(limited(orbit), search=False).remarks]
     assert any("no blend of this phase keeps all limits" in text for text in told)
+
+
+# -- what is recorded, and setpoints ---------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def flown_ways() -> Result:
+    """A smooth flight of all kinds of phases, looking along its way."""
+    return simulate(a_mission(*WAYS, yaw={"kind": "along"}))
+
+
+def test_results_record_references_with_derivatives(flown_ways, tmp_path):
+    """Slot velocity, acceleration and jerk are differences of the slots' positions, and survive the file."""
+    flown_ways.save(tmp_path / "a.nc")
+    again = Result.load(tmp_path / "a.nc")
+    for name in ("slot_velocity", "slot_acceleration", "slot_jerk", "yaw", "yaw_rate"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(flown_ways, name))
+    part = flown_ways.samples(5)  # through points
+    t = flown_ways.time[part]
+    spline = make_interp_spline(t, flown_ways.slot_position[part], k=7)
+    inner = slice(20, -20)
+    for order, name in enumerate(("slot_velocity", "slot_acceleration", "slot_jerk"), start=1):
+        expected = spline(t[inner], order)
+        np.testing.assert_allclose(
+            getattr(flown_ways, name)[part][inner], expected, rtol=0, atol=1e-6
+        )
+
+
+def test_yaw_is_continuous_over_the_whole_flight(flown_ways):
+    """Looking along the way: no jump of yaw or yaw rate at a switch, and the rate is that of the yaw."""
+    t, yaw, rate = flown_ways.time, flown_ways.yaw, flown_ways.yaw_rate
+    step = np.diff(t)[:, None]
+    assert np.abs(np.diff(yaw, axis=0) - 0.5 * step * (rate[1:] + rate[:-1])).max() < 0.01
+    at_switch = np.diff(flown_ways.phase) > 0
+    assert np.abs(np.diff(rate, axis=0)[at_switch]).max() < 1e-6
+    fast = np.linalg.norm(flown_ways.slot_velocity[..., :2], axis=-1) > 2.5
+    v = flown_ways.slot_velocity[fast]
+    off = np.angle(np.exp(1j * (yaw[fast] - np.arctan2(v[:, 1], v[:, 0]))))
+    assert np.median(np.abs(off)) < np.deg2rad(5)
+
+
+#: Names and units of position and its derivatives in a table of setpoints.
+UNITS = (("", "m"), ("v", "m_s"), ("a", "m_s2"), ("j", "m_s3"))
+
+
+def test_setpoints_at_any_rate_are_the_reference(tmp_path):
+    """At 333 Hz, between samples 50 ms apart, setpoints are the kernel's own reference to 1e-8."""
+    mission = a_mission(*WAYS[:4])
+    result = simulate(mission)
+    result.to_csv(tmp_path / "a.csv", rate=333.0)
+    table = np.genfromtxt(tmp_path / "a.csv", delimiter=",", names=True)
+    time = np.repeat(np.arange(len(table) // 3) / 333.0, 3)
+    np.testing.assert_allclose(table["time_s"], time, rtol=5e-9)
+    flight = Flight(mission)
+    checked = 0
+    while flight.begin():
+        plan = flight.plan
+        which = (time > plan.start + 1e-6) & (time < plan.t_end - 1e-6)
+        for agent in (1, 2, 3):
+            mine = which & (table["agent"] == agent)
+            rows, problem = table[mine], plan.problem
+            exact = d.slot_derivatives(problem.reference, problem.motion, time[mine])[
+                :, :, agent - 1
+            ]
+            for order, (name, unit) in enumerate(UNITS):
+                for axis, letter in enumerate("xyz"):
+                    told = rows[f"{name}{letter}_{unit}"]
+                    np.testing.assert_allclose(
+                        told, exact[:, order, axis], rtol=6e-9, atol=1e-9 * 30.0**order
+                    )
+            checked += len(rows)
+        flight.advance()
+    assert checked > 0.99 * len(table)
+
+
+def test_the_command_writes_setpoints(tmp_path, monkeypatch):
+    """`run --csv --csv-rate 10` writes ten rows a second and agent; its options need --csv."""
+    monkeypatch.chdir(tmp_path)
+    text = a_mission(WAYS[0]).text
+    (tmp_path / "m.toml").write_text(text, encoding="utf-8")
+    assert cli.main(["run", "m.toml", "--no-figures", "--csv", "--csv-rate", "10", "--flown"]) == 0
+    rows = (tmp_path / "flights" / "smooth" / "smooth.csv").read_text(encoding="utf-8").splitlines()
+    assert len(rows) == 1 + 3 * 171
+    assert cli.main(["run", "m.toml", "--flown"]) == 2
+
+
+def test_new_missions_are_smooth():
+    """What `rigidfleet new` writes flies without jumps in acceleration or jerk."""
+    mission = Mission.from_toml(draft("new", shape="hexagon"))
+    assert mission.smooth
+    for before, after in ends_of_phases(mission):
+        np.testing.assert_allclose(after[:4], before[:4], rtol=0, atol=1e-7)

@@ -12,21 +12,26 @@ import sys
 import time
 import tomllib
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from rich.console import Console
+from sample_flights import quadrotors, swarm
 from scipy import stats
 
+from rigidfleet.assessment import assess
 from rigidfleet.cli import app as cli
 from rigidfleet.cli import codes, console
 from rigidfleet.errors import ResultError, RigidfleetError, SweepError
 from rigidfleet.mission import Mission
+from rigidfleet.result import Extremum
 from rigidfleet.sweep import METRICS, Sweep, Table, fly, load, read
 from rigidfleet.sweep.figures import over_two, plot
 from rigidfleet.sweep.final_states import starts
+from rigidfleet.sweep.metrics import measure
 from rigidfleet.sweep.run import GROUP, fly_runs
 from rigidfleet.sweep.runner import SweepProgress
 from rigidfleet.sweep.summary import Example, drivers, rate, summarise
@@ -227,9 +232,23 @@ def test_a_file_is_checked_like_a_mission(tmp_path):
 # -- flying ------------------------------------------------------------------------------------------
 
 
+def test_metrics_of_vehicles_with_rotors():
+    """Rotors as a share of their limit, saturation as a share of a phase, and tilt, as the verdict has them."""
+    counts = {"steps": 1, "evaluations": 4}
+    result, points = (replace(f(3, 10.0), statistics=counts) for f in (quadrotors, swarm))
+    found = measure(result, assess(result))
+    assert found["rotor_share"] == pytest.approx(1.0)
+    assert found["tilt"] == pytest.approx(20.0)
+    result.phases[0].extremes["saturation"] = Extremum(0.25, 5.0, 1, -1)
+    assert measure(result, assess(result))["saturation"] == pytest.approx(0.25)
+    of_points = measure(points, assess(points))
+    assert all(math.isnan(of_points[name]) for name in ("rotor_share", "saturation", "tilt"))
+    off = np.linalg.norm(result.position - result.slot_position, axis=2)
+    assert found["tracking_error"] == of_points["tracking_error"] == off.max()
+
+
 def test_metrics_are_those_of_the_verdict(tmp_path):
     """A row has what simulate and assess say of the varied mission."""
-    from rigidfleet.assessment import assess
     from rigidfleet.simulation.flight import simulate
 
     found = sweep(runs=3)

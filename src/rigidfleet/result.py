@@ -13,8 +13,8 @@ import io
 import json
 import math
 import platform
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import InitVar, asdict, dataclass, field, fields
 from datetime import UTC, datetime
 from functools import cache, cached_property
 from importlib.metadata import PackageNotFoundError, version
@@ -35,7 +35,7 @@ import numpy as np
 
 from rigidfleet._common import markup
 from rigidfleet.errors import MissionError, ResultError, wrong_type
-from rigidfleet.math import attitude
+from rigidfleet.setpoints import Setpoints, at_rate, csv, of_motion
 from rigidfleet.typing import Bools, Floats, Ints
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ from rigidfleet._common.arguments import as_path
 from rigidfleet._common.files import why_not, write_file
 
 #: Version of the file format. Files of any other version are rejected.
-SCHEMA_VERSION = 3
+SCHEMA_VERSION = 4
 
 
 class Variable(NamedTuple):
@@ -330,9 +330,23 @@ class Result:
             "1 if a vehicle cannot give what is asked of it, else 0; missing without vehicles",
         ),
     ] = None
+    slot_velocity: Annotated[
+        Floats | None, _v("time agent axis", "m s-1", "desired velocity, world axes")
+    ] = None
+    slot_acceleration: Annotated[
+        Floats | None, _v("time agent axis", "m s-2", "desired acceleration, world axes")
+    ] = None
+    slot_jerk: Annotated[
+        Floats | None, _v("time agent axis", "m s-3", "desired jerk, world axes")
+    ] = None
+    yaw: Annotated[
+        Floats | None, _v("time agent", "rad", "desired yaw of each vehicle, from east to north")
+    ] = None
+    yaw_rate: Annotated[Floats | None, _v("time agent", "rad s-1", "desired yaw rate")] = None
 
     phases: list[PhaseRecord]
     mission_text: str
+    later: InitVar[Callable[[], dict[str, Floats]] | None] = None
     complete: bool = True
     ending: str = ""
     statistics: dict[str, Any] = field(default_factory=dict)
@@ -340,21 +354,15 @@ class Result:
     platform: str = field(default_factory=platform.platform)
     created: str = field(default_factory=_now)
 
-    def __post_init__(self) -> None:
+    def __post_init__(self, later: Callable[[], dict[str, Floats]] | None) -> None:
         sizes: dict[str, int] = {dim: len(names) for dim, names in LABELS.items()}
-        for name, variable in VARIABLES.items():
-            if getattr(self, name) is None and name in _OPTIONAL:
-                continue
-            dtype = np.int64 if name in _INTEGERS else np.float64
-            value = np.ascontiguousarray(getattr(self, name), dtype=dtype)
-            asked = tuple(sizes.get(dim, "any") for dim in variable.dims)
-            if value.ndim != len(asked) or any(
-                sizes.setdefault(dim, n) != n
-                for dim, n in zip(variable.dims, value.shape, strict=True)
-            ):
-                dims = ", ".join(variable.dims)
-                raise ValueError(f"{name} ({dims}) has shape {value.shape}, expected {asked}")
-            setattr(self, name, value)
+        for name in VARIABLES:
+            if getattr(self, name) is not None or name not in _OPTIONAL:
+                self._set(name, getattr(self, name), sizes)
+        if later is not None:
+            self._later = later
+            for name in LATER:
+                del self.__dict__[name]
         if sizes["time"] == 0 or sizes["agent"] == 0:
             raise ValueError("a result needs at least one sample and one agent")
         if not (np.isfinite(self.time).all() and (np.diff(self.time) > 0).all()):
@@ -381,6 +389,29 @@ class Result:
         if (self.edges[:, 0] == self.edges[:, 1]).any():
             raise ValueError("an edge joins an agent to itself")
 
+    def _set(self, name: str, given: Any, sizes: dict[str, int]) -> None:
+        """Set an array whose dimensions agree with ``sizes``, which learns new ones."""
+        dims = VARIABLES[name].dims
+        dtype = np.int64 if name in _INTEGERS else np.float64
+        value = np.ascontiguousarray(given, dtype=dtype)
+        asked = tuple(sizes.get(dim, "any") for dim in dims)
+        if value.ndim != len(asked) or any(
+            sizes.setdefault(dim, n) != n for dim, n in zip(dims, value.shape, strict=True)
+        ):
+            raise ValueError(
+                f"{name} ({', '.join(dims)}) has shape {value.shape}, expected {asked}"
+            )
+        setattr(self, name, value)
+
+    def __getattr__(self, name: str) -> Any:
+        """Compute the derivatives of references when they are first asked for: a flight alone does not need them."""
+        if name not in LATER or "_later" not in self.__dict__:
+            raise AttributeError(f"a result has no {name!r}")
+        sizes = {"time": len(self.time), "agent": self.n_agents, "axis": 3}
+        for key, value in self.__dict__.pop("_later")().items():
+            self._set(key, value, sizes)
+        return self.__dict__[name]
+
     def __repr__(self) -> str:
         end = "complete" if self.complete else f"incomplete: {self.ending or 'stopped'}"
         return (
@@ -406,6 +437,8 @@ class Result:
             ("clearance", "least clearance", "m"),
             ("speed", "greatest speed", "m/s"),
             ("thrust", "greatest thrust", "N"),
+            ("rotor_force", "greatest rotor force", "N"),
+            ("tracking_error", "greatest tracking error", "m"),
         )
         for quantity, words, unit in worst:
             if (x := self.extreme(quantity)) is not None and math.isfinite(x.value):
@@ -453,6 +486,8 @@ class Result:
 
         if mission.n_agents != self.n_agents:
             return f"the mission has {mission.n_agents} agents, the arrays have {self.n_agents}"
+        if mission.vehicle_models is not None and self.rotor_force is None:
+            return "it flies vehicles with rotors, of which the arrays have none"
         if not np.array_equal(mission.edges, self.edges):
             return "the edges of its formations differ from those of the arrays"
         named = [
@@ -526,28 +561,53 @@ class Result:
                 f"{path}: the result is damaged ({_one_line(error)}). Fly its mission again or use another copy."
             ) from error
 
-    def to_csv(self, path: str | Path) -> None:
-        """Write time, position, velocity and yaw of each agent to a CSV file, one row per sample and agent.
+    def setpoints(self, rate: float | None = None, *, flown: bool = False) -> Setpoints:
+        """Position, velocity, acceleration, jerk, yaw and yaw rate of each vehicle: the reference, or what was flown.
 
-        Columns: time_s, agent (from 1), x_m, y_m, z_m, vx_m_s, vy_m_s, vz_m_s, yaw_deg. The yaw is that of
-        the formation (3-2-1 Euler angles); it is empty before a body frame is attached. Of the two samples at a change
-        of phase, only the later one is written. Like `save`, this never leaves a partial file.
+        Parameters
+        ----------
+        rate : setpoints per second [Hz], on polynomials of degree 7 (yaw: 3) between samples; by default the samples
+            themselves, of which the later one counts at a change of phase
+        flown : give the motion flown instead of its reference; its jerk is that of quintics between samples, and its
+            yaw that of the reference
+
+        Raises
+        ------
+        ValueError
+            The rate is not positive, or gives too many setpoints.
+        """
+        references = [
+            self.slot_position,
+            self.slot_velocity,
+            self.slot_acceleration,
+            self.slot_jerk,
+        ]
+        nothing = np.full(self.position.shape, np.nan)
+        state = np.stack([nothing if x is None else x for x in references], axis=1)
+        if flown:
+            motion = self.position, self.velocity, self.acceleration
+            parts = [self.samples(k) for k in range(len(self.phases))]
+            state = np.concatenate(
+                [of_motion(*(x[part] for x in (*motion, self.time))) for part in parts]
+            )
+        yaw = [nothing[:, :, 0] if x is None else x for x in (self.yaw, self.yaw_rate)]
+        return at_rate(Setpoints(self.time, state, *yaw), rate)
+
+    def to_csv(self, path: str | Path, *, rate: float | None = None, flown: bool = False) -> None:
+        """Write the setpoints of each vehicle to a CSV file, one row per time and agent, to 9 digits.
+
+        Columns: time_s, agent (from 1), position x_m, y_m, z_m, velocity vx_m_s..., acceleration ax_m_s2..., jerk
+        jx_m_s3..., yaw_rad, yaw_rate_rad_s. Parameters are those of `setpoints`. Cells are empty where slots are not
+        tracked. Like `save`, this never leaves a partial file.
 
         Raises
         ------
         ResultError
             The file cannot be written.
+        ValueError
+            The rate is not positive, or gives too many setpoints.
         """
-        yaw = np.degrees(attitude.euler_from_quaternion(self.attitude)[:, 2])
-        keep = np.append(np.nextafter(self.time[:-1], math.inf) < self.time[1:], True)
-        lines = ["time_s,agent,x_m,y_m,z_m,vx_m_s,vy_m_s,vz_m_s,yaw_deg\n"]
-        state = np.concatenate([self.position, self.velocity], axis=2)
-        row = "{:.6f},{},{:.6f},{:.6f},{:.6f},{:.6f},{:.6f},{:.6f},{}\n".format
-        for k in np.flatnonzero(keep):
-            angle = "" if np.isnan(yaw[k]) else f"{yaw[k]:.6f}"
-            t = self.time[k]
-            lines += [row(t, i, *s, angle) for i, s in enumerate(state[k].tolist(), start=1)]
-        write_file(as_path(path), "".join(lines).encode())
+        write_file(as_path(path), csv(self.setpoints(rate, flown=flown)).encode())
 
     def _netcdf(self) -> bytes:
         """Build the content of the file in memory, so that a full disk is an ordinary write error, not one of HDF5."""
@@ -624,6 +684,14 @@ VARIABLES: dict[str, Variable] = {
 }
 #: Variables that a result may lack.
 _OPTIONAL = {f.name for f in fields(Result) if f.name in VARIABLES and f.default is None}
+
+
+#: Variables that are computed when they are first asked for.
+LATER = ("slot_velocity", "slot_acceleration", "slot_jerk", "yaw", "yaw_rate")
+for _name in (
+    LATER
+):  # the default of the field remains; without the class's attribute, `__getattr__` is called
+    delattr(Result, _name)
 
 
 _INTEGERS = {name for name in VARIABLES if _HINTS[name].__origin__ in (Ints, Ints | None)}

@@ -221,6 +221,40 @@ def test_end_says_where(browser):
     thread.join(5)
 
 
+def test_quadrotors(browser):
+    """Quadrotors fly by hand: they and their rotors are drawn and plotted; gusts and changes of formation work."""
+    session = Session(load_mission("passage-quadrotors"))
+    thread = threading.Thread(target=session.run)
+    thread.start()
+    try:
+        with Server(session) as server:
+            browser.open(server.url)
+            browser.wait("return replay.recording.end > 1")
+            titles = browser.run(
+                "return [...document.querySelectorAll('.plot h2')].map((h) => h.textContent)"
+            )
+            assert titles[:2] == ["Rotors, share of limit", "Tracking error"]
+            drawn = (
+                "replay.scene.draw(replay.time, 0); const { turned, small, noses } = replay.scene.places;"
+                "return [turned.count + small.count, noses.count]"
+            )
+            assert browser.run(drawn) == [3, 3]
+            browser.click("[data-formation=line]")
+            until(lambda: session.pilot.formation == "line")
+            browser.run(
+                "[...document.querySelectorAll('#fly button')].find((b) => b.textContent === 'behind').click()"
+            )
+            browser.wait(
+                "return Math.hypot(...replay.recording.at(replay.recording.end).slot) > 0.1"
+            )
+            assert session.pilot.ending == ""
+            assert browser.heard() == []
+            browser.driver.get("about:blank")
+    finally:
+        session.stop()
+        thread.join(5)
+
+
 def test_tab_closed(session, browser, monkeypatch):
     """When the last page is closed, the flight ends."""
     monkeypatch.setattr(sessions, "_PATIENCE", 0.5)
@@ -228,3 +262,28 @@ def test_tab_closed(session, browser, monkeypatch):
         browser.open(server.url)
         browser.driver.get("about:blank")
         until(session.stopped.is_set)
+
+
+def test_narrow_pages_keep_the_flight_in_sight(page):
+    """On a telephone the controls lie below the vehicles, without overlap; the panel takes their place."""
+    box = (
+        "(id => { const b = document.getElementById(id).getBoundingClientRect();"
+        " return [b.left, b.top, b.right, b.bottom] })"
+    )
+    page.driver.execute_cdp_cmd(
+        "Emulation.setDeviceMetricsOverride",
+        {"width": 400, "height": 800, "deviceScaleFactor": 1, "mobile": True},
+    )
+    try:
+        page.wait("return innerWidth === 400")
+        page.wait(f"return {box}('fly')[3] < {box}('bar')[1]")
+        _, top, right, _ = page.run(f"return {box}('fly')")
+        assert top > 400
+        assert right <= 400
+        middle = "const { camera } = replay.scene; return innerHeight * (1 - camera.centre[1]) / 2"
+        assert page.run(middle) < top
+        page.click("#more")
+        assert page.run("return document.getElementById('fly').offsetHeight") == 0
+        assert page.run(f"return {box}('panel')[3]") < page.run(f"return {box}('bar')[1]")
+    finally:
+        page.driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})

@@ -14,7 +14,7 @@ from threading import Thread
 import numpy as np
 import pytest
 from chromium import started
-from sample_flights import swarm
+from sample_flights import quadrotors, swarm
 from test_policy import HOSTILE, flight
 
 from rigidfleet.math import attitude as att
@@ -585,6 +585,56 @@ def test_vehicles_in_their_colours(show, eight):
     # The body's z axis in the world: the last row of its attitude, world to body.
     T = att.dcm_from_quaternion(data[:, 7:11])
     np.testing.assert_allclose(T[:, 2], up, atol=5e-3)
+
+
+def test_quadrotors_turn_as_they_flew(show):
+    """Vehicles with rotors have their own tilt and yaw, not those of the formation, and an arrow ahead."""
+    result = quadrotors(4, 20.0)
+    assert result.vehicle_attitude is not None
+    page = show(result)
+    for t in (2.0, 13.0):
+        count, drawn, noses = page.run(
+            "replay.scene.camera.zoom = 0.4; replay.scene.camera.shown = null; replay.scene.draw(arguments[0], 10);"
+            "const p = replay.scene.places.turned;"
+            "const q = Array.from({ length: p.count }, (_, k) => Array.from(p.data.slice(12 * k + 7, 12 * k + 11)));"
+            "return [p.count, q, replay.scene.places.noses.count]",
+            t,
+        )
+        assert count == noses == 4
+        assert result.vehicle_attitude is not None
+        flown = result.vehicle_attitude[np.searchsorted(result.time, t)]
+        np.testing.assert_allclose(np.abs(np.sum(np.array(drawn) * flown, axis=1)), 1.0, atol=1e-3)
+
+
+def test_rotor_at_its_limit_is_red(show):
+    """The rotor at its limit, and no other, is red, where it is on its vehicle; the panel names the vehicle."""
+    result = quadrotors(4, 20.0)
+    assert result.vehicle_attitude is not None
+    page = show(result, "t=2")
+    # Colours of all discs: four of each vehicle, in the order of the columns.
+    discs = (
+        "replay.scene.camera.zoom = 0.4; replay.scene.camera.shown = null; replay.scene.draw(arguments[0], 10);"
+        "const p = replay.scene.places.discs; return Array.from({ length: p.count }, (_, k) =>"
+        " [p.words[12 * k + 3] & 255, p.words[12 * k + 3] >> 8 & 255, ...p.data.slice(12 * k, 12 * k + 3)])"
+    )
+    calm, busy = np.array(page.run(discs, 2.0)), np.array(page.run(discs, 7.0))
+    assert len(calm) == len(busy) == 16
+    red = (busy[:, 0] > 200) & (busy[:, 1] < 30)
+    assert np.flatnonzero(red).tolist() == [5]
+    assert not ((calm[:, 0] > 200) & (calm[:, 1] < 30)).any()
+    k = np.searchsorted(result.time, 7.0)
+    assert result.vehicle_attitude is not None
+    away = att.dcm_from_quaternion(result.vehicle_attitude[k, 1]) @ (
+        busy[5, 2:] - result.position[k, 1]
+    )
+    assert away[0] > 0.01  # front, in the vehicle's own axes
+    assert away[1] < -0.01  # right
+    page.run("replay.seek(7)")
+    page.wait(
+        "return document.getElementById('notes').textContent.includes('Agent 2 cannot give all')"
+    )
+    page.run("replay.seek(2)")
+    page.wait("return !document.getElementById('notes').textContent.includes('cannot give')")
 
 
 def test_ghosts(show, eight):

@@ -54,11 +54,12 @@ class Safety:
 def safety(result: Result, verdict: Verdict) -> list[Safety]:
     """Worst value of each quantity of a judged flight, with its limit if there is one.
 
-    Limits are those of the verdict; those of the altitude are the geofence's.
+    Limits are those of the verdict; those of the altitude are the geofence's. Flights by vehicles with rotors have
+    rows of their own at the end.
     """
     measured = Measurements(result)
     found = {check.check: check for check in verdict.checks}
-    return [
+    rows = [
         _row(
             "proximity", "least distance between two vehicles' surfaces",
             found.get("separation"), "m", at_least=True,
@@ -79,6 +80,17 @@ def safety(result: Result, verdict: Verdict) -> list[Safety]:
             "clearance", "least distance of a vehicle's surface to an obstacle or the ground",
             found.get("clearance"), "m", at_least=True,
         ),
+    ]  # fmt: skip
+    if "rotor_force" not in found:
+        return rows
+    return rows + [
+        _row(name.replace("_", " "), text, found.get(name), unit)
+        for name, text, unit in (
+            ("rotor_force", "force of the rotor that comes nearest to its limit", "N"),
+            ("saturation", "greatest share of a phase in which a vehicle is asked for more than its rotors give", "%"),
+            ("tilt", "greatest tilt of a vehicle", "deg"),
+            ("tracking_error", "greatest distance of a vehicle from its slot", "m"),
+        )
     ]  # fmt: skip
 
 

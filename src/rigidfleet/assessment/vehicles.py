@@ -96,6 +96,7 @@ def _saturation(e: Extreme, limit: float) -> CheckResult:
     )
     if e.value == 0.0:
         words = "no vehicle is asked for more than its rotors give"
+        return CheckResult("saturation", True, words, 0.0, 100 * limit, "%")
     share = 100 * e.value
     return CheckResult(
         "saturation", passed, words, share, 100 * limit, "%", when=e.when, who=e.who, phase=e.phase

@@ -37,6 +37,8 @@ def run(
     no_titles: bool = False,
     replay: bool = False,
     csv: bool = False,
+    csv_rate: float | None = None,
+    flown: bool = False,
     json: bool = False,
     quiet: bool = False,
 ) -> int:
@@ -59,7 +61,11 @@ def run(
     replay : bool
         Also write replay.html, which replays the flight in a browser.
     csv : bool
-        Also write NAME.csv: time, position, velocity and yaw of each agent.
+        Also write NAME.csv: setpoints of each agent, the reference with acceleration, jerk and yaw.
+    csv_rate : float
+        Setpoints per second [Hz] in NAME.csv. Default: the samples of the result.
+    flown : bool
+        Write the motion flown into NAME.csv instead of the reference.
     json : bool
         Print the verdict as JSON.
     quiet : bool
@@ -67,12 +73,16 @@ def run(
     """
     from rigidfleet.mission import load_mission
 
-    flown = load_mission(mission)
-    files = Files(out or Path("flights", flown.name), flown.name)
+    if not csv and (csv_rate is not None or flown):
+        raise RigidfleetError("--csv-rate and --flown say what --csv writes. Add --csv.")
+    if csv_rate is not None and not csv_rate > 0.0:
+        raise RigidfleetError(f"--csv-rate must be positive [Hz], not {csv_rate:g}.")
+    asked = load_mission(mission)
+    files = Files(out or Path("flights", asked.name), asked.name)
     files.claim(replace=force)
     watch = None if quiet else console.FlightWatch()
     with watch or nullcontext():
-        result, interrupted = fly(flown, watch)
+        result, interrupted = fly(asked, watch)
 
     from rigidfleet._common.files import write_file
     from rigidfleet.assessment import assess
@@ -81,7 +91,10 @@ def run(
     result.save(files.result)
     files.forget()
     if csv:
-        result.to_csv(files.table)
+        try:
+            result.to_csv(files.table, rate=csv_rate, flown=flown)
+        except ValueError as error:
+            raise RigidfleetError(f"--csv-rate: {error}.") from None
     verdict = assess(result)
     write_file(files.verdict, (verdict.json() + "\n").encode())
     if json:

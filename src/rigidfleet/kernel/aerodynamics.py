@@ -2,16 +2,16 @@
 
 import math
 
-from rigidfleet.kernel.compiler.jit import compiled
+from rigidfleet.kernel.compiler.jit import compiled, inlined
 from rigidfleet.kernel.disturbances import spline
+from rigidfleet.kernel.fleet import jet_speed
 from rigidfleet.kernel.rigid_body import attitude_matrix
 
-# Turbulent jet below a hovering quadrotor: decay and spread of its far field, and its virtual origin in distances of
-# opposite motors (Bauersfeld et al. 2024, arXiv:2403.13321, Eq. (9)).
-_DECAY, _SPREAD, _ORIGIN = 10.11, 0.07668, -5.817
 # Share of the body's lift in the ground effect (Sanchez-Cuevas et al. 2017), and the least height, in radii, at which
 # the formula is used.
 _BODY, _LEAST_HEIGHT = 2.0, 0.5
+
+jet = inlined(jet_speed)
 
 
 @compiled
@@ -31,28 +31,19 @@ def air_velocity(t, h, around, out):
 def add_downwash(S, vehicles, density, T, out):
     """Add to the air (3, N, 3) the jets of all vehicles above, at states S (N, 17).
 
-    At a distance s [m] below a vehicle along its z axis and r beside that axis, with l the distance of opposite motors
-    and x = s/l + 5.817, air flows along the axis at (Bauersfeld et al. 2024, arXiv:2403.13321, Eqs. (1)-(9))
-
-        U = 10.11 U_H / (x (1 + (sqrt(2) - 1) (r / (0.07668 l x))^2)^2),  U_H^2 = m g / (8 pi density radius^2).
-
-    The fit holds from s = 2.5 l on and for hover; nearer, it is an extrapolation. Jets add up. T (3, 3) is work.
+    Each is that of `fleet.jet_speed`; they add up. T (3, 3) is work.
     """
     n = S.shape[0]
     for j in range(n):
         if vehicles.radius[j] > 0.0 and not (vehicles.lost[j] or vehicles.point[j]):
-            l, disc = vehicles.span[j, 1], vehicles.radius[j] * vehicles.radius[j]
-            hover = math.sqrt(vehicles.m[j] * vehicles.g / (8.0 * math.pi * density * disc))
+            weight = vehicles.m[j] * vehicles.g
             attitude_matrix(S[j, 6:10], T)
             for i in range(n):
                 x, y, z = S[j, 0] - S[i, 0], S[j, 1] - S[i, 1], S[j, 2] - S[i, 2]
                 s = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z
                 if i != j and s > 0.0:
                     rr = x * x + y * y + z * z - s * s
-                    far = s / l - _ORIGIN
-                    width = _SPREAD * l * far
-                    profile = 1.0 + (math.sqrt(2.0) - 1.0) * rr / (width * width)
-                    flow = hover * _DECAY / (far * profile * profile)
+                    flow = jet(weight, density, vehicles.radius[j], vehicles.span[j, 1], s, rr)
                     for stage in range(3):
                         for q in range(3):
                             out[stage, i, q] -= flow * T[2, q]

@@ -81,7 +81,7 @@ def attitude_torque(T, omega, desired, inertia, k_R, k_omega, tau):
     """Torque tau (3,) [N m] that leads the attitude T (3, 3) with rates omega (3,) to a desired one (5, 3).
 
     With E = T_d T^T, from body to desired body axes, the errors are e_R = (E - E^T)^v / 2 and
-    e_omega = omega - E^T omega_d, and (Lee et al. 2010, Eq. (16), gains per unit inertia)
+    e_omega = omega - E^T omega_d, and (Lee et al. 2010; gains per unit inertia)
 
         tau = I (-k_R e_R - k_omega e_omega - omega x E^T omega_d + E^T domega_d) + omega x I omega.
     """

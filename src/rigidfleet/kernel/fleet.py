@@ -4,6 +4,7 @@ N vehicles, m edges. World axes are x, y horizontal and z up; body axes are x fo
 its scalar first, and T(q) takes world axes to body axes, as in `rigidfleet.math.attitude`.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -57,7 +58,7 @@ class Vehicle:
     Raises
     ------
     ValueError
-        The rotors do not span thrust and three torques.
+        The rotors do not span thrust and three torques, or do not surround the centre of mass.
     """
 
     m: float  # [kg]
@@ -107,7 +108,13 @@ class Vehicle:
                 f"rotors at {rotors.tolist()} that turn by {spin.tolist()} do not span thrust and three torques; move"
                 " one, or turn it the other way"
             )
-        return np.linalg.inv(mixing)
+        inverse = np.linalg.inv(mixing)
+        if not (inverse[:, 0] > 0.0).all():
+            raise ValueError(
+                f"rotors at {rotors.tolist()} cannot hover: one of them would have to pull down; place them around the"
+                " centre of mass"
+            )
+        return inverse
 
 
 class Quadrotors(NamedTuple):
@@ -230,9 +237,7 @@ class SampledState(NamedTuple):
     clock: Floats  # (2,) time, and time of the last evaluation of the law [s]
     count: Ints  # (5,) see `STEPS`
     integral: Floats  # (1, m) of the constraints [m s]; (N, m) if linked
-    frame: (
-        Floats  # (3, 4) mean-axis quaternion at the last evaluation, its rate, and the rate before
-    )
+    frame: Floats  # (3, 4) mean-axis quaternion at the last evaluation, its rate, the one before
     error: Floats  # (N, 3) integral of the tracking error [m s]
     f_u: Floats  # (N, 3) input force of the law, held [N]
     f_C: Floats  # (N, 3) its constraint force [N]
@@ -257,9 +262,7 @@ class SampledWork(NamedTuple):
     """Work arrays of a sampled flight."""
 
     y: Floats  # (7, 17) start, trial, four derivatives, end
-    air: (
-        Floats  # (3, N, 3) velocity of the air at the start, the middle and the end of a step [m/s]
-    )
+    air: Floats  # (3, N, 3) velocity of the air: start, middle and end of a step [m/s]
     T: Floats  # (3, 3)
     desired: Floats  # (5, 3) desired attitude (3, 3), its rates and accelerations
     x: Floats  # (4, 4)
@@ -298,6 +301,36 @@ class Evaluation(NamedTuple):
     push: Floats  # (N, 3) [N]
     T: Floats  # (3, 3) work
     dS: Floats  # (N, 17), written
+
+
+# Turbulent jet below a hovering quadrotor: decay and spread of its far field, and its virtual origin in distances of
+# opposite motors (Bauersfeld et al. 2024, arXiv:2403.13321, the ninth equation).
+_DECAY, _SPREAD, _ORIGIN = 10.11, 0.07668, -5.817
+
+
+def jet_speed(weight, density, radius, span, s, rr):
+    """Speed [m/s] of the air below a hovering quadrotor, along its z axis.
+
+    At a distance s [m] below the vehicle along that axis and r beside it, with l the distance of opposite motors and
+    x = s/l + 5.817 (Bauersfeld et al. 2024, arXiv:2403.13321),
+
+        U = 10.11 U_H / (x (1 + (sqrt(2) - 1) (r / (0.07668 l x))^2)^2),  U_H^2 = m g / (8 pi density radius^2).
+
+    The fit holds from s = 2.5 l on and for hover; nearer, it is an extrapolation.
+
+    Parameters
+    ----------
+    weight : m g [N]
+    density : of the air [kg/m^3]
+    radius : of a rotor [m]
+    span : distance of opposite motors l [m]
+    s, rr : distance below [m], squared distance beside the axis [m^2]
+    """
+    far = s / span - _ORIGIN
+    width = _SPREAD * span * far
+    profile = 1.0 + (math.sqrt(2.0) - 1.0) * rr / (width * width)
+    hover = math.sqrt(weight / (8.0 * math.pi * density * radius * radius))
+    return hover * _DECAY / (far * profile * profile)
 
 
 # -- making them -------------------------------------------------------------------------------------
@@ -383,9 +416,7 @@ def begin(
     depth = 1 + int(sensing.delay.max()) + (int(sensing.link_delay.max()) if sensing.linked else 0)
     known = np.ascontiguousarray(S[:, :6])
     past = np.tile(known, (depth, 1, 1))
-    attitude = np.zeros((3, 4))
-    attitude[0] = (1.0, 0.0, 0.0, 0.0) if frame is None else frame
-    size = 6 * n + m + 4
+    attitude = _frame(frame)
     curves = given.vehicles.thrust.T[:, :, None]
     peak = np.where(given.vehicles.point[:, None], 0.0, thrust_of(S[:, 13:], *curves))
     worst = np.zeros((n, 5))
@@ -402,10 +433,38 @@ def begin(
         command=np.zeros((n, 4)), saturated=np.zeros(n, dtype=np.bool_), seen=known, history=past, sent=past.copy(),
         heard=np.tile(known, (n if sensing.linked else 0, 1, 1)), peak=peak, peak_time=times[:, :4].copy(),
         worst=worst, worst_time=times, saturations=np.zeros(n, dtype=np.int64), trail=trail,
-        work=SampledWork(
-            zeros(7, STATES), zeros(3, n, 3), np.eye(3), np.zeros((5, 3)), np.zeros((4, 4)), np.zeros(1),
-            np.zeros((1, size)), np.zeros(size),
-        ),
+        work=_work(n, m),
+    )  # fmt: skip
+
+
+def renewed(
+    state: SampledState, workspace: Workspace, integral: Floats, *, frame: Floats | None = None
+) -> SampledState:
+    """The same flight under another problem, such as that of the next phase, whose edges may be others.
+
+    With ``integral`` (m,) of its constraints [m s] and its frame, a quaternion (4,). The old state shares arrays with
+    the new one and must not be used further.
+    """
+    state.clock[1], state.count[LAWS] = state.clock[0], 0
+    views, n = len(state.integral), len(state.S)
+    return state._replace(
+        integral=np.tile(np.asarray(integral, dtype=float), (views, 1)), frame=_frame(frame),
+        work=_work(n, len(workspace.c)),
+    )  # fmt: skip
+
+
+def _frame(q: Floats | None) -> Floats:
+    """A frame at the start, which has no rates yet."""
+    rows = np.zeros((3, 4))
+    rows[0] = (1.0, 0.0, 0.0, 0.0) if q is None else q
+    return rows
+
+
+def _work(n: int, m: int) -> SampledWork:
+    size = 6 * n + m + 4
+    return SampledWork(
+        zeros(7, STATES), zeros(3, n, 3), np.eye(3), np.zeros((5, 3)), np.zeros((4, 4)), np.zeros(1),
+        np.zeros((1, size)), np.zeros(size),
     )  # fmt: skip
 
 

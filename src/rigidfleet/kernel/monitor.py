@@ -3,11 +3,7 @@
 The integrator records every step in its `Trail`: the continuous extension of each state, a polynomial of fourth
 degree, by its Bernstein coefficients (control points), and the forces at the end of the step.
 
-Extremes of distances are exact. A polynomial in Bernstein form lies in the convex hull of its coefficients, so the
-least coefficient bounds it from below. If the bound of a step is no worse than the worst value so far, the step is
-done. Otherwise it is halved by de Casteljau's algorithm, until the bound of each piece is within `CLOSE` of an
-attained value. Squared distances of two agents are polynomials of eighth degree. The distance to a box is convex and
-nowhere below its tangent plane, so the least coefficient along the plane's normal bounds it. In the body formulation,
+Extremes of distances are exact: `kernel.bernstein` finds the least value of each curve. In the body formulation,
 positions in the world are quartics through five points of each step. The steps are cut so short that these quartics
 are exact to 1e-9 of the formation's size.
 
@@ -22,8 +18,17 @@ do not depend on where the trail is cut, because the order of evaluations does n
 
 import math
 
-import numpy as np
-
+from rigidfleet.kernel.bernstein import (
+    CLOSE,
+    from_box,
+    length_at,
+    lowest,
+    lowest_overlap,
+    nearest_box,
+    shortest,
+    square,
+    weights,
+)
 from rigidfleet.kernel.compiler.jit import compiled
 from rigidfleet.kernel.gauge import read_gauge
 from rigidfleet.kernel.outside import call_recorder
@@ -48,259 +53,12 @@ from rigidfleet.kernel.records import (
     THRUST_MARGIN,
 )
 
-#: Accuracy of a least value [m, m/s], and relative accuracy of a greatest force, direct and iterated.
-CLOSE, _CLOSE_FORCE, _CLOSE_ITERATED = 1e-9, 1e-7, 1e-6
-#: Length of the shortest piece of a step.
-_SHORTEST = 2.0**-32
-#: Maximum number of pieces examined per step.
-_MOST = 10_000
-#: Rounding error, as a share of a number's size.
-_ROUNDING = 4e-15
+#: Relative accuracy of a greatest force, direct and iterated.
+_CLOSE_FORCE, _CLOSE_ITERATED = 1e-7, 1e-6
 #: Greatest rotation of one piece of a step in the body formulation [rad].
 _TURN = 0.1
 #: Least interval in which a peak of forces is searched, as a share of the whole interval.
 _NARROW = 1e-3
-
-#: Coefficients of a square: C(4, i) C(4, j) / C(8, i + j).
-_SQUARE = np.array(
-    [[math.comb(4, i) * math.comb(4, j) / math.comb(8, i + j) for j in range(5)] for i in range(5)]
-)
-
-
-@compiled
-def lowest(work, degree, floor):
-    """Least value of a polynomial over [0, 1] and its place, if below ``floor``; otherwise ``floor`` and -1.
-
-    ``work[0]`` holds the Bernstein coefficients. The value is exact to `CLOSE` and rounding; for squares, of eighth
-    degree, its root is. After `_MOST` pieces, more than any known flight needs, the bound itself is returned, which
-    errs on the safe side.
-    """
-    best, at, top, pieces, size = floor, -1.0, 0, 0, 0.0
-    start, width = degree + 1, degree + 2
-    work[0, start], work[0, width] = 0.0, 1.0
-    for k in range(degree + 1):
-        size = max(size, abs(work[0, k]))
-    while top >= 0:
-        piece, pieces = work[top], pieces + 1
-        bound, value = piece[0], piece[0]
-        for k in range(1, degree + 1):
-            bound = min(bound, piece[k])
-        if piece[degree] < value:
-            value = piece[degree]
-            if value < best:
-                best, at = value, piece[start] + piece[width]
-        elif value < best:
-            best, at = value, piece[start]
-        close = CLOSE
-        if degree == 8:
-            close = CLOSE * (2.0 * math.sqrt(min(abs(best), size)) + CLOSE)
-        close = max(close, _ROUNDING * size)
-        if bound < best - close and pieces > _MOST:
-            best, at = bound, piece[start]
-        if not bound < best - close or piece[width] <= _SHORTEST:
-            top -= 1
-            continue
-        left = work[top + 1]
-        half = 0.5 * piece[width]
-        left[start], left[width] = piece[start], half
-        piece[start] += half
-        piece[width] = half
-        left[0] = piece[0]
-        for k in range(1, degree + 1):
-            for i in range(degree + 1 - k):
-                piece[i] = 0.5 * (piece[i] + piece[i + 1])
-            left[k] = piece[0]
-        top += 1
-    return best, at
-
-
-@compiled
-def halve(piece, left):
-    """Halve a curve (15 control points, start and width): write its first half into ``left``, keep the second."""
-    half = 0.5 * piece[16]
-    left[15], left[16] = piece[15], half
-    piece[15] += half
-    piece[16] = half
-    for q in range(3):
-        left[q] = piece[q]
-    for k in range(1, 5):
-        for i in range(5 - k):
-            for q in range(3):
-                piece[3 * i + q] = 0.5 * (piece[3 * i + q] + piece[3 * i + 3 + q])
-        for q in range(3):
-            left[3 * k + q] = piece[q]
-
-
-@compiled
-def square(points, sign, out):
-    """Bernstein coefficients (9,) of sign |r|^2 of a curve with control points (15,)."""
-    for k in range(9):
-        out[k] = 0.0
-    for i in range(5):
-        for j in range(5):
-            dot = 0.0
-            for q in range(3):
-                dot += points[3 * i + q] * points[3 * j + q]
-            out[i + j] += sign * _SQUARE[i, j] * dot
-
-
-@compiled
-def length_at(points, x):
-    """|r| of a curve with control points (15,) at x."""
-    rest, total = 1.0 - x, 0.0
-    for q in range(3):
-        value = rest**4 * points[q] + x**4 * points[12 + q]
-        value += 4.0 * x * rest * (rest * rest * points[3 + q] + x * x * points[9 + q])
-        value += 6.0 * x * x * rest * rest * points[6 + q]
-        total += value * value
-    return math.sqrt(total)
-
-
-@compiled
-def shortest(curve, floor, work, pieces):
-    """Least |r| of a curve with control points (5, 3) and its place, if below ``floor``; otherwise ``floor`` and -1.
-
-    Rounding of a squared length of some metres hides lengths of a millimetre. Therefore both halves of a long piece
-    are examined again once their least length is roughly known.
-    """
-    best, at, top, count = floor, -1.0, 0, 0
-    for k in range(5):
-        for q in range(3):
-            pieces[0, 3 * k + q] = curve[k, q]
-    pieces[0, 15], pieces[0, 16] = 0.0, 1.0
-    while top >= 0:
-        piece, count = pieces[top], count + 1
-        middle, along, size = 0.0, math.inf, 0.0
-        for q in range(3):
-            middle += piece[6 + q] * piece[6 + q]
-        for k in range(5):
-            dot, far = 0.0, 0.0
-            for q in range(3):
-                dot += piece[6 + q] * piece[3 * k + q]
-                far += piece[3 * k + q] * piece[3 * k + q]
-            along, size = min(along, dot), max(size, far)
-        top -= 1
-        if middle > 0.0 and not along < best * math.sqrt(middle):
-            continue
-        start = length_at(piece, 0.0)
-        if start < best:
-            best, at = start, piece[15]
-        square(piece, 1.0, work[0])
-        _, found = lowest(work, 8, best * best)
-        if found >= 0.0:
-            length = length_at(piece, found)
-            if length < best:
-                best, at = length, piece[15] + found * piece[16]
-        close = max(CLOSE, _ROUNDING * math.sqrt(size))  # the accuracy that rounding allows
-        known = _ROUNDING * size <= close * max(2.0 * best, 1e-5)
-        if count > _MOST and not known and along < best * math.sqrt(middle):
-            best, at = along / math.sqrt(middle), piece[15]
-        elif not known and piece[16] > _SHORTEST:
-            halve(piece, pieces[top + 2])
-            top += 2
-    return best, at
-
-
-@compiled
-def from_box(x, y, z, box, normal):
-    """Signed distance of a point from a box (6,), negative inside; writes the normal of a supporting plane."""
-    inside, face = -math.inf, 0
-    outside = 0.0
-    for q in range(3):
-        r = x if q == 0 else y if q == 1 else z
-        below, above = box[q] - r, r - box[3 + q]
-        beyond = max(below, above)
-        if beyond > inside:
-            inside, face = beyond, q
-        out = max(beyond, 0.0)
-        outside += out * out
-        normal[q] = -out if below > above else out
-    if outside > 0.0:
-        outside = math.sqrt(outside)
-        for q in range(3):
-            normal[q] /= outside
-        return outside
-    r = x if face == 0 else y if face == 1 else z
-    for q in range(3):
-        normal[q] = 0.0
-    normal[face] = -1.0 if box[face] - r > r - box[3 + face] else 1.0
-    return inside
-
-
-@compiled
-def beyond_plane(piece, box, normal):
-    """Lower bound of the distance between a box and a curve with control points (15,).
-
-    The tangent plane at any point gives a bound; the middle control point is near the curve.
-    """
-    x, y, z = piece[6], piece[7], piece[8]
-    distance, least = from_box(x, y, z, box, normal), 0.0
-    a, b, c = normal[0], normal[1], normal[2]
-    for k in range(0, 15, 3):
-        least = min(least, a * (piece[k] - x) + b * (piece[k + 1] - y) + c * (piece[k + 2] - z))
-    return distance + least
-
-
-@compiled
-def nearest_box(curve, box, floor, pieces, normal):
-    """Least distance of a curve with control points (5, 3) from a box, if below ``floor``, and its place; else -1."""
-    best, at, top, count, close = floor, -1.0, 0, 0, CLOSE
-    for k in range(5):
-        for q in range(3):
-            pieces[0, 3 * k + q] = curve[k, q]
-    if not beyond_plane(pieces[0], box, normal) < floor:
-        return best, at
-    pieces[0, 15], pieces[0, 16] = 0.0, 1.0
-    for k in range(15):
-        close = max(close, _ROUNDING * abs(pieces[0, k]))
-    while top >= 0:
-        piece, count = pieces[top], count + 1
-        for k in (0, 4):
-            distance = from_box(piece[3 * k], piece[3 * k + 1], piece[3 * k + 2], box, normal)
-            if distance < best:
-                best, at = distance, piece[15] + (piece[16] if k == 4 else 0.0)
-        bound = beyond_plane(piece, box, normal)
-        if bound < best - close and count > _MOST:
-            best, at = bound, piece[15]
-        if not bound < best - close or piece[16] <= _SHORTEST:
-            top -= 1
-            continue
-        halve(piece, pieces[top + 1])
-        top += 1
-    return best, at
-
-
-@compiled
-def lowest_overlap(points, reach, floor, pieces):
-    """Least |z| of a curve with control points (5, 3) while within ``reach`` of the z axis, and its place."""
-    best, at, top, count, close = floor, -1.0, 0, 0, CLOSE
-    for k in range(5):
-        for q in range(3):
-            pieces[0, 3 * k + q] = points[k, q]
-            close = max(close, _ROUNDING * abs(points[k, q]))
-    pieces[0, 15], pieces[0, 16] = 0.0, 1.0
-    while top >= 0:
-        piece, count = pieces[top], count + 1
-        for k in (0, 4):
-            x, y, z = piece[3 * k], piece[3 * k + 1], abs(piece[3 * k + 2])
-            if x * x + y * y <= reach * reach and z < best:
-                best, at = z, piece[15] + (piece[16] if k == 4 else 0.0)
-        x, y = piece[6], piece[7]
-        along, low, high = math.inf, math.inf, -math.inf
-        for k in range(5):
-            along = min(along, x * piece[3 * k] + y * piece[3 * k + 1])
-            low, high = min(low, piece[3 * k + 2]), max(high, piece[3 * k + 2])
-        apart = along > reach * math.sqrt(x * x + y * y)
-        bound = max(0.0, low, -high)
-        if apart or not bound < best - close:
-            top -= 1
-        elif piece[16] <= _SHORTEST or count > _MOST:  # at the limit of an overlap: count it as one
-            best, at = bound, piece[15]
-            top -= 1
-        else:
-            halve(piece, pieces[top + 1])
-            top += 1
-    return best, at
 
 
 @compiled
@@ -330,14 +88,6 @@ def angle_of(points, p):
                 rate += d * d
         fastest, size = max(fastest, rate), min(size, here)
     return 2.0 * math.sqrt(fastest) / max(math.sqrt(size), 1e-3)
-
-
-@compiled
-def weights(x, out):
-    """Bernstein polynomials (5,) of fourth degree at x."""
-    y = 1.0 - x
-    out[0], out[1], out[2] = y**4, 4.0 * x * y**3, 6.0 * x * x * y * y
-    out[3], out[4] = 4.0 * x**3 * y, x**4
 
 
 @compiled

@@ -14,16 +14,19 @@ from rigidfleet.typing import Floats
 
 #: Number of coefficients of a piece.
 POWERS = 8
-#: From what position, velocity, acceleration and jerk lack at the end of a piece of unit length to its coefficients
-#: 4 to 7: the inverse of the rows k! / (k - m)! of u^k, k = 4..7, at u = 1, for the derivatives m = 0..3.
-_ENDS = np.array(
-    [
-        [35.0, -15.0, 2.5, -1 / 6],
-        [-84.0, 39.0, -7.0, 0.5],
-        [70.0, -34.0, 6.5, -0.5],
-        [-20.0, 10.0, -2.0, 1 / 6],
-    ]
-)
+#: From the derivatives that lack at the end of a piece of unit length to its highest coefficients, by the number of
+#: derivatives: the inverse of the rows k! / (k - m)! of u^k at u = 1.
+_ENDS = {
+    2: np.array([[3.0, -1.0], [-2.0, 1.0]]),
+    4: np.array(
+        [
+            [35.0, -15.0, 2.5, -1 / 6],
+            [-84.0, 39.0, -7.0, 0.5],
+            [70.0, -34.0, 6.5, -0.5],
+            [-20.0, 10.0, -2.0, 1 / 6],
+        ]
+    ),
+}
 
 
 def septic_pieces(times: Floats, x: Floats) -> Floats:
@@ -32,15 +35,19 @@ def septic_pieces(times: Floats, x: Floats) -> Floats:
     x(t) = sum_p pieces[i, ..., p] (t - times[i])^p for times[i] <= t <= times[i + 1], with three continuous
     derivatives.
     """
-    h = np.diff(times).reshape(-1, *(1,) * (x.ndim - 2))
-    a, b = series.from_derivatives(x)[:, :-1], x[:, 1:]
-    scale = np.stack([h**m for m in range(POWERS)])
-    start = a * scale[:4]  # coefficients in u = (t - t0) / h
+    return hermite(np.diff(times), x[:, :-1], x[:, 1:])
+
+
+def hermite(h: Floats, begin: Floats, end: Floats) -> Floats:
+    """Polynomials (n, ..., 2 m) of widths h (n,) with m derivatives ``begin`` and ``end`` (m, n, ...); m is 2 or 4."""
+    m = len(begin)
+    h = h.reshape(-1, *(1,) * (begin.ndim - 2))
+    scale = np.stack([h**k for k in range(2 * m)])
+    start = series.from_derivatives(begin) * scale[:m]  # coefficients in u = (t - t0) / h
     reached = [
-        sum(start[k] * np.prod(np.arange(k, k - m, -1.0)) for k in range(m, 4)) for m in range(4)
+        sum(start[k] * np.prod(np.arange(k, k - j, -1.0)) for k in range(j, m)) for j in range(m)
     ]
-    lacking = b * scale[:4] - np.stack(reached)
-    rest = np.tensordot(_ENDS, lacking, 1)
+    rest = np.tensordot(_ENDS[m], end * scale[:m] - np.stack(reached), 1)
     return np.moveaxis(np.concatenate([start, rest]) / scale, 0, -1)
 
 

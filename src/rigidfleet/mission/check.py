@@ -33,12 +33,12 @@ from rigidfleet.mission.schema import (
     Lqr,
     MissionHeader,
     Obstacle,
-    Part,
     Regulator,
     Start,
     Tracking,
     VehicleYaw,
 )
+from rigidfleet.mission.values import Part
 
 _TABLES: dict[str, type[Part]] = {
     "agents": Agents,
@@ -69,7 +69,7 @@ def check(data: Mapping[str, Any], origin: str) -> dict[str, Any]:
     if collector.findings:  # the other checks would take long
         raise MissionError(collector.findings)
     parts = _tables(collector)
-    for judge in (_agents, _gains, _regulators, _tracking, _allocation, _geofence, _yaw):
+    for judge in (_agents, _gains, _regulators, _tracking, _allocation, _geofence, _yaw, _planned):
         judge(collector, parts)
     n = _count(data)
     parts["obstacles"] = _obstacles(collector)
@@ -330,6 +330,18 @@ def _yaw(collector: FindingCollector, parts: dict[str, Any]) -> None:
         if key in yaw.model_fields_set and yaw.kind != kind:
             problem = f"has no effect with kind '{yaw.kind}'"
             collector.add(("yaw", key), problem, f"remove it or use kind = '{kind}'")
+
+
+def _planned(collector: FindingCollector, parts: dict[str, Any]) -> None:
+    """Find limits of the plan in a mission whose plan keeps none."""
+    limits = parts.get("limits", Limits())
+    flown = "vehicle" in collector.data.get("agents", {})  # the verdict judges the tilt of vehicles
+    for key in ("jerk",) if flown else ("jerk", "tilt_deg"):
+        if getattr(limits, key) is not None and parts.get("smoothness") == "lqr":
+            problem = "has no effect: only the plan of a smooth mission keeps it"
+            collector.add(
+                ("limits", key), problem, "remove it or add smoothness = 'jerk' at the top"
+            )
 
 
 def _ordered(collector: FindingCollector, box: Box | Geofence, path: tuple[str | int, ...]) -> None:

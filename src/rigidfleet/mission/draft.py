@@ -182,7 +182,7 @@ def _start(slots: Floats, apart: float) -> tuple[Floats, bool]:
 
 
 def _blend(way: float) -> int:
-    """Duration [s] of a blend over a distance [m] that keeps to `_SPEED` and `_ACCELERATION`.
+    """Duration [s] of a blend, or of a smooth flight, over a distance [m] that keeps to `_SPEED` and `_ACCELERATION`.
 
     The septic blend has a peak rate of 35/16 times the mean and a peak second derivative of 7.52.
     """
@@ -208,9 +208,7 @@ def _flights(at: Floats, waypoints: Sequence[Sequence[float]]) -> list[tuple[str
 
 def _time(way: Floats) -> int:
     """Duration [s] of a rest-to-rest flight by a vector (3,) [m] that keeps to `_SPEED` and `_ACCELERATION`."""
-    distance = float(np.linalg.norm(way))
-    least = max(1.5 * distance / _SPEED, math.sqrt(6.0 * distance / _ACCELERATION))
-    return max(4, math.ceil(least))
+    return max(4, _blend(float(np.linalg.norm(way))))
 
 
 def _aligned(text: str) -> str:
@@ -239,6 +237,7 @@ _HEAD = """\
 schema_version = 1
 name = {name}                   # results are written to flights/NAME
 title = "{title}"
+smoothness = "jerk"               # acceleration and jerk are continuous; "lqr": the legs of the paper
 {keys}
 [agents]
 mass = {mass}                        # [kg] one number for all, or a list
@@ -265,8 +264,9 @@ kind = "ground"
 [limits]                          # limits that the verdict checks
 separation = {separation}                  # [m] minimum distance between surfaces
 {below}separation_below = 0.8            # [m] minimum height above another agent (downwash)
-# speed = 6.0                     # [m/s]
+# speed = 6.0                     # [m/s]; with limits, duration = "auto" takes the least time that keeps them
 # acceleration = 4.0              # [m/s^2]
+# jerk = 6.0                      # [m/s^3]
 # geofence = {{min = [-50, -50, 0], max = [50, 50, 30]}}
 
 # -- the flight: phases in order, each ending after its duration [s] ------------------------------

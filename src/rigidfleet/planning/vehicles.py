@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,7 +26,7 @@ _BLOCK = 1024
 #: Kinds of random numbers.
 _NOISE, _DROPPED, _UNHEARD = 2, 3, 4
 #: Density of the air at sea level, ICAO standard atmosphere [kg/m^3].
-_DENSITY = 1.225
+DENSITY = 1.225
 #: Speed below which the direction of quadratic drag is rounded off [m/s].
 _STILL = 0.1
 #: Time in which a vehicle turns from its yaw at a switch to the yaw asked for [s].
@@ -58,7 +59,7 @@ def sampled_flight(mission: Mission) -> fleet.Flight:
         gust=around.gust,
         downwash=d is not None and d.downwash,
         ground_effect=d is not None and d.ground_effect and bool(grounds),
-        density=_DENSITY,
+        density=DENSITY,
         ground=max(grounds, default=0.0),
         floor=around.floor,
     )
@@ -149,13 +150,11 @@ class TickTables:
         found = slot_derivatives(self._source.reference, self._source.motion, time, 2)
         return np.concatenate([found[0, 0], found[0, 1]], axis=1)
 
-    def made(
-        self, first: int, last: int, problem: Problem, begun: float, start: Floats
-    ) -> fleet.Tables:
-        """Tables for ticks from ``first`` to before ``last``, in a phase begun at a time [s] with yaws (N,) [rad]."""
+    def made(self, first: int, last: int, problem: Problem, turn: Turn) -> fleet.Tables:
+        """Tables for ticks from ``first`` to before ``last``; ``turn`` is that of the phase."""
         sensing = self.flight.sensing
         time = np.arange(first, last) / self.rate
-        yaw, found = _references(problem, time, self.yaw, begun, start)
+        yaw, found = _references(problem, time, self.yaw, turn)
         jerk, snap = self._force_rates(found)
         path = np.zeros((0, self.n, 6))
         if self.compensated:
@@ -200,32 +199,50 @@ class TickTables:
         return np.ascontiguousarray(jerk), np.ascontiguousarray(snap)
 
 
-def yaw_at(problem: Problem, t: float, yaw: Yaw, begun: float, start: Floats) -> Floats:
-    """Yaw (N,) [rad] asked of each vehicle at a time [s] of a phase; see `TickTables.made`."""
-    return _references(problem, np.array([t]), yaw, begun, start)[0][0, :, 0]
+class Turn(NamedTuple):
+    """How vehicles turn from their yaw at a time into the one asked for."""
+
+    begun: float  # [s]
+    start: Floats  # (N,) yaw there [rad]
+    off: Floats  # (N,) what it differs by from the one asked for [rad]
 
 
-def _references(
-    problem: Problem, time: Floats, yaw: Yaw, begun: float, start: Floats
-) -> tuple[Floats, Floats]:
+def turn_from(problem: Problem, t: float, yaw: Yaw, start: Floats) -> Turn:
+    """The turn of vehicles with yaws ``start`` (N,) [rad] at a time [s] of a problem, at which its motion begins."""
+    if problem.control.kind != TRACKING or yaw.kind == "along":
+        return Turn(t, start, np.zeros(len(start)))
+    off = start - yaw_derivatives(problem.reference, problem.motion, np.array([t]), yaw)[0, 0]
+    if yaw.kind != "formation":
+        off = (off + np.pi) % (2.0 * np.pi) - np.pi
+    return Turn(t, start, off)
+
+
+def yaw_at(problem: Problem, t: float, yaw: Yaw, turn: Turn) -> Floats:
+    """Yaw (N,) [rad] asked of each vehicle at a time [s] of a phase."""
+    if t <= turn.begun:
+        return turn.start
+    return _references(problem, np.array([t]), yaw, turn)[0][0, :, 0]
+
+
+def _references(problem: Problem, time: Floats, yaw: Yaw, turn: Turn) -> tuple[Floats, Floats]:
     """Yaw with two derivatives (K, N, 3) of each vehicle at times (K,) [s], and its reference (K, 5, N, 3).
 
     A vehicle turns with the formation, or from its yaw at the start of the phase into the one asked for.
     """
-    n = len(start)
+    n = len(turn.start)
     if problem.control.kind != TRACKING or not len(time):
         still = np.zeros((len(time), n, 3))
-        still[..., 0] = start
+        still[..., 0] = turn.start
         return still, np.zeros((0, 5, n, 3))
     reference, motion = problem.reference, problem.motion
     found = slot_derivatives(reference, motion, time)
-    whole = np.concatenate([[begun], time])
-    turned = yaw_derivatives(reference, motion, whole, yaw, start if yaw.kind == "along" else None)
-    first, turned = turned[0, 0], turned[1:].swapaxes(1, 2).copy()
-    off = start - first
+    whole = np.concatenate([[turn.begun], time])
+    turned = yaw_derivatives(
+        reference, motion, whole, yaw, turn.start if yaw.kind == "along" else None
+    )
+    turned = turned[1:].swapaxes(1, 2).copy()
     if yaw.kind != "formation":
-        off = (off + np.pi) % (2.0 * np.pi) - np.pi
-        x = np.clip((time - begun) / _TURN_TIME, 0.0, 1.0)
+        x = np.clip((time - turn.begun) / _TURN_TIME, 0.0, 1.0)
         rest = np.stack(
             [
                 1.0 - septic_polynomial(x),
@@ -234,9 +251,9 @@ def _references(
             ],
             axis=1,
         )
-        turned += rest[:, None, :] * off[:, None]
+        turned += rest[:, None, :] * turn.off[:, None]
     else:
-        turned[..., 0] += off
+        turned[..., 0] += turn.off
     return np.ascontiguousarray(turned), found
 
 
@@ -262,4 +279,4 @@ def _block(kind: int, seed: int, block: int, shape: tuple[int, ...]) -> Floats:
     return random.standard_normal(size) if kind == _NOISE else random.random(size)
 
 
-__all__ = ["Bools", "TickTables", "kernel_vehicle", "sampled_flight", "yaw_at"]
+__all__ = ["Bools", "TickTables", "kernel_vehicle", "sampled_flight", "turn_from", "yaw_at"]

@@ -30,6 +30,7 @@ from rigidfleet.plotting.curves import (
     inputs,
 )
 from rigidfleet.plotting.page import summary
+from rigidfleet.plotting.quadrotors import has_rotors, rotors, vehicles
 from rigidfleet.plotting.space import formations, trajectory
 from rigidfleet.plotting.style import agent_colours, settings
 from rigidfleet.plotting.style import titles as shown_titles
@@ -54,15 +55,17 @@ __all__ = [
     "formations",
     "inputs",
     "plot",
+    "rotors",
     "summary",
     "trajectory",
+    "vehicles",
 ]
 
 _FIGURES: dict[str, Callable[[Result], Figure]] = {
     draw.__name__: draw
     for draw in (
         summary, trajectory, distances, cm, attitude, inputs, constraint_force, constraint_error,
-        clearance, formations, disturbance,
+        clearance, formations, disturbance, rotors, vehicles,
     )
 }  # fmt: skip
 #: File formats of figures.
@@ -84,6 +87,8 @@ def figure_names(result: Result | None = None) -> list[str]:
         "formations": not result.mission.formations,
         "clearance": result.n_agents == 1 and not result.mission.obstacles,
         "disturbance": result.disturbance_force is None,
+        "rotors": not has_rotors(result),
+        "vehicles": not has_rotors(result),
     }
     empty["constraint_error"] = empty["distances"] and empty["formations"]
     return [name for name in _FIGURES if not empty.get(name)]

@@ -10,9 +10,10 @@ import numpy as np
 
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
+from rigidfleet.plotting import peaks
 from rigidfleet.plotting import style as st
 from rigidfleet.plotting.style import styled
-from rigidfleet.result import Extremum, Result
+from rigidfleet.result import Result
 from rigidfleet.typing import Floats
 
 if TYPE_CHECKING:
@@ -20,12 +21,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
-    from rigidfleet.mission import Mission
 
 SINGLE = 6  # greatest number of edges with a colour each; more edges share one by length
 _PAIRS = 5e7  # greatest number of pair distances computed in all
 _SMALLEST = 1e-12  # least error drawn on a logarithmic axis [m]; smaller ones are rounding
-_IDLE = 1e-6  # force [N] or displacement [m] below which there is only rounding
 _LOW = 0.45  # height of a row in which nothing happens, as a share of the full height
 _TOLD = 0.7  # height of a row that holds only text
 
@@ -283,127 +282,34 @@ def attitude(result: Result) -> Figure:
 # -- forces ------------------------------------------------------------------------------------------
 
 
-def thrust_limits(mission: Mission) -> list[tuple[float, str, str]]:
-    """Each distinct thrust limit [N] with a label and a colour; the agent's colour if only one agent has it."""
-    limits = mission.fleet.thrust_limit
-    colours = st.agent_colours(len(limits))
-    found = []
-    for value in np.unique(limits[np.isfinite(limits)]).tolist():
-        of = np.flatnonzero(limits == value)
-        colour = colours[of[0]] if len(of) == 1 < len(limits) else st.ALERT
-        who = "" if len(of) == len(limits) else " of " + ", ".join(str(i + 1) for i in of[:6])
-        found.append((value, f"limit{who} {value:g} N", colour))
-    return found
-
-
 def draw_thrust(ax: Axes, result: Result) -> None:
     """Thrust of each agent with its limit, from zero."""
-    ax.set_ylabel(r"thrust $|f_u + f_C|$ [N]")
+    flown = result.rotor_force is not None  # rotors give what was asked for a little earlier
+    ax.set_ylabel("thrust [N]" if flown else r"thrust $|f_u + f_C|$ [N]")
     st.agent_lines(ax, result, result.thrust)
-    limits = thrust_limits(result.mission)
+    limits = peaks.limits(result.mission.fleet.thrust_limit)
     for value, label, colour in limits:
         st.limit(ax, value, label, colour)
-    top = max([*(value for value, *_ in limits), _sane(result, result.thrust)])
+    top = max([*(value for value, *_ in limits), peaks.sane(result, result.thrust)])
     ax.set_ylim(0, 1.12 * top if top > 0 else 1.0)
-    _extremes(ax, result, result.thrust, "N", _agent, name="thrust", always=False)
-
-
-def _sane(result: Result, values: Floats) -> float:
-    """Greatest value; if the flight broke down, the greatest one before the final peak."""
-    size = np.abs(values[np.isfinite(values)])
-    if not len(size):
-        return 0.0
-    usual = float(np.quantile(size, 0.99))
-    peak = float(size.max())
-    return peak if result.complete or peak < 10 * usual else 2 * usual
+    peaks.extremes(ax, result, result.thrust, "N", peaks.agent, name="thrust", always=False)
 
 
 @styled
 def inputs(result: Result) -> Figure:
-    """Thrust |f_u + f_C| of each agent with its limit, and enlarged."""
+    """Thrust of each agent with its limit, and enlarged."""
     fig, axes = st.time_figure(result, "Thrust of each agent", 2)
     above, below = axes[:, 0]
     draw_thrust(above, result)
     st.agent_lines(below, result, result.thrust)
     below.set_ylabel("enlarged [N]")
     if not st.still(below, result.thrust, "N"):
-        _within(below, result, result.thrust)
-        widen(below, 0.1)
-        _extremes(below, result, result.thrust, "N", _agent, name="thrust")
+        peaks.within(below, result, result.thrust)
+        widen(below, min(0.1, 0.1 * peaks.sane(result, result.thrust)))
+        peaks.extremes(below, result, result.thrust, "N", peaks.agent, name="thrust")
     st.agents_legend(above, result.n_agents)
     st.name_phases(fig, [above], result)
     return fig
-
-
-def _agent(i: int) -> str:
-    return f"agent {i + 1}"
-
-
-def _edge(x: Extremum) -> str:
-    return f"edge {x.who + 1}-{x.other + 1}"
-
-
-def _extremes(
-    ax: Axes,
-    result: Result,
-    values: Floats,
-    unit: str,
-    who: Callable[[int], str],
-    *,
-    name: str = "",
-    always: bool = True,
-) -> None:
-    """Write the greatest of values (K, n) into the axes, and mark values off the scale at top and bottom.
-
-    The greatest value between samples counts, too, if the record has it by ``name``. Without ``always``, only
-    values off the scale are written.
-    """
-    between = result.extreme(name)
-    low, high = ax.get_ylim()
-    for sign, edge, marker in ((1.0, high, "^"), (-1.0, low, "v")):
-        size = np.where(np.isfinite(values), sign * values, -np.inf)
-        k, i = np.unravel_index(int(size.argmax()), size.shape)
-        cut = size[k, i] > sign * edge
-        if not np.isfinite(size[k, i]) or not (cut or (always and sign > 0)):
-            continue
-        peak, when, whose = float(values[k, i]), float(result.time[k]), who(int(i))
-        if between is not None and sign > 0 and between.value > peak:
-            peak, when = between.value, between.time
-            whose = _edge(between) if between.other >= 0 else _agent(between.who)
-        told = f"peak {peak:.3g} {unit}: {whose} at {when:.2f} s"
-        if not cut:
-            if high <= peak < 1.5 * high:
-                ax.set_ylim(low, peak + 0.05 * (peak - low))
-            if peak > values[k, i]:
-                ax.plot(
-                    when, peak, "o", markersize=4, markerfacecolor="none", markeredgecolor=st.INK
-                )
-            st.annotate(ax, told, st.corners())
-            continue
-        t = result.time[int((size > sign * edge).any(axis=1).argmax())]
-        look: dict[str, Any] = {"color": st.ALERT, "markersize": 5, "clip_on": False, "zorder": 6}
-        ax.plot(t, edge, marker, **look, gid="cut")
-        st.annotate(ax, f"off scale: {told}", [*st.around(t, edge), *st.corners()], color=st.ALERT)
-
-
-def _idle(ax: Axes, result: Result, values: Floats, unit: str, who: Callable[[int], str]) -> bool:
-    """If values (K, n) are only rounding errors, say so in the axes; return whether they are."""
-    size = np.where(np.isfinite(values), np.abs(values), -np.inf)
-    k, i = np.unravel_index(int(size.argmax()), size.shape) if size.size else (0, 0)
-    if not size.size or not np.isfinite(size[k, i]) or size[k, i] > _IDLE:
-        return False
-    where = f", {who(int(i))} at {result.time[k]:.2f} s" if size[k, i] else ""
-    st.note(ax, f"only rounding errors: at most {size[k, i]:.3g} {unit}{where}")
-    return True
-
-
-def _within(ax: Axes, result: Result, values: Floats) -> None:
-    """Choose limits that leave out the final peak of a flight that broke down."""
-    top = _sane(result, values)
-    if top < np.nanmax(np.abs(values), initial=0.0):
-        finite = values[np.isfinite(values)]
-        low = max(float(finite.min()), -top)
-        ax.set_ylim(low - 0.05 * (top - low), top)
 
 
 @styled
@@ -415,36 +321,24 @@ def constraint_force(result: Result) -> Figure:
 
     force, tension = np.linalg.norm(result.constraint_force, axis=2), -result.multiplier
     shares = [
-        _TOLD if np.nanmax(np.abs(v), initial=0.0) <= _IDLE else 1.0 for v in (force, tension)
+        _TOLD if np.nanmax(np.abs(v), initial=0.0) <= peaks.IDLE else 1.0 for v in (force, tension)
     ]
     fig, axes = st.time_figure(result, "Constraint force", 2, shares=shares)
     above, below = axes[:, 0]
     above.set_ylabel(r"force $|f_C|$ [N]")
-    if _from_none(above, result, force, "N", "constraint_force"):
+    if peaks.from_none(above, result, force, "N", "constraint_force"):
         st.agents_legend(above, result.n_agents)
     below.set_ylabel(r"tension $-\lambda$ [N]")
     if not len(result.edges):
         st.note(below, "no edges")
-    elif not _idle(below, result, tension, "N", edge):
+    elif not peaks.idle(below, result, tension, "N", edge):
         edge_lines(below, result, tension)
         below.axhline(0.0, color=st.FAINT, linewidth=0.6, zorder=1)
-        _within(below, result, tension)
-        _extremes(below, result, tension, "N", edge, name="tension", always=False)
+        peaks.within(below, result, tension)
+        peaks.extremes(below, result, tension, "N", edge, name="tension", always=False)
         st.legend(below, edge_handles(result))
     st.name_phases(fig, [above], result)
     return fig
-
-
-def _from_none(ax: Axes, result: Result, values: Floats, unit: str, name: str = "") -> bool:
-    """Draw each agent's values (K, N) from zero, and write the greatest; return whether there was anything to draw."""
-    if _idle(ax, result, values, unit, _agent):
-        return False
-    st.agent_lines(ax, result, values)
-    top = _sane(result, values)
-    if top > 0.0:
-        ax.set_ylim(-0.04 * top, 1.12 * top)
-    _extremes(ax, result, values, unit, _agent, name=name)
-    return True
 
 
 @styled
@@ -457,12 +351,12 @@ def disturbance(result: Result) -> Figure:
         st.note(above, "still air")
     else:
         force = np.where(result.left, np.linalg.norm(result.disturbance_force, axis=2), np.nan)
-        if _from_none(above, result, force, "N"):
+        if peaks.from_none(above, result, force, "N"):
             st.agents_legend(above, result.n_agents)
     below.set_ylabel("from the slot [m]")
     off = np.linalg.norm(result.position - result.slot_position, axis=2)
     if np.isfinite(off).any():
-        _from_none(below, result, off, "m")
+        peaks.from_none(below, result, off, "m")
     else:
         st.note(below, "no slots are tracked")
     st.name_phases(fig, [above], result)

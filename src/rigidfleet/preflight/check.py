@@ -27,7 +27,7 @@ from rigidfleet.preflight.trajectory import (
     separation_remarks,
     thrust_remarks,
 )
-from rigidfleet.preflight.vehicles import vehicle_lags
+from rigidfleet.preflight.vehicles import check_vehicles, vehicle_lags, vehicle_remarks
 
 
 def check(
@@ -63,6 +63,7 @@ def check(
     if lags := vehicle_lags(mission):
         progress("margins")
         found.margins = check_margins(mission, planned, lags)
+        found.vehicles = check_vehicles(mission, planned)
     progress("collisions, obstacles and limits")
     found.remarks = [
         *formation_remarks(mission, formations),
@@ -72,6 +73,7 @@ def check(
         *downwash_remarks(mission, found),
         *assignment_remarks(mission, found),
         *thrust_remarks(mission, found),
+        *vehicle_remarks(mission, found),
         *disturbance_remarks(mission, found),
         *obstacle_remarks(mission, found),
         *limit_remarks(mission, found),

@@ -186,6 +186,41 @@ class Disturbed:
     lost: tuple[tuple[int, float], ...]
 
 
+@dataclass(frozen=True)
+class VehicleCheck:
+    """What the planned paths ask of vehicles with rotors, in still air.
+
+    Attributes
+    ----------
+    rotor_force : force of the rotor nearest to its limit [N], its time [s], the agent, the limit [N] and the phase
+    tilt : maximum tilt [deg], its time [s], the agent and the phase
+    jump : maximum jump of the acceleration [m/s^2], of the tilt there [deg], its time [s] and the phase that begins
+        there; None if there is no switch between phases that track slots
+    """
+
+    rotor_force: tuple[float, float, str, float, str]
+    tilt: tuple[float, float, str, str]
+    jump: tuple[float, float, float, str] | None
+
+    def describe(self) -> Iterator[tuple[str, str]]:
+        """Facts with their headings."""
+        force, t, who, limit, _ = self.rotor_force
+        share = 100 * (1 - force / limit)
+        text = f"maximum {force:.3g} N of a rotor (limit {limit:.3g} N, {share:.0f} % left), {who} at {t:.2f} s"
+        yield "rotors", text
+        yield "tilt", f"maximum {self.tilt[0]:.1f} deg, {self.tilt[2]} at {self.tilt[1]:.2f} s"
+
+    def data(self) -> dict[str, Any]:
+        """Plain data for JSON."""
+        return {
+            "rotor_force": _named(
+                ("force_n", "time_s", "who", "limit_n", "phase"), self.rotor_force
+            ),
+            "tilt": _named(("tilt_deg", "time_s", "who", "phase"), self.tilt),
+            "jump": _named(("acceleration_m_s2", "tilt_deg", "time_s", "phase"), self.jump),
+        }
+
+
 @dataclass
 class Preflight:
     """Result of `check`; `remarks` has the problems and notes.
@@ -201,6 +236,7 @@ class Preflight:
     assignments : assignments to slots that were compared, by name
     disturbed : effects of the disturbances; None without disturbances
     margins : what lag and delay the laws bear; None if vehicles have none
+    vehicles : what the planned paths ask of rotors; None if vehicles have none
     judged_to : mission time [s] up to which paths were checked; infinite if they all were
     remarks : problems and notes
 
@@ -222,6 +258,7 @@ class Preflight:
     assignments: dict[str, Assignment] = field(default_factory=dict)
     disturbed: Disturbed | None = None
     margins: MarginsCheck | None = None
+    vehicles: VehicleCheck | None = None
     judged_to: float = math.inf
     remarks: list[Remark] = field(default_factory=list)
 
@@ -259,6 +296,8 @@ class Preflight:
             force, t, who, limit = self.thrust
             of = f" (limit {limit:g} N)" if math.isfinite(limit) else " (no limit)"
             yield "thrust", f"maximum {force:.1f} N{of}, {who} at {t:.2f} s"
+        if self.vehicles is not None:
+            yield from self.vehicles.describe()
         if self.disturbed is not None:
             yield "disturbances", _disturbed_words(self.disturbed)
         for name, least, t, who in self.clearance:
@@ -307,6 +346,7 @@ class Preflight:
                 "force_per_error_n_m": g.force,
             },
             "margins": None if self.margins is None else self.margins.data(),
+            "vehicles": None if self.vehicles is None else self.vehicles.data(),
             "disturbances": None
             if (d := self.disturbed) is None
             else {

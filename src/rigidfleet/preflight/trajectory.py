@@ -392,9 +392,10 @@ def _gaps(mission: Mission, found: Preflight, radius: Floats) -> Iterator[Remark
 def limit_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     """Remarks on speed, acceleration and geofence beyond their limits."""
     limits = mission.limits
+    hopeless: set[str] = set()  # limits that no time keeps; each is told once
     for planned in found.planned_phases:
         if mission.smooth and planned.leg.phase.control == "tracking":
-            yield from _broken(mission, planned)
+            yield from _broken(mission, planned, hopeless)
         else:
             yield from _sampled(mission, planned)
         if limits.geofence is not None:
@@ -407,14 +408,15 @@ def limit_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
                 yield Remark("fails" if planned.exact else "note", "geofence", text)
 
 
-def _broken(mission: Mission, planned: PlannedPhase) -> Iterator[Remark]:
+def _broken(mission: Mission, planned: PlannedPhase, hopeless: set[str]) -> Iterator[Remark]:
     """Remark on the limit that the reference of a smooth phase breaks most, with the least time that keeps all."""
     over = timing.broken(mission, planned.leg)
-    if not over:
+    if not over or over[0].limit.name in hopeless:
         return
     key, least = timing.least_time(mission, planned.leg)
     if least is None:
         remedy = f"no {key} of this phase keeps all limits"
+        hopeless.add(over[0].limit.name)
     else:
         remedy = f"the least {key} of this phase is {math.ceil(100 * least) / 100:.2f} s"
     yield Remark(

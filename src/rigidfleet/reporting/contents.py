@@ -18,6 +18,13 @@ from rigidfleet._version import __version__
 from rigidfleet.assessment import Safety, Verdict, assess, safety
 from rigidfleet.assessment.outcome import value
 from rigidfleet.mission import ending, goal
+from rigidfleet.plotting.quadrotors import (
+    has_rotors,
+    rotor_forces,
+    rotor_limits,
+    tilt,
+    tracking_error,
+)
 from rigidfleet.plotting.style import clean
 from rigidfleet.reporting import gains, overlay
 
@@ -117,17 +124,23 @@ def _head(judged: int, failed: int) -> str:
 def _facts(result: Result) -> list[tuple[str, str]]:
     mission = result.mission
     mass = sorted(set(mission.agents.mass))
-    masses = f"{mass[0]:g} kg" if len(mass) == 1 else f"{mass[0]:g} to {mass[-1]:g} kg"
+    masses = f"{mass[0]:.4g} kg" if len(mass) == 1 else f"{mass[0]:.4g} to {mass[-1]:.4g} kg"
     forms = [
         f"{name} ({len(mission.formation_edges(name))} edges)" for name in mission.formations
     ]  # fmt: skip
     return [
-        ("vehicles", f"{result.n_agents}, {masses}"),
+        ("vehicles", f"{result.n_agents}, {masses}{_models(mission)}"),
         ("formations", ", ".join(forms) or "none"),
         ("control", mission.architecture),
         ("duration", f"{result.time[-1]:.4g} s, {len(result.phases)} phases"),
         ("simulated", result.created.replace("T", " ").replace("+00:00", " UTC")),
     ]
+
+
+def _models(mission: Mission) -> str:
+    """Models of vehicles with their number; "" for points."""
+    count = Counter(mission.vehicles[name].model for name in mission.agents.vehicle)
+    return ": " * bool(count) + ", ".join(f"{n} × {name}" for name, n in count.items())
 
 
 def _check(finding: Any) -> dict[str, Any]:
@@ -165,7 +178,7 @@ def _phases(result: Result, verdict: Verdict) -> list[dict[str, str]]:
     return rows
 
 
-def _vehicles(result: Result) -> list[dict[str, str]]:
+def _vehicles(result: Result) -> list[dict[str, Any]]:
     """Extremes of each vehicle; if there are too many, of those with the greatest thrust."""
     n, mission = result.n_agents, result.mission
     with np.errstate(invalid="ignore"):
@@ -177,11 +190,12 @@ def _vehicles(result: Result) -> list[dict[str, str]]:
     shown = np.arange(n) if n <= _VEHICLES else np.sort(np.argsort(-thrust)[:_VEHICLES])
     colours = plotting.agent_colours(n)
     limits = mission.agents.thrust_limit
+    flown = _with_rotors(result)
     return [
         {
             "name": str(i + 1),
             "colour": colours[i],
-            "mass": f"{mission.agents.mass[i]:g}",
+            "mass": f"{mission.agents.mass[i]:.4g}",
             "thrust": value(float(thrust[i])),
             "used": f"{100 * thrust[i] / limits[i]:.0f} %" if math.isfinite(limits[i]) else "",
             "speed": value(float(speed[i])),
@@ -189,8 +203,24 @@ def _vehicles(result: Result) -> list[dict[str, str]]:
             "low": value(float(np.nanmin(z[:, i]))),
             "high": value(float(np.nanmax(z[:, i]))),
             "path": value(float(path[i])),
+            "own": [column[i] for column in flown],
         }
         for i in shown.tolist()
+    ]
+
+
+def _with_rotors(result: Result) -> list[list[str]]:
+    """Columns of vehicles with rotors: rotor share, tilt, tracking error; empty for points, none for their flights."""
+    if not has_rotors(result):
+        return []
+    share = rotor_forces(result).max(axis=2) / rotor_limits(result.mission)
+    return [
+        [form(x) if math.isfinite(x) else "" for x in np.fmax.reduce(values, axis=0).tolist()]
+        for values, form in (
+            (share, lambda x: f"{100 * x:.0f} %"),
+            (tilt(result), value),
+            (tracking_error(result), value),
+        )
     ]
 
 
@@ -214,25 +244,33 @@ def _versions(result: Result) -> list[tuple[str, str]]:
 
 
 def _safety_table(flights: Sequence[Result], verdicts: Sequence[Verdict]) -> list[dict[str, Any]]:
-    """A row for each quantity with a cell for each flight."""
-    columns = [safety(*each) for each in zip(flights, verdicts, strict=True)]
+    """A row for each quantity of any flight, with a cell for each flight."""
+    columns = [
+        {row.quantity: row for row in safety(*each)} for each in zip(flights, verdicts, strict=True)
+    ]
     return [
         {
-            "name": rows[0].quantity,
-            "text": rows[0].text,
-            "cells": [_safety_cell(row) for row in rows],
+            "name": name,
+            "text": text,
+            "cells": [_safety_cell(column.get(name)) for column in columns],
         }
-        for rows in zip(*columns, strict=True)
+        for name, text in {row.quantity: row.text for c in columns for row in c.values()}.items()
     ]
 
 
-def _safety_cell(row: Safety) -> dict[str, Any]:
+def _safety_cell(row: Safety | None) -> dict[str, Any]:
+    if row is None:
+        return {"state": "free", "worst": "", "nothing": "flown by points"}
     margin, used = row.margin, row.used
     state = "free" if row.limit is None else "ok" if row.passed else "failed"
     left = ""
     if margin is not None:
         left = f"{value(abs(margin), row.unit)} {'left' if margin >= 0 else 'beyond'}"
-    nothing = {"downwash": "no vehicle is ever below another", "geofence": "no geofence"}
+    nothing = {
+        "downwash": "no vehicle is ever below another",
+        "geofence": "no geofence",
+        "saturation": "no vehicle is asked for more than its rotors give",
+    }
     return {
         "state": state,
         "sign": "≤" if not row.at_least else "≥" if row.limit else ">",
@@ -274,6 +312,9 @@ def _numbers(flights: Sequence[Result], verdicts: Sequence[Verdict]) -> list[dic
         ("greatest thrust", "N", partial(worst, "thrust")),
         ("mean thrust of a vehicle", "N", lambda r, _: _mean(r)),
         ("greatest constraint force", "N", partial(worst, "constraint_force")),
+        ("greatest share of a rotor's limit", "%", lambda _, v: _rotor_share(v)),
+        ("greatest tilt", "deg", partial(_checked, "tilt")),
+        ("greatest saturation of a phase", "%", partial(_checked, "saturation")),
     ]
     rows = []
     for name, unit, measure in measures:
@@ -290,6 +331,19 @@ def _numbers(flights: Sequence[Result], verdicts: Sequence[Verdict]) -> list[dic
             }
         )  # fmt: skip
     return rows
+
+
+def _checked(name: str, _: Result, verdict: Verdict) -> float | None:
+    """The worst value that a check found."""
+    return next((check.worst for check in verdict.checks if check.check == name), None)
+
+
+def _rotor_share(verdict: Verdict) -> float | None:
+    """Force of the rotor nearest to its limit, as a share of it [%]."""
+    found = next((check for check in verdict.checks if check.check == "rotor_force"), None)
+    if found is None or found.worst is None or not found.limit:
+        return None
+    return 100 * found.worst / found.limit
 
 
 def _greatest(values: Any) -> float | None:
@@ -362,6 +416,8 @@ _CAPTIONS = {
     "clearance": "Distances between surfaces, with the limits.",
     "formations": "Formations with their edges and body axes.",
     "disturbance": "Aerodynamic force on each vehicle, and distance of each vehicle from its slot.",
+    "rotors": "Greatest force of a rotor of each vehicle with its limit; all rotors of the one nearest to its limit.",
+    "vehicles": "Tilt of each vehicle, its distance from its slot, and when it is asked for more than its rotors give.",
 }  # fmt: skip
 
 

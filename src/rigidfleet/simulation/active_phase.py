@@ -22,7 +22,7 @@ from rigidfleet.planning.tolerances import most_steps
 from rigidfleet.simulation.callbacks import Controller, ExternalForce, Observation, asked
 from rigidfleet.simulation.diagnosis import Place, diagnose
 from rigidfleet.simulation.extremes import Extremes
-from rigidfleet.simulation.recording import Piece
+from rigidfleet.simulation.recording import Led, Piece
 from rigidfleet.simulation.solver_setup import equip, first_step, integrator
 from rigidfleet.typing import Bools, Floats
 
@@ -330,6 +330,14 @@ class ActivePhase:
             q = samples[:, 6 * n + m : 6 * n + m + 4]
             frame = q / np.linalg.norm(q, axis=1, keepdims=True)
         integral = samples[:, 6 * n : 6 * n + m]
+        led = self._led(times)
         self.pieces.append(
-            Piece(self.index, times, out, integral, frame, plan.edges, plan.attached)
+            Piece(self.index, times, out, integral, frame, plan.edges, plan.attached, led)
         )
+
+    def _led(self, times: Floats) -> Led:
+        """What the slots follow at the samples, if they are tracked."""
+        plan = self.plan
+        if plan.problem.control.kind != TRACKING or not len(times):
+            return ()
+        return ((times[0], plan.problem.reference, plan.problem.motion),)

@@ -4,18 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from rigidfleet.math import attitude as att
 from rigidfleet.math import constraint_jacobian, proximity, rigid_body
-from rigidfleet.result import PhaseRecord, Result
+from rigidfleet.planning.derivatives import Yaw, slot_derivatives, yaw_derivatives
+from rigidfleet.result import LATER, PhaseRecord, Result
 from rigidfleet.typing import Bools, Floats, Ints
 
 if TYPE_CHECKING:
+    from rigidfleet.kernel.problem import Motion, Reference
     from rigidfleet.kernel.records import Record
     from rigidfleet.mission import Mission
+    from rigidfleet.mission.schema import VehicleYaw
 
 
 #: Greatest number of edges, or of coordinates, for which the smallest singular value of J is recorded.
@@ -23,6 +27,10 @@ _SINGULAR = 400
 #: Greatest work for singular values in a phase, as (size of J)^3 times samples (some tenths of a second), and least
 #: number of samples.
 _WORK, _LEAST = 400_000_000, 9
+
+
+#: References that slots follow one after the other, each with the time [s] from which it counts; none if not tracked.
+Led = tuple[tuple[float, "Reference", "Motion"], ...]
 
 
 class VehicleSamples(NamedTuple):
@@ -46,6 +54,7 @@ class Piece:
     frame: Floats  # (K, 4)
     edges: Ints  # (m, 2) of this phase
     attached: bool  # whether the slots carry the body frame
+    led: Led  # what the slots follow, if they are tracked
     vehicles: VehicleSamples | None = None
 
 
@@ -155,6 +164,7 @@ def assemble(
         disturbance_force=joined("f_D") if airy else None,
         measured_position=joined("r_seen") if noisy else None,
         measured_velocity=joined("v_seen") if noisy else None,
+        later=partial(_references, mission.yaw, [(p.time, p.led) for p in pieces], left),
         vehicle_attitude=None if flown is None else flown.attitude,
         vehicle_rates=None if flown is None else flown.rates,
         rotor_force=None if flown is None else flown.rotor_force,
@@ -165,6 +175,45 @@ def assemble(
         ending=ending,
         statistics=statistics,
     )
+
+
+def _references(
+    yaw: VehicleYaw, pieces: Sequence[tuple[Floats, Led]], left: Bools
+) -> dict[str, Floats]:
+    """Derivatives of the slots and the yaw of each vehicle, of pieces of a flight; NaN where no slots are tracked.
+
+    Yaw "along" continues from piece to piece.
+    """
+    x, y, z = yaw.point or (0.0, 0.0, 0.0)
+    turned = Yaw(yaw.kind, float(np.deg2rad(yaw.yaw_deg)), (x, y, z))
+    n = left.shape[1]
+    states, angles = [], []
+    last, until = None, 0.0
+    for times, led in pieces:
+        if not led:
+            last = None
+            states.append(np.full((len(times), 3, n, 3), np.nan))
+            angles.append(np.full((len(times), 2, n), np.nan))
+            continue
+        spans = sorted(led, key=lambda span: span[0])
+        first = np.searchsorted(times, [begin for begin, *_ in spans[1:]])
+        for time, (_, reference, motion) in zip(np.split(times, first), spans, strict=True):
+            if not len(time):
+                continue
+            states.append(slot_derivatives(reference, motion, time, 4)[:, 1:])
+            # From the sample before, which may be one of an earlier piece.
+            begin = np.clip(until, motion.knots[0], time[0]) if last is not None else time[0]
+            since = time if begin == time[0] else np.append(begin, time)
+            found = yaw_derivatives(reference, motion, since, turned, last)[-len(time) :, :2]
+            angles.append(found)
+            last, until = found[-1, 0], time[-1]
+    state, angle = np.concatenate(states), np.concatenate(angles)
+    state[~left[:, None].repeat(3, axis=1)] = np.nan
+    angle[~left[:, None].repeat(2, axis=1)] = np.nan
+    known = np.isfinite(angle[:, 0]).any(axis=1)
+    angle[known, 0] = np.unwrap(angle[known, 0], axis=0)  # one turn, not one for each piece
+    values = (*state.swapaxes(0, 1), *angle.swapaxes(0, 1))
+    return dict(zip(LATER, values, strict=True))
 
 
 def _of_vehicles(pieces: Sequence[Piece]) -> VehicleSamples | None:

@@ -16,7 +16,7 @@ from rigidfleet.kernel.problem import Problem
 from rigidfleet.kernel.records import Record
 from rigidfleet.math import attitude as att
 from rigidfleet.mission import Mission
-from rigidfleet.planning.vehicles import TickTables, sampled_flight, yaw_at
+from rigidfleet.planning.vehicles import TickTables, sampled_flight, turn_from, yaw_at
 from rigidfleet.simulation.active_phase import ActivePhase
 from rigidfleet.simulation.callbacks import Observation
 from rigidfleet.simulation.diagnosis import diagnose
@@ -57,7 +57,10 @@ class SampledPhase(ActivePhase):
     def __init__(self, *arguments: Any, vehicles: Vehicles, **options: Any) -> None:
         self.vehicles, self.flight = vehicles, vehicles.flight
         self.tabled: Problem | None = None  # the plan's problem for which the tables are
+        self.led = False  # whether the reference is given piece by piece
         super().__init__(*arguments, **options)
+        yaw = vehicles.tables.yaw
+        self.turn = turn_from(self.plan.problem, self.plan.start, yaw, vehicles.yaw)
 
     def _start(self, y: Floats, t: float) -> None:
         plan, given = self.plan, self.vehicles
@@ -68,21 +71,29 @@ class SampledPhase(ActivePhase):
         lost = self.flight.vehicles._replace(lost=self.lost.copy())
         self.flight = self.flight._replace(vehicles=lost)
         frame = y[6 * n + m : 6 * n + m + 4] if plan.frame is not None else None
+        integral, before = y[6 * n : 6 * n + m], given.state
         begun = fleet.begin(self.flight, given.S, self.workspace, frame=frame)
-        begun.integral[:] = y[6 * n : 6 * n + m]
+        if before is None:
+            begun.integral[:] = integral
+        else:  # extremes are those of the phase
+            renewed = fleet.renewed(before, self.workspace, integral, frame=frame)
+            kept = ("peak", "peak_time", "worst", "worst_time", "saturations")
+            begun = renewed._replace(**{name: getattr(begun, name) for name in kept})
         begun.peak_time[:] = begun.worst_time[:] = t
-        before = given.state
-        if before is not None:
-            begun = before._replace(
-                integral=begun.integral, frame=begun.frame, work=begun.work, peak=begun.peak,
-                peak_time=begun.peak_time, worst=begun.worst, worst_time=begun.worst_time,
-                saturations=begun.saturations,
-            )  # fmt: skip
         self.sampled = given.state = begun._replace(trail=trail._replace(gauge=trail.gauge[:, :0]))
         self.first_tick = int(self.sampled.count[fleet.TICKS])
         self.tabled = None
 
     # -- flying -----------------------------------------------------------------------------------
+
+    def lead(self, problem: Problem) -> None:
+        """Continue with another problem; vehicles that turn along their way do so from the yaw they have now."""
+        yaw = self.vehicles.tables.yaw
+        if yaw.kind == "along":
+            now = yaw_at(self.plan.problem, self.t, yaw, self.turn)
+            self.turn = turn_from(problem, self.t, yaw, now)
+        self.led = True
+        super().lead(problem)
 
     def observe(self) -> Observation:
         """What a controller sees: measured positions and velocities."""
@@ -118,6 +129,8 @@ class SampledPhase(ActivePhase):
                 self._supply()
                 status = fly_ticks(problem, self.workspace, self.flight, sampled, call)
                 self._follow()
+                if status == records.FINISHED:  # to a rounding error of the grid of steps
+                    self.state.clock[0] = t_end
                 if self.external is not None:
                     self.external.check()
                 self._check()
@@ -131,6 +144,8 @@ class SampledPhase(ActivePhase):
             raise StoppedError(
                 diagnose(self.place, own_force=self.external is not None, collapsed=True)
             )
+        # Steps end at multiples of their length, which may be t_end but for rounding.
+        self.state.clock[0] = max(self.t, t_end)
 
     def _supply(self) -> None:
         """Make tables for the next ticks, if those that there are end here or belong to another reference."""
@@ -143,8 +158,10 @@ class SampledPhase(ActivePhase):
             s = self.sampled
             for known in (s.seen, s.history, s.sent, s.heard):
                 np.add(known, moved, out=known)
-        last = min(tick + _TICKS, math.ceil(self.plan.t_end * given.rate) + 1)
-        made = given.made(tick, max(last, tick + 1), planned, self.plan.start, self.vehicles.yaw)
+        # A piece of a reference that is led holds until the next stop
+        until = min(self.stop, self.plan.t_end) if self.led else self.plan.t_end
+        last = min(tick + _TICKS, math.ceil(until * given.rate) + 1)
+        made = given.made(tick, max(last, tick + 1), planned, self.turn)
         self.flight, self.tabled = self.flight._replace(tables=made), planned
 
     def _follow(self) -> None:
@@ -161,9 +178,7 @@ class SampledPhase(ActivePhase):
 
     def end(self) -> Any:
         """End the phase; the vehicles keep their states."""
-        self.vehicles.yaw = yaw_at(
-            self.plan.problem, self.t, self.vehicles.tables.yaw, self.plan.start, self.vehicles.yaw
-        )
+        self.vehicles.yaw = yaw_at(self.plan.problem, self.t, self.vehicles.tables.yaw, self.turn)
         self.vehicles.S, self.vehicles.state = self.sampled.S, self.sampled
         return super().end()
 
@@ -182,7 +197,15 @@ class SampledPhase(ActivePhase):
         out, kept = _as_flown(planned, call, done, self.flight.vehicles, problem)
         self.pieces.append(
             Piece(
-                self.index, times, out, call.integral[:done], frame, plan.edges, plan.attached, kept
+                self.index,
+                times,
+                out,
+                call.integral[:done],
+                frame,
+                plan.edges,
+                plan.attached,
+                self._led(times),
+                kept,
             )
         )
         assert out.r.shape[1] == n

@@ -53,6 +53,13 @@ METRICS: dict[str, Metric] = {
     "clearance": Metric("m", "minimum clearance to an obstacle: distance minus radius"),
     "geofence": Metric("m", "maximum distance outside the geofence; negative inside"),
     "thrust": Metric("N", "thrust closest to or farthest beyond its limit; peak if there is none"),
+    "rotor_share": Metric(
+        "1", "rotor force closest to its limit, as a share of it; only of vehicles with rotors"
+    ),
+    "saturation": Metric(
+        "1", "largest share of a phase in which a vehicle is asked for more than its rotors give"
+    ),
+    "tilt": Metric("deg", "maximum tilt of a vehicle with rotors"),
     "speed": Metric("m s-1", "maximum speed"),
     "acceleration": Metric("m s-2", "maximum acceleration"),
     "constraint_force": Metric("N", "maximum constraint force on an agent"),
@@ -96,7 +103,21 @@ def measure(result: Result, verdict: Verdict) -> dict[str, float]:
         for name in ("separation_below", "geofence", "thrust")
         if name in checked
     }
+    worst |= _of_rotors(verdict)
     return {name: float((worst | found).get(name, math.nan)) for name in METRICS}
+
+
+def _of_rotors(verdict: Verdict) -> dict[str, float]:
+    """What the checks of vehicles with rotors found; nothing of points."""
+    found = {f.check: (f.worst, f.limit) for f in verdict.checks if f.worst is not None}
+    if "rotor_force" not in found:
+        return {}
+    force, limit = found["rotor_force"]
+    assert limit is not None
+    shares = {"rotor_share": force / limit, "tilt": found["tilt"][0]}
+    if "saturation" in found:
+        shares["saturation"] = found["saturation"][0] / 100.0
+    return shares
 
 
 def _greatest(values: Iterable[float | None]) -> float:

@@ -6,7 +6,7 @@ import numpy as np
 
 from rigidfleet.kernel.engine import native
 from rigidfleet.kernel.engine.packing import UNRECORDED, pack, packed
-from rigidfleet.kernel.fleet import Evaluation, Flight, SampledSegment, SampledState
+from rigidfleet.kernel.fleet import ENDLESS, Evaluation, Flight, SampledSegment, SampledState
 from rigidfleet.kernel.problem import Problem, Workspace
 from rigidfleet.kernel.records import Segment
 from rigidfleet.typing import Floats
@@ -26,6 +26,7 @@ def fly_ticks(
     flight brings its own.
     """
     code, work = native.sampled(), state.work
+    _check(flight, state, workspace)
     if problem.body_formulation or problem.disturbance.active:
         raise ValueError(
             "a sampled flight takes a problem in the inertial formulation without disturbances; its Flight has its own"
@@ -37,6 +38,34 @@ def fly_ticks(
     )
     arguments = packed(problem), packed(workspace), packed(flight), packed(state), call
     return code.fly_ticks(*(a.address for a in arguments))
+
+
+def _check(flight: Flight, state: SampledState, workspace: Workspace) -> None:
+    """Refuse arrays too short for what the machine code reads.
+
+    Raises
+    ------
+    ValueError
+    """
+    n, m, t, sensing = len(flight.vehicles.m), len(workspace.c), flight.tables, flight.sensing
+    each = len(range(t.first, t.last)) if t.last < ENDLESS else 0
+    seen, heard = (-(-t.last // k) - -(-t.first // k) for k in (sensing.every, sensing.link_every))
+    needed = {"yaw": each, "jerk": each, "snap": each}
+    needed |= {"noise_r": seen, "noise_v": seen, "dropped": seen, "unheard": heard}
+    for name, rows in needed.items():
+        table = getattr(t, name)
+        if len(table) and (len(table) < rows or t.last == ENDLESS or table.shape[1] != n):
+            raise ValueError(
+                f"the table {name!r} of shape {table.shape} does not cover ticks {t.first} to {t.last} of {n} vehicles:"
+                f" it needs {rows} rows"
+            )
+    depth = int(sensing.delay.max()) + (int(sensing.link_delay.max()) if sensing.linked else 0)
+    sizes = len(state.S), state.integral.shape, state.work.law_state.shape[1], len(state.heard)
+    views = n if sensing.linked else 0
+    if len(state.history) <= depth or sizes != (n, (views or 1, m), 6 * n + m + 4, views):
+        raise ValueError(
+            "the state is of another flight or problem: begin a flight by `fleet.begin`, and a phase by `fleet.renewed`"
+        )
 
 
 def derivatives(

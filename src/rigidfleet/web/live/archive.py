@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from rigidfleet.result import Result
-from rigidfleet.simulation.recording import Piece
+from rigidfleet.simulation.recording import Piece, VehicleSamples
 from rigidfleet.typing import Bools, Floats
 
 #: Greatest number of values kept, 8 bytes each: 10 minutes of 50 vehicles with 144 edges at 0.05 s. Beyond it,
@@ -105,15 +105,18 @@ class Archive:
 
 
 def _numbers(piece: Piece) -> float:
-    return float(sum(x.size for x in piece.record) + piece.integral.size + piece.frame.size)
+    arrays = (*piece.record, piece.integral, piece.frame, *(piece.vehicles or ()))
+    return float(sum(x.size for x in arrays))
 
 
 def rows(piece: Piece, which: Bools | list[int]) -> Piece:
     """Some samples of a piece."""
     record = type(piece.record)(*(x[which] for x in piece.record))
+    flown = piece.vehicles
+    vehicles = None if flown is None else VehicleSamples._make(x[which] for x in flown)
     return Piece(
         piece.phase, piece.time[which], record, piece.integral[which], piece.frame[which], piece.edges,
-        piece.attached,
+        piece.attached, piece.led, vehicles,
     )  # fmt: skip
 
 
@@ -125,6 +128,10 @@ def _join(pieces: list[Piece]) -> Piece:
     """Pieces of one phase as one."""
     first, record = pieces[0], type(pieces[0].record)
     fields = (np.concatenate(each) for each in zip(*(p.record for p in pieces), strict=True))
+    flown = [p.vehicles for p in pieces if p.vehicles is not None]
+    vehicles = (
+        VehicleSamples._make(map(np.concatenate, zip(*flown, strict=True))) if flown else None
+    )
     return Piece(
         first.phase,
         np.concatenate([p.time for p in pieces]),
@@ -133,6 +140,8 @@ def _join(pieces: list[Piece]) -> Piece:
         np.concatenate([p.frame for p in pieces]),
         first.edges,
         first.attached,
+        tuple(led for p in pieces for led in p.led),
+        vehicles,
     )
 
 

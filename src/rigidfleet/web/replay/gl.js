@@ -140,7 +140,8 @@ export class Mesh {
   }
 }
 
-const ROTORS = [0, 1, 2, 3].map((k) => {
+/** Angle from the nose and place of each rotor, in units of the radius: front left, rear left, rear right, front right. */
+export const ROTORS = [0, 1, 2, 3].map((k) => {
   const angle = Math.PI / 4 + (k * Math.PI) / 2;
   return [angle, 0.58 * Math.cos(angle), 0.58 * Math.sin(angle)];
 });
@@ -167,6 +168,18 @@ export function smallVehicleMesh() {
     mesh.ring([x, y, 0.12], 0, 0.41, 6, OWN, [0.8, 1]);
   }
   return mesh;
+}
+
+/** An arrow ahead of vehicles whose own yaw is known. */
+export function noseMesh() {
+  const mesh = new Mesh().box([0.3, -0.05, -0.03], [1, 0.05, 0.03], DARK);
+  mesh.triangle([0.95, 0.24, 0], [0.95, -0.24, 0], [1.45, 0, 0], DARK);
+  return mesh;
+}
+
+/** One rotor at the centre. */
+export function discMesh() {
+  return new Mesh().ring([0, 0, 0], 0, 0.39, 14, OWN, [0.25, 1]);
 }
 
 export function rotorMesh() {

@@ -441,7 +441,9 @@ export class Player {
     const { clientWidth: width, clientHeight: height } = document.documentElement, { camera } = this.scene;
     if (!width || !height) return; // in a frame that is not shown yet
     const beside = (id) => (part(id)?.offsetWidth && width > 760 ? part(id).offsetWidth + 14 : 0);
-    const left = beside("fly"), right = beside("panel"), bottom = part("bar").offsetHeight + 14;
+    document.documentElement.style.setProperty("--bar", `${part("bar").offsetHeight}px`);
+    const below = part("fly")?.offsetHeight && width <= 760 ? part("fly").offsetHeight + 14 : 0;
+    const left = beside("fly"), right = beside("panel"), bottom = part("bar").offsetHeight + 14 + below;
     camera.centre = [(left - right) / width, bottom / height];
     camera.free = [1 - (left + right) / width, 1 - bottom / height];
     this.redraw();
@@ -513,8 +515,16 @@ export class Player {
     const [first, last] = this.span(), share = last > first ? (time - first) / (last - first) : 0;
     for (const plot of this.plots) plot.point(share, state);
     const larger = scene.enlarged > 1.15 ? `Vehicles are drawn ${digits(scene.enlarged)} times their size.` : "";
-    write("notes", [info.note, larger].filter(Boolean).join("\n"));
+    write("notes", [info.note, larger, overworked(state)].filter(Boolean).join("\n"));
   }
+}
+
+/** Which vehicles cannot give what is asked of them, in words. */
+function overworked({ saturated }) {
+  const who = Array.from(saturated ?? []).flatMap((share, i) => (share > 0.5 ? [i + 1] : []));
+  if (!who.length) return "";
+  const names = who.length > 8 ? `${who.length} agents` : `Agent${who.length > 1 ? "s" : ""} ${who.join(", ")}`;
+  return `${names} cannot give all that is asked.`;
 }
 
 export function say(words) {

@@ -1,16 +1,18 @@
 // The picture of a flight at one time, and its camera.
 
 import {
-  BACKGROUND, Lines, Mesh, NO_TURN, OWN, Places, Renderer, add, cross, dot, length, mixed,
-  quaternion, rotorMesh, scaled, smallVehicleMesh, sub, unit, vehicleMesh,
+  BACKGROUND, Lines, Mesh, NO_TURN, OWN, Places, ROTORS, Renderer, add, cross, discMesh, dot, length, mixed,
+  noseMesh, quaternion, rotorMesh, scaled, smallVehicleMesh, sub, unit, vehicleMesh,
 } from "./gl.js";
 import { bodyAxes } from "./recording.js";
 
 const AXES = [[0.84, 0.15, 0.16], [0.13, 0.58, 0.22], [0.12, 0.36, 0.86]];
 const IDLE = [0.42, 0.47, 0.53], PULL = [0.80, 0.11, 0.09], PUSH = [0.10, 0.33, 0.75];
-const INK = [0.13, 0.15, 0.18], BOX = [0.88, 0.88, 0.87], RIM = [0.50, 0.56, 0.63], FENCE = [0.69, 0, 0.13];
+const INK = [0.13, 0.15, 0.18], BOX = [0.88, 0.88, 0.87], RIM = [0.50, 0.56, 0.63], FENCE = [0.69, 0, 0.13], LIMIT = [0.86, 0.05, 0.10];
 const SMALLEST = 6, DETAILED = 12; // radius of a vehicle on the screen: the least, and that from which all detail is drawn [px]
 const TRAIL = 8; // length of trails [s]
+const FULL = 0.98; // share of its limit from which a rotor is drawn as being at it
+const ORDER = [0, 3, 2, 1]; // rotors of `ROTORS` in the columns: front left, front right, rear right, rear left
 const CROWD = 60; // number of vehicles beyond which each is drawn less prominently
 
 /** Colour of an edge: `share` of the largest tension, from -1 (pushes) to 1 (pulls), by its square root. */
@@ -156,12 +158,14 @@ export class Scene {
       vehicle: upload(vehicleMesh()),
       small: upload(smallVehicleMesh()),
       rotor: upload(rotorMesh()),
+      disc: upload(discMesh()),
+      nose: upload(noseMesh()),
       box: upload(new Mesh().box([-0.5, -0.5, -0.5], [0.5, 0.5, 0.5], OWN)),
       cone: upload(new Mesh().prism([0, 0, 0], 1, 0, 1, 12, OWN)),
       pin: upload(new Mesh().prism([0, 0, 0], 1, 0, 1.3, 4, OWN).prism([0, 0, 0], 1, 0, -1.3, 4, OWN)),
       shade: upload(new Mesh().ring([0, 0, 0], 0, 1, 16, OWN, [1, 0])),
     };
-    const names = ["solid", "veils", "vehicles", "small", "ghosts", "smallGhosts", "cones", "pins", "shades"];
+    const names = ["solid", "veils", "vehicles", "turned", "noses", "discs", "small", "ghosts", "smallGhosts", "cones", "pins", "shades"];
     this.places = Object.fromEntries(names.map((name) => [name, new Places()]));
     this.lines = { ground: new Lines(), world: new Lines() };
     this.fade = info.boxes.map(() => 1);
@@ -202,6 +206,8 @@ export class Scene {
     renderer.depth(true);
     renderer.meshes(meshes.box, places.solid);
     renderer.meshes(meshes.vehicle, places.vehicles);
+    renderer.meshes(meshes.vehicle, places.turned);
+    renderer.meshes(meshes.nose, places.noses);
     renderer.meshes(meshes.small, places.small);
     renderer.meshes(meshes.cone, places.cones);
     renderer.meshes(meshes.pin, places.pins);
@@ -210,6 +216,7 @@ export class Scene {
     renderer.meshes(meshes.vehicle, places.ghosts);
     renderer.meshes(meshes.small, places.smallGhosts);
     renderer.meshes(meshes.rotor, places.vehicles);
+    renderer.meshes(meshes.disc, places.discs);
     renderer.meshes(meshes.box, places.veils);
     this.labels.flush();
     return moving;
@@ -304,10 +311,13 @@ export class Scene {
       const p = state.position.subarray(3 * i, 3 * i + 3), radius = info.radius[i];
       const pixel = this.sized(p, 1), size = Math.max(radius, SMALLEST * pixel), near = size > DETAILED * pixel;
       this.enlarged = Math.max(this.enlarged, size / Math.max(radius, 1e-9));
-      const z = unit(state.thrust.subarray(3 * i, 3 * i + 3));
-      const y = unit(cross(z, Math.abs(dot(z, heading)) > 0.999 ? [0, 1, 0] : heading));
-      const q = quaternion(cross(y, z), y, z);
-      (near ? places.vehicles : places.small).add(p, size, q, this.colours[i], 1);
+      const own = info.rotors?.[i]; // vehicles turn as they are, points along their thrust
+      const q = own ? normal(state.turn.subarray(4 * i, 4 * i + 4)) : leaning(state.thrust.subarray(3 * i, 3 * i + 3), heading);
+      (near ? (own ? places.turned : places.vehicles) : places.small).add(p, size, q, this.colours[i], 1);
+      if (own) {
+        places.noses.add(p, size, q, this.colours[i], 1);
+        this.placeRotors(p, size, q, state.rotors.subarray(4 * i, 4 * i + 4), near, i);
+      }
       if (this.show.slots && !Number.isNaN(state.slot[3 * i])) {
         this.placeGhost(near ? places.ghosts : places.smallGhosts, p, size, q, state.slot.subarray(3 * i, 3 * i + 3), i);
       }
@@ -318,6 +328,17 @@ export class Scene {
       }
       if (named) this.labels.add(this.renderer.project(p), String(i + 1), "agent", 10 + (0.6 * size) / pixel, info.colours[i]);
     }
+  }
+
+  /** Rotors of a vehicle, the denser the more they give, red at their limit; from afar only these. */
+  placeRotors(p, size, q, shares, near, i) {
+    const [x, y, z] = bodyAxes(q);
+    ORDER.forEach((k, column) => {
+      const share = shares[column], full = share >= FULL;
+      if (!near && !full) return;
+      const [, a, b] = ROTORS[k], place = add(add(scaled(x, a * size), scaled(y, b * size)), scaled(z, 0.15 * size));
+      this.places.discs.add(add(p, place), size, q, full ? LIMIT : this.colours[i], full ? 1 : 0.1 + 0.35 * share);
+    });
   }
 
   /** The slot of a vehicle; visible only if the vehicle is not there. */
@@ -392,6 +413,18 @@ export class Scene {
       lines.world.add(origin, add(origin, scaled(axis, 1.15 * size)), 1.4, AXES[a], 0.4);
     });
   }
+}
+
+/** A quaternion of norm 1. */
+function normal(q) {
+  const size = Math.hypot(...q) || 1;
+  return Array.from(q, (x) => x / size);
+}
+
+/** The turn of a point's picture: rotors along its thrust, nose along the formation's heading. */
+function leaning(thrust, heading) {
+  const z = unit(thrust), y = unit(cross(z, Math.abs(dot(z, heading)) > 0.999 ? [0, 1, 0] : heading));
+  return quaternion(cross(y, z), y, z);
 }
 
 /** Whether the segment from a to b meets a box. */

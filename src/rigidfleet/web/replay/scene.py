@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rigidfleet.plotting import agent_colours
+from rigidfleet.plotting.quadrotors import rotor_forces, rotor_limits, tracking_error
 from rigidfleet.typing import Floats, Ints
 from rigidfleet.web.replay.pack import PackedColumn
 
 if TYPE_CHECKING:
-    pass
     from rigidfleet.mission import Mission
     from rigidfleet.result import Result
 
@@ -35,6 +35,7 @@ def describe(mission: Mission, edges: Ints, tension: float) -> dict[str, Any]:
         "title": mission.title,
         "radius": mission.agents.radius,
         "colours": agent_colours(mission.n_agents),
+        **_rotors(mission),
         "edges": edges,
         "tension": tension,
         "boxes": [{"name": o.name, "min": o.min, "max": o.max} for o in boxes],
@@ -50,10 +51,9 @@ def observe(result: Result, shown: Ints, tension: float) -> dict[str, PackedColu
     mission = result.mission
     # Fine enough for a vehicle that fills the screen.
     fine = max(size(result), *mission.agents.radius, 1e-9) / 20_000
-    force = result.input_force + result.constraint_force
     return {
         "position": PackedColumn(result.position, fine),
-        "thrust": PackedColumn(thrust_directions(force, mission.fleet.mass), 5e-4),
+        **_turned(result),
         "slot": PackedColumn(result.slot_position - result.position, fine),
         "cm": PackedColumn(result.cm, fine),
         "attitude": PackedColumn(result.attitude, 1e-4),
@@ -61,6 +61,38 @@ def observe(result: Result, shown: Ints, tension: float) -> dict[str, PackedColu
         "tension": PackedColumn(-result.multiplier[:, shown], tension / 1000),
         **_plotted(result),
     }
+
+
+def _rotors(mission: Mission) -> dict[str, Any]:
+    """Which vehicles have rotors of their own, whose forces are known; nothing for a fleet of points."""
+    known = np.isfinite(rotor_limits(mission))
+    return {"rotors": known.tolist()} if known.any() else {}
+
+
+def _turned(result: Result) -> dict[str, PackedColumn]:
+    """Samples that turn vehicles: attitudes and shares of the rotors' limits, and of points the thrust's direction."""
+    mission, found = result.mission, {}
+    limits = rotor_limits(mission)
+    known = np.isfinite(limits)
+    if not known.all():
+        force = result.input_force + result.constraint_force
+        found["thrust"] = PackedColumn(thrust_directions(force, mission.fleet.mass), 5e-4)
+    if known.any():
+        q, force, saturated = result.vehicle_attitude, result.rotor_force, result.saturated
+        assert q is not None
+        assert force is not None
+        assert saturated is not None
+        share = np.where(known[:, None], force / np.where(known, limits, 1.0)[:, None], 0.0)
+        found["turn"] = PackedColumn(_continuous(q), 1e-3)
+        found["rotors"] = PackedColumn(share, 0.01)
+        found["saturated"] = PackedColumn(np.where(result.left, saturated != 0, 0.0), 1.0)
+    return found
+
+
+def _continuous(q: Floats) -> Floats:
+    """Quaternions (K, N, 4) with signs such that neighbours in time can be mixed."""
+    turned = (q[1:] * q[:-1]).sum(axis=2) < 0.0
+    return q * np.cumprod(np.where(np.pad(turned, ((1, 0), (0, 0))), -1.0, 1.0), axis=0)[..., None]
 
 
 def sight(mission: Mission, low: Floats, high: Floats) -> Floats:
@@ -117,6 +149,11 @@ def _plots(mission: Mission) -> list[dict[str, Any]]:
         "floor": _FLOOR,
     }
     plots = [{"column": "thrust plot", **_thrust_plot(mission)}]
+    if np.isfinite(rotor_limits(mission)).any():
+        plots = [{"column": "rotor plot", **_rotor_plot(n)}]
+        plots.append(
+            {"column": "off plot", "title": "Tracking error", "limits": [limits.tracking_error]}
+        )
     if len(mission.edges):
         plots.append({"title": "Constraint error", "column": "error plot", "log": True})
     least = {"worst": "least", "least": limits.separation}
@@ -151,6 +188,25 @@ def _thrust_plot(mission: Mission) -> dict[str, Any]:
     return {"title": title, "unit": "N", "colours": agent_colours(len(alike)), "limits": own}
 
 
+def _rotor_plot(n: int) -> dict[str, Any]:
+    """Lines of the greatest rotor force of each vehicle, or of the least and the greatest of many, as shares."""
+    colours = agent_colours(n) if n <= _LINES else ["#8FA3B8", "#20262D"]
+    return {
+        "title": "Rotors, share of limit",
+        "unit": "%",
+        "colours": colours,
+        "limits": [100.0] * len(colours),
+    }
+
+
+def _rotor_lines(result: Result) -> Floats:
+    """Samples (K, lines) of `_rotor_plot`."""
+    share = 100.0 * rotor_forces(result).max(axis=2) / rotor_limits(result.mission)
+    if share.shape[1] <= _LINES:
+        return share
+    return np.stack([np.fmin.reduce(share, axis=1), np.fmax.reduce(share, axis=1)], axis=1)
+
+
 def _thrust_lines(mission: Mission, thrust: Floats) -> Floats:
     """Samples (K, lines) of `_thrust_plot`."""
     alike = _alike(mission)
@@ -173,4 +229,8 @@ def _plotted(result: Result) -> dict[str, PackedColumn]:
         "separation plot": PackedColumn(result.separation, 1e-3),
         "clearance plot": PackedColumn(result.clearance, 1e-3),
     }
+    if np.isfinite(rotor_limits(result.mission)).any():
+        samples["rotor plot"] = PackedColumn(_rotor_lines(result), 0.1)
+        off = np.fmax.reduce(tracking_error(result), axis=1)
+        samples["off plot"] = PackedColumn(off, 1e-4)
     return {plot["column"]: samples[plot["column"]] for plot in _plots(result.mission)}

@@ -1,0 +1,154 @@
+"""How fast quadrotors fly on one core, and how exact their steps are; beside RotorPy and crazyflow if installed.
+
+``make bench`` runs it. A vehicle-step is one step of one vehicle, with attitude control at 500 Hz on all sides. RotorPy
+(its SE(3) law, adaptive steps within each period) and crazyflow (its attitude law, float32, Runge-Kutta) hover; our
+vehicles fly the passage of the cube, or hover. Times are CPU times: other work on the machine counts less.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from importlib.util import find_spec
+from pathlib import Path
+from statistics import median
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+from vehicle_samples import ROTORPY, G, begun
+
+from rigidfleet.kernel import fleet
+from rigidfleet.kernel.engine import sampled
+from rigidfleet.kernel.problem import workspace
+from rigidfleet.kernel.records import FINISHED
+from rigidfleet.mission import load_mission
+from rigidfleet.planning.plan import plan_phase
+from rigidfleet.planning.reference import PhaseState
+
+VEHICLE = ROTORPY["px4_sihsim_quadx"]
+RATE = 500.0  # of attitude control and formation law [Hz]
+#: crazyflow must be imported before SciPy: a process of its own.
+CRAZYFLOW = """
+import sys, time
+import numpy as np
+from crazyflow.control import Control
+from crazyflow.sim import Sim
+n = int(sys.argv[1])
+sim = Sim(n_drones=n, control=Control.attitude, freq=500, attitude_freq=500, integrator="rk4")
+command = np.zeros((1, n, 4))
+command[..., 3] = 0.0328 * 9.81
+sim.reset()
+best = 0.0
+for _ in range(4):  # the first one compiles
+    begun = time.process_time()
+    sim.attitude_control(command)
+    sim.step(500)
+    sim.data.states.pos.block_until_ready()
+    best = max(best, 500 * n / (time.process_time() - begun))
+print("rate", best)
+"""
+
+
+def hover(n: int, h: float) -> float:
+    """Vehicle-steps per second of n vehicles that hover, of 4 s of flight."""
+    problem, work, flight, state = begun([VEHICLE] * n, h=h, steps=round(1.0 / (RATE * h)))
+    start = time.process_time()
+    sampled.fly_ticks(problem, work, flight, state, fleet.segment(n, 0, 4.0))
+    return n * int(state.count[fleet.STEPS]) / (time.process_time() - start)
+
+
+def passage(h: float) -> tuple[float, float, np.ndarray]:
+    """The cube's passage, 90 s of eight vehicles: flown time, time spent in the kernel [s], positions at 10 Hz."""
+    mission = load_mission("cube-passage")
+    agents, state, spent, path = mission.agents, None, 0.0, []
+    now = PhaseState(0.0, np.array(agents.position), np.array(agents.velocity))
+    vehicles = fleet.quadrotors([VEHICLE] * len(now.r), G)
+    flight = fleet.flight(vehicles, start=0.0, h=h, steps=round(1.0 / (RATE * h)))
+    S = fleet.hovering(vehicles, now.r, now.v)
+    for phase in mission.phases:
+        plan = plan_phase(mission, phase, now)
+        m = len(plan.edges)
+        work = workspace(len(S), m, solver=plan.problem.law.solver)
+        integral = plan.state()[6 * len(S) : 6 * len(S) + m]
+        if state is None:
+            state = fleet.begin(flight, S, work)
+        state = fleet.renewed(state, work, integral)
+        times = plan.start + 0.1 * np.arange(1, round(10.0 * (plan.t_end - plan.start)) + 1)
+        call = fleet.segment(len(S), m, plan.t_end, times)
+        begun_at = time.process_time()
+        status = sampled.fly_ticks(plan.problem, work, flight, state, call)
+        spent += time.process_time() - begun_at
+        if status != FINISHED:
+            raise RuntimeError(f"the flight ended in phase {phase.name!r}")
+        path.append(call.S[..., :3])
+        S = state.S
+        state.count[fleet.SAMPLES] = 0
+        y = np.concatenate([S[:, :3].ravel(), S[:, 3:6].ravel(), state.integral[0]])
+        now = plan.reached(plan.t_end, y, work)
+    return now.t, spent, np.concatenate(path)
+
+
+def rotorpy(steps: int) -> float:
+    """Vehicle-steps per second of RotorPy, its law at 500 Hz."""
+    from rotorpy.controllers.quadrotor_control import SE3Control
+    from rotorpy.vehicles.multirotor import Multirotor
+    from rotorpy.vehicles.px4_sihsim_quadx_params import quad_params
+
+    model, law = Multirotor(quad_params), SE3Control(quad_params)
+    rest = {name: np.zeros(3) for name in ("x", "x_dot", "x_ddot")} | {"yaw": 0.0, "yaw_dot": 0.0}
+    state = {
+        "x": np.zeros(3), "v": np.zeros(3), "q": np.array([0.0, 0, 0, 1]), "w": np.zeros(3), "wind": np.zeros(3),
+        "rotor_speeds": np.full(4, VEHICLE.speed_at(VEHICLE.m * G / 4)),
+    }  # fmt: skip
+    start = time.process_time()
+    for k in range(steps):
+        state = model.step(state, law.update(k / RATE, state, rest), 1.0 / RATE)
+    return steps / (time.process_time() - start)
+
+
+def crazyflow(n: int) -> float:
+    """Vehicle-steps per second of crazyflow on one core."""
+    environment = os.environ | {"SCIPY_ARRAY_API": "1", "JAX_PLATFORMS": "cpu"}
+    pinned = f"import os; os.sched_setaffinity(0, {{{min(os.sched_getaffinity(0))}}})\n"
+    with tempfile.TemporaryDirectory() as folder:  # MuJoCo writes a log into the current one
+        done = subprocess.run(
+            [sys.executable, "-c", pinned + CRAZYFLOW, str(n)], env=environment, cwd=folder, check=True,
+            capture_output=True, text=True,
+        )  # fmt: skip
+    return float(done.stdout.split("rate")[-1])
+
+
+def main() -> int:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--rounds", type=int, default=5, help="rounds, of which the median counts")
+    rounds = parser.parse_args().rounds
+    hover(1, 2e-3)  # compiled now, if not before
+    print("vehicle-steps per second on one core, float64, attitude control at 500 Hz")
+    for n in (1, 8, 100):
+        for h in (2e-3, 1e-3):
+            rate = median(hover(n, h) for _ in range(rounds))
+            print(f"  {n:3} vehicles, steps of {1e3 * h:g} ms: {rate:.3g}")
+    flights = [passage(2e-3) for _ in range(rounds)]
+    flown, path = flights[0][0], flights[0][2]
+    ratio = median(flown / spent for flown, spent, _ in flights)
+    print(f"cube-passage, eight vehicles, law at 500 Hz, {flown:g} s: {ratio:.0f} times real time")
+    exact = passage(2.5e-4)[2]
+    for h in (2e-3, 1e-3):
+        error = np.abs((path if h == 2e-3 else passage(h)[2]) - exact).max()
+        print(f"  steps of {1e3 * h:g} ms: positions within {error:.1e} m of those with 0.25 ms")
+    if find_spec("rotorpy"):
+        print(f"RotorPy, 1 vehicle: {median(rotorpy(300) for _ in range(rounds)):.3g}")
+    if find_spec("crazyflow"):
+        for n in (1, 8, 100):
+            print(f"crazyflow, {n} vehicles, float32: {crazyflow(n):.3g}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

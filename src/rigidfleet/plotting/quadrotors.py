@@ -1,0 +1,192 @@
+"""Figures of flights by vehicles with rotors: forces of the rotors, tilt, tracking error, saturation."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from rigidfleet.math import attitude as att
+from rigidfleet.plotting import peaks
+from rigidfleet.plotting import style as st
+from rigidfleet.plotting.style import styled
+from rigidfleet.result import LABELS, Extremum, Result
+from rigidfleet.typing import Bools, Floats
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from rigidfleet.mission import Mission
+
+_ROWS = 12  # greatest number of vehicles with a bar each; of more, their number is drawn
+_TOLD = 0.35  # height of a row that holds only text
+
+
+def rotor_limits(mission: Mission) -> Floats:
+    """Maximum thrust (N,) of a rotor of each vehicle [N]; NaN for points, which have none."""
+    models = mission.vehicle_models
+    if models is None:
+        return np.full(mission.n_agents, np.nan)
+    return np.array([math.nan if model.point else model.rotor_limit for model in models])
+
+
+def has_rotors(result: Result) -> bool:
+    """Whether a vehicle with rotors flies."""
+    return result.rotor_force is not None and bool(np.isfinite(rotor_limits(result.mission)).any())
+
+
+def rotor_forces(result: Result) -> Floats:
+    """Thrust (K, N, 4) of each rotor [N]; NaN for points and for vehicles that are lost."""
+    assert result.rotor_force is not None
+    known = result.left & np.isfinite(rotor_limits(result.mission))
+    return np.where(known[..., None], result.rotor_force, np.nan)
+
+
+def tilt(result: Result) -> Floats:
+    """Tilt (K, N) of each vehicle [deg]; NaN for points and for vehicles that are lost."""
+    assert result.vehicle_attitude is not None
+    up = att.dcm_from_quaternion(result.vehicle_attitude)[..., 2, 2]
+    known = result.left & np.isfinite(rotor_limits(result.mission))
+    return np.where(known, np.degrees(np.arccos(np.clip(up, -1.0, 1.0))), np.nan)
+
+
+def tracking_error(result: Result) -> Floats:
+    """Distance (K, N) of each vehicle from its slot [m]; NaN where no slot is tracked, or the vehicle is lost."""
+    off = np.linalg.norm(result.position - result.slot_position, axis=2)
+    return np.where(result.left, off, np.nan)
+
+
+def _nearest(result: Result, limits: Floats) -> Extremum | None:
+    """The rotor that comes nearest to its limit between samples; its ``other`` is the rotor."""
+    every = [p.extremes["rotor_force"] for p in result.phases if "rotor_force" in p.extremes]
+    return max(every, key=lambda x: x.value / limits[x.who], default=None)
+
+
+@styled
+def rotors(result: Result) -> Figure:
+    """Greatest force of a rotor of each vehicle with its limit, and all rotors of the vehicle nearest to its limit."""
+    fig, axes = st.time_figure(result, "Force of the rotors", 2)
+    above, below = axes[:, 0]
+    if not has_rotors(result):
+        for ax in (above, below):
+            st.note(ax, "no rotors")
+    else:
+        _draw_greatest(above, result)
+        st.agents_legend(above, result.n_agents)
+        _draw_nearest(below, result)
+    st.name_phases(fig, [above], result)
+    return fig
+
+
+def _draw_greatest(ax: Axes, result: Result) -> None:
+    """The greatest of the four rotors of each vehicle; as a share of the limit if limits differ."""
+    limits, force = rotor_limits(result.mission), rotor_forces(result).max(axis=2)
+    between, unit = _nearest(result, limits), "N"
+    shown = peaks.limits(limits)
+    ax.set_ylabel("greatest rotor force [N]")
+    if len(shown) > 1:
+        if between is not None:
+            between = between._replace(value=100.0 * between.value / limits[between.who])
+        force, unit, shown = 100.0 * force / limits, "%", [(100.0, "limit", st.ALERT)]
+        ax.set_ylabel("share of the rotor limit [%]")
+    between = None if between is None else between._replace(other=-1)
+    st.agent_lines(ax, result, force)
+    for value, label, colour in shown:
+        st.limit(ax, value, label, colour)
+    ax.set_ylim(0.0, 1.12 * max([*(value for value, *_ in shown), peaks.sane(result, force)]))
+    peaks.extremes(ax, result, force, unit, peaks.agent, between=between)
+
+
+def _draw_nearest(ax: Axes, result: Result) -> None:
+    """The four rotors of the vehicle that comes nearest to its limit, enlarged."""
+    from matplotlib.lines import Line2D
+
+    limits, force = rotor_limits(result.mission), rotor_forces(result)
+    peak = np.fmax.reduce(force, axis=(0, 2)) / limits
+    i = int(np.nanargmax(peak))
+    e = _nearest(result, limits)
+    if e is not None and e.value / limits[e.who] > peak[i]:
+        i = e.who
+    colours = st.scale(4)
+    for k, colour in enumerate(colours):
+        st.line(ax, result.time, force[:, i, k], color=colour, linewidth=1.9 - 0.35 * k)
+    peaks.within(ax, result, force[:, i])
+    low, high = ax.get_ylim()
+    if limits[i] < high + 0.3 * (high - low):
+        st.limit(ax, float(limits[i]), f"limit {limits[i]:.4g} N")
+    ax.set_ylabel(f"rotors of agent {i + 1} [N]")
+    entries = [
+        Line2D([], [], color=colour, label=name)
+        for name, colour in zip(LABELS["rotor"], colours, strict=True)
+    ]
+    st.legend(ax, entries, "nearest to its limit")
+
+
+@styled
+def vehicles(result: Result) -> Figure:
+    """Tilt of each vehicle, its distance from its slot, and when it cannot give what is asked of it."""
+    saturated = _saturated(result)
+    shares = (1.0, 1.0, 0.6 if saturated.any() else _TOLD)
+    title = "Tilt, tracking error and saturation of the vehicles"
+    fig, axes = st.time_figure(result, title, 3, height=1.9, shares=shares)
+    above, middle, below = axes[:, 0]
+    limits = result.mission.limits
+    above.set_ylabel("tilt [deg]")
+    if not has_rotors(result):
+        st.note(above, "points do not tilt")
+    else:
+        _draw_limited(above, result, tilt(result), "deg", "tilt", limits.tilt_deg)
+        st.agents_legend(above, result.n_agents)
+    middle.set_ylabel("from the slot [m]")
+    off = tracking_error(result)
+    if np.isfinite(off).any():
+        _draw_limited(middle, result, off, "m", "tracking_error", limits.tracking_error)
+    else:
+        st.note(middle, "no slots are tracked")
+    _draw_saturation(below, result, saturated)
+    st.name_phases(fig, [above], result)
+    return fig
+
+
+def _draw_limited(
+    ax: Axes, result: Result, values: Floats, unit: str, name: str, limit: float | None
+) -> None:
+    """Each agent's values (K, N) from zero, with their greatest and the mission's limit."""
+    between = result.extreme(name)
+    if between is not None and unit == "deg":
+        between = Extremum(math.degrees(between.value), between.time, between.who, -1)
+    if peaks.from_none(ax, result, values, unit, between=between) and limit is not None:
+        top = max(ax.get_ylim()[1], 1.2 * limit)
+        ax.set_ylim(-0.04 * top, top)
+        st.limit(ax, limit, f"limit {limit:g} {unit}")
+
+
+def _saturated(result: Result) -> Bools:
+    """Mask (K, N) of the vehicles that cannot give what is asked of them."""
+    if result.saturated is None:
+        return np.zeros(result.left.shape, dtype=np.bool_)
+    return (result.saturated != 0) & result.left
+
+
+def _draw_saturation(ax: Axes, result: Result, saturated: Bools) -> None:
+    """A bar for each vehicle while it is saturated; of many vehicles, how many are."""
+    n, t = result.n_agents, result.time
+    if not saturated.any():
+        st.note(ax, "no vehicle is asked for more than its rotors give")
+        return
+    if n > _ROWS:
+        ax.fill_between(t, saturated.sum(axis=1), step="post", color=st.FLOWN, linewidth=0)
+        ax.set_ylim(0, 1.12 * max(1, int(saturated.sum(axis=1).max())))
+        ax.set_ylabel("saturated\n[vehicles]")
+        return
+    for i, colour in enumerate(st.agent_colours(n)):
+        ends = np.flatnonzero(np.diff(np.pad(saturated[:, i], 1).astype(int)))
+        last = np.append(t, t[-1])
+        bars = [(t[a], last[b] - t[a]) for a, b in list(pairwise(ends.tolist()))[::2]]
+        ax.broken_barh(bars, (i + 0.6, 0.8), color=colour, linewidth=0.4)
+    ax.set_ylim(n + 0.6, 0.4)
+    ax.set_yticks(range(1, n + 1))
+    ax.set_ylabel("saturated\nagent")

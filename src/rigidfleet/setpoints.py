@@ -1,0 +1,119 @@
+"""Setpoints of each vehicle over time, between samples and as CSV: what other programs are given to fly.
+
+A `Setpoints` holds position, velocity, acceleration, jerk and yaw at some times. Between them, vehicles move on
+polynomials that meet all of these (degree 7), so that any rate can be had from the samples of a result.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from rigidfleet.math import lqr, series, splines
+from rigidfleet.typing import Floats, Ints
+
+_HEADER = (
+    "time_s,agent,x_m,y_m,z_m,vx_m_s,vy_m_s,vz_m_s,ax_m_s2,ay_m_s2,az_m_s2,jx_m_s3,jy_m_s3,jz_m_s3,"
+    "yaw_rad,yaw_rate_rad_s"
+)
+#: Greatest number of setpoints [one agent at one time] of a table: a file of 3 GB.
+MOST = 20_000_000
+
+
+class Setpoints(NamedTuple):
+    """States of N vehicles at K times; NaN where there is none.
+
+    Attributes
+    ----------
+    time : (K,) [s]
+    state : (K, 4, N, 3) position [m], velocity [m/s], acceleration [m/s^2], jerk [m/s^3]
+    yaw, yaw_rate : (K, N) [rad, rad/s]
+    """
+
+    time: Floats
+    state: Floats
+    yaw: Floats
+    yaw_rate: Floats
+
+
+def of_motion(position: Floats, velocity: Floats, acceleration: Floats, time: Floats) -> Floats:
+    """States (K, 4, N, 3) of a flown motion (K, N, 3) at times (K,) [s], with the jerk of quintics between them."""
+    x = np.stack([position, velocity, acceleration, np.full_like(position, np.nan)], axis=1)
+    if len(time) > 1:
+        pieces = lqr.quintic_pieces(time, position, velocity, acceleration)
+        x[:-1, 3] = 6.0 * pieces[..., 3]
+        last = series.of_polynomials(pieces[-1:], np.diff(time)[-1:], 4)
+        x[-1, 3] = 6.0 * last[3, 0]
+    return x
+
+
+def at_rate(given: Setpoints, rate: float | None) -> Setpoints:
+    """Setpoints at a rate [Hz] from the first time on; without one, at their own times.
+
+    Where two times are one representable number apart, as at a switch of phases, the later one counts.
+
+    Raises
+    ------
+    ValueError
+        The rate is not positive, or gives more than `MOST` setpoints.
+    """
+    time = given.time
+    later = np.append(np.nextafter(time[:-1], np.inf) < time[1:], True)
+    if rate is None:
+        return Setpoints(*(x[later] for x in given))
+    if not (np.isfinite(rate) and rate > 0.0):
+        raise ValueError(f"the rate must be positive [Hz], not {rate!r}")
+    count = int((time[-1] - time[0]) * rate * (1.0 + 1e-12)) + 1
+    n = given.yaw.shape[1]
+    if count * n > MOST:
+        fits = (MOST / n - 1) / (time[-1] - time[0])
+        raise ValueError(
+            f"a rate of {rate:g} Hz gives {count * n:,} setpoints; use {fits:.3g} Hz or less"
+        )
+    wanted = np.minimum(time[0] + np.arange(count) / rate, time[-1])
+    if len(time) == 1:
+        return given
+    # Pieces between samples of a phase; none is as narrow as a switch.
+    ends = np.flatnonzero(later[:-1])
+    low = ends[np.searchsorted(time[ends], np.nextafter(wanted, np.inf), side="right") - 1]
+    after = wanted - time[low]
+    state = np.empty((count, *given.state.shape[1:]))
+    yaw, yaw_rate = np.empty((count, n)), np.empty((count, n))
+    step = max(1, 200_000 // n)
+    for first in range(0, count, step):  # in blocks, to save memory
+        rows = slice(first, first + step)
+        k, x = low[rows], after[rows]
+        state[rows] = _between(time, given.state, k, x)
+        angle = np.stack([given.yaw, given.yaw_rate], axis=1)[..., None]
+        angle = _between(time, angle, k, x)[..., 0]
+        yaw[rows], yaw_rate[rows] = angle[:, 0], angle[:, 1]
+    return Setpoints(wanted, state, yaw, yaw_rate)
+
+
+def _between(time: Floats, x: Floats, low: Ints, after: Floats) -> Floats:
+    """Derivatives (K, m, ...) at times ``after`` [s] sample ``low`` (K,), by polynomials that meet x (n, m, ...)."""
+    begin, end = (x[k].swapaxes(0, 1) for k in (low, low + 1))
+    pieces = splines.hermite(time[low + 1] - time[low], begin, end)
+    found = series.of_polynomials(pieces, after, x.shape[1])
+    return series.derivatives(found).swapaxes(0, 1)
+
+
+def csv(given: Setpoints) -> str:
+    """The text of a table: a row for each time and agent (from 1), numbers to 9 digits, empty where there is none."""
+    k, n = given.yaw.shape
+    columns = np.concatenate(
+        [
+            given.state.transpose(0, 2, 1, 3).reshape(k, n, 12),
+            given.yaw[..., None],
+            given.yaw_rate[..., None],
+        ],
+        axis=2,
+    )
+    lines = [_HEADER]
+    row = ",".join(["%.9g"] * columns.shape[2])
+    for t, agents in zip(given.time.tolist(), columns, strict=True):
+        told = f"{t:.9g}"
+        for i, values in enumerate(agents.tolist(), start=1):
+            lines.append(f"{told},{i}," + row % tuple(values))
+    return "\n".join(lines).replace("nan", "") + "\n"

@@ -1,0 +1,288 @@
+"""Missions flown by vehicles: shipped ones and their promises, sampled points against continuous ones, bits."""
+
+import math
+
+import numpy as np
+import pytest
+
+import rigidfleet as rf
+from rigidfleet.mission import load_mission
+from rigidfleet.result import Result
+
+
+def changed(name, **tables):
+    """A shipped mission with other tables; a table of None is removed."""
+    data = load_mission(name).to_dict()
+    for key, table in tables.items():
+        if table is None:
+            data.pop(key, None)
+        elif isinstance(table, dict) and isinstance(data.get(key), dict):
+            data[key] = data[key] | table
+        else:
+            data[key] = table
+    return rf.Mission.from_dict(data)
+
+
+def errors(result):
+    """Greatest position error, and greatest shape error over all pairs [m], while slots are tracked."""
+    off = np.linalg.norm(result.position - result.slot_position, axis=2)
+    i, j = np.triu_indices(result.n_agents, 1)
+    shape = abs(
+        np.linalg.norm(result.position[:, i] - result.position[:, j], axis=2)
+        - np.linalg.norm(result.slot_position[:, i] - result.slot_position[:, j], axis=2)
+    )
+    return float(np.nanmax(off)), float(np.nanmax(shape))
+
+
+@pytest.fixture(scope="module")
+def passage():
+    return rf.simulate("passage-quadrotors")
+
+
+# -- shipped missions -------------------------------------------------------------------------------
+
+
+def test_the_papers_vehicle_flies_the_passage(passage):
+    """Four rotors of 5.9 N fly the narrow passage: to 5 cm, with 1 cm of shape, and half of each rotor left."""
+    position, shape = errors(passage)
+    assert position < 0.05
+    assert shape < 0.01
+    verdict = rf.assess(passage)
+    assert verdict.passed
+    x = passage.extreme("rotor_force")
+    assert x is not None
+    assert x.value < 0.55 * 5.9
+    told = {check.check: check for check in verdict.checks}
+    assert told["rotor_force"].limit == pytest.approx(5.9)
+    assert told["saturation"].worst == 0.0
+    assert "rotors peak at" in verdict.summary
+
+
+def test_what_check_foresees_is_what_rotors_give(passage):
+    """The rotor force that the check derives from the plan is that of the flight, to a few per cent."""
+    found = rf.check("passage-quadrotors", search=False)
+    assert found.vehicles is not None
+    x = passage.extreme("rotor_force")
+    assert x is not None
+    assert found.vehicles.rotor_force[0] == pytest.approx(x.value, rel=0.05)
+    tilt = passage.extreme("tilt")
+    assert tilt is not None
+    assert found.vehicles.tilt[0] == pytest.approx(math.degrees(tilt.value), rel=0.05)
+    assert found.vehicles.jump is not None
+    assert found.vehicles.jump[0] < 1e-6
+
+
+def test_a_regulators_way_jumps():
+    """On the paper's regulator legs, the check tells the jump; the flight asks for more than rotors give."""
+    mission = changed("passage-quadrotors", smoothness="lqr")
+    found = rf.check(mission, search=False)
+    (remark,) = (r for r in found.remarks if r.topic == "jumps")
+    assert "jumps by 2.47 m/s^2 (14.1 deg of tilt) at 65.00 s" in remark.text
+    x = rf.simulate(mission).extreme("saturation")
+    assert x is not None
+    assert x.value > 0.01
+
+
+@pytest.mark.long
+def test_the_cube_passes_with_px4s_vehicle():
+    """Eight vehicles with slow motors: to 6 cm, with 1 cm of shape."""
+    result = rf.simulate("cube-passage-quadrotors")
+    position, shape = errors(result)
+    assert position < 0.06
+    assert shape < 0.01
+    assert rf.assess(result).passed
+
+
+NOISE = {"position": 0.01, "velocity": 0.02, "rate": 100.0, "delay": 0.02}
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_noise_and_delay_leave_three_centimetres(seed):
+    """With 1 cm and 2 cm/s of noise and 20 ms of delay, the shape keeps within 3 cm."""
+    mission = changed("passage-quadrotors", disturbances={"noise": NOISE | {"seed": seed}})
+    assert errors(rf.simulate(mission))[1] < 0.03
+
+
+def test_old_measurements_are_compared_with_the_reference_of_their_time():
+    """Without that, the fold into a line is off by the way of 20 ms: five times as much."""
+    late = {"noise": {"delay": 0.02, "rate": 500.0}}
+    with_time = errors(rf.simulate(changed("passage-quadrotors", disturbances=late)))[1]
+    without = changed(
+        "passage-quadrotors", disturbances=late, autopilot={"delay_compensation": False}
+    )
+    assert errors(rf.simulate(without))[1] > 4.0 * with_time
+
+
+@pytest.mark.parametrize("name", ["crazyflies", "downwash-cube"])
+def test_shipped_missions_pass(name):
+    """Crazyflies in a room, and a cube in its own downwash, pass their verdict."""
+    assert rf.assess(rf.simulate(name)).passed
+
+
+def test_fifty_milliseconds_late():
+    """As the check foresees, slots survive 50 ms and edges with these gains do not; with slower ones they do."""
+    found = rf.check("delayed", search=False)
+    (remark,) = (r for r in found.remarks if r.level == "fails")
+    assert "unstable with the vehicles' lag and delay" in remark.text
+    verdict = rf.assess(rf.simulate("delayed"))
+    failed = {check.phase for check in verdict.checks if not check.passed}
+    assert failed == {"with edges"}
+    p = 2.0
+    slower = {"alpha": 1.5 * p, "beta": math.sqrt(3.0) * p, "gamma": p**3}
+    mission = changed("delayed", constraint=slower)
+    assert rf.check(mission, search=False).passed
+    assert rf.assess(rf.simulate(mission)).passed
+
+
+# -- properties -------------------------------------------------------------------------------------
+
+
+def test_sampled_points_fly_as_continuous_ones():
+    """Points with sampled control differ from those of continuous laws by what falls with the rate."""
+    smooth = changed("narrow-passage", smoothness="jerk")
+    whole = rf.simulate(smooth)
+    off = []
+    for rate in (100.0, 400.0):
+        data = smooth.to_dict() | {
+            "vehicles": {"p": {"model": "point", "mass": 1.0, "thrust_limit": 23.6}},
+            "autopilot": {"rate": rate, "formation_rate": rate},
+        }
+        kept = {k: v for k, v in data["agents"].items() if k not in ("mass", "thrust_limit")}
+        flown = rf.simulate(rf.Mission.from_dict(data | {"agents": kept | {"vehicle": "p"}}))
+        at = np.searchsorted(whole.time, flown.time[::20]).clip(max=len(whole.time) - 1)
+        same = whole.time[at] == flown.time[::20]
+        off.append(np.abs(whole.position[at] - flown.position[::20])[same].max())
+    assert off[0] < 0.05
+    assert off[1] < 0.4 * off[0]
+
+
+def short(**tables):
+    """Six seconds of three quadrotors that establish a triangle and fly."""
+    data = {
+        "schema_version": 1, "name": "short", "smoothness": "jerk",
+        "vehicles": {"drone": {"model": "paper"}},
+        "agents": {"vehicle": "drone", "position": [[1, 6, 3], [5, 4, 3], [4, 7, 3]]},
+        "tracking": {"drag_feedforward": True},
+        "formations": {"triangle": {"shape": "triangle", "size": 4.0}},
+        "phases": [
+            {"kind": "establish", "formation": "triangle", "blend": 2.5, "until": 3.0},
+            {"kind": "fly", "position": [6.0, 5.0, 4.0], "until": 6.0},
+        ],
+    }  # fmt: skip
+    return rf.Mission.from_dict(data | tables)
+
+
+NOISY = {
+    "noise": NOISE | {"dropped": 0.1},
+    "wind": [3.0, 1.0, 0.0],
+    "mass_error": [0.02, 0.0, -0.02],
+}
+LINKS = {"delay": 0.03, "rate": 50.0, "dropped": 0.2}
+
+
+@pytest.mark.parametrize("disturbances", [None, NOISY, NOISY | {"links": LINKS}])
+def test_flights_repeat_bit_for_bit(disturbances):
+    """The same mission flies the same bits; other samples are those of the same flight."""
+    tables = {} if disturbances is None else {"disturbances": disturbances}
+    first, again = (rf.simulate(short(**tables)) for _ in range(2))
+    assert first.position.tobytes() == again.position.tobytes()
+    coarse = rf.simulate(short(**tables, output_step=0.5))
+    at = np.searchsorted(first.time, coarse.time)
+    np.testing.assert_array_equal(first.position[at], coarse.position)
+    assert coarse.extreme("rotor_force") == first.extreme("rotor_force")
+
+
+def test_a_flight_step_by_step_is_the_same():
+    """Stops divide a step of the integrator at most."""
+    flight = rf.Flight(short())
+    while flight.begin():
+        while flight.advance(0.37):
+            flight.observe()
+    result, whole = flight.finish(), rf.simulate(short())
+    at = np.isin(result.time, whole.time)
+    np.testing.assert_allclose(
+        result.position[at], whole.position[np.isin(whole.time, result.time)], atol=1e-9
+    )
+
+
+def test_a_result_keeps_its_vehicles(tmp_path):
+    """Attitudes, rotors and saturation are saved, and the flight repeats from its result."""
+    result = rf.simulate(short())
+    result.save(tmp_path / "short.nc")
+    loaded = Result.load(tmp_path / "short.nc")
+    for name in ("vehicle_attitude", "vehicle_rates", "rotor_force", "saturated"):
+        np.testing.assert_array_equal(getattr(loaded, name), getattr(result, name))
+    assert rf.assess(loaded).passed == rf.assess(result).passed
+    again = rf.simulate(loaded.mission)
+    assert again.position.tobytes() == loaded.position.tobytes()
+    np.testing.assert_array_equal(again.rotor_force, loaded.rotor_force)
+
+
+def test_newton_holds_in_the_record():
+    """Mass times acceleration is the rotors' thrust along the vehicle's axis and all external forces."""
+    result = rf.simulate(short(disturbances={"wind": [3.0, 1.0, 0.0]}))
+    assert result.rotor_force is not None
+    assert result.vehicle_attitude is not None
+    w, x, y, z = np.moveaxis(result.vehicle_attitude, -1, 0)
+    up = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=-1)
+    thrust = result.rotor_force.sum(axis=2)
+    np.testing.assert_allclose(thrust, result.thrust, rtol=1e-12)
+    np.testing.assert_allclose(
+        result.acceleration, result.external_force + thrust[..., None] * up, atol=1e-9
+    )
+
+
+def test_a_lost_vehicle_falls_and_the_others_fly_on():
+    """Without thrust a vehicle falls; the rest of the formation keeps its shape."""
+    result = rf.simulate(
+        short(
+            disturbances={"lost": [{"agent": 2, "time": 3.5}]},
+            obstacles=[{"kind": "ground", "height": 0.0}],
+        )
+    )
+    assert result.complete
+    assert result.position[-1, 1, 2] < 0.5
+    assert np.abs(result.position[-1, [0, 2], 2] - 4.0).max() < 0.1
+
+
+def test_a_controller_flies_vehicles():
+    """A user's force replaces the tracking; it sees what is measured."""
+
+    def fly(seen):
+        e = seen.position - seen.reference_position
+        e_dot = seen.velocity - seen.reference_velocity
+        a = seen.reference_acceleration - 2.0 * e - 2.8 * e_dot
+        return seen.masses[:, None] * (a + [0.0, 0.0, seen.gravity])
+
+    result = rf.simulate(short(), controller=fly, rate=100.0)
+    own = rf.simulate(short(tracking={}))  # without drag, which the controller does not know
+    assert result.complete
+    assert errors(result)[0] == pytest.approx(errors(own)[0], rel=0.1)
+
+
+def test_an_external_force_pushes_vehicles():
+    """A user's force acts on the vehicles themselves."""
+    still = rf.simulate(short())
+    pushed = rf.simulate(short(), force=lambda t, r, v: np.full_like(r, 0.3) * [1.0, 0.0, 0.0])
+    assert (pushed.position[-1] - still.position[-1])[:, 0].min() > 0.02
+
+
+def test_bits_do_not_hang_on_wind_that_is_not_there():
+    """Downwash and ground effect act only when they are asked for, and then they do."""
+    still = rf.simulate(short())
+    ground = [{"kind": "ground", "height": 2.7}]
+    near = rf.simulate(short(obstacles=ground, disturbances={"ground_effect": True}))
+    far = rf.simulate(short(obstacles=ground))
+    assert far.position.tobytes() == still.position.tobytes()
+    assert np.abs(near.position - still.position).max() > 1e-4
+
+
+def test_a_record_of_rotors_that_lies_is_found():
+    """Samples above the recorded peak, and thrust that is not the rotors', are judged as they are."""
+    result = rf.simulate(short())
+    assert result.rotor_force is not None
+    result.rotor_force[50, 1, 2] = 7.0
+    found = {c.check: c for c in rf.assess(result).checks}
+    assert not found["rotor_force"].passed
+    assert found["rotor_force"].worst == pytest.approx(7.0)
+    assert not found["record"].passed
