@@ -400,12 +400,6 @@ def realisations() -> Figure:
     return fig
 
 
-DIAGRAMS: Sequence[Callable[[], Figure]] = (
-    edge, frame, constraint_architecture, body_architecture, local_architecture, singular_line,
-    overshoot, solvers, blend, no_inverse, realisations,
-)  # fmt: skip
-
-
 def error_budget() -> Figure:
     """Errors of the passage with quadrotors, from the table of vehicles.md."""
     page = Path(__file__).with_name("vehicles.md").read_text(encoding="utf-8")
@@ -425,3 +419,9 @@ def error_budget() -> Figure:
     ax.legend(loc="upper right", frameon=False)
     ax.spines[["top", "right"]].set_visible(False)
     return fig
+
+
+DIAGRAMS: Sequence[Callable[[], Figure]] = (
+    edge, frame, constraint_architecture, body_architecture, local_architecture, singular_line,
+    overshoot, solvers, blend, no_inverse, realisations, error_budget,
+)  # fmt: skip
