@@ -51,7 +51,9 @@ def flown(mission: Mission, position: Any, **changes: Any) -> Result:
     edges = mission.edges
     sizes = {"time": K, "agent": N, "edge": len(edges)} | {d: len(n) for d, n in LABELS.items()}
     zero: dict[str, Any] = {
-        name: np.zeros([sizes[d] for d in v.dims]) for name, v in VARIABLES.items()
+        name: np.zeros([sizes[d] for d in v.dims])
+        for name, v in VARIABLES.items()
+        if name not in ("vehicle_attitude", "vehicle_rates", "rotor_force", "saturated")
     }
     nothing: dict[str, Any] = {
         name: zero[name] * np.nan
