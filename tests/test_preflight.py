@@ -20,6 +20,7 @@ from rigidfleet.simulation.flight import simulate
 
 #: Missions of which something fails in flight, and what says so before.
 FAILING = {
+    "delayed": "margins",
     "drift": "gains",
     "establish-cube-as-printed": "formation",
     "line-singular": "formation",
