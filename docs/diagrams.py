@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Callable, Sequence
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -398,7 +400,28 @@ def realisations() -> Figure:
     return fig
 
 
+def error_budget() -> Figure:
+    """Errors of the passage with quadrotors, from the table of vehicles.md."""
+    page = Path(__file__).with_name("vehicles.md").read_text(encoding="utf-8")
+    section = page.split("## Where errors come from")[1].split("![")[0]
+    rows = [line.strip("| ").split(" | ") for line in section.splitlines() if line.startswith("| ")]
+    words = [row[0].replace("`", "").split(" (")[0] for row in rows[2:]]
+    errors = np.array([[float(value) for value in row[1:]] for row in rows[2:]])
+    fig = Figure(figsize=(7.6, 4.2), layout="constrained")
+    ax = fig.add_subplot()
+    at = np.arange(len(words))
+    for k, (name, colour) in enumerate((("position", BLUE), ("shape, any pair", ORANGE))):
+        bars = ax.barh(at + 0.2 * (2 * k - 1), errors[:, k], 0.36, color=colour, label=name)
+        ax.bar_label(bars, fmt="{:.3g}", padding=3, color=INK, fontsize=8)
+    ax.set(yticks=at, xscale="log", xlim=(1e-3, 4.0), xlabel="greatest error [m]")
+    ax.set_yticklabels([textwrap.fill(word, 38) for word in words], fontsize=8)
+    ax.invert_yaxis()
+    ax.legend(loc="upper right", frameon=False)
+    ax.spines[["top", "right"]].set_visible(False)
+    return fig
+
+
 DIAGRAMS: Sequence[Callable[[], Figure]] = (
     edge, frame, constraint_architecture, body_architecture, local_architecture, singular_line,
-    overshoot, solvers, blend, no_inverse, realisations,
+    overshoot, solvers, blend, no_inverse, realisations, error_budget,
 )  # fmt: skip

@@ -359,6 +359,7 @@ def test_commands_are_documented(capsys):
         "replay",
         "live",
         "sweep",
+        "tune",
     ):
         assert f"`rigidfleet {command}" in text
         main([command, "--help"])

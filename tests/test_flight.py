@@ -6,7 +6,7 @@ import pytest
 import rigidfleet as rf
 from rigidfleet.errors import FlightError, MissionError
 from rigidfleet.mission import Mission
-from rigidfleet.mission.schema import Fly, Reshape
+from rigidfleet.mission.kinds import Fly, Reshape
 
 FLY = {"kind": "fly", "position": [8.0, 0.0, 12.0], "duration": 8.0}
 

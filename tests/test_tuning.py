@@ -233,6 +233,11 @@ def test_study(study):
         assert after[law].phase >= was.phase * (1 - 1e-9)
         assert after[law].delay >= was.delay * (1 - 1e-9)
     assert "chosen" in tuned.text
+    assert tuned.conclusion in str(tuned)
+    for what, *cells in tuned.rows():
+        line = next(line for line in str(tuned).splitlines() if line.startswith(f"{what}  "))
+        assert line.removeprefix(what).split() == " ".join(cells).split()
+    assert "<td" in tuned._repr_html_()
     assert "noise" in tuned.text
 
 

@@ -6,6 +6,7 @@ the entries in a key such as `phases[3].until`. Arrays that `Mission` returns co
 """
 
 from rigidfleet.mission.describe import counted, ending, goal
+from rigidfleet.mission.kinds import KINDS, Establish, Fly, Hold, Phase, Reshape, Settle, Turn
 from rigidfleet.mission.model import (
     Mission,
     as_mission,
@@ -15,24 +16,16 @@ from rigidfleet.mission.model import (
     mission_text,
 )
 from rigidfleet.mission.schema import (
-    KINDS,
     Box,
     Disturbances,
-    Establish,
-    Fly,
     Formation,
     Geofence,
     Ground,
     Gusts,
-    Hold,
     Limits,
     Lqr,
     Obstacle,
-    Phase,
     Regulator,
-    Reshape,
-    Settle,
-    Turn,
 )
 
 __all__ = [

@@ -33,12 +33,12 @@ from rigidfleet.mission.schema import (
     Lqr,
     MissionHeader,
     Obstacle,
-    Part,
     Regulator,
     Start,
     Tracking,
     VehicleYaw,
 )
+from rigidfleet.mission.values import Part
 
 _TABLES: dict[str, type[Part]] = {
     "agents": Agents,
@@ -335,7 +335,7 @@ def _yaw(collector: FindingCollector, parts: dict[str, Any]) -> None:
 def _planned(collector: FindingCollector, parts: dict[str, Any]) -> None:
     """Find limits of the plan in a mission whose plan keeps none."""
     limits = parts.get("limits", Limits())
-    flown = "vehicle" in collector.data.get("agents", {})  # the verdict judges the tilt of vehicles
+    flown = vehicles.flies_vehicles(collector)  # the verdict judges their tilt
     for key in ("jerk",) if flown else ("jerk", "tilt_deg"):
         if getattr(limits, key) is not None and parts.get("smoothness") == "lqr":
             problem = "has no effect: only the plan of a smooth mission keeps it"

@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+from rigidfleet.mission.kinds import Phase
 from rigidfleet.mission.phases import latest_end
-from rigidfleet.mission.schema import AUTO, Phase
+from rigidfleet.mission.values import AUTO
 
 
 def counted(agents: int, formations: int, phases: Sequence[Phase]) -> str:

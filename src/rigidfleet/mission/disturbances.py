@@ -11,6 +11,7 @@ import numpy as np
 from rigidfleet.mission.findings import FindingCollector
 from rigidfleet.mission.phases import latest_end
 from rigidfleet.mission.schema import Disturbances, Gusts
+from rigidfleet.mission.vehicles import flies_vehicles
 from rigidfleet.typing import Floats
 
 _TABLE = "disturbances"
@@ -81,7 +82,7 @@ def _noise(collector: FindingCollector, found: Disturbances) -> None:
     silent = noise is not None and not any(getattr(noise, key) for key in keys)
     if silent and collector.right(where, *keys):
         collector.add(where, "is zero", "give position [m] or velocity [m/s] > 0")
-    if "vehicle" in collector.data.get("agents", {}):
+    if flies_vehicles(collector):
         return
     remedy = "give the agents a vehicle; model = 'point' flies points with sampled control"
     for key in ("downwash", "ground_effect"):

@@ -15,7 +15,7 @@ from rigidfleet._common.renamed import successor
 from rigidfleet._common.toml import toml_key
 from rigidfleet.errors import Finding
 from rigidfleet.formation.shapes import POLYGONS, SHAPES
-from rigidfleet.mission.schema import Part
+from rigidfleet.mission.values import Part
 
 Keys = tuple[str | int, ...]
 P = TypeVar("P", bound=Part)

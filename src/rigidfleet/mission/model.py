@@ -23,14 +23,9 @@ from rigidfleet.mission import bounds
 from rigidfleet.mission.check import check
 from rigidfleet.mission.describe import counted
 from rigidfleet.mission.findings import near
+from rigidfleet.mission.kinds import Establish, Phase
 from rigidfleet.mission.phases import latest_end
-from rigidfleet.mission.schema import (
-    DRAG,
-    Contents,
-    Establish,
-    Phase,
-    Start,
-)
+from rigidfleet.mission.schema import DRAG, Contents, Start
 from rigidfleet.mission.vehicles import VehicleModel, resolve
 from rigidfleet.typing import Bools, Floats, Ints
 

@@ -16,22 +16,19 @@ from rigidfleet.math import rigid_body
 from rigidfleet.mission import bounds
 from rigidfleet.mission.findings import FindingCollector, Keys, near
 from rigidfleet.mission.formations import sound
-from rigidfleet.mission.schema import (
+from rigidfleet.mission.kinds import (
     ANGLES,
-    AUTO,
     KINDS,
     TIMES,
-    Agents,
     AnyPhase,
     Establish,
-    Formation,
-    Limits,
-    Lqr,
     Orbit,
     Shaping,
     Turn,
     seconds,
 )
+from rigidfleet.mission.schema import Agents, Formation, Limits, Lqr
+from rigidfleet.mission.values import AUTO
 
 _ENDINGS = ("until", "duration", "settle")
 #: Maximum number of samples of a result.

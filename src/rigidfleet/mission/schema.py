@@ -6,18 +6,12 @@ The descriptions document the format: `rigidfleet missions --schema` exports the
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Annotated, Any, ClassVar, Literal, get_args
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import (
-    BaseModel,
-    ConfigDict,
-    Discriminator,
     Field,
     Strict,
-    Tag,
-    WithJsonSchema,
     model_validator,
 )
 
@@ -26,147 +20,62 @@ from rigidfleet.math import rigid_body
 from rigidfleet.mission import bounds
 from rigidfleet.mission.bounds import (
     ACCELERATION,
-    ANGLE,
     FORCE,
     GAIN,
-    JERK,
-    LENGTH,
     MASS,
-    SPEED,
-    TIME,
-    TOLERANCE,
-    WEIGHT,
-    Bound,
+)
+from rigidfleet.mission.kinds import Phase
+from rigidfleet.mission.values import (
+    NAME_OR_LIST,
+    Acceleration,
+    Angle,
+    AttitudeGains,
+    BodyDrag,
+    Coefficient,
+    Coordinate,
+    Cost,
+    Damping,
+    Delay,
+    Edges,
+    Flag,
+    Gain,
+    Inertia,
+    Jerk,
+    Length,
+    LengthOrZero,
+    Limit,
+    Mass,
+    MotorTimes,
+    Part,
+    PerAgent,
+    PerAgentError,
+    PerAxis,
+    Rate,
+    RotorSpeeds,
+    Seed,
+    Share,
+    Size,
+    Small,
+    Speed,
+    Spread,
+    Tilt,
+    Time,
+    Tolerance,
+    Vector,
+    Velocity,
+    Weight,
+    Weights,
+    Whole,
+    from_zero,
+    number_or_list,
+    signed,
 )
 from rigidfleet.typing import Floats, Ints
 
-#: Bound on all numbers: larger than any quantity in SI units here, and its sixth power is still finite.
-HUGE = 1e15
 #: Default drag coefficient of a vehicle per mass [1/s]. At the speeds of formation flight, rotor drag dominates, which
 #: is linear in the speed. Identified from flights: 0.4 to 0.5 /s along two axes of a quadrotor (Faessler, Franchi,
 #: Scaramuzza, Robotics and Automation Letters 3, 2018). A vehicle with more mass per rotor has less.
 DRAG = 0.3
-#: Keys of a phase that may be automatic, and the word for it.
-TIMES = ("duration", "travel", "blend")
-#: Value of a time that follows from the limits.
-AUTO = "auto"
-#: Keys of an attitude: 3-2-1 Euler angles.
-ANGLES = ("roll_deg", "pitch_deg", "yaw_deg")
-
-Number = Annotated[float, Strict(), Field(ge=-HUGE, le=HUGE)]
-Positive = Annotated[float, Strict(), Field(gt=0, le=HUGE)]
-
-
-def _signed(bound: Bound, power: int = 1) -> Any:
-    return Field(ge=-(bound.most**power), le=bound.most**power)
-
-
-def _positive(bound: Bound) -> Any:
-    return Field(ge=bound.least, le=bound.most)
-
-
-def _from_zero(bound: Bound) -> Any:
-    return Field(ge=0, le=bound.most)
-
-
-Coordinate = Annotated[float, Strict(), _signed(LENGTH)]
-Length = Annotated[float, Strict(), _positive(LENGTH)]
-LengthOrZero = Annotated[float, Strict(), _from_zero(LENGTH)]
-Time = Annotated[float, Strict(), _positive(TIME)]
-Dwell = Annotated[float, Strict(), _from_zero(TIME)]
-Speed = Annotated[float, Strict(), _positive(SPEED)]
-Spread = Annotated[float, Strict(), _from_zero(SPEED)]
-Acceleration = Annotated[float, Strict(), _positive(ACCELERATION)]
-Jerk = Annotated[float, Strict(), _positive(JERK)]
-Mass = Annotated[float, Strict(), _positive(MASS)]
-Angle = Annotated[float, Strict(), _signed(ANGLE)]
-Gain = Annotated[float, Strict(), _signed(GAIN)]
-Weight = Annotated[float, Strict(), _from_zero(WEIGHT)]
-Cost = Annotated[float, Strict(), _positive(WEIGHT)]
-Tolerance = Annotated[float, Strict(), _positive(TOLERANCE)]
-#: Infinity is allowed here; a later check rejects it with its own remedy.
-Limit = Annotated[float, Strict(), Field(ge=FORCE.least, allow_inf_nan=True)]
-Whole = Annotated[int, Strict(), Field(ge=-(2**31), lt=2**31)]
-Flag = Annotated[bool, Strict()]
-_Three = Field(min_length=3, max_length=3)
-Vector = Annotated[tuple[Coordinate, ...], _Three]
-Velocity = Annotated[tuple[Annotated[float, Strict(), _signed(SPEED)], ...], _Three]
-Force = Annotated[tuple[Annotated[float, Strict(), _signed(FORCE)], ...], _Three]
-Rates = Annotated[tuple[Angle, ...], _Three]
-Weights = Annotated[tuple[Weight, ...], Field(min_length=2, max_length=2)]
-
-_Extent = Annotated[tuple[Length, ...], _Three]
-_Pair = Annotated[tuple[Whole, ...], Field(min_length=2, max_length=2)]
-
-
-def _form(value: object) -> str:
-    return "list" if isinstance(value, list | tuple) else "one"
-
-
-Size = Annotated[
-    Annotated[Length, Tag("one")] | Annotated[_Extent, Tag("list")], Discriminator(_form)
-]
-Edges = Annotated[
-    Annotated[Literal["complete", "neighbours", "henneberg", "henneberg-multilevel"], Tag("one")]
-    | Annotated[tuple[_Pair, ...], Tag("list")],
-    Discriminator(_form),
-]
-
-Damping = Annotated[
-    Annotated[Tolerance, Tag("one")] | Annotated[Literal["auto"], Tag("word")],
-    Discriminator(lambda value: "word" if isinstance(value, str) else "one"),
-]
-
-#: A time, or "auto": the least one that keeps the limits.
-Duration = Annotated[
-    Annotated[Time, Tag("one")] | Annotated[Literal["auto"], Tag("word")],
-    Discriminator(lambda value: "word" if isinstance(value, str) else "one"),
-]
-
-
-_Error = Annotated[float, Strict(), Field(gt=-1, le=bounds.MASS_RATIO)]
-Seed = Annotated[int, Strict(), Field(ge=0, lt=2**31)]
-PerAgent = Annotated[
-    Annotated[Weight, Tag("one")] | Annotated[tuple[Weight, ...], Tag("list")],
-    Discriminator(_form),
-]
-PerAgentError = Annotated[
-    Annotated[_Error, Tag("one")] | Annotated[tuple[_Error, ...], Tag("list")],
-    Discriminator(_form),
-]
-PerAxis = Annotated[
-    Annotated[Spread, Tag("one")] | Annotated[tuple[Spread, ...], _Three, Tag("list")],
-    Discriminator(_form),
-]
-
-
-Small = Annotated[float, Strict(), Field(ge=1e-15, le=1.0)]
-Coefficient = Annotated[float, Strict(), Field(ge=0, le=1e3)]
-Delay = Annotated[float, Strict(), Field(ge=0, le=10)]
-Share = Annotated[float, Strict(), Field(ge=0, le=0.95)]
-Rate = Annotated[float, Strict(), Field(ge=1, le=100_000)]
-Tilt = Annotated[float, Strict(), Field(gt=0, lt=90)]
-Inertia = Annotated[tuple[Annotated[float, Strict(), Field(ge=1e-9, le=1e6)], ...], _Three]
-BodyDrag = Annotated[tuple[Coefficient, ...], _Three]
-_Two = Field(min_length=2, max_length=2)
-RotorSpeeds = Annotated[tuple[Annotated[float, Strict(), Field(ge=0, le=1e5)], ...], _Two]
-MotorTimes = Annotated[tuple[Annotated[float, Strict(), Field(ge=1e-3, le=10)], ...], _Two]
-AttitudeGains = Annotated[tuple[Annotated[float, Strict(), Field(gt=0, le=1e6)], ...], _Two]
-_NAME_OR_LIST = WithJsonSchema(
-    {"anyOf": [{"type": "string"}, {"type": "array", "items": {"type": "string"}}]}
-)
-
-
-def _number_or_list(least: float) -> WithJsonSchema:
-    number = {"type": "number", "minimum": least}
-    return WithJsonSchema({"anyOf": [number, {"type": "array", "items": number}]})
-
-
-class Part(BaseModel):
-    """A table of a mission file: immutable, without unknown keys, with finite numbers."""
-
-    # Tables are validated one by one; the models of tables that a mission lacks are never built.
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, defer_build=True)
 
 
 class Start(Part):
@@ -278,11 +187,11 @@ class Autopilot(Part):
 class Agents(Part):
     """The vehicles of the fleet. After the check, each field has one entry per agent."""
 
-    mass: Annotated[tuple[Mass, ...], _number_or_list(MASS.least)] = Field(
+    mass: Annotated[tuple[Mass, ...], number_or_list(MASS.least)] = Field(
         description="mass [kg], > 0: one number for all agents, or a list with one per agent; with vehicle, it is the "
         "vehicle's"
     )
-    vehicle: Annotated[tuple[str, ...], _NAME_OR_LIST] = Field(
+    vehicle: Annotated[tuple[str, ...], NAME_OR_LIST] = Field(
         (),
         description="name of a table [vehicles.NAME], or a list with one name per agent; default: point masses that "
         "give any force at once",
@@ -294,11 +203,11 @@ class Agents(Part):
     velocity: tuple[Velocity, ...] = Field(
         (), description="initial velocity of each agent [m/s]; default: at rest"
     )
-    radius: Annotated[tuple[LengthOrZero, ...], _number_or_list(0)] = Field(
+    radius: Annotated[tuple[LengthOrZero, ...], number_or_list(0)] = Field(
         (0.25,),
         description="radius of the sphere around an agent that must not touch anything [m]: a number or a list",
     )
-    thrust_limit: Annotated[tuple[Limit, ...], _number_or_list(FORCE.least)] = Field(
+    thrust_limit: Annotated[tuple[Limit, ...], number_or_list(FORCE.least)] = Field(
         (math.inf,),
         description="maximum thrust |f_u + f_C| [N], of input and constraint force together: a number or a list; "
         "default: unlimited",
@@ -329,7 +238,7 @@ class Constraint(Part):
     beta: Gain = Field(
         math.sqrt(12), description="beta [1/s], > 0; the feedback gain of c is beta^2"
     )
-    gamma: Annotated[float, Strict(), _signed(GAIN, 3)] = Field(
+    gamma: Annotated[float, Strict(), signed(GAIN, 3)] = Field(
         8.0, description="feedback gain of the integral of c [1/s^3], >= 0, < 2 alpha beta^2"
     )
     stabilisation: Literal["pid", "none"] = Field(
@@ -355,7 +264,7 @@ class Constraint(Part):
         description="cut-off of the pinv solver relative to the largest eigenvalue w, in (0, 1); smaller eigenvalues "
         "fade out smoothly",
     )
-    deformation_damping: Annotated[float, Strict(), _from_zero(GAIN)] = Field(
+    deformation_damping: Annotated[float, Strict(), from_zero(GAIN)] = Field(
         1.0, description="damping of deformation velocities while no slots are tracked [1/s], >= 0"
     )
 
@@ -395,7 +304,7 @@ class Tracking(Part):
         (4.0, 4.0), description="weights [position error, velocity error], the first > 0"
     )
     R: Cost = Field(1.0, description="weight of the acceleration, > 0")
-    integral: Annotated[float, Strict(), _from_zero(GAIN)] = Field(
+    integral: Annotated[float, Strict(), from_zero(GAIN)] = Field(
         0.0,
         description="gain of the integral of the position error [1/s^3], >= 0; frozen while a vehicle saturates; only "
         "with [vehicles]",
@@ -695,347 +604,6 @@ class Disturbances(Part):
     )
 
 
-class Settle(Part):
-    """The phase ends when its error has stayed within a tolerance for some time."""
-
-    tolerance: Tolerance = Field(1e-3, description="maximum error [m]")
-    dwell: Dwell = Field(1.0, description="time that the error must stay within tolerance [s]")
-    timeout: Time = Field(60.0, description="time after which the mission fails [s]")
-
-
-class AnyPhase(Part):
-    """Keys of every phase. Exactly one of until, duration and settle ends it."""
-
-    # Properties of a kind. Other modules use these instead of testing for the kind.
-
-    #: Whether the phase takes a formation.
-    shapes: ClassVar[bool] = False
-    #: Whether the phase moves the virtual body to a goal of its own, which needs feedback control.
-    moves: ClassVar[bool] = False
-    #: Whether a phase may be left anywhere, with its goal there. Other phases keep their goal for the next one.
-    goal_moves: ClassVar[bool] = False
-    #: Default control in architecture "body".
-    body_control: ClassVar[str] = "body"
-
-    name: str = Field("", description="unique name; default: its kind and number")
-    until: Time | None = Field(None, description="the phase ends at this mission time [s]")
-    duration: Duration | None = Field(
-        None,
-        description="the phase ends after this time [s]; auto: as soon as the limits allow (smooth missions)",
-    )
-    settle: Settle | None = Field(None, description="the phase ends when its error has settled")
-    control: Literal["open", "tracking", "body"] = Field(
-        "tracking",
-        description="open: weight compensation and input_force; tracking: each agent tracks its slot; body: "
-        "wrench on the virtual body. With architecture 'body' the default is open for establish, tracking for "
-        "orbit and body for other phases",
-    )
-    input_force: Force = Field(
-        (0.0, 0.0, 0.0),
-        description="force on each agent in addition to weight compensation [N]; only with control 'open'",
-    )
-
-    @property
-    def shaping(self) -> Shaping | None:
-        """The phase if it takes a formation, else None."""
-        return None
-
-    @property
-    def establishing(self) -> Establish | None:
-        """The phase if it also attaches the body frame to its formation, else None."""
-        return None
-
-    @property
-    def steering(self) -> Steering | None:
-        """The phase if the regulators of [lqr] steer it to a goal of its own, else None."""
-        return None
-
-    @property
-    def attitude_deg(self) -> tuple[float, float, float] | None:
-        """Commanded (roll, pitch, yaw) [deg]; None keeps the attitude commanded before."""
-        return None
-
-    @property
-    def meets(self) -> tuple[str, ...]:
-        """Which of position, velocity, attitude and rates the verdict checks at the arrival."""
-        return ()
-
-    @property
-    def turns_away(self) -> bool:
-        """Whether the phase ends in an attitude that no key commands."""
-        return False
-
-    @property
-    def automatic(self) -> list[str]:
-        """Keys whose times follow from the limits (`rigidfleet.planning.timing`)."""
-        return [key for key in TIMES if getattr(self, key, None) == AUTO]
-
-    @property
-    def least_time(self) -> float:
-        """Duration of its motion [s], nan while it is automatic. The phase should not end before."""
-        return 0.0
-
-    @property
-    def leads_to(self) -> str:
-        """Target of the phase in words; "" if it stays."""
-        return ""
-
-    def ended(self, length: float) -> dict[str, Any]:
-        """Keys that change if the pilot ends the phase after another duration [s]."""
-        return {}
-
-
-class Attitude(Part):
-    """Angles of an attitude; if one is given, the default of the others is 0."""
-
-    roll_deg: Angle | None = Field(None, description="roll at arrival [deg], 3-2-1 Euler angles")
-    pitch_deg: Angle | None = Field(None, description="pitch at arrival [deg]")
-    yaw_deg: Angle | None = Field(
-        None,
-        description="yaw at arrival [deg]; if one angle is given, the default of the others is 0",
-    )
-
-    @model_validator(mode="before")
-    @classmethod
-    def _complete(cls, data: Any) -> Any:
-        if isinstance(data, dict) and any(angle in data for angle in ANGLES):
-            return dict.fromkeys(ANGLES, 0.0) | data
-        return data
-
-    @property
-    def attitude_deg(self) -> tuple[float, float, float] | None:
-        """Commanded (roll, pitch, yaw) [deg]; None keeps the attitude commanded before."""
-        if self.roll_deg is None or self.pitch_deg is None or self.yaw_deg is None:
-            return None
-        return self.roll_deg, self.pitch_deg, self.yaw_deg
-
-    @property
-    def angles(self) -> list[str]:
-        """Commanded angles in words; empty to keep the attitude commanded before."""
-        given = zip(("roll", "pitch", "yaw"), self.attitude_deg or (), strict=False)
-        return [f"{name} {angle:g}°" for name, angle in given if angle or name == "yaw"]
-
-
-class Shaping(AnyPhase):
-    """A phase that changes the formation."""
-
-    shapes: ClassVar[bool] = True
-
-    formation: str = Field(description="name of the formation to take")
-    reference: Literal["shape", "distances", "squares", "step"] = Field(
-        "shape",
-        description="how the distances change: shape: slots blend; squares: squared distances blend; distances: as "
-        "squares if that leads to the slots or there are none, else as shape; step: at once, as in the paper",
-    )
-    blend: Duration = Field(
-        4.0,
-        description="duration of the blend from the start of the phase [s]; auto: the least that keeps the limits",
-    )
-
-    @property
-    def shaping(self) -> Shaping:
-        """The phase itself."""
-        return self
-
-    @property
-    def least_time(self) -> float:
-        """Duration of the blend [s]."""
-        return seconds(self.blend)
-
-    @property
-    def leads_to(self) -> str:
-        """The formation."""
-        return self.formation
-
-    def ended(self, length: float) -> dict[str, Any]:
-        """The formation, and a blend that is not longer than the phase; a step has none."""
-        told = {"formation": self.formation}
-        return (
-            told if self.reference == "step" else told | {"blend": min(seconds(self.blend), length)}
-        )
-
-
-class Establish(Attitude, Shaping):
-    """Take a formation from the current positions of the agents, and attach the body frame to it."""
-
-    body_control: ClassVar[str] = "open"
-
-    kind: Literal["establish"] = Field(description="take a formation")
-    attitude: Literal["drawn", "free"] = Field(
-        "drawn",
-        description="drawn: tracked slots have the attitude commanded here or in an earlier phase, else that of the "
-        "world axes or [body_frame]; free: slots have the attitude nearest to the agents. The attitude is always "
-        "free if no slots are tracked, or if the formation is given by distances and no angle is commanded",
-    )
-
-    @property
-    def establishing(self) -> Establish:
-        """The phase itself."""
-        return self
-
-    @property
-    def leads_to(self) -> str:
-        """The formation and its commanded angles."""
-        return ", ".join([self.formation, *self.angles])
-
-
-class Reshape(Shaping):
-    """Change from one formation to another."""
-
-    kind: Literal["reshape"] = Field(description="change the formation")
-
-
-class Steering(Attitude, AnyPhase):
-    """A phase that can change the attitude."""
-
-    moves: ClassVar[bool] = True
-
-    travel: Duration | None = Field(
-        None,
-        description="time from the start to the arrival [s]; default: the whole phase; auto: the least that keeps the "
-        "limits",
-    )
-    rates_deg_s: Rates = Field(
-        (0.0, 0.0, 0.0), description="body rates [p, q, r] at arrival [deg/s]"
-    )
-
-    @property
-    def steering(self) -> Steering:
-        """The phase itself."""
-        return self
-
-    @property
-    def meets(self) -> tuple[str, ...]:
-        """The attitude, if one is commanded."""
-        return () if self.attitude_deg is None else ("attitude", "rates")
-
-    @property
-    def least_time(self) -> float:
-        """Time to the arrival [s]."""
-        return seconds(self.travel or 0.0)
-
-    @property
-    def leads_to(self) -> str:
-        """The commanded angles and rates."""
-        rates = [_vector(self.rates_deg_s, "°/s")] if any(self.rates_deg_s) else []
-        return ", ".join([*self.angles, *rates])
-
-    def ended(self, length: float) -> dict[str, Any]:
-        """A travel time that is not longer than the phase."""
-        return {} if self.travel is None else {"travel": min(seconds(self.travel), length)}
-
-
-class Through(Part):
-    """A point that a `fly` phase passes without a stop."""
-
-    position: Vector = Field(description="centre of mass [x, y, z] [m]")
-    time: Time | None = Field(
-        None,
-        description="time from the start of the phase [s]; default: the times with the least snap",
-    )
-
-
-class Fly(Steering):
-    """Fly the centre of mass to a waypoint, with arrival after `travel` or at the end of the phase."""
-
-    kind: Literal["fly"] = Field(description="fly to a waypoint")
-    position: Vector = Field(description="centre of mass at arrival [x, y, z] [m]")
-    velocity: Velocity = Field((0.0, 0.0, 0.0), description="its velocity at arrival [m/s]")
-    through: tuple[Through, ...] = Field(
-        (),
-        description="points to pass on the way, with the least snap (smooth missions): "
-        "`through = [{ position = [x, y, z], time = 4.0 }]`",
-    )
-
-    @property
-    def meets(self) -> tuple[str, ...]:
-        """Position and velocity, and the attitude if one is commanded."""
-        return ("position", "velocity", *super().meets)
-
-    @property
-    def leads_to(self) -> str:
-        """The waypoint and the attitude."""
-        velocity = [_vector(self.velocity, "m/s")] if any(self.velocity) else []
-        rest = super().leads_to
-        return ", ".join([_vector(self.position, "m"), *velocity, *([rest] if rest else [])])
-
-
-class Turn(Steering):
-    """Turn on the spot to an attitude. At least one angle is required."""
-
-    kind: Literal["turn"] = Field(description="turn on the spot")
-
-
-class Hold(AnyPhase):
-    """Stay at the commanded position and attitude."""
-
-    kind: Literal["hold"] = Field(description="stay at the commanded position and attitude")
-
-
-class Orbit(AnyPhase):
-    """Circle a point on a horizontal circle at a constant rate, and leave the circle with the velocity there."""
-
-    moves: ClassVar[bool] = True
-    goal_moves: ClassVar[bool] = True
-    body_control: ClassVar[str] = "tracking"
-
-    kind: Literal["orbit"] = Field(description="circle a point")
-    centre: Vector = Field(description="centre of the horizontal circle [x, y, z] [m]")
-    radius: Length = Field(description="radius of the circle [m]")
-    rate_deg_s: Angle = Field(
-        description="angular rate [deg/s], not 0; seen from above, > 0 is counter-clockwise and < 0 clockwise"
-    )
-    yaw: Literal["fixed", "along"] = Field(
-        "fixed",
-        description="fixed: keeps the attitude commanded before; along: the body turns with the orbit, with the same "
-        "side towards the centre as at the start",
-    )
-    blend: Duration = Field(
-        4.0,
-        description="duration of the entry from the current position onto the circle [s]; auto: the least that keeps "
-        "the limits",
-    )
-
-    @property
-    def meets(self) -> tuple[str, ...]:
-        """Position and velocity on the circle, and the attitude if it turns."""
-        return ("position", "velocity", *(("attitude", "rates") if self.turns_away else ()))
-
-    @property
-    def turns_away(self) -> bool:
-        """Whether the body turns with the orbit."""
-        return self.yaw == "along"
-
-    @property
-    def least_time(self) -> float:
-        """Duration of the entry [s]."""
-        return seconds(self.blend)
-
-    @property
-    def leads_to(self) -> str:
-        """The circle."""
-        return f"round {_vector(self.centre, 'm')} at {self.radius:g} m, {self.rate_deg_s:g}°/s"
-
-    def ended(self, length: float) -> dict[str, Any]:
-        """An entry that is not longer than the phase."""
-        return {"blend": min(seconds(self.blend), length)}
-
-
-def seconds(time: float | Literal["auto"]) -> float:
-    """A time [s]; nan if it is automatic."""
-    return math.nan if isinstance(time, str) else time
-
-
-def _vector(values: Sequence[float], unit: str) -> str:
-    return f"({', '.join(f'{value:g}' for value in values)}) {unit}"
-
-
-Phase = Annotated[Establish | Fly | Reshape | Turn | Orbit | Hold, Field(discriminator="kind")]
-#: Models of all phases by `kind`.
-KINDS: dict[str, type[AnyPhase]] = {
-    get_args(model.model_fields["kind"].annotation)[0]: model
-    for model in get_args(get_args(Phase)[0])
-}
 Obstacle = Annotated[Box | Ground, Field(discriminator="kind")]
 
 
@@ -1069,7 +637,7 @@ class MissionHeader(Part):
         "least sum of squared distances from the start to the first established formation; safe: most clearance on the "
         "paths there; each: as shortest, anew at each change of formation, without turning the shapes",
     )
-    gravity: Annotated[float, Strict(), _from_zero(ACCELERATION)] = Field(
+    gravity: Annotated[float, Strict(), from_zero(ACCELERATION)] = Field(
         9.81, description="gravity [m/s^2], >= 0"
     )
     output_step: Time = Field(0.05, description="time between samples of the result [s]")

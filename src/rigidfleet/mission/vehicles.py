@@ -296,11 +296,16 @@ def equipped(collector: FindingCollector, agents: Any, vehicles: Mapping[str, Ve
     return {key: value for key, value in agents.items() if key != "saturate"} | own
 
 
+def flies_vehicles(collector: FindingCollector) -> bool:
+    """Whether the agents of a mission are to fly vehicles."""
+    agents = collector.data.get("agents")
+    return isinstance(agents, dict) and "vehicle" in agents
+
+
 def check_flight(collector: FindingCollector, parts: Mapping[str, Any]) -> None:
     """Find what vehicles cannot have beside them, and rates of the autopilot that do not go together."""
     autopilot: Autopilot = parts.get("autopilot", Autopilot())
-    flown = "vehicle" in collector.data.get("agents", {})
-    if not flown:
+    if not flies_vehicles(collector):
         tracking = parts.get("tracking")
         for key in ("integral", "drag_feedforward") if tracking is not None else ():
             if getattr(tracking, key):

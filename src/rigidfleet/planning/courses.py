@@ -17,7 +17,7 @@ from rigidfleet.kernel.problem import Motion, septic_polynomial
 from rigidfleet.math import attitude as att
 from rigidfleet.math import lqr, series, splines
 from rigidfleet.mission import Fly, Mission, Phase, Regulator
-from rigidfleet.mission.schema import Orbit, Steering, Through, seconds
+from rigidfleet.mission.kinds import Orbit, Steering, Through, seconds
 from rigidfleet.planning.reference import PhaseState, Pose
 from rigidfleet.typing import Floats
 

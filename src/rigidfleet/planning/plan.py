@@ -42,7 +42,8 @@ from rigidfleet.math import attitude as att
 from rigidfleet.math import lqr
 from rigidfleet.math.rigid_body import about_cm
 from rigidfleet.mission import Mission, Phase, Regulator, Settle
-from rigidfleet.mission.schema import Constraint, IntegratorOptions, seconds
+from rigidfleet.mission.kinds import seconds
+from rigidfleet.mission.schema import Constraint, IntegratorOptions
 from rigidfleet.planning import solvers
 from rigidfleet.planning.courses import course
 from rigidfleet.planning.disturbances import without

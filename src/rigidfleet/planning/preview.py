@@ -11,7 +11,7 @@ from rigidfleet.kernel.problem import SHAPE, Motion, Reference, septic_polynomia
 from rigidfleet.math import pid, rigid_body
 from rigidfleet.math.rigid_body import about_cm
 from rigidfleet.mission import Mission, Phase
-from rigidfleet.mission.schema import seconds
+from rigidfleet.mission.kinds import seconds
 from rigidfleet.planning.courses import course
 from rigidfleet.planning.derivatives import slot_derivatives
 from rigidfleet.planning.reference import (

@@ -16,7 +16,7 @@ from rigidfleet.math import attitude as att
 from rigidfleet.math import rigid_body, series
 from rigidfleet.math.rigid_body import about_cm, mean_axis_rates
 from rigidfleet.mission import Mission, Phase
-from rigidfleet.mission.schema import Shaping
+from rigidfleet.mission.kinds import Shaping
 from rigidfleet.planning.derivatives import body_series
 from rigidfleet.typing import Bools, Floats, Ints
 

@@ -12,7 +12,8 @@ from typing import Any
 
 from rigidfleet.errors import Finding, MissionError
 from rigidfleet.mission import Fly, Mission, Phase
-from rigidfleet.mission.schema import AUTO, Orbit, Shaping, Steering
+from rigidfleet.mission.kinds import Orbit, Shaping, Steering
+from rigidfleet.mission.values import AUTO
 from rigidfleet.planning.courses import SmoothFlight, course
 from rigidfleet.planning.limits import Reached, limits_of, reached
 from rigidfleet.planning.preview import Leg, at_start, leg

@@ -21,7 +21,7 @@ from rigidfleet.math.margins import (
     tracking_loops,
 )
 from rigidfleet.mission import Mission, Phase
-from rigidfleet.mission.schema import seconds
+from rigidfleet.mission.kinds import seconds
 from rigidfleet.planning.preview import PlannedPhase
 from rigidfleet.preflight.findings import FormationMargins, MarginsCheck, Preflight, Remark
 from rigidfleet.typing import Floats

@@ -9,7 +9,7 @@ from typing import Any
 from rigidfleet.errors import Finding, MissionError, wrong_type
 from rigidfleet.mission import Mission, Phase
 from rigidfleet.mission.findings import near
-from rigidfleet.mission.schema import KINDS
+from rigidfleet.mission.kinds import KINDS
 from rigidfleet.result import PhaseRecord
 
 

@@ -26,7 +26,7 @@ from rigidfleet.mission import Mission, load_mission, mission_names
 from rigidfleet.mission.findings import FindingCollector, Keys, unknown_key
 from rigidfleet.mission.model import as_mission, parse_toml, read_text
 from rigidfleet.mission.phases import kind, tables
-from rigidfleet.mission.schema import Part
+from rigidfleet.mission.values import Part
 from rigidfleet.sweep import keypaths
 from rigidfleet.sweep.variation import (
     KINDS,

@@ -22,7 +22,8 @@ from rigidfleet.formation.graphs import complete_graph
 from rigidfleet.math.rigid_body import centred
 from rigidfleet.mission import Mission
 from rigidfleet.mission.formations import coincident
-from rigidfleet.mission.schema import HUGE, seconds
+from rigidfleet.mission.kinds import seconds
+from rigidfleet.mission.values import HUGE
 from rigidfleet.simulation.ensemble import Ensemble, establish, max_edge_error
 from rigidfleet.sweep.metrics import METRICS
 from rigidfleet.sweep.record import RunRecord, refusal

@@ -15,7 +15,7 @@ from typing import Any
 from rigidfleet._common.toml import toml_key
 from rigidfleet.mission import Mission
 from rigidfleet.mission.findings import Keys, model_of
-from rigidfleet.mission.schema import Part
+from rigidfleet.mission.values import Part
 
 #: Stands for any index or name.
 ANY = "*"

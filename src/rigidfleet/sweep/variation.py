@@ -20,7 +20,7 @@ import numpy as np
 from pydantic import Field, Strict
 
 from rigidfleet.mission.findings import near
-from rigidfleet.mission.schema import Number, Part, Positive
+from rigidfleet.mission.values import Number, Part, Positive
 
 #: Signs in a line, and the change that each stands for.
 SIGNS = {"=": "set", "+=": "add", "*=": "scale"}

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rigidfleet._common import markup
 from rigidfleet.math.margins import Margins
 from rigidfleet.result import plain
 from rigidfleet.sweep.record import called
@@ -123,6 +124,21 @@ class Tuned:
             }
         }  # fmt: skip
         return plain(data)
+
+    def __str__(self) -> str:
+        rows = [("", "before", "after", "change"), *self.rows()]
+        wide = [max(map(len, column)) for column in zip(*rows, strict=True)]
+        lines = (
+            f"{what:{wide[0]}}  "
+            + "  ".join(f"{x:>{w}}" for x, w in zip(row, wide[1:], strict=True))
+            for what, *row in rows
+        )
+        return "\n".join([*(line.rstrip() for line in lines), self.conclusion])
+
+    def _repr_html_(self) -> str:
+        """Show both sides in a notebook."""
+        heads = ("", "before", "after", "change")
+        return markup.shown(self.mission, "tuned", heads, self.rows(), self.conclusion)
 
     def __rich__(self) -> RenderableType:
         from rich.box import SIMPLE_HEAD

@@ -1,0 +1,375 @@
+"""The kinds of phases: their keys with unit and meaning, and the properties by which other modules tell them apart."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Annotated, Any, ClassVar, Literal, get_args
+
+from pydantic import (
+    Field,
+    model_validator,
+)
+
+from rigidfleet.mission.values import (
+    AUTO,
+    Angle,
+    Duration,
+    Dwell,
+    Force,
+    Length,
+    Part,
+    Rates,
+    Time,
+    Tolerance,
+    Vector,
+    Velocity,
+)
+
+#: Keys of a phase that may be automatic, and the word for it.
+TIMES = ("duration", "travel", "blend")
+#: Keys of an attitude: 3-2-1 Euler angles.
+ANGLES = ("roll_deg", "pitch_deg", "yaw_deg")
+
+
+class Settle(Part):
+    """The phase ends when its error has stayed within a tolerance for some time."""
+
+    tolerance: Tolerance = Field(1e-3, description="maximum error [m]")
+    dwell: Dwell = Field(1.0, description="time that the error must stay within tolerance [s]")
+    timeout: Time = Field(60.0, description="time after which the mission fails [s]")
+
+
+class AnyPhase(Part):
+    """Keys of every phase. Exactly one of until, duration and settle ends it."""
+
+    # Properties of a kind. Other modules use these instead of testing for the kind.
+
+    #: Whether the phase takes a formation.
+    shapes: ClassVar[bool] = False
+    #: Whether the phase moves the virtual body to a goal of its own, which needs feedback control.
+    moves: ClassVar[bool] = False
+    #: Whether a phase may be left anywhere, with its goal there. Other phases keep their goal for the next one.
+    goal_moves: ClassVar[bool] = False
+    #: Default control in architecture "body".
+    body_control: ClassVar[str] = "body"
+
+    name: str = Field("", description="unique name; default: its kind and number")
+    until: Time | None = Field(None, description="the phase ends at this mission time [s]")
+    duration: Duration | None = Field(
+        None,
+        description="the phase ends after this time [s]; auto: as soon as the limits allow (smooth missions)",
+    )
+    settle: Settle | None = Field(None, description="the phase ends when its error has settled")
+    control: Literal["open", "tracking", "body"] = Field(
+        "tracking",
+        description="open: weight compensation and input_force; tracking: each agent tracks its slot; body: "
+        "wrench on the virtual body. With architecture 'body' the default is open for establish, tracking for "
+        "orbit and body for other phases",
+    )
+    input_force: Force = Field(
+        (0.0, 0.0, 0.0),
+        description="force on each agent in addition to weight compensation [N]; only with control 'open'",
+    )
+
+    @property
+    def shaping(self) -> Shaping | None:
+        """The phase if it takes a formation, else None."""
+        return None
+
+    @property
+    def establishing(self) -> Establish | None:
+        """The phase if it also attaches the body frame to its formation, else None."""
+        return None
+
+    @property
+    def steering(self) -> Steering | None:
+        """The phase if the regulators of [lqr] steer it to a goal of its own, else None."""
+        return None
+
+    @property
+    def attitude_deg(self) -> tuple[float, float, float] | None:
+        """Commanded (roll, pitch, yaw) [deg]; None keeps the attitude commanded before."""
+        return None
+
+    @property
+    def meets(self) -> tuple[str, ...]:
+        """Which of position, velocity, attitude and rates the verdict checks at the arrival."""
+        return ()
+
+    @property
+    def turns_away(self) -> bool:
+        """Whether the phase ends in an attitude that no key commands."""
+        return False
+
+    @property
+    def automatic(self) -> list[str]:
+        """Keys whose times follow from the limits (`rigidfleet.planning.timing`)."""
+        return [key for key in TIMES if getattr(self, key, None) == AUTO]
+
+    @property
+    def least_time(self) -> float:
+        """Duration of its motion [s], nan while it is automatic. The phase should not end before."""
+        return 0.0
+
+    @property
+    def leads_to(self) -> str:
+        """Target of the phase in words; "" if it stays."""
+        return ""
+
+    def ended(self, length: float) -> dict[str, Any]:
+        """Keys that change if the pilot ends the phase after another duration [s]."""
+        return {}
+
+
+class Attitude(Part):
+    """Angles of an attitude; if one is given, the default of the others is 0."""
+
+    roll_deg: Angle | None = Field(None, description="roll at arrival [deg], 3-2-1 Euler angles")
+    pitch_deg: Angle | None = Field(None, description="pitch at arrival [deg]")
+    yaw_deg: Angle | None = Field(
+        None,
+        description="yaw at arrival [deg]; if one angle is given, the default of the others is 0",
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _complete(cls, data: Any) -> Any:
+        if isinstance(data, dict) and any(angle in data for angle in ANGLES):
+            return dict.fromkeys(ANGLES, 0.0) | data
+        return data
+
+    @property
+    def attitude_deg(self) -> tuple[float, float, float] | None:
+        """Commanded (roll, pitch, yaw) [deg]; None keeps the attitude commanded before."""
+        if self.roll_deg is None or self.pitch_deg is None or self.yaw_deg is None:
+            return None
+        return self.roll_deg, self.pitch_deg, self.yaw_deg
+
+    @property
+    def angles(self) -> list[str]:
+        """Commanded angles in words; empty to keep the attitude commanded before."""
+        given = zip(("roll", "pitch", "yaw"), self.attitude_deg or (), strict=False)
+        return [f"{name} {angle:g}°" for name, angle in given if angle or name == "yaw"]
+
+
+class Shaping(AnyPhase):
+    """A phase that changes the formation."""
+
+    shapes: ClassVar[bool] = True
+
+    formation: str = Field(description="name of the formation to take")
+    reference: Literal["shape", "distances", "squares", "step"] = Field(
+        "shape",
+        description="how the distances change: shape: slots blend; squares: squared distances blend; distances: as "
+        "squares if that leads to the slots or there are none, else as shape; step: at once, as in the paper",
+    )
+    blend: Duration = Field(
+        4.0,
+        description="duration of the blend from the start of the phase [s]; auto: the least that keeps the limits",
+    )
+
+    @property
+    def shaping(self) -> Shaping:
+        """The phase itself."""
+        return self
+
+    @property
+    def least_time(self) -> float:
+        """Duration of the blend [s]."""
+        return seconds(self.blend)
+
+    @property
+    def leads_to(self) -> str:
+        """The formation."""
+        return self.formation
+
+    def ended(self, length: float) -> dict[str, Any]:
+        """The formation, and a blend that is not longer than the phase; a step has none."""
+        told = {"formation": self.formation}
+        return (
+            told if self.reference == "step" else told | {"blend": min(seconds(self.blend), length)}
+        )
+
+
+class Establish(Attitude, Shaping):
+    """Take a formation from the current positions of the agents, and attach the body frame to it."""
+
+    body_control: ClassVar[str] = "open"
+
+    kind: Literal["establish"] = Field(description="take a formation")
+    attitude: Literal["drawn", "free"] = Field(
+        "drawn",
+        description="drawn: tracked slots have the attitude commanded here or in an earlier phase, else that of the "
+        "world axes or [body_frame]; free: slots have the attitude nearest to the agents. The attitude is always "
+        "free if no slots are tracked, or if the formation is given by distances and no angle is commanded",
+    )
+
+    @property
+    def establishing(self) -> Establish:
+        """The phase itself."""
+        return self
+
+    @property
+    def leads_to(self) -> str:
+        """The formation and its commanded angles."""
+        return ", ".join([self.formation, *self.angles])
+
+
+class Reshape(Shaping):
+    """Change from one formation to another."""
+
+    kind: Literal["reshape"] = Field(description="change the formation")
+
+
+class Steering(Attitude, AnyPhase):
+    """A phase that can change the attitude."""
+
+    moves: ClassVar[bool] = True
+
+    travel: Duration | None = Field(
+        None,
+        description="time from the start to the arrival [s]; default: the whole phase; auto: the least that keeps the "
+        "limits",
+    )
+    rates_deg_s: Rates = Field(
+        (0.0, 0.0, 0.0), description="body rates [p, q, r] at arrival [deg/s]"
+    )
+
+    @property
+    def steering(self) -> Steering:
+        """The phase itself."""
+        return self
+
+    @property
+    def meets(self) -> tuple[str, ...]:
+        """The attitude, if one is commanded."""
+        return () if self.attitude_deg is None else ("attitude", "rates")
+
+    @property
+    def least_time(self) -> float:
+        """Time to the arrival [s]."""
+        return seconds(self.travel or 0.0)
+
+    @property
+    def leads_to(self) -> str:
+        """The commanded angles and rates."""
+        rates = [_vector(self.rates_deg_s, "°/s")] if any(self.rates_deg_s) else []
+        return ", ".join([*self.angles, *rates])
+
+    def ended(self, length: float) -> dict[str, Any]:
+        """A travel time that is not longer than the phase."""
+        return {} if self.travel is None else {"travel": min(seconds(self.travel), length)}
+
+
+class Through(Part):
+    """A point that a `fly` phase passes without a stop."""
+
+    position: Vector = Field(description="centre of mass [x, y, z] [m]")
+    time: Time | None = Field(
+        None,
+        description="time from the start of the phase [s]; default: the times with the least snap",
+    )
+
+
+class Fly(Steering):
+    """Fly the centre of mass to a waypoint, with arrival after `travel` or at the end of the phase."""
+
+    kind: Literal["fly"] = Field(description="fly to a waypoint")
+    position: Vector = Field(description="centre of mass at arrival [x, y, z] [m]")
+    velocity: Velocity = Field((0.0, 0.0, 0.0), description="its velocity at arrival [m/s]")
+    through: tuple[Through, ...] = Field(
+        (),
+        description="points to pass on the way, with the least snap (smooth missions): "
+        "`through = [{ position = [x, y, z], time = 4.0 }]`",
+    )
+
+    @property
+    def meets(self) -> tuple[str, ...]:
+        """Position and velocity, and the attitude if one is commanded."""
+        return ("position", "velocity", *super().meets)
+
+    @property
+    def leads_to(self) -> str:
+        """The waypoint and the attitude."""
+        velocity = [_vector(self.velocity, "m/s")] if any(self.velocity) else []
+        rest = super().leads_to
+        return ", ".join([_vector(self.position, "m"), *velocity, *([rest] if rest else [])])
+
+
+class Turn(Steering):
+    """Turn on the spot to an attitude. At least one angle is required."""
+
+    kind: Literal["turn"] = Field(description="turn on the spot")
+
+
+class Hold(AnyPhase):
+    """Stay at the commanded position and attitude."""
+
+    kind: Literal["hold"] = Field(description="stay at the commanded position and attitude")
+
+
+class Orbit(AnyPhase):
+    """Circle a point on a horizontal circle at a constant rate, and leave the circle with the velocity there."""
+
+    moves: ClassVar[bool] = True
+    goal_moves: ClassVar[bool] = True
+    body_control: ClassVar[str] = "tracking"
+
+    kind: Literal["orbit"] = Field(description="circle a point")
+    centre: Vector = Field(description="centre of the horizontal circle [x, y, z] [m]")
+    radius: Length = Field(description="radius of the circle [m]")
+    rate_deg_s: Angle = Field(
+        description="angular rate [deg/s], not 0; seen from above, > 0 is counter-clockwise and < 0 clockwise"
+    )
+    yaw: Literal["fixed", "along"] = Field(
+        "fixed",
+        description="fixed: keeps the attitude commanded before; along: the body turns with the orbit, with the same "
+        "side towards the centre as at the start",
+    )
+    blend: Duration = Field(
+        4.0,
+        description="duration of the entry from the current position onto the circle [s]; auto: the least that keeps "
+        "the limits",
+    )
+
+    @property
+    def meets(self) -> tuple[str, ...]:
+        """Position and velocity on the circle, and the attitude if it turns."""
+        return ("position", "velocity", *(("attitude", "rates") if self.turns_away else ()))
+
+    @property
+    def turns_away(self) -> bool:
+        """Whether the body turns with the orbit."""
+        return self.yaw == "along"
+
+    @property
+    def least_time(self) -> float:
+        """Duration of the entry [s]."""
+        return seconds(self.blend)
+
+    @property
+    def leads_to(self) -> str:
+        """The circle."""
+        return f"round {_vector(self.centre, 'm')} at {self.radius:g} m, {self.rate_deg_s:g}°/s"
+
+    def ended(self, length: float) -> dict[str, Any]:
+        """An entry that is not longer than the phase."""
+        return {"blend": min(seconds(self.blend), length)}
+
+
+def seconds(time: float | Literal["auto"]) -> float:
+    """A time [s]; nan if it is automatic."""
+    return math.nan if isinstance(time, str) else time
+
+
+def _vector(values: Sequence[float], unit: str) -> str:
+    return f"({', '.join(f'{value:g}' for value in values)}) {unit}"
+
+
+Phase = Annotated[Establish | Fly | Reshape | Turn | Orbit | Hold, Field(discriminator="kind")]
+#: Models of all phases by `kind`.
+KINDS: dict[str, type[AnyPhase]] = {
+    get_args(model.model_fields["kind"].annotation)[0]: model
+    for model in get_args(get_args(Phase)[0])
+}

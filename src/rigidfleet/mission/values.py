@@ -1,0 +1,154 @@
+"""Values of a mission file: numbers within bounds, vectors, lists; and `Part`, the base of all its tables."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Discriminator,
+    Field,
+    Strict,
+    Tag,
+    WithJsonSchema,
+)
+
+from rigidfleet.mission import bounds
+from rigidfleet.mission.bounds import (
+    ACCELERATION,
+    ANGLE,
+    FORCE,
+    GAIN,
+    JERK,
+    LENGTH,
+    MASS,
+    SPEED,
+    TIME,
+    TOLERANCE,
+    WEIGHT,
+    Bound,
+)
+
+#: Bound on all numbers: larger than any quantity in SI units here, and its sixth power is still finite.
+HUGE = 1e15
+#: Value of a time that follows from the limits.
+AUTO = "auto"
+
+Number = Annotated[float, Strict(), Field(ge=-HUGE, le=HUGE)]
+Positive = Annotated[float, Strict(), Field(gt=0, le=HUGE)]
+
+
+def signed(bound: Bound, power: int = 1) -> Any:
+    """A number of either sign within the bound, or its power."""
+    return Field(ge=-(bound.most**power), le=bound.most**power)
+
+
+def _positive(bound: Bound) -> Any:
+    return Field(ge=bound.least, le=bound.most)
+
+
+def from_zero(bound: Bound) -> Any:
+    """A number from zero up to the bound."""
+    return Field(ge=0, le=bound.most)
+
+
+Coordinate = Annotated[float, Strict(), signed(LENGTH)]
+Length = Annotated[float, Strict(), _positive(LENGTH)]
+LengthOrZero = Annotated[float, Strict(), from_zero(LENGTH)]
+Time = Annotated[float, Strict(), _positive(TIME)]
+Dwell = Annotated[float, Strict(), from_zero(TIME)]
+Speed = Annotated[float, Strict(), _positive(SPEED)]
+Spread = Annotated[float, Strict(), from_zero(SPEED)]
+Acceleration = Annotated[float, Strict(), _positive(ACCELERATION)]
+Jerk = Annotated[float, Strict(), _positive(JERK)]
+Mass = Annotated[float, Strict(), _positive(MASS)]
+Angle = Annotated[float, Strict(), signed(ANGLE)]
+Gain = Annotated[float, Strict(), signed(GAIN)]
+Weight = Annotated[float, Strict(), from_zero(WEIGHT)]
+Cost = Annotated[float, Strict(), _positive(WEIGHT)]
+Tolerance = Annotated[float, Strict(), _positive(TOLERANCE)]
+#: Infinity is allowed here; a later check rejects it with its own remedy.
+Limit = Annotated[float, Strict(), Field(ge=FORCE.least, allow_inf_nan=True)]
+Whole = Annotated[int, Strict(), Field(ge=-(2**31), lt=2**31)]
+Flag = Annotated[bool, Strict()]
+_Three = Field(min_length=3, max_length=3)
+Vector = Annotated[tuple[Coordinate, ...], _Three]
+Velocity = Annotated[tuple[Annotated[float, Strict(), signed(SPEED)], ...], _Three]
+Force = Annotated[tuple[Annotated[float, Strict(), signed(FORCE)], ...], _Three]
+Rates = Annotated[tuple[Angle, ...], _Three]
+Weights = Annotated[tuple[Weight, ...], Field(min_length=2, max_length=2)]
+
+_Extent = Annotated[tuple[Length, ...], _Three]
+_Pair = Annotated[tuple[Whole, ...], Field(min_length=2, max_length=2)]
+
+
+def _form(value: object) -> str:
+    return "list" if isinstance(value, list | tuple) else "one"
+
+
+Size = Annotated[
+    Annotated[Length, Tag("one")] | Annotated[_Extent, Tag("list")], Discriminator(_form)
+]
+Edges = Annotated[
+    Annotated[Literal["complete", "neighbours", "henneberg", "henneberg-multilevel"], Tag("one")]
+    | Annotated[tuple[_Pair, ...], Tag("list")],
+    Discriminator(_form),
+]
+
+Damping = Annotated[
+    Annotated[Tolerance, Tag("one")] | Annotated[Literal["auto"], Tag("word")],
+    Discriminator(lambda value: "word" if isinstance(value, str) else "one"),
+]
+
+#: A time, or "auto": the least one that keeps the limits.
+Duration = Annotated[
+    Annotated[Time, Tag("one")] | Annotated[Literal["auto"], Tag("word")],
+    Discriminator(lambda value: "word" if isinstance(value, str) else "one"),
+]
+
+
+_Error = Annotated[float, Strict(), Field(gt=-1, le=bounds.MASS_RATIO)]
+Seed = Annotated[int, Strict(), Field(ge=0, lt=2**31)]
+PerAgent = Annotated[
+    Annotated[Weight, Tag("one")] | Annotated[tuple[Weight, ...], Tag("list")],
+    Discriminator(_form),
+]
+PerAgentError = Annotated[
+    Annotated[_Error, Tag("one")] | Annotated[tuple[_Error, ...], Tag("list")],
+    Discriminator(_form),
+]
+PerAxis = Annotated[
+    Annotated[Spread, Tag("one")] | Annotated[tuple[Spread, ...], _Three, Tag("list")],
+    Discriminator(_form),
+]
+
+
+Small = Annotated[float, Strict(), Field(ge=1e-15, le=1.0)]
+Coefficient = Annotated[float, Strict(), Field(ge=0, le=1e3)]
+Delay = Annotated[float, Strict(), Field(ge=0, le=10)]
+Share = Annotated[float, Strict(), Field(ge=0, le=0.95)]
+Rate = Annotated[float, Strict(), Field(ge=1, le=100_000)]
+Tilt = Annotated[float, Strict(), Field(gt=0, lt=90)]
+Inertia = Annotated[tuple[Annotated[float, Strict(), Field(ge=1e-9, le=1e6)], ...], _Three]
+BodyDrag = Annotated[tuple[Coefficient, ...], _Three]
+_Two = Field(min_length=2, max_length=2)
+RotorSpeeds = Annotated[tuple[Annotated[float, Strict(), Field(ge=0, le=1e5)], ...], _Two]
+MotorTimes = Annotated[tuple[Annotated[float, Strict(), Field(ge=1e-3, le=10)], ...], _Two]
+AttitudeGains = Annotated[tuple[Annotated[float, Strict(), Field(gt=0, le=1e6)], ...], _Two]
+NAME_OR_LIST = WithJsonSchema(
+    {"anyOf": [{"type": "string"}, {"type": "array", "items": {"type": "string"}}]}
+)
+
+
+def number_or_list(least: float) -> WithJsonSchema:
+    """In the schema: a number of at least ``least``, or a list of them."""
+    number = {"type": "number", "minimum": least}
+    return WithJsonSchema({"anyOf": [number, {"type": "array", "items": number}]})
+
+
+class Part(BaseModel):
+    """A table of a mission file: immutable, without unknown keys, with finite numbers."""
+
+    # Tables are validated one by one; the models of tables that a mission lacks are never built.
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, defer_build=True)
