@@ -161,7 +161,7 @@ def by_quadrotors(models: list[str], *, lost: int | None = None) -> Result:
     wave = np.sin(np.pi * t / t[-1]) ** 2
     tilt = np.radians(10.0 * who) * wave[:, None]
     q = np.stack([np.cos(tilt / 2), np.sin(tilt / 2), 0 * tilt, 0 * tilt], axis=2)
-    vehicles = bare.mission.vehicle_models
+    vehicles = Mission.from_toml(bare.mission_text).vehicle_models
     assert vehicles is not None
     limit = np.array([model.rotor_limit for model in vehicles])
     force = 0.3 * np.broadcast_to(limit[:, None], (len(t), n, 4)).copy()
@@ -788,7 +788,7 @@ def test_files_appear_in_both_formats(triangle, tmp_path):
     """Each figure is a PNG of 150 to 200 dpi and an SVG whose text is text."""
     paths = plotting.plot(triangle, tmp_path / "new" / "folder")
     assert {p.name for p in paths} == {
-        f"{name}.{kind}" for name in plotting.figure_names() for kind in ("png", "svg")
+        f"{name}.{kind}" for name in plotting.figure_names(triangle) for kind in ("png", "svg")
     }
     assert sorted(p.name for p in (tmp_path / "new" / "folder").iterdir()) == sorted(
         p.name for p in paths

@@ -144,8 +144,6 @@ class SampledPhase(ActivePhase):
             raise StoppedError(
                 diagnose(self.place, own_force=self.external is not None, collapsed=True)
             )
-        # Steps end at multiples of their length, which may be t_end but for rounding.
-        self.state.clock[0] = max(self.t, t_end)
 
     def _supply(self) -> None:
         """Make tables for the next ticks, if those that there are end here or belong to another reference."""
