@@ -83,6 +83,7 @@ def test_points_without_vehicles_stay_as_they_are():
         (None, {"agents_thrust_limit": 9.0}, ("agents.thrust_limit", "given twice")),
         (None, {"agents_saturate": True}, ("agents.saturate", "no effect")),
         (None, {"disturbances": {"drag": 0.1, "wind": [1.0, 0.0, 0.0]}}, ("disturbances.drag", "given twice")),
+        (None, {"gravity": 0.0}, ("gravity", "must be >= 1")),
         (None, {"formulation": "body"}, ("formulation", "inertial")),
         (None, {"autopilot": {"formation_rate": 300.0}}, ("autopilot.formation_rate", "250 Hz")),
         (None, {"autopilot": {"rate": 100.0, "formation_rate": 400.0}}, ("100 Hz",)),

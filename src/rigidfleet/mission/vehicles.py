@@ -16,6 +16,8 @@ from rigidfleet.mission.findings import FindingCollector, near
 from rigidfleet.mission.schema import Autopilot, Vehicle
 
 _GRAVITY = 9.81
+#: Least gravity in which quadrotors fly [m/s^2].
+_LEAST_GRAVITY = 1.0
 
 
 @dataclass(frozen=True)
@@ -323,6 +325,12 @@ def check_flight(collector: FindingCollector, parts: Mapping[str, Any]) -> None:
         problem = f"is not a whole part of rate, {autopilot.rate:g} Hz"
         low = autopilot.rate / max(1, math.ceil(ratio))
         collector.add(("autopilot", "formation_rate"), problem, f"use {low:g} Hz, for example")
+    rotors = any(vehicle.model != "point" for vehicle in parts.get("vehicles", {}).values())
+    if rotors and parts.get("gravity", _GRAVITY) < _LEAST_GRAVITY:
+        problem = (
+            f"must be >= {_LEAST_GRAVITY:g}: the attitude of a quadrotor follows from its thrust"
+        )
+        collector.add(("gravity",), problem, "raise it, or fly points")
     if parts.get("formulation") == "body":
         problem = "formulation = 'body' is that of point masses"
         collector.add(("formulation",), problem, "use formulation = 'inertial' with vehicles")

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from rigidfleet._common.text import agent_names
 from rigidfleet.errors import StoppedError
 from rigidfleet.kernel import fleet, records
 from rigidfleet.kernel.engine import native
@@ -138,12 +139,21 @@ class SampledPhase(ActivePhase):
                 self.pause(self.t)
         finally:
             done = int(sampled.count[fleet.SAMPLES])
+            finite = np.isfinite(call.S[:done]).all(axis=(1, 2)) & np.isfinite(call.dS[:done]).all(
+                axis=(1, 2)
+            )
+            done = done if finite.all() else int(finite.argmin())
             if done:
                 self._keep(problem, call, done)
-        if status != records.FINISHED or not np.isfinite(sampled.S).all():
+        if not np.isfinite(sampled.S).all():
+            who = agent_names(np.flatnonzero(~np.isfinite(sampled.S).all(axis=1)))
             raise StoppedError(
-                diagnose(self.place, own_force=self.external is not None, collapsed=True)
+                f"the motion of {who} grows beyond all bounds by t = {self.t:.2f} s: the control is unstable. Lower"
+                " the gains, or raise the rates in [autopilot]"
             )
+        if status != records.FINISHED:
+            own = self.external is not None
+            raise StoppedError(diagnose(self.place, own_force=own, collapsed=True))
 
     def _supply(self) -> None:
         """Make tables for the next ticks, if those that there are end here or belong to another reference."""
