@@ -260,6 +260,68 @@ def test_a_controller_flies_vehicles():
     assert errors(result)[0] == pytest.approx(errors(own)[0], rel=0.1)
 
 
+def hover(seen, **changes):
+    """Thrust and attitude that lead to a place level, each vehicle by itself."""
+    e = seen.position - seen.reference_position
+    a = seen.reference_acceleration - e - 2.0 * (seen.velocity - seen.reference_velocity)
+    force = seen.masses[:, None] * (a + [0.0, 0.0, seen.gravity])
+    size = np.linalg.norm(force, axis=1)
+    # The least rotation from upright to the force
+    q = np.concatenate([(size + force[:, 2])[:, None], np.cross([0.0, 0.0, 1.0], force)], axis=1)
+    return rf.AttitudeCommand(**({"thrust": size, "attitude": q} | changes))
+
+
+def test_a_controller_may_command_attitudes():
+    """Thrust and attitude of a controller lead vehicles as forces do; it knows their attitudes."""
+    seen = []
+
+    def fly(observation):
+        seen.append(observation)
+        return hover(observation)
+
+    result = rf.simulate(short(), controller=fly, rate=100.0)
+    assert result.complete
+    assert errors(result)[0] < 0.4  # without feedforward of drag
+    assert result.vehicle_attitude is not None
+    assert seen[0].attitude.shape == (3, 4)
+    np.testing.assert_allclose(np.linalg.norm(seen[-1].attitude, axis=1), 1.0)
+
+
+def test_a_controller_may_command_rotors():
+    """Speeds of rotors are those that the rotors take; four alike at hover keep a vehicle where it is."""
+    speed = math.sqrt(9.81 / 4 / 5.9e-6)
+    phases = [{"kind": "establish", "formation": "triangle", "blend": 0.5, "until": 1.0}]
+    result = rf.simulate(
+        short(phases=phases), controller=lambda _: rf.RotorCommand(np.full((3, 4), speed))
+    )
+    assert result.rotor_force is not None
+    np.testing.assert_allclose(result.rotor_force, 9.81 / 4, rtol=1e-9)
+    np.testing.assert_allclose(
+        result.position, np.tile(result.position[0], (len(result.time), 1, 1)), atol=1e-9
+    )
+
+
+@pytest.mark.parametrize(
+    ("command", "words"),
+    [
+        (lambda seen: hover(seen, thrust=np.ones(2)), "AttitudeCommand .* whose thrust is not an array"),
+        (lambda seen: hover(seen, attitude=np.zeros((3, 4))), "attitude of norm zero"),
+        (lambda _: rf.RotorCommand(np.full((3, 4), np.nan)), "RotorCommand .* whose speed is not"),
+        (lambda _: rf.RotorCommand("fast"), "RotorCommand .* whose speed is not"),
+    ],
+)  # fmt: skip
+def test_commands_that_are_wrong(command, words):
+    """A command of the wrong form is one error that names it."""
+    with pytest.raises(rf.FlightError, match=words):
+        rf.simulate(short(), controller=command)
+
+
+def test_points_take_forces_alone():
+    """Point masses have no attitude to command."""
+    with pytest.raises(rf.FlightError, match="point masses do not take"):
+        rf.simulate("narrow-passage", controller=lambda _: rf.RotorCommand(np.ones((3, 4))))
+
+
 def test_an_external_force_pushes_vehicles():
     """A user's force acts on the vehicles themselves."""
     still = rf.simulate(short())

@@ -31,10 +31,12 @@ if TYPE_CHECKING:
     from rigidfleet.rigidity.design import design
     from rigidfleet.simulation.ensemble import Ensemble, establish
     from rigidfleet.simulation.flight import (
+        AttitudeCommand,
         Flight,
         FlightInterrupted,
         Observation,
         Progress,
+        RotorCommand,
         simulate,
     )
     from rigidfleet.sweep import Sweep
@@ -44,6 +46,7 @@ if TYPE_CHECKING:
 
 
 __all__ = [
+    "AttitudeCommand",
     "Ensemble",
     "Flight",
     "FlightError",
@@ -56,6 +59,7 @@ __all__ = [
     "Result",
     "ResultError",
     "RigidfleetError",
+    "RotorCommand",
     "Sweep",
     "SweepError",
     "Tuned",
@@ -77,6 +81,7 @@ __all__ = [
 
 #: The module of each public name.
 _HOME = {
+    "AttitudeCommand": "simulation.flight",
     "Ensemble": "simulation.ensemble",
     "Flight": "simulation.flight",
     "FlightError": "errors",
@@ -89,6 +94,7 @@ _HOME = {
     "Result": "result",
     "ResultError": "errors",
     "RigidfleetError": "errors",
+    "RotorCommand": "simulation.flight",
     "Sweep": "sweep",
     "SweepError": "errors",
     "Tuned": "tuning",

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rigidfleet.errors import StoppedError
+from rigidfleet.errors import FlightError, StoppedError
 from rigidfleet.kernel import records
 from rigidfleet.kernel.engine import native
 from rigidfleet.kernel.problem import OPEN, TRACKING, Problem
@@ -19,7 +19,14 @@ from rigidfleet.planning.disturbances import without
 from rigidfleet.planning.plan import PhasePlan
 from rigidfleet.planning.reference import PhaseState
 from rigidfleet.planning.tolerances import most_steps
-from rigidfleet.simulation.callbacks import Controller, ExternalForce, Observation, asked
+from rigidfleet.simulation.callbacks import (
+    Command,
+    Controller,
+    ExternalForce,
+    Observation,
+    called,
+    checked_force,
+)
 from rigidfleet.simulation.diagnosis import Place, diagnose
 from rigidfleet.simulation.extremes import Extremes
 from rigidfleet.simulation.recording import Led, Piece
@@ -131,11 +138,21 @@ class ActivePhase:
         while self.t < t_end:
             # Control instants are counted from the start of the phase, not from the ends of its segments.
             if self.held is None or self.t >= start + self.asked / rate:
-                f = asked("the controller", self.t, len(self.lost), controller, self.observe())
-                control = self.plan.problem.control._replace(kind=OPEN, force=f)
-                self.held = self.plan.problem._replace(control=control)
+                self.held = self._under(controller)
                 self.asked += 1
             self._integrate(self.held, min(start + self.asked / rate, t_end))
+
+    def _under(self, controller: Controller) -> Problem:
+        """The problem with the force that a user's controller asks for now."""
+        given = called("the controller", self.t, controller, self.observe())
+        if isinstance(given, Command):
+            raise FlightError(
+                f"the controller returned a {type(given).__name__} at t = {self.t:.3f} s, which point masses do not"
+                " take; return forces [N], or give the agents a vehicle"
+            )
+        force = checked_force(given, len(self.lost), "the controller", self.t)
+        control = self.plan.problem.control._replace(kind=OPEN, force=force)
+        return self.plan.problem._replace(control=control)
 
     def settle_by(
         self, t_end: float, settle: Settle, controller: Controller | None, rate: float, step: float

@@ -21,7 +21,8 @@ Force = Callable[[float, "Floats", "Floats"], ArrayLike]
 class Observation:
     """What a controller sees at a control step; arrays (N, 3) world axes, copies.
 
-    Positions and velocities are measured, masses are those the control laws assume.
+    Positions and velocities are measured, masses are those the control laws assume. The attitude, rates and rotors of
+    vehicles are known without delay; they are None for point masses that give any force at once.
     """
 
     t: float  # [s]
@@ -33,24 +34,73 @@ class Observation:
     reference_acceleration: Floats  # [m/s^2]
     masses: Floats  # (N,) [kg]
     gravity: float  # [m/s^2]
+    attitude: Floats | None = None  # (N, 4) of each vehicle, world to body, scalar first
+    rates: Floats | None = None  # (N, 3) body axes [rad/s]
+    rotor_speed: Floats | None = None  # (N, 4) [rad/s]
 
 
-Controller = Callable[[Observation], ArrayLike]
+@dataclass(frozen=True)
+class AttitudeCommand:
+    """What a controller may return for vehicles instead of forces: thrust and attitude, which their autopilots hold."""
+
+    thrust: ArrayLike  # (N,) along each vehicle's z axis [N]
+    attitude: ArrayLike  # (N, 4) quaternions, world to body, scalar first
+    rates: ArrayLike | None = (
+        None  # (N, 3) of that attitude, in its own axes [rad/s]; default: zero
+    )
+
+
+@dataclass(frozen=True)
+class RotorCommand:
+    """What a controller may return for vehicles instead of forces: the speeds of their rotors."""
+
+    speed: ArrayLike  # (N, 4) front left, front right, rear right, rear left [rad/s]
+
+
+Command = AttitudeCommand | RotorCommand
+Controller = Callable[[Observation], "ArrayLike | Command"]
 
 
 def asked(
     who: str, t: float, n: int, function: Callable[..., ArrayLike], *arguments: object
 ) -> Floats:
     """Forces (N, 3) [N] that a user's function returns; an error says what it returned instead."""
+    return checked_force(called(who, t, function, *arguments), n, who, t)
+
+
+def called(who: str, t: float, function: Callable[..., Any], *arguments: object) -> Any:
+    """What a user's function returns; its exceptions are told as those of a flight."""
     try:
-        f = function(*arguments)
+        return function(*arguments)
     except Exception as error:
         words = f"{who} raised {type(error).__name__} at t = {t:.3f} s: {error}"
         raise FlightError(words) from error
-    return _checked(f, n, who, t)
 
 
-def _checked(f: ArrayLike, n: int, who: str, t: float) -> Floats:
+def checked_command(given: Command, n: int, t: float) -> dict[str, Floats]:
+    """Arrays of a command, by their names; an error says which one is wrong."""
+    rows = {"thrust": (n,), "attitude": (n, 4), "rates": (n, 3), "speed": (n, 4)}
+    found = {}
+    for name, value in vars(given).items():
+        try:
+            array = np.array(np.zeros(rows[name]) if value is None else value, dtype=np.float64)
+        except (TypeError, ValueError):
+            array = np.full((), np.nan)
+        if array.shape != rows[name] or not np.isfinite(array).all():
+            raise FlightError(
+                f"the controller returned a {type(given).__name__} at t = {t:.3f} s whose {name} is not an array"
+                f" {rows[name]} of finite numbers"
+            )
+        found[name] = np.ascontiguousarray(array)
+    if "attitude" in found:
+        size = np.linalg.norm(found["attitude"], axis=1, keepdims=True)
+        if not (size > 0.0).all():
+            raise FlightError(f"the controller returned an attitude of norm zero at t = {t:.3f} s")
+        found["attitude"] = found["attitude"] / size
+    return found
+
+
+def checked_force(f: ArrayLike, n: int, who: str, t: float) -> Floats:
     """Forces (N, 3) [N] from a user's function, checked; an error says what it returned instead."""
     if np.iscomplexobj(f):
         raise FlightError(

@@ -25,7 +25,14 @@ from rigidfleet.planning.timing import timed, with_times
 from rigidfleet.result import PhaseRecord, Result
 from rigidfleet.simulation.active_phase import ActivePhase, Sampler
 from rigidfleet.simulation.as_flown import as_flown, check_formation, with_phase
-from rigidfleet.simulation.callbacks import Controller, ExternalForce, Force, Observation
+from rigidfleet.simulation.callbacks import (
+    AttitudeCommand,
+    Controller,
+    ExternalForce,
+    Force,
+    Observation,
+    RotorCommand,
+)
 from rigidfleet.simulation.extremes import Extremes
 from rigidfleet.simulation.recording import Piece, assemble
 from rigidfleet.simulation.sampled_phase import SampledPhase, Vehicles
@@ -35,7 +42,10 @@ from rigidfleet.typing import Floats
 if TYPE_CHECKING:
     from rigidfleet.kernel.large.solver import Counts  # imports the compiler
 
-__all__ = ["Controller", "Flight", "FlightInterrupted", "Observation", "Progress", "simulate"]
+__all__ = [
+    "AttitudeCommand", "Controller", "Flight", "FlightInterrupted", "Observation", "Progress", "RotorCommand",
+    "simulate",
+]  # fmt: skip
 
 #: Interval between progress reports [s of wall time].
 _REPORT = 0.1
@@ -79,7 +89,8 @@ def simulate(
     mission : a shipped name, a path or a `Mission`
     controller : replaces the input law wherever slots are tracked: a function of an `Observation` that
         returns the input force (N, 3) [N] of every agent, weight included. It is called ``rate`` times a
-        second; its force is held between calls, as on a vehicle.
+        second; its force is held between calls, as on a vehicle. For vehicles it may return an `AttitudeCommand` or
+        a `RotorCommand` instead, which no constraint force joins.
     rate : control rate [Hz]
     force : an external force f(t, r, v) -> (N, 3) [N] in addition to gravity, world axes, continuous in
         time. A Numba ``cfunc`` of void(double t, double* r, double* v, double* f, ssize_t n) is called

@@ -9,17 +9,25 @@ from typing import Any
 import numpy as np
 
 from rigidfleet._common.text import agent_names
-from rigidfleet.errors import StoppedError
+from rigidfleet.errors import FlightError, StoppedError
 from rigidfleet.kernel import fleet, records
 from rigidfleet.kernel.engine import native
 from rigidfleet.kernel.engine.sampled import fly_ticks
-from rigidfleet.kernel.problem import Problem
+from rigidfleet.kernel.problem import OPEN, Problem
 from rigidfleet.kernel.records import Record
 from rigidfleet.math import attitude as att
 from rigidfleet.mission import Mission
 from rigidfleet.planning.vehicles import TickTables, sampled_flight, turn_from, yaw_at
 from rigidfleet.simulation.active_phase import ActivePhase
-from rigidfleet.simulation.callbacks import Observation
+from rigidfleet.simulation.callbacks import (
+    AttitudeCommand,
+    Command,
+    Controller,
+    Observation,
+    called,
+    checked_command,
+    checked_force,
+)
 from rigidfleet.simulation.diagnosis import diagnose
 from rigidfleet.simulation.recording import Piece, VehicleSamples
 from rigidfleet.simulation.solver_setup import equip, integrator
@@ -102,7 +110,33 @@ class SampledPhase(ActivePhase):
         tables, tick = self.flight.tables, int(self.sampled.count[fleet.TICKS])
         if len(tables.path):
             seen += tables.path[min(max(tick - 1 - tables.first, 0), len(tables.path) - 1)]
-        return replace(found, position=seen[:, :3], velocity=seen[:, 3:])
+        S = self.sampled.S
+        return replace(
+            found, position=seen[:, :3], velocity=seen[:, 3:], attitude=S[:, 6:10].copy(), rates=S[:, 10:13].copy(),
+            rotor_speed=S[:, 13:].copy(),
+        )  # fmt: skip
+
+    def _under(self, controller: Controller) -> Problem:
+        """The problem with what a user's controller asks for now: forces, thrust and attitude, or speeds of rotors."""
+        given = called("the controller", self.t, controller, self.observe())
+        n, none = len(self.lost), fleet.no_commands(len(self.lost))
+        if not isinstance(given, Command):
+            self.flight = self.flight._replace(commands=none)
+            force = checked_force(given, n, "the controller", self.t)
+            control = self.plan.problem.control._replace(kind=OPEN, force=force)
+            return self.plan.problem._replace(control=control)
+        arrays = checked_command(given, n, self.t)
+        if self.flight.vehicles.point.any():
+            raise FlightError(
+                f"the controller returned a {type(given).__name__} at t = {self.t:.3f} s, but some agents are points;"
+                " return forces [N]"
+            )
+        if isinstance(given, AttitudeCommand):
+            commands = none._replace(kind=fleet.ATTITUDE, **arrays)
+        else:
+            commands = none._replace(kind=fleet.ROTORS, speeds=arrays["speed"])
+        self.flight = self.flight._replace(commands=commands)
+        return self.plan.problem._replace(external=self.plan.problem.external)
 
     def watch(self, *, last: bool) -> None:
         """Search the steps flown for extremes."""
