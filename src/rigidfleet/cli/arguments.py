@@ -6,10 +6,24 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+from rigidfleet.errors import RigidfleetError
+
 
 def exact(_type: Any, tokens: Sequence[Any]) -> int:
     """Converter of cyclopts for a whole number, without rounding."""
     return parse_whole(tokens[0].value)
+
+
+def check_workers(workers: int | None) -> None:
+    """Refuse fewer than one process.
+
+    Raises
+    ------
+    RigidfleetError
+        The number is not positive.
+    """
+    if workers is not None and workers < 1:
+        raise RigidfleetError(f"--workers = {workers}: must be at least 1.")
 
 
 def parse_number(text: str) -> float:

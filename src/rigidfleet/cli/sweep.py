@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from cyclopts import Parameter
 
 from rigidfleet.cli import console
-from rigidfleet.cli.arguments import exact
+from rigidfleet.cli.arguments import check_workers, exact
 from rigidfleet.errors import RigidfleetError
 
 if TYPE_CHECKING:
@@ -86,8 +86,7 @@ def sweep(
     from rigidfleet.sweep import store
     from rigidfleet.sweep.summary import summarise
 
-    if workers is not None and workers < 1:
-        raise RigidfleetError(f"--workers = {workers}: must be at least 1.")
+    check_workers(workers)
     if summary:
         folder = Path(mission)
         table = store.read(folder)

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 from cyclopts import Parameter
 
 from rigidfleet.cli import console
-from rigidfleet.cli.arguments import exact
+from rigidfleet.cli.arguments import check_workers, exact
 from rigidfleet.cli.codes import INTERRUPTED, PASSED
 from rigidfleet.cli.run import heeding_interrupts
 from rigidfleet.errors import RigidfleetError
@@ -73,8 +73,7 @@ def tune(
     from rigidfleet.mission import load_mission
     from rigidfleet.tuning import tune as study
 
-    if workers is not None and workers < 1:
-        raise RigidfleetError(f"--workers = {workers}: must be at least 1.")
+    check_workers(workers)
     found = load_mission(mission)
     folder = out or Path("tunes", found.name)
     watch = None if quiet else console.SweepWatch()

@@ -24,6 +24,7 @@ from rigidfleet.kernel.fleet import (
     TICKS,
     TRAILED,
     UPRIGHT,
+    speed_of,
     thrust_of,
 )
 from rigidfleet.kernel.problem import TRACKING
@@ -41,6 +42,7 @@ from rigidfleet.kernel.rigid_body import (
 _SAME = 1e-9
 
 _curve = inlined(thrust_of)
+_speed = inlined(speed_of)
 
 
 # -- what is known -------------------------------------------------------------------------------------
@@ -145,8 +147,7 @@ def expect_drag(i, v, share, vehicles, state):
     if not vehicles.point[i]:
         load = math.sqrt(force[0] ** 2 + force[1] ** 2 + force[2] ** 2)
         k0, k1, k2 = vehicles.thrust[i, 0], vehicles.thrust[i, 1], vehicles.thrust[i, 2]
-        root = math.sqrt(max(k1 * k1 + 4.0 * k2 * (0.25 * load - k0), 0.0))
-        rotors = 2.0 * (root - k1) / k2  # sum of their speeds
+        rotors = 4.0 * _speed(0.25 * load, k0, k1, k2)  # sum of their speeds
         across, along = vehicles.rotor_drag[i, 0] * rotors, vehicles.rotor_drag[i, 1] * rotors
     for q in range(3):
         rotor = across if q < 2 else along

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rigidfleet.math import series
 from rigidfleet.typing import Floats
 
 #: Rotors of an X quadrotor, a row each: x forward and y left as shares of the diagonal, and the sign of the torque
@@ -103,13 +104,5 @@ def _directions(v: Floats) -> tuple[Floats, Floats]:
 
 def _cross(a: Floats, b: Floats) -> Floats:
     """Cross product of two vectors with two derivatives, (K, 3, 3) each."""
-    return np.stack(
-        [
-            np.cross(a[:, 0], b[:, 0]),
-            np.cross(a[:, 1], b[:, 0]) + np.cross(a[:, 0], b[:, 1]),
-            np.cross(a[:, 2], b[:, 0])
-            + 2.0 * np.cross(a[:, 1], b[:, 1])
-            + np.cross(a[:, 0], b[:, 2]),
-        ],
-        axis=1,
-    )
+    x, y = (series.from_derivatives(v.swapaxes(0, 1)) for v in (a, b))
+    return series.derivatives(series.product(x, y, np.cross)).swapaxes(0, 1)

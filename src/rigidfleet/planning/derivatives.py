@@ -47,7 +47,7 @@ def slot_derivatives(
     ``orders``, the last ones are left out.
     """
     cm, axes = (x[:orders] for x in body_series(motion, time))
-    s = blend_series(reference, time)[:orders]
+    s = blend_series(time, reference.t0, reference.T_b)[:orders]
     if reference.turn.any():
         axes = series.product(axes, series.rotation(s[..., None] * reference.turn), np.matmul)
     moved = series.product(s[..., None, None], axes)
@@ -78,16 +78,16 @@ def body_series(motion: Motion, time: Floats) -> tuple[Floats, Floats]:
     return cm, motion.T1.T @ series.rotation(phi)
 
 
-def blend_series(reference: Reference, time: Floats) -> Floats:
-    """Taylor series (5, K) of the blend s of a phase's slots at times (K,) [s]; T_b = 0 is a step."""
-    since = time - reference.t0
+def blend_series(time: Floats, t0: float, T_b: float) -> Floats:
+    """Taylor series (5, K) at times (K,) [s] of the blend s from 0 to 1 over [t0, t0 + T_b]; T_b = 0 is a step."""
+    since = time - t0
     s = np.zeros((ORDERS, len(time)))
-    s[0] = since >= reference.T_b
-    under_way = (since > 0.0) & (since < reference.T_b)
+    s[0] = since >= T_b
+    under_way = (since > 0.0) & (since < T_b)
     if under_way.any():
-        x = since[under_way] / reference.T_b
+        x = since[under_way] / T_b
         powers = np.broadcast_to(_BLEND, (len(x), len(_BLEND)))
-        scale = reference.T_b ** -np.arange(ORDERS, dtype=float)
+        scale = T_b ** -np.arange(ORDERS, dtype=float)
         s[:, under_way] = series.of_polynomials(powers, x, ORDERS) * scale[:, None]
     return s
 

@@ -13,13 +13,14 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidfleet.kernel import fleet
-from rigidfleet.kernel.problem import TRACKING, Problem, septic_polynomial
+from rigidfleet.kernel.problem import TRACKING, Problem
+from rigidfleet.math import series
 from rigidfleet.math.quadrotor import ROTORS
 from rigidfleet.mission import Mission
 from rigidfleet.mission.vehicles import VehicleModel
-from rigidfleet.planning.derivatives import Yaw, slot_derivatives, yaw_derivatives
+from rigidfleet.planning.derivatives import Yaw, blend_series, slot_derivatives, yaw_derivatives
 from rigidfleet.planning.disturbances import disturbance
-from rigidfleet.typing import Bools, Floats, Ints
+from rigidfleet.typing import Floats, Ints
 
 #: Rows of random numbers in a block.
 _BLOCK = 1024
@@ -242,16 +243,9 @@ def _references(problem: Problem, time: Floats, yaw: Yaw, turn: Turn) -> tuple[F
     )
     turned = turned[1:].swapaxes(1, 2).copy()
     if yaw.kind != "formation":
-        x = np.clip((time - turn.begun) / _TURN_TIME, 0.0, 1.0)
-        rest = np.stack(
-            [
-                1.0 - septic_polynomial(x),
-                -140.0 * (x * (1 - x)) ** 3 / _TURN_TIME,
-                -420.0 * (x * (1 - x)) ** 2 * (1 - 2 * x) / _TURN_TIME**2,
-            ],
-            axis=1,
-        )
-        turned += rest[:, None, :] * turn.off[:, None]
+        rest = -series.derivatives(blend_series(time, turn.begun, _TURN_TIME)[:3])
+        rest[0] += 1.0
+        turned += rest.T[:, None, :] * turn.off[:, None]
     else:
         turned[..., 0] += turn.off
     return np.ascontiguousarray(turned), found
@@ -277,6 +271,3 @@ def _block(kind: int, seed: int, block: int, shape: tuple[int, ...]) -> Floats:
     random = np.random.default_rng((kind, seed, block))
     size = (_BLOCK, *shape)
     return random.standard_normal(size) if kind == _NOISE else random.random(size)
-
-
-__all__ = ["Bools", "TickTables", "kernel_vehicle", "sampled_flight", "turn_from", "yaw_at"]

@@ -146,13 +146,17 @@ class ActivePhase:
         """The problem with the force that a user's controller asks for now."""
         given = called("the controller", self.t, controller, self.observe())
         if isinstance(given, Command):
-            raise FlightError(
-                f"the controller returned a {type(given).__name__} at t = {self.t:.3f} s, which point masses do not"
-                " take; return forces [N], or give the agents a vehicle"
-            )
+            return self._commanded(given)
         force = checked_force(given, len(self.lost), "the controller", self.t)
         control = self.plan.problem.control._replace(kind=OPEN, force=force)
         return self.plan.problem._replace(control=control)
+
+    def _commanded(self, given: Command) -> Problem:
+        """The problem under a command of vehicles, which point masses do not take."""
+        raise FlightError(
+            f"the controller returned a {type(given).__name__} at t = {self.t:.3f} s, which point masses do not"
+            " take; return forces [N], or give the agents a vehicle"
+        )
 
     def settle_by(
         self, t_end: float, settle: Settle, controller: Controller | None, rate: float, step: float

@@ -13,7 +13,7 @@ from rigidfleet.errors import FlightError, StoppedError
 from rigidfleet.kernel import fleet, records
 from rigidfleet.kernel.engine import native
 from rigidfleet.kernel.engine.sampled import fly_ticks
-from rigidfleet.kernel.problem import OPEN, Problem
+from rigidfleet.kernel.problem import Problem
 from rigidfleet.kernel.records import Record
 from rigidfleet.math import attitude as att
 from rigidfleet.mission import Mission
@@ -24,14 +24,12 @@ from rigidfleet.simulation.callbacks import (
     Command,
     Controller,
     Observation,
-    called,
     checked_command,
-    checked_force,
 )
 from rigidfleet.simulation.diagnosis import diagnose
 from rigidfleet.simulation.recording import Piece, VehicleSamples
 from rigidfleet.simulation.solver_setup import equip, integrator
-from rigidfleet.typing import Bools, Floats
+from rigidfleet.typing import Floats
 
 #: Greatest number of ticks in a table, and of steps between two returns to Python.
 _TICKS, _STEPS = 1024, 4000
@@ -43,17 +41,11 @@ class Vehicles:
     def __init__(self, mission: Mission) -> None:
         self.flight = sampled_flight(mission)
         self.tables = TickTables(mission, self.flight)
-        self.mass = mission.fleet.mass
         yaw = 0.0 if mission.body_frame is None else math.radians(mission.body_frame.yaw_deg)
         start = mission.fleet
         self.yaw = np.full(mission.n_agents, yaw)  # asked of each vehicle at the last switch
         self.S = fleet.hovering(self.flight.vehicles, start.position, start.velocity, yaw)
         self.state: fleet.SampledState | None = None  # of the phase before
-
-    @property
-    def noisy(self) -> bool:
-        """Whether the law knows anything else than the true states."""
-        return self.tables.noise is not None or self.tables.links is not None
 
 
 class SampledPhase(ActivePhase):
@@ -118,25 +110,23 @@ class SampledPhase(ActivePhase):
 
     def _under(self, controller: Controller) -> Problem:
         """The problem with what a user's controller asks for now: forces, thrust and attitude, or speeds of rotors."""
-        given = called("the controller", self.t, controller, self.observe())
-        n, none = len(self.lost), fleet.no_commands(len(self.lost))
-        if not isinstance(given, Command):
-            self.flight = self.flight._replace(commands=none)
-            force = checked_force(given, n, "the controller", self.t)
-            control = self.plan.problem.control._replace(kind=OPEN, force=force)
-            return self.plan.problem._replace(control=control)
-        arrays = checked_command(given, n, self.t)
+        self.flight = self.flight._replace(commands=fleet.no_commands(len(self.lost)))
+        return super()._under(controller)
+
+    def _commanded(self, given: Command) -> Problem:
+        """The plan's problem, beside the thrust and attitude, or the speeds of rotors, that a controller commands."""
+        arrays = checked_command(given, len(self.lost), self.t)
         if self.flight.vehicles.point.any():
             raise FlightError(
                 f"the controller returned a {type(given).__name__} at t = {self.t:.3f} s, but some agents are points;"
                 " return forces [N]"
             )
         if isinstance(given, AttitudeCommand):
-            commands = none._replace(kind=fleet.ATTITUDE, **arrays)
+            commands = self.flight.commands._replace(kind=fleet.ATTITUDE, **arrays)
         else:
-            commands = none._replace(kind=fleet.ROTORS, speeds=arrays["speed"])
+            commands = self.flight.commands._replace(kind=fleet.ROTORS, speeds=arrays["speed"])
         self.flight = self.flight._replace(commands=commands)
-        return self.plan.problem._replace(external=self.plan.problem.external)
+        return self.plan.problem._replace()  # not the plan's own: a loss has to keep it held
 
     def watch(self, *, last: bool) -> None:
         """Search the steps flown for extremes."""
@@ -228,7 +218,7 @@ class SampledPhase(ActivePhase):
 
     def _keep(self, problem: Problem, call: fleet.SampledSegment, done: int) -> None:
         """Store samples: states and forces as flown, references and constraints of the plan."""
-        plan, n = self.plan, len(self.plan.masses)
+        plan = self.plan
         S, times = call.S[:done], call.times[:done]
         parts = [S[..., :3].reshape(done, -1), S[..., 3:6].reshape(done, -1), call.integral[:done]]
         frame = np.full((done, 4), np.nan)
@@ -250,7 +240,6 @@ class SampledPhase(ActivePhase):
                 kept,
             )
         )
-        assert out.r.shape[1] == n
 
 
 def _as_flown(
@@ -262,9 +251,8 @@ def _as_flown(
 ) -> tuple[Record, VehicleSamples]:
     """A record of references with the forces of vehicles, and the samples of the vehicles themselves."""
     S, a = call.S[:done], call.dS[:done, :, 3:6]
-    k0, k1, k2 = vehicles.thrust.T[..., None]
-    speed = S[..., 13:]
-    rotor = np.where(vehicles.point[:, None], 0.0, k0 + speed * (k1 + k2 * speed))
+    curves = vehicles.thrust.T[..., None]
+    rotor = np.where(vehicles.point[:, None], 0.0, fleet.thrust_of(S[..., 13:], *curves))
     T = att.dcm_from_quaternion(np.where(vehicles.point[:, None], [1.0, 0, 0, 0], S[..., 6:10]))
     thrust = rotor.sum(axis=2)[..., None] * T[..., 2, :]
     thrust = np.where(vehicles.point[:, None], call.command[:done, :, :3], thrust)
@@ -281,6 +269,3 @@ def _as_flown(
         S[..., 6:10], S[..., 10:13], rotor, np.linalg.norm(thrust, axis=2), call.saturated[:done]
     )
     return out, kept
-
-
-__all__ = ["Bools", "SampledPhase", "Vehicles"]
