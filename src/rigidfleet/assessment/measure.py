@@ -132,7 +132,7 @@ class Measurements:
         radius, obstacles = self.mission.agents.radius, self.mission.obstacles
         #: Clearance of each agent to obstacles [m], and the nearest obstacle (K, N).
         self.each_clearance, self.nearest = proximity.obstacle_clearances(
-            result.position, radius, obstacles
+            result.position, radius, obstacles, result.time
         )
         if not self.whole:
             self.each_clearance[~self.left] = np.inf

@@ -24,6 +24,7 @@ from rigidfleet.mission.check import check
 from rigidfleet.mission.describe import counted
 from rigidfleet.mission.findings import near
 from rigidfleet.mission.kinds import Establish, Phase
+from rigidfleet.mission.obstacles import with_files
 from rigidfleet.mission.phases import latest_end
 from rigidfleet.mission.schema import DRAG, Contents, Start
 from rigidfleet.mission.vehicles import VehicleModel, resolve
@@ -422,7 +423,10 @@ def load_mission(name_or_path: str | Path) -> Mission:
     """
     if isinstance(name_or_path, str) and name_or_path in mission_names():
         return Mission.from_toml(mission_text(name_or_path), name_or_path)
-    return Mission.from_toml(read_text(name_or_path), str(name_or_path))
+    text, origin = read_text(name_or_path), str(name_or_path)
+    if "file" in text:  # parsed twice only if it may name one
+        text = with_files(text, parse_toml(text, origin), Path(name_or_path))
+    return Mission.from_toml(text, origin)
 
 
 def as_mission(given: Mission | str | Path) -> Mission:

@@ -25,6 +25,7 @@ from rigidfleet.mission.bounds import (
     MASS,
 )
 from rigidfleet.mission.kinds import Phase
+from rigidfleet.mission.obstacles import Obstacle
 from rigidfleet.mission.values import (
     NAME_OR_LIST,
     Acceleration,
@@ -421,33 +422,6 @@ class Formation(Part):
         return distance_geometry.slots_from_distances(n, self.edge_array(n), self.distances or ())
 
 
-class Box(Part):
-    """A box parallel to the world axes."""
-
-    kind: Literal["box"] = Field(description="a box parallel to the world axes")
-    name: str = Field("", description="name; default: 'box' and its number")
-    min: Vector = Field(description="lowest corner [x, y, z] [m]")
-    max: Vector = Field(description="highest corner [x, y, z] [m]")
-
-    @property
-    def corners(self) -> tuple[float, ...]:
-        """Lowest and highest corner (6,) [m]."""
-        return (*self.min, *self.max)
-
-
-class Ground(Part):
-    """Everything below a height."""
-
-    kind: Literal["ground"] = Field(description="everything below a height")
-    name: str = Field("", description="name; default: 'ground'")
-    height: Coordinate = Field(0.0, description="height of the ground [m]")
-
-    @property
-    def corners(self) -> tuple[float, ...]:
-        """Lowest and highest corner (6,) [m] of a box that is infinite except at the top."""
-        return (*(-math.inf,) * 3, math.inf, math.inf, self.height)
-
-
 class Geofence(Part):
     """A box that no agent may leave."""
 
@@ -602,9 +576,6 @@ class Disturbances(Part):
     lost: tuple[Lost, ...] = Field(
         (), description="vehicles lost during the flight: `lost = [{ agent = 2, time = 30.0 }]`"
     )
-
-
-Obstacle = Annotated[Box | Ground, Field(discriminator="kind")]
 
 
 class MissionHeader(Part):
