@@ -35,7 +35,7 @@ from rigidfleet.solids.distance import (
     signed_distance,
 )
 from rigidfleet.solids.records import HEIGHTS
-from rigidfleet.typing import Bools, Floats, Ints
+from rigidfleet.typing import Bools, Edges, Floats, Ints
 
 #: Length of the shortest piece of a step, and the greatest number of pieces of one search.
 _SHORTEST, _MOST = 2.0**-32, 10_000
@@ -69,7 +69,7 @@ class _Vehicles(NamedTuple):
 
 
 class _Graph(NamedTuple):
-    edges: Ints
+    edges: Edges
 
 
 class Layout(NamedTuple):
@@ -80,7 +80,7 @@ class Layout(NamedTuple):
     body_formulation: bool
 
 
-def layout(m: Floats, edges: Ints, body_formulation: bool) -> Layout:
+def layout(m: Floats, edges: Edges, body_formulation: bool) -> Layout:
     """The layout of a problem with these masses, edges and formulation."""
     return Layout(_Vehicles(m), _Graph(edges), body_formulation)
 
@@ -106,10 +106,8 @@ def bound_of(piece, b, triangle, s):
     least, known = 0.0, u != 0.0 or v != 0.0 or w != 0.0
     for k in range(0, 15, 3):
         p, q, r = piece[k] - x, piece[k + 1] - y, piece[k + 2] - z
-        if known:
-            least = min(least, u * p + v * q + w * r)
-        else:
-            least = min(least, -math.sqrt(p * p + q * q + r * r))
+        along = u * p + v * q + w * r if known else -math.sqrt(p * p + q * q + r * r)
+        least = min(least, along)
     return distance + least
 
 
@@ -129,7 +127,9 @@ def nearest_along(curve, b, triangle, floor, pieces, s):
             top -= 1
             continue
         for k in (0, 4):
-            distance, _, _, _ = beside(piece[3 * k], piece[3 * k + 1], piece[3 * k + 2], b, triangle, s)
+            distance, _, _, _ = beside(
+                piece[3 * k], piece[3 * k + 1], piece[3 * k + 2], b, triangle, s
+            )
             if distance < best:
                 best, at = distance, piece[15] + (piece[16] if k == 4 else 0.0)
         if bound < best - close and count > _MOST:
@@ -210,6 +210,13 @@ def into_axes(curve, t, h, b, s, out):
 
 
 @compiled
+def into_own_axes(x, y, z, t, b, s):
+    """Coordinates of a point of the world in the axes of solid b at time t [s]."""
+    u, v, w = displacement(t, b, s)
+    return own_axes(x - u, y - v, z - w, b, s)
+
+
+@compiled
 def watch_solid(i, b, curve, t, h, s, monitor):
     """Clearance of agent i's surface to solid b over a piece of a step."""
     radius, part, own = monitor.radius[i], monitor.curves[1], monitor.curves[2]
@@ -255,8 +262,7 @@ def watch_landing(i, curve, t, s, monitor):
     if not (monitor.standing[i] != 0 or monitor.low[i, 0] < math.inf):
         return
     for b in range(s.kind.shape[0]):
-        p, q, r = displacement(t, b, s)
-        x, y, z = own_axes(curve[4, 0] - p, curve[4, 1] - q, curve[4, 2] - r, b, s)
+        x, y, z = into_own_axes(curve[4, 0], curve[4, 1], curve[4, 2], t, b, s)
         near = monitor.radius[i] + monitor.pad
         if far_from(x, y, z, b, s) <= near and signed_distance(x, y, z, b, s) <= near:
             return
@@ -290,4 +296,3 @@ def monitor_of(monitor: Monitor) -> Watched:
     """The monitor of obstacles that writes into another one's arrays."""
     known = {name: getattr(monitor, name) for name in Watched._fields if name != "curves"}
     return Watched(**known, curves=np.zeros((3, 5, 3)))
-

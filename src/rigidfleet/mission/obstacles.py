@@ -7,6 +7,7 @@ import math
 import re
 from abc import abstractmethod
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -49,7 +50,7 @@ class Solid(Part):
 
     @property
     def corners(self) -> tuple[float, ...] | None:
-        """Lowest and highest corner (6,) [m] of a box along the world's axes that does not move; None for all others."""
+        """Lowest and highest corner (6,) [m] of a box along the world's axes at rest; None for all others."""
         return None
 
     @property
@@ -78,8 +79,8 @@ class Moving(Solid):
     )
     waypoints: tuple[Vector, ...] | None = Field(
         None,
-        description="places of the obstacle's centre [x, y, z] [m] at `times`: straight between them at constant speed, "
-        "at rest before the first and after the last",
+        description="places of the obstacle's centre [x, y, z] [m] at `times`: straight between them at constant "
+        "speed, at rest before the first and after the last",
     )
     times: tuple[Seconds, ...] | None = Field(
         None, description="mission times of the waypoints [s], increasing"
@@ -199,7 +200,8 @@ class Heights(Solid):
         "the heights themselves",
     )
     base: Coordinate | None = Field(
-        None, description="height of the underside [m]; default: as far below the lowest height as the map is wide"
+        None,
+        description="height of the underside [m]; default: as far below the lowest height as the map is wide",
     )
 
     @property
@@ -234,17 +236,13 @@ class Ground(Part):
         return records.single(records.half_space(self.height))
 
 
-Obstacle = Annotated[
-    Box | Sphere | Cylinder | Hull | Heights | Ground, Field(discriminator="kind")
-]
+Obstacle = Annotated[Box | Sphere | Cylinder | Hull | Heights | Ground, Field(discriminator="kind")]
 KINDS: dict[str, type[Part]] = {
     "box": Box, "ground": Ground, "sphere": Sphere, "cylinder": Cylinder, "hull": Hull, "heights": Heights,
 }  # fmt: skip
 
 
-def checked(
-    collector: FindingCollector, kind: type[Part], data: Any, k: int
-) -> Obstacle | None:
+def checked(collector: FindingCollector, kind: type[Part], data: Any, k: int) -> Obstacle | None:
     """Obstacle number k (from 0) of a kind; None, with findings, if it is not valid."""
     path: Keys = ("obstacles", k)
     name = "ground" if kind is Ground else f"{data['kind']} {k + 1}"
@@ -283,9 +281,11 @@ def _motion(collector: FindingCollector, thing: Moving, path: Keys) -> bool:
         return True
     if len(ways) != len(times) or len(ways) < 2:
         problem = f"has {len(times)} entries for {len(ways)} waypoints"
-        collector.add((*path, "times"), problem, "give one time for each waypoint, two or more", None)
+        collector.add(
+            (*path, "times"), problem, "give one time for each waypoint, two or more", None
+        )
         return False
-    if min(b - a for a, b in zip(times[:-1], times[1:], strict=True)) < bounds.TIME.least:
+    if min(b - a for a, b in pairwise(times)) < bounds.TIME.least:
         collector.add((*path, "times"), "must increase", "order the waypoints by time")
         return False
     return True
@@ -368,10 +368,13 @@ def _table(path: Path) -> list[list[float]]:
         raise refused(problem, "give a file of heights, CSV or NPY") from None
     except ValueError:
         raise refused(
-            "is not a table of numbers", "give rows of equal length, separated by commas, or an NPY array"
+            "is not a table of numbers",
+            "give rows of equal length, separated by commas, or an NPY array",
         ) from None
     if found.ndim != 2 or not found.size or not np.isfinite(found).all():
         raise refused("is not a table of finite numbers", "give two or more rows of heights [m]")
     if found.size > bounds.HEIGHTS:
-        raise refused(f"has {found.size:,} heights; the maximum is {bounds.HEIGHTS:,}", "use a coarser grid")
+        raise refused(
+            f"has {found.size:,} heights; the maximum is {bounds.HEIGHTS:,}", "use a coarser grid"
+        )
     return found.tolist()

@@ -33,7 +33,6 @@ from rigidfleet.mission.values import (
     AttitudeGains,
     BodyDrag,
     Coefficient,
-    Coordinate,
     Cost,
     Damping,
     Delay,

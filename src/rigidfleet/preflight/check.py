@@ -19,11 +19,11 @@ from rigidfleet.preflight.findings import Preflight, Remark
 from rigidfleet.preflight.formations import SEARCHED, check_formations, formation_remarks
 from rigidfleet.preflight.gains import check_gains, gain_remarks
 from rigidfleet.preflight.margins import check_margins, margin_remarks
+from rigidfleet.preflight.obstacles import obstacle_remarks
 from rigidfleet.preflight.trajectory import (
     disturbance_remarks,
     downwash_remarks,
     limit_remarks,
-    obstacle_remarks,
     separation_remarks,
     thrust_remarks,
 )

@@ -158,7 +158,9 @@ class Extremes:
         trail, body = state.trail, bool(problem.body_formulation)
         laid = obstacles.layout(problem.vehicles.m, problem.graph.edges, body)
         watched = obstacles.monitor_of(self.monitor.monitor)
-        obstacles.watch(trail.points[first:last], trail.clock[first:last], laid, self.solids, watched)
+        obstacles.watch(
+            trail.points[first:last], trail.clock[first:last], laid, self.solids, watched
+        )
 
     def take_vehicles(
         self, state: fleet.SampledState, vehicles: fleet.Quadrotors, lost: Bools, ticks: int

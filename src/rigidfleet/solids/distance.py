@@ -21,7 +21,7 @@ Numbers = Any
 
 
 def choose(test: Numbers, this: Numbers, other: Numbers) -> Numbers:
-    """``this`` where the test holds, elsewhere ``other``."""
+    """One number where the test holds, the other elsewhere."""
     return np.where(test, this, other)
 
 
@@ -130,16 +130,30 @@ def off_triangle(x: Numbers, y: Numbers, z: Numbers, t: Any) -> Any:
     u, v, w = off_segment(x, y, z, b, c)
     d = u * u + v * v + w * w
     nearer = d < best
-    i, j, k, best = choose(nearer, u, i), choose(nearer, v, j), choose(nearer, w, k), choose(nearer, d, best)
+    i, j, k, best = (
+        choose(nearer, u, i),
+        choose(nearer, v, j),
+        choose(nearer, w, k),
+        choose(nearer, d, best),
+    )
     u, v, w = off_segment(x, y, z, c, a)
     d = u * u + v * v + w * w
     nearer = d < best
-    i, j, k, best = choose(nearer, u, i), choose(nearer, v, j), choose(nearer, w, k), choose(nearer, d, best)
+    i, j, k, best = (
+        choose(nearer, u, i),
+        choose(nearer, v, j),
+        choose(nearer, w, k),
+        choose(nearer, d, best),
+    )
     if area > 0.0:
         over = side(x, y, z, a, b, n) >= 0.0
         over = over & (side(x, y, z, b, c, n) >= 0.0) & (side(x, y, z, c, a, n) >= 0.0)
         height = ((x - a[0]) * n[0] + (y - a[1]) * n[1] + (z - a[2]) * n[2]) / area
-        i, j, k = choose(over, height * n[0], i), choose(over, height * n[1], j), choose(over, height * n[2], k)
+        i, j, k = (
+            choose(over, height * n[0], i),
+            choose(over, height * n[1], j),
+            choose(over, height * n[2], k),
+        )
         best = choose(over, height * height * area, best)
     return i, j, k, best
 
@@ -189,7 +203,14 @@ def below(x: Numbers, y: Numbers, b: int, s: Any) -> Any:
 def within(x: Numbers, y: Numbers, z: Numbers, b: int, s: Any) -> Any:
     """Whether the point is inside a solid of triangles: a convex hull or a height map."""
     size = s.size[b]
-    found = (x >= size[0]) & (x <= size[3]) & (y >= size[1]) & (y <= size[4]) & (z >= size[2]) & (z <= size[5])
+    found = (
+        (x >= size[0])
+        & (x <= size[3])
+        & (y >= size[1])
+        & (y <= size[4])
+        & (z >= size[2])
+        & (z <= size[5])
+    )
     if not some(found):
         return found
     if s.kind[b] == HEIGHTS:
@@ -199,7 +220,11 @@ def within(x: Numbers, y: Numbers, z: Numbers, b: int, s: Any) -> Any:
         t = s.triangles[m]
         e, f, g = t[1, 0] - t[0, 0], t[1, 1] - t[0, 1], t[1, 2] - t[0, 2]
         p, q, r = t[2, 0] - t[0, 0], t[2, 1] - t[0, 1], t[2, 2] - t[0, 2]
-        out = (x - t[0, 0]) * (f * r - g * q) + (y - t[0, 1]) * (g * p - e * r) + (z - t[0, 2]) * (e * q - f * p)
+        out = (
+            (x - t[0, 0]) * (f * r - g * q)
+            + (y - t[0, 1]) * (g * p - e * r)
+            + (z - t[0, 2]) * (e * q - f * p)
+        )
         found = found & (out <= 0.0)
     return found
 
@@ -233,7 +258,12 @@ def outward_normal(x: Numbers, y: Numbers, z: Numbers, b: int, s: Any) -> Any:
     away = np.sqrt(squared)
     away = choose(within(x, y, z, b, s), -away, away)
     known = squared > 0.0
-    i, j, k, away = choose(known, i, 0.0), choose(known, j, 0.0), choose(known, k, 0.0), choose(known, away, 1.0)
+    i, j, k, away = (
+        choose(known, i, 0.0),
+        choose(known, j, 0.0),
+        choose(known, k, 0.0),
+        choose(known, away, 1.0),
+    )
     return i / away, j / away, k / away
 
 

@@ -93,7 +93,9 @@ def cylinder(ends: ArrayLike, radius: float) -> Form:
     z = (b - a) / length
     x = np.cross(np.eye(3)[int(np.abs(z).argmin())], z)
     x /= np.linalg.norm(x)
-    return Form(CYLINDER, (a + b) / 2, np.array([x, np.cross(z, x), z]), [radius, length / 2, 0, 0, 0, 0])
+    return Form(
+        CYLINDER, (a + b) / 2, np.array([x, np.cross(z, x), z]), [radius, length / 2, 0, 0, 0, 0]
+    )
 
 
 def hull(points: ArrayLike) -> Form:
@@ -127,7 +129,10 @@ def height_map(corner: ArrayLike, spacing: ArrayLike, heights: ArrayLike, base: 
     Each cell of the grid is two triangles, divided from its lowest i, j to its highest.
     """
     z = np.asarray(heights, dtype=float)
-    step, origin = np.asarray(spacing, dtype=float), np.array([*np.asarray(corner, dtype=float), 0.0])
+    step, origin = (
+        np.asarray(spacing, dtype=float),
+        np.array([*np.asarray(corner, dtype=float), 0.0]),
+    )
     i, j = np.indices(z.shape)
     top = np.stack([i * step[0], j * step[1], z], axis=-1)
     low = top.copy()
@@ -176,7 +181,9 @@ def joined(parts: Sequence[Solids]) -> Solids:
         return single(half_space(0.0))._replace(kind=np.zeros(0, dtype=np.int64))
     columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
     joint = Solids(*columns)
-    counts = np.array([(len(p.nodes), len(p.triangles), len(p.heights), len(p.times)) for p in parts])
+    counts = np.array(
+        [(len(p.nodes), len(p.triangles), len(p.heights), len(p.times)) for p in parts]
+    )
     before = np.cumsum(counts, axis=0) - counts
     own = np.repeat(before, [len(p.kind) for p in parts], axis=0)
     nodes = np.repeat(before[:, :2], counts[:, 0], axis=0)
@@ -186,6 +193,27 @@ def joined(parts: Sequence[Solids]) -> Solids:
         after=joint.after + nodes[:, 0],
         leaf=joint.leaf + nodes[:, 1:],
     )
+
+
+def extent(solid: Solids) -> Floats:
+    """Lowest and highest corner (2, 3) [m] of the space that a solid, alone in its record, ever takes."""
+    size, turn = solid.size[0], solid.turn[0]
+    if solid.kind[0] == CYLINDER:
+        radius, half = size[0], size[1]
+        reach = half * np.abs(turn[2]) + radius * np.sqrt(np.maximum(1.0 - turn[2] ** 2, 0.0))
+        low, high = -reach, reach
+    elif solid.turned[0]:
+        corners = np.array(
+            [[size[a], size[b], size[c]] for a in (0, 3) for b in (1, 4) for c in (2, 5)]
+        )
+        corners = corners @ turn  # from own axes to the world's
+        low, high = corners.min(axis=0), corners.max(axis=0)
+    else:
+        low, high = size[:3], size[3:]
+    ends = np.array([low - solid.rounding[0], high + solid.rounding[0]]) + solid.origin[0]
+    if solid.moves:
+        ends += np.array([solid.ways.min(axis=0), solid.ways.max(axis=0)])
+    return ends
 
 
 def _tree(triangles: Floats) -> tuple[Floats, Floats, Ints, Ints]:

@@ -17,12 +17,16 @@ def _known(function: Callable[..., Any]) -> None:
     overload(function, jit_options=OPTIONS, strict=False)(lambda *_: function)
 
 
+def _floor(x):
+    return math.floor(x)
+
+
 # Numba takes the implementation that the second function returns for the arguments' types.
 overload(distance.choose, jit_options=OPTIONS)(
     lambda test, this, other: lambda test, this, other: this if test else other
 )
 overload(distance.some, jit_options=OPTIONS)(lambda test: lambda test: test)
-overload(distance.whole, jit_options=OPTIONS)(lambda x: lambda x: int(math.floor(x)))
+overload(distance.whole, jit_options=OPTIONS)(lambda x: _floor)
 
 for _function in distance.ELEMENTWISE:
     _known(_function)
