@@ -58,7 +58,7 @@ format: .venv/.dev  ## Rewrite the code in the project's style
 
 constraints: .venv/.dev  ## Choose newer versions of all packages
 	@$(BIN)/uv pip compile --quiet --universal --upgrade --no-header --no-annotate \
-		--all-extras --group dev --group bench --group peers --group vehicles --group docs --group build \
+		--all-extras --group dev --group bench --group peers --group vehicles --group oracles --group docs --group build \
 		pyproject.toml --output-file constraints.txt
 
 clean:  ## Remove .venv, caches and builds
@@ -78,7 +78,7 @@ clean:  ## Remove .venv, caches and builds
 	@$(INSTALL)
 	@touch $@
 
-.venv/.dev .venv/.bench .venv/.peers .venv/.vehicles .venv/.docs: .venv/.%: .venv/.core
+.venv/.dev .venv/.bench .venv/.peers .venv/.vehicles .venv/.oracles .venv/.docs: .venv/.%: .venv/.core
 	@echo "Installing what '$*' needs"
 	@$(INSTALL) --group $*
 	@touch $@
