@@ -66,7 +66,9 @@ def everything(rows: int = 0) -> tuple[Any, ...]:
             wind=np.array([1.0, -2.0, 0.3]), gust=rng.normal(size=(9, n, 3)), gust_step=0.1, downwash=True,
             ground_effect=True, floor=np.full(n, 0.5),
         ),
-        sensing=fleet.Sensing(3, rng.integers(0, 9, n), True, 5, rng.integers(0, 30, (n, n))),
+        sensing=fleet.Sensing(
+            3, rng.integers(0, 9, n), True, 5, rng.integers(0, 30, (n, n)), np.zeros((0, 2), dtype=np.int64)
+        ),
         guidance=fleet.Guidance(np.full(n, 0.8), np.full((n, 3), 0.3)),
         tables=fleet.Tables(
             0, K, rng.normal(size=(K, n, 6)), yaw, 0.5 * small[0], small[1], 0.01 * small[2, ::3], 0.02 * small[3, ::3],

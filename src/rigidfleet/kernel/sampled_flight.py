@@ -194,11 +194,30 @@ def worse(i, kind, value, t, state):
 
 
 @compiled
+def presume(k, t, w, flight, state):
+    """Let vehicles without a link take each other to be at their slots at tick k, time t [s].
+
+    The slots are those of the last evaluation of the law, moved on by their velocity and acceleration.
+    """
+    pairs, since = flight.sensing.parted, t - state.clock[1]
+    for row in range(pairs.shape[0]):
+        for side in range(2):
+            i, j = pairs[row, side], pairs[row, 1 - side]
+            for q in range(3):
+                v, a = w.v_ref[j, q], w.a_ref[j, q]
+                r = w.r_ref[j, q] + since * (v + 0.5 * since * a)
+                state.heard[i, j, q] = r - path_at(k, j, q, flight.tables)
+                v += since * a - path_at(k, j, 3 + q, flight.tables)
+                state.heard[i, j, 3 + q] = v
+
+
+@compiled
 def desire(k, t, p, w, flight, state, call):
     """Desired forces of all vehicles at tick k, time t [s]; returns False if the law gives none (a singular law)."""
     n, dt = state.S.shape[0], flight.every * flight.steps * flight.h
     advance_frame(t, p, state)
     linked = flight.sensing.linked
+    presume(k, t, w, flight, state)
     for i in range(n if linked else 1):
         known = state.heard[i] if linked else state.seen
         integral = state.integral[i]

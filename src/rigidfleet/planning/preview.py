@@ -168,6 +168,8 @@ def leg(mission: Mission, phase: Phase, now: PhaseState) -> Leg | None:
         tracked = pose if phase.control == "tracking" else None
         frame = pose.T if frame is not None else None
         after = replace(now, slots=slots, pose=tracked, goal=goal, frame=frame)
+    if shaping is None and now.blend is not None:
+        reference = now.blend
     r, v = slot_derivatives(reference, motion, np.array([t_end]), 2)[0]
     after = replace(after, t=t_end, r=r, v=v, formation=name)
     return Leg(phase, t0, t_end, reference, motion, before, after, exact)

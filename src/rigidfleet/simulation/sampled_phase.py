@@ -71,6 +71,11 @@ class SampledPhase(ActivePhase):
         self.state = integrator(plan, y, t, trail)
         lost = self.flight.vehicles._replace(lost=self.lost.copy())
         self.flight = self.flight._replace(vehicles=lost)
+        if self.parted.any():
+            parted = np.ascontiguousarray(plan.links_lost[0][self.parted])
+            sensing = self.flight.sensing._replace(parted=parted)
+            self.flight = self.flight._replace(sensing=sensing)
+            self.evaluate()  # the slots at which vehicles without a link presume each other
         frame = y[6 * n + m : 6 * n + m + 4] if plan.frame is not None else None
         integral, before = y[6 * n : 6 * n + m], given.state
         begun = fleet.begin(self.flight, given.S, self.workspace, frame=frame)

@@ -32,7 +32,8 @@ class Sampling:
         low, high = math.floor(t / step + 1e-9) + 1, math.floor(t_end / step + 1e-9) + 1
         grid = np.minimum(np.arange(low, high) * step, t_end)
         lost = plan.lost_at
-        for exact in (plan.arrival, plan.t_end, stop, *lost[np.isfinite(lost)]):
+        losses = (*lost[np.isfinite(lost)], *plan.links_lost[1])
+        for exact in (plan.arrival, plan.t_end, stop, *losses):
             if t < exact <= t_end:
                 grid = np.sort(np.append(grid[abs(grid - exact) > 1e-9 * step], exact))
         if not first:
