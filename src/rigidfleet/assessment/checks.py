@@ -332,12 +332,12 @@ def _abandoned(measured: Measurements) -> Iterator[CheckResult]:
     never = [phase.name for phase in mission.phases[begun:]]
     if not left + never:
         return
-    parts = [f"'{name}' was left there, and is not judged" for name in left]
+    parts = [f"'{name}' was left and is not judged" for name in left]
     if never:
         parts.append(
             f"{', '.join(map(repr, never))} {'was' if len(never) == 1 else 'were'} not flown"
         )
-    words = f"{mission.loss_in_words} at {when:.2f} s: {'; '.join(parts)}"
+    words = f"after the loss of {mission.first_lost} at {when:.2f} s, {'; '.join(parts)}"
     yield CheckResult(
         "abandoned", True, words, float(len(left + never)), None, "", when=when, judged=False
     )
@@ -390,6 +390,10 @@ def notes(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[str]:
     yield from _dips(measured)
     yield from _turned_over(measured, phases)
     yield from _fallen(measured)
+    pairs, times = measured.mission.links_lost
+    for (i, j), t in zip(pairs + 1, times, strict=True):
+        if t < measured.result.time[-1]:
+            yield f"the link {i}-{j} is lost at {t:.2f} s: after that, no edge joins agents {i} and {j}"
     agents = measured.mission.agents
     if agents.saturate:
         full = measured.thrust >= np.array(agents.thrust_limit) * (1 - 1e-6)

@@ -171,7 +171,7 @@ class Sensing(NamedTuple):
     linked: bool
     link_every: int  # attitude ticks between messages
     link_delay: Ints  # (N, N) attitude ticks from a measurement of j to its arrival at i, by [i, j]
-    parted: Ints  # (P, 2) pairs i, j without a link for good: i takes j to be at its slot
+    parted: Ints  # (P, 2) pairs without a link for good; see `sampled_flight.presume`
 
 
 class Guidance(NamedTuple):

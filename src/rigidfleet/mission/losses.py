@@ -122,8 +122,8 @@ def _links(
     for k, p in _under_way(parts["phases"], first, ever_after=True):
         if p.control != "tracking":
             problem = (
-                f"may be under way after the link lost at {first:g} s: vehicles without a link take each other"
-                " to be at their slots, so the slots must be tracked"
+                f"may be under way after the link lost at {first:g} s: vehicles without a link know each other"
+                " by their slots alone, so the slots must be tracked"
             )
             collector.add(("phases", k, "control"), problem, "use control = 'tracking'", p.control)
 

@@ -412,15 +412,14 @@ class Mission(Contents):
         return float(min(self.lost_at.min(), self.links_lost[1].min(initial=np.inf)))
 
     @property
-    def loss_in_words(self) -> str:
-        """What is lost first: agent 2 was lost."""
+    def first_lost(self) -> str:
+        """What is lost first, in words: agent 2, agents 1 and 2, the link 1-3."""
         pairs, times = self.links_lost
         when = self.first_loss
         who = np.flatnonzero(self.lost_at == when)
         told = [agent_names(who)] if len(who) else []
         told += [f"the link {i + 1}-{j + 1}" for i, j in pairs[times == when]]
-        plural = len(told) > 1 or told[0].startswith("agents")
-        return f"{' and '.join(told)} {'were' if plural else 'was'} lost"
+        return " and ".join(told)
 
     @property
     def on_loss(self) -> Literal["continue", "hold", "land"]:

@@ -24,7 +24,7 @@ from rigidfleet.planning.reference import PhaseState, pose_at
 #: Greatest acceleration [m/s^2] and jerk [m/s^3] of a slot while it brakes, turns or spreads, and greatest speed [m/s]
 #: and acceleration of the descent, unless `limits` asks for less. A motion that is faster when it begins may go on so.
 BRAKING, JERK = 2.0, 5.0
-DESCENT, DESCENDING = 2.0, 1.0
+DESCENT, DESCENDING = 1.0, 0.5
 #: Peaks of speed and acceleration of a septic blend over unit way and time.
 _PEAK_SPEED, _PEAK_ACCELERATION = 2.1875, 7.5132
 #: Least time of a phase [s]; ratio of a time tried to the one before, and number of times tried.

@@ -100,11 +100,11 @@ def preview(mission: Mission, phases: int | None = None) -> tuple[list[PlannedPh
         if found is None:
             return planned, False
         now = found.after
-        planned.append(_planned(found, most))
+        planned.append(planned_phase(found, most))
     return planned, len(planned) == len(wanted)
 
 
-def _planned(found: Leg, most: int) -> PlannedPhase:
+def planned_phase(found: Leg, most: int) -> PlannedPhase:
     """At most ``most`` samples of a leg."""
     begin, end, reference = found.begin, found.end, found.reference
     count = min(max(_SAMPLES, int((end - begin) / _STEP) + 1), _MOST, most)
