@@ -13,6 +13,7 @@ from rigidfleet.errors import MissionError
 from rigidfleet.math import splines
 from rigidfleet.mission import Mission
 from rigidfleet.result import Result
+from rigidfleet.web.live.pilot import Pilot
 
 RADIUS = 0.25
 START = [[0.0, 0, 5], [4.2, 0, 5], [4, 4.1, 5], [0, 4, 5]]
@@ -53,14 +54,22 @@ def names(result: Result) -> list[str]:
     return [phase.name for phase in result.phases]
 
 
+def slots(result: Result, order: int) -> Any:
+    """Derivative (K, N, 3) of the slots of an order: velocity, acceleration or jerk."""
+    name = ("slot_position", "slot_velocity", "slot_acceleration", "slot_jerk")[order]
+    found = getattr(result, name)
+    assert found is not None
+    return found
+
+
 def jumps(result: Result, t: float, who: list[int]) -> list[float]:
     """Jumps of the slots at a switch, of position and three derivatives."""
     k = int(np.searchsorted(result.time, t))
     assert result.time[k] == t
     assert result.time[k + 1] == np.nextafter(t, np.inf)
     found = []
-    for name in ("slot_position", "slot_velocity", "slot_acceleration", "slot_jerk"):
-        x = getattr(result, name)[k : k + 2, who]
+    for order in range(4):
+        x = slots(result, order)[k : k + 2, who]
         found.append(float(np.abs(np.diff(x, axis=0)).max()))
     return found
 
@@ -104,11 +113,11 @@ def test_the_others_brake_and_hold():
     assert max(jumps(result, 8.0, left)) < 1e-9
     assert max(jumps(result, result.phases[2].t_end, left)) < 1e-9
     after = result.time > 8.0
-    assert np.linalg.norm(result.slot_acceleration[after][:, left], axis=2).max() < 2.03
-    assert np.linalg.norm(result.slot_jerk[after][:, left], axis=2).max() < 5.06
+    assert np.linalg.norm(slots(result, 2)[after][:, left], axis=2).max() < 2.03
+    assert np.linalg.norm(slots(result, 3)[after][:, left], axis=2).max() < 5.06
     brakes = result.phases[2]
     still = result.time > brakes.t_end
-    assert np.abs(result.slot_velocity[still][:, left]).max() < 1e-9
+    assert np.abs(slots(result, 1)[still][:, left]).max() < 1e-9
     assert np.ptp(result.position[still][:, left], axis=0).max() < 1e-3
     assert result.time[-1] == 20.0
     assert result.complete
@@ -132,9 +141,9 @@ def test_an_orbit_brakes_from_its_acceleration():
     result = simulate(mission(lost, phases=[PHASES[0], orbit]))
     left = [1, 2, 3]
     k = int(np.searchsorted(result.time, 15.03))
-    assert np.linalg.norm(result.slot_acceleration[k, left], axis=1).max() > 2.3
+    assert np.linalg.norm(slots(result, 2)[k, left], axis=1).max() > 2.3
     assert max(jumps(result, 15.03, left)) < 1e-6
-    assert np.abs(result.slot_velocity[-1, left]).max() < 1e-9
+    assert np.abs(slots(result, 1)[-1, left]).max() < 1e-9
     assert result.time[-1] == 26.0
     assert assess(result).passed
 
@@ -156,9 +165,9 @@ def test_a_change_of_shape_is_completed():
     whole = simulate(mission(lost))
     assert names(result) == ["establish 1", "loss: brake", "loss: hold"]
     assert result.phases[1].t_end == pytest.approx(5.0)
-    for name in ("slot_position", "slot_acceleration"):
+    for order in (0, 2):
         one, other = (
-            getattr(r, name)[(r.time <= 5.0) & (r.phase < 2)][:, [0, 2, 3]] for r in (result, whole)
+            slots(r, order)[(r.time <= 5.0) & (r.phase < 2)][:, [0, 2, 3]] for r in (result, whole)
         )
         times = [r.time[(r.time <= 5.0) & (r.phase < 2)] for r in (result, whole)]
         both = np.isin(times[1], times[0])
@@ -174,9 +183,9 @@ def test_the_others_land():
     result = simulate(mission(LOST | {"on_loss": "land"}))
     assert names(result)[1:] == ["fly 2", "loss: brake", "loss: land"]
     left, land = [0, 2, 3], result.samples(3)
-    slots = result.slot_position[land][:, left]
-    assert np.ptp(slots[..., :2], axis=0).max() < 1e-9
-    speed = result.slot_velocity[land][:, left, 2]
+    places = result.slot_position[land][:, left]
+    assert np.ptp(places[..., :2], axis=0).max() < 1e-9
+    speed = slots(result, 1)[land][:, left, 2]
     assert -1.0 < speed.min() < -0.8
     assert speed.max() < 1e-9
     np.testing.assert_allclose(speed[-1], -0.2, atol=1e-9)
@@ -280,6 +289,23 @@ def test_a_loss_at_a_switch():
     assert "after the loss of agent 1 at 15.00 s, 'hold 3' was not flown" in verdict.notes
 
 
+def test_points_passed_before_the_loss_are_judged():
+    """Of a way through points, those passed before the loss count; those after it, and the waypoint, do not."""
+    points = [
+        {"position": [5.0, 2.0, 6.0], "time": 2.0},
+        {"position": [12.0, 4.0, 8.0], "time": 5.0},
+    ]
+    way = PHASES[1] | {"through": points}
+    result = simulate(mission(LOST | {"on_loss": "land"}, phases=[PHASES[0], way, PHASES[2]]))
+    verdict = assess(result)
+    (judged,) = verdict.phases[1].through
+    assert judged.time == 7.0
+    assert judged.position is not None
+    assert judged.position < 1e-3
+    assert verdict.phases[1].waypoint is None
+    assert verdict.passed, verdict.summary
+
+
 def test_a_second_loss_does_not_begin_anew():
     """The second vehicle drops out of the landing, which goes on to the ground on the same way."""
     two = {"lost": [*LOST["lost"], {"agent": 4, "time": 16.0}], "on_loss": "land"}
@@ -355,6 +381,19 @@ def test_by_hand_a_loss_ends_no_phase():
     assert result.mission.lost_at[1] == 8.0
     assert not any(p.abandoned for p in result.phases)
     assert simulate(result.mission).position[-1] == pytest.approx(result.position[-1], abs=1e-6)
+
+
+def test_a_live_flight_goes_on():
+    """The pilot decides: a loss ends no phase flown live, and the record repeats what was flown."""
+    pilot = Pilot(mission({"lost": [{"agent": 2, "time": 6.0}], "on_loss": "land"}))
+    while pilot.t < 8.0:
+        pilot.step()
+    assert not pilot.ending
+    result = pilot.result()
+    assert result.mission.on_loss == "continue"
+    assert result.mission.lost_at[1] == 6.0
+    assert np.isnan(result.slot_position[-1, 1]).all()
+    np.testing.assert_allclose(result.position[-1, [0, 2, 3], 2], 5.0, atol=1e-3)
 
 
 def test_reports_show_the_phases_flown(tmp_path):

@@ -45,7 +45,7 @@ from rigidfleet.mission import Mission, Phase, Regulator, Settle
 from rigidfleet.mission.kinds import seconds
 from rigidfleet.mission.schema import Constraint, IntegratorOptions
 from rigidfleet.planning import solvers
-from rigidfleet.planning.courses import course
+from rigidfleet.planning.courses import course, passed
 from rigidfleet.planning.disturbances import without
 from rigidfleet.planning.reference import (
     PhaseState,
@@ -98,6 +98,7 @@ class PhasePlan:
     before: PhaseState  # the state that the phase starts from
     links_lost: tuple[Ints, Floats]  # pairs (L, 2) and times (L,) of links that are lost
     blend: Reference  # of all edges, before any is released
+    through: tuple[tuple[float, Floats], ...] = ()  # times [s] and CM (3,) [m] to pass on the way
     smooth: bool = False  # whether the next phase needs acceleration and jerk of the reference
 
     @property
@@ -114,12 +115,14 @@ class PhasePlan:
         turns = lies or "attitude" in meets
         reference = self.problem.reference
         shaped = reference.t0 + reference.T_b
+        through = [{"time": t, "position": r.tolist()} for t, r in self.through]
         return {
             "time": max(self.arrival, shaped) if lies else self.arrival,
             "position": goal.r.tolist() if "position" in meets else None,
             "velocity": goal.v.tolist() if "velocity" in meets else None,
             "attitude": att.quaternion_from_dcm(goal.T).tolist() if turns else None,
             "rates": goal.omega.tolist() if turns and not lies else None,
+            **({"through": through} if through else {}),
         }
 
     def state(self) -> Floats:
@@ -284,7 +287,8 @@ def plan_phase(
         lies=phase.establishing is not None and not mission.free_attitude(phase), method=method,
         constraint=mission.constraint, integrator=mission.integrator,
         damping=partial(mission.damping, held), lost_at=mission.lost_at, masses=masses, before=before_switch,
-        smooth=mission.smooth or mission.on_loss != "continue", links_lost=mission.links_lost, blend=reference,
+        links_lost=mission.links_lost, blend=reference, through=passed(flight),
+        smooth=mission.smooth or mission.on_loss != "continue",
     )  # fmt: skip
     lost = np.zeros(len(masses), dtype=np.bool_) if now.lost is None else now.lost
     parted = plan.links_lost[1] <= now.t

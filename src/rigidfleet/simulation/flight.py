@@ -331,7 +331,8 @@ class Flight:
         Returns
         -------
         bool
-            Whether the phase goes on: False at its end, or if the flight cannot go on (then `ending` says why).
+            Whether the phase goes on: False at its end, at a loss that the mission answers, or if the flight cannot go
+            on (then `ending` says why).
 
         Raises
         ------
@@ -514,7 +515,8 @@ class Flight:
     def _leave(self, *, changed: bool = False, abandoned: bool = False) -> None:
         """End the phase under way.
 
-        A target that was ``changed`` in flight, or ``abandoned`` because of a loss, is not judged as a waypoint.
+        A target that was ``changed`` in flight, or ``abandoned`` because of a loss, is not judged as a waypoint. Points
+        on the way are, if the flight came to them before the loss.
         """
         active = self._active
         if active is None:
@@ -537,11 +539,11 @@ class Flight:
             self._solves.setdefault(method, type(counts)()).add(counts)
         self._now = active.end()
         record.t_end = self._now.t
-        if (
-            (changed or abandoned)
-            and record.target is not None
-            and record.target["time"] > record.t_end
-        ):
+        if abandoned:
+            points = () if record.target is None else record.target.get("through", ())
+            came = [point for point in points if point["time"] <= record.t_end]
+            record.target = {"time": came[-1]["time"], "through": came} if came else None
+        if changed and record.target is not None and record.target["time"] > record.t_end:
             record.target = None
 
     def _check_frame(self, plan: PhasePlan) -> None:

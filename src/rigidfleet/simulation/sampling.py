@@ -13,8 +13,9 @@ from rigidfleet.typing import Floats
 
 
 class Sampling:
-    """The times to record: multiples of a step, ends of phases, arrivals, losses and stops; or times given by the user.
+    """The times to record: those given by the user, or multiples of a step and exact moments.
 
+    Exact moments are ends of phases, arrivals, points to pass, losses and stops.
     The start of a phase is recorded one representable number after the switch; so is the state after a loss.
     """
 
@@ -33,7 +34,8 @@ class Sampling:
         grid = np.minimum(np.arange(low, high) * step, t_end)
         lost = plan.lost_at
         losses = (*lost[np.isfinite(lost)], *plan.links_lost[1])
-        for exact in (plan.arrival, plan.t_end, stop, *losses):
+        passed = (t for t, _ in plan.through)
+        for exact in (plan.arrival, plan.t_end, stop, *passed, *losses):
             if t < exact <= t_end:
                 grid = np.sort(np.append(grid[abs(grid - exact) > 1e-9 * step], exact))
         if not first:
