@@ -57,7 +57,7 @@ def after_loss(mission: Mission, now: PhaseState) -> list[Phase]:
     if d.on_loss == "hold":
         until = phase_spans(mission)[-1][1] if d.hold_until is None else d.hold_until
         if until > now.t:
-            phases.append(Hold(kind="hold", name="loss: hold", until=until))
+            phases.append(Hold(kind="hold", name="hold (loss)", until=until))
         return phases
     name = d.landing_formation
     if name is not None and name != now.formation:
@@ -104,23 +104,23 @@ def _planned(mission: Mission, phase: Phase, now: PhaseState) -> Leg:
 
 
 def _brake(travel: float, duration: float) -> Brake:
-    return Brake(kind="brake", name="loss: brake", duration=duration, travel=travel)
+    return Brake(kind="brake", name="brake (loss)", duration=duration, travel=travel)
 
 
 def _spread(formation: str, time: float) -> Reshape:
     return Reshape(
-        kind="reshape", name="loss: spread", formation=formation, blend=time, duration=time
+        kind="reshape", name="spread (loss)", formation=formation, blend=time, duration=time
     )
 
 
 def _turn(yaw: float, time: float) -> Turn:
     return Turn(
-        kind="turn", name="loss: level", roll_deg=0.0, pitch_deg=0.0, yaw_deg=yaw, duration=time
+        kind="turn", name="level (loss)", roll_deg=0.0, pitch_deg=0.0, yaw_deg=yaw, duration=time
     )
 
 
 def _land(time: float) -> Land:
-    return Land(kind="land", name="loss: land", duration=time)
+    return Land(kind="land", name="land (loss)", duration=time)
 
 
 def _shortest(
