@@ -305,6 +305,29 @@ def test_messages_that_are_lost():
     np.testing.assert_allclose(state.heard[3, 6], call.S[99, 6, :6], rtol=0, atol=1e-14)
 
 
+def test_without_a_link_a_vehicle_presumes_the_other():
+    """It takes the other one to be as far off its slot as it is itself, and hears nothing of where that is."""
+    problem, work, flight, state = planned("cube-passage", 1, SIH)
+    pair = np.array([[0, 1]])
+    flight = flight._replace(sensing=flight.sensing._replace(linked=True, parted=pair))
+    state = fleet.begin(flight, state.S, work)
+    times = np.asarray(flight.start + 2e-3 * np.arange(301))
+    y = np.concatenate([state.S[:, :3].ravel(), state.S[:, 3:6].ravel(), state.integral[0]])
+    native.record(
+        problem, work, times[:1], y[None]
+    )  # what is presumed begins with the slots in `work`
+    call = fly(problem, work, flight, state, times[-1], times)
+    k = 299
+    S = call.S[k, :, :6]
+    y = np.concatenate([S[:, :3].ravel(), S[:, 3:].ravel(), call.integral[k]])
+    slots = native.record(problem, work, times[k : k + 1], y[None]).r_ref[0]
+    for i, j in ((0, 1), (1, 0)):
+        presumed = S[i, :3] + slots[j] - slots[i]
+        np.testing.assert_allclose(state.heard[i, j, :3], presumed, rtol=0, atol=1e-8)
+        assert np.abs(presumed - S[j, :3]).max() > 1e-5
+    np.testing.assert_allclose(state.heard[2, 1], S[1], rtol=0, atol=1e-13)
+
+
 def test_a_law_at_a_slower_rate_holds_its_force():
     """Between evaluations of the law, desired forces are held."""
     given = planned("cube-passage", 1, SIH, every=5)
