@@ -139,6 +139,7 @@ class PhaseRecord:
     target : for phases with a goal of their own (fly, turn, orbit), and for establish phases with a commanded
         attitude: {"time" [s], "position" [m], "velocity" [m/s], "attitude" quaternion, "rates" [rad/s]}. Entries other
         than the time are None if nothing is commanded
+    abandoned : whether the loss of a vehicle or link ended it, before its own end
     extremes : worst values of the phase in continuous time, by name: separation, clearance, separation_below, lost
         (distance of a lost vehicle to one that still flies), geofence (distance beyond it), lowest, highest [m];
         speed [m/s]; acceleration [m/s^2]; thrust, thrust_margin (thrust minus its limit), constraint_force, tension
@@ -160,6 +161,7 @@ class PhaseRecord:
     extremes: Annotated[dict[str, Extremum], dict[str, tuple[float, float, int, int]]] = field(
         default_factory=dict
     )
+    abandoned: bool = False
 
     def __post_init__(self) -> None:
         self.extremes = {name: Extremum(*x) for name, x in (self.extremes or {}).items()}

@@ -7,12 +7,13 @@ from collections.abc import Mapping
 from functools import cached_property
 from importlib import resources
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, Literal, NamedTuple, Self
 
 import numpy as np
 from pydantic import PrivateAttr
 
 from rigidfleet._common.arguments import as_path
+from rigidfleet._common.text import agent_names
 from rigidfleet._common.toml import to_toml
 from rigidfleet.errors import Finding, MissionError, wrong_type
 from rigidfleet.formation.assignment import assigned
@@ -390,6 +391,41 @@ class Mission(Contents):
         for lost in self.disturbances.lost if self.disturbances is not None else ():
             when[lost.agent - 1] = lost.time
         return when
+
+    @cached_property
+    def links_lost(self) -> tuple[Ints, Floats]:
+        """The links that are lost: pairs (L, 2) of agents from 0, i < j, and times (L,) [s]."""
+        d = self.disturbances
+        lost = d.links.lost if d is not None and d.links is not None else ()
+        pairs = np.array([sorted(link.between) for link in lost], dtype=np.int64).reshape(-1, 2)
+        return pairs - 1, np.array([link.time for link in lost], dtype=np.float64)
+
+    def linked(self, edges: Ints, t: float) -> Bools:
+        """Mask (m,) of the edges (m, 2), i < j, whose link is not lost at a time [s]."""
+        pairs, times = self.links_lost
+        n = self.n_agents
+        lost = pairs[times < t]
+        return ~np.isin(edges[:, 0] * n + edges[:, 1], lost[:, 0] * n + lost[:, 1])
+
+    @property
+    def first_loss(self) -> float:
+        """Time [s] at which the first vehicle or link is lost; infinity if none is."""
+        return float(min(self.lost_at.min(), self.links_lost[1].min(initial=np.inf)))
+
+    @property
+    def first_lost(self) -> str:
+        """What is lost first, in words: agent 2, agents 1 and 2, the link 1-3."""
+        pairs, times = self.links_lost
+        when = self.first_loss
+        who = np.flatnonzero(self.lost_at == when)
+        told = [agent_names(who)] if len(who) else []
+        told += [f"the link {i + 1}-{j + 1}" for i, j in pairs[times == when]]
+        return " and ".join(told)
+
+    @property
+    def on_loss(self) -> Literal["continue", "hold", "land"]:
+        """What the others do when a vehicle or link is lost."""
+        return "continue" if self.disturbances is None else self.disturbances.on_loss
 
 
 def mission_names() -> list[str]:

@@ -21,7 +21,9 @@ from rigidfleet.mission.kinds import (
     KINDS,
     TIMES,
     AnyPhase,
+    Brake,
     Establish,
+    Land,
     Orbit,
     Shaping,
     Turn,
@@ -319,9 +321,26 @@ def _orbit(collector: FindingCollector, p: Orbit, path: Keys, longest: float | N
         collector.add(where, problem, "use a lower rate or several phases")
 
 
+def _led(collector: FindingCollector, p: Brake | Land, path: Keys, longest: float | None) -> None:
+    """Check that a brake or a landing has tracked slots and an end."""
+    kind_name = collector.data["phases"][path[1]]["kind"]
+    if p.control == "body" and collector.right(path, "control"):
+        problem = f"kind '{kind_name}' cannot be flown by a wrench on the virtual body"
+        collector.add((*path, "control"), problem, "use control = 'tracking'")
+    if p.settle is not None and collector.right(path, *_ENDINGS):
+        problem = f"kind '{kind_name}' needs a time of arrival"
+        collector.add((*path, "settle"), problem, "end it by duration or until", None)
+    travel = p.least_time
+    if longest is not None and travel > longest * (1 + 1e-9):
+        problem = f"is longer than the phase, which ends after {longest:g} s"
+        collector.add((*path, "travel"), problem, "reduce travel or end the phase later")
+
+
 #: Checks of single kinds. Arguments: the findings, the phase, its path, its maximum duration [s] or None.
 _OWN: dict[str, Callable[[FindingCollector, Any, Keys, float | None], None]] = {
+    "brake": _led,
     "establish": _establish,
+    "land": _led,
     "orbit": _orbit,
     "turn": _turn,
 }

@@ -521,6 +521,13 @@ class Noise(Part):
     )
 
 
+class LostLink(Part):
+    """Loss of a link: from this time on, two vehicles know nothing of each other, and no edge joins them."""
+
+    between: tuple[Whole, Whole] = Field(description="the two agents, counted from 1")
+    time: Time = Field(description="mission time of the loss [s], > 0")
+
+
 class Links(Part):
     """What vehicles know of each other: states sent at a fixed rate, which arrive late or not at all."""
 
@@ -531,6 +538,10 @@ class Links(Part):
     dropped: Share = Field(0.0, description="share of the states that are lost, 0 to 0.95")
     seed: Seed = Field(
         0, description="seed of the random numbers; the same seed loses the same states"
+    )
+    lost: tuple[LostLink, ...] = Field(
+        (),
+        description="links lost for good during the flight: `lost = [{ between = [1, 2], time = 30.0 }]`",
     )
 
 
@@ -574,6 +585,19 @@ class Disturbances(Part):
     )
     lost: tuple[Lost, ...] = Field(
         (), description="vehicles lost during the flight: `lost = [{ agent = 2, time = 30.0 }]`"
+    )
+    on_loss: Literal["continue", "hold", "land"] = Field(
+        "continue",
+        description="what the others do when the first vehicle or link is lost: continue: fly the mission on; hold: "
+        "brake to a stop and hold the formation; land: brake to a stop and land straight down",
+    )
+    hold_until: Time | None = Field(
+        None,
+        description="mission time to which on_loss 'hold' holds [s]; default: the planned end of the mission",
+    )
+    landing_formation: str | None = Field(
+        None,
+        description="level formation that on_loss 'land' takes before the descent; default: the one that is held",
     )
 
 

@@ -96,6 +96,8 @@ class PhasePlan:
     lost_at: Floats  # (N,) times at which vehicles are lost [s]
     masses: Floats  # (N,) assumed by the laws, lost vehicles included [kg]
     before: PhaseState  # the state that the phase starts from
+    links_lost: tuple[Ints, Floats]  # pairs (L, 2) and times (L,) of links that are lost
+    blend: Reference  # of all edges, before any is released
     through: tuple[tuple[float, Floats], ...] = ()  # times [s] and CM (3,) [m] to pass on the way
     smooth: bool = False  # whether the next phase needs acceleration and jerk of the reference
 
@@ -155,9 +157,12 @@ class PhasePlan:
         share = min(max(_RESIDUAL * self.integrator.rtol, _LEAST_RESIDUAL), _MOST_RESIDUAL)
         return share, _FLOOR * float(self.velocity_tolerance().min())  # over a step of 1 s
 
-    def release(self, lost: Bools) -> Bools:
-        """Remove the edges of vehicles ``lost`` (N,); return which edges (m,) are kept."""
-        kept = ~np.any(lost[self.edges], axis=1)
+    def release(self, lost: Bools, parted: Bools) -> Bools:
+        """Remove the edges of vehicles ``lost`` (N,) and links ``parted`` (L,); return which edges (m,) are kept."""
+        n = len(lost)
+        pairs = self.links_lost[0][parted]
+        keys = self.edges[:, 0] * n + self.edges[:, 1]
+        kept = ~np.any(lost[self.edges], axis=1) & ~np.isin(keys, pairs[:, 0] * n + pairs[:, 1])
         self.edges, self.distances = self.edges[kept], self.distances[kept]
         self.method = solvers.choose(len(lost), self.edges, self.constraint.solver)
         self.problem = without(self.problem, kept, lost, self.damping(lost), large=self.large)
@@ -187,6 +192,7 @@ class PhasePlan:
             slots=self.slots,
             pose=pose,
             goal=goal,
+            blend=self.blend if t < self.blend.t0 + self.blend.T_b else None,
         )
 
 
@@ -239,6 +245,8 @@ def plan_phase(
     if shaping is not None:
         dp, turn = align_slots(before, after, left, turned)
     reference = Reference(kind, now.t, T_b, d0, d1, before, dp, turn)
+    if shaping is None and now.blend is not None:
+        reference = now.blend
 
     goal, arrival, flight = course(mission, phase, now, t_end)
     motion, feedback = _REST, _NO_FEEDBACK
@@ -279,10 +287,13 @@ def plan_phase(
         lies=phase.establishing is not None and not mission.free_attitude(phase), method=method,
         constraint=mission.constraint, integrator=mission.integrator,
         damping=partial(mission.damping, held), lost_at=mission.lost_at, masses=masses, before=before_switch,
-        through=passed(flight), smooth=mission.smooth,
+        links_lost=mission.links_lost, blend=reference, through=passed(flight),
+        smooth=mission.smooth or mission.on_loss != "continue",
     )  # fmt: skip
-    if now.lost is not None and now.lost.any():
-        plan.release(now.lost)
+    lost = np.zeros(len(masses), dtype=np.bool_) if now.lost is None else now.lost
+    parted = plan.links_lost[1] <= now.t
+    if lost.any() or parted.any():
+        plan.release(lost, parted)
     return plan
 
 

@@ -100,11 +100,11 @@ def preview(mission: Mission, phases: int | None = None) -> tuple[list[PlannedPh
         if found is None:
             return planned, False
         now = found.after
-        planned.append(_planned(found, most))
+        planned.append(planned_phase(found, most))
     return planned, len(planned) == len(wanted)
 
 
-def _planned(found: Leg, most: int) -> PlannedPhase:
+def planned_phase(found: Leg, most: int) -> PlannedPhase:
     """At most ``most`` samples of a leg."""
     begin, end, reference = found.begin, found.end, found.reference
     count = min(max(_SAMPLES, int((end - begin) / _STEP) + 1), _MOST, most)
@@ -168,6 +168,8 @@ def leg(mission: Mission, phase: Phase, now: PhaseState) -> Leg | None:
         tracked = pose if phase.control == "tracking" else None
         frame = pose.T if frame is not None else None
         after = replace(now, slots=slots, pose=tracked, goal=goal, frame=frame)
+    if shaping is None and now.blend is not None:
+        reference = now.blend
     r, v = slot_derivatives(reference, motion, np.array([t_end]), 2)[0]
     after = replace(after, t=t_end, r=r, v=v, formation=name)
     return Leg(phase, t0, t_end, reference, motion, before, after, exact)
