@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from itertools import permutations, product
 from typing import NamedTuple
 
@@ -36,11 +37,33 @@ def closest_approach(
     pair : the two agents, from 0
     share : share of the path at which they are nearest, in [0, 1]
     """
-    p, q = (np.asarray(x, dtype=np.float64).T.copy() for x in (start, end))
-    n = p.shape[1]
-    r = np.zeros(n) if radius is None else np.asarray(radius, dtype=np.float64)
     best = np.inf, (0, 0), 0.0
-    first = 0
+    for i, separation, s in _approaches(start, end, radius):
+        k, j = np.unravel_index(int(separation.argmin()), separation.shape)
+        if separation[k, j] < best[0]:
+            best = float(separation[k, j]), (int(i[k]), int(i[0] + 1 + j)), float(s[k, j])
+    return best
+
+
+def nearer_than(distance: float, start: ArrayLike, end: ArrayLike) -> Ints:
+    """Pairs (m, 2), i < j, of agents that come nearer than a distance [m] on straight ways in step (N, 3) [m]."""
+    found = [np.zeros((0, 2), dtype=np.int64)]
+    for i, separation, _ in _approaches(start, end, None):
+        k, j = np.nonzero(separation < distance)
+        found.append(np.column_stack([i[k], i[0] + 1 + j]))
+    return np.concatenate(found)
+
+
+def _approaches(
+    start: ArrayLike, end: ArrayLike, radius: ArrayLike | None
+) -> Iterator[tuple[Ints, Floats, Floats]]:
+    """Of some agents (k,), in turn all: least separation from each later one (k, m), and the share of the way there.
+
+    Column j belongs to agent i[0] + 1 + j. The separation of pairs that occur in another place is infinite.
+    """
+    p, q = (np.asarray(x, dtype=np.float64).T.copy() for x in (start, end))
+    n, first = p.shape[1], 0
+    r = np.zeros(n) if radius is None else np.asarray(radius, dtype=np.float64)
     while first < n - 1:
         i = np.arange(first, min(first + max(1, _CACHED // (n - first)), n - 1))
         x = p[:, i, None] - p[:, None, first + 1 :]
@@ -55,11 +78,8 @@ def closest_approach(
         separation = np.sqrt(_dot(y, y))
         separation -= r[i, None] + r[first + 1 :]
         separation[np.tri(*separation.shape, -1, dtype=np.bool_)] = np.inf  # each pair once
-        k, j = np.unravel_index(int(separation.argmin()), separation.shape)
-        if separation[k, j] < best[0]:
-            best = float(separation[k, j]), (int(i[k]), first + 1 + int(j)), float(s[k, j])
+        yield i, separation, s
         first = int(i[-1]) + 1
-    return best
 
 
 def _dot(x: Floats, y: Floats) -> Floats:
