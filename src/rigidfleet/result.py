@@ -88,7 +88,7 @@ class Target(_Moment, total=False):
 class Planned(_Moment):
     """Certificate of a phase: the least separation of the planned paths [m], its time [s], the two agents, the proof.
 
-    Agents are counted from 0. ``how`` is "closed form" or "conservative advancement".
+    Agents are counted from 0. ``how`` is "closed form" or "polygons less sagitta".
     """
 
     separation: float

@@ -12,8 +12,8 @@ from rigidfleet.math import proximity
 from rigidfleet.mission import Phase
 from rigidfleet.typing import Bools, Floats
 
-#: Where a certificate is from: a closed form, which is exact, or conservative advancement, which is a lower bound.
-How = Literal["closed form", "conservative advancement"]
+#: Where a certificate is from: a closed form is exact; polygons of samples less their sagitta are a lower bound.
+How = Literal["closed form", "polygons less sagitta"]
 
 
 class Certificate(NamedTuple):
@@ -62,6 +62,26 @@ def straight(reference: Reference, radius: Floats, lost: Bools | None = None) ->
     i, j = (int(left[k]) for k in pair)
     time = reference.t0 + reference.T_b * _when(share)
     return Certificate(separation, time, (i, j), "closed form")
+
+
+def of_polygons(
+    position: Floats, time: Floats, acceleration: float, radius: Floats | None = None
+) -> Certificate:
+    """Certificate of bent ways from samples (K, N, 3) [m] at times (K,) [s], and a bound on every |a| [m/s^2].
+
+    Between two samples a pair moves straight in step, but for the sagitta of its relative motion: with |a_i - a_j|
+    <= 2 |a|, it is 2 |a| h^2 / 8 at most (interpolation error of a linear interpolant). The closed form for the
+    straight ways less that is a lower bound, whose gap falls with the square of the time h between samples.
+    """
+    best = np.inf, (0, 0), float(time[0])
+    for k in range(max(1, len(time) - 1)):
+        after = min(k + 1, len(time) - 1)
+        separation, pair, share = closest_approach(position[k], position[after], radius)
+        h = float(time[after] - time[k])
+        separation -= acceleration * h * h / 4.0
+        if separation < best[0]:
+            best = separation, pair, float(time[k]) + share * h
+    return Certificate(best[0], best[2], best[1], "polygons less sagitta")
 
 
 def _when(share: float) -> float:
