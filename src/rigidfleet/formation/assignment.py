@@ -186,10 +186,10 @@ def _nearest_slots(p: Floats, q: Floats) -> Ints:
     # Costs less prices have the same optimum. With prices near the optimal ones it is found five times faster.
     order = exchanged(p, q)
     cost = -(p @ q[order].T)
-    more = cost - cost.diagonal()[:, None]
-    price = np.zeros(n)
+    own, price, priced = cost.diagonal().copy(), np.zeros(n), np.empty_like(cost)
     for _ in range(_PRICED):
-        price = np.minimum(price, (more + price[:, None]).min(axis=0))
+        np.add(cost, (price - own)[:, None], out=priced)
+        price = np.minimum(price, priced.min(axis=0))
     cost -= price
     return order[linear_sum_assignment(cost)[1]]
 
