@@ -13,7 +13,7 @@ BUILD := $(BIN)/uv build --quiet --python $(BIN)/python --build-constraints cons
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test bench peers robustness docs package lint format constraints clean
+.PHONY: help setup demo test bench peers robustness avoidance docs package lint format constraints clean
 
 help:  ## Show this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' Makefile
@@ -36,6 +36,9 @@ peers: .venv/.peers  ## Fly beside other programs (Octave, too, if it is on PATH
 
 robustness: .venv/.bench  ## Fly 200 random formations under every graph and law
 	@$(BIN)/python benchmarks/robustness.py --write docs/robustness.md
+
+avoidance: .venv/.bench  ## Plan transitions and published problems, with proofs
+	@$(BIN)/python benchmarks/avoidance.py
 
 docs: .venv/.docs  ## Build the site into site/, with every figure on it
 	@$(BIN)/python docs/picture.py

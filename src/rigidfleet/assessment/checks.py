@@ -49,6 +49,7 @@ def all_checks(measured: Measurements, verdict: Verdict) -> Iterator[CheckResult
     worst = verdict.worst
     if "separation" in worst:
         yield _separation(measured, worst["separation"])
+        yield from _failures_or_worst(_as_planned(measured, verdict.phases))
     if "clearance" in worst:
         yield from _clearances(measured)
     if not measured.left.all():
@@ -275,6 +276,24 @@ def _separation(measured: Measurements, e: Extreme) -> CheckResult:
         depth = f"by {value(-e.value, 'm')} at {e.when:.2f} s"
         words = f"agents collide, first {since}; {e.who} overlap the most, {depth}"
     return _bounded("separation", e, "m", limit, words, passed=passed, at_least=True)
+
+
+def _as_planned(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[CheckResult]:
+    """Compare the separation of each phase with the certificate of its plan."""
+    allowed = measured.mission.limits.separation_allowance
+    for record, phase in zip(measured.result.phases, phases, strict=True):
+        planned, e = record.planned, phase.worst.get("separation")
+        if planned is None or e is None:
+            continue
+        nearer = planned["separation"] - e.value
+        words = (
+            f"in phase '{phase.name}' {e.who} come within {value(e.value, 'm')} of each other at {e.when:.2f} s;"
+            f" the plan proves {value(planned['separation'], 'm')}, of which {allowed:g} m are allowed for tracking"
+        )
+        yield CheckResult(
+            "separation_as_planned", nearer <= allowed + _SLACK, words, nearer, allowed, "m",
+            when=e.when, who=e.who, phase=phase.name,
+        )  # fmt: skip
 
 
 def _since(measured: Measurements, name: str, sampled: Floats) -> str:

@@ -45,7 +45,7 @@ SLOTS = 5_000_000
 #: Maximum number of pairs of agents that touch at the start or in a formation, if all have the largest radius.
 TOUCHING = 5_000_000
 #: Maximum number of agents where all pairs are compared: assignment to slots.
-ALL_PAIRS = 5000
+ALL_PAIRS = 20_000
 
 # -- how large ---------------------------------------------------------------------------------------
 

@@ -182,6 +182,11 @@ class Shaping(AnyPhase):
         return seconds(self.blend)
 
     @property
+    def aligned(self) -> bool:
+        """Whether the slots are rotated during the blend, so that they move least."""
+        return True
+
+    @property
     def leads_to(self) -> str:
         """The formation."""
         return self.formation
@@ -222,6 +227,22 @@ class Reshape(Shaping):
     """Change from one formation to another."""
 
     kind: Literal["reshape"] = Field(description="change the formation")
+    transition: Literal["straight", "layers", "auto"] = Field(
+        "straight",
+        description="ways to the new slots: straight: all at once; layers: apart to levels one above the other, "
+        "across, and together again, as three phases, with every pair proved; auto: straight if that keeps "
+        "limits.separation, else layers",
+    )
+    alignment: Literal["fit", "none"] = Field(
+        "fit",
+        description="fit: the new slots are rotated onto the old ones during the blend, and turn back meanwhile; none: "
+        "straight ways in the axes of the body",
+    )
+
+    @property
+    def aligned(self) -> bool:
+        """Whether the slots are fitted."""
+        return self.alignment == "fit"
 
 
 class Steering(Attitude, AnyPhase):

@@ -21,6 +21,7 @@ from rigidfleet.formation.distance_geometry import distances
 from rigidfleet.math import constraint_jacobian
 from rigidfleet.math.attitude import dcm_from_euler
 from rigidfleet.mission import bounds
+from rigidfleet.mission.changes import told_apart
 from rigidfleet.mission.check import check
 from rigidfleet.mission.describe import counted
 from rigidfleet.mission.findings import near
@@ -92,7 +93,10 @@ class Mission(Contents):
         """
         if not isinstance(text, str):
             raise wrong_type("the text of a mission file", text)
-        mission = cls.model_construct(**check(parse_toml(text, origin), origin))
+        parts = check(parse_toml(text, origin), origin)
+        if parts["assignment"] == "each":
+            parts["formations"], parts["phases"] = told_apart(parts["formations"], parts["phases"])
+        mission = cls.model_construct(**parts)
         mission._text, mission._origin = text, origin
         return mission
 
@@ -186,8 +190,9 @@ class Mission(Contents):
     def assigned_slots(self) -> dict[str, Ints]:
         """Slot (N,), from 0, that each agent takes in each formation, by the mission's `assignment`.
 
-        With "shortest" and "safe", an agent keeps its slot in all formations. With "each", slots are assigned anew when
-        a formation is first flown, from the positions of the agents at that time.
+        With "shortest" and "safe", an agent keeps its slot in all formations. With "each", slots are assigned anew at
+        each change, from the positions of the agents at that time. A formation that is taken again from elsewhere is
+        another one here, "NAME (2)".
         """
         return self._assigned[0]
 

@@ -25,6 +25,7 @@ from rigidfleet.mission.kinds import (
     Establish,
     Land,
     Orbit,
+    Reshape,
     Shaping,
     Turn,
     seconds,
@@ -337,11 +338,31 @@ def _led(collector: FindingCollector, p: Brake | Land, path: Keys, longest: floa
 
 
 #: Checks of single kinds. Arguments: the findings, the phase, its path, its maximum duration [s] or None.
+def _reshape(collector: FindingCollector, p: Reshape, path: Keys, _: float | None) -> None:
+    """Check that ways other than straight ones can be found and flown."""
+    if p.transition == "straight" or not collector.right(path, "transition"):
+        return
+    problem = remedy = ""
+    if p.control != "tracking" or p.reference != "shape":
+        problem = "needs slots that are tracked"
+        remedy = "use control = 'tracking' and reference = 'shape'"
+    elif collector.data.get("assignment", "given") != "given":
+        problem = "is for agents with slots of their own, but assignment chooses their slots"
+        remedy = "use assignment = 'given', or remove this key"
+    elif p.alignment == "none":
+        problem, remedy = "chooses the alignment itself", "remove alignment"
+    elif p.blend == AUTO != p.duration:
+        problem, remedy = "takes a time that is not known yet", "use duration = 'auto', too"
+    if problem:
+        collector.add((*path, "transition"), problem, remedy)
+
+
 _OWN: dict[str, Callable[[FindingCollector, Any, Keys, float | None], None]] = {
     "brake": _led,
     "establish": _establish,
     "land": _led,
     "orbit": _orbit,
+    "reshape": _reshape,
     "turn": _turn,
 }
 

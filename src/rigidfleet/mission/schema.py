@@ -445,6 +445,11 @@ class Limits(Part):
     separation: LengthOrZero | None = Field(
         None, description="minimum separation of agents [m]: centre distance minus radii"
     )
+    separation_allowance: LengthOrZero = Field(
+        0.1,
+        description="how much nearer to each other than planned agents may come in flight [m]; judged where the plan "
+        "has a certificate",
+    )
     separation_below: LengthOrZero | None = Field(
         None,
         description="minimum separation from an agent straight below [m]: height minus radii (downwash)",

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import cached_property, lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -41,10 +41,11 @@ from rigidfleet.kernel.problem import (
 from rigidfleet.math import attitude as att
 from rigidfleet.math import lqr
 from rigidfleet.math.rigid_body import about_cm
-from rigidfleet.mission import Mission, Phase, Regulator, Settle
+from rigidfleet.mission import Mission, Phase, Regulator, Settle, bounds
 from rigidfleet.mission.kinds import seconds
 from rigidfleet.mission.schema import Constraint, IntegratorOptions
 from rigidfleet.planning import solvers
+from rigidfleet.planning.certificate import Certificate, certified
 from rigidfleet.planning.courses import course, passed
 from rigidfleet.planning.disturbances import without
 from rigidfleet.planning.reference import (
@@ -95,11 +96,20 @@ class PhasePlan:
     damping: Callable[[Bools], float]  # damping mu, from which vehicles are lost (N,)
     lost_at: Floats  # (N,) times at which vehicles are lost [s]
     masses: Floats  # (N,) assumed by the laws, lost vehicles included [kg]
+    radius: Floats  # (N,) [m]
     before: PhaseState  # the state that the phase starts from
     links_lost: tuple[Ints, Floats]  # pairs (L, 2) and times (L,) of links that are lost
     blend: Reference  # of all edges, before any is released
     through: tuple[tuple[float, Floats], ...] = ()  # times [s] and CM (3,) [m] to pass on the way
     smooth: bool = False  # whether the next phase needs acceleration and jerk of the reference
+
+    @cached_property
+    def certificate(self) -> Certificate | None:
+        """The least separation of the planned paths, proved; None if agents track no slots."""
+        if len(self.radius) > bounds.ALL_PAIRS:  # takes longer than their flight
+            return None
+        reference = self.problem.reference
+        return certified(self.phase, reference, self.radius, self.before.lost)
 
     @property
     def large(self) -> bool:
@@ -286,9 +296,9 @@ def plan_phase(
         attached=before_switch.slots is not None or phase.control != "open",
         lies=phase.establishing is not None and not mission.free_attitude(phase), method=method,
         constraint=mission.constraint, integrator=mission.integrator,
-        damping=partial(mission.damping, held), lost_at=mission.lost_at, masses=masses, before=before_switch,
-        links_lost=mission.links_lost, blend=reference, through=passed(flight),
-        smooth=mission.smooth or mission.on_loss != "continue",
+        damping=partial(mission.damping, held), lost_at=mission.lost_at, masses=masses,
+        radius=mission.fleet.radius, before=before_switch, links_lost=mission.links_lost, blend=reference,
+        through=passed(flight), smooth=mission.smooth or mission.on_loss != "continue",
     )  # fmt: skip
     lost = np.zeros(len(masses), dtype=np.bool_) if now.lost is None else now.lost
     parted = plan.links_lost[1] <= now.t

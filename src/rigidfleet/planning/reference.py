@@ -122,6 +122,7 @@ def attach(
     frame, given = now.frame, None
     if shaping is not None:
         given = mission.assigned_turn(now.formation, shaping.formation)
+        given = given if shaping.aligned else np.eye(3)
     if phase.control == "open":
         if mission.formulation == "body" and frame is None:
             frame = np.eye(3)

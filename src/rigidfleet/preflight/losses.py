@@ -10,10 +10,10 @@ from rigidfleet.mission import Mission
 from rigidfleet.planning.losses import after_loss, state_at
 from rigidfleet.planning.preview import FEWEST_SAMPLES, Leg, leg, planned_phase, samples_per_phase
 from rigidfleet.preflight.findings import DENSE, Preflight, Remark
+from rigidfleet.preflight.obstacles import obstacle_remarks
 from rigidfleet.preflight.trajectory import (
     downwash_remarks,
     limit_remarks,
-    obstacle_remarks,
     separation_remarks,
     thrust_remarks,
 )
@@ -43,7 +43,9 @@ def loss_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     )
     yield Remark("note", "loss", text)
     most = max(samples_per_phase(mission), FEWEST_SAMPLES)
-    part = Preflight(found.formations, found.gains, [planned_phase(x, most) for x in way])
+    part = Preflight(
+        found.formations, found.gains, [planned_phase(x, most, mission.fleet.radius) for x in way]
+    )
     judges = (separation_remarks, downwash_remarks, thrust_remarks, obstacle_remarks, limit_remarks)
     for judge in judges:
         yield from judge(mission, part)

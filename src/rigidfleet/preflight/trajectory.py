@@ -8,12 +8,13 @@ from collections.abc import Iterator
 import numpy as np
 
 from rigidfleet._common.text import agent_names
-from rigidfleet.formation import assignment, distance_geometry
+from rigidfleet.formation import distance_geometry
 from rigidfleet.math import lqr, proximity
 from rigidfleet.mission import Mission
 from rigidfleet.mission.disturbances import intensity
 from rigidfleet.planning import timing
-from rigidfleet.planning.preview import PlannedPhase, septic
+from rigidfleet.planning.certificate import straight
+from rigidfleet.planning.preview import PlannedPhase
 from rigidfleet.preflight.findings import DENSE, SLACK, Disturbed, Preflight, Remark
 from rigidfleet.rigidity import (
     jacobian,
@@ -37,12 +38,14 @@ def separation_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
         for k in [int(separations.argmin())] if planned.path_ends is None else [0, -1]:
             ends.append((float(separations[k]), float(planned.time[k]), tuple(pairs[k].tolist())))
         if planned.path_ends is not None:
-            separation, who, share = assignment.closest_approach(*planned.path_ends, radius)
-            crossing = separation, _time_of(planned, share), who
+            certificate = planned.certificate or straight(planned.leg.reference, radius)
+            assert certificate is not None  # there are two agents
+            separation, who = certificate.separation, certificate.agents
+            crossing = separation, certificate.time, who
             least = min(least, crossing)
             beyond = separation <= 0 or separation < limit - SLACK
             if beyond and separation < min(ends)[0] - SLACK:
-                yield _crossing(mission, number, planned, crossing, limit)
+                yield _crossing(mission, planned, crossing, limit)
         for k, at in enumerate(ends):
             least = min(least, at)
             # The start positions are known even if the path from there is not.
@@ -68,16 +71,8 @@ def _near(
     return f"{agent_names(who)} have a separation of {separation:.2f} m at {t:.2f} s in '{phase}' (limit {limit:g} m)"
 
 
-def _time_of(planned: PlannedPhase, share: float) -> float:
-    """Time [s] at which agents have flown this fraction of their paths."""
-    blend = planned.leg.reference.T_b
-    tau = np.linspace(0.0, 1.0, 2001)
-    return float(planned.time[0] + blend * np.interp(share, septic(tau), tau))
-
-
 def _crossing(
     mission: Mission,
-    number: int,
     planned: PlannedPhase,
     at: tuple[float, float, tuple[int, ...]],
     limit: float,
@@ -93,16 +88,10 @@ def _crossing(
     assert after is not None  # the phase changes the formation
     assert planned.path_ends is not None
     apart = min(float(proximity.nearest(places).min()) for places in planned.path_ends)
-    flown = [p.shaping.formation for p in mission.phases[:number] if p.shaping is not None]
     spaced = f"place slots at least {math.sqrt(2) * needed:.2f} m apart (now {apart:.2f} m)"
     promised = mission.assigned_turn(before, after) is not None
     if promised:
         text += f"{spaced[0].upper()}{spaced[1:]}"
-    elif mission.assignment == "each" and after in flown:
-        text += (
-            f"The slots of '{after}' were assigned in an earlier change: add a second table [formations.NAME] with this"
-            " shape, which is then assigned in this change"
-        )
     else:
         text += 'Assign agents to near slots: assignment = "each"'
     if not promised and apart < math.sqrt(2) * needed:

@@ -321,6 +321,7 @@ class Flight:
         record = PhaseRecord(
             phase.name, phase.kind, phase.control, plan.formation, plan.start, plan.start,
             settled=None if phase.settle is None else False, target=plan.target,
+            planned=None if plan.certificate is None else plan.certificate._asdict(),
         )  # fmt: skip
         self.phases.append(record)
         return True
