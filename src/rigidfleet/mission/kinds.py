@@ -18,8 +18,10 @@ from rigidfleet.mission.values import (
     Dwell,
     Force,
     Length,
+    LengthOrZero,
     Part,
     Rates,
+    Scale,
     Time,
     Tolerance,
     Vector,
@@ -320,6 +322,32 @@ class Fly(Steering):
         return ", ".join([_vector(self.position, "m"), *velocity, *([rest] if rest else [])])
 
 
+class Go(Attitude, AnyPhase):
+    """Fly to a pose on a way that is found round obstacles. The way replaces the phase before the flight."""
+
+    moves: ClassVar[bool] = True
+    body_control: ClassVar[str] = "tracking"
+
+    kind: Literal["go"] = Field(description="fly to a pose, on a way that is found round obstacles")
+    position: Vector = Field(description="centre of mass at arrival [x, y, z] [m]")
+    clearance: LengthOrZero = Field(
+        0.2, description="least distance of vehicles from obstacles on the planned way [m]"
+    )
+    formations: tuple[str, ...] | None = Field(
+        None,
+        description="formations that may be taken on the way; default: all that have slots. The phase ends in the "
+        "formation in which it begins",
+    )
+    scales: tuple[Scale, ...] = Field(
+        (), description="factors by which formations may shrink on the way, below 1; default: none"
+    )
+
+    @property
+    def leads_to(self) -> str:
+        """The position and the attitude."""
+        return ", ".join([_vector(self.position, "m"), *self.angles])
+
+
 class Turn(Steering):
     """Turn on the spot to an attitude. At least one angle is required."""
 
@@ -432,7 +460,7 @@ def _vector(values: Sequence[float], unit: str) -> str:
 
 
 Phase = Annotated[
-    Establish | Fly | Reshape | Turn | Orbit | Hold | Brake | Land, Field(discriminator="kind")
+    Establish | Fly | Go | Reshape | Turn | Orbit | Hold | Brake | Land, Field(discriminator="kind")
 ]
 #: Models of all phases by `kind`.
 KINDS: dict[str, type[AnyPhase]] = {

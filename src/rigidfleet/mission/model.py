@@ -21,7 +21,7 @@ from rigidfleet.formation.distance_geometry import distances
 from rigidfleet.math import constraint_jacobian
 from rigidfleet.math.attitude import dcm_from_euler
 from rigidfleet.mission import bounds
-from rigidfleet.mission.changes import told_apart
+from rigidfleet.mission.changes import scaled, told_apart
 from rigidfleet.mission.check import check
 from rigidfleet.mission.describe import counted
 from rigidfleet.mission.findings import near
@@ -96,6 +96,8 @@ class Mission(Contents):
         parts = check(parse_toml(text, origin), origin)
         if parts["assignment"] == "each":
             parts["formations"], parts["phases"] = told_apart(parts["formations"], parts["phases"])
+        n = len(parts["agents"].position)
+        parts["formations"] = scaled(parts["formations"], parts["phases"], n)
         mission = cls.model_construct(**parts)
         mission._text, mission._origin = text, origin
         return mission
@@ -131,6 +133,11 @@ class Mission(Contents):
         mission = self.from_dict(self.to_dict() | {"phases": phases}, self._origin)
         mission._text = self._text
         return mission
+
+    def with_text_of(self, other: Mission) -> Self:
+        """Give this mission the text of another one, of which it is a form."""
+        self._text = other._text
+        return self
 
     @property
     def size_in_words(self) -> str:

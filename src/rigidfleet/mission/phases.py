@@ -23,6 +23,7 @@ from rigidfleet.mission.kinds import (
     AnyPhase,
     Brake,
     Establish,
+    Go,
     Land,
     Orbit,
     Reshape,
@@ -322,8 +323,10 @@ def _orbit(collector: FindingCollector, p: Orbit, path: Keys, longest: float | N
         collector.add(where, problem, "use a lower rate or several phases")
 
 
-def _led(collector: FindingCollector, p: Brake | Land, path: Keys, longest: float | None) -> None:
-    """Check that a brake or a landing has tracked slots and an end."""
+def _led(
+    collector: FindingCollector, p: Brake | Go | Land, path: Keys, longest: float | None
+) -> None:
+    """Check that a brake, a landing or a way to be found has tracked slots and an end."""
     kind_name = collector.data["phases"][path[1]]["kind"]
     if p.control == "body" and collector.right(path, "control"):
         problem = f"kind '{kind_name}' cannot be flown by a wrench on the virtual body"
@@ -335,6 +338,13 @@ def _led(collector: FindingCollector, p: Brake | Land, path: Keys, longest: floa
     if longest is not None and travel > longest * (1 + 1e-9):
         problem = f"is longer than the phase, which ends after {longest:g} s"
         collector.add((*path, "travel"), problem, "reduce travel or end the phase later")
+
+
+def _go(collector: FindingCollector, p: Go, path: Keys, longest: float | None) -> None:
+    """Check that a way can be found and flown: tracked slots, an end, and formations that exist."""
+    _led(collector, p, path, longest)
+    for name in p.formations or ():
+        _exists(collector, name, path, "formations")
 
 
 #: Checks of single kinds. Arguments: the findings, the phase, its path, its maximum duration [s] or None.
@@ -360,6 +370,7 @@ def _reshape(collector: FindingCollector, p: Reshape, path: Keys, _: float | Non
 _OWN: dict[str, Callable[[FindingCollector, Any, Keys, float | None], None]] = {
     "brake": _led,
     "establish": _establish,
+    "go": _go,
     "land": _led,
     "orbit": _orbit,
     "reshape": _reshape,
@@ -413,13 +424,11 @@ def _formations(
             collector.add((*path, "control"), problem, remedy, p.control)
 
 
-def _exists(collector: FindingCollector, name: str, path: Keys) -> None:
+def _exists(collector: FindingCollector, name: str, path: Keys, key: str = "formation") -> None:
     known = collector.data.get("formations", {})
     if isinstance(known, dict) and name not in known:
         names = f"formations: {', '.join(known)}" if known else "add a table [formations.NAME]"
-        collector.add(
-            (*path, "formation"), "there is no such formation", near(name, known) or names
-        )
+        collector.add((*path, key), "there is no such formation", near(name, known) or names, name)
 
 
 def _blendable(
@@ -520,7 +529,7 @@ def _automatic(
     if p.control != "tracking":
         problem = f"needs tracked slots to have a least time, not control '{p.control}'"
         collector.add(where, problem, "use control = 'tracking', or give a time")
-    if p.duration == AUTO and p.steering is None and p.shaping is None:
+    if p.duration == AUTO and not (p.steering or p.shaping or isinstance(p, Go)):
         problem = (
             f"a phase of kind '{collector.data['phases'][path[1]]['kind']}' has no least duration"
         )
