@@ -1,9 +1,9 @@
 """Random walls with one gap: does a way through come of itself, wherever there is one?
 
 ``make avoidance`` runs it. Four vehicles may fly as a rectangle, or fold into a line. Each wall has one window of
-random width, height, place and thickness, and fills everything else that the geofence leaves. An oracle that knows nothing of
-the planner takes every shape and yaw in turn, marks the places of a fine grid in which all vehicles keep their
-clearance, and floods them from one side of the wall: where it reaches the other side, there is a way.
+random width, height, place and thickness, and fills everything else that the geofence leaves. An oracle that knows
+nothing of the planner takes every shape and yaw in turn, marks the places of a fine grid in which all vehicles keep
+their clearance, and floods them from one side of the wall: where it reaches the other side, there is a way.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ STEP, TURN = 0.1, 7.5
 def wall(seed: int) -> list[dict[str, Any]]:
     """Four boxes round a window."""
     rng = np.random.default_rng(seed)
-    width, height = rng.uniform(0.6, 5.0), rng.uniform(0.6, 3.0)
+    width, height = rng.uniform(0.7, 4.0), rng.uniform(0.7, 2.0)
     y, z = rng.uniform(-10.0, 10.0), rng.uniform(3.0, 13.0)
     x = rng.uniform(-2.0, 2.0) + np.array([-0.5, 0.5]) * rng.uniform(0.1, 4.0)
     y, z = y + np.array([-0.5, 0.5]) * width, z + np.array([-0.5, 0.5]) * height

@@ -55,6 +55,8 @@ class AnyPhase(Part):
     goal_moves: ClassVar[bool] = False
     #: Whether the phase leads to the ground, so that the mission needs one.
     lands: ClassVar[bool] = False
+    #: Whether other phases take its place before the flight, so that it cannot begin in flight.
+    replaced: ClassVar[bool] = False
     #: Default control in architecture "body".
     body_control: ClassVar[str] = "body"
 
@@ -326,6 +328,7 @@ class Go(Attitude, AnyPhase):
     """Fly to a pose on a way that is found round obstacles. The way replaces the phase before the flight."""
 
     moves: ClassVar[bool] = True
+    replaced: ClassVar[bool] = True
     body_control: ClassVar[str] = "tracking"
 
     kind: Literal["go"] = Field(description="fly to a pose, on a way that is found round obstacles")

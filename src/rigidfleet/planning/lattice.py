@@ -31,6 +31,8 @@ _HALVINGS, _PARTS = 12, 400_000
 SPARE = 0.005
 #: Greatest number of coordinates along an axis that follow from obstacles.
 _MOST = 26
+#: What a metre aside of the straight way counts, where ways are compared by their room [m].
+_ASIDE = 1e-5
 #: How often a way is shortened.
 _SHORTER = 3
 #: Costs, as lengths: of a change in multiples of its longest way plus a length [m]; of a way in another shape.
@@ -46,9 +48,12 @@ class Space(NamedTuple):
     obstacles: Sequence[Obstacle]
     fence: Floats
 
-    def room(self, r: Floats, radius: Floats) -> Floats:
-        """Least distance (..., M) [m] of balls at r (..., M, 3) to an obstacle, or of their centres to the fence."""
-        found, _ = proximity.obstacle_clearances(r, radius, self.obstacles)
+    def room(self, r: Floats, radius: Floats, most: Floats | float = np.inf) -> Floats:
+        """Least distance (..., M) [m] of balls at r (..., M, 3) to an obstacle, or of their centres to the fence.
+
+        Beyond ``most`` (..., M) [m] the distance does not matter.
+        """
+        found, _ = proximity.obstacle_clearances(r, radius, self.obstacles, most=most)
         if np.isfinite(self.fence).any():
             found = np.minimum(found, np.minimum(r - self.fence[0], self.fence[1] - r).min(axis=-1))
         return found
@@ -94,9 +99,10 @@ def proved(
     for _ in range(_HALVINGS):
         middle = low + length / 2
         place = a[who] + middle[:, None] * (b - a)[who]
-        room = space.room(place[:, None] + path(middle), radius)
+        wanted = need + way[who] * length / 2
+        room = space.room(place[:, None] + path(middle), radius, wanted)
         found[who[(room < need).any(axis=1)]] = False
-        open_ = found[who] & (room - way[who] * length / 2 < need).any(axis=1)
+        open_ = found[who] & (room < wanted).any(axis=1)
         who, low, length = who[open_], low[open_], length / 2
         if not len(who):
             return found
@@ -138,7 +144,7 @@ class Lattice:
         self.layer, self.axes, self.shape = layer, axes, tuple(map(len, axes))
         grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
         self.points = grid @ frame
-        self.room = space.room(self.points[:, None] + layer.offsets, radius).min(axis=1)
+        self.room = space.room(self.points[:, None] + layer.offsets, radius, need).min(axis=1)
         free = self.room >= need
         index = np.arange(len(grid)).reshape(self.shape)
         tails, heads = [], []
@@ -375,6 +381,10 @@ class Network:
             heads.append(b + self.first[0, change.after])
             rooms.append(np.minimum(one.room[a], two.room[b]))
         tail, head, room = map(np.concatenate, (tails, heads, rooms))
+        # Of places that are as narrow, the one nearest to the straight way.
+        along = end[0] - begin[0]
+        beside = np.cross(self.points[tail] - begin[0], along / max(np.linalg.norm(along), 1e-9))
+        room = room - _ASIDE * np.linalg.norm(beside, axis=1)
         most = float(room.max()) + 1.0
         tree = minimum_spanning_tree(
             csr_array((most - room, (tail, head)), shape=(self.size, self.size))

@@ -213,7 +213,7 @@ class _Search:
                 way_of = changes[frozenset((i, j))]
                 yield f"take {name}", {"kind": "reshape", "formation": name}, way_of
             else:
-                keys = {"kind": "turn"} | dict(zip(ANGLES, layer.angles, strict=True))
+                keys: dict[str, Any] = {"kind": "turn"} | _angles(layer.angles)
                 yield f"turn to {layer.angles[2]:.4g}°", keys, changes[frozenset((i, j))]
 
     def _written(self) -> dict[str, str]:
@@ -245,7 +245,7 @@ class _Search:
             tables.append(table)
         last = tables[-1]
         if phase.attitude_deg is not None and last["kind"] == "fly":
-            last |= dict(zip(ANGLES, phase.attitude_deg, strict=True))
+            last |= _angles(phase.attitude_deg)
         if phase.duration != AUTO:
             before = [float(t["duration"]) for t in tables[:-1]]
             last["duration"] = round(end - self.now.t - sum(before), 6)
@@ -261,7 +261,9 @@ class _Search:
         mission, k = self.mission, self.number
         data, tables = mission.to_dict(), self._tables(network, way)
         forms = {
-            name: mission.formations[name].model_dump(mode="json", exclude_none=True)
+            name: mission.formations[name].model_dump(
+                mode="json", exclude_none=True, exclude_defaults=True
+            )
             for name in {t.get("formation") for t in tables} - {None} - set(data["formations"])
             if name in mission.formations
         }
@@ -332,12 +334,13 @@ class _Search:
         x = network.layers[layer]
         room = network.space.room(place + x.offsets, network.radius)
         _, thing = self._nearest(network, place, layer, room)
-        other = self._opposite(network, place, layer, thing)
         where = ", ".join(f"{v:.2f}" for v in place)
         problem = (
             f"no way is found: at the narrowest place of the best one, ({where}) m, '{x.formation}' at yaw"
-            f" {x.angles[2]:.4g}° has {least:.2f} m of clearance from {thing}{other},"
-            f" {max(network.need - least, 0.0):.2f} m less than asked for"
+            f" {x.angles[2]:.4g}° "
+        ) + (
+            self._gap(network, place, layer)
+            or f"has {least:.2f} m of clearance from {thing}, {network.need - least:.2f} m less than asked for"
         )
         remedy = "allow a slimmer formation (formations, scales), ask for less clearance, or name points on the way"
         return _refused(self.mission, self.number, "position", self.phase.position, problem, remedy)
@@ -353,8 +356,8 @@ class _Search:
         k = int(near[agent])
         return agent, f"'{network.space.obstacles[k].name}'" if k >= 0 else "the geofence"
 
-    def _opposite(self, network: Network, place: Floats, layer: int, thing: str) -> str:
-        """The gap in which the place lies, if a second obstacle is as near on the other side."""
+    def _gap(self, network: Network, place: Floats, layer: int) -> str:
+        """What a shape needs in the gap between the two nearest obstacles; "" if they do not lie on two sides of it."""
         x, boxes = network.layers[layer], []
         for other in network.space.obstacles:
             room = proximity.obstacle_clearances(place + x.offsets, network.radius, [other])[0]
@@ -371,7 +374,17 @@ class _Search:
         along = x.offsets[:, k]
         takes = float((along + network.radius).max() - (along - network.radius).min())
         needs = takes + 2.0 * self.phase.clearance
-        return f" ('{one.name}' and '{two.name}' leave {wide[k]:.2f} m, it needs {needs:.2f} m)"
+        if needs <= wide[k]:
+            return ""
+        return (
+            f"needs {needs:.2f} m between '{one.name}' and '{two.name}', which leave {wide[k]:.2f} m:"
+            f" {needs - wide[k]:.2f} m are missing"
+        )
+
+
+def _angles(angles: layers.Angles) -> dict[str, float]:
+    """Keys of an attitude; angles of zero need none, but for the yaw."""
+    return {k: x for k, x in zip(ANGLES, angles, strict=True) if x or k == "yaw_deg"}
 
 
 def _refused(

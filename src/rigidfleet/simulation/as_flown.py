@@ -58,7 +58,17 @@ def with_phase(
     else:
         data["phases"] = []
     data["phases"] = [*data["phases"], dict(table)]
-    return Mission.from_dict(data, "begin()").phases[-1]
+    phase = Mission.from_dict(data, "begin()").phases[-1]
+    _check_flown(phase)
+    return phase
+
+
+def _check_flown(phase: Phase) -> None:
+    """See that a phase has a flight of its own."""
+    if phase.replaced:
+        problem = "finds its way before the flight, and cannot begin by hand"
+        remedy = "use kind 'fly', or put it into the mission"
+        raise MissionError([Finding("begin()", "kind", phase.kind, problem, remedy)])
 
 
 def check_formation(mission: Mission, phase: Phase) -> None:
@@ -69,12 +79,13 @@ def check_formation(mission: Mission, phase: Phase) -> None:
     TypeError
         It is no phase.
     MissionError
-        The mission has no such formation, or the formation has no slots to track.
+        The mission has no such formation, the formation has no slots to track, or the phase has no flight of its own.
     """
     if not isinstance(phase, tuple(KINDS.values())):
         raise wrong_type(
             "a phase (a table as in a mission file, or one of a mission's phases)", phase
         )
+    _check_flown(phase)
     shaping = phase.shaping
     if shaping is None:
         return
@@ -124,6 +135,10 @@ def _flown_data(
         data["assignment"] = "given"
         data["formations"] = {name: _written_out(mission, name) for name in mission.formations}
     data["phases"] = [_written(*each) for each in zip(asked, records, strict=True)]
+    known = data.get("formations") or given.get("formations", {})
+    taken = {record.formation for record in records if record.formation} - set(known)
+    if taken := taken & set(mission.formations):  # shrunk on a way that was found
+        data["formations"] = known | {name: _written_out(mission, name) for name in sorted(taken)}
     if disturbed := given.get("disturbances"):
         # What followed from a loss is among the phases
         told = {key: x for key, x in disturbed.items() if key not in ("on_loss", *ON_LOSS)}
