@@ -17,7 +17,7 @@ from rigidfleet.kernel.problem import Problem
 from rigidfleet.kernel.records import Record
 from rigidfleet.math import attitude as att
 from rigidfleet.mission import Mission
-from rigidfleet.planning.vehicles import TickTables, sampled_flight, turn_from, yaw_at
+from rigidfleet.planning.vehicles import TickTables, sampled_flight, turn_from
 from rigidfleet.simulation.active_phase import ActivePhase
 from rigidfleet.simulation.callbacks import (
     AttitudeCommand,
@@ -91,7 +91,7 @@ class SampledPhase(ActivePhase):
         """Continue with another problem; vehicles that turn along their way do so from the yaw they have now."""
         yaw = self.vehicles.tables.yaw
         if yaw.kind == "along":
-            now = yaw_at(self.plan.problem, self.t, yaw, self.turn)
+            now = self.vehicles.tables.yaw_at(self.plan.problem, self.t, self.turn)
             self.turn = turn_from(problem, self.t, yaw, now)
         self.led = True
         super().lead(problem)
@@ -210,7 +210,7 @@ class SampledPhase(ActivePhase):
 
     def end(self) -> Any:
         """End the phase; the vehicles keep their states."""
-        self.vehicles.yaw = yaw_at(self.plan.problem, self.t, self.vehicles.tables.yaw, self.turn)
+        self.vehicles.yaw = self.vehicles.tables.yaw_at(self.plan.problem, self.t, self.turn)
         self.vehicles.S, self.vehicles.state = self.sampled.S, self.sampled
         return super().end()
 
