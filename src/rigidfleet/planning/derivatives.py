@@ -66,7 +66,7 @@ def slot_series(reference: Reference, body: tuple[Floats, Floats], time: Floats)
 
 def _matrix_product(a: Floats, b: Floats) -> Floats:
     """Products (..., 3, 3, K) of matrices (..., 3, 3, K)."""
-    return sum(a[..., :, j, None, :] * b[..., j, None, :, :] for j in range(3))
+    return (a[..., :, :, None, :] * b[..., None, :, :, :]).sum(axis=-3)
 
 
 def body_series(motion: Motion, time: Floats) -> tuple[Floats, Floats]:

@@ -59,6 +59,9 @@ class SampledPhase(ActivePhase):
         self.vehicles, self.flight = vehicles, vehicles.flight
         self.tabled: Problem | None = None  # the plan's problem for which the tables are
         self.led = False  # whether the reference is given piece by piece
+        self.unjudged = (
+            False  # whether steps were flown since the vehicles' own extremes were taken
+        )
         super().__init__(*arguments, **options)
         yaw = vehicles.tables.yaw
         self.turn = turn_from(self.plan.problem, self.plan.start, yaw, vehicles.yaw)
@@ -130,14 +133,16 @@ class SampledPhase(ActivePhase):
 
     def watch(self, *, last: bool) -> None:
         """Search the steps flown for extremes."""
-        rows = int(self.sampled.count[fleet.TRAILED])
-        if not rows or self.flown is None:
-            return
-        self.state.count[4] = rows
-        self.extremes.take_path(self.flown, self.workspace, self.state)
-        self.sampled.count[fleet.TRAILED] = self.state.count[4] = 0
-        ticks = int(self.sampled.count[fleet.TICKS]) - self.first_tick
-        self.extremes.take_vehicles(self.sampled, self.flight.vehicles, self.lost, ticks)
+        if rows := int(self.sampled.count[fleet.TRAILED]):
+            assert self.flown is not None
+            self.state.count[4] = rows
+            self.extremes.take_path(self.flown, self.workspace, self.state)
+            self.sampled.count[fleet.TRAILED] = self.state.count[4] = 0
+            self.unjudged = True
+        if last and self.unjudged:  # the rest is kept by the flight itself
+            ticks = int(self.sampled.count[fleet.TICKS]) - self.first_tick
+            self.extremes.take_vehicles(self.sampled, self.flight.vehicles, self.lost, ticks)
+            self.unjudged = False
 
     def _segment(self, problem: Problem, t_end: float) -> None:
         """Fly to ``t_end`` [s] and record the samples on the way."""
