@@ -115,34 +115,30 @@ def derivative(y, command, i, vehicles, around, air, push, T, dy):
 
 
 @compiled
-def runge_kutta(i, h, command, vehicles, around, push, work):
-    """Advance vehicle i by h [s] from row 0 of ``work.y`` to row 6, the classical method of fourth order.
+def runge_kutta(h, commands, vehicles, around, push, work):
+    """Advance all vehicles by h [s] from row 0 of ``work.y`` to row 6, the classical method of fourth order.
 
     ``work.air`` holds the air at the start, the middle and the end. The quaternion is normalised after the step. Row 2
-    then holds the derivative at the start.
+    then holds the derivative at the start. Each stage takes all vehicles in turn: a processor begins with the next one
+    while it ends the one before, but it cannot begin a stage before the last one is known.
     """
-    y = work.y
-    for q in range(17):
-        y[_TRIAL, q] = y[_END, q] = y[_START, q]
+    n = work.y.shape[0]
+    for i in range(n):
+        y = work.y[i]
+        for q in range(17):
+            y[_TRIAL, q] = y[_END, q] = y[_START, q]
     for stage in range(4):
-        rate = y[_RATES + stage]
-        derivative(
-            y[_TRIAL],
-            command,
-            i,
-            vehicles,
-            around,
-            work.air[(stage + 1) // 2, i],
-            push,
-            work.T,
-            rate,
-        )
         weight = h / 6.0 if stage in (0, 3) else h / 3.0
         reach = h if stage == 2 else 0.5 * h
-        for q in range(17):
-            y[_END, q] += weight * rate[q]
-            y[_TRIAL, q] = y[_START, q] + reach * rate[q]
-    normalise(y[_END, 6:10])
+        for i in range(n):
+            y, air = work.y[i], work.air[(stage + 1) // 2, i]
+            rate = y[_RATES + stage]
+            derivative(y[_TRIAL], commands[i], i, vehicles, around, air, push[i], work.T, rate)
+            for q in range(17):
+                y[_END, q] += weight * rate[q]
+                y[_TRIAL, q] = y[_START, q] + reach * rate[q]
+    for i in range(n):
+        normalise(work.y[i, _END, 6:10])
 
 
 @compiled
