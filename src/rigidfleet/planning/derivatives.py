@@ -25,6 +25,8 @@ _BLEND = septic_polynomial(Polynomial([0.0, 1.0])).coef
 SLOW, TRAIL = 0.5, 1.0
 #: Share of the turn towards one side, by which a vehicle that starts backwards turns round.
 _SIDE = 0.5
+#: Rotation vector that is taken as zero [rad]: at ten metres it moves a slot by no more than positions are rounded.
+_NO_TURN = 1e-14
 #: Step in which yaw "along" is integrated [s]: exact to 1e-9 rad at accelerations of some m/s^2.
 _STEP = 0.01
 
@@ -87,7 +89,7 @@ def body_series(motion: Motion, time: Floats) -> tuple[Floats, Floats]:
     x[0][:, beyond] += (time - inside)[beyond] * x[1][:, beyond]
     x[2:, :, beyond] = 0.0
     cm, phi = x[:, :3], x[:, 3:]
-    if not phi.any():  # most ways do not turn
+    if np.abs(phi).max(initial=0.0) <= _NO_TURN:  # most ways do not turn, but for rounding
         axes = np.zeros((ORDERS, 3, 3, len(time)))
         axes[0] = motion.T1.T[..., None]
         return cm, axes
@@ -148,13 +150,13 @@ def yaw_of(body: tuple[Floats, Floats], slots: Floats, yaw: Yaw) -> Floats:
         return found
     if yaw.kind == "formation":
         M = body[1][:3]
-        turned = series.angle(M[:, 1, 0] - M[:, 0, 1], M[:, 0, 0] + M[:, 1, 1])
-        found[:] = series.derivatives(turned)[:, None]
+        turned = series.angle(M[:, 1, 0] - M[:, 0, 1], M[:, 0, 0] + M[:, 1, 1])[:, None]
     else:
         away = -slots[:3, :2]
         away[0] += np.array(yaw.point)[:2, None, None]
-        found[:] = series.derivatives(series.angle(away[:, 1], away[:, 0]))
-    found[0] = np.unwrap(found[0])
+        turned = series.angle(away[:, 1], away[:, 0])
+    turned[0] = np.unwrap(turned[0])
+    found[:] = series.derivatives(turned)
     return found
 
 
@@ -193,7 +195,7 @@ def yaw_along(
     angles = angles.T
     now, (A_dot, B_dot, C_dot) = _steering(slots)
     cos, sin = np.cos(angles), np.sin(angles)
-    first = _turning(angles, now[0])
+    first = _turning(angles, now)
     second = A_dot + B_dot * cos + C_dot * sin + first * (now[2] * cos - now[1] * sin)
     return np.stack([angles, first, second]), (float(ends[known]), grid[known])
 
