@@ -1,9 +1,10 @@
 """How fast quadrotors fly on one core, and how exact their steps are; beside RotorPy and crazyflow if installed.
 
-``make bench`` runs it; ``--json`` keeps what it measured for `docs/performance.py`. A vehicle-step is one step of one vehicle, with attitude control at 500 Hz on all sides. RotorPy
-(its SE(3) law, adaptive steps within each period) and crazyflow (its attitude law, float32, Runge-Kutta) hover; our
-vehicles fly the passage of the cube, or hover. The kernel's flight has no planning and no record; whole flights have
-all that `simulate` does. Times are CPU times: other work on the machine counts less.
+``make bench`` runs it; ``--json`` keeps what it measured for `docs/performance.py`. A vehicle-step is one step of one
+vehicle, with attitude control at 500 Hz on all sides. RotorPy (its SE(3) law, adaptive steps within each period) and
+crazyflow (its attitude law, float32, Runge-Kutta) hover; our vehicles fly the passage of the cube, or hover. The
+kernel's flight has no planning and no record; whole flights have all that `simulate` does. Times are CPU times: other
+work on the machine counts less.
 """
 
 from __future__ import annotations
@@ -180,14 +181,18 @@ def main() -> int:
              "ratios": [t / spent for t, spent in found], "goal": GOAL if name == WHOLE[0] else None}
         )  # fmt: skip
     for row in flights:
-        error = "" if row["error"] is None else f", positions within {row['error']:.1e} m of 0.25 ms"
+        error = (
+            "" if row["error"] is None else f", positions within {row['error']:.1e} m of 0.25 ms"
+        )
         low, high = min(row["ratios"]), max(row["ratios"])
         print(
             f"{row['name']}, steps of {1e3 * row['step']:g} ms: {median(row['ratios']):.0f} times real time"
             f" ({low:.0f} to {high:.0f}){error}"
         )
     if arguments.json:
-        machine = f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}"
+        machine = (
+            f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}"
+        )
         head = {"date": str(date.today()), "machine": machine, "version": version("rigidfleet")}
         arguments.json.write_text(
             json.dumps({"vehicles": head | {"rates": rates, "flights": flights}}, indent=1)

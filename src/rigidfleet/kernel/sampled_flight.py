@@ -262,7 +262,7 @@ def advance(S, h, flight, state):
     work = state.work
     for i in range(S.shape[0]):
         for q in range(17):
-            work.y[i, 0, q] = S[i, q]
+            work.y[0, 17 * i + q] = S[i, q]
     runge_kutta(h, state.command, flight.vehicles, flight.air, state.push, work)
 
 
@@ -282,7 +282,7 @@ def write_derivatives(c, t, flight, state, call):
     advance(call.S[c], 0.0, flight, state)
     for i in range(state.S.shape[0]):
         for q in range(17):
-            call.dS[c, i, q] = state.work.y[i, 2, q]
+            call.dS[c, i, q] = state.work.y[2, 17 * i + q]
 
 
 @compiled
@@ -299,7 +299,7 @@ def write_samples(t, h, flight, state, call):
         advance(state.S, x, flight, state)
         for i in range(state.S.shape[0]):
             for q in range(17):
-                call.S[c, i, q] = work.y[i, 6, q]
+                call.S[c, i, q] = work.y[6, 17 * i + q]
             for q in range(4):
                 call.command[c, i, q] = state.command[i, q]
             for q in range(3):
@@ -322,7 +322,8 @@ def write_samples(t, h, flight, state, call):
 @compiled
 def keep_path(i, h, work, points):
     """Bernstein coefficients (5, 6 N) of vehicle i over a step: of the quartic through r0, v0, a0, r1, v1; its rate."""
-    first, end, rate = work.y[i, 0], work.y[i, 6], work.y[i, 2]
+    own = slice(17 * i, 17 * i + 17)
+    first, end, rate = work.y[0, own], work.y[6, own], work.y[2, own]
     n = points.shape[1] // 6
     for q in range(3):
         r0, v0, a0, r1, v1 = first[q], first[3 + q], rate[3 + q], end[q], end[3 + q]
@@ -344,7 +345,8 @@ def take_extremes(i, t, h, vehicles, state):
     A rotor's speed is monotone while its command is held, so the ends of steps have its greatest thrust. The
     acceleration of a point jumps at ticks, and is the highest after them.
     """
-    rate, end = state.work.y[i, 2], state.work.y[i, 6]
+    own = slice(17 * i, 17 * i + 17)
+    rate, end = state.work.y[2, own], state.work.y[6, own]
     a = math.sqrt(rate[3] ** 2 + rate[4] ** 2 + rate[5] ** 2)
     worse(i, ACCELERATION, a, t, state)
     command, load = state.command[i], 0.0
@@ -380,7 +382,7 @@ def advance_fleet(t, h, flight, state):
         if kept:
             keep_path(i, h, state.work, trail.points[row])
         for q in range(17):
-            state.S[i, q] = state.work.y[i, 6, q]
+            state.S[i, q] = state.work.y[6, 17 * i + q]
 
 
 @compiled
