@@ -65,6 +65,18 @@ def test_tables_are_up_to_date():
         assert page(path.name) == tables.render(page(path.name))
 
 
+@pytest.mark.long
+def test_flown_tables_are_up_to_date():
+    """Errors and rotor forces of vehicles.md are those that are flown, to the last digit printed or 3 %."""
+    old = page("vehicles.md")
+    new = script("flown").render(old)
+    number = re.compile(r"\d+\.\d+")
+    assert number.sub("", old) == number.sub("", new)
+    for was, now in zip(number.findall(old), number.findall(new), strict=True):
+        digit = 10.0 ** -len(was.partition(".")[2])
+        assert float(now) == pytest.approx(float(was), rel=0.03, abs=1.01 * digit)
+
+
 def test_measured_tables_come_from_measurements():
     """Every table of speeds is one that the script writes from the benchmarks' files, and has been written."""
     performance = script("performance")

@@ -2,6 +2,7 @@
 
 import math
 import re
+from typing import Any
 
 import numpy as np
 import pytest
@@ -212,6 +213,34 @@ def test_acceleration_and_jerk_are_continuous_through_every_switch():
         if waypoint is not None and waypoint.position is not None:
             assert waypoint.position < 1e-3
             assert (waypoint.velocity or 0.0) < 0.03
+
+
+def test_points_on_the_way_are_judged():
+    """Points to pass are met, each at its time, at any output step; a flight beside one of them misses it."""
+    paper = load_mission("narrow-passage")
+    tables: dict[str, Any] = paper.to_dict() | {"smoothness": "jerk", "output_step": 0.7}
+    start = paper.fleet.position.mean(axis=0)
+    points = [
+        {"position": list(start + [2.0, 1.0, 3.0])},
+        {"position": list(start + [5.0, -1.0, 4.0])},
+    ]
+    fly = {
+        "kind": "fly",
+        "position": list(start + [8.0, 0.0, 3.0]),
+        "through": points,
+        "duration": 9.0,
+    }
+    result = simulate(Mission.from_dict(tables | {"phases": [*tables["phases"][:1], fly]}))
+    through = assess(result).phases[1].through
+    times = [at["time"] for at in (result.phases[1].target or {})["through"]]
+    assert [at.time for at in through] == times
+    assert all((at.position or 0.0) < 1e-3 for at in through)
+    result.cm[result.time == times[1]] += [0.0, 0.3, 0.0]
+    failed = [c for c in assess(result).checks if c.check == "waypoint_position" and not c.passed]
+    assert [c.when for c in failed] == [times[1]]
+    assert failed[0].message.startswith(
+        f"point 2 on the way of phase '{result.phases[1].name}' is missed"
+    )
 
 
 def test_legs_of_the_regulators_jump():

@@ -76,13 +76,23 @@ class _Moment(TypedDict):
     time: float
 
 
+class Passed(_Moment):
+    """A point that the centre of mass is to pass, and when."""
+
+    position: _Three
+
+
 class Target(_Moment, total=False):
-    """Target of a phase: time of arrival [s] and the state commanded then. None: nothing is commanded."""
+    """Target of a phase: time of arrival [s] and the state commanded then, and points to pass on the way.
+
+    None: nothing is commanded.
+    """
 
     position: _Three | None
     velocity: _Three | None
     attitude: tuple[float, float, float, float] | None
     rates: _Three | None
+    through: list[Passed]
 
 
 class Statistics(TypedDict, total=False):

@@ -112,7 +112,10 @@ def _unseen(measured: Measurements) -> Iterator[CheckResult]:
     for i, p in enumerate(result.phases):
         if not result.complete and i == last:
             continue
-        moments = {"waypoint": p.target["time"] if p.target is not None else None}
+        target = p.target or {}
+        moments = {"waypoint": target.get("time")}
+        points = enumerate(target.get("through", ()), start=1)
+        moments |= {f"point {k} on the way": point["time"] for k, point in points}
         if KINDS[p.kind].shapes or i == last:
             moments["end"] = p.t_end
         for what, t in moments.items():
@@ -218,13 +221,18 @@ def _waypoints(phases: list[PhaseVerdict]) -> Iterator[CheckResult]:
     for name, limit in WAYPOINT_TOLERANCE.items():
         unit = {"position": "m", "velocity": "m/s", "attitude": "deg", "rates": "deg/s"}[name]
         for p in phases:
-            miss = getattr(p.waypoint, name) if p.waypoint is not None else None
-            if p.waypoint is not None and miss is not None:
-                when, passed = p.waypoint.time, miss <= limit
+            met = [] if p.waypoint is None else [("the waypoint", p.waypoint)]
+            points = [(f"point {k} on the way", at) for k, at in enumerate(p.through, start=1)]
+            for what, at in [*points, *met]:
+                miss = getattr(at, name)
+                if miss is None:
+                    continue
+                passed = miss <= limit
                 words = f"{'met' if passed else 'missed'}, {value(miss, unit)} off in {name}"
-                words = f"the waypoint of phase '{p.name}' is {words} (limit {limit:g} {unit})"
-                check = f"waypoint_{name}"
-                yield CheckResult(check, passed, words, miss, limit, unit, when=when, phase=p.name)
+                words = f"{what} of phase '{p.name}' is {words} (limit {limit:g} {unit})"
+                yield CheckResult(
+                    f"waypoint_{name}", passed, words, miss, limit, unit, when=at.time, phase=p.name
+                )
 
 
 def _bounded(

@@ -421,6 +421,7 @@ class Measurements:
             flip=None if fit is None else self.flip(fit, record, last),
             order=None if fit is None else fit.in_order,
             waypoint=self.waypoint(record, samples) if finished else None,
+            through=tuple(self.passed(record, samples)),
             worst={name: found for name, found in extremes.items() if found is not None},
         )
 
@@ -496,6 +497,16 @@ class Measurements:
             attitude=miss("attitude", result.attitude[k]),
             rates=None if rates is None else math.degrees(rates),
         )
+
+    def passed(self, record: PhaseRecord, samples: slice) -> Iterator[Waypoint]:
+        """Misses of the points on the way that the flight came to."""
+        result, times = self.result, self.result.time[samples]
+        for point in (record.target or {}).get("through", ()):
+            if not len(times) or times[-1] < point["time"]:
+                continue
+            k = samples.start + int(np.abs(times - point["time"]).argmin())
+            miss = float(np.linalg.norm(result.cm[k] - point["position"]))
+            yield Waypoint(float(result.time[k]), miss, None, None, None)
 
 
 def _length(x: Floats) -> Floats:

@@ -29,10 +29,10 @@ def rendered(
         worst = [p.worst.get(name) for name in ("constraint", "separation", "clearance", "thrust")]
         c, *rest = [None if e is None else e.value for e in worst]
         phases.append([p.name, f"{p.t_end:.2f}", *map(_number, (p.constraint, c, p.shape, *rest))])
-        if p.waypoint is not None:
-            w = p.waypoint
+        met = [] if p.waypoint is None else [(p.name, p.waypoint)]
+        for name, w in [*((f"{p.name}, point {k}", w) for k, w in enumerate(p.through, 1)), *met]:
             misses = (w.position, w.velocity, w.attitude, w.rates)
-            waypoints.append([p.name, f"{w.time:.2f}", *map(_number, misses)])
+            waypoints.append([name, f"{w.time:.2f}", *map(_number, misses)])
     shown: list[RenderableType] = [
         head,
         _table(_PHASE, phases),

@@ -214,6 +214,14 @@ class SmoothFlight:
         return splines.allocated(points, total, np.stack([start.v, start.a, start.jerk]), end)
 
 
+def passed(flight: Flight | None) -> tuple[tuple[float, Floats], ...]:
+    """Times [s] and positions (3,) [m] of the CM at the points that a trajectory passes."""
+    if not isinstance(flight, SmoothFlight):
+        return ()
+    times = flight.t0 + flight.times()[1:-1]
+    return tuple(zip(times.tolist(), (np.array(at.position) for at in flight.through), strict=True))
+
+
 def rotation_of(start: Pose, T1: Floats) -> Floats:
     """Rotation vector phi [rad] from an attitude T1 (3, 3) to that of a pose, and three derivatives (4, 3).
 

@@ -45,7 +45,7 @@ from rigidfleet.mission import Mission, Phase, Regulator, Settle
 from rigidfleet.mission.kinds import seconds
 from rigidfleet.mission.schema import Constraint, IntegratorOptions
 from rigidfleet.planning import solvers
-from rigidfleet.planning.courses import course
+from rigidfleet.planning.courses import course, passed
 from rigidfleet.planning.disturbances import without
 from rigidfleet.planning.reference import (
     PhaseState,
@@ -96,6 +96,7 @@ class PhasePlan:
     lost_at: Floats  # (N,) times at which vehicles are lost [s]
     masses: Floats  # (N,) assumed by the laws, lost vehicles included [kg]
     before: PhaseState  # the state that the phase starts from
+    through: tuple[tuple[float, Floats], ...] = ()  # times [s] and CM (3,) [m] to pass on the way
     smooth: bool = False  # whether the next phase needs acceleration and jerk of the reference
 
     @property
@@ -112,12 +113,14 @@ class PhasePlan:
         turns = lies or "attitude" in meets
         reference = self.problem.reference
         shaped = reference.t0 + reference.T_b
+        through = [{"time": t, "position": r.tolist()} for t, r in self.through]
         return {
             "time": max(self.arrival, shaped) if lies else self.arrival,
             "position": goal.r.tolist() if "position" in meets else None,
             "velocity": goal.v.tolist() if "velocity" in meets else None,
             "attitude": att.quaternion_from_dcm(goal.T).tolist() if turns else None,
             "rates": goal.omega.tolist() if turns and not lies else None,
+            **({"through": through} if through else {}),
         }
 
     def state(self) -> Floats:
@@ -276,7 +279,7 @@ def plan_phase(
         lies=phase.establishing is not None and not mission.free_attitude(phase), method=method,
         constraint=mission.constraint, integrator=mission.integrator,
         damping=partial(mission.damping, held), lost_at=mission.lost_at, masses=masses, before=before_switch,
-        smooth=mission.smooth,
+        through=passed(flight), smooth=mission.smooth,
     )  # fmt: skip
     if now.lost is not None and now.lost.any():
         plan.release(now.lost)

@@ -211,7 +211,9 @@ def _whole_legend(ax: Axes, references: list[Line2D], *, targets: bool) -> None:
 
 def _targets(result: Result, key: str) -> list[tuple[float, Any]]:
     """Time [s] and value of the waypoints that the flight reached."""
-    found = [(p.target["time"], p.target.get(key)) for p in result.phases if p.target is not None]
+    targets = [p.target for p in result.phases if p.target is not None]
+    moments = (at for target in targets for at in (*target.get("through", ()), target))
+    found = [(at["time"], at.get(key)) for at in moments]
     return [(t, value) for t, value in found if value is not None and t <= result.time[-1] + 1e-9]
 
 

@@ -101,9 +101,13 @@ def _waypoints(result: Result) -> list[tuple[str, Floats]]:
     found: dict[tuple[float, ...], str] = {}
     for phase in result.phases:
         target = phase.target or {}
-        if target.get("position") is not None:
-            place = tuple(np.round(np.asarray(target["position"], dtype=float), 6).tolist())
-            found.setdefault(place, st.clean(phase.name.split(":")[0], 12))
+        for position in [
+            *(at["position"] for at in target.get("through", ())),
+            target.get("position"),
+        ]:
+            if position is not None:
+                place = tuple(np.round(np.asarray(position, dtype=float), 6).tolist())
+                found.setdefault(place, st.clean(phase.name.split(":")[0], 12))
     return [(name, np.array(place)) for place, name in found.items()]
 
 

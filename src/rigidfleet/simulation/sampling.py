@@ -13,8 +13,9 @@ from rigidfleet.typing import Floats
 
 
 class Sampling:
-    """The times to record: multiples of a step, ends of phases, arrivals, losses and stops; or times given by the user.
+    """The times to record: those given by the user, or multiples of a step and exact moments.
 
+    Exact moments are ends of phases, arrivals, points to pass, losses and stops.
     The start of a phase is recorded one representable number after the switch; so is the state after a loss.
     """
 
@@ -32,7 +33,8 @@ class Sampling:
         low, high = math.floor(t / step + 1e-9) + 1, math.floor(t_end / step + 1e-9) + 1
         grid = np.minimum(np.arange(low, high) * step, t_end)
         lost = plan.lost_at
-        for exact in (plan.arrival, plan.t_end, stop, *lost[np.isfinite(lost)]):
+        passed = (t for t, _ in plan.through)
+        for exact in (plan.arrival, plan.t_end, stop, *passed, *lost[np.isfinite(lost)]):
             if t < exact <= t_end:
                 grid = np.sort(np.append(grid[abs(grid - exact) > 1e-9 * step], exact))
         if not first:
