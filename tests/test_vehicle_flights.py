@@ -365,5 +365,7 @@ def test_yaw_along_the_way_goes_on_from_table_to_table():
     whole = TickTables(mission, sampled).made(first, first + 1500, problem, turn).yaw
     tables, ends = TickTables(mission, sampled), first + np.array([0, 7, 403, 1001, 1500])
     pieces = [tables.made(a, b, problem, turn).yaw for a, b in itertools.pairwise(ends)]
-    np.testing.assert_allclose(np.concatenate(pieces), whole, rtol=0, atol=1e-9)  # of an integration
+    np.testing.assert_allclose(
+        np.concatenate(pieces), whole, rtol=0, atol=1e-9
+    )  # of an integration
     assert np.ptp(whole[:, :, 0], axis=0).min() > 0.1

@@ -171,6 +171,7 @@ class Sensing(NamedTuple):
     linked: bool
     link_every: int  # attitude ticks between messages
     link_delay: Ints  # (N, N) attitude ticks from a measurement of j to its arrival at i, by [i, j]
+    parted: Ints  # (P, 2) pairs without a link for good; see `sampled_flight.presume`
 
 
 class Guidance(NamedTuple):
@@ -365,7 +366,10 @@ def still_air(n: int) -> Air:
 
 def exact_sensing(n: int) -> Sensing:
     """States that are known exactly and at once."""
-    return Sensing(1, np.zeros(n, dtype=np.int64), False, 1, np.zeros((n, n), dtype=np.int64))
+    nobody = np.zeros((0, 2), dtype=np.int64)
+    return Sensing(
+        1, np.zeros(n, dtype=np.int64), False, 1, np.zeros((n, n), dtype=np.int64), nobody
+    )
 
 
 def no_tables(n: int) -> Tables:

@@ -245,6 +245,37 @@ def watch_coordinate(kind, curve, axis, sign, offset, t, h, i, monitor):
 
 
 @compiled
+def clearance_of_interest(i, monitor):
+    """Clearance of agent i from which on it is worse than what is stored."""
+    own = min(monitor.low[i, 0], monitor.worst[FLYING])
+    if monitor.standing[i] != 0:
+        own = monitor.worst[STANDING]
+    return max(own, monitor.worst[CLEARANCE])
+
+
+@compiled
+def take_clearance(value, t, i, b, monitor):
+    """Store the clearance of agent i to obstacle b; of one that may be landing, until it leaves."""
+    low = monitor.low
+    take(CLEARANCE, value, t, i, b, monitor)
+    if monitor.standing[i] != 0:
+        take(STANDING, value, t, i, b, monitor)
+    elif value < low[i, 0]:
+        low[i, 0], low[i, 1], low[i, 2] = value, t, float(b)
+
+
+@compiled
+def leave(i, monitor):
+    """Agent i is away from all obstacles: it no longer stands on one, and was not landing."""
+    low = monitor.low
+    if monitor.standing[i] != 0:
+        monitor.standing[i] = 0
+    else:
+        take(FLYING, low[i, 0], low[i, 1], i, int(low[i, 2]), monitor)
+        low[i, 0] = math.inf
+
+
+@compiled
 def watch_obstacles(i, curve, t, h, last, monitor):
     """Clearance of agent i's surface to obstacles over a piece of a step; ``last`` is the clearance at its end.
 
@@ -256,31 +287,21 @@ def watch_obstacles(i, curve, t, h, last, monitor):
     x, y, z, span = curve[2, 0], curve[2, 1], curve[2, 2], monitor.span[i]
     for b in range(monitor.boxes.shape[0]):
         box = monitor.boxes[b]
-        own = min(low[i, 0], monitor.worst[FLYING]) if not standing else monitor.worst[STANDING]
-        floor = max(own, monitor.worst[CLEARANCE]) + radius
+        floor = clearance_of_interest(i, monitor) + radius
         far = max(0.0, box[0] - x, x - box[3]) ** 2 + max(0.0, box[1] - y, y - box[4]) ** 2
         far += max(0.0, box[2] - z, z - box[5]) ** 2
         if far >= (floor + span) ** 2 and floor + span > 0.0:  # far from the whole obstacle
             continue
         value, at = nearest_box(curve, box, floor, monitor.pieces, normal)
         if at >= 0.0:
-            value -= radius
-            take(CLEARANCE, value, t + at * h, i, b, monitor)
-            if standing:
-                take(STANDING, value, t + at * h, i, b, monitor)
-            elif value < low[i, 0]:
-                low[i, 0], low[i, 1], low[i, 2] = value, t + at * h, float(b)
+            take_clearance(value - radius, t + at * h, i, b, monitor)
     if not last or not (standing or low[i, 0] < math.inf):
         return
     for b in range(monitor.boxes.shape[0]):
         end = from_box(curve[4, 0], curve[4, 1], curve[4, 2], monitor.boxes[b], normal)
         if end - radius <= monitor.pad:
             return
-    if standing:
-        monitor.standing[i] = 0
-    else:
-        take(FLYING, low[i, 0], low[i, 1], i, int(low[i, 2]), monitor)
-        low[i, 0] = math.inf
+    leave(i, monitor)
 
 
 @compiled

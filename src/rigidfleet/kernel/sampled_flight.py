@@ -194,11 +194,31 @@ def worse(i, kind, value, t, state):
 
 
 @compiled
+def presume(k, t, w, flight, state):
+    """Let vehicles without a link take each other to be as far off their slots as they are themselves.
+
+    At tick k, time t [s]. The slots are those of the last evaluation of the law, moved on by velocity and acceleration.
+    """
+    pairs, since, heard = flight.sensing.parted, t - state.clock[1], state.heard
+    for row in range(pairs.shape[0]):
+        for side in range(2):
+            i, j = pairs[row, side], pairs[row, 1 - side]
+            for q in range(3):
+                v, a = w.v_ref[j, q] - w.v_ref[i, q], w.a_ref[j, q] - w.a_ref[i, q]
+                r = w.r_ref[j, q] - w.r_ref[i, q] + since * (v + 0.5 * since * a)
+                v += since * a
+                r += path_at(k, i, q, flight.tables) - path_at(k, j, q, flight.tables)
+                v += path_at(k, i, 3 + q, flight.tables) - path_at(k, j, 3 + q, flight.tables)
+                heard[i, j, q], heard[i, j, 3 + q] = heard[i, i, q] + r, heard[i, i, 3 + q] + v
+
+
+@compiled
 def desire(k, t, p, w, flight, state, call):
     """Desired forces of all vehicles at tick k, time t [s]; returns False if the law gives none (a singular law)."""
     n, dt = state.S.shape[0], flight.every * flight.steps * flight.h
     advance_frame(t, p, state)
     linked = flight.sensing.linked
+    presume(k, t, w, flight, state)
     for i in range(n if linked else 1):
         known = state.heard[i] if linked else state.seen
         integral = state.integral[i]

@@ -19,6 +19,7 @@ from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
 from rigidfleet.mission import Mission
 from rigidfleet.result import PAD, Extremum, PhaseRecord
+from rigidfleet.solids.records import joined
 from rigidfleet.typing import Bools, Floats, Ints
 
 #: Greatest number of agents of which all pairs are monitored.
@@ -67,7 +68,12 @@ class Extremes:
         agents, limits = mission.agents, mission.limits
         self.n = mission.n_agents
         self.radius = np.array(agents.radius, dtype=float)
-        self.boxes = np.array([thing.corners for thing in mission.obstacles]).reshape(-1, 6)
+        corners = [thing.corners for thing in mission.obstacles]
+        #: Obstacles of all kinds, unless all are boxes that the monitor itself takes.
+        self.solids = None
+        if None in corners:
+            self.solids, corners = joined([thing.solid for thing in mission.obstacles]), []
+        self.boxes = np.array(corners).reshape(-1, 6)
         fence = limits.geofence
         self.fence = np.array([] if fence is None else [*fence.min, *fence.max]).reshape(-1, 6)
         self.stacks = self.n <= _FEW or limits.separation_below is not None
@@ -121,6 +127,7 @@ class Extremes:
     ) -> None:
         """Evaluate the steps in the trail; ``last``: no further steps of the segment follow."""
         flags, rows = self.monitor.monitor.flags, int(state.count[4])
+        self._take_solids(problem, state, int(flags[3]), rows)
         flags[:3] = flags[3], rows, 2 if last else 1
         if self.n > _FEW:
             for row in range(int(flags[3]), rows):
@@ -132,12 +139,28 @@ class Extremes:
     def take_path(self, problem: Problem, work: Workspace, state: records.IntegratorState) -> None:
         """Evaluate the paths alone of the steps in the trail, not the forces."""
         rows, flags = int(state.count[4]), self.monitor.monitor.flags
+        self._take_solids(problem, state, 0, rows)
         if self.n > _FEW:
             for row in range(rows):
                 self._step(problem, work, state, row)
             return
         flags[:3] = 0, rows, 0
         self.monitor(problem, work, state)
+
+    def _take_solids(
+        self, problem: Problem, state: records.IntegratorState, first: int, last: int
+    ) -> None:
+        """Take the clearances of some steps in the trail to obstacles that the monitor itself does not take."""
+        if self.solids is None:
+            return
+        from rigidfleet.kernel import obstacles  # loads the compiler
+
+        trail, body = state.trail, bool(problem.body_formulation)
+        laid = obstacles.layout(problem.vehicles.m, problem.graph.edges, body)
+        watched = obstacles.monitor_of(self.monitor.monitor)
+        obstacles.watch(
+            trail.points[first:last], trail.clock[first:last], laid, self.solids, watched
+        )
 
     def take_vehicles(
         self, state: fleet.SampledState, vehicles: fleet.Quadrotors, lost: Bools, ticks: int

@@ -17,6 +17,7 @@ from rigidfleet.kernel.problem import Problem
 from rigidfleet.kernel.records import Record
 from rigidfleet.math import attitude as att
 from rigidfleet.mission import Mission
+from rigidfleet.planning.reference import ByEdge
 from rigidfleet.planning.vehicles import TickTables, sampled_flight, turn_from
 from rigidfleet.simulation.active_phase import ActivePhase
 from rigidfleet.simulation.callbacks import (
@@ -46,6 +47,7 @@ class Vehicles:
         self.yaw = np.full(mission.n_agents, yaw)  # asked of each vehicle at the last switch
         self.S = fleet.hovering(self.flight.vehicles, start.position, start.velocity, yaw)
         self.state: fleet.SampledState | None = None  # of the phase before
+        self.edges = np.zeros((0, 2), dtype=np.int64)  # of that state
 
 
 class SampledPhase(ActivePhase):
@@ -74,6 +76,11 @@ class SampledPhase(ActivePhase):
         self.state = integrator(plan, y, t, trail)
         lost = self.flight.vehicles._replace(lost=self.lost.copy())
         self.flight = self.flight._replace(vehicles=lost)
+        if self.parted.any():
+            parted = np.ascontiguousarray(plan.links_lost[0][self.parted])
+            sensing = self.flight.sensing._replace(parted=parted)
+            self.flight = self.flight._replace(sensing=sensing)
+            self.evaluate()  # the slots by which vehicles without a link presume each other
         frame = y[6 * n + m : 6 * n + m + 4] if plan.frame is not None else None
         integral, before = y[6 * n : 6 * n + m], given.state
         begun = fleet.begin(self.flight, given.S, self.workspace, frame=frame)
@@ -81,10 +88,17 @@ class SampledPhase(ActivePhase):
             begun.integral[:] = integral
         else:  # extremes are those of the phase
             renewed = fleet.renewed(before, self.workspace, integral, frame=frame)
+            if self.parted.any():  # without a link, vehicles do not come to the same integrals
+                own = [
+                    ByEdge().updated(given.edges, x).of(plan.edges, integral)
+                    for x in before.integral
+                ]
+                renewed.integral[:] = own
             kept = ("peak", "peak_time", "worst", "worst_time", "saturations")
             begun = renewed._replace(**{name: getattr(begun, name) for name in kept})
         begun.peak_time[:] = begun.worst_time[:] = t
         self.sampled = given.state = begun._replace(trail=trail._replace(gauge=trail.gauge[:, :0]))
+        given.edges = plan.edges
         self.first_tick = int(self.sampled.count[fleet.TICKS])
         self.tabled = None
 
