@@ -20,7 +20,7 @@ from rigidfleet.math import proximity
 from rigidfleet.mission import Mission
 from rigidfleet.result import PAD, Extremum, PhaseRecord
 from rigidfleet.solids.records import joined
-from rigidfleet.typing import Bools, Floats
+from rigidfleet.typing import Bools, Floats, Ints
 
 #: Greatest number of agents of which all pairs are monitored.
 _FEW = 40
@@ -166,16 +166,11 @@ class Extremes:
         self, state: fleet.SampledState, vehicles: fleet.Quadrotors, lost: Bools, ticks: int
     ) -> None:
         """Take the extremes that a sampled flight keeps by itself, of a phase of some ticks so far."""
-        rotors = ~(vehicles.point | lost)
+        rotors, left = ~(vehicles.point | lost), np.flatnonzero(~lost)
         for k, kind, sign in _SAMPLED:
-            for i in np.flatnonzero(~lost):
-                self._take(
-                    kind, sign * float(state.worst[i, k]), float(state.worst_time[i, k]), int(i)
-                )
-        for i in np.flatnonzero(~lost):
-            load = float(state.worst[i, fleet.LOAD])
-            margin, when = float(vehicles.limit[i]) - load, float(state.worst_time[i, fleet.LOAD])
-            self._take(records.THRUST_MARGIN, margin, when, int(i))
+            self._take_first(kind, sign * state.worst[left, k], state.worst_time[left, k], left)
+        load, when = (x[left, fleet.LOAD] for x in (state.worst, state.worst_time))
+        self._take_first(records.THRUST_MARGIN, vehicles.limit[left] - load, when, left)
         found: dict[str, Extremum] = {}
         if rotors.any():
             peak = np.where(rotors[:, None], state.peak, -1.0)
@@ -197,9 +192,11 @@ class Extremes:
         found["saturation"] = Extremum(float(share[i]), float(state.clock[0]), i, -1)
         self.of_vehicles = found
 
-    def _take(self, kind: int, value: float, t: float, who: int) -> None:
-        if value < self.worst[kind]:
-            self.worst[kind], self.when[kind], self.who[kind] = value, t, (who, -1)
+    def _take_first(self, kind: int, values: Floats, times: Floats, who: Ints) -> None:
+        """Take the least of the agents' values into account; of equal ones, the first in time."""
+        if len(who) and (value := float(values.min())) < self.worst[kind]:
+            i = int(np.where(values == value, times, np.inf).argmin())
+            self.worst[kind], self.when[kind], self.who[kind] = value, times[i], (who[i], -1)
 
     def so_far(self) -> dict[str, Extremum]:
         """Extremes of the phase under way, by name."""
