@@ -163,10 +163,18 @@ class Extremes:
         )
 
     def take_vehicles(
-        self, state: fleet.SampledState, vehicles: fleet.Quadrotors, lost: Bools, ticks: int
+        self,
+        state: fleet.SampledState,
+        vehicles: fleet.Quadrotors,
+        gone: Bools,
+        lost: Bools,
+        ticks: int,
     ) -> None:
-        """Take the extremes that a sampled flight keeps by itself, of a phase of some ticks so far."""
-        rotors, left = ~(vehicles.point | lost), np.flatnonzero(~lost)
+        """Take the extremes that a sampled flight keeps by itself, of a phase of some ticks so far.
+
+        Vehicles ``gone`` (N,) were lost before the phase; those that are ``lost`` (N,) in it count up to then.
+        """
+        rotors, left = ~(vehicles.point | gone), np.flatnonzero(~gone)
         for k, kind, sign in _SAMPLED:
             self._take_first(kind, sign * state.worst[left, k], state.worst_time[left, k], left)
         load, when = (x[left, fleet.LOAD] for x in (state.worst, state.worst_time))
@@ -181,7 +189,7 @@ class Extremes:
             i = int(upright.argmin())
             angle = math.acos(min(max(float(upright[i]), -1.0), 1.0))
             found["tilt"] = Extremum(angle, float(state.worst_time[i, fleet.UPRIGHT]), i, -1)
-        error = np.where(lost, -1.0, state.worst[:, fleet.ERROR])
+        error = np.where(gone, -1.0, state.worst[:, fleet.ERROR])
         i = int(error.argmax())
         if error[i] > 0.0:
             found["tracking_error"] = Extremum(
