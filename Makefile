@@ -39,6 +39,7 @@ robustness: .venv/.bench  ## Fly 200 random formations under every graph and law
 
 avoidance: .venv/.bench  ## Plan transitions and published problems, with proofs
 	@$(BIN)/python benchmarks/avoidance.py
+	@$(BIN)/python benchmarks/gaps.py
 
 docs: .venv/.docs  ## Build the site into site/, with every figure on it
 	@$(BIN)/python docs/picture.py
