@@ -586,6 +586,10 @@ class Result:
         ValueError
             The rate is not positive, or gives too many setpoints.
         """
+        return at_rate(self.motion(flown=flown), rate)
+
+    def motion(self, *, flown: bool = False) -> Setpoints:
+        """The setpoints of every sample, of which there are two at a change of phase; see `setpoints`."""
         references = [
             self.slot_position,
             self.slot_velocity,
@@ -601,7 +605,7 @@ class Result:
                 [of_motion(*(x[part] for x in (*motion, self.time))) for part in parts]
             )
         yaw = [nothing[:, :, 0] if x is None else x for x in (self.yaw, self.yaw_rate)]
-        return at_rate(Setpoints(self.time, state, *yaw), rate)
+        return Setpoints(self.time, state, *yaw)
 
     def to_csv(self, path: str | Path, *, rate: float | None = None, flown: bool = False) -> None:
         """Write the setpoints of each vehicle to a CSV file, one row per time and agent, to 9 digits.
