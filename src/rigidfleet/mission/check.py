@@ -26,6 +26,7 @@ from rigidfleet.mission.schema import (
     Constraint,
     Contents,
     Disturbances,
+    GeodeticOrigin,
     Geofence,
     Ground,
     IntegratorOptions,
@@ -51,6 +52,7 @@ _TABLES: dict[str, type[Part]] = {
     "limits": Limits,
     "autopilot": Autopilot,
     "yaw": VehicleYaw,
+    "geodetic_origin": GeodeticOrigin,
     "disturbances": Disturbances,
 }
 _OBSTACLES: dict[str, type[Part]] = {"box": Box, "ground": Ground}
