@@ -470,6 +470,7 @@ def test_flown_is_not_the_reference(flight, tmp_path):
     made = export(beside, tmp_path / "flown.csv", "setpoints", flown=True)
     assert made.flown
     assert "kept the flown position" in str(made)
+    assert "yaw is the reference's" in str(made)
     files = tmp_path / "flown.csv", tmp_path / "reference.csv"
     flown, wanted = (np.loadtxt(file, delimiter=",", skiprows=1)[:, 2:5] for file in files)
     assert flown - wanted == pytest.approx(np.tile([0.0, 0.07, 0.0], (len(flown), 1)), abs=1e-7)

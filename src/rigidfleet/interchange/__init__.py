@@ -138,9 +138,13 @@ class Export:
         within = f"{_brief(1e3 * self.deviation)} mm" + (
             "" if math.isnan(turned) else f" and {_brief(turned)} deg"
         )
+        size = max(1, round(self.size / 1e3))
+        # No yaw is flown by points, and none is recorded of vehicles but in their attitudes.
+        heading = self.flown and not math.isnan(turned)
+        extra = "; yaw is the reference's, and east where it has none" if heading else ""
         return (
-            f"{self.format}: {files}, {self.size / 1e3:,.0f} kB; kept the {source} {what.kept}{self.part} within "
-            f"{within}; lost {what.lost}."
+            f"{self.format}: {files}, {size:,} kB; kept the {source} {what.kept}{self.part} within {within}; lost "
+            f"{what.lost}{extra}."
         )
 
 
