@@ -5,14 +5,14 @@ python benchmarks/exports.py --only cube-passage-quadrotors
 """
 
 import argparse
+import math
 import re
 import tempfile
-import time
 from pathlib import Path
 
 import rigidfleet as rf
 from rigidfleet.errors import ResultError
-from rigidfleet.interchange import FORMATS, export
+from rigidfleet.interchange import FORMATS, brief, export
 
 FLIGHTS = ("passage-quadrotors", "cube-passage-quadrotors", "show-1000")
 #: Any place: plans need one.
@@ -20,21 +20,16 @@ ORIGIN = {"latitude_deg": 47.3977, "longitude_deg": 8.5456, "altitude": 488.0}
 
 
 def row(result: rf.Result, name: str, folder: Path, flown: bool) -> str:
-    """Deviation [mm] and [deg], kilobytes and processor time of an export, or why there is none."""
-    begun = time.process_time()
+    """Deviation [mm] and [deg] and kilobytes of an export, or why there is none."""
     path = folder / (f"{name}.csv" if name == "setpoints" else name)
     try:
         made = export(result, path, name, flown=flown)  # ty: ignore[invalid-argument-type]
     except ResultError as error:
         found = re.search(r"is ([\d.]+ m) from|needs (\d+ \w+) of|needs (\d+ bytes)", str(error))
         return f"refused: {next(x for x in found.groups() if x) if found else error}"
-    took = time.process_time() - begun
-    turned = (
-        ""
-        if made.yaw_deviation != made.yaw_deviation
-        else f"{57.29578 * made.yaw_deviation:.2g} deg, "
-    )
-    return f"{1e3 * made.deviation:.2g} mm, {turned}{made.size / 1e3:,.0f} kB, {took:.1f} s"
+    degrees = math.degrees(made.yaw_deviation)
+    turned = "" if math.isnan(degrees) else f"{brief(degrees)} deg, "
+    return f"{brief(1e3 * made.deviation)} mm, {turned}{made.size / 1e3:,.0f} kB"
 
 
 def main() -> None:

@@ -135,8 +135,8 @@ class Export:
         files = "1 file" if self.files == 1 else f"{self.files} files"
         source = "flown" if self.flown else "reference"
         turned = math.degrees(self.yaw_deviation)
-        within = f"{_brief(1e3 * self.deviation)} mm" + (
-            "" if math.isnan(turned) else f" and {_brief(turned)} deg"
+        within = f"{brief(1e3 * self.deviation)} mm" + (
+            "" if math.isnan(turned) else f" and {brief(turned)} deg"
         )
         size = max(1, round(self.size / 1e3))
         # No yaw is flown by points, and none is recorded of vehicles but in their attitudes.
@@ -277,6 +277,6 @@ def _deviations(motion: Motion, chosen: Format, data: bytes, first: int) -> list
     ]
 
 
-def _brief(x: float) -> str:
-    """A deviation with two digits; a tiny one as a bound."""
-    return f"{x:.2g}" if x >= 1e-3 else "0.001"
+def brief(x: float) -> str:
+    """A deviation with two digits or in whole units; a tiny one as a bound."""
+    return "0.001" if x < 1e-3 else f"{x:.2g}" if x < 10.0 else f"{x:.0f}"
