@@ -476,6 +476,20 @@ def test_flown_is_not_the_reference(flight, tmp_path):
     assert flown - wanted == pytest.approx(np.tile([0.0, 0.07, 0.0], (len(flown), 1)), abs=1e-7)
 
 
+def test_a_lost_vehicle_is_exported_as_it_fell(tmp_path):
+    """At a loss, forces jump within a phase: the motion flown has no wild jerk there, and is exported with its fall."""
+    data = rf.load_mission("hexagon").to_dict()
+    end = data["phases"][0]["until"]
+    data["disturbances"] = {"lost": [{"agent": 2, "time": 0.5 * end}]}
+    lost = rf.simulate(rf.Mission.from_dict(data))
+    (jump,) = np.flatnonzero(np.diff(lost.time) < 1e-9)
+    assert lost.phase[jump] == lost.phase[jump + 1]
+    assert abs(lost.setpoints(flown=True).state[:, 3]).max() < 1e4
+    made = export(lost, tmp_path / "fall.csv", "setpoints", flown=True)
+    fallen = np.loadtxt(made.path, delimiter=",", skiprows=1)[-6:, 4]
+    assert fallen == pytest.approx(lost.position[-1, :, 2], rel=1e-8, abs=1e-8)
+
+
 def test_the_part_that_is_tracked(flight, tmp_path):
     """A phase at the beginning without a reference is left out, and named; files with their own time begin there."""
     state = {}

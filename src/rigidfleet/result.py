@@ -19,6 +19,7 @@ from datetime import UTC, datetime
 from functools import cache, cached_property
 from importlib.metadata import PackageNotFoundError, version
 from inspect import Parameter, Signature
+from itertools import pairwise
 from pathlib import Path
 from typing import (
     TYPE_CHECKING,
@@ -616,7 +617,10 @@ class Result:
         state = np.stack([nothing if x is None else x for x in references], axis=1)
         if flown:
             motion = self.position, self.velocity, self.acceleration
-            parts = [self.samples(k) for k in range(len(self.phases))]
+            # Forces jump where two samples have one time: at a change of phase and at a loss.
+            jumps = np.flatnonzero(np.nextafter(self.time[:-1], np.inf) >= self.time[1:]) + 1
+            ends = [0, *jumps.tolist(), len(self.time)]
+            parts = [slice(*pair) for pair in pairwise(ends)]
             state = np.concatenate(
                 [of_motion(*(x[part] for x in (*motion, self.time))) for part in parts]
             )
