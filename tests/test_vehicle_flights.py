@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import rigidfleet as rf
+from rigidfleet._common.text import percent
 from rigidfleet.mission import Mission, load_mission
 from rigidfleet.planning.vehicles import TickTables, Turn, sampled_flight
 from rigidfleet.result import Result
@@ -307,9 +308,9 @@ def test_a_controller_may_command_rotors():
 @pytest.mark.parametrize(
     ("command", "words"),
     [
-        (lambda seen: hover(seen, thrust=np.ones(2)), "AttitudeCommand .* whose thrust is not an array"),
+        (lambda seen: hover(seen, thrust=np.ones(2)), "returned an AttitudeCommand .* whose thrust is not an array"),
         (lambda seen: hover(seen, attitude=np.zeros((3, 4))), "attitude of norm zero"),
-        (lambda _: rf.RotorCommand(np.full((3, 4), np.nan)), "RotorCommand .* whose speed is not"),
+        (lambda _: rf.RotorCommand(np.full((3, 4), np.nan)), "returned a RotorCommand .* whose speed is not"),
         (lambda _: rf.RotorCommand("fast"), "RotorCommand .* whose speed is not"),
     ],
 )  # fmt: skip
@@ -419,7 +420,8 @@ def test_check_tells_what_vehicles_cannot_give(legs, tables, words):
     assert remark.level == "fails"
     assert words in remark.text
     verdict = rf.assess(rf.simulate(mission))
-    assert not next(c for c in verdict.checks if c.check == "saturation").passed
+    saturation = next(c for c in verdict.checks if c.check == "saturation")
+    assert not saturation.passed
 
 
 @pytest.mark.parametrize("integral", [0.0, 1.0])
@@ -437,3 +439,11 @@ def test_check_knows_the_integral_of_the_tracking(integral):
     off = np.linalg.norm(flown.position - flown.slot_position, axis=2)[-1].max()
     assert found.disturbed.offset[0] == pytest.approx(off, rel=0.05, abs=2e-3)
     assert any("no integral" in r.text for r in found.remarks) == (integral == 0.0)
+
+
+@pytest.mark.parametrize(
+    ("share", "words"), [(1.0, "100 %"), (0.5714, "57 %"), (0.0996, "10 %"), (0.00251, "0.25 %")]
+)
+def test_shares_in_per_cent(share, words):
+    """Shares are told without powers of ten."""
+    assert percent(share) == words

@@ -26,6 +26,7 @@ from rigidfleet.simulation.callbacks import (
     Controller,
     Observation,
     checked_command,
+    named,
 )
 from rigidfleet.simulation.diagnosis import diagnose
 from rigidfleet.simulation.recording import Piece, VehicleSamples
@@ -138,7 +139,7 @@ class SampledPhase(ActivePhase):
         arrays = checked_command(given, len(self.lost), self.t)
         if self.flight.vehicles.point.any():
             raise FlightError(
-                f"the controller returned a {type(given).__name__} at t = {self.t:.3f} s, but some agents are points;"
+                f"the controller returned {named(given)} at t = {self.t:.3f} s, but some agents are points;"
                 " return forces [N]"
             )
         if isinstance(given, AttitudeCommand):
