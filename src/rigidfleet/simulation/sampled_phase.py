@@ -18,7 +18,7 @@ from rigidfleet.kernel.records import Record
 from rigidfleet.math import attitude as att
 from rigidfleet.mission import Mission
 from rigidfleet.planning.reference import ByEdge
-from rigidfleet.planning.vehicles import TickTables, sampled_flight, turn_from
+from rigidfleet.planning.vehicles import TickTables, first_yaw, sampled_flight, turn_from
 from rigidfleet.simulation.active_phase import ActivePhase
 from rigidfleet.simulation.callbacks import (
     AttitudeCommand,
@@ -26,6 +26,7 @@ from rigidfleet.simulation.callbacks import (
     Controller,
     Observation,
     checked_command,
+    named,
 )
 from rigidfleet.simulation.diagnosis import diagnose
 from rigidfleet.simulation.recording import Piece, VehicleSamples
@@ -42,9 +43,9 @@ class Vehicles:
     def __init__(self, mission: Mission) -> None:
         self.flight = sampled_flight(mission)
         self.tables = TickTables(mission, self.flight)
-        yaw = 0.0 if mission.body_frame is None else math.radians(mission.body_frame.yaw_deg)
         start = mission.fleet
-        self.yaw = np.full(mission.n_agents, yaw)  # asked of each vehicle at the last switch
+        self.yaw = first_yaw(mission)  # asked of each vehicle at the last switch
+        yaw = float(self.yaw[0])
         self.S = fleet.hovering(self.flight.vehicles, start.position, start.velocity, yaw)
         self.state: fleet.SampledState | None = None  # of the phase before
         self.edges = np.zeros((0, 2), dtype=np.int64)  # of that state
@@ -138,7 +139,7 @@ class SampledPhase(ActivePhase):
         arrays = checked_command(given, len(self.lost), self.t)
         if self.flight.vehicles.point.any():
             raise FlightError(
-                f"the controller returned a {type(given).__name__} at t = {self.t:.3f} s, but some agents are points;"
+                f"the controller returned {named(given)} at t = {self.t:.3f} s, but some agents are points;"
                 " return forces [N]"
             )
         if isinstance(given, AttitudeCommand):
