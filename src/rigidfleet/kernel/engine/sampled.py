@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from rigidfleet.kernel.avoidance import Avoidance
 from rigidfleet.kernel.engine import native
-from rigidfleet.kernel.engine.packing import UNRECORDED, pack, packed
+from rigidfleet.kernel.engine.packing import UNRECORDED, Packed, pack, packed
 from rigidfleet.kernel.fleet import ENDLESS, Evaluation, Flight, SampledSegment, SampledState
 from rigidfleet.kernel.problem import Problem, Workspace
 from rigidfleet.kernel.records import Segment
@@ -18,12 +19,13 @@ def fly_ticks(
     flight: Flight,
     state: SampledState,
     segment: SampledSegment,
+    avoidance: Avoidance | None = None,
 ) -> int:
     """Fly to the end of the segment, see `rigidfleet.kernel.sampled_flight.fly_ticks`.
 
     The state and the samples of the segment are written; ``state.count[fleet.SAMPLES]`` is the next sample, which the
     caller sets to 0 for a new segment. The problem must be in the inertial formulation, and without disturbances: the
-    flight brings its own.
+    flight brings its own. With ``avoidance``, forces pass through its barriers and its guard.
     """
     code, work = native.sampled(), state.work
     _check(flight, state, workspace)
@@ -33,11 +35,34 @@ def fly_ticks(
         )
     law = pack(Segment(0.0, False, 0, work.law_time, work.law_state, work.law_rate))
     recorded = pack(UNRECORDED)
-    call = pack(
-        segment._replace(recorder=code.recorder, segment=law.address, record=recorded.address)
+    arguments = packed(problem), packed(workspace), packed(flight), packed(state)
+    segment = segment._replace(
+        recorder=code.recorder, segment=law.address, record=recorded.address
     )
-    arguments = packed(problem), packed(workspace), packed(flight), packed(state), call
+    kept = None
+    if avoidance is not None:
+        kept = _of(avoidance, problem, workspace)
+        segment = segment._replace(guard=native.avoiding().address, avoidance=kept.address)
+    arguments = *arguments, pack(segment)
     return code.fly_ticks(*(a.address for a in arguments))
+
+
+def avoid(
+    problem: Problem,
+    workspace: Workspace,
+    flight: Flight,
+    state: SampledState,
+    avoidance: Avoidance,
+) -> int:
+    """Filter and guard ``state.force`` once, at ``state.work.law_time``; see `rigidfleet.kernel.guard.avoid`."""
+    kept = _of(avoidance, problem, workspace)
+    return native.avoiding().avoid(packed(flight).address, packed(state).address, kept.address, 0)
+
+
+def _of(avoidance: Avoidance, problem: Problem, workspace: Workspace) -> Packed:
+    """Avoidance that knows the law whose forces it changes."""
+    addresses = packed(problem).address, packed(workspace).address
+    return packed(avoidance._replace(problem=addresses[0], workspace=addresses[1]))
 
 
 def _check(flight: Flight, state: SampledState, workspace: Workspace) -> None:
