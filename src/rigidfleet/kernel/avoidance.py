@@ -6,7 +6,7 @@ centres and surfaces: D and R contain the radii.
 """
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -82,7 +82,9 @@ class Avoidance(NamedTuple):
     count: Ints  # (3,) see `TICKS`
     acted: Ints  # (3, N) ticks at which each acted on a vehicle, see `BARRIER`
     first: Floats  # (3, N) time of the first one [s], infinity if none
-    margin: Floats  # (2, 2) least of dist(S, S) - D, of dist(S, obstacle) - R [m], and their times [s]
+    margin: (
+        Floats  # (2, 2) least of dist(S, S) - D, of dist(S, obstacle) - R [m], and their times [s]
+    )
     between: Ints  # (2, 2) vehicle, and the other or the obstacle
     lost: Floats  # (2, 2) time at which a margin first was negative [s], infinity if none; and its value [m]
     loser: Ints  # (2, 2) vehicle, and the other or the obstacle
@@ -109,7 +111,7 @@ def avoidance(
     filtered: bool = True,
     edges: int = 0,
 ) -> Avoidance:
-    """Avoidance of a fleet; see `Avoidance`. Each of ``drag`` [1/s], ``lag``, ``spare`` is one number or one a vehicle."""
+    """Avoidance of a fleet; see `Avoidance`. ``drag`` [1/s], ``lag`` and ``spare`` are one for all, or (N,)."""
     n, count = len(b), len(boxes)
     capacity = n * (n - 1) if n <= _FEW else _NEIGHBOURS * n
     rows = min(capacity // 2, _BARRIERS * n) + n * count
@@ -122,7 +124,8 @@ def avoidance(
         boxes=np.ascontiguousarray(boxes, dtype=float).reshape(-1, 6), candidates=candidates(),
         start=np.zeros(n + 1, dtype=np.int64), near=np.zeros(capacity, dtype=np.int64), floor=np.zeros(capacity),
         order=np.arange(n), listed=np.full((n, 3), np.inf), span=np.zeros(3),
-        known=np.zeros((3, n, 3)), wanted=np.zeros((n, 3)), shift=np.zeros((n, 3)), chosen=np.zeros((n, 3)), rise=np.zeros((n, 3)), ways=np.zeros((n, 4, 3)),
+        known=np.zeros((3, n, 3)), wanted=np.zeros((n, 3)), shift=np.zeros((n, 3)),
+        chosen=np.zeros((n, 3)), rise=np.zeros((n, 3)), ways=np.zeros((n, 4, 3)),
         far=np.zeros(n), walls=np.zeros((n, count)), trial=np.zeros((5, 3)), normal=np.zeros(3),
         rows=np.zeros((rows, 2), dtype=np.int64), normals=np.zeros((rows, 3)), needed=np.zeros(rows),
         push=np.zeros(rows), most=np.zeros(rows), hold=np.ones(n), pull=np.zeros(edges),
@@ -131,13 +134,19 @@ def avoidance(
     )  # fmt: skip
 
 
-def renewed(given: Avoidance, edges: int) -> Avoidance:
-    """The same avoidance in the next phase, which has so many edges and a record of its own."""
+def renewed(given: Avoidance) -> Avoidance:
+    """The same avoidance in the next phase, which has a record of its own."""
     given.count[TICKS] = 0
-    return given._replace(pull=np.zeros(edges), **_record(len(given.b)))
+    return given._replace(**_record(len(given.b)))
 
 
-def _record(n: int) -> dict[str, Floats | Ints]:
+def holding(given: Avoidance, edges: int) -> Avoidance:
+    """The same avoidance for so many other edges; neighbours are listed again."""
+    given.count[LISTED] = 0
+    return given._replace(pull=np.zeros(edges))
+
+
+def _record(n: int) -> dict[str, Any]:
     none = np.full((2, 2), -1)
     endless = np.array([[math.inf, 0.0]] * 2)
     return {
@@ -175,4 +184,3 @@ def candidates() -> Floats:
         return np.stack([across * np.cos(angle), across * np.sin(angle), np.cos(polar)], axis=1)
 
     return np.concatenate([directions(26), 0.4 * directions(12), np.zeros((1, 3))])
-

@@ -168,10 +168,15 @@ def entry(i, j, n, k, l, m, a):
     """Entry of A for two rows: unit vectors n and m (3,), vehicles i and j, k and l (-1: none)."""
     found = 0.0
     dot = n[0] * m[0] + n[1] * m[1] + n[2] * m[2]
-    if i == k or (i == l and l >= 0):
-        found += (dot if i == k else -dot) / a.weight[i]
-    if j >= 0 and (j == k or j == l):
-        found += (-dot if j == k else dot) / a.weight[j]
+    if i == k:
+        found += dot / a.weight[i]
+    elif i == l:
+        found -= dot / a.weight[i]
+    if j >= 0:
+        if j == k:
+            found -= dot / a.weight[j]
+        elif j == l:
+            found += dot / a.weight[j]
     return found
 
 
@@ -258,7 +263,7 @@ def limit(i, a):
 
 @compiled
 def filter_accelerations(t, r, v, lost, p, w, a):
-    """Change the accelerations asked for as little as possible, so that all barriers hold; returns whether any did not."""
+    """Change what is asked for as little as possible, so that all barriers hold; returns whether any did not."""
     count, violated = list_barriers(r, v, lost, a)
     n = a.b.shape[0]
     if violated:

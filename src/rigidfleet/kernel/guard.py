@@ -427,8 +427,7 @@ def choose(i, r, v, a):
 def tally(kind, i, t, a):
     """Count that a layer has acted on vehicle i at this tick."""
     a.acted[kind, i] += 1
-    if t < a.first[kind, i]:
-        a.first[kind, i] = t
+    a.first[kind, i] = min(a.first[kind, i], t)
 
 
 @compiled

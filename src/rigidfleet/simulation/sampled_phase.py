@@ -10,13 +10,14 @@ import numpy as np
 
 from rigidfleet._common.text import agent_names
 from rigidfleet.errors import FlightError, StoppedError
-from rigidfleet.kernel import fleet, records
+from rigidfleet.kernel import avoidance, fleet, records
 from rigidfleet.kernel.engine import native
 from rigidfleet.kernel.engine.sampled import fly_ticks
 from rigidfleet.kernel.problem import Problem
 from rigidfleet.kernel.records import Record
 from rigidfleet.math import attitude as att
 from rigidfleet.mission import Mission
+from rigidfleet.planning.avoidance import avoidance_in_flight
 from rigidfleet.planning.vehicles import TickTables, sampled_flight, turn_from, yaw_at
 from rigidfleet.simulation.active_phase import ActivePhase
 from rigidfleet.simulation.callbacks import (
@@ -41,6 +42,7 @@ class Vehicles:
     def __init__(self, mission: Mission) -> None:
         self.flight = sampled_flight(mission)
         self.tables = TickTables(mission, self.flight)
+        self.avoidance = avoidance_in_flight(mission, self.flight)
         yaw = 0.0 if mission.body_frame is None else math.radians(mission.body_frame.yaw_deg)
         start = mission.fleet
         self.yaw = np.full(mission.n_agents, yaw)  # asked of each vehicle at the last switch
@@ -58,6 +60,8 @@ class SampledPhase(ActivePhase):
     def __init__(self, *arguments: Any, vehicles: Vehicles, **options: Any) -> None:
         self.vehicles, self.flight = vehicles, vehicles.flight
         self.tabled: Problem | None = None  # the plan's problem for which the tables are
+        if vehicles.avoidance is not None:
+            vehicles.avoidance = avoidance.renewed(vehicles.avoidance)
         self.led = False  # whether the reference is given piece by piece
         super().__init__(*arguments, **options)
         yaw = vehicles.tables.yaw
@@ -82,6 +86,8 @@ class SampledPhase(ActivePhase):
             begun = renewed._replace(**{name: getattr(begun, name) for name in kept})
         begun.peak_time[:] = begun.worst_time[:] = t
         self.sampled = given.state = begun._replace(trail=trail._replace(gauge=trail.gauge[:, :0]))
+        if given.avoidance is not None:
+            given.avoidance = avoidance.holding(given.avoidance, m)
         self.first_tick = int(self.sampled.count[fleet.TICKS])
         self.tabled = None
 
@@ -121,6 +127,11 @@ class SampledPhase(ActivePhase):
                 f"the controller returned a {type(given).__name__} at t = {self.t:.3f} s, but some agents are points;"
                 " return forces [N]"
             )
+        if self.vehicles.avoidance is not None:
+            raise FlightError(
+                f"the controller returned a {type(given).__name__} at t = {self.t:.3f} s, which [avoidance] cannot"
+                " change; return forces [N], or remove [avoidance]"
+            )
         if isinstance(given, AttitudeCommand):
             commands = self.flight.commands._replace(kind=fleet.ATTITUDE, **arrays)
         else:
@@ -138,6 +149,8 @@ class SampledPhase(ActivePhase):
         self.sampled.count[fleet.TRAILED] = self.state.count[4] = 0
         ticks = int(self.sampled.count[fleet.TICKS]) - self.first_tick
         self.extremes.take_vehicles(self.sampled, self.flight.vehicles, self.lost, ticks)
+        if self.vehicles.avoidance is not None:
+            self.extremes.take_avoidance(self.vehicles.avoidance)
 
     def _segment(self, problem: Problem, t_end: float) -> None:
         """Fly to ``t_end`` [s] and record the samples on the way."""
@@ -145,14 +158,14 @@ class SampledPhase(ActivePhase):
         n, m = len(plan.masses), len(plan.edges)
         self.flown = problem
         times = self.sampler(plan, self.t, t_end, first=not self.begun, stop=self.stop)
-        self.begun = True
+        self.begun, given = True, self.vehicles.avoidance
         call = fleet.segment(n, m, t_end, times, _STEPS)
         sampled.count[fleet.SAMPLES] = 0
         status = records.PAUSED
         try:
             while status == records.PAUSED:
                 self._supply()
-                status = fly_ticks(problem, self.workspace, self.flight, sampled, call)
+                status = fly_ticks(problem, self.workspace, self.flight, sampled, call, given)
                 self._follow()
                 if status == records.FINISHED:  # to a rounding error of the grid of steps
                     self.state.clock[0] = t_end
@@ -174,6 +187,11 @@ class SampledPhase(ActivePhase):
             raise StoppedError(
                 f"the motion of {who} grows beyond all bounds by t = {self.t:.2f} s: the control is unstable. Lower"
                 " the gains, or raise the rates in [autopilot]"
+            )
+        if given is not None and given.count[avoidance.FULL]:
+            raise StoppedError(
+                f"avoidance cannot go on at t = {self.t:.2f} s: too many vehicles are near each other for their"
+                " speeds. Fly slower, or farther apart"
             )
         if status != records.FINISHED:
             own = self.external is not None

@@ -259,7 +259,7 @@ class _SecondProcess:
 
 
 def main(part: str) -> None:
-    """Write machine code to standard output: of "flight", the "half" of it that the second process makes, or of a library.
+    """Write machine code to standard output: of "flight", the "half" that the second process makes of it, or a library.
 
     Numba's internals are used where they are known; else the second process makes the monitor alone.
     """

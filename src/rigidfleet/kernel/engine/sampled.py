@@ -36,9 +36,7 @@ def fly_ticks(
     law = pack(Segment(0.0, False, 0, work.law_time, work.law_state, work.law_rate))
     recorded = pack(UNRECORDED)
     arguments = packed(problem), packed(workspace), packed(flight), packed(state)
-    segment = segment._replace(
-        recorder=code.recorder, segment=law.address, record=recorded.address
-    )
+    segment = segment._replace(recorder=code.recorder, segment=law.address, record=recorded.address)
     kept = None
     if avoidance is not None:
         kept = _of(avoidance, problem, workspace)
