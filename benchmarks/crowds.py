@@ -195,7 +195,9 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     chosen = parser.parse_args()
     native.avoiding()
-    print("| swap | least distance (0.5) | least margin | arrive | last at | barrier | guard | both cost |")
+    print(
+        "| swap | least distance (0.5) | least margin | arrive | last at | barrier | guard | both cost |"
+    )
     print("|---|---|---|---|---|---|---|---|")
     for n, radius, ring, longest in SWAPS:
         runs = [
@@ -214,7 +216,9 @@ def main() -> None:
             flush=True,
         )
     barrier, guard = layers()
-    print(f"\nFilter {barrier:.2f} us, guard {guard:.2f} us a vehicle and tick, among 100 vehicles.")
+    print(
+        f"\nFilter {barrier:.2f} us, guard {guard:.2f} us a vehicle and tick, among 100 vehicles."
+    )
     print(f"Nothing in range: {100 * out_of_range():.1f} % of a flight of eight.")
 
 

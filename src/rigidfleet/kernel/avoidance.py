@@ -30,8 +30,7 @@ EXACT = 64
 class Avoidance(NamedTuple):
     """What avoidance reads and writes at the ticks of the formation's law; K candidates, P entries of neighbours."""
 
-    problem: int  # address of the `Problem` whose law gave the forces
-    workspace: int  # of its `Workspace`
+    law: Ints  # (2,) addresses of the `Problem` whose law gave the forces, and of its `Workspace`
     guarded: bool
     filtered: bool
     period: float  # for which a command is held [s]
@@ -117,7 +116,7 @@ def avoidance(
     rows = min(capacity // 2, _BARRIERS * n) + n * count
     radius = np.asarray(radius, dtype=float)
     return Avoidance(
-        problem=0, workspace=0, guarded=guarded, filtered=filtered, period=float(period), rate=float(rate),
+        law=np.zeros(2, dtype=np.int64), guarded=guarded, filtered=filtered, period=float(period), rate=float(rate),
         share=float(share), release=float(release), b=_each(b, n), lift=_each(lift, n), weight=_each(mass, n),
         g=float(g), coast=_coast(_each(drag, n), period), lag=_each(lag, n), spare=_each(spare, n),
         room=radius + 0.5 * separation, reach=radius + clearance,

@@ -348,10 +348,18 @@ def note(kind, value, t, i, j, a):
 
 
 @compiled
+def alone(i, a):
+    """Whether vehicle i has neither neighbours nor obstacles."""
+    return a.start[i + 1] == a.start[i] and a.boxes.shape[0] == 0
+
+
+@compiled
 def set_floors(t, r, v, lost, a):
     """Let all vehicles brake, and find the distances that their stop segments keep, as they should or as they do."""
     n, acceleration = a.b.shape[0], a.trial[3]
     for i in range(n):
+        if alone(i, a):
+            continue
         brake(i, v[i], a, acceleration)
         speed = math.sqrt(v[i, 0] ** 2 + v[i, 1] ** 2 + v[i, 2] ** 2)
         stop = stop_distance(speed, i, a)
@@ -469,8 +477,9 @@ def avoid(p, w, flight, state, a):
         i = (k + a.count[TICKS]) % n  # each comes first in turn
         if lost[i]:
             continue
-        how = choose(i, r, v, a) if a.guarded else 0
-        if not a.guarded:
+        free = alone(i, a) or not a.guarded
+        how = 0 if free else choose(i, r, v, a)
+        if free:
             for q in range(3):
                 a.chosen[i, q] = a.wanted[i, q]
         if how > 0:

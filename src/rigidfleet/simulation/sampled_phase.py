@@ -149,8 +149,7 @@ class SampledPhase(ActivePhase):
         self.sampled.count[fleet.TRAILED] = self.state.count[4] = 0
         ticks = int(self.sampled.count[fleet.TICKS]) - self.first_tick
         self.extremes.take_vehicles(self.sampled, self.flight.vehicles, self.lost, ticks)
-        if self.vehicles.avoidance is not None:
-            self.extremes.take_avoidance(self.vehicles.avoidance)
+        self.extremes.avoidance = self.vehicles.avoidance
 
     def _segment(self, problem: Problem, t_end: float) -> None:
         """Fly to ``t_end`` [s] and record the samples on the way."""

@@ -117,7 +117,7 @@ def avoidance_code() -> list[bytes]:
 
     def avoid(f, s, given, _):
         a = avoidance(given)
-        return guard.avoid(problem(a.problem), workspace(a.workspace), flight(f), state(s), a)
+        return guard.avoid(problem(a.law[0]), workspace(a.law[1]), flight(f), state(s), a)
 
     return [_object(*_module(avoid, objects.AVOIDANCE_ENTRY), hot=())]
 

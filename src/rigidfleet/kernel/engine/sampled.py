@@ -59,8 +59,8 @@ def avoid(
 
 def _of(avoidance: Avoidance, problem: Problem, workspace: Workspace) -> Packed:
     """Avoidance that knows the law whose forces it changes."""
-    addresses = packed(problem).address, packed(workspace).address
-    return packed(avoidance._replace(problem=addresses[0], workspace=addresses[1]))
+    avoidance.law[:] = packed(problem).address, packed(workspace).address
+    return packed(avoidance)
 
 
 def _check(flight: Flight, state: SampledState, workspace: Workspace) -> None:
