@@ -71,8 +71,7 @@ def kernel(n: int, **given: Any) -> tuple[Any, ...]:
     work = workspace(n, 0)
     state = fleet.begin(flight, np.zeros((n, fleet.STATES)), work)
     a = avoidance(
-        period=PERIOD, b=THRUST * mass, lift=THRUST * mass, mass=mass, g=0.0, radius=0.5 * APART * mass,
-        boxes=np.zeros((0, 6)), **given,
+        period=PERIOD, b=THRUST * mass, lift=THRUST * mass, mass=mass, g=0.0, radius=0.5 * APART * mass, **given,
     )  # fmt: skip
     return problem, work, flight, state, a
 

@@ -83,6 +83,8 @@ def _value(entry: dict[str, Any]) -> str:
         case {"type": "array", "items": {"$ref": target}}:
             return f"list of tables, see `{target.rpartition('/')[2].lower()}`"
         case {"type": "array", "items": {"type": "array", "items": inner, **size}}:
+            if "minItems" not in size:
+                return f"list of lists of {_PLURAL[inner['type']]}"
             return f"list of [{size['minItems']} {_PLURAL[inner['type']]}]"
         case {"type": "array", "minItems": n}:
             return f"[{n} numbers]"
@@ -152,6 +154,8 @@ def _bounds() -> str:
         ("pairs of agents that touch, if all are as large as the largest", f"{bounds.TOUCHING:,}"),
         ("phases", f"{bounds.PHASES:,}"),
         ("obstacles", f"{bounds.OBSTACLES:,}"),
+        ("points of a hull", f"{bounds.HULL:,}"),
+        ("heights of a height map", f"{bounds.HEIGHTS:,}"),
         ("the heaviest vehicle over the lightest", f"{bounds.MASS_RATIO:g}"),
     ]
     return _table(("what", "at most"), rows)

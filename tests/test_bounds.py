@@ -70,7 +70,7 @@ BEYOND = [
     (HEAD + agents(4) + boxes(10_000) + HOLD, "obstacles", "10,000 entries; the maximum is 1,000"),
     (HEAD + agents(4) + formations(1000) + HOLD, "formations", "1,000 entries; the maximum is 200"),
     (HEAD + agents(100_000) + formations(100) + HOLD, "formations", "10,000,000 slots"),
-    (HEAD + agents(20_000, "assignment = 'each'\n") + HOLD, "assignment", "takes too long for 20,000 agents"),
+    (HEAD + agents(30_000, "assignment = 'each'\n") + HOLD, "assignment", "takes too long for 30,000 agents"),
     (HEAD + listed(100_000) + formation("line", 1.0) + ESTABLISH, "formations.f.edges", "4,999,950,000"),
     (
         HEAD + agents(10_000) + formation("grid", 1.0, "'neighbours'", "reach = 1e6\n") + ESTABLISH,

@@ -66,7 +66,9 @@ def everything(rows: int = 0) -> tuple[Any, ...]:
             wind=np.array([1.0, -2.0, 0.3]), gust=rng.normal(size=(9, n, 3)), gust_step=0.1, downwash=True,
             ground_effect=True, floor=np.full(n, 0.5),
         ),
-        sensing=fleet.Sensing(3, rng.integers(0, 9, n), True, 5, rng.integers(0, 30, (n, n))),
+        sensing=fleet.Sensing(
+            3, rng.integers(0, 9, n), True, 5, rng.integers(0, 30, (n, n)), np.zeros((0, 2), dtype=np.int64)
+        ),
         guidance=fleet.Guidance(np.full(n, 0.8), np.full((n, 3), 0.3)),
         tables=fleet.Tables(
             0, K, rng.normal(size=(K, n, 6)), yaw, 0.5 * small[0], small[1], 0.01 * small[2, ::3], 0.02 * small[3, ::3],
@@ -301,6 +303,29 @@ def test_messages_that_are_lost():
     call = fly(problem, work, flight, state, times[-1], times)
     np.testing.assert_allclose(state.heard[2, 6], call.S[39, 6, :6], rtol=0, atol=1e-14)
     np.testing.assert_allclose(state.heard[3, 6], call.S[99, 6, :6], rtol=0, atol=1e-14)
+
+
+def test_without_a_link_a_vehicle_presumes_the_other():
+    """It takes the other one to be as far off its slot as it is itself, and hears nothing of where that is."""
+    problem, work, flight, state = planned("cube-passage", 1, SIH)
+    pair = np.array([[0, 1]])
+    flight = flight._replace(sensing=flight.sensing._replace(linked=True, parted=pair))
+    state = fleet.begin(flight, state.S, work)
+    times = np.asarray(flight.start + 2e-3 * np.arange(301))
+    y = np.concatenate([state.S[:, :3].ravel(), state.S[:, 3:6].ravel(), state.integral[0]])
+    native.record(
+        problem, work, times[:1], y[None]
+    )  # what is presumed begins with the slots in `work`
+    call = fly(problem, work, flight, state, times[-1], times)
+    k = 299
+    S = call.S[k, :, :6]
+    y = np.concatenate([S[:, :3].ravel(), S[:, 3:].ravel(), call.integral[k]])
+    slots = native.record(problem, work, times[k : k + 1], y[None]).r_ref[0]
+    for i, j in ((0, 1), (1, 0)):
+        presumed = S[i, :3] + slots[j] - slots[i]
+        np.testing.assert_allclose(state.heard[i, j, :3], presumed, rtol=0, atol=1e-8)
+        assert np.abs(presumed - S[j, :3]).max() > 1e-5
+    np.testing.assert_allclose(state.heard[2, 1], S[1], rtol=0, atol=1e-13)
 
 
 def test_a_law_at_a_slower_rate_holds_its_force():

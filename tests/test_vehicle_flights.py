@@ -1,5 +1,6 @@
 """Missions flown by vehicles: shipped ones and their promises, sampled points against continuous ones, bits."""
 
+import itertools
 import math
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 
 import rigidfleet as rf
 from rigidfleet.mission import load_mission
+from rigidfleet.planning.vehicles import TickTables, Turn, sampled_flight
 from rigidfleet.result import Result
 
 
@@ -348,3 +350,22 @@ def test_a_record_of_rotors_that_lies_is_found():
     assert not found["rotor_force"].passed
     assert found["rotor_force"].worst == pytest.approx(7.0)
     assert not found["record"].passed
+
+
+def test_yaw_along_the_way_goes_on_from_table_to_table():
+    """Tables made one after the other hold the yaw of one table for the whole phase, on the same grid."""
+    mission = changed("passage-quadrotors", yaw={"kind": "along"})
+    flight = rf.Flight(mission)
+    while flight.begin() and flight.plan.phase.name != "WP2":
+        flight.advance()
+    problem, start = flight.plan.problem, flight.plan.start
+    first = round(start * mission.autopilot.rate)
+    turn = Turn(start, np.array([0.3, -0.2, 1.0]), np.zeros(3))
+    sampled = sampled_flight(mission)
+    whole = TickTables(mission, sampled).made(first, first + 1500, problem, turn).yaw
+    tables, ends = TickTables(mission, sampled), first + np.array([0, 7, 403, 1001, 1500])
+    pieces = [tables.made(a, b, problem, turn).yaw for a, b in itertools.pairwise(ends)]
+    np.testing.assert_allclose(
+        np.concatenate(pieces), whole, rtol=0, atol=1e-9
+    )  # of an integration
+    assert np.ptp(whole[:, :, 0], axis=0).min() > 0.1

@@ -95,6 +95,17 @@ class Target(_Moment, total=False):
     through: list[Passed]
 
 
+class Planned(_Moment):
+    """Certificate of a phase: the least separation of the planned paths [m], its time [s], the two agents, the proof.
+
+    Agents are counted from 0. ``how`` is "closed form" or "polygons less sagitta".
+    """
+
+    separation: float
+    agents: tuple[int, int]
+    how: str
+
+
 class Statistics(TypedDict, total=False):
     """Statistics of the integrator. Other keys are allowed."""
 
@@ -139,6 +150,9 @@ class PhaseRecord:
     target : for phases with a goal of their own (fly, turn, orbit), and for establish phases with a commanded
         attitude: {"time" [s], "position" [m], "velocity" [m/s], "attitude" quaternion, "rates" [rad/s]}. Entries other
         than the time are None if nothing is commanded
+    abandoned : whether the loss of a vehicle or link ended it, before its own end
+    planned : certificate of the planned paths, before the flight: {"separation" [m], "time" [s], "agents" from 0,
+        "how"}. None if agents track no slots, or there is a single agent
     extremes : worst values of the phase in continuous time, by name: separation, clearance, separation_below, lost
         (distance of a lost vehicle to one that still flies), geofence (distance beyond it), lowest, highest [m];
         speed [m/s]; acceleration [m/s^2]; thrust, thrust_margin (thrust minus its limit), constraint_force, tension
@@ -160,9 +174,11 @@ class PhaseRecord:
     t_end: float
     settled: bool | None = None
     target: Annotated[dict[str, Any] | None, Target] = None
+    planned: Annotated[dict[str, Any] | None, Planned] = None
     extremes: Annotated[dict[str, Extremum], dict[str, tuple[float, float, int, int]]] = field(
         default_factory=dict
     )
+    abandoned: bool = False
 
     def __post_init__(self) -> None:
         self.extremes = {name: Extremum(*x) for name, x in (self.extremes or {}).items()}

@@ -50,7 +50,8 @@ def assess(result: Result | str | Path) -> Verdict:
     - a formation is off by more than `SHAPE_TOLERANCE`, mirrored, flipped or out of order, at the end of an
       establish or reshape phase or at the end of the flight;
     - a waypoint is missed by more than `WAYPOINT_TOLERANCE`;
-    - agents collide with each other or with an obstacle; or
+    - agents collide with each other or with an obstacle;
+    - agents that track slots come nearer to each other than planned, by more than `limits.separation_allowance`; or
     - a limit of the mission is exceeded.
 
     The worst values of the flight are reported in any case.

@@ -50,10 +50,12 @@ def all_checks(measured: Measurements, verdict: Verdict) -> Iterator[CheckResult
     worst = verdict.worst
     if "separation" in worst:
         yield _separation(measured, worst["separation"])
+        yield from _failures_or_worst(_as_planned(measured, verdict.phases))
     if "clearance" in worst:
         yield from _clearances(measured)
     if not measured.left.all():
         yield _lost(measured)
+    yield from _abandoned(measured)
     limits = measured.mission.limits
     if limits.separation_below is not None:
         yield _downwash(measured, limits.separation_below)
@@ -112,7 +114,7 @@ def _unseen(measured: Measurements) -> Iterator[CheckResult]:
     result = measured.result
     last = len(result.phases) - 1
     for i, p in enumerate(result.phases):
-        if not result.complete and i == last:
+        if p.abandoned or (not result.complete and i == last):
             continue
         target = p.target or {}
         moments = {"waypoint": target.get("time")}
@@ -278,6 +280,24 @@ def _separation(measured: Measurements, e: Extreme) -> CheckResult:
     return _bounded("separation", e, "m", limit, words, passed=passed, at_least=True)
 
 
+def _as_planned(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[CheckResult]:
+    """Compare the separation of each phase with the certificate of its plan."""
+    allowed = measured.mission.limits.separation_allowance
+    for record, phase in zip(measured.result.phases, phases, strict=True):
+        planned, e = record.planned, phase.worst.get("separation")
+        if planned is None or e is None:
+            continue
+        nearer = planned["separation"] - e.value
+        words = (
+            f"in phase '{phase.name}' {e.who} come within {value(e.value, 'm')} of each other at {e.when:.2f} s;"
+            f" the plan proves {value(planned['separation'], 'm')}, of which {allowed:g} m are allowed for tracking"
+        )
+        yield CheckResult(
+            "separation_as_planned", nearer <= allowed + _SLACK, words, nearer, allowed, "m",
+            when=e.when, who=e.who, phase=phase.name,
+        )  # fmt: skip
+
+
 def _since(measured: Measurements, name: str, sampled: Floats) -> str:
     """When a quantity first fell to zero, as far as the samples and the worst value of each phase show."""
     phases = range(len(measured.result.phases))
@@ -330,6 +350,28 @@ def _lost(measured: Measurements) -> CheckResult:
     return _bounded("lost", e, "m", 0.0, words, passed=e.value > 0, at_least=True)
 
 
+def _abandoned(measured: Measurements) -> Iterator[CheckResult]:
+    """Report the phases that the flight left, or never began, because a vehicle or link was lost."""
+    mission, flown = measured.mission, measured.result.phases
+    when = mission.first_loss
+    if mission.on_loss == "continue" or not when < measured.result.time[-1]:
+        return
+    begun = sum(p.t_start < when for p in flown)
+    left = [p.name for p in flown if p.abandoned]
+    never = [phase.name for phase in mission.phases[begun:]]
+    if not left + never:
+        return
+    parts = [f"'{name}' was left and is not judged" for name in left]
+    if never:
+        parts.append(
+            f"{', '.join(map(repr, never))} {'was' if len(never) == 1 else 'were'} not flown"
+        )
+    words = f"after the loss of {mission.first_lost} at {when:.2f} s, {'; '.join(parts)}"
+    yield CheckResult(
+        "abandoned", True, words, float(len(left + never)), None, "", when=when, judged=False
+    )
+
+
 def _downwash(measured: Measurements, limit: float) -> CheckResult:
     e = measured.below()
     if e is None:
@@ -377,6 +419,10 @@ def notes(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[str]:
     yield from _dips(measured)
     yield from _turned_over(measured, phases)
     yield from _fallen(measured)
+    pairs, times = measured.mission.links_lost
+    for (i, j), t in zip(pairs + 1, times, strict=True):
+        if t < measured.result.time[-1]:
+            yield f"the link {i}-{j} is lost at {t:.2f} s: after that, no edge joins agents {i} and {j}"
     agents = measured.mission.agents
     if agents.saturate:
         full = measured.thrust >= np.array(agents.thrust_limit) * (1 - 1e-6)
@@ -391,6 +437,9 @@ def notes(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[str]:
 def _left(measured: Measurements) -> Iterator[str]:
     """Note each phase that was left for another one before it arrived."""
     result = measured.result
+    yield from (check.message for check in _abandoned(measured))
+    if result.mission.on_loss != "continue":
+        return  # no phase of such a mission was begun by hand
     for phase, record in zip(result.mission.phases, result.phases, strict=False):
         if phase.meets and record.target is None and record.settled is None:
             yield f"'{record.name}' was left at {record.t_end:.2f} s, before its arrival, which is not judged"

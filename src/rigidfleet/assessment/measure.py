@@ -132,7 +132,7 @@ class Measurements:
         radius, obstacles = self.mission.agents.radius, self.mission.obstacles
         #: Clearance of each agent to obstacles [m], and the nearest obstacle (K, N).
         self.each_clearance, self.nearest = proximity.obstacle_clearances(
-            result.position, radius, obstacles
+            result.position, radius, obstacles, result.time
         )
         if not self.whole:
             self.each_clearance[~self.left] = np.inf
@@ -396,6 +396,7 @@ class Measurements:
         result, samples = self.result, self.samples[index]
         flown, last = samples.stop > samples.start, samples.stop - 1
         finished = flown and (result.complete or index < len(result.phases) - 1)
+        finished = finished and not record.abandoned
         fit, distances, constraint = self.fits.get(index), None, None
         if flown:
             constraint = _greatest(result.constraint[last])
@@ -426,11 +427,12 @@ class Measurements:
         )
 
     def edges(self, formation: str, k: int) -> tuple[Ints, Floats]:
-        """Edges (m, 2) of a formation between agents still flying at sample k, and their lengths (m,) [m]."""
+        """Edges (m, 2) of a formation that are not lost at sample k, and their lengths (m,) [m]."""
         _, edges, intended = self.formation(formation)
-        if self.whole:
+        if self.whole and not len(self.mission.links_lost[1]):
             return edges, intended
         kept = self.left[k][edges].all(axis=1)
+        kept &= self.mission.linked(edges, float(self.result.time[k]))
         return edges[kept], intended[kept]
 
     def formation(self, name: str) -> tuple[Floats | None, Ints, Floats]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from itertools import permutations, product
 from typing import NamedTuple
 
@@ -36,24 +37,57 @@ def closest_approach(
     pair : the two agents, from 0
     share : share of the path at which they are nearest, in [0, 1]
     """
-    p, q = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
-    n = len(p)
-    r = np.zeros(n) if radius is None else np.asarray(radius, dtype=np.float64)
     best = np.inf, (0, 0), 0.0
-    rows = max(1, _PAIRS // n)
-    for first in range(0, n - 1, rows):
-        i = np.arange(first, min(first + rows, n - 1))
-        x = p[i, None] - p[first + 1 :]
-        y = q[i, None] - q[first + 1 :] - x
-        # Nearest point to zero of the segment from x to x + y.
-        xy, yy = (x * y).sum(axis=2), (y * y).sum(axis=2)
-        s = np.clip(-xy / np.maximum(yy, 1e-300), 0.0, 1.0)
-        separation = np.linalg.norm(x + s[..., None] * y, axis=2) - r[i, None] - r[first + 1 :]
-        separation[np.tri(*separation.shape, -1, dtype=np.bool_)] = np.inf  # each pair once
+    for i, separation, s in _approaches(start, end, radius):
         k, j = np.unravel_index(int(separation.argmin()), separation.shape)
         if separation[k, j] < best[0]:
-            best = float(separation[k, j]), (int(i[k]), first + 1 + int(j)), float(s[k, j])
+            best = float(separation[k, j]), (int(i[k]), int(i[0] + 1 + j)), float(s[k, j])
     return best
+
+
+def nearer_than(distance: float, start: ArrayLike, end: ArrayLike) -> Ints:
+    """Pairs (m, 2), i < j, of agents that come nearer than a distance [m] on straight ways in step (N, 3) [m]."""
+    found = [np.zeros((0, 2), dtype=np.int64)]
+    for i, separation, _ in _approaches(start, end, None):
+        k, j = np.nonzero(separation < distance)
+        found.append(np.column_stack([i[k], i[0] + 1 + j]))
+    return np.concatenate(found)
+
+
+def _approaches(
+    start: ArrayLike, end: ArrayLike, radius: ArrayLike | None
+) -> Iterator[tuple[Ints, Floats, Floats]]:
+    """Of some agents (k,), in turn all: least separation from each later one (k, m), and the share of the way there.
+
+    Column j belongs to agent i[0] + 1 + j. The separation of pairs that occur in another place is infinite.
+    """
+    p, q = (np.asarray(x, dtype=np.float64).T.copy() for x in (start, end))
+    n, first = p.shape[1], 0
+    r = np.zeros(n) if radius is None else np.asarray(radius, dtype=np.float64)
+    while first < n - 1:
+        i = np.arange(first, min(first + max(1, _CACHED // (n - first)), n - 1))
+        x = p[:, i, None] - p[:, None, first + 1 :]
+        y = q[:, i, None] - q[:, None, first + 1 :]
+        y -= x
+        # Nearest point to zero of the segment from x to x + y.
+        s = _dot(x, y)
+        s /= -np.maximum(_dot(y, y), 1e-300)
+        np.clip(s, 0.0, 1.0, out=s)
+        y *= s
+        y += x
+        separation = np.sqrt(_dot(y, y))
+        separation -= r[i, None] + r[first + 1 :]
+        separation[np.tri(*separation.shape, -1, dtype=np.bool_)] = np.inf  # each pair once
+        yield i, separation, s
+        first = int(i[-1]) + 1
+
+
+def _dot(x: Floats, y: Floats) -> Floats:
+    """Scalar products (...) of vectors (3, ...)."""
+    z = x[0] * y[0]
+    z += x[1] * y[1]
+    z += x[2] * y[2]
+    return z
 
 
 def assigned(
@@ -117,24 +151,120 @@ def assigned(
     return min(safe, key=lambda o: (-round(separation[id(o)], 2), *worth(o)))
 
 
-#: Number of pairs processed together; work on assignments, N^3 each, of some seconds.
-_PAIRS, _WORK = 200_000, 2e9
+#: Number of pairs processed together, which then stay in the processor's cache.
+_CACHED = 20_000
+#: Work on assignments, N^3 each, of some seconds.
+_WORK = 2e9
 
 
 #: Greatest number of assignments from one attitude.
 _ROUNDS = 20
 
 
+#: Numbers of agents up to which the least sum of squares is found from nothing, and from an exchange.
+_PLAIN, _LEAST = 300, 1024
+#: Rounds in which prices of slots are estimated. More cost more than they save.
+_PRICED = 5
+
+
 def _nearest_slots(p: Floats, q: Floats) -> Ints:
-    """Order (N,) of slots q (N, 3) with the least sum of squared distances from p."""
-    near = p @ q.T  # |p|^2 + |q|^2 is the same for every order
+    """Order (N,) of slots q (N, 3) in which no two agents p (N, 3) reduce the sum of squares by an exchange.
+
+    For up to `_LEAST` agents the sum is the least of all orders.
+    """
     n = len(p)
     if n <= _TRIED:
+        near = p @ q.T  # |p|^2 + |q|^2 is the same for every order
         orders = np.array(list(permutations(range(n))), dtype=np.int64)
         return orders[near[np.arange(n), orders].sum(axis=1).argmax()]
+    if n > _LEAST:
+        return exchanged(p, q)
     from scipy.optimize import linear_sum_assignment
 
-    return linear_sum_assignment(-near)[1]
+    if n <= _PLAIN:
+        return linear_sum_assignment(-(p @ q.T))[1]
+    # Costs less prices have the same optimum. With prices near the optimal ones it is found five times faster.
+    order = exchanged(p, q)
+    cost = -(p @ q[order].T)
+    own, price, priced = cost.diagonal().copy(), np.zeros(n), np.empty_like(cost)
+    for _ in range(_PRICED):
+        np.add(cost, (price - own)[:, None], out=priced)
+        price = np.minimum(price, priced.min(axis=0))
+    cost -= price
+    return order[linear_sum_assignment(cost)[1]]
+
+
+#: Number of agents whose exchanges with all others are found together.
+_TOGETHER = 64
+#: A sum of squares counts as reduced beyond this share of the greatest squares.
+_ROUNDING = 1e-12
+
+
+def exchanged(p: Floats, q: Floats) -> Ints:
+    """Order (N,) of slots q (N, 3) from which no exchange of two slots brings agents p (N, 3) nearer.
+
+    If i and j exchange their slots, the sum of squared distances falls by -2 x . y, x = p_i - p_j, y = q_i - q_j.
+    Exchanges of pairs with x . y < 0 therefore end, and leave x . y >= 0 for all pairs, up to rounding. Agents and
+    slots that are halved along their longest axis again and again give an order from which few exchanges are left.
+    """
+    n, order = len(p), _halved(p, q)
+    # x . y of agents i and j is the product of row i of one matrix and row j of the other.
+    rows, columns = np.ones((n, 8)), np.ones((n, 8))
+
+    def put(i: Ints) -> None:
+        slots = q[order[i]]
+        own = np.einsum("ia,ia->i", p[i], slots)
+        rows[i, :3], rows[i, 3:6], rows[i, 7] = p[i], slots, own
+        columns[i, :3], columns[i, 3:6], columns[i, 6] = -slots, -p[i], own
+
+    put(np.arange(n))
+    least = -_ROUNDING * float((p**2).sum(axis=1).max() + (q**2).sum(axis=1).max())
+    found = True
+    while found:
+        found = False
+        for first in range(0, n, _TOGETHER):
+            i = np.arange(first, min(first + _TOGETHER, n))
+            while len(i):
+                xy = rows[i] @ columns.T
+                j = xy.argmin(axis=1)
+                gain = xy[np.arange(len(i)), j]
+                bad = np.flatnonzero(gain < least)
+                if not len(bad):
+                    break
+                found = True
+                bad = bad[np.argsort(gain[bad], kind="stable")]
+                i, j = _apart(i[bad], j[bad])
+                order[i], order[j] = order[j], order[i]
+                put(np.concatenate([i, j]))
+                i = np.union1d(i, j[(j >= first) & (j < first + _TOGETHER)])
+    return order
+
+
+def _apart(i: Ints, j: Ints) -> tuple[Ints, Ints]:
+    """Those of the pairs (i, j), from the first on, that share no agent."""
+    taken: set[int] = set()
+    kept = []
+    for pair in zip(i.tolist(), j.tolist(), strict=True):
+        if taken.isdisjoint(pair):
+            taken.update(pair)
+            kept.append(pair)
+    one, other = np.array(kept, dtype=np.int64).T
+    return one, other
+
+
+def _halved(p: Floats, q: Floats) -> Ints:
+    """Order (N,) of slots q (N, 3) for agents p (N, 3): both are halved along the longest axis until one is left."""
+    order = np.empty(len(p), dtype=np.int64)
+    left = [(np.arange(len(p)), np.arange(len(p)))]
+    while left:
+        i, j = left.pop()
+        if len(i) == 1:
+            order[i] = j
+            continue
+        axis, half = int((np.ptp(p[i], axis=0) + np.ptp(q[j], axis=0)).argmax()), len(i) // 2
+        i, j = (k[np.argpartition(x[k, axis], half)] for k, x in ((i, p), (j, q)))
+        left += [(i[:half], j[:half]), (i[half:], j[half:])]
+    return order
 
 
 def _settled(p: Floats, q: Floats, turn: Floats, most: int) -> tuple[Assigned, int]:

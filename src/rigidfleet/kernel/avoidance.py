@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rigidfleet.solids.records import Solids, joined
 from rigidfleet.typing import Floats, Ints
 
 #: Columns of `Avoidance.count`: ticks, entries of the list of neighbours, whether the list is too short.
@@ -46,7 +47,7 @@ class Avoidance(NamedTuple):
     spare: Floats  # (N,) by which D and R are widened [m]
     room: Floats  # (N,) radius, and half of the separation to keep [m]
     reach: Floats  # (N,) radius, and the clearance to keep [m]
-    boxes: Floats  # (B, 6) obstacles
+    solids: Solids  # (B,) convex obstacles that stand still
     candidates: Floats  # (K, 3) accelerations that replace a refused one, in units of b
     # Neighbours
     start: Ints  # (N + 1,) those of vehicle i are at start[i] to start[i + 1]
@@ -97,7 +98,7 @@ def avoidance(
     mass: Floats,
     g: float,
     radius: Floats,
-    boxes: Floats,
+    solids: Solids | None = None,
     separation: float = 0.0,
     clearance: float = 0.0,
     drag: ArrayLike = 0.0,
@@ -111,7 +112,8 @@ def avoidance(
     edges: int = 0,
 ) -> Avoidance:
     """Avoidance of a fleet; see `Avoidance`. ``drag`` [1/s], ``lag`` and ``spare`` are one for all, or (N,)."""
-    n, count = len(b), len(boxes)
+    solids = joined([]) if solids is None else solids
+    n, count = len(b), len(solids.kind)
     capacity = n * (n - 1) if n <= _FEW else _NEIGHBOURS * n
     rows = min(capacity // 2, _BARRIERS * n) + n * count
     radius = np.asarray(radius, dtype=float)
@@ -120,7 +122,7 @@ def avoidance(
         share=float(share), release=float(release), b=_each(b, n), lift=_each(lift, n), weight=_each(mass, n),
         g=float(g), coast=_coast(_each(drag, n), period), lag=_each(lag, n), spare=_each(spare, n),
         room=radius + 0.5 * separation, reach=radius + clearance,
-        boxes=np.ascontiguousarray(boxes, dtype=float).reshape(-1, 6), candidates=candidates(),
+        solids=solids, candidates=candidates(),
         start=np.zeros(n + 1, dtype=np.int64), near=np.zeros(capacity, dtype=np.int64), floor=np.zeros(capacity),
         order=np.arange(n), listed=np.full((n, 3), np.inf), span=np.zeros(3),
         known=np.zeros((3, n, 3)), wanted=np.zeros((n, 3)), shift=np.zeros((n, 3)),

@@ -23,9 +23,10 @@ makes the problem solvable where barriers contradict each other. Edges let go ne
 import math
 
 from rigidfleet.kernel.avoidance import BARRIER, EXACT
-from rigidfleet.kernel.bernstein import from_box
+from rigidfleet.kernel.compiler import elementwise  # noqa: F401 -- the functions of numbers below
 from rigidfleet.kernel.compiler.jit import compiled
 from rigidfleet.kernel.linalg import cholesky, cholesky_solve
+from rigidfleet.solids.distance import outward_normal, own_axes, signed_distance
 
 #: Greatest number of sweeps, change of an acceleration that ends them [m/s^2], distance that counts as none [m].
 _SWEEPS, _CLOSE, _NEAREST = 100, 1e-7, 1e-6
@@ -33,6 +34,19 @@ _SWEEPS, _CLOSE, _NEAREST = 100, 1e-7, 1e-6
 _FULL = 0.5
 #: Least share to which an edge holds in the equations.
 _LOOSE = 1e-3
+
+
+@compiled
+def from_solid(x, y, z, o, solids, normal):
+    """Signed distance [m] of a point from obstacle o, which stands still; writes its gradient (3,)."""
+    x, y, z = own_axes(x, y, z, o, solids)
+    u, v, w = outward_normal(x, y, z, o, solids)
+    normal[0], normal[1], normal[2] = u, v, w
+    if solids.turned[o] != 0:
+        T = solids.turn[o]
+        for q in range(3):
+            normal[q] = T[0, q] * u + T[1, q] * v + T[2, q] * w
+    return signed_distance(x, y, z, o, solids)
 
 
 @compiled
@@ -99,8 +113,10 @@ def list_barriers(r, v, lost, a):
                 most = 2.0 * both / (1.0 / a.weight[i] + 1.0 / a.weight[j])
                 count = add_row(count, i, j, x, y, z, needed, most, a)
         normal = a.normal
-        for o in range(a.boxes.shape[0]):
-            gap = from_box(r[i, 0], r[i, 1], r[i, 2], a.boxes[o], normal) - a.reach[i] - a.spare[i]
+        for o in range(a.solids.kind.shape[0]):
+            gap = (
+                from_solid(r[i, 0], r[i, 1], r[i, 2], o, a.solids, normal) - a.reach[i] - a.spare[i]
+            )
             s = normal[0] * v[i, 0] + normal[1] * v[i, 1] + normal[2] * v[i, 2]
             gap -= max(0.0, -s) * a.lag[i]
             needed = needed_rate(gap, s, 0.0, a.share * a.b[i], a.rate)

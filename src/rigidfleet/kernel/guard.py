@@ -13,8 +13,7 @@ Vehicles or obstacles that are nearer than they should be must not come nearer s
 import math
 
 from rigidfleet.kernel.avoidance import BRAKE, FULL, GUARD, LISTED, OBSTACLE, PAIR, TICKS
-from rigidfleet.kernel.barriers import filter_accelerations, loosen
-from rigidfleet.kernel.bernstein import from_box
+from rigidfleet.kernel.barriers import filter_accelerations, from_solid, loosen
 from rigidfleet.kernel.compiler.jit import compiled
 from rigidfleet.kernel.fleet import TICKS as FLIGHT_TICKS
 from rigidfleet.kernel.sampled_flight import path_at
@@ -59,25 +58,25 @@ def between_segments(p, q, r, s):
 
 
 @compiled
-def slope(p, q, x, box, normal):
-    """Distance of a point at a share x of a segment from a box, and its rate along the segment; writes the normal."""
+def slope(p, q, x, o, solids, normal):
+    """Distance of a point at a share x of a segment from obstacle o, and its rate along it; writes the normal."""
     u, v, w = q[0] - p[0], q[1] - p[1], q[2] - p[2]
-    value = from_box(p[0] + x * u, p[1] + x * v, p[2] + x * w, box, normal)
+    value = from_solid(p[0] + x * u, p[1] + x * v, p[2] + x * w, o, solids, normal)
     return value, normal[0] * u + normal[1] * v + normal[2] * w
 
 
 @compiled
-def from_obstacle(p, q, box, enough, normal):
-    """Distance of the segment from p to q (3,) from a box: a lower bound, and a place near the nearest point.
+def from_obstacle(p, q, o, solids, enough, normal):
+    """Distance of the segment from p to q (3,) from obstacle o: a lower bound, and a place near the nearest point.
 
     The distance to a convex obstacle is convex along the segment, so that it lies above its tangents. The bound is
     exact, to rounding, unless it is certain to be at least, or below, ``enough``. Returns the bound, the distance at a
     share of the segment, and this share, for which ``normal`` (3,) is that of a supporting plane.
     """
-    high, falls = slope(p, q, 1.0, box, normal)
+    high, falls = slope(p, q, 1.0, o, solids, normal)
     if falls <= 0.0:
         return high, high, 1.0
-    low, rises = slope(p, q, 0.0, box, normal)
+    low, rises = slope(p, q, 0.0, o, solids, normal)
     if rises >= 0.0:
         return low, low, 0.0
     a, b = 0.0, 1.0
@@ -85,7 +84,7 @@ def from_obstacle(p, q, box, enough, normal):
     for _ in range(_TANGENTS):
         x = min(max((high - low + rises * a - falls * b) / (rises - falls), a), b)
         bound = low + rises * (x - a)
-        value, rate = slope(p, q, x, box, normal)
+        value, rate = slope(p, q, x, o, solids, normal)
         if bound >= enough or value < enough or value - bound <= 1e-13:
             break
         if rate < 0.0:
@@ -194,14 +193,14 @@ def keeps(i, v, j, s, floor, a):
 def clears(i, v, far, a):
     """Whether the candidate of vehicle i, with a velocity v (3,), keeps its distances from all obstacles."""
     way, normal = a.trial, a.normal
-    for o in range(a.boxes.shape[0]):
-        floor, box = a.walls[i, o], a.boxes[o]
-        if from_box(way[0, 0], way[0, 1], way[0, 2], box, normal) - far >= floor:
+    for o in range(a.solids.kind.shape[0]):
+        floor = a.walls[i, o]
+        if from_solid(way[0, 0], way[0, 1], way[0, 2], o, a.solids, normal) - far >= floor:
             continue
-        bound, _, _ = from_obstacle(way[1], way[2], box, floor, normal)
+        bound, _, _ = from_obstacle(way[1], way[2], o, a.solids, floor, normal)
         if bound < floor:
             return False
-        bound, value, x = from_obstacle(way[0], way[1], box, floor, normal)
+        bound, value, x = from_obstacle(way[0], way[1], o, a.solids, floor, normal)
         if bound < floor:
             return False
         along = rate = rise = 0.0
@@ -350,7 +349,7 @@ def note(kind, value, t, i, j, a):
 @compiled
 def alone(i, a):
     """Whether vehicle i has neither neighbours nor obstacles."""
-    return a.start[i + 1] == a.start[i] and a.boxes.shape[0] == 0
+    return a.start[i + 1] == a.start[i] and a.solids.kind.shape[0] == 0
 
 
 @compiled
@@ -381,12 +380,12 @@ def set_floors(t, r, v, lost, a):
                 a.floor[e] = min(need, found)
                 if i < j:
                     note(PAIR, found - a.room[i] - a.room[j], t, i, j, a)
-        for o in range(a.boxes.shape[0]):
-            need, box = a.reach[i] + a.spare[i], a.boxes[o]
-            apart = from_box(r[i, 0], r[i, 1], r[i, 2], box, a.normal) - a.far[i]
+        for o in range(a.solids.kind.shape[0]):
+            need = a.reach[i] + a.spare[i]
+            apart = from_solid(r[i, 0], r[i, 1], r[i, 2], o, a.solids, a.normal) - a.far[i]
             a.walls[i, o] = need
             if apart < need or apart - need < a.margin[OBSTACLE, 0]:
-                found, _, _ = from_obstacle(r[i], a.ways[i, 3], box, need, a.normal)
+                found, _, _ = from_obstacle(r[i], a.ways[i, 3], o, a.solids, need, a.normal)
                 a.walls[i, o] = min(need, found)
                 note(OBSTACLE, found - a.reach[i], t, i, o, a)
 

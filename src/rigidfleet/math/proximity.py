@@ -8,6 +8,8 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rigidfleet.solids import distance
+from rigidfleet.solids.records import HEIGHTS, HULL, Solids
 from rigidfleet.typing import Bools, Floats, Ints
 
 # Number of agents beyond which a tree finds near pairs, instead of a search of all pairs.
@@ -24,12 +26,16 @@ _SPARE = 1.2
 _CACHED = 60_000
 
 
+#: Number of points for which a surface of triangles is searched at once: near ones need the same triangles.
+_TOGETHER = 256
+
+
 class Obstacle(Protocol):
-    """An obstacle: a box along the world's axes, or a half space as a box with infinite sides."""
+    """An obstacle: a solid that may move."""
 
     @property
-    def corners(self) -> tuple[float, ...]:
-        """Lowest and highest corner (6,) [m]."""
+    def solid(self) -> Solids:
+        """The solid, alone in its record."""
         ...
 
 
@@ -196,13 +202,13 @@ def _lowest(r: Floats, radius: Floats) -> tuple[float, Ints]:
 
 
 def clearance(
-    r: Floats, radius: ArrayLike, obstacles: Sequence[Obstacle]
+    r: Floats, radius: ArrayLike, obstacles: Sequence[Obstacle], time: ArrayLike = 0.0
 ) -> tuple[Floats, Ints, Ints]:
     """Least distance to an obstacle (K,) [m], with the agent and the obstacle (K,).
 
-    Negative if they overlap; infinity, -1 and -1 without obstacles. r (K, N, 3), radius (N,).
+    Negative if they overlap; infinity, -1 and -1 without obstacles. r (K, N, 3), radius (N,), time (K,) [s].
     """
-    return least_clearance(*obstacle_clearances(r, radius, obstacles))
+    return least_clearance(*obstacle_clearances(r, radius, obstacles, time))
 
 
 def least_clearance(clearance: Floats, nearest: Ints) -> tuple[Floats, Ints, Ints]:
@@ -226,29 +232,42 @@ def separation_of_left(r: Floats, radius: ArrayLike, left: Bools) -> tuple[Float
 
 
 def obstacle_clearances(
-    r: Floats, radius: ArrayLike, obstacles: Sequence[Obstacle]
+    r: Floats, radius: ArrayLike, obstacles: Sequence[Obstacle], time: ArrayLike = 0.0
 ) -> tuple[Floats, Ints]:
-    """Least distance (..., N) [m] of agents r (..., N, 3) to an obstacle, and the obstacle; infinity and -1 without."""
+    """Least distance (..., N) [m] of agents r (..., N, 3) to an obstacle, and the obstacle; infinity and -1 without.
+
+    Obstacles that move are where they are at ``time`` (...) [s].
+    """
     radius = np.asarray(radius, dtype=float)
     least, nearest = np.full(r.shape[-2::-1], np.inf), np.full(r.shape[-2::-1], -1)
     # Axis by axis, in rows of samples, which is faster.
     places = np.ascontiguousarray(r.T) if obstacles else r.T
     radius = radius.reshape(-1, *[1] * (r.ndim - 2))
     for k, thing in enumerate(obstacles):
-        outside, inside = np.zeros(least.shape), np.full(least.shape, -np.inf)
-        corners = thing.corners
-        for x, low, high in zip(places, corners[:3], corners[3:], strict=True):
-            if low == -np.inf and high == np.inf:
-                continue
-            beyond = np.maximum(low - x, x - high)  # positive outside
-            np.maximum(inside, beyond, out=inside)
-            np.maximum(beyond, 0.0, out=beyond)
-            outside += beyond * beyond
-        clearance = np.sqrt(outside) + np.minimum(inside, 0.0) - radius
+        clearance = distances(*places, thing.solid, time, least + radius) - radius
         closer = clearance < least  # false for NaN
         np.copyto(least, clearance, where=closer)
         np.copyto(nearest, k, where=closer)
     return least.T, nearest.T
+
+
+def distances(
+    x: Floats, y: Floats, z: Floats, solid: Solids, time: ArrayLike = 0.0, most: ArrayLike = np.inf
+) -> Floats:
+    """Signed distance (...) [m] of points to a solid at ``time``; points farther than ``most`` may have infinity."""
+    if solid.moves:
+        shift = distance.displacement(np.asarray(time, dtype=float).T, 0, solid)
+        x, y, z = x - shift[0], y - shift[1], z - shift[2]
+    x, y, z = distance.own_axes(x, y, z, 0, solid)
+    if solid.kind[0] not in (HULL, HEIGHTS):
+        return distance.signed_distance(x, y, z, 0, solid)
+    found = np.full(x.shape, np.inf)
+    near = np.flatnonzero((distance.from_box(x, y, z, solid.size[0]) < most).reshape(-1))
+    points, flat = np.stack([x, y, z]).reshape(3, -1), found.reshape(-1)
+    for first in range(0, len(near), _TOGETHER):
+        some = near[first : first + _TOGETHER]
+        flat[some] = distance.signed_distance(*points[:, some], 0, solid)
+    return found
 
 
 #: Number of points up to which all distances are compared: importing what finds neighbours faster takes longer.

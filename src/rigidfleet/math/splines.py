@@ -18,6 +18,7 @@ POWERS = 8
 #: derivatives: the inverse of the rows k! / (k - m)! of u^k at u = 1.
 _ENDS = {
     2: np.array([[3.0, -1.0], [-2.0, 1.0]]),
+    3: np.array([[10.0, -4.0, 0.5], [-15.0, 7.0, -1.0], [6.0, -3.0, 0.5]]),
     4: np.array(
         [
             [35.0, -15.0, 2.5, -1 / 6],
@@ -39,7 +40,7 @@ def septic_pieces(times: Floats, x: Floats) -> Floats:
 
 
 def hermite(h: Floats, begin: Floats, end: Floats) -> Floats:
-    """Polynomials (n, ..., 2 m) of widths h (n,) with m derivatives ``begin`` and ``end`` (m, n, ...); m is 2 or 4."""
+    """Polynomials (n, ..., 2 m) of widths h (n,) with m derivatives ``begin`` and ``end`` (m, n, ...); m is 2 to 4."""
     m = len(begin)
     h = h.reshape(-1, *(1,) * (begin.ndim - 2))
     scale = np.stack([h**k for k in range(2 * m)])
@@ -49,6 +50,18 @@ def hermite(h: Floats, begin: Floats, end: Floats) -> Floats:
     ]
     rest = np.tensordot(_ENDS[m], end * scale[:m] - np.stack(reached), 1)
     return np.moveaxis(np.concatenate([start, rest]) / scale, 0, -1)
+
+
+def stopping_piece(T: float, begin: Floats) -> Floats:
+    """The piece (1, ..., 8) that comes to rest within T [s], from derivatives 0 to 3 ``begin`` (4, ...).
+
+    Velocity, acceleration and jerk vanish at its end, and where it ends is free. Of all such ways it has the least
+    integral of snap^2: the transversality condition x^(7)(T) = 0 leaves a velocity of degree 5.
+    """
+    velocity = hermite(np.array([T]), begin[1:, None], np.zeros((3, 1, *begin.shape[1:])))
+    place = velocity / np.arange(1.0, 7.0)
+    ends = np.zeros((1, *begin.shape[1:], 1))
+    return np.concatenate([ends + begin[0][None, ..., None], place, ends], axis=-1)
 
 
 def minimum_snap(times: Floats, x: Floats, begin: Floats, end: Floats) -> Floats:

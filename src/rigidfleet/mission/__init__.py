@@ -15,22 +15,29 @@ from rigidfleet.mission.model import (
     mission_names,
     mission_text,
 )
-from rigidfleet.mission.schema import (
+from rigidfleet.mission.obstacles import (
     Box,
+    Cylinder,
+    Ground,
+    Heights,
+    Hull,
+    Obstacle,
+    Sphere,
+)
+from rigidfleet.mission.schema import (
     Disturbances,
     Formation,
     Geofence,
-    Ground,
     Gusts,
     Limits,
     Lqr,
-    Obstacle,
     Regulator,
 )
 
 __all__ = [
     "KINDS",
     "Box",
+    "Cylinder",
     "Disturbances",
     "Establish",
     "Fly",
@@ -38,7 +45,9 @@ __all__ = [
     "Geofence",
     "Ground",
     "Gusts",
+    "Heights",
     "Hold",
+    "Hull",
     "Limits",
     "Lqr",
     "Mission",
@@ -47,6 +56,7 @@ __all__ = [
     "Regulator",
     "Reshape",
     "Settle",
+    "Sphere",
     "Turn",
     "as_mission",
     "counted",

@@ -116,6 +116,17 @@ def check(collector: FindingCollector, parts: Mapping[str, Any]) -> None:
             "needs the states of all vehicles at once, which [disturbances.links] does not give"
         )
         collector.add((_TABLE,), problem, "remove one of the two", None)
+    for k, thing in enumerate(parts.get("obstacles", ())):
+        if thing.kind == "heights":
+            problem = "is no obstacle that [avoidance] knows: it needs convex ones"
+            collector.add(
+                ("obstacles", k), problem, "build it of boxes or hulls, or remove [avoidance]", None
+            )
+        elif thing.solid.moves:
+            problem = "moves, and [avoidance] knows obstacles only that stand still"
+            collector.add(
+                ("obstacles", k), problem, "let it stand still, or remove [avoidance]", None
+            )
     if "agents" not in parts or collector.findings:
         return
     names, tables = parts["agents"].vehicle, parts["vehicles"]

@@ -35,6 +35,8 @@ AGENTS = 1_000_000
 FORMATIONS = 200
 PHASES = 1000
 OBSTACLES = 1000
+#: Maximum number of points of a convex hull, and of heights of a height map.
+HULL, HEIGHTS = 1000, 40_000
 #: Maximum number of edges of a formation: EDGES, or EDGES_EACH per agent if that is more. All pairs of 200 agents are
 #: fewer.
 EDGES, EDGES_EACH = 20_000, 32
@@ -43,7 +45,7 @@ SLOTS = 5_000_000
 #: Maximum number of pairs of agents that touch at the start or in a formation, if all have the largest radius.
 TOUCHING = 5_000_000
 #: Maximum number of agents where all pairs are compared: assignment to slots.
-ALL_PAIRS = 5000
+ALL_PAIRS = 20_000
 
 # -- how large ---------------------------------------------------------------------------------------
 

@@ -15,25 +15,31 @@ import numpy as np
 from rigidfleet.errors import MissionError
 from rigidfleet.formation.graphs import count_within
 from rigidfleet.formation.shapes import SHAPES
-from rigidfleet.mission import avoidance, bounds, disturbances, formations, phases, vehicles
+from rigidfleet.mission import (
+    avoidance,
+    bounds,
+    disturbances,
+    formations,
+    obstacles,
+    phases,
+    vehicles,
+)
 from rigidfleet.mission.findings import FindingCollector, Keys, near_shape
+from rigidfleet.mission.obstacles import Box, Obstacle
 from rigidfleet.mission.schema import (
     Agents,
     Allocation,
     Autopilot,
     Avoidance,
     BodyFrame,
-    Box,
     Constraint,
     Contents,
     Disturbances,
     Geofence,
-    Ground,
     IntegratorOptions,
     Limits,
     Lqr,
     MissionHeader,
-    Obstacle,
     Regulator,
     Start,
     Tracking,
@@ -55,7 +61,6 @@ _TABLES: dict[str, type[Part]] = {
     "yaw": VehicleYaw,
     "disturbances": Disturbances,
 }
-_OBSTACLES: dict[str, type[Part]] = {"box": Box, "ground": Ground}
 
 
 def check(data: Mapping[str, Any], origin: str) -> dict[str, Any]:
@@ -355,14 +360,11 @@ def _ordered(collector: FindingCollector, box: Box | Geofence, path: tuple[str |
 
 
 def _obstacles(collector: FindingCollector) -> tuple[Obstacle, ...]:
-    obstacles = []
+    found = []
     for k, data in enumerate(phases.tables(collector, "obstacles")):
-        kind = phases.kind(collector, data, ("obstacles", k), _OBSTACLES)
-        if kind is None:
-            continue
-        name = "ground" if kind is Ground else f"box {k + 1}"
-        obstacle = collector.validate(kind, {"name": name} | data, ("obstacles", k))
+        kind = phases.kind(collector, data, ("obstacles", k), obstacles.KINDS)
+        obstacle = None if kind is None else obstacles.checked(collector, kind, data, k)
         if isinstance(obstacle, Box):
             _ordered(collector, obstacle, ("obstacles", k))
-        obstacles += [obstacle] if obstacle is not None else []
-    return tuple(obstacles)
+        found += [obstacle] if obstacle is not None else []
+    return tuple(found)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from rigidfleet.mission import losses
 from rigidfleet.mission.findings import FindingCollector
 from rigidfleet.mission.phases import latest_end
 from rigidfleet.mission.schema import Disturbances, Gusts
@@ -48,7 +49,13 @@ def intensity(gusts: Gusts, wind: float) -> Floats:
 def check(collector: FindingCollector, parts: Mapping[str, Any], n: int | None) -> None:
     """Find the errors in [disturbances]."""
     found: Disturbances | None = parts.get(_TABLE)
+    end = latest_end(parts["phases"]) if collector.right((), "phases") else None
+    if end is not None and math.isnan(
+        end
+    ):  # automatic durations; checked again when they are known
+        end = None
     if found is None:
+        losses.check(collector, found, parts, n, end)
         return
     wind = sum(w * w for w in found.wind) ** 0.5
     for key in ("drag", "mass_error"):
@@ -65,12 +72,7 @@ def check(collector: FindingCollector, parts: Mapping[str, Any], n: int | None) 
     if found.gusts is not None:
         _gusts(collector, found.gusts, wind, n)
     _noise(collector, found)
-    end = latest_end(parts["phases"]) if collector.right((), "phases") else None
-    if end is not None and math.isnan(
-        end
-    ):  # automatic durations; checked again when they are known
-        end = None
-    _lost(collector, found, parts, n, end)
+    losses.check(collector, found, parts, n, end)
     if end is not None and n is not None and not collector.findings:
         _size(collector, found, wind, n, end)
 
@@ -132,38 +134,6 @@ def _gusts(collector: FindingCollector, gusts: Gusts, wind: float, n: int | None
         problem = f"needs a matrix of all pairs, which is too large for {n} agents"
         remedy = f"for more than {_MOST_BY_DISTANCE} agents use correlation"
         wrong("correlation_length", problem, remedy)
-
-
-def _lost(
-    collector: FindingCollector,
-    found: Disturbances,
-    parts: Mapping[str, Any],
-    n: int | None,
-    end: float | None,
-) -> None:
-    seen: set[int] = set()
-    for k, lost in enumerate(found.lost):
-        path = (_TABLE, "lost", k)
-        if n is not None and not 1 <= lost.agent <= n:
-            collector.add(
-                (*path, "agent"), "there is no such agent", f"agents are numbered from 1 to {n}"
-            )
-        elif lost.agent in seen:
-            collector.add((*path, "agent"), "is lost twice", "remove one of the two")
-        if end is not None and lost.time >= end:
-            problem = f"is not before the end of the mission at {end:g} s"
-            collector.add((*path, "time"), problem, "give an earlier time or remove the entry")
-        seen.add(lost.agent)
-    if n is not None and len(seen) >= n:
-        collector.add((_TABLE, "lost"), "all vehicles are lost", "keep at least one")
-    for key, possible in (("architecture", "local"), ("formulation", "inertial")):
-        if found.lost and parts.get(key) == "body":
-            problem = (
-                f"{key} = 'body' does not support lost vehicles: its state describes a body of all agents"
-                if key == "formulation"
-                else "architecture = 'body' does not support lost vehicles: its wrench is that of a body of all agents"
-            )
-            collector.add((_TABLE, "lost"), problem, f"use {key} = '{possible}'")
 
 
 def _size(

@@ -51,6 +51,8 @@ class AnyPhase(Part):
     moves: ClassVar[bool] = False
     #: Whether a phase may be left anywhere, with its goal there. Other phases keep their goal for the next one.
     goal_moves: ClassVar[bool] = False
+    #: Whether the phase leads to the ground, so that the mission needs one.
+    lands: ClassVar[bool] = False
     #: Default control in architecture "body".
     body_control: ClassVar[str] = "body"
 
@@ -180,6 +182,11 @@ class Shaping(AnyPhase):
         return seconds(self.blend)
 
     @property
+    def aligned(self) -> bool:
+        """Whether the slots are rotated during the blend, so that they move least."""
+        return True
+
+    @property
     def leads_to(self) -> str:
         """The formation."""
         return self.formation
@@ -220,6 +227,22 @@ class Reshape(Shaping):
     """Change from one formation to another."""
 
     kind: Literal["reshape"] = Field(description="change the formation")
+    transition: Literal["straight", "layers", "auto"] = Field(
+        "straight",
+        description="ways to the new slots: straight: all at once; layers: apart to levels one above the other, "
+        "across, and together again, as three phases, with every pair proved; auto: straight if that keeps "
+        "limits.separation, else layers",
+    )
+    alignment: Literal["fit", "none"] = Field(
+        "fit",
+        description="fit: the new slots are rotated onto the old ones during the blend, and turn back meanwhile; none: "
+        "straight ways in the axes of the body",
+    )
+
+    @property
+    def aligned(self) -> bool:
+        """Whether the slots are fitted."""
+        return self.alignment == "fit"
 
 
 class Steering(Attitude, AnyPhase):
@@ -309,6 +332,47 @@ class Hold(AnyPhase):
     kind: Literal["hold"] = Field(description="stay at the commanded position and attitude")
 
 
+class Brake(AnyPhase):
+    """Come to rest where braking leads, in position and attitude, with the least snap."""
+
+    moves: ClassVar[bool] = True
+    body_control: ClassVar[str] = "tracking"
+
+    kind: Literal["brake"] = Field(description="come to rest where braking leads")
+    travel: Time | None = Field(
+        None, description="time from the start to the stop [s]; default: the whole phase"
+    )
+
+    @property
+    def least_time(self) -> float:
+        """Time to the stop [s]."""
+        return self.travel or 0.0
+
+    def ended(self, length: float) -> dict[str, Any]:
+        """A time to the stop that is not longer than the phase."""
+        return {} if self.travel is None else {"travel": min(self.travel, length)}
+
+
+class Land(AnyPhase):
+    """Descend straight down, until the lowest vehicle is just above the ground."""
+
+    moves: ClassVar[bool] = True
+    lands: ClassVar[bool] = True
+    body_control: ClassVar[str] = "tracking"
+
+    kind: Literal["land"] = Field(description="descend straight down to the ground")
+
+    @property
+    def meets(self) -> tuple[str, ...]:
+        """Position and velocity at touch-down."""
+        return ("position", "velocity")
+
+    @property
+    def leads_to(self) -> str:
+        """The ground."""
+        return "the ground"
+
+
 class Orbit(AnyPhase):
     """Circle a point on a horizontal circle at a constant rate, and leave the circle with the velocity there."""
 
@@ -367,7 +431,9 @@ def _vector(values: Sequence[float], unit: str) -> str:
     return f"({', '.join(f'{value:g}' for value in values)}) {unit}"
 
 
-Phase = Annotated[Establish | Fly | Reshape | Turn | Orbit | Hold, Field(discriminator="kind")]
+Phase = Annotated[
+    Establish | Fly | Reshape | Turn | Orbit | Hold | Brake | Land, Field(discriminator="kind")
+]
 #: Models of all phases by `kind`.
 KINDS: dict[str, type[AnyPhase]] = {
     get_args(model.model_fields["kind"].annotation)[0]: model

@@ -7,12 +7,13 @@ from collections.abc import Mapping
 from functools import cached_property
 from importlib import resources
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, Literal, NamedTuple, Self
 
 import numpy as np
 from pydantic import PrivateAttr
 
 from rigidfleet._common.arguments import as_path
+from rigidfleet._common.text import agent_names
 from rigidfleet._common.toml import to_toml
 from rigidfleet.errors import Finding, MissionError, wrong_type
 from rigidfleet.formation.assignment import assigned
@@ -20,10 +21,12 @@ from rigidfleet.formation.distance_geometry import distances
 from rigidfleet.math import constraint_jacobian
 from rigidfleet.math.attitude import dcm_from_euler
 from rigidfleet.mission import bounds
+from rigidfleet.mission.changes import told_apart
 from rigidfleet.mission.check import check
 from rigidfleet.mission.describe import counted
 from rigidfleet.mission.findings import near
 from rigidfleet.mission.kinds import Establish, Phase
+from rigidfleet.mission.obstacles import with_files
 from rigidfleet.mission.phases import latest_end
 from rigidfleet.mission.schema import DRAG, Contents, Start
 from rigidfleet.mission.vehicles import VehicleModel, resolve
@@ -90,7 +93,10 @@ class Mission(Contents):
         """
         if not isinstance(text, str):
             raise wrong_type("the text of a mission file", text)
-        mission = cls.model_construct(**check(parse_toml(text, origin), origin))
+        parts = check(parse_toml(text, origin), origin)
+        if parts["assignment"] == "each":
+            parts["formations"], parts["phases"] = told_apart(parts["formations"], parts["phases"])
+        mission = cls.model_construct(**parts)
         mission._text, mission._origin = text, origin
         return mission
 
@@ -184,8 +190,9 @@ class Mission(Contents):
     def assigned_slots(self) -> dict[str, Ints]:
         """Slot (N,), from 0, that each agent takes in each formation, by the mission's `assignment`.
 
-        With "shortest" and "safe", an agent keeps its slot in all formations. With "each", slots are assigned anew when
-        a formation is first flown, from the positions of the agents at that time.
+        With "shortest" and "safe", an agent keeps its slot in all formations. With "each", slots are assigned anew at
+        each change, from the positions of the agents at that time. A formation that is taken again from elsewhere is
+        another one here, "NAME (2)".
         """
         return self._assigned[0]
 
@@ -390,6 +397,41 @@ class Mission(Contents):
             when[lost.agent - 1] = lost.time
         return when
 
+    @cached_property
+    def links_lost(self) -> tuple[Ints, Floats]:
+        """The links that are lost: pairs (L, 2) of agents from 0, i < j, and times (L,) [s]."""
+        d = self.disturbances
+        lost = d.links.lost if d is not None and d.links is not None else ()
+        pairs = np.array([sorted(link.between) for link in lost], dtype=np.int64).reshape(-1, 2)
+        return pairs - 1, np.array([link.time for link in lost], dtype=np.float64)
+
+    def linked(self, edges: Ints, t: float) -> Bools:
+        """Mask (m,) of the edges (m, 2), i < j, whose link is not lost at a time [s]."""
+        pairs, times = self.links_lost
+        n = self.n_agents
+        lost = pairs[times < t]
+        return ~np.isin(edges[:, 0] * n + edges[:, 1], lost[:, 0] * n + lost[:, 1])
+
+    @property
+    def first_loss(self) -> float:
+        """Time [s] at which the first vehicle or link is lost; infinity if none is."""
+        return float(min(self.lost_at.min(), self.links_lost[1].min(initial=np.inf)))
+
+    @property
+    def first_lost(self) -> str:
+        """What is lost first, in words: agent 2, agents 1 and 2, the link 1-3."""
+        pairs, times = self.links_lost
+        when = self.first_loss
+        who = np.flatnonzero(self.lost_at == when)
+        told = [agent_names(who)] if len(who) else []
+        told += [f"the link {i + 1}-{j + 1}" for i, j in pairs[times == when]]
+        return " and ".join(told)
+
+    @property
+    def on_loss(self) -> Literal["continue", "hold", "land"]:
+        """What the others do when a vehicle or link is lost."""
+        return "continue" if self.disturbances is None else self.disturbances.on_loss
+
 
 def mission_names() -> list[str]:
     """Names of the shipped missions, in alphabetical order."""
@@ -422,7 +464,10 @@ def load_mission(name_or_path: str | Path) -> Mission:
     """
     if isinstance(name_or_path, str) and name_or_path in mission_names():
         return Mission.from_toml(mission_text(name_or_path), name_or_path)
-    return Mission.from_toml(read_text(name_or_path), str(name_or_path))
+    text, origin = read_text(name_or_path), str(name_or_path)
+    if "file" in text:  # parsed twice only if it may name one
+        text = with_files(text, parse_toml(text, origin), Path(name_or_path))
+    return Mission.from_toml(text, origin)
 
 
 def as_mission(given: Mission | str | Path) -> Mission:

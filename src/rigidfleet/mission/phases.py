@@ -21,8 +21,11 @@ from rigidfleet.mission.kinds import (
     KINDS,
     TIMES,
     AnyPhase,
+    Brake,
     Establish,
+    Land,
     Orbit,
+    Reshape,
     Shaping,
     Turn,
     seconds,
@@ -319,10 +322,47 @@ def _orbit(collector: FindingCollector, p: Orbit, path: Keys, longest: float | N
         collector.add(where, problem, "use a lower rate or several phases")
 
 
+def _led(collector: FindingCollector, p: Brake | Land, path: Keys, longest: float | None) -> None:
+    """Check that a brake or a landing has tracked slots and an end."""
+    kind_name = collector.data["phases"][path[1]]["kind"]
+    if p.control == "body" and collector.right(path, "control"):
+        problem = f"kind '{kind_name}' cannot be flown by a wrench on the virtual body"
+        collector.add((*path, "control"), problem, "use control = 'tracking'")
+    if p.settle is not None and collector.right(path, *_ENDINGS):
+        problem = f"kind '{kind_name}' needs a time of arrival"
+        collector.add((*path, "settle"), problem, "end it by duration or until", None)
+    travel = p.least_time
+    if longest is not None and travel > longest * (1 + 1e-9):
+        problem = f"is longer than the phase, which ends after {longest:g} s"
+        collector.add((*path, "travel"), problem, "reduce travel or end the phase later")
+
+
 #: Checks of single kinds. Arguments: the findings, the phase, its path, its maximum duration [s] or None.
+def _reshape(collector: FindingCollector, p: Reshape, path: Keys, _: float | None) -> None:
+    """Check that ways other than straight ones can be found and flown."""
+    if p.transition == "straight" or not collector.right(path, "transition"):
+        return
+    problem = remedy = ""
+    if p.control != "tracking" or p.reference != "shape":
+        problem = "needs slots that are tracked"
+        remedy = "use control = 'tracking' and reference = 'shape'"
+    elif collector.data.get("assignment", "given") != "given":
+        problem = "is for agents with slots of their own, but assignment chooses their slots"
+        remedy = "use assignment = 'given', or remove this key"
+    elif p.alignment == "none":
+        problem, remedy = "chooses the alignment itself", "remove alignment"
+    elif p.blend == AUTO != p.duration:
+        problem, remedy = "takes a time that is not known yet", "use duration = 'auto', too"
+    if problem:
+        collector.add((*path, "transition"), problem, remedy)
+
+
 _OWN: dict[str, Callable[[FindingCollector, Any, Keys, float | None], None]] = {
+    "brake": _led,
     "establish": _establish,
+    "land": _led,
     "orbit": _orbit,
+    "reshape": _reshape,
     "turn": _turn,
 }
 

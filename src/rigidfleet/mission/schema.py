@@ -25,6 +25,7 @@ from rigidfleet.mission.bounds import (
     MASS,
 )
 from rigidfleet.mission.kinds import Phase
+from rigidfleet.mission.obstacles import Obstacle
 from rigidfleet.mission.values import (
     NAME_OR_LIST,
     Acceleration,
@@ -32,7 +33,6 @@ from rigidfleet.mission.values import (
     AttitudeGains,
     BodyDrag,
     Coefficient,
-    Coordinate,
     Cost,
     Damping,
     Delay,
@@ -455,33 +455,6 @@ class Formation(Part):
         return distance_geometry.slots_from_distances(n, self.edge_array(n), self.distances or ())
 
 
-class Box(Part):
-    """A box parallel to the world axes."""
-
-    kind: Literal["box"] = Field(description="a box parallel to the world axes")
-    name: str = Field("", description="name; default: 'box' and its number")
-    min: Vector = Field(description="lowest corner [x, y, z] [m]")
-    max: Vector = Field(description="highest corner [x, y, z] [m]")
-
-    @property
-    def corners(self) -> tuple[float, ...]:
-        """Lowest and highest corner (6,) [m]."""
-        return (*self.min, *self.max)
-
-
-class Ground(Part):
-    """Everything below a height."""
-
-    kind: Literal["ground"] = Field(description="everything below a height")
-    name: str = Field("", description="name; default: 'ground'")
-    height: Coordinate = Field(0.0, description="height of the ground [m]")
-
-    @property
-    def corners(self) -> tuple[float, ...]:
-        """Lowest and highest corner (6,) [m] of a box that is infinite except at the top."""
-        return (*(-math.inf,) * 3, math.inf, math.inf, self.height)
-
-
 class Geofence(Part):
     """A box that no agent may leave."""
 
@@ -505,6 +478,11 @@ class Limits(Part):
     )
     separation: LengthOrZero | None = Field(
         None, description="minimum separation of agents [m]: centre distance minus radii"
+    )
+    separation_allowance: LengthOrZero = Field(
+        0.1,
+        description="how much nearer to each other than planned agents may come in flight [m]; judged where the plan "
+        "has a certificate",
     )
     separation_below: LengthOrZero | None = Field(
         None,
@@ -582,6 +560,13 @@ class Noise(Part):
     )
 
 
+class LostLink(Part):
+    """Loss of a link: from this time on, two vehicles know nothing of each other, and no edge joins them."""
+
+    between: tuple[Whole, Whole] = Field(description="the two agents, counted from 1")
+    time: Time = Field(description="mission time of the loss [s], > 0")
+
+
 class Links(Part):
     """What vehicles know of each other: states sent at a fixed rate, which arrive late or not at all."""
 
@@ -592,6 +577,10 @@ class Links(Part):
     dropped: Share = Field(0.0, description="share of the states that are lost, 0 to 0.95")
     seed: Seed = Field(
         0, description="seed of the random numbers; the same seed loses the same states"
+    )
+    lost: tuple[LostLink, ...] = Field(
+        (),
+        description="links lost for good during the flight: `lost = [{ between = [1, 2], time = 30.0 }]`",
     )
 
 
@@ -636,9 +625,19 @@ class Disturbances(Part):
     lost: tuple[Lost, ...] = Field(
         (), description="vehicles lost during the flight: `lost = [{ agent = 2, time = 30.0 }]`"
     )
-
-
-Obstacle = Annotated[Box | Ground, Field(discriminator="kind")]
+    on_loss: Literal["continue", "hold", "land"] = Field(
+        "continue",
+        description="what the others do when the first vehicle or link is lost: continue: fly the mission on; hold: "
+        "brake to a stop and hold the formation; land: brake to a stop and land straight down",
+    )
+    hold_until: Time | None = Field(
+        None,
+        description="mission time to which on_loss 'hold' holds [s]; default: the planned end of the mission",
+    )
+    landing_formation: str | None = Field(
+        None,
+        description="level formation that on_loss 'land' takes before the descent; default: the one that is held",
+    )
 
 
 class MissionHeader(Part):

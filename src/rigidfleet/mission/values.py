@@ -57,6 +57,8 @@ Coordinate = Annotated[float, Strict(), signed(LENGTH)]
 Length = Annotated[float, Strict(), _positive(LENGTH)]
 LengthOrZero = Annotated[float, Strict(), from_zero(LENGTH)]
 Time = Annotated[float, Strict(), _positive(TIME)]
+#: A time of the mission, from its start on.
+Seconds = Annotated[float, Strict(), from_zero(TIME)]
 Dwell = Annotated[float, Strict(), from_zero(TIME)]
 Speed = Annotated[float, Strict(), _positive(SPEED)]
 Spread = Annotated[float, Strict(), from_zero(SPEED)]

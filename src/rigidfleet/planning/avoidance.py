@@ -7,6 +7,7 @@ import numpy as np
 from rigidfleet.kernel import avoidance, fleet
 from rigidfleet.mission import Mission
 from rigidfleet.mission.avoidance import braking, reaction_times, widening
+from rigidfleet.solids.records import joined
 
 
 def avoidance_in_flight(mission: Mission, flight: fleet.Flight) -> avoidance.Avoidance | None:
@@ -27,7 +28,7 @@ def avoidance_in_flight(mission: Mission, flight: fleet.Flight) -> avoidance.Avo
         mass=mass,
         g=mission.gravity,
         radius=np.array(mission.agents.radius, dtype=float),
-        boxes=np.array([thing.corners for thing in mission.obstacles]).reshape(-1, 6),
+        solids=joined([thing.solid for thing in mission.obstacles]),
         separation=separation,
         clearance=given.clearance,
         drag=drag,

@@ -17,12 +17,15 @@ from rigidfleet.kernel.problem import Motion, septic_polynomial
 from rigidfleet.math import attitude as att
 from rigidfleet.math import lqr, series, splines
 from rigidfleet.mission import Fly, Mission, Phase, Regulator
-from rigidfleet.mission.kinds import Orbit, Steering, Through, seconds
-from rigidfleet.planning.reference import PhaseState, Pose
+from rigidfleet.mission.kinds import Brake, Land, Orbit, Steering, Through, seconds
+from rigidfleet.planning.reference import PhaseState, Pose, pose_at
 from rigidfleet.typing import Floats
 
 #: Time in which a phase that ends by settling, without a target, brings the body to rest [s].
 _REST_WITHIN = 10.0
+#: Height above the ground at which a landing ends [m]: the vehicles' lags and noise shall not lead them into it; and
+#: the speed downwards there [m/s]. Both are well within what the verdict takes as standing on the ground.
+ABOVE, TOUCH_DOWN = 0.05, 0.2
 
 
 class Flight(Protocol):
@@ -80,6 +83,40 @@ def _orbit(mission: Mission, phase: Orbit, now: PhaseState, t_end: float) -> Cou
     return Course(goal, t_end, flight)
 
 
+def _brake(mission: Mission, phase: Brake, now: PhaseState, t_end: float) -> Course:
+    """Come to rest within ``travel`` or by the end, from the reference as it moves now."""
+    assert now.pose is not None  # slots are tracked
+    assert now.goal is not None
+    arrival = t_end if phase.travel is None else min(t_end, now.t + phase.travel)
+    flight = StoppingFlight(now.pose, now.t, arrival)
+    end = pose_at(flight.motion(), arrival)
+    turned = now.pose.omega.any() or not np.allclose(now.pose.T, now.goal.T, rtol=0, atol=1e-9)
+    goal = Pose(
+        end.r, np.zeros(3), end.T if turned else now.goal.T, np.zeros(3), now.goal.named and not turned
+    )  # fmt: skip
+    return Course(goal, arrival, flight)
+
+
+def _land(mission: Mission, phase: Land, now: PhaseState, t_end: float) -> Course:
+    """Descend straight down to just above the ground, by the end."""
+    assert now.pose is not None
+    assert now.goal is not None
+    depth = max(0.0, height(mission, now))
+    v = np.array([0.0, 0.0, -min(TOUCH_DOWN, depth / (t_end - now.t))])
+    goal = replace(now.goal, r=now.goal.r - [0.0, 0.0, depth], v=v, omega=np.zeros(3))
+    return Course(goal, t_end, SmoothFlight(now.pose, goal, now.t, t_end, ()))
+
+
+def height(mission: Mission, now: PhaseState) -> float:
+    """How far [m] the lowest vehicle is above the height at which a landing ends, at the pose to hold."""
+    assert now.goal is not None
+    assert now.slots is not None
+    left = np.ones(mission.n_agents, dtype=np.bool_) if now.lost is None else ~now.lost
+    below = now.goal.r[2] + now.slots @ now.goal.T[:, 2] - mission.fleet.radius
+    ground = max((o.height for o in mission.obstacles if o.kind == "ground"), default=-math.inf)
+    return float(below[left].min()) - ground - ABOVE
+
+
 def _led(
     mission: Mission,
     phase: Phase | Steering,
@@ -98,7 +135,9 @@ def _led(
 
 #: Function of each kind of phase that moves the virtual body; in all others, it comes to rest at the previous goal.
 _COURSES: dict[str, Callable[[Mission, Any, PhaseState, float], Course]] = {
+    "brake": _brake,
     "fly": _steer,
+    "land": _land,
     "orbit": _orbit,
     "turn": _steer,
 }
@@ -171,6 +210,23 @@ def regulated(
         arrival,
         t_end,
     )
+
+
+@dataclass
+class StoppingFlight:
+    """From a pose to rest with continuous acceleration and jerk; where it stops follows from the pose."""
+
+    start: Pose
+    t0: float  # [s]
+    arrival: float  # [s]
+
+    def motion(self) -> Motion:
+        """One piece, of degree 6."""
+        start = self.start
+        cm = np.stack([start.r, start.v, start.a, start.jerk])
+        begin = np.concatenate([cm, rotation_of(start, start.T)], axis=1)
+        piece = splines.stopping_piece(self.arrival - self.t0, begin)
+        return as_motion(np.array([self.t0, self.arrival]), piece, start.T)
 
 
 @dataclass

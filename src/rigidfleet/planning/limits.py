@@ -15,6 +15,7 @@ import numpy as np
 
 from rigidfleet.kernel.problem import Motion, Reference
 from rigidfleet.mission import Mission
+from rigidfleet.mission.schema import Limits
 from rigidfleet.planning.derivatives import slot_derivatives
 from rigidfleet.typing import Floats, Ints
 
@@ -50,9 +51,9 @@ class Reached(NamedTuple):
         return self.value / float(self.limit.most[self.agent])
 
 
-def limits_of(mission: Mission) -> list[Limit]:
-    """The limits that a mission sets to its references."""
-    given, n = mission.limits, mission.n_agents
+def limits_of(mission: Mission, given: Limits | None = None) -> list[Limit]:
+    """The limits that a mission sets to its references, or those ``given`` in place of `limits`."""
+    given, n = given or mission.limits, mission.n_agents
     mass, up = mission.fleet.mass, np.array([0.0, 0.0, mission.gravity])
 
     def size(order: int) -> Callable[[Floats, Ints], Floats]:

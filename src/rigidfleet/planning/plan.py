@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import cached_property, lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -41,10 +41,11 @@ from rigidfleet.kernel.problem import (
 from rigidfleet.math import attitude as att
 from rigidfleet.math import lqr
 from rigidfleet.math.rigid_body import about_cm
-from rigidfleet.mission import Mission, Phase, Regulator, Settle
+from rigidfleet.mission import Mission, Phase, Regulator, Settle, bounds
 from rigidfleet.mission.kinds import seconds
 from rigidfleet.mission.schema import Constraint, IntegratorOptions
 from rigidfleet.planning import solvers
+from rigidfleet.planning.certificate import Certificate, certified
 from rigidfleet.planning.courses import course, passed
 from rigidfleet.planning.disturbances import without
 from rigidfleet.planning.reference import (
@@ -95,9 +96,20 @@ class PhasePlan:
     damping: Callable[[Bools], float]  # damping mu, from which vehicles are lost (N,)
     lost_at: Floats  # (N,) times at which vehicles are lost [s]
     masses: Floats  # (N,) assumed by the laws, lost vehicles included [kg]
+    radius: Floats  # (N,) [m]
     before: PhaseState  # the state that the phase starts from
+    links_lost: tuple[Ints, Floats]  # pairs (L, 2) and times (L,) of links that are lost
+    blend: Reference  # of all edges, before any is released
     through: tuple[tuple[float, Floats], ...] = ()  # times [s] and CM (3,) [m] to pass on the way
     smooth: bool = False  # whether the next phase needs acceleration and jerk of the reference
+
+    @cached_property
+    def certificate(self) -> Certificate | None:
+        """The least separation of the planned paths, proved; None if agents track no slots."""
+        if len(self.radius) > bounds.ALL_PAIRS:  # takes longer than their flight
+            return None
+        reference = self.problem.reference
+        return certified(self.phase, reference, self.radius, self.before.lost)
 
     @property
     def large(self) -> bool:
@@ -155,9 +167,12 @@ class PhasePlan:
         share = min(max(_RESIDUAL * self.integrator.rtol, _LEAST_RESIDUAL), _MOST_RESIDUAL)
         return share, _FLOOR * float(self.velocity_tolerance().min())  # over a step of 1 s
 
-    def release(self, lost: Bools) -> Bools:
-        """Remove the edges of vehicles ``lost`` (N,); return which edges (m,) are kept."""
-        kept = ~np.any(lost[self.edges], axis=1)
+    def release(self, lost: Bools, parted: Bools) -> Bools:
+        """Remove the edges of vehicles ``lost`` (N,) and links ``parted`` (L,); return which edges (m,) are kept."""
+        n = len(lost)
+        pairs = self.links_lost[0][parted]
+        keys = self.edges[:, 0] * n + self.edges[:, 1]
+        kept = ~np.any(lost[self.edges], axis=1) & ~np.isin(keys, pairs[:, 0] * n + pairs[:, 1])
         self.edges, self.distances = self.edges[kept], self.distances[kept]
         self.method = solvers.choose(len(lost), self.edges, self.constraint.solver)
         self.problem = without(self.problem, kept, lost, self.damping(lost), large=self.large)
@@ -187,6 +202,7 @@ class PhasePlan:
             slots=self.slots,
             pose=pose,
             goal=goal,
+            blend=self.blend if t < self.blend.t0 + self.blend.T_b else None,
         )
 
 
@@ -239,6 +255,8 @@ def plan_phase(
     if shaping is not None:
         dp, turn = align_slots(before, after, left, turned)
     reference = Reference(kind, now.t, T_b, d0, d1, before, dp, turn)
+    if shaping is None and now.blend is not None:
+        reference = now.blend
 
     goal, arrival, flight = course(mission, phase, now, t_end)
     motion, feedback = _REST, _NO_FEEDBACK
@@ -278,11 +296,14 @@ def plan_phase(
         attached=before_switch.slots is not None or phase.control != "open",
         lies=phase.establishing is not None and not mission.free_attitude(phase), method=method,
         constraint=mission.constraint, integrator=mission.integrator,
-        damping=partial(mission.damping, held), lost_at=mission.lost_at, masses=masses, before=before_switch,
-        through=passed(flight), smooth=mission.smooth,
+        damping=partial(mission.damping, held), lost_at=mission.lost_at, masses=masses,
+        radius=mission.fleet.radius, before=before_switch, links_lost=mission.links_lost, blend=reference,
+        through=passed(flight), smooth=mission.smooth or mission.on_loss != "continue",
     )  # fmt: skip
-    if now.lost is not None and now.lost.any():
-        plan.release(now.lost)
+    lost = np.zeros(len(masses), dtype=np.bool_) if now.lost is None else now.lost
+    parted = plan.links_lost[1] <= now.t
+    if lost.any() or parted.any():
+        plan.release(lost, parted)
     return plan
 
 

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
-from rigidfleet.kernel.problem import SHAPE, Motion, Reference, septic_polynomial
+from rigidfleet.kernel.problem import SHAPE, Motion, Reference
 from rigidfleet.math import pid, rigid_body
 from rigidfleet.math.rigid_body import about_cm
 from rigidfleet.mission import Mission, Phase
 from rigidfleet.mission.kinds import seconds
+from rigidfleet.planning.certificate import Certificate, certified
 from rigidfleet.planning.courses import course
 from rigidfleet.planning.derivatives import slot_derivatives
 from rigidfleet.planning.reference import (
@@ -65,8 +67,14 @@ class PlannedPhase:
     acceleration: Floats
     exact: bool
     leg: Leg
+    radius: Floats
     path_ends: tuple[Floats, Floats] | None = None
     shapes: tuple[str | None, str | None] = (None, None)
+
+    @cached_property
+    def certificate(self) -> Certificate | None:
+        """The least separation of the planned paths, proved; None if agents track no slots."""
+        return certified(self.leg.phase, self.leg.reference, self.radius)
 
 
 class Leg(NamedTuple):
@@ -100,11 +108,11 @@ def preview(mission: Mission, phases: int | None = None) -> tuple[list[PlannedPh
         if found is None:
             return planned, False
         now = found.after
-        planned.append(_planned(found, most))
+        planned.append(planned_phase(found, most, mission.fleet.radius))
     return planned, len(planned) == len(wanted)
 
 
-def _planned(found: Leg, most: int) -> PlannedPhase:
+def planned_phase(found: Leg, most: int, radius: Floats) -> PlannedPhase:
     """At most ``most`` samples of a leg."""
     begin, end, reference = found.begin, found.end, found.reference
     count = min(max(_SAMPLES, int((end - begin) / _STEP) + 1), _MOST, most)
@@ -116,7 +124,16 @@ def _planned(found: Leg, most: int) -> PlannedPhase:
     ways = None if shaping is None else (reference.p0, reference.p0 + reference.dp)
     shapes = found.before.formation, found.after.formation
     return PlannedPhase(
-        found.phase.name, time, position, velocity, acceleration, found.exact, found, ways, shapes
+        found.phase.name,
+        time,
+        position,
+        velocity,
+        acceleration,
+        found.exact,
+        found,
+        radius,
+        ways,
+        shapes,
     )
 
 
@@ -168,6 +185,8 @@ def leg(mission: Mission, phase: Phase, now: PhaseState) -> Leg | None:
         tracked = pose if phase.control == "tracking" else None
         frame = pose.T if frame is not None else None
         after = replace(now, slots=slots, pose=tracked, goal=goal, frame=frame)
+    if shaping is None and now.blend is not None:
+        reference = now.blend
     r, v = slot_derivatives(reference, motion, np.array([t_end]), 2)[0]
     after = replace(after, t=t_end, r=r, v=v, formation=name)
     return Leg(phase, t0, t_end, reference, motion, before, after, exact)
@@ -223,8 +242,3 @@ def _settling(mission: Mission) -> float:
         return pid.settling_time(c.alpha, c.beta, c.gamma)
     except ValueError:
         return 0.0
-
-
-def septic(x: Floats) -> Floats:
-    """Blend of slots from 0 to 1 over x = (t - t0) / T_b, 0 before and 1 after."""
-    return septic_polynomial(np.clip(x, 0.0, 1.0))

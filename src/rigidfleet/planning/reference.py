@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 
 from rigidfleet.formation import distance_geometry
-from rigidfleet.kernel.problem import Motion
+from rigidfleet.kernel.problem import Motion, Reference
 from rigidfleet.math import attitude as att
 from rigidfleet.math import rigid_body, series
 from rigidfleet.math.rigid_body import about_cm, mean_axis_rates
@@ -70,7 +70,7 @@ class Pose:
 
 def pose_at(motion: Motion, t: float) -> Pose:
     """The pose of a reference motion at a time [s], with its acceleration and jerk."""
-    cm, axes = (x[:, 0] for x in body_series(motion, np.array([t])))
+    cm, axes = (x[..., 0] for x in body_series(motion, np.array([t])))
     r, v, a, jerk = series.derivatives(cm)[:4]
     omega, alpha, alpha_dot = series.derivatives(series.body_rates(axes))[:3]
     return Pose(r, v, axes[0].T, omega, a=a, jerk=jerk, alpha=alpha, alpha_dot=alpha_dot)
@@ -91,6 +91,7 @@ class PhaseState:
     pose: Pose | None = None  # last commanded; None if there was no command
     goal: Pose | None = None  # the pose to hold
     lost: Bools | None = None  # (N,) lost vehicles; None if there are none
+    blend: Reference | None = None  # change of shape under way, if a loss has ended its phase
 
 
 def slots_about_cm(mission: Mission, name: str | None, masses: Floats) -> Floats | None:
@@ -121,6 +122,7 @@ def attach(
     frame, given = now.frame, None
     if shaping is not None:
         given = mission.assigned_turn(now.formation, shaping.formation)
+        given = given if shaping.aligned else np.eye(3)
     if phase.control == "open":
         if mission.formulation == "body" and frame is None:
             frame = np.eye(3)

@@ -18,6 +18,7 @@ from rigidfleet.planning.courses import SmoothFlight, course
 from rigidfleet.planning.limits import Reached, limits_of, reached
 from rigidfleet.planning.preview import Leg, at_start, leg
 from rigidfleet.planning.reference import PhaseState, attach, slots_about_cm
+from rigidfleet.planning.transitions import expanded
 
 #: Shortest and longest time tried [s], and the number of times tried.
 _SHORTEST, _LONGEST, _TRIES = 0.1, 1e5, 60
@@ -35,7 +36,9 @@ SLACK = 1e-3
 
 
 def timed(mission: Mission) -> Mission:
-    """Return a mission with its automatic times replaced by the least ones; itself if it has none.
+    """Return a mission whose transitions are phases of their own (`transitions.expanded`), with its times known.
+
+    Automatic times are replaced by the least ones. A mission with neither is returned as it is.
 
     Times follow from the planned state at the start of each phase; a phase before that ends by settling is assumed to
     have arrived. The mission keeps its own text, so that a result repeats from it.
@@ -43,9 +46,10 @@ def timed(mission: Mission) -> Mission:
     Raises
     ------
     MissionError
-        No time of a phase keeps the limits, its start is not known before the flight, or a phase ends too early for
-        the times before it.
+        No transition keeps the separation, no time of a phase keeps the limits, its start is not known before the
+        flight, or a phase ends too early for the times before it.
     """
+    mission = expanded(mission)
     last = max((k for k, phase in enumerate(mission.phases) if phase.automatic), default=None)
     if last is None:
         return mission

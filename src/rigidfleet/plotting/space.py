@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from rigidfleet.formation import distance_geometry
-from rigidfleet.plotting import curves
+from rigidfleet.plotting import curves, solids
 from rigidfleet.plotting import style as st
 from rigidfleet.plotting.style import styled
 from rigidfleet.result import Result
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from rigidfleet.mission import Mission
 
-_BOX = "#9A9184"
+_BOX = solids.COLOUR
 _GROUND = "#E9E6DF"
 _ELEVATION = 24.0  # of the camera [deg]
 _TRAIL = 1500  # points of an agent's path
@@ -46,6 +46,7 @@ class Scene:
     floor: float  # height of the plane that shadows fall on [m]
     ground: bool  # whether this plane is the ground
     boxes: list[tuple[str, Floats, Floats]]  # name and corners [m]
+    shapes: list[solids.Shape]  # all other obstacles
     waypoints: list[tuple[str, Floats]]
 
 
@@ -69,14 +70,17 @@ def scene(result: Result) -> Scene:
         heights = []
     boxes = []
     for o in mission.obstacles:
-        if o.kind == "box":
+        if o.kind == "box" and o.corners is not None and not o.zone:
             # Only the part of a large box that is near the flight is shown.
             a = np.clip(np.array(o.min), low - near, high + near)
             b = np.clip(np.array(o.max), low - near, high + near)
             if (b > a).all():
                 boxes.append((o.name, a, b))
-    low = np.minimum.reduce([low, *(a for _, a, _ in boxes)])
-    high = np.maximum.reduce([high, *(b for _, _, b in boxes)])
+    begin, end = float(result.time[0]), float(result.time[-1])
+    shapes = solids.shapes(mission, begin, end, low - near, high + near)
+    seen_too = [np.clip(shape.ends, low - near, high + near) for shape in shapes]
+    low = np.minimum.reduce([low, *(a for _, a, _ in boxes), *(ends[0] for ends in seen_too)])
+    high = np.maximum.reduce([high, *(b for _, _, b in boxes), *(ends[1] for ends in seen_too)])
     # A margin around it; no direction too thin to see.
     size = float((high - low).max()) or 2.0
     lack = np.maximum(0.3 * size - (high - low), 0.08 * size) / 2
@@ -92,6 +96,7 @@ def scene(result: Result) -> Scene:
         floor,
         bool(heights),
         boxes,
+        shapes,
         waypoints,
     )
 
@@ -230,6 +235,8 @@ def draw_space(
             "alpha": 0.22,
         }
         ax.add_collection3d(Poly3DCollection(_faces(a, b), **faces, zorder=2, gid="obstacle"))
+    for shape in view.shapes:
+        solids.draw_in_space(ax, shape)
     shadow = np.full(len(view.centre), view.floor)
     ax.plot(*view.centre[:, :2].T, shadow, color=st.FAINT, linewidth=1.0, zorder=1)
     edges = _segments(result, view.shots)
@@ -338,6 +345,8 @@ def draw_above(ax: Axes, result: Result, view: Scene) -> None:
     ax.apply_aspect()
     for name, low, high in view.boxes:
         _outline(ax, low, high, name, facecolor=_BOX, alpha=0.3, linewidth=0)
+    for shape in view.shapes:
+        solids.draw_from_above(ax, shape)
     fence = result.mission.limits.geofence
     if fence is not None:
         look: dict[str, Any] = {"fill": False, "edgecolor": st.ALERT, "linestyle": (0, (6, 2))}

@@ -18,12 +18,13 @@ from rigidfleet.preflight.assignment import assignment_remarks
 from rigidfleet.preflight.findings import Preflight, Remark
 from rigidfleet.preflight.formations import SEARCHED, check_formations, formation_remarks
 from rigidfleet.preflight.gains import check_gains, gain_remarks
+from rigidfleet.preflight.losses import loss_remarks
 from rigidfleet.preflight.margins import check_margins, margin_remarks
+from rigidfleet.preflight.obstacles import obstacle_remarks
 from rigidfleet.preflight.trajectory import (
     disturbance_remarks,
     downwash_remarks,
     limit_remarks,
-    obstacle_remarks,
     separation_remarks,
     thrust_remarks,
 )
@@ -77,6 +78,7 @@ def check(
         *disturbance_remarks(mission, found),
         *obstacle_remarks(mission, found),
         *limit_remarks(mission, found),
+        *loss_remarks(mission, found),
     ]
     if not known:
         why = "later positions depend on distances alone and are known only in flight"

@@ -11,6 +11,7 @@ from rigidfleet._common import markup
 from rigidfleet._common.text import agent_names
 from rigidfleet.math.margins import Margins
 from rigidfleet.planning import solvers
+from rigidfleet.planning.certificate import Certificate
 from rigidfleet.planning.preview import PlannedPhase
 from rigidfleet.rigidity import (
     Kind,
@@ -292,6 +293,7 @@ class Preflight:
                 "separation",
                 f"minimum {self.separation[0]:.2f} m, {self.separation[2]} at {self.separation[1]:.2f} s",
             )
+        yield from self._proved()
         if self.thrust is not None:
             force, t, who, limit = self.thrust
             of = f" (limit {limit:g} N)" if math.isfinite(limit) else " (no limit)"
@@ -321,6 +323,30 @@ class Preflight:
                 "guessed",
                 f"straight paths are assumed in {names}, where only distances guide the agents",
             )
+
+    def _proved(self) -> Iterator[tuple[str, str]]:
+        """The least of the certificates, and the phases that have none."""
+        certificates = self.certificates
+        if not certificates:
+            return
+        phase, least = min(certificates.items(), key=lambda item: item[1].separation)
+        text = (
+            f"no two agents come nearer than {least.separation:.2f} m in the planned paths, {agent_names(least.agents)}"
+            f" at {least.time:.2f} s in '{phase}' ({least.how})"
+        )
+        lacking = [p.phase for p in self.planned_phases if p.certificate is None]
+        if lacking:
+            text += f"; {some(lacking)} not proved, as no slots are tracked"
+        yield "proved", text
+
+    @property
+    def certificates(self) -> dict[str, Certificate]:
+        """Certificate of each planned phase that has one, by its name."""
+        return {
+            planned.phase: certificate
+            for planned in self.planned_phases
+            if (certificate := planned.certificate) is not None
+        }
 
     def data(self) -> dict[str, Any]:
         """Plain data for JSON, agents and slots counted from 1."""
@@ -364,6 +390,16 @@ class Preflight:
                     planned.phase for planned in self.planned_phases if not planned.exact
                 ],
                 "separation": _named(("separation_m", "time_s", "who"), self.separation),
+                "certificates": [
+                    {
+                        "phase": phase,
+                        "separation_m": c.separation,
+                        "time_s": c.time,
+                        "agents": [i + 1 for i in c.agents],
+                        "how": c.how,
+                    }
+                    for phase, c in self.certificates.items()
+                ],
                 "thrust": _named(("thrust_n", "time_s", "who", "limit_n"), self.thrust),
                 "clearance": [
                     _named(("obstacle", "clearance_m", "time_s", "who"), c) for c in self.clearance

@@ -8,26 +8,18 @@ from collections.abc import Iterator
 import numpy as np
 
 from rigidfleet._common.text import agent_names
-from rigidfleet.formation import assignment, distance_geometry
+from rigidfleet.formation import distance_geometry
 from rigidfleet.math import lqr, proximity
-from rigidfleet.mission import Box, Ground, Mission
+from rigidfleet.mission import Mission
 from rigidfleet.mission.disturbances import intensity
 from rigidfleet.planning import timing
-from rigidfleet.planning.preview import PlannedPhase, septic
-from rigidfleet.preflight.findings import DENSE, SLACK, Disturbed, Preflight, Remark, some
+from rigidfleet.planning.certificate import straight
+from rigidfleet.planning.preview import PlannedPhase
+from rigidfleet.preflight.findings import DENSE, SLACK, Disturbed, Preflight, Remark
 from rigidfleet.rigidity import (
     jacobian,
 )
-from rigidfleet.typing import Floats
 
-#: Maximum number of comparisons of agent positions with obstacles.
-_HELD = 40_000_000
-#: Maximum number of comparisons of phases with obstacles.
-_MET = 50_000
-#: Maximum number of comparisons of samples with boxes, to find gaps.
-_PASSED = 100_000_000
-#: Maximum number of obstacles whose clearance is reported; the nearest ones.
-_NEAREST = 20
 #: A steady distance from the slots is reported beyond this [m]: the verdict's tolerance of a waypoint.
 _OFFSET = 0.1
 
@@ -46,12 +38,14 @@ def separation_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
         for k in [int(separations.argmin())] if planned.path_ends is None else [0, -1]:
             ends.append((float(separations[k]), float(planned.time[k]), tuple(pairs[k].tolist())))
         if planned.path_ends is not None:
-            separation, who, share = assignment.closest_approach(*planned.path_ends, radius)
-            crossing = separation, _time_of(planned, share), who
+            certificate = planned.certificate or straight(planned.leg.reference, radius)
+            assert certificate is not None  # there are two agents
+            separation, who = certificate.separation, certificate.agents
+            crossing = separation, certificate.time, who
             least = min(least, crossing)
             beyond = separation <= 0 or separation < limit - SLACK
             if beyond and separation < min(ends)[0] - SLACK:
-                yield _crossing(mission, number, planned, crossing, limit)
+                yield _crossing(mission, planned, crossing, limit)
         for k, at in enumerate(ends):
             least = min(least, at)
             # The start positions are known even if the path from there is not.
@@ -77,16 +71,8 @@ def _near(
     return f"{agent_names(who)} have a separation of {separation:.2f} m at {t:.2f} s in '{phase}' (limit {limit:g} m)"
 
 
-def _time_of(planned: PlannedPhase, share: float) -> float:
-    """Time [s] at which agents have flown this fraction of their paths."""
-    blend = planned.leg.reference.T_b
-    tau = np.linspace(0.0, 1.0, 2001)
-    return float(planned.time[0] + blend * np.interp(share, septic(tau), tau))
-
-
 def _crossing(
     mission: Mission,
-    number: int,
     planned: PlannedPhase,
     at: tuple[float, float, tuple[int, ...]],
     limit: float,
@@ -102,16 +88,10 @@ def _crossing(
     assert after is not None  # the phase changes the formation
     assert planned.path_ends is not None
     apart = min(float(proximity.nearest(places).min()) for places in planned.path_ends)
-    flown = [p.shaping.formation for p in mission.phases[:number] if p.shaping is not None]
     spaced = f"place slots at least {math.sqrt(2) * needed:.2f} m apart (now {apart:.2f} m)"
     promised = mission.assigned_turn(before, after) is not None
     if promised:
         text += f"{spaced[0].upper()}{spaced[1:]}"
-    elif mission.assignment == "each" and after in flown:
-        text += (
-            f"The slots of '{after}' were assigned in an earlier change: add a second table [formations.NAME] with this"
-            " shape, which is then assigned in this change"
-        )
     else:
         text += 'Assign agents to near slots: assignment = "each"'
     if not promised and apart < math.sqrt(2) * needed:
@@ -250,143 +230,6 @@ def _step_thrust(mission: Mission, found: Preflight) -> Iterator[Remark]:
                 f" (limit {limits[i]:g} N). Use reference = 'shape' or 'distances'"
             )
             yield Remark("fails" if c.solver in ("exact", "pinv") else "note", "thrust", text)
-
-
-def obstacle_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
-    """Remarks on hit obstacles. Clearances of many obstacles are computed for the near ones only."""
-    radius, way = mission.fleet.radius, found.planned_phases
-    if not (mission.obstacles and way):
-        return
-    # Bounding box of each phase, and a lower bound (L, B) of its distance to each obstacle.
-    within = np.array(
-        [[planned.position.min(axis=(0, 1)), planned.position.max(axis=(0, 1))] for planned in way]
-    )
-    far = np.stack([_beyond(within, thing) for thing in mission.obstacles], axis=1) - radius.max()
-    held, met, skipped = 0, 0, []
-    near = np.argsort(far.min(axis=0), kind="stable")
-    shown: dict[int, tuple[float, float, int, str]] = {}
-    remarks: dict[int, list[Remark]] = {}
-    for rank, b in enumerate(near.tolist()):
-        thing = mission.obstacles[b]
-        if rank >= _NEAREST and far[:, b].min() > 0:
-            break
-        worst: dict[bool, tuple[float, float, int, str]] = {}
-        for k in np.argsort(far[:, b], kind="stable").tolist():
-            planned = way[k]
-            if far[k, b] >= worst.get(planned.exact, (np.inf,))[0]:
-                continue
-            held, met = held + planned.position[:, :, 0].size, met + 1
-            if held > _HELD or met > _MET:
-                break
-            clearance, agent, _ = proximity.clearance(planned.position, radius, [thing])
-            at = int(clearance.argmin())
-            # Among equal minima, take the first one: ignore rounding and the last millimetre of a rest.
-            if clearance[at] < worst.get(planned.exact, (np.inf,))[0] - 1e-3:
-                worst[planned.exact] = (
-                    float(clearance[at]),
-                    float(planned.time[at]),
-                    int(agent[at]),
-                    planned.phase,
-                )
-        if held > _HELD or met > _MET:
-            skipped = near[rank:][far[:, near[rank:]].min(axis=0) <= 0].tolist()
-            break
-        if worst:
-            shown[b] = min(worst.values())
-        for exact, (clearance, t, i, phase) in worst.items():
-            if clearance <= 0:
-                verb = "hits" if exact else "may hit"
-                text = f"agent {i + 1} {verb} '{thing.name}' at {t:.2f} s in '{phase}'"
-                if not isinstance(thing, Box):
-                    text += _too_low(mission, found, phase, thing.height)
-                remark = Remark("fails" if exact else "note", "obstacle", text)
-                remarks.setdefault(b, []).append(remark)
-    for b in sorted(shown):
-        clearance, t, i, _ = shown[b]
-        found.clearance.append((mission.obstacles[b].name, clearance, t, f"agent {i + 1}"))
-    for b in sorted(remarks):
-        yield from remarks[b]
-    if skipped:
-        names = [mission.obstacles[b].name for b in sorted(skipped)]
-        text = f"to limit the time of the check, {some(names)} skipped"
-        yield Remark("note", "obstacle", text)
-    yield from _gaps(mission, found, radius)
-
-
-def _beyond(within: Floats, thing: Box | Ground) -> Floats:
-    """Distance (L,) [m] of boxes (L, 2, 3), given by lowest and highest corner, to an obstacle."""
-    low, high = within[:, 0], within[:, 1]
-    if isinstance(thing, Box):
-        apart = np.maximum(np.maximum(low - thing.max, thing.min - high), 0.0)
-        return np.linalg.norm(apart, axis=1)
-    return np.maximum(low[:, 2] - thing.height, 0.0)
-
-
-def _too_low(mission: Mission, found: Preflight, phase: str, ground: float) -> str:
-    """Why a vehicle touches the ground [m] in a phase, and the altitude that its formation needs."""
-    planned = next(planned for planned in found.planned_phases if planned.phase == phase)
-    masses, radius = mission.fleet.mass, mission.fleet.radius
-    z = planned.position[..., 2]
-    cm = z @ masses / masses.sum()
-    k, i = np.unravel_index(int((z - radius).argmin()), z.shape)
-    deep, below = ground + radius[i] - z[k, i], cm[k] - z[k, i]
-    high = float((ground + radius + cm[:, None] - z)[k].max())
-    return (
-        f": its centre is at z = {z[k, i]:.2f} m with a radius of {radius[i]:g} m, {deep:.2f} m too low, because its"
-        f" slot is {below:.2f} m below the centre of mass at z = {cm[k]:.2f} m. Keep it at or above z ="
-        f" {math.ceil(100 * high + 1e-6) / 100:.2f} m, or turn the formation so that this slot is higher"
-    )
-
-
-def _gaps(mission: Mission, found: Preflight, radius: Floats) -> Iterator[Remark]:
-    """Remarks on gaps between two boxes through which the centre of mass passes.
-
-    A gap lies between the nearest boxes on both sides of the centre of mass along an axis.
-    """
-    masses = mission.fleet.mass
-    boxes = [thing for thing in mission.obstacles if isinstance(thing, Box)]
-    if len(boxes) < 2:
-        return
-    low, high = np.array([box.min for box in boxes]), np.array([box.max for box in boxes])
-    least: dict[tuple[int, int, int], tuple[float, float, str]] = {}
-    looked, to = 0, math.inf
-    for planned in found.planned_phases:
-        looked += len(planned.time) * len(boxes)
-        if looked > _PASSED:
-            to = float(planned.time[0])
-            break
-        cm = np.einsum("i,kia->ka", masses, planned.position) / masses.sum()
-        between = (cm[:, None] > low) & (cm[:, None] < high)
-        for axis in range(3):
-            rest = [k for k in range(3) if k != axis]
-            beside = between[:, :, rest].all(axis=2)
-            if not beside.any():
-                continue
-            at = cm[:, axis, None]
-            below = np.where(beside & (high[:, axis] < at), high[:, axis], -np.inf)
-            above = np.where(beside & (low[:, axis] > at), low[:, axis], np.inf)
-            sides = np.column_stack([below.argmax(axis=1), above.argmin(axis=1)])
-            inside = np.isfinite(below.max(axis=1)) & np.isfinite(above.min(axis=1))
-            for one, two in np.unique(sides[inside], axis=0).tolist():
-                when = inside & (sides == [one, two]).all(axis=1)
-                along = planned.position[when][:, :, axis]
-                takes = (along + radius).max(axis=1) - (along - radius).min(axis=1)
-                k, key = int(takes.argmax()), (one, two, axis)
-                if key not in least or takes[k] > least[key][0]:
-                    least[key] = float(takes[k]), float(planned.time[when][k]), planned.phase
-    for (one, two, axis), (takes, t, phase) in sorted(least.items()):
-        between = f"'{boxes[one].name}' and '{boxes[two].name}'"
-        wide = float(low[two, axis] - high[one, axis])
-        found.gaps.append((between, wide, takes, t))
-        if takes > wide:
-            text = (
-                f"the gap between {between} is {wide:.2f} m wide, but the formation needs {takes:.2f} m"
-                f" in its attitude at {t:.2f} s in '{phase}': turn or reshape it before"
-            )
-            yield Remark("fails", "obstacle", text)
-    if math.isfinite(to):
-        text = f"gaps between obstacles are checked only up to {to:g} s: more would take too long"
-        yield Remark("note", "obstacle", text)
 
 
 def limit_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:

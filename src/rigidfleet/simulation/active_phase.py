@@ -74,6 +74,7 @@ class ActivePhase:
         self.lost = np.zeros(len(plan.masses), dtype=np.bool_)
         if plan.before.lost is not None:
             self.lost = plan.before.lost
+        self.parted = plan.links_lost[1] <= plan.start  # (L,) links that are lost
         self.asked = 0  # number of calls of the user's controller
         self.held: Problem | None = None  # with the controller's force
         self.flown: Problem | None = None  # the problem of the steps in the trail
@@ -216,28 +217,35 @@ class ActivePhase:
             self.solver.aside.check()
 
     def _integrate(self, problem: Problem, t_end: float) -> None:
-        """Integrate to ``t_end`` [s], and remove vehicles at the times at which they are lost.
+        """Integrate to ``t_end`` [s], and remove vehicles and links at the times at which they are lost.
 
         ``problem`` may hold a user's force instead of the phase's own input law.
         """
         while self.t < t_end:
             coming = np.where(self.lost, math.inf, self.plan.lost_at)
-            if coming.min() <= self.t:
+            links = np.where(self.parted, math.inf, self.plan.links_lost[1])
+            next_loss = min(float(coming.min()), float(links.min(initial=math.inf)))
+            if next_loss <= self.t:
                 problem = self._lose(problem, coming <= self.t)
             else:
-                self._segment(problem, min(t_end, float(coming.min())))
+                self._segment(problem, min(t_end, next_loss))
 
     def _lose(self, problem: Problem, now: Bools) -> Problem:
-        """Continue without the vehicles that are lost ``now`` (N,); return the remaining problem."""
+        """Continue without the vehicles that are lost ``now`` (N,) and without the links lost by now.
+
+        Returns the remaining problem.
+        """
         self.watch(last=True)
         self._check()
-        self.lost = self.lost | now
         plan, y, own = self.plan, self.state.y, problem is self.plan.problem
-        plan.before.lost = self.lost
-        self.extremes.lose(self.lost)
+        self.parted = plan.links_lost[1] <= self.t
+        if now.any():
+            self.lost = self.lost | now
+            plan.before.lost = self.lost
+            self.extremes.lose(self.lost)
         n = len(self.lost)
         self.count()
-        kept = plan.release(self.lost)
+        kept = plan.release(self.lost, self.parted)
         integral = y[6 * n : 6 * n + len(kept)][kept]
         rest = y[6 * n + len(kept) :]
         y = np.concatenate([y[: 6 * n], integral, rest])

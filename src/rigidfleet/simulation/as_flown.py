@@ -10,6 +10,7 @@ from rigidfleet.errors import Finding, MissionError, wrong_type
 from rigidfleet.mission import Mission, Phase
 from rigidfleet.mission.findings import near
 from rigidfleet.mission.kinds import KINDS
+from rigidfleet.mission.losses import ON_LOSS
 from rigidfleet.result import PhaseRecord
 
 
@@ -123,10 +124,13 @@ def _flown_data(
         data["assignment"] = "given"
         data["formations"] = {name: _written_out(mission, name) for name in mission.formations}
     data["phases"] = [_written(*each) for each in zip(asked, records, strict=True)]
-    disturbed = given.get("disturbances", {})
-    if "lost" in disturbed:
-        left = [lost for lost in disturbed["lost"] if lost["time"] < end]
-        data["disturbances"] = disturbed | {"lost": left}
+    if disturbed := given.get("disturbances"):
+        # What followed from a loss is among the phases
+        told = {key: x for key, x in disturbed.items() if key not in ("on_loss", *ON_LOSS)}
+        for table in (told, told.get("links", {})):
+            if "lost" in table:
+                table["lost"] = [lost for lost in table["lost"] if lost["time"] < end]
+        data["disturbances"] = told
     return data
 
 

@@ -19,7 +19,8 @@ from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
 from rigidfleet.mission import Mission
 from rigidfleet.result import PAD, Extremum, PhaseRecord
-from rigidfleet.typing import Bools, Floats
+from rigidfleet.solids.records import joined
+from rigidfleet.typing import Bools, Floats, Ints
 
 #: Greatest number of agents of which all pairs are monitored.
 _FEW = 40
@@ -67,7 +68,12 @@ class Extremes:
         agents, limits = mission.agents, mission.limits
         self.n = mission.n_agents
         self.radius = np.array(agents.radius, dtype=float)
-        self.boxes = np.array([thing.corners for thing in mission.obstacles]).reshape(-1, 6)
+        corners = [thing.corners for thing in mission.obstacles]
+        #: Obstacles of all kinds, unless all are boxes that the monitor itself takes.
+        self.solids = None
+        if None in corners:
+            self.solids, corners = joined([thing.solid for thing in mission.obstacles]), []
+        self.boxes = np.array(corners).reshape(-1, 6)
         fence = limits.geofence
         self.fence = np.array([] if fence is None else [*fence.min, *fence.max]).reshape(-1, 6)
         self.stacks = self.n <= _FEW or limits.separation_below is not None
@@ -122,6 +128,7 @@ class Extremes:
     ) -> None:
         """Evaluate the steps in the trail; ``last``: no further steps of the segment follow."""
         flags, rows = self.monitor.monitor.flags, int(state.count[4])
+        self._take_solids(problem, state, int(flags[3]), rows)
         flags[:3] = flags[3], rows, 2 if last else 1
         if self.n > _FEW:
             for row in range(int(flags[3]), rows):
@@ -133,6 +140,7 @@ class Extremes:
     def take_path(self, problem: Problem, work: Workspace, state: records.IntegratorState) -> None:
         """Evaluate the paths alone of the steps in the trail, not the forces."""
         rows, flags = int(state.count[4]), self.monitor.monitor.flags
+        self._take_solids(problem, state, 0, rows)
         if self.n > _FEW:
             for row in range(rows):
                 self._step(problem, work, state, row)
@@ -140,20 +148,38 @@ class Extremes:
         flags[:3] = 0, rows, 0
         self.monitor(problem, work, state)
 
-    def take_vehicles(
-        self, state: fleet.SampledState, vehicles: fleet.Quadrotors, lost: Bools, ticks: int
+    def _take_solids(
+        self, problem: Problem, state: records.IntegratorState, first: int, last: int
     ) -> None:
-        """Take the extremes that a sampled flight keeps by itself, of a phase of some ticks so far."""
-        rotors = ~(vehicles.point | lost)
+        """Take the clearances of some steps in the trail to obstacles that the monitor itself does not take."""
+        if self.solids is None:
+            return
+        from rigidfleet.kernel import obstacles  # loads the compiler
+
+        trail, body = state.trail, bool(problem.body_formulation)
+        laid = obstacles.layout(problem.vehicles.m, problem.graph.edges, body)
+        watched = obstacles.monitor_of(self.monitor.monitor)
+        obstacles.watch(
+            trail.points[first:last], trail.clock[first:last], laid, self.solids, watched
+        )
+
+    def take_vehicles(
+        self,
+        state: fleet.SampledState,
+        vehicles: fleet.Quadrotors,
+        gone: Bools,
+        lost: Bools,
+        ticks: int,
+    ) -> None:
+        """Take the extremes that a sampled flight keeps by itself, of a phase of some ticks so far.
+
+        Vehicles ``gone`` (N,) were lost before the phase; those that are ``lost`` (N,) in it count up to then.
+        """
+        rotors, left = ~(vehicles.point | gone), np.flatnonzero(~gone)
         for k, kind, sign in _SAMPLED:
-            for i in np.flatnonzero(~lost):
-                self._take(
-                    kind, sign * float(state.worst[i, k]), float(state.worst_time[i, k]), int(i)
-                )
-        for i in np.flatnonzero(~lost):
-            load = float(state.worst[i, fleet.LOAD])
-            margin, when = float(vehicles.limit[i]) - load, float(state.worst_time[i, fleet.LOAD])
-            self._take(records.THRUST_MARGIN, margin, when, int(i))
+            self._take_first(kind, sign * state.worst[left, k], state.worst_time[left, k], left)
+        load, when = (x[left, fleet.LOAD] for x in (state.worst, state.worst_time))
+        self._take_first(records.THRUST_MARGIN, vehicles.limit[left] - load, when, left)
         found: dict[str, Extremum] = {}
         if rotors.any():
             peak = np.where(rotors[:, None], state.peak, -1.0)
@@ -164,7 +190,7 @@ class Extremes:
             i = int(upright.argmin())
             angle = math.acos(min(max(float(upright[i]), -1.0), 1.0))
             found["tilt"] = Extremum(angle, float(state.worst_time[i, fleet.UPRIGHT]), i, -1)
-        error = np.where(lost, -1.0, state.worst[:, fleet.ERROR])
+        error = np.where(gone, -1.0, state.worst[:, fleet.ERROR])
         i = int(error.argmax())
         if error[i] > 0.0:
             found["tracking_error"] = Extremum(
@@ -199,9 +225,11 @@ class Extremes:
                 found[f"{name}_lost"] = Extremum(value, t, *who)
         return found
 
-    def _take(self, kind: int, value: float, t: float, who: int) -> None:
-        if value < self.worst[kind]:
-            self.worst[kind], self.when[kind], self.who[kind] = value, t, (who, -1)
+    def _take_first(self, kind: int, values: Floats, times: Floats, who: Ints) -> None:
+        """Take the least of the agents' values into account; of equal ones, the first in time."""
+        if len(who) and (value := float(values.min())) < self.worst[kind]:
+            i = int(np.where(values == value, times, np.inf).argmin())
+            self.worst[kind], self.when[kind], self.who[kind] = value, times[i], (who[i], -1)
 
     def so_far(self) -> dict[str, Extremum]:
         """Extremes of the phase under way, by name."""

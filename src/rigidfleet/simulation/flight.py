@@ -19,6 +19,7 @@ from rigidfleet.math import attitude as att
 from rigidfleet.math import lqr
 from rigidfleet.mission import Mission, Phase, as_mission
 from rigidfleet.planning.disturbances import disturbance
+from rigidfleet.planning.losses import after_loss
 from rigidfleet.planning.plan import PhasePlan, plan_phase
 from rigidfleet.planning.reference import PhaseState, Pose
 from rigidfleet.planning.timing import timed, with_times
@@ -206,7 +207,9 @@ class Flight:
         self._asked: list[Phase] = []  # each phase as it was begun
         self._cut: set[int] = set()  # phases left before their end
         self._finished = False
-        self._following = 0  # index of the mission's next phase
+        self._route = list(mission.phases)  # phases to fly; after a loss, those that it asks for
+        self._reacted = mission.on_loss == "continue"  # whether nothing (more) follows from a loss
+        self._following = 0  # index of the route's next phase
         self._started = self._reported = clock.perf_counter()
         self._count = np.zeros(3, dtype=np.int64)
         self._solves: dict[str, Counts] = {}
@@ -278,9 +281,12 @@ class Flight:
                 raise FlightError(
                     f"nothing of phase '{self.phases[-1].name}' has been flown: call advance before the next begin"
                 )
-            if self._following >= len(self.mission.phases):
+            if not self._reacted and self.t >= self.mission.first_loss:
+                self._leave(changed=True)
+                self._react()
+            if self._following >= len(self._route):
                 return False
-            phase = self.mission.phases[self._following]
+            phase = self._route[self._following]
             self._following += 1
         elif isinstance(
             phase, Mapping
@@ -290,6 +296,8 @@ class Flight:
         else:
             check_formation(self.mission, phase)
         self._leave(changed=True)
+        if self.mission.on_loss == "continue" or not self._given(phase):
+            self._now.blend = None
         phase = with_times(self.mission, phase, self._now, len(self._asked))
         if self._asked:
             self._report(phase, planning=True)
@@ -313,6 +321,7 @@ class Flight:
         record = PhaseRecord(
             phase.name, phase.kind, phase.control, plan.formation, plan.start, plan.start,
             settled=None if phase.settle is None else False, target=plan.target,
+            planned=None if plan.certificate is None else plan.certificate._asdict(),
         )  # fmt: skip
         self.phases.append(record)
         return True
@@ -323,7 +332,8 @@ class Flight:
         Returns
         -------
         bool
-            Whether the phase goes on: False at its end, or if the flight cannot go on (then `ending` says why).
+            Whether the phase goes on: False at its end, at a loss that the mission answers, or if the flight cannot go
+            on (then `ending` says why).
 
         Raises
         ------
@@ -339,6 +349,8 @@ class Flight:
             raise ValueError(f"the duration must be positive [s], not {duration!r}")
         plan = active.plan
         stop = math.inf if duration is None else active.t + duration
+        loss = self._loss_ahead()
+        stop = min(stop, loss)
         t_end, settle = min(stop, plan.t_end), plan.phase.settle
         active.stop = stop
         try:
@@ -364,6 +376,9 @@ class Flight:
                     f" {self.t:.2f} s its error was above {settle.tolerance:g} m. Give it a"
                     " longer timeout or a larger tolerance, or look for the cause in the constraint error"
                 )
+            return False
+        if active.t >= loss:
+            self._leave(abandoned=True)
             return False
         return True
 
@@ -426,7 +441,7 @@ class Flight:
         self.ending = ending or self.ending
         if not self.pieces:
             raise FlightError(self.ending or "the flight ended before the first time to record")
-        given = tuple(self.mission.phases)
+        given = tuple(self._route)
         last = len(self._asked) - 1
         own = tuple(self._asked) == given[: last + 1] and self._cut <= {last}
         whole = own and last + 1 == len(given) and not self._cut
@@ -478,28 +493,59 @@ class Flight:
             raise FlightError(f"no phase is under way: {why}")
         return self._active
 
-    def _leave(self, *, changed: bool = False) -> None:
-        """End the phase under way; a target that was ``changed`` in flight is not judged as a waypoint."""
+    def _loss_ahead(self) -> float:
+        """Time [s] of the loss that ends the phase under way; infinity if none does.
+
+        Phases begun by hand go on: who began them decides.
+        """
+        given = self._given(self._asked[-1])
+        return self.mission.first_loss if given and not self._reacted else math.inf
+
+    def _given(self, phase: Phase) -> bool:
+        """Whether the route gives a phase that has begun last, or is about to."""
+        return self._following > 0 and phase is self._route[self._following - 1]
+
+    def _react(self) -> None:
+        """Replace the rest of the route by what the mission asks for after a loss."""
+        self._reacted = True
+        lost = self.mission.lost_at <= self._now.t
+        if lost.any():
+            self._extremes.lose(lost)
+            self._now.lost = lost
+        self._route = [*self._asked, *after_loss(self.mission, self._now)]
+        self._following = len(self._asked)
+
+    def _leave(self, *, changed: bool = False, abandoned: bool = False) -> None:
+        """End the phase under way.
+
+        A target that was ``changed`` in flight, or ``abandoned`` because of a loss, is not judged as a waypoint. Points
+        on the way are, if the flight came to them before the loss.
+        """
         active = self._active
         if active is None:
             return
         self._active = None
         if not active.flew:  # as if it had never begun: if it is the mission's, it is still to come
-            self._following -= self._asked[-1] is self.mission.phases[self._following - 1]
+            self._following -= self._given(self._asked[-1])
             del self.phases[-1], self._asked[-1]
             return
-        if not (active.settled or active.over):
+        if not (active.settled or active.over or abandoned):
             self._cut.add(len(self.phases) - 1)
         active.watch(last=True)
         record = self.phases[-1]
         record.extremes = self._extremes.phase()
-        record.settled = active.settled
+        record.abandoned = abandoned
+        record.settled = None if abandoned else active.settled
         active.count()
         self._count += active.counted
         for method, counts in active.solves:
             self._solves.setdefault(method, type(counts)()).add(counts)
         self._now = active.end()
         record.t_end = self._now.t
+        if abandoned:
+            points = () if record.target is None else record.target.get("through", ())
+            came = [point for point in points if point["time"] <= record.t_end]
+            record.target = {"time": came[-1]["time"], "through": came} if came else None
         if changed and record.target is not None and record.target["time"] > record.t_end:
             record.target = None
 

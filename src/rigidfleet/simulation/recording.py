@@ -108,7 +108,7 @@ def assemble(
     wrench = np.concatenate([f_u.sum(axis=1), np.cross(x, f_u).sum(axis=1)], axis=1)
     asked = joined("wrench")
     radius = mission.agents.radius
-    each_clearance, nearest = proximity.obstacle_clearances(r, radius, mission.obstacles)
+    each_clearance, nearest = proximity.obstacle_clearances(r, radius, mission.obstacles, time)
     each_clearance[~left] = np.inf
     separation, pair = proximity.separation_of_left(r, radius, left)
     clearance, agent, obstacle = proximity.least_clearance(each_clearance, nearest)

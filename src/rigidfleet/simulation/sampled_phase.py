@@ -18,7 +18,8 @@ from rigidfleet.kernel.records import Record
 from rigidfleet.math import attitude as att
 from rigidfleet.mission import Mission
 from rigidfleet.planning.avoidance import avoidance_in_flight
-from rigidfleet.planning.vehicles import TickTables, sampled_flight, turn_from, yaw_at
+from rigidfleet.planning.reference import ByEdge
+from rigidfleet.planning.vehicles import TickTables, sampled_flight, turn_from
 from rigidfleet.simulation.active_phase import ActivePhase
 from rigidfleet.simulation.callbacks import (
     AttitudeCommand,
@@ -48,6 +49,7 @@ class Vehicles:
         self.yaw = np.full(mission.n_agents, yaw)  # asked of each vehicle at the last switch
         self.S = fleet.hovering(self.flight.vehicles, start.position, start.velocity, yaw)
         self.state: fleet.SampledState | None = None  # of the phase before
+        self.edges = np.zeros((0, 2), dtype=np.int64)  # of that state
 
 
 class SampledPhase(ActivePhase):
@@ -63,6 +65,8 @@ class SampledPhase(ActivePhase):
         if vehicles.avoidance is not None:
             vehicles.avoidance = avoidance.renewed(vehicles.avoidance)
         self.led = False  # whether the reference is given piece by piece
+        self.unjudged = False  # whether steps were flown since the extremes of vehicles were taken
+        self.first_tick: int | None = None
         super().__init__(*arguments, **options)
         yaw = vehicles.tables.yaw
         self.turn = turn_from(self.plan.problem, self.plan.start, yaw, vehicles.yaw)
@@ -75,20 +79,36 @@ class SampledPhase(ActivePhase):
         self.state = integrator(plan, y, t, trail)
         lost = self.flight.vehicles._replace(lost=self.lost.copy())
         self.flight = self.flight._replace(vehicles=lost)
+        if self.parted.any():
+            parted = np.ascontiguousarray(plan.links_lost[0][self.parted])
+            sensing = self.flight.sensing._replace(parted=parted)
+            self.flight = self.flight._replace(sensing=sensing)
+            self.evaluate()  # the slots by which vehicles without a link presume each other
         frame = y[6 * n + m : 6 * n + m + 4] if plan.frame is not None else None
         integral, before = y[6 * n : 6 * n + m], given.state
         begun = fleet.begin(self.flight, given.S, self.workspace, frame=frame)
         if before is None:
             begun.integral[:] = integral
-        else:  # extremes are those of the phase
+        else:
             renewed = fleet.renewed(before, self.workspace, integral, frame=frame)
-            kept = ("peak", "peak_time", "worst", "worst_time", "saturations")
-            begun = renewed._replace(**{name: getattr(begun, name) for name in kept})
-        begun.peak_time[:] = begun.worst_time[:] = t
+            if self.parted.any():  # without a link, vehicles do not come to the same integrals
+                own = [
+                    ByEdge().updated(given.edges, x).of(plan.edges, integral)
+                    for x in before.integral
+                ]
+                renewed.integral[:] = own
+            if self.first_tick is None:  # extremes are those of the phase, also after a loss in it
+                fresh = ("peak", "peak_time", "worst", "worst_time", "saturations")
+                renewed = renewed._replace(**{name: getattr(begun, name) for name in fresh})
+            begun = renewed
         self.sampled = given.state = begun._replace(trail=trail._replace(gauge=trail.gauge[:, :0]))
         if given.avoidance is not None:
             given.avoidance = avoidance.holding(given.avoidance, m)
-        self.first_tick = int(self.sampled.count[fleet.TICKS])
+        given.edges = plan.edges
+        if self.first_tick is None:
+            self.first_tick = int(begun.count[fleet.TICKS])
+            self.gone = self.lost.copy()  # (N,) vehicles that do not fly in this phase
+            begun.peak_time[:] = begun.worst_time[:] = t
         self.tabled = None
 
     # -- flying -----------------------------------------------------------------------------------
@@ -97,7 +117,7 @@ class SampledPhase(ActivePhase):
         """Continue with another problem; vehicles that turn along their way do so from the yaw they have now."""
         yaw = self.vehicles.tables.yaw
         if yaw.kind == "along":
-            now = yaw_at(self.plan.problem, self.t, yaw, self.turn)
+            now = self.vehicles.tables.yaw_at(self.plan.problem, self.t, self.turn)
             self.turn = turn_from(problem, self.t, yaw, now)
         self.led = True
         super().lead(problem)
@@ -141,15 +161,20 @@ class SampledPhase(ActivePhase):
 
     def watch(self, *, last: bool) -> None:
         """Search the steps flown for extremes."""
-        rows = int(self.sampled.count[fleet.TRAILED])
-        if not rows or self.flown is None:
-            return
-        self.state.count[4] = rows
-        self.extremes.take_path(self.flown, self.workspace, self.state)
-        self.sampled.count[fleet.TRAILED] = self.state.count[4] = 0
-        ticks = int(self.sampled.count[fleet.TICKS]) - self.first_tick
-        self.extremes.take_vehicles(self.sampled, self.flight.vehicles, self.lost, ticks)
         self.extremes.avoidance = self.vehicles.avoidance
+        if rows := int(self.sampled.count[fleet.TRAILED]):
+            assert self.flown is not None
+            self.state.count[4] = rows
+            self.extremes.take_path(self.flown, self.workspace, self.state)
+            self.sampled.count[fleet.TRAILED] = self.state.count[4] = 0
+            self.unjudged = True
+        if last and self.unjudged:  # the rest is kept by the flight itself
+            assert self.first_tick is not None  # it has begun
+            ticks = int(self.sampled.count[fleet.TICKS]) - self.first_tick
+            self.extremes.take_vehicles(
+                self.sampled, self.flight.vehicles, self.gone, self.lost, ticks
+            )
+            self.unjudged = False
 
     def _segment(self, problem: Problem, t_end: float) -> None:
         """Fly to ``t_end`` [s] and record the samples on the way."""
@@ -227,7 +252,7 @@ class SampledPhase(ActivePhase):
 
     def end(self) -> Any:
         """End the phase; the vehicles keep their states."""
-        self.vehicles.yaw = yaw_at(self.plan.problem, self.t, self.vehicles.tables.yaw, self.turn)
+        self.vehicles.yaw = self.vehicles.tables.yaw_at(self.plan.problem, self.t, self.turn)
         self.vehicles.S, self.vehicles.state = self.sampled.S, self.sampled
         return super().end()
 

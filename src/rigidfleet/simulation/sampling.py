@@ -33,8 +33,9 @@ class Sampling:
         low, high = math.floor(t / step + 1e-9) + 1, math.floor(t_end / step + 1e-9) + 1
         grid = np.minimum(np.arange(low, high) * step, t_end)
         lost = plan.lost_at
+        losses = (*lost[np.isfinite(lost)], *plan.links_lost[1])
         passed = (t for t, _ in plan.through)
-        for exact in (plan.arrival, plan.t_end, stop, *passed, *lost[np.isfinite(lost)]):
+        for exact in (plan.arrival, plan.t_end, stop, *passed, *losses):
             if t < exact <= t_end:
                 grid = np.sort(np.append(grid[abs(grid - exact) > 1e-9 * step], exact))
         if not first:

@@ -52,8 +52,10 @@ def _named() -> Path:
 @cache
 def _digest() -> str:
     digest = hashlib.sha256(f"{version('numba')} {sys.version}".encode())
-    for source in sorted(Path(__file__).parents[1].rglob("*.py")):
-        digest.update(source.read_bytes())
+    kernel = Path(__file__).parents[1]
+    for folder in kernel, kernel.parent / "solids":  # compiled, too
+        for source in sorted(folder.rglob("*.py")):
+            digest.update(source.read_bytes())
     return digest.hexdigest()[:16]
 
 

@@ -164,7 +164,7 @@ def examples() -> tuple[
     return (
         problem, work, state, segment, UNRECORDED, watching, flight, fleet.begin(flight, S, work),
         fleet.segment(1, 0, 0.0), fleet.Evaluation(S, rotors, places, places, frame, S),
-        avoidance(period=1.0, b=one, lift=one, mass=one, g=0.0, radius=one, boxes=np.zeros((0, 6))),
+        avoidance(period=1.0, b=one, lift=one, mass=one, g=0.0, radius=one),
     )  # fmt: skip
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import threading
+from typing import Any
+
 import numpy as np
 
 from rigidfleet.kernel.avoidance import Avoidance
@@ -27,22 +30,49 @@ def fly_ticks(
     caller sets to 0 for a new segment. The problem must be in the inertial formulation, and without disturbances: the
     flight brings its own. With ``avoidance``, forces pass through its barriers and its guard.
     """
-    code, work = native.sampled(), state.work
+    given = problem, workspace, flight, state, segment, avoidance
+    if not _last.given or any(a is not b for a, b in zip(given, _last.given, strict=True)):
+        _last.packed, _last.given = _packed(*given), given
+    return native.sampled().fly_ticks(*(a.address for a in _last.packed[:5]))
+
+
+class _Last(threading.local):
+    """The arguments of a thread's last call, checked and packed: a flight pauses and goes on with the same ones."""
+
+    def __init__(self) -> None:
+        self.given: tuple[Any, ...] = ()
+        self.packed: tuple[Packed, ...] = ()
+
+
+_last = _Last()
+
+
+def _packed(
+    problem: Problem,
+    workspace: Workspace,
+    flight: Flight,
+    state: SampledState,
+    segment: SampledSegment,
+    avoidance: Avoidance | None,
+) -> tuple[Packed, ...]:
+    """The arguments of the machine code, and what they point to."""
+    work = state.work
     _check(flight, state, workspace)
     if problem.body_formulation or problem.disturbance.active:
         raise ValueError(
             "a sampled flight takes a problem in the inertial formulation without disturbances; its Flight has its own"
         )
     law = pack(Segment(0.0, False, 0, work.law_time, work.law_state, work.law_rate))
-    recorded = pack(UNRECORDED)
-    arguments = packed(problem), packed(workspace), packed(flight), packed(state)
-    segment = segment._replace(recorder=code.recorder, segment=law.address, record=recorded.address)
-    kept = None
-    if avoidance is not None:
-        kept = _of(avoidance, problem, workspace)
-        segment = segment._replace(guard=native.avoiding().address, avoidance=kept.address)
-    arguments = *arguments, pack(segment)
-    return code.fly_ticks(*(a.address for a in arguments))
+    recorded = packed(UNRECORDED)
+    call = segment._replace(
+        recorder=native.sampled().recorder, segment=law.address, record=recorded.address
+    )
+    states = packed(problem), packed(workspace), packed(flight), packed(state)
+    if avoidance is None:
+        return *states, pack(call), law, recorded
+    kept = _of(avoidance, problem, workspace)
+    call = call._replace(guard=native.avoiding().address, avoidance=kept.address)
+    return *states, pack(call), law, recorded, kept
 
 
 def avoid(

@@ -8,7 +8,7 @@ import { bodyAxes } from "./recording.js";
 
 const AXES = [[0.84, 0.15, 0.16], [0.13, 0.58, 0.22], [0.12, 0.36, 0.86]];
 const IDLE = [0.42, 0.47, 0.53], PULL = [0.80, 0.11, 0.09], PUSH = [0.10, 0.33, 0.75];
-const INK = [0.13, 0.15, 0.18], BOX = [0.88, 0.88, 0.87], RIM = [0.50, 0.56, 0.63], FENCE = [0.69, 0, 0.13], LIMIT = [0.86, 0.05, 0.10];
+const INK = [0.13, 0.15, 0.18], BOX = [0.88, 0.88, 0.87], RIM = [0.50, 0.56, 0.63], FENCE = [0.69, 0, 0.13], SOLID = [0.80, 0.77, 0.72], LIMIT = [0.86, 0.05, 0.10];
 const SMALLEST = 6, DETAILED = 12; // radius of a vehicle on the screen: the least, and that from which all detail is drawn [px]
 const TRAIL = 8; // length of trails [s]
 const FULL = 0.98; // share of its limit from which a rotor is drawn as being at it
@@ -169,6 +169,7 @@ export class Scene {
     this.places = Object.fromEntries(names.map((name) => [name, new Places()]));
     this.lines = { ground: new Lines(), world: new Lines() };
     this.fade = info.boxes.map(() => 1);
+    this.solids = (info.solids ?? []).map((solid) => new Solid(solid, upload));
     this.enlarged = 1;
     // Grid lines 1, 10, ... m apart, so that the formation covers some.
     const size = Math.max(...recording.columns.position ? [recording.reachAt(0)] : [1], 1e-3);
@@ -189,6 +190,7 @@ export class Scene {
     this.pixel = (2 * Math.tan(camera.fov / 2)) / Math.max(canvas.clientHeight, 1);
 
     moving = this.placeBoxes(wait) || moving;
+    for (const solid of this.solids) moving = solid.place(this, time, wait) || moving;
     this.placeVehicles(state);
     if (this.show.trails) this.placeTrails(time);
     if (this.show.edges) this.placeEdges(state);
@@ -205,6 +207,7 @@ export class Scene {
     renderer.lines(lines.ground);
     renderer.depth(true);
     renderer.meshes(meshes.box, places.solid);
+    for (const solid of this.solids) renderer.meshes(solid.mesh, solid.solid);
     renderer.meshes(meshes.vehicle, places.vehicles);
     renderer.meshes(meshes.vehicle, places.turned);
     renderer.meshes(meshes.nose, places.noses);
@@ -218,6 +221,7 @@ export class Scene {
     renderer.meshes(meshes.rotor, places.vehicles);
     renderer.meshes(meshes.disc, places.discs);
     renderer.meshes(meshes.box, places.veils);
+    for (const solid of this.solids) renderer.meshes(solid.mesh, solid.veil);
     this.labels.flush();
     return moving;
   }
@@ -425,6 +429,53 @@ function normal(q) {
 function leaning(thrust, heading) {
   const z = unit(thrust), y = unit(cross(z, Math.abs(dot(z, heading)) > 0.999 ? [0, 1, 0] : heading));
   return quaternion(cross(y, z), y, z);
+}
+
+/** An obstacle that is no box along the axes: its surface, where it is, and how much it hides. */
+class Solid {
+  constructor(info, upload) {
+    this.info = info;
+    const { corners, triangles } = info, mesh = new Mesh();
+    this.low = [0, 1, 2].map((a) => Math.min(...corners.map((p) => p[a])));
+    this.high = [0, 1, 2].map((a) => Math.max(...corners.map((p) => p[a])));
+    // About its middle: vertices of a mesh are known to a tenth of a millimetre.
+    this.middle = mixed(this.low, this.high, 0.5);
+    const at = (k) => sub(corners[triangles[k]], this.middle);
+    for (let k = 0; k < triangles.length; k += 3) mesh.triangle(at(k), at(k + 1), at(k + 2), OWN);
+    this.mesh = upload(mesh);
+    this.solid = new Places();
+    this.veil = new Places();
+    this.fade = 1;
+  }
+
+  /** Displacement at a time: straight between waypoints, at rest before and after them. */
+  shift(time) {
+    const { times, ways } = this.info;
+    if (!times.length) return [0, 0, 0];
+    let k = 0;
+    while (k < times.length - 2 && times[k + 1] < time) k++;
+    const share = (time - times[k]) / (times[k + 1] - times[k]);
+    return mixed(ways[k], ways[k + 1], Math.max(0, Math.min(share, 1)));
+  }
+
+  /** Place it at a time; a zone is a veil, and so is what hides vehicles. True while its opacity changes. */
+  place(scene, time, wait) {
+    const { corners, lines, zone } = this.info, shift = this.shift(time), colour = zone ? FENCE : SOLID;
+    const goal = scene.hides(add(this.low, shift), add(this.high, shift), scene.state) ? 0.25 : 1;
+    this.fade = goal + (this.fade - goal) * Math.exp(-wait / 0.12);
+    const moving = Math.abs(this.fade - goal) >= 0.01;
+    if (!moving) this.fade = goal;
+    this.solid.clear();
+    this.veil.clear();
+    const alpha = zone ? 0.12 : this.fade;
+    (alpha < 1 ? this.veil : this.solid).add(add(this.middle, shift), 1, NO_TURN, colour, alpha);
+    const edge = zone ? FENCE : RIM;
+    for (let k = 0; k < lines.length; k += 2) {
+      const a = add(corners[lines[k]], shift), b = add(corners[lines[k + 1]], shift);
+      scene.lines.world.add(a, b, 1.2, edge, zone ? 0.5 : 0.25 + 0.35 * alpha);
+    }
+    return moving;
+  }
 }
 
 /** Whether the segment from a to b meets a box. */

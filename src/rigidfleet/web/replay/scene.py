@@ -8,11 +8,13 @@ import numpy as np
 
 from rigidfleet.plotting import agent_colours
 from rigidfleet.plotting.quadrotors import rotor_forces, rotor_limits, tracking_error
+from rigidfleet.solids.outline import outline
+from rigidfleet.solids.records import extent
 from rigidfleet.typing import Floats, Ints
 from rigidfleet.web.replay.pack import PackedColumn
 
 if TYPE_CHECKING:
-    from rigidfleet.mission import Mission
+    from rigidfleet.mission import Mission, Obstacle
     from rigidfleet.result import Result
 
 _LINES = 12  # greatest number of lines in a plot; for more agents, the least and the greatest value
@@ -28,7 +30,7 @@ def describe(mission: Mission, edges: Ints, tension: float) -> dict[str, Any]:
     Full colour of an edge stands for ``tension`` [N].
     """
     ground = [o.height for o in mission.obstacles if o.kind == "ground"]
-    boxes = [o for o in mission.obstacles if o.kind == "box"]
+    boxes = [(o.name, o.corners) for o in mission.obstacles if is_plain_box(o) and o.corners]
     fence = mission.limits.geofence
     return {
         "name": mission.name,
@@ -38,11 +40,36 @@ def describe(mission: Mission, edges: Ints, tension: float) -> dict[str, Any]:
         **_rotors(mission),
         "edges": edges,
         "tension": tension,
-        "boxes": [{"name": o.name, "min": o.min, "max": o.max} for o in boxes],
+        "boxes": [{"name": name, "min": ends[:3], "max": ends[3:]} for name, ends in boxes],
+        "solids": [
+            _solid(o) for o in mission.obstacles if o.kind != "ground" and not is_plain_box(o)
+        ],
         "fence": None if fence is None else {"min": fence.min, "max": fence.max},
         "ground": max(ground, default=0.0),
         "solid": bool(ground),
         "plots": _plots(mission),
+    }
+
+
+def is_plain_box(thing: Obstacle) -> bool:
+    """Whether an obstacle is a box along the axes at rest, and no zone; the page has a picture of its own for these."""
+    return thing.kind == "box" and thing.corners is not None and not thing.zone
+
+
+def _solid(thing: Obstacle) -> dict[str, Any]:
+    """Surface of an obstacle, to 0.1 mm, and its way: corners, triangles and lines as indices, times and places."""
+    surface, solid = outline(thing.solid), thing.solid
+    points = np.concatenate([surface.triangles.reshape(-1, 3), surface.lines.reshape(-1, 3)])
+    corners, index = np.unique(points.round(4), axis=0, return_inverse=True)
+    index, cut = index.reshape(-1), 3 * len(surface.triangles)
+    return {
+        "name": thing.name,
+        "zone": thing.zone,
+        "corners": corners,
+        "triangles": index[:cut],
+        "lines": index[cut:],
+        "times": solid.times,
+        "ways": solid.ways,
     }
 
 
@@ -103,9 +130,12 @@ def sight(mission: Mission, low: Floats, high: Floats) -> Floats:
     """
     reach = max(float(np.linalg.norm(high - low)), 1e-6)
     seen = []
-    for box in mission.obstacles:
-        if box.kind == "box":
-            near = np.maximum(box.min, low - reach), np.minimum(box.max, high + reach)
+    for box in mission.obstacles:  # of a height map only what is drawn
+        if box.kind != "ground":
+            ends = extent(box.solid)
+            if box.kind == "heights":
+                ends[0, 2] = box.solid.heights.min()
+            near = np.maximum(ends[0], low - reach), np.minimum(ends[1], high + reach)
             seen += [near] if (near[0] <= near[1]).all() else []
     if len(seen) > _BOXES:
         seen = [(np.min([a for a, _ in seen], axis=0), np.max([b for _, b in seen], axis=0))]

@@ -1,0 +1,32 @@
+"""Functions of numbers that a lower layer also runs on arrays, made known to the compiler from the same source."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+from numba.extending import overload
+
+from rigidfleet.kernel.compiler.jit import OPTIONS
+from rigidfleet.solids import distance
+
+
+def _known(function: Callable[..., Any]) -> None:
+    """Let compiled functions call a function of Python."""
+    overload(function, jit_options=OPTIONS, strict=False)(lambda *_: function)
+
+
+def _floor(x):
+    return math.floor(x)
+
+
+# Numba takes the implementation that the second function returns for the arguments' types.
+overload(distance.choose, jit_options=OPTIONS)(
+    lambda test, this, other: lambda test, this, other: this if test else other
+)
+overload(distance.some, jit_options=OPTIONS)(lambda test: lambda test: test)
+overload(distance.whole, jit_options=OPTIONS)(lambda x: _floor)
+
+for _function in distance.ELEMENTWISE:
+    _known(_function)

@@ -1,0 +1,298 @@
+"""Clearance to obstacles of every kind, still or moving, in continuous time, over the steps of the integrator.
+
+Missions with none but boxes along the axes and grounds that stand still do not load this module: `kernel.monitor`
+handles those. Otherwise it handles all, by the distance of `rigidfleet.solids.distance`, which is compiled here.
+
+In the axes of an obstacle that moves straight, the path of an agent over a step is a polynomial of fourth degree; steps
+are cut at waypoints. The signed distance to a convex solid is convex along the path, and nowhere below its tangent
+plane. A height map is not convex, but each of its triangles is: outside, its distance is the least of theirs, and exact
+to `CLOSE` as well. Inside, its depth is that at five points of each step, and its sign is certain.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from rigidfleet.kernel.bernstein import CLOSE, halve
+from rigidfleet.kernel.compiler import elementwise  # noqa: F401 -- the functions of numbers below
+from rigidfleet.kernel.compiler.jit import compiled
+from rigidfleet.kernel.monitor import (
+    angle_of,
+    attitudes,
+    clearance_of_interest,
+    in_world,
+    leave,
+    take_clearance,
+)
+from rigidfleet.kernel.records import Monitor
+from rigidfleet.solids.distance import (
+    displacement,
+    from_box,
+    off_triangle,
+    outward_normal,
+    own_axes,
+    signed_distance,
+)
+from rigidfleet.solids.records import HEIGHTS
+from rigidfleet.typing import Bools, Edges, Floats, Ints
+
+#: Length of the shortest piece of a step, and the greatest number of pieces of one search.
+_SHORTEST, _MOST = 2.0**-32, 10_000
+#: Rounding error, as a share of a number's size.
+_ROUNDING = 4e-15
+#: Greatest rotation of one piece of a step in the body formulation [rad].
+_TURN = 0.1
+
+
+class Watched(NamedTuple):
+    """What the monitor of obstacles reads and writes; the fields are those of `records.Monitor`."""
+
+    worst: Floats
+    when: Floats
+    who: Ints
+    radius: Floats
+    left: Bools
+    standing: Ints
+    low: Floats
+    pad: float
+    pieces: Floats
+    basis: Floats
+    poses: Floats
+    knots: Floats
+    scratch: Floats
+    curves: Floats  # (3, 5, 3) a path in the world, cut at waypoints, and in the obstacle's axes
+
+
+class _Vehicles(NamedTuple):
+    m: Floats
+
+
+class _Graph(NamedTuple):
+    edges: Edges
+
+
+class Layout(NamedTuple):
+    """The part of a `Problem` that says where positions are in its states."""
+
+    vehicles: _Vehicles
+    graph: _Graph
+    body_formulation: bool
+
+
+def layout(m: Floats, edges: Edges, body_formulation: bool) -> Layout:
+    """The layout of a problem with these masses, edges and formulation."""
+    return Layout(_Vehicles(m), _Graph(edges), body_formulation)
+
+
+@compiled
+def beside(x, y, z, b, triangle, s):
+    """Distance from solid b, or from one of its triangles if that is not -1, and the normal of a supporting plane."""
+    if triangle < 0:
+        u, v, w = outward_normal(x, y, z, b, s)
+        return signed_distance(x, y, z, b, s), u, v, w
+    u, v, w, squared = off_triangle(x, y, z, s.triangles[triangle])
+    away = math.sqrt(squared)
+    if away == 0.0:
+        return 0.0, 0.0, 0.0, 0.0
+    return away, u / away, v / away, w / away
+
+
+@compiled
+def bound_of(piece, b, triangle, s):
+    """Lower bound of the distance of a curve (15,) from something convex: its tangent plane, or the curve's extent."""
+    x, y, z = piece[6], piece[7], piece[8]
+    distance, u, v, w = beside(x, y, z, b, triangle, s)
+    least, known = 0.0, u != 0.0 or v != 0.0 or w != 0.0
+    for k in range(0, 15, 3):
+        p, q, r = piece[k] - x, piece[k + 1] - y, piece[k + 2] - z
+        along = u * p + v * q + w * r if known else -math.sqrt(p * p + q * q + r * r)
+        least = min(least, along)
+    return distance + least
+
+
+@compiled
+def nearest_along(curve, b, triangle, floor, pieces, s):
+    """Least distance of a curve with control points (5, 3) if below ``floor``, and its place; otherwise -1."""
+    best, at, top, count, close = floor, -1.0, 0, 0, CLOSE
+    for k in range(5):
+        for q in range(3):
+            pieces[0, 3 * k + q] = curve[k, q]
+            close = max(close, _ROUNDING * abs(curve[k, q]))
+    pieces[0, 15], pieces[0, 16] = 0.0, 1.0
+    while top >= 0:
+        piece, count = pieces[top], count + 1
+        bound = bound_of(piece, b, triangle, s)
+        if not bound < best - close:
+            top -= 1
+            continue
+        for k in (0, 4):
+            distance, _, _, _ = beside(
+                piece[3 * k], piece[3 * k + 1], piece[3 * k + 2], b, triangle, s
+            )
+            if distance < best:
+                best, at = distance, piece[15] + (piece[16] if k == 4 else 0.0)
+        if bound < best - close and count > _MOST:
+            best, at = bound, piece[15]
+        if not bound < best - close or piece[16] <= _SHORTEST:
+            top -= 1
+            continue
+        halve(piece, pieces[top + 1])
+        top += 1
+    return best, at
+
+
+@compiled
+def nearest_heights(curve, b, floor, pieces, s):
+    """The same for a height map: the least over its triangles near the curve, and inside the depth at five points."""
+    best, at = floor, -1.0
+    x, y, z, span = curve[2, 0], curve[2, 1], curve[2, 2], 0.0
+    for k in range(5):
+        p, q, r = curve[k, 0] - x, curve[k, 1] - y, curve[k, 2] - z
+        span = max(span, p * p + q * q + r * r)
+    span = math.sqrt(span)
+    node, last = s.first[b, 0], s.last[b, 0]
+    while node < last:
+        if from_box(x, y, z, s.nodes[node]) - span >= best:
+            node = s.after[node]
+            continue
+        for triangle in range(s.leaf[node, 0], s.leaf[node, 1]):
+            value, place = nearest_along(curve, b, triangle, best, pieces, s)
+            if place >= 0.0:
+                best, at = value, place
+        node += 1
+    for k in range(5):
+        share = 0.25 * k
+        x, y, z = point_at(curve, share)
+        value = signed_distance(x, y, z, b, s)
+        if value < best:
+            best, at = value, share
+    return best, at
+
+
+@compiled
+def point_at(curve, x):
+    """Point of a curve with control points (5, 3) at x."""
+    y = 1.0 - x
+    a, b, c, d, e = y**4, 4.0 * x * y**3, 6.0 * x * x * y * y, 4.0 * x**3 * y, x**4
+    return (
+        a * curve[0, 0] + b * curve[1, 0] + c * curve[2, 0] + d * curve[3, 0] + e * curve[4, 0],
+        a * curve[0, 1] + b * curve[1, 1] + c * curve[2, 1] + d * curve[3, 1] + e * curve[4, 1],
+        a * curve[0, 2] + b * curve[1, 2] + c * curve[2, 2] + d * curve[3, 2] + e * curve[4, 2],
+    )
+
+
+@compiled
+def cut(curve, start, end, work, out):
+    """Control points (5, 3) of the part of a curve between two places, by its blossom."""
+    for k in range(5):
+        for q in range(3):
+            for i in range(5):
+                work[i] = curve[i, q]
+            for level in range(4):
+                x = end if level < k else start
+                for i in range(4 - level):
+                    work[i] = (1.0 - x) * work[i] + x * work[i + 1]
+            out[k, q] = work[0]
+
+
+@compiled
+def into_axes(curve, t, h, b, s, out):
+    """Control points (5, 3) in the axes of solid b, which moves straight from t to t + h."""
+    x0, y0, z0 = displacement(t, b, s)
+    x1, y1, z1 = displacement(t + h, b, s)
+    for k in range(5):
+        share = 0.25 * k
+        x = curve[k, 0] - (x0 + share * (x1 - x0))
+        y = curve[k, 1] - (y0 + share * (y1 - y0))
+        z = curve[k, 2] - (z0 + share * (z1 - z0))
+        out[k, 0], out[k, 1], out[k, 2] = own_axes(x, y, z, b, s)
+
+
+@compiled
+def into_own_axes(x, y, z, t, b, s):
+    """Coordinates of a point of the world in the axes of solid b at time t [s]."""
+    u, v, w = displacement(t, b, s)
+    return own_axes(x - u, y - v, z - w, b, s)
+
+
+@compiled
+def watch_solid(i, b, curve, t, h, s, monitor):
+    """Clearance of agent i's surface to solid b over a piece of a step."""
+    radius, part, own = monitor.radius[i], monitor.curves[1], monitor.curves[2]
+    start, way, last = 0.0, s.first[b, 3], s.last[b, 3]
+    while start < 1.0:
+        end = 1.0
+        while way < last and s.times[way] <= t + start * h:
+            way += 1
+        if way < last and s.times[way] < t + h:
+            end = min(1.0, max((s.times[way] - t) / h, start + _SHORTEST))
+        if start > 0.0 or end < 1.0:
+            cut(curve, start, end, monitor.scratch[2], part)
+            into_axes(part, t + start * h, (end - start) * h, b, s, own)
+        else:
+            into_axes(curve, t, h, b, s, own)
+        x, y, z, span = own[2, 0], own[2, 1], own[2, 2], 0.0
+        for k in range(5):
+            p, q, r = own[k, 0] - x, own[k, 1] - y, own[k, 2] - z
+            span = max(span, p * p + q * q + r * r)
+        floor = clearance_of_interest(i, monitor) + radius
+        if not (floor < math.inf and far_from(x, y, z, b, s) - math.sqrt(span) >= floor):
+            if s.kind[b] == HEIGHTS:
+                value, at = nearest_heights(own, b, floor, monitor.pieces, s)
+            else:
+                value, at = nearest_along(own, b, -1, floor, monitor.pieces, s)
+            if at >= 0.0:
+                when = t + (start + at * (end - start)) * h
+                take_clearance(value - radius, when, i, b, monitor)
+        start = end
+
+
+@compiled
+def far_from(x, y, z, b, s):
+    """Lower bound of the distance of a point from solid b, in its axes: that from the box around it."""
+    if s.leaf.shape[0] > 0 and s.last[b, 0] > s.first[b, 0]:
+        return from_box(x, y, z, s.size[b])
+    return signed_distance(x, y, z, b, s)
+
+
+@compiled
+def watch_landing(i, curve, t, s, monitor):
+    """At the end (time t) of a step, tell whether agent i has left all obstacles."""
+    if not (monitor.standing[i] != 0 or monitor.low[i, 0] < math.inf):
+        return
+    for b in range(s.kind.shape[0]):
+        x, y, z = into_own_axes(curve[4, 0], curve[4, 1], curve[4, 2], t, b, s)
+        near = monitor.radius[i] + monitor.pad
+        if far_from(x, y, z, b, s) <= near and signed_distance(x, y, z, b, s) <= near:
+            return
+    leave(i, monitor)
+
+
+@compiled
+def watch(points, clock, p, s, monitor):
+    """Take the clearances of steps: control points (S, 5, n) of the states, start and length (S, 2) [s]."""
+    curve = monitor.curves[0]
+    for row in range(points.shape[0]):
+        parts = 1
+        if p.body_formulation:
+            parts = int(min(max(1.0, math.ceil(angle_of(points[row], p) / _TURN)), 1e4))
+        h = clock[row, 1] / parts
+        for part in range(parts):
+            start = clock[row, 0] + part * h
+            if p.body_formulation:
+                attitudes(points[row], part, parts, p, monitor)
+            for i in range(monitor.left.shape[0]):
+                if not monitor.left[i]:
+                    continue
+                in_world(points[row], i, 0, p, monitor, curve)
+                for b in range(s.kind.shape[0]):
+                    watch_solid(i, b, curve, start, h, s, monitor)
+                if part == parts - 1:
+                    watch_landing(i, curve, start + h, s, monitor)
+
+
+def monitor_of(monitor: Monitor) -> Watched:
+    """The monitor of obstacles that writes into another one's arrays."""
+    known = {name: getattr(monitor, name) for name in Watched._fields if name != "curves"}
+    return Watched(**known, curves=np.zeros((3, 5, 3)))

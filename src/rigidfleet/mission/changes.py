@@ -1,0 +1,42 @@
+"""Changes of formation whose slots are assigned anew."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from rigidfleet.mission.kinds import Phase
+from rigidfleet.mission.schema import Formation
+
+
+def told_apart(
+    formations: Mapping[str, Formation], phases: Sequence[Phase]
+) -> tuple[dict[str, Formation], tuple[Phase, ...]]:
+    """Formations and phases in which no formation is taken on two ways that need different slots.
+
+    A formation that is taken again gets a second name, "NAME (2)", and with it slots of its own. It keeps its name, and
+    its slots, on the way back from a formation that was reached from it, and wherever it comes from the same one as
+    before: there the same slots are as good.
+    """
+    known, told = dict(formations), []
+    ways: set[tuple[str | None, str]] = set()
+    before: str | None = None
+    latest: dict[str, str] = {}  # by written name, the name in use
+    for phase in phases:
+        shaping = phase.shaping
+        if shaping is None:
+            told.append(phase)
+            continue
+        written = shaping.formation
+        name = latest.get(written, written)
+        if written in latest and name != before and (before, name) not in ways:
+            count = 2
+            while (name := f"{written} ({count})") in known:
+                count += 1
+            known[name] = formations[written]
+        latest[written] = name
+        ways.add((before, name))
+        if before is not None:
+            ways.add((name, before))
+        told.append(phase if name == written else phase.model_copy(update={"formation": name}))
+        before = name
+    return known, tuple(told)

@@ -1,0 +1,380 @@
+"""Obstacles of a mission: their keys, their solids, and checks that no single key decides."""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+from abc import abstractmethod
+from functools import cached_property
+from itertools import pairwise
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from rigidfleet.errors import Finding, MissionError
+from rigidfleet.math.attitude import dcm_from_euler
+from rigidfleet.mission import bounds
+from rigidfleet.mission.findings import FindingCollector, Keys
+from rigidfleet.mission.values import (
+    Angle,
+    Coordinate,
+    Flag,
+    Length,
+    Part,
+    Seconds,
+    Vector,
+    Velocity,
+)
+from rigidfleet.solids import records
+from rigidfleet.solids.records import Form, Solids
+
+#: Time to which a constant velocity is continued [s].
+_EVER = bounds.TIME.most
+
+
+class Solid(Part):
+    """An obstacle, which is a solid shape; distances to it are those of `rigidfleet.solids`."""
+
+    name: str = Field("", description="name; default: the kind and a number")
+    zone: Flag = Field(
+        False, description="true: a no-fly zone; judged as an obstacle, and drawn as a zone"
+    )
+
+    @property
+    @abstractmethod
+    def form(self) -> Form:
+        """The shape, where its keys place it."""
+
+    @property
+    def corners(self) -> tuple[float, ...] | None:
+        """Lowest and highest corner (6,) [m] of a box along the world's axes at rest; None for all others."""
+        return None
+
+    @property
+    def motion(self) -> tuple[Any, Any]:
+        """Displacements (W, 3) [m] and their times (W,) [s]; empty if the obstacle does not move."""
+        return (), ()
+
+    @cached_property
+    def solid(self) -> Solids:
+        """The obstacle as arrays.
+
+        Raises
+        ------
+        ValueError
+            The points of a hull lie in a plane.
+        """
+        ways, times = self.motion
+        return records.single(self.form, times, ways)
+
+
+class Moving(Solid):
+    """An obstacle that may move, without turning."""
+
+    velocity: Velocity | None = Field(
+        None, description="constant velocity [m/s], from the start of the mission"
+    )
+    waypoints: tuple[Vector, ...] | None = Field(
+        None,
+        description="places of the obstacle's centre [x, y, z] [m] at `times`: straight between them at constant "
+        "speed, at rest before the first and after the last",
+    )
+    times: tuple[Seconds, ...] | None = Field(
+        None, description="mission times of the waypoints [s], increasing"
+    )
+
+    @property
+    def motion(self) -> tuple[Any, Any]:
+        """Displacements (W, 3) [m] and their times (W,) [s]."""
+        if self.velocity is not None and any(self.velocity):
+            return np.outer([0.0, _EVER], self.velocity), np.array([0.0, _EVER])
+        if self.waypoints is None:
+            return (), ()
+        return np.array(self.waypoints) - self.centre_of_form, np.array(self.times)
+
+    @property
+    def centre_of_form(self) -> Any:
+        """The centre (3,) [m] that waypoints lead: where the other keys place the obstacle."""
+        return self.form.origin
+
+
+class Box(Moving):
+    """A box, parallel to the world axes or turned."""
+
+    kind: Literal["box"] = Field(description="a box, parallel to the world axes unless turned")
+    min: Vector = Field(description="lowest corner [x, y, z] [m], before turning")
+    max: Vector = Field(description="highest corner [x, y, z] [m], before turning")
+    roll_deg: Angle = Field(
+        0.0, description="roll [deg] about the box's centre, 3-2-1 Euler angles"
+    )
+    pitch_deg: Angle = Field(0.0, description="pitch [deg]")
+    yaw_deg: Angle = Field(0.0, description="yaw [deg]")
+
+    @property
+    def corners(self) -> tuple[float, ...] | None:
+        """Lowest and highest corner (6,) [m]; None if the box is turned or moves."""
+        if self.turned or len(self.motion[1]):
+            return None
+        return (*self.min, *self.max)
+
+    @property
+    def turned(self) -> bool:
+        """Whether the box is not parallel to the world axes."""
+        return bool(self.roll_deg or self.pitch_deg or self.yaw_deg)
+
+    @property
+    def form(self) -> Form:
+        """The box; turned by ``turn`` from world axes to its own."""
+        angles = np.deg2rad([self.roll_deg, self.pitch_deg, self.yaw_deg])
+        return records.box(self.min, self.max, dcm_from_euler(angles) if self.turned else None)
+
+    @property
+    def centre_of_form(self) -> Any:
+        """The box's centre (3,) [m]."""
+        return (np.array(self.min) + np.array(self.max)) / 2
+
+
+class Sphere(Moving):
+    """A sphere."""
+
+    kind: Literal["sphere"] = Field(description="a sphere")
+    centre: Vector = Field((0.0, 0.0, 0.0), description="centre [x, y, z] [m]")
+    radius: Length = Field(description="radius [m]")
+
+    @property
+    def form(self) -> Form:
+        """The ball."""
+        return records.ball(self.centre, self.radius)
+
+
+class Cylinder(Moving):
+    """A cylinder along any axis."""
+
+    kind: Literal["cylinder"] = Field(description="a cylinder along any axis, with flat ends")
+    ends: Annotated[tuple[Vector, ...], Field(min_length=2, max_length=2)] = Field(
+        description="centres of the two ends, [[x, y, z], [x, y, z]] [m]"
+    )
+    radius: Length = Field(description="radius [m]")
+
+    @property
+    def form(self) -> Form:
+        """The cylinder."""
+        return records.cylinder(self.ends, self.radius)
+
+
+class Hull(Moving):
+    """The convex hull of points."""
+
+    kind: Literal["hull"] = Field(description="the convex hull of points; its centre is their mean")
+    points: Annotated[tuple[Vector, ...], Field(min_length=4, max_length=bounds.HULL)] = Field(
+        description="points [x, y, z] [m], four or more, not all in a plane"
+    )
+
+    @property
+    def form(self) -> Form:
+        """The hull."""
+        return records.hull(self.points)
+
+
+class Heights(Solid):
+    """A height map: terrain over a rectangle."""
+
+    kind: Literal["heights"] = Field(
+        description="everything between a surface of given heights and a base, over a rectangle"
+    )
+    corner: Annotated[tuple[Coordinate, ...], Field(min_length=2, max_length=2)] = Field(
+        (0.0, 0.0), description="place [x, y] [m] of the first height"
+    )
+    spacing: Length = Field(description="distance between neighbouring heights along x and y [m]")
+    heights: tuple[tuple[Coordinate, ...], ...] | None = Field(
+        None,
+        description="heights [m]: a list for each x, in which y increases; each square between four heights is two "
+        "triangles, divided from its lowest x and y to its highest",
+    )
+    file: str | None = Field(
+        None,
+        description="instead of heights: a CSV or NPY file with them, relative to the mission file; the result holds "
+        "the heights themselves",
+    )
+    base: Coordinate | None = Field(
+        None,
+        description="height of the underside [m]; default: as far below the lowest height as the map is wide",
+    )
+
+    @property
+    def form(self) -> Form:
+        """The height map."""
+        heights, step = np.array(self.heights), np.full(2, self.spacing)
+        wide = self.spacing * (max(heights.shape) - 1)
+        base = float(heights.min()) - wide if self.base is None else self.base
+        return records.height_map(self.corner, step, heights, base)
+
+
+class Ground(Part):
+    """Everything below a height."""
+
+    kind: Literal["ground"] = Field(description="everything below a height")
+    name: str = Field("", description="name; default: 'ground'")
+    height: Coordinate = Field(0.0, description="height of the ground [m]")
+
+    @property
+    def zone(self) -> bool:
+        """A ground is no zone."""
+        return False
+
+    @property
+    def corners(self) -> tuple[float, ...] | None:
+        """Lowest and highest corner (6,) [m] of a box that is infinite except at the top."""
+        return (*(-math.inf,) * 3, math.inf, math.inf, self.height)
+
+    @cached_property
+    def solid(self) -> Solids:
+        """The ground as arrays."""
+        return records.single(records.half_space(self.height))
+
+
+Obstacle = Annotated[Box | Sphere | Cylinder | Hull | Heights | Ground, Field(discriminator="kind")]
+KINDS: dict[str, type[Part]] = {
+    "box": Box, "ground": Ground, "sphere": Sphere, "cylinder": Cylinder, "hull": Hull, "heights": Heights,
+}  # fmt: skip
+
+
+def checked(collector: FindingCollector, kind: type[Part], data: Any, k: int) -> Obstacle | None:
+    """Obstacle number k (from 0) of a kind; None, with findings, if it is not valid."""
+    path: Keys = ("obstacles", k)
+    name = "ground" if kind is Ground else f"{data['kind']} {k + 1}"
+    found: Any = collector.validate(kind, {"name": name} | data, path)
+    if found is None:
+        return None
+    if isinstance(found, Heights) and not _heights(collector, found, path):
+        return None
+    if isinstance(found, Moving) and not _motion(collector, found, path):
+        return None
+    if isinstance(found, Cylinder) and math.dist(*found.ends) < bounds.LENGTH.least:
+        problem = "has both ends at the same place"
+        collector.add((*path, "ends"), problem, "give the centres of its two ends")
+        return None
+    if isinstance(found, Hull) and collector.right(path, "points"):
+        try:
+            found.solid  # noqa: B018
+        except ValueError as error:
+            remedy = "add points beside the plane, or use a thin box"
+            collector.add((*path, "points"), str(error), remedy, None)
+            return None
+    return found
+
+
+def _motion(collector: FindingCollector, thing: Moving, path: Keys) -> bool:
+    ways, times = thing.waypoints, thing.times
+    if thing.velocity is not None and ways is not None:
+        collector.add((*path, "velocity"), "has no effect with waypoints", "remove one of them")
+        return False
+    for one, other in ("waypoints", "times"), ("times", "waypoints"):
+        if getattr(thing, one) is not None and getattr(thing, other) is None:
+            if collector.right(path, other):
+                collector.add((*path, other), f"is missing: {one} need it", f"add {other}")
+            return False
+    if ways is None or times is None:
+        return True
+    if len(ways) != len(times) or len(ways) < 2:
+        problem = f"has {len(times)} entries for {len(ways)} waypoints"
+        collector.add(
+            (*path, "times"), problem, "give one time for each waypoint, two or more", None
+        )
+        return False
+    if min(b - a for a, b in pairwise(times)) < bounds.TIME.least:
+        collector.add((*path, "times"), "must increase", "order the waypoints by time")
+        return False
+    return True
+
+
+def _heights(collector: FindingCollector, thing: Heights, path: Keys) -> bool:
+    if thing.file is not None:
+        problem = "is read only with a mission file, as its path is relative to that"
+        collector.add((*path, "file"), problem, "load the mission from its file, or give heights")
+        return False
+    if thing.heights is None:
+        if collector.right(path, "heights"):
+            collector.add((*path, "heights"), "is missing", "add heights, or a file with them")
+        return False
+    rows = {len(row) for row in thing.heights}
+    if len(rows) > 1 or len(thing.heights) < 2 or min(rows) < 2:
+        problem = f"has rows of {min(rows, default=0)} to {max(rows, default=0)} heights, {len(thing.heights)} of them"
+        remedy = "give two rows or more, all of the same length, two or more"
+        collector.add((*path, "heights"), problem, remedy, None)
+        return False
+    if (count := len(thing.heights) * max(rows)) > bounds.HEIGHTS:
+        problem = f"has {count:,} heights; the maximum is {bounds.HEIGHTS:,}"
+        collector.add((*path, "heights"), problem, "use a coarser grid", None)
+        return False
+    lowest = min(map(min, thing.heights))
+    if thing.base is not None and thing.base > lowest:
+        problem = f"lies above the lowest height, {lowest:g} m"
+        collector.add((*path, "base"), problem, "give a base at or below all heights")
+        return False
+    return True
+
+
+# -- heights from files --------------------------------------------------------------------------------
+
+
+def with_files(text: str, data: dict[str, Any], path: Path) -> str:
+    """Text of a mission in which heights stand instead of the names of files.
+
+    Parameters
+    ----------
+    text, data : the mission's text, and what it says
+    path : the mission file; names of files are relative to its folder
+
+    Raises
+    ------
+    MissionError
+        A file cannot be read, or has no table of numbers.
+    """
+    things = data.get("obstacles")
+    named = [
+        thing["file"]
+        for thing in (things if isinstance(things, list) else [])
+        if isinstance(thing, dict) and thing.get("kind") == "heights"
+        and isinstance(thing.get("file"), str) and "heights" not in thing
+    ]  # fmt: skip
+    for name in named:
+        rows = _table(path.parent / name)
+        written = ",\n  ".join("[" + ", ".join(map(repr, row)) + "]" for row in rows)
+        line = re.compile(rf"^(\s*)file\s*=\s*([\"']){re.escape(name)}\2", re.MULTILINE)
+        put = f"# heights of {name!r}:\n\\1heights = [\n  {written},\n]"
+        text = line.sub(lambda m, put=put: put.replace("\\1", m[1].lstrip("\n")), text, count=1)
+    return text
+
+
+def _table(path: Path) -> list[list[float]]:
+    """Numbers of a CSV or NPY file, row by row."""
+
+    def refused(problem: str, remedy: str) -> MissionError:
+        return MissionError([Finding(str(path), "", None, problem, remedy)])
+
+    try:
+        if path.suffix.lower() == ".npy":
+            found = np.load(path, allow_pickle=False)
+        else:
+            rows = list(csv.reader(path.read_text(encoding="utf-8-sig").splitlines()))
+            found = np.array([row for row in rows if any(x.strip() for x in row)], dtype=float)
+        found = np.asarray(found, dtype=float)
+    except OSError as error:
+        problem = f"cannot be read: {(error.strerror or str(error)).lower()}"
+        raise refused(problem, "give a file of heights, CSV or NPY") from None
+    except ValueError:
+        raise refused(
+            "is not a table of numbers",
+            "give rows of equal length, separated by commas, or an NPY array",
+        ) from None
+    if found.ndim != 2 or not found.size or not np.isfinite(found).all():
+        raise refused("is not a table of finite numbers", "give two or more rows of heights [m]")
+    if found.size > bounds.HEIGHTS:
+        raise refused(
+            f"has {found.size:,} heights; the maximum is {bounds.HEIGHTS:,}", "use a coarser grid"
+        )
+    return found.tolist()

@@ -1,0 +1,159 @@
+"""What the others do when a vehicle or link is lost: they brake, and then hold or land.
+
+All phases follow from the reference at the moment of the loss, so that nothing jumps: position, velocity and
+acceleration of each slot continue, and in a smooth mission jerk. A change of shape under way is completed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from rigidfleet.kernel.problem import Motion, Reference
+from rigidfleet.mission import Mission, Phase
+from rigidfleet.mission.kinds import Brake, Hold, Land, Reshape, Turn
+from rigidfleet.planning.courses import height
+from rigidfleet.planning.limits import limits_of, reached
+from rigidfleet.planning.preview import Leg, leg, phase_spans
+from rigidfleet.planning.reference import PhaseState, pose_at
+
+#: Greatest acceleration [m/s^2] and jerk [m/s^3] of a slot while it brakes, turns or spreads, and greatest speed [m/s]
+#: and acceleration of the descent, unless `limits` asks for less. A motion that is faster when it begins may go on so.
+BRAKING, JERK = 2.0, 5.0
+DESCENT, DESCENDING = 1.0, 0.5
+#: Peaks of speed and acceleration of a septic blend over unit way and time.
+_PEAK_SPEED, _PEAK_ACCELERATION = 2.1875, 7.5132
+#: Least time of a phase [s]; ratio of a time tried to the one before, and number of times tried.
+_SHORTEST, _LONGER, _TRIES = 0.5, 1.1, 60
+#: Share of a limit that counts as keeping it; the state at the start may be beyond it by rounding.
+_KEPT = 1.01
+#: Tilt that counts as level [rad].
+_LEVEL = 1e-3
+
+
+def after_loss(mission: Mission, now: PhaseState) -> list[Phase]:
+    """The phases that follow the loss of a vehicle or link, from the state at that moment.
+
+    Parameters
+    ----------
+    now : the state, with the vehicles lost until then, its reference ``pose`` and the ``blend`` under way
+    """
+    d = mission.disturbances
+    assert d is not None
+    rest = 0.0 if now.blend is None else now.blend.t0 + now.blend.T_b - now.t
+    travel = _shortest(mission, now, lambda t: _brake(t, max(t, rest)), _SHORTEST)
+    phases: list[Phase] = []
+
+    def then(phase: Phase) -> None:
+        nonlocal now
+        phases.append(phase)
+        now = _after(mission, phase, now)
+
+    then(_brake(travel, max(travel, rest)))
+    if d.on_loss == "hold":
+        until = phase_spans(mission)[-1][1] if d.hold_until is None else d.hold_until
+        if until > now.t:
+            phases.append(Hold(kind="hold", name="hold (loss)", until=until))
+        return phases
+    name = d.landing_formation
+    if name is not None and name != now.formation:
+        make = partial(_spread, name)
+        then(make(_shortest(mission, now, make, _SHORTEST)))
+    assert now.goal is not None
+    axes = now.goal.T.T
+    if math.acos(min(1.0, float(axes[2, 2]))) > _LEVEL:
+        yaw = math.atan2(axes[1, 0] - axes[0, 1], axes[0, 0] + axes[1, 1])
+        make = partial(_turn, math.degrees(yaw))
+        then(make(_shortest(mission, now, make, _SHORTEST)))
+    depth = height(mission, now)
+    if depth > 0.0:
+        least = max(
+            _PEAK_SPEED * depth / DESCENT, math.sqrt(_PEAK_ACCELERATION * depth / DESCENDING)
+        )
+        phases.append(_land(_shortest(mission, now, _land, max(least, _SHORTEST))))
+    return phases
+
+
+def state_at(found: Leg, t: float, lost: np.ndarray | None) -> PhaseState:
+    """The planned state at a time [s] within a leg in which slots are tracked."""
+    before, reference = found.before, found.reference
+    pose = pose_at(found.motion, t)
+    blending = t < reference.t0 + reference.T_b
+    goal = found.after.goal
+    if found.phase.goal_moves and goal is not None:
+        goal = replace(pose, named=goal.named)
+    return replace(
+        before, t=t, pose=pose, goal=goal, slots=found.after.slots, formation=found.after.formation,
+        blend=reference if blending else None, lost=lost,
+    )  # fmt: skip
+
+
+def _after(mission: Mission, phase: Phase, now: PhaseState) -> PhaseState:
+    found = _planned(mission, phase, now).after
+    return replace(found, blend=None)
+
+
+def _planned(mission: Mission, phase: Phase, now: PhaseState) -> Leg:
+    found = leg(mission, phase, now)
+    assert found is not None  # slots are tracked
+    return found
+
+
+def _brake(travel: float, duration: float) -> Brake:
+    return Brake(kind="brake", name="brake (loss)", duration=duration, travel=travel)
+
+
+def _spread(formation: str, time: float) -> Reshape:
+    return Reshape(
+        kind="reshape", name="spread (loss)", formation=formation, blend=time, duration=time
+    )
+
+
+def _turn(yaw: float, time: float) -> Turn:
+    return Turn(
+        kind="turn", name="level (loss)", roll_deg=0.0, pitch_deg=0.0, yaw_deg=yaw, duration=time
+    )
+
+
+def _land(time: float) -> Land:
+    return Land(kind="land", name="land (loss)", duration=time)
+
+
+def _shortest(
+    mission: Mission, now: PhaseState, make: Callable[[float], Phase], least: float
+) -> float:
+    """The time [s] from ``least`` on, to within a tenth, in which a phase keeps the limits.
+
+    Where the state at the start is beyond a limit, that counts as the limit. If no time keeps them, the best one tried.
+    """
+    own = mission.limits
+    limits = limits_of(
+        mission,
+        own.model_copy(
+            update={
+                "acceleration": BRAKING if own.acceleration is None else min(own.acceleration, BRAKING),
+                "jerk": JERK if own.jerk is None else min(own.jerk, JERK),
+            }
+        ),
+    )  # fmt: skip
+
+    def shares(reference: Reference, motion: Motion, end: float) -> np.ndarray:
+        return np.array([x.share for x in reached(limits, reference, motion, now.t, end)])
+
+    best, time = (math.inf, least), least
+    allowed: np.ndarray | None = None
+    for _ in range(_TRIES):
+        found = _planned(mission, make(time), now)
+        if allowed is None:
+            begun = shares(found.reference, found.motion, now.t + 1e-9 * max(1.0, now.t))
+            allowed = np.maximum(begun, 1.0)
+        worst = float((shares(found.reference, found.motion, found.end) / allowed).max())
+        if worst <= _KEPT:
+            return time
+        best = min(best, (worst, time))
+        time *= _LONGER
+    return best[1]

@@ -1,0 +1,255 @@
+"""Transfers of labelled vehicles through a crowd: bent ways found together, and proved.
+
+Where vehicles are dense, neither straight ways nor layers fit. Here all ways are uniform cubic B-splines of one
+duration, from rest to rest. Their control points minimise penalties of what is broken: the distance of pairs at
+samples, the box, speed and acceleration; then the ways are proved. Speed and acceleration of a B-spline are bounded by
+differences of its control points, so that limits per axis and the box hold between samples, too. The distance of pairs
+is bounded between samples by that of the polygons through them (in closed form) less twice their sagitta
+(`rigidfleet.planning.certificate.of_polygons`).
+
+The penalty methods are those of trajectory optimisation with B-splines, e.g. Zhou et al., Robust and efficient
+quadrotor trajectory generation for fast autonomous flight, IEEE RA-L 4(4), 2019.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rigidfleet.planning.certificate import Certificate, of_polygons
+from rigidfleet.typing import Floats
+
+#: Spans of a way between its knots; samples of each span at which distances are penalised, or so many that the longest
+#: way has this many in the distance to keep, on average.
+_SPANS, _SAMPLES, _PASSED = 16, 3, 2.0
+#: Durations tried, as multiples of the slowest single vehicle's, and random starts of each.
+_SLOWER, _STARTS = (1.5, 1.8, 2.1, 2.4), 2
+#: Weights of distances, speed, acceleration and box; of smoothness. Distances are wanted this much larger.
+_WEIGHTS, _SMOOTH, _SPARE = (20.0, 2.0, 2.0, 20.0), 1e-3, 1.04
+#: Greatest random displacement of a control point at the start, as a multiple of the distance to keep.
+_NOISE = 1.0
+#: Duration [s] where nobody has to move.
+_SHORTEST = 1e-3
+#: Iterations, and samples of each span for the proof, which are doubled until they suffice, at most so often.
+_ITERATIONS, _FINE, _FINER = 300, 8, 4
+
+
+class Transfer(NamedTuple):
+    """Ways of all vehicles: uniform cubic B-splines.
+
+    Attributes
+    ----------
+    control : (M + 3, N, 3) control points [m]
+    duration : of the M spans together [s]
+    certificate : least distance of two centres, in the metric in which it was asked; its time is from the start
+    """
+
+    control: Floats
+    duration: float
+    certificate: Certificate
+
+    def at(self, time: ArrayLike) -> Floats:
+        """Positions (K, N, 3) [m] at times (K,) [s] from the start; at rest before and after."""
+        spans = len(self.control) - 3
+        u = np.clip(np.asarray(time) / self.duration * spans, 0.0, spans)
+        return np.tensordot(_basis(u, spans), self.control, axes=1)
+
+
+def least_duration(
+    start: ArrayLike, goal: ArrayLike, speed: ArrayLike, acceleration: ArrayLike
+) -> float:
+    """Least time [s] in which the slowest vehicle alone goes from rest to rest, with limits on each axis."""
+    s, g = (np.asarray(x, dtype=np.float64) for x in (start, goal))
+    way = np.abs(g - s)
+    v, a = np.broadcast_to(speed, 3), np.broadcast_to(acceleration, 3)
+    slow = 2.0 * np.sqrt(way / a)
+    with np.errstate(invalid="ignore"):
+        fast = np.where(way > v**2 / a, way / v + v / a, slow)
+    return float(np.maximum(fast, 0.0).max())
+
+
+def transfer(
+    start: ArrayLike,
+    goal: ArrayLike,
+    *,
+    distance: float,
+    speed: ArrayLike,
+    acceleration: ArrayLike,
+    box: tuple[ArrayLike, ArrayLike],
+    downwash: float = 1.0,
+    seed: int = 0,
+) -> Transfer | None:
+    """Ways of vehicles from ``start`` to ``goal`` (N, 3) [m], from rest to rest, in which no two come too near.
+
+    Parameters
+    ----------
+    distance : least distance of two centres [m], in a metric whose z is divided by ``downwash``
+    speed, acceleration : greatest on each axis, (3,) or a number [m/s, m/s^2]
+    box : lowest and highest corner [m], which no centre leaves
+    seed : of the random starts of the search
+
+    Returns
+    -------
+    The first ways found that are proved, by increasing duration; None if none are.
+
+    Raises
+    ------
+    ValueError
+        Vehicles are nearer to each other than ``distance`` at the start or at the goal.
+    """
+    s, g = (np.asarray(x, dtype=np.float64) for x in (start, goal))
+    metric = np.array([1.0, 1.0, 1.0 / downwash])
+    for name, x in (("start", s), ("goal", g)):
+        least = of_polygons(x[None] * metric, np.zeros(1), 0.0)
+        if least.separation < distance:
+            raise ValueError(
+                f"vehicles {least.agents[0] + 1} and {least.agents[1] + 1} are {least.separation:.3g} m apart at the"
+                f" {name}, nearer than the distance of {distance:g} m to keep: move one of them"
+            )
+    limits = _Limits(
+        distance, np.broadcast_to(speed, 3), np.broadcast_to(acceleration, 3),
+        np.array(box[0], dtype=np.float64), np.array(box[1], dtype=np.float64), metric,
+    )  # fmt: skip
+    rng = np.random.default_rng(seed)
+    least_time = max(least_duration(s, g, limits.speed, limits.acceleration), _SHORTEST)
+    for slower in _SLOWER:
+        for start_number in range(_STARTS + 1):
+            control = _straight(s, g)
+            if start_number:  # straight ways will not do
+                control = _searched(control, slower * least_time, limits, rng)
+            found = Transfer(control, slower * least_time, _NOTHING)
+            if not _kept(found, limits):
+                continue
+            certificate = _proved(found, limits)
+            if certificate.separation >= distance:
+                return found._replace(certificate=certificate)
+    return None
+
+
+_NOTHING = Certificate(0.0, 0.0, (0, 0), "polygons less sagitta")
+
+
+class _Limits(NamedTuple):
+    """Distance to keep, limits of each axis, box, and the factors of the metric."""
+
+    distance: float
+    speed: Floats
+    acceleration: Floats
+    low: Floats
+    high: Floats
+    metric: Floats
+
+
+def _basis(u: Floats, spans: int) -> Floats:
+    """Weights (K, M + 3) of the control points at parameters u (K,) in [0, M]."""
+    k = np.minimum(u.astype(np.int64), spans - 1)
+    x = u - k
+    weights = np.stack(
+        [(1 - x) ** 3, 3 * x**3 - 6 * x**2 + 4, -3 * x**3 + 3 * x**2 + 3 * x + 1, x**3], axis=1
+    )
+    B = np.zeros((len(u), spans + 3))
+    B[np.arange(len(u))[:, None], k[:, None] + np.arange(4)] = weights / 6.0
+    return B
+
+
+def _straight(s: Floats, g: Floats) -> Floats:
+    """Control points (M + 3, N, 3) of straight ways. The first and last three are equal, for rest at the ends."""
+    share = np.clip((np.arange(_SPANS + 3) - 2) / (_SPANS - 2), 0.0, 1.0)[:, None, None]
+    return (1 - share) * s + share * g
+
+
+def _searched(
+    control: Floats, duration: float, limits: _Limits, rng: np.random.Generator
+) -> Floats:
+    """Control points (M + 3, N, 3) with little penalty, from those of straight ways; their ends stay."""
+    from scipy.optimize import minimize
+
+    n, h = control.shape[1], duration / _SPANS
+    control = control.copy()
+    longest = float(np.linalg.norm(control[-1] - control[0], axis=1).max())
+    each = max(_SAMPLES, math.ceil(_PASSED * longest / (_SPANS * limits.distance)))
+    B = _basis(np.linspace(0.0, _SPANS, _SPANS * each + 1), _SPANS)
+    free = slice(3, _SPANS)
+    share = np.linspace(0.0, 1.0, _SPANS - 1)[1:-1, None, None]
+    noise = rng.uniform(-1, 1, (1, n, 3)) * (_NOISE * limits.distance / limits.metric)
+    control[free] += 4.0 * share * (1 - share) * noise
+    shape = control[free].shape
+    near = (_SPARE * limits.distance) ** 2
+    w_near, w_speed, w_acceleration, w_box = _WEIGHTS
+    itself = np.arange(n)
+
+    def penalty(y: Floats) -> tuple[float, Floats]:
+        control[free] = y.reshape(shape)
+        slope = np.zeros_like(control)
+        x = np.tensordot(B, control, axes=1) * limits.metric
+        square = (x * x).sum(axis=2)
+        miss = near - (square[:, :, None] + square[:, None] - 2.0 * x @ x.swapaxes(1, 2))
+        miss[:, itself, itself] = 0.0
+        np.maximum(miss, 0.0, out=miss)
+        cost = 0.5 * w_near / near**2 * float((miss * miss).sum())
+        push = x * miss.sum(axis=2)[:, :, None] - miss @ x
+        slope -= np.tensordot(B.T, (4.0 * w_near / near**2) * push * limits.metric, axes=1)
+        for order, most, weight in (
+            (1, limits.speed * h, w_speed),
+            (2, limits.acceleration * h * h, w_acceleration),
+        ):
+            d = np.diff(control, order, axis=0) / most
+            over = np.sign(d) * np.maximum(np.abs(d) - 0.99, 0.0)
+            cost += weight * float((over * over).sum())
+            rise = 2.0 * weight * over / most
+            slope -= _turned(rise, order)
+            if order == 2:
+                cost += _SMOOTH * float((d * d).sum())
+                slope -= _turned(2.0 * _SMOOTH * d / most, order)
+        out = np.maximum(control - limits.high, 0.0) + np.minimum(control - limits.low, 0.0)
+        cost += w_box * float((out * out).sum())
+        slope += 2.0 * w_box * out
+        return cost, slope[free].ravel()
+
+    bounds = [
+        (a, b) for _ in range(shape[0] * n) for a, b in zip(limits.low, limits.high, strict=True)
+    ]
+    found = minimize(
+        penalty, control[free].ravel(), jac=True, method="L-BFGS-B", bounds=bounds,
+        options={"maxiter": _ITERATIONS, "maxcor": 20},
+    )  # fmt: skip
+    control[free] = found.x.reshape(shape)
+    return control
+
+
+def _turned(rise: Floats, order: int) -> Floats:
+    """The negative transpose of differences of an order, applied to slopes of them."""
+    if order == 1:
+        return np.concatenate([rise[:1], np.diff(rise, axis=0), -rise[-1:]])
+    zero = np.zeros_like(rise[:1])
+    padded = np.concatenate([zero, zero, rise, zero, zero])
+    return -np.diff(padded, 2, axis=0)
+
+
+def _kept(found: Transfer, limits: _Limits) -> bool:
+    """Whether ways keep the box, and the limits of speed and acceleration on each axis."""
+    h = found.duration / (len(found.control) - 3)
+    speed = np.abs(np.diff(found.control, 1, axis=0)) / h
+    acceleration = np.abs(np.diff(found.control, 2, axis=0)) / h**2
+    inside = (found.control >= limits.low - 1e-9) & (found.control <= limits.high + 1e-9)
+    slow = (speed <= limits.speed * (1 + 1e-9)).all()
+    return bool(inside.all() and slow and (acceleration <= limits.acceleration * (1 + 1e-9)).all())
+
+
+def _proved(found: Transfer, limits: _Limits) -> Certificate:
+    """Certificate of ways, by polygons of more and more samples until they prove the distance or leave little open."""
+    spans = len(found.control) - 3
+    h = found.duration / spans
+    bend = np.diff(found.control * limits.metric, 2, axis=0) / h**2
+    most = float(np.linalg.norm(bend, axis=2).max())
+    count = _FINE * spans
+    for _ in range(_FINER):
+        time = np.linspace(0.0, found.duration, count + 1)
+        proof = of_polygons(found.at(time) * limits.metric, time, most)
+        if proof.separation >= limits.distance:
+            break
+        count *= 2
+    return proof

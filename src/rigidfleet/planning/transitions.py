@@ -1,0 +1,158 @@
+"""Transitions of agents with slots of their own, whose straight ways cross.
+
+Agents that exchange places at will cannot all go straight and in step. They go apart instead to levels one above the
+other, across, and together again. Each of these is a straight blend in step, so that its least separation is known in
+closed form. Agents whose ways across come near each other, as seen from above, get different levels: the levels are
+colours of the graph of these conflicts (greedy colouring, the agents with most conflicts first).
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from rigidfleet.errors import Finding, MissionError
+from rigidfleet.formation.assignment import closest_approach, nearer_than
+from rigidfleet.math import rigid_body
+from rigidfleet.mission import Mission
+from rigidfleet.mission.kinds import Reshape
+from rigidfleet.mission.values import AUTO
+from rigidfleet.planning.reference import slots_about_cm
+from rigidfleet.typing import Floats, Ints
+
+#: What the parts of a transition are called.
+_PARTS = ("apart", "across", "together")
+#: Excess over a limit that is ignored [m].
+_SLACK = 1e-9
+
+
+def expanded(mission: Mission) -> Mission:
+    """Return the mission with each transition by layers as three phases of their own; itself if it has none.
+
+    The result is an ordinary mission: it can be written, read and flown by itself.
+
+    Raises
+    ------
+    MissionError
+        The layers of a phase do not keep the separation, or there is no formation before it.
+    """
+    if all(not isinstance(p, Reshape) or p.transition == "straight" for p in mission.phases):
+        return mission
+    data, tables, forms = mission.to_dict(), [], {}
+    before: str | None = None
+    for k, phase in enumerate(mission.phases):
+        table = data["phases"][k] | {"name": phase.name}
+        table.pop("transition", None)
+        parts = [table]
+        if isinstance(phase, Reshape) and phase.transition != "straight":
+            levels = _levels(mission, k, phase, before)
+            if levels is not None:
+                names = [f"{phase.name}: {part}" for part in _PARTS[:2]]
+                forms |= {
+                    name: {"slots": x, "edges": []} for name, x in zip(names, levels, strict=True)
+                }
+                parts = _phases(table, phase, names, _lengths(mission, phase, before, levels))
+        tables += parts
+        before = before if phase.shaping is None else phase.shaping.formation
+    data |= {"phases": tables, "formations": data["formations"] | forms}
+    return Mission.from_dict(data, mission.origin)
+
+
+def _ends(mission: Mission, phase: Reshape, before: str | None) -> tuple[Floats, Floats] | None:
+    """Slots (N, 3) [m] about the centre of mass before and after a phase, in body axes; None if they are not known."""
+    masses = mission.fleet.mass
+    found = [slots_about_cm(mission, name, masses) for name in (before, phase.formation)]
+    return None if found[0] is None or found[1] is None else (found[0], found[1])
+
+
+def _levels(
+    mission: Mission, number: int, phase: Reshape, before: str | None
+) -> tuple[Floats, Floats] | None:
+    """Slots (N, 3) [m] of a phase's layers before and after the way across; None if its straight ways will do."""
+    ends = _ends(mission, phase, before)
+    path = f"phases[{number + 1}].transition"
+    if ends is None:
+        problem, remedy = "starts from no formation with slots", "take a formation before"
+        raise MissionError([Finding(mission.origin, path, phase.transition, problem, remedy)])
+    p, q = ends
+    masses, radius, limits = mission.fleet.mass, mission.fleet.radius, mission.limits
+    limit = limits.separation or 0.0
+    if phase.transition == AUTO:
+        turned = q @ rigid_body.kabsch(p, q, masses).T
+        separation = closest_approach(p, turned, radius)[0]
+        if separation >= limit - _SLACK and separation > 0.0:
+            return None
+    apart = 2.0 * float(radius.max()) + limit + limits.separation_allowance
+    height = max(apart, 2.0 * float(radius.max()) + (limits.separation_below or 0.0))
+    level = height * _level_of(nearer_than(apart, p * _ABOVE, q * _ABOVE), len(p))
+    one, two = (np.column_stack([x[:, :2], level]) for x in (p, q))
+    for a, b, part in ((p, one, "apart"), (one, two, "across"), (two, q, "together")):
+        separation, pair, _ = closest_approach(a, b, radius)
+        if separation <= 0.0 or separation < limit - _SLACK:
+            who = " and ".join(f"agent {i + 1}" for i in pair)
+            problem = (
+                f"finds no layers for '{phase.name}': {who} come within {max(separation, 0.0):.2f} m on the way"
+                f" {part} (limit {limit:g} m)"
+            )
+            remedy = "place slots farther apart as seen from above, or lower limits.separation"
+            raise MissionError([Finding(mission.origin, path, phase.transition, problem, remedy)])
+    return one, two
+
+
+_ABOVE = np.array([1.0, 1.0, 0.0])
+
+
+def _level_of(conflicts: Ints, n: int) -> Floats:
+    """Level (N,) of each agent, ... -1, 0, 1, ..., such that no conflict (m, 2) is within a level."""
+    near: list[list[int]] = [[] for _ in range(n)]
+    for i, j in conflicts.tolist():
+        near[i].append(j)
+        near[j].append(i)
+    colour = np.full(n, -1)
+    for i in np.argsort([-len(others) for others in near], kind="stable").tolist():
+        taken = set(colour[near[i]].tolist())
+        colour[i] = next(k for k in range(n) if k not in taken)
+    # The fullest in the middle: 0, 1, -1, 2, -2, ...
+    order = np.argsort(-np.bincount(colour), kind="stable")
+    place = np.empty(len(order))
+    place[order] = [(k + 1) // 2 * (1 if k % 2 else -1) for k in range(len(order))]
+    return place[colour]
+
+
+def _lengths(
+    mission: Mission, phase: Reshape, before: str | None, levels: tuple[Floats, Floats]
+) -> list[float]:
+    """Greatest way [m] of an agent in each of the three parts."""
+    ends = _ends(mission, phase, before)
+    assert ends is not None  # layers have been found between them
+    stops = [ends[0], *levels, ends[1]]
+    return [float(np.linalg.norm(b - a, axis=1).max()) for a, b in pairwise(stops)]
+
+
+def _phases(
+    table: dict[str, Any], phase: Reshape, names: list[str], lengths: list[float]
+) -> list[dict[str, Any]]:
+    """The three phases; a blend is shared such that all have about the same peak acceleration."""
+    blends: list[Any] = [AUTO] * 3
+    if phase.blend != AUTO:
+        shares = np.sqrt(np.maximum(lengths, 1e-3 * max(lengths)))
+        blends = [round(float(x), 6) for x in phase.blend * shares / shares.sum()]
+    parts = []
+    for name, blend in zip(names, blends, strict=False):
+        kept = {key: x for key, x in table.items() if key not in ("until", "settle")}
+        parts.append(
+            kept
+            | {
+                "name": name,
+                "formation": name,
+                "blend": blend,
+                "duration": blend,
+                "alignment": "none",
+            }
+        )
+    last = table | {"name": f"{phase.name}: {_PARTS[2]}", "blend": blends[2], "alignment": "none"}
+    if isinstance(phase.duration, float) and phase.blend != AUTO:
+        last["duration"] = round(phase.duration - blends[0] - blends[1], 6)
+    return [*parts, last]

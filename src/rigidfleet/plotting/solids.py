@@ -1,0 +1,159 @@
+"""Obstacles that are not boxes along the axes, in figures: from the side, from above, and where they move."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rigidfleet.plotting import style as st
+from rigidfleet.solids.outline import Outline, outline, places
+from rigidfleet.solids.records import HEIGHTS
+from rigidfleet.typing import Floats
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from mpl_toolkits.mplot3d import Axes3D
+
+    from rigidfleet.mission import Mission
+
+#: Colour of obstacles.
+COLOUR = "#9A9184"
+#: Number of places at which a moving obstacle is drawn, and the opacity of the first, as a share of the last.
+_PLACES, _FIRST = 5, 0.3
+#: Number of points of the way of a moving obstacle.
+_WAY = 200
+
+
+@dataclass(frozen=True)
+class Shape:
+    """An obstacle to draw."""
+
+    name: str
+    zone: bool
+    terrain: bool
+    surface: Outline  # without motion
+    at: Floats  # (M, 3) displacements at which it is drawn, in order of time [m]
+    way: Floats  # (W, 3) displacements over the flight [m]
+    grid: tuple[Floats, Floats, Floats] | None  # x, y and heights of a height map
+
+    @property
+    def ends(self) -> Floats:
+        """Lowest and highest corner (2, 3) [m] of all places at which it is drawn."""
+        points = self.surface.triangles.reshape(-1, 3)
+        return np.array(
+            [points.min(axis=0) + self.at.min(axis=0), points.max(axis=0) + self.at.max(axis=0)]
+        )
+
+
+def shapes(mission: Mission, begin: float, end: float, low: Floats, high: Floats) -> list[Shape]:
+    """Obstacles that are no plain boxes, over a time [s], as far as they come near the space from low to high (3,)."""
+    found = []
+    for thing in mission.obstacles:
+        if thing.kind == "ground" or (thing.corners is not None and not thing.zone):
+            continue
+        solid = thing.solid
+        at = way = np.zeros((1, 3))
+        if solid.moves:
+            first, last = max(begin, solid.times[0]), min(end, solid.times[-1])
+            at = places(solid, np.linspace(first, max(first, last), _PLACES))
+            way = places(solid, np.linspace(begin, end, _WAY))
+        grid = None
+        if solid.kind[0] == HEIGHTS:
+            x, y = (
+                solid.origin[0, k] + np.linspace(0.0, solid.size[0, 3 + k], n)
+                for k, n in enumerate(solid.grid[0])
+            )
+            grid = x, y, solid.heights.reshape(solid.grid[0])
+        shape = Shape(thing.name, thing.zone, grid is not None, outline(solid), at, way, grid)
+        near = (shape.ends[1] >= low) & (shape.ends[0] <= high)
+        if near.all():
+            found.append(shape)
+    return found
+
+
+def _fading(shape: Shape) -> Floats:
+    """Opacity of a shape at each of its places, as a share of the last one's."""
+    n = len(shape.at)
+    return np.linspace(_FIRST, 1.0, n) if n > 1 else np.ones(1)
+
+
+def draw_in_space(ax: Axes3D, shape: Shape) -> None:
+    """Draw an obstacle in three dimensions: lit faces, the lines of its shape, and its way."""
+    from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
+
+    colour = st.ALERT if shape.zone else COLOUR
+    dashes: Any = (0, (4, 2)) if shape.zone else "-"
+    for at, share in zip(shape.at, _fading(shape), strict=True):
+        opacity = float(share) * (0.07 if shape.zone else 0.7 if shape.terrain else 0.6)
+        faces = Poly3DCollection(
+            list(shape.surface.triangles + at), facecolors=_lit(shape, colour, opacity), edgecolors="none",
+            linewidths=0, antialiaseds=shape.zone, zorder=0.5 if shape.terrain else 2, gid="obstacle",
+        )  # fmt: skip
+        ax.add_collection3d(faces)
+        ax.add_collection3d(
+            Line3DCollection(
+                list(shape.surface.lines + at), colors=colour, linewidths=0.5, linestyles=dashes,
+                alpha=0.9 * float(share), zorder=0.6 if shape.terrain else 2.1,
+            )
+        )  # fmt: skip
+    if len(shape.way) > 1:
+        way = shape.way + shape.surface.triangles.reshape(-1, 3).mean(axis=0)
+        ax.plot(*way.T, color=colour, linewidth=1.0, linestyle=(0, (1, 1.5)), zorder=2.2)
+
+
+def _lit(shape: Shape, colour: str, opacity: float) -> Floats:
+    """Colours (T, 4) of the faces of a shape, lighter towards the light."""
+    from matplotlib.colors import to_rgb
+
+    a, b, c = shape.surface.triangles.swapaxes(0, 1)
+    normal = np.cross(b - a, c - a)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
+    light = 0.5 + 0.5 * normal @ np.array([-0.36, -0.48, 0.8])
+    dark = (1.0 - np.array(to_rgb(colour))) * (1.25 - 0.75 * light[:, None])
+    if shape.zone:
+        return np.column_stack([np.clip(1.0 - dark, 0.0, 1.0), np.full(len(dark), opacity)])
+    # Opaque in a paler colour: seams between translucent faces would show.
+    return np.column_stack([np.clip(1.0 - opacity * dark, 0.0, 1.0), np.ones(len(dark))])
+
+
+def draw_from_above(ax: Axes, shape: Shape) -> None:
+    """Draw an obstacle from above: its outline at each place, its way, contours of a height map, and its name."""
+    from matplotlib.patches import Polygon
+    from scipy.spatial import ConvexHull
+
+    colour = st.ALERT if shape.zone else COLOUR
+    flat = shape.surface.triangles.reshape(-1, 3)[:, :2]
+    rim = flat[ConvexHull(flat).vertices]
+    look: dict[str, Any] = {"facecolor": colour, "linewidth": 0, "zorder": 1}
+    if shape.zone:
+        look |= {"edgecolor": colour, "linewidth": 0.8, "linestyle": (0, (4, 2))}
+    if shape.grid is not None:
+        x, y, z = shape.grid
+        ax.contourf(x, y, z.T, 8, cmap=_ramp(), alpha=0.5, zorder=0.8)
+        ax.contour(x, y, z.T, 8, colors=colour, linewidths=0.4, alpha=0.8, zorder=0.9)
+    for at, share in zip(shape.at, _fading(shape), strict=True):
+        opacity = 0.0 if shape.terrain else 0.3 if not shape.zone else 0.1
+        patch = ax.add_patch(Polygon(rim + at[:2], **look, alpha=opacity * float(share)))
+        if shape.zone:
+            ax.add_patch(Polygon(rim + at[:2], fill=False, edgecolor=colour, linewidth=0.8,
+                                 linestyle=(0, (4, 2)), alpha=float(share), zorder=1.1))  # fmt: skip
+    if len(shape.way) > 1:
+        way = shape.way[:, :2] + rim.mean(axis=0)
+        ax.plot(*way.T, color=colour, linewidth=1.0, linestyle=(0, (1, 1.5)), zorder=1.2)
+    x, y = rim.mean(axis=0) + shape.at[-1, :2]
+    low = float(rim[:, 1].min() + shape.at[-1, 1])
+    label = ax.text(
+        x, low, st.clean(shape.name, 20), fontsize=6.5, color=st.GREY, ha="center", va="bottom", zorder=1.5,
+        parse_math=False,
+    )  # fmt: skip
+    if label.get_window_extent().width > patch.get_window_extent().width:
+        label.remove()
+
+
+def _ramp() -> Any:
+    """Colours of a height map from its lowest to its highest."""
+    from matplotlib.colors import LinearSegmentedColormap
+
+    return LinearSegmentedColormap.from_list("terrain", ["#F4F1EA", COLOUR])

@@ -1,0 +1,94 @@
+"""What follows from the losses of a mission: the planned way of those left, and the rigidity without lost links."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from rigidfleet.mission import Mission
+from rigidfleet.planning.losses import after_loss, state_at
+from rigidfleet.planning.preview import FEWEST_SAMPLES, Leg, leg, planned_phase, samples_per_phase
+from rigidfleet.preflight.findings import DENSE, Preflight, Remark
+from rigidfleet.preflight.obstacles import obstacle_remarks
+from rigidfleet.preflight.trajectory import (
+    downwash_remarks,
+    limit_remarks,
+    separation_remarks,
+    thrust_remarks,
+)
+from rigidfleet.rigidity import analyse
+
+
+def loss_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
+    """Remarks on lost links, and on the way of those left after the first loss."""
+    yield from _links(mission)
+    first = mission.first_loss
+    if mission.on_loss == "continue" or not np.isfinite(first):
+        return
+    legs = [planned.leg for planned in found.planned_phases]
+    at = next((x for x in legs if x.begin < first <= x.end), None)
+    if at is None:
+        text = f"{mission.first_lost} may be lost after the planned paths, at {first:g} s: what follows is not checked"
+        yield Remark("note", "loss", text)
+        return
+    way = planned_way(mission, at)
+    end = way[-1].end
+    does = "land by" if mission.on_loss == "land" else "hold to"
+    stop = way[0].after.r.mean(axis=0)
+    place = ", ".join(f"{x:.1f}" for x in stop)
+    text = (
+        f"after the loss of {mission.first_lost} at {first:g} s, in '{at.phase.name}', the others brake to rest about"
+        f" ({place}) m by {way[0].end:.1f} s, and {does} {end:.1f} s"
+    )
+    yield Remark("note", "loss", text)
+    most = max(samples_per_phase(mission), FEWEST_SAMPLES)
+    part = Preflight(
+        found.formations, found.gains, [planned_phase(x, most, mission.fleet.radius) for x in way]
+    )
+    judges = (separation_remarks, downwash_remarks, thrust_remarks, obstacle_remarks, limit_remarks)
+    for judge in judges:
+        yield from judge(mission, part)
+
+
+def planned_way(mission: Mission, at: Leg) -> list[Leg]:
+    """The planned legs after the first loss, which happens in the leg ``at``."""
+    first = mission.first_loss
+    lost = mission.lost_at <= first
+    now = state_at(at, first, lost if lost.any() else None)
+    way = []
+    for phase in after_loss(mission, now):
+        found = leg(mission, phase, now)
+        assert found is not None  # slots are tracked
+        way.append(found)
+        now = found.after
+    return way
+
+
+def _links(mission: Mission) -> Iterator[Remark]:
+    """Remarks on the rigidity of each formation without the edges of lost links."""
+    pairs, times = mission.links_lost
+    if not len(pairs):
+        return
+    links = ", ".join(f"{i + 1}-{j + 1} at {t:g} s" for (i, j), t in zip(pairs, times, strict=True))
+    used = {p.shaping.formation for p in mission.phases if p.shaping is not None}
+    for name in mission.formations:
+        slots, edges = mission.formation_slots(name), mission.formation_edges(name)
+        kept = edges[mission.linked(edges, np.inf)]
+        head = f"without the lost links ({links}), '{name}'"
+        if name not in used or slots is None:
+            continue
+        if len(kept) == len(edges):
+            text = f"{head} keeps all of its edges"
+        elif min(len(edges), 3 * mission.n_agents) > DENSE:
+            text = f"{head} has {len(kept)} of {len(edges)} edges; it is too large to check its rigidity"
+        elif not len(kept):
+            text = f"{head} has no edges; slots alone hold it"
+        else:
+            before, after = (analyse(slots, x, masses=mission.agents.mass) for x in (edges, kept))
+            text = (
+                f"{head} has {len(kept)} of {len(edges)} edges: {before.rigidity_class.value} before,"
+                f" {after.rigidity_class.value} after, with {after.rank} of {after.needed} independent distances"
+            )
+            text += "" if after.rigid else "; slots alone hold the rest"
+        yield Remark("note", "loss", text)

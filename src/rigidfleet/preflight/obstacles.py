@@ -1,0 +1,210 @@
+"""Check the planned paths against obstacles, in continuous time, and gaps between boxes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+
+from rigidfleet.math import proximity
+from rigidfleet.mission import Box, Ground, Mission, Obstacle
+from rigidfleet.planning.derivatives import slot_derivatives
+from rigidfleet.planning.preview import PlannedPhase
+from rigidfleet.preflight.findings import Preflight, Remark, some
+from rigidfleet.solids.records import extent
+from rigidfleet.typing import Floats
+
+#: Maximum number of comparisons of agent positions with obstacles.
+_HELD = 40_000_000
+#: Maximum number of comparisons of phases with obstacles.
+_MET = 50_000
+#: Maximum number of comparisons of samples with boxes, to find gaps.
+_PASSED = 100_000_000
+#: Maximum number of obstacles whose clearance is reported; the nearest ones.
+_NEAREST = 20
+#: Accuracy of a planned clearance [m].
+_CLOSE = 1e-3
+#: Greatest number of times that the time between two samples is halved, and of positions in one such step.
+_HALVINGS, _OPEN = 16, 200_000
+
+
+def obstacle_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
+    """Remarks on hit obstacles. Clearances of many obstacles are computed for the near ones only."""
+    radius, way = mission.fleet.radius, found.planned_phases
+    if not (mission.obstacles and way):
+        return
+    # Bounding box of each phase, and a lower bound (L, B) of its distance to each obstacle.
+    within = np.array(
+        [[planned.position.min(axis=(0, 1)), planned.position.max(axis=(0, 1))] for planned in way]
+    )
+    far = np.stack([_beyond(within, thing) for thing in mission.obstacles], axis=1) - radius.max()
+    held, met, skipped = 0, 0, []
+    paces = [_pace(planned) for planned in way]
+    near = np.argsort(far.min(axis=0), kind="stable")
+    shown: dict[int, tuple[float, float, int, str]] = {}
+    remarks: dict[int, list[Remark]] = {}
+    for rank, b in enumerate(near.tolist()):
+        thing = mission.obstacles[b]
+        if rank >= _NEAREST and far[:, b].min() > 0:
+            break
+        worst: dict[bool, tuple[float, float, int, str]] = {}
+        for k in np.argsort(far[:, b], kind="stable").tolist():
+            planned = way[k]
+            if far[k, b] >= worst.get(planned.exact, (np.inf,))[0]:
+                continue
+            held, met = held + planned.position[:, :, 0].size, met + 1
+            if held > _HELD or met > _MET:
+                break
+            clearance, agent, time = _closest(planned, thing, radius, paces[k])
+            # Among equal minima, take the first one: ignore rounding and the last millimetre of a rest.
+            if clearance < worst.get(planned.exact, (np.inf,))[0] - _CLOSE:
+                worst[planned.exact] = (clearance, time, agent, planned.phase)
+        if held > _HELD or met > _MET:
+            skipped = near[rank:][far[:, near[rank:]].min(axis=0) <= 0].tolist()
+            break
+        if worst:
+            shown[b] = min(worst.values())
+        for exact, (clearance, t, i, phase) in worst.items():
+            if clearance <= 0:
+                verb = "hits" if exact else "may hit"
+                text = f"agent {i + 1} {verb} '{thing.name}' at {t:.2f} s in '{phase}'"
+                if isinstance(thing, Ground):
+                    text += _too_low(mission, found, phase, thing.height)
+                remark = Remark("fails" if exact else "note", "obstacle", text)
+                remarks.setdefault(b, []).append(remark)
+    for b in sorted(shown):
+        clearance, t, i, _ = shown[b]
+        found.clearance.append((mission.obstacles[b].name, clearance, t, f"agent {i + 1}"))
+    for b in sorted(remarks):
+        yield from remarks[b]
+    if skipped:
+        names = [mission.obstacles[b].name for b in sorted(skipped)]
+        text = f"to limit the time of the check, {some(names)} skipped"
+        yield Remark("note", "obstacle", text)
+    yield from _gaps(mission, found, radius)
+
+
+def _beyond(within: Floats, thing: Obstacle) -> Floats:
+    """Lower bound (L,) [m] of the distance of boxes (L, 2, 3), given by lowest and highest corner, to an obstacle."""
+    low, high = extent(thing.solid)
+    apart = np.maximum(np.maximum(within[:, 0] - high, low - within[:, 1]), 0.0)
+    return np.linalg.norm(apart, axis=1)
+
+
+def _closest(
+    planned: PlannedPhase, thing: Obstacle, radius: Floats, pace: tuple[Floats, float]
+) -> tuple[float, int, float]:
+    """Least clearance [m] of a planned phase to an obstacle in continuous time, exact to `_CLOSE`; agent, and time [s].
+
+    Between two samples a distance falls by no more than the way that is flown relative to the obstacle. Where that
+    leaves room for less than the least one found, the plan is evaluated in the middle, and so on. Speeds are bounded by
+    those at both ends and by accelerations up to twice the greatest one at a sample of the phase.
+    """
+    time, moves = planned.time, thing.solid.moves
+    each, _ = proximity.obstacle_clearances(planned.position, radius, [thing], time)
+    k, i = np.unravel_index(int(each.argmin()), each.shape)
+    best, agent, when = float(each[k, i]), int(i), float(time[k])
+    speed, most = pace
+    first, length = time[:-1], np.diff(time)
+    near, far = each[:-1], each[1:]
+    for _ in range(_HALVINGS):
+        way = (speed + 0.5 * most * length[:, None]) * length[:, None]
+        if moves:
+            way = way + _way(thing, first, first + length)[:, None]
+        open_ = np.flatnonzero((0.5 * (near + far - way)).min(axis=1) < best - _CLOSE)
+        if not len(open_) or len(open_) * each.shape[1] > _OPEN:
+            break
+        first, length, speed = first[open_], 0.5 * length[open_], speed[open_]
+        middle = first + length
+        r = slot_derivatives(planned.leg.reference, planned.leg.motion, middle, 1)[:, 0]
+        between, _ = proximity.obstacle_clearances(r, radius, [thing], middle)
+        k, i = np.unravel_index(int(between.argmin()), between.shape)
+        if between[k, i] < best:
+            best, agent, when = float(between[k, i]), int(i), float(middle[k])
+        near, far = np.concatenate([near[open_], between]), np.concatenate([between, far[open_]])
+        first, length = np.concatenate([first, middle]), np.tile(length, 2)
+        speed = np.tile(speed, (2, 1))
+    return best, agent, when
+
+
+def _pace(planned: PlannedPhase) -> tuple[Floats, float]:
+    """Greatest speed (K - 1, N) [m/s] at the ends of each time between samples, and bound of accelerations [m/s^2]."""
+    speed = np.linalg.norm(planned.velocity, axis=2)
+    most = 2.0 * float(np.linalg.norm(planned.acceleration, axis=2).max())
+    return np.maximum(speed[:-1], speed[1:]), most
+
+
+def _way(thing: Obstacle, begin: Floats, end: Floats) -> Floats:
+    """Greatest way (L,) [m] of an obstacle between times (L,) [s]: its greatest speed counts wherever it moves."""
+    solid = thing.solid
+    pace = np.linalg.norm(np.diff(solid.ways, axis=0), axis=1) / np.diff(solid.times)
+    within = (solid.times[:-1] < end[:, None]) & (solid.times[1:] > begin[:, None])
+    return np.where(within, pace, 0.0).max(axis=1) * (end - begin)
+
+
+def _too_low(mission: Mission, found: Preflight, phase: str, ground: float) -> str:
+    """Why a vehicle touches the ground [m] in a phase, and the altitude that its formation needs."""
+    planned = next(planned for planned in found.planned_phases if planned.phase == phase)
+    masses, radius = mission.fleet.mass, mission.fleet.radius
+    z = planned.position[..., 2]
+    cm = z @ masses / masses.sum()
+    k, i = np.unravel_index(int((z - radius).argmin()), z.shape)
+    deep, below = ground + radius[i] - z[k, i], cm[k] - z[k, i]
+    high = float((ground + radius + cm[:, None] - z)[k].max())
+    return (
+        f": its centre is at z = {z[k, i]:.2f} m with a radius of {radius[i]:g} m, {deep:.2f} m too low, because its"
+        f" slot is {below:.2f} m below the centre of mass at z = {cm[k]:.2f} m. Keep it at or above z ="
+        f" {math.ceil(100 * high + 1e-6) / 100:.2f} m, or turn the formation so that this slot is higher"
+    )
+
+
+def _gaps(mission: Mission, found: Preflight, radius: Floats) -> Iterator[Remark]:
+    """Remarks on gaps between two boxes along the axes, at rest, through which the centre of mass passes.
+
+    A gap lies between the nearest boxes on both sides of the centre of mass along an axis.
+    """
+    masses = mission.fleet.mass
+    boxes = [t for t in mission.obstacles if isinstance(t, Box) and t.corners is not None]
+    if len(boxes) < 2:
+        return
+    low, high = np.array([box.min for box in boxes]), np.array([box.max for box in boxes])
+    least: dict[tuple[int, int, int], tuple[float, float, str]] = {}
+    looked, to = 0, math.inf
+    for planned in found.planned_phases:
+        looked += len(planned.time) * len(boxes)
+        if looked > _PASSED:
+            to = float(planned.time[0])
+            break
+        cm = np.einsum("i,kia->ka", masses, planned.position) / masses.sum()
+        between = (cm[:, None] > low) & (cm[:, None] < high)
+        for axis in range(3):
+            rest = [k for k in range(3) if k != axis]
+            beside = between[:, :, rest].all(axis=2)
+            if not beside.any():
+                continue
+            at = cm[:, axis, None]
+            below = np.where(beside & (high[:, axis] < at), high[:, axis], -np.inf)
+            above = np.where(beside & (low[:, axis] > at), low[:, axis], np.inf)
+            sides = np.column_stack([below.argmax(axis=1), above.argmin(axis=1)])
+            inside = np.isfinite(below.max(axis=1)) & np.isfinite(above.min(axis=1))
+            for one, two in np.unique(sides[inside], axis=0).tolist():
+                when = inside & (sides == [one, two]).all(axis=1)
+                along = planned.position[when][:, :, axis]
+                takes = (along + radius).max(axis=1) - (along - radius).min(axis=1)
+                k, key = int(takes.argmax()), (one, two, axis)
+                if key not in least or takes[k] > least[key][0]:
+                    least[key] = float(takes[k]), float(planned.time[when][k]), planned.phase
+    for (one, two, axis), (takes, t, phase) in sorted(least.items()):
+        between = f"'{boxes[one].name}' and '{boxes[two].name}'"
+        wide = float(low[two, axis] - high[one, axis])
+        found.gaps.append((between, wide, takes, t))
+        if takes > wide:
+            text = (
+                f"the gap between {between} is {wide:.2f} m wide, but the formation needs {takes:.2f} m"
+                f" in its attitude at {t:.2f} s in '{phase}': turn or reshape it before"
+            )
+            yield Remark("fails", "obstacle", text)
+    if math.isfinite(to):
+        text = f"gaps between obstacles are checked only up to {to:g} s: more would take too long"
+        yield Remark("note", "obstacle", text)

@@ -1,0 +1,301 @@
+"""Signed distances to solids: exact outside and inside, for one point or for arrays of points.
+
+Every function takes coordinates x, y, z that are numbers, or arrays of one shape. NumPy runs it on arrays. The kernel
+compiles the same source for numbers (`rigidfleet.kernel.compiler.elementwise`), so there is one distance in plan,
+flight and verdict. What differs between numbers and arrays is in `choose`, `some` and `whole`.
+
+Points are in the solid's own axes, unless a docstring says otherwise.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from rigidfleet.solids.records import CYLINDER, HEIGHTS, ROUNDED
+
+#: A number [m], or an array of them.
+Numbers = Any
+
+
+def choose(test: Numbers, this: Numbers, other: Numbers) -> Numbers:
+    """One number where the test holds, the other elsewhere."""
+    return np.where(test, this, other)
+
+
+def some(test: Numbers) -> Any:
+    """Whether the test holds for any point."""
+    return np.any(test)
+
+
+def whole(x: Numbers) -> Any:
+    """The greatest integer below."""
+    return np.floor(x).astype(np.int64)
+
+
+# -- boxes, balls, half spaces -------------------------------------------------------------------------
+
+
+def from_box(x: Numbers, y: Numbers, z: Numbers, box: Any) -> Numbers:
+    """Signed distance [m] from a box (6,), which may be infinite in both x and y."""
+    inside = np.maximum(box[2] - z, z - box[5])  # positive outside
+    beyond = np.maximum(inside, 0.0)
+    outside = beyond * beyond
+    if box[0] > -math.inf or box[3] < math.inf:
+        a = np.maximum(box[0] - x, x - box[3])
+        b = np.maximum(box[1] - y, y - box[4])
+        inside = np.maximum(np.maximum(a, b), inside)
+        a, b = np.maximum(a, 0.0), np.maximum(b, 0.0)
+        outside = a * a + b * b + outside
+    return np.sqrt(outside) + np.minimum(inside, 0.0)
+
+
+def box_normal(x: Numbers, y: Numbers, z: Numbers, box: Any) -> Any:
+    """Outward unit normal: away from the nearest point of a box, or inside towards its nearest face."""
+    a = np.maximum(x - box[3], 0.0) - np.maximum(box[0] - x, 0.0)
+    b = np.maximum(y - box[4], 0.0) - np.maximum(box[1] - y, 0.0)
+    c = np.maximum(z - box[5], 0.0) - np.maximum(box[2] - z, 0.0)
+    p = np.maximum(box[0] - x, x - box[3])
+    q = np.maximum(box[1] - y, y - box[4])
+    r = np.maximum(box[2] - z, z - box[5])
+    most = np.maximum(np.maximum(p, q), r)
+    inside = most <= 0.0
+    along_x, along_y = inside & (p >= most), inside & (q >= most) & (p < most)
+    along_z = inside & (q < most) & (p < most)
+    a = choose(along_x, choose(box[0] - x > x - box[3], -1.0, 1.0), a)
+    b = choose(along_y, choose(box[1] - y > y - box[4], -1.0, 1.0), b)
+    c = choose(along_z, choose(box[2] - z > z - box[5], -1.0, 1.0), c)
+    size = np.sqrt(a * a + b * b + c * c)
+    return a / size, b / size, c / size
+
+
+# -- cylinders -----------------------------------------------------------------------------------------
+
+
+def from_cylinder(x: Numbers, y: Numbers, z: Numbers, size: Any) -> Numbers:
+    """Signed distance [m] from a cylinder along z about the origin, of radius size[0] and half length size[1]."""
+    a, b = np.sqrt(x * x + y * y) - size[0], np.abs(z) - size[1]
+    inside = np.minimum(np.maximum(a, b), 0.0)
+    a, b = np.maximum(a, 0.0), np.maximum(b, 0.0)
+    return np.sqrt(a * a + b * b) + inside
+
+
+def cylinder_normal(x: Numbers, y: Numbers, z: Numbers, size: Any) -> Any:
+    """Outward unit normal at the nearest point of a cylinder's surface."""
+    far = np.sqrt(x * x + y * y)
+    a, b = far - size[0], np.abs(z) - size[1]
+    inside = np.maximum(a, b) <= 0.0
+    radial = choose(inside, choose(a >= b, 1.0, 0.0), np.maximum(a, 0.0))
+    axial = choose(inside, choose(a >= b, 0.0, 1.0), np.maximum(b, 0.0))
+    axial = choose(z < 0.0, -axial, axial)
+    length = np.sqrt(radial * radial + axial * axial)
+    on_axis = far <= 0.0
+    across = choose(on_axis, 1.0, far)
+    u, v = choose(on_axis, 1.0, x) / across, y / across
+    return radial * u / length, radial * v / length, axial / length
+
+
+# -- triangles -----------------------------------------------------------------------------------------
+
+
+def off_segment(x: Numbers, y: Numbers, z: Numbers, a: Any, b: Any) -> Any:
+    """Vector from the nearest point of the segment between a and b (3,) to the point."""
+    u, v, w = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+    x, y, z = x - a[0], y - a[1], z - a[2]
+    length = u * u + v * v + w * w
+    if length > 0.0:
+        share = np.minimum(np.maximum((x * u + y * v + z * w) / length, 0.0), 1.0)
+        x, y, z = x - share * u, y - share * v, z - share * w
+    return x, y, z
+
+
+def side(x: Numbers, y: Numbers, z: Numbers, a: Any, b: Any, normal: Any) -> Numbers:
+    """Positive on the inner side of a triangle's edge from a to b (3,)."""
+    u, v, w = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+    x, y, z = x - a[0], y - a[1], z - a[2]
+    return (v * z - w * y) * normal[0] + (w * x - u * z) * normal[1] + (u * y - v * x) * normal[2]
+
+
+def off_triangle(x: Numbers, y: Numbers, z: Numbers, t: Any) -> Any:
+    """Vector from the nearest point of a triangle (3, 3) to the point, and its squared length."""
+    a, b, c = t[0], t[1], t[2]
+    e, f, g = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+    p, q, r = c[0] - a[0], c[1] - a[1], c[2] - a[2]
+    n = (f * r - g * q, g * p - e * r, e * q - f * p)
+    area = n[0] * n[0] + n[1] * n[1] + n[2] * n[2]
+    i, j, k = off_segment(x, y, z, a, b)
+    best = i * i + j * j + k * k
+    u, v, w = off_segment(x, y, z, b, c)
+    d = u * u + v * v + w * w
+    nearer = d < best
+    i, j, k, best = (
+        choose(nearer, u, i),
+        choose(nearer, v, j),
+        choose(nearer, w, k),
+        choose(nearer, d, best),
+    )
+    u, v, w = off_segment(x, y, z, c, a)
+    d = u * u + v * v + w * w
+    nearer = d < best
+    i, j, k, best = (
+        choose(nearer, u, i),
+        choose(nearer, v, j),
+        choose(nearer, w, k),
+        choose(nearer, d, best),
+    )
+    if area > 0.0:
+        over = side(x, y, z, a, b, n) >= 0.0
+        over = over & (side(x, y, z, b, c, n) >= 0.0) & (side(x, y, z, c, a, n) >= 0.0)
+        height = ((x - a[0]) * n[0] + (y - a[1]) * n[1] + (z - a[2]) * n[2]) / area
+        i, j, k = (
+            choose(over, height * n[0], i),
+            choose(over, height * n[1], j),
+            choose(over, height * n[2], k),
+        )
+        best = choose(over, height * height * area, best)
+    return i, j, k, best
+
+
+# -- surfaces of triangles -----------------------------------------------------------------------------
+
+
+def off_surface(x: Numbers, y: Numbers, z: Numbers, b: int, s: Any) -> Any:
+    """Vector from the nearest point of the surface of solid b, of triangles, to the point, and its squared length."""
+    first, last = s.first[b], s.last[b]
+    t = s.triangles[first[1]]
+    i, j, k = x - t[0, 0], y - t[0, 1], z - t[0, 2]
+    if s.kind[b] == HEIGHTS:  # straight below
+        u, v, h = below(x, y, b, s)
+        i, j, k = x - u, y - v, z - h
+    best = i * i + j * j + k * k
+    node = first[0]
+    while node < last[0]:
+        far = np.maximum(from_box(x, y, z, s.nodes[node]), 0.0)
+        if not some(far * far < best):
+            node = s.after[node]
+            continue
+        for m in range(s.leaf[node, 0], s.leaf[node, 1]):
+            u, v, w, d = off_triangle(x, y, z, s.triangles[m])
+            nearer = d < best
+            i, j, k = choose(nearer, u, i), choose(nearer, v, j), choose(nearer, w, k)
+            best = choose(nearer, d, best)
+        node += 1
+    return i, j, k, best
+
+
+def below(x: Numbers, y: Numbers, b: int, s: Any) -> Any:
+    """The point (x, y, height) of a height map straight below or above the point, or its nearest rim."""
+    size, first = s.size[b], s.first[b, 2]
+    n, m = s.grid[b, 0], s.grid[b, 1]
+    u = np.minimum(np.maximum(x, 0.0), size[3])
+    v = np.minimum(np.maximum(y, 0.0), size[4])
+    p, q = u / size[3] * (n - 1), v / size[4] * (m - 1)
+    i, j = whole(np.minimum(p, n - 1.5)), whole(np.minimum(q, m - 1.5))
+    p, q, at = p - i, q - j, first + i * m + j
+    low, high = s.heights[at], s.heights[at + m + 1]
+    lower = low + p * (s.heights[at + m] - low) + q * (high - s.heights[at + m])
+    upper = low + q * (s.heights[at + 1] - low) + p * (high - s.heights[at + 1])
+    return u, v, choose(p >= q, lower, upper)
+
+
+def within(x: Numbers, y: Numbers, z: Numbers, b: int, s: Any) -> Any:
+    """Whether the point is inside a solid of triangles: a convex hull or a height map."""
+    size = s.size[b]
+    found = (
+        (x >= size[0])
+        & (x <= size[3])
+        & (y >= size[1])
+        & (y <= size[4])
+        & (z >= size[2])
+        & (z <= size[5])
+    )
+    if not some(found):
+        return found
+    if s.kind[b] == HEIGHTS:
+        _, _, height = below(x, y, b, s)
+        return found & (z <= height)
+    for m in range(s.first[b, 1], s.last[b, 1]):
+        t = s.triangles[m]
+        e, f, g = t[1, 0] - t[0, 0], t[1, 1] - t[0, 1], t[1, 2] - t[0, 2]
+        p, q, r = t[2, 0] - t[0, 0], t[2, 1] - t[0, 1], t[2, 2] - t[0, 2]
+        out = (
+            (x - t[0, 0]) * (f * r - g * q)
+            + (y - t[0, 1]) * (g * p - e * r)
+            + (z - t[0, 2]) * (e * q - f * p)
+        )
+        found = found & (out <= 0.0)
+    return found
+
+
+# -- any solid -----------------------------------------------------------------------------------------
+
+
+def signed_distance(x: Numbers, y: Numbers, z: Numbers, b: int, s: Any) -> Numbers:
+    """Signed distance [m] from solid b of a record s; negative inside."""
+    kind = s.kind[b]
+    if kind == ROUNDED:
+        found = from_box(x, y, z, s.size[b])
+        if s.rounding[b] > 0.0:
+            found = found - s.rounding[b]
+        return found
+    if kind == CYLINDER:
+        return from_cylinder(x, y, z, s.size[b])
+    _, _, _, squared = off_surface(x, y, z, b, s)
+    away = np.sqrt(squared)
+    return choose(within(x, y, z, b, s), -away, away)
+
+
+def outward_normal(x: Numbers, y: Numbers, z: Numbers, b: int, s: Any) -> Any:
+    """Unit gradient of the signed distance; three zeros on the surface of a hull or height map, where it is unknown."""
+    kind = s.kind[b]
+    if kind == ROUNDED:
+        return box_normal(x, y, z, s.size[b])
+    if kind == CYLINDER:
+        return cylinder_normal(x, y, z, s.size[b])
+    i, j, k, squared = off_surface(x, y, z, b, s)
+    away = np.sqrt(squared)
+    away = choose(within(x, y, z, b, s), -away, away)
+    known = squared > 0.0
+    i, j, k, away = (
+        choose(known, i, 0.0),
+        choose(known, j, 0.0),
+        choose(known, k, 0.0),
+        choose(known, away, 1.0),
+    )
+    return i / away, j / away, k / away
+
+
+def displacement(t: Numbers, b: int, s: Any) -> Any:
+    """Displacement [m] of solid b at time t [s]: straight between waypoints, at rest before and after them."""
+    first, last = s.first[b, 3], s.last[b, 3]
+    x = y = z = 0.0 * t
+    if last > first:
+        x, y, z = x + s.ways[first, 0], y + s.ways[first, 1], z + s.ways[first, 2]
+    for k in range(first, last - 1):
+        share = np.minimum(np.maximum((t - s.times[k]) / (s.times[k + 1] - s.times[k]), 0.0), 1.0)
+        x = x + share * (s.ways[k + 1, 0] - s.ways[k, 0])
+        y = y + share * (s.ways[k + 1, 1] - s.ways[k, 1])
+        z = z + share * (s.ways[k + 1, 2] - s.ways[k, 2])
+    return x, y, z
+
+
+def own_axes(x: Numbers, y: Numbers, z: Numbers, b: int, s: Any) -> Any:
+    """Coordinates in the axes of solid b, without its motion, of a point in the world."""
+    if s.turned[b] == 0:
+        return x, y, z
+    o, T = s.origin[b], s.turn[b]
+    x, y, z = x - o[0], y - o[1], z - o[2]
+    return (
+        T[0, 0] * x + T[0, 1] * y + T[0, 2] * z,
+        T[1, 0] * x + T[1, 1] * y + T[1, 2] * z,
+        T[2, 0] * x + T[2, 1] * y + T[2, 2] * z,
+    )
+
+
+#: The functions that the kernel compiles, each after those that it calls.
+ELEMENTWISE = (
+    from_box, box_normal, from_cylinder, cylinder_normal, off_segment, side, off_triangle, below, off_surface, within,
+    signed_distance, outward_normal, displacement, own_axes,
+)  # fmt: skip

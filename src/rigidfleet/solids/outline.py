@@ -1,0 +1,127 @@
+"""Surfaces of solids, to draw them."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from rigidfleet.solids.distance import displacement
+from rigidfleet.solids.records import CYLINDER, HEIGHTS, HULL, Solids
+from rigidfleet.typing import Floats
+
+#: Number of sides of a circle.
+_SIDES = 32
+#: Cosine of the least angle between two faces whose common edge is drawn.
+_FLAT = 0.9998
+
+
+class Outline(NamedTuple):
+    """The surface of a solid as triangles, and the lines that show its shape."""
+
+    triangles: Floats  # (T, 3, 3) [m], corners anticlockwise from outside
+    lines: Floats  # (L, 2, 3) [m]
+
+
+def outline(solid: Solids) -> Outline:
+    """The surface of a finite solid, alone in its record, without its motion; world axes."""
+    size, kind = solid.size[0], solid.kind[0]
+    if kind == HEIGHTS:
+        found = _terrain(solid)
+    elif kind == HULL:
+        found = Outline(solid.triangles, _creases(solid.triangles))
+    elif kind == CYLINDER:
+        found = _turned(
+            np.array([[0, -size[1]], [size[0], -size[1]], [size[0], size[1]], [0, size[1]]])
+        )
+    elif solid.rounding[0] > 0.0:
+        angle = np.linspace(-np.pi / 2, np.pi / 2, _SIDES // 2 + 1)
+        found = _turned(solid.rounding[0] * np.stack([np.cos(angle), np.sin(angle)], axis=1))
+    else:
+        found = _box(size)
+    T, o = solid.turn[0], solid.origin[0]
+    return Outline(found.triangles @ T + o, found.lines @ T + o)
+
+
+def places(solid: Solids, times: Floats) -> Floats:
+    """Displacements (K, 3) [m] of a solid, alone in its record, at times (K,) [s]."""
+    return np.stack(displacement(times, 0, solid), axis=-1)
+
+
+def _box(size: Floats) -> Outline:
+    corner = np.array(
+        [
+            [size[3 * i], size[1 + 3 * j], size[2 + 3 * k]]
+            for k in (0, 1)
+            for j in (0, 1)
+            for i in (0, 1)
+        ]
+    )
+    faces = [(4, 5, 7, 6), (0, 2, 3, 1), (0, 1, 5, 4), (2, 6, 7, 3), (1, 3, 7, 5), (0, 4, 6, 2)]
+    triangles = corner[[[a, b, c] for a, b, c, _ in faces] + [[a, c, d] for a, _, c, d in faces]]
+    edges = [(a, a | bit) for a in range(8) for bit in (1, 2, 4) if not a & bit]
+    return Outline(triangles, corner[edges])
+
+
+def _turned(profile: Floats) -> Outline:
+    """Surface of revolution about z of a profile (P, 2) of radii and heights, from below to above."""
+    angle = np.linspace(0.0, 2 * np.pi, _SIDES + 1)
+    circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    rings = np.concatenate(
+        [
+            profile[:, None, :1] * circle,
+            np.broadcast_to(profile[:, None, 1:], (len(profile), _SIDES + 1, 1)),
+        ],
+        axis=2,
+    )
+    a, b, c, d = (
+        x.reshape(-1, 3) for x in (rings[:-1, :-1], rings[:-1, 1:], rings[1:, 1:], rings[1:, :-1])
+    )
+    triangles = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+    size = np.linalg.norm(
+        np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1
+    )
+    triangles = triangles[size > 1e-12 * max(float(size.max()), 1e-300)]
+    if len(profile) == 4:  # a cylinder: its rims, and a few lines along it
+        kept = rings[1:3]
+        lines = np.stack([kept[:, :-1], kept[:, 1:]], axis=2).reshape(-1, 2, 3)
+        along = np.stack([kept[0, :: _SIDES // 4][:4], kept[1, :: _SIDES // 4][:4]], axis=1)
+        return Outline(triangles, np.concatenate([lines, along]))
+    middle = rings[len(profile) // 2]  # a sphere: three great circles
+    circles = [middle, middle[:, [0, 2, 1]], middle[:, [2, 0, 1]]]
+    return Outline(triangles, np.concatenate([np.stack([x[:-1], x[1:]], axis=1) for x in circles]))
+
+
+def _creases(triangles: Floats) -> Floats:
+    """Edges (L, 2, 3) between faces that do not lie in one plane."""
+    normal = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
+    sides: dict[tuple[tuple[float, ...], ...], list[int]] = {}
+    for t, corners in enumerate(triangles.tolist()):
+        for a, b in ((0, 1), (1, 2), (2, 0)):
+            sides.setdefault(tuple(sorted((tuple(corners[a]), tuple(corners[b])))), []).append(t)
+    kept = [e for e, t in sides.items() if len(t) != 2 or normal[t[0]] @ normal[t[1]] < _FLAT]
+    return np.array(kept).reshape(-1, 2, 3)
+
+
+def _terrain(solid: Solids) -> Outline:
+    """A height map's surface, its sides down to the lowest height, and some of the lines of its grid."""
+    z, size = solid.heights.reshape(solid.grid[0]), solid.size[0]
+    x, y = (np.linspace(0.0, size[3 + k], n) for k, n in enumerate(z.shape))
+    top = np.stack([*np.meshgrid(x, y, indexing="ij"), z], axis=-1)
+    a, b, c, d = (
+        p.reshape(-1, 3) for p in (top[:-1, :-1], top[1:, :-1], top[1:, 1:], top[:-1, 1:])
+    )
+    faces = [np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)]
+    rims = [top[:, 0], top[-1], top[::-1, -1], top[::-1][-1, ::-1]]
+    for rim in rims:
+        under = rim.copy()
+        under[:, 2] = z.min()
+        faces += [
+            np.stack([under[:-1], under[1:], rim[1:]], axis=1),
+            np.stack([under[:-1], rim[1:], rim[:-1]], axis=1),
+        ]
+    pick = [np.unique(np.linspace(0, n - 1, min(n, 13)).round().astype(int)) for n in z.shape]
+    rows = [*top[pick[0]], *top[:, pick[1]].swapaxes(0, 1)]
+    lines = np.concatenate([np.stack([row[:-1], row[1:]], axis=1) for row in rows])
+    return Outline(np.concatenate(faces), lines)
