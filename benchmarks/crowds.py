@@ -107,15 +107,25 @@ def least_distance(r: Floats, v: Floats, a: Floats, pairs: tuple[Any, Any]) -> f
     return float(np.linalg.norm(y, axis=2).min())
 
 
-def swap(n: int, radius: float, *, ring: bool, longest: float, seed: int, **given: Any) -> Swap:
-    """Fly one swap."""
+def swap(
+    n: int,
+    radius: float,
+    *,
+    ring: bool,
+    longest: float,
+    seed: int,
+    keep: list[tuple[Floats, Floats]] | None = None,
+) -> Swap:
+    """Fly one swap; ``keep`` takes the states at the ticks."""
     r = places(n, radius, ring=ring, rng=np.random.default_rng(seed))
     goal, v = -r, np.zeros_like(r)
-    problem, work, flight, state, a = kernel(n, **given)
+    problem, work, flight, state, a = kernel(n)
     pairs = np.triu_indices(n, 1)
     least, cost, k = np.inf, 0.0, 0
     arrived = np.full(n, np.inf)
     for k in range(int(longest / PERIOD)):
+        if keep is not None:
+            keep.append((r, v))
         state.seen[:, :3], state.seen[:, 3:] = r, v
         state.force[:] = asked(r, v, goal)
         state.work.law_time[0] = k * PERIOD
@@ -138,23 +148,24 @@ def swap(n: int, radius: float, *, ring: bool, longest: float, seed: int, **give
     )  # fmt: skip
 
 
-def layers(n: int = 100, repeats: int = 2000) -> tuple[float, float]:
-    """Processor time of the filter and of the guard [us] per vehicle and tick, in the middle of a swap in space."""
-    r = places(n, 3.0, ring=False, rng=np.random.default_rng(1))
-    v = -r / np.linalg.norm(r, axis=1, keepdims=True)
+def layers(n: int = 30, repeats: int = 5) -> tuple[float, float, float]:
+    """Processor time of call, filter and guard [us] per vehicle and tick, at the states of a swap in space."""
+    states: list[tuple[Floats, Floats]] = []
+    swap(n, 5.0, ring=False, longest=20.0, seed=0, keep=states)
     found = []
     for given in (
         {"filtered": False, "guarded": False}, {"guarded": False}, {"filtered": False},
     ):  # fmt: skip
         problem, work, flight, state, a = kernel(n, **given)
-        state.seen[:, :3], state.seen[:, 3:] = r, v
-        wanted = asked(r, v, -r)
-        begun = time.process_time()
-        for _ in range(repeats):
-            state.force[:] = wanted
+        cost = 0.0
+        for r, v in states * repeats:
+            state.seen[:, :3], state.seen[:, 3:] = r, v
+            state.force[:] = asked(r, v, -states[0][0])
+            begun = time.process_time()
             sampled.avoid(problem, work, flight, state, a)
-        found.append(1e6 * (time.process_time() - begun) / (repeats * n))
-    return found[1] - found[0], found[2]
+            cost += time.process_time() - begun
+        found.append(1e6 * cost / (repeats * len(states) * n))
+    return found[0], found[1] - found[0], found[2] - found[0]
 
 
 def out_of_range() -> float:
@@ -214,10 +225,9 @@ def main() -> None:
             f" {np.median([run.cost for run in runs]):.2f} us |",
             flush=True,
         )
-    barrier, guard = layers()
-    print(
-        f"\nFilter {barrier:.2f} us, guard {guard:.2f} us a vehicle and tick, among 100 vehicles."
-    )
+    call, barrier, guard = layers()
+    print(f"\nAt the states of a swap of 30, a vehicle and tick take {call:.2f} us for the call,")
+    print(f"{barrier:.2f} us for the filter, {guard:.2f} us for the guard.")
     print(f"Nothing in range: {100 * out_of_range():.1f} % of a flight of eight.")
 
 
