@@ -19,6 +19,7 @@ from datetime import UTC, datetime
 from functools import cache, cached_property
 from importlib.metadata import PackageNotFoundError, version
 from inspect import Parameter, Signature
+from itertools import pairwise
 from pathlib import Path
 from typing import (
     TYPE_CHECKING,
@@ -157,9 +158,12 @@ class PhaseRecord:
         (distance of a lost vehicle to one that still flies), geofence (distance beyond it), lowest, highest [m];
         speed [m/s]; acceleration [m/s^2]; thrust, thrust_margin (thrust minus its limit), constraint_force, tension
         [N]; constraint [m]; of vehicles also rotor_force [N] (of the rotor nearest to its limit), tilt [rad],
-        tracking_error [m] and saturation (share of the phase). If vehicles stand on obstacles, clearance is also
-        given for those that have stood on one since the start (clearance_start), for those in flight
-        (clearance_flight), and for those that stand on one until the end (clearance_end). Empty if only samples are
+        tracking_error [m] and saturation (share of the phase). With [avoidance] also barrier and guard (greatest share
+        of the phase in which they acted on a vehicle, and since when), guarantee and clearance_guarantee (least margin
+        of stop segments [m]) and, where it was negative, the first such: guarantee_lost, clearance_guarantee_lost. If
+        vehicles stand on obstacles, clearance is also given for those that have stood on one since the start
+        (clearance_start), for those in flight (clearance_flight), and for those that stand on one until the end
+        (clearance_end). Empty if only samples are
         known
     """
 
@@ -602,6 +606,10 @@ class Result:
         ValueError
             The rate is not positive, or gives too many setpoints.
         """
+        return at_rate(self.motion(flown=flown), rate)
+
+    def motion(self, *, flown: bool = False) -> Setpoints:
+        """The setpoints of every sample, of which there are two at a change of phase; see `setpoints`."""
         references = [
             self.slot_position,
             self.slot_velocity,
@@ -612,12 +620,15 @@ class Result:
         state = np.stack([nothing if x is None else x for x in references], axis=1)
         if flown:
             motion = self.position, self.velocity, self.acceleration
-            parts = [self.samples(k) for k in range(len(self.phases))]
+            # Forces jump where two samples have one time: at a change of phase and at a loss.
+            jumps = np.flatnonzero(np.nextafter(self.time[:-1], np.inf) >= self.time[1:]) + 1
+            ends = [0, *jumps.tolist(), len(self.time)]
+            parts = [slice(*pair) for pair in pairwise(ends)]
             state = np.concatenate(
                 [of_motion(*(x[part] for x in (*motion, self.time))) for part in parts]
             )
         yaw = [nothing[:, :, 0] if x is None else x for x in (self.yaw, self.yaw_rate)]
-        return at_rate(Setpoints(self.time, state, *yaw), rate)
+        return Setpoints(self.time, state, *yaw)
 
     def to_csv(self, path: str | Path, *, rate: float | None = None, flown: bool = False) -> None:
         """Write the setpoints of each vehicle to a CSV file, one row per time and agent, to 9 digits.
@@ -722,7 +733,7 @@ for _name in (
 
 _INTEGERS = {name for name in VARIABLES if _HINTS[name].__origin__ in (Ints, Ints | None)}
 #: Quantities whose minimum is the worst value. The same holds for all clearances.
-_LEAST = frozenset(("separation", "separation_below", "lost", "lowest"))
+_LEAST = frozenset(("separation", "separation_below", "lost", "lowest", "guarantee"))
 
 
 #: Attributes of a file and their types. Types other than int and str are stored as JSON.

@@ -15,17 +15,27 @@ import numpy as np
 from rigidfleet.errors import MissionError
 from rigidfleet.formation.graphs import count_within
 from rigidfleet.formation.shapes import SHAPES
-from rigidfleet.mission import bounds, disturbances, formations, obstacles, phases, vehicles
+from rigidfleet.mission import (
+    avoidance,
+    bounds,
+    disturbances,
+    formations,
+    obstacles,
+    phases,
+    vehicles,
+)
 from rigidfleet.mission.findings import FindingCollector, Keys, near_shape
 from rigidfleet.mission.obstacles import Box, Obstacle
 from rigidfleet.mission.schema import (
     Agents,
     Allocation,
     Autopilot,
+    Avoidance,
     BodyFrame,
     Constraint,
     Contents,
     Disturbances,
+    GeodeticOrigin,
     Geofence,
     IntegratorOptions,
     Limits,
@@ -48,7 +58,9 @@ _TABLES: dict[str, type[Part]] = {
     "body_frame": BodyFrame,
     "limits": Limits,
     "autopilot": Autopilot,
+    "avoidance": Avoidance,
     "yaw": VehicleYaw,
+    "geodetic_origin": GeodeticOrigin,
     "disturbances": Disturbances,
 }
 
@@ -76,6 +88,7 @@ def check(data: Mapping[str, Any], origin: str) -> dict[str, Any]:
     parts["phases"] = phases.check(collector, parts, n)
     disturbances.check(collector, parts, n)
     vehicles.check_flight(collector, parts)
+    avoidance.check(collector, parts)
     if collector.findings:
         raise MissionError(collector.findings)
     return parts

@@ -184,6 +184,40 @@ class Autopilot(Part):
     )
 
 
+class Avoidance(Part):
+    """Avoidance in flight, at the rate of the formation's laws; see docs/avoidance.md. Only with [vehicles]."""
+
+    guard: Flag = Field(
+        True,
+        description="true: a vehicle does only what leaves all of them able to brake in time",
+    )
+    barrier: Flag = Field(
+        True,
+        description="true: barriers change accelerations early and as little as possible, and edges of a formation let "
+        "go near them",
+    )
+    separation: LengthOrZero | None = Field(
+        None, description="separation of agents to keep [m]; default: that of [limits], or 0"
+    )
+    clearance: LengthOrZero = Field(
+        0.0, description="distance of an agent's surface from obstacles to keep [m]"
+    )
+    margin: LengthOrZero | None = Field(
+        None,
+        description="by which each agent is taken to be larger [m]; default: 0, or three times the noise of positions",
+    )
+    rate: Annotated[float, Strict(), Field(gt=0, le=100)] = Field(
+        3.0,
+        description="rate at which a barrier is approached [1/s]: lower, and vehicles give way earlier",
+    )
+    share: Annotated[float, Strict(), Field(gt=0, le=1)] = Field(
+        0.9, description="share of the vehicles' braking that barriers plan with [-]"
+    )
+    release: Annotated[float, Strict(), Field(ge=0.01, le=60)] = Field(
+        0.5, description="time in which edges let go near a barrier, and take hold again [s]"
+    )
+
+
 class Agents(Part):
     """The vehicles of the fleet. After the check, each field has one entry per agent."""
 
@@ -642,6 +676,20 @@ class MissionHeader(Part):
     output_step: Time = Field(0.05, description="time between samples of the result [s]")
 
 
+class GeodeticOrigin(Part):
+    """Place on the Earth of the mission's origin, for exports; x points east, y north and z up there."""
+
+    latitude_deg: Annotated[float, Strict(), Field(gt=-90, lt=90)] = Field(
+        description="latitude [deg], WGS 84"
+    )
+    longitude_deg: Annotated[float, Strict(), Field(ge=-180, le=180)] = Field(
+        description="longitude [deg]"
+    )
+    altitude: Annotated[float, Strict(), Field(ge=-1000, le=20_000)] = Field(
+        0.0, description="height of z = 0 above mean sea level [m]"
+    )
+
+
 class VehicleYaw(Part):
     """Yaw of each vehicle, which no force of a formation depends on."""
 
@@ -663,6 +711,9 @@ class Contents(MissionHeader):
     )
     autopilot: Autopilot = Field(
         default_factory=Autopilot, description="sampled control on board: [autopilot]"
+    )
+    avoidance: Avoidance | None = Field(
+        None, description="barriers and guard in flight: [avoidance]"
     )
     constraint: Constraint = Field(
         default_factory=Constraint, description="the constraint force: [constraint]"
@@ -688,6 +739,9 @@ class Contents(MissionHeader):
         default_factory=Limits, description="limits that the verdict checks: [limits]"
     )
     yaw: VehicleYaw = Field(default_factory=VehicleYaw, description="yaw of each vehicle: [yaw]")
+    geodetic_origin: GeodeticOrigin | None = Field(
+        None, description="place of the origin on the Earth, for exports: [geodetic_origin]"
+    )
     disturbances: Disturbances | None = Field(
         None, description="wind, gusts, noise, mass errors, lost vehicles: [disturbances]"
     )

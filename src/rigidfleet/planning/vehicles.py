@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidfleet.kernel import fleet
-from rigidfleet.kernel.problem import TRACKING, Problem
+from rigidfleet.kernel.problem import TRACKING, Motion, Problem, Reference
 from rigidfleet.math import series
 from rigidfleet.math.quadrotor import ROTORS
 from rigidfleet.mission import Mission
@@ -133,8 +133,7 @@ class TickTables:
         self.rate = mission.autopilot.rate
         self.noise = None if d is None else d.noise
         self.links = None if d is None else d.links
-        yaw = mission.yaw
-        self.yaw = Yaw(yaw.kind, math.radians(yaw.yaw_deg), yaw.point or (0.0, 0.0, 0.0))
+        self.yaw = asked_yaw(mission)
         self.linear_drag = np.array([model.linear_drag for model in mission.vehicle_models or ()])
         self.compensated = mission.autopilot.delay_compensation
         #: What states were last measured about: the problem of the path, or a point to stay at.
@@ -210,17 +209,11 @@ class TickTables:
         if self._known is not None and self._known[0] is turn and self._known[1] < time[0]:
             _, since, start = self._known
         whole = np.concatenate([[since], time])
-        body = body_series(motion, whole)
-        slots = slot_series(reference, body, whole)
-        if self.yaw.kind == "along":
-            turned, known = yaw_along(reference, motion, whole, slots, start)
+        slots, turned, known = slots_and_yaw(
+            reference, motion, whole, self.yaw, turn._replace(start=start)
+        )
+        if known is not None:
             self._known = turn, *known
-        else:
-            turned = yaw_of(body, slots, self.yaw)
-            turned[0] += turn.off[:, None]
-            if self.yaw.kind != "formation":
-                done = series.derivatives(blend_series(whole, turn.begun, _TURN_TIME)[:3])
-                turned -= done[:, None] * turn.off[:, None]
         return _by_tick(turned[..., 1:]), series.derivatives(slots[..., 1:])
 
     def _force_rates(self, x: Floats) -> tuple[Floats, Floats]:
@@ -244,6 +237,18 @@ class TickTables:
         return _by_tick(jerk), _by_tick(snap)
 
 
+def asked_yaw(mission: Mission) -> Yaw:
+    """The yaw that a mission asks of its vehicles."""
+    yaw = mission.yaw
+    return Yaw(yaw.kind, math.radians(yaw.yaw_deg), yaw.point or (0.0, 0.0, 0.0))
+
+
+def first_yaw(mission: Mission) -> Floats:
+    """Yaw (N,) [rad] with which vehicles start."""
+    frame = mission.body_frame
+    return np.full(mission.n_agents, 0.0 if frame is None else math.radians(frame.yaw_deg))
+
+
 class Turn(NamedTuple):
     """How vehicles turn from their yaw at a time into the one asked for."""
 
@@ -254,12 +259,38 @@ class Turn(NamedTuple):
 
 def turn_from(problem: Problem, t: float, yaw: Yaw, start: Floats) -> Turn:
     """The turn of vehicles with yaws ``start`` (N,) [rad] at a time [s] of a problem, at which its motion begins."""
-    if problem.control.kind != TRACKING or yaw.kind == "along":
+    if problem.control.kind != TRACKING:
         return Turn(t, start, np.zeros(len(start)))
-    off = start - yaw_derivatives(problem.reference, problem.motion, np.array([t]), yaw)[0, 0]
+    return turn_along(problem.reference, problem.motion, t, yaw, start)
+
+
+def turn_along(reference: Reference, motion: Motion, t: float, yaw: Yaw, start: Floats) -> Turn:
+    """`turn_from` while slots are tracked."""
+    if yaw.kind == "along":
+        return Turn(t, start, np.zeros(len(start)))
+    off = start - yaw_derivatives(reference, motion, np.array([t]), yaw)[0, 0]
     if yaw.kind != "formation":
         off = (off + np.pi) % (2.0 * np.pi) - np.pi
     return Turn(t, start, off)
+
+
+def slots_and_yaw(
+    reference: Reference, motion: Motion, time: Floats, yaw: Yaw, turn: Turn
+) -> tuple[Floats, Floats, tuple[float, Floats] | None]:
+    """Series of the slots (5, 3, N, K), and the yaw with two derivatives (3, N, K) that is asked of the vehicles.
+
+    Yaw "along" continues from ``turn.start`` at ``time[0]``; it is known at the time returned beside (see `yaw_along`).
+    """
+    body = body_series(motion, time)
+    slots = slot_series(reference, body, time)
+    if yaw.kind == "along":
+        return slots, *yaw_along(reference, motion, time, slots, turn.start)
+    turned = yaw_of(body, slots, yaw)
+    turned[0] += turn.off[:, None]
+    if yaw.kind != "formation":
+        done = series.derivatives(blend_series(time, turn.begun, _TURN_TIME)[:3])
+        turned -= done[:, None] * turn.off[:, None]
+    return slots, turned, None
 
 
 def _by_tick(x: Floats) -> Floats:

@@ -10,15 +10,16 @@ import numpy as np
 
 from rigidfleet._common.text import agent_names
 from rigidfleet.errors import FlightError, StoppedError
-from rigidfleet.kernel import fleet, records
+from rigidfleet.kernel import avoidance, fleet, records
 from rigidfleet.kernel.engine import native
 from rigidfleet.kernel.engine.sampled import fly_ticks
 from rigidfleet.kernel.problem import Problem
 from rigidfleet.kernel.records import Record
 from rigidfleet.math import attitude as att
 from rigidfleet.mission import Mission
+from rigidfleet.planning.avoidance import avoidance_in_flight
 from rigidfleet.planning.reference import ByEdge
-from rigidfleet.planning.vehicles import TickTables, sampled_flight, turn_from
+from rigidfleet.planning.vehicles import TickTables, first_yaw, sampled_flight, turn_from
 from rigidfleet.simulation.active_phase import ActivePhase
 from rigidfleet.simulation.callbacks import (
     AttitudeCommand,
@@ -26,6 +27,7 @@ from rigidfleet.simulation.callbacks import (
     Controller,
     Observation,
     checked_command,
+    named,
 )
 from rigidfleet.simulation.diagnosis import diagnose
 from rigidfleet.simulation.recording import Piece, VehicleSamples
@@ -42,9 +44,10 @@ class Vehicles:
     def __init__(self, mission: Mission) -> None:
         self.flight = sampled_flight(mission)
         self.tables = TickTables(mission, self.flight)
-        yaw = 0.0 if mission.body_frame is None else math.radians(mission.body_frame.yaw_deg)
+        self.avoidance = avoidance_in_flight(mission, self.flight)
         start = mission.fleet
-        self.yaw = np.full(mission.n_agents, yaw)  # asked of each vehicle at the last switch
+        self.yaw = first_yaw(mission)  # asked of each vehicle at the last switch
+        yaw = float(self.yaw[0])
         self.S = fleet.hovering(self.flight.vehicles, start.position, start.velocity, yaw)
         self.state: fleet.SampledState | None = None  # of the phase before
         self.edges = np.zeros((0, 2), dtype=np.int64)  # of that state
@@ -60,6 +63,8 @@ class SampledPhase(ActivePhase):
     def __init__(self, *arguments: Any, vehicles: Vehicles, **options: Any) -> None:
         self.vehicles, self.flight = vehicles, vehicles.flight
         self.tabled: Problem | None = None  # the plan's problem for which the tables are
+        if vehicles.avoidance is not None:
+            vehicles.avoidance = avoidance.renewed(vehicles.avoidance)
         self.led = False  # whether the reference is given piece by piece
         self.unjudged = False  # whether steps were flown since the extremes of vehicles were taken
         self.first_tick: int | None = None
@@ -98,6 +103,8 @@ class SampledPhase(ActivePhase):
                 renewed = renewed._replace(**{name: getattr(begun, name) for name in fresh})
             begun = renewed
         self.sampled = given.state = begun._replace(trail=trail._replace(gauge=trail.gauge[:, :0]))
+        if given.avoidance is not None:
+            given.avoidance = avoidance.holding(given.avoidance, m)
         given.edges = plan.edges
         if self.first_tick is None:
             self.first_tick = int(begun.count[fleet.TICKS])
@@ -138,8 +145,13 @@ class SampledPhase(ActivePhase):
         arrays = checked_command(given, len(self.lost), self.t)
         if self.flight.vehicles.point.any():
             raise FlightError(
-                f"the controller returned a {type(given).__name__} at t = {self.t:.3f} s, but some agents are points;"
+                f"the controller returned {named(given)} at t = {self.t:.3f} s, but some agents are points;"
                 " return forces [N]"
+            )
+        if self.vehicles.avoidance is not None:
+            raise FlightError(
+                f"the controller returned {named(given)} at t = {self.t:.3f} s, which [avoidance] cannot"
+                " change; return forces [N], or remove [avoidance]"
             )
         if isinstance(given, AttitudeCommand):
             commands = self.flight.commands._replace(kind=fleet.ATTITUDE, **arrays)
@@ -150,6 +162,7 @@ class SampledPhase(ActivePhase):
 
     def watch(self, *, last: bool) -> None:
         """Search the steps flown for extremes."""
+        self.extremes.avoidance = self.vehicles.avoidance
         if rows := int(self.sampled.count[fleet.TRAILED]):
             assert self.flown is not None
             self.state.count[4] = rows
@@ -170,14 +183,14 @@ class SampledPhase(ActivePhase):
         n, m = len(plan.masses), len(plan.edges)
         self.flown = problem
         times = self.sampler(plan, self.t, t_end, first=not self.begun, stop=self.stop)
-        self.begun = True
+        self.begun, given = True, self.vehicles.avoidance
         call = fleet.segment(n, m, t_end, times, _STEPS)
         sampled.count[fleet.SAMPLES] = 0
         status = records.PAUSED
         try:
             while status == records.PAUSED:
                 self._supply()
-                status = fly_ticks(problem, self.workspace, self.flight, sampled, call)
+                status = fly_ticks(problem, self.workspace, self.flight, sampled, call, given)
                 self._follow()
                 if status == records.FINISHED:  # to a rounding error of the grid of steps
                     self.state.clock[0] = t_end
@@ -199,6 +212,11 @@ class SampledPhase(ActivePhase):
             raise StoppedError(
                 f"the motion of {who} grows beyond all bounds by t = {self.t:.2f} s: the control is unstable. Lower"
                 " the gains, or raise the rates in [autopilot]"
+            )
+        if given is not None and given.count[avoidance.FULL]:
+            raise StoppedError(
+                f"avoidance cannot go on at t = {self.t:.2f} s: too many vehicles are near each other for their"
+                " speeds. Fly slower, or farther apart"
             )
         if status != records.FINISHED:
             own = self.external is not None
