@@ -138,7 +138,7 @@ def test_a_gap_is_passed_smaller():
     np.testing.assert_allclose(small, 0.6 * whole, atol=1e-12)
     result = simulate(mission)
     assert assess(result).passed
-    assert 'kind = "go"' in result.mission_text
+    assert len(result.mission.phases) == len(result.phases)
     again = simulate(Mission.from_toml(result.mission_text))
     assert np.array_equal(result.position, again.position)
     assert result.mission.formation_slots("square x 0.6") is not None
@@ -169,7 +169,7 @@ def test_what_is_written_flies_the_same_bits(tmp_path):
     assert np.array_equal(one.time, two.time)
     assert assess(one).passed
     assert assess(two).passed
-    assert one.mission.to_dict() == mission.to_dict()
+    assert one.mission.to_dict() == written.to_dict()
 
 
 def test_the_shipped_passage_folds_by_itself():

@@ -134,11 +134,6 @@ class Mission(Contents):
         mission._text = self._text
         return mission
 
-    def with_text_of(self, other: Mission) -> Self:
-        """Give this mission the text of another one, of which it is a form."""
-        self._text = other._text
-        return self
-
     @property
     def size_in_words(self) -> str:
         """Size of the mission: 3 agents, 2 formations, 12 phases, 90 s."""

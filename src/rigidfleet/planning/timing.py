@@ -55,7 +55,7 @@ def timed(mission: Mission) -> Mission:
     Automatic times are replaced by the least ones. A mission with neither is returned as it is.
 
     Times follow from the planned state at the start of each phase; a phase before that ends by settling is assumed to
-    have arrived. The mission keeps its own text, so that a result repeats from it.
+    have arrived. The text is that of `spelled_out`, so that a result repeats from it.
 
     Raises
     ------
@@ -63,11 +63,10 @@ def timed(mission: Mission) -> Mission:
         No transition keeps the separation, no time of a phase keeps the limits, its start is not known before the
         flight, or a phase ends too early for the times before it.
     """
-    given = expanded(mission)
-    mission = ways.found(given, with_times)
+    mission = spelled_out(mission)
     last = max((k for k, phase in enumerate(mission.phases) if phase.automatic), default=None)
     if last is None:
-        return mission if mission is given else mission.with_text_of(given)
+        return mission
     tables = mission.to_dict()["phases"]
     now = at_start(mission)
     for k, phase in enumerate(mission.phases[: last + 1]):
@@ -79,7 +78,7 @@ def timed(mission: Mission) -> Mission:
         if found is None:
             raise _unknown(mission, k, mission.phases[last])
         now = found.after
-    return mission.with_phases(tables).with_text_of(given)
+    return mission.with_phases(tables)
 
 
 def with_times(mission: Mission, phase: Phase, now: PhaseState, number: int) -> Phase:

@@ -135,10 +135,6 @@ def _flown_data(
         data["assignment"] = "given"
         data["formations"] = {name: _written_out(mission, name) for name in mission.formations}
     data["phases"] = [_written(*each) for each in zip(asked, records, strict=True)]
-    known = data.get("formations") or given.get("formations", {})
-    taken = {record.formation for record in records if record.formation} - set(known)
-    if taken := taken & set(mission.formations):  # shrunk on a way that was found
-        data["formations"] = known | {name: _written_out(mission, name) for name in sorted(taken)}
     if disturbed := given.get("disturbances"):
         # What followed from a loss is among the phases
         told = {key: x for key, x in disturbed.items() if key not in ("on_loss", *ON_LOSS)}
