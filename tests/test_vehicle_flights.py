@@ -9,6 +9,7 @@ import pytest
 
 import rigidfleet as rf
 from rigidfleet._common.text import percent
+from rigidfleet.math import attitude as att
 from rigidfleet.mission import Mission, load_mission
 from rigidfleet.planning.vehicles import TickTables, Turn, sampled_flight
 from rigidfleet.result import Result
@@ -447,3 +448,17 @@ def test_check_knows_the_integral_of_the_tracking(integral):
 def test_shares_in_per_cent(share, words):
     """Shares are told without powers of ten."""
     assert percent(share) == words
+
+
+@pytest.mark.parametrize("kind", ["formation", "fixed", "along"])
+def test_the_yaw_recorded_is_the_one_that_vehicles_are_asked_for(kind):
+    """Begun at another yaw, vehicles turn from there without a jump, and the record has this turn."""
+    result = rf.simulate(short(yaw={"kind": kind}, body_frame={"yaw_deg": 40.0}))
+    T = att.dcm_from_quaternion(result.vehicle_attitude)
+    known = np.isfinite(result.yaw)
+    flown = np.arctan2(T[..., 0, 1], T[..., 0, 0])
+    off = np.degrees(np.abs((flown - result.yaw + np.pi) % (2.0 * np.pi) - np.pi))
+    assert known.any()
+    assert off[known].max() < 3.0
+    first = np.argmax(known[:, 0])
+    assert np.degrees(result.yaw[first]) == pytest.approx(40.0, abs=1e-6)

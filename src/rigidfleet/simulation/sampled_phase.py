@@ -30,7 +30,7 @@ from rigidfleet.simulation.callbacks import (
     named,
 )
 from rigidfleet.simulation.diagnosis import diagnose
-from rigidfleet.simulation.recording import Piece, VehicleSamples
+from rigidfleet.simulation.recording import Led, Piece, VehicleSamples
 from rigidfleet.simulation.solver_setup import equip, integrator
 from rigidfleet.typing import Floats
 
@@ -250,6 +250,10 @@ class SampledPhase(ActivePhase):
         state.clock[0] = sampled.clock[0]
         state.count[0] = 4 * sampled.count[fleet.STEPS]
         state.count[1] = sampled.count[fleet.STEPS]
+
+    def _led(self, times: Floats) -> Led:
+        """What the slots follow at the samples, if they are tracked, and how the vehicles turn."""
+        return tuple((*span[:3], self.turn) for span in super()._led(times))
 
     def end(self) -> Any:
         """End the phase; the vehicles keep their states."""
