@@ -38,6 +38,10 @@ from rigidfleet.typing import Floats
 _TICKS, _STEPS = 1024, 4000
 
 
+#: Distance [m] and speed [m/s] that no vehicle reaches in flight.
+_FAR = 1e9
+
+
 class Vehicles:
     """The vehicles of a flight, from phase to phase: what they are, where they are, and their yaw."""
 
@@ -165,7 +169,9 @@ class SampledPhase(ActivePhase):
         self.extremes.avoidance = self.vehicles.avoidance
         if rows := int(self.sampled.count[fleet.TRAILED]):
             assert self.flown is not None
-            self.state.count[4] = rows
+            # A motion that grows beyond all bounds has extremes up to there.
+            within = (abs(self.state.trail.points[:rows]) < _FAR).all(axis=(1, 2))
+            self.state.count[4] = rows if within.all() else int(within.argmin())
             self.extremes.take_path(self.flown, self.workspace, self.state)
             self.sampled.count[fleet.TRAILED] = self.state.count[4] = 0
             self.unjudged = True
