@@ -30,12 +30,16 @@ from rigidfleet.simulation.callbacks import (
     named,
 )
 from rigidfleet.simulation.diagnosis import diagnose
-from rigidfleet.simulation.recording import Piece, VehicleSamples
+from rigidfleet.simulation.recording import Led, Piece, VehicleSamples
 from rigidfleet.simulation.solver_setup import equip, integrator
 from rigidfleet.typing import Floats
 
 #: Greatest number of ticks in a table, and of steps between two returns to Python.
 _TICKS, _STEPS = 1024, 4000
+
+
+#: Distance [m] and speed [m/s] that no vehicle reaches in flight.
+_FAR = 1e9
 
 
 class Vehicles:
@@ -165,7 +169,9 @@ class SampledPhase(ActivePhase):
         self.extremes.avoidance = self.vehicles.avoidance
         if rows := int(self.sampled.count[fleet.TRAILED]):
             assert self.flown is not None
-            self.state.count[4] = rows
+            # A motion that grows beyond all bounds has extremes up to there.
+            within = (abs(self.state.trail.points[:rows]) < _FAR).all(axis=(1, 2))
+            self.state.count[4] = rows if within.all() else int(within.argmin())
             self.extremes.take_path(self.flown, self.workspace, self.state)
             self.sampled.count[fleet.TRAILED] = self.state.count[4] = 0
             self.unjudged = True
@@ -250,6 +256,10 @@ class SampledPhase(ActivePhase):
         state.clock[0] = sampled.clock[0]
         state.count[0] = 4 * sampled.count[fleet.STEPS]
         state.count[1] = sampled.count[fleet.STEPS]
+
+    def _led(self, times: Floats) -> Led:
+        """What the slots follow at the samples, if they are tracked, and how the vehicles turn."""
+        return tuple((*span[:3], self.turn) for span in super()._led(times))
 
     def end(self) -> Any:
         """End the phase; the vehicles keep their states."""
