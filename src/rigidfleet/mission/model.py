@@ -225,6 +225,15 @@ class Mission(Contents):
                 lies = asked = dcm_from_euler(np.deg2rad(angles))
             if p.turns_away:
                 lies = asked = None
+            if (vertical := p.vertical) is not None and vertical.each:
+                before, up = None, np.eye(3)[2] if lies is None else lies[:, 2]
+                who = (
+                    np.array(vertical.agents, dtype=np.int64) - 1
+                    if vertical.agents
+                    else slice(None)
+                )
+                places = places.copy()
+                places[who] -= np.outer(places[who] @ up, up)  # all on one level
             if (shaping := p.shaping) is None:
                 continue
             name = shaping.formation
