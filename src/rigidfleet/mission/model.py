@@ -24,9 +24,9 @@ from rigidfleet.mission import bounds
 from rigidfleet.mission.changes import told_apart
 from rigidfleet.mission.check import check
 from rigidfleet.mission.describe import counted
+from rigidfleet.mission.files import may_name_files, with_files
 from rigidfleet.mission.findings import near
 from rigidfleet.mission.kinds import Establish, Phase
-from rigidfleet.mission.obstacles import with_files
 from rigidfleet.mission.phases import latest_end
 from rigidfleet.mission.schema import DRAG, Contents, Start
 from rigidfleet.mission.vehicles import VehicleModel, resolve
@@ -474,7 +474,7 @@ def load_mission(name_or_path: str | Path) -> Mission:
     if isinstance(name_or_path, str) and name_or_path in mission_names():
         return Mission.from_toml(mission_text(name_or_path), name_or_path)
     text, origin = read_text(name_or_path), str(name_or_path)
-    if "file" in text:  # parsed twice only if it may name one
+    if may_name_files(text):
         text = with_files(text, parse_toml(text, origin), Path(name_or_path))
     return Mission.from_toml(text, origin)
 
@@ -505,7 +505,9 @@ def json_schema() -> dict[str, Any]:
     # A shape of positions is replaced by its points before the model sees it, so the model does not have it.
     position = parts["Agents"]["properties"]["position"]
     listed = {key: position.pop(key) for key in ("type", "items", "minItems")}
-    position["anyOf"] = [listed, {"$ref": "#/$defs/Start"}]
+    position["anyOf"] = [listed, {"$ref": "#/$defs/Start"}, {"type": "string"}]
+    # So is the name of a file.
+    parts["Formation"]["properties"]["slots"]["anyOf"].append({"type": "string"})
     return draft | schema
 
 
