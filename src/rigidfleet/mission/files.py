@@ -39,9 +39,21 @@ class _Named(NamedTuple):
     read: Callable[[bytes, str], list[list[float]]]
 
 
-def may_name_files(text: str) -> bool:
-    """Whether the text of a mission may name files; if not, it need not be parsed twice."""
-    return _MAY_NAME.search(text) is not None
+def completed(text: str, path: Path) -> str:
+    """Text of a mission as `with_files` gives it; itself if it names no files.
+
+    Raises
+    ------
+    MissionError
+        As `with_files` does.
+    """
+    if _MAY_NAME.search(text) is None or bounds.excess(text):
+        return text  # which need not, or must not, be parsed
+    try:
+        data = tomllib.loads(text)
+    except (ValueError, RecursionError):
+        return text  # whose errors the check tells
+    return with_files(text, data, path)
 
 
 def with_files(text: str, data: dict[str, Any], path: Path) -> str:

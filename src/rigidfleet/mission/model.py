@@ -24,7 +24,7 @@ from rigidfleet.mission import bounds
 from rigidfleet.mission.changes import told_apart
 from rigidfleet.mission.check import check
 from rigidfleet.mission.describe import counted
-from rigidfleet.mission.files import may_name_files, with_files
+from rigidfleet.mission.files import completed
 from rigidfleet.mission.findings import near
 from rigidfleet.mission.kinds import Establish, Phase
 from rigidfleet.mission.phases import latest_end
@@ -474,8 +474,7 @@ def load_mission(name_or_path: str | Path) -> Mission:
     if isinstance(name_or_path, str) and name_or_path in mission_names():
         return Mission.from_toml(mission_text(name_or_path), name_or_path)
     text, origin = read_text(name_or_path), str(name_or_path)
-    if may_name_files(text):
-        text = with_files(text, parse_toml(text, origin), Path(name_or_path))
+    text = completed(text, Path(name_or_path))
     return Mission.from_toml(text, origin)
 
 
