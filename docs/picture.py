@@ -44,7 +44,7 @@ def show() -> None:
     text = show_draft.show("my-show", scenes, agents=100, spacing=2.0)
     result = rf.simulate(Mission.from_toml(text))
     with TemporaryDirectory() as folder:
-        paths = rf.plot(result, folder, formats=["png"], names=["trajectory", "operation"])
+        paths = rf.plot(result, folder, formats=["png"], names=["formations", "operation"])
         for path, name in zip(paths, ("show", "show-operation"), strict=True):
             _save_with_few_colours(path, name)
 
