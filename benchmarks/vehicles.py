@@ -1,21 +1,28 @@
 """How fast quadrotors fly on one core, and how exact their steps are; beside RotorPy and crazyflow if installed.
 
-``make bench`` runs it. A vehicle-step is one step of one vehicle, with attitude control at 500 Hz on all sides. RotorPy
-(its SE(3) law, adaptive steps within each period) and crazyflow (its attitude law, float32, Runge-Kutta) hover; our
-vehicles fly the passage of the cube, or hover. Times are CPU times: other work on the machine counts less.
+``make bench`` runs it; ``--json`` keeps what it measured for `docs/performance.py`. A vehicle-step is one step of one
+vehicle, with attitude control at 500 Hz on all sides. RotorPy (its SE(3) law, adaptive steps within each period) and
+crazyflow (its attitude law, float32, Runge-Kutta) hover; our vehicles fly the passage of the cube, or hover. The
+kernel's flight has no planning and no record; whole flights have all that `simulate` does. Times are CPU times: other
+work on the machine counts less.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import os
+import platform
 import subprocess
 import sys
 import tempfile
 import time
+from datetime import date
+from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
 from statistics import median
+from typing import Any
 
 import numpy as np
 
@@ -29,9 +36,13 @@ from rigidfleet.kernel.records import FINISHED
 from rigidfleet.mission import load_mission
 from rigidfleet.planning.plan import plan_phase
 from rigidfleet.planning.reference import PhaseState
+from rigidfleet.simulation.flight import simulate
 
 VEHICLE = ROTORPY["px4_sihsim_quadx"]
 RATE = 500.0  # of attitude control and formation law [Hz]
+#: Shipped missions flown as a whole, and the goal of the first one [times real time].
+WHOLE = ("cube-passage-quadrotors", "passage-quadrotors")
+GOAL = 150.0
 #: crazyflow must be imported before SciPy: a process of its own.
 CRAZYFLOW = """
 import sys, time
@@ -93,6 +104,13 @@ def passage(h: float) -> tuple[float, float, np.ndarray]:
     return now.t, spent, np.concatenate(path)
 
 
+def whole(name: str) -> tuple[float, float]:
+    """All of `simulate` of a shipped mission: flown time, time spent [s]."""
+    start = time.process_time()
+    result = simulate(name)
+    return float(result.time[-1]), time.process_time() - start
+
+
 def rotorpy(steps: int) -> float:
     """Vehicle-steps per second of RotorPy, its law at 500 Hz."""
     from rotorpy.controllers.quadrotor_control import SE3Control
@@ -127,26 +145,58 @@ def main() -> int:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rounds", type=int, default=5, help="rounds, of which the median counts")
-    rounds = parser.parse_args().rounds
+    parser.add_argument("--json", type=Path, help="write the figures to this file")
+    arguments = parser.parse_args()
+    rounds = arguments.rounds
     hover(1, 2e-3)  # compiled now, if not before
-    print("vehicle-steps per second on one core, float64, attitude control at 500 Hz")
+    rates: list[dict[str, Any]] = []
+
+    def hovering(name: str, n: int, step: float | None, found: list[float]) -> None:
+        rates.append({"name": name, "vehicles": n, "step": step, "rates": found})
+        steps = "" if step is None else f", steps of {1e3 * step:g} ms"
+        print(f"  {name}, {n} vehicles{steps}: {median(found):.3g}")
+
+    print("vehicle-steps per second on one core, attitude control at 500 Hz")
     for n in (1, 8, 100):
         for h in (2e-3, 1e-3):
-            rate = median(hover(n, h) for _ in range(rounds))
-            print(f"  {n:3} vehicles, steps of {1e3 * h:g} ms: {rate:.3g}")
-    flights = [passage(2e-3) for _ in range(rounds)]
-    flown, path = flights[0][0], flights[0][2]
-    ratio = median(flown / spent for flown, spent, _ in flights)
-    print(f"cube-passage, eight vehicles, law at 500 Hz, {flown:g} s: {ratio:.0f} times real time")
-    exact = passage(2.5e-4)[2]
-    for h in (2e-3, 1e-3):
-        error = np.abs((path if h == 2e-3 else passage(h)[2]) - exact).max()
-        print(f"  steps of {1e3 * h:g} ms: positions within {error:.1e} m of those with 0.25 ms")
+            hovering("rigidfleet", n, h, [hover(n, h) for _ in range(rounds)])
     if find_spec("rotorpy"):
-        print(f"RotorPy, 1 vehicle: {median(rotorpy(300) for _ in range(rounds)):.3g}")
+        hovering("RotorPy", 1, None, [rotorpy(300) for _ in range(rounds)])
     if find_spec("crazyflow"):
         for n in (1, 8, 100):
-            print(f"crazyflow, {n} vehicles, float32: {crazyflow(n):.3g}")
+            hovering("crazyflow, float32", n, 1.0 / RATE, [crazyflow(n)])
+    flights = []
+    exact = passage(2.5e-4)[2]
+    for h in (2e-3, 1e-3):
+        found = [passage(h) for _ in range(rounds)]
+        flights.append(
+            {"name": "the kernel alone, cube-passage", "step": h, "ratios": [t / spent for t, spent, _ in found],
+             "goal": GOAL, "error": float(np.abs(found[0][2] - exact).max())}
+        )  # fmt: skip
+    for name in WHOLE:
+        whole(name)  # compiled and read
+        found = [whole(name) for _ in range(rounds)]
+        flights.append(
+            {"name": f"simulate(), {name}", "step": load_mission(name).autopilot.step, "error": None,
+             "ratios": [t / spent for t, spent in found], "goal": GOAL if name == WHOLE[0] else None}
+        )  # fmt: skip
+    for row in flights:
+        error = (
+            "" if row["error"] is None else f", positions within {row['error']:.1e} m of 0.25 ms"
+        )
+        low, high = min(row["ratios"]), max(row["ratios"])
+        print(
+            f"{row['name']}, steps of {1e3 * row['step']:g} ms: {median(row['ratios']):.0f} times real time"
+            f" ({low:.0f} to {high:.0f}){error}"
+        )
+    if arguments.json:
+        machine = (
+            f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}"
+        )
+        head = {"date": str(date.today()), "machine": machine, "version": version("rigidfleet")}
+        arguments.json.write_text(
+            json.dumps({"vehicles": head | {"rates": rates, "flights": flights}}, indent=1)
+        )
     return 0
 
 

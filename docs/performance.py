@@ -3,7 +3,8 @@
     python benchmarks/run.py --json bench.json
     python benchmarks/compare.py --json peers.json --figure docs/images/work-precision.png
     python benchmarks/many.py --largest --json many.json
-    python docs/performance.py bench.json peers.json many.json
+    python benchmarks/vehicles.py --json vehicles.json
+    python docs/performance.py bench.json peers.json many.json vehicles.json
 
 rewrites them in place, each between `<!-- measured: NAME -->` and `<!-- end -->`; a file may be left out, and its
 tables stay as they are. No number of theirs is written by hand.
@@ -210,6 +211,35 @@ def _graphs(data: Data) -> str:
     return _table(head, rows)
 
 
+def _vehicles(data: Data) -> str:
+    """Flights of quadrotors against the time they last, and vehicle-steps per second."""
+    found = data["vehicles"]
+    flights = [
+        (
+            row["name"],
+            f"{1e3 * row['step']:g}",
+            "" if row["error"] is None else f"{row['error']:.0e}",
+            _ratio(median(row["ratios"])),
+            f"{_ratio(min(row['ratios']))} to {_ratio(max(row['ratios']))}",
+            "" if row["goal"] is None else f"≥ {row['goal']:g}",
+        )
+        for row in found["flights"]
+    ]
+    rates = [
+        (
+            row["name"],
+            str(row["vehicles"]),
+            "" if row["step"] is None else f"{1e3 * row['step']:g}",
+            f"{float(format(median(row['rates']), '.2g')):,.10g}",
+        )
+        for row in found["rates"]
+    ]
+    head = ("90 s of flight", "step [ms]", "error [m]", "times real time", "rounds", "goal")
+    text = _table(head, flights)
+    hover = _table(("hover", "vehicles", "step [ms]", "vehicle-steps in a second"), rates)
+    return f"{text}\n\n{hover}\n\nMeasured on {found['date']}: {found['machine']}; rigidfleet {found['version']}."
+
+
 def _time(seconds: list[float]) -> str:
     value = 1e3 * median(seconds)
     return f"{value:.3g}" if value < 1000 else f"{value:,.0f}"
@@ -233,6 +263,7 @@ TABLES: dict[str, tuple[str, Any]] = {
     "summary": ("rows", _summary),
     "many": ("many", _many),
     "graphs": ("many", _graphs),
+    "vehicles": ("vehicles", _vehicles),
 }
 
 

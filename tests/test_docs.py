@@ -369,6 +369,7 @@ def test_commands_are_documented(capsys):
         "new",
         "report",
         "replay",
+        "export",
         "live",
         "sweep",
         "tune",

@@ -606,3 +606,15 @@ def test_kinds_of_their_own():
     )
     np.testing.assert_allclose(result.slot_position[-1, :, 2], RADIUS + 0.05, atol=1e-9)
     assert assess(result).passed
+
+
+def test_what_vehicles_did_before_a_loss_still_counts():
+    """The regulator's way asks most of rotors as it begins; who is lost later has been there."""
+    whole, lossy = (simulate(rotors(x, smoothness="lqr")) for x in ({}, LOST))
+    before, after = (x.phases[1].extremes for x in (whole, lossy))
+    for name in ("rotor_force", "tilt", "tracking_error", "acceleration"):
+        assert before[name].time < 8.0, name
+        assert after[name] == before[name]
+    flown = lossy.phases[1].t_end - lossy.phases[1].t_start
+    assert 0.0 <= after["saturation"].value < 1.0
+    assert flown == 10.0

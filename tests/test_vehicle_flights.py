@@ -1,12 +1,16 @@
 """Missions flown by vehicles: shipped ones and their promises, sampled points against continuous ones, bits."""
 
+import itertools
 import math
+from typing import Any
 
 import numpy as np
 import pytest
 
 import rigidfleet as rf
-from rigidfleet.mission import load_mission
+from rigidfleet._common.text import percent
+from rigidfleet.mission import Mission, load_mission
+from rigidfleet.planning.vehicles import TickTables, Turn, sampled_flight
 from rigidfleet.result import Result
 
 
@@ -304,9 +308,9 @@ def test_a_controller_may_command_rotors():
 @pytest.mark.parametrize(
     ("command", "words"),
     [
-        (lambda seen: hover(seen, thrust=np.ones(2)), "AttitudeCommand .* whose thrust is not an array"),
+        (lambda seen: hover(seen, thrust=np.ones(2)), "returned an AttitudeCommand .* whose thrust is not an array"),
         (lambda seen: hover(seen, attitude=np.zeros((3, 4))), "attitude of norm zero"),
-        (lambda _: rf.RotorCommand(np.full((3, 4), np.nan)), "RotorCommand .* whose speed is not"),
+        (lambda _: rf.RotorCommand(np.full((3, 4), np.nan)), "returned a RotorCommand .* whose speed is not"),
         (lambda _: rf.RotorCommand("fast"), "RotorCommand .* whose speed is not"),
     ],
 )  # fmt: skip
@@ -348,3 +352,98 @@ def test_a_record_of_rotors_that_lies_is_found():
     assert not found["rotor_force"].passed
     assert found["rotor_force"].worst == pytest.approx(7.0)
     assert not found["record"].passed
+
+
+def test_yaw_along_the_way_goes_on_from_table_to_table():
+    """Tables made one after the other hold the yaw of one table for the whole phase, on the same grid."""
+    mission = changed("passage-quadrotors", yaw={"kind": "along"})
+    flight = rf.Flight(mission)
+    while flight.begin() and flight.plan.phase.name != "WP2":
+        flight.advance()
+    problem, start = flight.plan.problem, flight.plan.start
+    first = round(start * mission.autopilot.rate)
+    turn = Turn(start, np.array([0.3, -0.2, 1.0]), np.zeros(3))
+    sampled = sampled_flight(mission)
+    whole = TickTables(mission, sampled).made(first, first + 1500, problem, turn).yaw
+    tables, ends = TickTables(mission, sampled), first + np.array([0, 7, 403, 1001, 1500])
+    pieces = [tables.made(a, b, problem, turn).yaw for a, b in itertools.pairwise(ends)]
+    np.testing.assert_allclose(
+        np.concatenate(pieces), whole, rtol=0, atol=1e-9
+    )  # of an integration
+    assert np.ptp(whole[:, :, 0], axis=0).min() > 0.1
+
+
+def _legs(model: str, *legs: dict[str, Any], **tables: Any) -> Mission:
+    """Three vehicles that take a triangle of 4 m and fly some phases."""
+    begin = {"kind": "establish", "formation": "triangle", "duration": 5.0}
+    return Mission.from_dict(
+        {
+            "schema_version": 1, "name": "legs", "smoothness": "jerk", "vehicles": {"one": {"model": model}},
+            "agents": {"vehicle": "one", "position": [[0, 0, 5], [4, 0, 5], [2, 3.5, 5]]},
+            "tracking": {"drag_feedforward": True}, "formations": {"triangle": {"shape": "triangle", "size": 4.0}},
+            "phases": [begin, *legs], **tables,
+        }
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "yaw", [{"kind": "along"}, {"kind": "fixed", "yaw_deg": 170.0}, {"kind": "formation"}]
+)
+def test_check_foresees_the_rotors_of_every_yaw(yaw):
+    """Yaw costs rotor force: the check turns the vehicles as the flight does, also from the yaw of the phase before."""
+    way = {"kind": "fly", "position": [15, 5, 8], "yaw_deg": 60.0, "duration": 8.0}
+    mission = _legs("px4-sih", way, {"kind": "hold", "duration": 2.0}, yaw=yaw)
+    found = rf.check(mission, search=False).vehicles
+    flown = rf.simulate(mission).extreme("rotor_force")
+    assert found is not None
+    assert flown is not None
+    assert found.rotor_force[0] == pytest.approx(flown.value, rel=0.02)
+    assert found.beyond is None
+
+
+@pytest.mark.parametrize(
+    ("legs", "tables", "words"),
+    [
+        (
+            [{"kind": "fly", "position": [15, 5, 8], "yaw_deg": 60.0, "duration": 8.0}],
+            {"yaw": {"kind": "towards", "point": [7, 3, 0]}},
+            "rotor forces of",
+        ),
+        ([{"kind": "fly", "position": [15, 5, 8], "duration": 3.2}], {}, "deg of tilt (limit 45 deg)"),
+    ],
+)  # fmt: skip
+def test_check_tells_what_vehicles_cannot_give(legs, tables, words):
+    """A vehicle passes a point that it looks at, or has to tilt more than it may: the check and the flight fail."""
+    mission = _legs("px4-sih", *legs, **tables)
+    found = rf.check(mission, search=False)
+    (remark,) = (r for r in found.remarks if r.topic == "rotors")
+    assert remark.level == "fails"
+    assert words in remark.text
+    verdict = rf.assess(rf.simulate(mission))
+    saturation = next(c for c in verdict.checks if c.check == "saturation")
+    assert not saturation.passed
+
+
+@pytest.mark.parametrize("integral", [0.0, 1.0])
+def test_check_knows_the_integral_of_the_tracking(integral):
+    """A steady wind holds vehicles off their slots, unless the tracking has an integral."""
+    mission = _legs(
+        "paper",
+        {"kind": "hold", "duration": 30.0},
+        tracking={"integral": integral},
+        disturbances={"wind": [2.0, 0.0, 0.0]},
+    )
+    found = rf.check(mission, search=False)
+    assert found.disturbed is not None
+    flown = rf.simulate(mission)
+    off = np.linalg.norm(flown.position - flown.slot_position, axis=2)[-1].max()
+    assert found.disturbed.offset[0] == pytest.approx(off, rel=0.05, abs=2e-3)
+    assert any("no integral" in r.text for r in found.remarks) == (integral == 0.0)
+
+
+@pytest.mark.parametrize(
+    ("share", "words"), [(1.0, "100 %"), (0.5714, "57 %"), (0.0996, "10 %"), (0.00251, "0.25 %")]
+)
+def test_shares_in_per_cent(share, words):
+    """Shares are told without powers of ten."""
+    assert percent(share) == words

@@ -95,6 +95,7 @@ def test_points_without_vehicles_stay_as_they_are():
         ({"drone": {"model": "paper", "rotor_speed": [9.0, 1.0]}}, {}, ("rotor_speed", "swap")),
         ({"drone": {"model": "paper", "rotor_speed": [900.0, 1000.0]}}, {}, ("in hover",)),
         ({"drone": {"model": "paper", "attitude_gains": [544.0, 5.0]}}, {}, ("attitude_gains", "unstable")),
+        ({"drone": {"model": "paper", "motor_time": [0.2, 0.2]}}, {}, ("[544.0, 46.64]", "quicker motors")),
         ({"drone": {"model": "point"}}, {}, ("needs a mass",)),
         ({"drone": {"model": "point", "mass": 1.0, "arm": 0.1}}, {}, ("arm", "no effect on a point")),
         ({"drone": {"model": "paper"}, "spare": {"model": "x500"}}, {}, ("vehicles.spare", "no agent flies it")),

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
         RigidfleetError,
         SweepError,
     )
+    from rigidfleet.interchange import Export, export
     from rigidfleet.mission import Mission, load_mission, mission_names
     from rigidfleet.plotting import plot
     from rigidfleet.preflight.check import Preflight, check
@@ -48,6 +49,7 @@ if TYPE_CHECKING:
 __all__ = [
     "AttitudeCommand",
     "Ensemble",
+    "Export",
     "Flight",
     "FlightError",
     "FlightInterrupted",
@@ -69,6 +71,7 @@ __all__ = [
     "check",
     "design",
     "establish",
+    "export",
     "live",
     "load_mission",
     "mission_names",
@@ -83,6 +86,7 @@ __all__ = [
 _HOME = {
     "AttitudeCommand": "simulation.flight",
     "Ensemble": "simulation.ensemble",
+    "Export": "interchange",
     "Flight": "simulation.flight",
     "FlightError": "errors",
     "FlightInterrupted": "simulation.flight",
@@ -103,6 +107,7 @@ _HOME = {
     "check": "preflight.check",
     "design": "rigidity.design",
     "establish": "simulation.ensemble",
+    "export": "interchange",
     "live": "web.live",
     "load_mission": "mission",
     "mission_names": "mission",

@@ -19,6 +19,7 @@ from datetime import UTC, datetime
 from functools import cache, cached_property
 from importlib.metadata import PackageNotFoundError, version
 from inspect import Parameter, Signature
+from itertools import pairwise
 from pathlib import Path
 from typing import (
     TYPE_CHECKING,
@@ -602,6 +603,10 @@ class Result:
         ValueError
             The rate is not positive, or gives too many setpoints.
         """
+        return at_rate(self.motion(flown=flown), rate)
+
+    def motion(self, *, flown: bool = False) -> Setpoints:
+        """The setpoints of every sample, of which there are two at a change of phase; see `setpoints`."""
         references = [
             self.slot_position,
             self.slot_velocity,
@@ -612,12 +617,15 @@ class Result:
         state = np.stack([nothing if x is None else x for x in references], axis=1)
         if flown:
             motion = self.position, self.velocity, self.acceleration
-            parts = [self.samples(k) for k in range(len(self.phases))]
+            # Forces jump where two samples have one time: at a change of phase and at a loss.
+            jumps = np.flatnonzero(np.nextafter(self.time[:-1], np.inf) >= self.time[1:]) + 1
+            ends = [0, *jumps.tolist(), len(self.time)]
+            parts = [slice(*pair) for pair in pairwise(ends)]
             state = np.concatenate(
                 [of_motion(*(x[part] for x in (*motion, self.time))) for part in parts]
             )
         yaw = [nothing[:, :, 0] if x is None else x for x in (self.yaw, self.yaw_rate)]
-        return at_rate(Setpoints(self.time, state, *yaw), rate)
+        return Setpoints(self.time, state, *yaw)
 
     def to_csv(self, path: str | Path, *, rate: float | None = None, flown: bool = False) -> None:
         """Write the setpoints of each vehicle to a CSV file, one row per time and agent, to 9 digits.

@@ -13,7 +13,7 @@ import numpy as np
 from rigidfleet.math import lqr, series, splines
 from rigidfleet.typing import Floats, Ints
 
-_HEADER = (
+HEADER = (
     "time_s,agent,x_m,y_m,z_m,vx_m_s,vy_m_s,vz_m_s,ax_m_s2,ay_m_s2,az_m_s2,jx_m_s3,jy_m_s3,jz_m_s3,"
     "yaw_rad,yaw_rate_rad_s"
 )
@@ -71,9 +71,15 @@ def at_rate(given: Setpoints, rate: float | None) -> Setpoints:
         raise ValueError(
             f"a rate of {rate:g} Hz gives {count * n:,} setpoints; use {fits:.3g} Hz or less"
         )
-    wanted = np.minimum(time[0] + np.arange(count) / rate, time[-1])
+    return at_times(given, np.minimum(time[0] + np.arange(count) / rate, time[-1]))
+
+
+def at_times(given: Setpoints, wanted: Floats) -> Setpoints:
+    """Setpoints at increasing times (n,) [s] within the given ones; of two states at a switch, the later one counts."""
+    time, count, n = given.time, len(wanted), given.yaw.shape[1]
     if len(time) == 1:
         return given
+    later = np.append(np.nextafter(time[:-1], np.inf) < time[1:], True)
     # Pieces between samples of a phase; none is as narrow as a switch.
     ends = np.flatnonzero(later[:-1])
     low = ends[np.searchsorted(time[ends], np.nextafter(wanted, np.inf), side="right") - 1]
@@ -99,8 +105,11 @@ def _between(time: Floats, x: Floats, low: Ints, after: Floats) -> Floats:
     return series.derivatives(found).swapaxes(0, 1)
 
 
-def csv(given: Setpoints) -> str:
-    """The text of a table: a row for each time and agent (from 1), numbers to 9 digits, empty where there is none."""
+def csv(given: Setpoints, first: int = 1) -> str:
+    """The text of a table: a row for each time and agent, numbers to 9 digits, empty where there is none.
+
+    Agents count from ``first``.
+    """
     k, n = given.yaw.shape
     columns = np.concatenate(
         [
@@ -110,10 +119,10 @@ def csv(given: Setpoints) -> str:
         ],
         axis=2,
     )
-    lines = [_HEADER]
+    lines = [HEADER]
     row = ",".join(["%.9g"] * columns.shape[2])
     for t, agents in zip(given.time.tolist(), columns, strict=True):
         told = f"{t:.9g}"
-        for i, values in enumerate(agents.tolist(), start=1):
+        for i, values in enumerate(agents.tolist(), start=first):
             lines.append(f"{told},{i}," + row % tuple(values))
     return "\n".join(lines).replace("nan", "") + "\n"

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import re
 import secrets
+import shutil
 from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
@@ -41,6 +43,47 @@ def replacing(path: str | Path, *, private: bool = False) -> Generator[IO[bytes]
     except BaseException:
         part.unlink(missing_ok=True)
         raise
+
+
+@contextmanager
+def replacing_folder(path: Path, ours: re.Pattern[str]) -> Generator[Path]:
+    """Make a new folder that replaces the old one once all its files are written.
+
+    Parameters
+    ----------
+    path : path of the folder
+    ours : names of the files that an old folder may hold; one that holds others is not replaced
+
+    Raises
+    ------
+    ResultError
+        The folder cannot be written, or holds other files. It is unchanged.
+    """
+    target = Path(os.path.realpath(path))
+    token = secrets.token_hex(4)
+    part, old = (target.with_name(f".{target.name[:200]}.{token}.{end}") for end in ("part", "old"))
+    try:
+        if target.exists():
+            if not target.is_dir():
+                raise ResultError(f"{path}: is a file. Give the path of a folder.")
+            foreign = sorted(x.name for x in target.iterdir() if not ours.fullmatch(x.name))
+            if foreign:
+                raise ResultError(
+                    f"{path}: holds other files ({foreign[0]}), which are kept. Choose a new folder."
+                )
+        target.parent.mkdir(parents=True, exist_ok=True)
+        part.mkdir()
+        yield part
+        if target.exists():
+            target.rename(old)
+        part.rename(target)
+    except OSError as error:
+        raise ResultError(f"{path}: {why_not(error, 'written', path)}") from error
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+        if old.exists() and not target.exists():
+            old.rename(target)
+        shutil.rmtree(old, ignore_errors=True)
 
 
 def write_file(path: Path, data: bytes) -> None:

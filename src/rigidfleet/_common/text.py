@@ -11,3 +11,9 @@ def agent_names(indices: Iterable[int]) -> str:
     if len(numbers) == 1:
         return f"agent {numbers[0]}"
     return f"agents {', '.join(numbers[:-1])} and {numbers[-1]}"
+
+
+def percent(share: float) -> str:
+    """A share in per cent, to two digits below 10 %: "0.25 %", "57 %", "100 %"."""
+    value = 100 * share
+    return f"{value:.2g} %" if value < 10 else f"{value:.0f} %"

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
+from rigidfleet._common.text import percent
 from rigidfleet.assessment.measure import Measurements
 from rigidfleet.assessment.outcome import CheckResult, Extreme, value
 from rigidfleet.math import attitude as att
@@ -91,8 +92,8 @@ def _saturation(e: Extreme, limit: float) -> CheckResult:
     """Share of a phase in which a vehicle cannot give what is asked of it."""
     passed = e.value <= limit + _SLACK
     words = (
-        f"{e.who} cannot give what is asked of it for {100 * e.value:.2g} % of phase '{e.phase}'"
-        f" (limit {100 * limit:.2g} %)"
+        f"{e.who} cannot give what is asked of it for {percent(e.value)} of phase '{e.phase}'"
+        f" (limit {percent(limit)})"
     )
     if e.value == 0.0:
         words = "no vehicle is asked for more than its rotors give"

@@ -28,7 +28,7 @@ from typing import Any, cast
 from cyclopts import App, CycloptsError, Parameter, UnknownOptionError, UnusedCliTokensError
 
 from rigidfleet._version import __version__
-from rigidfleet.cli import check, console, design, live, new, report, run, sweep, tune
+from rigidfleet.cli import check, console, design, export, live, new, report, run, sweep, tune
 from rigidfleet.cli.codes import BAD_INPUT, FAILED, INTERRUPTED, PASSED
 from rigidfleet.errors import RigidfleetError
 
@@ -50,7 +50,7 @@ app = App(
 )
 _COMMANDS = (
     run.run, run.missions, check.check, design.design, new.new, report.report, report.replay,
-    live.live, sweep.sweep, tune.tune,
+    export.export, live.live, sweep.sweep, tune.tune,
 )  # fmt: skip
 for _key, _command in enumerate(_COMMANDS, start=1):
     app.command(_command, sort_key=_key)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigidfleet.kernel.problem import Workspace, zeros
+from rigidfleet.kernel.problem import Workspace, padded, zeros
 from rigidfleet.kernel.records import NO_TRAIL, Trail
 from rigidfleet.typing import Bools, Floats, Ints
 
@@ -262,7 +262,7 @@ class SampledState(NamedTuple):
 class SampledWork(NamedTuple):
     """Work arrays of a sampled flight."""
 
-    y: Floats  # (7, 17) start, trial, four derivatives, end
+    y: Floats  # (7, 17 N padded to eights) start, trial, four derivatives, end
     air: Floats  # (3, N, 3) velocity of the air: start, middle and end of a step [m/s]
     T: Floats  # (3, 3)
     desired: Floats  # (5, 3) desired attitude (3, 3), its rates and accelerations
@@ -467,7 +467,7 @@ def _frame(q: Floats | None) -> Floats:
 def _work(n: int, m: int) -> SampledWork:
     size = 6 * n + m + 4
     return SampledWork(
-        zeros(7, STATES), zeros(3, n, 3), np.eye(3), np.zeros((5, 3)), np.zeros((4, 4)), np.zeros(1),
+        zeros(7, padded(n * STATES)), zeros(3, n, 3), np.eye(3), np.zeros((5, 3)), np.zeros((4, 4)), np.zeros(1),
         np.zeros((1, size)), np.zeros(size),
     )  # fmt: skip
 

@@ -160,23 +160,58 @@ def in_world(points, i, moving, p, monitor, out):
 
 
 @compiled
-def between(points, i, j, out):
-    """Control points (5, 3) of r_i - r_j, in the axes of the states."""
+def span_of(curve):
+    """Radius [m] of a ball about the middle control point that holds a curve with control points (5, 3)."""
+    far = 0.0
     for k in range(5):
-        for q in range(3):
-            out[k, q] = points[k, 3 * i + q] - points[k, 3 * j + q]
+        x, y, z = curve[k, 0] - curve[2, 0], curve[k, 1] - curve[2, 1], curve[k, 2] - curve[2, 2]
+        far = max(far, x * x + y * y + z * z)
+    return math.sqrt(far)
 
 
 @compiled
-def watch_pairs(kind, pairs, points, t, h, monitor):
+def place(points, monitor):
+    """Control points of all agents' positions over a step, in the axes of the states, and their spans."""
+    for i in range(monitor.places.shape[0]):
+        curve = monitor.places[i]
+        for k in range(5):
+            for q in range(3):
+                curve[k, q] = points[k, 3 * i + q]
+        monitor.span[i] = span_of(curve)
+
+
+@compiled
+def apart(i, j, axes, reach, monitor):
+    """Whether agents i and j stay at least ``reach`` [m] apart over a step, by their balls, along the first ``axes``.
+
+    If so, their curves need not be compared. False does not say that they come closer.
+    """
+    far, reach = 0.0, reach + monitor.span[i] + monitor.span[j] + CLOSE
+    for q in range(axes):
+        x = monitor.places[i, 2, q] - monitor.places[j, 2, q]
+        far += x * x
+    return reach > 0.0 and far >= reach * reach
+
+
+@compiled
+def between(i, j, monitor):
+    """Control points (5, 3) of r_i - r_j, into ``monitor.curve``."""
+    for k in range(5):
+        for q in range(3):
+            monitor.curve[k, q] = monitor.places[i, k, q] - monitor.places[j, k, q]
+
+
+@compiled
+def watch_pairs(kind, pairs, t, h, monitor):
     """Least distance between the surfaces of pairs of agents (P, 2) over a step."""
-    radius, d = monitor.radius, monitor.curve
     for k in range(pairs.shape[0]):
         i, j = pairs[k, 0], pairs[k, 1]
-        between(points, i, j, d)
-        radii = radius[i] + radius[j]
+        radii = monitor.radius[i] + monitor.radius[j]
         floor = monitor.worst[kind] + radii
-        value, at = shortest(d, floor, monitor.work, monitor.pieces)
+        if apart(i, j, 3, floor, monitor):
+            continue
+        between(i, j, monitor)
+        value, at = shortest(monitor.curve, floor, monitor.work, monitor.pieces)
         if at >= 0.0:
             take(kind, value - radii, t + at * h, i, j, monitor)
 
@@ -184,15 +219,14 @@ def watch_pairs(kind, pairs, points, t, h, monitor):
 @compiled
 def watch_stacks(t, h, monitor):
     """Least height between the surfaces of two agents, one below the other, over a step."""
-    radius, d = monitor.radius, monitor.curve
     for k in range(monitor.columns.shape[0]):
         i, j = monitor.columns[k, 0], monitor.columns[k, 1]
-        for s in range(5):
-            for q in range(3):
-                d[s, q] = monitor.places[i, s, q] - monitor.places[j, s, q]
-        radii = radius[i] + radius[j]
+        radii = monitor.radius[i] + monitor.radius[j]
+        if apart(i, j, 2, radii, monitor):
+            continue
+        between(i, j, monitor)
         floor = monitor.worst[SEPARATION_BELOW] + radii
-        value, at = lowest_overlap(d, radii, floor, monitor.pieces)
+        value, at = lowest_overlap(monitor.curve, radii, floor, monitor.pieces)
         if at >= 0.0:
             take(SEPARATION_BELOW, value - radii, t + at * h, i, j, monitor)
 
@@ -250,11 +284,7 @@ def watch_obstacles(i, curve, t, h, last, monitor):
     """
     radius, standing = monitor.radius[i], monitor.standing[i] != 0
     low, normal = monitor.low, monitor.scratch[2]
-    x, y, z, span = curve[2, 0], curve[2, 1], curve[2, 2], 0.0
-    for k in range(5):
-        a, b, c = curve[k, 0] - x, curve[k, 1] - y, curve[k, 2] - z
-        span = max(span, a * a + b * b + c * c)
-    span = math.sqrt(span)
+    x, y, z, span = curve[2, 0], curve[2, 1], curve[2, 2], monitor.span[i]
     for b in range(monitor.boxes.shape[0]):
         box = monitor.boxes[b]
         floor = clearance_of_interest(i, monitor) + radius
@@ -279,8 +309,9 @@ def watch_distances(row, p, state, monitor):
     """Monitor distances and speeds over one step of the trail."""
     trail = state.trail
     points, t, h = trail.points[row], trail.clock[row, 0], trail.clock[row, 1]
-    watch_pairs(SEPARATION, monitor.pairs, points, t, h, monitor)
-    watch_pairs(LOST, monitor.struck, points, t, h, monitor)
+    place(points, monitor)
+    watch_pairs(SEPARATION, monitor.pairs, t, h, monitor)
+    watch_pairs(LOST, monitor.struck, t, h, monitor)
     parts = 1
     if p.body_formulation:
         parts = int(min(max(1.0, math.ceil(angle_of(points, p) / _TURN)), 1e4))
@@ -292,7 +323,7 @@ def watch_distances(row, p, state, monitor):
         for i in range(monitor.left.shape[0]):
             if not monitor.left[i]:
                 continue
-            curve = monitor.places[i]
+            curve = monitor.curve
             in_world(points, i, 1, p, monitor, curve)
             fastest = 0.0
             for k in range(5):
@@ -311,7 +342,10 @@ def watch_distances(row, p, state, monitor):
                 _, at = lowest(monitor.work, 8, floor)
                 if at >= 0.0:
                     take(SPEED, -length_at(piece, at), start + at * h, i, -1, monitor)
-            in_world(points, i, 0, p, monitor, curve)
+            curve = monitor.places[i]
+            if p.body_formulation:
+                in_world(points, i, 0, p, monitor, curve)
+                monitor.span[i] = span_of(curve)
             watch_coordinate(LOWEST, curve, 2, 1.0, 0.0, start, h, i, monitor)
             watch_coordinate(HIGHEST, curve, 2, -1.0, 0.0, start, h, i, monitor)
             for f in range(monitor.fence.shape[0]):

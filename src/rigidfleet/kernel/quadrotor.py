@@ -12,6 +12,7 @@ from rigidfleet.kernel.compiler.jit import compiled, inlined
 from rigidfleet.kernel.disturbances import contact
 from rigidfleet.kernel.fleet import thrust_of
 from rigidfleet.kernel.rigid_body import attitude_matrix, quaternion_rate
+from rigidfleet.kernel.vectors import in_vectors
 
 #: Rows of `SampledWork.y`.
 _START, _TRIAL, _RATES, _END = 0, 1, 2, 6
@@ -115,34 +116,32 @@ def derivative(y, command, i, vehicles, around, air, push, T, dy):
 
 
 @compiled
-def runge_kutta(i, h, command, vehicles, around, push, work):
-    """Advance vehicle i by h [s] from row 0 of ``work.y`` to row 6, the classical method of fourth order.
+def runge_kutta(h, commands, vehicles, around, push, work):
+    """Advance all vehicles by h [s] from row 0 of ``work.y`` to row 6, the classical method of fourth order.
 
-    ``work.air`` holds the air at the start, the middle and the end. The quaternion is normalised after the step. Row 2
-    then holds the derivative at the start.
+    A row holds the states of all vehicles, one after the other. ``work.air`` holds the air at the start, the middle and
+    the end. The quaternion is normalised after the step. Row 2 then holds the derivative at the start. Each stage takes
+    all vehicles, so that rows are added eight numbers at a time.
     """
-    y = work.y
-    for q in range(17):
-        y[_TRIAL, q] = y[_END, q] = y[_START, q]
+    y, rows = work.y, in_vectors(work.y)
+    for q in range(rows.shape[1]):
+        rows[_TRIAL, q] = rows[_END, q] = rows[_START, q]
     for stage in range(4):
-        rate = y[_RATES + stage]
-        derivative(
-            y[_TRIAL],
-            command,
-            i,
-            vehicles,
-            around,
-            work.air[(stage + 1) // 2, i],
-            push,
-            work.T,
-            rate,
-        )
+        trial, rate = y[_TRIAL], y[_RATES + stage]
+        for i in range(vehicles.m.shape[0]):
+            first, air = 17 * i, work.air[(stage + 1) // 2, i]
+            derivative(
+                trial[first : first + 17], commands[i], i, vehicles, around, air, push[i], work.T,
+                rate[first : first + 17],
+            )  # fmt: skip
         weight = h / 6.0 if stage in (0, 3) else h / 3.0
         reach = h if stage == 2 else 0.5 * h
-        for q in range(17):
-            y[_END, q] += weight * rate[q]
-            y[_TRIAL, q] = y[_START, q] + reach * rate[q]
-    normalise(y[_END, 6:10])
+        for q in range(rows.shape[1]):
+            change = rows[_RATES + stage, q]
+            rows[_END, q] += weight * change
+            rows[_TRIAL, q] = rows[_START, q] + reach * change
+    for i in range(vehicles.m.shape[0]):
+        normalise(y[_END, 17 * i + 6 : 17 * i + 10])
 
 
 @compiled

@@ -94,6 +94,7 @@ class Monitor(NamedTuple):
     instants: Floats  # (27,) times of these points [s]
     rank: Ints  # (27,) their order in time
     places: Floats  # (N, 5, 3) control points of the agents' positions over a step [m]
+    span: Floats  # (N,) radius of a ball about the third one that holds all five [m]
     curve: Floats  # (5, 3) of one pair
     work: Floats  # (40, 11) polynomials
     pieces: Floats  # (40, 17) curves
@@ -119,7 +120,7 @@ def monitor(
         "states": np.zeros((1, states)), "gauge": np.zeros((2, gauge)),
         "nodes": np.empty((_NODES, gauge)), "instants": np.zeros(_NODES),
         "rank": np.zeros(_NODES, dtype=np.int64),
-        "places": np.zeros((n, 5, 3)), "curve": np.zeros((5, 3)), "work": np.zeros((40, 11)),
+        "places": np.zeros((n, 5, 3)), "span": np.zeros(n), "curve": np.zeros((5, 3)), "work": np.zeros((40, 11)),
         "pieces": np.zeros((40, 17)), "basis": np.zeros((5, 5)), "poses": np.zeros((5, 15)),
         "knots": np.zeros((5, 3)), "scratch": np.zeros((3, 10)),
     }  # fmt: skip

@@ -277,11 +277,13 @@ def tick(k, t, p, w, flight, state, call):
 
 
 @compiled
-def advance_vehicle(i, h, flight, state):
-    """Advance vehicle i by h [s] in ``work.y``, from its state to row 6."""
-    for q in range(17):
-        state.work.y[0, q] = state.S[i, q]
-    runge_kutta(i, h, state.command[i], flight.vehicles, flight.air, state.push[i], state.work)
+def advance(S, h, flight, state):
+    """Advance all vehicles by h [s] in ``work.y``, from states S (N, 17) to row 6."""
+    work = state.work
+    for i in range(S.shape[0]):
+        for q in range(17):
+            work.y[0, 17 * i + q] = S[i, q]
+    runge_kutta(h, state.command, flight.vehicles, flight.air, state.push, work)
 
 
 @compiled
@@ -297,14 +299,10 @@ def breathe(t, h, flight, state):
 def write_derivatives(c, t, flight, state, call):
     """Derivatives of the states of sample c: those at the start of a step without length."""
     breathe(t, 0.0, flight, state)
+    advance(call.S[c], 0.0, flight, state)
     for i in range(state.S.shape[0]):
         for q in range(17):
-            state.work.y[0, q] = call.S[c, i, q]
-        runge_kutta(
-            i, 0.0, state.command[i], flight.vehicles, flight.air, state.push[i], state.work
-        )
-        for q in range(17):
-            call.dS[c, i, q] = state.work.y[2, q]
+            call.dS[c, i, q] = state.work.y[2, 17 * i + q]
 
 
 @compiled
@@ -318,10 +316,10 @@ def write_samples(t, h, flight, state, call):
             return
         x = h if x > h * (1.0 - _SAME) else x
         breathe(t, x, flight, state)
+        advance(state.S, x, flight, state)
         for i in range(state.S.shape[0]):
-            advance_vehicle(i, x, flight, state)
             for q in range(17):
-                call.S[c, i, q] = work.y[6, q]
+                call.S[c, i, q] = work.y[6, 17 * i + q]
             for q in range(4):
                 call.command[c, i, q] = state.command[i, q]
             for q in range(3):
@@ -344,7 +342,8 @@ def write_samples(t, h, flight, state, call):
 @compiled
 def keep_path(i, h, work, points):
     """Bernstein coefficients (5, 6 N) of vehicle i over a step: of the quartic through r0, v0, a0, r1, v1; its rate."""
-    first, end, rate = work.y[0], work.y[6], work.y[2]
+    own = slice(17 * i, 17 * i + 17)
+    first, end, rate = work.y[0, own], work.y[6, own], work.y[2, own]
     n = points.shape[1] // 6
     for q in range(3):
         r0, v0, a0, r1, v1 = first[q], first[3 + q], rate[3 + q], end[q], end[3 + q]
@@ -366,7 +365,8 @@ def take_extremes(i, t, h, vehicles, state):
     A rotor's speed is monotone while its command is held, so the ends of steps have its greatest thrust. The
     acceleration of a point jumps at ticks, and is the highest after them.
     """
-    rate, end = state.work.y[2], state.work.y[6]
+    own = slice(17 * i, 17 * i + 17)
+    rate, end = state.work.y[2, own], state.work.y[6, own]
     a = math.sqrt(rate[3] ** 2 + rate[4] ** 2 + rate[5] ** 2)
     worse(i, ACCELERATION, a, t, state)
     command, load = state.command[i], 0.0
@@ -395,15 +395,14 @@ def advance_fleet(t, h, flight, state):
     if kept:
         trail.clock[row, 0], trail.clock[row, 1] = t, h
         state.count[TRAILED] = row + 1
-    # The air, with the jets of all at the start of the step, is known already: states can be overwritten one by one
+    advance(state.S, h, flight, state)
     for i in range(state.S.shape[0]):
-        advance_vehicle(i, h, flight, state)
         if not flight.vehicles.lost[i]:
             take_extremes(i, t, h, flight.vehicles, state)
         if kept:
             keep_path(i, h, state.work, trail.points[row])
         for q in range(17):
-            state.S[i, q] = state.work.y[6, q]
+            state.S[i, q] = state.work.y[6, 17 * i + q]
 
 
 @compiled

@@ -16,7 +16,7 @@ from rigidfleet.math import attitude as att
 from rigidfleet.typing import Floats
 
 #: Up to this squared angle, Stumpff functions are summed as series, with this number of terms: exact to rounding.
-_SERIES, _TERMS = 16.0, 24
+_SERIES, _TERMS = 16.0, 16
 #: 1/k!
 _RECIPROCALS = [1.0 / math.factorial(k) for k in range(64)]
 
@@ -43,14 +43,15 @@ def rate(x: Floats) -> Floats:
 
 def of_polynomials(coefficients: Floats, x: Floats, orders: int) -> Floats:
     """Series (orders, K, ...) of polynomials with coefficients (K, ..., P), ascending, at x (K,)."""
-    c = np.moveaxis(np.array(coefficients, dtype=float), -1, 0)
-    x = x.reshape(-1, *(1,) * (c.ndim - 2))
+    c = list(np.moveaxis(np.asarray(coefficients, dtype=float), -1, 0))
+    x = x.reshape(-1, *(1,) * (c[0].ndim - 1))
     powers = len(c)
     for order in range(min(orders, powers)):  # repeated synthetic division by (t - x)
         for k in range(powers - 2, order - 1, -1):
-            c[k] += x * c[k + 1]
-    full = np.zeros((orders, *c.shape[1:]))
-    full[: min(orders, powers)] = c[:orders]
+            c[k] = c[k] + x * c[k + 1]
+    full = np.zeros((orders, *np.broadcast_shapes(x.shape, c[0].shape)))
+    for order, found in enumerate(c[:orders]):
+        full[order] = found
     return full
 
 
@@ -58,28 +59,31 @@ def product(
     a: Floats, b: Floats, multiply: Callable[[Floats, Floats], Floats] = np.multiply
 ) -> Floats:
     """Series of the product of two series of the same order, by any bilinear ``multiply``, such as `numpy.matmul`."""
-    found = []
-    for k in range(min(len(a), len(b))):
-        total = multiply(a[0], b[k])
-        for i in range(1, k + 1):
-            total = total + multiply(a[i], b[k - i])
-        found.append(total)
-    return np.array(found)
+    n = min(len(a), len(b))
+    found = multiply(a[0], b[:n])
+    for i in range(1, n):
+        found[i:] += multiply(a[i], b[: n - i])
+    return found
 
 
 def rotation(phi: Floats) -> Floats:
     """Series (n, ..., 3, 3) of R = Exp(phi), body to world, of rotation vectors phi (n, ..., 3) [rad].
 
-    R = 1 + c_1(u) [phi x] + c_2(u) [phi x]^2 with u = |phi|^2 and the Stumpff functions c_k, which are analytic in u,
-    so that no angle is special.
+    R = c_0(u) + c_1(u) [phi x] + c_2(u) phi phi^T with u = |phi|^2 and the Stumpff functions c_k, which are analytic in
+    u, so that no angle is special. Times are the last axis in memory: arithmetic on long rows is fast.
     """
-    u = product(phi, phi).sum(axis=-1)
-    functions = _stumpff(u[0], 2 * len(phi) + 2)
-    W = cross_matrix(phi)
-    R = product(_compose(1, functions, u)[..., None, None], W)
-    R += product(_compose(2, functions, u)[..., None, None], product(W, W, np.matmul))
-    R[0] += np.eye(3)
-    return R
+    x = np.ascontiguousarray(np.moveaxis(phi, -1, 1))
+    c0, c1, c2 = _stumpff_series(product(x, x).sum(axis=1))
+    S = product(c1[:, None], x)
+    P = product(product(c2[:, None], x)[:, [0, 1, 2, 0, 0, 1]], x[:, [0, 1, 2, 1, 2, 2]])
+    P[:, :3] += c0[:, None]
+    R = np.empty((len(x), 3, 3, *x.shape[2:]))
+    for k in range(3):
+        R[:, k, k] = P[:, k]
+    for k, (i, j, sign) in enumerate(((0, 1, -1.0), (0, 2, 1.0), (1, 2, -1.0))):
+        R[:, i, j] = P[:, 3 + k] + sign * S[:, 2 - k]
+        R[:, j, i] = P[:, 3 + k] - sign * S[:, 2 - k]
+    return np.moveaxis(R, (1, 2), (-2, -1))
 
 
 def rotation_vector(R: Floats) -> Floats:
@@ -147,8 +151,10 @@ def _stumpff(u: Floats, count: int) -> Floats:
     near = u < _SERIES
     small = np.where(near, u, 0.0)
     for k in (count - 1, count - 2):
+        total = found[k, ...]  # a view, of single numbers as well
         for i in range(_TERMS, -1, -1):  # Horner
-            found[k] = _RECIPROCALS[2 * i + k] - small * found[k]
+            np.multiply(total, small, out=total)
+            np.subtract(_RECIPROCALS[2 * i + k], total, out=total)
     for k in range(count - 3, -1, -1):  # c_k = 1/k! - u c_(k + 2), downwards for small u
         found[k] = _RECIPROCALS[k] - small * found[k + 2]
     if near.all():
@@ -161,23 +167,22 @@ def _stumpff(u: Floats, count: int) -> Floats:
     return np.where(near, found, np.stack(closed))
 
 
-def _compose(k: int, functions: Floats, u: Floats) -> Floats:
-    """Series of c_k(u) of a series u, from Stumpff ``functions`` (count, ...) of its value, by Taylor's formula.
+def _stumpff_series(u: Floats) -> tuple[Floats, Floats, Floats]:
+    """Series (n, ...) of c_0(u), c_1(u) and c_2(u) of a series u (n, ...).
 
-    c_k' = (k c_(k+2) - c_(k+1)) / 2 gives every derivative as a sum of Stumpff functions.
+    c_k' = (k c_(k+2) - c_(k+1)) / 2 gives each order from the order before of the following functions.
     """
-    change = u.copy()
-    change[0] = 0.0
-    power = np.zeros_like(u)
-    power[0] = 1.0
-    found, terms = np.zeros_like(u), {k: 1.0}
-    for order in range(len(u)):
-        value = sum(weight * functions[j] for j, weight in terms.items())
-        found += value / math.factorial(order) * power
-        power = product(power, change)
-        following: dict[int, float] = {}
-        for j, weight in terms.items():
-            following[j + 2] = following.get(j + 2, 0.0) + 0.5 * j * weight
-            following[j + 1] = following.get(j + 1, 0.0) - 0.5 * weight
-        terms = following
-    return found
+    n, slope = len(u), rate(u)
+    count = 2 * n + 1  # of the functions; two fewer with each order
+    found = [_stumpff(u[0], count)]
+    chain: list[Floats] = []  # derivatives by u
+    for order in range(1, n):
+        c = found[-1]
+        k = np.arange(len(c) - 2.0).reshape(-1, *(1,) * (c.ndim - 1))
+        chain.append(0.5 * (k * c[2:] - c[1:-1]))
+        total = slope[0] * chain[-1]
+        for i in range(1, order):
+            total += slope[i] * chain[order - 1 - i][: len(total)]
+        found.append(total / order)
+    c0, c1, c2 = (np.stack([c[k] for c in found]) for k in range(3))
+    return c0, c1, c2

@@ -27,6 +27,7 @@ from rigidfleet.mission.schema import (
     Constraint,
     Contents,
     Disturbances,
+    GeodeticOrigin,
     Geofence,
     IntegratorOptions,
     Limits,
@@ -50,6 +51,7 @@ _TABLES: dict[str, type[Part]] = {
     "limits": Limits,
     "autopilot": Autopilot,
     "yaw": VehicleYaw,
+    "geodetic_origin": GeodeticOrigin,
     "disturbances": Disturbances,
 }
 

@@ -645,6 +645,20 @@ class MissionHeader(Part):
     output_step: Time = Field(0.05, description="time between samples of the result [s]")
 
 
+class GeodeticOrigin(Part):
+    """Place on the Earth of the mission's origin, for exports; x points east, y north and z up there."""
+
+    latitude_deg: Annotated[float, Strict(), Field(gt=-90, lt=90)] = Field(
+        description="latitude [deg], WGS 84"
+    )
+    longitude_deg: Annotated[float, Strict(), Field(ge=-180, le=180)] = Field(
+        description="longitude [deg]"
+    )
+    altitude: Annotated[float, Strict(), Field(ge=-1000, le=20_000)] = Field(
+        0.0, description="height of z = 0 above mean sea level [m]"
+    )
+
+
 class VehicleYaw(Part):
     """Yaw of each vehicle, which no force of a formation depends on."""
 
@@ -691,6 +705,9 @@ class Contents(MissionHeader):
         default_factory=Limits, description="limits that the verdict checks: [limits]"
     )
     yaw: VehicleYaw = Field(default_factory=VehicleYaw, description="yaw of each vehicle: [yaw]")
+    geodetic_origin: GeodeticOrigin | None = Field(
+        None, description="place of the origin on the Earth, for exports: [geodetic_origin]"
+    )
     disturbances: Disturbances | None = Field(
         None, description="wind, gusts, noise, mass errors, lost vehicles: [disturbances]"
     )

@@ -238,7 +238,7 @@ def _sound(collector: FindingCollector, vehicle: Vehicle, path: tuple[str, ...])
         )
     elif low >= found.hover_speed:
         problem = f"the least speed is above the speed in hover, {found.hover_speed:.4g} rad/s"
-        collector.add((*path, "rotor_speed"), problem, "reduce it")
+        collector.add((*path, "rotor_speed"), problem, "reduce it", list(found.rotor_speed))
     k_R, k_omega = found.attitude_gains
     slowest = max(found.motor_time)
     # Routh's criterion of tau s^3 + s^2 + k_omega s + k_R.
@@ -246,7 +246,8 @@ def _sound(collector: FindingCollector, vehicle: Vehicle, path: tuple[str, ...])
         problem = (
             f"is unstable with motors of {slowest:g} s: k_omega must exceed {slowest * k_R:.4g} /s"
         )
-        collector.add((*path, "attitude_gains"), problem, "raise k_omega or lower k_R")
+        remedy = "raise k_omega, lower k_R, or take quicker motors"
+        collector.add((*path, "attitude_gains"), problem, remedy, list(found.attitude_gains))
     return len(collector.findings) == before
 
 

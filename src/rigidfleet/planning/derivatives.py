@@ -25,6 +25,8 @@ _BLEND = septic_polynomial(Polynomial([0.0, 1.0])).coef
 SLOW, TRAIL = 0.5, 1.0
 #: Share of the turn towards one side, by which a vehicle that starts backwards turns round.
 _SIDE = 0.5
+#: Rotation vector that is taken as zero [rad]: at ten metres it moves a slot by no more than positions are rounded.
+_NO_TURN = 1e-14
 #: Step in which yaw "along" is integrated [s]: exact to 1e-9 rad at accelerations of some m/s^2.
 _STEP = 0.01
 
@@ -46,36 +48,53 @@ def slot_derivatives(
     times (K,) [s] of a phase's problem with control "tracking". At a knot, the piece after it counts. With fewer
     ``orders``, the last ones are left out.
     """
-    cm, axes = (x[:orders] for x in body_series(motion, time))
-    s = blend_series(time, reference.t0, reference.T_b)[:orders]
+    found = series.derivatives(slot_series(reference, body_series(motion, time), time)[:orders])
+    return found.transpose(3, 0, 2, 1)
+
+
+def slot_series(reference: Reference, body: tuple[Floats, Floats], time: Floats) -> Floats:
+    """Taylor series (5, 3, N, K) of each slot, from the `body_series` at times (K,) [s]; see `slot_derivatives`."""
+    cm, axes = body
+    s = blend_series(time, reference.t0, reference.T_b)
     if reference.turn.any():
-        axes = series.product(axes, series.rotation(s[..., None] * reference.turn), np.matmul)
-    moved = series.product(s[..., None, None], axes)
-    found = np.einsum("mkab,nb->kmna", axes, reference.p0)
+        turned = np.moveaxis(series.rotation(s[..., None] * reference.turn), 1, -1)
+        axes = series.product(axes, turned, _matrix_product)
+    found = reference.p0 @ axes
     if reference.dp.any():
-        found += np.einsum("mkab,nb->kmna", moved, reference.dp)
-    found += cm.transpose(1, 0, 2)[:, :, None]
-    return series.derivatives(found.swapaxes(0, 1)).swapaxes(0, 1)
+        found += reference.dp @ series.product(s[:, None, None], axes)
+    found += cm[:, :, None]
+    return found
+
+
+def _matrix_product(a: Floats, b: Floats) -> Floats:
+    """Products (..., 3, 3, K) of matrices (..., 3, 3, K)."""
+    return (a[..., :, :, None, :] * b[..., None, :, :, :]).sum(axis=-3)
 
 
 def body_series(motion: Motion, time: Floats) -> tuple[Floats, Floats]:
-    """Taylor series (5, K, 3) [m] of the CM and (5, K, 3, 3) of the attitude, body to world, at times (K,) [s].
+    """Taylor series (5, 3, K) [m] of the CM and (5, 3, 3, K) of the attitude, body to world, at times (K,) [s].
 
-    After the last knot, the CM and the rotation vector continue at the rates they have there.
+    After the last knot, the CM and the rotation vector continue at the rates they have there. Times are the last axis,
+    also in memory, here and in `slot_series`: arithmetic on long rows is fast.
     """
     knots = motion.knots
     inside = np.minimum(time, knots[-1])
     low = np.clip(np.searchsorted(knots, inside, side="right") - 1, 0, len(knots) - 2)
-    x = series.of_polynomials(motion.coefficients[low], inside - knots[low], ORDERS)
+    rows = motion.coefficients.transpose(2, 1, 0)[..., low]  # (P, 6, K)
+    x = series.of_polynomials(
+        rows.reshape(len(rows), -1).T, np.tile(inside - knots[low], 6), ORDERS
+    )
+    x = x.reshape(ORDERS, 6, -1)
     beyond = time > knots[-1]
-    x[0, beyond] += (time - inside)[beyond, None] * x[1, beyond]
-    x[2:, beyond] = 0.0
-    cm, phi = x[..., :3], x[..., 3:]
-    if not phi.any():  # most ways do not turn
-        axes = np.zeros((ORDERS, len(time), 3, 3))
-        axes[0] = motion.T1.T
+    x[0][:, beyond] += (time - inside)[beyond] * x[1][:, beyond]
+    x[2:, :, beyond] = 0.0
+    cm, phi = x[:, :3], x[:, 3:]
+    if np.abs(phi).max(initial=0.0) <= _NO_TURN:  # most ways do not turn, but for rounding
+        axes = np.zeros((ORDERS, 3, 3, len(time)))
+        axes[0] = motion.T1.T[..., None]
         return cm, axes
-    return cm, motion.T1.T @ series.rotation(phi)
+    turned = np.moveaxis(series.rotation(phi.swapaxes(1, 2)), 1, -1)
+    return cm, (motion.T1.T @ turned.reshape(ORDERS, 3, -1)).reshape(turned.shape)
 
 
 def blend_series(time: Floats, t0: float, T_b: float) -> Floats:
@@ -112,79 +131,102 @@ def yaw_derivatives(
     start : yaw (N,) [rad] at ``time[0]`` for "along"; by default the direction of the velocity there, or that of the
         body if a vehicle is at rest
     """
-    n, times = len(reference.p0), len(time)
+    body = body_series(motion, time)
+    slots = slot_series(reference, body, time)
+    if yaw.kind == "along":
+        return yaw_along(reference, motion, time, slots, start)[0].transpose(2, 0, 1)
+    return yaw_of(body, slots, yaw).transpose(2, 0, 1)
+
+
+def yaw_of(body: tuple[Floats, Floats], slots: Floats, yaw: Yaw) -> Floats:
+    """Yaw with two derivatives (3, N, K) of every kind but "along", see `yaw_derivatives`.
+
+    From the `body_series` and the `slot_series` at the same times.
+    """
+    n, times = slots.shape[2:]
+    found = np.zeros((3, n, times))
     if yaw.kind == "fixed":
-        found = np.zeros((times, 3, n))
-        found[:, 0] = yaw.angle
+        found[0] = yaw.angle
         return found
     if yaw.kind == "formation":
-        M = body_series(motion, time)[1][:3]
-        found = series.derivatives(
-            series.angle(M[..., 1, 0] - M[..., 0, 1], M[..., 0, 0] + M[..., 1, 1])
-        )
-        found[0] = np.unwrap(found[0])
-        return np.repeat(found.T[..., None], n, axis=2)
-    if yaw.kind == "towards":
-        r = slot_derivatives(reference, motion, time, 3).swapaxes(0, 1)
-        away = -series.from_derivatives(r)
-        away[0] += np.array(yaw.point)
-        found = series.derivatives(series.angle(away[..., 1], away[..., 0]))
-        found[0] = np.unwrap(found[0], axis=0)
-        return found.swapaxes(0, 1)
-    return _along(reference, motion, time, start)
+        M = body[1][:3]
+        turned = series.angle(M[:, 1, 0] - M[:, 0, 1], M[:, 0, 0] + M[:, 1, 1])[:, None]
+    else:
+        away = -slots[:3, :2]
+        away[0] += np.array(yaw.point)[:2, None, None]
+        turned = series.angle(away[:, 1], away[:, 0])
+    turned[0] = np.unwrap(turned[0])
+    found[:] = series.derivatives(turned)
+    return found
 
 
-def _along(reference: Reference, motion: Motion, time: Floats, start: Floats | None) -> Floats:
-    """As `yaw_derivatives` for "along": Runge-Kutta of fourth order on a fixed grid, exact rates at ``time``."""
+def yaw_along(
+    reference: Reference, motion: Motion, time: Floats, slots: Floats, start: Floats | None
+) -> tuple[Floats, tuple[float, Floats]]:
+    """Yaw with two derivatives (3, N, K) of kind "along", see `yaw_derivatives`.
+
+    By the Runge-Kutta method of fourth order on a grid from ``time[0]``; rates at ``time`` are exact. Beside it, a time
+    of the grid shortly before the end and the yaw (N,) there, to continue on the same grid.
+    """
     ends = np.append(np.arange(time[0], time[-1], _STEP), time[-1])
-    middles = 0.5 * (ends[:-1] + ends[1:])
-    at_ends, between = (
-        slot_derivatives(reference, motion, t, 4)[:, 1:, :, :2] for t in (ends, middles)
-    )
+    grid_time = np.concatenate([ends, 0.5 * (ends[:-1] + ends[1:])])
+    body = body_series(motion, grid_time)
+    on_grid = slot_series(reference, body, grid_time)
     if start is None:
-        body = yaw_derivatives(reference, motion, ends[:1], Yaw())[0, 0]
-        v = at_ends[0, 0]
-        start = np.where(np.hypot(*v.T) > SLOW, np.arctan2(v[:, 1], v[:, 0]), body)
+        v = on_grid[1, :2, :, 0]
+        from_body = yaw_of(body, on_grid, Yaw())[0, :, 0]
+        start = np.where(np.hypot(*v) > SLOW, np.arctan2(v[1], v[0]), from_body)
+    terms = np.ascontiguousarray(_steering(on_grid)[0].transpose(2, 0, 1))  # (times, 3, N)
+    between = terms[len(ends) :]
     grid = np.empty((len(ends), len(start)))
     grid[0] = start
     for k, h in enumerate(np.diff(ends)):
         y, middle = grid[k], between[k]
-        k1 = _turning(y, at_ends[k])[0]
-        k2 = _turning(y + 0.5 * h * k1, middle)[0]
-        k3 = _turning(y + 0.5 * h * k2, middle)[0]
-        k4 = _turning(y + h * k3, at_ends[k + 1])[0]
+        k1 = _turning(y, terms[k])
+        k2 = _turning(y + 0.5 * h * k1, middle)
+        k3 = _turning(y + 0.5 * h * k2, middle)
+        k4 = _turning(y + h * k3, terms[k + 1])
         grid[k + 1] = y + h / 6.0 * (k1 + 2.0 * (k2 + k3) + k4)
-    if len(time) == len(ends) and np.array_equal(time, ends):
-        angles = grid
-    else:
-        rates = np.stack([_turning(y, x)[0] for y, x in zip(grid, at_ends, strict=True)])
+    angles = grid
+    if not np.array_equal(time, ends):
+        rates = _turning(grid, terms[: len(ends)].swapaxes(0, 1))
         angles = _hermite(ends, grid, rates, time)
-    motions = slot_derivatives(reference, motion, time, 4)[:, 1:, :, :2]
-    first, second = _turning(angles, motions.swapaxes(0, 1))
-    return np.stack([angles, first, second], axis=1)
+    known = max(len(ends) - 3, 0)
+    angles = angles.T
+    now, (A_dot, B_dot, C_dot) = _steering(slots)
+    cos, sin = np.cos(angles), np.sin(angles)
+    first = _turning(angles, now)
+    second = A_dot + B_dot * cos + C_dot * sin + first * (now[2] * cos - now[1] * sin)
+    return np.stack([angles, first, second]), (float(ends[known]), grid[known])
 
 
-def _turning(yaw: Floats, x: Floats) -> tuple[Floats, Floats]:
-    """Rate and acceleration of yaw "along" at yaws (..., N), from velocity, acceleration and jerk (3, ..., N, 2)."""
-    v, a, j = x
-    cos, sin = np.cos(yaw), np.sin(yaw)
+def _steering(slots: Floats) -> tuple[Floats, Floats]:
+    """Terms A, B, C (3, N, K) of yaw' = A + B cos yaw + C sin yaw of kind "along", and their rates, from `slot_series`.
 
-    def cross(p: Floats, q: Floats) -> Floats:
-        return p[..., 0] * q[..., 1] - p[..., 1] * q[..., 0]
-
-    vv, va = (v * v).sum(axis=-1), (v * a).sum(axis=-1)
-    size, turned, speed = vv + SLOW**2, cross(v, a), np.sqrt(vv)
+    |v| - h . v becomes (|v|^2 - |v| h . v) / sqrt(|v|^2 + SLOW^2), which is smooth at rest.
+    """
+    v, a, j = series.derivatives(slots[:4, :2])[1:]
+    vv, va = (v * v).sum(axis=0), (v * a).sum(axis=0)
+    size, speed = vv + SLOW**2, np.sqrt(vv)
     root = np.sqrt(size)
-    ahead, beside = v[..., 0] * cos + v[..., 1] * sin, v[..., 1] * cos - v[..., 0] * sin
-    astern = (vv - speed * ahead) / root  # |v| - h . v, but smooth at rest
-    first = turned / size + (beside + _SIDE * astern) / TRAIL
-    ahead_dot = a[..., 0] * cos + a[..., 1] * sin + first * beside
-    beside_dot = a[..., 1] * cos - a[..., 0] * sin - first * ahead
-    speed_dot = va / np.where(speed > 0.0, speed, 1.0)
-    astern_dot = (2.0 * va - speed_dot * ahead - speed * ahead_dot - astern * va / root) / root
-    second = (cross(v, j) - 2.0 * va * turned / size) / size
-    second += (beside_dot + _SIDE * astern_dot) / TRAIL
-    return first, second
+    speed_dot, root_dot = va / np.where(speed > 0.0, speed, 1.0), va / root
+    turned = (v[0] * a[1] - v[1] * a[0]) / size
+    turned_dot = (v[0] * j[1] - v[1] * j[0] - 2.0 * va * turned) / size
+    astern, back = _SIDE / TRAIL * vv / root, _SIDE / TRAIL * speed / root
+    astern_dot = (_SIDE / TRAIL * 2.0 * va - astern * root_dot) / root
+    back_dot = (_SIDE / TRAIL * speed_dot - back * root_dot) / root
+    terms = turned + astern, v[1] / TRAIL - back * v[0], -v[0] / TRAIL - back * v[1]
+    rates = (
+        turned_dot + astern_dot,
+        a[1] / TRAIL - back_dot * v[0] - back * a[0],
+        -a[0] / TRAIL - back_dot * v[1] - back * a[1],
+    )
+    return np.stack(terms), np.stack(rates)
+
+
+def _turning(yaw: Floats, terms: Floats) -> Floats:
+    """Rate of yaw "along" [rad/s] at yaws (...) from the `_steering` terms (3, ...)."""
+    return terms[0] + terms[1] * np.cos(yaw) + terms[2] * np.sin(yaw)
 
 
 def _hermite(knots: Floats, y: Floats, rates: Floats, time: Floats) -> Floats:

@@ -13,12 +13,21 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidfleet.kernel import fleet
-from rigidfleet.kernel.problem import TRACKING, Problem
+from rigidfleet.kernel.problem import TRACKING, Motion, Problem, Reference
 from rigidfleet.math import series
 from rigidfleet.math.quadrotor import ROTORS
 from rigidfleet.mission import Mission
 from rigidfleet.mission.vehicles import VehicleModel
-from rigidfleet.planning.derivatives import Yaw, blend_series, slot_derivatives, yaw_derivatives
+from rigidfleet.planning.derivatives import (
+    Yaw,
+    blend_series,
+    body_series,
+    slot_derivatives,
+    slot_series,
+    yaw_along,
+    yaw_derivatives,
+    yaw_of,
+)
 from rigidfleet.planning.disturbances import disturbance
 from rigidfleet.typing import Floats, Ints
 
@@ -124,13 +133,14 @@ class TickTables:
         self.rate = mission.autopilot.rate
         self.noise = None if d is None else d.noise
         self.links = None if d is None else d.links
-        yaw = mission.yaw
-        self.yaw = Yaw(yaw.kind, math.radians(yaw.yaw_deg), yaw.point or (0.0, 0.0, 0.0))
+        self.yaw = asked_yaw(mission)
         self.linear_drag = np.array([model.linear_drag for model in mission.vehicle_models or ()])
         self.compensated = mission.autopilot.delay_compensation
         #: What states were last measured about: the problem of the path, or a point to stay at.
         self._source: Problem | None = None
         self._anchor = np.zeros((self.n, 6))
+        #: Where the yaw "along" of a turn is known from, to continue from table to table: time [s], yaw (N,).
+        self._known: tuple[Turn, float, Floats] | None = None
 
     def start_path(self, problem: Problem, tick: int) -> Floats:
         """Begin to measure states about another path; return what to add (N, 6) to states measured before.
@@ -155,13 +165,13 @@ class TickTables:
         """Tables for ticks from ``first`` to before ``last``; ``turn`` is that of the phase."""
         sensing = self.flight.sensing
         time = np.arange(first, last) / self.rate
-        yaw, found = _references(problem, time, self.yaw, turn)
+        yaw, found = self._references(problem, time, turn)
         jerk, snap = self._force_rates(found)
         path = np.zeros((0, self.n, 6))
         if self.compensated:
             path = np.tile(self._anchor, (len(time), 1, 1))
             if len(found):
-                path = np.ascontiguousarray(np.concatenate([found[:, 0], found[:, 1]], axis=2))
+                path = _by_tick(found[:2].reshape(6, self.n, -1))
         noise_r = noise_v = np.zeros((0, self.n, 3))
         dropped = np.zeros((0, self.n), dtype=np.bool_)
         unheard = np.zeros((0, self.n, self.n), dtype=np.bool_)
@@ -179,25 +189,64 @@ class TickTables:
             unheard = _drawn(_UNHEARD, self.links.seed, rows, (self.n, self.n)) < self.links.dropped
         return fleet.Tables(first, last, path, yaw, jerk, snap, noise_r, noise_v, dropped, unheard)
 
+    def yaw_at(self, problem: Problem, t: float, turn: Turn) -> Floats:
+        """Yaw (N,) [rad] asked of each vehicle at a time [s] of a phase."""
+        if t <= turn.begun:
+            return turn.start
+        return self._references(problem, np.array([t]), turn)[0][0, :, 0]
+
+    def _references(self, problem: Problem, time: Floats, turn: Turn) -> tuple[Floats, Floats]:
+        """Yaw with two derivatives (K, N, 3) of each vehicle at times (K,) [s], and derivatives (5, 3, N, K) of slots.
+
+        A vehicle turns with the formation, or from its yaw at the start of the phase into the one asked for.
+        """
+        if problem.control.kind != TRACKING or not len(time):
+            still = np.zeros((len(time), self.n, 3))
+            still[..., 0] = turn.start
+            return still, np.zeros((0, 3, self.n, len(time)))
+        reference, motion = problem.reference, problem.motion
+        since, start = turn.begun, turn.start
+        if self._known is not None and self._known[0] is turn and self._known[1] < time[0]:
+            _, since, start = self._known
+        whole = np.concatenate([[since], time])
+        slots, turned, known = slots_and_yaw(
+            reference, motion, whole, self.yaw, turn._replace(start=start)
+        )
+        if known is not None:
+            self._known = turn, *known
+        return _by_tick(turned[..., 1:]), series.derivatives(slots[..., 1:])
+
     def _force_rates(self, x: Floats) -> tuple[Floats, Floats]:
-        """Two derivatives (K, N, 3) of the desired force per mass, from those of the reference, (K, 5, N, 3).
+        """Two derivatives (K, N, 3) of the desired force per mass, from those of the reference, (5, 3, N, K).
 
         Drag that is fed forward changes the force with the velocity; near level flight body axes are the world's.
         """
         if not len(x):
-            return x[:, 0], x[:, 0]
-        v, a, j, s = (x[:, k] for k in (1, 2, 3, 4))
+            return np.zeros((0, self.n, 3)), np.zeros((0, self.n, 3))
+        _, v, a, j, s = x
         vehicles = self.flight.vehicles
-        share = (self.flight.guidance.drag / vehicles.m)[:, None]
-        D, c = share * self.linear_drag, share * vehicles.c
+        share = self.flight.guidance.drag / vehicles.m
+        D, c = (share[:, None] * drag.T[..., None] for drag in (self.linear_drag, vehicles.c))
         jerk, snap = j + D * a, s + D * j
         if c.any():
-            speed = np.sqrt((v * v).sum(axis=2, keepdims=True) + _STILL**2)
-            faster = (v * a).sum(axis=2, keepdims=True) / speed
-            curve = ((a * a + v * j).sum(axis=2, keepdims=True) - faster**2) / speed
+            speed = np.sqrt((v * v).sum(axis=0) + _STILL**2)
+            faster = (v * a).sum(axis=0) / speed
+            curve = ((a * a + v * j).sum(axis=0) - faster**2) / speed
             jerk += c * (speed * a + faster * v)
             snap += c * (speed * j + 2.0 * faster * a + curve * v)
-        return np.ascontiguousarray(jerk), np.ascontiguousarray(snap)
+        return _by_tick(jerk), _by_tick(snap)
+
+
+def asked_yaw(mission: Mission) -> Yaw:
+    """The yaw that a mission asks of its vehicles."""
+    yaw = mission.yaw
+    return Yaw(yaw.kind, math.radians(yaw.yaw_deg), yaw.point or (0.0, 0.0, 0.0))
+
+
+def first_yaw(mission: Mission) -> Floats:
+    """Yaw (N,) [rad] with which vehicles start."""
+    frame = mission.body_frame
+    return np.full(mission.n_agents, 0.0 if frame is None else math.radians(frame.yaw_deg))
 
 
 class Turn(NamedTuple):
@@ -210,45 +259,46 @@ class Turn(NamedTuple):
 
 def turn_from(problem: Problem, t: float, yaw: Yaw, start: Floats) -> Turn:
     """The turn of vehicles with yaws ``start`` (N,) [rad] at a time [s] of a problem, at which its motion begins."""
-    if problem.control.kind != TRACKING or yaw.kind == "along":
+    if problem.control.kind != TRACKING:
         return Turn(t, start, np.zeros(len(start)))
-    off = start - yaw_derivatives(problem.reference, problem.motion, np.array([t]), yaw)[0, 0]
+    return turn_along(problem.reference, problem.motion, t, yaw, start)
+
+
+def turn_along(reference: Reference, motion: Motion, t: float, yaw: Yaw, start: Floats) -> Turn:
+    """`turn_from` while slots are tracked."""
+    if yaw.kind == "along":
+        return Turn(t, start, np.zeros(len(start)))
+    off = start - yaw_derivatives(reference, motion, np.array([t]), yaw)[0, 0]
     if yaw.kind != "formation":
         off = (off + np.pi) % (2.0 * np.pi) - np.pi
     return Turn(t, start, off)
 
 
-def yaw_at(problem: Problem, t: float, yaw: Yaw, turn: Turn) -> Floats:
-    """Yaw (N,) [rad] asked of each vehicle at a time [s] of a phase."""
-    if t <= turn.begun:
-        return turn.start
-    return _references(problem, np.array([t]), yaw, turn)[0][0, :, 0]
+def slots_and_yaw(
+    reference: Reference, motion: Motion, time: Floats, yaw: Yaw, turn: Turn
+) -> tuple[Floats, Floats, tuple[float, Floats] | None]:
+    """Series of the slots (5, 3, N, K), and the yaw with two derivatives (3, N, K) that is asked of the vehicles.
 
-
-def _references(problem: Problem, time: Floats, yaw: Yaw, turn: Turn) -> tuple[Floats, Floats]:
-    """Yaw with two derivatives (K, N, 3) of each vehicle at times (K,) [s], and its reference (K, 5, N, 3).
-
-    A vehicle turns with the formation, or from its yaw at the start of the phase into the one asked for.
+    Yaw "along" continues from ``turn.start`` at ``time[0]``; it is known at the time returned beside (see `yaw_along`).
     """
-    n = len(turn.start)
-    if problem.control.kind != TRACKING or not len(time):
-        still = np.zeros((len(time), n, 3))
-        still[..., 0] = turn.start
-        return still, np.zeros((0, 5, n, 3))
-    reference, motion = problem.reference, problem.motion
-    found = slot_derivatives(reference, motion, time)
-    whole = np.concatenate([[turn.begun], time])
-    turned = yaw_derivatives(
-        reference, motion, whole, yaw, turn.start if yaw.kind == "along" else None
-    )
-    turned = turned[1:].swapaxes(1, 2).copy()
+    body = body_series(motion, time)
+    slots = slot_series(reference, body, time)
+    if yaw.kind == "along":
+        return slots, *yaw_along(reference, motion, time, slots, turn.start)
+    turned = yaw_of(body, slots, yaw)
+    turned[0] += turn.off[:, None]
     if yaw.kind != "formation":
-        rest = -series.derivatives(blend_series(time, turn.begun, _TURN_TIME)[:3])
-        rest[0] += 1.0
-        turned += rest.T[:, None, :] * turn.off[:, None]
-    else:
-        turned[..., 0] += turn.off
-    return np.ascontiguousarray(turned), found
+        done = series.derivatives(blend_series(time, turn.begun, _TURN_TIME)[:3])
+        turned -= done[:, None] * turn.off[:, None]
+    return slots, turned, None
+
+
+def _by_tick(x: Floats) -> Floats:
+    """A table (K, N, Q) of values (Q, N, K)."""
+    found = np.empty(x.shape[::-1])
+    for q, values in enumerate(x):  # faster than a copy of the transposed array
+        found[..., q] = values.T
+    return found
 
 
 def _rows(first: int, last: int, every: int) -> Ints:

@@ -197,11 +197,14 @@ class VehicleCheck:
     tilt : maximum tilt [deg], its time [s], the agent and the phase
     jump : maximum jump of the acceleration [m/s^2], of the tilt there [deg], its time [s] and the phase that begins
         there; None if there is no switch between phases that track slots
+    beyond : greatest share of a phase in which a vehicle cannot give what the plan asks, for its rotors or its limit of
+        tilt; the agent, the phase, and in words what is needed; None if there is none
     """
 
     rotor_force: tuple[float, float, str, float, str]
     tilt: tuple[float, float, str, str]
     jump: tuple[float, float, float, str] | None
+    beyond: tuple[float, str, str, str] | None = None
 
     def describe(self) -> Iterator[tuple[str, str]]:
         """Facts with their headings."""
@@ -219,6 +222,7 @@ class VehicleCheck:
             ),
             "tilt": _named(("tilt_deg", "time_s", "who", "phase"), self.tilt),
             "jump": _named(("acceleration_m_s2", "tilt_deg", "time_s", "phase"), self.jump),
+            "beyond": _named(("share", "who", "phase", "needs"), self.beyond),
         }
 
 

@@ -176,6 +176,8 @@ def disturbance_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
             most = float(need[k, i]), float(planned.time[k]), f"agent {i + 1}", float(limits[i])
     steady = drag[:, None] * wind - ((true - believed) * g)[:, None] * up
     off = np.linalg.norm(steady, axis=1) / (k1 * believed)
+    if mission.tracking.integral:
+        off[:] = 0.0  # in the end
     far = int(off.argmax())
     lost = tuple((lost.agent - 1, lost.time) for lost in d.lost)
     found.disturbed = Disturbed(
@@ -189,6 +191,7 @@ def disturbance_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
         text = (
             f"steady disturbances hold agent {far + 1} {off[far]:.2f} m off its slot, because tracking has no integral;"
             f" a larger first weight in tracking.Q reduces the offset (now {mission.tracking.Q[0]:g})"
+            + ("" if mission.vehicle_models is None else ", and tracking.integral removes it")
         )
         yield Remark("note", "disturbances", text)
     if lost:

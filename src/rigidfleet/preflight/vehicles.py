@@ -4,17 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
+from rigidfleet._common.text import percent
 from rigidfleet.kernel.fleet import jet_speed
+from rigidfleet.math import series
 from rigidfleet.math.margins import Lag
 from rigidfleet.math.quadrotor import Flat, flat, mixing
 from rigidfleet.mission import Mission
 from rigidfleet.mission.vehicles import VehicleModel
-from rigidfleet.planning.derivatives import Yaw, slot_derivatives, yaw_derivatives
+from rigidfleet.planning.derivatives import slot_derivatives
 from rigidfleet.planning.preview import PlannedPhase
-from rigidfleet.planning.vehicles import DENSITY
+from rigidfleet.planning.vehicles import (
+    DENSITY,
+    asked_yaw,
+    first_yaw,
+    slots_and_yaw,
+    turn_along,
+)
 from rigidfleet.preflight.findings import Preflight, Remark, VehicleCheck
 from rigidfleet.typing import Floats
 
@@ -56,37 +65,60 @@ def check_vehicles(mission: Mission, way: Sequence[PlannedPhase]) -> VehicleChec
     """What the planned paths ask of rotors; None of points, and where no slots are tracked.
 
     Rotor forces follow from the reference by differential flatness (`rigidfleet.math.quadrotor`), with the drag of the
-    vehicle near hover, in still air.
+    vehicle near hover, in still air, and with the yaw that the mission asks for.
     """
     models = mission.vehicle_models
     tracked = [planned for planned in way if planned.leg.phase.control == "tracking"]
     if models is None or not tracked or all(model.point for model in models):
         return None
-    force, tilt = None, (0.0, 0.0, "", "")
+    asked, angle, found = asked_yaw(mission), first_yaw(mission), []
     for planned in tracked:
         leg, n = planned.leg, mission.n_agents
         count = min(max(_SAMPLES, int((leg.end - leg.begin) / _STEP) + 1), _MOST)
         time = np.linspace(leg.begin, leg.end, max(11, min(count, _PLACES // n)))
-        x = slot_derivatives(leg.reference, leg.motion, time)
-        yaw = yaw_derivatives(leg.reference, leg.motion, time, Yaw())
+        turn = turn_along(leg.reference, leg.motion, leg.begin, asked, angle)
+        slots, turned, _ = slots_and_yaw(leg.reference, leg.motion, time, asked, turn)
+        angle, yaw = turned[0, :, -1], turned.transpose(2, 0, 1)
+        x = series.derivatives(slots).transpose(3, 0, 2, 1)
         for i, model in enumerate(models):
-            if model.point:
-                continue
-            need = _needed(model, x[:, :, i], yaw[:, :, i], mission.gravity)
-            rotor = need.rotor_forces(
-                np.array(model.inertia),
-                mixing(model.arm, model.torque_coefficient / model.thrust_coefficient),
-            )
-            k, j = (int(a) for a in np.unravel_index(int(rotor.argmax()), rotor.shape))
-            share = float(rotor[k, j]) / model.rotor_limit
-            if force is None or share > force[0] / force[3]:
-                force = float(rotor[k, j]), float(time[k]), i, model.rotor_limit, planned.phase
-            k = int(need.tilt.argmax())
-            if (angle := float(np.degrees(need.tilt[k]))) > tilt[0]:
-                tilt = angle, float(time[k]), f"agent {i + 1}", planned.phase
-    assert force is not None
-    value, t, i, limit, phase = force
-    return VehicleCheck((value, t, f"agent {i + 1}", limit, phase), tilt, _jump(mission, tracked))
+            if not model.point:
+                need = _needed(model, x[:, :, i], yaw[:, :, i], mission.gravity)
+                found.append(_asked(model, need, time, f"agent {i + 1}", planned.phase))
+    force = max((asks.force for asks in found), key=lambda force: force[0] / force[3])
+    tilt = max((asks.tilt for asks in found), key=lambda tilt: tilt[0])
+    beyond = max((asks.beyond for asks in found), key=lambda beyond: beyond[0])
+    return VehicleCheck(force, tilt, _jump(mission, tracked), beyond if beyond[0] > 0.0 else None)
+
+
+class _Asks(NamedTuple):
+    """What a phase asks of one vehicle, as in `VehicleCheck`."""
+
+    force: tuple[float, float, str, float, str]
+    tilt: tuple[float, float, str, str]
+    beyond: tuple[float, str, str, str]
+
+
+def _asked(model: VehicleModel, need: Flat, time: Floats, who: str, phase: str) -> _Asks:
+    rotor = need.rotor_forces(
+        np.array(model.inertia),
+        mixing(model.arm, model.torque_coefficient / model.thrust_coefficient),
+    )
+    tilt = np.degrees(need.tilt)
+    least, most = (model.thrust_coefficient * speed**2 for speed in model.rotor_speed)
+    k, j = int(rotor.max(axis=1).argmax()), int(tilt.argmax())
+    weak = ((rotor < least) | (rotor > most)).any(axis=1)
+    limit = model.tilt_limit_deg
+    aslant = (tilt > limit) & (limit < 90.0)  # the control knows no limit from there on
+    needs = (
+        f"{tilt[j]:.1f} deg of tilt (limit {limit:g} deg)"
+        if aslant.sum() > weak.sum()
+        else f"rotor forces of {rotor.min():.3g} to {rotor.max():.3g} N (rotors give {least:.3g} to {most:.3g} N)"
+    )
+    return _Asks(
+        (float(rotor[k].max()), float(time[k]), who, most, phase),
+        (float(tilt[j]), float(time[j]), who, phase),
+        (float((weak | aslant).mean()), who, phase, needs),
+    )
 
 
 def _needed(model: VehicleModel, x: Floats, yaw: Floats, g: float) -> Flat:
@@ -123,14 +155,15 @@ def vehicle_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     """Remarks on rotors that the plan asks too much of, on jumps, and on vehicles in the jets of others."""
     if found.vehicles is None:
         return
-    force, t, who, limit, phase = found.vehicles.rotor_force
     exact = {planned.phase for planned in found.planned_phases if planned.exact}
-    if force > limit:
+    if found.vehicles.beyond is not None:
+        share, who, phase, need = found.vehicles.beyond
+        fails = share > mission.limits.saturation and phase in exact
         text = (
-            f"a rotor of {who} needs {force:.3g} N at {t:.2f} s in '{phase}' (limit {limit:.3g} N);"
-            " give the phase more time, or the vehicle less mass"
+            f"{who} cannot give what the plan asks of it for {percent(share)} of phase '{phase}', which needs {need};"
+            " give the phase more time, the vehicle less mass, or another yaw"
         )
-        yield Remark("fails" if phase in exact else "note", "rotors", text)
+        yield Remark("fails" if fails else "note", "rotors", text)
     jump = found.vehicles.jump
     if jump is not None and jump[0] > _JUMP:
         text = (

@@ -26,6 +26,7 @@ from rigidfleet.simulation.callbacks import (
     Observation,
     called,
     checked_force,
+    named,
 )
 from rigidfleet.simulation.diagnosis import Place, diagnose
 from rigidfleet.simulation.extremes import Extremes
@@ -155,7 +156,7 @@ class ActivePhase:
     def _commanded(self, given: Command) -> Problem:
         """The problem under a command of vehicles, which point masses do not take."""
         raise FlightError(
-            f"the controller returned a {type(given).__name__} at t = {self.t:.3f} s, which point masses do not"
+            f"the controller returned {named(given)} at t = {self.t:.3f} s, which point masses do not"
             " take; return forces [N], or give the agents a vehicle"
         )
 

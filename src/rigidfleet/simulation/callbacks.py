@@ -77,6 +77,11 @@ def called(who: str, t: float, function: Callable[..., Any], *arguments: object)
         raise FlightError(words) from error
 
 
+def named(given: Command) -> str:
+    """What a controller returned, with its article."""
+    return f"{'an' if isinstance(given, AttitudeCommand) else 'a'} {type(given).__name__}"
+
+
 def checked_command(given: Command, n: int, t: float) -> dict[str, Floats]:
     """Arrays of a command, by their names; an error says which one is wrong."""
     rows = {"thrust": (n,), "attitude": (n, 4), "rates": (n, 3), "speed": (n, 4)}
@@ -88,7 +93,7 @@ def checked_command(given: Command, n: int, t: float) -> dict[str, Floats]:
             array = np.full((), np.nan)
         if array.shape != rows[name] or not np.isfinite(array).all():
             raise FlightError(
-                f"the controller returned a {type(given).__name__} at t = {t:.3f} s whose {name} is not an array"
+                f"the controller returned {named(given)} at t = {t:.3f} s whose {name} is not an array"
                 f" {rows[name]} of finite numbers"
             )
         found[name] = np.ascontiguousarray(array)

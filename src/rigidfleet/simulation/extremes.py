@@ -20,7 +20,7 @@ from rigidfleet.math import proximity
 from rigidfleet.mission import Mission
 from rigidfleet.result import PAD, Extremum, PhaseRecord
 from rigidfleet.solids.records import joined
-from rigidfleet.typing import Bools, Floats
+from rigidfleet.typing import Bools, Floats, Ints
 
 #: Greatest number of agents of which all pairs are monitored.
 _FEW = 40
@@ -163,19 +163,22 @@ class Extremes:
         )
 
     def take_vehicles(
-        self, state: fleet.SampledState, vehicles: fleet.Quadrotors, lost: Bools, ticks: int
+        self,
+        state: fleet.SampledState,
+        vehicles: fleet.Quadrotors,
+        gone: Bools,
+        lost: Bools,
+        ticks: int,
     ) -> None:
-        """Take the extremes that a sampled flight keeps by itself, of a phase of some ticks so far."""
-        rotors = ~(vehicles.point | lost)
+        """Take the extremes that a sampled flight keeps by itself, of a phase of some ticks so far.
+
+        Vehicles ``gone`` (N,) were lost before the phase; those that are ``lost`` (N,) in it count up to then.
+        """
+        rotors, left = ~(vehicles.point | gone), np.flatnonzero(~gone)
         for k, kind, sign in _SAMPLED:
-            for i in np.flatnonzero(~lost):
-                self._take(
-                    kind, sign * float(state.worst[i, k]), float(state.worst_time[i, k]), int(i)
-                )
-        for i in np.flatnonzero(~lost):
-            load = float(state.worst[i, fleet.LOAD])
-            margin, when = float(vehicles.limit[i]) - load, float(state.worst_time[i, fleet.LOAD])
-            self._take(records.THRUST_MARGIN, margin, when, int(i))
+            self._take_first(kind, sign * state.worst[left, k], state.worst_time[left, k], left)
+        load, when = (x[left, fleet.LOAD] for x in (state.worst, state.worst_time))
+        self._take_first(records.THRUST_MARGIN, vehicles.limit[left] - load, when, left)
         found: dict[str, Extremum] = {}
         if rotors.any():
             peak = np.where(rotors[:, None], state.peak, -1.0)
@@ -186,7 +189,7 @@ class Extremes:
             i = int(upright.argmin())
             angle = math.acos(min(max(float(upright[i]), -1.0), 1.0))
             found["tilt"] = Extremum(angle, float(state.worst_time[i, fleet.UPRIGHT]), i, -1)
-        error = np.where(lost, -1.0, state.worst[:, fleet.ERROR])
+        error = np.where(gone, -1.0, state.worst[:, fleet.ERROR])
         i = int(error.argmax())
         if error[i] > 0.0:
             found["tracking_error"] = Extremum(
@@ -197,9 +200,11 @@ class Extremes:
         found["saturation"] = Extremum(float(share[i]), float(state.clock[0]), i, -1)
         self.of_vehicles = found
 
-    def _take(self, kind: int, value: float, t: float, who: int) -> None:
-        if value < self.worst[kind]:
-            self.worst[kind], self.when[kind], self.who[kind] = value, t, (who, -1)
+    def _take_first(self, kind: int, values: Floats, times: Floats, who: Ints) -> None:
+        """Take the least of the agents' values into account; of equal ones, the first in time."""
+        if len(who) and (value := float(values.min())) < self.worst[kind]:
+            i = int(np.where(values == value, times, np.inf).argmin())
+            self.worst[kind], self.when[kind], self.who[kind] = value, times[i], (who[i], -1)
 
     def so_far(self) -> dict[str, Extremum]:
         """Extremes of the phase under way, by name."""

@@ -18,7 +18,7 @@ from rigidfleet.kernel.records import Record
 from rigidfleet.math import attitude as att
 from rigidfleet.mission import Mission
 from rigidfleet.planning.reference import ByEdge
-from rigidfleet.planning.vehicles import TickTables, sampled_flight, turn_from, yaw_at
+from rigidfleet.planning.vehicles import TickTables, first_yaw, sampled_flight, turn_from
 from rigidfleet.simulation.active_phase import ActivePhase
 from rigidfleet.simulation.callbacks import (
     AttitudeCommand,
@@ -26,6 +26,7 @@ from rigidfleet.simulation.callbacks import (
     Controller,
     Observation,
     checked_command,
+    named,
 )
 from rigidfleet.simulation.diagnosis import diagnose
 from rigidfleet.simulation.recording import Piece, VehicleSamples
@@ -42,9 +43,9 @@ class Vehicles:
     def __init__(self, mission: Mission) -> None:
         self.flight = sampled_flight(mission)
         self.tables = TickTables(mission, self.flight)
-        yaw = 0.0 if mission.body_frame is None else math.radians(mission.body_frame.yaw_deg)
         start = mission.fleet
-        self.yaw = np.full(mission.n_agents, yaw)  # asked of each vehicle at the last switch
+        self.yaw = first_yaw(mission)  # asked of each vehicle at the last switch
+        yaw = float(self.yaw[0])
         self.S = fleet.hovering(self.flight.vehicles, start.position, start.velocity, yaw)
         self.state: fleet.SampledState | None = None  # of the phase before
         self.edges = np.zeros((0, 2), dtype=np.int64)  # of that state
@@ -61,6 +62,8 @@ class SampledPhase(ActivePhase):
         self.vehicles, self.flight = vehicles, vehicles.flight
         self.tabled: Problem | None = None  # the plan's problem for which the tables are
         self.led = False  # whether the reference is given piece by piece
+        self.unjudged = False  # whether steps were flown since the extremes of vehicles were taken
+        self.first_tick: int | None = None
         super().__init__(*arguments, **options)
         yaw = vehicles.tables.yaw
         self.turn = turn_from(self.plan.problem, self.plan.start, yaw, vehicles.yaw)
@@ -83,7 +86,7 @@ class SampledPhase(ActivePhase):
         begun = fleet.begin(self.flight, given.S, self.workspace, frame=frame)
         if before is None:
             begun.integral[:] = integral
-        else:  # extremes are those of the phase
+        else:
             renewed = fleet.renewed(before, self.workspace, integral, frame=frame)
             if self.parted.any():  # without a link, vehicles do not come to the same integrals
                 own = [
@@ -91,12 +94,16 @@ class SampledPhase(ActivePhase):
                     for x in before.integral
                 ]
                 renewed.integral[:] = own
-            kept = ("peak", "peak_time", "worst", "worst_time", "saturations")
-            begun = renewed._replace(**{name: getattr(begun, name) for name in kept})
-        begun.peak_time[:] = begun.worst_time[:] = t
+            if self.first_tick is None:  # extremes are those of the phase, also after a loss in it
+                fresh = ("peak", "peak_time", "worst", "worst_time", "saturations")
+                renewed = renewed._replace(**{name: getattr(begun, name) for name in fresh})
+            begun = renewed
         self.sampled = given.state = begun._replace(trail=trail._replace(gauge=trail.gauge[:, :0]))
         given.edges = plan.edges
-        self.first_tick = int(self.sampled.count[fleet.TICKS])
+        if self.first_tick is None:
+            self.first_tick = int(begun.count[fleet.TICKS])
+            self.gone = self.lost.copy()  # (N,) vehicles that do not fly in this phase
+            begun.peak_time[:] = begun.worst_time[:] = t
         self.tabled = None
 
     # -- flying -----------------------------------------------------------------------------------
@@ -105,7 +112,7 @@ class SampledPhase(ActivePhase):
         """Continue with another problem; vehicles that turn along their way do so from the yaw they have now."""
         yaw = self.vehicles.tables.yaw
         if yaw.kind == "along":
-            now = yaw_at(self.plan.problem, self.t, yaw, self.turn)
+            now = self.vehicles.tables.yaw_at(self.plan.problem, self.t, self.turn)
             self.turn = turn_from(problem, self.t, yaw, now)
         self.led = True
         super().lead(problem)
@@ -132,7 +139,7 @@ class SampledPhase(ActivePhase):
         arrays = checked_command(given, len(self.lost), self.t)
         if self.flight.vehicles.point.any():
             raise FlightError(
-                f"the controller returned a {type(given).__name__} at t = {self.t:.3f} s, but some agents are points;"
+                f"the controller returned {named(given)} at t = {self.t:.3f} s, but some agents are points;"
                 " return forces [N]"
             )
         if isinstance(given, AttitudeCommand):
@@ -144,14 +151,19 @@ class SampledPhase(ActivePhase):
 
     def watch(self, *, last: bool) -> None:
         """Search the steps flown for extremes."""
-        rows = int(self.sampled.count[fleet.TRAILED])
-        if not rows or self.flown is None:
-            return
-        self.state.count[4] = rows
-        self.extremes.take_path(self.flown, self.workspace, self.state)
-        self.sampled.count[fleet.TRAILED] = self.state.count[4] = 0
-        ticks = int(self.sampled.count[fleet.TICKS]) - self.first_tick
-        self.extremes.take_vehicles(self.sampled, self.flight.vehicles, self.lost, ticks)
+        if rows := int(self.sampled.count[fleet.TRAILED]):
+            assert self.flown is not None
+            self.state.count[4] = rows
+            self.extremes.take_path(self.flown, self.workspace, self.state)
+            self.sampled.count[fleet.TRAILED] = self.state.count[4] = 0
+            self.unjudged = True
+        if last and self.unjudged:  # the rest is kept by the flight itself
+            assert self.first_tick is not None  # it has begun
+            ticks = int(self.sampled.count[fleet.TICKS]) - self.first_tick
+            self.extremes.take_vehicles(
+                self.sampled, self.flight.vehicles, self.gone, self.lost, ticks
+            )
+            self.unjudged = False
 
     def _segment(self, problem: Problem, t_end: float) -> None:
         """Fly to ``t_end`` [s] and record the samples on the way."""
@@ -224,7 +236,7 @@ class SampledPhase(ActivePhase):
 
     def end(self) -> Any:
         """End the phase; the vehicles keep their states."""
-        self.vehicles.yaw = yaw_at(self.plan.problem, self.t, self.vehicles.tables.yaw, self.turn)
+        self.vehicles.yaw = self.vehicles.tables.yaw_at(self.plan.problem, self.t, self.turn)
         self.vehicles.S, self.vehicles.state = self.sampled.S, self.sampled
         return super().end()
 

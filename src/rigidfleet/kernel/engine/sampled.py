@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import threading
+from typing import Any
+
 import numpy as np
 
 from rigidfleet.kernel.engine import native
-from rigidfleet.kernel.engine.packing import UNRECORDED, pack, packed
+from rigidfleet.kernel.engine.packing import UNRECORDED, Packed, pack, packed
 from rigidfleet.kernel.fleet import ENDLESS, Evaluation, Flight, SampledSegment, SampledState
 from rigidfleet.kernel.problem import Problem, Workspace
 from rigidfleet.kernel.records import Segment
@@ -25,19 +28,44 @@ def fly_ticks(
     caller sets to 0 for a new segment. The problem must be in the inertial formulation, and without disturbances: the
     flight brings its own.
     """
-    code, work = native.sampled(), state.work
+    given = problem, workspace, flight, state, segment
+    if not _last.given or any(a is not b for a, b in zip(given, _last.given, strict=True)):
+        _last.packed, _last.given = _packed(*given), given
+    return native.sampled().fly_ticks(*(a.address for a in _last.packed[:5]))
+
+
+class _Last(threading.local):
+    """The arguments of a thread's last call, checked and packed: a flight pauses and goes on with the same ones."""
+
+    def __init__(self) -> None:
+        self.given: tuple[Any, ...] = ()
+        self.packed: tuple[Packed, ...] = ()
+
+
+_last = _Last()
+
+
+def _packed(
+    problem: Problem,
+    workspace: Workspace,
+    flight: Flight,
+    state: SampledState,
+    segment: SampledSegment,
+) -> tuple[Packed, ...]:
+    """The arguments of the machine code, and what they point to."""
+    work = state.work
     _check(flight, state, workspace)
     if problem.body_formulation or problem.disturbance.active:
         raise ValueError(
             "a sampled flight takes a problem in the inertial formulation without disturbances; its Flight has its own"
         )
     law = pack(Segment(0.0, False, 0, work.law_time, work.law_state, work.law_rate))
-    recorded = pack(UNRECORDED)
-    call = pack(
-        segment._replace(recorder=code.recorder, segment=law.address, record=recorded.address)
+    recorded = packed(UNRECORDED)
+    call = segment._replace(
+        recorder=native.sampled().recorder, segment=law.address, record=recorded.address
     )
-    arguments = packed(problem), packed(workspace), packed(flight), packed(state), call
-    return code.fly_ticks(*(a.address for a in arguments))
+    states = packed(problem), packed(workspace), packed(flight), packed(state)
+    return *states, pack(call), law, recorded
 
 
 def _check(flight: Flight, state: SampledState, workspace: Workspace) -> None:

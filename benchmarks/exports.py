@@ -1,0 +1,68 @@
+"""How far each export of three flights is from what was exported, as the exports say themselves.
+
+make exports                                           fly, export, and write the table of docs/export.md
+python benchmarks/exports.py --only cube-passage-quadrotors
+"""
+
+import argparse
+import math
+import re
+import tempfile
+from pathlib import Path
+
+import rigidfleet as rf
+from rigidfleet.errors import ResultError
+from rigidfleet.interchange import FORMATS, brief, export
+
+FLIGHTS = ("passage-quadrotors", "cube-passage-quadrotors", "show-1000")
+#: Any place: plans need one.
+ORIGIN = {"latitude_deg": 47.3977, "longitude_deg": 8.5456, "altitude": 488.0}
+
+
+def row(result: rf.Result, name: str, folder: Path, flown: bool) -> str:
+    """Deviation [mm] and [deg] and kilobytes of an export, or why there is none."""
+    path = folder / (f"{name}.csv" if name == "setpoints" else name)
+    try:
+        made = export(result, path, name, flown=flown)  # ty: ignore[invalid-argument-type]
+    except ResultError as error:
+        found = re.search(r"is ([\d.]+ m) from|needs (\d+ \w+) of|needs (\d+ bytes)", str(error))
+        return f"refused: {next(x for x in found.groups() if x) if found else error}"
+    degrees = math.degrees(made.yaw_deviation)
+    turned = "" if math.isnan(degrees) else f"{brief(degrees)} deg, "
+    return f"{brief(1e3 * made.deviation)} mm, {turned}{made.size / 1e3:,.0f} kB"
+
+
+def main() -> None:
+    """Fly, export and print; or write the table into a page."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", maxsplit=1)[0])
+    parser.add_argument("--only", action="append", choices=FLIGHTS, help="only this flight")
+    parser.add_argument("--flown", action="store_true", help="the motion flown, not the reference")
+    parser.add_argument("--write", type=Path, help="put the table into a page (docs/export.md)")
+    asked = parser.parse_args()
+    flights = asked.only or FLIGHTS
+    columns = []
+    for flight in flights:
+        tables = rf.load_mission(flight).to_dict() | {"geodetic_origin": ORIGIN}
+        result = rf.simulate(rf.Mission.from_dict(tables))
+        with tempfile.TemporaryDirectory() as folder:
+            columns.append([row(result, name, Path(folder), asked.flown) for name in FORMATS])
+    head = f"| format | {' | '.join(f'`{flight}`' for flight in flights)} |\n|{' --- |' * (len(flights) + 1)}"
+    rows = [
+        f"| `{name}` | {' | '.join(cells)} |"
+        for name, *cells in zip(FORMATS, *columns, strict=True)
+    ]
+    table = "\n".join([head, *rows])
+    print(table)
+    if asked.write:
+        page = asked.write.read_text(encoding="utf-8")
+        page = re.sub(
+            r"<!-- exports -->\n.*?<!-- end -->",
+            lambda _: f"<!-- exports -->\n{table}\n<!-- end -->",
+            page,
+            flags=re.DOTALL,
+        )
+        asked.write.write_text(page, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,67 @@
+"""Flights for other programs: `export`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from cyclopts import Parameter
+
+from rigidfleet.cli import console
+from rigidfleet.cli.codes import PASSED
+from rigidfleet.cli.outputs import taken
+from rigidfleet.errors import RigidfleetError
+
+#: Names of `rigidfleet.interchange.FORMATS`, whose module loads slowly.
+Name = Literal[
+    "setpoints", "polynomial", "poly4d", "compressed", "skyc", "mcap", "tlog", "plan", "rrd", "gltf"
+]
+
+
+def export(
+    result: Path,
+    /,
+    *,
+    format: Annotated[Name, Parameter(show_choices=False)],
+    out: Path | None = None,
+    rate: float | None = None,
+    tolerance: float | None = None,
+    flown: bool = False,
+    force: bool = False,
+) -> int:
+    """Write a flight for another program, and say what is kept and what is lost.
+
+    Parameters
+    ----------
+    result : Path
+        Result of a flight, NAME.nc.
+    format : str
+        setpoints (CSV), polynomial (Crazyswarm2), poly4d or compressed (memory of a Crazyflie), skyc (Skybrush), mcap
+        (ROS 2), tlog (MAVLink), plan (QGroundControl), rrd (Rerun) or gltf (Blender).
+    out : Path
+        File to write, or for polynomial, poly4d, compressed, tlog and plan, folder with one file a vehicle; setpoints
+        takes either. Default: beside the result.
+    rate : float
+        Samples per second [Hz] of setpoints, mcap, tlog and rrd. Default: those of the result.
+    tolerance : float
+        Greatest deviation [m] of the curves of all other formats. Default: 0.001 for polynomial and poly4d, 0.005 for
+        compressed, 0.01 for skyc and gltf, 0.1 for plan.
+    flown : bool
+        Write the motion flown instead of the reference.
+    force : bool
+        Overwrite existing files.
+    """
+    from rigidfleet.interchange import FORMATS
+    from rigidfleet.interchange import export as write
+
+    chosen = FORMATS[format]
+    name = f"{result.stem}-{format}" if chosen.each else f"{result.stem}.{chosen.suffix}"
+    path = out or result.with_name(name)
+    if path.exists() and not force:
+        raise taken(path)
+    try:
+        made = write(result, path, format, rate=rate, tolerance=tolerance, flown=flown)
+    except ValueError as error:
+        raise RigidfleetError(f"{error}.") from None
+    console.out().print(f"{made}\nExport   {path}", soft_wrap=True)
+    return PASSED

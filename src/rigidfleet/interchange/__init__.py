@@ -1,0 +1,282 @@
+"""Flights as the files that other programs fly, show or record.
+
+`export` writes a flight in one of `FORMATS`, reads its own output back, and says how far it is from what was exported.
+Each module of this package writes and reads the formats of one family: a ``write`` function yields the bytes of one
+file after the other, and its ``read`` function returns the ways in them.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, get_args
+
+import numpy as np
+
+from rigidfleet._common.arguments import as_path
+from rigidfleet._common.files import replacing_folder, write_file
+from rigidfleet.errors import ResultError
+from rigidfleet.interchange import crazyflie, gltf, mavlink, recordings, skybrush, tables
+from rigidfleet.interchange.curves import Deviation, Motion, deviation, tracked
+from rigidfleet.result import Result, as_result
+
+__all__ = ["FORMATS", "Export", "Format", "FormatName", "export"]
+
+FormatName = Literal[
+    "setpoints", "polynomial", "poly4d", "compressed", "skyc", "mcap", "tlog", "plan", "rrd", "gltf"
+]
+#: How much further off than its tolerance an export may be, by rounding and between the times that a fit checks.
+_SLACK = 1.05
+
+
+class Format(NamedTuple):
+    """A format of an export.
+
+    Attributes
+    ----------
+    write : from what is exported and the rate [Hz] or the tolerance [m] to the bytes of each file
+    read : from the bytes of a file to the ways of its vehicles (of a plan: its points)
+    suffix : of the files' names
+    each : whether each vehicle has a file of its own
+    tolerance : default tolerance of fitted curves [m]; None: it has samples at a rate instead
+    kept, lost : what such a file has of each vehicle, and what it lacks
+    own_time : whether its time begins at 0, not at the mission time of the first state
+    package, extra : what has to be installed, and the extra of rigidfleet that does so
+    """
+
+    write: Callable[[Motion, Any], Iterator[bytes]]
+    read: Callable[[bytes], Any]
+    suffix: str
+    each: bool
+    tolerance: float | None
+    kept: str
+    lost: str
+    own_time: bool = True
+    package: str = ""
+    extra: str = ""
+
+
+FORMATS: dict[str, Format] = {
+    "setpoints": Format(
+        tables.write_table, tables.read_table, "csv", False, None,
+        "position, velocity, acceleration, jerk, yaw and yaw rate", "tilt and rotors", False,
+    ),
+    "polynomial": Format(
+        crazyflie.write_polynomial, crazyflie.read_polynomial, "csv", True, 1e-3,
+        "position and yaw (pieces of degree 7)", "tilt and rotors",
+    ),
+    "poly4d": Format(
+        crazyflie.write_poly4d, crazyflie.read_poly4d, "bin", True, 1e-3,
+        "position and yaw (pieces of degree 7)", "tilt and rotors",
+    ),
+    "compressed": Format(
+        crazyflie.write_compressed, crazyflie.read_compressed, "bin", True, 5e-3,
+        "position and yaw (pieces of degree 7 in whole mm)", "tilt and rotors",
+    ),
+    "skyc": Format(
+        skybrush.write_skyc, skybrush.read_skyc, "skyc", False, 1e-2,
+        "position (cubic pieces) and yaw", "continuous acceleration, tilt and rotors",
+    ),
+    "mcap": Format(
+        recordings.write_mcap, recordings.read_mcap, "mcap", False, None,
+        "position, velocity, yaw and yaw rate", "acceleration, jerk, tilt and rotors", False, "mcap", "mcap",
+    ),
+    "tlog": Format(
+        mavlink.write_tlog, mavlink.read_tlog, "tlog", True, None,
+        "position, velocity, acceleration, yaw and yaw rate", "jerk, tilt and rotors",
+    ),
+    "plan": Format(
+        mavlink.write_plan, mavlink.read_plan, "plan", True, 0.1,
+        "path (straight legs)", "all times and speeds, and yaw: it is a preview",
+    ),
+    "rrd": Format(
+        recordings.write_rrd, recordings.read_rrd, "rrd", False, None,
+        "position and yaw", "velocity, acceleration, jerk, tilt and rotors", False, "rerun", "rerun",
+    ),
+    "gltf": Format(
+        gltf.write_gltf, gltf.read_gltf, "glb", False, 1e-2,
+        "position (cubic splines) and yaw", "continuous acceleration, tilt and rotors",
+    ),
+}  # fmt: skip
+assert tuple(FORMATS) == get_args(FormatName)
+
+
+@dataclass(frozen=True)
+class Export:
+    """What an export wrote, kept and lost; as text, one line.
+
+    Attributes
+    ----------
+    format, path : what was written, and where: a file, or a folder with one file a vehicle
+    files, size : number of files and of all their bytes
+    flown : whether it is the motion flown, not the reference
+    deviation : greatest distance of the files' ways from what was exported [m]; of a plan, of the paths
+    yaw_deviation : greatest difference of yaw [rad]; NaN if the format has no yaw
+    span : first and last mission time of the ways [s]
+    part : words about the part of the flight that the files have; "" for all of it
+    """
+
+    format: str
+    path: Path
+    files: int
+    size: int
+    flown: bool
+    deviation: float
+    yaw_deviation: float
+    span: tuple[float, float]
+    part: str
+
+    def __str__(self) -> str:
+        what = FORMATS[self.format]
+        files = "1 file" if self.files == 1 else f"{self.files} files"
+        source = "flown" if self.flown else "reference"
+        turned = math.degrees(self.yaw_deviation)
+        within = f"{brief(1e3 * self.deviation)} mm" + (
+            "" if math.isnan(turned) else f" and {brief(turned)} deg"
+        )
+        size = max(1, round(self.size / 1e3))
+        # No yaw is flown by points, and none is recorded of vehicles but in their attitudes.
+        heading = self.flown and not math.isnan(turned)
+        extra = "; yaw is the reference's, and east where it has none" if heading else ""
+        return (
+            f"{self.format}: {files}, {size:,} kB; kept the {source} {what.kept}{self.part} within {within}; lost "
+            f"{what.lost}{extra}."
+        )
+
+
+def export(
+    result: Result | str | Path,
+    path: str | Path,
+    format: FormatName,
+    *,
+    rate: float | None = None,
+    tolerance: float | None = None,
+    flown: bool = False,
+) -> Export:
+    """Write a flight for another program, and measure what was written by reading it back.
+
+    Existing files of the same names are replaced, all or none.
+
+    Parameters
+    ----------
+    result : a flight, or the path of a saved one
+    path : file to write; for a format with one file a vehicle, a folder. ``setpoints`` writes one file to a path that
+        ends in ``.csv``, and otherwise one a vehicle into a folder
+    format : see `FORMATS`
+    rate : samples per second [Hz] of ``setpoints``, ``mcap``, ``tlog`` and ``rrd``; by default those of the result
+    tolerance : greatest deviation of fitted curves [m], for all other formats; by default that of the format
+    flown : export the motion flown instead of the reference
+
+    Raises
+    ------
+    ResultError
+        The flight has no reference, does not fit the format, or cannot be kept within the tolerance; a package is
+        missing; the files cannot be written, or the result cannot be read.
+    ValueError
+        The format is unknown, or the rate or the tolerance is not positive or does not apply.
+    """
+    result, path = as_result(result), as_path(path)
+    chosen = _chosen(format, path)
+    setting = _setting(format, chosen, rate, tolerance)
+    if chosen.package and find_spec(chosen.package) is None:
+        raise ResultError(
+            f"{format}: needs the package {chosen.package!r}, which is not installed. Run: "
+            f"pip install 'rigidfleet[{chosen.extra}]'"
+        )
+    try:
+        motion, cut = tracked(result, flown=flown)
+        off, size, count = _written(motion, chosen, path, setting)
+    except ResultError as error:
+        raise ResultError(f"{format}: {error}") from None
+    end = motion.end - off.missing
+    part = ""
+    if cut or off.missing > 1e-3:
+        part = f" from {motion.start:g} to {end:g} s" + (
+            " (slots are not tracked before or after)" if cut else ""
+        )
+    return Export(
+        format, path, count, size, flown, off.position, off.yaw, (motion.start, end), part
+    )
+
+
+def _chosen(format: str, path: Path) -> Format:
+    if format not in FORMATS:
+        raise ValueError(f"there is no format {format!r}; use one of {', '.join(FORMATS)}")
+    chosen = FORMATS[format]
+    if format == "setpoints" and path.suffix != ".csv":
+        return chosen._replace(write=tables.write_tables, each=True)
+    return chosen
+
+
+def _setting(
+    name: str, chosen: Format, rate: float | None, tolerance: float | None
+) -> float | None:
+    """The rate [Hz] or the tolerance [m] of an export, whichever its format has."""
+    given = {"rate": rate, "tolerance": tolerance}
+    has, lacks = ("rate", "tolerance") if chosen.tolerance is None else ("tolerance", "rate")
+    if given[lacks] is not None:
+        of = "samples at a rate" if has == "rate" else "curves within a tolerance"
+        raise ValueError(f"{lacks} does not apply to {name}, which has {of}; give {has} instead")
+    value = given[has]
+    if value is not None and not (math.isfinite(value) and value > 0.0):
+        raise ValueError(f"{has} must be positive, not {value!r}")
+    return chosen.tolerance if value is None else value
+
+
+def _written(
+    motion: Motion, chosen: Format, path: Path, setting: float | None
+) -> tuple[Deviation, int, int]:
+    """Write the files, all or none; return how far they are off, and how many bytes and files they are."""
+    found: list[Deviation] = []
+    size = count = 0
+    for_each = chosen.write(motion, setting)
+
+    def measured() -> Iterator[bytes]:
+        nonlocal size, count
+        for data in for_each:
+            found.extend(_deviations(motion, chosen, data, len(found)))
+            worst = max(found, key=lambda x: x.position).position
+            if chosen.tolerance is not None and setting is not None and worst > _SLACK * setting:
+                raise ResultError(
+                    f"the tolerance of {1e3 * setting:g} mm cannot be met: what was written is {1e3 * worst:.2g} mm "
+                    f"off, by rounding. Use --tolerance {1.2 * worst:.2g}."
+                )
+            size, count = size + len(data), count + 1
+            yield data
+
+    if not chosen.each:
+        for data in measured():
+            write_file(path, data)
+    else:
+        if path.suffix == f".{chosen.suffix}":
+            raise ResultError(f"{path}: each vehicle has a file of its own. Give a folder.")
+        width = len(str(motion.n_agents))
+        ours = re.compile(rf"agent-\d+\.{chosen.suffix}")
+        with replacing_folder(path, ours) as folder:
+            for i, data in enumerate(measured(), start=1):
+                (folder / f"agent-{i:0{width}}.{chosen.suffix}").write_bytes(data)
+    return Deviation(*(float(np.max(x)) for x in zip(*found, strict=True))), size, count
+
+
+def _deviations(motion: Motion, chosen: Format, data: bytes, first: int) -> list[Deviation]:
+    """How far the ways in a file are from those of the vehicles from ``first`` on."""
+    read = chosen.read(data)
+    if isinstance(read, np.ndarray):  # a path without times
+        source = motion.knots(first).curve()
+        between = (source.time[:-1] + source.time[1:]) / 2
+        points = source.at(np.sort(np.concatenate([source.time, between])))[:, :3]
+        return [Deviation(float(mavlink.to_segments(points, read).max()), math.nan, 0.0)]
+    start = motion.start if chosen.own_time else 0.0
+    return [
+        deviation(motion.knots(first + i).curve(), curve.later(start))
+        for i, curve in enumerate(read)
+    ]
+
+
+def brief(x: float) -> str:
+    """A deviation with two digits or in whole units; a tiny one as a bound."""
+    return "0.001" if x < 1e-3 else f"{x:.2g}" if x < 10.0 else f"{x:.0f}"

@@ -1,0 +1,190 @@
+"""Trajectories for Crazyflies: Crazyswarm2's table of polynomials, and the two images of the vehicle's memory.
+
+Sources: Crazyswarm2's `uav_trajectory.py` (columns of the table); the Crazyflie firmware's `pptraj.h` (`poly4d`) and
+`pptraj_compressed.c` (compressed pieces: Bernstein coefficients, of which each piece takes the first from the end of
+the piece before).
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from rigidfleet.errors import ResultError
+from rigidfleet.interchange.curves import Curve, Knots, Motion, bernstein, of_bernstein
+from rigidfleet.math.splines import POWERS
+from rigidfleet.typing import Floats
+
+#: Bytes of the vehicle's memory for trajectories, and of one piece of kind poly4d.
+MEMORY, _POLY4D = 4096, 4 * (4 * POWERS + 1)
+PIECES = MEMORY // _POLY4D
+#: Units of the compressed form: lengths [m], angles [rad], times [s]; each within 16 bits.
+_MM, _TENTH, _MS = 1e-3, np.radians(0.1), 1e-3
+_MOST, _LONGEST = 32_767, 65_535
+#: What rounding to millimetres can move a position, and more [m].
+COMPRESSED_ROUNDING = 1e-3
+_NAMES = ("x", "y", "z", "yaw")
+_HEADER = ",".join(["duration", *(f"{name}^{k}" for name in _NAMES for k in range(POWERS))])
+#: Numbers of coefficients that a compressed piece can store beyond the first, by kind; its head: kinds and duration.
+_STORED = (0, 1, 3, 7)
+_PIECE = struct.Struct("<BH")
+_END = _PIECE.pack(0, 0)
+#: Tolerances that are tried for a flight that does not fit [m].
+_TRIED = tuple(1e-3 * np.array([2, 3, 5, 7, 10, 15, 20, 30, 50, 70, 100, 150, 200, 300, 500, 1000]))
+
+
+def write_polynomial(motion: Motion, tolerance: float) -> Iterator[bytes]:
+    """One table a vehicle: duration [s], and 8 coefficients of x, y, z [m] and yaw [rad] of each piece."""
+    for agent in range(motion.n_agents):
+        rows = _rows(motion.knots(agent).fitted(tolerance))
+        lines = [",".join(f"{x:.9g}" for x in row) for row in rows.tolist()]
+        yield "\n".join([_HEADER, *lines, ""]).encode()
+
+
+def read_polynomial(data: bytes) -> list[Curve]:
+    """The way in a table of `write_polynomial`, from time zero on."""
+    rows = np.loadtxt(data.decode().splitlines(), delimiter=",", skiprows=1, ndmin=2)
+    return [_curve(rows[:, 0], rows[:, 1:])]
+
+
+def write_poly4d(motion: Motion, tolerance: float) -> Iterator[bytes]:
+    """One memory image a vehicle: pieces of 32 coefficients and a duration, as 32-bit floats.
+
+    Raises
+    ------
+    ResultError
+        A flight needs more than `PIECES` pieces.
+    """
+    for agent in range(motion.n_agents):
+        knots = motion.knots(agent)
+        curve = knots.fitted(tolerance)
+        if len(curve.pieces) > PIECES:
+            raise _too_long(
+                agent,
+                f"{len(curve.pieces)} pieces of {_POLY4D} bytes, and the memory has room for {PIECES}",
+                curve.time[PIECES] - curve.time[0],
+                tolerance,
+                lambda x, knots=knots: len(knots.fitted(x).pieces) <= PIECES,
+            )
+        yield np.roll(_rows(curve), -1, axis=1).astype("<f4").tobytes()
+
+
+def read_poly4d(data: bytes) -> list[Curve]:
+    """The way in an image of `write_poly4d`, from time zero on."""
+    rows = np.frombuffer(data, "<f4").reshape(-1, 4 * POWERS + 1).astype(float)
+    return [_curve(rows[:, -1], rows[:, :-1])]
+
+
+def write_compressed(motion: Motion, tolerance: float) -> Iterator[bytes]:
+    """One compressed image a vehicle: Bernstein coefficients in millimetres and tenths of a degree.
+
+    Raises
+    ------
+    ResultError
+        The tolerance is not more than the rounding, or a flight needs more than `MEMORY` bytes, a length more than
+        32.767 m, or a piece more than 65.535 s.
+    """
+    if tolerance <= COMPRESSED_ROUNDING:
+        raise ResultError(
+            f"the tolerance of {1e3 * tolerance:g} mm cannot be met: this format rounds to millimetres. "
+            f"Use --tolerance {2 * COMPRESSED_ROUNDING:g} or more."
+        )
+    for agent in range(motion.n_agents):
+        knots = motion.knots(agent).moved(_MS)
+        data, ends = _compressed(knots, tolerance, agent)
+        if len(data) > MEMORY:
+            raise _too_long(
+                agent,
+                f"{len(data)} bytes, and the memory has {MEMORY}",
+                ends[
+                    max(0, int(np.searchsorted(ends[:, 0], MEMORY - len(_END), side="right")) - 1),
+                    1,
+                ],
+                tolerance,
+                lambda x, knots=knots, agent=agent: len(_compressed(knots, x, agent)[0]) <= MEMORY,
+            )
+        yield data
+
+
+def _compressed(knots: Knots, tolerance: float, agent: int) -> tuple[bytes, Floats]:
+    """The image of a way with times in whole milliseconds, and where each piece ends in it: (n, 2) [bytes, s]."""
+    curve = knots.fitted(tolerance - COMPRESSED_ROUNDING, longest=_LONGEST * _MS)
+    duration = np.diff(curve.time)
+    position = bernstein(curve.pieces[:, :3], duration) / _MM
+    yaw = (
+        bernstein(curve.pieces[:, 3:, :4], duration) / _TENTH
+    )  # of degree 3, like the reference between samples
+    if abs(position).max() > _MOST:
+        k = int(np.argmax(abs(position).max(axis=(1, 2))))
+        far = float(abs(position).max()) * _MM
+        raise ResultError(
+            f"agent {agent + 1} or a control point of its curve is {far:.3f} m from the origin along an axis, between "
+            f"{curve.time[k]:g} and {curve.time[k + 1]:g} s, and this format ends at {_MOST * _MM:g} m. Fly nearer to "
+            f"the origin, or smaller by a factor of {_MOST * _MM / far:.2g}, or use poly4d."
+        )
+    if abs(yaw).max() > _MOST:
+        raise ResultError(
+            f"the yaw of agent {agent + 1} reaches {abs(yaw).max() / 10:.0f} deg, and this format ends at "
+            f"{_MOST / 10:g} deg. Turn less, or use poly4d."
+        )
+    points = [*np.round(np.moveaxis(position, 1, 0)).astype(int), np.round(yaw[:, 0]).astype(int)]
+    at = [int(x[0, 0]) for x in points]
+    data, ends = struct.pack("<4h", *at), []
+    for k, milliseconds in enumerate(np.round(duration / _MS).astype(int).tolist()):
+        kinds, body = 0, b""
+        for axis, x in enumerate(points):
+            due = x[k, 1:].tolist()
+            if any(value != at[axis] for value in due):  # else a constant, of kind 0
+                kinds |= _STORED.index(len(due)) << 2 * axis
+                body += struct.pack(f"<{len(due)}h", *due)
+                at[axis] = due[-1]
+        data += _PIECE.pack(kinds, milliseconds) + body
+        ends.append((len(data), curve.time[k + 1] - curve.time[0]))
+    return data + _END, np.array(ends)
+
+
+def read_compressed(data: bytes) -> list[Curve]:
+    """The way in an image of `write_compressed`, from time zero on."""
+    units = [_MM, _MM, _MM, _TENTH]
+    at = [x * unit for x, unit in zip(struct.unpack_from("<4h", data), units, strict=True)]
+    place, durations, pieces = 8, [], []
+    while (head := _PIECE.unpack_from(data, place))[1]:
+        kinds, milliseconds = head
+        place += _PIECE.size
+        piece = np.zeros((4, POWERS))
+        for axis, unit in enumerate(units):
+            count = _STORED[kinds >> 2 * axis & 3]
+            due = struct.unpack_from(f"<{count}h", data, place)
+            place += 2 * count
+            points = np.array([at[axis], *(x * unit for x in due)])
+            piece[axis, : count + 1] = of_bernstein(points, milliseconds * _MS)
+            at[axis] = points[-1]
+        durations.append(milliseconds * _MS)
+        pieces.append(piece)
+    return [_curve(np.array(durations), np.array(pieces))]
+
+
+def _too_long(
+    agent: int, needed: str, until: float, tolerance: float, fits: Callable[[float], bool]
+) -> ResultError:
+    """Error about a flight that does not fit: which tolerance makes it fit, and how many seconds do."""
+    enough = next((x for x in _TRIED if x > tolerance and fits(x)), None)
+    remedy = (
+        f"--tolerance {enough:g} makes it fit" if enough else "no tolerance up to 1 m makes it fit"
+    )
+    return ResultError(
+        f"the flight of agent {agent + 1} needs {needed}. {remedy[0].upper()}{remedy[1:]}; at "
+        f"{1e3 * tolerance:g} mm, the first {until:.1f} s fit."
+    )
+
+
+def _rows(curve: Curve) -> Floats:
+    """Duration and coefficients (n, 33) of the pieces of a way."""
+    return np.column_stack([np.diff(curve.time), curve.pieces.reshape(len(curve.pieces), -1)])
+
+
+def _curve(duration: Floats, coefficients: Floats) -> Curve:
+    time = np.concatenate([[0.0], np.cumsum(duration)])
+    return Curve(time, coefficients.reshape(len(duration), 4, POWERS))

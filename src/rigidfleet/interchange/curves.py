@@ -1,0 +1,350 @@
+"""Ways of vehicles as polynomials: what an export is made from, is fitted to, and is read back as."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import comb
+from typing import NamedTuple
+
+import numpy as np
+
+from rigidfleet.errors import ResultError
+from rigidfleet.math import series, splines
+from rigidfleet.result import Result
+from rigidfleet.setpoints import Setpoints, at_rate
+from rigidfleet.typing import Floats
+
+#: Tolerance of yaw wherever pieces are fitted [rad]. Position does not depend on it.
+YAW_TOLERANCE = np.radians(0.5)
+#: Where in each interval a fit is checked, and an export is compared: shares of the interval.
+_CHECKED = np.array([0.25, 0.5, 0.75, 1.0])
+_COMPARED = np.array([0.02, 0.25, 0.5, 0.75, 0.98])
+
+
+class Curve(NamedTuple):
+    """The way of one vehicle, piece by piece.
+
+    Attributes
+    ----------
+    time : (n + 1,) ends of the pieces [s]
+    pieces : (n, 4, P) coefficients of x, y, z [m] and yaw [rad] in ascending powers of the time since the beginning of
+        a piece; yaw is NaN where a format does not have it
+    """
+
+    time: Floats
+    pieces: Floats
+
+    def at(self, t: Floats) -> Floats:
+        """Position [m] and yaw [rad] (K, 4) at times (K,) [s]; the first and last piece go on beyond the ends."""
+        k = np.clip(np.searchsorted(self.time, t, side="right") - 1, 0, len(self.pieces) - 1)
+        return _values(self.pieces[k], t - self.time[k])
+
+    def later(self, start: float) -> Curve:
+        """The same way, begun later [s]."""
+        return Curve(self.time + start, self.pieces)
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What is exported: the states of all vehicles at both ends of every interval between samples.
+
+    Attributes
+    ----------
+    result : the flight
+    samples : setpoints as recorded, both at a change of phase
+    flown : whether it is the motion flown, not the reference
+    """
+
+    result: Result
+    samples: Setpoints
+    flown: bool
+
+    @property
+    def start(self) -> float:
+        """Mission time of the first state [s]."""
+        return float(self.samples.time[0])
+
+    @property
+    def end(self) -> float:
+        """Mission time of the last state [s]."""
+        return float(self.samples.time[-1])
+
+    @property
+    def n_agents(self) -> int:
+        """Number of vehicles."""
+        return self.samples.yaw.shape[1]
+
+    def at_rate(self, rate: float | None) -> Setpoints:
+        """Setpoints at a rate [Hz]; without one, the samples."""
+        return at_rate(self.samples, rate)
+
+    def knots(self, agent: int) -> Knots:
+        """States of one vehicle at the ends of intervals; a change of phase is one knot with two states."""
+        given = self.samples
+        time = given.time
+        first = np.flatnonzero(np.nextafter(time[:-1], np.inf) < time[1:])
+        x = given.state[:, :, agent].swapaxes(0, 1)
+        angle = np.stack([given.yaw[:, agent], given.yaw_rate[:, agent]])[..., None]
+        ends = np.append(time[first], time[first[-1] + 1])
+        return Knots(
+            ends, x[:, first], x[:, first + 1], angle[:, first], angle[:, first + 1]
+        )  # fmt: skip
+
+
+class Knots(NamedTuple):
+    """States of one vehicle: derivatives 0 to 3 of position, and yaw and its rate, at both ends of n intervals.
+
+    Attributes
+    ----------
+    time : (n + 1,) [s]
+    begin, end : (4, n, 3) position [m] to jerk [m/s^3]
+    yaw_begin, yaw_end : (2, n, 1) yaw [rad], yaw rate [rad/s]
+    """
+
+    time: Floats
+    begin: Floats
+    end: Floats
+    yaw_begin: Floats
+    yaw_end: Floats
+
+    def curve(self) -> Curve:
+        """The way between all samples: of degree 7 (yaw: 3)."""
+        position = splines.hermite(np.diff(self.time), self.begin, self.end)
+        return Curve(self.time, _with_yaw(position, self._yaw(slice(None), slice(None))))
+
+    def _yaw(self, first: slice, last: slice) -> Floats:
+        h = self.time[1:][last] - self.time[:-1][first]
+        return splines.hermite(h, self.yaw_begin[:, first], self.yaw_end[:, last])
+
+    def moved(self, step: float) -> Knots:
+        """The same way with all times rounded to multiples of ``step`` [s], states moved along their derivatives."""
+        time = np.round(self.time / step) * step
+        by = time - self.time
+
+        def along(x: Floats, by: Floats) -> Floats:
+            pieces = np.moveaxis(series.from_derivatives(x), 0, -1)
+            return series.derivatives(series.of_polynomials(pieces, by, len(x)))
+
+        parts = (
+            (self.begin, by[:-1]),
+            (self.end, by[1:]),
+            (self.yaw_begin, by[:-1]),
+            (self.yaw_end, by[1:]),
+        )
+        return Knots(time, *(along(x, by) for x, by in parts))
+
+    def fitted(self, tolerance: float, orders: int = 4, longest: float = np.inf) -> Curve:
+        """The fewest pieces that go from knot to knot within a tolerance [m], and `YAW_TOLERANCE`.
+
+        Pieces meet 4 (degree 7) or 2 ``orders`` of derivatives (degree 3) at the knots they join. Each is as long as
+        the tolerance allows, and not longer than ``longest`` [s].
+
+        Raises
+        ------
+        ResultError
+            Not even a piece between two samples is within the tolerance.
+        """
+        n = len(self.time) - 1
+        source = self.curve()
+        t = self.time[:-1, None] + np.diff(self.time)[:, None] * _CHECKED
+        wanted = _values(
+            np.repeat(source.pieces, len(_CHECKED), axis=0), (t - self.time[:-1, None]).ravel()
+        )
+        wanted = wanted.reshape(n, len(_CHECKED), 4)
+
+        def tried(i: int, j: int) -> tuple[Floats, float]:
+            """The piece over intervals i to j - 1, and its error as a share of what is allowed."""
+            first, last = slice(i, i + 1), slice(j - 1, j)
+            h = self.time[j : j + 1] - self.time[i : i + 1]
+            piece = splines.hermite(h, self.begin[:orders, first], self.end[:orders, last])
+            piece = _with_yaw(piece, self._yaw(first, last))
+            after = (t[i:j] - self.time[i]).ravel()
+            off = _values(piece, after) - wanted[i:j].reshape(-1, 4)
+            far = np.sqrt((off[:, :3] ** 2).sum(axis=1).max()) / tolerance
+            far = max(far, h[0] / longest)
+            return piece, float(max(far, abs(off[:, 3]).max() / YAW_TOLERANCE))
+
+        ends, pieces, length = [0], [], 1
+        while ends[-1] < n:
+            i = ends[-1]
+            good, bad = i, n + 1  # the longest piece known to fit, the shortest known not to
+            j = min(i + length, n)
+            while good < n and bad - good > 1:
+                piece, error = tried(i, j)
+                if error <= 1.0:
+                    good, best = j, piece
+                elif j > i + 1:
+                    bad = j
+                else:
+                    raise ResultError(
+                        f"the tolerance of {1e3 * tolerance:g} mm cannot be met: a curve of degree {2 * orders - 1} "
+                        f"between the samples at {self.time[i]:g} and {self.time[j]:g} s is {error:.2g} times as far "
+                        f"off. Use --tolerance {1.2 * error * tolerance:.2g}, or fly with a shorter output_step."
+                    )
+                j = min(2 * good - i, n) if bad > n else (good + bad) // 2
+            ends.append(good)
+            pieces.append(best)
+            length = good - i
+        return Curve(self.time[ends], np.concatenate(pieces))
+
+
+def _values(pieces: Floats, after: Floats) -> Floats:
+    """Values (K, 4) of pieces (K or 1, 4, P) at times (K,) [s] since they began."""
+    found = np.zeros((len(after), pieces.shape[1]))
+    for k in range(pieces.shape[2] - 1, -1, -1):  # Horner
+        found = found * after[:, None] + pieces[:, :, k]
+    return found
+
+
+def _with_yaw(position: Floats, yaw: Floats) -> Floats:
+    """Pieces (n, 4, P) of positions (n, 3, P) and yaws (n, 1, 4)."""
+    powers = position.shape[2]
+    return np.concatenate([position, np.pad(yaw, ((0, 0), (0, 0), (0, powers - 4)))], axis=1)
+
+
+def bernstein(pieces: Floats, duration: Floats) -> Floats:
+    """Bernstein coefficients (n, ..., P), or control points, of pieces (n, ..., P) of durations (n,) [s]."""
+    powers = pieces.shape[-1]
+    scaled = pieces * duration.reshape(-1, *(1,) * (pieces.ndim - 1)) ** np.arange(powers)
+    return scaled @ _to_bernstein(powers).T
+
+
+def of_bernstein(points: Floats, duration: float) -> Floats:
+    """Coefficients (P,) in ascending powers of time of a piece with control points (P,) and a duration [s]."""
+    powers = len(points)
+    return np.linalg.solve(_to_bernstein(powers), points) / duration ** np.arange(powers)
+
+
+def _to_bernstein(powers: int) -> Floats:
+    """The matrix of Bernstein coefficients b_i = sum_k C(i, k) / C(P - 1, k) a_k on [0, 1]."""
+    return np.array(
+        [[comb(i, k) / comb(powers - 1, k) for k in range(powers)] for i in range(powers)]
+    )
+
+
+def through(time: Floats, states: Floats, yaw: Floats | None = None) -> Curve:
+    """The way through states (m, K, 3) at times (K,) [s]: m derivatives of position are met, 4, 2, or 1 (lines).
+
+    Yaw (2, K) [rad, rad/s] or (1, K) is met in the same way; without it, yaw is NaN.
+    """
+    if len(time) == 1:
+        time, states = np.append(time, time + 1.0), np.repeat(states, 2, axis=1)
+        states[1:] = 0.0
+        yaw = None if yaw is None else np.repeat(yaw, 2, axis=1) * [[1.0], [0.0]][: len(yaw)]
+
+    def between(x: Floats) -> Floats:
+        h = np.diff(time)
+        if len(x) == 1:
+            slope = np.diff(x[0], axis=0) / h[:, None]
+            return np.stack([x[0][:-1], slope], axis=-1)
+        return splines.hermite(h, x[:, :-1], x[:, 1:])
+
+    position = between(states)
+    angle = np.full((len(time) - 1, 1, 1), np.nan) if yaw is None else between(yaw[..., None])
+    powers = max(position.shape[2], angle.shape[2])
+    parts = [np.pad(x, ((0, 0), (0, 0), (0, powers - x.shape[2]))) for x in (position, angle)]
+    return Curve(time, np.concatenate(parts, axis=1))
+
+
+def headings(curve: Curve) -> tuple[Floats, Floats]:
+    """Times (K,) [s] and yaws (K,) [rad] with lines between them, within half of `YAW_TOLERANCE` of a way.
+
+    Times increase: where yaw jumps, it turns within a millisecond.
+    """
+    step, yaw = np.diff(curve.time), curve.pieces[:, 3]
+    bend = (
+        2.0 * abs(yaw[:, 2]) + 6.0 * abs(yaw[:, 3]) * step
+    )  # at least the greatest second derivative
+    counts = np.maximum(1, np.ceil(step * np.sqrt(bend / (4.0 * YAW_TOLERANCE)))).astype(int)
+    shares = [np.linspace(0.0, 1.0, count + 1) for count in counts]
+    k = np.repeat(np.arange(len(step)), counts + 1)
+    after = np.concatenate(shares) * step[k]
+    times, yaws = curve.time[k] + after, _values(curve.pieces[k], after)[:, 3]
+    again = np.append(False, np.diff(times) < 1e-9)
+    times[again] += 1e-3
+    needed = ~again | np.append(False, abs(np.diff(yaws)) > 1e-9)
+    times, yaws = times[needed], yaws[needed]
+    level = np.append(abs(np.diff(yaws)) < 1e-12, True) & np.append(
+        True, abs(np.diff(yaws)) < 1e-12
+    )
+    level[[0, -1]] = False
+    return times[~level], yaws[~level]
+
+
+def with_headings(curve: Curve, times: Floats, yaws: Floats) -> Curve:
+    """The same way with yaw on lines between yaws (K,) [rad] at times (K,) [s]."""
+    time = np.unique(
+        np.concatenate([curve.time, times[(times > curve.time[0]) & (times < curve.time[-1])]])
+    )
+    k = np.clip(np.searchsorted(curve.time, time[:-1], side="right") - 1, 0, len(curve.pieces) - 1)
+    moved = series.of_polynomials(
+        curve.pieces[k], time[:-1] - curve.time[k], curve.pieces.shape[-1]
+    )
+    pieces = np.moveaxis(moved, 0, -1)
+    at = np.interp(time, times, yaws)
+    pieces[:, 3] = 0.0
+    pieces[:, 3, 0], pieces[:, 3, 1] = at[:-1], np.diff(at) / np.diff(time)
+    return Curve(time, pieces)
+
+
+class Deviation(NamedTuple):
+    """How far an export is from what was exported: position [m], yaw [rad] (NaN: the format has none), and what lacks.
+
+    ``missing`` is the time at the end that the export does not have [s].
+    """
+
+    position: float
+    yaw: float
+    missing: float
+
+
+def deviation(source: Curve, written: Curve) -> Deviation:
+    """Greatest distance and difference of yaw between two ways, at five times in each interval of the source."""
+    h = np.diff(source.time)[:, None]
+    after = (h * _COMPARED).ravel()
+    t = (source.time[:-1, None] + h * _COMPARED).ravel()
+    wanted = _values(np.repeat(source.pieces, len(_COMPARED), axis=0), after)
+    there = t <= written.time[-1]
+    off = written.at(t[there]) - wanted[there]
+    turned = (off[:, 3] + np.pi) % (2.0 * np.pi) - np.pi
+    missing = max(0.0, float(source.time[-1] - written.time[-1]))
+    far = float(np.sqrt((off[:, :3] ** 2).sum(axis=1).max(initial=0.0)))
+    return Deviation(far, float(abs(turned).max(initial=0.0)), missing)
+
+
+def tracked(result: Result, *, flown: bool) -> tuple[Motion, bool]:
+    """What can be exported of a flight, and whether its beginning or end is left out: no slot is tracked there.
+
+    Raises
+    ------
+    ResultError
+        There is no reference at all, or it has gaps, or a value is not finite.
+    """
+    given = result.motion(flown=flown)
+    yaw, yaw_rate = given.yaw, given.yaw_rate
+    if flown:  # a flight without yaw of its own keeps pointing east
+        yaw, yaw_rate = np.nan_to_num(yaw), np.nan_to_num(yaw_rate)
+    k, n = yaw.shape
+    states = given.state.swapaxes(1, 2).reshape(k, n, 12)
+    every = np.concatenate([states, yaw[..., None], yaw_rate[..., None]], axis=2)
+    bad = ~np.asarray(np.isfinite(every).all(axis=2))
+    nothing = np.asarray(bad.all(axis=1))
+    which = "motion flown" if flown else "reference"
+    if nothing.all():
+        raise ResultError(
+            f"the {which} of this flight has no numbers: nothing is tracked. Export what was flown: --flown."
+        )
+    first, last = int(np.argmin(nothing)), len(nothing) - int(np.argmin(nothing[::-1]))
+    kept = slice(first, last)
+    if bad[kept].any():
+        k, agent = np.argwhere(bad[kept])[0]
+        at = given.time[first + k]
+        name = result.phases[result.phase[first + k]].name
+        raise ResultError(
+            f"the {which} of agent {agent + 1} has no number at {at:g} s (phase {name!r}). "
+            + ("Fly the mission again." if flown else "Export what was flown: --flown.")
+        )
+    if last - first < 2:
+        raise ResultError(f"the {which} has one sample only. Fly the mission further.")
+    cut = Setpoints(given.time[kept], given.state[kept], yaw[kept], yaw_rate[kept])
+    return Motion(result, cut, flown), last - first < len(nothing)

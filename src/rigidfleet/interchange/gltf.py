@@ -1,0 +1,140 @@
+"""glTF 2.0 in one binary file (.glb): an animation for Blender and other programs that draw.
+
+Source: the glTF 2.0 specification of Khronos: cubic splines (appendix C), the binary container (section 4). Axes are
+right-handed with y up: (x, y, z) of a mission is (x, z, -y) there. No package is used: those on offer either write no
+animations (trimesh) or only wrap the JSON (pygltflib, which the tests read with).
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from rigidfleet.interchange.curves import Curve, Motion, headings, with_headings
+from rigidfleet.math import series, splines
+from rigidfleet.typing import Floats, Ints
+
+_FLOAT, _UNSIGNED = 5126, 5125
+_MAGIC, _JSON, _BINARY = 0x46546C67, 0x4E4F534A, 0x004E4942
+#: An octahedron of radius 1: corners and triangles.
+_CORNERS = np.array(
+    [[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], dtype=float
+)
+_FACES = np.array(
+    [[2, 4, 0], [2, 1, 4], [2, 5, 1], [2, 0, 5], [3, 0, 4], [3, 4, 1], [3, 1, 5], [3, 5, 0]]
+)
+_TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
+
+
+class _File:
+    """The parts of a file as they are added: arrays in one buffer, each with its description."""
+
+    def __init__(self) -> None:
+        self.data, self.views, self.accessors = bytearray(), [], []
+
+    def add(self, x: Floats | Ints, dtype: str = "<f4", *, bounds: bool = False) -> int:
+        """Add an array (K,) or (K, n) and return its number."""
+        values = np.asarray(x, dtype=dtype)
+        self.views.append({"buffer": 0, "byteOffset": len(self.data), "byteLength": values.nbytes})
+        self.data += values.tobytes()
+        each = 1 if values.ndim == 1 else values.shape[1]
+        described: dict[str, Any] = {
+            "bufferView": len(self.views) - 1,
+            "componentType": _FLOAT if dtype == "<f4" else _UNSIGNED,
+            "count": len(values),
+            "type": _TYPES[each],
+        }
+        if bounds:
+            low, high = (getattr(values.reshape(-1, each), f)(axis=0) for f in ("min", "max"))
+            described |= {"min": low.tolist(), "max": high.tolist()}
+        self.accessors.append(described)
+        return len(self.accessors) - 1
+
+
+def write_gltf(motion: Motion, tolerance: float) -> Iterator[bytes]:
+    """One scene: a node for each vehicle, moved along cubic splines; its yaw turns at the same keys, and between."""
+    file = _File()
+    mesh = {
+        "attributes": {"POSITION": file.add(_CORNERS, bounds=True)},
+        "indices": file.add(_FACES.ravel(), "<u4"),
+    }
+    nodes, samplers, channels = [], [], []
+    for agent, radius in enumerate(motion.result.mission.fleet.radius.tolist()):
+        curve = motion.knots(agent).fitted(tolerance, orders=2).later(-motion.start)
+        times, yaws = headings(curve)
+        turned = np.stack([0 * yaws, np.sin(yaws / 2), 0 * yaws, np.cos(yaws / 2)], axis=1)
+        for path, time, values, way in (
+            ("translation", curve.time, _spline(curve), "CUBICSPLINE"),
+            ("rotation", times, turned, "LINEAR"),
+        ):
+            keys = {"input": file.add(time, bounds=True), "output": file.add(values)}
+            samplers.append(keys | {"interpolation": way})
+            channels.append({"sampler": len(samplers) - 1, "target": {"node": agent, "path": path}})
+        nodes.append({"name": f"agent {agent + 1}", "mesh": 0, "scale": [max(radius, 0.05)] * 3})
+    scene = {
+        "asset": {"version": "2.0", "generator": "rigidfleet"},
+        "scene": 0,
+        "scenes": [{"name": motion.result.mission.name, "nodes": list(range(len(nodes)))}],
+        "nodes": nodes,
+        "meshes": [{"primitives": [mesh]}],
+        "animations": [{"name": "flight", "samplers": samplers, "channels": channels}],
+        "buffers": [{"byteLength": len(file.data)}],
+        "bufferViews": file.views,
+        "accessors": file.accessors,
+    }
+    words = json.dumps(scene).encode()
+    parts = [(_JSON, words + b" " * (-len(words) % 4)), (_BINARY, bytes(file.data))]
+    size = 12 + sum(8 + len(part) for _, part in parts)
+    yield struct.pack("<III", _MAGIC, 2, size) + b"".join(
+        struct.pack("<II", len(part), kind) + part for kind, part in parts
+    )
+
+
+def read_gltf(data: bytes) -> list[Curve]:
+    """The ways in a file of `write_gltf`, from time zero on. Rotation is on lines of the angle, as slerp turns."""
+    length = struct.unpack_from("<I", data, 12)[0]
+    scene = json.loads(data[20 : 20 + length])
+    binary = data[28 + length :]
+
+    def array(number: int) -> Floats:
+        accessor = scene["accessors"][number]
+        view = scene["bufferViews"][accessor["bufferView"]]
+        each = {name: n for n, name in _TYPES.items()}[accessor["type"]]
+        found = np.frombuffer(binary, "<f4", accessor["count"] * each, view["byteOffset"])
+        return found.astype(float).reshape(-1, each)
+
+    animation = scene["animations"][0]
+    curves = []
+    for moved, turned in zip(animation["channels"][::2], animation["channels"][1::2], strict=True):
+        (time, values), (times, quaternions) = (
+            [array(animation["samplers"][channel["sampler"]][key]) for key in ("input", "output")]
+            for channel in (moved, turned)
+        )
+        before, at, after = (_y_down(x) for x in values.reshape(-1, 3, 3).swapaxes(0, 1))
+        begin, end = np.stack([at[:-1], after[:-1]]), np.stack([at[1:], before[1:]])
+        pieces = np.pad(splines.hermite(np.diff(time[:, 0]), begin, end), ((0, 0), (0, 1), (0, 0)))
+        yaw = np.unwrap(2.0 * np.arctan2(quaternions[:, 1], quaternions[:, 3]))
+        curves.append(with_headings(Curve(time[:, 0], pieces), times[:, 0], yaw))
+    return curves
+
+
+def _spline(curve: Curve) -> Floats:
+    """Rows (3 K, 3) of a cubic spline: for each key the velocity before, the position and the velocity after."""
+    h = np.diff(curve.time)
+    position = series.of_polynomials(curve.pieces[:, :3], h, 2)  # at the ends of pieces
+    rows = np.zeros((len(curve.time), 3, 3))
+    rows[1:, 0], rows[1:, 1] = position[1], position[0]
+    rows[:-1, 1:] = np.moveaxis(curve.pieces[:, :3, :2], 2, 1)
+    return _y_up(rows.reshape(-1, 3))
+
+
+def _y_up(x: Floats) -> Floats:
+    return np.stack([x[..., 0], x[..., 2], -x[..., 1]], axis=-1)
+
+
+def _y_down(x: Floats) -> Floats:
+    return np.stack([x[..., 0], -x[..., 2], x[..., 1]], axis=-1)

@@ -1,0 +1,214 @@
+"""MAVLink: a log of offboard setpoints (.tlog) for PX4 and ArduPilot, and QGroundControl plans.
+
+Sources: MAVLink's `common.xml` (messages 48 and 84), its packet format of version 1 with the checksum CRC-16/MCRF4XX,
+and QGroundControl's plan file format, version 1. Local axes are north, east, down: (N, E, D) = (y, x, -z), and yaw is
+clockwise from north.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from rigidfleet.errors import ResultError
+from rigidfleet.interchange.curves import Curve, Motion, through
+from rigidfleet.math import geodesy
+from rigidfleet.setpoints import Setpoints, at_times
+from rigidfleet.typing import Floats
+
+#: SET_POSITION_TARGET_LOCAL_NED: number, extra byte of the checksum, and fields in the order of the wire.
+_TARGET, _TARGET_EXTRA = 84, 143
+_FIELDS = np.dtype(
+    [("time_boot_ms", "<u4"), ("state", "<f4", (3, 3)), ("yaw", "<f4"), ("yaw_rate", "<f4"), ("type_mask", "<u2"),
+     ("target_system", "u1"), ("target_component", "u1"), ("coordinate_frame", "u1")]
+)  # fmt: skip
+#: A record of a log: microseconds, then the packet: its head, fields and checksum.
+_RECORD = np.dtype(
+    [("time", ">u8"), ("mark", "u1"), ("length", "u1"), ("sequence", "u1"), ("system", "u1"), ("component", "u1"),
+     ("message", "u1"), ("fields", _FIELDS), ("checksum", "<u2")]
+)  # fmt: skip
+#: SET_GPS_GLOBAL_ORIGIN: number, extra byte, head and fields.
+_ORIGIN, _ORIGIN_EXTRA = 48, 41
+_ORIGIN_RECORD = struct.Struct(">QBBBBBB")
+_ORIGIN_FIELDS = struct.Struct("<iiiB")
+_MARK, _STATION, _SYSTEMS = 0xFE, 255, 255
+_LOCAL_NED, _AUTOPILOT = 1, 1
+#: Commands and frame of a plan: waypoint, take-off; altitude above the home position.
+_WAYPOINT, _TAKEOFF, _RELATIVE = 16, 22, 3
+
+
+def write_tlog(motion: Motion, rate: float | None) -> Iterator[bytes]:
+    """One log a vehicle: at each time the message that asks for position, velocity, acceleration, yaw and yaw rate.
+
+    Vehicle i is system i (from 256 on, again from 1). Times are whole milliseconds since the start; states are those
+    of these times. If the mission has a geodetic origin, the first message sets it.
+    """
+    given = _in_milliseconds(motion, rate)
+    for agent in range(motion.n_agents):
+        system = agent % _SYSTEMS + 1
+        records: Any = np.zeros(len(given.time), dtype=_RECORD)
+        milliseconds = np.round((given.time - motion.start) * 1e3).astype(np.int64)
+        records["time"] = 1000 * milliseconds
+        records["mark"], records["length"], records["system"] = _MARK, _FIELDS.itemsize, _STATION
+        records["sequence"] = (np.arange(len(records)) + 1) % 256
+        records["message"] = _TARGET
+        fields = records["fields"]
+        fields["time_boot_ms"] = milliseconds
+        fields["state"] = _ned(given.state[:, :3, agent])
+        fields["yaw"] = (np.pi / 2 - given.yaw[:, agent] + np.pi) % (2.0 * np.pi) - np.pi
+        fields["yaw_rate"] = -given.yaw_rate[:, agent]
+        fields["target_system"], fields["target_component"] = system, _AUTOPILOT
+        fields["coordinate_frame"] = _LOCAL_NED
+        covered = records.view(np.uint8).reshape(len(records), -1)[:, 9:-2]
+        records["checksum"] = _checksum(covered, _TARGET_EXTRA)
+        yield _origin_record(motion, system) + records.tobytes()
+
+
+def read_tlog(data: bytes) -> list[Curve]:
+    """The way in a log: cubics through its positions and velocities."""
+    first = 8 + 8 + data[9]
+    if data[13] == _ORIGIN:
+        data = data[first:]
+    records: Any = np.frombuffer(data, dtype=_RECORD)
+    fields = records["fields"]
+    state = _ned(fields["state"].astype(float)).swapaxes(0, 1)
+    yaw = np.stack(
+        [np.unwrap(np.pi / 2 - fields["yaw"].astype(float)), -fields["yaw_rate"].astype(float)]
+    )
+    return [through(fields["time_boot_ms"] / 1e3, state[:2], yaw)]
+
+
+def _in_milliseconds(motion: Motion, rate: float | None) -> Setpoints:
+    """Setpoints at a rate [Hz], at times that are whole milliseconds after the start."""
+    given = motion.at_rate(rate)
+    wanted = np.unique(np.round((given.time - motion.start) * 1e3)) / 1e3 + motion.start
+    return at_times(motion.samples, np.minimum(wanted, motion.end))
+
+
+def _ned(x: Floats) -> Floats:
+    """Vectors (..., 3) in north, east, down from east, north, up, or back."""
+    return np.stack([x[..., 1], x[..., 0], -x[..., 2]], axis=-1)
+
+
+def _origin_record(motion: Motion, system: int) -> bytes:
+    if (origin := motion.result.mission.geodetic_origin) is None:
+        return b""
+    fields = _ORIGIN_FIELDS.pack(
+        round(1e7 * origin.latitude_deg),
+        round(1e7 * origin.longitude_deg),
+        round(1e3 * origin.altitude),
+        system,
+    )
+    record = _ORIGIN_RECORD.pack(0, _MARK, len(fields), 0, _STATION, 0, _ORIGIN) + fields
+    covered = np.frombuffer(record[9:], dtype=np.uint8)[None]
+    return record + _checksum(covered, _ORIGIN_EXTRA).astype("<u2").tobytes()
+
+
+def _checksum(data: np.ndarray, extra: int) -> np.ndarray:
+    """CRC-16/MCRF4XX (K,) of rows of bytes (K, n), each followed by an extra byte."""
+    crc = np.full(len(data), 0xFFFF, dtype=np.uint16)
+    for byte in [*data.T.astype(np.uint16), np.uint16(extra)]:
+        low = (byte ^ crc) & 0xFF
+        low ^= (low << 4) & 0xFF
+        crc = (crc >> 8) ^ (low << 8) ^ (low << 3) ^ (low >> 4)
+    return crc
+
+
+def write_plan(motion: Motion, tolerance: float) -> Iterator[bytes]:
+    """One plan a vehicle: a take-off to the start of its way and waypoints along it, without times.
+
+    Raises
+    ------
+    ResultError
+        The mission has no geodetic origin.
+    """
+    if (given := motion.result.mission.geodetic_origin) is None:
+        raise ResultError(
+            "a plan needs the place of the mission on the Earth. Add to the mission, and fly it again: "
+            "[geodetic_origin] latitude_deg, longitude_deg and altitude."
+        )
+    origin = np.array(
+        [np.radians(given.latitude_deg), np.radians(given.longitude_deg), given.altitude]
+    )
+    for agent in range(motion.n_agents):
+        curve = motion.knots(agent).curve()
+        t = (curve.time[:-1, None] + np.diff(curve.time)[:, None] * [0.0, 0.5]).ravel()
+        points = curve.at(np.append(t, curve.time[-1]))[:, :3]
+        places = geodesy.geodetic(points[_corners(points, tolerance)], origin)
+        items = [
+            _item(k, _TAKEOFF if k == 1 else _WAYPOINT, np.degrees(place[:2]), place[2] - origin[2])
+            for k, place in enumerate(places, start=1)
+        ]
+        home = [given.latitude_deg, given.longitude_deg, given.altitude]
+        yield (json.dumps(_plan(items, home), indent=1) + "\n").encode()
+
+
+def read_plan(data: bytes) -> Floats:
+    """The points (K, 3) [m] of a plan in axes east, north, up at its home position."""
+    mission = json.loads(data)["mission"]
+    latitude, longitude, altitude = mission["plannedHomePosition"]
+    places = np.array([item["params"][4:7] for item in mission["items"]], dtype=float)
+    places[:, :2] = np.radians(places[:, :2])
+    places[:, 2] += altitude
+    return geodesy.local(places, np.array([np.radians(latitude), np.radians(longitude), altitude]))
+
+
+def _plan(items: list[dict[str, Any]], home: list[float]) -> dict[str, Any]:
+    return {
+        "fileType": "Plan",
+        "version": 1,
+        "groundStation": "QGroundControl",
+        "geoFence": {"version": 2, "circles": [], "polygons": []},
+        "rallyPoints": {"version": 2, "points": []},
+        "mission": {
+            "version": 2,
+            "firmwareType": 12,
+            "vehicleType": 2,
+            "cruiseSpeed": 15,
+            "hoverSpeed": 5,
+            "plannedHomePosition": home,
+            "items": items,
+        },
+    }
+
+
+def _item(number: int, command: int, place: Floats, altitude: float) -> dict[str, Any]:
+    latitude, longitude = (round(float(x), 9) for x in place)
+    return {
+        "type": "SimpleItem",
+        "autoContinue": True,
+        "command": command,
+        "doJumpId": number,
+        "frame": _RELATIVE,
+        "params": [0, 0, 0, None, latitude, longitude, round(float(altitude), 4)],
+    }
+
+
+def _corners(points: Floats, tolerance: float) -> list[int]:
+    """Indices of the points (K, 3) whose polyline has all others within a tolerance [m] (Douglas and Peucker, 1973)."""
+    kept, open_ = {0, len(points) - 1}, [(0, len(points) - 1)]
+    while open_:
+        i, j = open_.pop()
+        if j - i < 2:
+            continue
+        off = to_segments(points[i + 1 : j], points[[i, j]])
+        if off.max() > tolerance:
+            k = i + 1 + int(off.argmax())
+            kept.add(k)
+            open_ += [(i, k), (k, j)]
+    return sorted(kept)
+
+
+def to_segments(points: Floats, corners: Floats) -> Floats:
+    """Distances (K,) of points (K, 3) to a polyline (n + 1, 3)."""
+    least = np.full(len(points), np.inf)
+    for a, b in pairwise(corners):
+        along = b - a
+        share = np.clip((points - a) @ along / max(along @ along, 1e-30), 0.0, 1.0)
+        least = np.minimum(least, np.linalg.norm(points - a - share[:, None] * along, axis=1))
+    return least

@@ -1,0 +1,174 @@
+"""Recordings for viewers and for ROS 2: MCAP with ROS 2 messages, and Rerun's .rrd.
+
+Sources: the definitions of `geometry_msgs` and `std_msgs` (ROS 2 common_interfaces), OMG's CDR as ROS 2 writes it
+(little-endian, fields aligned to their size), and MCAP's profile "ros2".
+"""
+
+from __future__ import annotations
+
+import io
+import struct
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from rigidfleet.interchange.curves import Curve, Motion, through
+from rigidfleet.typing import Floats
+
+_HEADER = """
+================================================================================
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+================================================================================
+MSG: builtin_interfaces/Time
+int32 sec
+uint32 nanosec
+"""
+_RULE = "=" * 80
+_POSE = f"""std_msgs/Header header
+geometry_msgs/Pose pose
+{_RULE}
+MSG: geometry_msgs/Pose
+geometry_msgs/Point position
+geometry_msgs/Quaternion orientation
+{_RULE}
+MSG: geometry_msgs/Point
+float64 x
+float64 y
+float64 z
+{_RULE}
+MSG: geometry_msgs/Quaternion
+float64 x
+float64 y
+float64 z
+float64 w{_HEADER}"""
+_TWIST = f"""std_msgs/Header header
+geometry_msgs/Twist twist
+{_RULE}
+MSG: geometry_msgs/Twist
+geometry_msgs/Vector3 linear
+geometry_msgs/Vector3 angular
+{_RULE}
+MSG: geometry_msgs/Vector3
+float64 x
+float64 y
+float64 z{_HEADER}"""
+#: Both messages in CDR: mark of little-endian CDR, stamp, length and text of the frame's name, numbers.
+_FRAME = b"map\0"
+_START = struct.Struct("<4siII4s")
+_CDR = b"\0\1\0\0"
+_BILLION = 1_000_000_000
+
+
+def write_mcap(motion: Motion, rate: float | None) -> Iterator[bytes]:
+    """One file: topics /agent_i/pose (PoseStamped) and /agent_i/twist (TwistStamped), in world axes, frame "map"."""
+    from mcap.writer import Writer
+
+    given = motion.at_rate(rate)
+    n = motion.n_agents
+    poses = np.concatenate([given.state[:, 0], _quaternions(given.yaw)], axis=2)
+    turning = np.zeros((*given.yaw.shape, 3))
+    turning[..., 2] = given.yaw_rate
+    twists = np.concatenate([given.state[:, 1], turning], axis=2)
+    buffer = io.BytesIO()
+    writer = Writer(buffer)
+    writer.start(profile="ros2", library="rigidfleet")
+    channels = []
+    for kind, words in (("pose", _POSE), ("twist", _TWIST)):
+        name = f"geometry_msgs/msg/{kind.capitalize()}Stamped"
+        schema = writer.register_schema(name=name, encoding="ros2msg", data=words.encode())
+        channels.append(
+            [writer.register_channel(f"/agent_{i + 1}/{kind}", "cdr", schema) for i in range(n)]
+        )
+    for k, t in enumerate(given.time.tolist()):
+        at = round(t * _BILLION)
+        start = _START.pack(_CDR, at // _BILLION, at % _BILLION, len(_FRAME), _FRAME)
+        for ids, rows in zip(channels, (poses[k], twists[k]), strict=True):
+            for channel, row in zip(ids, rows.astype("<f8"), strict=True):
+                writer.add_message(channel, at, start + row.tobytes(), at, k)
+    writer.finish()
+    yield buffer.getvalue()
+
+
+def read_mcap(data: bytes) -> list[Curve]:
+    """The ways in a file of `write_mcap`: cubics through its poses and twists."""
+    from mcap.reader import make_reader
+
+    found: dict[str, list[Floats]] = {}
+    for _, channel, message in make_reader(io.BytesIO(data)).iter_messages():
+        sec, nanosec = struct.unpack_from("<iI", message.data, 4)
+        numbers = np.frombuffer(message.data, "<f8", offset=_START.size)
+        found.setdefault(channel.topic, []).append(np.append(sec + nanosec / _BILLION, numbers))
+    curves = []
+    for i in range(1, len(found) // 2 + 1):
+        pose, twist = (np.array(found[f"/agent_{i}/{kind}"]) for kind in ("pose", "twist"))
+        yaw = np.stack([_yaws(pose[:, 4:]), twist[:, 6]])
+        curves.append(through(pose[:, 0], np.stack([pose[:, 1:4], twist[:, 1:4]]), yaw))
+    return curves
+
+
+def write_rrd(motion: Motion, rate: float | None) -> Iterator[bytes]:
+    """One recording: a frame that moves for each vehicle, with a ball of its radius, on the timeline "time"."""
+    import rerun as rr
+
+    given = motion.at_rate(rate)
+    recording = rr.RecordingStream("rigidfleet", recording_id=motion.result.mission.name)
+    stream = recording.binary_stream()
+    recording.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    times = rr.TimeColumn("time", duration=given.time)
+    quaternions = _quaternions(given.yaw)
+    for i, radius in enumerate(motion.result.mission.fleet.radius.tolist()):
+        name = f"vehicles/{i + 1}"
+        ball = rr.Points3D([[0.0, 0.0, 0.0]], radii=radius, labels=str(i + 1), show_labels=False)
+        recording.log(name, ball, static=True)
+        moved = rr.Transform3D.columns(
+            translation=given.state[:, 0, i], quaternion=quaternions[:, i]
+        )
+        recording.send_columns(name, [times], moved)
+    recording.flush()
+    data = stream.read()
+    recording.disconnect()
+    yield data or b""
+
+
+def read_rrd(data: bytes) -> list[Curve]:
+    """The ways in a recording of `write_rrd`: straight lines through its positions."""
+    from rerun.chunk import RrdReader
+
+    curves = {}
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "read.rrd")
+        path.write_bytes(data)
+        for chunk in RrdReader(str(path)).stream().to_chunks():
+            batch = chunk.to_record_batch()
+            if "Transform3D:translation" not in batch.schema.names:
+                continue
+            time = batch["time"].cast("int64").to_numpy() / _BILLION
+            columns = [
+                np.array(batch[f"Transform3D:{name}"].flatten().flatten()).reshape(len(time), -1)
+                for name in ("translation", "quaternion")
+            ]
+            position, quaternion = (x.astype(float) for x in columns)
+            number = int(chunk.entity_path.rpartition("/")[2])
+            parts = curves.setdefault(number, [])
+            parts.append(np.column_stack([time, position, quaternion]))
+    ways = []
+    for number in sorted(curves):
+        rows = np.concatenate(curves[number])
+        rows = rows[rows[:, 0].argsort()]
+        ways.append(through(rows[:, 0], rows[None, :, 1:4], _yaws(rows[:, 4:])[None]))
+    return ways
+
+
+def _quaternions(yaw: Floats) -> Floats:
+    """Quaternions (..., 4), scalar last, body to world, of turns about the vertical."""
+    zero = np.zeros_like(yaw)
+    return np.stack([zero, zero, np.sin(yaw / 2), np.cos(yaw / 2)], axis=-1)
+
+
+def _yaws(quaternions: Floats) -> Floats:
+    """Yaws (K,) [rad], without jumps, of quaternions (K, 4), scalar last, about the vertical."""
+    return np.unwrap(2.0 * np.arctan2(quaternions[:, 2], quaternions[:, 3]))

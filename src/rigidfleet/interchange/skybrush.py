@@ -1,0 +1,133 @@
+"""Skybrush show files (.skyc): a zip archive of JSON with cubic Bezier curves.
+
+Source: the types of Skybrush's show format (`ShowSpecification`, `Trajectory`, `YawControl`), and, for the location,
+`ShowLocation` of Skybrush Studio: [latitude, longitude] in 1e-7 deg, altitude in mm, and the direction of the show's
+x axis from north to east [deg], here east.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from rigidfleet.errors import ResultError
+from rigidfleet.interchange.curves import (
+    Curve,
+    Motion,
+    bernstein,
+    headings,
+    of_bernstein,
+    with_headings,
+)
+
+#: Greatest number of vehicles of a show.
+MOST = 5000
+#: Direction of the mission's x axis, east, from north [deg].
+_EAST = 90.0
+#: A constant date of the archive's entries, the earliest that zip has: the same show gives the same bytes.
+_DATE = (1980, 1, 1, 0, 0, 0)
+
+
+def write_skyc(motion: Motion, tolerance: float) -> Iterator[bytes]:
+    """One show: for each drone its home, a way of cubic curves, and its yaw.
+
+    Raises
+    ------
+    ResultError
+        There are more than `MOST` vehicles.
+    """
+    if motion.n_agents > MOST:
+        raise ResultError(f"a show has at most {MOST} drones, and this flight {motion.n_agents}.")
+    mission = motion.result.mission
+    drones, files = [], {}
+    for agent in range(motion.n_agents):
+        curve = motion.knots(agent).fitted(tolerance, orders=2).later(-motion.start)
+        name = f"agent {agent + 1}"
+        folder = f"drones/{name.replace(' ', '-')}"
+        points = _segments(curve)
+        files[f"{folder}/trajectory.json"] = {
+            "version": 1, "points": points, "takeoffTime": 0, "landingTime": points[-1][0]
+        }  # fmt: skip
+        times, yaws = headings(curve)
+        setpoints = np.column_stack([times.round(6), np.degrees(yaws).round(4)]).tolist()
+        files[f"{folder}/yaw.json"] = {"version": 1, "setpoints": setpoints}
+        settings = {
+            "name": name,
+            "home": points[0][1],
+            "landAt": points[-1][1],
+            "trajectory": {"$ref": f"./{folder}/trajectory.json#"},
+            "yawControl": {"$ref": f"./{folder}/yaw.json#"},
+        }
+        drones.append({"type": "generic", "settings": settings})
+    cues = [
+        {"name": phase.name, "time": round(phase.t_start - motion.start, 6)}
+        for phase in motion.result.phases
+        if motion.start <= phase.t_start < motion.end
+    ]
+    environment: dict[str, Any] = {"type": "outdoor"}
+    if (origin := mission.geodetic_origin) is not None:
+        place = [round(1e7 * origin.latitude_deg), round(1e7 * origin.longitude_deg)]
+        environment["location"] = {
+            "origin": [*place, round(1e3 * origin.altitude)], "orientation": _EAST
+        }  # fmt: skip
+    show = {
+        "version": 1,
+        "environment": environment,
+        "meta": {"title": mission.title or mission.name},
+        "settings": {"cues": {"version": 1, "items": cues}},
+        "swarm": {"drones": drones},
+    }
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        for path, content in {"show.json": show, **files}.items():
+            entry = zipfile.ZipInfo(path, _DATE)
+            archive.writestr(entry, json.dumps(content), zipfile.ZIP_DEFLATED)
+    yield buffer.getvalue()
+
+
+def read_skyc(data: bytes) -> list[Curve]:
+    """The ways in a show, from its time zero on. Yaw is on lines between its setpoints."""
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+
+        def found(value: Any) -> Any:
+            reference = value.get("$ref") if isinstance(value, dict) else None
+            if reference is None:
+                return value
+            return json.loads(archive.read(reference.removeprefix("./").removesuffix("#")))
+
+        drones = json.loads(archive.read("show.json"))["swarm"]["drones"]
+        settings = [drone["settings"] for drone in drones]
+        return [_curve(found(s["trajectory"]), found(s.get("yawControl"))) for s in settings]
+
+
+def _segments(curve: Curve) -> list[list[Any]]:
+    """Time, end point and inner control points of each cubic piece, and of the start; numbers to a micrometre."""
+    points = np.round(bernstein(curve.pieces[:, :3], np.diff(curve.time)), 6)
+    times = np.round(curve.time, 6)
+    segments: list[list[Any]] = [[times[0], points[0, :, 0].tolist(), []]]
+    for t, piece in zip(times[1:].tolist(), points, strict=True):
+        start, *inner, end = piece.T.tolist()
+        segments.append([t, end, [] if start == end == inner[0] == inner[1] else inner])
+    return segments
+
+
+def _curve(trajectory: dict[str, Any], yaw: dict[str, Any] | None) -> Curve:
+    points = trajectory["points"]
+    time = np.array([point[0] for point in points], dtype=float)
+    pieces = np.zeros((len(points) - 1, 4, 4))
+    for k, (begin, end) in enumerate(pairwise(points)):
+        control = np.array([begin[1], *end[2], end[1]])
+        for axis in range(3):
+            pieces[k, axis, : len(control)] = of_bernstein(control[:, axis], end[0] - begin[0])
+    curve = Curve(time, pieces)
+    if yaw is None:
+        pieces[:, 3] = np.nan
+        return curve
+    setpoints = np.array(yaw["setpoints"], dtype=float)
+    return with_headings(curve, setpoints[:, 0], np.radians(setpoints[:, 1]))
