@@ -42,6 +42,8 @@ exports: .venv/.interchange  ## Measure every export of three flights
 
 avoidance: .venv/.bench  ## Plan transitions and published problems, with proofs
 	@$(BIN)/python benchmarks/avoidance.py
+	@$(BIN)/python benchmarks/gaps.py
+	@$(BIN)/python benchmarks/crowds.py
 
 docs: .venv/.docs  ## Build the site into site/, with every figure on it
 	@$(BIN)/python docs/picture.py

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
+from matplotlib.patches import FancyArrowPatch, FancyBboxPatch, Rectangle
 
 from rigidfleet import physics
 from rigidfleet.formation.graphs import complete_graph
@@ -18,6 +18,9 @@ from rigidfleet.formation.shapes import slots
 from rigidfleet.math import attitude, pid
 from rigidfleet.math.constraint_jacobian import filter_factors
 from rigidfleet.math.rigid_body import kabsch
+from rigidfleet.mission import load_mission
+from rigidfleet.planning.preview import preview
+from rigidfleet.planning.timing import timed
 from rigidfleet.plotting.style import DASHES, FAINT, FLOWN, GREY, INK, PALETTE, TONES
 
 BLUE, ORANGE, GREEN, RED = PALETTE[:4]
@@ -421,7 +424,32 @@ def error_budget() -> Figure:
     return fig
 
 
+def way_found() -> Figure:
+    """The passage of narrow-passage-found from above, as it is found: formations at the ends of its phases."""
+    mission = timed(load_mission("narrow-passage-found"))
+    planned = [p for p in preview(mission)[0] if p.phase.startswith("through the passage")]
+    fig = Figure(figsize=(7.6, 3.6), layout="constrained")
+    ax = fig.add_subplot()
+    for thing in mission.obstacles:
+        if thing.kind == "box" and "wall" in thing.name:
+            low, high = np.array(thing.min), np.array(thing.max)
+            ax.add_patch(Rectangle((low[1], low[0]), *(high - low)[[1, 0]], color=FAINT))
+    for phase in planned:
+        for i, colour in enumerate(PALETTE[:3]):
+            ax.plot(*phase.position[:, i, [1, 0]].T, color=colour, linewidth=1.0, alpha=0.6)
+    stops = [planned[0].position[0], *(p.position[-1] for p in planned)]
+    along = planned[2].position[len(planned[2].position) // 2]
+    for places in (*stops, along):
+        ax.plot(*np.vstack([places, places[:1]])[:, [1, 0]].T, color=FLOWN, linewidth=1.2)
+        for x, colour in zip(places, PALETTE[:3], strict=True):
+            ax.plot(x[1], x[0], "o", color=colour, markersize=6)
+    ax.set(xlim=(44, 96), ylim=(52, 38), xlabel="y [m]", ylabel="x [m]")
+    ax.set_aspect("equal")
+    ax.spines[["top", "right"]].set_visible(False)
+    return fig
+
+
 DIAGRAMS: Sequence[Callable[[], Figure]] = (
     edge, frame, constraint_architecture, body_architecture, local_architecture, singular_line,
-    overshoot, solvers, blend, no_inverse, realisations, error_budget,
+    overshoot, solvers, blend, no_inverse, realisations, error_budget, way_found,
 )  # fmt: skip

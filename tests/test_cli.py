@@ -1029,3 +1029,20 @@ def test_progress_on_a_terminal(monkeypatch):
         now = 9.0
         assert f" 33% {console.COMPILING}: 9 s" in drawn()
     assert screen.getvalue().endswith("\x1b[2K")
+
+
+def test_found_ways_are_written_once(tmp_path, capsys):
+    """check --expand writes the mission with its ways, whole, and overwrites nothing unless forced."""
+    file = tmp_path / "found.toml"
+    asked = ["check", "narrow-passage-found", "--no-realisations", "--expand", str(file)]
+    assert cli.main(asked) == 0
+    written = file.read_text()
+    assert 'kind = "go"' not in written
+    assert 'formation = "line"' in written
+    assert f"wrote {file}" in capsys.readouterr().out
+    file.write_text("mine")
+    assert cli.main(asked) == 2
+    assert "--force" in capsys.readouterr().err
+    assert file.read_text() == "mine"
+    assert cli.main([*asked, "--force"]) == 0
+    assert file.read_text() == written

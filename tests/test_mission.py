@@ -40,6 +40,7 @@ SHIPPED = [
     "hexagon",
     "line-singular",
     "narrow-passage",
+    "narrow-passage-found",
     "passage-quadrotors",
     "pyramid",
     "show-1000",

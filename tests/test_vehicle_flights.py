@@ -9,6 +9,7 @@ import pytest
 
 import rigidfleet as rf
 from rigidfleet._common.text import percent
+from rigidfleet.math import attitude as att
 from rigidfleet.mission import Mission, load_mission
 from rigidfleet.planning.vehicles import TickTables, Turn, sampled_flight
 from rigidfleet.result import Result
@@ -447,3 +448,31 @@ def test_check_knows_the_integral_of_the_tracking(integral):
 def test_shares_in_per_cent(share, words):
     """Shares are told without powers of ten."""
     assert percent(share) == words
+
+
+@pytest.mark.parametrize("kind", ["formation", "fixed", "along"])
+def test_the_yaw_recorded_is_the_one_that_vehicles_are_asked_for(kind):
+    """Begun at another yaw, vehicles turn from there without a jump, and the record has this turn."""
+    result = rf.simulate(short(yaw={"kind": kind}, body_frame={"yaw_deg": 40.0}))
+    assert result.vehicle_attitude is not None
+    assert result.yaw is not None
+    T = att.dcm_from_quaternion(result.vehicle_attitude)
+    known = np.isfinite(result.yaw)
+    flown = np.arctan2(T[..., 0, 1], T[..., 0, 0])
+    off = np.degrees(np.abs((flown - result.yaw + np.pi) % (2.0 * np.pi) - np.pi))
+    assert known.any()
+    assert off[known].max() < 3.0
+    first = np.argmax(known[:, 0])
+    assert np.degrees(result.yaw[first]) == pytest.approx(40.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("inertia", [1e-9, 1e-6])
+def test_what_grows_beyond_all_bounds_is_judged_up_to_there(inertia):
+    """A vehicle that its own attitude control tears apart has an incomplete flight, and finite numbers."""
+    vehicles = {"drone": {"model": "paper", "inertia": [inertia] * 3}}
+    verdict = rf.assess(rf.simulate(short(vehicles=vehicles, obstacles=[{"kind": "ground"}])))
+    failed = {c.check: c for c in verdict.checks if not c.passed}
+    assert "complete" in failed
+    assert "record" not in failed
+    assert all(c.worst is None or math.isfinite(c.worst) for c in verdict.checks)
+    assert "inf" not in " ".join(c.message for c in verdict.checks)

@@ -158,9 +158,12 @@ class PhaseRecord:
         (distance of a lost vehicle to one that still flies), geofence (distance beyond it), lowest, highest [m];
         speed [m/s]; acceleration [m/s^2]; thrust, thrust_margin (thrust minus its limit), constraint_force, tension
         [N]; constraint [m]; of vehicles also rotor_force [N] (of the rotor nearest to its limit), tilt [rad],
-        tracking_error [m] and saturation (share of the phase). If vehicles stand on obstacles, clearance is also
-        given for those that have stood on one since the start (clearance_start), for those in flight
-        (clearance_flight), and for those that stand on one until the end (clearance_end). Empty if only samples are
+        tracking_error [m] and saturation (share of the phase). With [avoidance] also barrier and guard (greatest share
+        of the phase in which they acted on a vehicle, and since when), guarantee and clearance_guarantee (least margin
+        of stop segments [m]) and, where it was negative, the first such: guarantee_lost, clearance_guarantee_lost. If
+        vehicles stand on obstacles, clearance is also given for those that have stood on one since the start
+        (clearance_start), for those in flight (clearance_flight), and for those that stand on one until the end
+        (clearance_end). Empty if only samples are
         known
     """
 
@@ -730,7 +733,7 @@ for _name in (
 
 _INTEGERS = {name for name in VARIABLES if _HINTS[name].__origin__ in (Ints, Ints | None)}
 #: Quantities whose minimum is the worst value. The same holds for all clearances.
-_LEAST = frozenset(("separation", "separation_below", "lost", "lowest"))
+_LEAST = frozenset(("separation", "separation_below", "lost", "lowest", "guarantee"))
 
 
 #: Attributes of a file and their types. Types other than int and str are stored as JSON.

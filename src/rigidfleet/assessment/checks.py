@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 
 from rigidfleet._common.text import agent_names
+from rigidfleet.assessment.avoidance import avoidance_notes, guarantee_checks
 from rigidfleet.assessment.measure import Measurements, angle_between, is_rigid
 from rigidfleet.assessment.outcome import (
     DIP,
@@ -66,6 +67,7 @@ def all_checks(measured: Measurements, verdict: Verdict) -> Iterator[CheckResult
     yield _bounded("acceleration", worst.get("acceleration"), "m/s^2", limits.acceleration)
     yield from _thrust(measured, worst.get("thrust"))
     yield from vehicle_checks(measured)
+    yield from guarantee_checks(measured)
     units = {"constraint": "m", "constraint_force": "N", "tension": "N", "singular_value": ""}
     yield from (_bounded(name, worst[name], units[name], None) for name in units if name in worst)
 
@@ -454,6 +456,7 @@ def notes(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[str]:
             who = agent_names(np.flatnonzero(full.any(axis=0)))
             since = measured.first(full.max(axis=1))
             yield f"the thrust of {who} saturates at its limit, first at {since:.2f} s"
+    yield from avoidance_notes(measured)
     yield from _sampled(measured)
 
 

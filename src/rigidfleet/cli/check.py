@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from rigidfleet.cli import console
-from rigidfleet.errors import MissionError
+from rigidfleet.errors import MissionError, ResultError
 
 if TYPE_CHECKING:
     from rigidfleet.mission import Mission
@@ -21,6 +21,8 @@ def check(
     *,
     realisations: Annotated[bool | None, Parameter(negative="--no-realisations")] = None,
     figure: Path | None = None,
+    expand: Path | None = None,
+    force: bool = False,
     json: bool = False,
 ) -> int:
     """Check a mission without flying it.
@@ -37,16 +39,31 @@ def check(
         for up to 12 agents.
     figure : Path
         Draw the graphs to this file (.png, .svg or .pdf): redundant edges dashed, free motions as arrows.
+    expand : Path
+        Write the mission to this file (.toml) with the ways that are found for it as ordinary phases, to read, copy
+        and edit. Comments are not kept.
+    force : bool
+        Overwrite this file if it exists.
     json : bool
         Print the result as JSON.
     """
+    from rigidfleet._common.files import write_file
+    from rigidfleet._common.toml import to_toml
     from rigidfleet.mission import ending, goal, load_mission
-    from rigidfleet.planning.timing import timed
+    from rigidfleet.planning.timing import spelled_out, timed
 
+    if expand is not None and expand.exists() and not force:
+        raise ResultError(
+            f"{expand}: already exists; use --force to overwrite or give another path."
+        )
     watch = console.CheckWatch(mission)
     try:
         with watch:
-            found = timed(load_mission(mission))
+            found = load_mission(mission)
+            if expand is not None:
+                found = spelled_out(found)
+                write_file(expand, to_toml(found.to_dict()).encode())
+            found = timed(found)
     except MissionError as error:
         if not json:
             raise
@@ -78,6 +95,8 @@ def check(
     if ahead.remarks:
         console.out().print()
         console.print_words((remark.level, remark.text) for remark in ahead.remarks)
+    if expand is not None:
+        console.out().print(f"\nwrote {expand}")
     verdict = "no problems found" if ahead.passed else "the flight will fail"
     console.out().print(f"\n{found.name}: {verdict}", style=None if ahead.passed else "bold red")
     return PASSED if ahead.passed else FAILED

@@ -280,6 +280,8 @@ class SampledSegment(NamedTuple):
     recorder: int  # address of the recorder, with its arguments
     segment: int
     record: int
+    guard: int  # address of avoidance in flight, and of its record; 0 for none
+    avoidance: int
     times: Floats  # (K,) [s], increasing
     S: Floats  # (K, N, 17)
     dS: Floats  # (K, N, 17) derivative
@@ -479,7 +481,7 @@ def segment(
     at = np.ascontiguousarray(times, dtype=float)
     k = len(at)
     return SampledSegment(
-        t_end, max_steps, 0, 0, 0, at, np.empty((k, n, STATES)), np.empty((k, n, STATES)), np.empty((k, n, 4)),
+        t_end, max_steps, 0, 0, 0, 0, 0, at, np.empty((k, n, STATES)), np.empty((k, n, STATES)), np.empty((k, n, 4)),
         np.empty((k, n, 3)), np.empty((k, n, 3)), np.empty((k, n, 6)), np.empty((k, n, 3)),
         np.empty((k, n), dtype=np.bool_), np.empty((k, m)), np.empty((k, 4)),
     )  # fmt: skip

@@ -214,7 +214,7 @@ def presume(k, t, w, flight, state):
 
 @compiled
 def desire(k, t, p, w, flight, state, call):
-    """Desired forces of all vehicles at tick k, time t [s]; returns False if the law gives none (a singular law)."""
+    """Desired forces of all vehicles at tick k, time t [s]; returns False if there are none (a singular law)."""
     n, dt = state.S.shape[0], flight.every * flight.steps * flight.h
     advance_frame(t, p, state)
     linked = flight.sensing.linked
@@ -242,6 +242,8 @@ def desire(k, t, p, w, flight, state, call):
     for i in range(n):
         for q in range(3):
             total += state.force[i, q]
+    if abs(total) < math.inf and call.guard != 0:
+        return call_recorder(call.guard, flight, state, call.avoidance, 0) != 0
     return abs(total) < math.inf
 
 

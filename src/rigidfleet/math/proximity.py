@@ -232,14 +232,20 @@ def separation_of_left(r: Floats, radius: ArrayLike, left: Bools) -> tuple[Float
 
 
 def obstacle_clearances(
-    r: Floats, radius: ArrayLike, obstacles: Sequence[Obstacle], time: ArrayLike = 0.0
+    r: Floats,
+    radius: ArrayLike,
+    obstacles: Sequence[Obstacle],
+    time: ArrayLike = 0.0,
+    most: ArrayLike = np.inf,
 ) -> tuple[Floats, Ints]:
     """Least distance (..., N) [m] of agents r (..., N, 3) to an obstacle, and the obstacle; infinity and -1 without.
 
-    Obstacles that move are where they are at ``time`` (...) [s].
+    Obstacles that move are where they are at ``time`` (...) [s]. Distances beyond ``most`` (..., N) [m] need not be
+    known: these are ``most``, without an obstacle.
     """
     radius = np.asarray(radius, dtype=float)
-    least, nearest = np.full(r.shape[-2::-1], np.inf), np.full(r.shape[-2::-1], -1)
+    nearest = np.full(r.shape[-2::-1], -1)
+    least = np.broadcast_to(np.asarray(most, dtype=float).T, nearest.shape).copy()
     # Axis by axis, in rows of samples, which is faster.
     places = np.ascontiguousarray(r.T) if obstacles else r.T
     radius = radius.reshape(-1, *[1] * (r.ndim - 2))

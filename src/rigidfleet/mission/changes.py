@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from rigidfleet.mission.kinds import Phase
+from rigidfleet.mission.kinds import Go, Phase
 from rigidfleet.mission.schema import Formation
 
 
@@ -43,3 +43,36 @@ def told_apart(
         told.append(phase if name == written else phase.model_copy(update={"formation": name}))
         before = name
     return known, tuple(told)
+
+
+def scaled(
+    formations: Mapping[str, Formation], phases: Sequence[Phase], n: int
+) -> dict[str, Formation]:
+    """Formations with those added that phases of kind "go" may shrink: "NAME x 0.8"."""
+    known = dict(formations)
+    asked = [phase for phase in phases if isinstance(phase, Go)]
+    for phase in asked:
+        for scale in phase.scales:
+            for name, form in formations.items():
+                slots = form.slot_array(n)
+                if slots is None or (phase.formations is not None and name not in phase.formations):
+                    continue
+                lengths = form.distances
+                smaller = None if lengths is None else tuple(scale * x for x in lengths)
+                edges = form.edges
+                if isinstance(edges, str) and edges != "complete":  # rounding must not change them
+                    edges = tuple(map(tuple, (form.edge_array(n) + 1).tolist()))
+                shrunk = {
+                    "edges": edges,
+                    "shape": None,
+                    "size": None,
+                    "slots": tuple(map(tuple, (scale * slots).tolist())),
+                    "distances": smaller,
+                }
+                known[scaled_name(name, scale)] = form.model_copy(update=shrunk)
+    return known
+
+
+def scaled_name(name: str, scale: float) -> str:
+    """Name of a formation that is shrunk by a factor."""
+    return f"{name} x {scale:g}"

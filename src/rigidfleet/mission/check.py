@@ -15,7 +15,15 @@ import numpy as np
 from rigidfleet.errors import MissionError
 from rigidfleet.formation.graphs import count_within
 from rigidfleet.formation.shapes import SHAPES
-from rigidfleet.mission import bounds, disturbances, formations, obstacles, phases, vehicles
+from rigidfleet.mission import (
+    avoidance,
+    bounds,
+    disturbances,
+    formations,
+    obstacles,
+    phases,
+    vehicles,
+)
 from rigidfleet.mission.files import NOT_A_FILE
 from rigidfleet.mission.findings import FindingCollector, Keys, near_shape
 from rigidfleet.mission.obstacles import Box, Obstacle
@@ -23,6 +31,7 @@ from rigidfleet.mission.schema import (
     Agents,
     Allocation,
     Autopilot,
+    Avoidance,
     BodyFrame,
     Constraint,
     Contents,
@@ -50,6 +59,7 @@ _TABLES: dict[str, type[Part]] = {
     "body_frame": BodyFrame,
     "limits": Limits,
     "autopilot": Autopilot,
+    "avoidance": Avoidance,
     "yaw": VehicleYaw,
     "geodetic_origin": GeodeticOrigin,
     "disturbances": Disturbances,
@@ -79,6 +89,7 @@ def check(data: Mapping[str, Any], origin: str) -> dict[str, Any]:
     parts["phases"] = phases.check(collector, parts, n)
     disturbances.check(collector, parts, n)
     vehicles.check_flight(collector, parts)
+    avoidance.check(collector, parts)
     if collector.findings:
         raise MissionError(collector.findings)
     return parts

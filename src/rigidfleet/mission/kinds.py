@@ -19,8 +19,10 @@ from rigidfleet.mission.values import (
     Dwell,
     Force,
     Length,
+    LengthOrZero,
     Part,
     Rates,
+    Scale,
     Time,
     Tolerance,
     Vector,
@@ -55,6 +57,8 @@ class AnyPhase(Part):
     #: Whether the phase leads from or to the ground, so that the mission needs one; whether it ends there.
     grounded: ClassVar[bool] = False
     lands: ClassVar[bool] = False
+    #: Whether other phases take its place before the flight, so that it cannot begin in flight.
+    replaced: ClassVar[bool] = False
     #: Default control in architecture "body".
     body_control: ClassVar[str] = "body"
 
@@ -327,6 +331,33 @@ class Fly(Steering):
         return ", ".join([_vector(self.position, "m"), *velocity, *([rest] if rest else [])])
 
 
+class Go(Attitude, AnyPhase):
+    """Fly to a pose on a way that is found round obstacles. The way replaces the phase before the flight."""
+
+    moves: ClassVar[bool] = True
+    replaced: ClassVar[bool] = True
+    body_control: ClassVar[str] = "tracking"
+
+    kind: Literal["go"] = Field(description="fly to a pose, on a way that is found round obstacles")
+    position: Vector = Field(description="centre of mass at arrival [x, y, z] [m]")
+    clearance: LengthOrZero = Field(
+        0.2, description="least distance of vehicles from obstacles on the planned way [m]"
+    )
+    formations: tuple[str, ...] | None = Field(
+        None,
+        description="formations that may be taken on the way; default: all that have slots. The phase ends in the "
+        "formation in which it begins",
+    )
+    scales: tuple[Scale, ...] = Field(
+        (), description="factors by which formations may shrink on the way, below 1; default: none"
+    )
+
+    @property
+    def leads_to(self) -> str:
+        """The position and the attitude."""
+        return ", ".join([_vector(self.position, "m"), *self.angles])
+
+
 class Turn(Steering):
     """Turn on the spot to an attitude. At least one angle is required."""
 
@@ -500,7 +531,7 @@ def _vector(values: Sequence[float], unit: str) -> str:
 
 
 Phase = Annotated[
-    Establish | Fly | Reshape | Turn | Orbit | Hold | Brake | Takeoff | Land,
+    Establish | Fly | Go | Reshape | Turn | Orbit | Hold | Brake | Takeoff | Land,
     Field(discriminator="kind"),
 ]
 #: Models of all phases by `kind`.

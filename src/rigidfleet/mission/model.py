@@ -21,7 +21,7 @@ from rigidfleet.formation.distance_geometry import distances
 from rigidfleet.math import constraint_jacobian
 from rigidfleet.math.attitude import dcm_from_euler
 from rigidfleet.mission import bounds
-from rigidfleet.mission.changes import told_apart
+from rigidfleet.mission.changes import scaled, told_apart
 from rigidfleet.mission.check import check
 from rigidfleet.mission.describe import counted
 from rigidfleet.mission.files import completed
@@ -96,6 +96,8 @@ class Mission(Contents):
         parts = check(parse_toml(text, origin), origin)
         if parts["assignment"] == "each":
             parts["formations"], parts["phases"] = told_apart(parts["formations"], parts["phases"])
+        n = len(parts["agents"].position)
+        parts["formations"] = scaled(parts["formations"], parts["phases"], n)
         mission = cls.model_construct(**parts)
         mission._text, mission._origin = text, origin
         return mission

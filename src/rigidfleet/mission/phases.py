@@ -23,6 +23,7 @@ from rigidfleet.mission.kinds import (
     AnyPhase,
     Brake,
     Establish,
+    Go,
     Orbit,
     Reshape,
     Shaping,
@@ -325,9 +326,9 @@ def _orbit(collector: FindingCollector, p: Orbit, path: Keys, longest: float | N
 
 
 def _led(
-    collector: FindingCollector, p: Brake | Vertical, path: Keys, longest: float | None
+    collector: FindingCollector, p: Brake | Go | Vertical, path: Keys, longest: float | None
 ) -> None:
-    """Check that a brake, a take-off or a landing has tracked slots and an end."""
+    """Check that a brake, a take-off, a landing or a way to be found has tracked slots and an end."""
     kind_name = collector.data["phases"][path[1]]["kind"]
     if p.control == "body" and collector.right(path, "control"):
         problem = f"kind '{kind_name}' cannot be flown by a wrench on the virtual body"
@@ -356,6 +357,13 @@ def _vertical(collector: FindingCollector, p: Vertical, path: Keys, longest: flo
         collector.add(where, problem, "give its duration in seconds")
 
 
+def _go(collector: FindingCollector, p: Go, path: Keys, longest: float | None) -> None:
+    """Check that a way can be found and flown: tracked slots, an end, and formations that exist."""
+    _led(collector, p, path, longest)
+    for name in p.formations or ():
+        _exists(collector, name, path, "formations")
+
+
 #: Checks of single kinds. Arguments: the findings, the phase, its path, its maximum duration [s] or None.
 def _reshape(collector: FindingCollector, p: Reshape, path: Keys, _: float | None) -> None:
     """Check that ways other than straight ones can be found and flown."""
@@ -380,6 +388,7 @@ _OWN: dict[str, Callable[[FindingCollector, Any, Keys, float | None], None]] = {
     "brake": _led,
     "establish": _establish,
     "land": _vertical,
+    "go": _go,
     "orbit": _orbit,
     "reshape": _reshape,
     "takeoff": _vertical,
@@ -442,13 +451,11 @@ def _formations(
             collector.add((*path, "control"), problem, remedy, p.control)
 
 
-def _exists(collector: FindingCollector, name: str, path: Keys) -> None:
+def _exists(collector: FindingCollector, name: str, path: Keys, key: str = "formation") -> None:
     known = collector.data.get("formations", {})
     if isinstance(known, dict) and name not in known:
         names = f"formations: {', '.join(known)}" if known else "add a table [formations.NAME]"
-        collector.add(
-            (*path, "formation"), "there is no such formation", near(name, known) or names
-        )
+        collector.add((*path, key), "there is no such formation", near(name, known) or names, name)
 
 
 def _blendable(
@@ -549,7 +556,7 @@ def _automatic(
     if p.control != "tracking":
         problem = f"needs tracked slots to have a least time, not control '{p.control}'"
         collector.add(where, problem, "use control = 'tracking', or give a time")
-    if p.duration == AUTO and p.steering is p.shaping is p.vertical is None:
+    if p.duration == AUTO and not (p.steering or p.shaping or p.vertical or isinstance(p, Go)):
         problem = (
             f"a phase of kind '{collector.data['phases'][path[1]]['kind']}' has no least duration"
         )

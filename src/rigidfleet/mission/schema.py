@@ -184,6 +184,40 @@ class Autopilot(Part):
     )
 
 
+class Avoidance(Part):
+    """Avoidance in flight, at the rate of the formation's laws; see docs/avoidance.md. Only with [vehicles]."""
+
+    guard: Flag = Field(
+        True,
+        description="true: a vehicle does only what leaves all of them able to brake in time",
+    )
+    barrier: Flag = Field(
+        True,
+        description="true: barriers change accelerations early and as little as possible, and edges of a formation let "
+        "go near them",
+    )
+    separation: LengthOrZero | None = Field(
+        None, description="separation of agents to keep [m]; default: that of [limits], or 0"
+    )
+    clearance: LengthOrZero = Field(
+        0.0, description="distance of an agent's surface from obstacles to keep [m]"
+    )
+    margin: LengthOrZero | None = Field(
+        None,
+        description="by which each agent is taken to be larger [m]; default: 0, or three times the noise of positions",
+    )
+    rate: Annotated[float, Strict(), Field(gt=0, le=100)] = Field(
+        3.0,
+        description="rate at which a barrier is approached [1/s]: lower, and vehicles give way earlier",
+    )
+    share: Annotated[float, Strict(), Field(gt=0, le=1)] = Field(
+        0.9, description="share of the vehicles' braking that barriers plan with [-]"
+    )
+    release: Annotated[float, Strict(), Field(ge=0.01, le=60)] = Field(
+        0.5, description="time in which edges let go near a barrier, and take hold again [s]"
+    )
+
+
 class Agents(Part):
     """The vehicles of the fleet. After the check, each field has one entry per agent."""
 
@@ -680,6 +714,9 @@ class Contents(MissionHeader):
     )
     autopilot: Autopilot = Field(
         default_factory=Autopilot, description="sampled control on board: [autopilot]"
+    )
+    avoidance: Avoidance | None = Field(
+        None, description="barriers and guard in flight: [avoidance]"
     )
     constraint: Constraint = Field(
         default_factory=Constraint, description="the constraint force: [constraint]"

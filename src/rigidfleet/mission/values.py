@@ -129,6 +129,7 @@ PerAxis = Annotated[
 Small = Annotated[float, Strict(), Field(ge=1e-15, le=1.0)]
 Coefficient = Annotated[float, Strict(), Field(ge=0, le=1e3)]
 Delay = Annotated[float, Strict(), Field(ge=0, le=10)]
+Scale = Annotated[float, Strict(), Field(ge=0.1, lt=1.0)]
 Share = Annotated[float, Strict(), Field(ge=0, le=0.95)]
 Rate = Annotated[float, Strict(), Field(ge=1, le=100_000)]
 Tilt = Annotated[float, Strict(), Field(gt=0, lt=90)]

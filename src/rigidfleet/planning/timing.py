@@ -14,6 +14,7 @@ from rigidfleet.errors import Finding, MissionError
 from rigidfleet.mission import Fly, Mission, Phase
 from rigidfleet.mission.kinds import Orbit, Shaping, Steering, Vertical
 from rigidfleet.mission.values import AUTO
+from rigidfleet.planning import ways
 from rigidfleet.planning.courses import SmoothFlight, course
 from rigidfleet.planning.limits import Reached, limits_of, reached
 from rigidfleet.planning.preview import Leg, at_start, leg
@@ -35,13 +36,26 @@ _MARGIN, _UNIT = 1.005, 1e-3
 SLACK = 1e-3
 
 
+def spelled_out(mission: Mission) -> Mission:
+    """Return a mission whose transitions (`transitions.expanded`) and ways (`ways.found`) are phases of their own.
+
+    A mission with neither is returned as it is. The result's text is that of these phases; automatic times stay so.
+
+    Raises
+    ------
+    MissionError
+        No transition keeps the separation, or no way is found.
+    """
+    return ways.found(expanded(mission), with_times)
+
+
 def timed(mission: Mission) -> Mission:
-    """Return a mission whose transitions are phases of their own (`transitions.expanded`), with its times known.
+    """Return a mission whose transitions and ways are phases of their own (`spelled_out`), with its times known.
 
     Automatic times are replaced by the least ones. A mission with neither is returned as it is.
 
     Times follow from the planned state at the start of each phase; a phase before that ends by settling is assumed to
-    have arrived. The mission keeps its own text, so that a result repeats from it.
+    have arrived. The text is that of `spelled_out`, so that a result repeats from it.
 
     Raises
     ------
@@ -49,7 +63,7 @@ def timed(mission: Mission) -> Mission:
         No transition keeps the separation, no time of a phase keeps the limits, its start is not known before the
         flight, or a phase ends too early for the times before it.
     """
-    mission = expanded(mission)
+    mission = spelled_out(mission)
     last = max((k for k, phase in enumerate(mission.phases) if phase.automatic), default=None)
     if last is None:
         return mission

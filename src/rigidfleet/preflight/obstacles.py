@@ -7,10 +7,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from rigidfleet.math import proximity
 from rigidfleet.mission import Box, Ground, Mission, Obstacle
-from rigidfleet.planning.derivatives import slot_derivatives
-from rigidfleet.planning.preview import PlannedPhase
+from rigidfleet.planning.clearance import CLOSE, closest, pace
 from rigidfleet.preflight.findings import Preflight, Remark, some
 from rigidfleet.solids.records import extent
 from rigidfleet.typing import Floats
@@ -23,10 +21,6 @@ _MET = 50_000
 _PASSED = 100_000_000
 #: Maximum number of obstacles whose clearance is reported; the nearest ones.
 _NEAREST = 20
-#: Accuracy of a planned clearance [m].
-_CLOSE = 1e-3
-#: Greatest number of times that the time between two samples is halved, and of positions in one such step.
-_HALVINGS, _OPEN = 16, 200_000
 
 
 def obstacle_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
@@ -40,7 +34,7 @@ def obstacle_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     )
     far = np.stack([_beyond(within, thing) for thing in mission.obstacles], axis=1) - radius.max()
     held, met, skipped = 0, 0, []
-    paces = [_pace(planned) for planned in way]
+    paces = [pace(planned) for planned in way]
     near = np.argsort(far.min(axis=0), kind="stable")
     shown: dict[int, tuple[float, float, int, str]] = {}
     remarks: dict[int, list[Remark]] = {}
@@ -56,9 +50,9 @@ def obstacle_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
             held, met = held + planned.position[:, :, 0].size, met + 1
             if held > _HELD or met > _MET:
                 break
-            clearance, agent, time = _closest(planned, thing, radius, paces[k])
+            clearance, agent, time = closest(planned, thing, radius, paces[k])
             # Among equal minima, take the first one: ignore rounding and the last millimetre of a rest.
-            if clearance < worst.get(planned.exact, (np.inf,))[0] - _CLOSE:
+            if clearance < worst.get(planned.exact, (np.inf,))[0] - CLOSE:
                 worst[planned.exact] = (clearance, time, agent, planned.phase)
         if held > _HELD or met > _MET:
             skipped = near[rank:][far[:, near[rank:]].min(axis=0) <= 0].tolist()
@@ -90,57 +84,6 @@ def _beyond(within: Floats, thing: Obstacle) -> Floats:
     low, high = extent(thing.solid)
     apart = np.maximum(np.maximum(within[:, 0] - high, low - within[:, 1]), 0.0)
     return np.linalg.norm(apart, axis=1)
-
-
-def _closest(
-    planned: PlannedPhase, thing: Obstacle, radius: Floats, pace: tuple[Floats, float]
-) -> tuple[float, int, float]:
-    """Least clearance [m] of a planned phase to an obstacle in continuous time, exact to `_CLOSE`; agent, and time [s].
-
-    Between two samples a distance falls by no more than the way that is flown relative to the obstacle. Where that
-    leaves room for less than the least one found, the plan is evaluated in the middle, and so on. Speeds are bounded by
-    those at both ends and by accelerations up to twice the greatest one at a sample of the phase.
-    """
-    time, moves = planned.time, thing.solid.moves
-    each, _ = proximity.obstacle_clearances(planned.position, radius, [thing], time)
-    k, i = np.unravel_index(int(each.argmin()), each.shape)
-    best, agent, when = float(each[k, i]), int(i), float(time[k])
-    speed, most = pace
-    first, length = time[:-1], np.diff(time)
-    near, far = each[:-1], each[1:]
-    for _ in range(_HALVINGS):
-        way = (speed + 0.5 * most * length[:, None]) * length[:, None]
-        if moves:
-            way = way + _way(thing, first, first + length)[:, None]
-        open_ = np.flatnonzero((0.5 * (near + far - way)).min(axis=1) < best - _CLOSE)
-        if not len(open_) or len(open_) * each.shape[1] > _OPEN:
-            break
-        first, length, speed = first[open_], 0.5 * length[open_], speed[open_]
-        middle = first + length
-        r = slot_derivatives(planned.leg.reference, planned.leg.motion, middle, 1)[:, 0]
-        between, _ = proximity.obstacle_clearances(r, radius, [thing], middle)
-        k, i = np.unravel_index(int(between.argmin()), between.shape)
-        if between[k, i] < best:
-            best, agent, when = float(between[k, i]), int(i), float(middle[k])
-        near, far = np.concatenate([near[open_], between]), np.concatenate([between, far[open_]])
-        first, length = np.concatenate([first, middle]), np.tile(length, 2)
-        speed = np.tile(speed, (2, 1))
-    return best, agent, when
-
-
-def _pace(planned: PlannedPhase) -> tuple[Floats, float]:
-    """Greatest speed (K - 1, N) [m/s] at the ends of each time between samples, and bound of accelerations [m/s^2]."""
-    speed = np.linalg.norm(planned.velocity, axis=2)
-    most = 2.0 * float(np.linalg.norm(planned.acceleration, axis=2).max())
-    return np.maximum(speed[:-1], speed[1:]), most
-
-
-def _way(thing: Obstacle, begin: Floats, end: Floats) -> Floats:
-    """Greatest way (L,) [m] of an obstacle between times (L,) [s]: its greatest speed counts wherever it moves."""
-    solid = thing.solid
-    pace = np.linalg.norm(np.diff(solid.ways, axis=0), axis=1) / np.diff(solid.times)
-    within = (solid.times[:-1] < end[:, None]) & (solid.times[1:] > begin[:, None])
-    return np.where(within, pace, 0.0).max(axis=1) * (end - begin)
 
 
 def _too_low(mission: Mission, found: Preflight, phase: str, ground: float) -> str:

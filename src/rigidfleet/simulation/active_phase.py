@@ -370,4 +370,4 @@ class ActivePhase:
         plan = self.plan
         if plan.problem.control.kind != TRACKING or not len(times):
             return ()
-        return ((times[0], plan.problem.reference, plan.problem.motion),)
+        return ((times[0], plan.problem.reference, plan.problem.motion, None),)

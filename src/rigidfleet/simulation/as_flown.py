@@ -58,7 +58,17 @@ def with_phase(
     else:
         data["phases"] = []
     data["phases"] = [*data["phases"], dict(table)]
-    return Mission.from_dict(data, "begin()").phases[-1]
+    phase = Mission.from_dict(data, "begin()").phases[-1]
+    _check_flown(phase)
+    return phase
+
+
+def _check_flown(phase: Phase) -> None:
+    """See that a phase has a flight of its own."""
+    if phase.replaced:
+        problem = "finds its way before the flight, and cannot begin by hand"
+        remedy = "use kind 'fly', or put it into the mission"
+        raise MissionError([Finding("begin()", "kind", phase.kind, problem, remedy)])
 
 
 def check_formation(mission: Mission, phase: Phase) -> None:
@@ -69,12 +79,13 @@ def check_formation(mission: Mission, phase: Phase) -> None:
     TypeError
         It is no phase.
     MissionError
-        The mission has no such formation, or the formation has no slots to track.
+        The mission has no such formation, the formation has no slots to track, or the phase has no flight of its own.
     """
     if not isinstance(phase, tuple(KINDS.values())):
         raise wrong_type(
             "a phase (a table as in a mission file, or one of a mission's phases)", phase
         )
+    _check_flown(phase)
     shaping = phase.shaping
     if shaping is None:
         return

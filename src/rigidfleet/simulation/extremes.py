@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rigidfleet.kernel import fleet, records
+from rigidfleet.kernel import avoidance, fleet, records
 from rigidfleet.kernel.engine import native
 from rigidfleet.kernel.problem import Problem, Workspace
 from rigidfleet.math import attitude as att
@@ -90,6 +90,7 @@ class Extremes:
         self.spare, self.moved = 0.0, np.zeros(2)
         self.trail = records.NO_TRAIL
         self.of_vehicles: dict[str, Extremum] = {}
+        self.avoidance: avoidance.Avoidance | None = None  # that of the phase under way
         self._list_all()
 
     def begin(self, states: int, edges: int) -> records.Trail:
@@ -200,6 +201,30 @@ class Extremes:
         found["saturation"] = Extremum(float(share[i]), float(state.clock[0]), i, -1)
         self.of_vehicles = found
 
+    def _avoided(self) -> dict[str, Extremum]:
+        """What avoidance in flight has recorded of the phase so far, by name."""
+        given, found = self.avoidance, dict[str, Extremum]()
+        if given is None:
+            return found
+        ticks = max(int(given.count[avoidance.TICKS]), 1)
+        for name, kind in (("barrier", avoidance.BARRIER), ("guard", avoidance.GUARD)):
+            acted = given.acted[kind]
+            i = int(acted.argmax())
+            if acted[i]:
+                first = float(given.first[kind].min())
+                found[name] = Extremum(int(acted[i]) / ticks, first, i, -1)
+        for name, kind in (
+            ("guarantee", avoidance.PAIR),
+            ("clearance_guarantee", avoidance.OBSTACLE),
+        ):
+            (value, t), who = given.margin[kind].tolist(), given.between[kind].tolist()
+            if math.isfinite(value):
+                found[name] = Extremum(value, t, *who)
+            (t, value), who = given.lost[kind].tolist(), given.loser[kind].tolist()
+            if math.isfinite(t):
+                found[f"{name}_lost"] = Extremum(value, t, *who)
+        return found
+
     def _take_first(self, kind: int, values: Floats, times: Floats, who: Ints) -> None:
         """Take the least of the agents' values into account; of equal ones, the first in time."""
         if len(who) and (value := float(values.min())) < self.worst[kind]:
@@ -209,14 +234,14 @@ class Extremes:
     def so_far(self) -> dict[str, Extremum]:
         """Extremes of the phase under way, by name."""
         every = ((name, self._extremum(name, k)) for name, k in _NAMES.items())
-        return {name: x for name, x in every if x is not None} | self.of_vehicles
+        return {name: x for name, x in every if x is not None} | self.of_vehicles | self._avoided()
 
     def phase(self) -> dict[str, Extremum]:
         """Extremes of the phase that ends, by name; start those of the next one."""
         found = self.so_far()
         self.worst[list(_NAMES.values())] = np.inf
         self.moved[:] = np.inf  # the list was made for a worst value that no longer counts
-        self.of_vehicles = {}
+        self.of_vehicles, self.avoidance = {}, None
         return found
 
     def flight(self, phases: Sequence[PhaseRecord]) -> None:

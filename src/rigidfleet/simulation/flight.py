@@ -476,6 +476,8 @@ class Flight:
             "rtol": mission.integrator.rtol, "atol": mission.integrator.atol,
             "solvers": {method: vars(counts) for method, counts in self._solves.items()},
         }  # fmt: skip
+        if mission.avoidance is not None and self.external is not None:
+            statistics["pushed"] = True  # by a force that avoidance does not know
         ending = self.ending if ending is None else ending
         result = assemble(mission, phases, pieces, ending=ending, statistics=statistics)
         result.mission = mission  # keeps the slots assigned and edges that it has computed

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from rigidfleet.kernel.records import Record
     from rigidfleet.mission import Mission
     from rigidfleet.mission.schema import VehicleYaw
+    from rigidfleet.planning.vehicles import Turn
 
 
 #: Greatest number of edges, or of coordinates, for which the smallest singular value of J is recorded.
@@ -29,8 +30,9 @@ _SINGULAR = 400
 _WORK, _LEAST = 400_000_000, 9
 
 
-#: References that slots follow one after the other, each with the time [s] from which it counts; none if not tracked.
-Led = tuple[tuple[float, "Reference", "Motion"], ...]
+#: References that slots follow one after the other, each with the time [s] from which it counts, and how vehicles with
+#: sampled control turn; none if not tracked.
+Led = tuple[tuple[float, "Reference", "Motion", "Turn | None"], ...]
 
 
 class VehicleSamples(NamedTuple):
@@ -197,10 +199,13 @@ def _references(
             continue
         spans = sorted(led, key=lambda span: span[0])
         first = np.searchsorted(times, [begin for begin, *_ in spans[1:]])
-        for time, (_, reference, motion) in zip(np.split(times, first), spans, strict=True):
+        for time, (_, reference, motion, turn) in zip(np.split(times, first), spans, strict=True):
             if not len(time):
                 continue
             states.append(slot_derivatives(reference, motion, time, 4)[:, 1:])
+            if turn is not None:
+                angles.append(_turned(reference, motion, time, turned, turn))
+                continue
             # From the sample before, which may be one of an earlier piece.
             begin = np.clip(until, motion.knots[0], time[0]) if last is not None else time[0]
             since = time if begin == time[0] else np.append(begin, time)
@@ -214,6 +219,14 @@ def _references(
     angle[known, 0] = np.unwrap(angle[known, 0], axis=0)  # one turn, not one for each piece
     values = (*state.swapaxes(0, 1), *angle.swapaxes(0, 1))
     return dict(zip(LATER, values, strict=True))
+
+
+def _turned(reference: Reference, motion: Motion, time: Floats, yaw: Yaw, turn: Turn) -> Floats:
+    """Yaw and its rate (K, 2, N) asked of vehicles that turn into it from the yaw they had."""
+    from rigidfleet.planning.vehicles import slots_and_yaw
+
+    since = np.concatenate([[turn.begun], time])
+    return slots_and_yaw(reference, motion, since, yaw, turn)[1][:2, :, 1:].transpose(2, 0, 1)
 
 
 def _of_vehicles(pieces: Sequence[Piece]) -> VehicleSamples | None:

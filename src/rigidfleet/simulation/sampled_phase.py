@@ -10,13 +10,14 @@ import numpy as np
 
 from rigidfleet._common.text import agent_names
 from rigidfleet.errors import FlightError, StoppedError
-from rigidfleet.kernel import fleet, records
+from rigidfleet.kernel import avoidance, fleet, records
 from rigidfleet.kernel.engine import native
 from rigidfleet.kernel.engine.sampled import fly_ticks
 from rigidfleet.kernel.problem import Problem
 from rigidfleet.kernel.records import Record
 from rigidfleet.math import attitude as att
 from rigidfleet.mission import Mission
+from rigidfleet.planning.avoidance import avoidance_in_flight
 from rigidfleet.planning.reference import ByEdge
 from rigidfleet.planning.vehicles import TickTables, first_yaw, sampled_flight, turn_from
 from rigidfleet.simulation.active_phase import ActivePhase
@@ -29,12 +30,16 @@ from rigidfleet.simulation.callbacks import (
     named,
 )
 from rigidfleet.simulation.diagnosis import diagnose
-from rigidfleet.simulation.recording import Piece, VehicleSamples
+from rigidfleet.simulation.recording import Led, Piece, VehicleSamples
 from rigidfleet.simulation.solver_setup import equip, integrator
 from rigidfleet.typing import Floats
 
 #: Greatest number of ticks in a table, and of steps between two returns to Python.
 _TICKS, _STEPS = 1024, 4000
+
+
+#: Distance [m] and speed [m/s] that no vehicle reaches in flight.
+_FAR = 1e9
 
 
 class Vehicles:
@@ -43,6 +48,7 @@ class Vehicles:
     def __init__(self, mission: Mission) -> None:
         self.flight = sampled_flight(mission)
         self.tables = TickTables(mission, self.flight)
+        self.avoidance = avoidance_in_flight(mission, self.flight)
         start = mission.fleet
         self.yaw = first_yaw(mission)  # asked of each vehicle at the last switch
         yaw = float(self.yaw[0])
@@ -61,6 +67,8 @@ class SampledPhase(ActivePhase):
     def __init__(self, *arguments: Any, vehicles: Vehicles, **options: Any) -> None:
         self.vehicles, self.flight = vehicles, vehicles.flight
         self.tabled: Problem | None = None  # the plan's problem for which the tables are
+        if vehicles.avoidance is not None:
+            vehicles.avoidance = avoidance.renewed(vehicles.avoidance)
         self.led = False  # whether the reference is given piece by piece
         self.unjudged = False  # whether steps were flown since the extremes of vehicles were taken
         self.first_tick: int | None = None
@@ -99,6 +107,8 @@ class SampledPhase(ActivePhase):
                 renewed = renewed._replace(**{name: getattr(begun, name) for name in fresh})
             begun = renewed
         self.sampled = given.state = begun._replace(trail=trail._replace(gauge=trail.gauge[:, :0]))
+        if given.avoidance is not None:
+            given.avoidance = avoidance.holding(given.avoidance, m)
         given.edges = plan.edges
         if self.first_tick is None:
             self.first_tick = int(begun.count[fleet.TICKS])
@@ -142,6 +152,11 @@ class SampledPhase(ActivePhase):
                 f"the controller returned {named(given)} at t = {self.t:.3f} s, but some agents are points;"
                 " return forces [N]"
             )
+        if self.vehicles.avoidance is not None:
+            raise FlightError(
+                f"the controller returned {named(given)} at t = {self.t:.3f} s, which [avoidance] cannot"
+                " change; return forces [N], or remove [avoidance]"
+            )
         if isinstance(given, AttitudeCommand):
             commands = self.flight.commands._replace(kind=fleet.ATTITUDE, **arrays)
         else:
@@ -151,9 +166,12 @@ class SampledPhase(ActivePhase):
 
     def watch(self, *, last: bool) -> None:
         """Search the steps flown for extremes."""
+        self.extremes.avoidance = self.vehicles.avoidance
         if rows := int(self.sampled.count[fleet.TRAILED]):
             assert self.flown is not None
-            self.state.count[4] = rows
+            # A motion that grows beyond all bounds has extremes up to there.
+            within = (abs(self.state.trail.points[:rows]) < _FAR).all(axis=(1, 2))
+            self.state.count[4] = rows if within.all() else int(within.argmin())
             self.extremes.take_path(self.flown, self.workspace, self.state)
             self.sampled.count[fleet.TRAILED] = self.state.count[4] = 0
             self.unjudged = True
@@ -171,14 +189,14 @@ class SampledPhase(ActivePhase):
         n, m = len(plan.masses), len(plan.edges)
         self.flown = problem
         times = self.sampler(plan, self.t, t_end, first=not self.begun, stop=self.stop)
-        self.begun = True
+        self.begun, given = True, self.vehicles.avoidance
         call = fleet.segment(n, m, t_end, times, _STEPS)
         sampled.count[fleet.SAMPLES] = 0
         status = records.PAUSED
         try:
             while status == records.PAUSED:
                 self._supply()
-                status = fly_ticks(problem, self.workspace, self.flight, sampled, call)
+                status = fly_ticks(problem, self.workspace, self.flight, sampled, call, given)
                 self._follow()
                 if status == records.FINISHED:  # to a rounding error of the grid of steps
                     self.state.clock[0] = t_end
@@ -200,6 +218,11 @@ class SampledPhase(ActivePhase):
             raise StoppedError(
                 f"the motion of {who} grows beyond all bounds by t = {self.t:.2f} s: the control is unstable. Lower"
                 " the gains, or raise the rates in [autopilot]"
+            )
+        if given is not None and given.count[avoidance.FULL]:
+            raise StoppedError(
+                f"avoidance cannot go on at t = {self.t:.2f} s: too many vehicles are near each other for their"
+                " speeds. Fly slower, or farther apart"
             )
         if status != records.FINISHED:
             own = self.external is not None
@@ -233,6 +256,10 @@ class SampledPhase(ActivePhase):
         state.clock[0] = sampled.clock[0]
         state.count[0] = 4 * sampled.count[fleet.STEPS]
         state.count[1] = sampled.count[fleet.STEPS]
+
+    def _led(self, times: Floats) -> Led:
+        """What the slots follow at the samples, if they are tracked, and how the vehicles turn."""
+        return tuple((*span[:3], self.turn) for span in super()._led(times))
 
     def end(self) -> Any:
         """End the phase; the vehicles keep their states."""

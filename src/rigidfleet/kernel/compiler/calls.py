@@ -39,7 +39,10 @@ def call_solver(_context, address):
 
 @intrinsic
 def call_recorder(_context, address, p, w, segment, record):
-    """Call `native`'s recorder at ``address``: int64(problem, workspace, segment, record), all of them addresses."""
+    """Call `native`'s recorder at ``address``: int64(problem, workspace, segment, record), all of them addresses.
+
+    Avoidance in flight is called in the same way: int64(flight, state, avoidance, 0).
+    """
     from llvmlite import ir
 
     def generate(context, builder, signature, arguments):

@@ -94,7 +94,7 @@ def sampled_code() -> list[bytes]:
     """Object code of the two C functions of sampled flights, `objects.SAMPLED_ENTRIES`."""
     from rigidfleet.kernel import quadrotor, sampled_flight
 
-    problem, workspace, *_, flight, state, segment, evaluation = _pointers()
+    problem, workspace, *_, flight, state, segment, evaluation, _ = _pointers()
 
     def fly(p, w, f, s, call):
         return sampled_flight.fly_ticks(
@@ -107,6 +107,23 @@ def sampled_code() -> list[bytes]:
     entries = zip((fly, evaluate), (5, 2), objects.SAMPLED_ENTRIES, strict=True)
     modules = [_module(function, name, arguments) for function, arguments, name in entries]
     return [_object(*module, hot=_HOT_SAMPLED) for module in modules]
+
+
+def avoidance_code() -> list[bytes]:
+    """Object code of avoidance in flight, `objects.AVOIDANCE_ENTRY`."""
+    from rigidfleet.kernel import guard
+
+    problem, workspace, *_, flight, state, _, _, avoidance = _pointers()
+
+    def avoid(f, s, given, _):
+        a = avoidance(given)
+        return guard.avoid(problem(a.law[0]), workspace(a.law[1]), flight(f), state(s), a)
+
+    return [_object(*_module(avoid, objects.AVOIDANCE_ENTRY), hot=())]
+
+
+#: The makers of the libraries beside the first.
+LIBRARIES = {"sampled": sampled_code, "avoidance": avoidance_code}
 
 
 def _pointers() -> list[Any]:
@@ -242,15 +259,15 @@ class _SecondProcess:
 
 
 def main(part: str) -> None:
-    """Write machine code to standard output: of "flight", the "half" of it that the second process makes, or "sampled".
+    """Write machine code to standard output: of "flight", the "half" that the second process makes of it, or a library.
 
     Numba's internals are used where they are known; else the second process makes the monitor alone.
     """
     output, known = sys.stdout.buffer, numba_internals.known()
     if known:
         numba_internals.translate_only()
-    if part == "sampled":
-        output.write(objects.concatenated(sampled_code()))
+    if part in LIBRARIES:
+        output.write(objects.concatenated(LIBRARIES[part]()))
         return
     if part == "half":
         pickle.dump(_translated() if known else {}, output)

@@ -13,7 +13,7 @@ import os
 import subprocess
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,6 +24,7 @@ import numpy as np
 from rigidfleet._common.files import replacing
 from rigidfleet.kernel.compiler.cache import cache_directory, not_kept, opened, told
 from rigidfleet.kernel.engine.objects import (
+    AVOIDANCE_ENTRY,
     ELSEWHERE,
     ENTRIES,
     SAMPLED_ENTRIES,
@@ -118,6 +119,15 @@ class Sampled(NamedTuple):
     unkept: list[bytes] | None
 
 
+class Avoiding(NamedTuple):
+    """The third library: avoidance in flight, loaded by missions with [avoidance] alone."""
+
+    avoid: Any
+    address: int
+    engine: Any
+    unkept: list[bytes] | None
+
+
 _loading = threading.RLock()
 
 
@@ -125,6 +135,9 @@ _loaded: list[_Code] = []
 
 
 _sampled: list[Sampled] = []
+
+
+_avoiding: list[Avoiding] = []
 
 
 def _code() -> _Code:
@@ -145,15 +158,23 @@ def _load() -> _Code:
 
 def sampled() -> Sampled:
     """The machine code of sampled flights: from the cache, or compiled."""
+    return _library("sampled", _sampled, _linked_sampled)
+
+
+def avoiding() -> Avoiding:
+    """The machine code of avoidance in flight: from the cache, or compiled."""
+    return _library("avoidance", _avoiding, _linked_avoiding)
+
+
+def _library(part: str, loaded: list[Any], link: Callable[..., Any]) -> Any:
     with _loading:
-        if not _sampled:
-            if (parts := _read("sampled")) is not None:
-                _sampled.append(_linked_sampled(parts))
+        if not loaded:
+            if (parts := _read(part)) is not None:
+                loaded.append(link(parts))
             else:
-                parts = _compile("sampled")
-                unkept = None if _write(parts, "sampled") else parts
-                _sampled.append(_linked_sampled(parts, unkept))
-    return _sampled[0]
+                parts = _compile(part)
+                loaded.append(link(parts, None if _write(parts, part) else parts))
+    return loaded[0]
 
 
 def _linked_sampled(parts: Sequence[bytes], unkept: list[bytes] | None = None) -> Sampled:
@@ -164,6 +185,13 @@ def _linked_sampled(parts: Sequence[bytes], unkept: list[bytes] | None = None) -
         ctypes.CFUNCTYPE(word, *(word,) * 5)(fly), ctypes.CFUNCTYPE(word, word, word)(evaluate), _code().recorder,
         engine, unkept,
     )  # fmt: skip
+
+
+def _linked_avoiding(parts: Sequence[bytes], unkept: list[bytes] | None = None) -> Avoiding:
+    engine = _engine(parts)
+    address = engine.get_function_address(AVOIDANCE_ENTRY)
+    word = ctypes.c_int64
+    return Avoiding(ctypes.CFUNCTYPE(word, *(word,) * 4)(address), address, engine, unkept)
 
 
 def _linked(parts: Sequence[bytes], unkept: list[bytes] | None = None) -> _Code:
@@ -190,12 +218,14 @@ class Inheritance(NamedTuple):
     code: list[bytes] | None
     told: bool
     sampled: list[bytes] | None
+    avoiding: list[bytes] | None
 
 
 def bequeath() -> Inheritance:
     """Code of this process that its child processes cannot find in the cache; to be sent only to them."""
     return Inheritance(
-        _loaded[0].unkept if _loaded else None, told.is_set(), _sampled[0].unkept if _sampled else None
+        _loaded[0].unkept if _loaded else None, told.is_set(), _sampled[0].unkept if _sampled else None,
+        _avoiding[0].unkept if _avoiding else None,
     )  # fmt: skip
 
 
@@ -207,10 +237,12 @@ def inherit(given: Inheritance) -> None:
         _loaded.append(_linked(given.code, given.code))
     if given.sampled is not None:
         _sampled.append(_linked_sampled(given.sampled, given.sampled))
+    if given.avoiding is not None:
+        _avoiding.append(_linked_avoiding(given.avoiding, given.avoiding))
 
 
 def _compile(part: str = "flight") -> list[bytes]:
-    """Compile the kernel, or its ``part`` "sampled", in a separate process if possible.
+    """Compile the kernel, or another library (``part``), in a separate process if possible.
 
     In that process Numba only translates. Otherwise it would optimise each function before all are optimised
     together, and take twice as long.
@@ -226,7 +258,7 @@ def _compile(part: str = "flight") -> list[bytes]:
                 return parts
     from rigidfleet.kernel.engine import build
 
-    return build.sampled_code() if part == "sampled" else build.machine_code()
+    return build.LIBRARIES.get(part, build.machine_code)()
 
 
 def _file(part: str = "flight") -> Path:

@@ -17,6 +17,8 @@ import llvmlite.binding as llvm
 ENTRIES = "rigidfleet_integrate", "rigidfleet_record", "rigidfleet_watch"
 #: Those of the second library: int64(problem, workspace, flight, state, segment) and int64(flight, evaluation).
 SAMPLED_ENTRIES = "rigidfleet_fly_ticks", "rigidfleet_evaluate"
+#: That of the third library, avoidance in flight: int64(flight, state, avoidance, 0).
+AVOIDANCE_ENTRY = "rigidfleet_avoid"
 
 
 #: Working folder of the compiling processes, as Numba reads settings from a file in its working folder.

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rigidfleet.kernel import fleet
+from rigidfleet.kernel.avoidance import Avoidance, avoidance
 from rigidfleet.kernel.problem import (
     CONSTANT,
     ITERATED,
@@ -132,6 +133,7 @@ def examples() -> tuple[
     fleet.SampledState,
     fleet.SampledSegment,
     fleet.Evaluation,
+    Avoidance,
 ]:
     """One minimal example of each named tuple; its fields have the types that all have."""
     one, none, places, frame = np.ones(1), np.zeros(0), np.zeros((1, 3)), np.eye(3)
@@ -162,6 +164,7 @@ def examples() -> tuple[
     return (
         problem, work, state, segment, UNRECORDED, watching, flight, fleet.begin(flight, S, work),
         fleet.segment(1, 0, 0.0), fleet.Evaluation(S, rotors, places, places, frame, S),
+        avoidance(period=1.0, b=one, lift=one, mass=one, g=0.0, radius=one),
     )  # fmt: skip
 
 

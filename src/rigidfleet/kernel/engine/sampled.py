@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from rigidfleet.kernel.avoidance import Avoidance
 from rigidfleet.kernel.engine import native
 from rigidfleet.kernel.engine.packing import UNRECORDED, Packed, pack, packed
 from rigidfleet.kernel.fleet import ENDLESS, Evaluation, Flight, SampledSegment, SampledState
@@ -21,14 +22,15 @@ def fly_ticks(
     flight: Flight,
     state: SampledState,
     segment: SampledSegment,
+    avoidance: Avoidance | None = None,
 ) -> int:
     """Fly to the end of the segment, see `rigidfleet.kernel.sampled_flight.fly_ticks`.
 
     The state and the samples of the segment are written; ``state.count[fleet.SAMPLES]`` is the next sample, which the
     caller sets to 0 for a new segment. The problem must be in the inertial formulation, and without disturbances: the
-    flight brings its own.
+    flight brings its own. With ``avoidance``, forces pass through its barriers and its guard.
     """
-    given = problem, workspace, flight, state, segment
+    given = problem, workspace, flight, state, segment, avoidance
     if not _last.given or any(a is not b for a, b in zip(given, _last.given, strict=True)):
         _last.packed, _last.given = _packed(*given), given
     return native.sampled().fly_ticks(*(a.address for a in _last.packed[:5]))
@@ -51,6 +53,7 @@ def _packed(
     flight: Flight,
     state: SampledState,
     segment: SampledSegment,
+    avoidance: Avoidance | None,
 ) -> tuple[Packed, ...]:
     """The arguments of the machine code, and what they point to."""
     work = state.work
@@ -65,7 +68,29 @@ def _packed(
         recorder=native.sampled().recorder, segment=law.address, record=recorded.address
     )
     states = packed(problem), packed(workspace), packed(flight), packed(state)
-    return *states, pack(call), law, recorded
+    if avoidance is None:
+        return *states, pack(call), law, recorded
+    kept = _of(avoidance, problem, workspace)
+    call = call._replace(guard=native.avoiding().address, avoidance=kept.address)
+    return *states, pack(call), law, recorded, kept
+
+
+def avoid(
+    problem: Problem,
+    workspace: Workspace,
+    flight: Flight,
+    state: SampledState,
+    avoidance: Avoidance,
+) -> int:
+    """Filter and guard ``state.force`` once, at ``state.work.law_time``; see `rigidfleet.kernel.guard.avoid`."""
+    kept = _of(avoidance, problem, workspace)
+    return native.avoiding().avoid(packed(flight).address, packed(state).address, kept.address, 0)
+
+
+def _of(avoidance: Avoidance, problem: Problem, workspace: Workspace) -> Packed:
+    """Avoidance that knows the law whose forces it changes."""
+    avoidance.law[:] = packed(problem).address, packed(workspace).address
+    return packed(avoidance)
 
 
 def _check(flight: Flight, state: SampledState, workspace: Workspace) -> None:

@@ -1,0 +1,187 @@
+"""Avoidance in flight as arrays, read and written by `barriers` and `guard`.
+
+N vehicles, m edges, B obstacles. A vehicle can always brake with b [m/s^2]. Its *stop segment* S reaches from its
+position to where it would come to rest. Two vehicles are kept D apart, and a vehicle R from an obstacle, both between
+centres and surfaces: D and R contain the radii.
+"""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rigidfleet.solids.records import Solids, joined
+from rigidfleet.typing import Floats, Ints
+
+#: Columns of `Avoidance.count`: ticks, entries of the list of neighbours, whether the list is too short.
+TICKS, LISTED, FULL = range(3)
+#: Columns of `Avoidance.acted` and `Avoidance.first`: the barrier, the guard, the guard by braking.
+BARRIER, GUARD, BRAKE = range(3)
+#: Rows of `Avoidance.margin`: between two vehicles, between a vehicle and an obstacle.
+PAIR, OBSTACLE = range(2)
+#: Mean number of neighbours in a large fleet at most, and number of vehicles up to which all pairs fit.
+_NEIGHBOURS, _FEW = 256, 400
+#: Greatest number of barriers between vehicles at a tick, per vehicle; more are left to the guard.
+_BARRIERS = 32
+#: Greatest number of rows of an exact solution of the barriers.
+EXACT = 64
+
+
+class Avoidance(NamedTuple):
+    """What avoidance reads and writes at the ticks of the formation's law; K candidates, P entries of neighbours."""
+
+    law: Ints  # (2,) addresses of the `Problem` whose law gave the forces, and of its `Workspace`
+    guarded: bool
+    filtered: bool
+    period: float  # for which a command is held [s]
+    rate: float  # at which a barrier is approached [1/s]
+    share: float  # of the braking that the barrier plans with [-]
+    release: float  # time in which edges let go and take hold again [s]
+    b: Floats  # (N,) acceleration in any direction that each vehicle always has [m/s^2]
+    lift: Floats  # (N,) greatest thrust per mass [m/s^2]
+    weight: Floats  # (N,) mass that the laws know [kg]
+    g: float  # [m/s^2]
+    coast: Floats  # (N, 3) of the drag k per mass over a period T: e^-kT, (1 - e^-kT)/k, (T - (1 - e^-kT)/k)/k
+    lag: Floats  # (N,) time until a command acts [s]
+    spare: Floats  # (N,) by which D and R are widened [m]
+    room: Floats  # (N,) radius, and half of the separation to keep [m]
+    reach: Floats  # (N,) radius, and the clearance to keep [m]
+    solids: Solids  # (B,) convex obstacles that stand still
+    candidates: Floats  # (K, 3) accelerations that replace a refused one, in units of b
+    # Neighbours
+    start: Ints  # (N + 1,) those of vehicle i are at start[i] to start[i + 1]
+    near: Ints  # (P,)
+    floor: Floats  # (P,) distance of the stop segments to keep [m]
+    order: Ints  # (N,) vehicles along an axis
+    listed: Floats  # (N, 3) positions when they were listed [m]
+    span: Floats  # (3,) for what the list holds: ways since then [m], speeds [m/s], accelerations asked for [m/s^2]
+    # The tick
+    known: Floats  # (3, N, 3) measured positions and velocities; pushes of barriers [N]
+    wanted: Floats  # (N, 3) acceleration asked for, without drag [m/s^2]
+    shift: Floats  # (N, 3) by which barriers change it [m/s^2]
+    chosen: Floats  # (N, 3) acceleration given [m/s^2]
+    rise: Floats  # (N, 3) acceleration at the start of the tick, with drag [m/s^2]
+    ways: Floats  # (N, 4, 3) present choice: position, after the tick, stop point; stop point without a tick
+    far: Floats  # (N,) distance from its position that a vehicle cannot leave in the tick and by braking after it [m]
+    walls: Floats  # (N, B) distance of the stop segment from an obstacle to keep [m]
+    trial: Floats  # (5, 3) the same of a candidate; its acceleration; at the start of the tick
+    normal: Floats  # (3,)
+    # Barriers: W rows
+    rows: Ints  # (W, 2) vehicle, and the other or -1
+    normals: Floats  # (W, 3)
+    needed: Floats  # (W,) [m/s^2]
+    push: Floats  # (W,) kappa [N]
+    most: Floats  # (W,) greatest one [N]
+    hold: Floats  # (N,) share to which edges of a vehicle hold
+    pull: Floats  # (m,) what barriers add to the multipliers of edges [N]
+    system: Floats  # (EXACT, EXACT) work
+    right: Floats  # (EXACT,)
+    active: Ints  # (EXACT,)
+    # The record
+    count: Ints  # (3,) see `TICKS`
+    acted: Ints  # (3, N) ticks at which each acted on a vehicle, see `BARRIER`
+    first: Floats  # (3, N) time of the first one [s], infinity if none
+    margin: (
+        Floats  # (2, 2) least of dist(S, S) - D, of dist(S, obstacle) - R [m], and their times [s]
+    )
+    between: Ints  # (2, 2) vehicle, and the other or the obstacle
+    lost: Floats  # (2, 2) time at which a margin first was negative [s], infinity if none; and its value [m]
+    loser: Ints  # (2, 2) vehicle, and the other or the obstacle
+
+
+def avoidance(
+    *,
+    period: float,
+    b: Floats,
+    lift: Floats,
+    mass: Floats,
+    g: float,
+    radius: Floats,
+    solids: Solids | None = None,
+    separation: float = 0.0,
+    clearance: float = 0.0,
+    drag: ArrayLike = 0.0,
+    lag: ArrayLike = 0.0,
+    spare: ArrayLike = 0.0,
+    rate: float = 3.0,
+    share: float = 0.9,
+    release: float = 0.5,
+    guarded: bool = True,
+    filtered: bool = True,
+    edges: int = 0,
+) -> Avoidance:
+    """Avoidance of a fleet; see `Avoidance`. ``drag`` [1/s], ``lag`` and ``spare`` are one for all, or (N,)."""
+    solids = joined([]) if solids is None else solids
+    n, count = len(b), len(solids.kind)
+    capacity = n * (n - 1) if n <= _FEW else _NEIGHBOURS * n
+    rows = min(capacity // 2, _BARRIERS * n) + n * count
+    radius = np.asarray(radius, dtype=float)
+    return Avoidance(
+        law=np.zeros(2, dtype=np.int64), guarded=guarded, filtered=filtered, period=float(period), rate=float(rate),
+        share=float(share), release=float(release), b=_each(b, n), lift=_each(lift, n), weight=_each(mass, n),
+        g=float(g), coast=_coast(_each(drag, n), period), lag=_each(lag, n), spare=_each(spare, n),
+        room=radius + 0.5 * separation, reach=radius + clearance,
+        solids=solids, candidates=candidates(),
+        start=np.zeros(n + 1, dtype=np.int64), near=np.zeros(capacity, dtype=np.int64), floor=np.zeros(capacity),
+        order=np.arange(n), listed=np.full((n, 3), np.inf), span=np.zeros(3),
+        known=np.zeros((3, n, 3)), wanted=np.zeros((n, 3)), shift=np.zeros((n, 3)),
+        chosen=np.zeros((n, 3)), rise=np.zeros((n, 3)), ways=np.zeros((n, 4, 3)),
+        far=np.zeros(n), walls=np.zeros((n, count)), trial=np.zeros((5, 3)), normal=np.zeros(3),
+        rows=np.zeros((rows, 2), dtype=np.int64), normals=np.zeros((rows, 3)), needed=np.zeros(rows),
+        push=np.zeros(rows), most=np.zeros(rows), hold=np.ones(n), pull=np.zeros(edges),
+        system=np.zeros((EXACT, EXACT)), right=np.zeros(EXACT), active=np.zeros(EXACT, dtype=np.int64),
+        count=np.zeros(3, dtype=np.int64), **_record(n),
+    )  # fmt: skip
+
+
+def renewed(given: Avoidance) -> Avoidance:
+    """The same avoidance in the next phase, which has a record of its own."""
+    given.count[TICKS] = 0
+    return given._replace(**_record(len(given.b)))
+
+
+def holding(given: Avoidance, edges: int) -> Avoidance:
+    """The same avoidance for so many other edges; neighbours are listed again."""
+    given.count[LISTED] = 0
+    return given._replace(pull=np.zeros(edges))
+
+
+def _record(n: int) -> dict[str, Any]:
+    none = np.full((2, 2), -1)
+    endless = np.array([[math.inf, 0.0]] * 2)
+    return {
+        "acted": np.zeros((3, n), dtype=np.int64), "first": np.full((3, n), np.inf), "margin": endless,
+        "between": none, "lost": endless.copy(), "loser": none.copy(),
+    }  # fmt: skip
+
+
+def _each(x: ArrayLike, n: int) -> Floats:
+    return np.ascontiguousarray(np.broadcast_to(np.asarray(x, dtype=float), (n,)))
+
+
+def _coast(k: Floats, T: float) -> Floats:
+    """Coefficients (N, 3) of a motion under a held acceleration and linear drag; see `Avoidance.coast`."""
+    x = k * T
+    E = np.exp(-x)
+    small = x < 0.05
+    safe = np.where(small, 1.0, k)
+    # Where the differences would cancel, the series 1/2 - x/6 + x^2/24 - ...
+    series = np.ones_like(x)
+    for order in range(12, 0, -1):
+        series = 1.0 - x / (order + 2) * series
+    second = np.where(small, 0.5 * T * T * series, (T + np.expm1(-x) / safe) / safe)
+    first = np.where(small, T - k * second, -np.expm1(-x) / safe)
+    return np.stack([E, first, second], axis=1)
+
+
+def candidates() -> Floats:
+    """Accelerations (39, 3) in units of b: 26 directions and 12 weaker ones, spread evenly, and none."""
+
+    def directions(count: int) -> Floats:
+        i = np.arange(count) + 0.5  # a Fibonacci lattice
+        polar, angle = np.arccos(1.0 - 2.0 * i / count), math.pi * (1.0 + math.sqrt(5.0)) * i
+        across = np.sin(polar)
+        return np.stack([across * np.cos(angle), across * np.sin(angle), np.cos(polar)], axis=1)
+
+    return np.concatenate([directions(26), 0.4 * directions(12), np.zeros((1, 3))])

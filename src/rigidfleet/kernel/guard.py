@@ -1,0 +1,490 @@
+"""The guard: accepts, replaces or refuses the acceleration of each vehicle, so that all can always brake in time.
+
+Vehicle i brakes with b_i, and its stop segment S_i reaches from r_i to where it then comes to rest. The states with
+dist(S_i, S_j) >= D_ij and dist(S_i, O) >= R_i for all pairs and obstacles form a set C. If all brake, every S_i only
+shrinks, so that C is never left, whatever the number of vehicles. At a tick, all are first taken to brake. One vehicle
+after the other then takes what it wants, if its motion over the tick and its stop segment after it keep their distances
+from what the others do at present; else the nearest of some fixed accelerations that does; else it brakes. The proof is
+in docs/avoidance.md.
+
+Vehicles or obstacles that are nearer than they should be must not come nearer still.
+"""
+
+import math
+
+from rigidfleet.kernel.avoidance import BRAKE, FULL, GUARD, LISTED, OBSTACLE, PAIR, TICKS
+from rigidfleet.kernel.barriers import filter_accelerations, from_solid, loosen
+from rigidfleet.kernel.compiler.jit import compiled
+from rigidfleet.kernel.fleet import TICKS as FLIGHT_TICKS
+from rigidfleet.kernel.sampled_flight import path_at
+
+#: Greatest number of tangents by which the nearest point of a segment to an obstacle is sought.
+_TANGENTS = 40
+#: Neighbours are listed for speeds higher by this share and summand [m/s], and for ways of this share of their
+#: distance, or this way [m].
+_FASTER, _LEAST_SPEED, _NEARER, _LEAST_WAY = 0.25, 0.2, 0.15, 0.2
+#: Shortfall of a distance to keep that counts as rounding [m].
+_ROUNDING = 1e-9
+
+
+# -- distances -----------------------------------------------------------------------------------------
+
+
+@compiled
+def between_segments(p, q, r, s):
+    """Least distance [m] between the segments from p to q and from r to s (3,); Ericson 2005, section 5.1.9."""
+    d0, d1, d2 = q[0] - p[0], q[1] - p[1], q[2] - p[2]
+    e0, e1, e2 = s[0] - r[0], s[1] - r[1], s[2] - r[2]
+    x, y, z = p[0] - r[0], p[1] - r[1], p[2] - r[2]
+    dd, ee = d0 * d0 + d1 * d1 + d2 * d2, e0 * e0 + e1 * e1 + e2 * e2
+    f, c = e0 * x + e1 * y + e2 * z, d0 * x + d1 * y + d2 * z
+    a, b = 0.0, 0.0
+    if dd <= 1e-24:
+        b = min(max(f / ee, 0.0), 1.0) if ee > 1e-24 else 0.0
+    elif ee <= 1e-24:
+        a = min(max(-c / dd, 0.0), 1.0)
+    else:
+        de = d0 * e0 + d1 * e1 + d2 * e2
+        area = dd * ee - de * de
+        if area > 1e-12 * dd * ee:
+            a = min(max((de * f - c * ee) / area, 0.0), 1.0)
+        b = (de * a + f) / ee
+        if b < 0.0:
+            b, a = 0.0, min(max(-c / dd, 0.0), 1.0)
+        elif b > 1.0:
+            b, a = 1.0, min(max((de - c) / dd, 0.0), 1.0)
+    x, y, z = x + a * d0 - b * e0, y + a * d1 - b * e1, z + a * d2 - b * e2
+    return math.sqrt(x * x + y * y + z * z)
+
+
+@compiled
+def slope(p, q, x, o, solids, normal):
+    """Distance of a point at a share x of a segment from obstacle o, and its rate along it; writes the normal."""
+    u, v, w = q[0] - p[0], q[1] - p[1], q[2] - p[2]
+    value = from_solid(p[0] + x * u, p[1] + x * v, p[2] + x * w, o, solids, normal)
+    return value, normal[0] * u + normal[1] * v + normal[2] * w
+
+
+@compiled
+def from_obstacle(p, q, o, solids, enough, normal):
+    """Distance of the segment from p to q (3,) from obstacle o: a lower bound, and a place near the nearest point.
+
+    The distance to a convex obstacle is convex along the segment, so that it lies above its tangents. The bound is
+    exact, to rounding, unless it is certain to be at least, or below, ``enough``. Returns the bound, the distance at a
+    share of the segment, and this share, for which ``normal`` (3,) is that of a supporting plane.
+    """
+    high, falls = slope(p, q, 1.0, o, solids, normal)
+    if falls <= 0.0:
+        return high, high, 1.0
+    low, rises = slope(p, q, 0.0, o, solids, normal)
+    if rises >= 0.0:
+        return low, low, 0.0
+    a, b = 0.0, 1.0
+    bound, value, x = low + rises, low, 0.0
+    for _ in range(_TANGENTS):
+        x = min(max((high - low + rises * a - falls * b) / (rises - falls), a), b)
+        bound = low + rises * (x - a)
+        value, rate = slope(p, q, x, o, solids, normal)
+        if bound >= enough or value < enough or value - bound <= 1e-13:
+            break
+        if rate < 0.0:
+            a, low, rises = x, value, rate
+        else:
+            b, high, falls = x, value, rate
+    return bound, value, x
+
+
+# -- what a vehicle does -------------------------------------------------------------------------------
+
+
+@compiled
+def stop_distance(u, i, a):
+    """Way [m] to rest from a speed u [m/s], with commands held for a period: n whole ones, then one to rest."""
+    change = a.b[i] * a.period
+    n = math.floor(u / change)
+    rest = u - n * change
+    return a.period * (n * (u - 0.5 * n * change) + 0.5 * rest) + a.lag[i] * u
+
+
+@compiled
+def predict(i, r, v, c, a, out):
+    """Motion of vehicle i from r, v (3,) under an acceleration c (3,) held for a tick; see `Avoidance.trial`.
+
+    Returns the distance from r that it cannot leave in the tick, and by braking after it.
+    """
+    E, first, second = a.coast[i, 0], a.coast[i, 1], a.coast[i, 2]
+    drag = (1.0 - E) / first
+    speed = end = rise = 0.0
+    for q in range(3):
+        after = v[q] * E + c[q] * first
+        out[0, q], out[1, q], out[2, q] = r[q], r[q] + v[q] * first + c[q] * second, after
+        out[3, q], out[4, q] = c[q], c[q] - drag * v[q]
+        speed += v[q] * v[q]
+        end += after * after
+        rise += out[4, q] * out[4, q]
+    speed, end = math.sqrt(speed), math.sqrt(end)
+    stop = stop_distance(end, i, a)
+    for q in range(3):
+        out[2, q] = out[1, q] + stop / max(end, 1e-12) * out[2, q]
+    return a.period * (speed + 0.5 * a.period * math.sqrt(rise)) + stop
+
+
+@compiled
+def brake(i, v, a, out):
+    """Acceleration (3,) that brakes vehicle i from a velocity v (3,): by b, or to rest within the tick, with drag."""
+    speed = math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
+    size = min(a.b[i], speed * a.coast[i, 0] / a.coast[i, 1]) / max(speed, 1e-12)
+    for q in range(3):
+        out[q] = -size * v[q]
+
+
+@compiled
+def take(i, far, a):
+    """Make the candidate ``trial`` the present choice of vehicle i."""
+    trial = a.trial
+    a.far[i] = far
+    for q in range(3):
+        for k in range(3):
+            a.ways[i, k, q] = trial[k, q]
+        a.chosen[i, q], a.rise[i, q] = trial[3, q], trial[4, q]
+
+
+@compiled
+def least_along(x, rate, rise, T):
+    """Least value of x + rate t + rise t^2 / 2 over [0, T]."""
+    least = min(x, x + T * (rate + 0.5 * T * rise))
+    if rise > 0.0 and -rise * T < rate < 0.0:
+        least = x - 0.5 * rate * rate / rise
+    return least
+
+
+@compiled
+def keeps(i, v, j, s, floor, a):
+    """Whether the candidate of vehicle i keeps its distance from the present choice of j; velocities v and s (3,).
+
+    The relative path over the tick lies beyond the parabola of its part along any unit vector. The vector is that to
+    the nearest point of the chord.
+    """
+    mine, other, rise = a.trial, a.ways[j], a.rise[j]
+    if between_segments(mine[1], mine[2], other[1], other[2]) < floor:
+        return False
+    x, y, z = mine[0, 0] - other[0, 0], mine[0, 1] - other[0, 1], mine[0, 2] - other[0, 2]
+    u = mine[1, 0] - other[1, 0] - x
+    w = mine[1, 1] - other[1, 1] - y
+    k = mine[1, 2] - other[1, 2] - z
+    length, share = u * u + w * w + k * k, 0.0
+    if length > 0.0:
+        share = min(max(-(x * u + y * w + z * k) / length, 0.0), 1.0)
+    n0, n1, n2 = x + share * u, y + share * w, z + share * k
+    size = math.sqrt(n0 * n0 + n1 * n1 + n2 * n2)
+    if size < floor or size == 0.0:
+        return size >= floor
+    n0, n1, n2 = n0 / size, n1 / size, n2 / size
+    along = n0 * x + n1 * y + n2 * z
+    rate = n0 * (v[0] - s[0]) + n1 * (v[1] - s[1]) + n2 * (v[2] - s[2])
+    own = n0 * mine[4, 0] + n1 * mine[4, 1] + n2 * mine[4, 2]
+    theirs = n0 * rise[0] + n1 * rise[1] + n2 * rise[2]
+    # Drag lets accelerations decay during the tick
+    least = min(own, own * a.coast[i, 0]) - max(theirs, theirs * a.coast[j, 0])
+    return least_along(along, rate, least, a.period) >= floor
+
+
+@compiled
+def clears(i, v, far, a):
+    """Whether the candidate of vehicle i, with a velocity v (3,), keeps its distances from all obstacles."""
+    way, normal = a.trial, a.normal
+    for o in range(a.solids.kind.shape[0]):
+        floor = a.walls[i, o]
+        if from_solid(way[0, 0], way[0, 1], way[0, 2], o, a.solids, normal) - far >= floor:
+            continue
+        bound, _, _ = from_obstacle(way[1], way[2], o, a.solids, floor, normal)
+        if bound < floor:
+            return False
+        bound, value, x = from_obstacle(way[0], way[1], o, a.solids, floor, normal)
+        if bound < floor:
+            return False
+        along = rate = rise = 0.0
+        for q in range(3):
+            along += normal[q] * (way[1, q] - way[0, q])
+            rate += normal[q] * v[q]
+            rise += normal[q] * way[4, q]
+        rise = min(rise, rise * a.coast[i, 0])
+        if least_along(value - x * along, rate, rise, a.period) < floor:
+            return False
+    return True
+
+
+# -- neighbours ----------------------------------------------------------------------------------------
+
+
+@compiled
+def interaction_range(u, c, a):
+    """Distance [m] beyond which vehicles with speeds up to u [m/s] neither meet by the next tick nor meet a barrier.
+
+    A barrier asks for nothing while rate h + B s/sqrt(2 B (L - D)) is above the greatest relative acceleration, twice
+    that asked for, c [m/s^2]; s is at least -2 u.
+    """
+    room = stop = strongest = lift = lag = 0.0
+    weakest = math.inf
+    for i in range(a.b.shape[0]):
+        room, lag = max(room, a.room[i] + a.spare[i]), max(lag, a.lag[i])
+        stop, lift = max(stop, stop_distance(u, i, a)), max(lift, a.lift[i])
+        weakest, strongest = min(weakest, a.b[i]), max(strongest, a.b[i])
+    meet = 2.0 * (stop + a.period * (u + a.period * (lift + a.g)))
+    barrier = 0.0
+    if a.filtered:
+        half, B = a.rate * u + c, 2.0 * a.share * strongest
+        root = (half + math.sqrt(half * half + 2.0 * a.rate * B * u)) / a.rate
+        barrier = root * root / (4.0 * a.share * weakest) + 2.0 * u * lag
+    return 2.0 * room + max(meet, barrier)
+
+
+@compiled
+def list_neighbours(r, lost, way, a):
+    """List for each vehicle those within a distance ``way`` [m]; returns False if the list is too short."""
+    n, order = a.b.shape[0], a.order
+    axis, widest = 0, -1.0
+    for q in range(3):
+        low = high = r[0, q]
+        for i in range(n):
+            low, high = min(low, r[i, q]), max(high, r[i, q])
+        if high - low > widest:
+            axis, widest = q, high - low
+    for k in range(1, n):  # by insertion: mostly sorted from the time before
+        i, at = order[k], k
+        while at > 0 and r[order[at - 1], axis] > r[i, axis]:
+            order[at] = order[at - 1]
+            at -= 1
+        order[at] = i
+    for i in range(n + 1):
+        a.start[i] = 0
+    for fill in range(2):
+        for k in range(n):
+            i = order[k]
+            for l in range(k + 1, n):
+                j = order[l]
+                x = r[j, axis] - r[i, axis]
+                if x > way:
+                    break
+                x, y, z = r[j, 0] - r[i, 0], r[j, 1] - r[i, 1], r[j, 2] - r[i, 2]
+                if x * x + y * y + z * z > way * way or lost[i] or lost[j]:
+                    continue
+                if fill:
+                    a.near[a.start[i]], a.near[a.start[j]] = j, i
+                a.start[i] += 1
+                a.start[j] += 1
+        if fill == 0:
+            total = 0
+            for i in range(n):
+                total += a.start[i]
+                a.start[i] = total - a.start[i]
+            a.start[n] = total
+            if total > a.near.shape[0]:
+                return False
+    for i in range(n, 0, -1):  # each entry has moved to the start of the next vehicle
+        a.start[i] = a.start[i - 1]
+    a.start[0] = 0
+    return True
+
+
+@compiled
+def greatest(x):
+    """Greatest length of the rows of x (N, 3)."""
+    found = 0.0
+    for i in range(x.shape[0]):
+        found = max(found, x[i, 0] * x[i, 0] + x[i, 1] * x[i, 1] + x[i, 2] * x[i, 2])
+    return math.sqrt(found)
+
+
+@compiled
+def moved_apart(r, a):
+    """Greatest way [m] of a vehicle since neighbours were listed, beside the way that all have gone."""
+    n, found = a.b.shape[0], 0.0
+    x, y, z = 0.0, 0.0, 0.0
+    for i in range(n):
+        x += (r[i, 0] - a.listed[i, 0]) / n
+        y += (r[i, 1] - a.listed[i, 1]) / n
+        z += (r[i, 2] - a.listed[i, 2]) / n
+    for i in range(n):
+        u = r[i, 0] - a.listed[i, 0] - x
+        v = r[i, 1] - a.listed[i, 1] - y
+        w = r[i, 2] - a.listed[i, 2] - z
+        found = max(found, u * u + v * v + w * w)
+    return math.sqrt(found)
+
+
+@compiled
+def update_neighbours(r, v, lost, a):
+    """Renew the list of neighbours if others could have come near; returns False if it is too short."""
+    fastest, asked = greatest(v), greatest(a.wanted)
+    due = a.count[LISTED] == 0 or fastest > a.span[1] or asked > a.span[2]
+    # Nor for speeds far below those for which it was made
+    due = due or 2.5 * fastest + _LEAST_SPEED < 0.8 * a.span[1]
+    if not (due or 2.0 * moved_apart(r, a) > a.span[0]):
+        return True
+    speed, hard = (1.0 + _FASTER) * fastest + _LEAST_SPEED, (1.0 + _FASTER) * asked + 1.0
+    way = interaction_range(speed, hard, a)
+    a.span[0], a.span[1], a.span[2] = max(_NEARER * way, _LEAST_WAY), speed, hard
+    for i in range(a.b.shape[0]):
+        for q in range(3):
+            a.listed[i, q] = r[i, q]
+    a.count[LISTED] = 1
+    return list_neighbours(r, lost, way + a.span[0], a)
+
+
+# -- the tick ------------------------------------------------------------------------------------------
+
+
+@compiled
+def note(kind, value, t, i, j, a):
+    """Note a margin [m] of vehicle i to j, or to obstacle j, if it is the least so far, or the first negative one."""
+    if value < a.margin[kind, 0]:
+        a.margin[kind, 0], a.margin[kind, 1] = value, t
+        a.between[kind, 0], a.between[kind, 1] = i, j
+    if value < -_ROUNDING and not a.lost[kind, 0] < math.inf:
+        a.lost[kind, 0], a.lost[kind, 1] = t, value
+        a.loser[kind, 0], a.loser[kind, 1] = i, j
+
+
+@compiled
+def alone(i, a):
+    """Whether vehicle i has neither neighbours nor obstacles."""
+    return a.start[i + 1] == a.start[i] and a.solids.kind.shape[0] == 0
+
+
+@compiled
+def set_floors(t, r, v, lost, a):
+    """Let all vehicles brake, and find the distances that their stop segments keep, as they should or as they do."""
+    n, acceleration = a.b.shape[0], a.trial[3]
+    for i in range(n):
+        if alone(i, a):
+            continue
+        brake(i, v[i], a, acceleration)
+        speed = math.sqrt(v[i, 0] ** 2 + v[i, 1] ** 2 + v[i, 2] ** 2)
+        stop = stop_distance(speed, i, a)
+        for q in range(3):
+            a.ways[i, 3, q] = r[i, q] + stop / max(speed, 1e-12) * v[i, q]
+        # It stays on the stop segment, also after the tick
+        take(i, max(predict(i, r[i], v[i], acceleration, a, a.trial), stop), a)
+    for i in range(n):
+        if lost[i]:
+            continue
+        for e in range(a.start[i], a.start[i + 1]):
+            j = a.near[e]
+            need = a.room[i] + a.room[j] + a.spare[i] + a.spare[j]
+            x, y, z = r[i, 0] - r[j, 0], r[i, 1] - r[j, 1], r[i, 2] - r[j, 2]
+            apart = math.sqrt(x * x + y * y + z * z) - a.far[i] - a.far[j]
+            a.floor[e] = need
+            if apart < need or apart - need < a.margin[PAIR, 0]:
+                found = between_segments(r[i], a.ways[i, 3], r[j], a.ways[j, 3])
+                a.floor[e] = min(need, found)
+                if i < j:
+                    note(PAIR, found - a.room[i] - a.room[j], t, i, j, a)
+        for o in range(a.solids.kind.shape[0]):
+            need = a.reach[i] + a.spare[i]
+            apart = from_solid(r[i, 0], r[i, 1], r[i, 2], o, a.solids, a.normal) - a.far[i]
+            a.walls[i, o] = need
+            if apart < need or apart - need < a.margin[OBSTACLE, 0]:
+                found, _, _ = from_obstacle(r[i], a.ways[i, 3], o, a.solids, need, a.normal)
+                a.walls[i, o] = min(need, found)
+                note(OBSTACLE, found - a.reach[i], t, i, o, a)
+
+
+@compiled
+def safe(i, r, v, far, a):
+    """Whether the candidate of vehicle i is compatible with the present choices of all others and with obstacles."""
+    for e in range(a.start[i], a.start[i + 1]):
+        j = a.near[e]
+        x, y, z = r[i, 0] - r[j, 0], r[i, 1] - r[j, 1], r[i, 2] - r[j, 2]
+        reach = a.floor[e] + far + a.far[j]
+        if x * x + y * y + z * z < reach * reach and not keeps(i, v[i], j, v[j], a.floor[e], a):
+            return False
+    return clears(i, v[i], far, a)
+
+
+@compiled
+def choose(i, r, v, a):
+    """Choose for vehicle i: what it wants, else the nearest safe candidate, else braking; returns which.
+
+    0 means what it wants, 1 a candidate, 2 braking.
+    """
+    wanted, c, best, found = a.wanted[i], a.trial[3], math.inf, -1
+    for k in range(a.candidates.shape[0] + 1):
+        away = 0.0
+        for q in range(3):
+            c[q] = wanted[q] if k == 0 else a.b[i] * a.candidates[k - 1, q]
+            away += (c[q] - wanted[q]) ** 2
+        if away >= best:
+            continue
+        far = predict(i, r[i], v[i], c, a, a.trial)
+        if safe(i, r, v, far, a):
+            best, found = away, k
+            if k == 0:
+                take(i, far, a)
+                return 0
+    if found < 0:
+        return 2
+    for q in range(3):
+        c[q] = a.b[i] * a.candidates[found - 1, q]
+    take(i, predict(i, r[i], v[i], c, a, a.trial), a)
+    return 1
+
+
+@compiled
+def tally(kind, i, t, a):
+    """Count that a layer has acted on vehicle i at this tick."""
+    a.acted[kind, i] += 1
+    a.first[kind, i] = min(a.first[kind, i], t)
+
+
+@compiled
+def command(i, state, a):
+    """Give vehicle i the force of the acceleration chosen for it."""
+    for q in range(3):
+        state.force[i, q] = a.weight[i] * (a.chosen[i, q] + (a.g if q == 2 else 0.0))
+
+
+@compiled
+def want(i, state, a):
+    """The acceleration that vehicle i is asked for, with its thrust limited."""
+    force = state.force[i]
+    size = math.sqrt(force[0] * force[0] + force[1] * force[1] + force[2] * force[2])
+    share = min(1.0, a.lift[i] * a.weight[i] / max(size, 1e-300))
+    for q in range(3):
+        a.wanted[i, q] = share * force[q] / a.weight[i] - (a.g if q == 2 else 0.0)
+
+
+@compiled
+def avoid(p, w, flight, state, a):
+    """Filter and guard the forces that the formation's law has just given; returns 0 if neighbours are too many."""
+    n, lost, t = a.b.shape[0], flight.vehicles.lost, state.work.law_time[0]
+    r, v, k = a.known[0], a.known[1], state.count[FLIGHT_TICKS]
+    if a.filtered:
+        loosen(p, w, state, a)
+    for i in range(n):
+        for q in range(3):
+            r[i, q] = state.seen[i, q] + path_at(k, i, q, flight.tables)
+            v[i, q] = state.seen[i, 3 + q] + path_at(k, i, 3 + q, flight.tables)
+        want(i, state, a)
+    if not update_neighbours(r, v, lost, a):
+        a.count[FULL] = 1
+        return 0
+    a.count[TICKS] += 1
+    set_floors(t, r, v, lost, a)
+    changed = a.filtered and filter_accelerations(t, r, v, lost, p, w, a)
+    for k in range(n):
+        i = (k + a.count[TICKS]) % n  # each comes first in turn
+        if lost[i]:
+            continue
+        free = alone(i, a) or not a.guarded
+        how = 0 if free else choose(i, r, v, a)
+        if free:
+            for q in range(3):
+                a.chosen[i, q] = a.wanted[i, q]
+        if how > 0:
+            tally(GUARD, i, t, a)
+        if how > 1:
+            tally(BRAKE, i, t, a)
+        if how > 0 or changed:
+            command(i, state, a)
+    return 1

@@ -1,0 +1,147 @@
+"""Avoidance in flight: what vehicles can always brake with, what is guaranteed of whom, and checks of [avoidance]."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from rigidfleet.mission.disturbances import intensity
+from rigidfleet.mission.findings import FindingCollector
+from rigidfleet.mission.schema import Avoidance, Disturbances
+from rigidfleet.mission.vehicles import VehicleModel, flies_vehicles, resolve
+from rigidfleet.typing import Floats
+
+_TABLE = "avoidance"
+#: Standard deviations of gusts and noise that are reckoned with.
+_SIGMAS = 3.0
+
+
+def braking(
+    models: Sequence[VehicleModel], gravity: float, disturbances: Disturbances | None
+) -> Floats:
+    """Acceleration (N,) [m/s^2] that each vehicle has left in any direction, negative if none.
+
+    A point has F/m - g - w: the admissible accelerations are the ball of radius F/m about gravity, and w is the share
+    of wind and wrong masses. The thrust of a quadrotor tilts by no more than its limit, and does not pull down.
+    """
+    away = _disturbed(models, gravity, disturbances)
+    found = []
+    for model in models:
+        b = model.thrust_limit / model.mass - gravity
+        if not model.point:
+            b = min(b, gravity * math.sin(math.radians(model.tilt_limit_deg)))
+        found.append(b)
+    return np.array(found) - away
+
+
+def _disturbed(
+    models: Sequence[VehicleModel], gravity: float, disturbances: Disturbances | None
+) -> Floats:
+    """Acceleration (N,) [m/s^2] by wind, gusts of three standard deviations, and wrong masses."""
+    if disturbances is None:
+        return np.zeros(len(models))
+    wind = float(np.linalg.norm(disturbances.wind))
+    if disturbances.gusts is not None:
+        wind += _SIGMAS * float(np.linalg.norm(intensity(disturbances.gusts, wind)))
+    error = np.broadcast_to(np.array(disturbances.mass_error, dtype=float), len(models))
+    found = [
+        (max(model.linear_drag) + max(model.body_drag) * wind) * wind / model.mass
+        if not model.point
+        else model.drag * wind / model.mass
+        for model in models
+    ]
+    limit = np.array([model.thrust_limit / model.mass for model in models])
+    return np.array(found) + np.where(error > 0.0, limit, gravity) * np.abs(error)
+
+
+def reaction_times(models: Sequence[VehicleModel], disturbances: Disturbances | None) -> Floats:
+    """Time (N,) [s] until a commanded force acts: a measurement's delay; of quadrotors also motors and attitude.
+
+    The attitude loop follows a ramp late by k_omega / k_R.
+    """
+    noise = None if disturbances is None else disturbances.noise
+    delay = 0.0 if noise is None else noise.delay
+    own = [
+        0.0
+        if model.point
+        else max(model.motor_time) + model.attitude_gains[1] / model.attitude_gains[0]
+        for model in models
+    ]
+    return delay + np.array(own)
+
+
+def widening(given: Avoidance, disturbances: Disturbances | None) -> float:
+    """By how much each vehicle is taken to be larger [m]."""
+    if given.margin is not None:
+        return given.margin
+    noise = None if disturbances is None else disturbances.noise
+    return 0.0 if noise is None else _SIGMAS * noise.position
+
+
+def unproved(models: Sequence[VehicleModel], d: Disturbances | None) -> str:
+    """Why the guard's guarantee is no theorem for these vehicles; empty if it is one."""
+    if not all(model.point for model in models):
+        return "quadrotors cannot brake at once"
+    if d is None:
+        return ""
+    for found, words in (
+        (d.noise is not None, "states are measured with noise or late"),
+        (any(d.wind) or d.gusts is not None, "the wind is not known"),
+        (np.any(d.mass_error), "masses are not known"),
+        (d.lost, "vehicles are lost"),
+    ):
+        if found:
+            return words
+    return ""
+
+
+def check(collector: FindingCollector, parts: Mapping[str, Any]) -> None:
+    """Find the errors in [avoidance]."""
+    given = parts.get(_TABLE)
+    if given is None:
+        return
+    if not flies_vehicles(collector):
+        remedy = "give the agents a vehicle; model = 'point' flies points with sampled control"
+        problem = "needs sampled control, which only vehicles have"
+        collector.add((_TABLE,), problem, remedy, None)
+        return
+    if not (given.guard or given.barrier):
+        collector.add((_TABLE,), "has neither guard nor barrier", "remove it, or set one of them")
+    d: Disturbances | None = parts.get("disturbances")
+    if d is not None and d.links is not None:
+        problem = (
+            "needs the states of all vehicles at once, which [disturbances.links] does not give"
+        )
+        collector.add((_TABLE,), problem, "remove one of the two", None)
+    for k, thing in enumerate(parts.get("obstacles", ())):
+        if thing.kind == "heights":
+            problem = "is no obstacle that [avoidance] knows: it needs convex ones"
+            collector.add(
+                ("obstacles", k), problem, "build it of boxes or hulls, or remove [avoidance]", None
+            )
+        elif thing.solid.moves:
+            problem = "moves, and [avoidance] knows obstacles only that stand still"
+            collector.add(
+                ("obstacles", k), problem, "let it stand still, or remove [avoidance]", None
+            )
+    if "agents" not in parts or collector.findings:
+        return
+    names, tables = parts["agents"].vehicle, parts["vehicles"]
+    models = [resolve(tables[name]) for name in names]
+    left = braking(models, parts.get("gravity", 9.81), d)
+    for name in dict.fromkeys(names):
+        i, where = names.index(name), ("vehicles", name, "thrust_limit")
+        if math.isinf(left[i]):
+            problem = "is missing: without a limit there is no braking to reckon with"
+            collector.add(where, problem, "add the greatest thrust [N]")
+        elif left[i] <= 0.0:
+            weight = models[i].thrust_limit - left[i] * models[i].mass
+            problem = (
+                f"leaves nothing to brake with: {models[i].thrust_limit:.4g} N, but weight and wind take up to"
+                f" {weight:.4g} N"
+            )
+            remedy = "raise the thrust, lower mass, wind or mass_error, or remove [avoidance]"
+            collector.add(where, problem, remedy, None)

@@ -1,0 +1,42 @@
+"""Make what avoidance in flight reads, from a mission."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rigidfleet.kernel import avoidance, fleet
+from rigidfleet.mission import Mission
+from rigidfleet.mission.avoidance import braking, reaction_times, widening
+from rigidfleet.solids.records import joined
+
+
+def avoidance_in_flight(mission: Mission, flight: fleet.Flight) -> avoidance.Avoidance | None:
+    """Avoidance at the ticks of the formation's law; None without [avoidance]."""
+    given, models = mission.avoidance, mission.vehicle_models
+    if given is None or models is None:
+        return None
+    mass = mission.fleet.mass
+    separation = given.separation
+    if separation is None:
+        separation = mission.limits.separation or 0.0
+    limit = np.array([model.thrust_limit for model in models])
+    drag = np.where([model.point for model in models], mission.drag / mass, 0.0)
+    return avoidance.avoidance(
+        period=flight.every * flight.steps * flight.h,
+        b=braking(models, mission.gravity, mission.disturbances),
+        lift=limit / mass,
+        mass=mass,
+        g=mission.gravity,
+        radius=np.array(mission.agents.radius, dtype=float),
+        solids=joined([thing.solid for thing in mission.obstacles]),
+        separation=separation,
+        clearance=given.clearance,
+        drag=drag,
+        lag=reaction_times(models, mission.disturbances),
+        spare=widening(given, mission.disturbances),
+        rate=given.rate,
+        share=given.share,
+        release=given.release,
+        guarded=given.guard,
+        filtered=given.barrier,
+    )

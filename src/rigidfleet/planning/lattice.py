@@ -1,0 +1,399 @@
+"""Ways of a rigid shape among obstacles: a search over places, attitudes and shapes.
+
+A *layer* is a shape in an attitude: balls at fixed offsets from the centre of mass. Within a layer the shape moves
+straight; from layer to layer it turns or changes its shape on the spot. Places form a lattice whose coordinates follow
+from the obstacles: along each axis, the middles between the places at which the shape just touches an obstacle's
+extent. A gap between two boxes along the axes therefore has coordinates in its middle, however narrow it is. A few
+even coordinates, common to all layers, join them; there the layer can change. Turned boxes bring lattices along their
+own axes.
+
+A motion is kept only if conservative advancement proves it: halved again and again, until the room in the middle of
+each part, less the way that a ball flies from there, is what is needed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from rigidfleet.math import attitude as att
+from rigidfleet.math import proximity
+from rigidfleet.mission import Obstacle
+from rigidfleet.solids import records
+from rigidfleet.typing import Bools, Floats, Ints
+
+#: Greatest number of halvings of a motion, and of parts of motions looked at in one step.
+_HALVINGS, _PARTS = 12, 400_000
+#: Room to spare on either side in a gap that is found [m].
+SPARE = 0.005
+#: Greatest number of coordinates along an axis that follow from obstacles.
+_MOST = 26
+#: What a metre aside of the straight way counts, where ways are compared by their room [m].
+_ASIDE = 1e-5
+#: How often a way is shortened.
+_SHORTER = 3
+#: Costs, as lengths: of a change in multiples of its longest way plus a length [m]; of a way in another shape.
+_CHANGE, _OTHER = 1.0, 1.2
+
+#: Offsets (K, M, 3) [m] of balls at shares (K,) of a motion.
+Path = Callable[[Floats], Floats]
+
+
+class Space(NamedTuple):
+    """Obstacles at rest, and the box (2, 3) [m] in which agents' centres must stay, infinite without a geofence."""
+
+    obstacles: Sequence[Obstacle]
+    fence: Floats
+
+    def room(self, r: Floats, radius: Floats, most: Floats | float = np.inf) -> Floats:
+        """Least distance (..., M) [m] of balls at r (..., M, 3) to an obstacle, or of their centres to the fence.
+
+        Beyond ``most`` (..., M) [m] the distance does not matter.
+        """
+        found, _ = proximity.obstacle_clearances(r, radius, self.obstacles, most=most)
+        if np.isfinite(self.fence).any():
+            found = np.minimum(found, np.minimum(r - self.fence[0], self.fence[1] - r).min(axis=-1))
+        return found
+
+
+class Layer(NamedTuple):
+    """A shape in an attitude."""
+
+    formation: str
+    angles: tuple[float, float, float]  # roll, pitch, yaw [deg]
+    offsets: Floats  # (M, 3) of balls from the centre of mass, world axes [m]
+
+    @property
+    def turn(self) -> Floats:
+        """Its attitude (3, 3), world to body."""
+        return att.dcm_from_euler(np.deg2rad(self.angles))
+
+
+class Change(NamedTuple):
+    """A motion on the spot from one layer to another."""
+
+    before: int
+    after: int
+    path: Path
+    ways: Floats  # (M,) upper bounds of what each ball flies [m]
+
+    @property
+    def cost(self) -> float:
+        """As a length [m]."""
+        return _CHANGE + float(self.ways.max())
+
+
+def proved(
+    space: Space, a: Floats, b: Floats, path: Path, ways: Floats, radius: Floats, need: float
+) -> Bools:  # fmt: skip
+    """Whether motions (E,) keep the room ``need`` [m]: from a to b (E, 3) [m], with offsets that follow a path.
+
+    ``ways`` (M,) bounds what each ball flies relative to the centre of mass [m].
+    """
+    found = np.ones(len(a), dtype=np.bool_)
+    way = np.linalg.norm(b - a, axis=1)[:, None] + ways
+    who, low, length = np.arange(len(a)), np.zeros(len(a)), 1.0
+    for _ in range(_HALVINGS):
+        middle = low + length / 2
+        place = a[who] + middle[:, None] * (b - a)[who]
+        wanted = need + way[who] * length / 2
+        room = space.room(place[:, None] + path(middle), radius, wanted)
+        found[who[(room < need).any(axis=1)]] = False
+        open_ = found[who] & (room < wanted).any(axis=1)
+        who, low, length = who[open_], low[open_], length / 2
+        if not len(who):
+            return found
+        if len(who) * 2 > _PARTS:
+            break
+        who, low = np.tile(who, 2), np.concatenate([low, low + length])
+    found[who] = False
+    return found
+
+
+def staying(layer: Layer) -> Path:
+    """The path of a layer that does not change."""
+    return lambda share: np.broadcast_to(layer.offsets, (len(share), *layer.offsets.shape))
+
+
+class Lattice:
+    """Places of one layer in the axes of one frame, and its motions that are proved."""
+
+    def __init__(
+        self, space: Space, layer: Layer, radius: Floats, need: float, frame: Floats, common: list[Floats]
+    ) -> None:  # fmt: skip
+        """Find places and motions.
+
+        Parameters
+        ----------
+        frame : (3, 3), from world axes to those of the lattice
+        common : coordinates [m] along the axes that all layers have
+        """
+        offsets = layer.offsets @ frame.T
+        axes = [
+            _coordinates(
+                common[k],
+                np.array([_extent(thing, frame)[:, k] for thing in space.obstacles]).reshape(-1, 2),
+                float((offsets[:, k] + radius).max()) + need,
+                float((radius - offsets[:, k]).max()) + need,
+            )
+            for k in range(3)
+        ]
+        self.layer, self.axes, self.shape = layer, axes, tuple(map(len, axes))
+        grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+        self.points = grid @ frame
+        self.room = space.room(self.points[:, None] + layer.offsets, radius, need).min(axis=1)
+        free = self.room >= need
+        index = np.arange(len(grid)).reshape(self.shape)
+        tails, heads = [], []
+        for k in range(3):
+            one, two = (
+                np.delete(index, -1, axis=k).ravel(),
+                np.delete(index, 0, axis=k).ravel(),
+            )
+            tails.append(one)
+            heads.append(two)
+        self.all_edges = np.array([np.concatenate(tails), np.concatenate(heads)])
+        edges = self.all_edges[:, free[self.all_edges].all(axis=0)]
+        still = np.zeros(len(radius))
+        a, b = self.points[edges[0]], self.points[edges[1]]
+        self.edges = edges[:, proved(space, a, b, staying(layer), still, radius, need)]
+        self.common = index[
+            np.ix_(*(np.searchsorted(axes[k], common[k]) for k in range(3)))
+        ].ravel()
+        self.free = free
+
+
+def _coordinates(common: Floats, spans: Floats, above: float, below: float) -> Floats:
+    """Coordinates [m] along an axis: common ones, and middles between places where the shape touches a span (B, 2)."""
+    low, high = common[0], common[-1]
+    touch = np.unique(np.concatenate([spans[:, 0] - above, spans[:, 1] + below]))
+    touch = touch[(touch > low) & (touch < high)]
+    if len(touch) > _MOST:
+        touch = touch[np.linspace(0, len(touch) - 1, _MOST).round().astype(int)]
+    touch = np.concatenate([[low], touch, [high]])
+    wide = np.diff(touch) > SPARE
+    return np.unique(np.concatenate([common, ((touch[1:] + touch[:-1]) / 2)[wide]]))
+
+
+def _extent(thing: Obstacle, frame: Floats) -> Floats:
+    """Lowest and highest coordinates (2, 3) [m] of an obstacle along the axes of a frame."""
+    if np.array_equal(frame, np.eye(3)):
+        return records.extent(thing.solid)
+    solid = thing.solid
+    if not np.isfinite(records.extent(solid)).all():
+        ends = records.extent(solid)
+        upright = np.array_equal(frame[2], [0.0, 0.0, 1.0])
+        wide = np.array([[-np.inf] * 3, [np.inf] * 3])
+        wide[:, 2] = ends[:, 2] if upright else wide[:, 2]
+        return wide
+    turned = solid._replace(
+        turn=solid.turn @ frame.T, origin=solid.origin @ frame.T, turned=np.ones(1, dtype=np.int64)
+    )
+    return records.extent(turned)
+
+
+class Way(NamedTuple):
+    """A way that was found: a place (3,) [m] and a layer for each stop, in order."""
+
+    places: list[Floats]
+    layers: list[int]
+    cost: float  # as a length [m]
+
+
+#: A place (3,) [m] and a layer.
+Stop = tuple[Floats, int]
+
+
+class Network:
+    """Lattices of several layers and frames, joined where the layer can change."""
+
+    def __init__(
+        self, space: Space, layers: list[Layer], changes: list[Change], radius: Floats, need: float,
+        frames: list[Floats], common: list[list[Floats]],
+    ) -> None:  # fmt: skip
+        """Build the lattices; the parameters are those of `Lattice`, for each layer and frame."""
+        self.space, self.layers, self.changes = space, layers, changes
+        self.radius, self.need = radius, need
+        self.lattices = [
+            [Lattice(space, layer, radius, need, frame, even) for layer in layers]
+            for frame, even in zip(frames, common, strict=True)
+        ]
+        counts = [[len(x.points) for x in row] for row in self.lattices]
+        starts = np.cumsum([0, *np.ravel(counts)])
+        self.first = starts[:-1].reshape(len(frames), len(layers))
+        self.size = int(starts[-1])
+        self.points = np.concatenate([x.points for row in self.lattices for x in row])
+        self.layer_of = np.repeat(np.tile(np.arange(len(layers)), len(frames)), np.ravel(counts))
+        self._join()
+
+    def _join(self) -> None:
+        """Collect motions within layers, changes at common places, and crossings from frame to frame."""
+        tails, heads, costs = [], [], []
+
+        def add(one: Ints, two: Ints, cost: Floats) -> None:
+            tails.append(one)
+            heads.append(two)
+            costs.append(cost)
+
+        for f, row in enumerate(self.lattices):
+            for k, x in enumerate(row):
+                a, b = x.edges + self.first[f, k]
+                length = np.linalg.norm(self.points[a] - self.points[b], axis=1)
+                other = 1.0 if x.layer.formation == self.layers[0].formation else _OTHER
+                add(a, b, length * other)
+            for change in self.changes:
+                one, two = row[change.before], row[change.after]
+                free = one.free[one.common] & two.free[two.common]
+                a, b = one.common[free], two.common[free]
+                spots = one.points[a]
+                good = self._changes(change, spots)
+                a, b = a[good] + self.first[f, change.before], b[good] + self.first[f, change.after]
+                add(a, b, np.full(len(a), change.cost))
+        for f in range(1, len(self.lattices)):
+            for k, layer in enumerate(self.layers):
+                add(*self._crossings(k, layer, f))
+        self.tails, self.heads = np.concatenate(tails), np.concatenate(heads)
+        self.costs = np.concatenate(costs)
+
+    def _changes(self, change: Change, spots: Floats) -> Bools:
+        return proved(
+            self.space, spots, spots, change.path, change.ways, self.radius, self.need
+        )  # fmt: skip
+
+    def _crossings(self, k: int, layer: Layer, f: int) -> tuple[Ints, Ints, Floats]:
+        """Straight ways of a layer between common places of the world's lattice and the nearest of another frame."""
+        from scipy.spatial import KDTree
+
+        one, two = self.lattices[0][k], self.lattices[f][k]
+        a, b = one.common[one.free[one.common]], two.common[two.free[two.common]]
+        if not (len(a) and len(b)):
+            return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), np.zeros(0)
+        near = KDTree(two.points[b]).query(one.points[a], k=min(2, len(b)))[1].reshape(len(a), -1)
+        a, b = np.repeat(a, near.shape[1]), b[near.ravel()]
+        p, q = one.points[a], two.points[b]
+        still = np.zeros(len(self.radius))
+        good = proved(self.space, p, q, staying(layer), still, self.radius, self.need)
+        cost = np.linalg.norm(p - q, axis=1)[good]
+        return a[good] + self.first[0, k], b[good] + self.first[f, k], cost
+
+    def node(self, place: Floats, layer: int) -> int:
+        """The node at a place (3,) of a layer in the world's lattice; common coordinates contain it."""
+        x = self.lattices[0][layer]
+        at = [int(np.abs(x.axes[k] - place[k]).argmin()) for k in range(3)]
+        return int(self.first[0, layer] + np.ravel_multi_index(at, x.shape))
+
+    def shortest(self, begin: tuple[Floats, int], end: tuple[Floats, int]) -> Way | None:
+        """The way of least cost from a place and layer to others; None if there is none."""
+        from scipy.sparse import csr_array
+        from scipy.sparse.csgraph import dijkstra
+
+        a, b = self.node(*begin), self.node(*end)
+        graph = csr_array(
+            (np.maximum(self.costs, 1e-9), (self.tails, self.heads)), shape=(self.size, self.size)
+        )
+        cost, before = dijkstra(graph, directed=False, indices=a, return_predecessors=True)
+        if not np.isfinite(cost[b]):
+            return None
+        nodes = [b]
+        while nodes[-1] != a:
+            nodes.append(int(before[nodes[-1]]))
+        nodes.reverse()
+        return Way(
+            [self.points[k] for k in nodes], [int(self.layer_of[k]) for k in nodes], float(cost[b])
+        )
+
+    def shortened(self, way: Way) -> Way:
+        """The way with fewer stops: straight where that is proved, with changes at stops or half-way between them."""
+        stops = list(zip(way.places, way.layers, strict=True))
+        for _ in range(_SHORTER):
+            stops = self._changed_on_the_way(self._straightened(stops))
+        ends = way.places[0], way.places[-1]
+        places = [p if any(p is end for end in ends) else np.round(p, 3) for p, _ in stops]
+        return Way(places, [k for _, k in stops], way.cost)
+
+    def _free(self, a: Stop, b: Stop) -> bool:
+        """Whether the motion from one stop to another is proved: straight in one layer, or a change on the spot."""
+        (p, i), (q, j) = a, b
+        path, ways = staying(self.layers[i]), np.zeros(len(self.radius))
+        if i != j:
+            change = next((c for c in self.changes if {c.before, c.after} == {i, j}), None)
+            if change is None or not np.array_equal(p, q):
+                return False
+            path, ways = change.path, change.ways
+        return bool(proved(self.space, p[None], q[None], path, ways, self.radius, self.need)[0])
+
+    def _straightened(self, stops: list[Stop]) -> list[Stop]:
+        """From each stop on to the farthest one of its layer that is straight ahead."""
+        stops, k = list(stops), 0
+        while k < len(stops) - 2:
+            run = k + 1
+            while run + 1 < len(stops) and stops[run + 1][1] == stops[k][1]:
+                run += 1
+            far = next((j for j in range(run, k + 1, -1) if self._free(stops[k], stops[j])), k + 1)
+            del stops[k + 1 : far]
+            k += 1
+        return stops
+
+    def _changed_on_the_way(self, stops: list[Stop]) -> list[Stop]:
+        """Changes moved to the stop before or after, or half-way between the two, which saves a detour to them."""
+        stops, first = list(stops), 1
+        while first < len(stops) - 1:
+            after = first + 1
+            while after < len(stops) and np.array_equal(stops[after][0], stops[first][0]):
+                after += 1
+            if after - first > 1 and after < len(stops):
+                a, b = stops[first - 1], stops[after]
+                for place in (a[0], b[0], np.round((a[0] + b[0]) / 2, 3)):
+                    moved = [(place, layer) for _, layer in stops[first:after]]
+                    if all(self._free(x, y) for x, y in pairwise([a, *moved, b])):
+                        stops[first:after] = moved
+                        break
+            first = after
+        alike = [
+            k > 0 and s[1] == stops[k - 1][1] and np.array_equal(s[0], stops[k - 1][0])
+            for k, s in enumerate(stops)
+        ]
+        return [s for s, again in zip(stops, alike, strict=True) if not again]
+
+    def widest(
+        self, begin: tuple[Floats, int], end: tuple[Floats, int]
+    ) -> tuple[float, Floats, int]:
+        """The most room [m] that a way between two nodes leaves everywhere, and place and layer where it is least."""
+        from scipy.sparse import csr_array
+        from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
+
+        tails, heads, rooms = [], [], []
+        for k, x in enumerate(self.lattices[0]):
+            a, b = x.all_edges
+            share = np.linspace(0.0, 1.0, 5)[1:-1]
+            between = x.points[a, None] + share[:, None] * (x.points[b] - x.points[a])[:, None]
+            room = self.space.room(between[:, :, None] + x.layer.offsets, self.radius)
+            tails.append(a + self.first[0, k])
+            heads.append(b + self.first[0, k])
+            rooms.append(np.minimum(room.min(axis=(1, 2)), np.minimum(x.room[a], x.room[b])))
+        for change in self.changes:
+            one, two = self.lattices[0][change.before], self.lattices[0][change.after]
+            a, b = one.common, two.common
+            tails.append(a + self.first[0, change.before])
+            heads.append(b + self.first[0, change.after])
+            rooms.append(np.minimum(one.room[a], two.room[b]))
+        tail, head, room = map(np.concatenate, (tails, heads, rooms))
+        # Of places that are as narrow, the one nearest to the straight way.
+        along = end[0] - begin[0]
+        beside = np.cross(self.points[tail] - begin[0], along / max(np.linalg.norm(along), 1e-9))
+        room = room - _ASIDE * np.linalg.norm(beside, axis=1)
+        most = float(room.max()) + 1.0
+        tree = minimum_spanning_tree(
+            csr_array((most - room, (tail, head)), shape=(self.size, self.size))
+        )
+        a, b = self.node(*begin), self.node(*end)
+        _, before = breadth_first_order(tree, a, directed=False)
+        tree = (tree + tree.T).tocsr()
+        at, least = b, (np.inf, b)
+        while at != a:
+            least = min(least, (most - float(tree[at, before[at]]), at))
+            at = int(before[at])
+        return least[0], self.points[least[1]], int(self.layer_of[least[1]])

@@ -1,0 +1,394 @@
+"""Ways found round obstacles: a phase of kind "go" becomes ordinary phases that fly, turn and change the formation.
+
+The search (`rigidfleet.planning.lattice`) takes the formation as it is first, then the mission's other formations,
+then smaller ones, then more attitudes. What it finds is shortened, written as phases, and proved in time along the
+planned reference of every vehicle (`rigidfleet.planning.clearance`). If the proof fails, more room is asked for.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from rigidfleet.errors import Finding, MissionError
+from rigidfleet.math import attitude as att
+from rigidfleet.math import proximity
+from rigidfleet.mission import Mission, Phase
+from rigidfleet.mission.kinds import ANGLES, Go
+from rigidfleet.mission.values import AUTO
+from rigidfleet.planning import layers
+from rigidfleet.planning.clearance import CLOSE, closest, pace
+from rigidfleet.planning.lattice import Layer, Network, Space, Way, staying
+from rigidfleet.planning.preview import at_start, ending, leg, planned_phase, samples_per_phase
+from rigidfleet.planning.reference import PhaseState
+from rigidfleet.solids.records import extent
+from rigidfleet.typing import Floats
+
+#: A phase with its automatic times known, from the mission, the phase, the state at its start, and its number.
+Timed = Callable[[Mission, Phase, PhaseState, int], Phase]
+
+#: Greatest speed at the start of a way [m/s]: what regulators leave.
+_REST = 0.1
+#: Number of agents up to which each is a ball of the search; more are covered by one.
+_EACH = 60
+#: Least and greatest number of even coordinates along an axis.
+_EVEN = (4, 8)
+#: Yaws of the last search [deg], and how often a way is asked for more room after a failed proof.
+_YAWS, _TRIES = range(0, 360, 30), 4
+#: Cost of a way, over the straight one, up to which other shapes are not tried; number of shapes for more yaws.
+_SHORT, _FEW = 1.2, 6
+#: Room that the search keeps beyond what is asked for [m]: rounded places, and the accuracy of the proof.
+_KEPT = 2e-3
+
+
+def found(mission: Mission, timed: Timed) -> Mission:
+    """Return the mission with each phase of kind "go" replaced by those of a way; itself if it has none.
+
+    The result is an ordinary mission: it can be written, read and flown by itself.
+
+    Raises
+    ------
+    MissionError
+        There is no way, none was found that can be proved, or a phase cannot begin one.
+    """
+    while (k := next((k for k, p in enumerate(mission.phases) if isinstance(p, Go)), None)) is not None:  # fmt: skip
+        phase, now = mission.phases[k], at_start(mission)
+        assert isinstance(phase, Go)
+        for number, before in enumerate(mission.phases[:k]):
+            planned = leg(mission, timed(mission, before, now, number), now)
+            if planned is None:
+                raise _refused(mission, k, "kind", "go", "begins where distances alone have led",
+                               "give the formation a shape or slots")  # fmt: skip
+            now = planned.after
+        mission = _Search(mission, k, phase, now, timed).expanded()
+    return mission
+
+
+class _Search:
+    """The search for the way of one phase."""
+
+    def __init__(
+        self, mission: Mission, number: int, phase: Go, now: PhaseState, timed: Timed
+    ) -> None:
+        self.mission, self.number, self.phase, self.now, self.timed = mission, number, phase, now, timed  # fmt: skip
+        if now.formation is None or now.slots is None:
+            raise _refused(mission, number, "kind", "go", "needs a formation that flies there",
+                           "add a phase of kind 'establish' before")  # fmt: skip
+        speed = float(np.linalg.norm(now.v, axis=1).max())
+        if speed > _REST:
+            raise _refused(mission, number, "kind", "go", f"begins at {speed:.2g} m/s, but a way begins at rest",
+                           "end the phase before at rest")  # fmt: skip
+        masses = mission.fleet.mass
+        pose = now.goal
+        T = np.eye(3) if pose is None else pose.T
+        self.begin = masses @ now.r / masses.sum() if pose is None else pose.r
+        self.end = np.array(phase.position)
+        roll, pitch, yaw = (float(round(x, 6)) for x in np.rad2deg(att.euler_from_dcm(T)))
+        self.start = (roll, pitch, yaw)
+        self.goal = self.start if phase.attitude_deg is None else phase.attitude_deg
+        self.shapes = list(layers.allowed(mission, phase, now.formation))
+        most = max(float(np.linalg.norm(s.slots, axis=1).max()) for s in self.shapes)
+        self.reach = most + float(mission.fleet.radius.max())
+        self.each = mission.n_agents <= _EACH
+        self.radius = mission.fleet.radius if self.each else np.array([self.reach])
+
+    # -- what there is to choose from ------------------------------------------------------------------
+
+    def _near(self) -> list[Any]:
+        """Obstacles at rest that may stand in the way."""
+        low, high = self._domain
+        return [
+            thing
+            for thing in self.mission.obstacles
+            if not thing.solid.moves
+            and (extent(thing.solid)[0] <= high + self.reach + 1.0).all()
+            and (extent(thing.solid)[1] >= low - self.reach - 1.0).all()
+        ]
+
+    @property
+    def _domain(self) -> Floats:
+        """Lowest and highest place (2, 3) [m] of the centre of mass that is looked at."""
+        ends = np.array([self.begin, self.end])
+        low, high = ends.min(axis=0), ends.max(axis=0)
+        around = float(np.linalg.norm(high - low)) + 4.0 * self.reach
+        room = np.array([low - around, high + around])
+        for thing in self.mission.obstacles:
+            a, b = extent(thing.solid)
+            if not thing.solid.moves and (a <= room[1]).all() and (b >= room[0]).all():
+                low = np.minimum(low, np.maximum(a, room[0]))
+                high = np.maximum(high, np.minimum(b, room[1]))
+        beside = 2.0 * self.reach + 2.0 * self.phase.clearance
+        return np.array([low - beside, high + beside])
+
+    # -- the search ------------------------------------------------------------------------------------
+
+    def expanded(self) -> Mission:
+        """The mission with the way's phases in place of this one."""
+        need = self.phase.clearance + _KEPT
+        for _ in range(_TRIES):
+            way = self._searched(need)
+            mission, lacking = self._tried(*way)
+            if lacking <= 0.0:
+                return mission
+            need += lacking + _KEPT
+        return self._unproved(mission, lacking)
+
+    def _searched(self, need: float) -> tuple[Network, Way]:
+        """The way of least cost among shapes: more shapes, and then more yaws, as long as there is no short one."""
+        best: tuple[Network, Way] | None = None
+        straight = float(np.linalg.norm(self.end - self.begin))
+        stages = sorted({s.stage for s in self.shapes})
+        for stage, more in [*((k, False) for k in stages), (stages[-1], True)]:
+            if more and (best is not None or len(self.shapes) > _FEW):
+                break
+            shapes = [s for s in self.shapes if s.stage <= stage]
+            network = self._network(shapes, need, more=more)
+            way = network.shortest((self.begin, 0), (self.end, self._last))
+            if way is not None and (best is None or way.cost < best[1].cost):
+                best = network, way
+            if best is not None and best[1].cost <= _SHORT * straight + self.reach:
+                break
+        if best is None:
+            raise self._none(network)
+        return best[0], best[0].shortened(best[1])
+
+    def _network(self, shapes: list[layers.Shape], need: float, *, more: bool) -> Network:
+        frames = layers.frames(self._near())
+        fence = self.mission.limits.geofence
+        box = np.array([[-np.inf] * 3, [np.inf] * 3])
+        box = box if fence is None else np.array([fence.min, fence.max]) + [[need], [-need]]
+        space = Space(self._near(), box)
+        roll, pitch, yaw_before = self.start
+        yaws = {yaw_before + yaw for yaw in _YAWS} if more else set()
+        for shape in shapes:
+            yaws |= layers.narrow_yaws(shape.slots, self.start, frames)
+        angles = [self.start]
+        for a in (self.goal, *((roll, pitch, yaw) for yaw in sorted(yaws))):
+            if all(layers.angle_between(a, b) > 1e-6 for b in angles):
+                angles.append(a)
+        turns = [att.dcm_from_euler(np.deg2rad(a)) for a in angles]
+        found = [
+            Layer(s.name, a, s.slots @ T if self.each else np.zeros((1, 3)))
+            for s in shapes
+            for a, T in zip(angles, turns, strict=True)
+        ]
+        self._last = min(
+            range(len(angles)), key=lambda k: layers.angle_between(angles[k], self.goal)
+        )
+        common = []
+        for frame in frames:
+            corners = np.array(np.meshgrid(*self._domain.T)).reshape(3, -1).T @ frame.T
+            low, high = corners.min(axis=0), corners.max(axis=0)
+            ends = np.array([self.begin, self.end]) @ frame.T
+            count = np.clip(np.ceil((high - low) / (2.0 * self.reach)), *_EVEN).astype(int)
+            common.append(
+                [
+                    np.unique([*np.linspace(low[k], high[k], count[k]), *ends[:, k]])
+                    for k in range(3)
+                ]
+            )
+        changes = list(layers.changes(self.mission, shapes, angles))
+        if not self.each:  # the one ball that covers all neither turns nor changes
+            stays = staying(found[0])
+            changes = [c._replace(path=stays, ways=np.zeros(1)) for c in changes]
+        return Network(space, found, changes, self.radius, need, frames, common)
+
+    # -- from nodes to phases --------------------------------------------------------------------------
+
+    def _parts(self, network: Network, way: Way) -> Iterator[tuple[str, dict[str, Any], float]]:
+        """Name, keys and greatest way [m] of an agent, of each phase of a way."""
+        changes = {frozenset((c.before, c.after)): float(c.ways.max()) for c in network.changes}
+        written = self._written()
+        for (a, i), (b, j) in pairwise(zip(way.places, way.layers, strict=True)):
+            layer = network.layers[j]
+            if i == j:
+                told = f"to ({', '.join(f'{x:.4g}' for x in b)})"
+                yield told, {"kind": "fly", "position": b.tolist()}, float(np.linalg.norm(b - a))
+            elif layer.formation != network.layers[i].formation:
+                name = written.get(layer.formation, layer.formation)
+                way_of = changes[frozenset((i, j))]
+                yield f"take {name}", {"kind": "reshape", "formation": name}, way_of
+            else:
+                keys: dict[str, Any] = {"kind": "turn"} | _angles(layer.angles)
+                yield f"turn to {layer.angles[2]:.4g}°", keys, changes[frozenset((i, j))]
+
+    def _written(self) -> dict[str, str]:
+        """Names of formations as the file has them, by those that they have here."""
+        tables = self.mission.to_dict()["phases"]
+        return {
+            p.shaping.formation: t["formation"]
+            for p, t in zip(self.mission.phases, tables, strict=True)
+            if p.shaping is not None
+        }
+
+    def _tables(self, network: Network, way: Way) -> list[dict[str, Any]]:
+        """The phases of a way as tables; times are shared like the roots of the longest ways, or automatic."""
+        phase = self.phase
+        parts = list(self._parts(network, way))
+        if not parts:
+            parts = [("stay", {"kind": "fly", "position": self.end.tolist()}, 1.0)]
+        end = ending(self.mission, phase, self.now.t)
+        roots = np.sqrt([max(length, 1e-3) for *_, length in parts])
+        lengths = (end - self.now.t) * roots / roots.sum() if phase.duration != AUTO else roots
+        tables = []
+        for number, ((told, keys, _), length) in enumerate(zip(parts, lengths, strict=True), 1):
+            time = AUTO if phase.duration == AUTO else round(float(length), 3)
+            table = {"name": f"{phase.name} {number}: {told}", **keys, "duration": time}
+            if keys["kind"] == "reshape":
+                table["blend"] = time
+            if self.mission.architecture == "body":
+                table["control"] = phase.control
+            tables.append(table)
+        last = tables[-1]
+        if phase.attitude_deg is not None and last["kind"] == "fly":
+            last |= _angles(phase.attitude_deg)
+        if phase.duration != AUTO:
+            before = [float(t["duration"]) for t in tables[:-1]]
+            last["duration"] = round(end - self.now.t - sum(before), 6)
+            if "blend" in last:
+                last["blend"] = last["duration"]
+            if phase.until is not None:
+                last["until"] = phase.until
+                del last["duration"]
+        return tables
+
+    def _tried(self, network: Network, way: Way) -> tuple[Mission, float]:
+        """The mission with a way, and the clearance [m] that its proof lacks: that of every vehicle, in time."""
+        mission, k = self.mission, self.number
+        data, tables = mission.to_dict(), self._tables(network, way)
+        forms = {
+            name: mission.formations[name].model_dump(
+                mode="json", exclude_none=True, exclude_defaults=True
+            )
+            for name in {t.get("formation") for t in tables} - {None} - set(data["formations"])
+            if name in mission.formations
+        }
+        named = [t | {"name": p.name} for t, p in zip(data["phases"], mission.phases, strict=True)]
+        data |= {
+            "phases": [*named[:k], *tables, *named[k + 1 :]],
+            "formations": data["formations"] | dict(sorted(forms.items())),
+        }
+        tried = Mission.from_dict(data, mission.origin)
+        now, lacking = self.now, -math.inf
+        self._worst = ""
+        for number in range(k, k + len(tables)):
+            found = leg(tried, self.timed(tried, tried.phases[number], now, number), now)
+            assert found is not None  # slots are tracked
+            now = found.after
+            lacks = self._lacking(tried, found)
+            lacking = max(lacking, lacks)
+        return tried, lacking
+
+    def _lacking(self, mission: Mission, found: Any) -> float:
+        """How much [m] the clearance of a planned leg is below what is asked for; negative if it is kept."""
+        planned = planned_phase(found, max(samples_per_phase(mission), 11), mission.fleet.radius)
+        low, high = planned.position.min(axis=(0, 1)), planned.position.max(axis=(0, 1))
+        speed, need, radius = pace(planned), self.phase.clearance, mission.fleet.radius
+        least = math.inf
+        for thing in mission.obstacles:
+            a, b = extent(thing.solid)
+            beside = np.maximum(np.maximum(a - high, low - b), 0.0)
+            if np.linalg.norm(beside) - radius.max() > min(least, need + 1.0):
+                continue
+            clearance, agent, time = closest(planned, thing, radius, speed)
+            if clearance - CLOSE < least:
+                least = clearance - CLOSE
+                self._worst = (
+                    f"agent {agent + 1} is {clearance:.3f} m from '{thing.name}' at {time:.2f} s in"
+                    f" '{planned.phase}'"
+                )
+            if thing.solid.moves and clearance - CLOSE < need:
+                raise self._unmet()
+        return need - least
+
+    # -- what to say -----------------------------------------------------------------------------------
+
+    def _unmet(self) -> MissionError:
+        problem = f"ways are found round obstacles at rest, and on the one found {self._worst}"
+        return _refused(self.mission, self.number, "position", self.phase.position, problem,
+                        "wait before by kind 'hold', or fly elsewhere first")  # fmt: skip
+
+    def _unproved(self, mission: Mission, lacking: float) -> Mission:
+        problem = f"finds a way, but its proof lacks {lacking:.3f} m of clearance: {self._worst}"
+        raise _refused(self.mission, self.number, "clearance", self.phase.clearance, problem,
+                       "give more time, or ask for less clearance")  # fmt: skip
+
+    def _none(self, network: Network) -> MissionError:
+        """What stands in the way, and how much is missing."""
+        for what, place, layer in (("start", self.begin, 0), ("goal", self.end, self._last)):
+            x = network.layers[layer]
+            room = network.space.room(place + x.offsets, network.radius)
+            if room.min() < network.need:
+                agent, thing = self._nearest(network, place, layer, room)
+                problem = (
+                    f"its {what} leaves agent {agent + 1} {room.min():.2f} m of clearance from {thing}, which is less"
+                    f" than {self.phase.clearance:g} m"
+                )
+                return _refused(self.mission, self.number, "position", self.phase.position, problem,
+                                "move it, or ask for less clearance")  # fmt: skip
+        least, place, layer = network.widest((self.begin, 0), (self.end, self._last))
+        x = network.layers[layer]
+        room = network.space.room(place + x.offsets, network.radius)
+        _, thing = self._nearest(network, place, layer, room)
+        where = ", ".join(f"{v:.2f}" for v in place)
+        problem = (
+            f"no way is found: at the narrowest place of the best one, ({where}) m, '{x.formation}' at yaw"
+            f" {x.angles[2]:.4g}° "
+        ) + (
+            self._gap(network, place, layer)
+            or f"has {least:.2f} m of clearance from {thing}, {network.need - least:.2f} m less than asked for"
+        )
+        remedy = "allow a slimmer formation (formations, scales), ask for less clearance, or name points on the way"
+        return _refused(self.mission, self.number, "position", self.phase.position, problem, remedy)
+
+    def _nearest(
+        self, network: Network, place: Floats, layer: int, room: Floats
+    ) -> tuple[int, str]:
+        """The agent with the least room at a place, and what is nearest to it."""
+        x, agent = network.layers[layer], int(room.argmin())
+        _, near = proximity.obstacle_clearances(
+            place + x.offsets, network.radius, network.space.obstacles
+        )
+        k = int(near[agent])
+        return agent, f"'{network.space.obstacles[k].name}'" if k >= 0 else "the geofence"
+
+    def _gap(self, network: Network, place: Floats, layer: int) -> str:
+        """What a shape needs in the gap between the two nearest obstacles; "" if they do not lie on two sides of it."""
+        x, boxes = network.layers[layer], []
+        for other in network.space.obstacles:
+            room = proximity.obstacle_clearances(place + x.offsets, network.radius, [other])[0]
+            boxes.append((float(room.min()), other))
+        boxes.sort(key=lambda b: b[0])
+        if len(boxes) < 2:
+            return ""
+        (_, one), (_, two) = boxes[:2]
+        (a, b), (c, d) = extent(one.solid), extent(two.solid)
+        wide = np.maximum(a - d, c - b)
+        k = int(np.where(np.isfinite(wide), wide, -np.inf).argmax())
+        if wide[k] <= 0.0:
+            return ""
+        along = x.offsets[:, k]
+        takes = float((along + network.radius).max() - (along - network.radius).min())
+        needs = takes + 2.0 * self.phase.clearance
+        if needs <= wide[k]:
+            return ""
+        return (
+            f"needs {needs:.2f} m between '{one.name}' and '{two.name}', which leave {wide[k]:.2f} m:"
+            f" {needs - wide[k]:.2f} m are missing"
+        )
+
+
+def _angles(angles: layers.Angles) -> dict[str, float]:
+    """Keys of an attitude; angles of zero need none, but for the yaw."""
+    return {k: x for k, x in zip(ANGLES, angles, strict=True) if x or k == "yaw_deg"}
+
+
+def _refused(
+    mission: Mission, number: int, key: str, value: object, problem: str, remedy: str
+) -> MissionError:
+    path = f"phases[{number + 1}].{key}"
+    return MissionError([Finding(mission.origin, path, value, problem, remedy)])

@@ -1,0 +1,284 @@
+"""Ways found round obstacles: phases of kind "go"."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rigidfleet import assess, check, simulate
+from rigidfleet.errors import MissionError
+from rigidfleet.mission import Mission, load_mission
+from rigidfleet.planning.clearance import closest, greatest_speeds, pace
+from rigidfleet.planning.derivatives import slot_derivatives
+from rigidfleet.planning.preview import preview
+from rigidfleet.planning.timing import spelled_out, timed
+from rigidfleet.simulation.flight import Flight
+
+FORMS = {
+    "square": {"shape": "square", "size": 3.0},
+    "line": {"shape": "line", "size": 1.6},
+}
+
+
+def going(*obstacles: dict[str, Any], **keys: Any) -> Mission:
+    """Four vehicles in a square, 24 m before their goal, with obstacles between."""
+    changes = {k: keys.pop(k) for k in ("limits", "formations", "phases", "smoothness") if k in keys}  # fmt: skip
+    at = np.array([[-1.5, -1.5, 0], [1.5, -1.5, 0], [1.5, 1.5, 0], [-1.5, 1.5, 0]])
+    go = {"kind": "go", "name": "go", "position": [12, 0, 8], "duration": "auto"} | keys
+    data = {
+        "schema_version": 1,
+        "name": "going",
+        "smoothness": "jerk",
+        "agents": {"mass": 1.0, "radius": 0.25, "position": at + [-12, 0, 8]},
+        "formations": FORMS,
+        "limits": {"speed": 5.0, "acceleration": 3.0, "separation": 0.5},
+        "obstacles": list(obstacles),
+        "phases": [
+            {"kind": "establish", "formation": "square", "blend": 1.0, "duration": 1.0},
+            {k: v for k, v in go.items() if v is not None},
+        ],
+    }
+    return Mission.from_dict(data | changes)
+
+
+def wall(width: float, y: float = 0.0, **turned: float) -> list[dict[str, Any]]:
+    """A wall too wide and high to fly round, with a gap, turned about its middle."""
+    boxes: list[dict[str, Any]] = []
+    for name, (a, b) in {"left": (y + width / 2, 200.0), "right": (-200.0, y - width / 2)}.items():
+        boxes.append({"kind": "box", "name": name, "min": [-1, a, -200], "max": [1, b, 200]})
+    yaw = np.deg2rad(turned.get("yaw_deg", 0.0))
+    turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
+    for box in boxes:
+        middle = (np.array(box["min"]) + box["max"]) / 2
+        half = (np.array(box["max"]) - box["min"]) / 2
+        box.update(min=turn @ middle - half, max=turn @ middle + half, **turned)
+    return boxes
+
+
+def sampled(mission: Mission) -> float:
+    """Least distance [m] of a vehicle's surface from a box along the axes, a sphere or an upright cylinder: samples."""
+    least = np.inf
+    for planned in preview(timed(mission))[0]:
+        r = planned.position
+        for o in mission.obstacles:
+            if o.kind == "box":
+                out = np.maximum(np.maximum(np.array(o.min) - r, r - np.array(o.max)), 0.0)
+            elif o.kind == "sphere":
+                out = np.linalg.norm(r - o.centre, axis=-1, keepdims=True) - o.radius
+            else:
+                assert o.kind == "cylinder"
+                across = np.linalg.norm((r - np.array(o.ends[0]))[..., :2], axis=-1) - o.radius
+                out = np.stack([np.maximum(across, 0), np.maximum(r[..., 2] - o.ends[1][2], 0)], -1)
+            least = min(least, float(np.linalg.norm(out, axis=-1).min()) - 0.25)
+    return least
+
+
+SOLIDS = {
+    "box": [{"kind": "box", "min": [-1, -6, -50], "max": [1, 8, 20]}],
+    "sphere": [{"kind": "sphere", "centre": [0, 0.5, 8], "radius": 5.0}],
+    "cylinder": [{"kind": "cylinder", "ends": [[0, 1, -20], [0, 1, 40]], "radius": 4.0}],
+    "hull": [{"kind": "hull", "points": [[-3, -4, 0], [3, -5, 0], [0, 6, 0], [0, 0, 22]]}],
+    "heights": [
+        {
+            "kind": "heights",
+            "corner": [-6, -30],
+            "spacing": 6.0,
+            "heights": [[5.0] * 11, [11.0] * 11, [6.0] * 11],
+        }
+    ],
+    "zone": [{"kind": "box", "zone": True, "min": [-2, -5, -50], "max": [2, 5, 50]}],
+    "turned box": [{"kind": "box", "min": [-1, -8, -40], "max": [1, 6, 40], "yaw_deg": 35.0}],
+}
+
+
+@pytest.mark.parametrize("kind", SOLIDS)
+def test_each_kind_of_obstacle_is_flown_round(kind):
+    """The straight way meets the obstacle; the way found keeps its clearance, as the check proves."""
+    straight = going(*SOLIDS[kind]).to_dict()
+    straight["phases"][1] = {"kind": "fly", "position": [12, 0, 8], "duration": "auto"}
+    assert not check(Mission.from_dict(straight)).passed
+    mission = going(*SOLIDS[kind], clearance=0.5)
+    ahead = check(mission)
+    assert ahead.passed
+    assert min(clearance for _, clearance, *_ in ahead.clearance) >= 0.5
+    if kind in ("box", "sphere", "cylinder", "zone"):
+        assert sampled(mission) >= 0.5
+    goal = preview(timed(mission))[0][-1].leg.after.goal
+    assert goal is not None
+    assert np.array_equal(goal.r, [12, 0, 8])
+
+
+@pytest.mark.parametrize("yaw", [0.0, 30.0])
+@pytest.mark.parametrize(
+    ("width", "fold"),
+    [(4.0, False), (3.92, False), (3.0, True), (0.92, True)],
+    ids=["wide", "just", "narrow", "slit"],
+)
+def test_a_gap_is_passed_as_it_is_or_folded(width, fold, yaw):
+    """The square passes gaps of 3.9 m as it is, and folds for others, down to a vehicle and its clearance."""
+    turned = {"yaw_deg": yaw} if yaw else {}
+    mission = going(*wall(width, 4.0, **turned))
+    planned = timed(mission)
+    taken = [p.shaping.formation for p in planned.phases if p.shaping is not None]
+    assert taken == (["square", "line", "square"] if fold else ["square"])
+    ahead = check(mission)
+    assert ahead.passed
+    assert min(clearance for _, clearance, *_ in ahead.clearance) >= 0.2 - 1e-3
+
+
+def test_a_gap_is_passed_smaller():
+    """Without another formation, the square shrinks for the gap, and is itself again behind it."""
+    mission = going(*wall(2.8), formations={"square": FORMS["square"]}, scales=[0.9, 0.6])
+    planned = timed(mission)
+    taken = [p.shaping.formation for p in planned.phases if p.shaping is not None]
+    assert taken == ["square", "square x 0.6", "square"]
+    whole, small = (planned.formation_slots(f"square{x}") for x in ("", " x 0.6"))
+    assert whole is not None
+    assert small is not None
+    np.testing.assert_allclose(small, 0.6 * whole, atol=1e-12)
+    result = simulate(mission)
+    assert assess(result).passed
+    assert len(result.mission.phases) == len(result.phases)
+    again = simulate(Mission.from_toml(result.mission_text))
+    assert np.array_equal(result.position, again.position)
+    assert result.mission.formation_slots("square x 0.6") is not None
+
+
+@pytest.mark.parametrize(
+    ("keys", "needs"),
+    [({"formations": {"square": FORMS["square"]}}, 3.9), ({"clearance": 0.4}, 1.3)],
+    ids=["square", "line"],
+)
+def test_no_way_says_what_stands_in_it(keys, needs):
+    """Without a fold, or with much clearance, the error has the gap, its width, and what the slimmest shape needs."""
+    with pytest.raises(MissionError) as caught:
+        timed(going(*wall(1.2), **keys))
+    (finding,) = caught.value.findings
+    assert "no way is found" in finding.problem
+    assert f"needs {needs:.2f} m between '" in finding.problem
+    assert f"which leave 1.20 m: {needs - 1.2:.2f} m are missing" in finding.problem
+
+
+def test_what_is_written_flies_the_same_bits(tmp_path):
+    """The phases that are found, written and read again, fly exactly as the mission that asks for them."""
+    mission = going(*wall(2.0, 3.0))
+    written = Mission.from_toml(spelled_out(mission).text)
+    assert not any(p.kind == "go" for p in written.phases)
+    one, two = simulate(mission), simulate(written)
+    assert np.array_equal(one.position, two.position)
+    assert np.array_equal(one.time, two.time)
+    assert assess(one).passed
+    assert assess(two).passed
+    assert one.mission.to_dict() == written.to_dict()
+
+
+def test_the_shipped_passage_folds_by_itself():
+    """It takes the line between the walls, and its clearance there is that of the mission made by hand."""
+    found, made = (check(load_mission(f"narrow-passage{x}")) for x in ("-found", ""))
+    assert found.passed
+    walls = [
+        dict((name, x) for name, x, *_ in c.clearance if "wall" in name) for c in (found, made)
+    ]
+    for name in walls[0]:
+        assert walls[0][name] >= walls[1][name] - 2e-3
+    planned = timed(load_mission("narrow-passage-found"))
+    assert [p.shaping.formation for p in planned.phases if p.shaping] == ["triangle", "line", "triangle"]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("keys", "words"),
+    [
+        ({"duration": None, "settle": {}}, "needs a time of arrival"),
+        ({"control": "open"}, "needs feedback control"),
+        ({"formations": FORMS, "clearance": -1.0}, "clearance"),
+        ({"scales": [1.5]}, "scales"),
+        ({"position": [0, 0, 8]}, "at the narrowest place of the best one"),
+    ],
+)
+def test_bad_input_is_refused(keys, words):
+    """One error says what is wrong with a way that cannot be asked for."""
+    with pytest.raises(MissionError, match=words):
+        timed(going(*wall(0.0001), **keys))
+
+
+def test_a_formation_on_the_way_exists():
+    """A name that the mission does not have is refused with the names that it has."""
+    data = going().to_dict()
+    data["phases"][1]["formations"] = ["lime"]
+    with pytest.raises(MissionError, match="no such formation"):
+        Mission.from_dict(data)
+
+
+def test_a_way_begins_at_rest_and_in_a_formation():
+    """A start in motion, and a start without a formation, are refused."""
+    data = going().to_dict()
+    fly = {"kind": "fly", "position": [-10, 0, 8], "velocity": [1, 0, 0], "duration": "auto"}
+    with pytest.raises(MissionError, match="begins at 1 m/s, but a way begins at rest"):
+        timed(Mission.from_dict(data | {"phases": [data["phases"][0], fly, data["phases"][1]]}))
+    with pytest.raises(MissionError, match="needs a formation"):
+        timed(Mission.from_dict(data | {"phases": [data["phases"][1]]}))
+
+
+def test_an_obstacle_that_moves_is_met_or_not():
+    """Ways lead round what is at rest; one that meets what moves is refused, with the time."""
+    ball = {"kind": "sphere", "name": "ball", "radius": 2.0}
+    timed(going(ball | {"centre": [0, 0, 8], "velocity": [0, 8.0, 0]}))
+    with pytest.raises(MissionError, match="from 'ball' at"):
+        timed(going(ball | {"centre": [0, 0, 8], "velocity": [0.1, 0, 0]}))
+
+
+def test_nothing_begins_a_way_by_hand():
+    """In flight there is no search: begin() refuses."""
+    flight = Flight(going())
+    with pytest.raises(MissionError, match="before the flight"):
+        flight.begin({"kind": "go", "position": [0, 0, 8], "duration": 5.0})
+
+
+def test_a_geofence_bounds_the_way():
+    """With a fence that leaves no way round, there is none."""
+    box = {"kind": "box", "min": [-1, -6, -50], "max": [1, 8, 50]}
+    fence = {"min": [-30, -7, 0], "max": [30, 9, 20]}
+    limits = {"speed": 5.0, "acceleration": 3.0, "separation": 0.5}
+    timed(going(box, limits=limits))
+    with pytest.raises(MissionError, match="no way is found"):
+        timed(going(box, limits=limits | {"geofence": fence}))
+
+
+def test_many_agents_find_a_way_as_one_ball():
+    """Beyond 60 agents the search moves one ball round all; the proof counts every vehicle."""
+    grid = np.stack(np.meshgrid(np.arange(9.0), np.arange(9.0), [0.0]), axis=-1).reshape(-1, 3)
+    data = going(*SOLIDS["sphere"]).to_dict()
+    data["agents"]["position"] = (grid - [4, 4, 0] + [-16, 0, 8]).tolist()
+    data["agents"]["radius"] = 0.1
+    data["formations"] = {"grid": {"slots": grid.tolist(), "edges": []}}
+    data["phases"][0]["formation"] = "grid"
+    data["phases"][1]["position"] = [16, 0, 8]
+    assert check(Mission.from_dict(data), search=False).passed
+
+
+@pytest.mark.parametrize("name", ["narrow-passage", "cube-passage", "show-1000"])
+def test_speeds_between_samples_are_bounded(name):
+    """No slot is faster within a span than its bound, and the bounds of short spans are close."""
+    for planned in preview(timed(load_mission(name)))[0]:
+        leg, time = planned.leg, planned.time[::10]
+        bound = greatest_speeds(leg.reference, leg.motion, time[:-1], time[1:])
+        inside = time[:-1, None] + np.linspace(0, 1, 7)[1:-1] * np.diff(time)[:, None]
+        v = slot_derivatives(leg.reference, leg.motion, inside.ravel(), 2)[:, 1]
+        speed = np.linalg.norm(v, axis=-1).reshape(*inside.shape, -1).max(axis=1)
+        if leg.reference.T_b > 0.0 or not leg.reference.dp.any():
+            assert (speed <= bound + 1e-9).all()
+
+
+def test_the_least_clearance_is_between_samples():
+    """A thin plate that lies between two samples is found, to the accuracy that is promised."""
+    plate = {"kind": "box", "min": [-0.001, -1, 0], "max": [0.001, 1, 7.0]}
+    data = going(plate).to_dict()
+    data["phases"][1] = {"kind": "fly", "position": [12, 0, 8], "duration": 4.0}
+    mission = Mission.from_dict(data)
+    planned = preview(mission)[0][1]
+    clearance, _, _ = closest(planned, mission.obstacles[0], mission.fleet.radius, pace(planned))
+    t = np.linspace(planned.time[0], planned.time[-1], 40001)
+    r = slot_derivatives(planned.leg.reference, planned.leg.motion, t, 1)[:, 0]
+    out = np.maximum(np.maximum([-0.001, -1, 0] - r, r - [0.001, 1, 7.0]), 0.0)
+    dense = float(np.linalg.norm(out, axis=-1).min()) - 0.25
+    assert dense - 1e-3 <= clearance <= dense + 1e-3
