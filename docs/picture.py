@@ -15,6 +15,8 @@ from PIL import Image
 from shapes import SHAPES
 
 import rigidfleet as rf
+from rigidfleet.formation import outlines
+from rigidfleet.mission import Mission, show_draft
 from rigidfleet.plotting import write_figure
 from rigidfleet.plotting.style import settings
 from rigidfleet.sweep import Sweep, fly
@@ -32,6 +34,19 @@ def flight() -> None:
     with TemporaryDirectory() as folder:
         (path,) = rf.plot(result, folder, formats=["png"], names=["summary"])
         _save_with_few_colours(path, MISSION)
+
+
+def show() -> None:
+    """The pictures of a show, made as its page makes it."""
+    letters = outlines.on_outlines(outlines.text_outlines("HI"), 100, 2.0)
+    scenes = [show_draft.scene(shape, 100, 2.0) for shape in ("sphere", "helix")]
+    scenes.append(show_draft.points_scene("logo", letters, "logo.csv"))
+    text = show_draft.show("my-show", scenes, agents=100, spacing=2.0)
+    result = rf.simulate(Mission.from_toml(text))
+    with TemporaryDirectory() as folder:
+        paths = rf.plot(result, folder, formats=["png"], names=["formations", "operation"])
+        for path, name in zip(paths, ("show", "show-operation"), strict=True):
+            _save_with_few_colours(path, name)
 
 
 def study() -> None:
@@ -94,4 +109,5 @@ if __name__ == "__main__":
     IMAGES.mkdir(exist_ok=True)
     flight()
     study()
+    show()
     drawings()

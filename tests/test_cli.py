@@ -485,7 +485,7 @@ def test_design_keeps_files(capsys):
         (["square", "--edges", "henneberg"], "need slots"),
         (["cube", "--agents", "7"], "takes 8 agents"),
         (["blob"], "neither a shape nor a file"),
-        (["short.toml", "--size", "4"], "remove --agents and --size"),
+        (["short.toml", "--size", "4"], "use --spacing"),
         (["short.toml"], "short.toml"),
     ],
 )

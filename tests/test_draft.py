@@ -2,11 +2,13 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.distance import pdist
 
 from rigidfleet.assessment import assess
+from rigidfleet.cli.app import main
 from rigidfleet.errors import MissionError
 from rigidfleet.formation.shapes import SHAPES
-from rigidfleet.mission import Mission
+from rigidfleet.mission import Mission, load_mission, show_draft
 from rigidfleet.mission.draft import agents_for, draft, shape_for
 from rigidfleet.preflight.check import check
 from rigidfleet.simulation.flight import simulate
@@ -138,3 +140,87 @@ def test_what_cannot_be(asked, words):
     """What cannot be drafted is refused, and it is said why."""
     with pytest.raises(ValueError, match=words):
         draft("new", **asked)
+
+
+# -- shows --------------------------------------------------------------------------------------------
+
+
+def a_show(shape, agents, spacing=2.0):
+    """A show of one named shape."""
+    one = show_draft.scene(shape, agents, spacing)
+    return Mission.from_toml(show_draft.show("new", [one], agents=agents, spacing=spacing))
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_every_shape_is_shown(shape):
+    """A show of any shape passes its check at the fewest agents that it takes, and at a hundred; the plan is proved."""
+    taken = SHAPES[shape].agents
+    for n in sorted({n for n in (max(2, taken.start), 7, 100) if n in taken}):
+        mission = a_show(shape, n)
+        ahead = check(mission, search=False)
+        assert [r.text for r in ahead.remarks if r.level == "fails"] == []
+        limit = mission.limits.separation
+        assert limit is not None
+        assert min(c.separation for c in ahead.certificates.values()) >= limit
+
+
+def test_a_show_flies_and_lands_on_the_pads():
+    """It takes off, goes through its formations and back, and passes; each pad has one vehicle again."""
+    scenes = [show_draft.scene(shape, 30, 2.0) for shape in ("sphere", "helix", "sphere")]
+    mission = Mission.from_toml(show_draft.show("new", scenes, agents=30, spacing=2.0))
+    assert [p.kind for p in mission.phases] == [
+        "takeoff", "establish", "reshape", "reshape", "reshape", "land",
+    ]  # fmt: skip
+    result = simulate(mission)
+    verdict = assess(result)
+    assert verdict.passed, verdict.summary
+    pads = np.array(mission.agents.position)
+    end = result.position[-1]
+    away = np.linalg.norm(end[:, None] - pads[None], axis=2)
+    assert sorted(away.argmin(axis=1)) == list(range(30))
+    assert away.min(axis=1).max() < 1e-3
+
+
+def test_new_writes_a_show_of_files_and_words(tmp_path, monkeypatch):
+    """Points that fit stay in their file; others are scaled, and stand in the mission as numbers."""
+    monkeypatch.chdir(tmp_path)
+    fits = np.stack([3.0 * np.arange(12), 0.0 * np.arange(12), (np.arange(12.0) % 2)], axis=1)
+    np.savetxt("fits.csv", fits, delimiter=",")
+    np.savetxt("small.csv", 0.1 * fits, delimiter=",")
+    asked = ["new", "mine", "--show", "--formations", "fits.csv,small.csv,text:I", "--spacing", "2"]
+    assert main([*asked, "--quiet"]) == 0
+    text = (tmp_path / "mine.toml").read_text()
+    assert 'slots = "fits.csv"' in text
+    assert "small.csv" in text
+    mission = load_mission("mine.toml")
+    assert mission.n_agents == 12
+    for name, spacing in (("fits", 10.0**0.5), ("small", 2.0), ("I", 2.0)):
+        slots = np.array(mission.formations[name].slots)
+        assert pdist(slots).min() == pytest.approx(spacing, abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("asked", "words"),
+    [
+        (["--show", "--agents", "10000"], "2 to 2000 agents"),
+        (["--show", "--agents", "1"], "agents"),
+        (["--show", "--formations", "cube", "--agents", "9"], "takes 8 agents, not 9"),
+        (["--show", "--formations", "no.csv"], "there is no shape 'no.csv'"),
+        (["--show", "--formations", ","], "needs formations"),
+        (["--show", "--spacing", "0"], "positive"),
+        (["--show", "--spacing", "nan"], "positive"),
+        (["--show", "--shape", "cube"], "no effect on a show"),
+        (["--formations", "cube"], "add --show"),
+        (["--show", "--formations", "two.csv", "--agents", "5"], "cannot place 5 agents"),
+        (["--show", "--formations", "nan.csv"], "is not finite"),
+    ],
+    ids=str,
+)
+def test_shows_that_cannot_be(tmp_path, monkeypatch, capsys, asked, words):
+    """One clear error, and no file."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "two.csv").write_text("0,0,0\n3,0,0\n")
+    (tmp_path / "nan.csv").write_text("0,0,0\n3,0,nan\n")
+    assert main(["new", "bad", *asked, "--quiet"]) != 0
+    assert words in " ".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "bad.toml").exists()

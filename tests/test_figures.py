@@ -16,7 +16,7 @@ from matplotlib.lines import Line2D
 from matplotlib.text import Text
 from PIL import Image
 
-from rigidfleet import plotting
+from rigidfleet import plotting, simulate
 from rigidfleet.errors import ResultError
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
@@ -767,18 +767,45 @@ def test_a_flight_has_no_empty_figures(tmp_path):
     """Figures with nothing to show are left out, and say why when they are asked for."""
     calm = a_flight(disturbance_force=None)
     files = {p.stem for p in plotting.plot(calm, tmp_path, formats=["svg"])}
-    assert files == set(plotting.figure_names()) - {"disturbance", "rotors", "vehicles"}
+    assert files == set(plotting.figure_names()) - {
+        "disturbance",
+        "rotors",
+        "vehicles",
+        "operation",
+    }
     assert "still air" in texts(plotting.disturbance(calm))
     unknown = np.full((181, 4), np.nan)
     free = a_flight(n=4, formation=None, attitude=unknown, attitude_reference=unknown)
     missing = set(plotting.figure_names()) - set(plotting.figure_names(free))
     assert missing == {
         "distances", "attitude", "constraint_force", "constraint_error", "formations",
-        "rotors", "vehicles",
+        "rotors", "vehicles", "operation",
     }  # fmt: skip
     assert "no body frame attached" in texts(plotting.attitude(free))
     alone = a_flight(n=1, formation=None, mission={"obstacles": [], "limits": {}})
     assert "clearance" not in plotting.figure_names(alone)
+
+
+def test_the_figure_of_an_operator():
+    """Altitude, speeds, separation and clearance with their limits; single vehicles on demand."""
+    data = {
+        "schema_version": 1, "name": "up", "limits": {"speed": 9.5, "separation": 0.5},
+        "agents": {"mass": 1.0, "position": [[2.0 * i, 0.0, 0.3 + 0.1 * i] for i in range(4)]},
+        "obstacles": [{"kind": "ground"}],
+        "phases": [{"kind": "takeoff", "height": 12.0, "duration": 4.0}],
+    }  # fmt: skip
+    flight = simulate(Mission.from_dict(data))
+    assert "operation" in plotting.figure_names(flight)
+    figure = plotting.operation(flight)
+    labels = [ax.get_ylabel() for ax in figure.axes[:5]]
+    assert labels[:3] == ["altitude [m]", "speed [m/s]", "vertical [m/s]"]
+    assert "limit 9.5 m/s" in texts(figure)
+    one = plotting.operation(flight, [3])
+    assert "agent 3" in texts(one)
+    (line,) = [x for x in one.axes[0].lines if np.size(x.get_ydata()) > 10]
+    assert np.asarray(line.get_ydata())[-1] == pytest.approx(flight.position[-1, 2, 2])
+    with pytest.raises(ValueError, match="no agent 5"):
+        plotting.operation(flight, [5])
 
 
 # -- files

@@ -13,6 +13,7 @@ from rigidfleet.assessment.outcome import (
     DIP,
     FLIPPED,
     SHAPE_TOLERANCE,
+    TOUCH_DOWN,
     WAYPOINT_TOLERANCE,
     CheckResult,
     Extreme,
@@ -21,7 +22,7 @@ from rigidfleet.assessment.outcome import (
 )
 from rigidfleet.assessment.vehicles import vehicle_checks
 from rigidfleet.assessment.verdict import Verdict
-from rigidfleet.result import Result
+from rigidfleet.result import PAD, Result
 from rigidfleet.typing import Floats
 
 # Excess over a limit that counts as rounding.
@@ -45,6 +46,7 @@ def all_checks(measured: Measurements, verdict: Verdict) -> Iterator[CheckResult
         *_settled(verdict.phases),
         *_shapes(measured, verdict.phases),
         *_waypoints(verdict.phases),
+        *_touch_downs(measured, verdict.phases),
     ]
     yield from _failures_or_worst(candidates)
     worst = verdict.worst
@@ -237,6 +239,30 @@ def _waypoints(phases: list[PhaseVerdict]) -> Iterator[CheckResult]:
                 yield CheckResult(
                     f"waypoint_{name}", passed, words, miss, limit, unit, when=at.time, phase=p.name
                 )
+
+
+def _touch_downs(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[CheckResult]:
+    """Check how fast vehicles come down at the end of each landing."""
+    from rigidfleet.mission import KINDS  # takes long to load, and the flight has loaded it
+
+    for i, p in enumerate(phases):
+        if not (p.finished and KINDS[p.kind].lands):
+            continue
+        k = measured.samples[i].stop - 1
+        down = -measured.result.velocity[k, :, 2]
+        who = np.flatnonzero(measured.left[k] & (measured.each_clearance[k] <= PAD))
+        if not len(who):
+            yield _at_end(p, "touch_down", False, "no vehicle is on the ground")
+            continue
+        worst = int(who[down[who].argmax()])
+        speed = max(0.0, float(down[worst]))
+        words = (
+            f"agent {worst + 1} touches down at {value(speed, 'm/s')} (limit {TOUCH_DOWN:g} m/s)"
+        )
+        passed = speed <= TOUCH_DOWN
+        yield _at_end(
+            p, "touch_down", passed, words, speed, TOUCH_DOWN, "m/s", who=f"agent {worst + 1}"
+        )
 
 
 def _bounded(

@@ -16,6 +16,10 @@ SHAPE_TOLERANCE = 0.01
 WAYPOINT_TOLERANCE = {"position": 0.1, "velocity": 0.1, "attitude": 1.0, "rates": 1.0}
 
 
+#: Greatest speed downwards at touch-down [m/s]: the default of ArduPilot's LAND_SPEED.
+TOUCH_DOWN = 0.5
+
+
 #: Angle beyond which a plane's normal, or a line's direction, counts as flipped [deg].
 FLIPPED = 90.0
 

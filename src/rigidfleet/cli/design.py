@@ -1,4 +1,4 @@
-"""Choose the edges of a formation: `design`."""
+"""Turn a shape, a file or words into a formation, and choose its edges: `design`."""
 
 from __future__ import annotations
 
@@ -25,6 +25,8 @@ def design(
     *,
     agents: Annotated[int | None, Parameter(converter=exact)] = None,
     size: Annotated[list[float] | None, Parameter(consume_multiple=True)] = None,
+    spacing: float | None = None,
+    font: str | None = None,
     extra: str = "0",
     sensing_range: Annotated[float | None, Parameter(name="--range")] = None,
     edges: str | None = None,
@@ -35,27 +37,35 @@ def design(
 ) -> int:
     """Choose the edges that make a shape most rigid, and write the formation for a mission file.
 
+    The shape may also come from a file of points, a drawing (SVG) or words in a font, whose outlines are sampled with
+    even spacing.
+
     The search uses the fewest edges that hold the shape, maximises the rigidity index and compares the result with
     all pairs. For more than a few hundred agents the search takes hours: choose a graph by --edges instead.
 
     Parameters
     ----------
     shape : str
-        A named shape, or a file of points with x, y, z of one agent per line.
+        A named shape; a file of points (CSV, NPY or PLY) with x, y, z of one agent per line; a drawing (SVG); or
+        text:WORDS. Drawings and words stand upright, x to the east and z up.
     agents : int
-        Number of agents. Default: as many as the shape needs.
+        Number of agents. Default: as many as the shape needs, or the file has.
     size : float
         Edge length of a named shape [m], or three sizes for a cuboid or a helix. Default: 4.
+    spacing : float
+        Distance of the nearest two agents of a file or of words [m], which are scaled to it.
+    font : str
+        Font of text:WORDS. Default: DejaVu Sans.
     extra : str
         Number of additional, redundant edges, or "complete" for all pairs.
     sensing_range : float
         Maximum length of an edge [m].
     edges : str
-        Use this graph instead of a search: complete, neighbours, henneberg or henneberg-multilevel.
+        Use this graph instead of a search: complete, neighbours, henneberg, henneberg-multilevel, or none.
     reach : float
         Maximum length of edges "neighbours", in distances of nearest neighbours. Default: 1.9.
     out : Path
-        Write the formation to this file. Default: print it.
+        Write the formation to this file; its points alone if it ends in .csv. Default: print it.
     force : bool
         Overwrite this file.
     json : bool
@@ -68,8 +78,11 @@ def design(
     if out is not None and out.exists() and not force:
         raise RigidfleetError(f"{out}: already exists; use --force to overwrite.")
     try:
-        name, slots = _points(shape, agents, size)
-        if edges is not None:
+        name, slots = points_of(shape, agents, size, spacing, font)
+        if edges == "none":
+            _reject(edges, reach, searched=extra != "0" or sensing_range is not None)
+            kinds = {}
+        elif edges is not None:
             _reject(edges, reach, searched=extra != "0" or sensing_range is not None)
             kinds = {edges: designs.GRAPHS[edges](slots, REACH if reach is None else reach)}
         else:
@@ -83,13 +96,15 @@ def design(
                 kinds["the paper's 18"] = CUBE_EDGES
             if len(slots) <= _COMPARED:
                 kinds["all pairs"] = complete_graph(len(slots))
-        text = designs.mission_fragment(name, slots, edges or kinds["designed"], reach)
+        chosen = [] if edges == "none" else edges or kinds["designed"]
+        text = designs.mission_fragment(name, slots, chosen, reach)
         judged = {what: compare_graph(slots, graph) for what, graph in kinds.items()}
     except ValueError as error:
         raise RigidfleetError(f"{shape}: {str(error).rstrip('.')}.") from None
     limits = designs.limits(slots)
     if out is not None:
-        write_file(out, text.encode())
+        rows = "".join(f"{x!r},{y!r},{z!r}\n" for x, y, z in (slots + 0.0).tolist())
+        write_file(out, (f"x,y,z\n{rows}" if out.suffix.lower() == ".csv" else text).encode())
     if json:
         found = {what: data for what, (data, _) in judged.items()}
         console.print_json({"name": name, "toml": text, "limits": limits, "graphs": found})
@@ -100,8 +115,9 @@ def design(
         table.add_row(what, *cells)
     # Standard output has the formation alone, so that it can be piped.
     output = console.out() if out is not None else console.err()
-    output.print(table)
-    if limits:
+    if kinds:
+        output.print(table)
+    if limits and kinds:
         output.print(limits)
     if out is None:
         console.print_exactly(text)
@@ -121,8 +137,8 @@ def _reject(edges: str, reach: float | None, *, searched: bool) -> None:
     from rigidfleet._common.renamed import successor
     from rigidfleet.rigidity.design import GRAPHS
 
-    if edges not in GRAPHS:
-        told = successor("edges", edges) or f"graphs: {', '.join(GRAPHS)}"
+    if edges not in GRAPHS and edges != "none":
+        told = successor("edges", edges) or f"graphs: {', '.join(GRAPHS)}, none"
         raise ValueError(f"there is no graph {edges!r}; {told}")
     if searched:
         raise ValueError("--extra and --range have no effect with --edges; remove them or --edges")
@@ -164,26 +180,50 @@ def compare_graph(slots: Any, edges: Any) -> tuple[dict[str, Any], tuple[str, ..
     )
 
 
-def _points(shape: str, agents: int | None, size: list[float] | None) -> tuple[str, Any]:
-    """Name and slots (N, 3) [m] of a named shape or of a file of points.
+def points_of(
+    shape: str,
+    agents: int | None,
+    size: list[float] | None = None,
+    spacing: float | None = None,
+    font: str | None = None,
+) -> tuple[str, Any]:
+    """Name and slots (N, 3) [m] of a named shape, of a file of points or a drawing, or of words.
 
     Raises
     ------
     ValueError
-        The shape does not suit the number of agents or sizes, or an option has no effect on a file.
+        The shape does not suit the number of agents or sizes, or an option is missing or has no effect.
     """
+    from rigidfleet.formation import outlines
     from rigidfleet.formation.point_files import read_points
     from rigidfleet.formation.shapes import SHAPES, agents_taken, slots
     from rigidfleet.math.rigid_body import centred
 
+    words = shape.removeprefix("text:") if shape.startswith("text:") else None
+    if font is not None and words is None:
+        raise ValueError("--font has no effect without text:WORDS; remove it")
     if shape in SHAPES:
         form = SHAPES[shape]
         count = form.agents.start if agents is None else agents
+        if spacing is not None:
+            raise ValueError("--spacing has no effect on a named shape; use --size")
         if agents is None and len(form.agents) > 1:
             raise ValueError(f"takes {agents_taken(shape)}; give --agents")
         return shape, slots(shape, size or [4.0] * form.sizes, count)
-    if not Path(shape).exists():
+    if words is None and not Path(shape).exists():
         raise ValueError(f"is neither a shape nor a file; shapes: {', '.join(SHAPES)}")
-    if agents is not None or size is not None:
-        raise ValueError("a file of points determines agents and size; remove --agents and --size")
-    return Path(shape).stem, centred(read_points(shape))
+    if size is not None:
+        raise ValueError("--size has no effect on a file or on words; use --spacing")
+    if words is not None or Path(shape).suffix.lower() == ".svg":
+        if agents is None or spacing is None:
+            raise ValueError("an outline needs --agents and --spacing")
+        drawn = (
+            outlines.svg_outlines(shape)
+            if words is None
+            else outlines.text_outlines(words, font or "DejaVu Sans")
+        )
+        return words or Path(shape).stem, outlines.on_outlines(drawn, agents, spacing)
+    points = centred(read_points(shape))
+    if agents is not None and agents != len(points):
+        points = centred(outlines.spread(points, agents))
+    return Path(shape).stem, points if spacing is None else outlines.scaled(points, spacing)

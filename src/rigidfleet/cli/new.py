@@ -26,6 +26,9 @@ def new(
     mass: float | None = None,
     thrust_limit: float | None = None,
     to: list[tuple[float, float, float]] | None = None,
+    show: Annotated[bool, Parameter(negative=())] = False,
+    formations: str | None = None,
+    spacing: float | None = None,
     force: bool = False,
     quiet: bool = False,
     json: bool = False,
@@ -51,6 +54,13 @@ def new(
         Maximum thrust of each vehicle [N]. Default: 2.2 times its weight.
     to : float
         Waypoint X Y Z [m]; may be repeated.
+    show : bool
+        Write a show: take off from a grid, go through formations, return and land.
+    formations : str
+        Formations of a show, separated by commas: shapes, files of points, drawings (SVG) or text:WORDS.
+        Default: sphere,helix.
+    spacing : float
+        Distance of neighbours in a show [m]. Default: 2.
     force : bool
         Overwrite an existing file.
     quiet : bool
@@ -60,6 +70,7 @@ def new(
     """
     from rigidfleet._common.files import write_file
     from rigidfleet.mission import Mission, draft
+    from rigidfleet.mission.files import completed
     from rigidfleet.preflight.check import check as preflight
 
     given: dict[str, Any] = {
@@ -67,7 +78,7 @@ def new(
         "thrust_limit": thrust_limit, "waypoints": to,
     }  # fmt: skip
     asked = {key: value for key, value in given.items() if value is not None}
-    if not (asked or quiet or json) and sys.stdin.isatty() and console.err().is_terminal:
+    if not (asked or quiet or json or show) and sys.stdin.isatty() and console.err().is_terminal:
         name, asked = _ask(name)
     file = Path(name or "mission")
     if not file.name:
@@ -76,10 +87,17 @@ def new(
     if file.exists() and not force:
         raise RigidfleetError(f"{file}: already exists; use --force to overwrite.")
     try:
-        text = draft.draft(file.stem, file=str(file), **asked)
+        if show:
+            text = _show(
+                file, asked, formations or "sphere,helix", 2.0 if spacing is None else spacing
+            )
+        elif formations is not None or spacing is not None:
+            raise ValueError("--formations and --spacing are for a show: add --show")
+        else:
+            text = draft.draft(file.stem, file=str(file), **asked)
     except ValueError as error:
         raise RigidfleetError(str(error)) from None
-    mission = Mission.from_toml(text, str(file))
+    mission = Mission.from_toml(completed(text, file), str(file))
     fails = [r.text for r in preflight(mission, search=False).remarks if r.level == "fails"]
     if fails:
         raise RigidfleetError(
@@ -92,6 +110,59 @@ def new(
         console.out().print(f"{file}: {mission.size_in_words}", soft_wrap=True)
         console.out().print(f"To fly it: rigidfleet run {file}", soft_wrap=True)
     return PASSED
+
+
+def _show(file: Path, asked: dict[str, Any], formations: str, spacing: float) -> str:
+    """Text of a show; points in the folder of the mission are written by the name of their file.
+
+    Raises
+    ------
+    ValueError
+        An option has no effect on a show, or a formation cannot be made.
+    """
+    from rigidfleet.cli.design import points_of
+    from rigidfleet.formation.shapes import SHAPES
+    from rigidfleet.math import proximity
+    from rigidfleet.mission import show_draft
+
+    unused = [
+        f"--{key.replace('waypoints', 'to')}"
+        for key in ("shape", "size", "waypoints")
+        if key in asked
+    ]
+    if unused:
+        raise ValueError(
+            f"{' and '.join(unused)}: no effect on a show; use --formations and --spacing"
+        )
+    agents, scenes = asked.pop("agents", None), []
+    words = [word.strip() for word in formations.split(",") if word.strip()]
+    if agents is None:
+        files = [w for w in words if Path(w).suffix.lower() in _POINTS and Path(w).exists()]
+        agents = len(points_of(files[0], None)[1]) if files else _SHOWN
+    for word in words:
+        path = Path(word)
+        if word in SHAPES or not (word.startswith("text:") or path.exists()):
+            scenes.append(show_draft.scene(word, agents, spacing))
+            continue
+        try:
+            name, slots = points_of(word, agents, spacing=spacing)
+            own = points_of(word, None)[1] if path.suffix.lower() in _POINTS else slots
+        except ValueError as error:
+            raise ValueError(f"{word}: {error}") from None
+        folder = file.parent.resolve()
+        inside = path.suffix.lower() in _POINTS and path.resolve().is_relative_to(folder)
+        by_name = inside and len(own) == agents and proximity.nearest(own).min() >= spacing
+        source = path.resolve().relative_to(folder).as_posix() if by_name else word
+        if by_name:
+            slots = own
+        scenes.append(show_draft.points_scene(name, slots, source, by_name=by_name))
+    return show_draft.show(
+        file.stem, scenes, agents=agents, spacing=spacing, file=str(file), **asked
+    )
+
+
+#: Files of points, and the number of agents of a show without any.
+_POINTS, _SHOWN = (".csv", ".npy", ".ply", ".txt"), 100
 
 
 def _ask(name: str) -> tuple[str, dict[str, Any]]:

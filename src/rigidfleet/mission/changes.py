@@ -15,7 +15,7 @@ def told_apart(
 
     A formation that is taken again gets a second name, "NAME (2)", and with it slots of its own. It keeps its name, and
     its slots, on the way back from a formation that was reached from it, and wherever it comes from the same one as
-    before: there the same slots are as good.
+    before: there the same slots are as good. After a take-off, or a landing one by one, there is no formation.
     """
     known, told = dict(formations), []
     ways: set[tuple[str | None, str]] = set()
@@ -24,6 +24,9 @@ def told_apart(
     for phase in phases:
         shaping = phase.shaping
         if shaping is None:
+            if phase.vertical is not None and phase.vertical.each:
+                before = None
+                ways = {way for way in ways if way[0] is not None}
             told.append(phase)
             continue
         written = shaping.formation

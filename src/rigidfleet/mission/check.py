@@ -24,6 +24,7 @@ from rigidfleet.mission import (
     phases,
     vehicles,
 )
+from rigidfleet.mission.files import NOT_A_FILE
 from rigidfleet.mission.findings import FindingCollector, Keys, near_shape
 from rigidfleet.mission.obstacles import Box, Obstacle
 from rigidfleet.mission.schema import (
@@ -148,6 +149,10 @@ def _tables(collector: FindingCollector) -> dict[str, Any]:
 
 def _placed(collector: FindingCollector, agents: Any) -> Any:
     """Return [agents] with a shape of `position` replaced by its points; None if the shape has errors."""
+    if isinstance(agents, dict) and isinstance(agents.get("position"), str):
+        remedy = "load the mission from its file, or give the positions as points"
+        collector.add(("agents", "position"), NOT_A_FILE, remedy)
+        return None
     if not (isinstance(agents, dict) and isinstance(agents.get("position"), dict)):
         return agents
     path = ("agents", "position")

@@ -12,6 +12,7 @@ from rigidfleet._common.text import agent_names
 from rigidfleet.formation import distance_geometry, graphs, shapes
 from rigidfleet.math import proximity
 from rigidfleet.mission import bounds
+from rigidfleet.mission.files import NOT_A_FILE
 from rigidfleet.mission.findings import FindingCollector, Keys, near_shape
 from rigidfleet.mission.schema import Formation
 
@@ -31,6 +32,10 @@ def check(collector: FindingCollector, n: int | None) -> dict[str, Formation]:
         return {}
     found = {}
     for name, data in tables.items():
+        if isinstance(data, dict) and isinstance(data.get("slots"), str):
+            remedy = "load the mission from its file, or give the slots as points"
+            collector.add(("formations", name, "slots"), NOT_A_FILE, remedy)
+            continue
         form = collector.validate(Formation, data, ("formations", name))
         if form is not None:
             found[name] = form

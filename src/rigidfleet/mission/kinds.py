@@ -8,6 +8,7 @@ from typing import Annotated, Any, ClassVar, Literal, get_args
 
 from pydantic import (
     Field,
+    Strict,
     model_validator,
 )
 
@@ -53,7 +54,8 @@ class AnyPhase(Part):
     moves: ClassVar[bool] = False
     #: Whether a phase may be left anywhere, with its goal there. Other phases keep their goal for the next one.
     goal_moves: ClassVar[bool] = False
-    #: Whether the phase leads to the ground, so that the mission needs one.
+    #: Whether the phase leads from or to the ground, so that the mission needs one; whether it ends there.
+    grounded: ClassVar[bool] = False
     lands: ClassVar[bool] = False
     #: Whether other phases take its place before the flight, so that it cannot begin in flight.
     replaced: ClassVar[bool] = False
@@ -107,6 +109,11 @@ class AnyPhase(Part):
     def turns_away(self) -> bool:
         """Whether the phase ends in an attitude that no key commands."""
         return False
+
+    @property
+    def vertical(self) -> Vertical | None:
+        """The phase if it leads vehicles straight up or down, else None."""
+        return None
 
     @property
     def automatic(self) -> list[str]:
@@ -384,19 +391,80 @@ class Brake(AnyPhase):
         return {} if self.travel is None else {"travel": min(self.travel, length)}
 
 
-class Land(AnyPhase):
-    """Descend straight down, until the lowest vehicle is just above the ground."""
+class Vertical(AnyPhase):
+    """A phase that leads vehicles straight up or down: all together, some of them, or one group after another."""
 
     moves: ClassVar[bool] = True
-    lands: ClassVar[bool] = True
+    grounded: ClassVar[bool] = True
     body_control: ClassVar[str] = "tracking"
 
-    kind: Literal["land"] = Field(description="descend straight down to the ground")
+    travel: Time | None = Field(
+        None, description="time from the start to the arrival [s]; default: the whole phase"
+    )
+    agents: tuple[Annotated[int, Strict(), Field(ge=1)], ...] = Field(
+        (), description="numbers of the vehicles that move; the others stay. Default: all"
+    )
+    stagger: Time | None = Field(
+        None,
+        description="time [s] from one group's start to the next's; all arrive by the end of the phase, each before "
+        "the next starts. Default: all start together",
+    )
+    by: Literal["rows", "vehicles"] = Field(
+        "rows",
+        description="groups of stagger: rows: vehicles with the same y, the southernmost first; vehicles: one by one, "
+        "in the order of their numbers",
+    )
+
+    @property
+    def vertical(self) -> Vertical:
+        """The phase itself."""
+        return self
+
+    @property
+    def each(self) -> bool:
+        """Whether each vehicle has a way of its own, so that the shape may change."""
+        return bool(self.agents) or self.stagger is not None
 
     @property
     def meets(self) -> tuple[str, ...]:
-        """Position and velocity at touch-down."""
+        """Position and velocity on arrival."""
         return ("position", "velocity")
+
+    @property
+    def least_time(self) -> float:
+        """Time to the arrival [s]."""
+        return self.travel or 0.0
+
+    def ended(self, length: float) -> dict[str, Any]:
+        """A time to the arrival that is not longer than the phase."""
+        return {} if self.travel is None else {"travel": min(self.travel, length)}
+
+
+class Takeoff(Vertical):
+    """Climb straight up from the ground, until all vehicles are at one height."""
+
+    kind: Literal["takeoff"] = Field(description="climb straight up to a level height")
+    height: Length = Field(
+        description="height of the vehicles' centres above the ground on arrival [m]"
+    )
+
+    @property
+    def each(self) -> bool:
+        """Always: vehicles that stand on different heights come level."""
+        return True
+
+    @property
+    def leads_to(self) -> str:
+        """The height."""
+        return f"{self.height:g} m above the ground"
+
+
+class Land(Vertical):
+    """Descend straight down, until the lowest vehicle is just above the ground; staggered, until each is."""
+
+    lands: ClassVar[bool] = True
+
+    kind: Literal["land"] = Field(description="descend straight down to the ground")
 
     @property
     def leads_to(self) -> str:
@@ -463,7 +531,8 @@ def _vector(values: Sequence[float], unit: str) -> str:
 
 
 Phase = Annotated[
-    Establish | Fly | Go | Reshape | Turn | Orbit | Hold | Brake | Land, Field(discriminator="kind")
+    Establish | Fly | Go | Reshape | Turn | Orbit | Hold | Brake | Takeoff | Land,
+    Field(discriminator="kind"),
 ]
 #: Models of all phases by `kind`.
 KINDS: dict[str, type[AnyPhase]] = {

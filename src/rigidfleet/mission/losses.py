@@ -36,7 +36,7 @@ def check(
     no_ground = "needs a ground, and the mission has none"
     remedy = "add [[obstacles]] with kind = 'ground'"
     for k, p in enumerate(phases):
-        if p.lands and not grounded and collector.right((), "obstacles"):
+        if p.grounded and not grounded and collector.right((), "obstacles"):
             collector.add(("phases", k, "kind"), no_ground, remedy)
     if found is None:
         return

@@ -24,9 +24,9 @@ from rigidfleet.mission import bounds
 from rigidfleet.mission.changes import scaled, told_apart
 from rigidfleet.mission.check import check
 from rigidfleet.mission.describe import counted
+from rigidfleet.mission.files import completed
 from rigidfleet.mission.findings import near
 from rigidfleet.mission.kinds import Establish, Phase
-from rigidfleet.mission.obstacles import with_files
 from rigidfleet.mission.phases import latest_end
 from rigidfleet.mission.schema import DRAG, Contents, Start
 from rigidfleet.mission.vehicles import VehicleModel, resolve
@@ -227,6 +227,15 @@ class Mission(Contents):
                 lies = asked = dcm_from_euler(np.deg2rad(angles))
             if p.turns_away:
                 lies = asked = None
+            if (vertical := p.vertical) is not None and vertical.each:
+                before, up = None, np.eye(3)[2] if lies is None else lies[:, 2]
+                who = (
+                    np.array(vertical.agents, dtype=np.int64) - 1
+                    if vertical.agents
+                    else slice(None)
+                )
+                places = places.copy()
+                places[who] -= np.outer(places[who] @ up, up)  # all on one level
             if (shaping := p.shaping) is None:
                 continue
             name = shaping.formation
@@ -467,8 +476,7 @@ def load_mission(name_or_path: str | Path) -> Mission:
     if isinstance(name_or_path, str) and name_or_path in mission_names():
         return Mission.from_toml(mission_text(name_or_path), name_or_path)
     text, origin = read_text(name_or_path), str(name_or_path)
-    if "file" in text:  # parsed twice only if it may name one
-        text = with_files(text, parse_toml(text, origin), Path(name_or_path))
+    text = completed(text, Path(name_or_path))
     return Mission.from_toml(text, origin)
 
 
@@ -498,7 +506,9 @@ def json_schema() -> dict[str, Any]:
     # A shape of positions is replaced by its points before the model sees it, so the model does not have it.
     position = parts["Agents"]["properties"]["position"]
     listed = {key: position.pop(key) for key in ("type", "items", "minItems")}
-    position["anyOf"] = [listed, {"$ref": "#/$defs/Start"}]
+    position["anyOf"] = [listed, {"$ref": "#/$defs/Start"}, {"type": "string"}]
+    # So is the name of a file.
+    parts["Formation"]["properties"]["slots"]["anyOf"].append({"type": "string"})
     return draft | schema
 
 

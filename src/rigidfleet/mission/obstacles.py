@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import csv
 import math
-import re
 from abc import abstractmethod
 from functools import cached_property
 from itertools import pairwise
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
 
-from rigidfleet.errors import Finding, MissionError
 from rigidfleet.math.attitude import dcm_from_euler
 from rigidfleet.mission import bounds
+from rigidfleet.mission.files import NOT_A_FILE
 from rigidfleet.mission.findings import FindingCollector, Keys
 from rigidfleet.mission.values import (
     Angle,
@@ -293,8 +290,9 @@ def _motion(collector: FindingCollector, thing: Moving, path: Keys) -> bool:
 
 def _heights(collector: FindingCollector, thing: Heights, path: Keys) -> bool:
     if thing.file is not None:
-        problem = "is read only with a mission file, as its path is relative to that"
-        collector.add((*path, "file"), problem, "load the mission from its file, or give heights")
+        collector.add(
+            (*path, "file"), NOT_A_FILE, "load the mission from its file, or give heights"
+        )
         return False
     if thing.heights is None:
         if collector.right(path, "heights"):
@@ -316,65 +314,3 @@ def _heights(collector: FindingCollector, thing: Heights, path: Keys) -> bool:
         collector.add((*path, "base"), problem, "give a base at or below all heights")
         return False
     return True
-
-
-# -- heights from files --------------------------------------------------------------------------------
-
-
-def with_files(text: str, data: dict[str, Any], path: Path) -> str:
-    """Text of a mission in which heights stand instead of the names of files.
-
-    Parameters
-    ----------
-    text, data : the mission's text, and what it says
-    path : the mission file; names of files are relative to its folder
-
-    Raises
-    ------
-    MissionError
-        A file cannot be read, or has no table of numbers.
-    """
-    things = data.get("obstacles")
-    named = [
-        thing["file"]
-        for thing in (things if isinstance(things, list) else [])
-        if isinstance(thing, dict) and thing.get("kind") == "heights"
-        and isinstance(thing.get("file"), str) and "heights" not in thing
-    ]  # fmt: skip
-    for name in named:
-        rows = _table(path.parent / name)
-        written = ",\n  ".join("[" + ", ".join(map(repr, row)) + "]" for row in rows)
-        line = re.compile(rf"^(\s*)file\s*=\s*([\"']){re.escape(name)}\2", re.MULTILINE)
-        put = f"# heights of {name!r}:\n\\1heights = [\n  {written},\n]"
-        text = line.sub(lambda m, put=put: put.replace("\\1", m[1].lstrip("\n")), text, count=1)
-    return text
-
-
-def _table(path: Path) -> list[list[float]]:
-    """Numbers of a CSV or NPY file, row by row."""
-
-    def refused(problem: str, remedy: str) -> MissionError:
-        return MissionError([Finding(str(path), "", None, problem, remedy)])
-
-    try:
-        if path.suffix.lower() == ".npy":
-            found = np.load(path, allow_pickle=False)
-        else:
-            rows = list(csv.reader(path.read_text(encoding="utf-8-sig").splitlines()))
-            found = np.array([row for row in rows if any(x.strip() for x in row)], dtype=float)
-        found = np.asarray(found, dtype=float)
-    except OSError as error:
-        problem = f"cannot be read: {(error.strerror or str(error)).lower()}"
-        raise refused(problem, "give a file of heights, CSV or NPY") from None
-    except ValueError:
-        raise refused(
-            "is not a table of numbers",
-            "give rows of equal length, separated by commas, or an NPY array",
-        ) from None
-    if found.ndim != 2 or not found.size or not np.isfinite(found).all():
-        raise refused("is not a table of finite numbers", "give two or more rows of heights [m]")
-    if found.size > bounds.HEIGHTS:
-        raise refused(
-            f"has {found.size:,} heights; the maximum is {bounds.HEIGHTS:,}", "use a coarser grid"
-        )
-    return found.tolist()

@@ -24,11 +24,11 @@ from rigidfleet.mission.kinds import (
     Brake,
     Establish,
     Go,
-    Land,
     Orbit,
     Reshape,
     Shaping,
     Turn,
+    Vertical,
     seconds,
 )
 from rigidfleet.mission.schema import Agents, Formation, Limits, Lqr
@@ -58,6 +58,8 @@ def check(
         if p is not None:
             _smoothness(collector, p, ("phases", k), smooth=_smooth(parts))
             _automatic(collector, p, ("phases", k), parts)
+            if n is not None and p.vertical is not None:
+                _members(collector, p.vertical, n, ("phases", k))
     return tuple(p for p in found if p is not None)
 
 
@@ -324,9 +326,9 @@ def _orbit(collector: FindingCollector, p: Orbit, path: Keys, longest: float | N
 
 
 def _led(
-    collector: FindingCollector, p: Brake | Go | Land, path: Keys, longest: float | None
+    collector: FindingCollector, p: Brake | Go | Vertical, path: Keys, longest: float | None
 ) -> None:
-    """Check that a brake, a landing or a way to be found has tracked slots and an end."""
+    """Check that a brake, a take-off, a landing or a way to be found has tracked slots and an end."""
     kind_name = collector.data["phases"][path[1]]["kind"]
     if p.control == "body" and collector.right(path, "control"):
         problem = f"kind '{kind_name}' cannot be flown by a wrench on the virtual body"
@@ -338,6 +340,21 @@ def _led(
     if longest is not None and travel > longest * (1 + 1e-9):
         problem = f"is longer than the phase, which ends after {longest:g} s"
         collector.add((*path, "travel"), problem, "reduce travel or end the phase later")
+
+
+def _vertical(collector: FindingCollector, p: Vertical, path: Keys, longest: float | None) -> None:
+    """Check how a take-off or a landing is staggered, besides what `_led` checks."""
+    _led(collector, p, path, longest)
+    if p.stagger is None:
+        if "by" in p.model_fields_set:
+            collector.add((*path, "by"), "has no effect without stagger", "remove it")
+    elif p.travel is not None:
+        problem = "has no effect with stagger: a group takes what the others leave of the phase"
+        collector.add((*path, "travel"), problem, "remove it")
+    elif p.until is not None or p.duration == AUTO:
+        where = (*path, "until" if p.until is not None else "duration")
+        problem = "does not say how long a staggered phase lasts"
+        collector.add(where, problem, "give its duration in seconds")
 
 
 def _go(collector: FindingCollector, p: Go, path: Keys, longest: float | None) -> None:
@@ -370,12 +387,22 @@ def _reshape(collector: FindingCollector, p: Reshape, path: Keys, _: float | Non
 _OWN: dict[str, Callable[[FindingCollector, Any, Keys, float | None], None]] = {
     "brake": _led,
     "establish": _establish,
+    "land": _vertical,
     "go": _go,
-    "land": _led,
     "orbit": _orbit,
     "reshape": _reshape,
+    "takeoff": _vertical,
     "turn": _turn,
 }
+
+
+def _members(collector: FindingCollector, p: Vertical, n: int, path: Keys) -> None:
+    """Check that the agents that take off or land exist, and are named once."""
+    beyond = [i for i in p.agents if i > n]
+    if beyond:
+        collector.add((*path, "agents"), "there is no such agent", f"use 1 to {n}", beyond[0])
+    if len(set(p.agents)) < len(p.agents):
+        collector.add((*path, "agents"), "names an agent twice", "name each once", None)
 
 
 def _formations(
@@ -529,12 +556,13 @@ def _automatic(
     if p.control != "tracking":
         problem = f"needs tracked slots to have a least time, not control '{p.control}'"
         collector.add(where, problem, "use control = 'tracking', or give a time")
-    if p.duration == AUTO and not (p.steering or p.shaping or isinstance(p, Go)):
+    if p.duration == AUTO and not (p.steering or p.shaping or p.vertical or isinstance(p, Go)):
         problem = (
             f"a phase of kind '{collector.data['phases'][path[1]]['kind']}' has no least duration"
         )
         collector.add((*path, "duration"), problem, "give a duration")
-    if p.duration == AUTO and p.steering is not None and p.steering.travel is not None:
+    steers = p.steering or p.vertical
+    if p.duration == AUTO and steers is not None and steers.travel is not None:
         problem = "has no effect with duration = 'auto', which ends the phase at the arrival"
         collector.add((*path, "travel"), problem, "remove one of them")
     limits, agents = parts.get("limits", Limits()), parts.get("agents")

@@ -232,7 +232,8 @@ class Agents(Part):
     )
     position: Annotated[tuple[Vector, ...], Field(min_length=1)] = Field(
         description="initial position [x, y, z] of each agent [m], world axes ENU (z up); or a table with the "
-        "shape in which the agents start"
+        "shape in which the agents start, or the name of a file of points: CSV, NPY or PLY, relative to the mission "
+        "file"
     )
     velocity: tuple[Velocity, ...] = Field(
         (), description="initial velocity of each agent [m/s]; default: at rest"
@@ -408,7 +409,9 @@ class Formation(Part):
         None, description="edge length of the shape [m]; for a cuboid also [x, y, z]"
     )
     slots: tuple[Vector, ...] | None = Field(
-        None, description="instead of a shape: desired position of each agent in the body frame [m]"
+        None,
+        description="instead of a shape: desired position of each agent in the body frame [m], or the name of a "
+        "file of points: CSV, NPY or PLY, relative to the mission file and not outside its folder",
     )
     edges: Edges = Field(
         "complete",

@@ -17,7 +17,16 @@ from rigidfleet.kernel.problem import Motion, septic_polynomial
 from rigidfleet.math import attitude as att
 from rigidfleet.math import lqr, series, splines
 from rigidfleet.mission import Fly, Mission, Phase, Regulator
-from rigidfleet.mission.kinds import Brake, Land, Orbit, Steering, Through, seconds
+from rigidfleet.mission.kinds import (
+    Brake,
+    Land,
+    Orbit,
+    Steering,
+    Takeoff,
+    Through,
+    Vertical,
+    seconds,
+)
 from rigidfleet.planning.reference import PhaseState, Pose, pose_at
 from rigidfleet.typing import Floats
 
@@ -26,6 +35,8 @@ _REST_WITHIN = 10.0
 #: Height above the ground at which a landing ends [m]: the vehicles' lags and noise shall not lead them into it; and
 #: the speed downwards there [m/s]. Both are well within what the verdict takes as standing on the ground.
 ABOVE, TOUCH_DOWN = 0.05, 0.2
+#: Ways of vehicles straight up or down that differ by less count as one [m].
+_LEVEL = 1e-9
 
 
 class Flight(Protocol):
@@ -97,14 +108,63 @@ def _brake(mission: Mission, phase: Brake, now: PhaseState, t_end: float) -> Cou
     return Course(goal, arrival, flight)
 
 
-def _land(mission: Mission, phase: Land, now: PhaseState, t_end: float) -> Course:
-    """Descend straight down to just above the ground, by the end."""
+def _vertical(mission: Mission, phase: Vertical, now: PhaseState, t_end: float) -> Course:
+    """Go straight up or down by the mean of what the vehicles do, within ``travel`` or by the end."""
     assert now.pose is not None
     assert now.goal is not None
-    depth = max(0.0, height(mission, now))
-    v = np.array([0.0, 0.0, -min(TOUCH_DOWN, depth / (t_end - now.t))])
-    goal = replace(now.goal, r=now.goal.r - [0.0, 0.0, depth], v=v, omega=np.zeros(3))
-    return Course(goal, t_end, SmoothFlight(now.pose, goal, now.t, t_end, ()))
+    arrival = t_end if phase.travel is None else min(t_end, now.t + phase.travel)
+    up, v = np.zeros(3), np.zeros(3)
+    if phase.each:
+        up[2] = mission.fleet.mass @ rises(mission, phase, now) / mission.fleet.mass.sum()
+    else:
+        up[2] = -max(0.0, height(mission, now))
+        v[2] = -min(TOUCH_DOWN, -up[2] / (arrival - now.t))
+    goal = replace(now.goal, r=now.goal.r + up, v=v, omega=np.zeros(3))
+    return Course(goal, arrival, SmoothFlight(now.pose, goal, now.t, arrival, ()))
+
+
+def lifted(mission: Mission, phase: Phase, now: PhaseState, t_end: float) -> Lift | None:
+    """What a phase that leads vehicles straight up or down adds to their slots; None if it keeps the shape.
+
+    The virtual body goes by the mean (`_vertical`), from rest to rest on the same septic: together, each vehicle goes
+    straight up or down by its own way, and one that stays, stays.
+    """
+    vertical = phase.vertical
+    if vertical is None or not vertical.each:
+        return None
+    assert now.goal is not None
+    up, masses = rises(mission, vertical, now), mission.fleet.mass
+    if np.ptp(up) < _LEVEL:
+        return None
+    travel = t_end - now.t if vertical.travel is None else min(vertical.travel, t_end - now.t)
+    return Lift(np.outer(up - masses @ up / masses.sum(), now.goal.T[:, 2]), travel)
+
+
+class Lift(NamedTuple):
+    """Ways of the slots (N, 3) about the CM, body axes [m], and the time they take [s]."""
+
+    dp: Floats
+    time: float
+
+
+def rises(mission: Mission, phase: Vertical, now: PhaseState) -> Floats:
+    """How far [m] each vehicle (N,) goes up from the pose to hold: to a height, or (down) to just above the ground."""
+    assert now.goal is not None
+    assert now.slots is not None
+    n = mission.n_agents
+    place = now.goal.r[2] + now.slots @ now.goal.T[:, 2]
+    over = phase.height if isinstance(phase, Takeoff) else ABOVE + mission.fleet.radius
+    up = _ground(mission) + over - place
+    if isinstance(phase, Land):
+        up = np.minimum(up, 0.0)
+    goes = np.ones(n, dtype=np.bool_) if not phase.agents else np.zeros(n, dtype=np.bool_)
+    goes[np.array(phase.agents, dtype=np.int64) - 1] = True
+    return np.where(goes if now.lost is None else goes & ~now.lost, up, 0.0)
+
+
+def _ground(mission: Mission) -> float:
+    """Height of the highest ground [m]."""
+    return max((o.height for o in mission.obstacles if o.kind == "ground"), default=-math.inf)
 
 
 def height(mission: Mission, now: PhaseState) -> float:
@@ -113,8 +173,7 @@ def height(mission: Mission, now: PhaseState) -> float:
     assert now.slots is not None
     left = np.ones(mission.n_agents, dtype=np.bool_) if now.lost is None else ~now.lost
     below = now.goal.r[2] + now.slots @ now.goal.T[:, 2] - mission.fleet.radius
-    ground = max((o.height for o in mission.obstacles if o.kind == "ground"), default=-math.inf)
-    return float(below[left].min()) - ground - ABOVE
+    return float(below[left].min()) - _ground(mission) - ABOVE
 
 
 def _led(
@@ -137,8 +196,9 @@ def _led(
 _COURSES: dict[str, Callable[[Mission, Any, PhaseState, float], Course]] = {
     "brake": _brake,
     "fly": _steer,
-    "land": _land,
+    "land": _vertical,
     "orbit": _orbit,
+    "takeoff": _vertical,
     "turn": _steer,
 }
 

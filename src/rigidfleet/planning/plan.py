@@ -46,7 +46,7 @@ from rigidfleet.mission.kinds import seconds
 from rigidfleet.mission.schema import Constraint, IntegratorOptions
 from rigidfleet.planning import solvers
 from rigidfleet.planning.certificate import Certificate, certified
-from rigidfleet.planning.courses import course, passed
+from rigidfleet.planning.courses import course, lifted, passed
 from rigidfleet.planning.disturbances import without
 from rigidfleet.planning.reference import (
     PhaseState,
@@ -231,10 +231,12 @@ def plan_phase(
     before_switch, masses = now, mission.fleet.mass.copy()
     shaping = phase.shaping
     name = shaping.formation if shaping is not None else now.formation
-    edges = mission.formation_edges(name) if name else np.zeros((0, 2), dtype=np.int64)
     target = slots_about_cm(mission, name, masses)
     frame, now, turned = attach(mission, phase, now, masses, target)
-
+    lift = lifted(mission, phase, now, t_end)
+    if lift is not None:  # which no formation outlasts
+        name = target = None
+    edges = mission.formation_edges(name) if name else np.zeros((0, 2), dtype=np.int64)
     d1 = mission.formation_distances(name) if name else np.zeros(0)
     if shaping is None:
         d1 = now.reference.of(edges, d1)
@@ -254,6 +256,8 @@ def plan_phase(
     dp, turn = np.zeros_like(before), np.zeros(3)
     if shaping is not None:
         dp, turn = align_slots(before, after, left, turned)
+    if lift is not None:
+        kind, dp, T_b, after = SHAPE, lift.dp, lift.time, before + lift.dp
     reference = Reference(kind, now.t, T_b, d0, d1, before, dp, turn)
     if shaping is None and now.blend is not None:
         reference = now.blend

@@ -14,7 +14,7 @@ from rigidfleet.math.rigid_body import about_cm
 from rigidfleet.mission import Mission, Phase
 from rigidfleet.mission.kinds import seconds
 from rigidfleet.planning.certificate import Certificate, certified
-from rigidfleet.planning.courses import course
+from rigidfleet.planning.courses import course, lifted
 from rigidfleet.planning.derivatives import slot_derivatives
 from rigidfleet.planning.reference import (
     PhaseState,
@@ -180,6 +180,8 @@ def leg(mission: Mission, phase: Phase, now: PhaseState) -> Leg | None:
         if shaping is not None and target is not None:
             dp, turn = align_slots(now.slots, target, masses, turned)
             slots = target
+        if (lift := lifted(mission, phase, now, t_end)) is not None:
+            dp, blend, slots, name = lift.dp, lift.time, now.slots + lift.dp, None
         reference = Reference(SHAPE, t0, blend, _NONE, _NONE, now.slots, dp, turn)
         pose = pose_at(motion, t_end)
         tracked = pose if phase.control == "tracking" else None

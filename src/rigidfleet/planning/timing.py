@@ -12,7 +12,7 @@ from typing import Any
 
 from rigidfleet.errors import Finding, MissionError
 from rigidfleet.mission import Fly, Mission, Phase
-from rigidfleet.mission.kinds import Orbit, Shaping, Steering
+from rigidfleet.mission.kinds import Orbit, Shaping, Steering, Vertical
 from rigidfleet.mission.values import AUTO
 from rigidfleet.planning import ways
 from rigidfleet.planning.courses import SmoothFlight, course
@@ -177,7 +177,11 @@ def _key(phase: Phase) -> str:
     """The key that sets the time of a phase's motion."""
     if isinstance(phase, Shaping | Orbit):
         return "blend"
-    return "travel" if isinstance(phase, Steering) and phase.travel is not None else "duration"
+    return (
+        "travel"
+        if isinstance(phase, Steering | Vertical) and phase.travel is not None
+        else "duration"
+    )
 
 
 def _moving(phase: Phase, time: float) -> Phase:

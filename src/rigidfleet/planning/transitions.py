@@ -1,4 +1,4 @@
-"""Transitions of agents with slots of their own, whose straight ways cross.
+"""Phases that are flown as several: transitions whose straight ways cross, and staggered take-offs and landings.
 
 Agents that exchange places at will cannot all go straight and in step. They go apart instead to levels one above the
 other, across, and together again. Each of these is a straight blend in step, so that its least separation is known in
@@ -16,29 +16,34 @@ import numpy as np
 from rigidfleet.errors import Finding, MissionError
 from rigidfleet.formation.assignment import closest_approach, nearer_than
 from rigidfleet.math import rigid_body
-from rigidfleet.mission import Mission
-from rigidfleet.mission.kinds import Reshape
+from rigidfleet.mission import Mission, Phase
+from rigidfleet.mission.kinds import Reshape, Vertical
 from rigidfleet.mission.values import AUTO
 from rigidfleet.planning.reference import slots_about_cm
 from rigidfleet.typing import Floats, Ints
 
 #: What the parts of a transition are called.
 _PARTS = ("apart", "across", "together")
+#: Vehicles whose y differs by less stand in one row [m].
+_ROW = 1e-3
 #: Excess over a limit that is ignored [m].
 _SLACK = 1e-9
 
 
 def expanded(mission: Mission) -> Mission:
-    """Return the mission with each transition by layers as three phases of their own; itself if it has none.
+    """Return the mission with each phase that is flown as several in their place; itself if it has none.
+
+    A transition by layers becomes three phases, a staggered take-off or landing one for each group of vehicles.
 
     The result is an ordinary mission: it can be written, read and flown by itself.
 
     Raises
     ------
     MissionError
-        The layers of a phase do not keep the separation, or there is no formation before it.
+        The layers of a phase do not keep the separation, or there is no formation before it; or the groups of a
+        staggered phase have no time, or would be under way together.
     """
-    if all(not isinstance(p, Reshape) or p.transition == "straight" for p in mission.phases):
+    if not any(_is_several(phase) for phase in mission.phases):
         return mission
     data, tables, forms = mission.to_dict(), [], {}
     before: str | None = None
@@ -54,10 +59,60 @@ def expanded(mission: Mission) -> Mission:
                     name: {"slots": x, "edges": []} for name, x in zip(names, levels, strict=True)
                 }
                 parts = _phases(table, phase, names, _lengths(mission, phase, before, levels))
+        elif isinstance(phase, Vertical) and phase.stagger is not None:
+            parts = _staggered(mission, k, table, phase, before)
         tables += parts
         before = before if phase.shaping is None else phase.shaping.formation
     data |= {"phases": tables, "formations": data["formations"] | forms}
     return Mission.from_dict(data, mission.origin)
+
+
+def _is_several(phase: Phase) -> bool:
+    """Whether a phase is flown as several."""
+    if isinstance(phase, Vertical):
+        return phase.stagger is not None
+    return isinstance(phase, Reshape) and phase.transition != "straight"
+
+
+def _staggered(
+    mission: Mission, number: int, table: dict[str, Any], phase: Vertical, before: str | None
+) -> list[dict[str, Any]]:
+    """The phases of a staggered take-off or landing, one for each group.
+
+    Raises
+    ------
+    MissionError
+        The duration leaves no time for the last group, or so much that groups would be under way together.
+    """
+    assert phase.stagger is not None
+    assert isinstance(phase.duration, float)  # checked
+    moving = phase.agents or tuple(range(1, mission.n_agents + 1))
+    groups = [[i] for i in moving]
+    if phase.by == "rows":
+        slots = mission.formation_slots(before) if before is not None else None
+        y = (mission.fleet.position if slots is None else slots)[:, 1]
+        row = {i: round(float(y[i - 1]) / _ROW) for i in moving}
+        groups = [[i for i in moving if row[i] == k] for k in sorted(set(row.values()))]
+    travel = round(phase.duration - (len(groups) - 1) * phase.stagger, 6)
+    if not 0.0 < travel <= phase.stagger + 1e-6:
+        problem = (
+            f"leaves {travel:g} s to each of {len(groups)} groups, {phase.stagger:g} s apart"
+            if travel > 0
+            else f"is too short for {len(groups)} groups, {phase.stagger:g} s apart"
+        )
+        remedy = (
+            f"groups go one after another: give a duration of {len(groups) * phase.stagger:g} s, or up to"
+            f" {phase.stagger:g} s less"
+        )
+        path = f"phases[{number + 1}].duration"
+        raise MissionError([Finding(mission.origin, path, phase.duration, problem, remedy)])
+    kept = {key: x for key, x in table.items() if key not in ("stagger", "by")}
+    return [
+        kept
+        | {"name": f"{phase.name}: {k} of {len(groups)}", "agents": group, "travel": travel}
+        | {"duration": phase.stagger if k < len(groups) else travel}
+        for k, group in enumerate(groups, start=1)
+    ]
 
 
 def _ends(mission: Mission, phase: Reshape, before: str | None) -> tuple[Floats, Floats] | None:

@@ -29,6 +29,7 @@ from rigidfleet.plotting.curves import (
     disturbance,
     inputs,
 )
+from rigidfleet.plotting.operation import leaves_ground, operation
 from rigidfleet.plotting.page import summary
 from rigidfleet.plotting.quadrotors import has_rotors, rotors, vehicles
 from rigidfleet.plotting.space import formations, trajectory
@@ -54,6 +55,7 @@ __all__ = [
     "figure_names",
     "formations",
     "inputs",
+    "operation",
     "plot",
     "rotors",
     "summary",
@@ -65,7 +67,7 @@ _FIGURES: dict[str, Callable[[Result], Figure]] = {
     draw.__name__: draw
     for draw in (
         summary, trajectory, distances, cm, attitude, inputs, constraint_force, constraint_error,
-        clearance, formations, disturbance, rotors, vehicles,
+        clearance, formations, disturbance, rotors, vehicles, operation,
     )
 }  # fmt: skip
 #: File formats of figures.
@@ -89,6 +91,7 @@ def figure_names(result: Result | None = None) -> list[str]:
         "disturbance": result.disturbance_force is None,
         "rotors": not has_rotors(result),
         "vehicles": not has_rotors(result),
+        "operation": not leaves_ground(result),
     }
     empty["constraint_error"] = empty["distances"] and empty["formations"]
     return [name for name in _FIGURES if not empty.get(name)]

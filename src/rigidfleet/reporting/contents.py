@@ -417,6 +417,7 @@ _CAPTIONS = {
     "formations": "Formations with their edges and body axes.",
     "disturbance": "Aerodynamic force on each vehicle, and distance of each vehicle from its slot.",
     "rotors": "Greatest force of a rotor of each vehicle with its limit; all rotors of the one nearest to its limit.",
+    "operation": "Altitude and speeds of all vehicles, their least separation, and their clearance to obstacles.",
     "vehicles": "Tilt of each vehicle, its distance from its slot, and when it is asked for more than its rotors give.",
 }  # fmt: skip
 

@@ -1,0 +1,170 @@
+"""Points on outlines: drawings (SVG) and words in a font, and points evenly spread over them."""
+
+from __future__ import annotations
+
+import io
+import math
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial import KDTree
+
+from rigidfleet.errors import RigidfleetError
+from rigidfleet.formation.point_files import read_bytes
+from rigidfleet.math import proximity
+from rigidfleet.typing import Floats, Ints
+
+#: Points of an outline among which is chosen, as a multiple of those asked for, and rounds of improvement.
+_DENSE, _ROUNDS = 20, 30
+#: Steps in which a curve is measured.
+_STEPS = 200
+#: Greatest number of points of an outline.
+_MOST = 5000
+
+
+def svg_outlines(path: str | Path) -> list[Floats]:
+    """Outlines (K, 2) of the shapes of an SVG drawing as polygons, y up; a closed one ends where it begins.
+
+    Raises
+    ------
+    ValueError
+        The file is no SVG drawing, or has no outline.
+    RigidfleetError
+        svgpathtools is not installed, or (MissionError) the file cannot be read.
+    """
+    try:
+        import svgpathtools
+    except ImportError:
+        raise RigidfleetError(
+            'Drawings need svgpathtools. Install it: pip install "rigidfleet[show]".'
+        ) from None
+    text = read_bytes(path)
+    try:
+        paths = svgpathtools.Document(io.StringIO(text.decode("utf-8-sig"))).paths()
+        parts = [part for found in paths for part in found.continuous_subpaths()]
+    except Exception as error:  # its parsers raise errors of many kinds
+        raise ValueError(f"is no SVG drawing: {' '.join(str(error).split())}") from None
+    found = []
+    for part in parts:
+        ends = [np.array([segment.point(x) for x in _steps(segment)]) for segment in part]
+        z = np.concatenate([[part[0].start], *(end[1:] for end in ends)])
+        found.append(np.column_stack([z.real, -z.imag]))
+    return _drawn(found)
+
+
+def _steps(segment: object) -> Floats:
+    return np.linspace(0.0, 1.0, 2 if type(segment).__name__ == "Line" else _STEPS)
+
+
+def text_outlines(words: str, font: str = "DejaVu Sans") -> list[Floats]:
+    """Outlines (K, 2) of words in a font, of height about 1, as polygons.
+
+    Raises
+    ------
+    ValueError
+        There is no such font, or the words have no outline.
+    """
+    from matplotlib.font_manager import FontProperties, findfont
+    from matplotlib.textpath import TextPath
+
+    try:
+        findfont(font, fallback_to_default=False)
+    except ValueError:
+        raise ValueError(f"there is no font {font!r}; matplotlib lists those it finds") from None
+    if not words.strip():
+        raise ValueError("has no outline")
+    path = TextPath((0.0, 0.0), words, size=1.0, prop=FontProperties(family=font))
+    return _drawn([np.array(x) for x in path.to_polygons(closed_only=False)])
+
+
+def _drawn(outlines: list[Floats]) -> list[Floats]:
+    found = [x for x in outlines if len(x) > 1 and np.isfinite(x).all() and np.ptp(x, axis=0).any()]
+    if not found:
+        raise ValueError("has no outline")
+    return found
+
+
+def on_outlines(outlines: list[Floats], count: int, spacing: float) -> Floats:
+    """Slots (count, 3) [m] evenly spread over outlines, the nearest two ``spacing`` apart; upright: x east, z up.
+
+    Raises
+    ------
+    ValueError
+        The count or the spacing is not possible.
+    """
+    if not 2 <= count <= _MOST:
+        raise ValueError(f"an outline takes 2 to {_MOST:,} agents, not {count:,}")
+    flat = spread(_along(outlines, _DENSE * count), count)
+    return scaled(np.column_stack([flat[:, 0], 0.0 * flat[:, 0], flat[:, 1]]), spacing)
+
+
+def scaled(points: ArrayLike, spacing: float) -> Floats:
+    """Points (N, 3) about their centre, enlarged or reduced until the nearest two are ``spacing`` [m] apart.
+
+    Raises
+    ------
+    ValueError
+        The spacing is not a positive number, or there are fewer than two points.
+    """
+    p = np.asarray(points, dtype=np.float64)
+    if not 0.0 < spacing < math.inf:
+        raise ValueError(f"a spacing must be a positive length [m], not {spacing:g}")
+    if len(p) < 2:
+        raise ValueError("a single point has no spacing")
+    return (p - p.mean(axis=0)) * (spacing / float(proximity.nearest(p).min()))
+
+
+def spread(points: Floats, count: int) -> Floats:
+    """Those ``count`` of points (M, d) that are spread evenly: their least distance is as large as was found.
+
+    Two starts, every M/count-th point and the farthest from all chosen before, are improved in turns: each chosen point
+    goes to the middle of the points that are nearest to it (Lloyd), and from there to the nearest point.
+
+    Raises
+    ------
+    ValueError
+        There are fewer points.
+    """
+    if len(points) < count:
+        raise ValueError(f"{len(points):,} points cannot place {count:,} agents; use fewer agents")
+    tree = KDTree(points)
+    best, most = np.arange(count), -1.0
+    for start in (np.arange(count) * len(points) // count, _farthest(points, count)):
+        chosen = start
+        for _ in range(_ROUNDS):
+            least = float(proximity.nearest(points[chosen]).min()) if count > 1 else 0.0
+            if least > most:
+                best, most = chosen, least
+            owner = KDTree(points[chosen]).query(points)[1]
+            size = np.bincount(owner, minlength=count)
+            middle = np.stack([np.bincount(owner, x, count) for x in points.T], axis=1)
+            moved = np.unique(tree.query(middle / np.maximum(size, 1)[:, None])[1])
+            if len(moved) < count or (moved == np.sort(chosen)).all():
+                break
+            chosen = moved
+    return points[np.sort(best)]
+
+
+def _farthest(points: Floats, count: int) -> Ints:
+    """Indices (count,) of points, each the farthest from all before."""
+    chosen = np.zeros(count, dtype=np.int64)
+    away = np.linalg.norm(points - points[0], axis=1)
+    for k in range(1, count):
+        chosen[k] = int(away.argmax())
+        away = np.minimum(away, np.linalg.norm(points - points[chosen[k]], axis=1))
+    return chosen
+
+
+def _along(outlines: list[Floats], count: int) -> Floats:
+    """About ``count`` points (M, 2) at equal steps along polygons (K, 2)."""
+    lengths = [np.linalg.norm(np.diff(x, axis=0), axis=1) for x in outlines]
+    step = sum(map(np.sum, lengths)) / count
+    found = []
+    for x, length in zip(outlines, lengths, strict=True):
+        closed = np.allclose(x[0], x[-1], atol=1e-9 * float(np.ptp(x, axis=0).max()))
+        at = np.concatenate([[0.0], np.cumsum(length)])
+        parts = max(1, round(float(at[-1]) / step))
+        s = np.linspace(0.0, at[-1], parts + 1)[: -1 if closed and parts > 1 else None]
+        found.append(np.column_stack([np.interp(s, at, column) for column in x.T]))
+    return np.concatenate(found)

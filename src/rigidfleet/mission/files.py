@@ -1,0 +1,158 @@
+"""Numbers that a mission takes from files: points of slots and agents, heights of obstacles.
+
+The numbers stand in the text of the mission before it is checked. A result holds this text, and so repeats without
+the files.
+"""
+
+from __future__ import annotations
+
+import copy
+import csv
+import hashlib
+import io
+import re
+import tomllib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rigidfleet._common.toml import to_toml
+from rigidfleet.errors import Finding, MissionError
+from rigidfleet.formation.point_files import parse_points, read_bytes
+from rigidfleet.mission import bounds
+
+#: What a text has that may name a file.
+_MAY_NAME = re.compile(r"(file|slots|position)[\"']?\s*=\s*[\"']")
+#: What is said where a file cannot be found, because a mission is not from a file itself.
+NOT_A_FILE = "is read only with a mission file, as its path is relative to that"
+
+
+class _Named(NamedTuple):
+    """A file that a mission names: the table and key that do, the key of its numbers, and who reads them."""
+
+    table: dict[str, Any]
+    key: str
+    becomes: str
+    where: str
+    read: Callable[[bytes, str], list[list[float]]]
+
+
+def completed(text: str, path: Path) -> str:
+    """Text of a mission as `with_files` gives it; itself if it names no files.
+
+    Raises
+    ------
+    MissionError
+        As `with_files` does.
+    """
+    if _MAY_NAME.search(text) is None or bounds.excess(text):
+        return text  # which need not, or must not, be parsed
+    try:
+        data = tomllib.loads(text)
+    except (ValueError, RecursionError):
+        return text  # whose errors the check tells
+    return with_files(text, data, path)
+
+
+def with_files(text: str, data: dict[str, Any], path: Path) -> str:
+    """Text of a mission in which numbers stand instead of the names of files, with the SHA-256 digest of each.
+
+    Parameters
+    ----------
+    text, data : the mission's text, and what it says
+    path : the mission file; names of files are relative to its folder, and do not leave it
+
+    Raises
+    ------
+    MissionError
+        A file is outside the folder, cannot be read, or has not the numbers asked for.
+    """
+    data, digests = copy.deepcopy(data), []
+    for named in list(_named(data)):
+        name = named.table[named.key]
+        content = read_bytes(_inside(path, named.where, name))
+        rows = named.read(content, str(path.parent / name))
+        told = f"{named.becomes} of {name!r}, SHA-256 {hashlib.sha256(content).hexdigest()}"
+        digests.append(f"# {named.where}: {told}\n")
+        del named.table[named.key]
+        named.table[named.becomes] = rows
+        written = "".join(f"  {row!r},\n" for row in rows)
+        line = re.compile(rf"^([ \t]*){named.key}\s*=\s*([\"']){re.escape(name)}\2", re.MULTILINE)
+        put = f"# {told}\n{named.becomes} = [\n{written}]"
+        text = line.sub(lambda m, put=put: m[1] + put, text, count=1)
+    try:
+        if tomllib.loads(text) == data:
+            return text
+    except tomllib.TOMLDecodeError:
+        pass
+    return "".join(digests) + to_toml(data)  # where a file is named within a line
+
+
+def _named(data: dict[str, Any]) -> Iterator[_Named]:
+    forms, agents, things = (data.get(key) for key in ("formations", "agents", "obstacles"))
+    for name, form in forms.items() if isinstance(forms, dict) else ():
+        if isinstance(form, dict) and isinstance(form.get("slots"), str):
+            yield _Named(form, "slots", "slots", f"formations.{name}.slots", _points)
+    if isinstance(agents, dict) and isinstance(agents.get("position"), str):
+        yield _Named(agents, "position", "position", "agents.position", _points)
+    for k, thing in enumerate(things if isinstance(things, list) else (), start=1):
+        if (
+            isinstance(thing, dict)
+            and thing.get("kind") == "heights"
+            and isinstance(thing.get("file"), str)
+            and "heights" not in thing
+        ):
+            yield _Named(thing, "file", "heights", f"obstacles[{k}].file", _heights)
+
+
+def _inside(path: Path, where: str, name: str) -> Path:
+    """The file of a name, which may not leave the folder of the mission, not by a link either.
+
+    Raises
+    ------
+    MissionError
+        It does.
+    """
+    folder = path.parent.resolve()
+    try:
+        found = (folder / name).resolve()
+        if not Path(name).is_absolute() and found.is_relative_to(folder):
+            return found
+        problem = "leaves the folder of the mission"
+    except (OSError, RuntimeError, ValueError):
+        problem = "is no name of a file"
+    remedy = f"put the file into {folder} or below, and give its relative path"
+    raise MissionError([Finding(str(path), where, name, problem, remedy)])
+
+
+def _points(data: bytes, name: str) -> list[list[float]]:
+    return parse_points(data, name).tolist()
+
+
+def _heights(data: bytes, name: str) -> list[list[float]]:
+    """Numbers of a CSV or NPY file, row by row."""
+
+    def refused(problem: str, remedy: str) -> MissionError:
+        return MissionError([Finding(name, "", None, problem, remedy)])
+
+    try:
+        if name.lower().endswith(".npy"):
+            found = np.load(io.BytesIO(data), allow_pickle=False)
+        else:
+            rows = list(csv.reader(data.decode("utf-8-sig").splitlines()))
+            found = np.array([row for row in rows if any(x.strip() for x in row)], dtype=float)
+        found = np.asarray(found, dtype=float)
+    except (ValueError, EOFError, OSError):
+        raise refused(
+            "is not a table of numbers",
+            "give rows of equal length, separated by commas, or an NPY array",
+        ) from None
+    if found.ndim != 2 or not found.size or not np.isfinite(found).all():
+        raise refused("is not a table of finite numbers", "give two or more rows of heights [m]")
+    if found.size > bounds.HEIGHTS:
+        raise refused(
+            f"has {found.size:,} heights; the maximum is {bounds.HEIGHTS:,}", "use a coarser grid"
+        )
+    return found.tolist()

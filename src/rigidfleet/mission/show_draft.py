@@ -1,0 +1,211 @@
+"""Write the text of a new show: take off from a grid, go through formations, return and land."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from rigidfleet._common.toml import toml_key
+from rigidfleet.formation import shapes
+from rigidfleet.formation.assignment import assigned
+from rigidfleet.math import proximity
+from rigidfleet.mission.draft import _LIFT, _MOST, _aligned, _blend, _output_step, shape_known
+from rigidfleet.typing import Floats
+
+#: Mass of a vehicle of a show [kg], greatest radius [m], and that as a share of the spacing.
+_MASS, _RADIUS, _SLIM = 0.3, 0.15, 1 / 8
+#: Least height of a slot above the ground and of the whole show [m], and of a vehicle that stands.
+_ALOFT, _LOWEST, _STANDS = 5.0, 10.0, 0.05
+#: Share of the distance that is proved, which the mission asks for.
+_ASKED = 0.9
+#: Times to hold each formation, and to settle after a change [s].
+_SHOWN, _SETTLED = 4.0, 1.0
+#: Rise of a turn of a helix, in spacings.
+_RISE = 1.5
+
+
+class Scene(NamedTuple):
+    """A formation of a show.
+
+    Attributes
+    ----------
+    name : of the formation
+    slots : (N, 3) [m]
+    table : lines of its table, `shape` and `size`, or `slots`
+    """
+
+    name: str
+    slots: Floats
+    table: str
+
+
+def scene(shape: str, agents: int, spacing: float) -> Scene:
+    """A named shape whose nearest two agents are a spacing [m] apart.
+
+    Raises
+    ------
+    ValueError
+        There is no such shape, or not for this number of agents.
+    """
+    shape_known(shape)
+    if not 0.0 < spacing < math.inf:
+        raise ValueError(f"the spacing must be a positive length, not {spacing:g}")
+    size = [spacing] * shapes.SHAPES[shape].sizes
+    if shape == "helix":  # as high as it is wide: N spacing / (2 pi R) turns of one rise each
+        rise = _RISE * spacing
+        size = [round(math.sqrt(agents * spacing * rise / (4 * math.pi)), 3), rise, spacing]
+    slots = shapes.slots(shape, size, agents)
+    least = float(proximity.nearest(slots).min())
+    if least < spacing * (1 - 1e-9):
+        size = [math.ceil(1e3 * x * spacing / least) / 1e3 for x in size]
+        slots = shapes.slots(shape, size, agents)
+    written = json.dumps(size if len(size) > 1 else size[0])
+    return Scene(shape, slots, f'shape = "{shape}"\nsize = {written}                 # [m]\n')
+
+
+def points_scene(name: str, slots: Floats, source: str, *, by_name: bool = False) -> Scene:
+    """A formation of points (N, 3) [m], written as numbers, or by the name of their file."""
+    if by_name:
+        return Scene(name, slots, f"slots = {json.dumps(source)}\n")
+    rows = "".join(f"    {row},\n" for row in np.round(slots + 0.0, 6).tolist())
+    return Scene(name, slots, f"# points of {json.dumps(source)}\nslots = [\n{rows}]\n")
+
+
+def show(
+    name: str, scenes: Sequence[Scene], *, agents: int, spacing: float, mass: float = _MASS,
+    thrust_limit: float | None = None, file: str = "",
+) -> str:  # fmt: skip
+    """Return the TOML text of a show: from a grid through the scenes, and back.
+
+    Slots are assigned anew at each change, with the least squares of all ways, so that two agents come no nearer than
+    the spacing over sqrt(2) (`rigidfleet.formation.assignment.assigned`).
+
+    Raises
+    ------
+    ValueError
+        There are too many or too few agents, a scene has another number of them or is too narrow, or a number is not
+        positive.
+    """
+    if not 2 <= agents <= _MOST:
+        raise ValueError(f"a show takes 2 to {_MOST} agents, not {agents}")
+    for what, value in (
+        ("spacing", spacing),
+        ("mass", mass),
+        ("thrust limit", thrust_limit or 1.0),
+    ):
+        if not 0.0 < value < math.inf:
+            raise ValueError(f"the {what} must be a positive number, not {value:g}")
+    if not scenes:
+        raise ValueError("a show needs formations")
+    ground = "grid" if agents in shapes.SHAPES["grid"].agents else "line"
+    pads = scene(ground, agents, spacing)._replace(name="pads")
+    for one in scenes:
+        if len(one.slots) != agents:
+            raise ValueError(f"'{one.name}' has {len(one.slots)} points for {agents} agents")
+        least = float(proximity.nearest(one.slots).min())
+        if least < spacing * (1 - 1e-6):
+            raise ValueError(f"the points of '{one.name}' are {least:.3g} m apart, not {spacing:g}")
+    radius = min(_RADIUS, _SLIM * spacing)
+    height = max(_LOWEST, math.ceil(max(-one.slots[:, 2].min() for one in scenes) + _ALOFT))
+    start = radius + _STANDS
+    climb = _blend(height - start)
+    tables = {one.name: one for one in (pads, *scenes)}
+    places, lasts, phases, taken = pads.slots, 2.0 * climb, [], set[str]()
+    for k, one in enumerate([*scenes, pads]):
+        slots = one.slots - one.slots.mean(axis=0)
+        slots = slots[assigned(places, slots, turn=np.eye(3)).order]
+        blend = max(4, _blend(float(np.linalg.norm(slots - places, axis=1).max())))
+        title = one.name if one.name not in taken else f"{one.name}, phase {k + 2}"
+        shown = _SHOWN if one is not pads else _SETTLED
+        phases.append(
+            _CHANGE.format(
+                name=json.dumps(title), kind="reshape" if k else "establish",
+                formation=json.dumps(one.name), blend=f"{blend:.1f}", duration=f"{blend + shown:.1f}",
+            )
+        )  # fmt: skip
+        taken.add(one.name)
+        places, lasts = slots, lasts + blend + shown
+    separation = math.floor(100 * _ASKED * (spacing / math.sqrt(2) - 2 * radius)) / 100
+    if separation <= 0.0:
+        raise ValueError(f"a spacing of {spacing:g} m is too small for a show")
+    what = f"A show of {agents} vehicles: {', '.join(one.name for one in scenes)}"
+    what = " ".join(what.split())  # a name may have line breaks
+    return _aligned(
+        _HEAD.format(
+            name=json.dumps(name, ensure_ascii=False), file=file or f"{name}.toml",
+            what=what, title=json.dumps(what, ensure_ascii=False),
+            step=_output_step(agents, lasts), mass=f"{mass:g}", radius=f"{radius:.3g}",
+            limit=math.ceil(_LIFT * mass * 98.1) / 10 if thrust_limit is None else f"{thrust_limit:g}",
+            spacing=f"{spacing:g}", agents=agents, ground=ground, start=f"{start:.4g}", separation=f"{separation:g}",
+            formations="".join(
+                f"[formations.{toml_key(key)}]\n{one.table}edges = []                        # slots alone hold it\n\n"
+                for key, one in tables.items()
+            ),
+            height=f"{height:.1f}", climb=f"{climb:.1f}",
+        )
+        + "".join(phases)
+        + _LAND.format(climb=f"{climb:.1f}")
+    )  # fmt: skip
+
+
+_HEAD = """\
+# {what}.
+#
+# Change any number, then check the show, fly it, and watch it:
+#     rigidfleet check {file}
+#     rigidfleet run {file} --replay
+# Units are SI; x is east, y north, z up; agents count from 1. An error in a key is reported with its remedy.
+
+schema_version = 1
+name = {name}                     # results are written to flights/NAME
+title = {title}
+smoothness = "jerk"               # acceleration and jerk are continuous
+assignment = "each"               # at each change, the slots with the least squared distances: no two ways cross
+{step}
+[agents]
+mass = {mass}                        # [kg]
+radius = {radius}                     # [m] radius of the sphere around each agent
+thrust_limit = {limit}                # [N] of each agent
+position = {{ shape = "{ground}", size = {spacing}, count = {agents}, centre = [0.0, 0.0, {start}] }}
+
+[integrator]
+rtol = 1e-6
+atol = 1e-6                       # [m, m/s]
+
+{formations}[limits]                          # limits that the verdict checks
+separation = {separation}                  # [m] between surfaces; the plan is proved to keep it
+speed = 6.0                       # [m/s]
+acceleration = 4.0                # [m/s^2]
+
+[[obstacles]]
+kind = "ground"
+
+# -- the show: phases in order, each ending after its duration [s] --------------------------------
+
+[[phases]]
+name = "take off"
+kind = "takeoff"
+height = {height}                     # [m] above the ground; all scenes are centred there
+duration = {climb}
+# stagger = {climb}                   # [s] row after row: then, duration is that of all rows together
+"""
+
+_CHANGE = """
+[[phases]]
+name = {name}
+kind = "{kind}"
+formation = {formation}
+blend = {blend}                      # [s] of the change
+duration = {duration}
+"""
+
+_LAND = """
+[[phases]]
+name = "land"
+kind = "land"
+duration = {climb}
+"""

@@ -1,0 +1,83 @@
+"""The figure that an operator of a show reads: altitude, speeds and separation over time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from rigidfleet.plotting import style as st
+from rigidfleet.plotting.curves import draw_clearance, draw_separation
+from rigidfleet.plotting.style import styled
+from rigidfleet.result import Result
+from rigidfleet.typing import Floats
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+def leaves_ground(result: Result) -> bool:
+    """Whether vehicles take off or land in a phase of their own."""
+    return any(phase.vertical is not None for phase in result.mission.phases)
+
+
+def operation(result: Result, agents: Sequence[int] = ()) -> Figure:
+    """Altitude, speed and vertical speed of all vehicles over time, and separation and clearance.
+
+    Parameters
+    ----------
+    agents : numbers of vehicles, from 1, to draw alone, with a line each; by default all
+
+    Raises
+    ------
+    ValueError
+        There is no such vehicle.
+    """
+    n = result.n_agents
+    if beyond := [i for i in agents if not 1 <= i <= n]:
+        raise ValueError(f"there is no agent {beyond[0]}; agents are numbered from 1 to {n}")
+
+    @styled
+    def drawn(result: Result) -> Figure:
+        return _drawn(result, agents)
+
+    return drawn(result)
+
+
+def _drawn(result: Result, agents: Sequence[int]) -> Figure:
+    fig, axes = st.time_figure(result, "Operation", 5, height=1.6)
+    above, fast, climb, apart, clear = axes[:, 0]
+    v = result.velocity
+    top = result.mission.limits.speed
+    fence = result.mission.limits.geofence
+    for ax, words, values in (
+        (above, "altitude [m]", result.position[..., 2]),
+        (fast, "speed [m/s]", np.linalg.norm(v, axis=2)),
+        (climb, "vertical [m/s]", v[..., 2]),
+    ):
+        ax.set_ylabel(words)
+        _lines(ax, result, np.where(result.left, values, np.nan), agents)
+    if fence is not None:
+        st.limit(above, fence.max[2], f"geofence {fence.max[2]:g} m")
+    if top is not None:
+        st.limit(fast, top, f"limit {top:g} m/s")
+    draw_separation(apart, result)
+    draw_clearance(clear, result)
+    st.name_phases(fig, [above], result)
+    return fig
+
+
+def _lines(ax: Axes, result: Result, values: Floats, agents: Sequence[int]) -> None:
+    """Lines of some vehicles with a legend, or of all."""
+    if not agents:
+        st.agent_lines(ax, result, values)
+        st.agents_legend(ax, result.n_agents)
+        return
+    colours = st.agent_colours(len(agents))
+    drawn = [
+        st.line(ax, result.time, values[:, i - 1], color=colour, label=f"agent {i}")
+        for i, colour in zip(agents, colours, strict=True)
+    ]
+    st.legend(ax, drawn)
