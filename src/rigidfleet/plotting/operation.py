@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -58,7 +58,9 @@ def _drawn(result: Result, agents: Sequence[int]) -> Figure:
         (climb, "vertical [m/s]", v[..., 2]),
     ):
         ax.set_ylabel(words)
-        _lines(ax, result, np.where(result.left, values, np.nan), agents)
+        handles = _lines(ax, result, np.where(result.left, values, np.nan), agents)
+    # One legend for three panels; beside one of them it would push the others apart.
+    fig.legend(handles=handles, loc="outside right center", labelspacing=0.3)
     if fence is not None:
         st.limit(above, fence.max[2], f"geofence {fence.max[2]:g} m")
     if top is not None:
@@ -69,15 +71,13 @@ def _drawn(result: Result, agents: Sequence[int]) -> Figure:
     return fig
 
 
-def _lines(ax: Axes, result: Result, values: Floats, agents: Sequence[int]) -> None:
-    """Lines of some vehicles with a legend, or of all."""
+def _lines(ax: Axes, result: Result, values: Floats, agents: Sequence[int]) -> list[Any]:
+    """Lines of some vehicles, or of all; return what the legend has of them."""
     if not agents:
         st.agent_lines(ax, result, values)
-        st.agents_legend(ax, result.n_agents)
-        return
+        return st.agents_shown(result.n_agents)
     colours = st.agent_colours(len(agents))
-    drawn = [
+    return [
         st.line(ax, result.time, values[:, i - 1], color=colour, label=f"agent {i}")
         for i, colour in zip(agents, colours, strict=True)
     ]
-    st.legend(ax, drawn)

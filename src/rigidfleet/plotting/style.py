@@ -428,7 +428,12 @@ def agent_handles(n: int, **look: Any) -> list[Line2D]:
 
 def agents_legend(ax: Axes, n: int) -> None:
     """Legend of `agent_lines`."""
-    legend(ax, agent_handles(n) if n <= MANY else spread_handles(f"{n} agents", FLOWN))
+    legend(ax, agents_shown(n))
+
+
+def agents_shown(n: int) -> list[Any]:
+    """What a legend has of `agent_lines`."""
+    return agent_handles(n) if n <= MANY else spread_handles(f"{n} agents", FLOWN)
 
 
 def some(n: int, most: int) -> list[int]:
