@@ -12,6 +12,7 @@ from pydantic import (
     model_validator,
 )
 
+from rigidfleet.mission import bounds
 from rigidfleet.mission.values import (
     AUTO,
     Angle,
@@ -401,7 +402,7 @@ class Vertical(AnyPhase):
     travel: Time | None = Field(
         None, description="time from the start to the arrival [s]; default: the whole phase"
     )
-    agents: tuple[Annotated[int, Strict(), Field(ge=1)], ...] = Field(
+    agents: tuple[Annotated[int, Strict(), Field(ge=1, le=bounds.AGENTS)], ...] = Field(
         (), description="numbers of the vehicles that move; the others stay. Default: all"
     )
     stagger: Time | None = Field(
