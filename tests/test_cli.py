@@ -1039,7 +1039,7 @@ def test_found_ways_are_written_once(tmp_path, capsys):
     written = file.read_text()
     assert 'kind = "go"' not in written
     assert 'formation = "line"' in written
-    assert f"wrote {file}" in capsys.readouterr().out
+    assert f"Mission  {file}" in capsys.readouterr().out
     file.write_text("mine")
     assert cli.main(asked) == 2
     assert "--force" in capsys.readouterr().err

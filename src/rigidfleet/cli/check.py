@@ -96,7 +96,7 @@ def check(
         console.out().print()
         console.print_words((remark.level, remark.text) for remark in ahead.remarks)
     if expand is not None:
-        console.out().print(f"\nwrote {expand}")
+        console.out().print(f"\nMission  {expand}", soft_wrap=True)
     verdict = "no problems found" if ahead.passed else "the flight will fail"
     console.out().print(f"\n{found.name}: {verdict}", style=None if ahead.passed else "bold red")
     return PASSED if ahead.passed else FAILED
