@@ -13,7 +13,14 @@ from rigidfleet._common.toml import toml_key
 from rigidfleet.formation import shapes
 from rigidfleet.formation.assignment import assigned
 from rigidfleet.math import proximity
-from rigidfleet.mission.draft import _LIFT, _MOST, _aligned, _blend, _output_step, shape_known
+from rigidfleet.mission.draft import (
+    LIFT,
+    MOST_AGENTS,
+    aligned,
+    blend_time,
+    output_step,
+    shape_known,
+)
 from rigidfleet.typing import Floats
 
 #: Mass of a vehicle of a show [kg], greatest radius [m], and that as a share of the spacing.
@@ -90,8 +97,8 @@ def show(
         There are too many or too few agents, a scene has another number of them or is too narrow, or a number is not
         positive.
     """
-    if not 2 <= agents <= _MOST:
-        raise ValueError(f"a show takes 2 to {_MOST} agents, not {agents}")
+    if not 2 <= agents <= MOST_AGENTS:
+        raise ValueError(f"a show takes 2 to {MOST_AGENTS} agents, not {agents}")
     for what, value in (
         ("spacing", spacing),
         ("mass", mass),
@@ -112,13 +119,13 @@ def show(
     radius = min(_RADIUS, _SLIM * spacing)
     height = max(_LOWEST, math.ceil(max(-one.slots[:, 2].min() for one in scenes) + _ALOFT))
     start = radius + _STANDS
-    climb = _blend(height - start)
+    climb = blend_time(height - start)
     tables = {one.name: one for one in (pads, *scenes)}
     places, lasts, phases, taken = pads.slots, 2.0 * climb, [], set[str]()
     for k, one in enumerate([*scenes, pads]):
         slots = one.slots - one.slots.mean(axis=0)
         slots = slots[assigned(places, slots, turn=np.eye(3)).order]
-        blend = max(4, _blend(float(np.linalg.norm(slots - places, axis=1).max())))
+        blend = max(4, blend_time(float(np.linalg.norm(slots - places, axis=1).max())))
         title = one.name if one.name not in taken else f"{one.name}, phase {k + 2}"
         shown = _SHOWN if one is not pads else _SETTLED
         phases.append(
@@ -134,12 +141,12 @@ def show(
         raise ValueError(f"a spacing of {spacing:g} m is too small for a show")
     what = f"A show of {agents} vehicles: {', '.join(one.name for one in scenes)}"
     what = " ".join(what.split())  # a name may have line breaks
-    return _aligned(
+    return aligned(
         _HEAD.format(
             name=json.dumps(name, ensure_ascii=False), file=file or f"{name}.toml",
             what=what, title=json.dumps(what, ensure_ascii=False),
-            step=_output_step(agents, lasts), mass=f"{mass:g}", radius=f"{radius:.3g}",
-            limit=math.ceil(_LIFT * mass * 98.1) / 10 if thrust_limit is None else f"{thrust_limit:g}",
+            step=output_step(agents, lasts), mass=f"{mass:g}", radius=f"{radius:.3g}",
+            limit=math.ceil(LIFT * mass * 98.1) / 10 if thrust_limit is None else f"{thrust_limit:g}",
             spacing=f"{spacing:g}", agents=agents, ground=ground, start=f"{start:.4g}", separation=f"{separation:g}",
             formations="".join(
                 f"[formations.{toml_key(key)}]\n{one.table}edges = []                        # slots alone hold it\n\n"
