@@ -61,13 +61,13 @@ def folder(tmp_path):
 def test_ply_files_are_read(tmp_path, form):
     """Text and binary of either order give the vertices, whatever else they have."""
     (tmp_path / "p.ply").write_bytes(ply(POINTS, form))
-    np.testing.assert_array_equal(read_points(tmp_path / "p.ply"), POINTS)
+    np.testing.assert_array_equal(read_points(tmp_path / "p.ply").slots, POINTS)
 
 
 def test_npy_files_are_read(tmp_path):
     """Two columns are points at z = 0; whole numbers are numbers."""
     np.save(tmp_path / "p.npy", np.array([[0, 1], [2, 3]]))
-    np.testing.assert_array_equal(read_points(tmp_path / "p.npy"), [[0, 1, 0], [2, 3, 0]])
+    np.testing.assert_array_equal(read_points(tmp_path / "p.npy").slots, [[0, 1, 0], [2, 3, 0]])
 
 
 def npy(array: np.ndarray) -> bytes:
@@ -214,7 +214,7 @@ def test_points_are_thinned_evenly():
     """Fewer of a grid's points keep a distance as large as a coarser grid's."""
     grid = np.stack(np.meshgrid(np.arange(9.0), np.arange(9.0)), axis=-1).reshape(-1, 2)
     grid = np.asarray(grid, dtype=np.float64)
-    assert neighbours(outlines.spread(grid, 20)).min() >= np.sqrt(2.0)
+    assert neighbours(grid[outlines.spread(grid, 20)]).min() >= np.sqrt(2.0)
     with pytest.raises(ValueError, match="81 points cannot place 82"):
         outlines.spread(grid, 82)
 
@@ -224,7 +224,7 @@ def test_design_writes_points_that_it_reads(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     asked = ["design", "text:Hi", "--agents", "40", "--spacing", "1.5", "--edges", "none"]
     assert main([*asked, "--out", "hi.csv"]) == 0
-    p = read_points("hi.csv")
+    p = read_points("hi.csv").slots
     assert p.shape == (40, 3)
     assert neighbours(p).min() == pytest.approx(1.5)
     capsys.readouterr()
@@ -260,3 +260,54 @@ def test_what_cannot_be_designed(tmp_path, monkeypatch, capsys, asked, words):
     assert main(["design", *asked, "--out", "x.toml"]) != 0
     assert words in " ".join(capsys.readouterr().err.split())
     assert not (tmp_path / "x.toml").exists()
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".npy", ".ply"])
+def test_colours_of_points(suffix, tmp_path):
+    """Points keep the colours of their file: in a mission, and where a formation is designed from it."""
+    rows, path = np.hstack([POINTS, [[255, 0, 0], [0, 128, 7], [1, 2, 3]]]), tmp_path / f"p{suffix}"
+    if suffix == ".npy":
+        np.save(path, rows)
+    elif suffix == ".csv":
+        path.write_text("".join(f"{x},{y},{z},{r:g},{g:g},{b:g}\n" for x, y, z, r, g, b in rows))
+    else:
+        head = b"ply\nformat binary_little_endian 1.0\nelement vertex 3\n"
+        head += b"".join(b"property float %c\n" % axis for axis in b"xyz")
+        head += b"".join(b"property uchar %s\n" % name for name in (b"red", b"green", b"blue"))
+        body = b"".join(struct.pack("<fffBBB", *row[:3], *map(int, row[3:])) for row in rows)
+        path.write_bytes(head + b"end_header\n" + body)
+    found = read_points(path)
+    np.testing.assert_array_equal(found.slots, POINTS)
+    assert found.colours == ("#ff0000", "#008007", "#010203")
+    (tmp_path / "sub").mkdir()
+    np.savetxt(tmp_path / "sub" / "grid.csv", POINTS + [0, 0, 9], delimiter=",")
+    (tmp_path / "m.toml").write_text(PLAIN.replace("logo.ply", path.name))
+    mission = load_mission(tmp_path / "m.toml")
+    assert mission.formations["logo"].colour == found.colours
+    assert main(["design", str(path), "--out", str(tmp_path / "again.csv"), "--edges", "none"]) == 0
+    assert read_points(tmp_path / "again.csv").colours == found.colours
+
+
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        ("0,0,0,1,2,256\n1,0,0,1,2,3\n", "no whole numbers from 0 to 255"),
+        ("0,0,0,1,2,3.5\n1,0,0,1,2,3\n", "no whole numbers from 0 to 255"),
+        ("0,0,0,1,2,3\n1,0,0\n", "unlike the lines before"),
+        ("0,0,0,1,2\n", "has 5 numbers"),
+    ],
+)
+def test_wrong_colours_of_points(rows, message, tmp_path):
+    """Colours that are no colours are told with their line."""
+    (tmp_path / "p.csv").write_text(rows)
+    with pytest.raises(MissionError, match=message):
+        read_points(tmp_path / "p.csv")
+
+
+def test_wrong_colours_of_formations(folder):
+    """A list of colours has one for each slot, and a colour is six hexadecimal digits."""
+    text = PLAIN.replace('slots = "logo.ply"', 'slots = "logo.ply"\ncolour = {}')
+    for colour, message in (('["#000000"]', "1 colours for 3 agents"), ('"red"', "colour")):
+        (folder / "m.toml").write_text(text.format(colour))
+        with pytest.raises(MissionError, match=message):
+            load_mission(folder / "m.toml")

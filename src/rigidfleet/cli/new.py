@@ -138,24 +138,24 @@ def _show(file: Path, asked: dict[str, Any], formations: str, spacing: float) ->
     words = [word.strip() for word in formations.split(",") if word.strip()]
     if agents is None:
         files = [w for w in words if Path(w).suffix.lower() in _POINTS and Path(w).exists()]
-        agents = len(points_of(files[0], None)[1]) if files else _SHOWN
+        agents = len(points_of(files[0], None)[1].slots) if files else _SHOWN
     for word in words:
         path = Path(word)
         if word in SHAPES or not (word.startswith("text:") or path.exists()):
             scenes.append(show_draft.scene(word, agents, spacing))
             continue
         try:
-            name, slots = points_of(word, agents, spacing=spacing)
-            own = points_of(word, None)[1] if path.suffix.lower() in _POINTS else slots
+            name, points = points_of(word, agents, spacing=spacing)
+            own = points_of(word, None)[1] if path.suffix.lower() in _POINTS else points
         except ValueError as error:
             raise ValueError(f"{word}: {error}") from None
         folder = file.parent.resolve()
         inside = path.suffix.lower() in _POINTS and path.resolve().is_relative_to(folder)
-        by_name = inside and len(own) == agents and proximity.nearest(own).min() >= spacing
+        by_name = inside and len(own.slots) == agents
+        by_name = by_name and proximity.nearest(own.slots).min() >= spacing
         source = path.resolve().relative_to(folder).as_posix() if by_name else word
-        if by_name:
-            slots = own
-        scenes.append(show_draft.points_scene(name, slots, source, by_name=by_name))
+        points = own if by_name else points
+        scenes.append(show_draft.points_scene(name, points, source, by_name=by_name))
     return show_draft.show(
         file.stem, scenes, agents=agents, spacing=spacing, file=str(file), **asked
     )

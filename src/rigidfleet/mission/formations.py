@@ -107,6 +107,9 @@ def _formation(collector: FindingCollector, form: Formation, n: int | None, path
             collector.add(
                 (*path, "slots", j), f"is the same point as slot {i + 1}", "move the slots apart"
             )
+    if isinstance(form.colour, tuple) and len(form.colour) != n:
+        problem = f"has {len(form.colour)} colours for {n} agents"
+        collector.add((*path, "colour"), problem, "give one colour, or one per slot", None)
     if collector.right(path, "edges"):
         _edges(collector, form, n, (*path, "edges"))
     if form.distances is not None and collector.right(path, "edges", "distances"):

@@ -33,6 +33,7 @@ from rigidfleet.mission.values import (
     AttitudeGains,
     BodyDrag,
     Coefficient,
+    Colour,
     Cost,
     Damping,
     Delay,
@@ -426,6 +427,11 @@ class Formation(Part):
     )
     distances: tuple[Length, ...] | None = Field(
         None, description="length of each edge [m]; default: those between the slots"
+    )
+    colour: Colour | None = Field(
+        None,
+        description="light of the vehicles in this formation, '#rrggbb': one for all, or a list with one per slot; "
+        "default: that of the file of slots if it has colours, else the light before. `export --format skyc` writes it",
     )
 
     def edge_array(self, n: int) -> Ints:

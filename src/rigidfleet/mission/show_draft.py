@@ -12,6 +12,7 @@ import numpy as np
 from rigidfleet._common.toml import toml_key
 from rigidfleet.formation import shapes
 from rigidfleet.formation.assignment import assigned
+from rigidfleet.formation.point_files import Points
 from rigidfleet.math import proximity
 from rigidfleet.mission.draft import (
     LIFT,
@@ -74,12 +75,14 @@ def scene(shape: str, agents: int, spacing: float) -> Scene:
     return Scene(shape, slots, f'shape = "{shape}"\nsize = {written}                 # [m]\n')
 
 
-def points_scene(name: str, slots: Floats, source: str, *, by_name: bool = False) -> Scene:
-    """A formation of points (N, 3) [m], written as numbers, or by the name of their file."""
+def points_scene(name: str, points: Points, source: str, *, by_name: bool = False) -> Scene:
+    """A formation of points, written as numbers, or by the name of their file."""
+    slots, colours = points
     if by_name:
         return Scene(name, slots, f"slots = {json.dumps(source)}\n")
+    lights = "" if colours is None else f"colour = {json.dumps(colours)}\n"
     rows = "".join(f"    {row},\n" for row in np.round(slots + 0.0, 6).tolist())
-    return Scene(name, slots, f"# points of {json.dumps(source)}\nslots = [\n{rows}]\n")
+    return Scene(name, slots, f"# points of {json.dumps(source)}\nslots = [\n{rows}]\n{lights}")
 
 
 def show(
