@@ -689,6 +689,11 @@ class MissionHeader(Part):
         "least sum of squared distances from the start to the first established formation; safe: most clearance on the "
         "paths there; each: as shortest, anew at each change of formation, without turning the shapes",
     )
+    assignment_downwash: Annotated[float, Strict(), Field(ge=1, le=100)] = Field(
+        1.0,
+        description="with assignment 'each': heights count divided by this, so that vehicles that change places keep "
+        "more of a distance above each other than beside",
+    )
     gravity: Annotated[float, Strict(), from_zero(ACCELERATION)] = Field(
         9.81, description="gravity [m/s^2], >= 0"
     )
