@@ -13,7 +13,8 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from rigidfleet.errors import ResultError
-from rigidfleet.interchange.curves import Curve, Knots, Motion, bernstein, of_bernstein
+from rigidfleet.interchange.curves import Curve, Knots, Motion
+from rigidfleet.math.bernstein import bernstein, of_bernstein
 from rigidfleet.math.splines import POWERS
 from rigidfleet.typing import Floats
 

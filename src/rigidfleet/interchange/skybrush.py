@@ -21,12 +21,11 @@ from rigidfleet.errors import ResultError
 from rigidfleet.interchange.curves import (
     Curve,
     Motion,
-    bernstein,
     headings,
-    of_bernstein,
     with_headings,
 )
 from rigidfleet.interchange.lights import FRAME, fades, program
+from rigidfleet.math.bernstein import bernstein, of_bernstein
 
 #: Greatest number of vehicles of a show.
 MOST = 5000

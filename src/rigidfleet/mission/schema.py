@@ -486,6 +486,14 @@ class Limits(Part):
 
     speed: Speed | None = Field(None, description="maximum speed [m/s]")
     acceleration: Acceleration | None = Field(None, description="maximum acceleration [m/s^2]")
+    horizontal_speed: Speed | None = Field(None, description="maximum speed over the ground [m/s]")
+    vertical_speed: Speed | None = Field(None, description="maximum speed up and down [m/s]")
+    horizontal_acceleration: Acceleration | None = Field(
+        None, description="maximum horizontal acceleration [m/s^2]"
+    )
+    vertical_acceleration: Acceleration | None = Field(
+        None, description="maximum acceleration up and down [m/s^2]"
+    )
     jerk: Jerk | None = Field(
         None,
         description="maximum jerk of the reference [m/s^3]; kept by the plan of a smooth mission",
