@@ -29,6 +29,8 @@ from rigidfleet.typing import Floats
 _SLACK = 1e-9
 # Greatest overlap of a vehicle that stands on an obstacle [m]; more is a collision.
 _CONTACT = 1e-6
+#: Greatest number of vehicles whose names are listed.
+_NAMED = 20
 #: Greatest distance from the nearest sample at which a moment is still judged [s]: at 10 m/s, a vehicle then
 #: flies the tolerance of a waypoint.
 _UNSEEN = 0.01
@@ -490,6 +492,9 @@ def notes(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[str]:
     yield from _sampled(measured)
     if (how := measured.result.statistics.get("interpolation")) is not None:
         yield f"others made this flight: what is judged is its curve, {how}"
+        names = measured.result.statistics.get("names", [])
+        if names and len(names) <= _NAMED:
+            yield f"agents from 1 on are {', '.join(names)}"
 
 
 def _left(measured: Measurements) -> Iterator[str]:

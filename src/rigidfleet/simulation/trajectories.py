@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rigidfleet.errors import ResultError
+from rigidfleet.interchange.curves import Curve
 from rigidfleet.kernel import records
 from rigidfleet.kernel.problem import workspace
 from rigidfleet.math import proximity, series, splines
@@ -35,6 +36,8 @@ _JUMP = 1e-3
 _MOST, _TOGETHER = 5e8, 4_000_000
 #: Time between samples [s], unless the trajectory itself has more; about so many in all.
 _STEP, _SAMPLES = 0.05, 2_000_000
+#: Times that are nearer to each other than this are one [s].
+_SAME = 1e-9
 #: Where a start is moved to zero: a time of a clock, not of a flight [s].
 _CLOCK = 1e5
 NAMES = {
@@ -258,14 +261,14 @@ def judged_as(
 
 
 def of_pieces(
-    pieces: Pieces, interpolation: str, *, sources: Sequence[str] = (), **judged: Any
+    pieces: Pieces, interpolation: str, *, names: Sequence[str] = (), **judged: Any
 ) -> Result:
     """A result of piecewise polynomials; see `trajectories`.
 
     Parameters
     ----------
     interpolation : what the curves are, in words
-    sources : files that they are from
+    names : of the vehicles, where they come from
     judged : see `judged_as`
 
     Raises
@@ -281,19 +284,67 @@ def of_pieces(
     n, span = pieces.position.shape[1], float(pieces.time[-1] - pieces.time[0])
     step = max(_STEP, span * n / _SAMPLES)
     grid = pieces.time[0] + step * np.arange(1, math.ceil(span / step))
-    numbers = 2.0 * (len(pieces.time) + len(grid)) * n * 45
-    if numbers > _MOST:
-        raise ResultError(
-            f"{n:,} trajectories with {len(pieces.time):,} times of their own are {numbers:.2g} numbers; the maximum is"
-            f" {_MOST:g}. Give fewer vehicles, or samples at common times."
-        )
+    _bounded(n, len(pieces.time) + len(grid))
     pieces = pieces.cut(grid)
     first, last = pieces.states()
     mission = judged_as(first[0, 0], span, **judged)
     time, state, yaw = _samples(pieces, first, last)
     record = PhaseRecord(PHASE, "hold", "open", None, float(time[0]), float(time[-1]))
     _put_extremes(record, mission, pieces, smooth=interpolation != NAMES[1])
-    return _result(mission, record, time, state, yaw, interpolation, sources)
+    return _result(mission, record, time, state, yaw, interpolation, names)
+
+
+def of_curves(
+    curves: Sequence[Curve], interpolation: str, *, names: Sequence[str] = (), **judged: Any
+) -> Result:
+    """A result of curves with times of their own; before and after its own, a vehicle stays where it is.
+
+    Parameters
+    ----------
+    interpolation, judged : see `of_pieces`
+    names : of the vehicles, where they come from
+
+    Raises
+    ------
+    ResultError, MissionError
+        As for `of_pieces`.
+    """
+    begin, end = min(c.time[0] for c in curves), max(c.time[-1] for c in curves)
+    time = np.unique(np.concatenate([c.time for c in curves]))
+    time = time[np.append(True, np.diff(time) > _SAME)]
+    time[-1] = max(float(time[-1]), float(end))
+    n, powers = len(curves), max(c.pieces.shape[-1] for c in curves)
+    _bounded(n, len(time))
+    position, yaw = np.zeros((len(time) - 1, n, 3, powers)), np.full((len(time), n), np.nan)
+    for i, curve in enumerate(curves):
+        middle = 0.5 * (time[:-1] + time[1:])
+        k = np.clip(np.searchsorted(curve.time, middle, side="right") - 1, 0, len(curve.pieces) - 1)
+        moved = series.of_polynomials(
+            curve.pieces[k, :3], time[:-1] - curve.time[k], curve.pieces.shape[-1]
+        )
+        position[:, i, :, : len(moved)] = np.moveaxis(moved, 0, -1)
+        for outside, at in ((middle < curve.time[0], begin), (middle > curve.time[-1], end)):
+            position[outside, i] = 0.0
+            stay = curve.at(np.array([np.clip(at, curve.time[0], curve.time[-1])]))[0, :3]
+            position[outside, i, :, 0] = stay
+        yaw[:, i] = curve.at(np.clip(time, curve.time[0], curve.time[-1]))[:, 3]
+    return of_pieces(Pieces(time, position, yaw), interpolation, names=names, **judged)
+
+
+def _bounded(n: int, times: int) -> None:
+    """Refuse more numbers than a result may have.
+
+    Raises
+    ------
+    ResultError
+        There are more.
+    """
+    numbers = 2.0 * times * n * 45
+    if numbers > _MOST:
+        raise ResultError(
+            f"{n:,} trajectories with {times:,} times of their own are {numbers:.2g} numbers; the maximum is {_MOST:g}."
+            " Give fewer vehicles, or samples at common times."
+        )
 
 
 def _continuous(pieces: Pieces) -> None:
@@ -411,7 +462,7 @@ def _result(
     state: Floats,
     yaw: Floats,
     interpolation: str,
-    sources: Sequence[str],
+    names: Sequence[str],
 ) -> Result:
     r, v, a, j = state
     k, n = r.shape[:2]
@@ -449,5 +500,5 @@ def _result(
         edges=np.zeros((0, 2), dtype=np.int64), **empty, singular_value=np.full(k, np.nan),
         separation=separation, separation_pair=pair, clearance=clearance, clearance_agent=agent,
         clearance_obstacle=obstacle, **unknown, phases=[record], mission_text=mission.text,
-        statistics={"interpolation": interpolation, "sources": list(sources)},
+        statistics={"interpolation": interpolation, "names": list(names)},
     )  # fmt: skip
