@@ -492,8 +492,10 @@ def notes(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[str]:
     yield from _sampled(measured)
     if (how := measured.result.statistics.get("interpolation")) is not None:
         yield f"others made this flight: what is judged is its curve, {how}"
+        yield from measured.result.statistics.get("notes", [])
         names = measured.result.statistics.get("names", [])
-        if names and len(names) <= _NAMED:
+        plain = [f"agent {k}" for k in range(1, len(names) + 1)]
+        if names != plain and len(names) <= _NAMED:
             yield f"agents from 1 on are {', '.join(names)}"
 
 
