@@ -60,7 +60,8 @@ def contents(
     several = len(flights) > 1
     colours = plotting.agent_colours(len(flights))
     found = [_flight(*each) for each in zip(flights, judged, names, colours, strict=True)]
-    response = overlay.response(missions, names)
+    controlled = any(_controlled(flight) for flight in flights)
+    response = overlay.response(missions, names) if controlled else None
     return {
         "title": " · ".join(names),
         "several": several,
@@ -71,9 +72,15 @@ def contents(
         "numbers": _numbers(flights, judged) if several else [],
         "keys": _keys(missions) if several else [],
         "overlays": _overlays(flights, names) if several else [],
+        "controlled": controlled,
         "response": None if response is None else _embedded(response),
         "version": __version__,
     }
+
+
+def _controlled(result: Result) -> bool:
+    """Whether this program flew it; others' trajectories have neither gains nor forces."""
+    return "interpolation" not in result.statistics
 
 
 def _named(flights: Sequence[Result]) -> list[str]:
@@ -111,7 +118,7 @@ def _flight(result: Result, verdict: Verdict, label: str, colour: str) -> dict[s
         "vehicles": _vehicles(result),
         "vehicles_left_out": max(0, result.n_agents - _VEHICLES),
         "summary": _figure(result, "summary"),
-        "gains": gains.explained(mission),
+        "gains": gains.explained(mission) if _controlled(result) else [],
         "versions": _versions(result),
         "text": result.mission_text,
     }
@@ -128,6 +135,13 @@ def _facts(result: Result) -> list[tuple[str, str]]:
     forms = [
         f"{name} ({len(mission.formation_edges(name))} edges)" for name in mission.formations
     ]  # fmt: skip
+    if not _controlled(result):
+        return [
+            ("vehicles", f"{result.n_agents}, trajectories that others made"),
+            ("judged", f"the curve: {result.statistics['interpolation']}"),
+            ("duration", f"{result.time[-1] - result.time[0]:.4g} s"),
+            ("read", result.created.replace("T", " ").replace("+00:00", " UTC")),
+        ]
     return [
         ("vehicles", f"{result.n_agents}, {masses}{_models(mission)}"),
         ("formations", ", ".join(forms) or "none"),
