@@ -538,6 +538,11 @@ class Result:
         """Mask (K, N) of the agents that are not lost at the time of each sample."""
         return self.time[:, None] <= self.mission.lost_at
 
+    @property
+    def interpolation(self) -> str | None:
+        """In words, the curve between samples of a flight that others made; None for a flight of our own."""
+        return self.statistics.get("interpolation")
+
     @cached_property
     def motors_off(self) -> Floats:
         """Time (N,) [s] from which each vehicle may have its motors off: the end of the landing after which it stays.

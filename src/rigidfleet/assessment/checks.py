@@ -490,7 +490,7 @@ def notes(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[str]:
             yield f"the thrust of {who} saturates at its limit, first at {since:.2f} s"
     yield from avoidance_notes(measured)
     yield from _sampled(measured)
-    if (how := measured.result.statistics.get("interpolation")) is not None:
+    if (how := measured.result.interpolation) is not None:
         yield f"others made this flight: what is judged is its curve, {how}"
         yield from measured.result.statistics.get("notes", [])
         names = measured.result.statistics.get("names", [])
