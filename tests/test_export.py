@@ -5,6 +5,7 @@ Casteljau's construction of Bezier curves, the schema of Skybrush, the cubic spl
 test_export_readers.py.
 """
 
+import base64
 import itertools
 import json
 import math
@@ -257,11 +258,12 @@ def check_skyc(path):
         drones = []
         for drone in show["swarm"]["drones"]:
             settings = drone["settings"] | {
-                key: resolved(drone["settings"][key]) for key in ("trajectory", "yawControl")
+                key: resolved(drone["settings"][key])
+                for key in ("trajectory", "yawControl", "lights")
             }
             trajectory, yaw = settings["trajectory"], settings["yawControl"]
             assert drone["type"] == "generic"
-            assert trajectory["version"] == yaw["version"] == 1
+            assert trajectory["version"] == yaw["version"] == settings["lights"]["version"] == 1
             times = [point[0] for point in trajectory["points"]]
             assert times == sorted(set(times))
             assert [t for t, _ in yaw["setpoints"]] == sorted({t for t, _ in yaw["setpoints"]})
@@ -300,6 +302,55 @@ def test_skyc(flight, tmp_path):
     again = tmp_path / "again.skyc"
     export(flight, again, "skyc")
     assert again.read_bytes() == path.read_bytes()
+
+
+def lights(settings):
+    """The light program of a drone as (time, colour, fades) at the end of each of its commands.
+
+    From the table of commands of libskybrush: 4 sets a colour for a time, 8 fades to one in a time, 0 ends.
+    """
+    code, at, found, frames = base64.b64decode(settings["lights"]["data"]), 0, [], 0
+    while code[at]:
+        command, colour = code[at], tuple(code[at + 1 : at + 4])
+        assert command in (4, 8)
+        at, shift, duration = at + 4, 0, 0
+        while True:
+            duration |= (code[at] & 127) << shift
+            shift, at = shift + 7, at + 1
+            if code[at - 1] < 128:
+                break
+        frames += duration
+        found.append((round(frames * 0.02, 6), colour, command == 8))
+    assert at == len(code) - 1
+    return found
+
+
+def test_lights_of_a_show(tmp_path):
+    """Vehicles fade to the colour of the slot that they take, and keep it in a formation that has none."""
+    (tmp_path / "row.csv").write_text(
+        "x,y,z,red,green,blue\n-2,0,0,255,0,0\n0,0,0,0,255,0\n2,0,0,0,0,255\n"
+    )
+    mission = tmp_path / "m.toml"
+    phase = '[[phases]]\nkind = "{}"\nformation = "{}"\nblend = 2.0\nduration = 3.0\ncontrol = "tracking"\n'
+    mission.write_text(
+        'schema_version = 1\nname = "lit"\nassignment = "each"\n[agents]\nmass = 1.0\n'
+        "position = [[2, 0, 5], [-2, 0, 5], [0, 0, 5]]\n"
+        '[formations.row]\nslots = "row.csv"\nedges = []\n'
+        "[formations.plain]\nslots = [[-3, 0, 0], [0, 0, 0], [3, 0, 0]]\nedges = []\n"
+        "[formations.dark]\nslots = [[-4, 0, 0], [0, 0, 0], [4, 0, 0]]\nedges = []\ncolour = '#000000'\n"
+        + "".join(
+            phase.format(*x)
+            for x in (("establish", "row"), ("reshape", "plain"), ("reshape", "dark"))
+        )
+    )
+    result = rf.simulate(rf.load_mission(mission))
+    export(result, tmp_path / "show.skyc", "skyc")
+    _, drones = check_skyc(tmp_path / "show.skyc")
+    for drone, colour in zip(drones, ((0, 0, 255), (255, 0, 0), (0, 255, 0)), strict=True):
+        assert lights(drone) == [
+            (0.0, (255, 255, 255), False), (2.0, colour, True), (6.0, colour, False), (8.0, (0, 0, 0), True),
+            (9.0, (0, 0, 0), False),
+        ]  # fmt: skip
 
 
 # -- MAVLink ----------------------------------------------------------------------------------------

@@ -175,7 +175,9 @@ def test_points_are_read(tmp_path, text):
     """Commas, semicolons or blanks; names, comments, two columns, a byte-order mark: all the same points."""
     path = tmp_path / "points.csv"
     path.write_bytes(text.encode())
-    np.testing.assert_array_equal(point_files.read_points(path), [[0, 0, 0], [4, 0, 0], [0, 4, 0]])
+    np.testing.assert_array_equal(
+        point_files.read_points(path).slots, [[0, 0, 0], [4, 0, 0], [0, 4, 0]]
+    )
 
 
 @pytest.mark.parametrize(
@@ -185,7 +187,7 @@ def test_points_are_read(tmp_path, text):
         (b"x,y,z\n", "has no points"),
         (b"0,0,0\n1,two,3\n", "line 2 = '1,two,3': is not a point"),
         (b"0,0,0\n1\n", "line 2 = '1': has 1 numbers"),
-        (b"1,5;2,5;0,0\n", "has 6 numbers\n    .*decimal points"),
+        (b"1,5;2,5;0,0\n", "has commas and semicolons\n    .*decimal points"),
         (b"0,0,0\nnan,0,0\n", "line 2 = 'nan,0,0': is not finite"),
         (b"0,0,0\n1,0,0\n0,0\n", "line 3 = '0,0': repeats the point of line 1"),
         (b"\xff\xfe\x00", "is not text"),

@@ -2,15 +2,16 @@
 
 import hashlib
 import struct
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
-from rigidfleet import Result, load_mission, simulate
+from rigidfleet import Result, assess, load_mission, simulate
 from rigidfleet.cli.app import main
 from rigidfleet.errors import MissionError
-from rigidfleet.formation import outlines
+from rigidfleet.formation import outlines, shapes
 from rigidfleet.formation.point_files import read_points
 from rigidfleet.mission import Mission
 
@@ -61,13 +62,13 @@ def folder(tmp_path):
 def test_ply_files_are_read(tmp_path, form):
     """Text and binary of either order give the vertices, whatever else they have."""
     (tmp_path / "p.ply").write_bytes(ply(POINTS, form))
-    np.testing.assert_array_equal(read_points(tmp_path / "p.ply"), POINTS)
+    np.testing.assert_array_equal(read_points(tmp_path / "p.ply").slots, POINTS)
 
 
 def test_npy_files_are_read(tmp_path):
     """Two columns are points at z = 0; whole numbers are numbers."""
     np.save(tmp_path / "p.npy", np.array([[0, 1], [2, 3]]))
-    np.testing.assert_array_equal(read_points(tmp_path / "p.npy"), [[0, 1, 0], [2, 3, 0]])
+    np.testing.assert_array_equal(read_points(tmp_path / "p.npy").slots, [[0, 1, 0], [2, 3, 0]])
 
 
 def npy(array: np.ndarray) -> bytes:
@@ -214,7 +215,7 @@ def test_points_are_thinned_evenly():
     """Fewer of a grid's points keep a distance as large as a coarser grid's."""
     grid = np.stack(np.meshgrid(np.arange(9.0), np.arange(9.0)), axis=-1).reshape(-1, 2)
     grid = np.asarray(grid, dtype=np.float64)
-    assert neighbours(outlines.spread(grid, 20)).min() >= np.sqrt(2.0)
+    assert neighbours(grid[outlines.spread(grid, 20)]).min() >= np.sqrt(2.0)
     with pytest.raises(ValueError, match="81 points cannot place 82"):
         outlines.spread(grid, 82)
 
@@ -224,7 +225,7 @@ def test_design_writes_points_that_it_reads(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     asked = ["design", "text:Hi", "--agents", "40", "--spacing", "1.5", "--edges", "none"]
     assert main([*asked, "--out", "hi.csv"]) == 0
-    p = read_points("hi.csv")
+    p = read_points("hi.csv").slots
     assert p.shape == (40, 3)
     assert neighbours(p).min() == pytest.approx(1.5)
     capsys.readouterr()
@@ -260,3 +261,149 @@ def test_what_cannot_be_designed(tmp_path, monkeypatch, capsys, asked, words):
     assert main(["design", *asked, "--out", "x.toml"]) != 0
     assert words in " ".join(capsys.readouterr().err.split())
     assert not (tmp_path / "x.toml").exists()
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".npy", ".ply"])
+def test_colours_of_points(suffix, tmp_path):
+    """Points keep the colours of their file: in a mission, and where a formation is designed from it."""
+    rows, path = np.hstack([POINTS, [[255, 0, 0], [0, 128, 7], [1, 2, 3]]]), tmp_path / f"p{suffix}"
+    if suffix == ".npy":
+        np.save(path, rows)
+    elif suffix == ".csv":
+        path.write_text("".join(f"{x},{y},{z},{r:g},{g:g},{b:g}\n" for x, y, z, r, g, b in rows))
+    else:
+        head = b"ply\nformat binary_little_endian 1.0\nelement vertex 3\n"
+        head += b"".join(b"property float %c\n" % axis for axis in b"xyz")
+        head += b"".join(b"property uchar %s\n" % name for name in (b"red", b"green", b"blue"))
+        body = b"".join(struct.pack("<fffBBB", *row[:3], *map(int, row[3:])) for row in rows)
+        path.write_bytes(head + b"end_header\n" + body)
+    found = read_points(path)
+    np.testing.assert_array_equal(found.slots, POINTS)
+    assert found.colours == ("#ff0000", "#008007", "#010203")
+    (tmp_path / "sub").mkdir()
+    np.savetxt(tmp_path / "sub" / "grid.csv", POINTS + [0, 0, 9], delimiter=",")
+    (tmp_path / "m.toml").write_text(PLAIN.replace("logo.ply", path.name))
+    mission = load_mission(tmp_path / "m.toml")
+    assert mission.formations["logo"].colour == found.colours
+    assert main(["design", str(path), "--out", str(tmp_path / "again.csv"), "--edges", "none"]) == 0
+    assert read_points(tmp_path / "again.csv").colours == found.colours
+
+
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        ("0,0,0,1,2,256\n1,0,0,1,2,3\n", "no whole numbers from 0 to 255"),
+        ("0,0,0,1,2,3.5\n1,0,0,1,2,3\n", "no whole numbers from 0 to 255"),
+        ("0,0,0,1,2,3\n1,0,0\n", "unlike the lines before"),
+        ("0,0,0,1,2\n", "has 5 numbers"),
+    ],
+)
+def test_wrong_colours_of_points(rows, message, tmp_path):
+    """Colours that are no colours are told with their line."""
+    (tmp_path / "p.csv").write_text(rows)
+    with pytest.raises(MissionError, match=message):
+        read_points(tmp_path / "p.csv")
+
+
+def test_wrong_colours_of_formations(folder):
+    """A list of colours has one for each slot, and a colour is six hexadecimal digits."""
+    text = PLAIN.replace('slots = "logo.ply"', 'slots = "logo.ply"\ncolour = {}')
+    for colour, message in (('["#000000"]', "1 colours for 3 agents"), ('"red"', "colour")):
+        (folder / "m.toml").write_text(text.format(colour))
+        with pytest.raises(MissionError, match=message):
+            load_mission(folder / "m.toml")
+
+
+def fleet(n: int, **form: Any) -> dict[str, Any]:
+    """A mission of n vehicles in a row that take a formation, each the slot for which all ways are shortest."""
+    return {
+        "schema_version": 1, "name": "resting", "assignment": "each", "limits": {"separation": 0.3},
+        "agents": {"mass": 1.0, "position": [[2.0 * i, 0.0, 5.0] for i in range(n)]},
+        "formations": {"some": {"edges": []} | form},
+        "phases": [{"kind": "establish", "formation": "some", "control": "tracking", "duration": 12.0, "blend": 10.0}],
+    }  # fmt: skip
+
+
+def written_slots(mission: Mission, name: str) -> np.ndarray:
+    """The slots of a formation that has them as numbers."""
+    slots = mission.formations[name].slots
+    assert slots is not None
+    return np.array(slots)
+
+
+@pytest.mark.parametrize(("n", "k"), [(7, 3), (10, 4), (40, 9)])
+def test_vehicles_without_a_slot_rest_at_the_sides(n, k):
+    """They wait mirrored at the middle, no nearer than the slots are to each other, and dark; the flight passes."""
+    rng = np.random.default_rng(n)
+    slots = np.unique(rng.integers(-3, 4, (400, 3)), axis=0)
+    slots = 1.5 * slots[rng.permutation(len(slots))[:k]]
+    mission = Mission.from_dict(fleet(n, slots=slots.tolist(), rest="sides", colour="#ff0000"))
+    every = written_slots(mission, "some")
+    np.testing.assert_array_equal(every[:k], slots)
+    off = every[k:] - slots.mean(axis=0)
+    pairs = (n - k) // 2
+    np.testing.assert_allclose(off[: 2 * pairs : 2], -off[1 : 2 * pairs : 2], atol=1e-12)
+    step = neighbours(slots).min()
+    assert neighbours(every).min() >= step - 1e-9
+    assert (abs(off[:, 0]) > abs(slots[:, 0] - slots[:, 0].mean()).max() + step).all()
+    colours = mission.formation_colours("some")
+    assert colours is not None
+    assert colours.count("#ff0000") == k
+    assert colours.count("#000000") == n - k
+    result = simulate(mission)
+    assert assess(result).passed
+    # What is written is what was flown: the mission repeats from its text.
+    assert (
+        Mission.from_toml(result.mission.text).formations["some"].slots
+        == mission.formations["some"].slots
+    )
+
+
+def test_vehicles_rest_at_given_places():
+    """A shape of fewer vehicles, and a place for each of the others."""
+    rest = [[9.0, 0.0, 0.0], [-9.0, 0.0, 0.0]]
+    mission = Mission.from_dict(fleet(6, shape="square", size=3.0, agents=4, rest=rest))
+    slots = written_slots(mission, "some")
+    np.testing.assert_array_equal(slots[4:], rest)
+    np.testing.assert_array_equal(slots[:4], shapes.slots("square", 3.0, 4))
+
+
+@pytest.mark.parametrize(
+    ("form", "message"),
+    [
+        ({"slots": [[0, 0, 0], [3, 0, 0]]}, "2 slots for 6 agents\n    .*rest = 'sides'"),
+        ({"slots": [[0, 0, 0], [3, 0, 0]], "rest": [[9, 0, 0]]}, "1 places for the 4 agents"),
+        ({"slots": [[0, 0, 0]], "rest": "sides"}, "needs two or more slots"),
+        ({"slots": [[0, 0, 0], [3, 0, 0]], "rest": "below"}, "rest"),
+        ({"shape": "square", "size": 3.0, "agents": 4}, "no effect without rest"),
+        ({"shape": "square", "size": 3.0, "rest": "sides"}, "rest = 'sides': needs slots"),
+        ({"shape": "square", "size": 3.0, "agents": 9, "rest": "sides"}, "more than the 6 agents"),
+        ({"shape": "square", "size": 3.0, "agents": 5, "rest": "sides"}, "square"),
+    ],
+)
+def test_wrong_rests(form, message):
+    """What cannot rest says so."""
+    with pytest.raises(MissionError, match=message):
+        Mission.from_dict(fleet(6, **form))
+
+
+def test_a_show_of_fewer_points_than_vehicles(tmp_path, monkeypatch, capsys):
+    """`new --show` lets the vehicles rest for which a file has no points, and the show passes."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "logo.csv").write_text("".join(f"{2.5 * k},0,{k % 2}\n" for k in range(9)))
+    asked = [
+        "new",
+        "s",
+        "--show",
+        "--agents",
+        "16",
+        "--spacing",
+        "2",
+        "--formations",
+        "logo.csv,sphere",
+    ]
+    assert main(asked) == 0
+    assert 'rest = "sides"' in (tmp_path / "s.toml").read_text()
+    mission = load_mission(tmp_path / "s.toml")
+    assert written_slots(mission, "logo").shape == (16, 3)
+    assert assess(simulate(mission)).passed

@@ -71,14 +71,17 @@ def design(
     json : bool
         Print the result as JSON.
     """
+    from json import dumps
+
     from rigidfleet._common.files import write_file
     from rigidfleet.formation.graphs import CUBE_EDGES, REACH, complete_graph
+    from rigidfleet.formation.point_files import to_csv
     from rigidfleet.rigidity import design as designs
 
     if out is not None and out.exists() and not force:
         raise RigidfleetError(f"{out}: already exists; use --force to overwrite.")
     try:
-        name, slots = points_of(shape, agents, size, spacing, font)
+        name, (slots, colours) = points_of(shape, agents, size, spacing, font)
         if edges == "none":
             _reject(edges, reach, searched=extra != "0" or sensing_range is not None)
             kinds = {}
@@ -98,13 +101,15 @@ def design(
                 kinds["all pairs"] = complete_graph(len(slots))
         chosen = [] if edges == "none" else edges or kinds["designed"]
         text = designs.mission_fragment(name, slots, chosen, reach)
+        if colours is not None:
+            text += f"colour = {dumps(colours)}\n"
         judged = {what: compare_graph(slots, graph) for what, graph in kinds.items()}
     except ValueError as error:
         raise RigidfleetError(f"{shape}: {str(error).rstrip('.')}.") from None
     limits = designs.limits(slots)
     if out is not None:
-        rows = "".join(f"{x!r},{y!r},{z!r}\n" for x, y, z in (slots + 0.0).tolist())
-        write_file(out, (f"x,y,z\n{rows}" if out.suffix.lower() == ".csv" else text).encode())
+        table = to_csv(slots, colours) if out.suffix.lower() == ".csv" else text
+        write_file(out, table.encode())
     if json:
         found = {what: data for what, (data, _) in judged.items()}
         console.print_json({"name": name, "toml": text, "limits": limits, "graphs": found})
@@ -187,7 +192,7 @@ def points_of(
     spacing: float | None = None,
     font: str | None = None,
 ) -> tuple[str, Any]:
-    """Name and slots (N, 3) [m] of a named shape, of a file of points or a drawing, or of words.
+    """Name and `formation.point_files.Points` of a named shape, of a file of points or a drawing, or of words.
 
     Raises
     ------
@@ -195,7 +200,7 @@ def points_of(
         The shape does not suit the number of agents or sizes, or an option is missing or has no effect.
     """
     from rigidfleet.formation import outlines
-    from rigidfleet.formation.point_files import read_points
+    from rigidfleet.formation.point_files import Points, read_points
     from rigidfleet.formation.shapes import SHAPES, agents_taken, slots
     from rigidfleet.math.rigid_body import centred
 
@@ -209,7 +214,7 @@ def points_of(
             raise ValueError("--spacing has no effect on a named shape; use --size")
         if agents is None and len(form.agents) > 1:
             raise ValueError(f"takes {agents_taken(shape)}; give --agents")
-        return shape, slots(shape, size or [4.0] * form.sizes, count)
+        return shape, Points(slots(shape, size or [4.0] * form.sizes, count), None)
     if words is None and not Path(shape).exists():
         raise ValueError(f"is neither a shape nor a file; shapes: {', '.join(SHAPES)}")
     if size is not None:
@@ -222,8 +227,11 @@ def points_of(
             if words is None
             else outlines.text_outlines(words, font or "DejaVu Sans")
         )
-        return words or Path(shape).stem, outlines.on_outlines(drawn, agents, spacing)
-    points = centred(read_points(shape))
+        return words or Path(shape).stem, Points(outlines.on_outlines(drawn, agents, spacing), None)
+    points, colours = read_points(shape)
     if agents is not None and agents != len(points):
-        points = centred(outlines.spread(points, agents))
-    return Path(shape).stem, points if spacing is None else outlines.scaled(points, spacing)
+        kept = outlines.spread(points, agents)
+        points = points[kept]
+        colours = colours and tuple(colours[k] for k in kept.tolist())
+    points = centred(points) if spacing is None else outlines.scaled(points, spacing)
+    return Path(shape).stem, Points(points, colours)

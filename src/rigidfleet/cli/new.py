@@ -138,24 +138,27 @@ def _show(file: Path, asked: dict[str, Any], formations: str, spacing: float) ->
     words = [word.strip() for word in formations.split(",") if word.strip()]
     if agents is None:
         files = [w for w in words if Path(w).suffix.lower() in _POINTS and Path(w).exists()]
-        agents = len(points_of(files[0], None)[1]) if files else _SHOWN
+        agents = len(points_of(files[0], None)[1].slots) if files else _SHOWN
     for word in words:
         path = Path(word)
         if word in SHAPES or not (word.startswith("text:") or path.exists()):
             scenes.append(show_draft.scene(word, agents, spacing))
             continue
         try:
-            name, slots = points_of(word, agents, spacing=spacing)
-            own = points_of(word, None)[1] if path.suffix.lower() in _POINTS else slots
+            own = points_of(word, None)[1] if path.suffix.lower() in _POINTS else None
+            count = agents if own is None else min(agents, len(own.slots))
+            name, points = points_of(word, count, spacing=spacing)
         except ValueError as error:
             raise ValueError(f"{word}: {error}") from None
         folder = file.parent.resolve()
         inside = path.suffix.lower() in _POINTS and path.resolve().is_relative_to(folder)
-        by_name = inside and len(own) == agents and proximity.nearest(own).min() >= spacing
-        source = path.resolve().relative_to(folder).as_posix() if by_name else word
-        if by_name:
-            slots = own
-        scenes.append(show_draft.points_scene(name, slots, source, by_name=by_name))
+        source = word
+        by_name = own is not None and inside and len(own.slots) == count
+        if own is not None and by_name and proximity.nearest(own.slots).min() >= spacing:
+            source, points = path.resolve().relative_to(folder).as_posix(), own
+        else:
+            by_name = False
+        scenes.append(show_draft.points_scene(name, points, source, by_name=by_name))
     return show_draft.show(
         file.stem, scenes, agents=agents, spacing=spacing, file=str(file), **asked
     )

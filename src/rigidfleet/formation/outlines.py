@@ -95,7 +95,8 @@ def on_outlines(outlines: list[Floats], count: int, spacing: float) -> Floats:
     """
     if not 2 <= count <= _MOST:
         raise ValueError(f"an outline takes 2 to {_MOST:,} agents, not {count:,}")
-    flat = spread(_along(outlines, _DENSE * count), count)
+    dense = _along(outlines, _DENSE * count)
+    flat = dense[spread(dense, count)]
     return scaled(np.column_stack([flat[:, 0], 0.0 * flat[:, 0], flat[:, 1]]), spacing)
 
 
@@ -115,8 +116,8 @@ def scaled(points: ArrayLike, spacing: float) -> Floats:
     return (p - p.mean(axis=0)) * (spacing / float(proximity.nearest(p).min()))
 
 
-def spread(points: Floats, count: int) -> Floats:
-    """Those ``count`` of points (M, d) that are spread evenly: their least distance is as large as was found.
+def spread(points: Floats, count: int) -> Ints:
+    """Indices (count,) of points (M, d) that are spread evenly: their least distance is as large as was found.
 
     Two starts, every M/count-th point and the farthest from all chosen before, are improved in turns: each chosen point
     goes to the middle of the points that are nearest to it (Lloyd), and from there to the nearest point.
@@ -143,7 +144,7 @@ def spread(points: Floats, count: int) -> Floats:
             if len(moved) < count or (moved == np.sort(chosen)).all():
                 break
             chosen = moved
-    return points[np.sort(best)]
+    return np.sort(best)
 
 
 def _farthest(points: Floats, count: int) -> Ints:

@@ -7,6 +7,7 @@ x axis from north to east [deg], here east.
 
 from __future__ import annotations
 
+import base64
 import io
 import json
 import zipfile
@@ -25,6 +26,7 @@ from rigidfleet.interchange.curves import (
     of_bernstein,
     with_headings,
 )
+from rigidfleet.interchange.lights import FRAME, fades, program
 
 #: Greatest number of vehicles of a show.
 MOST = 5000
@@ -35,7 +37,7 @@ _DATE = (1980, 1, 1, 0, 0, 0)
 
 
 def write_skyc(motion: Motion, tolerance: float) -> Iterator[bytes]:
-    """One show: for each drone its home, a way of cubic curves, and its yaw.
+    """One show: for each drone its home, a way of cubic curves, its yaw and its light.
 
     Raises
     ------
@@ -45,24 +47,32 @@ def write_skyc(motion: Motion, tolerance: float) -> Iterator[bytes]:
     if motion.n_agents > MOST:
         raise ResultError(f"a show has at most {MOST} drones, and this flight {motion.n_agents}.")
     mission = motion.result.mission
+    changes = fades(motion.result, motion.start, motion.end)
+    last = round((motion.end - motion.start) / FRAME)
     drones, files = [], {}
     for agent in range(motion.n_agents):
         curve = motion.knots(agent).fitted(tolerance, orders=2).later(-motion.start)
         name = f"agent {agent + 1}"
         folder = f"drones/{name.replace(' ', '-')}"
         points = _segments(curve)
+        landing = min(
+            round(float(motion.result.motors_off[agent]) - motion.start, 6), points[-1][0]
+        )
         files[f"{folder}/trajectory.json"] = {
-            "version": 1, "points": points, "takeoffTime": 0, "landingTime": points[-1][0]
+            "version": 1, "points": points, "takeoffTime": 0, "landingTime": landing
         }  # fmt: skip
         times, yaws = headings(curve)
         setpoints = np.column_stack([times.round(6), np.degrees(yaws).round(4)]).tolist()
         files[f"{folder}/yaw.json"] = {"version": 1, "setpoints": setpoints}
+        light = base64.b64encode(program(changes, agent, last)).decode()
+        files[f"{folder}/lights.json"] = {"version": 1, "data": light}
         settings = {
             "name": name,
             "home": points[0][1],
             "landAt": points[-1][1],
             "trajectory": {"$ref": f"./{folder}/trajectory.json#"},
             "yawControl": {"$ref": f"./{folder}/yaw.json#"},
+            "lights": {"$ref": f"./{folder}/lights.json#"},
         }
         drones.append({"type": "generic", "settings": settings})
     cues = [

@@ -17,7 +17,7 @@ from rigidfleet.typing import Floats
 #: Defaults of a new mission: mass of a vehicle [kg], its radius [m], size of the shape [m], waypoint [m].
 MASS, RADIUS, SIZE, WAYPOINT = 1.2, 0.25, 4.0, (20.0, 10.0, 10.0)
 #: Thrust-to-weight ratio of a typical vehicle.
-_LIFT = 2.2
+LIFT = 2.2
 #: Speed [m/s] and acceleration [m/s^2] from which the durations of phases are chosen.
 _SPEED, _ACCELERATION = 4.0, 1.2
 #: Distance of vehicles on the ground, centre to centre [m].
@@ -29,8 +29,8 @@ _FEW, _WIDE = 20, 1.5
 _SETTLE, _HOLD = 2, 3
 #: Approximate number of agent positions that the result of a new mission stores.
 _STORED = 2e6
-#: More than _ALL_PAIRS agents are held by their slots alone, without edges. _MOST is the maximum number of agents.
-_ALL_PAIRS, _MOST = 40, 2000
+#: More than _ALL_PAIRS agents are held by their slots alone, without edges; MOST_AGENTS is the greatest number.
+_ALL_PAIRS, MOST_AGENTS = 40, 2000
 #: Column in which comments beside keys begin.
 _COLUMN = 34
 
@@ -72,8 +72,8 @@ def draft(
         shape = shape_for(agents)
     shape_known(shape)
     n = agents_for(shape) if agents is None else agents
-    if n > _MOST:
-        raise ValueError(f"{n} agents are too many: a new mission has at most {_MOST}")
+    if n > MOST_AGENTS:
+        raise ValueError(f"{n} agents are too many: a new mission has at most {MOST_AGENTS}")
     if not np.isfinite([thrust_limit or 0.0, mass, *size, *np.ravel(waypoints or ())]).all():
         raise ValueError("masses, sizes, limits and waypoints must be finite")
     slots = shapes.slots(shape, list(size) * (3 if _is_box(shape, size) else 1), n)
@@ -95,10 +95,10 @@ def draft(
     way = float(np.linalg.norm(slots - (start - centre), axis=1).max())
     if not below:  # some agents cross the whole shape
         way = float(np.linalg.norm(np.ptp(np.vstack([slots, start - centre]), axis=0)))
-    blend = max(4, _blend(way))
+    blend = max(4, blend_time(way))
     climb, flights = _time(aloft - centre), _flights(aloft, waypoints)
     lasts = climb + blend + _SETTLE + sum(time for _, time in flights) + _HOLD
-    limit = math.ceil(_LIFT * mass * 9.81) if thrust_limit is None else thrust_limit
+    limit = math.ceil(LIFT * mass * 9.81) if thrust_limit is None else thrust_limit
     extent = json.dumps([float(x) for x in size]) if len(size) > 1 else f"{size[0]:g}"
     if _is_box(shape, size):
         extent = json.dumps([float(size[0])] * 3)
@@ -118,7 +118,7 @@ def draft(
         separation=f"{min(0.5, nearest / 6):.3g}",
         # In a small spatial shape, or one of many agents, some agents pass below others in any case.
         below="" if below and (distance_geometry.dimension(slots) < 3 or nearest >= 3.0) else "# ",
-        keys=("" if below else _ASSIGNED) + _output_step(n, lasts),
+        keys=("" if below else _ASSIGNED) + output_step(n, lasts),
         aloft=_row(aloft),
         blend=""
         if blend == 4
@@ -126,7 +126,7 @@ def draft(
         establish=f"{blend + _SETTLE}.0",
         climb=f"{climb}.0",
     )
-    return _aligned(head + "".join(text for text, _ in flights) + _TAIL)
+    return aligned(head + "".join(text for text, _ in flights) + _TAIL)
 
 
 def shape_known(shape: str) -> None:
@@ -181,7 +181,7 @@ def _start(slots: Floats, apart: float) -> tuple[Floats, bool]:
     return start, True
 
 
-def _blend(way: float) -> int:
+def blend_time(way: float) -> int:
     """Duration [s] of a blend, or of a smooth flight, over a distance [m] that keeps to `_SPEED` and `_ACCELERATION`.
 
     The septic blend has a peak rate of 35/16 times the mean and a peak second derivative of 7.52.
@@ -189,7 +189,7 @@ def _blend(way: float) -> int:
     return math.ceil(max(35 / 16 * way / _SPEED, math.sqrt(7.52 * way / _ACCELERATION)))
 
 
-def _output_step(n: int, lasts: float) -> str:
+def output_step(n: int, lasts: float) -> str:
     """Return the key `output_step` if the default would store too much in a mission of this duration [s]; else ''."""
     step = math.ceil(20 * lasts * n / _STORED) / 20
     return "" if step <= 0.05 else f"output_step = {step:g}                # [s] between samples\n"
@@ -208,10 +208,10 @@ def _flights(at: Floats, waypoints: Sequence[Sequence[float]]) -> list[tuple[str
 
 def _time(way: Floats) -> int:
     """Duration [s] of a rest-to-rest flight by a vector (3,) [m] that keeps to `_SPEED` and `_ACCELERATION`."""
-    return max(4, _blend(float(np.linalg.norm(way))))
+    return max(4, blend_time(float(np.linalg.norm(way))))
 
 
-def _aligned(text: str) -> str:
+def aligned(text: str) -> str:
     """Align the comments beside keys in one column."""
     beside = re.compile(r"^([^#\n]*[^#\s]) +# ?(.*)$", re.MULTILINE)
     return beside.sub(lambda m: f"{m[1]:<{_COLUMN - 1}} # {m[2]}", text)

@@ -10,6 +10,7 @@ import copy
 import csv
 import hashlib
 import io
+import json
 import re
 import tomllib
 from collections.abc import Callable, Iterator
@@ -36,7 +37,14 @@ class _Named(NamedTuple):
     key: str
     becomes: str
     where: str
-    read: Callable[[bytes, str], list[list[float]]]
+    read: Callable[[bytes, str], Content]
+
+
+class Content(NamedTuple):
+    """What a file gives: rows of numbers, and colours of points if it has them."""
+
+    rows: list[list[float]]
+    colours: tuple[str, ...] | None = None
 
 
 def completed(text: str, path: Path) -> str:
@@ -73,7 +81,7 @@ def with_files(text: str, data: dict[str, Any], path: Path) -> str:
     for named in list(_named(data)):
         name = named.table[named.key]
         content = read_bytes(_inside(path, named.where, name))
-        rows = named.read(content, str(path.parent / name))
+        rows, colours = named.read(content, str(path.parent / name))
         told = f"{named.becomes} of {name!r}, SHA-256 {hashlib.sha256(content).hexdigest()}"
         digests.append(f"# {named.where}: {told}\n")
         del named.table[named.key]
@@ -81,6 +89,9 @@ def with_files(text: str, data: dict[str, Any], path: Path) -> str:
         written = "".join(f"  {row!r},\n" for row in rows)
         line = re.compile(rf"^([ \t]*){named.key}\s*=\s*([\"']){re.escape(name)}\2", re.MULTILINE)
         put = f"# {told}\n{named.becomes} = [\n{written}]"
+        if colours is not None and named.becomes == "slots" and "colour" not in named.table:
+            named.table["colour"] = [*colours]
+            put += f"\ncolour = {json.dumps(colours)}"
         text = line.sub(lambda m, put=put: m[1] + put, text, count=1)
     try:
         if tomllib.loads(text) == data:
@@ -127,11 +138,12 @@ def _inside(path: Path, where: str, name: str) -> Path:
     raise MissionError([Finding(str(path), where, name, problem, remedy)])
 
 
-def _points(data: bytes, name: str) -> list[list[float]]:
-    return parse_points(data, name).tolist()
+def _points(data: bytes, name: str) -> Content:
+    found = parse_points(data, name)
+    return Content(found.slots.tolist(), found.colours)
 
 
-def _heights(data: bytes, name: str) -> list[list[float]]:
+def _heights(data: bytes, name: str) -> Content:
     """Numbers of a CSV or NPY file, row by row."""
 
     def refused(problem: str, remedy: str) -> MissionError:
@@ -155,4 +167,4 @@ def _heights(data: bytes, name: str) -> list[list[float]]:
         raise refused(
             f"has {found.size:,} heights; the maximum is {bounds.HEIGHTS:,}", "use a coarser grid"
         )
-    return found.tolist()
+    return Content(found.tolist())

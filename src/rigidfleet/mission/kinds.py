@@ -371,37 +371,37 @@ class Hold(AnyPhase):
     kind: Literal["hold"] = Field(description="stay at the commanded position and attitude")
 
 
-class Brake(AnyPhase):
-    """Come to rest where braking leads, in position and attitude, with the least snap."""
+class Arriving(AnyPhase):
+    """A phase that arrives at a time of its own, and stays there until its end."""
 
     moves: ClassVar[bool] = True
-    body_control: ClassVar[str] = "tracking"
-
-    kind: Literal["brake"] = Field(description="come to rest where braking leads")
-    travel: Time | None = Field(
-        None, description="time from the start to the stop [s]; default: the whole phase"
-    )
-
-    @property
-    def least_time(self) -> float:
-        """Time to the stop [s]."""
-        return self.travel or 0.0
-
-    def ended(self, length: float) -> dict[str, Any]:
-        """A time to the stop that is not longer than the phase."""
-        return {} if self.travel is None else {"travel": min(self.travel, length)}
-
-
-class Vertical(AnyPhase):
-    """A phase that leads vehicles straight up or down: all together, some of them, or one group after another."""
-
-    moves: ClassVar[bool] = True
-    grounded: ClassVar[bool] = True
     body_control: ClassVar[str] = "tracking"
 
     travel: Time | None = Field(
         None, description="time from the start to the arrival [s]; default: the whole phase"
     )
+
+    @property
+    def least_time(self) -> float:
+        """Time to the arrival [s]."""
+        return self.travel or 0.0
+
+    def ended(self, length: float) -> dict[str, Any]:
+        """A time to the arrival that is not longer than the phase."""
+        return {} if self.travel is None else {"travel": min(self.travel, length)}
+
+
+class Brake(Arriving):
+    """Come to rest where braking leads, in position and attitude, with the least snap."""
+
+    kind: Literal["brake"] = Field(description="come to rest where braking leads")
+
+
+class Vertical(Arriving):
+    """A phase that leads vehicles straight up or down: all together, some of them, or one group after another."""
+
+    grounded: ClassVar[bool] = True
+
     agents: tuple[Annotated[int, Strict(), Field(ge=1, le=bounds.AGENTS)], ...] = Field(
         (), description="numbers of the vehicles that move; the others stay. Default: all"
     )
@@ -430,15 +430,6 @@ class Vertical(AnyPhase):
     def meets(self) -> tuple[str, ...]:
         """Position and velocity on arrival."""
         return ("position", "velocity")
-
-    @property
-    def least_time(self) -> float:
-        """Time to the arrival [s]."""
-        return self.travel or 0.0
-
-    def ended(self, length: float) -> dict[str, Any]:
-        """A time to the arrival that is not longer than the phase."""
-        return {} if self.travel is None else {"travel": min(self.travel, length)}
 
 
 class Takeoff(Vertical):

@@ -76,11 +76,8 @@ def _vehicles(
     seen: set[int] = set()
     for k, lost in enumerate(found.lost):
         path = (_TABLE, "lost", k)
-        if n is not None and not 1 <= lost.agent <= n:
-            collector.add(
-                (*path, "agent"), "there is no such agent", f"agents are numbered from 1 to {n}"
-            )
-        elif lost.agent in seen:
+        known = _known(collector, (*path, "agent"), (lost.agent,), n)
+        if known and lost.agent in seen:
             collector.add((*path, "agent"), "is lost twice", "remove one of the two")
         _in_time(collector, lost.time, end, path)
         seen.add(lost.agent)
@@ -108,12 +105,11 @@ def _links(
     for k, lost in enumerate(links):
         path, pair = (_TABLE, "links", "lost", k), tuple(sorted(lost.between))
         where = (*path, "between")
-        if n is not None and not (pair[0] >= 1 and pair[1] <= n):
-            collector.add(where, "there is no such agent", f"agents are numbered from 1 to {n}")
-        elif pair[0] == pair[1]:
-            collector.add(where, "joins an agent to itself", "give two agents")
-        elif pair in seen:
-            collector.add(where, "is lost twice", "remove one of the two")
+        if _known(collector, where, pair, n):
+            if pair[0] == pair[1]:
+                collector.add(where, "joins an agent to itself", "give two agents")
+            elif pair in seen:
+                collector.add(where, "is lost twice", "remove one of the two")
         _in_time(collector, lost.time, end, path)
         seen.add(pair)
     if not links:
@@ -126,6 +122,16 @@ def _links(
                 " by their slots alone, so the slots must be tracked"
             )
             collector.add(("phases", k, "control"), problem, "use control = 'tracking'", p.control)
+
+
+def _known(
+    collector: FindingCollector, where: tuple[str | int, ...], agents: Sequence[int], n: int | None
+) -> bool:
+    """Whether the mission has these agents; a finding if not."""
+    if n is None or all(1 <= agent <= n for agent in agents):
+        return True
+    collector.add(where, "there is no such agent", f"agents are numbered from 1 to {n}")
+    return False
 
 
 def _in_time(

@@ -323,6 +323,15 @@ class Mission(Contents):
         slots = self._slots(name)
         return slots if slots is None else slots[self.assigned_slots[name]]
 
+    def formation_colours(self, name: str) -> tuple[str, ...] | None:
+        """Light "#rrggbb" of each agent in a formation; None if the formation has none of its own."""
+        colour = self.formations[name].colour if name in self.formations else None
+        if colour is None:
+            return None
+        if isinstance(colour, str):
+            return (colour,) * self.n_agents
+        return tuple(colour[slot] for slot in self.assigned_slots[name].tolist())
+
     def formation_distances(self, name: str) -> Floats:
         """Length (m,) [m] of each edge of a formation."""
         given = self.formations[name].distances

@@ -12,8 +12,17 @@ import numpy as np
 from rigidfleet._common.toml import toml_key
 from rigidfleet.formation import shapes
 from rigidfleet.formation.assignment import assigned
+from rigidfleet.formation.point_files import Points
+from rigidfleet.formation.rest import beside
 from rigidfleet.math import proximity
-from rigidfleet.mission.draft import _LIFT, _MOST, _aligned, _blend, _output_step, shape_known
+from rigidfleet.mission.draft import (
+    LIFT,
+    MOST_AGENTS,
+    aligned,
+    blend_time,
+    output_step,
+    shape_known,
+)
 from rigidfleet.typing import Floats
 
 #: Mass of a vehicle of a show [kg], greatest radius [m], and that as a share of the spacing.
@@ -67,12 +76,24 @@ def scene(shape: str, agents: int, spacing: float) -> Scene:
     return Scene(shape, slots, f'shape = "{shape}"\nsize = {written}                 # [m]\n')
 
 
-def points_scene(name: str, slots: Floats, source: str, *, by_name: bool = False) -> Scene:
-    """A formation of points (N, 3) [m], written as numbers, or by the name of their file."""
+def points_scene(name: str, points: Points, source: str, *, by_name: bool = False) -> Scene:
+    """A formation of points, written as numbers, or by the name of their file."""
+    slots, colours = points
     if by_name:
         return Scene(name, slots, f"slots = {json.dumps(source)}\n")
+    lights = "" if colours is None else f"colour = {json.dumps(colours)}\n"
     rows = "".join(f"    {row},\n" for row in np.round(slots + 0.0, 6).tolist())
-    return Scene(name, slots, f"# points of {json.dumps(source)}\nslots = [\n{rows}]\n")
+    return Scene(name, slots, f"# points of {json.dumps(source)}\nslots = [\n{rows}]\n{lights}")
+
+
+def _rested(one: Scene, agents: int) -> Scene:
+    """A scene in which the vehicles that have no point rest at its sides."""
+    waiting = agents - len(one.slots)
+    if waiting < 1:
+        return one
+    slots = np.concatenate([one.slots, beside(one.slots, waiting)])
+    told = f'rest = "sides"                  # {waiting} vehicles wait, dark\n'
+    return Scene(one.name, slots, one.table + told)
 
 
 def show(
@@ -90,8 +111,8 @@ def show(
         There are too many or too few agents, a scene has another number of them or is too narrow, or a number is not
         positive.
     """
-    if not 2 <= agents <= _MOST:
-        raise ValueError(f"a show takes 2 to {_MOST} agents, not {agents}")
+    if not 2 <= agents <= MOST_AGENTS:
+        raise ValueError(f"a show takes 2 to {MOST_AGENTS} agents, not {agents}")
     for what, value in (
         ("spacing", spacing),
         ("mass", mass),
@@ -103,6 +124,7 @@ def show(
         raise ValueError("a show needs formations")
     ground = "grid" if agents in shapes.SHAPES["grid"].agents else "line"
     pads = scene(ground, agents, spacing)._replace(name="pads")
+    scenes = [_rested(one, agents) for one in scenes]
     for one in scenes:
         if len(one.slots) != agents:
             raise ValueError(f"'{one.name}' has {len(one.slots)} points for {agents} agents")
@@ -112,13 +134,13 @@ def show(
     radius = min(_RADIUS, _SLIM * spacing)
     height = max(_LOWEST, math.ceil(max(-one.slots[:, 2].min() for one in scenes) + _ALOFT))
     start = radius + _STANDS
-    climb = _blend(height - start)
+    climb = blend_time(height - start)
     tables = {one.name: one for one in (pads, *scenes)}
     places, lasts, phases, taken = pads.slots, 2.0 * climb, [], set[str]()
     for k, one in enumerate([*scenes, pads]):
         slots = one.slots - one.slots.mean(axis=0)
         slots = slots[assigned(places, slots, turn=np.eye(3)).order]
-        blend = max(4, _blend(float(np.linalg.norm(slots - places, axis=1).max())))
+        blend = max(4, blend_time(float(np.linalg.norm(slots - places, axis=1).max())))
         title = one.name if one.name not in taken else f"{one.name}, phase {k + 2}"
         shown = _SHOWN if one is not pads else _SETTLED
         phases.append(
@@ -134,12 +156,12 @@ def show(
         raise ValueError(f"a spacing of {spacing:g} m is too small for a show")
     what = f"A show of {agents} vehicles: {', '.join(one.name for one in scenes)}"
     what = " ".join(what.split())  # a name may have line breaks
-    return _aligned(
+    return aligned(
         _HEAD.format(
             name=json.dumps(name, ensure_ascii=False), file=file or f"{name}.toml",
             what=what, title=json.dumps(what, ensure_ascii=False),
-            step=_output_step(agents, lasts), mass=f"{mass:g}", radius=f"{radius:.3g}",
-            limit=math.ceil(_LIFT * mass * 98.1) / 10 if thrust_limit is None else f"{thrust_limit:g}",
+            step=output_step(agents, lasts), mass=f"{mass:g}", radius=f"{radius:.3g}",
+            limit=math.ceil(LIFT * mass * 98.1) / 10 if thrust_limit is None else f"{thrust_limit:g}",
             spacing=f"{spacing:g}", agents=agents, ground=ground, start=f"{start:.4g}", separation=f"{separation:g}",
             formations="".join(
                 f"[formations.{toml_key(key)}]\n{one.table}edges = []                        # slots alone hold it\n\n"

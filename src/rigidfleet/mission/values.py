@@ -98,6 +98,12 @@ Edges = Annotated[
     Discriminator(_form),
 ]
 
+#: Where vehicles without a slot wait.
+Rest = Annotated[
+    Annotated[Literal["sides"], Tag("one")] | Annotated[tuple[Vector, ...], Tag("list")],
+    Discriminator(_form),
+]
+
 Damping = Annotated[
     Annotated[Tolerance, Tag("one")] | Annotated[Literal["auto"], Tag("word")],
     Discriminator(lambda value: "word" if isinstance(value, str) else "one"),
@@ -139,6 +145,12 @@ _Two = Field(min_length=2, max_length=2)
 RotorSpeeds = Annotated[tuple[Annotated[float, Strict(), Field(ge=0, le=1e5)], ...], _Two]
 MotorTimes = Annotated[tuple[Annotated[float, Strict(), Field(ge=1e-3, le=10)], ...], _Two]
 AttitudeGains = Annotated[tuple[Annotated[float, Strict(), Field(gt=0, le=1e6)], ...], _Two]
+#: A colour of light: red, green and blue in hexadecimal digits.
+_Light = Annotated[str, Field(pattern="^#[0-9a-fA-F]{6}$")]
+Colour = Annotated[
+    Annotated[_Light, Tag("one")] | Annotated[tuple[_Light, ...], Tag("list")],
+    Discriminator(_form),
+]
 NAME_OR_LIST = WithJsonSchema(
     {"anyOf": [{"type": "string"}, {"type": "array", "items": {"type": "string"}}]}
 )

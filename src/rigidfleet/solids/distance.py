@@ -127,24 +127,16 @@ def off_triangle(x: Numbers, y: Numbers, z: Numbers, t: Any) -> Any:
     area = n[0] * n[0] + n[1] * n[1] + n[2] * n[2]
     i, j, k = off_segment(x, y, z, a, b)
     best = i * i + j * j + k * k
-    u, v, w = off_segment(x, y, z, b, c)
-    d = u * u + v * v + w * w
-    nearer = d < best
-    i, j, k, best = (
-        choose(nearer, u, i),
-        choose(nearer, v, j),
-        choose(nearer, w, k),
-        choose(nearer, d, best),
-    )
-    u, v, w = off_segment(x, y, z, c, a)
-    d = u * u + v * v + w * w
-    nearer = d < best
-    i, j, k, best = (
-        choose(nearer, u, i),
-        choose(nearer, v, j),
-        choose(nearer, w, k),
-        choose(nearer, d, best),
-    )
+    for m in range(1, 3):
+        u, v, w = off_segment(x, y, z, t[m], t[(m + 1) % 3])
+        d = u * u + v * v + w * w
+        nearer = d < best
+        i, j, k, best = (
+            choose(nearer, u, i),
+            choose(nearer, v, j),
+            choose(nearer, w, k),
+            choose(nearer, d, best),
+        )
     if area > 0.0:
         over = side(x, y, z, a, b, n) >= 0.0
         over = over & (side(x, y, z, b, c, n) >= 0.0) & (side(x, y, z, c, a, n) >= 0.0)
