@@ -4,6 +4,7 @@ K samples, N agents, m edges.
 """
 
 import math
+from itertools import accumulate
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -200,9 +201,9 @@ class Record(NamedTuple):
 
 def recorder(k: int, n: int, m: int) -> Record:
     """Allocate a record of ``k`` samples."""
-    agent, edge = (lambda: np.full((k, n, 3), np.nan)), (lambda: np.full((k, m), np.nan))
-    return Record(
-        *(agent() for _ in range(7)), *(edge() for _ in range(5)), agent(),
-        np.full((k, 6), np.nan), np.full((k, 3), np.nan), np.full((k, 3, 3), np.nan),
-        np.full((k, 6), np.nan), *(agent() for _ in range(3)),
-    )  # fmt: skip
+    agent, edge = (n, 3), (m,)
+    shapes = *(agent,) * 7, *(edge,) * 5, agent, (6,), (3,), (3, 3), (6,), *(agent,) * 3
+    ends = list(accumulate(k * math.prod(shape) for shape in shapes))
+    memory = np.full(ends[-1], np.nan)
+    parts = zip([0, *ends], ends, shapes, strict=False)
+    return Record(*(memory[a:b].reshape(k, *shape) for a, b, shape in parts))

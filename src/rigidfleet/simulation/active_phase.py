@@ -281,12 +281,11 @@ class ActivePhase:
         state.count[3] = 0
         first = np.nextafter(self.t, math.inf)
         status = records.PAUSED
+        go_on = native.Integration(problem, self.workspace, state, t_end, times, samples)
         try:
             while status == records.PAUSED:
                 begun = clock.perf_counter()
-                status = native.integrate(
-                    problem, self.workspace, state, t_end, fresh, times, samples, self.steps
-                )
+                status = go_on(fresh, self.steps)
                 took = max(clock.perf_counter() - begun, 1e-6)
                 if status == records.PAUSED:
                     self.steps = min(_STEPS, max(1, int(self.steps * min(_PAUSE / took, 10.0))))

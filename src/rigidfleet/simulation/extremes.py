@@ -7,6 +7,7 @@ as near.
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Sequence
 
@@ -92,6 +93,14 @@ class Extremes:
         self.of_vehicles: dict[str, Extremum] = {}
         self.avoidance: avoidance.Avoidance | None = None  # that of the phase under way
         self._list_all()
+
+    def anew(self) -> Extremes:
+        """A monitor of another flight of the same mission, which must not have begun here."""
+        other = copy.copy(self)
+        for name in ("worst", "when", "who", "sign", "left", "low", "standing", "moved"):
+            setattr(other, name, getattr(self, name).copy())
+        other.of_vehicles = {}
+        return other
 
     def begin(self, states: int, edges: int) -> records.Trail:
         """Begin to monitor an integrator with this many states; it must record its steps in the returned trail."""

@@ -142,7 +142,7 @@ def assemble(
         constraint=found.distance - reference if noisy else by_edge("c"),
         integral=by_edge("integral"),
         multiplier=by_edge("multiplier"),
-        singular_value=_singular_values(pieces),
+        singular_value=None,  # type: ignore[arg-type] -- later
         separation=separation,
         separation_pair=pair,
         clearance=clearance,
@@ -151,7 +151,10 @@ def assemble(
         disturbance_force=record.f_D if airy else None,
         measured_position=record.r_seen if noisy else None,
         measured_velocity=record.v_seen if noisy else None,
-        later=partial(_references, mission.yaw, [(p.time, p.led) for p in pieces], left),
+        later=(
+            (LATER, partial(_references, mission.yaw, [(p.time, p.led) for p in pieces], left)),
+            (("singular_value",), partial(_singular_values, [(p.record.r, p.edges) for p in pieces])),
+        ),
         vehicle_attitude=None if flown is None else flown.attitude,
         vehicle_rates=None if flown is None else flown.rates,
         rotor_force=None if flown is None else flown.rotor_force,
@@ -263,7 +266,7 @@ def _measured(mission: Mission, pieces: Sequence[Piece], time: Floats, record: R
         mass=mission.fleet.mass, lost_at=mission.lost_at,
         limit=mission.fleet.thrust_limit if agents.saturate else np.full(n, np.inf), edges=mission.edges,
         r=record.r, v=record.v, f_u=record.f_u, f_C=record.f_C, p=record.p, T_ref=record.T_ref,
-        frame=np.concatenate([p.frame for p in pieces]),
+        frame=_joined([p.frame for p in pieces]),
     )  # fmt: skip
     native.measure(found)
     return found
@@ -274,17 +277,21 @@ def _by_edge(
 ) -> Floats:
     """A quantity of the edges (K, m); NaN while an edge is not active."""
     rows = []
+    whole = all(isinstance(places, slice) for places in columns)
     for piece, places in zip(pieces, columns, strict=True):
         values = piece.integral if name == "integral" else getattr(piece.record, name)
+        if whole:
+            rows.append(values)
+            continue
         full = np.full((len(piece.time), count), np.nan)
         full[:, places] = values
         rows.append(full)
-    return np.concatenate(rows)
+    return _joined(rows)
 
 
 def _columns(some: Ints, edges: Ints) -> Ints | slice:
     """Indices of some edges among all edges, (m, 2) both."""
-    if np.array_equal(some, edges):
+    if some.shape == edges.shape and some.tobytes() == edges.tobytes():
         return slice(None)
     key = edges.max(initial=0) + 1
     keys = edges[:, 0] * key + edges[:, 1]
@@ -292,12 +299,12 @@ def _columns(some: Ints, edges: Ints) -> Ints | slice:
     return order[np.searchsorted(keys[order], some[:, 0] * key + some[:, 1])]
 
 
-def _singular_values(pieces: Sequence[Piece]) -> Floats:
+def _singular_values(pieces: Sequence[tuple[Floats, Ints]]) -> dict[str, Floats]:
     """Smallest non-zero singular value of J (K,); NaN if the formation is too large to compute it.
 
     In formations of some tens of agents it is computed at some samples of each phase, and linear in between.
     """
-    return np.concatenate([_singular(p.record.r, p.edges) for p in pieces])
+    return {"singular_value": np.concatenate([_singular(r, edges) for r, edges in pieces])}
 
 
 def _singular(r: Floats, edges: Ints) -> Floats:

@@ -64,6 +64,29 @@ def integrate(
     return _call(_code().integrate, packed(problem), packed(workspace), packed(state), segment)
 
 
+class Integration:
+    """An integration to ``t_end`` [s] in parts: a callable that integrates at most some steps."""
+
+    def __init__(
+        self,
+        problem: Problem,
+        workspace: Workspace,
+        state: IntegratorState,
+        t_end: float,
+        times: Floats,
+        samples: Floats,
+    ) -> None:
+        self._segment = pack(Segment(t_end, False, 0, times, samples, NOTHING))
+        self._kept = packed(problem), packed(workspace), packed(state), self._segment
+        self._addresses = [x.address for x in self._kept]
+        self._integrate = _code().integrate
+
+    def __call__(self, fresh: bool, max_steps: int) -> int:
+        """Go on; ``fresh`` as in `Segment`. Returns what `rigidfleet.kernel.dopri5.integrate` returns."""
+        self._segment.words[1:3] = fresh, max_steps
+        return self._integrate(*self._addresses)
+
+
 def record(problem: Problem, workspace: Workspace, times: Floats, samples: Floats) -> Record:
     """Forces and references at states ``samples`` (K, n) at ``times`` (K,) [s]."""
     n, m = len(problem.vehicles.m), len(problem.graph.edges)
@@ -98,7 +121,7 @@ def closed_loop(t: float, y: Floats, dy: Floats, problem: Problem, workspace: Wo
 
 
 def _call(function: Any, *arguments: Packed) -> int:
-    return function(*(a.address for a in arguments))
+    return function(*[a.address for a in arguments])
 
 
 def measure(found: Measured) -> None:

@@ -61,6 +61,9 @@ def use(gather: Callable[..., int]) -> None:
     _layout.cache_clear()
 
 
+_ARRAYS, _FLOATS = {np.ndarray}, {float, np.float64}
+
+
 class _Layout:
     """Memory layout of a type of named tuple, learnt from an example."""
 
@@ -98,9 +101,9 @@ class _Layout:
         floats, integers = self.of_floats(x), self.of_integers(x)
         if (
             not _gather
-            or any(type(array) is not np.ndarray for array in arrays)
-            or not all(isinstance(number, float) for number in floats)
-            or any(isinstance(number, float) for number in integers)
+            or set(map(type, arrays)) != _ARRAYS
+            or not _FLOATS.issuperset(map(type, floats))
+            or not _FLOATS.isdisjoint(map(type, integers))
         ):
             return None
         words = np.empty(self.size + len(arrays), dtype=np.int64)
