@@ -394,6 +394,9 @@ class Result:
             del self.__dict__[name]
         sizes: dict[str, int] = {dim: len(names) for dim, names in LABELS.items()}
         given = self.__dict__
+        for key, dims in (("time", ("time",)), ("position", ("time", "agent")), ("edges", ("edge",))):
+            if isinstance(given[key], np.ndarray):
+                sizes.update(zip(dims, given[key].shape, strict=False))
         for name, dims, dtype in _CHECKED:
             value = given.get(name)
             if value is None and (name in _OPTIONAL or name in self._later):

@@ -201,9 +201,10 @@ class Record(NamedTuple):
 
 def recorder(k: int, n: int, m: int) -> Record:
     """Allocate a record of ``k`` samples."""
-    agent, edge = (n, 3), (m,)
-    shapes = *(agent,) * 7, *(edge,) * 5, agent, (6,), (3,), (3, 3), (6,), *(agent,) * 3
-    ends = list(accumulate(k * math.prod(shape) for shape in shapes))
-    memory = np.full(ends[-1], np.nan)
-    parts = zip([0, *ends], ends, shapes, strict=False)
-    return Record(*(memory[a:b].reshape(k, *shape) for a, b, shape in parts))
+    agent, edge = (k, n, 3), (k, m)
+    shapes = *(agent,) * 7, *(edge,) * 5, agent, (k, 6), (k, 3), (k, 3, 3), (k, 6), *(agent,) * 3
+    sizes = *(3 * k * n,) * 7, *(k * m,) * 5, 3 * k * n, 6 * k, 3 * k, 9 * k, 6 * k, *(3 * k * n,) * 3
+    memory = np.empty(sum(sizes))
+    memory.fill(np.nan)
+    parts = zip(accumulate(sizes), sizes, shapes, strict=True)
+    return Record(*[memory[end - size : end].reshape(shape) for end, size, shape in parts])

@@ -31,7 +31,7 @@ from rigidfleet.simulation.callbacks import (
 from rigidfleet.simulation.diagnosis import Place, diagnose
 from rigidfleet.simulation.extremes import Extremes
 from rigidfleet.simulation.recording import Led, Piece
-from rigidfleet.simulation.solver_setup import equip, first_step, integrator
+from rigidfleet.simulation.solver_setup import equip, first_step, give_back, integrator
 from rigidfleet.typing import Bools, Floats
 
 if TYPE_CHECKING:
@@ -208,6 +208,10 @@ class ActivePhase:
             return self.plan.before
         self.evaluate()
         return self.plan.reached(self.t, self.state.y, self.workspace)
+
+    def release(self) -> None:
+        """Give the workspace back, after the end: nothing more is asked of this phase."""
+        give_back(self.plan, self.workspace)
 
     # -- inside -----------------------------------------------------------------------------------
 

@@ -451,7 +451,9 @@ class Flight:
         if own and not whole and not self.ending:
             self.ending = f"ended at t = {self.t:.2f} s, before the mission's end"
         self._finished = True
-        return self.record(self.pieces, None if own else self._asked)
+        result = self.record(self.pieces, None if own else self._asked)
+        self._prepared.give_back(self._extremes)
+        return result
 
     def record(
         self,
@@ -544,6 +546,7 @@ class Flight:
         for method, counts in active.solves:
             self._solves.setdefault(method, type(counts)()).add(counts)
         self._now = active.end()
+        active.release()
         record.t_end = self._now.t
         if abandoned:
             points = () if record.target is None else record.target.get("through", ())

@@ -25,6 +25,7 @@ class Preparation:
     def __init__(self, mission: Mission) -> None:
         self._mission = mission
         self._plans: dict[tuple[int, int], PhasePlan] = {}
+        self._idle: list[Extremes] = []
 
     @cached_property
     def mission(self) -> Mission:
@@ -36,13 +37,19 @@ class Preparation:
         """Disturbances of the flight of points."""
         return disturbance(self.mission)
 
-    @cached_property
-    def _extremes(self) -> Extremes:
-        return Extremes(self.mission)
-
     def extremes(self) -> Extremes:
-        """A new monitor."""
-        return self._extremes.anew()
+        """A monitor that no other flight uses."""
+        try:
+            found = self._idle.pop()
+        except IndexError:
+            return Extremes(self.mission)
+        found.restart()
+        return found
+
+    def give_back(self, extremes: Extremes) -> None:
+        """Let another flight use the monitor of one that is finished."""
+        if extremes.reusable and len(self._idle) < _KEPT:
+            self._idle.append(extremes)
 
     def first_plan(
         self, phase: Phase, now: PhaseState, given: Disturbance | None, external: int

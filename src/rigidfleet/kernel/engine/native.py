@@ -83,7 +83,7 @@ class Integration:
 
     def __call__(self, fresh: bool, max_steps: int) -> int:
         """Go on; ``fresh`` as in `Segment`. Returns what `rigidfleet.kernel.dopri5.integrate` returns."""
-        self._segment.words[1:3] = fresh, max_steps
+        self._segment.words[1], self._segment.words[2] = int(fresh), max_steps
         return self._integrate(*self._addresses)
 
 

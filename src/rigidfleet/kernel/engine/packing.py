@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import struct
 import threading
 from collections.abc import Callable, Iterator
@@ -40,14 +41,13 @@ from rigidfleet.kernel.records import (
     monitor,
     recorder,
 )
-from rigidfleet.typing import Ints
 
 
 class Packed(NamedTuple):
     """A named tuple as words, and the tuple itself, which keeps its arrays alive."""
 
     of: Any
-    words: Ints
+    words: ctypes.Array[ctypes.c_int64]
     address: int
 
 
@@ -61,7 +61,7 @@ def use(gather: Callable[..., int]) -> None:
     _layout.cache_clear()
 
 
-_ARRAYS, _FLOATS = {np.ndarray}, {float, np.float64}
+_ARRAYS = {np.ndarray}
 
 
 class _Layout:
@@ -74,48 +74,49 @@ class _Layout:
         _flatten(example, code, words, self.arrays)
         self.code = struct.Struct("=" + "".join(code))
         places = list(_places(example, ""))
+        size = len(words)
         starts = np.cumsum([0, *(1 if ndim is None else 1 + ndim for _, _, ndim in places)])
-        found = [(name, kind, int(k)) for (name, kind, _), k in zip(places, starts, strict=False)]
-        #: Names of the arrays, of the floats and of the integers, and their first words.
-        self.of_arrays = _getter([name for name, kind, _ in found if kind is np.ndarray])
-        self.of_floats = _getter([name for name, kind, _ in found if kind is float])
-        self.of_integers = _getter([name for name, kind, _ in found if kind is int])
-        self.floats = np.array([k for _, kind, k in found if kind is float], dtype=np.int64)
-        self.integers = np.array([k for _, kind, k in found if kind is int], dtype=np.int64)
-        first = [k for _, kind, k in found if kind is np.ndarray]
+        arrays = [(name, int(k)) for (name, kind, _), k in zip(places, starts, strict=False) if kind is np.ndarray]
+        self.of_arrays = _getter([name for name, _ in arrays])
+        self.of_numbers = _getter([name for name, kind, _ in places if kind is not np.ndarray])
+        #: Numbers at their words, with gaps for the arrays' words; then the addresses of the arrays.
+        gaps = {np.ndarray: "{}x", float: "d", int: "q"}
+        self.numbers = struct.Struct(
+            "=" + "".join(gaps[kind].format(8 * (1 + (ndim or 0))) for _, kind, ndim in places)
+        )
+        self.floats = [kind is float for _, kind, _ in places if kind is not np.ndarray]
+        self.kinds: set[tuple[type, ...]] = set()  # of numbers that are as in the example
+        self.objects = struct.Struct(f"={len(arrays)}q")
+        self.memory = ctypes.c_int64 * (size + len(arrays))
+        self.after, self.count = 8 * size, len(arrays)
         kinds = [id(x.dtype) for x in self.of_arrays(example)]
         #: (arrays, 3) first word, dimensions, address of the type of the numbers.
         self.asked = np.array(
-            [[k, n, kind] for k, (_, n), kind in zip(first, self.arrays, kinds, strict=True)], dtype=np.int64
+            [[k, n, kind] for (_, k), (_, n), kind in zip(arrays, self.arrays, kinds, strict=True)], dtype=np.int64
         ).reshape(-1, 3)  # fmt: skip
-        self.size = int(starts[-1])
         self.asked_at = self.asked.__array_interface__["data"][0]
         #: Whether `gathered` finds what `_flatten` finds: else arrays are not laid out as expected there.
         self.known = (found := self.gathered(example)) is not None and (
-            found.words.tobytes() == self.code.pack(*words)
+            bytes(found.words)[: 8 * size] == self.code.pack(*words)
         )
 
     def gathered(self, x: Any) -> Packed | None:
         """The words of a named tuple; None if a number or array is not as in the example."""
-        arrays = self.of_arrays(x)
-        floats, integers = self.of_floats(x), self.of_integers(x)
-        if (
-            not _gather
-            or set(map(type, arrays)) != _ARRAYS
-            or not _FLOATS.issuperset(map(type, floats))
-            or not _FLOATS.isdisjoint(map(type, integers))
-        ):
+        arrays, numbers = self.of_arrays(x), self.of_numbers(x)
+        kinds = tuple(map(type, numbers))
+        if kinds not in self.kinds:
+            if np.bool_ in kinds or [isinstance(x, float) for x in numbers] != self.floats:
+                return None
+            self.kinds.add(kinds)
+        if not _gather or set(map(type, arrays)) != _ARRAYS:
             return None
-        words = np.empty(self.size + len(arrays), dtype=np.int64)
-        words[self.size :] = [*map(id, arrays)]
-        at = words.__array_interface__["data"][0]
-        if _gather[0](at + 8 * self.size, len(arrays), self.asked_at, at):
+        words = self.memory()
+        at = ctypes.addressof(words)
+        self.numbers.pack_into(words, 0, *numbers)
+        self.objects.pack_into(words, self.after, *map(id, arrays))
+        if _gather[0](at + self.after, self.count, self.asked_at, at):
             return None
-        if floats:
-            words.view(np.float64)[self.floats] = floats
-        if integers:
-            words[self.integers] = integers
-        return Packed(x, words[: self.size], at)
+        return Packed(x, words, at)
 
 
 def _places(x: Any, prefix: str) -> Iterator[tuple[str, type, int | None]]:
@@ -174,8 +175,8 @@ def pack(x: Any) -> Packed:
         raise TypeError(
             f"this {type(x).__name__} has arrays or numbers of types that the kernel does not take"
         )
-    words = np.frombuffer(layout.code.pack(*values), dtype=np.int64)
-    return Packed(x, words, words.__array_interface__["data"][0])
+    words = (ctypes.c_int64 * (layout.code.size // 8)).from_buffer_copy(layout.code.pack(*values))
+    return Packed(x, words, ctypes.addressof(words))
 
 
 class _Last(threading.local):
