@@ -54,7 +54,7 @@ def second_order(white: Floats, step: float, tau: float) -> Floats:
     z[0] = np.tensordot(start, white[0], 1)
     rows, added = z.reshape(len(z), 2, -1), np.empty((2, z[0, 0].size))
     for before, after in pairwise(rows):
-        after += np.dot(A, before, out=added)
+        np.add(after, np.dot(A, before, out=added), out=after)
     return (math.sqrt(3.0) * z[:, 0] + (1.0 - math.sqrt(3.0)) * z[:, 1]) / math.sqrt(2.0)
 
 
