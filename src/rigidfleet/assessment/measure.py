@@ -21,7 +21,9 @@ from rigidfleet.assessment.outcome import (
 )
 from rigidfleet.formation import distance_geometry
 from rigidfleet.math import attitude as att
-from rigidfleet.math import proximity, rigid_body
+from rigidfleet.math import proximity, rigid_body, splines
+from rigidfleet.math.bernstein import bernstein
+from rigidfleet.math.bernstein import greatest as extreme_of
 from rigidfleet.math.constraint_jacobian import jacobian
 from rigidfleet.result import PAD, PhaseRecord, Result
 from rigidfleet.typing import Bools, Floats, Ints
@@ -37,6 +39,9 @@ _SLACK = {"separation": 0.0, "clearance": 0.0, "speed": 1e-9}
 
 #: Greatest size of slots, in bytes, whose shape is cached for the next phase or flight.
 _KEPT = 100_000
+
+#: About so many curves are compared together.
+_TOGETHER = 100_000
 
 #: Greatest number of agents for which a wrong shape is tested for rigidity.
 _JUDGED = 200
@@ -260,6 +265,36 @@ class Measurements:
             return self.between(name, index)
         return None if rank == -math.inf else self.worst_sample(quantity, self.samples[index])
 
+    def greatest(self, order: int, size: Callable[[Floats], Floats]) -> Extreme | None:
+        """Greatest convex ``size`` of velocities (order 1) or accelerations (2) between samples; None if unknown.
+
+        Of a trajectory that others made, it is that of its curves. Of a flight, it is that of the polynomials of degree
+        7 through position, velocity, acceleration and jerk of its samples.
+        """
+        result = self.result
+        motion = result.motion(flown="interpolation" not in result.statistics)
+        time, state = motion.time, np.where(self.left[:, None, :, None], motion.state, np.nan)
+        state = state.swapaxes(0, 1)  # (4, K, N, 3)
+        apart = np.flatnonzero(np.nextafter(time[:-1], np.inf) < time[1:])
+        n, worst, at = result.n_agents, None, (0.0, 0)
+        for k in np.array_split(apart, 1 + len(apart) * n // _TOGETHER):
+            h = time[k + 1] - time[k]
+            pieces = splines.hermite(h, *(state[:, k + i] for i in (0, 1)))
+            power = np.arange(pieces.shape[-1])
+            factor = power if order == 1 else power * (power - 1)
+            points = bernstein(
+                (pieces * factor)[..., order:].reshape(len(k) * n, 3, -1), np.repeat(h, n)
+            )
+            known = np.flatnonzero(np.isfinite(points).all(axis=(1, 2)))
+            found = extreme_of(points[known], size)
+            if found.curve >= 0 and (worst is None or found.value > worst):
+                i, who = divmod(int(known[found.curve]), n)
+                worst, at = found.value, (float(time[k[i]] + found.place * h[i]), who)
+        if worst is None:
+            return None
+        index = int(result.phase[np.searchsorted(time, at[0], side="right") - 1])
+        return Extreme(worst, at[0], self.agent(0, at[1]), result.phases[index].name)
+
     def below(self) -> Extreme | None:
         """Least height [m] between two agents, one below the other."""
         least, pair = proximity.headroom(
@@ -364,7 +399,8 @@ class Measurements:
         for index, phase in enumerate(result.phases):
             samples = self.samples[index]
             if samples.stop > samples.start and phase.extremes:
-                due = ["speed", "lowest", "highest", "thrust"]
+                due = ["speed", "lowest", "highest"]
+                due += ["thrust"] if np.isfinite(self.thrust[samples]).any() else []
                 due += ["separation"] if self.left[samples.start].sum() > 1 else []
                 due += ["clearance"] if self.mission.obstacles else []
                 due += ["geofence"] if self.mission.limits.geofence is not None else []

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import comb
 from typing import NamedTuple
 
 import numpy as np
@@ -42,6 +41,18 @@ class Curve(NamedTuple):
     def later(self, start: float) -> Curve:
         """The same way, begun later [s]."""
         return Curve(self.time + start, self.pieces)
+
+    def cut(self, start: float, end: float) -> Curve:
+        """The part of the way from a start to an end [s] within it."""
+        first = int(np.searchsorted(self.time, start, side="right")) - 1
+        last = int(np.searchsorted(self.time, end, side="left"))
+        time = np.concatenate([[start], self.time[first + 1 : last], [end]])
+        pieces = self.pieces[first:last].copy()
+        moved = series.of_polynomials(
+            pieces[:1], np.array([start - self.time[first]]), pieces.shape[2]
+        )
+        pieces[:1] = np.moveaxis(moved, 0, -1)
+        return Curve(time, pieces)
 
 
 @dataclass(frozen=True)
@@ -200,26 +211,6 @@ def _with_yaw(position: Floats, yaw: Floats) -> Floats:
     """Pieces (n, 4, P) of positions (n, 3, P) and yaws (n, 1, 4)."""
     powers = position.shape[2]
     return np.concatenate([position, np.pad(yaw, ((0, 0), (0, 0), (0, powers - 4)))], axis=1)
-
-
-def bernstein(pieces: Floats, duration: Floats) -> Floats:
-    """Bernstein coefficients (n, ..., P), or control points, of pieces (n, ..., P) of durations (n,) [s]."""
-    powers = pieces.shape[-1]
-    scaled = pieces * duration.reshape(-1, *(1,) * (pieces.ndim - 1)) ** np.arange(powers)
-    return scaled @ _to_bernstein(powers).T
-
-
-def of_bernstein(points: Floats, duration: float) -> Floats:
-    """Coefficients (P,) in ascending powers of time of a piece with control points (P,) and a duration [s]."""
-    powers = len(points)
-    return np.linalg.solve(_to_bernstein(powers), points) / duration ** np.arange(powers)
-
-
-def _to_bernstein(powers: int) -> Floats:
-    """The matrix of Bernstein coefficients b_i = sum_k C(i, k) / C(P - 1, k) a_k on [0, 1]."""
-    return np.array(
-        [[comb(i, k) / comb(powers - 1, k) for k in range(powers)] for i in range(powers)]
-    )
 
 
 def through(time: Floats, states: Floats, yaw: Floats | None = None) -> Curve:

@@ -164,7 +164,7 @@ def _straight(s: Floats, g: Floats) -> Floats:
 
 
 def _bowed(s: Floats, g: Floats) -> Floats:
-    """Control points (M + 3, N, 3) of ways that all keep to the right: seen from above, half an ellipse about the middle.
+    """Control points (M + 3, N, 3) of ways that all keep to the right, seen from above on half an ellipse.
 
     Where each vehicle goes to the opposite place of a circle, this is half a turn of them all.
     """
