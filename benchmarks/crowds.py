@@ -70,8 +70,10 @@ def kernel(n: int, **given: Any) -> tuple[Any, ...]:
     flight = fleet.flight(vehicles, start=0.0, h=PERIOD, steps=1)
     work = workspace(n, 0)
     state = fleet.begin(flight, np.zeros((n, fleet.STATES)), work)
+    given = {"radius": 0.5 * APART} | given
+    radius = given.pop("radius") * mass
     a = avoidance(
-        period=PERIOD, b=THRUST * mass, lift=THRUST * mass, mass=mass, g=0.0, radius=0.5 * APART * mass, **given,
+        period=PERIOD, b=THRUST * mass, lift=THRUST * mass, mass=mass, g=0.0, radius=radius, **given,
     )  # fmt: skip
     return problem, work, flight, state, a
 

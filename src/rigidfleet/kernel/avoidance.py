@@ -40,7 +40,8 @@ class Sight(NamedTuple):
     noise: float  # standard deviation of a measured place along each axis [m]
     swerve: float  # acceleration of obstacles that is reckoned with [m/s^2]
     normals: Floats  # (D,) standard normal numbers, taken in turn
-    ball: Floats  # (B,) radius of a ball that holds the obstacle [m]
+    centre: Floats  # (B, 3) middle of a ball that holds the obstacle, where it stands [m]
+    ball: Floats  # (B,) its radius [m]
     known: Ints  # (B,) see `UNKNOWN`
     track: Floats  # (B, 6) estimated displacement [m] and velocity [m/s]
     spread: Floats  # (B, 3) variance of place, covariance of place and velocity, variance of velocity, of each axis
@@ -58,19 +59,25 @@ def sight(
     count = len(solids.kind)
     moves = solids.last[:count, 3] > solids.first[:count, 3]
     drawn = np.random.default_rng(seed).standard_normal(_DRAWS) if noise else np.zeros(1)
-    reaches = [np.inf if solids.kind[o] == HEIGHTS else _ball(solids, o) for o in range(count)]
+    centre, radius = np.zeros((count, 3)), np.zeros(count)
+    for o in range(count):
+        centre[o], radius[o] = _ball(solids, o)
     return Sight(
         moves=moves.astype(np.int64), reach=float(reach), noise=float(noise), swerve=float(swerve), normals=drawn,
-        ball=np.array(reaches, dtype=float), known=np.full(count, UNKNOWN), track=np.zeros((count, 6)),
+        centre=centre, ball=radius, known=np.full(count, UNKNOWN), track=np.zeros((count, 6)),
         spread=np.zeros((count, 3)), bound=np.zeros((count, 2)),
     )  # fmt: skip
 
 
-def _ball(solids: Solids, o: int) -> float:
-    size = solids.size[o]
+def _ball(solids: Solids, o: int) -> tuple[Floats, float]:
+    """Middle (3,) and radius [m] of a ball that holds obstacle o; the radius of a ground or terrain is infinite."""
+    size, origin = solids.size[o], solids.origin[o]
     if solids.kind[o] == CYLINDER:
-        return float(np.hypot(size[0], size[1]))
-    return float(0.5 * np.linalg.norm(size[3:] - size[:3]) + solids.rounding[o])
+        return origin, float(np.hypot(size[0], size[1]))
+    if solids.kind[o] == HEIGHTS or not np.isfinite(size).all():
+        return origin, math.inf
+    half = float(0.5 * np.linalg.norm(size[3:] - size[:3]))
+    return origin + 0.5 * (size[:3] + size[3:]) @ solids.turn[o], half + float(solids.rounding[o])
 
 
 class Avoidance(NamedTuple):
@@ -113,6 +120,7 @@ class Avoidance(NamedTuple):
     far: Floats  # (N,) distance from its position that a vehicle cannot leave in the tick and by braking after it [m]
     walls: Floats  # (N, B) distance of the stop segment from an obstacle to keep [m]
     threat: Ints  # (N,) the obstacle that moves and leaves the least room, -1 if all leave enough
+    late: Floats  # (N,) by which its stop segment comes nearer than it should to this obstacle, negative [m]
     shifted: (
         Floats  # (4, 3) work: a way relative to an obstacle that moves, and the relative velocity
     )
@@ -184,7 +192,7 @@ def avoidance(
         known=np.zeros((3, n, 3)), wanted=np.zeros((n, 3)), shift=np.zeros((n, 3)),
         chosen=np.zeros((n, 3)), rise=np.zeros((n, 3)), ways=np.zeros((n, 4, 3)),
         far=np.zeros(n), walls=np.zeros((n, count)), threat=np.full(n, -1),
-        shifted=np.zeros((4, 3)), trial=np.zeros((5, 3)), normal=np.zeros(3),
+        late=np.zeros(n), shifted=np.zeros((4, 3)), trial=np.zeros((5, 3)), normal=np.zeros(3),
         rows=np.zeros((rows, 2), dtype=np.int64), normals=np.zeros((rows, 3)), needed=np.zeros(rows),
         push=np.zeros(rows), most=np.zeros(rows), hold=np.ones(n), pull=np.zeros(edges),
         system=np.zeros((EXACT, EXACT)), right=np.zeros(EXACT), active=np.zeros(EXACT, dtype=np.int64),

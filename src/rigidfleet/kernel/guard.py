@@ -23,6 +23,7 @@ from rigidfleet.kernel.moving import (
     braking_beside,
     follow_flow,
     look,
+    miss,
     need_beside,
     present,
     room_beside,
@@ -35,6 +36,8 @@ from rigidfleet.kernel.segments import between_segments, from_obstacle, from_sol
 #: Neighbours are listed for speeds higher by this share and summand [m/s], and for ways of this share of their
 #: distance, or this way [m].
 _FASTER, _LEAST_SPEED, _NEARER, _LEAST_WAY = 0.25, 0.2, 0.15, 0.2
+#: Shortfall beside an obstacle that moves from which a vehicle evades as well as it can [m].
+_LATE = 0.05
 #: Shortfall of a distance to keep that counts as rounding [m].
 _ROUNDING = 1e-9
 
@@ -336,10 +339,11 @@ def set_floors(t, r, v, lost, a):
                 a.floor[e] = min(need, found)
                 if i < j:
                     note(PAIR, found - a.room[i] - a.room[j], t, i, j, a)
-        a.threat[i], closest = -1, 0.0
+        a.threat[i], a.late[i], closest = -1, 0.0, 0.0
         for o in range(a.solids.kind.shape[0]):
             if a.sight.moves[o] != 0:
                 closest = set_floor_beside(t, i, o, r[i], v[i], closest, a)
+                a.late[i] = closest
                 continue
             need = a.reach[i] + a.spare[i]
             apart = from_solid(r[i, 0], r[i, 1], r[i, 2], o, a.solids, a.normal) - a.far[i]
@@ -380,10 +384,12 @@ def propose(i, k, v, a, c):
 
 
 @compiled
-def room_of_braking(i, r, v, a):
-    """By how much vehicle i keeps its distances from obstacles that move if it brakes [m]."""
+def room_if_braking(i, r, v, late, a):
+    """What `choose` compares of vehicle i, if it brakes [m]."""
     c = a.trial[3]
     brake(i, v[i], a, c)
+    if late:
+        return miss(r[i], v[i], c, a)
     predict(i, r[i], v[i], c, a, a.trial)
     return room_beside(i, v[i], a)
 
@@ -393,10 +399,12 @@ def choose(i, r, v, a):
     """Choose for vehicle i: what it wants, else the nearest safe candidate, else braking; returns which.
 
     0 means what it wants, 1 a candidate, 2 braking. Obstacles that move can leave no safe candidate and make braking
-    unsafe, too: then the one counts that keeps all else and has the most room beside them.
+    unsafe, too: then the one counts that keeps all else and has the most room beside them. Where a vehicle could
+    not brake in time any more, the one counts that misses them most, held.
     """
     wanted, c, best, found = a.wanted[i], a.trial[3], math.inf, -1
     most, second = -math.inf, -1
+    late = a.threat[i] >= 0 and a.late[i] < -_LATE
     for k in range(a.candidates.shape[0] + (2 if a.threat[i] >= 0 else 1)):
         propose(i, k, v[i], a, c)
         away = 0.0
@@ -407,8 +415,8 @@ def choose(i, r, v, a):
         far = predict(i, r[i], v[i], c, a, a.trial)
         if not safe(i, r, v, far, a):
             continue
-        room = room_beside(i, v[i], a)
-        if room < 0.0:
+        room = miss(r[i], v[i], c, a) if late else room_beside(i, v[i], a)
+        if late or room < 0.0:
             if room > most:
                 most, second = room, k
             continue
@@ -417,7 +425,7 @@ def choose(i, r, v, a):
             take(i, far, a)
             return 0
     if found < 0:
-        if second < 0 or room_of_braking(i, r, v, a) >= most:
+        if second < 0 or room_if_braking(i, r, v, late, a) >= most:
             return 2
         found = second
     propose(i, found, v[i], a, c)
@@ -461,7 +469,7 @@ def avoid(p, w, flight, state, a):
             r[i, q] = state.seen[i, q] + path_at(k, i, q, flight.tables)
             v[i, q] = state.seen[i, 3 + q] + path_at(k, i, 3 + q, flight.tables)
         want(i, state, a)
-    look(t, k, r, lost, a)
+    look(t, r, lost, a)
     led = False
     if a.flow:
         for i in range(n):

@@ -27,6 +27,8 @@ _FIRST, _SURE = 10.0, 0.5
 _LASTS = 1.0
 #: Standard deviation of its place with which an obstacle out of sight is forgotten [m].
 _FORGET = 1.0
+#: Longest time [s] and number of times at which a miss is looked for.
+_FARTHEST, _LOOKS = 3.0, 12
 #: Least share of its braking that a vehicle is taken to have relative to an obstacle.
 _LEAST = 0.1
 #: Rate at which flow leads a vehicle's velocity [1/s], its radius over that of the obstacle with the vehicle, and the
@@ -97,9 +99,10 @@ def see(o, k, x, y, z, u, v, w, a):
 
 
 @compiled
-def look(t, k, r, lost, a):
-    """Bring what is known of all obstacles that move to t [s], at tick k; true positions r (N, 3)."""
+def look(t, r, lost, a):
+    """Bring what is known of all obstacles that move to t [s], with vehicles at r (N, 3)."""
     s, T = a.sight, a.period
+    k = int(t / T + 0.5)
     for o in range(s.moves.shape[0]):
         if s.moves[o] == 0:
             continue
@@ -208,6 +211,33 @@ def room_beside(i, v, a):
             lift += normal[q] * way[4, q]
         room = min(room, least_along(value - share * along, rate, min(lift, lift * E), T) - floor)
     return room
+
+
+@compiled
+def miss(r, v, c, a):
+    """By how much a vehicle at r with v (3,) misses all obstacles that move [m], if it holds an acceleration c (3,).
+
+    That is the least distance of its centre at some times, up to twice that of the nearest approach without c.
+    """
+    least = math.inf
+    for o in range(a.sight.moves.shape[0]):
+        if a.sight.moves[o] == 0 or a.sight.known[o] != KNOWN:
+            continue
+        x, w = a.sight.track[o], a.shifted[3]
+        nearing = fast = 0.0
+        for q in range(3):
+            w[q] = v[q] - x[3 + q]
+            nearing -= (r[q] - x[q] - a.sight.centre[o, q]) * w[q]
+            fast += w[q] * w[q]
+        until = min(2.0 * nearing / max(fast, 1e-12), _FARTHEST)
+        for k in range(1, _LOOKS + 1):
+            t = max(until, a.period) * k / _LOOKS
+            away = from_solid(
+                r[0] - x[0] + t * (w[0] + 0.5 * t * c[0]), r[1] - x[1] + t * (w[1] + 0.5 * t * c[1]),
+                r[2] - x[2] + t * (w[2] + 0.5 * t * c[2]), o, a.solids, a.normal,
+            )  # fmt: skip
+            least = min(least, away)
+    return least
 
 
 # -- flow ----------------------------------------------------------------------------------------------
