@@ -34,6 +34,8 @@ RADIUS, BALL, COURSE, EDGE = 0.3, 0.7, 24.0, 3.0
 RANGE, NOISE = 10.0, 0.05
 #: The criterion: share of the acceleration, for how long [s], what to keep [m], for how long [s].
 SHARE, HELD, SPARE, AHEAD = 0.6, 1.5, 0.1, 6.0
+#: Distance of centres below which distances are taken [m].
+NEAR = 1.5
 #: Methods: what `kernel.avoidance.avoidance` is asked for.
 METHODS = {
     "flow": {"flow": True, "guarded": False, "filtered": False},
@@ -127,10 +129,10 @@ def fly(given: Scene, method: str) -> Flown:
         seen=sight(things, RANGE, NOISE, 0.2), **METHODS[method],
     )  # fmt: skip
     r, v = given.slots.copy(), np.zeros((n, 3)) + [given.speed, 0.0, 0.0]
-    own, other = np.triu_indices(n, 1), np.divmod(np.arange(2 * n), 2)
-    across = other[0], n + other[1]
+    own, other = np.triu_indices(n, 1)
+    across = np.repeat(np.arange(n), 2), n + np.tile([0, 1], n)
     nearest, apart, cost, ticks = np.inf, np.inf, 0.0, 0
-    rest, arrived = np.zeros((2, 3)), np.inf
+    goal, rest, arrived = given.slots + [COURSE, 0.0, 0.0], np.zeros((2, 3)), np.inf
     for k in range(int((COURSE / given.speed + 12.0) / PERIOD)):
         t = k * PERIOD
         state.seen[:, :3], state.seen[:, 3:] = r, v
@@ -143,18 +145,33 @@ def fly(given: Scene, method: str) -> Flown:
         ticks += 1
         c = state.force.copy()
         assert (c * c).sum(axis=1).max() <= THRUST**2 * (1 + 1e-9)
-        r_all = np.concatenate([r, given.place + t * given.velocity])
-        v_all, c_all = np.concatenate([v, given.velocity]), np.concatenate([c, rest])
-        nearest = min(nearest, least_distance(r_all, v_all, c_all, across))
-        if n > 1:
-            apart = min(apart, least_distance(r, v, c, own))
+        place = given.place + t * given.velocity
+        if ((r[:, None] - place) ** 2).sum(axis=2).min() < NEAR**2:
+            both = np.concatenate([r, place]), np.concatenate([v, given.velocity])
+            nearest = min(nearest, least_distance(*both, np.concatenate([c, rest]), across))
+        if n > 1 and ((r[own] - r[other]) ** 2).sum(axis=1).min() < NEAR**2:
+            apart = min(apart, least_distance(r, v, c, (own, other)))
         r, v = r + v * PERIOD + 0.5 * c * PERIOD**2, v + c * PERIOD
-        goal = given.slots + [COURSE, 0.0, 0.0]
         if given.speed * t > COURSE and np.linalg.norm(r - goal, axis=1).max() < 0.3:
             arrived = t
             break
     assert a.count[TICKS] == ticks
     return Flown(nearest - RADIUS - BALL, apart - 2 * RADIUS, arrived, 1e6 * cost / (ticks * n))
+
+
+def row(n: int, speeds: tuple[float, float], count: int, seed: int, method: str) -> str:
+    """A row of the table."""
+    scenes = [scene(n, *speeds, seed + k) for k in range(count)]
+    fit = np.array([feasible(each) for each in scenes])
+    flown = [fly(each, method) for each in scenes]
+    least = np.array([min(x.obstacle, x.pair) for x in flown])
+    late, hit = np.array([x.arrived for x in flown]), least < 0.0
+    closest = f"{least[fit].min():.3f}" if least[fit].min() < np.inf else "-"
+    return (
+        f"| {n} | {speeds[0]:g} | {speeds[1]:g} | {fit.sum()} of {count} | {method} | {(hit & fit).sum()} |"
+        f" {(hit & ~fit).sum()} | {closest} | {100 * np.isfinite(late[fit]).mean():.1f} % |"
+        f" {np.median(late[fit]):.1f} | {np.median([x.cost for x in flown]):.1f} |"
+    )
 
 
 def main() -> None:
@@ -170,21 +187,9 @@ def main() -> None:
     )
     print("|---" * 11 + "|")
     for n in (1, 8):
-        for speed, fastest in SPEEDS:
-            scenes = [scene(n, speed, fastest, chosen.seed + k) for k in range(chosen.scenes)]
-            fit = np.array([feasible(each) for each in scenes])
+        for speeds in SPEEDS:
             for method in METHODS:
-                flown = [fly(each, method) for each in scenes]
-                least = np.array([min(x.obstacle, x.pair) for x in flown])
-                late = np.array([x.arrived for x in flown])
-                hit = least < 0.0
-                print(
-                    f"| {n} | {speed:g} | to {fastest:g} | {fit.sum()} of {len(fit)} | {method} |"
-                    f" {(hit & fit).sum()} | {(hit & ~fit).sum()} | {least[fit].min():.3f} |"
-                    f" {100 * np.isfinite(late[fit]).mean():.1f} % | {np.median(late[fit]):.1f} |"
-                    f" {np.median([x.cost for x in flown]):.1f} |",
-                    flush=True,
-                )
+                print(row(n, speeds, chosen.scenes, chosen.seed, method), flush=True)
 
 
 if __name__ == "__main__":
