@@ -1,10 +1,13 @@
-"""Crowds under bounded thrust: antipodal swaps by barriers and guard alone, and what both cost.
+"""Crowds under bounded thrust: antipodal swaps by barriers and guard alone, and by a plan, and what both cost.
 
 Every vehicle flies straight for the opposite place, as fast as it may, and knows nothing of a plan. Its acceleration
 is at most 5 m/s^2. Distances are the least in continuous time: commands are held, so that each relative path is a
 parabola between ticks. Costs are processor time.
 
-    python benchmarks/crowds.py [--runs 20] [--seed 0]
+By the plan, ways of all are found together and proved (`rigidfleet.planning.transfers`), with limits of each axis that
+keep speed and acceleration within the same in every direction.
+
+    python benchmarks/crowds.py [--runs 20] [--planned 1] [--seed 0]
 """
 
 from __future__ import annotations
@@ -22,6 +25,7 @@ from rigidfleet.kernel.engine import native, sampled
 from rigidfleet.kernel.problem import graph, workspace
 from rigidfleet.planning.plan import plan_phase
 from rigidfleet.planning.reference import PhaseState
+from rigidfleet.planning.transfers import least_duration, transfer
 from rigidfleet.typing import Floats
 
 #: Greatest acceleration and speed, what centres are to keep, period of the commands.
@@ -31,6 +35,10 @@ SWAPS = (
     (10, 4.0, False, 60.0), (10, 4.0, True, 60.0), (30, 5.0, False, 60.0), (30, 6.0, True, 60.0),
     (100, 8.0, False, 60.0),
 )  # fmt: skip
+
+
+#: Swaps by the plan: number of vehicles, radius [m], whether it is a ring.
+PLANNED = ((30, 5.0, False), (100, 8.0, False), (100, 14.0, True))
 
 
 class Swap(NamedTuple):
@@ -150,6 +158,22 @@ def swap(
     )  # fmt: skip
 
 
+def planned(n: int, radius: float, *, ring: bool, seed: int) -> tuple[float, float, float]:
+    """Proved distance [m], makespan as a multiple of the slowest vehicle's alone, and planning time [s] of a swap."""
+    s = places(n, radius, ring=ring, rng=np.random.default_rng(seed))
+    box = np.full(3, radius + 3.0)
+    speed, acceleration = SPEED / 3**0.5, THRUST / 3**0.5
+    begun = time.process_time()
+    found = transfer(
+        s, -s, distance=APART, speed=speed, acceleration=acceleration, box=(-box, box), seed=seed
+    )
+    took = time.process_time() - begun
+    if found is None:
+        return 0.0, np.inf, took
+    alone = least_duration(s, -s, speed, acceleration)
+    return found.certificate.separation, found.duration / alone, took
+
+
 def layers(n: int = 30, repeats: int = 5) -> tuple[float, float, float]:
     """Processor time of call, filter and guard [us] per vehicle and tick, at the states of a swap in space."""
     states: list[tuple[Floats, Floats]] = []
@@ -204,6 +228,7 @@ def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--runs", type=int, default=20, help="swaps of each kind")
+    parser.add_argument("--planned", type=int, default=1, help="swaps of each kind by the plan")
     parser.add_argument("--seed", type=int, default=0)
     chosen = parser.parse_args()
     native.avoiding()
@@ -225,6 +250,20 @@ def main() -> None:
             f" {100 * np.mean([run.barrier for run in runs]):.0f} % |"
             f" {100 * np.mean([run.guard for run in runs]):.0f} % |"
             f" {np.median([run.cost for run in runs]):.2f} us |",
+            flush=True,
+        )
+    print("\n| swap by the plan | least distance proved (0.5) | arrive | makespan | planning |")
+    print("|---|---|---|---|---|")
+    for n, radius, ring in PLANNED:
+        seeds = range(chosen.seed, chosen.seed + chosen.planned)
+        found = [planned(n, radius, ring=ring, seed=seed) for seed in seeds]
+        proved = [x for x in found if x[0] >= APART]
+        least = f"{min(x[0] for x in proved):.3f} m" if proved else "-"
+        slow = f"{max(x[1] for x in proved):.2f}" if proved else "-"
+        print(
+            f"| {n} {'on a ring' if ring else 'in space'} | {least} |"
+            f" {100 * len(proved) / max(len(found), 1):.0f} % of {len(found)} | {slow} |"
+            f" {np.median([x[2] for x in found]) if found else 0.0:.0f} s |",
             flush=True,
         )
     call, barrier, guard = layers()

@@ -211,7 +211,7 @@ def test_new_writes_a_show_of_files_and_words(tmp_path, monkeypatch):
         (["--show", "--spacing", "nan"], "positive"),
         (["--show", "--shape", "cube"], "no effect on a show"),
         (["--formations", "cube"], "add --show"),
-        (["--show", "--formations", "two.csv", "--agents", "5"], "cannot place 5 agents"),
+        (["--show", "--formations", "one.csv", "--agents", "5"], "a single point has no spacing"),
         (["--show", "--formations", "nan.csv"], "is not finite"),
     ],
     ids=str,
@@ -220,6 +220,7 @@ def test_shows_that_cannot_be(tmp_path, monkeypatch, capsys, asked, words):
     """One clear error, and no file."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "two.csv").write_text("0,0,0\n3,0,0\n")
+    (tmp_path / "one.csv").write_text("0,0,0\n")
     (tmp_path / "nan.csv").write_text("0,0,0\n3,0,nan\n")
     assert main(["new", "bad", *asked, "--quiet"]) != 0
     assert words in " ".join(capsys.readouterr().err.split())

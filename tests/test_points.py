@@ -2,15 +2,16 @@
 
 import hashlib
 import struct
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
-from rigidfleet import Result, load_mission, simulate
+from rigidfleet import Result, assess, load_mission, simulate
 from rigidfleet.cli.app import main
 from rigidfleet.errors import MissionError
-from rigidfleet.formation import outlines
+from rigidfleet.formation import outlines, shapes
 from rigidfleet.formation.point_files import read_points
 from rigidfleet.mission import Mission
 
@@ -311,3 +312,98 @@ def test_wrong_colours_of_formations(folder):
         (folder / "m.toml").write_text(text.format(colour))
         with pytest.raises(MissionError, match=message):
             load_mission(folder / "m.toml")
+
+
+def fleet(n: int, **form: Any) -> dict[str, Any]:
+    """A mission of n vehicles in a row that take a formation, each the slot for which all ways are shortest."""
+    return {
+        "schema_version": 1, "name": "resting", "assignment": "each", "limits": {"separation": 0.3},
+        "agents": {"mass": 1.0, "position": [[2.0 * i, 0.0, 5.0] for i in range(n)]},
+        "formations": {"some": {"edges": []} | form},
+        "phases": [{"kind": "establish", "formation": "some", "control": "tracking", "duration": 12.0, "blend": 10.0}],
+    }  # fmt: skip
+
+
+def written_slots(mission: Mission, name: str) -> np.ndarray:
+    """The slots of a formation that has them as numbers."""
+    slots = mission.formations[name].slots
+    assert slots is not None
+    return np.array(slots)
+
+
+@pytest.mark.parametrize(("n", "k"), [(7, 3), (10, 4), (40, 9)])
+def test_vehicles_without_a_slot_rest_at_the_sides(n, k):
+    """They wait mirrored at the middle, no nearer than the slots are to each other, and dark; the flight passes."""
+    rng = np.random.default_rng(n)
+    slots = np.unique(rng.integers(-3, 4, (400, 3)), axis=0)
+    slots = 1.5 * slots[rng.permutation(len(slots))[:k]]
+    mission = Mission.from_dict(fleet(n, slots=slots.tolist(), rest="sides", colour="#ff0000"))
+    every = written_slots(mission, "some")
+    np.testing.assert_array_equal(every[:k], slots)
+    off = every[k:] - slots.mean(axis=0)
+    pairs = (n - k) // 2
+    np.testing.assert_allclose(off[: 2 * pairs : 2], -off[1 : 2 * pairs : 2], atol=1e-12)
+    step = neighbours(slots).min()
+    assert neighbours(every).min() >= step - 1e-9
+    assert (abs(off[:, 0]) > abs(slots[:, 0] - slots[:, 0].mean()).max() + step).all()
+    colours = mission.formation_colours("some")
+    assert colours is not None
+    assert colours.count("#ff0000") == k
+    assert colours.count("#000000") == n - k
+    result = simulate(mission)
+    assert assess(result).passed
+    # What is written is what was flown: the mission repeats from its text.
+    assert (
+        Mission.from_toml(result.mission.text).formations["some"].slots
+        == mission.formations["some"].slots
+    )
+
+
+def test_vehicles_rest_at_given_places():
+    """A shape of fewer vehicles, and a place for each of the others."""
+    rest = [[9.0, 0.0, 0.0], [-9.0, 0.0, 0.0]]
+    mission = Mission.from_dict(fleet(6, shape="square", size=3.0, agents=4, rest=rest))
+    slots = written_slots(mission, "some")
+    np.testing.assert_array_equal(slots[4:], rest)
+    np.testing.assert_array_equal(slots[:4], shapes.slots("square", 3.0, 4))
+
+
+@pytest.mark.parametrize(
+    ("form", "message"),
+    [
+        ({"slots": [[0, 0, 0], [3, 0, 0]]}, "2 slots for 6 agents\n    .*rest = 'sides'"),
+        ({"slots": [[0, 0, 0], [3, 0, 0]], "rest": [[9, 0, 0]]}, "1 places for the 4 agents"),
+        ({"slots": [[0, 0, 0]], "rest": "sides"}, "needs two or more slots"),
+        ({"slots": [[0, 0, 0], [3, 0, 0]], "rest": "below"}, "rest"),
+        ({"shape": "square", "size": 3.0, "agents": 4}, "no effect without rest"),
+        ({"shape": "square", "size": 3.0, "rest": "sides"}, "rest = 'sides': needs slots"),
+        ({"shape": "square", "size": 3.0, "agents": 9, "rest": "sides"}, "more than the 6 agents"),
+        ({"shape": "square", "size": 3.0, "agents": 5, "rest": "sides"}, "square"),
+    ],
+)
+def test_wrong_rests(form, message):
+    """What cannot rest says so."""
+    with pytest.raises(MissionError, match=message):
+        Mission.from_dict(fleet(6, **form))
+
+
+def test_a_show_of_fewer_points_than_vehicles(tmp_path, monkeypatch, capsys):
+    """`new --show` lets the vehicles rest for which a file has no points, and the show passes."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "logo.csv").write_text("".join(f"{2.5 * k},0,{k % 2}\n" for k in range(9)))
+    asked = [
+        "new",
+        "s",
+        "--show",
+        "--agents",
+        "16",
+        "--spacing",
+        "2",
+        "--formations",
+        "logo.csv,sphere",
+    ]
+    assert main(asked) == 0
+    assert 'rest = "sides"' in (tmp_path / "s.toml").read_text()
+    mission = load_mission(tmp_path / "s.toml")
+    assert written_slots(mission, "logo").shape == (16, 3)
+    assert assess(simulate(mission)).passed

@@ -107,3 +107,15 @@ def test_the_same_seed_finds_the_same_ways():
     still = transfer(start, start, **LIMITS)
     assert still is not None
     assert np.ptp(still.control, axis=0).max() < 1e-6
+
+
+def test_opposite_places():
+    """Vehicles on a circle that all go to the opposite place, and so would all meet in its middle, have proved ways."""
+    angle = 2.0 * np.pi * np.arange(16) / 16
+    s = 4.0 * np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
+    found = transfer(s, -s, distance=0.5, speed=1.7, acceleration=2.9, box=([-6.0] * 3, [6.0] * 3))
+    assert found is not None
+    assert found.certificate.separation >= 0.5
+    places = found.at(np.linspace(0.0, found.duration, 2001))
+    np.testing.assert_allclose(places[[0, -1]], [s, -s], atol=1e-12)
+    assert min(pdist(r).min() for r in places) >= found.certificate.separation - 1e-9

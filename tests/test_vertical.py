@@ -1,12 +1,14 @@
 """Take-off and landing: straight up and down, together, some vehicles, or one group after another."""
 
 import dataclasses
+import json
+import zipfile
 from typing import Any
 
 import numpy as np
 import pytest
 
-from rigidfleet import assess, check, simulate
+from rigidfleet import assess, check, export, simulate
 from rigidfleet.errors import MissionError
 from rigidfleet.mission import Mission
 from rigidfleet.planning.timing import timed
@@ -171,3 +173,49 @@ def test_without_ground():
     """Height is above the ground: a mission without one is refused."""
     with pytest.raises(MissionError, match="needs a ground"):
         mission(UP, obstacles=[])
+
+
+def test_motors_are_off_after_the_last_landing(tmp_path):
+    """A group that has landed may switch off at once; one that takes off again, or never lands, not."""
+    m = mission(
+        UP, DOWN | {"name": "some", "agents": [1, 2, 3]}, UP | {"name": "again", "agents": [3]},
+        DOWN | {"name": "last", "agents": [3, 4]},
+    )  # fmt: skip
+    result = simulate(m)
+    expected = [11.0, 11.0, 22.0, 22.0] + 5 * [np.inf]
+    np.testing.assert_allclose(result.motors_off, expected)
+    verdict = assess(result)
+    said = [c.message for c in verdict.checks if c.check == "touch_down"]
+    assert [text.split("; ")[1] for text in said] == ["4 vehicles may switch off"]
+    with zipfile.ZipFile(export(result, tmp_path / "show.skyc", "skyc").path) as show:
+        landings = [
+            json.loads(show.read(f"drones/agent-{i}/trajectory.json"))["landingTime"]
+            for i in range(1, 10)
+        ]
+    assert landings == pytest.approx(np.minimum(expected, 22.0))
+
+
+def test_a_landed_vehicle_is_disarmed(tmp_path):
+    """The last message to a vehicle that has landed is the command to disarm, with a right checksum."""
+    mavutil = pytest.importorskip("pymavlink.mavutil", reason="pymavlink: make .venv/.interchange")
+    result = simulate(
+        mission(UP, DOWN | {"agents": [1], "duration": 6.0}, UP | {"name": "two", "agents": [2]})
+    )
+    made = export(result, tmp_path / "logs", "tlog", rate=10.0)
+    assert made.span == (0.0, 16.0)
+    for agent, end in ((1, 11.0), (2, 16.0)):
+        log = mavutil.mavlink_connection(str(tmp_path / "logs" / f"agent-{agent}.tlog"))
+        messages = []
+        while (message := log.recv_match()) is not None:
+            messages.append(message)
+        log.close()
+        kinds = [message.get_type() for message in messages]
+        setpoints = [x for x in messages if x.get_type() == "SET_POSITION_TARGET_LOCAL_NED"]
+        assert setpoints[-1].time_boot_ms == 1e3 * end
+        if agent == 2:
+            assert {*kinds} == {"SET_POSITION_TARGET_LOCAL_NED"}
+            continue
+        last = messages[-1]
+        assert kinds.count("COMMAND_LONG") == 1
+        assert (last.command, last.param1, last.target_system) == (400, 0.0, 1)
+        assert last._timestamp == pytest.approx(end)

@@ -538,6 +538,30 @@ class Result:
         """Mask (K, N) of the agents that are not lost at the time of each sample."""
         return self.time[:, None] <= self.mission.lost_at
 
+    @cached_property
+    def motors_off(self) -> Floats:
+        """Time (N,) [s] from which each vehicle may have its motors off: the end of the landing after which it stays.
+
+        Infinity for a vehicle that does not end on the ground, or that got there without a landing.
+        """
+        from rigidfleet.mission import KINDS  # takes long to load
+
+        off = np.full(self.n_agents, np.inf)
+        ground = max(
+            (o.height for o in self.mission.obstacles if o.kind == "ground"), default=-np.inf
+        )
+        over = self.position[:, :, 2] - self.mission.fleet.radius - ground
+        down = self.left & (over <= PAD)
+        for i, phase in enumerate(self.phases):
+            k = self.samples(i).stop - 1
+            if (
+                KINDS[phase.kind].lands
+                and k >= self.samples(i).start
+                and self.time[k] >= phase.t_end
+            ):
+                off = np.where(down[k:].all(axis=0), np.minimum(off, self.time[k]), off)
+        return off
+
     def samples(self, phase: int) -> slice:
         """Slice of the samples of a phase; empty if the phase was not reached.
 

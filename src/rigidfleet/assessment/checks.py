@@ -259,6 +259,8 @@ def _touch_downs(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator
         words = (
             f"agent {worst + 1} touches down at {value(speed, 'm/s')} (limit {TOUCH_DOWN:g} m/s)"
         )
+        if (off := int(np.isfinite(measured.result.motors_off).sum())) > 0:
+            words += f"; {off} vehicle{'s' if off > 1 else ''} may switch off"
         passed = speed <= TOUCH_DOWN
         yield _at_end(
             p, "touch_down", passed, words, speed, TOUCH_DOWN, "m/s", who=f"agent {worst + 1}"

@@ -145,16 +145,19 @@ def _show(file: Path, asked: dict[str, Any], formations: str, spacing: float) ->
             scenes.append(show_draft.scene(word, agents, spacing))
             continue
         try:
-            name, points = points_of(word, agents, spacing=spacing)
-            own = points_of(word, None)[1] if path.suffix.lower() in _POINTS else points
+            own = points_of(word, None)[1] if path.suffix.lower() in _POINTS else None
+            count = agents if own is None else min(agents, len(own.slots))
+            name, points = points_of(word, count, spacing=spacing)
         except ValueError as error:
             raise ValueError(f"{word}: {error}") from None
         folder = file.parent.resolve()
         inside = path.suffix.lower() in _POINTS and path.resolve().is_relative_to(folder)
-        by_name = inside and len(own.slots) == agents
-        by_name = by_name and proximity.nearest(own.slots).min() >= spacing
-        source = path.resolve().relative_to(folder).as_posix() if by_name else word
-        points = own if by_name else points
+        source = word
+        by_name = own is not None and inside and len(own.slots) == count
+        if own is not None and by_name and proximity.nearest(own.slots).min() >= spacing:
+            source, points = path.resolve().relative_to(folder).as_posix(), own
+        else:
+            by_name = False
         scenes.append(show_draft.points_scene(name, points, source, by_name=by_name))
     return show_draft.show(
         file.stem, scenes, agents=agents, spacing=spacing, file=str(file), **asked

@@ -272,7 +272,9 @@ def _deviations(motion: Motion, chosen: Format, data: bytes, first: int) -> list
         return [Deviation(float(mavlink.to_segments(points, read).max()), math.nan, 0.0)]
     start = motion.start if chosen.own_time else 0.0
     return [
-        deviation(motion.knots(first + i).curve(), curve.later(start))
+        deviation(
+            motion.knots(first + i).curve(), curve.later(start), motion.result.motors_off[first + i]
+        )
         for i, curve in enumerate(read)
     ]
 

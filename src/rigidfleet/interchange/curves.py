@@ -298,8 +298,11 @@ class Deviation(NamedTuple):
     missing: float
 
 
-def deviation(source: Curve, written: Curve) -> Deviation:
-    """Greatest distance and difference of yaw between two ways, at five times in each interval of the source."""
+def deviation(source: Curve, written: Curve, until: float = np.inf) -> Deviation:
+    """Greatest distance and difference of yaw between two ways, at five times in each interval of the source.
+
+    After a time ``until`` [s] nothing is missing: the vehicle stands on the ground.
+    """
     h = np.diff(source.time)[:, None]
     after = (h * _COMPARED).ravel()
     t = (source.time[:-1, None] + h * _COMPARED).ravel()
@@ -307,7 +310,7 @@ def deviation(source: Curve, written: Curve) -> Deviation:
     there = t <= written.time[-1]
     off = written.at(t[there]) - wanted[there]
     turned = (off[:, 3] + np.pi) % (2.0 * np.pi) - np.pi
-    missing = max(0.0, float(source.time[-1] - written.time[-1]))
+    missing = max(0.0, float(min(source.time[-1], until) - written.time[-1]))
     far = float(np.sqrt((off[:, :3] ** 2).sum(axis=1).max(initial=0.0)))
     return Deviation(far, float(abs(turned).max(initial=0.0)), missing)
 

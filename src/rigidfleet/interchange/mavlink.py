@@ -1,8 +1,8 @@
 """MAVLink: a log of offboard setpoints (.tlog) for PX4 and ArduPilot, and QGroundControl plans.
 
-Sources: MAVLink's `common.xml` (messages 48 and 84), its packet format of version 1 with the checksum CRC-16/MCRF4XX,
-and QGroundControl's plan file format, version 1. Local axes are north, east, down: (N, E, D) = (y, x, -z), and yaw is
-clockwise from north.
+Sources: MAVLink's `common.xml` (messages 48, 76 and 84, command 400), its packet format of version 1 with the checksum
+CRC-16/MCRF4XX, and QGroundControl's plan file format, version 1. Local axes are north, east, down: (N, E, D) =
+(y, x, -z), and yaw is clockwise from north.
 """
 
 from __future__ import annotations
@@ -32,9 +32,13 @@ _RECORD = np.dtype(
     [("time", ">u8"), ("mark", "u1"), ("length", "u1"), ("sequence", "u1"), ("system", "u1"), ("component", "u1"),
      ("message", "u1"), ("fields", _FIELDS), ("checksum", "<u2")]
 )  # fmt: skip
-#: SET_GPS_GLOBAL_ORIGIN: number, extra byte, head and fields.
+#: Time and head of the record of another message.
+_HEAD = struct.Struct(">QBBBBBB")
+#: COMMAND_LONG: number, extra byte and fields; the command that arms (1) or disarms (0).
+_COMMAND, _COMMAND_EXTRA, _ARM_DISARM = 76, 152, 400
+_COMMAND_FIELDS = struct.Struct("<7fHBBB")
+#: SET_GPS_GLOBAL_ORIGIN: number, extra byte and fields.
 _ORIGIN, _ORIGIN_EXTRA = 48, 41
-_ORIGIN_RECORD = struct.Struct(">QBBBBBB")
 _ORIGIN_FIELDS = struct.Struct("<iiiB")
 _MARK, _STATION, _SYSTEMS = 0xFE, 255, 255
 _LOCAL_NED, _AUTOPILOT = 1, 1
@@ -46,27 +50,32 @@ def write_tlog(motion: Motion, rate: float | None) -> Iterator[bytes]:
     """One log a vehicle: at each time the message that asks for position, velocity, acceleration, yaw and yaw rate.
 
     Vehicle i is system i (from 256 on, again from 1). Times are whole milliseconds since the start; states are those
-    of these times. If the mission has a geodetic origin, the first message sets it.
+    of these times. If the mission has a geodetic origin, the first message sets it. A vehicle that has landed for good
+    is disarmed, and gets no more setpoints.
     """
     given = _in_milliseconds(motion, rate)
+    every = np.round((given.time - motion.start) * 1e3).astype(np.int64)
     for agent in range(motion.n_agents):
         system = agent % _SYSTEMS + 1
-        records: Any = np.zeros(len(given.time), dtype=_RECORD)
-        milliseconds = np.round((given.time - motion.start) * 1e3).astype(np.int64)
+        off = 1e3 * (float(motion.result.motors_off[agent]) - motion.start)
+        flies = every <= off
+        milliseconds = every[flies]
+        records: Any = np.zeros(len(milliseconds), dtype=_RECORD)
         records["time"] = 1000 * milliseconds
         records["mark"], records["length"], records["system"] = _MARK, _FIELDS.itemsize, _STATION
         records["sequence"] = (np.arange(len(records)) + 1) % 256
         records["message"] = _TARGET
         fields = records["fields"]
         fields["time_boot_ms"] = milliseconds
-        fields["state"] = _ned(given.state[:, :3, agent])
-        fields["yaw"] = (np.pi / 2 - given.yaw[:, agent] + np.pi) % (2.0 * np.pi) - np.pi
-        fields["yaw_rate"] = -given.yaw_rate[:, agent]
+        fields["state"] = _ned(given.state[flies, :3, agent])
+        fields["yaw"] = (np.pi / 2 - given.yaw[flies, agent] + np.pi) % (2.0 * np.pi) - np.pi
+        fields["yaw_rate"] = -given.yaw_rate[flies, agent]
         fields["target_system"], fields["target_component"] = system, _AUTOPILOT
         fields["coordinate_frame"] = _LOCAL_NED
         covered = records.view(np.uint8).reshape(len(records), -1)[:, 9:-2]
         records["checksum"] = _checksum(covered, _TARGET_EXTRA)
-        yield _origin_record(motion, system) + records.tobytes()
+        disarmed = b"" if off > every[-1] else _disarm_record(int(milliseconds[-1]), system)
+        yield _origin_record(motion, system) + records.tobytes() + disarmed
 
 
 def read_tlog(data: bytes) -> list[Curve]:
@@ -74,7 +83,7 @@ def read_tlog(data: bytes) -> list[Curve]:
     first = 8 + 8 + data[9]
     if data[13] == _ORIGIN:
         data = data[first:]
-    records: Any = np.frombuffer(data, dtype=_RECORD)
+    records: Any = np.frombuffer(data, dtype=_RECORD, count=len(data) // _RECORD.itemsize)
     fields = records["fields"]
     state = _ned(fields["state"].astype(float)).swapaxes(0, 1)
     yaw = np.stack(
@@ -104,9 +113,18 @@ def _origin_record(motion: Motion, system: int) -> bytes:
         round(1e3 * origin.altitude),
         system,
     )
-    record = _ORIGIN_RECORD.pack(0, _MARK, len(fields), 0, _STATION, 0, _ORIGIN) + fields
+    return _record(0, _ORIGIN, fields, _ORIGIN_EXTRA)
+
+
+def _disarm_record(milliseconds: int, system: int) -> bytes:
+    fields = _COMMAND_FIELDS.pack(*(0.0,) * 7, _ARM_DISARM, system, _AUTOPILOT, 0)
+    return _record(milliseconds, _COMMAND, fields, _COMMAND_EXTRA)
+
+
+def _record(milliseconds: int, message: int, fields: bytes, extra: int) -> bytes:
+    record = _HEAD.pack(1000 * milliseconds, _MARK, len(fields), 0, _STATION, 0, message) + fields
     covered = np.frombuffer(record[9:], dtype=np.uint8)[None]
-    return record + _checksum(covered, _ORIGIN_EXTRA).astype("<u2").tobytes()
+    return record + _checksum(covered, extra).astype("<u2").tobytes()
 
 
 def _checksum(data: np.ndarray, extra: int) -> np.ndarray:

@@ -55,8 +55,11 @@ def write_skyc(motion: Motion, tolerance: float) -> Iterator[bytes]:
         name = f"agent {agent + 1}"
         folder = f"drones/{name.replace(' ', '-')}"
         points = _segments(curve)
+        landing = min(
+            round(float(motion.result.motors_off[agent]) - motion.start, 6), points[-1][0]
+        )
         files[f"{folder}/trajectory.json"] = {
-            "version": 1, "points": points, "takeoffTime": 0, "landingTime": points[-1][0]
+            "version": 1, "points": points, "takeoffTime": 0, "landingTime": landing
         }  # fmt: skip
         times, yaws = headings(curve)
         setpoints = np.column_stack([times.round(6), np.degrees(yaws).round(4)]).tolist()

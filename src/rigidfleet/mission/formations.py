@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from rigidfleet._common.text import agent_names
 from rigidfleet.formation import distance_geometry, graphs, shapes
+from rigidfleet.formation.rest import beside
 from rigidfleet.math import proximity
 from rigidfleet.mission import bounds
 from rigidfleet.mission.files import NOT_A_FILE
@@ -18,6 +19,8 @@ from rigidfleet.mission.schema import Formation
 
 #: Maximum number of contradictions among distances that are listed.
 _SHOWN = 6
+#: Light of vehicles that rest.
+_DARK = "#000000"
 #: Approximate maximum number of triangles and tetrahedra that are checked among distances.
 _MOST_CLIQUES = 5e6
 
@@ -38,9 +41,66 @@ def check(collector: FindingCollector, n: int | None) -> dict[str, Formation]:
             continue
         form = collector.validate(Formation, data, ("formations", name))
         if form is not None:
+            if n is not None and (form.rest is not None or form.agents is not None):
+                form = _rested(collector, form, n, ("formations", name))
             found[name] = form
             _formation(collector, form, n, ("formations", name))
     return found
+
+
+def _rested(collector: FindingCollector, form: Formation, n: int, path: Keys) -> Formation:
+    """A formation of fewer than n agents with slots for all: those that rest come last."""
+    slots = form.slots
+    if form.agents is not None:
+        if form.shape is None or form.rest is None:
+            without = "rest" if form.rest is None else "shape"
+            collector.add(
+                (*path, "agents"),
+                f"has no effect without {without}",
+                f"add {without}, or remove it",
+            )
+            return form
+        if form.agents > n:
+            collector.add((*path, "agents"), f"is more than the {n} agents", "give fewer")
+            return form
+        _shape(collector, form, form.shape, form.agents, path)
+        if not collector.right(path, "shape", "size"):
+            return form
+        made = form.slot_array(form.agents)
+        assert made is not None  # a shape has them
+        slots = tuple(map(tuple, made.tolist()))
+    if slots is None or form.distances is not None:
+        problem = "needs slots" if slots is None else "does not go with distances"
+        remedy = (
+            "give slots, or shape and agents; edges keep the lengths that they have in the slots"
+        )
+        collector.add((*path, "rest"), problem, remedy)
+        return form
+    waiting = n - len(slots)
+    if isinstance(form.rest, tuple):
+        if len(form.rest) != waiting:
+            problem = (
+                f"has {len(form.rest)} places for the {max(waiting, 0)} agents that have no slot"
+            )
+            collector.add((*path, "rest"), problem, "give a place to each, or 'sides'", None)
+            return form
+        places = form.rest
+    elif waiting < 1:
+        return form
+    elif len(slots) < 2:
+        collector.add(
+            (*path, "rest"), "needs two or more slots", "give the places as a list of points"
+        )
+        return form
+    else:
+        places = tuple(map(tuple, beside(slots, waiting).tolist()))
+    colour = form.colour
+    if colour is not None:
+        colour = ((colour,) * len(slots) if isinstance(colour, str) else colour) + (_DARK,) * len(
+            places
+        )
+    changed = {"slots": (*slots, *places), "shape": None, "size": None, "colour": colour}
+    return form.model_copy(update=changed)
 
 
 def sound(collector: FindingCollector, name: str) -> bool:
@@ -102,7 +162,9 @@ def _formation(collector: FindingCollector, form: Formation, n: int | None, path
     if form.slots is not None:
         if len(form.slots) != n:
             problem = f"has {len(form.slots)} slots for {n} agents"
-            collector.add((*path, "slots"), problem, f"give one slot per agent, {n} in all", None)
+            fewer = ", or rest = 'sides' for the others" if len(form.slots) < n else ""
+            remedy = f"give one slot per agent, {n} in all{fewer}"
+            collector.add((*path, "slots"), problem, remedy, None)
         for i, j in coincident(form.slots):
             collector.add(
                 (*path, "slots", j), f"is the same point as slot {i + 1}", "move the slots apart"

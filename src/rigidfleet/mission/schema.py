@@ -52,6 +52,7 @@ from rigidfleet.mission.values import (
     PerAgentError,
     PerAxis,
     Rate,
+    Rest,
     RotorSpeeds,
     Seed,
     Share,
@@ -448,10 +449,19 @@ class Formation(Part):
     distances: tuple[Length, ...] | None = Field(
         None, description="length of each edge [m]; default: those between the slots"
     )
+    agents: Annotated[int, Strict(), Field(ge=1, le=bounds.AGENTS)] | None = Field(
+        None, description="number of vehicles in the shape, if the others rest; default: all"
+    )
+    rest: Rest | None = Field(
+        None,
+        description="where vehicles wait for which there are no slots, in the axes of the slots: a list of points [m]; "
+        "'sides': left and right of the formation, along x, mirrored so that its middle stays the same",
+    )
     colour: Colour | None = Field(
         None,
         description="light of the vehicles in this formation, '#rrggbb': one for all, or a list with one per slot; "
-        "default: that of the file of slots if it has colours, else the light before. `export --format skyc` writes it",
+        "default: that of the file of slots if it has colours, else the light before. Vehicles that rest are dark. "
+        "`export --format skyc` writes it",
     )
 
     def edge_array(self, n: int) -> Ints:

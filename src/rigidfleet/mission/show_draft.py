@@ -13,6 +13,7 @@ from rigidfleet._common.toml import toml_key
 from rigidfleet.formation import shapes
 from rigidfleet.formation.assignment import assigned
 from rigidfleet.formation.point_files import Points
+from rigidfleet.formation.rest import beside
 from rigidfleet.math import proximity
 from rigidfleet.mission.draft import (
     LIFT,
@@ -85,6 +86,16 @@ def points_scene(name: str, points: Points, source: str, *, by_name: bool = Fals
     return Scene(name, slots, f"# points of {json.dumps(source)}\nslots = [\n{rows}]\n{lights}")
 
 
+def _rested(one: Scene, agents: int) -> Scene:
+    """A scene in which the vehicles that have no point rest at its sides."""
+    waiting = agents - len(one.slots)
+    if waiting < 1:
+        return one
+    slots = np.concatenate([one.slots, beside(one.slots, waiting)])
+    told = f'rest = "sides"                  # {waiting} vehicles wait, dark\n'
+    return Scene(one.name, slots, one.table + told)
+
+
 def show(
     name: str, scenes: Sequence[Scene], *, agents: int, spacing: float, mass: float = _MASS,
     thrust_limit: float | None = None, file: str = "",
@@ -113,6 +124,7 @@ def show(
         raise ValueError("a show needs formations")
     ground = "grid" if agents in shapes.SHAPES["grid"].agents else "line"
     pads = scene(ground, agents, spacing)._replace(name="pads")
+    scenes = [_rested(one, agents) for one in scenes]
     for one in scenes:
         if len(one.slots) != agents:
             raise ValueError(f"'{one.name}' has {len(one.slots)} points for {agents} agents")

@@ -98,6 +98,12 @@ Edges = Annotated[
     Discriminator(_form),
 ]
 
+#: Where vehicles without a slot wait.
+Rest = Annotated[
+    Annotated[Literal["sides"], Tag("one")] | Annotated[tuple[Vector, ...], Tag("list")],
+    Discriminator(_form),
+]
+
 Damping = Annotated[
     Annotated[Tolerance, Tag("one")] | Annotated[Literal["auto"], Tag("word")],
     Discriminator(lambda value: "word" if isinstance(value, str) else "one"),

@@ -25,7 +25,7 @@ from rigidfleet.typing import Floats
 #: Spans of a way between its knots; samples of each span at which distances are penalised, or so many that the longest
 #: way has this many in the distance to keep, on average.
 _SPANS, _SAMPLES, _PASSED = 16, 3, 2.0
-#: Durations tried, as multiples of the slowest single vehicle's, and random starts of each.
+#: Durations tried, as multiples of the slowest single vehicle's, and random starts of each, before one roundabout.
 _SLOWER, _STARTS = (1.5, 1.8, 2.1, 2.4), 2
 #: Weights of distances, speed, acceleration and box; of smoothness. Distances are wanted this much larger.
 _WEIGHTS, _SMOOTH, _SPARE = (20.0, 2.0, 2.0, 20.0), 1e-3, 1.04
@@ -116,9 +116,11 @@ def transfer(
     rng = np.random.default_rng(seed)
     least_time = max(least_duration(s, g, limits.speed, limits.acceleration), _SHORTEST)
     for slower in _SLOWER:
-        for start_number in range(_STARTS + 1):
+        for start_number in range(_STARTS + 2):
             control = _straight(s, g)
-            if start_number:  # straight ways will not do
+            if start_number > _STARTS:  # as in a roundabout, for crowds that all meet at one place
+                control = _searched(_bowed(s, g), slower * least_time, limits, rng)
+            elif start_number:  # straight ways will not do
                 control = _searched(control, slower * least_time, limits, rng)
             found = Transfer(control, slower * least_time, _NOTHING)
             if not _kept(found, limits):
@@ -161,10 +163,21 @@ def _straight(s: Floats, g: Floats) -> Floats:
     return (1 - share) * s + share * g
 
 
+def _bowed(s: Floats, g: Floats) -> Floats:
+    """Control points (M + 3, N, 3) of ways that all keep to the right, seen from above on half an ellipse.
+
+    Where each vehicle goes to the opposite place of a circle, this is half a turn of them all.
+    """
+    share = np.clip((np.arange(_SPANS + 3) - 2) / (_SPANS - 2), 0.0, 1.0)[:, None, None]
+    way = g - s
+    right = 0.5 * np.stack([way[:, 1], -way[:, 0], 0.0 * way[:, 0]], axis=1)
+    return s + 0.5 * (1.0 - np.cos(np.pi * share)) * way + np.sin(np.pi * share) * right
+
+
 def _searched(
     control: Floats, duration: float, limits: _Limits, rng: np.random.Generator
 ) -> Floats:
-    """Control points (M + 3, N, 3) with little penalty, from those of straight ways; their ends stay."""
+    """Control points (M + 3, N, 3) with little penalty, from those of other ways; their ends stay."""
     from scipy.optimize import minimize
 
     n, h = control.shape[1], duration / _SPANS
