@@ -16,13 +16,14 @@ from __future__ import annotations
 
 import argparse
 import time
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from crowds import PERIOD, THRUST, kernel, least_distance
+from crowds import PERIOD, THRUST, kernel, on_parabolas
 
-from rigidfleet.kernel.avoidance import TICKS, candidates, sight
-from rigidfleet.kernel.engine import native, sampled
+from rigidfleet.kernel.avoidance import candidates, sight
+from rigidfleet.kernel.engine import native
+from rigidfleet.kernel.engine.packing import Packed, packed
 from rigidfleet.solids.records import Solids, ball, joined, single
 from rigidfleet.typing import Floats
 
@@ -30,12 +31,14 @@ from rigidfleet.typing import Floats
 SPEEDS = ((2.0, 2.0), (2.0, 6.0), (5.0, 6.0))
 #: Radii of vehicles and obstacles, length of the course, edge of the cube [m].
 RADIUS, BALL, COURSE, EDGE = 0.3, 0.7, 24.0, 3.0
-#: Sensing range, its noise [m].
-RANGE, NOISE = 10.0, 0.05
+#: Sensing range, its noise [m], acceleration of obstacles that is reckoned with [m/s^2].
+RANGE, NOISE, SWERVE = 10.0, 0.05, 0.2
 #: The criterion: share of the acceleration, for how long [s], what to keep [m], for how long [s].
 SHARE, HELD, SPARE, AHEAD = 0.6, 1.5, 0.1, 6.0
 #: Distance of centres below which distances are taken [m].
 NEAR = 1.5
+#: Time for which a flight goes on after its slots have arrived [s].
+LATER = 12.0
 #: Methods: what `kernel.avoidance.avoidance` is asked for.
 METHODS = {
     "flow": {"flow": True, "guarded": False, "filtered": False},
@@ -54,11 +57,11 @@ class Scene(NamedTuple):
 
 
 class Flown(NamedTuple):
-    """Least distances of surfaces [m], from obstacles and between vehicles, time of arrival [s] and cost [us]."""
+    """Of S scenes: least distances of surfaces [m], times of arrival [s], cost per vehicle and tick [us]."""
 
-    obstacle: float
-    pair: float
-    arrived: float
+    obstacle: Floats  # (S,) from obstacles
+    pair: Floats  # (S,) between vehicles
+    arrived: Floats  # (S,) infinity if not all arrive
     cost: float
 
 
@@ -101,13 +104,12 @@ def feasible(given: Scene) -> bool:
 
 
 def asked(r: Floats, v: Floats, slots: Floats, speed: float, t: float) -> Floats:
-    """Accelerations that track the slots, which stop at the end of the course."""
+    """Accelerations (S, n, 3) that track the slots, which stop at the end of the course."""
     moving = speed * t < COURSE
-    ahead = min(speed * t, COURSE)
-    e = slots + [ahead, 0.0, 0.0] - r
-    e *= np.minimum(1.0, 1.5 / np.maximum(np.linalg.norm(e, axis=1, keepdims=True), 1e-12))
+    e = slots + [min(speed * t, COURSE), 0.0, 0.0] - r
+    e *= np.minimum(1.0, 1.5 / np.maximum(np.linalg.norm(e, axis=2, keepdims=True), 1e-12))
     a = 2.0 * e + 2.5 * ([speed if moving else 0.0, 0.0, 0.0] - v)
-    return a * np.minimum(1.0, THRUST / np.maximum(np.linalg.norm(a, axis=1, keepdims=True), 1e-12))
+    return a * np.minimum(1.0, THRUST / np.maximum(np.linalg.norm(a, axis=2, keepdims=True), 1e-12))
 
 
 def solids(given: Scene) -> Solids:
@@ -121,56 +123,77 @@ def solids(given: Scene) -> Solids:
     )
 
 
-def fly(given: Scene, method: str) -> Flown:
-    """Fly one scene."""
-    n, things = len(given.slots), solids(given)
+def prepared(given: Scene, method: str) -> tuple[Any, list[Packed]]:
+    """State of a scene in the kernel, and what its avoidance is called with: flight, state, avoidance and the law."""
+    things = solids(given)
     problem, work, flight, state, a = kernel(
-        n, radius=RADIUS, solids=things, separation=0.1, clearance=0.05,
-        seen=sight(things, RANGE, NOISE, 0.2), **METHODS[method],
+        len(given.slots), radius=RADIUS, solids=things, separation=0.1, clearance=0.05,
+        seen=sight(things, RANGE, NOISE, SWERVE), **METHODS[method],
     )  # fmt: skip
-    r, v = given.slots.copy(), np.zeros((n, 3)) + [given.speed, 0.0, 0.0]
+    law = [packed(problem), packed(work)]
+    a.law[:] = [each.address for each in law]
+    return state, [packed(flight), packed(state), packed(a), *law]
+
+
+def take_least(least: Floats, x: Floats, w: Floats, rise: Floats) -> None:
+    """Take the least lengths of relative parabolas (S, P, 3) into those of the scenes (S,), where they are near."""
+    scenes, pairs = np.nonzero((x * x).sum(axis=2) < NEAR**2)
+    if len(scenes):
+        at = scenes, pairs
+        np.minimum.at(least, scenes, on_parabolas(x[at], w[at], rise[at]))
+
+
+def fly(scenes: list[Scene], method: str) -> Flown:
+    """Fly scenes of one kind, tick by tick together; they know nothing of each other."""
+    count, n, speed = len(scenes), len(scenes[0].slots), scenes[0].speed
+    made, avoid = [prepared(each, method) for each in scenes], native.avoiding().avoid
+    slots = np.array([each.slots for each in scenes])
+    place, velocity = (np.array([each[k] for each in scenes])[:, None] for k in (2, 3))
+    r, v = slots.copy(), np.zeros((count, n, 3)) + [speed, 0.0, 0.0]
     own, other = np.triu_indices(n, 1)
-    across = np.repeat(np.arange(n), 2), n + np.tile([0, 1], n)
-    nearest, apart, cost, ticks = np.inf, np.inf, 0.0, 0
-    goal, rest, arrived = given.slots + [COURSE, 0.0, 0.0], np.zeros((2, 3)), np.inf
-    for k in range(int((COURSE / given.speed + 12.0) / PERIOD)):
+    least, arrived = np.full((2, count), np.inf), np.full(count, np.inf)
+    cost, ticks, flying = 0.0, 0, np.arange(count)
+    for k in range(int((COURSE / speed + LATER) / PERIOD)):
         t = k * PERIOD
-        state.seen[:, :3], state.seen[:, 3:] = r, v
-        state.force[:] = asked(r, v, given.slots, given.speed, t)
-        state.work.law_time[0] = t
+        c = asked(r, v, slots, speed, t)
         begun = time.process_time()
-        if not sampled.avoid(problem, work, flight, state, a):
-            raise SystemExit("too many neighbours")
+        for s in flying:
+            state, given = made[s]
+            state.seen[:, :3], state.seen[:, 3:], state.force[:] = r[s], v[s], c[s]
+            state.work.law_time[0] = t
+            if not avoid(given[0].address, given[1].address, given[2].address, 0):
+                raise SystemExit("too many neighbours")
+            c[s] = state.force
         cost += time.process_time() - begun
-        ticks += 1
-        c = state.force.copy()
-        assert (c * c).sum(axis=1).max() <= THRUST**2 * (1 + 1e-9)
-        place = given.place + t * given.velocity
-        if ((r[:, None] - place) ** 2).sum(axis=2).min() < NEAR**2:
-            both = np.concatenate([r, place]), np.concatenate([v, given.velocity])
-            nearest = min(nearest, least_distance(*both, np.concatenate([c, rest]), across))
-        if n > 1 and ((r[own] - r[other]) ** 2).sum(axis=1).min() < NEAR**2:
-            apart = min(apart, least_distance(r, v, c, (own, other)))
+        ticks += len(flying)
+        assert (c[flying] ** 2).sum(axis=2).max() <= THRUST**2 * (1 + 1e-9)
+        x = (r[:, :, None] - place - t * velocity)[flying]
+        w, shape = (v[:, :, None] - velocity)[flying], (len(flying), -1, 3)
+        rise = np.broadcast_to(c[flying, :, None], x.shape)
+        found = np.full((2, len(flying)), np.inf)
+        take_least(found[0], x.reshape(shape), w.reshape(shape), rise.reshape(shape))
+        x, w, rise = (y[flying][:, own] - y[flying][:, other] for y in (r, v, c))
+        take_least(found[1], x, w, rise)
+        least[:, flying] = np.minimum(least[:, flying], found)
         r, v = r + v * PERIOD + 0.5 * c * PERIOD**2, v + c * PERIOD
-        if given.speed * t > COURSE and np.linalg.norm(r - goal, axis=1).max() < 0.3:
-            arrived = t
-            break
-    assert a.count[TICKS] == ticks
-    return Flown(nearest - RADIUS - BALL, apart - 2 * RADIUS, arrived, 1e6 * cost / (ticks * n))
+        if speed * t > COURSE:
+            far = np.linalg.norm(r[flying] - slots[flying] - [COURSE, 0.0, 0.0], axis=2).max(axis=1)
+            arrived[flying[far < 0.3]] = t
+            flying = flying[far >= 0.3]
+            if not len(flying):
+                break
+    return Flown(least[0] - RADIUS - BALL, least[1] - 2 * RADIUS, arrived, 1e6 * cost / (ticks * n))
 
 
-def row(n: int, speeds: tuple[float, float], count: int, seed: int, method: str) -> str:
+def row(scenes: list[Scene], fit: Any, method: str) -> str:
     """A row of the table."""
-    scenes = [scene(n, *speeds, seed + k) for k in range(count)]
-    fit = np.array([feasible(each) for each in scenes])
-    flown = [fly(each, method) for each in scenes]
-    least = np.array([min(x.obstacle, x.pair) for x in flown])
-    late, hit = np.array([x.arrived for x in flown]), least < 0.0
+    flown = fly(scenes, method)
+    least = np.minimum(flown.obstacle, flown.pair)
+    hit, late = least < 0.0, flown.arrived[fit]
     closest = f"{least[fit].min():.3f}" if least[fit].min() < np.inf else "-"
     return (
-        f"| {n} | {speeds[0]:g} | {speeds[1]:g} | {fit.sum()} of {count} | {method} | {(hit & fit).sum()} |"
-        f" {(hit & ~fit).sum()} | {closest} | {100 * np.isfinite(late[fit]).mean():.1f} % |"
-        f" {np.median(late[fit]):.1f} | {np.median([x.cost for x in flown]):.1f} |"
+        f"| {method} | {(hit & fit).sum()} | {(hit & ~fit).sum()} | {closest} |"
+        f" {100 * np.isfinite(late).mean():.1f} % | {np.median(late):.1f} | {flown.cost:.1f} |"
     )
 
 
@@ -182,14 +205,17 @@ def main() -> None:
     chosen = parser.parse_args()
     native.avoiding()
     print(
-        "| vehicles | their speed | obstacles' | feasible | flown with | contacts | of the infeasible"
+        "| vehicles | speed [m/s] | obstacles' speed | feasible | flown with | contacts | of the infeasible"
         " | least distance [m] | arrive | median time [s] | cost [us] |"
     )
     print("|---" * 11 + "|")
     for n in (1, 8):
-        for speeds in SPEEDS:
+        for speed, fastest in SPEEDS:
+            scenes = [scene(n, speed, fastest, chosen.seed + k) for k in range(chosen.scenes)]
+            fit = np.array([feasible(each) for each in scenes])
+            head = f"| {n} | {speed:g} | to {fastest:g} | {fit.sum()} of {len(fit)} "
             for method in METHODS:
-                print(row(n, speeds, chosen.scenes, chosen.seed, method), flush=True)
+                print(head + row(scenes, fit, method), flush=True)
 
 
 if __name__ == "__main__":

@@ -20,6 +20,7 @@ from rigidfleet.kernel.barriers import filter_accelerations, limit, loosen
 from rigidfleet.kernel.compiler.jit import compiled
 from rigidfleet.kernel.fleet import TICKS as FLIGHT_TICKS
 from rigidfleet.kernel.moving import (
+    brake_beside,
     braking_beside,
     follow_flow,
     look,
@@ -376,11 +377,7 @@ def propose(i, k, v, a, c):
         for q in range(3):
             c[q] = a.b[i] * a.candidates[k - 1, q]
     else:
-        x = a.sight.track[a.threat[i]]
-        u, w, z = v[0] - x[3], v[1] - x[4], v[2] - x[5]
-        speed = math.sqrt(u * u + w * w + z * z)
-        size = min(a.b[i], speed / a.period) / max(speed, 1e-12)
-        c[0], c[1], c[2] = -size * u, -size * w, -size * z
+        brake_beside(i, a.threat[i], v, a, c)
 
 
 @compiled

@@ -142,6 +142,22 @@ def braking_beside(i, o, a):
 
 
 @compiled
+def brake_beside(i, o, v, a, out):
+    """Acceleration (3,) that brakes vehicle i from a velocity v (3,) relative to obstacle o, straight, with drag.
+
+    It bears the drag that the vehicle has at the obstacle's velocity, so that what is left acts on the relative one.
+    """
+    x, E, first = a.sight.track[o], a.coast[i, 0], a.coast[i, 1]
+    speed = 0.0
+    for q in range(3):
+        speed += (v[q] - x[3 + q]) ** 2
+    speed = math.sqrt(speed)
+    size = min(braking_beside(i, o, a), speed * E / first) / max(speed, 1e-12)
+    for q in range(3):
+        out[q] = (1.0 - E) / first * x[3 + q] - size * (v[q] - x[3 + q])
+
+
+@compiled
 def way_to_rest(u, b, lag, T):
     """Way [m] to rest from a speed u [m/s], with commands held for a period: n whole ones, then one to rest."""
     change = b * T
