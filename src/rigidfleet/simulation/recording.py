@@ -153,7 +153,10 @@ def assemble(
         measured_velocity=record.v_seen if noisy else None,
         later=(
             (LATER, partial(_references, mission.yaw, [(p.time, p.led) for p in pieces], left)),
-            (("singular_value",), partial(_singular_values, [(p.record.r, p.edges) for p in pieces])),
+            (
+                ("singular_value",),
+                partial(_singular_values, [(p.record.r, p.edges) for p in pieces]),
+            ),
         ),
         vehicle_attitude=None if flown is None else flown.attitude,
         vehicle_rates=None if flown is None else flown.rates,
