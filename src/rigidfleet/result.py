@@ -394,7 +394,11 @@ class Result:
             del self.__dict__[name]
         sizes: dict[str, int] = {dim: len(names) for dim, names in LABELS.items()}
         given = self.__dict__
-        for key, dims in (("time", ("time",)), ("position", ("time", "agent")), ("edges", ("edge",))):
+        for key, dims in (
+            ("time", ("time",)),
+            ("position", ("time", "agent")),
+            ("edges", ("edge",)),
+        ):
             if isinstance(given[key], np.ndarray):
                 sizes.update(zip(dims, given[key].shape, strict=False))
         for name, dims, dtype in _CHECKED:

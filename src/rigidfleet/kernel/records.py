@@ -203,7 +203,16 @@ def recorder(k: int, n: int, m: int) -> Record:
     """Allocate a record of ``k`` samples."""
     agent, edge = (k, n, 3), (k, m)
     shapes = *(agent,) * 7, *(edge,) * 5, agent, (k, 6), (k, 3), (k, 3, 3), (k, 6), *(agent,) * 3
-    sizes = *(3 * k * n,) * 7, *(k * m,) * 5, 3 * k * n, 6 * k, 3 * k, 9 * k, 6 * k, *(3 * k * n,) * 3
+    sizes = (
+        *(3 * k * n,) * 7,
+        *(k * m,) * 5,
+        3 * k * n,
+        6 * k,
+        3 * k,
+        9 * k,
+        6 * k,
+        *(3 * k * n,) * 3,
+    )
     memory = np.empty(sum(sizes))
     memory.fill(np.nan)
     parts = zip(accumulate(sizes), sizes, shapes, strict=True)

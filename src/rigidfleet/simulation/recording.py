@@ -142,7 +142,7 @@ def assemble(
         constraint=found.distance - reference if noisy else by_edge("c"),
         integral=by_edge("integral"),
         multiplier=by_edge("multiplier"),
-        singular_value=None,  # type: ignore[arg-type] -- later
+        singular_value=np.zeros(0),  # computed later
         separation=separation,
         separation_pair=pair,
         clearance=clearance,
@@ -153,7 +153,10 @@ def assemble(
         measured_velocity=record.v_seen if noisy else None,
         later=(
             (LATER, partial(_references, mission.yaw, [(p.time, p.led) for p in pieces], left)),
-            (("singular_value",), partial(_singular_values, [(p.record.r, p.edges) for p in pieces])),
+            (
+                ("singular_value",),
+                partial(_singular_values, [(p.record.r, p.edges) for p in pieces]),
+            ),
         ),
         vehicle_attitude=None if flown is None else flown.attitude,
         vehicle_rates=None if flown is None else flown.rates,
