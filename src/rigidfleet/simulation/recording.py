@@ -142,7 +142,7 @@ def assemble(
         constraint=found.distance - reference if noisy else by_edge("c"),
         integral=by_edge("integral"),
         multiplier=by_edge("multiplier"),
-        singular_value=None,  # type: ignore[arg-type] -- later
+        singular_value=np.zeros(0),  # computed later
         separation=separation,
         separation_pair=pair,
         clearance=clearance,

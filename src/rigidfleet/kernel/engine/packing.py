@@ -84,7 +84,7 @@ class _Layout:
         self.of_arrays = _getter([name for name, _ in arrays])
         self.of_numbers = _getter([name for name, kind, _ in places if kind is not np.ndarray])
         #: Numbers at their words, with gaps for the arrays' words; then the addresses of the arrays.
-        gaps = {np.ndarray: "{}x", float: "d", int: "q"}
+        gaps: dict[type, str] = {np.ndarray: "{}x", float: "d", int: "q"}
         self.numbers = struct.Struct(
             "=" + "".join(gaps[kind].format(8 * (1 + (ndim or 0))) for _, kind, ndim in places)
         )
