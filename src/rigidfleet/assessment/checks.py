@@ -330,7 +330,7 @@ def _moving(check: str, e: Extreme | None, unit: str, limit: float | None) -> Ch
 def _corners(measured: Measurements) -> Iterator[CheckResult]:
     """Fail limits of acceleration where a curve that others made turns at a corner: none is great enough there."""
     result, limits = measured.result, measured.mission.limits
-    if result.statistics.get("interpolation") is None or not np.isfinite(result.acceleration).any():
+    if result.interpolation is None or not np.isfinite(result.acceleration).any():
         return  # of straight lines, accelerations are not judged at all
     first = np.flatnonzero(np.nextafter(result.time[:-1], np.inf) >= result.time[1:])
     by = np.linalg.norm(result.velocity[first + 1] - result.velocity[first], axis=2)
@@ -519,7 +519,7 @@ def notes(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[str]:
 def _of_others(measured: Measurements) -> Iterator[str]:
     """What is judged of a flight that others made, how near its centres come, what is odd, and who is who."""
     result = measured.result
-    if (how := result.statistics.get("interpolation")) is None:
+    if (how := result.interpolation) is None:
         return
     yield (
         f"others made this flight: what is judged is its curve, {how}, also between samples; forces, thrust and "
