@@ -14,6 +14,7 @@ import json
 import re
 import tomllib
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,8 +23,11 @@ import numpy as np
 from rigidfleet._common.toml import to_toml
 from rigidfleet.errors import Finding, MissionError
 from rigidfleet.formation.point_files import parse_points, read_bytes
+from rigidfleet.formation.trajectory_files import curve_to_rows, parse_trajectories
 from rigidfleet.mission import bounds
 
+#: What stands before the digest of a file.
+_DIGEST = "SHA-256 "
 #: What a text has that may name a file.
 _MAY_NAME = re.compile(r"(file|slots|position)[\"']?\s*=\s*[\"']")
 #: What is said where a file cannot be found, because a mission is not from a file itself.
@@ -31,19 +35,23 @@ NOT_A_FILE = "is read only with a mission file, as its path is relative to that"
 
 
 class _Named(NamedTuple):
-    """A file that a mission names: the table and key that do, the key of its numbers, and who reads them."""
+    """A file that a mission names: the table and key that do, the key of its numbers, and who reads them.
+
+    It may be a ``folder`` of files, one a vehicle.
+    """
 
     table: dict[str, Any]
     key: str
     becomes: str
     where: str
-    read: Callable[[bytes, str], Content]
+    read: Callable[[list[tuple[str, bytes]]], Content]
+    folder: bool = False
 
 
 class Content(NamedTuple):
-    """What a file gives: rows of numbers, and colours of points if it has them."""
+    """What a file gives: rows of numbers (of trajectories: of each vehicle), and colours of points if it has them."""
 
-    rows: list[list[float]]
+    rows: list[Any]
     colours: tuple[str, ...] | None = None
 
 
@@ -80,9 +88,13 @@ def with_files(text: str, data: dict[str, Any], path: Path) -> str:
     data, digests = copy.deepcopy(data), []
     for named in list(_named(data)):
         name = named.table[named.key]
-        content = read_bytes(_inside(path, named.where, name))
-        rows, colours = named.read(content, str(path.parent / name))
-        told = f"{named.becomes} of {name!r}, SHA-256 {hashlib.sha256(content).hexdigest()}"
+        contents = [
+            (str(path.parent / x), read_bytes(_inside(path, named.where, x)))
+            for x in _names(path, named)
+        ]
+        rows, colours = named.read(contents)
+        digest = hashlib.sha256(b"".join(data for _, data in contents)).hexdigest()
+        told = f"{named.becomes} of {name!r}, {_DIGEST}{digest}"
         digests.append(f"# {named.where}: {told}\n")
         del named.table[named.key]
         named.table[named.becomes] = rows
@@ -101,8 +113,45 @@ def with_files(text: str, data: dict[str, Any], path: Path) -> str:
     return "".join(digests) + to_toml(data)  # where a file is named within a line
 
 
+def digests(text: str) -> str:
+    """The lines of a mission's text that tell the digests of files, for a text that is written anew from its data."""
+    found = re.findall(rf"^# .*{_DIGEST}[0-9a-f]{{64}}$", text, re.MULTILINE)
+    return "".join(f"{line}\n" for line in dict.fromkeys(found))
+
+
+def _names(path: Path, named: _Named) -> list[str]:
+    """Names of the files of a name: itself, or those in a folder, in the order of the numbers in them.
+
+    Raises
+    ------
+    MissionError
+        The folder has no files, or is outside the mission's.
+    """
+    name = named.table[named.key]
+    found = _inside(path, named.where, name)
+    if not named.folder or not found.is_dir():
+        return [name]
+    inside = [x.name for x in found.iterdir() if x.suffix.lower() == ".csv"]
+    if not inside:
+        remedy = "give a folder with a .csv for each vehicle"
+        raise MissionError([Finding(str(path), named.where, name, "has no .csv in it", remedy)])
+    order = sorted(inside, key=lambda x: [(len(y), y) for y in re.split(r"(\d+)", x)])
+    return [str(Path(name) / x) for x in order]
+
+
 def _named(data: dict[str, Any]) -> Iterator[_Named]:
-    forms, agents, things = (data.get(key) for key in ("formations", "agents", "obstacles"))
+    forms, agents, things, phases = (
+        data.get(key) for key in ("formations", "agents", "obstacles", "phases")
+    )
+    for k, phase in enumerate(phases if isinstance(phases, list) else (), start=1):
+        if (
+            isinstance(phase, dict)
+            and phase.get("kind") == "follow"
+            and isinstance(phase.get("file"), str)
+            and "trajectories" not in phase
+        ):
+            read = partial(_trajectories, yaw=phase.get("yaw") == "file")
+            yield _Named(phase, "file", "trajectories", f"phases[{k}].file", read, True)
     for name, form in forms.items() if isinstance(forms, dict) else ():
         if isinstance(form, dict) and isinstance(form.get("slots"), str):
             yield _Named(form, "slots", "slots", f"formations.{name}.slots", _points)
@@ -138,13 +187,24 @@ def _inside(path: Path, where: str, name: str) -> Path:
     raise MissionError([Finding(str(path), where, name, problem, remedy)])
 
 
-def _points(data: bytes, name: str) -> Content:
+def _points(files: list[tuple[str, bytes]]) -> Content:
+    (name, data) = files[0]
     found = parse_points(data, name)
     return Content(found.slots.tolist(), found.colours)
 
 
-def _heights(data: bytes, name: str) -> Content:
+def _trajectories(files: list[tuple[str, bytes]], *, yaw: bool) -> Content:
+    """Pieces of each vehicle; with a ``yaw`` if that is asked for."""
+    curves, turns = parse_trajectories(files)
+    if yaw and not turns:
+        problem, remedy = "has no yaw", "remove yaw = 'file', or give a file with a column of yaw"
+        raise MissionError([Finding(files[0][0], "", None, problem, remedy)])
+    return Content([curve_to_rows(curve) for curve in curves])
+
+
+def _heights(files: list[tuple[str, bytes]]) -> Content:
     """Numbers of a CSV or NPY file, row by row."""
+    (name, data) = files[0]
 
     def refused(problem: str, remedy: str) -> MissionError:
         return MissionError([Finding(name, "", None, problem, remedy)])

@@ -35,9 +35,9 @@ def as_flown(
     as_given = dict(data)
     data |= _flown_data(mission, data, asked, records, step)
     try:
-        return Mission.from_dict(data), records
+        return mission.rewritten(data, "<dict>"), records
     except MissionError:
-        return Mission.from_dict(as_given), records
+        return mission.rewritten(as_given, "<dict>"), records
 
 
 def with_phase(
