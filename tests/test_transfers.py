@@ -63,7 +63,7 @@ def test_vehicles_change_sides_of_a_ring():
 
 
 def test_a_certificate_of_bent_ways_is_a_tight_lower_bound():
-    """Against a dense sampling of random quintics of five vehicles: never above it, and below by no more than promised."""
+    """Against dense samples of random quintics of five vehicles: never above, and below by no more than promised."""
     rng = np.random.default_rng(3)
     knots = np.array([0.0, 0.7, 2.0, 3.1])
     ways = rng.normal(size=(3, 5, 3, 6)) * [3.0, 2.0, 1.0, 0.5, 0.2, 0.1]
@@ -83,7 +83,7 @@ def test_a_certificate_of_bent_ways_is_a_tight_lower_bound():
 
 
 def test_vehicles_that_keep_their_distance_need_no_search():
-    """A rigid turn, in polynomials: the distance is stationary everywhere, and the certificate is exact to its promise."""
+    """A rigid turn: the distance is stationary everywhere, and the certificate is exact to its promise."""
     time = np.linspace(0.0, 2 * np.pi, 200)
     x = np.stack(
         [np.stack([np.cos(time + a), np.sin(time + a), 0 * time], 1) for a in (0.0, np.pi)], 1

@@ -123,6 +123,11 @@ class AnyPhase(Part):
         return None
 
     @property
+    def spelled(self) -> bool:
+        """Whether the phase is flown as written; others take its place before the flight (`planning.transitions`)."""
+        return True
+
+    @property
     def bent(self) -> bool:
         """Whether the phase leads its vehicles on bent ways to a formation."""
         return False
@@ -271,6 +276,11 @@ class Reshape(Shaping):
     def aligned(self) -> bool:
         """Whether the slots are fitted."""
         return self.alignment == "fit"
+
+    @property
+    def spelled(self) -> bool:
+        """Whether the ways are straight, or given."""
+        return self.transition == "straight"
 
     @property
     def bent(self) -> bool:
@@ -441,6 +451,11 @@ class Vertical(Arriving):
     def vertical(self) -> Vertical:
         """The phase itself."""
         return self
+
+    @property
+    def spelled(self) -> bool:
+        """Whether there is one group."""
+        return self.stagger is None
 
     @property
     def each(self) -> bool:

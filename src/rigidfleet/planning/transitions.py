@@ -17,7 +17,7 @@ import numpy as np
 from rigidfleet.errors import Finding, MissionError
 from rigidfleet.formation.assignment import closest_approach, nearer_than
 from rigidfleet.math import rigid_body
-from rigidfleet.mission import Mission, Phase
+from rigidfleet.mission import Mission
 from rigidfleet.mission.kinds import Reshape, Vertical
 from rigidfleet.mission.values import AUTO
 from rigidfleet.planning.reference import slots_about_cm
@@ -48,7 +48,7 @@ def expanded(mission: Mission) -> Mission:
         The layers of a phase do not keep the separation, or there is no formation before it; or the groups of a
         staggered phase have no time, or would be under way together.
     """
-    if not any(_is_several(phase) for phase in mission.phases):
+    if all(phase.spelled for phase in mission.phases):
         return mission
     data, tables, forms = mission.to_dict(), [], {}
     before: str | None = None
@@ -72,13 +72,6 @@ def expanded(mission: Mission) -> Mission:
         before = before if phase.shaping is None else phase.shaping.formation
     data |= {"phases": tables, "formations": data["formations"] | forms}
     return mission.rewritten(data)
-
-
-def _is_several(phase: Phase) -> bool:
-    """Whether a phase is flown as several."""
-    if isinstance(phase, Vertical):
-        return phase.stagger is not None
-    return isinstance(phase, Reshape) and phase.transition != "straight"
 
 
 def _staggered(
