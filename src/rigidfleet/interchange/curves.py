@@ -43,6 +43,18 @@ class Curve(NamedTuple):
         """The same way, begun later [s]."""
         return Curve(self.time + start, self.pieces)
 
+    def cut(self, start: float, end: float) -> Curve:
+        """The part of the way from a start to an end [s] within it."""
+        first = int(np.searchsorted(self.time, start, side="right")) - 1
+        last = int(np.searchsorted(self.time, end, side="left"))
+        time = np.concatenate([[start], self.time[first + 1 : last], [end]])
+        pieces = self.pieces[first:last].copy()
+        moved = series.of_polynomials(
+            pieces[:1], np.array([start - self.time[first]]), pieces.shape[2]
+        )
+        pieces[:1] = np.moveaxis(moved, 0, -1)
+        return Curve(time, pieces)
+
 
 @dataclass(frozen=True)
 class Motion:
