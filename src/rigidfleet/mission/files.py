@@ -21,9 +21,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rigidfleet._common.toml import to_toml
-from rigidfleet.errors import Finding, MissionError
+from rigidfleet.errors import Finding, MissionError, TrajectoryError
+from rigidfleet.foreign.curves import Curve
+from rigidfleet.foreign.files import files_of, read_trajectories
+from rigidfleet.foreign.pieces import curve_to_rows, smoothed
+from rigidfleet.foreign.samples import ASSUMED
 from rigidfleet.formation.point_files import parse_points, read_bytes
-from rigidfleet.formation.trajectory_files import curve_to_rows, parse_trajectories
 from rigidfleet.mission import bounds
 
 #: What stands before the digest of a file.
@@ -44,7 +47,7 @@ class _Named(NamedTuple):
     key: str
     becomes: str
     where: str
-    read: Callable[[list[tuple[str, bytes]]], Content]
+    read: Callable[[bytes, str], Content]
     folder: bool = False
 
 
@@ -88,13 +91,9 @@ def with_files(text: str, data: dict[str, Any], path: Path) -> str:
     data, digests = copy.deepcopy(data), []
     for named in list(_named(data)):
         name = named.table[named.key]
-        contents = [
-            (str(path.parent / x), read_bytes(_inside(path, named.where, x)))
-            for x in _names(path, named)
-        ]
-        rows, colours = named.read(contents)
-        digest = hashlib.sha256(b"".join(data for _, data in contents)).hexdigest()
-        told = f"{named.becomes} of {name!r}, {_DIGEST}{digest}"
+        content = b"".join(read_bytes(_inside(path, named.where, x)) for x in _names(path, named))
+        rows, colours = named.read(content, str(path.parent / name))
+        told = f"{named.becomes} of {name!r}, {_DIGEST}{hashlib.sha256(content).hexdigest()}"
         digests.append(f"# {named.where}: {told}\n")
         del named.table[named.key]
         named.table[named.becomes] = rows
@@ -120,7 +119,7 @@ def digests(text: str) -> str:
 
 
 def _names(path: Path, named: _Named) -> list[str]:
-    """Names of the files of a name: itself, or those in a folder, in the order of the numbers in them.
+    """Names of the files of a name: itself, or those in a folder.
 
     Raises
     ------
@@ -131,12 +130,16 @@ def _names(path: Path, named: _Named) -> list[str]:
     found = _inside(path, named.where, name)
     if not named.folder or not found.is_dir():
         return [name]
-    inside = [x.name for x in found.iterdir() if x.suffix.lower() == ".csv"]
-    if not inside:
-        remedy = "give a folder with a .csv for each vehicle"
-        raise MissionError([Finding(str(path), named.where, name, "has no .csv in it", remedy)])
-    order = sorted(inside, key=lambda x: [(len(y), y) for y in re.split(r"(\d+)", x)])
-    return [str(Path(name) / x) for x in order]
+    try:
+        inside = [file for group in files_of(found) for file in group]
+    except TrajectoryError as error:
+        raise _unread(str(path), named.where, error) from None
+    return [str(Path(name) / file.relative_to(found)) for file in inside]
+
+
+def _unread(name: str, where: str, error: TrajectoryError) -> MissionError:
+    problem = str(error).removeprefix(f"{name}: ").rstrip(".")
+    return MissionError([Finding(name, where, None, problem, "")])
 
 
 def _named(data: dict[str, Any]) -> Iterator[_Named]:
@@ -187,24 +190,31 @@ def _inside(path: Path, where: str, name: str) -> Path:
     raise MissionError([Finding(str(path), where, name, problem, remedy)])
 
 
-def _points(files: list[tuple[str, bytes]]) -> Content:
-    (name, data) = files[0]
+def _points(data: bytes, name: str) -> Content:
     found = parse_points(data, name)
     return Content(found.slots.tolist(), found.colours)
 
 
-def _trajectories(files: list[tuple[str, bytes]], *, yaw: bool) -> Content:
-    """Pieces of each vehicle; with a ``yaw`` if that is asked for."""
-    curves, turns = parse_trajectories(files)
-    if yaw and not turns:
-        problem, remedy = "has no yaw", "remove yaw = 'file', or give a file with a column of yaw"
-        raise MissionError([Finding(files[0][0], "", None, problem, remedy)])
-    return Content([curve_to_rows(curve) for curve in curves])
+def _trajectories(_: bytes, name: str, *, yaw: bool) -> Content:
+    """Pieces of each vehicle; with a ``yaw`` if that is asked for.
+
+    Where a file has samples, they are joined by the spline with the least jerk (C4): it is not only judged but flown.
+    """
+    try:
+        found = read_trajectories(name)
+    except TrajectoryError as error:
+        raise _unread(name, "", error) from None
+    curves = [Curve(curve.time - curve.time[0], curve.pieces) for curve in found.curves]
+    if found.assumed in ASSUMED.values():
+        curves = [smoothed(curve) for curve in curves]
+    if yaw and any(np.isnan(curve.pieces[:, 3]).any() for curve in curves):
+        problem, remedy = "has no yaw", "remove yaw = 'file', or give a file with a yaw"
+        raise MissionError([Finding(name, "", None, problem, remedy)])
+    return Content([curve_to_rows(Curve(c.time, np.nan_to_num(c.pieces))) for c in curves])
 
 
-def _heights(files: list[tuple[str, bytes]]) -> Content:
+def _heights(data: bytes, name: str) -> Content:
     """Numbers of a CSV or NPY file, row by row."""
-    (name, data) = files[0]
 
     def refused(problem: str, remedy: str) -> MissionError:
         return MissionError([Finding(name, "", None, problem, remedy)])

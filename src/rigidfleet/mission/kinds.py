@@ -13,7 +13,7 @@ from pydantic import (
     model_validator,
 )
 
-from rigidfleet.formation.trajectory_files import joined, rows_to_curve
+from rigidfleet.foreign.pieces import joined, rows_to_curve
 from rigidfleet.mission import bounds
 from rigidfleet.mission.values import (
     AUTO,

@@ -11,8 +11,8 @@ import numpy as np
 
 from rigidfleet._common.text import agent_names
 from rigidfleet._common.toml import toml_key
+from rigidfleet.foreign.pieces import CHANNELS, jump, rows_to_curve
 from rigidfleet.formation import distance_geometry
-from rigidfleet.formation.trajectory_files import CHANNELS, jump, rows_to_curve
 from rigidfleet.math import rigid_body
 from rigidfleet.mission import bounds
 from rigidfleet.mission.files import NOT_A_FILE
@@ -376,9 +376,8 @@ def _go(collector: FindingCollector, p: Go, path: Keys, longest: float | None) -
         _exists(collector, name, path, "formations")
 
 
-#: Greatest jumps of position [m], velocity [m/s] and acceleration [m/s^2] within a trajectory: those of numbers that
-#: were rounded in a file.
-_JUMPS = ((0.01, "m"), (0.1, "m/s"), (1.0, "m/s^2"))
+#: Greatest jumps of position [m] and velocity [m/s] within a trajectory: those of numbers rounded in a file.
+_JUMPS = ((0.01, "m"), (0.1, "m/s"))
 
 
 def _follow(collector: FindingCollector, p: Follow, path: Keys, longest: float | None) -> None:
@@ -404,7 +403,7 @@ def _follow(collector: FindingCollector, p: Follow, path: Keys, longest: float |
             )
             return
         by, when = jump(rows_to_curve(rows))
-        for far, t, (most, unit) in zip(by.tolist(), when.tolist(), _JUMPS, strict=True):
+        for far, t, (most, unit) in zip(by.tolist(), when.tolist(), _JUMPS, strict=False):
             if far > most:
                 problem = f"jumps by {far:.3g} {unit} at {t:.6g} s"
                 remedy = f"correct it: at most {most:g} {unit} is taken for rounding"

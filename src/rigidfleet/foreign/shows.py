@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from rigidfleet.errors import TrajectoryError
-from rigidfleet.interchange.curves import Curve, of_bernstein, with_headings
+from rigidfleet.foreign.curves import Curve, of_bernstein, with_headings
 
 #: What is between the points of a show.
 BEZIER = "the Bezier curves of the show"
