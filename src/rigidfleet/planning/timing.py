@@ -102,7 +102,7 @@ def with_times(mission: Mission, phase: Phase, now: PhaseState, number: int) -> 
                 "lead the vehicles there before, by phases such as 'fly', 'turn' and 'reshape'",
             )
             path = f"phases[{number + 1}].{key}"
-            raise MissionError([Finding(mission.origin, path, phase.name, problem, remedy)])
+            raise MissionError([Finding(mission.origin, path, None, problem, remedy)])
     if not phase.automatic:
         return phase
     phase = _shared_out(mission, phase, now)
