@@ -309,7 +309,9 @@ def test_bent_ways_begin_by_hand():
     flight.advance()
     assert flight.begin(data["phases"][1])
     flight.advance()
-    assert flight.phases[1].planned["how"] == "conservative advancement"
+    planned = flight.phases[1].planned
+    assert planned is not None
+    assert planned["how"] == "conservative advancement"
     with pytest.raises(rf.MissionError, match="cannot begin by hand"):
         flight.begin(data["phases"][1] | {"transition": "layers", "formation": "ring"})
     result = flight.finish()

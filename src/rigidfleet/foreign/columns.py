@@ -106,7 +106,8 @@ def numbers(
                 fine = False
             if not fine:
                 raise TrajectoryError(
-                    f"{name}: line {line}: {names[k]} is {told[:40] or 'empty'}, not a finite number."
+                    f"{name}: line {line}: {names[k]} is {told[:40] or 'empty'}, not a finite number. Leave out rows"
+                    " without a position."
                 )
     raise TrajectoryError(f"{name}: the numbers cannot be read.")
 

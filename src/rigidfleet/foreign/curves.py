@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from math import comb
 from typing import NamedTuple
 
 import numpy as np
@@ -55,26 +54,6 @@ def values(pieces: Floats, after: Floats) -> Floats:
     for k in range(pieces.shape[2] - 1, -1, -1):  # Horner
         found = found * after[:, None] + pieces[:, :, k]
     return found
-
-
-def bernstein(pieces: Floats, duration: Floats) -> Floats:
-    """Bernstein coefficients (n, ..., P), or control points, of pieces (n, ..., P) of durations (n,) [s]."""
-    powers = pieces.shape[-1]
-    scaled = pieces * duration.reshape(-1, *(1,) * (pieces.ndim - 1)) ** np.arange(powers)
-    return scaled @ _to_bernstein(powers).T
-
-
-def of_bernstein(points: Floats, duration: float) -> Floats:
-    """Coefficients (P,) in ascending powers of time of a piece with control points (P,) and a duration [s]."""
-    powers = len(points)
-    return np.linalg.solve(_to_bernstein(powers), points) / duration ** np.arange(powers)
-
-
-def _to_bernstein(powers: int) -> Floats:
-    """The matrix of Bernstein coefficients b_i = sum_k C(i, k) / C(P - 1, k) a_k on [0, 1]."""
-    return np.array(
-        [[comb(i, k) / comb(powers - 1, k) for k in range(powers)] for i in range(powers)]
-    )
 
 
 def through(time: Floats, states: Floats, yaw: Floats | None = None) -> Curve:

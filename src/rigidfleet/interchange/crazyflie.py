@@ -13,8 +13,9 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from rigidfleet.errors import ResultError
-from rigidfleet.foreign.curves import NAMES, Curve, bernstein, of_bernstein
+from rigidfleet.foreign.curves import NAMES, Curve
 from rigidfleet.interchange.curves import Knots, Motion
+from rigidfleet.math.bernstein import bernstein, of_bernstein
 from rigidfleet.math.splines import POWERS
 from rigidfleet.typing import Floats
 

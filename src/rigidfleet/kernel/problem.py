@@ -244,6 +244,15 @@ def workspace(
     return w
 
 
+def cleared(w: Workspace) -> Workspace:
+    """The workspace as it was made; all its arrays lie in one memory."""
+    memory = w.r.base
+    assert memory is not None
+    memory.fill(0.0)
+    w.T[:] = w.T_ref[:] = np.eye(3)
+    return w
+
+
 def padded(count: int) -> int:
     """``count`` rounded up to a multiple of 8: the numbers in a cache line, and the lanes of a `lanes` value."""
     return -(-count // 8) * 8

@@ -29,7 +29,9 @@ _CLOSE, _STEP, _NEARLY, _NEAR = 1.006, 4.0, 1.002, 1.005
 #: A time that is more than twice as long has to lower the greatest share of a limit at least to this part of it.
 _STALLED = 0.98
 #: Root of each share that falls in proportion to the time, for ways from rest to rest.
-_POWERS = {"speed": 1.0, "acceleration": 1 / 2, "jerk": 1 / 3, "tilt": 1 / 2, "thrust": 1 / 2}
+_POWERS = {"jerk": 1 / 3, "tilt": 1 / 2, "thrust": 1 / 2}
+_POWERS |= {f"{way}speed": 1.0 for way in ("", "horizontal ", "vertical ")}
+_POWERS |= {f"{way}acceleration": 1 / 2 for way in ("", "horizontal ", "vertical ")}
 #: What automatic times have in reserve, and the unit to which they are rounded up [s].
 _MARGIN, _UNIT = 1.005, 1e-3
 #: Excess over a limit that is ignored.
@@ -114,7 +116,7 @@ def with_times(mission: Mission, phase: Phase, now: PhaseState, number: int) -> 
     if time is None:
         key = phase.automatic[0]
         problem = f"no time keeps the limits of the mission: {said(worst, phase)}"
-        remedy = f"raise limits.{worst.limit.name}, or change the way"
+        remedy = f"raise limits.{worst.limit.name.replace(' ', '_')}, or change the way"
         path = f"phases[{number + 1}].{key}"
         raise MissionError([Finding(mission.origin, path, AUTO, problem, remedy)])
     if time > shortest:

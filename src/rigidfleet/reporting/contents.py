@@ -73,6 +73,7 @@ def contents(
         "overlays": _overlays(flights, names) if several else [],
         "response": None if response is None else _embedded(response),
         "version": __version__,
+        "covers": _covers(flights),
     }
 
 
@@ -121,6 +122,17 @@ def _head(judged: int, failed: int) -> str:
     return f"{failed} of {judged} checks failed" if failed else f"all {judged} checks hold"
 
 
+def _covers(flights: Sequence[Result]) -> str:
+    """What the flights are, and what the report does not cover."""
+    if all(flight.interpolation is not None for flight in flights):
+        return "Others made this flight: its curve is judged, not whether vehicles can fly it."
+    if any(flight.rotor_force is not None for flight in flights):
+        return "This is a simulation: real vehicles differ from their models."
+    return (
+        "This is a simulation: vehicles are point masses that produce any thrust vector instantly."
+    )
+
+
 def _facts(result: Result) -> list[tuple[str, str]]:
     mission = result.mission
     mass = sorted(set(mission.agents.mass))
@@ -128,12 +140,20 @@ def _facts(result: Result) -> list[tuple[str, str]]:
     forms = [
         f"{name} ({len(mission.formation_edges(name))} edges)" for name in mission.formations
     ]  # fmt: skip
+    made = result.created.replace("T", " ").replace("+00:00", " UTC")
+    if result.interpolation is not None:
+        return [
+            ("vehicles", f"{result.n_agents}"),
+            ("duration", f"{result.time[-1] - result.time[0]:.4g} s"),
+            ("curve", result.interpolation),
+            ("read", made),
+        ]
     return [
         ("vehicles", f"{result.n_agents}, {masses}{_models(mission)}"),
         ("formations", ", ".join(forms) or "none"),
         ("control", mission.architecture),
         ("duration", f"{result.time[-1]:.4g} s, {len(result.phases)} phases"),
-        ("simulated", result.created.replace("T", " ").replace("+00:00", " UTC")),
+        ("simulated", made),
     ]
 
 
@@ -190,13 +210,13 @@ def _vehicles(result: Result) -> list[dict[str, Any]]:
     shown = np.arange(n) if n <= _VEHICLES else np.sort(np.argsort(-thrust)[:_VEHICLES])
     colours = plotting.agent_colours(n)
     limits = mission.agents.thrust_limit
-    flown = _with_rotors(result)
+    flown, known = _with_rotors(result), result.interpolation is None
     return [
         {
             "name": str(i + 1),
             "colour": colours[i],
-            "mass": f"{mission.agents.mass[i]:.4g}",
-            "thrust": value(float(thrust[i])),
+            "mass": f"{mission.agents.mass[i]:.4g}" if known else "",
+            "thrust": value(float(thrust[i])) if known else "",
             "used": f"{100 * thrust[i] / limits[i]:.0f} %" if math.isfinite(limits[i]) else "",
             "speed": value(float(speed[i])),
             "acceleration": value(float(acceleration[i])),
