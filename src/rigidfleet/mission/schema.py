@@ -218,6 +218,26 @@ class Avoidance(Part):
     release: Annotated[float, Strict(), Field(ge=0.01, le=60)] = Field(
         0.5, description="time in which edges let go near a barrier, and take hold again [s]"
     )
+    reference: Literal["path", "flow"] = Field(
+        "path",
+        description="path: vehicles are asked for what the laws ask; flow: what they ask is led round obstacles as a "
+        "flow round balls",
+    )
+    sensing_range: Length | None = Field(
+        None,
+        description="distance of an agent's centre from an obstacle that moves within which all see it [m]; default: "
+        "its motion is known in advance",
+    )
+    sensing_noise: LengthOrZero = Field(
+        0.0, description="standard deviation of the place of an obstacle seen, along each axis [m]"
+    )
+    obstacle_acceleration: Annotated[float, Strict(), Field(ge=0, le=100)] = Field(
+        0.0,
+        description="acceleration of obstacles that is reckoned with [m/s^2]: in the Kalman filter, and less braking",
+    )
+    seed: Seed = Field(
+        0, description="seed of the random numbers; the same seed gives the same sensing noise"
+    )
 
 
 class Agents(Part):
@@ -486,6 +506,14 @@ class Limits(Part):
 
     speed: Speed | None = Field(None, description="maximum speed [m/s]")
     acceleration: Acceleration | None = Field(None, description="maximum acceleration [m/s^2]")
+    horizontal_speed: Speed | None = Field(None, description="maximum speed over the ground [m/s]")
+    vertical_speed: Speed | None = Field(None, description="maximum speed up and down [m/s]")
+    horizontal_acceleration: Acceleration | None = Field(
+        None, description="maximum horizontal acceleration [m/s^2]"
+    )
+    vertical_acceleration: Acceleration | None = Field(
+        None, description="maximum acceleration up and down [m/s^2]"
+    )
     jerk: Jerk | None = Field(
         None,
         description="maximum jerk of the reference [m/s^3]; kept by the plan of a smooth mission",
@@ -688,6 +716,11 @@ class MissionHeader(Part):
         description="assignment of agents to slots and their edges: given: agent 1 to slot 1 and so on; shortest: "
         "least sum of squared distances from the start to the first established formation; safe: most clearance on the "
         "paths there; each: as shortest, anew at each change of formation, without turning the shapes",
+    )
+    assignment_downwash: Annotated[float, Strict(), Field(ge=1, le=100)] = Field(
+        1.0,
+        description="with assignment 'each': heights count divided by this, so that vehicles that change places keep "
+        "more of a distance above each other than beside",
     )
     gravity: Annotated[float, Strict(), from_zero(ACCELERATION)] = Field(
         9.81, description="gravity [m/s^2], >= 0"
