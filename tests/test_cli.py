@@ -678,13 +678,17 @@ def test_interrupt():
     assert not Path("flights/long/figures").exists()
 
 
-def test_interrupt_of_drawing(capsys, monkeypatch):
-    """Ctrl-C while figures are drawn leaves the flight as it is, and says so."""
+@pytest.mark.parametrize(
+    ("at_once", "during"), [(1, "plotting.plot"), (2, "cli.drawing.as_completed")]
+)
+def test_interrupt_of_drawing(capsys, monkeypatch, at_once: int, during: str):
+    """Ctrl-C while figures are drawn, here or by processes, leaves the flight as it is, and says so."""
 
     def draw(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("rigidfleet.plotting.plot", draw)
+    monkeypatch.setattr("rigidfleet.cli.drawing.at_once", lambda: at_once)
+    monkeypatch.setattr(f"rigidfleet.{during}", draw)
     assert cli.main(["run", "short.toml"]) == codes.INTERRUPTED
     assert capsys.readouterr().err.startswith(
         "Interrupted: the complete flight is saved in flights"

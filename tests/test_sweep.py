@@ -875,6 +875,8 @@ def test_command(folder, capsys):
         "sweeps/pair",
         "--summary",
         "--quiet",
+        "--format",
+        "svg",
         "--map",
         "agents.mass.1",
         "agents.mass.2",
