@@ -12,8 +12,8 @@ from rigidfleet.typing import Floats
 
 #: What is assumed between samples, in words.
 ASSUMED = {
-    "linear": "straight lines between the samples",
-    "cubic": "the cubic spline through the samples",
+    "linear": "straight lines between samples",
+    "cubic": "cubic splines through the positions",
 }
 
 

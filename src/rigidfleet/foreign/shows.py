@@ -41,13 +41,13 @@ def read_show(data: bytes, name: str) -> tuple[tuple[str, ...], tuple[Curve, ...
                     f"{name}: unpacks to {size >> 20:,} MiB, more than {_BYTES >> 20}. It is not a show."
                 )
             return _drones(archive, name)
-    except (zipfile.BadZipFile, EOFError, RuntimeError, NotImplementedError, OSError) as error:
-        raise TrajectoryError(
-            f"{name}: is not a complete zip archive ({error}). Export the show again."
-        ) from None
     except RecursionError:
         raise TrajectoryError(
             f"{name}: show.json is nested too deeply. Export the show again."
+        ) from None
+    except (zipfile.BadZipFile, EOFError, RuntimeError, NotImplementedError, OSError) as error:
+        raise TrajectoryError(
+            f"{name}: is not a complete zip archive ({error}). Export the show again."
         ) from None
 
 

@@ -280,14 +280,29 @@ def _sampled(mission: Mission, planned: PlannedPhase) -> Iterator[Remark]:
     for what, values, limit, unit in (
         ("speed", planned.velocity, limits.speed, "m/s"),
         ("acceleration", planned.acceleration, limits.acceleration, "m/s^2"),
+        ("horizontal speed", planned.velocity[..., :2], limits.horizontal_speed, "m/s"),
+        ("vertical speed", planned.velocity[..., 2:], limits.vertical_speed, "m/s"),
+        (
+            "horizontal acceleration",
+            planned.acceleration[..., :2],
+            limits.horizontal_acceleration,
+            "m/s^2",
+        ),
+        (
+            "vertical acceleration",
+            planned.acceleration[..., 2:],
+            limits.vertical_acceleration,
+            "m/s^2",
+        ),
     ):
         if limit is None:
             continue
         size = np.linalg.norm(values, axis=2)
+        of = f" of {what}" if " " in what else ""
         k, i = np.unravel_index(int(size.argmax()), size.shape)
         if size[k, i] > limit * (1 + 1e-3):
             text = (
-                f"agent {i + 1} reaches {size[k, i]:.3g} {unit} at {planned.time[k]:.2f} s in '{planned.phase}'"
+                f"agent {i + 1} reaches {size[k, i]:.3g} {unit}{of} at {planned.time[k]:.2f} s in '{planned.phase}'"
                 f" (limit {limit:g} {unit})"
             )
             yield Remark("fails" if planned.exact else "note", what, text)

@@ -60,7 +60,9 @@ def contents(
     several = len(flights) > 1
     colours = plotting.agent_colours(len(flights))
     found = [_flight(*each) for each in zip(flights, judged, names, colours, strict=True)]
-    response = overlay.response(missions, names)
+    # Trajectories that others made have no gains.
+    controlled = any(flight.interpolation is None for flight in flights)
+    response = overlay.response(missions, names) if controlled else None
     return {
         "title": " · ".join(names),
         "several": several,
@@ -71,6 +73,7 @@ def contents(
         "numbers": _numbers(flights, judged) if several else [],
         "keys": _keys(missions) if several else [],
         "overlays": _overlays(flights, names) if several else [],
+        "controlled": controlled,
         "response": None if response is None else _embedded(response),
         "version": __version__,
         "covers": _covers(flights),
@@ -112,7 +115,7 @@ def _flight(result: Result, verdict: Verdict, label: str, colour: str) -> dict[s
         "vehicles": _vehicles(result),
         "vehicles_left_out": max(0, result.n_agents - _VEHICLES),
         "summary": _figure(result, "summary"),
-        "gains": gains.explained(mission),
+        "gains": gains.explained(mission) if result.interpolation is None else [],
         "versions": _versions(result),
         "text": result.mission_text,
     }
