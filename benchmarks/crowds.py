@@ -78,8 +78,10 @@ def kernel(n: int, **given: Any) -> tuple[Any, ...]:
     flight = fleet.flight(vehicles, start=0.0, h=PERIOD, steps=1)
     work = workspace(n, 0)
     state = fleet.begin(flight, np.zeros((n, fleet.STATES)), work)
+    given = {"radius": 0.5 * APART} | given
+    radius = given.pop("radius") * mass
     a = avoidance(
-        period=PERIOD, b=THRUST * mass, lift=THRUST * mass, mass=mass, g=0.0, radius=0.5 * APART * mass, **given,
+        period=PERIOD, b=THRUST * mass, lift=THRUST * mass, mass=mass, g=0.0, radius=radius, **given,
     )  # fmt: skip
     return problem, work, flight, state, a
 
@@ -101,18 +103,24 @@ def least_distance(r: Floats, v: Floats, a: Floats, pairs: tuple[Any, Any]) -> f
     if not len(near):
         return np.inf
     i, j = i[near], j[near]
-    x, w, rise = x[near], v[i] - v[j], a[i] - a[j]
-    # Stationary points of a quartic, by Newton's method from eight places, and the ends
-    t = np.linspace(0.0, PERIOD, 8)[:, None] + np.zeros(len(near))
+    return float(on_parabolas(x[near], v[i] - v[j], a[i] - a[j]).min())
+
+
+def on_parabolas(x: Floats, w: Floats, rise: Floats) -> Floats:
+    """Least lengths (P,) of x + w t + rise t^2 / 2 (P, 3) over a period [m].
+
+    Stationary points of a quartic, by Newton's method from eight places, and the ends.
+    """
+    t = np.linspace(0.0, PERIOD, 8)[:, None] + np.zeros(len(x))
     for _ in range(4):
         y = x + w * t[..., None] + 0.5 * rise * t[..., None] ** 2
         rate = w + rise * t[..., None]
         slope = (y * rate).sum(axis=2)
         bend = (rate * rate + y * rise).sum(axis=2)
         t = np.clip(t - slope / np.where(bend > 1e-12, bend, np.inf), 0.0, PERIOD)
-    t = np.concatenate([t, np.zeros((1, len(near))), np.full((1, len(near)), PERIOD)])
+    t = np.concatenate([t, np.zeros((1, len(x))), np.full((1, len(x)), PERIOD)])
     y = x + w * t[..., None] + 0.5 * rise * t[..., None] ** 2
-    return float(np.linalg.norm(y, axis=2).min())
+    return np.linalg.norm(y, axis=2).min(axis=0)
 
 
 def swap(

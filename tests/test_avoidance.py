@@ -314,7 +314,7 @@ def test_a_force_from_outside_is_not_proved():
         ({"vehicles": {"point": {"model": "point", "mass": 1.0}}}, "thrust_limit"),
         ({"vehicles": {"point": {"model": "point", "mass": 2.0, "thrust_limit": 19.0}}}, "nothing to brake with"),
         ({"disturbances": {"links": {"rate": 50.0}}}, "links"),
-        ({"obstacles": [{"kind": "sphere", "centre": [9.0, 0, 0], "radius": 1.0, "velocity": [1.0, 0, 0]}]}, "moves"),
+        ({"avoidance": {"sensing_noise": 0.1}}, "sensing_range"),
         ({"disturbances": {"wind": [9.0, 0, 0]}, "vehicles": {
             "point": {"model": "point", "mass": 1.0, "thrust_limit": 12.0, "drag": 0.3}}}, "nothing to brake with"),
     ],

@@ -99,7 +99,7 @@ class Target(_Moment, total=False):
 class Planned(_Moment):
     """Certificate of a phase: the least separation of the planned paths [m], its time [s], the two agents, the proof.
 
-    Agents are counted from 0. ``how`` is "closed form" or "polygons less sagitta".
+    Agents are counted from 0. ``how`` is "closed form" or "conservative advancement".
     """
 
     separation: float
@@ -563,6 +563,11 @@ class Result:
     def left(self) -> Bools:
         """Mask (K, N) of the agents that are not lost at the time of each sample."""
         return self.time[:, None] <= self.mission.lost_at
+
+    @property
+    def interpolation(self) -> str | None:
+        """In words, the curve between samples of a flight that others made; None for a flight of our own."""
+        return self.statistics.get("interpolation")
 
     @cached_property
     def motors_off(self) -> Floats:

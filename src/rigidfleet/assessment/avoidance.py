@@ -102,4 +102,4 @@ def _doubt(measured: Measurements) -> str:
     if measured.result.statistics.get("pushed"):
         return "a force from outside acted, which it does not know"
     mission = measured.mission
-    return unproved(mission.vehicle_models or [], mission.disturbances)
+    return unproved(mission.vehicle_models or [], mission.disturbances, mission.obstacles)

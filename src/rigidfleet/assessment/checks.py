@@ -29,6 +29,8 @@ from rigidfleet.typing import Floats
 _SLACK = 1e-9
 # Greatest overlap of a vehicle that stands on an obstacle [m]; more is a collision.
 _CONTACT = 1e-6
+#: Greatest jump of a velocity that counts as rounding [m/s]. A speed and an extent from which units are doubted.
+_CORNER, _FAST, _WIDE = 0.01, 100.0, 20_000.0
 #: Greatest number of vehicles whose names are listed.
 _NAMED = 20
 #: Greatest distance from the nearest sample at which a moment is still judged [s]: at 10 m/s, a vehicle then
@@ -73,6 +75,7 @@ def all_checks(measured: Measurements, verdict: Verdict) -> Iterator[CheckResult
         if (limit := getattr(limits, name)) is not None:
             unit = "m/s" if order == 1 else "m/s^2"
             yield _moving(name, measured.greatest(order, size), unit, limit)
+    yield from _corners(measured)
     yield from _thrust(measured, worst.get("thrust"))
     yield from vehicle_checks(measured)
     yield from guarantee_checks(measured)
@@ -324,6 +327,26 @@ def _moving(check: str, e: Extreme | None, unit: str, limit: float | None) -> Ch
     return CheckResult(check, False, words, None, limit, unit)
 
 
+def _corners(measured: Measurements) -> Iterator[CheckResult]:
+    """Fail limits of acceleration where a curve that others made turns at a corner: none is great enough there."""
+    result, limits = measured.result, measured.mission.limits
+    if result.interpolation is None or not np.isfinite(result.acceleration).any():
+        return  # of straight lines, accelerations are not judged at all
+    first = np.flatnonzero(np.nextafter(result.time[:-1], np.inf) >= result.time[1:])
+    by = np.linalg.norm(result.velocity[first + 1] - result.velocity[first], axis=2)
+    if not by.size or by.max() <= _CORNER:
+        return
+    k, i = np.unravel_index(int(by.argmax()), by.shape)
+    most, t, who = float(by[k, i]), float(result.time[first[k]]), f"agent {i + 1}"
+    words = f"{who} turns at a corner at {t:.2f} s: its velocity jumps by {value(most, 'm/s')}"
+    judged = any(getattr(limits, f"{way}acceleration") for way in ("", "horizontal_", "vertical_"))
+    if judged:
+        words += f" (limit {_CORNER:g} m/s where accelerations are limited)"
+    yield CheckResult(
+        "corner", not judged, words, most, _CORNER if judged else None, "m/s", when=t, who=who, judged=judged
+    )  # fmt: skip
+
+
 def _separation(measured: Measurements, e: Extreme) -> CheckResult:
     limit = measured.mission.limits.separation or 0.0
     passed = e.value > 0 and e.value >= limit - _SLACK
@@ -490,13 +513,38 @@ def notes(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[str]:
             yield f"the thrust of {who} saturates at its limit, first at {since:.2f} s"
     yield from avoidance_notes(measured)
     yield from _sampled(measured)
-    if (how := measured.result.statistics.get("interpolation")) is not None:
-        yield f"others made this flight: what is judged is its curve, {how}"
-        yield from measured.result.statistics.get("notes", [])
-        names = measured.result.statistics.get("names", [])
-        plain = [f"agent {k}" for k in range(1, len(names) + 1)]
-        if names != plain and len(names) <= _NAMED:
-            yield f"agents from 1 on are {', '.join(names)}"
+    yield from _of_others(measured)
+
+
+def _of_others(measured: Measurements) -> Iterator[str]:
+    """What is judged of a flight that others made, how near its centres come, what is odd, and who is who."""
+    result = measured.result
+    if (how := result.interpolation) is None:
+        return
+    yield (
+        f"others made this flight: what is judged is its curve, {how}, also between samples; forces, thrust and "
+        "attitudes are not known"
+    )
+    radius, e = measured.mission.fleet.radius, measured.worst("separation", None, lambda x: -x)
+    if e is not None and np.ptp(radius) == 0.0:
+        far = value(e.value + 2.0 * float(radius[0]), "m")
+        yield f"the least distance centre to centre is {far}, {e.who} at {e.when:.2f} s"
+    fast, wide = measured.worst("speed", None), float(np.abs(result.position).max())
+    if wide > _WIDE or (fast is not None and fast.value > _FAST):
+        told = "" if fast is None else f"speeds reach {fast.value:,.0f} m/s and "
+        yield (
+            f"{told}positions {wide:,.0f} m: are these metres and seconds? A table may name other units in its "
+            "columns: x [mm], time [ms]"
+        )
+    yield from result.statistics.get("notes", [])
+    names = result.statistics.get("names", [])
+    known = (
+        [f"agent {k}" for k in range(1, len(names) + 1)],
+        [f"{k + 1}" for k in range(len(names))],
+    )
+    if names and names not in known:
+        more = f" and {len(names) - _NAMED:,} more" if len(names) > _NAMED else ""
+        yield f"agents from 1 on are {', '.join(names[:_NAMED])}{more}"
 
 
 def _left(measured: Measurements) -> Iterator[str]:

@@ -272,7 +272,7 @@ class Measurements:
         7 through position, velocity, acceleration and jerk of its samples.
         """
         result = self.result
-        motion = result.motion(flown="interpolation" not in result.statistics)
+        motion = result.motion(flown=result.interpolation is None)
         time, state = motion.time, np.where(self.left[:, None, :, None], motion.state, np.nan)
         state = state.swapaxes(0, 1)  # (4, K, N, 3)
         apart = np.flatnonzero(np.nextafter(time[:-1], np.inf) < time[1:])

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigidfleet.solids.records import Solids, joined
+from rigidfleet.solids.records import CYLINDER, HEIGHTS, Solids, joined
 from rigidfleet.typing import Floats, Ints
 
 #: Columns of `Avoidance.count`: ticks, entries of the list of neighbours, whether the list is too short.
@@ -20,12 +20,64 @@ TICKS, LISTED, FULL = range(3)
 BARRIER, GUARD, BRAKE = range(3)
 #: Rows of `Avoidance.margin`: between two vehicles, between a vehicle and an obstacle.
 PAIR, OBSTACLE = range(2)
+#: What is known of an obstacle that moves: nothing, its place, or its velocity, too; see `Sight.known`.
+UNKNOWN, FOLLOWED, KNOWN = range(3)
+#: Number of random numbers that measurements take in turn; prime, so that obstacles and axes share no pattern.
+_DRAWS = 65_521
 #: Mean number of neighbours in a large fleet at most, and number of vehicles up to which all pairs fit.
 _NEIGHBOURS, _FEW = 256, 400
 #: Greatest number of barriers between vehicles at a tick, per vehicle; more are left to the guard.
 _BARRIERS = 32
 #: Greatest number of rows of an exact solution of the barriers.
 EXACT = 64
+
+
+class Sight(NamedTuple):
+    """What is known of B obstacles, as displacements from where they stand in `Avoidance.solids`."""
+
+    moves: Ints  # (B,) 1 if it moves
+    reach: float  # distance from a vehicle within which an obstacle is seen [m]; infinity: known in advance
+    noise: float  # standard deviation of a measured place along each axis [m]
+    swerve: float  # acceleration of obstacles that is reckoned with [m/s^2]
+    normals: Floats  # (D,) standard normal numbers, taken in turn
+    centre: Floats  # (B, 3) middle of a ball that holds the obstacle, where it stands [m]
+    ball: Floats  # (B,) its radius [m]
+    known: Ints  # (B,) see `UNKNOWN`
+    track: Floats  # (B, 6) estimated displacement [m] and velocity [m/s]
+    spread: Floats  # (B, 3) variance of place, covariance of place and velocity, variance of velocity, of each axis
+    bound: Floats  # (B, 2) three standard deviations of place [m] and velocity [m/s]
+
+
+def sight(
+    solids: Solids,
+    reach: float = math.inf,
+    noise: float = 0.0,
+    swerve: float = 0.0,
+    seed: int = 0,
+) -> Sight:
+    """What is known of obstacles before the flight: nothing of those that move; see `Sight`."""
+    count = len(solids.kind)
+    moves = solids.last[:count, 3] > solids.first[:count, 3]
+    drawn = np.random.default_rng(seed).standard_normal(_DRAWS) if noise else np.zeros(1)
+    centre, radius = np.zeros((count, 3)), np.zeros(count)
+    for o in range(count):
+        centre[o], radius[o] = _ball(solids, o)
+    return Sight(
+        moves=moves.astype(np.int64), reach=float(reach), noise=float(noise), swerve=float(swerve), normals=drawn,
+        centre=centre, ball=radius, known=np.full(count, UNKNOWN), track=np.zeros((count, 6)),
+        spread=np.zeros((count, 3)), bound=np.zeros((count, 2)),
+    )  # fmt: skip
+
+
+def _ball(solids: Solids, o: int) -> tuple[Floats, float]:
+    """Middle (3,) and radius [m] of a ball that holds obstacle o; the radius of a ground or terrain is infinite."""
+    size, origin = solids.size[o], solids.origin[o]
+    if solids.kind[o] == CYLINDER:
+        return origin, float(np.hypot(size[0], size[1]))
+    if solids.kind[o] == HEIGHTS or not np.isfinite(size).all():
+        return origin, math.inf
+    half = float(0.5 * np.linalg.norm(size[3:] - size[:3]))
+    return origin + 0.5 * (size[:3] + size[3:]) @ solids.turn[o], half + float(solids.rounding[o])
 
 
 class Avoidance(NamedTuple):
@@ -47,7 +99,9 @@ class Avoidance(NamedTuple):
     spare: Floats  # (N,) by which D and R are widened [m]
     room: Floats  # (N,) radius, and half of the separation to keep [m]
     reach: Floats  # (N,) radius, and the clearance to keep [m]
-    solids: Solids  # (B,) convex obstacles that stand still
+    solids: Solids  # (B,) convex obstacles
+    sight: Sight  # those of them that move
+    flow: bool  # whether what vehicles are asked for flows round obstacles
     candidates: Floats  # (K, 3) accelerations that replace a refused one, in units of b
     # Neighbours
     start: Ints  # (N + 1,) those of vehicle i are at start[i] to start[i + 1]
@@ -65,6 +119,11 @@ class Avoidance(NamedTuple):
     ways: Floats  # (N, 4, 3) present choice: position, after the tick, stop point; stop point without a tick
     far: Floats  # (N,) distance from its position that a vehicle cannot leave in the tick and by braking after it [m]
     walls: Floats  # (N, B) distance of the stop segment from an obstacle to keep [m]
+    threat: Ints  # (N,) the obstacle that moves and leaves the least room, -1 if all leave enough
+    late: Floats  # (N,) by which its stop segment comes nearer than it should to this obstacle, negative [m]
+    shifted: (
+        Floats  # (4, 3) work: a way relative to an obstacle that moves, and the relative velocity
+    )
     trial: Floats  # (5, 3) the same of a candidate; its acceleration; at the start of the tick
     normal: Floats  # (3,)
     # Barriers: W rows
@@ -109,9 +168,14 @@ def avoidance(
     release: float = 0.5,
     guarded: bool = True,
     filtered: bool = True,
+    flow: bool = False,
+    seen: Sight | None = None,
     edges: int = 0,
 ) -> Avoidance:
-    """Avoidance of a fleet; see `Avoidance`. ``drag`` [1/s], ``lag`` and ``spare`` are one for all, or (N,)."""
+    """Avoidance of a fleet; see `Avoidance`. ``drag`` [1/s], ``lag`` and ``spare`` are one for all, or (N,).
+
+    Obstacles that move are known in advance, without ``seen``.
+    """
     solids = joined([]) if solids is None else solids
     n, count = len(b), len(solids.kind)
     capacity = n * (n - 1) if n <= _FEW else _NEIGHBOURS * n
@@ -122,12 +186,13 @@ def avoidance(
         share=float(share), release=float(release), b=_each(b, n), lift=_each(lift, n), weight=_each(mass, n),
         g=float(g), coast=_coast(_each(drag, n), period), lag=_each(lag, n), spare=_each(spare, n),
         room=radius + 0.5 * separation, reach=radius + clearance,
-        solids=solids, candidates=candidates(),
+        solids=solids, sight=sight(solids) if seen is None else seen, flow=flow, candidates=candidates(),
         start=np.zeros(n + 1, dtype=np.int64), near=np.zeros(capacity, dtype=np.int64), floor=np.zeros(capacity),
         order=np.arange(n), listed=np.full((n, 3), np.inf), span=np.zeros(3),
         known=np.zeros((3, n, 3)), wanted=np.zeros((n, 3)), shift=np.zeros((n, 3)),
         chosen=np.zeros((n, 3)), rise=np.zeros((n, 3)), ways=np.zeros((n, 4, 3)),
-        far=np.zeros(n), walls=np.zeros((n, count)), trial=np.zeros((5, 3)), normal=np.zeros(3),
+        far=np.zeros(n), walls=np.zeros((n, count)), threat=np.full(n, -1),
+        late=np.zeros(n), shifted=np.zeros((4, 3)), trial=np.zeros((5, 3)), normal=np.zeros(3),
         rows=np.zeros((rows, 2), dtype=np.int64), normals=np.zeros((rows, 3)), needed=np.zeros(rows),
         push=np.zeros(rows), most=np.zeros(rows), hold=np.ones(n), pull=np.zeros(edges),
         system=np.zeros((EXACT, EXACT)), right=np.zeros(EXACT), active=np.zeros(EXACT, dtype=np.int64),

@@ -22,11 +22,11 @@ makes the problem solvable where barriers contradict each other. Edges let go ne
 
 import math
 
-from rigidfleet.kernel.avoidance import BARRIER, EXACT
-from rigidfleet.kernel.compiler import elementwise  # noqa: F401 -- the functions of numbers below
+from rigidfleet.kernel.avoidance import BARRIER, EXACT, KNOWN
 from rigidfleet.kernel.compiler.jit import compiled
 from rigidfleet.kernel.linalg import cholesky, cholesky_solve
-from rigidfleet.solids.distance import outward_normal, own_axes, signed_distance
+from rigidfleet.kernel.moving import braking_beside
+from rigidfleet.kernel.segments import from_solid
 
 #: Greatest number of sweeps, change of an acceleration that ends them [m/s^2], distance that counts as none [m].
 _SWEEPS, _CLOSE, _NEAREST = 100, 1e-7, 1e-6
@@ -34,19 +34,6 @@ _SWEEPS, _CLOSE, _NEAREST = 100, 1e-7, 1e-6
 _FULL = 0.5
 #: Least share to which an edge holds in the equations.
 _LOOSE = 1e-3
-
-
-@compiled
-def from_solid(x, y, z, o, solids, normal):
-    """Signed distance [m] of a point from obstacle o, which stands still; writes its gradient (3,)."""
-    x, y, z = own_axes(x, y, z, o, solids)
-    u, v, w = outward_normal(x, y, z, o, solids)
-    normal[0], normal[1], normal[2] = u, v, w
-    if solids.turned[o] != 0:
-        T = solids.turn[o]
-        for q in range(3):
-            normal[q] = T[0, q] * u + T[1, q] * v + T[2, q] * w
-    return signed_distance(x, y, z, o, solids)
 
 
 @compiled
@@ -114,12 +101,23 @@ def list_barriers(r, v, lost, a):
                 count = add_row(count, i, j, x, y, z, needed, most, a)
         normal = a.normal
         for o in range(a.solids.kind.shape[0]):
-            gap = (
-                from_solid(r[i, 0], r[i, 1], r[i, 2], o, a.solids, normal) - a.reach[i] - a.spare[i]
-            )
-            s = normal[0] * v[i, 0] + normal[1] * v[i, 1] + normal[2] * v[i, 2]
+            B = a.b[i]
+            if a.sight.moves[o] == 0:
+                away = from_solid(r[i, 0], r[i, 1], r[i, 2], o, a.solids, normal)
+                gap = away - a.reach[i] - a.spare[i]
+                s = normal[0] * v[i, 0] + normal[1] * v[i, 1] + normal[2] * v[i, 2]
+            elif a.sight.known[o] == KNOWN:
+                x, bound, B = a.sight.track[o], a.sight.bound[o], braking_beside(i, o, a)
+                away = from_solid(
+                    r[i, 0] - x[0], r[i, 1] - x[1], r[i, 2] - x[2], o, a.solids, normal
+                )
+                gap = away - a.reach[i] - a.spare[i] - bound[0]
+                s = normal[0] * (v[i, 0] - x[3]) + normal[1] * (v[i, 1] - x[4])
+                s += normal[2] * (v[i, 2] - x[5]) - bound[1]
+            else:
+                continue
             gap -= max(0.0, -s) * a.lag[i]
-            needed = needed_rate(gap, s, 0.0, a.share * a.b[i], a.rate)
+            needed = needed_rate(gap, s, 0.0, a.share * B, a.rate)
             have = normal[0] * c[0] + normal[1] * c[1] + normal[2] * c[2]
             if needed > have - a.b[i]:
                 violated = violated or needed > have

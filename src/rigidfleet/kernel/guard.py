@@ -8,90 +8,39 @@ from what the others do at present; else the nearest of some fixed accelerations
 in docs/avoidance.md.
 
 Vehicles or obstacles that are nearer than they should be must not come nearer still.
+
+Beside an obstacle that moves, the stop segment is that of the relative velocity: braking relative to it keeps it, and
+is one of the candidates. This is braking to rest for no other, so that the proof holds for none of these.
 """
 
 import math
 
 from rigidfleet.kernel.avoidance import BRAKE, FULL, GUARD, LISTED, OBSTACLE, PAIR, TICKS
-from rigidfleet.kernel.barriers import filter_accelerations, from_solid, loosen
+from rigidfleet.kernel.barriers import filter_accelerations, limit, loosen
 from rigidfleet.kernel.compiler.jit import compiled
 from rigidfleet.kernel.fleet import TICKS as FLIGHT_TICKS
+from rigidfleet.kernel.moving import (
+    brake_beside,
+    braking_beside,
+    follow_flow,
+    look,
+    miss,
+    need_beside,
+    present,
+    room_beside,
+    stop_beside,
+    way_to_rest,
+)
 from rigidfleet.kernel.sampled_flight import path_at
+from rigidfleet.kernel.segments import between_segments, from_obstacle, from_solid, least_along
 
-#: Greatest number of tangents by which the nearest point of a segment to an obstacle is sought.
-_TANGENTS = 40
 #: Neighbours are listed for speeds higher by this share and summand [m/s], and for ways of this share of their
 #: distance, or this way [m].
 _FASTER, _LEAST_SPEED, _NEARER, _LEAST_WAY = 0.25, 0.2, 0.15, 0.2
+#: Shortfall beside an obstacle that moves from which a vehicle evades as well as it can [m].
+_LATE = 0.05
 #: Shortfall of a distance to keep that counts as rounding [m].
 _ROUNDING = 1e-9
-
-
-# -- distances -----------------------------------------------------------------------------------------
-
-
-@compiled
-def between_segments(p, q, r, s):
-    """Least distance [m] between the segments from p to q and from r to s (3,); Ericson 2005, section 5.1.9."""
-    d0, d1, d2 = q[0] - p[0], q[1] - p[1], q[2] - p[2]
-    e0, e1, e2 = s[0] - r[0], s[1] - r[1], s[2] - r[2]
-    x, y, z = p[0] - r[0], p[1] - r[1], p[2] - r[2]
-    dd, ee = d0 * d0 + d1 * d1 + d2 * d2, e0 * e0 + e1 * e1 + e2 * e2
-    f, c = e0 * x + e1 * y + e2 * z, d0 * x + d1 * y + d2 * z
-    a, b = 0.0, 0.0
-    if dd <= 1e-24:
-        b = min(max(f / ee, 0.0), 1.0) if ee > 1e-24 else 0.0
-    elif ee <= 1e-24:
-        a = min(max(-c / dd, 0.0), 1.0)
-    else:
-        de = d0 * e0 + d1 * e1 + d2 * e2
-        area = dd * ee - de * de
-        if area > 1e-12 * dd * ee:
-            a = min(max((de * f - c * ee) / area, 0.0), 1.0)
-        b = (de * a + f) / ee
-        if b < 0.0:
-            b, a = 0.0, min(max(-c / dd, 0.0), 1.0)
-        elif b > 1.0:
-            b, a = 1.0, min(max((de - c) / dd, 0.0), 1.0)
-    x, y, z = x + a * d0 - b * e0, y + a * d1 - b * e1, z + a * d2 - b * e2
-    return math.sqrt(x * x + y * y + z * z)
-
-
-@compiled
-def slope(p, q, x, o, solids, normal):
-    """Distance of a point at a share x of a segment from obstacle o, and its rate along it; writes the normal."""
-    u, v, w = q[0] - p[0], q[1] - p[1], q[2] - p[2]
-    value = from_solid(p[0] + x * u, p[1] + x * v, p[2] + x * w, o, solids, normal)
-    return value, normal[0] * u + normal[1] * v + normal[2] * w
-
-
-@compiled
-def from_obstacle(p, q, o, solids, enough, normal):
-    """Distance of the segment from p to q (3,) from obstacle o: a lower bound, and a place near the nearest point.
-
-    The distance to a convex obstacle is convex along the segment, so that it lies above its tangents. The bound is
-    exact, to rounding, unless it is certain to be at least, or below, ``enough``. Returns the bound, the distance at a
-    share of the segment, and this share, for which ``normal`` (3,) is that of a supporting plane.
-    """
-    high, falls = slope(p, q, 1.0, o, solids, normal)
-    if falls <= 0.0:
-        return high, high, 1.0
-    low, rises = slope(p, q, 0.0, o, solids, normal)
-    if rises >= 0.0:
-        return low, low, 0.0
-    a, b = 0.0, 1.0
-    bound, value, x = low + rises, low, 0.0
-    for _ in range(_TANGENTS):
-        x = min(max((high - low + rises * a - falls * b) / (rises - falls), a), b)
-        bound = low + rises * (x - a)
-        value, rate = slope(p, q, x, o, solids, normal)
-        if bound >= enough or value < enough or value - bound <= 1e-13:
-            break
-        if rate < 0.0:
-            a, low, rises = x, value, rate
-        else:
-            b, high, falls = x, value, rate
-    return bound, value, x
 
 
 # -- what a vehicle does -------------------------------------------------------------------------------
@@ -99,11 +48,8 @@ def from_obstacle(p, q, o, solids, enough, normal):
 
 @compiled
 def stop_distance(u, i, a):
-    """Way [m] to rest from a speed u [m/s], with commands held for a period: n whole ones, then one to rest."""
-    change = a.b[i] * a.period
-    n = math.floor(u / change)
-    rest = u - n * change
-    return a.period * (n * (u - 0.5 * n * change) + 0.5 * rest) + a.lag[i] * u
+    """Way [m] of vehicle i to rest from a speed u [m/s]."""
+    return way_to_rest(u, a.b[i], a.lag[i], a.period)
 
 
 @compiled
@@ -150,15 +96,6 @@ def take(i, far, a):
 
 
 @compiled
-def least_along(x, rate, rise, T):
-    """Least value of x + rate t + rise t^2 / 2 over [0, T]."""
-    least = min(x, x + T * (rate + 0.5 * T * rise))
-    if rise > 0.0 and -rise * T < rate < 0.0:
-        least = x - 0.5 * rate * rate / rise
-    return least
-
-
-@compiled
 def keeps(i, v, j, s, floor, a):
     """Whether the candidate of vehicle i keeps its distance from the present choice of j; velocities v and s (3,).
 
@@ -191,9 +128,11 @@ def keeps(i, v, j, s, floor, a):
 
 @compiled
 def clears(i, v, far, a):
-    """Whether the candidate of vehicle i, with a velocity v (3,), keeps its distances from all obstacles."""
+    """Whether the candidate of vehicle i, with a velocity v (3,), keeps its distances from obstacles at rest."""
     way, normal = a.trial, a.normal
     for o in range(a.solids.kind.shape[0]):
+        if a.sight.moves[o] != 0:
+            continue
         floor = a.walls[i, o]
         if from_solid(way[0, 0], way[0, 1], way[0, 2], o, a.solids, normal) - far >= floor:
             continue
@@ -353,6 +292,27 @@ def alone(i, a):
 
 
 @compiled
+def set_floor_beside(t, i, o, r, v, closest, a):
+    """Find the distance that the relative stop segment of vehicle i keeps from obstacle o, which moves.
+
+    Returns the least by which such a segment exceeds what it needs so far, at most 0; `threat` is its obstacle.
+    """
+    if not present(o, a):
+        return closest
+    stop, speed = stop_beside(i, o, r, v, a)
+    need, way = need_beside(i, o, speed, braking_beside(i, o, a), a), a.shifted
+    apart = from_solid(way[0, 0], way[0, 1], way[0, 2], o, a.solids, a.normal) - stop
+    a.walls[i, o] = need
+    if apart < need or apart - need < a.margin[OBSTACLE, 0]:
+        found, _, _ = from_obstacle(way[0], way[2], o, a.solids, need, a.normal)
+        a.walls[i, o] = min(need, found)
+        note(OBSTACLE, found - a.reach[i], t, i, o, a)
+        if found - need < closest or (apart < need and a.threat[i] < 0):
+            a.threat[i], closest = o, min(found - need, 0.0)
+    return closest
+
+
+@compiled
 def set_floors(t, r, v, lost, a):
     """Let all vehicles brake, and find the distances that their stop segments keep, as they should or as they do."""
     n, acceleration = a.b.shape[0], a.trial[3]
@@ -380,7 +340,12 @@ def set_floors(t, r, v, lost, a):
                 a.floor[e] = min(need, found)
                 if i < j:
                     note(PAIR, found - a.room[i] - a.room[j], t, i, j, a)
+        a.threat[i], a.late[i], closest = -1, 0.0, 0.0
         for o in range(a.solids.kind.shape[0]):
+            if a.sight.moves[o] != 0:
+                closest = set_floor_beside(t, i, o, r[i], v[i], closest, a)
+                a.late[i] = closest
+                continue
             need = a.reach[i] + a.spare[i]
             apart = from_solid(r[i, 0], r[i, 1], r[i, 2], o, a.solids, a.normal) - a.far[i]
             a.walls[i, o] = need
@@ -403,29 +368,64 @@ def safe(i, r, v, far, a):
 
 
 @compiled
+def propose(i, k, v, a, c):
+    """Candidate k of vehicle i into c (3,): what it wants, fixed ones, then braking relative to its threat."""
+    last = a.candidates.shape[0] + 1
+    if k == 0:
+        c[0], c[1], c[2] = a.wanted[i, 0], a.wanted[i, 1], a.wanted[i, 2]
+    elif k < last:
+        for q in range(3):
+            c[q] = a.b[i] * a.candidates[k - 1, q]
+    else:
+        brake_beside(i, a.threat[i], v, a, c)
+
+
+@compiled
+def room_if_braking(i, r, v, late, a):
+    """What `choose` compares of vehicle i, if it brakes [m]."""
+    c = a.trial[3]
+    brake(i, v[i], a, c)
+    if late:
+        return miss(r[i], v[i], c, a)
+    predict(i, r[i], v[i], c, a, a.trial)
+    return room_beside(i, v[i], a)
+
+
+@compiled
 def choose(i, r, v, a):
     """Choose for vehicle i: what it wants, else the nearest safe candidate, else braking; returns which.
 
-    0 means what it wants, 1 a candidate, 2 braking.
+    0 means what it wants, 1 a candidate, 2 braking. Obstacles that move can leave no safe candidate and make braking
+    unsafe, too: then the one counts that keeps all else and has the most room beside them. Where a vehicle could
+    not brake in time any more, the one counts that misses them most, held.
     """
     wanted, c, best, found = a.wanted[i], a.trial[3], math.inf, -1
-    for k in range(a.candidates.shape[0] + 1):
+    most, second = -math.inf, -1
+    late = a.threat[i] >= 0 and a.late[i] < -_LATE
+    for k in range(a.candidates.shape[0] + (2 if a.threat[i] >= 0 else 1)):
+        propose(i, k, v[i], a, c)
         away = 0.0
         for q in range(3):
-            c[q] = wanted[q] if k == 0 else a.b[i] * a.candidates[k - 1, q]
             away += (c[q] - wanted[q]) ** 2
         if away >= best:
             continue
         far = predict(i, r[i], v[i], c, a, a.trial)
-        if safe(i, r, v, far, a):
-            best, found = away, k
-            if k == 0:
-                take(i, far, a)
-                return 0
+        if not safe(i, r, v, far, a):
+            continue
+        room = miss(r[i], v[i], c, a) if late else room_beside(i, v[i], a)
+        if late or room < 0.0:
+            if room > most:
+                most, second = room, k
+            continue
+        best, found = away, k
+        if k == 0:
+            take(i, far, a)
+            return 0
     if found < 0:
-        return 2
-    for q in range(3):
-        c[q] = a.b[i] * a.candidates[found - 1, q]
+        if second < 0 or room_if_braking(i, r, v, late, a) >= most:
+            return 2
+        found = second
+    propose(i, found, v[i], a, c)
     take(i, predict(i, r[i], v[i], c, a, a.trial), a)
     return 1
 
@@ -466,6 +466,13 @@ def avoid(p, w, flight, state, a):
             r[i, q] = state.seen[i, q] + path_at(k, i, q, flight.tables)
             v[i, q] = state.seen[i, 3 + q] + path_at(k, i, 3 + q, flight.tables)
         want(i, state, a)
+    look(t, r, lost, a)
+    led = False
+    if a.flow:
+        for i in range(n):
+            if follow_flow(i, r[i], v[i], a):
+                limit(i, a)
+                led = True
     if not update_neighbours(r, v, lost, a):
         a.count[FULL] = 1
         return 0
@@ -485,6 +492,6 @@ def avoid(p, w, flight, state, a):
             tally(GUARD, i, t, a)
         if how > 1:
             tally(BRAKE, i, t, a)
-        if how > 0 or changed:
+        if how > 0 or changed or led:
             command(i, state, a)
     return 1

@@ -81,10 +81,14 @@ def widening(given: Avoidance, disturbances: Disturbances | None) -> float:
     return 0.0 if noise is None else _SIGMAS * noise.position
 
 
-def unproved(models: Sequence[VehicleModel], d: Disturbances | None) -> str:
-    """Why the guard's guarantee is no theorem for these vehicles; empty if it is one."""
+def unproved(
+    models: Sequence[VehicleModel], d: Disturbances | None, obstacles: Sequence[Any] = ()
+) -> str:
+    """Why the guard's guarantee is no theorem for these vehicles and obstacles; empty if it is one."""
     if not all(model.point for model in models):
         return "quadrotors cannot brake at once"
+    if any(thing.solid.moves for thing in obstacles):
+        return "obstacles move"
     if d is None:
         return ""
     for found, words in (
@@ -108,8 +112,12 @@ def check(collector: FindingCollector, parts: Mapping[str, Any]) -> None:
         problem = "needs sampled control, which only vehicles have"
         collector.add((_TABLE,), problem, remedy, None)
         return
-    if not (given.guard or given.barrier):
-        collector.add((_TABLE,), "has neither guard nor barrier", "remove it, or set one of them")
+    if not (given.guard or given.barrier or given.reference == "flow"):
+        problem = "has neither guard nor barrier nor flow"
+        collector.add((_TABLE,), problem, "remove it, or set one of them")
+    if given.sensing_noise and given.sensing_range is None:
+        remedy = "add the range within which obstacles that move are seen, or remove the noise"
+        collector.add((_TABLE, "sensing_noise"), "has no effect without sensing_range", remedy)
     d: Disturbances | None = parts.get("disturbances")
     if d is not None and d.links is not None:
         problem = (
@@ -121,11 +129,6 @@ def check(collector: FindingCollector, parts: Mapping[str, Any]) -> None:
             problem = "is no obstacle that [avoidance] knows: it needs convex ones"
             collector.add(
                 ("obstacles", k), problem, "build it of boxes or hulls, or remove [avoidance]", None
-            )
-        elif thing.solid.moves:
-            problem = "moves, and [avoidance] knows obstacles only that stand still"
-            collector.add(
-                ("obstacles", k), problem, "let it stand still, or remove [avoidance]", None
             )
     if "agents" not in parts or collector.findings:
         return

@@ -218,6 +218,26 @@ class Avoidance(Part):
     release: Annotated[float, Strict(), Field(ge=0.01, le=60)] = Field(
         0.5, description="time in which edges let go near a barrier, and take hold again [s]"
     )
+    reference: Literal["path", "flow"] = Field(
+        "path",
+        description="path: vehicles are asked for what the laws ask; flow: what they ask is led round obstacles as a "
+        "flow round balls",
+    )
+    sensing_range: Length | None = Field(
+        None,
+        description="distance of an agent's centre from an obstacle that moves within which all see it [m]; default: "
+        "its motion is known in advance",
+    )
+    sensing_noise: LengthOrZero = Field(
+        0.0, description="standard deviation of the place of an obstacle seen, along each axis [m]"
+    )
+    obstacle_acceleration: Annotated[float, Strict(), Field(ge=0, le=100)] = Field(
+        0.0,
+        description="acceleration of obstacles that is reckoned with [m/s^2]: in the Kalman filter, and less braking",
+    )
+    seed: Seed = Field(
+        0, description="seed of the random numbers; the same seed gives the same sensing noise"
+    )
 
 
 class Agents(Part):

@@ -20,6 +20,8 @@ def avoidance_in_flight(mission: Mission, flight: fleet.Flight) -> avoidance.Avo
     if separation is None:
         separation = mission.limits.separation or 0.0
     limit = np.array([model.thrust_limit for model in models])
+    solids = joined([thing.solid for thing in mission.obstacles])
+    reach = np.inf if given.sensing_range is None else given.sensing_range
     drag = np.where([model.point for model in models], mission.drag / mass, 0.0)
     return avoidance.avoidance(
         period=flight.every * flight.steps * flight.h,
@@ -28,7 +30,10 @@ def avoidance_in_flight(mission: Mission, flight: fleet.Flight) -> avoidance.Avo
         mass=mass,
         g=mission.gravity,
         radius=np.array(mission.agents.radius, dtype=float),
-        solids=joined([thing.solid for thing in mission.obstacles]),
+        solids=solids,
+        seen=avoidance.sight(
+            solids, reach, given.sensing_noise, given.obstacle_acceleration, given.seed
+        ),
         separation=separation,
         clearance=given.clearance,
         drag=drag,
@@ -39,4 +44,5 @@ def avoidance_in_flight(mission: Mission, flight: fleet.Flight) -> avoidance.Avo
         release=given.release,
         guarded=given.guard,
         filtered=given.barrier,
+        flow=given.reference == "flow",
     )

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rigidfleet.errors import ResultError
+from rigidfleet.foreign.samples import ASSUMED
 from rigidfleet.interchange.curves import Curve
 from rigidfleet.kernel import records
 from rigidfleet.kernel.problem import workspace
@@ -41,11 +42,13 @@ _SAME = 1e-9
 #: Where a start is moved to zero: a time of a clock, not of a flight [s].
 _CLOCK = 1e5
 NAMES = {
-    1: "straight lines between samples",
+    1: ASSUMED["linear"],
     3: "cubics",
     5: "quintics",
     7: "polynomials of degree 7",
 }
+#: Limits of a mission that positions over time do not show.
+UNJUDGED = ("jerk", "tilt_deg", "saturation", "tracking_error", "separation_allowance")
 #: Name of the only phase.
 PHASE = "flight"
 
@@ -170,7 +173,7 @@ def trajectories(
         from scipy.interpolate import CubicSpline
 
         pieces = np.moveaxis(CubicSpline(t, states[0]).c[::-1], 0, -1)
-        how = "cubic splines"
+        how = ASSUMED["cubic"]
     elif len(states) == 1:
         slope = np.diff(states[0], axis=0) / np.diff(t)[:, None, None]
         pieces, how = np.stack([states[0][:-1], slope], axis=-1), NAMES[1]
@@ -246,6 +249,8 @@ def judged_as(
             "geodetic_origin",
         )
         data = {key: x for key, x in given.to_dict().items() if key in kept}
+        bounds = data.get("limits", {})
+        data["limits"] = {key: x for key, x in bounds.items() if key not in UNJUDGED}
         agents: dict[str, Any] = {
             "radius": list(given.agents.radius),
             "mass": list(given.agents.mass),
@@ -290,7 +295,10 @@ def of_pieces(
     mission = judged_as(first[0, 0], span, **judged)
     time, state, yaw = _samples(pieces, first, last)
     record = PhaseRecord(PHASE, "hold", "open", None, float(time[0]), float(time[-1]))
-    _put_extremes(record, mission, pieces, smooth=interpolation != NAMES[1])
+    smooth = pieces.position.shape[-1] > 2  # lines turn at once at samples
+    _put_extremes(record, mission, pieces, smooth=smooth)
+    if not smooth:
+        state[2:] = np.nan
     return _result(mission, record, time, state, yaw, interpolation, names)
 
 
@@ -481,7 +489,6 @@ def _result(
         )
         for name in names
     }
-    flown = a if interpolation != NAMES[1] else nothing  # lines turn at once at samples
     edged = (
         "distance",
         "distance_reference",
@@ -492,8 +499,8 @@ def _result(
     )
     empty: dict[str, Any] = dict.fromkeys(edged, none)
     return Result(
-        time=time, phase=np.zeros(k, dtype=np.int64), position=r, velocity=v, acceleration=flown,
-        slot_position=r, slot_velocity=v, slot_acceleration=flown, slot_jerk=j,
+        time=time, phase=np.zeros(k, dtype=np.int64), position=r, velocity=v, acceleration=a,
+        slot_position=r, slot_velocity=v, slot_acceleration=a, slot_jerk=j,
         yaw=np.nan_to_num(yaw), yaw_rate=np.zeros((k, n)),
         input_force=nothing, constraint_force=nothing, external_force=nothing, thrust=nothing[..., 0],
         cm=cm, cm_velocity=cm_velocity, cm_reference=cm, cm_velocity_reference=cm_velocity,

@@ -7,13 +7,13 @@ from collections.abc import Callable
 import numpy as np
 
 from rigidfleet.errors import TrajectoryError
-from rigidfleet.interchange.curves import Curve, through
+from rigidfleet.foreign.curves import Curve, through
 from rigidfleet.typing import Floats
 
 #: What is assumed between samples, in words.
 ASSUMED = {
-    "linear": "straight lines between the samples",
-    "cubic": "the cubic spline through the samples",
+    "linear": "straight lines between samples",
+    "cubic": "cubic splines through the positions",
 }
 
 

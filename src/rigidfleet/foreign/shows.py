@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from rigidfleet.errors import TrajectoryError
-from rigidfleet.interchange.curves import Curve, with_headings
+from rigidfleet.foreign.curves import Curve, with_headings
 from rigidfleet.math.bernstein import of_bernstein
 
 #: What is between the points of a show.
@@ -41,13 +41,13 @@ def read_show(data: bytes, name: str) -> tuple[tuple[str, ...], tuple[Curve, ...
                     f"{name}: unpacks to {size >> 20:,} MiB, more than {_BYTES >> 20}. It is not a show."
                 )
             return _drones(archive, name)
-    except (zipfile.BadZipFile, EOFError, RuntimeError, NotImplementedError, OSError) as error:
-        raise TrajectoryError(
-            f"{name}: is not a complete zip archive ({error}). Export the show again."
-        ) from None
     except RecursionError:
         raise TrajectoryError(
             f"{name}: show.json is nested too deeply. Export the show again."
+        ) from None
+    except (zipfile.BadZipFile, EOFError, RuntimeError, NotImplementedError, OSError) as error:
+        raise TrajectoryError(
+            f"{name}: is not a complete zip archive ({error}). Export the show again."
         ) from None
 
 

@@ -1,0 +1,290 @@
+"""Obstacles that move: what is known of them, how vehicles fly relative to them, and the flow round them.
+
+An obstacle is known in advance, or seen while it is within a range of any vehicle; vehicles share what they see. Places
+are seen with noise, of the same size along each axis. A Kalman filter with the model of a constant velocity
+(Bar-Shalom, Li and Kirubarajan, *Estimation with Applications to Tracking and Navigation*, 2001, section 6.2.2) follows
+each obstacle; its three axes share one covariance. Where a filter is not sure of the velocity yet, the obstacle counts
+as unknown.
+
+Relative to an obstacle of constant velocity, a vehicle brakes as it does relative to one that stands still: its
+stop segment is that of its relative velocity. Drag, which acts against the velocity through the air, takes from the
+braking what it is at the obstacle's velocity, and so does the acceleration of the obstacle that is reckoned with.
+"""
+
+import math
+
+from rigidfleet.kernel.avoidance import FOLLOWED, KNOWN, UNKNOWN
+from rigidfleet.kernel.compiler import elementwise  # noqa: F401 -- the functions of numbers below
+from rigidfleet.kernel.compiler.jit import compiled
+from rigidfleet.kernel.segments import from_obstacle, from_solid, least_along
+from rigidfleet.solids.distance import displacement
+
+#: Standard deviations that bounds of an estimate have.
+_SIGMAS = 3.0
+#: Standard deviation of the speed of an obstacle at first sight, and below which it is known [m/s].
+_FIRST, _SURE = 10.0, 0.5
+#: Time that an acceleration of an obstacle is taken to last [s]; it makes white noise of it.
+_LASTS = 1.0
+#: Standard deviation of its place with which an obstacle out of sight is forgotten [m].
+_FORGET = 1.0
+#: Longest time [s] and number of times at which a miss is looked for.
+_FARTHEST, _LOOKS = 3.0, 12
+#: Least share of its braking that a vehicle is taken to have relative to an obstacle.
+_LEAST = 0.1
+#: Rate at which flow leads a vehicle's velocity [1/s], its radius over that of the obstacle with the vehicle, and the
+#: least share of a velocity that it changes.
+_FLOW_RATE, _WIDER, _WEAK = 4.0, 1.2, 1e-3
+
+
+# -- what is known -------------------------------------------------------------------------------------
+
+
+@compiled
+def expect(o, T, sight):
+    """Predict the track of obstacle o by T [s]: constant velocity, with white noise of its acceleration."""
+    x, P = sight.track[o], sight.spread[o]
+    q = sight.swerve * sight.swerve * _LASTS
+    for axis in range(3):
+        x[axis] += T * x[3 + axis]
+    P[0] += T * (2.0 * P[1] + T * (P[2] + q * T / 3.0))
+    P[1] += T * (P[2] + 0.5 * q * T)
+    P[2] += q * T
+
+
+@compiled
+def correct(o, z, sight):
+    """Correct the track of obstacle o by a measured displacement z (3,) [m]."""
+    x, P = sight.track[o], sight.spread[o]
+    total = P[0] + sight.noise * sight.noise
+    near, fast = P[0] / total, P[1] / total
+    for axis in range(3):
+        wrong = z[axis] - x[axis]
+        x[axis] += near * wrong
+        x[3 + axis] += fast * wrong
+    P[2] -= fast * P[1]
+    P[1] *= 1.0 - near
+    P[0] *= 1.0 - near
+
+
+@compiled
+def in_sight(o, x, y, z, r, lost, a):
+    """Whether any vehicle is within sensing range of obstacle o, displaced by x, y, z [m]."""
+    for i in range(r.shape[0]):
+        if not lost[i]:
+            away = from_solid(r[i, 0] - x, r[i, 1] - y, r[i, 2] - z, o, a.solids, a.normal)
+            if away <= a.sight.reach:
+                return True
+    return False
+
+
+@compiled
+def see(o, k, x, y, z, u, v, w, a):
+    """Take a measurement of obstacle o at tick k, at the displacement x, y, z [m] with the velocity u, v, w [m/s]."""
+    s = a.sight
+    track, spread, seen = s.track[o], s.spread[o], a.shifted[0]
+    seen[0], seen[1], seen[2] = x, y, z
+    if s.noise == 0.0:
+        track[0], track[1], track[2], track[3], track[4], track[5] = x, y, z, u, v, w
+        spread[0], spread[1], spread[2] = 0.0, 0.0, 0.0
+        return
+    for axis in range(3):
+        at = (3 * (k * s.moves.shape[0] + o) + axis) % s.normals.shape[0]
+        seen[axis] += s.noise * s.normals[at]
+    if s.known[o] == UNKNOWN:
+        for axis in range(3):
+            track[axis], track[3 + axis] = seen[axis], 0.0
+        spread[0], spread[1], spread[2] = s.noise * s.noise, 0.0, _FIRST * _FIRST
+    else:
+        correct(o, seen, s)
+
+
+@compiled
+def look(t, r, lost, a):
+    """Bring what is known of all obstacles that move to t [s], with vehicles at r (N, 3)."""
+    s, T = a.sight, a.period
+    k = int(t / T + 0.5)
+    for o in range(s.moves.shape[0]):
+        if s.moves[o] == 0:
+            continue
+        x, y, z = displacement(t, o, a.solids)
+        u, v, w = displacement(t + T, o, a.solids)
+        u, v, w = (u - x) / T, (v - y) / T, (w - z) / T
+        if s.known[o] != UNKNOWN:
+            expect(o, T, s)
+        if not s.reach < math.inf or in_sight(o, x, y, z, r, lost, a):
+            see(o, k, x, y, z, u, v, w, a)
+            s.known[o] = FOLLOWED
+        if s.known[o] == UNKNOWN:
+            continue
+        place, speed = math.sqrt(s.spread[o, 0]), math.sqrt(s.spread[o, 2])
+        s.bound[o, 0], s.bound[o, 1] = _SIGMAS * place, _SIGMAS * speed
+        s.known[o] = KNOWN if speed <= _SURE else FOLLOWED
+        if place > _FORGET:
+            s.known[o] = UNKNOWN
+
+
+# -- relative motion -----------------------------------------------------------------------------------
+
+
+@compiled
+def present(o, a):
+    """Whether obstacle o stands still, or moves and is known."""
+    return a.sight.moves[o] == 0 or a.sight.known[o] == KNOWN
+
+
+@compiled
+def braking_beside(i, o, a):
+    """Acceleration [m/s^2] with which vehicle i can always brake relative to obstacle o, which moves."""
+    x = a.sight.track[o]
+    speed = math.sqrt(x[3] * x[3] + x[4] * x[4] + x[5] * x[5])
+    drag = (1.0 - a.coast[i, 0]) / a.coast[i, 1]
+    return max(a.b[i] - drag * speed - a.sight.swerve, _LEAST * a.b[i])
+
+
+@compiled
+def brake_beside(i, o, v, a, out):
+    """Acceleration (3,) that brakes vehicle i from a velocity v (3,) relative to obstacle o, straight, with drag.
+
+    It bears the drag that the vehicle has at the obstacle's velocity, so that what is left acts on the relative one.
+    """
+    x, E, first = a.sight.track[o], a.coast[i, 0], a.coast[i, 1]
+    speed = 0.0
+    for q in range(3):
+        speed += (v[q] - x[3 + q]) ** 2
+    speed = math.sqrt(speed)
+    size = min(braking_beside(i, o, a), speed * E / first) / max(speed, 1e-12)
+    for q in range(3):
+        out[q] = (1.0 - E) / first * x[3 + q] - size * (v[q] - x[3 + q])
+
+
+@compiled
+def way_to_rest(u, b, lag, T):
+    """Way [m] to rest from a speed u [m/s], with commands held for a period: n whole ones, then one to rest."""
+    change = b * T
+    n = math.floor(u / change)
+    rest = u - n * change
+    return T * (n * (u - 0.5 * n * change) + 0.5 * rest) + lag * u
+
+
+@compiled
+def need_beside(i, o, speed, b, a):
+    """Distance [m] from obstacle o, which moves, to keep by the stop segment of vehicle i at a relative speed."""
+    bound = a.sight.bound[o]
+    return a.reach[i] + a.spare[i] + bound[0] + bound[1] * speed / b
+
+
+@compiled
+def stop_beside(i, o, r, v, a):
+    """Write the relative stop segment of vehicle i to ``shifted`` 0 and 2; returns its length and relative speed."""
+    x, out = a.sight.track[o], a.shifted
+    speed = 0.0
+    for q in range(3):
+        out[0, q], out[3, q] = r[q] - x[q], v[q] - x[3 + q]
+        speed += out[3, q] * out[3, q]
+    speed = math.sqrt(speed)
+    stop = way_to_rest(speed, braking_beside(i, o, a), a.lag[i], a.period)
+    for q in range(3):
+        out[2, q] = out[0, q] + stop / max(speed, 1e-12) * out[3, q]
+    return stop, speed
+
+
+@compiled
+def room_beside(i, v, a):
+    """By how much the candidate of vehicle i keeps its distances from obstacles that move [m]; infinite if it is far.
+
+    The candidate is ``trial``, the velocity before it v (3,).
+    """
+    way, out, T, normal, room = a.trial, a.shifted, a.period, a.normal, math.inf
+    E, first = a.coast[i, 0], a.coast[i, 1]
+    for o in range(a.sight.moves.shape[0]):
+        if a.sight.moves[o] == 0 or a.sight.known[o] != KNOWN:
+            continue
+        x, floor = a.sight.track[o], a.walls[i, o]
+        before = after = rise = 0.0
+        for q in range(3):
+            end = v[q] * E + way[3, q] * first - x[3 + q]
+            out[0, q] = way[0, q] - x[q]
+            out[1, q] = way[1, q] - x[q] - T * x[3 + q]
+            out[2, q], out[3, q] = end, v[q] - x[3 + q]
+            before += out[3, q] * out[3, q]
+            after += end * end
+            rise += way[4, q] * way[4, q]
+        before, after = math.sqrt(before), math.sqrt(after)
+        stop = way_to_rest(after, braking_beside(i, o, a), a.lag[i], T)
+        far = T * (before + 0.5 * T * math.sqrt(rise)) + stop
+        if from_solid(out[0, 0], out[0, 1], out[0, 2], o, a.solids, normal) - far >= floor:
+            continue
+        for q in range(3):
+            out[2, q] = out[1, q] + stop / max(after, 1e-12) * out[2, q]
+        bound, value, _ = from_obstacle(out[1], out[2], o, a.solids, floor, normal)
+        room = min(room, (value if value < floor else bound) - floor)
+        bound, value, share = from_obstacle(out[0], out[1], o, a.solids, floor, normal)
+        room = min(room, (value if value < floor else bound) - floor)
+        along = rate = lift = 0.0
+        for q in range(3):
+            along += normal[q] * (out[1, q] - out[0, q])
+            rate += normal[q] * out[3, q]
+            lift += normal[q] * way[4, q]
+        room = min(room, least_along(value - share * along, rate, min(lift, lift * E), T) - floor)
+    return room
+
+
+@compiled
+def miss(r, v, c, a):
+    """By how much a vehicle at r with v (3,) misses all obstacles that move [m], if it holds an acceleration c (3,).
+
+    That is the least distance of its centre at some times, up to twice that of the nearest approach without c.
+    """
+    least = math.inf
+    for o in range(a.sight.moves.shape[0]):
+        if a.sight.moves[o] == 0 or a.sight.known[o] != KNOWN:
+            continue
+        x, w = a.sight.track[o], a.shifted[3]
+        nearing = fast = 0.0
+        for q in range(3):
+            w[q] = v[q] - x[3 + q]
+            nearing -= (r[q] - x[q] - a.sight.centre[o, q]) * w[q]
+            fast += w[q] * w[q]
+        until = min(2.0 * nearing / max(fast, 1e-12), _FARTHEST)
+        for k in range(1, _LOOKS + 1):
+            t = max(until, a.period) * k / _LOOKS
+            away = from_solid(
+                r[0] - x[0] + t * (w[0] + 0.5 * t * c[0]), r[1] - x[1] + t * (w[1] + 0.5 * t * c[1]),
+                r[2] - x[2] + t * (w[2] + 0.5 * t * c[2]), o, a.solids, a.normal,
+            )  # fmt: skip
+            least = min(least, away)
+    return least
+
+
+# -- flow ----------------------------------------------------------------------------------------------
+
+
+@compiled
+def follow_flow(i, r, v, a):
+    """Lead what vehicle i is asked for round obstacles, as a flow round balls leads a fluid; whether it does.
+
+    The law asks for a velocity V = v + a / rate. With the obstacle's velocity w, the stream U = V - w that meets a
+    ball of radius R has at a distance q from its middle, in the direction n, the velocity of a doublet in it:
+    U + (R / q)^3 / 2 (U - 3 (U . n) n) (Lamb, *Hydrodynamics*, section 92). R is that of a ball round the obstacle,
+    with the vehicle, and a fifth more; nearer than R, q is R.
+    """
+    s, led, normal, ask = a.sight, False, a.normal, a.shifted[0]
+    for q in range(3):
+        ask[q] = v[q] + a.wanted[i, q] / _FLOW_RATE
+    for o in range(s.moves.shape[0]):
+        if not (s.ball[o] < math.inf and present(o, a)):
+            continue
+        x = s.track[o]
+        away = from_solid(r[0] - x[0], r[1] - x[1], r[2] - x[2], o, a.solids, normal)
+        size = _WIDER * (s.ball[o] + a.reach[i] + a.spare[i])
+        share = 0.5 * (size / max(away + s.ball[o], size)) ** 3
+        if share < _WEAK:
+            continue
+        along = 0.0
+        for q in range(3):
+            along += (ask[q] - x[3 + q]) * normal[q]
+        for q in range(3):
+            turn = share * (ask[q] - x[3 + q] - 3.0 * along * normal[q])
+            a.wanted[i, q] += _FLOW_RATE * turn
+        led = True
+    return led
