@@ -415,3 +415,25 @@ def test_a_mission_gives_obstacles_and_limits(own, capsys):
     found = {c["check"]: c for c in json.loads(capsys.readouterr().out)["checks"]}
     flown = check_of(rf.assess(rf.simulate("narrow-passage")), "clearance")
     assert found["clearance"]["worst"] == pytest.approx(flown.worst, abs=0.02)
+
+
+# -- the page ----------------------------------------------------------------------------------------
+
+ROOT = Path(__file__).parents[1]
+
+
+def test_the_page_says_what_happens(tmp_path, monkeypatch, capsys):
+    """The command of the page gives the verdict that it quotes, and its Python runs."""
+    page = (ROOT / "docs" / "import.md").read_text(encoding="utf-8")
+    (command,) = re.findall(r"^    rigidfleet (assess .*)$", page, re.MULTILINE)
+    monkeypatch.chdir(tmp_path)
+    tmp_path.joinpath("tests").symlink_to(ROOT / "tests")
+    assert main(command.split()) == FAILED
+    said = " ".join(capsys.readouterr().out.split())
+    quoted = re.search(r"^    Note: others.*?(?=\n\n)", page, re.MULTILINE | re.DOTALL)
+    assert quoted is not None
+    assert " ".join(quoted[0].split()) in said
+    assert (tmp_path / "flights" / "seven" / "report.html").exists()
+    (code,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    exec(compile(code, "import.md", "exec"), {})
+    assert capsys.readouterr().out.startswith("Passed")
