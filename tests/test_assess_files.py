@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rigidfleet.interchange.foreign import read_trajectories
 
 import rigidfleet as rf
 from rigidfleet.cli.app import BAD_INPUT, FAILED, PASSED, main
 from rigidfleet.interchange import texts
-from rigidfleet.interchange.foreign import read_trajectories
 from rigidfleet.simulation.trajectories import of_curves
 
 SEVEN = Path(__file__).parent / "data" / "sequence_trajectories"

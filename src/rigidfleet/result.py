@@ -99,7 +99,7 @@ class Target(_Moment, total=False):
 class Planned(_Moment):
     """Certificate of a phase: the least separation of the planned paths [m], its time [s], the two agents, the proof.
 
-    Agents are counted from 0. ``how`` is "closed form" or "polygons less sagitta".
+    Agents are counted from 0. ``how`` is "closed form" or "conservative advancement".
     """
 
     separation: float

@@ -117,7 +117,7 @@ def _of_others(
     RigidfleetError
         A file or a limit cannot be read, or an option has no effect.
     """
-    from rigidfleet.interchange.foreign import read_trajectories
+    from rigidfleet.foreign.files import read_trajectories
     from rigidfleet.simulation.trajectories import of_curves
 
     found: dict[str, float] = {}

@@ -20,7 +20,8 @@ import numpy as np
 from rigidfleet._common.arguments import as_path
 from rigidfleet._common.files import replacing_folder, write_file
 from rigidfleet.errors import ResultError
-from rigidfleet.interchange import crazyflie, gltf, mavlink, recordings, skybrush, tables, texts
+from rigidfleet.foreign import texts
+from rigidfleet.interchange import crazyflie, gltf, mavlink, recordings, skybrush, tables
 from rigidfleet.interchange.curves import Deviation, Motion, deviation, tracked
 from rigidfleet.result import Result, as_result
 

@@ -13,7 +13,8 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from rigidfleet.errors import ResultError
-from rigidfleet.interchange.curves import Curve, Knots, Motion
+from rigidfleet.foreign.curves import NAMES, Curve
+from rigidfleet.interchange.curves import Knots, Motion
 from rigidfleet.math.bernstein import bernstein, of_bernstein
 from rigidfleet.math.splines import POWERS
 from rigidfleet.typing import Floats
@@ -26,7 +27,6 @@ _MM, _TENTH, _MS = 1e-3, np.radians(0.1), 1e-3
 _MOST, _LONGEST = 32_767, 65_535
 #: What rounding to millimetres can move a position, and more [m].
 COMPRESSED_ROUNDING = 1e-3
-NAMES = ("x", "y", "z", "yaw")
 _HEADER = ",".join(["duration", *(f"{name}^{k}" for name in NAMES for k in range(POWERS))])
 #: Numbers of coefficients that a compressed piece can store beyond the first, by kind; its head: kinds and duration.
 _STORED = (0, 1, 3, 7)

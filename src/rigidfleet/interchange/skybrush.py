@@ -17,13 +17,10 @@ from typing import Any
 import numpy as np
 
 from rigidfleet.errors import ResultError
-from rigidfleet.interchange.curves import (
-    Curve,
-    Motion,
-    headings,
-)
+from rigidfleet.foreign.curves import Curve
+from rigidfleet.foreign.shows import read_show
+from rigidfleet.interchange.curves import Motion, headings
 from rigidfleet.interchange.lights import FRAME, fades, program
-from rigidfleet.interchange.shows import read_show
 from rigidfleet.math.bernstein import bernstein
 
 #: Greatest number of vehicles of a show.

@@ -24,7 +24,7 @@ from rigidfleet.mission import bounds
 from rigidfleet.mission.changes import scaled, told_apart
 from rigidfleet.mission.check import check
 from rigidfleet.mission.describe import counted
-from rigidfleet.mission.files import completed
+from rigidfleet.mission.files import completed, digests
 from rigidfleet.mission.findings import near
 from rigidfleet.mission.kinds import Establish, Phase
 from rigidfleet.mission.phases import latest_end
@@ -121,6 +121,18 @@ class Mission(Contents):
         except RecursionError:
             raise _unread(origin, "is nested too deeply", "use the keys of a mission") from None
         return cls.from_toml(text, origin)
+
+    def rewritten(self, data: Mapping[str, Any], origin: str | None = None) -> Self:
+        """Return a mission from changed data of this one, checked; its text keeps the digests of files.
+
+        Raises
+        ------
+        MissionError
+            With a finding for each error.
+        """
+        mission = self.from_dict(data, self._origin if origin is None else origin)
+        mission._text = digests(self._text) + mission._text
+        return mission
 
     def with_phases(self, phases: list[dict[str, Any]]) -> Self:
         """Return the mission with other tables of phases, checked. It keeps its own text.

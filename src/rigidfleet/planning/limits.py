@@ -118,7 +118,8 @@ def reached(
 
 
 def _grid(reference: Reference, motion: Motion, begin: float, end: float) -> Floats:
-    knots = motion.knots[(motion.knots >= begin) & (motion.knots <= end)]
+    knots = np.union1d(motion.knots, reference.knots)
+    knots = knots[(knots >= begin) & (knots <= end)]
     each = max(2, min(_PIECE, _MOST // max(len(knots), 1)))
     shares = np.linspace(0.0, 1.0, each, endpoint=False)
     inside = (knots[:-1, None] + shares * np.diff(knots)[:, None]).ravel()
@@ -128,7 +129,8 @@ def _grid(reference: Reference, motion: Motion, begin: float, end: float) -> Flo
 
 
 def _of(reference: Reference, who: Ints) -> Reference:
-    return reference._replace(p0=reference.p0[who], dp=reference.dp[who])
+    ways = reference.ways[:, who] if len(reference.knots) else reference.ways
+    return reference._replace(p0=reference.p0[who], dp=reference.dp[who], ways=ways)
 
 
 def _highest(

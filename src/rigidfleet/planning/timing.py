@@ -15,7 +15,7 @@ from rigidfleet.mission import Fly, Mission, Phase
 from rigidfleet.mission.kinds import Orbit, Shaping, Steering, Vertical
 from rigidfleet.mission.values import AUTO
 from rigidfleet.planning import ways
-from rigidfleet.planning.courses import SmoothFlight, course
+from rigidfleet.planning.courses import SmoothFlight, course, misled
 from rigidfleet.planning.limits import Reached, limits_of, reached
 from rigidfleet.planning.preview import Leg, at_start, leg
 from rigidfleet.planning.reference import PhaseState, attach, slots_about_cm
@@ -66,7 +66,9 @@ def timed(mission: Mission) -> Mission:
         flight, or a phase ends too early for the times before it.
     """
     mission = spelled_out(mission)
-    last = max((k for k, phase in enumerate(mission.phases) if phase.automatic), default=None)
+    last = max(
+        (k for k, phase in enumerate(mission.phases) if phase.automatic or phase.led), default=None
+    )
     if last is None:
         return mission
     tables = mission.to_dict()["phases"]
@@ -89,8 +91,20 @@ def with_times(mission: Mission, phase: Phase, now: PhaseState, number: int) -> 
     Raises
     ------
     MissionError
-        No time keeps the limits.
+        No time keeps the limits, or the phase follows given ways that begin elsewhere.
     """
+    if phase.led or phase.bent:
+        masses = mission.fleet.mass
+        _, begun, _ = attach(
+            mission, phase, now, masses, slots_about_cm(mission, now.formation, masses)
+        )
+        if problem := misled(mission, phase, begun):
+            key, remedy = (
+                "file",
+                "lead the vehicles there before, by phases such as 'fly', 'turn' and 'reshape'",
+            )
+            path = f"phases[{number + 1}].{key}"
+            raise MissionError([Finding(mission.origin, path, None, problem, remedy)])
     if not phase.automatic:
         return phase
     phase = _shared_out(mission, phase, now)

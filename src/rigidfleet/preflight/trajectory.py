@@ -37,6 +37,9 @@ def separation_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
         separations, pairs = proximity.separation(positions, radius)
         for k in [int(separations.argmin())] if planned.path_ends is None else [0, -1]:
             ends.append((float(separations[k]), float(planned.time[k]), tuple(pairs[k].tolist())))
+        bent = planned.leg.reference.knots
+        if len(bent) and planned.path_ends is None and (proved := planned.certificate) is not None:
+            ends = [(proved.separation, proved.time, proved.agents)]
         if planned.path_ends is not None:
             certificate = planned.certificate or straight(planned.leg.reference, radius)
             assert certificate is not None  # there are two agents
@@ -240,7 +243,8 @@ def limit_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     limits = mission.limits
     hopeless: set[str] = set()  # limits that no time keeps; each is told once
     for planned in found.planned_phases:
-        if mission.smooth and planned.leg.phase.control == "tracking":
+        phase = planned.leg.phase
+        if (mission.smooth or phase.led) and phase.control == "tracking":
             yield from _broken(mission, planned, hopeless)
         else:
             yield from _sampled(mission, planned)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigidfleet.errors import FlightError, StoppedError, wrong_type
+from rigidfleet.errors import FlightError, MissionError, StoppedError, wrong_type
 from rigidfleet.kernel.problem import TRACKING, Motion
 from rigidfleet.math import attitude as att
 from rigidfleet.math import lqr
@@ -276,6 +276,7 @@ class Flight:
             raise FlightError(_FINISHED)
         if self.ending:
             return False
+        by_hand = phase is not None
         if phase is None:
             if self._active is not None and not self._active.flew:
                 raise FlightError(
@@ -298,7 +299,13 @@ class Flight:
         self._leave(changed=True)
         if self.mission.on_loss == "continue" or not self._given(phase):
             self._now.blend = None
-        phase = with_times(self.mission, phase, self._now, len(self._asked))
+        try:
+            phase = with_times(self.mission, phase, self._now, len(self._asked))
+        except MissionError as error:
+            if by_hand:
+                raise
+            self.ending = "; ".join(f"phase '{phase.name}' {f.problem}" for f in error.findings)
+            return False
         if self._asked:
             self._report(phase, planning=True)
         try:

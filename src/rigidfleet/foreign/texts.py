@@ -7,10 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from rigidfleet.errors import TrajectoryError
-from rigidfleet.interchange.columns import numbers, read_columns, read_lines
-from rigidfleet.interchange.crazyflie import NAMES
-from rigidfleet.interchange.curves import Curve, through
-from rigidfleet.interchange.samples import ASSUMED, sampled
+from rigidfleet.foreign.columns import numbers, read_columns, read_lines
+from rigidfleet.foreign.curves import NAMES, Curve, through
+from rigidfleet.foreign.samples import ASSUMED, sampled
 from rigidfleet.math.splines import POWERS
 from rigidfleet.typing import Floats
 

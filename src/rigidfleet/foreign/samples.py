@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from rigidfleet.errors import TrajectoryError
-from rigidfleet.interchange.curves import Curve, through
+from rigidfleet.foreign.curves import Curve, through
 from rigidfleet.typing import Floats
 
 #: What is assumed between samples, in words.

@@ -16,9 +16,9 @@ import numpy as np
 
 from rigidfleet._common.files import why_not
 from rigidfleet.errors import TrajectoryError
-from rigidfleet.interchange import poses, shows, texts
-from rigidfleet.interchange.curves import Curve
-from rigidfleet.interchange.samples import ASSUMED
+from rigidfleet.foreign import poses, shows, texts
+from rigidfleet.foreign.curves import Curve
+from rigidfleet.foreign.samples import ASSUMED
 
 __all__ = ["Interpolation", "Trajectories", "read_trajectories"]
 
@@ -71,7 +71,7 @@ def read_trajectories(
     paths = [Path(files)] if isinstance(files, str | Path) else [Path(file) for file in files]
     if not paths:
         raise TrajectoryError("no file was given. Give at least one.")
-    listed = [found for path in paths for found in _listed(path)]
+    listed = [found for path in paths for found in files_of(path)]
     if len(listed) > _FILES:
         raise TrajectoryError(f"{paths[0]}: {len(listed):,} files are more than {_FILES:,}.")
     parts = [_of_sequence(group, interpolation) for group in listed]
@@ -97,7 +97,7 @@ def read_trajectories(
     return Trajectories(tuple(names), tuple(curves), parts[0].assumed, tuple(notes))
 
 
-def _listed(path: Path) -> list[list[Path]]:
+def files_of(path: Path) -> list[list[Path]]:
     """The files of a path, those of one vehicle that follow each other together."""
     if not path.is_dir():
         return [[path]]

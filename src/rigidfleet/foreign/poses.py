@@ -13,8 +13,8 @@ from importlib.util import find_spec
 import numpy as np
 
 from rigidfleet.errors import TrajectoryError
-from rigidfleet.interchange.curves import Curve
-from rigidfleet.interchange.samples import sampled
+from rigidfleet.foreign.curves import Curve
+from rigidfleet.foreign.samples import sampled
 from rigidfleet.typing import Floats
 
 _POSE = "geometry_msgs/msg/PoseStamped"

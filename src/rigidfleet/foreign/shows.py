@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from rigidfleet.errors import TrajectoryError
-from rigidfleet.interchange.curves import Curve, with_headings
+from rigidfleet.foreign.curves import Curve, with_headings
 from rigidfleet.math.bernstein import of_bernstein
 
 #: What is between the points of a show.
