@@ -15,8 +15,8 @@ from PIL import Image
 from shapes import SHAPES
 
 import rigidfleet as rf
+from rigidfleet.foreign.files import read_trajectories
 from rigidfleet.formation import outlines
-from rigidfleet.interchange.foreign import read_trajectories
 from rigidfleet.mission import Mission, show_draft
 from rigidfleet.plotting import write_figure
 from rigidfleet.plotting.style import settings

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rigidfleet.interchange.foreign import read_trajectories
 
 import rigidfleet as rf
 from rigidfleet.cli.app import BAD_INPUT, FAILED, PASSED, main
-from rigidfleet.interchange import texts
+from rigidfleet.foreign import texts
+from rigidfleet.foreign.files import read_trajectories
 from rigidfleet.simulation.trajectories import of_curves
 
 SEVEN = Path(__file__).parent / "data" / "sequence_trajectories"
@@ -309,7 +309,7 @@ def test_bad_shows_are_refused(kind, tmp_path, capsys):
 
 def test_a_zip_bomb_is_refused_unopened(tmp_path, monkeypatch):
     """An archive that says it unpacks to more than the greatest size is not unpacked."""
-    from rigidfleet.interchange import shows
+    from rigidfleet.foreign import shows
 
     monkeypatch.setattr(shows, "_BYTES", 1 << 20)
     path = tmp_path / "bomb.skyc"

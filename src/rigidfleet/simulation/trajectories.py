@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rigidfleet.errors import ResultError
+from rigidfleet.foreign.samples import ASSUMED
 from rigidfleet.interchange.curves import Curve
-from rigidfleet.interchange.samples import ASSUMED
 from rigidfleet.kernel import records
 from rigidfleet.kernel.problem import workspace
 from rigidfleet.math import proximity, series, splines
