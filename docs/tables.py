@@ -83,6 +83,8 @@ def _value(entry: dict[str, Any]) -> str:
         case {"type": "array", "items": {"$ref": target}}:
             return f"list of tables, see `{target.rpartition('/')[2].lower()}`"
         case {"type": "array", "items": {"type": "array", "items": inner, **size}}:
+            if inner["type"] == "array":
+                return f"list of lists of lists of {_PLURAL[inner['items']['type']]}"
             if "minItems" not in size:
                 return f"list of lists of {_PLURAL[inner['type']]}"
             return f"list of [{size['minItems']} {_PLURAL[inner['type']]}]"
