@@ -85,6 +85,8 @@ def _value(entry: dict[str, Any]) -> str:
         case {"type": "array", "items": {"type": "array", "items": {"type": "array"} as inner}}:
             return f"list of lists: {_value(inner)}"
         case {"type": "array", "items": {"type": "array", "items": inner, **size}}:
+            if inner["type"] == "array":
+                return f"list of lists of lists of {_PLURAL[inner['items']['type']]}"
             if "minItems" not in size:
                 return f"list of lists of {_PLURAL[inner['type']]}"
             return f"list of [{size['minItems']} {_PLURAL[inner['type']]}]"
