@@ -69,11 +69,19 @@ def _ratio(x: float) -> str:
 
 def _missions(data: Data) -> str:
     """Whole missions, against the time they last."""
-    rows = [
-        (row["name"], _time(row["ours"]), f"{median(row['ratios']):,.0f}")
-        for row in data["missions"]
+    flown, *others = data["missions"]
+    row = (
+        flown["name"],
+        _time(flown["ours"]),
+        f"{median(flown['ratios']):,.0f}",
+        f"≥ {flown['goal']:,.0f}",
+    )
+    table = _table(("", "ours [ms]", "simulated s in a second", "goal"), [row])
+    judged = [
+        f"{other['name']}: {_time(other['ours'])} ms (goal: {1e3 * other['theirs'][0]:,.0f} ms)."
+        for other in others
     ]
-    return _table(("", "ours [ms]", "simulated s in a second"), rows)
+    return "\n\n".join([table, *judged])
 
 
 def _processes(data: Data) -> str:

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import pdist
+from scipy.spatial.transform import Rotation
 
-from rigidfleet import assess, check, simulate
+from rigidfleet import MissionError, assess, check, simulate
 from rigidfleet.formation import assignment, shapes
 from rigidfleet.mission import Mission, load_mission
 from rigidfleet.planning.preview import preview
@@ -59,6 +60,48 @@ def test_no_exchange_of_two_slots_is_better(n):
         assert products(p, q[order]).min() >= -1e-9 * (p**2).sum(axis=1).max()
         a, b = pdist(p).min(), pdist(q).min()
         assert assignment.closest_approach(p, q[order])[0] >= a * b / np.hypot(a, b) * (1 - 1e-9)
+
+
+@pytest.mark.parametrize("n", [40, 1025])
+def test_the_bound_holds_where_heights_count_less(n):
+    """In a downwash metric along any axis the order is the optimum, or no exchange is better, and the bound holds."""
+    up = np.array([0.0, 0.6, 0.8])
+    metric = assignment.squashed(up, 3.0)
+    np.testing.assert_allclose(metric @ up, up / 3.0, atol=1e-15)
+    np.testing.assert_allclose(metric @ [1.0, 0.0, 0.0], [1.0, 0.0, 0.0], atol=1e-15)
+    turn = Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix()
+    for p, q in zip(tour(n), tour(n)[1:], strict=False):
+        order = assignment.assigned(p, q, turn=turn, metric=metric).order
+        x, y = p @ metric, q @ turn.T @ metric
+        assert products(x, y[order]).min() >= -1e-9 * (x**2).sum(axis=1).max()
+        if n < 1000:
+            best = linear_sum_assignment(-(x @ y.T))[1]
+            assert (x * y[order]).sum() == pytest.approx((x * y[best]).sum(), rel=1e-12)
+        a, b = pdist(x).min(), pdist(y).min()
+        assert assignment.closest_approach(x, y[order])[0] >= a * b / np.hypot(a, b) * (1 - 1e-9)
+    with pytest.raises(ValueError, match="prescribed turn"):
+        assignment.assigned(p, q, metric=metric)
+
+
+def test_missions_assign_where_heights_count_less():
+    """Two vehicles that would pass above each other, and do not if heights count less; on a tilted body, too."""
+    slots = [[0.0, 0.0, 0.0], [1.0, 0.0, 2.2], [3.0, 0.0, 1.0]]
+    start = [[0.0, 0.0, 2.0], [1.1, 0.0, 0.0], [3.0, 0.0, 1.0]]
+
+    def orders(**keys):
+        return Mission.from_dict(
+            {
+                "schema_version": 1, "name": "above", "assignment": "each",
+                "agents": {"mass": 1.0, "position": (np.array(start) + [0, 0, 9]).tolist()},
+                "formations": {"f": {"slots": slots, "edges": []}},
+                "phases": [{"kind": "establish", "formation": "f", "control": "tracking", "duration": 5.0}],
+            } | keys
+        ).assigned_slots["f"].tolist()  # fmt: skip
+
+    assert orders() == [1, 0, 2]
+    assert orders(assignment_downwash=4.0) == [0, 1, 2]
+    with pytest.raises(MissionError, match="no effect with assignment 'shortest'"):
+        orders(assignment="shortest", assignment_downwash=4.0)
 
 
 def test_exchanges_end_at_any_points():

@@ -9,7 +9,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from rigidfleet.formation import distance_geometry, graphs, shapes
-from rigidfleet.math import constraint_jacobian, proximity, rigid_body
+from rigidfleet.kernel.engine import native
+from rigidfleet.kernel.measured import Measured, measured
+from rigidfleet.math import attitude, constraint_jacobian, proximity, rigid_body
 from rigidfleet.mission import Box, Ground
 
 seeds = st.integers(0, 2**32 - 1)
@@ -138,6 +140,33 @@ def shape(name: str, rng: np.random.Generator) -> np.ndarray:
     return Rotation.random(random_state=rng).apply(rng.normal(size=(5, 3)) * 3 * np.array(flat))
 
 
+def measure(x, v, p, m, near) -> Measured:
+    """The kernel's measurement of agents at x with velocities v, slots p (K, N, 3) and masses m (N,).
+
+    ``near`` (K, 3, 3) are attitudes commanded; one (3, 3) is the attitude before the first sample.
+    """
+    x, p = np.ascontiguousarray(x), np.ascontiguousarray(p)
+    K, n = x.shape[:2]
+    zero = np.zeros_like(x)
+    commanded = near if near.ndim == 3 else np.full((K, 3, 3), np.nan)
+    found = measured(
+        n, 0, K, time=np.arange(K, dtype=float), start=np.array([0, K]), attached=np.ones(1, dtype=bool),
+        framed=False, mass=m, lost_at=np.full(n, np.inf), limit=np.full(n, np.inf),
+        edges=np.zeros((0, 2), dtype=np.int64), r=x, v=np.ascontiguousarray(v), f_u=zero, f_C=zero, p=p,
+        T_ref=np.ascontiguousarray(commanded),
+    )  # fmt: skip
+    if near.ndim == 2:
+        found.work[5, :3, :3] = near
+    native.measure(found)
+    return found
+
+
+def fit_attitudes(x, p, m, near) -> tuple[np.ndarray, np.ndarray]:
+    """Attitudes (K, 3, 3) of slots p (K, N, 3) fitted to agents x, and whether these are lines; as in `measure`."""
+    found = measure(x, np.zeros_like(x), p, m, near)
+    return attitude.dcm_from_quaternion(found.attitude), found.line
+
+
 @pytest.mark.parametrize("name", ["spatial", "planar"])
 @settings(max_examples=20)
 @given(seed=seeds)
@@ -149,7 +178,7 @@ def test_fit_finds_the_attitude_of_turned_slots(name, seed):
     p -= m @ p / m.sum()
     T = Rotation.random(4, random_state=rng).as_matrix()
     x = np.einsum("kba,ib->kia", T, p)
-    found, _ = rigid_body.fit_attitudes(x, np.broadcast_to(p, x.shape), m, EYE)
+    found, _ = fit_attitudes(x, np.broadcast_to(p, x.shape), m, EYE)
     np.testing.assert_allclose(found, T, rtol=0, atol=1e-12)
 
 
@@ -164,7 +193,7 @@ def test_fit_of_a_deformed_shape_is_scipys(seed):
     T = Rotation.random(random_state=rng)
     x = T.inv().apply(p) + rng.normal(size=p.shape) * 0.2
     x -= m @ x / m.sum()
-    found = rigid_body.fit_attitudes(x[None], p[None], m, EYE)[0][0]
+    found = fit_attitudes(x[None], p[None], m, EYE)[0][0]
     expected = Rotation.align_vectors(p, x, weights=m)[0].as_matrix()
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-10)
 
@@ -175,7 +204,7 @@ def test_a_mirror_image_gets_a_rotation_all_the_same():
     p = shape("spatial", rng)
     p -= p.mean(axis=0)
     x = p * [1, 1, -1]
-    T = rigid_body.fit_attitudes(x[None], p[None], np.ones(5), EYE)[0][0]
+    T = fit_attitudes(x[None], p[None], np.ones(5), EYE)[0][0]
     assert np.linalg.det(T) == pytest.approx(1.0, abs=1e-12)
     np.testing.assert_allclose(T @ T.T, EYE, rtol=0, atol=1e-12)
     assert np.abs(x @ T.T - p).max() > 0.5
@@ -194,7 +223,7 @@ def test_a_line_takes_the_attitude_nearest_to_the_one_expected(seed):
     near = Rotation.random(3, random_state=rng).as_matrix()
     small = Rotation.from_rotvec(rng.normal(size=(3, 3)) * 0.3).as_matrix()
     x = turned_line(small @ near)
-    found, _ = rigid_body.fit_attitudes(x, np.broadcast_to(LINE, x.shape), np.ones(3), near)
+    found, _ = fit_attitudes(x, np.broadcast_to(LINE, x.shape), np.ones(3), near)
     np.testing.assert_allclose(
         np.einsum("kab,kib->kia", found, x), np.broadcast_to(LINE, x.shape), atol=1e-12
     )
@@ -216,13 +245,13 @@ def test_a_line_is_followed_from_sample_to_sample():
     roll = Rotation.from_rotvec([0.7, 0, 0]).as_matrix()
     T = roll @ Rotation.from_euler("z", -yaw[:, None]).as_matrix()
     x = turned_line(T)
-    found, _ = rigid_body.fit_attitudes(x, np.broadcast_to(LINE, x.shape), np.ones(3), T[0])
+    found, _ = fit_attitudes(x, np.broadcast_to(LINE, x.shape), np.ones(3), T[0])
     np.testing.assert_allclose(found, T, rtol=0, atol=1e-10)
 
 
 def test_a_line_turned_about_by_half_a_turn_has_an_attitude():
     """Where every axis across the line would do, one is taken: a rotation that brings the line home."""
-    found = rigid_body.fit_attitudes(-LINE[None], LINE[None], np.ones(3), EYE)[0][0]
+    found = fit_attitudes(-LINE[None], LINE[None], np.ones(3), EYE)[0][0]
     np.testing.assert_allclose(-LINE @ found.T, LINE, rtol=0, atol=1e-12)
     assert np.linalg.det(found) == pytest.approx(1.0, abs=1e-12)
 
@@ -233,7 +262,7 @@ def test_lines_that_are_nearly_reversed_have_attitudes(short):
     towards = np.array([np.cos(np.pi - short), np.sin(np.pi - short), 0.0])
     x = np.outer(LINE[:, 0], towards)
     for near in (EYE, EYE[None]):
-        T = rigid_body.fit_attitudes(x[None], LINE[None], np.ones(3), near)[0][0]
+        T = fit_attitudes(x[None], LINE[None], np.ones(3), near)[0][0]
         np.testing.assert_allclose(T @ T.T, EYE, rtol=0, atol=1e-7)
         np.testing.assert_allclose(LINE @ T, x, rtol=0, atol=1e-6)
         assert np.linalg.det(T) > 0
@@ -247,15 +276,15 @@ def test_attitude_goes_on_through_a_line():
     p -= p.mean(axis=1, keepdims=True)
     T = Rotation.from_euler("ZYX", [50, 20, -30], degrees=True).as_matrix().T
     x = p @ T
-    found, _ = rigid_body.fit_attitudes(x, p, np.ones(3), T)
+    found, _ = fit_attitudes(x, p, np.ones(3), T)
     np.testing.assert_allclose(found, np.broadcast_to(T, found.shape), rtol=0, atol=1e-9)
 
 
 def test_one_agent_has_the_attitude_expected():
     """A point has no attitude of its own."""
     near = Rotation.from_euler("z", [[0.3], [0.4]]).as_matrix()
-    found, _ = rigid_body.fit_attitudes(np.zeros((2, 1, 3)), np.zeros((2, 1, 3)), np.ones(1), near)
-    np.testing.assert_array_equal(found, near)
+    found, _ = fit_attitudes(np.zeros((2, 1, 3)), np.zeros((2, 1, 3)), np.ones(1), near)
+    np.testing.assert_allclose(found, near, rtol=0, atol=1e-15)
 
 
 @settings(max_examples=20)
@@ -267,13 +296,18 @@ def test_mean_axis_rates_are_those_of_the_rigid_motion(seed, n):
     x = rng.normal(size=(3, n, 3)) * 2
     x -= np.einsum("i,kia->ka", m, x)[:, None] / m.sum()
     omega = rng.normal(size=(3, 3))
-    found = rigid_body.mean_axis_rates(x, np.cross(omega[:, None], x), m)
+    y = np.cross(omega[:, None], x)
+    found = rigid_body.mean_axis_rates(x, y, m)
     if n == 1:
         omega = np.zeros((3, 3))
     elif n == 2:
         u = x[:, 0] / np.linalg.norm(x[:, 0], axis=1)[:, None]
         omega = omega - np.einsum("ka,ka->k", u, omega)[:, None] * u
     np.testing.assert_allclose(found, omega, rtol=0, atol=1e-9)
+    at_rest = np.broadcast_to(EYE, (3, 3, 3))
+    spatial = n > 2  # slots on a line would have no spin about themselves
+    rates = measure(x, y, x, m, at_rest).rates if spatial else omega
+    np.testing.assert_allclose(rates, omega, rtol=0, atol=1e-9)
 
 
 # -- ranks -----------------------------------------------------------------------------------------
@@ -313,6 +347,22 @@ def test_smallest_singular_value_is_the_last_above_the_rank(name):
     assert np.linalg.matrix_rank(jacobian(r, edges), 1e-9) == rank
     found = constraint_jacobian.smallest_singular_value(r[None], edges)
     assert found[0] == pytest.approx(values[rank - 1], rel=1e-9)
+    recorded = native.least_singular_values(r[None].copy(), edges)
+    assert recorded[0] == pytest.approx(values[rank - 1], rel=1e-9)
+
+
+@settings(max_examples=20)
+@given(seed=seeds, n=st.integers(2, 9))
+def test_recorded_singular_values_are_numpys(seed, n):
+    """At random places, of any number of edges, on the smaller and the larger side of J."""
+    rng = np.random.default_rng(seed)
+    edges = rng.permutation(graphs.complete_graph(n))[: rng.integers(1, 4 * n)]
+    r = rng.normal(size=(4, n, 3)) * 3
+    found = native.least_singular_values(r, edges)
+    for k in range(4):
+        values = np.linalg.svd(jacobian(r[k], edges), compute_uv=False)
+        least = values[values > 1e-6 * values[0]].min()
+        assert found[k] == pytest.approx(least, rel=1e-7)
 
 
 def test_weighted_singular_values_are_those_of_the_law():
@@ -377,12 +427,13 @@ def test_a_bent_line_has_no_attitude_about_itself():
     off = rng.normal(size=(20, 3, 3)) * 0.2
     x = np.einsum("kba,ib->kia", T, p) + off
     x -= x.mean(axis=1, keepdims=True)
-    found, line = rigid_body.fit_attitudes(x, np.broadcast_to(p, x.shape), np.ones(3), T)
+    found, line = fit_attitudes(x, np.broadcast_to(p, x.shape), np.ones(3), T)
     assert line.all()
     away = np.einsum("kab,kcb->kac", found, T)
     assert np.degrees(np.arccos((np.trace(away, axis1=1, axis2=2) - 1) / 2)).max() < 10
     y = rng.normal(size=x.shape)
-    omega = rigid_body.mean_axis_rates(x, y - y.mean(axis=1, keepdims=True), np.ones(3), line)
+    rates = measure(x, y, np.broadcast_to(p, x.shape), np.ones(3), T).rates
+    omega = np.einsum("kba,kb->ka", found, rates)
     axis = np.linalg.svd(x)[2][:, 0]
     assert np.abs(np.einsum("ka,ka->k", omega, axis)).max() < 1e-9
 
@@ -394,7 +445,7 @@ def test_a_narrow_shape_that_fits_keeps_its_attitude():
     T = Rotation.random(20, random_state=rng).as_matrix()
     x = np.einsum("kba,ib->kia", T, p) + rng.normal(size=(20, 3, 3)) * 1e-3
     x -= x.mean(axis=1, keepdims=True)
-    found, line = rigid_body.fit_attitudes(x, np.broadcast_to(p, x.shape), np.ones(3), T)
+    found, line = fit_attitudes(x, np.broadcast_to(p, x.shape), np.ones(3), T)
     assert not line.any()
     np.testing.assert_allclose(found, T, rtol=0, atol=0.03)
 

@@ -40,6 +40,7 @@ if TYPE_CHECKING:
         RotorCommand,
         simulate,
     )
+    from rigidfleet.simulation.trajectories import trajectories
     from rigidfleet.sweep import Sweep
     from rigidfleet.tuning import Tuned, tune
     from rigidfleet.web.live import live
@@ -79,6 +80,7 @@ __all__ = [
     "replay",
     "report",
     "simulate",
+    "trajectories",
     "tune",
 ]
 
@@ -115,6 +117,7 @@ _HOME = {
     "replay": "web.replay",
     "report": "reporting",
     "simulate": "simulation.flight",
+    "trajectories": "simulation.trajectories",
     "tune": "tuning",
 }
 

@@ -66,6 +66,10 @@ class ResultError(RigidfleetError):
     """A result cannot be read or written."""
 
 
+class TrajectoryError(RigidfleetError):
+    """Trajectories of another program cannot be read or judged. The message names the file and the place in it."""
+
+
 class StoppedError(RigidfleetError):
     """A flight cannot continue. The message is the diagnosis; it is stored in the record of the flight."""
 

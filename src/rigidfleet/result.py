@@ -99,7 +99,7 @@ class Target(_Moment, total=False):
 class Planned(_Moment):
     """Certificate of a phase: the least separation of the planned paths [m], its time [s], the two agents, the proof.
 
-    Agents are counted from 0. ``how`` is "closed form" or "polygons less sagitta".
+    Agents are counted from 0. ``how`` is "closed form" or "conservative advancement".
     """
 
     separation: float
@@ -183,6 +183,10 @@ class PhaseRecord:
 
     def __post_init__(self) -> None:
         self.extremes = {name: Extremum(*x) for name, x in (self.extremes or {}).items()}
+
+
+#: Names of variables, and a function that computes them when they are first asked for.
+Later = Sequence[tuple[tuple[str, ...], Callable[[], dict[str, Floats]]]]
 
 
 @cache
@@ -376,7 +380,7 @@ class Result:
 
     phases: list[PhaseRecord]
     mission_text: str
-    later: InitVar[Callable[[], dict[str, Floats]] | None] = None
+    later: InitVar[Later] = ()
     complete: bool = True
     ending: str = ""
     statistics: dict[str, Any] = field(default_factory=dict)
@@ -384,22 +388,40 @@ class Result:
     platform: str = field(default_factory=platform.platform)
     created: str = field(default_factory=_now)
 
-    def __post_init__(self, later: Callable[[], dict[str, Floats]] | None) -> None:
+    def __post_init__(self, later: Later) -> None:
+        self._later = {name: (names, make) for names, make in later for name in names}
+        for name in self._later:
+            del self.__dict__[name]
         sizes: dict[str, int] = {dim: len(names) for dim, names in LABELS.items()}
-        for name in VARIABLES:
-            if getattr(self, name) is not None or name not in _OPTIONAL:
-                self._set(name, getattr(self, name), sizes)
-        if later is not None:
-            self._later = later
-            for name in LATER:
-                del self.__dict__[name]
+        given = self.__dict__
+        for key, dims in (
+            ("time", ("time",)),
+            ("position", ("time", "agent")),
+            ("edges", ("edge",)),
+        ):
+            if isinstance(given[key], np.ndarray):
+                sizes.update(zip(dims, given[key].shape, strict=False))
+        for name, dims, dtype in _CHECKED:
+            value = given.get(name)
+            if value is None and (name in _OPTIONAL or name in self._later):
+                continue
+            asked = tuple(map(sizes.get, dims))
+            if not (
+                type(value) is np.ndarray
+                and value.dtype is dtype
+                and value.shape == asked
+                and value.flags.c_contiguous
+            ):
+                self._set(name, value, sizes)
         if sizes["time"] == 0 or sizes["agent"] == 0:
             raise ValueError("a result needs at least one sample and one agent")
-        if not (np.isfinite(self.time).all() and (np.diff(self.time) > 0).all()):
+        time, phase = self.time, self.phase
+        ends = math.isfinite(time[0]) and math.isfinite(time[-1])
+        if not (ends and (time[1:] > time[:-1]).all()):
             raise ValueError("time must be finite and strictly increasing")
-        if self.phase.min() < 0 or self.phase.max() >= len(self.phases):
+        if phase.min() < 0 or phase.max() >= len(self.phases):
             raise ValueError(f"phase has indices outside 0 to {len(self.phases) - 1}")
-        if (np.diff(self.phase) < 0).any():
+        if (phase[1:] < phase[:-1]).any():
             raise ValueError("phase must not decrease")
         n = sizes["agent"]
         for name, least in (("edges", 0), ("separation_pair", -1), ("clearance_agent", -1)):
@@ -413,8 +435,8 @@ class Result:
             alone |= name == "rotor_force" and x.other not in range(4)
             if alone or x.who not in range(n):
                 raise ValueError(f"extreme {name} must name different agents from 0 to {n - 1}")
-        for name in (name for name, v in VARIABLES.items() if "quaternion" in v.dims):
-            if getattr(self, name) is not None and not getattr(self, name).any(axis=-1).all():
+        for name in _QUATERNIONS:
+            if given[name] is not None and not getattr(self, name).any(axis=-1).all():
                 raise ValueError(f"{name} has a quaternion of norm zero")
         if (self.edges[:, 0] == self.edges[:, 1]).any():
             raise ValueError("an edge joins an agent to itself")
@@ -434,12 +456,16 @@ class Result:
         setattr(self, name, value)
 
     def __getattr__(self, name: str) -> Any:
-        """Compute the derivatives of references when they are first asked for: a flight alone does not need them."""
-        if name not in LATER or "_later" not in self.__dict__:
+        """Compute what the flight alone does not need when it is first asked for: it takes longer than the flight."""
+        found = self.__dict__.get("_later", {}).get(name)
+        if found is None:
             raise AttributeError(f"a result has no {name!r}")
+        names, make = found
         sizes = {"time": len(self.time), "agent": self.n_agents, "axis": 3}
-        for key, value in self.__dict__.pop("_later")().items():
+        for key, value in make().items():
             self._set(key, value, sizes)
+        for key in names:
+            self._later.pop(key, None)
         return self.__dict__[name]
 
     def __repr__(self) -> str:
@@ -537,6 +563,11 @@ class Result:
     def left(self) -> Bools:
         """Mask (K, N) of the agents that are not lost at the time of each sample."""
         return self.time[:, None] <= self.mission.lost_at
+
+    @property
+    def interpolation(self) -> str | None:
+        """In words, the curve between samples of a flight that others made; None for a flight of our own."""
+        return self.statistics.get("interpolation")
 
     @cached_property
     def motors_off(self) -> Floats:
@@ -756,6 +787,12 @@ for _name in (
 
 
 _INTEGERS = {name for name in VARIABLES if _HINTS[name].__origin__ in (Ints, Ints | None)}
+#: Name, dimensions and type of each array, and the arrays of quaternions.
+_CHECKED = [
+    (name, v.dims, np.dtype(np.int64 if name in _INTEGERS else np.float64))
+    for name, v in VARIABLES.items()
+]
+_QUATERNIONS = [name for name, v in VARIABLES.items() if "quaternion" in v.dims]
 #: Quantities whose minimum is the worst value. The same holds for all clearances.
 _LEAST = frozenset(("separation", "separation_below", "lost", "lowest", "guarantee"))
 

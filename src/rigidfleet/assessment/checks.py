@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
 
@@ -29,6 +29,10 @@ from rigidfleet.typing import Floats
 _SLACK = 1e-9
 # Greatest overlap of a vehicle that stands on an obstacle [m]; more is a collision.
 _CONTACT = 1e-6
+#: Greatest jump of a velocity that counts as rounding [m/s]. A speed and an extent from which units are doubted.
+_CORNER, _FAST, _WIDE = 0.01, 100.0, 20_000.0
+#: Greatest number of vehicles whose names are listed.
+_NAMED = 20
 #: Greatest distance from the nearest sample at which a moment is still judged [s]: at 10 m/s, a vehicle then
 #: flies the tolerance of a waypoint.
 _UNSEEN = 0.01
@@ -64,7 +68,14 @@ def all_checks(measured: Measurements, verdict: Verdict) -> Iterator[CheckResult
     if limits.geofence is not None:
         yield _geofence(measured, np.array(limits.geofence.min), np.array(limits.geofence.max))
     yield _bounded("speed", worst.get("speed"), "m/s", limits.speed)
-    yield _bounded("acceleration", worst.get("acceleration"), "m/s^2", limits.acceleration)
+    acceleration = worst.get("acceleration")
+    if acceleration is not None or limits.acceleration is not None:
+        yield _moving("acceleration", acceleration, "m/s^2", limits.acceleration)
+    for name, (order, size) in _DIRECTIONS.items():
+        if (limit := getattr(limits, name)) is not None:
+            unit = "m/s" if order == 1 else "m/s^2"
+            yield _moving(name, measured.greatest(order, size), unit, limit)
+    yield from _corners(measured)
     yield from _thrust(measured, worst.get("thrust"))
     yield from vehicle_checks(measured)
     yield from guarantee_checks(measured)
@@ -296,6 +307,46 @@ def _bounded(
     )  # fmt: skip
 
 
+#: Limits of a direction: the derivative, and what of it counts.
+_DIRECTIONS: dict[str, tuple[int, Callable[[Floats], Floats]]] = {
+    "horizontal_speed": (1, lambda x: np.hypot(x[..., 0], x[..., 1])),
+    "vertical_speed": (1, lambda x: np.abs(x[..., 2])),
+    "horizontal_acceleration": (2, lambda x: np.hypot(x[..., 0], x[..., 1])),
+    "vertical_acceleration": (2, lambda x: np.abs(x[..., 2])),
+}
+
+
+def _moving(check: str, e: Extreme | None, unit: str, limit: float | None) -> CheckResult:
+    """As `_bounded`; a limit of what a trajectory does not have fails."""
+    if e is not None or limit is None:
+        return _bounded(check, e, unit, limit)
+    words = (
+        f"{check.replace('_', ' ')} cannot be judged (limit {limit:g} {unit}): straight lines between samples have"
+        " none. Assume cubics, or give velocities"
+    )
+    return CheckResult(check, False, words, None, limit, unit)
+
+
+def _corners(measured: Measurements) -> Iterator[CheckResult]:
+    """Fail limits of acceleration where a curve that others made turns at a corner: none is great enough there."""
+    result, limits = measured.result, measured.mission.limits
+    if result.interpolation is None or not np.isfinite(result.acceleration).any():
+        return  # of straight lines, accelerations are not judged at all
+    first = np.flatnonzero(np.nextafter(result.time[:-1], np.inf) >= result.time[1:])
+    by = np.linalg.norm(result.velocity[first + 1] - result.velocity[first], axis=2)
+    if not by.size or by.max() <= _CORNER:
+        return
+    k, i = np.unravel_index(int(by.argmax()), by.shape)
+    most, t, who = float(by[k, i]), float(result.time[first[k]]), f"agent {i + 1}"
+    words = f"{who} turns at a corner at {t:.2f} s: its velocity jumps by {value(most, 'm/s')}"
+    judged = any(getattr(limits, f"{way}acceleration") for way in ("", "horizontal_", "vertical_"))
+    if judged:
+        words += f" (limit {_CORNER:g} m/s where accelerations are limited)"
+    yield CheckResult(
+        "corner", not judged, words, most, _CORNER if judged else None, "m/s", when=t, who=who, judged=judged
+    )  # fmt: skip
+
+
 def _separation(measured: Measurements, e: Extreme) -> CheckResult:
     limit = measured.mission.limits.separation or 0.0
     passed = e.value > 0 and e.value >= limit - _SLACK
@@ -303,7 +354,7 @@ def _separation(measured: Measurements, e: Extreme) -> CheckResult:
     words += f" (limit {limit:g} m)"
     if e.value <= 0:
         since = _since(measured, "separation", measured.close[0])
-        depth = f"by {value(-e.value, 'm')} at {e.when:.2f} s"
+        depth = f"by {value(abs(e.value), 'm')} at {e.when:.2f} s"
         words = f"agents collide, first {since}; {e.who} overlap the most, {depth}"
     return _bounded("separation", e, "m", limit, words, passed=passed, at_least=True)
 
@@ -423,7 +474,9 @@ def _geofence(measured: Measurements, low: Floats, high: Floats) -> CheckResult:
 def _thrust(measured: Measurements, e: Extreme | None) -> Iterator[CheckResult]:
     """Check the vehicle nearest to its own thrust limit; report the greatest thrust if another vehicle has it."""
     beyond = measured.nearest_to_limit()
-    if e is None or beyond is None:
+    if e is None:
+        return  # nobody knows what a trajectory from elsewhere needs
+    if beyond is None:
         yield _bounded("thrust", e, "N", None)
         return
     limits = measured.mission.agents.thrust_limit
@@ -460,6 +513,38 @@ def notes(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[str]:
             yield f"the thrust of {who} saturates at its limit, first at {since:.2f} s"
     yield from avoidance_notes(measured)
     yield from _sampled(measured)
+    yield from _of_others(measured)
+
+
+def _of_others(measured: Measurements) -> Iterator[str]:
+    """What is judged of a flight that others made, how near its centres come, what is odd, and who is who."""
+    result = measured.result
+    if (how := result.interpolation) is None:
+        return
+    yield (
+        f"others made this flight: what is judged is its curve, {how}, also between samples; forces, thrust and "
+        "attitudes are not known"
+    )
+    radius, e = measured.mission.fleet.radius, measured.worst("separation", None, lambda x: -x)
+    if e is not None and np.ptp(radius) == 0.0:
+        far = value(e.value + 2.0 * float(radius[0]), "m")
+        yield f"the least distance centre to centre is {far}, {e.who} at {e.when:.2f} s"
+    fast, wide = measured.worst("speed", None), float(np.abs(result.position).max())
+    if wide > _WIDE or (fast is not None and fast.value > _FAST):
+        told = "" if fast is None else f"speeds reach {fast.value:,.0f} m/s and "
+        yield (
+            f"{told}positions {wide:,.0f} m: are these metres and seconds? A table may name other units in its "
+            "columns: x [mm], time [ms]"
+        )
+    yield from result.statistics.get("notes", [])
+    names = result.statistics.get("names", [])
+    known = (
+        [f"agent {k}" for k in range(1, len(names) + 1)],
+        [f"{k + 1}" for k in range(len(names))],
+    )
+    if names and names not in known:
+        more = f" and {len(names) - _NAMED:,} more" if len(names) > _NAMED else ""
+        yield f"agents from 1 on are {', '.join(names[:_NAMED])}{more}"
 
 
 def _left(measured: Measurements) -> Iterator[str]:

@@ -21,7 +21,9 @@ from rigidfleet.assessment.outcome import (
 )
 from rigidfleet.formation import distance_geometry
 from rigidfleet.math import attitude as att
-from rigidfleet.math import proximity, rigid_body
+from rigidfleet.math import proximity, rigid_body, splines
+from rigidfleet.math.bernstein import bernstein
+from rigidfleet.math.bernstein import greatest as extreme_of
 from rigidfleet.math.constraint_jacobian import jacobian
 from rigidfleet.result import PAD, PhaseRecord, Result
 from rigidfleet.typing import Bools, Floats, Ints
@@ -37,6 +39,9 @@ _SLACK = {"separation": 0.0, "clearance": 0.0, "speed": 1e-9}
 
 #: Greatest size of slots, in bytes, whose shape is cached for the next phase or flight.
 _KEPT = 100_000
+
+#: About so many curves are compared together.
+_TOGETHER = 100_000
 
 #: Greatest number of agents for which a wrong shape is tested for rigidity.
 _JUDGED = 200
@@ -91,11 +96,9 @@ class Fit:
         """Greatest error of a pair [m]."""
         return SHAPE_TOLERANCE * self.shortest
 
-    def angle_from(self, quaternion: Floats) -> float:
-        """Angle [deg] of the axis from its direction in an attitude (4,); NaN without an attitude."""
-        if not np.isfinite(quaternion).all():
-            return math.nan
-        return angle_between(self.points, att.dcm_from_quaternion(quaternion).T @ self.axis)
+    def angle_from(self, T: Floats) -> float:
+        """Angle [deg] of the axis from its direction in an attitude T (3, 3); NaN without an attitude."""
+        return angle_between(self.points, T.T @ self.axis)
 
 
 class Quantity:
@@ -262,6 +265,36 @@ class Measurements:
             return self.between(name, index)
         return None if rank == -math.inf else self.worst_sample(quantity, self.samples[index])
 
+    def greatest(self, order: int, size: Callable[[Floats], Floats]) -> Extreme | None:
+        """Greatest convex ``size`` of velocities (order 1) or accelerations (2) between samples; None if unknown.
+
+        Of a trajectory that others made, it is that of its curves. Of a flight, it is that of the polynomials of degree
+        7 through position, velocity, acceleration and jerk of its samples.
+        """
+        result = self.result
+        motion = result.motion(flown=result.interpolation is None)
+        time, state = motion.time, np.where(self.left[:, None, :, None], motion.state, np.nan)
+        state = state.swapaxes(0, 1)  # (4, K, N, 3)
+        apart = np.flatnonzero(np.nextafter(time[:-1], np.inf) < time[1:])
+        n, worst, at = result.n_agents, None, (0.0, 0)
+        for k in np.array_split(apart, 1 + len(apart) * n // _TOGETHER):
+            h = time[k + 1] - time[k]
+            pieces = splines.hermite(h, *(state[:, k + i] for i in (0, 1)))
+            power = np.arange(pieces.shape[-1])
+            factor = power if order == 1 else power * (power - 1)
+            points = bernstein(
+                (pieces * factor)[..., order:].reshape(len(k) * n, 3, -1), np.repeat(h, n)
+            )
+            known = np.flatnonzero(np.isfinite(points).all(axis=(1, 2)))
+            found = extreme_of(points[known], size)
+            if found.curve >= 0 and (worst is None or found.value > worst):
+                i, who = divmod(int(known[found.curve]), n)
+                worst, at = found.value, (float(time[k[i]] + found.place * h[i]), who)
+        if worst is None:
+            return None
+        index = int(result.phase[np.searchsorted(time, at[0], side="right") - 1])
+        return Extreme(worst, at[0], self.agent(0, at[1]), result.phases[index].name)
+
     def below(self) -> Extreme | None:
         """Least height [m] between two agents, one below the other."""
         least, pair = proximity.headroom(
@@ -366,7 +399,8 @@ class Measurements:
         for index, phase in enumerate(result.phases):
             samples = self.samples[index]
             if samples.stop > samples.start and phase.extremes:
-                due = ["speed", "lowest", "highest", "thrust"]
+                due = ["speed", "lowest", "highest"]
+                due += ["thrust"] if np.isfinite(self.thrust[samples]).any() else []
                 due += ["separation"] if self.left[samples.start].sum() > 1 else []
                 due += ["clearance"] if self.mission.obstacles else []
                 due += ["geofence"] if self.mission.limits.geofence is not None else []
@@ -421,7 +455,7 @@ class Measurements:
             handedness=None if fit is None or fit.dimension < 3 else not fit.mirrored,
             flip=None if fit is None else self.flip(fit, record, last),
             order=None if fit is None else fit.in_order,
-            waypoint=self.waypoint(record, samples) if finished else None,
+            waypoint=self.waypoint(index) if finished else None,
             through=tuple(self.passed(record, samples)),
             worst={name: found for name, found in extremes.items() if found is not None},
         )
@@ -466,30 +500,55 @@ class Measurements:
     def flip(self, fit: Fit, record: PhaseRecord, k: int) -> float | None:
         """Angle [deg] of a line or plane from its intended direction at sample k; None if there is none."""
         # A commanded attitude decides; without one, the integrated frame says how a plane should lie.
-        if fit.dimension == 2:
-            references = [self.result.attitude_reference[k], self.result.frame[k]]
-        elif fit.dimension == 1 and record.control == "tracking":
+        references = self._directions[k]
+        if fit.dimension == 1 and record.control == "tracking":
             # Only tracked slots steer a line; otherwise its direction follows from the shape before.
-            references = [self.result.attitude_reference[k]]
-        else:
+            references = references[:1]
+        elif fit.dimension != 2:
             return None
-        return next((a for q in references if math.isfinite(a := fit.angle_from(q))), None)
+        return next((a for T in references if math.isfinite(a := fit.angle_from(T))), None)
 
-    def waypoint(self, record: PhaseRecord, samples: slice) -> Waypoint | None:
-        """Miss at the waypoint's time, or at the end of the phase if it settles earlier."""
-        target = record.target
-        if target is None:
-            return None
+    @cached_property
+    def _directions(self) -> dict[int, Floats]:
+        """Commanded attitude and integrated frame (2, 3, 3) at the last sample of each phase, by sample."""
+        last = [self.samples[k].stop - 1 for k in self.flown]
         result = self.result
-        k = samples.start + int(np.abs(result.time[samples] - target["time"]).argmin())
+        T = att.dcm_from_quaternion([result.attitude_reference[last], result.frame[last]])
+        return dict(zip(last, T.swapaxes(0, 1), strict=True))
+
+    def _arrival(self, index: int) -> int | None:
+        """The sample nearest to the time of a phase's target; None if it has no target or no samples."""
+        target, samples = self.result.phases[index].target, self.samples[index]
+        if target is None or samples.stop == samples.start:
+            return None
+        return samples.start + int(np.abs(self.result.time[samples] - target["time"]).argmin())
+
+    @cached_property
+    def _turned(self) -> dict[int, float]:
+        """Angle [deg] between the attitude flown and that of the target, by the sample of the arrival."""
+        found = {
+            k: target["attitude"]
+            for index, phase in enumerate(self.result.phases)
+            if (target := phase.target) and target.get("attitude") is not None
+            and (k := self._arrival(index)) is not None
+        }  # fmt: skip
+        if not found:
+            return {}
+        angles = np.degrees(att.angle_between(self.result.attitude[[*found]], [*found.values()]))
+        return dict(zip(found, angles.tolist(), strict=True))
+
+    def waypoint(self, index: int) -> Waypoint | None:
+        """Miss at the waypoint's time, or at the end of the phase if it settles earlier."""
+        result = self.result
+        target, k = result.phases[index].target, self._arrival(index)
+        if target is None or k is None:
+            return None
 
         def miss(name: str, flown: Floats) -> float | None:
             asked = target.get(name)
-            if asked is None or not np.isfinite(flown).all():
+            if asked is None or not all(map(math.isfinite, flown.tolist())):
                 return None
-            if name == "attitude":
-                return math.degrees(float(att.angle_between(flown, asked)))
-            return float(np.linalg.norm(flown - np.asarray(asked)))
+            return self._turned[k] if name == "attitude" else math.dist(flown.tolist(), asked)
 
         rates = miss("rates", result.rates[k])
         return Waypoint(
@@ -507,7 +566,7 @@ class Measurements:
             if not len(times) or times[-1] < point["time"]:
                 continue
             k = samples.start + int(np.abs(times - point["time"]).argmin())
-            miss = float(np.linalg.norm(result.cm[k] - point["position"]))
+            miss = math.dist(result.cm[k].tolist(), point["position"])
             yield Waypoint(float(result.time[k]), miss, None, None, None)
 
 
@@ -541,7 +600,7 @@ def _all_pairs(p: Floats, slots: Floats, laid: Laid) -> tuple[float, tuple[int, 
         if last <= k + 1:
             break
         others = np.sort(order[k + 1 : last])
-        flown, intended = np.linalg.norm(both[:, others] - both[:, i, None], axis=2)
+        flown, intended = _length(both[:, others] - both[:, i, None])
         error = np.abs(flown - intended)
         j = int(error.argmax())
         if error[j] > worst[0]:
@@ -569,5 +628,5 @@ def _greatest(values: Floats) -> float | None:
 def angle_between(a: Floats, b: Floats) -> float:
     """Angle [deg] between two vectors."""
     (x, y, z), (u, v, w) = a.tolist(), b.tolist()
-    across = np.array([y * w - z * v, z * u - x * w, x * v - y * u])
-    return math.degrees(math.atan2(float(np.linalg.norm(across)), float(a @ b)))
+    across = math.hypot(y * w - z * v, z * u - x * w, x * v - y * u)
+    return math.degrees(math.atan2(across, x * u + y * v + z * w))

@@ -70,6 +70,7 @@ def safety(result: Result, verdict: Verdict) -> list[Safety]:
         ),
         _row("speed", "greatest speed of a vehicle", found.get("speed"), "m/s"),
         _row("acceleration", "greatest acceleration of a vehicle", found.get("acceleration"), "m/s²"),
+        *_directions(found),
         *_altitudes(measured),
         _row(
             "geofence", "least distance of a vehicle's centre to the geofence, from inside",
@@ -92,6 +93,16 @@ def safety(result: Result, verdict: Verdict) -> list[Safety]:
             ("tracking_error", "greatest distance of a vehicle from its slot", "m"),
         )
     ]  # fmt: skip
+
+
+def _directions(found: dict[str, CheckResult]) -> list[Safety]:
+    """Rows of the speeds and accelerations over the ground, and up and down, that are limited."""
+    return [
+        _row(f"{way} {what}", f"greatest {way} {what} of a vehicle", found[f"{way}_{what}"], unit)
+        for what, unit in (("speed", "m/s"), ("acceleration", "m/s²"))
+        for way in ("horizontal", "vertical")
+        if f"{way}_{what}" in found
+    ]
 
 
 def _row(

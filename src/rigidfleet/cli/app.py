@@ -5,8 +5,8 @@ for terminals only, and `NO_COLOR` is respected.
 
 Exit codes
 ----------
-- 0: success; for `run` and `report`: the flight passed its verdict; for `sweep`: all runs are flown, whether they
-  passed or failed; for `tune`: gains are chosen, perhaps the mission's own
+- 0: success; for `run`, `assess` and `report`: the flight passed its verdict; for `sweep`: all runs are flown, whether
+  they passed or failed; for `tune`: gains are chosen, perhaps the mission's own
 - 1: the flight failed its verdict or ended early; for `check`: the flight will fail
 - 2: invalid input, or files that cannot be read or written
 - 130: interrupted (Ctrl-C); the flight so far is saved, marked incomplete
@@ -28,7 +28,19 @@ from typing import Any, cast
 from cyclopts import App, CycloptsError, Parameter, UnknownOptionError, UnusedCliTokensError
 
 from rigidfleet._version import __version__
-from rigidfleet.cli import check, console, design, export, live, new, report, run, sweep, tune
+from rigidfleet.cli import (
+    assess,
+    check,
+    console,
+    design,
+    export,
+    live,
+    new,
+    report,
+    run,
+    sweep,
+    tune,
+)
 from rigidfleet.cli.codes import BAD_INPUT, FAILED, INTERRUPTED, PASSED
 from rigidfleet.errors import RigidfleetError
 
@@ -49,7 +61,7 @@ app = App(
     result_action="return_value",
 )
 _COMMANDS = (
-    run.run, run.missions, check.check, design.design, new.new, report.report, report.replay,
+    run.run, run.missions, check.check, design.design, new.new, assess.assess, report.report, report.replay,
     export.export, live.live, sweep.sweep, tune.tune,
 )  # fmt: skip
 for _key, _command in enumerate(_COMMANDS, start=1):

@@ -50,6 +50,7 @@ def check(
     from rigidfleet._common.files import write_file
     from rigidfleet._common.toml import to_toml
     from rigidfleet.mission import ending, goal, load_mission
+    from rigidfleet.mission.files import digests
     from rigidfleet.planning.timing import spelled_out, timed
 
     if expand is not None and expand.exists() and not force:
@@ -62,7 +63,7 @@ def check(
             found = load_mission(mission)
             if expand is not None:
                 found = spelled_out(found)
-                write_file(expand, to_toml(found.to_dict()).encode())
+                write_file(expand, (digests(found.text) + to_toml(found.to_dict())).encode())
             found = timed(found)
     except MissionError as error:
         if not json:

@@ -20,6 +20,7 @@ import numpy as np
 from rigidfleet._common.arguments import as_path
 from rigidfleet._common.files import replacing_folder, write_file
 from rigidfleet.errors import ResultError
+from rigidfleet.foreign import texts
 from rigidfleet.interchange import crazyflie, gltf, mavlink, recordings, skybrush, tables
 from rigidfleet.interchange.curves import Deviation, Motion, deviation, tracked
 from rigidfleet.result import Result, as_result
@@ -62,11 +63,11 @@ class Format(NamedTuple):
 
 FORMATS: dict[str, Format] = {
     "setpoints": Format(
-        tables.write_table, tables.read_table, "csv", False, None,
+        tables.write_table, texts.read_table, "csv", False, None,
         "position, velocity, acceleration, jerk, yaw and yaw rate", "tilt and rotors", False,
     ),
     "polynomial": Format(
-        crazyflie.write_polynomial, crazyflie.read_polynomial, "csv", True, 1e-3,
+        crazyflie.write_polynomial, texts.read_polynomial, "csv", True, 1e-3,
         "position and yaw (pieces of degree 7)", "tilt and rotors",
     ),
     "poly4d": Format(

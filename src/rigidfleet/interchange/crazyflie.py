@@ -13,7 +13,9 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from rigidfleet.errors import ResultError
-from rigidfleet.interchange.curves import Curve, Knots, Motion, bernstein, of_bernstein
+from rigidfleet.foreign.curves import NAMES, Curve
+from rigidfleet.interchange.curves import Knots, Motion
+from rigidfleet.math.bernstein import bernstein, of_bernstein
 from rigidfleet.math.splines import POWERS
 from rigidfleet.typing import Floats
 
@@ -25,8 +27,7 @@ _MM, _TENTH, _MS = 1e-3, np.radians(0.1), 1e-3
 _MOST, _LONGEST = 32_767, 65_535
 #: What rounding to millimetres can move a position, and more [m].
 COMPRESSED_ROUNDING = 1e-3
-_NAMES = ("x", "y", "z", "yaw")
-_HEADER = ",".join(["duration", *(f"{name}^{k}" for name in _NAMES for k in range(POWERS))])
+_HEADER = ",".join(["duration", *(f"{name}^{k}" for name in NAMES for k in range(POWERS))])
 #: Numbers of coefficients that a compressed piece can store beyond the first, by kind; its head: kinds and duration.
 _STORED = (0, 1, 3, 7)
 _PIECE = struct.Struct("<BH")
@@ -41,12 +42,6 @@ def write_polynomial(motion: Motion, tolerance: float) -> Iterator[bytes]:
         rows = _rows(motion.knots(agent).fitted(tolerance))
         lines = [",".join(f"{x:.9g}" for x in row) for row in rows.tolist()]
         yield "\n".join([_HEADER, *lines, ""]).encode()
-
-
-def read_polynomial(data: bytes) -> list[Curve]:
-    """The way in a table of `write_polynomial`, from time zero on."""
-    rows = np.loadtxt(data.decode().splitlines(), delimiter=",", skiprows=1, ndmin=2)
-    return [_curve(rows[:, 0], rows[:, 1:])]
 
 
 def write_poly4d(motion: Motion, tolerance: float) -> Iterator[bytes]:

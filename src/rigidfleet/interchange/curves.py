@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import comb
 from typing import NamedTuple
 
 import numpy as np
 
 from rigidfleet.errors import ResultError
+from rigidfleet.foreign.curves import Curve, values
 from rigidfleet.math import series, splines
 from rigidfleet.result import Result
 from rigidfleet.setpoints import Setpoints, at_rate
@@ -19,29 +19,6 @@ YAW_TOLERANCE = np.radians(0.5)
 #: Where in each interval a fit is checked, and an export is compared: shares of the interval.
 _CHECKED = np.array([0.25, 0.5, 0.75, 1.0])
 _COMPARED = np.array([0.02, 0.25, 0.5, 0.75, 0.98])
-
-
-class Curve(NamedTuple):
-    """The way of one vehicle, piece by piece.
-
-    Attributes
-    ----------
-    time : (n + 1,) ends of the pieces [s]
-    pieces : (n, 4, P) coefficients of x, y, z [m] and yaw [rad] in ascending powers of the time since the beginning of
-        a piece; yaw is NaN where a format does not have it
-    """
-
-    time: Floats
-    pieces: Floats
-
-    def at(self, t: Floats) -> Floats:
-        """Position [m] and yaw [rad] (K, 4) at times (K,) [s]; the first and last piece go on beyond the ends."""
-        k = np.clip(np.searchsorted(self.time, t, side="right") - 1, 0, len(self.pieces) - 1)
-        return _values(self.pieces[k], t - self.time[k])
-
-    def later(self, start: float) -> Curve:
-        """The same way, begun later [s]."""
-        return Curve(self.time + start, self.pieces)
 
 
 @dataclass(frozen=True)
@@ -147,7 +124,7 @@ class Knots(NamedTuple):
         n = len(self.time) - 1
         source = self.curve()
         t = self.time[:-1, None] + np.diff(self.time)[:, None] * _CHECKED
-        wanted = _values(
+        wanted = values(
             np.repeat(source.pieces, len(_CHECKED), axis=0), (t - self.time[:-1, None]).ravel()
         )
         wanted = wanted.reshape(n, len(_CHECKED), 4)
@@ -159,7 +136,7 @@ class Knots(NamedTuple):
             piece = splines.hermite(h, self.begin[:orders, first], self.end[:orders, last])
             piece = _with_yaw(piece, self._yaw(first, last))
             after = (t[i:j] - self.time[i]).ravel()
-            off = _values(piece, after) - wanted[i:j].reshape(-1, 4)
+            off = values(piece, after) - wanted[i:j].reshape(-1, 4)
             far = np.sqrt((off[:, :3] ** 2).sum(axis=1).max()) / tolerance
             far = max(far, h[0] / longest)
             return piece, float(max(far, abs(off[:, 3]).max() / YAW_TOLERANCE))
@@ -188,62 +165,10 @@ class Knots(NamedTuple):
         return Curve(self.time[ends], np.concatenate(pieces))
 
 
-def _values(pieces: Floats, after: Floats) -> Floats:
-    """Values (K, 4) of pieces (K or 1, 4, P) at times (K,) [s] since they began."""
-    found = np.zeros((len(after), pieces.shape[1]))
-    for k in range(pieces.shape[2] - 1, -1, -1):  # Horner
-        found = found * after[:, None] + pieces[:, :, k]
-    return found
-
-
 def _with_yaw(position: Floats, yaw: Floats) -> Floats:
     """Pieces (n, 4, P) of positions (n, 3, P) and yaws (n, 1, 4)."""
     powers = position.shape[2]
     return np.concatenate([position, np.pad(yaw, ((0, 0), (0, 0), (0, powers - 4)))], axis=1)
-
-
-def bernstein(pieces: Floats, duration: Floats) -> Floats:
-    """Bernstein coefficients (n, ..., P), or control points, of pieces (n, ..., P) of durations (n,) [s]."""
-    powers = pieces.shape[-1]
-    scaled = pieces * duration.reshape(-1, *(1,) * (pieces.ndim - 1)) ** np.arange(powers)
-    return scaled @ _to_bernstein(powers).T
-
-
-def of_bernstein(points: Floats, duration: float) -> Floats:
-    """Coefficients (P,) in ascending powers of time of a piece with control points (P,) and a duration [s]."""
-    powers = len(points)
-    return np.linalg.solve(_to_bernstein(powers), points) / duration ** np.arange(powers)
-
-
-def _to_bernstein(powers: int) -> Floats:
-    """The matrix of Bernstein coefficients b_i = sum_k C(i, k) / C(P - 1, k) a_k on [0, 1]."""
-    return np.array(
-        [[comb(i, k) / comb(powers - 1, k) for k in range(powers)] for i in range(powers)]
-    )
-
-
-def through(time: Floats, states: Floats, yaw: Floats | None = None) -> Curve:
-    """The way through states (m, K, 3) at times (K,) [s]: m derivatives of position are met, 4, 2, or 1 (lines).
-
-    Yaw (2, K) [rad, rad/s] or (1, K) is met in the same way; without it, yaw is NaN.
-    """
-    if len(time) == 1:
-        time, states = np.append(time, time + 1.0), np.repeat(states, 2, axis=1)
-        states[1:] = 0.0
-        yaw = None if yaw is None else np.repeat(yaw, 2, axis=1) * [[1.0], [0.0]][: len(yaw)]
-
-    def between(x: Floats) -> Floats:
-        h = np.diff(time)
-        if len(x) == 1:
-            slope = np.diff(x[0], axis=0) / h[:, None]
-            return np.stack([x[0][:-1], slope], axis=-1)
-        return splines.hermite(h, x[:, :-1], x[:, 1:])
-
-    position = between(states)
-    angle = np.full((len(time) - 1, 1, 1), np.nan) if yaw is None else between(yaw[..., None])
-    powers = max(position.shape[2], angle.shape[2])
-    parts = [np.pad(x, ((0, 0), (0, 0), (0, powers - x.shape[2]))) for x in (position, angle)]
-    return Curve(time, np.concatenate(parts, axis=1))
 
 
 def headings(curve: Curve) -> tuple[Floats, Floats]:
@@ -259,7 +184,7 @@ def headings(curve: Curve) -> tuple[Floats, Floats]:
     shares = [np.linspace(0.0, 1.0, count + 1) for count in counts]
     k = np.repeat(np.arange(len(step)), counts + 1)
     after = np.concatenate(shares) * step[k]
-    times, yaws = curve.time[k] + after, _values(curve.pieces[k], after)[:, 3]
+    times, yaws = curve.time[k] + after, values(curve.pieces[k], after)[:, 3]
     again = np.append(False, np.diff(times) < 1e-9)
     times[again] += 1e-3
     needed = ~again | np.append(False, abs(np.diff(yaws)) > 1e-9)
@@ -269,22 +194,6 @@ def headings(curve: Curve) -> tuple[Floats, Floats]:
     )
     level[[0, -1]] = False
     return times[~level], yaws[~level]
-
-
-def with_headings(curve: Curve, times: Floats, yaws: Floats) -> Curve:
-    """The same way with yaw on lines between yaws (K,) [rad] at times (K,) [s]."""
-    time = np.unique(
-        np.concatenate([curve.time, times[(times > curve.time[0]) & (times < curve.time[-1])]])
-    )
-    k = np.clip(np.searchsorted(curve.time, time[:-1], side="right") - 1, 0, len(curve.pieces) - 1)
-    moved = series.of_polynomials(
-        curve.pieces[k], time[:-1] - curve.time[k], curve.pieces.shape[-1]
-    )
-    pieces = np.moveaxis(moved, 0, -1)
-    at = np.interp(time, times, yaws)
-    pieces[:, 3] = 0.0
-    pieces[:, 3, 0], pieces[:, 3, 1] = at[:-1], np.diff(at) / np.diff(time)
-    return Curve(time, pieces)
 
 
 class Deviation(NamedTuple):
@@ -306,7 +215,7 @@ def deviation(source: Curve, written: Curve, until: float = np.inf) -> Deviation
     h = np.diff(source.time)[:, None]
     after = (h * _COMPARED).ravel()
     t = (source.time[:-1, None] + h * _COMPARED).ravel()
-    wanted = _values(np.repeat(source.pieces, len(_COMPARED), axis=0), after)
+    wanted = values(np.repeat(source.pieces, len(_COMPARED), axis=0), after)
     there = t <= written.time[-1]
     off = written.at(t[there]) - wanted[there]
     turned = (off[:, 3] + np.pi) % (2.0 * np.pi) - np.pi

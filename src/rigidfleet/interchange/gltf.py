@@ -14,7 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from rigidfleet.interchange.curves import Curve, Motion, headings, with_headings
+from rigidfleet.foreign.curves import Curve, with_headings
+from rigidfleet.interchange.curves import Motion, headings
 from rigidfleet.math import series, splines
 from rigidfleet.typing import Floats, Ints
 

@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 
 from rigidfleet.errors import ResultError
-from rigidfleet.interchange.curves import Curve, Motion, through
+from rigidfleet.foreign.curves import Curve, through
+from rigidfleet.interchange.curves import Motion
 from rigidfleet.math import geodesy
 from rigidfleet.setpoints import Setpoints, at_times
 from rigidfleet.typing import Floats

@@ -14,7 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from rigidfleet.interchange.curves import Curve, Motion, through
+from rigidfleet.foreign.curves import Curve, through
+from rigidfleet.interchange.curves import Motion
 from rigidfleet.typing import Floats
 
 _HEADER = """

@@ -12,21 +12,16 @@ import io
 import json
 import zipfile
 from collections.abc import Iterator
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from rigidfleet.errors import ResultError
-from rigidfleet.interchange.curves import (
-    Curve,
-    Motion,
-    bernstein,
-    headings,
-    of_bernstein,
-    with_headings,
-)
+from rigidfleet.foreign.curves import Curve
+from rigidfleet.foreign.shows import read_show
+from rigidfleet.interchange.curves import Motion, headings
 from rigidfleet.interchange.lights import FRAME, fades, program
+from rigidfleet.math.bernstein import bernstein
 
 #: Greatest number of vehicles of a show.
 MOST = 5000
@@ -103,17 +98,7 @@ def write_skyc(motion: Motion, tolerance: float) -> Iterator[bytes]:
 
 def read_skyc(data: bytes) -> list[Curve]:
     """The ways in a show, from its time zero on. Yaw is on lines between its setpoints."""
-    with zipfile.ZipFile(io.BytesIO(data)) as archive:
-
-        def found(value: Any) -> Any:
-            reference = value.get("$ref") if isinstance(value, dict) else None
-            if reference is None:
-                return value
-            return json.loads(archive.read(reference.removeprefix("./").removesuffix("#")))
-
-        drones = json.loads(archive.read("show.json"))["swarm"]["drones"]
-        settings = [drone["settings"] for drone in drones]
-        return [_curve(found(s["trajectory"]), found(s.get("yawControl"))) for s in settings]
+    return list(read_show(data, "skyc")[1])
 
 
 def _segments(curve: Curve) -> list[list[Any]]:
@@ -125,19 +110,3 @@ def _segments(curve: Curve) -> list[list[Any]]:
         start, *inner, end = piece.T.tolist()
         segments.append([t, end, [] if start == end == inner[0] == inner[1] else inner])
     return segments
-
-
-def _curve(trajectory: dict[str, Any], yaw: dict[str, Any] | None) -> Curve:
-    points = trajectory["points"]
-    time = np.array([point[0] for point in points], dtype=float)
-    pieces = np.zeros((len(points) - 1, 4, 4))
-    for k, (begin, end) in enumerate(pairwise(points)):
-        control = np.array([begin[1], *end[2], end[1]])
-        for axis in range(3):
-            pieces[k, axis, : len(control)] = of_bernstein(control[:, axis], end[0] - begin[0])
-    curve = Curve(time, pieces)
-    if yaw is None:
-        pieces[:, 3] = np.nan
-        return curve
-    setpoints = np.array(yaw["setpoints"], dtype=float)
-    return with_headings(curve, setpoints[:, 0], np.radians(setpoints[:, 1]))

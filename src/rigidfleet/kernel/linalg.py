@@ -130,3 +130,90 @@ def jacobi_eigen(A, V, w):
         w[i] = A[i, i]
         largest = max(largest, w[i])
     return largest
+
+
+@compiled
+def least_eigenvalue(A, v, d, e, zero):
+    """The smallest eigenvalue of symmetric A (n, n) that exceeds ``zero`` times the largest one.
+
+    Householder's reflections reduce A to a tridiagonal matrix, whose eigenvalues the QL algorithm finds (Golub and Van
+    Loan, Matrix Computations, section 8.3). Reads the lower triangle; A is destroyed. v, d and e (n,) are scratch.
+    """
+    n = A.shape[0]
+    for k in range(n - 2):
+        norm = 0.0
+        for i in range(k + 1, n):
+            norm += A[i, k] * A[i, k]
+        d[k], e[k] = A[k, k], 0.0
+        if norm == 0.0:
+            continue
+        first = A[k + 1, k]
+        e[k] = -math.copysign(math.sqrt(norm), first)
+        A[k + 1, k] = first - e[k]  # the column below the diagonal is now the reflection's vector
+        beta = 1.0 / (norm - first * e[k])  # 2 over the square of its length
+        share = 0.0
+        for i in range(k + 1, n):
+            v[i] = 0.0
+        for i in range(k + 1, n):
+            s, x = A[i, i] * A[i, k], A[i, k]
+            for j in range(k + 1, i):
+                s += A[i, j] * A[j, k]
+                v[j] += A[i, j] * x
+            v[i] += s
+        for i in range(k + 1, n):
+            v[i] *= beta
+            share += v[i] * A[i, k]
+        share *= 0.5 * beta
+        for i in range(k + 1, n):
+            v[i] -= share * A[i, k]
+            x, y = A[i, k], v[i]
+            for j in range(k + 1, i + 1):
+                A[i, j] -= x * v[j] + y * A[j, k]
+    if n > 1:
+        d[n - 2], e[n - 2] = A[n - 2, n - 2], A[n - 1, n - 2]
+    d[n - 1], e[n - 1] = A[n - 1, n - 1], 0.0
+    tridiagonal_eigenvalues(d, e)
+    largest = d[0]
+    for i in range(n):
+        largest = max(largest, d[i])
+    least = largest
+    for i in range(n):
+        if d[i] >= zero * largest:
+            least = min(least, d[i])
+    return least
+
+
+@compiled
+def tridiagonal_eigenvalues(d, e):
+    """Eigenvalues of a tridiagonal matrix with diagonal d (n,) and subdiagonal e (n,), whose last is 0; into d."""
+    n = d.shape[0]
+    for l in range(n):
+        for _ in range(60):
+            m = l
+            while m < n - 1:
+                if not abs(e[m]) > 1e-16 * (abs(d[m]) + abs(d[m + 1])):
+                    break
+                m += 1
+            if m == l:
+                break
+            # Wilkinson's shift, and a chain of rotations from below
+            g = (d[l + 1] - d[l]) / (2.0 * e[l])
+            g = d[m] - d[l] + e[l] / (g + math.copysign(math.sqrt(g * g + 1.0), g))
+            s, c, p = 1.0, 1.0, 0.0
+            for i in range(m - 1, l - 1, -1):
+                f, b = s * e[i], c * e[i]
+                r = math.sqrt(f * f + g * g)
+                e[i + 1] = r
+                if r == 0.0:
+                    d[i + 1] -= p
+                    break
+                s, c = f / r, g / r
+                g = d[i + 1] - p
+                r = (d[i] - g) * s + 2.0 * c * b
+                p = s * r
+                d[i + 1] = g + p
+                g = c * r - b
+            else:
+                d[l] -= p
+                e[l] = g
+            e[m] = 0.0

@@ -65,8 +65,16 @@ class ConstraintLaw(NamedTuple):
     k_def: float  # deformation damping [1/s]
 
 
+#: Ways of slots that only blend: none. One object for all, and of a type that all share.
+NO_KNOTS, NO_WAYS = np.zeros(0), np.zeros((0, 0, 3, 4))
+
+
 class Reference(NamedTuple):
-    """Desired shape or distances, blended from one to another over [t0, t0 + T_b]."""
+    """Desired shape or distances, blended from one to another over [t0, t0 + T_b].
+
+    If there are ``knots``, slots follow ``ways`` instead, piecewise polynomials from ``p0`` to ``p0 + dp`` over the
+    same time. They have two continuous derivatives, up to the tolerances of the file or plan that they are from.
+    """
 
     kind: int
     t0: float  # [s]
@@ -75,7 +83,11 @@ class Reference(NamedTuple):
     d1: Floats  # (m,) distances after [m]
     p0: Floats  # (N, 3) slots before, body axes [m]
     dp: Floats  # (N, 3) what the blend adds to them [m]
-    turn: Floats  # (3,) rotation vector by which the slots turn during the blend [rad]
+    turn: Floats  # (3,) rotation vector by which the slots turn during the blend [rad]; zero with ``knots``
+    knots: Floats = NO_KNOTS  # (K + 1,) [s], or empty
+    ways: Floats = (
+        NO_WAYS  # (K, N, 3, P): piece, slot in body axes [m], power of (t - knots[piece])
+    )
 
 
 class Motion(NamedTuple):
@@ -228,6 +240,15 @@ def workspace(
             wrench=(6,), H=(k, k), H_V=(k, k), H_w=(2, k),
         )
     )  # fmt: skip
+    w.T[:] = w.T_ref[:] = np.eye(3)
+    return w
+
+
+def cleared(w: Workspace) -> Workspace:
+    """The workspace as it was made; all its arrays lie in one memory."""
+    memory = w.r.base
+    assert memory is not None
+    memory.fill(0.0)
     w.T[:] = w.T_ref[:] = np.eye(3)
     return w
 

@@ -4,6 +4,7 @@ K samples, N agents, m edges.
 """
 
 import math
+from itertools import accumulate
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -200,9 +201,19 @@ class Record(NamedTuple):
 
 def recorder(k: int, n: int, m: int) -> Record:
     """Allocate a record of ``k`` samples."""
-    agent, edge = (lambda: np.full((k, n, 3), np.nan)), (lambda: np.full((k, m), np.nan))
-    return Record(
-        *(agent() for _ in range(7)), *(edge() for _ in range(5)), agent(),
-        np.full((k, 6), np.nan), np.full((k, 3), np.nan), np.full((k, 3, 3), np.nan),
-        np.full((k, 6), np.nan), *(agent() for _ in range(3)),
-    )  # fmt: skip
+    agent, edge = (k, n, 3), (k, m)
+    shapes = *(agent,) * 7, *(edge,) * 5, agent, (k, 6), (k, 3), (k, 3, 3), (k, 6), *(agent,) * 3
+    sizes = (
+        *(3 * k * n,) * 7,
+        *(k * m,) * 5,
+        3 * k * n,
+        6 * k,
+        3 * k,
+        9 * k,
+        6 * k,
+        *(3 * k * n,) * 3,
+    )
+    memory = np.empty(sum(sizes))
+    memory.fill(np.nan)
+    parts = zip(accumulate(sizes), sizes, shapes, strict=True)
+    return Record(*[memory[end - size : end].reshape(shape) for end, size, shape in parts])

@@ -25,12 +25,42 @@ def septic(t, t0, T_b):
 
 
 @compiled
+def follow_ways(t, knots, ways, p, p_dot, p_ddot):
+    """Slots p (N, 3) [m] on their ways at t, and their derivatives; at rest before the first knot and after the last.
+
+    Pieces are polynomials of any degree between knots (K + 1,) [s], ``ways`` (K, N, 3, P).
+    """
+    low, high = 0, knots.shape[0] - 1
+    inside = min(max(t, knots[0]), knots[high])
+    moves = 1.0 if inside == t else 0.0
+    while high - low > 1:
+        middle = (low + high) // 2
+        if knots[middle] <= t:
+            low = middle
+        else:
+            high = middle
+    x = inside - knots[low]
+    for i in range(p.shape[0]):
+        for q in range(3):
+            c = ways[low, i, q]
+            value = rate = second = 0.0  # Horner's scheme for a polynomial and two derivatives
+            for k in range(ways.shape[3] - 1, -1, -1):
+                second = second * x + 2.0 * rate
+                rate = rate * x + value
+                value = value * x + c[k]
+            p[i, q], p_dot[i, q], p_ddot[i, q] = value, moves * rate, moves * second
+
+
+@compiled
 def blend_slots(t, reference, p, p_dot, p_ddot):
-    """Slots p (N, 3) [m] in body axes at t, and their derivatives.
+    """Slots p (N, 3) [m] in body axes at t, and their derivatives, by a blend or on their ways.
 
     p = R(s turn) (p0 + s dp): the shape moves on straight lines while it turns about one axis, so
     that reshaping by a Kabsch-aligned ``dp`` need not change the commanded attitude.
     """
+    if reference.knots.shape[0] > 0:
+        follow_ways(t, reference.knots, reference.ways, p, p_dot, p_ddot)
+        return
     s, s_dot, s_ddot = septic(t, reference.t0, reference.T_b)
     n = reference.turn
     angle = math.sqrt(n[0] * n[0] + n[1] * n[1] + n[2] * n[2])

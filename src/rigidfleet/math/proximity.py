@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -58,16 +59,32 @@ def separation(r: Floats, radius: ArrayLike) -> tuple[Floats, Ints]:
                 least[k : k + 1], near = _closest_of_many(r[k : k + 1, who], radius[who])
                 pair[k] = who[near[0]]
         return least, pair
-    x = np.ascontiguousarray(r.T)
-    for i in range(n - 1):  # rows of samples are faster than rows of agents
-        d = x[:, i + 1 :] - x[:, i : i + 1]
-        apart = _root(d) - (radius[i] + radius[i + 1 :])[:, None]
-        for j in np.flatnonzero((apart < least).any(axis=1)).tolist():
-            closer = apart[j] < least  # false for NaN
-            np.copyto(least, apart[j], where=closer)
-            np.copyto(pair[:, 0], i, where=closer)
-            np.copyto(pair[:, 1], i + 1 + j, where=closer)
+    x, samples = np.ascontiguousarray(r.T), np.arange(len(r))  # rows of samples are faster
+    i, j = pairs = _pairs(n)
+    some = max(1, _CACHED // max(1, 3 * len(r)))
+    for first in range(0, len(i), some):
+        part = slice(first, first + some)
+        d = x[:, j[part]]
+        d -= x[:, i[part]]
+        apart = _root(d)
+        apart -= (radius[i] + radius[j])[part, None]
+        at = apart.argmin(axis=0)
+        value = apart[at, samples]
+        if np.isnan(value).any():  # of agents without a position
+            at = np.where(np.isnan(apart), np.inf, apart).argmin(axis=0)
+            value = apart[at, samples]
+        closer = value < least  # false for NaN
+        if closer.all():
+            least, pair = value, pairs[:, at + first].T
+        else:
+            least[closer], pair[closer] = value[closer], pairs[:, at + first].T[closer]
     return least, pair
+
+
+@lru_cache(16)
+def _pairs(n: int) -> Ints:
+    """All pairs (2, n (n - 1) / 2) of n agents, i < j."""
+    return np.stack(np.triu_indices(n, 1))
 
 
 def lengths(r: Floats, pairs: Ints) -> Floats:

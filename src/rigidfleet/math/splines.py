@@ -52,6 +52,44 @@ def hermite(h: Floats, begin: Floats, end: Floats) -> Floats:
     return np.moveaxis(np.concatenate([start, rest]) / scale, 0, -1)
 
 
+#: Weights (4, 4) of four control points, and powers of the share x of a span, of a uniform cubic B-spline.
+CUBIC = np.array([[1, -3, 3, -1], [4, 0, -6, 3], [1, 3, 3, -3], [0, 0, 0, 1]]) / 6.0
+
+
+def b_spline_pieces(control: Floats, duration: float) -> tuple[Floats, Floats]:
+    """Knots (M + 1,) [s] and cubics (M, ..., 4) of a uniform cubic B-spline with control points (M + 3, ...)."""
+    spans = len(control) - 3
+    windows = np.stack([control[k : k + spans] for k in range(4)], axis=-1)
+    return np.linspace(0.0, duration, spans + 1), windows @ CUBIC * (spans / duration) ** np.arange(
+        4.0
+    )
+
+
+def begun_from(knots: Floats, pieces: Floats, start: Floats, fade: float) -> tuple[Floats, Floats]:
+    """Knots from 0 and pieces (K, ..., P) of a way, so that it begins in another state.
+
+    What the derivatives 0 to 3, ``start`` (4, ...), differ from those of the way fades within a time [s] along a
+    polynomial of degree 7, so that three derivatives stay as continuous as they are.
+    """
+    orders = pieces.shape[-1]
+    first = np.zeros((4, *pieces.shape[1:-1]))
+    first[: min(4, orders)] = series.derivatives(np.moveaxis(pieces[0], -1, 0)[:4])
+    off = start - first
+    if not off.any():
+        return knots, pieces
+    extra = hermite(np.array([fade]), off[:, None], np.zeros_like(off[:, None]))
+    at = np.union1d(knots, [fade])
+    low = np.clip(np.searchsorted(knots, at[:-1], side="right") - 1, 0, len(pieces) - 1)
+    found = np.zeros((len(low), *pieces.shape[1:-1], POWERS))
+    found[..., :orders] = np.moveaxis(
+        series.of_polynomials(pieces[low], at[:-1] - knots[low], orders), 0, -1
+    )
+    early = at[:-1] < fade
+    shifted = series.of_polynomials(np.repeat(extra, early.sum(), axis=0), at[:-1][early], POWERS)
+    found[early] += np.moveaxis(shifted, 0, -1)
+    return at, found
+
+
 def stopping_piece(T: float, begin: Floats) -> Floats:
     """The piece (1, ..., 8) that comes to rest within T [s], from derivatives 0 to 3 ``begin`` (4, ...).
 

@@ -7,6 +7,7 @@ process for any step. The input is white standard-normal samples, so that the ca
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -51,8 +52,9 @@ def second_order(white: Floats, step: float, tau: float) -> Floats:
     start = np.linalg.cholesky(P)
     z = np.einsum("ab,kb...->ka...", root, white)
     z[0] = np.tensordot(start, white[0], 1)
-    for k in range(1, len(z)):
-        z[k] += np.tensordot(A, z[k - 1], 1)
+    rows, added = z.reshape(len(z), 2, -1), np.empty((2, z[0, 0].size))
+    for before, after in pairwise(rows):
+        np.add(after, np.dot(A, before, out=added), out=after)
     return (math.sqrt(3.0) * z[:, 0] + (1.0 - math.sqrt(3.0)) * z[:, 1]) / math.sqrt(2.0)
 
 

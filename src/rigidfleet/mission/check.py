@@ -119,6 +119,9 @@ def _numbers(collector: FindingCollector) -> None:
         problem = f"{len(forms)} formations of {n:,} agents have {slots:,} slots; the maximum is {bounds.SLOTS:,}"
         collector.add(("formations",), problem, "use fewer formations, or fewer agents", None)
     assignment = collector.data.get("assignment", "given")
+    if assignment != "each" and "assignment_downwash" in collector.data:
+        path, remedy = ("assignment_downwash",), "use assignment = 'each', or remove this key"
+        collector.add(path, f"has no effect with assignment {assignment!r}", remedy)
     if assignment != "given" and n > bounds.ALL_PAIRS:
         problem = f"compares all agents with all slots, which takes too long for {n:,} agents"
         remedy = f"for more than {bounds.ALL_PAIRS:,} agents use 'given' and order the agents as their slots"

@@ -14,16 +14,23 @@ import json
 import re
 import tomllib
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from rigidfleet._common.toml import to_toml
-from rigidfleet.errors import Finding, MissionError
+from rigidfleet.errors import Finding, MissionError, TrajectoryError
+from rigidfleet.foreign.curves import Curve
+from rigidfleet.foreign.files import files_of, read_trajectories
+from rigidfleet.foreign.pieces import curve_to_rows, smoothed
+from rigidfleet.foreign.samples import ASSUMED
 from rigidfleet.formation.point_files import parse_points, read_bytes
 from rigidfleet.mission import bounds
 
+#: What stands before the digest of a file.
+_DIGEST = "SHA-256 "
 #: What a text has that may name a file.
 _MAY_NAME = re.compile(r"(file|slots|position)[\"']?\s*=\s*[\"']")
 #: What is said where a file cannot be found, because a mission is not from a file itself.
@@ -31,19 +38,23 @@ NOT_A_FILE = "is read only with a mission file, as its path is relative to that"
 
 
 class _Named(NamedTuple):
-    """A file that a mission names: the table and key that do, the key of its numbers, and who reads them."""
+    """A file that a mission names: the table and key that do, the key of its numbers, and who reads them.
+
+    It may be a ``folder`` of files, one a vehicle.
+    """
 
     table: dict[str, Any]
     key: str
     becomes: str
     where: str
     read: Callable[[bytes, str], Content]
+    folder: bool = False
 
 
 class Content(NamedTuple):
-    """What a file gives: rows of numbers, and colours of points if it has them."""
+    """What a file gives: rows of numbers (of trajectories: of each vehicle), and colours of points if it has them."""
 
-    rows: list[list[float]]
+    rows: list[Any]
     colours: tuple[str, ...] | None = None
 
 
@@ -80,9 +91,9 @@ def with_files(text: str, data: dict[str, Any], path: Path) -> str:
     data, digests = copy.deepcopy(data), []
     for named in list(_named(data)):
         name = named.table[named.key]
-        content = read_bytes(_inside(path, named.where, name))
+        content = b"".join(read_bytes(_inside(path, named.where, x)) for x in _names(path, named))
         rows, colours = named.read(content, str(path.parent / name))
-        told = f"{named.becomes} of {name!r}, SHA-256 {hashlib.sha256(content).hexdigest()}"
+        told = f"{named.becomes} of {name!r}, {_DIGEST}{hashlib.sha256(content).hexdigest()}"
         digests.append(f"# {named.where}: {told}\n")
         del named.table[named.key]
         named.table[named.becomes] = rows
@@ -101,8 +112,49 @@ def with_files(text: str, data: dict[str, Any], path: Path) -> str:
     return "".join(digests) + to_toml(data)  # where a file is named within a line
 
 
+def digests(text: str) -> str:
+    """The lines of a mission's text that tell the digests of files, for a text that is written anew from its data."""
+    found = re.findall(rf"^# .*{_DIGEST}[0-9a-f]{{64}}$", text, re.MULTILINE)
+    return "".join(f"{line}\n" for line in dict.fromkeys(found))
+
+
+def _names(path: Path, named: _Named) -> list[str]:
+    """Names of the files of a name: itself, or those in a folder.
+
+    Raises
+    ------
+    MissionError
+        The folder has no files, or is outside the mission's.
+    """
+    name = named.table[named.key]
+    found = _inside(path, named.where, name)
+    if not named.folder or not found.is_dir():
+        return [name]
+    try:
+        inside = [file for group in files_of(found) for file in group]
+    except TrajectoryError as error:
+        raise _unread(str(path), named.where, error) from None
+    return [str(Path(name) / file.relative_to(found)) for file in inside]
+
+
+def _unread(name: str, where: str, error: TrajectoryError) -> MissionError:
+    problem = str(error).removeprefix(f"{name}: ").rstrip(".")
+    return MissionError([Finding(name, where, None, problem, "")])
+
+
 def _named(data: dict[str, Any]) -> Iterator[_Named]:
-    forms, agents, things = (data.get(key) for key in ("formations", "agents", "obstacles"))
+    forms, agents, things, phases = (
+        data.get(key) for key in ("formations", "agents", "obstacles", "phases")
+    )
+    for k, phase in enumerate(phases if isinstance(phases, list) else (), start=1):
+        if (
+            isinstance(phase, dict)
+            and phase.get("kind") == "follow"
+            and isinstance(phase.get("file"), str)
+            and "trajectories" not in phase
+        ):
+            read = partial(_trajectories, yaw=phase.get("yaw") == "file")
+            yield _Named(phase, "file", "trajectories", f"phases[{k}].file", read, True)
     for name, form in forms.items() if isinstance(forms, dict) else ():
         if isinstance(form, dict) and isinstance(form.get("slots"), str):
             yield _Named(form, "slots", "slots", f"formations.{name}.slots", _points)
@@ -141,6 +193,24 @@ def _inside(path: Path, where: str, name: str) -> Path:
 def _points(data: bytes, name: str) -> Content:
     found = parse_points(data, name)
     return Content(found.slots.tolist(), found.colours)
+
+
+def _trajectories(_: bytes, name: str, *, yaw: bool) -> Content:
+    """Pieces of each vehicle; with a ``yaw`` if that is asked for.
+
+    Where a file has samples, they are joined by the spline with the least jerk (C4): it is not only judged but flown.
+    """
+    try:
+        found = read_trajectories(name)
+    except TrajectoryError as error:
+        raise _unread(name, "", error) from None
+    curves = [Curve(curve.time - curve.time[0], curve.pieces) for curve in found.curves]
+    if found.assumed in ASSUMED.values():
+        curves = [smoothed(curve) for curve in curves]
+    if yaw and any(np.isnan(curve.pieces[:, 3]).any() for curve in curves):
+        problem, remedy = "has no yaw", "remove yaw = 'file', or give a file with a yaw"
+        raise MissionError([Finding(name, "", None, problem, remedy)])
+    return Content([curve_to_rows(Curve(c.time, np.nan_to_num(c.pieces))) for c in curves])
 
 
 def _heights(data: bytes, name: str) -> Content:

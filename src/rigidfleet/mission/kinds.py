@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Annotated, Any, ClassVar, Literal, get_args
 
 from pydantic import (
@@ -12,6 +13,7 @@ from pydantic import (
     model_validator,
 )
 
+from rigidfleet.foreign.pieces import joined, rows_to_curve
 from rigidfleet.mission import bounds
 from rigidfleet.mission.values import (
     AUTO,
@@ -26,9 +28,11 @@ from rigidfleet.mission.values import (
     Scale,
     Time,
     Tolerance,
+    Trajectories,
     Vector,
     Velocity,
 )
+from rigidfleet.typing import Floats
 
 #: Keys of a phase that may be automatic, and the word for it.
 TIMES = ("duration", "travel", "blend")
@@ -60,6 +64,8 @@ class AnyPhase(Part):
     lands: ClassVar[bool] = False
     #: Whether other phases take its place before the flight, so that it cannot begin in flight.
     replaced: ClassVar[bool] = False
+    #: Whether the phase follows ways that are given, whose start has to be where the vehicles are.
+    led: ClassVar[bool] = False
     #: Default control in architecture "body".
     body_control: ClassVar[str] = "body"
 
@@ -115,6 +121,16 @@ class AnyPhase(Part):
     def vertical(self) -> Vertical | None:
         """The phase if it leads vehicles straight up or down, else None."""
         return None
+
+    @property
+    def spelled(self) -> bool:
+        """Whether the phase is flown as written; others take its place before the flight (`planning.transitions`)."""
+        return True
+
+    @property
+    def bent(self) -> bool:
+        """Whether the phase leads its vehicles on bent ways to a formation."""
+        return False
 
     @property
     def automatic(self) -> list[str]:
@@ -239,11 +255,16 @@ class Reshape(Shaping):
     """Change from one formation to another."""
 
     kind: Literal["reshape"] = Field(description="change the formation")
-    transition: Literal["straight", "layers", "auto"] = Field(
+    transition: Literal["straight", "layers", "ways", "auto"] = Field(
         "straight",
         description="ways to the new slots: straight: all at once; layers: apart to levels one above the other, "
-        "across, and together again, as three phases, with every pair proved; auto: straight if that keeps "
-        "limits.separation, else layers",
+        "across, and together again, as three phases, with every pair proved; ways: bent ways for all together, found "
+        "within limits.speed and acceleration, and proved; auto: straight if that keeps limits.separation, else layers",
+    )
+    control_points: tuple[tuple[Vector, ...], ...] | None = Field(
+        None,
+        description="bent ways to the new slots over `blend`: control points of uniform cubic B-splines, a row of "
+        "slots [m] for each. `check --expand` and results have them in place of transition = 'ways'",
     )
     alignment: Literal["fit", "none"] = Field(
         "fit",
@@ -255,6 +276,16 @@ class Reshape(Shaping):
     def aligned(self) -> bool:
         """Whether the slots are fitted."""
         return self.alignment == "fit"
+
+    @property
+    def spelled(self) -> bool:
+        """Whether the ways are straight, or given."""
+        return self.transition == "straight"
+
+    @property
+    def bent(self) -> bool:
+        """Whether ways have been found, or given."""
+        return self.control_points is not None
 
 
 class Steering(Attitude, AnyPhase):
@@ -422,6 +453,11 @@ class Vertical(Arriving):
         return self
 
     @property
+    def spelled(self) -> bool:
+        """Whether there is one group."""
+        return self.stagger is None
+
+    @property
     def each(self) -> bool:
         """Whether each vehicle has a way of its own, so that the shape may change."""
         return bool(self.agents) or self.stagger is not None
@@ -462,6 +498,91 @@ class Land(Vertical):
     def leads_to(self) -> str:
         """The ground."""
         return "the ground"
+
+
+class Follow(AnyPhase):
+    """Follow trajectories that another program made: the virtual body, or each vehicle its own."""
+
+    moves: ClassVar[bool] = True
+    goal_moves: ClassVar[bool] = True
+    led: ClassVar[bool] = True
+    body_control: ClassVar[str] = "tracking"
+
+    kind: Literal["follow"] = Field(description="follow trajectories of a file")
+    file: str | None = Field(
+        None,
+        description="file of the trajectories, relative to the mission file: one for the virtual body, or one for each "
+        "vehicle; or a folder with a file for each vehicle. A result holds `trajectories` in its place",
+    )
+    trajectories: Trajectories | None = Field(
+        None,
+        description="of each vehicle, or of the virtual body alone: a list of pieces, each with its duration [s] and "
+        "the coefficients of x, y, z [m] and yaw [rad], in ascending powers of the time since its beginning, equally "
+        "many of each (at most 8)",
+    )
+    yaw: Literal["fixed", "file"] = Field(
+        "fixed",
+        description="fixed: keeps the attitude commanded before; file: the virtual body is level and has the yaw of "
+        "the file. The yaw of single vehicles follows [yaw]",
+    )
+    travel: Time | None = Field(
+        None,
+        description="time from the start to the end of the trajectories [s]; default: the whole phase, whose default "
+        "is the time in the file. With another time, all speeds scale",
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _lasting(cls, data: Any) -> Any:
+        if isinstance(data, dict) and not {"until", "duration", "settle"} & data.keys():
+            return data | {"duration": data.get("travel") or _time_of(data.get("trajectories"))}
+        return data
+
+    @cached_property
+    def pieces(self) -> tuple[Floats, Floats]:
+        """Knots (K + 1,) from 0 [s], and pieces (K, N, 4, P) [m, rad] of all trajectories.
+
+        Raises
+        ------
+        ValueError
+            They have too many knots in all.
+        """
+        return joined([rows_to_curve(rows) for rows in self.trajectories or ()])
+
+    @property
+    def meets(self) -> tuple[str, ...]:
+        """Position and velocity at the end, and the attitude if it turns."""
+        return ("position", "velocity", *(("attitude", "rates") if self.turns_away else ()))
+
+    @property
+    def turns_away(self) -> bool:
+        """Whether the body turns as the file says."""
+        return self.yaw == "file"
+
+    @property
+    def least_time(self) -> float:
+        """Time to the end of the trajectories [s]."""
+        return self.travel or 0.0
+
+    @property
+    def leads_to(self) -> str:
+        """The trajectories."""
+        n = len(self.trajectories or ())
+        return "along a trajectory" if n == 1 else f"along {n} trajectories"
+
+    def ended(self, length: float) -> dict[str, Any]:
+        """The time of the whole trajectories, so that they are flown as fast up to the new end."""
+        whole = self.travel or self.duration
+        return {"travel": length if whole is None else seconds(whole)}
+
+
+def _time_of(trajectories: Any) -> float:
+    """Duration [s] of the longest of trajectories whose form is not checked yet; 1 if it has errors."""
+    try:
+        longest = max(math.fsum(row[0] for row in rows) for rows in trajectories)
+        return longest if 0.0 < longest < math.inf else 1.0
+    except (TypeError, ValueError, IndexError, OverflowError):
+        return 1.0
 
 
 class Orbit(AnyPhase):
@@ -523,7 +644,7 @@ def _vector(values: Sequence[float], unit: str) -> str:
 
 
 Phase = Annotated[
-    Establish | Fly | Go | Reshape | Turn | Orbit | Hold | Brake | Takeoff | Land,
+    Establish | Fly | Follow | Go | Reshape | Turn | Orbit | Hold | Brake | Takeoff | Land,
     Field(discriminator="kind"),
 ]
 #: Models of all phases by `kind`.

@@ -16,7 +16,7 @@ from rigidfleet._common.arguments import as_path
 from rigidfleet._common.text import agent_names
 from rigidfleet._common.toml import to_toml
 from rigidfleet.errors import Finding, MissionError, wrong_type
-from rigidfleet.formation.assignment import assigned
+from rigidfleet.formation.assignment import assigned, squashed
 from rigidfleet.formation.distance_geometry import distances
 from rigidfleet.math import constraint_jacobian
 from rigidfleet.math.attitude import dcm_from_euler
@@ -24,7 +24,7 @@ from rigidfleet.mission import bounds
 from rigidfleet.mission.changes import scaled, told_apart
 from rigidfleet.mission.check import check
 from rigidfleet.mission.describe import counted
-from rigidfleet.mission.files import completed
+from rigidfleet.mission.files import completed, digests
 from rigidfleet.mission.findings import near
 from rigidfleet.mission.kinds import Establish, Phase
 from rigidfleet.mission.phases import latest_end
@@ -121,6 +121,18 @@ class Mission(Contents):
         except RecursionError:
             raise _unread(origin, "is nested too deeply", "use the keys of a mission") from None
         return cls.from_toml(text, origin)
+
+    def rewritten(self, data: Mapping[str, Any], origin: str | None = None) -> Self:
+        """Return a mission from changed data of this one, checked; its text keeps the digests of files.
+
+        Raises
+        ------
+        MissionError
+            With a finding for each error.
+        """
+        mission = self.from_dict(data, self._origin if origin is None else origin)
+        mission._text = digests(self._text) + mission._text
+        return mission
 
     def with_phases(self, phases: list[dict[str, Any]]) -> Self:
         """Return the mission with other tables of phases, checked. It keeps its own text.
@@ -239,6 +251,7 @@ class Mission(Contents):
             if (shaping := p.shaping) is None:
                 continue
             name = shaping.formation
+            up = np.eye(3)[2] if lies is None else lies[:, 2]
             axes: Floats | None = np.eye(3)  # axes of this formation in those of the one before
             if self.free_attitude(p):
                 axes = lies = None
@@ -252,7 +265,10 @@ class Mission(Contents):
                 known = False
             elif name not in flown:
                 radius = self.agents.radius if self.assignment == "safe" else None
-                order, turn = assigned(places, slots, turn=axes, radius=radius)
+                metric = None
+                if self.assignment_downwash > 1.0 and axes is not None:
+                    metric = squashed(up, self.assignment_downwash)
+                order, turn = assigned(places, slots, turn=axes, radius=radius, metric=metric)
                 if self.assignment != "each":
                     return dict.fromkeys(self.formations, order), {(before, name): turn}
                 orders[name] = order

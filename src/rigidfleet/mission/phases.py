@@ -11,9 +11,11 @@ import numpy as np
 
 from rigidfleet._common.text import agent_names
 from rigidfleet._common.toml import toml_key
+from rigidfleet.foreign.pieces import CHANNELS, jump, rows_to_curve
 from rigidfleet.formation import distance_geometry
 from rigidfleet.math import rigid_body
 from rigidfleet.mission import bounds
+from rigidfleet.mission.files import NOT_A_FILE
 from rigidfleet.mission.findings import FindingCollector, Keys, near
 from rigidfleet.mission.formations import sound
 from rigidfleet.mission.kinds import (
@@ -23,6 +25,7 @@ from rigidfleet.mission.kinds import (
     AnyPhase,
     Brake,
     Establish,
+    Follow,
     Go,
     Orbit,
     Reshape,
@@ -60,6 +63,10 @@ def check(
             _automatic(collector, p, ("phases", k), parts)
             if n is not None and p.vertical is not None:
                 _members(collector, p.vertical, n, ("phases", k))
+            if n is not None and isinstance(p, Follow):
+                _followers(collector, p, n, ("phases", k))
+            if n is not None and isinstance(p, Reshape) and p.control_points is not None:
+                _bent(collector, p, p.control_points, n, ("phases", k))
     return tuple(p for p in found if p is not None)
 
 
@@ -329,6 +336,15 @@ def _led(
     collector: FindingCollector, p: Brake | Go | Vertical, path: Keys, longest: float | None
 ) -> None:
     """Check that a brake, a take-off, a landing or a way to be found has tracked slots and an end."""
+    _ended(collector, p, path)
+    travel = p.least_time
+    if longest is not None and travel > longest * (1 + 1e-9):
+        problem = f"is longer than the phase, which ends after {longest:g} s"
+        collector.add((*path, "travel"), problem, "reduce travel or end the phase later")
+
+
+def _ended(collector: FindingCollector, p: AnyPhase, path: Keys) -> None:
+    """Check that a phase with a way of its own has tracked slots and a time of arrival."""
     kind_name = collector.data["phases"][path[1]]["kind"]
     if p.control == "body" and collector.right(path, "control"):
         problem = f"kind '{kind_name}' cannot be flown by a wrench on the virtual body"
@@ -336,10 +352,6 @@ def _led(
     if p.settle is not None and collector.right(path, *_ENDINGS):
         problem = f"kind '{kind_name}' needs a time of arrival"
         collector.add((*path, "settle"), problem, "end it by duration or until", None)
-    travel = p.least_time
-    if longest is not None and travel > longest * (1 + 1e-9):
-        problem = f"is longer than the phase, which ends after {longest:g} s"
-        collector.add((*path, "travel"), problem, "reduce travel or end the phase later")
 
 
 def _vertical(collector: FindingCollector, p: Vertical, path: Keys, longest: float | None) -> None:
@@ -362,6 +374,71 @@ def _go(collector: FindingCollector, p: Go, path: Keys, longest: float | None) -
     _led(collector, p, path, longest)
     for name in p.formations or ():
         _exists(collector, name, path, "formations")
+
+
+#: Greatest jumps of position [m] and velocity [m/s] within a trajectory: those of numbers rounded in a file.
+_JUMPS = ((0.01, "m"), (0.1, "m/s"))
+
+
+def _follow(collector: FindingCollector, p: Follow, path: Keys, longest: float | None) -> None:
+    """Check that there are trajectories, without jumps, and an end."""
+    _ended(collector, p, path)
+    where = (*path, "trajectories")
+    if p.trajectories is None:
+        problem, remedy = "is missing", "give the name of a file with trajectories"
+        if p.file is not None:
+            problem, remedy = NOT_A_FILE, "load the mission from its file"
+        if collector.right(path, "file", "trajectories"):
+            collector.add((*path, "file"), problem, remedy)
+        return
+    if p.file is not None:
+        collector.add((*path, "file"), "is given beside its numbers", "remove one of the two")
+        return
+    for i, rows in enumerate(p.trajectories):
+        lengths = {len(row) for row in rows}
+        if len(lengths) > 1 or (min(lengths) - 1) % CHANNELS or min(row[0] for row in rows) <= 0.0:
+            problem = "has pieces of another form than a duration > 0 and as many coefficients of x, y, z and yaw"
+            collector.add(
+                (*where, i), problem, "make all rows of one length: 1 + 4 P numbers", None
+            )
+            return
+        by, when = jump(rows_to_curve(rows))
+        for far, t, (most, unit) in zip(by.tolist(), when.tolist(), _JUMPS, strict=False):
+            if far > most:
+                problem = f"jumps by {far:.3g} {unit} at {t:.6g} s"
+                remedy = f"correct it: at most {most:g} {unit} is taken for rounding"
+                collector.add((*where, i), problem, remedy, None)
+                return
+    try:
+        _ = p.pieces
+    except ValueError as error:
+        collector.add(where, str(error), "give all vehicles the same times, or fewer", None)
+
+
+def _followers(collector: FindingCollector, p: Follow, n: int, path: Keys) -> None:
+    """Check that there is one trajectory for the virtual body, or one for each vehicle."""
+    given = len(p.trajectories or ())
+    if given not in (0, 1, n):
+        problem = f"has {given} trajectories for {n} agents"
+        remedy = "give one for the virtual body, or one for each agent"
+        collector.add((*path, "trajectories"), problem, remedy, None)
+    elif given > 1 and p.yaw == "file":
+        problem = "has no effect with a trajectory for each vehicle, whose yaw follows [yaw]"
+        collector.add((*path, "yaw"), problem, "remove it")
+
+
+def _bent(
+    collector: FindingCollector, p: Reshape, rows: Sequence[Sequence[Any]], n: int, path: Keys
+) -> None:
+    """Check the form of bent ways, and that nothing else bends them."""
+    where, problem, remedy = (*path, "control_points"), "", ""
+    if len(rows) < 4 or any(len(row) != n for row in rows):
+        problem, remedy = "is no list of four or more rows of slots", f"give {n} points in each row"
+    elif p.transition != "straight" or p.alignment != "none" or p.control != "tracking":
+        problem = "needs tracked slots, alignment = 'none' and no transition"
+        remedy = "correct these keys, or use transition = 'ways'"
+    if problem:
+        collector.add(where, problem, remedy, None)
 
 
 #: Checks of single kinds. Arguments: the findings, the phase, its path, its maximum duration [s] or None.
@@ -387,6 +464,7 @@ def _reshape(collector: FindingCollector, p: Reshape, path: Keys, _: float | Non
 _OWN: dict[str, Callable[[FindingCollector, Any, Keys, float | None], None]] = {
     "brake": _led,
     "establish": _establish,
+    "follow": _follow,
     "land": _vertical,
     "go": _go,
     "orbit": _orbit,
@@ -556,12 +634,14 @@ def _automatic(
     if p.control != "tracking":
         problem = f"needs tracked slots to have a least time, not control '{p.control}'"
         collector.add(where, problem, "use control = 'tracking', or give a time")
-    if p.duration == AUTO and not (p.steering or p.shaping or p.vertical or isinstance(p, Go)):
+    if p.duration == AUTO and not (
+        p.steering or p.shaping or p.vertical or p.led or isinstance(p, Go)
+    ):
         problem = (
             f"a phase of kind '{collector.data['phases'][path[1]]['kind']}' has no least duration"
         )
         collector.add((*path, "duration"), problem, "give a duration")
-    steers = p.steering or p.vertical
+    steers = p.steering or p.vertical or (p if isinstance(p, Follow) else None)
     if p.duration == AUTO and steers is not None and steers.travel is not None:
         problem = "has no effect with duration = 'auto', which ends the phase at the arrival"
         collector.add((*path, "travel"), problem, "remove one of them")

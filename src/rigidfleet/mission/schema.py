@@ -506,6 +506,14 @@ class Limits(Part):
 
     speed: Speed | None = Field(None, description="maximum speed [m/s]")
     acceleration: Acceleration | None = Field(None, description="maximum acceleration [m/s^2]")
+    horizontal_speed: Speed | None = Field(None, description="maximum speed over the ground [m/s]")
+    vertical_speed: Speed | None = Field(None, description="maximum speed up and down [m/s]")
+    horizontal_acceleration: Acceleration | None = Field(
+        None, description="maximum horizontal acceleration [m/s^2]"
+    )
+    vertical_acceleration: Acceleration | None = Field(
+        None, description="maximum acceleration up and down [m/s^2]"
+    )
     jerk: Jerk | None = Field(
         None,
         description="maximum jerk of the reference [m/s^3]; kept by the plan of a smooth mission",
@@ -708,6 +716,11 @@ class MissionHeader(Part):
         description="assignment of agents to slots and their edges: given: agent 1 to slot 1 and so on; shortest: "
         "least sum of squared distances from the start to the first established formation; safe: most clearance on the "
         "paths there; each: as shortest, anew at each change of formation, without turning the shapes",
+    )
+    assignment_downwash: Annotated[float, Strict(), Field(ge=1, le=100)] = Field(
+        1.0,
+        description="with assignment 'each': heights count divided by this, so that vehicles that change places keep "
+        "more of a distance above each other than beside",
     )
     gravity: Annotated[float, Strict(), from_zero(ACCELERATION)] = Field(
         9.81, description="gravity [m/s^2], >= 0"

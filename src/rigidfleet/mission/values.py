@@ -98,6 +98,13 @@ Edges = Annotated[
     Discriminator(_form),
 ]
 
+#: Of each vehicle, pieces: duration, and coefficients of x, y, z and yaw.
+_Number = Annotated[float, Strict(), Field(ge=-1e12, le=1e12)]
+_Row = Annotated[tuple[_Number, ...], Field(min_length=5, max_length=33)]
+Trajectories = Annotated[
+    tuple[Annotated[tuple[_Row, ...], Field(min_length=1)], ...], Field(min_length=1)
+]
+
 #: Where vehicles without a slot wait.
 Rest = Annotated[
     Annotated[Literal["sides"], Tag("one")] | Annotated[tuple[Vector, ...], Tag("list")],

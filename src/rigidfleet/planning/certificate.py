@@ -9,14 +9,16 @@ import numpy as np
 
 from rigidfleet.formation.assignment import closest_approach
 from rigidfleet.kernel.problem import Reference, septic_polynomial
-from rigidfleet.math import proximity
+from rigidfleet.math import proximity, series
 from rigidfleet.mission import Phase
 from rigidfleet.typing import Bools, Floats
 
 #: Greatest size of slots, in bytes, whose least separation is cached.
 _KEPT = 100_000
-#: Where a certificate is from: a closed form is exact; polygons of samples less their sagitta are a lower bound.
-How = Literal["closed form", "polygons less sagitta"]
+#: What a certificate of bent ways gives away, so that its search ends [m].
+CLOSE = 1e-6
+#: Where a certificate is from: a closed form is exact; conservative advancement gives away `CLOSE`.
+How = Literal["closed form", "conservative advancement"]
 
 
 class Certificate(NamedTuple):
@@ -45,7 +47,14 @@ def certified(
     """
     if phase.control != "tracking" or (reference.T_b == 0.0 and reference.dp.any()):
         return None
-    return straight(reference, radius, lost)
+    if not len(reference.knots):
+        return straight(reference, radius, lost)
+    left = np.arange(len(radius)) if lost is None else np.flatnonzero(~lost)
+    if len(left) < 2:
+        return None
+    found = of_ways(reference.knots, reference.ways[:, left], radius[left])
+    i, j = (int(left[k]) for k in found.agents)
+    return found._replace(agents=(i, j))
 
 
 def straight(reference: Reference, radius: Floats, lost: Bools | None = None) -> Certificate | None:
@@ -79,24 +88,43 @@ def _least(p: bytes, dp: bytes, radius: bytes) -> tuple[float, tuple[int, int], 
     return float(least[0]), (int(pairs[0, 0]), int(pairs[0, 1])), 0.0
 
 
-def of_polygons(
-    position: Floats, time: Floats, acceleration: float, radius: Floats | None = None
-) -> Certificate:
-    """Certificate of bent ways from samples (K, N, 3) [m] at times (K,) [s], and a bound on every |a| [m/s^2].
+def of_ways(knots: Floats, ways: Floats, radius: Floats | None = None) -> Certificate:
+    """Certificate of bent ways, polynomials (K, N, 3, P) between knots (K + 1,) [s], for radii (N,) [m] or points.
 
-    Between two samples a pair moves straight in step, but for the sagitta of its relative motion: with |a_i - a_j|
-    <= 2 |a|, it is 2 |a| h^2 / 8 at most (interpolation error of a linear interpolant). The closed form for the
-    straight ways less that is a lower bound, whose gap falls with the square of the time h between samples.
+    Let p(t) = sum_k c_k (t - m)^k be the way of one vehicle relative to another about the middle m of a span of length
+    2 h, and n the direction of c_0. Then |p(t)| >= n . p(t) >= |c_0| - sum_k |n . c_k| h^k. Spans in which this bound
+    is less than the least distance known, `CLOSE` set aside, are halved until there are none (conservative advancement,
+    of second order where the distance is stationary).
     """
-    best = np.inf, (0, 0), float(time[0])
-    for k in range(max(1, len(time) - 1)):
-        after = min(k + 1, len(time) - 1)
-        separation, pair, share = closest_approach(position[k], position[after], radius)
-        h = float(time[after] - time[k])
-        separation -= acceleration * h * h / 4.0
-        if separation < best[0]:
-            best = separation, pair, float(time[k]) + share * h
-    return Certificate(best[0], best[2], best[1], "polygons less sagitta")
+    n, powers = ways.shape[1], ways.shape[3]
+    r = np.zeros(n) if radius is None else radius
+    best: tuple[float, float, tuple[int, int]] = np.inf, float(knots[0]), (0, 0)
+    for i in range(n - 1):
+        c = (ways[:, i + 1 :] - ways[:, i : i + 1]).reshape(-1, 3, powers)
+        half = np.repeat(np.diff(knots) / 2, n - 1 - i)
+        middle = np.repeat((knots[:-1] + knots[1:]) / 2, n - 1 - i)
+        other = np.tile(np.arange(i + 1, n), len(knots) - 1)
+        c = _about(c, half)
+        while len(c):
+            distance = np.linalg.norm(c[..., 0], axis=1)
+            direction = c[..., 0] / np.where(distance > 0.0, distance, 1.0)[:, None]
+            along = np.abs(np.einsum("lq,lqk->lk", direction, c[..., 1:]))
+            fall = (along * half[:, None] ** np.arange(1, powers)).sum(axis=1)
+            separation = distance - r[i] - r[other]
+            k = int(separation.argmin())
+            if separation[k] < best[0]:
+                best = float(separation[k]), float(middle[k]), (i, int(other[k]))
+            open_ = separation - fall < best[0] - CLOSE
+            c, half, middle, other = c[open_], half[open_] / 2, middle[open_], other[open_]
+            c = np.concatenate([_about(c, -half), _about(c, half)])
+            middle = np.concatenate([middle - half, middle + half])
+            half, other = np.tile(half, 2), np.tile(other, 2)
+    return Certificate(best[0] - CLOSE, best[1], best[2], "conservative advancement")
+
+
+def _about(c: Floats, x: Floats) -> Floats:
+    """Coefficients (L, 3, P) of polynomials about other points x (L,)."""
+    return np.moveaxis(series.of_polynomials(c, x, c.shape[-1]), 0, -1)
 
 
 def _when(share: float) -> float:

@@ -31,22 +31,12 @@ def greatest_speeds(reference: Reference, motion: Motion, begin: Floats, end: Fl
     k |c_k| h^(k-1). The body turns no faster than its rotation vector changes, since the Jacobian of the exponential
     map has no singular value above 1. A slot that blends lies on a straight way, whose ends are its greatest levers.
     """
-    knots, pieces = motion.knots, len(motion.coefficients)
-    first = np.clip(np.searchsorted(knots, begin, side="right") - 1, 0, pieces - 1)
-    last = np.clip(np.searchsorted(knots, end, side="left") - 1, first, pieces - 1)
-    speed, turning = np.zeros(len(begin)), np.zeros(len(begin))
-    for k in range(int((last - first).max(initial=0)) + 1):
-        piece = np.minimum(first + k, last)
-        low, high = (np.clip(t, knots[piece], knots[piece + 1]) for t in (begin, end))
-        coefficients, half = motion.coefficients[piece], (high - low) / 2
-        x = series.of_polynomials(
-            coefficients, (low + high) / 2 - knots[piece], coefficients.shape[-1]
-        )
-        powers = half ** np.arange(len(x) - 1.0)[:, None]
-        rates = series.rate(x)
-        speed = np.maximum(speed, (np.linalg.norm(rates[..., :3], axis=-1) * powers).sum(axis=0))
-        turn = (np.linalg.norm(rates[..., 3:], axis=-1) * powers).sum(axis=0)
-        turning = np.maximum(turning, turn)
+    c = motion.coefficients
+    speed = _bounds(motion.knots, c[:, None, :3], begin, end)[1][:, 0]
+    turning = _bounds(motion.knots, c[:, None, 3:], begin, end)[1][:, 0]
+    if len(reference.knots):
+        lever, rate = _bounds(reference.knots, reference.ways, begin, end)
+        return speed[:, None] + turning[:, None] * lever + rate
     p0, p1 = reference.p0, reference.p0 + reference.dp
     lever = np.maximum(np.linalg.norm(p0, axis=1), np.linalg.norm(p1, axis=1))
     blending = np.zeros(len(begin))
@@ -57,6 +47,23 @@ def greatest_speeds(reference: Reference, motion: Motion, begin: Floats, end: Fl
     turning = turning + blending * float(np.linalg.norm(reference.turn))
     ways = np.linalg.norm(reference.dp, axis=1)
     return speed[:, None] + turning[:, None] * lever + blending[:, None] * ways
+
+
+def _bounds(knots: Floats, ways: Floats, begin: Floats, end: Floats) -> tuple[Floats, Floats]:
+    """Upper bounds (L, n) of size and rate of polynomials (K, n, 3, P) over spans, from ``begin`` to ``end`` (L,)."""
+    first = np.clip(np.searchsorted(knots, begin, side="right") - 1, 0, len(ways) - 1)
+    last = np.clip(np.searchsorted(knots, end, side="left") - 1, first, len(ways) - 1)
+    size = rate = np.zeros((len(begin), ways.shape[1]))
+    for k in range(int((last - first).max(initial=0)) + 1):
+        piece = np.minimum(first + k, last)
+        low, high = (np.clip(t, knots[piece], knots[piece + 1]) for t in (begin, end))
+        half = (high - low) / 2
+        x = series.of_polynomials(ways[piece], (low + high) / 2 - knots[piece], ways.shape[-1])
+        powers = half ** np.arange(float(len(x)))[:, None]
+        far = (np.linalg.norm(x, axis=-1) * powers[..., None]).sum(axis=0)
+        fast = (np.linalg.norm(series.rate(x), axis=-1) * powers[:-1, :, None]).sum(axis=0)
+        size, rate = np.maximum(size, far), np.maximum(rate, fast)
+    return size, rate
 
 
 def pace(planned: PlannedPhase) -> Floats:

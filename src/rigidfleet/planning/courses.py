@@ -13,14 +13,16 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from rigidfleet.kernel.problem import Motion, septic_polynomial
+from rigidfleet.kernel.problem import NO_KNOTS, NO_WAYS, Motion, septic_polynomial
 from rigidfleet.math import attitude as att
 from rigidfleet.math import lqr, series, splines
 from rigidfleet.mission import Fly, Mission, Phase, Regulator
 from rigidfleet.mission.kinds import (
     Brake,
+    Follow,
     Land,
     Orbit,
+    Reshape,
     Steering,
     Takeoff,
     Through,
@@ -35,6 +37,8 @@ _REST_WITHIN = 10.0
 #: Height above the ground at which a landing ends [m]: the vehicles' lags and noise shall not lead them into it; and
 #: the speed downwards there [m/s]. Both are well within what the verdict takes as standing on the ground.
 ABOVE, TOUCH_DOWN = 0.05, 0.2
+#: How far the first point of given ways may be off [m, m/s, rad], and the time in which the difference fades [s].
+_LED, _FADED = (0.1, 0.1, math.radians(5.0)), 1.0
 #: Ways of vehicles straight up or down that differ by less count as one [m].
 _LEVEL = 1e-9
 
@@ -123,12 +127,110 @@ def _vertical(mission: Mission, phase: Vertical, now: PhaseState, t_end: float) 
     return Course(goal, arrival, SmoothFlight(now.pose, goal, now.t, arrival, ()))
 
 
-def lifted(mission: Mission, phase: Phase, now: PhaseState, t_end: float) -> Lift | None:
-    """What a phase that leads vehicles straight up or down adds to their slots; None if it keeps the shape.
+def _follow(mission: Mission, phase: Follow, now: PhaseState, t_end: float) -> Course:
+    """Follow the trajectories of the virtual body, or the mean of the vehicles' own."""
+    assert now.goal is not None
+    flight, _ = _followed(mission, phase, now, t_end)
+    end = pose_at(flight.found, t_end)
+    named = now.goal.named and not phase.turns_away
+    arrival = float(min(t_end, flight.found.knots[-1]))
+    return Course(replace(end, named=named), arrival, flight)
 
-    The virtual body goes by the mean (`_vertical`), from rest to rest on the same septic: together, each vehicle goes
-    straight up or down by its own way, and one that stays, stays.
+
+def _followed(
+    mission: Mission, phase: Follow, now: PhaseState, t_end: float
+) -> tuple[GivenFlight, Lift | None]:
+    """The way of the virtual body, and of the slots about it if each vehicle has a way of its own.
+
+    What the first point of a file differs from the place where the vehicles are fades over `_FADED`.
     """
+    assert now.pose is not None
+    assert now.slots is not None
+    pose, slots = now.pose, now.slots
+    knots, pieces = phase.pieces
+    length = t_end - now.t if phase.travel is None else phase.travel
+    scale = length / knots[-1]
+    knots, pieces = knots * scale, pieces * scale ** -np.arange(float(pieces.shape[-1]))
+    T1 = np.eye(3) if phase.turns_away else pose.T
+    begin = np.concatenate(
+        [np.stack([pose.r, pose.v, pose.a, pose.jerk]), rotation_of(pose, T1)], 1
+    )
+    lift, fade = None, min(_FADED, float(knots[-1]))
+    body = np.zeros((len(pieces), 6, pieces.shape[-1]))
+    if pieces.shape[1] == 1:
+        body[:, :3] = pieces[:, 0, :3]
+        if phase.turns_away:
+            body[:, 5] = pieces[:, 0, 3]
+            body[:, 5, 0] += _whole_turns(body[0, 5, 0], begin[0, 5])
+    else:
+        masses = mission.fleet.mass
+        body[:, :3] = np.einsum("i,kiqp->kqp", masses / masses.sum(), pieces[:, :, :3])
+        ways = np.einsum("ab,kibp->kiap", pose.T, pieces[:, :, :3] - body[:, None, :3])
+        start = np.zeros((4, *slots.shape))
+        start[0] = slots
+        at, ways = splines.begun_from(knots, ways, start, fade)
+        end = series.of_polynomials(ways[-1:], np.diff(at)[-1:], 1)[0, 0]
+        lift = Lift(end - slots, length, now.t + at, np.ascontiguousarray(ways))
+    at, body = splines.begun_from(knots, body, begin, fade)
+    return GivenFlight(as_motion(now.t + at, body, T1)), lift
+
+
+def _whole_turns(yaw: float, near: float) -> float:
+    """What to add to a yaw [rad] so that it is the one nearest to another."""
+    return 2.0 * math.pi * round((near - yaw) / (2.0 * math.pi))
+
+
+def misled(mission: Mission, phase: Phase, now: PhaseState) -> str:
+    """What keeps a phase from following the ways that are given for it, from the state at its start; "" if nothing."""
+    if isinstance(phase, Reshape) and phase.control_points is not None:
+        first = np.array(phase.control_points[0])
+        far = np.inf if now.slots is None else float(np.abs(first - now.slots).max())
+        return "" if far < _LED[0] else "begins in other slots than the phase before has led to"
+    if not isinstance(phase, Follow) or now.pose is None or now.slots is None:
+        return ""
+    pose = now.pose
+    _, pieces = phase.pieces
+    first = pieces[0, :, :3, :2]
+    alone = pieces.shape[1] == 1
+    place = pose.r[None] if alone else pose.r + now.slots @ pose.T
+    speed = pose.v[None] + (0.0 if alone else np.cross(pose.omega, now.slots) @ pose.T)
+    knots = phase.pieces[0]
+    length = phase.travel or (phase.duration if isinstance(phase.duration, float) else knots[-1])
+    off = (
+        np.linalg.norm(first[..., 0] - place, axis=1),
+        np.linalg.norm(first[..., 1] * (knots[-1] / length) - speed, axis=1),
+    )
+    for far, most, unit in zip(off, _LED, ("m", "m/s"), strict=False):
+        i = int(far.argmax())
+        if far[i] > most:
+            who = "the virtual body" if alone else f"agent {i + 1}"
+            point, here = (", ".join(f"{x:.2f}" for x in y[i]) for y in (first[..., 0], place))
+            return (
+                f"its first point ({point}) m is {far[i]:.2f} {unit} from where {who} is then, ({here}) m"
+                if unit == "m"
+                else f"begins with a velocity {far[i]:.2f} {unit} off that of {who} (at most {most:g} {unit})"
+            )
+    if phase.turns_away:
+        T1 = att.dcm_from_euler(np.array([0.0, 0.0, pieces[0, 0, 3, 0]]))
+        angle = float(np.linalg.norm(att.rotation_vector_from_dcm(pose.T @ T1.T)))
+        if angle > _LED[2]:
+            return f"its first attitude, yaw {math.degrees(pieces[0, 0, 3, 0]):.1f}°, is {math.degrees(angle):.1f}° off"
+    return ""
+
+
+def lifted(mission: Mission, phase: Phase, now: PhaseState, t_end: float) -> Lift | None:
+    """What a phase adds to the slots that leads vehicles each on a way of its own; None if it keeps the shape.
+
+    Bent ways are given by the phase. Where a phase leads vehicles straight up or down, the virtual body goes by the
+    mean (`_vertical`), from rest to rest on the same septic: together, each vehicle goes straight up or down by its own
+    way, and one that stays, stays.
+    """
+    if isinstance(phase, Follow):
+        return _followed(mission, phase, now, t_end)[1]
+    if isinstance(phase, Reshape) and phase.control_points is not None:
+        control = np.array(phase.control_points)
+        knots, ways = splines.b_spline_pieces(control, seconds(phase.blend))
+        return Lift(control[-1] - control[0], seconds(phase.blend), now.t + knots, ways, keeps=True)
     vertical = phase.vertical
     if vertical is None or not vertical.each:
         return None
@@ -141,10 +243,16 @@ def lifted(mission: Mission, phase: Phase, now: PhaseState, t_end: float) -> Lif
 
 
 class Lift(NamedTuple):
-    """Ways of the slots (N, 3) about the CM, body axes [m], and the time they take [s]."""
+    """Ways of the slots (N, 3) about the CM, body axes [m], and the time they take [s]; if they are bent, how.
+
+    ``knots`` and ``ways`` are those of `Reference`; ``keeps`` says whether the phase's formation is reached by them.
+    """
 
     dp: Floats
     time: float
+    knots: Floats = NO_KNOTS
+    ways: Floats = NO_WAYS
+    keeps: bool = False
 
 
 def rises(mission: Mission, phase: Vertical, now: PhaseState) -> Floats:
@@ -196,6 +304,7 @@ def _led(
 _COURSES: dict[str, Callable[[Mission, Any, PhaseState, float], Course]] = {
     "brake": _brake,
     "fly": _steer,
+    "follow": _follow,
     "land": _vertical,
     "orbit": _orbit,
     "takeoff": _vertical,
@@ -328,6 +437,17 @@ class SmoothFlight:
         points = np.array([start.r, *(at.position for at in self.through), self.goal.r])
         end = np.stack([self.goal.v, np.zeros(3), np.zeros(3)])
         return splines.allocated(points, total, np.stack([start.v, start.a, start.jerk]), end)
+
+
+@dataclass
+class GivenFlight:
+    """A way that is given."""
+
+    found: Motion
+
+    def motion(self) -> Motion:
+        """The way itself."""
+        return self.found
 
 
 def passed(flight: Flight | None) -> tuple[tuple[float, Floats], ...]:

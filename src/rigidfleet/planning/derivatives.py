@@ -44,9 +44,9 @@ def slot_derivatives(
 ) -> Floats:
     """Position, velocity, acceleration, jerk and snap (K, 5, N, 3) [m, m/s, ...] of each slot, world axes.
 
-    r_i = r_cm + T1^T Exp(phi) Exp(s turn) (p0_i + s dp_i), as in the kernel's `desired_agents` and `blend_slots`; at
-    times (K,) [s] of a phase's problem with control "tracking". At a knot, the piece after it counts. With fewer
-    ``orders``, the last ones are left out.
+    r_i = r_cm + T1^T Exp(phi) p_i, with slots p_i = Exp(s turn) (p0_i + s dp_i) or on their ways, as in the kernel's
+    `desired_agents` and `blend_slots`; at times (K,) [s] of a phase's problem with control "tracking". At a knot, the
+    piece after it counts. With fewer ``orders``, the last ones are left out.
     """
     found = series.derivatives(slot_series(reference, body_series(motion, time), time)[:orders])
     return found.transpose(3, 0, 2, 1)
@@ -55,6 +55,8 @@ def slot_derivatives(
 def slot_series(reference: Reference, body: tuple[Floats, Floats], time: Floats) -> Floats:
     """Taylor series (5, 3, N, K) of each slot, from the `body_series` at times (K,) [s]; see `slot_derivatives`."""
     cm, axes = body
+    if len(reference.knots):
+        return series.product(way_series(reference, time), axes, _in_world) + cm[:, :, None]
     s = blend_series(time, reference.t0, reference.T_b)
     if reference.turn.any():
         turned = np.moveaxis(series.rotation(s[..., None] * reference.turn), 1, -1)
@@ -64,6 +66,21 @@ def slot_series(reference: Reference, body: tuple[Floats, Floats], time: Floats)
         found += reference.dp @ series.product(s[:, None, None], axes)
     found += cm[:, :, None]
     return found
+
+
+def way_series(reference: Reference, time: Floats) -> Floats:
+    """Taylor series (5, N, 3, K) of slots on their ways, body axes, at times (K,) [s]; at rest before and after."""
+    knots, ways = reference.knots, reference.ways
+    inside = np.clip(time, knots[0], knots[-1])
+    low = np.clip(np.searchsorted(knots, inside, side="right") - 1, 0, len(knots) - 2)
+    found = np.moveaxis(series.of_polynomials(ways[low], inside - knots[low], ORDERS), 1, -1)
+    found[1:, ..., inside != time] = 0.0
+    return found
+
+
+def _in_world(a: Floats, axes: Floats) -> Floats:
+    """Vectors (..., 3, N, K) in world axes, from (..., N, 3, K) in body axes and ``axes`` (..., 3, 3, K)."""
+    return (axes[..., :, None, :, :] * a[..., None, :, :, :]).sum(axis=-2)
 
 
 def _matrix_product(a: Floats, b: Floats) -> Floats:

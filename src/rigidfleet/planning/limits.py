@@ -59,6 +59,12 @@ def limits_of(mission: Mission, given: Limits | None = None) -> list[Limit]:
     def size(order: int) -> Callable[[Floats, Ints], Floats]:
         return lambda x, _: np.linalg.norm(x[:, order], axis=-1)
 
+    def level(order: int) -> Callable[[Floats, Ints], Floats]:
+        return lambda x, _: np.hypot(x[:, order, ..., 0], x[:, order, ..., 1])
+
+    def upright(order: int) -> Callable[[Floats, Ints], Floats]:
+        return lambda x, _: np.abs(x[:, order, ..., 2])
+
     def tilt(x: Floats, _: Ints) -> Floats:
         force = x[:, 2] + up
         return np.rad2deg(np.arctan2(np.hypot(force[..., 0], force[..., 1]), force[..., 2]))
@@ -71,6 +77,10 @@ def limits_of(mission: Mission, given: Limits | None = None) -> list[Limit]:
         for name, unit, most, quantity in (
             ("speed", "m/s", given.speed, size(1)),
             ("acceleration", "m/s^2", given.acceleration, size(2)),
+            ("horizontal speed", "m/s", given.horizontal_speed, level(1)),
+            ("vertical speed", "m/s", given.vertical_speed, upright(1)),
+            ("horizontal acceleration", "m/s^2", given.horizontal_acceleration, level(2)),
+            ("vertical acceleration", "m/s^2", given.vertical_acceleration, upright(2)),
             ("jerk", "m/s^3", given.jerk, size(3)),
             ("tilt", "deg", given.tilt_deg, tilt),
         )
@@ -108,7 +118,8 @@ def reached(
 
 
 def _grid(reference: Reference, motion: Motion, begin: float, end: float) -> Floats:
-    knots = motion.knots[(motion.knots >= begin) & (motion.knots <= end)]
+    knots = np.union1d(motion.knots, reference.knots)
+    knots = knots[(knots >= begin) & (knots <= end)]
     each = max(2, min(_PIECE, _MOST // max(len(knots), 1)))
     shares = np.linspace(0.0, 1.0, each, endpoint=False)
     inside = (knots[:-1, None] + shares * np.diff(knots)[:, None]).ravel()
@@ -118,7 +129,8 @@ def _grid(reference: Reference, motion: Motion, begin: float, end: float) -> Flo
 
 
 def _of(reference: Reference, who: Ints) -> Reference:
-    return reference._replace(p0=reference.p0[who], dp=reference.dp[who])
+    ways = reference.ways[:, who] if len(reference.knots) else reference.ways
+    return reference._replace(p0=reference.p0[who], dp=reference.dp[who], ways=ways)
 
 
 def _highest(

@@ -234,8 +234,8 @@ def plan_phase(
     target = slots_about_cm(mission, name, masses)
     frame, now, turned = attach(mission, phase, now, masses, target)
     lift = lifted(mission, phase, now, t_end)
-    if lift is not None:  # which no formation outlasts
-        name = target = None
+    if lift is not None and not lift.keeps:
+        name = target = None  # no formation outlasts it
     edges = mission.formation_edges(name) if name else np.zeros((0, 2), dtype=np.int64)
     d1 = mission.formation_distances(name) if name else np.zeros(0)
     if shaping is None:
@@ -258,7 +258,8 @@ def plan_phase(
         dp, turn = align_slots(before, after, left, turned)
     if lift is not None:
         kind, dp, T_b, after = SHAPE, lift.dp, lift.time, before + lift.dp
-    reference = Reference(kind, now.t, T_b, d0, d1, before, dp, turn)
+    bent = () if lift is None else (lift.knots, lift.ways)
+    reference = Reference(kind, now.t, T_b, d0, d1, before, dp, turn, *bent)
     if shaping is None and now.blend is not None:
         reference = now.blend
 

@@ -121,7 +121,8 @@ def planned_phase(found: Leg, most: int, radius: Floats) -> PlannedPhase:
         0, 1
     )
     shaping = found.phase.shaping
-    ways = None if shaping is None else (reference.p0, reference.p0 + reference.dp)
+    straight = shaping is not None and not len(reference.knots)
+    ways = (reference.p0, reference.p0 + reference.dp) if straight else None
     shapes = found.before.formation, found.after.formation
     return PlannedPhase(
         found.phase.name,
@@ -181,8 +182,10 @@ def leg(mission: Mission, phase: Phase, now: PhaseState) -> Leg | None:
             dp, turn = align_slots(now.slots, target, masses, turned)
             slots = target
         if (lift := lifted(mission, phase, now, t_end)) is not None:
-            dp, blend, slots, name = lift.dp, lift.time, now.slots + lift.dp, None
-        reference = Reference(SHAPE, t0, blend, _NONE, _NONE, now.slots, dp, turn)
+            dp, blend, slots = lift.dp, lift.time, now.slots + lift.dp
+            name = name if lift.keeps else None
+        bent = () if lift is None else (lift.knots, lift.ways)
+        reference = Reference(SHAPE, t0, blend, _NONE, _NONE, now.slots, dp, turn, *bent)
         pose = pose_at(motion, t_end)
         tracked = pose if phase.control == "tracking" else None
         frame = pose.T if frame is not None else None

@@ -37,7 +37,10 @@ class ByEdge:
 
     def updated(self, edges: Ints, values: Floats) -> ByEdge:
         """These values, updated with the ``values`` of edges (m, 2), i < j."""
-        keys, first = np.unique(np.concatenate([self._keys(edges), self.keys]), return_index=True)
+        keys = self._keys(edges)
+        if (keys[1:] > keys[:-1]).all() and (not len(self.keys) or np.array_equal(keys, self.keys)):
+            return ByEdge(keys, values.copy())
+        keys, first = np.unique(np.concatenate([keys, self.keys]), return_index=True)
         return ByEdge(keys, np.concatenate([values, self.values])[first])
 
     @staticmethod

@@ -15,7 +15,7 @@ from rigidfleet.mission import Fly, Mission, Phase
 from rigidfleet.mission.kinds import Orbit, Shaping, Steering, Vertical
 from rigidfleet.mission.values import AUTO
 from rigidfleet.planning import ways
-from rigidfleet.planning.courses import SmoothFlight, course
+from rigidfleet.planning.courses import SmoothFlight, course, misled
 from rigidfleet.planning.limits import Reached, limits_of, reached
 from rigidfleet.planning.preview import Leg, at_start, leg
 from rigidfleet.planning.reference import PhaseState, attach, slots_about_cm
@@ -29,7 +29,9 @@ _CLOSE, _STEP, _NEARLY, _NEAR = 1.006, 4.0, 1.002, 1.005
 #: A time that is more than twice as long has to lower the greatest share of a limit at least to this part of it.
 _STALLED = 0.98
 #: Root of each share that falls in proportion to the time, for ways from rest to rest.
-_POWERS = {"speed": 1.0, "acceleration": 1 / 2, "jerk": 1 / 3, "tilt": 1 / 2, "thrust": 1 / 2}
+_POWERS = {"jerk": 1 / 3, "tilt": 1 / 2, "thrust": 1 / 2}
+_POWERS |= {f"{way}speed": 1.0 for way in ("", "horizontal ", "vertical ")}
+_POWERS |= {f"{way}acceleration": 1 / 2 for way in ("", "horizontal ", "vertical ")}
 #: What automatic times have in reserve, and the unit to which they are rounded up [s].
 _MARGIN, _UNIT = 1.005, 1e-3
 #: Excess over a limit that is ignored.
@@ -64,7 +66,9 @@ def timed(mission: Mission) -> Mission:
         flight, or a phase ends too early for the times before it.
     """
     mission = spelled_out(mission)
-    last = max((k for k, phase in enumerate(mission.phases) if phase.automatic), default=None)
+    last = max(
+        (k for k, phase in enumerate(mission.phases) if phase.automatic or phase.led), default=None
+    )
     if last is None:
         return mission
     tables = mission.to_dict()["phases"]
@@ -87,8 +91,20 @@ def with_times(mission: Mission, phase: Phase, now: PhaseState, number: int) -> 
     Raises
     ------
     MissionError
-        No time keeps the limits.
+        No time keeps the limits, or the phase follows given ways that begin elsewhere.
     """
+    if phase.led or phase.bent:
+        masses = mission.fleet.mass
+        _, begun, _ = attach(
+            mission, phase, now, masses, slots_about_cm(mission, now.formation, masses)
+        )
+        if problem := misled(mission, phase, begun):
+            key, remedy = (
+                "file",
+                "lead the vehicles there before, by phases such as 'fly', 'turn' and 'reshape'",
+            )
+            path = f"phases[{number + 1}].{key}"
+            raise MissionError([Finding(mission.origin, path, None, problem, remedy)])
     if not phase.automatic:
         return phase
     phase = _shared_out(mission, phase, now)
@@ -100,7 +116,7 @@ def with_times(mission: Mission, phase: Phase, now: PhaseState, number: int) -> 
     if time is None:
         key = phase.automatic[0]
         problem = f"no time keeps the limits of the mission: {said(worst, phase)}"
-        remedy = f"raise limits.{worst.limit.name}, or change the way"
+        remedy = f"raise limits.{worst.limit.name.replace(' ', '_')}, or change the way"
         path = f"phases[{number + 1}].{key}"
         raise MissionError([Finding(mission.origin, path, AUTO, problem, remedy)])
     if time > shortest:

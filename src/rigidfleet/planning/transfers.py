@@ -4,8 +4,8 @@ Where vehicles are dense, neither straight ways nor layers fit. Here all ways ar
 duration, from rest to rest. Their control points minimise penalties of what is broken: the distance of pairs at
 samples, the box, speed and acceleration; then the ways are proved. Speed and acceleration of a B-spline are bounded by
 differences of its control points, so that limits per axis and the box hold between samples, too. The distance of pairs
-is bounded between samples by that of the polygons through them (in closed form) less twice their sagitta
-(`rigidfleet.planning.certificate.of_polygons`).
+is bounded in continuous time by conservative advancement on the ways themselves
+(`rigidfleet.planning.certificate.of_ways`).
 
 The penalty methods are those of trajectory optimisation with B-splines, e.g. Zhou et al., Robust and efficient
 quadrotor trajectory generation for fast autonomous flight, IEEE RA-L 4(4), 2019.
@@ -19,7 +19,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigidfleet.planning.certificate import Certificate, of_polygons
+from rigidfleet.formation.assignment import closest_approach
+from rigidfleet.math import splines
+from rigidfleet.planning.certificate import Certificate, of_ways
 from rigidfleet.typing import Floats
 
 #: Spans of a way between its knots; samples of each span at which distances are penalised, or so many that the longest
@@ -33,8 +35,8 @@ _WEIGHTS, _SMOOTH, _SPARE = (20.0, 2.0, 2.0, 20.0), 1e-3, 1.04
 _NOISE = 1.0
 #: Duration [s] where nobody has to move.
 _SHORTEST = 1e-3
-#: Iterations, and samples of each span for the proof, which are doubled until they suffice, at most so often.
-_ITERATIONS, _FINE, _FINER = 300, 8, 4
+#: Iterations of a search.
+_ITERATIONS = 300
 
 
 class Transfer(NamedTuple):
@@ -50,6 +52,10 @@ class Transfer(NamedTuple):
     control: Floats
     duration: float
     certificate: Certificate
+
+    def pieces(self) -> tuple[Floats, Floats]:
+        """Knots (M + 1,) [s], and the ways between them as cubics (M, N, 3, 4), powers of the time since a knot."""
+        return splines.b_spline_pieces(self.control, self.duration)
 
     def at(self, time: ArrayLike) -> Floats:
         """Positions (K, N, 3) [m] at times (K,) [s] from the start; at rest before and after."""
@@ -103,11 +109,11 @@ def transfer(
     s, g = (np.asarray(x, dtype=np.float64) for x in (start, goal))
     metric = np.array([1.0, 1.0, 1.0 / downwash])
     for name, x in (("start", s), ("goal", g)):
-        least = of_polygons(x[None] * metric, np.zeros(1), 0.0)
-        if least.separation < distance:
+        least, (i, j), _ = closest_approach(x * metric, x * metric)
+        if least < distance:
             raise ValueError(
-                f"vehicles {least.agents[0] + 1} and {least.agents[1] + 1} are {least.separation:.3g} m apart at the"
-                f" {name}, nearer than the distance of {distance:g} m to keep: move one of them"
+                f"vehicles {i + 1} and {j + 1} are {least:.3g} m apart at the {name}, nearer than the distance of"
+                f" {distance:g} m to keep: move one of them"
             )
     limits = _Limits(
         distance, np.broadcast_to(speed, 3), np.broadcast_to(acceleration, 3),
@@ -131,7 +137,7 @@ def transfer(
     return None
 
 
-_NOTHING = Certificate(0.0, 0.0, (0, 0), "polygons less sagitta")
+_NOTHING = Certificate(0.0, 0.0, (0, 0), "conservative advancement")
 
 
 class _Limits(NamedTuple):
@@ -149,11 +155,10 @@ def _basis(u: Floats, spans: int) -> Floats:
     """Weights (K, M + 3) of the control points at parameters u (K,) in [0, M]."""
     k = np.minimum(u.astype(np.int64), spans - 1)
     x = u - k
-    weights = np.stack(
-        [(1 - x) ** 3, 3 * x**3 - 6 * x**2 + 4, -3 * x**3 + 3 * x**2 + 3 * x + 1, x**3], axis=1
-    )
     B = np.zeros((len(u), spans + 3))
-    B[np.arange(len(u))[:, None], k[:, None] + np.arange(4)] = weights / 6.0
+    B[np.arange(len(u))[:, None], k[:, None] + np.arange(4)] = (
+        x[:, None] ** np.arange(4) @ splines.CUBIC.T
+    )
     return B
 
 
@@ -253,16 +258,6 @@ def _kept(found: Transfer, limits: _Limits) -> bool:
 
 
 def _proved(found: Transfer, limits: _Limits) -> Certificate:
-    """Certificate of ways, by polygons of more and more samples until they prove the distance or leave little open."""
-    spans = len(found.control) - 3
-    h = found.duration / spans
-    bend = np.diff(found.control * limits.metric, 2, axis=0) / h**2
-    most = float(np.linalg.norm(bend, axis=2).max())
-    count = _FINE * spans
-    for _ in range(_FINER):
-        time = np.linspace(0.0, found.duration, count + 1)
-        proof = of_polygons(found.at(time) * limits.metric, time, most)
-        if proof.separation >= limits.distance:
-            break
-        count *= 2
-    return proof
+    """Certificate of ways, in the metric of the distance to keep."""
+    knots, pieces = found.pieces()
+    return of_ways(knots, pieces * limits.metric[:, None])

@@ -1,4 +1,4 @@
-"""Phases that are flown as several: transitions whose straight ways cross, and staggered take-offs and landings.
+"""Phases that are flown otherwise than written: transitions whose straight ways cross, staggered take-offs, landings.
 
 Agents that exchange places at will cannot all go straight and in step. They go apart instead to levels one above the
 other, across, and together again. Each of these is a straight blend in step, so that its least separation is known in
@@ -8,6 +8,7 @@ colours of the graph of these conflicts (greedy colouring, the agents with most 
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 from typing import Any
 
@@ -16,16 +17,19 @@ import numpy as np
 from rigidfleet.errors import Finding, MissionError
 from rigidfleet.formation.assignment import closest_approach, nearer_than
 from rigidfleet.math import rigid_body
-from rigidfleet.mission import Mission, Phase
+from rigidfleet.mission import Mission
 from rigidfleet.mission.kinds import Reshape, Vertical
 from rigidfleet.mission.values import AUTO
 from rigidfleet.planning.reference import slots_about_cm
+from rigidfleet.planning.transfers import transfer
 from rigidfleet.typing import Floats, Ints
 
 #: What the parts of a transition are called.
 _PARTS = ("apart", "across", "together")
 #: Vehicles whose y differs by less stand in one row [m].
 _ROW = 1e-3
+#: Room around the slots for bent ways, as a multiple of the height that vehicles keep above each other.
+_ROOM = 2.0
 #: Excess over a limit that is ignored [m].
 _SLACK = 1e-9
 
@@ -33,7 +37,8 @@ _SLACK = 1e-9
 def expanded(mission: Mission) -> Mission:
     """Return the mission with each phase that is flown as several in their place; itself if it has none.
 
-    A transition by layers becomes three phases, a staggered take-off or landing one for each group of vehicles.
+    A transition by layers becomes three phases, a staggered take-off or landing one for each group of vehicles; one by
+    bent ways has their control points.
 
     The result is an ordinary mission: it can be written, read and flown by itself.
 
@@ -43,7 +48,7 @@ def expanded(mission: Mission) -> Mission:
         The layers of a phase do not keep the separation, or there is no formation before it; or the groups of a
         staggered phase have no time, or would be under way together.
     """
-    if not any(_is_several(phase) for phase in mission.phases):
+    if all(phase.spelled for phase in mission.phases):
         return mission
     data, tables, forms = mission.to_dict(), [], {}
     before: str | None = None
@@ -51,7 +56,9 @@ def expanded(mission: Mission) -> Mission:
         table = data["phases"][k] | {"name": phase.name}
         table.pop("transition", None)
         parts = [table]
-        if isinstance(phase, Reshape) and phase.transition != "straight":
+        if isinstance(phase, Reshape) and phase.transition == "ways":
+            parts = [_bent(mission, k, table, phase, before)]
+        elif isinstance(phase, Reshape) and phase.transition != "straight":
             levels = _levels(mission, k, phase, before)
             if levels is not None:
                 names = [f"{phase.name}: {part}" for part in _PARTS[:2]]
@@ -64,14 +71,7 @@ def expanded(mission: Mission) -> Mission:
         tables += parts
         before = before if phase.shaping is None else phase.shaping.formation
     data |= {"phases": tables, "formations": data["formations"] | forms}
-    return Mission.from_dict(data, mission.origin)
-
-
-def _is_several(phase: Phase) -> bool:
-    """Whether a phase is flown as several."""
-    if isinstance(phase, Vertical):
-        return phase.stagger is not None
-    return isinstance(phase, Reshape) and phase.transition != "straight"
+    return mission.rewritten(data)
 
 
 def _staggered(
@@ -122,16 +122,90 @@ def _ends(mission: Mission, phase: Reshape, before: str | None) -> tuple[Floats,
     return None if found[0] is None or found[1] is None else (found[0], found[1])
 
 
+def _bent(
+    mission: Mission, number: int, table: dict[str, Any], phase: Reshape, before: str | None
+) -> dict[str, Any]:
+    """The phase with the control points of bent ways, found and proved between its slots in body axes.
+
+    Raises
+    ------
+    MissionError
+        There are no limits of speed and acceleration, no ways are found, or the blend is too short for them.
+    """
+
+    def refused(key: str, value: object, problem: str, remedy: str) -> MissionError:
+        return MissionError(
+            [Finding(mission.origin, f"phases[{number + 1}].{key}", value, problem, remedy)]
+        )
+
+    p, q = _ends_known(mission, number, phase, before)
+    limits, radius = mission.limits, float(mission.fleet.radius.max())
+    if limits.speed is None or limits.acceleration is None:
+        problem = "is found within limits of speed and acceleration, and the mission lacks one"
+        raise refused(
+            "transition", phase.transition, problem, "give limits.speed and limits.acceleration"
+        )
+    distance = 2.0 * radius + (limits.separation or 0.0) + limits.separation_allowance
+    below = max(distance, 2.0 * radius + (limits.separation_below or 0.0))
+    room = _ROOM * below
+    box = np.minimum(p, q).min(axis=0) - room, np.maximum(p, q).max(axis=0) + room
+    each = 1.0 / np.sqrt(3.0)  # limits of each axis, which together keep those of the vector
+    try:
+        found = transfer(
+            p, q, distance=distance, speed=each * limits.speed, acceleration=each * limits.acceleration,
+            box=box, downwash=below / distance,
+        )  # fmt: skip
+    except ValueError as error:
+        problem = f"between '{before}' and '{phase.formation}', {error}"
+        raise refused(
+            "transition", phase.transition, problem, "or lower limits.separation"
+        ) from None
+    if found is None:
+        problem = (
+            f"finds no ways to '{phase.formation}' that keep {distance:.3g} m from centre to centre"
+        )
+        remedy = "use transition = 'layers', place slots farther apart, or lower limits.separation"
+        raise refused("transition", phase.transition, problem, remedy)
+    least = math.ceil(found.duration * 1e3) / 1e3
+    if phase.blend != AUTO and "blend" in phase.model_fields_set and phase.blend < least:
+        problem = f"is too short for the ways found; the least is {least:g} s"
+        raise refused("blend", phase.blend, problem, "give that, or leave it out")
+    blend = phase.blend if "blend" in phase.model_fields_set and phase.blend != AUTO else least
+    if isinstance(phase.duration, float) and phase.duration < blend:
+        problem = f"is shorter than the ways found, which take {blend:g} s"
+        raise refused("duration", phase.duration, problem, "end the phase later")
+    points = np.round(found.control, 9)
+    points[:3], points[-3:] = p, q  # to the last bit, so that nothing jumps
+    told = {"blend": blend, "alignment": "none", "control_points": points.tolist()}
+    if phase.duration == AUTO:
+        told["duration"] = blend
+    return table | told
+
+
+def _ends_known(
+    mission: Mission, number: int, phase: Reshape, before: str | None
+) -> tuple[Floats, Floats]:
+    """`_ends` of a phase.
+
+    Raises
+    ------
+    MissionError
+        They are not known.
+    """
+    ends = _ends(mission, phase, before)
+    if ends is None:
+        path = f"phases[{number + 1}].transition"
+        problem, remedy = "starts from no formation with slots", "take a formation before"
+        raise MissionError([Finding(mission.origin, path, phase.transition, problem, remedy)])
+    return ends
+
+
 def _levels(
     mission: Mission, number: int, phase: Reshape, before: str | None
 ) -> tuple[Floats, Floats] | None:
     """Slots (N, 3) [m] of a phase's layers before and after the way across; None if its straight ways will do."""
-    ends = _ends(mission, phase, before)
+    p, q = _ends_known(mission, number, phase, before)
     path = f"phases[{number + 1}].transition"
-    if ends is None:
-        problem, remedy = "starts from no formation with slots", "take a formation before"
-        raise MissionError([Finding(mission.origin, path, phase.transition, problem, remedy)])
-    p, q = ends
     masses, radius, limits = mission.fleet.mass, mission.fleet.radius, mission.limits
     limit = limits.separation or 0.0
     if phase.transition == AUTO:

@@ -272,7 +272,7 @@ class _Search:
             "phases": [*named[:k], *tables, *named[k + 1 :]],
             "formations": data["formations"] | dict(sorted(forms.items())),
         }
-        tried = Mission.from_dict(data, mission.origin)
+        tried = mission.rewritten(data)
         now, lacking = self.now, -math.inf
         self._worst = ""
         for number in range(k, k + len(tables)):

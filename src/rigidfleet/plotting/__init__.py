@@ -86,6 +86,7 @@ def figure_names(result: Result | None = None) -> list[str]:
         "distances": not len(result.edges),
         "attitude": not np.isfinite([result.attitude, result.attitude_reference]).any(),
         "constraint_force": not len(result.edges),
+        "inputs": not np.isfinite(result.thrust).any(),
         "formations": not result.mission.formations,
         "clearance": result.n_agents == 1 and not result.mission.obstacles,
         "disturbance": result.disturbance_force is None,

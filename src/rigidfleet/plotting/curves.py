@@ -288,6 +288,9 @@ def draw_thrust(ax: Axes, result: Result) -> None:
     """Thrust of each agent with its limit, from zero."""
     flown = result.rotor_force is not None  # rotors give what was asked for a little earlier
     ax.set_ylabel("thrust [N]" if flown else r"thrust $|f_u + f_C|$ [N]")
+    if not np.isfinite(result.thrust).any():
+        st.note(ax, "forces are not known")
+        return
     st.agent_lines(ax, result, result.thrust)
     limits = peaks.limits(result.mission.fleet.thrust_limit)
     for value, label, colour in limits:

@@ -31,9 +31,10 @@ def assignment_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     for name in ("as it is", "shortest", "safe"):
         other, planned = mission, found.planned_phases[index]
         if name not in ("as it is", mission.assignment):
-            other = Mission.from_dict(mission.to_dict() | {"assignment": name}, mission.origin)
+            other = mission.rewritten(mission.to_dict() | {"assignment": name})
             planned = preview(other, index + 1)[0][index]
-        assert planned.path_ends is not None  # the phase changes the formation
+        if planned.path_ends is None:  # on bent ways
+            return
         x = planned.position - (masses @ planned.position)[:, None] / masses.sum()
         length = float(np.linalg.norm(np.diff(x, axis=0), axis=2).sum())
         clearance = assignment.closest_approach(*planned.path_ends, mission.agents.radius)[0]

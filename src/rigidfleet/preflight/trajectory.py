@@ -37,6 +37,9 @@ def separation_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
         separations, pairs = proximity.separation(positions, radius)
         for k in [int(separations.argmin())] if planned.path_ends is None else [0, -1]:
             ends.append((float(separations[k]), float(planned.time[k]), tuple(pairs[k].tolist())))
+        bent = planned.leg.reference.knots
+        if len(bent) and planned.path_ends is None and (proved := planned.certificate) is not None:
+            ends = [(proved.separation, proved.time, proved.agents)]
         if planned.path_ends is not None:
             certificate = planned.certificate or straight(planned.leg.reference, radius)
             assert certificate is not None  # there are two agents
@@ -240,7 +243,8 @@ def limit_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     limits = mission.limits
     hopeless: set[str] = set()  # limits that no time keeps; each is told once
     for planned in found.planned_phases:
-        if mission.smooth and planned.leg.phase.control == "tracking":
+        phase = planned.leg.phase
+        if (mission.smooth or phase.led) and phase.control == "tracking":
             yield from _broken(mission, planned, hopeless)
         else:
             yield from _sampled(mission, planned)
@@ -276,14 +280,29 @@ def _sampled(mission: Mission, planned: PlannedPhase) -> Iterator[Remark]:
     for what, values, limit, unit in (
         ("speed", planned.velocity, limits.speed, "m/s"),
         ("acceleration", planned.acceleration, limits.acceleration, "m/s^2"),
+        ("horizontal speed", planned.velocity[..., :2], limits.horizontal_speed, "m/s"),
+        ("vertical speed", planned.velocity[..., 2:], limits.vertical_speed, "m/s"),
+        (
+            "horizontal acceleration",
+            planned.acceleration[..., :2],
+            limits.horizontal_acceleration,
+            "m/s^2",
+        ),
+        (
+            "vertical acceleration",
+            planned.acceleration[..., 2:],
+            limits.vertical_acceleration,
+            "m/s^2",
+        ),
     ):
         if limit is None:
             continue
         size = np.linalg.norm(values, axis=2)
+        of = f" of {what}" if " " in what else ""
         k, i = np.unravel_index(int(size.argmax()), size.shape)
         if size[k, i] > limit * (1 + 1e-3):
             text = (
-                f"agent {i + 1} reaches {size[k, i]:.3g} {unit} at {planned.time[k]:.2f} s in '{planned.phase}'"
+                f"agent {i + 1} reaches {size[k, i]:.3g} {unit}{of} at {planned.time[k]:.2f} s in '{planned.phase}'"
                 f" (limit {limit:g} {unit})"
             )
             yield Remark("fails" if planned.exact else "note", what, text)

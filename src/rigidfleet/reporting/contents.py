@@ -60,7 +60,9 @@ def contents(
     several = len(flights) > 1
     colours = plotting.agent_colours(len(flights))
     found = [_flight(*each) for each in zip(flights, judged, names, colours, strict=True)]
-    response = overlay.response(missions, names)
+    # Trajectories that others made have no gains.
+    controlled = any(flight.interpolation is None for flight in flights)
+    response = overlay.response(missions, names) if controlled else None
     return {
         "title": " · ".join(names),
         "several": several,
@@ -71,8 +73,10 @@ def contents(
         "numbers": _numbers(flights, judged) if several else [],
         "keys": _keys(missions) if several else [],
         "overlays": _overlays(flights, names) if several else [],
+        "controlled": controlled,
         "response": None if response is None else _embedded(response),
         "version": __version__,
+        "covers": _covers(flights),
     }
 
 
@@ -111,7 +115,7 @@ def _flight(result: Result, verdict: Verdict, label: str, colour: str) -> dict[s
         "vehicles": _vehicles(result),
         "vehicles_left_out": max(0, result.n_agents - _VEHICLES),
         "summary": _figure(result, "summary"),
-        "gains": gains.explained(mission),
+        "gains": gains.explained(mission) if result.interpolation is None else [],
         "versions": _versions(result),
         "text": result.mission_text,
     }
@@ -121,6 +125,17 @@ def _head(judged: int, failed: int) -> str:
     return f"{failed} of {judged} checks failed" if failed else f"all {judged} checks hold"
 
 
+def _covers(flights: Sequence[Result]) -> str:
+    """What the flights are, and what the report does not cover."""
+    if all(flight.interpolation is not None for flight in flights):
+        return "Others made this flight: its curve is judged, not whether vehicles can fly it."
+    if any(flight.rotor_force is not None for flight in flights):
+        return "This is a simulation: real vehicles differ from their models."
+    return (
+        "This is a simulation: vehicles are point masses that produce any thrust vector instantly."
+    )
+
+
 def _facts(result: Result) -> list[tuple[str, str]]:
     mission = result.mission
     mass = sorted(set(mission.agents.mass))
@@ -128,12 +143,20 @@ def _facts(result: Result) -> list[tuple[str, str]]:
     forms = [
         f"{name} ({len(mission.formation_edges(name))} edges)" for name in mission.formations
     ]  # fmt: skip
+    made = result.created.replace("T", " ").replace("+00:00", " UTC")
+    if result.interpolation is not None:
+        return [
+            ("vehicles", f"{result.n_agents}"),
+            ("duration", f"{result.time[-1] - result.time[0]:.4g} s"),
+            ("curve", result.interpolation),
+            ("read", made),
+        ]
     return [
         ("vehicles", f"{result.n_agents}, {masses}{_models(mission)}"),
         ("formations", ", ".join(forms) or "none"),
         ("control", mission.architecture),
         ("duration", f"{result.time[-1]:.4g} s, {len(result.phases)} phases"),
-        ("simulated", result.created.replace("T", " ").replace("+00:00", " UTC")),
+        ("simulated", made),
     ]
 
 
@@ -190,13 +213,13 @@ def _vehicles(result: Result) -> list[dict[str, Any]]:
     shown = np.arange(n) if n <= _VEHICLES else np.sort(np.argsort(-thrust)[:_VEHICLES])
     colours = plotting.agent_colours(n)
     limits = mission.agents.thrust_limit
-    flown = _with_rotors(result)
+    flown, known = _with_rotors(result), result.interpolation is None
     return [
         {
             "name": str(i + 1),
             "colour": colours[i],
-            "mass": f"{mission.agents.mass[i]:.4g}",
-            "thrust": value(float(thrust[i])),
+            "mass": f"{mission.agents.mass[i]:.4g}" if known else "",
+            "thrust": value(float(thrust[i])) if known else "",
             "used": f"{100 * thrust[i] / limits[i]:.0f} %" if math.isfinite(limits[i]) else "",
             "speed": value(float(speed[i])),
             "acceleration": value(float(acceleration[i])),

@@ -31,7 +31,7 @@ from rigidfleet.simulation.callbacks import (
 from rigidfleet.simulation.diagnosis import Place, diagnose
 from rigidfleet.simulation.extremes import Extremes
 from rigidfleet.simulation.recording import Led, Piece
-from rigidfleet.simulation.solver_setup import equip, first_step, integrator
+from rigidfleet.simulation.solver_setup import equip, first_step, give_back, integrator
 from rigidfleet.typing import Bools, Floats
 
 if TYPE_CHECKING:
@@ -209,6 +209,10 @@ class ActivePhase:
         self.evaluate()
         return self.plan.reached(self.t, self.state.y, self.workspace)
 
+    def release(self) -> None:
+        """Give the workspace back, after the end: nothing more is asked of this phase."""
+        give_back(self.plan, self.workspace)
+
     # -- inside -----------------------------------------------------------------------------------
 
     def _check(self) -> None:
@@ -281,12 +285,11 @@ class ActivePhase:
         state.count[3] = 0
         first = np.nextafter(self.t, math.inf)
         status = records.PAUSED
+        go_on = native.Integration(problem, self.workspace, state, t_end, times, samples)
         try:
             while status == records.PAUSED:
                 begun = clock.perf_counter()
-                status = native.integrate(
-                    problem, self.workspace, state, t_end, fresh, times, samples, self.steps
-                )
+                status = go_on(fresh, self.steps)
                 took = max(clock.perf_counter() - begun, 1e-6)
                 if status == records.PAUSED:
                     self.steps = min(_STEPS, max(1, int(self.steps * min(_PAUSE / took, 10.0))))

@@ -11,6 +11,7 @@ from rigidfleet.mission import Mission, Phase
 from rigidfleet.mission.findings import near
 from rigidfleet.mission.kinds import KINDS
 from rigidfleet.mission.losses import ON_LOSS
+from rigidfleet.planning.transitions import expanded
 from rigidfleet.result import PhaseRecord
 
 
@@ -35,9 +36,9 @@ def as_flown(
     as_given = dict(data)
     data |= _flown_data(mission, data, asked, records, step)
     try:
-        return Mission.from_dict(data), records
+        return mission.rewritten(data, "<dict>"), records
     except MissionError:
-        return Mission.from_dict(as_given), records
+        return mission.rewritten(as_given, "<dict>"), records
 
 
 def with_phase(
@@ -58,9 +59,13 @@ def with_phase(
     else:
         data["phases"] = []
     data["phases"] = [*data["phases"], dict(table)]
-    phase = Mission.from_dict(data, "begin()").phases[-1]
-    _check_flown(phase)
-    return phase
+    made = Mission.from_dict(data, "begin()")
+    if not made.phases[-1].spelled:
+        spread = expanded(made)
+        if len(spread.phases) == len(made.phases):  # with the ways that were found
+            made = spread
+    _check_flown(made.phases[-1])
+    return made.phases[-1]
 
 
 def _check_flown(phase: Phase) -> None:
@@ -69,6 +74,11 @@ def _check_flown(phase: Phase) -> None:
         problem = "finds its way before the flight, and cannot begin by hand"
         remedy = "use kind 'fly', or put it into the mission"
         raise MissionError([Finding("begin()", "kind", phase.kind, problem, remedy)])
+    if not phase.spelled:
+        key = "stagger" if phase.vertical is not None else "transition"
+        problem = "is flown as several phases, and cannot begin by hand"
+        remedy = "begin one phase after the other, each with its agents or formation, or put it into the mission"
+        raise MissionError([Finding("begin()", key, getattr(phase, key), problem, remedy)])
 
 
 def check_formation(mission: Mission, phase: Phase) -> None:

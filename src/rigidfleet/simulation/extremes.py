@@ -85,13 +85,30 @@ class Extremes:
         start, _ = proximity.obstacle_clearances(
             np.array(agents.position), self.radius, mission.obstacles
         )
-        self.standing = (start <= PAD).astype(np.int64)
+        self.stood = (start <= PAD).astype(np.int64)
+        self.standing = self.stood.copy()
         self.pairs = self.columns = self.struck = np.zeros((0, 2), dtype=np.int64)
         self.spare, self.moved = 0.0, np.zeros(2)
         self.trail = records.NO_TRAIL
         self.of_vehicles: dict[str, Extremum] = {}
         self.avoidance: avoidance.Avoidance | None = None  # that of the phase under way
         self._list_all()
+
+    @property
+    def reusable(self) -> bool:
+        """Whether another flight of the mission can be monitored after `restart`: no vehicle was lost."""
+        return self.n <= _FEW and bool(self.left.all())
+
+    def restart(self) -> None:
+        """Forget the flight that was monitored."""
+        self.worst.fill(np.inf)
+        self.low.fill(np.inf)
+        self.when.fill(0.0)
+        self.who.fill(-1)
+        self.standing[:] = self.stood
+        self.of_vehicles, self.avoidance = {}, None
+        if len(self.trail.points):
+            self.monitor.monitor.flags.fill(0)
 
     def begin(self, states: int, edges: int) -> records.Trail:
         """Begin to monitor an integrator with this many states; it must record its steps in the returned trail."""
@@ -233,8 +250,12 @@ class Extremes:
 
     def so_far(self) -> dict[str, Extremum]:
         """Extremes of the phase under way, by name."""
-        every = ((name, self._extremum(name, k)) for name, k in _NAMES.items())
-        return {name: x for name, x in every if x is not None} | self.of_vehicles | self._avoided()
+        worst, when, who = self.worst.tolist(), self.when.tolist(), self.who.tolist()
+        found = {}
+        for name, k in _NAMES.items():
+            if math.isfinite(value := worst[k]):
+                found[name] = Extremum(self._signed(name, value), when[k], *who[k])
+        return found | self.of_vehicles | self._avoided()
 
     def phase(self) -> dict[str, Extremum]:
         """Extremes of the phase that ends, by name; start those of the next one."""
@@ -261,11 +282,13 @@ class Extremes:
         value = float(self.worst[k])
         if not math.isfinite(value):
             return None
+        return Extremum(self._signed(name, value), float(self.when[k]), *map(int, self.who[k]))
+
+    def _signed(self, name: str, value: float) -> float:
+        """The value of a quantity that the monitor may store with the opposite sign."""
         if name in _GREATEST:
             value = -value
-        if name == "tension":
-            value *= float(self.sign[0])
-        return Extremum(value, float(self.when[k]), *map(int, self.who[k]))
+        return value * float(self.sign[0]) if name == "tension" else value
 
     # -- large fleets ---------------------------------------------------------------------------------
 

@@ -13,16 +13,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigidfleet.errors import FlightError, StoppedError, wrong_type
+from rigidfleet.errors import FlightError, MissionError, StoppedError, wrong_type
 from rigidfleet.kernel.problem import TRACKING, Motion
 from rigidfleet.math import attitude as att
 from rigidfleet.math import lqr
 from rigidfleet.mission import Mission, Phase, as_mission
-from rigidfleet.planning.disturbances import disturbance
 from rigidfleet.planning.losses import after_loss
 from rigidfleet.planning.plan import PhasePlan, plan_phase
 from rigidfleet.planning.reference import PhaseState, Pose
-from rigidfleet.planning.timing import timed, with_times
+from rigidfleet.planning.timing import with_times
 from rigidfleet.result import PhaseRecord, Result
 from rigidfleet.simulation.active_phase import ActivePhase, Sampler
 from rigidfleet.simulation.as_flown import as_flown, check_formation, with_phase
@@ -34,7 +33,7 @@ from rigidfleet.simulation.callbacks import (
     Observation,
     RotorCommand,
 )
-from rigidfleet.simulation.extremes import Extremes
+from rigidfleet.simulation.preparation import prepared
 from rigidfleet.simulation.recording import Piece, assemble
 from rigidfleet.simulation.sampled_phase import SampledPhase, Vehicles
 from rigidfleet.simulation.sampling import Sampling, times_asked
@@ -179,7 +178,8 @@ class Flight:
         ``sampler`` chooses the times to record (`rigidfleet.simulation.sampling`); ``flips`` allows a formation to
         flip over.
         """
-        self.mission = mission = timed(as_mission(mission))
+        self._prepared = prepared(as_mission(mission))
+        self.mission = mission = self._prepared.mission
         if not (isinstance(rate, int | float | np.number) and rate > 0.0):
             raise ValueError(f"the control rate must be positive [Hz], not {rate!r}")
         for name, function in (("controller", controller), ("progress", progress)):
@@ -196,13 +196,13 @@ class Flight:
         if mission.body_frame is not None:
             b = mission.body_frame
             frame = att.dcm_from_euler(np.deg2rad([b.roll_deg, b.pitch_deg, b.yaw_deg]))
-        self._now = PhaseState(
+        self._begins = self._now = PhaseState(
             0.0, mission.fleet.position.copy(), mission.fleet.velocity.copy(), frame=frame
         )
         self._vehicles = None if mission.vehicle_models is None else Vehicles(mission)
         # Vehicles meet their disturbances in their own equations of motion.
-        self._disturbance = disturbance(mission) if self._vehicles is None else None
-        self._extremes = Extremes(mission)
+        self._disturbance = self._prepared.disturbance if self._vehicles is None else None
+        self._extremes = self._prepared.extremes()
         self._active: ActivePhase | None = None
         self._asked: list[Phase] = []  # each phase as it was begun
         self._cut: set[int] = set()  # phases left before their end
@@ -276,6 +276,7 @@ class Flight:
             raise FlightError(_FINISHED)
         if self.ending:
             return False
+        by_hand = phase is not None
         if phase is None:
             if self._active is not None and not self._active.flew:
                 raise FlightError(
@@ -298,14 +299,23 @@ class Flight:
         self._leave(changed=True)
         if self.mission.on_loss == "continue" or not self._given(phase):
             self._now.blend = None
-        phase = with_times(self.mission, phase, self._now, len(self._asked))
+        try:
+            phase = with_times(self.mission, phase, self._now, len(self._asked))
+        except MissionError as error:
+            if by_hand:
+                raise
+            self.ending = "; ".join(f"phase '{phase.name}' {f.problem}" for f in error.findings)
+            return False
         if self._asked:
             self._report(phase, planning=True)
         try:
             external = 0 if self.external is None else self.external.address
-            plan = plan_phase(
-                self.mission, phase, self._now, disturbance=self._disturbance, external=external
-            )
+            if self._now is self._begins and self._now.lost is None:
+                plan = self._prepared.first_plan(phase, self._now, self._disturbance, external)
+            else:
+                plan = plan_phase(
+                    self.mission, phase, self._now, disturbance=self._disturbance, external=external
+                )
             self._check_frame(plan)
             make = ActivePhase
             if self._vehicles is not None:
@@ -448,7 +458,9 @@ class Flight:
         if own and not whole and not self.ending:
             self.ending = f"ended at t = {self.t:.2f} s, before the mission's end"
         self._finished = True
-        return self.record(self.pieces, None if own else self._asked)
+        result = self.record(self.pieces, None if own else self._asked)
+        self._prepared.give_back(self._extremes)
+        return result
 
     def record(
         self,
@@ -541,6 +553,7 @@ class Flight:
         for method, counts in active.solves:
             self._solves.setdefault(method, type(counts)()).add(counts)
         self._now = active.end()
+        active.release()
         record.t_end = self._now.t
         if abandoned:
             points = () if record.target is None else record.target.get("through", ())

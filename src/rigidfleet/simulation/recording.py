@@ -9,15 +9,17 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from rigidfleet.kernel.engine import native
+from rigidfleet.kernel.measured import Measured, measured
+from rigidfleet.kernel.records import Record
 from rigidfleet.math import attitude as att
-from rigidfleet.math import constraint_jacobian, proximity, rigid_body
+from rigidfleet.math import proximity
 from rigidfleet.planning.derivatives import Yaw, slot_derivatives, yaw_derivatives
 from rigidfleet.result import LATER, PhaseRecord, Result
 from rigidfleet.typing import Bools, Floats, Ints
 
 if TYPE_CHECKING:
     from rigidfleet.kernel.problem import Motion, Reference
-    from rigidfleet.kernel.records import Record
     from rigidfleet.mission import Mission
     from rigidfleet.mission.schema import VehicleYaw
     from rigidfleet.planning.vehicles import Turn
@@ -70,55 +72,38 @@ def assemble(
 ) -> Result:
     """Join the pieces of a flight and compute all that follows from positions and forces."""
     pieces = [p for p in pieces if len(p.time)]
-    time = np.concatenate([p.time for p in pieces])
-    left = time[:, None] <= mission.lost_at  # (K, N)
-    masses = np.where(left, mission.fleet.mass, 0.0)
-    M = masses.sum(axis=1)[:, None]
-
-    def joined(name: str) -> Floats:
-        return np.concatenate([getattr(p.record, name) for p in pieces])
-
-    r, v = joined("r"), joined("v")
-    f_u, f_C = joined("f_u"), joined("f_C")
-    thrust = np.linalg.norm(f_u + f_C, axis=2)
+    time = _joined([p.time for p in pieces])
+    whole = not (mission.lost_at < time[-1]).any()
+    left = np.ones((len(time), mission.n_agents), dtype=np.bool_)
+    if not whole:
+        left = time[:, None] <= mission.lost_at  # (K, N)
+    record = pieces[0].record
+    if len(pieces) > 1:
+        edgewise = {"c", "L", "d", "d_dot", "multiplier"}
+        parts = [p.record for p in pieces]
+        record = record._replace(
+            **{
+                name: np.concatenate(rows)
+                for name, *rows in zip(Record._fields, *parts, strict=True)
+                if name not in edgewise
+            }
+        )
+    found = _measured(mission, pieces, time, record)
     flown = _of_vehicles(pieces)
+    thrust = found.thrust
     if flown is not None:
         thrust = flown.thrust
-    if mission.agents.saturate:  # the thrust flown, not the commanded one
-        thrust = np.minimum(thrust, mission.agents.thrust_limit)
-    cm, cm_velocity = (np.einsum("ki,kia->ka", masses, z) / M for z in (r, v))
-    x, y = r - cm[:, None], v - cm_velocity[:, None]
-    slots = joined("p")
-    # Of agents still flying; otherwise the body's origin
-    centre = np.einsum("ki,kia->ka", masses, slots) / M
-    attitude, line = _attitudes(
-        pieces, x, slots - centre[:, None], masses, framed=mission.body_frame is not None
-    )
-    T = np.full((len(r), 3, 3), np.nan)
-    attached = np.isfinite(attitude[:, 0])
-    T[attached] = att.dcm_from_quaternion(attitude[attached])
-    T_ref = joined("T_ref")
-    attitude_reference = np.full((len(r), 4), np.nan)
-    commanded = np.isfinite(T_ref[:, 0, 0])
-    attitude_reference[commanded] = att.quaternion_from_dcm(T_ref[commanded])
-    omega = rigid_body.mean_axis_rates(x, y, masses, line)
-    lacking = attached & ~left.all(axis=1)
-    offset = np.einsum("kab,ka->kb", T[lacking], centre[lacking])
-    cm[lacking] -= offset
-    cm_velocity[lacking] -= np.cross(omega[lacking], offset)
-    motion = joined("motion")
-    wrench = np.concatenate([f_u.sum(axis=1), np.cross(x, f_u).sum(axis=1)], axis=1)
-    asked = joined("wrench")
+        if mission.agents.saturate:  # the thrust flown, not the commanded one
+            thrust = np.minimum(thrust, mission.agents.thrust_limit)
+    r, motion = record.r, record.motion
     radius = mission.agents.radius
     each_clearance, nearest = proximity.obstacle_clearances(r, radius, mission.obstacles, time)
-    each_clearance[~left] = np.inf
+    if not whole:
+        each_clearance[~left] = np.inf
     separation, pair = proximity.separation_of_left(r, radius, left)
     clearance, agent, obstacle = proximity.least_clearance(each_clearance, nearest)
     _put_extremes(phases, time, (separation, pair, clearance, agent, obstacle))
     edges = mission.edges
-    distance = np.linalg.norm(r[:, edges[:, 0]] - r[:, edges[:, 1]], axis=2)
-    if not left.all():
-        distance[~left[:, edges].all(axis=2)] = np.nan
     columns = [_columns(p.edges, edges) for p in pieces]
 
     def by_edge(name: str) -> Floats:
@@ -132,41 +117,47 @@ def assemble(
         time=time,
         phase=np.concatenate([np.full(len(p.time), p.phase) for p in pieces]),
         position=r,
-        velocity=v,
-        acceleration=joined("a"),
-        slot_position=np.where(left[:, :, None], joined("r_ref"), np.nan),
-        input_force=f_u,
-        constraint_force=f_C,
-        external_force=joined("f_E"),
+        velocity=record.v,
+        acceleration=record.a,
+        slot_position=record.r_ref if whole else np.where(left[:, :, None], record.r_ref, np.nan),
+        input_force=record.f_u,
+        constraint_force=record.f_C,
+        external_force=record.f_E,
         thrust=thrust,
-        cm=cm,
-        cm_velocity=cm_velocity,
+        cm=found.cm,
+        cm_velocity=found.cm_velocity,
         cm_reference=motion[:, :3],
         cm_velocity_reference=motion[:, 3:],
-        attitude=attitude,
-        attitude_reference=att.unwrap_quaternion(attitude_reference),
-        frame=att.unwrap_quaternion(np.concatenate([p.frame for p in pieces])),
-        rates=np.einsum("kab,kb->ka", T, omega),
-        rates_reference=joined("rates"),
-        wrench_asked=np.where(np.isfinite(motion[:, :1]), asked, wrench),
-        wrench_achieved=wrench,
+        attitude=found.attitude,
+        attitude_reference=found.attitude_reference,
+        frame=found.frame,
+        rates=found.rates,
+        rates_reference=record.rates,
+        wrench_asked=np.where(np.isfinite(motion[:, :1]), record.wrench, found.wrench),
+        wrench_achieved=found.wrench,
         edges=edges,
-        distance=distance,
+        distance=found.distance,
         distance_reference=reference,
         distance_rate_reference=by_edge("d_dot"),
-        constraint=distance - reference if noisy else by_edge("c"),
+        constraint=found.distance - reference if noisy else by_edge("c"),
         integral=by_edge("integral"),
         multiplier=by_edge("multiplier"),
-        singular_value=_singular_values(pieces),
+        singular_value=np.zeros(0),  # computed later
         separation=separation,
         separation_pair=pair,
         clearance=clearance,
         clearance_agent=agent,
         clearance_obstacle=obstacle,
-        disturbance_force=joined("f_D") if airy else None,
-        measured_position=joined("r_seen") if noisy else None,
-        measured_velocity=joined("v_seen") if noisy else None,
-        later=partial(_references, mission.yaw, [(p.time, p.led) for p in pieces], left),
+        disturbance_force=record.f_D if airy else None,
+        measured_position=record.r_seen if noisy else None,
+        measured_velocity=record.v_seen if noisy else None,
+        later=(
+            (LATER, partial(_references, mission.yaw, [(p.time, p.led) for p in pieces], left)),
+            (
+                ("singular_value",),
+                partial(_singular_values, [(p.record.r, p.edges) for p in pieces]),
+            ),
+        ),
         vehicle_attitude=None if flown is None else flown.attitude,
         vehicle_rates=None if flown is None else flown.rates,
         rotor_force=None if flown is None else flown.rotor_force,
@@ -259,39 +250,29 @@ def _put_extremes(phases: Sequence[PhaseRecord], time: Floats, closeness: tuple[
                     agent[k], obstacle[k] = x.who, x.other
 
 
-def _attitudes(
-    pieces: Sequence[Piece], x: Floats, p: Floats, masses: Floats, *, framed: bool
-) -> tuple[Floats, Bools]:
-    """Attitude quaternions (K, 4) of the formation's slots p (K, N, 3), fitted to x by masses (K, N).
+def _joined(parts: Sequence[Floats]) -> Floats:
+    """Parts of a flight, one after the other."""
+    return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
-    Also whether the slots are a line (K,).
 
-    Without slots, the attitude is that of the integrated frame, if the mission attaches one (``framed``).
+def _measured(mission: Mission, pieces: Sequence[Piece], time: Floats, record: Record) -> Measured:
+    """Attitude, rates, wrench, thrust and distances at all samples, by the kernel.
+
+    Without slots, the attitude is that of the integrated frame, if the mission attaches one.
     """
-    quaternions, line = np.full((len(x), 4), np.nan), np.zeros(len(x), dtype=np.bool_)
-    fitted = np.zeros(len(x), dtype=bool)
-    T = np.empty((len(x), 3, 3))
-    last = np.eye(3)
-    start = 0
-    for piece in pieces:
-        rows = slice(start, start + len(piece.time))
-        start = rows.stop
-        if not piece.attached:
-            if framed:
-                quaternions[rows] = piece.frame
-            continue
-        near = piece.record.T_ref
-        if np.isnan(near[0, 0, 0]):
-            near = last
-        who = masses[rows.start] > 0.0
-        T[rows], line[rows] = rigid_body.fit_attitudes(
-            x[rows][:, who], p[rows][:, who], masses[rows.start, who], near
-        )
-        last = T[rows][-1]
-        fitted[rows] = True
-    if fitted.any():
-        quaternions[fitted] = att.quaternion_from_dcm(T[fitted])
-    return att.unwrap_quaternion(quaternions), line
+    agents = mission.agents
+    n = mission.n_agents
+    found = measured(
+        n, len(mission.edges), len(time), time=time,
+        start=np.cumsum([0, *(len(p.time) for p in pieces)]),
+        attached=np.array([p.attached for p in pieces]), framed=mission.body_frame is not None,
+        mass=mission.fleet.mass, lost_at=mission.lost_at,
+        limit=mission.fleet.thrust_limit if agents.saturate else np.full(n, np.inf), edges=mission.edges,
+        r=record.r, v=record.v, f_u=record.f_u, f_C=record.f_C, p=record.p, T_ref=record.T_ref,
+        frame=_joined([p.frame for p in pieces]),
+    )  # fmt: skip
+    native.measure(found)
+    return found
 
 
 def _by_edge(
@@ -299,17 +280,21 @@ def _by_edge(
 ) -> Floats:
     """A quantity of the edges (K, m); NaN while an edge is not active."""
     rows = []
+    whole = all(isinstance(places, slice) for places in columns)
     for piece, places in zip(pieces, columns, strict=True):
         values = piece.integral if name == "integral" else getattr(piece.record, name)
+        if whole:
+            rows.append(values)
+            continue
         full = np.full((len(piece.time), count), np.nan)
         full[:, places] = values
         rows.append(full)
-    return np.concatenate(rows)
+    return _joined(rows)
 
 
 def _columns(some: Ints, edges: Ints) -> Ints | slice:
     """Indices of some edges among all edges, (m, 2) both."""
-    if np.array_equal(some, edges):
+    if some.shape == edges.shape and some.tobytes() == edges.tobytes():
         return slice(None)
     key = edges.max(initial=0) + 1
     keys = edges[:, 0] * key + edges[:, 1]
@@ -317,20 +302,21 @@ def _columns(some: Ints, edges: Ints) -> Ints | slice:
     return order[np.searchsorted(keys[order], some[:, 0] * key + some[:, 1])]
 
 
-def _singular_values(pieces: Sequence[Piece]) -> Floats:
+def _singular_values(pieces: Sequence[tuple[Floats, Ints]]) -> dict[str, Floats]:
     """Smallest non-zero singular value of J (K,); NaN if the formation is too large to compute it.
 
     In formations of some tens of agents it is computed at some samples of each phase, and linear in between.
     """
-    return np.concatenate([_singular(p.record.r, p.edges) for p in pieces])
+    return {"singular_value": np.concatenate([_singular(r, edges) for r, edges in pieces])}
 
 
 def _singular(r: Floats, edges: Ints) -> Floats:
     """Smallest non-zero singular value of J in one phase (K,), at positions r (K, N, 3)."""
     size = min(len(edges), 3 * r.shape[1])
-    if size > _SINGULAR:
+    if size > _SINGULAR or not len(edges):
         return np.full(len(r), np.nan)
-    count = min(len(r), max(_LEAST, _WORK // max(size, 1) ** 3))
+    count = max(_LEAST, _WORK // size**3)
+    if count >= len(r):
+        return native.least_singular_values(r, edges)
     some = np.unique(np.linspace(0, len(r) - 1, count).round().astype(np.int64))
-    found = constraint_jacobian.smallest_singular_value(r[some], edges)
-    return np.interp(np.arange(len(r)), some, found)
+    return np.interp(np.arange(len(r)), some, native.least_singular_values(r[some], edges))

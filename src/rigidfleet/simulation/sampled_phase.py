@@ -267,6 +267,9 @@ class SampledPhase(ActivePhase):
         self.vehicles.S, self.vehicles.state = self.sampled.S, self.sampled
         return super().end()
 
+    def release(self) -> None:
+        """Keep the workspace: the state of the next phase may refer to it."""
+
     # -- recording --------------------------------------------------------------------------------
 
     def _keep(self, problem: Problem, call: fleet.SampledSegment, done: int) -> None:

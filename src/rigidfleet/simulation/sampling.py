@@ -52,7 +52,12 @@ def times_asked(times: ArrayLike, end: float) -> Floats:
     ValueError
         A time lies outside the mission.
     """
-    t = np.unique(numbers("times to record [s]", times))
+    t = _increasing(numbers("times to record [s]", times))
     if not (len(t) and t[0] >= 0.0 and t[-1] <= end * (1.0 + 1e-12)):
         raise ValueError(f"times to record must lie between 0 and the mission's end, {end:g} s")
-    return np.unique(np.minimum(t, end))
+    return _increasing(np.minimum(t, end))
+
+
+def _increasing(t: Floats) -> Floats:
+    """Times (K,) sorted, each once."""
+    return t if t.ndim == 1 and (t[1:] > t[:-1]).all() else np.unique(t)

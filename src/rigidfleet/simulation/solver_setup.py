@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from functools import cache, partial
 from typing import TYPE_CHECKING
 
@@ -10,7 +11,7 @@ import numpy as np
 
 from rigidfleet.kernel import records
 from rigidfleet.kernel.engine import native
-from rigidfleet.kernel.problem import RIGID, Problem, Workspace, workspace
+from rigidfleet.kernel.problem import RIGID, Problem, Workspace, cleared, workspace
 from rigidfleet.planning import solvers
 from rigidfleet.planning.plan import PhasePlan
 from rigidfleet.typing import Floats
@@ -20,18 +21,21 @@ if TYPE_CHECKING:
     from rigidfleet.kernel.large.solver import LargeSolver
 
 
+#: Workspaces that no phase uses, by agents, edges, whether they have H, and solver; how many, and of how many agents.
+_idle: dict[tuple[int, int, bool, int], list[Workspace]] = {}
+_KEPT, _SMALL = 8, 200
+
+
 def equip(plan: PhasePlan) -> tuple[Workspace, LargeSolver | None]:
     """Workspace of a plan, and the solver for its multipliers if the kernel itself does not solve for them."""
-    problem = plan.problem
-    work = workspace(
-        len(plan.masses),
-        len(plan.edges),
-        with_h=problem.control.allocation != RIGID,
-        solver=problem.law.solver,
-        large=plan.large,
-    )
+    problem, size = plan.problem, (len(plan.masses), len(plan.edges))
+    with_h, solves = problem.control.allocation != RIGID, problem.law.solver
     if not plan.large:
-        return work, None
+        kind = (*size, with_h, solves)
+        with suppress(KeyError, IndexError):  # none is idle
+            return cleared(_idle[kind].pop()), None
+        return workspace(*size, with_h=with_h, solver=solves), None
+    work = workspace(*size, with_h=with_h, solver=solves, large=True)
     from rigidfleet.kernel.large.solver import LargeSolver
 
     edges = plan.edges
@@ -43,6 +47,16 @@ def equip(plan: PhasePlan) -> tuple[Workspace, LargeSolver | None]:
     )
     plan.problem = problem._replace(graph=problem.graph._replace(solver=solver.address))
     return work, solver
+
+
+def give_back(plan: PhasePlan, work: Workspace) -> None:
+    """Let another phase use the workspace of a plan that has been flown."""
+    if plan.large or len(plan.masses) > _SMALL:
+        return
+    kind = (*work.p.shape[:1], *work.L.shape, work.H.size > 0, plan.problem.law.solver)
+    idle = _idle.setdefault(kind, [])
+    if len(idle) < _KEPT:
+        idle.append(work)
 
 
 def integrator(

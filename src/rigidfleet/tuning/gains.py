@@ -16,6 +16,7 @@ from rigidfleet._common.toml import to_toml
 from rigidfleet.math import lqr, pid
 from rigidfleet.math.margins import Feedback, Loop, Margins, margins
 from rigidfleet.mission import Mission
+from rigidfleet.mission.files import digests
 from rigidfleet.mission.schema import Tracking
 from rigidfleet.planning.preview import preview
 from rigidfleet.planning.timing import timed
@@ -216,7 +217,7 @@ def with_gains(text: str, gains: Gains) -> str:
         same = tomllib.loads(new) == wanted
     except tomllib.TOMLDecodeError:
         same = False
-    return new if same else to_toml(wanted)
+    return new if same else digests(text) + to_toml(wanted)
 
 
 def _entries(document: dict[str, Any], gains: Gains) -> Iterator[tuple[str, str, Any]]:

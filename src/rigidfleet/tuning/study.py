@@ -106,7 +106,7 @@ def tune(
         On Ctrl-C. What was flown is kept, and the same call goes on.
     """
     given = as_mission(mission)
-    flown = Mission.from_dict(_merged(given.to_dict(), assume or {}), given.origin)
+    flown = given.rewritten(_merged(given.to_dict(), assume or {}))
     paths, random = _seed_paths(flown)
     seeds, validation = (seeds, validation) if random else (1, 0)
     options = {

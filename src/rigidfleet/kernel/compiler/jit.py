@@ -51,6 +51,11 @@ def inlined(function: F) -> F:
     return _cached(function, _CACHED | {"forceinline": _OPTIMISES})
 
 
+def exact(function: F) -> F:
+    """Compile with sums as they are written, neither reordered nor fused: the same bits as NumPy's."""
+    return _cached(function, _CACHED | {"fastmath": False})
+
+
 def compiled_copy(function: Any, name: str, **instead: Any) -> Any:
     """Compile the source of a compiled function again, with other functions in place of some that it calls."""
     return _cached(_copy(function.py_func, name, instead), _CACHED)

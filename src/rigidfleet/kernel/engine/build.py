@@ -24,11 +24,12 @@ from rigidfleet.kernel import (
     disturbances,
     dopri5,
     dynamics,
+    measurement,
     monitor,
     recorder,
     rigid_body,
 )
-from rigidfleet.kernel.compiler import numba_internals
+from rigidfleet.kernel.compiler import gathering, numba_internals
 from rigidfleet.kernel.compiler.jit import OPTIONS
 from rigidfleet.kernel.compiler.pointers import Pointer, pointer
 from rigidfleet.kernel.engine import objects, packing
@@ -76,25 +77,38 @@ def machine_code(second: "_SecondProcess | None" = None) -> list[bytes]:
     functions = zip((integrate_segment, record_segment), objects.ENTRIES, strict=False)
     modules = [_module(function, name) for function, name in functions]
     codes = [_object(*module) for module in modules]
-    made = None if second is None else second.monitor()
-    return [*codes, made or _monitor()]
+    made = None if second is None else second.apart()
+    return [*codes, *(made or _apart())]
 
 
-def _monitor() -> bytes:
-    """Object code of the monitor, which shares nothing with the rest."""
-    problem, workspace, integrator, _, _, watching, *_ = _pointers()
+def _apart() -> list[bytes]:
+    """Object codes of the monitor, of measurement and of packing, which share nothing with the rest."""
+    problem, workspace, integrator, _, _, watching, *_, measured, spectrum = _pointers()
 
     def watch_trail(p, w, state, found):
         return monitor.watch(problem(p), workspace(w), integrator(state), watching(found))
 
-    return _object(*_module(watch_trail, objects.ENTRIES[2]))
+    def measure_flight(m):
+        measurement.measure(measured(m))
+        return 0
+
+    def singular_values(s):
+        measurement.spectrum(spectrum(s))
+        return 0
+
+    def gather(of, count, asked, words):
+        return gathering.gather(of, count, asked, words)
+
+    functions = watch_trail, measure_flight, singular_values, gather
+    entries = zip(functions, (4, 1, 1, 4), objects.ENTRIES[2:], strict=True)
+    return [_object(*_module(function, name, words)) for function, words, name in entries]
 
 
 def sampled_code() -> list[bytes]:
     """Object code of the two C functions of sampled flights, `objects.SAMPLED_ENTRIES`."""
     from rigidfleet.kernel import quadrotor, sampled_flight
 
-    problem, workspace, *_, flight, state, segment, evaluation, _ = _pointers()
+    problem, workspace, *_, flight, state, segment, evaluation, _, _, _ = _pointers()
 
     def fly(p, w, f, s, call):
         return sampled_flight.fly_ticks(
@@ -113,7 +127,7 @@ def avoidance_code() -> list[bytes]:
     """Object code of avoidance in flight, `objects.AVOIDANCE_ENTRY`."""
     from rigidfleet.kernel import guard
 
-    problem, workspace, *_, flight, state, _, _, avoidance = _pointers()
+    problem, workspace, *_, flight, state, _, _, avoidance, _, _ = _pointers()
 
     def avoid(f, s, given, _):
         a = avoidance(given)
@@ -212,7 +226,7 @@ def _translated() -> dict[str, bytes]:
 
 
 class _SecondProcess:
-    """The second process, which translates its half and compiles the monitor.
+    """The second process, which translates its half and compiles the monitor and measurement.
 
     Whatever fails there is done in this process.
     """
@@ -231,8 +245,8 @@ class _SecondProcess:
         """Its half of the functions, by name."""
         return self._answer() or {}
 
-    def monitor(self) -> bytes | None:
-        """The object of the monitor."""
+    def apart(self) -> list[bytes] | None:
+        """The objects of `_apart`."""
         done = self.translated
         return self._answer() if done or not self._shares else None
 
@@ -261,7 +275,7 @@ class _SecondProcess:
 def main(part: str) -> None:
     """Write machine code to standard output: of "flight", the "half" that the second process makes of it, or a library.
 
-    Numba's internals are used where they are known; else the second process makes the monitor alone.
+    Numba's internals are used where they are known; else the second process makes the monitor and measurement alone.
     """
     output, known = sys.stdout.buffer, numba_internals.known()
     if known:
@@ -272,6 +286,6 @@ def main(part: str) -> None:
     if part == "half":
         pickle.dump(_translated() if known else {}, output)
         output.flush()
-        pickle.dump(_monitor(), output)
+        pickle.dump(_apart(), output)
         return
     output.write(objects.concatenated(machine_code(_SecondProcess(shares=known))))

@@ -33,7 +33,8 @@ from rigidfleet.kernel.engine.objects import (
     separated,
     target_machine,
 )
-from rigidfleet.kernel.engine.packing import NOTHING, UNRECORDED, Packed, pack, packed
+from rigidfleet.kernel.engine.packing import NOTHING, UNRECORDED, Packed, pack, packed, use
+from rigidfleet.kernel.measured import Measured, spectrum_of
 from rigidfleet.kernel.problem import (
     Problem,
     Workspace,
@@ -45,7 +46,7 @@ from rigidfleet.kernel.records import (
     Segment,
     recorder,
 )
-from rigidfleet.typing import Floats
+from rigidfleet.typing import Floats, Ints
 
 
 def integrate(
@@ -61,6 +62,29 @@ def integrate(
     """Integrate to ``t_end`` [s], see `rigidfleet.kernel.dopri5.integrate`."""
     segment = pack(Segment(t_end, fresh, max_steps, times, samples, NOTHING))
     return _call(_code().integrate, packed(problem), packed(workspace), packed(state), segment)
+
+
+class Integration:
+    """An integration to ``t_end`` [s] in parts: a callable that integrates at most some steps."""
+
+    def __init__(
+        self,
+        problem: Problem,
+        workspace: Workspace,
+        state: IntegratorState,
+        t_end: float,
+        times: Floats,
+        samples: Floats,
+    ) -> None:
+        self._segment = pack(Segment(t_end, False, 0, times, samples, NOTHING))
+        self._kept = packed(problem), packed(workspace), packed(state), self._segment
+        self._addresses = [x.address for x in self._kept]
+        self._integrate = _code().integrate
+
+    def __call__(self, fresh: bool, max_steps: int) -> int:
+        """Go on; ``fresh`` as in `Segment`. Returns what `rigidfleet.kernel.dopri5.integrate` returns."""
+        self._segment.words[1], self._segment.words[2] = int(fresh), max_steps
+        return self._integrate(*self._addresses)
 
 
 def record(problem: Problem, workspace: Workspace, times: Floats, samples: Floats) -> Record:
@@ -97,13 +121,27 @@ def closed_loop(t: float, y: Floats, dy: Floats, problem: Problem, workspace: Wo
 
 
 def _call(function: Any, *arguments: Packed) -> int:
-    return function(*(a.address for a in arguments))
+    return function(*[a.address for a in arguments])
+
+
+def measure(found: Measured) -> None:
+    """Measure the samples of a flight, see `rigidfleet.kernel.measurement.measure`."""
+    _call(_code().measure, pack(found))
+
+
+def least_singular_values(r: Floats, edges: Ints) -> Floats:
+    """Smallest non-zero singular value (K,) of J at r (K, N, 3), see `rigidfleet.kernel.measurement.spectrum`."""
+    found = spectrum_of(r, edges)
+    _call(_code().spectrum, pack(found))
+    return found.least
 
 
 class _Code(NamedTuple):
     integrate: Any
     record: Any
     watch: Any
+    measure: Any
+    spectrum: Any
     recorder: int  # address of record
     engine: Any  # keeps the code alive
     unkept: list[bytes] | None  # objects that could not be stored in the cache
@@ -196,9 +234,15 @@ def _linked_avoiding(parts: Sequence[bytes], unkept: list[bytes] | None = None) 
 
 def _linked(parts: Sequence[bytes], unkept: list[bytes] | None = None) -> _Code:
     engine = _engine(parts)
-    kind = ctypes.CFUNCTYPE(ctypes.c_int64, *(ctypes.c_int64,) * 4)
+    word = ctypes.c_int64
     addresses = [engine.get_function_address(name) for name in ENTRIES]
-    return _Code(*map(kind, addresses), addresses[1], engine, unkept)
+    functions = (
+        ctypes.CFUNCTYPE(word, *(word,) * words)(address)
+        for words, address in zip((4, 4, 4, 1, 1, 4), addresses, strict=True)
+    )
+    *calls, gather = functions
+    use(gather)
+    return _Code(*calls, addresses[1], engine, unkept)
 
 
 def _engine(parts: Sequence[bytes]) -> Any:

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import ctypes
 import struct
 import threading
+from collections.abc import Callable, Iterator
 from functools import cache
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from rigidfleet.kernel import fleet
 from rigidfleet.kernel.avoidance import Avoidance, avoidance
+from rigidfleet.kernel.measured import Measured, Spectrum, measured, spectrum_of
 from rigidfleet.kernel.problem import (
     CONSTANT,
     ITERATED,
@@ -37,22 +41,104 @@ from rigidfleet.kernel.records import (
     monitor,
     recorder,
 )
-from rigidfleet.typing import Ints
 
 
 class Packed(NamedTuple):
     """A named tuple as words, and the tuple itself, which keeps its arrays alive."""
 
     of: Any
-    words: Ints
+    words: ctypes.Array[ctypes.c_int64]
     address: int
 
 
-class _Layout(NamedTuple):
-    """Memory layout of a type of named tuple."""
+#: The compiled function `rigidfleet.kernel.compiler.gathering.gather`, once it is loaded.
+_gather: list[Callable[..., int]] = []
 
-    code: struct.Struct
-    arrays: tuple[tuple[str, int], ...]  # kind of number and dimensions of each
+
+def use(gather: Callable[..., int]) -> None:
+    """Pack with a compiled function from now on."""
+    _gather[:] = [gather]
+    _layout.cache_clear()
+
+
+_ARRAYS = {np.ndarray}
+
+
+class _Layout:
+    """Memory layout of a type of named tuple, learnt from an example."""
+
+    def __init__(self, example: Any) -> None:
+        code: list[str] = []
+        self.arrays: list[tuple[str, int]] = []
+        words: list[Any] = []
+        _flatten(example, code, words, self.arrays)
+        self.code = struct.Struct("=" + "".join(code))
+        places = list(_places(example, ""))
+        size = len(words)
+        starts = np.cumsum([0, *(1 if ndim is None else 1 + ndim for _, _, ndim in places)])
+        arrays = [
+            (name, int(k))
+            for (name, kind, _), k in zip(places, starts, strict=False)
+            if kind is np.ndarray
+        ]
+        self.of_arrays = _getter([name for name, _ in arrays])
+        self.of_numbers = _getter([name for name, kind, _ in places if kind is not np.ndarray])
+        #: Numbers at their words, with gaps for the arrays' words; then the addresses of the arrays.
+        gaps: dict[type, str] = {np.ndarray: "{}x", float: "d", int: "q"}
+        self.numbers = struct.Struct(
+            "=" + "".join(gaps[kind].format(8 * (1 + (ndim or 0))) for _, kind, ndim in places)
+        )
+        self.floats = [kind is float for _, kind, _ in places if kind is not np.ndarray]
+        self.kinds: set[tuple[type, ...]] = set()  # of numbers that are as in the example
+        self.objects = struct.Struct(f"={len(arrays)}q")
+        self.memory = ctypes.c_int64 * (size + len(arrays))
+        self.after, self.count = 8 * size, len(arrays)
+        kinds = [id(x.dtype) for x in self.of_arrays(example)]
+        #: (arrays, 3) first word, dimensions, address of the type of the numbers.
+        self.asked = np.array(
+            [[k, n, kind] for (_, k), (_, n), kind in zip(arrays, self.arrays, kinds, strict=True)], dtype=np.int64
+        ).reshape(-1, 3)  # fmt: skip
+        self.asked_at = self.asked.__array_interface__["data"][0]
+        #: Whether `gathered` finds what `_flatten` finds: else arrays are not laid out as expected there.
+        self.known = (found := self.gathered(example)) is not None and (
+            bytes(found.words)[: 8 * size] == self.code.pack(*words)
+        )
+
+    def gathered(self, x: Any) -> Packed | None:
+        """The words of a named tuple; None if a number or array is not as in the example."""
+        arrays, numbers = self.of_arrays(x), self.of_numbers(x)
+        kinds = tuple(map(type, numbers))
+        if kinds not in self.kinds:
+            if np.bool_ in kinds or [isinstance(x, float) for x in numbers] != self.floats:
+                return None
+            self.kinds.add(kinds)
+        if not _gather or set(map(type, arrays)) != _ARRAYS:
+            return None
+        words = self.memory()
+        at = ctypes.addressof(words)
+        self.numbers.pack_into(words, 0, *numbers)
+        self.objects.pack_into(words, self.after, *map(id, arrays))
+        if _gather[0](at + self.after, self.count, self.asked_at, at):
+            return None
+        return Packed(x, words, at)
+
+
+def _places(x: Any, prefix: str) -> Iterator[tuple[str, type, int | None]]:
+    """Name, kind and dimensions of each field of a named tuple and of those inside it."""
+    for name, value in zip(x._fields, x, strict=True):
+        if isinstance(value, np.ndarray):
+            yield prefix + name, np.ndarray, value.ndim
+        elif isinstance(value, tuple):
+            yield from _places(value, f"{prefix}{name}.")
+        else:
+            yield prefix + name, float if isinstance(value, float) else int, None
+
+
+def _getter(names: list[str]) -> Callable[[Any], tuple[Any, ...]]:
+    """A function that returns the fields with these names."""
+    if len(names) < 2:
+        return lambda x: tuple(attrgetter(name)(x) for name in names)
+    return attrgetter(*names)
 
 
 def _flatten(x: Any, code: list[str], words: list[Any], arrays: list[tuple[str, int]]) -> None:
@@ -82,17 +168,19 @@ def pack(x: Any) -> Packed:
     TypeError
         Numbers or arrays are not of the types that the kernel is compiled for.
     """
+    layout = _layout(type(x))
+    if layout.known and (found := layout.gathered(x)) is not None:
+        return found
     code: list[str] = []
     values: list[Any] = []
     arrays: list[tuple[str, int]] = []
     _flatten(x, code, values, arrays)
-    layout = _layout(type(x))
-    if tuple(arrays) != layout.arrays or "".join(code) != layout.code.format[1:]:
+    if arrays != layout.arrays or "".join(code) != layout.code.format[1:]:
         raise TypeError(
             f"this {type(x).__name__} has arrays or numbers of types that the kernel does not take"
         )
-    words = np.frombuffer(layout.code.pack(*values), dtype=np.int64)
-    return Packed(x, words, words.__array_interface__["data"][0])
+    words = (ctypes.c_int64 * (layout.code.size // 8)).from_buffer_copy(layout.code.pack(*values))
+    return Packed(x, words, ctypes.addressof(words))
 
 
 class _Last(threading.local):
@@ -115,10 +203,7 @@ def packed(x: Any) -> Packed:
 
 @cache
 def _layout(kind: type) -> _Layout:
-    code: list[str] = []
-    arrays: list[tuple[str, int]] = []
-    _flatten(next(x for x in examples() if isinstance(x, kind)), code, [], arrays)
-    return _Layout(struct.Struct("=" + "".join(code)), tuple(arrays))
+    return _Layout(next(x for x in examples() if isinstance(x, kind)))
 
 
 @cache
@@ -134,6 +219,8 @@ def examples() -> tuple[
     fleet.SampledSegment,
     fleet.Evaluation,
     Avoidance,
+    Measured,
+    Spectrum,
 ]:
     """One minimal example of each named tuple; its fields have the types that all have."""
     one, none, places, frame = np.ones(1), np.zeros(0), np.zeros((1, 3)), np.eye(3)
@@ -160,11 +247,15 @@ def examples() -> tuple[
     vehicles = fleet.quadrotors([fleet.Vehicle(1.0, point=True)])
     flight = fleet.flight(vehicles, start=0.0, h=0.0, steps=1)
     S = np.zeros((1, fleet.STATES))
-    rotors = np.zeros((1, 4))
+    rotors, rows = np.zeros((1, 4)), np.zeros((0, 1, 3))
     return (
         problem, work, state, segment, UNRECORDED, watching, flight, fleet.begin(flight, S, work),
         fleet.segment(1, 0, 0.0), fleet.Evaluation(S, rotors, places, places, frame, S),
         avoidance(period=1.0, b=one, lift=one, mass=one, g=0.0, radius=one),
+        measured(1, 0, 0, time=none, start=np.zeros(1, dtype=np.int64), attached=np.zeros(0, dtype=np.bool_),
+                 framed=False, mass=one, lost_at=one, limit=one, edges=np.zeros((0, 2), dtype=np.int64),
+                 r=rows, v=rows, f_u=rows, f_C=rows, p=rows, T_ref=np.zeros((0, 3, 3))),
+        spectrum_of(rows, np.zeros((0, 2), dtype=np.int64)),
     )  # fmt: skip
 
 

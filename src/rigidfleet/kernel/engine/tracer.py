@@ -344,7 +344,8 @@ _PARTS = ("vehicles", "graph", "law", "reference", "control", "disturbance")
 def _used(problem: Problem) -> Problem:
     """The problem without the parts that such flights do not use, which the tracer could not handle."""
     none: Any = None
-    reference = problem.reference._replace(t0=none, T_b=none, d0=none, p0=none, dp=none, turn=none)
+    slots = ("t0", "T_b", "d0", "p0", "dp", "turn", "knots", "ways")
+    reference = problem.reference._replace(**dict.fromkeys(slots, none))
     fields = ("active", "inverse")
     disturbance = problem.disturbance
     disturbance = disturbance._replace(**{f: none for f in disturbance._fields if f not in fields})

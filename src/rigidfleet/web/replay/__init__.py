@@ -97,6 +97,8 @@ def html_page(result: Result) -> str:
         }
     )
     info = describe(result.mission, result.edges[shown], tension) | _story(result, time)
+    if result.interpolation is not None:  # nobody knows the thrust
+        info["plots"] = [plot for plot in info["plots"] if plot["column"] != "thrust plot"]
     info |= {"columns": described, "count": len(time), "beyond": most > tension}
     info |= {"note": _note(result, shown, tension, most)}
     return page(info, start="replay/replay.js", data=data)

@@ -514,7 +514,8 @@ export class Player {
     [...part("phases").children].forEach((button, k) => button.toggleAttribute("aria-current", k === state.phase));
     const [first, last] = this.span(), share = last > first ? (time - first) / (last - first) : 0;
     for (const plot of this.plots) plot.point(share, state);
-    const larger = scene.enlarged > 1.15 ? `Vehicles are drawn ${digits(scene.enlarged)} times their size.` : "";
+    const much = scene.enlarged > 1e6 ? "Vehicles have no size; they are drawn as if." : `Vehicles are drawn ${digits(scene.enlarged)} times their size.`;
+    const larger = scene.enlarged > 1.15 ? much : "";
     write("notes", [info.note, larger, overworked(state)].filter(Boolean).join("\n"));
   }
 }

@@ -1,0 +1,150 @@
+"""Judge flights, also those that others made: `assess`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from rigidfleet.cli import console
+from rigidfleet.cli.codes import FAILED, PASSED
+from rigidfleet.cli.outputs import Files, taken
+from rigidfleet.errors import RigidfleetError
+
+if TYPE_CHECKING:
+    from rigidfleet.result import Result
+
+
+def assess(
+    *files: Path,
+    mission: str | None = None,
+    separation: float | None = None,
+    limits: list[str] | None = None,
+    radius: float | None = None,
+    ground: float | None = None,
+    interpolation: Literal["cubic", "linear"] | None = None,
+    out: Path | None = None,
+    force: bool = False,
+    json: bool = False,
+) -> int:
+    """Judge a flight: a result, or trajectories that another program made.
+
+    Parameters
+    ----------
+    files : Path
+        A result (NAME.nc), or trajectories: setpoints (CSV with columns time, x, y, z and, for several vehicles,
+        agent), Crazyswarm2's polynomials (CSV, one a vehicle), a Skybrush show (.skyc), ROS 2 poses (.mcap), or folders
+        of these.
+    mission : str
+        Judge trajectories by this mission's radii, limits and obstacles.
+    separation : float
+        Least distance [m] between two vehicles, less their radii.
+    limits : list
+        Further limits, KEY=VALUE, may be repeated: speed, acceleration, horizontal_speed, vertical_speed,
+        horizontal_acceleration, vertical_acceleration, separation_below.
+    radius : float
+        Radius of every vehicle [m]. Default: 0, distances are centre to centre.
+    ground : float
+        Height of the ground [m]. Default: there is none.
+    interpolation : str
+        Between samples: cubic (a spline through the positions) or linear. Default: cubic.
+    out : Path
+        Folder for a result, the verdict, a report with figures, and a replay. Default: write nothing.
+    force : bool
+        Overwrite existing files.
+    json : bool
+        Print the verdict as JSON.
+    """
+    from rigidfleet._common.files import write_file
+    from rigidfleet.assessment import assess as judge
+
+    if not files:
+        raise RigidfleetError("no file was given; give a result or trajectories to judge")
+    given = {
+        "mission": mission, "separation": separation, "limits": limits, "radius": radius, "ground": ground,
+        "interpolation": interpolation,
+    }  # fmt: skip
+    chosen = [f"--{key}" for key, value in given.items() if value is not None]
+    if len(files) == 1 and files[0].suffix == ".nc":
+        from rigidfleet.result import Result
+
+        if chosen:
+            told = f"{chosen[0]}: no effect on a result, which has its own mission; remove it"
+            raise RigidfleetError(told)
+        result = Result.load(files[0])
+    else:
+        result = _of_others(
+            files, mission, separation, limits or [], radius, ground, interpolation or "cubic"
+        )
+    verdict = judge(result)
+    made = Files(out, result.mission.name) if out is not None else None
+    if made is not None:
+        made.try_out()
+        for path in (made.result, made.verdict, made.report, made.replay):
+            if path.exists() and not force:
+                raise taken(path)
+    if json:
+        console.print_json(verdict.to_dict())
+    else:
+        console.out().print(verdict)
+    if made is not None:
+        from rigidfleet.cli.report import write_report
+        from rigidfleet.cli.run import list_files, write_replay
+
+        made.make_folder()
+        result.save(made.result)
+        write_file(made.verdict, (verdict.json() + "\n").encode())
+        write_report([result], [verdict], made.report, quiet=json)
+        write_replay(result, made.replay)
+        if not json:
+            console.out().print()
+            list_files(made)
+    return PASSED if verdict.passed else FAILED
+
+
+def _of_others(
+    files: tuple[Path, ...],
+    mission: str | None,
+    separation: float | None,
+    limits: list[str],
+    radius: float | None,
+    ground: float | None,
+    interpolation: Literal["cubic", "linear"],
+) -> Result:
+    """The trajectories of files as a result.
+
+    Raises
+    ------
+    RigidfleetError
+        A file or a limit cannot be read, or an option has no effect.
+    """
+    from rigidfleet.foreign.files import read_trajectories
+    from rigidfleet.simulation.trajectories import of_curves
+
+    found: dict[str, float] = {}
+    for told in limits:
+        for part in told.split(","):
+            key, equals, value = part.partition("=")
+            try:
+                found[key.strip()] = float(value)
+            except ValueError:
+                equals = ""
+            if not equals:
+                raise RigidfleetError(f"--limits {part}: give KEY=VALUE, such as speed=3")
+    if mission is not None:
+        own = {
+            "--separation": separation,
+            "--radius": radius,
+            "--ground": ground,
+            "--limits": found or None,
+        }
+        if unused := [key for key, value in own.items() if value is not None]:
+            raise RigidfleetError(
+                f"{unused[0]}: no effect with --mission, which has its own; remove one"
+            )
+    read = read_trajectories(files, interpolation)
+    result = of_curves(
+        read.curves, read.assumed, names=read.names, mission=mission, separation=separation, limits=found,
+        radius=radius or 0.0, ground=ground, name=files[0].stem,
+    )  # fmt: skip
+    result.statistics["notes"] = list(read.notes)
+    return result

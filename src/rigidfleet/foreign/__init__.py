@@ -1,0 +1,1 @@
+"""Trajectories that other programs made: their files, read as piecewise polynomials of each vehicle."""

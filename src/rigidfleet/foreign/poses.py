@@ -1,0 +1,114 @@
+"""Poses in recordings of ROS 2 (MCAP), whoever wrote them.
+
+Sources: `geometry_msgs/msg/PoseStamped` (ROS 2 common_interfaces), and CDR: after 4 bytes that say the order of bytes,
+each field is aligned to its size.
+"""
+
+from __future__ import annotations
+
+import io
+import struct
+from importlib.util import find_spec
+
+import numpy as np
+
+from rigidfleet.errors import TrajectoryError
+from rigidfleet.foreign.curves import Curve
+from rigidfleet.foreign.samples import sampled
+from rigidfleet.typing import Floats
+
+_POSE = "geometry_msgs/msg/PoseStamped"
+_BILLION = 1_000_000_000
+
+
+def read_poses(
+    data: bytes, name: str, interpolation: str
+) -> tuple[tuple[str, ...], tuple[Curve, ...]]:
+    """Names of the topics with poses, and a curve for each; times count from the first pose of the recording.
+
+    Raises
+    ------
+    TrajectoryError
+        The package `mcap` is missing, the recording is damaged, has no poses, or its stamps do not increase.
+    """
+    if find_spec("mcap") is None:
+        raise TrajectoryError(
+            f"{name}: needs the package 'mcap', which is not installed. Run: pip install 'rigidfleet[mcap]'"
+        )
+    found = _messages(data, name)
+    if not found:
+        raise TrajectoryError(
+            f"{name}: has no {_POSE}. Record the topics with the vehicles' poses."
+        )
+    first = min(rows[0][0] for rows in found.values())
+    curves = []
+    for topic, rows in found.items():
+        table = np.array([row[1:] for row in rows])
+        time = (
+            np.array([row[0] - first for row in rows]) / _BILLION
+        )  # whole numbers keep nanoseconds
+        if not np.isfinite(table).all():
+            k = int(np.argmin(np.isfinite(table).all(axis=1)))
+            raise TrajectoryError(f"{name}: {topic}: message {k + 1}: the pose is not finite.")
+        where = lambda k, topic=topic: f"{topic}: message {k + 1}"  # noqa: E731
+        offset = 0.0 if first > 1_000_000 * _BILLION else first / _BILLION
+        curves.append(
+            sampled(time + offset, table[:, :3], _yaws(table[:, 3:]), interpolation, name, where)
+        )
+    return tuple(found), tuple(curves)
+
+
+def _messages(data: bytes, name: str) -> dict[str, list[tuple[float, ...]]]:
+    """Stamp [ns], position and quaternion (scalar last) of each pose, by topic."""
+    from mcap.exceptions import McapError
+    from mcap.reader import make_reader
+
+    found: dict[str, list[tuple[float, ...]]] = {}
+    try:
+        for schema, channel, message in make_reader(io.BytesIO(data)).iter_messages():
+            if schema is None or schema.name not in (_POSE, "geometry_msgs/PoseStamped"):
+                continue
+            if channel.message_encoding != "cdr":
+                raise TrajectoryError(
+                    f"{name}: {channel.topic}: is encoded as {channel.message_encoding!r}, not as CDR."
+                )
+            rows = found.setdefault(channel.topic, [])
+            try:
+                rows.append(_pose(message.data))
+            except struct.error:
+                raise TrajectoryError(
+                    f"{name}: {channel.topic}: message {len(rows) + 1}: is cut off. Record again."
+                ) from None
+    except TrajectoryError:
+        raise
+    except (
+        McapError,
+        ValueError,
+        EOFError,
+        KeyError,
+        struct.error,
+        RuntimeError,
+        MemoryError,
+    ) as error:
+        told = " ".join(str(error).split()) or type(error).__name__
+        raise TrajectoryError(f"{name}: the recording is damaged ({told}). Record again.") from None
+    except ImportError as error:
+        raise TrajectoryError(
+            f"{name}: is compressed, and a package is missing ({error})."
+        ) from None
+    return found
+
+
+def _pose(data: bytes) -> tuple[float, ...]:
+    """Stamp [ns], position and quaternion of a PoseStamped in CDR."""
+    order = "<" if data[1:2] == b"\1" else ">"
+    sec, nanosec, length = struct.unpack_from(f"{order}iII", data, 4)
+    start = 16 + length
+    start += -(start - 4) % 8
+    return sec * _BILLION + nanosec, *struct.unpack_from(f"{order}7d", data, start)
+
+
+def _yaws(quaternions: Floats) -> Floats:
+    """Yaws (K,) [rad] of quaternions (K, 4), scalar last, body to world; zero without an attitude."""
+    x, y, z, w = quaternions.T
+    return np.arctan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z)

@@ -1,0 +1,55 @@
+"""Curves through the samples of others: what is assumed between them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from rigidfleet.errors import TrajectoryError
+from rigidfleet.foreign.curves import Curve, through
+from rigidfleet.typing import Floats
+
+#: What is assumed between samples, in words.
+ASSUMED = {
+    "linear": "straight lines between samples",
+    "cubic": "cubic splines through the positions",
+}
+
+
+def sampled(
+    time: Floats,
+    position: Floats,
+    yaw: Floats | None,
+    kind: str,
+    name: str,
+    place: Callable[[int], str],
+) -> Curve:
+    """The curve through positions (K, 3) [m] and yaws (K,) [rad] at times (K,) [s].
+
+    ``cubic`` is the spline with continuous acceleration (not-a-knot at its ends); yaw is on lines without full turns.
+    A single sample stays for a second.
+
+    Raises
+    ------
+    TrajectoryError
+        A time does not increase; ``place`` tells where in the file ``name`` it is.
+    """
+    behind = np.flatnonzero(~(np.diff(time) > 0.0))
+    if len(behind):
+        k = int(behind[0]) + 1
+        how = "repeats" if time[k] == time[k - 1] else "goes back behind"
+        raise TrajectoryError(
+            f"{name}: {place(k)}: the time {time[k]:.9g} s {how} {time[k - 1]:.9g} s. Give increasing times."
+        )
+    told = None if yaw is None else np.unwrap(yaw)[None]
+    lines = through(time, position[None], told)
+    if kind == "linear" or len(time) < 3:
+        return lines
+    from scipy.interpolate import CubicSpline
+
+    spline = CubicSpline(time, position)
+    pieces = np.zeros((len(time) - 1, 4, 4))
+    pieces[:, :3] = np.moveaxis(np.asarray(spline.c)[::-1], (0, 1, 2), (2, 0, 1))
+    pieces[:, 3] = np.pad(lines.pieces[:, 3], ((0, 0), (0, 2)))
+    return Curve(time, pieces)

@@ -1,0 +1,178 @@
+"""Skybrush's shows, read: curves of all drones, from an archive that is not trusted.
+
+Sources: the types of Skybrush's show format; times of a trajectory count from its ``takeoffTime``.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+import zlib
+from collections.abc import Callable
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from rigidfleet.errors import TrajectoryError
+from rigidfleet.foreign.curves import Curve, with_headings
+from rigidfleet.math.bernstein import of_bernstein
+
+#: What is between the points of a show.
+BEZIER = "the Bezier curves of the show"
+#: Greatest size of an archive's content [bytes], and greatest number of points between the ends of a segment.
+_BYTES, _INNER = 512 << 20, 6
+
+
+def read_show(data: bytes, name: str) -> tuple[tuple[str, ...], tuple[Curve, ...]]:
+    """Names and curves of the drones of a show, in the show's time and axes.
+
+    Raises
+    ------
+    TrajectoryError
+        The archive is damaged, too large or refers to files outside of it, or an entry is missing or not a number.
+    """
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            size = sum(entry.file_size for entry in archive.infolist())
+            if size > _BYTES:
+                raise TrajectoryError(
+                    f"{name}: unpacks to {size >> 20:,} MiB, more than {_BYTES >> 20}. It is not a show."
+                )
+            return _drones(archive, name)
+    except RecursionError:
+        raise TrajectoryError(
+            f"{name}: show.json is nested too deeply. Export the show again."
+        ) from None
+    except (zipfile.BadZipFile, EOFError, RuntimeError, NotImplementedError, OSError) as error:
+        raise TrajectoryError(
+            f"{name}: is not a complete zip archive ({error}). Export the show again."
+        ) from None
+
+
+def _drones(archive: zipfile.ZipFile, name: str) -> tuple[tuple[str, ...], tuple[Curve, ...]]:
+    show = _json(archive, "show.json", name)
+    drones = _get(show, "swarm.drones", list, f"{name}: show.json")
+    if not drones:
+        raise TrajectoryError(f"{name}: show.json: has no drones.")
+    names: list[str] = []
+    curves: list[Curve] = []
+    for k, drone in enumerate(drones, 1):
+        where = f"{name}: show.json: drone {k}"
+        settings = _get(drone, "settings", dict, where)
+        who = settings.get("name")
+        names.append(who if isinstance(who, str) and who else f"drone {k}")
+        trajectory = _resolved(archive, settings.get("trajectory"), name, f"{where}: trajectory")
+        yaw = settings.get("yawControl")
+        turned = None if yaw is None else _resolved(archive, yaw, name, f"{where}: yawControl")
+        curves.append(_curve(trajectory, turned, f"{name}: {names[-1]}"))
+    if len(set(names)) < len(names):
+        names = [f"{who} ({k})" for k, who in enumerate(names, 1)]
+    return tuple(names), tuple(curves)
+
+
+def _json(archive: zipfile.ZipFile, entry: str, name: str) -> Any:
+    try:
+        return json.loads(archive.read(entry), parse_constant=_no_constant)
+    except KeyError:
+        raise TrajectoryError(f"{name}: has no {entry}. Is it a show of Skybrush?") from None
+    except (ValueError, zlib.error) as error:
+        raise TrajectoryError(
+            f"{name}: {entry}: is damaged ({error}). Export the show again."
+        ) from None
+
+
+def _no_constant(told: str) -> float:
+    raise ValueError(f"has {told}, not a finite number")
+
+
+def _get(given: Any, path: str, kind: type, where: str) -> Any:
+    for key in path.split("."):
+        given = given.get(key) if isinstance(given, dict) else None
+    if not isinstance(given, kind):
+        word = "list" if kind is list else "object"
+        raise TrajectoryError(f"{where}: has no {word} {path!r}. Export the show again.")
+    return given
+
+
+def _resolved(archive: zipfile.ZipFile, value: Any, name: str, where: str) -> dict[str, Any]:
+    """An object of a show, or the one in the entry that it refers to."""
+    if not isinstance(value, dict):
+        raise TrajectoryError(f"{where}: is missing. Export the show again.")
+    reference = value.get("$ref")
+    if reference is None:
+        return value
+    entry = str(reference).removeprefix("./").removesuffix("#")
+    if entry.startswith(("/", "\\")) or ".." in entry.replace("\\", "/").split("/") or ":" in entry:
+        raise TrajectoryError(
+            f"{where}: refers to {entry[:80]!r}, outside of the show, which is not read."
+        )
+    found = _json(archive, entry, name)
+    if not isinstance(found, dict):
+        raise TrajectoryError(f"{name}: {entry}: is no object. Export the show again.")
+    return found
+
+
+def _curve(trajectory: dict[str, Any], yaw: dict[str, Any] | None, where: str) -> Curve:
+    points = _get(trajectory, "points", list, where)
+    if not points:
+        raise TrajectoryError(f"{where}: its trajectory has no points.")
+
+    def told(k: int) -> str:
+        return f"{where}: point {k + 1}"
+
+    start = _floats(trajectory.get("takeoffTime", 0), (), lambda: f"{where}: takeoffTime")
+    for k, point in enumerate(points):
+        if not isinstance(point, list) or len(point) < 2:
+            raise TrajectoryError(f"{told(k)}: is not [time, [x, y, z], [control points]].")
+    time = np.array([_floats(p[0], (), lambda k=k: told(k)) for k, p in enumerate(points)])
+    ends = [_floats(p[1], (3,), lambda k=k: told(k)) for k, p in enumerate(points)]
+    if len(points) == 1:
+        points, time, ends = [*points, [0, ends[0], []]], np.append(time, time + 1.0), ends * 2
+    late = np.flatnonzero(~(np.diff(time) > 0.0))
+    if len(late):
+        k = int(late[0])
+        raise TrajectoryError(
+            f"{told(k + 1)}: its time {time[k + 1]:g} s is not after {time[k]:g} s. Give increasing times."
+        )
+    inner = [p[2] if len(p) > 2 and p[2] is not None else [] for p in points[1:]]
+    powers = 2 + max((len(c) if isinstance(c, list) else 0 for c in inner), default=0)
+    if powers > _INNER + 2:
+        raise TrajectoryError(
+            f"{where}: has {powers - 2} control points in a segment, more than {_INNER}."
+        )
+    pieces = np.zeros((len(inner), 4, max(powers, 2)))
+    for k, ((begin, end), between) in enumerate(zip(pairwise(ends), inner, strict=True)):
+        middle = _floats(between or np.zeros((0, 3)), (None, 3), lambda k=k: told(k + 1))
+        control = np.vstack([begin, middle, end])
+        for axis in range(3):
+            pieces[k, axis, : len(control)] = of_bernstein(control[:, axis], time[k + 1] - time[k])
+    curve = Curve(time + start, pieces)
+    if yaw is None:
+        pieces[:, 3] = np.nan
+        return curve
+    setpoints = _floats(
+        _get(yaw, "setpoints", list, where), (None, 2), lambda: f"{where}: yaw setpoints"
+    )
+    if (np.diff(setpoints[:, 0]) < 0.0).any():
+        raise TrajectoryError(f"{where}: yaw setpoints: times go back. Give increasing times.")
+    if not len(setpoints):
+        pieces[:, 3] = np.nan
+        return curve
+    return with_headings(curve, setpoints[:, 0] + start, np.radians(setpoints[:, 1]))
+
+
+def _floats(given: Any, shape: tuple[int | None, ...], where: Callable[[], str]) -> Any:
+    """Finite numbers of a shape, in which None is any length."""
+    try:
+        found = np.asarray(given, dtype=float)
+    except (TypeError, ValueError, OverflowError):
+        found = np.array(np.nan)
+    fits = found.ndim == len(shape) and all(
+        n in (None, m) for n, m in zip(shape, found.shape, strict=True)
+    )
+    if not fits or not np.isfinite(found).all() or isinstance(given, str | bool):
+        words = "numbers" if shape else "a number"
+        raise TrajectoryError(f"{where()}: has {str(given)[:60]!r} where {words} must be.")
+    return found if shape else float(found)

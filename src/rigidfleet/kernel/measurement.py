@@ -1,0 +1,461 @@
+"""What follows from the recorded positions and forces of a flight: attitude, rates, wrench, thrust, singular values.
+
+One pass over all samples. Attitudes are those of the formation's slots, fitted to the agents (Wahba's problem): the
+quaternion is the eigenvector of the largest eigenvalue of Davenport's matrix K, found as in QUEST by Newton's method
+on the characteristic polynomial (Shuster and Oh 1981, doi:10.2514/3.19717; Theobald 2005,
+doi:10.1107/S0108767305015266).
+"""
+
+import math
+
+from rigidfleet.kernel.compiler.jit import compiled, exact
+from rigidfleet.kernel.linalg import jacobi_eigen, least_eigenvalue
+from rigidfleet.kernel.rigid_body import (
+    attitude_matrix,
+    centre_of_mass,
+    inertia,
+    inertia_inverse,
+    multiply,
+    multiply_transposed,
+)
+
+#: Slots thinner than this, relative to their length, count as a line in an attitude fit.
+_THIN = 1e-3
+#: Slots narrower than the first count as a line unless their width exceeds the agents' errors by the second factor.
+_NARROW, _SURE = 0.1, 4.0
+#: A rotation counts as half a turn if 1 + cos of its angle is smaller: within 1e-8 rad.
+_HALF_TURN = 5e-17
+#: Share of K's size, to the third power, below which the product of the gaps between its largest eigenvalue and the
+#: others is too small for the root of a polynomial; the error grows with the inverse square of the gap.
+_MULTIPLE = 0.03
+#: Eigenvalues of J J^T below this share of the largest count as zero.
+_ZERO = 1e-14
+
+
+@compiled
+def fit(B, K, V, w, q):
+    """Unit quaternion q (4,) of the rotation T that maximises tr(T B^T), B = sum m p x^T (3, 3)."""
+    trace = B[0, 0] + B[1, 1] + B[2, 2]
+    a, b, c = B[1, 2] - B[2, 1], B[2, 0] - B[0, 2], B[0, 1] - B[1, 0]
+    size = 0.0
+    for i in range(3):
+        for j in range(3):
+            size += B[i, j] * B[i, j]
+            K[1 + i, 1 + j] = B[i, j] + B[j, i]
+        K[1 + i, 1 + i] -= trace
+    K[0, 0], K[0, 1], K[0, 2], K[0, 3] = trace, a, b, c
+    K[1, 0], K[2, 0], K[3, 0] = a, b, c
+    # det (K - x) = x^4 - 2 |B|^2 x^2 - 8 det B x + det K: Newton's method, from above all roots.
+    det = (
+        B[0, 0] * (B[1, 1] * B[2, 2] - B[1, 2] * B[2, 1])
+        - B[0, 1] * (B[1, 0] * B[2, 2] - B[1, 2] * B[2, 0])
+        + B[0, 2] * (B[1, 0] * B[2, 1] - B[1, 1] * B[2, 0])
+    )
+    second, first = -2.0 * size, -8.0 * det
+    last = determinant(K)
+    x = math.sqrt(3.0 * size)
+    for _ in range(60):
+        square = x * x
+        value = (square + second) * square + first * x + last
+        slope = (4.0 * square + 2.0 * second) * x + first
+        step = value / slope if slope > 0.0 else 0.0
+        x -= step
+        if not abs(step) > 1e-15 * x:
+            break
+    for i in range(4):
+        K[i, i] -= x
+    # The eigenvector is a column of the adjugate; the longest one is accurate.
+    most = 0.0
+    for i in range(4):
+        length = cofactors(K, i, V[1])
+        if length > most:
+            most = length
+            for j in range(4):
+                q[j] = V[1, j]
+    if most > (_MULTIPLE * size * math.sqrt(size)) ** 2:
+        scale = 1.0 / math.sqrt(most)
+        for j in range(4):
+            q[j] *= scale
+        return
+    # Several rotations fit almost equally well
+    for i in range(4):
+        K[i, i] += x
+    largest, at = jacobi_eigen(K, V, w), 0
+    for i in range(4):
+        if w[i] == largest:
+            at = i
+    for j in range(4):
+        q[j] = V[j, at]
+
+
+@compiled
+def cofactors(K, i, out):
+    """Row i of the cofactors of K (4, 4) into out (4,); returns the square of their length."""
+    a, b, c = K[0], K[1], K[2]
+    if i < 3:
+        c = K[3]
+    if i < 2:
+        b = K[2]
+    if i < 1:
+        a = K[1]
+    sign, total = 1.0 if i % 2 == 0 else -1.0, 0.0
+    for j in range(4):
+        k, l, m = 0 if j > 0 else 1, 1 if j > 1 else 2, 2 if j > 2 else 3
+        minor = (
+            a[k] * (b[l] * c[m] - b[m] * c[l])
+            - a[l] * (b[k] * c[m] - b[m] * c[k])
+            + a[m] * (b[k] * c[l] - b[l] * c[k])
+        )
+        out[j] = sign * minor
+        sign = -sign
+        total += minor * minor
+    return total
+
+
+@compiled
+def determinant(K):
+    """Determinant of K (4, 4)."""
+    s0, s1 = K[0, 0] * K[1, 1] - K[1, 0] * K[0, 1], K[0, 0] * K[1, 2] - K[1, 0] * K[0, 2]
+    s2, s3 = K[0, 0] * K[1, 3] - K[1, 0] * K[0, 3], K[0, 1] * K[1, 2] - K[1, 1] * K[0, 2]
+    s4, s5 = K[0, 1] * K[1, 3] - K[1, 1] * K[0, 3], K[0, 2] * K[1, 3] - K[1, 2] * K[0, 3]
+    c5, c4 = K[2, 2] * K[3, 3] - K[3, 2] * K[2, 3], K[2, 1] * K[3, 3] - K[3, 1] * K[2, 3]
+    c3, c2 = K[2, 1] * K[3, 2] - K[3, 1] * K[2, 2], K[2, 0] * K[3, 3] - K[3, 0] * K[2, 3]
+    c1, c0 = K[2, 0] * K[3, 2] - K[3, 0] * K[2, 2], K[2, 0] * K[3, 1] - K[3, 0] * K[2, 1]
+    return s0 * c5 - s1 * c4 + s2 * c3 + s3 * c2 - s4 * c1 + s5 * c0
+
+
+@compiled
+def quaternion_of(T, q):
+    """Unit quaternion q (4,) of a rotation T (3, 3): the longest column of 4 q q^T."""
+    a, b, c = T[0, 0], T[1, 1], T[2, 2]
+    q0, q1, q2, q3 = 1.0 + a + b + c, 1.0 + a - b - c, 1.0 - a + b - c, 1.0 - a - b + c
+    x, y, z = T[1, 2] - T[2, 1], T[2, 0] - T[0, 2], T[0, 1] - T[1, 0]
+    f, g, h = T[0, 1] + T[1, 0], T[0, 2] + T[2, 0], T[1, 2] + T[2, 1]
+    if q0 >= q1 and q0 >= q2 and q0 >= q3:
+        q[0], q[1], q[2], q[3] = q0, x, y, z
+    elif q1 >= q2 and q1 >= q3:
+        q[0], q[1], q[2], q[3] = x, q1, f, g
+    elif q2 >= q3:
+        q[0], q[1], q[2], q[3] = y, f, q2, h
+    else:
+        q[0], q[1], q[2], q[3] = z, g, h, q3
+    scale = 1.0 / math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+    for k in range(4):
+        q[k] *= scale
+
+
+@compiled
+def continued(q, last):
+    """Choose the sign of a quaternion q (4,): no jump from the one before, ``last``, or else q0 >= 0."""
+    if math.isnan(q[0] + q[1] + q[2] + q[3]):
+        return
+    along = 0.0
+    for k in range(4):
+        along += q[k] * last[k]
+    if along < 0.0:
+        for k in range(4):
+            q[k] = -q[k]
+    for k in range(4):
+        last[k] = q[k]
+
+
+@compiled
+def extent(p, root, C, V, w, axis):
+    """Width and length of slots p (N, 3), weighted by ``root`` (N,); the direction of the length into ``axis`` (3,).
+
+    For slots too wide to be a line, two numbers with a ratio that shows this, and no axis.
+    """
+    for a in range(3):
+        axis[a] = 0.0
+        for b in range(a + 1):
+            s = 0.0
+            for i in range(p.shape[0]):
+                s += root[i] * root[i] * p[i, a] * p[i, b]
+            C[a, b] = C[b, a] = s
+    # Eigenvalues a >= b >= c of C: with s = a + b + c, b >= (ab + ac + bc) / 3s.
+    s, square = C[0, 0] + C[1, 1] + C[2, 2], 0.0
+    for a in range(3):
+        for b in range(3):
+            square += C[a, b] * C[a, b]
+    length = math.sqrt(s)
+    width = math.sqrt(max(s * s - square, 0.0) / (6.0 * s)) if s > 0.0 else 0.0
+    if width > _NARROW * length:
+        return width, length
+    jacobi_eigen(C, V, w)
+    k = 0
+    for a in range(1, 3):
+        if w[a] > w[k]:
+            k = a
+    for a in range(3):
+        axis[a] = V[a, k]
+    second = max(w[0] if k != 0 else w[1], w[2] if k != 2 else w[1])
+    return math.sqrt(max(second, 0.0)), math.sqrt(max(w[k], 0.0))
+
+
+@compiled
+def lay_line(x, p, axis, near, T, now, there, across):
+    """Attitude T (3, 3) of a line: ``near``, followed by the smallest rotation that lays its axis along the agents."""
+    for a in range(3):
+        there[a] = 0.0
+    for i in range(x.shape[0]):
+        along = p[i, 0] * axis[0] + p[i, 1] * axis[1] + p[i, 2] * axis[2]
+        for a in range(3):
+            there[a] += along * x[i, a]
+    length = math.sqrt(there[0] ** 2 + there[1] ** 2 + there[2] ** 2)
+    if length == 0.0:
+        for a in range(3):
+            for b in range(3):
+                T[a, b] = near[a, b]
+        return
+    multiply_transposed(near, axis, now)
+    close = square = 0.0  # 1 + c with the cosine c of the angle, accurate up to half a turn
+    for a in range(3):
+        there[a] /= length
+        close += 0.5 * (now[a] + there[a]) ** 2
+    if close < _HALF_TURN:
+        # Half a turn, about any axis perpendicular to the line: R = 2 n n^T - 1
+        k = 0
+        for a in range(1, 3):
+            if abs(now[a]) < abs(now[k]):
+                k = a
+        i, j = (k + 1) % 3, (k + 2) % 3
+        scale = 1.0 / math.sqrt(now[i] * now[i] + now[j] * now[j])
+        across[k], across[i], across[j] = 0.0, now[j] * scale, -now[i] * scale
+        for a in range(3):
+            s = near[a, 0] * across[0] + near[a, 1] * across[1] + near[a, 2] * across[2]
+            for b in range(3):
+                T[a, b] = 2.0 * s * across[b] - near[a, b]
+        return
+    # T = near R^T with R = 1 + [n x] + [n x]^2 / (1 + c), n = now x there
+    for a in range(3):
+        b, c = (a + 1) % 3, (a + 2) % 3
+        across[a] = now[b] * there[c] - now[c] * there[b]
+        square += across[a] * across[a]
+    for k in range(3):
+        along = near[k, 0] * across[0] + near[k, 1] * across[1] + near[k, 2] * across[2]
+        for a in range(3):
+            b, c = (a + 1) % 3, (a + 2) % 3
+            T[k, a] = near[k, a] - (near[k, b] * across[c] - near[k, c] * across[b])
+            T[k, a] += (along * across[a] - square * near[k, a]) / close
+
+
+@compiled
+def line_inverse(I, C, V, w, out):
+    """Pseudo-inverse of an inertia I (3, 3) into out, without the spin of a line about itself."""
+    for a in range(3):
+        for b in range(3):
+            C[a, b] = I[a, b]
+            out[a, b] = 0.0
+    largest = jacobi_eigen(C, V, w)
+    for k in range(3):
+        if w[k] > _NARROW * _NARROW * largest:
+            for a in range(3):
+                for b in range(3):
+                    out[a, b] += V[a, k] * V[b, k] / w[k]
+
+
+@compiled
+def attitude_of(m, k, known, line_known, near, work, T):
+    """Attitude of the slots at sample k into ``m.attitude`` and T (3, 3); returns whether they count as a line.
+
+    ``near`` (3, 3) is the attitude expected, commanded (``known``) or that of the sample before. ``line_known`` tells
+    that the slots are those of the sample before, whose extent is in ``work[7]``.
+    """
+    x, p, mass, root = m.x[0], m.x[1], m.who[0], m.who[1]
+    B, K, V, w, axis, size = work[0], work[1], work[2], work[3, 0], work[7, 0], work[7, 1]
+    n = x.shape[0]
+    if not line_known:
+        size[0], size[1] = extent(p, root, K, V, w, axis)
+    width, length = size[0], size[1]
+    line = width <= _THIN * length
+    if line or (known and width <= _NARROW * length):
+        lay_line(x, p, axis, near, T, work[3, 1], work[3, 2], work[3, 3])
+        if not line:
+            off = 0.0
+            for i in range(n):
+                for a in range(3):
+                    d = x[i, a] - (p[i, 0] * T[0, a] + p[i, 1] * T[1, a] + p[i, 2] * T[2, a])
+                    off += mass[i] * d * d
+            line = width <= _SURE * math.sqrt(off)
+        if line:
+            quaternion_of(T, m.attitude[k])
+            return True
+    for a in range(3):
+        for b in range(3):
+            s = 0.0
+            for i in range(n):
+                s += mass[i] * p[i, a] * x[i, b]
+            B[a, b] = s
+    fit(B, K, V, w, m.attitude[k])
+    attitude_matrix(m.attitude[k], T)
+    return False
+
+
+@compiled
+def measure(m):
+    """Measure all samples."""
+    n, work = m.mass.shape[0], m.work
+    T, near, last = work[4], work[5], work[6]
+    centre, zero = work[7, 2], work[7, 3]
+    I, inverse, h, omega = work[0], work[1], work[3, 0], work[3, 1]
+    for a in range(4):
+        for b in range(4):
+            last[a, b] = 0.0
+    last[0, 0] = last[1, 0] = 1.0
+    mass, root = m.who[0], m.who[1]
+    for piece in range(m.attached.shape[0]):
+        first = m.start[piece]
+        commanded = first < m.start[piece + 1] and not math.isnan(m.T_ref[first, 0, 0])
+        for k in range(first, m.start[piece + 1]):
+            M, left = 0.0, 0
+            for i in range(n):
+                mass[i] = m.mass[i] if m.time[k] <= m.lost_at[i] else 0.0
+                root[i] = math.sqrt(mass[i])
+                M += mass[i]
+                left += 1 if mass[i] > 0.0 else 0
+            same = k > first
+            if same:
+                for i in range(n):
+                    for a in range(3):
+                        same = same and m.p[k, i, a] == m.p[k - 1, i, a]
+            motion(m, k, mass, M)
+            line = False
+            if m.attached[piece]:
+                centre_of_mass(m.p[k], mass, M, centre)
+                for i in range(n):
+                    for a in range(3):
+                        m.x[1, i, a] = m.p[k, i, a] - centre[a]
+                if commanded:
+                    for a in range(3):
+                        for b in range(3):
+                            near[a, b] = m.T_ref[k, a, b]
+                line = m.line[k] = attitude_of(m, k, commanded, same, near, work, T)
+                for a in range(3):
+                    for b in range(3):
+                        near[a, b] = T[a, b]
+            elif m.framed:
+                for a in range(4):
+                    m.attitude[k, a] = m.frame[k, a]
+                attitude_matrix(m.attitude[k], T)
+            else:
+                for a in range(4):
+                    m.attitude[k, a] = math.nan
+            continued(m.attitude[k], last[0])
+            if not math.isnan(m.T_ref[k, 0, 0]):
+                quaternion_of(m.T_ref[k], m.attitude_reference[k])
+                continued(m.attitude_reference[k], last[1])
+            if k == 0 or math.isnan(last[2, 0]):
+                for a in range(4):
+                    last[2, a] = m.frame[k, a]
+            continued(m.frame[k], last[2])
+            angular_momentum(m, k, mass, h)
+            inertia(m.x[0], mass, zero, I)
+            if line:
+                line_inverse(I, work[8], work[2], work[3, 2], inverse)
+            else:
+                inertia_inverse(I, inverse)
+            multiply(inverse, h, omega)
+            if left < 2:
+                omega[0] = omega[1] = omega[2] = 0.0
+            if math.isnan(m.attitude[k, 0]):
+                for a in range(3):
+                    m.rates[k, a] = math.nan
+            else:
+                multiply(T, omega, m.rates[k])
+                if left < n:
+                    move_origin(m, k, T, centre, omega, h)
+
+
+@compiled
+def move_origin(m, k, T, centre, omega, offset):
+    """Move the centre of mass of the agents left to the origin of the body, of which some agents are missing."""
+    multiply_transposed(T, centre, offset)
+    for a in range(3):
+        b, c = (a + 1) % 3, (a + 2) % 3
+        m.cm[k, a] -= offset[a]
+        m.cm_velocity[k, a] -= omega[b] * offset[c] - omega[c] * offset[b]
+
+
+@exact
+def length(x, y, z):
+    """Length of a vector."""
+    return math.sqrt(x * x + y * y + z * z)
+
+
+@compiled
+def motion(m, k, mass, M):
+    """Centre of mass, wrench, thrust and distances at sample k; agents about their centre of mass into ``m.x``."""
+    r, v, f, g = m.r[k], m.v[k], m.f_u[k], m.f_C[k]
+    n = r.shape[0]
+    centre_of_mass(r, mass, M, m.cm[k])
+    centre_of_mass(v, mass, M, m.cm_velocity[k])
+    for a in range(6):
+        m.wrench[k, a] = 0.0
+    for i in range(n):
+        for a in range(3):
+            m.x[0, i, a] = r[i, a] - m.cm[k, a]
+            m.wrench[k, a] += f[i, a]
+        thrust = length(f[i, 0] + g[i, 0], f[i, 1] + g[i, 1], f[i, 2] + g[i, 2])
+        m.thrust[k, i] = m.limit[i] if thrust > m.limit[i] else thrust
+        x, y, z = m.x[0, i, 0], m.x[0, i, 1], m.x[0, i, 2]
+        m.wrench[k, 3] += y * f[i, 2] - z * f[i, 1]
+        m.wrench[k, 4] += z * f[i, 0] - x * f[i, 2]
+        m.wrench[k, 5] += x * f[i, 1] - y * f[i, 0]
+    for e in range(m.edges.shape[0]):
+        i, j = m.edges[e, 0], m.edges[e, 1]
+        x, y, z = r[i, 0] - r[j, 0], r[i, 1] - r[j, 1], r[i, 2] - r[j, 2]
+        both = mass[i] > 0.0 and mass[j] > 0.0
+        m.distance[k, e] = length(x, y, z) if both else math.nan
+
+
+@compiled
+def angular_momentum(m, k, mass, h):
+    """h = sum m x cross v about the centre of mass at sample k, Eq. (17), into h (3,)."""
+    V, v, x = m.cm_velocity[k], m.v[k], m.x[0]
+    h[0] = h[1] = h[2] = 0.0
+    for i in range(x.shape[0]):
+        X, Y, Z = v[i, 0] - V[0], v[i, 1] - V[1], v[i, 2] - V[2]
+        h[0] += mass[i] * (x[i, 1] * Z - x[i, 2] * Y)
+        h[1] += mass[i] * (x[i, 2] * X - x[i, 0] * Z)
+        h[2] += mass[i] * (x[i, 0] * Y - x[i, 1] * X)
+
+
+@compiled
+def spectrum(s):
+    """The smallest non-zero singular value of J, Eq. (5), at each sample, from the smaller of J J^T and J^T J."""
+    edges, u, A = s.edges, s.u, s.A
+    m, n = edges.shape[0], s.r.shape[1]
+    for k in range(s.r.shape[0]):
+        r = s.r[k]
+        for e in range(m):
+            i, j = edges[e, 0], edges[e, 1]
+            x, y, z = r[i, 0] - r[j, 0], r[i, 1] - r[j, 1], r[i, 2] - r[j, 2]
+            inverse = 1.0 / math.sqrt(x * x + y * y + z * z)
+            u[e, 0], u[e, 1], u[e, 2] = x * inverse, y * inverse, z * inverse
+        if m <= 3 * n:
+            for e in range(m):
+                i, j = edges[e, 0], edges[e, 1]
+                for o in range(e + 1):
+                    a, b = edges[o, 0], edges[o, 1]
+                    sign = 0.0
+                    sign += 1.0 if i == a else 0.0
+                    sign += 1.0 if j == b else 0.0
+                    sign -= 1.0 if i == b else 0.0
+                    sign -= 1.0 if j == a else 0.0
+                    if sign != 0.0:
+                        sign *= u[e, 0] * u[o, 0] + u[e, 1] * u[o, 1] + u[e, 2] * u[o, 2]
+                    A[e, o] = sign
+        else:
+            for a in range(3 * n):
+                for b in range(3 * n):
+                    A[a, b] = 0.0
+            for e in range(m):
+                i, j = 3 * edges[e, 0], 3 * edges[e, 1]
+                for a in range(3):
+                    for b in range(3):
+                        uv = u[e, a] * u[e, b]
+                        A[i + a, i + b] += uv
+                        A[j + a, j + b] += uv
+                        A[i + a, j + b] -= uv
+                        A[j + a, i + b] -= uv
+        s.least[k] = math.sqrt(least_eigenvalue(A, s.work[0], s.work[1], s.work[2], _ZERO))

@@ -1,0 +1,77 @@
+"""Polynomials by their Bernstein coefficients (control points), and their greatest values in continuous time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from math import comb
+from typing import NamedTuple
+
+import numpy as np
+
+from rigidfleet.typing import Floats
+
+#: Relative accuracy of a greatest value, and the most halvings of a piece.
+_CLOSE, _HALVINGS = 1e-10, 50
+
+
+def bernstein(pieces: Floats, duration: Floats) -> Floats:
+    """Bernstein coefficients (n, ..., P), or control points, of pieces (n, ..., P) of durations (n,) [s]."""
+    powers = pieces.shape[-1]
+    scaled = pieces * duration.reshape(-1, *(1,) * (pieces.ndim - 1)) ** np.arange(powers)
+    return scaled @ _to_bernstein(powers).T
+
+
+def of_bernstein(points: Floats, duration: float) -> Floats:
+    """Coefficients (P,) in ascending powers of time of a piece with control points (P,) and a duration [s]."""
+    powers = len(points)
+    return np.linalg.solve(_to_bernstein(powers), points) / duration ** np.arange(powers)
+
+
+@cache
+def _to_bernstein(powers: int) -> Floats:
+    """The matrix of Bernstein coefficients b_i = sum_k C(i, k) / C(P - 1, k) a_k on [0, 1]."""
+    return np.array(
+        [[comb(i, k) / comb(powers - 1, k) for k in range(powers)] for i in range(powers)]
+    )
+
+
+@cache
+def _halving(powers: int) -> Floats:
+    """Matrices (2, P, P) from the control points of a piece to those of its first and of its second half."""
+    first = np.array([[comb(i, k) / 2.0**i for k in range(powers)] for i in range(powers)])
+    return np.stack([first, first[::-1, ::-1]])
+
+
+class Greatest(NamedTuple):
+    """A greatest value, the curve that has it, and where on that curve, from 0 to 1."""
+
+    value: float
+    curve: int
+    place: float
+
+
+def greatest(points: Floats, size: Callable[[Floats], Floats]) -> Greatest:
+    """Greatest value of a convex function over curves with control points (M, 3, P), to 1e-10 of the value.
+
+    ``size`` maps (..., 3) to (...). A curve lies within the hull of its control points, where a convex function is
+    greatest at one of them. Curves that may have the greatest value are halved until their hulls promise no more.
+    """
+    who, start, width = np.arange(len(points)), np.zeros(len(points)), 1.0
+    best = Greatest(-np.inf, -1, 0.0)
+    halving = _halving(points.shape[-1])
+    for _ in range(_HALVINGS):
+        sizes = size(np.moveaxis(points, -1, 1))  # (M, P)
+        ends = sizes[:, [0, -1]]
+        if len(ends) and ends.max() > best.value:
+            k, end = divmod(int(ends.argmax()), 2)
+            best = Greatest(float(ends[k, end]), int(who[k]), float(start[k] + end * width))
+        bound = sizes.max(axis=1) if len(sizes) else np.zeros(0)
+        open_ = bound > best.value + _CLOSE * max(abs(best.value), 1e-3)
+        if not open_.any():
+            break
+        points = np.einsum("hij,maj->hmai", halving, points[open_]).reshape(-1, *points.shape[1:])
+        width *= 0.5
+        who = np.tile(who[open_], 2)
+        start = np.concatenate([start[open_], start[open_] + width])
+    return best

@@ -1,0 +1,511 @@
+"""Flights that others made, as results: judged, drawn, replayed and exported like one's own.
+
+A trajectory is a piecewise polynomial for each vehicle. Its extremes are those of the curve, in continuous time, by the
+same monitor that watches our own flights; what was recorded elsewhere is not read. The monitor takes curves of fourth
+degree: pieces of a higher one are cut so short that they are within a micrometre of such a curve.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rigidfleet.errors import ResultError
+from rigidfleet.foreign.samples import ASSUMED
+from rigidfleet.interchange.curves import Curve
+from rigidfleet.kernel import records
+from rigidfleet.kernel.problem import workspace
+from rigidfleet.math import proximity, series, splines
+from rigidfleet.math.bernstein import bernstein, greatest
+from rigidfleet.mission import Mission, load_mission
+from rigidfleet.planning.plan import plan_phase
+from rigidfleet.planning.reference import PhaseState
+from rigidfleet.result import Extremum, PhaseRecord, Result
+from rigidfleet.simulation.extremes import Extremes
+from rigidfleet.typing import Floats
+
+#: Greatest distance [m] of a curve of fourth degree from the piece that it stands for, and most parts of a piece.
+_CLOSE, _PARTS = 1e-6, 256
+#: Greatest jump of a position between two pieces [m]; a larger one is no flight.
+_JUMP = 1e-3
+#: Numbers of a result, and of a part of the pieces that is processed together.
+_MOST, _TOGETHER = 5e8, 4_000_000
+#: Time between samples [s], unless the trajectory itself has more; about so many in all.
+_STEP, _SAMPLES = 0.05, 2_000_000
+#: Times that are nearer to each other than this are one [s].
+_SAME = 1e-9
+#: Where a start is moved to zero: a time of a clock, not of a flight [s].
+_CLOCK = 1e5
+NAMES = {
+    1: ASSUMED["linear"],
+    3: "cubics",
+    5: "quintics",
+    7: "polynomials of degree 7",
+}
+#: Limits of a mission that positions over time do not show.
+UNJUDGED = ("jerk", "tilt_deg", "saturation", "tracking_error", "separation_allowance")
+#: Name of the only phase.
+PHASE = "flight"
+
+
+class Pieces:
+    """Trajectories of N vehicles with common ends of their pieces.
+
+    Attributes
+    ----------
+    time : (K,) ends of the pieces [s]
+    position : (K - 1, N, 3, P) coefficients [m] in ascending powers of the time since the beginning of a piece
+    yaw : (K, N) [rad], NaN where it is not known
+    """
+
+    def __init__(self, time: Floats, position: Floats, yaw: Floats | None = None) -> None:
+        self.time, self.position = time, position
+        n = position.shape[1]
+        self.yaw = np.full((len(time), n), np.nan) if yaw is None else yaw
+
+    def cut(self, times: Floats) -> Pieces:
+        """The same trajectories, with ends of pieces also at these times."""
+        inside = times[(times > self.time[0]) & (times < self.time[-1])]
+        near = np.searchsorted(self.time, inside)
+        far = np.minimum(inside - self.time[near - 1], self.time[near] - inside)
+        time = np.union1d(self.time, inside[far > 1e-6])
+        k = np.searchsorted(self.time, time[:-1], side="right") - 1
+        moved = series.of_polynomials(
+            self.position[k], time[:-1] - self.time[k], self.position.shape[-1]
+        )
+        yaw = np.stack([np.interp(time, self.time, x) for x in self.yaw.T], axis=1)
+        return Pieces(time, np.moveaxis(moved, 0, -1), yaw)
+
+    def states(self) -> tuple[Floats, Floats]:
+        """Derivatives 0 to 3 (4, K - 1, N, 3) at the beginning and at the end of each piece."""
+        ends = np.stack([np.zeros(len(self.time) - 1), np.diff(self.time)])
+        first, last = (series.derivatives(series.of_polynomials(self.position, t, 4)) for t in ends)
+        return first, last
+
+
+def trajectories(
+    time: ArrayLike,
+    position: ArrayLike,
+    *,
+    velocity: ArrayLike | None = None,
+    acceleration: ArrayLike | None = None,
+    jerk: ArrayLike | None = None,
+    yaw: ArrayLike | None = None,
+    cubic: bool = False,
+    mission: Mission | str | Path | None = None,
+    separation: float | None = None,
+    limits: Mapping[str, float] | None = None,
+    radius: float = 0.0,
+    ground: float | None = None,
+    name: str = "trajectories",
+) -> Result:
+    """A flight that others made, from samples: a result that is judged, drawn, replayed and exported like any.
+
+    Between samples, vehicles move on polynomials that meet all that is given: straight lines through positions, cubics
+    through velocities, too, quintics through accelerations, and degree 7 through jerks. The verdict says so, and
+    "passed" covers this curve.
+
+    >>> import numpy as np
+    >>> import rigidfleet as rf
+    >>> t = np.linspace(0, 10, 101)
+    >>> x = np.stack([t, 0 * t, 2 + 0 * t], axis=1)
+    >>> flight = rf.trajectories(t, np.stack([x, x + [0, 1, 0]], axis=1), separation=0.9)
+    >>> rf.assess(flight).passed
+    True
+
+    Parameters
+    ----------
+    time : (K,) [s], increasing
+    position : (K, N, 3) [m], world axes (z up)
+    velocity, acceleration, jerk : (K, N, 3); each needs those before
+    yaw : (K, N) [rad]
+    cubic : without velocities, cubic splines with continuous acceleration (`scipy.interpolate.CubicSpline`) instead of
+        lines
+    mission : a mission, its name or path: the radii and masses of its vehicles, its limits and obstacles count, instead
+        of what follows
+    separation : least distance of centres, less their radii [m]
+    limits : further keys of `[limits]`
+    radius : of every vehicle [m]; 0: separation is centre to centre
+    ground : height of the ground [m]; None: there is none
+    name : of the result
+
+    Raises
+    ------
+    ResultError
+        The arrays are no trajectories: a wrong shape, values that are not finite, times that do not increase.
+    MissionError
+        A limit is invalid.
+    """
+    t = _checked("time", time, 1)
+    states = [_checked("position", position, 3)]
+    lacks = ""
+    for what, given in (("velocity", velocity), ("acceleration", acceleration), ("jerk", jerk)):
+        if given is None:
+            lacks = lacks or what
+        elif lacks:
+            raise ResultError(
+                f"without {lacks}, {what} says nothing. Give {lacks}, or leave {what} out."
+            )
+        else:
+            states.append(_checked(what, given, 3))
+    shape = (len(t), states[0].shape[1], 3)
+    for what, x in zip(("position", "velocity", "acceleration", "jerk"), states, strict=False):
+        if x.shape != shape:
+            raise ResultError(
+                f"{what} has shape {x.shape}, expected {shape}: samples, vehicles, x y z."
+            )
+    if len(t) < 2:
+        raise ResultError("a trajectory needs two samples or more.")
+    if not (np.diff(t) > 0).all():
+        k = int(np.argmin(np.diff(t)))
+        raise ResultError(
+            f"times must increase: sample {k + 2} is at {t[k + 1]:g} s, the one before at {t[k]:g} s."
+        )
+    yaws = None if yaw is None else _checked("yaw", yaw, 2)
+    if yaws is not None and yaws.shape != shape[:2]:
+        raise ResultError(f"yaw has shape {yaws.shape}, expected {shape[:2]}: samples, vehicles.")
+    if cubic and len(states) == 1:
+        from scipy.interpolate import CubicSpline
+
+        pieces = np.moveaxis(CubicSpline(t, states[0]).c[::-1], 0, -1)
+        how = ASSUMED["cubic"]
+    elif len(states) == 1:
+        slope = np.diff(states[0], axis=0) / np.diff(t)[:, None, None]
+        pieces, how = np.stack([states[0][:-1], slope], axis=-1), NAMES[1]
+    else:
+        x = np.stack(states)
+        pieces = splines.hermite(np.diff(t), x[:, :-1], x[:, 1:])
+        how = NAMES[2 * len(states) - 1]
+    return of_pieces(
+        Pieces(t, pieces, yaws), how,
+        mission=mission, separation=separation, limits=limits, radius=radius, ground=ground, name=name,
+    )  # fmt: skip
+
+
+def _checked(name: str, given: ArrayLike, dimensions: int) -> Floats:
+    try:
+        x = np.asarray(given, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ResultError(f"{name} is no array of numbers.") from None
+    if x.ndim != dimensions or not x.size:
+        raise ResultError(
+            f"{name} has shape {x.shape}; it needs {dimensions} dimensions, none of them empty."
+        )
+    if not np.isfinite(x).all():
+        where = ", ".join(str(k + 1) for k in np.argwhere(~np.isfinite(x))[0])
+        raise ResultError(f"{name} has a value that is not finite, first at ({where}).")
+    return x
+
+
+def judged_as(
+    start: Floats,
+    duration: float,
+    *,
+    mission: Mission | str | Path | None = None,
+    separation: float | None = None,
+    limits: Mapping[str, float] | None = None,
+    radius: float = 0.0,
+    ground: float | None = None,
+    name: str = "trajectories",
+) -> Mission:
+    """The mission against which trajectories are judged: one phase, in which nothing is commanded.
+
+    Parameters
+    ----------
+    start : (N, 3) positions at the start [m]
+    duration : [s]
+    mission : its vehicles' radii and masses, limits and obstacles count, instead of what follows
+    separation : least distance of centres, less their radii [m]
+    limits : further keys of `[limits]`
+    radius : of every vehicle [m]; 0: separation is centre to centre
+    ground : height of the ground [m]; None: there is none
+
+    Raises
+    ------
+    MissionError
+        A limit is invalid.
+    ResultError
+        The mission has another number of vehicles.
+    """
+    phase = {"kind": "hold", "name": PHASE, "control": "open", "duration": max(duration, 1e-3)}
+    if mission is not None:
+        given = mission if isinstance(mission, Mission) else load_mission(mission)
+        if given.n_agents != len(start):
+            raise ResultError(
+                f"the mission {given.name!r} has {given.n_agents} agents, and there are {len(start)} trajectories."
+            )
+        kept = (
+            "schema_version",
+            "name",
+            "title",
+            "limits",
+            "obstacles",
+            "gravity",
+            "geodetic_origin",
+        )
+        data = {key: x for key, x in given.to_dict().items() if key in kept}
+        bounds = data.get("limits", {})
+        data["limits"] = {key: x for key, x in bounds.items() if key not in UNJUDGED}
+        agents: dict[str, Any] = {
+            "radius": list(given.agents.radius),
+            "mass": list(given.agents.mass),
+        }
+    else:
+        bounds = dict(limits or {}) | ({} if separation is None else {"separation": separation})
+        data = {"schema_version": 1, "name": name, "limits": bounds}
+        if ground is not None:
+            data["obstacles"] = [{"kind": "ground", "height": ground}]
+        agents = {"radius": radius, "mass": 1.0}
+    agents["position"] = start.tolist()
+    return Mission.from_dict(data | {"agents": agents, "phases": [phase]}, "the limits")
+
+
+def of_pieces(
+    pieces: Pieces, interpolation: str, *, names: Sequence[str] = (), **judged: Any
+) -> Result:
+    """A result of piecewise polynomials; see `trajectories`.
+
+    Parameters
+    ----------
+    interpolation : what the curves are, in words
+    names : of the vehicles, where they come from
+    judged : see `judged_as`
+
+    Raises
+    ------
+    ResultError
+        A vehicle jumps, or there are too many numbers.
+    MissionError
+        A limit is invalid.
+    """
+    if abs(pieces.time[0]) > _CLOCK or pieces.time[0] < 0.0:
+        pieces = Pieces(pieces.time - pieces.time[0], pieces.position, pieces.yaw)
+    _continuous(pieces)
+    n, span = pieces.position.shape[1], float(pieces.time[-1] - pieces.time[0])
+    step = max(_STEP, span * n / _SAMPLES)
+    grid = pieces.time[0] + step * np.arange(1, math.ceil(span / step))
+    _bounded(n, len(pieces.time) + len(grid))
+    pieces = pieces.cut(grid)
+    first, last = pieces.states()
+    mission = judged_as(first[0, 0], span, **judged)
+    time, state, yaw = _samples(pieces, first, last)
+    record = PhaseRecord(PHASE, "hold", "open", None, float(time[0]), float(time[-1]))
+    smooth = pieces.position.shape[-1] > 2  # lines turn at once at samples
+    _put_extremes(record, mission, pieces, smooth=smooth)
+    if not smooth:
+        state[2:] = np.nan
+    return _result(mission, record, time, state, yaw, interpolation, names)
+
+
+def of_curves(
+    curves: Sequence[Curve], interpolation: str, *, names: Sequence[str] = (), **judged: Any
+) -> Result:
+    """A result of curves with times of their own; before and after its own, a vehicle stays where it is.
+
+    Parameters
+    ----------
+    interpolation, judged : see `of_pieces`
+    names : of the vehicles, where they come from
+
+    Raises
+    ------
+    ResultError, MissionError
+        As for `of_pieces`.
+    """
+    begin, end = min(c.time[0] for c in curves), max(c.time[-1] for c in curves)
+    time = np.unique(np.concatenate([c.time for c in curves]))
+    time = time[np.append(True, np.diff(time) > _SAME)]
+    time[-1] = max(float(time[-1]), float(end))
+    n, powers = len(curves), max(c.pieces.shape[-1] for c in curves)
+    _bounded(n, len(time))
+    position, yaw = np.zeros((len(time) - 1, n, 3, powers)), np.full((len(time), n), np.nan)
+    for i, curve in enumerate(curves):
+        middle = 0.5 * (time[:-1] + time[1:])
+        k = np.clip(np.searchsorted(curve.time, middle, side="right") - 1, 0, len(curve.pieces) - 1)
+        moved = series.of_polynomials(
+            curve.pieces[k, :3], time[:-1] - curve.time[k], curve.pieces.shape[-1]
+        )
+        position[:, i, :, : len(moved)] = np.moveaxis(moved, 0, -1)
+        for outside, at in ((middle < curve.time[0], begin), (middle > curve.time[-1], end)):
+            position[outside, i] = 0.0
+            stay = curve.at(np.array([np.clip(at, curve.time[0], curve.time[-1])]))[0, :3]
+            position[outside, i, :, 0] = stay
+        yaw[:, i] = curve.at(np.clip(time, curve.time[0], curve.time[-1]))[:, 3]
+    return of_pieces(Pieces(time, position, yaw), interpolation, names=names, **judged)
+
+
+def _bounded(n: int, times: int) -> None:
+    """Refuse more numbers than a result may have.
+
+    Raises
+    ------
+    ResultError
+        There are more.
+    """
+    numbers = 2.0 * times * n * 45
+    if numbers > _MOST:
+        raise ResultError(
+            f"{n:,} trajectories with {times:,} times of their own are {numbers:.2g} numbers; the maximum is {_MOST:g}."
+            " Give fewer vehicles, or samples at common times."
+        )
+
+
+def _continuous(pieces: Pieces) -> None:
+    """Refuse trajectories that jump.
+
+    Raises
+    ------
+    ResultError
+        One does.
+    """
+    h = np.diff(pieces.time)[:-1]
+    end = series.of_polynomials(pieces.position[:-1], h, 1)[0]
+    off = np.linalg.norm(pieces.position[1:, ..., 0] - end, axis=2)
+    if off.size and off.max() > _JUMP:
+        k, i = np.unravel_index(int(off.argmax()), off.shape)
+        raise ResultError(
+            f"agent {i + 1} jumps by {off[k, i]:.3g} m at {pieces.time[k + 1]:g} s: its pieces do not join."
+        )
+
+
+def _samples(pieces: Pieces, first: Floats, last: Floats) -> tuple[Floats, Floats, Floats]:
+    """Times (K',), states (4, K', N, 3) and yaws (K', N): one sample at each end of a piece, two where states jump."""
+    before, after = last[:, :-1], first[:, 1:]
+    scale = 1.0 + np.abs(after).max(axis=(1, 2, 3), initial=0.0)
+    jump = (np.abs(after - before) > 1e-9 * scale[:, None, None, None]).any(axis=(0, 2, 3))
+    again = np.flatnonzero(jump) + 1
+    k = np.sort(np.concatenate([np.arange(len(pieces.time)), again]))
+    later = np.append(False, k[1:] == k[:-1])  # the second sample of a jump
+    time = pieces.time[k]
+    time[later] = np.nextafter(time[later], np.inf)
+    state = np.concatenate([first, last[:, -1:]], axis=1)[:, k]
+    state[:, np.flatnonzero(later) - 1] = before[:, again - 1]
+    return time, state, pieces.yaw[k]
+
+
+def _put_extremes(record: PhaseRecord, mission: Mission, pieces: Pieces, *, smooth: bool) -> None:
+    """Give the phase the extremes of the curves, in continuous time."""
+    n = mission.n_agents
+    extremes = Extremes(mission)
+    r, v = (
+        series.derivatives(pieces.position[:1, ..., :2].transpose(3, 0, 1, 2))[k][0] for k in (0, 1)
+    )
+    problem = plan_phase(mission, mission.phases[0], PhaseState(0.0, r, v)).problem
+    work = workspace(n, 0)
+    trail = extremes.begin(6 * n, 0)
+    y = np.zeros(6 * n)
+    state = records.integrator(y, record.t_start, rtol=1e-9, atol=np.ones_like(y), trail=trail)
+    powers = pieces.position.shape[-1]
+    together = max(1, _TOGETHER // (n * 3 * powers))
+    row, best = 0, {}
+    for begin in range(0, len(pieces.position), together):
+        c = pieces.position[begin : begin + together]
+        t, h = pieces.time[begin : begin + len(c)], np.diff(pieces.time[begin : begin + len(c) + 1])
+        for k, parts in enumerate(_parts(c, h)):
+            for part in range(parts):
+                width = h[k] / parts
+                x = part * width + width * records.KNOTS
+                x = series.of_polynomials(np.broadcast_to(c[k], (5, *c[k].shape)), x, 2)
+                trail.clock[row] = t[k] + part * width, width
+                trail.points[row] = records.FROM_KNOTS @ x.reshape(2, 5, -1).swapaxes(0, 1).reshape(
+                    5, -1
+                )
+                row += 1
+                if row == len(trail.clock):
+                    _take(extremes, problem, work, state, row)
+                    row = 0
+        _accelerations(best, c, t, h, n, smooth=smooth)
+    _take(extremes, problem, work, state, row)
+    record.extremes.update(extremes.phase())
+    extremes.flight([record])
+    record.extremes.update(best)
+
+
+def _take(
+    extremes: Extremes, problem: Any, work: Any, state: records.IntegratorState, rows: int
+) -> None:
+    state.count[4] = rows
+    extremes.take_path(problem, work, state)
+
+
+def _parts(c: Floats, h: Floats) -> list[int]:
+    """Into how many parts each piece (M, N, 3, P) of width h (M,) is cut, to be within `_CLOSE` of fourth degree."""
+    beyond = np.abs(c[..., 5:]).max(axis=(1, 2), initial=0.0)
+    power = np.arange(5, c.shape[-1])
+    parts = np.ones(len(c), dtype=np.int64)
+    while True:
+        # Of a position, and of a velocity in the time of a part.
+        off = (beyond * (h / parts)[:, None] ** power * (1.0 + power)).sum(axis=1)
+        wide = (off > _CLOSE) & (parts < _PARTS)
+        if not wide.any():
+            return parts.tolist()
+        parts[wide] *= 2
+
+
+def _accelerations(
+    best: dict[str, Extremum], c: Floats, t: Floats, h: Floats, n: int, *, smooth: bool
+) -> None:
+    """Take the greatest acceleration of some pieces into account; straight lines have none."""
+    if not smooth or c.shape[-1] < 3:
+        return
+    power = np.arange(2, c.shape[-1])
+    a = (c[..., 2:] * (power * (power - 1))).reshape(len(c) * n, 3, -1)
+    points = bernstein(a, np.repeat(h, n))
+    found = greatest(points, lambda x: np.linalg.norm(x, axis=-1))
+    known = best.get("acceleration")
+    if known is None or found.value > known.value:
+        k, i = divmod(found.curve, n)
+        best["acceleration"] = Extremum(found.value, float(t[k] + found.place * h[k]), i, -1)
+
+
+def _result(
+    mission: Mission,
+    record: PhaseRecord,
+    time: Floats,
+    state: Floats,
+    yaw: Floats,
+    interpolation: str,
+    names: Sequence[str],
+) -> Result:
+    r, v, a, j = state
+    k, n = r.shape[:2]
+    radius = mission.agents.radius
+    each, nearest = proximity.obstacle_clearances(r, radius, mission.obstacles, time)
+    separation, pair = proximity.separation(r, np.array(radius))
+    clearance, agent, obstacle = proximity.least_clearance(each, nearest)
+    nothing, none = np.full((k, n, 3), np.nan), np.zeros((k, 0))
+    cm, cm_velocity = r.mean(axis=1), v.mean(axis=1)
+    unknown: dict[str, Any] = {
+        name: np.full((k, size), np.nan)
+        for names, size in (
+            (("attitude", "attitude_reference", "frame"), 4),
+            (("rates", "rates_reference"), 3),
+            (("wrench_asked", "wrench_achieved"), 6),
+        )
+        for name in names
+    }
+    edged = (
+        "distance",
+        "distance_reference",
+        "distance_rate_reference",
+        "constraint",
+        "integral",
+        "multiplier",
+    )
+    empty: dict[str, Any] = dict.fromkeys(edged, none)
+    return Result(
+        time=time, phase=np.zeros(k, dtype=np.int64), position=r, velocity=v, acceleration=a,
+        slot_position=r, slot_velocity=v, slot_acceleration=a, slot_jerk=j,
+        yaw=np.nan_to_num(yaw), yaw_rate=np.zeros((k, n)),
+        input_force=nothing, constraint_force=nothing, external_force=nothing, thrust=nothing[..., 0],
+        cm=cm, cm_velocity=cm_velocity, cm_reference=cm, cm_velocity_reference=cm_velocity,
+        edges=np.zeros((0, 2), dtype=np.int64), **empty, singular_value=np.full(k, np.nan),
+        separation=separation, separation_pair=pair, clearance=clearance, clearance_agent=agent,
+        clearance_obstacle=obstacle, **unknown, phases=[record], mission_text=mission.text,
+        statistics={"interpolation": interpolation, "names": list(names)},
+    )  # fmt: skip

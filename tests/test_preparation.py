@@ -1,0 +1,133 @@
+"""What flights share, and what compiled code is given, leaves no trace in a flight."""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+
+from rigidfleet import simulate
+from rigidfleet.kernel import records
+from rigidfleet.kernel.engine import native, packing
+from rigidfleet.kernel.problem import workspace
+from rigidfleet.mission import Mission, load_mission
+from rigidfleet.result import VARIABLES, Result
+from rigidfleet.simulation.flight import Flight
+
+LOST = {"disturbances": {"lost": [{"agent": 2, "time": 3.0}]}}
+
+
+def a_mission(**changes) -> Mission:
+    """The triangle, flown for some seconds and turned."""
+    data = load_mission("establish-triangle").to_dict()
+    name = data["phases"][0]["formation"]
+    data["phases"] = [
+        {"kind": "establish", "formation": name, "duration": 4.0},
+        {"kind": "fly", "position": [4.0, 2.0, 9.0], "duration": 5.0},
+    ]
+    return Mission.from_dict(data | changes)
+
+
+def same(a: Result, b: Result) -> None:
+    """All arrays have the same bits, and the phases the same extremes."""
+    for name in VARIABLES:
+        x, y = getattr(a, name), getattr(b, name)
+        assert (x is None) == (y is None), name
+        if x is not None:
+            np.testing.assert_array_equal(x, y, name)
+    assert [p.extremes for p in a.phases] == [p.extremes for p in b.phases]
+
+
+@pytest.mark.parametrize("changes", [{}, LOST], ids=["whole", "lost"])
+def test_flights_of_one_mission_repeat_bit_for_bit(changes):
+    """A second and a third flight of a mission, which reuse what the first has prepared, are those of a new mission."""
+    mission = a_mission(**changes)
+    first = simulate(mission)
+    simulate(a_mission(agents=mission.to_dict()["agents"] | {"mass": [1.0, 1.2, 1.1]}))
+    for _ in range(2):
+        same(simulate(mission), first)
+    same(simulate(a_mission(**changes)), first)
+
+
+def test_flights_of_one_mission_at_the_same_time_do_not_meet():
+    """Flights in threads, and flights step by step in turns, are those flown alone."""
+    mission = a_mission()
+    alone = simulate(mission)
+    with ThreadPoolExecutor(4) as pool:
+        for result in pool.map(lambda _: simulate(mission), range(8)):
+            same(result, alone)
+    flights = [Flight(mission), Flight(mission)]
+    while [flight.begin() for flight in flights] == [True, True]:
+        for flight in flights:
+            flight.advance()
+    for flight in flights:
+        same(flight.finish(), alone)
+
+
+def test_a_force_changes_only_its_own_flight():
+    """A plan that has been flown with a user's force is not that of a flight without one."""
+    mission = a_mission()
+    calm = simulate(mission)
+    pushed = simulate(mission, force=lambda t, r, v: np.full(r.shape, 0.1))
+    assert np.abs(pushed.position - calm.position).max() > 1e-3
+    same(simulate(mission), calm)
+
+
+def examples() -> list:
+    """Named tuples of several sizes."""
+    rng = np.random.default_rng(1)
+    state = records.integrator(rng.normal(size=21), 1.5, rtol=1e-8, atol=np.ones(21))
+    times = np.linspace(0.0, 1.0, 7)
+    return [
+        workspace(3, 3), state, records.recorder(7, 3, 3), packing.examples()[0],
+        records.Segment(2.5, True, 9, times, np.ones((7, 21)), np.ones(21)),
+        native.spectrum_of(rng.normal(size=(4, 3, 3)), np.array([[0, 1], [1, 2]])),
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("k", range(6))
+def test_words_are_those_of_a_walk_through_the_tuple(k):
+    """Compiled code finds the addresses, shapes and numbers that Python finds one by one."""
+    native._code()
+    x = examples()[k]
+    code, words, arrays = [], [], []
+    packing._flatten(x, code, words, arrays)
+    layout = packing._layout(type(x))
+    assert layout.known
+    packed = packing.pack(x)
+    assert bytes(packed.words)[: 8 * len("".join(code))] == layout.code.pack(*words)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"times": np.arange(7)},  # integers
+        {"samples": np.ones((21, 7)).T},  # not C-contiguous
+        {"samples": np.ones(21)},  # one dimension too few
+        {"max_steps": 9.0},
+        {"t_end": 2},
+    ],
+    ids=["type", "order", "dimensions", "float", "int"],
+)
+def test_arguments_of_other_types_are_refused(wrong):
+    """Machine code gets nothing that it would misread."""
+    native._code()
+    segment = examples()[4]
+    packing.pack(segment)
+    with pytest.raises(TypeError):
+        packing.pack(segment._replace(**wrong))
+
+
+def test_singular_values_come_when_they_are_asked_for(tmp_path):
+    """A flight does not compute them; its file has them, and they are those of J at the positions."""
+    result = simulate(a_mission())
+    assert "singular_value" not in vars(result)
+    result.save(tmp_path / "flight.nc")
+    loaded = Result.load(tmp_path / "flight.nc")
+    k = len(result.time) // 2
+    J = np.zeros((len(result.edges), 3, 3))
+    for row, (i, j) in enumerate(result.edges):
+        way = result.position[k, i] - result.position[k, j]
+        J[row, i], J[row, j] = way / np.linalg.norm(way), -way / np.linalg.norm(way)
+    expected = np.linalg.svd(J.reshape(len(J), -1), compute_uv=False)[-1]
+    assert loaded.singular_value[k] == pytest.approx(expected, rel=1e-9)
+    np.testing.assert_array_equal(result.singular_value, loaded.singular_value)
