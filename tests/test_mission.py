@@ -39,6 +39,7 @@ SHIPPED = [
     "establish-triangle",
     "hexagon",
     "line-singular",
+    "moving-obstacles",
     "narrow-passage",
     "narrow-passage-found",
     "passage-quadrotors",
