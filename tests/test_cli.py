@@ -19,8 +19,8 @@ import pytest
 from rich.console import Console
 
 from rigidfleet.cli import app as cli
-from rigidfleet.cli import codes, console
-from rigidfleet.errors import FlightError
+from rigidfleet.cli import codes, console, drawing
+from rigidfleet.errors import FlightError, ResultError
 from rigidfleet.formation.graphs import neighbours
 from rigidfleet.formation.shapes import SHAPES
 from rigidfleet.formation.shapes import slots as slots_of
@@ -722,14 +722,15 @@ def plot(monkeypatch):
             write(Path(folder, f"{name}.{kind}"), "drawn" if titles else "bare")
 
     monkeypatch.setattr("rigidfleet.plotting.plot", draw)
+    monkeypatch.setattr("rigidfleet.cli.drawing.at_once", lambda: 1)  # others would not know of it
 
 
 def test_run_draws(capsys, plot):
-    """Figures are drawn into a folder of their own, each as PNG and SVG."""
+    """Figures are drawn into a folder of their own, each as PNG."""
     assert cli.main(["run", "short.toml"]) == codes.PASSED
     found = {p.name for p in Path("flights/short/figures").iterdir()}
     known = figure_names(Result.load("flights/short/short.nc"))
-    assert found == {f"{name}.{kind}" for name in known for kind in ("png", "svg")}
+    assert found == {f"{name}.png" for name in known}
     where = os.path.join("flights", "short", "figures") + os.sep
     assert f"Figures  {where} ({len(found)} files)" in capsys.readouterr().out
 
@@ -756,6 +757,26 @@ def test_formats_and_titles_of_figures(capsys, plot):
     assert '"png", "svg", "pdf"' in capsys.readouterr().err
 
 
+def test_figures_are_the_same_from_processes_side_by_side(folder, monkeypatch):
+    """Processes side by side draw the files that this one draws, and say what they cannot write."""
+    assert cli.main(["run", "short.toml", "--no-figures"]) == codes.PASSED
+    result = Result.load("flights/short/short.nc")
+    drawn = {}
+    for count in (1, 2):
+        monkeypatch.setattr("rigidfleet.cli.drawing.at_once", lambda count=count: count)
+        figures = {
+            folder / str(count) / name: ["png", "svg"] for name in ("cm", "inputs", "clearance")
+        }
+        assert set(drawing.draw_all(result, figures, titles=True)) == set(figures)
+        drawn[count] = {p.name: p.read_bytes() for p in (folder / str(count)).iterdir()}
+    assert len(drawn[1]) == 6
+    assert drawn[1] == drawn[2]
+    write(folder / "taken", "a file")
+    there = {folder / "taken" / name: ["png"] for name in ("cm", "inputs", "clearance")}
+    with pytest.raises(ResultError, match="cannot be written"):
+        list(drawing.draw_all(result, there, titles=True))
+
+
 @pytest.mark.long
 def test_demo(folder):
     """The demonstration passes its verdict, may be repeated, and leaves every figure."""
@@ -765,7 +786,7 @@ def test_demo(folder):
     figures = folder / "flights" / "narrow-passage" / "figures"
     found = {path.name for path in figures.iterdir() if path.stat().st_size > 10_000}
     known = figure_names(Result.load(figures.parent / "narrow-passage.nc"))
-    assert found == {f"{name}.{kind}" for name in known for kind in ("png", "svg")}
+    assert found == {f"{name}.png" for name in known}
 
 
 def test_report(capsys, plot):
@@ -776,19 +797,19 @@ def test_report(capsys, plot):
     write(verdict, "earlier")
     figures = Path("flights/short/figures")
     figures.mkdir()
-    write(figures / "cm.svg", "earlier")
+    write(figures / "cm.png", "earlier")
     assert cli.main(["report", "flights/short/short.nc"]) == codes.PASSED
     out, err = capsys.readouterr()
     assert "Passed" in out
     assert "2 existing files kept" in err
     for path, text in (
         (verdict, "earlier"),
-        (figures / "cm.svg", "earlier"),
-        (figures / "cm.png", "drawn"),
+        (figures / "cm.png", "earlier"),
+        (figures / "clearance.png", "drawn"),
     ):
         assert path.read_text(encoding="utf-8") == text
     known = figure_names(Result.load("flights/short/short.nc"))
-    assert len(list(figures.iterdir())) == 2 * len(known)
+    assert len(list(figures.iterdir())) == len(known)
 
 
 def test_report_force(capsys, plot):

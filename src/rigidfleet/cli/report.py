@@ -46,7 +46,7 @@ def report(
     no_figures : bool
         Write no figure files. The report has its figures in any case.
     format : list
-        Format of the figure files; may be repeated: --format pdf --format png. Default: png and svg.
+        Format of the figure files; may be repeated: --format pdf --format png. Default: png.
     no_titles : bool
         Draw the figure files without titles, for papers with captions.
     json : bool

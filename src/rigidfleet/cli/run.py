@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from rigidfleet.cli import console
+from rigidfleet.cli import console, drawing
 from rigidfleet.cli.outputs import Files
 from rigidfleet.errors import RigidfleetError
 
@@ -23,7 +23,7 @@ from rigidfleet.cli.codes import FAILED, INTERRUPTED, PASSED
 #: A format of figures.
 Format = Literal["png", "svg", "pdf"]
 #: Default formats of figures.
-DRAWN: tuple[Format, ...] = ("png", "svg")
+DRAWN: tuple[Format, ...] = ("png",)
 
 
 def run(
@@ -55,7 +55,7 @@ def run(
     no_figures : bool
         Draw no figures; "rigidfleet report" can draw them later.
     format : list
-        Format of the figures; may be repeated: --format pdf --format png. Default: png and svg.
+        Format of the figures; may be repeated: --format pdf --format png. Default: png.
     no_titles : bool
         Draw figures without titles, for papers with captions.
     replay : bool
@@ -80,6 +80,8 @@ def run(
     asked = load_mission(mission)
     files = Files(out or Path("flights", asked.name), asked.name)
     files.claim(replace=force)
+    if not no_figures:
+        drawing.prepare()
     watch = None if quiet else console.FlightWatch()
     with watch or nullcontext():
         result, interrupted = fly(asked, watch)
@@ -207,7 +209,7 @@ def draw(
     quiet: bool = False,
 ) -> None:
     """Draw the figures that apply to the flight, each to the file of its name."""
-    from rigidfleet.plotting import figure_names, plot
+    from rigidfleet.plotting import figure_names
 
     names = figure_names(result)
     formats: dict[Path, list[str]] = {}
@@ -217,10 +219,9 @@ def draw(
         formats.setdefault(path.with_suffix(""), []).append(path.suffix[1:])
     shown = console.err().is_interactive and not quiet
     with console.err().status("Drawing the figures") if shown else nullcontext() as status:
-        for n, (path, wanted) in enumerate(formats.items(), start=1):
+        for n, path in enumerate(drawing.draw_all(result, formats, titles=titles), start=1):
             if status is not None:
-                status.update(f"Drawing figure {n} of {len(formats)}: {path.name}")
-            plot(result, path.parent, names=[path.name], formats=wanted, titles=titles)
+                status.update(f"Drawing the figures: {path.name}, {n} of {len(formats)}")
 
 
 def write_replay(result: Result, path: Path) -> None:

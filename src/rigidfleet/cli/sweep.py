@@ -75,7 +75,7 @@ def sweep(
     no_figures : bool
         Draw no figures.
     format : list
-        Format of the figures; may be repeated: --format pdf --format png. Default: png and svg.
+        Format of the figures; may be repeated: --format pdf --format png. Default: png.
     no_titles : bool
         Draw figures without titles, for papers with captions.
     json : bool

@@ -286,10 +286,10 @@ def around(x: float, y: float) -> list[Place]:
 
 
 def place_words(fig: Figure) -> None:
-    """Move annotated text to where it covers nothing, or least."""
+    """Lay the figure out, and move annotated text to where it covers nothing, or least."""
     every = [(text, places) for text, places in _places.items() if text.get_figure() is fig]
     engine = fig.get_layout_engine()
-    if engine is not None and every:
+    if engine is not None:
         engine.execute(fig)
     for ax in fig.axes:
         labels = [(text, places) for text, places in every if text.axes is ax]

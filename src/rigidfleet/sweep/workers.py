@@ -13,6 +13,7 @@ from multiprocessing import connection
 from multiprocessing.context import SpawnContext, SpawnProcess
 from typing import TYPE_CHECKING, Any
 
+from rigidfleet._common.processes import safe_path
 from rigidfleet._version import __version__
 from rigidfleet.errors import RigidfleetError
 from rigidfleet.sweep.definition import shared
@@ -50,7 +51,7 @@ def processes(count: int) -> Generator[Pool]:
     from rigidfleet.kernel.engine.native import bequeath
 
     before = set(multiprocessing.active_children())
-    with _safe_path():  # for multiprocessing's resource tracker
+    with safe_path():  # for multiprocessing's resource tracker
         pool = ProcessPoolExecutor(
             count, mp_context=_Context(), initializer=_begin, initargs=(bequeath(),)
         )
@@ -65,7 +66,7 @@ def processes(count: int) -> Generator[Pool]:
 class _Process(SpawnProcess):
     @staticmethod
     def _Popen(process_obj: Any) -> Any:  # noqa: N802
-        with _safe_path():
+        with safe_path():
             return SpawnProcess._Popen(process_obj)
 
 
@@ -77,21 +78,6 @@ class _Context(SpawnContext):
     """
 
     Process = _Process
-
-
-@contextmanager
-def _safe_path() -> Generator[None]:
-    """Keep the current folder off the module path of Python processes that are started in this context."""
-    name = "PYTHONSAFEPATH"
-    before = os.environ.get(name)
-    os.environ[name] = "1"
-    try:
-        yield
-    finally:
-        if before is None:
-            del os.environ[name]
-        else:
-            os.environ[name] = before
 
 
 def _begin(given: Inheritance) -> None:
