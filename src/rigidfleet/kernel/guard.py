@@ -37,10 +37,8 @@ from rigidfleet.kernel.segments import between_segments, from_obstacle, from_sol
 #: Neighbours are listed for speeds higher by this share and summand [m/s], and for ways of this share of their
 #: distance, or this way [m].
 _FASTER, _LEAST_SPEED, _NEARER, _LEAST_WAY = 0.25, 0.2, 0.15, 0.2
-#: Shortfall beside an obstacle that moves from which a vehicle evades as well as it can [m].
-_LATE = 0.05
-#: Shortfall of a distance to keep that counts as rounding [m].
-_ROUNDING = 1e-9
+#: Shortfall of a distance from which a vehicle evades what moves as well as it can, and that counts as rounding [m].
+_LATE, _ROUNDING = 0.05, 1e-9
 
 
 # -- what a vehicle does -------------------------------------------------------------------------------
