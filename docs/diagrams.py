@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import FancyArrowPatch, FancyBboxPatch, Rectangle
+from matplotlib.patches import Circle, FancyArrowPatch, FancyBboxPatch, Rectangle
 
-from rigidfleet import physics
+from rigidfleet import physics, simulate
 from rigidfleet.formation.graphs import complete_graph
 from rigidfleet.formation.shapes import slots
 from rigidfleet.math import attitude, pid
@@ -449,7 +449,30 @@ def way_found() -> Figure:
     return fig
 
 
+def moving_obstacles() -> Figure:
+    """The flight of moving-obstacles from above: paths, and where vehicles and balls are at three moments."""
+    mission = load_mission("moving-obstacles")
+    result = simulate(mission)
+    fig = Figure(figsize=(7.6, 3.6), layout="constrained")
+    ax = fig.add_subplot()
+    for i in range(8):
+        ax.plot(*result.position[:, i, :2].T, color=PALETTE[0], linewidth=0.7, alpha=0.6)
+    for moment, colour in zip((8.4, 11.0, 13.5), PALETTE[1:4], strict=True):
+        k = int(np.searchsorted(result.time, moment))
+        label = f"{result.time[k]:.1f} s"
+        ax.plot(*result.position[k, :, :2].T, "o", color=colour, markersize=4, label=label)
+        for thing in mission.obstacles:
+            place = np.array(thing.centre) + result.time[k] * np.array(thing.velocity)
+            ax.add_patch(Circle(place[:2], thing.radius, color=colour, alpha=0.35))
+    ax.set(xlim=(-4, 36), ylim=(-9, 9), xlabel="x [m]", ylabel="y [m]")
+    ax.set_aspect("equal")
+    ax.legend(loc="upper left", frameon=False)
+    ax.spines[["top", "right"]].set_visible(False)
+    return fig
+
+
 DIAGRAMS: Sequence[Callable[[], Figure]] = (
     edge, frame, constraint_architecture, body_architecture, local_architecture, singular_line,
     overshoot, solvers, blend, no_inverse, realisations, error_budget, way_found,
+    moving_obstacles,
 )  # fmt: skip

@@ -15,10 +15,12 @@ from PIL import Image
 from shapes import SHAPES
 
 import rigidfleet as rf
+from rigidfleet.foreign.files import read_trajectories
 from rigidfleet.formation import outlines
 from rigidfleet.mission import Mission, show_draft
 from rigidfleet.plotting import write_figure
 from rigidfleet.plotting.style import settings
+from rigidfleet.simulation.trajectories import of_curves
 from rigidfleet.sweep import Sweep, fly
 from rigidfleet.sweep.figures import over_two
 
@@ -47,6 +49,16 @@ def show() -> None:
         paths = rf.plot(result, folder, formats=["png"], names=["formations", "operation"])
         for path, name in zip(paths, ("show", "show-operation"), strict=True):
             _save_with_few_colours(path, name)
+
+
+def others() -> None:
+    """The picture of a flight that others made, judged as its page says."""
+    files = IMAGES.parents[1] / "tests" / "data" / "sequence_trajectories"
+    read = read_trajectories(files)
+    result = of_curves(read.curves, read.assumed, separation=0.3, name=files.name)
+    with TemporaryDirectory() as folder:
+        (path,) = rf.plot(result, folder, formats=["png"], names=["clearance"])
+        _save_with_few_colours(path, "seven-crazyflies")
 
 
 def study() -> None:
@@ -110,4 +122,5 @@ if __name__ == "__main__":
     flight()
     study()
     show()
+    others()
     drawings()

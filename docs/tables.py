@@ -82,10 +82,16 @@ def _value(entry: dict[str, Any]) -> str:
             return f"table, see `{target.rpartition('/')[2].lower()}`"
         case {"type": "array", "items": {"$ref": target}}:
             return f"list of tables, see `{target.rpartition('/')[2].lower()}`"
+        case {"type": "array", "items": {"type": "array", "items": {"type": "array"} as inner}}:
+            return f"list of lists: {_value(inner)}"
         case {"type": "array", "items": {"type": "array", "items": inner, **size}}:
+            if inner["type"] == "array":
+                return f"list of lists of lists of {_PLURAL[inner['items']['type']]}"
             if "minItems" not in size:
                 return f"list of lists of {_PLURAL[inner['type']]}"
             return f"list of [{size['minItems']} {_PLURAL[inner['type']]}]"
+        case {"type": "array", "minItems": n, "maxItems": most} if n < most:
+            return f"[{n} to {most} numbers]"
         case {"type": "array", "minItems": n}:
             return f"[{n} numbers]"
         case {"type": "array", "items": inner}:

@@ -187,6 +187,19 @@ def test_units_are_those_of_the_names(tmp_path):
     assert not any("metres and seconds?" in note for note in judged(named)[0].notes)
 
 
+def test_vehicles_at_one_place_fail(tmp_path):
+    """Two vehicles that start and fly at the same place are judged, not refused."""
+    rows = [[t, i, t, 0, 1] for t in range(4) for i in (1, 2)]
+    path = table(tmp_path / "same.csv", rows, "time_s,agent,x_m,y_m,z_m")
+    verdict, _ = judged(path)
+    assert not verdict.passed
+    assert check_of(verdict, "separation").worst == 0.0
+    with pytest.raises(rf.RigidfleetError, match="separation_below needs radii"):
+        judged(path, limits={"separation_below": 1.0})
+    stacked = judged(path, radius=0.2, limits={"separation_below": 1.0})[0]
+    assert not check_of(stacked, "separation_below").passed
+
+
 def test_stated_velocities_are_not_believed(tmp_path):
     """Speeds come from positions; other velocities in the file are noted."""
     head = HEAD + ",vx_m_s,vy_m_s,vz_m_s"
@@ -229,7 +242,7 @@ BAD_TEXTS = {
     "repeated": (f"{HEAD}\n0,0,0,1\n1,0,0,1\n1,0,0,1\n", "line 4: the time 1 s repeats 1 s"),
     "backwards": (f"{HEAD}\n0,0,0,1\n2,0,0,1\n1,0,0,1\n", "line 4: the time 1 s goes back behind 2 s"),
     "huge": (f"{HEAD}\n0,0,0,1\n1,1e300,0,1\n", "from the origin in piece 1"),
-    "late": (f"{HEAD}\n0,0,0,1\n1e9,0,0,1\n", "the most is 1e"),
+    "late": (f"{HEAD}\n0,0,0,1\n1e9,0,0,1\n", "the most is 1e+06 s"),
     "missing column": ("time_s,x_m,y_m\n0,0,0\n", "no column for z"),
     "two columns": ("time_s,x_m,y_m,z_m,x [mm]\n0,0,0,0,0\n", "two columns for x"),
     "feet": ("time_s,x [ft],y_m,z_m\n0,0,0,1\n", "unknown unit 'ft'"),
@@ -415,3 +428,25 @@ def test_a_mission_gives_obstacles_and_limits(own, capsys):
     found = {c["check"]: c for c in json.loads(capsys.readouterr().out)["checks"]}
     flown = check_of(rf.assess(rf.simulate("narrow-passage")), "clearance")
     assert found["clearance"]["worst"] == pytest.approx(flown.worst, abs=0.02)
+
+
+# -- the page ----------------------------------------------------------------------------------------
+
+ROOT = Path(__file__).parents[1]
+
+
+def test_the_page_says_what_happens(tmp_path, monkeypatch, capsys):
+    """The command of the page gives the verdict that it quotes, and its Python runs."""
+    page = (ROOT / "docs" / "import.md").read_text(encoding="utf-8")
+    (command,) = re.findall(r"^    rigidfleet (assess .*)$", page, re.MULTILINE)
+    monkeypatch.chdir(tmp_path)
+    tmp_path.joinpath("tests").symlink_to(ROOT / "tests")
+    assert main(command.split()) == FAILED
+    said = " ".join(capsys.readouterr().out.split())
+    quoted = re.search(r"^    Note: others.*?(?=\n\n)", page, re.MULTILINE | re.DOTALL)
+    assert quoted is not None
+    assert " ".join(quoted[0].split()) in said
+    assert (tmp_path / "flights" / "seven" / "report.html").exists()
+    (code,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    exec(compile(code, "import.md", "exec"), {})
+    assert capsys.readouterr().out.startswith("Passed")

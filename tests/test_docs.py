@@ -367,6 +367,7 @@ def test_commands_are_documented(capsys):
         "check",
         "design",
         "new",
+        "assess",
         "report",
         "replay",
         "export",

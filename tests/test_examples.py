@@ -61,6 +61,16 @@ def test_own_formation(example, capsys):
     assert "Passed" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("example", ["follow_a_file"], indirect=True)
+def test_follow_a_file(example, capsys):
+    """With the duration that check names, the mission passes; the result holds the trajectories."""
+    example.main()
+    printed = capsys.readouterr().out
+    assert "the least duration of this phase is" in printed
+    assert "Passed: all" in printed
+    assert "kept in the result: True" in printed
+
+
 @pytest.mark.parametrize("example", ["gusts"], indirect=True)
 def test_gusts(example):
     """Idle in calm air, f_C holds the distances in gusts: all but wholly if it is told of them, by

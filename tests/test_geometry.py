@@ -280,6 +280,17 @@ def test_attitude_goes_on_through_a_line():
     np.testing.assert_allclose(found, np.broadcast_to(T, found.shape), rtol=0, atol=1e-9)
 
 
+def test_an_agent_that_is_lost_does_not_turn_the_line_of_the_others():
+    """Two of three that are left are a line, wherever the third falls."""
+    T = Rotation.from_euler("z", -0.3).as_matrix()
+    p = np.array([[-2.0, 0, 0], [2.0, 0, 0], [0, 3.0, 0]])
+    x = np.broadcast_to(p @ T, (4, 3, 3)).copy()
+    x[:, 2] += [5.0, -7.0, -20.0]
+    found, line = fit_attitudes(x, np.broadcast_to(p, x.shape), np.array([1.0, 1.0, 0.0]), T)
+    assert line.all()
+    np.testing.assert_allclose(found, np.broadcast_to(T, found.shape), rtol=0, atol=1e-12)
+
+
 def test_one_agent_has_the_attitude_expected():
     """A point has no attitude of its own."""
     near = Rotation.from_euler("z", [[0.3], [0.4]]).as_matrix()

@@ -39,6 +39,7 @@ SHIPPED = [
     "establish-triangle",
     "hexagon",
     "line-singular",
+    "moving-obstacles",
     "narrow-passage",
     "narrow-passage-found",
     "passage-quadrotors",
@@ -125,7 +126,13 @@ def test_shipped_mission_is_in_order(name):
     mission = load_mission(name)
     assert mission.name == name
     assert mission.title
-    assert mission.source or name in ("show-1000", "crazyflies", "delayed", "downwash-cube")
+    assert mission.source or name in (
+        "show-1000",
+        "crazyflies",
+        "delayed",
+        "downwash-cube",
+        "moving-obstacles",
+    )
     assert mission.text == mission_text(name)
     assert mission.text.startswith("# ")
 

@@ -161,7 +161,9 @@ def test_one_vehicle_is_never_met_by_one_obstacle(seed, period, drag, barrier, r
     )  # fmt: skip
     result = rf.simulate(mission, controller=Wild(rng, limit), rate=1.0 / period)
     assert result.complete, result.ending
-    assert worst(result, "clearance") >= 0.05 - 1e-8
+    assert (
+        worst(result, "clearance") >= 0.05 - 1e-6
+    )  # its place is known to some 1e-9 m at each tick
     check = {c.check: c for c in rf.assess(result).checks}["guarantee"]
     assert check.passed
     assert "held" in check.message

@@ -182,12 +182,17 @@ def _check_size(name: str, who: str, curve: Curve) -> None:
     with np.errstate(all="ignore"):
         powers = h[:, None, None] ** np.arange(curve.pieces.shape[2])
         reach = np.abs(curve.pieces[:, :3] * powers).sum(axis=2).max(axis=1)
-    bad = np.flatnonzero(~(reach <= FARTHEST) | ~(np.abs(curve.time[1:]) <= FARTHEST))
+    if not (np.abs(curve.time[[0, -1]]) <= FARTHEST).all():
+        raise TrajectoryError(
+            f"{name}: {who} flies from {curve.time[0]:.9g} to {curve.time[-1]:.9g} s; the most is {FARTHEST:g} s. Let "
+            "times begin at 0, in seconds, or name their unit: time [ms]."
+        )
+    bad = np.flatnonzero(~(reach <= FARTHEST))
     if len(bad):
         k = int(bad[0])
         raise TrajectoryError(
             f"{name}: {who} reaches {reach[k]:.3g} m from the origin in piece {k + 1}, which begins at "
-            f"{curve.time[k]:.3g} s; the most is {FARTHEST:g} m and s. Give metres and seconds of one flight."
+            f"{curve.time[k]:.3g} s; the most is {FARTHEST:g} m. Give metres and seconds, or name other units."
         )
 
 

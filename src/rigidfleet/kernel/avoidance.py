@@ -119,7 +119,7 @@ class Avoidance(NamedTuple):
     ways: Floats  # (N, 4, 3) present choice: position, after the tick, stop point; stop point without a tick
     far: Floats  # (N,) distance from its position that a vehicle cannot leave in the tick and by braking after it [m]
     walls: Floats  # (N, B) distance of the stop segment from an obstacle to keep [m]
-    threat: Ints  # (N,) the obstacle that moves and leaves the least room, -1 if all leave enough
+    threat: Ints  # (N,) a known obstacle that moves, the one that leaves the least room; -1 if none
     late: Floats  # (N,) by which its stop segment comes nearer than it should to this obstacle, negative [m]
     shifted: (
         Floats  # (4, 3) work: a way relative to an obstacle that moves, and the relative velocity

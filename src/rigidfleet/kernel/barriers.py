@@ -17,7 +17,7 @@ accelerations that the law gave them, softly: with A = J M^-1 J^T of edges E and
 
 This is the same minimum as that of the law and the barriers together, because the law's accelerations are the
 projection of the free ones onto the edges. Between vehicles, the pushes add no net force and no torque. Their bound
-makes the problem solvable where barriers contradict each other. Edges let go near vehicles that barriers push.
+makes the problem solvable where barriers contradict each other. Edges let go while barriers push vehicles.
 """
 
 import math
@@ -46,13 +46,16 @@ def needed_rate(gap, s, across, B, rate):
 
 @compiled
 def loosen(p, w, state, a):
-    """Take from the forces of edges what they let go, and from their integrals what the tick has added to it."""
-    edges = p.graph.edges
+    """Take from the forces of edges what they let go, and from their integrals what the tick has added to it.
+
+    All edges let go by one share, that of the vehicle that is pushed most: where edges are redundant, forces of single
+    ones are large and cancel each other, so that what is left without some of them would drive the formation apart.
+    """
+    edges, free = p.graph.edges, 0.0
     for e in range(edges.shape[0]):
+        free = max(free, 1.0 - min(a.hold[edges[e, 0]], a.hold[edges[e, 1]]))
+    for e in range(edges.shape[0] if free > 0.0 else 0):
         i, j = edges[e, 0], edges[e, 1]
-        free = 1.0 - min(a.hold[i], a.hold[j])
-        if free <= 0.0:
-            continue
         for q in range(3):
             force = free * w.multiplier[e] * w.u[e, q]
             state.force[i, q] -= force

@@ -203,6 +203,22 @@ def beyond_plane(piece, box, normal):
 
 
 @compiled
+def refine(bound, best, at, close, count, top, pieces):
+    """Halve the piece on top of the stack if its lower bound may be below the best value, else drop it.
+
+    After `_MOST` pieces, the bound itself is taken. Returns the best value, its place, and the new top.
+    """
+    piece = pieces[top]
+    if bound < best - close:
+        if count > _MOST:
+            return bound, piece[15], top - 1
+        if piece[16] > _SHORTEST:
+            halve(piece, pieces[top + 1])
+            return best, at, top + 1
+    return best, at, top - 1
+
+
+@compiled
 def nearest_box(curve, box, floor, pieces, normal):
     """Least distance of a curve with control points (5, 3) from a box, if below ``floor``, and its place; else -1."""
     best, at, top, count, close = floor, -1.0, 0, 0, CLOSE
@@ -221,13 +237,7 @@ def nearest_box(curve, box, floor, pieces, normal):
             if distance < best:
                 best, at = distance, piece[15] + (piece[16] if k == 4 else 0.0)
         bound = beyond_plane(piece, box, normal)
-        if bound < best - close and count > _MOST:
-            best, at = bound, piece[15]
-        if not bound < best - close or piece[16] <= _SHORTEST:
-            top -= 1
-            continue
-        halve(piece, pieces[top + 1])
-        top += 1
+        best, at, top = refine(bound, best, at, close, count, top, pieces)
     return best, at
 
 

@@ -37,10 +37,8 @@ from rigidfleet.kernel.segments import between_segments, from_obstacle, from_sol
 #: Neighbours are listed for speeds higher by this share and summand [m/s], and for ways of this share of their
 #: distance, or this way [m].
 _FASTER, _LEAST_SPEED, _NEARER, _LEAST_WAY = 0.25, 0.2, 0.15, 0.2
-#: Shortfall beside an obstacle that moves from which a vehicle evades as well as it can [m].
-_LATE = 0.05
-#: Shortfall of a distance to keep that counts as rounding [m].
-_ROUNDING = 1e-9
+#: Shortfall of a distance from which a vehicle evades what moves as well as it can, and that counts as rounding [m].
+_LATE, _ROUNDING = 0.05, 1e-9
 
 
 # -- what a vehicle does -------------------------------------------------------------------------------
@@ -303,11 +301,15 @@ def set_floor_beside(t, i, o, r, v, closest, a):
     need, way = need_beside(i, o, speed, braking_beside(i, o, a), a), a.shifted
     apart = from_solid(way[0, 0], way[0, 1], way[0, 2], o, a.solids, a.normal) - stop
     a.walls[i, o] = need
+    if a.threat[i] < 0:  # also one that is still far: a single tick may bring it near
+        a.threat[i] = o
     if apart < need or apart - need < a.margin[OBSTACLE, 0]:
-        found, _, _ = from_obstacle(way[0], way[2], o, a.solids, need, a.normal)
+        # Rounding alone must not make the bound a loose one: the vehicle could lose a little at each tick
+        enough = need - 10.0 * _ROUNDING
+        found, _, _ = from_obstacle(way[0], way[2], o, a.solids, enough, a.normal)
         a.walls[i, o] = min(need, found)
         note(OBSTACLE, found - a.reach[i], t, i, o, a)
-        if found - need < closest or (apart < need and a.threat[i] < 0):
+        if found - need < closest or (apart < need and closest == 0.0):
             a.threat[i], closest = o, min(found - need, 0.0)
     return closest
 

@@ -193,12 +193,13 @@ def extent(p, root, C, V, w, axis):
 
 
 @compiled
-def lay_line(x, p, axis, near, T, now, there, across):
+def lay_line(x, p, mass, axis, near, T, now, there, across):
     """Attitude T (3, 3) of a line: ``near``, followed by the smallest rotation that lays its axis along the agents."""
     for a in range(3):
         there[a] = 0.0
     for i in range(x.shape[0]):
         along = p[i, 0] * axis[0] + p[i, 1] * axis[1] + p[i, 2] * axis[2]
+        along = along if mass[i] > 0.0 else 0.0  # agents that are lost do not count
         for a in range(3):
             there[a] += along * x[i, a]
     length = math.sqrt(there[0] ** 2 + there[1] ** 2 + there[2] ** 2)
@@ -269,7 +270,7 @@ def attitude_of(m, k, known, line_known, near, work, T):
     width, length = size[0], size[1]
     line = width <= _THIN * length
     if line or (known and width <= _NARROW * length):
-        lay_line(x, p, axis, near, T, work[3, 1], work[3, 2], work[3, 3])
+        lay_line(x, p, mass, axis, near, T, work[3, 1], work[3, 2], work[3, 3])
         if not line:
             off = 0.0
             for i in range(n):

@@ -67,6 +67,17 @@ def correct(o, z, sight):
 
 
 @compiled
+def velocity(t, o, solids):
+    """Velocity [m/s] of obstacle o at t [s], free of the rounding that differences of places would have."""
+    for k in range(solids.first[o, 3], solids.last[o, 3] - 1):
+        if solids.times[k] <= t < solids.times[k + 1]:
+            span = solids.times[k + 1] - solids.times[k]
+            x, y = solids.ways[k], solids.ways[k + 1]
+            return (y[0] - x[0]) / span, (y[1] - x[1]) / span, (y[2] - x[2]) / span
+    return 0.0, 0.0, 0.0
+
+
+@compiled
 def in_sight(o, x, y, z, r, lost, a):
     """Whether any vehicle is within sensing range of obstacle o, displaced by x, y, z [m]."""
     for i in range(r.shape[0]):
@@ -107,8 +118,7 @@ def look(t, r, lost, a):
         if s.moves[o] == 0:
             continue
         x, y, z = displacement(t, o, a.solids)
-        u, v, w = displacement(t + T, o, a.solids)
-        u, v, w = (u - x) / T, (v - y) / T, (w - z) / T
+        u, v, w = velocity(t + 0.5 * T, o, a.solids)
         if s.known[o] != UNKNOWN:
             expect(o, T, s)
         if not s.reach < math.inf or in_sight(o, x, y, z, r, lost, a):

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidfleet.kernel.bernstein import CLOSE, halve
+from rigidfleet.kernel.bernstein import CLOSE, refine
 from rigidfleet.kernel.compiler import elementwise  # noqa: F401 -- the functions of numbers below
 from rigidfleet.kernel.compiler.jit import compiled
 from rigidfleet.kernel.monitor import (
@@ -37,8 +37,8 @@ from rigidfleet.solids.distance import (
 from rigidfleet.solids.records import HEIGHTS
 from rigidfleet.typing import Bools, Edges, Floats, Ints
 
-#: Length of the shortest piece of a step, and the greatest number of pieces of one search.
-_SHORTEST, _MOST = 2.0**-32, 10_000
+#: Length of the shortest piece of a step.
+_SHORTEST = 2.0**-32
 #: Rounding error, as a share of a number's size.
 _ROUNDING = 4e-15
 #: Greatest rotation of one piece of a step in the body formulation [rad].
@@ -132,13 +132,7 @@ def nearest_along(curve, b, triangle, floor, pieces, s):
             )
             if distance < best:
                 best, at = distance, piece[15] + (piece[16] if k == 4 else 0.0)
-        if bound < best - close and count > _MOST:
-            best, at = bound, piece[15]
-        if not bound < best - close or piece[16] <= _SHORTEST:
-            top -= 1
-            continue
-        halve(piece, pieces[top + 1])
-        top += 1
+        best, at, top = refine(bound, best, at, close, count, top, pieces)
     return best, at
 
 

@@ -99,10 +99,8 @@ def with_times(mission: Mission, phase: Phase, now: PhaseState, number: int) -> 
             mission, phase, now, masses, slots_about_cm(mission, now.formation, masses)
         )
         if problem := misled(mission, phase, begun):
-            key, remedy = (
-                "file",
-                "lead the vehicles there before, by phases such as 'fly', 'turn' and 'reshape'",
-            )
+            key = "file" if phase.led else "formation"
+            remedy = "lead the vehicles there before, by phases such as 'fly', 'turn' and 'reshape'"
             path = f"phases[{number + 1}].{key}"
             raise MissionError([Finding(mission.origin, path, None, problem, remedy)])
     if not phase.automatic:

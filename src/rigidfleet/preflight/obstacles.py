@@ -65,7 +65,10 @@ def obstacle_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
                 text = f"agent {i + 1} {verb} '{thing.name}' at {t:.2f} s in '{phase}'"
                 if isinstance(thing, Ground):
                     text += _too_low(mission, found, phase, thing.height)
-                remark = Remark("fails" if exact else "note", "obstacle", text)
+                evaded = mission.avoidance is not None and thing.solid.moves
+                if evaded:
+                    text += " as planned; [avoidance] has to evade it"
+                remark = Remark("fails" if exact and not evaded else "note", "obstacle", text)
                 remarks.setdefault(b, []).append(remark)
     for b in sorted(shown):
         clearance, t, i, _ = shown[b]

@@ -256,13 +256,27 @@ def judged_as(
             "mass": list(given.agents.mass),
         }
     else:
+        if "separation_below" in (limits or {}) and radius == 0.0:
+            raise ResultError(
+                "separation_below needs radii: one vehicle is below another where their spheres overlap as seen from "
+                "above. Give a radius."
+            )
         bounds = dict(limits or {}) | ({} if separation is None else {"separation": separation})
         data = {"schema_version": 1, "name": name, "limits": bounds}
         if ground is not None:
             data["obstacles"] = [{"kind": "ground", "height": ground}]
         agents = {"radius": radius, "mass": 1.0}
-    agents["position"] = start.tolist()
+    agents["position"] = _told_apart(start).tolist()
     return Mission.from_dict(data | {"agents": agents, "phases": [phase]}, "the limits")
+
+
+def _told_apart(start: Floats) -> Floats:
+    """Starts (N, 3) of which no two are equal: a mission refuses what the verdict on the curves has to judge."""
+    _, first, again = np.unique(start, axis=0, return_index=True, return_inverse=True)
+    twice = np.flatnonzero(first[again.ravel()] != np.arange(len(start)))
+    found = start.copy()
+    found[twice, 2] += 1e-6 * np.arange(1, len(twice) + 1)
+    return found
 
 
 def of_pieces(

@@ -241,7 +241,7 @@ def _linked(parts: Sequence[bytes], unkept: list[bytes] | None = None) -> _Code:
         for words, address in zip((4, 4, 4, 1, 1, 4), addresses, strict=True)
     )
     *calls, gather = functions
-    use(gather)
+    use(gather, engine)
     return _Code(*calls, addresses[1], engine, unkept)
 
 

@@ -51,13 +51,13 @@ class Packed(NamedTuple):
     address: int
 
 
-#: The compiled function `rigidfleet.kernel.compiler.gathering.gather`, once it is loaded.
-_gather: list[Callable[..., int]] = []
+#: The compiled function `rigidfleet.kernel.compiler.gathering.gather`, once it is loaded, and what keeps its code.
+_gather: list[Any] = []
 
 
-def use(gather: Callable[..., int]) -> None:
-    """Pack with a compiled function from now on."""
-    _gather[:] = [gather]
+def use(gather: Callable[..., int], code: Any) -> None:
+    """Pack with a compiled function from now on, whose machine code lives as long as ``code`` does."""
+    _gather[:] = [gather, code]
     _layout.cache_clear()
 
 
