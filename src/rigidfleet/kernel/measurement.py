@@ -423,7 +423,7 @@ def angular_momentum(m, k, mass, h):
 
 @compiled
 def spectrum(s):
-    """The smallest non-zero singular value of the constraint Jacobian J at each sample, from the smaller of J J^T and J^T J."""
+    """The smallest non-zero singular value of the constraint Jacobian J, from the smaller of J J^T and J^T J."""
     edges, u, A = s.edges, s.u, s.A
     m, n = edges.shape[0], s.r.shape[1]
     for k in range(s.r.shape[0]):
