@@ -450,3 +450,9 @@ def test_the_page_says_what_happens(tmp_path, monkeypatch, capsys):
     (code,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     exec(compile(code, "import.md", "exec"), {})
     assert capsys.readouterr().out.startswith("Passed")
+
+
+def test_a_missing_file_is_named(tmp_path, capsys):
+    """A path without a file says so, and nothing of folders to create."""
+    assert main(["assess", str(tmp_path / "none.csv")]) == BAD_INPUT
+    assert "none.csv: no such file" in capsys.readouterr().err

@@ -106,6 +106,8 @@ def why_not(error: OSError, done: str, path: Path) -> str:
     match error:
         case IsADirectoryError():
             return "is a folder. Give the path of a file."
+        case FileNotFoundError() | NotADirectoryError() if done == "read":
+            return "no such file. Check the path."
         case FileNotFoundError() | NotADirectoryError():
             return f"cannot be {done}: there is no folder {path.parent}. Create it first."
         case PermissionError():
