@@ -51,7 +51,7 @@ _QUICK = ("sroa", "simplify_cfg", "instruction_combine", "simplify_cfg")
 
 
 def machine_code(second: "_SecondProcess | None" = None) -> list[bytes]:
-    """Object code of the three C functions that `native` calls, `objects.ENTRIES`.
+    """Object code of the C functions that `native` calls, `objects.ENTRIES`.
 
     Their arguments are addresses of named tuples. They integrate (and return what `dopri5.integrate` returns),
     record, and monitor (as `monitor.watch` does). The ``second`` process, if there is one, does part of the work.
