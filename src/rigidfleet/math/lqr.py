@@ -19,6 +19,7 @@ x v and v^2/2, so N has the same effect as Q22 - 2 n1, S12 + n1 and S22 + n2.
 """
 
 import math
+from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -28,6 +29,8 @@ from rigidfleet.typing import Bools, Floats
 
 # Cache key of an array: its shape and contents.
 Key = tuple[tuple[int, ...], bytes]
+# States (K, n, n) and inputs (K, m, n) of a regulated system, from each state alone.
+Response = tuple[Floats, Floats]
 
 # Number of cached results that depend on weights and times alone: they are the same in every run of a
 # sweep, and often from phase to phase.
@@ -173,10 +176,35 @@ def finite_horizon_trajectory(
     the regulator follows this moving target, not a fixed point.
     """
     t = _times("times", times)
+    return led(double_integrator_response(t, T, Q, R, S), t, start, target, T)
+
+
+def double_integrator_response(
+    times: Floats, T: float, Q: ArrayLike, R: ArrayLike, S: ArrayLike | None
+) -> Response:
+    """How a regulated double integrator responds at times (K,) [s] in [0, T]; S = None means an infinite horizon.
+
+    States (K, 2, 2) and inputs (K, 1, 2) from an error in position, and in velocity, of 1; see `led`.
+    """
+    if S is None:
+        # With the cost of an infinite horizon as final weight, the Riccati equation is stationary.
+        S = _cost_at_rest(_key(Q), _key(R))
+    return _responses(*map(_key, (_A, _B, Q, R, np.zeros(_B.shape), S, T, times)))
+
+
+def led(
+    response: Response,
+    times: Floats,
+    start: Sequence[ArrayLike] | Floats,
+    target: Sequence[ArrayLike] | Floats,
+    T: float,
+) -> tuple[Floats, Floats, Floats]:
+    """The trajectory of `finite_horizon_trajectory`, from the response at its times (K,) [s]."""
+    states, inputs = response
     x0, v0, x1, v1 = np.broadcast_arrays(*(np.asarray(z, dtype=float) for z in (*start, *target)))
     e0 = np.stack([x0 - (x1 - T * v1), v0 - v1])
-    e, a = closed_loop_response(_A, _B, Q, R, S, T, e0, t)
-    since = (t - T).reshape(-1, *[1] * x0.ndim)
+    e, a = np.tensordot(states, e0, axes=1), np.tensordot(inputs, e0, axes=1)
+    since = (times - T).reshape(-1, *[1] * x0.ndim)
     return x1 + since * v1 + e[:, 0], v1 + e[:, 1], a[:, 0]
 
 
@@ -192,8 +220,8 @@ def infinite_horizon_trajectory(
 
     The target position is that at t = T; for a target at rest, T is only the end of ``times``.
     """
-    # With the cost of an infinite horizon as final weight, the Riccati equation is stationary.
-    return finite_horizon_trajectory(times, start, target, T, Q, R, _cost_at_rest(_key(Q), _key(R)))
+    t = _times("times", times)
+    return led(double_integrator_response(t, T, Q, R, None), t, start, target, T)
 
 
 def knots(

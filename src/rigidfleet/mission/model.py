@@ -13,6 +13,7 @@ import numpy as np
 from pydantic import PrivateAttr
 
 from rigidfleet._common.arguments import as_path
+from rigidfleet._common.kept import kept
 from rigidfleet._common.text import agent_names
 from rigidfleet._common.toml import to_toml
 from rigidfleet.errors import Finding, MissionError, wrong_type
@@ -69,6 +70,8 @@ class Mission(Contents):
     _origin: str = PrivateAttr("")
     _made_slots: dict[str, Floats | None] = PrivateAttr(default_factory=dict)
     _made_edges: dict[str, Ints] = PrivateAttr(default_factory=dict)
+    _ordered_slots: dict[str, Floats | None] = PrivateAttr(default_factory=dict)
+    _made_distances: dict[str, Floats] = PrivateAttr(default_factory=dict)
 
     def __init__(self, *_: object, **__: object) -> None:
         """Refuse: keys alone would not be checked as a whole.
@@ -336,8 +339,13 @@ class Mission(Contents):
 
         Without slots, they are derived from the distances; None if the distances are not complete.
         """
-        slots = self._slots(name)
-        return slots if slots is None else slots[self.assigned_slots[name]]
+        if name not in self._ordered_slots:
+            slots = self._slots(name)
+            if slots is not None:
+                slots = slots[self.assigned_slots[name]]
+                slots.flags.writeable = False
+            self._ordered_slots[name] = slots
+        return self._ordered_slots[name]
 
     def formation_colours(self, name: str) -> tuple[str, ...] | None:
         """Light "#rrggbb" of each agent in a formation; None if the formation has none of its own."""
@@ -350,12 +358,17 @@ class Mission(Contents):
 
     def formation_distances(self, name: str) -> Floats:
         """Length (m,) [m] of each edge of a formation."""
-        given = self.formations[name].distances
-        if given is not None:
-            return np.array(given, dtype=np.float64)
-        slots = self.formation_slots(name)
-        assert slots is not None  # checked: without distances there is a shape or slots
-        return distances(slots, self.formation_edges(name))
+        if name not in self._made_distances:
+            given = self.formations[name].distances
+            if given is not None:
+                lengths = np.array(given, dtype=np.float64)
+            else:
+                slots = self.formation_slots(name)
+                assert slots is not None  # checked: without distances there is a shape or slots
+                lengths = distances(slots, self.formation_edges(name))
+            lengths.flags.writeable = False
+            self._made_distances[name] = lengths
+        return self._made_distances[name]
 
     def damping(self, name: str | None, lost: Bools | None = None) -> float:
         """Damping mu [-] of the iterated solver while a formation is held, or during a change if ``name`` is None.
@@ -375,8 +388,7 @@ class Mission(Contents):
         if not len(edges) or min(len(edges), 3 * int(left.sum())) > _DENSE:
             return _DAMPING[1]
         masses = self.fleet.mass[left]
-        index = constraint_jacobian.smallest_singular_value(slots[left][None], edges, masses)[0]
-        return float(np.clip(index**2 / 4, *_DAMPING))
+        return _damping(slots[left], edges, masses)
 
     @property
     def latest_end(self) -> float:
@@ -467,6 +479,13 @@ class Mission(Contents):
     def on_loss(self) -> Literal["continue", "hold", "land"]:
         """What the others do when a vehicle or link is lost."""
         return "continue" if self.disturbances is None else self.disturbances.on_loss
+
+
+@kept
+def _damping(slots: Floats, edges: Ints, masses: Floats) -> float:
+    """Damping "auto" of a formation held: slots (N, 3) [m], edges (m, 2) and masses (N,) [kg]."""
+    index = constraint_jacobian.smallest_singular_value(slots[None], edges, masses)[0]
+    return float(np.clip(index**2 / 4, *_DAMPING))
 
 
 def mission_names() -> list[str]:
