@@ -261,7 +261,7 @@ def _touch_downs(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator
             continue
         k = measured.samples[i].stop - 1
         down = -measured.result.velocity[k, :, 2]
-        who = np.flatnonzero(measured.left[k] & (measured.each_clearance[k] <= PAD))
+        who = np.flatnonzero(measured.left[k] & (measured.close.each[k] <= PAD))
         if not len(who):
             yield _at_end(p, "touch_down", False, "no vehicle is on the ground")
             continue
@@ -353,7 +353,7 @@ def _separation(measured: Measurements, e: Extreme) -> CheckResult:
     words = f"{e.who} come within {value(e.value, 'm')} of each other at {e.when:.2f} s"
     words += f" (limit {limit:g} m)"
     if e.value <= 0:
-        since = _since(measured, "separation", measured.close[0])
+        since = _since(measured, "separation", measured.close.separation)
         depth = f"by {value(abs(e.value), 'm')} at {e.when:.2f} s"
         words = f"agents collide, first {since}; {e.who} overlap the most, {depth}"
     return _bounded("separation", e, "m", limit, words, passed=passed, at_least=True)
@@ -399,7 +399,7 @@ def _clearances(measured: Measurements) -> Iterator[CheckResult]:
         agent, obstacle = e.who.split(", ", 1)
         words = f"{agent} comes within {value(e.value, 'm')} of '{obstacle}' at {e.when:.2f} s"
         if hit or e.value <= 0:
-            since = _since(measured, "clearance", measured.close[2])
+            since = _since(measured, "clearance", measured.close.clearance)
             depth = f"by {value(abs(e.value), 'm')} at {e.when:.2f} s"
             words = (
                 f"agents hit obstacles, first {since}; {agent} is deepest in '{obstacle}', {depth}"

@@ -201,11 +201,15 @@ def led(
 ) -> tuple[Floats, Floats, Floats]:
     """The trajectory of `finite_horizon_trajectory`, from the response at its times (K,) [s]."""
     states, inputs = response
-    x0, v0, x1, v1 = np.broadcast_arrays(*(np.asarray(z, dtype=float) for z in (*start, *target)))
-    e0 = np.stack([x0 - (x1 - T * v1), v0 - v1])
-    e, a = np.tensordot(states, e0, axes=1), np.tensordot(inputs, e0, axes=1)
+    given = [np.asarray(z, dtype=float) for z in (*start, *target)]
+    alike = all(z.shape == given[0].shape for z in given)
+    x0, v0, x1, v1 = given if alike else np.broadcast_arrays(*given)
+    e0 = np.array([x0 - (x1 - T * v1), v0 - v1])
+    rows, shape = e0.reshape(2, -1), x0.shape
+    e = (states.reshape(-1, 2) @ rows).reshape(-1, 2, *shape)
+    a = (inputs.reshape(-1, 2) @ rows).reshape(-1, *shape)
     since = (times - T).reshape(-1, *[1] * x0.ndim)
-    return x1 + since * v1 + e[:, 0], v1 + e[:, 1], a[:, 0]
+    return x1 + since * v1 + e[:, 0], v1 + e[:, 1], a
 
 
 def infinite_horizon_trajectory(

@@ -58,6 +58,15 @@ class Fleet(NamedTuple):
     thrust_limit: Floats
 
 
+class _Made(NamedTuple):
+    """What is computed once of each formation, by its name."""
+
+    slots: dict[str, Floats | None]  # in their own order
+    ordered: dict[str, Floats | None]  # in the order of the agents
+    edges: dict[str, Ints]
+    distances: dict[str, Floats]
+
+
 class Mission(Contents):
     """A checked mission. Create one by `load_mission`, `Mission.from_toml` or `Mission.from_dict`.
 
@@ -68,10 +77,6 @@ class Mission(Contents):
 
     _text: str = PrivateAttr("")
     _origin: str = PrivateAttr("")
-    _made_slots: dict[str, Floats | None] = PrivateAttr(default_factory=dict)
-    _made_edges: dict[str, Ints] = PrivateAttr(default_factory=dict)
-    _ordered_slots: dict[str, Floats | None] = PrivateAttr(default_factory=dict)
-    _made_distances: dict[str, Floats] = PrivateAttr(default_factory=dict)
 
     def __init__(self, *_: object, **__: object) -> None:
         """Refuse: keys alone would not be checked as a whole.
@@ -96,7 +101,22 @@ class Mission(Contents):
         """
         if not isinstance(text, str):
             raise wrong_type("the text of a mission file", text)
-        parts = check(parse_toml(text, origin), origin)
+        return cls._checked(parse_toml(text, origin), text, origin)
+
+    @classmethod
+    def from_plain(cls, data: dict[str, Any], origin: str) -> Self:
+        """Check a mission given as the plain data of its TOML text, as `to_dict` returns it.
+
+        Raises
+        ------
+        MissionError
+            With a finding for each error.
+        """
+        return cls._checked(data, to_toml(data), origin)
+
+    @classmethod
+    def _checked(cls, data: dict[str, Any], text: str, origin: str) -> Self:
+        parts = check(data, origin)
         if parts["assignment"] == "each":
             parts["formations"], parts["phases"] = told_apart(parts["formations"], parts["phases"])
         n = len(parts["agents"].position)
@@ -319,33 +339,38 @@ class Mission(Contents):
             return False
         return taken.attitude == "free" or not self.formations[taken.formation].knows_slots
 
+    @cached_property
+    def _made(self) -> _Made:
+        return _Made({}, {}, {}, {})
+
     def _slots(self, name: str) -> Floats | None:
         """Slots (N, 3) [m] of a formation in their own order; computed once."""
-        if name not in self._made_slots:
-            self._made_slots[name] = self.formations[name].slot_array(self.n_agents)
-        return self._made_slots[name]
+        made = self._made.slots
+        if name not in made:
+            made[name] = self.formations[name].slot_array(self.n_agents)
+        return made[name]
 
     def formation_edges(self, name: str) -> Ints:
         """Edges (m, 2) of a formation, agents from 0, i < j."""
-        if name not in self._made_edges:
+        made = self._made.edges
+        if name not in made:
             edges = self.formations[name].edge_array(self.n_agents)
             if self.assignment != "given":
                 edges = np.sort(np.argsort(self.assigned_slots[name])[edges], axis=1)
-            self._made_edges[name] = edges
-        return self._made_edges[name]
+            made[name] = edges
+        return made[name]
 
     def formation_slots(self, name: str) -> Floats | None:
         """Slots (N, 3) [m] of a formation about their geometric centre, in the order of the agents.
 
         Without slots, they are derived from the distances; None if the distances are not complete.
         """
-        if name not in self._ordered_slots:
+        made = self._made.ordered
+        if name not in made:
             slots = self._slots(name)
-            if slots is not None:
-                slots = slots[self.assigned_slots[name]]
-                slots.flags.writeable = False
-            self._ordered_slots[name] = slots
-        return self._ordered_slots[name]
+            made[name] = None if slots is None else slots[self.assigned_slots[name]]
+        ordered = made[name]
+        return None if ordered is None else ordered.copy()
 
     def formation_colours(self, name: str) -> tuple[str, ...] | None:
         """Light "#rrggbb" of each agent in a formation; None if the formation has none of its own."""
@@ -358,7 +383,8 @@ class Mission(Contents):
 
     def formation_distances(self, name: str) -> Floats:
         """Length (m,) [m] of each edge of a formation."""
-        if name not in self._made_distances:
+        made = self._made.distances
+        if name not in made:
             given = self.formations[name].distances
             if given is not None:
                 lengths = np.array(given, dtype=np.float64)
@@ -366,9 +392,8 @@ class Mission(Contents):
                 slots = self.formation_slots(name)
                 assert slots is not None  # checked: without distances there is a shape or slots
                 lengths = distances(slots, self.formation_edges(name))
-            lengths.flags.writeable = False
-            self._made_distances[name] = lengths
-        return self._made_distances[name]
+            made[name] = lengths
+        return made[name].copy()
 
     def damping(self, name: str | None, lost: Bools | None = None) -> float:
         """Damping mu [-] of the iterated solver while a formation is held, or during a change if ``name`` is None.

@@ -31,22 +31,27 @@ class ByEdge:
 
     def of(self, edges: Ints, other: Floats | float) -> Floats:
         """Values (m,) of edges (m, 2), i < j; ``other`` (m,) for new edges."""
-        keys = self._keys(edges)
+        keys = _keys(edges)
+        if keys is self.keys:
+            return self.values.copy()
         at = np.searchsorted(self.keys, keys)
         known = np.append(self.keys, -1)[at] == keys
         return np.where(known, np.append(self.values, 0.0)[at], other)
 
     def updated(self, edges: Ints, values: Floats) -> ByEdge:
         """These values, updated with the ``values`` of edges (m, 2), i < j."""
-        keys = self._keys(edges)
+        keys = _keys(edges)
+        if keys is self.keys:
+            return ByEdge(keys, values.copy())
         if (keys[1:] > keys[:-1]).all() and (not len(self.keys) or np.array_equal(keys, self.keys)):
             return ByEdge(keys, values.copy())
         keys, first = np.unique(np.concatenate([keys, self.keys]), return_index=True)
         return ByEdge(keys, np.concatenate([values, self.values])[first])
 
-    @staticmethod
-    def _keys(edges: Ints) -> Ints:
-        return (edges[:, 0] << 32) + edges[:, 1]
+
+@kept
+def _keys(edges: Ints) -> Ints:
+    return (edges[:, 0] << 32) + edges[:, 1]
 
 
 @dataclass
