@@ -30,9 +30,9 @@ class ByEdge:
     values: Floats = field(default_factory=lambda: np.zeros(0))
 
     def of(self, edges: Ints, other: Floats | float) -> Floats:
-        """Values (m,) of edges (m, 2), i < j; ``other`` (m,) for new edges."""
+        """Values (m,) of edges (m, 2), i < j; ``other`` (m,) for new edges, or (B, m), then of so many flights."""
         keys = _keys(edges)
-        if keys is self.keys:
+        if keys is self.keys and np.ndim(other) < 2:
             return self.values.copy()
         at = np.searchsorted(self.keys, keys)
         known = np.append(self.keys, -1)[at] == keys
