@@ -59,15 +59,21 @@ class Laid(NamedTuple):
     off: Floats  # (..., N) distance of each agent from its slot, mirrored if that fits better
     mirrored: Bools  # (...) whether mirrored slots fit better
     turn: Floats  # (..., 3, 3) the best-fitting rotation, without a reflection
+    size: Floats  # (...) the greatest coordinate of the slots, about their centre
+    lengths: Floats  # (2, ..., N, N) distances of agents, and of slots, if they are few; else (2, ..., 0, 0)
 
     @classmethod
     def of(cls, p: Floats, slots: Floats) -> Laid:
         """Fit slots (..., N, 3) to agents p (..., N, 3)."""
+        few = np.stack([p, slots])[..., : p.shape[-2] if p.shape[-2] <= _FEW else 0, :]
+        lengths = _length(few[..., :, None, :] - few[..., None, :, :])
         p, slots = p - p.mean(axis=-2, keepdims=True), slots - slots.mean(axis=-2, keepdims=True)
         across = p.swapaxes(-1, -2) @ slots
         U, _, Vt = np.linalg.svd(slots.swapaxes(-1, -2) @ p)
         off = np.linalg.norm(p - slots @ (U @ Vt), axis=-1)
-        return cls(p, slots, off, np.linalg.det(across) < 0, rigid_body.kabsch(p, slots))
+        size = np.abs(slots).max(axis=(-2, -1))
+        turn = rigid_body.kabsch(p, slots)
+        return cls(p, slots, off, np.linalg.det(across) < 0, turn, size, lengths)
 
 
 class Fit:
@@ -489,7 +495,8 @@ class Measurements:
             laid = Laid.of(
                 np.stack([p for _, p, _, _ in group]), np.stack([s for *_, s, _ in group])
             )
-            for (index, p, slots, left), one in zip(group, zip(*laid, strict=True), strict=True):
+            each = zip(*laid._replace(lengths=laid.lengths.swapaxes(0, 1)), strict=True)
+            for (index, p, slots, left), one in zip(group, each, strict=True):
                 fits[index] = Fit(p, slots, left, Laid(*one))
         return fits
 
@@ -587,17 +594,16 @@ def _all_pairs(p: Floats, slots: Floats, laid: Laid) -> tuple[float, tuple[int, 
     Few pairs have to be computed: the error of a pair is at most the sum of both agents' distances from their slots,
     for any fit of the slots, mirrored or not. Improvements below rounding are ignored.
     """
-    off, both = laid.off.tolist(), np.stack([p, slots])
+    off, both = laid.off.tolist(), np.array([p, slots])
     order = sorted(range(len(off)), key=lambda i: -off[i])
-    ranked, rounding = [-off[i] for i in order], 1e-12 * float(np.abs(laid.slots).max())
-    few = _length(both[:, :, None] - both[:, None]).tolist() if len(off) <= _FEW else None
+    ranked, rounding, few = [-off[i] for i in order], 1e-12 * float(laid.size), laid.lengths.tolist()
     worst = (-1.0, (0, 0), 0.0, 0.0)
     for k, i in enumerate(order[:-1]):
         last = bisect_left(ranked, off[i] - worst[0] - rounding)
         if last <= k + 1:
             break
         others = sorted(order[k + 1 : last])
-        if few is None:
+        if not few[0]:
             flown, intended = _length(both[:, others] - both[:, i, None]).tolist()
         else:
             flown, intended = ([lengths[i][j] for j in others] for lengths in few)
