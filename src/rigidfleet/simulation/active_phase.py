@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 #: size of formation, this is often enough for Ctrl-C and progress.
 _STEPS, _PAUSE = 2000, 0.05
 #: Least number of steps at the start of a phase: they may take a thousand times as long as those of the phase before.
-#: Small fleets take about so many numbers' steps, in less than a tenth of `_PAUSE`.
+#: Without a user's force, steps of this many numbers in all take less than a tenth of `_PAUSE`.
 _FIRST_STEPS, _FIRST_NUMBERS = 10, 3000
 #: Interval between checks whether a phase has settled, if it ends by settling [s].
 _CHECK = 0.1
@@ -89,7 +89,9 @@ class ActivePhase:
         self.begun = False  # whether samples exist since the start or the last loss
         self._start(plan.state(), plan.start)
         #: Steps per call of the integrator; more once their duration is known.
-        self.steps = max(_FIRST_STEPS, _FIRST_NUMBERS // len(self.state.y))
+        self.steps = _FIRST_STEPS
+        if external is None:
+            self.steps = max(_FIRST_STEPS, _FIRST_NUMBERS // len(self.state.y))
         if self.solver is not None:
             self.state.clock[1] = first_step(plan, self.workspace, self.state)
 
