@@ -286,14 +286,14 @@ def quintic_pieces(times: ArrayLike, x: ArrayLike, v: ArrayLike, a: ArrayLike) -
     """
     t = np.asarray(times, dtype=float)
     x, v, a = (np.asarray(z, dtype=float) for z in (x, v, a))
-    if t.ndim != 1 or len(t) < 2 or not np.all(np.diff(t) > 0):
+    if t.ndim != 1 or len(t) < 2 or not ((h := t[1:] - t[:-1]) > 0).all():
         raise ValueError("times must be at least two increasing times [s]")
     if not x.shape == v.shape == a.shape or x.shape[:1] != t.shape:
         raise ValueError(
             f"x, v and a must have one row for each of the {len(t)} times and the same shape,"
             f" not {x.shape}, {v.shape} and {a.shape}"
         )
-    return _quintics(np.diff(t), (x[:-1], x[1:]), (v[:-1], v[1:]), (a[:-1], a[1:]))
+    return _quintics(h, (x[:-1], x[1:]), (v[:-1], v[1:]), (a[:-1], a[1:]))
 
 
 def _quintics(h: Floats, x: ArrayLike, v: ArrayLike, a: ArrayLike) -> Floats:

@@ -407,8 +407,10 @@ class Mission(Contents):
         slots = self.formation_slots(name) if name else None
         if name is None or slots is None:
             return _DAMPING[1]
-        left = np.ones(self.n_agents, dtype=np.bool_) if lost is None else ~lost
         edges = self.formation_edges(name)
+        if lost is None and len(edges) > 0 and min(len(edges), 3 * self.n_agents) <= _DENSE:
+            return _damping(slots, edges, self.fleet.mass)
+        left = np.ones(self.n_agents, dtype=np.bool_) if lost is None else ~lost
         edges = (np.cumsum(left) - 1)[edges[left[edges].all(axis=1)]]
         if not len(edges) or min(len(edges), 3 * int(left.sum())) > _DENSE:
             return _DAMPING[1]

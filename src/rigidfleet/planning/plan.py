@@ -400,7 +400,8 @@ def _law(mission: Mission, mu: float, *, damped: bool) -> ConstraintLaw:
 
 def _control(mission: Mission, phase: Phase, masses: Floats) -> Control:
     kind = {"open": OPEN, "tracking": TRACKING, "body": BODY}[phase.control]
-    force = np.tile(np.array(phase.input_force), (len(masses), 1))
+    force = np.empty((len(masses), 3))
+    force[:] = phase.input_force
     force[:, 2] += masses * mission.gravity
     k1, k2 = lqr.double_integrator_gains(mission.tracking.Q, mission.tracking.R)
     allocation = mission.allocation

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 
@@ -69,6 +70,17 @@ _SAMPLED = (
 _OF_FLIGHT = {"clearance_start": records.STANDING, "clearance_flight": records.FLYING}
 
 
+@lru_cache(16)
+def _stood(
+    position: Sequence[Sequence[float]],
+    radius: Sequence[float],
+    obstacles: Sequence[proximity.Obstacle],
+) -> Ints:
+    """Whether agents stand on obstacles at the start (N,), kept for missions with the same start and obstacles."""
+    start, _ = proximity.obstacle_clearances(np.array(position), np.array(radius), obstacles)
+    return (start <= PAD).astype(np.int64)
+
+
 class Extremes:
     """Monitors a flight and reports the worst values of each phase."""
 
@@ -90,10 +102,7 @@ class Extremes:
         self.who, self.sign = np.full((count, 2), -1), np.zeros(1)
         self.left = np.ones(self.n, dtype=np.bool_)
         self.low = np.full((self.n, 3), np.inf)
-        start, _ = proximity.obstacle_clearances(
-            np.array(agents.position), self.radius, mission.obstacles
-        )
-        self.stood = (start <= PAD).astype(np.int64)
+        self.stood = _stood(agents.position, agents.radius, mission.obstacles)
         self.standing = self.stood.copy()
         self.pairs = self.columns = self.struck = np.zeros((0, 2), dtype=np.int64)
         self.spare, self.moved = 0.0, np.zeros(2)
