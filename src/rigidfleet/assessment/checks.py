@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
+from operator import itemgetter
 
 import numpy as np
 
@@ -235,21 +236,29 @@ def _at_end(
 
 
 def _waypoints(phases: list[PhaseVerdict]) -> Iterator[CheckResult]:
+    """Every waypoint that is missed, in each quantity, or the one met least well."""
+    points = [
+        (p, what, at)
+        for p in phases
+        for what, at in (
+            *((f"point {k} on the way", at) for k, at in enumerate(p.through, start=1)),
+            ("the waypoint", p.waypoint),
+        )
+        if at is not None
+    ]
     for name, limit in WAYPOINT_TOLERANCE.items():
         unit = {"position": "m", "velocity": "m/s", "attitude": "deg", "rates": "deg/s"}[name]
-        for p in phases:
-            met = [] if p.waypoint is None else [("the waypoint", p.waypoint)]
-            points = [(f"point {k} on the way", at) for k, at in enumerate(p.through, start=1)]
-            for what, at in [*points, *met]:
-                miss = getattr(at, name)
-                if miss is None:
-                    continue
-                passed = miss <= limit
-                words = f"{'met' if passed else 'missed'}, {value(miss, unit)} off in {name}"
-                words = f"{what} of phase '{p.name}' is {words} (limit {limit:g} {unit})"
-                yield CheckResult(
-                    f"waypoint_{name}", passed, words, miss, limit, unit, when=at.time, phase=p.name
-                )
+        found = [
+            (miss, *point) for point in points if (miss := getattr(point[2], name)) is not None
+        ]
+        missed = [one for one in found if not one[0] <= limit]
+        for miss, p, what, at in missed or ([max(found, key=itemgetter(0))] if found else []):
+            passed = miss <= limit
+            words = f"{'met' if passed else 'missed'}, {value(miss, unit)} off in {name}"
+            words = f"{what} of phase '{p.name}' is {words} (limit {limit:g} {unit})"
+            yield CheckResult(
+                f"waypoint_{name}", passed, words, miss, limit, unit, when=at.time, phase=p.name
+            )
 
 
 def _touch_downs(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[CheckResult]:
