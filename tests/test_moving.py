@@ -134,6 +134,39 @@ def test_the_flow_is_that_of_a_doublet_in_a_stream(seed):
     assert given == pytest.approx(4.0 * (np.array(flow) + w - v), rel=1e-6)
 
 
+# -- the barriers -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_vehicle_steers_past_what_would_pass_too_near(seed):
+    """Held until the nearest approach, the least change of what is asked for leads past at the distance to keep."""
+    rng = np.random.default_rng(seed)
+    fly = One(passing([6.0, 0, 0], [-3.0, 0, 0]), guarded=False, clearance=0.1)
+    r, v, force = rng.normal(0, 0.2, 3), rng.normal(0, 0.2, 3), rng.normal(0, 0.1, 3)
+    change = fly(0.0, r, v, force) - force
+    x, u = r - [6.0, 0, 0], v - [-3.0, 0, 0]
+    t = -(x @ u) / (u @ u)
+    beside = x + t * u  # at right angles to the way, which both would go on straight
+    n = beside / np.linalg.norm(beside)
+    asked = n @ force
+    led = np.linalg.norm(beside) + 0.5 * (asked + n @ change) * t * t
+    assert led == pytest.approx(0.7 + 0.3 + 0.1, abs=1e-5)
+    assert np.linalg.norm(np.cross(n, change)) < 1e-6
+
+
+def test_a_ball_does_not_drive_a_vehicle_into_another():
+    """One of two vehicles in line is met straight from ahead: it gives way beside, not towards the other."""
+    mission = crowd(
+        [[0.0, 0, 5], [-2.0, 0, 5]], limit=15.0, until=6.0,
+        obstacles=[{"kind": "sphere", "centre": [10.0, 0.01, 5], "radius": 0.7, "velocity": [-2.5, 0, 0]}],
+        avoidance={"separation": 0.1, "clearance": 0.05},
+    )  # fmt: skip
+    result = rf.simulate(mission)
+    assert worst(result, "clearance") >= 0.05 - 1e-6
+    assert worst(result, "separation") >= 0.1 - 1e-6
+    assert guarantee(mission)[0].passed
+
+
 # -- the guard ----------------------------------------------------------------------------------------
 
 

@@ -179,7 +179,7 @@ def avoidance(
     solids = joined([]) if solids is None else solids
     n, count = len(b), len(solids.kind)
     capacity = n * (n - 1) if n <= _FEW else _NEIGHBOURS * n
-    rows = min(capacity // 2, _BARRIERS * n) + n * count
+    rows = min(capacity // 2, _BARRIERS * n) + 2 * n * count
     radius = np.asarray(radius, dtype=float)
     return Avoidance(
         law=np.zeros(2, dtype=np.int64), guarded=guarded, filtered=filtered, period=float(period), rate=float(rate),

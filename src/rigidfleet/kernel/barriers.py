@@ -26,12 +26,14 @@ from rigidfleet.kernel.avoidance import BARRIER, EXACT, KNOWN
 from rigidfleet.kernel.compiler.jit import compiled
 from rigidfleet.kernel.linalg import cholesky, cholesky_solve
 from rigidfleet.kernel.moving import braking_beside
-from rigidfleet.kernel.segments import from_solid
+from rigidfleet.kernel.segments import from_obstacle, from_solid
 
 #: Greatest number of sweeps, change of an acceleration that ends them [m/s^2], distance that counts as none [m].
 _SWEEPS, _CLOSE, _NEAREST = 100, 1e-7, 1e-6
 #: Share of its braking by which barriers push a vehicle whose edges let go completely.
 _FULL = 0.5
+#: Time for which vehicles look ahead to where obstacles that move pass them [s].
+_AHEAD = 3.0
 #: Least share to which an edge holds in the equations.
 _LOOSE = 1e-3
 
@@ -73,6 +75,36 @@ def add_row(count, i, j, n0, n1, n2, needed, most, a):
         a.needed[count], a.push[count], a.most[count] = needed, 0.0, most
         count += 1
     return count
+
+
+@compiled
+def add_obstacle(count, i, needed, a):
+    """Add a barrier of vehicle i along ``normal``, if it may act; the number of them, and whether this is violated."""
+    n, c = a.normal, a.wanted[i]
+    have = n[0] * c[0] + n[1] * c[1] + n[2] * c[2]
+    if needed > have - a.b[i]:
+        count = add_row(count, i, -1, n[0], n[1], n[2], needed, 2.0 * a.b[i] * a.weight[i], a)
+    return count, needed > have
+
+
+@compiled
+def needed_beside(i, o, r, v, a):
+    """Least acceleration of vehicle i with which obstacle o, which moves, passes it; ``normal`` is its direction.
+
+    Both go on straight to where they are nearest, in the time t, with a part of the distance to keep missing. An
+    acceleration of 2 / t^2 times that part along the normal there, held until then, makes up for it. Without it, a
+    vehicle would be driven along by an obstacle that comes straight at it, until others are in its way.
+    """
+    x, p, q, bound = a.sight.track[o], a.shifted[0], a.shifted[2], a.sight.bound[o]
+    for k in range(3):
+        p[k] = r[k] - x[k]
+        q[k] = p[k] + _AHEAD * (v[k] - x[3 + k])
+    _, away, share = from_obstacle(p, q, o, a.solids, math.nan, a.normal)
+    t = _AHEAD * share
+    missing = a.reach[i] + a.spare[i] + bound[0] + t * bound[1] - away
+    if missing <= 0.0 or share == 0.0:
+        return -math.inf
+    return 2.0 * missing / max(t - a.lag[i], a.period) ** 2
 
 
 @compiled
@@ -121,11 +153,11 @@ def list_barriers(r, v, lost, a):
                 continue
             gap -= max(0.0, -s) * a.lag[i]
             needed = needed_rate(gap, s, 0.0, a.share * B, a.rate)
-            have = normal[0] * c[0] + normal[1] * c[1] + normal[2] * c[2]
-            if needed > have - a.b[i]:
-                violated = violated or needed > have
-                most = 2.0 * a.b[i] * a.weight[i]
-                count = add_row(count, i, -1, normal[0], normal[1], normal[2], needed, most, a)
+            count, worse = add_obstacle(count, i, needed, a)
+            violated = violated or worse
+            if a.sight.moves[o] != 0:
+                count, worse = add_obstacle(count, i, needed_beside(i, o, r[i], v[i], a), a)
+                violated = violated or worse
     return count, violated
 
 
