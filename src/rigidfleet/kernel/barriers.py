@@ -29,9 +29,9 @@ from rigidfleet.kernel.moving import braking_beside
 from rigidfleet.kernel.segments import from_obstacle, from_solid
 
 #: Greatest number of sweeps, change of an acceleration that ends them [m/s^2], distance that counts as none [m].
-_SWEEPS, _CLOSE, _NEAREST = 10, 1e-6, 1e-6
-#: Number of sweeps over barriers that push between those over all.
-_INNER = 10
+_SWEEPS, _CLOSE, _NEAREST = 10, 1e-5, 1e-6
+#: Number of sweeps over barriers that push between those over all, and the factor of over-relaxation.
+_INNER, _BEYOND = 15, 1.5
 #: Share of its braking by which barriers push a vehicle whose edges let go completely.
 _FULL = 0.5
 #: Time for which vehicles look ahead to where obstacles that move pass them [s].
@@ -69,15 +69,18 @@ def loosen(p, w, state, a):
 
 
 @compiled
-def add_row(count, i, j, entry, n, missing, most, a):
-    """Add a barrier along n (3,), with its entry of ``last``; returns the number of them."""
+def add_row(count, i, j, entry, n, missing, limit, a):
+    """Add a barrier along n (3,), with its entry of ``last``; returns the number of them.
+
+    It changes the acceleration along n by twice ``limit`` at most.
+    """
     if count < a.rows.shape[0]:
         a.rows[count, 0], a.rows[count, 1], a.rows[count, 2] = i, j, entry
         for q in range(3):
             a.normals[count, q] = n[q]
-        a.missing[count], a.most[count] = missing, most
-        a.push[count] = min(a.last[entry], most)
-        a.reduced[count] = 1.0 / (a.inverse[i] + (a.inverse[j] if j >= 0 else 0.0))
+        reduced = 1.0 / (a.inverse[i] + (a.inverse[j] if j >= 0 else 0.0))
+        a.missing[count], a.most[count] = missing, 2.0 * limit * reduced
+        a.push[count], a.reduced[count] = min(a.last[entry], a.most[count]), reduced
         count += 1
     return count
 
@@ -88,7 +91,7 @@ def add_obstacle(count, i, entry, needed, a):
     n, c = a.normal, a.wanted[i]
     missing = needed - (n[0] * c[0] + n[1] * c[1] + n[2] * c[2])
     if missing > -a.b[i]:
-        count = add_row(count, i, -1, entry, n, missing, 2.0 * a.b[i] * a.weight[i], a)
+        count = add_row(count, i, -1, entry, n, missing, a.b[i], a)
     return count, missing > 0.0
 
 
@@ -104,9 +107,13 @@ def needed_beside(i, o, r, v, a):
     for k in range(3):
         p[k] = r[k] - x[k]
         q[k] = p[k] + _AHEAD * (v[k] - x[3 + k])
+    keep = a.reach[i] + a.spare[i] + bound[0]
+    most = keep + _AHEAD * bound[1]
+    if from_obstacle(p, q, o, a.solids, most, a.normal)[1] >= most:  # quick
+        return -math.inf
     _, away, share = from_obstacle(p, q, o, a.solids, math.nan, a.normal)
     t = _AHEAD * share
-    missing = a.reach[i] + a.spare[i] + bound[0] + t * bound[1] - away
+    missing = keep + t * bound[1] - away
     if missing <= 0.0 or share == 0.0:
         return -math.inf
     return 2.0 * missing / max(t - a.lag[i], a.period) ** 2
@@ -126,19 +133,19 @@ def list_barriers(r, v, lost, a):
                 continue
             x, y, z = r[i, 0] - r[j, 0], r[i, 1] - r[j, 1], r[i, 2] - r[j, 2]
             L = math.sqrt(x * x + y * y + z * z)
-            n[0], n[1], n[2] = x / L, y / L, z / L
+            inverse = 1.0 / L
+            n[0], n[1], n[2] = inverse * x, inverse * y, inverse * z
             X, Y, Z = v[i, 0] - v[j, 0], v[i, 1] - v[j, 1], v[i, 2] - v[j, 2]
             s, d = n[0] * X + n[1] * Y + n[2] * Z, a.wanted[j]
             both = a.b[i] + a.b[j]
             gap = L - a.room[i] - a.room[j] - a.spare[i] - a.spare[j]
             gap -= max(0.0, -s) * max(a.lag[i], a.lag[j])
-            across = (X * X + Y * Y + Z * Z - s * s) / L
+            across = (X * X + Y * Y + Z * Z - s * s) * inverse
             needed = needed_rate(gap, s, across, a.share * both, a.rate)
             have = n[0] * (c[0] - d[0]) + n[1] * (c[1] - d[1]) + n[2] * (c[2] - d[2])
             if needed > have - both:
                 violated = violated or needed > have
-                most = 2.0 * both / (a.inverse[i] + a.inverse[j])
-                count = add_row(count, i, j, e, n, needed - have, most, a)
+                count = add_row(count, i, j, e, n, needed - have, both, a)
         for o in range(a.solids.kind.shape[0]):
             B = a.b[i]
             if a.sight.moves[o] == 0:
@@ -196,7 +203,7 @@ def relax(k, a):
     """Let barrier k push as it must with the present accelerations; returns the change that it makes [m/s^2]."""
     i, j, n = a.rows[k, 0], a.rows[k, 1], a.normals[k]
     rest = a.missing[k] - relative(i, j, n, a.shift)
-    push = min(max(a.push[k] + rest * a.reduced[k], 0.0), a.most[k])
+    push = min(max(a.push[k] + _BEYOND * rest * a.reduced[k], 0.0), a.most[k])
     more = push - a.push[k]
     if more == 0.0:
         return 0.0
@@ -215,7 +222,7 @@ def relax_edges(p, w, a):
         if along == 0.0 and a.pull[e] == 0.0:
             continue
         soft, diagonal = softness(e, p, a), p.graph.diagonal[e]
-        pull = -(along + soft * a.pull[e]) / (diagonal + soft)
+        pull = -_BEYOND * (along + soft * a.pull[e]) / (diagonal + soft)
         change = max(change, abs(pull) * diagonal)
         shove(i, j, n, pull, a)
         a.pull[e] += pull
