@@ -12,7 +12,7 @@ from rigidfleet.kernel import fleet
 from rigidfleet.kernel.avoidance import KNOWN, UNKNOWN, avoidance, sight
 from rigidfleet.kernel.engine import sampled
 from rigidfleet.kernel.problem import graph, workspace
-from rigidfleet.solids.records import ball, half_space, joined, single
+from rigidfleet.solids.records import ball, box, half_space, joined, single
 
 #: Period of the commands [s].
 T = 0.02
@@ -152,6 +152,14 @@ def test_a_vehicle_steers_past_what_would_pass_too_near(seed):
     led = np.linalg.norm(beside) + 0.5 * (asked + n @ change) * t * t
     assert led == pytest.approx(0.7 + 0.3 + 0.1, abs=1e-5)
     assert np.linalg.norm(np.cross(n, change)) < 1e-6
+
+
+def test_nobody_steers_round_a_wall():
+    """A wide plate that comes from afar asks for nothing: there is no way past it, and braking suffices later."""
+    ends, plate = np.array([0.0, 60.0]), box([6.0, -4.5, -4.5], [6.01, 4.5, 4.5])
+    fly = One(single(plate, ends, np.outer(ends, [-2.5, 0, 0])), guarded=False)
+    given = fly(0.0, np.zeros(3), np.zeros(3), np.zeros(3))
+    assert given == pytest.approx(np.zeros(3), abs=1e-12)
 
 
 def test_a_ball_does_not_drive_a_vehicle_into_another():

@@ -36,6 +36,8 @@ _INNER, _BEYOND = 15, 1.5
 _FULL = 0.5
 #: Time for which vehicles look ahead to where obstacles that move pass them [s].
 _AHEAD = 3.0
+#: Square of the cosine between their way and a direction that still counts as beside it.
+_ACROSS = 0.25
 #: Least share to which an edge holds in the equations.
 _LOOSE = 1e-3
 
@@ -101,7 +103,8 @@ def needed_beside(i, o, r, v, a):
 
     Both go on straight to where they are nearest, in the time t, with a part of the distance to keep missing. An
     acceleration of 2 / t^2 times that part along the normal there, held until then, makes up for it. Without it, a
-    vehicle would be driven along by an obstacle that comes straight at it, until others are in its way.
+    vehicle would be driven along by an obstacle that comes straight at it, until others are in its way. A wide
+    obstacle, which is left in or against the direction of the way, asks for nothing: braking has to do.
     """
     x, p, q, bound = a.sight.track[o], a.shifted[0], a.shifted[2], a.sight.bound[o]
     for k in range(3):
@@ -114,7 +117,11 @@ def needed_beside(i, o, r, v, a):
     _, away, share = from_obstacle(p, q, o, a.solids, math.nan, a.normal)
     t = _AHEAD * share
     missing = keep + t * bound[1] - away
-    if missing <= 0.0 or share == 0.0:
+    along = fast = 0.0
+    for k in range(3):
+        along += a.normal[k] * (q[k] - p[k])
+        fast += (q[k] - p[k]) ** 2
+    if missing <= 0.0 or along * along > _ACROSS * fast:
         return -math.inf
     return 2.0 * missing / max(t - a.lag[i], a.period) ** 2
 
