@@ -9,6 +9,8 @@ and s = dL/dt,
 
     u . (a_i - a_j) >= -rate h - B s / sqrt(2 B (L - D)) - (|v|^2 - s^2) / L.
 
+Beside an obstacle that moves, a second row steers: what would pass too near passes at the distance to keep.
+
 The accelerations change by the least of 1/2 sum m_i |da_i|^2 (Gauss) so that these rows hold and edges keep the
 accelerations that the law gave them, softly: with A = J M^-1 J^T of edges E and barriers B,
 
