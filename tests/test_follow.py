@@ -204,6 +204,25 @@ BAD = {
 }  # fmt: skip
 
 
+@pytest.mark.parametrize(("kind", "near"), [("skyc", 0.02), ("mcap", 1e-3)])
+def test_vehicles_follow_what_was_exported(tmp_path, kind, near):
+    """A flight that leaves as a show or as ROS 2 poses is followed as it was flown, within the format's deviation."""
+    if kind == "mcap":
+        pytest.importorskip("mcap", reason="make .venv/.interchange installs it")
+    first = rf.simulate(_written(tmp_path, 'file = "way.csv"', content=_table(_own())))
+    file = f"flown.{kind}"
+    rf.export(first, tmp_path / file, kind)
+    path = tmp_path / "again.toml"
+    path.write_text(HEAD.format(limits="") + f'file = "{file}"')
+    again = rf.simulate(path)
+    assert rf.assess(again).passed
+    # The second flight waits for the establishment of its own; the file begins with that of the first.
+    for t in np.linspace(0.0, first.time[-1], 9):
+        then, now = np.abs(first.time - t).argmin(), np.abs(again.time - t - 4.0).argmin()
+        assert abs(again.time[now] - 4.0 - first.time[then]) < 1e-9
+        np.testing.assert_allclose(again.position[now], first.position[then], atol=near)
+
+
 @pytest.mark.parametrize("name", BAD)
 def test_bad_files_get_one_clear_error(tmp_path, name):
     """What is wrong, and where."""
