@@ -177,6 +177,22 @@ export function noseMesh() {
   return mesh;
 }
 
+/** A ball of radius 1. */
+export function ballMesh() {
+  const mesh = new Mesh(), N = 12;
+  const at = (i, j) => {
+    const a = (Math.PI * i) / N, b = (Math.PI * j) / N;
+    return [Math.sin(a) * Math.cos(b), Math.sin(a) * Math.sin(b), Math.cos(a)];
+  };
+  for (let i = 0; i < N; i++) {
+    for (let j = 0; j < 2 * N; j++) {
+      if (i > 0) mesh.triangle(at(i, j), at(i + 1, j), at(i, j + 1), OWN);
+      if (i < N - 1) mesh.triangle(at(i + 1, j), at(i + 1, j + 1), at(i, j + 1), OWN);
+    }
+  }
+  return mesh;
+}
+
 /** One rotor at the centre. */
 export function discMesh() {
   return new Mesh().ring([0, 0, 0], 0, 0.39, 14, OWN, [0.25, 1]);
@@ -523,6 +539,14 @@ export class Renderer {
     gl.useProgram(this.line.program);
     gl.bindVertexArray(this.corners);
     gl.drawElements(gl.TRIANGLES, 6 * lines.count, gl.UNSIGNED_INT, 0);
+  }
+
+  /** Direction in the world in which a point of the page [px] is seen. */
+  ray(x, y) {
+    const { eye, target, right, fov, centre } = this.camera, back = unit(sub(eye, target)), up = cross(back, right);
+    const { clientWidth: wide, clientHeight: high } = this.canvas, t = Math.tan(fov / 2);
+    const a = ((2 * x) / wide - 1 - centre[0]) * t * (wide / high), b = (1 - (2 * y) / high - centre[1]) * t;
+    return unit(add(add(scaled(right, a), scaled(up, b)), scaled(back, -1)));
   }
 
   /** Position of a point on the page [px] and its distance ahead [m]; null behind the camera. */

@@ -323,14 +323,18 @@ export class Player {
     view.addEventListener("contextmenu", (event) => event.preventDefault());
     view.addEventListener("pointerdown", (event) => {
       view.setPointerCapture(event.pointerId);
+      if (this.grab(event)) return;
       fingers.set(event.pointerId, event);
     });
-    const away = (event) => fingers.delete(event.pointerId);
+    const away = (event) => {
+      fingers.delete(event.pointerId);
+      this.release(event);
+    };
     view.addEventListener("pointerup", away);
     view.addEventListener("pointercancel", away);
     view.addEventListener("pointermove", (event) => {
       const before = fingers.get(event.pointerId);
-      if (!before) return;
+      if (!before) return this.drag(event);
       const dx = event.clientX - before.clientX, dy = event.clientY - before.clientY;
       const other = [...fingers.values()].find((finger) => finger.pointerId !== event.pointerId);
       if (other) {
@@ -349,6 +353,15 @@ export class Player {
       this.stale = true;
     }, { passive: false });
   }
+
+  // What a press, a movement and a release in the picture do, other than to turn it.
+  grab() {
+    return false;
+  }
+
+  drag() {}
+
+  release() {}
 
   key(event) {
     if (event.ctrlKey || event.metaKey || event.altKey || event.target.tagName === "SELECT") return;

@@ -2,7 +2,7 @@
 
 import {
   BACKGROUND, Lines, Mesh, NO_TURN, OWN, Places, ROTORS, Renderer, add, cross, discMesh, dot, length, mixed,
-  noseMesh, quaternion, rotorMesh, scaled, smallVehicleMesh, sub, unit, vehicleMesh,
+  ballMesh, noseMesh, quaternion, rotorMesh, scaled, smallVehicleMesh, sub, unit, vehicleMesh,
 } from "./gl.js";
 import { bodyAxes } from "./recording.js";
 
@@ -163,9 +163,10 @@ export class Scene {
       box: upload(new Mesh().box([-0.5, -0.5, -0.5], [0.5, 0.5, 0.5], OWN)),
       cone: upload(new Mesh().prism([0, 0, 0], 1, 0, 1, 12, OWN)),
       pin: upload(new Mesh().prism([0, 0, 0], 1, 0, 1.3, 4, OWN).prism([0, 0, 0], 1, 0, -1.3, 4, OWN)),
+      ball: upload(ballMesh()),
       shade: upload(new Mesh().ring([0, 0, 0], 0, 1, 16, OWN, [1, 0])),
     };
-    const names = ["solid", "veils", "vehicles", "turned", "noses", "discs", "small", "ghosts", "smallGhosts", "cones", "pins", "shades"];
+    const names = ["solid", "veils", "vehicles", "turned", "noses", "discs", "small", "ghosts", "smallGhosts", "cones", "pins", "shades", "balls", "ballVeils"];
     this.places = Object.fromEntries(names.map((name) => [name, new Places()]));
     this.lines = { ground: new Lines(), world: new Lines() };
     this.fade = info.boxes.map(() => 1);
@@ -196,6 +197,7 @@ export class Scene {
     if (this.show.edges) this.placeEdges(state);
     if (this.show.axes) this.placeAxes(state);
     if (state.target) this.placeTarget(state);
+    if (state.balls) this.placeBalls(state);
     this.placePath();
     this.placeWaypoints(state);
 
@@ -214,6 +216,7 @@ export class Scene {
     renderer.meshes(meshes.small, places.small);
     renderer.meshes(meshes.cone, places.cones);
     renderer.meshes(meshes.pin, places.pins);
+    renderer.meshes(meshes.ball, places.balls);
     renderer.depth(false);
     renderer.lines(lines.world);
     renderer.meshes(meshes.vehicle, places.ghosts);
@@ -221,6 +224,7 @@ export class Scene {
     renderer.meshes(meshes.rotor, places.vehicles);
     renderer.meshes(meshes.disc, places.discs);
     renderer.meshes(meshes.box, places.veils);
+    renderer.meshes(meshes.ball, places.ballVeils);
     for (const solid of this.solids) renderer.meshes(solid.mesh, solid.veil);
     this.labels.flush();
     return moving;
@@ -399,6 +403,23 @@ export class Scene {
     bodyAxes(state.target.subarray(3, 7)).forEach((axis, a) => lines.world.add(p, add(p, scaled(axis, size)), 2, AXES[a], 0.7));
   }
 
+  /** Balls of a live flight; the chosen one has a ring. */
+  placeBalls(state) {
+    const { places, lines, info } = this;
+    for (let slot = 0; 4 * slot < state.balls.length; slot++) {
+      const p = Array.from(state.balls.subarray(4 * slot, 4 * slot + 3)), radius = state.balls[4 * slot + 3];
+      if (Number.isNaN(radius)) continue;
+      const half = [radius, radius, radius], veil = this.hides(sub(p, half), add(p, half), state);
+      (veil ? places.ballVeils : places.balls).add(p, radius, NO_TURN, SOLID, veil ? 0.3 : 1);
+      places.shades.add([p[0], p[1], info.ground], 1.2 * radius, NO_TURN, INK, 0.35);
+      lines.world.add(p, [p[0], p[1], info.ground], 1, RIM, 0.5);
+      if (this.show.names) this.labels.add(this.renderer.project(add(p, [0, 0, radius])), this.ballNames?.[slot] ?? "", "place", 10);
+      if (slot !== this.chosen) continue;
+      const at = (k) => add(p, scaled([Math.cos(k * Math.PI / 18), Math.sin(k * Math.PI / 18), 0], 1.15 * radius));
+      for (let k = 0; k < 36; k++) lines.world.add(at(k), at(k + 1), 2.5, AXES[2], 0.9);
+    }
+  }
+
   /** Body axes at the centre of mass and, faintly, the commanded ones if they differ. */
   placeAxes(state) {
     const { lines, places, recording } = this;
@@ -451,7 +472,7 @@ class Solid {
   /** Displacement at a time: straight between waypoints, at rest before and after them. */
   shift(time) {
     const { times, ways } = this.info;
-    if (!times.length) return [0, 0, 0];
+    if (times.length < 2) return ways[0] ?? [0, 0, 0];
     let k = 0;
     while (k < times.length - 2 && times[k + 1] < time) k++;
     const share = (time - times[k]) / (times[k + 1] - times[k]);
@@ -460,13 +481,15 @@ class Solid {
 
   /** Place it at a time; a zone is a veil, and so is what hides vehicles. True while its opacity changes. */
   place(scene, time, wait) {
-    const { corners, lines, zone } = this.info, shift = this.shift(time), colour = zone ? FENCE : SOLID;
+    this.solid.clear();
+    this.veil.clear();
+    const { corners, lines, zone, there } = this.info, [since, until] = there;
+    if (time < (since ?? -Infinity) || time > (until ?? Infinity)) return false;
+    const shift = this.shift(time), colour = zone ? FENCE : SOLID;
     const goal = scene.hides(add(this.low, shift), add(this.high, shift), scene.state) ? 0.25 : 1;
     this.fade = goal + (this.fade - goal) * Math.exp(-wait / 0.12);
     const moving = Math.abs(this.fade - goal) >= 0.01;
     if (!moving) this.fade = goal;
-    this.solid.clear();
-    this.veil.clear();
     const alpha = zone ? 0.12 : this.fade;
     (alpha < 1 ? this.veil : this.solid).add(add(this.middle, shift), 1, NO_TURN, colour, alpha);
     const edge = zone ? FENCE : RIM;
