@@ -87,7 +87,7 @@ def main() -> None:
                 if isinstance(what, int):
                     result = made_up(what, 60.0)
                 else:
-                    result = rf.simulate(what) if isinstance(what, str) else rf.load_result(what)
+                    result = rf.simulate(what) if isinstance(what, str) else rf.Result.load(what)
                 page, begun = Path(folder) / "page.html", time.perf_counter()
                 rf.replay(result, page)
                 took = time.perf_counter() - begun

@@ -67,7 +67,7 @@ class LivePlayer extends Player {
     const ball = element("section", card, { id: "ball" });
     element("h2", ball, {}, "Ball");
     const row = element("div", ball, { class: "row" });
-    const add_ = element("button", row, { type: "button", id: "add-ball", title: "Click in the picture where it shall be (b)" }, "Add");
+    const add_ = element("button", row, { type: "button", id: "add-ball", title: "Click in the picture where it shall be (b)" }, "Add ball");
     add_.addEventListener("click", () => this.arm(!this.arming));
     const remove = element("button", row, { type: "button", id: "remove-ball", title: "Remove the ball with the ring (x)" }, "Remove");
     remove.addEventListener("click", () => this.removeBall());
