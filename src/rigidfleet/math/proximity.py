@@ -325,7 +325,21 @@ def obstacle_clearances(
 def distances(
     x: Floats, y: Floats, z: Floats, solid: Solids, time: ArrayLike = 0.0, most: ArrayLike = np.inf
 ) -> Floats:
-    """Signed distance (...) [m] of points to a solid at ``time``; points farther than ``most`` may have infinity."""
+    """Signed distance (...) [m] of points to a solid at ``time``, infinite while it is not there.
+
+    Points farther than ``most`` may have infinity, too.
+    """
+    found = _while_there(x, y, z, solid, time, most)
+    if not np.isfinite(solid.there).any():
+        return found
+    there = distance.is_there(np.asarray(time, dtype=float).T, 0, solid)
+    return np.where(there, found, np.inf)
+
+
+def _while_there(
+    x: Floats, y: Floats, z: Floats, solid: Solids, time: ArrayLike, most: ArrayLike
+) -> Floats:
+    """Signed distance (...) [m] of points to a solid where it is, or would be, at ``time``."""
     if solid.moves:
         shift = distance.displacement(np.asarray(time, dtype=float).T, 0, solid)
         x, y, z = x - shift[0], y - shift[1], z - shift[2]

@@ -70,6 +70,7 @@ def _solid(thing: Obstacle) -> dict[str, Any]:
         "lines": index[cut:],
         "times": solid.times,
         "ways": solid.ways,
+        "there": [x if np.isfinite(x) else None for x in solid.there[0].tolist()],
     }
 
 
