@@ -22,12 +22,13 @@ from rigidfleet.math import attitude as att
 from rigidfleet.math import series
 from rigidfleet.typing import Floats
 
-#: Rate at which a deviation decays [1/s].
-DECAY = 0.8
+#: Rates at which a deviation decays [1/s], and while a barrier is near: returning against it would use up the thrust.
+DECAY, NEAR = 0.9, 0.3
 #: Displacement [m], rotation [rad] and scale, and their derivatives, below which a deviation has ended.
 _ENDED = 1e-3
-#: Smallest and greatest scale, and rate at which these bounds are approached [1/s].
-_SMALLEST, _GREATEST, _APPROACH = 0.7, 1.3, 2.0
+#: Least and greatest scale, and rate at which these bounds are approached [1/s]. A formation that does not shrink keeps
+#: the separation that is proved of its plan.
+_LEAST, _GREATEST, _APPROACH = 1.0, 1.3, 2.0
 #: Least moment of inertia, over the trace: bodies that are lines or points do not turn about themselves.
 _THIN = 1e-9
 
@@ -52,9 +53,8 @@ class Deviation:
         """Rotation vector (3,) [rad]."""
         return att.rotation_vector_from_dcm(self.Q.T)
 
-    def decay(self) -> Floats:
-        """Second derivatives (7,) of displacement, rotation and scale that bring the deviation back."""
-        k = DECAY
+    def decay(self, k: float = DECAY) -> Floats:
+        """Second derivatives (7,) of displacement, rotation and scale that bring the deviation back at a rate [1/s]."""
         return np.concatenate(
             [
                 -2 * k * self.x[1] - k * k * self.x[0], -2 * k * self.omega[0] - k * k * self.turned,
@@ -144,12 +144,11 @@ def steered(
     return None if y is None else asked + np.linalg.solve(L.T, y)
 
 
-def scale_rows(deviation: Deviation, least: float) -> tuple[Floats, Floats]:
-    """Rows (2, 7) and what they need (2,), so that the scale stays above ``least`` and below its greatest value."""
+def scale_rows(deviation: Deviation) -> tuple[Floats, Floats]:
+    """Rows (2, 7) and what they need (2,), so that the scale stays between its bounds."""
     value, rate, _ = deviation.scale
     rows, needed = np.zeros((2, 7)), np.zeros(2)
-    low = min(max(_SMALLEST, least), 1.0)
-    for k, (sign, gap) in enumerate(((1.0, value - low), (-1.0, _GREATEST - value))):
+    for k, (sign, gap) in enumerate(((1.0, value - _LEAST), (-1.0, _GREATEST - value))):
         rows[k, 6] = sign
         needed[k] = -(_APPROACH**2) * gap - 2.0 * _APPROACH * sign * rate
     return rows, needed

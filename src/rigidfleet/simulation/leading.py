@@ -18,6 +18,7 @@ from rigidfleet.math import lqr, series
 from rigidfleet.mission import Mission
 from rigidfleet.mission.schema import Avoidance as Settings
 from rigidfleet.planning.body_layer import (
+    NEAR,
     Deviation,
     greatest_acceleration,
     rigid_rows,
@@ -32,7 +33,7 @@ from rigidfleet.solids.distance import outward_normal, own_axes, signed_distance
 from rigidfleet.typing import Floats
 
 #: Time for which a decision holds [s].
-_PERIOD = 0.05
+_PERIOD = 0.1
 #: How far the clock looks ahead [s], at how many times, and the rates that it compares.
 _HORIZON, _LOOKS, _RATES = 4.0, 24, (1.0, 0.7, 0.4, 0.0)
 #: Clearance of a path beyond what is to be kept with which it counts as free, and to go faster again [m].
@@ -278,6 +279,8 @@ class Leader:
         rows, needed, who = (np.concatenate(parts) for parts in zip(*found, strict=True)) if found else (
             np.zeros((0, 7)), np.zeros(0), np.zeros(0, dtype=int)
         )
+        if len(rows):
+            asked = self.deviation.decay(NEAR)
         short = needed - rows @ asked
         if not (len(short) and short.max() > 0.0) and self.deviation.none:
             return asked
@@ -289,10 +292,7 @@ class Leader:
             more, least, _ = self._barriers(o, r, v, rise, arms, limit, a)
             rows, needed = np.vstack([rows, more]), np.append(needed, least)
         if self._scales():
-            gap = np.linalg.norm(arms[:, None] - arms, axis=2) / z
-            keep = (a.room + a.spare)[:, None] + (a.room + a.spare)
-            np.fill_diagonal(gap, np.inf)
-            more, least = scale_rows(self.deviation, float((keep / gap).max()))
+            more, least = scale_rows(self.deviation)
             rows, needed = np.vstack([rows, more]), np.append(needed, least)
         else:
             rows[:, 6] = 0.0

@@ -158,6 +158,8 @@ class SampledPhase(ActivePhase):
     def lead(self, problem: Problem) -> None:
         """Continue with another problem that somebody else has made: the layers above the barriers then rest."""
         self.steered = True
+        if self.leader is not None:
+            self.leader.now = None
         self._renew(problem)
 
     def _renew(self, problem: Problem) -> None:
