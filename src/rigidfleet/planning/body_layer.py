@@ -23,7 +23,7 @@ from rigidfleet.math import series
 from rigidfleet.typing import Floats
 
 #: Rates at which a deviation decays [1/s], and while a barrier is near: returning against it would use up the thrust.
-DECAY, NEAR = 0.9, 0.3
+DECAY, NEAR = 0.9, 0.5
 #: Displacement [m], rotation [rad] and scale, and their derivatives, below which a deviation has ended.
 _ENDED = 1e-3
 #: Least and greatest scale, and rate at which these bounds are approached [1/s]. A formation that does not shrink keeps

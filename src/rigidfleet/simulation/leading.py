@@ -36,14 +36,22 @@ from rigidfleet.typing import Floats
 _PERIOD = 0.1
 #: How far the clock looks ahead [s], at how many times, and the rates that it compares.
 _HORIZON, _LOOKS, _RATES = 4.0, 24, (1.0, 0.7, 0.4, 0.0)
+#: Bandwidth of the clock, times the time in which vehicles react: they are to follow what it does.
+_FOLLOWED = 0.3
 #: Clearance of a path beyond what is to be kept with which it counts as free, and to go faster again [m].
 _FREE, _AGAIN = 0.2, 0.4
 #: Share of the least braking for slowing the path, and for steering the body.
 _SLOWING, _STEERING = 0.4, 0.5
 #: Share of the barriers' rate at which the body approaches its barriers: it gives way before single vehicles do.
 _EARLIER = 0.5
+#: Rate at which velocities leave collision cones [1/s], and room beside an obstacle that the body adds [m].
+_CONE, _ASIDE = 1.5, 0.5
+#: Least tangent, over the radius of the ball: inside it there is none.
+_TANGENT = 0.1
 #: Time by which a reference is valid before and after its period [s].
 _OVERLAP = 1e-3
+#: How far beside a jump it is evaluated [s].
+_BESIDE = 1e-9
 
 
 def layers(mission: Mission) -> Settings | None:
@@ -61,6 +69,13 @@ class Led(NamedTuple):
     begun: float
     clock: VirtualClock
     deviation: Deviation
+
+
+def _polynomials(times: Floats, ends: Floats) -> Floats:
+    """Quintics (K, ..., 6) between times (K + 1,) [s], by values and two derivatives (3, 2 K, ...) at both ends of each."""
+    pairs = ends.reshape(3, -1, 2, *ends.shape[2:])
+    parts = [lqr.quintic_pieces(times[k : k + 2], *pairs[:, k]) for k in range(len(times) - 1)]
+    return np.ascontiguousarray(np.concatenate(parts))
 
 
 @dataclass
@@ -184,7 +199,8 @@ class Leader:
         best = free[0] if free else int(np.argmax(room))
         if not free and room[best] < room[0] + _FREE:
             best = 0
-        return _RATES[best], _SLOWING * float(a.b.min()) / (STEEPEST * fastest)
+        bandwidth = _SLOWING * float(a.b.min()) / (STEEPEST * fastest)
+        return _RATES[best], min(bandwidth, _FOLLOWED / max(float(a.lag.max()), 1e-9))
 
     def _room(self, r: Floats, ahead: Floats, a: Avoidance, seen: Floats) -> float:
         """Least distance [m] of places r (K, N, 3) at times ahead (K,) [s] from what moves, beyond what is kept."""
@@ -231,33 +247,47 @@ class Leader:
     def _piece(self, t: float, h: float, asked: Floats) -> Problem:
         """The problem from t for h [s]: the path at the clock's time, moved by the deviation, as polynomials.
 
-        They have the values and two derivatives of both at either end.
+        They have the values and two derivatives of both at either end, and at the end of the path, where its
+        acceleration may jump.
         """
-        problem, dt = self.problem, np.array([-_OVERLAP, h + _OVERLAP])
+        problem = self.problem
         reference, motion = problem.reference, problem.motion
-        progress, *rates = self.clock.ahead(dt)[:3]
-        tau, times, rates = t - self.clock.delay + progress, t + dt, np.array(rates)
+        dt = [-_OVERLAP, h + _OVERLAP]
+        left = motion.knots[-1] - (t - self.clock.delay)
+        if 0.0 < left < self.clock.ahead(h)[0]:
+            dt.insert(1, self.clock.when(left, h))
+        times, dt = t + np.array(dt), np.repeat(dt, 2)[1:-1]  # both ends of each polynomial
+        dt[1:-1:2] -= _BESIDE
+        dt[2:-1:2] += _BESIDE
+        progress, s, slope, _ = self.clock.ahead(dt)
+        tau, rates = t - self.clock.delay + progress, np.stack([s, slope])
         cm, axes = body_series(motion, tau)
         still = np.zeros_like(axes)
         still[0] = np.eye(3)[..., None]
-        p = chained(series.derivatives(slot_series(reference, (np.zeros_like(cm), still), tau)[:3]), rates)
+        p = chained(
+            series.derivatives(slot_series(reference, (np.zeros_like(cm), still), tau)[:3]), rates
+        )
         x = chained(series.derivatives(cm[:3]), rates)
         B = series.from_derivatives(chained(series.derivatives(axes[:3]), rates))
         ends = [self.deviation.at(each, asked, h) for each in dt]
-        moves, turns, grows = (np.stack(each, axis=-1) for each in zip(*(e.series() for e in ends), strict=True))
+        moves, turns, grows = (
+            np.stack(each, axis=-1) for each in zip(*(e.series() for e in ends), strict=True)
+        )
         x += series.derivatives(moves)
-        p = series.derivatives(series.product(series.from_derivatives(p), grows[:, None, None], np.multiply))
+        grown = series.product(series.from_derivatives(p), grows[:, None, None])
+        p = series.derivatives(grown)
         B = series.product(np.moveaxis(turns, -1, 1), np.moveaxis(B, -1, 1), np.matmul)
         phi = series.derivatives(series.rotation_vector(B[0, 0].T @ B))
-        channels = np.concatenate([x.transpose(0, 2, 1), phi], axis=2)  # (3, 2, 6)
-        pieces = np.ascontiguousarray(lqr.quintic_pieces(times, *channels))
-        led = Motion(times, pieces, np.ascontiguousarray(B[0, 0].T))
-        if not (p[1:].any() or self._scaled(ends)):
-            return self._late(problem)._replace(motion=led)
-        ways = np.ascontiguousarray(lqr.quintic_pieces(times, *p.transpose(0, 3, 2, 1)))
-        kind = SHAPE if self._scaled(ends) else reference.kind
-        late = self._late(problem).reference
-        return problem._replace(motion=led, reference=late._replace(kind=kind, knots=times, ways=ways))
+        channels = np.concatenate([x.transpose(0, 2, 1), phi], axis=2)  # (3, ends, 6)
+        led = Motion(times, _polynomials(times, channels), np.ascontiguousarray(B[0, 0].T))
+        late, scaled = self._late(problem).reference, self._scaled(ends)
+        if not (p[1:].any() or scaled):
+            return problem._replace(motion=led, reference=late)
+        ways = _polynomials(times, p.transpose(0, 3, 2, 1))
+        kind = SHAPE if scaled else reference.kind
+        return problem._replace(
+            motion=led, reference=late._replace(kind=kind, knots=times, ways=ways)
+        )
 
     @staticmethod
     def _scaled(ends: list[Deviation]) -> bool:
@@ -275,7 +305,7 @@ class Leader:
         r, v, rise, arms = self._slots(t)
         z = self.deviation.scale[0]
         limit = _STEERING * float(a.b.min())
-        found = [self._barriers(o, r, v, rise, arms, limit, a) for o in moving]
+        found = [self._cones(o, r, v, rise, arms, limit, a) for o in moving]
         rows, needed, who = (np.concatenate(parts) for parts in zip(*found, strict=True)) if found else (
             np.zeros((0, 7)), np.zeros(0), np.zeros(0, dtype=int)
         )
@@ -338,21 +368,44 @@ class Leader:
         a = c[2] + d[0] @ Q[2].T + 2.0 * d[1] @ Q[1].T + turned[2]
         return r, v, a, turned[0]
 
+    def _cones(
+        self, o: int, r: Floats, v: Floats, rise: Floats, arms: Floats, limit: float, a: Avoidance
+    ) -> tuple[Floats, Floats, Floats]:
+        """Rows (R, 7) of slots against obstacle o, which moves, what they need (R,), and the vehicles (R,).
+
+        With x the place of a slot relative to the middle of a ball round the obstacle, w its relative velocity and s the
+        length of a tangent from it to the ball, h = x . w + |w| s is not negative if w points past the ball: a barrier
+        by the collision cone of Chakravarthy and Ghose (*Obstacle avoidance in a dynamic environment*, IEEE
+        Transactions on Systems, Man, and Cybernetics A 28, 1998). It steers aside, where one on the distance brakes.
+        """
+        sight = a.sight
+        track, bound = sight.track[o], sight.bound[o]
+        x, w = r - sight.centre[o] - track[:3], v - track[3:]
+        size = sight.ball[o] + a.reach + a.spare + bound[0] + _ASIDE
+        along, speed = (x * w).sum(axis=1), np.maximum(np.linalg.norm(w, axis=1), 1e-6)
+        s = np.sqrt(np.maximum((x * x).sum(axis=1) - size**2, (_TANGENT * size) ** 2))
+        normal = x + (s / speed)[:, None] * w
+        length = np.maximum(np.linalg.norm(normal, axis=1), 1e-9)
+        h = along + speed * s
+        needed = -_CONE * h - speed**2 - speed * along / s
+        needed = (needed - (normal * rise).sum(axis=1)) / length
+        some = np.flatnonzero((along < 0.0) & (-along < _HORIZON * speed**2) & (needed > -limit))
+        rows = rigid_rows(normal[some] / length[some, None], arms[some], self.deviation.scale[0])
+        return rows, needed[some], some
+
     def _barriers(
         self, o: int, r: Floats, v: Floats, rise: Floats, arms: Floats, limit: float, a: Avoidance
     ) -> tuple[Floats, Floats, Floats]:
-        """Barriers of slots against obstacle o that may act: rows (R, 7), what they need (R,), the vehicles (R,)."""
-        sight, solids = a.sight, a.solids
-        moves = sight.moves[o] == 1
-        x, bound = (sight.track[o], sight.bound[o]) if moves else (np.zeros(6), np.zeros(2))
-        at = own_axes(*(r - x[:3]).T, o, solids)
+        """Barriers of slots against obstacle o, which stands still, that may act; see `_cones`."""
+        solids = a.solids
+        at = own_axes(*r.T, o, solids)
         away = signed_distance(*at, o, solids)
         normal = np.stack(np.broadcast_arrays(*outward_normal(*at, o, solids)), axis=1)
         if solids.turned[o]:
             normal = normal @ solids.turn[o]
-        rate = (normal * (v - x[3:])).sum(axis=1) - bound[1]
-        gap = away - a.reach - a.spare - bound[0] - np.maximum(0.0, -rate) * (self.period + a.lag)
-        strength = _STEERING * a.share * np.maximum(a.b - (sight.swerve if moves else 0.0), 0.1 * a.b)
+        rate = (normal * v).sum(axis=1)
+        gap = away - a.reach - a.spare - np.maximum(0.0, -rate) * (self.period + a.lag)
+        strength = _STEERING * a.share * a.b
         needed = needed_rate(gap, rate, 0.0, strength, _EARLIER * a.rate) - (normal * rise).sum(axis=1)
         some = np.flatnonzero(needed > -limit)
         rows = rigid_rows(normal[some], arms[some], self.deviation.scale[0])
