@@ -406,6 +406,8 @@ def test_assess_writes_what_a_flight_has(tmp_path, capsys):
     assert "the polynomials of the file" in text
     names = {path.name for path in out.iterdir()}
     assert {"sequence_trajectories.nc", "verdict.json", "report.html", "replay.html"} <= names
+    drawn = {"clearance.png", "cm.png", "trajectory.png"}
+    assert {path.name for path in (out / "figures").iterdir()} == drawn
     page = (out / "report.html").read_text()
     assert "the polynomials of the file" in page
     assert "Gains" not in page

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from rigidfleet.cli import console
+from rigidfleet.cli import console, drawing
 from rigidfleet.cli.codes import FAILED, PASSED
 from rigidfleet.cli.outputs import Files, taken
 from rigidfleet.errors import RigidfleetError
@@ -48,7 +48,7 @@ def assess(
     interpolation : str
         Between samples: cubic (a spline through the positions) or linear. Default: cubic.
     out : Path
-        Folder for a result, the verdict, a report with figures, and a replay. Default: write nothing.
+        Folder for a result, the verdict, a report, a replay and figures. Default: write nothing.
     force : bool
         Overwrite existing files.
     json : bool
@@ -79,7 +79,8 @@ def assess(
     made = Files(out, result.mission.name) if out is not None else None
     if made is not None:
         made.try_out()
-        for path in (made.result, made.verdict, made.report, made.replay):
+        drawing.prepare()
+        for path in (made.result, made.verdict, made.report, made.replay, *made.figures):
             if path.exists() and not force:
                 raise taken(path)
     if json:
@@ -88,13 +89,14 @@ def assess(
         console.out().print(verdict)
     if made is not None:
         from rigidfleet.cli.report import write_report
-        from rigidfleet.cli.run import list_files, write_replay
+        from rigidfleet.cli.run import draw, list_files, write_replay
 
         made.make_folder()
         result.save(made.result)
         write_file(made.verdict, (verdict.json() + "\n").encode())
         write_report([result], [verdict], made.report, quiet=json)
         write_replay(result, made.replay)
+        draw(result, made.figures, None, titles=True, quiet=json)
         if not json:
             console.out().print()
             list_files(made)

@@ -94,6 +94,8 @@ def figure_names(result: Result | None = None) -> list[str]:
         "vehicles": not has_rotors(result),
         "operation": not leaves_ground(result),
     }
+    # Of trajectories that others made, most panels of the summary would be empty.
+    empty["summary"] = empty["distances"] and empty["inputs"] and empty["attitude"]
     empty["constraint_error"] = empty["distances"] and empty["formations"]
     return [name for name in _FIGURES if not empty.get(name)]
 
