@@ -15,7 +15,17 @@ is one of the candidates. This is braking to rest for no other, so that the proo
 
 import math
 
-from rigidfleet.kernel.avoidance import ACTS, BARRIER, BRAKE, FULL, GUARD, LISTED, OBSTACLE, PAIR, TICKS
+from rigidfleet.kernel.avoidance import (
+    ACTS,
+    BARRIER,
+    BRAKE,
+    FULL,
+    GUARD,
+    LISTED,
+    OBSTACLE,
+    PAIR,
+    TICKS,
+)
 from rigidfleet.kernel.barriers import filter_accelerations, limit, loosen
 from rigidfleet.kernel.compiler.jit import compiled
 from rigidfleet.kernel.fleet import TICKS as FLIGHT_TICKS

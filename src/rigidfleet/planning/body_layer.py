@@ -1,8 +1,8 @@
 """The body layer: a formation is steered round obstacles as one body, before single vehicles give way.
 
-The reference of the virtual body deviates from the planned one by a displacement x, a rotation Q about the body's origin
-and a scale z of the slots: r_i = r + x + z Q (r_i - r). With d_i = Q (r_i - r), its second derivatives (a, alpha, z'')
-add a + alpha x (z d_i) + z'' d_i to the acceleration of slot i. They are those that bring the deviation back,
+The reference of the virtual body deviates from the planned one by a displacement x, a rotation Q about the body's
+origin and a scale z of the slots: slot i is at r + x + z d_i, with d_i = Q (r_i - r). The second derivatives a, alpha,
+z'' add a + alpha x (z d_i) + z'' d_i to its acceleration. They are those that bring the deviation back,
 
     a = -2 k x' - k^2 x, and so on, with both poles at -k,
 
@@ -37,7 +37,9 @@ _THIN = 1e-9
 class Deviation:
     """What the reference of a body deviates from the planned one by, in world axes."""
 
-    x: Floats = field(default_factory=lambda: np.zeros((3, 3)))  # displacement, two derivatives [m, s]
+    x: Floats = field(
+        default_factory=lambda: np.zeros((3, 3))
+    )  # displacement, two derivatives [m, s]
     Q: Floats = field(default_factory=lambda: np.eye(3))  # rotation
     omega: Floats = field(default_factory=lambda: np.zeros((2, 3)))  # rates [rad/s], derivative
     scale: Floats = field(default_factory=lambda: np.array([1.0, 0.0, 0.0]))  # and two derivatives
@@ -92,7 +94,9 @@ class Deviation:
 
     def series(self) -> tuple[Floats, Floats, Floats]:
         """Taylor series of displacement (3, 3), rotation (3, 3, 3), body to world, and scale (3,)."""
-        own = self.omega @ self.Q  # in the axes of Q, in which the derivative of the rates is the same
+        own = (
+            self.omega @ self.Q
+        )  # in the axes of Q, in which the derivative of the rates is the same
         Q = series.from_rates(self.Q, own)
         return series.from_derivatives(self.x), Q, series.from_derivatives(self.scale)
 
@@ -106,7 +110,9 @@ def least_distance(G: Floats, h: Floats) -> Floats | None:
     f[-1] = 1.0
     u, _ = nnls(E, f)
     r = E @ u - f
-    if -r[-1] <= 1e-12:  # the residual of a consistent problem is not zero, and its last entry is its square
+    if (
+        -r[-1] <= 1e-12
+    ):  # the residual of a consistent problem is not zero, and its last entry is its square
         return None
     return -r[:-1] / r[-1]
 
@@ -120,11 +126,14 @@ def rigid_rows(normals: Floats, arms: Floats, scale: float) -> Floats:
 def steered(
     asked: Floats, rows: Floats, needed: Floats, masses: Floats, arms: Floats, scale: float
 ) -> Floats | None:
-    """Second derivatives (7,) nearest to those asked for with rows (R, 7) . them >= needed (R,); None if there are none.
+    """Second derivatives (7,) nearest to those asked for, with rows (R, 7) . them >= needed (R,); None if none exist.
 
     The distance is that of Gauss's principle, of masses (N,) at ``arms`` (N, 3) from the body's origin.
     """
-    spread = np.eye(3)[None] * (arms * arms).sum(axis=1)[:, None, None] - arms[:, :, None] * arms[:, None]
+    spread = (
+        np.eye(3)[None] * (arms * arms).sum(axis=1)[:, None, None]
+        - arms[:, :, None] * arms[:, None]
+    )
     inertia = np.einsum("i,ijk->jk", masses, spread)
     radial = float(masses @ (arms * arms).sum(axis=1)) / scale**2
     centre = masses @ arms
@@ -132,7 +141,11 @@ def steered(
     H = np.zeros((7, 7))
     H[:3, :3] = masses.sum() * np.eye(3)
     H[3:6, 3:6] = inertia
-    H[:3, 3:6] = [[0.0, centre[2], -centre[1]], [-centre[2], 0.0, centre[0]], [centre[1], -centre[0], 0.0]]
+    H[:3, 3:6] = [
+        [0.0, centre[2], -centre[1]],
+        [-centre[2], 0.0, centre[0]],
+        [centre[1], -centre[0], 0.0],
+    ]
     H[3:6, :3] = H[:3, 3:6].T
     H[:3, 6] = H[6, :3] = centre / scale
     H[6, 6] = radial

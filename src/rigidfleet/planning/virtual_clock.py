@@ -1,4 +1,4 @@
-"""The virtual clock: a planned path is flown at the time tau, with 0 <= dtau/dt <= 1, so that a formation can wait on it.
+"""The virtual clock: a path is flown at the time tau, with 0 <= dtau/dt <= 1, so that a formation can wait on it.
 
 The path is the one planned, and the time along it is chosen in flight: the decomposition of Kant and Zucker (*Toward
 efficient trajectory planning: the path-velocity decomposition*, International Journal of Robotics Research 5, 1986).
@@ -6,9 +6,9 @@ The rate s = dtau/dt follows a target u in [0, 1] through three equal lags,
 
     (d/dt / omega + 1)^3 s = u.
 
-Their response to a step is a positive kernel of integral 1, so that s stays between 0 and 1 whatever the targets.
-Its first two derivatives are continuous and the third is bounded, as snap of the path needs. By the chain rule, the
-path r(tau) is flown with the velocity r' s and the acceleration r'' s^2 + r' ds/dt; the greatest |ds/dt| after a step is
+They weight past targets by a positive kernel of integral 1, so that s stays between 0 and 1 whatever the targets. Its
+first two derivatives are continuous and the third is bounded, as snap of the path needs. By the chain rule, the path
+r(tau) is flown with the velocity r' s and the acceleration r'' s^2 + r' ds/dt; the greatest |ds/dt| after a step is
 2 omega / e^2.
 """
 
@@ -41,9 +41,7 @@ class VirtualClock:
     def steady(self) -> bool:
         """Whether the rate is its target, to rounding."""
         s, first, second = self.rate
-        off = max(
-            abs(s - self.target), abs(first) / self.omega, abs(second) / self.omega**2
-        )
+        off = max(abs(s - self.target), abs(first) / self.omega, abs(second) / self.omega**2)
         return off <= _STEADY
 
     @property
@@ -52,7 +50,7 @@ class VirtualClock:
         return self.target == 1.0 and self.rate == (1.0, 0.0, 0.0)
 
     def lead(self, target: float, omega: float) -> None:
-        """Set the target, and while the clock is steady also the bandwidth: changed on the way, it would make s jump."""
+        """Set the target, and while the clock is steady also the bandwidth omega [1/s]."""
         if self.steady:
             self.rate = self.target, 0.0, 0.0
             self.omega = min(max(omega, _SLOWEST), _FASTEST)

@@ -30,7 +30,7 @@ from rigidfleet.planning.plan import PhasePlan
 from rigidfleet.planning.virtual_clock import STEEPEST, VirtualClock, chained
 from rigidfleet.result import Extremum
 from rigidfleet.solids.distance import outward_normal, own_axes, signed_distance
-from rigidfleet.typing import Floats
+from rigidfleet.typing import Floats, Ints
 
 #: Time for which a decision holds [s].
 _PERIOD = 0.1
@@ -72,7 +72,7 @@ class Led(NamedTuple):
 
 
 def _polynomials(times: Floats, ends: Floats) -> Floats:
-    """Quintics (K, ..., 6) between times (K + 1,) [s], by values and two derivatives (3, 2 K, ...) at both ends of each."""
+    """Quintics (K, ..., 6) between times (K + 1,) [s], by values and two derivatives (3, 2 K, ...) at their ends."""
     pairs = ends.reshape(3, -1, 2, *ends.shape[2:])
     parts = [lqr.quintic_pieces(times[k : k + 2], *pairs[:, k]) for k in range(len(times) - 1)]
     return np.ascontiguousarray(np.concatenate(parts))
@@ -195,14 +195,18 @@ class Leader:
                 low = at.astype(int)
                 share = (at - low)[:, None, None]
                 room.append(self._room((1.0 - share) * r[low] + share * r[low + 1], ahead, a, seen))
-        free = [k for k, x in enumerate(room) if x >= (_AGAIN if again and _RATES[k] > self.clock.target else _FREE)]
+        free = [
+            k
+            for k, x in enumerate(room)
+            if x >= (_AGAIN if again and _RATES[k] > self.clock.target else _FREE)
+        ]
         best = free[0] if free else int(np.argmax(room))
         if not free and room[best] < room[0] + _FREE:
             best = 0
         bandwidth = _SLOWING * float(a.b.min()) / (STEEPEST * fastest)
         return _RATES[best], min(bandwidth, _FOLLOWED / max(float(a.lag.max()), 1e-9))
 
-    def _room(self, r: Floats, ahead: Floats, a: Avoidance, seen: Floats) -> float:
+    def _room(self, r: Floats, ahead: Floats, a: Avoidance, seen: Ints) -> float:
         """Least distance [m] of places r (K, N, 3) at times ahead (K,) [s] from what moves, beyond what is kept."""
         least = np.inf
         for o in seen:
@@ -296,7 +300,7 @@ class Leader:
     # -- the body -----------------------------------------------------------------------------------------
 
     def _steer(self, t: float, a: Avoidance) -> Floats:
-        """Second derivatives (7,) of the deviation to take: those of its decay, changed as barriers of the slots need."""
+        """Second derivatives (7,) of the deviation to take: those of its decay, changed as barriers need."""
         asked, self.calm = self.deviation.decay(), True
         sight = a.sight
         moving = np.flatnonzero((sight.moves == 1) & (sight.known == KNOWN))
@@ -306,8 +310,10 @@ class Leader:
         z = self.deviation.scale[0]
         limit = _STEERING * float(a.b.min())
         found = [self._cones(o, r, v, rise, arms, limit, a) for o in moving]
-        rows, needed, who = (np.concatenate(parts) for parts in zip(*found, strict=True)) if found else (
-            np.zeros((0, 7)), np.zeros(0), np.zeros(0, dtype=int)
+        rows, needed, who = (
+            (np.concatenate(parts) for parts in zip(*found, strict=True))
+            if found
+            else (np.zeros((0, 7)), np.zeros(0), np.zeros(0, dtype=int))
         )
         if len(rows):
             asked = self.deviation.decay(NEAR)
@@ -370,12 +376,12 @@ class Leader:
 
     def _cones(
         self, o: int, r: Floats, v: Floats, rise: Floats, arms: Floats, limit: float, a: Avoidance
-    ) -> tuple[Floats, Floats, Floats]:
+    ) -> tuple[Floats, Floats, Ints]:
         """Rows (R, 7) of slots against obstacle o, which moves, what they need (R,), and the vehicles (R,).
 
-        With x the place of a slot relative to the middle of a ball round the obstacle, w its relative velocity and s the
-        length of a tangent from it to the ball, h = x . w + |w| s is not negative if w points past the ball: a barrier
-        by the collision cone of Chakravarthy and Ghose (*Obstacle avoidance in a dynamic environment*, IEEE
+        With x the place of a slot relative to the middle of a ball round the obstacle, w its relative velocity and s
+        the length of a tangent from it to the ball, h = x . w + |w| s is not negative if w points past the ball: a
+        barrier by the collision cone of Chakravarthy and Ghose (*Obstacle avoidance in a dynamic environment*, IEEE
         Transactions on Systems, Man, and Cybernetics A 28, 1998). It steers aside, where one on the distance brakes.
         """
         sight = a.sight
@@ -395,7 +401,7 @@ class Leader:
 
     def _barriers(
         self, o: int, r: Floats, v: Floats, rise: Floats, arms: Floats, limit: float, a: Avoidance
-    ) -> tuple[Floats, Floats, Floats]:
+    ) -> tuple[Floats, Floats, Ints]:
         """Barriers of slots against obstacle o, which stands still, that may act; see `_cones`."""
         solids = a.solids
         at = own_axes(*r.T, o, solids)
@@ -406,7 +412,9 @@ class Leader:
         rate = (normal * v).sum(axis=1)
         gap = away - a.reach - a.spare - np.maximum(0.0, -rate) * (self.period + a.lag)
         strength = _STEERING * a.share * a.b
-        needed = needed_rate(gap, rate, 0.0, strength, _EARLIER * a.rate) - (normal * rise).sum(axis=1)
+        needed = needed_rate(gap, rate, 0.0, strength, _EARLIER * a.rate) - (normal * rise).sum(
+            axis=1
+        )
         some = np.flatnonzero(needed > -limit)
         rows = rigid_rows(normal[some], arms[some], self.deviation.scale[0])
         return rows, needed[some], some
