@@ -251,6 +251,7 @@ def test_velocities_recorded_are_the_differences_of_slots_while_the_clock_slows(
     assert len(k) > 5
     over = (result.time[k + 1] - result.time[k - 1])[:, None, None]
     slope = (result.slot_position[k + 1] - result.slot_position[k - 1]) / over
+    assert result.slot_velocity is not None
     np.testing.assert_allclose(slope, result.slot_velocity[k], atol=0.02)
 
 

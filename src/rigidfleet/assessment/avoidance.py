@@ -13,6 +13,8 @@ from rigidfleet.result import Extremum, Result
 
 #: The two margins: between vehicles, and between vehicles and obstacles.
 _MARGINS = ("guarantee", "clearance_guarantee")
+#: Rate below which the clock counts as slowed: it comes back to 1 by an exponential.
+_SLOWED = 0.99
 
 
 def guarantee_checks(measured: Measurements) -> Iterator[CheckResult]:
@@ -87,7 +89,7 @@ def _first_layers(result: Result) -> Iterator[str]:
     step = np.gradient(result.time)
     step /= step.sum()
     shares = {
-        "the clock slowed": rate < 1.0,
+        "the clock slowed": rate < _SLOWED,
         "the body deviated": way.any(axis=1),
         "barriers acted": (acts & 1 != 0).any(axis=1),
         "the guard acted": (acts & 2 != 0).any(axis=1),

@@ -25,7 +25,7 @@ STEEPEST = 2.0 * math.exp(-2.0)
 #: Least and greatest omega [1/s]: the clock stops within 3 / omega seconds of path.
 _SLOWEST, _FASTEST = 0.5, 4.0
 #: Difference of the rate from its target, and its derivatives over powers of omega, that count as none.
-_STEADY = 1e-9
+_STEADY = 1e-6
 
 
 class VirtualClock:

@@ -319,7 +319,7 @@ export class Scene {
       const q = own ? normal(state.turn.subarray(4 * i, 4 * i + 4)) : leaning(state.thrust.subarray(3 * i, 3 * i + 3), heading);
       (near ? (own ? places.turned : places.vehicles) : places.small).add(p, size, q, this.colours[i], 1);
       const acts = state.acts?.[i] ?? 0; // barriers, from 1.5 on the guard
-      if (acts > 0.5) places.discs.add(p, 2 * size, NO_TURN, acts > 1.5 ? LIMIT : YIELDS, 0.55);
+      if (acts > 0.5) places.discs.add(p, 5 * size, NO_TURN, acts > 1.5 ? LIMIT : YIELDS, 0.55);
       if (own) {
         places.noses.add(p, size, q, this.colours[i], 1);
         this.placeRotors(p, size, q, state.rotors.subarray(4 * i, 4 * i + 4), near, i);
