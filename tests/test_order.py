@@ -14,6 +14,7 @@ from rigidfleet.planning.body_layer import Deviation, least_distance, rigid_rows
 from rigidfleet.planning.derivatives import slot_derivatives
 from rigidfleet.planning.virtual_clock import STEEPEST, VirtualClock
 from rigidfleet.simulation.leading import Leader, Led
+from rigidfleet.web.replay.scene import observe
 
 #: A ball that crosses the path of the formation just ahead of it, from the side, and one that never comes near.
 CROSSING = {
@@ -304,3 +305,21 @@ def test_quadrotors_wait_with_their_feed_forward_right():
         errors.append(worst.value)
         assert ball is FAR or layers(result).rate.min() < 0.8
     assert errors[0] < 1.5 * errors[1] + 0.02
+
+
+def test_the_verdict_and_the_page_tell_which_layer_acted():
+    """The longest wait and the shares of time are told; the page has the clock, the body and who gives way."""
+    result = rf.simulate(triangle(CROSSING, body=False))
+    clock = result.phases[1].extremes["clock"]
+    notes = " ".join(rf.assess(result).notes)
+    assert f"ends {clock.value:.3g} s later than planned" in notes
+    slow = np.where(layers(result).rate < 0.99, 1.0, 0.0)
+    share = float(np.trapezoid(slow, result.time)) / result.time[-1]
+    assert f"the clock slowed {100 * share:.2g} %" in notes
+    columns = observe(result, np.arange(3), 1.0)
+    np.testing.assert_array_equal(columns["clock"].values, layers(result).rate)
+    assert not columns["acts"].values.any()
+    evades = rf.simulate(triangle(CROSSING, clock=False, body=False))
+    acts = observe(evades, np.arange(3), 1.0)["acts"].values
+    np.testing.assert_array_equal(acts > 0.0, layers(evades).acts > 0)
+    assert "clock" not in observe(rf.simulate("square"), np.arange(0), 1.0)
