@@ -18,6 +18,8 @@ from rigidfleet.typing import Floats, Ints
 TICKS, LISTED, FULL = range(3)
 #: Columns of `Avoidance.acted` and `Avoidance.first`: the barrier, the guard, the guard by braking.
 BARRIER, GUARD, BRAKE = range(3)
+#: Bits of `SampledState.layers`, of the same three.
+ACTS = (1, 2, 4)
 #: Rows of `Avoidance.margin`: between two vehicles, between a vehicle and an obstacle.
 PAIR, OBSTACLE = range(2)
 #: What is known of an obstacle that moves: nothing, its place, or its velocity, too; see `Sight.known`.
@@ -28,6 +30,8 @@ _DRAWS = 65_521
 _NEIGHBOURS, _FEW = 256, 400
 #: Greatest number of barriers between vehicles at a tick, per vehicle; more are left to the guard.
 _BARRIERS = 32
+#: Distance that counts as none [m].
+_NEAREST = 1e-6
 #: Greatest number of rows of an exact solution of the barriers.
 EXACT = 64
 
@@ -242,6 +246,16 @@ def _record(n: int) -> dict[str, Any]:
         "acted": np.zeros((3, n), dtype=np.int64), "first": np.full((3, n), np.inf), "margin": endless,
         "between": none, "lost": endless.copy(), "loser": none.copy(),
     }  # fmt: skip
+
+
+def needed_rate(gap, s, across, B, rate):
+    """Least second derivative of a distance by a barrier, see `barriers`; ``across``: the part that motion gives.
+
+    For numbers and arrays: the gap to what is to be kept [m], its rate s, and the braking B to reckon with.
+    """
+    safe = np.maximum(gap, _NEAREST)
+    root = np.sqrt(2.0 * B * safe)
+    return -rate * (root + s) - B * s / root - across
 
 
 def _each(x: ArrayLike, n: int) -> Floats:

@@ -276,7 +276,7 @@ def closeness(
     given = [r, radius, time, left]
     for things, before, found in _last[-1:]:
         if things is obstacles and all(map(_same, given, before)):
-            return Closeness(*(x.copy() for x in found))
+            return Closeness._make(x.copy() for x in found)
     each, nearest = obstacle_clearances(r, radius, obstacles, time)
     if not left.all():
         each[~left] = np.inf
@@ -284,7 +284,7 @@ def closeness(
         *separation_of_left(r, radius, left), each, nearest, *least_clearance(each, nearest)
     )
     if r.nbytes <= _KEPT:
-        copies = Closeness(*(x.copy() for x in found))
+        copies = Closeness._make(x.copy() for x in found)
         _last[:] = [(obstacles, [x.copy() for x in given], copies)]
     return found
 

@@ -110,6 +110,7 @@ class Extremes:
         self.trail = records.NO_TRAIL
         self.of_vehicles: dict[str, Extremum] = {}
         self.avoidance: avoidance.Avoidance | None = None  # that of the phase under way
+        self.led: dict[str, Extremum] = {}  # what its clock and its body layer did
         self._list_all()
 
     def _take_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
@@ -148,7 +149,7 @@ class Extremes:
         self.when.fill(0.0)
         self.who.fill(-1)
         self.standing[:] = self.stood
-        self.of_vehicles, self.avoidance = {}, None
+        self.of_vehicles, self.avoidance, self.led = {}, None, {}
         if len(self.trail.points):
             self.monitor.monitor.flags.fill(0)
 
@@ -297,14 +298,14 @@ class Extremes:
         for name, k in _NAMES.items():
             if math.isfinite(value := worst[k]):
                 found[name] = Extremum(self._signed(name, value), when[k], *who[k])
-        return found | self.of_vehicles | self._avoided()
+        return found | self.of_vehicles | self._avoided() | self.led
 
     def phase(self) -> dict[str, Extremum]:
         """Extremes of the phase that ends, by name; start those of the next one."""
         found = self.so_far()
         self.worst[list(_NAMES.values())] = np.inf
         self.moved[:] = np.inf  # the list was made for a worst value that no longer counts
-        self.of_vehicles, self.avoidance = {}, None
+        self.of_vehicles, self.avoidance, self.led = {}, None, {}
         return found
 
     def flight(self, phases: Sequence[PhaseRecord]) -> None:
