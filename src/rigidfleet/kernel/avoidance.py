@@ -97,6 +97,7 @@ class Avoidance(NamedTuple):
     b: Floats  # (N,) acceleration in any direction that each vehicle always has [m/s^2]
     lift: Floats  # (N,) greatest thrust per mass [m/s^2]
     weight: Floats  # (N,) mass that the laws know [kg]
+    inverse: Floats  # (N,) its inverse [1/kg]
     g: float  # [m/s^2]
     coast: Floats  # (N, 3) of the drag k per mass over a period T: e^-kT, (1 - e^-kT)/k, (T - (1 - e^-kT)/k)/k
     lag: Floats  # (N,) time until a command acts [s]
@@ -131,11 +132,14 @@ class Avoidance(NamedTuple):
     trial: Floats  # (5, 3) the same of a candidate; its acceleration; at the start of the tick
     normal: Floats  # (3,)
     # Barriers: W rows
-    rows: Ints  # (W, 2) vehicle, and the other or -1
+    rows: Ints  # (W, 3) vehicle, the other or -1, entry of ``last``
     normals: Floats  # (W, 3)
-    needed: Floats  # (W,) [m/s^2]
+    missing: Floats  # (W,) acceleration along them that is needed, less what is asked for [m/s^2]
+    reduced: Floats  # (W,) reduced mass of the two [kg]
     push: Floats  # (W,) kappa [N]
     most: Floats  # (W,) greatest one [N]
+    last: Floats  # (P + 2 N B,) those of the tick before, of neighbours and of obstacles [N]
+    pushing: Ints  # (W,) work: rows that push
     hold: Floats  # (N,) share to which edges of a vehicle hold
     pull: Floats  # (m,) what barriers add to the multipliers of edges [N]
     system: Floats  # (EXACT, EXACT) work
@@ -183,11 +187,12 @@ def avoidance(
     solids = joined([]) if solids is None else solids
     n, count = len(b), len(solids.kind)
     capacity = n * (n - 1) if n <= _FEW else _NEIGHBOURS * n
-    rows = min(capacity // 2, _BARRIERS * n) + n * count
+    rows = min(capacity // 2, _BARRIERS * n) + 2 * n * count
     radius = np.asarray(radius, dtype=float)
     return Avoidance(
         law=np.zeros(2, dtype=np.int64), guarded=guarded, filtered=filtered, period=float(period), rate=float(rate),
         share=float(share), release=float(release), b=_each(b, n), lift=_each(lift, n), weight=_each(mass, n),
+        inverse=1.0 / _each(mass, n),
         g=float(g), coast=_coast(_each(drag, n), period), lag=_each(lag, n), spare=_each(spare, n),
         room=radius + 0.5 * separation, reach=radius + clearance,
         solids=solids, sight=sight(solids) if seen is None else seen, flow=flow, candidates=candidates(),
@@ -197,8 +202,10 @@ def avoidance(
         chosen=np.zeros((n, 3)), rise=np.zeros((n, 3)), ways=np.zeros((n, 4, 3)),
         far=np.zeros(n), walls=np.zeros((n, count)), threat=np.full(n, -1),
         late=np.zeros(n), shifted=np.zeros((4, 3)), trial=np.zeros((5, 3)), normal=np.zeros(3),
-        rows=np.zeros((rows, 2), dtype=np.int64), normals=np.zeros((rows, 3)), needed=np.zeros(rows),
-        push=np.zeros(rows), most=np.zeros(rows), hold=np.ones(n), pull=np.zeros(edges),
+        rows=np.zeros((rows, 3), dtype=np.int64), normals=np.zeros((rows, 3)), missing=np.zeros(rows),
+        reduced=np.zeros(rows), push=np.zeros(rows), most=np.zeros(rows),
+        last=np.zeros(capacity + 2 * n * count), pushing=np.zeros(rows, dtype=np.int64),
+        hold=np.ones(n), pull=np.zeros(edges),
         system=np.zeros((EXACT, EXACT)), right=np.zeros(EXACT), active=np.zeros(EXACT, dtype=np.int64),
         count=np.zeros(3, dtype=np.int64), **_record(n),
     )  # fmt: skip

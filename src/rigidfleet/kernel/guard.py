@@ -275,7 +275,7 @@ def update_neighbours(r, v, lost, a):
     for i in range(a.b.shape[0]):
         for q in range(3):
             a.listed[i, q] = r[i, q]
-    a.count[LISTED] = 1
+    a.count[LISTED], a.last[:] = 1, 0.0
     return list_neighbours(r, lost, way + a.span[0], a)
 
 

@@ -9,9 +9,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
+from rigidfleet._common.kept import kept
 from rigidfleet.kernel import avoidance, fleet, records
 from rigidfleet.kernel.engine import native
 from rigidfleet.kernel.problem import Problem, Workspace
@@ -19,7 +21,7 @@ from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
 from rigidfleet.mission import Mission
 from rigidfleet.result import PAD, Extremum, PhaseRecord
-from rigidfleet.solids.records import joined
+from rigidfleet.solids.records import Solids, joined
 from rigidfleet.typing import Bools, Floats, Ints
 
 #: Greatest number of agents of which all pairs are monitored.
@@ -69,6 +71,19 @@ _SAMPLED = (
 _OF_FLIGHT = {"clearance_start": records.STANDING, "clearance_flight": records.FLYING}
 
 
+class _Thing(NamedTuple):
+    """An obstacle, as its arrays alone."""
+
+    solid: Solids
+
+
+@kept
+def _stood(position: Floats, radius: Floats, obstacles: tuple[_Thing, ...]) -> Ints:
+    """Whether agents stand on obstacles at the start (N,)."""
+    start, _ = proximity.obstacle_clearances(position, radius, obstacles)
+    return (start <= PAD).astype(np.int64)
+
+
 class Extremes:
     """Monitors a flight and reports the worst values of each phase."""
 
@@ -90,10 +105,8 @@ class Extremes:
         self.who, self.sign = np.full((count, 2), -1), np.zeros(1)
         self.left = np.ones(self.n, dtype=np.bool_)
         self.low = np.full((self.n, 3), np.inf)
-        start, _ = proximity.obstacle_clearances(
-            np.array(agents.position), self.radius, mission.obstacles
-        )
-        self.stood = (start <= PAD).astype(np.int64)
+        things = tuple(_Thing(thing.solid) for thing in mission.obstacles)
+        self.stood = _stood(mission.fleet.position, self.radius, things)
         self.standing = self.stood.copy()
         self.pairs = self.columns = self.struck = np.zeros((0, 2), dtype=np.int64)
         self.spare, self.moved = 0.0, np.zeros(2)
