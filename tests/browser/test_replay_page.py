@@ -11,6 +11,7 @@ from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from importlib import resources
 from threading import Thread
+from typing import Any
 
 import numpy as np
 import pytest
@@ -786,7 +787,7 @@ def test_an_obstacle_comes_and_goes(show):
     """An obstacle that appears and vanishes is drawn while it is there, with its way; the overview shows it."""
     flown = swarm(4, 10.0)
     data = flown.mission.to_dict()
-    ball = {"kind": "sphere", "radius": 1.0, "appears": 3.0, "vanishes": 7.0}
+    ball: dict[str, Any] = {"kind": "sphere", "radius": 1.0, "appears": 3.0, "vanishes": 7.0}
     ball |= {"waypoints": [[0.0, 9.0, 12.0], [8.0, 9.0, 12.0]], "times": [3.0, 7.0]}
     far = {
         "kind": "sphere",
