@@ -40,11 +40,13 @@ robustness: .venv/.bench  ## Fly 200 random formations under every graph and law
 exports: .venv/.interchange  ## Measure every export of three flights
 	@$(BIN)/python benchmarks/exports.py --write docs/export.md
 
-avoidance: .venv/.bench  ## Plan transitions and published problems, with proofs
+avoidance: .venv/.bench .venv/.crowds  ## Plan transitions and published problems, with proofs
 	@$(BIN)/python benchmarks/avoidance.py
 	@$(BIN)/python benchmarks/moving.py
+	@$(BIN)/python benchmarks/order.py
 	@$(BIN)/python benchmarks/gaps.py
 	@$(BIN)/python benchmarks/crowds.py
+	@$(BIN)/python benchmarks/reciprocal.py
 
 replays: .venv/.dev  ## Measure replays in Chromium without a graphics card
 	@$(BIN)/python benchmarks/replay.py
@@ -70,7 +72,7 @@ format: .venv/.dev  ## Rewrite the code in the project's style
 
 constraints: .venv/.dev  ## Choose newer versions of all packages
 	@$(BIN)/uv pip compile --quiet --universal --upgrade --no-header --no-annotate \
-		--all-extras --group dev --group bench --group peers --group vehicles --group interchange --group oracles --group docs --group build \
+		--all-extras --group dev --group bench --group peers --group crowds --group vehicles --group interchange --group oracles --group docs --group build \
 		pyproject.toml --output-file constraints.txt
 
 clean:  ## Remove .venv, caches and builds
@@ -90,7 +92,7 @@ clean:  ## Remove .venv, caches and builds
 	@$(INSTALL)
 	@touch $@
 
-.venv/.dev .venv/.bench .venv/.peers .venv/.vehicles .venv/.interchange .venv/.oracles .venv/.docs: .venv/.%: .venv/.core
+.venv/.dev .venv/.bench .venv/.peers .venv/.crowds .venv/.vehicles .venv/.interchange .venv/.oracles .venv/.docs: .venv/.%: .venv/.core
 	@echo "Installing what '$*' needs"
 	@$(INSTALL) --group $*
 	@touch $@

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
 #: What the server loads: all that drawing a figure needs.
 _LOADED = [
-    "rigidfleet.plotting", "matplotlib.backends.backend_agg", "matplotlib.backends.backend_svg",
-    "mpl_toolkits.mplot3d.axes3d",
+    "rigidfleet.plotting", "matplotlib.backends.backend_agg", "matplotlib.style", "mpl_toolkits.mplot3d.axes3d",
+    "rigidfleet.plotting.figure",
 ]  # fmt: skip
 #: Each drawing process holds a copy of the result: larger positions [bytes] are drawn in this process.
 _LARGEST = 50_000_000

@@ -71,17 +71,17 @@ def run(
     quiet : bool
         Print only errors, and JSON with --json.
     """
-    from rigidfleet.mission import load_mission
-
     if not csv and (csv_rate is not None or flown):
         raise RigidfleetError("--csv-rate and --flown say what --csv writes. Add --csv.")
     if csv_rate is not None and not csv_rate > 0.0:
         raise RigidfleetError(f"--csv-rate must be positive [Hz], not {csv_rate:g}.")
+    if not no_figures:
+        drawing.prepare()
+    from rigidfleet.mission import load_mission
+
     asked = load_mission(mission)
     files = Files(out or Path("flights", asked.name), asked.name)
     files.claim(replace=force)
-    if not no_figures:
-        drawing.prepare()
     watch = None if quiet else console.FlightWatch()
     with watch or nullcontext():
         result, interrupted = fly(asked, watch)

@@ -172,7 +172,7 @@ def plot(
         if target is None:
             drawn.append(figure)
         else:
-            figure.set_layout_engine("none")  # it is laid out; that takes a third of the time
+            keep_layout(figure)
             paths += write_figure(figure, target, name, formats, close=not titles)
     return drawn if folder is None else paths
 
@@ -210,9 +210,14 @@ def _rendered(figure: Figure, kind: str, *, close: bool = False) -> bytes:
     with settings():
         box = _ink(figure) if close else None
         figure.savefig(buffer, format=kind, metadata=metadata.get(kind), bbox_inches=box)
-    # The layout is final; do not compute it again.
-    figure.set_layout_engine("none")
+    keep_layout(figure)
     return buffer.getvalue()
+
+
+def keep_layout(figure: Figure) -> None:
+    """Make the layout that a figure has its last one: neither it nor a drawing for it is computed again."""
+    with settings():
+        figure.set_layout_engine(None)  # with "none", matplotlib still draws the figure once more
 
 
 def _ink(figure: Figure) -> Bbox:

@@ -8,6 +8,7 @@ from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 from matplotlib import figure
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 
 class Figure(figure.Figure):
@@ -19,6 +20,12 @@ class Figure(figure.Figure):
     """
 
     settings: Callable[[], AbstractContextManager[Any]] = nullcontext
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        FigureCanvasAgg(
+            self
+        )  # which keeps its renderer; measuring a text would make a new one each time
 
     def _repr_png_(self) -> tuple[bytes, dict[str, Any]]:
         """The picture, and the size it is shown at: fine screens have dots to spare."""

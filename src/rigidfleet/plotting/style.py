@@ -460,14 +460,11 @@ def clean(name: str, longest: int = _LONGEST) -> str:
 
 
 def name_phases(fig: Figure, axes: Iterable[Axes], result: Result) -> None:
-    """Write the phases' names along the top of axes, without overlaps.
+    """Write the phases' names along the top of axes, without overlaps, before the figure is laid out.
 
     If all names fit, each stands horizontally over its phase. Otherwise they are slanted, moved apart where
     phases are short, with a line to their phase. If even this is too narrow, the shortest phases have no name.
     """
-    engine = fig.get_layout_engine()
-    if engine is not None:
-        engine.execute(fig)
     for ax in axes:
         labels = _upright(ax, result) or _slanting(ax, result)
         for label in labels:
@@ -549,8 +546,11 @@ def _spans(ax: Axes, result: Result) -> list[tuple[str, float, float]]:
 
 
 def _per_second(ax: Axes) -> float:
-    """Pixels per second, underestimated because names at the right may narrow the axes."""
-    return 0.88 * ax.bbox.width / float(np.diff(ax.get_xlim())[0])
+    """Pixels per second, underestimated: the layout, which takes a third of a figure's time, comes later.
+
+    It widens axes beside which nothing stands by up to 20 %, and narrows those beside a legend by up to 9 %.
+    """
+    return 0.9 * ax.bbox.width / float(np.diff(ax.get_xlim())[0])
 
 
 def _apart(places: Floats, pitch: float) -> Floats:

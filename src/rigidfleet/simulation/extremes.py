@@ -9,9 +9,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
+from rigidfleet._common.kept import kept
 from rigidfleet.kernel import avoidance, fleet, records
 from rigidfleet.kernel.engine import native
 from rigidfleet.kernel.problem import Problem, Workspace
@@ -19,7 +21,7 @@ from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
 from rigidfleet.mission import Mission, Obstacle
 from rigidfleet.result import PAD, Extremum, PhaseRecord
-from rigidfleet.solids.records import joined
+from rigidfleet.solids.records import Solids, joined
 from rigidfleet.typing import Bools, Floats, Ints
 
 #: Greatest number of agents of which all pairs are monitored.
@@ -71,6 +73,19 @@ _SAMPLED = (
 _OF_FLIGHT = {"clearance_start": records.STANDING, "clearance_flight": records.FLYING}
 
 
+class _Thing(NamedTuple):
+    """An obstacle, as its arrays alone."""
+
+    solid: Solids
+
+
+@kept
+def _stood(position: Floats, radius: Floats, obstacles: tuple[_Thing, ...]) -> Ints:
+    """Whether agents stand on obstacles at the start (N,)."""
+    start, _ = proximity.obstacle_clearances(position, radius, obstacles)
+    return (start <= PAD).astype(np.int64)
+
+
 class Extremes:
     """Monitors a flight and reports the worst values of each phase."""
 
@@ -87,16 +102,15 @@ class Extremes:
         self.who, self.sign = np.full((count, 2), -1), np.zeros(1)
         self.left = np.ones(self.n, dtype=np.bool_)
         self.low = np.full((self.n, 3), np.inf)
-        start, _ = proximity.obstacle_clearances(
-            np.array(agents.position), self.radius, mission.obstacles
-        )
-        self.stood = (start <= PAD).astype(np.int64)
+        things = tuple(_Thing(thing.solid) for thing in mission.obstacles)
+        self.stood = _stood(mission.fleet.position, self.radius, things)
         self.standing = self.stood.copy()
         self.pairs = self.columns = self.struck = np.zeros((0, 2), dtype=np.int64)
         self.spare, self.moved = 0.0, np.zeros(2)
         self.trail = records.NO_TRAIL
         self.of_vehicles: dict[str, Extremum] = {}
         self.avoidance: avoidance.Avoidance | None = None  # that of the phase under way
+        self.led: dict[str, Extremum] = {}  # what its clock and its body layer did
         self._list_all()
 
     def _take_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
@@ -135,7 +149,7 @@ class Extremes:
         self.when.fill(0.0)
         self.who.fill(-1)
         self.standing[:] = self.stood
-        self.of_vehicles, self.avoidance = {}, None
+        self.of_vehicles, self.avoidance, self.led = {}, None, {}
         if len(self.trail.points):
             self.monitor.monitor.flags.fill(0)
 
@@ -284,14 +298,14 @@ class Extremes:
         for name, k in _NAMES.items():
             if math.isfinite(value := worst[k]):
                 found[name] = Extremum(self._signed(name, value), when[k], *who[k])
-        return found | self.of_vehicles | self._avoided()
+        return found | self.of_vehicles | self._avoided() | self.led
 
     def phase(self) -> dict[str, Extremum]:
         """Extremes of the phase that ends, by name; start those of the next one."""
         found = self.so_far()
         self.worst[list(_NAMES.values())] = np.inf
         self.moved[:] = np.inf  # the list was made for a worst value that no longer counts
-        self.of_vehicles, self.avoidance = {}, None
+        self.of_vehicles, self.avoidance, self.led = {}, None, {}
         return found
 
     def flight(self, phases: Sequence[PhaseRecord]) -> None:

@@ -569,6 +569,8 @@ class Flight:
         record = self.phases[-1]
         record.extremes = self._extremes.phase()
         record.abandoned = abandoned
+        if active.delay > 0.0:
+            record.target = active.plan.target
         record.settled = None if abandoned else active.settled
         active.count()
         self._count += active.counted

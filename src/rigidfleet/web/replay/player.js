@@ -521,7 +521,8 @@ export class Player {
     part("compass").style.transform = `rotate(${Math.atan2(Math.cos(azimuth), -Math.sin(azimuth))}rad)`;
     write("time", `${time.toFixed(1)} s`);
     write("number", `${state.phase + 1}/${info.phases.length}`);
-    write("phase-name", phase?.name ?? "");
+    const rate = state.clock?.[0] ?? 1;
+    write("phase-name", `${phase?.name ?? ""}${rate < 0.995 ? ` (waits: clock at ${Math.round(100 * rate)} %)` : ""}`);
     part("scrub").min = String(recording.start);
     part("scrub").max = String(recording.end);
     part("scrub").value = String(time);
@@ -531,16 +532,31 @@ export class Player {
     for (const plot of this.plots) plot.point(share, state);
     const much = scene.enlarged > 1e6 ? "Vehicles have no size; they are drawn as if." : `Vehicles are drawn ${digits(scene.enlarged)} times their size.`;
     const larger = scene.enlarged > 1.15 ? much : "";
-    write("notes", [info.note, larger, overworked(state)].filter(Boolean).join("\n"));
+    write("notes", [info.note, larger, overworked(state), avoiding(state)].filter(Boolean).join("\n"));
   }
+}
+
+/** Names of the vehicles for which a test of their value holds; "" for none. */
+function named(values, test) {
+  const who = Array.from(values ?? []).flatMap((value, i) => (test(value) ? [i + 1] : []));
+  if (!who.length) return "";
+  return who.length > 8 ? `${who.length} agents` : `Agent${who.length > 1 ? "s" : ""} ${who.join(", ")}`;
 }
 
 /** Which vehicles cannot give what is asked of them, in words. */
 function overworked({ saturated }) {
-  const who = Array.from(saturated ?? []).flatMap((share, i) => (share > 0.5 ? [i + 1] : []));
-  if (!who.length) return "";
-  const names = who.length > 8 ? `${who.length} agents` : `Agent${who.length > 1 ? "s" : ""} ${who.join(", ")}`;
-  return `${names} cannot give all that is asked.`;
+  const who = named(saturated, (share) => share > 0.5);
+  return who && `${who} cannot give all that is asked.`;
+}
+
+/** What the layers of avoidance do, in words. */
+function avoiding({ aside, acts }) {
+  const yields = named(acts, (x) => x > 0.5 && x <= 1.5), held = named(acts, (x) => x > 1.5);
+  const way = aside?.[0] ?? 0;
+  return [
+    way > 0.02 && `The formation flies ${way.toFixed(1)} m beside its path.`,
+    yields && `${yields} led by barriers (amber).`, held && `${held} held by the guard (red).`,
+  ].filter(Boolean).join("\n");
 }
 
 export function say(words) {

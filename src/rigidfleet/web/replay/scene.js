@@ -10,7 +10,7 @@ export const LEAST_EFFORT = 0.5; // least share of the resolution
 
 const AXES = [[0.84, 0.15, 0.16], [0.13, 0.58, 0.22], [0.12, 0.36, 0.86]];
 const IDLE = [0.42, 0.47, 0.53], PULL = [0.80, 0.11, 0.09], PUSH = [0.10, 0.33, 0.75];
-const INK = [0.13, 0.15, 0.18], BOX = [0.88, 0.88, 0.87], RIM = [0.50, 0.56, 0.63], FENCE = [0.69, 0, 0.13], SOLID = [0.80, 0.77, 0.72], LIMIT = [0.86, 0.05, 0.10];
+const INK = [0.13, 0.15, 0.18], BOX = [0.88, 0.88, 0.87], RIM = [0.50, 0.56, 0.63], FENCE = [0.69, 0, 0.13], SOLID = [0.80, 0.77, 0.72], LIMIT = [0.86, 0.05, 0.10], YIELDS = [0.90, 0.60, 0.0];
 const SMALLEST = 6, DETAILED = 12; // radius of a vehicle on the screen: the least, and that from which all detail is drawn [px]
 const TRAIL = 8; // length of trails [s]
 const FULL = 0.98; // share of its limit from which a rotor is drawn as being at it
@@ -343,6 +343,8 @@ export class Scene {
       const own = info.rotors?.[i]; // vehicles turn as they are, points along their thrust
       const q = own ? normal(state.turn.subarray(4 * i, 4 * i + 4)) : leaning(state.thrust.subarray(3 * i, 3 * i + 3), heading);
       (near ? (own ? places.turned : places.vehicles) : places.small).add(p, size, q, this.colours[i], 1);
+      const acts = state.acts?.[i] ?? 0; // barriers, from 1.5 on the guard
+      if (acts > 0.5) places.discs.add(p, 5 * size, NO_TURN, acts > 1.5 ? LIMIT : YIELDS, 0.55);
       if (own) {
         places.noses.add(p, size, q, this.colours[i], 1);
         this.placeRotors(p, size, q, state.rotors.subarray(4 * i, 4 * i + 4), near, i);
