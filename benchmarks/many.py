@@ -30,11 +30,13 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from rigidfleet.assessment import assess
 from rigidfleet.assessment.measure import Fit
 from rigidfleet.formation import distance_geometry, shapes
-from rigidfleet.math import rigid_body
+from rigidfleet.math import proximity, rigid_body
 from rigidfleet.mission import Mission, load_mission
 from rigidfleet.planning.solvers import WORDS
+from rigidfleet.result import Result
 from rigidfleet.rigidity import spectrum
 from rigidfleet.rigidity.design import GRAPHS as DESIGNS
 from rigidfleet.simulation.flight import simulate
@@ -75,11 +77,24 @@ GRAPHS: list[tuple[str, int, str, float | None]] = [
     ("helix of show-1000", 1000, "neighbours", 3.05),
     ("helix of show-1000", 1000, "henneberg-multilevel", None),
 ]
-#: Flown if asked for.
-LARGEST = ("lattice, henneberg, body axes", 100_000, None)
-#: Goals: growth of the time of a step, flatness of the sheet [m], the show from command to verdict [s].
-EXPONENT, FLAT, SHOW = 1.1, 5e-3, 60.0
+#: 3 s for 20 s; and a million, flown only if asked for, for its memory [GB].
+LARGEST = ("lattice, henneberg, body axes", 100_000, DURATION / 3.0)
+MILLION = ("lattice, henneberg, body axes", 1_000_000, None)
+#: Agents of flights whose samples are judged, and how often each is.
+JUDGED, TIMES = (500, 1581, 5000, 15_811, 50_000), 3
+#: Goals: growth of the time of a step and of judging, flatness of the sheet [m], the show from command to verdict [s].
+EXPONENT, JUDGING, FLAT, SHOW, MEMORY = 1.1, 1.2, 5e-3, 60.0, 24.0
 ROUNDS = 3
+#: What is judged.
+WORK: dict[str, Callable[[Result], object]] = {
+    "separation": lambda x: proximity.separation_of_left(
+        x.position, x.mission.agents.radius, x.left
+    ),
+    "clearance": lambda x: proximity.obstacle_clearances(
+        x.position, x.mission.agents.radius, x.mission.obstacles, x.time
+    ),
+    "verdict": assess,
+}
 
 
 @dataclass
@@ -141,7 +156,10 @@ def mission(kind: str, n: int) -> Mission:
     p = lattice(n) if named is None else shapes.slots(named, SPACING, n)
     off = (0.1 if kind.endswith(_FAR) else 0.02) * SPACING
     r = p + off * np.random.default_rng(0).uniform(-1, 1, p.shape)
-    form: dict[str, Any] = {"slots": p.tolist(), "edges": graph.partition(" ")[0]}
+    # The text of a mission has at most 64 MiB and 10,000,000 numbers: a million start from their slots, at rest.
+    few = n >= MILLION[1]
+    slots = p.astype(int) if few else p
+    form: dict[str, Any] = {"slots": slots.tolist(), "edges": graph.partition(" ")[0]}
     if graph == "triangulated":
         form["edges"] = triangulated(p)
     elif graph == "neighbours within 1.5":
@@ -150,7 +168,7 @@ def mission(kind: str, n: int) -> Mission:
     data: dict[str, Any] = {
         "schema_version": 1,
         "name": shape,
-        "agents": {"mass": 1.0, "position": r.tolist()},
+        "agents": {"mass": 1.0, "position": (slots if few else r).tolist()},
         "formulation": "body" if kind.endswith(_BODY) else "inertial",
         "constraint": {"solver": "exact" if exact else "iterated"},
         "formations": {"f": form},
@@ -169,7 +187,8 @@ def mission(kind: str, n: int) -> Mission:
             },
         ]
         return Mission.from_dict(data)
-    data["agents"]["velocity"] = np.cross([0.0, 0.0, RATE], r - r.mean(axis=0)).tolist()
+    if not few:
+        data["agents"]["velocity"] = np.cross([0.0, 0.0, RATE], r - r.mean(axis=0)).tolist()
     data["phases"] = [
         {"kind": "establish", "formation": "f", "control": "open", "reference": "step", "duration": 6.0},
         {"kind": "hold", "control": "open", "input_force": [0.1, 0.1, 0.0], "duration": DURATION - 6.0},
@@ -243,6 +262,33 @@ def show() -> dict[str, float]:
     return {"wall": wall, "processor": spent}
 
 
+def judging() -> dict[str, float]:
+    """Exponents of the number of agents in the processor's time of separation, clearance and verdict.
+
+    41 samples of the lattice among two spheres, above the ground; least squares of logarithms.
+    """
+    things = [
+        {"kind": "sphere", "name": f"ball {x:+}", "centre": [x, 0, 0], "radius": 2.0}
+        for x in (300, -300)
+    ]
+    times: dict[str, list[float]] = {name: [] for name in WORK}
+    for n in JUDGED:
+        data = mission(LARGEST[0], n).to_dict()
+        data |= {"obstacles": [{"kind": "ground", "height": -200.0}, *things], "output_step": 0.5}
+        data["limits"] = {"separation": 0.3, "speed": 100.0}
+        data["agents"]["radius"] = 0.2
+        flown = simulate(Mission.from_dict(data))
+        for name, work in WORK.items():
+            spent = []
+            for _ in range(TIMES):
+                start = time.process_time()
+                work(flown)
+                spent.append(time.process_time() - start)
+            times[name].append(min(spent))
+    agents = np.log(np.array(JUDGED))
+    return {name: float(np.polyfit(agents, np.log(t), 1)[0]) for name, t in times.items()}
+
+
 def growth(rows: list[tuple[Flown, float | None]]) -> float:
     """The exponent of N in the time of a step on the henneberg lattice."""
     found = [(r.agents, r.wall / r.steps) for r, _ in rows if r.kind == LARGEST[0]]
@@ -277,7 +323,10 @@ def table(rows: list[tuple[Flown, float | None]]) -> Table:
 
 
 def goals(
-    rows: list[tuple[Flown, float | None]], exponent: float, spent: dict[str, float]
+    rows: list[tuple[Flown, float | None]],
+    exponent: float,
+    exponents: dict[str, float],
+    spent: dict[str, float],
 ) -> list[dict[str, Any]]:
     """Each goal, what came of it by the wall's clock, and whether it is reached."""
     found = [
@@ -291,7 +340,16 @@ def goals(
         if row.flat is not None
     ]
     found += [
+        (f"{row.agents:,}: memory [GB]", row.memory, MEMORY, False)
+        for row, _ in rows
+        if row.agents == MILLION[1]
+    ]
+    found += [
         ("exponent of a step's time on the lattice", exponent, EXPONENT, False),
+        *(
+            (f"exponent of the time of its {name}", x, JUDGING, False)
+            for name, x in exponents.items()
+        ),
         ("show-1000 from command to verdict [s]", spent["wall"], SHOW, False),
     ]
     judged = []
@@ -307,7 +365,7 @@ def main() -> int:
     """Fly all, print the table and the goals."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--one", nargs=2, metavar=("KIND", "AGENTS"), help="fly this one, as JSON")
-    parser.add_argument("--largest", action="store_true", help=f"fly {LARGEST[1]:,} agents, too")
+    parser.add_argument("--million", action="store_true", help="fly a million agents, too")
     parser.add_argument("--json", type=Path, help="write the figures to this file")
     arguments = parser.parse_args()
     if arguments.one:
@@ -320,13 +378,13 @@ def main() -> int:
     load = os.getloadavg()[0]  # a time of the wall's clock means little where others work
     console.print(f"{date.today()}; {machine}; {versions}; load {load:.1f}", highlight=False)
     console.print(f"{DURATION:g} s of flight, {TOLERANCE}, one thread", highlight=False)
-    flights = [*FLIGHTS, *([LARGEST] if arguments.largest else [])]
+    flights = [*FLIGHTS, LARGEST, *([MILLION] if arguments.million else [])]
     rows = [(measured(k, n), goal) for k, n, goal in flights]
     console.print(table(rows))
     for method in dict.fromkeys(row.solve for row, _ in rows):
         console.print(f"{method}: {WORDS.get(method, method)}", highlight=False)  # ty: ignore
-    exponent, spent = growth(rows), show()
-    judged = goals(rows, exponent, spent)
+    exponent, exponents, spent = growth(rows), judging(), show()
+    judged = goals(rows, exponent, exponents, spent)
     for goal in judged:
         sign, words = ">=" if goal["least"] else "<=", "reached" if goal["reached"] else "MISSED"
         text = f"{goal['name']}: {goal['value']:.3g}, goal {sign} {goal['goal']:g}: {words}"

@@ -363,6 +363,7 @@ def processes(rounds: int) -> list[Row]:
             "help": ["-m", "rigidfleet", "--help"],
             "check": ["-m", "rigidfleet", "check", "narrow-passage"],
             "run": ["-m", "rigidfleet", *flight],
+            "figures": ["-m", "rigidfleet", *(x for x in flight if x != "--no-figures")],
         }
 
         def call(name: str, cache: str = "") -> None:
@@ -386,6 +387,14 @@ def processes(rounds: int) -> list[Row]:
         Row("check narrow-passage", spent["check"], spent["numpy"], 8.0, False, bare),
         Row("run narrow-passage", spent["run"], spent["numpy"], 12.0, False, bare),
         Row("  against its imports", spent["run"], spent["imports"], 4.0, False),
+        Row(
+            "  with its figures",
+            spent["figures"],
+            spent["run"],
+            2.5,
+            False,
+            "against the same without",
+        ),
         Row("the first run ever", first, [1.0], 25.0, False, "seconds, compile included"),
     ]
 

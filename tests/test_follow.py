@@ -204,6 +204,25 @@ BAD = {
 }  # fmt: skip
 
 
+@pytest.mark.parametrize(("kind", "near"), [("skyc", 0.02), ("mcap", 1e-3)])
+def test_vehicles_follow_what_was_exported(tmp_path, kind, near):
+    """A flight that leaves as a show or as ROS 2 poses is followed as it was flown, within the format's deviation."""
+    if kind == "mcap":
+        pytest.importorskip("mcap", reason="make .venv/.interchange installs it")
+    first = rf.simulate(_written(tmp_path, 'file = "way.csv"', content=_table(_own())))
+    file = f"flown.{kind}"
+    rf.export(first, tmp_path / file, kind)
+    path = tmp_path / "again.toml"
+    path.write_text(HEAD.format(limits="") + f'file = "{file}"')
+    again = rf.simulate(path)
+    assert rf.assess(again).passed
+    # The second flight waits for the establishment of its own; the file begins with that of the first.
+    for t in np.linspace(0.0, first.time[-1], 9):
+        then, now = np.abs(first.time - t).argmin(), np.abs(again.time - t - 4.0).argmin()
+        assert abs(again.time[now] - 4.0 - first.time[then]) < 1e-9
+        np.testing.assert_allclose(again.position[now], first.position[then], atol=near)
+
+
 @pytest.mark.parametrize("name", BAD)
 def test_bad_files_get_one_clear_error(tmp_path, name):
     """What is wrong, and where."""
@@ -280,6 +299,25 @@ def test_a_mission_flies_bent_ways_with_a_certificate():
     np.testing.assert_allclose(result.position[-1], np.roll(RING, 3, axis=0) + [0, 0, 5], atol=1e-6)
     again = rf.simulate(rf.Mission.from_toml(result.mission.text))
     np.testing.assert_array_equal(again.position, result.position)
+
+
+@pytest.mark.parametrize("yaw", [0.0, 90.0])
+def test_bent_ways_keep_to_the_ground_and_the_geofence(yaw):
+    """Close to the ground and below a ceiling, with the fence's sides if the body's axes are along it."""
+    data = _swap()
+    fence = {"min": [-5.0, -2.4, 0.0], "max": [5.0, 2.4, 1.4]}
+    data["limits"]["geofence"] = fence
+    data["obstacles"] = [{"kind": "ground"}]
+    data["agents"]["position"] = RING + [0, 0, 0.4]
+    data["phases"].insert(1, {"kind": "turn", "yaw_deg": yaw, "duration": 6.0})
+    result = rf.simulate(rf.Mission.from_dict(data))
+    assert rf.assess(result).passed
+    flown = result.position[result.phase == 2]
+    rest = 2.0 * (0.2 + 0.2 + 0.1)  # what ways without these would take below and above their slots
+    assert flown[..., 2].max() > 0.45  # they do leave the plane
+    assert flown[..., 2].min() >= 0.1
+    assert 0.4 - rest < 0.1
+    assert np.abs(flown[..., 1]).max() <= 2.3 + 1e-6
 
 
 def test_quadrotors_fly_bent_ways():

@@ -11,6 +11,7 @@ from rigidfleet.mission import Mission, Phase
 from rigidfleet.mission.findings import near
 from rigidfleet.mission.kinds import KINDS
 from rigidfleet.mission.losses import ON_LOSS
+from rigidfleet.planning.timing import with_times
 from rigidfleet.planning.transitions import expanded
 from rigidfleet.result import PhaseRecord
 
@@ -61,7 +62,7 @@ def with_phase(
     data["phases"] = [*data["phases"], dict(table)]
     made = Mission.from_dict(data, "begin()")
     if not made.phases[-1].spelled:
-        spread = expanded(made)
+        spread = expanded(made, with_times)
         if len(spread.phases) == len(made.phases):  # with the ways that were found
             made = spread
     _check_flown(made.phases[-1])
