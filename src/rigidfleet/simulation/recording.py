@@ -228,9 +228,7 @@ def _of_vehicles(pieces: Sequence[Piece]) -> VehicleSamples | None:
     )
 
 
-def _put_extremes(
-    phases: Sequence[PhaseRecord], time: Floats, close: proximity.Closeness
-) -> None:
+def _put_extremes(phases: Sequence[PhaseRecord], time: Floats, close: proximity.Closeness) -> None:
     """Enter the extremes between samples at the sample after each."""
     for phase in phases:
         for name, values in (("separation", close.separation), ("clearance", close.clearance)):
