@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigidfleet.math import attitude as att
 from rigidfleet.typing import Floats
 
 
@@ -100,7 +99,7 @@ def mean_axis_rates(x: Floats, y: Floats, masses: Floats) -> Floats:
     x, y (K, N, 3): positions and velocities about the CM [m, m/s]; masses (N,) or (K, N).
     """
     masses = np.broadcast_to(masses, x.shape[:2])
-    h = np.einsum("ki,kia->ka", masses, att.cross(x, y))
+    h = np.einsum("ki,kia->ka", masses, np.cross(x, y))
     C = np.einsum("ki,kia,kib->kab", masses, x, x)
     inertia = np.trace(C, axis1=1, axis2=2)[:, None, None] * np.eye(3) - C
     # Far from a line, the inverse equals the pseudo-inverse and takes a third of the time.
