@@ -259,6 +259,10 @@ class Closeness(NamedTuple):
     agent: Ints  # (K,)
     obstacle: Ints  # (K,)
 
+    def copied(self) -> Closeness:
+        """The same in arrays of its own."""
+        return self._replace(**{name: x.copy() for name, x in self._asdict().items()})
+
 
 #: The last arguments of `closeness`, and what was found; greatest size of a flight that is kept [bytes].
 _last: list[tuple[Sequence[Obstacle], list[Floats | Bools], Closeness]] = []
@@ -276,7 +280,7 @@ def closeness(
     given = [r, radius, time, left]
     for things, before, found in _last[-1:]:
         if things is obstacles and all(map(_same, given, before)):
-            return Closeness(*(x.copy() for x in found))
+            return found.copied()
     each, nearest = obstacle_clearances(r, radius, obstacles, time)
     if not left.all():
         each[~left] = np.inf
@@ -284,8 +288,7 @@ def closeness(
         *separation_of_left(r, radius, left), each, nearest, *least_clearance(each, nearest)
     )
     if r.nbytes <= _KEPT:
-        copies = Closeness(*(x.copy() for x in found))
-        _last[:] = [(obstacles, [x.copy() for x in given], copies)]
+        _last[:] = [(obstacles, [x.copy() for x in given], found.copied())]
     return found
 
 
