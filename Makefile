@@ -13,7 +13,7 @@ BUILD := $(BIN)/uv build --quiet --python $(BIN)/python --build-constraints cons
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test bench peers robustness avoidance exports docs package lint format constraints clean
+.PHONY: help setup demo test bench peers robustness avoidance exports replays docs package lint format constraints clean
 
 help:  ## Show this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' Makefile
@@ -40,11 +40,16 @@ robustness: .venv/.bench  ## Fly 200 random formations under every graph and law
 exports: .venv/.interchange  ## Measure every export of three flights
 	@$(BIN)/python benchmarks/exports.py --write docs/export.md
 
-avoidance: .venv/.bench  ## Plan transitions and published problems, with proofs
+avoidance: .venv/.bench .venv/.crowds  ## Plan transitions and published problems, with proofs
 	@$(BIN)/python benchmarks/avoidance.py
 	@$(BIN)/python benchmarks/moving.py
+	@$(BIN)/python benchmarks/order.py
 	@$(BIN)/python benchmarks/gaps.py
 	@$(BIN)/python benchmarks/crowds.py
+	@$(BIN)/python benchmarks/reciprocal.py
+
+replays: .venv/.dev  ## Measure replays in Chromium without a graphics card
+	@$(BIN)/python benchmarks/replay.py
 
 docs: .venv/.docs  ## Build the site into site/, with every figure on it
 	@$(BIN)/python docs/picture.py
@@ -67,7 +72,7 @@ format: .venv/.dev  ## Rewrite the code in the project's style
 
 constraints: .venv/.dev  ## Choose newer versions of all packages
 	@$(BIN)/uv pip compile --quiet --universal --upgrade --no-header --no-annotate \
-		--all-extras --group dev --group bench --group peers --group vehicles --group interchange --group oracles --group docs --group build \
+		--all-extras --group dev --group bench --group peers --group crowds --group vehicles --group interchange --group oracles --group docs --group build \
 		pyproject.toml --output-file constraints.txt
 
 clean:  ## Remove .venv, caches and builds
@@ -87,7 +92,7 @@ clean:  ## Remove .venv, caches and builds
 	@$(INSTALL)
 	@touch $@
 
-.venv/.dev .venv/.bench .venv/.peers .venv/.vehicles .venv/.interchange .venv/.oracles .venv/.docs: .venv/.%: .venv/.core
+.venv/.dev .venv/.bench .venv/.peers .venv/.crowds .venv/.vehicles .venv/.interchange .venv/.oracles .venv/.docs: .venv/.%: .venv/.core
 	@echo "Installing what '$*' needs"
 	@$(INSTALL) --group $*
 	@touch $@

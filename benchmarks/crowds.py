@@ -86,13 +86,22 @@ def kernel(n: int, **given: Any) -> tuple[Any, ...]:
     return problem, work, flight, state, a
 
 
-def asked(r: Floats, v: Floats, goal: Floats) -> Floats:
-    """Accelerations towards a goal, at most SPEED fast."""
+def preferred(r: Floats, goal: Floats) -> Floats:
+    """Velocities straight towards a goal, at most SPEED fast."""
     way = goal - r
     far = np.linalg.norm(way, axis=1, keepdims=True)
     fast = np.minimum(SPEED, np.sqrt(THRUST * far))
-    a = 3.0 * (np.where(far < 0.3, 1.5 * way, way / np.maximum(far, 1e-9) * fast) - v)
+    return np.where(far < 0.3, 1.5 * way, way / np.maximum(far, 1e-9) * fast)
+
+
+def limited(a: Floats) -> Floats:
+    """Accelerations of THRUST at most."""
     return a * np.minimum(1.0, THRUST / np.maximum(np.linalg.norm(a, axis=1, keepdims=True), 1e-12))
+
+
+def asked(r: Floats, v: Floats, goal: Floats) -> Floats:
+    """Accelerations that lead to the preferred velocity."""
+    return limited(3.0 * (preferred(r, goal) - v))
 
 
 def least_distance(r: Floats, v: Floats, a: Floats, pairs: tuple[Any, Any]) -> float:

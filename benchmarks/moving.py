@@ -5,9 +5,13 @@ about where and when the vehicles pass. They are seen within RANGE alone, with n
 the kernel. Accelerations are at most 5 m/s^2. Least distances are those in continuous time: commands are held, so that
 relative paths are parabolas between ticks.
 
-A scene counts as feasible by a criterion that knows nothing of any of these methods: from the first moment at which an
-undisturbed vehicle has the ball within RANGE, one constant acceleration of SHARE of the greatest one, the same for all
-vehicles and held for HELD, in one of 38 directions, or none, leads them past it, SPARE away, for the next AHEAD.
+A scene counts as feasible by a criterion that knows nothing of any of these methods: every vehicle has an *escape*, a
+way among both balls at once, SPARE away from them and from the escapes of the others. Vehicles fly undisturbed until a
+ball can be known: SETTLE after the first moment at which one of them has it within RANGE. From then on each escapes
+with one of 27 constant accelerations: SHARE of the greatest one in 26 directions, or none. It is held for HELD, or
+until the second ball can be known, when another one may begin; then the vehicle goes on straight. That is watched for
+AHEAD. So an escape needs no more thrust than there is, takes no heed of a ball before it is known, and need not lead
+back to the slots.
 
     python benchmarks/moving.py [--scenes 1000] [--seed 0]
 """
@@ -33,8 +37,9 @@ SPEEDS = ((2.0, 2.0), (2.0, 6.0), (5.0, 6.0))
 RADIUS, BALL, COURSE, EDGE = 0.3, 0.7, 24.0, 3.0
 #: Sensing range, its noise [m], acceleration of obstacles that is reckoned with [m/s^2].
 RANGE, NOISE, SWERVE = 10.0, 0.05, 0.2
-#: The criterion: share of the acceleration, for how long [s], what to keep [m], for how long [s].
-SHARE, HELD, SPARE, AHEAD = 0.6, 1.5, 0.1, 6.0
+#: The criterion: time until a ball that is seen is known [s], share of the acceleration, for how long [s], what to keep
+#: [m], for how long [s], at times so far apart [s].
+SETTLE, SHARE, HELD, SPARE, AHEAD, LOOK = 0.3, 0.6, 1.5, 0.1, 6.0, 0.04
 #: Distance of centres below which distances are taken [m].
 NEAR = 1.5
 #: Time for which a flight goes on after its slots have arrived [s].
@@ -80,26 +85,50 @@ def scene(n: int, speed: float, fastest: float, seed: int) -> Scene:
     return Scene(slots, speed, np.array([f[0] for f in found]), np.array([f[1] for f in found]))
 
 
-def feasible(given: Scene) -> bool:
-    """Whether every obstacle, alone and at first sight, can be evaded by all vehicles in one way; see above."""
-    t = np.arange(0.0, COURSE / given.speed, PERIOD)
+def bend(s: Floats, held: float) -> Floats:
+    """Displacement by an acceleration of 1 m/s^2 that begins at s = 0 [s] and is held for some time [m]."""
+    part = np.clip(s, 0.0, held)
+    return part * (s - 0.5 * part)
+
+
+def escapes(given: Scene) -> tuple[Any, Floats]:
+    """Which manoeuvres keep each vehicle clear of all balls (K, n), and their displacements (K, T, 3) [m]."""
     fly = np.array([given.speed, 0.0, 0.0])
-    push = np.concatenate([candidates()[:26], candidates()[-1:]]) * SHARE * THRUST
-    s = np.arange(0.0, AHEAD, PERIOD)
-    bend = np.where(s < HELD, 0.5 * s * s, HELD * s - 0.5 * HELD * HELD)
-    for place, w in zip(given.place, given.velocity, strict=True):
-        x = given.slots - place
-        away = np.linalg.norm(x[:, None] + t[:, None] * (fly - w), axis=2).min(axis=0) - BALL
-        seen = np.flatnonzero(away <= RANGE)
-        if not len(seen):
-            continue
-        x = x + t[seen[0]] * (fly - w)
-        clear = np.ones(len(push), dtype=bool)
-        for own in x:
-            path = own + s[:, None] * (fly - w) + push[:, None, :] * bend[:, None]
-            clear &= np.linalg.norm(path, axis=2).min(axis=1) > RADIUS + BALL + SPARE
-        if not clear.any():
+    t = np.arange(0.0, COURSE / given.speed + AHEAD, LOOK)
+    gap = given.slots[:, None] - given.place  # (n, 2, 3)
+    x = gap[:, :, None] + t[:, None] * (fly - given.velocity)[:, None]  # (n, 2, T, 3), undisturbed
+    away = np.linalg.norm(x, axis=3).min(axis=0) - BALL
+    known = np.sort([t[np.argmax(each <= RANGE)] for each in away if (each <= RANGE).any()])
+    known += SETTLE
+    t = t[t <= max(known, default=0.0) + AHEAD]
+    push = np.concatenate([candidates()[-1:], candidates()[:26]]) * SHARE * THRUST
+    shift = np.zeros((1, len(t), 3))
+    for begin, held in zip(known, [*np.minimum(np.diff(known), HELD), HELD], strict=False):
+        own = push[:, None] * bend(t - begin, held)[:, None]
+        shift = (shift[:, None] + own).reshape(-1, len(t), 3)
+    clear, size = np.ones((len(shift), len(given.slots)), dtype=bool), (shift**2).sum(axis=2)
+    for i in range(len(given.slots)):
+        for path in x[i, :, : len(t)]:
+            square = size + 2.0 * np.einsum("ktq,tq->kt", shift, path) + (path**2).sum(axis=1)
+            clear[:, i] &= square.min(axis=1) > (RADIUS + BALL + SPARE) ** 2
+    return clear, shift
+
+
+def feasible(given: Scene) -> bool:
+    """Whether all vehicles have escapes that keep apart from each other; see above."""
+    clear, shift = escapes(given)
+    if not clear.any(axis=0).all():
+        return False
+    if clear.all(axis=1).any():  # the same for all: they stay a cube
+        return True
+    chosen: list[Floats] = []
+    for i, slot in enumerate(given.slots):  # the first that keeps apart from those before
+        paths = slot + shift[clear[:, i]]
+        for other in chosen:
+            paths = paths[np.linalg.norm(paths - other, axis=2).min(axis=1) > 2 * RADIUS + SPARE]
+        if not len(paths):
             return False
+        chosen.append(paths[0])
     return True
 
 

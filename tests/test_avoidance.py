@@ -187,9 +187,11 @@ def test_barriers_change_accelerations_as_an_exact_solver_does(seed):
         period=0.02, b=b, lift=np.full(n, 1e3), mass=m, g=0.0, radius=np.full(n, D / 2), rate=rate, share=share,
         solids=single(half_space(ground)), guarded=False, edges=len(edges),
     )  # fmt: skip
-    a.hold[:] = hold
-    state.seen[:, :3], state.seen[:, 3:], state.force[:] = r, v, m[:, None] * wanted
-    assert sampled.avoid(problem, work, flight, state, a)
+    state.seen[:, :3], state.seen[:, 3:] = r, v
+    for ask in (20.0 * (r.mean(axis=0) - r), wanted):
+        a.hold[:], state.force[:] = hold, m[:, None] * ask
+        assert (a.last > 0.0).any() == (ask is wanted)  # the search begins with other pushes
+        assert sampled.avoid(problem, work, flight, state, a)
     # The same problem from its definition
     rows, needed, most = [], [], []
     for e, (i, j) in enumerate(edges):

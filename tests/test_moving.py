@@ -12,7 +12,7 @@ from rigidfleet.kernel import fleet
 from rigidfleet.kernel.avoidance import KNOWN, UNKNOWN, avoidance, sight
 from rigidfleet.kernel.engine import sampled
 from rigidfleet.kernel.problem import graph, workspace
-from rigidfleet.solids.records import ball, half_space, joined, single
+from rigidfleet.solids.records import ball, box, half_space, joined, single
 
 #: Period of the commands [s].
 T = 0.02
@@ -132,6 +132,47 @@ def test_the_flow_is_that_of_a_doublet_in_a_stream(seed):
     flow = [(potential(x + e) - potential(x - e)) / (2 * step) for e in step * np.eye(3)]
     given = fly(0.0, place + x, v, force)
     assert given == pytest.approx(4.0 * (np.array(flow) + w - v), rel=1e-6)
+
+
+# -- the barriers -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_vehicle_steers_past_what_would_pass_too_near(seed):
+    """Held until the nearest approach, the least change of what is asked for leads past at the distance to keep."""
+    rng = np.random.default_rng(seed)
+    fly = One(passing([6.0, 0, 0], [-3.0, 0, 0]), guarded=False, clearance=0.1)
+    r, v, force = rng.normal(0, 0.2, 3), rng.normal(0, 0.2, 3), rng.normal(0, 0.1, 3)
+    change = fly(0.0, r, v, force) - force
+    x, u = r - [6.0, 0, 0], v - [-3.0, 0, 0]
+    t = -(x @ u) / (u @ u)
+    beside = x + t * u  # at right angles to the way, which both would go on straight
+    n = beside / np.linalg.norm(beside)
+    asked = n @ force
+    led = np.linalg.norm(beside) + 0.5 * (asked + n @ change) * t * t
+    assert led == pytest.approx(0.7 + 0.3 + 0.1, abs=1e-5)
+    assert np.linalg.norm(np.cross(n, change)) < 1e-6
+
+
+def test_nobody_steers_round_a_wall():
+    """A wide plate that comes from afar asks for nothing: there is no way past it, and braking suffices later."""
+    ends, plate = np.array([0.0, 60.0]), box([6.0, -4.5, -4.5], [6.01, 4.5, 4.5])
+    fly = One(single(plate, ends, np.outer(ends, [-2.5, 0, 0])), guarded=False)
+    given = fly(0.0, np.zeros(3), np.zeros(3), np.zeros(3))
+    assert given == pytest.approx(np.zeros(3), abs=1e-12)
+
+
+def test_a_ball_does_not_drive_a_vehicle_into_another():
+    """One of two vehicles in line is met straight from ahead: it gives way beside, not towards the other."""
+    mission = crowd(
+        [[0.0, 0, 5], [-2.0, 0, 5]], limit=15.0, until=6.0,
+        obstacles=[{"kind": "sphere", "centre": [10.0, 0.01, 5], "radius": 0.7, "velocity": [-2.5, 0, 0]}],
+        avoidance={"separation": 0.1, "clearance": 0.05},
+    )  # fmt: skip
+    result = rf.simulate(mission)
+    assert worst(result, "clearance") >= 0.05 - 1e-6
+    assert worst(result, "separation") >= 0.1 - 1e-6
+    assert guarantee(mission)[0].passed
 
 
 # -- the guard ----------------------------------------------------------------------------------------

@@ -18,6 +18,8 @@ from rigidfleet.typing import Floats, Ints
 TICKS, LISTED, FULL = range(3)
 #: Columns of `Avoidance.acted` and `Avoidance.first`: the barrier, the guard, the guard by braking.
 BARRIER, GUARD, BRAKE = range(3)
+#: Bits of `SampledState.layers`, of the same three.
+ACTS = (1, 2, 4)
 #: Rows of `Avoidance.margin`: between two vehicles, between a vehicle and an obstacle.
 PAIR, OBSTACLE = range(2)
 #: What is known of an obstacle that moves: nothing, its place, or its velocity, too; see `Sight.known`.
@@ -28,6 +30,8 @@ _DRAWS = 65_521
 _NEIGHBOURS, _FEW = 256, 400
 #: Greatest number of barriers between vehicles at a tick, per vehicle; more are left to the guard.
 _BARRIERS = 32
+#: Distance that counts as none [m].
+_NEAREST = 1e-6
 #: Greatest number of rows of an exact solution of the barriers.
 EXACT = 64
 
@@ -57,7 +61,7 @@ def sight(
 ) -> Sight:
     """What is known of obstacles before the flight: nothing of those that move; see `Sight`."""
     count = len(solids.kind)
-    moves = solids.last[:count, 3] > solids.first[:count, 3]
+    moves = solids.last[:count, 3] > solids.first[:count, 3]  # also what appears or vanishes
     drawn = np.random.default_rng(seed).standard_normal(_DRAWS) if noise else np.zeros(1)
     centre, radius = np.zeros((count, 3)), np.zeros(count)
     for o in range(count):
@@ -93,6 +97,7 @@ class Avoidance(NamedTuple):
     b: Floats  # (N,) acceleration in any direction that each vehicle always has [m/s^2]
     lift: Floats  # (N,) greatest thrust per mass [m/s^2]
     weight: Floats  # (N,) mass that the laws know [kg]
+    inverse: Floats  # (N,) its inverse [1/kg]
     g: float  # [m/s^2]
     coast: Floats  # (N, 3) of the drag k per mass over a period T: e^-kT, (1 - e^-kT)/k, (T - (1 - e^-kT)/k)/k
     lag: Floats  # (N,) time until a command acts [s]
@@ -127,11 +132,14 @@ class Avoidance(NamedTuple):
     trial: Floats  # (5, 3) the same of a candidate; its acceleration; at the start of the tick
     normal: Floats  # (3,)
     # Barriers: W rows
-    rows: Ints  # (W, 2) vehicle, and the other or -1
+    rows: Ints  # (W, 3) vehicle, the other or -1, entry of ``last``
     normals: Floats  # (W, 3)
-    needed: Floats  # (W,) [m/s^2]
+    missing: Floats  # (W,) acceleration along them that is needed, less what is asked for [m/s^2]
+    reduced: Floats  # (W,) reduced mass of the two [kg]
     push: Floats  # (W,) kappa [N]
     most: Floats  # (W,) greatest one [N]
+    last: Floats  # (P + 2 N B,) those of the tick before, of neighbours and of obstacles [N]
+    pushing: Ints  # (W,) work: rows that push
     hold: Floats  # (N,) share to which edges of a vehicle hold
     pull: Floats  # (m,) what barriers add to the multipliers of edges [N]
     system: Floats  # (EXACT, EXACT) work
@@ -179,11 +187,11 @@ def avoidance(
     solids = joined([]) if solids is None else solids
     n, count = len(b), len(solids.kind)
     capacity = n * (n - 1) if n <= _FEW else _NEIGHBOURS * n
-    rows = min(capacity // 2, _BARRIERS * n) + n * count
     radius = np.asarray(radius, dtype=float)
     return Avoidance(
         law=np.zeros(2, dtype=np.int64), guarded=guarded, filtered=filtered, period=float(period), rate=float(rate),
         share=float(share), release=float(release), b=_each(b, n), lift=_each(lift, n), weight=_each(mass, n),
+        inverse=1.0 / _each(mass, n),
         g=float(g), coast=_coast(_each(drag, n), period), lag=_each(lag, n), spare=_each(spare, n),
         room=radius + 0.5 * separation, reach=radius + clearance,
         solids=solids, sight=sight(solids) if seen is None else seen, flow=flow, candidates=candidates(),
@@ -191,12 +199,11 @@ def avoidance(
         order=np.arange(n), listed=np.full((n, 3), np.inf), span=np.zeros(3),
         known=np.zeros((3, n, 3)), wanted=np.zeros((n, 3)), shift=np.zeros((n, 3)),
         chosen=np.zeros((n, 3)), rise=np.zeros((n, 3)), ways=np.zeros((n, 4, 3)),
-        far=np.zeros(n), walls=np.zeros((n, count)), threat=np.full(n, -1),
+        far=np.zeros(n), threat=np.full(n, -1),
         late=np.zeros(n), shifted=np.zeros((4, 3)), trial=np.zeros((5, 3)), normal=np.zeros(3),
-        rows=np.zeros((rows, 2), dtype=np.int64), normals=np.zeros((rows, 3)), needed=np.zeros(rows),
-        push=np.zeros(rows), most=np.zeros(rows), hold=np.ones(n), pull=np.zeros(edges),
+        hold=np.ones(n), pull=np.zeros(edges),
         system=np.zeros((EXACT, EXACT)), right=np.zeros(EXACT), active=np.zeros(EXACT, dtype=np.int64),
-        count=np.zeros(3, dtype=np.int64), **_record(n),
+        count=np.zeros(3, dtype=np.int64), **_by_obstacle(n, count), **_record(n),
     )  # fmt: skip
 
 
@@ -204,6 +211,26 @@ def renewed(given: Avoidance) -> Avoidance:
     """The same avoidance in the next phase, which has a record of its own."""
     given.count[TICKS] = 0
     return given._replace(**_record(len(given.b)))
+
+
+def among(given: Avoidance, solids: Solids) -> Avoidance:
+    """The same avoidance among other obstacles; the first of them are those before, and what is known of them stays."""
+    before, seen = given.sight, sight(solids, given.sight.reach, 0.0, given.sight.swerve)
+    seen = seen._replace(noise=before.noise, normals=before.normals)
+    for mine, old in zip(seen[-4:], before[-4:], strict=True):  # what is known
+        mine[: len(old)] = old
+    return given._replace(solids=solids, sight=seen, **_by_obstacle(len(given.b), len(solids.kind)))
+
+
+def _by_obstacle(n: int, count: int) -> dict[str, Any]:
+    """Arrays whose size depends on the number of obstacles."""
+    capacity = n * (n - 1) if n <= _FEW else _NEIGHBOURS * n
+    rows = min(capacity // 2, _BARRIERS * n) + 2 * n * count
+    return {
+        "walls": np.zeros((n, count)), "rows": np.zeros((rows, 3), dtype=np.int64), "normals": np.zeros((rows, 3)),
+        "missing": np.zeros(rows), "reduced": np.zeros(rows), "push": np.zeros(rows), "most": np.zeros(rows),
+        "last": np.zeros(capacity + 2 * n * count), "pushing": np.zeros(rows, dtype=np.int64),
+    }  # fmt: skip
 
 
 def holding(given: Avoidance, edges: int) -> Avoidance:
@@ -219,6 +246,16 @@ def _record(n: int) -> dict[str, Any]:
         "acted": np.zeros((3, n), dtype=np.int64), "first": np.full((3, n), np.inf), "margin": endless,
         "between": none, "lost": endless.copy(), "loser": none.copy(),
     }  # fmt: skip
+
+
+def needed_rate(gap, s, across, B, rate):
+    """Least second derivative of a distance by a barrier, see `barriers`; ``across``: the part that motion gives.
+
+    For numbers and arrays: the gap to what is to be kept [m], its rate s, and the braking B to reckon with.
+    """
+    safe = np.maximum(gap, _NEAREST)
+    root = np.sqrt(2.0 * B * safe)
+    return -rate * (root + s) - B * s / root - across
 
 
 def _each(x: ArrayLike, n: int) -> Floats:

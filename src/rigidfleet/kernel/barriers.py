@@ -9,6 +9,8 @@ and s = dL/dt,
 
     u . (a_i - a_j) >= -rate h - B s / sqrt(2 B (L - D)) - (|v|^2 - s^2) / L.
 
+Beside an obstacle that moves, a second row steers: what would pass too near passes at the distance to keep.
+
 The accelerations change by the least of 1/2 sum m_i |da_i|^2 (Gauss) so that these rows hold and edges keep the
 accelerations that the law gave them, softly: with A = J M^-1 J^T of edges E and barriers B,
 
@@ -23,25 +25,26 @@ makes the problem solvable where barriers contradict each other. Edges let go wh
 import math
 
 from rigidfleet.kernel.avoidance import BARRIER, EXACT, KNOWN
-from rigidfleet.kernel.compiler.jit import compiled
+from rigidfleet.kernel.avoidance import needed_rate as _needed_rate
+from rigidfleet.kernel.compiler.jit import compiled, inlined
 from rigidfleet.kernel.linalg import cholesky, cholesky_solve
 from rigidfleet.kernel.moving import braking_beside
-from rigidfleet.kernel.segments import from_solid
+from rigidfleet.kernel.segments import from_obstacle, from_solid
 
-#: Greatest number of sweeps, change of an acceleration that ends them [m/s^2], distance that counts as none [m].
-_SWEEPS, _CLOSE, _NEAREST = 100, 1e-7, 1e-6
+#: Greatest number of sweeps, change of an acceleration that ends them [m/s^2].
+_SWEEPS, _CLOSE = 10, 1e-5
+#: Number of sweeps over barriers that push between those over all, and the factor of over-relaxation.
+_INNER, _BEYOND = 15, 1.5
 #: Share of its braking by which barriers push a vehicle whose edges let go completely.
 _FULL = 0.5
+#: Time for which vehicles look ahead to where obstacles that move pass them [s].
+_AHEAD = 3.0
+#: Square of the cosine between their way and a direction that still counts as beside it.
+_ACROSS = 0.25
 #: Least share to which an edge holds in the equations.
 _LOOSE = 1e-3
 
-
-@compiled
-def needed_rate(gap, s, across, B, rate):
-    """Least second derivative of the distance by a barrier; ``across`` is the part of it that motion gives."""
-    safe = max(gap, _NEAREST)
-    root = math.sqrt(2.0 * B * safe)
-    return -rate * (root + s) - B * s / root - across
+needed_rate = inlined(_needed_rate)
 
 
 @compiled
@@ -65,20 +68,65 @@ def loosen(p, w, state, a):
 
 
 @compiled
-def add_row(count, i, j, n0, n1, n2, needed, most, a):
-    """Add a barrier; returns the number of them."""
+def add_row(count, i, j, entry, n, missing, limit, a):
+    """Add a barrier along n (3,), with its entry of ``last``; returns the number of them.
+
+    It changes the acceleration along n by twice ``limit`` at most.
+    """
     if count < a.rows.shape[0]:
-        a.rows[count, 0], a.rows[count, 1] = i, j
-        a.normals[count, 0], a.normals[count, 1], a.normals[count, 2] = n0, n1, n2
-        a.needed[count], a.push[count], a.most[count] = needed, 0.0, most
+        a.rows[count, 0], a.rows[count, 1], a.rows[count, 2] = i, j, entry
+        for q in range(3):
+            a.normals[count, q] = n[q]
+        reduced = 1.0 / (a.inverse[i] + (a.inverse[j] if j >= 0 else 0.0))
+        a.missing[count], a.most[count] = missing, 2.0 * limit * reduced
+        a.push[count], a.reduced[count] = min(a.last[entry], a.most[count]), reduced
         count += 1
     return count
 
 
 @compiled
+def add_obstacle(count, i, entry, needed, a):
+    """Add a barrier of vehicle i along ``normal``, if it may act; the number of them, and whether this is violated."""
+    n, c = a.normal, a.wanted[i]
+    missing = needed - (n[0] * c[0] + n[1] * c[1] + n[2] * c[2])
+    if missing > -a.b[i]:
+        count = add_row(count, i, -1, entry, n, missing, a.b[i], a)
+    return count, missing > 0.0
+
+
+@compiled
+def needed_beside(i, o, r, v, a):
+    """Least acceleration of vehicle i with which obstacle o, which moves, passes it; ``normal`` is its direction.
+
+    Both go on straight to where they are nearest, in the time t, with a part of the distance to keep missing. An
+    acceleration of 2 / t^2 times that part along the normal there, held until then, makes up for it. Without it, a
+    vehicle would be driven along by an obstacle that comes straight at it, until others are in its way. A wide
+    obstacle, which is left in or against the direction of the way, asks for nothing: braking has to do.
+    """
+    x, p, q, bound = a.sight.track[o], a.shifted[0], a.shifted[2], a.sight.bound[o]
+    for k in range(3):
+        p[k] = r[k] - x[k]
+        q[k] = p[k] + _AHEAD * (v[k] - x[3 + k])
+    keep = a.reach[i] + a.spare[i] + bound[0]
+    most = keep + _AHEAD * bound[1]
+    if from_obstacle(p, q, o, a.solids, most, a.normal)[1] >= most:  # quick
+        return -math.inf
+    _, away, share = from_obstacle(p, q, o, a.solids, math.nan, a.normal)
+    t = _AHEAD * share
+    missing = keep + t * bound[1] - away
+    along = fast = 0.0
+    for k in range(3):
+        along += a.normal[k] * (q[k] - p[k])
+        fast += (q[k] - p[k]) ** 2
+    if missing <= 0.0 or along * along > _ACROSS * fast:
+        return -math.inf
+    return 2.0 * missing / max(t - a.lag[i], a.period) ** 2
+
+
+@compiled
 def list_barriers(r, v, lost, a):
     """Write the barriers that may act at this tick; returns their number, and whether one of them is violated."""
-    count, violated = 0, False
+    count, violated, n, walls = 0, False, a.normal, a.near.shape[0]
     for i in range(a.b.shape[0]):
         if lost[i]:
             continue
@@ -89,43 +137,42 @@ def list_barriers(r, v, lost, a):
                 continue
             x, y, z = r[i, 0] - r[j, 0], r[i, 1] - r[j, 1], r[i, 2] - r[j, 2]
             L = math.sqrt(x * x + y * y + z * z)
-            x, y, z = x / L, y / L, z / L
+            inverse = 1.0 / L
+            n[0], n[1], n[2] = inverse * x, inverse * y, inverse * z
             X, Y, Z = v[i, 0] - v[j, 0], v[i, 1] - v[j, 1], v[i, 2] - v[j, 2]
-            s, d = x * X + y * Y + z * Z, a.wanted[j]
+            s, d = n[0] * X + n[1] * Y + n[2] * Z, a.wanted[j]
             both = a.b[i] + a.b[j]
             gap = L - a.room[i] - a.room[j] - a.spare[i] - a.spare[j]
             gap -= max(0.0, -s) * max(a.lag[i], a.lag[j])
-            across = (X * X + Y * Y + Z * Z - s * s) / L
+            across = (X * X + Y * Y + Z * Z - s * s) * inverse
             needed = needed_rate(gap, s, across, a.share * both, a.rate)
-            have = x * (c[0] - d[0]) + y * (c[1] - d[1]) + z * (c[2] - d[2])
+            have = n[0] * (c[0] - d[0]) + n[1] * (c[1] - d[1]) + n[2] * (c[2] - d[2])
             if needed > have - both:
                 violated = violated or needed > have
-                most = 2.0 * both / (1.0 / a.weight[i] + 1.0 / a.weight[j])
-                count = add_row(count, i, j, x, y, z, needed, most, a)
-        normal = a.normal
+                count = add_row(count, i, j, e, n, needed - have, both, a)
         for o in range(a.solids.kind.shape[0]):
             B = a.b[i]
             if a.sight.moves[o] == 0:
-                away = from_solid(r[i, 0], r[i, 1], r[i, 2], o, a.solids, normal)
+                away = from_solid(r[i, 0], r[i, 1], r[i, 2], o, a.solids, n)
                 gap = away - a.reach[i] - a.spare[i]
-                s = normal[0] * v[i, 0] + normal[1] * v[i, 1] + normal[2] * v[i, 2]
+                s = n[0] * v[i, 0] + n[1] * v[i, 1] + n[2] * v[i, 2]
             elif a.sight.known[o] == KNOWN:
                 x, bound, B = a.sight.track[o], a.sight.bound[o], braking_beside(i, o, a)
-                away = from_solid(
-                    r[i, 0] - x[0], r[i, 1] - x[1], r[i, 2] - x[2], o, a.solids, normal
-                )
+                away = from_solid(r[i, 0] - x[0], r[i, 1] - x[1], r[i, 2] - x[2], o, a.solids, n)
                 gap = away - a.reach[i] - a.spare[i] - bound[0]
-                s = normal[0] * (v[i, 0] - x[3]) + normal[1] * (v[i, 1] - x[4])
-                s += normal[2] * (v[i, 2] - x[5]) - bound[1]
+                s = n[0] * (v[i, 0] - x[3]) + n[1] * (v[i, 1] - x[4]) + n[2] * (v[i, 2] - x[5])
+                s -= bound[1]
             else:
                 continue
             gap -= max(0.0, -s) * a.lag[i]
             needed = needed_rate(gap, s, 0.0, a.share * B, a.rate)
-            have = normal[0] * c[0] + normal[1] * c[1] + normal[2] * c[2]
-            if needed > have - a.b[i]:
-                violated = violated or needed > have
-                most = 2.0 * a.b[i] * a.weight[i]
-                count = add_row(count, i, -1, normal[0], normal[1], normal[2], needed, most, a)
+            entry = walls + 2 * (i * a.solids.kind.shape[0] + o)
+            count, worse = add_obstacle(count, i, entry, needed, a)
+            violated = violated or worse
+            if a.sight.moves[o] != 0:
+                needed = needed_beside(i, o, r[i], v[i], a)
+                count, worse = add_obstacle(count, i, entry + 1, needed, a)
+                violated = violated or worse
     return count, violated
 
 
@@ -142,9 +189,9 @@ def relative(i, j, n, x):
 def shove(i, j, n, force, a):
     """Add the accelerations of a force [N] along a unit vector n (3,) on i, and against it on j if j is not -1."""
     for q in range(3):
-        a.shift[i, q] += force / a.weight[i] * n[q]
+        a.shift[i, q] += force * a.inverse[i] * n[q]
         if j >= 0:
-            a.shift[j, q] -= force / a.weight[j] * n[q]
+            a.shift[j, q] -= force * a.inverse[j] * n[q]
 
 
 @compiled
@@ -156,28 +203,56 @@ def softness(e, p, a):
 
 
 @compiled
-def sweep(count, p, w, a):
-    """One sweep of projected Gauss-Seidel over barriers and edges; returns the greatest change [m/s^2]."""
+def relax(k, a):
+    """Let barrier k push as it must with the present accelerations; returns the change that it makes [m/s^2]."""
+    i, j, n = a.rows[k, 0], a.rows[k, 1], a.normals[k]
+    rest = a.missing[k] - relative(i, j, n, a.shift)
+    push = min(max(a.push[k] + _BEYOND * rest * a.reduced[k], 0.0), a.most[k])
+    more = push - a.push[k]
+    if more == 0.0:
+        return 0.0
+    shove(i, j, n, more, a)
+    a.push[k] = push
+    return abs(more) * (a.inverse[i] + (a.inverse[j] if j >= 0 else 0.0))
+
+
+@compiled
+def relax_edges(p, w, a):
+    """The same for all edges."""
     change = 0.0
-    for k in range(count):
-        i, j, n = a.rows[k, 0], a.rows[k, 1], a.normals[k]
-        diagonal = 1.0 / a.weight[i] + (1.0 / a.weight[j] if j >= 0 else 0.0)
-        rest = a.needed[k] - relative(i, j, n, a.wanted) - relative(i, j, n, a.shift)
-        push = min(max(a.push[k] + rest / diagonal, 0.0), a.most[k])
-        if push != a.push[k]:
-            change = max(change, abs(push - a.push[k]) * diagonal)
-            shove(i, j, n, push - a.push[k], a)
-            a.push[k] = push
     for e in range(p.graph.edges.shape[0]):
         i, j, n = p.graph.edges[e, 0], p.graph.edges[e, 1], w.u[e]
-        soft = softness(e, p, a)
-        diagonal = p.graph.diagonal[e]
-        pull = -(relative(i, j, n, a.shift) + soft * a.pull[e]) / (diagonal + soft)
-        if pull != 0.0:
-            change = max(change, abs(pull) * diagonal)
-            shove(i, j, n, pull, a)
-            a.pull[e] += pull
+        along = relative(i, j, n, a.shift)
+        if along == 0.0 and a.pull[e] == 0.0:
+            continue
+        soft, diagonal = softness(e, p, a), p.graph.diagonal[e]
+        pull = -_BEYOND * (along + soft * a.pull[e]) / (diagonal + soft)
+        change = max(change, abs(pull) * diagonal)
+        shove(i, j, n, pull, a)
+        a.pull[e] += pull
     return change
+
+
+@compiled
+def sweep(count, p, w, a):
+    """Projected Gauss-Seidel: a sweep over all barriers and edges, then some over those that push alone.
+
+    Returns the greatest change of the first one [m/s^2].
+    """
+    first, pushing = 0.0, 0
+    for k in range(count):
+        first = max(first, relax(k, a))
+        if a.push[k] > 0.0:
+            a.pushing[pushing] = k
+            pushing += 1
+    first = max(first, relax_edges(p, w, a))
+    for _ in range(_INNER if first >= _CLOSE else 0):
+        change = 0.0
+        for k in range(pushing):
+            change = max(change, relax(a.pushing[k], a))
+        if max(change, relax_edges(p, w, a)) < _CLOSE:
+            break
+    return first
 
 
 @compiled
@@ -230,7 +305,7 @@ def finish(count, p, w, a):
         # What is left by the pushes found and by those at their bounds
         a.right[x] = -relative(i, j, n, a.shift)
         if barrier:
-            a.right[x] += a.needed[k] - relative(i, j, n, a.wanted)
+            a.right[x] += a.missing[k]
         else:
             a.right[x] -= softness(k, p, a) * a.pull[k]
     if not cholesky(a.system[:whole, :whole]):
@@ -253,17 +328,21 @@ def finish(count, p, w, a):
 
 @compiled
 def solve_barriers(count, p, w, a):
-    """Pushes of barriers, pulls of edges, and the changes of accelerations that they make (``shift``)."""
+    """Pushes of barriers, pulls of edges, and the changes of accelerations that they make (``shift``).
+
+    It begins with the pushes of the tick before.
+    """
     for i in range(a.b.shape[0]):
         for q in range(3):
             a.shift[i, q] = 0.0
     for e in range(a.pull.shape[0]):
         a.pull[e] = 0.0
+    for k in range(count):
+        if a.push[k] > 0.0:
+            shove(a.rows[k, 0], a.rows[k, 1], a.normals[k], a.push[k], a)
     for _ in range(3):
-        change = _CLOSE
         for _ in range(_SWEEPS):
-            change = sweep(count, p, w, a)
-            if change < _CLOSE:
+            if sweep(count, p, w, a) < _CLOSE:
                 return
         finish(count, p, w, a)  # a sweep after it tells whether that was all
 
@@ -288,7 +367,10 @@ def filter_accelerations(t, r, v, lost, p, w, a):
     for i in range(n):
         for q in range(3):
             a.known[2, i, q] = 0.0
+    for k in range(a.last.shape[0]):
+        a.last[k] = 0.0
     for k in range(count if violated else 0):
+        a.last[a.rows[k, 2]] = a.push[k]
         for side in range(2):
             i = a.rows[k, side]
             if i >= 0 and a.push[k] > 0.0:

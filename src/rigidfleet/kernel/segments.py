@@ -63,8 +63,8 @@ def from_obstacle(p, q, o, solids, enough, normal):
     """Distance of the segment from p to q (3,) from obstacle o: a lower bound, and a place near the nearest point.
 
     The distance to a convex obstacle is convex along the segment, so that it lies above its tangents. The bound is
-    exact, to rounding, unless it is certain to be at least, or below, ``enough``. Returns the bound, the distance at a
-    share of the segment, and this share, for which ``normal`` (3,) is that of a supporting plane.
+    exact, to rounding, unless it is certain to be at least, or below, ``enough`` (NaN: always). Returns the bound, the
+    distance at a share of the segment, and this share, for which ``normal`` (3,) is that of a supporting plane.
     """
     high, falls = slope(p, q, 1.0, o, solids, normal)
     if falls <= 0.0:

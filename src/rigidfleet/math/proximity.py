@@ -259,10 +259,6 @@ class Closeness(NamedTuple):
     agent: Ints  # (K,)
     obstacle: Ints  # (K,)
 
-    def copied(self) -> Closeness:
-        """The same in arrays of its own."""
-        return self._replace(**{name: x.copy() for name, x in self._asdict().items()})
-
 
 #: The last arguments of `closeness`, and what was found; greatest size of a flight that is kept [bytes].
 _last: list[tuple[Sequence[Obstacle], list[Floats | Bools], Closeness]] = []
@@ -280,7 +276,7 @@ def closeness(
     given = [r, radius, time, left]
     for things, before, found in _last[-1:]:
         if things is obstacles and all(map(_same, given, before)):
-            return found.copied()
+            return Closeness._make(x.copy() for x in found)
     each, nearest = obstacle_clearances(r, radius, obstacles, time)
     if not left.all():
         each[~left] = np.inf
@@ -288,7 +284,8 @@ def closeness(
         *separation_of_left(r, radius, left), each, nearest, *least_clearance(each, nearest)
     )
     if r.nbytes <= _KEPT:
-        _last[:] = [(obstacles, [x.copy() for x in given], found.copied())]
+        copies = Closeness._make(x.copy() for x in found)
+        _last[:] = [(obstacles, [x.copy() for x in given], copies)]
     return found
 
 
@@ -328,7 +325,21 @@ def obstacle_clearances(
 def distances(
     x: Floats, y: Floats, z: Floats, solid: Solids, time: ArrayLike = 0.0, most: ArrayLike = np.inf
 ) -> Floats:
-    """Signed distance (...) [m] of points to a solid at ``time``; points farther than ``most`` may have infinity."""
+    """Signed distance (...) [m] of points to a solid at ``time``, infinite while it is not there.
+
+    Points farther than ``most`` may have infinity, too.
+    """
+    found = _while_there(x, y, z, solid, time, most)
+    if not np.isfinite(solid.there).any():
+        return found
+    there = distance.is_there(np.asarray(time, dtype=float).T, 0, solid)
+    return np.where(there, found, np.inf)
+
+
+def _while_there(
+    x: Floats, y: Floats, z: Floats, solid: Solids, time: ArrayLike, most: ArrayLike
+) -> Floats:
+    """Signed distance (...) [m] of points to a solid where it is, or would be, at ``time``."""
     if solid.moves:
         shift = distance.displacement(np.asarray(time, dtype=float).T, 0, solid)
         x, y, z = x - shift[0], y - shift[1], z - shift[2]

@@ -127,6 +127,9 @@ class ActivePhase:
         settle = self.plan.phase.settle
         return None if settle is None else self.t - self.quiet_since >= settle.dwell - 1e-9
 
+    #: Time by which the events of the phase come later than planned [s].
+    delay = 0.0
+
     # -- flying -----------------------------------------------------------------------------------
 
     def fly_to(self, t_end: float, controller: Controller | None, rate: float) -> None:

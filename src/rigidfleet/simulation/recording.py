@@ -47,6 +47,14 @@ class VehicleSamples(NamedTuple):
     saturated: Bools  # (K, N)
 
 
+class LayerSamples(NamedTuple):
+    """Samples of what the layers of avoidance in flight do."""
+
+    rate: Floats  # (K,) of the virtual clock
+    displacement: Floats  # (K, 3) of the body from its path [m]
+    layers: Ints  # (K, N) that change what a vehicle is asked for
+
+
 @dataclass
 class Piece:
     """Samples of a phase, or of part of one, as the kernel returns them."""
@@ -60,6 +68,7 @@ class Piece:
     attached: bool  # whether the slots carry the body frame
     led: Led  # what the slots follow, if they are tracked
     vehicles: VehicleSamples | None = None
+    layers: LayerSamples | None = None
 
 
 def assemble(
@@ -157,6 +166,9 @@ def assemble(
         vehicle_rates=None if flown is None else flown.rates,
         rotor_force=None if flown is None else flown.rotor_force,
         saturated=None if flown is None else flown.saturated.astype(np.int64),
+        clock_rate=_of_layers(pieces, "rate"),
+        body_displacement=_of_layers(pieces, "displacement"),
+        avoidance_layers=_of_layers(pieces, "layers"),
         phases=list(phases),
         mission_text=mission.text,
         complete=not ending,
@@ -226,6 +238,12 @@ def _of_vehicles(pieces: Sequence[Piece]) -> VehicleSamples | None:
             [att.unwrap_quaternion(q) for q in joined.attitude.swapaxes(0, 1)], axis=1
         )
     )
+
+
+def _of_layers(pieces: Sequence[Piece], name: str) -> Any:
+    """Samples of the layers of avoidance of all pieces; None without avoidance."""
+    parts = [getattr(piece.layers, name) for piece in pieces if piece.layers is not None]
+    return _joined(parts) if parts else None
 
 
 def _put_extremes(phases: Sequence[PhaseRecord], time: Floats, close: proximity.Closeness) -> None:
