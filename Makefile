@@ -43,6 +43,7 @@ exports: .venv/.interchange  ## Measure every export of three flights
 avoidance: .venv/.bench .venv/.crowds  ## Plan transitions and published problems, with proofs
 	@$(BIN)/python benchmarks/avoidance.py
 	@$(BIN)/python benchmarks/moving.py
+	@$(BIN)/python benchmarks/order.py
 	@$(BIN)/python benchmarks/gaps.py
 	@$(BIN)/python benchmarks/crowds.py
 	@$(BIN)/python benchmarks/reciprocal.py

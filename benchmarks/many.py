@@ -156,8 +156,9 @@ def mission(kind: str, n: int) -> Mission:
     p = lattice(n) if named is None else shapes.slots(named, SPACING, n)
     off = (0.1 if kind.endswith(_FAR) else 0.02) * SPACING
     r = p + off * np.random.default_rng(0).uniform(-1, 1, p.shape)
-    digits = 2 if n >= MILLION[1] else 15  # the text of a mission has at most 64 MiB
-    slots = p.astype(int) if n >= MILLION[1] else p
+    # The text of a mission has at most 64 MiB and 10,000,000 numbers: a million start from their slots, at rest.
+    few = n >= MILLION[1]
+    slots = p.astype(int) if few else p
     form: dict[str, Any] = {"slots": slots.tolist(), "edges": graph.partition(" ")[0]}
     if graph == "triangulated":
         form["edges"] = triangulated(p)
@@ -167,7 +168,7 @@ def mission(kind: str, n: int) -> Mission:
     data: dict[str, Any] = {
         "schema_version": 1,
         "name": shape,
-        "agents": {"mass": 1.0, "position": np.round(r, digits).tolist()},
+        "agents": {"mass": 1.0, "position": (slots if few else r).tolist()},
         "formulation": "body" if kind.endswith(_BODY) else "inertial",
         "constraint": {"solver": "exact" if exact else "iterated"},
         "formations": {"f": form},
@@ -186,8 +187,8 @@ def mission(kind: str, n: int) -> Mission:
             },
         ]
         return Mission.from_dict(data)
-    v = np.cross([0.0, 0.0, RATE], r - r.mean(axis=0))
-    data["agents"]["velocity"] = np.round(v, digits).tolist()
+    if not few:
+        data["agents"]["velocity"] = np.cross([0.0, 0.0, RATE], r - r.mean(axis=0)).tolist()
     data["phases"] = [
         {"kind": "establish", "formation": "f", "control": "open", "reference": "step", "duration": 6.0},
         {"kind": "hold", "control": "open", "input_force": [0.1, 0.1, 0.0], "duration": DURATION - 6.0},

@@ -78,7 +78,8 @@ def _missions(data: Data) -> str:
     )
     table = _table(("", "ours [ms]", "simulated s in a second", "goal"), [row])
     judged = [
-        f"{other['name']}: {_time(other['ours'])} ms (goal: {1e3 * other['theirs'][0]:,.0f} ms)."
+        f"{other['name'].strip()}: {_time(other['ours'])} ms"
+        + (f" (goal: {1e3 * other['theirs'][0]:,.0f} ms)." if other["goal"] else ".")
         for other in others
     ]
     return "\n\n".join([table, *judged])

@@ -301,6 +301,25 @@ def test_a_mission_flies_bent_ways_with_a_certificate():
     np.testing.assert_array_equal(again.position, result.position)
 
 
+@pytest.mark.parametrize("yaw", [0.0, 90.0])
+def test_bent_ways_keep_to_the_ground_and_the_geofence(yaw):
+    """Close to the ground and below a ceiling, with the fence's sides if the body's axes are along it."""
+    data = _swap()
+    fence = {"min": [-5.0, -2.4, 0.0], "max": [5.0, 2.4, 1.4]}
+    data["limits"]["geofence"] = fence
+    data["obstacles"] = [{"kind": "ground"}]
+    data["agents"]["position"] = RING + [0, 0, 0.4]
+    data["phases"].insert(1, {"kind": "turn", "yaw_deg": yaw, "duration": 6.0})
+    result = rf.simulate(rf.Mission.from_dict(data))
+    assert rf.assess(result).passed
+    flown = result.position[result.phase == 2]
+    rest = 2.0 * (0.2 + 0.2 + 0.1)  # what ways without these would take below and above their slots
+    assert flown[..., 2].max() > 0.45  # they do leave the plane
+    assert flown[..., 2].min() >= 0.1
+    assert 0.4 - rest < 0.1
+    assert np.abs(flown[..., 1]).max() <= 2.3 + 1e-6
+
+
 def test_quadrotors_fly_bent_ways():
     """With rotors and lag, within the allowance of the certificate."""
     data = _swap()

@@ -5,10 +5,12 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from rigidfleet import simulate
+from rigidfleet import assess, simulate
+from rigidfleet._common.kept import kept
 from rigidfleet.kernel import records
 from rigidfleet.kernel.engine import native, packing
 from rigidfleet.kernel.problem import workspace
+from rigidfleet.math import proximity
 from rigidfleet.mission import Mission, load_mission
 from rigidfleet.result import VARIABLES, Result
 from rigidfleet.simulation.flight import Flight
@@ -131,3 +133,80 @@ def test_singular_values_come_when_they_are_asked_for(tmp_path):
     expected = np.linalg.svd(J.reshape(len(J), -1), compute_uv=False)[-1]
     assert loaded.singular_value[k] == pytest.approx(expected, rel=1e-9)
     np.testing.assert_array_equal(result.singular_value, loaded.singular_value)
+
+
+# -- results kept by contents
+
+
+def test_what_is_kept_depends_on_the_contents_alone():
+    """Equal numbers find what is kept; other numbers, signs of zero, types and layouts do not."""
+    calls = []
+
+    @kept
+    def function(x, factor):
+        calls.append(factor)
+        return x * factor, x.strides
+
+    x = np.arange(6.0).reshape(2, 3)
+    first = function(x, 2.0)
+    assert function(x.copy(), 2.0) is first
+    x[0, 0] = 1.0
+    assert function(x, 2.0)[0][0, 0] == 2.0
+    assert function(x, 0.0)[0][0, 0] == 0.0
+    assert np.signbit(function(x, -0.0)[0]).all()
+    assert function(np.asfortranarray(x), 2.0)[1] != function(x, 2.0)[1]
+    assert function(x.astype(np.int64), 2)[0].dtype == np.int64
+    assert len(calls) == 6
+    with pytest.raises(ValueError, match="read-only"):
+        first[0][0, 0] = 5.0
+
+
+def test_few_results_and_none_for_large_arrays_are_kept():
+    """Memory stays bounded: the oldest results go first, and large arrays are not kept."""
+    calls = []
+
+    @kept
+    def function(x):
+        calls.append(x)
+        return 1
+
+    for _ in range(2):
+        function(np.zeros(10_000))
+    assert len(calls) == 2
+    for k in range(1000):
+        function(k)
+    function(999)
+    assert len(calls) == 1002
+    function(0)
+    assert len(calls) == 1003
+
+
+def test_the_verdict_finds_what_was_altered_after_the_flight():
+    """Distances are taken over from the flight only for the same numbers: an altered position is judged anew."""
+    result = simulate(a_mission())
+    assert not [c for c in assess(result).checks if c.check == "record"]
+    before = result.position.copy()
+    result.position[50, 0] += 0.5
+    wrong = [c for c in assess(result).checks if c.check == "record"]
+    assert "contradicts itself" in wrong[0].message
+    result.position[:] = before
+    assert not [c for c in assess(result).checks if c.check == "record"]
+
+
+def test_distances_taken_over_are_those_computed():
+    """The same numbers give the same distances, which nobody else can change."""
+    result = simulate(load_mission("narrow-passage"))
+    given = (
+        result.position,
+        result.mission.agents.radius,
+        result.mission.obstacles,
+        result.time,
+        result.left,
+    )
+    first = proximity.closeness(*given)
+    first.each[:] = 0.0
+    again = proximity.closeness(*given)
+    alone = proximity.obstacle_clearances(given[0], given[1], given[2], given[3])
+    np.testing.assert_array_equal(again.each, alone[0])
+    np.testing.assert_array_equal(again.nearest, alone[1])
+    np.testing.assert_array_equal(again.separation, proximity.separation(given[0], given[1])[0])

@@ -159,7 +159,9 @@ class PhaseRecord:
         speed [m/s]; acceleration [m/s^2]; thrust, thrust_margin (thrust minus its limit), constraint_force, tension
         [N]; constraint [m]; of vehicles also rotor_force [N] (of the rotor nearest to its limit), tilt [rad],
         tracking_error [m] and saturation (share of the phase). With [avoidance] also barrier and guard (greatest share
-        of the phase in which they acted on a vehicle, and since when), guarantee and clearance_guarantee (least margin
+        of the phase in which they acted on a vehicle, and since when), clock (by how much the phase ended later because
+        the formation waited [s], and since when) and body (share of the phase in which the formation deviated from its
+        path as a body), guarantee and clearance_guarantee (least margin
         of stop segments [m]) and, where it was negative, the first such: guarantee_lost, clearance_guarantee_lost. If
         vehicles stand on obstacles, clearance is also given for those that have stood on one since the start
         (clearance_start), for those in flight (clearance_flight), and for those that stand on one until the end
@@ -364,6 +366,27 @@ class Result:
             "1 if a vehicle cannot give what is asked of it, else 0; missing without vehicles",
         ),
     ] = None
+    clock_rate: Annotated[
+        Floats | None,
+        _v("time", "1", "rate of the virtual clock; missing without [avoidance]"),
+    ] = None
+    body_displacement: Annotated[
+        Floats | None,
+        _v(
+            "time axis",
+            "m",
+            "displacement of the reference from the planned path, by the body layer; missing without [avoidance]",
+        ),
+    ] = None
+    avoidance_layers: Annotated[
+        Ints | None,
+        _v(
+            "time agent",
+            "1",
+            "sum of the layers that change what an agent is asked for: 1 barriers, 2 guard, 4 guard by braking; "
+            "missing without [avoidance]",
+        ),
+    ] = None
     slot_velocity: Annotated[
         Floats | None, _v("time agent axis", "m s-1", "desired velocity, world axes")
     ] = None
@@ -436,7 +459,8 @@ class Result:
             if alone or x.who not in range(n):
                 raise ValueError(f"extreme {name} must name different agents from 0 to {n - 1}")
         for name in _QUATERNIONS:
-            if given[name] is not None and not getattr(self, name).any(axis=-1).all():
+            q = given[name]  # most have a scalar part, which is found in a fifth of the time
+            if q is not None and not q[..., 0].all() and not q.any(axis=-1).all():
                 raise ValueError(f"{name} has a quaternion of norm zero")
         if (self.edges[:, 0] == self.edges[:, 1]).any():
             raise ValueError("an edge joins an agent to itself")

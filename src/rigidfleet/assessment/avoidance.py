@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import numpy as np
+
 from rigidfleet._common.text import agent_names
 from rigidfleet.assessment.measure import Measurements
 from rigidfleet.assessment.outcome import CheckResult, value
-from rigidfleet.result import Extremum
+from rigidfleet.result import Extremum, Result
 
 #: The two margins: between vehicles, and between vehicles and obstacles.
 _MARGINS = ("guarantee", "clearance_guarantee")
+#: Rate below which the clock counts as slowed: it comes back to 1 by an exponential.
+_SLOWED = 0.99
 
 
 def guarantee_checks(measured: Measurements) -> Iterator[CheckResult]:
@@ -57,6 +61,7 @@ def avoidance_notes(measured: Measurements) -> Iterator[str]:
             if doubt
             else "the guarantee of [avoidance] is proved: at every tick, all vehicles could brake in time"
         )
+    yield from _first_layers(result)
     for name, words in (("barrier", "barriers changed"), ("guard", "the guard replaced")):
         every = [p.extremes[name] for p in result.phases if name in p.extremes]
         if every:
@@ -66,6 +71,34 @@ def avoidance_notes(measured: Measurements) -> Iterator[str]:
                 f"{words} what vehicles were asked for, first at {first:.2f} s, most of agent {most.who + 1}: at"
                 f" {100 * most.value:.2g} % of the ticks of a phase"
             )
+
+
+def _first_layers(result: Result) -> Iterator[str]:
+    """What the virtual clock and the body layer did, and the share of time by layer."""
+    waited = [p for p in result.phases if "clock" in p.extremes]
+    if waited:
+        longest = max(waited, key=lambda p: p.extremes["clock"].value)
+        x = longest.extremes["clock"]
+        yield (
+            f"the formation waited on its path from {x.time:.2f} s on: phase '{longest.name}' ends"
+            f" {value(x.value, 's')} later than planned"
+        )
+    rate, way, acts = result.clock_rate, result.body_displacement, result.avoidance_layers
+    if rate is None or way is None or acts is None or len(result.time) < 2:
+        return
+    step = np.gradient(result.time)
+    step /= step.sum()
+    shares = {
+        "the clock slowed": rate < _SLOWED,
+        "the body deviated": way.any(axis=1),
+        "barriers acted": (acts & 1 != 0).any(axis=1),
+        "the guard acted": (acts & 2 != 0).any(axis=1),
+    }
+    told = [f"{words} {100 * float(step @ on):.2g} %" for words, on in shares.items() if on.any()]
+    if told:
+        far = float(np.linalg.norm(way, axis=1).max())
+        aside = f"; the body was up to {value(far, 'm')} beside its path" if far > 0.0 else ""
+        yield f"of the samples, by time: {', '.join(told)}{aside}"
 
 
 def _lost(measured: Measurements) -> tuple[str, Extremum, str] | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
+from operator import itemgetter
 
 import numpy as np
 
@@ -235,21 +236,29 @@ def _at_end(
 
 
 def _waypoints(phases: list[PhaseVerdict]) -> Iterator[CheckResult]:
+    """Every waypoint that is missed, in each quantity, or the one met least well."""
+    points = [
+        (p, what, at)
+        for p in phases
+        for what, at in (
+            *((f"point {k} on the way", at) for k, at in enumerate(p.through, start=1)),
+            ("the waypoint", p.waypoint),
+        )
+        if at is not None
+    ]
     for name, limit in WAYPOINT_TOLERANCE.items():
         unit = {"position": "m", "velocity": "m/s", "attitude": "deg", "rates": "deg/s"}[name]
-        for p in phases:
-            met = [] if p.waypoint is None else [("the waypoint", p.waypoint)]
-            points = [(f"point {k} on the way", at) for k, at in enumerate(p.through, start=1)]
-            for what, at in [*points, *met]:
-                miss = getattr(at, name)
-                if miss is None:
-                    continue
-                passed = miss <= limit
-                words = f"{'met' if passed else 'missed'}, {value(miss, unit)} off in {name}"
-                words = f"{what} of phase '{p.name}' is {words} (limit {limit:g} {unit})"
-                yield CheckResult(
-                    f"waypoint_{name}", passed, words, miss, limit, unit, when=at.time, phase=p.name
-                )
+        found = [
+            (miss, *point) for point in points if (miss := getattr(point[2], name)) is not None
+        ]
+        missed = [one for one in found if not one[0] <= limit]
+        for miss, p, what, at in missed or ([max(found, key=itemgetter(0))] if found else []):
+            passed = miss <= limit
+            words = f"{'met' if passed else 'missed'}, {value(miss, unit)} off in {name}"
+            words = f"{what} of phase '{p.name}' is {words} (limit {limit:g} {unit})"
+            yield CheckResult(
+                f"waypoint_{name}", passed, words, miss, limit, unit, when=at.time, phase=p.name
+            )
 
 
 def _touch_downs(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[CheckResult]:
@@ -261,7 +270,7 @@ def _touch_downs(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator
             continue
         k = measured.samples[i].stop - 1
         down = -measured.result.velocity[k, :, 2]
-        who = np.flatnonzero(measured.left[k] & (measured.each_clearance[k] <= PAD))
+        who = np.flatnonzero(measured.left[k] & (measured.close.each[k] <= PAD))
         if not len(who):
             yield _at_end(p, "touch_down", False, "no vehicle is on the ground")
             continue
@@ -353,7 +362,7 @@ def _separation(measured: Measurements, e: Extreme) -> CheckResult:
     words = f"{e.who} come within {value(e.value, 'm')} of each other at {e.when:.2f} s"
     words += f" (limit {limit:g} m)"
     if e.value <= 0:
-        since = _since(measured, "separation", measured.close[0])
+        since = _since(measured, "separation", measured.close.separation)
         depth = f"by {value(abs(e.value), 'm')} at {e.when:.2f} s"
         words = f"agents collide, first {since}; {e.who} overlap the most, {depth}"
     return _bounded("separation", e, "m", limit, words, passed=passed, at_least=True)
@@ -399,7 +408,7 @@ def _clearances(measured: Measurements) -> Iterator[CheckResult]:
         agent, obstacle = e.who.split(", ", 1)
         words = f"{agent} comes within {value(e.value, 'm')} of '{obstacle}' at {e.when:.2f} s"
         if hit or e.value <= 0:
-            since = _since(measured, "clearance", measured.close[2])
+            since = _since(measured, "clearance", measured.close.clearance)
             depth = f"by {value(abs(e.value), 'm')} at {e.when:.2f} s"
             words = (
                 f"agents hit obstacles, first {since}; {agent} is deepest in '{obstacle}', {depth}"

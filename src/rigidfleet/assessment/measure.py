@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections.abc import Callable, Iterator
 from functools import cached_property, lru_cache
 from itertools import pairwise
@@ -40,6 +41,9 @@ _SLACK = {"separation": 0.0, "clearance": 0.0, "speed": 1e-9}
 #: Greatest size of slots, in bytes, whose shape is cached for the next phase or flight.
 _KEPT = 100_000
 
+#: Number of agents up to which all distances of a shape are computed at once.
+_FEW = 16
+
 #: About so many curves are compared together.
 _TOGETHER = 100_000
 
@@ -55,15 +59,21 @@ class Laid(NamedTuple):
     off: Floats  # (..., N) distance of each agent from its slot, mirrored if that fits better
     mirrored: Bools  # (...) whether mirrored slots fit better
     turn: Floats  # (..., 3, 3) the best-fitting rotation, without a reflection
+    size: Floats  # (...) the greatest coordinate of the slots, about their centre
+    lengths: Floats  # (2, ..., N, N) distances of agents, and of slots, if they are few; else (2, ..., 0, 0)
 
     @classmethod
     def of(cls, p: Floats, slots: Floats) -> Laid:
         """Fit slots (..., N, 3) to agents p (..., N, 3)."""
+        few = np.stack([p, slots])[..., : p.shape[-2] if p.shape[-2] <= _FEW else 0, :]
+        lengths = _length(few[..., :, None, :] - few[..., None, :, :])
         p, slots = p - p.mean(axis=-2, keepdims=True), slots - slots.mean(axis=-2, keepdims=True)
         across = p.swapaxes(-1, -2) @ slots
         U, _, Vt = np.linalg.svd(slots.swapaxes(-1, -2) @ p)
         off = np.linalg.norm(p - slots @ (U @ Vt), axis=-1)
-        return cls(p, slots, off, np.linalg.det(across) < 0, rigid_body.kabsch(p, slots))
+        size = np.abs(slots).max(axis=(-2, -1))
+        turn = rigid_body.kabsch(p, slots)
+        return cls(p, slots, off, np.linalg.det(across) < 0, turn, size, lengths)
 
 
 class Fit:
@@ -132,17 +142,13 @@ class Measurements:
         #: Phases that have samples.
         self.flown = [k for k, s in enumerate(self.samples) if s.stop > s.start]
         self._formations: dict[str, tuple[Floats | None, Ints, Floats]] = {}
-        radius, obstacles = self.mission.agents.radius, self.mission.obstacles
-        #: Clearance of each agent to obstacles [m], and the nearest obstacle (K, N).
-        self.each_clearance, self.nearest = proximity.obstacle_clearances(
-            result.position, radius, obstacles, result.time
-        )
-        if not self.whole:
-            self.each_clearance[~self.left] = np.inf
-        #: Separation, pair, clearance, agent and obstacle at samples (K, ...).
-        self.close = (
-            *proximity.separation_of_left(result.position, radius, self.left),
-            *proximity.least_clearance(self.each_clearance, self.nearest),
+        #: Distances to each other and to obstacles at samples.
+        self.close = proximity.closeness(
+            result.position,
+            self.mission.agents.radius,
+            self.mission.obstacles,
+            result.time,
+            self.left,
         )
         thrust = _length(result.input_force + result.constraint_force)
         if self.mission.agents.saturate:
@@ -154,8 +160,8 @@ class Measurements:
             name: Quantity(values, who, SENSE[name])
             for name, values, who in (
                 ("constraint", np.abs(result.constraint), self.edge),
-                ("separation", self.close[0], self.pair),
-                ("clearance", self.close[2], self.obstacle),
+                ("separation", self.close.separation, self.pair),
+                ("clearance", self.close.clearance, self.obstacle),
                 ("thrust", self.thrust, self.agent),
                 ("speed", self.of_left(_length(result.velocity)), self.agent),
                 ("acceleration", self.of_left(_length(result.acceleration)), self.agent),
@@ -186,11 +192,11 @@ class Measurements:
 
     def pair(self, k: int) -> str:
         """The two agents that are nearest to each other at sample k."""
-        return agent_names(np.sort(self.close[1][k]))
+        return agent_names(np.sort(self.close.pair[k]))
 
     def obstacle(self, k: int) -> str:
         """Names of the agent nearest to an obstacle at sample k, and of that obstacle."""
-        return self.beside(int(self.close[3][k]), int(self.close[4][k]))
+        return self.beside(int(self.close.agent[k]), int(self.close.obstacle[k]))
 
     def beside(self, agent: int, obstacle: int) -> str:
         """Names of an agent and an obstacle, both counted from 0."""
@@ -329,7 +335,7 @@ class Measurements:
         A vehicle stands on an obstacle while it has been within `PAD` of it since the start, or stays so to the end.
         """
         time = self.result.time
-        clearance, nearest = self.of_left(self.each_clearance), self.nearest
+        clearance, nearest = self.of_left(self.close.each), self.close.nearest
         told = {name for p in self.result.phases for name in p.extremes}
         stands = (~(clearance[0] > PAD)).any() or (self.left[-1] & ~(clearance[-1] > PAD)).any()
         if not (stands or told & {"clearance_start", "clearance_end"}):
@@ -382,8 +388,8 @@ class Measurements:
         rounding = 1e-9 * (1.0 + float(np.nanmax(np.abs(result.position), initial=0.0)))
         with np.errstate(invalid="ignore"):  # infinity where there is nothing to be near
             stored = {
-                "separation": (result.separation - self.close[0], "m"),
-                "clearance": (result.clearance - self.close[2], "m"),
+                "separation": (result.separation - self.close.separation, "m"),
+                "clearance": (result.clearance - self.close.clearance, "m"),
                 "distance": (np.abs(result.distance - length), "m"),
                 "thrust": (self.thrust - result.thrust, "N"),
             }
@@ -493,7 +499,8 @@ class Measurements:
             laid = Laid.of(
                 np.stack([p for _, p, _, _ in group]), np.stack([s for *_, s, _ in group])
             )
-            for (index, p, slots, left), one in zip(group, zip(*laid, strict=True), strict=True):
+            each = zip(*laid._replace(lengths=laid.lengths.swapaxes(0, 1)), strict=True)
+            for (index, p, slots, left), one in zip(group, each, strict=True):
                 fits[index] = Fit(p, slots, left, Laid(*one))
         return fits
 
@@ -591,21 +598,27 @@ def _all_pairs(p: Floats, slots: Floats, laid: Laid) -> tuple[float, tuple[int, 
     Few pairs have to be computed: the error of a pair is at most the sum of both agents' distances from their slots,
     for any fit of the slots, mirrored or not. Improvements below rounding are ignored.
     """
-    off, both = laid.off, np.stack([p, slots])
-    order = np.argsort(-off, kind="stable")
-    ranked, rounding = -off[order], 1e-12 * float(np.abs(laid.slots).max())
+    off, both = laid.off.tolist(), np.array([p, slots])
+    order = sorted(range(len(off)), key=lambda i: -off[i])
+    ranked, rounding, few = (
+        [-off[i] for i in order],
+        1e-12 * float(laid.size),
+        laid.lengths.tolist(),
+    )
     worst = (-1.0, (0, 0), 0.0, 0.0)
     for k, i in enumerate(order[:-1]):
-        last = int(np.searchsorted(ranked, off[i] - worst[0] - rounding))
+        last = bisect_left(ranked, off[i] - worst[0] - rounding)
         if last <= k + 1:
             break
-        others = np.sort(order[k + 1 : last])
-        flown, intended = _length(both[:, others] - both[:, i, None])
-        error = np.abs(flown - intended)
-        j = int(error.argmax())
-        if error[j] > worst[0]:
-            pair = (int(min(i, others[j])), int(max(i, others[j])))
-            worst = (float(error[j]), pair, float(flown[j]), float(intended[j]))
+        others = sorted(order[k + 1 : last])
+        if not few[0]:
+            flown, intended = _length(both[:, others] - both[:, i, None]).tolist()
+        else:
+            flown, intended = ([lengths[i][j] for j in others] for lengths in few)
+        error = [abs(a - b) for a, b in zip(flown, intended, strict=True)]
+        if (most := max(error)) > worst[0]:
+            j = error.index(most)
+            worst = (most, (min(i, others[j]), max(i, others[j])), flown[j], intended[j])
     return worst
 
 

@@ -18,6 +18,8 @@ from rigidfleet.typing import Floats, Ints
 TICKS, LISTED, FULL = range(3)
 #: Columns of `Avoidance.acted` and `Avoidance.first`: the barrier, the guard, the guard by braking.
 BARRIER, GUARD, BRAKE = range(3)
+#: Bits of `SampledState.layers`, of the same three.
+ACTS = (1, 2, 4)
 #: Rows of `Avoidance.margin`: between two vehicles, between a vehicle and an obstacle.
 PAIR, OBSTACLE = range(2)
 #: What is known of an obstacle that moves: nothing, its place, or its velocity, too; see `Sight.known`.
@@ -28,6 +30,8 @@ _DRAWS = 65_521
 _NEIGHBOURS, _FEW = 256, 400
 #: Greatest number of barriers between vehicles at a tick, per vehicle; more are left to the guard.
 _BARRIERS = 32
+#: Distance that counts as none [m].
+_NEAREST = 1e-6
 #: Greatest number of rows of an exact solution of the barriers.
 EXACT = 64
 
@@ -57,7 +61,7 @@ def sight(
 ) -> Sight:
     """What is known of obstacles before the flight: nothing of those that move; see `Sight`."""
     count = len(solids.kind)
-    moves = solids.last[:count, 3] > solids.first[:count, 3]
+    moves = solids.last[:count, 3] > solids.first[:count, 3]  # also what appears or vanishes
     drawn = np.random.default_rng(seed).standard_normal(_DRAWS) if noise else np.zeros(1)
     centre, radius = np.zeros((count, 3)), np.zeros(count)
     for o in range(count):
@@ -183,7 +187,6 @@ def avoidance(
     solids = joined([]) if solids is None else solids
     n, count = len(b), len(solids.kind)
     capacity = n * (n - 1) if n <= _FEW else _NEIGHBOURS * n
-    rows = min(capacity // 2, _BARRIERS * n) + 2 * n * count
     radius = np.asarray(radius, dtype=float)
     return Avoidance(
         law=np.zeros(2, dtype=np.int64), guarded=guarded, filtered=filtered, period=float(period), rate=float(rate),
@@ -196,14 +199,11 @@ def avoidance(
         order=np.arange(n), listed=np.full((n, 3), np.inf), span=np.zeros(3),
         known=np.zeros((3, n, 3)), wanted=np.zeros((n, 3)), shift=np.zeros((n, 3)),
         chosen=np.zeros((n, 3)), rise=np.zeros((n, 3)), ways=np.zeros((n, 4, 3)),
-        far=np.zeros(n), walls=np.zeros((n, count)), threat=np.full(n, -1),
+        far=np.zeros(n), threat=np.full(n, -1),
         late=np.zeros(n), shifted=np.zeros((4, 3)), trial=np.zeros((5, 3)), normal=np.zeros(3),
-        rows=np.zeros((rows, 3), dtype=np.int64), normals=np.zeros((rows, 3)), missing=np.zeros(rows),
-        reduced=np.zeros(rows), push=np.zeros(rows), most=np.zeros(rows),
-        last=np.zeros(capacity + 2 * n * count), pushing=np.zeros(rows, dtype=np.int64),
         hold=np.ones(n), pull=np.zeros(edges),
         system=np.zeros((EXACT, EXACT)), right=np.zeros(EXACT), active=np.zeros(EXACT, dtype=np.int64),
-        count=np.zeros(3, dtype=np.int64), **_record(n),
+        count=np.zeros(3, dtype=np.int64), **_by_obstacle(n, count), **_record(n),
     )  # fmt: skip
 
 
@@ -211,6 +211,26 @@ def renewed(given: Avoidance) -> Avoidance:
     """The same avoidance in the next phase, which has a record of its own."""
     given.count[TICKS] = 0
     return given._replace(**_record(len(given.b)))
+
+
+def among(given: Avoidance, solids: Solids) -> Avoidance:
+    """The same avoidance among other obstacles; the first of them are those before, and what is known of them stays."""
+    before, seen = given.sight, sight(solids, given.sight.reach, 0.0, given.sight.swerve)
+    seen = seen._replace(noise=before.noise, normals=before.normals)
+    for mine, old in zip(seen[-4:], before[-4:], strict=True):  # what is known
+        mine[: len(old)] = old
+    return given._replace(solids=solids, sight=seen, **_by_obstacle(len(given.b), len(solids.kind)))
+
+
+def _by_obstacle(n: int, count: int) -> dict[str, Any]:
+    """Arrays whose size depends on the number of obstacles."""
+    capacity = n * (n - 1) if n <= _FEW else _NEIGHBOURS * n
+    rows = min(capacity // 2, _BARRIERS * n) + 2 * n * count
+    return {
+        "walls": np.zeros((n, count)), "rows": np.zeros((rows, 3), dtype=np.int64), "normals": np.zeros((rows, 3)),
+        "missing": np.zeros(rows), "reduced": np.zeros(rows), "push": np.zeros(rows), "most": np.zeros(rows),
+        "last": np.zeros(capacity + 2 * n * count), "pushing": np.zeros(rows, dtype=np.int64),
+    }  # fmt: skip
 
 
 def holding(given: Avoidance, edges: int) -> Avoidance:
@@ -226,6 +246,16 @@ def _record(n: int) -> dict[str, Any]:
         "acted": np.zeros((3, n), dtype=np.int64), "first": np.full((3, n), np.inf), "margin": endless,
         "between": none, "lost": endless.copy(), "loser": none.copy(),
     }  # fmt: skip
+
+
+def needed_rate(gap, s, across, B, rate):
+    """Least second derivative of a distance by a barrier, see `barriers`; ``across``: the part that motion gives.
+
+    For numbers and arrays: the gap to what is to be kept [m], its rate s, and the braking B to reckon with.
+    """
+    safe = np.maximum(gap, _NEAREST)
+    root = np.sqrt(2.0 * B * safe)
+    return -rate * (root + s) - B * s / root - across
 
 
 def _each(x: ArrayLike, n: int) -> Floats:

@@ -25,13 +25,14 @@ makes the problem solvable where barriers contradict each other. Edges let go wh
 import math
 
 from rigidfleet.kernel.avoidance import BARRIER, EXACT, KNOWN
-from rigidfleet.kernel.compiler.jit import compiled
+from rigidfleet.kernel.avoidance import needed_rate as _needed_rate
+from rigidfleet.kernel.compiler.jit import compiled, inlined
 from rigidfleet.kernel.linalg import cholesky, cholesky_solve
 from rigidfleet.kernel.moving import braking_beside
 from rigidfleet.kernel.segments import from_obstacle, from_solid
 
-#: Greatest number of sweeps, change of an acceleration that ends them [m/s^2], distance that counts as none [m].
-_SWEEPS, _CLOSE, _NEAREST = 10, 1e-5, 1e-6
+#: Greatest number of sweeps, change of an acceleration that ends them [m/s^2].
+_SWEEPS, _CLOSE = 10, 1e-5
 #: Number of sweeps over barriers that push between those over all, and the factor of over-relaxation.
 _INNER, _BEYOND = 15, 1.5
 #: Share of its braking by which barriers push a vehicle whose edges let go completely.
@@ -43,13 +44,7 @@ _ACROSS = 0.25
 #: Least share to which an edge holds in the equations.
 _LOOSE = 1e-3
 
-
-@compiled
-def needed_rate(gap, s, across, B, rate):
-    """Least second derivative of the distance by a barrier; ``across`` is the part of it that motion gives."""
-    safe = max(gap, _NEAREST)
-    root = math.sqrt(2.0 * B * safe)
-    return -rate * (root + s) - B * s / root - across
+needed_rate = inlined(_needed_rate)
 
 
 @compiled

@@ -246,6 +246,7 @@ class SampledState(NamedTuple):
     push: Floats  # (N, 3) a user's external force [N]
     command: Floats  # (N, 4) rotor speeds [rad/s]; force of a point (3) [N], 0
     saturated: Bools  # (N,) at the last tick
+    layers: Ints  # (N,) of avoidance that have acted at the last tick; see `avoidance.ACTS`
     seen: Floats  # (N, 6) measured r, v
     history: Floats  # (D, N, 6) true r, v of the last ticks
     sent: Floats  # (D, N, 6) measured ones
@@ -291,6 +292,7 @@ class SampledSegment(NamedTuple):
     seen: Floats  # (K, N, 6)
     air: Floats  # (K, N, 3) velocity of the air [m/s]
     saturated: Bools  # (K, N)
+    layers: Ints  # (K, N)
     integral: Floats  # (K, m) of the constraints, of the first vehicle's view if linked
     frame: Floats  # (K, 4)
 
@@ -436,7 +438,8 @@ def begin(
         S=S.copy(), clock=np.array([given.start, given.start]), count=np.zeros(5, dtype=np.int64),
         integral=np.zeros((n if sensing.linked else 1, m)), frame=attitude, error=np.zeros((n, 3)),
         f_u=np.zeros((n, 3)), f_C=np.zeros((n, 3)), force=np.zeros((n, 3)), push=np.zeros((n, 3)),
-        command=np.zeros((n, 4)), saturated=np.zeros(n, dtype=np.bool_), seen=known, history=past, sent=past.copy(),
+        command=np.zeros((n, 4)), saturated=np.zeros(n, dtype=np.bool_),
+        layers=np.zeros(n, dtype=np.int64), seen=known, history=past, sent=past.copy(),
         heard=np.tile(known, (n if sensing.linked else 0, 1, 1)), peak=peak, peak_time=times[:, :4].copy(),
         worst=worst, worst_time=times, saturations=np.zeros(n, dtype=np.int64), trail=trail,
         work=_work(n, m),
@@ -483,5 +486,5 @@ def segment(
     return SampledSegment(
         t_end, max_steps, 0, 0, 0, 0, 0, at, np.empty((k, n, STATES)), np.empty((k, n, STATES)), np.empty((k, n, 4)),
         np.empty((k, n, 3)), np.empty((k, n, 3)), np.empty((k, n, 6)), np.empty((k, n, 3)),
-        np.empty((k, n), dtype=np.bool_), np.empty((k, m)), np.empty((k, 4)),
+        np.empty((k, n), dtype=np.bool_), np.empty((k, n), dtype=np.int64), np.empty((k, m)), np.empty((k, 4)),
     )  # fmt: skip

@@ -15,7 +15,17 @@ is one of the candidates. This is braking to rest for no other, so that the proo
 
 import math
 
-from rigidfleet.kernel.avoidance import BRAKE, FULL, GUARD, LISTED, OBSTACLE, PAIR, TICKS
+from rigidfleet.kernel.avoidance import (
+    ACTS,
+    BARRIER,
+    BRAKE,
+    FULL,
+    GUARD,
+    LISTED,
+    OBSTACLE,
+    PAIR,
+    TICKS,
+)
 from rigidfleet.kernel.barriers import filter_accelerations, limit, loosen
 from rigidfleet.kernel.compiler.jit import compiled
 from rigidfleet.kernel.fleet import TICKS as FLIGHT_TICKS
@@ -468,6 +478,7 @@ def avoid(p, w, flight, state, a):
             r[i, q] = state.seen[i, q] + path_at(k, i, q, flight.tables)
             v[i, q] = state.seen[i, 3 + q] + path_at(k, i, 3 + q, flight.tables)
         want(i, state, a)
+        state.layers[i] = 0
     look(t, r, lost, a)
     led = False
     if a.flow:
@@ -483,6 +494,9 @@ def avoid(p, w, flight, state, a):
     changed = a.filtered and filter_accelerations(t, r, v, lost, p, w, a)
     for k in range(n):
         i = (k + a.count[TICKS]) % n  # each comes first in turn
+        push = a.known[2, i]
+        if changed and push[0] * push[0] + push[1] * push[1] + push[2] * push[2] > 0.0:
+            state.layers[i] = ACTS[BARRIER]
         if lost[i]:
             continue
         free = alone(i, a) or not a.guarded
@@ -492,8 +506,10 @@ def avoid(p, w, flight, state, a):
                 a.chosen[i, q] = a.wanted[i, q]
         if how > 0:
             tally(GUARD, i, t, a)
+            state.layers[i] |= ACTS[GUARD]
         if how > 1:
             tally(BRAKE, i, t, a)
+            state.layers[i] |= ACTS[BRAKE]
         if how > 0 or changed or led:
             command(i, state, a)
     return 1

@@ -332,6 +332,7 @@ def write_samples(t, h, flight, state, call):
                     count[TICKS] - 1, i, q, flight.tables
                 )
             call.saturated[c, i] = state.saturated[i]
+            call.layers[c, i] = state.layers[i]
         write_derivatives(c, t + x, flight, state, call)
         for k in range(state.integral.shape[1]):
             call.integral[c, k] = state.integral[0, k]

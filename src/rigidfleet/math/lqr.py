@@ -19,6 +19,7 @@ x v and v^2/2, so N has the same effect as Q22 - 2 n1, S12 + n1 and S22 + n2.
 """
 
 import math
+from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -28,6 +29,8 @@ from rigidfleet.typing import Bools, Floats
 
 # Cache key of an array: its shape and contents.
 Key = tuple[tuple[int, ...], bytes]
+# States (K, n, n) and inputs (K, m, n) of a regulated system, from each state alone.
+Response = tuple[Floats, Floats]
 
 # Number of cached results that depend on weights and times alone: they are the same in every run of a
 # sweep, and often from phase to phase.
@@ -173,11 +176,40 @@ def finite_horizon_trajectory(
     the regulator follows this moving target, not a fixed point.
     """
     t = _times("times", times)
-    x0, v0, x1, v1 = np.broadcast_arrays(*(np.asarray(z, dtype=float) for z in (*start, *target)))
-    e0 = np.stack([x0 - (x1 - T * v1), v0 - v1])
-    e, a = closed_loop_response(_A, _B, Q, R, S, T, e0, t)
-    since = (t - T).reshape(-1, *[1] * x0.ndim)
-    return x1 + since * v1 + e[:, 0], v1 + e[:, 1], a[:, 0]
+    return led(double_integrator_response(t, T, Q, R, S), t, start, target, T)
+
+
+def double_integrator_response(
+    times: Floats, T: float, Q: ArrayLike, R: ArrayLike, S: ArrayLike | None
+) -> Response:
+    """How a regulated double integrator responds at times (K,) [s] in [0, T]; S = None means an infinite horizon.
+
+    States (K, 2, 2) and inputs (K, 1, 2) from an error in position, and in velocity, of 1; see `led`.
+    """
+    if S is None:
+        # With the cost of an infinite horizon as final weight, the Riccati equation is stationary.
+        S = _cost_at_rest(_key(Q), _key(R))
+    return _responses(*map(_key, (_A, _B, Q, R, np.zeros(_B.shape), S, T, times)))
+
+
+def led(
+    response: Response,
+    times: Floats,
+    start: Sequence[ArrayLike] | Floats,
+    target: Sequence[ArrayLike] | Floats,
+    T: float,
+) -> tuple[Floats, Floats, Floats]:
+    """The trajectory of `finite_horizon_trajectory`, from the response at its times (K,) [s]."""
+    states, inputs = response
+    given = [np.asarray(z, dtype=float) for z in (*start, *target)]
+    alike = all(z.shape == given[0].shape for z in given)
+    x0, v0, x1, v1 = given if alike else np.broadcast_arrays(*given)
+    e0 = np.array([x0 - (x1 - T * v1), v0 - v1])
+    rows, shape = e0.reshape(2, -1), x0.shape
+    e = (states.reshape(-1, 2) @ rows).reshape(-1, 2, *shape)
+    a = (inputs.reshape(-1, 2) @ rows).reshape(-1, *shape)
+    since = (times - T).reshape(-1, *[1] * x0.ndim)
+    return x1 + since * v1 + e[:, 0], v1 + e[:, 1], a
 
 
 def infinite_horizon_trajectory(
@@ -192,8 +224,8 @@ def infinite_horizon_trajectory(
 
     The target position is that at t = T; for a target at rest, T is only the end of ``times``.
     """
-    # With the cost of an infinite horizon as final weight, the Riccati equation is stationary.
-    return finite_horizon_trajectory(times, start, target, T, Q, R, _cost_at_rest(_key(Q), _key(R)))
+    t = _times("times", times)
+    return led(double_integrator_response(t, T, Q, R, None), t, start, target, T)
 
 
 def knots(
@@ -254,14 +286,14 @@ def quintic_pieces(times: ArrayLike, x: ArrayLike, v: ArrayLike, a: ArrayLike) -
     """
     t = np.asarray(times, dtype=float)
     x, v, a = (np.asarray(z, dtype=float) for z in (x, v, a))
-    if t.ndim != 1 or len(t) < 2 or not np.all(np.diff(t) > 0):
+    if t.ndim != 1 or len(t) < 2 or not ((h := t[1:] - t[:-1]) > 0).all():
         raise ValueError("times must be at least two increasing times [s]")
     if not x.shape == v.shape == a.shape or x.shape[:1] != t.shape:
         raise ValueError(
             f"x, v and a must have one row for each of the {len(t)} times and the same shape,"
             f" not {x.shape}, {v.shape} and {a.shape}"
         )
-    return _quintics(np.diff(t), (x[:-1], x[1:]), (v[:-1], v[1:]), (a[:-1], a[1:]))
+    return _quintics(h, (x[:-1], x[1:]), (v[:-1], v[1:]), (a[:-1], a[1:]))
 
 
 def _quintics(h: Floats, x: ArrayLike, v: ArrayLike, a: ArrayLike) -> Floats:

@@ -248,6 +248,54 @@ def separation_of_left(r: Floats, radius: ArrayLike, left: Bools) -> tuple[Float
     return least, pair
 
 
+class Closeness(NamedTuple):
+    """How near agents come to each other and to obstacles, at K samples; infinity and -1 where there is nothing."""
+
+    separation: Floats  # (K,) least distance between two agents' surfaces [m]
+    pair: Ints  # (K, 2) these agents
+    each: Floats  # (K, N) least distance of each agent's surface to an obstacle [m]
+    nearest: Ints  # (K, N) this obstacle
+    clearance: Floats  # (K,) the least of `each`
+    agent: Ints  # (K,)
+    obstacle: Ints  # (K,)
+
+
+#: The last arguments of `closeness`, and what was found; greatest size of a flight that is kept [bytes].
+_last: list[tuple[Sequence[Obstacle], list[Floats | Bools], Closeness]] = []
+_KEPT = 4_000_000
+
+
+def closeness(
+    r: Floats, radius: ArrayLike, obstacles: Sequence[Obstacle], time: Floats, left: Bools
+) -> Closeness:
+    """Distances of the agents ``left`` (K, N) at r (K, N, 3), with radius (N,), to each other and to obstacles.
+
+    The verdict asks for what the flight has asked for: the last answer is kept, and given to the same numbers alone.
+    """
+    radius = np.asarray(radius, dtype=float)
+    given = [r, radius, time, left]
+    for things, before, found in _last[-1:]:
+        if things is obstacles and all(map(_same, given, before)):
+            return Closeness._make(x.copy() for x in found)
+    each, nearest = obstacle_clearances(r, radius, obstacles, time)
+    if not left.all():
+        each[~left] = np.inf
+    found = Closeness(
+        *separation_of_left(r, radius, left), each, nearest, *least_clearance(each, nearest)
+    )
+    if r.nbytes <= _KEPT:
+        copies = Closeness._make(x.copy() for x in found)
+        _last[:] = [(obstacles, [x.copy() for x in given], copies)]
+    return found
+
+
+def _same(a: Floats | Bools, b: Floats | Bools) -> bool:
+    """Whether two arrays have the same bits; NaN equals NaN."""
+    if a.shape != b.shape or a.dtype != b.dtype or not a.flags.c_contiguous:
+        return False
+    return bool((a.reshape(-1).view(np.uint8) == b.reshape(-1).view(np.uint8)).all())
+
+
 def obstacle_clearances(
     r: Floats,
     radius: ArrayLike,
@@ -277,7 +325,21 @@ def obstacle_clearances(
 def distances(
     x: Floats, y: Floats, z: Floats, solid: Solids, time: ArrayLike = 0.0, most: ArrayLike = np.inf
 ) -> Floats:
-    """Signed distance (...) [m] of points to a solid at ``time``; points farther than ``most`` may have infinity."""
+    """Signed distance (...) [m] of points to a solid at ``time``, infinite while it is not there.
+
+    Points farther than ``most`` may have infinity, too.
+    """
+    found = _while_there(x, y, z, solid, time, most)
+    if not np.isfinite(solid.there).any():
+        return found
+    there = distance.is_there(np.asarray(time, dtype=float).T, 0, solid)
+    return np.where(there, found, np.inf)
+
+
+def _while_there(
+    x: Floats, y: Floats, z: Floats, solid: Solids, time: ArrayLike, most: ArrayLike
+) -> Floats:
+    """Signed distance (...) [m] of points to a solid where it is, or would be, at ``time``."""
     if solid.moves:
         shift = distance.displacement(np.asarray(time, dtype=float).T, 0, solid)
         x, y, z = x - shift[0], y - shift[1], z - shift[2]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rigidfleet.math import attitude as att
 from rigidfleet.typing import Floats
 
 
@@ -99,7 +100,7 @@ def mean_axis_rates(x: Floats, y: Floats, masses: Floats) -> Floats:
     x, y (K, N, 3): positions and velocities about the CM [m, m/s]; masses (N,) or (K, N).
     """
     masses = np.broadcast_to(masses, x.shape[:2])
-    h = np.einsum("ki,kia->ka", masses, np.cross(x, y))
+    h = np.einsum("ki,kia->ka", masses, att.cross(x, y))
     C = np.einsum("ki,kia,kib->kab", masses, x, x)
     inertia = np.trace(C, axis1=1, axis2=2)[:, None, None] * np.eye(3) - C
     # Far from a line, the inverse equals the pseudo-inverse and takes a third of the time.
@@ -108,9 +109,9 @@ def mean_axis_rates(x: Floats, y: Floats, masses: Floats) -> Floats:
         round_ = np.linalg.det(inertia) > 1e-4 * size**3
     omega = np.empty((len(x), 3))
     omega[round_] = np.linalg.solve(inertia[round_], h[round_, :, None])[:, :, 0]
-    rest = ~round_
-    pseudo = np.linalg.pinv(inertia[rest], 1e-9, hermitian=True)
-    omega[rest] = np.einsum("kab,kb->ka", pseudo, h[rest])
+    if not round_.all():
+        pseudo = np.linalg.pinv(inertia[~round_], 1e-9, hermitian=True)
+        omega[~round_] = np.einsum("kab,kb->ka", pseudo, h[~round_])
     # A single point has no rates; rounding would give some.
     return np.where(np.count_nonzero(masses, axis=1)[:, None] > 1, omega, 0.0)
 

@@ -135,7 +135,7 @@ class AnyPhase(Part):
     @property
     def automatic(self) -> list[str]:
         """Keys whose times follow from the limits (`rigidfleet.planning.timing`)."""
-        return [key for key in TIMES if getattr(self, key, None) == AUTO]
+        return [key for key in TIMES if self.__dict__.get(key) == AUTO]
 
     @property
     def least_time(self) -> float:

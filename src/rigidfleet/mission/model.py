@@ -13,6 +13,7 @@ import numpy as np
 from pydantic import PrivateAttr
 
 from rigidfleet._common.arguments import as_path
+from rigidfleet._common.kept import kept
 from rigidfleet._common.text import agent_names
 from rigidfleet._common.toml import to_toml
 from rigidfleet.errors import Finding, MissionError, wrong_type
@@ -57,6 +58,15 @@ class Fleet(NamedTuple):
     thrust_limit: Floats
 
 
+class _Made(NamedTuple):
+    """What is computed once of each formation, by its name."""
+
+    slots: dict[str, Floats | None]  # in their own order
+    ordered: dict[str, Floats | None]  # in the order of the agents
+    edges: dict[str, Ints]
+    distances: dict[str, Floats]
+
+
 class Mission(Contents):
     """A checked mission. Create one by `load_mission`, `Mission.from_toml` or `Mission.from_dict`.
 
@@ -67,8 +77,6 @@ class Mission(Contents):
 
     _text: str = PrivateAttr("")
     _origin: str = PrivateAttr("")
-    _made_slots: dict[str, Floats | None] = PrivateAttr(default_factory=dict)
-    _made_edges: dict[str, Ints] = PrivateAttr(default_factory=dict)
 
     def __init__(self, *_: object, **__: object) -> None:
         """Refuse: keys alone would not be checked as a whole.
@@ -93,7 +101,22 @@ class Mission(Contents):
         """
         if not isinstance(text, str):
             raise wrong_type("the text of a mission file", text)
-        parts = check(parse_toml(text, origin), origin)
+        return cls._checked(parse_toml(text, origin), text, origin)
+
+    @classmethod
+    def from_plain(cls, data: dict[str, Any], origin: str) -> Self:
+        """Check a mission given as the plain data of its TOML text, as `to_dict` returns it.
+
+        Raises
+        ------
+        MissionError
+            With a finding for each error.
+        """
+        return cls._checked(data, to_toml(data), origin)
+
+    @classmethod
+    def _checked(cls, data: dict[str, Any], text: str, origin: str) -> Self:
+        parts = check(data, origin)
         if parts["assignment"] == "each":
             parts["formations"], parts["phases"] = told_apart(parts["formations"], parts["phases"])
         n = len(parts["agents"].position)
@@ -316,28 +339,38 @@ class Mission(Contents):
             return False
         return taken.attitude == "free" or not self.formations[taken.formation].knows_slots
 
+    @cached_property
+    def _made(self) -> _Made:
+        return _Made({}, {}, {}, {})
+
     def _slots(self, name: str) -> Floats | None:
         """Slots (N, 3) [m] of a formation in their own order; computed once."""
-        if name not in self._made_slots:
-            self._made_slots[name] = self.formations[name].slot_array(self.n_agents)
-        return self._made_slots[name]
+        made = self._made.slots
+        if name not in made:
+            made[name] = self.formations[name].slot_array(self.n_agents)
+        return made[name]
 
     def formation_edges(self, name: str) -> Ints:
         """Edges (m, 2) of a formation, agents from 0, i < j."""
-        if name not in self._made_edges:
+        made = self._made.edges
+        if name not in made:
             edges = self.formations[name].edge_array(self.n_agents)
             if self.assignment != "given":
                 edges = np.sort(np.argsort(self.assigned_slots[name])[edges], axis=1)
-            self._made_edges[name] = edges
-        return self._made_edges[name]
+            made[name] = edges
+        return made[name]
 
     def formation_slots(self, name: str) -> Floats | None:
         """Slots (N, 3) [m] of a formation about their geometric centre, in the order of the agents.
 
         Without slots, they are derived from the distances; None if the distances are not complete.
         """
-        slots = self._slots(name)
-        return slots if slots is None else slots[self.assigned_slots[name]]
+        made = self._made.ordered
+        if name not in made:
+            slots = self._slots(name)
+            made[name] = None if slots is None else slots[self.assigned_slots[name]]
+        ordered = made[name]
+        return None if ordered is None else ordered.copy()
 
     def formation_colours(self, name: str) -> tuple[str, ...] | None:
         """Light "#rrggbb" of each agent in a formation; None if the formation has none of its own."""
@@ -350,12 +383,17 @@ class Mission(Contents):
 
     def formation_distances(self, name: str) -> Floats:
         """Length (m,) [m] of each edge of a formation."""
-        given = self.formations[name].distances
-        if given is not None:
-            return np.array(given, dtype=np.float64)
-        slots = self.formation_slots(name)
-        assert slots is not None  # checked: without distances there is a shape or slots
-        return distances(slots, self.formation_edges(name))
+        made = self._made.distances
+        if name not in made:
+            given = self.formations[name].distances
+            if given is not None:
+                lengths = np.array(given, dtype=np.float64)
+            else:
+                slots = self.formation_slots(name)
+                assert slots is not None  # checked: without distances there is a shape or slots
+                lengths = distances(slots, self.formation_edges(name))
+            made[name] = lengths
+        return made[name].copy()
 
     def damping(self, name: str | None, lost: Bools | None = None) -> float:
         """Damping mu [-] of the iterated solver while a formation is held, or during a change if ``name`` is None.
@@ -369,14 +407,15 @@ class Mission(Contents):
         slots = self.formation_slots(name) if name else None
         if name is None or slots is None:
             return _DAMPING[1]
-        left = np.ones(self.n_agents, dtype=np.bool_) if lost is None else ~lost
         edges = self.formation_edges(name)
+        if lost is None and len(edges) > 0 and min(len(edges), 3 * self.n_agents) <= _DENSE:
+            return _damping(slots, edges, self.fleet.mass)
+        left = np.ones(self.n_agents, dtype=np.bool_) if lost is None else ~lost
         edges = (np.cumsum(left) - 1)[edges[left[edges].all(axis=1)]]
         if not len(edges) or min(len(edges), 3 * int(left.sum())) > _DENSE:
             return _DAMPING[1]
         masses = self.fleet.mass[left]
-        index = constraint_jacobian.smallest_singular_value(slots[left][None], edges, masses)[0]
-        return float(np.clip(index**2 / 4, *_DAMPING))
+        return _damping(slots[left], edges, masses)
 
     @property
     def latest_end(self) -> float:
@@ -467,6 +506,13 @@ class Mission(Contents):
     def on_loss(self) -> Literal["continue", "hold", "land"]:
         """What the others do when a vehicle or link is lost."""
         return "continue" if self.disturbances is None else self.disturbances.on_loss
+
+
+@kept
+def _damping(slots: Floats, edges: Ints, masses: Floats) -> float:
+    """Damping "auto" of a formation held: slots (N, 3) [m], edges (m, 2) and masses (N,) [kg]."""
+    index = constraint_jacobian.smallest_singular_value(slots[None], edges, masses)[0]
+    return float(np.clip(index**2 / 4, *_DAMPING))
 
 
 def mission_names() -> list[str]:

@@ -198,6 +198,18 @@ class Avoidance(Part):
         description="true: barriers change accelerations early and as little as possible, and edges of a formation let "
         "go near them",
     )
+    clock: Flag = Field(
+        True,
+        description="true: a formation waits on its path while an obstacle that moves passes",
+    )
+    patience: Annotated[float, Strict(), Field(ge=0, le=3600)] = Field(
+        30.0, description="time by which a phase may end later because its formation waits [s]"
+    )
+    body: Flag = Field(
+        True,
+        description="true: a formation is steered round obstacles that move as one body, before single agents give "
+        "way",
+    )
     separation: LengthOrZero | None = Field(
         None, description="separation of agents to keep [m]; default: that of [limits], or 0"
     )

@@ -13,10 +13,11 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from rigidfleet._common.kept import kept
 from rigidfleet.kernel.problem import NO_KNOTS, NO_WAYS, Motion, septic_polynomial
 from rigidfleet.math import attitude as att
 from rigidfleet.math import lqr, series, splines
-from rigidfleet.mission import Fly, Mission, Phase, Regulator
+from rigidfleet.mission import Fly, Mission, Phase
 from rigidfleet.mission.kinds import (
     Brake,
     Follow,
@@ -312,6 +313,12 @@ _COURSES: dict[str, Callable[[Mission, Any, PhaseState, float], Course]] = {
 }
 
 
+#: A regulator's horizon, Q, R and S; those of the CM and of the attitude; Q and R of the tracking gains.
+_Law = tuple[str, Any, float, Any]
+#: Position, velocity, attitude (3, 3) and body rates.
+_End = tuple[Floats, Floats, Floats, Floats]
+
+
 @dataclass
 class RegulatedFlight:
     """LQR of the virtual body from one pose to another, and the tracking gains from arrival to the phase's end.
@@ -321,64 +328,80 @@ class RegulatedFlight:
     input phi'', which is exact for a rotation about one axis.
     """
 
-    regulators: tuple[Regulator, Regulator]
+    regulators: tuple[_Law, _Law]
     tracking: tuple[Any, float]  # Q, R
-    begin: tuple[tuple[Floats, Floats], tuple[Floats, Floats]]  # (r, v), (phi, phi_dot)
-    end: tuple[tuple[Floats, Floats], tuple[Floats, Floats]]
-    T1: Floats
+    start: _End
+    goal: _End
     t0: float  # [s]
     arrival: float  # [s]
     t_end: float  # [s]
 
     def motion(self) -> Motion:
         """Quintics between knots that are dense enough for the regulators."""
-        T, rest = self.arrival - self.t0, self.t_end - self.arrival
-        times = np.unique(np.concatenate([_knots(law, T) for law in self.regulators]))
-        after = lqr.knots(rest, *self.tracking) if rest > 0.0 else np.zeros(1)
-        pieces = []
-        for k in range(2):
-            x = self._under_way(k, times)
-            piece = lqr.quintic_pieces(times, *x)
-            if rest > 0.0:
-                x = self._after(k, (x[0][-1], x[1][-1]), rest, after)
-                piece = np.concatenate([piece, lqr.quintic_pieces(after, *x)])
-            pieces.append(piece)
-        knots = np.concatenate([self.t0 + times, self.arrival + after[1:]])
-        return as_motion(knots, np.concatenate(pieces, axis=1), self.T1)
+        return _regulated(
+            self.regulators,
+            self.tracking,
+            self.start,
+            self.goal,
+            self.t0,
+            self.arrival,
+            self.t_end,
+        )
 
-    def _under_way(self, k: int, times: Floats) -> tuple[Floats, Floats, Floats]:
-        """Position, rate and second derivative (K, 3) of CM (0) or phi (1) at times (K,) [s] from the start."""
-        law, T = self.regulators[k], self.arrival - self.t0
-        begin, end = self.begin[k], self.end[k]
-        if law.horizon == "finite":
-            return lqr.finite_horizon_trajectory(times, begin, end, T, law.Q, law.R, law.S)
-        return lqr.infinite_horizon_trajectory(times, begin, end, T, law.Q, law.R)
 
-    def _after(
-        self, k: int, state: tuple[Floats, Floats], rest: float, times: Floats
-    ) -> tuple[Floats, Floats, Floats]:
-        """The same at times (K,) in [0, rest] after arrival in a state."""
-        r, v = self.end[k]
-        target = (r + v * rest, v)
-        return lqr.infinite_horizon_trajectory(times, state, target, rest, *self.tracking)
+@kept
+def _regulated(
+    regulators: tuple[_Law, _Law],
+    tracking: tuple[Any, float],
+    start: _End,
+    goal: _End,
+    t0: float,
+    arrival: float,
+    t_end: float,
+) -> Motion:
+    (r, v, T, omega), (r1, v1, T1, omega1) = start, goal
+    phi = att.rotation_vector_from_dcm(T @ T1.T)  # start = goal Exp(phi)
+    begin = np.concatenate([r, phi]), np.concatenate([v, att.rotation_vector_rate(phi, omega)])
+    end = np.concatenate([r1, np.zeros(3)]), np.concatenate([v1, omega1])
+    length, rest = arrival - t0, t_end - arrival
+    times, after, (body, turn, *hold) = _responses(regulators, tracking, length, rest)
+    parts = [
+        lqr.led(response, times, [x[k : k + 3] for x in begin], [x[k : k + 3] for x in end], length)
+        for k, response in ((0, body), (3, turn))
+    ]
+    x = [np.concatenate(both, axis=1) for both in zip(*parts, strict=True)]
+    pieces, knots = [lqr.quintic_pieces(times, *x)], t0 + times
+    if rest > 0.0:
+        state, target = (x[0][-1], x[1][-1]), (end[0] + end[1] * rest, end[1])
+        pieces.append(lqr.quintic_pieces(after, *lqr.led(hold[0], after, state, target, rest)))
+        knots = np.concatenate([knots, arrival + after[1:]])
+    return as_motion(knots, np.concatenate(pieces), T1.copy())
+
+
+@kept
+def _responses(
+    regulators: tuple[_Law, _Law], tracking: tuple[Any, float], length: float, rest: float
+) -> tuple[Floats, Floats, tuple[lqr.Response, ...]]:
+    """Knots of the way and of the rest after it; the responses of both regulators and of the tracking gains there."""
+    times = np.unique(np.concatenate([_knots(law, length) for law in regulators]))
+    after = lqr.knots(rest, *tracking) if rest > 0.0 else np.zeros(1)
+    found = [
+        lqr.double_integrator_response(times, length, Q, R, S if horizon == "finite" else None)
+        for horizon, Q, R, S in regulators
+    ]
+    if rest > 0.0:
+        found.append(lqr.double_integrator_response(after, rest, *tracking, None))
+    return times, after, tuple(found)
 
 
 def regulated(
     mission: Mission, start: Pose, goal: Pose, t0: float, arrival: float, t_end: float
 ) -> RegulatedFlight:
     """The regulators' trajectory from one pose at ``t0`` [s] to another, and on to the end of the phase."""
-    phi = att.rotation_vector_from_dcm(start.T @ goal.T.T)  # start = goal Exp(phi)
-    phi_dot = att.rotation_vector_rate(phi, start.omega)
-    return RegulatedFlight(
-        (mission.lqr, mission.lqr.attitude),
-        (mission.tracking.Q, mission.tracking.R),
-        ((start.r, start.v), (phi, phi_dot)),
-        ((goal.r, goal.v), (np.zeros(3), goal.omega)),
-        goal.T,
-        t0,
-        arrival,
-        t_end,
-    )
+    law, turn = ((x.horizon, x.Q, x.R, x.S) for x in (mission.lqr, mission.lqr.attitude))
+    ends = [(pose.r, pose.v, pose.T, pose.omega) for pose in (start, goal)]
+    tracking = (mission.tracking.Q, mission.tracking.R)
+    return RegulatedFlight((law, turn), tracking, *ends, t0, arrival, t_end)
 
 
 @dataclass
@@ -596,5 +619,6 @@ def as_motion(knots: Floats, coefficients: Floats, T1: Floats) -> Motion:
     return Motion(knots, np.ascontiguousarray(coefficients), np.ascontiguousarray(T1))
 
 
-def _knots(law: Regulator, T: float) -> Floats:
-    return lqr.knots(T, law.Q, law.R, law.S if law.horizon == "finite" else None)
+def _knots(law: _Law, T: float) -> Floats:
+    horizon, Q, R, S = law
+    return lqr.knots(T, Q, R, S if horizon == "finite" else None)

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from rigidfleet._common.kept import kept
 from rigidfleet.errors import StoppedError
 from rigidfleet.formation import distance_geometry, graphs
 from rigidfleet.kernel.problem import (
@@ -130,7 +131,7 @@ class PhasePlan:
             "time": max(self.arrival, shaped) if lies else self.arrival,
             "position": goal.r.tolist() if "position" in meets else None,
             "velocity": goal.v.tolist() if "velocity" in meets else None,
-            "attitude": att.quaternion_from_dcm(goal.T).tolist() if turns else None,
+            "attitude": [*_quaternion(goal.T)] if turns else None,
             "rates": goal.omega.tolist() if turns and not lies else None,
             **({"through": through} if through else {}),
         }
@@ -141,7 +142,7 @@ class PhasePlan:
         integral = now.integral.of(self.edges, 0.0)
         if self.frame is None:
             return np.concatenate([now.r.ravel(), now.v.ravel(), integral])
-        q = att.quaternion_from_dcm(self.frame)
+        q = np.array(_quaternion(self.frame))
         if not self.problem.body_formulation:
             return np.concatenate([now.r.ravel(), now.v.ravel(), integral, q])
         x, y = about_cm(now.r, masses) @ self.frame.T, about_cm(now.v, masses) @ self.frame.T
@@ -249,9 +250,7 @@ def plan_phase(
     if shaping is not None:
         T_b = 0.0 if shaping.reference == "step" else seconds(shaping.blend)
         kind = _KINDS[reference_kind(mission, shaping, before, target)]
-    elif phase.control == "tracking" and np.allclose(
-        d1, distance_geometry.distances(before, edges), rtol=1e-12
-    ):
+    elif phase.control == "tracking" and _agree(d1, before, edges):
         kind = SHAPE
     dp, turn = np.zeros_like(before), np.zeros(3)
     if shaping is not None:
@@ -359,10 +358,28 @@ def _held(mission: Mission, name: str | None, now: PhaseState) -> str | None:
     slots, r = slots[left], now.r[left]
     if len(slots) < 2:
         return None
+    pairs, wanted, most = _wanted(slots)
+    near = np.abs(distance_geometry.distances(r, pairs) - wanted).max() <= most
+    return name if near else None
+
+
+@kept
+def _wanted(slots: Floats) -> tuple[Ints, Floats, float]:
+    """All pairs of slots (N, 3), their distances [m], and the greatest error [m] at which they count as held."""
     pairs = graphs.complete_graph(len(slots))
     wanted = distance_geometry.distances(slots, pairs)
-    near = np.abs(distance_geometry.distances(r, pairs) - wanted).max() <= _NEAR * wanted.min()
-    return name if near else None
+    return pairs.copy(), wanted, _NEAR * float(wanted.min())
+
+
+@kept
+def _agree(asked: Floats, slots: Floats, edges: Ints) -> bool:
+    """Whether the edges (m, 2) of slots have the lengths (m,) asked for."""
+    return np.allclose(asked, distance_geometry.distances(slots, edges), rtol=1e-12)
+
+
+@kept
+def _quaternion(T: Floats) -> tuple[float, ...]:
+    return tuple(att.quaternion_from_dcm(T).tolist())
 
 
 def _law(mission: Mission, mu: float, *, damped: bool) -> ConstraintLaw:
@@ -383,7 +400,8 @@ def _law(mission: Mission, mu: float, *, damped: bool) -> ConstraintLaw:
 
 def _control(mission: Mission, phase: Phase, masses: Floats) -> Control:
     kind = {"open": OPEN, "tracking": TRACKING, "body": BODY}[phase.control]
-    force = np.tile(np.array(phase.input_force), (len(masses), 1))
+    force = np.empty((len(masses), 3))
+    force[:] = phase.input_force
     force[:, 2] += masses * mission.gravity
     k1, k2 = lqr.double_integrator_gains(mission.tracking.Q, mission.tracking.R)
     allocation = mission.allocation

@@ -10,6 +10,7 @@ from typing import Literal
 
 import numpy as np
 
+from rigidfleet._common.kept import kept
 from rigidfleet.formation import distance_geometry
 from rigidfleet.kernel.problem import Motion, Reference
 from rigidfleet.math import attitude as att
@@ -29,23 +30,28 @@ class ByEdge:
     values: Floats = field(default_factory=lambda: np.zeros(0))
 
     def of(self, edges: Ints, other: Floats | float) -> Floats:
-        """Values (m,) of edges (m, 2), i < j; ``other`` (m,) for new edges."""
-        keys = self._keys(edges)
+        """Values (m,) of edges (m, 2), i < j; ``other`` (m,) for new edges, or (B, m), then of so many flights."""
+        keys = _keys(edges)
+        if keys is self.keys and np.ndim(other) < 2:
+            return self.values.copy()
         at = np.searchsorted(self.keys, keys)
         known = np.append(self.keys, -1)[at] == keys
         return np.where(known, np.append(self.values, 0.0)[at], other)
 
     def updated(self, edges: Ints, values: Floats) -> ByEdge:
         """These values, updated with the ``values`` of edges (m, 2), i < j."""
-        keys = self._keys(edges)
+        keys = _keys(edges)
+        if keys is self.keys:
+            return ByEdge(keys, values.copy())
         if (keys[1:] > keys[:-1]).all() and (not len(self.keys) or np.array_equal(keys, self.keys)):
             return ByEdge(keys, values.copy())
         keys, first = np.unique(np.concatenate([keys, self.keys]), return_index=True)
         return ByEdge(keys, np.concatenate([values, self.values])[first])
 
-    @staticmethod
-    def _keys(edges: Ints) -> Ints:
-        return (edges[:, 0] << 32) + edges[:, 1]
+
+@kept
+def _keys(edges: Ints) -> Ints:
+    return (edges[:, 0] << 32) + edges[:, 1]
 
 
 @dataclass
@@ -180,7 +186,12 @@ def slots_before(mission: Mission, now: PhaseState, masses: Floats) -> Floats:
 def _turn(given: Floats | None, before: Floats, after: Floats | None, masses: Floats) -> Floats:
     if after is None:
         return np.eye(3)
-    return rigid_body.kabsch(before, after, masses) if given is None else given
+    return _fitted(before, after, masses) if given is None else given
+
+
+@kept
+def _fitted(before: Floats, after: Floats, masses: Floats) -> Floats:
+    return rigid_body.kabsch(before, after, masses)
 
 
 def reference_kind(
@@ -202,6 +213,14 @@ def reference_kind(
         return "squares"
     edges = mission.formation_edges(phase.formation)
     asked = mission.formation_distances(phase.formation)
+    return _leads(before, target, edges, asked)
+
+
+@kept
+def _leads(
+    before: Floats, target: Floats, edges: Ints, asked: Floats
+) -> Literal["shape", "squares"]:
+    """Kind of reference that leads from slots to others, whose edges have lengths (m,) [m] asked for."""
     if not np.allclose(distance_geometry.distances(target, edges), asked, rtol=1e-3):
         return "squares"
     start, goal = rigid_body.centred(before), rigid_body.centred(target)
@@ -222,5 +241,10 @@ def align_slots(
     straight blend then has no angular momentum in its own frame, and moves the agents least. During the blend the
     slots rotate back, so that the body axes keep their meaning; distances are not affected.
     """
-    R = rigid_body.kabsch(before, after, masses) if turn is None else turn
+    R = _fitted(before, after, masses) if turn is None else turn
+    return _aligned(before, after, R)
+
+
+@kept
+def _aligned(before: Floats, after: Floats, R: Floats) -> tuple[Floats, Floats]:
     return after @ R.T - before, att.rotation_vector_from_dcm(R)  # log of R^T

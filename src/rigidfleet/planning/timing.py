@@ -48,7 +48,7 @@ def spelled_out(mission: Mission) -> Mission:
     MissionError
         No transition keeps the separation, or no way is found.
     """
-    return ways.found(expanded(mission), with_times)
+    return ways.found(expanded(mission, with_times), with_times)
 
 
 def timed(mission: Mission) -> Mission:

@@ -18,10 +18,13 @@ from rigidfleet.errors import Finding, MissionError
 from rigidfleet.formation.assignment import closest_approach, nearer_than
 from rigidfleet.math import rigid_body
 from rigidfleet.mission import Mission
-from rigidfleet.mission.kinds import Reshape, Vertical
+from rigidfleet.mission.kinds import Go, Reshape, Vertical
+from rigidfleet.mission.obstacles import Ground
 from rigidfleet.mission.values import AUTO
-from rigidfleet.planning.reference import slots_about_cm
+from rigidfleet.planning.preview import at_start, leg
+from rigidfleet.planning.reference import PhaseState, slots_about_cm
 from rigidfleet.planning.transfers import transfer
+from rigidfleet.planning.ways import Timed
 from rigidfleet.typing import Floats, Ints
 
 #: What the parts of a transition are called.
@@ -34,13 +37,14 @@ _ROOM = 2.0
 _SLACK = 1e-9
 
 
-def expanded(mission: Mission) -> Mission:
+def expanded(mission: Mission, timed: Timed) -> Mission:
     """Return the mission with each phase that is flown as several in their place; itself if it has none.
 
     A transition by layers becomes three phases, a staggered take-off or landing one for each group of vehicles; one by
     bent ways has their control points.
 
-    The result is an ordinary mission: it can be written, read and flown by itself.
+    The result is an ordinary mission: it can be written, read and flown by itself. ``timed`` gives a phase its
+    automatic times (`timing.with_times`).
 
     Raises
     ------
@@ -57,7 +61,9 @@ def expanded(mission: Mission) -> Mission:
         table.pop("transition", None)
         parts = [table]
         if isinstance(phase, Reshape) and phase.transition == "ways":
-            parts = [_bent(mission, k, table, phase, before)]
+            so_far = data | {"phases": tables, "formations": data["formations"] | forms}
+            room = _room(mission.rewritten(so_far) if tables else mission, len(tables), timed)
+            parts = [_bent(mission, k, table, phase, before, room)]
         elif isinstance(phase, Reshape) and phase.transition != "straight":
             levels = _levels(mission, k, phase, before)
             if levels is not None:
@@ -122,10 +128,52 @@ def _ends(mission: Mission, phase: Reshape, before: str | None) -> tuple[Floats,
     return None if found[0] is None or found[1] is None else (found[0], found[1])
 
 
+def _room(mission: Mission, phases: int, timed: Timed) -> Floats:
+    """Corners (2, 3) [m], about the centre of mass in body axes, between which vehicles fly after some phases.
+
+    These are heights above the ground and within the geofence if the formation is level then, and the geofence's sides
+    if its axes are along the world's. Infinite where that, or the place of the formation, is not known.
+    """
+    box = np.array([[-np.inf] * 3, [np.inf] * 3])
+    now: PhaseState | None = at_start(mission)
+    for number, phase in enumerate(mission.phases[:phases]):
+        assert now is not None
+        found = (
+            None if isinstance(phase, Go) else leg(mission, timed(mission, phase, now, number), now)
+        )
+        now = None if found is None else found.after
+        if now is None:
+            return box
+    pose = None if now is None else now.goal
+    if pose is None:
+        return box
+    radius, fence = float(mission.fleet.radius.max()), mission.limits.geofence
+    grounds = [o.height + radius for o in mission.obstacles if isinstance(o, Ground)]
+    lowest = np.array([-np.inf, -np.inf, max(grounds, default=-np.inf)])
+    within = np.array([lowest, [np.inf] * 3])
+    if fence is not None:
+        within = np.array(
+            [np.maximum(lowest, np.array(fence.min) + radius), np.array(fence.max) - radius]
+        )
+    within -= pose.r
+    for q in range(3):  # axis q of the body along an axis of the world
+        k = int(np.abs(pose.T[q]).argmax())
+        if abs(pose.T[q, k]) > 1.0 - 1e-9:
+            box[:, q] = np.sort(within[:, k] * np.sign(pose.T[q, k]))
+    return box
+
+
 def _bent(
-    mission: Mission, number: int, table: dict[str, Any], phase: Reshape, before: str | None
+    mission: Mission,
+    number: int,
+    table: dict[str, Any],
+    phase: Reshape,
+    before: str | None,
+    within: Floats,
 ) -> dict[str, Any]:
     """The phase with the control points of bent ways, found and proved between its slots in body axes.
+
+    ``within`` (2, 3) [m] are corners about the centre of mass that the ways do not leave.
 
     Raises
     ------
@@ -148,7 +196,12 @@ def _bent(
     distance = 2.0 * radius + (limits.separation or 0.0) + limits.separation_allowance
     below = max(distance, 2.0 * radius + (limits.separation_below or 0.0))
     room = _ROOM * below
-    box = np.minimum(p, q).min(axis=0) - room, np.maximum(p, q).max(axis=0) + room
+    low, high = np.minimum(p, q).min(axis=0), np.maximum(p, q).max(axis=0)
+    # Slots that are outside already are for the plan's check to find.
+    box = (
+        np.maximum(low - room, np.minimum(within[0], low)),
+        np.minimum(high + room, np.maximum(within[1], high)),
+    )
     each = 1.0 / np.sqrt(3.0)  # limits of each axis, which together keep those of the vector
     try:
         found = transfer(

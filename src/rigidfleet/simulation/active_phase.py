@@ -40,8 +40,9 @@ if TYPE_CHECKING:
 #: Greatest number of steps, and greatest wall time [s], after which the integrator returns to Python. For any
 #: size of formation, this is often enough for Ctrl-C and progress.
 _STEPS, _PAUSE = 2000, 0.05
-#: Number of steps at the start of a phase: they may take a thousand times as long as those of the phase before.
-_FIRST_STEPS = 10
+#: Least number of steps at the start of a phase: they may take a thousand times as long as those of the phase before.
+#: Without a user's force, steps of this many numbers in all take less than a tenth of `_PAUSE`.
+_FIRST_STEPS, _FIRST_NUMBERS = 10, 3000
 #: Interval between checks whether a phase has settled, if it ends by settling [s].
 _CHECK = 0.1
 
@@ -79,7 +80,6 @@ class ActivePhase:
         self.asked = 0  # number of calls of the user's controller
         self.held: Problem | None = None  # with the controller's force
         self.flown: Problem | None = None  # the problem of the steps in the trail
-        self.steps = _FIRST_STEPS  # per call of the integrator; more once their duration is known
         self.counted = np.zeros(
             3, dtype=np.int64
         )  # evaluations, steps and rejections before a loss
@@ -88,6 +88,10 @@ class ActivePhase:
         self.stop = math.inf  # time at which the caller wants a sample [s]
         self.begun = False  # whether samples exist since the start or the last loss
         self._start(plan.state(), plan.start)
+        #: Steps per call of the integrator; more once their duration is known.
+        self.steps = _FIRST_STEPS
+        if external is None:
+            self.steps = max(_FIRST_STEPS, _FIRST_NUMBERS // len(self.state.y))
         if self.solver is not None:
             self.state.clock[1] = first_step(plan, self.workspace, self.state)
 
@@ -122,6 +126,9 @@ class ActivePhase:
         """Whether the phase has settled; None if it does not end by settling."""
         settle = self.plan.phase.settle
         return None if settle is None else self.t - self.quiet_since >= settle.dwell - 1e-9
+
+    #: Time by which the events of the phase come later than planned [s].
+    delay = 0.0
 
     # -- flying -----------------------------------------------------------------------------------
 

@@ -11,6 +11,7 @@ from rigidfleet.mission import Mission, Phase
 from rigidfleet.mission.findings import near
 from rigidfleet.mission.kinds import KINDS
 from rigidfleet.mission.losses import ON_LOSS
+from rigidfleet.planning.timing import with_times
 from rigidfleet.planning.transitions import expanded
 from rigidfleet.result import PhaseRecord
 
@@ -33,6 +34,11 @@ def as_flown(
     data.pop("source", None)  # it no longer reproduces a figure
     data["name"] = f"{mission.name.removesuffix('-live')}-live"
     data["title"] = f"{mission.title or mission.name}, flown by hand"
+    own = data.get("obstacles", [])
+    pushed = mission.obstacles[len(own) :]  # in flight, by hand
+    if pushed:
+        told = [thing.model_dump(mode="json", exclude_unset=True) for thing in pushed]
+        data["obstacles"] = [*own, *told]
     as_given = dict(data)
     data |= _flown_data(mission, data, asked, records, step)
     try:
@@ -61,7 +67,7 @@ def with_phase(
     data["phases"] = [*data["phases"], dict(table)]
     made = Mission.from_dict(data, "begin()")
     if not made.phases[-1].spelled:
-        spread = expanded(made)
+        spread = expanded(made, with_times)
         if len(spread.phases) == len(made.phases):  # with the ways that were found
             made = spread
     _check_flown(made.phases[-1])

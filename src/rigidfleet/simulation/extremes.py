@@ -9,17 +9,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
+from rigidfleet._common.kept import kept
 from rigidfleet.kernel import avoidance, fleet, records
 from rigidfleet.kernel.engine import native
 from rigidfleet.kernel.problem import Problem, Workspace
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
-from rigidfleet.mission import Mission
+from rigidfleet.mission import Mission, Obstacle
 from rigidfleet.result import PAD, Extremum, PhaseRecord
-from rigidfleet.solids.records import joined
+from rigidfleet.solids.records import Solids, joined
 from rigidfleet.typing import Bools, Floats, Ints
 
 #: Greatest number of agents of which all pairs are monitored.
@@ -28,6 +30,8 @@ _FEW = 40
 _SPARE = 0.5
 #: Least such distance, as a share of the fleet's size over the root of its number; agents may be at the same place.
 _LEAST = 0.1
+#: Overlap with an obstacle from which on it is a contact [m].
+_TOUCH = 1e-6
 #: Shortest piece of a step, as a share of the step.
 _SHORTEST = 2.0**-20
 #: Agents whose bounds are computed at a time.
@@ -69,6 +73,19 @@ _SAMPLED = (
 _OF_FLIGHT = {"clearance_start": records.STANDING, "clearance_flight": records.FLYING}
 
 
+class _Thing(NamedTuple):
+    """An obstacle, as its arrays alone."""
+
+    solid: Solids
+
+
+@kept
+def _stood(position: Floats, radius: Floats, obstacles: tuple[_Thing, ...]) -> Ints:
+    """Whether agents stand on obstacles at the start (N,)."""
+    start, _ = proximity.obstacle_clearances(position, radius, obstacles)
+    return (start <= PAD).astype(np.int64)
+
+
 class Extremes:
     """Monitors a flight and reports the worst values of each phase."""
 
@@ -76,12 +93,7 @@ class Extremes:
         agents, limits = mission.agents, mission.limits
         self.n = mission.n_agents
         self.radius = np.array(agents.radius, dtype=float)
-        corners = [thing.corners for thing in mission.obstacles]
-        #: Obstacles of all kinds, unless all are boxes that the monitor itself takes.
-        self.solids = None
-        if None in corners:
-            self.solids, corners = joined([thing.solid for thing in mission.obstacles]), []
-        self.boxes = np.array(corners).reshape(-1, 6)
+        self._take_obstacles(mission.obstacles)
         fence = limits.geofence
         self.fence = np.array([] if fence is None else [*fence.min, *fence.max]).reshape(-1, 6)
         self.stacks = self.n <= _FEW or limits.separation_below is not None
@@ -90,17 +102,40 @@ class Extremes:
         self.who, self.sign = np.full((count, 2), -1), np.zeros(1)
         self.left = np.ones(self.n, dtype=np.bool_)
         self.low = np.full((self.n, 3), np.inf)
-        start, _ = proximity.obstacle_clearances(
-            np.array(agents.position), self.radius, mission.obstacles
-        )
-        self.stood = (start <= PAD).astype(np.int64)
+        things = tuple(_Thing(thing.solid) for thing in mission.obstacles)
+        self.stood = _stood(mission.fleet.position, self.radius, things)
         self.standing = self.stood.copy()
         self.pairs = self.columns = self.struck = np.zeros((0, 2), dtype=np.int64)
         self.spare, self.moved = 0.0, np.zeros(2)
         self.trail = records.NO_TRAIL
         self.of_vehicles: dict[str, Extremum] = {}
         self.avoidance: avoidance.Avoidance | None = None  # that of the phase under way
+        self.led: dict[str, Extremum] = {}  # what its clock and its body layer did
         self._list_all()
+
+    def _take_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
+        corners = [thing.corners for thing in obstacles]
+        #: Obstacles of all kinds, unless all are boxes that the monitor itself takes.
+        self.solids = None
+        if None in corners:
+            self.solids, corners = joined([thing.solid for thing in obstacles]), []
+        self.boxes = np.array(corners).reshape(-1, 6)
+
+    def among(self, obstacles: Sequence[Obstacle]) -> None:
+        """Continue among these obstacles; the first of them are those before."""
+        self._take_obstacles(obstacles)
+        if len(self.trail.points):
+            found = self.monitor.monitor
+            self.monitor = native.Watch(found._replace(boxes=self.boxes, flags=found.flags.copy()))
+
+    def contact(self) -> Extremum | None:
+        """The deepest contact of a vehicle in flight with an obstacle so far; None if there was none."""
+        found = self._extremum("clearance_flight", records.FLYING)
+        near = np.where(self.left & (self.standing == 0), self.low[:, 0], np.inf)
+        i = int(near.argmin())
+        if near[i] < (np.inf if found is None else found.value):
+            found = Extremum(float(near[i]), float(self.low[i, 1]), i, int(self.low[i, 2]))
+        return found if found is not None and found.value < -_TOUCH else None
 
     @property
     def reusable(self) -> bool:
@@ -114,7 +149,7 @@ class Extremes:
         self.when.fill(0.0)
         self.who.fill(-1)
         self.standing[:] = self.stood
-        self.of_vehicles, self.avoidance = {}, None
+        self.of_vehicles, self.avoidance, self.led = {}, None, {}
         if len(self.trail.points):
             self.monitor.monitor.flags.fill(0)
 
@@ -263,14 +298,14 @@ class Extremes:
         for name, k in _NAMES.items():
             if math.isfinite(value := worst[k]):
                 found[name] = Extremum(self._signed(name, value), when[k], *who[k])
-        return found | self.of_vehicles | self._avoided()
+        return found | self.of_vehicles | self._avoided() | self.led
 
     def phase(self) -> dict[str, Extremum]:
         """Extremes of the phase that ends, by name; start those of the next one."""
         found = self.so_far()
         self.worst[list(_NAMES.values())] = np.inf
         self.moved[:] = np.inf  # the list was made for a worst value that no longer counts
-        self.of_vehicles, self.avoidance = {}, None
+        self.of_vehicles, self.avoidance, self.led = {}, None, {}
         return found
 
     def flight(self, phases: Sequence[PhaseRecord]) -> None:

@@ -47,6 +47,14 @@ class VehicleSamples(NamedTuple):
     saturated: Bools  # (K, N)
 
 
+class LayerSamples(NamedTuple):
+    """Samples of what the layers of avoidance in flight do."""
+
+    rate: Floats  # (K,) of the virtual clock
+    displacement: Floats  # (K, 3) of the body from its path [m]
+    layers: Ints  # (K, N) that change what a vehicle is asked for
+
+
 @dataclass
 class Piece:
     """Samples of a phase, or of part of one, as the kernel returns them."""
@@ -60,6 +68,7 @@ class Piece:
     attached: bool  # whether the slots carry the body frame
     led: Led  # what the slots follow, if they are tracked
     vehicles: VehicleSamples | None = None
+    layers: LayerSamples | None = None
 
 
 def assemble(
@@ -96,13 +105,8 @@ def assemble(
         if mission.agents.saturate:  # the thrust flown, not the commanded one
             thrust = np.minimum(thrust, mission.agents.thrust_limit)
     r, motion = record.r, record.motion
-    radius = mission.agents.radius
-    each_clearance, nearest = proximity.obstacle_clearances(r, radius, mission.obstacles, time)
-    if not whole:
-        each_clearance[~left] = np.inf
-    separation, pair = proximity.separation_of_left(r, radius, left)
-    clearance, agent, obstacle = proximity.least_clearance(each_clearance, nearest)
-    _put_extremes(phases, time, (separation, pair, clearance, agent, obstacle))
+    close = proximity.closeness(r, mission.agents.radius, mission.obstacles, time, left)
+    _put_extremes(phases, time, close)
     edges = mission.edges
     columns = [_columns(p.edges, edges) for p in pieces]
 
@@ -143,11 +147,11 @@ def assemble(
         integral=by_edge("integral"),
         multiplier=by_edge("multiplier"),
         singular_value=np.zeros(0),  # computed later
-        separation=separation,
-        separation_pair=pair,
-        clearance=clearance,
-        clearance_agent=agent,
-        clearance_obstacle=obstacle,
+        separation=close.separation,
+        separation_pair=close.pair,
+        clearance=close.clearance,
+        clearance_agent=close.agent,
+        clearance_obstacle=close.obstacle,
         disturbance_force=record.f_D if airy else None,
         measured_position=record.r_seen if noisy else None,
         measured_velocity=record.v_seen if noisy else None,
@@ -162,6 +166,9 @@ def assemble(
         vehicle_rates=None if flown is None else flown.rates,
         rotor_force=None if flown is None else flown.rotor_force,
         saturated=None if flown is None else flown.saturated.astype(np.int64),
+        clock_rate=_of_layers(pieces, "rate"),
+        body_displacement=_of_layers(pieces, "displacement"),
+        avoidance_layers=_of_layers(pieces, "layers"),
         phases=list(phases),
         mission_text=mission.text,
         complete=not ending,
@@ -233,11 +240,16 @@ def _of_vehicles(pieces: Sequence[Piece]) -> VehicleSamples | None:
     )
 
 
-def _put_extremes(phases: Sequence[PhaseRecord], time: Floats, closeness: tuple[Any, ...]) -> None:
+def _of_layers(pieces: Sequence[Piece], name: str) -> Any:
+    """Samples of the layers of avoidance of all pieces; None without avoidance."""
+    parts = [getattr(piece.layers, name) for piece in pieces if piece.layers is not None]
+    return _joined(parts) if parts else None
+
+
+def _put_extremes(phases: Sequence[PhaseRecord], time: Floats, close: proximity.Closeness) -> None:
     """Enter the extremes between samples at the sample after each."""
-    separation, pair, clearance, agent, obstacle = closeness
     for phase in phases:
-        for name, values in (("separation", separation), ("clearance", clearance)):
+        for name, values in (("separation", close.separation), ("clearance", close.clearance)):
             x = phase.extremes.get(name)
             if x is None:
                 continue
@@ -245,9 +257,9 @@ def _put_extremes(phases: Sequence[PhaseRecord], time: Floats, closeness: tuple[
             if x.value < values[k]:
                 values[k] = x.value
                 if name == "separation":
-                    pair[k] = x.who, x.other
+                    close.pair[k] = x.who, x.other
                 else:
-                    agent[k], obstacle[k] = x.who, x.other
+                    close.agent[k], close.obstacle[k] = x.who, x.other
 
 
 def _joined(parts: Sequence[Floats]) -> Floats:

@@ -13,7 +13,7 @@ from rigidfleet.errors import FlightError, StoppedError
 from rigidfleet.kernel import avoidance, fleet, records
 from rigidfleet.kernel.engine import native
 from rigidfleet.kernel.engine.sampled import fly_ticks
-from rigidfleet.kernel.problem import Problem
+from rigidfleet.kernel.problem import TRACKING, Problem
 from rigidfleet.kernel.records import Record
 from rigidfleet.math import attitude as att
 from rigidfleet.mission import Mission
@@ -30,7 +30,8 @@ from rigidfleet.simulation.callbacks import (
     named,
 )
 from rigidfleet.simulation.diagnosis import diagnose
-from rigidfleet.simulation.recording import Led, Piece, VehicleSamples
+from rigidfleet.simulation.leading import Leader, layers
+from rigidfleet.simulation.recording import LayerSamples, Led, Piece, VehicleSamples
 from rigidfleet.simulation.solver_setup import equip, integrator
 from rigidfleet.typing import Floats
 
@@ -55,6 +56,9 @@ class Vehicles:
         self.S = fleet.hovering(self.flight.vehicles, start.position, start.velocity, yaw)
         self.state: fleet.SampledState | None = None  # of the phase before
         self.edges = np.zeros((0, 2), dtype=np.int64)  # of that state
+        self.layers = layers(mission)  # settings of the clock and the body layer, if they may act
+        self.output_step = mission.output_step
+        self.scale = np.array([1.0, 0.0, 0.0])  # of the slots at the last switch, two derivatives
 
 
 class SampledPhase(ActivePhase):
@@ -70,9 +74,16 @@ class SampledPhase(ActivePhase):
         if vehicles.avoidance is not None:
             vehicles.avoidance = avoidance.renewed(vehicles.avoidance)
         self.led = False  # whether the reference is given piece by piece
+        self.steered = False  # whether it is given by hand
+        self.led_until = -math.inf  # end of what the leader has decided [s]
         self.unjudged = False  # whether steps were flown since the extremes of vehicles were taken
         self.first_tick: int | None = None
+        self.leader: Leader | None = None
         super().__init__(*arguments, **options)
+        if vehicles.layers is not None and self.plan.problem.control.kind == TRACKING:
+            period = self.flight.every * self.flight.steps * self.flight.h
+            self.leader = Leader(vehicles.layers, self.plan, period)
+            self.leader.deviation.scale = vehicles.scale
         yaw = vehicles.tables.yaw
         self.turn = turn_from(self.plan.problem, self.plan.start, yaw, vehicles.yaw)
 
@@ -118,14 +129,47 @@ class SampledPhase(ActivePhase):
 
     # -- flying -----------------------------------------------------------------------------------
 
+    def fly_to(self, t_end: float, controller: Controller | None, rate: float) -> None:
+        """Fly to ``t_end`` [s], or to the end of the phase, which comes later if the formation waits."""
+        leader, given = self.leader, self.vehicles.avoidance
+        if leader is None or given is None or controller is not None or self.steered:
+            super().fly_to(t_end, controller, rate)
+            return
+        whole = t_end >= self.plan.t_end
+        while self.t < (self.plan.t_end if whole else t_end):
+            end = leader.next_end(self.t, self.vehicles.output_step)
+            if self.t >= self.led_until:
+                self.led_until = end
+                if (problem := leader.lead(self.t, end, given)) is not None:
+                    self._follow_leader(problem)
+            end = min(self.led_until, self.plan.t_end if whole else t_end)
+            super().fly_to(end, controller, rate)
+
+    @property
+    def delay(self) -> float:
+        """Time by which the events of the phase come later than planned [s]."""
+        return 0.0 if self.leader is None else self.leader.clock.delay
+
+    def _follow_leader(self, problem: Problem) -> None:
+        """Continue with a problem that the leader has made of the plan's."""
+        self._renew(problem)
+        self.led = self.leader is not None and self.leader.leads
+
     def lead(self, problem: Problem) -> None:
+        """Continue with another problem that somebody else has made: the layers above the barriers then rest."""
+        self.steered = True
+        if self.leader is not None:
+            self.leader.now = None
+        self._renew(problem)
+
+    def _renew(self, problem: Problem) -> None:
         """Continue with another problem; vehicles that turn along their way do so from the yaw they have now."""
         yaw = self.vehicles.tables.yaw
         if yaw.kind == "along":
             now = self.vehicles.tables.yaw_at(self.plan.problem, self.t, self.turn)
             self.turn = turn_from(problem, self.t, yaw, now)
         self.led = True
-        super().lead(problem)
+        ActivePhase.lead(self, problem)
 
     def observe(self) -> Observation:
         """What a controller sees: measured positions and velocities."""
@@ -167,6 +211,8 @@ class SampledPhase(ActivePhase):
     def watch(self, *, last: bool) -> None:
         """Search the steps flown for extremes."""
         self.extremes.avoidance = self.vehicles.avoidance
+        if self.leader is not None:
+            self.extremes.led = self.leader.extremes(self.t)
         if rows := int(self.sampled.count[fleet.TRAILED]):
             assert self.flown is not None
             # A motion that grows beyond all bounds has extremes up to there.
@@ -240,7 +286,9 @@ class SampledPhase(ActivePhase):
             for known in (s.seen, s.history, s.sent, s.heard):
                 np.add(known, moved, out=known)
         # A piece of a reference that is led holds until the next stop
-        until = min(self.stop, self.plan.t_end) if self.led else self.plan.t_end
+        until = self.plan.t_end
+        if self.led:
+            until = min(until, self.led_until if not self.steered else self.stop)
         last = min(tick + _TICKS, math.ceil(until * given.rate) + 1)
         made = given.made(tick, max(last, tick + 1), planned, self.turn)
         self.flight, self.tabled = self.flight._replace(tables=made), planned
@@ -265,6 +313,8 @@ class SampledPhase(ActivePhase):
         """End the phase; the vehicles keep their states."""
         self.vehicles.yaw = self.vehicles.tables.yaw_at(self.plan.problem, self.t, self.turn)
         self.vehicles.S, self.vehicles.state = self.sampled.S, self.sampled
+        if self.leader is not None:
+            self.vehicles.scale = self.leader.deviation.scale
         return super().end()
 
     def release(self) -> None:
@@ -294,8 +344,18 @@ class SampledPhase(ActivePhase):
                 plan.attached,
                 self._led(times),
                 kept,
+                self._layers(call, done),
             )
         )
+
+    def _layers(self, call: fleet.SampledSegment, done: int) -> LayerSamples | None:
+        """Samples of what avoidance did."""
+        if self.vehicles.avoidance is None:
+            return None
+        times, acting = call.times[:done], call.layers[:done]
+        if self.leader is None:
+            return LayerSamples(np.ones(done), np.zeros((done, 3)), acting)
+        return LayerSamples(self.leader.rate(times), self.leader.displacement(times), acting)
 
 
 def _as_flown(

@@ -488,10 +488,8 @@ def _result(
 ) -> Result:
     r, v, a, j = state
     k, n = r.shape[:2]
-    radius = mission.agents.radius
-    each, nearest = proximity.obstacle_clearances(r, radius, mission.obstacles, time)
-    separation, pair = proximity.separation(r, np.array(radius))
-    clearance, agent, obstacle = proximity.least_clearance(each, nearest)
+    left = np.ones((k, n), dtype=np.bool_)
+    close = proximity.closeness(r, mission.agents.radius, mission.obstacles, time, left)
     nothing, none = np.full((k, n, 3), np.nan), np.zeros((k, 0))
     cm, cm_velocity = r.mean(axis=1), v.mean(axis=1)
     unknown: dict[str, Any] = {
@@ -519,7 +517,7 @@ def _result(
         input_force=nothing, constraint_force=nothing, external_force=nothing, thrust=nothing[..., 0],
         cm=cm, cm_velocity=cm_velocity, cm_reference=cm, cm_velocity_reference=cm_velocity,
         edges=np.zeros((0, 2), dtype=np.int64), **empty, singular_value=np.full(k, np.nan),
-        separation=separation, separation_pair=pair, clearance=clearance, clearance_agent=agent,
-        clearance_obstacle=obstacle, **unknown, phases=[record], mission_text=mission.text,
-        statistics={"interpolation": interpolation, "names": list(names)},
+        separation=close.separation, separation_pair=close.pair, clearance=close.clearance,
+        clearance_agent=close.agent, clearance_obstacle=close.obstacle, **unknown, phases=[record],
+        mission_text=mission.text, statistics={"interpolation": interpolation, "names": list(names)},
     )  # fmt: skip

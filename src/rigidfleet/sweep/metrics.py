@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from rigidfleet.math import proximity
 from rigidfleet.typing import Floats
 
 if TYPE_CHECKING:
@@ -148,10 +149,10 @@ def shape_errors(result: Result) -> Floats:
     n = result.position.shape[1]
     if n < 2 or n > _PAIRED:
         return error
-    i, j = np.triu_indices(n, 1)
+    pairs = np.stack(np.triu_indices(n, 1), axis=1)
     r = np.where(result.left[..., None], result.position, np.nan)
-    flown, asked = (np.linalg.norm(x[:, i] - x[:, j], axis=2) for x in (r, result.slot_position))
-    return np.fmax(error, _most(np.abs(flown - asked)))
+    flown, asked = (proximity.lengths(x, pairs) for x in (r, result.slot_position))
+    return np.fmax(error, _most(np.abs(flown - asked).T))
 
 
 def _most(values: Floats) -> Floats:

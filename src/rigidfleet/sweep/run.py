@@ -38,7 +38,7 @@ def _fly(sweep: Sweep, run: int) -> RunRecord:
     codes = tuple(c.variation.code(v) for c, v in zip(sweep.columns, values, strict=True))
     metrics = dict.fromkeys(METRICS, math.nan)
     try:
-        result = simulate(Mission.from_dict(sweep.varied(run), f"run {run}"))
+        result = simulate(Mission.from_plain(sweep.varied(run), f"run {run}"))
         verdict = assess(result)
         metrics = measure(result, verdict)
         failed = [f for f in verdict.checks if not f.passed]

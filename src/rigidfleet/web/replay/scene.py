@@ -70,6 +70,7 @@ def _solid(thing: Obstacle) -> dict[str, Any]:
         "lines": index[cut:],
         "times": solid.times,
         "ways": solid.ways,
+        "there": [x if np.isfinite(x) else None for x in solid.there[0].tolist()],
     }
 
 
@@ -81,6 +82,7 @@ def observe(result: Result, shown: Ints, tension: float) -> dict[str, PackedColu
     return {
         "position": PackedColumn(result.position, fine),
         **_turned(result),
+        **_avoiding(result),
         "slot": PackedColumn(result.slot_position - result.position, fine),
         "cm": PackedColumn(result.cm, fine),
         "attitude": PackedColumn(result.attitude, 1e-4),
@@ -114,6 +116,19 @@ def _turned(result: Result) -> dict[str, PackedColumn]:
         found["rotors"] = PackedColumn(share, 0.01)
         found["saturated"] = PackedColumn(np.where(result.left, saturated != 0, 0.0), 1.0)
     return found
+
+
+def _avoiding(result: Result) -> dict[str, PackedColumn]:
+    """Samples of the layers of avoidance: the clock's rate, the body's way [m]; 1 where barriers act, 2 the guard."""
+    layers, rate, way = result.avoidance_layers, result.clock_rate, result.body_displacement
+    if layers is None or rate is None or way is None:
+        return {}
+    acts = np.where(layers > 1, 2.0, np.where(layers == 1, 1.0, 0.0))
+    return {
+        "clock": PackedColumn(rate, 0.01),
+        "aside": PackedColumn(np.linalg.norm(way, axis=1), 0.01),
+        "acts": PackedColumn(acts, 1.0),
+    }
 
 
 def _continuous(q: Floats) -> Floats:

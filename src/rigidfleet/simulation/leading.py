@@ -1,0 +1,420 @@
+"""The first layers of avoidance in flight: the virtual clock and the body layer, which lead the reference of a phase.
+
+They look ahead at multiples of `_PERIOD` of the flight, and act by another reference for the next one: the planned path
+at the time of the virtual clock, moved by the deviation of the body. Where neither acts, the plan itself is flown.
+"""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from rigidfleet.kernel.avoidance import KNOWN, Avoidance, needed_rate
+from rigidfleet.kernel.problem import SHAPE, SQUARED, Motion, Problem
+from rigidfleet.math import lqr, series
+from rigidfleet.mission import Mission
+from rigidfleet.mission.schema import Avoidance as Settings
+from rigidfleet.planning.body_layer import (
+    NEAR,
+    Deviation,
+    greatest_acceleration,
+    rigid_rows,
+    scale_rows,
+    steered,
+)
+from rigidfleet.planning.derivatives import body_series, slot_derivatives, slot_series
+from rigidfleet.planning.plan import PhasePlan
+from rigidfleet.planning.virtual_clock import STEEPEST, VirtualClock, chained
+from rigidfleet.result import Extremum
+from rigidfleet.solids.distance import outward_normal, own_axes, signed_distance
+from rigidfleet.typing import Floats, Ints
+
+#: Time for which a decision holds [s].
+_PERIOD = 0.1
+#: How far the clock looks ahead [s], at how many times, and the rates that it compares.
+_HORIZON, _LOOKS, _RATES = 4.0, 24, (1.0, 0.7, 0.4, 0.0)
+#: Bandwidth of the clock, times the time in which vehicles react: they are to follow what it does.
+_FOLLOWED = 0.3
+#: Clearance of a path beyond what is to be kept with which it counts as free, and to go faster again [m].
+_FREE, _AGAIN = 0.2, 0.4
+#: Share of the least braking for slowing the path, and for steering the body.
+_SLOWING, _STEERING = 0.4, 0.5
+#: Share of the barriers' rate at which the body approaches its barriers: it gives way before single vehicles do.
+_EARLIER = 0.5
+#: Rate at which velocities leave collision cones [1/s], and room beside an obstacle that the body adds [m].
+_CONE, _ASIDE = 1.5, 0.5
+#: Least tangent, over the radius of the ball: inside it there is none.
+_TANGENT = 0.1
+#: Time by which a reference is valid before and after its period [s].
+_OVERLAP = 1e-3
+#: How far beside a jump it is evaluated [s].
+_BESIDE = 1e-9
+
+
+def layers(mission: Mission) -> Settings | None:
+    """The settings of [avoidance], if its clock or its body layer can act: obstacles move, and no vehicle is lost."""
+    given, d = mission.avoidance, mission.disturbances
+    if given is None or not (given.clock or given.body):
+        return None
+    lost = d is not None and bool(d.lost)
+    return None if lost or not any(o.solid.moves for o in mission.obstacles) else given
+
+
+class Led(NamedTuple):
+    """A period that is led: when it begins [s], and clock and deviation there."""
+
+    begun: float
+    clock: VirtualClock
+    deviation: Deviation
+
+
+def _polynomials(times: Floats, ends: Floats) -> Floats:
+    """Quintics (K, ..., 6) between times (K + 1,) [s], by values and two derivatives (3, 2 K, ...) at their ends."""
+    pairs = ends.reshape(3, -1, 2, *ends.shape[2:])
+    parts = [lqr.quintic_pieces(times[k : k + 2], *pairs[:, k]) for k in range(len(times) - 1)]
+    return np.ascontiguousarray(np.concatenate(parts))
+
+
+@dataclass
+class Leader:
+    """Leads the reference of one phase.
+
+    Attributes
+    ----------
+    problem : what the plan asks for, as planned
+    plan : whose times of events are moved by what the clock falls behind
+    waited, steered : when [s] the clock first slowed, and the body was first steered; None if never
+    steering : time for which the body deviated [s]
+    """
+
+    settings: Settings
+    plan: PhasePlan
+    period: float
+    deviation: Deviation = field(default_factory=Deviation)
+    clock: VirtualClock = field(default_factory=VirtualClock)
+    waited: float | None = None
+    steered: float | None = None
+    steering: float = 0.0
+    who: int = 0
+
+    def __post_init__(self) -> None:
+        self.problem = self.plan.problem
+        self.now: Led | None = None
+        self.leads = False  # whether the reference flown is another than the plan's
+        self.calm = True  # whether no barrier asks for more than the deviation's own decay
+        self._unscalable: bool | None = None
+        n = max(1, round(_PERIOD / self.period))
+        self.period *= n
+
+    def next_end(self, t: float, step: float) -> float:
+        """End [s] of the period that t [s] lies in; exactly a multiple of ``step`` [s] if it is one to rounding."""
+        end = (np.floor(t / self.period + 1e-6) + 1.0) * self.period
+        sample = round(end / step) * step
+        return float(sample if abs(sample - end) < 1e-9 * max(1.0, end) else end)
+
+    def lead(self, t: float, end: float, a: Avoidance) -> Problem | None:
+        """Decide at t [s] until ``end`` [s]; returns the problem to fly, or None if it is the one flown already."""
+        h = end - t
+        acts = self._acts(t + h)
+        self.clock.lead(*(self._choose(t, a) if acts and self.settings.clock else (1.0, np.inf)))
+        asked = self._steer(t, a) if acts and self.settings.body else self.deviation.decay()
+        if self.clock.runs and self.deviation.none and not asked.any():
+            self.now = None
+            if not self.leads:
+                return None
+            self.leads = False
+            return self._late(self.problem)
+        self.leads = True
+        self.now = Led(t, copy.copy(self.clock), self.deviation)
+        problem = self._piece(t, h, asked)
+        lost = self.clock.advance(h)
+        if lost > 0.0:
+            self.waited = t if self.waited is None else self.waited
+            self._put_off(end, lost)
+        self.deviation = self.deviation.at(h, asked, h)
+        self.deviation.end(still=self.calm)
+        if not self.deviation.none:
+            self.steering += h
+            self.steered = t if self.steered is None else self.steered
+        return problem
+
+    def rate(self, time: Floats) -> Floats:
+        """Rate of the clock at times (K,) [s] of the period flown last."""
+        if self.now is None:
+            return np.ones(len(time))
+        return self.now.clock.ahead(time - self.now.begun)[1]
+
+    def displacement(self, time: Floats) -> Floats:
+        """Displacement (K, 3) [m] of the body from its path at times (K,) [s] of the period flown last."""
+        if self.now is None:
+            return np.zeros((len(time), 3))
+        since, (x, v, _) = (time - self.now.begun)[:, None], self.now.deviation.x
+        return x + since * v
+
+    def extremes(self, t: float) -> dict[str, Extremum]:
+        """What the layers did by t [s]: delay [s], and share of the time in which the body deviated."""
+        found = {}
+        if self.waited is not None:
+            found["clock"] = Extremum(self.clock.delay, self.waited, self.who, -1)
+        if self.steered is not None:
+            share = self.steering / max(t - self.plan.start, self.steering)
+            found["body"] = Extremum(share, self.steered, self.who, -1)
+        return found
+
+    # -- the clock ----------------------------------------------------------------------------------------
+
+    def _acts(self, t: float) -> bool:
+        """Whether a reference can be led at t [s]: blends of squared distances are those of no slots."""
+        reference = self.problem.reference
+        return reference.kind != SQUARED or t - self.clock.delay >= reference.t0 + reference.T_b
+
+    def _choose(self, t: float, a: Avoidance) -> tuple[float, float]:
+        """The rate to aim at, and the bandwidth of the clock.
+
+        The greatest one at which the slots keep away from all that moves, as far as it is known, over the horizon; if
+        none does, that of the least harm, unless it helps little.
+        """
+        seen = np.flatnonzero((a.sight.moves == 1) & (a.sight.known == KNOWN))
+        if not len(seen) or self.clock.delay >= self.settings.patience:
+            return 1.0, np.inf
+        ahead = np.linspace(0.0, _HORIZON, _LOOKS + 1)
+        problem, tau = self.problem, t - self.clock.delay + ahead
+        r = slot_derivatives(problem.reference, problem.motion, tau, 1)[:, 0] + self.deviation.x[0]
+        step = ahead[1]
+        fastest = float(np.linalg.norm(np.diff(r, axis=0), axis=2).max()) / step
+        if fastest < 1e-6:
+            return 1.0, np.inf  # a formation at rest does not wait
+        room = [self._room(r, ahead, a, seen)]
+        again = self.clock.target < 1.0
+        if room[0] < (_AGAIN if again else _FREE):
+            for rate in _RATES[1:]:
+                at = np.clip(self.clock.ahead(ahead, rate)[0] / step, 0.0, _LOOKS - 1e-9)
+                low = at.astype(int)
+                share = (at - low)[:, None, None]
+                room.append(self._room((1.0 - share) * r[low] + share * r[low + 1], ahead, a, seen))
+        free = [
+            k
+            for k, x in enumerate(room)
+            if x >= (_AGAIN if again and _RATES[k] > self.clock.target else _FREE)
+        ]
+        best = free[0] if free else int(np.argmax(room))
+        if not free and room[best] < room[0] + _FREE:
+            best = 0
+        bandwidth = _SLOWING * float(a.b.min()) / (STEEPEST * fastest)
+        return _RATES[best], min(bandwidth, _FOLLOWED / max(float(a.lag.max()), 1e-9))
+
+    def _room(self, r: Floats, ahead: Floats, a: Avoidance, seen: Ints) -> float:
+        """Least distance [m] of places r (K, N, 3) at times ahead (K,) [s] from what moves, beyond what is kept."""
+        least = np.inf
+        for o in seen:
+            x, bound = a.sight.track[o], a.sight.bound[o]
+            away = r - (x[:3] + ahead[:, None] * x[3:])[:, None]
+            found = signed_distance(*own_axes(*np.moveaxis(away, -1, 0), o, a.solids), o, a.solids)
+            found = found - (a.reach + a.spare) - (bound[0] + bound[1] / 3.0 * ahead)[:, None]
+            if (worst := float(found.min())) < least:
+                least, self.who = worst, int(np.unravel_index(found.argmin(), found.shape)[1])
+        return least
+
+    def _put_off(self, end: float, lost: float) -> None:
+        """Move the events of the plan that have not come yet by what the clock has fallen behind by ``end`` [s]."""
+        assert self.now is not None
+        begun, clock = self.now.begun, self.now.clock
+
+        def moved(time: float) -> float:
+            progress = time - begun
+            if progress <= 0.0:
+                return time
+            if progress <= end - begun - lost:
+                return begun + clock.when(progress, end - begun)
+            return time + lost
+
+        plan = self.plan
+        plan.t_end, plan.arrival = moved(plan.t_end), moved(plan.arrival)
+        plan.through = tuple((moved(time), r) for time, r in plan.through)
+        if begun < plan.blend.t0 + plan.blend.T_b:
+            plan.blend = plan.blend._replace(t0=plan.blend.t0 + lost)
+
+    def _late(self, problem: Problem) -> Problem:
+        """The plan's problem, later by the delay of the clock."""
+        reference, motion, delay = problem.reference, problem.motion, self.clock.delay
+        if delay == 0.0:
+            return problem
+        knots = reference.knots + delay if len(reference.knots) else reference.knots
+        return problem._replace(
+            motion=motion._replace(knots=motion.knots + delay),
+            reference=reference._replace(t0=reference.t0 + delay, knots=knots),
+        )
+
+    def _piece(self, t: float, h: float, asked: Floats) -> Problem:
+        """The problem from t for h [s]: the path at the clock's time, moved by the deviation, as polynomials.
+
+        They have the values and two derivatives of both at either end, and at the end of the path, where its
+        acceleration may jump.
+        """
+        problem = self.problem
+        reference, motion = problem.reference, problem.motion
+        dt = [-_OVERLAP, h + _OVERLAP]
+        left = motion.knots[-1] - (t - self.clock.delay)
+        if 0.0 < left < self.clock.ahead(h)[0]:
+            dt.insert(1, self.clock.when(left, h))
+        times, dt = t + np.array(dt), np.repeat(dt, 2)[1:-1]  # both ends of each polynomial
+        dt[1:-1:2] -= _BESIDE
+        dt[2:-1:2] += _BESIDE
+        progress, s, slope, _ = self.clock.ahead(dt)
+        tau, rates = t - self.clock.delay + progress, np.stack([s, slope])
+        cm, axes = body_series(motion, tau)
+        still = np.zeros_like(axes)
+        still[0] = np.eye(3)[..., None]
+        p = chained(
+            series.derivatives(slot_series(reference, (np.zeros_like(cm), still), tau)[:3]), rates
+        )
+        x = chained(series.derivatives(cm[:3]), rates)
+        B = series.from_derivatives(chained(series.derivatives(axes[:3]), rates))
+        ends = [self.deviation.at(each, asked, h) for each in dt]
+        moves, turns, grows = (
+            np.stack(each, axis=-1) for each in zip(*(e.series() for e in ends), strict=True)
+        )
+        x += series.derivatives(moves)
+        grown = series.product(series.from_derivatives(p), grows[:, None, None])
+        p = series.derivatives(grown)
+        B = series.product(np.moveaxis(turns, -1, 1), np.moveaxis(B, -1, 1), np.matmul)
+        phi = series.derivatives(series.rotation_vector(B[0, 0].T @ B))
+        channels = np.concatenate([x.transpose(0, 2, 1), phi], axis=2)  # (3, ends, 6)
+        led = Motion(times, _polynomials(times, channels), np.ascontiguousarray(B[0, 0].T))
+        late, scaled = self._late(problem).reference, self._scaled(ends)
+        if not (p[1:].any() or scaled):
+            return problem._replace(motion=led, reference=late)
+        ways = _polynomials(times, p.transpose(0, 3, 2, 1))
+        kind = SHAPE if scaled else reference.kind
+        return problem._replace(
+            motion=led, reference=late._replace(kind=kind, knots=times, ways=ways)
+        )
+
+    @staticmethod
+    def _scaled(ends: list[Deviation]) -> bool:
+        return any(np.any(e.scale != [1.0, 0.0, 0.0]) for e in ends)
+
+    # -- the body -----------------------------------------------------------------------------------------
+
+    def _steer(self, t: float, a: Avoidance) -> Floats:
+        """Second derivatives (7,) of the deviation to take: those of its decay, changed as barriers need."""
+        asked, self.calm = self.deviation.decay(), True
+        sight = a.sight
+        moving = np.flatnonzero((sight.moves == 1) & (sight.known == KNOWN))
+        if not len(moving) and self.deviation.none:
+            return asked
+        r, v, rise, arms = self._slots(t)
+        z = self.deviation.scale[0]
+        limit = _STEERING * float(a.b.min())
+        found = [self._cones(o, r, v, rise, arms, limit, a) for o in moving]
+        rows, needed, who = (
+            (np.concatenate(parts) for parts in zip(*found, strict=True))
+            if found
+            else (np.zeros((0, 7)), np.zeros(0), np.zeros(0, dtype=int))
+        )
+        if len(rows):
+            asked = self.deviation.decay(NEAR)
+        short = needed - rows @ asked
+        if not (len(short) and short.max() > 0.0) and self.deviation.none:
+            return asked
+        self.calm = not (len(short) and short.max() > 0.0)
+        if not self.calm:
+            self.who = int(who[short.argmax()])
+        # Off the planned path, what stands still counts, too
+        for o in np.flatnonzero(sight.moves == 0):
+            more, least, _ = self._barriers(o, r, v, rise, arms, limit, a)
+            rows, needed = np.vstack([rows, more]), np.append(needed, least)
+        if self._scales():
+            more, least = scale_rows(self.deviation)
+            rows, needed = np.vstack([rows, more]), np.append(needed, least)
+        else:
+            rows[:, 6] = 0.0
+        if not (needed > rows @ asked).any():
+            return asked
+        wanted = steered(asked, rows, needed, a.weight, arms, z)
+        if wanted is None:  # no motion of the body helps: single vehicles have to give way
+            return asked
+        change = wanted - asked
+        greatest = greatest_acceleration(change, arms, z)
+        return asked + min(1.0, limit / max(greatest, 1e-12)) * change
+
+    def _scales(self) -> bool:
+        """Whether slots may be scaled: their distances are those of the edges."""
+        if not self._scaled([self.deviation]) and self._unscalable is None:
+            plan = self.plan
+            if plan.slots is None:
+                self._unscalable = True
+            else:
+                i, j = plan.edges.T
+                d = np.linalg.norm(plan.slots[i] - plan.slots[j], axis=1)
+                self._unscalable = not np.allclose(d, plan.distances, rtol=0.0, atol=1e-6)
+        return not self._unscalable
+
+    def _slots(self, t: float) -> tuple[Floats, Floats, Floats, Floats]:
+        """Slots (N, 3), velocities, accelerations without those of the deviation, and arms from the body's origin."""
+        tau = np.array([t - self.clock.delay])
+        cm, axes = body_series(self.problem.motion, tau)
+        slots = slot_series(self.problem.reference, (cm, axes), tau)
+        rates = np.array(self.clock.rate[:2])[:, None]
+        c = chained(series.derivatives(cm[:3]), rates)[..., 0]
+        arm = chained(series.derivatives(slots[:3]), rates)[..., 0].transpose(0, 2, 1) - c[:, None]
+        Q = series.derivatives(self.deviation.series()[1])
+        z, z1, _ = self.deviation.scale
+        x = self.deviation.x
+        # Without the second derivatives that are asked for
+        spin = np.cross(self.deviation.omega[0], np.eye(3)).T
+        Q = Q[0], Q[1], spin @ spin @ Q[0]
+        d = z * arm[0], z1 * arm[0] + z * arm[1], 2.0 * z1 * arm[1] + z * arm[2]
+        turned = [y @ Q[0].T for y in d]
+        r = c[0] + x[0] + turned[0]
+        v = c[1] + x[1] + d[0] @ Q[1].T + turned[1]
+        a = c[2] + d[0] @ Q[2].T + 2.0 * d[1] @ Q[1].T + turned[2]
+        return r, v, a, turned[0]
+
+    def _cones(
+        self, o: int, r: Floats, v: Floats, rise: Floats, arms: Floats, limit: float, a: Avoidance
+    ) -> tuple[Floats, Floats, Ints]:
+        """Rows (R, 7) of slots against obstacle o, which moves, what they need (R,), and the vehicles (R,).
+
+        With x the place of a slot relative to the middle of a ball round the obstacle, w its relative velocity and s
+        the length of a tangent from it to the ball, h = x . w + |w| s is not negative if w points past the ball: a
+        barrier by the collision cone of Chakravarthy and Ghose (*Obstacle avoidance in a dynamic environment*, IEEE
+        Transactions on Systems, Man, and Cybernetics A 28, 1998). It steers aside, where one on the distance brakes.
+        """
+        sight = a.sight
+        track, bound = sight.track[o], sight.bound[o]
+        x, w = r - sight.centre[o] - track[:3], v - track[3:]
+        size = sight.ball[o] + a.reach + a.spare + bound[0] + _ASIDE
+        along, speed = (x * w).sum(axis=1), np.maximum(np.linalg.norm(w, axis=1), 1e-6)
+        s = np.sqrt(np.maximum((x * x).sum(axis=1) - size**2, (_TANGENT * size) ** 2))
+        normal = x + (s / speed)[:, None] * w
+        length = np.maximum(np.linalg.norm(normal, axis=1), 1e-9)
+        h = along + speed * s
+        needed = -_CONE * h - speed**2 - speed * along / s
+        needed = (needed - (normal * rise).sum(axis=1)) / length
+        some = np.flatnonzero((along < 0.0) & (-along < _HORIZON * speed**2) & (needed > -limit))
+        rows = rigid_rows(normal[some] / length[some, None], arms[some], self.deviation.scale[0])
+        return rows, needed[some], some
+
+    def _barriers(
+        self, o: int, r: Floats, v: Floats, rise: Floats, arms: Floats, limit: float, a: Avoidance
+    ) -> tuple[Floats, Floats, Ints]:
+        """Barriers of slots against obstacle o, which stands still, that may act; see `_cones`."""
+        solids = a.solids
+        at = own_axes(*r.T, o, solids)
+        away = signed_distance(*at, o, solids)
+        normal = np.stack(np.broadcast_arrays(*outward_normal(*at, o, solids)), axis=1)
+        if solids.turned[o]:
+            normal = normal @ solids.turn[o]
+        rate = (normal * v).sum(axis=1)
+        gap = away - a.reach - a.spare - np.maximum(0.0, -rate) * (self.period + a.lag)
+        strength = _STEERING * a.share * a.b
+        needed = needed_rate(gap, rate, 0.0, strength, _EARLIER * a.rate) - (normal * rise).sum(
+            axis=1
+        )
+        some = np.flatnonzero(needed > -limit)
+        rows = rigid_rows(normal[some], arms[some], self.deviation.scale[0])
+        return rows, needed[some], some
