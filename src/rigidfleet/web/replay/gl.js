@@ -598,7 +598,7 @@ export class Renderer {
     gl.uniform1f(uniforms.u_pixels, pixels * ratio);
     gl.uniform1f(uniforms.u_least, least * ratio);
     gl.uniform1f(uniforms.u_ground, ground ?? 0);
-    gl.uniform1f(uniforms.u_shade, ground === null ? 0 : 0.22);
+    gl.uniform1f(uniforms.u_shade, ground === null ? 0 : 0.14);
     gl.bindVertexArray(swarm.array);
     gl.bindBuffer(gl.ARRAY_BUFFER, swarm.places);
     gl.bufferData(gl.ARRAY_BUFFER, places, gl.DYNAMIC_DRAW);

@@ -514,6 +514,18 @@ class Solid {
     return mixed(ways[k], ways[k + 1], Math.max(0, Math.min(share, 1)));
   }
 
+  /** The last seconds of its middle's way. */
+  trail(scene, time, colour) {
+    const { times, there: [since] } = this.info, least = since ?? scene.recording.start;
+    if (times.length < 2) return;
+    // From waypoint to waypoint, and at even times for what fades.
+    const begin = Math.max(time - TRAIL, least, scene.recording.start), at = [begin, ...times.filter((t) => t > begin && t < time), time];
+    for (let k = 1; k < TRAIL; k++) if (time - k > begin) at.push(time - k);
+    at.sort((a, b) => a - b);
+    const place = (t) => add(this.middle, this.shift(t)), fresh = (t) => 0.7 * Math.pow(Math.max(0, 1 - (time - t) / TRAIL), 1.4);
+    for (let k = 1; k < at.length; k++) scene.lines.world.add(place(at[k - 1]), place(at[k]), 2, colour, fresh(at[k - 1]), fresh(at[k]));
+  }
+
   /** Place it at a time; a zone is a veil, and so is what hides vehicles. True while its opacity changes. */
   place(scene, time, wait) {
     this.solid.clear();
@@ -528,6 +540,7 @@ class Solid {
     const alpha = zone ? 0.12 : this.fade;
     (alpha < 1 ? this.veil : this.solid).add(add(this.middle, shift), 1, NO_TURN, colour, alpha);
     const edge = zone ? FENCE : RIM;
+    if (scene.show.trails) this.trail(scene, time, edge);
     for (let k = 0; k < lines.length; k += 2) {
       const a = add(corners[lines[k]], shift), b = add(corners[lines[k + 1]], shift);
       scene.lines.world.add(a, b, 1.2, edge, zone ? 0.5 : 0.25 + 0.35 * alpha);
