@@ -13,7 +13,7 @@ BUILD := $(BIN)/uv build --quiet --python $(BIN)/python --build-constraints cons
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test bench peers robustness avoidance exports docs package lint format constraints clean
+.PHONY: help setup demo test bench peers robustness avoidance exports replays docs package lint format constraints clean
 
 help:  ## Show this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' Makefile
@@ -47,6 +47,9 @@ avoidance: .venv/.bench .venv/.crowds  ## Plan transitions and published problem
 	@$(BIN)/python benchmarks/gaps.py
 	@$(BIN)/python benchmarks/crowds.py
 	@$(BIN)/python benchmarks/reciprocal.py
+
+replays: .venv/.dev  ## Measure replays in Chromium without a graphics card
+	@$(BIN)/python benchmarks/replay.py
 
 docs: .venv/.docs  ## Build the site into site/, with every figure on it
 	@$(BIN)/python docs/picture.py

@@ -258,9 +258,7 @@ def against(goals: Sequence[Goal], rounds: int) -> list[Row]:
     for k in range(rounds):
         for goal in goals:
             spent[goal.name].append(goal.spent(k))
-    return [
-        Row(g.name, spent[g.name], [g.time] * rounds, g.least, True, g.note) for g in goals
-    ]
+    return [Row(g.name, spent[g.name], [g.time] * rounds, g.least, True, g.note) for g in goals]
 
 
 def missions(rounds: int) -> list[Row]:

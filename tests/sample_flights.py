@@ -4,6 +4,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from rigidfleet.math import attitude as att
 from rigidfleet.mission import Mission
@@ -80,9 +81,8 @@ def swarm(n: int, seconds: float, **changes) -> Result:
 
 def _neighbours(slots: np.ndarray) -> np.ndarray:
     """Pairs no further apart than the diagonal of a square of four."""
-    apart = np.linalg.norm(slots[:, None] - slots[None], axis=2)
-    i, j = np.nonzero(np.triu(apart < 4.5, 1))
-    return np.stack([i, j], axis=1)
+    pairs = KDTree(slots).query_pairs(4.5, output_type="ndarray")
+    return pairs[np.lexsort(pairs.T[::-1])]
 
 
 def quadrotors(n: int, seconds: float) -> Result:

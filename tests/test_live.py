@@ -5,6 +5,7 @@ import http.client
 import json
 import math
 import queue
+import re
 import signal
 import socket
 import subprocess
@@ -12,6 +13,7 @@ import sys
 import threading
 import time
 from contextlib import closing
+from typing import Any
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -24,8 +26,9 @@ from rigidfleet.math import attitude as att
 from rigidfleet.mission import Mission, load_mission, mission_names
 from rigidfleet.result import Result
 from rigidfleet.simulation.flight import StoppedError
-from rigidfleet.web.live import live
+from rigidfleet.web.live import balls, live
 from rigidfleet.web.live import session as sessions
+from rigidfleet.web.live.guarding import guarded
 from rigidfleet.web.live.pilot import TICK, Gust, Pilot
 from rigidfleet.web.live.server import Server
 from rigidfleet.web.live.session import Session
@@ -236,6 +239,225 @@ def test_cannot_go_on(monkeypatch):
     assert after is before
 
 
+# -- obstacles
+
+
+def settled(**changes) -> Pilot:
+    """A pilot with the guard whose triangle hovers."""
+    pilot = Pilot(guarded(mission(**changes))[0])
+    flown(pilot, 7.0)
+    return pilot
+
+
+def places(pilot: Pilot) -> np.ndarray:
+    return pilot.flight.observe().position
+
+
+def target_slots(pilot: Pilot) -> np.ndarray:
+    """Where the target would have the vehicles."""
+    slots = pilot.flight.plan.slots
+    assert slots is not None
+    return slots @ pilot.target.attitude + pilot.target.r
+
+
+def kept(result: Result, ball: int) -> Any:
+    """A ball of the record."""
+    return result.mission.obstacles[ball]
+
+
+def clearance_of(result: Result, ball: int) -> float:
+    """Least distance of all samples from a ball of the record, from places alone."""
+    thing = kept(result, ball)
+    there = (result.time >= thing.appears) & (result.time <= (thing.vanishes or math.inf))
+    way = np.stack(
+        [np.interp(result.time[there], thing.times, axis) for axis in np.transpose(thing.waypoints)], axis=1
+    )  # fmt: skip
+    away = np.linalg.norm(result.position[there] - way[:, None], axis=2)
+    return float((away - thing.radius - result.mission.fleet.radius).min())
+
+
+def test_a_ball_is_avoided_and_kept():
+    """Vehicles give way to a ball that flies at one of them; the record has it: when, where, how it moved."""
+    pilot = settled()
+    start, appeared = places(pilot)[0] + [9.0, 0.0, 0.0], pilot.t
+    ball = pilot.push_in(start, 0.8, np.array([-2.0, 0.0, 0.0]))
+    flown(pilot, 7.0)
+    gone = pilot.t
+    np.testing.assert_allclose(ball.place, start - [14.0, 0.0, 0.0], atol=1e-9)
+    pilot.take_out(ball.slot)
+    flown(pilot, 1.0)
+    assert pilot.ending == ""
+    result = pilot.result()
+    index = len(TRIANGLE.obstacles)
+    thing = kept(result, index)
+    assert (thing.name, thing.kind, thing.radius) == ("ball 1", "sphere", 0.8)
+    assert (thing.appears, thing.vanishes) == pytest.approx((appeared, gone))
+    np.testing.assert_allclose(thing.waypoints, [start, start - [14.0, 0.0, 0.0]], atol=1e-9)
+    np.testing.assert_allclose(thing.times, [appeared, gone], atol=1e-9)
+    assert clearance_of(result, index) > 0.0
+    checks = {check.check: check for check in assess(result).checks}
+    assert checks["clearance"].passed
+    assert result.clearance_obstacle[result.time < appeared].max() < index
+    assert result.clearance_obstacle[result.time > gone].max() < index
+    assert index in result.clearance_obstacle
+
+
+def test_without_the_guard_contact_ends_the_flight():
+    """Points that nothing guards meet the ball; the flight ends, and says who met what and when."""
+    pilot = Pilot(mission())
+    flown(pilot, 7.0)
+    ball = pilot.push_in(places(pilot)[1] + [0.0, 0.0, 5.0], 1.0, np.array([0.0, 0.0, -2.0]))
+    flown(pilot, 4.0)
+    met = 7.0 + (5.0 - 1.25) / 2.0  # the surfaces
+    assert pilot.ending.startswith("agent 2 met 'ball 1' at 8.")
+    assert float(pilot.ending.split()[-2]) == pytest.approx(met, abs=TICK)
+    assert pilot.t == pytest.approx(met, abs=TICK)
+    place = ball.place.copy()
+    flown(pilot, 1.0)
+    np.testing.assert_array_equal(ball.place, place)
+    verdict = assess(pilot.result())
+    assert not verdict.passed
+    assert "agent 2 met 'ball 1'" in verdict.summary
+
+
+def test_a_ball_is_drawn():
+    """A ball follows where it is drawn to, no faster than allowed, and stays where it is let go."""
+    pilot = settled()
+    start = places(pilot).mean(axis=0) + [0.0, 12.0, 0.0]
+    ball = pilot.push_in(start, 0.5, np.zeros(3))
+    pilot.pull(ball.slot, start + [6.0, 0.0, 0.0])
+    before = ball.place
+    for _ in range(20):
+        pilot.step()
+        assert np.linalg.norm(ball.place - before) <= balls.FASTEST * TICK + 1e-12
+        before = ball.place
+    assert ball.place[0] > start[0] + 2.0
+    pilot.pull(ball.slot, None)
+    flown(pilot, 0.5)
+    np.testing.assert_array_equal(ball.place, before)
+    result = pilot.result()
+    thing = kept(result, -1)
+    assert thing.vanishes is None
+    np.testing.assert_allclose(thing.waypoints[-1], before)
+    pilot.pull(ball.slot, start)
+    flown(pilot, 4.0)
+    np.testing.assert_allclose(ball.place, start, atol=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("radius", "velocity", "away", "words"),
+    [
+        (0.01, 0.0, 9.0, "radius of a ball is 0.1 to 5 m, not 0.01 m"),
+        (9.0, 0.0, 30.0, "not 9 m"),
+        (1.0, 6.0, 9.0, "up to 5 m/s, not 6 m/s"),
+        (1.0, 0.0, 2.0, "0.75 m from agent 1: put it at least 1 m away"),
+    ],
+)
+def test_balls_have_limits(radius, velocity, away, words):
+    """A ball that is too small, large, fast or near is refused in one line, and the flight goes on as it was."""
+    pilot = settled()
+    place = places(pilot)[0] + [-away, 0.0, 0.0]
+    with pytest.raises(ValueError, match=re.escape(words)) as refused:
+        pilot.push_in(place, radius, np.array([velocity, 0.0, 0.0]))
+    assert "\n" not in str(refused.value)
+    assert pilot.balls == []
+
+
+def test_eight_balls_at_once():
+    """No more than eight balls are there at the same time; one that is gone makes room, and cannot be pushed."""
+    pilot = settled()
+    up = places(pilot).max(axis=0) + [0.0, 0.0, 10.0]
+    for k in range(balls.AT_ONCE):
+        assert pilot.push_in(up + [k, 0.0, 0.0], 0.3, np.zeros(3)).slot == k
+    with pytest.raises(ValueError, match="remove one first"):
+        pilot.push_in(up, 0.3, np.zeros(3))
+    pilot.step()
+    pilot.take_out(3)
+    with pytest.raises(ValueError, match="gone"):
+        pilot.pull(3, up)
+    assert pilot.push_in(up, 0.3, np.zeros(3)).name == "ball 9"
+    assert [ball.slot for ball in pilot.flying].count(3) == 1
+
+
+def test_the_target_stays_out_of_obstacles():
+    """The target does not enter ground or walls, along which it moves on; it says what holds it off."""
+    pilot = settled()
+    for _ in range(100):
+        pilot.steer(np.array([1.0, 0.0, -2.0]), np.zeros(3))
+        pilot.step()
+    assert pilot.held_off == "ground"
+    slots = target_slots(pilot)
+    assert 0.25 <= slots[:, 2].min() < 0.25 + 0.1 + 2.0 * TICK
+    assert pilot.target.r[0] > 9.0
+    flown(pilot, 4.0)
+    assert places(pilot)[:, 2].min() > 0.25
+    pilot.steer(np.array([0.0, 0.0, 1.0]), np.zeros(3))
+    pilot.step()
+    assert pilot.held_off == ""
+    for _ in range(400):
+        pilot.steer(np.array([4.0, 0.0, 0.0]), np.zeros(3))
+        pilot.step()
+    assert pilot.held_off == "hall"  # its west side is at x = 21 m
+    slots = target_slots(pilot)
+    assert 20.75 - 0.3 <= slots[:, 0].max() <= 20.75
+    assert pilot.ending == ""
+
+
+def test_a_formation_without_room_is_refused():
+    """A formation whose way leads through a wall is refused with the wall's name, and the one before stays."""
+    wall = {"kind": "box", "name": "wall", "min": [8.5, -10.0, 0.0], "max": [9.0, 20.0, 9.0]}
+    pilot = settled(obstacles=[{"kind": "ground"}, wall])
+    assert pilot.ending == ""
+    with pytest.raises(ValueError, match=r"'line' has no room here: agent 3 would meet 'wall'"):
+        pilot.change("line")
+    assert pilot.waiting is None
+
+
+def test_points_fly_with_the_guard():
+    """Live gives points vehicles and [avoidance], so that nothing is met; the text of the mission says it."""
+    flies, why = guarded(TRIANGLE)
+    assert why == ""
+    assert flies.avoidance is not None
+    assert Mission.from_toml(flies.text).avoidance == flies.avoidance
+    assert flies.fleet.mass.tolist() == TRIANGLE.fleet.mass.tolist()
+    assert flies.fleet.thrust_limit.tolist() == TRIANGLE.fleet.thrust_limit.tolist()
+    pilot = Pilot(flies)
+    records = flown(pilot, 8.0)
+    for k in range(120):
+        pilot.steer(np.array([1.0, -0.5, 0.25]), np.array([0.0, 0.0, 0.3 * (k < 40)]))
+        records.append(pilot.step())
+    assert max(map(slot_error, records)) < 6e-3
+    result = pilot.result()
+    assert "pushed" not in result.statistics  # no gust has blown
+    assert {check.check: check.passed for check in assess(result).checks}["guarantee"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "why"),
+    [
+        ({"agents": TRIANGLE.to_dict()["agents"] | {"thrust_limit": 9.0}}, "nothing to brake with"),
+        ({"obstacles": [{"kind": "ground", "height": 2.9}]}, "starts in an obstacle"),
+        (
+            {"agents": {k: x for k, x in TRIANGLE.to_dict()["agents"].items() if k != "thrust_limit"}},
+            "no limit of thrust",
+        ),
+    ],
+)  # fmt: skip
+def test_why_there_is_no_guard(changes, why):
+    """Where the guard cannot be had, the mission stays as it is, and the page says why."""
+    given = mission(**changes)
+    flies, words = guarded(given)
+    assert flies is given
+    assert why in words
+    assert why in Session(given).html()
+
+
+def test_the_guard_of_the_mission_stays():
+    """A mission with [avoidance] of its own is flown as it is."""
+    given = load_mission("moving-obstacles")
+    assert guarded(given) == (given, "")
+
+
 # -- what is kept of a flight
 
 
@@ -244,7 +466,7 @@ def by_hand(pilot: Pilot, seconds: float, change: float = math.inf) -> list:
     rng, records = np.random.default_rng(2), []
     for k in range(round(seconds / TICK)):
         if k % 8 == 0:
-            pilot.steer(rng.normal(size=3), 0.3 * rng.normal(size=3))
+            pilot.steer(rng.normal(size=3) + [0.0, 0.0, 0.7], 0.3 * rng.normal(size=3))
         if k == round(change / TICK) if math.isfinite(change) else False:
             pilot.change(next(name for name in pilot.formations if name != pilot.formation))
         records.append(pilot.step())
@@ -432,7 +654,7 @@ def test_samples_are_the_flight():
         name, data = told(messages)
     numbers = np.frombuffer(base64.b64decode(data), "<f4")
     n, m = 3, len(TRIANGLE.edges)
-    assert len(numbers) == 1 + 9 * n + 3 + 8 + m + (n + 3) + 7
+    assert len(numbers) == 1 + 9 * n + 3 + 8 + m + (n + 3) + 7 + 4 * balls.AT_ONCE
     position = numbers[1 : 1 + 3 * n].reshape(n, 3)
     np.testing.assert_allclose(position, TRIANGLE.agents.position, atol=0.05)
     session.command({"stop": True})

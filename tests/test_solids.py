@@ -242,6 +242,7 @@ def a_mission(obstacles: list[dict[str, Any]], until: float = 4.0, **agents: Any
         ({"kind": "heights", "spacing": 1.0}, "heights", "is missing", "file"),
         ({"kind": "heights", "spacing": 1.0, "file": "a.csv"}, "file", "only with a mission file", "give heights"),
         (TERRAIN | {"velocity": [1, 0, 0]}, "velocity", "unknown key", "corner"),
+        (BALL | {"appears": 3, "vanishes": 3}, "vanishes", "not after 3 s", "after it has appeared"),
         (BALL | {"times": [0, 1]}, "waypoints", "times need it", "add waypoints"),
         (BALL | {"waypoints": [[0, 0, 0], [1, 0, 0]]}, "times", "waypoints need it", "add times"),
         (BALL | {"waypoints": [[0, 0, 0], [1, 0, 0]], "times": [1]}, "times", "1 entries for 2", "each waypoint"),
@@ -332,6 +333,37 @@ def test_a_thin_wall_that_flies_past_between_samples_is_met(formulation):
     (remark,) = [r for r in check(mission).remarks if r.topic == "obstacle"]
     assert remark.level == "fails"
     assert "agent 1 hits 'plate' at 0.75 s" in remark.text
+
+
+@pytest.mark.parametrize(
+    ("since", "until"), [(0.0, 1.98765), (1.98765, 2.5), (2.43219, 3.0), (None, 1.1), (2.7, None), (5.0, 9.0)]
+)  # fmt: skip
+def test_an_obstacle_appears_and_vanishes(since, until):
+    """A point passes the place of a ball at 2 s: it counts while it is there, to the moment, and else is nowhere."""
+    ball = {"kind": "sphere", "centre": [0.0, 1.0, 20.0], "radius": 0.5}
+    ball |= {name: t for name, t in (("appears", since), ("vanishes", until)) if t is not None}
+    result = simulate(a_mission([ball], position=[[-4.0, 0.0, 20.0]], velocity=[[2.0, 0.0, 0.0]]))
+
+    def away(t):
+        return np.hypot(2.0 * t - 4.0, 1.0) - 0.75
+
+    begin, end = since or 0.0, min(until or 4.0, 4.0)
+    there = (result.time >= begin) & (result.time <= end)
+    sampled, _, _ = proximity.clearance(
+        result.position, 0.25, result.mission.obstacles, result.time
+    )
+    np.testing.assert_allclose(sampled[there], away(result.time[there]), atol=1e-9)
+    assert np.isinf(sampled[~there]).all()
+    found = result.phases[0].extremes.get("clearance")
+    if begin > 4.0:
+        assert found is None
+        return
+    when = float(np.clip(2.0, begin, end))
+    assert found is not None
+    assert found.time == pytest.approx(when, abs=1e-4)
+    assert found.value == pytest.approx(away(when), abs=1e-8)
+    planned = check(result.mission)
+    assert not [remark for remark in planned.remarks if remark.topic == "obstacle"]
 
 
 def test_a_ball_among_waypoints_comes_as_near_as_the_closed_form_says():

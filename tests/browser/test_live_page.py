@@ -130,6 +130,79 @@ def test_gust(page, session):
     page.wait(MOVED)
 
 
+def place_ball(page, session, x=180, y=120):
+    """Add a ball by a click beside the middle of the picture, once the formation is there."""
+    from selenium.webdriver import ActionChains
+
+    page.wait("return !replay.recording.info.busy")
+    page.click("#add-ball")
+    page.wait("return document.getElementById('word').textContent.startsWith('Click')")
+    view = page.driver.find_element("css selector", "#view")
+    ActionChains(page.driver).move_to_element_with_offset(view, x, y).click().perform()
+    page.wait("return replay.recording.info.balls.length === 1")
+    page.wait("return !Number.isNaN(replay.scene.state.balls[0])")
+    return session.pilot.balls[0]
+
+
+def test_a_ball_is_put_drawn_and_removed(page, session):
+    """A click puts a ball of the chosen size at the formation's height; it is drawn about, and removed."""
+    from selenium.webdriver import ActionChains
+
+    page.run(
+        "const s = document.getElementById('radius'); s.value = '0.7'; s.dispatchEvent(new Event('input'))"
+    )
+    ball = place_ball(page, session)
+    assert ball.radius == 0.7
+    height = page.run("return replay.recording.at(replay.recording.end).cm[2]")
+    assert ball.place[2] == pytest.approx(height, abs=0.05)
+    at = "const b = replay.scene.state.balls; return replay.scene.renderer.project([b[0], b[1], b[2]])"
+    x, y, _ = page.run(at)
+    before = ball.place.copy()
+    width, height = page.run("return [view.clientWidth, view.clientHeight]")
+    view = page.driver.find_element("css selector", "#view")
+    middle = round(x - width / 2), round(y - height / 2)
+    press = ActionChains(page.driver).move_to_element_with_offset(view, *middle)
+    press.click_and_hold().move_by_offset(60, 20).release().perform()
+    until(lambda: abs(ball.place - before).max() > 0.3)
+    until(lambda: not ball.velocity.any())
+    assert ball.place[2] == pytest.approx(before[2], abs=1e-2)
+    page.wait(f"const f = () => {{ {at} }}; const p = f(); return p && p[0] > {x} + 20")
+    page.click("#remove-ball")
+    until(lambda: not session.pilot.flying)
+    page.wait("return Number.isNaN(replay.scene.state.balls[0])")
+    assert page.run("return document.getElementById('remove-ball').disabled")
+    assert page.heard() == []
+
+
+def test_a_refused_ball_says_why(page, session):
+    """Where a ball would touch a vehicle it is refused; the page says why, until a command is taken."""
+    session.paused = True
+    page.wait("return replay.recording.info.paused")
+    page.run("document.getElementById('radius').value = '5'")
+    page.press("b")
+    page.wait("return document.getElementById('word').textContent.startsWith('Click')")
+    page.click("#view")
+    page.wait("return document.getElementById('word').textContent.includes('at least 1 m away')")
+    assert session.pilot.balls == []
+    page.click("#play")
+    page.wait("return document.getElementById('word').hidden")
+
+
+def test_contact_ends_the_flight_in_words(page, session):
+    """Whoever meets what ends the flight, in the page's own words."""
+    session.pilot.flight.ending = "agent 3 met 'left' at 4.20 s"
+    page.wait("return !document.getElementById('ending').hidden")
+    assert page.text("#ending") == "Incomplete: agent 3 met 'left' at 4.20 s"
+
+
+def test_held_off(page, session):
+    """A target that is held off by the ground is said to be."""
+    session.pilot.held_off = "ground"
+    page.wait(
+        "return document.getElementById('word').textContent === \"The target stays out of 'ground'\""
+    )
+
+
 def test_pause_and_speed(page, session):
     """The flight pauses and goes on, slower or faster."""
     page.click("#play")

@@ -6,10 +6,12 @@ import re
 import shutil
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from importlib import resources
 from threading import Thread
+from typing import Any
 
 import numpy as np
 import pytest
@@ -734,6 +736,79 @@ def test_hundreds(show):
     page.run("replay.scene.renderer.effort = 0.5; replay.play(true)")
     pictures = page.run("return replay.pictures")
     page.wait(f"return replay.pictures > {pictures} + 10", 60)
+
+
+def test_without_a_graphics_card(show, eight):
+    """The page knows that it is drawn in software, and does without what then takes long."""
+    page = show(eight)
+    assert page.run("return replay.scene.renderer.software")
+    assert not page.run("return replay.scene.renderer.gl.getContextAttributes().antialias")
+    assert page.run("return getComputedStyle(document.getElementById('bar')).boxShadow") == "none"
+
+
+def test_a_crowd_is_dots_while_it_moves(show):
+    """400 vehicles are dots while the picture moves, and have their shapes when it rests."""
+    page = show(swarm(400, 1.0), "t=0.5")
+    page.wait("return replay.scene.renderer.scale === 1 && !replay.stale")
+    assert (
+        page.run("return replay.scene.places.small.count + replay.scene.places.vehicles.count")
+        == 400
+    )
+    moving = "const s = replay.scene; s.renderer.scale = 0.5; s.draw(0.5, 0); return s.places.small.count"
+    assert page.run(moving) == 0
+    assert page.run("return replay.scene.swarm.count") == 400
+    assert page.heard() == []
+
+
+def test_a_swarm(show):
+    """Thousands are dots, except those near the eye; the page has no more columns than it draws."""
+    page = show(swarm(3001, 0.5), "t=0.2")
+    assert "Vehicles are dots" in page.text("#notes")
+    assert not {"slot", "thrust"} & set(page.run("return Object.keys(replay.recording.widths)"))
+    colours = """
+        const { renderer, camera } = replay.scene, { gl } = renderer, pixel = new Uint8Array(4);
+        replay.frame = () => {};
+        replay.scene.draw(0.2, 0);
+        const [x, y] = renderer.project(replay.scene.state.position.subarray(0, 3));
+        const s = renderer.canvas.width / renderer.canvas.clientWidth;
+        gl.readPixels(x * s, renderer.canvas.height - y * s, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, pixel);
+        return [Array.from(pixel).slice(0, 3), replay.scene.colours[0].map((c) => 255 * c)];
+    """
+    drawn, own = page.run(colours)
+    assert np.abs(np.array(drawn) - own).max() < 60  # light and haze change it a little
+    assert page.run("return replay.scene.places.vehicles.count") == 0
+    page.run(
+        "replay.scene.camera.zoom = 0.03; replay.scene.camera.shown = null; replay.scene.draw(0.2, 0)"
+    )
+    assert page.run("return replay.scene.places.vehicles.count") > 0
+
+
+def test_an_obstacle_comes_and_goes(show):
+    """An obstacle that appears and vanishes is drawn while it is there, with its way; the overview shows it."""
+    flown = swarm(4, 10.0)
+    data = flown.mission.to_dict()
+    ball: dict[str, Any] = {"kind": "sphere", "radius": 1.0, "appears": 3.0, "vanishes": 7.0}
+    ball |= {"waypoints": [[0.0, 9.0, 12.0], [8.0, 9.0, 12.0]], "times": [3.0, 7.0]}
+    far = {
+        "kind": "sphere",
+        "centre": [900.0, 0.0, 12.0],
+        "radius": 1.0,
+        "velocity": [50.0, 0.0, 0.0],
+    }
+    data["obstacles"] = [ball, far]
+    page = show(replace(flown, mission_text=Mission.from_dict(data).text))
+    drawn = """
+        replay.scene.draw(arguments[0], 0);
+        const { solid } = replay.scene.solids[0];
+        return Array.from(solid.data.subarray(0, 3 * solid.count));
+    """
+    page.run("replay.frame = () => {}")
+    assert page.run(drawn, 2.9) == []
+    np.testing.assert_allclose(page.run(drawn, 5.0), [4.0, 9.0, 12.0], atol=1e-3)
+    assert page.run(drawn, 7.1) == []
+    sight = np.array(page.run("return replay.recording.info.sight"))
+    assert sight[:, 0].max() < 50.0
+    np.testing.assert_allclose([sight[:, 0].min(), sight[:, 0].max()], [-1.0, 9.0], atol=0.2)
 
 
 def test_in_a_cell_of_a_notebook(browser, eight, tmp_path):

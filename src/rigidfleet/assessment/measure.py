@@ -144,7 +144,11 @@ class Measurements:
         self._formations: dict[str, tuple[Floats | None, Ints, Floats]] = {}
         #: Distances to each other and to obstacles at samples.
         self.close = proximity.closeness(
-            result.position, self.mission.agents.radius, self.mission.obstacles, result.time, self.left
+            result.position,
+            self.mission.agents.radius,
+            self.mission.obstacles,
+            result.time,
+            self.left,
         )
         thrust = _length(result.input_force + result.constraint_force)
         if self.mission.agents.saturate:
@@ -596,7 +600,11 @@ def _all_pairs(p: Floats, slots: Floats, laid: Laid) -> tuple[float, tuple[int, 
     """
     off, both = laid.off.tolist(), np.array([p, slots])
     order = sorted(range(len(off)), key=lambda i: -off[i])
-    ranked, rounding, few = [-off[i] for i in order], 1e-12 * float(laid.size), laid.lengths.tolist()
+    ranked, rounding, few = (
+        [-off[i] for i in order],
+        1e-12 * float(laid.size),
+        laid.lengths.tolist(),
+    )
     worst = (-1.0, (0, 0), 0.0, 0.0)
     for k, i in enumerate(order[:-1]):
         last = bisect_left(ranked, off[i] - worst[0] - rounding)

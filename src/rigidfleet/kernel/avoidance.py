@@ -61,7 +61,7 @@ def sight(
 ) -> Sight:
     """What is known of obstacles before the flight: nothing of those that move; see `Sight`."""
     count = len(solids.kind)
-    moves = solids.last[:count, 3] > solids.first[:count, 3]
+    moves = solids.last[:count, 3] > solids.first[:count, 3]  # also what appears or vanishes
     drawn = np.random.default_rng(seed).standard_normal(_DRAWS) if noise else np.zeros(1)
     centre, radius = np.zeros((count, 3)), np.zeros(count)
     for o in range(count):
@@ -187,7 +187,6 @@ def avoidance(
     solids = joined([]) if solids is None else solids
     n, count = len(b), len(solids.kind)
     capacity = n * (n - 1) if n <= _FEW else _NEIGHBOURS * n
-    rows = min(capacity // 2, _BARRIERS * n) + 2 * n * count
     radius = np.asarray(radius, dtype=float)
     return Avoidance(
         law=np.zeros(2, dtype=np.int64), guarded=guarded, filtered=filtered, period=float(period), rate=float(rate),
@@ -200,14 +199,11 @@ def avoidance(
         order=np.arange(n), listed=np.full((n, 3), np.inf), span=np.zeros(3),
         known=np.zeros((3, n, 3)), wanted=np.zeros((n, 3)), shift=np.zeros((n, 3)),
         chosen=np.zeros((n, 3)), rise=np.zeros((n, 3)), ways=np.zeros((n, 4, 3)),
-        far=np.zeros(n), walls=np.zeros((n, count)), threat=np.full(n, -1),
+        far=np.zeros(n), threat=np.full(n, -1),
         late=np.zeros(n), shifted=np.zeros((4, 3)), trial=np.zeros((5, 3)), normal=np.zeros(3),
-        rows=np.zeros((rows, 3), dtype=np.int64), normals=np.zeros((rows, 3)), missing=np.zeros(rows),
-        reduced=np.zeros(rows), push=np.zeros(rows), most=np.zeros(rows),
-        last=np.zeros(capacity + 2 * n * count), pushing=np.zeros(rows, dtype=np.int64),
         hold=np.ones(n), pull=np.zeros(edges),
         system=np.zeros((EXACT, EXACT)), right=np.zeros(EXACT), active=np.zeros(EXACT, dtype=np.int64),
-        count=np.zeros(3, dtype=np.int64), **_record(n),
+        count=np.zeros(3, dtype=np.int64), **_by_obstacle(n, count), **_record(n),
     )  # fmt: skip
 
 
@@ -215,6 +211,26 @@ def renewed(given: Avoidance) -> Avoidance:
     """The same avoidance in the next phase, which has a record of its own."""
     given.count[TICKS] = 0
     return given._replace(**_record(len(given.b)))
+
+
+def among(given: Avoidance, solids: Solids) -> Avoidance:
+    """The same avoidance among other obstacles; the first of them are those before, and what is known of them stays."""
+    before, seen = given.sight, sight(solids, given.sight.reach, 0.0, given.sight.swerve)
+    seen = seen._replace(noise=before.noise, normals=before.normals)
+    for mine, old in zip(seen[-4:], before[-4:], strict=True):  # what is known
+        mine[: len(old)] = old
+    return given._replace(solids=solids, sight=seen, **_by_obstacle(len(given.b), len(solids.kind)))
+
+
+def _by_obstacle(n: int, count: int) -> dict[str, Any]:
+    """Arrays whose size depends on the number of obstacles."""
+    capacity = n * (n - 1) if n <= _FEW else _NEIGHBOURS * n
+    rows = min(capacity // 2, _BARRIERS * n) + 2 * n * count
+    return {
+        "walls": np.zeros((n, count)), "rows": np.zeros((rows, 3), dtype=np.int64), "normals": np.zeros((rows, 3)),
+        "missing": np.zeros(rows), "reduced": np.zeros(rows), "push": np.zeros(rows), "most": np.zeros(rows),
+        "last": np.zeros(capacity + 2 * n * count), "pushing": np.zeros(rows, dtype=np.int64),
+    }  # fmt: skip
 
 
 def holding(given: Avoidance, edges: int) -> Avoidance:

@@ -17,7 +17,7 @@ from rigidfleet.kernel.avoidance import FOLLOWED, KNOWN, UNKNOWN
 from rigidfleet.kernel.compiler import elementwise  # noqa: F401 -- the functions of numbers below
 from rigidfleet.kernel.compiler.jit import compiled
 from rigidfleet.kernel.segments import from_obstacle, from_solid, least_along
-from rigidfleet.solids.distance import displacement
+from rigidfleet.solids.distance import displacement, is_there
 
 #: Standard deviations that bounds of an estimate have.
 _SIGMAS = 3.0
@@ -116,6 +116,9 @@ def look(t, r, lost, a):
     k = int(t / T + 0.5)
     for o in range(s.moves.shape[0]):
         if s.moves[o] == 0:
+            continue
+        if not is_there(t, o, a.solids):
+            s.known[o] = UNKNOWN
             continue
         x, y, z = displacement(t, o, a.solids)
         u, v, w = velocity(t + 0.5 * T, o, a.solids)

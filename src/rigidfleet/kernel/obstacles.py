@@ -29,6 +29,7 @@ from rigidfleet.kernel.records import Monitor
 from rigidfleet.solids.distance import (
     displacement,
     from_box,
+    is_there,
     off_triangle,
     outward_normal,
     own_axes,
@@ -214,13 +215,17 @@ def into_own_axes(x, y, z, t, b, s):
 def watch_solid(i, b, curve, t, h, s, monitor):
     """Clearance of agent i's surface to solid b over a piece of a step."""
     radius, part, own = monitor.radius[i], monitor.curves[1], monitor.curves[2]
-    start, way, last = 0.0, s.first[b, 3], s.last[b, 3]
-    while start < 1.0:
-        end = 1.0
+    start, stop, way, last = 0.0, 1.0, s.first[b, 3], s.last[b, 3]
+    if s.there[b, 0] > t:
+        start = (s.there[b, 0] - t) / h
+    if s.there[b, 1] < t + h:
+        stop = (s.there[b, 1] - t) / h
+    while start < stop:
+        end = stop
         while way < last and s.times[way] <= t + start * h:
             way += 1
         if way < last and s.times[way] < t + h:
-            end = min(1.0, max((s.times[way] - t) / h, start + _SHORTEST))
+            end = min(stop, max((s.times[way] - t) / h, start + _SHORTEST))
         if start > 0.0 or end < 1.0:
             cut(curve, start, end, monitor.scratch[2], part)
             into_axes(part, t + start * h, (end - start) * h, b, s, own)
@@ -256,6 +261,8 @@ def watch_landing(i, curve, t, s, monitor):
     if not (monitor.standing[i] != 0 or monitor.low[i, 0] < math.inf):
         return
     for b in range(s.kind.shape[0]):
+        if not is_there(t, b, s):
+            continue
         x, y, z = into_own_axes(curve[4, 0], curve[4, 1], curve[4, 2], t, b, s)
         near = monitor.radius[i] + monitor.pad
         if far_from(x, y, z, b, s) <= near and signed_distance(x, y, z, b, s) <= near:

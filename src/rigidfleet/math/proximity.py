@@ -276,7 +276,7 @@ def closeness(
     given = [r, radius, time, left]
     for things, before, found in _last[-1:]:
         if things is obstacles and all(map(_same, given, before)):
-            return Closeness(*(x.copy() for x in found))
+            return Closeness._make(x.copy() for x in found)
     each, nearest = obstacle_clearances(r, radius, obstacles, time)
     if not left.all():
         each[~left] = np.inf
@@ -284,7 +284,7 @@ def closeness(
         *separation_of_left(r, radius, left), each, nearest, *least_clearance(each, nearest)
     )
     if r.nbytes <= _KEPT:
-        copies = Closeness(*(x.copy() for x in found))
+        copies = Closeness._make(x.copy() for x in found)
         _last[:] = [(obstacles, [x.copy() for x in given], copies)]
     return found
 
@@ -325,7 +325,21 @@ def obstacle_clearances(
 def distances(
     x: Floats, y: Floats, z: Floats, solid: Solids, time: ArrayLike = 0.0, most: ArrayLike = np.inf
 ) -> Floats:
-    """Signed distance (...) [m] of points to a solid at ``time``; points farther than ``most`` may have infinity."""
+    """Signed distance (...) [m] of points to a solid at ``time``, infinite while it is not there.
+
+    Points farther than ``most`` may have infinity, too.
+    """
+    found = _while_there(x, y, z, solid, time, most)
+    if not np.isfinite(solid.there).any():
+        return found
+    there = distance.is_there(np.asarray(time, dtype=float).T, 0, solid)
+    return np.where(there, found, np.inf)
+
+
+def _while_there(
+    x: Floats, y: Floats, z: Floats, solid: Solids, time: ArrayLike, most: ArrayLike
+) -> Floats:
+    """Signed distance (...) [m] of points to a solid where it is, or would be, at ``time``."""
     if solid.moves:
         shift = distance.displacement(np.asarray(time, dtype=float).T, 0, solid)
         x, y, z = x - shift[0], y - shift[1], z - shift[2]

@@ -55,6 +55,11 @@ class Solid(Part):
         """Displacements (W, 3) [m] and their times (W,) [s]; empty if the obstacle does not move."""
         return (), ()
 
+    @property
+    def there(self) -> tuple[float, float]:
+        """Times from which and until which the obstacle is there [s]."""
+        return records.ALWAYS
+
     @cached_property
     def solid(self) -> Solids:
         """The obstacle as arrays.
@@ -65,7 +70,7 @@ class Solid(Part):
             The points of a hull lie in a plane.
         """
         ways, times = self.motion
-        return records.single(self.form, times, ways)
+        return records.single(self.form, times, ways, self.there)
 
 
 class Moving(Solid):
@@ -82,6 +87,13 @@ class Moving(Solid):
     times: tuple[Seconds, ...] | None = Field(
         None, description="mission times of the waypoints [s], increasing"
     )
+    appears: Seconds | None = Field(
+        None,
+        description="mission time from which the obstacle is there [s]; default: from the start",
+    )
+    vanishes: Seconds | None = Field(
+        None, description="mission time until which it is there [s]; default: to the end"
+    )
 
     @property
     def motion(self) -> tuple[Any, Any]:
@@ -89,8 +101,18 @@ class Moving(Solid):
         if self.velocity is not None and any(self.velocity):
             return np.outer([0.0, _EVER], self.velocity), np.array([0.0, _EVER])
         if self.waypoints is None:
-            return (), ()
+            still = np.isfinite(self.there).any()  # one that appears counts as one that moves
+            return (np.zeros((1, 3)), np.zeros(1)) if still else ((), ())
         return np.array(self.waypoints) - self.centre_of_form, np.array(self.times)
+
+    @property
+    def there(self) -> tuple[float, float]:
+        """Times from which and until which the obstacle is there [s]."""
+        since, until = records.ALWAYS
+        return (
+            since if self.appears is None else self.appears,
+            until if self.vanishes is None else self.vanishes,
+        )
 
     @property
     def centre_of_form(self) -> Any:
@@ -266,6 +288,10 @@ def checked(collector: FindingCollector, kind: type[Part], data: Any, k: int) ->
 
 def _motion(collector: FindingCollector, thing: Moving, path: Keys) -> bool:
     ways, times = thing.waypoints, thing.times
+    if not thing.there[0] < thing.there[1]:
+        problem = f"is not after {thing.there[0]:g} s, when the obstacle appears"
+        collector.add((*path, "vanishes"), problem, "let it vanish after it has appeared")
+        return False
     if thing.velocity is not None and ways is not None:
         collector.add((*path, "velocity"), "has no effect with waypoints", "remove one of them")
         return False

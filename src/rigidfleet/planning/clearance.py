@@ -7,6 +7,8 @@ way needs no look inside, and every other is halved.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from rigidfleet.kernel.problem import Motion, Reference
@@ -14,6 +16,7 @@ from rigidfleet.math import proximity, series
 from rigidfleet.mission import Obstacle
 from rigidfleet.planning.derivatives import slot_derivatives
 from rigidfleet.planning.preview import PlannedPhase
+from rigidfleet.solids.records import Solids
 from rigidfleet.typing import Floats
 
 #: Accuracy of a planned clearance [m].
@@ -81,7 +84,8 @@ def closest(
     middle, and so on.
     """
     leg, time, moves = planned.leg, planned.time, thing.solid.moves
-    each, _ = proximity.obstacle_clearances(planned.position, radius, [thing], time)
+    met = _from_sample_to_sample(thing, time)
+    each, _ = proximity.obstacle_clearances(planned.position, radius, [met], time)
     k, i = np.unravel_index(int(each.argmin()), each.shape)
     best, agent, when = float(each[k, i]), int(i), float(time[k])
     first, length = time[:-1], np.diff(time)
@@ -89,14 +93,14 @@ def closest(
     for _ in range(_HALVINGS):
         way = speed * length[:, None]
         if moves:
-            way = way + _way(thing, first, first + length)[:, None]
+            way = way + _way(met, first, first + length)[:, None]
         open_ = np.flatnonzero((0.5 * (near + far - way)).min(axis=1) < best - CLOSE)
         if not len(open_) or len(open_) * each.shape[1] > _OPEN:
             break
         first, length = first[open_], 0.5 * length[open_]
         middle = first + length
         r = slot_derivatives(leg.reference, leg.motion, middle, 1)[:, 0]
-        between, _ = proximity.obstacle_clearances(r, radius, [thing], middle)
+        between, _ = proximity.obstacle_clearances(r, radius, [met], middle)
         k, i = np.unravel_index(int(between.argmin()), between.shape)
         if between[k, i] < best:
             best, agent, when = float(between[k, i]), int(i), float(middle[k])
@@ -106,9 +110,26 @@ def closest(
     return best, agent, when
 
 
-def _way(thing: Obstacle, begin: Floats, end: Floats) -> Floats:
+class _Thing(NamedTuple):
+    """An obstacle that is there from one sample to another."""
+
+    solid: Solids
+
+
+def _from_sample_to_sample(thing: Obstacle, time: Floats) -> Obstacle | _Thing:
+    """The obstacle; one that appears or vanishes is taken to be there from the sample before to the one after."""
+    if not np.isfinite(thing.solid.there).any():
+        return thing
+    since, until = thing.solid.there[0]
+    first = max(int(np.searchsorted(time, since, side="right")) - 1, 0)
+    last = min(int(np.searchsorted(time, until)), len(time) - 1)
+    there = np.array([[min(time[first], since), max(time[last], until)]])
+    return _Thing(thing.solid._replace(there=there))
+
+
+def _way(thing: Obstacle | _Thing, begin: Floats, end: Floats) -> Floats:
     """Greatest way (L,) [m] of an obstacle between times (L,) [s]: its greatest speed counts wherever it moves."""
     solid = thing.solid
     speed = np.linalg.norm(np.diff(solid.ways, axis=0), axis=1) / np.diff(solid.times)
     within = (solid.times[:-1] < end[:, None]) & (solid.times[1:] > begin[:, None])
-    return np.where(within, speed, 0.0).max(axis=1) * (end - begin)
+    return np.where(within, speed, 0.0).max(axis=1, initial=0.0) * (end - begin)

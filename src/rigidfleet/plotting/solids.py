@@ -56,9 +56,12 @@ def shapes(mission: Mission, begin: float, end: float, low: Floats, high: Floats
         solid = thing.solid
         at = way = np.zeros((1, 3))
         if solid.moves:
-            first, last = max(begin, solid.times[0]), min(end, solid.times[-1])
-            at = places(solid, np.linspace(first, max(first, last), _PLACES))
-            way = places(solid, np.linspace(begin, end, _WAY))
+            since, until = np.clip(solid.there[0], begin, end)
+            if solid.there[0, 0] > end or solid.there[0, 1] < begin:
+                continue
+            first, last = np.clip(solid.times[[0, -1]], since, until)
+            at = places(solid, np.linspace(first, last, _PLACES))
+            way = places(solid, np.linspace(since, until, _WAY))
         grid = None
         if solid.kind[0] == HEIGHTS:
             x, y = (

@@ -34,6 +34,11 @@ def as_flown(
     data.pop("source", None)  # it no longer reproduces a figure
     data["name"] = f"{mission.name.removesuffix('-live')}-live"
     data["title"] = f"{mission.title or mission.name}, flown by hand"
+    own = data.get("obstacles", [])
+    pushed = mission.obstacles[len(own) :]  # in flight, by hand
+    if pushed:
+        told = [thing.model_dump(mode="json", exclude_unset=True) for thing in pushed]
+        data["obstacles"] = [*own, *told]
     as_given = dict(data)
     data |= _flown_data(mission, data, asked, records, step)
     try:

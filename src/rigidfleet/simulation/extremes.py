@@ -19,7 +19,7 @@ from rigidfleet.kernel.engine import native
 from rigidfleet.kernel.problem import Problem, Workspace
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
-from rigidfleet.mission import Mission
+from rigidfleet.mission import Mission, Obstacle
 from rigidfleet.result import PAD, Extremum, PhaseRecord
 from rigidfleet.solids.records import Solids, joined
 from rigidfleet.typing import Bools, Floats, Ints
@@ -30,6 +30,8 @@ _FEW = 40
 _SPARE = 0.5
 #: Least such distance, as a share of the fleet's size over the root of its number; agents may be at the same place.
 _LEAST = 0.1
+#: Overlap with an obstacle from which on it is a contact [m].
+_TOUCH = 1e-6
 #: Shortest piece of a step, as a share of the step.
 _SHORTEST = 2.0**-20
 #: Agents whose bounds are computed at a time.
@@ -91,12 +93,7 @@ class Extremes:
         agents, limits = mission.agents, mission.limits
         self.n = mission.n_agents
         self.radius = np.array(agents.radius, dtype=float)
-        corners = [thing.corners for thing in mission.obstacles]
-        #: Obstacles of all kinds, unless all are boxes that the monitor itself takes.
-        self.solids = None
-        if None in corners:
-            self.solids, corners = joined([thing.solid for thing in mission.obstacles]), []
-        self.boxes = np.array(corners).reshape(-1, 6)
+        self._take_obstacles(mission.obstacles)
         fence = limits.geofence
         self.fence = np.array([] if fence is None else [*fence.min, *fence.max]).reshape(-1, 6)
         self.stacks = self.n <= _FEW or limits.separation_below is not None
@@ -115,6 +112,30 @@ class Extremes:
         self.avoidance: avoidance.Avoidance | None = None  # that of the phase under way
         self.led: dict[str, Extremum] = {}  # what its clock and its body layer did
         self._list_all()
+
+    def _take_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
+        corners = [thing.corners for thing in obstacles]
+        #: Obstacles of all kinds, unless all are boxes that the monitor itself takes.
+        self.solids = None
+        if None in corners:
+            self.solids, corners = joined([thing.solid for thing in obstacles]), []
+        self.boxes = np.array(corners).reshape(-1, 6)
+
+    def among(self, obstacles: Sequence[Obstacle]) -> None:
+        """Continue among these obstacles; the first of them are those before."""
+        self._take_obstacles(obstacles)
+        if len(self.trail.points):
+            found = self.monitor.monitor
+            self.monitor = native.Watch(found._replace(boxes=self.boxes, flags=found.flags.copy()))
+
+    def contact(self) -> Extremum | None:
+        """The deepest contact of a vehicle in flight with an obstacle so far; None if there was none."""
+        found = self._extremum("clearance_flight", records.FLYING)
+        near = np.where(self.left & (self.standing == 0), self.low[:, 0], np.inf)
+        i = int(near.argmin())
+        if near[i] < (np.inf if found is None else found.value):
+            found = Extremum(float(near[i]), float(self.low[i, 1]), i, int(self.low[i, 2]))
+        return found if found is not None and found.value < -_TOUCH else None
 
     @property
     def reusable(self) -> bool:

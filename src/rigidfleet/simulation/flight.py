@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time as clock
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -14,15 +14,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rigidfleet.errors import FlightError, MissionError, StoppedError, wrong_type
+from rigidfleet.kernel.avoidance import among
 from rigidfleet.kernel.problem import TRACKING, Motion
 from rigidfleet.math import attitude as att
 from rigidfleet.math import lqr
-from rigidfleet.mission import Mission, Phase, as_mission
+from rigidfleet.mission import Mission, Obstacle, Phase, as_mission
 from rigidfleet.planning.losses import after_loss
 from rigidfleet.planning.plan import PhasePlan, plan_phase
 from rigidfleet.planning.reference import PhaseState, Pose
 from rigidfleet.planning.timing import with_times
-from rigidfleet.result import PhaseRecord, Result
+from rigidfleet.result import Extremum, PhaseRecord, Result
 from rigidfleet.simulation.active_phase import ActivePhase, Sampler
 from rigidfleet.simulation.as_flown import as_flown, check_formation, with_phase
 from rigidfleet.simulation.callbacks import (
@@ -37,6 +38,7 @@ from rigidfleet.simulation.preparation import prepared
 from rigidfleet.simulation.recording import Piece, assemble
 from rigidfleet.simulation.sampled_phase import SampledPhase, Vehicles
 from rigidfleet.simulation.sampling import Sampling, times_asked
+from rigidfleet.solids.records import joined
 from rigidfleet.typing import Floats
 
 if TYPE_CHECKING:
@@ -494,6 +496,26 @@ class Flight:
         result = assemble(mission, phases, pieces, ending=ending, statistics=statistics)
         result.mission = mission  # keeps the slots assigned and edges that it has computed
         return result
+
+    def among(self, obstacles: Sequence[Obstacle]) -> None:
+        """Fly on among these obstacles: the first are those before, others may be new or move in other ways.
+
+        `mission` has them from now on, its text has not.
+        """
+        if self._active is not None:
+            self._active.watch(last=True)
+        self.mission = self.mission.model_copy(update={"obstacles": tuple(obstacles)})
+        self._extremes.among(obstacles)
+        vehicles = self._vehicles
+        if vehicles is not None and vehicles.avoidance is not None:
+            solids = joined([thing.solid for thing in obstacles])
+            vehicles.avoidance = among(vehicles.avoidance, solids)
+
+    def contact(self) -> Extremum | None:
+        """The deepest contact of a vehicle in flight with an obstacle so far, with vehicle and obstacle, or None."""
+        if self._active is not None:
+            self._active.watch(last=True)
+        return self._extremes.contact()
 
     # -- inside -----------------------------------------------------------------------------------
 

@@ -273,6 +273,11 @@ def displacement(t: Numbers, b: int, s: Any) -> Any:
     return x, y, z
 
 
+def is_there(t: Numbers, b: int, s: Any) -> Any:
+    """Whether solid b is there at time t [s]: some appear, and vanish."""
+    return (t >= s.there[b, 0]) & (t <= s.there[b, 1])
+
+
 def own_axes(x: Numbers, y: Numbers, z: Numbers, b: int, s: Any) -> Any:
     """Coordinates in the axes of solid b, without its motion, of a point in the world."""
     if s.turned[b] == 0:
@@ -289,5 +294,5 @@ def own_axes(x: Numbers, y: Numbers, z: Numbers, b: int, s: Any) -> Any:
 #: The functions that the kernel compiles, each after those that it calls.
 ELEMENTWISE = (
     from_box, box_normal, from_cylinder, cylinder_normal, off_segment, side, off_triangle, below, off_surface, within,
-    signed_distance, outward_normal, displacement, own_axes,
+    signed_distance, outward_normal, displacement, is_there, own_axes,
 )  # fmt: skip

@@ -42,6 +42,7 @@ class Solids(NamedTuple):
     leaf: Ints  # (M, 2) triangles of a node: the first, and after the last; none: an inner node
     triangles: Floats  # (T, 3, 3) corners [m]
     heights: Floats  # (H,) [m]
+    there: Floats  # (B, 2) times from which and until which it is there [s]; infinite: always
     times: Floats  # (W,) of waypoints, increasing [s]
     ways: Floats  # (W, 3) displacement at these times [m]
 
@@ -63,6 +64,8 @@ class Form(NamedTuple):
     heights: Floats = np.zeros((0, 0))
 
 
+#: Times from which and until which a solid is there that always is [s].
+ALWAYS = (-math.inf, math.inf)
 _UPRIGHT = np.eye(3)
 _MIDDLE = np.zeros(3)
 
@@ -160,8 +163,13 @@ def _cells(top: Floats) -> list[Floats]:
 # -- many solids in one record -------------------------------------------------------------------------
 
 
-def single(form: Form, times: ArrayLike = (), ways: ArrayLike = ()) -> Solids:
-    """The record of one solid, which moves in straight lines: displacements (W, 3) [m] at times (W,) [s]."""
+def single(
+    form: Form, times: ArrayLike = (), ways: ArrayLike = (), there: ArrayLike = ALWAYS
+) -> Solids:
+    """The record of one solid, which moves in straight lines: displacements (W, 3) [m] at times (W,) [s].
+
+    It is there from the first time of ``there`` (2,) [s] until the second.
+    """
     times = np.asarray(times, dtype=float)
     ways = np.asarray(ways, dtype=float).reshape(-1, 3)
     triangles, nodes, after, leaf = _tree(form.triangles)
@@ -171,7 +179,7 @@ def single(form: Form, times: ArrayLike = (), ways: ArrayLike = ()) -> Solids:
         np.array([form.kind]), form.origin[None], form.turn[None], np.array([int(turned)]),
         np.array([form.size], dtype=float), np.array([form.rounding]), np.zeros((1, 4), dtype=np.int64),
         np.array([last]), np.array([[*form.heights.shape]]), nodes, after, leaf, triangles,
-        form.heights.reshape(-1), times, ways,
+        form.heights.reshape(-1), np.array([there], dtype=float), times, ways,
     )  # fmt: skip
 
 

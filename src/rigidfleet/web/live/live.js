@@ -2,6 +2,7 @@
 
 import { Player, digits, element, part, say } from "../replay/player.js";
 import { Recording } from "../replay/recording.js";
+import { add, dot, length, scaled, sub, unit } from "../replay/gl.js";
 
 const KEPT = 12000; // greatest number of samples
 const SPAN = 30; // time range of the plots [s]
@@ -10,12 +11,15 @@ const HANDS = { // each key with the control that it moves: forward, left, up; r
   q: ["turn", 2, 1], e: ["turn", 2, -1],
 };
 
-/** Send a command to the flight; show why it is refused. */
+const CLEAR = 14; // least size of a ball to a pointer [px]
+
+let refusal = ""; // why the last command was refused, until another is taken
+
+/** Send a command to the flight; the page says why it is refused. */
 async function order(command) {
   const answer = await fetch("command", { method: "POST", body: JSON.stringify(command) }).catch(() => null);
-  if (!answer || answer.ok) return;
-  part("ending").textContent = await answer.text();
-  part("ending").hidden = false;
+  if (answer && !(answer.ok && ("move" in command || "pull" in command))) refusal = answer.ok ? "" : await answer.text();
+  window.replay?.speak();
 }
 
 const FAREWELL = "The flight has ended. This page can be closed.";
@@ -26,6 +30,8 @@ class LivePlayer extends Player {
     this.hand = { move: [0, 0, 0], turn: [0, 0, 0] };
     this.keys = new Set();
     this.idle = true; // no command to send
+    this.arming = false; // whether the next click puts a ball
+    this.held = null; // the ball that is drawn: its slot, the pointer and the place it is drawn to
     this.build(recording.info);
     this.hear(recording.info);
     this.resize();
@@ -58,7 +64,29 @@ class LivePlayer extends Player {
     }
     const label = element("label", card, { class: "lever" }, "force");
     this.strength = element("input", label, { type: "range", min: "0.5", max: "8", step: "0.5", value: "3", id: "strength" });
-    element("p", card, {}, "Keys: W A S D move, R F up and down, Q E turn, space pauses");
+    const ball = element("section", card, { id: "ball" });
+    element("h2", ball, {}, "Ball");
+    const row = element("div", ball, { class: "row" });
+    const add_ = element("button", row, { type: "button", id: "add-ball", title: "Click in the picture where it shall be (b)" }, "Add ball");
+    add_.addEventListener("click", () => this.arm(!this.arming));
+    const remove = element("button", row, { type: "button", id: "remove-ball", title: "Remove the ball with the ring (x)" }, "Remove");
+    remove.addEventListener("click", () => this.removeBall());
+    const setting = (id, text, unit, most, value) => {
+      const lever = element("label", ball, { class: "lever value" }, text), { radius: [least] } = info.ball;
+      const input = element("input", lever, { type: "range", min: id === "radius" ? String(least) : "0", max: String(most), step: "0.1", value, id });
+      const told = element("output", lever), tell = () => (told.textContent = `${input.value} ${unit}`);
+      input.addEventListener("input", tell);
+      tell();
+    };
+    setting("radius", "radius", "m", info.ball.radius[1], "1");
+    setting("fling", "speed", "m/s", info.ball.speed, "0");
+    const guard = info.unguarded ? `Contact ends the flight: there is no guard (${info.unguarded})` : "Vehicles keep clear of balls, walls and ground";
+    element("p", card, { id: "guard" }, guard);
+    element("p", card, {}, "Keys: W A S D move, R F up and down, Q E turn, B adds a ball, drag moves it; space pauses");
+    part("ending").after(document.createElement("p"));
+    part("ending").nextSibling.id = "word";
+    part("word").setAttribute("role", "status");
+    part("word").hidden = true;
     const controls = part("controls"), before = part("cameras");
     const add = (id, text, title, deed) => {
       const button = element("button", controls, { type: "button", id, title }, text);
@@ -108,10 +136,99 @@ class LivePlayer extends Player {
     for (const end of ["pointerup", "pointercancel", "blur", "keyup"]) input.addEventListener(end, back);
   }
 
+  // -- balls --
+
+  /** Put the next ball where the picture is clicked, or not. */
+  arm(on) {
+    this.arming = on;
+    part("add-ball").setAttribute("aria-pressed", String(on));
+    part("view").style.cursor = on ? "crosshair" : "";
+    this.speak();
+  }
+
+  /** Where a pointer is at the height of a point; `upright`: in the upright plane through it that faces the eye. */
+  pointed(event, through, upright) {
+    const { renderer, camera } = this.scene, ray = renderer.ray(event.clientX, event.clientY), { eye } = camera;
+    let normal = [0, 0, 1];
+    if (upright || Math.abs(ray[2]) < 0.05) normal = unit([eye[0] - through[0], eye[1] - through[1], 0]);
+    const along = dot(ray, normal), far = along ? dot(sub(through, eye), normal) / along : 0;
+    return far > 0 && far < 1e4 ? add(eye, scaled(ray, far)) : null;
+  }
+
+  /** The ball under a pointer: the nearest one to the eye. */
+  under(event) {
+    const { scene } = this, { balls } = scene.state;
+    let found = null, least = Infinity;
+    for (const { slot } of this.recording.info.balls) {
+      const place = Array.from(balls.subarray(4 * slot, 4 * slot + 3)), seen = scene.renderer.project(place);
+      if (!seen) continue; // behind the eye, or not shown yet
+      const size = Math.max(CLEAR, balls[4 * slot + 3] / scene.sized(place, 1));
+      if (Math.hypot(seen[0] - event.clientX, seen[1] - event.clientY) < size && seen[2] < least) [found, least] = [{ slot, place }, seen[2]];
+    }
+    return found;
+  }
+
+  grab(event) {
+    if (this.over || this.back || event.button !== 0) return false;
+    const cm = Array.from(this.scene.state.cm);
+    if (this.arming) {
+      const place = this.pointed(event, cm, false);
+      if (!place) return true;
+      const way = sub(cm, place), speed = Number(part("fling").value);
+      order({ ball: place, radius: Number(part("radius").value), velocity: scaled(length(way) > 1e-6 ? unit(way) : [0, 0, 0], speed) });
+      this.arm(false);
+      return true;
+    }
+    const ball = this.under(event);
+    if (!ball) return false;
+    this.choose(ball.slot);
+    this.held = { slot: ball.slot, id: event.pointerId, to: null, place: ball.place };
+    return true;
+  }
+
+  drag(event) {
+    if (this.held?.id !== event.pointerId) return;
+    const { held } = this, to = this.pointed(event, held.to ?? held.place, event.shiftKey);
+    if (to) held.to = to;
+  }
+
+  release(event) {
+    if (this.held?.id !== event.pointerId) return;
+    const { slot, to } = this.held;
+    this.held = null;
+    order({ pull: slot, to }); // it stops when it is there; one that was not drawn stops at once
+  }
+
+  choose(slot) {
+    this.scene.chosen = slot;
+    this.stale = true;
+  }
+
+  removeBall() {
+    const { balls } = this.recording.info, chosen = balls.find(({ slot }) => slot === this.scene.chosen) ?? balls.at(-1);
+    if (chosen) order({ remove: chosen.slot });
+  }
+
+  /** Say what a command could not do, or what the next click does. */
+  speak() {
+    const { held_off } = this.recording.info;
+    const words = refusal || (this.arming ? "Click where the ball shall be" : held_off ? `The target stays out of '${held_off}'` : "");
+    const text = words && words[0].toUpperCase() + words.slice(1);
+    if (part("word").textContent === text) return;
+    part("word").textContent = text;
+    part("word").hidden = !text;
+    this.resize(); // the card begins below
+  }
+
   // -- controls --
 
   press(event, down) {
     const key = event.key.toLowerCase();
+    if (down && !event.repeat && !event.ctrlKey && !event.metaKey && !event.altKey && !this.over && !part("help").open) {
+      if (key === "b") this.arm(!this.arming);
+      if (key === "escape") this.arm(false);
+      if (key === "x") this.removeBall();
+    }
     if (!(key in HANDS) || event.ctrlKey || event.metaKey || event.altKey || event.target.tagName === "SELECT") return;
     if (down) this.keys.add(key);
     else this.keys.delete(key);
@@ -125,6 +242,7 @@ class LivePlayer extends Player {
 
   /** Send the state of the controls to the flight. */
   push() {
+    if (this.held?.to) order({ pull: this.held.slot, to: this.held.to });
     const move = [...this.hand.move], turn = [...this.hand.turn], all = { move, turn };
     for (const key of this.keys) {
       const [group, k, sign] = HANDS[key];
@@ -159,6 +277,11 @@ class LivePlayer extends Player {
     part("speed").value = String(story.speed);
     this.writeStory(info);
     this.mark(!story.paused);
+    this.scene.ballNames = [];
+    for (const { slot, name } of info.balls) this.scene.ballNames[slot] = name;
+    if (!(this.scene.chosen in this.scene.ballNames)) this.choose(info.balls.at(-1)?.slot);
+    part("remove-ball").disabled = !info.balls.length;
+    this.speak();
     for (const button of this.choices.children) {
       const mine = button.dataset.formation;
       button.setAttribute("aria-pressed", String(mine === story.formation));
@@ -183,7 +306,8 @@ class LivePlayer extends Player {
   }
 
   keys() {
-    const own = [["W A S D", "move the target: away, left, towards you, right"], ["R F", "raise or lower the target"], ["Q E", "turn the target left or right"]];
+    const own = [["W A S D", "move the target: away, left, towards you, right"], ["R F", "raise or lower the target"], ["Q E", "turn the target left or right"],
+      ["B", "add a ball where the picture is clicked"], ["X", "remove the ball with the ring"], ["drag a ball", "move it; with Shift up and down"]];
     return [...own, ...super.keys().map(([keys, deed]) => [keys, keys === "space" ? "pause or continue" : deed])];
   }
 

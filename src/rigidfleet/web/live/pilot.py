@@ -1,4 +1,4 @@
-"""A flight by hand: the user moves the target of the virtual body during the flight.
+"""A flight by hand: the user moves the target of the virtual body, and pushes balls in, during the flight.
 
 In each tick the reference follows the target smoothly along one piece of a quintic. The control laws
 are the mission's own.
@@ -14,14 +14,17 @@ import numpy as np
 
 from rigidfleet.errors import FlightError
 from rigidfleet.math import attitude as att
+from rigidfleet.math import proximity
 from rigidfleet.mission import Establish, Hold, Mission, Phase, Reshape
 from rigidfleet.planning.plan import PhasePlan
 from rigidfleet.planning.reference import Pose
 from rigidfleet.result import PhaseRecord, Result
 from rigidfleet.simulation.flight import Flight
 from rigidfleet.simulation.recording import assemble
-from rigidfleet.typing import Floats
+from rigidfleet.typing import Floats, Ints
+from rigidfleet.web.live import balls
 from rigidfleet.web.live.archive import Archive, rows
+from rigidfleet.web.live.balls import Ball
 
 TICK = 0.05  # time between readings of the user's commands [s]
 _BLEND = 4.0  # duration of a change of formation [s]
@@ -35,6 +38,7 @@ _ACCELERATION, _TURN = 3.0, 1.5  # greatest accelerations of the reference [m/s^
 _FINEST = 1e-3  # least time between stored samples [s]
 #: Time without a command after which the controls count as released [s of mission time].
 _GRIP = 0.6
+_LOOK = 0.1  # greatest way of the target between two looks at obstacles [m]
 
 
 @dataclass
@@ -83,6 +87,8 @@ class Pilot:
     target : the target pose of the body
     formations : names of those that can be flown
     waiting : the next formation; None if there is none
+    balls : all that were pushed in, also those that are gone
+    held_off : the obstacle that the target does not enter; "" if it is where it was moved
 
     Raises
     ------
@@ -102,6 +108,11 @@ class Pilot:
         self.archive = Archive(max(mission.output_step, _FINEST))
         self.flight = Flight(mission, force=self._wind, sampler=self._samples, flips=True)
         self.gusts: list[Gust] = []
+        self.gusted = False  # whether there was any
+        self.balls: list[Ball] = []
+        self.moved = False  # whether the flight does not know all balls as they are
+        self.held_off = ""
+        self.at_rest = [thing for thing in mission.obstacles if not thing.solid.moves]
         self.waiting: str | None = None
         self.by_body = mission.architecture == "body"
         self.fastest = 0.7 * mission.limits.speed if mission.limits.speed else math.inf
@@ -151,7 +162,26 @@ class Pilot:
         self.target.turn, self.target.held = turn, self.t
 
     def change(self, formation: str) -> None:
-        """Change to another formation as soon as the current change is complete."""
+        """Change to another formation as soon as the current change is complete.
+
+        Raises
+        ------
+        ValueError
+            It has no room where the target is.
+        """
+        slots, before = self.mission.formation_slots(formation), self.flight.plan.slots
+        assert slots is not None  # of all formations flown
+        assert before is not None
+        far = float(np.linalg.norm(slots - before, axis=1).max())
+        share = np.linspace(0.0, 1.0, math.ceil(far / _LOOK) + 2)[1:, None, None]
+        way = before + share * (slots - before)  # straight and in step
+        room, agent, which = self._room(self.target.r + way @ self.target.attitude)
+        k = int(room.argmin())
+        if formation != self.formation and room[k] < 0.0:
+            name = self.at_rest[which[k]].name
+            raise ValueError(
+                f"'{formation}' has no room here: agent {agent[k] + 1} would meet '{name}'. Move the target away"
+            )
         self.waiting = formation if formation != self.formation else None
 
     def gust(self, direction: Floats, strength: float) -> None:
@@ -159,7 +189,73 @@ class Pilot:
         if self.ending:
             return
         d = direction / np.linalg.norm(direction)
+        self.gusted = True
         self.gusts.append(Gust(self.t, float((self._places() @ d).min()), d, strength))
+
+    def push_in(self, place: Floats, radius: float, velocity: Floats) -> Ball:
+        """Add a ball at ``place`` (3,) [m] that flies with a constant velocity (3,) [m/s].
+
+        Raises
+        ------
+        ValueError
+            The ball is too small, large, fast, or near a vehicle, or there are too many.
+        """
+        taken = {ball.slot for ball in self.flying}
+        speed = float(np.linalg.norm(velocity))
+        if len(taken) >= balls.AT_ONCE:
+            raise ValueError(f"there are {balls.AT_ONCE} balls already: remove one first")
+        if len(self.balls) >= balls.IN_A_FLIGHT:
+            raise ValueError(f"a flight takes {balls.IN_A_FLIGHT} balls: begin a new one")
+        if not balls.SMALLEST <= radius <= balls.LARGEST:
+            raise ValueError(
+                f"the radius of a ball is {balls.SMALLEST:g} to {balls.LARGEST:g} m, not {radius:g} m"
+            )
+        if speed > balls.FASTEST:
+            raise ValueError(f"a ball flies at up to {balls.FASTEST:g} m/s, not {speed:.3g} m/s")
+        away = np.linalg.norm(self._places() - place, axis=1) - self.mission.fleet.radius - radius
+        i = int(away.argmin())
+        if away[i] < balls.ROOM:
+            raise ValueError(
+                f"the ball would be {max(away[i], 0.0):.2g} m from agent {i + 1}: put it at least {balls.ROOM:g} m away"
+            )
+        slot = min(set(range(balls.AT_ONCE)) - taken)
+        ball = Ball(len(self.balls) + 1, slot, radius, place.copy(), velocity.copy(), self.t)
+        self.balls.append(ball)
+        return ball
+
+    @property
+    def flying(self) -> list[Ball]:
+        """The balls that are there."""
+        return [ball for ball in self.balls if ball.until is None]
+
+    def ball(self, slot: int) -> Ball:
+        """The ball that has a slot of the page.
+
+        Raises
+        ------
+        ValueError
+            There is none.
+        """
+        for ball in self.flying:
+            if ball.slot == slot:
+                return ball
+        raise ValueError("this ball is gone")
+
+    def pull(self, slot: int, goal: Floats | None) -> None:
+        """Draw a ball to a goal (3,) [m], or let go of it: it stays where it is."""
+        ball = self.ball(slot)
+        ball.goal = goal
+        if goal is None:
+            ball.turn(np.zeros(3))
+
+    def take_out(self, slot: int) -> None:
+        """Remove a ball."""
+        ball = self.ball(slot)
+        self.moved = True
+        if ball.turns:
+            ball.until = self.t
+        else:  # nobody has met it
+            self.balls.remove(ball)
 
     def step(self) -> Result:
         """Fly one tick; return the record of its end alone.
@@ -177,13 +273,19 @@ class Pilot:
                 self._hold()
         if not flight.ending:
             self._follow(TICK)
-            flight.advance(self.ticks * TICK - self.t)
+            self._push()
+            t = self.t
+            flight.advance(self.ticks * TICK - t)
+            for ball in self.flying:
+                ball.move(self.t - t)
+            self._touch()
         if flight.pieces or self.last is None:
             end = [rows(flight.pieces[-1], [-1])] if flight.pieces else []
             # A record of one moment has no extremes
             phases = [replace(p, extremes={}) for p in self.phases]
-            result = assemble(self.mission, phases, end, ending="", statistics={})
-            result.mission = self.mission  # so that it is not parsed again
+            mission = flight.mission  # with the balls
+            result = assemble(mission, phases, end, ending="", statistics={})
+            result.mission = mission  # so that it is not parsed again
             self.last = result
             self.archive.add(flight.pieces, result)
         return self.last
@@ -196,9 +298,17 @@ class Pilot:
         ending = self.ending
         if not ending and self.busy:
             ending = f"ended by hand on the way to '{self.formation}'"
+        now = self.flight.mission.obstacles
+        flown = [ball.flown(self.t) for ball in self.balls if ball.turns]
+        self.flight.mission = self.flight.mission.model_copy(
+            update={"obstacles": (*self.mission.obstacles, *flown)}
+        )
         result = self.flight.record(
             self.archive.pieces(), self.asked, step=self.archive.step, ending=ending
         )
+        self.flight.mission = self.flight.mission.model_copy(update={"obstacles": now})
+        if not self.gusted:
+            result.statistics.pop("pushed", None)
         result.statistics["simulated_s"] = float(result.time[-1])
         return result
 
@@ -268,9 +378,7 @@ class Pilot:
         """Move the target as commanded, and the reference after it, over the next tick."""
         target, pose = self.target, self.pose
         if self.t - target.held <= _GRIP:
-            target.r += h * target.move
-            target.euler += h * target.turn
-            target.euler[1] = np.clip(target.euler[1], -1.2, 1.2)  # clear of the poles
+            self._shift(h)
         away = att.rotation_vector_from_dcm(target.attitude @ pose.T.T)  # body axes
         r, v, a = _pulled(target.r - pose.r, pose.v, self.a, h, _ACCELERATION)
         phi, omega, alpha = _pulled(away, pose.omega, self.alpha, h, _TURN)
@@ -287,6 +395,69 @@ class Pilot:
             T = att.dcm_from_rotation_vector(phi) @ pose.T
             self.pose = Pose(pose.r + r, v, T, omega)
             self.a, self.alpha = a, alpha
+
+    def _shift(self, h: float) -> None:
+        """Move and turn the target as commanded, but no slot deeper into an obstacle or the ground."""
+        target, held_off = self.target, ""
+        turned = target.euler + h * target.turn
+        turned[1] = np.clip(turned[1], -1.2, 1.2)  # clear of the poles
+        room, _, _ = self._room(self._slots_at(target.r[None], target.attitude))
+        least = min(float(room[0]), 0.0)
+        if target.turn.any():
+            after, _, which = self._room(self._slots_at(target.r[None], att.dcm_from_euler(turned)))
+            if after[0] >= least:
+                target.euler = turned
+            else:
+                held_off = self.at_rest[which[0]].name
+        way = h * target.move
+        parts = [way] if np.count_nonzero(way) < 2 else [way, *(way * row for row in np.eye(3))]
+        for k, part in enumerate(parts):  # along what stands in the way
+            looks = math.ceil(float(np.linalg.norm(part)) / _LOOK)
+            if not looks:
+                continue
+            path = target.r + np.linspace(0.0, 1.0, looks + 1)[1:, None] * part
+            after, _, which = self._room(self._slots_at(path, target.attitude))
+            if (after >= least).all():
+                target.r = target.r + part
+                if k == 0:
+                    break
+            else:
+                held_off = self.at_rest[which[int(after.argmin())]].name
+        self.held_off = held_off
+
+    def _room(self, places: Floats) -> tuple[Floats, Ints, Ints]:
+        """Least room (K,) [m] of vehicles at places (K, N, 3) beside obstacles at rest, agent and obstacle (K,)."""
+        return proximity.clearance(places, self.mission.fleet.radius, self.at_rest)
+
+    def _slots_at(self, r: Floats, T: Floats) -> Floats:
+        """Places (K, N, 3) [m] of the slots with the body at r (K, 3) in an attitude T (3, 3)."""
+        slots = self.flight.plan.slots
+        assert slots is not None  # every formation flown has slots
+        return r[:, None] + slots @ T
+
+    # -- obstacles --------------------------------------------------------------------------------
+
+    def _push(self) -> None:
+        """Tell the flight of balls that are new, gone, or fly another way."""
+        for ball in self.flying:
+            ball.lead()
+        fresh = [ball for ball in self.flying if ball.changed]
+        for ball in fresh:
+            ball.tell(self.t)
+        if fresh or self.moved:
+            self.moved = False
+            seen = [
+                ball.ahead(self.t) if ball.until is None else ball.flown(self.t)
+                for ball in self.balls
+            ]
+            self.flight.among((*self.mission.obstacles, *seen))
+
+    def _touch(self) -> None:
+        """End the flight if a vehicle has met an obstacle."""
+        met = None if self.flight.ending else self.flight.contact()
+        if met is not None:
+            name = self.flight.mission.obstacles[met.other].name
+            self.flight.ending = f"agent {met.who + 1} met '{name}' at {met.time:.2f} s"
 
     # -- wind -------------------------------------------------------------------------------------
 

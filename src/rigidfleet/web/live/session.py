@@ -16,6 +16,8 @@ import numpy as np
 from rigidfleet.math import attitude as att
 from rigidfleet.mission import Mission
 from rigidfleet.result import Result, plain
+from rigidfleet.web.live.balls import AT_ONCE, FASTEST, LARGEST, SMALLEST
+from rigidfleet.web.live.guarding import guarded
 from rigidfleet.web.live.pilot import TICK, Pilot
 from rigidfleet.web.replay.page import page, read
 from rigidfleet.web.replay.scene import describe, observe, sight, weight
@@ -30,6 +32,7 @@ _LATE = 0.3  # greatest delay that is made up for [s]
 _PATIENCE = 4.0
 _FAREWELL = 1.0  # time for pages to receive the end [s]
 _FASTEST, _TURNING, _STRONGEST = 50.0, 3.0, 20.0  # greatest values of commands [m/s, rad/s, N/kg]
+_FARTHEST = 1e5  # greatest coordinate of a ball [m]
 _WAITING = 64  # greatest number of messages queued for a slow page; further ones are dropped
 
 
@@ -42,7 +45,8 @@ class Session:
     """
 
     def __init__(self, mission: Mission, landed: Callable[[Result], str] | None = None) -> None:
-        self.mission, self.landed = mission, landed
+        self.mission, self.unguarded = guarded(mission)
+        self.landed = landed
         self.farewell = ""
         self.shown = np.arange(min(len(mission.edges), _EDGES))
         self.tension = _TENSION * weight(mission)
@@ -78,7 +82,11 @@ class Session:
             start = self.mission.fleet.position
             near = sight(self.mission, start.min(axis=0) - _AROUND, start.max(axis=0) + _AROUND)
             info = describe(self.mission, self.mission.edges[self.shown], self.tension) | {
-                "columns": [*widths, {"name": "target", "width": 7}],
+                "columns": [
+                    *widths,
+                    {"name": "target", "width": 7},
+                    {"name": "balls", "width": 4 * AT_ONCE},
+                ],
                 "count": 0,
                 "start": 0.0,
                 "step": TICK,
@@ -91,6 +99,8 @@ class Session:
                 "sight": near,
                 "azimuth": -1.1,
                 "formations": self.pilot.formations,
+                "unguarded": self.unguarded,
+                "ball": {"radius": [SMALLEST, LARGEST], "speed": FASTEST},
                 "speeds": SPEEDS,
                 **self.story(),
             }
@@ -108,6 +118,8 @@ class Session:
             "formation": pilot.formation,
             "waiting": pilot.waiting,
             "busy": pilot.busy,
+            "balls": [{"slot": b.slot, "name": b.name} for b in pilot.flying],
+            "held_off": pilot.held_off,
             "paused": self.paused,
             "speed": self.speed,
             "pace": self.pace,
@@ -147,9 +159,17 @@ class Session:
             *(c.values.ravel() for c in columns),
             target.r,
             att.quaternion_from_dcm(target.attitude),
+            self._balls(),
         ]
         numbers = np.concatenate(values).astype("<f4")
         return _event("sample", base64.b64encode(numbers.tobytes()).decode("ascii"))
+
+    def _balls(self) -> np.ndarray:
+        """Place and radius of each ball of the page; nan where there is none."""
+        found = np.full((AT_ONCE, 4), np.nan)
+        for ball in self.pilot.flying:
+            found[ball.slot] = *ball.place, ball.radius
+        return found.ravel()
 
     # -- commands ---------------------------------------------------------------------------------
 
@@ -173,6 +193,15 @@ class Session:
                     if not direction.any():
                         raise ValueError("a gust needs a direction")
                     self.pilot.gust(direction, strength)
+                case {"ball": place, "radius": radius, "velocity": velocity}:
+                    place, velocity = _vector(place, _FARTHEST), _vector(velocity, _FASTEST)
+                    self.pilot.push_in(place, _number(radius, _FARTHEST), velocity)
+                case {"pull": int(slot), "to": None}:
+                    self.pilot.pull(slot, None)
+                case {"pull": int(slot), "to": place}:
+                    self.pilot.pull(slot, _vector(place, _FARTHEST))
+                case {"remove": int(slot)}:
+                    self.pilot.take_out(slot)
                 case {"pause": bool(paused)}:
                     self.paused = paused
                 case {"speed": float(speed) | int(speed)} if speed in SPEEDS:

@@ -30,6 +30,8 @@ _SAMPLES = (
 )
 _HEIGHT = 600  # height in a notebook [px]
 _EDGES = 3000  # greatest number of edges drawn; more would hide the vehicles
+#: Number of vehicles beyond which each is a dot, unless it is near; columns that dots do without.
+_SWARM, _SHAPES = 3000, ("thrust", "turn", "rotors", "slot")
 #: Least and greatest tension that the full colour of an edge stands for, as a share of a vehicle's weight.
 _IDLE, _HEAVY = 0.005, 2.0
 
@@ -89,7 +91,9 @@ def html_page(result: Result) -> str:
     most = float(np.nanmax(np.abs(result.multiplier[:, shown]), initial=0.0))
     scale = weight(result.mission)
     tension = min(max(most, _IDLE * scale), _HEAVY * scale)
-    columns = observe(result, shown, tension)
+    columns, swarm = observe(result, shown, tension), result.n_agents > _SWARM
+    if swarm:  # dots have neither attitudes nor slots
+        columns = {k: c for k, c in columns.items() if k not in _SHAPES}
     described, data = pack(
         {
             name: PackedColumn(_sampled(result, c.values, time), c.step)
@@ -100,7 +104,7 @@ def html_page(result: Result) -> str:
     if result.interpolation is not None:  # nobody knows the thrust
         info["plots"] = [plot for plot in info["plots"] if plot["column"] != "thrust plot"]
     info |= {"columns": described, "count": len(time), "beyond": most > tension}
-    info |= {"note": _note(result, shown, tension, most)}
+    info |= {"note": _note(result, shown, tension, most), "swarm": swarm}
     return page(info, start="replay/replay.js", data=data)
 
 
@@ -144,7 +148,7 @@ def _story(result: Result, time: Floats) -> dict[str, Any]:
     """Information on the page about a finished flight."""
     low, high = result.position.min(axis=(0, 1)), result.position.max(axis=(0, 1))
     extent, reach = float(np.linalg.norm(high - low)) / 2, size(result)
-    seen = sight(result.mission, low, high)
+    seen = sight(result.mission, low, high, float(result.time[0]), float(result.time[-1]))
     least, most = seen.min(axis=0), seen.max(axis=0)
     way = (result.cm[-1] - result.cm[0])[:2]
     far = float(np.linalg.norm(way)) > 2 * reach
@@ -178,6 +182,8 @@ def _story(result: Result, time: Floats) -> dict[str, Any]:
 
 def _note(result: Result, shown: Ints, tension: float, most: float) -> str:
     words = []
+    if result.n_agents > _SWARM:
+        words.append("Vehicles are dots, without trails and slots.")
     if len(shown) < len(result.edges):
         words.append(f"Only the {len(shown)} shortest of {len(result.edges)} edges are drawn.")
     if len(shown) and most < tension:

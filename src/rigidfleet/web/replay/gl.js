@@ -170,10 +170,34 @@ export function smallVehicleMesh() {
   return mesh;
 }
 
+/** The simplest one, for crowds that are drawn without a graphics card: a body and four flat squares. */
+export function farVehicleMesh() {
+  const mesh = new Mesh();
+  mesh.prism([0, 0, -0.1], 0.3, 0, 0.4, 3, OWN);
+  for (const [, x, y] of ROTORS) mesh.quad([x + 0.4, y, 0.12], [x, y + 0.4, 0.12], [x - 0.4, y, 0.12], [x, y - 0.4, 0.12], OWN);
+  return mesh;
+}
+
 /** An arrow ahead of vehicles whose own yaw is known. */
 export function noseMesh() {
   const mesh = new Mesh().box([0.3, -0.05, -0.03], [1, 0.05, 0.03], DARK);
   mesh.triangle([0.95, 0.24, 0], [0.95, -0.24, 0], [1.45, 0, 0], DARK);
+  return mesh;
+}
+
+/** A ball of radius 1. */
+export function ballMesh() {
+  const mesh = new Mesh(), N = 12;
+  const at = (i, j) => {
+    const a = (Math.PI * i) / N, b = (Math.PI * j) / N;
+    return [Math.sin(a) * Math.cos(b), Math.sin(a) * Math.sin(b), Math.cos(a)];
+  };
+  for (let i = 0; i < N; i++) {
+    for (let j = 0; j < 2 * N; j++) {
+      if (i > 0) mesh.triangle(at(i, j), at(i + 1, j), at(i, j + 1), OWN);
+      if (i < N - 1) mesh.triangle(at(i + 1, j), at(i + 1, j + 1), at(i, j + 1), OWN);
+    }
+  }
   return mesh;
 }
 
@@ -337,6 +361,33 @@ void main() {
   colour = vec4(v_colour.rgb, v_colour.a * clamp(v_across.y - abs(v_across.x), 0.0, 1.0));
 }`;
 
+// Vehicles of a swarm, one dot each.
+const DOT_VERTEX = `#version 300 es
+layout(location=0) in vec3 a_position;
+layout(location=1) in float a_radius;
+layout(location=2) in vec4 a_colour;
+uniform mat4 u_view;
+uniform vec3 u_eye, u_background;
+uniform float u_fog, u_pixels, u_least, u_ground, u_shade; // a shade lies on the ground
+out vec4 v_colour;
+${FOG}
+void main() {
+  vec3 place = u_shade > 0.0 ? vec3(a_position.xy, u_ground) : a_position;
+  gl_Position = u_view * vec4(place, 1.0);
+  gl_PointSize = 2.0 * max(a_radius * u_pixels / max(gl_Position.w, 1e-6), u_least);
+  v_colour = u_shade > 0.0 ? vec4(0.13, 0.15, 0.18, u_shade) : vec4(fogged(a_colour.rgb, place), 1.0);
+}`;
+
+const DOT_FRAGMENT = `#version 300 es
+precision mediump float;
+in vec4 v_colour;
+out vec4 colour;
+void main() {
+  vec2 d = gl_PointCoord - 0.5;
+  if (dot(d, d) > 0.25) discard;
+  colour = vec4(v_colour.rgb * (1.05 - 0.4 * gl_PointCoord.y), v_colour.a);
+}`;
+
 const GROUND_VERTEX = `#version 300 es
 uniform mat4 u_view;
 uniform vec3 u_centre;
@@ -369,7 +420,9 @@ void main() {
 /** Whether WebGL runs in software, without a graphics card. */
 function inSoftware() {
   const gl = document.createElement("canvas").getContext("webgl2");
-  const name = String(gl?.getParameter(gl.RENDERER));
+  // Chromium names the renderer in an extension alone.
+  const told = gl?.getExtension("WEBGL_debug_renderer_info");
+  const name = `${gl?.getParameter(gl.RENDERER)} ${told ? gl.getParameter(told.UNMASKED_RENDERER_WEBGL) : ""}`;
   gl?.getExtension("WEBGL_lose_context")?.loseContext();
   return /swiftshader|llvmpipe|softpipe|software|basic render/i.test(name);
 }
@@ -377,16 +430,17 @@ function inSoftware() {
 export class Renderer {
   constructor(canvas) {
     // Antialiasing is free on a graphics card, and four times the work in software.
-    const gl = canvas.getContext("webgl2", { alpha: false, antialias: !inSoftware(), powerPreference: "high-performance" });
+    this.software = inSoftware();
+    const gl = canvas.getContext("webgl2", { alpha: false, antialias: !this.software, powerPreference: "high-performance" });
     if (!gl) throw new Error("WebGL 2 is not available");
     this.canvas = canvas;
     this.gl = gl;
-    this.software = inSoftware();
     this.effort = this.software ? 0.7 : 1; // share of the resolution, lowered where drawing is slow
     this.scale = 1;
     this.mesh = this.program(MESH_VERTEX, PLAIN_FRAGMENT);
     this.line = this.program(LINE_VERTEX, LINE_FRAGMENT);
     this.grid = this.program(GROUND_VERTEX, GROUND_FRAGMENT);
+    this.dot = null; // made for swarms alone
     this.items = gl.createTexture();
     this.rows = 0;
     this.corners = gl.createVertexArray(); // of segments, two triangles each
@@ -453,7 +507,7 @@ export class Renderer {
     gl.clearColor(...BACKGROUND, 1);
     gl.depthMask(true);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
-    for (const { program, uniforms } of [this.mesh, this.line, this.grid]) {
+    for (const { program, uniforms } of [this.mesh, this.line, this.grid, this.dot].filter(Boolean)) {
       gl.useProgram(program);
       gl.uniformMatrix4fv(uniforms.u_view, false, this.view);
       if (uniforms.u_background) gl.uniform3fv(uniforms.u_background, BACKGROUND);
@@ -516,6 +570,41 @@ export class Renderer {
     }
   }
 
+  /** Vehicles that are drawn as dots: radii (n,) and colours (n x 4 bytes), which do not change. */
+  swarm(radius, colours) {
+    const { gl } = this, array = gl.createVertexArray(), places = gl.createBuffer();
+    this.dot ??= this.program(DOT_VERTEX, DOT_FRAGMENT);
+    gl.bindVertexArray(array);
+    const column = (index, buffer, data, width, kind, scaled) => {
+      gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
+      if (data) gl.bufferData(gl.ARRAY_BUFFER, data, gl.STATIC_DRAW);
+      gl.enableVertexAttribArray(index);
+      gl.vertexAttribPointer(index, width, kind, scaled, 0, 0);
+    };
+    column(0, places, null, 3, gl.FLOAT, false);
+    column(1, gl.createBuffer(), radius, 1, gl.FLOAT, false);
+    column(2, gl.createBuffer(), colours, 4, gl.UNSIGNED_BYTE, true);
+    gl.bindVertexArray(null);
+    return { array, places, count: radius.length };
+  }
+
+  /**
+   * Draw a swarm at its places (n x 3), or its shades on the ground at a height. `pixels` cover a metre at 1 m, and no dot
+   * has a smaller radius than `least` [px].
+   */
+  dots(swarm, places, pixels, least, ground = null) {
+    const { gl } = this, { program, uniforms } = this.dot, ratio = this.canvas.width / Math.max(this.canvas.clientWidth, 1);
+    gl.useProgram(program);
+    gl.uniform1f(uniforms.u_pixels, pixels * ratio);
+    gl.uniform1f(uniforms.u_least, least * ratio);
+    gl.uniform1f(uniforms.u_ground, ground ?? 0);
+    gl.uniform1f(uniforms.u_shade, ground === null ? 0 : 0.14);
+    gl.bindVertexArray(swarm.array);
+    gl.bindBuffer(gl.ARRAY_BUFFER, swarm.places);
+    gl.bufferData(gl.ARRAY_BUFFER, places, gl.DYNAMIC_DRAW);
+    gl.drawArrays(gl.POINTS, 0, swarm.count);
+  }
+
   lines(lines) {
     if (!lines.count) return;
     const { gl } = this;
@@ -523,6 +612,14 @@ export class Renderer {
     gl.useProgram(this.line.program);
     gl.bindVertexArray(this.corners);
     gl.drawElements(gl.TRIANGLES, 6 * lines.count, gl.UNSIGNED_INT, 0);
+  }
+
+  /** Direction in the world in which a point of the page [px] is seen. */
+  ray(x, y) {
+    const { eye, target, right, fov, centre } = this.camera, back = unit(sub(eye, target)), up = cross(back, right);
+    const { clientWidth: wide, clientHeight: high } = this.canvas, t = Math.tan(fov / 2);
+    const a = ((2 * x) / wide - 1 - centre[0]) * t * (wide / high), b = (1 - (2 * y) / high - centre[1]) * t;
+    return unit(add(add(scaled(right, a), scaled(up, b)), scaled(back, -1)));
   }
 
   /** Position of a point on the page [px] and its distance ahead [m]; null behind the camera. */

@@ -1,6 +1,7 @@
 // The page around the picture: timeline, speed, cameras, plots, keys.
 
-import { CAMERAS, Scene, tensionColour } from "./scene.js";
+import { Renderer } from "./gl.js";
+import { CAMERAS, LEAST_EFFORT, Scene, tensionColour } from "./scene.js";
 
 const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 4, 8, 16];
 const KEYS = [
@@ -17,7 +18,7 @@ const KEYS = [
 ];
 const SHOWN = { edges: "edges", trails: "trails", slots: "slots", axes: "body axes", names: "names" };
 const ALERT = "#b00020";
-const SLOW = 1 / 24; // seconds per picture above which the resolution is lowered
+const SLOW = 1 / 31; // seconds per picture above which the resolution is lowered
 
 export const part = (id) => document.getElementById(id);
 
@@ -203,7 +204,7 @@ class Plot {
 // -- the player -----------------------------------------------------------------------------------------
 
 export class Player {
-  constructor(recording) {
+  constructor(recording, renderer = new Renderer(part("view"))) {
     const { info } = recording;
     this.recording = recording;
     this.time = recording.start;
@@ -213,7 +214,8 @@ export class Player {
     this.stale = true;
     this.slow = 0;
     this.told = 0;
-    this.scene = new Scene(part("view"), part("labels"), recording);
+    this.scene = new Scene(renderer, part("labels"), recording);
+    document.documentElement.classList.toggle("software", renderer.software);
     this.write(info);
     const go = (share) => this.seek(this.span()[0] + share * (this.span()[1] - this.span()[0]));
     this.plots = info.plots.map((plot) => new Plot(part("plots"), plot, recording, go));
@@ -323,14 +325,18 @@ export class Player {
     view.addEventListener("contextmenu", (event) => event.preventDefault());
     view.addEventListener("pointerdown", (event) => {
       view.setPointerCapture(event.pointerId);
+      if (this.grab(event)) return;
       fingers.set(event.pointerId, event);
     });
-    const away = (event) => fingers.delete(event.pointerId);
+    const away = (event) => {
+      fingers.delete(event.pointerId);
+      this.release(event);
+    };
     view.addEventListener("pointerup", away);
     view.addEventListener("pointercancel", away);
     view.addEventListener("pointermove", (event) => {
       const before = fingers.get(event.pointerId);
-      if (!before) return;
+      if (!before) return this.drag(event);
       const dx = event.clientX - before.clientX, dy = event.clientY - before.clientY;
       const other = [...fingers.values()].find((finger) => finger.pointerId !== event.pointerId);
       if (other) {
@@ -349,6 +355,15 @@ export class Player {
       this.stale = true;
     }, { passive: false });
   }
+
+  // What a press, a movement and a release in the picture do, other than to turn it.
+  grab() {
+    return false;
+  }
+
+  drag() {}
+
+  release() {}
 
   key(event) {
     if (event.ctrlKey || event.metaKey || event.altKey || event.target.tagName === "SELECT") return;
@@ -494,8 +509,8 @@ export class Player {
   spare(wait) {
     const { renderer } = this.scene;
     this.slow = wait > SLOW ? this.slow + 1 : Math.max(0, this.slow - 1);
-    if (this.slow < 12) return;
-    renderer.effort = Math.max(0.5, 0.8 * renderer.effort);
+    if (this.slow < 8) return;
+    renderer.effort = Math.max(LEAST_EFFORT, 0.8 * renderer.effort);
     this.slow = 0;
   }
 

@@ -4,7 +4,8 @@ import { grown, unit } from "./gl.js";
 
 /** Read what `pack.py` has written: columns {name, width, step}, one after the other in `text`. */
 export async function unpack(text, columns, count) {
-  const packed = Uint8Array.from(atob(text.trim()), (c) => c.charCodeAt(0));
+  const letters = atob(text.trim()), packed = new Uint8Array(letters.length);
+  for (let k = 0; k < letters.length; k++) packed[k] = letters.charCodeAt(k);
   const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate"));
   const bytes = new Uint8Array(await new Response(stream).arrayBuffer());
   const out = {};
@@ -122,10 +123,11 @@ export class Recording {
   reachAt(k) {
     if (this.reach[k] === undefined) {
       const { position, cm } = this.columns, n = this.widths.position / 3;
+      const { radius } = this.info, x = cm[3 * k], y = cm[3 * k + 1], z = cm[3 * k + 2];
       let most = 0;
-      for (let i = 0; i < n; i++) {
-        const at = 3 * (k * n + i);
-        most = Math.max(most, Math.hypot(position[at] - cm[3 * k], position[at + 1] - cm[3 * k + 1], position[at + 2] - cm[3 * k + 2]) + this.info.radius[i]);
+      for (let i = 0, at = 3 * k * n; i < n; i++, at += 3) {
+        const a = position[at] - x, b = position[at + 1] - y, c = position[at + 2] - z, far = a * a + b * b + c * c, rest = most - radius[i];
+        if (rest < 0 || far > rest * rest) most = Math.max(most, Math.sqrt(far) + radius[i]);
       }
       this.reach[k] = most;
     }

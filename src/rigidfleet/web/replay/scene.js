@@ -1,10 +1,12 @@
 // The picture of a flight at one time, and its camera.
 
 import {
-  BACKGROUND, Lines, Mesh, NO_TURN, OWN, Places, ROTORS, Renderer, add, cross, discMesh, dot, length, mixed,
-  noseMesh, quaternion, rotorMesh, scaled, smallVehicleMesh, sub, unit, vehicleMesh,
+  BACKGROUND, Lines, Mesh, NO_TURN, OWN, Places, ROTORS, add, cross, discMesh, dot, length, mixed,
+  ballMesh, farVehicleMesh, noseMesh, quaternion, rotorMesh, scaled, smallVehicleMesh, sub, unit, vehicleMesh,
 } from "./gl.js";
 import { bodyAxes } from "./recording.js";
+
+export const LEAST_EFFORT = 0.5; // least share of the resolution
 
 const AXES = [[0.84, 0.15, 0.16], [0.13, 0.58, 0.22], [0.12, 0.36, 0.86]];
 const IDLE = [0.42, 0.47, 0.53], PULL = [0.80, 0.11, 0.09], PUSH = [0.10, 0.33, 0.75];
@@ -13,6 +15,10 @@ const SMALLEST = 6, DETAILED = 12; // radius of a vehicle on the screen: the lea
 const TRAIL = 8; // length of trails [s]
 const FULL = 0.98; // share of its limit from which a rotor is drawn as being at it
 const ORDER = [0, 3, 2, 1]; // rotors of `ROTORS` in the columns: front left, front right, rear right, rear left
+const MANY = 300; // number of vehicles from which on drawing in software begins at the least resolution
+const AWAY = 1e12; // a coordinate that no camera sees [m]
+const NEAR = 500; // greatest number of vehicles of a swarm that are drawn with a shape
+const DOT = 2.5, LARGE_DOT = 3.5; // least radius of a dot on the screen [px], in a swarm and in a crowd
 const CROWD = 60; // number of vehicles beyond which each is drawn less prominently
 
 /** Colour of an edge: `share` of the largest tension, from -1 (pushes) to 1 (pulls), by its square root. */
@@ -142,30 +148,35 @@ class Camera {
 // -- the scene ----------------------------------------------------------------------------------------
 
 export class Scene {
-  constructor(canvas, labels, recording) {
+  constructor(renderer, labels, recording) {
     const { info } = recording;
     this.recording = recording;
     this.info = info;
     this.n = info.radius.length;
     this.colours = info.colours.map(rgb);
-    this.renderer = new Renderer(canvas);
+    this.renderer = renderer;
     this.labels = new Labels(labels);
     this.show = { edges: true, trails: true, slots: true, axes: true, names: true };
     this.camera = new Camera(recording);
     this.crowd = this.n > CROWD;
+    const plain = this.crowd && renderer.software; // many triangles are slow without a graphics card
+    if (this.n > MANY && renderer.software) renderer.effort = LEAST_EFFORT;
+    // Dots for vehicles: in swarms always, in crowds without a graphics card while the picture moves.
+    if (info.swarm || (this.n > MANY && renderer.software)) this.swarm = renderer.swarm(Float32Array.from(info.radius), Uint8Array.from(this.colours.flatMap((c) => [...c.map((x) => 255 * x), 255])));
     const upload = (mesh) => this.renderer.upload(mesh);
     this.meshes = {
       vehicle: upload(vehicleMesh()),
-      small: upload(smallVehicleMesh()),
+      small: upload(plain ? farVehicleMesh() : smallVehicleMesh()),
       rotor: upload(rotorMesh()),
       disc: upload(discMesh()),
       nose: upload(noseMesh()),
       box: upload(new Mesh().box([-0.5, -0.5, -0.5], [0.5, 0.5, 0.5], OWN)),
       cone: upload(new Mesh().prism([0, 0, 0], 1, 0, 1, 12, OWN)),
       pin: upload(new Mesh().prism([0, 0, 0], 1, 0, 1.3, 4, OWN).prism([0, 0, 0], 1, 0, -1.3, 4, OWN)),
-      shade: upload(new Mesh().ring([0, 0, 0], 0, 1, 16, OWN, [1, 0])),
+      ball: upload(ballMesh()),
+      shade: upload(new Mesh().ring([0, 0, 0], 0, 1, plain ? 6 : 16, OWN, [1, 0])),
     };
-    const names = ["solid", "veils", "vehicles", "turned", "noses", "discs", "small", "ghosts", "smallGhosts", "cones", "pins", "shades"];
+    const names = ["solid", "veils", "vehicles", "turned", "noses", "discs", "small", "ghosts", "smallGhosts", "cones", "pins", "shades", "balls", "ballVeils"];
     this.places = Object.fromEntries(names.map((name) => [name, new Places()]));
     this.lines = { ground: new Lines(), world: new Lines() };
     this.fade = info.boxes.map(() => 1);
@@ -192,10 +203,11 @@ export class Scene {
     moving = this.placeBoxes(wait) || moving;
     for (const solid of this.solids) moving = solid.place(this, time, wait) || moving;
     this.placeVehicles(state);
-    if (this.show.trails) this.placeTrails(time);
+    if (this.show.trails && !this.info.swarm) this.placeTrails(time);
     if (this.show.edges) this.placeEdges(state);
     if (this.show.axes) this.placeAxes(state);
     if (state.target) this.placeTarget(state);
+    if (state.balls) this.placeBalls(state);
     this.placePath();
     this.placeWaypoints(state);
 
@@ -203,7 +215,9 @@ export class Scene {
     renderer.depth(null);
     const under = [camera.target[0], camera.target[1], info.ground];
     renderer.ground(under, Math.max(8 * camera.distance, 0.6 * info.extent), this.gridStep, info.solid);
+    const { dotted } = this, pixels = 1 / this.pixel, least = info.swarm ? DOT : LARGE_DOT;
     renderer.meshes(meshes.shade, places.shades);
+    if (dotted) renderer.dots(this.swarm, this.far, pixels, 1.3 * least, info.ground);
     renderer.lines(lines.ground);
     renderer.depth(true);
     renderer.meshes(meshes.box, places.solid);
@@ -212,8 +226,10 @@ export class Scene {
     renderer.meshes(meshes.vehicle, places.turned);
     renderer.meshes(meshes.nose, places.noses);
     renderer.meshes(meshes.small, places.small);
+    if (dotted) renderer.dots(this.swarm, this.far, pixels, least);
     renderer.meshes(meshes.cone, places.cones);
     renderer.meshes(meshes.pin, places.pins);
+    renderer.meshes(meshes.ball, places.balls);
     renderer.depth(false);
     renderer.lines(lines.world);
     renderer.meshes(meshes.vehicle, places.ghosts);
@@ -221,6 +237,7 @@ export class Scene {
     renderer.meshes(meshes.rotor, places.vehicles);
     renderer.meshes(meshes.disc, places.discs);
     renderer.meshes(meshes.box, places.veils);
+    renderer.meshes(meshes.ball, places.ballVeils);
     for (const solid of this.solids) renderer.meshes(solid.mesh, solid.veil);
     this.labels.flush();
     return moving;
@@ -295,7 +312,7 @@ export class Scene {
   placePath() {
     const { recording, lines, info } = this;
     if (!info.path || !this.show.trails) return;
-    const { cm } = recording.columns, every = Math.max(1, Math.ceil(recording.count / 600));
+    const { cm } = recording.columns, every = Math.max(1, Math.ceil(recording.count / (this.renderer.software ? 150 : 600)));
     const at = (k) => cm.subarray(3 * k, 3 * k + 3);
     for (let k = 0; k < recording.count - 1; k += every) {
       lines.world.add(at(k), at(Math.min(k + every, recording.count - 1)), 1.2, RIM, 0.38);
@@ -305,6 +322,12 @@ export class Scene {
   // -- things that move --
 
   placeVehicles(state) {
+    this.dotted = this.info.swarm || (this.swarm && this.renderer.scale < 1);
+    if (this.dotted) this.far = state.position.slice(); // all but those that have a shape
+    if (this.info.swarm) {
+      this.placeNear(state);
+      return;
+    }
     const { info, places, n, recording } = this, shade = this.crowd ? 0.2 : 0.28;
     const heading = Number.isNaN(state.attitude[0]) ? [1, 0, 0] : bodyAxes(state.attitude)[0];
     this.enlarged = 1;
@@ -315,6 +338,8 @@ export class Scene {
       const p = state.position.subarray(3 * i, 3 * i + 3), radius = info.radius[i];
       const pixel = this.sized(p, 1), size = Math.max(radius, SMALLEST * pixel), near = size > DETAILED * pixel;
       this.enlarged = Math.max(this.enlarged, size / Math.max(radius, 1e-9));
+      if (this.dotted && !near) continue;
+      if (this.dotted) this.far[3 * i] = AWAY;
       const own = info.rotors?.[i]; // vehicles turn as they are, points along their thrust
       const q = own ? normal(state.turn.subarray(4 * i, 4 * i + 4)) : leaning(state.thrust.subarray(3 * i, 3 * i + 3), heading);
       (near ? (own ? places.turned : places.vehicles) : places.small).add(p, size, q, this.colours[i], 1);
@@ -334,6 +359,18 @@ export class Scene {
       }
       if (named) this.labels.add(this.renderer.project(p), String(i + 1), "agent", 10 + (0.6 * size) / pixel, info.colours[i]);
     }
+  }
+
+  /** Vehicles of a swarm that are near enough to have a shape; all others are dots. */
+  placeNear(state) {
+    const { info, places, n, pixel } = this, [x, y, z] = this.camera.eye, { position } = state;
+    for (let i = 0, at = 0; i < n; i++, at += 3) {
+      const a = position[at] - x, b = position[at + 1] - y, c = position[at + 2] - z, reach = info.radius[i] / (SMALLEST * pixel);
+      if (a * a + b * b + c * c > reach * reach || places.vehicles.count >= NEAR) continue;
+      places.vehicles.add(position.subarray(at, at + 3), info.radius[i], NO_TURN, this.colours[i], 1);
+      this.far[at] = AWAY;
+    }
+    this.enlarged = Math.max(1, (DOT * this.sized(state.cm, 1)) / Math.max(info.radius[0], 1e-9));
   }
 
   /** Rotors of a vehicle, the denser the more they give, red at their limit; from afar only these. */
@@ -401,6 +438,23 @@ export class Scene {
     bodyAxes(state.target.subarray(3, 7)).forEach((axis, a) => lines.world.add(p, add(p, scaled(axis, size)), 2, AXES[a], 0.7));
   }
 
+  /** Balls of a live flight; the chosen one has a ring. */
+  placeBalls(state) {
+    const { places, lines, info } = this;
+    for (let slot = 0; 4 * slot < state.balls.length; slot++) {
+      const p = Array.from(state.balls.subarray(4 * slot, 4 * slot + 3)), radius = state.balls[4 * slot + 3];
+      if (Number.isNaN(radius)) continue;
+      const half = [radius, radius, radius], veil = this.hides(sub(p, half), add(p, half), state);
+      (veil ? places.ballVeils : places.balls).add(p, radius, NO_TURN, SOLID, veil ? 0.3 : 1);
+      places.shades.add([p[0], p[1], info.ground], 1.2 * radius, NO_TURN, INK, 0.35);
+      lines.world.add(p, [p[0], p[1], info.ground], 1, RIM, 0.5);
+      if (this.show.names) this.labels.add(this.renderer.project(add(p, [0, 0, radius])), this.ballNames?.[slot] ?? "", "place", 10);
+      if (slot !== this.chosen) continue;
+      const at = (k) => add(p, scaled([Math.cos(k * Math.PI / 18), Math.sin(k * Math.PI / 18), 0], 1.15 * radius));
+      for (let k = 0; k < 36; k++) lines.world.add(at(k), at(k + 1), 2.5, AXES[2], 0.9);
+    }
+  }
+
   /** Body axes at the centre of mass and, faintly, the commanded ones if they differ. */
   placeAxes(state) {
     const { lines, places, recording } = this;
@@ -453,25 +507,40 @@ class Solid {
   /** Displacement at a time: straight between waypoints, at rest before and after them. */
   shift(time) {
     const { times, ways } = this.info;
-    if (!times.length) return [0, 0, 0];
+    if (times.length < 2) return ways[0] ?? [0, 0, 0];
     let k = 0;
     while (k < times.length - 2 && times[k + 1] < time) k++;
     const share = (time - times[k]) / (times[k + 1] - times[k]);
     return mixed(ways[k], ways[k + 1], Math.max(0, Math.min(share, 1)));
   }
 
+  /** The last seconds of its middle's way. */
+  trail(scene, time, colour) {
+    const { times, there: [since] } = this.info, least = since ?? scene.recording.start;
+    if (times.length < 2) return;
+    // From waypoint to waypoint, and at even times for what fades.
+    const begin = Math.max(time - TRAIL, least, scene.recording.start), at = [begin, ...times.filter((t) => t > begin && t < time), time];
+    for (let k = 1; k < TRAIL; k++) if (time - k > begin) at.push(time - k);
+    at.sort((a, b) => a - b);
+    const place = (t) => add(this.middle, this.shift(t)), fresh = (t) => 0.7 * Math.pow(Math.max(0, 1 - (time - t) / TRAIL), 1.4);
+    for (let k = 1; k < at.length; k++) scene.lines.world.add(place(at[k - 1]), place(at[k]), 2, colour, fresh(at[k - 1]), fresh(at[k]));
+  }
+
   /** Place it at a time; a zone is a veil, and so is what hides vehicles. True while its opacity changes. */
   place(scene, time, wait) {
-    const { corners, lines, zone } = this.info, shift = this.shift(time), colour = zone ? FENCE : SOLID;
+    this.solid.clear();
+    this.veil.clear();
+    const { corners, lines, zone, there } = this.info, [since, until] = there;
+    if (time < (since ?? -Infinity) || time > (until ?? Infinity)) return false;
+    const shift = this.shift(time), colour = zone ? FENCE : SOLID;
     const goal = scene.hides(add(this.low, shift), add(this.high, shift), scene.state) ? 0.25 : 1;
     this.fade = goal + (this.fade - goal) * Math.exp(-wait / 0.12);
     const moving = Math.abs(this.fade - goal) >= 0.01;
     if (!moving) this.fade = goal;
-    this.solid.clear();
-    this.veil.clear();
     const alpha = zone ? 0.12 : this.fade;
     (alpha < 1 ? this.veil : this.solid).add(add(this.middle, shift), 1, NO_TURN, colour, alpha);
     const edge = zone ? FENCE : RIM;
+    if (scene.show.trails) this.trail(scene, time, edge);
     for (let k = 0; k < lines.length; k += 2) {
       const a = add(corners[lines[k]], shift), b = add(corners[lines[k + 1]], shift);
       scene.lines.world.add(a, b, 1.2, edge, zone ? 0.5 : 0.25 + 0.35 * alpha);

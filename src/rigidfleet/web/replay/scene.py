@@ -8,8 +8,9 @@ import numpy as np
 
 from rigidfleet.plotting import agent_colours
 from rigidfleet.plotting.quadrotors import rotor_forces, rotor_limits, tracking_error
+from rigidfleet.solids.distance import displacement
 from rigidfleet.solids.outline import outline
-from rigidfleet.solids.records import extent
+from rigidfleet.solids.records import Solids, extent
 from rigidfleet.typing import Floats, Ints
 from rigidfleet.web.replay.pack import PackedColumn
 
@@ -21,6 +22,8 @@ _LINES = 12  # greatest number of lines in a plot; for more agents, the least an
 _BOXES = (
     200  # greatest number of obstacles that an overview fits one by one; more are fitted together
 )
+#: Distance from the flight up to which obstacles that move are in sight, as a share of its length; places looked at.
+_BESIDE, _PLACES = 0.15, 100
 _FLOOR = 1e-6  # least constraint error that is distinguished from zero [m]
 
 
@@ -70,6 +73,7 @@ def _solid(thing: Obstacle) -> dict[str, Any]:
         "lines": index[cut:],
         "times": solid.times,
         "ways": solid.ways,
+        "there": [x if np.isfinite(x) else None for x in solid.there[0].tolist()],
     }
 
 
@@ -136,11 +140,14 @@ def _continuous(q: Floats) -> Floats:
     return q * np.cumprod(np.where(np.pad(turned, ((1, 0), (0, 0))), -1.0, 1.0), axis=0)[..., None]
 
 
-def sight(mission: Mission, low: Floats, high: Floats) -> Floats:
+def sight(
+    mission: Mission, low: Floats, high: Floats, begin: float = 0.0, end: float = 0.0
+) -> Floats:
     """Points (P, 3) [m] that an overview shows: 8 corners of the flight's box, then those of obstacles near it.
 
-    An obstacle is cut at the distance from the flight that equals the flight's length. ``low`` and ``high`` (3,)
-    are the flight's least and greatest coordinates [m].
+    An obstacle is cut at the distance from the flight that equals the flight's length; one that moves counts where it
+    comes near. ``low`` and ``high`` (3,) are the flight's least and greatest coordinates [m], from ``begin`` to ``end``
+    [s].
     """
     reach = max(float(np.linalg.norm(high - low)), 1e-6)
     seen = []
@@ -149,13 +156,29 @@ def sight(mission: Mission, low: Floats, high: Floats) -> Floats:
             ends = extent(box.solid)
             if box.kind == "heights":
                 ends[0, 2] = box.solid.heights.min()
-            near = np.maximum(ends[0], low - reach), np.minimum(ends[1], high + reach)
+            far = reach
+            if box.solid.moves:
+                ends, far = _passing(box.solid, low, high, begin, end), _BESIDE * reach
+            near = np.maximum(ends[0], low - far), np.minimum(ends[1], high + far)
             seen += [near] if (near[0] <= near[1]).all() else []
     if len(seen) > _BOXES:
         seen = [(np.min([a for a, _ in seen], axis=0), np.max([b for _, b in seen], axis=0))]
     ends = np.array([(low, high), *seen])  # (1 + boxes, 2, 3)
     pick = np.indices((2, 2, 2)).reshape(3, 8)  # corners
     return np.stack([ends[:, pick[a], a] for a in range(3)], axis=2).reshape(-1, 3)
+
+
+def _passing(solid: Solids, low: Floats, high: Floats, begin: float, end: float) -> Floats:
+    """Lowest and highest corner (2, 3) [m] of a solid that moves, where it is near a box while it is there."""
+    since, until = np.clip(solid.there[0], begin, end)
+    still = extent(solid._replace(times=np.zeros(0), ways=np.zeros((0, 3))))
+    ways = np.stack(displacement(np.linspace(since, until, _PLACES), 0, solid), axis=-1)
+    ends = still[:, None] + ways  # (2, places, 3)
+    far = _BESIDE * float(np.linalg.norm(high - low))
+    near = ((ends[0] <= high + far) & (ends[1] >= low - far)).all(axis=1)
+    if not near.any():
+        return np.array([[np.inf] * 3, [-np.inf] * 3])
+    return np.array([ends[0][near].min(axis=0), ends[1][near].max(axis=0)])
 
 
 def thrust_directions(force: Floats, mass: Floats) -> Floats:
