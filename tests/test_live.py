@@ -300,6 +300,9 @@ def test_a_ball_is_avoided_and_kept():
     assert result.clearance_obstacle[result.time < appeared].max() < index
     assert result.clearance_obstacle[result.time > gone].max() < index
     assert index in result.clearance_obstacle
+    assert result.avoidance_layers is not None  # barriers or guard, while the ball is near
+    assert result.avoidance_layers[(result.time > appeared) & (result.time < gone)].any()
+    assert not result.avoidance_layers[result.time < appeared].any()
 
 
 def test_without_the_guard_contact_ends_the_flight():
@@ -654,7 +657,7 @@ def test_samples_are_the_flight():
         name, data = told(messages)
     numbers = np.frombuffer(base64.b64decode(data), "<f4")
     n, m = 3, len(TRIANGLE.edges)
-    assert len(numbers) == 1 + 9 * n + 3 + 8 + m + (n + 3) + 7 + 4 * balls.AT_ONCE
+    assert len(numbers) == 1 + 9 * n + 3 + 8 + m + (n + 3) + 7 + 4 * balls.AT_ONCE + (2 + n)
     position = numbers[1 : 1 + 3 * n].reshape(n, 3)
     np.testing.assert_allclose(position, TRIANGLE.agents.position, atol=0.05)
     session.command({"stop": True})

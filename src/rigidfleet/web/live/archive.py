@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from rigidfleet.result import Result
-from rigidfleet.simulation.recording import Piece, VehicleSamples
+from rigidfleet.simulation.recording import LayerSamples, Piece, VehicleSamples
 from rigidfleet.typing import Bools, Floats
 
 #: Greatest number of values kept, 8 bytes each: 10 minutes of 50 vehicles with 144 edges at 0.05 s. Beyond it,
@@ -105,18 +105,25 @@ class Archive:
 
 
 def _numbers(piece: Piece) -> float:
-    arrays = (*piece.record, piece.integral, piece.frame, *(piece.vehicles or ()))
+    arrays = (
+        *piece.record,
+        piece.integral,
+        piece.frame,
+        *(piece.vehicles or ()),
+        *(piece.layers or ()),
+    )
     return float(sum(x.size for x in arrays))
 
 
 def rows(piece: Piece, which: Bools | list[int]) -> Piece:
     """Some samples of a piece."""
     record = type(piece.record)(*(x[which] for x in piece.record))
-    flown = piece.vehicles
+    flown, acting = piece.vehicles, piece.layers
     vehicles = None if flown is None else VehicleSamples._make(x[which] for x in flown)
+    layers = None if acting is None else LayerSamples._make(x[which] for x in acting)
     return Piece(
         piece.phase, piece.time[which], record, piece.integral[which], piece.frame[which], piece.edges,
-        piece.attached, piece.led, vehicles,
+        piece.attached, piece.led, vehicles, layers,
     )  # fmt: skip
 
 
@@ -132,6 +139,8 @@ def _join(pieces: list[Piece]) -> Piece:
     vehicles = (
         VehicleSamples._make(map(np.concatenate, zip(*flown, strict=True))) if flown else None
     )
+    acting = [p.layers for p in pieces if p.layers is not None]
+    layers = LayerSamples._make(map(np.concatenate, zip(*acting, strict=True))) if acting else None
     return Piece(
         first.phase,
         np.concatenate([p.time for p in pieces]),
@@ -142,6 +151,7 @@ def _join(pieces: list[Piece]) -> Piece:
         first.attached,
         tuple(led for p in pieces for led in p.led),
         vehicles,
+        layers,
     )
 
 
