@@ -17,6 +17,7 @@ from shapes import SHAPES
 import rigidfleet as rf
 from rigidfleet.foreign.files import read_trajectories
 from rigidfleet.formation import outlines
+from rigidfleet.formation.point_files import Points
 from rigidfleet.mission import Mission, show_draft
 from rigidfleet.plotting import write_figure
 from rigidfleet.plotting.style import settings
@@ -42,7 +43,7 @@ def show() -> None:
     """The pictures of a show, made as its page makes it."""
     letters = outlines.on_outlines(outlines.text_outlines("HI"), 100, 2.0)
     scenes = [show_draft.scene(shape, 100, 2.0) for shape in ("sphere", "helix")]
-    scenes.append(show_draft.points_scene("logo", letters, "logo.csv"))
+    scenes.append(show_draft.points_scene("logo", Points(letters, None), "logo.csv"))
     text = show_draft.show("my-show", scenes, agents=100, spacing=2.0)
     result = rf.simulate(Mission.from_toml(text))
     with TemporaryDirectory() as folder:

@@ -32,9 +32,9 @@ from rigidfleet.kernel.moving import braking_beside
 from rigidfleet.kernel.segments import from_obstacle, from_solid
 
 #: Greatest number of sweeps, change of an acceleration that ends them [m/s^2].
-_SWEEPS, _CLOSE = 10, 1e-5
+_SWEEPS, _CLOSE = 10, 5e-5
 #: Number of sweeps over barriers that push between those over all, and the factor of over-relaxation.
-_INNER, _BEYOND = 15, 1.5
+_INNER, _BEYOND = 8, 1.5
 #: Share of its braking by which barriers push a vehicle whose edges let go completely.
 _FULL = 0.5
 #: Time for which vehicles look ahead to where obstacles that move pass them [s].
