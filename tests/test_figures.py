@@ -28,7 +28,10 @@ START = [[1.0, 6.0, 3.0], [8.0, 3.0, 3.0], [7.0, 6.0, 3.0]]
 TRIANGLE = {"shape": "triangle", "size": 4.0}
 CUBE = {"shape": "cube", "size": 4.0}
 BOX = {"kind": "box", "name": "wall", "min": [10.0, 8.0, 0.0], "max": [14.0, 12.0, 6.0]}
-OF_VEHICLES = ("vehicle_attitude", "vehicle_rates", "rotor_force", "saturated")
+OF_VEHICLES = (
+    "vehicle_attitude", "vehicle_rates", "rotor_force", "saturated", "clock_rate", "body_displacement",
+    "avoidance_layers",
+)  # fmt: skip
 OVER_TIME = [
     "distances", "cm", "attitude", "inputs", "constraint_force", "constraint_error", "clearance",
 ]  # fmt: skip
