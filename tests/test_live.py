@@ -872,14 +872,14 @@ class Visitor:
         where = urlsplit(url)
 
         def listen() -> None:
-            with closing(http.client.HTTPConnection(where.netloc, timeout=20)) as stream:
+            with closing(http.client.HTTPConnection(where.netloc, timeout=120)) as stream:
                 stream.request("GET", f"{where.path}stream")
                 self.heard = stream.getresponse().read().decode()
 
         def tell() -> None:
             for command in self.commands:
                 time.sleep(self.seconds)
-                with closing(http.client.HTTPConnection(where.netloc, timeout=20)) as control:
+                with closing(http.client.HTTPConnection(where.netloc, timeout=120)) as control:
                     origin = {"Origin": f"http://{where.netloc}"}
                     control.request("POST", f"{where.path}command", command, origin)
                     assert control.getresponse().status == 204
@@ -892,7 +892,7 @@ class Visitor:
     @property
     def farewell(self) -> str:
         for thread in self.threads:
-            thread.join(10)
+            thread.join(60)
         return json.loads(self.heard.rpartition("event: end\ndata: ")[2])
 
 
