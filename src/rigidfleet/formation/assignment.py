@@ -183,7 +183,7 @@ _ROUNDS = 20
 #: Numbers of agents up to which the least sum of squares is found from nothing, and from an exchange.
 _PLAIN, _LEAST = 300, 1024
 #: Rounds in which prices of slots are estimated. More cost more than they save.
-_PRICED = 5
+_PRICED = 8
 
 
 def _nearest_slots(p: Floats, q: Floats) -> Ints:
