@@ -21,7 +21,7 @@ import pytest
 
 from rigidfleet.kernel.compiler import cache, jit
 from rigidfleet.kernel.compiler.cache import cache_directory
-from rigidfleet.kernel.engine import native, objects
+from rigidfleet.kernel.engine import native, objects, packing
 from rigidfleet.kernel.engine.native import is_compiled
 
 PLANTED, OWN = 666, 1
@@ -49,6 +49,15 @@ def answer() -> int:
 def forget() -> None:
     """Let the next warning be the first."""
     native.told.clear()
+
+
+@pytest.fixture(autouse=True)
+def packs() -> Iterator[None]:
+    """Afterwards, what packs arguments is that of the kernel that was loaded before, not of one made here."""
+    before = list(packing._gather)
+    yield
+    if before:
+        packing.use(*before)
 
 
 @pytest.fixture

@@ -150,7 +150,7 @@ def test_a_vehicle_steers_past_what_would_pass_too_near(seed):
     n = beside / np.linalg.norm(beside)
     asked = n @ force
     led = np.linalg.norm(beside) + 0.5 * (asked + n @ change) * t * t
-    assert led == pytest.approx(0.7 + 0.3 + 0.1, abs=1e-5)
+    assert led == pytest.approx(0.7 + 0.3 + 0.1, abs=1e-4)
     assert np.linalg.norm(np.cross(n, change)) < 1e-6
 
 
