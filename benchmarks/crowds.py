@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -39,6 +40,10 @@ SWAPS = (
 
 #: Swaps by the plan: number of vehicles, radius [m], whether it is a ring.
 PLANNED = ((30, 5.0, False), (100, 8.0, False), (100, 14.0, True))
+
+
+#: Accelerations of vehicles from time, positions and velocities, and the processor time that it took [s].
+Law = Callable[[float, Floats, Floats], tuple[Floats, float]]
 
 
 class Swap(NamedTuple):
@@ -132,6 +137,33 @@ def on_parabolas(x: Floats, w: Floats, rise: Floats) -> Floats:
     return np.linalg.norm(y, axis=2).min(axis=0)
 
 
+class Flown(NamedTuple):
+    """What a flight of a crowd came to."""
+
+    least: float  # distance of centres [m]
+    arrived: float  # time of the last arrival [s], infinity if not all arrive
+    cost: float  # of the law per vehicle and tick [us]
+
+
+def fly(r: Floats, law: Law, longest: float, *, at_once: bool = False) -> Flown:
+    """Fly vehicles at r (N, 3) [m] to the opposite places; ``at_once``: velocities change at once, then are held."""
+    n, goal, v = len(r), -r, np.zeros_like(r)
+    pairs = np.triu_indices(n, 1)
+    least, cost, arrived, k = np.inf, 0.0, np.full(n, np.inf), 0
+    for k in range(int(longest / PERIOD)):
+        c, took = law(k * PERIOD, r, v)
+        cost += took
+        if at_once:
+            v, c = v + c * PERIOD, 0.0 * c
+        least = min(least, least_distance(r, v, c, pairs))
+        r, v = r + v * PERIOD + 0.5 * c * PERIOD**2, v + c * PERIOD
+        there = np.linalg.norm(r - goal, axis=1) < 0.1
+        arrived = np.where(there, np.minimum(arrived, (k + 1) * PERIOD), np.inf)
+        if there.all():
+            break
+    return Flown(least, float(arrived.max()), 1e6 * cost / ((k + 1) * n))
+
+
 def swap(
     n: int,
     radius: float,
@@ -142,35 +174,26 @@ def swap(
     keep: list[tuple[Floats, Floats]] | None = None,
 ) -> Swap:
     """Fly one swap; ``keep`` takes the states at the ticks."""
-    r = places(n, radius, ring=ring, rng=np.random.default_rng(seed))
-    goal, v = -r, np.zeros_like(r)
+    start = places(n, radius, ring=ring, rng=np.random.default_rng(seed))
     problem, work, flight, state, a = kernel(n)
-    pairs = np.triu_indices(n, 1)
-    least, cost, k = np.inf, 0.0, 0
-    arrived = np.full(n, np.inf)
-    for k in range(int(longest / PERIOD)):
+
+    def law(t: float, r: Floats, v: Floats) -> tuple[Floats, float]:
         if keep is not None:
             keep.append((r, v))
         state.seen[:, :3], state.seen[:, 3:] = r, v
-        state.force[:] = asked(r, v, goal)
-        state.work.law_time[0] = k * PERIOD
+        state.force[:] = asked(r, v, -start)
+        state.work.law_time[0] = t
         begun = time.process_time()
         if not sampled.avoid(problem, work, flight, state, a):
             raise SystemExit("too many neighbours")
-        cost += time.process_time() - begun
+        took = time.process_time() - begun
         c = state.force.copy()
         assert np.linalg.norm(c, axis=1).max() <= THRUST + 1e-9
-        least = min(least, least_distance(r, v, c, pairs))
-        r, v = r + v * PERIOD + 0.5 * c * PERIOD**2, v + c * PERIOD
-        there = np.linalg.norm(r - goal, axis=1) < 0.1
-        arrived = np.where(there, np.minimum(arrived, (k + 1) * PERIOD), np.inf)
-        if there.all():
-            break
-    ticks = int(a.count[TICKS])
-    shares = a.acted[[BARRIER, GUARD]].sum(axis=1) / (ticks * n)
-    return Swap(
-        least, float(a.margin[0, 0]), float(arrived.max()), *map(float, shares), 1e6 * cost / (ticks * n)
-    )  # fmt: skip
+        return c, took
+
+    flown = fly(start, law, longest)
+    shares = a.acted[[BARRIER, GUARD]].sum(axis=1) / (int(a.count[TICKS]) * n)
+    return Swap(flown.least, float(a.margin[0, 0]), flown.arrived, *map(float, shares), flown.cost)
 
 
 def planned(n: int, radius: float, *, ring: bool, seed: int) -> tuple[float, float, float]:

@@ -13,10 +13,10 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from crowds import APART, PERIOD, SPEED, asked, kernel, least_distance, limited, places, preferred
+from crowds import APART, PERIOD, SPEED, Flown, Law, asked, fly, kernel, limited, places, preferred
 
 from rigidfleet.kernel.engine import native, sampled
 from rigidfleet.typing import Floats
@@ -25,16 +25,6 @@ from rigidfleet.typing import Floats
 RINGS, LONGEST = ((10, 4.0), (30, 6.0)), 60.0
 #: Time for which ORCA looks ahead [s]: the one of its example of a circle, and one that suits these speeds.
 HORIZONS = (10.0, 2.0)
-#: Accelerations of vehicles from their positions and velocities, and the processor time that it took [s].
-Law = Callable[[Floats, Floats], tuple[Floats, float]]
-
-
-class Run(NamedTuple):
-    """What one swap came to."""
-
-    least: float  # distance of centres [m]
-    arrived: float  # time of the last arrival [s], infinity if not all arrive
-    cost: float  # per vehicle and step [us]
 
 
 def guarded(goal: Floats) -> Law:
@@ -45,7 +35,7 @@ def guarded(goal: Floats) -> Law:
         angle = np.linspace(0.0, 2 * np.pi, some.stop - some.start, endpoint=False)
         a.candidates[some] = size * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
 
-    def law(r: Floats, v: Floats) -> tuple[Floats, float]:
+    def law(_t: float, r: Floats, v: Floats) -> tuple[Floats, float]:
         state.seen[:, :3], state.seen[:, 3:], state.force[:] = r, v, asked(r, v, goal)
         begun = time.process_time()
         assert sampled.avoid(problem, work, flight, state, a)
@@ -63,7 +53,7 @@ def reciprocal(goal: Floats, horizon: float, *, bounded: bool) -> Law:
     for x in -goal:
         simulator.add_agent((x[0], x[1]))
 
-    def law(r: Floats, v: Floats) -> tuple[Floats, float]:
+    def law(_t: float, r: Floats, v: Floats) -> tuple[Floats, float]:
         aims = preferred(r, goal)
         for i in range(n):
             simulator.set_agent_position(i, (r[i, 0], r[i, 1]))
@@ -80,26 +70,19 @@ def reciprocal(goal: Floats, horizon: float, *, bounded: bool) -> Law:
     return law
 
 
-def swap(n: int, radius: float, seed: int, made: Callable[[Floats], Law], *, at_once: bool) -> Run:
-    """Fly one swap in the plane; ``at_once``: velocities change at once, and are then held."""
-    r = places(n, radius, ring=True, rng=np.random.default_rng(seed))
-    r[:, 2] = 0.0
-    goal, v = -r, np.zeros_like(r)
-    law, pairs = made(goal), np.triu_indices(n, 1)
-    least, cost, arrived, k = np.inf, 0.0, np.full(n, np.inf), 0
-    for k in range(int(LONGEST / PERIOD)):
-        c, took = law(r, v)
-        cost += took
-        if at_once:
-            v, c = v + c * PERIOD, 0.0 * c
-        least = min(least, least_distance(r, v, c, pairs))
-        r, v = r + v * PERIOD + 0.5 * c * PERIOD**2, v + c * PERIOD
-        there = np.linalg.norm(r - goal, axis=1) < 0.1
-        arrived = np.where(there, np.minimum(arrived, (k + 1) * PERIOD), np.inf)
-        if there.all():
-            break
-    assert np.abs(r[:, 2]).max() == 0.0
-    return Run(least, float(arrived.max()), 1e6 * cost / ((k + 1) * n))
+def swap(
+    n: int, radius: float, seed: int, made: Callable[[Floats], Law], *, at_once: bool
+) -> Flown:
+    """Fly one swap in the plane."""
+    start = places(n, radius, ring=True, rng=np.random.default_rng(seed))
+    start[:, 2] = 0.0
+    law = made(-start)
+
+    def level(t: float, r: Floats, v: Floats) -> tuple[Floats, float]:
+        assert np.abs(r[:, 2]).max() == 0.0
+        return law(t, r, v)
+
+    return fly(start, level, LONGEST, at_once=at_once)
 
 
 def main() -> None:

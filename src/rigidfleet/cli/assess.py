@@ -79,10 +79,10 @@ def assess(
     made = Files(out, result.mission.name) if out is not None else None
     if made is not None:
         made.try_out()
-        drawing.prepare()
         for path in (made.result, made.verdict, made.report, made.replay, *made.figures):
             if path.exists() and not force:
                 raise taken(path)
+        drawing.prepare()
     if json:
         console.print_json(verdict.to_dict())
     else:

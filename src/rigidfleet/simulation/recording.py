@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -55,6 +55,9 @@ class LayerSamples(NamedTuple):
     layers: Ints  # (K, N) that change what a vehicle is asked for
 
 
+Samples = TypeVar("Samples", VehicleSamples, LayerSamples)
+
+
 @dataclass
 class Piece:
     """Samples of a phase, or of part of one, as the kernel returns them."""
@@ -99,6 +102,8 @@ def assemble(
         )
     found = _measured(mission, pieces, time, record)
     flown = _of_vehicles(pieces)
+    avoided = [piece.layers for piece in pieces if piece.layers is not None]
+    layers = _together(avoided) if avoided else None
     thrust = found.thrust
     if flown is not None:
         thrust = flown.thrust
@@ -166,9 +171,9 @@ def assemble(
         vehicle_rates=None if flown is None else flown.rates,
         rotor_force=None if flown is None else flown.rotor_force,
         saturated=None if flown is None else flown.saturated.astype(np.int64),
-        clock_rate=_of_layers(pieces, "rate"),
-        body_displacement=_of_layers(pieces, "displacement"),
-        avoidance_layers=_of_layers(pieces, "layers"),
+        clock_rate=None if layers is None else layers.rate,
+        body_displacement=None if layers is None else layers.displacement,
+        avoidance_layers=None if layers is None else layers.layers,
         phases=list(phases),
         mission_text=mission.text,
         complete=not ending,
@@ -232,7 +237,7 @@ def _of_vehicles(pieces: Sequence[Piece]) -> VehicleSamples | None:
     found = [piece.vehicles for piece in pieces if piece.vehicles is not None]
     if not found:
         return None
-    joined = VehicleSamples(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
+    joined = _together(found)
     return joined._replace(
         attitude=np.stack(
             [att.unwrap_quaternion(q) for q in joined.attitude.swapaxes(0, 1)], axis=1
@@ -240,10 +245,9 @@ def _of_vehicles(pieces: Sequence[Piece]) -> VehicleSamples | None:
     )
 
 
-def _of_layers(pieces: Sequence[Piece], name: str) -> Any:
-    """Samples of the layers of avoidance of all pieces; None without avoidance."""
-    parts = [getattr(piece.layers, name) for piece in pieces if piece.layers is not None]
-    return _joined(parts) if parts else None
+def _together(found: Sequence[Samples]) -> Samples:
+    """Samples of pieces, one after the other."""
+    return type(found[0])(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
 
 
 def _put_extremes(phases: Sequence[PhaseRecord], time: Floats, close: proximity.Closeness) -> None:
