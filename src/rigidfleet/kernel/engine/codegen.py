@@ -125,12 +125,19 @@ def _keep_start(p, w, state):
     """Do nothing: flights of an ensemble record no forces."""
 
 
+@inlined
+def _step_size(t, h, t_end, p):
+    """As `dopri5.step_size`: ensembles have no disturbances."""
+    return min(h, t_end - t)
+
+
 #: As `dopri5.integrate`; p is an `UnrolledProblem`, w is not used, arrays hold lanes.
 integrate = compiled_copy(
     dopri5.integrate,
     "integrate_straight",
     closed_loop=_closed_loop,
     advance=_advance,
+    step_size=_step_size,
     keep_start=_keep_start,
     keep_step=_keep_step,
 )
