@@ -271,6 +271,22 @@ def test_laws_see_noise_and_newton_does_not():
     np.testing.assert_allclose(result.input_force[k], f, atol=1e-6)
 
 
+def test_steps_end_at_the_knots_of_gusts_and_noise():
+    """Where third derivatives jump, steps end: at the default tolerances, positions are within 1e-9 m."""
+    disturbed = {
+        "wind": [1.0, 0.0, 0.0], "drag": 0.3, "gusts": FIRST | {"seed": 1},
+        "noise": {"position": 0.01, "velocity": 0.03, "rate": 50.0, "seed": 1},
+    }  # fmt: skip
+    stiff = {
+        "edges": [], "tracking": {"Q": [600.0, 60.0]},
+        "phases": [{"kind": "establish", "formation": "triangle", "duration": 6.0}],
+    }  # fmt: skip
+    exact = simulate(mission(disturbed, integrator={"rtol": 1e-12, "atol": 1e-14}, **stiff))
+    flown = simulate(mission(disturbed, **stiff))
+    assert np.abs(flown.position - exact.position).max() < 1e-9
+    assert flown.statistics["rejected"] < 0.01 * flown.statistics["steps"]
+
+
 def test_a_users_controller_sees_what_is_measured():
     """An observation holds measured positions: a controller can tell them from the truth."""
     seen = []
