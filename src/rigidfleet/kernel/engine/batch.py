@@ -12,7 +12,7 @@ import numpy as np
 from rigidfleet.kernel.compiler.jit import compiled
 from rigidfleet.kernel.compiler.pointers import by_address
 from rigidfleet.kernel.compiler.simd import WIDTH, LaneArray, pack, unpack
-from rigidfleet.kernel.engine import native
+from rigidfleet.kernel.engine import lane_steps, native
 from rigidfleet.kernel.engine.codegen import integrate, unrolled
 from rigidfleet.kernel.problem import EXACT, ITERATED, OPEN, SHAPE, Problem, padded, workspace
 from rigidfleet.kernel.records import FINISHED, LEAST_ERROR, integrator
@@ -130,8 +130,8 @@ def fly_all(
 
     def begin() -> Callable[..., None]:
         state = integrator(np.zeros(n), 0.0, rtol=rtol, atol=atol)
-        K = np.zeros((*state.K.shape[:1], n, WIDTH))
-        K[-1] = atol[:, None]
+        K = np.zeros((lane_steps.ROWS, n, WIDTH))
+        K[lane_steps.ATOL] = atol[:, None]
         state = state._replace(y=pack(np.zeros((n, WIDTH))), K=pack(K))
         own = ready._replace(before=ready.before.copy(), time=ready.time.copy())
 
