@@ -163,9 +163,26 @@ def test_the_recorded_margin_is_that_of_the_nearest_stop_segments():
 # -- the barriers -------------------------------------------------------------------------------------
 
 
+def by_scipy(A, right, low, high):
+    """Minimise x A x / 2 - right x within bounds, by SciPy's least squares."""
+    L = np.linalg.cholesky(A)
+    return lsq_linear(L.T, np.linalg.solve(L, right), (low, high), method="bvls", tol=1e-14).x
+
+
+def by_daqp(A, right, low, high):
+    """The same by DAQP (Arnström, Bemporad and Axehill, 2022)."""
+    daqp = pytest.importorskip("daqp")
+    rows, kinds = np.zeros((0, len(A))), np.zeros(len(A), dtype=np.int32)
+    far = (np.clip(x, -1e30, 1e30) for x in (high, low))
+    x, _, status, _ = daqp.solve(A, -right, rows, *far, kinds, eps_prox=1e-6, primal_tol=1e-10)
+    assert status == 1
+    return x
+
+
+@pytest.mark.parametrize("solve", [by_scipy, by_daqp])
 @pytest.mark.parametrize("seed", range(12))
-def test_barriers_change_accelerations_as_an_exact_solver_does(seed):
-    """Barriers and soft edges give the accelerations of the quadratic programme, solved by SciPy on its dual."""
+def test_barriers_change_accelerations_as_exact_solvers_do(seed, solve):
+    """Barriers and soft edges give the accelerations of the quadratic programme, solved by others on its dual."""
     rng = np.random.default_rng(seed)
     n, D, rate, share = 5, 0.5, 3.0, 0.9
     r, v = scattered(rng, n, 0.6, 0.8), rng.normal(0.0, 0.7, (n, 3))
@@ -227,9 +244,8 @@ def test_barriers_change_accelerations_as_an_exact_solver_does(seed):
     )
     low = np.concatenate([np.full(len(edges), -np.inf), np.zeros(len(needed))])
     high = np.concatenate([np.full(len(edges), np.inf), most])
-    L = np.linalg.cholesky(A + 1e-11 * np.eye(len(A)))
-    solved = lsq_linear(L.T, np.linalg.solve(L, right), (low, high), method="bvls", tol=1e-14)
-    expected = wanted + (inverse * (J.T @ solved.x)).reshape(n, 3)
+    pushes = solve(A + 1e-11 * np.eye(len(A)), right, low, high)
+    expected = wanted + (inverse * (J.T @ pushes)).reshape(n, 3)
     assert np.abs(state.force / m[:, None] - expected).max() < 1e-4
     if not (a.push[a.rows[:, 1] < 0] > 0).any():  # between vehicles alone
         change = state.force - m[:, None] * wanted

@@ -187,8 +187,8 @@ class PhaseRecord:
         self.extremes = {name: Extremum(*x) for name, x in (self.extremes or {}).items()}
 
 
-#: Names of variables, and a function that computes them when they are first asked for.
-Later = Sequence[tuple[tuple[str, ...], Callable[[], dict[str, Floats]]]]
+#: Names of fields, and a function that computes them when they are first asked for.
+Later = Sequence[tuple[tuple[str, ...], Callable[[], dict[str, Any]]]]
 
 
 @cache
@@ -487,7 +487,10 @@ class Result:
         names, make = found
         sizes = {"time": len(self.time), "agent": self.n_agents, "axis": 3}
         for key, value in make().items():
-            self._set(key, value, sizes)
+            if key in VARIABLES:
+                self._set(key, value, sizes)
+            else:
+                setattr(self, key, value)
         for key in names:
             self._later.pop(key, None)
         return self.__dict__[name]

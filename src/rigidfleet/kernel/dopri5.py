@@ -72,6 +72,28 @@ def squared_errors(k, h, rtol, p):
     return squares
 
 
+@inlined
+def until_knot(t, step):
+    """Time from t to the next knot [s]; knots are every ``step`` from 0, and one that t just meets has passed."""
+    return (math.floor(t / step + 1e-6) + 1.0) * step - t
+
+
+@inlined
+def step_size(t, h, t_end, p):
+    """Length of the next step [s]: about h at most, in equal steps up to the next knot of gusts or noise.
+
+    Third derivatives of the disturbances jump at knots; the error of a step across one falls with h^4 only.
+    """
+    rest, disturbance = t_end - t, p.disturbance
+    if disturbance.noise_r.shape[0] == 0 and disturbance.gust.shape[0] == 0:
+        return min(h, rest)
+    if disturbance.noise_r.shape[0] > 0:
+        rest = min(rest, until_knot(t, disturbance.noise_step))
+    if disturbance.gust.shape[0] > 0:
+        rest = min(rest, until_knot(t, disturbance.gust_step))
+    return rest / max(1.0, math.ceil(rest / h - 0.05))
+
+
 @compiled
 def keep_start(p, w, state):
     """Record the forces after a jump in the trail."""
@@ -130,7 +152,7 @@ def integrate(p, w, state, t_end, fresh, times, samples, max_steps):
     first = 0 if fresh else 1
     status = PAUSED
     for _ in range(max_steps):
-        h = min(h, t_end - t)
+        h = step_size(t, h, t_end, p)
         stage = first
         # One call site of the right-hand side: stage 0 is the derivative at y itself.
         while stage < _STAGES:

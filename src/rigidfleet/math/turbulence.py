@@ -7,7 +7,6 @@ process for any step. The input is white standard-normal samples, so that the ca
 from __future__ import annotations
 
 import math
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -26,9 +25,7 @@ def first_order(white: Floats, step: float, tau: float) -> Floats:
     a = math.exp(-step / tau)
     x = white * math.sqrt(-math.expm1(-2.0 * step / tau))
     x[0] = white[0]
-    for k in range(1, len(x)):
-        x[k] += a * x[k - 1]
-    return x
+    return _followed(x.reshape(len(x), 1, -1), np.array([[a]])).reshape(x.shape)
 
 
 def second_order(white: Floats, step: float, tau: float) -> Floats:
@@ -52,10 +49,20 @@ def second_order(white: Floats, step: float, tau: float) -> Floats:
     start = np.linalg.cholesky(P)
     z = np.einsum("ab,kb...->ka...", root, white)
     z[0] = np.tensordot(start, white[0], 1)
-    rows, added = z.reshape(len(z), 2, -1), np.empty((2, z[0, 0].size))
-    for before, after in pairwise(rows):
-        np.add(after, np.dot(A, before, out=added), out=after)
+    z = _followed(z.reshape(len(z), 2, -1), A).reshape(z.shape)
     return (math.sqrt(3.0) * z[:, 0] + (1.0 - math.sqrt(3.0)) * z[:, 1]) / math.sqrt(2.0)
+
+
+def _followed(x: Floats, A: Floats) -> Floats:
+    """Solve z_{k+1} = A z_k + x_{k+1} from z_0 = x_0; x and z (K, n, M), A (n, n).
+
+    By doubling: after the pass with a shift of s samples, z_k holds the terms A^j x_{k-j} with j < 2 s.
+    """
+    shift = 1
+    while shift < len(x) and A.any():
+        x = np.concatenate([x[:shift], x[shift:] + A @ x[:-shift]])
+        shift, A = 2 * shift, A @ A
+    return x
 
 
 def low_altitude(height: float, wind: float) -> tuple[Floats, Floats]:

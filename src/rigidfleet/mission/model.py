@@ -76,6 +76,7 @@ class Mission(Contents):
     """
 
     _text: str = PrivateAttr("")
+    _plain: dict[str, Any] | None = PrivateAttr(None)  # what the text is made of when it is asked for
     _origin: str = PrivateAttr("")
 
     def __init__(self, *_: object, **__: object) -> None:
@@ -112,7 +113,9 @@ class Mission(Contents):
         MissionError
             With a finding for each error.
         """
-        return cls._checked(data, to_toml(data), origin)
+        mission = cls._checked(data, "", origin)
+        mission._plain = data
+        return mission
 
     @classmethod
     def _checked(cls, data: dict[str, Any], text: str, origin: str) -> Self:
@@ -154,7 +157,7 @@ class Mission(Contents):
             With a finding for each error.
         """
         mission = self.from_dict(data, self._origin if origin is None else origin)
-        mission._text = digests(self._text) + mission._text
+        mission._text = digests(self.text) + mission._text
         return mission
 
     def with_phases(self, phases: list[dict[str, Any]]) -> Self:
@@ -166,7 +169,7 @@ class Mission(Contents):
             With a finding for each error.
         """
         mission = self.from_dict(self.to_dict() | {"phases": phases}, self._origin)
-        mission._text = self._text
+        mission._text = self.text
         return mission
 
     @property
@@ -193,11 +196,13 @@ class Mission(Contents):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the mission as a dictionary, as written. Edit it and pass it to `Mission.from_dict`."""
-        return tomllib.loads(self._text)
+        return tomllib.loads(self.text)
 
     @property
     def text(self) -> str:
         """The TOML text of the mission."""
+        if self._plain is not None:
+            self._text, self._plain = to_toml(self._plain), None
         return self._text
 
     @property

@@ -97,7 +97,7 @@ def closest(
         open_ = np.flatnonzero((0.5 * (near + far - way)).min(axis=1) < best - CLOSE)
         if not len(open_) or len(open_) * each.shape[1] > _OPEN:
             break
-        first, length = first[open_], 0.5 * length[open_]
+        first, length, speed = first[open_], 0.5 * length[open_], speed[open_]
         middle = first + length
         r = slot_derivatives(leg.reference, leg.motion, middle, 1)[:, 0]
         between, _ = proximity.obstacle_clearances(r, radius, [met], middle)
@@ -105,8 +105,9 @@ def closest(
         if between[k, i] < best:
             best, agent, when = float(between[k, i]), int(i), float(middle[k])
         near, far = np.concatenate([near[open_], between]), np.concatenate([between, far[open_]])
+        # Samples are near each other: a bound for both halves together is hardly greater than each half's own.
         first, length = np.concatenate([first, middle]), np.tile(length, 2)
-        speed = greatest_speeds(leg.reference, leg.motion, first, first + length)
+        speed = np.concatenate([speed, speed])
     return best, agent, when
 
 

@@ -166,6 +166,7 @@ def assemble(
                 ("singular_value",),
                 partial(_singular_values, [(p.record.r, p.edges) for p in pieces]),
             ),
+            (("mission_text",), partial(_text, mission)),
         ),
         vehicle_attitude=None if flown is None else flown.attitude,
         vehicle_rates=None if flown is None else flown.rates,
@@ -175,11 +176,15 @@ def assemble(
         body_displacement=None if layers is None else layers.displacement,
         avoidance_layers=None if layers is None else layers.layers,
         phases=list(phases),
-        mission_text=mission.text,
+        mission_text="",  # made later
         complete=not ending,
         ending=ending,
         statistics=statistics,
     )
+
+
+def _text(mission: Mission) -> dict[str, str]:
+    return {"mission_text": mission.text}
 
 
 def _references(

@@ -76,14 +76,14 @@ def machine_code(second: "_SecondProcess | None" = None) -> list[bytes]:
             function.compile(arguments)
     functions = zip((integrate_segment, record_segment), objects.ENTRIES, strict=False)
     modules = [_module(function, name) for function, name in functions]
-    codes = [_object(*module) for module in modules]
+    codes, small = [_object(*module) for module in modules], _small()
     made = None if second is None else second.apart()
-    return [*codes, *(made or _apart())]
+    return [*codes, *(made or _apart()), *small]
 
 
 def _apart() -> list[bytes]:
-    """Object codes of the monitor, of measurement and of packing, which share nothing with the rest."""
-    problem, workspace, integrator, _, _, watching, *_, measured, spectrum = _pointers()
+    """Object codes of the monitor and of measurement, which share nothing with the rest."""
+    problem, workspace, integrator, _, _, watching, *_, measured, _ = _pointers()
 
     def watch_trail(p, w, state, found):
         return monitor.watch(problem(p), workspace(w), integrator(state), watching(found))
@@ -92,6 +92,14 @@ def _apart() -> list[bytes]:
         measurement.measure(measured(m))
         return 0
 
+    entries = zip((watch_trail, measure_flight), (4, 1), objects.ENTRIES[2:4], strict=True)
+    return [_object(*_module(function, name, words)) for function, words, name in entries]
+
+
+def _small() -> list[bytes]:
+    """Object codes of singular values and of packing, for which the first process has time left."""
+    spectrum = _pointers()[-1]
+
     def singular_values(s):
         measurement.spectrum(spectrum(s))
         return 0
@@ -99,8 +107,7 @@ def _apart() -> list[bytes]:
     def gather(of, count, asked, words):
         return gathering.gather(of, count, asked, words)
 
-    functions = watch_trail, measure_flight, singular_values, gather
-    entries = zip(functions, (4, 1, 1, 4), objects.ENTRIES[2:], strict=True)
+    entries = zip((singular_values, gather), (1, 4), objects.ENTRIES[4:], strict=True)
     return [_object(*_module(function, name, words)) for function, words, name in entries]
 
 
@@ -209,12 +216,12 @@ def _halves() -> tuple[_Functions, _Functions]:
         rigid_body.allocate: (
             places, row, number, row, row, row, types.int64, places, places, places, places, places, places
         ),
+        rigid_body.mean_axes: (places, places, row, number, w),
+        dynamics.world_states: (row, p, w),
     }  # fmt: skip
     others = {
         control.local_law: (number, p, w),
         control.body_law: (number, p, w),
-        rigid_body.mean_axes: (places, places, row, number, w),
-        dynamics.world_states: (row, p, w),
     }
     return own, others
 

@@ -156,6 +156,12 @@ def squared_errors(k, h, rtol, p):
 
 
 @inlined
+def step_size(t, h, t_end, p):
+    """As `dopri5.step_size`: ensembles have no disturbances."""
+    return min(h, t_end - t)
+
+
+@inlined
 def keep_step(t, h, p, w, state):
     """Do nothing: flights of an ensemble record no trail."""
 
@@ -177,4 +183,5 @@ INSTEAD = {
     "keep_start": keep_start,
     "keep_step": keep_step,
     "squared_errors": squared_errors,
+    "step_size": step_size,
 }
