@@ -76,7 +76,8 @@ class Mission(Contents):
     """
 
     _text: str = PrivateAttr("")
-    _plain: dict[str, Any] | None = PrivateAttr(None)  # what the text is made of when it is asked for
+    #: What the text is made of when it is asked for.
+    _plain: dict[str, Any] | None = PrivateAttr(None)
     _origin: str = PrivateAttr("")
 
     def __init__(self, *_: object, **__: object) -> None:
