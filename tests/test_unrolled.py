@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from rigidfleet.kernel.compiler.simd import pack, unpack
-from rigidfleet.kernel.engine import codegen, native
+from rigidfleet.kernel.engine import codegen, lane_steps, native
 from rigidfleet.kernel.engine.tracer import Code, Trace, UnfitError, elimination_order, structure
 from rigidfleet.kernel.problem import Problem, workspace
 from rigidfleet.mission import Mission
@@ -73,12 +73,15 @@ def call(p, y, dy, t):
 
 
 def in_lanes(p: Problem, y: np.ndarray, t: float) -> np.ndarray:
-    """dy/dt (8, n) of states y (8, n)."""
+    """dy/dt (8, n) of states y (8, n); the code leaves out positions, whose derivatives are velocities."""
     ready = codegen.unrolled(p)
     before = pack(np.repeat(p.reference.d0[:, None], 8, axis=1))
     dy = pack(np.zeros_like(y.T))
     call(ready._replace(before=before), pack(y.T), dy, t)
-    return unpack(dy).T
+    found, coordinates = unpack(dy).T, 3 * len(p.vehicles.m)
+    assert not found[:, :coordinates].any()
+    found[:, :coordinates] = y[:, coordinates : 2 * coordinates]
+    return found
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -145,3 +148,26 @@ def test_what_branches_on_the_state_is_refused(solver: str):
     p, _ = make(4, {"constraint": {"solver": solver}, "edges": "complete"})
     with pytest.raises(UnfitError):
         Trace(p)
+
+
+def test_the_pair_for_lanes_has_its_orders():
+    """Its weights meet Butcher's conditions of fifth order, and those of the error vanish up to the fourth."""
+    A, c, one = lane_steps.A, lane_steps.C, np.ones(lane_steps.STAGES)
+    np.testing.assert_allclose(A.sum(axis=1), c, atol=1e-15)
+    # Each rooted tree: its elementary weight of every stage, and its density.
+    trees = {
+        1: [(one, 1)],
+        2: [(c, 2)],
+        3: [(c**2, 3), (A @ c, 6)],
+        4: [(c**3, 4), (c * (A @ c), 8), (A @ c**2, 12), (A @ A @ c, 24)],
+        5: [
+            (c**4, 5), (c**2 * (A @ c), 10), (c * (A @ c**2), 15), (c * (A @ A @ c), 30), ((A @ c) ** 2, 20),
+            (A @ c**3, 20), (A @ (c * (A @ c)), 40), (A @ A @ c**2, 60), (A @ A @ A @ c, 120),
+        ],
+    }  # fmt: skip
+    for order, weights in trees.items():
+        for weight, density in weights:
+            assert A[-1] @ weight == pytest.approx(1.0 / density, abs=1e-14)
+            if order <= 4:
+                assert lane_steps.E @ weight == pytest.approx(0.0, abs=1e-15)
+    assert max(abs(lane_steps.E @ weight) for weight, _ in trees[5]) > 1e-5

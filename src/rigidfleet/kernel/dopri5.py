@@ -19,6 +19,7 @@ from rigidfleet.kernel.records import (
 from rigidfleet.kernel.vectors import filled, in_vectors, rough_inverse, total_or_worst
 
 # Dormand and Prince's 5(4) pair, with Hairer's fourth-order continuous extension.
+_STAGES = 7
 _A = np.zeros((7, 6))
 _A[1, :1] = 1 / 5
 _A[2, :2] = 3 / 40, 9 / 40
@@ -45,8 +46,8 @@ def forget_stages(k, first):
 
 
 @inlined
-def advance(k, stage, a, h):
-    """Write the state of a stage: y + h sum a[stage, s] k_s."""
+def advance(k, stage, a, h, p):
+    """Write the state of a stage of p: y + h sum a[stage, s] k_s."""
     # All six terms at once: later stages have weight zero and finite values.
     a0, a1, a2 = h * a[stage, 0], h * a[stage, 1], h * a[stage, 2]
     a3, a4, a5 = h * a[stage, 3], h * a[stage, 4], h * a[stage, 5]
@@ -54,6 +55,21 @@ def advance(k, stage, a, h):
         k[TRIAL, q] = ((a0 * k[0, q] + a1 * k[1, q]) + (a2 * k[2, q] + a3 * k[3, q])) + (
             k[STATE, q] + (a4 * k[4, q] + a5 * k[5, q])
         )
+
+
+@inlined
+def squared_errors(k, h, rtol, p):
+    """Squares of a step's errors over their tolerances, summed over vectors of states."""
+    squares = filled(0.0)
+    for q in range(k.shape[1]):
+        e = h * (
+            (_E[0] * k[0, q] + _E[2] * k[2, q] + _E[3] * k[3, q])
+            + (_E[4] * k[4, q] + _E[5] * k[5, q] + _E[6] * k[6, q])
+        )
+        size = max(abs(k[STATE, q]), abs(k[TRIAL, q]))
+        e *= rough_inverse(k[ATOL, q] + rtol * size)
+        squares += e * e
+    return squares
 
 
 @inlined
@@ -139,22 +155,14 @@ def integrate(p, w, state, t_end, fresh, times, samples, max_steps):
         h = step_size(t, h, t_end, p)
         stage = first
         # One call site of the right-hand side: stage 0 is the derivative at y itself.
-        while stage < 7:
-            advance(k, stage, _A, h)
+        while stage < _STAGES:
+            advance(k, stage, _A, h, p)
             closed_loop(t + _C[stage] * h, trial, K[stage], p, w)
             if stage == 0 and capacity > 0:
                 keep_start(p, w, state)
             count[0] += 1
             stage += 1
-        squares = filled(0.0)
-        for q in range(k.shape[1]):
-            e = h * (
-                (_E[0] * k[0, q] + _E[2] * k[2, q] + _E[3] * k[3, q])
-                + (_E[4] * k[4, q] + _E[5] * k[5, q] + _E[6] * k[6, q])
-            )
-            size = max(abs(k[STATE, q]), abs(k[TRIAL, q]))
-            e *= rough_inverse(k[ATOL, q] + state.rtol * size)
-            squares += e * e
+        squares = squared_errors(k, h, state.rtol, p)
         error = math.sqrt(total_or_worst(squares, y) / n)
         if not error <= 1.0:  # NaN too
             count[2] += 1
@@ -189,7 +197,7 @@ def integrate(p, w, state, t_end, fresh, times, samples, max_steps):
             keep_step(t, h, p, w, state)
         for q in range(k.shape[1]):
             k[STATE, q] = k[TRIAL, q]
-            k[0, q] = k[6, q]
+            k[0, q] = k[_STAGES - 1, q]
         t = t_new
         first = 1
         count[1] += 1

@@ -18,7 +18,7 @@ from rigidfleet._common.arguments import numbers
 from rigidfleet.kernel.compiler.simd import WIDTH
 from rigidfleet.kernel.engine import batch
 from rigidfleet.mission import Mission, Phase, as_mission
-from rigidfleet.planning.plan import plan_phase
+from rigidfleet.planning.plan import PhasePlan, plan_phase
 from rigidfleet.planning.reference import PhaseState
 from rigidfleet.planning.solvers import choose
 from rigidfleet.planning.timing import timed
@@ -137,8 +137,15 @@ class _Flights:
         self.integral: dict[tuple[int, int], Floats] = {}
         self.finished = np.ones(count, dtype=bool)
         self.evaluations = np.zeros(count, dtype=np.int64)
-        self.error = np.zeros(count)
+        self.plan: PhasePlan | None = None
         self.vectors = True
+
+    @property
+    def error(self) -> Floats:
+        """Greatest error (B,) of a distance of the last formation [m]."""
+        if self.plan is None:
+            return np.zeros(len(self.r))
+        return max_edge_error(self.r, self.plan.edges, self.plan.distances)
 
     def fly(self, phase: Phase, vectors: bool | None, threads: int) -> None:
         """Fly one phase and store its final states."""
@@ -174,7 +181,7 @@ class _Flights:
         self.now = replace(
             now, t=plan.t_end, reference=known, formation=plan.formation, slots=plan.slots
         )
-        self.error = max_edge_error(self.r, plan.edges, plan.distances)
+        self.plan = plan
 
 
 def _alike(mission: Mission, phase: Phase) -> bool:
@@ -213,5 +220,6 @@ def max_edge_error(r: Floats, edges: NDArray[np.integer], asked: Floats) -> Floa
 
 def _lengths(r: Floats, edges: NDArray[np.integer]) -> Floats:
     """Lengths (B, m) of edges [m]."""
-    way = r[:, edges[:, 0]] - r[:, edges[:, 1]]
+    way = r.take(edges[:, 0], axis=1)
+    way -= r.take(edges[:, 1], axis=1)
     return np.sqrt(np.einsum("bka,bka->bk", way, way))

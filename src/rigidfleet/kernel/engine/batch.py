@@ -12,16 +12,16 @@ import numpy as np
 from rigidfleet.kernel.compiler.jit import compiled
 from rigidfleet.kernel.compiler.pointers import by_address
 from rigidfleet.kernel.compiler.simd import WIDTH, LaneArray, pack, unpack
-from rigidfleet.kernel.engine import native
+from rigidfleet.kernel.engine import lane_steps, native
 from rigidfleet.kernel.engine.codegen import integrate, unrolled
 from rigidfleet.kernel.problem import EXACT, ITERATED, OPEN, SHAPE, Problem, padded, workspace
-from rigidfleet.kernel.records import FINISHED, LEAST_ERROR, integrator
+from rigidfleet.kernel.records import FINISHED, LEAST_ERROR, NO_TRAIL, IntegratorState, integrator
 from rigidfleet.typing import Bools, Floats, Ints
 
 #: Number of ranges of flights per thread; each range is taken by the next free thread.
 _RANGES = 4
-#: First step that a flight tries [s].
-_FIRST_STEP = 1e-3
+#: First step that a flight tries alone, and in a vector, whose pair takes longer steps [s].
+_FIRST_STEP, _FIRST_STEP_IN_VECTORS = 1e-3, 1e-2
 #: Greatest number of equations for straight-line code, whose length grows with their cube.
 _MOST_EQUATIONS = 36
 
@@ -129,14 +129,14 @@ def fly_all(
         return pack(x.reshape(len(x) // WIDTH, WIDTH, x.shape[1]).swapaxes(1, 2))
 
     def begin() -> Callable[..., None]:
-        state = integrator(np.zeros(n), 0.0, rtol=rtol, atol=atol)
-        K = np.zeros((*state.K.shape[:1], n, WIDTH))
-        K[-1] = atol[:, None]
-        state = state._replace(y=pack(np.zeros((n, WIDTH))), K=pack(K))
+        K = np.zeros((lane_steps.ROWS, n, WIDTH))
+        K[lane_steps.ATOL] = atol[:, None]
+        y, clock, counts = pack(np.zeros((n, WIDTH))), np.zeros(3), np.zeros(5, dtype=np.int64)
+        state = IntegratorState(y, pack(K), clock, counts, rtol, NO_TRAIL)
         own = ready._replace(before=ready.before.copy(), time=ready.time.copy())
 
         def work(*part: Any) -> None:
-            fly(own, state, *times, _FIRST_STEP, *part, max_steps, True)
+            fly(own, state, *times, _FIRST_STEP_IN_VECTORS, *part, max_steps, True)
 
         return work
 

@@ -19,9 +19,9 @@ from rigidfleet.kernel import dopri5
 from rigidfleet.kernel.compiler import simd
 from rigidfleet.kernel.compiler.jit import compiled_copy, compiled_for_c, inlined
 from rigidfleet.kernel.compiler.simd import VECTOR, WIDTH, LaneArray
+from rigidfleet.kernel.engine import lane_steps
 from rigidfleet.kernel.engine.tracer import Code, Symbol, Trace, structure
 from rigidfleet.kernel.problem import Problem
-from rigidfleet.kernel.records import STATE, TRIAL
 from rigidfleet.kernel.references import septic
 from rigidfleet.typing import Floats
 
@@ -84,62 +84,9 @@ def _closed_loop(t, y, dy, p, w):
     _call_code(p.address, y, dy, p.uniform, p.before, p.time)
 
 
-@inlined
-def _advance(k, stage, a, h):
-    """As `dopri5.advance`, without terms of weight zero, since each vector operation costs time."""
-    a0, a1, a2 = h * a[stage, 0], h * a[stage, 1], h * a[stage, 2]
-    a3, a4, a5 = h * a[stage, 3], h * a[stage, 4], h * a[stage, 5]
-    if stage <= 1:
-        for q in range(k.shape[1]):
-            k[TRIAL, q] = k[STATE, q] + a0 * k[0, q]
-    elif stage == 2:
-        for q in range(k.shape[1]):
-            k[TRIAL, q] = k[STATE, q] + a0 * k[0, q] + a1 * k[1, q]
-    elif stage == 3:
-        for q in range(k.shape[1]):
-            k[TRIAL, q] = (k[STATE, q] + a0 * k[0, q]) + (a1 * k[1, q] + a2 * k[2, q])
-    elif stage == 4:
-        for q in range(k.shape[1]):
-            k[TRIAL, q] = (k[STATE, q] + a0 * k[0, q] + a1 * k[1, q]) + (
-                a2 * k[2, q] + a3 * k[3, q]
-            )
-    elif stage == 5:
-        for q in range(k.shape[1]):
-            k[TRIAL, q] = (k[STATE, q] + a0 * k[0, q] + a1 * k[1, q]) + (
-                a2 * k[2, q] + a3 * k[3, q] + a4 * k[4, q]
-            )
-    else:
-        for q in range(k.shape[1]):
-            k[TRIAL, q] = (k[STATE, q] + a0 * k[0, q] + a2 * k[2, q]) + (
-                a3 * k[3, q] + a4 * k[4, q] + a5 * k[5, q]
-            )
-
-
-@inlined
-def _keep_step(t, h, p, w, state):
-    """Do nothing: flights of an ensemble record no trail."""
-
-
-@inlined
-def _keep_start(p, w, state):
-    """Do nothing: flights of an ensemble record no forces."""
-
-
-@inlined
-def _step_size(t, h, t_end, p):
-    """As `dopri5.step_size`: ensembles have no disturbances."""
-    return min(h, t_end - t)
-
-
-#: As `dopri5.integrate`; p is an `UnrolledProblem`, w is not used, arrays hold lanes.
+#: As `dopri5.integrate`, by the steps of `lane_steps`; p is an `UnrolledProblem`, w is not used, arrays hold lanes.
 integrate = compiled_copy(
-    dopri5.integrate,
-    "integrate_straight",
-    closed_loop=_closed_loop,
-    advance=_advance,
-    step_size=_step_size,
-    keep_start=_keep_start,
-    keep_step=_keep_step,
+    dopri5.integrate, "integrate_straight", closed_loop=_closed_loop, **lane_steps.INSTEAD
 )
 
 
@@ -207,8 +154,10 @@ def _emit(module: ir.Module, code: Code) -> ir.Function:
         values[x.serial] = simd.BUILD[x.operation](builder, *map(value, x.arguments))
     whole = [builder.fcmp_ordered(">", value(x), simd.number(0.0)) for x in code.positive]
     for index, x in enumerate(code.outputs):
+        if index < code.coordinates:  # a velocity, see `lane_steps`
+            continue
         found = value(x)
-        if index == 0:  # one state without a derivative is enough
+        if index == code.coordinates:  # one state without a derivative is enough
             for good in whole:
                 found = builder.select(good, found, simd.number(float("nan")))
         builder.store(found, element(dy, index), align=8)

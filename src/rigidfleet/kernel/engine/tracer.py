@@ -113,6 +113,7 @@ class Trace:
     ----------
     made : symbols by their operation and arguments
     outputs : (n,) the derivative of the state, symbols or numbers
+    coordinates : number of coordinates of positions; their derivatives are velocities
     positive : symbols assumed positive; if one is not, the state has no derivative
 
     Raises
@@ -142,6 +143,9 @@ class Trace:
         dy = np.full(len(y), 0.0, dtype=object)
         self._plain(dynamics.closed_loop)(0.0, y, dy, p, w)
         self.outputs: list[Any] = dy[np.argsort(states)].tolist()
+        self.coordinates = 3 * n
+        if any(self.outputs[q] is not y[3 * n + q] for q in range(3 * n)):
+            raise UnfitError("a derivative of a position that is not the velocity")
 
     def known_positive(self, x: Symbol) -> bool:
         """Whether a number of the problem is positive; `structure` distinguishes those that are not."""
@@ -245,13 +249,14 @@ class Code:
     Attributes
     ----------
     outputs : (n,) symbols or numbers
+    coordinates : number of coordinates of positions, whose derivatives, the first outputs, are velocities
     positive : symbols that have to be positive
     lines : symbols computed in flight, each after its arguments
     inputs : (U,) symbols that depend on the problem's numbers alone and that the lines use
     """
 
     def __init__(self, trace: Trace) -> None:
-        self.outputs = trace.outputs
+        self.outputs, self.coordinates = trace.outputs, trace.coordinates
         self.positive = [x for x in trace.positive if x.known > UNIFORM]
         self.lines: list[Symbol] = []
         self._uniform: list[Symbol] = []
@@ -305,14 +310,12 @@ def structure(problem: Problem) -> tuple[bytes, Floats, Ints]:
     used = _used(problem)
     for name in _PARTS:
         _sort_out(getattr(used, name), numbers, others)
-    together = np.concatenate(numbers)
-    _, first, which = np.unique(together, return_index=True, return_inverse=True)
-    order = np.argsort(first)
-    rank = np.empty(len(order), dtype=np.int64)
-    rank[order] = np.arange(len(order))
-    values, which = together[first[order]], rank[which]
-    kinds = np.select([values == 0.0, values == 1.0, values > 0.0], [0, 1, 2], 3)
-    return repr((others, which.tolist(), kinds.tolist())).encode(), values, which
+    # By a dictionary: for some hundred numbers, sorting arrays takes several times as long.
+    rank: dict[float, int] = {}
+    which = [rank.setdefault(x, len(rank)) for x in np.concatenate(numbers).tolist()]
+    kinds = [0 if x == 0.0 else 1 if x == 1.0 else 2 if x > 0.0 else 3 for x in rank]
+    values, places = np.array(list(rank)), np.array(which, dtype=np.int64)
+    return repr((others, which, kinds)).encode(), values, places
 
 
 def elimination_order(edges: NDArray[np.integer]) -> Ints:
