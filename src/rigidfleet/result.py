@@ -412,7 +412,7 @@ class Result:
     created: str = field(default_factory=_now)
 
     def __post_init__(self, later: Later) -> None:
-        self._later = {name: (names, make) for names, make in later for name in names}
+        self._later = {name: make for names, make in later for name in names}
         for name in self._later:
             del self.__dict__[name]
         sizes: dict[str, int] = {dim: len(names) for dim, names in LABELS.items()}
@@ -448,8 +448,8 @@ class Result:
             raise ValueError("phase must not decrease")
         n = sizes["agent"]
         for name, least in (("edges", 0), ("separation_pair", -1), ("clearance_agent", -1)):
-            who = getattr(self, name)
-            if who.size and not least <= who.min() <= who.max() < n:
+            who = given.get(name)  # None if it is made later
+            if who is not None and who.size and not least <= who.min() <= who.max() < n:
                 raise ValueError(f"{name} has agents outside {least} to {n - 1}")
         for name, x in (pair for phase in self.phases for pair in phase.extremes.items()):
             # A clearance names an obstacle, a rotor's force its rotor
@@ -459,7 +459,7 @@ class Result:
             if alone or x.who not in range(n):
                 raise ValueError(f"extreme {name} must name different agents from 0 to {n - 1}")
         for name in _QUATERNIONS:
-            q = given[name]  # most have a scalar part, which is found in a fifth of the time
+            q = given.get(name)  # most have a scalar part, which is found in a fifth of the time
             if q is not None and not q[..., 0].all() and not q.any(axis=-1).all():
                 raise ValueError(f"{name} has a quaternion of norm zero")
         if (self.edges[:, 0] == self.edges[:, 1]).any():
@@ -481,17 +481,19 @@ class Result:
 
     def __getattr__(self, name: str) -> Any:
         """Compute what the flight alone does not need when it is first asked for: it takes longer than the flight."""
-        found = self.__dict__.get("_later", {}).get(name)
-        if found is None:
+        make = self.__dict__.get("_later", {}).get(name)
+        if make is None:
+            if name in self.__dict__:  # another thread has just made it
+                return self.__dict__[name]
             raise AttributeError(f"a result has no {name!r}")
-        names, make = found
-        sizes = {"time": len(self.time), "agent": self.n_agents, "axis": 3}
+        sizes = {dim: len(labels) for dim, labels in LABELS.items()}
+        sizes |= {"time": len(self.time), "agent": self.n_agents, "edge": len(self.edges)}
         for key, value in make().items():
-            if key in VARIABLES:
-                self._set(key, value, sizes)
-            else:
-                setattr(self, key, value)
-        for key in names:
+            if key in self._later and key not in self.__dict__:  # nor has somebody set it
+                if key in VARIABLES:
+                    self._set(key, value, sizes)
+                else:
+                    setattr(self, key, value)
             self._later.pop(key, None)
         return self.__dict__[name]
 
@@ -805,11 +807,19 @@ VARIABLES: dict[str, Variable] = {
 _OPTIONAL = {f.name for f in fields(Result) if f.name in VARIABLES and f.default is None}
 
 
-#: Variables that are computed when they are first asked for.
+#: Variables that are computed when they are first asked for: references of slots; distances; what the law makes of the
+#: states, and what is measured of that, as a rule; as a rule, with noise, too.
 LATER = ("slot_velocity", "slot_acceleration", "slot_jerk", "yaw", "yaw_rate")
-for _name in (
-    LATER
-):  # the default of the field remains; without the class's attribute, `__getattr__` is called
+CLOSE = ("separation", "separation_pair", "clearance", "clearance_agent", "clearance_obstacle")
+RECORDED = (
+    "acceleration", "slot_position", "input_force", "constraint_force", "external_force", "thrust", "cm",
+    "cm_velocity", "cm_reference", "cm_velocity_reference", "attitude", "attitude_reference", "frame", "rates",
+    "rates_reference", "wrench_asked", "wrench_achieved", "distance", "distance_reference",
+    "distance_rate_reference", "constraint", "multiplier",
+)  # fmt: skip
+SEEN = ("measured_position", "measured_velocity")
+# The default of the field remains; without the class's attribute, `__getattr__` is called.
+for _name in (*LATER, *SEEN, "disturbance_force"):
     delattr(Result, _name)
 
 

@@ -30,7 +30,7 @@ from rigidfleet.simulation.callbacks import (
 )
 from rigidfleet.simulation.diagnosis import Place, diagnose
 from rigidfleet.simulation.extremes import Extremes
-from rigidfleet.simulation.recording import Led, Piece
+from rigidfleet.simulation.recording import Led, Piece, Unevaluated
 from rigidfleet.simulation.solver_setup import equip, first_step, give_back, integrator
 from rigidfleet.typing import Bools, Floats
 
@@ -218,7 +218,7 @@ class ActivePhase:
 
     def release(self) -> None:
         """Give the workspace back, after the end: nothing more is asked of this phase."""
-        give_back(self.plan, self.workspace)
+        give_back(self.plan.problem, self.workspace)
 
     # -- inside -----------------------------------------------------------------------------------
 
@@ -350,29 +350,20 @@ class ActivePhase:
         return float(max(errors))
 
     def _record(self, problem: Problem, times: Floats, samples: Floats) -> None:
-        """Evaluate forces and references at the samples and store them."""
-        plan, w = self.plan, self.workspace
+        """Store the samples; forces and references at them are evaluated when they are asked for."""
+        plan = self.plan
         n, m = len(plan.masses), len(plan.edges)
-        out = native.record(problem, w, times, samples)
-        # Flown by a user's controller: take the references of the phase
-        if problem is not plan.problem:
-            planned = native.record(plan.problem, w, times, samples)
-            out = out._replace(
-                r_ref=planned.r_ref,
-                p=planned.p,
-                motion=planned.motion,
-                rates=planned.rates,
-                T_ref=planned.T_ref,
-                wrench=planned.wrench,
-            )
+        given = Unevaluated(problem, plan.problem, samples)
+        # What keeps a state of its own, or calls a user's function, is asked while it is at hand.
+        if self.solver is not None or self.external is not None or problem.body_formulation:
+            given = given.evaluated(times, self.workspace)
         frame = np.full((len(times), 4), np.nan)
         if plan.frame is not None:
             q = samples[:, 6 * n + m : 6 * n + m + 4]
             frame = q / np.linalg.norm(q, axis=1, keepdims=True)
-        integral = samples[:, 6 * n : 6 * n + m]
-        led = self._led(times)
+        integral, led = samples[:, 6 * n : 6 * n + m], self._led(times)
         self.pieces.append(
-            Piece(self.index, times, out, integral, frame, plan.edges, plan.attached, led)
+            Piece(self.index, times, given, integral, frame, plan.edges, plan.attached, led)
         )
 
     def _led(self, times: Floats) -> Led:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -15,13 +15,13 @@ from rigidfleet.kernel.records import Record
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
 from rigidfleet.planning.derivatives import Yaw, slot_derivatives, yaw_derivatives
-from rigidfleet.result import LATER, PhaseRecord, Result
+from rigidfleet.result import CLOSE, LATER, RECORDED, SEEN, Extremum, PhaseRecord, Result
+from rigidfleet.simulation.solver_setup import give_back, small_workspace
 from rigidfleet.typing import Bools, Floats, Ints
 
 if TYPE_CHECKING:
-    from rigidfleet.kernel.problem import Motion, Reference
+    from rigidfleet.kernel.problem import Motion, Problem, Reference, Workspace
     from rigidfleet.mission import Mission
-    from rigidfleet.mission.schema import VehicleYaw
     from rigidfleet.planning.vehicles import Turn
 
 
@@ -31,6 +31,10 @@ _SINGULAR = 400
 #: number of samples.
 _WORK, _LEAST = 400_000_000, 9
 
+
+#: Columns of a record that are those of the phase, also where a user's controller flies.
+_REFERENCES = "r_ref", "p", "motion", "rates", "T_ref", "wrench"
+_STATES = "position", "velocity"
 
 #: References that slots follow one after the other, each with the time [s] from which it counts, and how vehicles with
 #: sampled control turn; none if not tracked.
@@ -58,13 +62,36 @@ class LayerSamples(NamedTuple):
 Samples = TypeVar("Samples", VehicleSamples, LayerSamples)
 
 
+class Unevaluated(NamedTuple):
+    """States of the integrator at samples, of which forces and references have not been asked for yet."""
+
+    problem: Problem  # as flown: it may hold the force of a user's controller
+    planned: Problem  # of the phase, which has the references
+    y: Floats  # (K, n)
+
+    @property
+    def motion(self) -> tuple[Floats, Floats]:
+        """Positions and velocities (K, N, 3) of agents, as copies."""
+        n = len(self.problem.vehicles.m)
+        r, v = (self.y[:, s * n : (s + 3) * n].reshape(-1, n, 3) for s in (0, 3))
+        return np.array(r), np.array(v)
+
+    def evaluated(self, times: Floats, work: Workspace) -> Record:
+        """Forces and references at the samples, times (K,) [s]."""
+        out = native.record(self.problem, work, times, self.y)
+        if self.problem is self.planned:
+            return out
+        of_phase = native.record(self.planned, work, times, self.y)
+        return out._replace(**{name: getattr(of_phase, name) for name in _REFERENCES})
+
+
 @dataclass
 class Piece:
-    """Samples of a phase, or of part of one, as the kernel returns them."""
+    """Samples of a phase, or of part of one."""
 
     phase: int
     time: Floats  # (K,) [s]
-    record: Record
+    given: Record | Unevaluated
     integral: Floats  # (K, m) [m s]
     frame: Floats  # (K, 4)
     edges: Ints  # (m, 2) of this phase
@@ -72,6 +99,21 @@ class Piece:
     led: Led  # what the slots follow, if they are tracked
     vehicles: VehicleSamples | None = None
     layers: LayerSamples | None = None
+
+    @property
+    def r(self) -> Floats:
+        """Positions (K, N, 3) [m]."""
+        return self.given.motion[0] if isinstance(self.given, Unevaluated) else self.given.r
+
+    @cached_property
+    def record(self) -> Record:
+        """Forces and references, as the kernel returns them."""
+        if not isinstance(self.given, Unevaluated):
+            return self.given
+        work = small_workspace(self.given.planned)
+        found = self.given.evaluated(self.time, work)
+        give_back(self.given.planned, work)
+        return found
 
 
 def assemble(
@@ -82,13 +124,73 @@ def assemble(
     ending: str,
     statistics: dict[str, Any],
 ) -> Result:
-    """Join the pieces of a flight and compute all that follows from positions and forces."""
+    """Join the pieces of a flight.
+
+    All that follows from positions and velocities is computed when it is first asked for, unless the law has already
+    been evaluated at the samples.
+    """
     pieces = [p for p in pieces if len(p.time)]
     time = _joined([p.time for p in pieces])
-    whole = not (mission.lost_at < time[-1]).any()
-    left = np.ones((len(time), mission.n_agents), dtype=np.bool_)
-    if not whole:
-        left = time[:, None] <= mission.lost_at  # (K, N)
+    flown = _of_vehicles(pieces)
+    avoided = [piece.layers for piece in pieces if piece.layers is not None]
+    layers = _together(avoided) if avoided else None
+    d = mission.disturbances
+    noisy = d is not None and d.noise is not None
+    airy = bool(mission.drag.any()) or flown is not None
+    worst = [
+        {
+            name: phase.extremes[name]
+            for name in ("separation", "clearance")
+            if name in phase.extremes
+        }
+        for phase in phases
+    ]
+    later: list[tuple[tuple[str, ...], Callable[[], dict[str, Any]]]] = [
+        (
+            (*RECORDED, *(("disturbance_force",) if airy else ()), *(SEEN if noisy else ())),
+            partial(_recorded, mission, pieces, time, flown),
+        ),
+        (CLOSE, partial(_close, mission, worst, pieces, time)),
+        (LATER, partial(_references, mission, [(p.time, p.led) for p in pieces])),
+        (("singular_value",), partial(_singular_values, pieces)),
+        (("mission_text",), partial(_text, mission)),
+    ]
+    motion = [p.given.motion for p in pieces if isinstance(p.given, Unevaluated)]
+    now: dict[str, Any] = {}
+    if len(motion) == len(pieces):
+        now["position"], now["velocity"] = (_joined(parts) for parts in zip(*motion, strict=True))
+    else:
+        for names, make in later[:2]:
+            made = make()
+            now |= {name: made[name] for name in (*_STATES, *names) if name in made}
+        del later[:2]
+    unmade: dict[str, Any] = dict.fromkeys(name for names, _ in later for name in names)
+    return Result(
+        time=time,
+        phase=np.repeat([p.phase for p in pieces], [len(p.time) for p in pieces]),
+        edges=mission.edges,
+        integral=_by_edge(pieces, mission.edges, lambda p: p.integral),
+        vehicle_attitude=None if flown is None else flown.attitude,
+        vehicle_rates=None if flown is None else flown.rates,
+        rotor_force=None if flown is None else flown.rotor_force,
+        saturated=None if flown is None else flown.saturated.astype(np.int64),
+        clock_rate=None if layers is None else layers.rate,
+        body_displacement=None if layers is None else layers.displacement,
+        avoidance_layers=None if layers is None else layers.layers,
+        phases=list(phases),
+        complete=not ending,
+        ending=ending,
+        statistics=statistics,
+        later=later,
+        **(unmade | now),
+    )
+
+
+def _recorded(
+    mission: Mission, pieces: Sequence[Piece], time: Floats, flown: VehicleSamples | None
+) -> dict[str, Any]:
+    """Forces and references at all samples, and what is measured of them."""
+    edges = mission.edges
     record = pieces[0].record
     if len(pieces) > 1:
         edgewise = {"c", "L", "d", "d_dot", "multiplier"}
@@ -101,102 +203,90 @@ def assemble(
             }
         )
     found = _measured(mission, pieces, time, record)
-    flown = _of_vehicles(pieces)
-    avoided = [piece.layers for piece in pieces if piece.layers is not None]
-    layers = _together(avoided) if avoided else None
-    thrust = found.thrust
+    thrust, motion, r_ref = found.thrust, record.motion, record.r_ref
     if flown is not None:
         thrust = flown.thrust
         if mission.agents.saturate:  # the thrust flown, not the commanded one
             thrust = np.minimum(thrust, mission.agents.thrust_limit)
-    r, motion = record.r, record.motion
-    close = proximity.closeness(r, mission.agents.radius, mission.obstacles, time, left)
-    _put_extremes(phases, time, close)
-    edges = mission.edges
-    columns = [_columns(p.edges, edges) for p in pieces]
-
-    def by_edge(name: str) -> Floats:
-        return _by_edge(pieces, columns, name, len(edges))
-
-    reference = by_edge("d")
+    if (left := _left(mission, time)) is not None:
+        r_ref = np.where(left[:, :, None], r_ref, np.nan)
+    reference = _by_edge(pieces, edges, lambda p: p.record.d)
+    constraint = _by_edge(pieces, edges, lambda p: p.record.c)
     d = mission.disturbances
-    noisy = d is not None and d.noise is not None
-    airy = mission.drag.any() or flown is not None
-    return Result(
-        time=time,
-        phase=np.concatenate([np.full(len(p.time), p.phase) for p in pieces]),
-        position=r,
-        velocity=record.v,
-        acceleration=record.a,
-        slot_position=record.r_ref if whole else np.where(left[:, :, None], record.r_ref, np.nan),
-        input_force=record.f_u,
-        constraint_force=record.f_C,
-        external_force=record.f_E,
-        thrust=thrust,
-        cm=found.cm,
-        cm_velocity=found.cm_velocity,
-        cm_reference=motion[:, :3],
-        cm_velocity_reference=motion[:, 3:],
-        attitude=found.attitude,
-        attitude_reference=found.attitude_reference,
-        frame=found.frame,
-        rates=found.rates,
-        rates_reference=record.rates,
-        wrench_asked=np.where(np.isfinite(motion[:, :1]), record.wrench, found.wrench),
-        wrench_achieved=found.wrench,
-        edges=edges,
-        distance=found.distance,
-        distance_reference=reference,
-        distance_rate_reference=by_edge("d_dot"),
-        constraint=found.distance - reference if noisy else by_edge("c"),
-        integral=by_edge("integral"),
-        multiplier=by_edge("multiplier"),
-        singular_value=np.zeros(0),  # computed later
-        separation=close.separation,
-        separation_pair=close.pair,
-        clearance=close.clearance,
-        clearance_agent=close.agent,
-        clearance_obstacle=close.obstacle,
-        disturbance_force=record.f_D if airy else None,
-        measured_position=record.r_seen if noisy else None,
-        measured_velocity=record.v_seen if noisy else None,
-        later=(
-            (LATER, partial(_references, mission.yaw, [(p.time, p.led) for p in pieces], left)),
-            (
-                ("singular_value",),
-                partial(_singular_values, [(p.record.r, p.edges) for p in pieces]),
-            ),
-            (("mission_text",), partial(_text, mission)),
-        ),
-        vehicle_attitude=None if flown is None else flown.attitude,
-        vehicle_rates=None if flown is None else flown.rates,
-        rotor_force=None if flown is None else flown.rotor_force,
-        saturated=None if flown is None else flown.saturated.astype(np.int64),
-        clock_rate=None if layers is None else layers.rate,
-        body_displacement=None if layers is None else layers.displacement,
-        avoidance_layers=None if layers is None else layers.layers,
-        phases=list(phases),
-        mission_text="",  # made later
-        complete=not ending,
-        ending=ending,
-        statistics=statistics,
-    )
+    if d is not None and d.noise is not None:
+        constraint = found.distance - reference
+    return {
+        "position": record.r,
+        "velocity": record.v,
+        "acceleration": record.a,
+        "slot_position": r_ref,
+        "input_force": record.f_u,
+        "constraint_force": record.f_C,
+        "external_force": record.f_E,
+        "disturbance_force": record.f_D,
+        "measured_position": record.r_seen,
+        "measured_velocity": record.v_seen,
+        "thrust": thrust,
+        "cm": found.cm,
+        "cm_velocity": found.cm_velocity,
+        "cm_reference": motion[:, :3],
+        "cm_velocity_reference": motion[:, 3:],
+        "attitude": found.attitude,
+        "attitude_reference": found.attitude_reference,
+        "frame": found.frame,
+        "rates": found.rates,
+        "rates_reference": record.rates,
+        "wrench_asked": np.where(np.isfinite(motion[:, :1]), record.wrench, found.wrench),
+        "wrench_achieved": found.wrench,
+        "distance": found.distance,
+        "distance_reference": reference,
+        "distance_rate_reference": _by_edge(pieces, edges, lambda p: p.record.d_dot),
+        "constraint": constraint,
+        "multiplier": _by_edge(pieces, edges, lambda p: p.record.multiplier),
+    }
 
 
 def _text(mission: Mission) -> dict[str, str]:
     return {"mission_text": mission.text}
 
 
-def _references(
-    yaw: VehicleYaw, pieces: Sequence[tuple[Floats, Led]], left: Bools
-) -> dict[str, Floats]:
+def _left(mission: Mission, time: Floats) -> Bools | None:
+    """Mask (K, N) of the agents that are not lost; None if none is."""
+    left = time[:, None] <= mission.lost_at
+    return None if left.all() else left
+
+
+def _close(
+    mission: Mission,
+    worst: Sequence[dict[str, Extremum]],
+    pieces: Sequence[Piece],
+    time: Floats,
+) -> dict[str, Any]:
+    """Distances at samples; the one after an extreme of a phase, ``worst``, has the extreme."""
+    left = _left(mission, time)
+    if left is None:
+        left = np.ones((len(time), mission.n_agents), dtype=np.bool_)
+    r = _joined([p.r for p in pieces])
+    close = proximity.closeness(r, mission.agents.radius, mission.obstacles, time, left)
+    for extremes in worst:
+        _put(extremes, time, close)
+    return dict(
+        zip(
+            CLOSE,
+            (close.separation, close.pair, close.clearance, close.agent, close.obstacle),
+            strict=True,
+        )
+    )
+
+
+def _references(mission: Mission, pieces: Sequence[tuple[Floats, Led]]) -> dict[str, Floats]:
     """Derivatives of the slots and the yaw of each vehicle, of pieces of a flight; NaN where no slots are tracked.
 
     Yaw "along" continues from piece to piece.
     """
+    yaw, n = mission.yaw, mission.n_agents
     x, y, z = yaw.point or (0.0, 0.0, 0.0)
     turned = Yaw(yaw.kind, float(np.deg2rad(yaw.yaw_deg)), (x, y, z))
-    n = left.shape[1]
     states, angles = [], []
     last, until = None, 0.0
     for times, led in pieces:
@@ -221,8 +311,10 @@ def _references(
             angles.append(found)
             last, until = found[-1, 0], time[-1]
     state, angle = np.concatenate(states), np.concatenate(angles)
-    state[~left[:, None].repeat(3, axis=1)] = np.nan
-    angle[~left[:, None].repeat(2, axis=1)] = np.nan
+    left = _left(mission, _joined([times for times, _ in pieces]))
+    if left is not None:
+        state[~left[:, None].repeat(3, axis=1)] = np.nan
+        angle[~left[:, None].repeat(2, axis=1)] = np.nan
     known = np.isfinite(angle[:, 0]).any(axis=1)
     angle[known, 0] = np.unwrap(angle[known, 0], axis=0)  # one turn, not one for each piece
     values = (*state.swapaxes(0, 1), *angle.swapaxes(0, 1))
@@ -255,20 +347,19 @@ def _together(found: Sequence[Samples]) -> Samples:
     return type(found[0])(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
 
 
-def _put_extremes(phases: Sequence[PhaseRecord], time: Floats, close: proximity.Closeness) -> None:
-    """Enter the extremes between samples at the sample after each."""
-    for phase in phases:
-        for name, values in (("separation", close.separation), ("clearance", close.clearance)):
-            x = phase.extremes.get(name)
-            if x is None:
-                continue
-            k = min(int(np.searchsorted(time, x.time)), len(time) - 1)
-            if x.value < values[k]:
-                values[k] = x.value
-                if name == "separation":
-                    close.pair[k] = x.who, x.other
-                else:
-                    close.agent[k], close.obstacle[k] = x.who, x.other
+def _put(extremes: dict[str, Extremum], time: Floats, close: proximity.Closeness) -> None:
+    """Enter extremes between samples at the sample after each."""
+    for name, values in (("separation", close.separation), ("clearance", close.clearance)):
+        x = extremes.get(name)
+        if x is None:
+            continue
+        k = min(int(np.searchsorted(time, x.time)), len(time) - 1)
+        if x.value < values[k]:
+            values[k] = x.value
+            if name == "separation":
+                close.pair[k] = x.who, x.other
+            else:
+                close.agent[k], close.obstacle[k] = x.who, x.other
 
 
 def _joined(parts: Sequence[Floats]) -> Floats:
@@ -296,19 +387,15 @@ def _measured(mission: Mission, pieces: Sequence[Piece], time: Floats, record: R
     return found
 
 
-def _by_edge(
-    pieces: Sequence[Piece], columns: Sequence[Ints | slice], name: str, count: int
-) -> Floats:
-    """A quantity of the edges (K, m); NaN while an edge is not active."""
+def _by_edge(pieces: Sequence[Piece], edges: Ints, given: Callable[[Piece], Floats]) -> Floats:
+    """A quantity of the edges (K, m), ``given`` for those of a piece; NaN while an edge is not active."""
+    columns = [_columns(p.edges, edges) for p in pieces]
+    if all(isinstance(places, slice) for places in columns):
+        return _joined([given(p) for p in pieces])
     rows = []
-    whole = all(isinstance(places, slice) for places in columns)
     for piece, places in zip(pieces, columns, strict=True):
-        values = piece.integral if name == "integral" else getattr(piece.record, name)
-        if whole:
-            rows.append(values)
-            continue
-        full = np.full((len(piece.time), count), np.nan)
-        full[:, places] = values
+        full = np.full((len(piece.time), len(edges)), np.nan)
+        full[:, places] = given(piece)
         rows.append(full)
     return _joined(rows)
 
@@ -323,12 +410,12 @@ def _columns(some: Ints, edges: Ints) -> Ints | slice:
     return order[np.searchsorted(keys[order], some[:, 0] * key + some[:, 1])]
 
 
-def _singular_values(pieces: Sequence[tuple[Floats, Ints]]) -> dict[str, Floats]:
+def _singular_values(pieces: Sequence[Piece]) -> dict[str, Floats]:
     """Smallest non-zero singular value of J (K,); NaN if the formation is too large to compute it.
 
     In formations of some tens of agents it is computed at some samples of each phase, and linear in between.
     """
-    return {"singular_value": np.concatenate([_singular(r, edges) for r, edges in pieces])}
+    return {"singular_value": np.concatenate([_singular(p.r, p.edges) for p in pieces])}
 
 
 def _singular(r: Floats, edges: Ints) -> Floats:

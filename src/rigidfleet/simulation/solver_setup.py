@@ -28,17 +28,14 @@ _KEPT, _SMALL = 8, 200
 
 def equip(plan: PhasePlan) -> tuple[Workspace, LargeSolver | None]:
     """Workspace of a plan, and the solver for its multipliers if the kernel itself does not solve for them."""
-    problem, size = plan.problem, (len(plan.masses), len(plan.edges))
-    with_h, solves = problem.control.allocation != RIGID, problem.law.solver
+    problem, edges = plan.problem, plan.edges
     if not plan.large:
-        kind = (*size, with_h, solves)
-        with suppress(KeyError, IndexError):  # none is idle
-            return cleared(_idle[kind].pop()), None
-        return workspace(*size, with_h=with_h, solver=solves), None
-    work = workspace(*size, with_h=with_h, solver=solves, large=True)
+        return small_workspace(problem), None
+    with_h = problem.control.allocation != RIGID
+    size = len(plan.masses), len(edges)
+    work = workspace(*size, with_h=with_h, solver=problem.law.solver, large=True)
     from rigidfleet.kernel.large.solver import LargeSolver
 
-    edges = plan.edges
     points = plan.before.r if plan.slots is None else plan.slots
     steps = solvers.elimination_steps(len(points), edges) if plan.method == "elimination" else None
     order = cache(partial(solvers.dissection, points, edges))
@@ -49,11 +46,20 @@ def equip(plan: PhasePlan) -> tuple[Workspace, LargeSolver | None]:
     return work, solver
 
 
-def give_back(plan: PhasePlan, work: Workspace) -> None:
-    """Let another phase use the workspace of a plan that has been flown."""
-    if plan.large or len(plan.masses) > _SMALL:
+def small_workspace(problem: Problem) -> Workspace:
+    """A workspace for a problem whose multipliers the kernel itself solves for: an idle one, or a new one."""
+    size = len(problem.vehicles.m), len(problem.graph.edges)
+    with_h, solves = problem.control.allocation != RIGID, problem.law.solver
+    with suppress(KeyError, IndexError):  # none is idle
+        return cleared(_idle[*size, with_h, solves].pop())
+    return workspace(*size, with_h=with_h, solver=solves)
+
+
+def give_back(problem: Problem, work: Workspace) -> None:
+    """Let others use the workspace of a problem that is done with."""
+    if problem.graph.solver or len(problem.vehicles.m) > _SMALL:
         return
-    kind = (*work.p.shape[:1], *work.L.shape, work.H.size > 0, plan.problem.law.solver)
+    kind = (*work.p.shape[:1], *work.L.shape, work.H.size > 0, problem.law.solver)
     idle = _idle.setdefault(kind, [])
     if len(idle) < _KEPT:
         idle.append(work)
