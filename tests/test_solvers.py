@@ -1,11 +1,17 @@
 """Large formations: elimination, the vertex graph and the dense factor solve the same law."""
 
+import os
+import shutil
+import subprocess
+import sys
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from rigidfleet.formation import graphs, shapes
+from rigidfleet.kernel.compiler.cache import cache_directory
 from rigidfleet.kernel.large import block_cholesky
 from rigidfleet.kernel.large.solver import LargeSolver
 from rigidfleet.kernel.problem import EXACT, ITERATED, ConstraintLaw, Vehicles, workspace
@@ -318,6 +324,33 @@ def test_flights_are_the_same_whatever_the_solve(law, kind, method, monkeypatch)
     assert counts["fallbacks"] == counts["failures"] == 0
     np.testing.assert_allclose(found[method].position, found["dense"].position, atol=1e-6)
     np.testing.assert_allclose(found[method].multiplier, found["dense"].multiplier, atol=1e-4)
+
+
+SAME_BITS = """
+import hashlib, sys
+sys.path.insert(0, sys.argv[1])
+from test_solvers import flight, simulate, solvers
+for law, kind, method in ("exact", "henneberg", "elimination"), ("iterated", "neighbours", "sparse"):
+    solvers.choose = lambda *_: method
+    print(hashlib.sha256(simulate(flight(law, kind)).position.tobytes()).hexdigest())
+"""
+
+
+@pytest.mark.long
+def test_a_process_that_compiles_flies_the_bits_of_one_that_loads(tmp_path):
+    """Sums are reordered where functions are compiled into others: each has to be compiled in one way only."""
+    folder = tmp_path / cache_directory().relative_to(cache_directory().parents[1])
+    folder.mkdir(parents=True)
+    for library in cache_directory().glob("*.o"):
+        shutil.copy2(library, folder)
+    command = [sys.executable, "-c", SAME_BITS, str(Path(__file__).parent)]
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    compiled, loaded = (
+        subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
+        for _ in range(2)
+    )
+    assert compiled == loaded
+    assert len(set(compiled.split())) == 2
 
 
 def test_the_integral_does_not_set_the_step(monkeypatch):

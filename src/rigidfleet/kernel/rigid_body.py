@@ -7,7 +7,7 @@ from rigidfleet.kernel.linalg import jacobi_eigen, surely_positive, where_positi
 from rigidfleet.kernel.problem import PINV_EQUAL, PINV_INERTIA_FORCE, RIGID
 
 
-@compiled
+@inlined
 def centre_of_mass(r, m, M, out):
     """Mass-weighted mean of r (N, 3) into out (3,); M is the sum of the masses m (N,)."""
     x = y = z = 0.0
@@ -16,7 +16,7 @@ def centre_of_mass(r, m, M, out):
     out[0], out[1], out[2] = x / M, y / M, z / M
 
 
-@compiled
+@inlined
 def inertia(r, m, cm, I):
     """Inertia I (3, 3) [kg m^2] of points r (N, 3) about cm, as in Eq. (19): sum m (|x|^2 1 - x x^T)."""
     a = b = c = d = e = f = 0.0
@@ -34,7 +34,7 @@ def inertia(r, m, cm, I):
     I[2, 0], I[2, 1], I[2, 2] = c, e, f
 
 
-@compiled
+@inlined
 def inertia_inverse(I, out):
     """Pseudo-inverse of the inertia of point masses into out (3, 3), relative cut-off 1e-9.
 

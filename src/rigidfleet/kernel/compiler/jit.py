@@ -47,7 +47,10 @@ def compiled(function: F) -> F:
 
 
 def inlined(function: F) -> F:
-    """Compile into each caller, for functions that every evaluation of a flight calls."""
+    """Compile into each caller, for functions that every evaluation of a flight calls, and for those that sum.
+
+    Where it is not inlined, the linker takes the copy that was loaded first, and copies sum in different orders.
+    """
     return _cached(function, _CACHED | {"forceinline": _OPTIMISES})
 
 

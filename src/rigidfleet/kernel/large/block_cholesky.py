@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rigidfleet.kernel.compiler.jit import compiled
+from rigidfleet.kernel.compiler.jit import compiled, inlined
 from rigidfleet.typing import Ints
 
 
@@ -188,7 +188,7 @@ def factor(column, row, first, left, block, L, at):
     return True
 
 
-@compiled
+@inlined
 def precondition(R, place, column, row, L, r, w, z):
     """z = R (L L^T)^-1 R^T r for (N, 3) arrays, where R (3, 3) is the rotation since the factor was made."""
     for i in range(r.shape[0]):
@@ -247,7 +247,7 @@ def apply_Jt(u, edges, b, scale, out):
             out[j, q] -= s * u[k, q]
 
 
-@compiled
+@inlined
 def apply(u, edges, m, mbar, mu, a, out):
     """out = K a for (N, 3) arrays."""
     for i in range(m.shape[0]):
@@ -261,7 +261,7 @@ def apply(u, edges, m, mbar, mu, a, out):
         out[j, 0], out[j, 1], out[j, 2] = out[j, 0] - s * x, out[j, 1] - s * y, out[j, 2] - s * z
 
 
-@compiled
+@inlined
 def inner(a, b):
     """Sum of a b over (N, 3) arrays."""
     s = 0.0

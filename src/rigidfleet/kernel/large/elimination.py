@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rigidfleet.kernel.compiler.jit import compiled
+from rigidfleet.kernel.compiler.jit import compiled, inlined
 from rigidfleet.kernel.rigid_body import centre_of_mass, inertia, inertia_inverse
 from rigidfleet.typing import Edges, Ints
 
@@ -57,7 +57,7 @@ def solve(u, b, r, m, M, order, known, cm, I, I_inv, a, multiplier):
     return pivot
 
 
-@compiled
+@inlined
 def particular(u, b, order, a):
     """Write into a (N, 3) a solution of J a = b, agent by agent; return the smallest pivot.
 
@@ -102,7 +102,7 @@ def particular(u, b, order, a):
     return smallest
 
 
-@compiled
+@inlined
 def balance(r, m, M, cm, I_inv, a):
     """Turn accelerations a (N, 3) into forces M a, after removing the rigid motion that carries momentum.
 
@@ -127,7 +127,7 @@ def balance(r, m, M, cm, I_inv, a):
         a[i, 2] = m[i] * (a[i, 2] - p2 - (w0 * y - w1 * x))
 
 
-@compiled
+@inlined
 def pull_back(u, order, f, multiplier):
     """Multipliers (m,) with J^T lambda = f for balanced forces f (N, 3), last agent first; f is overwritten.
 
