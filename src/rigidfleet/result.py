@@ -70,6 +70,9 @@ LABELS: dict[str, tuple[str, ...]] = {
 }
 
 
+_LABELLED = {dim: len(names) for dim, names in LABELS.items()}
+
+
 _Three = tuple[float, float, float]
 
 
@@ -412,11 +415,11 @@ class Result:
     created: str = field(default_factory=_now)
 
     def __post_init__(self, later: Later) -> None:
-        self._later = {name: make for names, make in later for name in names}
-        for name in self._later:
-            del self.__dict__[name]
-        sizes: dict[str, int] = {dim: len(names) for dim, names in LABELS.items()}
+        self._later = unmade = {name: make for names, make in later for name in names}
         given = self.__dict__
+        for name in unmade:
+            del given[name]
+        sizes: dict[str, int] = dict(_LABELLED)
         for key, dims in (
             ("time", ("time",)),
             ("position", ("time", "agent")),
@@ -426,13 +429,12 @@ class Result:
                 sizes.update(zip(dims, given[key].shape, strict=False))
         for name, dims, dtype in _CHECKED:
             value = given.get(name)
-            if value is None and (name in _OPTIONAL or name in self._later):
+            if value is None and (name in unmade or name in _OPTIONAL):
                 continue
-            asked = tuple(map(sizes.get, dims))
             if not (
                 type(value) is np.ndarray
                 and value.dtype is dtype
-                and value.shape == asked
+                and value.shape == tuple([sizes.get(dim) for dim in dims])
                 and value.flags.c_contiguous
             ):
                 self._set(name, value, sizes)
@@ -442,9 +444,11 @@ class Result:
         ends = math.isfinite(time[0]) and math.isfinite(time[-1])
         if not (ends and (time[1:] > time[:-1]).all()):
             raise ValueError("time must be finite and strictly increasing")
-        if phase.min() < 0 or phase.max() >= len(self.phases):
+        falls = (phase[1:] < phase[:-1]).any()
+        least, most = (phase.min(), phase.max()) if falls else (phase[0], phase[-1])
+        if least < 0 or most >= len(self.phases):
             raise ValueError(f"phase has indices outside 0 to {len(self.phases) - 1}")
-        if (phase[1:] < phase[:-1]).any():
+        if falls:
             raise ValueError("phase must not decrease")
         n = sizes["agent"]
         for name, least in (("edges", 0), ("separation_pair", -1), ("clearance_agent", -1)):
@@ -486,8 +490,11 @@ class Result:
             if name in self.__dict__:  # another thread has just made it
                 return self.__dict__[name]
             raise AttributeError(f"a result has no {name!r}")
-        sizes = {dim: len(labels) for dim, labels in LABELS.items()}
-        sizes |= {"time": len(self.time), "agent": self.n_agents, "edge": len(self.edges)}
+        sizes = _LABELLED | {
+            "time": len(self.time),
+            "agent": self.n_agents,
+            "edge": len(self.edges),
+        }
         for key, value in make().items():
             if key in self._later and key not in self.__dict__:  # nor has somebody set it
                 if key in VARIABLES:

@@ -31,6 +31,8 @@ class ByEdge:
 
     def of(self, edges: Ints, other: Floats | float) -> Floats:
         """Values (m,) of edges (m, 2), i < j; ``other`` (m,) for new edges, or (B, m), then of so many flights."""
+        if not len(self.keys):
+            return np.zeros(len(edges)) + other
         keys = _keys(edges)
         if keys is self.keys and np.ndim(other) < 2:
             return self.values.copy()

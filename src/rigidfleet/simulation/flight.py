@@ -198,7 +198,7 @@ class Flight:
         if mission.body_frame is not None:
             b = mission.body_frame
             frame = att.dcm_from_euler(np.deg2rad([b.roll_deg, b.pitch_deg, b.yaw_deg]))
-        self._begins = self._now = PhaseState(
+        self._begins = self._reached = PhaseState(
             0.0, mission.fleet.position.copy(), mission.fleet.velocity.copy(), frame=frame
         )
         self._vehicles = None if mission.vehicle_models is None else Vehicles(mission)
@@ -206,6 +206,10 @@ class Flight:
         self._disturbance = self._prepared.disturbance if self._vehicles is None else None
         self._extremes = self._prepared.extremes()
         self._active: ActivePhase | None = None
+        self._ended: ActivePhase | None = (
+            None  # the phase before, if its last state is not known yet
+        )
+        self._t = 0.0  # end of the phase before [s]
         self._asked: list[Phase] = []  # each phase as it was begun
         self._cut: set[int] = set()  # phases left before their end
         self._finished = False
@@ -224,7 +228,7 @@ class Flight:
     @property
     def t(self) -> float:
         """Mission time reached [s]."""
-        return self._now.t if self._active is None else self._active.t
+        return self._t if self._active is None else self._active.t
 
     @property
     def plan(self) -> PhasePlan:
@@ -462,6 +466,9 @@ class Flight:
         self._finished = True
         result = self.record(self.pieces, None if own else self._asked)
         self._prepared.give_back(self._extremes)
+        if self._ended is not None:  # no phase follows
+            self._ended.release()
+            self._ended = None
         return result
 
     def record(
@@ -518,6 +525,15 @@ class Flight:
         return self._extremes.contact()
 
     # -- inside -----------------------------------------------------------------------------------
+
+    @property
+    def _now(self) -> PhaseState:
+        """The state from which the next phase starts, evaluated when it is asked for: none follows the last."""
+        if self._ended is not None:
+            self._reached = self._ended.end()
+            self._ended.release()
+            self._ended = None
+        return self._reached
 
     def _under_way(self) -> ActivePhase:
         if self._finished:
@@ -576,9 +592,10 @@ class Flight:
         self._count += active.counted
         for method, counts in active.solves:
             self._solves.setdefault(method, type(counts)()).add(counts)
-        self._now = active.end()
-        active.release()
-        record.t_end = self._now.t
+        self._ended = active
+        self._t = record.t_end = active.t
+        if active.solver is not None:  # its errors are told at once
+            _ = self._now
         if abandoned:
             points = () if record.target is None else record.target.get("through", ())
             came = [point for point in points if point["time"] <= record.t_end]
