@@ -1,5 +1,7 @@
 """What flights share, and what compiled code is given, leaves no trace in a flight."""
 
+import copy
+import pickle
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -133,6 +135,51 @@ def test_singular_values_come_when_they_are_asked_for(tmp_path):
     expected = np.linalg.svd(J.reshape(len(J), -1), compute_uv=False)[-1]
     assert loaded.singular_value[k] == pytest.approx(expected, rel=1e-9)
     np.testing.assert_array_equal(result.singular_value, loaded.singular_value)
+
+
+def asked_for(result: Result, names) -> dict[str, np.ndarray]:
+    """Arrays of a result, asked for in this order."""
+    found = {name: getattr(result, name) for name in names}
+    return {name: x for name, x in found.items() if x is not None}
+
+
+WINDY = {
+    "disturbances": {
+        "wind": [1.0, 0.0, 0.0], "drag": 0.3, "noise": {"position": 0.01, "velocity": 0.03, "rate": 50.0, "seed": 1},
+    }
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("given", [{}, WINDY], ids=["still", "windy"])
+@pytest.mark.parametrize("controller", [None, lambda seen: 9.81 * seen.masses[:, None] * [0, 0, 1]])
+def test_what_a_flight_makes_later_is_what_it_would_have_made_at_once(given, controller):
+    """Bit for bit: in any order, after other flights, from a pickle, a copy, or two threads at once."""
+    mission = Mission.from_dict(a_mission().to_dict() | given)
+    names = [*VARIABLES]
+    first, second, third = (simulate(mission, controller=controller) for _ in range(3))
+    assert {"thrust", "attitude", "separation"}.isdisjoint(vars(first))
+    whole = asked_for(first, names)
+    assert simulate("establish-cube").thrust.any()
+    pickled, copied = pickle.loads(pickle.dumps(second)), copy.copy(second)
+    with ThreadPoolExecutor(2) as pool:
+        both = [pool.submit(asked_for, third, order) for order in (names, names[::-1])]
+        others = [asked_for(x, names[::-1]) for x in (second, pickled, copied)]
+        others += [thread.result() for thread in both]
+    for other in others:
+        assert other.keys() == whole.keys()
+        for name, x in whole.items():
+            np.testing.assert_array_equal(other[name], x, err_msg=name)
+
+
+def test_what_somebody_sets_is_not_made_later():
+    """A field that is set stays when others are made; positions changed in place change nothing else."""
+    changed, plain = simulate(a_mission()), simulate(a_mission())
+    changed.thrust = np.zeros_like(plain.thrust)
+    changed.position[:] += 100.0
+    np.testing.assert_array_equal(changed.cm, plain.cm)
+    np.testing.assert_array_equal(changed.separation, plain.separation)
+    assert not changed.thrust.any()
+    np.testing.assert_array_equal(changed.position, plain.position + 100.0)
 
 
 # -- results kept by contents

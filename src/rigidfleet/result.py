@@ -455,12 +455,15 @@ class Result:
             who = given.get(name)  # None if it is made later
             if who is not None and who.size and not least <= who.min() <= who.max() < n:
                 raise ValueError(f"{name} has agents outside {least} to {n - 1}")
+        agents, rotors = range(n), range(4)
         for name, x in (pair for phase in self.phases for pair in phase.extremes.items()):
             # A clearance names an obstacle, a rotor's force its rotor
-            of_pair = not name.startswith("clearance") and name != "rotor_force"
-            alone = of_pair and not (-1 <= x.other < n and x.other != x.who)
-            alone |= name == "rotor_force" and x.other not in range(4)
-            if alone or x.who not in range(n):
+            if name == "rotor_force":
+                alone = x.other not in rotors
+            else:
+                alone = not (-1 <= x.other < n and x.other != x.who)
+                alone = alone and not name.startswith("clearance")
+            if alone or x.who not in agents:
                 raise ValueError(f"extreme {name} must name different agents from 0 to {n - 1}")
         for name in _QUATERNIONS:
             q = given.get(name)  # most have a scalar part, which is found in a fifth of the time
@@ -495,13 +498,15 @@ class Result:
             "agent": self.n_agents,
             "edge": len(self.edges),
         }
-        for key, value in make().items():
+        made = make()
+        for key, value in made.items():
             if key in self._later and key not in self.__dict__:  # nor has somebody set it
                 if key in VARIABLES:
                     self._set(key, value, sizes)
                 else:
                     setattr(self, key, value)
-            self._later.pop(key, None)
+        # Another one, as a copy of this result may have to make the same.
+        self._later = {key: other for key, other in self._later.items() if key not in made}
         return self.__dict__[name]
 
     def __repr__(self) -> str:
