@@ -232,6 +232,9 @@ class Result:
     representable number later, the start of the next. `VARIABLES` gives the dimensions, unit and meaning of each
     array. The other fields describe the flight: its phases, its mission and how it ended.
 
+    `simulate` fills in the states. Forces, frames, rates and distances are computed when one of them is first asked
+    for; their values do not depend on when that is.
+
     Raises
     ------
     ValueError
