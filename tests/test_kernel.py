@@ -810,19 +810,20 @@ def test_half_a_kernel_is_none(tmp_path, monkeypatch):
 
 @pytest.mark.long
 @pytest.mark.parametrize("helped", [True, False])
-def test_the_kernel_is_translated_once(helped):
-    """Two processes translate each function for the types that the others ask for; one does it alone if it must."""
+def test_a_second_process_makes_what_is_apart(helped):
+    """It is not made again; if the second process fails, the first one makes it."""
     code = f"""
-from rigidfleet.kernel.engine import build, objects
+import subprocess
 from rigidfleet.kernel.compiler import numba_internals
+from rigidfleet.kernel.engine import build, objects
 numba_internals.translate_only()
-second = build._SecondProcess(shares=True)
+second = subprocess.Popen(objects.build_process("apart"), stdout=subprocess.PIPE)
 if not {helped}:
-    second._process.kill()
+    second.kill()
+made, apart = [], build.apart
+build.apart = lambda: made.append(1) or apart()
 assert len(build.machine_code(second)) == len(objects.ENTRIES)
-ours, theirs = build._halves()
-assert [len(function.overloads) for function in (*ours, *theirs)] == [1] * len(ours | theirs)
-assert set(second.translated) == (set(function.__name__ for function in theirs) if {helped} else set())
+assert len(made) == {int(not helped)}
 """
     environment = os.environ | {"NUMBA_OPT": "0"}
     subprocess.run([sys.executable, "-c", code], check=True, env=environment)
@@ -838,7 +839,7 @@ if sys.argv[1] == "other":
     numba_internals.TESTED = ()
     assert not numba_internals.known()
     from rigidfleet.kernel.engine import build, native
-    native._loaded.append(native._linked(build.machine_code(build._SecondProcess(shares=False))))
+    native._loaded.append(native._linked(build.machine_code()))
 import rigidfleet as rf
 print(hashlib.sha256(rf.simulate("establish-triangle").position.tobytes()).hexdigest())
 """

@@ -1,18 +1,15 @@
 """Use of Numba's internals, which are not a stable interface: isolated here, for the tested versions only.
 
-They shorten the very first run in two ways: Numba translates the kernel's functions and makes no machine code of each
-(an eighth of the time), and a second process does half of the translation (a third of the time). With any other
-version, neither is done: Numba's public functions alone build the kernel, with the same result.
+They shorten the very first run by an eighth: Numba translates the kernel's functions and makes no machine code of
+each. With any other version, Numba's public functions alone build the kernel, with the same result.
 """
 
 from __future__ import annotations
 
-import pickle
-from collections.abc import Callable
 from typing import Any
 
 import numba
-from numba.core import codegen, compiler, cpu, serialize
+from numba.core import codegen, cpu
 
 #: Versions of Numba whose internals these are.
 TESTED = ("0.68.1",)
@@ -48,27 +45,3 @@ def translate_only() -> None:
     codegen.CPUCodeLibrary.get_llvm_str = whole
     codegen.JITCodeLibrary._finalize_specific = lambda _library: None
     codegen.JITCPUCodegen.set_env = lambda _codegen, _name, _environment: None
-
-
-def portable(function: Any, arguments: Any, simplified: Callable[[str, str, str], Any]) -> bytes:
-    """A function that Numba has translated for ``arguments``, as bytes for `received` in another process.
-
-    ``simplified(text, symbol, name)`` returns its module in the form to be stored.
-    """
-    function.compile(arguments)
-    result = function.overloads[arguments]
-    symbol = result.fndesc.llvm_func_name
-    module = simplified(result.library.get_llvm_str(), symbol, symbol)
-    result.library.serialize_using_object_code = result.library.serialize_using_bitcode
-    result.library._final_module = module
-    return serialize.dumps(result._reduce())
-
-
-def received(context: Any, done: bytes) -> Any:
-    """A function from `portable`, in the form of Numba's own translated functions."""
-    return compiler.CompileResult._rebuild(context, *pickle.loads(done))
-
-
-def given_by(function: Any, cache: Any) -> None:
-    """Make Numba look up a function's translations in ``cache``."""
-    function._cache = cache

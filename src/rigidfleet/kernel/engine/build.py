@@ -3,38 +3,24 @@
 Numba translates the integrator, the recorder, the monitor and all functions that they call to LLVM's intermediate
 representation. Functions that are not called from outside become internal, and all are optimised once, together.
 
-In a process of its own (`objects.build_process`) it writes the code to standard output. Most of the time goes into the
-translation, so that a second process does its half of it meanwhile.
+In a process of its own (`objects.build_process`) it writes the code to standard output. A second process makes what
+shares little with the integrator meanwhile.
 """
 
-import pickle
 import re
 import subprocess
 import sys
-from contextlib import suppress
-from functools import cached_property
 from typing import Any
 
 import llvmlite.binding as llvm
 from numba import cfunc, typeof, types
 
-from rigidfleet.kernel import (
-    constraint,
-    control,
-    disturbances,
-    dopri5,
-    dynamics,
-    measurement,
-    monitor,
-    recorder,
-    rigid_body,
-)
+from rigidfleet.kernel import dopri5, measurement, monitor, recorder
 from rigidfleet.kernel.compiler import gathering, numba_internals
 from rigidfleet.kernel.compiler.jit import OPTIONS
-from rigidfleet.kernel.compiler.pointers import Pointer, pointer
+from rigidfleet.kernel.compiler.pointers import pointer
 from rigidfleet.kernel.engine import objects, packing
 
-_Functions = dict[Any, tuple[types.Type, ...]]
 #: Functions that every evaluation calls, to be inlined; calls would take a tenth of a small formation's time.
 _HOT = (
     "closed_loop", "input_law", "constraint_force", "accelerate", "mean_axes", "centre_of_mass", "inertia",
@@ -50,11 +36,11 @@ _HOT_SAMPLED = (
 _QUICK = ("sroa", "simplify_cfg", "instruction_combine", "simplify_cfg")
 
 
-def machine_code(second: "_SecondProcess | None" = None) -> list[bytes]:
+def machine_code(second: "subprocess.Popen[bytes] | None" = None) -> list[bytes]:
     """Object code of the C functions that `native` calls, `objects.ENTRIES`.
 
     Their arguments are addresses of named tuples. They integrate (and return what `dopri5.integrate` returns),
-    record, and monitor (as `monitor.watch` does). The ``second`` process, if there is one, does part of the work.
+    record, and monitor (as `monitor.watch` does). The ``second`` process, if there is one, makes what is `apart`.
     """
     problem, workspace, integrator, segment, record, *_ = _pointers()
 
@@ -70,20 +56,16 @@ def machine_code(second: "_SecondProcess | None" = None) -> list[bytes]:
         recorder.record(call.times, call.samples, problem(p), workspace(w), call.dy, record(out))
         return 0
 
-    if second is not None:
-        # Before the parts that wait for the second process
-        for function, arguments in _halves()[0].items():
-            function.compile(arguments)
     functions = zip((integrate_segment, record_segment), objects.ENTRIES, strict=False)
     modules = [_module(function, name) for function, name in functions]
-    codes, small = [_object(*module) for module in modules], _small()
-    made = None if second is None else second.apart()
-    return [*codes, *(made or _apart()), *small]
+    codes = [_object(*module) for module in modules]
+    made = None if second is None else objects.separated(second.communicate()[0])
+    return [*codes, *(made or apart())]
 
 
-def _apart() -> list[bytes]:
-    """Object codes of the monitor and of measurement, which share nothing with the rest."""
-    problem, workspace, integrator, _, _, watching, *_, measured, _ = _pointers()
+def apart() -> list[bytes]:
+    """Object codes of the monitor, of measurement and of packing, which share little with the rest."""
+    problem, workspace, integrator, _, _, watching, *_, measured, spectrum = _pointers()
 
     def watch_trail(p, w, state, found):
         return monitor.watch(problem(p), workspace(w), integrator(state), watching(found))
@@ -92,14 +74,6 @@ def _apart() -> list[bytes]:
         measurement.measure(measured(m))
         return 0
 
-    entries = zip((watch_trail, measure_flight), (4, 1), objects.ENTRIES[2:4], strict=True)
-    return [_object(*_module(function, name, words)) for function, words, name in entries]
-
-
-def _small() -> list[bytes]:
-    """Object codes of singular values and of packing, for which the first process has time left."""
-    spectrum = _pointers()[-1]
-
     def singular_values(s):
         measurement.spectrum(spectrum(s))
         return 0
@@ -107,8 +81,9 @@ def _small() -> list[bytes]:
     def gather(of, count, asked, words):
         return gathering.gather(of, count, asked, words)
 
-    entries = zip((singular_values, gather), (1, 4), objects.ENTRIES[4:], strict=True)
-    return [_object(*_module(function, name, words)) for function, words, name in entries]
+    functions = (watch_trail, 4), (measure_flight, 1), (singular_values, 1), (gather, 4)
+    entries = zip(functions, objects.ENTRIES[2:], strict=True)
+    return [_object(*_module(function, name, words)) for (function, words), name in entries]
 
 
 def sampled_code() -> list[bytes]:
@@ -143,8 +118,8 @@ def avoidance_code() -> list[bytes]:
     return [_object(*_module(avoid, objects.AVOIDANCE_ENTRY), hot=())]
 
 
-#: The makers of the libraries beside the first.
-LIBRARIES = {"sampled": sampled_code, "avoidance": avoidance_code}
+#: The makers of the libraries beside the first, and of the part that a second process makes of that.
+LIBRARIES = {"sampled": sampled_code, "avoidance": avoidance_code, "apart": apart}
 
 
 def _pointers() -> list[Any]:
@@ -197,102 +172,15 @@ def _passes(level: int) -> Any:
     return llvm.create_pass_builder(objects.target_machine(), options)
 
 
-# -- two processes -----------------------------------------------------------------------------------
-
-
-def _halves() -> tuple[_Functions, _Functions]:
-    """Functions with the types of their arguments, first those of this process, then those of the second."""
-    example, work, _, _, out, *_ = packing.examples()
-    p, w, record = (Pointer(typeof(x)) for x in (example, work, out))
-    disturbance = Pointer(typeof(example.disturbance))
-    number, row, places = types.float64, typeof(example.vehicles.m), typeof(work.r)
-    own = {
-        constraint.constraint_force: (number, row, row, p, w),
-        dynamics.accelerate: (row, p, w),
-        dynamics.body_derivatives: (row, row, p, w),
-        recorder.record_sample: (number, p, w, types.int64, record),
-        disturbances.disturb: (number, row, number, disturbance, w),
-        disturbances.sense: (number, disturbance, w),
-        rigid_body.allocate: (
-            places, row, number, row, row, row, types.int64, places, places, places, places, places, places
-        ),
-        rigid_body.mean_axes: (places, places, row, number, w),
-        dynamics.world_states: (row, p, w),
-    }  # fmt: skip
-    others = {
-        control.local_law: (number, p, w),
-        control.body_law: (number, p, w),
-    }
-    return own, others
-
-
-def _translated() -> dict[str, bytes]:
-    """The second half: each function in the form of Numba's cache, but already simplified."""
-    halves = _halves()[1].items()
-    return {f.__name__: numba_internals.portable(f, types_, _simplified) for f, types_ in halves}
-
-
-class _SecondProcess:
-    """The second process, which translates its half and compiles the monitor and measurement.
-
-    Whatever fails there is done in this process.
-    """
-
-    def __init__(self, *, shares: bool) -> None:
-        self._shares = shares
-        self._process = subprocess.Popen(
-            objects.build_process("half"), cwd=objects.ELSEWHERE, stdout=subprocess.PIPE
-        )  # fmt: skip
-        for function, arguments in _halves()[1].items() if shares else ():
-            half = self._Half(self, function.__name__, arguments)
-            numba_internals.given_by(function, half)
-
-    @cached_property
-    def translated(self) -> dict[str, bytes]:
-        """Its half of the functions, by name."""
-        return self._answer() or {}
-
-    def apart(self) -> list[bytes] | None:
-        """The objects of `_apart`."""
-        done = self.translated
-        return self._answer() if done or not self._shares else None
-
-    def _answer(self) -> Any:
-        assert self._process.stdout is not None
-        with suppress(EOFError, pickle.UnpicklingError):
-            return pickle.load(self._process.stdout)
-
-    class _Half:
-        """Acts as the cache of a function for Numba."""
-
-        def __init__(self, process: "_SecondProcess", name: str, arguments: Any) -> None:
-            self._process, self._name, self._arguments = process, name, arguments
-
-        def load_overload(self, arguments: Any, context: Any) -> Any:
-            """The function from the other process; with None, Numba translates it here."""
-            done = self._process.translated.get(self._name)
-            if done is None or arguments != self._arguments:
-                return None
-            return numba_internals.received(context, done)
-
-        def save_overload(self, *_: Any) -> None:
-            """Store nothing."""
-
-
 def main(part: str) -> None:
-    """Write machine code to standard output: of "flight", the "half" that the second process makes of it, or a library.
-
-    Numba's internals are used where they are known; else the second process makes the monitor and measurement alone.
-    """
-    output, known = sys.stdout.buffer, numba_internals.known()
-    if known:
+    """Write machine code to standard output: of "flight", for which a second process is started, or of a library."""
+    if numba_internals.known():
         numba_internals.translate_only()
     if part in LIBRARIES:
-        output.write(objects.concatenated(LIBRARIES[part]()))
-        return
-    if part == "half":
-        pickle.dump(_translated() if known else {}, output)
-        output.flush()
-        pickle.dump(_apart(), output)
-        return
-    output.write(objects.concatenated(machine_code(_SecondProcess(shares=known))))
+        codes = LIBRARIES[part]()
+    else:
+        second = subprocess.Popen(
+            objects.build_process("apart"), cwd=objects.ELSEWHERE, stdout=subprocess.PIPE
+        )
+        codes = machine_code(second)
+    sys.stdout.buffer.write(objects.concatenated(codes))
