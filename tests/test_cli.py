@@ -771,14 +771,18 @@ def test_figures_are_the_same_from_processes_side_by_side(folder, monkeypatch):
         figures = {
             folder / str(count) / name: ["png", "svg"] for name in ("cm", "inputs", "clearance")
         }
-        assert set(drawing.draw_all(result, figures, titles=True)) == set(figures)
+        with drawing.Drawings(result, figures, titles=True) as pictures:
+            assert set(pictures) == set(figures)
         drawn[count] = {p.name: p.read_bytes() for p in (folder / str(count)).iterdir()}
     assert len(drawn[1]) == 6
     assert drawn[1] == drawn[2]
     write(folder / "taken", "a file")
     there = {folder / "taken" / name: ["png"] for name in ("cm", "inputs", "clearance")}
-    with pytest.raises(ResultError, match="cannot be written"):
-        list(drawing.draw_all(result, there, titles=True))
+    with (
+        pytest.raises(ResultError, match="cannot be written"),
+        drawing.Drawings(result, there, titles=True) as pictures,
+    ):
+        list(pictures)
 
 
 @pytest.mark.long

@@ -89,14 +89,15 @@ def assess(
         console.out().print(verdict)
     if made is not None:
         from rigidfleet.cli.report import write_report
-        from rigidfleet.cli.run import draw, list_files, write_replay
+        from rigidfleet.cli.run import drawings, list_files, write_figures, write_replay
 
         made.make_folder()
-        result.save(made.result)
-        write_file(made.verdict, (verdict.json() + "\n").encode())
-        write_report([result], [verdict], made.report, quiet=json)
-        write_replay(result, made.replay)
-        draw(result, made.figures, None, titles=True, quiet=json)
+        with drawings(result, made.figures, None, titles=True) as pictures:
+            result.save(made.result)
+            write_file(made.verdict, (verdict.json() + "\n").encode())
+            write_report([result], [verdict], made.report, quiet=json)
+            write_replay(result, made.replay)
+            write_figures(pictures, quiet=json)
         if not json:
             console.out().print()
             list_files(made)

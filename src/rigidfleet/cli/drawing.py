@@ -1,7 +1,8 @@
 """Figures drawn side by side, in processes that load matplotlib while the flight is still computed.
 
-A server process loads the plotting packages once; every drawing process is a fork of it and begins at once. Where
-there is no such server (Windows), or one processor, or a very large result, figures are drawn in this process.
+They draw while the flight is saved and judged; this process then writes the files. A server process loads the plotting
+packages once; every drawing process is a fork of it and begins at once. Where there is no such server (Windows), or one
+processor, or a very large result, figures are drawn in this process.
 """
 
 from __future__ import annotations
@@ -9,9 +10,10 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from pathlib import Path
+from threading import Thread
 from typing import TYPE_CHECKING
 
 from rigidfleet._common.processes import safe_path
@@ -28,6 +30,8 @@ _LOADED = [
 _LARGEST = 50_000_000
 #: Fewer figures are not worth a process.
 _FEW = 3
+#: Figures that take longest; they are drawn first, so that all processes end at about the same time.
+_SLOW = ("summary", "cm", "clearance", "attitude", "vehicles", "rotors")
 
 
 def at_once() -> int:
@@ -53,48 +57,84 @@ def prepare() -> None:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def draw_all(
-    result: Result, figures: Mapping[Path, Sequence[str]], *, titles: bool
-) -> Iterator[Path]:
-    """Draw figures, given as files without their suffix and formats of each; yield each when it is drawn.
+class Drawings:
+    """Figures of a flight: other processes begin to draw them at once; iteration writes each file when it is drawn.
 
-    Raises
-    ------
-    ResultError
-        A file cannot be written.
+    Where there is one process, iteration draws them. Leaving the context ends what still draws.
+
+    Parameters
+    ----------
+    figures : files without their suffix, and formats of each
+    titles : as for `rigidfleet.plotting.plot`
     """
-    count = min(at_once(), len(figures))
-    if count == 1 or len(figures) < _FEW or result.position.nbytes > _LARGEST:
-        yield from _draw(result, figures.items(), titles)
-        return
-    prepare()
-    pool = ProcessPoolExecutor(
-        count,
-        mp_context=multiprocessing.get_context("forkserver"),
-        initializer=_begin,
-        initargs=(result, titles),
-    )
-    drawn = False
-    try:
-        jobs = [pool.submit(_one, path, formats) for path, formats in figures.items()]
-        for job in as_completed(jobs):
-            yield job.result()
-        drawn = True
-    finally:
-        if not drawn:
-            for process in multiprocessing.active_children():
-                process.terminate()
-        pool.shutdown(wait=drawn, cancel_futures=True)
 
+    def __init__(
+        self, result: Result, figures: Mapping[Path, Sequence[str]], *, titles: bool
+    ) -> None:
+        self.figures, self._result, self._titles = figures, result, titles
+        self._pool: ProcessPoolExecutor | None = None
+        self._jobs: dict[Future[dict[str, bytes]], Path] = {}
+        self._count = min(at_once(), len(figures))
+        if self._count == 1 or len(figures) < _FEW or result.position.nbytes > _LARGEST:
+            return
+        prepare()
+        self._pool = ProcessPoolExecutor(
+            self._count, mp_context=multiprocessing.get_context("forkserver"), initializer=_begin,
+            initargs=(result, titles),
+        )  # fmt: skip
+        # In a thread, as it waits until the server has loaded everything
+        self._asking = Thread(target=self._ask, args=(self._pool,), daemon=True)
+        self._asking.start()
 
-def _draw(
-    result: Result, figures: Iterable[tuple[Path, Sequence[str]]], titles: bool
-) -> Iterator[Path]:
-    from rigidfleet.plotting import plot
+    def _ask(self, pool: ProcessPoolExecutor) -> None:
+        """Ask for each figure, those that take longest first; a process that cannot be started is an error of each."""
+        for path in sorted(self.figures, key=lambda path: path.name not in _SLOW):
+            try:
+                job = pool.submit(_one, path.name, self.figures[path])
+            except (OSError, RuntimeError) as error:
+                job = Future[dict[str, bytes]]()
+                job.set_exception(error)
+            self._jobs[job] = path
 
-    for path, formats in figures:
-        plot(result, path.parent, names=[path.name], formats=formats, titles=titles)
-        yield path
+    def __enter__(self) -> Drawings:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._pool is not None:
+            self._asking.join()
+            drawn = all(job.done() for job in self._jobs)
+            if not drawn:
+                for process in multiprocessing.active_children():
+                    process.terminate()
+            self._pool.shutdown(wait=drawn, cancel_futures=True)
+
+    def __iter__(self) -> Iterator[Path]:
+        """Paths of the figures without their suffix, each when its files are written.
+
+        Raises
+        ------
+        ResultError
+            A file cannot be written.
+        """
+        from rigidfleet.plotting import plot, write
+
+        if self._pool is None:
+            for path, formats in self.figures.items():
+                plot(
+                    self._result,
+                    path.parent,
+                    names=[path.name],
+                    formats=formats,
+                    titles=self._titles,
+                )
+                yield path
+            return
+        self._asking.join()
+        for job in as_completed(self._jobs):
+            path = self._jobs[job]
+            for kind, data in job.result().items():
+                write(path.with_name(f"{path.name}.{kind}"), data)
+            yield path
 
 
 _drawn: list[tuple[Result, bool]] = []
@@ -105,7 +145,9 @@ def _begin(result: Result, titles: bool) -> None:
     _drawn[:] = [(result, titles)]
 
 
-def _one(path: Path, formats: Sequence[str]) -> Path:
-    """Draw one figure, in a drawing process."""
+def _one(name: str, formats: Sequence[str]) -> dict[str, bytes]:
+    """Files of one figure by format, from a drawing process."""
+    from rigidfleet.plotting import rendered
+
     result, titles = _drawn[0]
-    return next(_draw(result, [(path, formats)], titles))
+    return rendered(result, name, formats, titles=titles)

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from rigidfleet.assessment import Verdict
     from rigidfleet.result import Result
 from rigidfleet.cli.codes import FAILED, PASSED
-from rigidfleet.cli.run import Format, draw, list_files, of_formats, write_replay
+from rigidfleet.cli.run import Format, drawings, list_files, of_formats, write_figures, write_replay
 
 
 def report(
@@ -88,9 +88,10 @@ def report(
         if files.verdict not in kept:
             write_file(files.verdict, (verdicts[0].json() + "\n").encode())
         left = [path for path in drawn if path not in kept]
-        draw(records[0], left, format, titles=not no_titles, quiet=quiet)
-        if files.report not in kept:
-            write_report(records, verdicts, files.report, quiet=quiet)
+        with drawings(records[0], left, format, titles=not no_titles) as pictures:
+            if files.report not in kept:
+                write_report(records, verdicts, files.report, quiet=quiet)
+            write_figures(pictures, quiet=quiet)
         if not (json or quiet):
             console.out().print()
             list_files(files)

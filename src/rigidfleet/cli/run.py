@@ -90,32 +90,33 @@ def run(
     from rigidfleet.assessment import assess
 
     files.make_folder()
-    result.save(files.result)
-    files.forget()
-    if csv:
-        try:
-            result.to_csv(files.table, rate=csv_rate, flown=flown)
-        except ValueError as error:
-            raise RigidfleetError(f"--csv-rate: {error}.") from None
-    verdict = assess(result)
-    write_file(files.verdict, (verdict.json() + "\n").encode())
-    if json:
-        console.print_exactly(verdict.json() + "\n")
-    elif not quiet:
-        console.out().print(verdict)
-    what = (
-        "the flight so far is saved, marked incomplete,"
-        if interrupted
-        else "the complete flight is saved"
-    )
-    if not interrupted:
-        try:
-            if replay:
-                write_replay(result, files.replay)
-            if not no_figures:
-                draw(result, files.figures, format, titles=not no_titles, quiet=quiet)
-        except KeyboardInterrupt:
-            interrupted = True
+    drawn = [] if interrupted or no_figures else files.figures
+    with drawings(result, drawn, format, titles=not no_titles) as pictures:
+        result.save(files.result)
+        files.forget()
+        if csv:
+            try:
+                result.to_csv(files.table, rate=csv_rate, flown=flown)
+            except ValueError as error:
+                raise RigidfleetError(f"--csv-rate: {error}.") from None
+        verdict = assess(result)
+        write_file(files.verdict, (verdict.json() + "\n").encode())
+        if json:
+            console.print_exactly(verdict.json() + "\n")
+        elif not quiet:
+            console.out().print(verdict)
+        what = (
+            "the flight so far is saved, marked incomplete,"
+            if interrupted
+            else "the complete flight is saved"
+        )
+        if not interrupted:
+            try:
+                if replay:
+                    write_replay(result, files.replay)
+                write_figures(pictures, quiet=quiet)
+            except KeyboardInterrupt:
+                interrupted = True
     if not (json or quiet):
         console.out().print()
         list_files(files)
@@ -200,28 +201,28 @@ def of_formats(figures: Iterable[Path], formats: Iterable[Format] | None) -> lis
     return [path for path in figures if path.suffix in kinds]
 
 
-def draw(
-    result: Result,
-    figures: Iterable[Path],
-    kinds: Iterable[Format] | None,
-    *,
-    titles: bool,
-    quiet: bool = False,
-) -> None:
-    """Draw the figures that apply to the flight, each to the file of its name."""
+def drawings(
+    result: Result, figures: Iterable[Path], kinds: Iterable[Format] | None, *, titles: bool
+) -> drawing.Drawings:
+    """Begin to draw the figures that apply to the flight, each for the file of its name."""
     from rigidfleet.plotting import figure_names
 
-    names = figure_names(result)
     formats: dict[Path, list[str]] = {}
-    for path in of_formats(figures, kinds):
-        if path.stem not in names:
-            continue
-        formats.setdefault(path.with_suffix(""), []).append(path.suffix[1:])
+    if paths := of_formats(figures, kinds):
+        names = figure_names(result)
+        for path in paths:
+            if path.stem in names:
+                formats.setdefault(path.with_suffix(""), []).append(path.suffix[1:])
+    return drawing.Drawings(result, formats, titles=titles)
+
+
+def write_figures(pictures: drawing.Drawings, *, quiet: bool = False) -> None:
+    """Write figures as they are drawn."""
     shown = console.err().is_interactive and not quiet
     with console.err().status("Drawing the figures") if shown else nullcontext() as status:
-        for n, path in enumerate(drawing.draw_all(result, formats, titles=titles), start=1):
+        for n, path in enumerate(pictures, start=1):
             if status is not None:
-                status.update(f"Drawing the figures: {path.name}, {n} of {len(formats)}")
+                status.update(f"Drawing the figures: {path.name}, {n} of {len(pictures.figures)}")
 
 
 def write_replay(result: Result, path: Path) -> None:
