@@ -78,7 +78,7 @@ class Row:
         value = median(self.ratios)
         if self.goal is None:
             return None
-        return value >= self.goal if self.faster else value <= self.goal
+        return bool(value >= self.goal if self.faster else value <= self.goal)
 
 
 def establishment(source: str, *, default_law: bool) -> Mission:
