@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import pickle
 import signal
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
@@ -80,7 +81,7 @@ class Drawings:
         prepare()
         self._pool = ProcessPoolExecutor(
             self._count, mp_context=multiprocessing.get_context("forkserver"), initializer=_begin,
-            initargs=(result, titles),
+            initargs=(pickle.dumps(result), titles),  # now: what it computes later would change it in the thread
         )  # fmt: skip
         # In a thread, as it waits until the server has loaded everything
         self._asking = Thread(target=self._ask, args=(self._pool,), daemon=True)
@@ -140,9 +141,9 @@ class Drawings:
 _drawn: list[tuple[Result, bool]] = []
 
 
-def _begin(result: Result, titles: bool) -> None:
+def _begin(result: bytes, titles: bool) -> None:
     """Keep, in a drawing process, what all its figures show."""
-    _drawn[:] = [(result, titles)]
+    _drawn[:] = [(pickle.loads(result), titles)]
 
 
 def _one(name: str, formats: Sequence[str]) -> dict[str, bytes]:
