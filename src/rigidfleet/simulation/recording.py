@@ -100,11 +100,6 @@ class Piece:
     vehicles: VehicleSamples | None = None
     layers: LayerSamples | None = None
 
-    @property
-    def r(self) -> Floats:
-        """Positions (K, N, 3) [m]."""
-        return self.given.motion[0] if isinstance(self.given, Unevaluated) else self.given.r
-
     @cached_property
     def record(self) -> Record:
         """Forces and references, as the kernel returns them."""
@@ -145,14 +140,19 @@ def assemble(
         }
         for phase in phases
     ]
+    # Of the pieces, what is left to do keeps no more than it needs.
+    places = [p.given.y if isinstance(p.given, Unevaluated) else p.given.r for p in pieces]
     later: list[tuple[tuple[str, ...], Callable[[], dict[str, Any]]]] = [
         (
             (*RECORDED, *(("disturbance_force",) if airy else ()), *(SEEN if noisy else ())),
             partial(_recorded, mission, pieces, time, flown),
         ),
-        (CLOSE, partial(_close, mission, worst, pieces, time)),
+        (CLOSE, partial(_close, mission, worst, places, time)),
         (LATER, partial(_references, mission, [(p.time, p.led) for p in pieces])),
-        (("singular_value",), partial(_singular_values, pieces)),
+        (
+            ("singular_value",),
+            partial(_singular_values, mission.n_agents, places, [p.edges for p in pieces]),
+        ),
         (("mission_text",), partial(_text, mission)),
     ]
     motion = [p.given.motion for p in pieces if isinstance(p.given, Unevaluated)]
@@ -259,14 +259,14 @@ def _left(mission: Mission, time: Floats) -> Bools | None:
 def _close(
     mission: Mission,
     worst: Sequence[dict[str, Extremum]],
-    pieces: Sequence[Piece],
+    places: Sequence[Floats],
     time: Floats,
 ) -> dict[str, Any]:
     """Distances at samples; the one after an extreme of a phase, ``worst``, has the extreme."""
     left = _left(mission, time)
     if left is None:
         left = np.ones((len(time), mission.n_agents), dtype=np.bool_)
-    r = _joined([p.r for p in pieces])
+    r = _joined([_positions(x, mission.n_agents) for x in places])
     close = proximity.closeness(r, mission.agents.radius, mission.obstacles, time, left)
     for extremes in worst:
         _put(extremes, time, close)
@@ -410,12 +410,19 @@ def _columns(some: Ints, edges: Ints) -> Ints | slice:
     return order[np.searchsorted(keys[order], some[:, 0] * key + some[:, 1])]
 
 
-def _singular_values(pieces: Sequence[Piece]) -> dict[str, Floats]:
+def _positions(x: Floats, n: int) -> Floats:
+    """Positions (K, N, 3) themselves, or those of the states (K, ...) that begin with them."""
+    return x if x.ndim == 3 else np.ascontiguousarray(x[:, : 3 * n]).reshape(-1, n, 3)
+
+
+def _singular_values(n: int, places: Sequence[Floats], edges: Sequence[Ints]) -> dict[str, Floats]:
     """Smallest non-zero singular value of J (K,); NaN if the formation is too large to compute it.
 
-    In formations of some tens of agents it is computed at some samples of each phase, and linear in between.
+    ``places`` and ``edges`` are those of each piece. In formations of some tens of agents it is computed at some
+    samples of each phase, and linear in between.
     """
-    return {"singular_value": np.concatenate([_singular(p.r, p.edges) for p in pieces])}
+    found = [_singular(_positions(x, n), e) for x, e in zip(places, edges, strict=True)]
+    return {"singular_value": np.concatenate(found)}
 
 
 def _singular(r: Floats, edges: Ints) -> Floats:
