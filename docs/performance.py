@@ -56,6 +56,7 @@ def _ratios(name: str, theirs: str) -> Any:
                 "" if row["goal"] is None else f"{'≥' if row['faster'] else '≤'} {row['goal']:,g}",
             )
             for row in data[name]
+            if "share" not in row["name"]  # of a time of ours, not of a peer's
         ]
         return _table(("", "ours [ms]", f"{theirs} [ms]", "ratio", "rounds", "goal"), rows)
 
