@@ -418,9 +418,9 @@ class Result:
     created: str = field(default_factory=_now)
 
     def __post_init__(self, later: Later) -> None:
-        self._later = unmade = {name: make for names, make in later for name in names}
         given = self.__dict__
-        for name in unmade:
+        self._later = {name: make for names, make in later for name in names}
+        for name in self._later:
             del given[name]
         sizes: dict[str, int] = dict(_LABELLED)
         for key, dims in (
@@ -430,9 +430,9 @@ class Result:
         ):
             if isinstance(given[key], np.ndarray):
                 sizes.update(zip(dims, given[key].shape, strict=False))
-        for name, dims, dtype in _CHECKED:
-            value = given.get(name)
-            if value is None and (name in unmade or name in _OPTIONAL):
+        for name in [name for name in given if name in _CHECKED]:
+            value, (dims, dtype) = given[name], _CHECKED[name]
+            if value is None and name in _OPTIONAL:
                 continue
             if not (
                 type(value) is np.ndarray
@@ -459,15 +459,16 @@ class Result:
             if who is not None and who.size and not least <= who.min() <= who.max() < n:
                 raise ValueError(f"{name} has agents outside {least} to {n - 1}")
         agents, rotors = range(n), range(4)
-        for name, x in (pair for phase in self.phases for pair in phase.extremes.items()):
-            # A clearance names an obstacle, a rotor's force its rotor
-            if name == "rotor_force":
-                alone = x.other not in rotors
-            else:
-                alone = not (-1 <= x.other < n and x.other != x.who)
-                alone = alone and not name.startswith("clearance")
-            if alone or x.who not in agents:
-                raise ValueError(f"extreme {name} must name different agents from 0 to {n - 1}")
+        for phase in self.phases:
+            for name, x in phase.extremes.items():
+                # A clearance names an obstacle, a rotor's force its rotor
+                if name == "rotor_force":
+                    alone = x.other not in rotors
+                else:
+                    alone = not (-1 <= x.other < n and x.other != x.who)
+                    alone = alone and not name.startswith("clearance")
+                if alone or x.who not in agents:
+                    raise ValueError(f"extreme {name} must name different agents from 0 to {n - 1}")
         for name in _QUATERNIONS:
             q = given.get(name)  # most have a scalar part, which is found in a fifth of the time
             if q is not None and not q[..., 0].all() and not q.any(axis=-1).all():
@@ -839,11 +840,11 @@ for _name in (*LATER, *SEEN, "disturbance_force"):
 
 
 _INTEGERS = {name for name in VARIABLES if _HINTS[name].__origin__ in (Ints, Ints | None)}
-#: Name, dimensions and type of each array, and the arrays of quaternions.
-_CHECKED = [
-    (name, v.dims, np.dtype(np.int64 if name in _INTEGERS else np.float64))
+#: Dimensions and type of each array, by name, and the arrays of quaternions.
+_CHECKED = {
+    name: (v.dims, np.dtype(np.int64 if name in _INTEGERS else np.float64))
     for name, v in VARIABLES.items()
-]
+}
 _QUATERNIONS = [name for name, v in VARIABLES.items() if "quaternion" in v.dims]
 #: Quantities whose minimum is the worst value. The same holds for all clearances.
 _LEAST = frozenset(("separation", "separation_below", "lost", "lowest", "guarantee"))

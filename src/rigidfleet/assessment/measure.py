@@ -59,6 +59,7 @@ class Laid(NamedTuple):
     off: Floats  # (..., N) distance of each agent from its slot, mirrored if that fits better
     mirrored: Bools  # (...) whether mirrored slots fit better
     turn: Floats  # (..., 3, 3) the best-fitting rotation, without a reflection
+    along: Floats  # (..., 3) the direction in which the agents extend most
     size: Floats  # (...) the greatest coordinate of the slots, about their centre
     lengths: Floats  # (2, ..., N, N) distances of agents, and of slots, if they are few; else (2, ..., 0, 0)
 
@@ -68,12 +69,13 @@ class Laid(NamedTuple):
         few = np.stack([p, slots])[..., : p.shape[-2] if p.shape[-2] <= _FEW else 0, :]
         lengths = _length(few[..., :, None, :] - few[..., None, :, :])
         p, slots = p - p.mean(axis=-2, keepdims=True), slots - slots.mean(axis=-2, keepdims=True)
-        across = p.swapaxes(-1, -2) @ slots
-        U, _, Vt = np.linalg.svd(slots.swapaxes(-1, -2) @ p)
-        off = np.linalg.norm(p - slots @ (U @ Vt), axis=-1)
+        across, of_agents = p.swapaxes(-1, -2) @ np.stack([slots, p])
+        U, s, Vt = np.linalg.svd(across)
+        off = _length(p - slots @ (U @ Vt).swapaxes(-1, -2))
         size = np.abs(slots).max(axis=(-2, -1))
-        turn = rigid_body.kabsch(p, slots)
-        return cls(p, slots, off, np.linalg.det(across) < 0, turn, size, lengths)
+        turn, proper = rigid_body.best_rotation(U, s, Vt)
+        along = np.linalg.eigh(of_agents)[1][..., -1]
+        return cls(p, slots, off, ~proper, turn, along, size, lengths)
 
 
 class Fit:
@@ -97,8 +99,7 @@ class Fit:
         self.in_order: bool | None = None
         if self.dimension == 1 and len(p) > 2:
             asked = np.argsort(laid.slots @ self.axis).tolist()
-            along = np.linalg.svd(laid.p, full_matrices=False)[2][0]
-            flown = np.argsort(laid.p @ along).tolist()
+            flown = np.argsort(laid.p @ laid.along).tolist()
             self.in_order = flown in (asked, asked[::-1])
 
     @property
@@ -192,7 +193,7 @@ class Measurements:
 
     def pair(self, k: int) -> str:
         """The two agents that are nearest to each other at sample k."""
-        return agent_names(np.sort(self.close.pair[k]))
+        return agent_names(sorted(self.close.pair[k].tolist()))
 
     def obstacle(self, k: int) -> str:
         """Names of the agent nearest to an obstacle at sample k, and of that obstacle."""
@@ -204,10 +205,8 @@ class Measurements:
 
     def at(self, k: int) -> dict[str, Any]:
         """Time [s] and phase of sample k."""
-        return {
-            "when": float(self.result.time[k]),
-            "phase": self.result.phases[self.result.phase[k]].name,
-        }
+        result = self.result
+        return {"when": result.time.item(k), "phase": result.phases[result.phase.item(k)].name}
 
     def first(self, broken: Bools) -> float:
         """Time [s] of the first sample at which ``broken`` holds; infinity if it never does."""
@@ -221,15 +220,13 @@ class Measurements:
 
     def worst_sample(self, quantity: Quantity, samples: slice) -> Extreme | None:
         """The worst value of a quantity among some samples; None if none is finite."""
-        rank = quantity.rank[samples]
-        if not rank.size:
+        places = quantity.rank.shape[1]
+        rank = quantity.rank.reshape(-1)[places * samples.start : places * samples.stop]
+        if not rank.size or rank[worst := int(rank.argmax())] == -np.inf:
             return None
-        k, place = divmod(int(rank.argmax()), rank.shape[1])
-        if rank[k, place] == -np.inf:
-            return None
-        k += samples.start
-        at = () if quantity.values.ndim == 1 else (place,)
-        return Extreme(float(quantity.values[k, *at]), who=quantity.who(k, *at), **self.at(k))
+        k, place = divmod(worst, places)
+        at = (samples.start + k, place)[: quantity.values.ndim]
+        return Extreme(float(quantity.values.item(at)), who=quantity.who(*at), **self.at(at[0]))
 
     # -- between samples ------------------------------------------------------------------------------
 
@@ -406,8 +403,8 @@ class Measurements:
             samples = self.samples[index]
             if samples.stop > samples.start and phase.extremes:
                 due = ["speed", "lowest", "highest"]
-                due += ["thrust"] if np.isfinite(self.thrust[samples]).any() else []
-                due += ["separation"] if self.left[samples.start].sum() > 1 else []
+                due += ["thrust"] if self.rank["thrust"][index] > -math.inf else []
+                due += ["separation"] if np.count_nonzero(self.left[samples.start]) > 1 else []
                 due += ["clearance"] if self.mission.obstacles else []
                 due += ["geofence"] if self.mission.limits.geofence is not None else []
                 if lacking := [name for name in due if name not in phase.extremes]:
@@ -579,7 +576,8 @@ class Measurements:
 
 def _length(x: Floats) -> Floats:
     """Lengths (...) of vectors (..., 3)."""
-    return np.sqrt(np.einsum("...a,...a->...", x, x))
+    squares = x * x
+    return np.sqrt(squares[..., 0] + squares[..., 1] + squares[..., 2])
 
 
 @lru_cache(64)
@@ -634,6 +632,8 @@ def is_rigid(p: Floats, edges: Ints) -> bool:
 
 
 def _greatest(values: Floats) -> float | None:
+    if math.isfinite(most := float(np.abs(values).max(initial=0.0))) and len(values):
+        return most
     values = np.abs(values[np.isfinite(values)])
     return float(values.max()) if len(values) else None
 

@@ -157,8 +157,7 @@ def integrator(
     """
     n = len(y)
     K = zeros(10, padded(n))
-    K[ATOL] = 1.0
-    K[ATOL, :n] = atol
+    K[ATOL, :n], K[ATOL, n:] = atol, 1.0
     clock, count = np.array([t, step, LEAST_ERROR]), np.zeros(5, dtype=np.int64)
     return IntegratorState(y.copy(), K, clock, count, rtol, trail)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigidfleet.typing import Floats
+from rigidfleet.typing import Bools, Floats
 
 
 def centred(points: ArrayLike) -> Floats:
@@ -62,33 +62,42 @@ def kabsch(
     w = np.ones(p.shape[-2]) if weights is None else np.asarray(weights, dtype=np.float64)
     w = w[:, None] / w.sum()
     p, q = p - (w * p).sum(axis=-2, keepdims=True), q - (w * q).sum(axis=-2, keepdims=True)
-    u, s, vt = np.linalg.svd(np.swapaxes(w * p, -1, -2) @ q)
-    proper = np.linalg.det(u @ vt) > 0
-    u[..., 2] *= np.where(proper, 1.0, -1.0)[..., None]
+    return best_rotation(*np.linalg.svd(np.swapaxes(w * p, -1, -2) @ q), near, tol)[0]
+
+
+def best_rotation(
+    u: Floats, s: Floats, vt: Floats, near: ArrayLike | None = None, tol: float = 1e-9
+) -> tuple[Floats, Bools]:
+    """The rotations of `kabsch`, from the decomposition u, s, vt of sum_i w_i target_i source_i^T (..., 3, 3).
+
+    Returns also where they need no reflection (...).
+    """
     rotation = u @ vt
+    proper = np.linalg.det(rotation) > 0
+    turned = u * np.where(proper[..., None], 1.0, [1.0, 1.0, -1.0])[..., None, :]
+    rotation = turned @ vt
     alike = tol * s[..., 0]
     free = (s[..., 1] <= alike) | (~proper & (s[..., 1] - s[..., 2] <= alike))
-    guide = np.eye(3) if near is None else np.asarray(near, dtype=np.float64)
-    for at in np.argwhere(free):
-        k = tuple(at)
-        rotation[k] = _nearest_fit(u[k], s[k], vt[k], guide, tol)
-    return rotation
+    if free.any():
+        guide = np.eye(3) if near is None else np.asarray(near, dtype=np.float64)
+        rotation[free] = _nearest_fit(turned[free], s[free], vt[free], guide, tol)
+    return rotation, proper
 
 
 def _nearest_fit(u: Floats, s: Floats, vt: Floats, near: Floats, tol: float) -> Floats:
-    """Of the rotations that fit as well as U V^T, the one nearest to `near`.
+    """Of the rotations that fit as well as U V^T, the ones nearest to `near` (3, 3); u, s, vt of F fits.
 
     With the last column of U reversed, they are U (1 - 2 n n^T) V^T, where n is any unit vector in the span of
     the equal smallest singular directions.
     """
-    if s[0] == 0:
-        return near.copy()
-    u = u * [1, 1, -1]
-    equal = int(np.count_nonzero(s <= s[2] + tol * s[0]))
-    overlap = (vt @ near.T @ u)[-equal:, -equal:]
-    n = np.zeros(3)
-    n[-equal:] = np.linalg.eigh(overlap + overlap.T)[1][:, 0]
-    return (u - 2 * np.outer(u @ n, n)) @ vt
+    u = u * [1.0, 1.0, -1.0]
+    overlap, n = vt @ near.T @ u, np.zeros(s.shape)
+    overlap = overlap + overlap.swapaxes(1, 2)
+    equal = np.count_nonzero(s <= s[:, 2:] + tol * s[:, :1], axis=1)
+    for some in set(equal.tolist()):
+        n[equal == some, -some:] = np.linalg.eigh(overlap[equal == some, -some:, -some:])[1][..., 0]
+    fit = (u - 2.0 * (u @ n[..., None]) * n[:, None, :]) @ vt
+    return np.where(s[:, :1, None] == 0.0, near, fit)
 
 
 def mean_axis_rates(x: Floats, y: Floats, masses: Floats) -> Floats:

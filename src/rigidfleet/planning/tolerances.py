@@ -41,7 +41,7 @@ def absolute_tolerances(
     """
     n, m = len(velocity), len(distances)
     atol = np.full(size, given.atol)
-    atol[3 * n : 6 * n] = np.repeat(velocity, 3)
+    atol[3 * n : 6 * n].reshape(n, 3)[:] = velocity[:, None]
     if given.atol_integral is not None:
         atol[6 * n : 6 * n + m] = given.atol_integral
     elif large:

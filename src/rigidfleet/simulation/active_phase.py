@@ -77,6 +77,7 @@ class ActivePhase:
         if plan.before.lost is not None:
             self.lost = plan.before.lost
         self.parted = plan.links_lost[1] <= plan.start  # (L,) links that are lost
+        self.next_loss = self._loss_ahead()  # of a vehicle or a link [s]
         self.asked = 0  # number of calls of the user's controller
         self.held: Problem | None = None  # with the controller's force
         self.flown: Problem | None = None  # the problem of the steps in the trail
@@ -234,13 +235,10 @@ class ActivePhase:
         ``problem`` may hold a user's force instead of the phase's own input law.
         """
         while self.t < t_end:
-            coming = np.where(self.lost, math.inf, self.plan.lost_at)
-            links = np.where(self.parted, math.inf, self.plan.links_lost[1])
-            next_loss = min(float(coming.min()), float(links.min(initial=math.inf)))
-            if next_loss <= self.t:
-                problem = self._lose(problem, coming <= self.t)
+            if self.next_loss <= self.t:
+                problem = self._lose(problem, ~self.lost & (self.plan.lost_at <= self.t))
             else:
-                self._segment(problem, min(t_end, next_loss))
+                self._segment(problem, min(t_end, self.next_loss))
 
     def _lose(self, problem: Problem, now: Bools) -> Problem:
         """Continue without the vehicles that are lost ``now`` (N,) and without the links lost by now.
@@ -255,6 +253,7 @@ class ActivePhase:
             self.lost = self.lost | now
             plan.before.lost = self.lost
             self.extremes.lose(self.lost)
+        self.next_loss = self._loss_ahead()
         n = len(self.lost)
         self.count()
         kept = plan.release(self.lost, self.parted)
@@ -269,6 +268,11 @@ class ActivePhase:
         held = without(problem, kept, self.lost, mu, large=plan.large)
         self.held = held._replace(graph=plan.problem.graph)
         return self.held
+
+    def _loss_ahead(self) -> float:
+        """Time [s] at which the next vehicle or link is lost; infinity if none is."""
+        coming = float(self.plan.lost_at[~self.lost].min(initial=math.inf))
+        return min([coming, *self.plan.links_lost[1][~self.parted].tolist()])
 
     def count(self) -> None:
         """Add up the evaluations, steps and solves of the phase, or of its part up to a loss."""
@@ -361,7 +365,7 @@ class ActivePhase:
         if plan.frame is not None:
             q = samples[:, 6 * n + m : 6 * n + m + 4]
             frame = q / np.linalg.norm(q, axis=1, keepdims=True)
-        integral, led = samples[:, 6 * n : 6 * n + m], self._led(times)
+        integral, led = np.ascontiguousarray(samples[:, 6 * n : 6 * n + m]), self._led(times)
         self.pieces.append(
             Piece(self.index, times, given, integral, frame, plan.edges, plan.attached, led)
         )

@@ -71,6 +71,9 @@ _SAMPLED = (
     (fleet.CONSTRAINT_FORCE, records.CONSTRAINT_FORCE, -1.0),
 )
 _OF_FLIGHT = {"clearance_start": records.STANDING, "clearance_flight": records.FLYING}
+#: The quantities of a phase, each with its name, its index, and the sign with which it is stored.
+_STORED = [(name, k, -1.0 if name in _GREATEST else 1.0) for name, k in _NAMES.items()]
+_OF_PHASE = np.array(list(_NAMES.values()))
 
 
 class _Thing(NamedTuple):
@@ -130,12 +133,9 @@ class Extremes:
 
     def contact(self) -> Extremum | None:
         """The deepest contact of a vehicle in flight with an obstacle so far; None if there was none."""
-        found = self._extremum("clearance_flight", records.FLYING)
-        near = np.where(self.left & (self.standing == 0), self.low[:, 0], np.inf)
-        i = int(near.argmin())
-        if near[i] < (np.inf if found is None else found.value):
-            found = Extremum(float(near[i]), float(self.low[i, 1]), i, int(self.low[i, 2]))
-        return found if found is not None and found.value < -_TOUCH else None
+        found = [x for x in (self._extremum(records.FLYING), self._landing()) if x is not None]
+        deepest = min(found, key=lambda x: x.value, default=None)
+        return deepest if deepest is not None and deepest.value < -_TOUCH else None
 
     @property
     def reusable(self) -> bool:
@@ -294,44 +294,47 @@ class Extremes:
     def so_far(self) -> dict[str, Extremum]:
         """Extremes of the phase under way, by name."""
         worst, when, who = self.worst.tolist(), self.when.tolist(), self.who.tolist()
-        found = {}
-        for name, k in _NAMES.items():
-            if math.isfinite(value := worst[k]):
-                found[name] = Extremum(self._signed(name, value), when[k], *who[k])
+        found = {
+            name: Extremum(sign * value, when[k], *who[k])
+            for name, k, sign in _STORED
+            if math.isfinite(value := worst[k])
+        }
+        if (tension := found.get("tension")) is not None and self.sign[0] < 0.0:
+            found["tension"] = tension._replace(value=-tension.value)
         return found | self.of_vehicles | self._avoided() | self.led
 
     def phase(self) -> dict[str, Extremum]:
         """Extremes of the phase that ends, by name; start those of the next one."""
         found = self.so_far()
-        self.worst[list(_NAMES.values())] = np.inf
+        self.worst[_OF_PHASE] = np.inf
         self.moved[:] = np.inf  # the list was made for a worst value that no longer counts
         self.of_vehicles, self.avoidance, self.led = {}, None, {}
         return found
 
     def flight(self, phases: Sequence[PhaseRecord]) -> None:
         """Give the phases of a finished flight its clearance in flight, and that of vehicles on an obstacle."""
-        ends = np.where(self.left & (self.standing == 0), self.low[:, 0], np.inf)
-        i = int(ends.argmin())
-        found = {name: self._extremum(name, k) for name, k in _OF_FLIGHT.items()}
-        if ends[i] < np.inf:
-            t, b = self.low[i, 1:]
-            found["clearance_end"] = Extremum(float(ends[i]), float(t), i, int(b))
+        found = {name: self._extremum(k) for name, k in _OF_FLIGHT.items()}
+        found["clearance_end"] = self._landing()
         for name, x in found.items():
             if x is not None:
                 last = [p for p in phases if p.t_start <= x.time] or phases
                 last[-1].extremes[name] = x
 
-    def _extremum(self, name: str, k: int) -> Extremum | None:
+    def _landing(self) -> Extremum | None:
+        """The least clearance of an agent that has stayed near since, as it may be landing; None if there is none."""
+        near = self.low[:, 0]
+        if math.isfinite(near.min()):
+            near = np.where(self.left & (self.standing == 0), near, np.inf)
+            i = int(near.argmin())
+            if math.isfinite(near[i]):
+                return Extremum(float(near[i]), float(self.low[i, 1]), i, int(self.low[i, 2]))
+        return None
+
+    def _extremum(self, k: int) -> Extremum | None:
         value = float(self.worst[k])
         if not math.isfinite(value):
             return None
-        return Extremum(self._signed(name, value), float(self.when[k]), *map(int, self.who[k]))
-
-    def _signed(self, name: str, value: float) -> float:
-        """The value of a quantity that the monitor may store with the opposite sign."""
-        if name in _GREATEST:
-            value = -value
-        return value * float(self.sign[0]) if name == "tension" else value
+        return Extremum(value, float(self.when[k]), *map(int, self.who[k]))
 
     # -- large fleets ---------------------------------------------------------------------------------
 

@@ -55,7 +55,7 @@ def times_asked(times: ArrayLike, end: float) -> Floats:
     t = _increasing(numbers("times to record [s]", times))
     if not (len(t) and t[0] >= 0.0 and t[-1] <= end * (1.0 + 1e-12)):
         raise ValueError(f"times to record must lie between 0 and the mission's end, {end:g} s")
-    return _increasing(np.minimum(t, end))
+    return t if t[-1] <= end else _increasing(np.minimum(t, end))
 
 
 def _increasing(t: Floats) -> Floats:
