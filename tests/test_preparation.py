@@ -161,10 +161,13 @@ def test_what_a_flight_makes_later_is_what_it_would_have_made_at_once(given, con
     whole = asked_for(first, names)
     assert simulate("establish-cube").thrust.any()
     pickled, copied = pickle.loads(pickle.dumps(second)), copy.copy(second)
+    ready = vars(copy.copy(second).evaluate())
+    assert whole.keys() | {"mission_text"} <= ready.keys()
     with ThreadPoolExecutor(2) as pool:
         both = [pool.submit(asked_for, third, order) for order in (names, names[::-1])]
         others = [asked_for(x, names[::-1]) for x in (second, pickled, copied)]
         others += [thread.result() for thread in both]
+    others.append({name: ready[name] for name in whole})
     for other in others:
         assert other.keys() == whole.keys()
         for name, x in whole.items():

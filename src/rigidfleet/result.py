@@ -513,6 +513,12 @@ class Result:
         self._later = {key: other for key, other in self._later.items() if key not in made}
         return self.__dict__[name]
 
+    def evaluate(self) -> Result:
+        """Compute now what is computed when it is first asked for, as before a copy goes elsewhere; return itself."""
+        for name in [*self._later]:
+            getattr(self, name)
+        return self
+
     def __repr__(self) -> str:
         end = "complete" if self.complete else f"incomplete: {self.ending or 'stopped'}"
         return (

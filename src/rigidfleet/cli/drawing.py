@@ -83,7 +83,7 @@ class Drawings:
         prepare()
         self._pool = ProcessPoolExecutor(
             self._count, mp_context=multiprocessing.get_context("forkserver"), initializer=_begin,
-            initargs=(pickle.dumps(result), titles),  # now: what it computes later would change it in the thread
+            initargs=(pickle.dumps(result.evaluate()), titles),  # the kernel is loaded in this process alone
         )  # fmt: skip
         # In a thread, as it waits until the server has loaded everything
         self._asking = Thread(target=self._ask, args=(self._pool,), daemon=True)

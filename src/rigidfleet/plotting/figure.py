@@ -10,6 +10,9 @@ from typing import Any
 from matplotlib import figure
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
+#: Pixels per inch of a notebook's screen.
+_SHOWN = 100
+
 
 class Figure(figure.Figure):
     """A matplotlib figure that a notebook shows at the end of a cell, without a magic command.
@@ -32,5 +35,5 @@ class Figure(figure.Figure):
         buffer = io.BytesIO()
         with self.settings():
             self.savefig(buffer, format="png")
-        width, height = (int(x) for x in self.get_size_inches() * self.dpi)
+        width, height = (int(x) for x in self.get_size_inches() * _SHOWN)
         return buffer.getvalue(), {"width": width, "height": height}

@@ -42,6 +42,7 @@ ALERT = "#B00020"
 
 WIDTH = 9.0  # width of a figure over time [in]
 _PAD = 0.07  # margin around the content [in]
+_DOT = 1.6  # a hundredth of an inch [pixels]
 _SLANT = 38.0  # slant of phase names that do not fit horizontally [deg]
 _LONGEST = 28  # greatest length of a phase name
 _POINTS = 3000  # greatest number of samples of a line; more would be drawn over each other
@@ -93,7 +94,7 @@ _RC: dict[str, Any] = {
     "legend.fontsize": 8,
     "legend.handlelength": 1.6,
     "legend.borderaxespad": 0.0,
-    "figure.dpi": 100,
+    "figure.dpi": 160,  # as it is saved, so that a text is measured once
     "figure.constrained_layout.w_pad": _PAD,
     "figure.constrained_layout.h_pad": _PAD,
     "savefig.dpi": 160,
@@ -304,7 +305,7 @@ def place_words(fig: Figure) -> None:
             best, chosen = math.inf, places[0]
             for place in places:
                 _move(label, place)
-                covered = _covered(ax, label.get_window_extent().padded(2.0), others)
+                covered = _covered(ax, label.get_window_extent().padded(2 * _DOT), others)
                 if covered < best:
                     best, chosen = covered, place
                 if not covered:
@@ -324,13 +325,13 @@ def _covered(ax: Axes, box: Bbox, others: Sequence[Bbox]) -> int:
     for line in ax.lines:
         path = line.get_transform().transform_path(line.get_path())
         if line.get_linestyle() in ("None", ""):
-            n += int(box.padded(3.0).count_contains(path.vertices) > 0)
+            n += int(box.padded(3 * _DOT).count_contains(path.vertices) > 0)
         else:
             n += bool(path.intersects_bbox(box, filled=False))
     for band in ax.collections:
         for path in band.get_paths():
             n += bool(band.get_transform().transform_path(path).intersects_bbox(box, filled=True))
-    inside = ax.bbox.padded(1.0)
+    inside = ax.bbox.padded(_DOT)
     if not (inside.contains(box.x0, box.y0) and inside.contains(box.x1, box.y1)):
         n += 100
     return n
@@ -484,7 +485,7 @@ def number_phases(fig: Figure, axes: Iterable[Axes], result: Result) -> str:
                 va="bottom", transform=ax.get_xaxis_transform(), gid="phase",
             )  # fmt: skip
             box = label.get_window_extent()
-            if box.x0 < right + 1:
+            if box.x0 < right + _DOT:
                 label.remove()
             else:
                 right = box.x1
