@@ -458,14 +458,32 @@ def test_the_last_weight_with_an_infinite_horizon():
     assert double_integrator_gains([1.0, -2.0 + 1e-6], 1.0) == pytest.approx(tuple(K[0]), rel=1e-6)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(8))
 def test_no_cost_that_is_positive_is_refused(seed):
     """Where [[Q, N], [N^T, R]] is positive semi-definite, even of rank one, horizons of any length are solved."""
     rng = np.random.default_rng(seed)
     C = rng.normal(size=(1, 3))
     Q, N, R = C[:, :2].T @ C[:, :2], C[:, :2].T @ C[:, 2:], C[:, 2:].T @ C[:, 2:]
-    P, _ = finite_horizon(A, B, Q, R, [1.0, 0.0], [0.0, 1.0, 1e2], N=N)
-    assert np.linalg.eigvalsh(P).min() > -1e-9 * np.abs(P).max()
+    P, _ = finite_horizon(A, B, Q, R, [1.0, 0.0], [1e2, 10.0, 0.0, 1.0], N=N)
+    assert np.linalg.eigvalsh(P).min() > -1e-12 * np.abs(P).max()
+
+    def rate(_, p):
+        P = p.reshape(2, 2)
+        K = np.linalg.solve(R, B.T @ P + N.T)
+        return (A.T @ P + P @ A - K.T @ R @ K + Q).ravel()
+
+    expected = solve_ivp(rate, (0, 10), [1.0, 0, 0, 0], "Radau", [0, 1, 10], rtol=1e-9, atol=1e-13)
+    np.testing.assert_allclose(P[[2, 3, 1]].reshape(3, 4), expected.y.T, rtol=1e-4, atol=1e-6)
+
+    def law(t, x):
+        K = finite_horizon(A, B, Q, R, [1.0, 0.0], 5.0 - t, N=N)[1]
+        return (A - B @ K) @ x
+
+    x, u = closed_loop_response(A, B, Q, R, [1.0, 0.0], 5.0, [1.0, -2.0], [5.0, 0.0, 2.0], N=N)
+    flown = solve_ivp(law, (0, 5), [1.0, -2.0], "DOP853", [0, 2, 5], rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(x[[1, 2, 0]], flown.y.T, rtol=1e-6, atol=1e-6)
+    K = finite_horizon(A, B, Q, R, [1.0, 0.0], 3.0, N=N)[1]
+    np.testing.assert_allclose(u[2], -K @ x[2], rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("seed", range(3))

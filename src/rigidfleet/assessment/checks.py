@@ -588,7 +588,7 @@ def _fallen(measured: Measurements) -> Iterator[str]:
         down &= ~measured.left[:, i]
         if down.any():
             x, y, _ = r[-1]
-            yield f"{words} hits the ground at {measured.first(down):.2f} s and lies at ({x:.1f}, {y:.1f}) m"
+            yield f"{words} hits the ground at {measured.first(down):.2f} s and lies at ({x:z.1f}, {y:z.1f}) m"
         else:
             yield f"{words} is still falling at z = {r[-1, 2]:.1f} m when the flight ends"
 

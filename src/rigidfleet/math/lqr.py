@@ -39,6 +39,9 @@ _KEPT = 512
 # A weight counts as negative beyond this share of its greatest entry.
 _ROUNDING = 1e-12
 
+# Growth of a motion over a step up to which the doubled flow keeps half of its digits: they are lost with its square.
+_GROWTH = 1e4
+
 # The double integrator.
 _A = np.array([[0.0, 1.0], [0.0, 0.0]])
 _B = np.array([[0.0], [1.0]])
@@ -318,9 +321,18 @@ def _responses(*keys: Key) -> tuple[Floats, Floats]:
     if t.ndim != 1 or np.any(t > T * (1.0 + 1e-12)):
         raise ValueError(f"times must be a list of times between 0 and T = {T} s")
     reduced = _reduced(A, B, Q, R, N)
-    P = _cost_to_go(*reduced, S, np.maximum(T - t, 0.0))
-    X, Phi, W, _ = _flow(*reduced, S, t, T)
-    x = _solve(np.eye(len(A)) + W @ (P - X), Phi)
+    tau = np.maximum(T - t, 0.0)
+    if _grows(reduced[0], reduced[2], S, T):
+        every, which = np.unique(np.append(tau, T), return_inverse=True)
+        P, moved = _marched(*reduced, S, every)
+        for k in range(len(every) - 2, -1, -1):  # the first moves, too: by nothing, to itself
+            moved[k] = moved[k] @ moved[k + 1]
+        P = P[which[:-1]]
+        x = np.concatenate([moved[1:], np.eye(len(A))[None]])[which[:-1]]
+    else:
+        P = _cost_to_go(*reduced, S, tau)
+        X, Phi, W, _ = _flow(*reduced, S, t, T)
+        x = _solve(np.eye(len(A)) + W @ (P - X), Phi)
     return x, -_solve(R, (B.T @ P + N.T) @ x)
 
 
@@ -369,10 +381,46 @@ def _positive(weight: Floats) -> bool:
 
 def _cost_to_go(A: Floats, G: Floats, Q: Floats, S: Floats, tau: Floats) -> Floats:
     """P (..., n, n) at times to go tau (...)."""
-    X, Phi, W, V = _flow(A, G, Q, S, tau, tau.max(initial=0.0))
+    T = tau.max(initial=0.0)
+    if _grows(A, Q, S, T):
+        every, which = np.unique(tau, return_inverse=True)
+        return _marched(A, G, Q, S, every)[0][which].reshape(*tau.shape, *A.shape)
+    X, Phi, W, V = _flow(A, G, Q, S, tau, T)
     D = S - X
     P = X + V + _transposed(Phi) @ _solve(np.eye(len(A)) + D @ W, D @ Phi)
     return 0.5 * (P + _transposed(P))
+
+
+def _grows(A: Floats, Q: Floats, S: Floats, T: float) -> bool:
+    """Whether a motion may grow over T so far that only small steps keep its digits; of a positive cost."""
+    far = np.linalg.eigvals(A).real.max() * T > math.log(_GROWTH)
+    return bool(far) and _positive(Q) and _positive(S)
+
+
+def _marched(A: Floats, G: Floats, Q: Floats, S: Floats, tau: Floats) -> tuple[Floats, Floats]:
+    """P (K, n, n) at increasing times to go tau (K,), in steps that each keep it positive.
+
+    Also returns the matrices (K, n, n) that lead x at each time to go to x at the one before.
+    """
+    identity, rate = np.eye(len(A)), _rate(A, G, Q)
+    P, costs, moves = S, [], []
+    for span in np.diff(tau, prepend=0.0):
+        left = max(1, math.ceil(span * rate / math.log(_GROWTH)))
+        Phi, W, V, _ = _propagate(A, G, Q, np.array(span / left), rate)
+        move = identity
+        while left:
+            value, vector = np.linalg.eigh(P)
+            root = vector * np.sqrt(value.clip(min=0.0))
+            closed, reach = _solve(identity + W @ P, Phi), root.T @ Phi
+            last, P = P, V + reach.T @ _solve(identity + root.T @ W @ root, reach)
+            P = 0.5 * (P + P.T)
+            # At a stationary P, all further steps are the same.
+            done = left if np.abs(P - last).max() <= np.finfo(float).eps * np.abs(P).max() else 1
+            move = move @ np.linalg.matrix_power(closed, done)
+            left -= done
+        costs.append(P)
+        moves.append(move)
+    return np.array(costs), np.array(moves)
 
 
 def _flow(

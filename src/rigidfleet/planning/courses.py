@@ -205,7 +205,7 @@ def misled(mission: Mission, phase: Phase, now: PhaseState) -> str:
         i = int(far.argmax())
         if far[i] > most:
             who = "the virtual body" if alone else f"agent {i + 1}"
-            point, here = (", ".join(f"{x:.2f}" for x in y[i]) for y in (first[..., 0], place))
+            point, here = (", ".join(f"{x:z.2f}" for x in y[i]) for y in (first[..., 0], place))
             return (
                 f"its first point ({point}) m is {far[i]:.2f} {unit} from where {who} is then, ({here}) m"
                 if unit == "m"

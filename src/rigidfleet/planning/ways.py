@@ -334,7 +334,7 @@ class _Search:
         x = network.layers[layer]
         room = network.space.room(place + x.offsets, network.radius)
         _, thing = self._nearest(network, place, layer, room)
-        where = ", ".join(f"{v:.2f}" for v in place)
+        where = ", ".join(f"{v:z.2f}" for v in place)
         problem = (
             f"no way is found: at the narrowest place of the best one, ({where}) m, '{x.formation}' at yaw"
             f" {x.angles[2]:.4g}° "

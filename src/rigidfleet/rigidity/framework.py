@@ -21,6 +21,8 @@ ZERO = 1e-7
 
 #: Speed below which an agent counts as at rest in a flex whose fastest agent has speed 1.
 _STILL = 1e-5
+#: Relative difference below which two lengths or strengths are the same: rounding must not choose between them.
+_ALIKE = 1e-6
 
 #: Share of the original squares below which the remainder has too few correct digits.
 _SPENT = 1e-8
@@ -223,6 +225,8 @@ def _single(frame: Framework) -> list[Floats]:
 def sparse(flexes: Floats, rigid: Floats, n: int, most: int = 1 << 30) -> list[Floats]:
     """Flexes (N, d) that move few agents: for each agent, the one with the least sum of speeds in which it moves.
 
+    It moves in the direction in which flexes can move it most; if there are several, in each of them.
+
     Parameters
     ----------
     flexes, rigid : (N d, .) orthonormal; any rigid motion may be added to a flex
@@ -236,15 +240,29 @@ def sparse(flexes: Floats, rigid: Floats, n: int, most: int = 1 << 30) -> list[F
     seeds = np.flatnonzero(strength[:, 0] > _STILL)
     found = []
     for i in seeds[:: max(1, -(-len(seeds) // most))]:
-        c = part[i, :, 0] @ blocks[i]
-        speed = np.ones(n)
-        for sharp in np.logspace(0, -7, 20):
-            weight = np.repeat(1 / (speed + sharp), len(V) // n)
-            a = np.linalg.solve(V.T @ (weight[:, None] * V), c)
-            motion = (V @ (a / (c @ a))).reshape(n, -1)
-            speed = np.linalg.norm(motion, axis=1)
-        found.append(_cleaned(motion, V))
+        for way in _along_axes(part[i][:, strength[i] > (1.0 - _ALIKE) * strength[i, 0]]):
+            c = way @ blocks[i]
+            speed = np.ones(n)
+            for sharp in np.logspace(0, -7, 20):
+                weight = np.repeat(1 / (speed + sharp), len(V) // n)
+                a = np.linalg.solve(V.T @ (weight[:, None] * V), c)
+                motion = (V @ (a / (c @ a))).reshape(n, -1)
+                speed = np.linalg.norm(motion, axis=1)
+            found.append(_cleaned(motion, V))
     return found
+
+
+def _along_axes(U: Floats) -> list[Floats]:
+    """A basis of the span of U (d, k), orthonormal, as near to the axes as it can be: the same on any machine."""
+    rest, basis = U @ U.T, []
+    for _ in range(U.shape[1]):
+        length = np.linalg.norm(rest, axis=1)
+        way = rest[
+            int(np.argmax(length > (1.0 - _ALIKE) * length.max()))
+        ]  # of equal ones, the first
+        basis.append(way / np.linalg.norm(way))
+        rest = rest - np.outer(rest @ basis[-1], basis[-1])
+    return basis
 
 
 def _cleaned(motion: Floats, V: Floats) -> Floats:
