@@ -164,6 +164,8 @@ def test_first_flight(tmp_path, monkeypatch, capsys):
         "new",
         "run",
     ]
+    told = assess(simulate(Mission.from_toml(printed))).summary
+    assert f"> {told.partition(';')[0]};" in text
     run, new = commands[2], commands[4]
     assert main([*run[1:], "--no-figures"]) == 1
     assert "west wall" in " ".join(capsys.readouterr().out.split())

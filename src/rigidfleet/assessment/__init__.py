@@ -72,6 +72,8 @@ def assess(result: Result | str | Path) -> Verdict:
     ------
     ResultError
         The result, or the mission inside it, cannot be read.
+    TypeError
+        ``result`` is neither a flight nor a path.
     """
     result = as_result(result)
     measured = Measurements(result)

@@ -41,6 +41,13 @@ _PRAISE = {
 class Verdict:
     """What `assess` finds: all checks, the numbers of each phase, and notes, which fail nothing.
 
+    Attributes
+    ----------
+    mission, title : name and title of the mission
+    checks : each check with its worst value, its limit, when and who
+    phases : the numbers of each phase, in order of flight
+    notes : what else to know of the flight
+
     >>> import rigidfleet as rf
     >>> verdict = rf.assess(rf.simulate("square"))
     >>> verdict.passed

@@ -179,6 +179,8 @@ def export(
         missing; the files cannot be written, or the result cannot be read.
     ValueError
         The format is unknown, or the rate or the tolerance is not positive or does not apply.
+    TypeError
+        ``result`` is neither a flight nor a path.
     """
     result, path = as_result(result), as_path(path)
     chosen = _chosen(format, path)

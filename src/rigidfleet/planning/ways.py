@@ -135,7 +135,7 @@ class _Search:
             if lacking <= 0.0:
                 return mission
             need += lacking + _KEPT
-        return self._unproved(mission, lacking)
+        raise self._unproved(lacking)
 
     def _searched(self, need: float) -> tuple[Network, Way]:
         """The way of least cost among shapes: more shapes, and then more yaws, as long as there is no short one."""
@@ -312,9 +312,9 @@ class _Search:
         return _refused(self.mission, self.number, "position", self.phase.position, problem,
                         "wait before by kind 'hold', or fly elsewhere first")  # fmt: skip
 
-    def _unproved(self, mission: Mission, lacking: float) -> Mission:
+    def _unproved(self, lacking: float) -> MissionError:
         problem = f"finds a way, but its proof lacks {lacking:.3f} m of clearance: {self._worst}"
-        raise _refused(self.mission, self.number, "clearance", self.phase.clearance, problem,
+        return _refused(self.mission, self.number, "clearance", self.phase.clearance, problem,
                        "give more time, or ask for less clearance")  # fmt: skip
 
     def _none(self, network: Network) -> MissionError:

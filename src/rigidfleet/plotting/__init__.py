@@ -159,7 +159,9 @@ def plot(
     ValueError
         A format or a name is unknown.
     ResultError
-        A file cannot be written, or the mission inside the result cannot be read.
+        A file cannot be written, or the result or the mission inside it cannot be read.
+    TypeError
+        ``result`` is neither a flight nor a path.
     """
     result = as_result(result)
     target = None if folder is None else as_path(folder)

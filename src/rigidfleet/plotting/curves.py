@@ -152,7 +152,7 @@ def distances(result: Result) -> Figure:
     if len(result.edges):
         title = "edge" if len(result.edges) <= SINGLE else ""
         st.legend(ax, [*edge_handles(result), *_reference_handle(result.distance_reference)], title)
-    st.name_phases(fig, [ax], result)
+    st.name_phases([ax], result)
     return fig
 
 
@@ -230,7 +230,7 @@ def cm(result: Result) -> Figure:
     )  # fmt: skip
     references = _reference_handle(result.cm_reference, result.cm_velocity_reference)
     _whole_legend(axes[0, 1], references, targets=bool(places or speeds))
-    st.name_phases(fig, axes[0], result)
+    st.name_phases(axes[0], result)
     return fig
 
 
@@ -267,7 +267,7 @@ def attitude(result: Result) -> Figure:
     if not np.isfinite([flown, wanted]).any():
         fig, axes = st.time_figure(result, title, 1)
         st.note(axes[0, 0], "no body frame attached")
-        st.name_phases(fig, axes[0], result)
+        st.name_phases(axes[0], result)
         return fig
     turned = np.degrees(result.rates), np.degrees(result.rates_reference)
     shares = _shares((flown, wanted), turned)
@@ -277,7 +277,7 @@ def attitude(result: Result) -> Figure:
     _components(result, axes[:, 1], *turned, turning, ("p", "q", "r"), "deg/s")
     references = _reference_handle(wanted, result.rates_reference)
     _whole_legend(axes[0, 1], references, targets=bool(targets or turning))
-    st.name_phases(fig, axes[0], result)
+    st.name_phases(axes[0], result)
     return fig
 
 
@@ -313,7 +313,7 @@ def inputs(result: Result) -> Figure:
         widen(below, min(0.1, 0.1 * peaks.sane(result, result.thrust)))
         peaks.extremes(below, result, result.thrust, "N", peaks.agent, name="thrust")
     st.agents_legend(above, result.n_agents)
-    st.name_phases(fig, [above], result)
+    st.name_phases([above], result)
     return fig
 
 
@@ -342,7 +342,7 @@ def constraint_force(result: Result) -> Figure:
         peaks.within(below, result, tension)
         peaks.extremes(below, result, tension, "N", edge, name="tension", always=False)
         st.legend(below, edge_handles(result))
-    st.name_phases(fig, [above], result)
+    st.name_phases([above], result)
     return fig
 
 
@@ -364,7 +364,7 @@ def disturbance(result: Result) -> Figure:
         peaks.from_none(below, result, off, "m")
     else:
         st.note(below, "no slots are tracked")
-    st.name_phases(fig, [above], result)
+    st.name_phases([above], result)
     return fig
 
 
@@ -443,7 +443,7 @@ def constraint_error(result: Result) -> Figure:
     handles = draw_error(ax, result)
     if handles:
         st.legend(ax, [*handles, *(edge_handles(result) if len(result.edges) else [])])
-    st.name_phases(fig, [ax], result)
+    st.name_phases([ax], result)
     return fig
 
 
@@ -554,5 +554,5 @@ def clearance(result: Result) -> Figure:
     fig, axes = st.time_figure(result, "Clearance between surfaces", len(panels), height=height)
     for draw, ax in zip(panels, axes[:, 0], strict=True):
         draw(ax)
-    st.name_phases(fig, axes[0], result)
+    st.name_phases(axes[0], result)
     return fig

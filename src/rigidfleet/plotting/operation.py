@@ -67,7 +67,7 @@ def _drawn(result: Result, agents: Sequence[int]) -> Figure:
         st.limit(fast, top, f"limit {top:g} m/s")
     draw_separation(apart, result)
     draw_clearance(clear, result)
-    st.name_phases(fig, [above], result)
+    st.name_phases([above], result)
     return fig
 
 

@@ -69,7 +69,7 @@ def summary(result: Result) -> Figure:
     _draw_attitude(angles, result)
     curves.draw_thrust(thrust, result)
     (curves.draw_clearance if result.mission.obstacles else curves.draw_separation)(apart, result)
-    key = textwrap.wrap("Phases:  " + st.number_phases(fig, over_time, result), 150)
+    key = textwrap.wrap("Phases:  " + st.number_phases(over_time, result), 150)
     entries = space.handles(result, view)
     fig.legend(handles=entries, loc="center", ncols=len(entries), bbox_to_anchor=(0.5, 0.075))
     fig.text(

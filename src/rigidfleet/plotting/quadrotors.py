@@ -77,7 +77,7 @@ def rotors(result: Result) -> Figure:
         _draw_greatest(above, result)
         st.agents_legend(above, result.n_agents)
         _draw_nearest(below, result)
-    st.name_phases(fig, [above], result)
+    st.name_phases([above], result)
     return fig
 
 
@@ -147,7 +147,7 @@ def vehicles(result: Result) -> Figure:
     else:
         st.note(middle, "no slots are tracked")
     _draw_saturation(below, result, saturated)
-    st.name_phases(fig, [above], result)
+    st.name_phases([above], result)
     return fig
 
 

@@ -460,7 +460,7 @@ def clean(name: str, longest: int = _LONGEST) -> str:
     return words if len(words) <= longest else words[: longest - 1].rstrip() + "…"
 
 
-def name_phases(fig: Figure, axes: Iterable[Axes], result: Result) -> None:
+def name_phases(axes: Iterable[Axes], result: Result) -> None:
     """Write the phases' names along the top of axes, without overlaps, before the figure is laid out.
 
     If all names fit, each stands horizontally over its phase. Otherwise they are slanted, moved apart where
@@ -472,7 +472,7 @@ def name_phases(fig: Figure, axes: Iterable[Axes], result: Result) -> None:
             label.set_gid("phase")
 
 
-def number_phases(fig: Figure, axes: Iterable[Axes], result: Result) -> str:
+def number_phases(axes: Iterable[Axes], result: Result) -> str:
     """Write the phases' numbers along the top of small axes; return the key to them.
 
     A number that does not fit is left out.

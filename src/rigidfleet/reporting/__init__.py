@@ -44,6 +44,8 @@ def report(
         The page cannot be written, or a result or the mission inside a result cannot be read.
     ValueError
         There is no result, or the number of labels or verdicts differs from that of results.
+    TypeError
+        ``results`` holds what is neither a flight nor a path.
     """
     target = as_path(path)
     write_file(target, html_page(results, labels=labels, verdicts=verdicts).encode())

@@ -77,6 +77,10 @@ def establish(
     ValueError
         The mission has other phases, axes or assignments, disturbances, or too many edges for the dense solve; or the
         starts have the wrong shape or are not finite.
+    MissionError
+        The mission does not exist, or has errors.
+    TypeError
+        ``mission`` is no mission.
     """
     mission = timed(as_mission(mission))
     r = _starts("position", position, mission.n_agents)

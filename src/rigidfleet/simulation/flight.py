@@ -116,6 +116,8 @@ def simulate(
         forces. The error's ``result`` is the incomplete flight, or None.
     MissionError
         The mission does not exist, or has errors.
+    TypeError
+        ``mission`` is no mission.
     ValueError
         A time to record lies outside the mission, or the control rate is not positive.
     """

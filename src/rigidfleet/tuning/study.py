@@ -102,6 +102,8 @@ def tune(
         The folder holds another study or a changed file, or cannot be written.
     RigidfleetError
         An option is wrong, or there is nothing to tune.
+    TypeError
+        ``mission`` is no mission.
     KeyboardInterrupt
         On Ctrl-C. What was flown is kept, and the same call goes on.
     """

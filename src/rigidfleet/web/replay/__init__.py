@@ -77,6 +77,8 @@ def replay(result: Result | str | Path, path: str | Path | None = None) -> Repla
     ------
     ResultError
         The file cannot be written, or the result or the mission inside it cannot be read.
+    TypeError
+        ``result`` is neither a flight nor a path.
     """
     page_ = html_page(as_result(result))
     if path is None:
