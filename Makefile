@@ -26,7 +26,7 @@ demo: .venv/.core  ## Fly the paper's narrow passage
 test: .venv/.dev  ## Run the tests (MARK= runs the long ones, too)
 	@$(BIN)/python -m pytest -n $(JOBS) -m "$(MARK)"
 
-bench: .venv/.bench .venv/.vehicles  ## Measure the speed, as ratios
+bench: .venv/.vehicles  ## Measure the speed, as ratios
 	@$(BIN)/python benchmarks/run.py
 	@$(BIN)/python benchmarks/many.py
 	@$(BIN)/python benchmarks/vehicles.py
@@ -34,13 +34,13 @@ bench: .venv/.bench .venv/.vehicles  ## Measure the speed, as ratios
 peers: .venv/.peers  ## Fly beside other programs (Octave, too, if it is on PATH)
 	@$(BIN)/python benchmarks/compare.py
 
-robustness: .venv/.bench  ## Fly 200 random formations under every graph and law
+robustness: .venv/.core  ## Fly 200 random formations under every graph and law
 	@$(BIN)/python benchmarks/robustness.py --write docs/robustness.md
 
 exports: .venv/.interchange  ## Measure every export of three flights
 	@$(BIN)/python benchmarks/exports.py --write docs/export.md
 
-avoidance: .venv/.bench .venv/.crowds  ## Plan transitions and published problems, with proofs
+avoidance: .venv/.crowds  ## Plan transitions and published problems, with proofs
 	@$(BIN)/python benchmarks/avoidance.py
 	@$(BIN)/python benchmarks/moving.py
 	@$(BIN)/python benchmarks/order.py
@@ -72,7 +72,7 @@ format: .venv/.dev  ## Rewrite the code in the project's style
 
 constraints: .venv/.dev  ## Choose newer versions of all packages
 	@$(BIN)/uv pip compile --quiet --universal --upgrade --no-header --no-annotate \
-		--all-extras --group dev --group bench --group peers --group crowds --group vehicles --group interchange --group oracles --group docs --group build \
+		--all-extras --group dev --group peers --group crowds --group vehicles --group interchange --group oracles --group docs --group build \
 		pyproject.toml --output-file constraints.txt
 
 clean:  ## Remove .venv, caches and builds
@@ -92,7 +92,7 @@ clean:  ## Remove .venv, caches and builds
 	@$(INSTALL)
 	@touch $@
 
-.venv/.dev .venv/.bench .venv/.peers .venv/.crowds .venv/.vehicles .venv/.interchange .venv/.oracles .venv/.docs: .venv/.%: .venv/.core
+.venv/.dev .venv/.peers .venv/.crowds .venv/.vehicles .venv/.interchange .venv/.oracles .venv/.docs: .venv/.%: .venv/.core
 	@echo "Installing what '$*' needs"
 	@$(INSTALL) --group $*
 	@touch $@

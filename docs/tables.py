@@ -79,9 +79,9 @@ def _value(entry: dict[str, Any]) -> str:
         case {"anyOf": choices} | {"oneOf": choices}:
             return " or ".join(_value(c) for c in choices if c.get("type") != "null")
         case {"$ref": target}:
-            return f"table, see `{target.rpartition('/')[2].lower()}`"
+            return f"table, see `{_named(target)}`"
         case {"type": "array", "items": {"$ref": target}}:
-            return f"list of tables, see `{target.rpartition('/')[2].lower()}`"
+            return f"list of tables, see `{_named(target)}`"
         case {"type": "array", "items": {"type": "array", "items": {"type": "array"} as inner}}:
             return f"list of lists: {_value(inner)}"
         case {"type": "array", "items": {"type": "array", "items": inner, **size}}:
@@ -97,6 +97,12 @@ def _value(entry: dict[str, Any]) -> str:
         case {"type": "array", "items": inner}:
             return f"list of {_PLURAL[inner['type']]}"
     return {"integer": "whole number", "boolean": "true, false"}.get(entry["type"], entry["type"])
+
+
+def _named(target: str) -> str:
+    """What the page calls a table of the schema."""
+    name = target.rpartition("/")[2]
+    return "links.lost" if name == "LostLink" else name.lower()
 
 
 _PLURAL = {"string": "names", "number": "numbers", "integer": "whole numbers"}
