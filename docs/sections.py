@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ast
 import re
+from collections.abc import Iterator
 from typing import Any
 
 import griffe
@@ -11,12 +13,27 @@ _NAMED = ("Parameters", "Attributes", "Other Parameters")
 
 
 class Sections(griffe.Extension):
-    """Puts each meaning below its name; types come from the signature."""
+    """Puts each meaning below its name; types come from the signature. Comments behind fields are their meanings."""
 
-    def on_instance(self, *, obj: griffe.Object, **_: Any) -> None:
+    def on_instance(
+        self, *, node: ast.AST | griffe.ObjectNode, obj: griffe.Object, **_: Any
+    ) -> None:
         """Rewrite a docstring before it is parsed."""
         if obj.docstring is not None:
-            obj.docstring.value = rewritten(obj.docstring.value)
+            text = obj.docstring.value
+            if isinstance(node, ast.ClassDef) and "Attributes\n---" not in text:
+                told = list(fields(node, obj.filepath.read_text("utf-8").splitlines()))
+                text += "\n\nAttributes\n----------\n" + "\n".join(told) if told else ""
+            obj.docstring.value = rewritten(text)
+
+
+def fields(node: ast.ClassDef, source: list[str]) -> Iterator[str]:
+    """The fields of a class that a comment explains, as "name : meaning"."""
+    for field in node.body:
+        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name):
+            meaning = source[(field.end_lineno or field.lineno) - 1].partition("  # ")[2]
+            if meaning:
+                yield f"{field.target.id} : {meaning}"
 
 
 def rewritten(text: str) -> str:

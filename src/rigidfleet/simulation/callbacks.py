@@ -19,42 +19,64 @@ Force = Callable[[float, "Floats", "Floats"], ArrayLike]
 
 @dataclass(frozen=True)
 class Observation:
-    """What a controller sees at a control step; arrays (N, 3) world axes, copies.
+    """What a controller sees at a control step; arrays are copies.
 
     Positions and velocities are measured, masses are those the control laws assume. The attitude, rates and rotors of
     vehicles are known without delay; they are None for point masses that give any force at once.
+
+    Attributes
+    ----------
+    t : mission time [s]
+    phase : name of the phase
+    position, velocity : (N, 3) of each agent, world axes [m, m/s]
+    reference_position, reference_velocity, reference_acceleration : (N, 3) of its slot, world axes [m, m/s, m/s^2]
+    masses : (N,) [kg]
+    gravity : [m/s^2]
+    attitude : (N, 4) of each vehicle, world to body, scalar first
+    rates : (N, 3) of each vehicle, body axes [rad/s]
+    rotor_speed : (N, 4) front left, front right, rear right, rear left [rad/s]
     """
 
-    t: float  # [s]
+    t: float
     phase: str
-    position: Floats  # [m]
-    velocity: Floats  # [m/s]
-    reference_position: Floats  # desired [m]
-    reference_velocity: Floats  # [m/s]
-    reference_acceleration: Floats  # [m/s^2]
-    masses: Floats  # (N,) [kg]
-    gravity: float  # [m/s^2]
-    attitude: Floats | None = None  # (N, 4) of each vehicle, world to body, scalar first
-    rates: Floats | None = None  # (N, 3) body axes [rad/s]
-    rotor_speed: Floats | None = None  # (N, 4) [rad/s]
+    position: Floats
+    velocity: Floats
+    reference_position: Floats
+    reference_velocity: Floats
+    reference_acceleration: Floats
+    masses: Floats
+    gravity: float
+    attitude: Floats | None = None
+    rates: Floats | None = None
+    rotor_speed: Floats | None = None
 
 
 @dataclass(frozen=True)
 class AttitudeCommand:
-    """What a controller may return for vehicles instead of forces: thrust and attitude, which their autopilots hold."""
+    """What a controller may return for vehicles instead of forces: thrust and attitude, which their autopilots hold.
 
-    thrust: ArrayLike  # (N,) along each vehicle's z axis [N]
-    attitude: ArrayLike  # (N, 4) quaternions, world to body, scalar first
-    rates: ArrayLike | None = (
-        None  # (N, 3) of that attitude, in its own axes [rad/s]; default: zero
-    )
+    Attributes
+    ----------
+    thrust : (N,) along each vehicle's z axis [N]
+    attitude : (N, 4) quaternions, world to body, scalar first
+    rates : (N, 3) of that attitude, in its own axes [rad/s]; default: zero
+    """
+
+    thrust: ArrayLike
+    attitude: ArrayLike
+    rates: ArrayLike | None = None
 
 
 @dataclass(frozen=True)
 class RotorCommand:
-    """What a controller may return for vehicles instead of forces: the speeds of their rotors."""
+    """What a controller may return for vehicles instead of forces: the speeds of their rotors.
 
-    speed: ArrayLike  # (N, 4) front left, front right, rear right, rear left [rad/s]
+    Attributes
+    ----------
+    speed : (N, 4) front left, front right, rear right, rear left [rad/s]
+    """
+
+    speed: ArrayLike
 
 
 Command = AttitudeCommand | RotorCommand

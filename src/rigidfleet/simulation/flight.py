@@ -58,13 +58,22 @@ _FINISHED = "the flight is finished: make another Flight to fly on"
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a flight has come."""
+    """How far a flight has come.
 
-    t: float  # mission time reached [s]
-    t_end: float  # mission time at the end, settling phases counted up to their timeouts [s]
+    Attributes
+    ----------
+    t : mission time reached [s]
+    t_end : mission time at the end, settling phases counted up to their timeouts [s]
+    phase : name of the phase
+    wall : wall time so far [s]
+    planning : whether the phase is still being planned
+    """
+
+    t: float
+    t_end: float
     phase: str
-    wall: float  # wall time so far [s]
-    planning: bool = False  # whether the phase is still being planned
+    wall: float
+    planning: bool = False
 
 
 class FlightInterrupted(KeyboardInterrupt):
