@@ -785,6 +785,29 @@ def test_figures_are_the_same_from_processes_side_by_side(folder, monkeypatch):
         list(pictures)
 
 
+@pytest.mark.parametrize(
+    ("what", "does"),
+    [
+        ("multiprocessing.forkserver.ensure_running", OSError("AF_UNIX path too long")),
+        ("rigidfleet.cli.drawing.ProcessPoolExecutor", OSError("no semaphores")),
+        ("rigidfleet.cli.drawing.ProcessPoolExecutor.submit", BrokenPipeError("the server ended")),
+        ("rigidfleet.cli.drawing._begin", None),
+    ],
+)
+def test_figures_are_drawn_where_processes_fail(folder, monkeypatch, what: str, does):
+    """No server, no pool, a server or processes that end: this process draws every figure."""
+
+    def fail(*_, **__):
+        raise does
+
+    assert cli.main(["run", "short.toml", "--no-figures"]) == codes.PASSED
+    monkeypatch.setattr("rigidfleet.cli.drawing.at_once", lambda: 2)
+    monkeypatch.setattr(what, fail if does else os._exit)  # which a process runs as it begins
+    assert cli.main(["run", "short.toml", "--force"]) == codes.PASSED
+    drawn = {path.stem for path in Path("flights/short/figures").iterdir()}
+    assert drawn == set(figure_names(Result.load("flights/short/short.nc")))
+
+
 @pytest.mark.long
 def test_demo(folder):
     """The demonstration passes its verdict, may be repeated, and leaves every figure."""

@@ -174,6 +174,14 @@ def test_what_a_flight_makes_later_is_what_it_would_have_made_at_once(given, con
             np.testing.assert_array_equal(other[name], x, err_msg=name)
 
 
+def test_what_is_made_later_is_listed():
+    """Consoles and notebooks complete every field of a result, made or not."""
+    result = simulate(a_mission())
+    assert "thrust" not in vars(result)
+    assert {*VARIABLES, "mission_text"} <= {*dir(result)}
+    assert "thrust" not in vars(result), "listing makes nothing"
+
+
 def test_what_somebody_sets_is_not_made_later():
     """A field that is set stays when others are made; positions changed in place change nothing else."""
     changed, plain = simulate(a_mission()), simulate(a_mission())

@@ -519,6 +519,10 @@ class Result:
             getattr(self, name)
         return self
 
+    def __dir__(self) -> list[str]:
+        """Names that can be asked for, also of what is not computed yet: consoles and notebooks complete them."""
+        return sorted({*super().__dir__(), *self.__dict__.get("_later", ())})
+
     def __repr__(self) -> str:
         end = "complete" if self.complete else f"incomplete: {self.ending or 'stopped'}"
         return (

@@ -2,7 +2,8 @@
 
 They draw while the flight is saved and judged; this process then writes the files. A server process loads the plotting
 packages once; every drawing process is a fork of it and begins at once. Where there is no such server (Windows), or one
-processor, or a very large result, figures are drawn in this process.
+processor, or a very large result, figures are drawn in this process; so is a figure whose process fails, as where the
+system ends it for its memory.
 """
 
 from __future__ import annotations
@@ -44,10 +45,10 @@ def at_once() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def prepare() -> None:
-    """Start the server, which loads matplotlib beside whatever this process does next."""
+def prepare() -> bool:
+    """Start the server, which loads matplotlib beside whatever this process does next; return whether there is one."""
     if at_once() == 1:
-        return
+        return False
     from multiprocessing import forkserver
 
     multiprocessing.set_forkserver_preload(_LOADED)
@@ -56,6 +57,9 @@ def prepare() -> None:
     try:
         with safe_path():
             forkserver.ensure_running()
+        return True
+    except OSError:  # a temporary folder whose path is too long for a socket, for example
+        return False
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
@@ -78,13 +82,20 @@ class Drawings:
         self._pool: ProcessPoolExecutor | None = None
         self._jobs: dict[Future[dict[str, bytes]], Path] = {}
         self._count = min(at_once(), len(figures))
-        if self._count == 1 or len(figures) < _FEW or result.position.nbytes > _LARGEST:
+        if (
+            self._count == 1
+            or len(figures) < _FEW
+            or result.position.nbytes > _LARGEST
+            or not prepare()
+        ):
             return
-        prepare()
-        self._pool = ProcessPoolExecutor(
-            self._count, mp_context=multiprocessing.get_context("forkserver"), initializer=_begin,
-            initargs=(pickle.dumps(result.evaluate()), titles),  # the kernel is loaded in this process alone
-        )  # fmt: skip
+        try:
+            self._pool = ProcessPoolExecutor(
+                self._count, mp_context=multiprocessing.get_context("forkserver"), initializer=_begin,
+                initargs=(pickle.dumps(result.evaluate()), titles),  # the kernel is loaded in this process alone
+            )  # fmt: skip
+        except (ImportError, OSError):  # no semaphores: no /dev/shm, for example
+            return
         # In a thread, as it waits until the server has loaded everything
         self._asking = Thread(target=self._ask, args=(self._pool,), daemon=True)
         self._asking.start()
@@ -119,7 +130,7 @@ class Drawings:
         ResultError
             A file cannot be written.
         """
-        from rigidfleet.plotting import plot, write
+        from rigidfleet.plotting import plot, rendered, write
 
         if self._pool is None:
             for path, formats in self.figures.items():
@@ -135,7 +146,14 @@ class Drawings:
         self._asking.join()
         for job in as_completed(self._jobs):
             path = self._jobs[job]
-            for kind, data in job.result().items():
+            try:
+                files = job.result()
+            except (
+                OSError,
+                RuntimeError,
+            ):  # of the process; what is wrong with the figure is wrong here, too
+                files = rendered(self._result, path.name, self.figures[path], titles=self._titles)
+            for kind, data in files.items():
                 write(path.with_name(f"{path.name}.{kind}"), data)
             yield path
 
