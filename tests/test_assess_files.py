@@ -187,6 +187,24 @@ def test_units_are_those_of_the_names(tmp_path):
     assert not any("metres and seconds?" in note for note in judged(named)[0].notes)
 
 
+def test_fields_may_be_quoted(tmp_path):
+    """A spreadsheet that quotes every field writes the same table, with the same names of vehicles."""
+    head, rows = f"agent,{HEAD}", [["cf 1", 0, 0, 0, 1], ["cf 1", 1, 2, 3, 4]]
+    plain, quoted = table(tmp_path / "plain.csv", rows, head), tmp_path / "quoted.csv"
+    quoted.write_text(re.sub(r"[^,\n]+", r'"\g<0>"', plain.read_text()))
+    one, other = read_trajectories(plain), read_trajectories(quoted)
+    assert one.names == other.names == ("cf 1",)
+    np.testing.assert_array_equal(one.curves[0].pieces, other.curves[0].pieces)
+
+
+def test_a_flight_shorter_than_a_sample_is_judged(tmp_path):
+    """Seconds that a column calls milliseconds: 2 m in 20 ms are 100 m/s."""
+    path = table(tmp_path / "short.csv", [[0, 0, 0, 1], [20, 2, 0, 1]], "time [ms],x,y,z")
+    verdict, result = judged(path, limits={"speed": 50.0})
+    assert check_of(verdict, "speed").worst == pytest.approx(100.0)
+    assert result.time[-1] == pytest.approx(0.02)
+
+
 def test_vehicles_at_one_place_fail(tmp_path):
     """Two vehicles that start and fly at the same place are judged, not refused."""
     rows = [[t, i, t, 0, 1] for t in range(4) for i in (1, 2)]
@@ -248,6 +266,12 @@ BAD_TEXTS = {
     "feet": ("time_s,x [ft],y_m,z_m\n0,0,0,1\n", "unknown unit 'ft'"),
     "other spans": (f"agent,{HEAD}\n1,0,0,0,1\n1,1.5,0,0,1\n2,0,1,0,1\n2,1,1,0,1\n2,9,1,0,1\n2,10,1,0,1\n",
                     "'2' ends at 10 s, and '1' at 1.5 s"),
+    "decimal comma": ("time;x;y;z\n0;0;0;1\n0,5;0;0;1\n",
+                      "line 3: time is 0,5, not a finite number. Write decimals with a point"),
+    "grouped digits": (f"{HEAD}\n0,0,0,1\n1,1_0,0,1\n", "line 3: x_m is 1_0"),
+    "nameless": (f"agent,{HEAD}\na,0,0,0,1\n,1,0,0,1\n", "line 3: agent is empty"),
+    "escapes": (f"{HEAD}\n0,0,0,1\n1,\033[31m0,0,1\n", "line 3: has the control character U+001B"),
+    "NUL": (f"{HEAD}\n0,0,0,\0\n", "line 2: has the control character U+0000"),
     "short polynomial": (f"{_POLY}\n{_ROW}\n1,0,0\n", "line 3: has 3 fields"),
     "NaN polynomial": (f"{_POLY}\n{_ROW[:-1]}nan\n", "line 2: yaw^7 is nan"),
     "no duration": (f"{_POLY}\n{_ROW}\n0{_ROW[1:]}\n", "line 3: the duration is 0 s"),
@@ -267,6 +291,15 @@ def test_bad_tables_are_refused_by_file_and_line(kind, tmp_path, capsys):
     err = capsys.readouterr().err
     assert "Traceback" not in err
     assert "bug" not in err
+
+
+def test_another_encoding_is_named(tmp_path):
+    path = tmp_path / "old.csv"
+    path.write_bytes(f"agent,{HEAD}\né,0,0,0,1\n".encode("latin-1"))
+    with pytest.raises(
+        rf.RigidfleetError, match=r"old\.csv: is neither text in UTF-8 .* Save a table as UTF-8"
+    ):
+        read_trajectories(path)
 
 
 def zipped(entries):
@@ -458,3 +491,16 @@ def test_a_missing_file_is_named(tmp_path, capsys):
     """A path without a file says so, and nothing of folders to create."""
     assert main(["assess", str(tmp_path / "none.csv")]) == BAD_INPUT
     assert "none.csv: no such file" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["my flight (2).csv", "Дрон.csv", "flight é.csv", "-.csv"])
+def test_a_file_may_have_any_name(name, tmp_path, monkeypatch, capsys):
+    """Also one that a mission may not have; so may the folder in which it is judged."""
+    folder = tmp_path / "été 2026"
+    folder.mkdir()
+    table(folder / name, [[0, 0, 0, 1], [1, 1, 0, 1]])
+    monkeypatch.chdir(folder)
+    assert main(["assess", str(folder / name), "--out", "made"]) == PASSED
+    assert "Passed: the only check holds." in capsys.readouterr().out
+    assert len(list(Path("made").glob("*.nc"))) == 1
+    assert main(["assess", "."]) == PASSED

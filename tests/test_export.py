@@ -9,6 +9,7 @@ import base64
 import itertools
 import json
 import math
+import os
 import struct
 import zipfile
 from dataclasses import replace
@@ -609,6 +610,11 @@ def test_a_curve_that_cannot_be_met(flight, tmp_path):
         ("skyc", {"tolerance": 0.0}, "tolerance must be positive, not 0.0"),
         ("tlog", {"rate": math.nan}, "rate must be positive, not nan"),
         ("setpoints", {"rate": 1e9}, "gives .* setpoints; use .* Hz or less"),
+        (
+            "tlog",
+            {"rate": 0.04},
+            "a rate of 0.04 Hz gives one setpoint in 20 s; use 0.05 Hz or more",
+        ),
     ],
 )
 def test_wrong_arguments(flight, tmp_path, name, options, message):
@@ -656,7 +662,16 @@ def test_all_files_or_none(flight, tmp_path, monkeypatch):
     assert (folder / "mine.txt").read_text() == "kept"
 
 
-def test_command(flight, tmp_path, capsys):
+def test_only_files_are_replaced(flight, tmp_path):
+    """A pipe, and so a device, is refused: a file in its place would remove it."""
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    with pytest.raises(rf.ResultError, match="pipe: cannot be written: it is a device or a pipe"):
+        export(flight, pipe, "skyc")
+    assert pipe.is_fifo()
+
+
+def test_command(flight, tmp_path, monkeypatch, capsys):
     """The command says in one line what it kept and lost, keeps existing files, and refuses a truncated result."""
     result = tmp_path / "sines.nc"
     flight.save(result)
@@ -674,6 +689,9 @@ def test_command(flight, tmp_path, capsys):
     capsys.readouterr()
     assert main(["export", str(result), "--format", "tlog", "--tolerance", "0.1"]) == 2
     assert "error: tolerance does not apply to tlog" in capsys.readouterr().err
+    monkeypatch.chdir(tmp_path)
+    assert main(["export", ".", "--format", "skyc"]) == 2
+    assert "error: .: is a folder" in capsys.readouterr().err
     assert main(["export", str(result), "--format", "usd"]) == 2
     assert "usd" in capsys.readouterr().err
     cut = tmp_path / "cut.nc"

@@ -56,7 +56,7 @@ def at_rate(given: Setpoints, rate: float | None) -> Setpoints:
     Raises
     ------
     ValueError
-        The rate is not positive, or gives more than `MOST` setpoints.
+        The rate is not positive, or gives more than `MOST` setpoints, or a single one of a flight that lasts.
     """
     time = given.time
     later = np.append(np.nextafter(time[:-1], np.inf) < time[1:], True)
@@ -64,10 +64,15 @@ def at_rate(given: Setpoints, rate: float | None) -> Setpoints:
         return Setpoints(*(x[later] for x in given))
     if not (np.isfinite(rate) and rate > 0.0):
         raise ValueError(f"the rate must be positive [Hz], not {rate!r}")
-    count = int((time[-1] - time[0]) * rate * (1.0 + 1e-12)) + 1
+    span = time[-1] - time[0]
+    count = int(span * rate * (1.0 + 1e-12)) + 1
     n = given.yaw.shape[1]
+    if count < 2 and span > 0.0:
+        raise ValueError(
+            f"a rate of {rate:g} Hz gives one setpoint in {span:.4g} s; use {1.0 / span:.3g} Hz or more"
+        )
     if count * n > MOST:
-        fits = (MOST / n - 1) / (time[-1] - time[0])
+        fits = (MOST / n - 1) / span
         raise ValueError(
             f"a rate of {rate:g} Hz gives {count * n:,} setpoints; use {fits:.3g} Hz or less"
         )

@@ -13,6 +13,11 @@ def agent_names(indices: Iterable[int]) -> str:
     return f"agents {', '.join(numbers[:-1])} and {numbers[-1]}"
 
 
+def all_hold(count: int) -> str:
+    """That all checks hold: "all 4 checks hold", "the only check holds"."""
+    return "the only check holds" if count == 1 else f"all {count} checks hold"
+
+
 def percent(share: float) -> str:
     """A share in per cent, to two digits below 10 %: "0.25 %", "57 %", "100 %"."""
     value = 100 * share

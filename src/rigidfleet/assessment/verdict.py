@@ -6,6 +6,7 @@ import json
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
+from rigidfleet._common.text import all_hold
 from rigidfleet.result import plain
 
 if TYPE_CHECKING:
@@ -89,7 +90,7 @@ class Verdict:
         if "thrust_peak" in found:
             praise["thrust"] = "{who} comes nearest to its limit, at {worst} of {limit}"
         told = [found[name].fill(words) for name, words in praise.items() if name in found]
-        head = f"Passed: all {len(judged)} checks hold"
+        head = f"Passed: {all_hold(len(judged))}"
         return f"{head}; {', '.join(told)}." if told else f"{head}."
 
     def to_dict(self) -> dict[str, Any]:

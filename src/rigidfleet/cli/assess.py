@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -147,7 +148,13 @@ def _of_others(
     read = read_trajectories(files, interpolation)
     result = of_curves(
         read.curves, read.assumed, names=read.names, mission=mission, separation=separation, limits=found,
-        radius=radius or 0.0, ground=ground, name=files[0].stem,
+        radius=radius or 0.0, ground=ground, name=_name(files[0]),
     )  # fmt: skip
     result.statistics["notes"] = list(read.notes)
     return result
+
+
+def _name(file: Path) -> str:
+    """The name of a flight after its file: files may have any characters, and names of missions only plain ones."""
+    plain = re.sub(r"[^A-Za-z0-9._-]+", "-", file.resolve().stem).strip("._-")
+    return plain or "trajectories"

@@ -82,12 +82,8 @@ class Drawings:
         self._pool: ProcessPoolExecutor | None = None
         self._jobs: dict[Future[dict[str, bytes]], Path] = {}
         self._count = min(at_once(), len(figures))
-        if (
-            self._count == 1
-            or len(figures) < _FEW
-            or result.position.nbytes > _LARGEST
-            or not prepare()
-        ):
+        few = self._count == 1 or len(figures) < _FEW
+        if few or result.position.nbytes > _LARGEST or not prepare():
             return
         try:
             self._pool = ProcessPoolExecutor(
@@ -148,10 +144,8 @@ class Drawings:
             path = self._jobs[job]
             try:
                 files = job.result()
-            except (
-                OSError,
-                RuntimeError,
-            ):  # of the process; what is wrong with the figure is wrong here, too
+            except (OSError, RuntimeError):
+                # The process failed. What is wrong with the figure itself is wrong here, too.
                 files = rendered(self._result, path.name, self.figures[path], titles=self._titles)
             for kind, data in files.items():
                 write(path.with_name(f"{path.name}.{kind}"), data)

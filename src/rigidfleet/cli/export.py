@@ -56,7 +56,7 @@ def export(
 
     chosen = FORMATS[format]
     name = f"{result.stem}-{format}" if chosen.each else f"{result.stem}.{chosen.suffix}"
-    path = out or result.with_name(name)
+    path = out or result.parent / name  # a path such as "." has no name to change
     if path.exists() and not force:
         raise taken(path)
     try:

@@ -23,6 +23,8 @@ _ALIASES = {
     "t": "time", "timestamp": "time", "id": "agent", "drone": "agent", "vehicle": "agent", "name": "agent", "px": "x",
     "py": "y", "pz": "z",
 }  # fmt: skip
+#: Characters that no table has, and that a terminal would obey when a message shows them.
+_CONTROL = re.compile(r"[^\t\n\r\x20-\x7e\xa0-\U0010ffff]")
 #: Longest line that is read [characters].
 _LONGEST = 100_000
 
@@ -54,9 +56,14 @@ def read_lines(data: bytes, name: str) -> tuple[list[str], str, list[str], list[
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError:
         raise TrajectoryError(
-            f"{name}: is neither text nor another known format. Give .csv, .skyc or .mcap."
+            f"{name}: is neither text in UTF-8 nor another known format. Save a table as UTF-8, or give .skyc or .mcap."
         ) from None
-    every = text.splitlines()
+    every = text.replace('"', "").splitlines()
+    if odd := _CONTROL.search(text):
+        line = len(f"{text[: odd.start()]}.".splitlines())
+        raise TrajectoryError(
+            f"{name}: line {line}: has the control character U+{ord(odd[0]):04X}. Remove it."
+        )
     kept = [k for k, line in enumerate(every, 1) if line and not line.isspace() and line[0] != "#"]
     if not kept:
         raise TrajectoryError(f"{name}: is empty. Give a table with a line of names.")
@@ -101,13 +108,16 @@ def numbers(
         for k in which:
             told = fields[k].strip()
             try:
-                fine = math.isfinite(float(told))
+                # Python alone groups digits by "_".
+                fine = math.isfinite(float(told)) and "_" not in told
             except ValueError:
                 fine = False
             if not fine:
+                remedy = "Leave out rows without a position."
+                if re.fullmatch(r"[-+]?\d*,\d+", told):
+                    remedy = "Write decimals with a point."
                 raise TrajectoryError(
-                    f"{name}: line {line}: {names[k]} is {told[:40] or 'empty'}, not a finite number. Leave out rows"
-                    " without a position."
+                    f"{name}: line {line}: {names[k]} is {told[:40] or 'empty'}, not a finite number. {remedy}"
                 )
     raise TrajectoryError(f"{name}: the numbers cannot be read.")
 
@@ -147,6 +157,9 @@ def read_columns(
     if "agent" in places:
         k = places.pop("agent")
         who = np.array([row.split(comma, k + 1)[k].strip() for row in rows])
+        if (nameless := np.flatnonzero(who == "")).size:
+            line = lines[int(nameless[0])]
+            raise TrajectoryError(f"{name}: line {line}: agent is empty. Name the vehicle.")
     values = numbers(rows, lines, comma, names, list(places.values()), name)
     found = {q: values[:, i] * factor[q] for i, q in enumerate(places)}
     return Columns(np.array(lines), found, who)
@@ -154,7 +167,7 @@ def read_columns(
 
 def _quantity(told: str, known: set[str]) -> tuple[str | None, str]:
     """The quantity and the unit that the name of a column tells; None for an unknown one."""
-    plain = told.lower().strip('"')
+    plain = told.lower()
     bracket = re.fullmatch(r"(.*?)\s*[\[(](.*)[\])]", plain)
     if bracket:
         plain = bracket[1].strip()

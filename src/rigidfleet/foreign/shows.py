@@ -62,7 +62,9 @@ def _drones(archive: zipfile.ZipFile, name: str) -> tuple[tuple[str, ...], tuple
         where = f"{name}: show.json: drone {k}"
         settings = _get(drone, "settings", dict, where)
         who = settings.get("name")
-        names.append(who if isinstance(who, str) and who else f"drone {k}")
+        names.append(
+            who if isinstance(who, str) and who.strip() and who.isprintable() else f"drone {k}"
+        )
         trajectory = _resolved(archive, settings.get("trajectory"), name, f"{where}: trajectory")
         yaw = settings.get("yawControl")
         turned = None if yaw is None else _resolved(archive, yaw, name, f"{where}: yawControl")

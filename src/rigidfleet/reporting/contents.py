@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rigidfleet import plotting
+from rigidfleet._common.text import all_hold
 from rigidfleet._version import __version__
 from rigidfleet.assessment import Safety, Verdict, assess, safety
 from rigidfleet.assessment.outcome import value
@@ -122,7 +123,7 @@ def _flight(result: Result, verdict: Verdict, label: str, colour: str) -> dict[s
 
 
 def _head(judged: int, failed: int) -> str:
-    return f"{failed} of {judged} checks failed" if failed else f"all {judged} checks hold"
+    return f"{failed} of {judged} checks failed" if failed else all_hold(judged)
 
 
 def _covers(flights: Sequence[Result]) -> str:

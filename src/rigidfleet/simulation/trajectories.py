@@ -267,7 +267,8 @@ def judged_as(
             data["obstacles"] = [{"kind": "ground", "height": ground}]
         agents = {"radius": radius, "mass": 1.0}
     agents["position"] = _told_apart(start).tolist()
-    return Mission.from_dict(data | {"agents": agents, "phases": [phase]}, "the limits")
+    step = {"output_step": phase["duration"]} if duration < _STEP else {}
+    return Mission.from_dict(data | step | {"agents": agents, "phases": [phase]}, "the limits")
 
 
 def _told_apart(start: Floats) -> Floats:
