@@ -21,7 +21,8 @@ def replacing(path: str | Path, *, private: bool = False) -> Generator[IO[bytes]
     Parameters
     ----------
     path : path of the file
-    private : whether only this user can read it: a file of a cache, which need not outlive a power failure
+    private : whether only this user can read it: a file of a cache, which need not outlive a power failure, and
+        replaces even a pipe
 
     Raises
     ------
@@ -31,7 +32,7 @@ def replacing(path: str | Path, *, private: bool = False) -> Generator[IO[bytes]
     target = Path(os.path.realpath(path))  # replaces the target of a symbolic link, not the link
     if target.is_dir():
         raise IsADirectoryError
-    if os.path.exists(path) and not os.path.isfile(path):
+    if not private and os.path.exists(path) and not os.path.isfile(path):
         raise OSError("it is a device or a pipe")  # which a new file would remove
     part = target.with_name(f".{target.name[:200]}.{secrets.token_hex(4)}.part")
     mode = 0o600 if private else 0o666
