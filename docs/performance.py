@@ -2,7 +2,7 @@
 
     python benchmarks/run.py --json bench.json
     python benchmarks/compare.py --json peers.json --figure docs/images/work-precision.png
-    python benchmarks/many.py --largest --json many.json
+    python benchmarks/many.py --million --json many.json
     python benchmarks/vehicles.py --json vehicles.json
     python docs/performance.py bench.json peers.json many.json vehicles.json
 
