@@ -486,6 +486,21 @@ def test_no_cost_that_is_positive_is_refused(seed):
     np.testing.assert_allclose(u[2], -K @ x[2], rtol=1e-9, atol=1e-9)
 
 
+def test_motions_that_no_weight_sees_are_brought_to_rest():
+    """Of x' = x + u, at no cost of x, P is 2 and x' = -x then; a motion that is 10^8 times slower is too slow."""
+    modes, inputs = np.diag([1.0, -1e-3]), [[1.0], [1.0]]
+    K, P = infinite_horizon(modes, inputs, [0.0, 0.0], 1.0)
+    assert pytest.approx([2.0, 0.0], abs=1e-9) == K[0]
+    np.testing.assert_allclose(P, np.diag([2.0, 0.0]), atol=1e-9)
+    with pytest.raises(ValueError, match="a motion grows that no weight sees"):
+        infinite_horizon(np.diag([1.0, -1e-8]), inputs, [0.0, 0.0], 1.0)
+    # One that is weighed needs no steps, however much slower another one is.
+    stiff = np.diag([1e2, -1e-4])
+    K, P = infinite_horizon(stiff, inputs, [1.0, 1.0], 1.0)
+    residual = stiff.T @ P + P @ stiff - K.T @ K + np.eye(2)
+    assert np.abs(residual).max() < 1e-9 * np.abs(P).max() * 1e2
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_cost_with_a_cross_weight_is_what_the_motion_costs(seed):
     """x0^T P x0 / 2 is the cost of the optimal motion, its cross term included, by Gauss-Legendre quadrature."""

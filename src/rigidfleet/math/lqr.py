@@ -41,6 +41,8 @@ _ROUNDING = 1e-12
 
 # Growth of a motion over a step up to which the doubled flow keeps half of its digits: they are lost with its square.
 _GROWTH = 1e4
+# Most steps of a horizon in which such a motion grows: about a second.
+_STEPS = 20_000
 
 # The double integrator.
 _A = np.array([[0.0, 1.0], [0.0, 0.0]])
@@ -322,7 +324,7 @@ def _responses(*keys: Key) -> tuple[Floats, Floats]:
         raise ValueError(f"times must be a list of times between 0 and T = {T} s")
     reduced = _reduced(A, B, Q, R, N)
     tau = np.maximum(T - t, 0.0)
-    if _grows(reduced[0], reduced[2], S, T):
+    if _grows(*reduced, S, T):
         every, which = np.unique(np.append(tau, T), return_inverse=True)
         P, moved = _marched(*reduced, S, every)
         for k in range(len(every) - 2, -1, -1):  # the first moves, too: by nothing, to itself
@@ -382,7 +384,7 @@ def _positive(weight: Floats) -> bool:
 def _cost_to_go(A: Floats, G: Floats, Q: Floats, S: Floats, tau: Floats) -> Floats:
     """P (..., n, n) at times to go tau (...)."""
     T = tau.max(initial=0.0)
-    if _grows(A, Q, S, T):
+    if _grows(A, G, Q, S, T):
         every, which = np.unique(tau, return_inverse=True)
         return _marched(A, G, Q, S, every)[0][which].reshape(*tau.shape, *A.shape)
     X, Phi, W, V = _flow(A, G, Q, S, tau, T)
@@ -391,19 +393,34 @@ def _cost_to_go(A: Floats, G: Floats, Q: Floats, S: Floats, tau: Floats) -> Floa
     return 0.5 * (P + _transposed(P))
 
 
-def _grows(A: Floats, Q: Floats, S: Floats, T: float) -> bool:
-    """Whether a motion may grow over T so far that only small steps keep its digits; of a positive cost."""
-    far = np.linalg.eigvals(A).real.max() * T > math.log(_GROWTH)
-    return bool(far) and _positive(Q) and _positive(S)
+def _grows(A: Floats, G: Floats, Q: Floats, S: Floats, T: float) -> bool:
+    """Whether a motion that no weight sees grows over T so far that only small steps keep its digits.
+
+    Motions that are weighed end the growth themselves, on the way of the doublings.
+    """
+    if not np.linalg.eigvals(A).real.max() * T > math.log(_GROWTH):
+        return False
+    if not (_positive(Q) and _positive(S)):
+        return False
+    rate = _rate(A, G, Q)
+    stages = np.ldexp(T, -np.arange(math.ceil(math.log2(2.0 * rate * T)) + 1))
+    try:
+        with np.errstate(over="ignore", invalid="ignore"):
+            Phi = _propagate(A, G, Q, stages, rate)[0]
+    except np.linalg.LinAlgError:  # too great for any digits
+        return True
+    return not float(np.abs(Phi).max()) <= _GROWTH  # true for NaN
 
 
 def _marched(A: Floats, G: Floats, Q: Floats, S: Floats, tau: Floats) -> tuple[Floats, Floats]:
     """P (K, n, n) at increasing times to go tau (K,), in steps that each keep it positive.
 
-    Also returns the matrices (K, n, n) that lead x at each time to go to x at the one before.
+    Also returns the matrices (K, n, n) that lead x at each time to go to x at the one before. Raises ValueError if
+    there are too many steps.
     """
     identity, rate = np.eye(len(A)), _rate(A, G, Q)
     P, costs, moves = S, [], []
+    steps = 0
     for span in np.diff(tau, prepend=0.0):
         left = max(1, math.ceil(span * rate / math.log(_GROWTH)))
         Phi, W, V, _ = _propagate(A, G, Q, np.array(span / left), rate)
@@ -417,7 +434,12 @@ def _marched(A: Floats, G: Floats, Q: Floats, S: Floats, tau: Floats) -> tuple[F
             # At a stationary P, all further steps are the same.
             done = left if np.abs(P - last).max() <= np.finfo(float).eps * np.abs(P).max() else 1
             move = move @ np.linalg.matrix_power(closed, done)
-            left -= done
+            left, steps = left - done, steps + 1
+            if steps > _STEPS:
+                raise ValueError(
+                    f"the cost over {tau[-1]:.6g} s cannot be computed: a motion grows that no weight sees, while"
+                    " another one changes too slowly. Weigh the first in Q, or shorten the horizon"
+                )
         costs.append(P)
         moves.append(move)
     return np.array(costs), np.array(moves)
