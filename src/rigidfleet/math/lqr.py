@@ -325,14 +325,9 @@ def _responses(*keys: Key) -> tuple[Floats, Floats]:
     reduced = _reduced(A, B, Q, R, N)
     tau = np.maximum(T - t, 0.0)
     if _grows(*reduced, S, T):
-        every, which = np.unique(np.append(tau, T), return_inverse=True)
-        P, moved = _marched(*reduced, S, every)
-        for k in range(len(every) - 2, -1, -1):  # the first moves, too: by nothing, to itself
-            moved[k] = moved[k] @ moved[k + 1]
-        P = P[which[:-1]]
-        x = np.concatenate([moved[1:], np.eye(len(A))[None]])[which[:-1]]
+        P, x = (found[:-1] for found in _marched(*reduced, S, np.append(tau, T)))
     else:
-        P = _cost_to_go(*reduced, S, tau)
+        P = _doubled(*reduced, S, tau)
         X, Phi, W, _ = _flow(*reduced, S, t, T)
         x = _solve(np.eye(len(A)) + W @ (P - X), Phi)
     return x, -_solve(R, (B.T @ P + N.T) @ x)
@@ -383,11 +378,13 @@ def _positive(weight: Floats) -> bool:
 
 def _cost_to_go(A: Floats, G: Floats, Q: Floats, S: Floats, tau: Floats) -> Floats:
     """P (..., n, n) at times to go tau (...)."""
-    T = tau.max(initial=0.0)
-    if _grows(A, G, Q, S, T):
-        every, which = np.unique(tau, return_inverse=True)
-        return _marched(A, G, Q, S, every)[0][which].reshape(*tau.shape, *A.shape)
-    X, Phi, W, V = _flow(A, G, Q, S, tau, T)
+    grows = _grows(A, G, Q, S, tau.max(initial=0.0))
+    return _marched(A, G, Q, S, tau)[0] if grows else _doubled(A, G, Q, S, tau)
+
+
+def _doubled(A: Floats, G: Floats, Q: Floats, S: Floats, tau: Floats) -> Floats:
+    """P (..., n, n) at times to go tau (...), from the flow of `_propagate`."""
+    X, Phi, W, V = _flow(A, G, Q, S, tau, tau.max(initial=0.0))
     D = S - X
     P = X + V + _transposed(Phi) @ _solve(np.eye(len(A)) + D @ W, D @ Phi)
     return 0.5 * (P + _transposed(P))
@@ -413,15 +410,16 @@ def _grows(A: Floats, G: Floats, Q: Floats, S: Floats, T: float) -> bool:
 
 
 def _marched(A: Floats, G: Floats, Q: Floats, S: Floats, tau: Floats) -> tuple[Floats, Floats]:
-    """P (K, n, n) at increasing times to go tau (K,), in steps that each keep it positive.
+    """P and x (..., n, n) at times to go tau (...), in steps that each keep P positive.
 
-    Also returns the matrices (K, n, n) that lead x at each time to go to x at the one before. Raises ValueError if
-    there are too many steps.
+    Columns of x are the states that each state alone, at the greatest time to go, leads to. Raises ValueError if there
+    are too many steps.
     """
     identity, rate = np.eye(len(A)), _rate(A, G, Q)
     P, costs, moves = S, [], []
     steps = 0
-    for span in np.diff(tau, prepend=0.0):
+    every, which = np.unique(tau, return_inverse=True)
+    for span in np.diff(every, prepend=0.0):
         left = max(1, math.ceil(span * rate / math.log(_GROWTH)))
         Phi, W, V, _ = _propagate(A, G, Q, np.array(span / left), rate)
         move = identity
@@ -437,12 +435,16 @@ def _marched(A: Floats, G: Floats, Q: Floats, S: Floats, tau: Floats) -> tuple[F
             left, steps = left - done, steps + 1
             if steps > _STEPS:
                 raise ValueError(
-                    f"the cost over {tau[-1]:.6g} s cannot be computed: a motion grows that no weight sees, while"
+                    f"the cost over {every[-1]:.6g} s cannot be computed: a motion grows that no weight sees, while"
                     " another one changes too slowly. Weigh the first in Q, or shorten the horizon"
                 )
         costs.append(P)
         moves.append(move)
-    return np.array(costs), np.array(moves)
+    states = [identity]
+    for move in moves[:0:-1]:  # each leads x at its time to go to x at the one before
+        states.append(move @ states[-1])
+    where = which.reshape(tau.shape)
+    return np.array(costs)[where], np.array(states[::-1])[where]
 
 
 def _flow(

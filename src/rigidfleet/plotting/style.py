@@ -42,7 +42,8 @@ ALERT = "#B00020"
 
 WIDTH = 9.0  # width of a figure over time [in]
 _PAD = 0.07  # margin around the content [in]
-_DOT = 1.6  # a hundredth of an inch [pixels]
+_DPI = 160  # resolution [pixels per inch]: also of measures, so that a text is measured once
+_DOT = _DPI / 100  # a hundredth of an inch [pixels]
 _SLANT = 38.0  # slant of phase names that do not fit horizontally [deg]
 _LONGEST = 28  # greatest length of a phase name
 _POINTS = 3000  # greatest number of samples of a line; more would be drawn over each other
@@ -94,10 +95,10 @@ _RC: dict[str, Any] = {
     "legend.fontsize": 8,
     "legend.handlelength": 1.6,
     "legend.borderaxespad": 0.0,
-    "figure.dpi": 160,  # as it is saved, so that a text is measured once
+    "figure.dpi": _DPI,
     "figure.constrained_layout.w_pad": _PAD,
     "figure.constrained_layout.h_pad": _PAD,
-    "savefig.dpi": 160,
+    "savefig.dpi": _DPI,
     "svg.fonttype": "none",  # text remains text
     "svg.hashsalt": "rigidfleet",  # the same flight gives the same file
 }

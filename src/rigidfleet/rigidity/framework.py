@@ -241,15 +241,19 @@ def sparse(flexes: Floats, rigid: Floats, n: int, most: int = 1 << 30) -> list[F
     found = []
     for i in seeds[:: max(1, -(-len(seeds) // most))]:
         for way in _along_axes(part[i][:, strength[i] > (1.0 - _ALIKE) * strength[i, 0]]):
-            c = way @ blocks[i]
-            speed = np.ones(n)
-            for sharp in np.logspace(0, -7, 20):
-                weight = np.repeat(1 / (speed + sharp), len(V) // n)
-                a = np.linalg.solve(V.T @ (weight[:, None] * V), c)
-                motion = (V @ (a / (c @ a))).reshape(n, -1)
-                speed = np.linalg.norm(motion, axis=1)
-            found.append(_cleaned(motion, V))
+            found.append(_cleaned(_of_least_speed(way @ blocks[i], V, n), V))
     return found
+
+
+def _of_least_speed(c: Floats, V: Floats, n: int) -> Floats:
+    """The motion V a (n, d) with c a = 1 whose sum of speeds is least, by iteratively reweighted least squares."""
+    speed = np.ones(n)
+    for sharp in np.logspace(0, -7, 20):
+        weight = np.repeat(1 / (speed + sharp), len(V) // n)
+        a = np.linalg.solve(V.T @ (weight[:, None] * V), c)
+        motion = (V @ (a / (c @ a))).reshape(n, -1)
+        speed = np.linalg.norm(motion, axis=1)
+    return motion
 
 
 def _along_axes(U: Floats) -> list[Floats]:
@@ -257,9 +261,8 @@ def _along_axes(U: Floats) -> list[Floats]:
     rest, basis = U @ U.T, []
     for _ in range(U.shape[1]):
         length = np.linalg.norm(rest, axis=1)
-        way = rest[
-            int(np.argmax(length > (1.0 - _ALIKE) * length.max()))
-        ]  # of equal ones, the first
+        first = int(np.argmax(length > (1.0 - _ALIKE) * length.max()))  # of equal ones
+        way = rest[first]
         basis.append(way / np.linalg.norm(way))
         rest = rest - np.outer(rest @ basis[-1], basis[-1])
     return basis
