@@ -81,13 +81,11 @@ class Drawings:
         self.figures, self._result, self._titles = figures, result, titles
         self._pool: ProcessPoolExecutor | None = None
         self._jobs: dict[Future[dict[str, bytes]], Path] = {}
-        self._count = min(at_once(), len(figures))
-        few = self._count == 1 or len(figures) < _FEW
-        if few or result.position.nbytes > _LARGEST or not prepare():
+        if len(figures) < _FEW or result.position.nbytes > _LARGEST or not prepare():
             return
         try:
             self._pool = ProcessPoolExecutor(
-                self._count, mp_context=multiprocessing.get_context("forkserver"), initializer=_begin,
+                min(at_once(), len(figures)), mp_context=multiprocessing.get_context("forkserver"), initializer=_begin,
                 initargs=(pickle.dumps(result.evaluate()), titles),  # the kernel is loaded in this process alone
             )  # fmt: skip
         except (ImportError, OSError):  # no semaphores: no /dev/shm, for example
@@ -126,17 +124,11 @@ class Drawings:
         ResultError
             A file cannot be written.
         """
-        from rigidfleet.plotting import plot, rendered, write
+        from rigidfleet.plotting import write
 
         if self._pool is None:
-            for path, formats in self.figures.items():
-                plot(
-                    self._result,
-                    path.parent,
-                    names=[path.name],
-                    formats=formats,
-                    titles=self._titles,
-                )
+            for path in self.figures:
+                self._draw(path)
                 yield path
             return
         self._asking.join()
@@ -146,10 +138,18 @@ class Drawings:
                 files = job.result()
             except (OSError, RuntimeError):
                 # The process failed. What is wrong with the figure itself is wrong here, too.
-                files = rendered(self._result, path.name, self.figures[path], titles=self._titles)
-            for kind, data in files.items():
-                write(path.with_name(f"{path.name}.{kind}"), data)
+                self._draw(path)
+            else:
+                for kind, data in files.items():
+                    write(path.with_name(f"{path.name}.{kind}"), data)
             yield path
+
+    def _draw(self, path: Path) -> None:
+        """Draw a figure in this process, and write it."""
+        from rigidfleet.plotting import plot
+
+        formats = self.figures[path]
+        plot(self._result, path.parent, names=[path.name], formats=formats, titles=self._titles)
 
 
 _drawn: list[tuple[Result, bool]] = []
