@@ -678,9 +678,7 @@ def test_interrupt():
     assert not Path("flights/long/figures").exists()
 
 
-@pytest.mark.parametrize(
-    ("at_once", "during"), [(1, "plotting.plot"), (2, "cli.drawing.as_completed")]
-)
+@pytest.mark.parametrize(("at_once", "during"), [(1, "plotting.plot"), (2, "plotting.write")])
 def test_interrupt_of_drawing(capsys, monkeypatch, at_once: int, during: str):
     """Ctrl-C while figures are drawn, here or by processes, leaves the flight as it is, and says so."""
 
@@ -789,9 +787,9 @@ def test_figures_are_the_same_from_processes_side_by_side(folder, monkeypatch):
     ("what", "does"),
     [
         ("multiprocessing.forkserver.ensure_running", OSError("AF_UNIX path too long")),
-        ("rigidfleet.cli.drawing.ProcessPoolExecutor", OSError("no semaphores")),
-        ("rigidfleet.cli.drawing.ProcessPoolExecutor.submit", BrokenPipeError("the server ended")),
-        ("rigidfleet.cli.drawing._begin", None),
+        ("multiprocessing.connection.Pipe", OSError("too many open files")),
+        ("multiprocessing.context.ForkServerProcess.start", BrokenPipeError("the server ended")),
+        ("rigidfleet.cli.drawing._draw", None),
     ],
 )
 def test_figures_are_drawn_where_processes_fail(folder, monkeypatch, what: str, does):

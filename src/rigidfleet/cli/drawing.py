@@ -13,22 +13,26 @@ import multiprocessing
 import os
 import pickle
 import signal
+from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from contextlib import suppress
+from multiprocessing.connection import Connection
 from pathlib import Path
+from queue import SimpleQueue
 from threading import Thread
 from typing import TYPE_CHECKING
 
 from rigidfleet._common.processes import safe_path
 
 if TYPE_CHECKING:
+    from multiprocessing.context import ForkServerProcess
+
     from rigidfleet.result import Result
 
 #: What the server loads: all that a drawing process needs, which would otherwise be loaded in each of them.
 _LOADED = [
     "rigidfleet.plotting", "matplotlib.backends.backend_agg", "matplotlib.style", "mpl_toolkits.mplot3d.axes3d",
-    "rigidfleet.plotting.figure", "rigidfleet.mission", __name__, "concurrent.futures.process",
-    "matplotlib.patheffects",
+    "rigidfleet.plotting.figure", "rigidfleet.mission", __name__, "matplotlib.patheffects",
 ]  # fmt: skip
 #: Each drawing process holds a copy of the result: larger positions [bytes] are drawn in this process.
 _LARGEST = 50_000_000
@@ -79,42 +83,47 @@ class Drawings:
         self, result: Result, figures: Mapping[Path, Sequence[str]], *, titles: bool
     ) -> None:
         self.figures, self._result, self._titles = figures, result, titles
-        self._pool: ProcessPoolExecutor | None = None
-        self._jobs: dict[Future[dict[str, bytes]], Path] = {}
+        self._asked = deque(sorted(figures, key=lambda path: path.name not in _SLOW))
+        #: A figure and its files by format; None when a process draws no more.
+        self._drawn: SimpleQueue[tuple[Path, dict[str, bytes]] | None] = SimpleQueue()
+        self._processes: list[ForkServerProcess] = []
+        self._drawing = 0  # number of threads, each of which has a process
         if len(figures) < _FEW or result.position.nbytes > _LARGEST or not prepare():
             return
-        try:
-            self._pool = ProcessPoolExecutor(
-                min(at_once(), len(figures)), mp_context=multiprocessing.get_context("forkserver"), initializer=_begin,
-                initargs=(pickle.dumps(result.evaluate()), titles),  # the kernel is loaded in this process alone
-            )  # fmt: skip
-        except (ImportError, OSError):  # no semaphores: no /dev/shm, for example
-            return
-        # In a thread, as it waits until the server has loaded everything
-        self._asking = Thread(target=self._ask, args=(self._pool,), daemon=True)
-        self._asking.start()
+        given = (
+            pickle.dumps(result.evaluate()),
+            titles,
+        )  # the kernel is loaded in this process alone
+        self._drawing = min(at_once(), len(figures))
+        for _ in range(self._drawing):
+            Thread(target=self._ask, args=given, daemon=True).start()
 
-    def _ask(self, pool: ProcessPoolExecutor) -> None:
-        """Ask for each figure, those that take longest first; a process that cannot be started is an error of each."""
-        for path in sorted(self.figures, key=lambda path: path.name not in _SLOW):
-            try:
-                job = pool.submit(_one, path.name, self.figures[path])
-            except (OSError, RuntimeError) as error:
-                job = Future[dict[str, bytes]]()
-                job.set_exception(error)
-            self._jobs[job] = path
+    def _ask(self, *given: object) -> None:
+        """Let a process of its own draw figures until none is left, or until it fails."""
+        try:
+            context = multiprocessing.get_context("forkserver")
+            here, there = context.Pipe()
+            process = context.Process(target=_draw, args=(there, *given), daemon=True)
+            process.start()
+            there.close()
+            self._processes.append(process)
+            while self._asked:
+                path = self._asked.popleft()
+                here.send((path.name, self.figures[path]))
+                self._drawn.put((path, here.recv()))
+            here.close()
+        except (OSError, EOFError, IndexError):
+            pass  # no process, or one that has ended, or no figure left; the rest is drawn in this process
+        finally:
+            self._drawn.put(None)
 
     def __enter__(self) -> Drawings:
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._pool is not None:
-            self._asking.join()
-            drawn = all(job.done() for job in self._jobs)
-            if not drawn:
-                for process in multiprocessing.active_children():
-                    process.terminate()
-            self._pool.shutdown(wait=drawn, cancel_futures=True)
+        self._asked.clear()
+        for process in self._processes:
+            process.terminate()
 
     def __iter__(self) -> Iterator[Path]:
         """Paths of the figures without their suffix, each when its files are written.
@@ -124,46 +133,33 @@ class Drawings:
         ResultError
             A file cannot be written.
         """
-        from rigidfleet.plotting import write
+        from rigidfleet.plotting import plot, write
 
-        if self._pool is None:
-            for path in self.figures:
-                self._draw(path)
-                yield path
-            return
-        self._asking.join()
-        for job in as_completed(self._jobs):
-            path = self._jobs[job]
-            try:
-                files = job.result()
-            except (OSError, RuntimeError):
-                # The process failed. What is wrong with the figure itself is wrong here, too.
-                self._draw(path)
-            else:
-                for kind, data in files.items():
-                    write(path.with_name(f"{path.name}.{kind}"), data)
+        left = dict(self.figures)
+        while self._drawing:
+            if (found := self._drawn.get()) is None:
+                self._drawing -= 1
+                continue
+            path, files = found
+            for kind, data in files.items():
+                write(path.with_name(f"{path.name}.{kind}"), data)
+            del left[path]
+            yield path
+        for path, formats in left.items():
+            plot(self._result, path.parent, names=[path.name], formats=formats, titles=self._titles)
             yield path
 
-    def _draw(self, path: Path) -> None:
-        """Draw a figure in this process, and write it."""
-        from rigidfleet.plotting import plot
 
-        formats = self.figures[path]
-        plot(self._result, path.parent, names=[path.name], formats=formats, titles=self._titles)
+def _draw(asked: Connection, result: bytes, titles: bool) -> None:
+    """Draw figures, in a process of its own, as their names and formats arrive; send their files.
 
-
-_drawn: list[tuple[Result, bool]] = []
-
-
-def _begin(result: bytes, titles: bool) -> None:
-    """Keep, in a drawing process, what all its figures show."""
-    gc.disable()  # of a process that ends after some figures; it takes a tenth of the time
-    _drawn[:] = [(pickle.loads(result), titles)]
-
-
-def _one(name: str, formats: Sequence[str]) -> dict[str, bytes]:
-    """Files of one figure by format, from a drawing process."""
+    Any error ends the process, without a word: what is wrong with a figure is told where it is drawn again.
+    """
     from rigidfleet.plotting import rendered
 
-    result, titles = _drawn[0]
-    return rendered(result, name, formats, titles=titles)
+    gc.disable()  # of a process that ends after some figures; it takes a tenth of the time
+    with suppress(Exception):
+        flown: Result = pickle.loads(result)
+        while True:
+            name, formats = asked.recv()
+            asked.send(rendered(flown, name, formats, titles=titles))
