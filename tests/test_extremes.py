@@ -1,6 +1,7 @@
 """Extremes in continuous time, against the same steps and continuous extension sampled finely."""
 
 import math
+import threading
 import time
 from typing import Any
 
@@ -401,6 +402,61 @@ def test_extremes_of_a_large_formation_depend_on_no_pause_and_no_sample(monkeypa
     every.append(simulate(a_sphere()))
     found = [[p.extremes for p in result.phases] for result in every]
     assert found[0] == found[1] == found[2]
+
+
+@pytest.mark.parametrize("solver", ["iterated", "exact"])
+def test_who_watches_a_large_formation_does_not_change_what_is_found(solver, monkeypatch):
+    """Another thread, while the flight goes on, or this one, while it waits: the same to the bit."""
+    mission = a_sphere(solver)
+    threads, take = set(), watching.Extremes.take
+
+    def spy(*given: Any, **options: Any) -> None:
+        threads.add(threading.get_ident())
+        take(*given, **options)
+
+    monkeypatch.setattr(watching.Extremes, "take", spy)
+    aside = simulate(mission)
+    assert len(threads) == 2, "each phase's last steps are taken here"
+
+    def take_here(extremes: Any, problem: Any, work: Any, state: Any) -> Any:
+        extremes.take(problem, work, state, last=False)
+        return state
+
+    monkeypatch.setattr(watching.Extremes, "hand_over", take_here)
+    here = simulate(mission)
+    assert [p.extremes for p in aside.phases] == [p.extremes for p in here.phases]
+    assert (aside.position == here.position).all()
+
+
+def test_what_goes_wrong_in_the_thread_that_watches_is_raised(monkeypatch):
+    """An error ends the flight; Ctrl-C while it is waited for ends it with what was flown and found."""
+    mission, take = a_sphere(), watching.Extremes.take
+    here = threading.get_ident()
+
+    def fail(*given: Any, **options: Any) -> None:
+        if threading.get_ident() != here:
+            raise MemoryError("no more of it")
+        take(*given, **options)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(watching.Extremes, "take", fail)
+        with pytest.raises(MemoryError, match="no more of it"):
+            simulate(mission)
+    done, wait = [], watching.Extremes.wait
+
+    def interrupt(extremes: Any) -> None:
+        if extremes._taking is not None and len(done) < 2:
+            done.append(extremes)
+            if len(done) == 2:
+                raise KeyboardInterrupt
+        wait(extremes)
+
+    monkeypatch.setattr(watching.Extremes, "wait", interrupt)
+    with pytest.raises(FlightInterrupted) as stopped:
+        simulate(mission)
+    result = stopped.value.result
+    assert 0.0 < result.phases[-1].t_end < mission.latest_end
+    assert result.phases[-1].extremes["thrust"].time <= result.phases[-1].t_end
 
 
 # -- what the verdict makes of them

@@ -174,6 +174,31 @@ def test_what_a_flight_makes_later_is_what_it_would_have_made_at_once(given, con
             np.testing.assert_array_equal(other[name], x, err_msg=name)
 
 
+@pytest.mark.parametrize("solver", ["iterated", "exact"])
+@pytest.mark.parametrize("formulation", ["inertial", "body"])
+def test_what_a_large_flight_makes_later_is_what_its_law_gave(solver, formulation):
+    """Also from a pickle; to the residual of the solves as with a user's force of zero, which is asked at once."""
+    position = {"shape": "grid", "size": 2.0, "count": 150, "centre": [0.0, 0.0, 30.0]}
+    mission = Mission.from_dict(
+        {
+            "schema_version": 1, "name": "sphere", "agents": {"mass": 0.3, "position": position},
+            "assignment": "each", "constraint": {"solver": solver}, "formulation": formulation,
+            "formations": {"sphere": {"shape": "sphere", "size": 2.0, "edges": "neighbours"}},
+            "phases": [{"kind": "establish", "formation": "sphere", "blend": 2.0, "duration": 2.5}], "output_step": 0.5,
+        }
+    )  # fmt: skip
+    flown = simulate(mission)
+    assert {*flown.statistics["solvers"]} == {"sparse"}
+    assert "thrust" not in vars(flown)
+    again = pickle.loads(pickle.dumps(flown))
+    asked = simulate(mission, force=lambda t, r, v: np.zeros_like(r))
+    assert "thrust" in vars(asked)
+    for name, x in asked_for(flown, [*VARIABLES]).items():
+        np.testing.assert_array_equal(getattr(again, name), x, err_msg=name)
+        scale = np.nanmax(np.abs(x), initial=1.0)
+        np.testing.assert_allclose(x, getattr(asked, name), atol=1e-7 * scale, err_msg=name)
+
+
 def test_what_is_made_later_is_listed():
     """Consoles and notebooks complete every field of a result, made or not."""
     result = simulate(a_mission())

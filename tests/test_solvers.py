@@ -4,7 +4,6 @@ import os
 import shutil
 import subprocess
 import sys
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +11,8 @@ import pytest
 
 from rigidfleet.formation import graphs, shapes
 from rigidfleet.kernel.compiler.cache import cache_directory
-from rigidfleet.kernel.large import block_cholesky
-from rigidfleet.kernel.large.solver import LargeSolver
+from rigidfleet.kernel.large import block_cholesky, elimination
+from rigidfleet.kernel.large.solver import LargeSolver, Setup
 from rigidfleet.kernel.problem import EXACT, ITERATED, ConstraintLaw, Vehicles, workspace
 from rigidfleet.mission import Mission
 from rigidfleet.planning import solvers
@@ -42,9 +41,12 @@ def solver_of(p, edges, masses, law, *, eliminated=False, tolerance=1e-13) -> La
     work = workspace(len(p), len(edges), large=True)
     work.r[:] = p
     work.u[:] = directions(p, edges)
-    steps = solvers.elimination_steps(len(p), edges) if eliminated else None
-    order = partial(solvers.dissection, p, edges)
-    return LargeSolver(vehicles, edges, law, work, steps, order, tolerance)
+    order = None
+    if eliminated:
+        steps = solvers.elimination_steps(len(p), edges)
+        order = None if steps is None else elimination.order(steps, edges)
+    setup = Setup(order, solvers.Dissection(p, edges), tolerance)
+    return LargeSolver(vehicles, edges, law, work, setup)
 
 
 def solved(solver, b) -> np.ndarray:

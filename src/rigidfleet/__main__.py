@@ -1,8 +1,17 @@
-"""``python -m rigidfleet`` is the command ``rigidfleet``."""
+"""``python -m rigidfleet`` is the command ``rigidfleet``.
+
+Nothing is loaded with this module: processes that draw figures load it again, and are not the command.
+"""
 
 import sys
 
-from rigidfleet.cli.app import main
+
+def main() -> int:
+    """Run the command; return its exit code."""
+    from rigidfleet.cli import app
+
+    return app.main()
+
 
 if __name__ == "__main__":
     sys.exit(main())

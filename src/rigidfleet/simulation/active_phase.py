@@ -31,7 +31,13 @@ from rigidfleet.simulation.callbacks import (
 from rigidfleet.simulation.diagnosis import Place, diagnose
 from rigidfleet.simulation.extremes import Extremes
 from rigidfleet.simulation.recording import Led, Piece, Unevaluated
-from rigidfleet.simulation.solver_setup import equip, first_step, give_back, integrator
+from rigidfleet.simulation.solver_setup import (
+    equip,
+    first_step,
+    give_back,
+    integrator,
+    solved_by,
+)
 from rigidfleet.typing import Bools, Floats
 
 if TYPE_CHECKING:
@@ -205,9 +211,19 @@ class ActivePhase:
         )  # fmt: skip
 
     def watch(self, *, last: bool) -> None:
-        """Search the steps flown for extremes; ``last``: no further steps of this problem follow."""
-        if self.state.count[4] and self.flown is not None:
-            self.extremes.take(self.flown, self.workspace, self.state, last=last)
+        """Search the steps flown for extremes; ``last``: no further steps of this problem follow.
+
+        In a large formation, the search takes as long as the flight: another thread does it meanwhile. The user's
+        force, which may not be ready for two threads, is asked by one.
+        """
+        self.extremes.wait()
+        if not self.state.count[4] or self.flown is None:
+            return
+        work = self.workspace if self.solver is None else self.solver.aside.workspace
+        if last or self.solver is None or self.external is not None:
+            self.extremes.take(self.flown, work, self.state, last=last)
+        else:
+            self.state = self.extremes.hand_over(self.flown, work, self.state)
 
     def end(self) -> PhaseState:
         """End the phase at its current state; return the state that the next phase starts from."""
@@ -282,16 +298,15 @@ class ActivePhase:
 
     def _segment(self, problem: Problem, t_end: float) -> None:
         """Integrate to ``t_end`` [s] and record the samples on the way."""
-        state = self.state
-        fresh = state.count[0] == 0 or problem is not self.plan.problem
+        fresh = self.state.count[0] == 0 or problem is not self.plan.problem
         if fresh:
             self.watch(last=True)
             self.flown = problem
             if self.solver is not None:  # a solver keeps state: the monitor has its own
-                graph = problem.graph._replace(solver=self.solver.aside.address)
-                self.flown = problem._replace(graph=graph)
+                self.flown = solved_by(self.solver.aside, problem)
         times = self.sampler(self.plan, self.t, t_end, first=not self.begun, stop=self.stop)
         self.begun = True
+        state = self.state  # of which another trail alone may follow
         samples = np.empty((len(times), len(state.y)))
         state.count[3] = 0
         first = np.nextafter(self.t, math.inf)
@@ -299,6 +314,11 @@ class ActivePhase:
         go_on = native.Integration(problem, self.workspace, state, t_end, times, samples)
         try:
             while status == records.PAUSED:
+                if state is not self.state:
+                    state = self.state
+                    go_on = native.Integration(
+                        problem, self.workspace, state, t_end, times, samples
+                    )
                 begun = clock.perf_counter()
                 status = go_on(fresh, self.steps)
                 took = max(clock.perf_counter() - begun, 1e-6)
@@ -357,9 +377,9 @@ class ActivePhase:
         """Store the samples; forces and references at them are evaluated when they are asked for."""
         plan = self.plan
         n, m = len(plan.masses), len(plan.edges)
-        given = Unevaluated(problem, plan.problem, samples)
-        # What keeps a state of its own, or calls a user's function, is asked while it is at hand.
-        if self.solver is not None or self.external is not None or problem.body_formulation:
+        setup = None if self.solver is None else self.solver.setup
+        given = Unevaluated(problem, plan.problem, samples, setup)
+        if self.external is not None:  # a user's function is asked while it is at hand
             given = given.evaluated(times, self.workspace)
         frame = np.full((len(times), 4), np.nan)
         if plan.frame is not None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -24,6 +24,9 @@ from rigidfleet.result import PAD, Extremum, PhaseRecord
 from rigidfleet.solids.records import Solids, joined
 from rigidfleet.typing import Bools, Floats, Ints
 
+if TYPE_CHECKING:
+    from concurrent.futures import Future, ThreadPoolExecutor
+
 #: Greatest number of agents of which all pairs are monitored.
 _FEW = 40
 #: Distance by which the list reaches beyond the pairs that matter, as a share of the agents' spacing.
@@ -34,6 +37,8 @@ _LEAST = 0.1
 _TOUCH = 1e-6
 #: Shortest piece of a step, as a share of the step.
 _SHORTEST = 2.0**-20
+#: Agents that are asked for their nearest one, to choose how far the list reaches.
+_ASKED = 2000
 #: Agents whose bounds are computed at a time.
 _AT_ONCE = 4096
 #: Bernstein coefficients of degree 4 of the derivative of a polynomial with coefficients x of degree 4: row k is
@@ -110,7 +115,9 @@ class Extremes:
         self.standing = self.stood.copy()
         self.pairs = self.columns = self.struck = np.zeros((0, 2), dtype=np.int64)
         self.spare, self.moved = 0.0, np.zeros(2)
-        self.trail = records.NO_TRAIL
+        self.trail = self._other = records.NO_TRAIL
+        self._thread: ThreadPoolExecutor | None = None  # of large formations
+        self._taking: Future[None] | None = None
         self.of_vehicles: dict[str, Extremum] = {}
         self.avoidance: avoidance.Avoidance | None = None  # that of the phase under way
         self.led: dict[str, Extremum] = {}  # what its clock and its body layer did
@@ -196,6 +203,39 @@ class Extremes:
             flags = self.monitor.monitor.flags
             flags[:3] = rows, rows, 2 if last else 1
         self.monitor(problem, work, state)
+
+    def hand_over(
+        self, problem: Problem, work: Workspace, state: records.IntegratorState
+    ) -> records.IntegratorState:
+        """Let another thread evaluate the steps in the trail, `take`; return the state with another trail to fill.
+
+        Until `wait`, only that thread may use this monitor, ``work``, and what the problem's law changes.
+        """
+        if self._thread is None:
+            from concurrent.futures import ThreadPoolExecutor
+
+            self._thread = ThreadPoolExecutor(1)
+        full, rows = state.trail, int(state.count[4])
+        if self._other.points.shape != full.points.shape or len(self._other.start) != len(
+            full.start
+        ):
+            self._other = records.Trail(*(np.empty_like(x) for x in full))
+        self.trail, self._other = self._other, full
+        # The last step waits for its neighbour, which is the first one of the other trail.
+        for part, of in zip(self.trail[:3], full[:3], strict=True):
+            part[0] = of[rows - 1]
+        taken = state._replace(count=state.count.copy())
+        state.count[4] = 1
+        self._taking = self._thread.submit(self.take, problem, work, taken, last=False)
+        return state._replace(trail=self.trail)
+
+    def wait(self) -> None:
+        """Wait until the steps that were handed over are evaluated."""
+        if self._taking is not None:
+            error = self._taking.exception()  # Ctrl-C ends the waiting, not the evaluation
+            self._taking = None
+            if error is not None:
+                raise error
 
     def take_path(self, problem: Problem, work: Workspace, state: records.IntegratorState) -> None:
         """Evaluate the paths alone of the steps in the trail, not the forces."""
@@ -389,10 +429,14 @@ class Extremes:
             return
         widest = 2.0 * float(self.radius[who].max())
         tree = KDTree(x, balanced_tree=False, compact_nodes=False)
-        near, j = tree.query(x, k=2)
+        # The nearest pair of some agents is no nearer than that of all: the list is only longer.
+        some = np.arange(len(who))
+        if len(who) > _ASKED:
+            some = np.random.default_rng(0).integers(len(who), size=_ASKED)
+        near, j = tree.query(x[some], k=2)
         # Of two agents at the same place, either may be found as its own nearest one.
-        other = np.where(j[:, 1] == np.arange(len(who)), j[:, 0], j[:, 1])
-        separations = near[:, 1] - self.radius[who] - self.radius[who[other]]
+        other = np.where(j[:, 1] == some, j[:, 0], j[:, 1])
+        separations = near[:, 1] - self.radius[who[some]] - self.radius[who[other]]
         size = float(np.linalg.norm(np.ptp(x, axis=0))) / math.sqrt(len(who))
         spare = max(_SPARE * float(np.median(near[:, 1])), _LEAST * size, 1.01 * moves, 1e-6)
         least = min(float(separations.min()), float(self.worst[records.SEPARATION]))

@@ -16,10 +16,16 @@ from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
 from rigidfleet.planning.derivatives import Yaw, slot_derivatives, yaw_derivatives
 from rigidfleet.result import CLOSE, LATER, RECORDED, SEEN, Extremum, PhaseRecord, Result
-from rigidfleet.simulation.solver_setup import give_back, small_workspace
+from rigidfleet.simulation.solver_setup import (
+    give_back,
+    large_solver,
+    small_workspace,
+    solved_by,
+)
 from rigidfleet.typing import Bools, Floats, Ints
 
 if TYPE_CHECKING:
+    from rigidfleet.kernel.large.solver import Setup
     from rigidfleet.kernel.problem import Motion, Problem, Reference, Workspace
     from rigidfleet.mission import Mission
     from rigidfleet.planning.vehicles import Turn
@@ -68,13 +74,24 @@ class Unevaluated(NamedTuple):
     problem: Problem  # as flown: it may hold the force of a user's controller
     planned: Problem  # of the phase, which has the references
     y: Floats  # (K, n)
+    setup: Setup | None  # of a large formation
 
     @property
     def motion(self) -> tuple[Floats, Floats]:
-        """Positions and velocities (K, N, 3) of agents, as copies."""
-        n = len(self.problem.vehicles.m)
+        """Positions and velocities (K, N, 3) of agents, world axes, as copies."""
+        n, m = len(self.problem.vehicles.m), len(self.problem.graph.edges)
         r, v = (self.y[:, s * n : (s + 3) * n].reshape(-1, n, 3) for s in (0, 3))
-        return np.array(r), np.array(v)
+        if not self.problem.body_formulation:
+            return np.array(r), np.array(v)
+        q, *cm = np.split(self.y[:, 6 * n + m :], [4, 7], axis=1)
+        T = att.dcm_from_quaternion(q / np.linalg.norm(q, axis=1, keepdims=True))
+        r_cm, v_cm = (x[:, None] for x in cm)
+        return r_cm + r @ T, v_cm + v @ T
+
+    @property
+    def places(self) -> Floats:
+        """Positions (K, N, 3) of agents, or states that begin with them: what is at hand."""
+        return self.motion[0] if self.problem.body_formulation else self.y
 
     def evaluated(self, times: Floats, work: Workspace) -> Record:
         """Forces and references at the samples, times (K,) [s]."""
@@ -103,11 +120,21 @@ class Piece:
     @cached_property
     def record(self) -> Record:
         """Forces and references, as the kernel returns them."""
-        if not isinstance(self.given, Unevaluated):
-            return self.given
-        work = small_workspace(self.given.planned)
-        found = self.given.evaluated(self.time, work)
-        give_back(self.given.planned, work)
+        given = self.given
+        if not isinstance(given, Unevaluated):
+            return given
+        if given.setup is not None:
+            solver = large_solver(given.planned, given.setup)
+            planned = solved_by(solver, given.planned)
+            own = given.problem is given.planned
+            problem = planned if own else solved_by(solver, given.problem)
+            found = given._replace(problem=problem, planned=planned)
+            found = found.evaluated(self.time, solver.workspace)
+            solver.check()
+            return found
+        work = small_workspace(given.planned)
+        found = given.evaluated(self.time, work)
+        give_back(given.planned, work)
         return found
 
 
@@ -141,7 +168,7 @@ def assemble(
         for phase in phases
     ]
     # Of the pieces, what is left to do keeps no more than it needs.
-    places = [p.given.y if isinstance(p.given, Unevaluated) else p.given.r for p in pieces]
+    places = [p.given.places if isinstance(p.given, Unevaluated) else p.given.r for p in pieces]
     later: list[tuple[tuple[str, ...], Callable[[], dict[str, Any]]]] = [
         (
             (*RECORDED, *(("disturbance_force",) if airy else ()), *(SEEN if noisy else ())),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from contextlib import suppress
-from functools import cache, partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,7 +17,7 @@ from rigidfleet.typing import Floats
 
 if TYPE_CHECKING:
     # Imports the compiler, which only large formations need.
-    from rigidfleet.kernel.large.solver import LargeSolver
+    from rigidfleet.kernel.large.solver import LargeSolver, Setup
 
 
 #: Workspaces that no phase uses, by agents, edges, whether they have H, and solver; how many, and of how many agents.
@@ -28,22 +27,38 @@ _KEPT, _SMALL = 8, 200
 
 def equip(plan: PhasePlan) -> tuple[Workspace, LargeSolver | None]:
     """Workspace of a plan, and the solver for its multipliers if the kernel itself does not solve for them."""
-    problem, edges = plan.problem, plan.edges
     if not plan.large:
-        return small_workspace(problem), None
-    with_h = problem.control.allocation != RIGID
-    size = len(plan.masses), len(edges)
-    work = workspace(*size, with_h=with_h, solver=problem.law.solver, large=True)
+        return small_workspace(plan.problem), None
+    from rigidfleet.kernel.large import elimination
+    from rigidfleet.kernel.large.solver import Setup
+
+    points, edges = plan.before.r if plan.slots is None else plan.slots, plan.edges
+    order = None
+    if plan.method == "elimination":
+        steps = solvers.elimination_steps(len(points), edges)
+        order = None if steps is None else elimination.order(steps, plan.problem.graph.edges)
+    solver = large_solver(
+        plan.problem, Setup(order, solvers.Dissection(points, edges), *plan.residual())
+    )
+    plan.problem = solved_by(solver, plan.problem)
+    return solver.workspace, solver
+
+
+def large_solver(problem: Problem, setup: Setup) -> LargeSolver:
+    """A solver for the multipliers of a large formation, with a workspace."""
     from rigidfleet.kernel.large.solver import LargeSolver
 
-    points = plan.before.r if plan.slots is None else plan.slots
-    steps = solvers.elimination_steps(len(points), edges) if plan.method == "elimination" else None
-    order = cache(partial(solvers.dissection, points, edges))
-    solver = LargeSolver(
-        problem.vehicles, problem.graph.edges, problem.law, work, steps, order, *plan.residual()
+    size, with_h = (
+        (len(problem.vehicles.m), len(problem.graph.edges)),
+        problem.control.allocation != RIGID,
     )
-    plan.problem = problem._replace(graph=problem.graph._replace(solver=solver.address))
-    return work, solver
+    work = workspace(*size, with_h=with_h, solver=problem.law.solver, large=True)
+    return LargeSolver(problem.vehicles, problem.graph.edges, problem.law, work, setup)
+
+
+def solved_by(solver: LargeSolver, problem: Problem) -> Problem:
+    """A problem whose multipliers this solver finds, as long as somebody keeps it."""
+    return problem._replace(graph=problem.graph._replace(solver=solver.address))
 
 
 def small_workspace(problem: Problem) -> Workspace:

@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -49,23 +50,26 @@ class Counts:
             setattr(self, name, getattr(self, name) + value)
 
 
+class Setup(NamedTuple):
+    """How a `LargeSolver` solves: what all solvers of the same equations share."""
+
+    elimination: elimination.Order | None
+    order: Callable[
+        [], Ints
+    ]  # asked for the order (N,) in which the sparse factor eliminates agents, if needed
+    tolerance: float  # relative residual of conjugate gradients
+    floor: float = 0.0  # error of an acceleration that the damped law may always have [m/s^2]
+
+
 @dataclass
 class LargeSolver:
-    """Multipliers of one phase, Eq. (12), into its workspace.
-
-    ``steps`` (N, 4) are those of elimination, or None. ``order`` is called for the order (N,) in which the sparse
-    factor eliminates agents, if it is needed. ``tolerance`` is the relative residual of conjugate gradients, and
-    ``floor`` the error of an acceleration [m/s^2] that the damped law may always have.
-    """
+    """Multipliers of one phase, Eq. (12), into its workspace."""
 
     vehicles: Vehicles
     edges: Edges
     law: ConstraintLaw
     workspace: Workspace
-    steps: Ints | None
-    order: Callable[[], Ints]
-    tolerance: float
-    floor: float = 0.0
+    setup: Setup
     counts: Counts = field(default_factory=Counts)
     error: BaseException | None = None
 
@@ -76,8 +80,7 @@ class LargeSolver:
         iterated = law.solver == ITERATED
         self.mu, self.iterations = (law.mu, law.iterations) if iterated else (_EXACT_MU, 2)
         self.a, self.rest = np.zeros((n, 3)), np.zeros(len(self.edges))
-        self.least = self.mu * self.mbar * self.floor * math.sqrt(n)
-        self.elimination = None if self.steps is None else elimination.order(self.steps, self.edges)
+        self.least = self.mu * self.mbar * self.setup.floor * math.sqrt(n)
         self.pattern: block_cholesky.Pattern | None = (
             None  # not needed as long as elimination succeeds
         )
@@ -96,8 +99,9 @@ class LargeSolver:
 
     @cached_property
     def aside(self) -> LargeSolver:
-        """Another solver of the same equations in the same workspace; its solves leave this one unchanged."""
-        return replace(self, counts=Counts(), error=None)
+        """Another solver of the same equations, in a workspace of its own, for another thread."""
+        own = Workspace(*(x.copy() for x in self.workspace))
+        return replace(self, workspace=own, counts=Counts(), error=None)
 
     def check(self) -> None:
         """Raise an error that occurred in a call from the kernel."""
@@ -107,12 +111,12 @@ class LargeSolver:
 
     def solve(self) -> None:
         """Solve for the multipliers of ``workspace.b``; NaN if there is no solution."""
-        w, vehicles = self.workspace, self.vehicles
-        if self.elimination is not None:
+        w, vehicles, order = self.workspace, self.vehicles, self.setup.elimination
+        if order is not None:
             # With deformation damping, the kernel has computed the mean axes already.
             known = self.law.k_def > 0.0
             pivot = elimination.solve(
-                w.u, w.b, w.r, vehicles.m, vehicles.M, self.elimination, known, w.cm[0], w.I, w.I_inv, self.a,
+                w.u, w.b, w.r, vehicles.m, vehicles.M, order, known, w.cm[0], w.I, w.I_inv, self.a,
                 w.multiplier,
             )  # fmt: skip
             if pivot > elimination.LOST:
@@ -158,7 +162,7 @@ class LargeSolver:
 
     def _prepare(self) -> None:
         n, edges = len(self.a), self.edges
-        self.pattern = block_cholesky.pattern(n, edges, self.order(), _FILL)
+        self.pattern = block_cholesky.pattern(n, edges, self.setup.order(), _FILL)
         self.L, self.place = np.zeros((len(self.pattern.row), 9)), np.empty(n, dtype=np.int64)
         # Seven digits are enough for preconditioning, unless the damping of the rigid motions is tiny.
         self.kept = self.L.astype(np.float32) if self.mu > _EXACT_MU else self.L
@@ -182,7 +186,9 @@ class LargeSolver:
         """
         w, x, past = self.workspace, self.x, self.past[number]
         # A residual r causes an error r/mu of the force.
-        within = max(self.tolerance * math.sqrt(block_cholesky.inner(self.g, self.g)), self.least)
+        within = max(
+            self.setup.tolerance * math.sqrt(block_cholesky.inner(self.g, self.g)), self.least
+        )
         self.counts.solves += 1
         block_cholesky.project(
             w.u, self.edges, self.vehicles.m, self.mbar, self.mu, self.g, past, self.gram, x
