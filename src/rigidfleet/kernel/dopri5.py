@@ -48,13 +48,20 @@ def forget_stages(k, first):
 @inlined
 def advance(k, stage, a, h, p):
     """Write the state of a stage of p: y + h sum a[stage, s] k_s."""
-    # All six terms at once: later stages have weight zero and finite values.
+    # All six terms at once, or the first: later stages have weight zero and finite values.
     a0, a1, a2 = h * a[stage, 0], h * a[stage, 1], h * a[stage, 2]
     a3, a4, a5 = h * a[stage, 3], h * a[stage, 4], h * a[stage, 5]
-    for q in range(k.shape[1]):
-        k[TRIAL, q] = ((a0 * k[0, q] + a1 * k[1, q]) + (a2 * k[2, q] + a3 * k[3, q])) + (
-            k[STATE, q] + (a4 * k[4, q] + a5 * k[5, q])
-        )
+    if stage < 3:
+        for q in range(k.shape[1]):
+            k[TRIAL, q] = (a0 * k[0, q] + a1 * k[1, q]) + k[STATE, q]
+    elif stage < 5:
+        for q in range(k.shape[1]):
+            k[TRIAL, q] = ((a0 * k[0, q] + a1 * k[1, q]) + (a2 * k[2, q] + a3 * k[3, q])) + k[STATE, q]
+    else:
+        for q in range(k.shape[1]):
+            k[TRIAL, q] = ((a0 * k[0, q] + a1 * k[1, q]) + (a2 * k[2, q] + a3 * k[3, q])) + (
+                k[STATE, q] + (a4 * k[4, q] + a5 * k[5, q])
+            )
 
 
 @inlined
