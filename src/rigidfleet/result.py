@@ -441,6 +441,12 @@ class Result:
                 and value.flags.c_contiguous
             ):
                 self._set(name, value, sizes)
+        if not later:  # what a flight of this process has made is right
+            self._check(sizes)
+
+    def _check(self, sizes: dict[str, int]) -> None:
+        """Check values: they come from somewhere else."""
+        given = self.__dict__
         if sizes["time"] == 0 or sizes["agent"] == 0:
             raise ValueError("a result needs at least one sample and one agent")
         time, phase = self.time, self.phase
@@ -838,7 +844,7 @@ _OPTIONAL = {f.name for f in fields(Result) if f.name in VARIABLES and f.default
 LATER = ("slot_velocity", "slot_acceleration", "slot_jerk", "yaw", "yaw_rate")
 CLOSE = ("separation", "separation_pair", "clearance", "clearance_agent", "clearance_obstacle")
 RECORDED = (
-    "acceleration", "slot_position", "input_force", "constraint_force", "external_force", "thrust", "cm",
+    "integral", "acceleration", "slot_position", "input_force", "constraint_force", "external_force", "thrust", "cm",
     "cm_velocity", "cm_reference", "cm_velocity_reference", "attitude", "attitude_reference", "frame", "rates",
     "rates_reference", "wrench_asked", "wrench_achieved", "distance", "distance_reference",
     "distance_rate_reference", "constraint", "multiplier",

@@ -56,7 +56,9 @@ def advance(k, stage, a, h, p):
             k[TRIAL, q] = (a0 * k[0, q] + a1 * k[1, q]) + k[STATE, q]
     elif stage < 5:
         for q in range(k.shape[1]):
-            k[TRIAL, q] = ((a0 * k[0, q] + a1 * k[1, q]) + (a2 * k[2, q] + a3 * k[3, q])) + k[STATE, q]
+            k[TRIAL, q] = ((a0 * k[0, q] + a1 * k[1, q]) + (a2 * k[2, q] + a3 * k[3, q])) + k[
+                STATE, q
+            ]
     else:
         for q in range(k.shape[1]):
             k[TRIAL, q] = ((a0 * k[0, q] + a1 * k[1, q]) + (a2 * k[2, q] + a3 * k[3, q])) + (

@@ -249,7 +249,8 @@ def cleared(w: Workspace) -> Workspace:
     memory = w.r.base
     assert memory is not None
     memory.fill(0.0)
-    w.T[:] = w.T_ref[:] = np.eye(3)
+    for T in (w.T, w.T_ref):
+        T[0, 0] = T[1, 1] = T[2, 2] = 1.0
     return w
 
 

@@ -149,9 +149,11 @@ class PhasePlan:
         cm = (masses @ now.r / masses.sum(), masses @ now.v / masses.sum())
         return np.concatenate([x.ravel(), y.ravel(), integral, q, *cm])
 
-    def tolerances(self, size: int) -> Floats:
-        """Absolute tolerances (size,) of the states."""
-        velocity = self.velocity_tolerance()
+    @cached_property
+    def tolerances(self) -> Floats:
+        """Absolute tolerances (n,) of the states."""
+        velocity, size = self.velocity_tolerance(), 6 * len(self.masses) + len(self.edges)
+        size += 0 if self.frame is None else 10 if self.problem.body_formulation else 4
         return absolute_tolerances(
             self.integrator, size, velocity, self.distances, large=self.large
         )
@@ -175,6 +177,7 @@ class PhasePlan:
         keys = self.edges[:, 0] * n + self.edges[:, 1]
         kept = ~np.any(lost[self.edges], axis=1) & ~np.isin(keys, pairs[:, 0] * n + pairs[:, 1])
         self.edges, self.distances = self.edges[kept], self.distances[kept]
+        self.__dict__.pop("tolerances", None)
         self.method = solvers.choose(len(lost), self.edges, self.constraint.solver)
         self.problem = without(self.problem, kept, lost, self.damping(lost), large=self.large)
         return kept

@@ -287,8 +287,8 @@ class ActivePhase:
 
     def _loss_ahead(self) -> float:
         """Time [s] at which the next vehicle or link is lost; infinity if none is."""
-        coming = float(self.plan.lost_at[~self.lost].min(initial=math.inf))
-        return min([coming, *self.plan.links_lost[1][~self.parted].tolist()])
+        agents, links = self.plan.lost_at[~self.lost], self.plan.links_lost[1][~self.parted]
+        return min([*agents.tolist(), *links.tolist()], default=math.inf)
 
     def count(self) -> None:
         """Add up the evaluations, steps and solves of the phase, or of its part up to a loss."""
@@ -309,7 +309,7 @@ class ActivePhase:
         state = self.state  # of which another trail alone may follow
         samples = np.empty((len(times), len(state.y)))
         state.count[3] = 0
-        first = np.nextafter(self.t, math.inf)
+        first = math.nextafter(self.t, math.inf)
         status = records.PAUSED
         go_on = native.Integration(problem, self.workspace, state, t_end, times, samples)
         try:
@@ -328,7 +328,8 @@ class ActivePhase:
                 if self.external is not None:
                     self.external.check()
                 self._check()
-                self.watch(last=False)
+                if status == records.PAUSED or state.count[4] == len(state.trail.clock):
+                    self.watch(last=False)
                 self.pause(self.t)
                 if status == records.PAUSED and self._stalled():
                     break
@@ -385,7 +386,7 @@ class ActivePhase:
         if plan.frame is not None:
             q = samples[:, 6 * n + m : 6 * n + m + 4]
             frame = q / np.linalg.norm(q, axis=1, keepdims=True)
-        integral, led = np.ascontiguousarray(samples[:, 6 * n : 6 * n + m]), self._led(times)
+        integral, led = samples[:, 6 * n : 6 * n + m], self._led(times)
         self.pieces.append(
             Piece(self.index, times, given, integral, frame, plan.edges, plan.attached, led)
         )

@@ -353,6 +353,8 @@ class Extremes:
 
     def flight(self, phases: Sequence[PhaseRecord]) -> None:
         """Give the phases of a finished flight its clearance in flight, and that of vehicles on an obstacle."""
+        if self.solids is None and not len(self.boxes):
+            return
         found = {name: self._extremum(k) for name, k in _OF_FLIGHT.items()}
         found["clearance_end"] = self._landing()
         for name, x in found.items():

@@ -501,7 +501,7 @@ class Flight:
             step = step or mission.output_step
             mission, phases = as_flown(mission, flown[:last], phases[:last], step)
         self._extremes.flight(phases)
-        evaluations, steps, rejected = (int(c) for c in self._count)
+        evaluations, steps, rejected = self._count.tolist()
         statistics = {
             "evaluations": evaluations, "steps": steps, "rejected": rejected,
             "wall_s": clock.perf_counter() - self._started, "simulated_s": self.t,

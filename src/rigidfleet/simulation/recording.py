@@ -66,6 +66,7 @@ class LayerSamples(NamedTuple):
 
 
 Samples = TypeVar("Samples", VehicleSamples, LayerSamples)
+Array = TypeVar("Array", Floats, Ints)
 
 
 class Unevaluated(NamedTuple):
@@ -80,9 +81,10 @@ class Unevaluated(NamedTuple):
     def motion(self) -> tuple[Floats, Floats]:
         """Positions and velocities (K, N, 3) of agents, world axes, as copies."""
         n, m = len(self.problem.vehicles.m), len(self.problem.graph.edges)
-        r, v = (self.y[:, s * n : (s + 3) * n].reshape(-1, n, 3) for s in (0, 3))
+        both = self.y[:, : 6 * n].reshape(-1, 2, n, 3)
+        r, v = both[:, 0], both[:, 1]
         if not self.problem.body_formulation:
-            return np.array(r), np.array(v)
+            return r.copy(), v.copy()
         q, *cm = np.split(self.y[:, 6 * n + m :], [4, 7], axis=1)
         T = att.dcm_from_quaternion(q / np.linalg.norm(q, axis=1, keepdims=True))
         r_cm, v_cm = (x[:, None] for x in cm)
@@ -158,7 +160,7 @@ def assemble(
     layers = _together(avoided) if avoided else None
     d = mission.disturbances
     noisy = d is not None and d.noise is not None
-    airy = bool(mission.drag.any()) or flown is not None
+    airy = flown is not None or (d is not None and bool(mission.drag.any()))
     worst = [
         {
             name: phase.extremes[name]
@@ -194,9 +196,8 @@ def assemble(
     unmade: dict[str, Any] = dict.fromkeys(name for names, _ in later for name in names)
     return Result(
         time=time,
-        phase=np.repeat([p.phase for p in pieces], [len(p.time) for p in pieces]),
+        phase=_joined([np.full(len(p.time), p.phase) for p in pieces]),
         edges=mission.edges,
-        integral=_by_edge(pieces, mission.edges, lambda p: p.integral),
         vehicle_attitude=None if flown is None else flown.attitude,
         vehicle_rates=None if flown is None else flown.rates,
         rotor_force=None if flown is None else flown.rotor_force,
@@ -270,6 +271,7 @@ def _recorded(
         "distance_rate_reference": _by_edge(pieces, edges, lambda p: p.record.d_dot),
         "constraint": constraint,
         "multiplier": _by_edge(pieces, edges, lambda p: p.record.multiplier),
+        "integral": _by_edge(pieces, edges, lambda p: p.integral),
     }
 
 
@@ -389,7 +391,7 @@ def _put(extremes: dict[str, Extremum], time: Floats, close: proximity.Closeness
                 close.agent[k], close.obstacle[k] = x.who, x.other
 
 
-def _joined(parts: Sequence[Floats]) -> Floats:
+def _joined(parts: Sequence[Array]) -> Array:
     """Parts of a flight, one after the other."""
     return parts[0] if len(parts) == 1 else np.concatenate(parts)
 

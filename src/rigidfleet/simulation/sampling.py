@@ -27,8 +27,8 @@ class Sampling:
     ) -> Floats:
         """Times in (t, t_end] [s] of a phase; ``first`` after a switch; ``stop`` is where the caller stops."""
         if self.times is not None:
-            before = -math.inf if first and t == 0.0 else t
-            return self.times[(self.times > before) & (self.times <= t_end)]
+            begin = 0 if first and t == 0.0 else self.times.searchsorted(t, "right")
+            return self.times[begin : self.times.searchsorted(t_end, "right")]
         step = self.step
         low, high = math.floor(t / step + 1e-9) + 1, math.floor(t_end / step + 1e-9) + 1
         grid = np.minimum(np.arange(low, high) * step, t_end)
@@ -59,5 +59,5 @@ def times_asked(times: ArrayLike, end: float) -> Floats:
 
 
 def _increasing(t: Floats) -> Floats:
-    """Times (K,) sorted, each once."""
-    return t if t.ndim == 1 and (t[1:] > t[:-1]).all() else np.unique(t)
+    """Times (K,) sorted, each once; a copy, of which a flight records parts."""
+    return t.copy() if t.ndim == 1 and (t[1:] > t[:-1]).all() else np.unique(t)

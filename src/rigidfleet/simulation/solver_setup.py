@@ -84,9 +84,7 @@ def integrator(
     plan: PhasePlan, y: Floats, t: float, trail: records.Trail
 ) -> records.IntegratorState:
     """An integrator of a plan at time t [s] and state y (n,), which records its steps in a trail."""
-    return records.integrator(
-        y, t, rtol=plan.integrator.rtol, atol=plan.tolerances(len(y)), trail=trail
-    )
+    return records.integrator(y, t, rtol=plan.integrator.rtol, atol=plan.tolerances, trail=trail)
 
 
 def first_step(plan: PhasePlan, work: Workspace, state: records.IntegratorState) -> float:
@@ -97,7 +95,7 @@ def first_step(plan: PhasePlan, work: Workspace, state: records.IntegratorState)
     """
     problem: Problem = plan.problem
     t, y = float(state.clock[0]), state.y
-    scale = plan.tolerances(len(y)) + state.rtol * np.abs(y)
+    scale = plan.tolerances + state.rtol * np.abs(y)
 
     def size(x: Floats) -> float:
         return float(np.sqrt(np.mean((x / scale) ** 2)))
