@@ -6,7 +6,6 @@ come from a separate Philox stream, keyed by (seed, k).
 
 from __future__ import annotations
 
-import copy
 import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -250,7 +249,7 @@ class Sweep:
 
     def varied(self, run: int) -> dict[str, Any]:
         """The mission of a run as plain data, not yet checked."""
-        document = copy.deepcopy(self.document)
+        document = _copied(self.document)
         for column, value in zip(self.columns, self.values(run), strict=True):
             apply(document, self.whole, column, value)
         return document
@@ -264,6 +263,13 @@ class Sweep:
             "seed": self.seed,
             "evaluate": self.evaluate,
         }
+
+
+def _copied(x: Any) -> Any:
+    """A copy of plain data: tables, lists, words and numbers."""
+    if isinstance(x, dict):
+        return {key: _copied(value) for key, value in x.items()}
+    return [_copied(value) for value in x] if isinstance(x, list) else x
 
 
 def _axis(column: SweepColumn, k: int) -> str | int:

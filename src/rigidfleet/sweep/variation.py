@@ -13,6 +13,7 @@ import json
 import re
 from abc import abstractmethod
 from dataclasses import dataclass
+from functools import cached_property
 from statistics import NormalDist
 from typing import Annotated, Any, Literal
 
@@ -143,7 +144,7 @@ class _Listed(Variation):
             )
         return None
 
-    @property
+    @cached_property
     def _numeric(self) -> bool:
         return all(map(is_number, self.values))
 
