@@ -377,7 +377,7 @@ def main() -> int:
     machine = f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}"
     load = os.getloadavg()[0]  # a time of the wall's clock means little where others work
     console.print(f"{date.today()}; {machine}; {versions}; load {load:.1f}", highlight=False)
-    console.print(f"{DURATION:g} s of flight, {TOLERANCE}, one thread", highlight=False)
+    console.print(f"{DURATION:g} s of flight, {TOLERANCE}", highlight=False)
     flights = [*FLIGHTS, LARGEST, *([MILLION] if arguments.million else [])]
     rows = [(measured(k, n), goal) for k, n, goal in flights]
     console.print(table(rows))

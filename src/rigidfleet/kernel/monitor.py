@@ -12,8 +12,8 @@ than both its neighbours, the law is evaluated in between, until the parabola th
 rise: to 1e-5 of the value. The same holds for large formations, whose multipliers are iterated, with one exception:
 constraint forces and tensions below a tenth of the greatest thrust are found to 1e-6 of that thrust, the accuracy that
 the solver's residual allows. Large formations use a separate solver for these evaluations (`LargeSolver.aside`),
-because a solver keeps state. The flight is therefore the same to the bit with and without a monitor. The extremes
-do not depend on where the trail is cut, because the order of evaluations does not.
+because a solver keeps state and another thread calls the monitor. The flight is therefore the same to the bit with and
+without a monitor. The extremes do not depend on where the trail is cut, because the order of evaluations does not.
 """
 
 import math
