@@ -150,6 +150,11 @@ class PhasePlan:
         return np.concatenate([x.ravel(), y.ravel(), integral, q, *cm])
 
     @cached_property
+    def loses(self) -> bool:
+        """Whether vehicles or links are lost at any time."""
+        return bool(len(self.links_lost[1]) or np.isfinite(self.lost_at).any())
+
+    @cached_property
     def tolerances(self) -> Floats:
         """Absolute tolerances (n,) of the states."""
         velocity, size = self.velocity_tolerance(), 6 * len(self.masses) + len(self.edges)

@@ -287,6 +287,8 @@ class ActivePhase:
 
     def _loss_ahead(self) -> float:
         """Time [s] at which the next vehicle or link is lost; infinity if none is."""
+        if not self.plan.loses:
+            return math.inf
         agents, links = self.plan.lost_at[~self.lost], self.plan.links_lost[1][~self.parted]
         return min([*agents.tolist(), *links.tolist()], default=math.inf)
 

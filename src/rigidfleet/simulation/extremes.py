@@ -216,10 +216,8 @@ class Extremes:
 
             self._thread = ThreadPoolExecutor(1)
         full, rows = state.trail, int(state.count[4])
-        if self._other.points.shape != full.points.shape or len(self._other.start) != len(
-            full.start
-        ):
-            self._other = records.Trail(*(np.empty_like(x) for x in full))
+        if self._other.start is not full.start:  # which both share: it counts until a fresh start
+            self._other = records.Trail(*(np.empty_like(x) for x in full[:3]), full.start)
         self.trail, self._other = self._other, full
         # The last step waits for its neighbour, which is the first one of the other trail.
         for part, of in zip(self.trail[:3], full[:3], strict=True):

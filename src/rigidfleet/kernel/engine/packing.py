@@ -136,9 +136,10 @@ def _places(x: Any, prefix: str) -> Iterator[tuple[str, type, int | None]]:
 
 def _getter(names: list[str]) -> Callable[[Any], tuple[Any, ...]]:
     """A function that returns the fields with these names."""
-    if len(names) < 2:
-        return lambda x: tuple(attrgetter(name)(x) for name in names)
-    return attrgetter(*names)
+    if not names:
+        return lambda _: ()
+    get = attrgetter(*names)
+    return get if len(names) > 1 else lambda x: (get(x),)
 
 
 def _flatten(x: Any, code: list[str], words: list[Any], arrays: list[tuple[str, int]]) -> None:
