@@ -339,7 +339,9 @@ class Extremes:
         }
         if (tension := found.get("tension")) is not None and self.sign[0] < 0.0:
             found["tension"] = tension._replace(value=-tension.value)
-        return found | self.of_vehicles | self._avoided() | self.led
+        if self.of_vehicles or self.avoidance is not None or self.led:
+            found |= self.of_vehicles | self._avoided() | self.led
+        return found
 
     def phase(self) -> dict[str, Extremum]:
         """Extremes of the phase that ends, by name; start those of the next one."""

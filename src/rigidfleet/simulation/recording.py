@@ -42,6 +42,11 @@ _WORK, _LEAST = 400_000_000, 9
 _REFERENCES = "r_ref", "p", "motion", "rates", "T_ref", "wrench"
 _STATES = "position", "velocity"
 
+#: Fields of a result that a flight makes later, as a rule.
+_UNMADE: dict[str, Any] = dict.fromkeys(
+    (*RECORDED, *CLOSE, *LATER, "singular_value", "mission_text")
+)
+
 #: References that slots follow one after the other, each with the time [s] from which it counts, and how vehicles with
 #: sampled control turn; none if not tracked.
 Led = tuple[tuple[float, "Reference", "Motion", "Turn | None"], ...]
@@ -193,7 +198,6 @@ def assemble(
             made = make()
             now |= {name: made[name] for name in (*_STATES, *names) if name in made}
         del later[:2]
-    unmade: dict[str, Any] = dict.fromkeys(name for names, _ in later for name in names)
     return Result(
         time=time,
         phase=_joined([np.full(len(p.time), p.phase) for p in pieces]),
@@ -210,7 +214,7 @@ def assemble(
         ending=ending,
         statistics=statistics,
         later=later,
-        **(unmade | now),
+        **(_UNMADE | now),
     )
 
 
