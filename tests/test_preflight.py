@@ -213,6 +213,20 @@ def test_gaps(yaw, fits):
     assert found.passed == fits
 
 
+def test_clearance_is_that_of_the_deepest_phase():
+    """A phase that grazes an obstacle does not hide a later one that flies into its middle."""
+    ball = {"kind": "sphere", "name": "ball", "centre": [20.0, 2.0, 5.0], "radius": 3.0}
+    phases = [
+        {"kind": "establish", "formation": "square", "until": 5.0},
+        {"kind": "fly", "position": [16.5, 2.0, 5.0], "until": 15.0},
+        {"kind": "fly", "position": [30.0, 2.0, 5.0], "until": 30.0},
+    ]
+    found = check(mission(agents={"radius": 0.5}, phases=phases, obstacles=[ball]))
+    ((_, clearance, time, _),) = found.clearance
+    assert clearance == pytest.approx(2.0 - 3.0 - 0.5, abs=1e-3)  # slots pass 2 m beside the centre
+    assert time > 15.0
+
+
 def test_steps_are_judged_by_force():
     """The force of a step is J^+ (-beta^2 c): two agents 4 m too far apart, beta^2 = 12: 24 N each, and weight."""
     phases = [

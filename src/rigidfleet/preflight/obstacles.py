@@ -83,10 +83,13 @@ def obstacle_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
 
 
 def _beyond(within: Floats, thing: Obstacle) -> Floats:
-    """Lower bound (L,) [m] of the distance of boxes (L, 2, 3), given by lowest and highest corner, to an obstacle."""
+    """Lower bound (L,) [m] of the distance of boxes (L, 2, 3), given by lowest and highest corner, to an obstacle.
+
+    Minus infinity where a box overlaps the obstacle's extent: how deep it reaches into the obstacle is not known.
+    """
     low, high = extent(thing.solid)
     apart = np.maximum(np.maximum(within[:, 0] - high, low - within[:, 1]), 0.0)
-    return np.linalg.norm(apart, axis=1)
+    return np.where(apart.any(axis=1), np.linalg.norm(apart, axis=1), -np.inf)
 
 
 def _too_low(mission: Mission, found: Preflight, phase: str, ground: float) -> str:
