@@ -7,6 +7,7 @@ import pytest
 
 from rigidfleet import assess, check, simulate
 from rigidfleet.errors import MissionError
+from rigidfleet.math import proximity
 from rigidfleet.mission import Mission, load_mission
 from rigidfleet.planning.clearance import closest, greatest_speeds, pace
 from rigidfleet.planning.derivatives import slot_derivatives
@@ -276,9 +277,57 @@ def test_the_least_clearance_is_between_samples():
     data["phases"][1] = {"kind": "fly", "position": [12, 0, 8], "duration": 4.0}
     mission = Mission.from_dict(data)
     planned = preview(mission)[0][1]
-    clearance, _, _ = closest(planned, mission.obstacles[0], mission.fleet.radius, pace(planned))
+    found = closest(planned, mission.obstacles[0], mission.fleet.radius, pace(planned))
     t = np.linspace(planned.time[0], planned.time[-1], 40001)
     r = slot_derivatives(planned.leg.reference, planned.leg.motion, t, 1)[:, 0]
     out = np.maximum(np.maximum([-0.001, -1, 0] - r, r - [0.001, 1, 7.0]), 0.0)
     dense = float(np.linalg.norm(out, axis=-1).min()) - 0.25
-    assert dense - 1e-3 <= clearance <= dense + 1e-3
+    assert dense - 1e-3 <= found.clearance <= dense + 1e-3
+    assert found.proved == found.clearance - 1e-3
+
+
+def past_a_ball(count: int) -> Mission:
+    """A grid of vehicles that flies past a ball of 2 cm at up to 33 m/s, one of them near it."""
+    ball = {"kind": "sphere", "name": "bird", "centre": [300.31, 0.43, 10.07], "radius": 0.02}
+    grid = {"shape": "grid", "size": 2.0, "count": count, "centre": [0.0, 0.0, 10.0]}
+    return Mission.from_dict(
+        {
+            "schema_version": 1, "name": "past", "agents": {"mass": 0.3, "radius": 0.1, "position": grid},
+            "obstacles": [ball], "phases": [{"kind": "fly", "position": [600.0, 0.0, 10.0], "duration": 40.0}],
+        }
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("at_once", [20_000, 200_000])
+def test_the_least_clearance_of_many_is_between_samples(at_once, monkeypatch):
+    """Also where not all vehicles and spans fit at once."""
+    monkeypatch.setattr("rigidfleet.planning.clearance._AT_ONCE", at_once)
+    mission = past_a_ball(1000)
+    planned = preview(mission)[0][0]
+    found = closest(planned, mission.obstacles[0], mission.fleet.radius, pace(planned))
+    assert found.proved == found.clearance - 1e-3
+    t = np.linspace(found.time - 0.3, found.time + 0.3, 6001)
+    near = slot_derivatives(planned.leg.reference, planned.leg.motion, t, 1)[:, 0, found.agent]
+    dense = float(np.linalg.norm(near - [300.31, 0.43, 10.07], axis=-1).min()) - 0.12
+    assert found.clearance == pytest.approx(dense, abs=1e-3)
+    each, _ = proximity.obstacle_clearances(
+        slot_derivatives(planned.leg.reference, planned.leg.motion, t[::10], 1)[:, 0],
+        mission.fleet.radius, mission.obstacles, t[::10],
+    )  # fmt: skip
+    assert found.clearance <= each.min() + 1e-3
+
+
+def test_what_a_check_has_no_time_to_prove_is_told(monkeypatch):
+    """The bound holds, is worse than a millimetre, and is said."""
+    monkeypatch.setattr("rigidfleet.planning.clearance._IN_ALL", 10_000)
+    mission = past_a_ball(1000)
+    planned = preview(mission)[0][0]
+    found = closest(planned, mission.obstacles[0], mission.fleet.radius, pace(planned))
+    t = np.linspace(planned.time[0], planned.time[-1], 4001)
+    r = slot_derivatives(planned.leg.reference, planned.leg.motion, t, 1)[:, 0]
+    dense = float(np.linalg.norm(r - [300.31, 0.43, 10.07], axis=-1).min()) - 0.12
+    assert found.proved < found.clearance - 1e-3
+    assert found.proved <= dense
+    (said,) = [x for x in check(mission).remarks if "proved to" in x.text]
+    assert said.level == "note"
+    assert "'bird' is proved to" in said.text

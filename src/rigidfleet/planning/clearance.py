@@ -7,6 +7,7 @@ way needs no look inside, and every other is halved.
 
 from __future__ import annotations
 
+from collections import deque
 from typing import NamedTuple
 
 import numpy as np
@@ -17,12 +18,12 @@ from rigidfleet.mission import Obstacle
 from rigidfleet.planning.derivatives import slot_derivatives
 from rigidfleet.planning.preview import PlannedPhase
 from rigidfleet.solids.records import Solids
-from rigidfleet.typing import Floats
+from rigidfleet.typing import Floats, Ints
 
 #: Accuracy of a planned clearance [m].
 CLOSE = 1e-3
-#: Greatest number of times that the time between two samples is halved, and of positions in one such step.
-_HALVINGS, _OPEN = 16, 200_000
+#: Greatest number of times that the time between two samples is halved, and of positions: in one step, and in all.
+_HALVINGS, _AT_ONCE, _IN_ALL = 16, 200_000, 4_000_000
 #: Greatest rate of the septic blend, 140 x^3 (1 - x)^3 at x = 1/2.
 _BLEND_RATE = 140.0
 
@@ -75,10 +76,35 @@ def pace(planned: PlannedPhase) -> Floats:
     return greatest_speeds(leg.reference, leg.motion, time[:-1], time[1:])
 
 
-def closest(
-    planned: PlannedPhase, thing: Obstacle, radius: Floats, speed: Floats
-) -> tuple[float, int, float]:
-    """Least clearance [m] of a planned phase to an obstacle in continuous time, exact to `CLOSE`; agent, and time [s].
+class Closest(NamedTuple):
+    """The least clearance of a planned phase to an obstacle in continuous time."""
+
+    clearance: float  # [m]
+    agent: int
+    time: float  # [s]
+    proved: float  # what the clearance is never below [m]: to `CLOSE` as a rule, less if that took too long
+
+
+class _Spans(NamedTuple):
+    """Spans of time between two positions known, of some agents."""
+
+    first: Floats  # (L,) beginning [s]
+    length: Floats  # (L,) [s]
+    near: Floats  # (L, n) clearance at the beginning [m]
+    far: Floats  # (L, n) and at the end [m]
+    speed: Floats  # (L, n) greatest speed within [m/s]
+    who: Ints  # (n,) agents
+    halved: int
+
+    def of(self, rows: Ints, columns: Ints) -> _Spans:
+        """Some spans, of some of the agents."""
+        both = np.ix_(rows, columns)
+        kept = (x[both] for x in (self.near, self.far, self.speed))
+        return _Spans(self.first[rows], self.length[rows], *kept, self.who[columns], self.halved)
+
+
+def closest(planned: PlannedPhase, thing: Obstacle, radius: Floats, speed: Floats) -> Closest:
+    """Least clearance of a planned phase to an obstacle in continuous time.
 
     ``speed`` is the `pace` of the phase. Where the room between two samples might not do, the plan is evaluated in the
     middle, and so on.
@@ -88,27 +114,53 @@ def closest(
     each, _ = proximity.obstacle_clearances(planned.position, radius, [met], time)
     k, i = np.unravel_index(int(each.argmin()), each.shape)
     best, agent, when = float(each[k, i]), int(i), float(time[k])
-    first, length = time[:-1], np.diff(time)
-    near, far = each[:-1], each[1:]
-    for _ in range(_HALVINGS):
-        way = speed * length[:, None]
+    everybody, least, done = np.arange(each.shape[1]), np.inf, 0
+    # The shortest spans last, so that the time for all is not spent on some.
+    todo = deque([_Spans(time[:-1], np.diff(time), each[:-1], each[1:], speed, everybody, 0)])
+    while todo:
+        spans = todo.popleft()
+        way = spans.speed * spans.length[:, None]
         if moves:
-            way = way + _way(met, first, first + length)[:, None]
-        open_ = np.flatnonzero((0.5 * (near + far - way)).min(axis=1) < best - CLOSE)
-        if not len(open_) or len(open_) * each.shape[1] > _OPEN:
-            break
-        first, length, speed = first[open_], 0.5 * length[open_], speed[open_]
-        middle = first + length
-        r = slot_derivatives(leg.reference, leg.motion, middle, 1)[:, 0]
-        between, _ = proximity.obstacle_clearances(r, radius, [met], middle)
+            way = way + _way(met, spans.first, spans.first + spans.length)[:, None]
+        low = 0.5 * (spans.near + spans.far - way)
+        open_ = low < best - CLOSE
+        if not open_.any():
+            continue
+        if spans.halved == _HALVINGS or done > _IN_ALL:
+            least = min(least, float(low.min()))
+            continue
+        spans = spans.of(np.flatnonzero(open_.any(axis=1)), np.flatnonzero(open_.any(axis=0)))
+        rows, columns = np.arange(len(spans.first)), np.arange(len(spans.who))
+        if (
+            len(rows) > 1 and len(rows) * len(columns) > _AT_ONCE
+        ):  # not all are near at the same time
+            halves = np.array_split(np.argsort(spans.first, kind="stable"), 2)
+            todo.extendleft(spans.of(half, columns) for half in halves)
+            continue
+        done += len(rows) * len(columns)
+        half = 0.5 * spans.length
+        middle, who = spans.first + half, spans.who
+        r = slot_derivatives(_of(leg.reference, who), leg.motion, middle, 1)[:, 0]
+        between, _ = proximity.obstacle_clearances(r, radius[who], [met], middle)
         k, i = np.unravel_index(int(between.argmin()), between.shape)
         if between[k, i] < best:
-            best, agent, when = float(between[k, i]), int(i), float(middle[k])
-        near, far = np.concatenate([near[open_], between]), np.concatenate([between, far[open_]])
+            best, agent, when = float(between[k, i]), int(who[i]), float(middle[k])
         # Samples are near each other: a bound for both halves together is hardly greater than each half's own.
-        first, length = np.concatenate([first, middle]), np.tile(length, 2)
-        speed = np.concatenate([speed, speed])
-    return best, agent, when
+        todo.append(
+            _Spans(
+                np.concatenate([spans.first, middle]), np.tile(half, 2), np.concatenate([spans.near, between]),
+                np.concatenate([between, spans.far]), np.tile(spans.speed, (2, 1)), who, spans.halved + 1,
+            )
+        )  # fmt: skip
+    return Closest(best, agent, when, min(least, best - CLOSE))
+
+
+def _of(reference: Reference, who: Ints) -> Reference:
+    """The reference of some agents' slots."""
+    if len(who) == len(reference.p0):
+        return reference
+    ways = reference.ways[:, who] if len(reference.knots) else reference.ways
+    return reference._replace(p0=reference.p0[who], dp=reference.dp[who], ways=ways)
 
 
 class _Thing(NamedTuple):

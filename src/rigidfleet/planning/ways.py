@@ -21,7 +21,7 @@ from rigidfleet.mission import Mission, Phase
 from rigidfleet.mission.kinds import ANGLES, Go
 from rigidfleet.mission.values import AUTO
 from rigidfleet.planning import layers
-from rigidfleet.planning.clearance import CLOSE, closest, pace
+from rigidfleet.planning.clearance import closest, pace
 from rigidfleet.planning.lattice import Layer, Network, Space, Way, staying
 from rigidfleet.planning.preview import at_start, ending, leg, planned_phase, samples_per_phase
 from rigidfleet.planning.reference import PhaseState
@@ -294,14 +294,14 @@ class _Search:
             beside = np.maximum(np.maximum(a - high, low - b), 0.0)
             if np.linalg.norm(beside) - radius.max() > min(least, need + 1.0):
                 continue
-            clearance, agent, time = closest(planned, thing, radius, speed)
-            if clearance - CLOSE < least:
-                least = clearance - CLOSE
+            clearance, agent, time, proved = closest(planned, thing, radius, speed)
+            if proved < least:
+                least = proved
                 self._worst = (
                     f"agent {agent + 1} is {clearance:.3f} m from '{thing.name}' at {time:.2f} s in"
                     f" '{planned.phase}'"
                 )
-            if thing.solid.moves and clearance - CLOSE < need:
+            if thing.solid.moves and proved < need:
                 raise self._unmet()
         return need - least
 

@@ -34,6 +34,7 @@ def obstacle_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     )
     far = np.stack([_beyond(within, thing) for thing in mission.obstacles], axis=1) - radius.max()
     held, met, skipped = 0, 0, []
+    unproved: dict[int, float] = {}
     paces = [pace(planned) for planned in way]
     near = np.argsort(far.min(axis=0), kind="stable")
     shown: dict[int, tuple[float, float, int, str]] = {}
@@ -50,7 +51,9 @@ def obstacle_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
             held, met = held + planned.position[:, :, 0].size, met + 1
             if held > _HELD or met > _MET:
                 break
-            clearance, agent, time = closest(planned, thing, radius, paces[k])
+            clearance, agent, time, proved = closest(planned, thing, radius, paces[k])
+            if clearance - proved > max(unproved.get(b, 0.0), 1.5 * CLOSE):
+                unproved[b] = clearance - proved
             # Among equal minima, take the first one: ignore rounding and the last millimetre of a rest.
             if clearance < worst.get(planned.exact, (np.inf,))[0] - CLOSE:
                 worst[planned.exact] = (clearance, time, agent, planned.phase)
@@ -75,6 +78,13 @@ def obstacle_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
         found.clearance.append((mission.obstacles[b].name, clearance, t, f"agent {i + 1}"))
     for b in sorted(remarks):
         yield from remarks[b]
+    if unproved:
+        names = [mission.obstacles[b].name for b in sorted(unproved)]
+        text = (
+            f"to limit the time of the check, the clearance told of {some(names)} proved to"
+            f" {max(unproved.values()):.2g} m only"
+        )
+        yield Remark("note", "obstacle", text)
     if skipped:
         names = [mission.obstacles[b].name for b in sorted(skipped)]
         text = f"to limit the time of the check, {some(names)} skipped"
