@@ -90,10 +90,8 @@ class Drawings:
         self._drawing = 0  # number of threads, each of which has a process
         if len(figures) < _FEW or result.position.nbytes > _LARGEST or not prepare():
             return
-        given = (
-            pickle.dumps(result.evaluate()),
-            titles,
-        )  # the kernel is loaded in this process alone
+        # The kernel, which evaluates the result, is loaded in this process alone.
+        given = pickle.dumps(result.evaluate()), titles
         self._drawing = min(at_once(), len(figures))
         for _ in range(self._drawing):
             Thread(target=self._ask, args=given, daemon=True).start()

@@ -56,14 +56,12 @@ def advance(k, stage, a, h, p):
             k[TRIAL, q] = (a0 * k[0, q] + a1 * k[1, q]) + k[STATE, q]
     elif stage < 5:
         for q in range(k.shape[1]):
-            k[TRIAL, q] = ((a0 * k[0, q] + a1 * k[1, q]) + (a2 * k[2, q] + a3 * k[3, q])) + k[
-                STATE, q
-            ]
+            early = (a0 * k[0, q] + a1 * k[1, q]) + (a2 * k[2, q] + a3 * k[3, q])
+            k[TRIAL, q] = early + k[STATE, q]
     else:
         for q in range(k.shape[1]):
-            k[TRIAL, q] = ((a0 * k[0, q] + a1 * k[1, q]) + (a2 * k[2, q] + a3 * k[3, q])) + (
-                k[STATE, q] + (a4 * k[4, q] + a5 * k[5, q])
-            )
+            early = (a0 * k[0, q] + a1 * k[1, q]) + (a2 * k[2, q] + a3 * k[3, q])
+            k[TRIAL, q] = early + (k[STATE, q] + (a4 * k[4, q] + a5 * k[5, q]))
 
 
 @inlined

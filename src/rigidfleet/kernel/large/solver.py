@@ -54,9 +54,8 @@ class Setup(NamedTuple):
     """How a `LargeSolver` solves: what all solvers of the same equations share."""
 
     elimination: elimination.Order | None
-    order: Callable[
-        [], Ints
-    ]  # asked for the order (N,) in which the sparse factor eliminates agents, if needed
+    #: Asked for the order (N,) in which the sparse factor eliminates agents, if it is needed.
+    order: Callable[[], Ints]
     tolerance: float  # relative residual of conjugate gradients
     floor: float = 0.0  # error of an acceleration that the damped law may always have [m/s^2]
 
