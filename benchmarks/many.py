@@ -31,7 +31,7 @@ from rich.console import Console
 from rich.table import Table
 
 from rigidfleet.assessment import assess
-from rigidfleet.assessment.measure import Fit
+from rigidfleet.assessment.fits import Fit
 from rigidfleet.formation import distance_geometry, shapes
 from rigidfleet.math import proximity, rigid_body
 from rigidfleet.mission import Mission, load_mission

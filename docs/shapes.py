@@ -14,7 +14,7 @@ from rigidfleet.formation.shapes import slots
 from rigidfleet.math import pid
 from rigidfleet.math.constraint_jacobian import filter_factors
 from rigidfleet.mission import Mission
-from rigidfleet.plotting import space
+from rigidfleet.plotting import sketches, space
 from rigidfleet.plotting.graph import graphs
 from rigidfleet.plotting.style import DASHES, FLOWN, GREY, INK, PALETTE
 from rigidfleet.rigidity import Kind, analyse, realisations
@@ -88,7 +88,7 @@ def folded_twin() -> Figure:
     for k, (p, name) in enumerate(((cube, "a cube of 18 edges"), (twin.slots, told))):
         ax = fig.add_axes((0.02 + 0.5 * k, 0.02, 0.46, 0.84))
         colours = [FLOWN] * len(edges)
-        space.draw_graph(ax, (p - p.mean(axis=0)) @ R.T, edges, colours, None)
+        sketches.draw_graph(ax, (p - p.mean(axis=0)) @ R.T, edges, colours, None)
         ax.set_title(name)
     return fig
 

@@ -12,7 +12,7 @@ import pytest
 from rich.console import Console
 
 from rigidfleet.assessment import SHAPE_TOLERANCE, CheckResult, Verdict, assess
-from rigidfleet.assessment.measure import Fit
+from rigidfleet.assessment.fits import Fit
 from rigidfleet.formation import distance_geometry, graphs, shapes
 from rigidfleet.math import attitude as att
 from rigidfleet.math.proximity import clearance, separation

@@ -21,7 +21,7 @@ from rigidfleet.errors import ResultError
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
 from rigidfleet.mission import Mission
-from rigidfleet.plotting import curves, space, style
+from rigidfleet.plotting import curves, sketches, space, style
 from rigidfleet.result import LABELS, VARIABLES, PhaseRecord, Result
 
 START = [[1.0, 6.0, 3.0], [8.0, 3.0, 3.0], [7.0, 6.0, 3.0]]
@@ -753,7 +753,7 @@ def test_a_formation_shows_its_graph(n, formation):
 def test_a_graph_without_slots_is_spread_out():
     """A chain of four distances is drawn as a line: each shortest path as long as it is."""
     result = a_flight(n=4, formation=CHAIN)
-    places, placed = space.sketch_places(result.mission, "shape")
+    places, placed = sketches.sketch_places(result.mission, "shape")
     assert not placed
     np.testing.assert_allclose(np.linalg.norm(np.diff(places, axis=0), axis=1), 4.0, atol=1e-6)
     assert np.linalg.norm(places[0] - places[3]) == pytest.approx(12.0)

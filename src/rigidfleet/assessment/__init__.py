@@ -11,8 +11,9 @@ count from 1.
 
 from pathlib import Path
 
-from rigidfleet.assessment.checks import all_checks, notes
+from rigidfleet.assessment.checks import all_checks
 from rigidfleet.assessment.measure import Measurements
+from rigidfleet.assessment.notes import notes
 from rigidfleet.assessment.outcome import (
     FLIPPED,
     SHAPE_TOLERANCE,

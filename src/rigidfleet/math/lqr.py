@@ -25,7 +25,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigidfleet.typing import Bools, Floats
+from rigidfleet.math import riccati
+from rigidfleet.typing import Floats
 
 # Cache key of an array: its shape and contents.
 Key = tuple[tuple[int, ...], bytes]
@@ -36,13 +37,6 @@ Response = tuple[Floats, Floats]
 # sweep, and often from phase to phase.
 _KEPT = 512
 
-# A weight counts as negative beyond this share of its greatest entry.
-_ROUNDING = 1e-12
-
-# Growth of a motion over a step up to which the doubled flow keeps half of its digits: they are lost with its square.
-_GROWTH = 1e4
-# Most steps of a horizon in which such a motion grows: about a second.
-_STEPS = 20_000
 
 # The double integrator.
 _A = np.array([[0.0, 1.0], [0.0, 0.0]])
@@ -74,20 +68,20 @@ def infinite_horizon(
                 " Q[0] > 0), or use a finite horizon"
             )
     # The closed loop has the stable half of the Hamiltonian's eigenvalues, which are +- each other.
-    H = _hamiltonian(F, G, W)
+    H = riccati.hamiltonian(F, G, W)
     modes = np.linalg.eigvals(H)
     slowest = np.abs(modes.real).min()
     start = np.eye(len(A))
-    if not _positive(W):
-        start = _stable_subspace(H)
+    if not riccati.positive(W):
+        start = riccati.stable_subspace(H)
     elif not slowest > 1e-12 * np.abs(modes).max():
         raise ValueError(
             "the Riccati equation has no stabilising solution to rounding: bring the magnitudes of"
             " the entries of Q and R closer together, or use a finite horizon"
         )
     # Beyond 40 of the slowest time constants, the cost to go no longer depends on its final value.
-    P = _cost_to_go(F, G, W, start, np.array(40.0 / slowest))
-    return _solve(R, B.T @ P + N.T), P
+    P = riccati.cost_to_go(F, G, W, start, np.array(40.0 / slowest))
+    return riccati.solve(R, B.T @ P + N.T), P
 
 
 def finite_horizon(
@@ -109,8 +103,8 @@ def finite_horizon(
     """
     A, B, Q, R, N = _system(A, B, Q, R, N)
     S = _weight("S", S, len(A))
-    P = _cost_to_go(*_reduced(A, B, Q, R, N), S, _times("time_to_go", time_to_go))
-    return P, _solve(R, B.T @ P + N.T)
+    P = riccati.cost_to_go(*_reduced(A, B, Q, R, N), S, _times("time_to_go", time_to_go))
+    return P, riccati.solve(R, B.T @ P + N.T)
 
 
 def closed_loop_response(
@@ -253,7 +247,9 @@ def knots(
 def _knots(T: float, Q_key: Key, R_key: Key, S_key: Key, tolerance: float) -> Floats:
     S = _array(S_key)
     _, _, Q, R, _ = _system(_A, _B, _array(Q_key), _array(R_key))
-    fastest = np.abs(np.linalg.eigvals(_hamiltonian(_A, _B @ _solve(R, _B.T), Q))).max()
+    fastest = np.abs(
+        np.linalg.eigvals(riccati.hamiltonian(_A, _B @ riccati.solve(R, _B.T), Q))
+    ).max()
     inside = np.array([0.25, 0.5, 0.75])
     powers = np.arange(6)
     u = inside[:, None] ** powers
@@ -322,15 +318,8 @@ def _responses(*keys: Key) -> tuple[Floats, Floats]:
     t, T = _times("times", times), float(_times("T", T))
     if t.ndim != 1 or np.any(t > T * (1.0 + 1e-12)):
         raise ValueError(f"times must be a list of times between 0 and T = {T} s")
-    reduced = _reduced(A, B, Q, R, N)
-    tau = np.maximum(T - t, 0.0)
-    if _grows(*reduced, S, T):
-        P, x = (found[:-1] for found in _marched(*reduced, S, np.append(tau, T)))
-    else:
-        P = _doubled(*reduced, S, tau)
-        X, Phi, W, _ = _flow(*reduced, S, t, T)
-        x = _solve(np.eye(len(A)) + W @ (P - X), Phi)
-    return x, -_solve(R, (B.T @ P + N.T) @ x)
+    P, x = riccati.costs_and_states(*_reduced(A, B, Q, R, N), S, t, T)
+    return x, -riccati.solve(R, (B.T @ P + N.T) @ x)
 
 
 @lru_cache(_KEPT)
@@ -361,211 +350,14 @@ def _reduced(
     A: Floats, B: Floats, Q: Floats, R: Floats, N: Floats
 ) -> tuple[Floats, Floats, Floats]:
     """The same problem without N, for the input u + R^-1 N^T x: its A, B R^-1 B^T and Q."""
-    G = B @ _solve(R, B.T)
+    G = B @ riccati.solve(R, B.T)
     if not N.any():
         return A, G, Q
-    rest = Q - N @ _solve(R, N.T)
+    rest = Q - N @ riccati.solve(R, N.T)
     value, vector = np.linalg.eigh(0.5 * (rest + rest.T))
-    if -_ROUNDING * np.abs(Q).max() <= value[0] < 0.0:  # a zero with rounding error
+    if -riccati.ROUNDING * np.abs(Q).max() <= value[0] < 0.0:  # a zero with rounding error
         value = value.clip(min=0.0)
-    return A - B @ _solve(R, N.T), G, (vector * value) @ vector.T
-
-
-def _positive(weight: Floats) -> bool:
-    """Whether a weight is positive semi-definite, to rounding."""
-    return bool(np.linalg.eigvalsh(weight)[0] >= -_ROUNDING * np.abs(weight).max())
-
-
-def _cost_to_go(A: Floats, G: Floats, Q: Floats, S: Floats, tau: Floats) -> Floats:
-    """P (..., n, n) at times to go tau (...)."""
-    grows = _grows(A, G, Q, S, tau.max(initial=0.0))
-    return _marched(A, G, Q, S, tau)[0] if grows else _doubled(A, G, Q, S, tau)
-
-
-def _doubled(A: Floats, G: Floats, Q: Floats, S: Floats, tau: Floats) -> Floats:
-    """P (..., n, n) at times to go tau (...), from the flow of `_propagate`."""
-    X, Phi, W, V = _flow(A, G, Q, S, tau, tau.max(initial=0.0))
-    D = S - X
-    P = X + V + _transposed(Phi) @ _solve(np.eye(len(A)) + D @ W, D @ Phi)
-    return 0.5 * (P + _transposed(P))
-
-
-def _grows(A: Floats, G: Floats, Q: Floats, S: Floats, T: float) -> bool:
-    """Whether a motion that no weight sees grows over T so far that only small steps keep its digits.
-
-    Motions that are weighed end the growth themselves, on the way of the doublings.
-    """
-    if not np.linalg.eigvals(A).real.max() * T > math.log(_GROWTH):
-        return False
-    if not (_positive(Q) and _positive(S)):
-        return False
-    rate = _rate(A, G, Q)
-    stages = np.ldexp(T, -np.arange(math.ceil(math.log2(2.0 * rate * T)) + 1))
-    try:
-        with np.errstate(over="ignore", invalid="ignore"):
-            Phi = _propagate(A, G, Q, stages, rate)[0]
-    except np.linalg.LinAlgError:  # too great for any digits
-        return True
-    return not float(np.abs(Phi).max()) <= _GROWTH  # true for NaN
-
-
-def _marched(A: Floats, G: Floats, Q: Floats, S: Floats, tau: Floats) -> tuple[Floats, Floats]:
-    """P and x (..., n, n) at times to go tau (...), in steps that each keep P positive.
-
-    Columns of x are the states that each state alone, at the greatest time to go, leads to. Raises ValueError if there
-    are too many steps.
-    """
-    identity, rate = np.eye(len(A)), _rate(A, G, Q)
-    P, costs, moves = S, [], []
-    steps = 0
-    every, which = np.unique(tau, return_inverse=True)
-    for span in np.diff(every, prepend=0.0):
-        left = max(1, math.ceil(span * rate / math.log(_GROWTH)))
-        Phi, W, V, _ = _propagate(A, G, Q, np.array(span / left), rate)
-        move = identity
-        while left:
-            value, vector = np.linalg.eigh(P)
-            root = vector * np.sqrt(value.clip(min=0.0))
-            closed, reach = _solve(identity + W @ P, Phi), root.T @ Phi
-            last, P = P, V + reach.T @ _solve(identity + root.T @ W @ root, reach)
-            P = 0.5 * (P + P.T)
-            # At a stationary P, all further steps are the same.
-            done = left if np.abs(P - last).max() <= np.finfo(float).eps * np.abs(P).max() else 1
-            move = move @ np.linalg.matrix_power(closed, done)
-            left, steps = left - done, steps + 1
-            if steps > _STEPS:
-                raise ValueError(
-                    f"the cost over {every[-1]:.6g} s cannot be computed: a motion grows that no weight sees, while"
-                    " another one changes too slowly. Weigh the first in Q, or shorten the horizon"
-                )
-        costs.append(P)
-        moves.append(move)
-    states = [identity]
-    for move in moves[:0:-1]:  # each leads x at its time to go to x at the one before
-        states.append(move @ states[-1])
-    where = which.reshape(tau.shape)
-    return np.array(costs)[where], np.array(states[::-1])[where]
-
-
-def _flow(
-    A: Floats, G: Floats, Q: Floats, S: Floats, tau: Floats, T: float
-) -> tuple[Floats, Floats, Floats, Floats]:
-    """X (n, n) and Phi, W, V (..., n, n) over tau (...), as `_propagate` has them of P - X.
-
-    Raises ValueError if P, starting from S, does not exist at all times to go up to T.
-    """
-    if _positive(Q) and _positive(S):
-        return np.zeros_like(Q), *_propagate(A, G, Q, tau, _rate(A, G, Q))[:3]
-    # P - S starts from zero. Its Phi, W and V therefore exist exactly as long as P does.
-    GS = G @ S
-    A, Q = A - GS, A.T @ S + S @ A - S @ GS + Q
-    rate = float(np.linalg.norm(A, 2) + np.sqrt(np.linalg.norm(G, 2) * np.linalg.norm(Q, 2)))
-
-    def escaped(t: float) -> bool:
-        return bool(_propagate(A, G, Q, np.array(t), rate)[3])
-
-    if escaped(T):
-        low, high = 0.0, T
-        while high - low > 1e-12 * high:
-            middle = 0.5 * (low + high)
-            low, high = (low, middle) if escaped(middle) else (middle, high)
-        raise ValueError(
-            f"the cost has no minimum over {high:.10g} s or longer: its Riccati equation grows"
-            f" beyond all bounds at a time to go of {high:.10g} s. Shorten the horizon, or make Q or S"
-            " greater or N less, so that the cost cannot fall below all bounds"
-        )
-    return S, *_propagate(A, G, Q, tau, rate)[:3]
-
-
-def _stable_subspace(H: Floats) -> Floats:
-    """P (n, n), to some digits, from the stable half of a Hamiltonian matrix (2 n, 2 n).
-
-    Raises ValueError if an eigenvalue lies on the imaginary axis, within rounding of the matrix.
-    """
-    from scipy.linalg import schur
-
-    n = len(H) // 2
-    near = min(np.linalg.eigvals(H), key=lambda s: abs(s.real))
-    # Rounding moves a double eigenvalue far off the axis, so the distance to a singular matrix decides.
-    g, q = np.linalg.norm(H[:n, n:], 2), np.linalg.norm(H[n:, :n], 2)
-    scale = np.repeat([1.0, math.sqrt(q / g) if g > 0.0 else 1.0], n)
-    balanced = H * scale / scale[:, None]
-    least = np.linalg.svd(balanced - 1j * near.imag * np.eye(2 * n), compute_uv=False)[-1]
-    if not least > 8 * n * np.finfo(float).eps * np.linalg.norm(balanced, 2):
-        raise ValueError(
-            "the cost has no minimum over an infinite horizon: its Hamiltonian matrix has the"
-            f" eigenvalue {abs(near.imag):.6g}i on the imaginary axis, so an oscillation at"
-            f" {abs(near.imag):.6g} rad/s has zero or negative cost. Increase Q or reduce N, or use a"
-            " finite horizon"
-        )
-    vectors = schur(balanced, sort="lhp")[1][:, :n] * scale[:, None]
-    P = _solve(vectors[:n].T, vectors[n:].T)
-    return 0.5 * (P + P.T)
-
-
-def _rate(A: Floats, G: Floats, Q: Floats) -> float:
-    """Rate of the fastest motion of a Hamiltonian system [1/s]."""
-    return float(np.abs(np.linalg.eigvals(_hamiltonian(A, G, Q))).max())
-
-
-def _propagate(
-    A: Floats, G: Floats, Q: Floats, tau: Floats, rate: float
-) -> tuple[Floats, Floats, Floats, Bools]:
-    """Phi, W, V (..., n, n): x(tau) = Phi x(0) - W y(tau), y(0) = V x(0) + Phi^T y(tau).
-
-    The flow of the Hamiltonian system x' = A x - G y, y' = -Q x - A^T y over tau, solved for the unknowns of its
-    boundary value problem. The exponential would grow as fast as y does, but these matrices do not: W and V
-    grow monotonically from zero, and Phi tends to the transition matrix of the closed loop.
-
-    Also returns whether the solution V of the Riccati equation, which starts from zero, has become unbounded by
-    tau (...). This happens only for an indefinite Q; the three matrices are then meaningless.
-    """
-    n = len(A)
-    identity = np.eye(n)
-    backward = -_hamiltonian(A, G, Q)
-    with np.errstate(divide="ignore"):
-        doublings = np.ceil(np.log2(2.0 * rate * tau)).clip(min=0.0)
-    # A Taylor series, because each entry keeps its own leading power of the step. A Pade approximant
-    # would round the small entries (W begins with the third power) relative to the large ones.
-    step = backward * (tau * 0.5**doublings)[..., None, None]
-    E = term = step
-    for k in range(2, 25):
-        term = term @ step / k
-        E = E + term
-    # D = Phi - 1 in place of Phi: squaring a matrix near 1 doubles its rounding error each time.
-    D = -_solve(identity + E[..., :n, :n], E[..., :n, :n])
-    W = E[..., :n, n:] + D @ E[..., :n, n:]
-    V = E[..., n:, :n] + E[..., n:, :n] @ D
-    escaped, watched = np.zeros(tau.shape, dtype=bool), not _positive(Q)
-    for k in range(int(doublings.max(initial=0.0))):
-        more = doublings > k
-        if watched:
-            # Over a further step V becomes (1 + V w)^-1 V and more, w from 0 to W: as w only grows, it has
-            # passed a singular 1 + V w by the end if and only if 1 + V W has an eigenvalue that is not positive.
-            more &= ~escaped
-            passed = np.linalg.eigvals(W[more] @ V[more]).real.min(axis=-1, initial=0.0) <= -1.0
-            escaped[more] = passed
-            more &= ~escaped
-        d, w, v = D[more], W[more], V[more]
-        phi, wv = identity + d, w @ v
-        turn = _solve(identity + wv, np.concatenate([wv, w @ _transposed(phi)], axis=-1))
-        loss, reach = turn[..., :n], turn[..., n:]
-        D[more] = 2.0 * d + d @ d - phi @ loss @ phi
-        W[more] = w + phi @ reach
-        V[more] = v + _transposed(phi) @ v @ (phi - loss @ phi)
-    return identity + D, W, V, escaped
-
-
-def _hamiltonian(A: Floats, G: Floats, Q: Floats) -> Floats:
-    return np.block([[A, -G], [-Q, -A.T]])
-
-
-def _solve(M: Floats, b: Floats) -> Floats:
-    return np.linalg.solve(M, b).astype(float, copy=False)
-
-
-def _transposed(M: Floats) -> Floats:
-    return np.swapaxes(M, -1, -2)
+    return A - B @ riccati.solve(R, N.T), G, (vector * value) @ vector.T
 
 
 def _system(

@@ -7,14 +7,8 @@ the entries in a key such as `phases[3].until`. Arrays that `Mission` returns co
 
 from rigidfleet.mission.describe import counted, ending, goal
 from rigidfleet.mission.kinds import KINDS, Establish, Fly, Hold, Phase, Reshape, Settle, Turn
-from rigidfleet.mission.model import (
-    Mission,
-    as_mission,
-    json_schema,
-    load_mission,
-    mission_names,
-    mission_text,
-)
+from rigidfleet.mission.loading import as_mission, json_schema, load_mission
+from rigidfleet.mission.model import Mission
 from rigidfleet.mission.obstacles import (
     Box,
     Cylinder,
@@ -33,6 +27,7 @@ from rigidfleet.mission.schema import (
     Lqr,
     Regulator,
 )
+from rigidfleet.mission.text import mission_names, mission_text
 
 __all__ = [
     "KINDS",

@@ -1,18 +1,15 @@
-"""Read missions from TOML text, from plain data, from files and from the package."""
+"""The mission: its data as checked, and what follows from them, as arrays."""
 
 from __future__ import annotations
 
 import tomllib
 from collections.abc import Mapping
 from functools import cached_property
-from importlib import resources
-from pathlib import Path
 from typing import Any, Literal, NamedTuple, Self
 
 import numpy as np
 from pydantic import PrivateAttr
 
-from rigidfleet._common.arguments import as_path
 from rigidfleet._common.kept import kept
 from rigidfleet._common.text import agent_names
 from rigidfleet._common.toml import to_toml
@@ -21,19 +18,17 @@ from rigidfleet.formation.assignment import assigned, squashed
 from rigidfleet.formation.distance_geometry import distances
 from rigidfleet.math import constraint_jacobian
 from rigidfleet.math.attitude import dcm_from_euler
-from rigidfleet.mission import bounds
 from rigidfleet.mission.changes import scaled, told_apart
 from rigidfleet.mission.check import check
 from rigidfleet.mission.describe import counted
-from rigidfleet.mission.files import completed, digests
-from rigidfleet.mission.findings import near
+from rigidfleet.mission.files import digests
 from rigidfleet.mission.kinds import Establish, Phase
 from rigidfleet.mission.phases import latest_end
-from rigidfleet.mission.schema import DRAG, Contents, Start
+from rigidfleet.mission.schema import DRAG, Contents
+from rigidfleet.mission.text import parse_toml, unread
 from rigidfleet.mission.vehicles import VehicleModel, resolve
 from rigidfleet.typing import Bools, Floats, Ints
 
-_SHIPPED = resources.files("rigidfleet") / "missions"
 #: Smallest and largest damping that "auto" uses. Below, rounding errors show; docs/robustness.md has the measurements.
 _DAMPING = (1e-5, 0.03)
 #: Maximum number of equations for which "auto" computes eigenvalues; beyond, it uses the largest damping.
@@ -146,7 +141,7 @@ class Mission(Contents):
             remedy = "use numbers, strings, lists and dicts"
             raise MissionError([Finding(origin, "", None, str(error), remedy)]) from None
         except RecursionError:
-            raise _unread(origin, "is nested too deeply", "use the keys of a mission") from None
+            raise unread(origin, "is nested too deeply", "use the keys of a mission") from None
         return cls.from_toml(text, origin)
 
     def rewritten(self, data: Mapping[str, Any], origin: str | None = None) -> Self:
@@ -519,146 +514,3 @@ def _damping(slots: Floats, edges: Ints, masses: Floats) -> float:
     """Damping "auto" of a formation held: slots (N, 3) [m], edges (m, 2) and masses (N,) [kg]."""
     index = constraint_jacobian.smallest_singular_value(slots[None], edges, masses)[0]
     return float(np.clip(index**2 / 4, *_DAMPING))
-
-
-def mission_names() -> list[str]:
-    """Names of the shipped missions, in alphabetical order."""
-    names = (entry.name for entry in _SHIPPED.iterdir())
-    return sorted(name.removesuffix(".toml") for name in names if name.endswith(".toml"))
-
-
-def mission_text(name: str) -> str:
-    """TOML text of a shipped mission.
-
-    Raises
-    ------
-    MissionError
-        There is no shipped mission of this name.
-    """
-    if name not in mission_names():
-        raise MissionError([_not_found(name)])
-    return (_SHIPPED / f"{name}.toml").read_text(encoding="utf-8")
-
-
-def load_mission(name_or_path: str | Path) -> Mission:
-    """Read and check a mission: a shipped one by its name, or a file.
-
-    The name of a shipped mission takes precedence over a file; write `./name` for the file.
-
-    Raises
-    ------
-    MissionError
-        There is no such mission, it cannot be read, or it has errors; `findings` has all of them.
-    """
-    if isinstance(name_or_path, str) and name_or_path in mission_names():
-        return Mission.from_toml(mission_text(name_or_path), name_or_path)
-    text, origin = read_text(name_or_path), str(name_or_path)
-    text = completed(text, Path(name_or_path))
-    return Mission.from_toml(text, origin)
-
-
-def as_mission(given: Mission | str | Path) -> Mission:
-    """Return the `Mission` that was given, or load it by its shipped name or path.
-
-    Raises
-    ------
-    TypeError
-        The argument is none of these.
-    MissionError
-        As `load_mission` does.
-    """
-    if isinstance(given, Mission):
-        return given
-    if isinstance(given, str | Path):
-        return load_mission(given)
-    raise wrong_type("a mission (a shipped name, a path or a Mission)", given)
-
-
-def json_schema() -> dict[str, Any]:
-    """JSON schema of the mission format for editors, with the unit and meaning of every key."""
-    draft = {"$schema": "https://json-schema.org/draft/2020-12/schema"}
-    schema = Mission.model_json_schema()
-    parts = schema["$defs"]
-    parts["Start"] = Start.model_json_schema()
-    # A shape of positions is replaced by its points before the model sees it, so the model does not have it.
-    position = parts["Agents"]["properties"]["position"]
-    listed = {key: position.pop(key) for key in ("type", "items", "minItems")}
-    position["anyOf"] = [listed, {"$ref": "#/$defs/Start"}, {"type": "string"}]
-    # So is the name of a file.
-    parts["Formation"]["properties"]["slots"]["anyOf"].append({"type": "string"})
-    return draft | schema
-
-
-def read_text(path: str | Path) -> str:
-    """Text of a mission file or a sweep file.
-
-    Raises
-    ------
-    MissionError
-        The file cannot be read.
-    """
-    origin = str(path)
-    as_path(path)  # a number would be an open file
-    try:
-        with open(path, "rb") as file:
-            data = file.read(bounds.BYTES + 1)
-    except FileNotFoundError:
-        raise MissionError([_not_found(origin)]) from None
-    except IsADirectoryError:
-        raise _unread(origin, "is a folder", "give the path of a mission file in it") from None
-    except PermissionError:
-        raise _unread(
-            origin, "cannot be read: permission denied", "change its permissions"
-        ) from None
-    except (OSError, ValueError) as error:
-        raise _unread(
-            origin, f"cannot be read ({error})", "give the path of a mission file"
-        ) from None
-    if len(data) > bounds.BYTES:
-        raise _unread(
-            origin,
-            f"is larger than {bounds.BYTES >> 20} MiB",
-            "give the path of a mission file (TOML)",
-        )
-    try:
-        return data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        remedy = "give the path of a mission file (TOML)" if b"\0" in data else "save it as UTF-8"
-        raise _unread(origin, f"is not UTF-8 text (byte {error.start + 1})", remedy) from None
-
-
-def _unread(origin: str, problem: str, remedy: str) -> MissionError:
-    return MissionError([Finding(origin, "", None, problem, remedy)])
-
-
-def _not_found(name: str) -> Finding:
-    known = mission_names()
-    remedy = near(Path(name).stem, known) or f"shipped missions: {', '.join(known)}"
-    return Finding(name, "", None, "no such file and no shipped mission of this name", remedy)
-
-
-def parse_toml(text: str, origin: str) -> dict[str, Any]:
-    """Parse TOML text.
-
-    Raises
-    ------
-    MissionError
-        The text is not valid TOML or exceeds the bounds on the text of a mission.
-    """
-    if beyond := bounds.excess(text):
-        raise _unread(origin, beyond, "reduce it; docs/missions.md lists the bounds")
-    try:
-        return tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        problem, remedy = (
-            f"is not valid TOML: {error}",
-            "correct the line; toml.io describes the format",
-        )
-    except ValueError as error:  # a number of thousands of digits
-        problem, remedy = (
-            f"cannot be read as TOML: {error}",
-            "correct it; toml.io describes the format",
-        )
-    except RecursionError:
-        problem, remedy = "is nested too deeply", "use the keys of a mission"
-    raise _unread(origin, problem, remedy)

@@ -46,8 +46,9 @@ from rigidfleet.mission import Mission, Phase, Regulator, Settle, bounds
 from rigidfleet.mission.kinds import seconds
 from rigidfleet.mission.schema import Constraint, IntegratorOptions
 from rigidfleet.planning import solvers
+from rigidfleet.planning.body_trajectories import passed
 from rigidfleet.planning.certificate import Certificate, certified
-from rigidfleet.planning.courses import course, lifted, passed
+from rigidfleet.planning.courses import course, lifted
 from rigidfleet.planning.disturbances import without
 from rigidfleet.planning.reference import (
     PhaseState,
@@ -270,11 +271,11 @@ def plan_phase(
     if shaping is None and now.blend is not None:
         reference = now.blend
 
-    goal, arrival, flight = course(mission, phase, now, t_end)
+    goal, arrival, trajectory = course(mission, phase, now, t_end)
     motion, feedback = _REST, _NO_FEEDBACK
     if phase.control == "tracking":
-        assert flight is not None  # attached above
-        motion = flight.motion()
+        assert trajectory is not None  # attached above
+        motion = trajectory.motion()
     elif phase.control == "body":
         assert goal is not None
         feedback = _feedback(mission, goal, now.t, arrival, moves=phase.moves)
@@ -310,7 +311,7 @@ def plan_phase(
         constraint=mission.constraint, integrator=mission.integrator,
         damping=partial(mission.damping, held), lost_at=mission.lost_at, masses=masses,
         radius=mission.fleet.radius, before=before_switch, links_lost=mission.links_lost, blend=reference,
-        through=passed(flight), smooth=mission.smooth or mission.on_loss != "continue",
+        through=passed(trajectory), smooth=mission.smooth or mission.on_loss != "continue",
     )  # fmt: skip
     lost = np.zeros(len(masses), dtype=np.bool_) if now.lost is None else now.lost
     parted = plan.links_lost[1] <= now.t

@@ -175,9 +175,9 @@ def leg(mission: Mission, phase: Phase, now: PhaseState) -> Leg | None:
         after = replace(now, slots=slots, pose=None, frame=frame)
     else:
         assert now.slots is not None  # attached above
-        goal, _, flight = course(mission, phase, now, t_end)
-        assert flight is not None
-        motion, dp, slots = flight.motion(), 0.0 * now.slots, now.slots
+        goal, _, trajectory = course(mission, phase, now, t_end)
+        assert trajectory is not None
+        motion, dp, slots = trajectory.motion(), 0.0 * now.slots, now.slots
         if shaping is not None and target is not None:
             dp, turn = align_slots(now.slots, target, masses, turned)
             slots = target

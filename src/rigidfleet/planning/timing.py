@@ -15,7 +15,8 @@ from rigidfleet.mission import Fly, Mission, Phase
 from rigidfleet.mission.kinds import Orbit, Shaping, Steering, Vertical
 from rigidfleet.mission.values import AUTO
 from rigidfleet.planning import ways
-from rigidfleet.planning.courses import SmoothFlight, course, misled
+from rigidfleet.planning.body_trajectories import SmoothTrajectory
+from rigidfleet.planning.courses import course, misled
 from rigidfleet.planning.limits import Reached, limits_of, reached
 from rigidfleet.planning.preview import Leg, at_start, leg
 from rigidfleet.planning.reference import PhaseState, attach, slots_about_cm
@@ -237,9 +238,9 @@ def _shared_out(mission: Mission, phase: Phase, now: PhaseState) -> Phase:
     masses = mission.fleet.mass
     _, now, _ = attach(mission, phase, now, masses, slots_about_cm(mission, now.formation, masses))
     end = now.t + _arrival(phase)
-    flight = course(mission, phase.model_copy(update=_until(phase)), now, end).flight
-    assert isinstance(flight, SmoothFlight)
-    times = flight.times()[1:-1].tolist()
+    trajectory = course(mission, phase.model_copy(update=_until(phase)), now, end).trajectory
+    assert isinstance(trajectory, SmoothTrajectory)
+    times = trajectory.times()[1:-1].tolist()
     through = zip(phase.through, times, strict=True)
     shared = tuple(at.model_copy(update={"time": round(t, 6)}) for at, t in through)
     return phase.model_copy(update={"through": shared})

@@ -32,7 +32,8 @@ from rigidfleet.plotting.curves import (
 from rigidfleet.plotting.operation import leaves_ground, operation
 from rigidfleet.plotting.page import summary
 from rigidfleet.plotting.quadrotors import has_rotors, rotors, vehicles
-from rigidfleet.plotting.space import formations, trajectory
+from rigidfleet.plotting.sketches import formations
+from rigidfleet.plotting.space import trajectory
 from rigidfleet.plotting.style import agent_colours, settings
 from rigidfleet.plotting.style import titles as shown_titles
 from rigidfleet.result import Result, as_result

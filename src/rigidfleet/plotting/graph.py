@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rigidfleet.formation import distance_geometry
-from rigidfleet.plotting import space
+from rigidfleet.plotting import sketches, space
 from rigidfleet.plotting import style as st
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ def draw_graphs(mission: Mission, judged: Mapping[str, Rigidity | None], path: P
 
 
 def _draw(ax: Axes, mission: Mission, name: str, rigidity: Rigidity | None) -> None:
-    p, placed = space.sketch_places(mission, name)
+    p, placed = sketches.sketch_places(mission, name)
     p = p - p.mean(axis=0)
     edges, lengths = mission.formation_edges(name), mission.formation_distances(name)
     extent = float(np.ptp(p)) or 1.0
@@ -77,7 +77,7 @@ def _draw(ax: Axes, mission: Mission, name: str, rigidity: Rigidity | None) -> N
     colours = [st.FLOWN if k in redundant else st.GREY for k in range(len(edges))]
     dashed = [k in redundant for k in range(len(edges))]
     few = len(edges) <= 12
-    space.draw_graph(ax, p @ R.T, edges, colours, lengths if few else None, dashed=dashed)
+    sketches.draw_graph(ax, p @ R.T, edges, colours, lengths if few else None, dashed=dashed)
     told = f"{len(edges)} edges" + ("" if placed else "; their distances fix no positions")
     if rigidity is not None:
         told = f"{rigidity.rigidity_class}, rank {rigidity.rank} of {rigidity.needed}, {told}"

@@ -1,17 +1,15 @@
-"""Figures in space: the trajectory among the obstacles, and the formations' graphs."""
+"""The figure of the trajectory among the obstacles, in space and from above."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from rigidfleet.formation import distance_geometry
-from rigidfleet.plotting import curves, solids
+from rigidfleet.plotting import solids
 from rigidfleet.plotting import style as st
 from rigidfleet.plotting.style import styled
 from rigidfleet.result import Result
@@ -22,7 +20,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from mpl_toolkits.mplot3d import Axes3D
 
-    from rigidfleet.mission import Mission
 
 _BOX = solids.COLOUR
 _GROUND = "#E9E6DF"
@@ -172,9 +169,9 @@ def _draw_paths(ax: Axes, result: Result, view: Scene, axes: int) -> None:
         path: dict[str, Any] = {"color": colour, "linewidth": 0.8, "alpha": 0.9, "zorder": 3}
         ax.plot(*view.paths[:, i, :axes].T, **path, gid=f"agent-{i + 1}")
         r = result.position[shots, i, :axes].T
-        ax.plot(*r, **_dot(colour, 3), zorder=5)
-        ax.plot(*r[:, :1], **_dot(colour, 5, hollow=True), zorder=6, gid="start")
-        ax.plot(*r[:, -1:], **_dot(colour, 5, marker="s"), zorder=6, gid="end")
+        ax.plot(*r, **dot(colour, 3), zorder=5)
+        ax.plot(*r[:, :1], **dot(colour, 5, hollow=True), zorder=6, gid="start")
+        ax.plot(*r[:, -1:], **dot(colour, 5, marker="s"), zorder=6, gid="end")
     for _, place in view.waypoints:
         ax.plot(*place[:axes, None], **_CROSS, zorder=7)
 
@@ -195,7 +192,8 @@ def _draw_many(ax: Axes, result: Result, view: Scene, axes: int) -> None:
         ax.plot(*place[:axes, None], **_CROSS, zorder=7)
 
 
-def _dot(colour: str, size: float, *, hollow: bool = False, marker: str = "o") -> dict[str, Any]:
+def dot(colour: str, size: float, *, hollow: bool = False, marker: str = "o") -> dict[str, Any]:
+    """Look of a marker of a size [points], filled or hollow."""
     return {
         "linestyle": "", "marker": marker, "markersize": size,
         "markerfacecolor": "white" if hollow else colour,
@@ -384,8 +382,8 @@ def handles(result: Result, view: Scene) -> list[Any]:
     from matplotlib.lines import Line2D
 
     marks = [
-        Line2D([], [], **_dot(st.GREY, 5, hollow=True), label="start"),
-        Line2D([], [], **_dot(st.GREY, 5, marker="s"), label="end"),
+        Line2D([], [], **dot(st.GREY, 5, hollow=True), label="start"),
+        Line2D([], [], **dot(st.GREY, 5, marker="s"), label="end"),
     ]
     if view.waypoints:
         marks.append(Line2D([], [], **_CROSS, label="waypoint"))
@@ -416,220 +414,9 @@ def trajectory(result: Result) -> Figure:
     return fig
 
 
-# -- formations --------------------------------------------------------------------------------------
-
-
-def sketch_places(mission: Mission, name: str) -> tuple[Floats, bool]:
-    """Positions (N, 3) [m] at which a formation's graph is drawn, and whether they are its slots.
-
-    If the distances fix no shape, classical scaling of the shortest paths in the graph gives positions.
-    """
-    slots = mission.formation_slots(name)
-    if slots is not None:
-        return slots, True
-    n, edges = mission.n_agents, mission.formation_edges(name)
-    lengths = mission.formation_distances(name)
-    d = np.full((n, n), np.inf)
-    np.fill_diagonal(d, 0.0)
-    d[edges[:, 0], edges[:, 1]] = d[edges[:, 1], edges[:, 0]] = lengths
-    for k in range(n):
-        d = np.minimum(d, d[:, k : k + 1] + d[k : k + 1])
-    # Between components that no edge joins
-    d[np.isinf(d)] = 1.5 * d[np.isfinite(d)].max(initial=1.0)
-    centring = np.eye(n) - 1 / n
-    value, vector = np.linalg.eigh(-0.5 * centring @ d**2 @ centring)
-    places = np.zeros((n, 3))
-    places[:, : min(n, 3)] = (vector * np.sqrt(np.maximum(value, 0)))[:, ::-1][:, :3]
-    return places, False
-
-
-@styled
-def formations(result: Result) -> Figure:
-    """Constraint graph and body axes of each formation of the mission."""
-    from rigidfleet.plotting.figure import Figure
-
-    names = list(result.mission.formations)
-    columns = min(max(len(names), 1), 3)
-    rows = math.ceil(max(len(names), 1) / columns)
-    fig = Figure(figsize=(max(3.4 * columns, 6.0), 0.5 + 3.5 * rows))
-    fig.settings = st.settings
-    st.head(fig, result, "Formations")
-    if not names:
-        fig.text(0.5, 0.45, "the mission has no formation", ha="center", color=st.GREY)
-    legend = len(result.edges) > curves.SINGLE and bool(names)
-    top, bottom = 1 - 0.45 / fig.get_figheight(), 0.7 * legend / fig.get_figheight()
-    for k, name in enumerate(names):
-        row, column = divmod(k, columns)
-        height = (top - bottom) / rows
-        rect = (column / columns, top - (row + 1) * height, 1 / columns, height)
-        _sketch(fig, rect, result, name)
-    if legend:
-        entries = curves.edge_handles(result)
-        fig.legend(
-            handles=entries,
-            loc="lower center",
-            ncols=min(int(fig.get_figwidth() / 2.2), len(entries)),
-            borderaxespad=0.8,
-        )
-    return fig
-
-
-def _sketch(
-    fig: Figure, rect: tuple[float, float, float, float], result: Result, name: str
-) -> None:
-    mission = result.mission
-    p, placed = sketch_places(mission, name)
-    edges = mission.formation_edges(name)
-    lengths = mission.formation_distances(name)
-    masses = mission.fleet.mass
-    origin = masses @ p / masses.sum()
-    flat = distance_geometry.dimension(p, 1e-3) < 3 and float(np.ptp(p[:, 2])) < 1e-3 * max(
-        1e-9, float(np.ptp(p))
-    )
-    x, y, w, h = rect
-    given = mission.formations[name]
-    words = given.shape or ("slots" if given.slots is not None else "by distances")
-    fig.text(
-        x + w / 2, y + 0.95 * h, st.clean(name), ha="center", fontweight="bold", parse_math=False
-    )
-    told = f"{words}, {len(edges)} edge{'s' if len(edges) != 1 else ''}"
-    told += "" if placed else "; their distances fix no positions"
-    fig.text(x + w / 2, y + 0.89 * h, told, ha="center", fontsize=7.5, color=st.GREY)
-    ax = fig.add_axes((x + 0.06 * w, y + 0.04 * h, 0.88 * w, 0.8 * h))
-    turned = p - origin
-    axes = np.eye(3)
-    if not flat:
-        R = camera(-70.0, 16.0)
-        turned, axes = turned @ R.T, axes @ R.T
-    colours = {k: g.colour for g in curves.edge_groups(result) for k in g.edges}
-    index = {edge: k for k, edge in enumerate(map(tuple, result.edges.tolist()))}
-    of_edge = [colours[index[edge]] for edge in map(tuple, edges.tolist())]
-    draw_graph(ax, turned, edges, of_edge, lengths if len(edges) <= curves.SINGLE else None)
-    if placed and len(p) > 1:
-        reach = float(np.linalg.norm(turned, axis=1).max())
-        taken = bool(np.linalg.norm(turned, axis=1).min() < 0.1 * reach)
-        length = (0.3, 0.3, 0.42, 0.5)[distance_geometry.dimension(p, 1e-3)] * reach
-        _draw_axes(ax, axes, length, taken=taken)
-
-
-def draw_graph(
-    ax: Axes,
-    p: Floats,
-    edges: Any,
-    colours: list[str],
-    lengths: Floats | None,
-    *,
-    dashed: Sequence[bool] = (),
-) -> None:
-    """Draw agents at p (N, 3), seen along the last axis, as numbered discs, with edges and their lengths [m]."""
-    n = len(p)
-    room = 1.25 * float(np.abs(p[:, :2]).max()) or 1.0
-    ax.set(xlim=(-room, room), ylim=(-room, room), aspect="equal")
-    ax.axis("off")
-    if n > st.MANY:
-        _draw_mesh(ax, p, edges, colours)
-        return
-    for e in np.argsort(p[edges, 2].mean(axis=1)) if len(edges) else []:
-        i, j = edges[e]
-        a, b = p[i], p[j]
-        # In the middle of a diagonal, the label would cover other edges and the body axes.
-        middle = a + (b - a) * (0.5 if np.hypot(*(a + b)[:2]) > 0.3 * room else 0.28)
-        others = np.delete(p, [i, j], axis=0)
-        path = np.array([a, b])[:, :2]
-        if len(others) and _distance_to(others, a, b).min() < 0.02 * room:
-            # A straight edge would run through another agent.
-            across = np.array([a[1] - b[1], b[0] - a[0]]) * -0.22
-            s = np.linspace(0, 1, 40)[:, None]
-            path = (1 - s) * a[:2] + s * b[:2] + 4 * s * (1 - s) * across
-            middle = np.append((a + b)[:2] / 2 + across, 0.0)
-        dash: Any = st.DASHES if dashed and dashed[e] else "-"
-        look: dict[str, Any] = {"color": colours[e], "linewidth": 1.6, "linestyle": dash}
-        ax.plot(*path.T, **look, zorder=2, gid=f"edge-{i + 1}-{j + 1}")
-        if lengths is not None:
-            x, y = middle[:2]
-            ax.text(
-                x, y, f"{lengths[e]:.3g} m", fontsize=7.5, ha="center", va="center", zorder=3,
-                bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.0},
-            )  # fmt: skip
-    size = 14.0 if n <= 12 else 60.0 / math.sqrt(n)
-    for i in np.argsort(p[:, 2]):
-        colour = st.agent_colours(n)[i]
-        x, y = p[i, :2]
-        ax.plot(x, y, **_dot(colour, size), zorder=5, gid=f"agent-{i + 1}")
-        if size > 7:
-            ax.text(
-                x, y, str(i + 1), fontsize=0.6 * size, color=_readable_on(colour), ha="center",
-                va="center_baseline", zorder=6, fontweight="bold",
-            )  # fmt: skip
-
-
-def _draw_mesh(ax: Axes, p: Floats, edges: Any, colours: list[str]) -> None:
-    """Draw a graph of many agents, with the far parts first and fainter."""
-    from matplotlib.collections import LineCollection
-    from matplotlib.colors import to_rgba_array
-
-    depth = p[:, 2] - p[:, 2].min()
-    depth = (
-        0.15 + 0.85 * depth / max(float(depth.max()), 1e-9) if np.ptp(p[:, 2]) else 1 + 0 * depth
-    )
-    if len(edges):
-        near = depth[edges].mean(axis=1)
-        order = np.argsort(near)
-        look = to_rgba_array(colours)
-        look[:, 3] = near
-        lines = LineCollection(list(p[edges[order]][:, :, :2]), colors=look[order], linewidths=0.5)
-        lines.set_gid("edges")
-        ax.add_collection(lines)
-    order = np.argsort(p[:, 2])
-    dots = to_rgba_array(st.agent_colours(len(p)))
-    dots[:, 3] = depth
-    ax.scatter(*p[order, :2].T, s=2000 / len(p) + 1, c=dots[order], linewidths=0, zorder=3)
-
-
-def _draw_axes(ax: Axes, axes: Floats, length: float, *, taken: bool) -> None:
-    """Draw body axes from the centre of mass; rows of `axes` (3, 3), the last column towards the viewer.
-
-    An axis that points to the viewer is drawn as a ring with a dot, beside the centre if an agent has `taken` it.
-    """
-    tips = length * axes
-    for tip, name in zip(tips, "xyz", strict=True):
-        label = f"${name}_b$"
-        if np.hypot(*tip[:2]) < 1e-6 * length:
-            words = f"⊙ {label}" if taken else label
-            place: dict[str, Any] = {"textcoords": "offset points", "ha": "right", "va": "top"}
-            place["bbox"] = {"facecolor": "white", "edgecolor": "none", "pad": 0.5, "alpha": 0.8}
-            ax.annotate(words, (0, 0), (-9, -9), fontsize=9.5, gid="body-axis", zorder=7, **place)
-            if not taken:
-                ring: dict[str, Any] = {"markerfacecolor": "white", "markeredgecolor": st.INK}
-                ax.plot(0, 0, "o", markersize=9, zorder=7, **ring)
-                ax.plot(0, 0, "o", markersize=2.5, color=st.INK, zorder=8)
-            continue
-        ax.annotate(
-            "", tip[:2], (0, 0), zorder=4,
-            arrowprops={"arrowstyle": "-|>", "color": st.INK, "linewidth": 1.3, "shrinkA": 0, "shrinkB": 0},
-        )  # fmt: skip
-        ax.annotate(
-            label, 1.1 * tip[:2], ha="center", va="center", zorder=7, fontsize=9.5, gid="body-axis",
-            bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.5, "alpha": 0.8},
-        )  # fmt: skip
-
-
 def camera(azimuth: float, elevation: float) -> Floats:
     """Unit vectors right, up and towards the viewer (rows) of a camera at these angles [deg]."""
     a, e = math.radians(azimuth), math.radians(elevation)
     out = np.array([math.cos(a) * math.cos(e), math.sin(a) * math.cos(e), math.sin(e)])
     right = np.array([-math.sin(a), math.cos(a), 0.0])
     return np.array([right, np.cross(out, right), out])
-
-
-def _distance_to(points: Floats, a: Floats, b: Floats) -> Floats:
-    """Distances of points (n, 3) from the segment a b."""
-    along = b - a
-    s = np.clip((points - a) @ along / max(float(along @ along), 1e-300), 0.0, 1.0)
-    return np.linalg.norm(points - a - s[:, None] * along, axis=1)
-
-
-def _readable_on(colour: str) -> str:
-    from matplotlib.colors import to_rgb
-
-    return "white" if float(np.dot(to_rgb(colour), (0.299, 0.587, 0.114))) < 0.6 else st.INK

@@ -23,8 +23,9 @@ from rigidfleet._version import __version__
 from rigidfleet.errors import MissionError, SweepError, wrong_type
 from rigidfleet.mission import Mission, load_mission, mission_names
 from rigidfleet.mission.findings import FindingCollector, Keys, unknown_key
-from rigidfleet.mission.model import as_mission, parse_toml, read_text
+from rigidfleet.mission.loading import as_mission
 from rigidfleet.mission.phases import kind, tables
+from rigidfleet.mission.text import parse_toml, read_text
 from rigidfleet.mission.values import Part
 from rigidfleet.sweep import keypaths
 from rigidfleet.sweep.variation import (

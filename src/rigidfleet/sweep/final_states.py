@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rigidfleet.assessment import SHAPE_TOLERANCE
-from rigidfleet.assessment.measure import THIN
+from rigidfleet.assessment.fits import THIN
 from rigidfleet.errors import MissionError
 from rigidfleet.formation.distance_geometry import dimension, distances
 from rigidfleet.formation.graphs import complete_graph

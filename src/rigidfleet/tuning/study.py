@@ -28,7 +28,7 @@ from rigidfleet._common.files import write_file
 from rigidfleet._version import __version__
 from rigidfleet.errors import ResultError, RigidfleetError
 from rigidfleet.mission import Mission
-from rigidfleet.mission.model import as_mission
+from rigidfleet.mission.loading import as_mission
 from rigidfleet.sweep import Sweep, SweepProgress, Table, fly
 from rigidfleet.sweep.record import BROKEN, REFUSED
 from rigidfleet.sweep.runner import cores

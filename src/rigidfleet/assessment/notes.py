@@ -1,0 +1,141 @@
+"""Notes of a verdict: facts that fail no check but that a reader should know."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from rigidfleet._common.text import agent_names
+from rigidfleet.assessment.avoidance import avoidance_notes
+from rigidfleet.assessment.checks import abandoned
+from rigidfleet.assessment.fits import angle_between
+from rigidfleet.assessment.measure import Measurements
+from rigidfleet.assessment.outcome import DIP, FLIPPED, PhaseVerdict, value
+from rigidfleet.typing import Floats
+
+#: A speed [m/s] and an extent [m] from which units are doubted.
+_FAST, _WIDE = 100.0, 20_000.0
+#: Greatest number of vehicles whose names are listed.
+_NAMED = 20
+
+
+def notes(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[str]:
+    """Facts that fail no check but that a reader should know."""
+    yield from _left(measured)
+    yield from _dips(measured)
+    yield from _turned_over(measured, phases)
+    yield from _fallen(measured)
+    pairs, times = measured.mission.links_lost
+    for (i, j), t in zip(pairs + 1, times, strict=True):
+        if t < measured.result.time[-1]:
+            yield f"the link {i}-{j} is lost at {t:.2f} s: after that, no edge joins agents {i} and {j}"
+    agents = measured.mission.agents
+    if agents.saturate:
+        full = measured.thrust >= np.array(agents.thrust_limit) * (1 - 1e-6)
+        if full.any():
+            who = agent_names(np.flatnonzero(full.any(axis=0)))
+            since = measured.first(full.max(axis=1))
+            yield f"the thrust of {who} saturates at its limit, first at {since:.2f} s"
+    yield from avoidance_notes(measured)
+    yield from _sampled(measured)
+    yield from _of_others(measured)
+
+
+def _of_others(measured: Measurements) -> Iterator[str]:
+    """What is judged of a flight that others made, how near its centres come, what is odd, and who is who."""
+    result = measured.result
+    if (how := result.interpolation) is None:
+        return
+    yield (
+        f"others made this flight: what is judged is its curve, {how}, also between samples; forces, thrust and "
+        "attitudes are not known"
+    )
+    radius, e = measured.mission.fleet.radius, measured.worst("separation", None, lambda x: -x)
+    if e is not None and np.ptp(radius) == 0.0:
+        far = value(e.value + 2.0 * float(radius[0]), "m")
+        yield f"the least distance centre to centre is {far}, {e.who} at {e.when:.2f} s"
+    fast, wide = measured.worst("speed", None), float(np.abs(result.position).max())
+    if wide > _WIDE or (fast is not None and fast.value > _FAST):
+        told = "" if fast is None else f"speeds reach {fast.value:,.0f} m/s and "
+        yield (
+            f"{told}positions {wide:,.0f} m: are these metres and seconds? A table may name other units in its "
+            "columns: x [mm], time [ms]"
+        )
+    yield from result.statistics.get("notes", [])
+    names = result.statistics.get("names", [])
+    known = (
+        [f"agent {k}" for k in range(1, len(names) + 1)],
+        [f"{k + 1}" for k in range(len(names))],
+    )
+    if names and names not in known:
+        more = f" and {len(names) - _NAMED:,} more" if len(names) > _NAMED else ""
+        yield f"agents from 1 on are {', '.join(names[:_NAMED])}{more}"
+
+
+def _left(measured: Measurements) -> Iterator[str]:
+    """Note each phase that was left for another one before it arrived."""
+    result = measured.result
+    yield from (check.message for check in abandoned(measured))
+    if result.mission.on_loss != "continue":
+        return  # no phase of such a mission was begun by hand
+    for phase, record in zip(result.mission.phases, result.phases, strict=False):
+        if phase.meets and record.target is None and record.settled is None:
+            yield f"'{record.name}' was left at {record.t_end:.2f} s, before its arrival, which is not judged"
+
+
+def _sampled(measured: Measurements) -> Iterator[str]:
+    """Note a record that does not say what happens between its samples."""
+    if any(not measured.result.phases[k].extremes for k in measured.flown):
+        step = float(np.diff(measured.result.time).max(initial=0.0))
+        yield (
+            f"only samples are judged, up to {step:.3g} s apart: the record does not say what happens"
+            " between them"
+        )
+
+
+def _fallen(measured: Measurements) -> Iterator[str]:
+    """Note where each lost vehicle falls."""
+    grounds = [o.height for o in measured.mission.obstacles if o.kind == "ground"]
+    radius = measured.mission.agents.radius
+    for i in np.flatnonzero(~measured.left[-1]):
+        r = measured.result.position[:, i]
+        words = f"agent {i + 1}, lost at {measured.mission.lost_at[i]:.2f} s,"
+        down = r[:, 2] <= max(grounds) + radius[i] if grounds else np.zeros(len(r), dtype=np.bool_)
+        down &= ~measured.left[:, i]
+        if down.any():
+            x, y, _ = r[-1]
+            yield f"{words} hits the ground at {measured.first(down):.2f} s and lies at ({x:z.1f}, {y:z.1f}) m"
+        else:
+            yield f"{words} is still falling at z = {r[-1, 2]:.1f} m when the flight ends"
+
+
+def _dips(measured: Measurements) -> Iterator[str]:
+    """Note agents below z = 0 if the mission has neither a ground nor a geofence."""
+    mission = measured.mission
+    if mission.limits.geofence is not None or any(o.kind == "ground" for o in mission.obstacles):
+        return
+    e = measured.height(lowest=True)
+    if e is not None and e.value < -DIP:
+        z = measured.of_left(measured.result.position[..., 2])
+        low = np.flatnonzero((z < -DIP).any(axis=0))
+        others = f" ({agent_names(low)} are below 0 at times)" if len(low) > 1 else ""
+        words = f"dips to z = {e.value:.2f} m at {e.when:.2f} s{others}"
+        yield f"{e.who} {words}; the mission has no ground"
+
+
+def _turned_over(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[str]:
+    """Note planar formations that turn over between phases while no attitude is commanded."""
+    seen: dict[str, tuple[Floats, float]] = {}
+    for i, p in enumerate(phases):
+        fit = measured.fits.get(i)
+        if fit is None or p.formation is None or fit.dimension != 2 or p.flip is not None:
+            continue
+        if not p.finished or fit.error > fit.limit:
+            continue
+        normal, since = seen.setdefault(p.formation, (fit.points, p.t_end))
+        if angle_between(normal, fit.points) > FLIPPED:
+            yield (
+                f"'{p.formation}' turns over between {since:.2f} s and {p.t_end:.2f} s;"
+                " no attitude is commanded"
+            )

@@ -1,0 +1,61 @@
+"""Load missions by name or path; their JSON schema."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from rigidfleet.errors import wrong_type
+from rigidfleet.mission.files import completed
+from rigidfleet.mission.model import Mission
+from rigidfleet.mission.schema import Start
+from rigidfleet.mission.text import mission_names, mission_text, read_text
+
+
+def load_mission(name_or_path: str | Path) -> Mission:
+    """Read and check a mission: a shipped one by its name, or a file.
+
+    The name of a shipped mission takes precedence over a file; write `./name` for the file.
+
+    Raises
+    ------
+    MissionError
+        There is no such mission, it cannot be read, or it has errors; `findings` has all of them.
+    """
+    if isinstance(name_or_path, str) and name_or_path in mission_names():
+        return Mission.from_toml(mission_text(name_or_path), name_or_path)
+    text, origin = read_text(name_or_path), str(name_or_path)
+    text = completed(text, Path(name_or_path))
+    return Mission.from_toml(text, origin)
+
+
+def as_mission(given: Mission | str | Path) -> Mission:
+    """Return the `Mission` that was given, or load it by its shipped name or path.
+
+    Raises
+    ------
+    TypeError
+        The argument is none of these.
+    MissionError
+        As `load_mission` does.
+    """
+    if isinstance(given, Mission):
+        return given
+    if isinstance(given, str | Path):
+        return load_mission(given)
+    raise wrong_type("a mission (a shipped name, a path or a Mission)", given)
+
+
+def json_schema() -> dict[str, Any]:
+    """JSON schema of the mission format for editors, with the unit and meaning of every key."""
+    draft = {"$schema": "https://json-schema.org/draft/2020-12/schema"}
+    schema = Mission.model_json_schema()
+    parts = schema["$defs"]
+    parts["Start"] = Start.model_json_schema()
+    # A shape of positions is replaced by its points before the model sees it, so the model does not have it.
+    position = parts["Agents"]["properties"]["position"]
+    listed = {key: position.pop(key) for key in ("type", "items", "minItems")}
+    position["anyOf"] = [listed, {"$ref": "#/$defs/Start"}, {"type": "string"}]
+    # So is the name of a file.
+    parts["Formation"]["properties"]["slots"]["anyOf"].append({"type": "string"})
+    return draft | schema

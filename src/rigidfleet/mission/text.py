@@ -1,0 +1,110 @@
+"""Texts of missions: the shipped ones, and those in files."""
+
+from __future__ import annotations
+
+import tomllib
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from rigidfleet._common.arguments import as_path
+from rigidfleet.errors import Finding, MissionError
+from rigidfleet.mission import bounds
+from rigidfleet.mission.findings import near
+
+_SHIPPED = resources.files("rigidfleet") / "missions"
+
+
+def mission_names() -> list[str]:
+    """Names of the shipped missions, in alphabetical order."""
+    names = (entry.name for entry in _SHIPPED.iterdir())
+    return sorted(name.removesuffix(".toml") for name in names if name.endswith(".toml"))
+
+
+def mission_text(name: str) -> str:
+    """TOML text of a shipped mission.
+
+    Raises
+    ------
+    MissionError
+        There is no shipped mission of this name.
+    """
+    if name not in mission_names():
+        raise MissionError([_not_found(name)])
+    return (_SHIPPED / f"{name}.toml").read_text(encoding="utf-8")
+
+
+def read_text(path: str | Path) -> str:
+    """Text of a mission file or a sweep file.
+
+    Raises
+    ------
+    MissionError
+        The file cannot be read.
+    """
+    origin = str(path)
+    as_path(path)  # a number would be an open file
+    try:
+        with open(path, "rb") as file:
+            data = file.read(bounds.BYTES + 1)
+    except FileNotFoundError:
+        raise MissionError([_not_found(origin)]) from None
+    except IsADirectoryError:
+        raise unread(origin, "is a folder", "give the path of a mission file in it") from None
+    except PermissionError:
+        raise unread(
+            origin, "cannot be read: permission denied", "change its permissions"
+        ) from None
+    except (OSError, ValueError) as error:
+        raise unread(
+            origin, f"cannot be read ({error})", "give the path of a mission file"
+        ) from None
+    if len(data) > bounds.BYTES:
+        raise unread(
+            origin,
+            f"is larger than {bounds.BYTES >> 20} MiB",
+            "give the path of a mission file (TOML)",
+        )
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        remedy = "give the path of a mission file (TOML)" if b"\0" in data else "save it as UTF-8"
+        raise unread(origin, f"is not UTF-8 text (byte {error.start + 1})", remedy) from None
+
+
+def unread(origin: str, problem: str, remedy: str) -> MissionError:
+    """The error of a text that cannot be read."""
+    return MissionError([Finding(origin, "", None, problem, remedy)])
+
+
+def _not_found(name: str) -> Finding:
+    known = mission_names()
+    remedy = near(Path(name).stem, known) or f"shipped missions: {', '.join(known)}"
+    return Finding(name, "", None, "no such file and no shipped mission of this name", remedy)
+
+
+def parse_toml(text: str, origin: str) -> dict[str, Any]:
+    """Parse TOML text.
+
+    Raises
+    ------
+    MissionError
+        The text is not valid TOML or exceeds the bounds on the text of a mission.
+    """
+    if beyond := bounds.excess(text):
+        raise unread(origin, beyond, "reduce it; docs/missions.md lists the bounds")
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        problem, remedy = (
+            f"is not valid TOML: {error}",
+            "correct the line; toml.io describes the format",
+        )
+    except ValueError as error:  # a number of thousands of digits
+        problem, remedy = (
+            f"cannot be read as TOML: {error}",
+            "correct it; toml.io describes the format",
+        )
+    except RecursionError:
+        problem, remedy = "is nested too deeply", "use the keys of a mission"
+    raise unread(origin, problem, remedy)
