@@ -969,7 +969,7 @@ def test_unreadable_files(monkeypatch):
     def refused(*_):
         raise PermissionError
 
-    monkeypatch.setattr("rigidfleet.mission.model.open", refused, raising=False)
+    monkeypatch.setattr("rigidfleet.mission.text.open", refused, raising=False)
     assert "cannot be read: permission denied" in fails(load_mission, "mine.toml").problem
 
 

@@ -15,7 +15,8 @@ from rigidfleet.cli import app as cli
 from rigidfleet.cli import codes
 from rigidfleet.errors import ResultError
 from rigidfleet.mission import mission_text
-from rigidfleet.result import _ATTRIBUTES, VARIABLES, Result
+from rigidfleet.result import VARIABLES, Result
+from rigidfleet.result.netcdf import ATTRIBUTES
 
 Change = Callable[[Any], None]
 
@@ -104,7 +105,7 @@ def declared(*shape: int) -> Change:
     return change
 
 
-@pytest.mark.parametrize("name", [n.replace("mission_text", "mission") for n in _ATTRIBUTES])
+@pytest.mark.parametrize("name", [n.replace("mission_text", "mission") for n in ATTRIBUTES])
 @pytest.mark.parametrize(
     "value",
     [0.5, np.arange(5), np.bytes_(b"\xff\xfe"), np.zeros((2, 2)), b"\xed\xb2\x80", np.complex128(1j),

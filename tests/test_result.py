@@ -146,7 +146,7 @@ def test_it_opens_in_xarray_in_one_line(tmp_path):
         np.testing.assert_array_equal(ds.time, result.time)  # seconds, not decoded into dates
         assert ds.attrs["mission"] == MISSION
         for name, variable in VARIABLES.items():
-            assert (ds[name].attrs["units"], ds[name].attrs["long_name"]) == variable[1:], name
+            assert (ds[name].attrs["units"], ds[name].attrs["long_name"]) == variable[1:3], name
 
 
 def test_an_edgeless_result_opens_in_xarray(tmp_path):
@@ -216,7 +216,7 @@ def test_a_foreign_netcdf_file_is_no_result(tmp_path):
 
 def test_a_newer_format_is_refused(tmp_path, monkeypatch):
     """A file of a later format is not half understood: a newer version is asked for."""
-    monkeypatch.setattr("rigidfleet.result.SCHEMA_VERSION", 5)
+    monkeypatch.setattr("rigidfleet.result.netcdf.SCHEMA_VERSION", 5)
     a_result().save(tmp_path / "a.nc")
     monkeypatch.undo()
     assert "Use a newer version" in refusal(tmp_path / "a.nc")
@@ -224,7 +224,7 @@ def test_a_newer_format_is_refused(tmp_path, monkeypatch):
 
 def test_an_older_format_is_refused(tmp_path, monkeypatch):
     """Words have changed since: the message names both formats, and says what to do."""
-    monkeypatch.setattr("rigidfleet.result.SCHEMA_VERSION", 3)
+    monkeypatch.setattr("rigidfleet.result.netcdf.SCHEMA_VERSION", 3)
     a_result().save(tmp_path / "a.nc")
     monkeypatch.undo()
     told = refusal(tmp_path / "a.nc")
@@ -328,8 +328,8 @@ def test_a_killed_save_leaves_the_old_file(tmp_path):
     path = tmp_path / "a.nc"
     path.write_bytes(b"old")
     code = (
-        "import os, sys; from pathlib import Path; from rigidfleet import result; "
-        "os.replace = lambda *a: os._exit(9); result.write_file(Path(sys.argv[1]), b'new')"
+        "import os, sys; from pathlib import Path; from rigidfleet._common import files; "
+        "os.replace = lambda *a: os._exit(9); files.write_file(Path(sys.argv[1]), b'new')"
     )
     assert subprocess.run([sys.executable, "-c", code, str(path)], check=False).returncode == 9
     assert path.read_bytes() == b"old"

@@ -6,8 +6,8 @@ import json
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
+from rigidfleet._common.plain import plain
 from rigidfleet._common.text import all_hold
-from rigidfleet.result import plain
 
 if TYPE_CHECKING:
     from rich.console import RenderableType

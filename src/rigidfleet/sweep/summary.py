@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rigidfleet.result import plain
+from rigidfleet._common.plain import plain
 from rigidfleet.sweep.metrics import METRICS, readable
 from rigidfleet.sweep.record import called
 from rigidfleet.sweep.store import Table

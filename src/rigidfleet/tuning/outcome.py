@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rigidfleet._common import markup
+from rigidfleet._common.plain import plain
 from rigidfleet.math.margins import Margins
-from rigidfleet.result import plain
 from rigidfleet.sweep.record import called
 from rigidfleet.tuning.gains import Gains
 

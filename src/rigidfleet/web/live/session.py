@@ -13,9 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from rigidfleet._common.plain import plain
 from rigidfleet.math import attitude as att
 from rigidfleet.mission import Mission
-from rigidfleet.result import Result, plain
+from rigidfleet.result import Result
 from rigidfleet.web.live.balls import AT_ONCE, FASTEST, LARGEST, SMALLEST
 from rigidfleet.web.live.guarding import guarded
 from rigidfleet.web.live.pilot import TICK, Pilot

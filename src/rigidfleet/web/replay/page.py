@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from importlib import resources
 from typing import Any
 
-from rigidfleet.result import plain
+from rigidfleet._common.plain import plain
 from rigidfleet.web.policy import content_policy
 from rigidfleet.web.template import templates
 

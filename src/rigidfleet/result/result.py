@@ -1,19 +1,10 @@
-"""The record of a flight: states, references and forces over time. It can be saved, loaded and exported.
-
-A `Result` contains NumPy arrays (radians, scalar-first quaternions, agents counted from 0). It is saved as one
-netCDF-4 file, in which each variable has its unit and its meaning. The file also contains the mission, so that the
-flight can be repeated from its result. NaN means "not active".
-
-h5netcdf reads and writes the file; it is imported only when needed.
-"""
+"""The record of a flight, of which arrays are made when they are first asked for."""
 
 from __future__ import annotations
 
-import io
-import json
 import math
 import platform
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import InitVar, asdict, dataclass, field, fields
 from datetime import UTC, datetime
 from functools import cache, cached_property
@@ -21,173 +12,28 @@ from importlib.metadata import PackageNotFoundError, version
 from inspect import Parameter, Signature
 from itertools import pairwise
 from pathlib import Path
-from typing import (
-    TYPE_CHECKING,
-    Annotated,
-    Any,
-    Literal,
-    NamedTuple,
-    Self,
-    TypedDict,
-    get_type_hints,
-)
+from typing import TYPE_CHECKING, Annotated, Any, Self, get_type_hints
 
 import numpy as np
 
 from rigidfleet._common import markup
+from rigidfleet._common.arguments import as_path
+from rigidfleet._common.files import write_file
 from rigidfleet.errors import MissionError, ResultError, wrong_type
+from rigidfleet.result.netcdf import ATTRIBUTES, LABELS, Variable, file_content, read_file
+from rigidfleet.result.phases import PAD, Extremum, PhaseRecord
 from rigidfleet.setpoints import Setpoints, at_rate, csv, of_motion
 from rigidfleet.typing import Bools, Floats, Ints
 
 if TYPE_CHECKING:
     from rigidfleet.mission import Mission
-from rigidfleet._common.arguments import as_path
-from rigidfleet._common.files import why_not, write_file
-
-#: Version of the file format. Files of any other version are rejected.
-SCHEMA_VERSION = 4
-
-
-class Variable(NamedTuple):
-    """Declaration of an array of a result: dimensions, unit and meaning."""
-
-    dims: tuple[str, ...]
-    units: str
-    text: str
 
 
 def _v(dims: str, units: str, text: str) -> Variable:
     return Variable(tuple(dims.split()), units, text)
 
 
-#: Labels of each dimension whose length does not depend on the flight.
-LABELS: dict[str, tuple[str, ...]] = {
-    "axis": ("x", "y", "z"),
-    "quaternion": ("w", "x", "y", "z"),
-    "wrench": ("Fx", "Fy", "Fz", "tau_x", "tau_y", "tau_z"),
-    "end": ("first", "second"),
-    "rotor": ("front left", "front right", "rear right", "rear left"),
-}
-
-
 _LABELLED = {dim: len(names) for dim, names in LABELS.items()}
-
-
-_Three = tuple[float, float, float]
-
-
-class _Moment(TypedDict):
-    time: float
-
-
-class Passed(_Moment):
-    """A point that the centre of mass is to pass, and when."""
-
-    position: _Three
-
-
-class Target(_Moment, total=False):
-    """Target of a phase: time of arrival [s] and the state commanded then, and points to pass on the way.
-
-    None: nothing is commanded.
-    """
-
-    position: _Three | None
-    velocity: _Three | None
-    attitude: tuple[float, float, float, float] | None
-    rates: _Three | None
-    through: list[Passed]
-
-
-class Planned(_Moment):
-    """Certificate of a phase: the least separation of the planned paths [m], its time [s], the two agents, the proof.
-
-    Agents are counted from 0. ``how`` is "closed form" or "conservative advancement".
-    """
-
-    separation: float
-    agents: tuple[int, int]
-    how: str
-
-
-class Statistics(TypedDict, total=False):
-    """Statistics of the integrator. Other keys are allowed."""
-
-    __others__: Any
-    evaluations: int
-    steps: int
-    rejected: int
-    wall_s: float
-    simulated_s: float
-    rtol: float
-    atol: float
-    solvers: dict[str, dict[str, float]]
-
-
-#: A vehicle that stays within this distance of an obstacle from the start, or until the end, stands on it [m].
-PAD = 0.1
-
-
-class Extremum(NamedTuple):
-    """Worst value of a quantity in continuous time, not only at samples.
-
-    ``who`` is the agent, or the first of two, counted from 0. ``other`` is the second agent or the obstacle, counted
-    from 0; -1 if there is neither.
-    """
-
-    value: float
-    time: float
-    who: int
-    other: int
-
-
-@dataclass(slots=True)
-class PhaseRecord:
-    """A phase as flown.
-
-    Attributes
-    ----------
-    name, kind, control : as in the mission; control is "open", "tracking" or "body"
-    formation : name of the formation that is held or approached; None if no formation has been established
-    t_start, t_end : mission time [s]
-    settled : whether a phase that ends by settling has settled; None for a phase that ends at a time
-    target : for phases with a goal of their own (fly, turn, orbit), and for establish phases with a commanded
-        attitude: {"time" [s], "position" [m], "velocity" [m/s], "attitude" quaternion, "rates" [rad/s]}. Entries other
-        than the time are None if nothing is commanded
-    abandoned : whether the loss of a vehicle or link ended it, before its own end
-    planned : certificate of the planned paths, before the flight: {"separation" [m], "time" [s], "agents" from 0,
-        "how"}. None if agents track no slots, or there is a single agent
-    extremes : worst values of the phase in continuous time, by name: separation, clearance, separation_below, lost
-        (distance of a lost vehicle to one that still flies), geofence (distance beyond it), lowest, highest [m];
-        speed [m/s]; acceleration [m/s^2]; thrust, thrust_margin (thrust minus its limit), constraint_force, tension
-        [N]; constraint [m]; of vehicles also rotor_force [N] (of the rotor nearest to its limit), tilt [rad],
-        tracking_error [m] and saturation (share of the phase). With [avoidance] also barrier and guard (greatest share
-        of the phase in which they acted on a vehicle, and since when), clock (by how much the phase ended later because
-        the formation waited [s], and since when) and body (share of the phase in which the formation deviated from its
-        path as a body), guarantee and clearance_guarantee (least margin
-        of stop segments [m]) and, where it was negative, the first such: guarantee_lost, clearance_guarantee_lost. If
-        vehicles stand on obstacles, clearance is also given for those that have stood on one since the start
-        (clearance_start), for those in flight (clearance_flight), and for those that stand on one until the end
-        (clearance_end). Empty if only samples are
-        known
-    """
-
-    name: str
-    kind: str
-    control: Literal["open", "tracking", "body"]
-    formation: str | None
-    t_start: float
-    t_end: float
-    settled: bool | None = None
-    target: Annotated[dict[str, Any] | None, Target] = None
-    planned: Annotated[dict[str, Any] | None, Planned] = None
-    extremes: Annotated[dict[str, Extremum], dict[str, tuple[float, float, int, int]]] = field(
-        default_factory=dict
-    )
-    abandoned: bool = False
-
-    def __post_init__(self) -> None:
-        self.extremes = {name: Extremum(*x) for name, x in (self.extremes or {}).items()}
 
 
 #: Names of fields, and a function that computes them when they are first asked for.
@@ -432,7 +278,7 @@ class Result:
                 sizes.update(zip(dims, given[key].shape, strict=False))
         for name in [name for name in given if name in _CHECKED]:
             value, (dims, dtype) = given[name], _CHECKED[name]
-            if value is None and name in _OPTIONAL:
+            if value is None and VARIABLES[name].optional:
                 continue
             if not (
                 type(value) is np.ndarray
@@ -484,8 +330,7 @@ class Result:
 
     def _set(self, name: str, given: Any, sizes: dict[str, int]) -> None:
         """Set an array whose dimensions agree with ``sizes``, which learns new ones."""
-        dims = VARIABLES[name].dims
-        dtype = np.int64 if name in _INTEGERS else np.float64
+        dims, dtype = _CHECKED[name]
         value = np.ascontiguousarray(given, dtype=dtype)
         asked = tuple(sizes.get(dim, "any") for dim in dims)
         if value.ndim != len(asked) or any(
@@ -683,7 +528,11 @@ class Result:
         ResultError
             The file cannot be written.
         """
-        write_file(as_path(path), self._netcdf())
+        every = {name: getattr(self, name) for name in VARIABLES}
+        arrays = {name: value for name, value in every.items() if value is not None}
+        attributes = {name: getattr(self, name) for name in ATTRIBUTES}
+        attributes["phases"] = [asdict(phase) for phase in self.phases]
+        write_file(as_path(path), file_content(VARIABLES, arrays, self.edge_labels, attributes))
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -695,9 +544,8 @@ class Result:
             The file does not exist, is not a result, is damaged, or has another format version.
         """
         path = as_path(path)
-        data = _read(path)
         try:
-            return cls(**_parse(path, data))
+            return cls(**read_file(path, VARIABLES))
         except ResultError:
             raise
         except MemoryError as error:
@@ -762,59 +610,6 @@ class Result:
         """
         write_file(as_path(path), csv(self.setpoints(rate, flown=flown)).encode())
 
-    def _netcdf(self) -> bytes:
-        """Build the content of the file in memory, so that a full disk is an ordinary write error, not one of HDF5."""
-        import h5netcdf
-        import h5py
-
-        text = h5py.string_dtype()
-        labels: dict[str, Any] = dict(LABELS)
-        labels["edge"] = self.edge_labels
-        sizes = {dim: len(names) for dim, names in labels.items()}
-        sizes |= {"time": len(self.time), "agent": self.n_agents}
-        buffer = io.BytesIO()
-        with h5netcdf.File(buffer, "w") as file:
-            file.dimensions = sizes
-            file.attrs.update(self._attributes())
-            for name, names in labels.items():
-                names_along = file.create_variable(name, (name,), text)
-                if names:
-                    names_along[...] = np.array(names, dtype=object)
-            agent = file.create_variable("agent", ("agent",), "i4")
-            agent[...] = np.arange(1, self.n_agents + 1)
-            agent.attrs["long_name"] = "agent, from 1"
-            for name, variable in VARIABLES.items():
-                value = getattr(self, name)
-                if value is None:
-                    continue
-                entry = file.create_variable(
-                    name,
-                    variable.dims,
-                    "i4" if name in _INTEGERS else "f8",
-                    data=value,
-                    chunks=_chunks(value.shape),
-                    fletcher32=True,  # detects damage; compression would save a seventh of the size and double the time
-                )
-                entry.attrs["units"] = variable.units
-                entry.attrs["long_name"] = variable.text
-        return buffer.getvalue()
-
-    def _attributes(self) -> dict[str, Any]:
-        # Attributes can be text or numbers, but not dict, bool or None: those are stored as JSON.
-        return {
-            "Conventions": "CF-1.11",
-            "title": "flight of a virtual rigid body formation",
-            _MARK: SCHEMA_VERSION,
-            "mission": self.mission_text,
-            "complete": int(self.complete),
-            "ending": self.ending,
-            "phases": _json([asdict(phase) for phase in self.phases]),
-            "statistics": _json(self.statistics),
-            "versions": _json(self.versions),
-            "platform": self.platform,
-            "created": self.created,
-        }
-
 
 #: Signature that `help` shows first. The forty arrays are left out: their units stand at their declarations.
 _FIELDS = [
@@ -831,12 +626,12 @@ _HINTS = get_type_hints(Result, include_extras=True)
 
 #: Dimensions, unit and meaning of each array of a result.
 VARIABLES: dict[str, Variable] = {
-    f.name: _HINTS[f.name].__metadata__[0]
+    f.name: _HINTS[f.name]
+    .__metadata__[0]
+    ._replace(integers=_HINTS[f.name].__origin__ in (Ints, Ints | None), optional=f.default is None)
     for f in fields(Result)
     if hasattr(_HINTS[f.name], "__metadata__")
 }
-#: Variables that a result may lack.
-_OPTIONAL = {f.name for f in fields(Result) if f.name in VARIABLES and f.default is None}
 
 
 #: Variables that are computed when they are first asked for: references of slots; distances; what the law makes of the
@@ -855,34 +650,14 @@ for _name in (*LATER, *SEEN, "disturbance_force"):
     delattr(Result, _name)
 
 
-_INTEGERS = {name for name in VARIABLES if _HINTS[name].__origin__ in (Ints, Ints | None)}
 #: Dimensions and type of each array, by name, and the arrays of quaternions.
 _CHECKED = {
-    name: (v.dims, np.dtype(np.int64 if name in _INTEGERS else np.float64))
+    name: (v.dims, np.dtype(np.int64 if v.integers else np.float64))
     for name, v in VARIABLES.items()
 }
 _QUATERNIONS = [name for name, v in VARIABLES.items() if "quaternion" in v.dims]
 #: Quantities whose minimum is the worst value. The same holds for all clearances.
 _LEAST = frozenset(("separation", "separation_below", "lost", "lowest", "guarantee"))
-
-
-#: Attributes of a file and their types. Types other than int and str are stored as JSON.
-_ATTRIBUTES: dict[str, Any] = {
-    "mission_text": str,
-    "complete": int,
-    "ending": str,
-    "phases": list[PhaseRecord],
-    "statistics": Statistics,
-    "versions": dict[str, str],
-    "platform": str,
-    "created": str,
-}
-#: Attribute that identifies a file as a result.
-_MARK = "rigidfleet_schema_version"
-
-
-#: Maximum size of a chunk [bytes]: the size of HDF5's cache.
-_CHUNK = 1 << 20
 
 
 def as_result(given: Result | str | Path) -> Result:
@@ -902,79 +677,5 @@ def as_result(given: Result | str | Path) -> Result:
     raise wrong_type("a flight (a Result or the path of one that was saved)", given)
 
 
-def plain(value: Any) -> Any:
-    """Convert a value to plain JSON data: arrays to lists, NumPy scalars to numbers, non-finite numbers to None."""
-    if isinstance(value, np.ndarray | np.generic):
-        value = value.tolist()
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, Sequence) and not isinstance(value, str):
-        return [plain(item) for item in value]
-    return value
-
-
-def _json(value: Any) -> str:
-    return json.dumps(plain(value), ensure_ascii=False, allow_nan=False)
-
-
-def _chunks(shape: tuple[int, ...]) -> tuple[int, ...] | None:
-    """Shape of a chunk: as many whole rows as fit into `_CHUNK`; None for an empty array."""
-    if 0 in shape:
-        return None
-    row = 8 * math.prod(shape[1:])
-    return (min(shape[0], max(1, _CHUNK // row)), *shape[1:])
-
-
 def _one_line(error: BaseException) -> str:
     return " ".join(str(error).split()) or type(error).__name__
-
-
-def _read(path: Path) -> bytes:
-    try:
-        data = path.read_bytes()
-    except FileNotFoundError as error:
-        raise ResultError(f"{path}: no such file. `rigidfleet run` creates results.") from error
-    except IsADirectoryError as error:
-        raise ResultError(f"{path}: is a folder. Give the path of a result file in it.") from error
-    except OSError as error:
-        raise ResultError(f"{path}: {why_not(error, 'read', path)}") from error
-    if not data.startswith(b"\x89HDF\r\n\x1a\n"):
-        what = "is empty" if not data else "is not a netCDF-4 file"
-        raise ResultError(f"{path}: {what}. Give the path of a result of `rigidfleet run`.")
-    return data
-
-
-def _parse(path: Path, data: bytes) -> dict[str, Any]:
-    """Return the arguments of `Result` from the content of a file, checked against their declarations."""
-    from rigidfleet._common import reader
-
-    due = {
-        name: reader.Array(variable.dims, name in _INTEGERS, name in _OPTIONAL)
-        for name, variable in VARIABLES.items()
-    }
-    with reader.opened(data) as file:
-        if _MARK not in file.attrs:
-            raise ResultError(
-                f"{path}: is a netCDF-4 or HDF5 file, but not a result of rigidfleet. "
-                "Give the path of a result of `rigidfleet run`."
-            )
-        made = reader.attribute(file, _MARK, int)
-        if made > SCHEMA_VERSION:
-            raise ResultError(
-                f"{path}: has result format {made}; this version of rigidfleet reads format "
-                f"{SCHEMA_VERSION}. Use a newer version."
-            )
-        if made < SCHEMA_VERSION:
-            raise ResultError(
-                f"{path}: was written by an earlier version of rigidfleet (result format {made}); this version reads "
-                f"format {SCHEMA_VERSION}. Fly the mission again."
-            )
-        attributes = {
-            key: reader.attribute(file, "mission" if key == "mission_text" else key, kind)
-            for key, kind in _ATTRIBUTES.items()
-        }
-        sizes = {dim: len(names) for dim, names in LABELS.items()}
-        arrays = reader.arrays(file, due, sizes, len(data))
-    return arrays | attributes | {"complete": bool(attributes["complete"])}

@@ -1,0 +1,28 @@
+"""Any data as plain JSON data."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+
+def plain(value: Any) -> Any:
+    """Convert a value to plain JSON data: arrays to lists, NumPy scalars to numbers, non-finite numbers to None."""
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return [plain(item) for item in value]
+    return value
+
+
+def plain_text(value: Any) -> str:
+    """Return a value as JSON text (`plain`)."""
+    return json.dumps(plain(value), ensure_ascii=False, allow_nan=False)
