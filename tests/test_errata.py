@@ -8,6 +8,7 @@ import math
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from oracles import jacobian
 
 from rigidfleet import physics
 from rigidfleet.assessment import assess
@@ -57,15 +58,6 @@ class Moving:
 def inertia(x: Array, m: Array) -> Array:
     """Inertia (3, 3) of points x (N, 3)."""
     return np.einsum("i,ij,ij->", m, x, x) * np.eye(3) - (m[:, None] * x).T @ x
-
-
-def jacobian(r: Array, edges: NDArray[np.int64]) -> Array:
-    """Constraint Jacobian J (m, 3N)."""
-    J = np.zeros((len(edges), len(r), 3))
-    for k, (i, j) in enumerate(edges):
-        J[k, i] = (r[i] - r[j]) / np.linalg.norm(r[i] - r[j])
-        J[k, j] = -J[k, i]
-    return J.reshape(len(edges), -1)
 
 
 def decoupling(x: Array) -> Array:

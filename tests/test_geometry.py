@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from oracles import jacobian
 from scipy.spatial.transform import Rotation
 
 from rigidfleet.formation import distance_geometry, graphs, shapes
@@ -322,14 +323,6 @@ def test_mean_axis_rates_are_those_of_the_rigid_motion(seed, n):
 
 
 # -- ranks -----------------------------------------------------------------------------------------
-
-
-def jacobian(r: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    J = np.zeros((len(edges), *r.shape))
-    for row, (i, j) in enumerate(edges):
-        J[row, i] = (r[i] - r[j]) / np.linalg.norm(r[i] - r[j])
-        J[row, j] = -J[row, i]
-    return J.reshape(len(edges), -1)
 
 
 CYCLE = np.array([(0, 1), (1, 2), (2, 3), (0, 3)])

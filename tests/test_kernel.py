@@ -10,6 +10,7 @@ import numba
 import numpy as np
 import pytest
 from numba import types
+from oracles import jacobian
 from scipy.spatial.transform import Rotation
 
 from rigidfleet import physics
@@ -446,14 +447,6 @@ def rolled_off(w: np.ndarray, least: float) -> np.ndarray:
     """1/w, and below ``least`` the parabola that goes on from there with its slope, to 0 at 0."""
     x = w / least
     return np.where(x >= 1, 1 / np.where(x >= 1, w, 1.0), x * (3 - 2 * x) / least)
-
-
-def jacobian(r: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    J = np.zeros((len(edges), *r.shape))
-    for row, (i, j) in enumerate(edges):
-        J[row, i] = (r[i] - r[j]) / np.linalg.norm(r[i] - r[j])
-        J[row, j] = -J[row, i]
-    return J.reshape(len(edges), -1)
 
 
 @pytest.mark.parametrize(

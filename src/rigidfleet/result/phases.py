@@ -42,20 +42,6 @@ class Planned(_Moment):
     how: str
 
 
-class Statistics(TypedDict, total=False):
-    """Statistics of the integrator. Other keys are allowed."""
-
-    __others__: Any
-    evaluations: int
-    steps: int
-    rejected: int
-    wall_s: float
-    simulated_s: float
-    rtol: float
-    atol: float
-    solvers: dict[str, dict[str, float]]
-
-
 #: A vehicle that stays within this distance of an obstacle from the start, or until the end, stands on it [m].
 PAD = 0.1
 
