@@ -366,6 +366,33 @@ def test_an_obstacle_appears_and_vanishes(since, until):
     assert not [remark for remark in planned.remarks if remark.topic == "obstacle"]
 
 
+@pytest.mark.parametrize(
+    ("since", "until"), [(0.4, 0.9), (1.3, 1.71), (2.503, 3.2), (0.7, 3.3)]
+)  # fmt: skip
+def test_an_obstacle_counts_in_the_phases_in_which_it_is_there(since, until):
+    """Plan, flight and verdict agree on it; a phase without it lacks nothing."""
+    ball = {"kind": "sphere", "centre": [4.0, 0.5, 5.0], "radius": 0.5}
+    ball |= {"appears": since, "vanishes": until}
+    fly = [{"kind": "fly", "position": [x, 0.0, 5.0], "duration": 1.0} for x in (4.0, 4.0, 0.0)]
+    shape = {"slots": [[0.0, 0.0, 0.0], [0.0, 2.0, 0.0]]}
+    mission = Mission.from_dict({
+        "schema_version": 1, "name": "ball", "obstacles": [ball], "formations": {"pair": shape},
+        "agents": {"mass": 1.0, "position": [[0.0, -1.0, 5.0], [0.0, 1.0, 5.0]], "radius": 0.1},
+        "phases": [{"kind": "establish", "formation": "pair", "duration": 1.0, "blend": 0.5}, *fly],
+    })  # fmt: skip
+    flight = simulate(mission)
+    checks = {check.check: check for check in assess(flight).checks}
+    assert "record" not in checks or checks["record"].passed
+    flown = flight.extreme("clearance")
+    assert flown is not None
+    ((_, planned, when, _),) = check(mission).clearance
+    assert planned == pytest.approx(flown.value, abs=2e-3)
+    assert since <= when <= until
+    for phase in flight.phases:
+        assert ("clearance" in phase.extremes) == (phase.t_start < until and phase.t_end > since)
+    assert checks["clearance"].passed == (flown.value > 0.0)
+
+
 def test_a_ball_among_waypoints_comes_as_near_as_the_closed_form_says():
     """Points on straight ways: the least of the closed forms of all legs, at its time, whatever the steps are."""
     ways, times = np.array([[-9.0, 0, 20], [3, 1, 22], [5, -8, 19]]), np.array([0.3, 1.7, 3.6])

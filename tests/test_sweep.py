@@ -12,6 +12,7 @@ import sys
 import time
 import tomllib
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -521,7 +522,7 @@ def until(ready: Callable[[], bool], process: subprocess.Popen[bytes]) -> None:
 
 def count(folder: Path) -> int:
     try:
-        with sqlite3.connect(folder / "sweep.db") as db:
+        with closing(sqlite3.connect(folder / "sweep.db")) as db:
             return db.execute("SELECT count(*) FROM runs").fetchone()[0]
     except sqlite3.Error:
         return 0

@@ -324,7 +324,7 @@ class Measurements:
                 due = ["speed", "lowest", "highest"]
                 due += ["thrust"] if self.rank["thrust"][index] > -math.inf else []
                 due += ["separation"] if np.count_nonzero(self.left[samples.start]) > 1 else []
-                due += ["clearance"] if self.mission.obstacles else []
+                due += ["clearance"] if self._meets_obstacles(phase) else []
                 due += ["geofence"] if self.mission.limits.geofence is not None else []
                 if lacking := [name for name in due if name not in phase.extremes]:
                     words = (
@@ -346,6 +346,11 @@ class Measurements:
                     )
                     words += f" {value(x.value)} at {x.time:.2f} s, but a sample shows {value(sampled.value)}"
                     yield words, sampled.when
+
+    def _meets_obstacles(self, phase: PhaseRecord) -> bool:
+        """Whether an obstacle is there during a phase, not only at its start or end."""
+        every = (thing.solid.there[0] for thing in self.mission.obstacles)
+        return any(a < phase.t_end - 1e-9 and b > phase.t_start + 1e-9 for a, b in every)
 
     def phase(self, index: int, record: PhaseRecord) -> PhaseVerdict:
         """Numbers of a phase."""

@@ -109,9 +109,15 @@ def closest(planned: PlannedPhase, thing: Obstacle, radius: Floats, speed: Float
     ``speed`` is the `pace` of the phase. Where the room between two samples might not do, the plan is evaluated in the
     middle, and so on.
     """
-    leg, time, moves = planned.leg, planned.time, thing.solid.moves
-    met = _from_sample_to_sample(thing, time)
-    each, _ = proximity.obstacle_clearances(planned.position, radius, [met], time)
+    leg, solid = planned.leg, thing.solid
+    met: Obstacle | _Thing = thing
+    time, position = planned.time, planned.position
+    if np.isfinite(solid.there).any():
+        time, position, speed = _while_there(planned, *solid.there[0].tolist(), speed)
+        met = _Thing(solid._replace(there=np.array([[-np.inf, np.inf]])))
+    if not len(time):
+        return Closest(np.inf, 0, float(planned.time[0]), np.inf)
+    each, _ = proximity.obstacle_clearances(position, radius, [met], time)
     k, i = np.unravel_index(int(each.argmin()), each.shape)
     best, agent, when = float(each[k, i]), int(i), float(time[k])
     everybody, least, done = np.arange(each.shape[1]), np.inf, 0
@@ -120,7 +126,7 @@ def closest(planned: PlannedPhase, thing: Obstacle, radius: Floats, speed: Float
     while todo:
         spans = todo.popleft()
         way = spans.speed * spans.length[:, None]
-        if moves:
+        if solid.moves:
             way = way + _way(met, spans.first, spans.first + spans.length)[:, None]
         low = 0.5 * (spans.near + spans.far - way)
         open_ = low < best - CLOSE
@@ -164,20 +170,30 @@ def _of(reference: Reference, who: Ints) -> Reference:
 
 
 class _Thing(NamedTuple):
-    """An obstacle that is there from one sample to another."""
+    """An obstacle that is always there."""
 
     solid: Solids
 
 
-def _from_sample_to_sample(thing: Obstacle, time: Floats) -> Obstacle | _Thing:
-    """The obstacle; one that appears or vanishes is taken to be there from the sample before to the one after."""
-    if not np.isfinite(thing.solid.there).any():
-        return thing
-    since, until = thing.solid.there[0]
-    first = max(int(np.searchsorted(time, since, side="right")) - 1, 0)
-    last = min(int(np.searchsorted(time, until)), len(time) - 1)
-    there = np.array([[min(time[first], since), max(time[last], until)]])
-    return _Thing(thing.solid._replace(there=there))
+class _Flown(NamedTuple):
+    """The samples of a planned phase while an obstacle is there."""
+
+    time: Floats  # (K,) [s]; none if it is never there
+    position: Floats  # (K, N, 3) [m]
+    speed: Floats  # (K - 1, N) greatest speed between two samples [m/s]
+
+
+def _while_there(planned: PlannedPhase, since: float, until: float, speed: Floats) -> _Flown:
+    """The samples of a phase from one time to another [s], with samples at both."""
+    leg, time = planned.leg, planned.time
+    ends = np.array([max(since, time[0]), min(until, time[-1])])
+    if ends[0] > ends[1]:
+        return _Flown(time[:0], planned.position[:0], speed[:0])
+    within = (time > ends[0]) & (time < ends[1])
+    first, last = slot_derivatives(leg.reference, leg.motion, ends, 1)[:, :1]
+    at = np.concatenate([ends[:1], time[within], ends[1:]])
+    span = np.clip(np.searchsorted(time, at[:-1], side="right") - 1, 0, len(speed) - 1)
+    return _Flown(at, np.concatenate([first, planned.position[within], last]), speed[span])
 
 
 def _way(thing: Obstacle | _Thing, begin: Floats, end: Floats) -> Floats:
