@@ -228,6 +228,18 @@ def test_knots(T, Q, R, S_T):
     assert np.all(np.abs(motion(t, 1) - exact[0][:, 1]) <= 1.1e-10 * largest[1] + rounding)
 
 
+def test_knots_of_two_regulators_are_equal_or_apart():
+    """They lie at exact shares of the horizon: those of both together leave no piece that is only rounding."""
+    rng = np.random.default_rng(0)
+    for _ in range(100):
+        T = rng.uniform(0.1, 50.0)
+        both = [
+            knots(T, rng.uniform(0.1, 5.0, 2), 1.0, 10 ** rng.uniform(1, 4, 2)) for _ in range(2)
+        ]
+        assert all(ends[0] == 0.0 and ends[-1] == T for ends in both)
+        assert np.diff(np.unique(np.concatenate(both))).min() > 1e-6 * T
+
+
 def test_knots_are_dense_where_the_flight_bends():
     """Over a long horizon the knots gather at its two ends, and the calm middle needs few."""
     ends = knots(1000.0, [4.0, 4.0], 1.0, S)

@@ -1,4 +1,5 @@
 import json
+import re
 import subprocess
 import sys
 
@@ -497,3 +498,36 @@ def test_published_formations(name, control):
     error = np.abs(distances(result.position[-1], every) - distances(p, every)).max()
     assert assess(result).passed == (error < 0.01 * distances(p, every).min())
     assert control == "open" or error < 1e-3
+
+
+@pytest.mark.parametrize("architecture", ["local", "body"])
+@pytest.mark.parametrize("horizon", ["finite", "infinite"])
+def test_waypoints_that_the_regulator_cannot_meet(architecture, horizon):
+    """Each miss is told before the flight, in the size that is flown, and nothing else is."""
+    weights = {"horizon": horizon, "Q": [2.0, 2.0], "S": [300.0, 20.0]}
+    fly = {"kind": "fly", "position": [8.0, 3.0, 12.0], "yaw_deg": 40.0}
+    tables = {
+        "architecture": architecture,
+        "lqr": weights | {"attitude": {"Q": [3.0, 1.0], "S": [1e3, 40.0]}},
+        "phases": [
+            {"kind": "establish", "formation": "square", "duration": 4.0},
+            fly | {"name": "soon", "duration": 2.3},
+            {"kind": "hold", "duration": 20.0},
+            {"kind": "fly", "name": "late", "position": [9.0, 3.0, 12.0], "duration": 30.0},
+        ],
+    }
+    hurried = mission(**tables)
+    told = [r for r in check(hurried).remarks if r.topic == "waypoint"]
+    assert told
+    missed = [c for c in assess(simulate(hurried)).checks if not c.passed]
+    assert {c.phase for c in missed} == {"soon"}
+    for one in missed:
+        what = one.check.removeprefix("waypoint_")
+        (remark,) = [r for r in told if f"off in {what} at 6.30 s" in r.text]
+        sure = architecture == "local" or what in ("position", "velocity")
+        assert remark.level == ("fails" if sure else "note")
+        size = float(re.findall(r"missed, (\S+) ", remark.text)[0])
+        assert size == pytest.approx(one.worst, rel=0.06 if sure else 0.2)
+        table = "lqr.attitude" if what in ("attitude", "rates") else "lqr"
+        assert f"greater weights {table}.{'S' if horizon == 'finite' else 'Q'}" in remark.text
+    assert len(told) == len(missed)

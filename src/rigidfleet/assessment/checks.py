@@ -8,6 +8,7 @@ from operator import itemgetter
 import numpy as np
 
 from rigidfleet._common.text import agent_names
+from rigidfleet._common.waypoints import UNITS, WAYPOINT_TOLERANCE
 from rigidfleet.assessment.avoidance import guarantee_checks
 from rigidfleet.assessment.fits import is_rigid
 from rigidfleet.assessment.measure import Measurements
@@ -15,7 +16,6 @@ from rigidfleet.assessment.outcome import (
     FLIPPED,
     SHAPE_TOLERANCE,
     TOUCH_DOWN,
-    WAYPOINT_TOLERANCE,
     CheckResult,
     Extreme,
     PhaseVerdict,
@@ -245,7 +245,7 @@ def _waypoints(phases: list[PhaseVerdict]) -> Iterator[CheckResult]:
         if at is not None
     ]
     for name, limit in WAYPOINT_TOLERANCE.items():
-        unit = {"position": "m", "velocity": "m/s", "attitude": "deg", "rates": "deg/s"}[name]
+        unit = UNITS[name]
         found = [
             (miss, *point) for point in points if (miss := getattr(point[2], name)) is not None
         ]

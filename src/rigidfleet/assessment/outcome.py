@@ -11,11 +11,6 @@ from typing import Any
 SHAPE_TOLERANCE = 0.01
 
 
-#: Greatest miss of a waypoint's position [m], velocity [m/s], attitude [deg] and rates [deg/s]. An outdoor
-#: vehicle knows its own state this well; a regulator that meets its waypoint leaves far smaller errors.
-WAYPOINT_TOLERANCE = {"position": 0.1, "velocity": 0.1, "attitude": 1.0, "rates": 1.0}
-
-
 #: Greatest speed downwards at touch-down [m/s]: the default of ArduPilot's LAND_SPEED.
 TOUCH_DOWN = 0.5
 

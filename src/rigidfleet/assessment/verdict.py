@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from rigidfleet._common.plain import plain
 from rigidfleet._common.text import all_hold
+from rigidfleet._common.waypoints import WAYPOINT_TOLERANCE
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -15,7 +16,6 @@ from rigidfleet.assessment.outcome import (
     FLIPPED,
     SENSE,
     SHAPE_TOLERANCE,
-    WAYPOINT_TOLERANCE,
     CheckResult,
     Extreme,
     PhaseVerdict,

@@ -254,10 +254,13 @@ def _knots(T: float, Q_key: Key, R_key: Key, S_key: Key, tolerance: float) -> Fl
     powers = np.arange(6)
     u = inside[:, None] ** powers
     u_dot = powers * inside[:, None] ** np.maximum(powers - 1, 0)
-    left, width = np.zeros(1), float(T)
-    result, largest = [np.zeros(1)], np.zeros((2, 2))
+    # In shares of T, which are exact: knots of different regulators that should be equal have the same bits.
+    left, share = np.zeros(1), 1.0
+    result: list[Floats] = [np.array([0.0, 1.0])]
+    largest = np.zeros((2, 2))
     while left.size:
-        t = left[:, None] + width * np.array([0.0, *inside, 1.0])
+        t = T * (left[:, None] + share * np.array([0.0, *inside, 1.0]))
+        width = T * share
         # Two starts span all others: position 1 with velocity 0, and position 0 with velocity 1.
         x, a = closed_loop_response(_A, _B, Q, R, S, T, np.eye(2), t.ravel())
         x, a = x.reshape(*t.shape, 2, 2), a.reshape(*t.shape, 2)
@@ -272,11 +275,11 @@ def _knots(T: float, Q_key: Key, R_key: Key, S_key: Key, tolerance: float) -> Fl
         allowed = tolerance * largest + rounding
         bad = np.any(np.abs(deviation) > allowed.T[..., None], axis=(1, 2, 3))
         bad &= width * fastest > 1 / 64  # narrower pieces contain only rounding
-        result.append(left[~bad] + width)
-        width *= 0.5
-        left = np.concatenate([left[bad], left[bad] + width])
-    result.append(np.array([T]))
-    return np.unique(np.concatenate(result))
+        result.append(left[~bad] + share)
+        share *= 0.5
+        left = np.concatenate([left[bad], left[bad] + share])
+    every: Floats = np.unique(np.concatenate(result))
+    return T * every
 
 
 def quintic_pieces(times: ArrayLike, x: ArrayLike, v: ArrayLike, a: ArrayLike) -> Floats:

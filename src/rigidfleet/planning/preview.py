@@ -78,7 +78,10 @@ class PlannedPhase:
 
 
 class Leg(NamedTuple):
-    """The reference of a planned phase from ``begin`` to ``end`` [s], and the state at its end."""
+    """The reference of a planned phase from ``begin`` to ``end`` [s], and the state at its end.
+
+    ``arrival`` is the time [s] at which the body is to reach its goal, that of ``after``.
+    """
 
     phase: Phase
     begin: float
@@ -88,6 +91,7 @@ class Leg(NamedTuple):
     before: PhaseState
     after: PhaseState
     exact: bool
+    arrival: float
 
 
 def preview(mission: Mission, phases: int | None = None) -> tuple[list[PlannedPhase], bool]:
@@ -161,6 +165,7 @@ def leg(mission: Mission, phase: Phase, now: PhaseState) -> Leg | None:
         or (phase.control == "open" and reference_kind(mission, shaping, slots, target) == "shape")
     )
     frame, now, turned = attach(mission, phase, now, masses, target)
+    arrival = t_end
     blend, turn = (0.0 if shaping is None else seconds(shaping.blend)), np.zeros(3)
     if phase.control == "open":
         x = about_cm(now.r, masses)
@@ -175,7 +180,7 @@ def leg(mission: Mission, phase: Phase, now: PhaseState) -> Leg | None:
         after = replace(now, slots=slots, pose=None, frame=frame)
     else:
         assert now.slots is not None  # attached above
-        goal, _, trajectory = course(mission, phase, now, t_end)
+        goal, arrival, trajectory = course(mission, phase, now, t_end)
         assert trajectory is not None
         motion, dp, slots = trajectory.motion(), 0.0 * now.slots, now.slots
         if shaping is not None and target is not None:
@@ -194,7 +199,7 @@ def leg(mission: Mission, phase: Phase, now: PhaseState) -> Leg | None:
         reference = now.blend
     r, v = slot_derivatives(reference, motion, np.array([t_end]), 2)[0]
     after = replace(after, t=t_end, r=r, v=v, formation=name)
-    return Leg(phase, t0, t_end, reference, motion, before, after, exact)
+    return Leg(phase, t0, t_end, reference, motion, before, after, exact, arrival)
 
 
 _NONE = np.zeros(0)

@@ -27,6 +27,7 @@ from rigidfleet.preflight.trajectory import (
     limit_remarks,
     separation_remarks,
     thrust_remarks,
+    waypoint_remarks,
 )
 from rigidfleet.preflight.vehicles import check_vehicles, vehicle_lags, vehicle_remarks
 
@@ -78,6 +79,7 @@ def check(
         *disturbance_remarks(mission, found),
         *obstacle_remarks(mission, found),
         *limit_remarks(mission, found),
+        *waypoint_remarks(mission, found),
         *loss_remarks(mission, found),
     ]
     if not known:

@@ -8,20 +8,25 @@ from collections.abc import Iterator
 import numpy as np
 
 from rigidfleet._common.text import agent_names
+from rigidfleet._common.waypoints import UNITS, WAYPOINT_TOLERANCE
 from rigidfleet.formation import distance_geometry
+from rigidfleet.math import attitude as att
 from rigidfleet.math import lqr, proximity
+from rigidfleet.math.rigid_body import mean_axis_rates
 from rigidfleet.mission import Mission
 from rigidfleet.mission.disturbances import intensity
 from rigidfleet.planning import timing
 from rigidfleet.planning.certificate import straight
+from rigidfleet.planning.derivatives import slot_derivatives
 from rigidfleet.planning.preview import PlannedPhase
+from rigidfleet.planning.reference import pose_at
 from rigidfleet.preflight.findings import DENSE, SLACK, Disturbed, Preflight, Remark
 from rigidfleet.rigidity import (
     jacobian,
 )
 
-#: A steady distance from the slots is reported beyond this [m]: the verdict's tolerance of a waypoint.
-_OFFSET = 0.1
+#: Share by which a goal is planned to be missed by more than its tolerance, before it is said to be missed.
+_CLEARLY = 0.02
 
 
 def separation_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
@@ -190,7 +195,9 @@ def disturbance_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     if most[0] > most[3]:
         text = f"with disturbances, {most[2]} may need {most[0]:.1f} N at {most[1]:.2f} s (limit {most[3]:g} N)"
         yield Remark("note", "thrust", text)
-    if off[far] > _OFFSET and any(phase.control == "tracking" for phase in mission.phases):
+    if off[far] > WAYPOINT_TOLERANCE["position"] and any(
+        phase.control == "tracking" for phase in mission.phases
+    ):
         text = (
             f"steady disturbances hold agent {far + 1} {off[far]:.2f} m off its slot, because tracking has no integral;"
             f" a larger first weight in tracking.Q reduces the offset (now {mission.tracking.Q[0]:g})"
@@ -236,6 +243,53 @@ def _step_thrust(mission: Mission, found: Preflight) -> Iterator[Remark]:
                 f" (limit {limits[i]:g} N). Use reference = 'shape' or 'distances'"
             )
             yield Remark("fails" if c.solver in ("exact", "pinv") else "note", "thrust", text)
+
+
+def waypoint_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
+    """Remarks on goals that the body misses even without errors of control: its regulator has too little time."""
+    masses = mission.fleet.mass
+    for planned in found.planned_phases:
+        leg = planned.leg
+        phase, goal = leg.phase, leg.after.goal
+        if phase.control == "open" or goal is None or leg.arrival > leg.end:
+            continue
+        pose = pose_at(leg.motion, leg.arrival)
+        meets = {
+            "position": math.dist(pose.r, goal.r),
+            "velocity": math.dist(pose.v, goal.v),
+        }
+        meets = {what: off for what, off in meets.items() if what in phase.meets}
+        if "attitude" in phase.meets and mission.n_agents > 1:
+            turn = att.rotation_vector_from_dcm(pose.T @ goal.T.T)
+            # As flown: agents on a line do not show how it spins.
+            state = slot_derivatives(leg.reference, leg.motion, np.array([leg.arrival]), 2)
+            x, y = (state[:, k] - (masses @ state[:, k] / masses.sum())[:, None] for k in (0, 1))
+            spin = pose.T @ mean_axis_rates(x, y, masses)[0] - goal.omega
+            meets |= {
+                "attitude": math.degrees(np.linalg.norm(turn)),
+                "rates": math.degrees(np.linalg.norm(spin)),
+            }
+        for what, off in meets.items():
+            if off > (1.0 + _CLEARLY) * WAYPOINT_TOLERANCE[what]:
+                yield _missed(mission, planned, what, off)
+
+
+def _missed(mission: Mission, planned: PlannedPhase, what: str, off: float) -> Remark:
+    """Remark on a goal that is missed by this much in position, velocity, attitude or rates."""
+    turns = what in ("attitude", "rates")
+    law, table = (mission.lqr.attitude, "lqr.attitude") if turns else (mission.lqr, "lqr")
+    remedy = f"greater weights {table}.S"
+    if law.horizon == "infinite":
+        remedy = f"greater weights {table}.Q, or horizon = 'finite'"
+    # Of a body under feedback, the rotation is planned as one about a fixed axis.
+    sure = planned.leg.phase.control == "tracking" or not turns
+    return Remark(
+        "fails" if sure else "note",
+        "waypoint",
+        f"the waypoint of '{planned.phase}' {'is' if sure else 'may be'} missed, {off:.2g} {UNITS[what]} off in {what}"
+        f" at {planned.leg.arrival:.2f} s (limit {WAYPOINT_TOLERANCE[what]:g} {UNITS[what]}): give the phase more"
+        f" time, or {remedy}",
+    )
 
 
 def limit_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
