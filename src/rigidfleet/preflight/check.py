@@ -88,4 +88,7 @@ def check(
             why = "more agents and phases would take too long"
         text = f"paths are checked only up to {found.judged_to:g} s: {why}"
         found.remarks.append(Remark("note", "paths", text))
+    if any(planned.leg.phase.control == "body" for planned in found.planned_phases):
+        text = "paths in phases with control = 'body' are estimates, less close the faster the formation turns"
+        found.remarks.append(Remark("note", "paths", text))
     return found

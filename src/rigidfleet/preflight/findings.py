@@ -42,7 +42,7 @@ class Remark:
     ----------
     level : "fails" or "note"
     topic : formation, gains, margins, collision, downwash, assignment, thrust, disturbances, obstacle, geofence, speed,
-        acceleration, waypoint or paths (paths that were not checked)
+        acceleration, waypoint or paths (that were not checked, or are estimates)
     text : the problem or note in words
     """
 
