@@ -243,6 +243,27 @@ def test_points_on_the_way_are_judged():
     )
 
 
+@pytest.mark.parametrize("beside", [3e-5, 1e-6, 4e-4, -2e-5])
+def test_a_sample_just_beside_another_shows_no_rounding(beside):
+    """A point is passed a moment before or after an output time: jerk and worst values are those of the way."""
+    through = [{"position": [4.0, 2.0, 13.0], "time": 3.0 - beside}]
+    mission = a_mission(
+        {"kind": "fly", "position": [9.0, 1.0, 11.0], "through": through, "duration": 7.0},
+        output_step=0.02,
+        limits={"vertical_acceleration": 5.0, "horizontal_acceleration": 5.0},
+    )
+    result = simulate(mission)
+    assert np.abs(np.diff(result.time) - abs(beside)).min() < 1e-9
+    jerk = result.motion(flown=True).state[:, 3]
+    assert np.abs(jerk - result.motion().state[:, 3]).max() < 0.2
+    acceleration = result.motion().state[:, 2]
+    worst = {check.check: check.worst for check in assess(result).checks}
+    up = np.abs(acceleration[..., 2]).max()
+    along = np.hypot(acceleration[..., 0], acceleration[..., 1]).max()
+    assert worst["vertical_acceleration"] == pytest.approx(up, rel=1e-3)
+    assert worst["horizontal_acceleration"] == pytest.approx(along, rel=1e-3)
+
+
 def test_legs_of_the_regulators_jump():
     """The same switches are not continuous in a mission of the paper: the tests above can fail."""
     data = load_mission("narrow-passage").to_dict()

@@ -17,6 +17,8 @@ HEADER = (
     "time_s,agent,x_m,y_m,z_m,vx_m_s,vy_m_s,vz_m_s,ax_m_s2,ay_m_s2,az_m_s2,jx_m_s3,jy_m_s3,jz_m_s3,"
     "yaw_rad,yaw_rate_rad_s"
 )
+#: Ratio of the time before a sample to that after it, from which on it counts as clearly longer.
+_LONGER = 2.0
 #: Greatest number of setpoints [one agent at one time] of a table: a file of 3 GB.
 MOST = 20_000_000
 
@@ -38,13 +40,18 @@ class Setpoints(NamedTuple):
 
 
 def of_motion(position: Floats, velocity: Floats, acceleration: Floats, time: Floats) -> Floats:
-    """States (K, 4, N, 3) of a flown motion (K, N, 3) at times (K,) [s], with the jerk of quintics between them."""
+    """States (K, 4, N, 3) of a flown motion (K, N, 3) at times (K,) [s], with the jerk of quintics between them.
+
+    At a sample it is that of the quintic after it, or of the one before where that is clearly longer, or the last:
+    over a very short time, a jerk would show the rounding of the samples.
+    """
     x = np.stack([position, velocity, acceleration, np.full_like(position, np.nan)], axis=1)
     if len(time) > 1:
-        pieces = lqr.quintic_pieces(time, position, velocity, acceleration)
+        pieces, h = lqr.quintic_pieces(time, position, velocity, acceleration), np.diff(time)
         x[:-1, 3] = 6.0 * pieces[..., 3]
-        last = series.of_polynomials(pieces[-1:], np.diff(time)[-1:], 4)
-        x[-1, 3] = 6.0 * last[3, 0]
+        before = np.append(np.flatnonzero(h[:-1] > _LONGER * h[1:]), len(h) - 1)
+        ends = series.of_polynomials(pieces[before], h[before], 4)
+        x[before + 1, 3] = 6.0 * ends[3]
     return x
 
 

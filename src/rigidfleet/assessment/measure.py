@@ -29,6 +29,9 @@ _SLACK = {"separation": 0.0, "clearance": 0.0, "speed": 1e-9}
 
 #: About so many curves are compared together.
 _TOGETHER = 100_000
+#: Times between two samples that are very short [s]: of a flight, of curves that are given; and as a share of the
+#: longest.
+_SHORT, _INSTANT, _SHARE = 1e-3, 1e-6, 0.05
 
 
 class Quantity:
@@ -198,6 +201,10 @@ class Measurements:
         time, state = motion.time, np.where(self.left[:, None, :, None], motion.state, np.nan)
         state = state.swapaxes(0, 1)  # (4, K, N, 3)
         apart = np.flatnonzero(np.nextafter(time[:-1], np.inf) < time[1:])
+        # A polynomial over a very short time shows the rounding of its ends, which those beside it have, too.
+        h = time[apart + 1] - time[apart]
+        most = _INSTANT if result.interpolation else _SHORT
+        apart = apart[h > np.minimum(most, _SHARE * h.max(initial=0.0))]
         n, worst, at = result.n_agents, None, (0.0, 0)
         for k in np.array_split(apart, 1 + len(apart) * n // _TOGETHER):
             h = time[k + 1] - time[k]
