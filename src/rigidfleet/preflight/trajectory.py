@@ -247,10 +247,14 @@ def _step_thrust(mission: Mission, found: Preflight) -> Iterator[Remark]:
 
 def waypoint_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     """Remarks on goals that the body misses even without errors of control: its regulator has too little time."""
-    masses = mission.fleet.mass
+    masses, begun = (
+        mission.fleet.mass,
+        True,
+    )  # whether the phase begins when and where it is planned
     for planned in found.planned_phases:
         leg = planned.leg
-        phase, goal = leg.phase, leg.after.goal
+        phase, goal, exact = leg.phase, leg.after.goal, begun
+        begun = begun and phase.settle is None
         if phase.control == "open" or goal is None or leg.arrival > leg.end:
             continue
         pose = pose_at(leg.motion, leg.arrival)
@@ -271,10 +275,12 @@ def waypoint_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
             }
         for what, off in meets.items():
             if off > (1.0 + _CLEARLY) * WAYPOINT_TOLERANCE[what]:
-                yield _missed(mission, planned, what, off)
+                yield _missed(mission, planned, what, off, exact=exact)
 
 
-def _missed(mission: Mission, planned: PlannedPhase, what: str, off: float) -> Remark:
+def _missed(
+    mission: Mission, planned: PlannedPhase, what: str, off: float, *, exact: bool
+) -> Remark:
     """Remark on a goal that is missed by this much in position, velocity, attitude or rates."""
     turns = what in ("attitude", "rates")
     law, table = (mission.lqr.attitude, "lqr.attitude") if turns else (mission.lqr, "lqr")
@@ -282,7 +288,7 @@ def _missed(mission: Mission, planned: PlannedPhase, what: str, off: float) -> R
     if law.horizon == "infinite":
         remedy = f"greater weights {table}.Q, or horizon = 'finite'"
     # Of a body under feedback, the rotation is planned as one about a fixed axis.
-    sure = planned.leg.phase.control == "tracking" or not turns
+    sure = exact and (planned.leg.phase.control == "tracking" or not turns)
     return Remark(
         "fails" if sure else "note",
         "waypoint",
