@@ -12,7 +12,7 @@ from rigidfleet._common.waypoints import UNITS, WAYPOINT_TOLERANCE
 from rigidfleet.formation import distance_geometry
 from rigidfleet.math import attitude as att
 from rigidfleet.math import lqr, proximity
-from rigidfleet.math.rigid_body import mean_axis_rates
+from rigidfleet.math.rigid_body import about_cm, mean_axis_rates
 from rigidfleet.mission import Mission
 from rigidfleet.mission.disturbances import intensity
 from rigidfleet.planning import timing
@@ -247,10 +247,8 @@ def _step_thrust(mission: Mission, found: Preflight) -> Iterator[Remark]:
 
 def waypoint_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     """Remarks on goals that the body misses even without errors of control: its regulator has too little time."""
-    masses, begun = (
-        mission.fleet.mass,
-        True,
-    )  # whether the phase begins when and where it is planned
+    masses = mission.fleet.mass
+    begun = True  # whether the phase begins when and where it is planned
     for planned in found.planned_phases:
         leg = planned.leg
         phase, goal, exact = leg.phase, leg.after.goal, begun
@@ -266,8 +264,8 @@ def waypoint_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
         if "attitude" in phase.meets and mission.n_agents > 1:
             turn = att.rotation_vector_from_dcm(pose.T @ goal.T.T)
             # As flown: agents on a line do not show how it spins.
-            state = slot_derivatives(leg.reference, leg.motion, np.array([leg.arrival]), 2)
-            x, y = (state[:, k] - (masses @ state[:, k] / masses.sum())[:, None] for k in (0, 1))
+            state = slot_derivatives(leg.reference, leg.motion, np.array([leg.arrival]), 2)[0]
+            x, y = (about_cm(part, masses)[None] for part in state)
             spin = pose.T @ mean_axis_rates(x, y, masses)[0] - goal.omega
             meets |= {
                 "attitude": math.degrees(np.linalg.norm(turn)),

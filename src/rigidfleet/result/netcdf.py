@@ -14,7 +14,6 @@ from typing import Any, NamedTuple, TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
-from rigidfleet._common import reader
 from rigidfleet._common.files import why_not
 from rigidfleet._common.plain import plain_text
 from rigidfleet.errors import ResultError
@@ -146,6 +145,8 @@ def read_file(path: Path, variables: Mapping[str, Variable]) -> dict[str, Any]:
     Exception
         Any other error: the file is damaged.
     """
+    from rigidfleet._common import reader
+
     data = _bytes(path)
     due = {name: reader.Array(v.dims, v.integers, v.optional) for name, v in variables.items()}
     with reader.opened(data) as file:
