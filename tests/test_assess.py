@@ -757,3 +757,27 @@ def test_worst_pair_is_that_of_all_pairs(flown):
     assert fit.intended == pytest.approx(np.linalg.norm(slots[i] - slots[j]))
     assert fit.shortest == pytest.approx(2.0)
     assert fit.mirrored == (flown == "mirrored") or flown in ("exchanged", "scattered")
+
+
+@pytest.mark.parametrize("agents", [2, 3, 5, 16, 17])
+def test_worst_pair_of_few_agents(agents):
+    """Few agents are compared at once; 17 are too many for that, and give the same."""
+    rng = np.random.default_rng(agents)
+    slots = rng.normal(size=(agents, 3))
+    p = slots + 0.1 * rng.normal(size=slots.shape)
+    fit = Fit(p, slots)
+    flown, intended = (np.linalg.norm(x[:, None] - x, axis=2) for x in (p, slots))
+    i, j = fit.pair
+    assert i < j
+    assert fit.error == pytest.approx(np.abs(flown - intended).max(), rel=1e-12)
+    assert fit.flown == pytest.approx(flown[i, j])
+    assert fit.intended == pytest.approx(intended[i, j])
+    assert fit.error == pytest.approx(abs(fit.flown - fit.intended), rel=1e-9)
+
+
+def test_of_pairs_equally_wrong_the_first_is_named():
+    """A triangle that is too large is so along all edges, which differ by rounding alone."""
+    slots = shapes.slots("triangle", 4.0, 3)
+    for turn in range(20):
+        p = 1.1 * slots @ att.dcm_from_euler([0.1 * turn, 0.2, 0.3 * turn]) + [9.0, 7.0, 5.0]
+        assert Fit(p, slots).pair == (0, 1)

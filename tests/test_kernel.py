@@ -4,7 +4,7 @@ import math
 import os
 import subprocess
 import sys
-from typing import Any
+from typing import Any, get_type_hints
 
 import numba
 import numpy as np
@@ -24,7 +24,7 @@ from rigidfleet.kernel import (
 )
 from rigidfleet.kernel.compiler import numba_internals
 from rigidfleet.kernel.compiler.cache import cache_directory
-from rigidfleet.kernel.engine import native
+from rigidfleet.kernel.engine import native, packing
 from rigidfleet.kernel.engine.native import is_compiled
 from rigidfleet.kernel.problem import (
     EXACT,
@@ -891,3 +891,54 @@ def test_a_force_in_python_and_a_compiled_one_fly_alike():
     for row in (0, 50, -1):
         f = python(a.time[row], a.position[row], a.velocity[row])
         np.testing.assert_allclose(a.external_force[row], f + weight, rtol=0, atol=1e-12)
+
+
+def declared(x: Any, sizes: dict[str, int], path: str) -> None:
+    """Check that arrays of a named tuple have the extents that its types declare."""
+    hints = get_type_hints(type(x), include_extras=True)
+    for name, value in zip(x._fields, x, strict=True):
+        if isinstance(value, tuple):
+            declared(value, sizes, f"{path}.{name}")
+        for extents in getattr(hints[name], "__metadata__", ()):
+            for has, asked in zip(value.shape, extents, strict=True):
+                if has == 0 and asked is None:
+                    break  # without rows, nothing is read
+                want = sizes.setdefault(asked, has) if isinstance(asked, str) else asked
+                assert want in (None, has), f"{path}.{name} {value.shape} is declared as {extents}"
+
+
+@pytest.mark.parametrize("mission", ["narrow-passage", "windy-passage", "cube-passage", "drift"])
+def test_arrays_have_the_extents_that_the_kernel_is_compiled_for(mission, monkeypatch):
+    seen = set()
+
+    def pack(x: Any) -> packing.Packed:
+        declared(x, {}, type(x).__name__)
+        seen.add(type(x).__name__)
+        return real(x)
+
+    real = packing.pack
+    monkeypatch.setattr(packing, "pack", pack)
+    monkeypatch.setattr(native, "pack", pack)
+    packing._last.packed.clear()
+    simulate(mission).evaluate()
+    assert {"Problem", "Workspace", "IntegratorState", "Monitor", "Record", "Segment"} <= seen
+
+
+def test_the_kernel_for_three_agents_is_the_kernel(monkeypatch):
+    """Of the same source, but for the lengths of its loops: the same flight to rounding."""
+    own = simulate("narrow-passage")
+    code = native._code()
+    monkeypatch.setattr(native, "_loaded", [code._replace(integrate_three=code.integrate)])
+    other = simulate("narrow-passage")
+    assert own.statistics["steps"] == other.statistics["steps"]
+    assert np.abs(own.position - other.position).max() < 1e-9
+
+
+def test_the_kernel_for_three_agents_is_for_them_alone(monkeypatch):
+    def refused(*_: int) -> int:
+        raise AssertionError("called")
+
+    code = native._code()
+    monkeypatch.setattr(native, "_loaded", [code._replace(integrate_three=refused)])
+    for mission in ("two-agents", "square", "hexagon"):
+        assert simulate(mission).complete

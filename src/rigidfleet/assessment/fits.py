@@ -28,6 +28,10 @@ _KEPT = 100_000
 _FEW = 16
 
 
+#: Errors of distances that differ by less than this share of the shape's size are equal.
+_ROUNDING = 1e-12
+
+
 #: Greatest number of agents for which a wrong shape is tested for rigidity.
 _JUDGED = 200
 
@@ -42,13 +46,14 @@ class Laid(NamedTuple):
     turn: Floats  # (..., 3, 3) the best-fitting rotation, without a reflection
     along: Floats  # (..., 3) the direction in which the agents extend most
     size: Floats  # (...) the greatest coordinate of the slots, about their centre
-    lengths: Floats  # (2, ..., N, N) distances of agents, and of slots, if they are few; else (2, ..., 0, 0)
+    #: The pair with the worst distance (..., 5): error [m], both, flown, of slots [m]; of many agents (..., 0)
+    worst: Floats
 
     @classmethod
     def of(cls, p: Floats, slots: Floats) -> Laid:
         """Fit slots (..., N, 3) to agents p (..., N, 3)."""
-        few = np.stack([p, slots])[..., : p.shape[-2] if p.shape[-2] <= _FEW else 0, :]
-        lengths = length(few[..., :, None, :] - few[..., None, :, :])
+        few = 1 < p.shape[-2] <= _FEW
+        worst = _worst_of_few(p, slots) if few else np.empty((*p.shape[:-2], 0))
         p, slots = p - p.mean(axis=-2, keepdims=True), slots - slots.mean(axis=-2, keepdims=True)
         across, of_agents = p.swapaxes(-1, -2) @ np.stack([slots, p])
         U, s, Vt = np.linalg.svd(across)
@@ -56,7 +61,7 @@ class Laid(NamedTuple):
         size = np.abs(slots).max(axis=(-2, -1))
         turn, proper = rigid_body.best_rotation(U, s, Vt)
         along = np.linalg.eigh(of_agents)[1][..., -1]
-        return cls(p, slots, off, ~proper, turn, along, size, lengths)
+        return cls(p, slots, off, ~proper, turn, along, size, worst)
 
 
 class Fit:
@@ -109,29 +114,41 @@ def _shape(slots: bytes) -> tuple[int, Floats, float]:
     return dimension, axes[0] if dimension == 1 else axes[2], float(proximity.nearest(points).min())
 
 
+def _worst_of_few(p: Floats, slots: Floats) -> Floats:
+    """Worst error of a distance of few agents (..., N, 3), see `Laid.worst`; of equal errors the first pair's."""
+    both = np.stack([p, slots])
+    flown, intended = length(both[..., :, None, :] - both[..., None, :, :]).reshape(
+        2, *p.shape[:-2], -1
+    )
+    n, error = p.shape[-2], np.abs(flown - intended)
+    error[..., :: n + 1] = -1.0  # an agent and itself
+    most = error.max(axis=-1, keepdims=True)
+    at = (error >= most - _ROUNDING * intended.max(axis=-1, keepdims=True)).argmax(axis=-1)
+    there = at[..., None]
+    values = (np.take_along_axis(x, there, axis=-1)[..., 0] for x in (error, flown, intended))
+    off, flown, intended = values
+    return np.stack([off, *np.divmod(at, n), flown, intended], axis=-1)
+
+
 def _all_pairs(p: Floats, slots: Floats, laid: Laid) -> tuple[float, tuple[int, int], float, float]:
     """Worst error of a distance among all pairs: error, pair, flown, intended [m].
 
-    Few pairs have to be computed: the error of a pair is at most the sum of both agents' distances from their slots,
-    for any fit of the slots, mirrored or not. Improvements below rounding are ignored.
+    Of many agents, few pairs have to be computed: the error of a pair is at most the sum of both agents' distances from
+    their slots, for any fit of the slots, mirrored or not. Improvements below rounding are ignored.
     """
+    if len(laid.worst):
+        error, i, j, flown, intended = laid.worst.tolist()
+        return error, (int(i), int(j)), flown, intended
     off, both = laid.off.tolist(), np.array([p, slots])
     order = sorted(range(len(off)), key=lambda i: -off[i])
-    ranked, rounding, few = (
-        [-off[i] for i in order],
-        1e-12 * float(laid.size),
-        laid.lengths.tolist(),
-    )
+    ranked, rounding = [-off[i] for i in order], _ROUNDING * float(laid.size)
     worst = (-1.0, (0, 0), 0.0, 0.0)
     for k, i in enumerate(order[:-1]):
         last = bisect_left(ranked, off[i] - worst[0] - rounding)
         if last <= k + 1:
             break
         others = sorted(order[k + 1 : last])
-        if not few[0]:
-            flown, intended = length(both[:, others] - both[:, i, None]).tolist()
-        else:
-            flown, intended = ([lengths[i][j] for j in others] for lengths in few)
+        flown, intended = length(both[:, others] - both[:, i, None]).tolist()
         error = [abs(a - b) for a, b in zip(flown, intended, strict=True)]
         if (most := max(error)) > worst[0]:
             j = error.index(most)

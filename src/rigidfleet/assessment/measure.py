@@ -182,13 +182,19 @@ class Measurements:
             return sampled or between
         return between if sense(between.value) > sense(sampled.value) else sampled
 
-    def worst_of(self, name: str, index: int) -> Extreme | None:
-        """The worst value of a phase, at its samples or between them."""
-        quantity, x = self.measured[name], self.result.phases[index].extremes.get(name)
-        rank = self.rank[name].get(index, -math.inf)
-        if x is not None and rank < quantity.sense(x.value):
-            return self.between(name, index)
-        return None if rank == -math.inf else self.worst_sample(quantity, self.samples[index])
+    def worst_of(self, index: int) -> dict[str, Extreme]:
+        """The worst values of a phase, at its samples or between them, by name."""
+        extremes, samples, found = self.result.phases[index].extremes, self.samples[index], {}
+        for name, quantity in self.measured.items():
+            x, rank = extremes.get(name), self.rank[name].get(index, -math.inf)
+            worst = None
+            if x is not None and rank < quantity.sense(x.value):
+                worst = self.between(name, index)
+            elif rank != -math.inf:
+                worst = self.worst_sample(quantity, samples)
+            if worst is not None:
+                found[name] = worst
+        return found
 
     def greatest(self, order: int, size: Callable[[Floats], Floats]) -> Extreme | None:
         """Greatest convex ``size`` of velocities (order 1) or accelerations (2) between samples; None if unknown.
@@ -373,7 +379,6 @@ class Measurements:
             distances = _greatest(
                 distance_geometry.distances(result.position[last], edges) - intended
             )
-        extremes = {name: self.worst_of(name, index) for name in self.measured}
         return PhaseVerdict(
             name=record.name,
             kind=record.kind,
@@ -391,7 +396,7 @@ class Measurements:
             order=None if fit is None else fit.in_order,
             waypoint=self.waypoint(index) if finished else None,
             through=tuple(self.passed(record, samples)),
-            worst={name: found for name, found in extremes.items() if found is not None},
+            worst=self.worst_of(index),
         )
 
     def edges(self, formation: str, k: int) -> tuple[Ints, Floats]:
@@ -416,19 +421,26 @@ class Measurements:
     def fits(self) -> dict[int, Fit]:
         """Fits of the formations at the end of each phase; those of equally many agents are computed at once."""
         alike: dict[int, list[tuple[int, Floats, Floats, Ints]]] = {}
-        for index in self.flown:
-            name, last = self.result.phases[index].formation, self.samples[index].stop - 1
-            p, left = self.result.position[last], np.flatnonzero(self.left[last])
+        ends = self.result.position[[self.samples[k].stop - 1 for k in self.flown]]
+        known: Bools = np.isfinite(ends).all(axis=(1, 2))
+        every = np.arange(self.result.n_agents)
+        for k, (index, end) in enumerate(zip(self.flown, ends, strict=True)):
+            name = self.result.phases[index].formation
             slots = None if name is None else self.formation(name)[0]
-            if slots is not None and len(left) > 1 and np.isfinite(p).all():
-                alike.setdefault(len(left), []).append((index, p[left], slots[left], left))
+            if slots is None or not known[k]:
+                continue
+            one = index, end, slots, every
+            if not self.whole:
+                left = np.flatnonzero(self.left[self.samples[index].stop - 1])
+                one = index, end[left], slots[left], left
+            if len(one[-1]) > 1:
+                alike.setdefault(len(one[-1]), []).append(one)
         fits = {}
         for group in alike.values():
             laid = Laid.of(
                 np.stack([p for _, p, _, _ in group]), np.stack([s for *_, s, _ in group])
             )
-            each = zip(*laid._replace(lengths=laid.lengths.swapaxes(0, 1)), strict=True)
-            for (index, p, slots, left), one in zip(group, each, strict=True):
+            for (index, p, slots, left), one in zip(group, zip(*laid, strict=True), strict=True):
                 fits[index] = Fit(p, slots, left, Laid(*one))
         return fits
 

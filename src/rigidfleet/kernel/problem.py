@@ -1,16 +1,30 @@
 """One phase of a flight as arrays, written by `plan` and read by the kernel.
 
-Short names are the paper's; every array is C-contiguous float64 (edges: uint32). N agents, m edges.
+Short names are the paper's; every array is C-contiguous float64 (edges: uint32). N agents, m edges. The kernel is
+compiled with the extents that types of arrays declare here, and once more with N = m = 3 (see `compiler.pointers`).
 """
 
 import math
 from itertools import accumulate
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rigidfleet.typing import Bools, Edges, Floats
+
+
+class Extents(tuple[int | str | None, ...]):
+    """Extents of an array: numbers, or "N", "m", "P" pairs of edges, "A" unknowns of the multipliers; None: any."""
+
+
+PerAgent = Annotated[Floats, Extents(("N",))]
+PerEdge = Annotated[Floats, Extents(("m",))]
+#: A vector for each agent, and over time.
+Places = Annotated[Floats, Extents(("N", 3))]
+PlacesInTime = Annotated[Floats, Extents((None, "N", 3))]
+Vector = Annotated[Floats, Extents((3,))]
+Matrix = Annotated[Floats, Extents((3, 3))]
 
 # Multiplier solves (`ConstraintLaw.solver`).
 ITERATED, SPECTRAL, EXACT, PINV = range(4)
@@ -28,11 +42,11 @@ SPLITS = {"equal": PINV_EQUAL, "inertia": PINV_INERTIA, "inertia+force": PINV_IN
 class Vehicles(NamedTuple):
     """The agents: point masses."""
 
-    m: Floats  # (N,) mass [kg]
-    inverse: Floats  # (N,) of it [1/kg]
+    m: PerAgent  # mass [kg]
+    inverse: PerAgent  # of it [1/kg]
     M: float  # their sum [kg]
     mean: float  # mean mass of the agents not lost [kg]; the laws' unit of mass
-    thrust_limit: Floats  # (N,) [N]; inf if unlimited
+    thrust_limit: PerAgent  # [N]; inf if unlimited
     saturate: bool  # clip the thrust at its limit
     g: float  # gravity along -z [m/s^2]
 
@@ -44,10 +58,12 @@ class Graph(NamedTuple):
     that agent adds to ``A = J M^-1 J^T``: ``A[k, l] = weight[p] * (u_k . u_l)``.
     """
 
-    edges: Edges  # (m, 2), agents from 0; unsigned, which makes an index cheaper
-    pairs: Edges  # (P, 2)
-    weight: Floats  # (P,) +-1/m_i [1/kg]
-    diagonal: Floats  # (m,) of A: 1/m_i + 1/m_j [1/kg]
+    edges: Annotated[
+        Edges, Extents(("m", 2))
+    ]  # agents from 0; unsigned, which makes an index cheaper
+    pairs: Annotated[Edges, Extents(("P", 2))]
+    weight: Annotated[Floats, Extents(("P",))]  # +-1/m_i [1/kg]
+    diagonal: PerEdge  # of A: 1/m_i + 1/m_j [1/kg]
     solver: int = 0  # address of the multiplier solver of a large formation (`large`)
 
 
@@ -79,11 +95,11 @@ class Reference(NamedTuple):
     kind: int
     t0: float  # [s]
     T_b: float  # [s]
-    d0: Floats  # (m,) distances before [m]
-    d1: Floats  # (m,) distances after [m]
-    p0: Floats  # (N, 3) slots before, body axes [m]
-    dp: Floats  # (N, 3) what the blend adds to them [m]
-    turn: Floats  # (3,) rotation vector by which the slots turn during the blend [rad]; zero with ``knots``
+    d0: PerEdge  # distances before [m]
+    d1: PerEdge  # distances after [m]
+    p0: Places  # slots before, body axes [m]
+    dp: Places  # what the blend adds to them [m]
+    turn: Vector  # rotation vector by which the slots turn during the blend [rad]; zero with ``knots``
     knots: Floats = NO_KNOTS  # (K + 1,) [s], or empty
     ways: Floats = (
         NO_WAYS  # (K, N, 3, P): piece, slot in body axes [m], power of (t - knots[piece])
@@ -98,29 +114,30 @@ class Motion(NamedTuple):
     """
 
     knots: Floats  # (n + 1,) [s]
-    coefficients: Floats  # (n, 6, P): piece, channel, power of (t - knots[piece]); quintics (P = 6) are fastest
-    T1: Floats  # (3, 3) world -> body
+    # (n, 6, P) piece, channel, power of (t - knots[piece]); quintics (P = 6) are fastest
+    coefficients: Annotated[Floats, Extents((None, 6, None))]
+    T1: Matrix  # world -> body
 
 
 class Feedback(NamedTuple):
     """LQR of the virtual body: gain tables over the time to go, and the moving target."""
 
     to_go: Floats  # (n,) increasing, from 0 [s]
-    gain: Floats  # (n, 4): position [1/s^2], velocity [1/s]; attitude, rate
-    slope: Floats  # (n, 4) their derivatives with respect to the time to go
+    gain: Annotated[Floats, Extents((None, 4))]  # position [1/s^2], velocity [1/s]; attitude, rate
+    slope: Annotated[Floats, Extents((None, 4))]  # their derivatives with respect to the time to go
     arrival: float  # T [s]
-    r: Floats  # (3,) target at T [m]
-    v: Floats  # (3,) [m/s]
-    T1: Floats  # (3, 3) target attitude at T, world -> body
-    omega: Floats  # (3,) target rates, body axes [rad/s]
-    hold: Floats  # (4,) gains after T
+    r: Vector  # target at T [m]
+    v: Vector  # [m/s]
+    T1: Matrix  # target attitude at T, world -> body
+    omega: Vector  # target rates, body axes [rad/s]
+    hold: Annotated[Floats, Extents((4,))]  # gains after T
 
 
 class Control(NamedTuple):
     """Input law of a phase."""
 
     kind: int
-    force: Floats  # (N, 3) open loop: input force, weight balance included [N]
+    force: Places  # open loop: input force, weight balance included [N]
     k1: float  # local LQR [1/s^2]
     k2: float  # [1/s]
     allocation: int
@@ -133,17 +150,17 @@ class Disturbance(NamedTuple):
     """
 
     active: bool  # whether there is any disturbance; `inverse` is always used
-    m: Floats  # (N,) true mass [kg]
-    inverse: Floats  # (N,) of it [1/kg]
-    drag: Floats  # (N,) [N s/m]
-    wind: Floats  # (3,) steady, world [m/s]
+    m: PerAgent  # true mass [kg]
+    inverse: PerAgent  # of it [1/kg]
+    drag: PerAgent  # [N s/m]
+    wind: Vector  # steady, world [m/s]
     gust_step: float  # between knots [s]
-    gust: Floats  # (K, N, 3) [m/s]
+    gust: PlacesInTime  # [m/s]
     noise_step: float  # [s]
-    noise_r: Floats  # (K', N, 3) of the measured position [m]
-    noise_v: Floats  # (K', N, 3) of the measured velocity [m/s]
-    lost: Bools  # (N,) without thrust
-    floor: Floats  # (N,) height at which a lost vehicle comes to rest [m]
+    noise_r: PlacesInTime  # of the measured position [m]
+    noise_v: PlacesInTime  # of the measured velocity [m/s]
+    lost: Annotated[Bools, Extents(("N",))]  # without thrust
+    floor: PerAgent  # height at which a lost vehicle comes to rest [m]
 
 
 class Problem(NamedTuple):
@@ -165,41 +182,48 @@ class Problem(NamedTuple):
 class Workspace(NamedTuple):
     """Everything that the right-hand side writes; after a call it holds the values at that state."""
 
-    r: Floats  # (N, 3) position, world [m]
-    v: Floats  # (N, 3) velocity [m/s]
-    r_seen: Floats  # (N, 3) position as measured [m], if there is noise
-    v_seen: Floats  # (N, 3) velocity as measured [m/s], if there is noise
-    u: Floats  # (m, 3) unit vectors of the edges
-    L: Floats  # (m,) lengths [m]
-    d: Floats  # (m,) references [m]
-    d_dot: Floats  # (m,) [m/s]
-    d_ddot: Floats  # (m,) [m/s^2]
-    c: Floats  # (m,) constraints [m]
-    b: Floats  # (m,) right side of the multiplier equation [m/s^2]
-    A: Floats  # (m, m) J M^-1 J^T, or (3N, 3N) J^T J; its lower triangle is factored in place
+    r: Places  # position, world [m]
+    v: Places  # velocity [m/s]
+    r_seen: Places  # position as measured [m], if there is noise
+    v_seen: Places  # velocity as measured [m/s], if there is noise
+    u: Annotated[Floats, Extents(("m", 3))]  # unit vectors of the edges
+    L: PerEdge  # lengths [m]
+    d: PerEdge  # references [m]
+    d_dot: PerEdge  # [m/s]
+    d_ddot: PerEdge  # [m/s^2]
+    c: PerEdge  # constraints [m]
+    b: PerEdge  # right side of the multiplier equation [m/s^2]
+    # J M^-1 J^T (m, m), or J^T J (3N, 3N); its lower triangle is factored in place
+    A: Annotated[Floats, Extents(("A", "A"))]
     V: Floats  # (m, m) eigenvectors, if a law needs them
-    w: Floats  # (m,) eigenvalues; work
-    multiplier: Floats  # (m,) [N]
-    f_E: Floats  # (N, 3) gravity, the user's force and disturbances [N]
-    f_u: Floats  # (N, 3) input [N]
-    f_C: Floats  # (N, 3) constraint force [N]
-    f_D: Floats  # (N, 3) aerodynamic force, part of f_E, if there are disturbances [N]
-    a: Floats  # (N, 3) acceleration [m/s^2]
-    p: Floats  # (N, 3) slots, body axes [m]
-    p_dot: Floats  # (N, 3)
-    p_ddot: Floats  # (N, 3)
-    r_ref: Floats  # (N, 3) desired positions, world [m]
-    v_ref: Floats  # (N, 3)
-    a_ref: Floats  # (N, 3)
-    cm: Floats  # (5, 3): CM position, velocity; omega, h, world axes; omega, body axes
-    I: Floats  # (3, 3) inertia about the CM, world axes [kg m^2]
-    I_inv: Floats  # (3, 3) its pseudo-inverse
-    T: Floats  # (3, 3) world -> body, of the frame among the states
-    body: Floats  # (8, 3) reference motion: r, v, a of the CM; omega, omega_dot; phi, its rates
-    gain: Floats  # (4,)
-    E: Floats  # (3, 3) a relative rotation
-    T_ref: Floats  # (3, 3) world -> body, of the reference motion
-    wrench: Floats  # (6,) commanded: force, torque about the CM, world [N, N m]
+    w: PerEdge  # eigenvalues; work
+    multiplier: PerEdge  # [N]
+    f_E: Places  # gravity, the user's force and disturbances [N]
+    f_u: Places  # input [N]
+    f_C: Places  # constraint force [N]
+    f_D: Places  # aerodynamic force, part of f_E, if there are disturbances [N]
+    a: Places  # acceleration [m/s^2]
+    p: Places  # slots, body axes [m]
+    p_dot: Places
+    p_ddot: Places
+    r_ref: Places  # desired positions, world [m]
+    v_ref: Places
+    a_ref: Places
+    cm: Annotated[
+        Floats, Extents((5, 3))
+    ]  # CM position, velocity; omega, h, world axes; omega, body axes
+    I: Matrix  # inertia about the CM, world axes [kg m^2]
+    I_inv: Matrix  # its pseudo-inverse
+    T: Matrix  # world -> body, of the frame among the states
+    body: Annotated[
+        Floats, Extents((8, 3))
+    ]  # reference motion: r, v, a of the CM; omega, omega_dot; phi, its rates
+    gain: Annotated[Floats, Extents((4,))]
+    E: Matrix  # a relative rotation
+    T_ref: Matrix  # world -> body, of the reference motion
+    wrench: Annotated[
+        Floats, Extents((6,))
+    ]  # commanded: force, torque about the CM, world [N, N m]
     H: Floats  # (3N, 3N) normal matrix of the paper's H; work
     H_V: Floats  # (3N, 3N)
     H_w: Floats  # (2, 3N): right side, eigenvalues

@@ -5,13 +5,18 @@ K samples, N agents, m edges.
 
 import math
 from itertools import accumulate
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rigidfleet.kernel.problem import padded, zeros
+from rigidfleet.kernel.problem import Extents, PerAgent, Places, PlacesInTime, Vector, padded, zeros
 from rigidfleet.typing import Bools, Floats, Ints
+
+PerEdgeInTime = Annotated[Floats, Extents((None, "m"))]
+#: Boxes by their least and greatest corners, and pairs of agents.
+Corners = Annotated[Floats, Extents((None, 6))]
+Pairs = Annotated[Ints, Extents((None, 2))]
 
 #: Return values of an integration.
 FINISHED, PAUSED, COLLAPSED = range(3)
@@ -48,8 +53,8 @@ class Trail(NamedTuple):
     ``points`` are the Bernstein coefficients of the continuous extension, a polynomial of fourth degree.
     """
 
-    clock: Floats  # (S, 2) start [s], length [s]
-    points: Floats  # (S, 5, n)
+    clock: Annotated[Floats, Extents((None, 2))]  # start [s], length [s]
+    points: Annotated[Floats, Extents((None, 5, None))]  # (S, 5, n)
     gauge: Floats  # (S, 3N + 2m) at the end, see `gauge.read_gauge`
     start: Floats  # (3N + 2m,) at the start of the first step, after a jump
 
@@ -74,16 +79,17 @@ class Monitor(NamedTuple):
     when: Floats  # (16,) [s]
     who: Ints  # (16, 2) agents; agent and obstacle; agents of an edge; -1: none
     sign: Floats  # (1,) of the greatest tension
-    radius: Floats  # (N,) [m]
-    left: Bools  # (N,) whether an agent is monitored: not lost
-    standing: Ints  # (N,) whether an agent has stood on an obstacle since the start
-    low: Floats  # (N, 3) clearance, time and obstacle of agents that may be landing; infinity: none
+    radius: PerAgent  # [m]
+    left: Annotated[Bools, Extents(("N",))]  # whether an agent is monitored: not lost
+    # whether an agent has stood on an obstacle since the start
+    standing: Annotated[Ints, Extents(("N",))]
+    low: Places  # clearance, time and obstacle of agents that may be landing; infinity: none
     pad: float  # clearance within which an agent may stand on an obstacle [m]
-    boxes: Floats  # (B, 6) corners of obstacles; of the ground infinite
-    fence: Floats  # (F, 6) corners of the geofence, if there is one
-    pairs: Ints  # (P, 2) whose separation is monitored
-    struck: Ints  # (P', 2) of a lost agent and one still flying
-    columns: Ints  # (P'', 2) that may fly one below the other
+    boxes: Corners  # of obstacles; of the ground infinite
+    fence: Corners  # of the geofence, if there is one
+    pairs: Pairs  # whose separation is monitored
+    struck: Pairs  # of a lost agent and one still flying
+    columns: Pairs  # that may fly one below the other
     flags: Ints  # (4,) see `monitor.watch`
     recorder: int  # address of the recorder, with its arguments: `time` and `states` to evaluate at
     segment: int
@@ -94,15 +100,16 @@ class Monitor(NamedTuple):
     nodes: Floats  # (27, 3N + 2m) forces at points of two steps
     instants: Floats  # (27,) times of these points [s]
     rank: Ints  # (27,) their order in time
-    places: Floats  # (N, 5, 3) control points of the agents' positions over a step [m]
-    span: Floats  # (N,) radius of a ball about the third one that holds all five [m]
-    curve: Floats  # (5, 3) of one pair
-    work: Floats  # (40, 11) polynomials
-    pieces: Floats  # (40, 17) curves
-    basis: Floats  # (5, 5)
-    poses: Floats  # (5, 15) attitude, centre and its velocity at knots
-    knots: Floats  # (5, 3)
-    scratch: Floats  # (3, 10)
+    # control points of the agents' positions over a step [m]
+    places: Annotated[Floats, Extents(("N", 5, 3))]
+    span: PerAgent  # radius of a ball about the third one that holds all five [m]
+    curve: Annotated[Floats, Extents((5, 3))]  # of one pair
+    work: Annotated[Floats, Extents((40, 11))]  # polynomials
+    pieces: Annotated[Floats, Extents((40, 17))]  # curves
+    basis: Annotated[Floats, Extents((5, 5))]
+    poses: Annotated[Floats, Extents((5, 15))]  # attitude, centre and its velocity at knots
+    knots: Annotated[Floats, Extents((5, 3))]
+    scratch: Annotated[Floats, Extents((3, 10))]
 
 
 def monitor(
@@ -133,7 +140,7 @@ class IntegratorState(NamedTuple):
 
     y: Floats  # (n,) state at `clock[0]`
     K: Floats  # (10, n padded to eights) stages, K[0] the derivative at y; y, trial, tolerance
-    clock: Floats  # (3,) t [s], next step h [s], logarithm of the last error
+    clock: Vector  # t [s], next step h [s], logarithm of the last error
     count: NDArray[
         np.int64
     ]  # (5,) evaluations, accepted, rejected, samples written, steps in the trail
@@ -176,26 +183,26 @@ class Segment(NamedTuple):
 class Record(NamedTuple):
     """Recorded quantities, one row per sample."""
 
-    r: Floats  # (K, N, 3)
-    v: Floats
-    a: Floats
-    f_E: Floats
-    f_u: Floats
-    f_C: Floats
-    r_ref: Floats
-    c: Floats  # (K, m)
-    L: Floats
-    d: Floats
-    d_dot: Floats
-    multiplier: Floats
-    p: Floats  # (K, N, 3) slots
-    motion: Floats  # (K, 6) CM reference position and velocity
-    rates: Floats  # (K, 3) reference rates, body axes
-    T_ref: Floats  # (K, 3, 3)
-    wrench: Floats  # (K, 6)
-    r_seen: Floats  # (K, N, 3) as measured
-    v_seen: Floats
-    f_D: Floats
+    r: PlacesInTime
+    v: PlacesInTime
+    a: PlacesInTime
+    f_E: PlacesInTime
+    f_u: PlacesInTime
+    f_C: PlacesInTime
+    r_ref: PlacesInTime
+    c: PerEdgeInTime
+    L: PerEdgeInTime
+    d: PerEdgeInTime
+    d_dot: PerEdgeInTime
+    multiplier: PerEdgeInTime
+    p: PlacesInTime  # slots
+    motion: Annotated[Floats, Extents((None, 6))]  # CM reference position and velocity
+    rates: Annotated[Floats, Extents((None, 3))]  # reference rates, body axes
+    T_ref: Annotated[Floats, Extents((None, 3, 3))]
+    wrench: Annotated[Floats, Extents((None, 6))]
+    r_seen: PlacesInTime  # as measured
+    v_seen: PlacesInTime
+    f_D: PlacesInTime
 
 
 def recorder(k: int, n: int, m: int) -> Record:

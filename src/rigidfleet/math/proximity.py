@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from functools import lru_cache
 from typing import NamedTuple, Protocol
@@ -29,6 +30,10 @@ _CACHED = 60_000
 
 #: Number of points for which a surface of triangles is searched at once: near ones need the same triangles.
 _TOGETHER = 256
+
+
+#: Kinds of solids whose distance takes a search of triangles.
+_SURFACES = HULL, HEIGHTS
 
 
 class Obstacle(Protocol):
@@ -315,10 +320,14 @@ def obstacle_clearances(
     places = np.ascontiguousarray(r.T) if obstacles else r.T
     radius = radius.reshape(-1, *[1] * (r.ndim - 2))
     for k, thing in enumerate(obstacles):
-        clearance = distances(*places, thing.solid, time, least + radius) - radius
+        far = least + radius if thing.solid.kind[0] in _SURFACES else np.inf
+        clearance = distances(*places, thing.solid, time, far) - radius
         closer = clearance < least  # false for NaN
-        np.copyto(least, clearance, where=closer)
-        np.copyto(nearest, k, where=closer)
+        if closer.all():
+            least, nearest = clearance, np.full(nearest.shape, k)
+        elif closer.any():
+            np.copyto(least, clearance, where=closer)
+            np.copyto(nearest, k, where=closer)
     return least.T, nearest.T
 
 
@@ -330,7 +339,7 @@ def distances(
     Points farther than ``most`` may have infinity, too.
     """
     found = _while_there(x, y, z, solid, time, most)
-    if not np.isfinite(solid.there).any():
+    if not any(map(math.isfinite, solid.there[0].tolist())):
         return found
     there = distance.is_there(np.asarray(time, dtype=float).T, 0, solid)
     return np.where(there, found, np.inf)
@@ -344,7 +353,7 @@ def _while_there(
         shift = distance.displacement(np.asarray(time, dtype=float).T, 0, solid)
         x, y, z = x - shift[0], y - shift[1], z - shift[2]
     x, y, z = distance.own_axes(x, y, z, 0, solid)
-    if solid.kind[0] not in (HULL, HEIGHTS):
+    if solid.kind[0] not in _SURFACES:
         return distance.signed_distance(x, y, z, 0, solid)
     found = np.full(x.shape, np.inf)
     near = np.flatnonzero((distance.from_box(x, y, z, solid.size[0]) < most).reshape(-1))

@@ -5,10 +5,16 @@ value, every call would copy them all, and compiling the copies would take as lo
 A `Pointer` is the address of a named tuple laid out in words of eight bytes: a number takes one word (a value of
 lanes takes eight), an array the words of its data address and shape, a nested tuple the words of its fields. Reading a
 field loads its words. They never change while compiled code runs, and the compiler knows this.
+
+Extents of arrays that the tuple's type declares (`rigidfleet.kernel.problem.Extents`) are not loaded. An extent with a
+name passes through a function that returns what it is given; `sized` replaces this function, and makes code for a size
+of the same translation.
 """
 
 import hashlib
-from typing import Any
+import re
+from functools import cache
+from typing import Any, get_type_hints
 
 from llvmlite import ir
 from numba import types
@@ -23,11 +29,14 @@ from numba.extending import (
 )
 
 from rigidfleet.kernel.compiler.simd import WIDTH, lanes
+from rigidfleet.kernel.problem import Extents
 
 _WORD = ir.IntType(64)
 _ADDRESS = _WORD.as_pointer()
 #: Part of a named tuple that may be read in advance [bytes]; there are no registers for more.
 _AHEAD = 256
+#: The function through which a named extent passes.
+_NAMED = "rigidfleet_extent_{}"
 
 
 class Pointer(types.Type):
@@ -85,7 +94,8 @@ def _read(context: Any, builder: Any, kind: Any, address: Any, name: str) -> Any
     if isinstance(found, types.Array):
         array = context.make_array(found)(context, builder)
         array.data = _load(builder, address, first, array.data.type)
-        shape = [_load(builder, address, first + 1 + k) for k in range(found.ndim)]
+        extents = _declared(kind.to.instance_class).get(name, (None,) * found.ndim)
+        shape = [_extent(builder, address, first + 1 + k, x) for k, x in enumerate(extents)]
         return _described(context, builder, found, array, shape)
     if found == types.boolean:
         return builder.trunc(_load(builder, address, first), ir.IntType(1))
@@ -101,6 +111,38 @@ def _load(builder: Any, address: Any, word: int, kind: ir.Type = _WORD) -> Any:
     loaded = builder.load(place, align=8)
     loaded.set_metadata("invariant.load", builder.module.add_metadata([]))
     return loaded
+
+
+@cache
+def _declared(kind: type) -> dict[str, Extents]:
+    """Declared extents of the arrays of a type of named tuple."""
+    hints = get_type_hints(kind, include_extras=True)
+    about = {name: getattr(hint, "__metadata__", ()) for name, hint in hints.items()}
+    return {name: x for name, known in about.items() for x in known if isinstance(x, Extents)}
+
+
+def _extent(builder: Any, address: Any, word: int, declared: int | str | None) -> Any:
+    if isinstance(declared, int):
+        return ir.Constant(_WORD, declared)
+    loaded = _load(builder, address, word)
+    if declared is None:
+        return loaded
+    name, kind = _NAMED.format(declared), ir.FunctionType(_WORD, [_WORD])
+    function = builder.module.globals.get(name)
+    if function is None:
+        function = ir.Function(builder.module, kind, name)
+        function.linkage = "linkonce_odr"
+        function.attributes.add("alwaysinline")
+        ir.IRBuilder(function.append_basic_block()).ret(function.args[0])
+    return builder.call(function, [loaded])
+
+
+def sized(text: str, sizes: dict[str, int]) -> str:
+    """A module's text in which named extents are these numbers."""
+    for name, size in sizes.items():
+        body = rf"(?s)(define [^\n]*@\"?{_NAMED.format(name)}\"?\(.*?ret i64) [^\n]*"
+        text = re.sub(body, rf"\1 {size}", text)
+    return text
 
 
 def _described(context: Any, builder: Any, kind: types.Array, array: Any, shape: list[Any]) -> Any:

@@ -61,7 +61,9 @@ def integrate(
 ) -> int:
     """Integrate to ``t_end`` [s], see `rigidfleet.kernel.dopri5.integrate`."""
     segment = pack(Segment(t_end, fresh, max_steps, times, samples, NOTHING))
-    return _call(_code().integrate, packed(problem), packed(workspace), packed(state), segment)
+    return _call(
+        _integrator(problem, workspace), packed(problem), packed(workspace), packed(state), segment
+    )
 
 
 class Integration:
@@ -79,12 +81,18 @@ class Integration:
         self._segment = pack(Segment(t_end, False, 0, times, samples, NOTHING))
         self._kept = packed(problem), packed(workspace), packed(state), self._segment
         self._addresses = [x.address for x in self._kept]
-        self._integrate = _code().integrate
+        self._integrate = _integrator(problem, workspace)
 
     def __call__(self, fresh: bool, max_steps: int) -> int:
         """Go on; ``fresh`` as in `Segment`. Returns what `rigidfleet.kernel.dopri5.integrate` returns."""
         self._segment.words[1], self._segment.words[2] = int(fresh), max_steps
         return self._integrate(*self._addresses)
+
+
+def _integrator(problem: Problem, workspace: Workspace) -> Any:
+    code, graph = _code(), problem.graph
+    sizes = len(problem.vehicles.m), len(graph.edges), len(graph.pairs), len(workspace.A)
+    return code.integrate_three if sizes == (3, 3, 3, 3) else code.integrate
 
 
 def record(problem: Problem, workspace: Workspace, times: Floats, samples: Floats) -> Record:
@@ -142,6 +150,7 @@ class _Code(NamedTuple):
     watch: Any
     measure: Any
     spectrum: Any
+    integrate_three: Any  # integrate, for three agents with three edges
     recorder: int  # address of record
     engine: Any  # keeps the code alive
     unkept: list[bytes] | None  # objects that could not be stored in the cache
@@ -238,11 +247,11 @@ def _linked(parts: Sequence[bytes], unkept: list[bytes] | None = None) -> _Code:
     addresses = [engine.get_function_address(name) for name in ENTRIES]
     functions = (
         ctypes.CFUNCTYPE(word, *(word,) * words)(address)
-        for words, address in zip((4, 4, 4, 1, 1, 4), addresses, strict=True)
+        for words, address in zip((4, 4, 4, 1, 1, 4, 4), addresses, strict=True)
     )
-    *calls, gather = functions
+    *calls, gather, three = functions
     use(gather, engine)
-    return _Code(*calls, addresses[1], engine, unkept)
+    return _Code(*calls, three, addresses[1], engine, unkept)
 
 
 def _engine(parts: Sequence[bytes]) -> Any:
