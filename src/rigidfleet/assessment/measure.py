@@ -422,7 +422,7 @@ class Measurements:
         """Fits of the formations at the end of each phase; those of equally many agents are computed at once."""
         alike: dict[int, list[tuple[int, Floats, Floats, Ints]]] = {}
         ends = self.result.position[[self.samples[k].stop - 1 for k in self.flown]]
-        known: Bools = np.isfinite(ends).all(axis=(1, 2))
+        known = np.atleast_1d(np.isfinite(ends).all(axis=(1, 2)))
         every = np.arange(self.result.n_agents)
         for k, (index, end) in enumerate(zip(self.flown, ends, strict=True)):
             name = self.result.phases[index].formation
