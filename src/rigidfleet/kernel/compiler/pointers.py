@@ -8,11 +8,12 @@ field loads its words. They never change while compiled code runs, and the compi
 
 Extents of arrays that the tuple's type declares (`rigidfleet.kernel.problem.Extents`) are not loaded. An extent with a
 name passes through a function that returns what it is given; `sized` replaces this function, and makes code for a size
-of the same translation.
+of the same translation, if `keep_extents` was called before it.
 """
 
 import hashlib
 import re
+from collections.abc import Mapping
 from functools import cache
 from typing import Any, get_type_hints
 
@@ -35,8 +36,8 @@ _WORD = ir.IntType(64)
 _ADDRESS = _WORD.as_pointer()
 #: Part of a named tuple that may be read in advance [bytes]; there are no registers for more.
 _AHEAD = 256
-#: The function through which a named extent passes.
-_NAMED = "rigidfleet_extent_{}"
+#: The function through which a named extent passes, and whether calls of it are inlined at once.
+_NAMED, _inlining = "rigidfleet_extent_{}", ["alwaysinline"]
 
 
 class Pointer(types.Type):
@@ -132,16 +133,32 @@ def _extent(builder: Any, address: Any, word: int, declared: int | str | None) -
     if function is None:
         function = ir.Function(builder.module, kind, name)
         function.linkage = "linkonce_odr"
-        function.attributes.add("alwaysinline")
+        function.attributes.add(_inlining[0])
         ir.IRBuilder(function.append_basic_block()).ret(function.args[0])
     return builder.call(function, [loaded])
 
 
-def sized(text: str, sizes: dict[str, int]) -> str:
-    """A module's text in which named extents are these numbers."""
-    for name, size in sizes.items():
-        body = rf"(?s)(define [^\n]*@\"?{_NAMED.format(name)}\"?\(.*?ret i64) [^\n]*"
-        text = re.sub(body, rf"\1 {size}", text)
+def keep_extents() -> None:
+    """Keep the functions of named extents, in what is translated from now on, until `sized` replaces them."""
+    _inlining[0] = "noinline"
+
+
+def sized(text: str, sizes: Mapping[str, int]) -> str:
+    """A module's text in which named extents are these numbers; those not given are as they come.
+
+    Raises RuntimeError if the text has no such extent.
+    """
+    found = set()
+
+    def inlined(function: re.Match[str]) -> str:
+        found.add(function[2])
+        extent = sizes.get(function[2], "%x")
+        return f"define linkonce_odr i64 @{function[1]}(i64 %x) alwaysinline {{ ret i64 {extent} }}"
+
+    definition = rf'^define [^\n]*@"?({_NAMED.format("([A-Za-z])")})"?\(.*?^}}'
+    text = re.sub(definition, inlined, text, flags=re.DOTALL | re.MULTILINE)
+    if missing := sizes.keys() - found:
+        raise RuntimeError(f"the translated kernel has no extents {', '.join(sorted(missing))}")
     return text
 
 

@@ -10,6 +10,7 @@ shares little with the integrator meanwhile.
 import re
 import subprocess
 import sys
+from collections.abc import Mapping
 from typing import Any
 
 import llvmlite.binding as llvm
@@ -18,7 +19,7 @@ from numba import cfunc, typeof, types
 from rigidfleet.kernel import dopri5, measurement, monitor, recorder
 from rigidfleet.kernel.compiler import gathering, numba_internals
 from rigidfleet.kernel.compiler.jit import OPTIONS
-from rigidfleet.kernel.compiler.pointers import pointer, sized
+from rigidfleet.kernel.compiler.pointers import keep_extents, pointer, sized
 from rigidfleet.kernel.engine import objects, packing
 
 #: Functions that every evaluation calls, to be inlined; calls would take a tenth of a small formation's time.
@@ -35,6 +36,8 @@ _HOT_SAMPLED = (
 #: Extents of the triangle, the paper's first formation, for which the integrator is compiled once more: loops of known
 #: length save a fifth of the time.
 THREE = {"N": 3, "m": 3, "P": 3, "A": 3}
+#: No extents: code for any number of agents.
+ANY: Mapping[str, int] = {}
 #: Passes that simplify each translated function before inlining.
 _QUICK = ("sroa", "simplify_cfg", "instruction_combine", "simplify_cfg")
 
@@ -59,11 +62,12 @@ def machine_code(second: "subprocess.Popen[bytes] | None" = None) -> list[bytes]
         recorder.record(call.times, call.samples, problem(p), workspace(w), call.dy, record(out))
         return 0
 
+    keep_extents()
     functions = zip((integrate_segment, record_segment), objects.ENTRIES, strict=False)
     modules = [_module(function, name) for function, name in functions]
     text, symbol, _ = modules[0]
-    modules.append((sized(text, THREE), symbol, objects.ENTRIES[-1]))
-    *codes, three = [_object(*module) for module in modules]
+    codes = [_object(*module) for module in modules]
+    three = _object(text, symbol, objects.ENTRIES[-1], sizes=THREE)
     made = None if second is None else objects.separated(second.communicate()[0])
     return [*codes, *(made or apart()), three]
 
@@ -137,9 +141,15 @@ def _module(function: Any, name: str, arguments: int = 4) -> tuple[str, str, str
     return made.inspect_llvm(), made.native_name, name
 
 
-def _object(text: str, symbol: str, name: str, hot: tuple[str, ...] = _HOT) -> bytes:
-    """Object code of a module of which ``symbol`` alone, now called ``name``, is called from outside."""
-    module = _simplified(text, symbol, name, hot)
+def _object(
+    text: str,
+    symbol: str,
+    name: str,
+    hot: tuple[str, ...] = _HOT,
+    sizes: Mapping[str, int] = ANY,
+) -> bytes:
+    """Object code of a module of which ``symbol`` alone, now called ``name``, is called from outside; see `sized`."""
+    module = _simplified(sized(text, sizes), symbol, name, hot)
     builder = _passes(3)
     builder.getModulePassManager().run(module, builder)
     for function in module.functions:
