@@ -8,7 +8,6 @@ system ends it for its memory.
 
 from __future__ import annotations
 
-import gc
 import multiprocessing
 import os
 import pickle
@@ -29,17 +28,15 @@ if TYPE_CHECKING:
 
     from rigidfleet.result import Result
 
-#: What the server loads: all that a drawing process needs, which would otherwise be loaded in each of them.
-_LOADED = [
-    "rigidfleet.plotting", "matplotlib.backends.backend_agg", "matplotlib.style", "mpl_toolkits.mplot3d.axes3d",
-    "rigidfleet.plotting.figure", "rigidfleet.mission", __name__, "matplotlib.patheffects",
-]  # fmt: skip
 #: Each drawing process holds a copy of the result: larger positions [bytes] are drawn in this process.
 _LARGEST = 50_000_000
 #: Fewer figures are not worth a process.
 _FEW = 3
-#: Figures that take longest; they are drawn first, so that all processes end at about the same time.
-_SLOW = ("summary", "cm", "clearance", "attitude", "vehicles", "rotors")
+#: Figures by the time they take; the longest are drawn first, so that all processes end at about the same time.
+_SLOW = (
+    "summary", "cm", "attitude", "vehicles", "rotors", "clearance", "trajectory", "constraint_error",
+    "constraint_force", "inputs",
+)  # fmt: skip
 
 
 def at_once() -> int:
@@ -55,7 +52,7 @@ def prepare() -> bool:
         return False
     from multiprocessing import forkserver
 
-    multiprocessing.set_forkserver_preload(_LOADED)
+    multiprocessing.set_forkserver_preload(["rigidfleet.cli.drawing_server"])
     # Ctrl-C is for this process alone, which ends the others. They inherit that the signal waits.
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
@@ -83,7 +80,7 @@ class Drawings:
         self, result: Result, figures: Mapping[Path, Sequence[str]], *, titles: bool
     ) -> None:
         self.figures, self._result, self._titles = figures, result, titles
-        self._asked = deque(sorted(figures, key=lambda path: path.name not in _SLOW))
+        self._asked = deque(sorted(figures, key=_rank))
         #: A figure and its files by format; None when a process draws no more.
         self._drawn: SimpleQueue[tuple[Path, dict[str, bytes]] | None] = SimpleQueue()
         self._processes: list[ForkServerProcess] = []
@@ -148,6 +145,10 @@ class Drawings:
             yield path
 
 
+def _rank(figure: Path) -> int:
+    return _SLOW.index(figure.name) if figure.name in _SLOW else len(_SLOW)
+
+
 def _draw(asked: Connection, result: bytes, titles: bool) -> None:
     """Draw figures, in a process of its own, as their names and formats arrive; send their files.
 
@@ -155,7 +156,6 @@ def _draw(asked: Connection, result: bytes, titles: bool) -> None:
     """
     from rigidfleet.plotting import rendered
 
-    gc.disable()  # of a process that ends after some figures; it takes a tenth of the time
     with suppress(Exception):
         flown: Result = pickle.loads(result)
         while True:
