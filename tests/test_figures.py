@@ -939,6 +939,19 @@ def test_a_folder_that_is_a_file_is_reported(triangle, tmp_path):
         plotting.plot(triangle, tmp_path / "x", names=["cm"], formats=["png"])
 
 
+@pytest.mark.parametrize("transparent", [False, True])
+def test_a_png_holds_the_pixels_that_are_drawn(triangle, tmp_path, transparent):
+    """Our PNG files are read back as what matplotlib's renderer holds, with its resolution and any transparency."""
+    figure = drawn("distances", triangle)
+    figure.savefig(tmp_path / "ours.png", transparent=transparent)
+    figure.savefig(tmp_path / "theirs.png", transparent=transparent, metadata={"Author": "Ada"})
+    with Image.open(tmp_path / "ours.png") as ours, Image.open(tmp_path / "theirs.png") as theirs:
+        assert ours.mode == ("RGBA" if transparent else "RGB")
+        assert ours.info["dpi"] == pytest.approx((figure.dpi, figure.dpi), rel=1e-3)
+        assert theirs.info["Author"] == "Ada"
+        np.testing.assert_array_equal(np.asarray(ours.convert("RGBA")), np.asarray(theirs))
+
+
 def test_drawing_leaves_matplotlib_alone(triangle, tmp_path):
     """Settings are as before, and the backend is not chosen for the user."""
     before = dict(mpl.rcParams)
