@@ -125,8 +125,9 @@ def _worst_of_few(p: Floats, slots: Floats) -> Floats:
     most = error.max(axis=-1, keepdims=True)
     at = (error >= most - _ROUNDING * intended.max(axis=-1, keepdims=True)).argmax(axis=-1)
     there = at[..., None]
-    values = (np.take_along_axis(x, there, axis=-1)[..., 0] for x in (error, flown, intended))
-    off, flown, intended = values
+    off, flown, intended = (
+        np.take_along_axis(x, there, axis=-1)[..., 0] for x in (error, flown, intended)
+    )
     return np.stack([off, *np.divmod(at, n), flown, intended], axis=-1)
 
 

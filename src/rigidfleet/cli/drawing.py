@@ -80,7 +80,7 @@ class Drawings:
         self, result: Result, figures: Mapping[Path, Sequence[str]], *, titles: bool
     ) -> None:
         self.figures, self._result, self._titles = figures, result, titles
-        self._asked = deque(sorted(figures, key=_rank))
+        self._asked = deque(sorted(figures, key=lambda path: (*_SLOW, path.name).index(path.name)))
         #: A figure and its files by format; None when a process draws no more.
         self._drawn: SimpleQueue[tuple[Path, dict[str, bytes]] | None] = SimpleQueue()
         self._processes: list[ForkServerProcess] = []
@@ -143,10 +143,6 @@ class Drawings:
         for path, formats in left.items():
             plot(self._result, path.parent, names=[path.name], formats=formats, titles=self._titles)
             yield path
-
-
-def _rank(figure: Path) -> int:
-    return _SLOW.index(figure.name) if figure.name in _SLOW else len(_SLOW)
 
 
 def _draw(asked: Connection, result: bytes, titles: bool) -> None:

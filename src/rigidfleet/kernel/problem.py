@@ -58,9 +58,8 @@ class Graph(NamedTuple):
     that agent adds to ``A = J M^-1 J^T``: ``A[k, l] = weight[p] * (u_k . u_l)``.
     """
 
-    edges: Annotated[
-        Edges, Extents(("m", 2))
-    ]  # agents from 0; unsigned, which makes an index cheaper
+    # agents from 0; unsigned, which makes an index cheaper
+    edges: Annotated[Edges, Extents(("m", 2))]
     pairs: Annotated[Edges, Extents(("P", 2))]
     weight: Annotated[Floats, Extents(("P",))]  # +-1/m_i [1/kg]
     diagonal: PerEdge  # of A: 1/m_i + 1/m_j [1/kg]
@@ -209,21 +208,18 @@ class Workspace(NamedTuple):
     r_ref: Places  # desired positions, world [m]
     v_ref: Places
     a_ref: Places
-    cm: Annotated[
-        Floats, Extents((5, 3))
-    ]  # CM position, velocity; omega, h, world axes; omega, body axes
+    # CM position, velocity; omega, h, world axes; omega, body axes
+    cm: Annotated[Floats, Extents((5, 3))]
     I: Matrix  # inertia about the CM, world axes [kg m^2]
     I_inv: Matrix  # its pseudo-inverse
     T: Matrix  # world -> body, of the frame among the states
-    body: Annotated[
-        Floats, Extents((8, 3))
-    ]  # reference motion: r, v, a of the CM; omega, omega_dot; phi, its rates
+    # reference motion: r, v, a of the CM; omega, omega_dot; phi, its rates
+    body: Annotated[Floats, Extents((8, 3))]
     gain: Annotated[Floats, Extents((4,))]
     E: Matrix  # a relative rotation
     T_ref: Matrix  # world -> body, of the reference motion
-    wrench: Annotated[
-        Floats, Extents((6,))
-    ]  # commanded: force, torque about the CM, world [N, N m]
+    # commanded: force, torque about the CM, world [N, N m]
+    wrench: Annotated[Floats, Extents((6,))]
     H: Floats  # (3N, 3N) normal matrix of the paper's H; work
     H_V: Floats  # (3N, 3N)
     H_w: Floats  # (2, 3N): right side, eigenvalues

@@ -187,9 +187,10 @@ def rendered(
     result: Result, name: str, formats: Iterable[str], *, titles: bool = True
 ) -> dict[str, bytes]:
     """Contents of a figure's files by format; parameters are those of `plot`."""
-    figure = _drawn(result, name, titles=titles)
-    keep_layout(figure)
-    return {kind: _rendered(figure, kind, close=not titles) for kind in formats}
+    with settings():
+        figure = _drawn(result, name, titles=titles)
+        keep_layout(figure)
+        return {kind: _rendered(figure, kind, close=not titles) for kind in formats}
 
 
 def write_figure(

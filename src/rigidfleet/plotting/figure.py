@@ -46,9 +46,8 @@ def _png(pixels: np.ndarray[Any, np.dtype[np.uint8]], dpi: float) -> bytes:
     opaque = pixels[..., 3].min() == 255
     height, width, channels = *pixels.shape[:2], 3 if opaque else 4
     colours = pixels[..., :channels].reshape(height, width * channels)
-    rows = np.full(
-        (height, 1 + width * channels), 2, np.uint8
-    )  # filter 2: the difference to the row above
+    # Filter 2 begins each row: the difference to the row above
+    rows = np.full((height, 1 + width * channels), 2, np.uint8)
     rows[0, 1:] = colours[0]
     np.subtract(colours[1:], colours[:-1], out=rows[1:, 1:])
     per_metre = round(dpi / _METRES_PER_INCH)

@@ -61,17 +61,13 @@ Place = tuple[tuple[float, float], Any, tuple[float, float], str, str]
 _ALONG = ((0.995, "right"), (0.5, "center"), (0.005, "left"), (0.75, "center"), (0.25, "center"))
 _places: WeakKeyDictionary[Annotation, Sequence[Place]] = WeakKeyDictionary()
 _titled: ContextVar[bool] = ContextVar("titled", default=True)
-_applied: ContextVar[bool] = ContextVar(
-    "applied", default=False
-)  # whether the style is, which takes 2 ms
+#: Whether the style is applied, which takes 2 ms.
+_applied: ContextVar[bool] = ContextVar("applied", default=False)
 
 _RC: dict[str, Any] = {
     "font.family": "sans-serif",
-    "font.sans-serif": [
-        "DejaVu Sans",
-        "Verdana",
-        "Arial",
-    ],  # of a file that keeps text; each is sought for each text
+    # In files that keep text; each font is sought for each text
+    "font.sans-serif": ["DejaVu Sans", "Verdana", "Arial"],
     "font.size": 8.5,
     "axes.titlesize": 9,
     "axes.labelsize": 8.5,
@@ -193,9 +189,8 @@ def time_figure(
     head(fig, result, title)
     for ax in axes.flat:
         over_time(ax, result)
-    for ax in axes[
-        :-1
-    ].flat:  # where time has neither numbers nor a name; matplotlib would seek places for them
+    # Upper time axes have neither numbers nor a name; matplotlib would seek places for them
+    for ax in axes[:-1].flat:
         ax.xaxis.set_in_layout(False)
         ax.xaxis.set_label_coords(0.5, 0.0)
     for ax in axes[-1]:
