@@ -266,6 +266,22 @@ def filled(_context, x):
 
 
 @intrinsic
+def spread(_context, x, addresses, offset):
+    """Store each lane of x at one of eight addresses (8,), plus an offset in numbers."""
+
+    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        given = context.make_array(sig.args[1])(context, builder, args[1]).data
+        pointer = ir.DoubleType().as_pointer()
+        for lane in range(WIDTH):
+            place = builder.load(builder.gep(given, [ir.Constant(_INDEX, lane)]))
+            place = builder.gep(builder.inttoptr(place, pointer), [args[2]])
+            builder.store(builder.extract_element(args[0], ir.Constant(_INDEX, lane)), place)
+        return context.get_dummy_value()
+
+    return types.void(lanes, addresses, types.int64), generate
+
+
+@intrinsic
 def in_vectors(_context, array):
     """View float64 (..., n), n a multiple of 8, as lanes (..., n / 8); lanes are returned unchanged."""
     if array.dtype == lanes:

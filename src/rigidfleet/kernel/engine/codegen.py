@@ -1,4 +1,4 @@
-"""Fly eight flights of one problem at a time, with straight-line code generated for it.
+"""Fly eight flights at a time, of one problem or of problems that differ in numbers, with straight-line code.
 
 `rigidfleet.kernel.engine.tracer` generates the code of the right-hand side. It is compiled once for each
 structure of a problem (its graph, its law, which of its numbers are equal). The integrator is that of
@@ -8,6 +8,7 @@ single flights, compiled once for vectors.
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,51 +20,125 @@ from rigidfleet.kernel import dopri5
 from rigidfleet.kernel.compiler import simd
 from rigidfleet.kernel.compiler.jit import compiled_copy, compiled_for_c, inlined
 from rigidfleet.kernel.compiler.simd import VECTOR, WIDTH, LaneArray
+from rigidfleet.kernel.control import piece_at
+from rigidfleet.kernel.disturbances import spline_weights
 from rigidfleet.kernel.engine import lane_steps
-from rigidfleet.kernel.engine.tracer import Code, Symbol, Trace, structure
-from rigidfleet.kernel.problem import Problem
+from rigidfleet.kernel.engine.tracer import (
+    MOMENT,
+    Code,
+    FlightTrace,
+    Symbol,
+    Trace,
+    flight_structure,
+    numbers,
+    structure,
+)
+from rigidfleet.kernel.problem import Disturbance, Problem
 from rigidfleet.kernel.references import septic
-from rigidfleet.typing import Floats
+from rigidfleet.typing import Floats, Ints
 
 
 class UnrolledProblem(NamedTuple):
-    """A problem in the form that straight-line code reads; ``before`` and ``time`` are overwritten in flight."""
+    """A problem in the form that straight-line code reads; arrays of lanes hold a number of each of eight flights.
+
+    ``before``, ``time`` and ``gauge`` are overwritten in flight. Tables over time have no rows if there are none.
+    """
 
     address: int  # of the code
-    uniform: Floats  # (U,) values that depend on the problem's numbers alone
+    uniform: LaneArray  # (U,) values that depend on the problem's numbers alone
     before: LaneArray  # (m,) distances from which references are blended [m]
-    time: Floats  # (3,) blend of the references, and two derivatives
+    time: Floats  # (12,) numbers of the moment, see `tracer`
+    gauge: LaneArray  # (3N + 2m,) forces to watch, or (0,)
     t0: float  # [s]
     T_b: float  # [s]
+    knots: Floats  # of the reference motion [s]
+    motion: LaneArray  # (pieces, 36) its coefficients
+    gust_step: float  # [s]
+    gust: LaneArray  # (K, 3N)
+    noise_step: float  # [s]
+    noise_r: LaneArray  # (K, 3N)
+    noise_v: LaneArray  # (K, 3N)
+    # (4, 8) addresses of each flight's steps, forces, forces at the start, and samples; see `lane_steps`
+    kept: Ints
 
 
 def unrolled(problem: Problem) -> UnrolledProblem:
-    """Prepare a problem for `integrate`; compile its code if it is not yet in the cache.
+    """Prepare a problem of eight flights for `integrate`; compile its code if it is not yet in the cache.
 
     Raises
     ------
     UnfitError
         The problem has branches that depend on the state.
     """
-    description, numbers, _ = structure(problem)
+    description, values, _ = structure(problem)
+    return _prepared(problem, description, values[:, None], lambda: Trace(problem))
+
+
+def unrolled_together(problems: Sequence[Problem], tables: Tables) -> UnrolledProblem:
+    """Prepare eight problems, which `batch.fit_together`, of one flight each; with their tables of disturbances.
+
+    Raises
+    ------
+    UnfitError
+        The problems have branches that depend on the state, or take different ones.
+    """
+    first, values = problems[0], numbers(problems)
+    ready = _prepared(first, flight_structure(first, values), values, lambda: FlightTrace(first, values))
+    motion = np.stack([p.motion.coefficients for p in problems], axis=-1)
+    d0 = np.stack([p.reference.d0 for p in problems], axis=-1)
+    return ready._replace(
+        before=simd.pack(d0), knots=first.motion.knots, motion=simd.pack(motion.reshape(len(motion), 36, WIDTH)),
+        **tables._asdict(),
+    )  # fmt: skip
+
+
+class Tables(NamedTuple):
+    """Gusts and noise of eight flights, as in `UnrolledProblem`."""
+
+    gust_step: float
+    gust: LaneArray
+    noise_step: float
+    noise_r: LaneArray
+    noise_v: LaneArray
+
+
+def tables(given: Sequence[Disturbance]) -> Tables:
+    """The tables of the disturbances of eight flights."""
+
+    def packed(name: str) -> LaneArray:
+        parts = [getattr(x, name) for x in given]
+        rows, agents, _ = parts[0].shape
+        return simd.pack(np.stack([x.reshape(rows, 3 * agents) for x in parts], axis=-1))
+
+    return Tables(
+        given[0].gust_step, packed("gust"), given[0].noise_step, packed("noise_r"), packed("noise_v")
+    )
+
+
+def _prepared(
+    problem: Problem, description: bytes, values: Floats, trace: Callable[[], Trace]
+) -> UnrolledProblem:
     name = hashlib.sha256(description).hexdigest()[:16]
     if name not in _KNOWN:
-        code = Code(Trace(problem))
+        code = Code(trace())
         _KNOWN[name] = code, _compile(code, name)
     code, address = _KNOWN[name]
-    reference = problem.reference
-    before = simd.pack(np.zeros((len(problem.graph.edges), WIDTH)))
+    uniform = np.broadcast_to(code.values(values), (len(code.inputs), WIDTH))
+    edges, reference = len(problem.graph.edges), problem.reference
+    none = simd.pack(np.zeros((0, 1, WIDTH)))
     return UnrolledProblem(
-        address, code.values(numbers), before, np.zeros(3), reference.t0, reference.T_b
-    )
+        address, simd.pack(uniform), simd.pack(np.zeros((edges, WIDTH))), np.zeros(MOMENT),
+        simd.pack(np.zeros((len(code.gauge), WIDTH))), reference.t0, reference.T_b,
+        np.zeros(0), none, 1.0, none, 1.0, none, none, np.zeros((4, WIDTH), dtype=np.int64),
+    )  # fmt: skip
 
 
 _KNOWN: dict[str, tuple[Code, int]] = {}
 
 
 @intrinsic
-def _call_code(_context, address, y, dy, uniform, before, time):
-    """Call straight-line code with the data of five arrays."""
+def _call_code(_context, address, y, dy, gauge, uniform, before, time, motion, gust, noise_r, noise_v):
+    """Call straight-line code with the data of arrays."""
 
     def generate(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
         pointer = ir.DoubleType().as_pointer()
@@ -75,13 +150,25 @@ def _call_code(_context, address, y, dy, uniform, before, time):
         builder.call(builder.inttoptr(arguments[0], kind.as_pointer()), data)
         return context.get_dummy_value()
 
-    return types.void(types.int64, y, dy, uniform, before, time), generate
+    arrays = y, dy, gauge, uniform, before, time, motion, gust, noise_r, noise_v
+    return types.void(types.int64, *arrays), generate
 
 
 @inlined
 def _closed_loop(t, y, dy, p, w):
-    p.time[0], p.time[1], p.time[2] = septic(t, p.t0, p.T_b)
-    _call_code(p.address, y, dy, p.uniform, p.before, p.time)
+    time = p.time
+    time[0], time[1], time[2] = septic(t, p.t0, p.T_b)
+    piece = gust = noise = 0
+    if p.motion.shape[0] > 0:
+        piece, time[3], _ = piece_at(t, p.knots)
+    if p.gust.shape[0] > 0:
+        gust, time[4], time[5], time[6], time[7] = spline_weights(t, p.gust_step, p.gust.shape[0])
+    if p.noise_r.shape[0] > 0:
+        noise, time[8], time[9], time[10], time[11] = spline_weights(t, p.noise_step, p.noise_r.shape[0])
+    _call_code(
+        p.address, y, dy, p.gauge, p.uniform, p.before, time, p.motion[piece:], p.gust[gust:], p.noise_r[noise:],
+        p.noise_v[noise:],
+    )  # fmt: skip
 
 
 #: As `dopri5.integrate`, by the steps of `lane_steps`; p is an `UnrolledProblem`, w is not used, arrays hold lanes.
@@ -90,38 +177,44 @@ integrate = compiled_copy(
 )
 
 
-def _lines(y, dy, uniform, before, time):
+def _lines(y, dy, gauge, uniform, before, time, motion, gust, noise_r, noise_v):
     """Straight-line code: each copy of `_derivative` has its own."""
     raise NotImplementedError
 
 
-def _derivative(y, dy, uniform, before, time):
-    _lines(y, dy, uniform, before, time)
+def _derivative(y, dy, gauge, uniform, before, time, motion, gust, noise_r, noise_v):
+    _lines(y, dy, gauge, uniform, before, time, motion, gust, noise_r, noise_v)
+
+
+#: Number of arrays that the code takes.
+_ARRAYS = _derivative.__code__.co_argcount
 
 
 def _compile(code: Code, name: str) -> int:
     """Compile straight-line code, or find it compiled on disk; return its address."""
 
     @intrinsic
-    def lines(_context, y, dy, uniform, before, time):
+    def lines(_context, y, dy, gauge, uniform, before, time, motion, gust, noise_r, noise_v):
         def generate(context: Any, builder: Any, _sig: Any, arguments: Any) -> Any:
             builder.call(_emit(builder.module, code), arguments)
             return context.get_dummy_value()
 
-        return types.void(y, dy, uniform, before, time), generate
+        arrays = y, dy, gauge, uniform, before, time, motion, gust, noise_r, noise_v
+        return types.void(*arrays), generate
 
-    return compiled_for_c(_derivative, f"derivative_{name}", arguments=5, _lines=lines)
+    return compiled_for_c(_derivative, f"derivative_{name}", arguments=_ARRAYS, _lines=lines)
 
 
 def _emit(module: ir.Module, code: Code) -> ir.Function:
-    """Write the code as a function of pointers to y, dy, uniform, before and time."""
+    """Write the code as a function of pointers to the arrays of `_derivative`."""
     pointer = ir.DoubleType().as_pointer()
-    function = ir.Function(module, ir.FunctionType(ir.VoidType(), [pointer] * 5), "straight_line")
+    kind = ir.FunctionType(ir.VoidType(), [pointer] * _ARRAYS)
+    function = ir.Function(module, kind, "straight_line")
     function.linkage = "internal"
     function.attributes.add("noinline")
     for argument in function.args:
         argument.add_attribute("noalias")
-    y, dy, uniform, before, time = function.args
+    y, dy, gauge, uniform, before, time, *rows = function.args
     builder = ir.IRBuilder(function.append_basic_block())
     values: dict[int, ir.Value] = {}
 
@@ -135,19 +228,24 @@ def _emit(module: ir.Module, code: Code) -> ir.Function:
 
     inputs = {x.serial: index for index, x in enumerate(code.inputs)}
 
+    def loaded(x: Symbol) -> ir.Value:
+        if x.serial in inputs:
+            return builder.load(element(uniform, inputs[x.serial]), align=8)
+        match x.operation, *x.arguments:
+            case "time", place:
+                return scalar(time, place)
+            case "table", which, index:
+                return builder.load(element(rows[which], index), align=8)
+            case "before", index:
+                return builder.load(element(before, index), align=8)
+        return builder.load(element(y, x.arguments[0]), align=8)
+
     def value(x: Symbol | float) -> ir.Value:
         """The value of a symbol, computed already or loaded at its first use."""
         if not isinstance(x, Symbol):
             return simd.number(x)
         if x.serial not in values:
-            if x.serial in inputs:
-                found = scalar(uniform, inputs[x.serial])
-            elif x.operation == "time":
-                found = scalar(time, x.arguments[0])
-            else:
-                array = {"y": y, "before": before}[x.operation]
-                found = builder.load(element(array, x.arguments[0]), align=8)
-            values[x.serial] = found
+            values[x.serial] = loaded(x)
         return values[x.serial]
 
     for x in code.lines:
@@ -161,5 +259,7 @@ def _emit(module: ir.Module, code: Code) -> ir.Function:
             for good in whole:
                 found = builder.select(good, found, simd.number(float("nan")))
         builder.store(found, element(dy, index), align=8)
+    for index, x in enumerate(code.gauge):
+        builder.store(value(x), element(gauge, index), align=8)
     builder.ret_void()
     return function
