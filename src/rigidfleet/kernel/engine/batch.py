@@ -193,16 +193,16 @@ class Vector:
     def __call__(self, t_end: float, max_steps: int) -> int:
         """Go on to ``t_end`` [s]; return what `dopri5.integrate` returns. States, trails and samples are then known."""
         state = self._state
-        state.count[4] = self._states[0].count[4]
+        begin = state.count[4] = self._states[0].count[4]
         status = fly_on(
             self._problem, state, t_end, self._fresh, self._times, _UNSAMPLED, max_steps
         )
         self._fresh = False
-        steps, y = int(state.count[4]), unpack(state.y)
+        steps, y = state.count[4], unpack(state.y)
         for lane, own in enumerate(self._states):
             own.y[:] = y[:, lane]
             own.clock[:], own.count[:] = state.clock, state.count
-            own.trail.clock[:steps] = state.trail.clock[:steps]
+            own.trail.clock[begin:steps] = state.trail.clock[begin:steps]
         return status
 
 
