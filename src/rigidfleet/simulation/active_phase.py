@@ -311,7 +311,7 @@ class ActivePhase:
 
     def _segment(self, problem: Problem, t_end: float) -> None:
         """Integrate to ``t_end`` [s] and record the samples on the way."""
-        stretch = self.prepare(problem, t_end)
+        stretch = self.prepare(problem, self.times(t_end))
         state, fresh = self.state, stretch.fresh  # of which another trail alone may follow
         given = t_end, stretch.times, stretch.samples
         status = records.PAUSED
@@ -342,15 +342,18 @@ class ActivePhase:
             own_force = self.external is not None
             raise StoppedError(diagnose(self.place, own_force=own_force, collapsed=collapsed))
 
-    def prepare(self, problem: Problem, t_end: float) -> Stretch:
-        """Prepare to integrate a problem from now to ``t_end`` [s]: what to record on the way."""
+    def times(self, t_end: float) -> Floats:
+        """Times (K,) [s] to record from now to ``t_end`` [s]."""
+        return self.sampler(self.plan, self.t, t_end, first=not self.begun, stop=self.stop)
+
+    def prepare(self, problem: Problem, times: Floats) -> Stretch:
+        """Prepare to integrate a problem from now on, and to record the states at some times (K,) [s]."""
         fresh = self.state.count[0] == 0 or problem is not self.plan.problem
         if fresh:
             self.watch(last=True)
             self.flown = problem
             if self.solver is not None:  # a solver keeps state: the monitor has its own
                 self.flown = solved_by(self.solver.aside, problem)
-        times = self.sampler(self.plan, self.t, t_end, first=not self.begun, stop=self.stop)
         self.begun = True
         samples = np.empty((len(times), len(self.state.y)))
         self.state.count[3] = 0

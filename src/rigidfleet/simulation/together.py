@@ -39,6 +39,8 @@ def simulate_together(missions: Sequence[Mission]) -> list[Result]:
     MissionError
         A mission has errors.
     """
+    if len({mission.output_step for mission in missions}) > 1:
+        return [simulate(mission) for mission in missions]
     flights = [Flight(mission) for mission in missions]
     given: Tables | None = None
     while True:
@@ -85,7 +87,7 @@ def _plain(phase: ActivePhase) -> bool:
 
 
 def _times(phase: ActivePhase) -> tuple[object, ...]:
-    """When a phase is flown, and the times to record."""
+    """When a phase is flown, and all that the times to record follow from."""
     plan = phase.plan
     points = tuple(t for t, _ in plan.through)
     return plan.start, plan.t_end, plan.arrival, points, plan.integrator.rtol, len(phase.state.y)
@@ -97,13 +99,14 @@ def _fly(active: Sequence[ActivePhase], given: Tables) -> bool:
     from rigidfleet.kernel.engine.tracer import UnfitError
 
     t_end = active[0].plan.t_end
-    stretches = [phase.prepare(phase.plan.problem, t_end) for phase in active]
+    times = active[0].times(t_end)
+    stretches = [phase.prepare(phase.plan.problem, times) for phase in active]
     try:
         vector = batch.Vector(
             _filled([stretch.problem for stretch in stretches]),
             _filled([phase.state for phase in active]),
             given,
-            stretches[0].times,
+            times,
             _filled([stretch.samples for stretch in stretches]),
         )
     except UnfitError:

@@ -13,7 +13,13 @@ from rigidfleet.kernel.compiler.jit import compiled
 from rigidfleet.kernel.compiler.pointers import by_address
 from rigidfleet.kernel.compiler.simd import WIDTH, LaneArray, pack, unpack
 from rigidfleet.kernel.engine import lane_steps, native
-from rigidfleet.kernel.engine.codegen import Tables, integrate, unrolled, unrolled_together
+from rigidfleet.kernel.engine.codegen import (
+    Tables,
+    integrate,
+    interleaved,
+    unrolled,
+    unrolled_together,
+)
 from rigidfleet.kernel.problem import (
     EXACT,
     ITERATED,
@@ -181,13 +187,12 @@ class Vector:
         kept = [[t.points for t in trails], [t.gauge for t in trails], [t.start for t in trails], samples]
         self._problem.kept[:] = [[x.ctypes.data for x in row] for row in kept]
         n = len(states[0].y)
-        K = np.zeros((lane_steps.ROWS, n, WIDTH))
-        K[lane_steps.ATOL] = np.stack([state.K[ATOL, :n] for state in states], axis=-1)
+        K = pack(np.zeros((lane_steps.ROWS, n, WIDTH)))
+        K[lane_steps.ATOL] = interleaved([state.K[ATOL, :n] for state in states])
         clock = np.array([states[0].clock[0], _FIRST_STEP_IN_VECTORS, LEAST_ERROR])
         trail = NO_TRAIL._replace(clock=np.empty_like(trails[0].clock))
-        y = pack(np.stack([state.y for state in states], axis=-1))
-        counts = np.zeros(5, dtype=np.int64)
-        self._state = IntegratorState(y, pack(K), clock, counts, states[0].rtol, trail)
+        y, counts = interleaved([state.y for state in states]), np.zeros(5, dtype=np.int64)
+        self._state = IntegratorState(y, K, clock, counts, states[0].rtol, trail)
         self._fresh = True
 
     def __call__(self, t_end: float, max_steps: int) -> int:

@@ -7,6 +7,7 @@ single flights, compiled once for vectors.
 
 from __future__ import annotations
 
+import ctypes
 import hashlib
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -18,13 +19,14 @@ from numba.extending import intrinsic
 
 from rigidfleet.kernel import dopri5
 from rigidfleet.kernel.compiler import simd
-from rigidfleet.kernel.compiler.jit import compiled_copy, compiled_for_c, inlined
-from rigidfleet.kernel.compiler.simd import VECTOR, WIDTH, LaneArray
+from rigidfleet.kernel.compiler.jit import compiled, compiled_copy, compiled_for_c, inlined
+from rigidfleet.kernel.compiler.simd import VECTOR, WIDTH, LaneArray, collected
 from rigidfleet.kernel.control import piece_at
 from rigidfleet.kernel.disturbances import spline_weights
 from rigidfleet.kernel.engine import lane_steps
 from rigidfleet.kernel.engine.tracer import (
     MOMENT,
+    SOURCES,
     Code,
     FlightTrace,
     Symbol,
@@ -84,12 +86,11 @@ def unrolled_together(problems: Sequence[Problem], tables: Tables) -> UnrolledPr
     """
     first, values = problems[0], numbers(problems)
     ready = _prepared(first, flight_structure(first, values), values, lambda: FlightTrace(first, values))
-    motion = np.stack([p.motion.coefficients for p in problems], axis=-1)
-    d0 = np.stack([p.reference.d0 for p in problems], axis=-1)
+    before = interleaved([p.reference.d0 for p in problems])
+    motion = interleaved([p.motion.coefficients for p in problems])
     return ready._replace(
-        before=simd.pack(d0), knots=first.motion.knots, motion=simd.pack(motion.reshape(len(motion), 36, WIDTH)),
-        **tables._asdict(),
-    )  # fmt: skip
+        before=before, knots=first.motion.knots, motion=motion.reshape(-1, 36), **tables._asdict()
+    )
 
 
 class Tables(NamedTuple):
@@ -108,11 +109,25 @@ def tables(given: Sequence[Disturbance]) -> Tables:
     def packed(name: str) -> LaneArray:
         parts = [getattr(x, name) for x in given]
         rows, agents, _ = parts[0].shape
-        return simd.pack(np.stack([x.reshape(rows, 3 * agents) for x in parts], axis=-1))
+        return interleaved(parts).reshape(rows, 3 * agents)
 
     return Tables(
         given[0].gust_step, packed("gust"), given[0].noise_step, packed("noise_r"), packed("noise_v")
     )
+
+
+def interleaved(parts: Sequence[Floats]) -> LaneArray:
+    """Lanes of eight arrays of one shape (...), one after the other in C order."""
+    parts = [np.ascontiguousarray(x) for x in parts]
+    made = simd.empty((parts[0].size,))
+    _interleave(np.array([x.ctypes.data for x in parts]), made)
+    return made
+
+
+@compiled
+def _interleave(addresses, made):
+    for k in range(made.shape[0]):
+        made[k] = collected(addresses, k)
 
 
 def _prepared(
@@ -121,19 +136,22 @@ def _prepared(
     name = hashlib.sha256(description).hexdigest()[:16]
     if name not in _KNOWN:
         code = Code(trace())
-        _KNOWN[name] = code, _compile(code, name)
-    code, address = _KNOWN[name]
-    uniform = np.broadcast_to(code.values(values), (len(code.inputs), WIDTH))
+        _KNOWN[name] = code, _compile(code, name), _compile_before(code, name)
+    code, address, before = _KNOWN[name]
+    uniform, given = simd.empty((len(code.inputs),)), simd.pack(np.broadcast_to(values, (len(values), WIDTH)))
+    before(given.ctypes.data, uniform.ctypes.data)
     edges, reference = len(problem.graph.edges), problem.reference
-    none = simd.pack(np.zeros((0, 1, WIDTH)))
+    none = simd.empty((0, 1))
     return UnrolledProblem(
-        address, simd.pack(uniform), simd.pack(np.zeros((edges, WIDTH))), np.zeros(MOMENT),
+        address, uniform, simd.pack(np.zeros((edges, WIDTH))), np.zeros(MOMENT),
         simd.pack(np.zeros((len(code.gauge), WIDTH))), reference.t0, reference.T_b,
         np.zeros(0), none, 1.0, none, 1.0, none, none, np.zeros((4, WIDTH), dtype=np.int64),
     )  # fmt: skip
 
 
-_KNOWN: dict[str, tuple[Code, int]] = {}
+#: Code by its structure, the address of what is computed in flight, and a function of two addresses that computes what
+#: is known before.
+_KNOWN: dict[str, tuple[Code, int, Callable[[int, int], None]]] = {}
 
 
 @intrinsic
@@ -205,6 +223,67 @@ def _compile(code: Code, name: str) -> int:
     return compiled_for_c(_derivative, f"derivative_{name}", arguments=_ARRAYS, _lines=lines)
 
 
+def _numbers_before(given, uniform):
+    """What depends on a problem's numbers alone: each copy of `_before` has its own."""
+    raise NotImplementedError
+
+
+def _before(given, uniform):
+    _numbers_before(given, uniform)
+
+
+def _compile_before(code: Code, name: str) -> Callable[[int, int], None]:
+    """Compile what is known before a flight: a function of the addresses of numbers (D,) and inputs (U,), in lanes."""
+
+    @intrinsic
+    def numbers_before(_context, given, uniform):
+        def generate(context: Any, builder: Any, _sig: Any, arguments: Any) -> Any:
+            numbers, inputs = arguments
+            load = lambda b, x: b.load(_element(b, numbers, x.arguments[0]), align=8)  # noqa: E731
+            value = _valued(builder, load)
+            for x in code.before:
+                value(x)
+            for index, x in enumerate(code.inputs):
+                builder.store(value(x), _element(builder, inputs, index), align=8)
+            return context.get_dummy_value()
+
+        return types.void(given, uniform), generate
+
+    address = compiled_for_c(
+        _before, f"before_{name}", arguments=2, _numbers_before=numbers_before
+    )
+    return ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)(address)
+
+
+def _element(builder: ir.IRBuilder, array: ir.Value, index: int) -> ir.Value:
+    """Place of lanes in an array."""
+    vectors = builder.bitcast(array, VECTOR.as_pointer())
+    return builder.gep(vectors, [ir.Constant(ir.IntType(64), index)])
+
+
+def _valued(
+    builder: ir.IRBuilder, load: Callable[[ir.IRBuilder, Symbol], ir.Value], known: Sequence[Symbol] = ()
+) -> Callable[[Symbol | float], ir.Value]:
+    """A function that returns the value of a symbol whose arguments it has returned before.
+
+    Sources and the symbols ``known`` are loaded, at their first use.
+    """
+    values: dict[int, ir.Value] = {}
+    loaded = {x.serial for x in known}
+
+    def value(x: Symbol | float) -> ir.Value:
+        if not isinstance(x, Symbol):
+            return simd.number(x)
+        if x.serial not in values:
+            if x.serial in loaded or x.operation in SOURCES:
+                values[x.serial] = load(builder, x)
+            else:
+                values[x.serial] = simd.BUILD[x.operation](builder, *map(value, x.arguments))
+        return values[x.serial]
+
+    return value
+
+
 def _emit(module: ir.Module, code: Code) -> ir.Function:
     """Write the code as a function of pointers to the arrays of `_derivative`."""
     pointer = ir.DoubleType().as_pointer()
@@ -216,40 +295,24 @@ def _emit(module: ir.Module, code: Code) -> ir.Function:
         argument.add_attribute("noalias")
     y, dy, gauge, uniform, before, time, *rows = function.args
     builder = ir.IRBuilder(function.append_basic_block())
-    values: dict[int, ir.Value] = {}
-
-    def element(array: ir.Value, index: int) -> ir.Value:
-        vectors = builder.bitcast(array, VECTOR.as_pointer())
-        return builder.gep(vectors, [ir.Constant(ir.IntType(64), index)])
-
-    def scalar(array: ir.Value, index: int) -> ir.Value:
-        place = builder.gep(array, [ir.Constant(ir.IntType(64), index)])
-        return simd.in_all(builder, builder.load(place))
-
     inputs = {x.serial: index for index, x in enumerate(code.inputs)}
 
-    def loaded(x: Symbol) -> ir.Value:
-        if x.serial in inputs:
-            return builder.load(element(uniform, inputs[x.serial]), align=8)
+    def load(builder: ir.IRBuilder, x: Symbol) -> ir.Value:
         match x.operation, *x.arguments:
+            case _ if x.serial in inputs:
+                array, index = uniform, inputs[x.serial]
             case "time", place:
-                return scalar(time, place)
+                number = builder.gep(time, [ir.Constant(ir.IntType(64), place)])
+                return simd.in_all(builder, builder.load(number))
             case "table", which, index:
-                return builder.load(element(rows[which], index), align=8)
-            case "before", index:
-                return builder.load(element(before, index), align=8)
-        return builder.load(element(y, x.arguments[0]), align=8)
+                array = rows[which]
+            case operation, index:
+                array = {"y": y, "before": before}[operation]
+        return builder.load(_element(builder, array, index), align=8)
 
-    def value(x: Symbol | float) -> ir.Value:
-        """The value of a symbol, computed already or loaded at its first use."""
-        if not isinstance(x, Symbol):
-            return simd.number(x)
-        if x.serial not in values:
-            values[x.serial] = loaded(x)
-        return values[x.serial]
-
+    value = _valued(builder, load, code.inputs)
     for x in code.lines:
-        values[x.serial] = simd.BUILD[x.operation](builder, *map(value, x.arguments))
+        value(x)
     whole = [builder.fcmp_ordered(">", value(x), simd.number(0.0)) for x in code.positive]
     for index, x in enumerate(code.outputs):
         if index < code.coordinates:  # a velocity, see `lane_steps`
@@ -258,8 +321,8 @@ def _emit(module: ir.Module, code: Code) -> ir.Function:
         if index == code.coordinates:  # one state without a derivative is enough
             for good in whole:
                 found = builder.select(good, found, simd.number(float("nan")))
-        builder.store(found, element(dy, index), align=8)
+        builder.store(found, _element(builder, dy, index), align=8)
     for index, x in enumerate(code.gauge):
-        builder.store(value(x), element(gauge, index), align=8)
+        builder.store(value(x), _element(builder, gauge, index), align=8)
     builder.ret_void()
     return function

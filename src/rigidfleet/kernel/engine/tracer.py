@@ -26,26 +26,13 @@ from rigidfleet.typing import Floats, Ints
 #: Sources of a symbol's value, in the order in which they become known: numbers of the problem;
 #: numbers of the flight, of the moment (the same for all flights, or by flight), and of its state.
 UNIFORM, FLIGHT, TIME, STATE = range(4)
-_SOURCES = {"uniform": UNIFORM, "before": FLIGHT, "time": TIME, "table": TIME, "y": STATE}
+SOURCES = {"uniform": UNIFORM, "before": FLIGHT, "time": TIME, "table": TIME, "y": STATE}
 #: Places among the moment's numbers: blend and two derivatives; time since the reference's piece began; weights of
 #: the gusts' and of the noise's splines.
 BLEND, SINCE, GUST, NOISE, MOMENT = 0, 3, 4, 8, 12
 #: Tables over time: pieces of the reference motion, gusts, noise of positions and of velocities.
 MOTION, GUSTS, NOISE_R, NOISE_V = range(4)
 
-_EVALUATE: dict[str, Callable[..., Any]] = {
-    "add": lambda a, b: a + b,
-    "sub": lambda a, b: a - b,
-    "mul": lambda a, b: a * b,
-    "neg": lambda a: -a,
-    "inverse": lambda a: 1.0 / a,
-    "inverse_root": lambda a: 1.0 / np.sqrt(a),
-    "root": lambda a, _: np.sqrt(a),
-    "max": np.maximum,
-    "min": np.minimum,
-    "abs": np.abs,
-    "where_positive": lambda x, a, b: np.where(x > 0.0, a, b),
-}
 #: Terms of the series of functions of an angle, and the square of the greatest angle; exact to 1e-15 up to it.
 _TERMS, _WIDEST = 17, 16.0
 
@@ -63,7 +50,7 @@ class Symbol:
         self.trace, self.operation, self.arguments = trace, operation, arguments
         self.serial = len(trace.made)
         given = [x.known for x in arguments if isinstance(x, Symbol)]
-        self.known = _SOURCES[operation] if operation in _SOURCES else max(given, default=UNIFORM)
+        self.known = SOURCES[operation] if operation in SOURCES else max(given, default=UNIFORM)
 
     def __add__(self, other: Any) -> Any:
         return self.trace.add(self, other)
@@ -266,8 +253,8 @@ class Trace:
 
     def _plain(self, function: Dispatcher) -> Callable[..., Any]:
         """The function, and all that it calls, as plain Python functions with mathematics for symbols."""
-        some = lambda operation: (  # noqa: E731
-            lambda a, b: self.symbol(operation, a, b) if _any(a, b) else _EVALUATE[operation](a, b)
+        some = lambda operation, plain: (  # noqa: E731
+            lambda a, b: self.symbol(operation, a, b) if _any(a, b) else plain(a, b)
         )
         mathematics = SimpleNamespace(
             sqrt=self.root, sin=self._sine, cos=self._cosine, nan=math.nan, inf=math.inf
@@ -275,8 +262,8 @@ class Trace:
         time = lambda *places: [self.symbol("time", k) for k in places]  # noqa: E731
         instead = {
             "math": mathematics,
-            "max": some("max"),
-            "min": some("min"),
+            "max": some("max", max),
+            "min": some("min", min),
             "septic": lambda *_: time(BLEND, BLEND + 1, BLEND + 2),
             "piece_at": lambda *_: (0, *time(SINCE), 0.0),
             # The step of a table has been replaced by the place of its weights.
@@ -330,7 +317,7 @@ class FlightTrace(Trace):
     Raises
     ------
     UnfitError
-        The problem has branches that depend on the state, or problems that take different ones.
+        The problem has branches that depend on the state.
     """
 
     def __init__(self, problem: Problem, values: Floats) -> None:
@@ -338,11 +325,8 @@ class FlightTrace(Trace):
         super().__init__(problem)
 
     def known_positive(self, x: Symbol) -> bool:
-        """Whether a number is positive in all problems."""
-        found = self._values[x.arguments[0]] > 0.0
-        if found.any() and not found.all():
-            raise UnfitError("problems that take different branches")
-        return bool(found.all())
+        """Whether a number is positive: in all problems, or in none (`flight_structure`)."""
+        return bool((self._values[x.arguments[0]] > 0.0).all())
 
     def _with_symbols(self, problem: Problem) -> Problem:
         parts: dict[str, dict[str, Any]] = {}
@@ -380,21 +364,26 @@ class FlightTrace(Trace):
 
 
 def flight_structure(problem: Problem, values: Floats) -> bytes:
-    """Everything that the code of a `FlightTrace` depends on."""
+    """Everything that the code of a `FlightTrace` depends on.
+
+    Raises
+    ------
+    UnfitError
+        Some of the problems damp deformations, others do not, which is a branch of the law.
+    """
     graph, law, control, given = problem.graph, problem.law, problem.control, problem.disturbance
-    sizes = [np.size(x) for x in _numbers_of(problem)]
-    ends = np.cumsum(sizes)
-    signs = [
-        np.sign(values[end - size : end]).any()
-        for name, size, end in zip(_OF_FLIGHT, sizes, ends, strict=True)
-        if name in _MAY_BE_ZERO
-    ]
+    ends = np.cumsum([np.size(x) for x in _numbers_of(problem)])[-len(_MAY_BE_ZERO) - 1 :]
+    of = {
+        name: values[ends[k] : ends[k + 1]].any(axis=0) for k, name in enumerate(_MAY_BE_ZERO)
+    }
+    if len(set(of["law.k_def"].tolist())) > 1:
+        raise UnfitError("problems that take different branches")
     kinds = law.solver, law.iterations, problem.reference.kind, control.kind, given.active
     tables = [len(x) > 0 for x in (given.gust, given.noise_r, given.noise_v)]
-    saturates = problem.vehicles.saturate
-    return repr(
-        ("flight", len(problem.vehicles.m), graph.edges.tolist(), graph.pairs.tolist(), kinds, tables, saturates, signs)
-    ).encode()  # fmt: skip
+    there = [bool(x.any()) for x in of.values()]
+    pairs = graph.edges.tolist(), graph.pairs.tolist()
+    saturates = bool(problem.vehicles.saturate)
+    return repr(("flight", len(problem.vehicles.m), pairs, kinds, tables, saturates, there)).encode()
 
 
 class Code:
@@ -406,8 +395,9 @@ class Code:
     gauge : (3N + 2m,) symbols or numbers, or none
     coordinates : number of coordinates of positions, whose derivatives, the first outputs, are velocities
     positive : symbols that have to be positive
+    before : symbols that depend on the problem's numbers alone, each after its arguments
+    inputs : (U,) those of them that the lines use
     lines : symbols computed in flight, each after its arguments
-    inputs : (U,) symbols that depend on the problem's numbers alone and that the lines use
     """
 
     def __init__(self, trace: Trace) -> None:
@@ -415,31 +405,16 @@ class Code:
         self.gauge = trace.gauge
         self.positive = [x for x in trace.positive if x.known > UNIFORM]
         self.lines: list[Symbol] = []
-        self._uniform: list[Symbol] = []
+        self.before: list[Symbol] = []
         self._seen: set[int] = set()
         for x in (*self.positive, *self.outputs, *self.gauge):
             self._need(x)
         self.lines = sorted(
-            (x for x in self.lines if x.operation not in _SOURCES), key=lambda x: x.serial
+            (x for x in self.lines if x.operation not in SOURCES), key=lambda x: x.serial
         )
         used = [x for line in self.lines for x in line.arguments] + self.outputs + self.gauge
         inputs = [x for x in used if isinstance(x, Symbol) and x.known == UNIFORM]
         self.inputs = list({x.serial: x for x in inputs}.values())
-
-    def values(self, numbers: Floats) -> Floats:
-        """Values (U, ...) of the inputs for a problem's distinct numbers, as `structure` returns them; or for `numbers`."""
-        found: dict[int, Any] = {}
-        with np.errstate(all="ignore"):
-            for x in self._uniform:
-                if x.operation == "uniform":
-                    found[x.serial] = numbers[x.arguments[0]]
-                else:
-                    given = (found[a.serial] if isinstance(a, Symbol) else a for a in x.arguments)
-                    found[x.serial] = _EVALUATE[x.operation](*given)
-        made = np.empty((len(self.inputs), *numbers.shape[1:]))
-        for row, x in zip(made, self.inputs, strict=True):
-            row[...] = found[x.serial]
-        return made
 
     def _need(self, wanted: Any) -> None:
         """List everything that a symbol needs, without recursion, because chains are long."""
@@ -455,7 +430,7 @@ class Code:
                 stack += [x, *missing]
                 continue
             self._seen.add(x.serial)
-            (self._uniform if x.known == UNIFORM else self.lines).append(x)
+            (self.before if x.known == UNIFORM else self.lines).append(x)
 
 
 def structure(problem: Problem) -> tuple[bytes, Floats, Ints]:
