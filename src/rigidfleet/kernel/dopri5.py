@@ -101,15 +101,6 @@ def step_size(t, h, t_end, p):
     return rest / max(1.0, math.ceil(rest / h - 0.05))
 
 
-@inlined
-def growth(error, last, p):
-    """Ratio of the next step to one with this error, after one with the error before (logarithms of both).
-
-    0.9 error^-0.17 last^0.04, by logarithms: two powers would cost half an evaluation.
-    """
-    return 0.9 * math.exp(0.04 * last - 0.17 * error)
-
-
 @compiled
 def keep_start(p, w, state):
     """Record the forces after a jump in the trail."""
@@ -224,8 +215,9 @@ def integrate(p, w, state, t_end, fresh, times, samples, max_steps):
         t = t_new
         first = 1
         count[1] += 1
+        # 0.9 error^-0.17 last^0.04, by logarithms: two powers would cost half an evaluation.
         error = math.log(max(error, 1e-8))
-        h *= min(5.0, max(0.2, growth(error, last, p)))
+        h *= min(5.0, max(0.2, 0.9 * math.exp(0.04 * last - 0.17 * error)))
         last = max(error, LEAST_ERROR)
         if t >= t_end:
             status = FINISHED

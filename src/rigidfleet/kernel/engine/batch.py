@@ -184,13 +184,16 @@ class Vector:
         self._states, self._samples, self._times = states, samples, times
         self._problem = unrolled_together(_alike(problems), given)
         trails = [state.trail for state in states]
-        kept = [[t.points for t in trails], [t.gauge for t in trails], [t.start for t in trails], samples]
+        kept = [
+            [t.points for t in trails], [t.gauge for t in trails], [t.start for t in trails], samples,
+            [t.clock for t in trails],
+        ]  # fmt: skip
         self._problem.kept[:] = [[x.ctypes.data for x in row] for row in kept]
         n = len(states[0].y)
         K = pack(np.zeros((lane_steps.ROWS, n, WIDTH)))
         K[lane_steps.ATOL] = interleaved([state.K[ATOL, :n] for state in states])
         clock = np.array([states[0].clock[0], _FIRST_STEP_IN_VECTORS, LEAST_ERROR])
-        trail = NO_TRAIL._replace(clock=np.empty_like(trails[0].clock))
+        trail = NO_TRAIL._replace(clock=trails[0].clock)  # for its length
         y, counts = interleaved([state.y for state in states]), np.zeros(5, dtype=np.int64)
         self._state = IntegratorState(y, K, clock, counts, states[0].rtol, trail)
         self._fresh = True
@@ -198,16 +201,15 @@ class Vector:
     def __call__(self, t_end: float, max_steps: int) -> int:
         """Go on to ``t_end`` [s]; return what `dopri5.integrate` returns. States, trails and samples are then known."""
         state = self._state
-        begin = state.count[4] = self._states[0].count[4]
+        state.count[4] = self._states[0].count[4]
         status = fly_on(
             self._problem, state, t_end, self._fresh, self._times, _UNSAMPLED, max_steps
         )
         self._fresh = False
-        steps, y = state.count[4], unpack(state.y)
+        y = unpack(state.y)
         for lane, own in enumerate(self._states):
             own.y[:] = y[:, lane]
             own.clock[:], own.count[:] = state.clock, state.count
-            own.trail.clock[begin:steps] = state.trail.clock[begin:steps]
         return status
 
 

@@ -60,7 +60,7 @@ class UnrolledProblem(NamedTuple):
     noise_step: float  # [s]
     noise_r: LaneArray  # (K, 3N)
     noise_v: LaneArray  # (K, 3N)
-    # (4, 8) addresses of each flight's steps, forces, forces at the start, and samples; see `lane_steps`
+    # (5, 8) addresses of each flight's steps, forces, forces at the start, samples, and times; see `lane_steps`
     kept: Ints
 
 
@@ -145,7 +145,7 @@ def _prepared(
     return UnrolledProblem(
         address, uniform, simd.pack(np.zeros((edges, WIDTH))), np.zeros(MOMENT),
         simd.pack(np.zeros((len(code.gauge), WIDTH))), reference.t0, reference.T_b,
-        np.zeros(0), none, 1.0, none, 1.0, none, none, np.zeros((4, WIDTH), dtype=np.int64),
+        np.zeros(0), none, 1.0, none, 1.0, none, none, np.zeros((5, WIDTH), dtype=np.int64),
     )  # fmt: skip
 
 

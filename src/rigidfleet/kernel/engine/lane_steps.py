@@ -177,14 +177,6 @@ def step_size(t, h, t_end, p):
 
 
 @inlined
-def growth(error, last, p):
-    """As `dopri5.growth`; towards knots, which set the steps, by the last error alone: it falls with h^5."""
-    if p.noise_r.shape[0] == 0 and p.gust.shape[0] == 0:
-        return 0.9 * math.exp(0.04 * last - 0.17 * error)
-    return 0.9 * math.exp(-0.2 * error)
-
-
-@inlined
 def _points(k, q, coordinates, h):
     """Bernstein coefficients of a state's continuous extension.
 
@@ -205,10 +197,11 @@ def _points(k, q, coordinates, h):
 
 @compiled
 def keep_step(t, h, p, w, state):
-    """As `dopri5.keep_step`, for each flight into its own trail; ``state.trail`` has the times of all."""
+    """As `dopri5.keep_step`, for each flight into its own trail."""
     k, row = state.K, state.count[4]
     n, forces = k.shape[1], p.gauge.shape[0]
-    state.trail.clock[row, 0], state.trail.clock[row, 1] = t, h
+    spread(filled(t), p.kept[4], 2 * row)
+    spread(filled(h), p.kept[4], 2 * row + 1)
     for q in range(n):
         a, b, c, d, e = _points(k, q, _coordinates(k, p), h)
         place = 5 * n * row + q
@@ -254,7 +247,6 @@ INSTEAD = {
     "TRIAL": TRIAL,
     "advance": advance,
     "forget_stages": forget_stages,
-    "growth": growth,
     "keep_samples": keep_samples,
     "keep_start": keep_start,
     "keep_step": keep_step,
