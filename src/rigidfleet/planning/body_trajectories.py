@@ -58,61 +58,55 @@ class RegulatedTrajectory:
     t_end: float  # [s]
 
     def motion(self) -> Motion:
-        """Quintics between knots that are dense enough for the regulators."""
-        return _regulated(
-            self.regulators,
-            self.tracking,
-            self.start,
-            self.goal,
-            self.t0,
-            self.arrival,
-            self.t_end,
-        )
+        """Quintics between knots that are dense enough for the regulators.
 
-
-@kept
-def _regulated(
-    regulators: tuple[_Law, _Law],
-    tracking: tuple[Any, float],
-    start: _End,
-    goal: _End,
-    t0: float,
-    arrival: float,
-    t_end: float,
-) -> Motion:
-    (r, v, T, omega), (r1, v1, T1, omega1) = start, goal
-    phi = att.rotation_vector_from_dcm(T @ T1.T)  # start = goal Exp(phi)
-    begin = np.concatenate([r, phi]), np.concatenate([v, att.rotation_vector_rate(phi, omega)])
-    end = np.concatenate([r1, np.zeros(3)]), np.concatenate([v1, omega1])
-    length, rest = arrival - t0, t_end - arrival
-    times, after, (body, turn, *hold) = _responses(regulators, tracking, length, rest)
-    parts = [
-        lqr.led(response, times, [x[k : k + 3] for x in begin], [x[k : k + 3] for x in end], length)
-        for k, response in ((0, body), (3, turn))
-    ]
-    x = [np.concatenate(both, axis=1) for both in zip(*parts, strict=True)]
-    pieces, knots = [lqr.quintic_pieces(times, *x)], t0 + times
-    if rest > 0.0:
-        state, target = (x[0][-1], x[1][-1]), (end[0] + end[1] * rest, end[1])
-        pieces.append(lqr.quintic_pieces(after, *lqr.led(hold[0], after, state, target, rest)))
-        knots = np.concatenate([knots, arrival + after[1:]])
-    return as_motion(knots, np.concatenate(pieces), T1.copy())
+        The motion is that of its goal, which goes on with its velocity, plus that of the errors, which is linear in
+        the errors at the start.
+        """
+        (r, v, T, omega), (r1, v1, T1, omega1) = self.start, self.goal
+        phi = att.rotation_vector_from_dcm(T @ T1.T)  # start = goal Exp(phi)
+        length, rest = self.arrival - self.t0, self.t_end - self.arrival
+        since, responses = _responses(self.regulators, self.tracking, length, rest)
+        target, rate = np.zeros((2, 3)), np.array([v1, omega1])
+        target[0] = r1
+        errors = np.empty((2, 3, 2))  # of CM and attitude
+        errors[0, :, 0], errors[1, :, 0] = r, phi
+        errors[0, :, 1], errors[1, :, 1] = v, att.rotation_vector_rate(phi, omega)
+        errors[..., 0] -= target - length * rate
+        errors[..., 1] -= rate
+        pieces = np.empty((len(since), 2, 3, 6))
+        by_body = pieces.transpose(1, 2, 0, 3)
+        by_body[:] = (errors @ responses).reshape(by_body.shape)
+        pieces[..., 0] += target + (since[:, None, None] - length) * rate
+        pieces[..., 1] += rate
+        knots = np.append(self.t0 + since, self.t_end)
+        return as_motion(knots, pieces.reshape(-1, 6, 6), T1.copy())
 
 
 @kept
 def _responses(
     regulators: tuple[_Law, _Law], tracking: tuple[Any, float], length: float, rest: float
-) -> tuple[Floats, Floats, tuple[lqr.Response, ...]]:
-    """Knots of the way and of the rest after it; the responses of both regulators and of the tracking gains there."""
+) -> tuple[Floats, Floats]:
+    """Starts of the pieces (n,) [s] of a way and of the rest after it, and quintics of errors (2, 2, n * 6) there.
+
+    The quintics are those of either regulator, then of the tracking gains, from an error in position, or in velocity,
+    of 1 at the start.
+    """
     times = np.unique(np.concatenate([_knots(law, length) for law in regulators]))
     after = lqr.knots(rest, *tracking) if rest > 0.0 else np.zeros(1)
-    found = [
-        lqr.double_integrator_response(times, length, Q, R, S if horizon == "finite" else None)
-        for horizon, Q, R, S in regulators
-    ]
-    if rest > 0.0:
-        found.append(lqr.double_integrator_response(after, rest, *tracking, None))
-    return times, after, tuple(found)
+    zero, found = np.zeros((2, 2)), []
+    for horizon, Q, R, S in regulators:
+        final = S if horizon == "finite" else None
+        response = lqr.double_integrator_response(times, length, Q, R, final)
+        x = lqr.led(response, times, np.eye(2), zero, length)
+        pieces = [lqr.quintic_pieces(times, *x)]
+        if rest > 0.0:
+            response = lqr.double_integrator_response(after, rest, *tracking, None)
+            x = lqr.led(response, after, (x[0][-1], x[1][-1]), zero, rest)
+            pieces.append(lqr.quintic_pieces(after, *x))
+        found.append(np.concatenate(pieces))
+    since = np.concatenate([times[:-1], length + after[:-1]])
+    return since, np.stack(found).swapaxes(1, 2).reshape(2, 2, -1)
 
 
 def regulated(
