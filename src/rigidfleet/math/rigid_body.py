@@ -74,8 +74,10 @@ def best_rotation(
     """
     rotation = u @ vt
     proper = np.linalg.det(rotation) > 0
-    turned = u * np.where(proper[..., None], 1.0, [1.0, 1.0, -1.0])[..., None, :]
-    rotation = turned @ vt
+    turned = u
+    if not proper.all():
+        turned = u * np.where(proper[..., None], 1.0, [1.0, 1.0, -1.0])[..., None, :]
+        rotation = turned @ vt
     alike = tol * s[..., 0]
     free = (s[..., 1] <= alike) | (~proper & (s[..., 1] - s[..., 2] <= alike))
     if free.any():

@@ -18,6 +18,8 @@ from rigidfleet.formation.assignment import assigned, squashed
 from rigidfleet.formation.distance_geometry import distances
 from rigidfleet.math import constraint_jacobian
 from rigidfleet.math.attitude import dcm_from_euler
+from rigidfleet.math.lqr import double_integrator_gains
+from rigidfleet.math.rigid_body import about_cm
 from rigidfleet.mission.changes import scaled, told_apart
 from rigidfleet.mission.check import check
 from rigidfleet.mission.describe import counted
@@ -58,6 +60,7 @@ class _Made(NamedTuple):
 
     slots: dict[str, Floats | None]  # in their own order
     ordered: dict[str, Floats | None]  # in the order of the agents
+    about_cm: dict[str, Floats | None]  # the same about their centre of mass
     edges: dict[str, Ints]
     distances: dict[str, Floats]
 
@@ -342,7 +345,7 @@ class Mission(Contents):
 
     @cached_property
     def _made(self) -> _Made:
-        return _Made({}, {}, {}, {})
+        return _Made({}, {}, {}, {}, {})
 
     def _slots(self, name: str) -> Floats | None:
         """Slots (N, 3) [m] of a formation in their own order; computed once."""
@@ -372,6 +375,17 @@ class Mission(Contents):
             made[name] = None if slots is None else slots[self.assigned_slots[name]]
         ordered = made[name]
         return None if ordered is None else ordered.copy()
+
+    def slots_about_cm(self, name: str | None) -> Floats | None:
+        """Slots (N, 3) [m] of a formation about their centre of mass; None without a formation, or if it has none."""
+        if name is None:
+            return None
+        made = self._made.about_cm
+        if name not in made:
+            slots = self.formation_slots(name)
+            made[name] = None if slots is None else about_cm(slots, self.fleet.mass)
+        found = made[name]
+        return None if found is None else found.copy()
 
     def formation_colours(self, name: str) -> tuple[str, ...] | None:
         """Light "#rrggbb" of each agent in a formation; None if the formation has none of its own."""
@@ -435,6 +449,11 @@ class Mission(Contents):
         for values in fleet:
             values.flags.writeable = False
         return fleet
+
+    @cached_property
+    def tracking_gains(self) -> tuple[float, float]:
+        """Gains k1 [1/s^2] and k2 [1/s] of local tracking."""
+        return double_integrator_gains(self.tracking.Q, self.tracking.R)
 
     @cached_property
     def vehicle_models(self) -> list[VehicleModel] | None:

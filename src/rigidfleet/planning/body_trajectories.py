@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
@@ -15,7 +15,7 @@ from rigidfleet.math import attitude as att
 from rigidfleet.math import lqr, series, splines
 from rigidfleet.mission import Mission
 from rigidfleet.mission.kinds import Orbit, Through, seconds
-from rigidfleet.planning.reference import Pose
+from rigidfleet.planning.reference import Pose, changed
 from rigidfleet.typing import Floats
 
 #: Angle of an orbit [rad], and share of its run-in, spanned by one quintic; exact to 2e-11 of the radius.
@@ -66,28 +66,25 @@ class RegulatedTrajectory:
         (r, v, T, omega), (r1, v1, T1, omega1) = self.start, self.goal
         phi = att.rotation_vector_from_dcm(T @ T1.T)  # start = goal Exp(phi)
         length, rest = self.arrival - self.t0, self.t_end - self.arrival
-        since, responses = _responses(self.regulators, self.tracking, length, rest)
-        target, rate = np.zeros((2, 3)), np.array([v1, omega1])
-        target[0] = r1
-        errors = np.empty((2, 3, 2))  # of CM and attitude
-        errors[0, :, 0], errors[1, :, 0] = r, phi
-        errors[0, :, 1], errors[1, :, 1] = v, att.rotation_vector_rate(phi, omega)
-        errors[..., 0] -= target - length * rate
-        errors[..., 1] -= rate
-        pieces = np.empty((len(since), 2, 3, 6))
-        by_body = pieces.transpose(1, 2, 0, 3)
-        by_body[:] = (errors @ responses).reshape(by_body.shape)
-        pieces[..., 0] += target + (since[:, None, None] - length) * rate
+        times, responses = _responses(self.regulators, self.tracking, length, rest)
+        start = np.concatenate([r, phi, v, att.rotation_vector_rate(phi, omega)])
+        goal = np.concatenate([r1, np.zeros(3), v1, omega1])
+        place, rate = goal[:6], goal[6:]
+        errors = start - goal
+        errors[:6] += length * rate
+        by_body = errors.reshape(2, 2, 3).transpose(1, 2, 0) @ responses
+        n = len(times) - 1
+        pieces = np.ascontiguousarray(by_body.reshape(6, n, 6).swapaxes(0, 1))
+        pieces[..., 0] += place + (times[:-1, None] - length) * rate
         pieces[..., 1] += rate
-        knots = np.append(self.t0 + since, self.t_end)
-        return as_motion(knots, pieces.reshape(-1, 6, 6), T1.copy())
+        return as_motion(self.t0 + times, pieces, T1.copy())
 
 
 @kept
 def _responses(
     regulators: tuple[_Law, _Law], tracking: tuple[Any, float], length: float, rest: float
 ) -> tuple[Floats, Floats]:
-    """Starts of the pieces (n,) [s] of a way and of the rest after it, and quintics of errors (2, 2, n * 6) there.
+    """Knots (n + 1,) [s] of a way and of the rest after it, and quintics (2, 2, n * 6) of errors between them.
 
     The quintics are those of either regulator, then of the tracking gains, from an error in position, or in velocity,
     of 1 at the start.
@@ -105,8 +102,9 @@ def _responses(
             x = lqr.led(response, after, (x[0][-1], x[1][-1]), zero, rest)
             pieces.append(lqr.quintic_pieces(after, *x))
         found.append(np.concatenate(pieces))
-    since = np.concatenate([times[:-1], length + after[:-1]])
-    return since, np.stack(found).swapaxes(1, 2).reshape(2, 2, -1)
+    return np.concatenate([times, length + after[1:]]), np.stack(found).swapaxes(1, 2).reshape(
+        2, 2, -1
+    )
 
 
 def regulated(
@@ -315,7 +313,7 @@ def orbit(
         attitude, seconds(phase.blend), t0, t_end,
     )  # fmt: skip
     if smooth:
-        polar = replace(trajectory, carried=np.zeros((0, 6))).at(np.zeros(1))
+        polar = changed(trajectory, carried=np.zeros((0, 6))).at(np.zeros(1))
         cm = np.stack([start.v, start.a, start.jerk])
         full = np.concatenate([cm, rotation_of(start, attitude)[1:]], axis=1)
         trajectory.carried = full - np.stack(polar[1:])[:, 0]
