@@ -24,6 +24,7 @@ from rigidfleet.mission.changes import scaled, told_apart
 from rigidfleet.mission.check import check
 from rigidfleet.mission.describe import counted
 from rigidfleet.mission.files import digests
+from rigidfleet.mission.findings import Shared
 from rigidfleet.mission.kinds import Establish, Phase
 from rigidfleet.mission.phases import latest_end
 from rigidfleet.mission.schema import DRAG, Contents
@@ -104,21 +105,25 @@ class Mission(Contents):
         return cls._checked(parse_toml(text, origin), text, origin)
 
     @classmethod
-    def from_plain(cls, data: dict[str, Any], origin: str) -> Self:
+    def from_plain(cls, data: dict[str, Any], origin: str, shared: Shared | None = None) -> Self:
         """Check a mission given as the plain data of its TOML text, as `to_dict` returns it.
+
+        Tables that are ``shared`` with other missions are validated once for all of them.
 
         Raises
         ------
         MissionError
             With a finding for each error.
         """
-        mission = cls._checked(data, "", origin)
+        mission = cls._checked(data, "", origin, shared)
         mission._plain = data
         return mission
 
     @classmethod
-    def _checked(cls, data: dict[str, Any], text: str, origin: str) -> Self:
-        parts = check(data, origin)
+    def _checked(
+        cls, data: dict[str, Any], text: str, origin: str, shared: Shared | None = None
+    ) -> Self:
+        parts = check(data, origin, shared)
         if parts["assignment"] == "each":
             parts["formations"], parts["phases"] = told_apart(parts["formations"], parts["phases"])
         n = len(parts["agents"].position)

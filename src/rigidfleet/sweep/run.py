@@ -30,7 +30,6 @@ def fly_runs(sweep: Sweep, runs: Sequence[int]) -> list[RunRecord]:
 
 def _fly(sweep: Sweep, run: int) -> RunRecord:
     from rigidfleet.assessment import assess
-    from rigidfleet.mission import Mission
     from rigidfleet.simulation.flight import simulate
 
     begun = perf_counter()
@@ -38,7 +37,7 @@ def _fly(sweep: Sweep, run: int) -> RunRecord:
     codes = tuple(c.variation.code(v) for c, v in zip(sweep.columns, values, strict=True))
     metrics = dict.fromkeys(METRICS, math.nan)
     try:
-        result = simulate(Mission.from_plain(sweep.varied(run), f"run {run}"))
+        result = simulate(sweep.mission_of(run))
         verdict = assess(result)
         metrics = measure(result, verdict)
         failed = [f for f in verdict.checks if not f.passed]
