@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Mapping
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any, Literal, NamedTuple, Self
 
 import numpy as np
@@ -64,6 +64,17 @@ class _Made(NamedTuple):
     about_cm: dict[str, Floats | None]  # the same about their centre of mass
     edges: dict[str, Ints]
     distances: dict[str, Floats]
+
+
+@cache
+def _defaults() -> dict[str, Any]:
+    """What a mission has for tables that are not given: immutable, and the same for all missions."""
+    fields = Contents.model_fields.items()
+    return {
+        name: field.get_default(call_default_factory=True)
+        for name, field in fields
+        if not field.is_required()
+    }
 
 
 class Mission(Contents):
@@ -128,7 +139,7 @@ class Mission(Contents):
             parts["formations"], parts["phases"] = told_apart(parts["formations"], parts["phases"])
         n = len(parts["agents"].position)
         parts["formations"] = scaled(parts["formations"], parts["phases"], n)
-        mission = cls.model_construct(**parts)
+        mission = cls.model_construct(set(parts), **_defaults() | parts)
         mission._text, mission._origin = text, origin
         return mission
 

@@ -183,7 +183,10 @@ def attach(
         slots = slots @ axes
         pose = pose.in_axes(axes)
         goal = changed(goal, T=pose.T if free else asked, named=not free)
-        given = None if given is None else axes.T @ given
+        if free:  # in the axes that fit best, nothing is left to turn
+            given = np.eye(3)
+        elif given is not None:
+            given = axes.T @ given
     if shaping is not None:
         turn = _turn(given, slots, target, masses)
     if phase.control == "body" or (mission.formulation == "body" and frame is None):
