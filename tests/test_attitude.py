@@ -228,6 +228,28 @@ TRIANGLE = np.array(
 )
 
 
+@given(
+    st.lists(st.tuples(vectors, vectors), min_size=1, max_size=5),
+    st.sampled_from([1e-9, 0.04, 1.8]),
+)
+def test_single_rotations_are_those_of_many(pairs, scale):
+    """What is computed of a single rotation in plain numbers is what is computed of it among others, to rounding."""
+    phi, omega = (np.array(x) for x in zip(*pairs, strict=True))
+    phi = scale * phi
+    T = dcm_from_rotation_vector(phi)
+    for k in range(len(T)):
+        assert quaternion_from_dcm(T[k]) == pytest.approx(quaternion_from_dcm(T)[k], abs=1e-15)
+        vector = rotation_vector_from_dcm(T)[k]
+        if np.linalg.norm(vector) < 3.1:  # half a turn has two vectors
+            assert rotation_vector_from_dcm(T[k]) == pytest.approx(vector, abs=1e-14)
+        rate = rotation_vector_rate(phi, omega)[k]
+        assert rotation_vector_rate(phi[k], omega[k]) == pytest.approx(rate, abs=1e-14)
+    nothing = np.full((3, 3), np.nan)
+    assert np.isnan(quaternion_from_dcm(nothing)).all()
+    assert np.isnan(rotation_vector_from_dcm(nothing)).all()
+    assert np.isnan(rotation_vector_rate(nothing[0], nothing[0])).all()
+
+
 def test_triangle_frame_of_table_1():
     """Table 1's triangle attaches its frame at a yaw of 56.0139 degrees, level."""
     euler = np.degrees(euler_from_dcm(triangle_frame(TRIANGLE)))

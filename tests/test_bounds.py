@@ -9,11 +9,11 @@ import pytest
 from rigidfleet.cli import app as cli
 from rigidfleet.cli import codes, console
 from rigidfleet.errors import MissionError
-from rigidfleet.math import turbulence
 from rigidfleet.mission import Mission, json_schema, mission_names, mission_text
 from rigidfleet.mission import bounds as limits
 from rigidfleet.mission.bounds import excess
 from rigidfleet.mission.formations import coincident
+from rigidfleet.planning import filters
 from rigidfleet.preflight.check import check
 
 HEAD = 'schema_version = 1\nname = "a"\n'
@@ -198,9 +198,9 @@ def test_points_at_one_place_are_found():
 def test_short_steps_of_slow_gusts_stay_gusts():
     """Dryden's transverse gusts of step 1e-6 tau grow apart as their spectrum says: 2 - 2 rho(t) = 3 t / tau."""
     white = np.random.default_rng(0).standard_normal((100_001, 2))
-    steps = np.diff(turbulence.second_order(white, 1e-6, 1.0))
+    steps = np.diff(filters.second_order(white, 1e-6, 1.0))
     assert np.mean(steps**2) / 3e-6 == pytest.approx(1.0, abs=0.03)
-    assert np.isfinite(turbulence.second_order(white[:10], 1e-12, 1.0)).all()
+    assert np.isfinite(filters.second_order(white[:10], 1e-12, 1.0)).all()
 
 
 # -- what takes long ---------------------------------------------------------------------------------

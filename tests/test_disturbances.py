@@ -40,7 +40,7 @@ FIRST = {"model": "first-order", "time_scale": 1.0, "intensity": 0.5}
 
 def test_the_kernels_spline_is_scipys():
     """Between knots the kernel evaluates the natural cubic spline, and outside of them it is constant."""
-    from rigidfleet.math.turbulence import spline_coefficients
+    from rigidfleet.planning.filters import spline_coefficients
 
     y = np.random.default_rng(0).standard_normal((20, 2, 3))
     table, out = spline_coefficients(y), np.empty((2, 3))

@@ -26,7 +26,7 @@ from scipy import stats
 from rigidfleet.assessment import assess
 from rigidfleet.cli import app as cli
 from rigidfleet.cli import codes, console
-from rigidfleet.errors import ResultError, RigidfleetError, SweepError
+from rigidfleet.errors import MissionError, ResultError, RigidfleetError, SweepError
 from rigidfleet.mission import Mission
 from rigidfleet.result import Extremum
 from rigidfleet.sweep import METRICS, Sweep, Table, fly, load, read
@@ -92,6 +92,35 @@ def test_a_path_leads_to_what_the_document_has():
     assert mission.formations["pair"].size == 6.0
     assert document["formations"]["pair"].keys() == PAIR["formations"]["pair"].keys()
     assert found.mission.to_dict() == tomllib.loads(MISSION.text)
+
+
+@pytest.mark.parametrize(
+    ("name", "line"),
+    [
+        ("windy-passage", "phases[3].until += uniform(-12, 20)"),
+        ("moving-obstacles", "obstacles[2].radius = choice(0.1, 1.0, nought)"),
+        ("crazyflies", "phases[2].duration = choice(3.0, 4.0, -1.0)"),
+    ],
+)
+def test_runs_share_what_does_not_vary(name, line):
+    """A run's mission is the one that its data alone give, or has the same findings; the sweep's data stay as read."""
+    found = Sweep.of(name, ["agents.radius.* *= uniform(0.1, 1)", line], runs=40)
+    refused, whole = [], json.dumps(found.document)
+
+    def outcome(make: Callable[[], Mission]) -> tuple[str, Any]:
+        try:
+            return "", make().model_dump()
+        except MissionError as error:
+            return str(error), None
+
+    for k in range(40):
+        alone = json.loads(json.dumps(found.varied(k)))
+        shared = outcome(lambda k=k: found.mission_of(k))
+        assert shared == outcome(lambda k=k, data=alone: Mission.from_plain(data, f"run {k}"))
+        refused.append(bool(shared[0]))
+    assert json.dumps(found.document) == whole
+    assert any(refused)
+    assert not all(refused)
 
 
 def test_a_star_gives_each_its_own_and_no_star_all_the_same():

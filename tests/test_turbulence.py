@@ -6,7 +6,9 @@ from scipy import signal
 from scipy.interpolate import CubicSpline
 from scipy.linalg import solve_continuous_lyapunov
 
+from rigidfleet.kernel.engine import native
 from rigidfleet.math import turbulence as tb
+from rigidfleet.planning import filters
 
 TAU, STEP = 0.7, 0.1
 
@@ -16,11 +18,11 @@ def white(shape, seed=1):
 
 
 def second(e, step, tau):
-    return tb.second_order(e, step, tau)
+    return filters.second_order(e, step, tau)
 
 
 def first(e, step, tau):
-    return tb.first_order(e[:, 0], step, tau)
+    return filters.first_order(e[:, 0], step, tau)
 
 
 PROCESSES = {
@@ -98,8 +100,18 @@ def test_correlation_falls_with_distance():
 def test_splines_are_scipys(n):
     """The coefficients are those of the natural cubic spline through the samples, SciPy's."""
     y = white((n, 3, 2))
-    c = tb.spline_coefficients(y)
+    c = filters.spline_coefficients(y)
     assert c.shape == (n + 2, 3, 2)
     reference = CubicSpline(np.arange(n), y, bc_type="natural")
     np.testing.assert_allclose((c[:-2] + 4 * c[1:-1] + c[2:]) / 6, y, atol=1e-12)
     np.testing.assert_allclose((c[2:] - c[:-2]) / 2, reference(np.arange(n), 1), atol=1e-12)
+
+
+@pytest.mark.parametrize("backward", [False, True])
+def test_recursions_are_followed_along_rows(backward):
+    """The compiled recursion solves the bidiagonal system of its rows, forwards and backwards."""
+    x, a = white((7, 4)), white(7, seed=2)
+    L = np.eye(7) - np.diag(a[:-1] if backward else a[1:], 1 if backward else -1)
+    expected = np.linalg.solve(L, x)
+    native.follow(x, a, backward=backward)
+    np.testing.assert_allclose(x, expected, rtol=1e-12, atol=1e-12)

@@ -11,7 +11,8 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rigidfleet.typing import Bools, Edges, Floats
+from rigidfleet._common.kept import kept
+from rigidfleet.typing import Bools, Edges, Floats, Ints
 
 
 class Extents(tuple[int | str | None, ...]):
@@ -308,16 +309,28 @@ def graph(ends: NDArray[np.integer], masses: Floats, *, large: bool = False) -> 
     edges = np.ascontiguousarray(ends, dtype=np.uint32).reshape(-1, 2)
     if large:
         return Graph(edges, np.zeros((0, 2), dtype=np.uint32), np.zeros(0), np.zeros(0))
-    parts = []
+    inverse = 1.0 / masses
+    pairs, where, agent, sign = _meeting(edges)
+    # Edges that share both agents meet twice.
+    weight = np.zeros(len(pairs))
+    np.add.at(weight, where, sign * inverse[agent])
+    return Graph(edges, pairs.copy(), weight, inverse[edges].sum(axis=1))
+
+
+@kept
+def _meeting(edges: NDArray[np.integer]) -> tuple[Edges, Ints, Ints, Floats]:
+    """Pairs (P, 2) of edges (m, 2) that share an agent; each time they do: which pair, which agent, which sign (M,)."""
+    parts = [np.zeros((4, 0))]
     for agent in np.unique(edges):
         k, end = np.nonzero(edges == agent)
         sign = 1.0 - 2.0 * end
         p, q = np.tril_indices(len(k), -1)
-        parts.append(np.stack([k[p], k[q], sign[p] * sign[q] / masses[agent]]))
-    found = np.concatenate(parts, axis=1) if parts else np.zeros((3, 0))
-    # Edges that share both agents meet twice.
-    met, where = np.unique(found[:2].T.astype(np.uint32), axis=0, return_inverse=True)
-    weight = np.zeros(len(met))
-    np.add.at(weight, where.ravel(), found[2])
-    diagonal = (1.0 / masses)[edges].sum(axis=1)
-    return Graph(edges, np.ascontiguousarray(met).reshape(-1, 2), weight, diagonal)
+        parts.append(np.stack([k[p], k[q], np.full(len(p), float(agent)), sign[p] * sign[q]]))
+    found = np.concatenate(parts, axis=1)
+    pairs, where = np.unique(found[:2].T.astype(np.uint32), axis=0, return_inverse=True)
+    return (
+        np.ascontiguousarray(pairs).reshape(-1, 2),
+        where.ravel(),
+        found[2].astype(np.int64),
+        found[3],
+    )

@@ -223,3 +223,11 @@ def recorder(k: int, n: int, m: int) -> Record:
     memory.fill(np.nan)
     parts = zip(accumulate(sizes), sizes, shapes, strict=True)
     return Record(*[memory[end - size : end].reshape(shape) for end, size, shape in parts])
+
+
+class Recursion(NamedTuple):
+    """Rows x_k to which the row before is added, times a number; see `rigidfleet.kernel.recursion`."""
+
+    x: Floats  # (K, M)
+    a: Floats  # (K,)
+    backward: bool  # whether the rows are followed from the last to the first

@@ -74,8 +74,10 @@ def best_rotation(
     """
     rotation = u @ vt
     proper = np.linalg.det(rotation) > 0
-    turned = u * np.where(proper[..., None], 1.0, [1.0, 1.0, -1.0])[..., None, :]
-    rotation = turned @ vt
+    turned = u
+    if not proper.all():
+        turned = u * np.where(proper[..., None], 1.0, [1.0, 1.0, -1.0])[..., None, :]
+        rotation = turned @ vt
     alike = tol * s[..., 0]
     free = (s[..., 1] <= alike) | (~proper & (s[..., 1] - s[..., 2] <= alike))
     if free.any():
@@ -108,8 +110,10 @@ def mean_axis_rates(x: Floats, y: Floats, masses: Floats) -> Floats:
     x, y (K, N, 3): positions and velocities about the CM [m, m/s]; masses (N,) or (K, N).
     """
     masses = np.broadcast_to(masses, x.shape[:2])
-    h = np.einsum("ki,kia->ka", masses, np.cross(x, y))
-    C = np.einsum("ki,kia,kib->kab", masses, x, x)
+    weighted = np.swapaxes(masses[..., None] * x, 1, 2)
+    C, D = weighted @ x, weighted @ y
+    D = D - np.swapaxes(D, 1, 2)  # of which h is the axial vector
+    h = np.stack([D[:, 1, 2], D[:, 2, 0], D[:, 0, 1]], axis=1)
     inertia = np.trace(C, axis1=1, axis2=2)[:, None, None] * np.eye(3) - C
     # Far from a line, the inverse equals the pseudo-inverse and takes a third of the time.
     size = np.trace(inertia, axis1=1, axis2=2)

@@ -25,7 +25,7 @@ from rigidfleet.mission import (
     vehicles,
 )
 from rigidfleet.mission.files import NOT_A_FILE
-from rigidfleet.mission.findings import FindingCollector, Keys, near_shape
+from rigidfleet.mission.findings import FindingCollector, Keys, Shared, near_shape
 from rigidfleet.mission.obstacles import Box, Obstacle
 from rigidfleet.mission.schema import (
     Agents,
@@ -66,15 +66,17 @@ _TABLES: dict[str, type[Part]] = {
 }
 
 
-def check(data: Mapping[str, Any], origin: str) -> dict[str, Any]:
+def check(data: Mapping[str, Any], origin: str, shared: Shared | None = None) -> dict[str, Any]:
     """Check the data of a mission and return its parts, by the fields of `Contents`.
+
+    Tables that are ``shared`` with other missions are validated once for all of them.
 
     Raises
     ------
     MissionError
         With a finding for each error.
     """
-    collector = FindingCollector(data, origin)
+    collector = FindingCollector(data, origin, shared)
     _numbers(collector)
     if collector.findings:  # the other checks would take long
         raise MissionError(collector.findings)

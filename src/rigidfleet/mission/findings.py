@@ -23,10 +23,41 @@ P = TypeVar("P", bound=Part)
 #: Maximum number of findings of one kind that are listed; the others are counted.
 _TOLD = 8
 _UNKNOWN = "unknown key"
+_NONE: dict[str, Any] = {}
 #: Stands for any index of a list.
 _ANY = -1
 #: Values for required keys with errors, so that the rest of their table can still be checked.
 _STAND_IN: dict[str, Any] = {"mass": 1.0, "position": (0.0, 0.0, 0.0), "formation": ""}
+
+
+class Shared:
+    """The tables that several missions have in common, as the same objects, each validated once for all of them."""
+
+    def __init__(self, data: Mapping[str, Any]) -> None:
+        self._tables = {
+            id(table): table for table in _tables(data)
+        }  # keeps them alive, and so their numbers
+        self._models: dict[tuple[Any, ...], Part] = {}
+
+    def key(self, kind: type[Part], data: object, defaults: Mapping[str, Any]) -> Any:
+        """What a model of a table is found by; None if the table is none of these."""
+        return (id(data), kind, *defaults.values()) if id(data) in self._tables else None
+
+    def model(self, key: Any) -> Any:
+        """The model of a table; None if it has not been validated."""
+        return self._models.get(key)
+
+    def keep(self, key: Any, model: Part) -> None:
+        """Keep the model of a table without errors."""
+        if key is not None:
+            self._models[key] = model
+
+
+def _tables(data: Any) -> Iterator[dict[str, Any]]:
+    if isinstance(data, dict):
+        yield data
+    for part in data.values() if isinstance(data, dict) else data if isinstance(data, list) else ():
+        yield from _tables(part)
 
 
 class FindingCollector:
@@ -35,9 +66,10 @@ class FindingCollector:
     A path counts from 0, a message from 1: ("phases", 1) is reported as `phases[2]`.
     """
 
-    def __init__(self, data: Mapping[str, Any], origin: str) -> None:
+    def __init__(self, data: Mapping[str, Any], origin: str, shared: Shared | None = None) -> None:
         self.data = data
         self.origin = origin
+        self.shared = shared or Shared({})
         self._findings: dict[tuple[str, str], Finding] = {}
         self._told: Counter[Keys] = Counter()
         self._wrong: set[Keys] = set()
@@ -79,20 +111,29 @@ class FindingCollector:
 
     def right(self, path: Keys, *keys: str) -> bool:
         """Whether there is no finding so far at or below these keys of a table."""
-        return not any((*path, key) in self._wrong for key in keys)
+        return not self._wrong or not any((*path, key) in self._wrong for key in keys)
 
-    def validate(self, kind: type[P], data: Any, path: Keys) -> P | None:
-        """Validate a table and return its model; record a finding for each error.
+    def validate(
+        self, kind: type[P], data: Any, path: Keys, defaults: Mapping[str, Any] = _NONE
+    ) -> P | None:
+        """Validate a table, with defaults of its own, and return its model; record a finding for each error.
 
         Keys with errors are left out, so that later checks can use the others. None if that leaves no valid model.
         """
+        key = self.shared.key(kind, data, defaults)
+        if (found := self.shared.model(key)) is not None:
+            return found
         if not isinstance(data, dict):
             self.add(path, "must be a table", f"write [{_key(path)}] with its keys below it")
             return None
+        data = {**defaults, **data} if defaults else data
         try:
-            return kind.model_validate(data)
+            model = kind.model_validate(data)
         except ValidationError as error:
             errors = error.errors(include_url=False)
+        else:
+            self.shared.keep(key, model)
+            return model
         for error in errors:
             self._structural(error, kind, path)
         wrong = {error["loc"][0] for error in errors}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Mapping
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any, Literal, NamedTuple, Self
 
 import numpy as np
@@ -18,10 +18,13 @@ from rigidfleet.formation.assignment import assigned, squashed
 from rigidfleet.formation.distance_geometry import distances
 from rigidfleet.math import constraint_jacobian
 from rigidfleet.math.attitude import dcm_from_euler
+from rigidfleet.math.lqr import double_integrator_gains
+from rigidfleet.math.rigid_body import about_cm
 from rigidfleet.mission.changes import scaled, told_apart
 from rigidfleet.mission.check import check
 from rigidfleet.mission.describe import counted
 from rigidfleet.mission.files import digests
+from rigidfleet.mission.findings import Shared
 from rigidfleet.mission.kinds import Establish, Phase
 from rigidfleet.mission.phases import latest_end
 from rigidfleet.mission.schema import DRAG, Contents
@@ -58,8 +61,20 @@ class _Made(NamedTuple):
 
     slots: dict[str, Floats | None]  # in their own order
     ordered: dict[str, Floats | None]  # in the order of the agents
+    about_cm: dict[str, Floats | None]  # the same about their centre of mass
     edges: dict[str, Ints]
     distances: dict[str, Floats]
+
+
+@cache
+def _defaults() -> dict[str, Any]:
+    """What a mission has for tables that are not given: immutable, and the same for all missions."""
+    fields = Contents.model_fields.items()
+    return {
+        name: field.get_default(call_default_factory=True)
+        for name, field in fields
+        if not field.is_required()
+    }
 
 
 class Mission(Contents):
@@ -101,26 +116,30 @@ class Mission(Contents):
         return cls._checked(parse_toml(text, origin), text, origin)
 
     @classmethod
-    def from_plain(cls, data: dict[str, Any], origin: str) -> Self:
+    def from_plain(cls, data: dict[str, Any], origin: str, shared: Shared | None = None) -> Self:
         """Check a mission given as the plain data of its TOML text, as `to_dict` returns it.
+
+        Tables that are ``shared`` with other missions are validated once for all of them.
 
         Raises
         ------
         MissionError
             With a finding for each error.
         """
-        mission = cls._checked(data, "", origin)
+        mission = cls._checked(data, "", origin, shared)
         mission._plain = data
         return mission
 
     @classmethod
-    def _checked(cls, data: dict[str, Any], text: str, origin: str) -> Self:
-        parts = check(data, origin)
+    def _checked(
+        cls, data: dict[str, Any], text: str, origin: str, shared: Shared | None = None
+    ) -> Self:
+        parts = check(data, origin, shared)
         if parts["assignment"] == "each":
             parts["formations"], parts["phases"] = told_apart(parts["formations"], parts["phases"])
         n = len(parts["agents"].position)
         parts["formations"] = scaled(parts["formations"], parts["phases"], n)
-        mission = cls.model_construct(**parts)
+        mission = cls.model_construct(set(parts), **_defaults() | parts)
         mission._text, mission._origin = text, origin
         return mission
 
@@ -342,7 +361,7 @@ class Mission(Contents):
 
     @cached_property
     def _made(self) -> _Made:
-        return _Made({}, {}, {}, {})
+        return _Made({}, {}, {}, {}, {})
 
     def _slots(self, name: str) -> Floats | None:
         """Slots (N, 3) [m] of a formation in their own order; computed once."""
@@ -372,6 +391,17 @@ class Mission(Contents):
             made[name] = None if slots is None else slots[self.assigned_slots[name]]
         ordered = made[name]
         return None if ordered is None else ordered.copy()
+
+    def slots_about_cm(self, name: str | None) -> Floats | None:
+        """Slots (N, 3) [m] of a formation about their centre of mass; None without a formation, or if it has none."""
+        if name is None:
+            return None
+        made = self._made.about_cm
+        if name not in made:
+            slots = self.formation_slots(name)
+            made[name] = None if slots is None else about_cm(slots, self.fleet.mass)
+        found = made[name]
+        return None if found is None else found.copy()
 
     def formation_colours(self, name: str) -> tuple[str, ...] | None:
         """Light "#rrggbb" of each agent in a formation; None if the formation has none of its own."""
@@ -435,6 +465,11 @@ class Mission(Contents):
         for values in fleet:
             values.flags.writeable = False
         return fleet
+
+    @cached_property
+    def tracking_gains(self) -> tuple[float, float]:
+        """Gains k1 [1/s^2] and k2 [1/s] of local tracking."""
+        return double_integrator_gains(self.tracking.Q, self.tracking.R)
 
     @cached_property
     def vehicle_models(self) -> list[VehicleModel] | None:

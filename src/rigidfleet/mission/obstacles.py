@@ -265,7 +265,7 @@ def checked(collector: FindingCollector, kind: type[Part], data: Any, k: int) ->
     """Obstacle number k (from 0) of a kind; None, with findings, if it is not valid."""
     path: Keys = ("obstacles", k)
     name = "ground" if kind is Ground else f"{data['kind']} {k + 1}"
-    found: Any = collector.validate(kind, {"name": name} | data, path)
+    found: Any = collector.validate(kind, data, path, {"name": name})
     if found is None:
         return None
     if isinstance(found, Heights) and not _heights(collector, found, path):

@@ -115,8 +115,8 @@ def _phases(collector: FindingCollector) -> list[AnyPhase | None]:
             found.append(None)
             continue
         control = model.body_control if body else "tracking"
-        given = {"name": f"{data['kind']} {k + 1}", "control": control} | data
-        found.append(collector.validate(model, given, ("phases", k)))
+        defaults = {"name": f"{data['kind']} {k + 1}", "control": control}
+        found.append(collector.validate(model, data, ("phases", k), defaults))
     if not found and collector.right((), "phases"):
         collector.add(
             ("phases",),
@@ -492,6 +492,7 @@ def _formations(
     """Check that formations exist and can be blended to, tracked and reached."""
     forms: Mapping[str, Formation] = parts["formations"]
     held: str | None = ""  # name of the formation held; "": initial positions; None: unknown
+    slotted: set[str] = set()  # names of formations that have slots to track
     for k, p in enumerate(found):
         path = ("phases", k)
         if p is None or not collector.right(path, "formation", "reference"):
@@ -523,10 +524,14 @@ def _formations(
         tracked = p.control == "tracking" and collector.right(path, "control")
         if not tracked or n is None or form is None or not held or not sound(collector, held):
             continue
+        if held in slotted:
+            continue
         if form.slot_array(n) is None:
             problem = f"formation '{held}' has no slots to track"
             remedy = f"give formations.{toml_key(held)} a shape or slots, or change control"
             collector.add((*path, "control"), problem, remedy, p.control)
+        else:
+            slotted.add(held)
 
 
 def _exists(collector: FindingCollector, name: str, path: Keys, key: str = "formation") -> None:

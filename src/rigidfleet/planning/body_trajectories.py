@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
@@ -15,7 +15,7 @@ from rigidfleet.math import attitude as att
 from rigidfleet.math import lqr, series, splines
 from rigidfleet.mission import Mission
 from rigidfleet.mission.kinds import Orbit, Through, seconds
-from rigidfleet.planning.reference import Pose
+from rigidfleet.planning.reference import Pose, changed
 from rigidfleet.typing import Floats
 
 #: Angle of an orbit [rad], and share of its run-in, spanned by one quintic; exact to 2e-11 of the radius.
@@ -58,61 +58,53 @@ class RegulatedTrajectory:
     t_end: float  # [s]
 
     def motion(self) -> Motion:
-        """Quintics between knots that are dense enough for the regulators."""
-        return _regulated(
-            self.regulators,
-            self.tracking,
-            self.start,
-            self.goal,
-            self.t0,
-            self.arrival,
-            self.t_end,
-        )
+        """Quintics between knots that are dense enough for the regulators.
 
-
-@kept
-def _regulated(
-    regulators: tuple[_Law, _Law],
-    tracking: tuple[Any, float],
-    start: _End,
-    goal: _End,
-    t0: float,
-    arrival: float,
-    t_end: float,
-) -> Motion:
-    (r, v, T, omega), (r1, v1, T1, omega1) = start, goal
-    phi = att.rotation_vector_from_dcm(T @ T1.T)  # start = goal Exp(phi)
-    begin = np.concatenate([r, phi]), np.concatenate([v, att.rotation_vector_rate(phi, omega)])
-    end = np.concatenate([r1, np.zeros(3)]), np.concatenate([v1, omega1])
-    length, rest = arrival - t0, t_end - arrival
-    times, after, (body, turn, *hold) = _responses(regulators, tracking, length, rest)
-    parts = [
-        lqr.led(response, times, [x[k : k + 3] for x in begin], [x[k : k + 3] for x in end], length)
-        for k, response in ((0, body), (3, turn))
-    ]
-    x = [np.concatenate(both, axis=1) for both in zip(*parts, strict=True)]
-    pieces, knots = [lqr.quintic_pieces(times, *x)], t0 + times
-    if rest > 0.0:
-        state, target = (x[0][-1], x[1][-1]), (end[0] + end[1] * rest, end[1])
-        pieces.append(lqr.quintic_pieces(after, *lqr.led(hold[0], after, state, target, rest)))
-        knots = np.concatenate([knots, arrival + after[1:]])
-    return as_motion(knots, np.concatenate(pieces), T1.copy())
+        The motion is that of its goal, which goes on with its velocity, plus that of the errors, which is linear in
+        the errors at the start.
+        """
+        (r, v, T, omega), (r1, v1, T1, omega1) = self.start, self.goal
+        phi = att.rotation_vector_from_dcm(T @ T1.T)  # start = goal Exp(phi)
+        length, rest = self.arrival - self.t0, self.t_end - self.arrival
+        times, responses = _responses(self.regulators, self.tracking, length, rest)
+        start = np.concatenate([r, phi, v, att.rotation_vector_rate(phi, omega)])
+        goal = np.concatenate([r1, np.zeros(3), v1, omega1])
+        place, rate = goal[:6], goal[6:]
+        errors = start - goal
+        errors[:6] += length * rate
+        by_body = errors.reshape(2, 2, 3).transpose(1, 2, 0) @ responses
+        n = len(times) - 1
+        pieces = np.ascontiguousarray(by_body.reshape(6, n, 6).swapaxes(0, 1))
+        pieces[..., 0] += place + (times[:-1, None] - length) * rate
+        pieces[..., 1] += rate
+        return as_motion(self.t0 + times, pieces, T1.copy())
 
 
 @kept
 def _responses(
     regulators: tuple[_Law, _Law], tracking: tuple[Any, float], length: float, rest: float
-) -> tuple[Floats, Floats, tuple[lqr.Response, ...]]:
-    """Knots of the way and of the rest after it; the responses of both regulators and of the tracking gains there."""
+) -> tuple[Floats, Floats]:
+    """Knots (n + 1,) [s] of a way and of the rest after it, and quintics (2, 2, n * 6) of errors between them.
+
+    The quintics are those of either regulator, then of the tracking gains, from an error in position, or in velocity,
+    of 1 at the start.
+    """
     times = np.unique(np.concatenate([_knots(law, length) for law in regulators]))
     after = lqr.knots(rest, *tracking) if rest > 0.0 else np.zeros(1)
-    found = [
-        lqr.double_integrator_response(times, length, Q, R, S if horizon == "finite" else None)
-        for horizon, Q, R, S in regulators
-    ]
-    if rest > 0.0:
-        found.append(lqr.double_integrator_response(after, rest, *tracking, None))
-    return times, after, tuple(found)
+    zero, found = np.zeros((2, 2)), []
+    for horizon, Q, R, S in regulators:
+        final = S if horizon == "finite" else None
+        response = lqr.double_integrator_response(times, length, Q, R, final)
+        x = lqr.led(response, times, np.eye(2), zero, length)
+        pieces = [lqr.quintic_pieces(times, *x)]
+        if rest > 0.0:
+            response = lqr.double_integrator_response(after, rest, *tracking, None)
+            x = lqr.led(response, after, (x[0][-1], x[1][-1]), zero, rest)
+            pieces.append(lqr.quintic_pieces(after, *x))
+        found.append(np.concatenate(pieces))
+    return np.concatenate([times, length + after[1:]]), np.stack(found).swapaxes(1, 2).reshape(
+        2, 2, -1
+    )
 
 
 def regulated(
@@ -321,7 +313,7 @@ def orbit(
         attitude, seconds(phase.blend), t0, t_end,
     )  # fmt: skip
     if smooth:
-        polar = replace(trajectory, carried=np.zeros((0, 6))).at(np.zeros(1))
+        polar = changed(trajectory, carried=np.zeros((0, 6))).at(np.zeros(1))
         cm = np.stack([start.v, start.a, start.jerk])
         full = np.concatenate([cm, rotation_of(start, attitude)[1:]], axis=1)
         trajectory.carried = full - np.stack(polar[1:])[:, 0]

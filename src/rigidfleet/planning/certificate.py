@@ -17,6 +17,9 @@ from rigidfleet.typing import Bools, Floats
 _KEPT = 100_000
 #: What a certificate of bent ways gives away, so that its search ends [m].
 CLOSE = 1e-6
+#: Shares of a blend's duration, and of the paths flown by then.
+_TAU = np.linspace(0.0, 1.0, 2001)
+_FLOWN = septic_polynomial(_TAU)
 #: Where a certificate is from: a closed form is exact; conservative advancement gives away `CLOSE`.
 How = Literal["closed form", "conservative advancement"]
 
@@ -129,5 +132,4 @@ def _about(c: Floats, x: Floats) -> Floats:
 
 def _when(share: float) -> float:
     """Share of the blend's duration at which agents have flown this share of their paths."""
-    tau = np.linspace(0.0, 1.0, 2001)
-    return float(np.interp(share, septic_polynomial(tau), tau))
+    return float(np.interp(share, _FLOWN, _TAU))

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from rigidfleet._common.kept import kept
 from rigidfleet.kernel.problem import NO_KNOTS, NO_WAYS
 from rigidfleet.math import attitude as att
 from rigidfleet.math import series, splines
@@ -38,7 +38,7 @@ from rigidfleet.planning.body_trajectories import (
     regulated,
     rotation_of,
 )
-from rigidfleet.planning.reference import PhaseState, Pose, pose_at
+from rigidfleet.planning.reference import PhaseState, Pose, changed, pose_at
 from rigidfleet.typing import Floats
 
 #: Time in which a phase that ends by settling, without a target, brings the body to rest [s].
@@ -70,7 +70,7 @@ def _stay(mission: Mission, phase: Phase, now: PhaseState, t_end: float) -> Cour
     arrival = t_end if phase.settle is None else min(t_end, now.t + _REST_WITHIN)
     if now.goal is None:
         return Course(None, t_end, None)
-    goal = replace(now.goal, v=np.zeros(3), omega=np.zeros(3))
+    goal = changed(now.goal, v=np.zeros(3), omega=np.zeros(3))
     return _led(mission, phase, now, goal, arrival, t_end)
 
 
@@ -79,13 +79,19 @@ def _steer(mission: Mission, phase: Steering, now: PhaseState, t_end: float) -> 
     assert now.goal is not None  # a steering phase has a goal
     arrival = t_end if phase.travel is None else now.t + seconds(phase.travel)
     angles = phase.attitude_deg
-    T = now.goal.T if angles is None else att.dcm_from_euler(np.deg2rad(angles))
+    T = now.goal.T if angles is None else _attitude(angles)
     named = now.goal.named or angles is not None
     r, v = now.goal.r, np.zeros(3)
     if isinstance(phase, Fly):
         r, v = np.array(phase.position), np.array(phase.velocity)
     goal = Pose(r, v, T, np.deg2rad(phase.rates_deg_s), named)
     return _led(mission, phase, now, goal, arrival, t_end)
+
+
+@kept
+def _attitude(angles: tuple[float, ...]) -> Floats:
+    """Direction cosines (3, 3) of roll, pitch and yaw [deg]."""
+    return att.dcm_from_euler(np.deg2rad(angles))
 
 
 def _orbit(mission: Mission, phase: Orbit, now: PhaseState, t_end: float) -> Course:
@@ -124,7 +130,7 @@ def _vertical(mission: Mission, phase: Vertical, now: PhaseState, t_end: float) 
     else:
         up[2] = -max(0.0, height(mission, now))
         v[2] = -min(TOUCH_DOWN, -up[2] / (arrival - now.t))
-    goal = replace(now.goal, r=now.goal.r + up, v=v, omega=np.zeros(3))
+    goal = changed(now.goal, r=now.goal.r + up, v=v, omega=np.zeros(3))
     return Course(goal, arrival, SmoothTrajectory(now.pose, goal, now.t, arrival, ()))
 
 
@@ -135,7 +141,7 @@ def _follow(mission: Mission, phase: Follow, now: PhaseState, t_end: float) -> C
     end = pose_at(trajectory.found, t_end)
     named = now.goal.named and not phase.turns_away
     arrival = float(min(t_end, trajectory.found.knots[-1]))
-    return Course(replace(end, named=named), arrival, trajectory)
+    return Course(changed(end, named=named), arrival, trajectory)
 
 
 def _followed(

@@ -14,6 +14,7 @@ from rigidfleet.kernel.problem import Disturbance, Problem, graph, no_disturbanc
 from rigidfleet.math import turbulence
 from rigidfleet.mission import Gusts, Mission
 from rigidfleet.mission.disturbances import gust_step, intensity
+from rigidfleet.planning import filters
 from rigidfleet.typing import Bools, Floats
 
 #: Mass of a lost vehicle in the control laws [kg]: too small to count, yet nothing is divided by zero.
@@ -38,23 +39,23 @@ def disturbance(mission: Mission) -> Disturbance:
     )
     if d.gusts is not None:
         step = gust_step(d.gusts, float(np.linalg.norm(wind)))
-        out = out._replace(gust_step=step, gust=_table(_gusts(mission, d.gusts, wind, step)))
+        out = out._replace(
+            gust_step=step, gust=filters.spline_coefficients(_gusts(mission, d.gusts, wind, step))
+        )
     if d.noise is not None:
         step = 1.0 / d.noise.rate
         shape = (_knots(mission, step), 2, mission.n_agents, 3)
         white = np.random.default_rng((1, d.noise.seed)).standard_normal(shape)
-        r, v = d.noise.position * white[:, 0], d.noise.velocity * white[:, 1]
-        out = out._replace(noise_step=step, noise_r=_table(r), noise_v=_table(v))
+        r, v = (
+            filters.spline_coefficients(white[:, k], scale)
+            for k, scale in enumerate((d.noise.position, d.noise.velocity))
+        )
+        out = out._replace(noise_step=step, noise_r=r, noise_v=v)
     return out
 
 
 def _knots(mission: Mission, step: float) -> int:
     return math.ceil(mission.latest_end / step) + 2
-
-
-def _table(samples: Floats) -> Floats:
-    """Coefficients of a spline, in the only memory layout that the kernel is compiled for."""
-    return np.ascontiguousarray(turbulence.spline_coefficients(samples))
 
 
 def _gusts(mission: Mission, gusts: Gusts, wind: Floats, step: float) -> Floats:
@@ -70,7 +71,7 @@ def _gusts(mission: Mission, gusts: Gusts, wind: Floats, step: float) -> Floats:
         white = turbulence.correlate_evenly(white, gusts.correlation or 0.0)
     if gusts.model == "first-order":
         assert gusts.time_scale is not None  # checked on entry
-        u = turbulence.first_order(white[:, 0], step, gusts.time_scale)
+        u = filters.first_order(white[:, 0], step, gusts.time_scale)
     else:
         if gusts.altitude is not None:
             _, length = turbulence.low_altitude(gusts.altitude, speed)
@@ -78,10 +79,10 @@ def _gusts(mission: Mission, gusts: Gusts, wind: Floats, step: float) -> Floats:
             length = np.broadcast_to(np.array(gusts.length, dtype=np.float64), 3)
         tau = length / (gusts.airspeed or speed)
         u = np.empty(white[:, 0].shape)
-        u[..., 0] = turbulence.first_order(white[:, 0, :, 0], step, tau[0])
+        u[..., 0] = filters.first_order(white[:, 0, :, 0], step, tau[0])
         for axis in (1, 2):
-            u[..., axis] = turbulence.second_order(white[..., axis], step, tau[axis])
-    return (intensity(gusts, speed) * u) @ _wind_axes(wind)
+            u[..., axis] = filters.second_order(white[..., axis], step, tau[axis])
+    return ((intensity(gusts, speed) * u).reshape(-1, 3) @ _wind_axes(wind)).reshape(u.shape)
 
 
 def _wind_axes(wind: Floats) -> Floats:

@@ -15,7 +15,7 @@ from rigidfleet.mission import Mission, Obstacle
 from rigidfleet.mission.changes import scaled_name
 from rigidfleet.mission.kinds import Go
 from rigidfleet.planning.lattice import Change, Path
-from rigidfleet.planning.reference import align_slots, slots_about_cm
+from rigidfleet.planning.reference import align_slots
 from rigidfleet.typing import Floats
 
 #: Roll, pitch and yaw [deg].
@@ -49,11 +49,7 @@ def allowed(mission: Mission, phase: Go, own: str) -> Iterator[Shape]:
     for scale in sorted(phase.scales, reverse=True):
         stages += [(scaled_name(n, scale), 2) for n in (own, *others)]
     for name, stage in stages:
-        slots = (
-            slots_about_cm(mission, name, mission.fleet.mass)
-            if name in mission.formations
-            else None
-        )
+        slots = mission.slots_about_cm(name) if name in mission.formations else None
         if slots is None:
             continue
         apart = float(proximity.separation(slots[None], radius)[0][0])

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -19,7 +18,7 @@ from rigidfleet.mission.kinds import Brake, Hold, Land, Reshape, Turn
 from rigidfleet.planning.courses import height
 from rigidfleet.planning.limits import limits_of, reached
 from rigidfleet.planning.preview import Leg, leg, phase_spans
-from rigidfleet.planning.reference import PhaseState, pose_at
+from rigidfleet.planning.reference import PhaseState, changed, pose_at
 
 #: Greatest acceleration [m/s^2] and jerk [m/s^3] of a slot while it brakes, turns or spreads, and greatest speed [m/s]
 #: and acceleration of the descent, unless `limits` asks for less. A motion that is faster when it begins may go on so.
@@ -85,8 +84,8 @@ def state_at(found: Leg, t: float, lost: np.ndarray | None) -> PhaseState:
     blending = t < reference.t0 + reference.T_b
     goal = found.after.goal
     if found.phase.goal_moves and goal is not None:
-        goal = replace(pose, named=goal.named)
-    return replace(
+        goal = changed(pose, named=goal.named)
+    return changed(
         before, t=t, pose=pose, goal=goal, slots=found.after.slots, formation=found.after.formation,
         blend=reference if blending else None, lost=lost,
     )  # fmt: skip
@@ -94,7 +93,7 @@ def state_at(found: Leg, t: float, lost: np.ndarray | None) -> PhaseState:
 
 def _after(mission: Mission, phase: Phase, now: PhaseState) -> PhaseState:
     found = _planned(mission, phase, now).after
-    return replace(found, blend=None)
+    return changed(found, blend=None)
 
 
 def _planned(mission: Mission, phase: Phase, now: PhaseState) -> Leg:

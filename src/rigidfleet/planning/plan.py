@@ -7,7 +7,7 @@ kernel only evaluates. A `PhaseState` holds what the next phase inherits.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
 from typing import Any
 
@@ -55,9 +55,9 @@ from rigidfleet.planning.reference import (
     Pose,
     align_slots,
     attach,
+    changed,
     pose_at,
     reference_kind,
-    slots_about_cm,
     slots_before,
 )
 from rigidfleet.planning.tolerances import absolute_tolerances, tolerance_of_velocity
@@ -66,6 +66,8 @@ from rigidfleet.typing import Bools, Floats, Ints
 _KINDS = {"shape": SHAPE, "squares": SQUARED, "step": CONSTANT}
 #: Greatest error of any pair, as a share of the shortest distance, at which a formation counts as held.
 _NEAR = 0.1
+#: Difference of two lengths that is ignored [m].
+_ROUNDED = 1e-8
 
 
 #: Residual of an iterative solve, as a share of the integrator's tolerance; the relative residual has bounds.
@@ -199,8 +201,8 @@ class PhasePlan:
             pose = Pose(w.body[0].copy(), w.body[1].copy(), w.T_ref.copy(), w.body[3].copy())
             pose = pose_at(self.problem.motion, t) if self.smooth else pose
         if self.phase.goal_moves and pose is not None and goal is not None and t < self.t_end:
-            goal = replace(pose, T=pose.T if self.phase.turns_away else goal.T, named=goal.named)
-        return replace(
+            goal = changed(pose, T=pose.T if self.phase.turns_away else goal.T, named=goal.named)
+        return changed(
             self.before,
             t=t,
             r=w.r.copy(),
@@ -241,7 +243,7 @@ def plan_phase(
     before_switch, masses = now, mission.fleet.mass.copy()
     shaping = phase.shaping
     name = shaping.formation if shaping is not None else now.formation
-    target = slots_about_cm(mission, name, masses)
+    target = mission.slots_about_cm(name)
     frame, now, turned = attach(mission, phase, now, masses, target)
     lift = lifted(mission, phase, now, t_end)
     if lift is not None and not lift.keeps:
@@ -250,7 +252,7 @@ def plan_phase(
     d1 = mission.formation_distances(name) if name else np.zeros(0)
     if shaping is None:
         d1 = now.reference.of(edges, d1)
-    d0 = now.reference.of(edges, distance_geometry.distances(now.r, edges))
+    d0 = now.reference.of(edges, lambda: distance_geometry.distances(now.r, edges))
     # Slots are blended if the reference is a shape; if it is distances, slots matter only when tracked.
     left = masses if now.lost is None else np.where(now.lost, 0.0, masses)
     before = slots_before(mission, now, left)
@@ -284,9 +286,8 @@ def plan_phase(
     problem = Problem(
         body_formulation=mission.formulation == "body",
         has_frame=frame is not None,
-        vehicles=Vehicles(
-            masses, 1.0 / masses, float(masses.sum()), float(masses.mean()),
-            mission.fleet.thrust_limit.copy(), mission.agents.saturate, mission.gravity,
+        vehicles=_vehicles(
+            masses, mission.fleet.thrust_limit, mission.agents.saturate, mission.gravity
         ),
         graph=_graph(edges.tobytes(), masses.tobytes(), large=method != "dense"),
         law=_law(
@@ -313,10 +314,11 @@ def plan_phase(
         radius=mission.fleet.radius, before=before_switch, links_lost=mission.links_lost, blend=reference,
         through=passed(trajectory), smooth=mission.smooth or mission.on_loss != "continue",
     )  # fmt: skip
-    lost = np.zeros(len(masses), dtype=np.bool_) if now.lost is None else now.lost
-    parted = plan.links_lost[1] <= now.t
-    if lost.any() or parted.any():
-        plan.release(lost, parted)
+    if now.lost is not None or len(plan.links_lost[1]):
+        lost = np.zeros(len(masses), dtype=np.bool_) if now.lost is None else now.lost
+        parted = plan.links_lost[1] <= now.t
+        if lost.any() or parted.any():
+            plan.release(lost, parted)
     return plan
 
 
@@ -351,6 +353,13 @@ def _check_size(mission: Mission, phase: Phase) -> None:
         )
 
 
+@kept
+def _vehicles(masses: Floats, limit: Floats, saturate: bool, gravity: float) -> Vehicles:
+    return Vehicles(
+        masses.copy(), 1.0 / masses, float(masses.sum()), float(masses.mean()), limit.copy(), saturate, gravity
+    )  # fmt: skip
+
+
 @lru_cache(64)
 def _graph(edges: bytes, masses: bytes, *, large: bool) -> Graph:
     """The constraint graph, cached because most phases have the same one as the phase before."""
@@ -380,10 +389,10 @@ def _wanted(slots: Floats) -> tuple[Ints, Floats, float]:
     return pairs.copy(), wanted, _NEAR * float(wanted.min())
 
 
-@kept
 def _agree(asked: Floats, slots: Floats, edges: Ints) -> bool:
-    """Whether the edges (m, 2) of slots have the lengths (m,) asked for."""
-    return np.allclose(asked, distance_geometry.distances(slots, edges), rtol=1e-12)
+    """Whether the edges (m, 2) of slots have the lengths (m,) asked for, to rounding [m]."""
+    found = distance_geometry.distances(slots, edges)
+    return bool((np.abs(asked - found) <= _ROUNDED + 1e-12 * found).all())
 
 
 @kept
@@ -412,10 +421,9 @@ def _control(mission: Mission, phase: Phase, masses: Floats) -> Control:
     force = np.empty((len(masses), 3))
     force[:] = phase.input_force
     force[:, 2] += masses * mission.gravity
-    k1, k2 = lqr.double_integrator_gains(mission.tracking.Q, mission.tracking.R)
     allocation = mission.allocation
     method = RIGID if allocation.method == "rigid" else SPLITS[allocation.torque_split]
-    return Control(kind, force, k1, k2, method)
+    return Control(kind, force, *mission.tracking_gains, method)
 
 
 _REST = Motion(np.zeros(2), np.zeros((1, 6, 6)), np.eye(3))
@@ -427,7 +435,7 @@ _NO_FEEDBACK = Feedback(
 
 def _feedback(mission: Mission, goal: Pose, t0: float, arrival: float, *, moves: bool) -> Feedback:
     """LQR of the virtual body itself: gain tables on the way to a waypoint, tracking gains at rest."""
-    hold = lqr.double_integrator_gains(mission.tracking.Q, mission.tracking.R) * 2
+    hold = mission.tracking_gains * 2
     to_go, gain, slope = np.zeros(0), np.zeros((0, 4)), np.zeros((0, 4))
     if moves:
         # Gains grow like 1/tau near arrival, until S bounds them. Cubics on a geometric grid are

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
@@ -20,9 +20,9 @@ from rigidfleet.planning.reference import (
     PhaseState,
     align_slots,
     attach,
+    changed,
     pose_at,
     reference_kind,
-    slots_about_cm,
     slots_before,
 )
 from rigidfleet.typing import Floats
@@ -152,7 +152,7 @@ def leg(mission: Mission, phase: Phase, now: PhaseState) -> Leg | None:
     """The planned leg of a phase from the state at its start; None if it depends on distances alone."""
     masses, shaping = mission.fleet.mass, phase.shaping
     name = shaping.formation if shaping is not None else now.formation
-    target = slots_about_cm(mission, name, masses)
+    target = mission.slots_about_cm(name)
     if shaping is not None and target is None:
         return None
     before = now
@@ -177,7 +177,7 @@ def leg(mission: Mission, phase: Phase, now: PhaseState) -> Leg | None:
         motion = _thrown(mission, phase, now, t_end)
         reference = Reference(SHAPE, t0, blend, _NONE, _NONE, x, dp, turn)
         slots = target if shaping is not None else now.slots
-        after = replace(now, slots=slots, pose=None, frame=frame)
+        after = changed(now, slots=slots, pose=None, frame=frame)
     else:
         assert now.slots is not None  # attached above
         goal, arrival, trajectory = course(mission, phase, now, t_end)
@@ -194,11 +194,11 @@ def leg(mission: Mission, phase: Phase, now: PhaseState) -> Leg | None:
         pose = pose_at(motion, t_end)
         tracked = pose if phase.control == "tracking" else None
         frame = pose.T if frame is not None else None
-        after = replace(now, slots=slots, pose=tracked, goal=goal, frame=frame)
+        after = changed(now, slots=slots, pose=tracked, goal=goal, frame=frame)
     if shaping is None and now.blend is not None:
         reference = now.blend
     r, v = slot_derivatives(reference, motion, np.array([t_end]), 2)[0]
-    after = replace(after, t=t_end, r=r, v=v, formation=name)
+    after = changed(after, t=t_end, r=r, v=v, formation=name)
     return Leg(phase, t0, t_end, reference, motion, before, after, exact, arrival)
 
 

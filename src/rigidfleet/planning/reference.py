@@ -5,8 +5,9 @@ Both the plan of a flight and the check before it use them. Nothing here integra
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import Literal
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 
@@ -29,16 +30,20 @@ class ByEdge:
     keys: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     values: Floats = field(default_factory=lambda: np.zeros(0))
 
-    def of(self, edges: Ints, other: Floats | float) -> Floats:
-        """Values (m,) of edges (m, 2), i < j; ``other`` (m,) for new edges, or (B, m), then of so many flights."""
-        if not len(self.keys):
-            return np.zeros(len(edges)) + other
+    def of(self, edges: Ints, other: Floats | float | Callable[[], Floats]) -> Floats:
+        """Values (m,) of edges (m, 2), i < j; ``other`` (m,) for new edges, or (B, m), then of so many flights.
+
+        A function of ``other`` values is called only where edges may be new.
+        """
         keys = _keys(edges)
-        if keys is self.keys and np.ndim(other) < 2:
+        if keys is self.keys and not (isinstance(other, np.ndarray) and other.ndim > 1):
             return self.values.copy()
+        new = other if isinstance(other, np.ndarray | float | int) else other()
+        if not len(self.keys):
+            return np.zeros(len(edges)) + new
         at = np.searchsorted(self.keys, keys)
         known = np.append(self.keys, -1)[at] == keys
-        return np.where(known, np.append(self.values, 0.0)[at], other)
+        return np.where(known, np.append(self.values, 0.0)[at], new)
 
     def updated(self, edges: Ints, values: Floats) -> ByEdge:
         """These values, updated with the ``values`` of edges (m, 2), i < j."""
@@ -56,6 +61,20 @@ def _keys(edges: Ints) -> Ints:
     return (edges[:, 0] << 32) + edges[:, 1]
 
 
+State = TypeVar("State")
+
+#: The rates of a pose that has none, which all such poses share.
+_ZERO = np.zeros(3)
+_ZERO.flags.writeable = False
+
+
+def changed(state: State, **fields: Any) -> State:
+    """A shallow copy of a pose, a state or a plan with other fields; `dataclasses.replace` takes five times as long."""
+    new = object.__new__(type(state))
+    new.__dict__.update(state.__dict__, **fields)
+    return new
+
+
 @dataclass
 class Pose:
     """Pose of the virtual body, actual or desired: CM [m], attitude T (world -> body) and their rates.
@@ -68,15 +87,15 @@ class Pose:
     T: Floats
     omega: Floats  # body axes [rad/s]
     named: bool = False  # whether a phase specifies this attitude explicitly
-    a: Floats = field(default_factory=lambda: np.zeros(3))  # [m/s^2]
-    jerk: Floats = field(default_factory=lambda: np.zeros(3))  # [m/s^3]
-    alpha: Floats = field(default_factory=lambda: np.zeros(3))  # of omega, body axes [rad/s^2]
-    alpha_dot: Floats = field(default_factory=lambda: np.zeros(3))  # [rad/s^3]
+    a: Floats = field(default_factory=lambda: _ZERO)  # [m/s^2]
+    jerk: Floats = field(default_factory=lambda: _ZERO)  # [m/s^3]
+    alpha: Floats = field(default_factory=lambda: _ZERO)  # of omega, body axes [rad/s^2]
+    alpha_dot: Floats = field(default_factory=lambda: _ZERO)  # [rad/s^3]
 
     def in_axes(self, axes: Floats) -> Pose:
         """The same pose in new body axes; ``axes`` (3, 3) maps vectors from new to old ones."""
         rates = {key: axes.T @ getattr(self, key) for key in ("T", "omega", "alpha", "alpha_dot")}
-        return replace(self, **rates)
+        return changed(self, **rates)
 
 
 def pose_at(motion: Motion, t: float) -> Pose:
@@ -103,12 +122,6 @@ class PhaseState:
     goal: Pose | None = None  # the pose to hold
     lost: Bools | None = None  # (N,) lost vehicles; None if there are none
     blend: Reference | None = None  # change of shape under way, if a loss has ended its phase
-
-
-def slots_about_cm(mission: Mission, name: str | None, masses: Floats) -> Floats | None:
-    """Slots (N, 3) [m] of a formation about their centre of mass; None if it has no slots."""
-    slots = mission.formation_slots(name) if name else None
-    return None if slots is None else about_cm(slots, masses)
 
 
 def attach(
@@ -156,7 +169,7 @@ def attach(
             pose.v = pose.v - T.T @ np.cross(pose.omega, centre)
             x = x + T.T @ centre
     slots = now.slots if now.slots is not None else x @ pose.T.T
-    goal = now.goal or replace(pose, v=np.zeros(3), omega=np.zeros(3))
+    goal = now.goal or changed(pose, v=np.zeros(3), omega=np.zeros(3))
     turn = np.eye(3)
     if establishing is not None and target is not None:
         # The new axes in the old ones: `axes` maps vectors from new to old.
@@ -169,13 +182,16 @@ def attach(
             axes = np.eye(3) if steady else pose.T @ asked.T
         slots = slots @ axes
         pose = pose.in_axes(axes)
-        goal = replace(goal, T=pose.T if free else asked, named=not free)
-        given = None if given is None else axes.T @ given
+        goal = changed(goal, T=pose.T if free else asked, named=not free)
+        if free:  # in the axes that fit best, nothing is left to turn
+            given = np.eye(3)
+        elif given is not None:
+            given = axes.T @ given
     if shaping is not None:
         turn = _turn(given, slots, target, masses)
     if phase.control == "body" or (mission.formulation == "body" and frame is None):
         frame = pose.T
-    return frame, replace(now, pose=pose, slots=slots, goal=goal), turn
+    return frame, changed(now, pose=pose, slots=slots, goal=goal), turn
 
 
 def slots_before(mission: Mission, now: PhaseState, masses: Floats) -> Floats:

@@ -19,7 +19,7 @@ from rigidfleet.planning.body_trajectories import SmoothTrajectory
 from rigidfleet.planning.courses import course, misled
 from rigidfleet.planning.limits import Reached, limits_of, reached
 from rigidfleet.planning.preview import Leg, at_start, leg
-from rigidfleet.planning.reference import PhaseState, attach, slots_about_cm
+from rigidfleet.planning.reference import PhaseState, attach
 from rigidfleet.planning.transitions import expanded
 
 #: Shortest and longest time tried [s], and the number of times tried.
@@ -96,9 +96,7 @@ def with_times(mission: Mission, phase: Phase, now: PhaseState, number: int) -> 
     """
     if phase.led or phase.bent:
         masses = mission.fleet.mass
-        _, begun, _ = attach(
-            mission, phase, now, masses, slots_about_cm(mission, now.formation, masses)
-        )
+        _, begun, _ = attach(mission, phase, now, masses, mission.slots_about_cm(now.formation))
         if problem := misled(mission, phase, begun):
             key = "file" if phase.led else "formation"
             remedy = "lead the vehicles there before, by phases such as 'fly', 'turn' and 'reshape'"
@@ -236,7 +234,7 @@ def _shared_out(mission: Mission, phase: Phase, now: PhaseState) -> Phase:
     if not isinstance(phase, Fly) or not phase.through:
         return phase
     masses = mission.fleet.mass
-    _, now, _ = attach(mission, phase, now, masses, slots_about_cm(mission, now.formation, masses))
+    _, now, _ = attach(mission, phase, now, masses, mission.slots_about_cm(now.formation))
     end = now.t + _arrival(phase)
     trajectory = course(mission, phase.model_copy(update=_until(phase)), now, end).trajectory
     assert isinstance(trajectory, SmoothTrajectory)

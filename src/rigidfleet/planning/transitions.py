@@ -22,7 +22,7 @@ from rigidfleet.mission.kinds import Go, Reshape, Vertical
 from rigidfleet.mission.obstacles import Ground
 from rigidfleet.mission.values import AUTO
 from rigidfleet.planning.preview import at_start, leg
-from rigidfleet.planning.reference import PhaseState, slots_about_cm
+from rigidfleet.planning.reference import PhaseState
 from rigidfleet.planning.transfers import transfer
 from rigidfleet.planning.ways import Timed
 from rigidfleet.typing import Floats, Ints
@@ -123,8 +123,7 @@ def _staggered(
 
 def _ends(mission: Mission, phase: Reshape, before: str | None) -> tuple[Floats, Floats] | None:
     """Slots (N, 3) [m] about the centre of mass before and after a phase, in body axes; None if they are not known."""
-    masses = mission.fleet.mass
-    found = [slots_about_cm(mission, name, masses) for name in (before, phase.formation)]
+    found = [mission.slots_about_cm(name) for name in (before, phase.formation)]
     return None if found[0] is None or found[1] is None else (found[0], found[1])
 
 

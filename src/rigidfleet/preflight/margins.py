@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigidfleet.math import lqr
 from rigidfleet.math.margins import (
     GROWTH,
     Feedback,
@@ -111,7 +110,7 @@ def formation_laws(
 def _feedback(mission: Mission, phase: Phase | None, held: str | None) -> Feedback:
     """The laws of a phase; ``held`` is the formation in which it begins, None if the shape changes."""
     c = mission.constraint
-    k1, k2 = lqr.double_integrator_gains(mission.tracking.Q, mission.tracking.R)
+    k1, k2 = mission.tracking_gains
     on = float(c.stabilisation == "pid")
     d = mission.disturbances
     links = None if d is None else d.links

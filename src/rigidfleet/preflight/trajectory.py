@@ -11,7 +11,7 @@ from rigidfleet._common.text import agent_names
 from rigidfleet._common.waypoints import UNITS, WAYPOINT_TOLERANCE
 from rigidfleet.formation import distance_geometry
 from rigidfleet.math import attitude as att
-from rigidfleet.math import lqr, proximity
+from rigidfleet.math import proximity
 from rigidfleet.math.rigid_body import about_cm, mean_axis_rates
 from rigidfleet.mission import Mission
 from rigidfleet.mission.disturbances import intensity
@@ -165,7 +165,7 @@ def disturbance_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     believed, true, drag = mission.fleet.mass, mission.true_mass, mission.drag
     wind, up = np.array(d.wind), np.array([0.0, 0.0, 1.0])
     g, speed = mission.gravity, float(np.linalg.norm(d.wind))
-    k1, k2 = lqr.double_integrator_gains(mission.tracking.Q, mission.tracking.R)
+    k1, k2 = mission.tracking_gains
     sigma = 0.0 if d.gusts is None else float(intensity(d.gusts, speed).max())
     gusts = 3 * sigma * drag
     noise = np.zeros(len(believed))

@@ -4,28 +4,17 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from functools import cached_property
-from typing import TypeVar
 
 from rigidfleet.kernel.problem import Disturbance
 from rigidfleet.mission import Mission, Phase
 from rigidfleet.planning.disturbances import disturbance
 from rigidfleet.planning.plan import PhasePlan, plan_phase
-from rigidfleet.planning.reference import PhaseState
+from rigidfleet.planning.reference import PhaseState, changed
 from rigidfleet.planning.timing import timed
 from rigidfleet.simulation.extremes import Extremes
 
 #: Number of missions whose preparation is kept, and their greatest number of agents.
 _KEPT, _SMALL = 8, 200
-
-
-Plain = TypeVar("Plain")
-
-
-def _copied(x: Plain) -> Plain:
-    """A shallow copy of an object without slots; `copy.copy` takes several times as long."""
-    new = object.__new__(type(x))
-    new.__dict__.update(x.__dict__)
-    return new
 
 
 class Preparation:
@@ -78,8 +67,8 @@ class Preparation:
             found = plan_phase(self.mission, phase, now, disturbance=given, external=external)
             _ = found.certificate, found.tolerances, found.loses  # once for all flights
             self._plans = {key: found}
-        plan = _copied(found)
-        plan.before = _copied(found.before)
+        plan = changed(found)
+        plan.before = changed(found.before)
         return plan
 
 

@@ -22,7 +22,7 @@ from rigidfleet._common.renamed import successor
 from rigidfleet._version import __version__
 from rigidfleet.errors import MissionError, SweepError, wrong_type
 from rigidfleet.mission import Mission, load_mission, mission_names
-from rigidfleet.mission.findings import FindingCollector, Keys, unknown_key
+from rigidfleet.mission.findings import FindingCollector, Keys, Shared, unknown_key
 from rigidfleet.mission.loading import as_mission
 from rigidfleet.mission.phases import kind, tables
 from rigidfleet.mission.text import parse_toml, read_text
@@ -249,11 +249,25 @@ class Sweep:
         return found[::-1]
 
     def varied(self, run: int) -> dict[str, Any]:
-        """The mission of a run as plain data, not yet checked."""
-        document = _copied(self.document)
+        """The mission of a run as plain data, not yet checked; what does not vary is shared with `document`."""
+        document = _copied(self.document, [column.keys for column in self.columns])
         for column, value in zip(self.columns, self.values(run), strict=True):
             apply(document, self.whole, column, value)
         return document
+
+    def mission_of(self, run: int) -> Mission:
+        """The mission of a run.
+
+        Raises
+        ------
+        MissionError
+            It has errors.
+        """
+        return Mission.from_plain(self.varied(run), f"run {run}", self._shared)
+
+    @cached_property
+    def _shared(self) -> Shared:
+        return Shared(self.document)
 
     def _data(self) -> dict[str, Any]:
         return {
@@ -266,11 +280,18 @@ class Sweep:
         }
 
 
-def _copied(x: Any) -> Any:
-    """A copy of plain data: tables, lists, words and numbers."""
-    if isinstance(x, dict):
-        return {key: _copied(value) for key, value in x.items()}
-    return [_copied(value) for value in x] if isinstance(x, list) else x
+def _copied(x: Any, places: Sequence[Keys]) -> Any:
+    """A copy of plain data in which the tables and lists on the way to some places are copied, and others shared."""
+    if not isinstance(x, dict | list):
+        return x
+    new: Any = x.copy()
+    below: dict[Any, list[Keys]] = {}
+    for first, *rest in filter(None, places):
+        below.setdefault(first, []).append(tuple(rest))
+    for key, further in below.items():
+        if (there := keypaths.look_up(x, (key,))) is not None:
+            new[key] = _copied(there, further)
+    return new
 
 
 def _axis(column: SweepColumn, k: int) -> str | int:

@@ -13,7 +13,6 @@ from rigidfleet.sweep.metrics import METRICS, measure
 from rigidfleet.sweep.record import BROKEN, RunRecord, refusal
 
 if TYPE_CHECKING:
-    from rigidfleet.mission import Mission
     from rigidfleet.result import Result
 
 #: Number of consecutive runs in a group. The first run of a group is a multiple of it.
@@ -40,7 +39,7 @@ def _fly(sweep: Sweep, runs: Sequence[int]) -> list[RunRecord]:
     from rigidfleet.simulation.together import simulate_together
 
     begun = perf_counter()
-    missions = {run: _tried(lambda run=run: _mission(sweep, run)) for run in runs}
+    missions = {run: _tried(lambda run=run: sweep.mission_of(run)) for run in runs}
     whole = [run for run, mission in missions.items() if not isinstance(mission, Exception)]
     flown: dict[int, Any] = dict(missions)
     together = _tried(lambda: simulate_together([missions[run] for run in whole]))
@@ -50,12 +49,6 @@ def _fly(sweep: Sweep, runs: Sequence[int]) -> list[RunRecord]:
         flown |= dict(zip(whole, together, strict=True))
     shared = (perf_counter() - begun) / len(runs)
     return [_row(sweep, run, flown[run], shared) for run in runs]
-
-
-def _mission(sweep: Sweep, run: int) -> Mission:
-    from rigidfleet.mission import Mission
-
-    return Mission.from_plain(sweep.varied(run), f"run {run}")
 
 
 def _tried(job: Callable[[], Any]) -> Any:

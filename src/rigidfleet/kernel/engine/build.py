@@ -16,7 +16,7 @@ from typing import Any
 import llvmlite.binding as llvm
 from numba import cfunc, typeof, types
 
-from rigidfleet.kernel import dopri5, measurement, monitor, recorder
+from rigidfleet.kernel import dopri5, measurement, monitor, recorder, recursion
 from rigidfleet.kernel.compiler import gathering, numba_internals
 from rigidfleet.kernel.compiler.jit import OPTIONS
 from rigidfleet.kernel.compiler.pointers import keep_extents, pointer, sized
@@ -73,8 +73,8 @@ def machine_code(second: "subprocess.Popen[bytes] | None" = None) -> list[bytes]
 
 
 def apart() -> list[bytes]:
-    """Object codes of the monitor, of measurement and of packing, which share little with the rest."""
-    problem, workspace, integrator, _, _, watching, *_, measured, spectrum = _pointers()
+    """Object codes of the monitor, of measurement, recursions and packing, which share little with the rest."""
+    problem, workspace, integrator, _, _, watching, *_, measured, spectrum, recursing = _pointers()
 
     def watch_trail(p, w, state, found):
         return monitor.watch(problem(p), workspace(w), integrator(state), watching(found))
@@ -87,10 +87,20 @@ def apart() -> list[bytes]:
         measurement.spectrum(spectrum(s))
         return 0
 
+    def follow(s):
+        recursion.follow(recursing(s))
+        return 0
+
     def gather(of, count, asked, words):
         return gathering.gather(of, count, asked, words)
 
-    functions = (watch_trail, 4), (measure_flight, 1), (singular_values, 1), (gather, 4)
+    functions = (
+        (watch_trail, 4),
+        (measure_flight, 1),
+        (singular_values, 1),
+        (follow, 1),
+        (gather, 4),
+    )
     entries = zip(functions, objects.ENTRIES[2:-1], strict=True)
     return [_object(*_module(function, name, words)) for (function, words), name in entries]
 
@@ -99,7 +109,7 @@ def sampled_code() -> list[bytes]:
     """Object code of the two C functions of sampled flights, `objects.SAMPLED_ENTRIES`."""
     from rigidfleet.kernel import quadrotor, sampled_flight
 
-    problem, workspace, *_, flight, state, segment, evaluation, _, _, _ = _pointers()
+    problem, workspace, *_, flight, state, segment, evaluation, _, _, _, _ = _pointers()
 
     def fly(p, w, f, s, call):
         return sampled_flight.fly_ticks(
@@ -118,7 +128,7 @@ def avoidance_code() -> list[bytes]:
     """Object code of avoidance in flight, `objects.AVOIDANCE_ENTRY`."""
     from rigidfleet.kernel import guard
 
-    problem, workspace, *_, flight, state, _, _, avoidance, _, _ = _pointers()
+    problem, workspace, *_, flight, state, _, _, avoidance, _, _, _ = _pointers()
 
     def avoid(f, s, given, _):
         a = avoidance(given)

@@ -43,6 +43,7 @@ from rigidfleet.kernel.records import (
     IntegratorState,
     Monitor,
     Record,
+    Recursion,
     Segment,
     recorder,
 )
@@ -144,12 +145,18 @@ def least_singular_values(r: Floats, edges: Ints) -> Floats:
     return found.least
 
 
+def follow(x: Floats, a: Floats, *, backward: bool = False) -> None:
+    """x_k += a_k x_(k-1) in rows x (K, M), with a (K,), or backward, see `rigidfleet.kernel.recursion.follow`."""
+    _call(_code().follow, pack(Recursion(x, a, backward)))
+
+
 class _Code(NamedTuple):
     integrate: Any
     record: Any
     watch: Any
     measure: Any
     spectrum: Any
+    follow: Any
     integrate_three: Any  # integrate, for three agents with three edges
     recorder: int  # address of record
     engine: Any  # keeps the code alive
@@ -247,7 +254,7 @@ def _linked(parts: Sequence[bytes], unkept: list[bytes] | None = None) -> _Code:
     addresses = [engine.get_function_address(name) for name in ENTRIES]
     functions = (
         ctypes.CFUNCTYPE(word, *(word,) * words)(address)
-        for words, address in zip((4, 4, 4, 1, 1, 4, 4), addresses, strict=True)
+        for words, address in zip((4, 4, 4, 1, 1, 1, 4, 4), addresses, strict=True)
     )
     *calls, gather, three = functions
     use(gather, engine)

@@ -36,6 +36,7 @@ from rigidfleet.kernel.records import (
     IntegratorState,
     Monitor,
     Record,
+    Recursion,
     Segment,
     integrator,
     monitor,
@@ -228,6 +229,7 @@ def examples() -> tuple[
     Avoidance,
     Measured,
     Spectrum,
+    Recursion,
 ]:
     """One minimal example of each named tuple; its fields have the types that all have."""
     one, none, places, frame = np.ones(1), np.zeros(0), np.zeros((1, 3)), np.eye(3)
@@ -262,7 +264,7 @@ def examples() -> tuple[
         measured(1, 0, 0, time=none, start=np.zeros(1, dtype=np.int64), attached=np.zeros(0, dtype=np.bool_),
                  framed=False, mass=one, lost_at=one, limit=one, edges=np.zeros((0, 2), dtype=np.int64),
                  r=rows, v=rows, f_u=rows, f_C=rows, p=rows, T_ref=np.zeros((0, 3, 3))),
-        spectrum_of(rows, np.zeros((0, 2), dtype=np.int64)),
+        spectrum_of(rows, np.zeros((0, 2), dtype=np.int64)), Recursion(np.zeros((0, 1)), none, False),
     )  # fmt: skip
 
 

@@ -1,0 +1,89 @@
+"""Filters that make gusts and sensor noise of white samples: shaping filters, and splines through samples.
+
+Shaping filters are discretised exactly: from the first sample on, samples have the covariances of the continuous
+process for any step. The input is white standard-normal samples, so that the caller controls the seeds.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from rigidfleet.typing import Floats
+
+#: Limit of the pivots of `spline_coefficients`, and the number of them that differ from it.
+_PIVOT, _EARLY = 2.0 - math.sqrt(3.0), 16
+
+
+def first_order(white: Floats, step: float, tau: float) -> Floats:
+    """Gauss-Markov process (K, ...) of unit variance and autocorrelation exp(-|t| / tau).
+
+    x_{k+1} = a x_k + sqrt(1 - a^2) e_k with a = exp(-step / tau), stationary from the start (Uhlenbeck and
+    Ornstein, 1930). Parameters: white samples e (K, ...); their step and tau [s].
+    """
+    x = white * math.sqrt(-math.expm1(-2.0 * step / tau))
+    x[0] = white[0]
+    return _followed(x, math.exp(-step / tau))
+
+
+def second_order(white: Floats, step: float, tau: float) -> Floats:
+    """Dryden's transverse process (K, ...), unit variance, autocorrelation exp(-s) (1 - s / 2), s = |t| / tau.
+
+    Its spectrum is that of (1 + sqrt(3) tau s) / (1 + tau s)^2, the lateral and vertical filter of MIL-F-8785C. In
+    partial fractions it is y = sqrt(3) z1 + (1 - sqrt(3)) z2 with tau dz1/dt = -z1 + e, tau dz2/dt = -z2 + z1,
+    whose transition matrix exp(-s) [[1, 0], [s, 1]] and covariances are known in closed form.
+
+    Parameters: white samples (K, 2, ...), two for each sample; their step and tau [s].
+    """
+    from scipy.special import gammainc
+
+    s = step / tau
+    a = math.exp(-s)
+    # P - A P A^T, of the stationary covariances P = [[1, 1/2], [1/2, 1/2]], by incomplete gamma functions: for a short
+    # step, differences would cancel.
+    q11, q12, q22 = (gammainc([1, 2, 3], 2.0 * s) * [1.0, 0.5, 0.5]).tolist()
+    root = math.sqrt(q11)
+    low = q12 / root
+    z1, z2 = root * white[:, 0], low * white[:, 0] + math.sqrt(q22 - low**2) * white[:, 1]
+    z1[0], z2[0] = white[0, 0], 0.5 * (white[0, 0] + white[0, 1])
+    z1 = _followed(z1, a)
+    z2[1:] += a * s * z1[:-1]
+    z2 = _followed(z2, a)
+    return (math.sqrt(3.0) * z1 + (1.0 - math.sqrt(3.0)) * z2) / math.sqrt(2.0)
+
+
+def _followed(x: Floats, a: float) -> Floats:
+    """Solve z_{k+1} = a z_k + x_{k+1} from z_0 = x_0; x and z (K, ...)."""
+    from rigidfleet.kernel.engine import native  # loads the compiled kernel
+
+    z = np.ascontiguousarray(x)
+    native.follow(z.reshape(len(z), -1), np.full(len(z), a))
+    return z
+
+
+def spline_coefficients(samples: Floats, scale: float = 1.0) -> Floats:
+    """Coefficients (K + 2, ...) of the natural cubic B-spline through samples (K, ...), K >= 2, on even knots.
+
+    The samples are multiplied by a ``scale``. Coefficients c solve the tridiagonal system
+    c_{k-1} + 4 c_k + c_{k+1} = 6 y_k; both ends are samples.
+    """
+    from rigidfleet.kernel.engine import native
+
+    n = len(samples)
+    flat = samples.reshape(n, -1)
+    table = np.empty((n + 2, flat.shape[1]))
+    c, ends = table[1:-1], scale * flat[[0, -1]]
+    if n > 2:
+        pivots = np.full(n - 2, _PIVOT)  # of the factors without exchanges
+        pivot = 0.0
+        for k in range(min(_EARLY, n - 2)):
+            pivots[k] = pivot = 1.0 / (4.0 - pivot)
+        np.multiply(flat[1:-1], (6.0 * scale * pivots)[:, None], out=c[1:-1])
+        c[1] -= pivots[0] * ends[0]
+        c[-2] -= pivots[-1] * ends[1]
+        for backward in (False, True):
+            native.follow(c[1:-1], -pivots, backward=backward)
+    c[0], c[-1] = ends
+    table[0], table[-1] = 2.0 * c[0] - c[1], 2.0 * c[-1] - c[-2]
+    return table.reshape(n + 2, *samples.shape[1:])
