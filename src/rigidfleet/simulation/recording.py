@@ -299,14 +299,12 @@ def _close(
     if left is None:
         left = np.ones((len(time), mission.n_agents), dtype=np.bool_)
     close = proximity.closeness(places.joined, mission.agents.radius, mission.obstacles, time, left)
-    _put(worst, time, close)
-    return dict(
-        zip(
-            CLOSE,
-            (close.separation, close.pair, close.clearance, close.agent, close.obstacle),
-            strict=True,
-        )
-    )
+    own = {
+        name: getattr(close, name).copy()
+        for name in ("separation", "pair", "clearance", "agent", "obstacle")
+    }
+    _put(worst, time, close._replace(**own))
+    return dict(zip(CLOSE, own.values(), strict=True))
 
 
 def _references(mission: Mission, pieces: Sequence[tuple[Floats, Led]]) -> dict[str, Floats]:
