@@ -29,7 +29,8 @@ class Steps:
 
         def spy(extremes: Any, problem: Any, work: Any, state: Any, *, last: bool) -> None:
             seen = int(extremes.monitor.monitor.flags[3])
-            for row in range(seen, int(state.count[4])):
+            for step in range(seen, int(state.count[4])):
+                row = (state.count[5] + step) % len(state.trail.clock)
                 t, h = state.trail.clock[row]
                 self.rows.append((t, h, state.trail.points[row].copy()))
             take(extremes, problem, work, state, last=last)
@@ -426,9 +427,8 @@ def test_who_watches_a_large_formation_does_not_change_what_is_found(solver, mon
     aside, looked = simulate(mission), flown()
     assert len(threads) > 1, "each phase's last steps are taken here"
 
-    def take_here(extremes: Any, problem: Any, work: Any, state: Any) -> Any:
+    def take_here(extremes: Any, problem: Any, work: Any, state: Any) -> None:
         extremes.take(problem, work, state, last=False)
-        return state
 
     monkeypatch.setattr(watching.Extremes, "hand_over", take_here)
     for one, other in ((aside, simulate(mission)), (looked, flown())):

@@ -223,7 +223,7 @@ class ActivePhase:
         if last or self.solver is None or self.external is not None:
             self.extremes.take(self.flown, work, self.state, last=last)
         else:
-            self.state = self.extremes.hand_over(self.flown, work, self.state)
+            self.extremes.hand_over(self.flown, work, self.state)
 
     def end(self) -> PhaseState:
         """End the phase at its current state; return the state that the next phase starts from."""
@@ -308,21 +308,17 @@ class ActivePhase:
                 self.flown = solved_by(self.solver.aside, problem)
         times = self.sampler(self.plan, self.t, t_end, first=not self.begun, stop=self.stop)
         self.begun = True
-        state = self.state  # of which another trail alone may follow
+        state = self.state
         samples = np.empty((len(times), len(state.y)))
         state.count[3] = 0
         first = math.nextafter(self.t, math.inf)
         status = records.PAUSED
+        most = _STEPS if self.solver is None else self.extremes.room
         go_on = native.Integration(problem, self.workspace, state, t_end, times, samples)
         try:
             while status == records.PAUSED:
-                if state is not self.state:
-                    state = self.state
-                    go_on = native.Integration(
-                        problem, self.workspace, state, t_end, times, samples
-                    )
                 begun = clock.perf_counter()
-                status = go_on(fresh, self.steps)
+                status = go_on(fresh, min(self.steps, most))
                 took = max(clock.perf_counter() - begun, 1e-6)
                 if status == records.PAUSED:
                     self.steps = min(_STEPS, max(1, int(self.steps * min(_PAUSE / took, 10.0))))

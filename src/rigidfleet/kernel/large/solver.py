@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ctypes
 import math
+import weakref
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -83,8 +84,10 @@ class LargeSolver:
         self.pattern: block_cholesky.Pattern | None = (
             None  # not needed as long as elimination succeeds
         )
-        # An exception cannot pass through compiled code; the multipliers become NaN.
-        self._call = ctypes.CFUNCTYPE(None)(self._solve)
+        # An exception cannot pass through compiled code; the multipliers become NaN. What the kernel calls does not keep
+        # the solver alive: its memory is free as soon as nobody needs it.
+        solve = weakref.WeakMethod(self._solve)
+        self._call = ctypes.CFUNCTYPE(None)(lambda: solve()())  # ty: ignore
         self.address = int(ctypes.cast(self._call, ctypes.c_void_p).value or 0)
 
     def _solve(self) -> None:
