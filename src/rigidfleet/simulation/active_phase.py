@@ -11,7 +11,7 @@ import numpy as np
 
 from rigidfleet.errors import FlightError, StoppedError
 from rigidfleet.kernel import records
-from rigidfleet.kernel.engine import native
+from rigidfleet.kernel.engine import native, packing
 from rigidfleet.kernel.problem import OPEN, TRACKING, Problem
 from rigidfleet.math import attitude as att
 from rigidfleet.mission import Settle
@@ -236,6 +236,8 @@ class ActivePhase:
     def release(self) -> None:
         """Give the workspace back, after the end: nothing more is asked of this phase."""
         give_back(self.plan.problem, self.workspace)
+        if self.solver is not None:
+            packing.forget()
 
     # -- inside -----------------------------------------------------------------------------------
 

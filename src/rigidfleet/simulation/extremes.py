@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from rigidfleet._common.kept import kept
 from rigidfleet.kernel import avoidance, fleet, records
-from rigidfleet.kernel.engine import native
+from rigidfleet.kernel.engine import native, packing
 from rigidfleet.kernel.problem import Problem, Workspace
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
@@ -216,7 +216,11 @@ class Extremes:
         taken, count = state._replace(count=state.count.copy()), state.count
         # The last step stays, until its neighbour is known.
         count[4:] = 1, (count[5] + count[4] - 1) % len(state.trail.clock)
-        self._taking = self._thread.submit(self.take, problem, work, taken, last=False)
+        self._taking = self._thread.submit(self._take_aside, problem, work, taken)
+
+    def _take_aside(self, *given: Any) -> None:
+        self.take(*given, last=False)
+        packing.forget()  # the phase may be over before this thread packs others
 
     def wait(self) -> None:
         """Wait until the steps that were handed over are evaluated."""

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidfleet.kernel.large import block_cholesky, elimination
-from rigidfleet.kernel.problem import ITERATED, ConstraintLaw, Vehicles, Workspace
+from rigidfleet.kernel.problem import ITERATED, ConstraintLaw, Vehicles, Workspace, workspace
 from rigidfleet.typing import Edges, Floats, Ints
 
 #: A stored factor is renewed when the iterations in excess of a new factor's have taken as long as making one. It is
@@ -102,7 +102,8 @@ class LargeSolver:
     @cached_property
     def aside(self) -> LargeSolver:
         """Another solver of the same equations, in a workspace of its own, for another thread."""
-        own = Workspace(*(x.copy() for x in self.workspace))
+        with_h = self.workspace.H.size > 0
+        own = workspace(len(self.a), len(self.edges), with_h=with_h, large=True)
         return replace(self, workspace=own, counts=Counts(), error=None)
 
     def check(self) -> None:
