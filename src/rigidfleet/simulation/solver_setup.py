@@ -58,7 +58,8 @@ def large_solver(problem: Problem, setup: Setup) -> LargeSolver:
 
 def solved_by(solver: LargeSolver, problem: Problem) -> Problem:
     """A problem whose multipliers this solver finds, as long as somebody keeps it."""
-    return problem._replace(graph=problem.graph._replace(solver=solver.address))
+    graph = problem.graph._replace(solver=solver.address, multipliers=solver.multipliers)
+    return problem._replace(graph=graph)
 
 
 def small_workspace(problem: Problem) -> Workspace:
