@@ -109,7 +109,7 @@ def keep_start(p, w, state):
 
 @compiled
 def keep_step(t, h, p, w, state):
-    """Record a step in the next row of the trail: the Bernstein coefficients of its continuous extension, and the forces at its end.
+    """Record a step in the next row of the trail: Bernstein coefficients of its extension, and the forces at its end.
 
     The terms are those of Hairer's form, y + x (rise + (1 - x) (bend + x (rest + (1 - x) twist))).
     """

@@ -206,7 +206,11 @@ def bound_moves(points, p, monitor):
             x1 = y1 = z1 = u0 = u1 = u2 = v0 = v1 = v2 = 0.0
             for k in range(5):
                 if k < 4:
-                    x1, y1, z1 = points[k + 1, 3 * i], points[k + 1, 3 * i + 1], points[k + 1, 3 * i + 2]
+                    x1, y1, z1 = (
+                        points[k + 1, 3 * i],
+                        points[k + 1, 3 * i + 1],
+                        points[k + 1, 3 * i + 2],
+                    )
                     x1, y1, z1 = x1 - mean[k + 1, 0], y1 - mean[k + 1, 1], z1 - mean[k + 1, 2]
                     v0, v1, v2 = x1 - x0, y1 - y0, z1 - z0
                 # The rate has the coefficients k (x_k - x_k-1) + (4 - k) (x_k+1 - x_k).
@@ -425,7 +429,11 @@ def watch_distances(row, p, state, monitor):
         for i in range(monitor.left.shape[0]):
             if not monitor.left[i]:
                 continue
-            if p.body_formulation and heights and unremarkable(points, i, angle / parts, p, monitor):
+            if (
+                p.body_formulation
+                and heights
+                and unremarkable(points, i, angle / parts, p, monitor)
+            ):
                 continue
             curve = monitor.curve
             in_world(points, i, 1, p, monitor, curve)
@@ -573,7 +581,13 @@ def look_between(before, middle, after, step, ta, tb, tc, p, w, state, monitor):
         at[k], rank[k] = ta if k == 0 else tb if k == 1 else tc, k
     for count in range(3, at.shape[0]):
         evaluate(
-            top, step if top <= end_of(step, state) else step + 1, p, w, state, monitor, values[count]
+            top,
+            step if top <= end_of(step, state) else step + 1,
+            p,
+            w,
+            state,
+            monitor,
+            values[count],
         )
         k = count
         while at[rank[k - 1]] > top:

@@ -104,8 +104,10 @@ class ActivePhase:
 
     def _start(self, y: Floats, t: float) -> None:
         """Start to integrate the plan at a state (n,) and time [s]."""
-        self.workspace, self.solver = equip(self.plan)
-        trail = self.extremes.begin(len(y), len(self.plan.edges))
+        plan = self.plan
+        aside = plan.large and self.external is None
+        trail = self.extremes.begin(len(y), len(plan.edges), aside=aside)
+        self.workspace, self.solver = equip(plan)
         self.state = integrator(self.plan, y, t, trail)
 
     @property
@@ -227,11 +229,17 @@ class ActivePhase:
 
     def end(self) -> PhaseState:
         """End the phase at its current state; return the state that the next phase starts from."""
-        self._check()
+        self.check()
         if not (self.state.count[0] or self.t > self.plan.start):
             return self.plan.before
         self.evaluate()
         return self.plan.reached(self.t, self.state.y, self.workspace)
+
+    def check(self) -> None:
+        """Raise errors of the multipliers' solver, or of the monitor's solver."""
+        if self.solver is not None:
+            self.solver.check()
+            self.solver.aside.check()
 
     def release(self) -> None:
         """Give the workspace back, after the end: nothing more is asked of this phase."""
@@ -240,12 +248,6 @@ class ActivePhase:
             packing.forget()
 
     # -- inside -----------------------------------------------------------------------------------
-
-    def _check(self) -> None:
-        """Raise errors of the multipliers' solver, or of the monitor's solver."""
-        if self.solver is not None:
-            self.solver.check()
-            self.solver.aside.check()
 
     def _integrate(self, problem: Problem, t_end: float) -> None:
         """Integrate to ``t_end`` [s], and remove vehicles and links at the times at which they are lost.
@@ -264,7 +266,7 @@ class ActivePhase:
         Returns the remaining problem.
         """
         self.watch(last=True)
-        self._check()
+        self.check()
         plan, y, own = self.plan, self.state.y, problem is self.plan.problem
         self.parted = plan.links_lost[1] <= self.t
         if now.any():
@@ -327,7 +329,7 @@ class ActivePhase:
                 fresh = False
                 if self.external is not None:
                     self.external.check()
-                self._check()
+                self.check()
                 if status == records.PAUSED or state.count[4] == len(state.trail.clock):
                     self.watch(last=False)
                 self.pause(self.t)

@@ -110,6 +110,7 @@ class Extremes:
         self.trail = records.NO_TRAIL
         self._thread: ThreadPoolExecutor | None = None  # of large formations
         self._taking: Future[None] | None = None
+        self._touching: Future[None] | None = None
         self.of_vehicles: dict[str, Extremum] = {}
         self.avoidance: avoidance.Avoidance | None = None  # that of the phase under way
         self.led: dict[str, Extremum] = {}  # what its clock and its body layer did
@@ -152,8 +153,11 @@ class Extremes:
         if len(self.trail.points):
             self.monitor.monitor.flags.fill(0)
 
-    def begin(self, states: int, edges: int) -> records.Trail:
-        """Begin to monitor an integrator with this many states; it must record its steps in the returned trail."""
+    def begin(self, states: int, edges: int, *, aside: bool = False) -> records.Trail:
+        """Begin to monitor an integrator with this many states; it must record its steps in the returned trail.
+
+        ``aside``: they will be handed over to another thread.
+        """
         if self.trail.points.shape[2] == states and len(self.trail.start) == 3 * self.n + 2 * edges:
             return self.trail
         self.trail = trail = records.trail(states, self.n, edges)
@@ -164,7 +168,19 @@ class Extremes:
             struck=self.struck,
         )  # fmt: skip
         self.monitor = native.Watch(found)
+        if aside:
+            # Memory costs far more time when it is first touched than ever after. The rows that the integrator reaches
+            # after it has handed over steps are touched while it flies these.
+            self._touching = self._beside().submit(trail.points[self.room :].fill, 0.0)
         return trail
+
+    def _beside(self) -> ThreadPoolExecutor:
+        """The other thread."""
+        if self._thread is None:
+            from concurrent.futures import ThreadPoolExecutor
+
+            self._thread = ThreadPoolExecutor(1)
+        return self._thread
 
     def lose(self, lost: Bools) -> None:
         """Continue without the vehicles ``lost`` (N,), which must not hit the others."""
@@ -202,21 +218,18 @@ class Extremes:
         """Number of steps for which the trail has room while another thread evaluates as many, and the one before."""
         return (len(self.trail.clock) - 1) // 2
 
-    def hand_over(
-        self, problem: Problem, work: Workspace, state: records.IntegratorState
-    ) -> None:
+    def hand_over(self, problem: Problem, work: Workspace, state: records.IntegratorState) -> None:
         """Let another thread evaluate the steps in the trail, `take`; no more than `room` may follow.
 
         Until `wait`, only that thread may use this monitor, ``work``, and what the problem's law changes.
         """
-        if self._thread is None:
-            from concurrent.futures import ThreadPoolExecutor
-
-            self._thread = ThreadPoolExecutor(1)
+        if self._touching is not None:
+            self._touching.result()
+            self._touching = None
         taken, count = state._replace(count=state.count.copy()), state.count
         # The last step stays, until its neighbour is known.
         count[4:] = 1, (count[5] + count[4] - 1) % len(state.trail.clock)
-        self._taking = self._thread.submit(self._take_aside, problem, work, taken)
+        self._taking = self._beside().submit(self._take_aside, problem, work, taken)
 
     def _take_aside(self, *given: Any) -> None:
         self.take(*given, last=False)
@@ -241,9 +254,7 @@ class Extremes:
         flags[:3] = 0, steps, 0
         self.monitor(problem, work, state)
 
-    def _take_solids(
-        self, problem: Problem, state: records.IntegratorState, steps: range
-    ) -> None:
+    def _take_solids(self, problem: Problem, state: records.IntegratorState, steps: range) -> None:
         """Take the clearances of some steps in the trail to obstacles that the monitor itself does not take."""
         if self.solids is None:
             return

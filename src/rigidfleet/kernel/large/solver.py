@@ -59,6 +59,7 @@ class Setup(NamedTuple):
     order: Callable[[], Ints]
     tolerance: float  # relative residual of conjugate gradients
     floor: float = 0.0  # error of an acceleration that the damped law may always have [m/s^2]
+    axes: bool = False  # whether the kernel has computed the mean axes when it asks for a solution
 
 
 @dataclass
@@ -134,10 +135,8 @@ class LargeSolver:
         """Solve for the forces or multipliers of ``workspace.b``; NaN if there is no solution."""
         w, vehicles, order = self.workspace, self.vehicles, self.setup.elimination
         if order is not None:
-            # With deformation damping, the kernel has computed the mean axes already.
-            known = self.law.k_def > 0.0
             pivot = elimination.solve(
-                w.u, w.b, w.r, vehicles.m, vehicles.M, order, known, w.cm[0], w.I, w.I_inv, self.a, w.f_C,
+                w.u, w.b, w.r, vehicles.m, vehicles.M, order, self.setup.axes, w.cm[0], w.I, w.I_inv, self.a, w.f_C,
             )  # fmt: skip
             self.pulled = not pivot > elimination.LOST
             if not self.pulled:
@@ -289,8 +288,14 @@ class LargeSolver:
 
 def _callable(method: Callable[[], None]) -> Any:
     """A C function that calls a method. It does not keep the object alive, so that nothing but its users does."""
-    call = weakref.WeakMethod(method)
-    return ctypes.CFUNCTYPE(None)(lambda: call()())  # ty: ignore
+    found = weakref.WeakMethod(method)
+
+    def call() -> None:
+        bound = found()
+        if bound is not None:
+            bound()
+
+    return ctypes.CFUNCTYPE(None)(call)
 
 
 def _far_apart(r: Floats) -> Ints:
