@@ -673,7 +673,11 @@ def watch(p, w, state, monitor):
         bound_moves(trail.points[row_of(flags[0], state)], p, monitor)
         return 0
     for step in range(flags[0], flags[1]):
-        watch_distances(row_of(step, state), p, state, monitor)
+        row = row_of(step, state)
+        if row < monitor.quiet.shape[0] and monitor.quiet[row]:
+            monitor.quiet[row] = False
+        else:
+            watch_distances(row, p, state, monitor)
     if flags[2] == 0:
         return 0
     steps, last = state.count[4], flags[2] == 2

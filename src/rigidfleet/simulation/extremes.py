@@ -165,7 +165,7 @@ class Extremes:
             self.radius, self.boxes, self.fence, states, len(trail.start),
             worst=self.worst, when=self.when, who=self.who, sign=self.sign, left=self.left,
             standing=self.standing, low=self.low, pad=PAD, pairs=self.pairs, columns=self.columns,
-            struck=self.struck,
+            struck=self.struck, quiet=np.zeros(len(trail.clock), dtype=np.bool_),
         )  # fmt: skip
         self.monitor = native.Watch(found)
         if aside:

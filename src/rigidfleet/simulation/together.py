@@ -105,6 +105,7 @@ def _fly(active: Sequence[ActivePhase], given: Tables) -> bool:
         vector = batch.Vector(
             _filled([stretch.problem for stretch in stretches]),
             _filled([phase.state for phase in active]),
+            _filled([phase.extremes.monitor.monitor for phase in active]),
             given,
             times,
             _filled([stretch.samples for stretch in stretches]),

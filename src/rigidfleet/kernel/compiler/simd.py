@@ -260,6 +260,7 @@ _register((operator.mul, operator.imul), 2, BUILD["mul"])
 _register((operator.truediv, operator.itruediv), 2, _quotient)
 _register((abs,), 1, BUILD["abs"])
 _register((max,), 2, BUILD["max"])
+_register((min,), 2, BUILD["min"])
 
 
 @intrinsic
@@ -270,6 +271,12 @@ def filled(_context, x):
         return in_all(builder, context.cast(builder, args[0], sig.args[0], types.float64))
 
     return lanes(x), generate
+
+
+@intrinsic
+def inverse_root_of(_context, x):
+    """Lanes of 1/sqrt(x), exact to the last bit but one."""
+    return lanes(x), lambda _context, builder, _sig, args: inverse_root(builder, args[0])
 
 
 @intrinsic

@@ -11,8 +11,8 @@ import numpy as np
 
 from rigidfleet.kernel.compiler.jit import compiled
 from rigidfleet.kernel.compiler.pointers import by_address
-from rigidfleet.kernel.compiler.simd import WIDTH, LaneArray, pack, unpack
-from rigidfleet.kernel.engine import lane_steps, native
+from rigidfleet.kernel.compiler.simd import WIDTH, LaneArray, empty, pack, unpack
+from rigidfleet.kernel.engine import lane_bounds, lane_steps, native
 from rigidfleet.kernel.engine.codegen import (
     Tables,
     integrate,
@@ -38,6 +38,7 @@ from rigidfleet.kernel.records import (
     LEAST_ERROR,
     NO_TRAIL,
     IntegratorState,
+    Monitor,
     integrator,
 )
 from rigidfleet.typing import Bools, Floats, Ints
@@ -164,6 +165,7 @@ class Vector:
     ----------
     problems : of eight flights, which `fit_together`
     states : (8,) of their integrators, at one time; their trails have the same number of rows
+    monitors : of their extremes, for the same pairs; steps that need not be searched are marked
     given : tables of their disturbances
     times, samples : times (K,) [s] to record, and an array (K, n) for each flight
 
@@ -177,19 +179,24 @@ class Vector:
         self,
         problems: Sequence[Problem],
         states: Sequence[IntegratorState],
+        monitors: Sequence[Monitor],
         given: Tables,
         times: Floats,
         samples: Sequence[Floats],
     ) -> None:
         self._states, self._samples, self._times = states, samples, times
-        self._problem = unrolled_together(_alike(problems), given)
-        trails = [state.trail for state in states]
+        self._monitors = monitors
+        trails, n = [state.trail for state in states], len(states[0].y)
+        self._problem = unrolled_together(_alike(problems), given)._replace(
+            points=empty((5, n)), bounds=empty((len(trails[0].clock), lane_bounds.COLUMNS)),
+            radius=interleaved([x.radius for x in monitors]), pairs=monitors[0].pairs,
+            boxes=interleaved([x.boxes for x in monitors]).reshape(-1, 6),
+        )  # fmt: skip
         kept = [
             [t.points for t in trails], [t.gauge for t in trails], [t.start for t in trails], samples,
             [t.clock for t in trails],
         ]  # fmt: skip
         self._problem.kept[:] = [[x.ctypes.data for x in row] for row in kept]
-        n = len(states[0].y)
         K = pack(np.zeros((lane_steps.ROWS, n, WIDTH)))
         K[lane_steps.ATOL] = interleaved([state.K[ATOL, :n] for state in states])
         clock = np.array([states[0].clock[0], _FIRST_STEP_IN_VECTORS, LEAST_ERROR])
@@ -202,6 +209,7 @@ class Vector:
         """Go on to ``t_end`` [s]; return what `dopri5.integrate` returns. States, trails and samples are then known."""
         state = self._state
         state.count[4:] = self._states[0].count[4:]
+        before = int(state.count[4])
         status = fly_on(
             self._problem, state, t_end, self._fresh, self._times, _UNSAMPLED, max_steps
         )
@@ -210,6 +218,11 @@ class Vector:
         for lane, own in enumerate(self._states):
             own.y[:] = y[:, lane]
             own.clock[:], own.count[:] = state.clock, state.count
+        rows = np.arange(before, state.count[4]) + state.count[5]
+        if len(rows):
+            lane_bounds.mark_quiet(
+                self._problem.bounds, rows % len(state.trail.clock), self._monitors
+            )
         return status
 
 

@@ -62,6 +62,11 @@ class UnrolledProblem(NamedTuple):
     noise_v: LaneArray  # (K, 3N)
     # (5, 8) addresses of each flight's steps, forces, forces at the start, samples, and times; see `lane_steps`
     kept: Ints
+    points: LaneArray  # (5, n) control points of a step
+    bounds: LaneArray  # (rows of the trail, columns), see `lane_bounds`
+    radius: LaneArray  # (N,) [m]
+    pairs: Ints  # (P, 2) of agents
+    boxes: LaneArray  # (B, 6) obstacles [m]
 
 
 def unrolled(problem: Problem) -> UnrolledProblem:
@@ -146,6 +151,7 @@ def _prepared(
         address, uniform, simd.pack(np.zeros((edges, WIDTH))), np.zeros(MOMENT),
         simd.pack(np.zeros((len(code.gauge), WIDTH))), reference.t0, reference.T_b,
         np.zeros(0), none, 1.0, none, 1.0, none, none, np.zeros((5, WIDTH), dtype=np.int64),
+        none, none, none[:, 0], np.zeros((0, 2), dtype=np.int64), none,
     )  # fmt: skip
 
 

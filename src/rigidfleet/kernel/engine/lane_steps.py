@@ -20,6 +20,7 @@ import numpy as np
 from rigidfleet.kernel.compiler.jit import compiled, inlined
 from rigidfleet.kernel.compiler.simd import spread
 from rigidfleet.kernel.dopri5 import until_knot
+from rigidfleet.kernel.engine.lane_bounds import bound_step
 from rigidfleet.kernel.vectors import filled, rough_inverse
 
 #: Number of stages; rows of `IntegratorState.K` after them.
@@ -202,8 +203,10 @@ def keep_step(t, h, p, w, state):
     n, forces = k.shape[1], p.gauge.shape[0]
     spread(filled(t), p.kept[4], 2 * row)
     spread(filled(h), p.kept[4], 2 * row + 1)
+    points = p.points
     for q in range(n):
         a, b, c, d, e = _points(k, q, _coordinates(k, p), h)
+        points[0, q], points[1, q], points[2, q], points[3, q], points[4, q] = a, b, c, d, e
         place = 5 * n * row + q
         spread(a, p.kept[0], place)
         spread(b, p.kept[0], place + n)
@@ -212,6 +215,7 @@ def keep_step(t, h, p, w, state):
         spread(e, p.kept[0], place + 4 * n)
     for g in range(forces):
         spread(p.gauge[g], p.kept[1], forces * row + g)
+    bound_step(points, p, row)
     state.count[4] += 1
 
 

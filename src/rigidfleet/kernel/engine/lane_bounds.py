@@ -1,0 +1,121 @@
+"""Bounds of what a step can reach, for eight flights in the lanes of vectors, so that few steps need the monitor.
+
+In most steps nothing comes nearer, faster, lower or higher than in others of the same flight. Bounds from control
+points say so for eight flights at once; `kernel.monitor` then searches the other steps alone, and finds what it would
+have found in all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from rigidfleet.kernel.bernstein import CLOSE
+from rigidfleet.kernel.compiler.jit import compiled, inlined
+from rigidfleet.kernel.compiler.simd import LaneArray, filled, inverse_root_of, unpack
+from rigidfleet.kernel.records import CLEARANCE, HIGHEST, LOWEST, SEPARATION, SPEED, Monitor
+from rigidfleet.typing import Ints
+
+#: Columns of bounds over a step, and after `ENDS` more of the values at its end: separation, height, height downwards
+#: and clearance [m], square of the speed [m^2/s^2]. The least counts; heights downwards and speeds have the opposite
+#: sign. The last column is the distance of two agents seen from above [m].
+SEPARATIONS, LOWS, HIGHS, CLEARANCES, SPEEDS, ENDS = range(6)
+STACKS, COLUMNS = 2 * ENDS, 2 * ENDS + 1
+_QUANTITIES = np.array([SEPARATION, LOWEST, HIGHEST, CLEARANCE, SPEED])
+_FAR = 1e100
+#: Distance and share by which bounds must miss the worst value: the monitor's own accuracy, and rounding.
+_MARGIN, _SHARE = 4.0 * CLOSE, 1e-9
+
+
+@inlined
+def _square(x, y, z):
+    return x * x + y * y + z * z
+
+
+@compiled
+def bound_step(points, p, row):
+    """Write the bounds of a step with control points (5, n), in lanes, into row ``row`` of ``p.bounds``."""
+    out, n = p.bounds[row], p.radius.shape[0]
+    near, at_end, beside = filled(_FAR), filled(_FAR), filled(_FAR)
+    for k in range(p.pairs.shape[0]):
+        i, j = p.pairs[k, 0], p.pairs[k, 1]
+        radii = p.radius[i] + p.radius[j]
+        X = points[2, 3 * i] - points[2, 3 * j]
+        Y = points[2, 3 * i + 1] - points[2, 3 * j + 1]
+        Z = points[2, 3 * i + 2] - points[2, 3 * j + 2]
+        along, level = filled(_FAR), filled(_FAR)
+        x = y = z = X
+        for s in range(5):
+            x = points[s, 3 * i] - points[s, 3 * j]
+            y = points[s, 3 * i + 1] - points[s, 3 * j + 1]
+            z = points[s, 3 * i + 2] - points[s, 3 * j + 2]
+            flat = X * x + Y * y
+            level, along = min(level, flat), min(along, flat + Z * z)
+        # The component along a fixed direction is no longer than the vector.
+        near = min(near, along * inverse_root_of(_square(X, Y, Z)) - radii)
+        beside = min(beside, level * inverse_root_of(X * X + Y * Y + 1e-30) - radii)
+        end = _square(x, y, z)
+        at_end = min(at_end, end * inverse_root_of(end) - radii)
+    out[SEPARATIONS], out[ENDS + SEPARATIONS], out[STACKS] = near, at_end, beside
+    low, low_end, clear, clear_end = filled(_FAR), filled(_FAR), filled(_FAR), filled(_FAR)
+    high, high_end, fast, fast_end = filled(-_FAR), filled(-_FAR), filled(0.0), filled(0.0)
+    for i in range(n):
+        q = 3 * i
+        v = 3 * n + q
+        x = x0 = x1 = points[4, q]
+        y = y0 = y1 = points[4, q + 1]
+        z = z0 = z1 = points[4, q + 2]
+        end = _square(points[4, v], points[4, v + 1], points[4, v + 2])
+        fast, fast_end = max(fast, end), max(fast_end, end)
+        for s in range(4):
+            fast = max(fast, _square(points[s, v], points[s, v + 1], points[s, v + 2]))
+            x0, x1 = min(x0, points[s, q]), max(x1, points[s, q])
+            y0, y1 = min(y0, points[s, q + 1]), max(y1, points[s, q + 1])
+            z0, z1 = min(z0, points[s, q + 2]), max(z1, points[s, q + 2])
+        low, high = min(low, z0), max(high, z1)
+        low_end, high_end = min(low_end, z), max(high_end, z)
+        far, far_end = filled(_FAR), filled(_FAR)  # squares
+        for b in range(p.boxes.shape[0]):
+            x_low, y_low, z_low = p.boxes[b, 0], p.boxes[b, 1], p.boxes[b, 2]
+            x_high, y_high, z_high = p.boxes[b, 3], p.boxes[b, 4], p.boxes[b, 5]
+            # The distance of the box about the control points, and that of the end.
+            a = max(max(x_low - x1, x0 - x_high), 0.0)
+            c = max(max(y_low - y1, y0 - y_high), 0.0)
+            d = max(max(z_low - z1, z0 - z_high), 0.0)
+            far = min(far, _square(a, c, d))
+            a = max(max(x_low - x, x - x_high), 0.0)
+            c = max(max(y_low - y, y - y_high), 0.0)
+            d = max(max(z_low - z, z - z_high), 0.0)
+            far_end = min(far_end, _square(a, c, d))
+        clear = min(clear, far * inverse_root_of(far + 1e-30) - p.radius[i])
+        clear_end = min(clear_end, far_end * inverse_root_of(far_end + 1e-30) - p.radius[i])
+    out[LOWS], out[ENDS + LOWS] = low, low_end
+    out[HIGHS], out[ENDS + HIGHS] = 0.0 - high, 0.0 - high_end
+    out[CLEARANCES], out[ENDS + CLEARANCES] = clear, clear_end
+    out[SPEEDS], out[ENDS + SPEEDS] = 0.0 - fast, 0.0 - fast_end
+
+
+def mark_quiet(bounds: LaneArray, rows: Ints, monitors: Sequence[Monitor]) -> None:
+    """Mark the steps in some rows of eight flights' trails in which none of their monitors can find anything worse.
+
+    A step cannot hold a least value if its bound is above the least of those known and of those at the ends of steps;
+    or if it is no lower than the least of those before: then an earlier step has it, up to a tenth of `CLOSE`, which
+    the monitor does not tell apart.
+    """
+    found = unpack(bounds)[rows]  # (S, columns, 8)
+    bound, end = found[:, :ENDS], found[:, ENDS:STACKS]
+    known = np.empty((len(rows) + 1, ENDS, len(monitors)))
+    known[0] = np.stack([monitor.worst for monitor in monitors], axis=-1)[_QUANTITIES]
+    known[0, SPEEDS] *= np.abs(known[0, SPEEDS])
+    known[1:] = end
+    np.minimum.accumulate(known, axis=0, out=known)
+    above = bound > known[-1] + (_MARGIN + _SHARE * np.abs(known[-1]))
+    above |= bound >= known[:-1] - 0.1 * CLOSE
+    quiet = above.all(axis=1) & (found[:, STACKS] > _MARGIN)
+    nearest = bound[:, CLEARANCES].min(axis=0).tolist()
+    for lane, monitor in enumerate(monitors):
+        # Where an agent stands, lands or takes off, what is stored depends on every step.
+        landed = nearest[lane] <= monitor.pad + _MARGIN or monitor.standing.any()
+        landed = landed or len(monitor.fence) > 0 or monitor.low[:, 0].min() < np.inf
+        monitor.quiet[rows] = False if landed else quiet[:, lane]
