@@ -162,7 +162,8 @@ def attach(
         else:
             T = near if mission.body_frame is not None else mission.drawn_attitude
         pose = Pose(masses @ now.r / masses.sum(), masses @ now.v / masses.sum(), T, np.zeros(3))
-        pose.omega = T @ mean_axis_rates(x[None], about_cm(now.v, masses)[None], masses)[0]
+        if now.v.any():
+            pose.omega = T @ mean_axis_rates(x[None], about_cm(now.v, masses)[None], masses)[0]
         if now.lost is not None and fit is not None:
             centre = masses @ fit / masses.sum()  # of the remaining agents, from the body's origin
             pose.r = pose.r - T.T @ centre
