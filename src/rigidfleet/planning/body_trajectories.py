@@ -102,9 +102,8 @@ def _responses(
             x = lqr.led(response, after, (x[0][-1], x[1][-1]), zero, rest)
             pieces.append(lqr.quintic_pieces(after, *x))
         found.append(np.concatenate(pieces))
-    return np.concatenate([times, length + after[1:]]), np.stack(found).swapaxes(1, 2).reshape(
-        2, 2, -1
-    )
+    quintics = np.stack(found).swapaxes(1, 2).reshape(2, 2, -1)
+    return np.concatenate([times, length + after[1:]]), quintics
 
 
 def regulated(
