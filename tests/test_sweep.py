@@ -278,12 +278,12 @@ def test_metrics_of_vehicles_with_rotors():
 
 
 def test_metrics_are_those_of_the_verdict(tmp_path):
-    """A row has what simulate and assess say of the varied mission."""
-    from rigidfleet.simulation.flight import simulate
+    """A row has what assess says of the varied mission, flown beside the others of its group."""
+    from rigidfleet.simulation.together import simulate_together
 
     found = sweep(runs=3)
-    (row,) = fly_runs(found, [2])
-    result = simulate(Mission.from_dict(found.varied(2)))
+    row = fly_runs(found, range(3))[2]
+    result = simulate_together([Mission.from_dict(found.varied(run)) for run in range(3)])[2]
     verdict = assess(result)
     assert list(row.metrics) == list(METRICS)
     assert row.passed == verdict.passed

@@ -170,4 +170,6 @@ def test_the_pair_for_lanes_has_its_orders():
             assert A[-1] @ weight == pytest.approx(1.0 / density, abs=1e-14)
             if order <= 4:
                 assert lane_steps.E @ weight == pytest.approx(0.0, abs=1e-15)
+            # Halfway through the step, the continuous extension has the fifth order, too.
+            assert lane_steps.HALF @ weight == pytest.approx(0.5**order / density, abs=1e-15)
     assert max(abs(lane_steps.E @ weight) for weight, _ in trees[5]) > 1e-5

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
-from functools import lru_cache
-from typing import NamedTuple
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -36,57 +35,92 @@ _ROUNDING = 1e-12
 _JUDGED = 200
 
 
-class Laid(NamedTuple):
-    """Slots fitted to the agents of one formation, or of many (...)."""
+class Laid:
+    """Slots fitted to the agents of G formations of equally many agents; what is asked for is found for all at once."""
 
-    p: Floats  # (..., N, 3) agents, about their centre
-    slots: Floats  # (..., N, 3) slots, about their centre
-    off: Floats  # (..., N) distance of each agent from its slot, mirrored if that fits better
-    mirrored: Bools  # (...) whether mirrored slots fit better
-    turn: Floats  # (..., 3, 3) the best-fitting rotation, without a reflection
-    along: Floats  # (..., 3) the direction in which the agents extend most
-    size: Floats  # (...) the greatest coordinate of the slots, about their centre
-    #: The pair with the worst distance (..., 5): error [m], both, flown, of slots [m]; of many agents (..., 0)
-    worst: Floats
+    def __init__(self, p: Floats, slots: Floats) -> None:
+        """Take agents and slots (G, N, 3)."""
+        self.p, self.slots = (
+            p - p.mean(axis=1, keepdims=True),
+            slots - slots.mean(axis=1, keepdims=True),
+        )
+        few = 1 < p.shape[1] <= _FEW
+        #: The pair with the worst distance (G, 5): error [m], both, flown, of slots [m]; None of many agents.
+        self.worst = _worst_of_few(p, slots).tolist() if few else None
 
-    @classmethod
-    def of(cls, p: Floats, slots: Floats) -> Laid:
-        """Fit slots (..., N, 3) to agents p (..., N, 3)."""
-        few = 1 < p.shape[-2] <= _FEW
-        worst = _worst_of_few(p, slots) if few else np.empty((*p.shape[:-2], 0))
-        p, slots = p - p.mean(axis=-2, keepdims=True), slots - slots.mean(axis=-2, keepdims=True)
-        across, of_agents = p.swapaxes(-1, -2) @ np.stack([slots, p])
-        U, s, Vt = np.linalg.svd(across)
-        off = length(p - slots @ (U @ Vt).swapaxes(-1, -2))
-        size = np.abs(slots).max(axis=(-2, -1))
-        turn, proper = rigid_body.best_rotation(U, s, Vt)
-        along = np.linalg.eigh(of_agents)[1][..., -1]
-        return cls(p, slots, off, ~proper, turn, along, size, worst)
+    @cached_property
+    def _parts(self) -> tuple[Floats, Floats, Floats]:
+        """The decomposition of sum p slot^T (G, 3, 3)."""
+        return np.linalg.svd(self.p.swapaxes(1, 2) @ self.slots)
+
+    @cached_property
+    def off(self) -> Floats:
+        """Distance (G, N) of each agent from its slot, mirrored if that fits better."""
+        U, _, Vt = self._parts
+        return length(self.p - self.slots @ (U @ Vt).swapaxes(1, 2))
+
+    @cached_property
+    def size(self) -> Floats:
+        """Greatest coordinate (G,) of the slots, about their centre."""
+        return np.abs(self.slots).max(axis=(1, 2))
+
+    @cached_property
+    def turn(self) -> tuple[Floats, Bools]:
+        """The best-fitting rotation (G, 3, 3), without a reflection, and whether it needs none (G,)."""
+        return rigid_body.best_rotation(*self._parts)
+
+    @cached_property
+    def along(self) -> Floats:
+        """The direction (G, 3) in which the agents extend most."""
+        return np.linalg.eigh(self.p.swapaxes(1, 2) @ self.p)[1][..., -1]
 
 
 class Fit:
-    """A formation as flown at one sample, p (N, 3), compared with its slots (N, 3)."""
+    """A formation as flown at one sample, compared with its slots.
+
+    Attributes
+    ----------
+    dimension, axis, shortest : of the slots: dimension; direction of a line or normal of a plane, in their axes;
+        shortest distance [m]
+    error, pair, flown, intended : the greatest error of a distance [m], of which agents, and the two distances [m]
+    """
 
     def __init__(
-        self, p: Floats, slots: Floats, who: Ints | None = None, laid: Laid | None = None
+        self,
+        p: Floats,
+        slots: Floats,
+        who: Ints | None = None,
+        laid: Laid | None = None,
+        k: int = 0,
     ) -> None:
-        laid = Laid.of(p, slots) if laid is None else laid
+        """Compare agents p (N, 3) with slots (N, 3), which are the k-th of ``laid``; ``who`` (N,) are their numbers."""
+        self._laid, self._k = Laid(p[None], slots[None]) if laid is None else laid, k
         known = (
             _shape(slots.tobytes()) if slots.nbytes < _KEPT else _shape.__wrapped__(slots.tobytes())
         )
-        #: Dimension of the slots; direction of a line or normal of a plane, in their axes; shortest distance [m].
         self.dimension, self.axis, self.shortest = known
-        self.error, pair, self.flown, self.intended = _all_pairs(p, slots, laid)
-        #: The pair with the greatest error, as agent numbers from ``who`` (N,).
+        self.error, pair, self.flown, self.intended = _all_pairs(p, slots, self._laid, k)
         self.pair = pair if who is None else (int(who[pair[0]]), int(who[pair[1]]))
-        self.mirrored = self.dimension == 3 and bool(laid.mirrored)
-        #: Where the axis points in the world.
-        self.points: Floats = laid.turn @ self.axis
-        self.in_order: bool | None = None
-        if self.dimension == 1 and len(p) > 2:
-            asked = np.argsort(laid.slots @ self.axis).tolist()
-            flown = np.argsort(laid.p @ laid.along).tolist()
-            self.in_order = flown in (asked, asked[::-1])
+
+    @property
+    def mirrored(self) -> bool:
+        """Whether a spatial shape is the mirror image of its slots."""
+        return self.dimension == 3 and not self._laid.turn[1][self._k]
+
+    @cached_property
+    def points(self) -> Floats:
+        """Where the axis (3,) points in the world."""
+        return self._laid.turn[0][self._k] @ self.axis
+
+    @cached_property
+    def in_order(self) -> bool | None:
+        """Whether the agents of a line are in order; None for other shapes, and for two agents."""
+        laid, k = self._laid, self._k
+        if self.dimension != 1 or laid.p.shape[1] < 3:
+            return None
+        asked = np.argsort(laid.slots[k] @ self.axis).tolist()
+        flown = np.argsort(laid.p[k] @ laid.along[k]).tolist()
+        return flown in (asked, asked[::-1])
 
     @property
     def limit(self) -> float:
@@ -115,40 +149,36 @@ def _shape(slots: bytes) -> tuple[int, Floats, float]:
 
 
 def _worst_of_few(p: Floats, slots: Floats) -> Floats:
-    """Worst error of a distance of few agents (..., N, 3), see `Laid.worst`; of equal errors the first pair's."""
-    both = np.stack([p, slots])
-    flown, intended = length(both[..., :, None, :] - both[..., None, :, :]).reshape(
-        2, *p.shape[:-2], -1
-    )
-    n, error = p.shape[-2], np.abs(flown - intended)
-    error[..., :: n + 1] = -1.0  # an agent and itself
-    most = error.max(axis=-1, keepdims=True)
-    at = (error >= most - _ROUNDING * intended.max(axis=-1, keepdims=True)).argmax(axis=-1)
-    there = at[..., None]
-    off, flown, intended = (
-        np.take_along_axis(x, there, axis=-1)[..., 0] for x in (error, flown, intended)
-    )
-    return np.stack([off, *np.divmod(at, n), flown, intended], axis=-1)
+    """Worst error of a distance of few agents (G, N, 3), see `Laid.worst`; of equal errors the first pair's."""
+    i, j = proximity.all_pairs(p.shape[1])
+    flown, intended = (length(x.take(i, axis=1) - x.take(j, axis=1)) for x in (p, slots))
+    error = np.abs(flown - intended)
+    least = error.max(axis=1) - _ROUNDING * intended.max(axis=1)
+    at = (error >= least[:, None]).argmax(axis=1)
+    k = np.arange(len(p))
+    return np.stack([error[k, at], i[at], j[at], flown[k, at], intended[k, at]], axis=1)
 
 
-def _all_pairs(p: Floats, slots: Floats, laid: Laid) -> tuple[float, tuple[int, int], float, float]:
+def _all_pairs(
+    p: Floats, slots: Floats, laid: Laid, k: int
+) -> tuple[float, tuple[int, int], float, float]:
     """Worst error of a distance among all pairs: error, pair, flown, intended [m].
 
     Of many agents, few pairs have to be computed: the error of a pair is at most the sum of both agents' distances from
     their slots, for any fit of the slots, mirrored or not. Improvements below rounding are ignored.
     """
-    if len(laid.worst):
-        error, i, j, flown, intended = laid.worst.tolist()
+    if laid.worst is not None:
+        error, i, j, flown, intended = laid.worst[k]
         return error, (int(i), int(j)), flown, intended
-    off, both = laid.off.tolist(), np.array([p, slots])
+    off, both = laid.off[k].tolist(), np.array([p, slots])
     order = sorted(range(len(off)), key=lambda i: -off[i])
-    ranked, rounding = [-off[i] for i in order], _ROUNDING * float(laid.size)
+    ranked, rounding = [-off[i] for i in order], _ROUNDING * float(laid.size[k])
     worst = (-1.0, (0, 0), 0.0, 0.0)
-    for k, i in enumerate(order[:-1]):
+    for first, i in enumerate(order[:-1], start=1):
         last = bisect_left(ranked, off[i] - worst[0] - rounding)
-        if last <= k + 1:
+        if last <= first:
             break
-        others = sorted(order[k + 1 : last])
+        others = sorted(order[first:last])
         flown, intended = length(both[:, others] - both[:, i, None]).tolist()
         error = [abs(a - b) for a, b in zip(flown, intended, strict=True)]
         if (most := max(error)) > worst[0]:

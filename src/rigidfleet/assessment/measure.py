@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections.abc import Callable, Iterator
 from functools import cached_property
 from itertools import pairwise
@@ -13,7 +14,6 @@ import numpy as np
 from rigidfleet._common.text import agent_names
 from rigidfleet.assessment.fits import Fit, Laid, length
 from rigidfleet.assessment.outcome import SENSE, Extreme, PhaseVerdict, Waypoint, value
-from rigidfleet.formation import distance_geometry
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity, splines
 from rigidfleet.math.bernstein import bernstein
@@ -29,23 +29,32 @@ _SLACK = {"separation": 0.0, "clearance": 0.0, "speed": 1e-9}
 
 #: About so many curves are compared together.
 _TOGETHER = 100_000
+#: The first sample.
+_START = np.zeros(1, dtype=np.int64)
 #: Times between two samples that are very short [s]: of a flight, of curves that are given; and as a share of the
 #: longest.
 _SHORT, _INSTANT, _SHARE = 1e-3, 1e-6, 0.05
 
 
 class Quantity:
-    """Values (K, ...) at samples, with the name of their owner and the sense in which they get worse."""
+    """Values (K, ...) at samples, with the name of their owner.
 
-    def __init__(self, values: Floats, who: Callable[..., str], sense: Callable[..., Any]) -> None:
-        self.values, self.who, self.sense = values, who, sense
-        rank = np.ascontiguousarray(sense(values)).reshape(len(values), -1)
-        finite = np.isfinite(rank)
-        #: Rank of each value (K, places): greater is worse; -infinity if the value is not finite.
-        self.rank = rank if finite.all() else np.where(finite, rank, -np.inf)
+    Attributes
+    ----------
+    rank : of each value (K, places): greater is worse; -infinity if the value is not finite
+    most : greatest rank from the start of each phase to that of the next one
+    """
 
-    def worst(self, starts: Ints) -> list[float]:
-        """Greatest rank among the samples from each start to the next one, or to the end."""
+    def __init__(self, values: Floats, who: Callable[..., str], rank: Floats, starts: Ints) -> None:
+        """Take values with their ranks (K, ...), and the samples at which phases begin."""
+        self.values, self.who = values, who
+        self.rank = rank.reshape(len(rank), -1)
+        self.most = self._most(starts)
+        if not all(rank < math.inf for rank in self.most):  # NaN, too
+            self.rank = np.where(np.isfinite(self.rank), self.rank, -np.inf)
+            self.most = self._most(starts)
+
+    def _most(self, starts: Ints) -> list[float]:
         places = self.rank.shape[1]
         if not places:
             return [-math.inf] * len(starts)
@@ -79,26 +88,35 @@ class Measurements:
         if result.rotor_force is not None:  # what was given, not what was asked
             thrust = result.rotor_force.sum(axis=2)
         self.thrust = self.of_left(np.maximum(thrust, result.thrust))
+        starts = np.array([self.samples[k].start for k in self.flown])
+        constraint, tension = np.abs(result.constraint), -result.multiplier
+        speed, acceleration, force = (
+            self.of_left(length(x))
+            for x in (result.velocity, result.acceleration, result.constraint_force)
+        )
+        close, single = self.close, result.singular_value
         self.measured: dict[str, Quantity] = {
-            name: Quantity(values, who, SENSE[name])
-            for name, values, who in (
-                ("constraint", np.abs(result.constraint), self.edge),
-                ("separation", self.close.separation, self.pair),
-                ("clearance", self.close.clearance, self.obstacle),
-                ("thrust", self.thrust, self.agent),
-                ("speed", self.of_left(length(result.velocity)), self.agent),
-                ("acceleration", self.of_left(length(result.acceleration)), self.agent),
-                ("constraint_force", self.of_left(length(result.constraint_force)), self.agent),
-                ("tension", -result.multiplier, self.edge),
-                ("singular_value", result.singular_value, lambda k: ""),
+            name: Quantity(values, who, rank, starts)
+            for name, values, who, rank in (
+                ("constraint", constraint, self.edge, constraint),
+                ("separation", close.separation, self.pair, -close.separation),
+                ("clearance", close.clearance, self.obstacle, -close.clearance),
+                ("thrust", self.thrust, self.agent, self.thrust),
+                ("speed", speed, self.agent, speed),
+                ("acceleration", acceleration, self.agent, acceleration),
+                ("constraint_force", force, self.agent, force),
+                ("tension", tension, self.edge, np.abs(tension)),
+                ("singular_value", single, lambda k: "", -single),
             )
         }
-        starts = np.array([self.samples[k].start for k in self.flown])
-        #: Greatest rank of each quantity at the samples of each phase flown.
-        self.rank = {
-            name: dict(zip(self.flown, q.worst(starts), strict=True))
-            for name, q in self.measured.items()
-        }
+        #: Greatest rank of each quantity at the samples of each phase; -infinity of phases without samples.
+        self.rank = {name: [-math.inf] * len(result.phases) for name in self.measured}
+        for name, quantity in self.measured.items():
+            for k, rank in zip(self.flown, quantity.most, strict=True):
+                self.rank[name][k] = rank
+        #: The last sample of each phase flown, and positions (F, N, 3) there.
+        self.last = [self.samples[k].stop - 1 for k in self.flown]
+        self.ends = result.position[self.last]
 
     def of_left(self, values: Floats) -> Floats:
         """Values (K, N), NaN for lost agents."""
@@ -138,15 +156,17 @@ class Measurements:
         self, values: Floats, who: Callable[..., str], sense: Callable[..., Any] = lambda x: x
     ) -> Extreme | None:
         """The finite one of ``values`` (K, ...) whose ``sense`` is greatest."""
-        return self.worst_sample(Quantity(values, who, sense), slice(0, len(values)))
+        rank = np.ascontiguousarray(sense(values))
+        return self.worst_sample(Quantity(values, who, rank, _START), slice(0, len(values)))
 
     def worst_sample(self, quantity: Quantity, samples: slice) -> Extreme | None:
         """The worst value of a quantity among some samples; None if none is finite."""
-        places = quantity.rank.shape[1]
-        rank = quantity.rank.reshape(-1)[places * samples.start : places * samples.stop]
-        if not rank.size or rank[worst := int(rank.argmax())] == -np.inf:
+        rank = quantity.rank[samples]
+        if not rank.size:
             return None
-        k, place = divmod(worst, places)
+        k, place = divmod(int(rank.argmax()), rank.shape[1])
+        if rank.item(k, place) == -math.inf:
+            return None
         at = (samples.start + k, place)[: quantity.values.ndim]
         return Extreme(float(quantity.values.item(at)), who=quantity.who(*at), **self.at(at[0]))
 
@@ -186,9 +206,9 @@ class Measurements:
         """The worst values of a phase, at its samples or between them, by name."""
         extremes, samples, found = self.result.phases[index].extremes, self.samples[index], {}
         for name, quantity in self.measured.items():
-            x, rank = extremes.get(name), self.rank[name].get(index, -math.inf)
+            x, rank = extremes.get(name), self.rank[name][index]
             worst = None
-            if x is not None and rank < quantity.sense(x.value):
+            if x is not None and rank < SENSE[name](x.value):
                 worst = self.between(name, index)
             elif rank != -math.inf:
                 worst = self.worst_sample(quantity, samples)
@@ -292,7 +312,8 @@ class Measurements:
     def worst_clearance(self) -> Extreme | None:
         """Least clearance to an obstacle [m] of all vehicles, standing ones included."""
         q = self.measured["clearance"]
-        return self.worst("clearance", self.worst_sample(q, slice(0, len(q.values))), q.sense)
+        sampled = self.worst_sample(q, slice(0, len(q.values)))
+        return self.worst("clearance", sampled, SENSE["clearance"])
 
     def fallen_on(self) -> Extreme | None:
         """Least clearance [m] between a lost agent and one still flying; None if no agent is lost."""
@@ -313,13 +334,13 @@ class Measurements:
     def contradictions(self) -> Iterator[tuple[str, float]]:
         """Values of the record that disagree with its own positions and forces: in words, and when [s]."""
         result, time = self.result, self.result.time
-        length = proximity.lengths(result.position, result.edges).T
+        length = proximity.lengths(result.position, result.edges)
         rounding = 1e-9 * (1.0 + float(np.nanmax(np.abs(result.position), initial=0.0)))
         with np.errstate(invalid="ignore"):  # infinity where there is nothing to be near
             stored = {
                 "separation": (result.separation - self.close.separation, "m"),
                 "clearance": (result.clearance - self.close.clearance, "m"),
-                "distance": (np.abs(result.distance - length), "m"),
+                "distance": (np.abs(result.distance - length.T), "m"),
                 "thrust": (self.thrust - result.thrust, "N"),
             }
         for name, (off, unit) in stored.items():
@@ -331,21 +352,23 @@ class Measurements:
                     f"its {name} is up to {value(worst, unit)} off the value from its own samples"
                 )
                 yield words, float(time[k])
+        there = [thing.solid.there[0].tolist() for thing in self.mission.obstacles]
+        fenced = self.mission.limits.geofence is not None
         for index, phase in enumerate(result.phases):
-            samples = self.samples[index]
-            if samples.stop > samples.start and phase.extremes:
+            samples, extremes = self.samples[index], phase.extremes
+            if samples.stop > samples.start and extremes:
                 due = ["speed", "lowest", "highest"]
                 due += ["thrust"] if self.rank["thrust"][index] > -math.inf else []
-                due += ["separation"] if np.count_nonzero(self.left[samples.start]) > 1 else []
-                due += ["clearance"] if self._meets_obstacles(phase) else []
-                due += ["geofence"] if self.mission.limits.geofence is not None else []
-                if lacking := [name for name in due if name not in phase.extremes]:
+                due += ["separation"] if self._several(samples.start) else []
+                due += ["clearance"] if _meets(there, phase) else []
+                due += ["geofence"] if fenced else []
+                if lacking := [name for name in due if name not in extremes]:
                     words = (
                         f"it lacks the worst '{lacking[0]}' of phase '{phase.name}' between samples"
                     )
                     yield words, float(time[samples.start])
             for name, share in _SLACK.items():
-                x, rank = phase.extremes.get(name), self.rank[name].get(index, -math.inf)
+                x, rank = extremes.get(name), self.rank[name][index]
                 if x is None or rank == -math.inf:
                     continue
                 slack = rounding + share * abs(rank)
@@ -360,25 +383,17 @@ class Measurements:
                     words += f" {value(x.value)} at {x.time:.2f} s, but a sample shows {value(sampled.value)}"
                     yield words, sampled.when
 
-    def _meets_obstacles(self, phase: PhaseRecord) -> bool:
-        """Whether an obstacle is there during a phase, not only at its start or end."""
-        every = (thing.solid.there[0] for thing in self.mission.obstacles)
-        return any(a < phase.t_end - 1e-9 and b > phase.t_start + 1e-9 for a, b in every)
+    def _several(self, k: int) -> bool:
+        """Whether at sample k several agents are left."""
+        return int(self.left[k].sum()) > 1
 
     def phase(self, index: int, record: PhaseRecord) -> PhaseVerdict:
         """Numbers of a phase."""
         result, samples = self.result, self.samples[index]
-        flown, last = samples.stop > samples.start, samples.stop - 1
+        flown = samples.stop > samples.start
         finished = flown and (result.complete or index < len(result.phases) - 1)
         finished = finished and not record.abandoned
-        fit, distances, constraint = self.fits.get(index), None, None
-        if flown:
-            constraint = _greatest(result.constraint[last])
-        if flown and record.formation is not None:
-            edges, intended = self.edges(record.formation, last)
-            distances = _greatest(
-                distance_geometry.distances(result.position[last], edges) - intended
-            )
+        fit = self.fits.get(index)
         return PhaseVerdict(
             name=record.name,
             kind=record.kind,
@@ -388,21 +403,47 @@ class Measurements:
             t_end=record.t_end,
             settled=record.settled,
             finished=finished,
-            constraint=constraint,
-            distances=distances,
+            constraint=self.constraints.get(index),
+            distances=self.distances.get(index),
             shape=None if fit is None else fit.error,
             handedness=None if fit is None or fit.dimension < 3 else not fit.mirrored,
-            flip=None if fit is None else self.flip(fit, record, last),
+            flip=None if fit is None else self.flip(fit, record, index),
             order=None if fit is None else fit.in_order,
-            waypoint=self.waypoint(index) if finished else None,
-            through=tuple(self.passed(record, samples)),
+            waypoint=self.waypoints.get(index) if finished else None,
+            through=tuple(self.passed(index)),
             worst=self.worst_of(index),
         )
+
+    @cached_property
+    def constraints(self) -> dict[int, float | None]:
+        """Greatest |c| [m] of an edge at the end of each phase flown."""
+        return dict(zip(self.flown, _greatest(self.result.constraint[self.last]), strict=True))
+
+    @cached_property
+    def distances(self) -> dict[int, float | None]:
+        """Greatest error [m] of an edge against its formation at the end of each phase that has one."""
+        alike: dict[str, list[int]] = {}
+        for i, k in enumerate(self.flown):
+            if (name := self.result.phases[k].formation) is not None:
+                alike.setdefault(name, []).append(i)
+        found: dict[int, float | None] = {}
+        for name, every in alike.items():
+            # Some edges may be lost later
+            for group in [every] if self._same_edges else [[i] for i in every]:
+                edges, intended = self.edges(name, self.last[group[0]])
+                off = (proximity.lengths(self.ends[group], edges) - intended[:, None]).T
+                found |= zip([self.flown[i] for i in group], _greatest(off), strict=True)
+        return found
+
+    @property
+    def _same_edges(self) -> bool:
+        """Whether no edge of a formation is ever lost."""
+        return self.whole and not len(self.mission.links_lost[1])
 
     def edges(self, formation: str, k: int) -> tuple[Ints, Floats]:
         """Edges (m, 2) of a formation that are not lost at sample k, and their lengths (m,) [m]."""
         _, edges, intended = self.formation(formation)
-        if self.whole and not len(self.mission.links_lost[1]):
+        if self._same_edges:
             return edges, intended
         kept = self.left[k][edges].all(axis=1)
         kept &= self.mission.linked(edges, float(self.result.time[k]))
@@ -420,34 +461,30 @@ class Measurements:
     @cached_property
     def fits(self) -> dict[int, Fit]:
         """Fits of the formations at the end of each phase; those of equally many agents are computed at once."""
-        alike: dict[int, list[tuple[int, Floats, Floats, Ints]]] = {}
-        ends = self.result.position[[self.samples[k].stop - 1 for k in self.flown]]
-        known = np.atleast_1d(np.isfinite(ends).all(axis=(1, 2)))
-        every = np.arange(self.result.n_agents)
-        for k, (index, end) in enumerate(zip(self.flown, ends, strict=True)):
+        alike: dict[int, list[tuple[int, Floats, Floats, Ints | None]]] = {}
+        known = np.atleast_1d(np.isfinite(self.ends).all(axis=(1, 2)))
+        for index, end, finite in zip(self.flown, self.ends, known, strict=True):
             name = self.result.phases[index].formation
             slots = None if name is None else self.formation(name)[0]
-            if slots is None or not known[k]:
+            if slots is None or not finite:
                 continue
-            one = index, end, slots, every
+            one = index, end, slots, None
             if not self.whole:
                 left = np.flatnonzero(self.left[self.samples[index].stop - 1])
                 one = index, end[left], slots[left], left
-            if len(one[-1]) > 1:
-                alike.setdefault(len(one[-1]), []).append(one)
+            if len(one[1]) > 1:
+                alike.setdefault(len(one[1]), []).append(one)
         fits = {}
         for group in alike.values():
-            laid = Laid.of(
-                np.stack([p for _, p, _, _ in group]), np.stack([s for *_, s, _ in group])
-            )
-            for (index, p, slots, left), one in zip(group, zip(*laid, strict=True), strict=True):
-                fits[index] = Fit(p, slots, left, Laid(*one))
+            laid = Laid(np.array([p for _, p, *_ in group]), np.array([s for *_, s, _ in group]))
+            for k, (index, p, slots, left) in enumerate(group):
+                fits[index] = Fit(p, slots, left, laid, k)
         return fits
 
-    def flip(self, fit: Fit, record: PhaseRecord, k: int) -> float | None:
-        """Angle [deg] of a line or plane from its intended direction at sample k; None if there is none."""
+    def flip(self, fit: Fit, record: PhaseRecord, index: int) -> float | None:
+        """Angle [deg] of a line or plane from its intended direction at the end of a phase; None if there is none."""
         # A commanded attitude decides; without one, the integrated frame says how a plane should lie.
-        references = self._directions[k]
+        references = self._directions[index]
         if fit.dimension == 1 and record.control == "tracking":
             # Only tracked slots steer a line; otherwise its direction follows from the shape before.
             references = references[:1]
@@ -457,68 +494,79 @@ class Measurements:
 
     @cached_property
     def _directions(self) -> dict[int, Floats]:
-        """Commanded attitude and integrated frame (2, 3, 3) at the last sample of each phase, by sample."""
-        last = [self.samples[k].stop - 1 for k in self.flown]
+        """Commanded attitude and integrated frame (2, 3, 3) at the last sample of each phase."""
         result = self.result
-        T = att.dcm_from_quaternion([result.attitude_reference[last], result.frame[last]])
-        return dict(zip(last, T.swapaxes(0, 1), strict=True))
+        T = att.dcm_from_quaternion([result.attitude_reference[self.last], result.frame[self.last]])
+        return dict(zip(self.flown, T.swapaxes(0, 1), strict=True))
 
-    def _arrival(self, index: int) -> int | None:
-        """The sample nearest to the time of a phase's target; None if it has no target or no samples."""
-        target, samples = self.result.phases[index].target, self.samples[index]
-        if target is None or samples.stop == samples.start:
-            return None
-        return samples.start + int(np.abs(self.result.time[samples] - target["time"]).argmin())
+    def nearest(self, t: float, index: int) -> int:
+        """The sample of a phase flown that is nearest to a time [s]; of two equally near the first."""
+        time, samples = self.result.time, self.samples[index]
+        after = bisect_left(time, t, samples.start, samples.stop - 1)
+        before = max(after - 1, samples.start)
+        return after if abs(time[after] - t) < abs(time[before] - t) else before
 
     @cached_property
-    def _turned(self) -> dict[int, float]:
-        """Angle [deg] between the attitude flown and that of the target, by the sample of the arrival."""
-        found = {
-            k: target["attitude"]
-            for index, phase in enumerate(self.result.phases)
-            if (target := phase.target) and target.get("attitude") is not None
-            and (k := self._arrival(index)) is not None
-        }  # fmt: skip
-        if not found:
+    def waypoints(self) -> dict[int, Waypoint]:
+        """Miss of each phase with a target, at the target's time, or at the end of a phase that settles earlier."""
+        result, phases = self.result, self.result.phases
+        targets = [(k, x) for k in self.flown if (x := phases[k].target) is not None]
+        if not targets:
             return {}
-        angles = np.degrees(att.angle_between(self.result.attitude[[*found]], [*found.values()]))
-        return dict(zip(found, angles.tolist(), strict=True))
+        at = [self.nearest(target["time"], k) for k, target in targets]
+        flown = {
+            "position": result.cm[at], "velocity": result.cm_velocity[at], "attitude": result.attitude[at],
+            "rates": result.rates[at],
+        }  # fmt: skip
+        #: Where a quantity is asked for, and known.
+        asked = {
+            name: [
+                i for i, ((_, target), row) in enumerate(zip(targets, rows.tolist(), strict=True))
+                if target.get(name) is not None and all(map(math.isfinite, row))
+            ]
+            for name, rows in flown.items()
+        }  # fmt: skip
+        miss: dict[str, dict[int, float]] = {}
+        for name, who in asked.items():
+            wanted = [targets[i][1][name] for i in who]
+            if name == "attitude" and who:
+                off = np.degrees(att.angle_between(flown[name][who], wanted)).tolist()
+            else:
+                off = list(map(math.dist, flown[name][who].tolist(), wanted))
+            miss[name] = dict(zip(who, off, strict=True))
+        return {
+            k: Waypoint(
+                time=t,
+                position=miss["position"].get(i),
+                velocity=miss["velocity"].get(i),
+                attitude=miss["attitude"].get(i),
+                rates=math.degrees(miss["rates"][i]) if i in miss["rates"] else None,
+            )
+            for i, ((k, _), t) in enumerate(zip(targets, result.time[at].tolist(), strict=True))
+        }
 
-    def waypoint(self, index: int) -> Waypoint | None:
-        """Miss at the waypoint's time, or at the end of the phase if it settles earlier."""
-        result = self.result
-        target, k = result.phases[index].target, self._arrival(index)
-        if target is None or k is None:
-            return None
-
-        def miss(name: str, flown: Floats) -> float | None:
-            asked = target.get(name)
-            if asked is None or not all(map(math.isfinite, flown.tolist())):
-                return None
-            return self._turned[k] if name == "attitude" else math.dist(flown.tolist(), asked)
-
-        rates = miss("rates", result.rates[k])
-        return Waypoint(
-            time=float(result.time[k]),
-            position=miss("position", result.cm[k]),
-            velocity=miss("velocity", result.cm_velocity[k]),
-            attitude=miss("attitude", result.attitude[k]),
-            rates=None if rates is None else math.degrees(rates),
-        )
-
-    def passed(self, record: PhaseRecord, samples: slice) -> Iterator[Waypoint]:
-        """Misses of the points on the way that the flight came to."""
-        result, times = self.result, self.result.time[samples]
-        for point in (record.target or {}).get("through", ()):
-            if not len(times) or times[-1] < point["time"]:
+    def passed(self, index: int) -> Iterator[Waypoint]:
+        """Misses of the points on the way of a phase that the flight came to."""
+        result, samples = self.result, self.samples[index]
+        for point in (result.phases[index].target or {}).get("through", ()):
+            if samples.stop == samples.start or result.time[samples.stop - 1] < point["time"]:
                 continue
-            k = samples.start + int(np.abs(times - point["time"]).argmin())
+            k = self.nearest(point["time"], index)
             miss = math.dist(result.cm[k].tolist(), point["position"])
             yield Waypoint(float(result.time[k]), miss, None, None, None)
 
 
-def _greatest(values: Floats) -> float | None:
-    if math.isfinite(most := float(np.abs(values).max(initial=0.0))) and len(values):
-        return most
-    values = np.abs(values[np.isfinite(values)])
-    return float(values.max()) if len(values) else None
+def _meets(there: list[list[float]], phase: PhaseRecord) -> bool:
+    """Whether an obstacle is there during a phase, not only at its start or end, of all ``there`` from when to when."""
+    return any(a < phase.t_end - 1e-9 and b > phase.t_start + 1e-9 for a, b in there)
+
+
+def _greatest(values: Floats) -> list[float | None]:
+    """Greatest finite size of each row of values (G, m); None if there is none."""
+    sizes = np.abs(values)
+    if not sizes.shape[1]:
+        return [None] * len(sizes)
+    return [
+        most if math.isfinite(most) else max(filter(math.isfinite, row.tolist()), default=None)
+        for most, row in zip(sizes.max(axis=1).tolist(), sizes, strict=True)
+    ]

@@ -35,6 +35,12 @@ def _closed(xx, s):
 
 
 @compiled
+def rate_factors(xx, s):
+    """a, b and their derivatives over time, of `body_rates`, for xx = |phi|^2 and s = phi . dphi/dt."""
+    return _series(xx, s) if xx < 0.04 else _closed(xx, s)
+
+
+@compiled
 def body_rates(phi, phi_dot, phi_ddot, omega, omega_dot):
     """Body-axes rates of R = Exp(phi): omega = J_r(phi) phi_dot, and its derivative.
 
@@ -43,7 +49,7 @@ def body_rates(phi, phi_dot, phi_ddot, omega, omega_dot):
     """
     xx = phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]
     s = phi[0] * phi_dot[0] + phi[1] * phi_dot[1] + phi[2] * phi_dot[2]  # x dx/dt
-    a, b, a_dot, b_dot = _series(xx, s) if xx < 0.04 else _closed(xx, s)
+    a, b, a_dot, b_dot = rate_factors(xx, s)
     for q in range(3):
         i, j = (q + 1) % 3, (q + 2) % 3
         pv_i = phi[j] * phi_dot[q] - phi[q] * phi_dot[j]  # components of phi x phi_dot
@@ -88,22 +94,27 @@ def rotate_after(E, T, out):
 
 
 @inlined
-def reference_motion(t, motion, w):
-    """Reference motion of the virtual body at t into w.body (see `Workspace`) and w.T_ref.
-
-    After the last knot, the CM and the attitude continue at the rates they have there.
-    """
-    knots, body = motion.knots, w.body
+def piece_at(t, knots):
+    """Piece between knots (n + 1,) [s] at t, the time since it began, and the time since the last knot, or zero."""
     low, high = 0, knots.shape[0] - 1
     inside = min(t, knots[high])
-    beyond = t - inside
     while high - low > 1:
         middle = (low + high) // 2
         if knots[middle] <= t:
             low = middle
         else:
             high = middle
-    x = inside - knots[low]
+    return low, inside - knots[low], t - inside
+
+
+@inlined
+def reference_motion(t, motion, w):
+    """Reference motion of the virtual body at t into w.body (see `Workspace`) and w.T_ref.
+
+    After the last knot, the CM and the attitude continue at the rates they have there.
+    """
+    body = w.body
+    low, x, beyond = piece_at(t, motion.knots)
     powers = motion.coefficients.shape[2]
     for q in range(6):
         c = motion.coefficients[low, q]

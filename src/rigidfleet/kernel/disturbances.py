@@ -12,20 +12,26 @@ from rigidfleet.kernel.compiler.jit import compiled, inlined
 _CONTACT, _SOFT = 20.0, 0.01
 
 
+@inlined
+def spline_weights(t, step, rows):
+    """First of the four rows of a table of ``rows`` that count at t, and their weights; see `spline`."""
+    last = rows - 4
+    x = min(max(t / step, 0.0), last + 1.0)
+    j = min(int(x), last)
+    s = x - j
+    rest = 1.0 - s
+    b1 = 2.0 / 3.0 - s * s * (1.0 - 0.5 * s)
+    b2 = 2.0 / 3.0 - rest * rest * (1.0 - 0.5 * rest)
+    return j, rest * rest * rest / 6.0, b1, b2, s * s * s / 6.0
+
+
 @compiled
 def spline(t, step, table, out):
     """Cubic B-spline with coefficients table (K, N, 3), knots every `step` [s] from 0, into out (N, 3).
 
     Twice continuously differentiable; constant before the first and after the last knot.
     """
-    last = table.shape[0] - 4
-    x = min(max(t / step, 0.0), last + 1.0)
-    j = min(int(x), last)
-    s = x - j
-    rest = 1.0 - s
-    b0, b3 = rest * rest * rest / 6.0, s * s * s / 6.0
-    b1 = 2.0 / 3.0 - s * s * (1.0 - 0.5 * s)
-    b2 = 2.0 / 3.0 - rest * rest * (1.0 - 0.5 * rest)
+    j, b0, b1, b2, b3 = spline_weights(t, step, table.shape[0])
     for i in range(out.shape[0]):
         for q in range(3):
             out[i, q] = (

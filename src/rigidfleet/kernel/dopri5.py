@@ -131,6 +131,27 @@ def keep_step(t, h, p, w, state):
     state.count[4] = row + 1
 
 
+@inlined
+def keep_samples(t, h, t_new, times, samples, p, state):
+    """Write the states at the times in (t, t_new] by the step's continuous extension, from t [s] on, of length h."""
+    K, count = state.K, state.count
+    if count[3] < times.shape[0] and times[count[3]] <= t_new:
+        for q in range(samples.shape[1]):  # into K[1], which has weight zero in the sums
+            d = _D[0] * K[0, q]
+            for s in range(1, 7):
+                d += _D[s] * K[s, q]
+            K[1, q] = h * d
+    while count[3] < times.shape[0] and times[count[3]] <= t_new:
+        x = (times[count[3]] - t) / h
+        for q in range(samples.shape[1]):
+            rise = K[TRIAL, q] - K[STATE, q]
+            bend = h * K[0, q] - rise
+            rest = rise - h * K[6, q] - bend
+            inner = bend + x * (rest + (1.0 - x) * K[1, q])
+            samples[count[3], q] = K[STATE, q] + x * (rise + (1.0 - x) * inner)
+        count[3] += 1
+
+
 @compiled
 def integrate(p, w, state, t_end, fresh, times, samples, max_steps):
     """Integrate `closed_loop` to ``t_end`` [s]; adaptive Dormand-Prince 5(4), PI step control.
@@ -185,21 +206,7 @@ def integrate(p, w, state, t_end, fresh, times, samples, max_steps):
                 break
             continue
         t_new = t + h if t + h < t_end else t_end
-        if count[3] < times.shape[0] and times[count[3]] <= t_new:
-            for q in range(n):  # into K[1], which has weight zero in the sums
-                d = _D[0] * K[0, q]
-                for s in range(1, 7):
-                    d += _D[s] * K[s, q]
-                K[1, q] = h * d
-        while count[3] < times.shape[0] and times[count[3]] <= t_new:
-            x = (times[count[3]] - t) / h
-            for q in range(n):
-                rise = trial[q] - y[q]
-                bend = h * K[0, q] - rise
-                rest = rise - h * K[6, q] - bend
-                inner = bend + x * (rest + (1.0 - x) * K[1, q])
-                samples[count[3], q] = y[q] + x * (rise + (1.0 - x) * inner)
-            count[3] += 1
+        keep_samples(t, h, t_new, times, samples, p, state)
         if capacity > 0:
             keep_step(t, h, p, w, state)
         for q in range(k.shape[1]):

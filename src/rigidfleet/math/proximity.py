@@ -65,13 +65,13 @@ def separation(r: Floats, radius: ArrayLike) -> tuple[Floats, Ints]:
                 pair[k] = who[near[0]]
         return least, pair
     x, samples = np.ascontiguousarray(r.T), np.arange(len(r))  # rows of samples are faster
-    i, j = pairs = _pairs(n)
+    i, j = pairs = all_pairs(n)
     some = max(1, _CACHED // max(1, 3 * len(r)))
     for first in range(0, len(i), some):
         part = slice(first, first + some)
-        d = x[:, j[part]]
-        d -= x[:, i[part]]
-        apart = _root(d)
+        d = x.take(j[part], axis=1)
+        d -= x.take(i[part], axis=1)
+        apart = root_of_squares(d)
         apart -= (radius[i] + radius[j])[part, None]
         at = apart.argmin(axis=0)
         value = apart[at, samples]
@@ -80,14 +80,14 @@ def separation(r: Floats, radius: ArrayLike) -> tuple[Floats, Ints]:
             value = apart[at, samples]
         closer = value < least  # false for NaN
         if closer.all():
-            least, pair = value, pairs[:, at + first].T
+            least, pair = value, pairs.take(at + first, axis=1).T
         else:
             least[closer], pair[closer] = value[closer], pairs[:, at + first].T[closer]
     return least, pair
 
 
 @lru_cache(16)
-def _pairs(n: int) -> Ints:
+def all_pairs(n: int) -> Ints:
     """All pairs (2, n (n - 1) / 2) of n agents, i < j."""
     return np.stack(np.triu_indices(n, 1))
 
@@ -98,13 +98,13 @@ def lengths(r: Floats, pairs: Ints) -> Floats:
     some = max(1, _CACHED // (3 * len(r)))
     for first in range(0, len(pairs), some):
         i, j = pairs[first : first + some].T
-        d = x[:, i]
-        d -= x[:, j]
-        found[first : first + some] = _root(d)
+        d = x.take(i, axis=1)
+        d -= x.take(j, axis=1)
+        found[first : first + some] = root_of_squares(d)
     return found
 
 
-def _root(d: Floats) -> Floats:
+def root_of_squares(d: Floats) -> Floats:
     """Lengths (...) of vectors (3, ...), which are overwritten."""
     d *= d
     d[0] += d[1]
@@ -235,9 +235,10 @@ def clearance(
 
 def least_clearance(clearance: Floats, nearest: Ints) -> tuple[Floats, Ints, Ints]:
     """Least of the `obstacle_clearances` (K, N) of each sample (K,), with the agent and the obstacle (K,)."""
-    agent, samples = clearance.argmin(axis=1), np.arange(len(clearance))
+    rows, samples = np.ascontiguousarray(clearance.T), np.arange(len(clearance))
+    agent = rows.argmin(axis=0)
     obstacle = nearest[samples, agent]
-    return clearance[samples, agent], np.where(obstacle < 0, -1, agent), obstacle
+    return rows[agent, samples], np.where(obstacle < 0, -1, agent), obstacle
 
 
 def separation_of_left(r: Floats, radius: ArrayLike, left: Bools) -> tuple[Floats, Ints]:
@@ -276,21 +277,23 @@ def closeness(
     """Distances of the agents ``left`` (K, N) at r (K, N, 3), with radius (N,), to each other and to obstacles.
 
     The verdict asks for what the flight has asked for: the last answer is kept, and given to the same numbers alone.
+    Its arrays are read-only.
     """
     radius = np.asarray(radius, dtype=float)
     given = [r, radius, time, left]
     for things, before, found in _last[-1:]:
         if things is obstacles and all(map(_same, given, before)):
-            return Closeness._make(x.copy() for x in found)
+            return found
     each, nearest = obstacle_clearances(r, radius, obstacles, time)
     if not left.all():
         each[~left] = np.inf
     found = Closeness(
         *separation_of_left(r, radius, left), each, nearest, *least_clearance(each, nearest)
     )
+    for values in found:
+        values.flags.writeable = False
     if r.nbytes <= _KEPT:
-        copies = Closeness._make(x.copy() for x in found)
-        _last[:] = [(obstacles, [x.copy() for x in given], copies)]
+        _last[:] = [(obstacles, [x.copy() for x in given], found)]
     return found
 
 
@@ -321,10 +324,12 @@ def obstacle_clearances(
     radius = radius.reshape(-1, *[1] * (r.ndim - 2))
     for k, thing in enumerate(obstacles):
         far = least + radius if thing.solid.kind[0] in _SURFACES else np.inf
-        clearance = distances(*places, thing.solid, time, far) - radius
+        clearance = distances(*places, thing.solid, time, far)
+        clearance -= radius
         closer = clearance < least  # false for NaN
         if closer.all():
-            least, nearest = clearance, np.full(nearest.shape, k)
+            least = clearance
+            nearest.fill(k)
         elif closer.any():
             np.copyto(least, clearance, where=closer)
             np.copyto(nearest, k, where=closer)

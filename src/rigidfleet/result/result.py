@@ -277,15 +277,8 @@ class Result:
             if isinstance(given[key], np.ndarray):
                 sizes.update(zip(dims, given[key].shape, strict=False))
         for name in [name for name in given if name in _CHECKED]:
-            value, (dims, dtype) = given[name], _CHECKED[name]
-            if value is None and VARIABLES[name].optional:
-                continue
-            if not (
-                type(value) is np.ndarray
-                and value.dtype is dtype
-                and value.shape == tuple([sizes.get(dim) for dim in dims])
-                and value.flags.c_contiguous
-            ):
+            value = given[name]
+            if value is not None or not VARIABLES[name].optional:
                 self._set(name, value, sizes)
         if not later:  # what a flight of this process has made is right
             self._check(sizes)
@@ -331,6 +324,14 @@ class Result:
     def _set(self, name: str, given: Any, sizes: dict[str, int]) -> None:
         """Set an array whose dimensions agree with ``sizes``, which learns new ones."""
         dims, dtype = _CHECKED[name]
+        if (
+            type(given) is np.ndarray
+            and given.dtype is dtype
+            and given.shape == tuple([sizes.get(dim) for dim in dims])
+            and given.flags.c_contiguous
+        ):
+            self.__dict__[name] = given
+            return
         value = np.ascontiguousarray(given, dtype=dtype)
         asked = tuple(sizes.get(dim, "any") for dim in dims)
         if value.ndim != len(asked) or any(

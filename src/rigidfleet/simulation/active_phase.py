@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time as clock
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -51,6 +51,17 @@ _STEPS, _PAUSE = 2000, 0.05
 _FIRST_STEPS, _FIRST_NUMBERS = 10, 3000
 #: Interval between checks whether a phase has settled, if it ends by settling [s].
 _CHECK = 0.1
+
+
+class Stretch(NamedTuple):
+    """What is integrated at a time: a problem, the times (K,) [s] to record, and the states (K, n) there."""
+
+    problem: Problem
+    times: Floats
+    samples: Floats
+    fresh: bool  # whether the derivative at the start is not known
+    first: float  # the first time after the start [s]
+
 
 #: Function that gives the times in (t, t_end] to record: sampling(plan, t, t_end, first=..., stop=...).
 Sampler = Callable[..., Floats]
@@ -300,27 +311,16 @@ class ActivePhase:
 
     def _segment(self, problem: Problem, t_end: float) -> None:
         """Integrate to ``t_end`` [s] and record the samples on the way."""
-        fresh = self.state.count[0] == 0 or problem is not self.plan.problem
-        if fresh:
-            self.watch(last=True)
-            self.flown = problem
-            if self.solver is not None:  # a solver keeps state: the monitor has its own
-                self.flown = solved_by(self.solver.aside, problem)
-        times = self.sampler(self.plan, self.t, t_end, first=not self.begun, stop=self.stop)
-        self.begun = True
-        state = self.state  # of which another trail alone may follow
-        samples = np.empty((len(times), len(state.y)))
-        state.count[3] = 0
-        first = math.nextafter(self.t, math.inf)
+        stretch = self.prepare(problem, self.times(t_end))
+        state, fresh = self.state, stretch.fresh  # of which another trail alone may follow
+        given = t_end, stretch.times, stretch.samples
         status = records.PAUSED
-        go_on = native.Integration(problem, self.workspace, state, t_end, times, samples)
+        go_on = native.Integration(problem, self.workspace, state, *given)
         try:
             while status == records.PAUSED:
                 if state is not self.state:
                     state = self.state
-                    go_on = native.Integration(
-                        problem, self.workspace, state, t_end, times, samples
-                    )
+                    go_on = native.Integration(problem, self.workspace, state, *given)
                 begun = clock.perf_counter()
                 status = go_on(fresh, self.steps)
                 took = max(clock.perf_counter() - begun, 1e-6)
@@ -336,15 +336,37 @@ class ActivePhase:
                 if status == records.PAUSED and self._stalled():
                     break
         finally:
-            done = int(state.count[3])
-            if state.count[0] and not state.count[1] and len(times) and times[0] <= first:
-                samples[0], done = state.y, 1  # no step was possible: record the start alone
-            if done:
-                self._record(problem, times[:done], samples[:done])
+            self.record(stretch)
         if status != records.FINISHED:
             collapsed = status == records.COLLAPSED
             own_force = self.external is not None
             raise StoppedError(diagnose(self.place, own_force=own_force, collapsed=collapsed))
+
+    def times(self, t_end: float) -> Floats:
+        """Times (K,) [s] to record from now to ``t_end`` [s]."""
+        return self.sampler(self.plan, self.t, t_end, first=not self.begun, stop=self.stop)
+
+    def prepare(self, problem: Problem, times: Floats) -> Stretch:
+        """Prepare to integrate a problem from now on, and to record the states at some times (K,) [s]."""
+        fresh = self.state.count[0] == 0 or problem is not self.plan.problem
+        if fresh:
+            self.watch(last=True)
+            self.flown = problem
+            if self.solver is not None:  # a solver keeps state: the monitor has its own
+                self.flown = solved_by(self.solver.aside, problem)
+        self.begun = True
+        samples = np.empty((len(times), len(self.state.y)))
+        self.state.count[3] = 0
+        return Stretch(problem, times, samples, fresh, math.nextafter(self.t, math.inf))
+
+    def record(self, stretch: Stretch) -> None:
+        """Store the samples of what was integrated since `prepare`."""
+        state, (problem, times, samples, _, first) = self.state, stretch
+        done = int(state.count[3])
+        if state.count[0] and not state.count[1] and len(times) and times[0] <= first:
+            samples[0], done = state.y, 1  # no step was possible: record the start alone
+        if done:
+            self._record(problem, times[:done], samples[:done])
 
     def _stalled(self) -> bool:
         """Whether the phase takes far more steps than its duration explains."""

@@ -244,7 +244,7 @@ class Flight:
     @property
     def plan(self) -> PhasePlan:
         """Plan of the phase under way: its formation, slots, goal and problem."""
-        return self._under_way().plan
+        return self.under_way().plan
 
     def observe(self) -> Observation:
         """Measured and desired states of the vehicles.
@@ -254,11 +254,11 @@ class Flight:
         FlightError
             No phase is under way.
         """
-        return self._under_way().observe()
+        return self.under_way().observe()
 
     def pose(self) -> Pose:
         """Pose of the virtual body: its reference if slots are tracked, otherwise the agents' own frame."""
-        active = self._under_way()
+        active = self.under_way()
         active.evaluate()
         w, plan = active.workspace, active.plan
         if plan.problem.control.kind == TRACKING:
@@ -369,24 +369,22 @@ class Flight:
         ValueError
             The duration is not positive.
         """
-        active = self._under_way()
+        active = self.under_way()
         if duration is not None and not isinstance(duration, int | float | np.number):
             raise wrong_type("a duration [s]", duration)
         if duration is not None and not duration > 0.0:
             raise ValueError(f"the duration must be positive [s], not {duration!r}")
         plan = active.plan
-        stop = math.inf if duration is None else active.t + duration
-        loss = self._loss_ahead()
-        stop = min(stop, loss)
-        t_end, settle = min(stop, plan.t_end), plan.phase.settle
-        active.stop = stop
+        active.stop = min(
+            math.inf if duration is None else active.t + duration, self._loss_ahead()
+        )
+        t_end, settle = min(active.stop, plan.t_end), plan.phase.settle
         try:
             if settle is None:
                 active.fly_to(t_end, self.controller, self.rate)
             else:
                 step = self.mission.output_step
                 active.settle_by(t_end, settle, self.controller, self.rate, step)
-            self.phases[-1].t_end = active.t
         except StoppedError as stopped:
             self.ending = str(stopped)
             self._leave()
@@ -394,6 +392,13 @@ class Flight:
         except BaseException:
             self._leave()
             raise
+        return self.arrive()
+
+    def arrive(self) -> bool:
+        """End the phase under way if it is over; return whether it goes on, as `advance` does."""
+        active = self.under_way()
+        plan, settle, loss = active.plan, active.plan.phase.settle, self._loss_ahead()
+        self.phases[-1].t_end = active.t
         if active.settled or active.over:
             settled = active.settled
             self._leave()
@@ -429,7 +434,7 @@ class Flight:
         turn : rotation vector (3,) [rad] over ``h``, body rates and their derivative at its end
         force : whether the user's force acts during ``h``
         """
-        active = self._under_way()
+        active = self.under_way()
         t, problem = active.t, active.plan.problem
         external = self.external.address if force and self.external is not None else 0
         if active.plan.phase.control == "body":
@@ -546,7 +551,14 @@ class Flight:
             self._ended = None
         return self._reached
 
-    def _under_way(self) -> ActivePhase:
+    def under_way(self) -> ActivePhase:
+        """The phase under way.
+
+        Raises
+        ------
+        FlightError
+            None is.
+        """
         if self._finished:
             raise FlightError(_FINISHED)
         if self._active is None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from rigidfleet.kernel.engine import native
 from rigidfleet.kernel.measured import Measured, measured
-from rigidfleet.kernel.records import Record
+from rigidfleet.kernel.records import Record, recorder
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
 from rigidfleet.planning.derivatives import Yaw, slot_derivatives, yaw_derivatives
@@ -41,6 +41,8 @@ _WORK, _LEAST = 400_000_000, 9
 #: Columns of a record that are those of the phase, also where a user's controller flies.
 _REFERENCES = "r_ref", "p", "motion", "rates", "T_ref", "wrench"
 _STATES = "position", "velocity"
+#: Columns of a record that are those of edges.
+_EDGEWISE = "c", "L", "d", "d_dot", "multiplier"
 
 #: Fields of a result that a flight makes later, as a rule.
 _UNMADE: dict[str, Any] = dict.fromkeys(
@@ -100,13 +102,14 @@ class Unevaluated(NamedTuple):
         """Positions (K, N, 3) of agents, or states that begin with them: what is at hand."""
         return self.motion[0] if self.problem.body_formulation else self.y
 
-    def evaluated(self, times: Floats, work: Workspace) -> Record:
-        """Forces and references at the samples, times (K,) [s]."""
-        out = native.record(self.problem, work, times, self.y)
-        if self.problem is self.planned:
-            return out
-        of_phase = native.record(self.planned, work, times, self.y)
-        return out._replace(**{name: getattr(of_phase, name) for name in _REFERENCES})
+    def evaluated(self, times: Floats, work: Workspace, out: Record | None = None) -> Record:
+        """Forces and references at the samples, times (K,) [s], into the rows ``out`` if given."""
+        out = native.record(self.problem, work, times, self.y, out)
+        if self.problem is not self.planned:
+            of_phase = native.record(self.planned, work, times, self.y)
+            for name in _REFERENCES:
+                getattr(out, name)[:] = getattr(of_phase, name)
+        return out
 
 
 @dataclass
@@ -126,23 +129,32 @@ class Piece:
 
     @cached_property
     def record(self) -> Record:
-        """Forces and references, as the kernel returns them."""
+        """Forces and references, of the edges of this phase."""
+        if not isinstance(self.given, Unevaluated):
+            return self.given
+        n = len(self.given.problem.vehicles.m)
+        out = recorder(len(self.time), n, len(self.edges))
+        self.record_into(out)
+        return out
+
+    def record_into(self, out: Record) -> None:
+        """Write forces and references, of the edges of this phase, into rows of a record."""
         given = self.given
         if not isinstance(given, Unevaluated):
-            return given
-        if given.setup is not None:
+            for rows, values in zip(out, given, strict=True):
+                rows[:] = values
+        elif given.setup is None:
+            work = small_workspace(given.planned)
+            given.evaluated(self.time, work, out)
+            give_back(given.planned, work)
+        else:
             solver = large_solver(given.planned, given.setup)
             planned = solved_by(solver, given.planned)
             own = given.problem is given.planned
             problem = planned if own else solved_by(solver, given.problem)
             found = given._replace(problem=problem, planned=planned)
-            found = found.evaluated(self.time, solver.workspace)
+            found.evaluated(self.time, solver.workspace, out)
             solver.check()
-            return found
-        work = small_workspace(given.planned)
-        found = given.evaluated(self.time, work)
-        give_back(given.planned, work)
-        return found
 
 
 def assemble(
@@ -175,7 +187,10 @@ def assemble(
         for phase in phases
     ]
     # Of the pieces, what is left to do keeps no more than it needs.
-    places = [p.given.places if isinstance(p.given, Unevaluated) else p.given.r for p in pieces]
+    places = _Places(
+        [p.given.places if isinstance(p.given, Unevaluated) else p.given.r for p in pieces],
+        mission.n_agents,
+    )
     later: list[tuple[tuple[str, ...], Callable[[], dict[str, Any]]]] = [
         (
             (*RECORDED, *(("disturbance_force",) if airy else ()), *(SEEN if noisy else ())),
@@ -183,10 +198,7 @@ def assemble(
         ),
         (CLOSE, partial(_close, mission, worst, places, time)),
         (LATER, partial(_references, mission, [(p.time, p.led) for p in pieces])),
-        (
-            ("singular_value",),
-            partial(_singular_values, mission.n_agents, places, [p.edges for p in pieces]),
-        ),
+        (("singular_value",), partial(_singular_values, places, [p.edges for p in pieces])),
         (("mission_text",), partial(_text, mission)),
     ]
     motion = [p.given.motion for p in pieces if isinstance(p.given, Unevaluated)]
@@ -222,18 +234,7 @@ def _recorded(
     mission: Mission, pieces: Sequence[Piece], time: Floats, flown: VehicleSamples | None
 ) -> dict[str, Any]:
     """Forces and references at all samples, and what is measured of them."""
-    edges = mission.edges
-    record = pieces[0].record
-    if len(pieces) > 1:
-        edgewise = {"c", "L", "d", "d_dot", "multiplier"}
-        parts = [p.record for p in pieces]
-        record = record._replace(
-            **{
-                name: np.concatenate(rows)
-                for name, *rows in zip(Record._fields, *parts, strict=True)
-                if name not in edgewise
-            }
-        )
+    record = _record(pieces, mission.n_agents, mission.edges)
     found = _measured(mission, pieces, time, record)
     thrust, motion, r_ref = found.thrust, record.motion, record.r_ref
     if flown is not None:
@@ -242,11 +243,9 @@ def _recorded(
             thrust = np.minimum(thrust, mission.agents.thrust_limit)
     if (left := _left(mission, time)) is not None:
         r_ref = np.where(left[:, :, None], r_ref, np.nan)
-    reference = _by_edge(pieces, edges, lambda p: p.record.d)
-    constraint = _by_edge(pieces, edges, lambda p: p.record.c)
-    d = mission.disturbances
+    constraint, d = record.c, mission.disturbances
     if d is not None and d.noise is not None:
-        constraint = found.distance - reference
+        constraint = found.distance - record.d
     return {
         "position": record.r,
         "velocity": record.v,
@@ -271,11 +270,11 @@ def _recorded(
         "wrench_asked": np.where(np.isfinite(motion[:, :1]), record.wrench, found.wrench),
         "wrench_achieved": found.wrench,
         "distance": found.distance,
-        "distance_reference": reference,
-        "distance_rate_reference": _by_edge(pieces, edges, lambda p: p.record.d_dot),
+        "distance_reference": record.d,
+        "distance_rate_reference": record.d_dot,
         "constraint": constraint,
-        "multiplier": _by_edge(pieces, edges, lambda p: p.record.multiplier),
-        "integral": _by_edge(pieces, edges, lambda p: p.integral),
+        "multiplier": record.multiplier,
+        "integral": _integral(pieces, mission.edges),
     }
 
 
@@ -285,31 +284,27 @@ def _text(mission: Mission) -> dict[str, str]:
 
 def _left(mission: Mission, time: Floats) -> Bools | None:
     """Mask (K, N) of the agents that are not lost; None if none is."""
-    left = time[:, None] <= mission.lost_at
-    return None if left.all() else left
+    lost_at = mission.lost_at
+    return None if time[-1] <= lost_at.min() else time[:, None] <= lost_at
 
 
 def _close(
     mission: Mission,
     worst: Sequence[dict[str, Extremum]],
-    places: Sequence[Floats],
+    places: _Places,
     time: Floats,
 ) -> dict[str, Any]:
     """Distances at samples; the one after an extreme of a phase, ``worst``, has the extreme."""
     left = _left(mission, time)
     if left is None:
         left = np.ones((len(time), mission.n_agents), dtype=np.bool_)
-    r = _joined([_positions(x, mission.n_agents) for x in places])
-    close = proximity.closeness(r, mission.agents.radius, mission.obstacles, time, left)
-    for extremes in worst:
-        _put(extremes, time, close)
-    return dict(
-        zip(
-            CLOSE,
-            (close.separation, close.pair, close.clearance, close.agent, close.obstacle),
-            strict=True,
-        )
-    )
+    close = proximity.closeness(places.joined, mission.agents.radius, mission.obstacles, time, left)
+    own = {
+        name: getattr(close, name).copy()
+        for name in ("separation", "pair", "clearance", "agent", "obstacle")
+    }
+    _put(worst, time, close._replace(**own))
+    return dict(zip(CLOSE, own.values(), strict=True))
 
 
 def _references(mission: Mission, pieces: Sequence[tuple[Floats, Led]]) -> dict[str, Floats]:
@@ -380,19 +375,18 @@ def _together(found: Sequence[Samples]) -> Samples:
     return type(found[0])(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
 
 
-def _put(extremes: dict[str, Extremum], time: Floats, close: proximity.Closeness) -> None:
+def _put(worst: Sequence[dict[str, Extremum]], time: Floats, close: proximity.Closeness) -> None:
     """Enter extremes between samples at the sample after each."""
     for name, values in (("separation", close.separation), ("clearance", close.clearance)):
-        x = extremes.get(name)
-        if x is None:
-            continue
-        k = min(int(np.searchsorted(time, x.time)), len(time) - 1)
-        if x.value < values[k]:
-            values[k] = x.value
-            if name == "separation":
-                close.pair[k] = x.who, x.other
-            else:
-                close.agent[k], close.obstacle[k] = x.who, x.other
+        every = [extremes[name] for extremes in worst if name in extremes]
+        after = np.searchsorted(time, [x.time for x in every]).clip(max=len(time) - 1)
+        for x, k in zip(every, after.tolist(), strict=True):
+            if x.value < values[k]:
+                values[k] = x.value
+                if name == "separation":
+                    close.pair[k] = x.who, x.other
+                else:
+                    close.agent[k], close.obstacle[k] = x.who, x.other
 
 
 def _joined(parts: Sequence[Array]) -> Array:
@@ -420,15 +414,33 @@ def _measured(mission: Mission, pieces: Sequence[Piece], time: Floats, record: R
     return found
 
 
-def _by_edge(pieces: Sequence[Piece], edges: Ints, given: Callable[[Piece], Floats]) -> Floats:
-    """A quantity of the edges (K, m), ``given`` for those of a piece; NaN while an edge is not active."""
+def _record(pieces: Sequence[Piece], n: int, edges: Ints) -> Record:
+    """Forces and references at all samples, of the pieces one after the other; NaN while an edge is not active."""
+    out, end = recorder(sum(len(p.time) for p in pieces), n, len(edges)), 0
+    for piece in pieces:
+        begin, end = end, end + len(piece.time)
+        rows = Record._make([x[begin:end] for x in out])
+        places = _columns(piece.edges, edges)
+        if isinstance(places, slice):
+            piece.record_into(rows)
+            continue
+        size = len(piece.time), len(piece.edges)
+        own = rows._replace(**{name: np.empty(size) for name in _EDGEWISE})
+        piece.record_into(own)
+        for name in _EDGEWISE:
+            getattr(rows, name)[:, places] = getattr(own, name)
+    return out
+
+
+def _integral(pieces: Sequence[Piece], edges: Ints) -> Floats:
+    """Integrals of the constraint errors (K, m); NaN while an edge is not active."""
     columns = [_columns(p.edges, edges) for p in pieces]
     if all(isinstance(places, slice) for places in columns):
-        return _joined([given(p) for p in pieces])
+        return _joined([p.integral for p in pieces])
     rows = []
     for piece, places in zip(pieces, columns, strict=True):
         full = np.full((len(piece.time), len(edges)), np.nan)
-        full[:, places] = given(piece)
+        full[:, places] = piece.integral
         rows.append(full)
     return _joined(rows)
 
@@ -443,28 +455,56 @@ def _columns(some: Ints, edges: Ints) -> Ints | slice:
     return order[np.searchsorted(keys[order], some[:, 0] * key + some[:, 1])]
 
 
-def _positions(x: Floats, n: int) -> Floats:
-    """Positions (K, N, 3) themselves, or those of the states (K, ...) that begin with them."""
-    return x if x.ndim == 3 else np.ascontiguousarray(x[:, : 3 * n]).reshape(-1, n, 3)
+class _Places:
+    """Positions of a flight, from ``parts`` (K, N, 3), or (K, ...) if they are states that begin with positions."""
+
+    def __init__(self, parts: Sequence[Floats], n: int) -> None:
+        self.parts, self.n = parts, n
+
+    @cached_property
+    def joined(self) -> Floats:
+        """Positions (K, N, 3) at all samples."""
+        width = 3 * self.n
+        rows = [x.reshape(len(x), -1)[:, :width] for x in self.parts]
+        return np.concatenate(rows).reshape(-1, self.n, 3)
 
 
-def _singular_values(n: int, places: Sequence[Floats], edges: Sequence[Ints]) -> dict[str, Floats]:
+def _singular_values(places: _Places, edges: Sequence[Ints]) -> dict[str, Floats]:
     """Smallest non-zero singular value of J (K,); NaN if the formation is too large to compute it.
 
-    ``places`` and ``edges`` are those of each piece. In formations of some tens of agents it is computed at some
-    samples of each phase, and linear in between.
+    ``edges`` are those of each piece. In formations of some tens of agents it is computed at some samples of each
+    phase, and linear in between.
     """
-    found = [_singular(_positions(x, n), e) for x, e in zip(places, edges, strict=True)]
+    ends = np.cumsum([len(x) for x in places.parts]).tolist()
+    spans: list[tuple[list[int], Ints]] = []  # pieces with the same edges, one after the other
+    for end, some in zip(ends, edges, strict=True):
+        if spans and np.array_equal(spans[-1][1], some):
+            spans[-1][0].append(end)
+        else:
+            spans.append(([end], some))
+    found, begin = [], 0
+    for parts, some in spans:
+        r = places.joined[begin : parts[-1]]
+        within = [end - begin for end in parts[:-1]]
+        found += _singular(r, within, some)
+        begin = parts[-1]
     return {"singular_value": np.concatenate(found)}
 
 
-def _singular(r: Floats, edges: Ints) -> Floats:
-    """Smallest non-zero singular value of J in one phase (K,), at positions r (K, N, 3)."""
+def _singular(r: Floats, within: Sequence[int], edges: Ints) -> list[Floats]:
+    """Smallest non-zero singular value of J (K,) at positions r (K, N, 3) of phases that begin at 0 and ``within``."""
     size = min(len(edges), 3 * r.shape[1])
     if size > _SINGULAR or not len(edges):
-        return np.full(len(r), np.nan)
+        return [np.full(len(r), np.nan)]
     count = max(_LEAST, _WORK // size**3)
     if count >= len(r):
-        return native.least_singular_values(r, edges)
-    some = np.unique(np.linspace(0, len(r) - 1, count).round().astype(np.int64))
-    return np.interp(np.arange(len(r)), some, native.least_singular_values(r[some], edges))
+        return [native.least_singular_values(r, edges)]
+    found = []
+    for part in np.split(r, within):
+        if count >= len(part):
+            found.append(native.least_singular_values(part, edges))
+            continue
+        some = np.unique(np.linspace(0, len(part) - 1, count).round().astype(np.int64))
+        values = native.least_singular_values(part[some], edges)
+        found.append(np.interp(np.arange(len(part)), some, values))
+    return found

@@ -491,6 +491,7 @@ def _result(
     k, n = r.shape[:2]
     left = np.ones((k, n), dtype=np.bool_)
     close = proximity.closeness(r, mission.agents.radius, mission.obstacles, time, left)
+    close = proximity.Closeness._make(x.copy() for x in close)
     nothing, none = np.full((k, n, 3), np.nan), np.zeros((k, 0))
     cm, cm_velocity = r.mean(axis=1), v.mean(axis=1)
     unknown: dict[str, Any] = {

@@ -127,10 +127,10 @@ def _greatest(values: Iterable[float | None]) -> float:
 
 def _in_flight(result: Result) -> dict[str, float]:
     """Errors of shape and of tracking at all samples, lost vehicles left out."""
-    r = np.where(result.left[..., None], result.position, np.nan)
+    off = np.ascontiguousarray((_left(result) - result.slot_position).T)
     errors = {
         "shape_flight": shape_errors(result),
-        "tracking_error": _most(np.linalg.norm(r - result.slot_position, axis=2)),
+        "tracking_error": _most(proximity.root_of_squares(off)),
     }
     found = {}
     for (name, error), mean in zip(errors.items(), ("shape_rms", "tracking_rms"), strict=True):
@@ -145,16 +145,22 @@ def shape_errors(result: Result) -> Floats:
 
     Elsewhere, and with many agents, it is that of the edges against their references. NaN if there are none.
     """
-    error = _most(np.abs(result.constraint))
+    error = _most(np.abs(np.ascontiguousarray(result.constraint.T)))
     n = result.position.shape[1]
     if n < 2 or n > _PAIRED:
         return error
-    pairs = np.stack(np.triu_indices(n, 1), axis=1)
-    r = np.where(result.left[..., None], result.position, np.nan)
-    flown, asked = (proximity.lengths(x, pairs) for x in (r, result.slot_position))
-    return np.fmax(error, _most(np.abs(flown - asked).T))
+    pairs = proximity.all_pairs(n).T
+    flown, asked = (proximity.lengths(x, pairs) for x in (_left(result), result.slot_position))
+    flown -= asked
+    return np.fmax(error, _most(np.abs(flown, out=flown)))
+
+
+def _left(result: Result) -> Floats:
+    """Positions (K, N, 3) [m]; NaN of agents that are lost."""
+    left = result.left
+    return result.position if left.all() else np.where(left[..., None], result.position, np.nan)
 
 
 def _most(values: Floats) -> Floats:
-    """Greatest finite value (K,) of each row (K, M); NaN if there is none."""
-    return np.fmax.reduce(values, axis=1, initial=np.nan)
+    """Greatest finite value (K,) of each column of values (M, K); NaN if there is none."""
+    return np.fmax.reduce(values, axis=0, initial=np.nan)

@@ -1,15 +1,19 @@
-"""Fly runs of a sweep: whole flights one by one, or final states alone, eight per vector."""
+"""Fly runs of a sweep, eight per vector: whole flights, which are judged, or final states alone."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from time import perf_counter
+from typing import TYPE_CHECKING, Any
 
 from rigidfleet.errors import MissionError
 from rigidfleet.sweep.definition import Sweep
 from rigidfleet.sweep.metrics import METRICS, measure
 from rigidfleet.sweep.record import BROKEN, RunRecord, refusal
+
+if TYPE_CHECKING:
+    from rigidfleet.result import Result
 
 #: Number of consecutive runs in a group. The first run of a group is a multiple of it.
 GROUP = 8
@@ -25,29 +29,61 @@ def fly_runs(sweep: Sweep, runs: Sequence[int]) -> list[RunRecord]:
         from rigidfleet.sweep.final_states import fly_final_states
 
         return fly_final_states(sweep, runs)
-    return [_fly(sweep, run) for run in runs]
+    groups = [runs[k : k + GROUP] for k in range(0, len(runs), GROUP)]
+    return [row for group in groups for row in _fly(sweep, group)]
 
 
-def _fly(sweep: Sweep, run: int) -> RunRecord:
-    from rigidfleet.assessment import assess
+def _fly(sweep: Sweep, runs: Sequence[int]) -> list[RunRecord]:
+    """Fly a group of runs side by side; one by one, if anything unforeseen happens to any of them."""
     from rigidfleet.simulation.flight import simulate
+    from rigidfleet.simulation.together import simulate_together
 
+    begun = perf_counter()
+    missions = {run: _tried(lambda run=run: sweep.mission_of(run)) for run in runs}
+    whole = [run for run, mission in missions.items() if not isinstance(mission, Exception)]
+    flown: dict[int, Any] = dict(missions)
+    together = _tried(lambda: simulate_together([missions[run] for run in whole]))
+    if isinstance(together, Exception):
+        flown |= {run: _tried(lambda run=run: simulate(missions[run])) for run in whole}
+    else:
+        flown |= dict(zip(whole, together, strict=True))
+    shared = (perf_counter() - begun) / len(runs)
+    return [_row(sweep, run, flown[run], shared) for run in runs]
+
+
+def _tried(job: Callable[[], Any]) -> Any:
+    """What a function returns, or its exception: one failed run must not end the sweep."""
+    try:
+        return job()
+    except Exception as error:
+        if isinstance(error.__context__ or error.__cause__, KeyboardInterrupt):
+            raise  # Ctrl-C, turned into another exception by the compiler
+        return error
+
+
+def _row(sweep: Sweep, run: int, flown: Result | Exception, shared: float) -> RunRecord:
+    """Judge a flight and measure it; ``shared`` is its share of the time that its group has taken so far [s]."""
     begun = perf_counter()
     values = sweep.values(run)
     codes = tuple(c.variation.code(v) for c, v in zip(sweep.columns, values, strict=True))
     metrics = dict.fromkeys(METRICS, math.nan)
-    try:
-        result = simulate(sweep.mission_of(run))
-        verdict = assess(result)
-        metrics = measure(result, verdict)
-        failed = [f for f in verdict.checks if not f.passed]
-        reason = ", ".join(dict.fromkeys(f.check for f in failed))
-        detail = failed[0].message if failed else ""
-    except MissionError as error:
-        reason, detail = refusal(error)
-    except Exception as error:  # one failed run must not end the sweep
-        if isinstance(error.__context__ or error.__cause__, KeyboardInterrupt):
-            raise  # Ctrl-C, turned into another exception by the compiler
-        reason, detail = BROKEN, f"{type(error).__name__}: {error}"
-    wall = perf_counter() - begun
+    found = flown if isinstance(flown, Exception) else _tried(lambda: _judged(flown))
+    match found:
+        case MissionError():
+            reason, detail = refusal(found)
+        case Exception():
+            reason, detail = BROKEN, f"{type(found).__name__}: {found}"
+        case _:
+            metrics, reason, detail = found
+    wall = shared + perf_counter() - begun
     return RunRecord(run, not reason, reason, " ".join(detail.split()), codes, metrics, wall)
+
+
+def _judged(result: Result) -> tuple[dict[str, float], str, str]:
+    """Metrics of a flight, and why it has failed."""
+    from rigidfleet.assessment import assess
+
+    verdict = assess(result)
+    failed = [f for f in verdict.checks if not f.passed]
+    reason = ", ".join(dict.fromkeys(f.check for f in failed))
+    return measure(result, verdict), reason, failed[0].message if failed else ""

@@ -6,6 +6,7 @@ the lanes share their steps. For a single flight, `in_vectors` views eight conse
 so that the integrator's sums use the machine's vector registers.
 """
 
+import math
 import operator
 from functools import partial
 from typing import Any
@@ -71,12 +72,18 @@ class LaneArray(np.ndarray):
 def pack(values: Floats) -> LaneArray:
     """An array (...) of lanes from float64 (..., 8): a copy, aligned for vectors."""
     values = np.asarray(values, dtype=np.float64)
-    memory = np.empty(values.size + WIDTH)
+    packed = empty(values.shape[:-1])
+    unpack(packed)[...] = values
+    return packed
+
+
+def empty(shape: tuple[int, ...]) -> LaneArray:
+    """An array of lanes with any numbers, aligned for vectors."""
+    size = WIDTH * math.prod(shape)
+    memory = np.empty(size + WIDTH)
     skip = -memory.ctypes.data // memory.itemsize % WIDTH
-    flat = memory[skip : skip + values.size]
-    flat[:] = values.ravel()
-    kind = np.dtype((np.void, WIDTH * flat.itemsize))
-    return flat.view(kind).reshape(values.shape[:-1]).view(LaneArray)
+    kind = np.dtype((np.void, WIDTH * memory.itemsize))
+    return memory[skip : skip + size].view(kind).reshape(shape).view(LaneArray)
 
 
 def unpack(array: NDArray[Any]) -> Floats:
@@ -263,6 +270,38 @@ def filled(_context, x):
         return in_all(builder, context.cast(builder, args[0], sig.args[0], types.float64))
 
     return lanes(x), generate
+
+
+@intrinsic
+def collected(_context, addresses, offset):
+    """Lanes of the numbers at eight addresses (8,), plus an offset in numbers."""
+
+    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        given = context.make_array(sig.args[0])(context, builder, args[0]).data
+        pointer, found = ir.DoubleType().as_pointer(), ir.Constant(VECTOR, ir.Undefined)
+        for lane in range(WIDTH):
+            place = builder.load(builder.gep(given, [ir.Constant(_INDEX, lane)]))
+            place = builder.gep(builder.inttoptr(place, pointer), [args[1]])
+            found = builder.insert_element(found, builder.load(place), ir.Constant(_INDEX, lane))
+        return found
+
+    return lanes(addresses, types.int64), generate
+
+
+@intrinsic
+def spread(_context, x, addresses, offset):
+    """Store each lane of x at one of eight addresses (8,), plus an offset in numbers."""
+
+    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        given = context.make_array(sig.args[1])(context, builder, args[1]).data
+        pointer = ir.DoubleType().as_pointer()
+        for lane in range(WIDTH):
+            place = builder.load(builder.gep(given, [ir.Constant(_INDEX, lane)]))
+            place = builder.gep(builder.inttoptr(place, pointer), [args[2]])
+            builder.store(builder.extract_element(args[0], ir.Constant(_INDEX, lane)), place)
+        return context.get_dummy_value()
+
+    return types.void(lanes, addresses, types.int64), generate
 
 
 @intrinsic

@@ -1,8 +1,8 @@
-"""Many flights of one problem: eight flights per SIMD vector, and vectors distributed over the cores."""
+"""Eight flights per SIMD vector: many flights of one problem, over all cores, or eight flights of missions that vary."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -13,9 +13,33 @@ from rigidfleet.kernel.compiler.jit import compiled
 from rigidfleet.kernel.compiler.pointers import by_address
 from rigidfleet.kernel.compiler.simd import WIDTH, LaneArray, pack, unpack
 from rigidfleet.kernel.engine import lane_steps, native
-from rigidfleet.kernel.engine.codegen import integrate, unrolled
-from rigidfleet.kernel.problem import EXACT, ITERATED, OPEN, SHAPE, Problem, padded, workspace
-from rigidfleet.kernel.records import FINISHED, LEAST_ERROR, NO_TRAIL, IntegratorState, integrator
+from rigidfleet.kernel.engine.codegen import (
+    Tables,
+    integrate,
+    interleaved,
+    unrolled,
+    unrolled_together,
+)
+from rigidfleet.kernel.problem import (
+    EXACT,
+    ITERATED,
+    OPEN,
+    SHAPE,
+    TRACKING,
+    Disturbance,
+    Problem,
+    Reference,
+    padded,
+    workspace,
+)
+from rigidfleet.kernel.records import (
+    ATOL,
+    FINISHED,
+    LEAST_ERROR,
+    NO_TRAIL,
+    IntegratorState,
+    integrator,
+)
 from rigidfleet.typing import Bools, Floats, Ints
 
 #: Number of ranges of flights per thread; each range is taken by the next free thread.
@@ -51,6 +75,13 @@ def fly(p, state, t0, t_end, step, starts, before, ends, status, evaluations, ma
             ends[g, q] = state.y[q]
 
 
+@compiled
+def fly_on(p, state, t_end, fresh, times, unsampled, max_steps):
+    """Integrate eight flights to ``t_end`` [s], see `dopri5.integrate`; p is an `UnrolledProblem`."""
+    p, state = by_address(p), by_address(state)
+    return integrate(p, p, state, t_end, fresh, times, unsampled, max_steps)
+
+
 @dataclass(frozen=True)
 class FinalStates:
     """Final states of flights.
@@ -72,16 +103,130 @@ def fits(problem: Problem) -> bool:
 
     Its branches must not depend on the state, and its code must not be too long to be compiled.
     """
-    edges, agents = len(problem.graph.edges), len(problem.vehicles.m)
-    equations = min(edges, 3 * agents) if problem.law.solver == ITERATED else edges
     return (
         problem.control.kind == OPEN
         and problem.law.solver in (ITERATED, EXACT)
         and problem.reference.kind != SHAPE
         and not (problem.has_frame or problem.body_formulation or problem.disturbance.active)
         and problem.external == 0
-        and equations <= _MOST_EQUATIONS
+        and _equations(problem) <= _MOST_EQUATIONS
     )
+
+
+def _equations(problem: Problem) -> int:
+    edges, agents = len(problem.graph.edges), len(problem.vehicles.m)
+    return min(edges, 3 * agents) if problem.law.solver == ITERATED else edges
+
+
+def fit_together(problems: Sequence[Problem]) -> bool:
+    """Return whether problems differ in nothing but numbers and tables over time, and suit straight-line code.
+
+    They must have the same graph, laws, blend and knots, and no branch that depends on the state.
+    """
+    first = problems[0]
+    if not (
+        first.control.kind in (OPEN, TRACKING)
+        and first.law.solver in (ITERATED, EXACT)
+        and first.graph.solver == 0
+        and first.motion.coefficients.shape[2] == 6
+        and _equations(first) <= _MOST_EQUATIONS
+    ):
+        return False
+    return all(
+        not (x.has_frame or x.body_formulation or x.external or x.disturbance.lost.any())
+        and len(x.reference.knots) == 0
+        and x.vehicles.saturate == first.vehicles.saturate
+        and x.law.solver == first.law.solver
+        and x.law.iterations == first.law.iterations
+        and x.control.kind == first.control.kind
+        and _blend(x.reference) == _blend(first.reference)
+        and _tables(x.disturbance) == _tables(first.disturbance)
+        and np.array_equal(x.graph.edges, first.graph.edges)
+        and np.array_equal(x.motion.knots, first.motion.knots)
+        for x in problems
+    )
+
+
+def _blend(reference: Reference) -> tuple[int, float, float]:
+    return reference.kind, reference.t0, reference.T_b
+
+
+def _tables(given: Disturbance) -> tuple[object, ...]:
+    return (
+        given.active, given.gust.shape, given.noise_r.shape, given.noise_v.shape, given.gust_step, given.noise_step,
+    )  # fmt: skip
+
+
+class Vector:
+    """Eight flights in the lanes of a vector, integrated in common steps.
+
+    Parameters
+    ----------
+    problems : of eight flights, which `fit_together`
+    states : (8,) of their integrators, at one time; their trails have the same number of rows
+    given : tables of their disturbances
+    times, samples : times (K,) [s] to record, and an array (K, n) for each flight
+
+    Raises
+    ------
+    UnfitError
+        The problems take different branches.
+    """
+
+    def __init__(
+        self,
+        problems: Sequence[Problem],
+        states: Sequence[IntegratorState],
+        given: Tables,
+        times: Floats,
+        samples: Sequence[Floats],
+    ) -> None:
+        self._states, self._samples, self._times = states, samples, times
+        self._problem = unrolled_together(_alike(problems), given)
+        trails = [state.trail for state in states]
+        kept = [
+            [t.points for t in trails], [t.gauge for t in trails], [t.start for t in trails], samples,
+            [t.clock for t in trails],
+        ]  # fmt: skip
+        self._problem.kept[:] = [[x.ctypes.data for x in row] for row in kept]
+        n = len(states[0].y)
+        K = pack(np.zeros((lane_steps.ROWS, n, WIDTH)))
+        K[lane_steps.ATOL] = interleaved([state.K[ATOL, :n] for state in states])
+        clock = np.array([states[0].clock[0], _FIRST_STEP_IN_VECTORS, LEAST_ERROR])
+        trail = NO_TRAIL._replace(clock=trails[0].clock)  # for its length
+        y, counts = interleaved([state.y for state in states]), np.zeros(5, dtype=np.int64)
+        self._state = IntegratorState(y, K, clock, counts, states[0].rtol, trail)
+        self._fresh = True
+
+    def __call__(self, t_end: float, max_steps: int) -> int:
+        """Go on to ``t_end`` [s]; return what `dopri5.integrate` returns. States, trails and samples are then known."""
+        state = self._state
+        state.count[4] = self._states[0].count[4]
+        status = fly_on(
+            self._problem, state, t_end, self._fresh, self._times, _UNSAMPLED, max_steps
+        )
+        self._fresh = False
+        y = unpack(state.y)
+        for lane, own in enumerate(self._states):
+            own.y[:] = y[:, lane]
+            own.clock[:], own.count[:] = state.clock, state.count
+        return status
+
+
+_UNSAMPLED = pack(np.zeros((0, 1, WIDTH)))
+#: What turns slots that do not turn, where others do: too little to count, yet a direction [rad].
+_BARELY = np.array([0.0, 0.0, 1e-150])
+
+
+def _alike(problems: Sequence[Problem]) -> Sequence[Problem]:
+    """The problems, of which either all turn their slots, or none."""
+    turns = [bool(p.reference.turn.any()) for p in problems]
+    if all(turns) or not any(turns):
+        return problems
+    return [
+        p if turn else p._replace(reference=p.reference._replace(turn=_BARELY))
+        for p, turn in zip(problems, turns, strict=True)
+    ]
 
 
 def fly_all(

@@ -1,4 +1,4 @@
-"""Fly eight flights of one problem at a time, with straight-line code generated for it.
+"""Fly eight flights at a time, of one problem or of problems that differ in numbers, with straight-line code.
 
 `rigidfleet.kernel.engine.tracer` generates the code of the right-hand side. It is compiled once for each
 structure of a problem (its graph, its law, which of its numbers are equal). The integrator is that of
@@ -7,7 +7,9 @@ single flights, compiled once for vectors.
 
 from __future__ import annotations
 
+import ctypes
 import hashlib
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,53 +19,144 @@ from numba.extending import intrinsic
 
 from rigidfleet.kernel import dopri5
 from rigidfleet.kernel.compiler import simd
-from rigidfleet.kernel.compiler.jit import compiled_copy, compiled_for_c, inlined
-from rigidfleet.kernel.compiler.simd import VECTOR, WIDTH, LaneArray
+from rigidfleet.kernel.compiler.jit import compiled, compiled_copy, compiled_for_c, inlined
+from rigidfleet.kernel.compiler.simd import VECTOR, WIDTH, LaneArray, collected
+from rigidfleet.kernel.control import piece_at
+from rigidfleet.kernel.disturbances import spline_weights
 from rigidfleet.kernel.engine import lane_steps
-from rigidfleet.kernel.engine.tracer import Code, Symbol, Trace, structure
-from rigidfleet.kernel.problem import Problem
+from rigidfleet.kernel.engine.tracer import (
+    MOMENT,
+    SOURCES,
+    Code,
+    FlightTrace,
+    Symbol,
+    Trace,
+    flight_structure,
+    numbers,
+    structure,
+)
+from rigidfleet.kernel.problem import Disturbance, Problem
 from rigidfleet.kernel.references import septic
-from rigidfleet.typing import Floats
+from rigidfleet.typing import Floats, Ints
 
 
 class UnrolledProblem(NamedTuple):
-    """A problem in the form that straight-line code reads; ``before`` and ``time`` are overwritten in flight."""
+    """A problem in the form that straight-line code reads; arrays of lanes hold a number of each of eight flights.
+
+    ``before``, ``time`` and ``gauge`` are overwritten in flight. Tables over time have no rows if there are none.
+    """
 
     address: int  # of the code
-    uniform: Floats  # (U,) values that depend on the problem's numbers alone
+    uniform: LaneArray  # (U,) values that depend on the problem's numbers alone
     before: LaneArray  # (m,) distances from which references are blended [m]
-    time: Floats  # (3,) blend of the references, and two derivatives
+    time: Floats  # (12,) numbers of the moment, see `tracer`
+    gauge: LaneArray  # (3N + 2m,) forces to watch, or (0,)
     t0: float  # [s]
     T_b: float  # [s]
+    knots: Floats  # of the reference motion [s]
+    motion: LaneArray  # (pieces, 36) its coefficients
+    gust_step: float  # [s]
+    gust: LaneArray  # (K, 3N)
+    noise_step: float  # [s]
+    noise_r: LaneArray  # (K, 3N)
+    noise_v: LaneArray  # (K, 3N)
+    # (5, 8) addresses of each flight's steps, forces, forces at the start, samples, and times; see `lane_steps`
+    kept: Ints
 
 
 def unrolled(problem: Problem) -> UnrolledProblem:
-    """Prepare a problem for `integrate`; compile its code if it is not yet in the cache.
+    """Prepare a problem of eight flights for `integrate`; compile its code if it is not yet in the cache.
 
     Raises
     ------
     UnfitError
         The problem has branches that depend on the state.
     """
-    description, numbers, _ = structure(problem)
-    name = hashlib.sha256(description).hexdigest()[:16]
-    if name not in _KNOWN:
-        code = Code(Trace(problem))
-        _KNOWN[name] = code, _compile(code, name)
-    code, address = _KNOWN[name]
-    reference = problem.reference
-    before = simd.pack(np.zeros((len(problem.graph.edges), WIDTH)))
-    return UnrolledProblem(
-        address, code.values(numbers), before, np.zeros(3), reference.t0, reference.T_b
+    description, values, _ = structure(problem)
+    return _prepared(problem, description, values[:, None], lambda: Trace(problem))
+
+
+def unrolled_together(problems: Sequence[Problem], tables: Tables) -> UnrolledProblem:
+    """Prepare eight problems, which `batch.fit_together`, of one flight each; with their tables of disturbances.
+
+    Raises
+    ------
+    UnfitError
+        The problems have branches that depend on the state, or take different ones.
+    """
+    first, values = problems[0], numbers(problems)
+    ready = _prepared(first, flight_structure(first, values), values, lambda: FlightTrace(first, values))
+    before = interleaved([p.reference.d0 for p in problems])
+    motion = interleaved([p.motion.coefficients for p in problems])
+    return ready._replace(
+        before=before, knots=first.motion.knots, motion=motion.reshape(-1, 36), **tables._asdict()
     )
 
 
-_KNOWN: dict[str, tuple[Code, int]] = {}
+class Tables(NamedTuple):
+    """Gusts and noise of eight flights, as in `UnrolledProblem`."""
+
+    gust_step: float
+    gust: LaneArray
+    noise_step: float
+    noise_r: LaneArray
+    noise_v: LaneArray
+
+
+def tables(given: Sequence[Disturbance]) -> Tables:
+    """The tables of the disturbances of eight flights."""
+
+    def packed(name: str) -> LaneArray:
+        parts = [getattr(x, name) for x in given]
+        rows, agents, _ = parts[0].shape
+        return interleaved(parts).reshape(rows, 3 * agents)
+
+    return Tables(
+        given[0].gust_step, packed("gust"), given[0].noise_step, packed("noise_r"), packed("noise_v")
+    )
+
+
+def interleaved(parts: Sequence[Floats]) -> LaneArray:
+    """Lanes of eight arrays of one shape (...), one after the other in C order."""
+    parts = [np.ascontiguousarray(x) for x in parts]
+    made = simd.empty((parts[0].size,))
+    _interleave(np.array([x.ctypes.data for x in parts]), made)
+    return made
+
+
+@compiled
+def _interleave(addresses, made):
+    for k in range(made.shape[0]):
+        made[k] = collected(addresses, k)
+
+
+def _prepared(
+    problem: Problem, description: bytes, values: Floats, trace: Callable[[], Trace]
+) -> UnrolledProblem:
+    name = hashlib.sha256(description).hexdigest()[:16]
+    if name not in _KNOWN:
+        code = Code(trace())
+        _KNOWN[name] = code, _compile(code, name), _compile_before(code, name)
+    code, address, before = _KNOWN[name]
+    uniform, given = simd.empty((len(code.inputs),)), simd.pack(np.broadcast_to(values, (len(values), WIDTH)))
+    before(given.ctypes.data, uniform.ctypes.data)
+    edges, reference = len(problem.graph.edges), problem.reference
+    none = simd.empty((0, 1))
+    return UnrolledProblem(
+        address, uniform, simd.pack(np.zeros((edges, WIDTH))), np.zeros(MOMENT),
+        simd.pack(np.zeros((len(code.gauge), WIDTH))), reference.t0, reference.T_b,
+        np.zeros(0), none, 1.0, none, 1.0, none, none, np.zeros((5, WIDTH), dtype=np.int64),
+    )  # fmt: skip
+
+
+#: Code by its structure, the address of what is computed in flight, and a function of two addresses that computes what
+#: is known before.
+_KNOWN: dict[str, tuple[Code, int, Callable[[int, int], None]]] = {}
 
 
 @intrinsic
-def _call_code(_context, address, y, dy, uniform, before, time):
-    """Call straight-line code with the data of five arrays."""
+def _call_code(_context, address, y, dy, gauge, uniform, before, time, motion, gust, noise_r, noise_v):
+    """Call straight-line code with the data of arrays."""
 
     def generate(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
         pointer = ir.DoubleType().as_pointer()
@@ -75,13 +168,25 @@ def _call_code(_context, address, y, dy, uniform, before, time):
         builder.call(builder.inttoptr(arguments[0], kind.as_pointer()), data)
         return context.get_dummy_value()
 
-    return types.void(types.int64, y, dy, uniform, before, time), generate
+    arrays = y, dy, gauge, uniform, before, time, motion, gust, noise_r, noise_v
+    return types.void(types.int64, *arrays), generate
 
 
 @inlined
 def _closed_loop(t, y, dy, p, w):
-    p.time[0], p.time[1], p.time[2] = septic(t, p.t0, p.T_b)
-    _call_code(p.address, y, dy, p.uniform, p.before, p.time)
+    time = p.time
+    time[0], time[1], time[2] = septic(t, p.t0, p.T_b)
+    piece = gust = noise = 0
+    if p.motion.shape[0] > 0:
+        piece, time[3], _ = piece_at(t, p.knots)
+    if p.gust.shape[0] > 0:
+        gust, time[4], time[5], time[6], time[7] = spline_weights(t, p.gust_step, p.gust.shape[0])
+    if p.noise_r.shape[0] > 0:
+        noise, time[8], time[9], time[10], time[11] = spline_weights(t, p.noise_step, p.noise_r.shape[0])
+    _call_code(
+        p.address, y, dy, p.gauge, p.uniform, p.before, time, p.motion[piece:], p.gust[gust:], p.noise_r[noise:],
+        p.noise_v[noise:],
+    )  # fmt: skip
 
 
 #: As `dopri5.integrate`, by the steps of `lane_steps`; p is an `UnrolledProblem`, w is not used, arrays hold lanes.
@@ -90,68 +195,124 @@ integrate = compiled_copy(
 )
 
 
-def _lines(y, dy, uniform, before, time):
+def _lines(y, dy, gauge, uniform, before, time, motion, gust, noise_r, noise_v):
     """Straight-line code: each copy of `_derivative` has its own."""
     raise NotImplementedError
 
 
-def _derivative(y, dy, uniform, before, time):
-    _lines(y, dy, uniform, before, time)
+def _derivative(y, dy, gauge, uniform, before, time, motion, gust, noise_r, noise_v):
+    _lines(y, dy, gauge, uniform, before, time, motion, gust, noise_r, noise_v)
+
+
+#: Number of arrays that the code takes.
+_ARRAYS = _derivative.__code__.co_argcount
 
 
 def _compile(code: Code, name: str) -> int:
     """Compile straight-line code, or find it compiled on disk; return its address."""
 
     @intrinsic
-    def lines(_context, y, dy, uniform, before, time):
+    def lines(_context, y, dy, gauge, uniform, before, time, motion, gust, noise_r, noise_v):
         def generate(context: Any, builder: Any, _sig: Any, arguments: Any) -> Any:
             builder.call(_emit(builder.module, code), arguments)
             return context.get_dummy_value()
 
-        return types.void(y, dy, uniform, before, time), generate
+        arrays = y, dy, gauge, uniform, before, time, motion, gust, noise_r, noise_v
+        return types.void(*arrays), generate
 
-    return compiled_for_c(_derivative, f"derivative_{name}", arguments=5, _lines=lines)
+    return compiled_for_c(_derivative, f"derivative_{name}", arguments=_ARRAYS, _lines=lines)
+
+
+def _numbers_before(given, uniform):
+    """What depends on a problem's numbers alone: each copy of `_before` has its own."""
+    raise NotImplementedError
+
+
+def _before(given, uniform):
+    _numbers_before(given, uniform)
+
+
+def _compile_before(code: Code, name: str) -> Callable[[int, int], None]:
+    """Compile what is known before a flight: a function of the addresses of numbers (D,) and inputs (U,), in lanes."""
+
+    @intrinsic
+    def numbers_before(_context, given, uniform):
+        def generate(context: Any, builder: Any, _sig: Any, arguments: Any) -> Any:
+            numbers, inputs = arguments
+            load = lambda b, x: b.load(_element(b, numbers, x.arguments[0]), align=8)  # noqa: E731
+            value = _valued(builder, load)
+            for x in code.before:
+                value(x)
+            for index, x in enumerate(code.inputs):
+                builder.store(value(x), _element(builder, inputs, index), align=8)
+            return context.get_dummy_value()
+
+        return types.void(given, uniform), generate
+
+    address = compiled_for_c(
+        _before, f"before_{name}", arguments=2, _numbers_before=numbers_before
+    )
+    return ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)(address)
+
+
+def _element(builder: ir.IRBuilder, array: ir.Value, index: int) -> ir.Value:
+    """Place of lanes in an array."""
+    vectors = builder.bitcast(array, VECTOR.as_pointer())
+    return builder.gep(vectors, [ir.Constant(ir.IntType(64), index)])
+
+
+def _valued(
+    builder: ir.IRBuilder, load: Callable[[ir.IRBuilder, Symbol], ir.Value], known: Sequence[Symbol] = ()
+) -> Callable[[Symbol | float], ir.Value]:
+    """A function that returns the value of a symbol whose arguments it has returned before.
+
+    Sources and the symbols ``known`` are loaded, at their first use.
+    """
+    values: dict[int, ir.Value] = {}
+    loaded = {x.serial for x in known}
+
+    def value(x: Symbol | float) -> ir.Value:
+        if not isinstance(x, Symbol):
+            return simd.number(x)
+        if x.serial not in values:
+            if x.serial in loaded or x.operation in SOURCES:
+                values[x.serial] = load(builder, x)
+            else:
+                values[x.serial] = simd.BUILD[x.operation](builder, *map(value, x.arguments))
+        return values[x.serial]
+
+    return value
 
 
 def _emit(module: ir.Module, code: Code) -> ir.Function:
-    """Write the code as a function of pointers to y, dy, uniform, before and time."""
+    """Write the code as a function of pointers to the arrays of `_derivative`."""
     pointer = ir.DoubleType().as_pointer()
-    function = ir.Function(module, ir.FunctionType(ir.VoidType(), [pointer] * 5), "straight_line")
+    kind = ir.FunctionType(ir.VoidType(), [pointer] * _ARRAYS)
+    function = ir.Function(module, kind, "straight_line")
     function.linkage = "internal"
     function.attributes.add("noinline")
     for argument in function.args:
         argument.add_attribute("noalias")
-    y, dy, uniform, before, time = function.args
+    y, dy, gauge, uniform, before, time, *rows = function.args
     builder = ir.IRBuilder(function.append_basic_block())
-    values: dict[int, ir.Value] = {}
-
-    def element(array: ir.Value, index: int) -> ir.Value:
-        vectors = builder.bitcast(array, VECTOR.as_pointer())
-        return builder.gep(vectors, [ir.Constant(ir.IntType(64), index)])
-
-    def scalar(array: ir.Value, index: int) -> ir.Value:
-        place = builder.gep(array, [ir.Constant(ir.IntType(64), index)])
-        return simd.in_all(builder, builder.load(place))
-
     inputs = {x.serial: index for index, x in enumerate(code.inputs)}
 
-    def value(x: Symbol | float) -> ir.Value:
-        """The value of a symbol, computed already or loaded at its first use."""
-        if not isinstance(x, Symbol):
-            return simd.number(x)
-        if x.serial not in values:
-            if x.serial in inputs:
-                found = scalar(uniform, inputs[x.serial])
-            elif x.operation == "time":
-                found = scalar(time, x.arguments[0])
-            else:
-                array = {"y": y, "before": before}[x.operation]
-                found = builder.load(element(array, x.arguments[0]), align=8)
-            values[x.serial] = found
-        return values[x.serial]
+    def load(builder: ir.IRBuilder, x: Symbol) -> ir.Value:
+        match x.operation, *x.arguments:
+            case _ if x.serial in inputs:
+                array, index = uniform, inputs[x.serial]
+            case "time", place:
+                number = builder.gep(time, [ir.Constant(ir.IntType(64), place)])
+                return simd.in_all(builder, builder.load(number))
+            case "table", which, index:
+                array = rows[which]
+            case operation, index:
+                array = {"y": y, "before": before}[operation]
+        return builder.load(_element(builder, array, index), align=8)
 
+    value = _valued(builder, load, code.inputs)
     for x in code.lines:
-        values[x.serial] = simd.BUILD[x.operation](builder, *map(value, x.arguments))
+        value(x)
     whole = [builder.fcmp_ordered(">", value(x), simd.number(0.0)) for x in code.positive]
     for index, x in enumerate(code.outputs):
         if index < code.coordinates:  # a velocity, see `lane_steps`
@@ -160,6 +321,8 @@ def _emit(module: ir.Module, code: Code) -> ir.Function:
         if index == code.coordinates:  # one state without a derivative is enough
             for good in whole:
                 found = builder.select(good, found, simd.number(float("nan")))
-        builder.store(found, element(dy, index), align=8)
+        builder.store(found, _element(builder, dy, index), align=8)
+    for index, x in enumerate(code.gauge):
+        builder.store(value(x), _element(builder, gauge, index), align=8)
     builder.ret_void()
     return function

@@ -13,9 +13,13 @@ Both sums load the same numbers, and derivatives of positions are neither stored
 [r (3N), v (3N), int c (m)].
 """
 
+import math
+
 import numpy as np
 
 from rigidfleet.kernel.compiler.jit import compiled, inlined
+from rigidfleet.kernel.compiler.simd import spread
+from rigidfleet.kernel.dopri5 import until_knot
 from rigidfleet.kernel.vectors import filled, rough_inverse
 
 #: Number of stages; rows of `IntegratorState.K` after them.
@@ -50,8 +54,12 @@ _LATE = (
 )  # fmt: skip
 #: Weights of the stages in the estimate that controls the steps.
 E = 1.5 * _EARLY - 0.5 * _LATE
-# Weights of accelerations in positions and in their error.
-_AA, _EA = A @ A, E @ A
+#: Weights of the stages halfway through a step, of fifth order, too.
+HALF = np.array(
+    [455 / 6144, 0, 10256301 / 35409920, 2307361 / 17971200, -387 / 102400, 73 / 5130, -7267 / 215040, 1 / 32]
+)  # fmt: skip
+# Weights of accelerations in positions, in their error, and halfway.
+_AA, _EA, _HALF_A = A @ A, E @ A, HALF @ A
 
 
 @compiled
@@ -157,18 +165,77 @@ def squared_errors(k, h, rtol, p):
 
 @inlined
 def step_size(t, h, t_end, p):
-    """As `dopri5.step_size`: ensembles have no disturbances."""
-    return min(h, t_end - t)
+    """As `dopri5.step_size`."""
+    rest = t_end - t
+    if p.noise_r.shape[0] == 0 and p.gust.shape[0] == 0:
+        return min(h, rest)
+    if p.noise_r.shape[0] > 0:
+        rest = min(rest, until_knot(t, p.noise_step))
+    if p.gust.shape[0] > 0:
+        rest = min(rest, until_knot(t, p.gust_step))
+    return rest / max(1.0, math.ceil(rest / h - 0.05))
 
 
 @inlined
+def _points(k, q, coordinates, h):
+    """Bernstein coefficients of a state's continuous extension.
+
+    It is the polynomial of fourth degree with the states and derivatives at both ends, and the state halfway.
+    """
+    y, y_new = k[STATE, q], k[TRIAL, q]
+    if q < coordinates:
+        i = coordinates + q
+        w = _HALF_A
+        middle = y + (0.5 * h) * k[STATE, i]
+        middle += (h * h) * (_sum(k, i, w, STAGES - 1, False) + w[7] * k[7, i])
+        first, last = y + (0.25 * h) * k[STATE, i], y_new - (0.25 * h) * k[TRIAL, i]
+    else:
+        middle = y + h * (_sum(k, q, HALF, STAGES - 1, True) + HALF[7] * k[7, q])
+        first, last = y + (0.25 * h) * k[0, q], y_new - (0.25 * h) * k[7, q]
+    return y, first, (16.0 * middle - (y + y_new) - 4.0 * (first + last)) * (1 / 6), last, y_new
+
+
+@compiled
 def keep_step(t, h, p, w, state):
-    """Do nothing: flights of an ensemble record no trail."""
+    """As `dopri5.keep_step`, for each flight into its own trail."""
+    k, row = state.K, state.count[4]
+    n, forces = k.shape[1], p.gauge.shape[0]
+    spread(filled(t), p.kept[4], 2 * row)
+    spread(filled(h), p.kept[4], 2 * row + 1)
+    for q in range(n):
+        a, b, c, d, e = _points(k, q, _coordinates(k, p), h)
+        place = 5 * n * row + q
+        spread(a, p.kept[0], place)
+        spread(b, p.kept[0], place + n)
+        spread(c, p.kept[0], place + 2 * n)
+        spread(d, p.kept[0], place + 3 * n)
+        spread(e, p.kept[0], place + 4 * n)
+    for g in range(forces):
+        spread(p.gauge[g], p.kept[1], forces * row + g)
+    state.count[4] = row + 1
 
 
-@inlined
+@compiled
 def keep_start(p, w, state):
-    """Do nothing: flights of an ensemble record no forces."""
+    """As `dopri5.keep_start`, for each flight into its own trail."""
+    for g in range(p.gauge.shape[0]):
+        spread(p.gauge[g], p.kept[2], g)
+
+
+@compiled
+def keep_samples(t, h, t_new, times, samples, p, state):
+    """As `dopri5.keep_samples`, for each flight into its own samples."""
+    k, count = state.K, state.count
+    n = k.shape[1]
+    while count[3] < times.shape[0] and times[count[3]] <= t_new:
+        x = (times[count[3]] - t) / h
+        z = 1.0 - x
+        for q in range(n):
+            a, b, c, d, e = _points(k, q, _coordinates(k, p), h)
+            value = (z * z) * ((z * z) * a + (4.0 * x * z) * b + (6.0 * x * x) * c)
+            value += (x * x * x) * ((4.0 * z) * d + x * e)
+            spread(value, p.kept[3], n * count[3] + q)
+        count[3] += 1
 
 
 #: What differs from `dopri5.integrate`.
@@ -180,6 +247,7 @@ INSTEAD = {
     "TRIAL": TRIAL,
     "advance": advance,
     "forget_stages": forget_stages,
+    "keep_samples": keep_samples,
     "keep_start": keep_start,
     "keep_step": keep_step,
     "squared_errors": squared_errors,

@@ -96,10 +96,16 @@ def _integrator(problem: Problem, workspace: Workspace) -> Any:
     return code.integrate_three if sizes == (3, 3, 3, 3) else code.integrate
 
 
-def record(problem: Problem, workspace: Workspace, times: Floats, samples: Floats) -> Record:
-    """Forces and references at states ``samples`` (K, n) at ``times`` (K,) [s]."""
-    n, m = len(problem.vehicles.m), len(problem.graph.edges)
-    out = recorder(len(times), n, m)
+def record(
+    problem: Problem,
+    workspace: Workspace,
+    times: Floats,
+    samples: Floats,
+    out: Record | None = None,
+) -> Record:
+    """Forces and references at states ``samples`` (K, n) at ``times`` (K,) [s], into the rows ``out`` if given."""
+    if out is None:
+        out = recorder(len(times), len(problem.vehicles.m), len(problem.graph.edges))
     segment = Segment(0.0, False, 0, times, samples, np.empty(samples.shape[1]))
     _call(_code().record, packed(problem), packed(workspace), pack(segment), pack(out))
     return out

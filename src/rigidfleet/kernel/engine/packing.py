@@ -186,20 +186,26 @@ def pack(x: Any) -> Packed:
 
 
 class _Last(threading.local):
-    """The last tuple of each type packed by a thread: flights call the kernel with the same ones repeatedly."""
+    """The tuples that a thread packed last, by their identity: flights call the kernel with the same ones repeatedly."""
 
     def __init__(self) -> None:
-        self.packed: dict[type, Packed] = {}
+        self.packed: dict[int, Packed] = {}
 
 
 _last = _Last()
+#: How many of them are kept: those of eight flights side by side.
+_KEPT = 32
 
 
 def packed(x: Any) -> Packed:
-    """`pack`, unless the last named tuple of this type that the thread packed is the same one."""
-    found = _last.packed.get(type(x))
+    """`pack`, unless the named tuple is among the last ones that the thread has packed."""
+    kept = _last.packed
+    found = kept.get(id(x))
     if found is None or found.of is not x:
-        found = _last.packed[type(x)] = pack(x)
+        found = pack(x)
+        if len(kept) >= _KEPT:
+            del kept[next(iter(kept))]
+        kept[id(x)] = found
     return found
 
 

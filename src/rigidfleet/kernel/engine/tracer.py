@@ -1,15 +1,17 @@
-"""The closed loop of one problem as straight-line code, generated from the kernel's own source.
+"""The closed loop of a problem as straight-line code, generated from the kernel's own source.
 
 The kernel's functions run once in plain Python, with symbols in place of numbers, and all operations on
 the symbols are recorded. The result has no loops, indices, branches, products with zero or repeated
 computations. Whatever depends on masses and gains alone is computed before the flight.
-`rigidfleet.kernel.engine.codegen` compiles the rest for eight flights at a time.
+`rigidfleet.kernel.engine.codegen` compiles the rest for eight flights at a time: eight flights of one problem
+(`Trace`), or one of each of eight problems that differ in their numbers alone (`FlightTrace`).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from operator import attrgetter
 from types import FunctionType, SimpleNamespace
 from typing import Any
 
@@ -17,28 +19,22 @@ import numpy as np
 from numba.core.dispatcher import Dispatcher
 from numpy.typing import NDArray
 
-from rigidfleet.kernel import dynamics
+from rigidfleet.kernel import dynamics, gauge
 from rigidfleet.kernel.problem import EXACT, ITERATED, Graph, Problem, workspace
 from rigidfleet.typing import Floats, Ints
 
 #: Sources of a symbol's value, in the order in which they become known: numbers of the problem;
-#: numbers of the flight, of the moment, and of its state.
+#: numbers of the flight, of the moment (the same for all flights, or by flight), and of its state.
 UNIFORM, FLIGHT, TIME, STATE = range(4)
-_SOURCES = {"uniform": UNIFORM, "before": FLIGHT, "time": TIME, "y": STATE}
+SOURCES = {"uniform": UNIFORM, "before": FLIGHT, "time": TIME, "table": TIME, "y": STATE}
+#: Places among the moment's numbers: blend and two derivatives; time since the reference's piece began; weights of
+#: the gusts' and of the noise's splines.
+BLEND, SINCE, GUST, NOISE, MOMENT = 0, 3, 4, 8, 12
+#: Tables over time: pieces of the reference motion, gusts, noise of positions and of velocities.
+MOTION, GUSTS, NOISE_R, NOISE_V = range(4)
 
-_EVALUATE: dict[str, Callable[..., Any]] = {
-    "add": lambda a, b: a + b,
-    "sub": lambda a, b: a - b,
-    "mul": lambda a, b: a * b,
-    "neg": lambda a: -a,
-    "inverse": lambda a: 1.0 / a,
-    "inverse_root": lambda a: 1.0 / np.sqrt(a),
-    "root": lambda a, _: np.sqrt(a),
-    "max": max,
-    "min": min,
-    "abs": abs,
-    "where_positive": lambda x, a, b: a if x > 0.0 else b,
-}
+#: Terms of the series of functions of an angle, and the square of the greatest angle; exact to 1e-15 up to it.
+_TERMS, _WIDEST = 17, 16.0
 
 
 class UnfitError(ValueError):
@@ -54,7 +50,7 @@ class Symbol:
         self.trace, self.operation, self.arguments = trace, operation, arguments
         self.serial = len(trace.made)
         given = [x.known for x in arguments if isinstance(x, Symbol)]
-        self.known = _SOURCES[operation] if operation in _SOURCES else max(given, default=UNIFORM)
+        self.known = SOURCES[operation] if operation in SOURCES else max(given, default=UNIFORM)
 
     def __add__(self, other: Any) -> Any:
         return self.trace.add(self, other)
@@ -113,6 +109,7 @@ class Trace:
     ----------
     made : symbols by their operation and arguments
     outputs : (n,) the derivative of the state, symbols or numbers
+    gauge : (3N + 2m,) forces to watch, or none
     coordinates : number of coordinates of positions; their derivatives are velocities
     positive : symbols assumed positive; if one is not, the state has no derivative
 
@@ -127,25 +124,36 @@ class Trace:
             raise UnfitError("a law that continues if its matrix has no factor")
         self.made: dict[tuple[Any, ...], Symbol] = {}
         self.positive: list[Symbol] = []
-        _, self._values, which = structure(problem)
-        self._numbers = iter(which.tolist())
         n, m = len(problem.vehicles.m), len(problem.graph.edges)
+        order = elimination_order(problem.graph.edges)
         states = np.arange(6 * n + m)
-        states[6 * n :] += (order := elimination_order(problem.graph.edges)) - np.arange(m)
+        states[6 * n :] += order - np.arange(m)
         work = workspace(n, m, solver=problem.law.solver)
         w = type(work)(*(np.full(x.shape, 0.0, dtype=object) for x in work))
         y = np.array([self.symbol("y", q) for q in states.tolist()], dtype=object)
-        before = [self.symbol("before", k) for k in order.tolist()]
-        p = _used(problem)
-        p = p._replace(**{name: self._symbolic(getattr(p, name)) for name in _PARTS})
-        d0, d1 = np.array(before, dtype=object), p.reference.d1[order]
-        p = p._replace(graph=_ordered(p.graph, order), reference=p.reference._replace(d0=d0, d1=d1))
         dy = np.full(len(y), 0.0, dtype=object)
+        p = self._with_symbols(problem)
+        reference = p.reference._replace(d0=p.reference.d0[order], d1=p.reference.d1[order])
+        p = p._replace(graph=_ordered(p.graph, order), reference=reference)
         self._plain(dynamics.closed_loop)(0.0, y, dy, p, w)
         self.outputs: list[Any] = dy[np.argsort(states)].tolist()
         self.coordinates = 3 * n
         if any(self.outputs[q] is not y[3 * n + q] for q in range(3 * n)):
             raise UnfitError("a derivative of a position that is not the velocity")
+        self.gauge: list[Any] = self._gauge(p, w, order)
+
+    def _with_symbols(self, problem: Problem) -> Problem:
+        """The problem with symbols in place of its numbers."""
+        _, self._values, which = structure(problem)
+        self._numbers = iter(which.tolist())
+        p = _used(problem)
+        p = p._replace(**{name: self._symbolic(getattr(p, name)) for name in _PARTS})
+        before = [self.symbol("before", k) for k in range(len(problem.graph.edges))]
+        return p._replace(reference=p.reference._replace(d0=np.array(before, dtype=object)))
+
+    def _gauge(self, p: Problem, w: Any, order: Ints) -> list[Any]:
+        """Forces to watch, see `gauge.read_gauge`: none."""
+        return []
 
     def known_positive(self, x: Symbol) -> bool:
         """Whether a number of the problem is positive; `structure` distinguishes those that are not."""
@@ -203,6 +211,34 @@ class Trace:
             return math.sqrt(x)
         return self.symbol("root", x, self.symbol("inverse_root", x))
 
+    def _series(self, xx: Any, first: int, rate: int = 0) -> Any:
+        """Sum of (-xx)^k / (2 k + first)!, or its derivative with respect to xx; xx at most the square of `_WIDEST`."""
+        weights = [(-1.0) ** k / math.factorial(2 * k + first) for k in range(_TERMS)]
+        weights = [k * w for k, w in enumerate(weights)][1:] if rate else weights
+        total = weights[-1]
+        for weight in weights[-2::-1]:
+            total = total * xx + weight
+        return total
+
+    def _angle(self, x: Any) -> Any:
+        """The square of an angle [rad], which must not be too wide for the series."""
+        xx = x * x
+        self.positive.append(self.subtract(_WIDEST, xx))
+        return xx
+
+    def _sine(self, x: Any) -> Any:
+        return x * self._series(self._angle(x), 1) if isinstance(x, Symbol) else math.sin(x)
+
+    def _cosine(self, x: Any) -> Any:
+        return self._series(self._angle(x), 0) if isinstance(x, Symbol) else math.cos(x)
+
+    def _rate_factors(self, xx: Any, s: Any) -> tuple[Any, ...]:
+        """As `control.rate_factors`, without its branch."""
+        self.positive.append(self.subtract(_WIDEST, xx))
+        a, b = self._series(xx, 2), self._series(xx, 3)
+        twice = s + s
+        return a, b, twice * self._series(xx, 2, 1), twice * self._series(xx, 3, 1)
+
     def _symbolic(self, x: Any) -> Any:
         """Replace numbers by symbols, equal numbers by the same one; 0 and 1 stay numbers."""
         if isinstance(x, tuple):
@@ -217,15 +253,22 @@ class Trace:
 
     def _plain(self, function: Dispatcher) -> Callable[..., Any]:
         """The function, and all that it calls, as plain Python functions with mathematics for symbols."""
-        some = lambda operation: (  # noqa: E731
-            lambda a, b: self.symbol(operation, a, b) if _any(a, b) else _EVALUATE[operation](a, b)
+        some = lambda operation, plain: (  # noqa: E731
+            lambda a, b: self.symbol(operation, a, b) if _any(a, b) else plain(a, b)
         )
-        mathematics = SimpleNamespace(sqrt=self.root, nan=math.nan, inf=math.inf)
+        mathematics = SimpleNamespace(
+            sqrt=self.root, sin=self._sine, cos=self._cosine, nan=math.nan, inf=math.inf
+        )
+        time = lambda *places: [self.symbol("time", k) for k in places]  # noqa: E731
         instead = {
             "math": mathematics,
-            "max": some("max"),
-            "min": some("min"),
-            "septic": lambda *_: tuple(self.symbol("time", k) for k in range(3)),
+            "max": some("max", max),
+            "min": some("min", min),
+            "septic": lambda *_: time(BLEND, BLEND + 1, BLEND + 2),
+            "piece_at": lambda *_: (0, *time(SINCE), 0.0),
+            # The step of a table has been replaced by the place of its weights.
+            "spline_weights": lambda _, k, __: (0, *time(*range(k, k + 4))),
+            "rate_factors": self._rate_factors,
             "where_positive": lambda x, a, b: self.symbol("where_positive", x, a, b),
             "surely_positive": lambda _: False,  # not known
         }
@@ -243,44 +286,135 @@ class Trace:
         return rebuilt(function)
 
 
+#: Numbers in which the problems of eight flights may differ; those of the law, and the slots' turn, are left out of the
+#: code where they are zero in all.
+_OF_FLIGHT = (
+    "vehicles.m", "vehicles.inverse", "vehicles.M", "vehicles.mean", "vehicles.thrust_limit", "vehicles.g",
+    "graph.weight", "graph.diagonal", "reference.d0", "reference.d1", "reference.p0", "reference.dp",
+    "motion.T1", "control.force", "control.k1", "control.k2", "disturbance.m", "disturbance.inverse",
+    "disturbance.drag", "disturbance.wind",
+    "law.alpha", "law.beta", "law.gamma", "law.mu", "law.k_def", "reference.turn",
+)  # fmt: skip
+_MAY_BE_ZERO = _OF_FLIGHT[-6:]
+_numbers_of = attrgetter(*_OF_FLIGHT)
+
+
+def numbers(problems: Iterable[Problem]) -> Floats:
+    """The numbers (U, B) in which B problems of one graph may differ, in the order of `FlightTrace`."""
+    return np.stack([np.concatenate([np.ravel(x) for x in _numbers_of(p)]) for p in problems], -1)
+
+
+class FlightTrace(Trace):
+    """The recorded operations of the kernel on eight problems, which differ in their numbers alone.
+
+    Numbers differ from flight to flight; so do the tables over time, of which the code reads the rows of the moment.
+
+    Parameters
+    ----------
+    problem : one of them
+    values : (U, B) `numbers` of all of them
+
+    Raises
+    ------
+    UnfitError
+        The problem has branches that depend on the state.
+    """
+
+    def __init__(self, problem: Problem, values: Floats) -> None:
+        self._values = values
+        super().__init__(problem)
+
+    def known_positive(self, x: Symbol) -> bool:
+        """Whether a number is positive: in all problems, or in none (`flight_structure`)."""
+        return bool((self._values[x.arguments[0]] > 0.0).all())
+
+    def _with_symbols(self, problem: Problem) -> Problem:
+        parts: dict[str, dict[str, Any]] = {}
+        index = 0
+        for name, x in zip(_OF_FLIGHT, _numbers_of(problem), strict=True):
+            shape, size = np.shape(x), np.size(x)
+            zero = name in _MAY_BE_ZERO and not self._values[index : index + size].any()
+            made = [0.0 if zero else self.symbol("uniform", index + k) for k in range(size)]
+            part, field = name.split(".")
+            found = np.array(made, dtype=object).reshape(shape)
+            parts.setdefault(part, {})[field] = found if shape else found.item()
+            index += size
+        parts["motion"]["coefficients"] = self._table(MOTION, (1, 6, 6))
+        given = problem.disturbance
+        for name, which in (("gust", GUSTS), ("noise_r", NOISE_R), ("noise_v", NOISE_V)):
+            rows, *shape = getattr(given, name).shape
+            parts["disturbance"][name] = self._table(which, (4 if rows else 0, *shape))
+        parts["disturbance"] |= {"gust_step": GUST, "noise_step": NOISE}
+        return problem._replace(
+            **{part: getattr(problem, part)._replace(**fields) for part, fields in parts.items()}
+        )
+
+    def _table(self, which: int, shape: tuple[int, ...]) -> Any:
+        """Rows of a table at the moment."""
+        made = [self.symbol("table", which, k) for k in range(math.prod(shape))]
+        return np.array(made, dtype=object).reshape(shape)
+
+    def _gauge(self, p: Problem, w: Any, order: Ints) -> list[Any]:
+        n, m = len(p.vehicles.m), len(order)
+        values = np.full(3 * n + 2 * m, 0.0, dtype=object)
+        self._plain(gauge.read_gauge)(p, w, values)
+        places = np.arange(len(values))
+        places[3 * n :] = np.concatenate([3 * n + order, 3 * n + m + order])
+        return values[np.argsort(places)].tolist()
+
+
+def flight_structure(problem: Problem, values: Floats) -> bytes:
+    """Everything that the code of a `FlightTrace` depends on.
+
+    Raises
+    ------
+    UnfitError
+        Some of the problems damp deformations, others do not, which is a branch of the law.
+    """
+    graph, law, control, given = problem.graph, problem.law, problem.control, problem.disturbance
+    ends = np.cumsum([np.size(x) for x in _numbers_of(problem)])[-len(_MAY_BE_ZERO) - 1 :]
+    of = {
+        name: values[ends[k] : ends[k + 1]].any(axis=0) for k, name in enumerate(_MAY_BE_ZERO)
+    }
+    if len(set(of["law.k_def"].tolist())) > 1:
+        raise UnfitError("problems that take different branches")
+    kinds = law.solver, law.iterations, problem.reference.kind, control.kind, given.active
+    tables = [len(x) > 0 for x in (given.gust, given.noise_r, given.noise_v)]
+    there = [bool(x.any()) for x in of.values()]
+    pairs = graph.edges.tolist(), graph.pairs.tolist()
+    saturates = bool(problem.vehicles.saturate)
+    return repr(("flight", len(problem.vehicles.m), pairs, kinds, tables, saturates, there)).encode()
+
+
 class Code:
     """Straight-line code of a trace: its computations in order.
 
     Attributes
     ----------
     outputs : (n,) symbols or numbers
+    gauge : (3N + 2m,) symbols or numbers, or none
     coordinates : number of coordinates of positions, whose derivatives, the first outputs, are velocities
     positive : symbols that have to be positive
+    before : symbols that depend on the problem's numbers alone, each after its arguments
+    inputs : (U,) those of them that the lines use
     lines : symbols computed in flight, each after its arguments
-    inputs : (U,) symbols that depend on the problem's numbers alone and that the lines use
     """
 
     def __init__(self, trace: Trace) -> None:
         self.outputs, self.coordinates = trace.outputs, trace.coordinates
+        self.gauge = trace.gauge
         self.positive = [x for x in trace.positive if x.known > UNIFORM]
         self.lines: list[Symbol] = []
-        self._uniform: list[Symbol] = []
+        self.before: list[Symbol] = []
         self._seen: set[int] = set()
-        for x in (*self.positive, *self.outputs):
+        for x in (*self.positive, *self.outputs, *self.gauge):
             self._need(x)
         self.lines = sorted(
-            (x for x in self.lines if x.operation not in _SOURCES), key=lambda x: x.serial
+            (x for x in self.lines if x.operation not in SOURCES), key=lambda x: x.serial
         )
-        used = [x for line in self.lines for x in line.arguments] + self.outputs
+        used = [x for line in self.lines for x in line.arguments] + self.outputs + self.gauge
         inputs = [x for x in used if isinstance(x, Symbol) and x.known == UNIFORM]
         self.inputs = list({x.serial: x for x in inputs}.values())
-
-    def values(self, numbers: Floats) -> Floats:
-        """Values (U,) of the inputs for a problem's distinct numbers, as `structure` returns them."""
-        found: dict[int, float] = {}
-        with np.errstate(all="ignore"):
-            for x in self._uniform:
-                if x.operation == "uniform":
-                    found[x.serial] = numbers[x.arguments[0]]
-                else:
-                    given = (found[a.serial] if isinstance(a, Symbol) else a for a in x.arguments)
-                    found[x.serial] = _EVALUATE[x.operation](*given)
-        return np.array([found[x.serial] for x in self.inputs])
 
     def _need(self, wanted: Any) -> None:
         """List everything that a symbol needs, without recursion, because chains are long."""
@@ -296,7 +430,7 @@ class Code:
                 stack += [x, *missing]
                 continue
             self._seen.add(x.serial)
-            (self._uniform if x.known == UNIFORM else self.lines).append(x)
+            (self.before if x.known == UNIFORM else self.lines).append(x)
 
 
 def structure(problem: Problem) -> tuple[bytes, Floats, Ints]:

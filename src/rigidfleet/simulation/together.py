@@ -1,0 +1,129 @@
+"""Fly eight missions side by side, in the lanes of vectors: missions that differ in numbers, as in a sweep.
+
+Each phase in which the eight differ in nothing but numbers is integrated in common steps
+(`rigidfleet.kernel.engine.batch.Vector`); each flight flies any other phase alone. Everything else is that of a single
+flight: plan, monitor, record. A flight agrees with `simulate` to the integrator's tolerances, not to the last bit,
+because the steps are those that the eight need.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, TypeVar
+
+from rigidfleet.kernel import records
+from rigidfleet.mission import Mission
+from rigidfleet.planning.tolerances import most_steps
+from rigidfleet.result import Result
+from rigidfleet.simulation.active_phase import ActivePhase
+from rigidfleet.simulation.flight import Flight, simulate
+
+if TYPE_CHECKING:
+    from rigidfleet.kernel.engine.codegen import Tables  # imports the compiler
+
+T = TypeVar("T")
+
+#: Number of missions of a vector.
+WIDTH = 8
+#: Greatest number of common steps between two looks at Ctrl-C.
+_STEPS = 2000
+
+
+def simulate_together(missions: Sequence[Mission]) -> list[Result]:
+    """Fly at most eight missions side by side, each as by `simulate`; return their records.
+
+    A flight's last bits depend on the others. If a step of the common ones fails, each mission is flown alone.
+
+    Raises
+    ------
+    MissionError
+        A mission has errors.
+    """
+    if len({mission.output_step for mission in missions}) > 1:
+        return [simulate(mission) for mission in missions]
+    flights = [Flight(mission) for mission in missions]
+    given: Tables | None = None
+    while True:
+        going = [flight.begin() for flight in flights]
+        if not any(going):
+            return [flight.finish() for flight in flights]
+        active = [flight.under_way() for flight, goes in zip(flights, going, strict=True) if goes]
+        if all(going) and _alike(active):
+            from rigidfleet.kernel.engine import codegen
+
+            whole = _filled([phase.plan.problem.disturbance for phase in active])
+            given = given or codegen.tables(whole)
+            if not _fly(active, given):
+                return [simulate(mission) for mission in missions]
+            for flight in flights:
+                flight.arrive()
+            continue
+        for flight, goes in zip(flights, going, strict=True):
+            while goes and flight.advance():
+                pass
+
+
+def _alike(active: Sequence[ActivePhase]) -> bool:
+    """Whether phases differ in nothing but numbers, so that they can share steps."""
+    first = _times(active[0])
+    if not all(_plain(phase) and _times(phase) == first for phase in active):
+        return False
+    from rigidfleet.kernel.engine import batch
+
+    return batch.fit_together([phase.plan.problem for phase in active])
+
+
+def _plain(phase: ActivePhase) -> bool:
+    """Whether a phase is one of points, of a given duration, without losses and calls of users' functions."""
+    plan = phase.plan
+    return (
+        type(phase) is ActivePhase
+        and plan.phase.settle is None
+        and phase.solver is None
+        and phase.external is None
+        and not plan.loses
+        and not phase.lost.any()
+    )
+
+
+def _times(phase: ActivePhase) -> tuple[object, ...]:
+    """When a phase is flown, and all that the times to record follow from."""
+    plan = phase.plan
+    points = tuple(t for t, _ in plan.through)
+    return plan.start, plan.t_end, plan.arrival, points, plan.integrator.rtol, len(phase.state.y)
+
+
+def _fly(active: Sequence[ActivePhase], given: Tables) -> bool:
+    """Fly phases to their end in common steps and record them; return whether they came there."""
+    from rigidfleet.kernel.engine import batch
+    from rigidfleet.kernel.engine.tracer import UnfitError
+
+    t_end = active[0].plan.t_end
+    times = active[0].times(t_end)
+    stretches = [phase.prepare(phase.plan.problem, times) for phase in active]
+    try:
+        vector = batch.Vector(
+            _filled([stretch.problem for stretch in stretches]),
+            _filled([phase.state for phase in active]),
+            given,
+            times,
+            _filled([stretch.samples for stretch in stretches]),
+        )
+    except UnfitError:
+        return False
+    status = records.PAUSED
+    while status == records.PAUSED:
+        status = vector(t_end, _STEPS)
+        if status == records.PAUSED:
+            for phase in active:
+                phase.watch(last=False)
+            if sum(active[0].state.count[1:3]) > most_steps(active[0].t - active[0].plan.start):
+                return False
+    for phase, stretch in zip(active, stretches, strict=True):
+        phase.record(stretch)
+    return status == records.FINISHED
+
+
+def _filled(x: list[T]) -> list[T]:
+    """Eight things: the last one is repeated."""
+    return x + x[-1:] * (WIDTH - len(x))
