@@ -389,6 +389,7 @@ def _wanted(slots: Floats) -> tuple[Ints, Floats, float]:
     return pairs.copy(), wanted, _NEAR * float(wanted.min())
 
 
+@kept
 def _agree(asked: Floats, slots: Floats, edges: Ints) -> bool:
     """Whether the edges (m, 2) of slots have the lengths (m,) asked for, to rounding [m]."""
     found = distance_geometry.distances(slots, edges)
