@@ -10,6 +10,8 @@ import pytest
 
 from rigidfleet.assessment import assess
 from rigidfleet.errors import FlightError
+from rigidfleet.kernel.records import bernstein
+from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
 from rigidfleet.math.proximity import headroom, obstacle_clearances
 from rigidfleet.mission import Mission, load_mission
@@ -29,7 +31,8 @@ class Steps:
 
         def spy(extremes: Any, problem: Any, work: Any, state: Any, *, last: bool) -> None:
             seen = int(extremes.monitor.monitor.flags[3])
-            for row in range(seen, int(state.count[4])):
+            for step in range(seen, int(state.count[4])):
+                row = (state.count[5] + step) % len(state.trail.clock)
                 t, h = state.trail.clock[row]
                 self.rows.append((t, h, state.trail.points[row].copy()))
             take(extremes, problem, work, state, last=last)
@@ -255,6 +258,53 @@ def test_pairs_of_a_large_fleet_that_are_not_listed_are_not_the_nearest(formulat
     assert below - 0.02 < least < below + CLOSE
 
 
+@pytest.mark.parametrize("formulation", ["inertial", "body"])
+def test_agents_that_are_passed_over_are_neither_highest_nor_lowest_nor_fastest(formulation):
+    """Where nothing else needs the way of each agent, few are looked at; the extremes are those of fine samples."""
+    data = a_crowd(formulation).to_dict()
+    del data["obstacles"], data["limits"]
+    found = simulate(Mission.from_dict(data)).phases
+    fine = simulate(Mission.from_dict(data | {"output_step": 0.002}))
+    for k, phase in enumerate(found):
+        here = fine.phase == k
+        r, v = fine.position[here], fine.velocity[here]
+        values = r[..., 2].min(), r[..., 2].max(), np.linalg.norm(v, axis=2).max()
+        for name, value in zip(("lowest", "highest", "speed"), values, strict=True):
+            assert phase.extremes[name].value == pytest.approx(value, abs=2e-5), name
+
+
+@pytest.mark.parametrize("formulation", ["inertial", "body"])
+def test_no_distance_changes_more_than_its_bound(formulation, monkeypatch):
+    """In space and as seen from above, at nine points of each step; what turns as one body has small bounds."""
+    call, found, mission = watching.native.Watch.__call__, [], a_crowd(formulation)
+    n = mission.n_agents
+    i, j = np.triu_indices(n, 1)
+    basis = bernstein(np.linspace(0.0, 1.0, 9))
+
+    def spy(watch: Any, problem: Any, work: Any, state: Any) -> int:
+        status = call(watch, problem, work, state)
+        if watch.monitor.flags[2] == 3:
+            y = basis @ state.trail.points[0]
+            x = y[:, : 3 * n].reshape(9, n, 3)
+            if formulation == "body":
+                q = y[:, 6 * n : 6 * n + 4]
+                x = x @ att.dcm_from_quaternion(q / np.linalg.norm(q, axis=1, keepdims=True))
+            apart = x[:, i] - x[:, j]
+            lengths = [np.linalg.norm(apart[..., :axes], axis=2) for axes in (3, 2)]
+            changes = [np.abs(d - d[0]).max() for d in lengths]
+            way = np.linalg.norm(x[-1] - x[0], axis=1).max()
+            found.append((*changes, *watch.monitor.moves, way, state.trail.clock[0, 0]))
+        return status
+
+    monkeypatch.setattr(watching.native.Watch, "__call__", spy)
+    simulate(mission)
+    space, above, bound, bound_above, way, t = np.array(found).T
+    assert (space <= bound + 1e-9).all()
+    assert (above <= bound_above + 1e-9).all()
+    turns = (t > 5.0) & (t < 6.0)
+    assert (bound[turns] < 0.1 * way[turns]).all(), (bound[turns] / way[turns]).max()
+
+
 @pytest.mark.parametrize("name", ["cube-waypoint", "narrow-passage"])
 def test_both_formulations_come_to_the_same(name):
     """Positions as polynomials in world and in body axes have the same extremes."""
@@ -426,9 +476,8 @@ def test_who_watches_a_large_formation_does_not_change_what_is_found(solver, mon
     aside, looked = simulate(mission), flown()
     assert len(threads) > 1, "each phase's last steps are taken here"
 
-    def take_here(extremes: Any, problem: Any, work: Any, state: Any) -> Any:
+    def take_here(extremes: Any, problem: Any, work: Any, state: Any) -> None:
         extremes.take(problem, work, state, last=False)
-        return state
 
     monkeypatch.setattr(watching.Extremes, "hand_over", take_here)
     for one, other in ((aside, simulate(mission)), (looked, flown())):

@@ -1,9 +1,11 @@
 """Large formations: elimination, the vertex graph and the dense factor solve the same law."""
 
+import gc
 import os
 import shutil
 import subprocess
 import sys
+import weakref
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +19,7 @@ from rigidfleet.kernel.problem import EXACT, ITERATED, ConstraintLaw, Vehicles, 
 from rigidfleet.mission import Mission
 from rigidfleet.planning import solvers
 from rigidfleet.rigidity import jacobian
-from rigidfleet.simulation.flight import simulate
+from rigidfleet.simulation.flight import Flight, simulate
 
 
 def lattice(side: int, *, seed: int = 0) -> np.ndarray:
@@ -52,6 +54,7 @@ def solver_of(p, edges, masses, law, *, eliminated=False, tolerance=1e-13) -> La
 def solved(solver, b) -> np.ndarray:
     solver.workspace.b[:] = b
     solver.solve()
+    solver.pull()
     return solver.workspace.multiplier.copy()
 
 
@@ -79,6 +82,29 @@ def test_sweep_vertex_graph_and_dense_factor_agree_on_the_exact_law(side, rng):
     sparse = solved(solver_of(p, edges, masses, EXACT), b)
     np.testing.assert_allclose(eliminated, dense, rtol=0, atol=1e-12 * np.abs(dense).max())
     np.testing.assert_allclose(sparse, dense, rtol=0, atol=1e-9 * np.abs(dense).max())
+
+
+def test_elimination_finds_the_force_before_the_multipliers(rng):
+    """Of unequal masses, the force is M a of the exact law at once; the multipliers, asked for later, agree with it."""
+    p = lattice(4)
+    edges, masses = graphs.henneberg(p), rng.uniform(0.5, 2.0, len(p))
+    J, b = jacobian(p, edges), rng.normal(size=len(edges))
+    solver = solver_of(p, edges, masses, EXACT, eliminated=True)
+    w = solver.workspace
+    w.b[:] = b
+    solver.solve()
+    force = w.f_C.ravel().copy()
+    exact = J.T @ np.linalg.solve(gram(p, edges, masses), b)
+    np.testing.assert_allclose(force, exact, rtol=0, atol=1e-9 * np.abs(exact).max())
+    np.testing.assert_allclose(
+        J / np.repeat(masses, 3) @ force, b, rtol=0, atol=1e-11 * np.abs(b).max()
+    )
+    for _ in range(2):  # asked for once or twice
+        solver.pull()
+        assert (w.f_C.ravel() == force).all()
+        np.testing.assert_allclose(
+            J.T @ w.multiplier, force, rtol=0, atol=1e-9 * np.abs(force).max()
+        )
 
 
 @pytest.mark.parametrize("reach", [1.5, 1.9])
@@ -214,6 +240,8 @@ def test_a_lost_pivot_falls_back_and_is_counted(rng):
     assert solver.counts.failures == 0
     J = jacobian(p, edges)
     np.testing.assert_allclose(J @ J.T @ found, solver.workspace.b, atol=1e-6)
+    force = solver.workspace.f_C.ravel()
+    np.testing.assert_allclose(J.T @ found, force, rtol=0, atol=1e-12 * np.abs(force).max())
 
 
 def test_what_is_not_finite_has_no_solution(rng):
@@ -304,6 +332,28 @@ def flight(law: str, kind: str, **integrator) -> Mission:
             ],
         }
     )
+
+
+def test_the_memory_of_a_phase_is_free_when_the_next_one_flies():
+    """Without waiting for the garbage collector: large formations would need it twice."""
+    flown = Flight(flight("exact", "henneberg"))
+    gc.disable()
+    try:
+        flown.begin()
+        while flown.advance(1.0):
+            pass
+        active = flown._ended
+        assert active is not None
+        assert active.solver is not None
+        kept = [weakref.ref(x) for x in (active.solver, active.workspace.r.base, active.state.K)]
+        kept += [
+            weakref.ref(x) for x in (active.solver.aside, active.solver.aside.workspace.r.base)
+        ]
+        del active
+        assert flown.begin()
+        assert [x() for x in kept] == [None] * 5
+    finally:
+        gc.enable()
 
 
 @pytest.mark.parametrize(

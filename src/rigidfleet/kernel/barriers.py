@@ -27,6 +27,7 @@ import math
 from rigidfleet.kernel.avoidance import BARRIER, EXACT, KNOWN
 from rigidfleet.kernel.avoidance import needed_rate as _needed_rate
 from rigidfleet.kernel.compiler.jit import compiled, inlined
+from rigidfleet.kernel.constraint import find_multipliers
 from rigidfleet.kernel.linalg import cholesky, cholesky_solve
 from rigidfleet.kernel.moving import braking_beside
 from rigidfleet.kernel.segments import from_obstacle, from_solid
@@ -57,6 +58,8 @@ def loosen(p, w, state, a):
     edges, free = p.graph.edges, 0.0
     for e in range(edges.shape[0]):
         free = max(free, 1.0 - min(a.hold[edges[e, 0]], a.hold[edges[e, 1]]))
+    if free > 0.0:
+        find_multipliers(p.graph)
     for e in range(edges.shape[0] if free > 0.0 else 0):
         i, j = edges[e, 0], edges[e, 1]
         for q in range(3):

@@ -30,7 +30,8 @@ def constraint_force(t, y, dy, p, w):
             w.a[i, s] = vehicles.inverse[i] * (w.f_E[i, s] + w.f_u[i, s])
     right_side(w.r, w.v, y[6 * n : 6 * n + m], w.a, graph.edges, p.law, w)
     solve_multipliers(vehicles, graph, p.law, w)
-    apply_multipliers(w.u, graph.edges, w.multiplier, w.f_C)
+    if graph.multipliers == 0:
+        apply_multipliers(w.u, graph.edges, w.multiplier, w.f_C)
     for k in range(m):
         dy[6 * n + k] = w.c[k]
 
@@ -206,6 +207,16 @@ def solve_at_agents(m, mbar, edges, law, w):
         for i in range(n):
             for p in range(3):
                 a[i, p] += x[3 * i + p]
+
+
+@compiled
+def find_multipliers(graph):
+    """Have w.multiplier (m,) [N] of the last evaluation computed, by a solver that finds f_C without.
+
+    Few evaluations of a large formation are asked for them, those of samples and at the ends of steps.
+    """
+    if graph.multipliers != 0:
+        call_solver(graph.multipliers)
 
 
 @compiled

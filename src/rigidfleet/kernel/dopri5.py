@@ -109,11 +109,11 @@ def keep_start(p, w, state):
 
 @compiled
 def keep_step(t, h, p, w, state):
-    """Record a step in the trail: the Bernstein coefficients of its continuous extension, and the forces at its end.
+    """Record a step in the next row of the trail: Bernstein coefficients of its extension, and the forces at its end.
 
     The terms are those of Hairer's form, y + x (rise + (1 - x) (bend + x (rest + (1 - x) twist))).
     """
-    K, row = state.K, state.count[4]
+    K, row = state.K, (state.count[5] + state.count[4]) % state.trail.clock.shape[0]
     points = state.trail.points[row]
     state.trail.clock[row, 0], state.trail.clock[row, 1] = t, h
     for q in range(points.shape[1]):
@@ -128,7 +128,7 @@ def keep_step(t, h, p, w, state):
         points[3, q] = y + 0.75 * rise + 0.25 * (bend + rest)
         points[4, q] = K[TRIAL, q]
     read_gauge(p, w, state.trail.gauge[row])
-    state.count[4] = row + 1
+    state.count[4] += 1
 
 
 @inlined

@@ -37,12 +37,14 @@ def closed_loop(t, y, dy, p, w):
     q = 6 * n + n_edges
     if p.has_frame:
         attitude_matrix(y[q : q + 4], T)
-    for i in range(n):
-        for s in range(3):
-            r[i, s], v[i, s] = y[3 * i + s], y[3 * n + 3 * i + s]
-        w.f_E[i, 0], w.f_E[i, 1], w.f_E[i, 2] = 0.0, 0.0, -m[i] * g
     if p.body_formulation:
         world_states(y, p, w)
+    else:
+        for i in range(n):
+            for s in range(3):
+                r[i, s], v[i, s] = y[3 * i + s], y[3 * n + 3 * i + s]
+    for i in range(n):
+        w.f_E[i, 0], w.f_E[i, 1], w.f_E[i, 2] = 0.0, 0.0, -m[i] * g
     if p.external != 0:
         for i in range(n):
             w.a[i, 0], w.a[i, 1], w.a[i, 2] = 0.0, 0.0, 0.0
@@ -72,7 +74,10 @@ def closed_loop(t, y, dy, p, w):
 
 @inlined
 def accelerate(dy, p, w):
-    """Newton's law, Eqs. (1), (2), with true masses and what vehicles can give: w.a (N, 3) [m/s^2], dy of r and v."""
+    """Newton's law, Eqs. (1), (2), with true masses and what vehicles can give: w.a (N, 3) [m/s^2].
+
+    In world axes, also dy of r and v.
+    """
     vehicles, inverse, v = p.vehicles, p.disturbance.inverse, w.v
     n = inverse.shape[0]
     for i in range(n):
@@ -86,7 +91,8 @@ def accelerate(dy, p, w):
         for s in range(3):
             net = w.f_E[i, s] + share * (w.f_u[i, s] + w.f_C[i, s])
             w.a[i, s] = inverse[i] * net
-            dy[3 * i + s], dy[3 * n + 3 * i + s] = v[i, s], w.a[i, s]
+            if not p.body_formulation:
+                dy[3 * i + s], dy[3 * n + 3 * i + s] = v[i, s], w.a[i, s]
 
 
 @compiled

@@ -3,6 +3,7 @@
 import math
 
 from rigidfleet.kernel.compiler.jit import compiled
+from rigidfleet.kernel.constraint import find_multipliers
 
 
 @compiled
@@ -11,6 +12,7 @@ def read_gauge(p, w, values):
     vehicles, edges = p.vehicles, p.graph.edges
     n, m = vehicles.m.shape[0], edges.shape[0]
     noisy = p.disturbance.noise_r.shape[0] > 0
+    find_multipliers(p.graph)
     for i in range(n):
         thrust, a, f = 0.0, 0.0, 0.0
         for q in range(3):

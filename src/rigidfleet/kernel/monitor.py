@@ -52,6 +52,7 @@ from rigidfleet.kernel.records import (
     THRUST,
     THRUST_MARGIN,
 )
+from rigidfleet.kernel.rigid_body import inertia_inverse
 
 #: Relative accuracy of a greatest force, direct and iterated.
 _CLOSE_FORCE, _CLOSE_ITERATED = 1e-7, 1e-6
@@ -160,24 +161,100 @@ def in_world(points, i, moving, p, monitor, out):
 
 
 @compiled
-def span_of(curve):
-    """Radius [m] of a ball about the middle control point that holds a curve with control points (5, 3)."""
+def bound_moves(points, p, monitor):
+    """Bounds [m] of the change of any distance over a step, in space and as seen from above, into ``monitor.moves``.
+
+    With r_i' = any rigid motion + u_i, the rate of a distance is at most |u_i| + |u_j|, and |u_i| is at most its
+    greatest Bernstein coefficient. The rotation is the one that leaves the smallest u_i. As seen from above, tilting
+    rotations change distances, too.
+    """
+    n, left, mean = monitor.left.shape[0], monitor.left, monitor.knots
+    count = 0
+    for i in range(n):
+        count += 1 if left[i] else 0
+    for k in range(5):
+        x = y = z = 0.0
+        for i in range(n):
+            if left[i]:
+                x, y, z = x + points[k, 3 * i], y + points[k, 3 * i + 1], z + points[k, 3 * i + 2]
+        mean[k, 0], mean[k, 1], mean[k, 2] = x / count, y / count, z / count
+    I, I_inv = monitor.basis[:3, :3], monitor.poses[:3, :3]
+    a = b = c = d = e = f = h0 = h1 = h2 = 0.0
+    for i in range(n):
+        if left[i]:
+            x0, y0, z0 = points[0, 3 * i], points[0, 3 * i + 1], points[0, 3 * i + 2]
+            x1, y1, z1 = points[4, 3 * i], points[4, 3 * i + 1], points[4, 3 * i + 2]
+            x0, y0, z0 = x0 - mean[0, 0], y0 - mean[0, 1], z0 - mean[0, 2]
+            x1, y1, z1 = x1 - mean[4, 0], y1 - mean[4, 1], z1 - mean[4, 2]
+            x, y, z = 0.5 * (x0 + x1), 0.5 * (y0 + y1), 0.5 * (z0 + z1)
+            x1, y1, z1 = x1 - x0, y1 - y0, z1 - z0
+            a, d, f = a + y * y + z * z, d + x * x + z * z, f + x * x + y * y
+            b, c, e = b - x * y, c - x * z, e - y * z
+            h0, h1, h2 = h0 + y * z1 - z * y1, h1 + z * x1 - x * z1, h2 + x * y1 - y * x1
+    I[0, 0], I[0, 1], I[0, 2] = a, b, c
+    I[1, 0], I[1, 1], I[1, 2] = b, d, e
+    I[2, 0], I[2, 1], I[2, 2] = c, e, f
+    inertia_inverse(I, I_inv)
+    s0 = I_inv[0, 0] * h0 + I_inv[0, 1] * h1 + I_inv[0, 2] * h2
+    s1 = I_inv[1, 0] * h0 + I_inv[1, 1] * h1 + I_inv[1, 2] * h2
+    s2 = I_inv[2, 0] * h0 + I_inv[2, 1] * h1 + I_inv[2, 2] * h2
+    fastest = farthest = 0.0
+    for i in range(n):
+        if left[i]:
+            x0, y0, z0 = points[0, 3 * i], points[0, 3 * i + 1], points[0, 3 * i + 2]
+            x0, y0, z0 = x0 - mean[0, 0], y0 - mean[0, 1], z0 - mean[0, 2]
+            x1 = y1 = z1 = u0 = u1 = u2 = v0 = v1 = v2 = 0.0
+            for k in range(5):
+                if k < 4:
+                    x1, y1, z1 = (
+                        points[k + 1, 3 * i],
+                        points[k + 1, 3 * i + 1],
+                        points[k + 1, 3 * i + 2],
+                    )
+                    x1, y1, z1 = x1 - mean[k + 1, 0], y1 - mean[k + 1, 1], z1 - mean[k + 1, 2]
+                    v0, v1, v2 = x1 - x0, y1 - y0, z1 - z0
+                # The rate has the coefficients k (x_k - x_k-1) + (4 - k) (x_k+1 - x_k).
+                rate0 = k * u0 + (4 - k) * v0 - (s1 * z0 - s2 * y0)
+                rate1 = k * u1 + (4 - k) * v1 - (s2 * x0 - s0 * z0)
+                rate2 = k * u2 + (4 - k) * v2 - (s0 * y0 - s1 * x0)
+                fastest = max(fastest, rate0 * rate0 + rate1 * rate1 + rate2 * rate2)
+                farthest = max(farthest, x0 * x0 + y0 * y0 + z0 * z0)
+                x0, y0, z0, u0, u1, u2 = x1, y1, z1, v0, v1, v2
+    tilt = math.hypot(s0, s1)
+    if p.body_formulation:
+        q = 6 * p.vehicles.m.shape[0] + p.graph.edges.shape[0]
+        rate, size = 0.0, math.inf
+        for k in range(5):
+            here = turn = 0.0
+            for s in range(4):
+                here += points[k, q + s] ** 2
+                turn += (points[min(k + 1, 4), q + s] - points[k, q + s]) ** 2
+            rate, size = max(rate, 4.0 * math.sqrt(turn)), min(size, math.sqrt(here))
+        tilt = 2.0 * rate / max(size - 0.1, 0.1) + math.sqrt(s0 * s0 + s1 * s1 + s2 * s2)
+    monitor.moves[0] = 2.0 * math.sqrt(fastest)
+    monitor.moves[1] = monitor.moves[0] + tilt * 2.0 * math.sqrt(farthest)
+
+
+@compiled
+def put(curve, ball):
+    """Write into a ball (4,) the middle one of control points (5, 3), and the least radius [m] that holds all."""
     far = 0.0
     for k in range(5):
         x, y, z = curve[k, 0] - curve[2, 0], curve[k, 1] - curve[2, 1], curve[k, 2] - curve[2, 2]
         far = max(far, x * x + y * y + z * z)
-    return math.sqrt(far)
+    ball[0], ball[1], ball[2], ball[3] = curve[2, 0], curve[2, 1], curve[2, 2], math.sqrt(far)
 
 
 @compiled
 def place(points, monitor):
-    """Control points of all agents' positions over a step, in the axes of the states, and their spans."""
-    for i in range(monitor.places.shape[0]):
-        curve = monitor.places[i]
+    """Balls that hold the agents' positions over a step, in the axes of the states."""
+    for i in range(monitor.balls.shape[0]):
+        far, ball = 0.0, monitor.balls[i]
+        x, y, z = points[2, 3 * i], points[2, 3 * i + 1], points[2, 3 * i + 2]
         for k in range(5):
-            for q in range(3):
-                curve[k, q] = points[k, 3 * i + q]
-        monitor.span[i] = span_of(curve)
+            a, b, c = points[k, 3 * i] - x, points[k, 3 * i + 1] - y, points[k, 3 * i + 2] - z
+            far = max(far, a * a + b * b + c * c)
+        ball[0], ball[1], ball[2], ball[3] = x, y, z, math.sqrt(far)
 
 
 @compiled
@@ -186,31 +263,26 @@ def apart(i, j, axes, reach, monitor):
 
     If so, their curves need not be compared. False does not say that they come closer.
     """
-    far, reach = 0.0, reach + monitor.span[i] + monitor.span[j] + CLOSE
+    balls = monitor.balls
+    far, reach = 0.0, reach + balls[i, 3] + balls[j, 3] + CLOSE
     for q in range(axes):
-        x = monitor.places[i, 2, q] - monitor.places[j, 2, q]
+        x = balls[i, q] - balls[j, q]
         far += x * x
     return reach > 0.0 and far >= reach * reach
 
 
 @compiled
-def between(i, j, monitor):
-    """Control points (5, 3) of r_i - r_j, into ``monitor.curve``."""
-    for k in range(5):
-        for q in range(3):
-            monitor.curve[k, q] = monitor.places[i, k, q] - monitor.places[j, k, q]
-
-
-@compiled
-def watch_pairs(kind, pairs, t, h, monitor):
-    """Least distance between the surfaces of pairs of agents (P, 2) over a step."""
+def watch_pairs(kind, pairs, points, t, h, monitor):
+    """Least distance between the surfaces of pairs of agents (P, 2) over a step with control points (5, n)."""
     for k in range(pairs.shape[0]):
         i, j = pairs[k, 0], pairs[k, 1]
         radii = monitor.radius[i] + monitor.radius[j]
         floor = monitor.worst[kind] + radii
         if apart(i, j, 3, floor, monitor):
             continue
-        between(i, j, monitor)
+        for s in range(5):
+            for q in range(3):
+                monitor.curve[s, q] = points[s, 3 * i + q] - points[s, 3 * j + q]
         value, at = shortest(monitor.curve, floor, monitor.work, monitor.pieces)
         if at >= 0.0:
             take(kind, value - radii, t + at * h, i, j, monitor)
@@ -224,7 +296,9 @@ def watch_stacks(t, h, monitor):
         radii = monitor.radius[i] + monitor.radius[j]
         if apart(i, j, 2, radii, monitor):
             continue
-        between(i, j, monitor)
+        for s in range(5):
+            for q in range(3):
+                monitor.curve[s, q] = monitor.places[i, s, q] - monitor.places[j, s, q]
         floor = monitor.worst[SEPARATION_BELOW] + radii
         value, at = lowest_overlap(monitor.curve, radii, floor, monitor.pieces)
         if at >= 0.0:
@@ -284,7 +358,7 @@ def watch_obstacles(i, curve, t, h, last, monitor):
     """
     radius, standing = monitor.radius[i], monitor.standing[i] != 0
     low, normal = monitor.low, monitor.scratch[2]
-    x, y, z, span = curve[2, 0], curve[2, 1], curve[2, 2], monitor.span[i]
+    x, y, z, span = curve[2, 0], curve[2, 1], curve[2, 2], monitor.balls[i, 3]
     for b in range(monitor.boxes.shape[0]):
         box = monitor.boxes[b]
         floor = clearance_of_interest(i, monitor) + radius
@@ -305,23 +379,61 @@ def watch_obstacles(i, curve, t, h, last, monitor):
 
 
 @compiled
+def unremarkable(points, i, angle, p, monitor):
+    """Whether agent i is surely neither faster nor lower nor higher, over a step, than others have been.
+
+    By its control points in body axes, for a piece of the step over which these turn by ``angle`` [rad] at most. The
+    curves in world axes, of which few agents are worth it, take ten times as long.
+    """
+    n, worst, pose = p.vehicles.m.shape[0], monitor.worst, monitor.poses[2]
+    q = 6 * n + p.graph.edges.shape[0] + 4
+    far = fast = carried = 0.0
+    low = least = math.inf
+    high = most = -math.inf
+    for k in range(5):
+        x, y, z = points[k, 3 * i], points[k, 3 * i + 1], points[k, 3 * i + 2]
+        up = pose[6] * x + pose[7] * y + pose[8] * z
+        low, high, far = min(low, up), max(high, up), max(far, x * x + y * y + z * z)
+        x, y, z = points[k, 3 * (n + i)], points[k, 3 * (n + i) + 1], points[k, 3 * (n + i) + 2]
+        fast = max(fast, x * x + y * y + z * z)
+        least, most = min(least, points[k, q + 2]), max(most, points[k, q + 2])
+        x, y, z = points[k, q + 3], points[k, q + 4], points[k, q + 5]
+        carried = max(carried, x * x + y * y + z * z)
+    room = -worst[SPEED] - math.sqrt(carried) - CLOSE
+    off = angle * math.sqrt(far) + CLOSE
+    return (
+        room > 0.0 and fast <= room * room
+        and least + low - off >= worst[LOWEST] and -(most + high + off) >= worst[HIGHEST]
+    )  # fmt: skip
+
+
+@compiled
 def watch_distances(row, p, state, monitor):
     """Monitor distances and speeds over one step of the trail."""
     trail = state.trail
     points, t, h = trail.points[row], trail.clock[row, 0], trail.clock[row, 1]
     place(points, monitor)
-    watch_pairs(SEPARATION, monitor.pairs, t, h, monitor)
-    watch_pairs(LOST, monitor.struck, t, h, monitor)
-    parts = 1
+    watch_pairs(SEPARATION, monitor.pairs, points, t, h, monitor)
+    watch_pairs(LOST, monitor.struck, points, t, h, monitor)
+    parts, angle = 1, 0.0
     if p.body_formulation:
-        parts = int(min(max(1.0, math.ceil(angle_of(points, p) / _TURN)), 1e4))
+        angle = angle_of(points, p)
+        parts = int(min(max(1.0, math.ceil(angle / _TURN)), 1e4))
     h /= parts
+    # Obstacles, pairs one below the other and fences need the curve of each agent.
+    heights = monitor.boxes.shape[0] + monitor.columns.shape[0] + monitor.fence.shape[0] == 0
     for part in range(parts):
         start = t + part * h
         if p.body_formulation:
             attitudes(points, part, parts, p, monitor)
         for i in range(monitor.left.shape[0]):
             if not monitor.left[i]:
+                continue
+            if (
+                p.body_formulation
+                and heights
+                and unremarkable(points, i, angle / parts, p, monitor)
+            ):
                 continue
             curve = monitor.curve
             in_world(points, i, 1, p, monitor, curve)
@@ -343,9 +455,8 @@ def watch_distances(row, p, state, monitor):
                 if at >= 0.0:
                     take(SPEED, -length_at(piece, at), start + at * h, i, -1, monitor)
             curve = monitor.places[i]
-            if p.body_formulation:
-                in_world(points, i, 0, p, monitor, curve)
-                monitor.span[i] = span_of(curve)
+            in_world(points, i, 0, p, monitor, curve)
+            put(curve, monitor.balls[i])
             watch_coordinate(LOWEST, curve, 2, 1.0, 0.0, start, h, i, monitor)
             watch_coordinate(HIGHEST, curve, 2, -1.0, 0.0, start, h, i, monitor)
             for f in range(monitor.fence.shape[0]):
@@ -400,9 +511,9 @@ def worst_of(c, p, monitor):
 
 
 @compiled
-def evaluate(t, row, p, w, state, monitor, values):
+def evaluate(t, step, p, w, state, monitor, values):
     """Forces at time t [s], within a step of the trail, into a gauge."""
-    trail = state.trail
+    trail, row = state.trail, row_of(step, state)
     x = (t - trail.clock[row, 0]) / trail.clock[row, 1]
     basis, y = monitor.basis[0], monitor.states[0]
     weights(min(max(x, 0.0), 1.0), basis)
@@ -447,7 +558,7 @@ def promise(c, a, b, v, ta, tb, tc, p, monitor):
 
 
 @compiled
-def look_between(before, middle, after, row, ta, tb, tc, p, w, state, monitor):
+def look_between(before, middle, after, step, ta, tb, tc, p, w, state, monitor):
     """Search for the greatest forces between ta and tc, from gauges at ta < tb < tc.
 
     The law is evaluated where the parabola through three neighbouring values of an entry promises most. All entries
@@ -470,7 +581,13 @@ def look_between(before, middle, after, row, ta, tb, tc, p, w, state, monitor):
         at[k], rank[k] = ta if k == 0 else tb if k == 1 else tc, k
     for count in range(3, at.shape[0]):
         evaluate(
-            top, row if top <= end_of(row, state) else row + 1, p, w, state, monitor, values[count]
+            top,
+            step if top <= end_of(step, state) else step + 1,
+            p,
+            w,
+            state,
+            monitor,
+            values[count],
         )
         k = count
         while at[rank[k - 1]] > top:
@@ -493,42 +610,50 @@ def look_between(before, middle, after, row, ta, tb, tc, p, w, state, monitor):
 
 
 @compiled
-def end_of(row, state):
+def row_of(step, state):
+    """Row of the trail that holds one of the steps in it, which are numbered from 0."""
+    return (state.count[5] + step) % state.trail.clock.shape[0]
+
+
+@compiled
+def end_of(step, state):
     """Time [s] at which a step of the trail ends."""
+    row = row_of(step, state)
     return state.trail.clock[row, 0] + state.trail.clock[row, 1]
 
 
 @compiled
-def watch_middle(row, before, after, p, w, state, monitor):
+def watch_middle(step, before, after, p, w, state, monitor):
     """Search a step that has no neighbour, because of a jump or the end."""
-    start, end = state.trail.clock[row, 0], end_of(row, state)
+    start, end = state.trail.clock[row_of(step, state), 0], end_of(step, state)
     middle, values = 0.5 * (start + end), monitor.gauge[1]
-    evaluate(middle, row, p, w, state, monitor, values)
-    look_between(before, values, after, row, start, middle, end, p, w, state, monitor)
+    evaluate(middle, step, p, w, state, monitor, values)
+    look_between(before, values, after, step, start, middle, end, p, w, state, monitor)
 
 
 @compiled
-def watch_forces(p, w, state, monitor, rows, last):
+def watch_forces(p, w, state, monitor, steps, last):
     """Monitor forces over the steps of a trail; with ``last``, no further step of the segment follows."""
     trail, before = state.trail, monitor.gauge[0]
-    for row in range(rows):
-        new = row > 0 or monitor.flags[3] == 0
-        start, end = trail.clock[row, 0], end_of(row, state)
+    for step in range(steps):
+        new = step > 0 or monitor.flags[3] == 0
+        row = row_of(step, state)
+        start, end = trail.clock[row, 0], end_of(step, state)
         after = trail.gauge[row]
-        a_row = trail.gauge[row - 1] if row > 0 else before
-        if row == 0 and new:
+        earlier = trail.gauge[row_of(step - 1, state)] if step > 0 else before
+        if step == 0 and new:
             for c in range(before.shape[0]):
                 before[c] = trail.start[c]
             judge_forces(before, start, p, monitor)
         if new:
             judge_forces(after, end, p, monitor)
-        if row == 0 and new:
+        if step == 0 and new:
             watch_middle(0, before, after, p, w, state, monitor)
-        if row + 1 < rows:
-            then, until = trail.gauge[row + 1], end_of(row + 1, state)
-            look_between(a_row, after, then, row, start, end, until, p, w, state, monitor)
-        elif last and (row > 0 or not new):
-            watch_middle(row, a_row, after, p, w, state, monitor)
+        if step + 1 < steps:
+            then, until = trail.gauge[row_of(step + 1, state)], end_of(step + 1, state)
+            look_between(earlier, after, then, step, start, end, until, p, w, state, monitor)
+        elif last and (step > 0 or not new):
+            watch_middle(step, earlier, after, p, w, state, monitor)
 
 
 # -- entry point ------------------------------------------------------------------------------------
@@ -540,30 +665,26 @@ def watch(p, w, state, monitor):
 
     Distances are monitored for the steps from ``monitor.flags[0]`` to before ``flags[1]``. ``flags[2]`` chooses the
     forces: none (0); all but the last step, which stays in the trail until its neighbour is known (1); or all steps,
-    because none follows (2). ``flags[3]`` is 1 if a step has stayed in the trail.
+    because none follows (2). ``flags[3]`` is 1 if a step has stayed in the trail. With 3 for ``flags[2]``, nothing is
+    monitored: the first step's bounds are computed (`bound_moves`).
     """
     trail, flags = state.trail, monitor.flags
-    for row in range(flags[0], flags[1]):
-        watch_distances(row, p, state, monitor)
+    if flags[2] == 3:
+        bound_moves(trail.points[row_of(flags[0], state)], p, monitor)
+        return 0
+    for step in range(flags[0], flags[1]):
+        watch_distances(row_of(step, state), p, state, monitor)
     if flags[2] == 0:
         return 0
-    rows, last = state.count[4], flags[2] == 2
-    watch_forces(p, w, state, monitor, rows, last)
-    if last or rows == 0:
+    steps, last = state.count[4], flags[2] == 2
+    watch_forces(p, w, state, monitor, steps, last)
+    if last or steps == 0:
         flags[3], state.count[4] = 0, 0
         return 0
-    if rows > 1:
-        copy(trail.gauge[rows - 2 : rows - 1], monitor.gauge)
-        copy(trail.gauge[rows - 1 :], trail.gauge[:1])
-        copy(trail.clock[rows - 1 :], trail.clock[:1])
-        copy(trail.points[rows - 1], trail.points[0])
+    if steps > 1:
+        before = trail.gauge[row_of(steps - 2, state)]
+        for c in range(before.shape[0]):
+            monitor.gauge[0, c] = before[c]
+    state.count[5] = row_of(steps - 1, state)
     flags[3], state.count[4] = 1, 1
     return 0
-
-
-@compiled
-def copy(a, out):
-    """Copy rows of a into out, as many as both have."""
-    for k in range(min(a.shape[0], out.shape[0])):
-        for c in range(a.shape[1]):
-            out[k, c] = a[k, c]

@@ -272,25 +272,23 @@ def watch_landing(i, curve, t, s, monitor):
 
 @compiled
 def watch(points, clock, p, s, monitor):
-    """Take the clearances of steps: control points (S, 5, n) of the states, start and length (S, 2) [s]."""
-    curve = monitor.curves[0]
-    for row in range(points.shape[0]):
-        parts = 1
+    """Take the clearances of a step: control points (5, n) of the states, start and length (2,) [s]."""
+    curve, parts = monitor.curves[0], 1
+    if p.body_formulation:
+        parts = int(min(max(1.0, math.ceil(angle_of(points, p) / _TURN)), 1e4))
+    h = clock[1] / parts
+    for part in range(parts):
+        start = clock[0] + part * h
         if p.body_formulation:
-            parts = int(min(max(1.0, math.ceil(angle_of(points[row], p) / _TURN)), 1e4))
-        h = clock[row, 1] / parts
-        for part in range(parts):
-            start = clock[row, 0] + part * h
-            if p.body_formulation:
-                attitudes(points[row], part, parts, p, monitor)
-            for i in range(monitor.left.shape[0]):
-                if not monitor.left[i]:
-                    continue
-                in_world(points[row], i, 0, p, monitor, curve)
-                for b in range(s.kind.shape[0]):
-                    watch_solid(i, b, curve, start, h, s, monitor)
-                if part == parts - 1:
-                    watch_landing(i, curve, start + h, s, monitor)
+            attitudes(points, part, parts, p, monitor)
+        for i in range(monitor.left.shape[0]):
+            if not monitor.left[i]:
+                continue
+            in_world(points, i, 0, p, monitor, curve)
+            for b in range(s.kind.shape[0]):
+                watch_solid(i, b, curve, start, h, s, monitor)
+            if part == parts - 1:
+                watch_landing(i, curve, start + h, s, monitor)
 
 
 def monitor_of(monitor: Monitor) -> Watched:

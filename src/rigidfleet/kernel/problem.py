@@ -65,6 +65,8 @@ class Graph(NamedTuple):
     weight: Annotated[Floats, Extents(("P",))]  # +-1/m_i [1/kg]
     diagonal: PerEdge  # of A: 1/m_i + 1/m_j [1/kg]
     solver: int = 0  # address of the multiplier solver of a large formation (`large`)
+    # if it finds the constraint force itself: address of what computes the multipliers of the last evaluation
+    multipliers: int = 0
 
 
 class ConstraintLaw(NamedTuple):

@@ -1,6 +1,7 @@
 """Content of a sample: forces and references at a state."""
 
 from rigidfleet.kernel.compiler.jit import compiled
+from rigidfleet.kernel.constraint import find_multipliers
 from rigidfleet.kernel.dynamics import closed_loop
 from rigidfleet.kernel.problem import BODY, OPEN, TRACKING
 from rigidfleet.kernel.references import blend_slots
@@ -30,6 +31,7 @@ def record(times, samples, p, w, dy, out):
 def record_sample(t, p, w, k, out):
     """Copy the values of the closed loop at time t [s] from the workspace into row k of a record."""
     kind = p.control.kind
+    find_multipliers(p.graph)
     for i in range(w.c.shape[0]):
         out.c[k, i], out.L[k, i], out.multiplier[k, i] = w.c[i], w.L[i], w.multiplier[i]
         out.d[k, i], out.d_dot[k, i] = w.d[i], w.d_dot[i]

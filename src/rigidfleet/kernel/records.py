@@ -50,6 +50,7 @@ FROM_KNOTS = np.linalg.inv(bernstein(KNOTS))
 class Trail(NamedTuple):
     """Recorded steps, for extremes between samples; without rows, no steps are recorded.
 
+    The first row follows the last one: steps that have been searched make room for others, and none is ever moved.
     ``points`` are the Bernstein coefficients of the continuous extension, a polynomial of fourth degree.
     """
 
@@ -60,9 +61,9 @@ class Trail(NamedTuple):
 
 
 def trail(states: int, agents: int, edges: int) -> Trail:
-    """Allocate a trail of half a megabyte, or of two steps."""
+    """Allocate a trail of half a megabyte, or of three steps."""
     row = 5 * states + 3 * agents + 2 * edges
-    rows = max(2, _TRAIL // (8 * row))
+    rows = max(3, _TRAIL // (8 * row))
     gauge = 3 * agents + 2 * edges
     shapes = (rows, 2), (rows, 5, states), (rows, gauge), (gauge,)
     return Trail(*(np.empty(shape) for shape in shapes))
@@ -91,6 +92,9 @@ class Monitor(NamedTuple):
     struck: Pairs  # of a lost agent and one still flying
     columns: Pairs  # that may fly one below the other
     flags: Ints  # (4,) see `monitor.watch`
+    moves: (
+        Floats  # (2,) bounds of how far distances change over a step [m], see `monitor.bound_moves`
+    )
     recorder: int  # address of the recorder, with its arguments: `time` and `states` to evaluate at
     segment: int
     record: int
@@ -100,9 +104,10 @@ class Monitor(NamedTuple):
     nodes: Floats  # (27, 3N + 2m) forces at points of two steps
     instants: Floats  # (27,) times of these points [s]
     rank: Ints  # (27,) their order in time
-    # control points of the agents' positions over a step [m]
+    # control points of the agents' positions over a step, world axes, if pairs or obstacles need them [m]
     places: Annotated[Floats, Extents(("N", 5, 3))]
-    span: PerAgent  # radius of a ball about the third one that holds all five [m]
+    # of the ball about the third control point that holds all five: its centre and its radius [m]
+    balls: Annotated[Floats, Extents(("N", 4))]
     curve: Annotated[Floats, Extents((5, 3))]  # of one pair
     work: Annotated[Floats, Extents((40, 11))]  # polynomials
     pieces: Annotated[Floats, Extents((40, 17))]  # curves
@@ -123,12 +128,12 @@ def monitor(
         "who": np.full((count, 2), -1), "radius": radius, "boxes": boxes, "fence": fence,
         "left": np.ones(n, dtype=np.bool_), "standing": np.zeros(n, dtype=np.int64),
         "low": np.full((n, 3), np.inf), "pad": 0.0, "pairs": none, "struck": none, "columns": none,
-        "flags": np.zeros(4, dtype=np.int64),
+        "flags": np.zeros(4, dtype=np.int64), "moves": np.zeros(2),
         "recorder": 0, "segment": 0, "record": 0, "time": np.zeros(1),
         "states": np.zeros((1, states)), "gauge": np.zeros((2, gauge)),
         "nodes": np.empty((_NODES, gauge)), "instants": np.zeros(_NODES),
         "rank": np.zeros(_NODES, dtype=np.int64),
-        "places": np.zeros((n, 5, 3)), "span": np.zeros(n), "curve": np.zeros((5, 3)), "work": np.zeros((40, 11)),
+        "places": np.zeros((n, 5, 3)), "balls": np.zeros((n, 4)), "curve": np.zeros((5, 3)), "work": np.zeros((40, 11)),
         "pieces": np.zeros((40, 17)), "basis": np.zeros((5, 5)), "poses": np.zeros((5, 15)),
         "knots": np.zeros((5, 3)), "scratch": np.zeros((3, 10)),
     }  # fmt: skip
@@ -143,7 +148,7 @@ class IntegratorState(NamedTuple):
     clock: Vector  # t [s], next step h [s], logarithm of the last error
     count: NDArray[
         np.int64
-    ]  # (5,) evaluations, accepted, rejected, samples written, steps in the trail
+    ]  # (6,) evaluations, accepted, rejected, samples written, steps in the trail, row of the first of these
     rtol: float
     trail: Trail
 
@@ -165,7 +170,7 @@ def integrator(
     n = len(y)
     K = zeros(10, padded(n))
     K[ATOL, :n], K[ATOL, n:] = atol, 1.0
-    clock, count = np.array([t, step, LEAST_ERROR]), np.zeros(5, dtype=np.int64)
+    clock, count = np.array([t, step, LEAST_ERROR]), np.zeros(6, dtype=np.int64)
     return IntegratorState(y.copy(), K, clock, count, rtol, trail)
 
 

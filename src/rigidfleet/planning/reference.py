@@ -25,7 +25,7 @@ from rigidfleet.typing import Bools, Floats, Ints
 
 @dataclass(frozen=True)
 class ByEdge:
-    """A number for each edge that has been active: values (m,), sorted by the edges' keys (m,)."""
+    """A number for each edge that has been active: keys of the edges (m,), and values (m,)."""
 
     keys: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     values: Floats = field(default_factory=lambda: np.zeros(0))
@@ -36,24 +36,28 @@ class ByEdge:
         A function of ``other`` values is called only where edges may be new.
         """
         keys = _keys(edges)
-        if keys is self.keys and not (isinstance(other, np.ndarray) and other.ndim > 1):
+        if self._has(keys) and not (isinstance(other, np.ndarray) and other.ndim > 1):
             return self.values.copy()
         new = other if isinstance(other, np.ndarray | float | int) else other()
         if not len(self.keys):
             return np.zeros(len(edges)) + new
-        at = np.searchsorted(self.keys, keys)
+        order = np.argsort(self.keys)
+        at = np.searchsorted(self.keys, keys, sorter=order)
+        at = np.append(order, len(order))[at]
         known = np.append(self.keys, -1)[at] == keys
         return np.where(known, np.append(self.values, 0.0)[at], new)
 
     def updated(self, edges: Ints, values: Floats) -> ByEdge:
         """These values, updated with the ``values`` of edges (m, 2), i < j."""
         keys = _keys(edges)
-        if keys is self.keys:
-            return ByEdge(keys, values.copy())
-        if (keys[1:] > keys[:-1]).all() and (not len(self.keys) or np.array_equal(keys, self.keys)):
+        if not len(self.keys) or self._has(keys):
             return ByEdge(keys, values.copy())
         keys, first = np.unique(np.concatenate([keys, self.keys]), return_index=True)
         return ByEdge(keys, np.concatenate([values, self.values])[first])
+
+    def _has(self, keys: Ints) -> bool:
+        """Whether these are its edges, in the same order: most phases have those of the phase before."""
+        return keys is self.keys or np.array_equal(keys, self.keys)
 
 
 @kept

@@ -11,7 +11,7 @@ import numpy as np
 
 from rigidfleet.errors import FlightError, StoppedError
 from rigidfleet.kernel import records
-from rigidfleet.kernel.engine import native
+from rigidfleet.kernel.engine import native, packing
 from rigidfleet.kernel.problem import OPEN, TRACKING, Problem
 from rigidfleet.math import attitude as att
 from rigidfleet.mission import Settle
@@ -115,8 +115,10 @@ class ActivePhase:
 
     def _start(self, y: Floats, t: float) -> None:
         """Start to integrate the plan at a state (n,) and time [s]."""
-        self.workspace, self.solver = equip(self.plan)
-        trail = self.extremes.begin(len(y), len(self.plan.edges))
+        plan = self.plan
+        aside = plan.large and self.external is None
+        trail = self.extremes.begin(len(y), len(plan.edges), aside=aside)
+        self.workspace, self.solver = equip(plan)
         self.state = integrator(self.plan, y, t, trail)
 
     @property
@@ -234,27 +236,29 @@ class ActivePhase:
         if last or self.solver is None or self.external is not None:
             self.extremes.take(self.flown, work, self.state, last=last)
         else:
-            self.state = self.extremes.hand_over(self.flown, work, self.state)
+            self.extremes.hand_over(self.flown, work, self.state)
 
     def end(self) -> PhaseState:
         """End the phase at its current state; return the state that the next phase starts from."""
-        self._check()
+        self.check()
         if not (self.state.count[0] or self.t > self.plan.start):
             return self.plan.before
         self.evaluate()
         return self.plan.reached(self.t, self.state.y, self.workspace)
 
-    def release(self) -> None:
-        """Give the workspace back, after the end: nothing more is asked of this phase."""
-        give_back(self.plan.problem, self.workspace)
-
-    # -- inside -----------------------------------------------------------------------------------
-
-    def _check(self) -> None:
+    def check(self) -> None:
         """Raise errors of the multipliers' solver, or of the monitor's solver."""
         if self.solver is not None:
             self.solver.check()
             self.solver.aside.check()
+
+    def release(self) -> None:
+        """Give the workspace back, after the end: nothing more is asked of this phase."""
+        give_back(self.plan.problem, self.workspace)
+        if self.solver is not None:
+            packing.forget()
+
+    # -- inside -----------------------------------------------------------------------------------
 
     def _integrate(self, problem: Problem, t_end: float) -> None:
         """Integrate to ``t_end`` [s], and remove vehicles and links at the times at which they are lost.
@@ -273,7 +277,7 @@ class ActivePhase:
         Returns the remaining problem.
         """
         self.watch(last=True)
-        self._check()
+        self.check()
         plan, y, own = self.plan, self.state.y, problem is self.plan.problem
         self.parted = plan.links_lost[1] <= self.t
         if now.any():
@@ -312,24 +316,23 @@ class ActivePhase:
     def _segment(self, problem: Problem, t_end: float) -> None:
         """Integrate to ``t_end`` [s] and record the samples on the way."""
         stretch = self.prepare(problem, self.times(t_end))
-        state, fresh = self.state, stretch.fresh  # of which another trail alone may follow
-        given = t_end, stretch.times, stretch.samples
+        state, fresh = self.state, stretch.fresh
         status = records.PAUSED
-        go_on = native.Integration(problem, self.workspace, state, *given)
+        most = _STEPS if self.solver is None else self.extremes.room
+        go_on = native.Integration(
+            problem, self.workspace, state, t_end, stretch.times, stretch.samples
+        )
         try:
             while status == records.PAUSED:
-                if state is not self.state:
-                    state = self.state
-                    go_on = native.Integration(problem, self.workspace, state, *given)
                 begun = clock.perf_counter()
-                status = go_on(fresh, self.steps)
+                status = go_on(fresh, min(self.steps, most))
                 took = max(clock.perf_counter() - begun, 1e-6)
                 if status == records.PAUSED:
                     self.steps = min(_STEPS, max(1, int(self.steps * min(_PAUSE / took, 10.0))))
                 fresh = False
                 if self.external is not None:
                     self.external.check()
-                self._check()
+                self.check()
                 if status == records.PAUSED or state.count[4] == len(state.trail.clock):
                     self.watch(last=False)
                 self.pause(self.t)

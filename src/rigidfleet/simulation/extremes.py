@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from rigidfleet._common.kept import kept
 from rigidfleet.kernel import avoidance, fleet, records
-from rigidfleet.kernel.engine import native
+from rigidfleet.kernel.engine import native, packing
 from rigidfleet.kernel.problem import Problem, Workspace
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
@@ -39,14 +39,6 @@ _TOUCH = 1e-6
 _SHORTEST = 2.0**-20
 #: Agents that are asked for their nearest one, to choose how far the list reaches.
 _ASKED = 2000
-#: Agents whose bounds are computed at a time.
-_AT_ONCE = 4096
-#: Bernstein coefficients of degree 4 of the derivative of a polynomial with coefficients x of degree 4: row k is
-#: k (x_k - x_k-1) + (4 - k) (x_k+1 - x_k).
-_RATES = np.array(
-    [[-4, 4, 0, 0, 0], [-1, -2, 3, 0, 0], [0, -2, 0, 2, 0], [0, 0, -3, 2, 1], [0, 0, 0, -4, 4]],
-    dtype=float,
-)
 #: Quantities that the monitor stores with the opposite sign.
 _GREATEST = frozenset(
     ("geofence", "highest", "speed", "thrust", "thrust_margin", "acceleration", "constraint_force", "tension",
@@ -115,9 +107,10 @@ class Extremes:
         self.standing = self.stood.copy()
         self.pairs = self.columns = self.struck = np.zeros((0, 2), dtype=np.int64)
         self.spare, self.moved = 0.0, np.zeros(2)
-        self.trail = self._other = records.NO_TRAIL
+        self.trail = records.NO_TRAIL
         self._thread: ThreadPoolExecutor | None = None  # of large formations
         self._taking: Future[None] | None = None
+        self._touching: Future[None] | None = None
         self.of_vehicles: dict[str, Extremum] = {}
         self.avoidance: avoidance.Avoidance | None = None  # that of the phase under way
         self.led: dict[str, Extremum] = {}  # what its clock and its body layer did
@@ -160,8 +153,11 @@ class Extremes:
         if len(self.trail.points):
             self.monitor.monitor.flags.fill(0)
 
-    def begin(self, states: int, edges: int) -> records.Trail:
-        """Begin to monitor an integrator with this many states; it must record its steps in the returned trail."""
+    def begin(self, states: int, edges: int, *, aside: bool = False) -> records.Trail:
+        """Begin to monitor an integrator with this many states; it must record its steps in the returned trail.
+
+        ``aside``: they will be handed over to another thread.
+        """
         if self.trail.points.shape[2] == states and len(self.trail.start) == 3 * self.n + 2 * edges:
             return self.trail
         self.trail = trail = records.trail(states, self.n, edges)
@@ -172,7 +168,19 @@ class Extremes:
             struck=self.struck,
         )  # fmt: skip
         self.monitor = native.Watch(found)
+        if aside:
+            # Memory costs far more time when it is first touched than ever after. The rows that the integrator reaches
+            # after it has handed over steps are touched while it flies these.
+            self._touching = self._beside().submit(trail.points[self.room :].fill, 0.0)
         return trail
+
+    def _beside(self) -> ThreadPoolExecutor:
+        """The other thread."""
+        if self._thread is None:
+            from concurrent.futures import ThreadPoolExecutor
+
+            self._thread = ThreadPoolExecutor(1)
+        return self._thread
 
     def lose(self, lost: Bools) -> None:
         """Continue without the vehicles ``lost`` (N,), which must not hit the others."""
@@ -194,38 +202,38 @@ class Extremes:
         self, problem: Problem, work: Workspace, state: records.IntegratorState, *, last: bool
     ) -> None:
         """Evaluate the steps in the trail; ``last``: no further steps of the segment follow."""
-        flags, rows = self.monitor.monitor.flags, int(state.count[4])
-        self._take_solids(problem, state, int(flags[3]), rows)
-        flags[:3] = flags[3], rows, 2 if last else 1
+        flags, steps = self.monitor.monitor.flags, int(state.count[4])
+        new = range(int(flags[3]), steps)
+        self._take_solids(problem, state, new)
+        flags[:3] = flags[3], steps, 2 if last else 1
         if self.n > _FEW:
-            for row in range(int(flags[3]), rows):
-                self._step(problem, work, state, row)
+            for step in new:
+                self._step(problem, work, state, step)
             flags = self.monitor.monitor.flags
-            flags[:3] = rows, rows, 2 if last else 1
+            flags[:3] = steps, steps, 2 if last else 1
         self.monitor(problem, work, state)
 
-    def hand_over(
-        self, problem: Problem, work: Workspace, state: records.IntegratorState
-    ) -> records.IntegratorState:
-        """Let another thread evaluate the steps in the trail, `take`; return the state with another trail to fill.
+    @property
+    def room(self) -> int:
+        """Number of steps for which the trail has room while another thread evaluates as many, and the one before."""
+        return (len(self.trail.clock) - 1) // 2
+
+    def hand_over(self, problem: Problem, work: Workspace, state: records.IntegratorState) -> None:
+        """Let another thread evaluate the steps in the trail, `take`; no more than `room` may follow.
 
         Until `wait`, only that thread may use this monitor, ``work``, and what the problem's law changes.
         """
-        if self._thread is None:
-            from concurrent.futures import ThreadPoolExecutor
+        if self._touching is not None:
+            self._touching.result()
+            self._touching = None
+        taken, count = state._replace(count=state.count.copy()), state.count
+        # The last step stays, until its neighbour is known.
+        count[4:] = 1, (count[5] + count[4] - 1) % len(state.trail.clock)
+        self._taking = self._beside().submit(self._take_aside, problem, work, taken)
 
-            self._thread = ThreadPoolExecutor(1)
-        full, rows = state.trail, int(state.count[4])
-        if self._other.start is not full.start:  # which both share: it counts until a fresh start
-            self._other = records.Trail(*(np.empty_like(x) for x in full[:3]), full.start)
-        self.trail, self._other = self._other, full
-        # The last step waits for its neighbour, which is the first one of the other trail.
-        for part, of in zip(self.trail[:3], full[:3], strict=True):
-            part[0] = of[rows - 1]
-        taken = state._replace(count=state.count.copy())
-        state.count[4] = 1
-        self._taking = self._thread.submit(self.take, problem, work, taken, last=False)
-        return state._replace(trail=self.trail)
+    def _take_aside(self, *given: Any) -> None:
+        self.take(*given, last=False)
+        packing.forget()  # the phase may be over before this thread packs others
 
     def wait(self) -> None:
         """Wait until the steps that were handed over are evaluated."""
@@ -237,18 +245,16 @@ class Extremes:
 
     def take_path(self, problem: Problem, work: Workspace, state: records.IntegratorState) -> None:
         """Evaluate the paths alone of the steps in the trail, not the forces."""
-        rows, flags = int(state.count[4]), self.monitor.monitor.flags
-        self._take_solids(problem, state, 0, rows)
+        steps, flags = int(state.count[4]), self.monitor.monitor.flags
+        self._take_solids(problem, state, range(steps))
         if self.n > _FEW:
-            for row in range(rows):
-                self._step(problem, work, state, row)
+            for step in range(steps):
+                self._step(problem, work, state, step)
             return
-        flags[:3] = 0, rows, 0
+        flags[:3] = 0, steps, 0
         self.monitor(problem, work, state)
 
-    def _take_solids(
-        self, problem: Problem, state: records.IntegratorState, first: int, last: int
-    ) -> None:
+    def _take_solids(self, problem: Problem, state: records.IntegratorState, steps: range) -> None:
         """Take the clearances of some steps in the trail to obstacles that the monitor itself does not take."""
         if self.solids is None:
             return
@@ -257,9 +263,9 @@ class Extremes:
         trail, body = state.trail, bool(problem.body_formulation)
         laid = obstacles.layout(problem.vehicles.m, problem.graph.edges, body)
         watched = obstacles.monitor_of(self.monitor.monitor)
-        obstacles.watch(
-            trail.points[first:last], trail.clock[first:last], laid, self.solids, watched
-        )
+        for step in steps:
+            row = _row(state, step)
+            obstacles.watch(trail.points[row], trail.clock[row], laid, self.solids, watched)
 
     def take_vehicles(
         self,
@@ -390,15 +396,23 @@ class Extremes:
             self.columns = self.pairs
 
     def _step(
-        self, problem: Problem, work: Workspace, state: records.IntegratorState, row: int
+        self, problem: Problem, work: Workspace, state: records.IntegratorState, step: int
     ) -> None:
         """Monitor the distances of one step, in pieces so short that only the listed pairs matter."""
+        row = _row(state, step)
         (start, length), whole = state.trail.clock[row], state.trail.points[row]
         gauge, none = state.trail.gauge[:0], state.trail.start
         pieces: list[tuple[float, float, Floats]] = [(start, length, whole)]
         while pieces:
             t, h, points = pieces.pop()
-            moved = self._moves(problem, points)
+            trail = records.Trail(np.array([[t, h]]), points[None], gauge, none)
+            piece = state._replace(trail=trail)
+            flags = self.monitor.monitor.flags
+            flags[:3] = 0, 1, 3
+            self.monitor(problem, work, piece)
+            moved = self.monitor.monitor.moves.copy()
+            if not self.stacks:
+                moved[1] = 0.0
             if (self.moved + moved > self.spare).any():
                 self._list(problem, points[0], 0.0)
             if moved.max() > self.spare:
@@ -413,8 +427,7 @@ class Extremes:
                 self._list(problem, points[0], float(moved.max()))
             self.moved += moved
             self.monitor.monitor.flags[:3] = 0, 1, 0
-            trail = records.Trail(np.array([[t, h]]), points[None], gauge, none)
-            self.monitor(problem, work, state._replace(trail=trail))
+            self.monitor(problem, work, piece)
 
     def _list(self, problem: Problem, y: Floats, moves: float) -> None:
         """List the pairs that are near each other, or one below the other, at a state (n,).
@@ -461,39 +474,7 @@ class Extremes:
             before._replace(pairs=self.pairs, columns=self.columns, flags=before.flags.copy())
         )
 
-    def _moves(self, problem: Problem, points: Floats) -> Floats:
-        """Bounds (2,) [m] of the change of any distance over a step (5, n), in space and as seen from above.
 
-        With r_i' = any rigid motion + u_i, the rate of a distance is at most |u_i| + |u_j|, and |u_i| is at most its
-        greatest Bernstein coefficient. The rotation is the one that leaves the smallest u_i. As seen from above,
-        tilting rotations change distances, too.
-        """
-        x = points[:, : 3 * self.n].reshape(5, -1, 3)
-        x = x if self.left.all() else x[:, self.left]
-        mean = x.mean(axis=1, keepdims=True)
-        # Few agents at a time, so that what is computed of them stays in the processor's cache
-        parts = [slice(k, k + _AT_ONCE) for k in range(0, x.shape[1], _AT_ONCE)]
-        second, turning = np.zeros((3, 3)), np.zeros((3, 3))
-        for part in parts:
-            of = x[:, part] - mean
-            middle, way = 0.5 * (of[0] + of[4]), of[4] - of[0]
-            second += middle.T @ middle
-            turning += middle.T @ way
-        inertia = np.trace(second) * np.eye(3) - second
-        moment = [turning[a, b] - turning[b, a] for a, b in ((1, 2), (2, 0), (0, 1))]
-        spin = np.linalg.pinv(inertia, 1e-9, hermitian=True) @ np.array(moment)
-        turned = np.cross(spin, np.eye(3))
-        fastest = farthest = 0.0
-        for part in parts:
-            of = x[:, part] - mean
-            rate = (_RATES @ of.reshape(5, -1)).reshape(-1, 3) - of.reshape(-1, 3) @ turned
-            fastest = max(fastest, float(np.einsum("ia,ia->i", rate, rate).max()))
-            farthest = max(farthest, float(np.einsum("kia,kia->ki", of, of).max()))
-        moved, widest = 2.0 * math.sqrt(fastest), 2.0 * math.sqrt(farthest)
-        tilt = math.hypot(spin[0], spin[1])
-        if problem.body_formulation:
-            q = points[:, 6 * self.n + len(problem.graph.edges) :][:, :4]
-            rates = 4.0 * np.linalg.norm(np.diff(q, axis=0), axis=1).max()
-            size = max(float(np.linalg.norm(q, axis=1).min()) - 0.1, 0.1)
-            tilt = 2.0 * float(rates) / size + float(np.linalg.norm(spin))
-        return np.array([moved, moved + tilt * widest if self.stacks else 0.0])
+def _row(state: records.IntegratorState, step: int) -> int:
+    """Row of the trail that holds one of the steps in it, which are numbered from 0."""
+    return int(state.count[5] + step) % len(state.trail.clock)

@@ -618,7 +618,7 @@ class Flight:
         self._ended = active
         self._t = record.t_end = active.t
         if active.solver is not None:  # its errors are told at once
-            _ = self._now
+            active.check()
         if abandoned:
             points = () if record.target is None else record.target.get("through", ())
             came = [point for point in points if point["time"] <= record.t_end]

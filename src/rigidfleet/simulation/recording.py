@@ -97,11 +97,6 @@ class Unevaluated(NamedTuple):
         r_cm, v_cm = (x[:, None] for x in cm)
         return r_cm + r @ T, v_cm + v @ T
 
-    @property
-    def places(self) -> Floats:
-        """Positions (K, N, 3) of agents, or states that begin with them: what is at hand."""
-        return self.motion[0] if self.problem.body_formulation else self.y
-
     def evaluated(self, times: Floats, work: Workspace, out: Record | None = None) -> Record:
         """Forces and references at the samples, times (K,) [s], into the rows ``out`` if given."""
         out = native.record(self.problem, work, times, self.y, out)
@@ -186,9 +181,18 @@ def assemble(
         }
         for phase in phases
     ]
-    # Of the pieces, what is left to do keeps no more than it needs.
+    # Of the pieces, what is left to do keeps no more than it needs: positions, or states that begin with them.
+    motion = [
+        p.given.motion if isinstance(p.given, Unevaluated) else (p.given.r, p.given.v)
+        for p in pieces
+    ]
     places = _Places(
-        [p.given.places if isinstance(p.given, Unevaluated) else p.given.r for p in pieces],
+        [
+            p.given.y
+            if isinstance(p.given, Unevaluated) and not p.given.problem.body_formulation
+            else r
+            for p, (r, _) in zip(pieces, motion, strict=True)
+        ],
         mission.n_agents,
     )
     later: list[tuple[tuple[str, ...], Callable[[], dict[str, Any]]]] = [
@@ -201,9 +205,8 @@ def assemble(
         (("singular_value",), partial(_singular_values, places, [p.edges for p in pieces])),
         (("mission_text",), partial(_text, mission)),
     ]
-    motion = [p.given.motion for p in pieces if isinstance(p.given, Unevaluated)]
     now: dict[str, Any] = {}
-    if len(motion) == len(pieces):
+    if all(isinstance(p.given, Unevaluated) for p in pieces):
         now["position"], now["velocity"] = (_joined(parts) for parts in zip(*motion, strict=True))
     else:
         for names, make in later[:2]:

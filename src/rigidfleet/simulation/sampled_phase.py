@@ -248,7 +248,7 @@ class SampledPhase(ActivePhase):
                     self.state.clock[0] = t_end
                 if self.external is not None:
                     self.external.check()
-                self._check()
+                self.check()
                 self.watch(last=False)
                 self.pause(self.t)
         finally:

@@ -37,8 +37,9 @@ def equip(plan: PhasePlan) -> tuple[Workspace, LargeSolver | None]:
     if plan.method == "elimination":
         steps = solvers.elimination_steps(len(points), edges)
         order = None if steps is None else elimination.order(steps, plan.problem.graph.edges)
+    axes = plan.problem.has_frame or plan.problem.law.k_def > 0.0
     solver = large_solver(
-        plan.problem, Setup(order, solvers.Dissection(points, edges), *plan.residual())
+        plan.problem, Setup(order, solvers.Dissection(points, edges), *plan.residual(), axes)
     )
     plan.problem = solved_by(solver, plan.problem)
     return solver.workspace, solver
@@ -58,7 +59,8 @@ def large_solver(problem: Problem, setup: Setup) -> LargeSolver:
 
 def solved_by(solver: LargeSolver, problem: Problem) -> Problem:
     """A problem whose multipliers this solver finds, as long as somebody keeps it."""
-    return problem._replace(graph=problem.graph._replace(solver=solver.address))
+    graph = problem.graph._replace(solver=solver.address, multipliers=solver.multipliers)
+    return problem._replace(graph=graph)
 
 
 def small_workspace(problem: Problem) -> Workspace:

@@ -194,14 +194,14 @@ class Vector:
         K[lane_steps.ATOL] = interleaved([state.K[ATOL, :n] for state in states])
         clock = np.array([states[0].clock[0], _FIRST_STEP_IN_VECTORS, LEAST_ERROR])
         trail = NO_TRAIL._replace(clock=trails[0].clock)  # for its length
-        y, counts = interleaved([state.y for state in states]), np.zeros(5, dtype=np.int64)
+        y, counts = interleaved([state.y for state in states]), np.zeros(6, dtype=np.int64)
         self._state = IntegratorState(y, K, clock, counts, states[0].rtol, trail)
         self._fresh = True
 
     def __call__(self, t_end: float, max_steps: int) -> int:
         """Go on to ``t_end`` [s]; return what `dopri5.integrate` returns. States, trails and samples are then known."""
         state = self._state
-        state.count[4] = self._states[0].count[4]
+        state.count[4:] = self._states[0].count[4:]
         status = fly_on(
             self._problem, state, t_end, self._fresh, self._times, _UNSAMPLED, max_steps
         )
@@ -276,7 +276,7 @@ def fly_all(
     def begin() -> Callable[..., None]:
         K = np.zeros((lane_steps.ROWS, n, WIDTH))
         K[lane_steps.ATOL] = atol[:, None]
-        y, clock, counts = pack(np.zeros((n, WIDTH))), np.zeros(3), np.zeros(5, dtype=np.int64)
+        y, clock, counts = pack(np.zeros((n, WIDTH))), np.zeros(3), np.zeros(6, dtype=np.int64)
         state = IntegratorState(y, pack(K), clock, counts, rtol, NO_TRAIL)
         own = ready._replace(before=ready.before.copy(), time=ready.time.copy())
 

@@ -198,7 +198,7 @@ def _points(k, q, coordinates, h):
 @compiled
 def keep_step(t, h, p, w, state):
     """As `dopri5.keep_step`, for each flight into its own trail."""
-    k, row = state.K, state.count[4]
+    k, row = state.K, (state.count[5] + state.count[4]) % state.trail.clock.shape[0]
     n, forces = k.shape[1], p.gauge.shape[0]
     spread(filled(t), p.kept[4], 2 * row)
     spread(filled(h), p.kept[4], 2 * row + 1)
@@ -212,7 +212,7 @@ def keep_step(t, h, p, w, state):
         spread(e, p.kept[0], place + 4 * n)
     for g in range(forces):
         spread(p.gauge[g], p.kept[1], forces * row + g)
-    state.count[4] = row + 1
+    state.count[4] += 1
 
 
 @compiled

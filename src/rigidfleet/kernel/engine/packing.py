@@ -209,6 +209,11 @@ def packed(x: Any) -> Packed:
     return found
 
 
+def forget() -> None:
+    """Let go of the tuples that this thread has packed last; those of a large formation hold much memory."""
+    _last.packed.clear()
+
+
 @cache
 def _layout(kind: type) -> _Layout:
     return _Layout(next(x for x in examples() if isinstance(x, kind)))

@@ -3,7 +3,7 @@
 Such a graph (a 3-tree, or any other made by Henneberg type-I steps) has 3N - 6 edges. If no pivot is lost, J has
 full row rank, and its null space is the six rigid motions of the *current* shape. So any a_p with J a_p = b, plus the
 rigid motion that restores the balance of momentum, is M^-1 f_C of the exact law. A = J M^-1 J^T is neither formed nor
-factored: a forward pass finds a_p, and a backward pass the multipliers.
+factored: a forward pass finds a_p, and a backward pass the multipliers, if they are asked for.
 """
 
 import math
@@ -40,8 +40,8 @@ def order(steps: Ints, edges: NDArray[np.integer]) -> Order:
 
 
 @compiled
-def solve(u, b, r, m, M, order, known, cm, I, I_inv, a, multiplier):
-    """Compute multipliers (m,) of the exact law for b (m,) and return the smallest pivot; if LOST, write nothing.
+def solve(u, b, r, m, M, order, known, cm, I, I_inv, a, f_C):
+    """Compute f_C (N, 3) of the exact law for b (m,) and return the smallest pivot; if LOST, write nothing.
 
     The agents are at r (N, 3), with unit vectors u (m, 3). The centre of mass cm, the inertia I about it and its
     inverse are computed unless ``known``; a (N, 3) is scratch.
@@ -52,8 +52,7 @@ def solve(u, b, r, m, M, order, known, cm, I, I_inv, a, multiplier):
         inertia_inverse(I, I_inv)
     pivot = particular(u, b, order, a)
     if pivot > LOST:
-        balance(r, m, M, cm, I_inv, a)
-        pull_back(u, order, a, multiplier)
+        balance(r, m, M, cm, I_inv, a, f_C)
     return pivot
 
 
@@ -103,8 +102,8 @@ def particular(u, b, order, a):
 
 
 @inlined
-def balance(r, m, M, cm, I_inv, a):
-    """Turn accelerations a (N, 3) into forces M a, after removing the rigid motion that carries momentum.
+def balance(r, m, M, cm, I_inv, a, f):
+    """Forces f = M a (N, 3) of accelerations a (N, 3), without the rigid motion that carries their momentum.
 
     The forces then have zero sum, and zero torque about cm, the centre of mass of agents r (N, 3).
     """
@@ -122,12 +121,12 @@ def balance(r, m, M, cm, I_inv, a):
     w2 = I_inv[2, 0] * h0 + I_inv[2, 1] * h1 + I_inv[2, 2] * h2
     for i in range(r.shape[0]):
         x, y, z = r[i, 0] - cm[0], r[i, 1] - cm[1], r[i, 2] - cm[2]
-        a[i, 0] = m[i] * (a[i, 0] - p0 - (w1 * z - w2 * y))
-        a[i, 1] = m[i] * (a[i, 1] - p1 - (w2 * x - w0 * z))
-        a[i, 2] = m[i] * (a[i, 2] - p2 - (w0 * y - w1 * x))
+        f[i, 0] = m[i] * (a[i, 0] - p0 - (w1 * z - w2 * y))
+        f[i, 1] = m[i] * (a[i, 1] - p1 - (w2 * x - w0 * z))
+        f[i, 2] = m[i] * (a[i, 2] - p2 - (w0 * y - w1 * x))
 
 
-@inlined
+@compiled
 def pull_back(u, order, f, multiplier):
     """Multipliers (m,) with J^T lambda = f for balanced forces f (N, 3), last agent first; f is overwritten.
 

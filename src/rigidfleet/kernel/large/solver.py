@@ -1,6 +1,6 @@
 """The multiplier solve of large formations: its sequence of steps, and the fallback if a step fails.
 
-The kernel calls a `LargeSolver` through a C function (`Graph.solver`), like a user's force. A call costs some 20 us,
+The kernel calls a `LargeSolver` through C functions (`Graph.solver`), like a user's force. A call costs some 20 us,
 and the solve of a formation this large takes much longer. Memory and work grow with the number of edges.
 """
 
@@ -8,15 +8,16 @@ from __future__ import annotations
 
 import ctypes
 import math
+import weakref
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from rigidfleet.kernel.large import block_cholesky, elimination
-from rigidfleet.kernel.problem import ITERATED, ConstraintLaw, Vehicles, Workspace
+from rigidfleet.kernel.problem import ITERATED, ConstraintLaw, Vehicles, Workspace, workspace
 from rigidfleet.typing import Edges, Floats, Ints
 
 #: A stored factor is renewed when the iterations in excess of a new factor's have taken as long as making one. It is
@@ -58,11 +59,15 @@ class Setup(NamedTuple):
     order: Callable[[], Ints]
     tolerance: float  # relative residual of conjugate gradients
     floor: float = 0.0  # error of an acceleration that the damped law may always have [m/s^2]
+    axes: bool = False  # whether the kernel has computed the mean axes when it asks for a solution
 
 
 @dataclass
 class LargeSolver:
-    """Multipliers of one phase, Eq. (12), into its workspace."""
+    """Multipliers of one phase, Eq. (12), into its workspace.
+
+    Elimination finds the constraint force first, and the multipliers when they are asked for (`Graph.multipliers`).
+    """
 
     vehicles: Vehicles
     edges: Edges
@@ -83,23 +88,41 @@ class LargeSolver:
         self.pattern: block_cholesky.Pattern | None = (
             None  # not needed as long as elimination succeeds
         )
-        # An exception cannot pass through compiled code; the multipliers become NaN.
-        self._call = ctypes.CFUNCTYPE(None)(self._solve)
-        self.address = int(ctypes.cast(self._call, ctypes.c_void_p).value or 0)
+        self.pulled = True  # whether the workspace has the multipliers of the last evaluation
+        self._calls = [_callable(method) for method in (self._solve, self._pull)]
+        self.address, self.multipliers = (
+            int(ctypes.cast(call, ctypes.c_void_p).value or 0) for call in self._calls
+        )
+        if self.setup.elimination is None:
+            self.multipliers = 0
 
     def _solve(self) -> None:
-        self.workspace.multiplier[:] = math.nan
+        # An exception cannot pass through compiled code; the forces become NaN.
         try:
             if self.error is None:
                 self.counts.evaluations += 1
                 self.solve()
+                return
         except BaseException as error:
             self.error = error
+        self._fail()
+
+    def _pull(self) -> None:
+        try:
+            self.pull()
+        except BaseException as error:
+            self.error = error
+            self._fail()
+
+    def _fail(self) -> None:
+        self.workspace.multiplier[:] = self.workspace.f_C[:] = math.nan
+        self.pulled = True
 
     @cached_property
     def aside(self) -> LargeSolver:
         """Another solver of the same equations, in a workspace of its own, for another thread."""
-        own = Workspace(*(x.copy() for x in self.workspace))
+        with_h = self.workspace.H.size > 0
+        own = workspace(len(self.a), len(self.edges), with_h=with_h, large=True)
         return replace(self, workspace=own, counts=Counts(), error=None)
 
     def check(self) -> None:
@@ -109,21 +132,30 @@ class LargeSolver:
             raise error
 
     def solve(self) -> None:
-        """Solve for the multipliers of ``workspace.b``; NaN if there is no solution."""
+        """Solve for the forces or multipliers of ``workspace.b``; NaN if there is no solution."""
         w, vehicles, order = self.workspace, self.vehicles, self.setup.elimination
         if order is not None:
-            # With deformation damping, the kernel has computed the mean axes already.
-            known = self.law.k_def > 0.0
             pivot = elimination.solve(
-                w.u, w.b, w.r, vehicles.m, vehicles.M, order, known, w.cm[0], w.I, w.I_inv, self.a,
-                w.multiplier,
+                w.u, w.b, w.r, vehicles.m, vehicles.M, order, self.setup.axes, w.cm[0], w.I, w.I_inv, self.a, w.f_C,
             )  # fmt: skip
-            if pivot > elimination.LOST:
+            self.pulled = not pivot > elimination.LOST
+            if not self.pulled:
                 return
             self.counts.fallbacks += 1
         if not np.isfinite(w.b).all() or not self._on_vertex_graph():
             self.counts.failures += 1
-            w.multiplier[:] = math.nan
+            self._fail()
+        elif order is not None:
+            w.f_C[:] = 0.0
+            block_cholesky.apply_Jt(w.u, self.edges, w.multiplier, 1.0, w.f_C)
+
+    def pull(self) -> None:
+        """Find the multipliers of the last evaluation, if elimination has not found them yet."""
+        if not self.pulled:
+            self.pulled = True
+            w, order = self.workspace, self.setup.elimination
+            self.a[:] = w.f_C
+            elimination.pull_back(w.u, order, self.a, w.multiplier)
 
     def _on_vertex_graph(self) -> bool:
         """Iterated Tikhonov in the agents' coordinates, see `constraint.solve_at_agents`.
@@ -252,6 +284,18 @@ class LargeSolver:
                 self.kept[:] = self.L
                 return
             mu = max(10.0 * mu, 1e-3)
+
+
+def _callable(method: Callable[[], None]) -> Any:
+    """A C function that calls a method. It does not keep the object alive, so that nothing but its users does."""
+    found = weakref.WeakMethod(method)
+
+    def call() -> None:
+        bound = found()
+        if bound is not None:
+            bound()
+
+    return ctypes.CFUNCTYPE(None)(call)
 
 
 def _far_apart(r: Floats) -> Ints:
