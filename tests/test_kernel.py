@@ -785,7 +785,8 @@ def test_a_flight_needs_no_compiler():
     code = """
 import sys
 from rigidfleet import assess, load_mission, simulate
-assert assess(simulate(load_mission("narrow-passage"))).passed
+for name in ("narrow-passage", "windy-passage"):
+    assert assess(simulate(load_mission(name))).passed
 assert not {"numba", "scipy"} & set(sys.modules)
 """
     subprocess.run([sys.executable, "-c", code], check=True)

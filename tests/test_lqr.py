@@ -11,6 +11,11 @@ from scipy.interpolate import PPoly
 from scipy.linalg import expm, solve_continuous_are
 from scipy.optimize import brentq
 
+from rigidfleet.math.attitude import (
+    dcm_from_rotation_vector,
+    rotation_vector_from_dcm,
+    rotation_vector_rate,
+)
 from rigidfleet.math.lqr import (
     closed_loop_response,
     double_integrator_gains,
@@ -21,6 +26,7 @@ from rigidfleet.math.lqr import (
     knots,
     quintic_pieces,
 )
+from rigidfleet.planning.body_trajectories import RegulatedTrajectory
 
 CASE = json.loads((Path(__file__).parent / "data/reference_lqr_finite_gains.json").read_text())
 
@@ -570,3 +576,47 @@ def test_references_take_weights_of_any_proportion(Q):
     times = knots(0.2, Q, [1.0])
     assert np.isfinite(times).all()
     assert times[-1] == pytest.approx(0.2)
+
+
+def test_planned_motions_are_those_of_the_regulators():
+    """CM and rotation vector of a regulated phase are the trajectories of both regulators, then of the tracking gains.
+
+    The plan has one linear map from its ends to its pieces; here each axis is regulated by itself.
+    """
+    rng = np.random.default_rng(5)
+    t0, arrival, t_end = 3.0, 9.0, 14.0
+    laws = ("finite", (2.0, 1.0), 1.5, (50.0, 9.0)), ("infinite", (0.7, 0.2), 1.0, (0.0, 0.0))
+    tracking = (4.0, 4.0), 1.0
+    (r, v, omega), (r1, v1, omega1) = rng.normal(0.0, 5.0, (2, 3, 3))
+    T, T1 = (dcm_from_rotation_vector(x) for x in rng.normal(0.0, 0.8, (2, 3)))
+    phi = rotation_vector_from_dcm(T @ T1.T)
+    ends = (r, v, T, omega), (r1, v1, T1, omega1)
+    motion = RegulatedTrajectory(laws, tracking, *ends, t0, arrival, t_end).motion()
+    assert motion.knots[[0, -1]] == pytest.approx([t0, t_end])
+    np.testing.assert_array_equal(motion.T1, T1)
+
+    t = np.linspace(t0, t_end, 201)
+    k = np.clip(np.searchsorted(motion.knots, t, side="right") - 1, 0, len(motion.coefficients) - 1)
+    u = (t - motion.knots[k])[:, None] ** np.arange(6)
+    found = np.einsum("kap,kp->ka", motion.coefficients[k], u)
+    slope = np.einsum("kap,kp->ka", motion.coefficients[k][..., 1:], u[:, :-1] * np.arange(1, 6))
+    way, length, rest = t <= arrival, arrival - t0, t_end - arrival
+    begins = (r, v), (phi, rotation_vector_rate(phi, omega))
+    goals = (r1, v1), (np.zeros(3), omega1)
+    for axes, (horizon, Q, R, S), begin, goal in zip(
+        (slice(3), slice(3, 6)), laws, begins, goals, strict=True
+    ):
+        given = [*(t[way] - t0), length], begin, goal, length, Q, R
+        x, x_dot, _ = (
+            finite_horizon_trajectory(*given, S)
+            if horizon == "finite"
+            else infinite_horizon_trajectory(*given)
+        )
+        np.testing.assert_allclose(found[way, axes], x[:-1], rtol=0, atol=1e-8)
+        np.testing.assert_allclose(slope[way, axes], x_dot[:-1], rtol=0, atol=1e-8)
+        onward = goal[0] + rest * goal[1], goal[1]
+        x, x_dot, _ = infinite_horizon_trajectory(
+            t[~way] - arrival, (x[-1], x_dot[-1]), onward, rest, *tracking
+        )
+        np.testing.assert_allclose(found[~way, axes], x, rtol=0, atol=1e-8)
+        np.testing.assert_allclose(slope[~way, axes], x_dot, rtol=0, atol=1e-8)

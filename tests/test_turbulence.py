@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy import signal
+from scipy import signal, special
 from scipy.interpolate import CubicSpline
 from scipy.linalg import solve_continuous_lyapunov
 
@@ -115,3 +115,11 @@ def test_recursions_are_followed_along_rows(backward):
     expected = np.linalg.solve(L, x)
     native.follow(x, a, backward=backward)
     np.testing.assert_allclose(x, expected, rtol=1e-12, atol=1e-12)
+
+
+def test_covariances_of_short_steps_are_scipys():
+    """Incomplete gamma functions of whole numbers, which covariances are made of, are SciPy's to rounding."""
+    for n in (1, 2, 3):
+        x = np.geomspace(1e-12, 100.0, 300)
+        found = [filters._incomplete_gamma(n, value) for value in x.tolist()]
+        np.testing.assert_allclose(found, special.gammainc(n, x), rtol=1e-13)

@@ -49,13 +49,15 @@ def kept(function: Callable[..., R]) -> Callable[..., R]:
 
 
 def _key(x: Any) -> Any:
+    if isinstance(x, float):
+        return x or ("zero", str(x))  # 0.0 == -0.0
     if isinstance(x, np.ndarray):
         if x.nbytes > _LARGEST:
             raise _TooLargeError
         return x.shape, x.strides, x.dtype.char, x.tobytes()
     if isinstance(x, tuple):
         return tuple([_key(part) for part in x])
-    return ("zero", str(x)) if isinstance(x, float) and x == 0.0 else x  # 0.0 == -0.0
+    return x
 
 
 def _freeze(x: Any) -> None:

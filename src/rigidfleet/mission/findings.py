@@ -34,9 +34,8 @@ class Shared:
     """The tables that several missions have in common, as the same objects, each validated once for all of them."""
 
     def __init__(self, data: Mapping[str, Any]) -> None:
-        self._tables = {
-            id(table): table for table in _tables(data)
-        }  # keeps them alive, and so their numbers
+        # Alive, so that no other table gets the number of one of them.
+        self._tables = {id(table): table for table in _tables(data)}
         self._models: dict[tuple[Any, ...], Part] = {}
 
     def key(self, kind: type[Part], data: object, defaults: Mapping[str, Any]) -> Any:
@@ -54,10 +53,13 @@ class Shared:
 
 
 def _tables(data: Any) -> Iterator[dict[str, Any]]:
+    """All tables in plain data."""
     if isinstance(data, dict):
         yield data
-    for part in data.values() if isinstance(data, dict) else data if isinstance(data, list) else ():
-        yield from _tables(part)
+        data = list(data.values())
+    if isinstance(data, list):
+        for part in data:
+            yield from _tables(part)
 
 
 class FindingCollector:

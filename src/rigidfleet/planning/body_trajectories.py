@@ -60,34 +60,30 @@ class RegulatedTrajectory:
     def motion(self) -> Motion:
         """Quintics between knots that are dense enough for the regulators.
 
-        The motion is that of its goal, which goes on with its velocity, plus that of the errors, which is linear in
-        the errors at the start.
+        They are linear in the errors at the start, and in the goal, which goes on with its velocity.
         """
         (r, v, T, omega), (r1, v1, T1, omega1) = self.start, self.goal
         phi = att.rotation_vector_from_dcm(T @ T1.T)  # start = goal Exp(phi)
         length, rest = self.arrival - self.t0, self.t_end - self.arrival
         times, responses = _responses(self.regulators, self.tracking, length, rest)
-        start = np.concatenate([r, phi, v, att.rotation_vector_rate(phi, omega)])
-        goal = np.concatenate([r1, np.zeros(3), v1, omega1])
-        place, rate = goal[:6], goal[6:]
-        errors = start - goal
-        errors[:6] += length * rate
-        by_body = errors.reshape(2, 2, 3).transpose(1, 2, 0) @ responses
+        ends = np.concatenate(
+            [r, phi, v, att.rotation_vector_rate(phi, omega), r1, np.zeros(3), v1, omega1]
+        ).reshape(4, 6)
+        ends[:2] -= ends[2:]
+        ends[0] += length * ends[3]
+        pieces = ends.reshape(4, 2, 3).transpose(1, 2, 0) @ responses
         n = len(times) - 1
-        pieces = np.ascontiguousarray(by_body.reshape(6, n, 6).swapaxes(0, 1))
-        pieces[..., 0] += place + (times[:-1, None] - length) * rate
-        pieces[..., 1] += rate
-        return as_motion(self.t0 + times, pieces, T1.copy())
+        return as_motion(self.t0 + times, pieces.reshape(6, n, 6).swapaxes(0, 1), T1.copy())
 
 
 @kept
 def _responses(
     regulators: tuple[_Law, _Law], tracking: tuple[Any, float], length: float, rest: float
 ) -> tuple[Floats, Floats]:
-    """Knots (n + 1,) [s] of a way and of the rest after it, and quintics (2, 2, n * 6) of errors between them.
+    """Knots (n + 1,) [s] of a way and of the rest after it, and quintics (2, 4, n * 6) between them.
 
-    The quintics are those of either regulator, then of the tracking gains, from an error in position, or in velocity,
-    of 1 at the start.
+    For either regulator, and then the tracking gains, they are those from an error in position of 1 at the start, from
+    one in velocity, and those of a goal at 1, and of one with a velocity of 1 that is at 0 on arrival.
     """
     times = np.unique(np.concatenate([_knots(law, length) for law in regulators]))
     after = lqr.knots(rest, *tracking) if rest > 0.0 else np.zeros(1)
@@ -102,9 +98,12 @@ def _responses(
             x = lqr.led(response, after, (x[0][-1], x[1][-1]), zero, rest)
             pieces.append(lqr.quintic_pieces(after, *x))
         found.append(np.concatenate(pieces))
-    return np.concatenate([times, length + after[1:]]), np.stack(found).swapaxes(1, 2).reshape(
-        2, 2, -1
-    )
+    knots = np.concatenate([times, length + after[1:]])
+    quintics = np.zeros((2, 4, len(knots) - 1, 6))
+    quintics[:, :2] = np.stack(found).swapaxes(1, 2)
+    quintics[:, 2, :, 0] = quintics[:, 3, :, 1] = 1.0
+    quintics[:, 3, :, 0] = knots[:-1] - length
+    return knots, quintics.reshape(2, 4, -1)
 
 
 def regulated(

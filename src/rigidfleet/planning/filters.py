@@ -36,13 +36,11 @@ def second_order(white: Floats, step: float, tau: float) -> Floats:
 
     Parameters: white samples (K, 2, ...), two for each sample; their step and tau [s].
     """
-    from scipy.special import gammainc
-
     s = step / tau
     a = math.exp(-s)
     # P - A P A^T, of the stationary covariances P = [[1, 1/2], [1/2, 1/2]], by incomplete gamma functions: for a short
     # step, differences would cancel.
-    q11, q12, q22 = (gammainc([1, 2, 3], 2.0 * s) * [1.0, 0.5, 0.5]).tolist()
+    q11, q12, q22 = (w * _incomplete_gamma(n, 2.0 * s) for n, w in ((1, 1.0), (2, 0.5), (3, 0.5)))
     root = math.sqrt(q11)
     low = q12 / root
     z1, z2 = root * white[:, 0], low * white[:, 0] + math.sqrt(q22 - low**2) * white[:, 1]
@@ -51,6 +49,19 @@ def second_order(white: Floats, step: float, tau: float) -> Floats:
     z2[1:] += a * s * z1[:-1]
     z2 = _followed(z2, a)
     return (math.sqrt(3.0) * z1 + (1.0 - math.sqrt(3.0)) * z2) / math.sqrt(2.0)
+
+
+def _incomplete_gamma(n: int, x: float) -> float:
+    """The regularised lower incomplete gamma function P(n, x) = exp(-x) sum_{k >= n} x^k / k! of a whole number n."""
+    head, tail, term = 0.0, 0.0, math.exp(-x)
+    for k in range(n):
+        head, term = head + term, term * x / (k + 1)
+    if x > n:
+        return 1.0 - head
+    while term > 1e-17 * tail:
+        n += 1
+        tail, term = tail + term, term * x / n
+    return tail
 
 
 def _followed(x: Floats, a: float) -> Floats:

@@ -263,7 +263,7 @@ def plan_phase(
         kind = _KINDS[reference_kind(mission, shaping, before, target)]
     elif phase.control == "tracking" and _agree(d1, before, edges):
         kind = SHAPE
-    dp, turn = np.zeros_like(before), np.zeros(3)
+    dp, turn = np.zeros(before.shape), np.zeros(3)
     if shaping is not None:
         dp, turn = align_slots(before, after, left, turned)
     if lift is not None:
@@ -389,6 +389,7 @@ def _wanted(slots: Floats) -> tuple[Ints, Floats, float]:
     return pairs.copy(), wanted, _NEAR * float(wanted.min())
 
 
+@kept
 def _agree(asked: Floats, slots: Floats, edges: Ints) -> bool:
     """Whether the edges (m, 2) of slots have the lengths (m,) asked for, to rounding [m]."""
     found = distance_geometry.distances(slots, edges)

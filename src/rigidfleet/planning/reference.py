@@ -155,24 +155,23 @@ def attach(
         if mission.formulation == "body" and frame is None:
             frame = np.eye(3)
         return frame, now, _turn(given, slots_before(mission, now, masses), target, masses)
-    x = about_cm(now.r, masses)
     if phase.control == "tracking" and now.pose is not None:
         pose = now.pose  # the reference continues without a jump
     else:
-        fit = now.slots
+        x, fit = about_cm(now.r, masses), now.slots
         near = frame if frame is not None else now.pose.T if now.pose is not None else np.eye(3)
         if fit is not None:
             T = rigid_body.kabsch(x, fit, masses, near=near.T).T
         else:
             T = near if mission.body_frame is not None else mission.drawn_attitude
         pose = Pose(masses @ now.r / masses.sum(), masses @ now.v / masses.sum(), T, np.zeros(3))
-        pose.omega = T @ mean_axis_rates(x[None], about_cm(now.v, masses)[None], masses)[0]
+        if now.v.any():
+            pose.omega = T @ mean_axis_rates(x[None], about_cm(now.v, masses)[None], masses)[0]
         if now.lost is not None and fit is not None:
             centre = masses @ fit / masses.sum()  # of the remaining agents, from the body's origin
             pose.r = pose.r - T.T @ centre
             pose.v = pose.v - T.T @ np.cross(pose.omega, centre)
-            x = x + T.T @ centre
-    slots = now.slots if now.slots is not None else x @ pose.T.T
+    slots = now.slots if now.slots is not None else about_cm(now.r, masses) @ pose.T.T
     goal = now.goal or changed(pose, v=np.zeros(3), omega=np.zeros(3))
     turn = np.eye(3)
     if establishing is not None and target is not None:
