@@ -632,12 +632,23 @@ def watch_middle(step, before, after, p, w, state, monitor):
 
 
 @compiled
+def known(marks, row):
+    """Whether a step is marked; its row will hold another one."""
+    if row >= marks.shape[0] or not marks[row]:
+        return False
+    marks[row] = False
+    return True
+
+
+@compiled
 def watch_forces(p, w, state, monitor, steps, last):
     """Monitor forces over the steps of a trail; with ``last``, no further step of the segment follows."""
     trail, before = state.trail, monitor.gauge[0]
     for step in range(steps):
         new = step > 0 or monitor.flags[3] == 0
         row = row_of(step, state)
+        if step > 0 and step + 1 < steps and known(monitor.calm, row):
+            continue
         start, end = trail.clock[row, 0], end_of(step, state)
         after = trail.gauge[row]
         earlier = trail.gauge[row_of(step - 1, state)] if step > 0 else before
@@ -674,9 +685,7 @@ def watch(p, w, state, monitor):
         return 0
     for step in range(flags[0], flags[1]):
         row = row_of(step, state)
-        if row < monitor.quiet.shape[0] and monitor.quiet[row]:
-            monitor.quiet[row] = False
-        else:
+        if not known(monitor.quiet, row):
             watch_distances(row, p, state, monitor)
     if flags[2] == 0:
         return 0

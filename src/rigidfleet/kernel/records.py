@@ -92,7 +92,9 @@ class Monitor(NamedTuple):
     struck: Pairs  # of a lost agent and one still flying
     columns: Pairs  # that may fly one below the other
     flags: Ints  # (4,) see `monitor.watch`
-    quiet: Bools  # (S,) steps of the trail in which nothing can be worse, if that is known
+    # (S,) steps of the trail in which no distance can be worse, and after which no force can, if that is known
+    quiet: Bools
+    calm: Bools
     moves: (
         Floats  # (2,) bounds of how far distances change over a step [m], see `monitor.bound_moves`
     )
@@ -129,7 +131,7 @@ def monitor(
         "who": np.full((count, 2), -1), "radius": radius, "boxes": boxes, "fence": fence,
         "left": np.ones(n, dtype=np.bool_), "standing": np.zeros(n, dtype=np.int64),
         "low": np.full((n, 3), np.inf), "pad": 0.0, "pairs": none, "struck": none, "columns": none,
-        "flags": np.zeros(4, dtype=np.int64), "quiet": np.zeros(0, dtype=np.bool_), "moves": np.zeros(2),
+        "flags": np.zeros(4, dtype=np.int64), "quiet": np.zeros(0, dtype=np.bool_), "calm": np.zeros(0, dtype=np.bool_), "moves": np.zeros(2),
         "recorder": 0, "segment": 0, "record": 0, "time": np.zeros(1),
         "states": np.zeros((1, states)), "gauge": np.zeros((2, gauge)),
         "nodes": np.empty((_NODES, gauge)), "instants": np.zeros(_NODES),

@@ -166,6 +166,7 @@ class Extremes:
             worst=self.worst, when=self.when, who=self.who, sign=self.sign, left=self.left,
             standing=self.standing, low=self.low, pad=PAD, pairs=self.pairs, columns=self.columns,
             struck=self.struck, quiet=np.zeros(len(trail.clock), dtype=np.bool_),
+            calm=np.zeros(len(trail.clock), dtype=np.bool_),
         )  # fmt: skip
         self.monitor = native.Watch(found)
         if aside:

@@ -280,6 +280,12 @@ def inverse_root_of(_context, x):
 
 
 @intrinsic
+def where_positive(_context, x, a, b):
+    """Lanes of a where those of x are positive, of b elsewhere."""
+    return lanes(x, a, b), lambda _context, builder, _sig, args: _where_positive(builder, *args)
+
+
+@intrinsic
 def collected(_context, addresses, offset):
     """Lanes of the numbers at eight addresses (8,), plus an offset in numbers."""
 

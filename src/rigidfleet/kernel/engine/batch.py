@@ -191,6 +191,8 @@ class Vector:
             points=empty((5, n)), bounds=empty((len(trails[0].clock), lane_bounds.COLUMNS)),
             radius=interleaved([x.radius for x in monitors]), pairs=monitors[0].pairs,
             boxes=interleaved([x.boxes for x in monitors]).reshape(-1, 6),
+            limit=interleaved([np.minimum(p.vehicles.thrust_limit, _NO_LIMIT) for p in problems]),
+            forces=empty((2, len(trails[0].start))),
         )  # fmt: skip
         kept = [
             [t.points for t in trails], [t.gauge for t in trails], [t.start for t in trails], samples,
@@ -226,6 +228,8 @@ class Vector:
         return status
 
 
+#: Thrust that stands for no limit [N].
+_NO_LIMIT = 1e150
 _UNSAMPLED = pack(np.zeros((0, 1, WIDTH)))
 #: What turns slots that do not turn, where others do: too little to count, yet a direction [rad].
 _BARELY = np.array([0.0, 0.0, 1e-150])

@@ -67,6 +67,9 @@ class UnrolledProblem(NamedTuple):
     radius: LaneArray  # (N,) [m]
     pairs: Ints  # (P, 2) of agents
     boxes: LaneArray  # (B, 6) obstacles [m]
+    limit: LaneArray  # (N,) of thrust [N]
+    forces: LaneArray  # (2, 3N + 2m) sizes of the forces at the ends of the last two steps
+    moments: Floats  # (2,) when these were [s]
 
 
 def unrolled(problem: Problem) -> UnrolledProblem:
@@ -151,7 +154,7 @@ def _prepared(
         address, uniform, simd.pack(np.zeros((edges, WIDTH))), np.zeros(MOMENT),
         simd.pack(np.zeros((len(code.gauge), WIDTH))), reference.t0, reference.T_b,
         np.zeros(0), none, 1.0, none, 1.0, none, none, np.zeros((5, WIDTH), dtype=np.int64),
-        none, none, none[:, 0], np.zeros((0, 2), dtype=np.int64), none,
+        none, none, none[:, 0], np.zeros((0, 2), dtype=np.int64), none, none[:, 0], none, np.zeros(2),
     )  # fmt: skip
 
 

@@ -1,28 +1,56 @@
 """Bounds of what a step can reach, for eight flights in the lanes of vectors, so that few steps need the monitor.
 
-In most steps nothing comes nearer, faster, lower or higher than in others of the same flight. Bounds from control
-points say so for eight flights at once; `kernel.monitor` then searches the other steps alone, and finds what it would
-have found in all.
+In most steps nothing comes nearer, faster, lower or higher than in others of the same flight, and no force is greater.
+Bounds from control points, and the parabolas through forces at the ends of steps by which `kernel.monitor` searches
+them, say so for eight flights at once. The monitor then searches the other steps alone, and finds what it would have
+found in all.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
 
 from rigidfleet.kernel.bernstein import CLOSE
 from rigidfleet.kernel.compiler.jit import compiled, inlined
-from rigidfleet.kernel.compiler.simd import LaneArray, filled, inverse_root_of, unpack
-from rigidfleet.kernel.records import CLEARANCE, HIGHEST, LOWEST, SEPARATION, SPEED, Monitor
+from rigidfleet.kernel.compiler.simd import (
+    LaneArray,
+    filled,
+    inverse_root_of,
+    unpack,
+    where_positive,
+)
+from rigidfleet.kernel.records import (
+    ACCELERATION,
+    CLEARANCE,
+    CONSTRAINT,
+    CONSTRAINT_FORCE,
+    HIGHEST,
+    LOWEST,
+    SEPARATION,
+    SPEED,
+    TENSION,
+    THRUST,
+    THRUST_MARGIN,
+    Monitor,
+)
 from rigidfleet.typing import Ints
 
 #: Columns of bounds over a step, and after `ENDS` more of the values at its end: separation, height, height downwards
 #: and clearance [m], square of the speed [m^2/s^2]. The least counts; heights downwards and speeds have the opposite
-#: sign. The last column is the distance of two agents seen from above [m].
+#: sign. Then the distance of two agents seen from above [m].
 SEPARATIONS, LOWS, HIGHS, CLEARANCES, SPEEDS, ENDS = range(6)
-STACKS, COLUMNS = 2 * ENDS, 2 * ENDS + 1
+STACKS = 2 * ENDS
+#: Columns of what a force promises to be near the end of a step, and after `FORCES` more of its value there: thrust,
+#: acceleration, constraint force, tension, constraint, thrust beyond its limit. The greatest counts.
+FIRST_FORCE, FORCES = STACKS + 1, 6
+COLUMNS = FIRST_FORCE + 2 * FORCES
 _QUANTITIES = np.array([SEPARATION, LOWEST, HIGHEST, CLEARANCE, SPEED])
+_OF_FORCES = np.array(
+    [THRUST, ACCELERATION, CONSTRAINT_FORCE, TENSION, CONSTRAINT, THRUST_MARGIN]
+)
 _FAR = 1e100
 #: Distance and share by which bounds must miss the worst value: the monitor's own accuracy, and rounding.
 _MARGIN, _SHARE = 4.0 * CLOSE, 1e-9
@@ -96,10 +124,51 @@ def bound_step(points, p, row):
     out[SPEEDS], out[ENDS + SPEEDS] = 0.0 - fast, 0.0 - fast_end
 
 
+@compiled
+def begin_forces(t, p):
+    """Begin with the forces at a start or after a jump, at t [s]."""
+    for c in range(p.gauge.shape[0]):
+        p.forces[1, c] = abs(p.gauge[c])
+    p.moments[0], p.moments[1] = -math.inf, t
+
+
+@compiled
+def bound_forces(t, p, row, before):
+    """Write the forces at the end t [s] of a step into row ``row``, and what they promise near the end of the one before.
+
+    As `monitor.promise` says: the top of the parabola through three values, with twice the rise that counts there.
+    """
+    n, m, forces = p.radius.shape[0], p.before.shape[0], p.forces
+    ends, peaks = p.bounds[row, FIRST_FORCE + FORCES :], p.bounds[before, FIRST_FORCE:]
+    ta, tb = p.moments[0], p.moments[1]
+    for kind in range(FORCES):
+        ends[kind] = filled(-_FAR)
+        if ta > -math.inf:
+            peaks[kind] = filled(-_FAR)
+    for c in range(p.gauge.shape[0]):
+        kind = c // n if c < 3 * n else 3 + (c - 3 * n) // m
+        a, b, v = forces[0, c], forces[1, c], abs(p.gauge[c])
+        forces[0, c], forces[1, c] = b, v
+        ends[kind] = max(ends[kind], v)
+        if c < n:
+            ends[5] = max(ends[5], v - p.limit[c])
+        if ta > -math.inf:
+            left, right = (b - a) * (1.0 / (tb - ta)), (v - b) * (1.0 / (t - tb))
+            bend = (left - right) * (1.0 / (t - ta))  # downwards
+            off = 0.5 * left / bend - 0.5 * (tb - ta)
+            top = b + 4.0 * bend * off * off
+            rises = min(left, 0.0 - right) + 1e-30
+            top = where_positive(rises, where_positive(bend, top, b), b)
+            peaks[kind] = max(peaks[kind], top)
+            if c < n:
+                peaks[5] = max(peaks[5], top - p.limit[c])
+    p.moments[0], p.moments[1] = tb, t
+
+
 def mark_quiet(bounds: LaneArray, rows: Ints, monitors: Sequence[Monitor]) -> None:
     """Mark the steps in some rows of eight flights' trails in which none of their monitors can find anything worse.
 
-    A step cannot hold a least value if its bound is above the least of those known and of those at the ends of steps;
+    The last step has no neighbour yet. A step cannot hold a least value if its bound is above the least of those known and of those at the ends of steps;
     or if it is no lower than the least of those before: then an earlier step has it, up to a tenth of `CLOSE`, which
     the monitor does not tell apart.
     """
@@ -119,3 +188,10 @@ def mark_quiet(bounds: LaneArray, rows: Ints, monitors: Sequence[Monitor]) -> No
         landed = nearest[lane] <= monitor.pad + _MARGIN or monitor.standing.any()
         landed = landed or len(monitor.fence) > 0 or monitor.low[:, 0].min() < np.inf
         monitor.quiet[rows] = False if landed else quiet[:, lane]
+    peak, end = found[:, FIRST_FORCE : FIRST_FORCE + FORCES], found[:, FIRST_FORCE + FORCES :]
+    worst = np.stack([monitor.worst for monitor in monitors], axis=-1)[_OF_FORCES]
+    floor = np.maximum(-worst, end.max(axis=0))
+    calm = ((peak <= floor) & ((end < floor) | (floor < -0.5 * _FAR))).all(axis=1)
+    calm[-1] = False
+    for lane, monitor in enumerate(monitors):
+        monitor.calm[rows] = calm[:, lane]

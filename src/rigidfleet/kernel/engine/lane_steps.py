@@ -20,7 +20,7 @@ import numpy as np
 from rigidfleet.kernel.compiler.jit import compiled, inlined
 from rigidfleet.kernel.compiler.simd import spread
 from rigidfleet.kernel.dopri5 import until_knot
-from rigidfleet.kernel.engine.lane_bounds import bound_step
+from rigidfleet.kernel.engine.lane_bounds import begin_forces, bound_forces, bound_step
 from rigidfleet.kernel.vectors import filled, rough_inverse
 
 #: Number of stages; rows of `IntegratorState.K` after them.
@@ -216,6 +216,8 @@ def keep_step(t, h, p, w, state):
     for g in range(forces):
         spread(p.gauge[g], p.kept[1], forces * row + g)
     bound_step(points, p, row)
+    rows = state.trail.clock.shape[0]
+    bound_forces(t + h, p, row, (row + rows - 1) % rows)
     state.count[4] += 1
 
 
@@ -224,6 +226,7 @@ def keep_start(p, w, state):
     """As `dopri5.keep_start`, for each flight into its own trail."""
     for g in range(p.gauge.shape[0]):
         spread(p.gauge[g], p.kept[2], g)
+    begin_forces(state.clock[0], p)
 
 
 @compiled
