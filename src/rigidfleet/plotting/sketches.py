@@ -197,7 +197,7 @@ def _draw_axes(ax: Axes, axes: Floats, length: float, *, taken: bool) -> None:
     """
     tips = length * axes
     for tip, name in zip(tips, "xyz", strict=True):
-        label = f"${name}_b$"
+        label = name
         if np.hypot(*tip[:2]) < 1e-6 * length:
             words = f"⊙ {label}" if taken else label
             place: dict[str, Any] = {"textcoords": "offset points", "ha": "right", "va": "top"}
