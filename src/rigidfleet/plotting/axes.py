@@ -27,6 +27,15 @@ class _Sparing(axis.Axis):
     _side = 0  # of the coordinates x and y, the one along this axis
     _autolabelpos: bool  # matplotlib's: whether it places the name of the axis
 
+    def set_clip_path(self, path: Any, transform: Any = None) -> None:
+        """Clip the axis; minor ticks, which are made when they are first asked for, only if they are there."""
+        if "minorTicks" in vars(self):
+            super().set_clip_path(path, transform)
+        else:
+            self.minorTicks = []
+            super().set_clip_path(path, transform)
+            del self.minorTicks
+
     def _tick(self) -> Tick | None:
         """The tick that stands for all; None if matplotlib has to draw them."""
         tick = self.majorTicks[0]

@@ -34,7 +34,8 @@ class Renderer(RendererAgg):
 
     def _get_font_height_metrics(self, prop: FontProperties) -> Any:
         """Ascent, descent and gap of a font's lines [pixels], for which matplotlib reads the font each time."""
-        return _heights(findfont(prop), prop.get_size_in_points() * self.dpi / 72)
+        heights = _heights if applied.get() else _heights.__wrapped__
+        return heights(prop.copy(), self.dpi)
 
     def draw_text(
         self, gc: Any, x: float, y: float, s: str, prop: FontProperties, angle: float, ismath: Any = False,
@@ -54,12 +55,14 @@ def _size(s: str, prop: FontProperties, ismath: bool, dpi: float) -> tuple[float
 
 
 @lru_cache(_KEPT)
-def _heights(path: str, pixels: float) -> tuple[float, float, float] | tuple[None, None, None]:
-    font = get_font(path)
+def _heights(
+    prop: FontProperties, dpi: float
+) -> tuple[float, float, float] | tuple[None, None, None]:
+    font = get_font(findfont(prop))
     table, head = font.get_sfnt_table("OS/2"), font.get_sfnt_table("head")
     if table is None or head is None:
         return None, None, None
-    unit = pixels / head["unitsPerEm"]
+    unit = prop.get_size_in_points() * dpi / 72 / head["unitsPerEm"]
     up, down, gap = table["sTypoAscender"], table["sTypoDescender"], table["sTypoLineGap"]
     return up * unit, -down * unit, gap * unit
 
