@@ -29,12 +29,12 @@ class _Sparing(axis.Axis):
 
     def set_clip_path(self, path: Any, transform: Any = None) -> None:
         """Clip the axis; minor ticks, which are made when they are first asked for, only if they are there."""
-        if "minorTicks" in vars(self):
-            super().set_clip_path(path, transform)
-        else:
-            self.minorTicks = []
-            super().set_clip_path(path, transform)
-            del self.minorTicks
+        missing = "minorTicks" not in vars(self)
+        if missing:
+            vars(self)["minorTicks"] = []
+        super().set_clip_path(path, transform)
+        if missing:
+            del vars(self)["minorTicks"]
 
     def _tick(self) -> Tick | None:
         """The tick that stands for all; None if matplotlib has to draw them."""
