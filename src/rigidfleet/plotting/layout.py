@@ -96,7 +96,7 @@ def _ticks(cells: Cells) -> list[list[float]]:
 
 def _extent(ax: Axes) -> Bbox:
     """Extent [pixels] of axes with their words and legend."""
-    boxes: list[Any] = [ax.bbox]
+    boxes: list[Any] = [ax.bbox, ax.spines["bottom"].get_window_extent()]  # with its marks
     boxes += [axis.get_tightbbox(for_layout_only=True) for axis in (ax.xaxis, ax.yaxis)]
     words = [ax.get_legend(), *ax.texts]
     boxes += [
