@@ -36,38 +36,34 @@ class _Sparing(axis.Axis):
         if missing:
             del vars(self)["minorTicks"]
 
-    def _tick(self) -> Tick | None:
-        """The tick that stands for all; None if matplotlib has to draw them."""
-        tick = self.majorTicks[0]
-        alone = (
-            len(self.majorTicks) == 1
-            and isinstance(self.get_minor_locator(), NullLocator)
-            and not (tick.tick2line.get_visible() or tick.label2.get_visible())
-            and self.get_label_position() in ("bottom", "left")
-            and not self.get_major_formatter().get_offset()
-        )
-        return tick if alone else None
-
-    def _marks(self) -> tuple[list[float], list[str]]:
-        """Places and words of the ticks within the limits."""
+    def _marks(self) -> tuple[Tick, list[tuple[float, str]]] | None:
+        """The tick that stands for all, with their places and words; None if matplotlib has to draw them."""
         places = np.asarray(self.get_majorticklocs(), dtype=float)
         words = self.get_major_formatter().format_ticks(places.tolist())
+        tick = self.majorTicks[0]
+        if (
+            len(self.majorTicks) > 1
+            or not isinstance(self.get_minor_locator(), NullLocator)
+            or tick.tick2line.get_visible()
+            or tick.label2.get_visible()
+            or self.get_label_position() not in ("bottom", "left")
+            or self.get_major_formatter().get_offset()
+        ):
+            return None
         low, high = sorted(self.get_view_interval())
         near = _NEAR * (high - low)
-        seen = (low - near <= places) & (places <= high + near)
-        return places[seen].tolist(), [
-            word for word, shown in zip(words, seen, strict=True) if shown
-        ]
+        every = zip(places.tolist(), words, strict=True)
+        return tick, [(at, word) for at, word in every if low - near <= at <= high + near]
 
     def _update_ticks(self) -> list[Tick]:
         """What spines ask for the room that marks need."""
-        tick, matplotlib = self._tick(), super()
-        return cast("Any", matplotlib)._update_ticks() if tick is None else [tick]
+        marks, matplotlib = self._marks(), super()
+        return cast("Any", matplotlib)._update_ticks() if marks is None else [marks[0]]
 
-    def _boxes(self, tick: Tick, renderer: Any) -> list[Bbox]:
+    def _boxes(self, tick: Tick, marks: list[tuple[float, str]], renderer: Any) -> list[Bbox]:
         """Extents [pixels] of the words of all ticks."""
         boxes = []
-        for place, word in zip(*self._marks(), strict=True) if tick.label1.get_visible() else ():
+        for place, word in marks if tick.label1.get_visible() else ():
             tick.update_position(place)
             tick.label1.set_text(word)
             boxes.append(tick.label1.get_window_extent(renderer))
@@ -85,12 +81,12 @@ class _Sparing(axis.Axis):
 
     def get_tightbbox(self, renderer: Any = None, *, for_layout_only: bool = False) -> Bbox | None:
         """Extent [pixels] of the words; for a layout, the name of the axis has no length."""
-        tick = self._tick()
-        if tick is None:
-            return super().get_tightbbox(renderer, for_layout_only=for_layout_only)
         if not self.get_visible() or (for_layout_only and not self.get_in_layout()):
             return None
-        boxes = self._boxes(tick, renderer)
+        if (found := self._marks()) is None:
+            return super().get_tightbbox(renderer, for_layout_only=for_layout_only)
+        tick, marks = found
+        boxes = self._boxes(tick, marks, renderer)
         self._place_label(tick, boxes)
         if self.label.get_visible():
             ends = self.label.get_window_extent(renderer).get_points()
@@ -102,17 +98,19 @@ class _Sparing(axis.Axis):
 
     def draw(self, renderer: Any) -> None:
         """Draw grid, marks and words."""
-        tick = self._tick()
-        if tick is None or not self.get_visible():
+        if not self.get_visible():
+            return
+        if (found := self._marks()) is None:
             super().draw(renderer)
             return
+        tick, marks = found
         renderer.open_group("axis", gid=self.get_gid())
-        places, words = self._marks()
-        boxes = self._boxes(tick, renderer)
-        lines = np.array([[at, at, np.nan] for at in places]).ravel()
+        boxes = self._boxes(tick, marks, renderer) if self.label.get_text() else []
+        places = [place for place, _ in marks]
+        lines = np.array([[place, place, np.nan] for place in places]).ravel()
         self._draw_line(tick.gridline, renderer, lines, [0.0, 1.0, np.nan] * len(places))
         self._draw_line(tick.tick1line, renderer, places, [0.0] * len(places))
-        for place, word in zip(places, words, strict=True):
+        for place, word in marks if tick.label1.get_visible() else ():
             tick.update_position(place)
             tick.label1.set_text(word)
             tick.label1.draw(renderer)
