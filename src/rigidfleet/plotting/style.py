@@ -244,7 +244,8 @@ def over_time(ax: Axes, result: Result) -> None:
         corners = [at for a, b in bands for at in ((a, 0), (a, 1), (b, 1), (b, 0), (a, 0))]
         strokes = [Path.MOVETO, Path.LINETO, Path.LINETO, Path.LINETO, Path.CLOSEPOLY]
         path, along = Path(corners, strokes * len(bands)), ax.get_xaxis_transform()
-        ax.add_patch(PathPatch(path, facecolor=BAND, linewidth=0, zorder=0, transform=along))
+        # As an artist, without a search for the limits of its data
+        ax.add_artist(PathPatch(path, facecolor=BAND, linewidth=0, zorder=0, transform=along))
     if not result.complete:
         ax.axvline(t[-1], color=ALERT, linewidth=0.8)
 
