@@ -851,7 +851,7 @@ def test_names_and_formats_choose(triangle, tmp_path):
     assert sorted(tmp_path.iterdir()) == sorted(paths)
 
 
-@pytest.mark.parametrize("name", ["inputs", "summary", "trajectory", "formations"])
+@pytest.mark.parametrize("name", ["inputs", "attitude", "summary", "trajectory", "formations"])
 def test_titles_may_be_left_out(triangle, tmp_path, name):
     """Without titles neither title nor mission is drawn, what is drawn fills the picture, and all else is the same."""
     with_, without = (
