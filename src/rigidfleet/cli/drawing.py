@@ -35,8 +35,6 @@ _SLOW = (
     "summary", "trajectory", "attitude", "cm", "vehicles", "rotors", "clearance", "constraint_error",
     "constraint_force", "inputs",
 )  # fmt: skip
-
-
 #: Ends of pipes to the drawing processes that are prepared; none if they are taken.
 _prepared: list[Connection] = []
 
