@@ -769,13 +769,16 @@ def test_figures_are_the_same_from_processes_side_by_side(folder, monkeypatch):
         figures = {
             folder / str(count) / name: ["png", "svg"] for name in ("cm", "inputs", "clearance")
         }
+        drawing.prepare()
         with drawing.Drawings(result, figures, titles=True) as pictures:
             assert set(pictures) == set(figures)
+            assert len(pictures._processes) == (count if count > 1 else 0)
         drawn[count] = {p.name: p.read_bytes() for p in (folder / str(count)).iterdir()}
     assert len(drawn[1]) == 6
     assert drawn[1] == drawn[2]
     write(folder / "taken", "a file")
     there = {folder / "taken" / name: ["png"] for name in ("cm", "inputs", "clearance")}
+    drawing.prepare()
     with (
         pytest.raises(ResultError, match="cannot be written"),
         drawing.Drawings(result, there, titles=True) as pictures,
@@ -786,21 +789,21 @@ def test_figures_are_the_same_from_processes_side_by_side(folder, monkeypatch):
 @pytest.mark.parametrize(
     ("what", "does"),
     [
-        ("multiprocessing.forkserver.ensure_running", OSError("AF_UNIX path too long")),
         ("multiprocessing.connection.Pipe", OSError("too many open files")),
-        ("multiprocessing.context.ForkServerProcess.start", BrokenPipeError("the server ended")),
+        ("multiprocessing.context.ForkProcess.start", BlockingIOError("too many processes")),
+        ("rigidfleet.cli.drawing._serve", None),
         ("rigidfleet.cli.drawing._draw", None),
     ],
 )
 def test_figures_are_drawn_where_processes_fail(folder, monkeypatch, what: str, does):
-    """No server, no pool, a server or processes that end: this process draws every figure."""
+    """No pipes, no processes, or some that end at once: this process draws every figure."""
 
     def fail(*_, **__):
         raise does
 
     assert cli.main(["run", "short.toml", "--no-figures"]) == codes.PASSED
     monkeypatch.setattr("rigidfleet.cli.drawing.at_once", lambda: 2)
-    monkeypatch.setattr(what, fail if does else os._exit)  # which a process runs as it begins
+    monkeypatch.setattr(what, fail if does else lambda *_: os._exit(1))
     assert cli.main(["run", "short.toml", "--force"]) == codes.PASSED
     drawn = {path.stem for path in Path("flights/short/figures").iterdir()}
     assert drawn == set(figure_names(Result.load("flights/short/short.nc")))

@@ -1,6 +1,6 @@
 """``python -m rigidfleet`` is the command ``rigidfleet``.
 
-Nothing is loaded with this module: processes that draw figures load it again, and are not the command.
+Nothing is loaded with this module: the processes of a sweep load it again, and are not the command.
 """
 
 import sys

@@ -60,6 +60,8 @@ def assess(
 
     if not files:
         raise RigidfleetError("no file was given; give a result or trajectories to judge")
+    if out is not None:
+        drawing.prepare()
     given = {
         "mission": mission, "separation": separation, "limits": limits, "radius": radius, "ground": ground,
         "interpolation": interpolation,
@@ -83,7 +85,6 @@ def assess(
         for path in (made.result, made.verdict, made.report, made.replay, *made.figures):
             if path.exists() and not force:
                 raise taken(path)
-        drawing.prepare()
     if json:
         console.print_json(verdict.to_dict())
     else:

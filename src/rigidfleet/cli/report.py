@@ -6,7 +6,7 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rigidfleet.cli import console
+from rigidfleet.cli import console, drawing
 from rigidfleet.cli.outputs import Files, taken
 
 if TYPE_CHECKING:
@@ -58,6 +58,8 @@ def report(
     from rigidfleet.assessment import assess
     from rigidfleet.result import Result
 
+    if not (no_figures or others):
+        drawing.prepare()
     paths = [result, *others]
     records = [Result.load(path) for path in paths]
     if others:

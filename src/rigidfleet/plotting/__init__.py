@@ -242,7 +242,7 @@ def _ink(figure: Figure) -> Bbox:
 
     buffer = io.BytesIO()
     figure.savefig(buffer, format="rgba", dpi=figure.dpi)
-    width, height = (figure.get_size_inches() * figure.dpi).astype(int).tolist()
+    width, height = figure.canvas.get_width_height()
     colours = np.frombuffer(buffer.getvalue(), np.uint8).reshape(height, width, 4)
     drawn = colours.min(axis=2) < 255
     across, down = (np.flatnonzero(np.any(drawn, axis=axis)) for axis in (0, 1))

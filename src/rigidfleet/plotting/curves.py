@@ -286,8 +286,7 @@ def attitude(result: Result) -> Figure:
 
 def draw_thrust(ax: Axes, result: Result) -> None:
     """Thrust of each agent with its limit, from zero."""
-    flown = result.rotor_force is not None  # rotors give what was asked for a little earlier
-    ax.set_ylabel("thrust [N]" if flown else r"thrust $|f_u + f_C|$ [N]")
+    ax.set_ylabel("thrust [N]")
     if not np.isfinite(result.thrust).any():
         st.note(ax, "forces are not known")
         return
@@ -330,10 +329,10 @@ def constraint_force(result: Result) -> Figure:
     ]
     fig, axes = st.time_figure(result, "Constraint force", 2, shares=shares)
     above, below = axes[:, 0]
-    above.set_ylabel(r"force $|f_C|$ [N]")
+    above.set_ylabel("constraint force [N]")
     if peaks.from_none(above, result, force, "N", "constraint_force"):
         st.agents_legend(above, result.n_agents)
-    below.set_ylabel(r"tension $-\lambda$ [N]")
+    below.set_ylabel("tension [N]")
     if not len(result.edges):
         st.note(below, "no edges")
     elif not peaks.idle(below, result, tension, "N", edge):
@@ -351,7 +350,7 @@ def disturbance(result: Result) -> Figure:
     """Aerodynamic force |f_D| on each agent, and distance of each agent from its slot."""
     fig, axes = st.time_figure(result, "Aerodynamic force, and distance from the slots", 2)
     above, below = axes[:, 0]
-    above.set_ylabel(r"force $|f_D|$ [N]")
+    above.set_ylabel("aerodynamic force [N]")
     if result.disturbance_force is None:
         st.note(above, "still air")
     else:
@@ -397,8 +396,9 @@ def shape_error(result: Result) -> Floats:
 def draw_error(ax: Axes, result: Result) -> list[Line2D]:
     """Draw the errors |c| of the edges, the greatest, and that of all pairs; return legend entries of the last two."""
     from matplotlib.lines import Line2D
+    from matplotlib.ticker import FuncFormatter
 
-    ax.set_ylabel(r"error $|c|$ of an edge [m]")
+    ax.set_ylabel("error |c| of an edge [m]")
     size, shape = np.abs(result.constraint), shape_error(result)
     handles = []
     if np.isfinite(shape).any():
@@ -415,6 +415,7 @@ def draw_error(ax: Axes, result: Result) -> list[Line2D]:
         st.note(ax, "neither edges nor slots")
         return []
     ax.set_yscale("log", nonpositive="clip")
+    ax.yaxis.set_major_formatter(FuncFormatter(st.power))
     seen = np.concatenate([size.ravel(), shape])
     seen = seen[np.isfinite(seen)]
     large = seen[seen > _SMALLEST]

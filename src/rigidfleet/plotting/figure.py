@@ -11,7 +11,10 @@ from typing import Any
 
 import numpy as np
 from matplotlib import cbook, figure
-from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backends.backend_agg import FigureCanvasAgg, RendererAgg
+
+from rigidfleet.plotting.axes import Axes
+from rigidfleet.plotting.words import Renderer
 
 #: Pixels per inch of a notebook's screen.
 _SHOWN = 100
@@ -23,6 +26,13 @@ class _Canvas(FigureCanvasAgg):
 
     Pillow tries five filters on each row of pixels. The difference to the row above suits figures: most of it is zero.
     """
+
+    def get_renderer(self) -> RendererAgg:
+        """The renderer of this size, which is kept."""
+        size = *self.get_width_height(physical=True), self.figure.dpi
+        if self._lastKey != size:
+            self.renderer, self._lastKey = Renderer(*size), size
+        return self.renderer
 
     def print_png(
         self,
@@ -45,11 +55,12 @@ def _png(pixels: np.ndarray[Any, np.dtype[np.uint8]], dpi: float) -> bytes:
     """A PNG file (ISO/IEC 15948) of pixels (rows, columns, 4), red, green, blue and opacity."""
     opaque = pixels[..., 3].min() == 255
     height, width, channels = *pixels.shape[:2], 3 if opaque else 4
-    colours = pixels[..., :channels].reshape(height, width * channels)
     # Filter 2 begins each row: the difference to the row above
-    rows = np.full((height, 1 + width * channels), 2, np.uint8)
-    rows[0, 1:] = colours[0]
-    np.subtract(colours[1:], colours[:-1], out=rows[1:, 1:])
+    rows = np.empty((height, 1 + width * channels), np.uint8)
+    rows[:, 0] = 2
+    for k in range(channels):  # one at a time, which is twice as fast
+        rows[0, 1 + k :: channels] = pixels[0, :, k]
+        np.subtract(pixels[1:, :, k], pixels[:-1, :, k], out=rows[1:, 1 + k :: channels])
     per_metre = round(dpi / _METRES_PER_INCH)
     chunks = {
         b"IHDR": struct.pack(">2I5B", width, height, 8, 2 if opaque else 6, 0, 0, 0),
@@ -77,6 +88,14 @@ class Figure(figure.Figure):
         super().__init__(*arguments, **options)
         _Canvas(self)  # which keeps its renderer; measuring a text would make a new one each time
 
+    def add_subplot(self, *arguments: Any, **options: Any) -> Any:
+        """Add axes of ours, unless a projection is asked for."""
+        return super().add_subplot(*arguments, **_ours(options))
+
+    def add_axes(self, *arguments: Any, **options: Any) -> Any:
+        """Add axes of ours, unless a projection is asked for."""
+        return super().add_axes(*arguments, **_ours(options))
+
     def _repr_png_(self) -> tuple[bytes, dict[str, Any]]:
         """The picture, and the size it is shown at: fine screens have dots to spare."""
         buffer = io.BytesIO()
@@ -84,3 +103,9 @@ class Figure(figure.Figure):
             self.savefig(buffer, format="png")
         width, height = (int(x) for x in self.get_size_inches() * _SHOWN)
         return buffer.getvalue(), {"width": width, "height": height}
+
+
+def _ours(options: dict[str, Any]) -> dict[str, Any]:
+    """Options of new axes, which are ours unless they say otherwise."""
+    other = {"axes_class", "projection", "polar"} & options.keys()
+    return options if other else options | {"axes_class": Axes}

@@ -57,7 +57,7 @@ def formations(result: Result) -> Figure:
     rows = math.ceil(max(len(names), 1) / columns)
     fig = Figure(figsize=(max(3.4 * columns, 6.0), 0.5 + 3.5 * rows))
     fig.settings = st.settings
-    st.head(fig, result, "Formations")
+    st.head(fig, result, "Formations with their body axes")
     if not names:
         fig.text(0.5, 0.45, "the mission has no formation", ha="center", color=st.GREY)
     legend = len(result.edges) > curves.SINGLE and bool(names)
@@ -196,8 +196,7 @@ def _draw_axes(ax: Axes, axes: Floats, length: float, *, taken: bool) -> None:
     An axis that points to the viewer is drawn as a ring with a dot, beside the centre if an agent has `taken` it.
     """
     tips = length * axes
-    for tip, name in zip(tips, "xyz", strict=True):
-        label = f"${name}_b$"
+    for tip, label in zip(tips, "xyz", strict=True):
         if np.hypot(*tip[:2]) < 1e-6 * length:
             words = f"⊙ {label}" if taken else label
             place: dict[str, Any] = {"textcoords": "offset points", "ha": "right", "va": "top"}

@@ -368,7 +368,7 @@ def _outline(ax: Axes, low: Floats, high: Floats, name: str, **look: Any) -> Non
     from matplotlib.patches import Rectangle
 
     (x, y), (width, depth) = low[:2].tolist(), (high - low)[:2].tolist()
-    box = ax.add_patch(Rectangle((x, y), width, depth, zorder=1, **look))
+    box = ax.add_artist(Rectangle((x, y), width, depth, zorder=1, **look))
     label = ax.text(
         x + width / 2, y, st.clean(name, 20), fontsize=6.5, color=st.GREY, ha="center",
         va="bottom", zorder=1.5, parse_math=False,

@@ -14,6 +14,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from rigidfleet.plotting.applied import applied
 from rigidfleet.result import Result
 from rigidfleet.typing import Floats
 
@@ -55,14 +56,14 @@ _ENTRIES = 12  # greatest number of entries of a legend
 STILL = 1e-3
 _ROUNDING = 1e-9  # smaller deviations are not mentioned
 
+_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
 #: A possible place of a text: a point and its coordinate system, an offset [points] from it, alignment.
 Place = tuple[tuple[float, float], Any, tuple[float, float], str, str]
 #: Positions along the width of an axes, ends and middle first.
 _ALONG = ((0.995, "right"), (0.5, "center"), (0.005, "left"), (0.75, "center"), (0.25, "center"))
 _places: WeakKeyDictionary[Annotation, Sequence[Place]] = WeakKeyDictionary()
 _titled: ContextVar[bool] = ContextVar("titled", default=True)
-#: Whether the style is applied, which takes 2 ms.
-_applied: ContextVar[bool] = ContextVar("applied", default=False)
 
 _RC: dict[str, Any] = {
     "font.family": "sans-serif",
@@ -112,7 +113,7 @@ _RC: dict[str, Any] = {
 @contextmanager
 def settings() -> Generator[None]:
     """Apply matplotlib's defaults and our style, whatever the user has set; restored at the end."""
-    if _applied.get():
+    if applied.get():  # to apply it takes 2 ms
         yield
         return
     import matplotlib as mpl
@@ -122,11 +123,11 @@ def settings() -> Generator[None]:
     with mpl.rc_context(look), warnings.catch_warnings():
         # Letters that the font lacks show as boxes in a PNG, and correctly in an SVG.
         warnings.filterwarnings("ignore", message="Glyph .* missing from font")
-        before = _applied.set(True)
+        before = applied.set(True)
         try:
             yield
         finally:
-            _applied.reset(before)
+            applied.reset(before)
 
 
 def styled(draw: Draw) -> Draw:
@@ -181,11 +182,18 @@ def time_figure(
 ) -> tuple[Figure, Any]:
     """Figure with rows x columns axes (object array) that share time; `height` of a row [in], scaled by its share."""
     from rigidfleet.plotting.figure import Figure
+    from rigidfleet.plotting.layout import Layout
 
     shares = [1.0] * rows if shares is None else shares
-    fig = Figure(figsize=(WIDTH, 1.3 + height * sum(shares)), layout="constrained")
+    whole = 1.3 + height * sum(shares)
+    fig = Figure(figsize=(WIDTH, whole), layout=Layout(_PAD))
     fig.settings = settings
-    axes = fig.subplots(rows, columns, sharex=True, squeeze=False, height_ratios=shares)
+    # Nearly the heights that the axes will have, as the number of their ticks depends on it
+    inside = whole - 1.2 - 2 * _PAD * (rows - 1)
+    grid = {"bottom": 0.5 / whole, "top": 1 - 0.7 / whole, "hspace": 2 * _PAD * rows / inside}
+    axes = fig.subplots(
+        rows, columns, sharex=True, squeeze=False, height_ratios=shares, gridspec_kw=grid
+    )
     head(fig, result, title)
     for ax in axes.flat:
         over_time(ax, result)
@@ -236,7 +244,8 @@ def over_time(ax: Axes, result: Result) -> None:
         corners = [at for a, b in bands for at in ((a, 0), (a, 1), (b, 1), (b, 0), (a, 0))]
         strokes = [Path.MOVETO, Path.LINETO, Path.LINETO, Path.LINETO, Path.CLOSEPOLY]
         path, along = Path(corners, strokes * len(bands)), ax.get_xaxis_transform()
-        ax.add_patch(PathPatch(path, facecolor=BAND, linewidth=0, zorder=0, transform=along))
+        # As an artist, without a search for the limits of its data
+        ax.add_artist(PathPatch(path, facecolor=BAND, linewidth=0, zorder=0, transform=along))
     if not result.complete:
         ax.axvline(t[-1], color=ALERT, linewidth=0.8)
 
@@ -398,6 +407,14 @@ def note(ax: Axes, words: str) -> None:
     """Write text in an axes that has nothing to show."""
     ax.text(0.5, 0.5, words, transform=ax.transAxes, ha="center", va="center", color=GREY)
     ax.tick_params(left=False, labelleft=False)
+
+
+def power(value: float, _: int) -> str:
+    """A power of ten on a logarithmic axis, in letters: formulas take twenty times as long."""
+    exponent = math.log10(value) if value > 0.0 else 0.5
+    if abs(exponent - round(exponent)) > 1e-9:  # as a user's ticks may be
+        return f"{value:g}"
+    return "10" + f"{exponent:.0f}".translate(_RAISED)
 
 
 def spread(ax: Axes, t: Floats, values: Floats, colour: str) -> None:
@@ -574,7 +591,7 @@ def _spans(ax: Axes, result: Result) -> list[tuple[str, float, float]]:
 
 
 def _per_second(ax: Axes) -> float:
-    """Pixels per second, underestimated: the layout, which takes a third of a figure's time, comes later.
+    """Pixels per second, underestimated: the layout comes later, as it needs the names.
 
     It widens axes beside which nothing stands by up to 20 %, and narrows those beside a legend by up to 9 %.
     """
