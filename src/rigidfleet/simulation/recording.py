@@ -142,7 +142,7 @@ class Piece:
         given = self.given
         if not isinstance(given, Unevaluated):
             for rows, values in zip(out, given, strict=True):
-                rows[:] = values
+                rows[:] = values[: len(rows)]
         elif given.setup is None:
             work = small_workspace(given.planned)
             given.evaluated(self.time, work, out)
@@ -234,7 +234,9 @@ def _recorded(
     mission: Mission, pieces: Sequence[Piece], time: Floats, flown: VehicleSamples | None
 ) -> dict[str, Any]:
     """Forces and references at all samples, and what is measured of them."""
-    record = _record(pieces, mission.n_agents, mission.edges)
+    d = mission.disturbances
+    disturbed = flown is not None or d is not None
+    record = _record(pieces, mission.n_agents, mission.edges, disturbed=disturbed)
     found = _measured(mission, pieces, time, record)
     thrust, motion, r_ref = found.thrust, record.motion, record.r_ref
     if flown is not None:
@@ -243,7 +245,7 @@ def _recorded(
             thrust = np.minimum(thrust, mission.agents.thrust_limit)
     if (left := _left(mission, time)) is not None:
         r_ref = np.where(left[:, :, None], r_ref, np.nan)
-    constraint, d = record.c, mission.disturbances
+    constraint = record.c
     if d is not None and d.noise is not None:
         constraint = found.distance - record.d
     return {
@@ -414,9 +416,10 @@ def _measured(mission: Mission, pieces: Sequence[Piece], time: Floats, record: R
     return found
 
 
-def _record(pieces: Sequence[Piece], n: int, edges: Ints) -> Record:
+def _record(pieces: Sequence[Piece], n: int, edges: Ints, *, disturbed: bool) -> Record:
     """Forces and references at all samples, of the pieces one after the other; NaN while an edge is not active."""
-    out, end = recorder(sum(len(p.time) for p in pieces), n, len(edges)), 0
+    count, end = sum(len(p.time) for p in pieces), 0
+    out = recorder(count, n, len(edges), disturbed=disturbed)
     for piece in pieces:
         begin, end = end, end + len(piece.time)
         rows = Record._make([x[begin:end] for x in out])
@@ -428,7 +431,9 @@ def _record(pieces: Sequence[Piece], n: int, edges: Ints) -> Record:
         own = rows._replace(**{name: np.empty(size) for name in _EDGEWISE})
         piece.record_into(own)
         for name in _EDGEWISE:
-            getattr(rows, name)[:, places] = getattr(own, name)
+            full = getattr(rows, name)
+            full.fill(np.nan)
+            full[:, places] = getattr(own, name)
     return out
 
 
