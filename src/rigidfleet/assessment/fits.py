@@ -70,9 +70,10 @@ class Laid:
         return rigid_body.best_rotation(*self._parts)
 
     @cached_property
-    def along(self) -> Floats:
-        """The direction (G, 3) in which the agents extend most."""
-        return np.linalg.eigh(self.p.swapaxes(1, 2) @ self.p)[1][..., -1]
+    def order(self) -> list[list[int]]:
+        """The agents in the order in which they follow each other where they extend most."""
+        along = np.linalg.eigh(self.p.swapaxes(1, 2) @ self.p)[1][..., -1:]
+        return (self.p @ along)[..., 0].argsort(axis=1).tolist()
 
 
 class Fit:
@@ -98,7 +99,7 @@ class Fit:
         known = (
             _shape(slots.tobytes()) if slots.nbytes < _KEPT else _shape.__wrapped__(slots.tobytes())
         )
-        self.dimension, self.axis, self.shortest = known
+        self.dimension, self.axis, self._order, self.shortest = known
         self.error, pair, self.flown, self.intended = _all_pairs(p, slots, self._laid, k)
         self.pair = pair if who is None else (int(who[pair[0]]), int(who[pair[1]]))
 
@@ -112,15 +113,12 @@ class Fit:
         """Where the axis (3,) points in the world."""
         return self._laid.turn[0][self._k] @ self.axis
 
-    @cached_property
+    @property
     def in_order(self) -> bool | None:
         """Whether the agents of a line are in order; None for other shapes, and for two agents."""
-        laid, k = self._laid, self._k
-        if self.dimension != 1 or laid.p.shape[1] < 3:
+        if self.dimension != 1 or len(self._order) < 3:
             return None
-        asked = np.argsort(laid.slots[k] @ self.axis).tolist()
-        flown = np.argsort(laid.p[k] @ laid.along[k]).tolist()
-        return flown in (asked, asked[::-1])
+        return self._laid.order[self._k] in (self._order, self._order[::-1])
 
     @property
     def limit(self) -> float:
@@ -139,13 +137,15 @@ def length(x: Floats) -> Floats:
 
 
 @lru_cache(64)
-def _shape(slots: bytes) -> tuple[int, Floats, float]:
-    """Dimension of slots (N, 3), the direction of a line or the normal of a plane, and the shortest distance [m]."""
+def _shape(slots: bytes) -> tuple[int, Floats, list[int], float]:
+    """Of slots (N, 3): dimension, direction of a line or normal of a plane, order along a line, shortest distance [m]."""
     points = np.frombuffer(slots).reshape(-1, 3)
     centred = rigid_body.centred(points)
     dimension = distance_geometry.dimension(centred, THIN)
     axes = np.linalg.svd(centred, full_matrices=False)[2]
-    return dimension, axes[0] if dimension == 1 else axes[2], float(proximity.nearest(points).min())
+    axis = axes[0] if dimension == 1 else axes[2]
+    order = (centred @ axis).argsort().tolist() if dimension == 1 else []
+    return dimension, axis, order, float(proximity.nearest(points).min())
 
 
 def _worst_of_few(p: Floats, slots: Floats) -> Floats:

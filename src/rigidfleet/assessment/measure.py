@@ -128,7 +128,7 @@ class Measurements:
 
     def edge(self, _k: int, e: int) -> str:
         """Name of edge e (from 0), the same at every sample."""
-        i, j = self.result.edges[e]
+        i, j = self.result.edges[e].tolist()
         return f"edge {i + 1}-{j + 1}"
 
     def pair(self, k: int) -> str:
@@ -137,16 +137,11 @@ class Measurements:
 
     def obstacle(self, k: int) -> str:
         """Names of the agent nearest to an obstacle at sample k, and of that obstacle."""
-        return self.beside(int(self.close.agent[k]), int(self.close.obstacle[k]))
+        return self.beside(self.close.agent.item(k), self.close.obstacle.item(k))
 
     def beside(self, agent: int, obstacle: int) -> str:
         """Names of an agent and an obstacle, both counted from 0."""
         return f"agent {agent + 1}, {self.mission.obstacles[obstacle].name}"
-
-    def at(self, k: int) -> dict[str, Any]:
-        """Time [s] and phase of sample k."""
-        result = self.result
-        return {"when": result.time.item(k), "phase": result.phases[result.phase.item(k)].name}
 
     def first(self, broken: Bools) -> float:
         """Time [s] of the first sample at which ``broken`` holds; infinity if it never does."""
@@ -161,14 +156,16 @@ class Measurements:
 
     def worst_sample(self, quantity: Quantity, samples: slice) -> Extreme | None:
         """The worst value of a quantity among some samples; None if none is finite."""
-        rank = quantity.rank[samples]
+        rank, values, result = quantity.rank[samples], quantity.values, self.result
         if not rank.size:
             return None
         k, place = divmod(int(rank.argmax()), rank.shape[1])
         if rank.item(k, place) == -math.inf:
             return None
-        at = (samples.start + k, place)[: quantity.values.ndim]
-        return Extreme(float(quantity.values.item(at)), who=quantity.who(*at), **self.at(at[0]))
+        k += samples.start
+        at = (k,) if values.ndim == 1 else (k, place)
+        phase = result.phases[result.phase.item(k)].name
+        return Extreme(values.item(at), result.time.item(k), quantity.who(*at), phase)
 
     # -- between samples ------------------------------------------------------------------------------
 
@@ -334,8 +331,12 @@ class Measurements:
     def contradictions(self) -> Iterator[tuple[str, float]]:
         """Values of the record that disagree with its own positions and forces: in words, and when [s]."""
         result, time = self.result, self.result.time
-        length = proximity.lengths(result.position, result.edges)
-        rounding = 1e-9 * (1.0 + float(np.nanmax(np.abs(result.position), initial=0.0)))
+        r = result.position
+        length = proximity.lengths(r, result.edges)
+        reach = float(max(r.max(initial=0.0), -r.min(initial=0.0)))
+        if math.isnan(reach):
+            reach = float(np.nanmax(np.abs(r), initial=0.0))
+        rounding = 1e-9 * (1.0 + reach)
         with np.errstate(invalid="ignore"):  # infinity where there is nothing to be near
             stored = {
                 "separation": (result.separation - self.close.separation, "m"),
@@ -357,12 +358,17 @@ class Measurements:
         for index, phase in enumerate(result.phases):
             samples, extremes = self.samples[index], phase.extremes
             if samples.stop > samples.start and extremes:
-                due = ["speed", "lowest", "highest"]
-                due += ["thrust"] if self.rank["thrust"][index] > -math.inf else []
-                due += ["separation"] if self._several(samples.start) else []
-                due += ["clearance"] if _meets(there, phase) else []
-                due += ["geofence"] if fenced else []
-                if lacking := [name for name in due if name not in extremes]:
+                due = {
+                    "speed": True,
+                    "lowest": True,
+                    "highest": True,
+                    "thrust": self.rank["thrust"][index] > -math.inf,
+                    "separation": np.count_nonzero(self.left[samples.start]) > 1,
+                    "clearance": _meets(there, phase),
+                    "geofence": fenced,
+                }
+                lacking = [name for name, needed in due.items() if needed and name not in extremes]
+                if lacking:
                     words = (
                         f"it lacks the worst '{lacking[0]}' of phase '{phase.name}' between samples"
                     )
@@ -382,10 +388,6 @@ class Measurements:
                     )
                     words += f" {value(x.value)} at {x.time:.2f} s, but a sample shows {value(sampled.value)}"
                     yield words, sampled.when
-
-    def _several(self, k: int) -> bool:
-        """Whether at sample k several agents are left."""
-        return int(self.left[k].sum()) > 1
 
     def phase(self, index: int, record: PhaseRecord) -> PhaseVerdict:
         """Numbers of a phase."""
