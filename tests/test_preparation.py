@@ -287,7 +287,9 @@ def test_distances_taken_over_are_those_computed():
         result.left,
     )
     first = proximity.closeness(*given)
-    first.each[:] = 0.0
+    for values in first:
+        with pytest.raises(ValueError, match="read-only"):
+            values[0] = 0
     again = proximity.closeness(*given)
     alone = proximity.obstacle_clearances(given[0], given[1], given[2], given[3])
     np.testing.assert_array_equal(again.each, alone[0])

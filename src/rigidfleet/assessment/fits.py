@@ -138,7 +138,7 @@ def length(x: Floats) -> Floats:
 
 @lru_cache(64)
 def _shape(slots: bytes) -> tuple[int, Floats, list[int], float]:
-    """Of slots (N, 3): dimension, direction of a line or normal of a plane, order along a line, shortest distance [m]."""
+    """Of slots (N, 3): dimension, direction of a line or normal of a plane, order on a line, shortest distance [m]."""
     points = np.frombuffer(slots).reshape(-1, 3)
     centred = rigid_body.centred(points)
     dimension = distance_geometry.dimension(centred, THIN)

@@ -177,6 +177,7 @@ class Segment(NamedTuple):
     times: Floats  # (K,) [s], increasing
     samples: Floats  # (K, n) states at these times: written by the integrator, read by the recorder
     dy: Floats  # (n,) the recorder's derivative
+    first: int = 0  # the recorder's first row
 
 
 class Record(NamedTuple):
