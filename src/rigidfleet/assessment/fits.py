@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
+from collections.abc import Sequence
 from functools import cached_property, lru_cache
 
 import numpy as np
@@ -125,10 +126,6 @@ class Fit:
         """Greatest error of a pair [m]."""
         return SHAPE_TOLERANCE * self.shortest
 
-    def angle_from(self, T: Floats) -> float:
-        """Angle [deg] of the axis from its direction in an attitude T (3, 3); NaN without an attitude."""
-        return angle_between(self.points, T.T @ self.axis)
-
 
 def length(x: Floats) -> Floats:
     """Lengths (...) of vectors (..., 3)."""
@@ -198,8 +195,8 @@ def is_rigid(p: Floats, edges: Ints) -> bool:
     return bool(np.isfinite(J).all()) and np.linalg.matrix_rank(J, rtol=1e-6) == 3 * len(p) - 6
 
 
-def angle_between(a: Floats, b: Floats) -> float:
+def angle_between(a: Sequence[float], b: Sequence[float]) -> float:
     """Angle [deg] between two vectors."""
-    (x, y, z), (u, v, w) = a.tolist(), b.tolist()
+    (x, y, z), (u, v, w) = a, b
     across = math.hypot(y * w - z * v, z * u - x * w, x * v - y * u)
     return math.degrees(math.atan2(across, x * u + y * v + z * w))

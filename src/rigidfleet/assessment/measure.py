@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from rigidfleet._common.text import agent_names
-from rigidfleet.assessment.fits import Fit, Laid, length
+from rigidfleet.assessment.fits import Fit, Laid, angle_between, length
 from rigidfleet.assessment.outcome import SENSE, Extreme, PhaseVerdict, Waypoint, value
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity, splines
@@ -25,6 +25,9 @@ from rigidfleet.typing import Bools, Floats, Ints
 #: Forces have no such bound: a peak is searched only where the ends of a step show one, so that a jump of a user's
 #: force may be missed.
 _SLACK = {"separation": 0.0, "clearance": 0.0, "speed": 1e-9}
+#: Extremes of pairs of agents, and of edges.
+_OF_PAIRS = frozenset(("separation", "separation_below", "lost"))
+_OF_EDGES = frozenset(("tension", "constraint"))
 
 
 #: About so many curves are compared together.
@@ -175,14 +178,14 @@ class Measurements:
         x = phase.extremes.get(name)
         if x is None:
             return None
-        if name in ("separation", "separation_below", "lost"):
+        if name in _OF_PAIRS:
             who = agent_names(sorted((x.who, x.other)))
-        elif name in ("tension", "constraint"):
+        elif name in _OF_EDGES:
             who = f"edge {x.who + 1}-{x.other + 1}"
         elif name.startswith("clearance"):
             who = self.beside(x.who, x.other)
         else:
-            who = self.agent(0, x.who)
+            who = f"agent {x.who + 1}"
         return Extreme(abs(x.value) if name == "constraint" else x.value, x.time, who, phase.name)
 
     def worst(
@@ -199,18 +202,20 @@ class Measurements:
             return sampled or between
         return between if sense(between.value) > sense(sampled.value) else sampled
 
-    def worst_of(self, index: int) -> dict[str, Extreme]:
-        """The worst values of a phase, at its samples or between them, by name."""
-        extremes, samples, found = self.result.phases[index].extremes, self.samples[index], {}
+    @cached_property
+    def worst_of(self) -> list[dict[str, Extreme]]:
+        """The worst values of each phase, at its samples or between them, by name."""
+        found: list[dict[str, Extreme]] = [{} for _ in self.samples]
         for name, quantity in self.measured.items():
-            x, rank = extremes.get(name), self.rank[name][index]
-            worst = None
-            if x is not None and rank < SENSE[name](x.value):
-                worst = self.between(name, index)
-            elif rank != -math.inf:
-                worst = self.worst_sample(quantity, samples)
-            if worst is not None:
-                found[name] = worst
+            sense, ranks = SENSE[name], self.rank[name]
+            for k, phase in enumerate(self.result.phases):
+                x, rank, worst = phase.extremes.get(name), ranks[k], None
+                if x is not None and rank < sense(x.value):
+                    worst = self.between(name, k)
+                elif rank != -math.inf:
+                    worst = self.worst_sample(quantity, self.samples[k])
+                if worst is not None:
+                    found[k][name] = worst
         return found
 
     def greatest(self, order: int, size: Callable[[Floats], Floats]) -> Extreme | None:
@@ -409,11 +414,11 @@ class Measurements:
             distances=self.distances.get(index),
             shape=None if fit is None else fit.error,
             handedness=None if fit is None or fit.dimension < 3 else not fit.mirrored,
-            flip=None if fit is None else self.flip(fit, record, index),
+            flip=self.flips.get(index),
             order=None if fit is None else fit.in_order,
             waypoint=self.waypoints.get(index) if finished else None,
             through=tuple(self.passed(index)),
-            worst=self.worst_of(index),
+            worst=self.worst_of[index],
         )
 
     @cached_property
@@ -483,23 +488,30 @@ class Measurements:
                 fits[index] = Fit(p, slots, left, laid, k)
         return fits
 
-    def flip(self, fit: Fit, record: PhaseRecord, index: int) -> float | None:
-        """Angle [deg] of a line or plane from its intended direction at the end of a phase; None if there is none."""
-        # A commanded attitude decides; without one, the integrated frame says how a plane should lie.
-        references = self._directions[index]
-        if fit.dimension == 1 and record.control == "tracking":
-            # Only tracked slots steer a line; otherwise its direction follows from the shape before.
-            references = references[:1]
-        elif fit.dimension != 2:
-            return None
-        return next((a for T in references if math.isfinite(a := fit.angle_from(T))), None)
-
     @cached_property
-    def _directions(self) -> dict[int, Floats]:
-        """Commanded attitude and integrated frame (2, 3, 3) at the last sample of each phase."""
-        result = self.result
-        T = att.dcm_from_quaternion([result.attitude_reference[self.last], result.frame[self.last]])
-        return dict(zip(self.flown, T.swapaxes(0, 1), strict=True))
+    def flips(self) -> dict[int, float]:
+        """Angle [deg] of a line or plane from its intended direction at the end of each phase that has one."""
+        flat = {k: fit for k, fit in self.fits.items() if fit.dimension in (1, 2)}
+        if not flat:
+            return {}
+        # A commanded attitude decides; without one, the integrated frame says how a plane should lie.
+        last = [self.samples[k].stop - 1 for k in flat]
+        q = np.array([self.result.attitude_reference[last], self.result.frame[last]])
+        axes = np.array([fit.axis for fit in flat.values()])
+        aims = (att.dcm_from_quaternion(q).swapaxes(2, 3) @ axes[..., None])[..., 0]
+        found = {}
+        for i, (k, fit) in enumerate(flat.items()):
+            some = aims[:, i].tolist()
+            if fit.dimension == 1:
+                # Only tracked slots steer a line; otherwise its direction follows from the shape before.
+                some = some[:1] if self.result.phases[k].control == "tracking" else []
+            points = fit.points.tolist()
+            angle = next(
+                (a for aim in some if math.isfinite(a := angle_between(points, aim))), None
+            )
+            if angle is not None:
+                found[k] = angle
+        return found
 
     def nearest(self, t: float, index: int) -> int:
         """The sample of a phase flown that is nearest to a time [s]; of two equally near the first."""
