@@ -13,7 +13,7 @@ from rigidfleet.assessment.outcome import SHAPE_TOLERANCE
 from rigidfleet.formation import distance_geometry
 from rigidfleet.math import proximity, rigid_body
 from rigidfleet.math.constraint_jacobian import jacobian
-from rigidfleet.typing import Bools, Floats, Ints
+from rigidfleet.typing import Floats, Ints
 
 #: Slots thinner than this, relative to their length, count as planar or straight. Distances of seven digits
 #: give a flat shape a thickness of 3e-4.
@@ -30,6 +30,10 @@ _FEW = 16
 
 #: Errors of distances that differ by less than this share of the shape's size are equal.
 _ROUNDING = 1e-12
+
+
+#: Share of their length below which agents have no width: they are on a line.
+_FLAT = 1e-9
 
 
 #: Greatest number of agents for which a wrong shape is tested for rigidity.
@@ -50,14 +54,14 @@ class Laid:
         self.worst = _worst_of_few(p, slots).tolist() if few else None
 
     @cached_property
-    def _parts(self) -> tuple[Floats, Floats, Floats]:
-        """The decomposition of sum p slot^T (G, 3, 3)."""
-        return np.linalg.svd(self.p.swapaxes(1, 2) @ self.slots)
+    def across(self) -> Floats:
+        """The sums of p slot^T (G, 3, 3) over the agents."""
+        return self.p.swapaxes(1, 2) @ self.slots
 
     @cached_property
     def off(self) -> Floats:
         """Distance (G, N) of each agent from its slot, mirrored if that fits better."""
-        U, _, Vt = self._parts
+        U, _, Vt = np.linalg.svd(self.across)
         return length(self.p - self.slots @ (U @ Vt).swapaxes(1, 2))
 
     @cached_property
@@ -66,9 +70,14 @@ class Laid:
         return np.abs(self.slots).max(axis=(1, 2))
 
     @cached_property
-    def turn(self) -> tuple[Floats, Bools]:
-        """The best-fitting rotation (G, 3, 3), without a reflection, and whether it needs none (G,)."""
-        return rigid_body.best_rotation(*self._parts)
+    def mirrored(self) -> list[bool]:
+        """Whether the slots fit better if they are mirrored (G,)."""
+        return (~(np.linalg.det(self.across) > 0.0)).tolist()
+
+    @cached_property
+    def turn(self) -> Floats:
+        """The best-fitting rotation (G, 3, 3), without a reflection."""
+        return rigid_body.best_rotation(*np.linalg.svd(self.across))[0]
 
     @cached_property
     def order(self) -> list[list[int]]:
@@ -97,22 +106,29 @@ class Fit:
     ) -> None:
         """Compare agents p (N, 3) with slots (N, 3), which are the k-th of ``laid``; ``who`` (N,) are their numbers."""
         self._laid, self._k = Laid(p[None], slots[None]) if laid is None else laid, k
-        known = (
-            _shape(slots.tobytes()) if slots.nbytes < _KEPT else _shape.__wrapped__(slots.tobytes())
-        )
-        self.dimension, self.axis, self._order, self.shortest = known
+        shape = _shape if slots.nbytes < _KEPT else _shape.__wrapped__
+        self.dimension, self.axis, self._plane, self._order, self.shortest = shape(slots.tobytes())
         self.error, pair, self.flown, self.intended = _all_pairs(p, slots, self._laid, k)
         self.pair = pair if who is None else (int(who[pair[0]]), int(who[pair[1]]))
 
     @property
     def mirrored(self) -> bool:
         """Whether a spatial shape is the mirror image of its slots."""
-        return self.dimension == 3 and not self._laid.turn[1][self._k]
+        return self.dimension == 3 and self._laid.mirrored[self._k]
 
     @cached_property
-    def points(self) -> Floats:
-        """Where the axis (3,) points in the world."""
-        return self._laid.turn[0][self._k] @ self.axis
+    def points(self) -> list[float]:
+        """Where the best-fitting rotation turns the axis in the world: a vector (3,) of any length."""
+        across = self._laid.across[self._k]
+        if self.dimension == 1:
+            found = (across @ self.axis).tolist()
+            known = any(found)
+        else:
+            (x, y, z), (u, v, w) = (self._plane @ across.T).tolist()
+            found = [y * w - z * v, z * u - x * w, x * v - y * u]
+            known = math.hypot(*found) > _FLAT * (x * x + y * y + z * z + u * u + v * v + w * w)
+        # Of agents on a line, or at a point, many rotations fit equally well.
+        return found if known else (self._laid.turn[self._k] @ self.axis).tolist()
 
     @property
     def in_order(self) -> bool | None:
@@ -134,15 +150,16 @@ def length(x: Floats) -> Floats:
 
 
 @lru_cache(64)
-def _shape(slots: bytes) -> tuple[int, Floats, list[int], float]:
-    """Of slots (N, 3): dimension, direction of a line or normal of a plane, order on a line, shortest distance [m]."""
+def _shape(slots: bytes) -> tuple[int, Floats, Floats, list[int], float]:
+    """Of slots (N, 3): dimension, axis of `Fit`, two directions across it, order on a line, shortest distance [m]."""
     points = np.frombuffer(slots).reshape(-1, 3)
     centred = rigid_body.centred(points)
     dimension = distance_geometry.dimension(centred, THIN)
     axes = np.linalg.svd(centred, full_matrices=False)[2]
     axis = axes[0] if dimension == 1 else axes[2]
     order = (centred @ axis).argsort().tolist() if dimension == 1 else []
-    return dimension, axis, order, float(proximity.nearest(points).min())
+    plane = np.array([axes[0], np.cross(axis, axes[0])])
+    return dimension, axis, plane, order, float(proximity.nearest(points).min())
 
 
 def _worst_of_few(p: Floats, slots: Floats) -> Floats:

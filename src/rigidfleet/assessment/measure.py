@@ -505,10 +505,8 @@ class Measurements:
             if fit.dimension == 1:
                 # Only tracked slots steer a line; otherwise its direction follows from the shape before.
                 some = some[:1] if self.result.phases[k].control == "tracking" else []
-            points = fit.points.tolist()
-            angle = next(
-                (a for aim in some if math.isfinite(a := angle_between(points, aim))), None
-            )
+            angles = (angle_between(fit.points, aim) for aim in some)
+            angle = next(filter(math.isfinite, angles), None)
             if angle is not None:
                 found[k] = angle
         return found

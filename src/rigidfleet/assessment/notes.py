@@ -132,9 +132,8 @@ def _turned_over(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator
             continue
         if not p.finished or fit.error > fit.limit:
             continue
-        points = fit.points.tolist()
-        normal, since = seen.setdefault(p.formation, (points, p.t_end))
-        if angle_between(normal, points) > FLIPPED:
+        normal, since = seen.setdefault(p.formation, (fit.points, p.t_end))
+        if angle_between(normal, fit.points) > FLIPPED:
             yield (
                 f"'{p.formation}' turns over between {since:.2f} s and {p.t_end:.2f} s;"
                 " no attitude is commanded"
