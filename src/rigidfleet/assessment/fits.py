@@ -45,10 +45,7 @@ class Laid:
 
     def __init__(self, p: Floats, slots: Floats) -> None:
         """Take agents and slots (G, N, 3)."""
-        self.p, self.slots = (
-            p - p.mean(axis=1, keepdims=True),
-            slots - slots.mean(axis=1, keepdims=True),
-        )
+        self.p, self.slots = (x - x.sum(axis=1, keepdims=True) / x.shape[1] for x in (p, slots))
         few = 1 < p.shape[1] <= _FEW
         #: The pair with the worst distance (G, 5): error [m], both, flown, of slots [m]; None of many agents.
         self.worst = _worst_of_few(p, slots).tolist() if few else None
