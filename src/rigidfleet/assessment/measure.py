@@ -18,7 +18,7 @@ from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity, splines
 from rigidfleet.math.bernstein import bernstein
 from rigidfleet.math.bernstein import greatest as extreme_of
-from rigidfleet.result import PAD, PhaseRecord, Result
+from rigidfleet.result import PAD, Extremum, PhaseRecord, Result
 from rigidfleet.typing import Bools, Floats, Ints
 
 #: Share by which a sample may be worse than the worst value of its phase; beyond it, the record contradicts itself.
@@ -176,8 +176,10 @@ class Measurements:
         """The recorded extreme of a phase in continuous time; None if the record has none."""
         phase = self.result.phases[index]
         x = phase.extremes.get(name)
-        if x is None:
-            return None
+        return None if x is None else self.recorded(name, x, phase.name)
+
+    def recorded(self, name: str, x: Extremum, phase: str) -> Extreme:
+        """An extreme of a phase, as it was recorded."""
         if name in _OF_PAIRS:
             who = agent_names(sorted((x.who, x.other)))
         elif name in _OF_EDGES:
@@ -186,7 +188,7 @@ class Measurements:
             who = self.beside(x.who, x.other)
         else:
             who = f"agent {x.who + 1}"
-        return Extreme(abs(x.value) if name == "constraint" else x.value, x.time, who, phase.name)
+        return Extreme(abs(x.value) if name == "constraint" else x.value, x.time, who, phase)
 
     def worst(
         self, name: str, sampled: Extreme | None, sense: Callable[..., Any] = lambda x: x
@@ -211,7 +213,7 @@ class Measurements:
             for k, phase in enumerate(self.result.phases):
                 x, rank, worst = phase.extremes.get(name), ranks[k], None
                 if x is not None and rank < sense(x.value):
-                    worst = self.between(name, k)
+                    worst = self.recorded(name, x, phase.name)
                 elif rank != -math.inf:
                     worst = self.worst_sample(quantity, self.samples[k])
                 if worst is not None:

@@ -430,8 +430,18 @@ def angular_momentum(m, k, mass, h):
 @compiled
 def spectrum(s):
     """The smallest non-zero singular value of the constraint Jacobian J, from the smaller of J J^T and J^T J."""
-    edges, u, A = s.edges, s.u, s.A
+    edges, u, A, share = s.edges, s.u, s.A, s.share
     m, n = edges.shape[0], s.r.shape[1]
+    for e in range(share.shape[0]):
+        i, j = edges[e, 0], edges[e, 1]
+        for o in range(e + 1):
+            a, b = edges[o, 0], edges[o, 1]
+            sign = 0.0
+            sign += 1.0 if i == a else 0.0
+            sign += 1.0 if j == b else 0.0
+            sign -= 1.0 if i == b else 0.0
+            sign -= 1.0 if j == a else 0.0
+            share[e, o] = sign
     for k in range(s.r.shape[0]):
         r = s.r[k]
         for e in range(m):
@@ -441,14 +451,8 @@ def spectrum(s):
             u[e, 0], u[e, 1], u[e, 2] = x * inverse, y * inverse, z * inverse
         if m <= 3 * n:
             for e in range(m):
-                i, j = edges[e, 0], edges[e, 1]
                 for o in range(e + 1):
-                    a, b = edges[o, 0], edges[o, 1]
-                    sign = 0.0
-                    sign += 1.0 if i == a else 0.0
-                    sign += 1.0 if j == b else 0.0
-                    sign -= 1.0 if i == b else 0.0
-                    sign -= 1.0 if j == a else 0.0
+                    sign = share[e, o]
                     if sign != 0.0:
                         sign *= u[e, 0] * u[o, 0] + u[e, 1] * u[o, 1] + u[e, 2] * u[o, 2]
                     A[e, o] = sign
