@@ -15,6 +15,7 @@ from rigidfleet.assessment import SHAPE_TOLERANCE, CheckResult, Verdict, assess
 from rigidfleet.assessment.fits import Fit
 from rigidfleet.formation import distance_geometry, graphs, shapes
 from rigidfleet.math import attitude as att
+from rigidfleet.math import rigid_body
 from rigidfleet.math.proximity import clearance, separation
 from rigidfleet.mission import Mission
 from rigidfleet.result import LABELS, VARIABLES, PhaseRecord, Result
@@ -781,3 +782,28 @@ def test_of_pairs_equally_wrong_the_first_is_named():
     for turn in range(20):
         p = 1.1 * slots @ att.dcm_from_euler([0.1 * turn, 0.2, 0.3 * turn]) + [9.0, 7.0, 5.0]
         assert Fit(p, slots).pair == (0, 1)
+
+
+@pytest.mark.parametrize("shape", ["triangle", "square", "line"])
+@pytest.mark.parametrize("error", [0.0, 0.05])
+def test_an_axis_points_where_the_best_rotation_turns_it(shape, error):
+    """A plane's normal and a line's direction, against the decomposition that fits slots to agents."""
+    rng = np.random.default_rng(3)
+    slots = shapes.slots(shape, 4.0, 4 if shape == "square" else 3)
+    for _ in range(20):
+        T = att.dcm_from_euler(rng.uniform(-3.0, 3.0, 3))
+        p = slots @ T + rng.normal(scale=5.0, size=3) + error * rng.normal(size=slots.shape)
+        fit = Fit(p, slots)
+        wanted = rigid_body.kabsch(p, slots) @ fit.axis
+        found = np.array(fit.points) / np.linalg.norm(fit.points)
+        np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-12)
+
+
+def test_a_plane_whose_agents_are_on_a_line_points_where_the_nearest_rotation_turns_it():
+    """Agents on a line show no normal: of all rotations that fit, the nearest to none is taken."""
+    slots = shapes.slots("triangle", 4.0, 3)
+    p = slots * [1.0, 0.0, 0.0]
+    np.testing.assert_allclose(
+        Fit(p, slots).points, rigid_body.kabsch(p, slots) @ Fit(p, slots).axis, rtol=0, atol=1e-12
+    )
+    assert np.isfinite(Fit(np.zeros((3, 3)), slots).points).all()

@@ -287,9 +287,25 @@ def test_distances_taken_over_are_those_computed():
         result.left,
     )
     first = proximity.closeness(*given)
-    first.each[:] = 0.0
+    for values in first:
+        with pytest.raises(ValueError, match="read-only"):
+            values[0] = 0
     again = proximity.closeness(*given)
     alone = proximity.obstacle_clearances(given[0], given[1], given[2], given[3])
     np.testing.assert_array_equal(again.each, alone[0])
     np.testing.assert_array_equal(again.nearest, alone[1])
     np.testing.assert_array_equal(again.separation, proximity.separation(given[0], given[1])[0])
+
+
+def test_a_copy_of_what_is_packed_has_the_addresses_of_its_own_arrays():
+    """A deep copy of a flight that has not been evaluated keeps nothing of the original."""
+    times = np.linspace(0.0, 2.5, 7)
+    given = packing.pack(records.Segment(2.5, True, 9, times, np.ones((7, 21)), np.ones(21)))
+    for other in (copy.deepcopy(given), pickle.loads(pickle.dumps(given))):
+        assert other.of.times is not times
+        assert bytes(other.words) == bytes(packing.pack(other.of).words)
+    result = simulate(load_mission("square"))
+    other = copy.deepcopy(result)
+    np.testing.assert_array_equal(
+        other.evaluate().constraint_force, result.evaluate().constraint_force
+    )

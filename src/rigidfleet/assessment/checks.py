@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator
 from operator import itemgetter
 
@@ -55,7 +56,7 @@ def all_checks(measured: Measurements, verdict: Verdict) -> Iterator[CheckResult
     worst = verdict.worst
     if "separation" in worst:
         yield _separation(measured, worst["separation"])
-        yield from _failures_or_worst(_as_planned(measured, verdict.phases))
+        yield from _as_planned(measured, verdict.phases)
     if "clearance" in worst:
         yield from _clearances(measured)
     if not measured.left.all():
@@ -130,21 +131,19 @@ def _unseen(measured: Measurements) -> Iterator[CheckResult]:
             continue
         target = p.target or {}
         moments = {"waypoint": target.get("time")}
-        points = enumerate(target.get("through", ()), start=1)
-        moments |= {f"point {k} on the way": point["time"] for k, point in points}
+        for k, point in enumerate(target.get("through", ()), start=1):
+            moments[f"point {k} on the way"] = point["time"]
         if KINDS[p.kind].shapes or i == last:
             moments["end"] = p.t_end
         for what, t in moments.items():
             if t is None:
                 continue
-            seen = result.time[measured.samples[i]]
-            away = float(np.abs(seen - min(t, p.t_end)).min(initial=np.inf))
+            away, nearest = math.inf, "the phase has no sample"
+            if i in measured.flown:
+                due = min(t, p.t_end)
+                away = abs(float(result.time[measured.nearest(due, i)]) - due)
+                nearest = f"the nearest sample is {away:.2g} s away"
             if away > _UNSEEN:
-                nearest = (
-                    f"the nearest sample is {away:.2g} s away"
-                    if len(seen)
-                    else "the phase has no sample"
-                )
                 words = f"the {what} of phase '{p.name}' ({t:.2f} s) is not judged: {nearest}. Record this time"
                 yield CheckResult("samples", False, words, away, _UNSEEN, "s", when=t, phase=p.name)
 
@@ -367,20 +366,22 @@ def _separation(measured: Measurements, e: Extreme) -> CheckResult:
 
 
 def _as_planned(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[CheckResult]:
-    """Compare the separation of each phase with the certificate of its plan."""
+    """Every phase in which agents come nearer than its plan's certificate allows, or the one nearest to that."""
     allowed = measured.mission.limits.separation_allowance
-    for record, phase in zip(measured.result.phases, phases, strict=True):
-        planned, e = record.planned, phase.worst.get("separation")
-        if planned is None or e is None:
-            continue
-        nearer = planned["separation"] - e.value
+    found = [
+        (record.planned["separation"] - e.value, record.planned["separation"], phase.name, e)
+        for record, phase in zip(measured.result.phases, phases, strict=True)
+        if record.planned is not None and (e := phase.worst.get("separation")) is not None
+    ]
+    nearer = [one for one in found if not one[0] <= allowed + _SLACK]
+    for off, planned, name, e in nearer or ([max(found, key=itemgetter(0))] if found else []):
         words = (
-            f"in phase '{phase.name}' {e.who} come within {value(e.value, 'm')} of each other at {e.when:.2f} s;"
-            f" the plan proves {value(planned['separation'], 'm')}, of which {allowed:g} m are allowed for tracking"
+            f"in phase '{name}' {e.who} come within {value(e.value, 'm')} of each other at {e.when:.2f} s;"
+            f" the plan proves {value(planned, 'm')}, of which {allowed:g} m are allowed for tracking"
         )
         yield CheckResult(
-            "separation_as_planned", nearer <= allowed + _SLACK, words, nearer, allowed, "m",
-            when=e.when, who=e.who, phase=phase.name,
+            "separation_as_planned", off <= allowed + _SLACK, words, off, allowed, "m",
+            when=e.when, who=e.who, phase=name,
         )  # fmt: skip
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
+from collections.abc import Sequence
 from functools import cached_property, lru_cache
 
 import numpy as np
@@ -12,7 +13,7 @@ from rigidfleet.assessment.outcome import SHAPE_TOLERANCE
 from rigidfleet.formation import distance_geometry
 from rigidfleet.math import proximity, rigid_body
 from rigidfleet.math.constraint_jacobian import jacobian
-from rigidfleet.typing import Bools, Floats, Ints
+from rigidfleet.typing import Floats, Ints
 
 #: Slots thinner than this, relative to their length, count as planar or straight. Distances of seven digits
 #: give a flat shape a thickness of 3e-4.
@@ -31,6 +32,10 @@ _FEW = 16
 _ROUNDING = 1e-12
 
 
+#: Share of their length below which agents have no width: they are on a line.
+_FLAT = 1e-9
+
+
 #: Greatest number of agents for which a wrong shape is tested for rigidity.
 _JUDGED = 200
 
@@ -40,23 +45,20 @@ class Laid:
 
     def __init__(self, p: Floats, slots: Floats) -> None:
         """Take agents and slots (G, N, 3)."""
-        self.p, self.slots = (
-            p - p.mean(axis=1, keepdims=True),
-            slots - slots.mean(axis=1, keepdims=True),
-        )
+        self.p, self.slots = (x - x.sum(axis=1, keepdims=True) / x.shape[1] for x in (p, slots))
         few = 1 < p.shape[1] <= _FEW
         #: The pair with the worst distance (G, 5): error [m], both, flown, of slots [m]; None of many agents.
         self.worst = _worst_of_few(p, slots).tolist() if few else None
 
     @cached_property
-    def _parts(self) -> tuple[Floats, Floats, Floats]:
-        """The decomposition of sum p slot^T (G, 3, 3)."""
-        return np.linalg.svd(self.p.swapaxes(1, 2) @ self.slots)
+    def across(self) -> Floats:
+        """The sums of p slot^T (G, 3, 3) over the agents."""
+        return self.p.swapaxes(1, 2) @ self.slots
 
     @cached_property
     def off(self) -> Floats:
         """Distance (G, N) of each agent from its slot, mirrored if that fits better."""
-        U, _, Vt = self._parts
+        U, _, Vt = np.linalg.svd(self.across)
         return length(self.p - self.slots @ (U @ Vt).swapaxes(1, 2))
 
     @cached_property
@@ -65,14 +67,20 @@ class Laid:
         return np.abs(self.slots).max(axis=(1, 2))
 
     @cached_property
-    def turn(self) -> tuple[Floats, Bools]:
-        """The best-fitting rotation (G, 3, 3), without a reflection, and whether it needs none (G,)."""
-        return rigid_body.best_rotation(*self._parts)
+    def mirrored(self) -> list[bool]:
+        """Whether the slots fit better if they are mirrored (G,)."""
+        return (~(np.linalg.det(self.across) > 0.0)).tolist()
 
     @cached_property
-    def along(self) -> Floats:
-        """The direction (G, 3) in which the agents extend most."""
-        return np.linalg.eigh(self.p.swapaxes(1, 2) @ self.p)[1][..., -1]
+    def turn(self) -> Floats:
+        """The best-fitting rotation (G, 3, 3), without a reflection."""
+        return rigid_body.best_rotation(*np.linalg.svd(self.across))[0]
+
+    @cached_property
+    def order(self) -> list[list[int]]:
+        """The agents in the order in which they follow each other where they extend most."""
+        along = np.linalg.eigh(self.p.swapaxes(1, 2) @ self.p)[1][..., -1:]
+        return (self.p @ along)[..., 0].argsort(axis=1).tolist()
 
 
 class Fit:
@@ -95,41 +103,41 @@ class Fit:
     ) -> None:
         """Compare agents p (N, 3) with slots (N, 3), which are the k-th of ``laid``; ``who`` (N,) are their numbers."""
         self._laid, self._k = Laid(p[None], slots[None]) if laid is None else laid, k
-        known = (
-            _shape(slots.tobytes()) if slots.nbytes < _KEPT else _shape.__wrapped__(slots.tobytes())
-        )
-        self.dimension, self.axis, self.shortest = known
+        shape = _shape if slots.nbytes < _KEPT else _shape.__wrapped__
+        self.dimension, self.axis, self._plane, self._order, self.shortest = shape(slots.tobytes())
         self.error, pair, self.flown, self.intended = _all_pairs(p, slots, self._laid, k)
         self.pair = pair if who is None else (int(who[pair[0]]), int(who[pair[1]]))
 
     @property
     def mirrored(self) -> bool:
         """Whether a spatial shape is the mirror image of its slots."""
-        return self.dimension == 3 and not self._laid.turn[1][self._k]
+        return self.dimension == 3 and self._laid.mirrored[self._k]
 
     @cached_property
-    def points(self) -> Floats:
-        """Where the axis (3,) points in the world."""
-        return self._laid.turn[0][self._k] @ self.axis
+    def points(self) -> list[float]:
+        """Where the best-fitting rotation turns the axis in the world: a vector (3,) of any length."""
+        across = self._laid.across[self._k]
+        if self.dimension == 1:
+            found = (across @ self.axis).tolist()
+            known = any(found)
+        else:
+            (x, y, z), (u, v, w) = (self._plane @ across.T).tolist()
+            found = [y * w - z * v, z * u - x * w, x * v - y * u]
+            known = math.hypot(*found) > _FLAT * (x * x + y * y + z * z + u * u + v * v + w * w)
+        # Of agents on a line, or at a point, many rotations fit equally well.
+        return found if known else (self._laid.turn[self._k] @ self.axis).tolist()
 
-    @cached_property
+    @property
     def in_order(self) -> bool | None:
         """Whether the agents of a line are in order; None for other shapes, and for two agents."""
-        laid, k = self._laid, self._k
-        if self.dimension != 1 or laid.p.shape[1] < 3:
+        if self.dimension != 1 or len(self._order) < 3:
             return None
-        asked = np.argsort(laid.slots[k] @ self.axis).tolist()
-        flown = np.argsort(laid.p[k] @ laid.along[k]).tolist()
-        return flown in (asked, asked[::-1])
+        return self._laid.order[self._k] in (self._order, self._order[::-1])
 
     @property
     def limit(self) -> float:
         """Greatest error of a pair [m]."""
         return SHAPE_TOLERANCE * self.shortest
-
-    def angle_from(self, T: Floats) -> float:
-        """Angle [deg] of the axis from its direction in an attitude T (3, 3); NaN without an attitude."""
-        return angle_between(self.points, T.T @ self.axis)
 
 
 def length(x: Floats) -> Floats:
@@ -139,13 +147,16 @@ def length(x: Floats) -> Floats:
 
 
 @lru_cache(64)
-def _shape(slots: bytes) -> tuple[int, Floats, float]:
-    """Dimension of slots (N, 3), the direction of a line or the normal of a plane, and the shortest distance [m]."""
+def _shape(slots: bytes) -> tuple[int, Floats, Floats, list[int], float]:
+    """Of slots (N, 3): dimension, axis of `Fit`, two directions across it, order on a line, shortest distance [m]."""
     points = np.frombuffer(slots).reshape(-1, 3)
     centred = rigid_body.centred(points)
     dimension = distance_geometry.dimension(centred, THIN)
     axes = np.linalg.svd(centred, full_matrices=False)[2]
-    return dimension, axes[0] if dimension == 1 else axes[2], float(proximity.nearest(points).min())
+    axis = axes[0] if dimension == 1 else axes[2]
+    order = (centred @ axis).argsort().tolist() if dimension == 1 else []
+    plane = np.array([axes[0], np.cross(axis, axes[0])])
+    return dimension, axis, plane, order, float(proximity.nearest(points).min())
 
 
 def _worst_of_few(p: Floats, slots: Floats) -> Floats:
@@ -198,8 +209,8 @@ def is_rigid(p: Floats, edges: Ints) -> bool:
     return bool(np.isfinite(J).all()) and np.linalg.matrix_rank(J, rtol=1e-6) == 3 * len(p) - 6
 
 
-def angle_between(a: Floats, b: Floats) -> float:
+def angle_between(a: Sequence[float], b: Sequence[float]) -> float:
     """Angle [deg] between two vectors."""
-    (x, y, z), (u, v, w) = a.tolist(), b.tolist()
+    (x, y, z), (u, v, w) = a, b
     across = math.hypot(y * w - z * v, z * u - x * w, x * v - y * u)
     return math.degrees(math.atan2(across, x * u + y * v + z * w))

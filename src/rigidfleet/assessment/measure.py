@@ -12,19 +12,22 @@ from typing import Any
 import numpy as np
 
 from rigidfleet._common.text import agent_names
-from rigidfleet.assessment.fits import Fit, Laid, length
+from rigidfleet.assessment.fits import Fit, Laid, angle_between, length
 from rigidfleet.assessment.outcome import SENSE, Extreme, PhaseVerdict, Waypoint, value
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity, splines
 from rigidfleet.math.bernstein import bernstein
 from rigidfleet.math.bernstein import greatest as extreme_of
-from rigidfleet.result import PAD, PhaseRecord, Result
+from rigidfleet.result import PAD, Extremum, PhaseRecord, Result
 from rigidfleet.typing import Bools, Floats, Ints
 
 #: Share by which a sample may be worse than the worst value of its phase; beyond it, the record contradicts itself.
 #: Forces have no such bound: a peak is searched only where the ends of a step show one, so that a jump of a user's
 #: force may be missed.
 _SLACK = {"separation": 0.0, "clearance": 0.0, "speed": 1e-9}
+#: Extremes of pairs of agents, and of edges.
+_OF_PAIRS = frozenset(("separation", "separation_below", "lost"))
+_OF_EDGES = frozenset(("tension", "constraint"))
 
 
 #: About so many curves are compared together.
@@ -128,7 +131,7 @@ class Measurements:
 
     def edge(self, _k: int, e: int) -> str:
         """Name of edge e (from 0), the same at every sample."""
-        i, j = self.result.edges[e]
+        i, j = self.result.edges[e].tolist()
         return f"edge {i + 1}-{j + 1}"
 
     def pair(self, k: int) -> str:
@@ -137,16 +140,11 @@ class Measurements:
 
     def obstacle(self, k: int) -> str:
         """Names of the agent nearest to an obstacle at sample k, and of that obstacle."""
-        return self.beside(int(self.close.agent[k]), int(self.close.obstacle[k]))
+        return self.beside(self.close.agent.item(k), self.close.obstacle.item(k))
 
     def beside(self, agent: int, obstacle: int) -> str:
         """Names of an agent and an obstacle, both counted from 0."""
         return f"agent {agent + 1}, {self.mission.obstacles[obstacle].name}"
-
-    def at(self, k: int) -> dict[str, Any]:
-        """Time [s] and phase of sample k."""
-        result = self.result
-        return {"when": result.time.item(k), "phase": result.phases[result.phase.item(k)].name}
 
     def first(self, broken: Bools) -> float:
         """Time [s] of the first sample at which ``broken`` holds; infinity if it never does."""
@@ -161,14 +159,16 @@ class Measurements:
 
     def worst_sample(self, quantity: Quantity, samples: slice) -> Extreme | None:
         """The worst value of a quantity among some samples; None if none is finite."""
-        rank = quantity.rank[samples]
+        rank, values, result = quantity.rank[samples], quantity.values, self.result
         if not rank.size:
             return None
         k, place = divmod(int(rank.argmax()), rank.shape[1])
         if rank.item(k, place) == -math.inf:
             return None
-        at = (samples.start + k, place)[: quantity.values.ndim]
-        return Extreme(float(quantity.values.item(at)), who=quantity.who(*at), **self.at(at[0]))
+        k += samples.start
+        at = (k,) if values.ndim == 1 else (k, place)
+        phase = result.phases[result.phase.item(k)].name
+        return Extreme(values.item(at), result.time.item(k), quantity.who(*at), phase)
 
     # -- between samples ------------------------------------------------------------------------------
 
@@ -176,17 +176,19 @@ class Measurements:
         """The recorded extreme of a phase in continuous time; None if the record has none."""
         phase = self.result.phases[index]
         x = phase.extremes.get(name)
-        if x is None:
-            return None
-        if name in ("separation", "separation_below", "lost"):
+        return None if x is None else self.recorded(name, x, phase.name)
+
+    def recorded(self, name: str, x: Extremum, phase: str) -> Extreme:
+        """An extreme of a phase, as it was recorded."""
+        if name in _OF_PAIRS:
             who = agent_names(sorted((x.who, x.other)))
-        elif name in ("tension", "constraint"):
+        elif name in _OF_EDGES:
             who = f"edge {x.who + 1}-{x.other + 1}"
         elif name.startswith("clearance"):
             who = self.beside(x.who, x.other)
         else:
-            who = self.agent(0, x.who)
-        return Extreme(abs(x.value) if name == "constraint" else x.value, x.time, who, phase.name)
+            who = f"agent {x.who + 1}"
+        return Extreme(abs(x.value) if name == "constraint" else x.value, x.time, who, phase)
 
     def worst(
         self, name: str, sampled: Extreme | None, sense: Callable[..., Any] = lambda x: x
@@ -202,18 +204,20 @@ class Measurements:
             return sampled or between
         return between if sense(between.value) > sense(sampled.value) else sampled
 
-    def worst_of(self, index: int) -> dict[str, Extreme]:
-        """The worst values of a phase, at its samples or between them, by name."""
-        extremes, samples, found = self.result.phases[index].extremes, self.samples[index], {}
+    @cached_property
+    def worst_of(self) -> list[dict[str, Extreme]]:
+        """The worst values of each phase, at its samples or between them, by name."""
+        found: list[dict[str, Extreme]] = [{} for _ in self.samples]
         for name, quantity in self.measured.items():
-            x, rank = extremes.get(name), self.rank[name][index]
-            worst = None
-            if x is not None and rank < SENSE[name](x.value):
-                worst = self.between(name, index)
-            elif rank != -math.inf:
-                worst = self.worst_sample(quantity, samples)
-            if worst is not None:
-                found[name] = worst
+            sense, ranks = SENSE[name], self.rank[name]
+            for k, phase in enumerate(self.result.phases):
+                x, rank, worst = phase.extremes.get(name), ranks[k], None
+                if x is not None and rank < sense(x.value):
+                    worst = self.recorded(name, x, phase.name)
+                elif rank != -math.inf:
+                    worst = self.worst_sample(quantity, self.samples[k])
+                if worst is not None:
+                    found[k][name] = worst
         return found
 
     def greatest(self, order: int, size: Callable[[Floats], Floats]) -> Extreme | None:
@@ -334,8 +338,12 @@ class Measurements:
     def contradictions(self) -> Iterator[tuple[str, float]]:
         """Values of the record that disagree with its own positions and forces: in words, and when [s]."""
         result, time = self.result, self.result.time
-        length = proximity.lengths(result.position, result.edges)
-        rounding = 1e-9 * (1.0 + float(np.nanmax(np.abs(result.position), initial=0.0)))
+        r = result.position
+        length = proximity.lengths(r, result.edges)
+        reach = float(max(r.max(initial=0.0), -r.min(initial=0.0)))
+        if math.isnan(reach):
+            reach = float(np.nanmax(np.abs(r), initial=0.0))
+        rounding = 1e-9 * (1.0 + reach)
         with np.errstate(invalid="ignore"):  # infinity where there is nothing to be near
             stored = {
                 "separation": (result.separation - self.close.separation, "m"),
@@ -357,12 +365,17 @@ class Measurements:
         for index, phase in enumerate(result.phases):
             samples, extremes = self.samples[index], phase.extremes
             if samples.stop > samples.start and extremes:
-                due = ["speed", "lowest", "highest"]
-                due += ["thrust"] if self.rank["thrust"][index] > -math.inf else []
-                due += ["separation"] if self._several(samples.start) else []
-                due += ["clearance"] if _meets(there, phase) else []
-                due += ["geofence"] if fenced else []
-                if lacking := [name for name in due if name not in extremes]:
+                due = {
+                    "speed": True,
+                    "lowest": True,
+                    "highest": True,
+                    "thrust": self.rank["thrust"][index] > -math.inf,
+                    "separation": np.count_nonzero(self.left[samples.start]) > 1,
+                    "clearance": _meets(there, phase),
+                    "geofence": fenced,
+                }
+                lacking = [name for name, needed in due.items() if needed and name not in extremes]
+                if lacking:
                     words = (
                         f"it lacks the worst '{lacking[0]}' of phase '{phase.name}' between samples"
                     )
@@ -382,10 +395,6 @@ class Measurements:
                     )
                     words += f" {value(x.value)} at {x.time:.2f} s, but a sample shows {value(sampled.value)}"
                     yield words, sampled.when
-
-    def _several(self, k: int) -> bool:
-        """Whether at sample k several agents are left."""
-        return int(self.left[k].sum()) > 1
 
     def phase(self, index: int, record: PhaseRecord) -> PhaseVerdict:
         """Numbers of a phase."""
@@ -407,11 +416,11 @@ class Measurements:
             distances=self.distances.get(index),
             shape=None if fit is None else fit.error,
             handedness=None if fit is None or fit.dimension < 3 else not fit.mirrored,
-            flip=None if fit is None else self.flip(fit, record, index),
+            flip=self.flips.get(index),
             order=None if fit is None else fit.in_order,
             waypoint=self.waypoints.get(index) if finished else None,
             through=tuple(self.passed(index)),
-            worst=self.worst_of(index),
+            worst=self.worst_of[index],
         )
 
     @cached_property
@@ -481,23 +490,28 @@ class Measurements:
                 fits[index] = Fit(p, slots, left, laid, k)
         return fits
 
-    def flip(self, fit: Fit, record: PhaseRecord, index: int) -> float | None:
-        """Angle [deg] of a line or plane from its intended direction at the end of a phase; None if there is none."""
-        # A commanded attitude decides; without one, the integrated frame says how a plane should lie.
-        references = self._directions[index]
-        if fit.dimension == 1 and record.control == "tracking":
-            # Only tracked slots steer a line; otherwise its direction follows from the shape before.
-            references = references[:1]
-        elif fit.dimension != 2:
-            return None
-        return next((a for T in references if math.isfinite(a := fit.angle_from(T))), None)
-
     @cached_property
-    def _directions(self) -> dict[int, Floats]:
-        """Commanded attitude and integrated frame (2, 3, 3) at the last sample of each phase."""
-        result = self.result
-        T = att.dcm_from_quaternion([result.attitude_reference[self.last], result.frame[self.last]])
-        return dict(zip(self.flown, T.swapaxes(0, 1), strict=True))
+    def flips(self) -> dict[int, float]:
+        """Angle [deg] of a line or plane from its intended direction at the end of each phase that has one."""
+        flat = {k: fit for k, fit in self.fits.items() if fit.dimension in (1, 2)}
+        if not flat:
+            return {}
+        # A commanded attitude decides; without one, the integrated frame says how a plane should lie.
+        last = [self.samples[k].stop - 1 for k in flat]
+        q = np.array([self.result.attitude_reference[last], self.result.frame[last]])
+        axes = np.array([fit.axis for fit in flat.values()])
+        aims = (att.dcm_from_quaternion(q).swapaxes(2, 3) @ axes[..., None])[..., 0]
+        found = {}
+        for i, (k, fit) in enumerate(flat.items()):
+            some = aims[:, i].tolist()
+            if fit.dimension == 1:
+                # Only tracked slots steer a line; otherwise its direction follows from the shape before.
+                some = some[:1] if self.result.phases[k].control == "tracking" else []
+            angles = (angle_between(fit.points, aim) for aim in some)
+            angle = next(filter(math.isfinite, angles), None)
+            if angle is not None:
+                found[k] = angle
+        return found
 
     def nearest(self, t: float, index: int) -> int:
         """The sample of a phase flown that is nearest to a time [s]; of two equally near the first."""

@@ -12,7 +12,6 @@ from rigidfleet.assessment.checks import abandoned
 from rigidfleet.assessment.fits import angle_between
 from rigidfleet.assessment.measure import Measurements
 from rigidfleet.assessment.outcome import DIP, FLIPPED, PhaseVerdict, value
-from rigidfleet.typing import Floats
 
 #: A speed [m/s] and an extent [m] from which units are doubted.
 _FAST, _WIDE = 100.0, 20_000.0
@@ -126,7 +125,7 @@ def _dips(measured: Measurements) -> Iterator[str]:
 
 def _turned_over(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[str]:
     """Note planar formations that turn over between phases while no attitude is commanded."""
-    seen: dict[str, tuple[Floats, float]] = {}
+    seen: dict[str, tuple[list[float], float]] = {}
     for i, p in enumerate(phases):
         fit = measured.fits.get(i)
         if fit is None or p.formation is None or fit.dimension != 2 or p.flip is not None:

@@ -70,12 +70,13 @@ class Verdict:
     @property
     def worst(self) -> dict[str, Extreme]:
         """Extremes of the whole flight, named as in `PhaseVerdict.worst`."""
-        found = {}
-        for name, sense in SENSE.items():
-            every = [phase.worst[name] for phase in self.phases if name in phase.worst]
-            if every:
-                found[name] = max(every, key=lambda e, sense=sense: sense(e.value))
-        return found
+        found: dict[str, tuple[float, Extreme]] = {}
+        for phase in self.phases:
+            for name, e in phase.worst.items():
+                rank = SENSE[name](e.value)
+                if name not in found or rank > found[name][0]:
+                    found[name] = rank, e
+        return {name: found[name][1] for name in SENSE if name in found}
 
     @property
     def summary(self) -> str:

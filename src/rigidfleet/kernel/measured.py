@@ -45,6 +45,7 @@ class Spectrum(NamedTuple):
     r: Floats  # (K, N, 3)
     edges: Ints  # (m, 2)
     u: Floats  # (m, 3) unit vectors
+    share: Floats  # (m, m) of two edges in J J^T: what their unit vectors' product counts; empty if m > 3N
     A: Floats  # (s, s), s the smaller of m and 3N
     work: Floats  # (3, s)
     least: Floats  # (K,) the smallest non-zero one
@@ -65,7 +66,8 @@ def measured(n: int, m: int, K: int, **given: Any) -> Measured:
 
 def spectrum_of(r: Floats, edges: Ints) -> Spectrum:
     """Arrays for the singular values of J with ``edges`` (m, 2) at positions r (K, N, 3)."""
-    size = min(len(edges), 3 * r.shape[1])
+    m, size = len(edges), min(len(edges), 3 * r.shape[1])
+    share = np.empty((m, m) if m == size else (0, 0))
     return Spectrum(
-        r, edges, np.empty((len(edges), 3)), np.empty((size, size)), np.empty((3, size)), np.empty(len(r))
+        r, edges, np.empty((m, 3)), share, np.empty((size, size)), np.empty((3, size)), np.empty(len(r))
     )  # fmt: skip

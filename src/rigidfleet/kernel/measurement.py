@@ -33,8 +33,11 @@ _ZERO = 1e-14
 
 
 @compiled
-def fit(B, K, V, w, q):
-    """Unit quaternion q (4,) of the rotation T that maximises tr(T B^T), B = sum m p x^T (3, 3)."""
+def fit(B, bound, K, V, w, q):
+    """Unit quaternion q (4,) of the rotation T that maximises tr(T B^T), B = sum m p x^T (3, 3).
+
+    ``bound`` is the maximum, or little more: sum m (p^2 + x^2) / 2 is, if the points nearly fit.
+    """
     trace = B[0, 0] + B[1, 1] + B[2, 2]
     a, b, c = B[1, 2] - B[2, 1], B[2, 0] - B[0, 2], B[0, 1] - B[1, 0]
     size = 0.0
@@ -53,7 +56,7 @@ def fit(B, K, V, w, q):
     )
     second, first = -2.0 * size, -8.0 * det
     last = determinant(K)
-    x = math.sqrt(3.0 * size)
+    x = min(math.sqrt(3.0 * size), bound)
     for _ in range(60):
         square = x * x
         value = (square + second) * square + first * x + last
@@ -281,13 +284,16 @@ def attitude_of(m, k, known, line_known, near, work, T):
         if line:
             quaternion_of(T, m.attitude[k])
             return True
+    bound = 0.0
     for a in range(3):
         for b in range(3):
             s = 0.0
             for i in range(n):
                 s += mass[i] * p[i, a] * x[i, b]
             B[a, b] = s
-    fit(B, K, V, w, m.attitude[k])
+        for i in range(n):
+            bound += 0.5 * mass[i] * (p[i, a] * p[i, a] + x[i, a] * x[i, a])
+    fit(B, bound, K, V, w, m.attitude[k])
     attitude_matrix(m.attitude[k], T)
     return False
 
@@ -424,8 +430,18 @@ def angular_momentum(m, k, mass, h):
 @compiled
 def spectrum(s):
     """The smallest non-zero singular value of the constraint Jacobian J, from the smaller of J J^T and J^T J."""
-    edges, u, A = s.edges, s.u, s.A
+    edges, u, A, share = s.edges, s.u, s.A, s.share
     m, n = edges.shape[0], s.r.shape[1]
+    for e in range(share.shape[0]):
+        i, j = edges[e, 0], edges[e, 1]
+        for o in range(e + 1):
+            a, b = edges[o, 0], edges[o, 1]
+            sign = 0.0
+            sign += 1.0 if i == a else 0.0
+            sign += 1.0 if j == b else 0.0
+            sign -= 1.0 if i == b else 0.0
+            sign -= 1.0 if j == a else 0.0
+            share[e, o] = sign
     for k in range(s.r.shape[0]):
         r = s.r[k]
         for e in range(m):
@@ -435,14 +451,8 @@ def spectrum(s):
             u[e, 0], u[e, 1], u[e, 2] = x * inverse, y * inverse, z * inverse
         if m <= 3 * n:
             for e in range(m):
-                i, j = edges[e, 0], edges[e, 1]
                 for o in range(e + 1):
-                    a, b = edges[o, 0], edges[o, 1]
-                    sign = 0.0
-                    sign += 1.0 if i == a else 0.0
-                    sign += 1.0 if j == b else 0.0
-                    sign -= 1.0 if i == b else 0.0
-                    sign -= 1.0 if j == a else 0.0
+                    sign = share[e, o]
                     if sign != 0.0:
                         sign *= u[e, 0] * u[o, 0] + u[e, 1] * u[o, 1] + u[e, 2] * u[o, 2]
                     A[e, o] = sign

@@ -16,15 +16,15 @@ def copy(a, out):
 
 
 @compiled
-def record(times, samples, p, w, dy, out):
-    """Evaluate the closed loop at the sampled states, and record its forces and references.
+def record(times, samples, p, w, dy, out, first):
+    """Evaluate the closed loop at the sampled states, and record its forces and references from row ``first`` on.
 
     Without rows in ``out``, the only result is what the last evaluation leaves in the workspace.
     """
     for k in range(times.shape[0]):
         closed_loop(times[k], samples[k], dy, p, w)
-        if k < out.r.shape[0]:
-            record_sample(times[k], p, w, k, out)
+        if first + k < out.r.shape[0]:
+            record_sample(times[k], p, w, first + k, out)
 
 
 @compiled

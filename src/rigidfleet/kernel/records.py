@@ -4,7 +4,6 @@ K samples, N agents, m edges.
 """
 
 import math
-from itertools import accumulate
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
@@ -186,6 +185,7 @@ class Segment(NamedTuple):
     times: Floats  # (K,) [s], increasing
     samples: Floats  # (K, n) states at these times: written by the integrator, read by the recorder
     dy: Floats  # (n,) the recorder's derivative
+    first: int = 0  # the recorder's first row
 
 
 class Record(NamedTuple):
@@ -213,24 +213,17 @@ class Record(NamedTuple):
     f_D: PlacesInTime
 
 
-def recorder(k: int, n: int, m: int) -> Record:
-    """Allocate a record of ``k`` samples."""
-    agent, edge = (k, n, 3), (k, m)
-    shapes = *(agent,) * 7, *(edge,) * 5, agent, (k, 6), (k, 3), (k, 3, 3), (k, 6), *(agent,) * 3
-    sizes = (
-        *(3 * k * n,) * 7,
-        *(k * m,) * 5,
-        3 * k * n,
-        6 * k,
-        3 * k,
-        9 * k,
-        6 * k,
-        *(3 * k * n,) * 3,
-    )
-    memory = np.empty(sum(sizes))
-    memory.fill(np.nan)
-    parts = zip(accumulate(sizes), sizes, shapes, strict=True)
-    return Record(*[memory[end - size : end].reshape(shape) for end, size, shape in parts])
+def recorder(k: int, n: int, m: int, *, disturbed: bool = True) -> Record:
+    """Allocate a record of ``k`` samples, NaN where the kernel does not write in every phase.
+
+    Unless ``disturbed``, there are no rows of what disturbances alone give.
+    """
+    agent, edge, given = (k, n, 3), (k, m), (k if disturbed else 0, n, 3)
+    shapes = *(agent,) * 7, *(edge,) * 5, agent, (k, 6), (k, 3), (k, 3, 3), (k, 6), *(given,) * 3
+    out = Record._make([np.empty(shape) for shape in shapes])
+    for values in (out.r_ref, out.motion, out.rates, out.T_ref, out.r_seen, out.v_seen, out.f_D):
+        values.fill(np.nan)
+    return out
 
 
 class Recursion(NamedTuple):

@@ -73,8 +73,7 @@ def separation(r: Floats, radius: ArrayLike) -> tuple[Floats, Ints]:
         d -= x.take(i[part], axis=1)
         apart = root_of_squares(d)
         apart -= (radius[i] + radius[j])[part, None]
-        at = apart.argmin(axis=0)
-        value = apart[at, samples]
+        at, value = apart.argmin(axis=0), apart.min(axis=0)
         if np.isnan(value).any():  # of agents without a position
             at = np.where(np.isnan(apart), np.inf, apart).argmin(axis=0)
             value = apart[at, samples]
@@ -238,7 +237,7 @@ def least_clearance(clearance: Floats, nearest: Ints) -> tuple[Floats, Ints, Int
     rows, samples = np.ascontiguousarray(clearance.T), np.arange(len(clearance))
     agent = rows.argmin(axis=0)
     obstacle = nearest[samples, agent]
-    return rows[agent, samples], np.where(obstacle < 0, -1, agent), obstacle
+    return rows.min(axis=0), np.where(obstacle < 0, -1, agent), obstacle
 
 
 def separation_of_left(r: Floats, radius: ArrayLike, left: Bools) -> tuple[Floats, Ints]:

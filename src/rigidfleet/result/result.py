@@ -469,7 +469,10 @@ class Result:
     @cached_property
     def left(self) -> Bools:
         """Mask (K, N) of the agents that are not lost at the time of each sample."""
-        return self.time[:, None] <= self.mission.lost_at
+        lost_at = self.mission.lost_at
+        if self.time[-1] <= lost_at.min():
+            return np.ones((len(self.time), len(lost_at)), dtype=np.bool_)
+        return self.time[:, None] <= lost_at
 
     @property
     def interpolation(self) -> str | None:

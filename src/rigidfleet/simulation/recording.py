@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
@@ -97,14 +97,21 @@ class Unevaluated(NamedTuple):
         r_cm, v_cm = (x[:, None] for x in cm)
         return r_cm + r @ T, v_cm + v @ T
 
-    def evaluated(self, times: Floats, work: Workspace, out: Record | None = None) -> Record:
-        """Forces and references at the samples, times (K,) [s], into the rows ``out`` if given."""
-        out = native.record(self.problem, work, times, self.y, out)
+    def evaluated(self, times: Floats, work: Workspace) -> Record:
+        """Forces and references at the samples, times (K,) [s]."""
+        out = recorder(len(times), len(self.problem.vehicles.m), len(self.problem.graph.edges))
+        self.evaluate_into(native.pack(out), 0, times, work, native.packed(self.problem))
+        return out
+
+    def evaluate_into(
+        self, out: native.Packed, first: int, times: Floats, work: Workspace, problem: native.Packed
+    ) -> None:
+        """Write them into a record from row ``first`` on; it and the ``problem`` as flown are packed."""
+        native.record_into(out, first, problem, work, times, self.y)
         if self.problem is not self.planned:
             of_phase = native.record(self.planned, work, times, self.y)
             for name in _REFERENCES:
-                getattr(out, name)[:] = getattr(of_phase, name)
-        return out
+                getattr(out.of, name)[first : first + len(times)] = getattr(of_phase, name)
 
 
 @dataclass
@@ -121,6 +128,12 @@ class Piece:
     led: Led  # what the slots follow, if they are tracked
     vehicles: VehicleSamples | None = None
     layers: LayerSamples | None = None
+    #: The problem as flown, packed while it is at hand; None of a large formation, and where nothing is left to do.
+    _problem: native.Packed | None = field(init=False, default=None)
+
+    def __post_init__(self) -> None:
+        if isinstance(self.given, Unevaluated) and self.given.setup is None:
+            self._problem = native.packed(self.given.problem)
 
     @cached_property
     def record(self) -> Record:
@@ -129,27 +142,29 @@ class Piece:
             return self.given
         n = len(self.given.problem.vehicles.m)
         out = recorder(len(self.time), n, len(self.edges))
-        self.record_into(out)
+        self.record_into(native.pack(out), 0)
         return out
 
-    def record_into(self, out: Record) -> None:
-        """Write forces and references, of the edges of this phase, into rows of a record."""
+    def record_into(self, out: native.Packed, first: int) -> None:
+        """Write forces and references, of the edges of this phase, into a packed record from row ``first`` on."""
         given = self.given
         if not isinstance(given, Unevaluated):
-            for rows, values in zip(out, given, strict=True):
-                rows[:] = values
-        elif given.setup is None:
-            work = small_workspace(given.planned)
-            given.evaluated(self.time, work, out)
-            give_back(given.planned, work)
-        else:
+            for rows, values in zip(out.of, given, strict=True):
+                if len(rows):
+                    rows[first : first + len(values)] = values
+        elif given.setup is not None:
             solver = large_solver(given.planned, given.setup)
             planned = solved_by(solver, given.planned)
             own = given.problem is given.planned
             problem = planned if own else solved_by(solver, given.problem)
-            found = given._replace(problem=problem, planned=planned)
-            found.evaluated(self.time, solver.workspace, out)
+            found, words = given._replace(problem=problem, planned=planned), native.packed(problem)
+            found.evaluate_into(out, first, self.time, solver.workspace, words)
             solver.check()
+        else:
+            assert self._problem is not None
+            work = small_workspace(given.planned)
+            given.evaluate_into(out, first, self.time, work, self._problem)
+            give_back(given.planned, work)
 
 
 def assemble(
@@ -237,7 +252,9 @@ def _recorded(
     mission: Mission, pieces: Sequence[Piece], time: Floats, flown: VehicleSamples | None
 ) -> dict[str, Any]:
     """Forces and references at all samples, and what is measured of them."""
-    record = _record(pieces, mission.n_agents, mission.edges)
+    d = mission.disturbances
+    disturbed = flown is not None or d is not None
+    record = _record(pieces, mission.n_agents, mission.edges, disturbed=disturbed)
     found = _measured(mission, pieces, time, record)
     thrust, motion, r_ref = found.thrust, record.motion, record.r_ref
     if flown is not None:
@@ -246,7 +263,7 @@ def _recorded(
             thrust = np.minimum(thrust, mission.agents.thrust_limit)
     if (left := _left(mission, time)) is not None:
         r_ref = np.where(left[:, :, None], r_ref, np.nan)
-    constraint, d = record.c, mission.disturbances
+    constraint = record.c
     if d is not None and d.noise is not None:
         constraint = found.distance - record.d
     return {
@@ -417,21 +434,24 @@ def _measured(mission: Mission, pieces: Sequence[Piece], time: Floats, record: R
     return found
 
 
-def _record(pieces: Sequence[Piece], n: int, edges: Ints) -> Record:
+def _record(pieces: Sequence[Piece], n: int, edges: Ints, *, disturbed: bool) -> Record:
     """Forces and references at all samples, of the pieces one after the other; NaN while an edge is not active."""
-    out, end = recorder(sum(len(p.time) for p in pieces), n, len(edges)), 0
+    count, end = sum(len(p.time) for p in pieces), 0
+    out = recorder(count, n, len(edges), disturbed=disturbed)
+    whole = native.pack(out)
     for piece in pieces:
         begin, end = end, end + len(piece.time)
-        rows = Record._make([x[begin:end] for x in out])
         places = _columns(piece.edges, edges)
         if isinstance(places, slice):
-            piece.record_into(rows)
+            piece.record_into(whole, begin)
             continue
-        size = len(piece.time), len(piece.edges)
-        own = rows._replace(**{name: np.empty(size) for name in _EDGEWISE})
-        piece.record_into(own)
+        size = count, len(piece.edges)
+        own = out._replace(**{name: np.empty(size) for name in _EDGEWISE})
+        piece.record_into(native.pack(own), begin)
         for name in _EDGEWISE:
-            getattr(rows, name)[:, places] = getattr(own, name)
+            rows = getattr(out, name)[begin:end]
+            rows.fill(np.nan)
+            rows[:, places] = getattr(own, name)[begin:end]
     return out
 
 

@@ -59,7 +59,9 @@ def machine_code(second: "subprocess.Popen[bytes] | None" = None) -> list[bytes]
 
     def record_segment(p, w, s, out):
         call = segment(s)
-        recorder.record(call.times, call.samples, problem(p), workspace(w), call.dy, record(out))
+        recorder.record(
+            call.times, call.samples, problem(p), workspace(w), call.dy, record(out), call.first
+        )
         return 0
 
     keep_extents()

@@ -96,19 +96,19 @@ def _integrator(problem: Problem, workspace: Workspace) -> Any:
     return code.integrate_three if sizes == (3, 3, 3, 3) else code.integrate
 
 
-def record(
-    problem: Problem,
-    workspace: Workspace,
-    times: Floats,
-    samples: Floats,
-    out: Record | None = None,
-) -> Record:
-    """Forces and references at states ``samples`` (K, n) at ``times`` (K,) [s], into the rows ``out`` if given."""
-    if out is None:
-        out = recorder(len(times), len(problem.vehicles.m), len(problem.graph.edges))
-    segment = Segment(0.0, False, 0, times, samples, np.empty(samples.shape[1]))
-    _call(_code().record, packed(problem), packed(workspace), pack(segment), pack(out))
+def record(problem: Problem, workspace: Workspace, times: Floats, samples: Floats) -> Record:
+    """Forces and references at states ``samples`` (K, n) at ``times`` (K,) [s]."""
+    out = recorder(len(times), len(problem.vehicles.m), len(problem.graph.edges))
+    record_into(pack(out), 0, packed(problem), workspace, times, samples)
     return out
+
+
+def record_into(
+    out: Packed, first: int, problem: Packed, workspace: Workspace, times: Floats, samples: Floats
+) -> None:
+    """`record` into a `Record` from row ``first`` on; it and the problem are packed."""
+    segment = Segment(0.0, False, 0, times, samples, np.empty(samples.shape[1]), first)
+    _call(_code().record, problem, packed(workspace), pack(segment), out)
 
 
 class Watch:

@@ -51,6 +51,10 @@ class Packed(NamedTuple):
     words: ctypes.Array[ctypes.c_int64]
     address: int
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """A copy has words of its own: the arrays of the tuple lie elsewhere."""
+        return pack, (self.of,)
+
 
 #: The compiled function `rigidfleet.kernel.compiler.gathering.gather`, once it is loaded, and what keeps its code.
 _gather: list[Any] = []
