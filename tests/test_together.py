@@ -56,7 +56,9 @@ def alone(missions: list[Mission]) -> list[Result]:
     ("name", "change", "close", "force"),
     [("narrow-passage", folding, 2e-7, 1e-5), ("windy-passage", windy, 4e-6, 2e-3)],
 )
-def test_flights_side_by_side_are_those_flown_alone(name: str, change: Any, close: float, force: float):
+def test_flights_side_by_side_are_those_flown_alone(
+    name: str, change: Any, close: float, force: float
+):
     """Places, forces, references and extremes agree to what the tolerances of both leave open."""
     missions = varied(name, change)
     for one, other in zip(simulate_together(missions), alone(missions), strict=True):
@@ -145,7 +147,8 @@ def test_a_flight_that_fails_takes_nobody_along():
     """Where the law is singular for one, all are flown alone, bit for bit."""
     missions = [load_mission("line-singular")] + [
         Mission.from_dict(
-            load_mission("line-singular").to_dict() | {"constraint": {"solver": "exact", "alpha": 0.5 + 0.01 * k}}
+            load_mission("line-singular").to_dict()
+            | {"constraint": {"solver": "exact", "alpha": 0.5 + 0.01 * k}}
         )
         for k in range(3)
     ]
@@ -176,7 +179,13 @@ def kernel(p: Problem, y: np.ndarray, t: float) -> tuple[np.ndarray, np.ndarray]
 
 @pytest.mark.parametrize(
     ("name", "phase"),
-    [("windy-passage", 0), ("windy-passage", 2), ("narrow-passage", 6), ("cube-passage", 2), ("cube-passage", 6)],
+    [
+        ("windy-passage", 0),
+        ("windy-passage", 2),
+        ("narrow-passage", 6),
+        ("cube-passage", 2),
+        ("cube-passage", 6),
+    ],
 )
 def test_the_code_of_eight_problems_is_the_kernel(name: str, phase: int):
     """Derivatives and forces of random states: tracked slots that move, turn and blend, in noise, gusts and drag."""
@@ -209,7 +218,9 @@ def test_the_code_of_eight_problems_is_the_kernel(name: str, phase: int):
         n = len(problems[0].vehicles.m)
         for lane, p in enumerate(problems):
             expected, forces = kernel(p, y[lane], t)
-            np.testing.assert_allclose(unpack(dy)[3 * n :, lane], expected[3 * n :], rtol=1e-9, atol=1e-9)
+            np.testing.assert_allclose(
+                unpack(dy)[3 * n :, lane], expected[3 * n :], rtol=1e-9, atol=1e-9
+            )
             np.testing.assert_allclose(unpack(ready.gauge)[:, lane], forces, rtol=1e-9, atol=1e-9)
 
 

@@ -39,7 +39,9 @@ class _Sparing(axis.Axis):
         try:
             yield
         finally:
-            vars(self).pop("minorTicks", None)  # it is made when it is asked for, as it is to be by then
+            vars(self).pop(
+                "minorTicks", None
+            )  # it is made when it is asked for, as it is to be by then
 
     def set_clip_path(self, path: Any, transform: Any = None) -> None:
         """Clip what is drawn to a path."""

@@ -375,9 +375,7 @@ class Flight:
         if duration is not None and not duration > 0.0:
             raise ValueError(f"the duration must be positive [s], not {duration!r}")
         plan = active.plan
-        active.stop = min(
-            math.inf if duration is None else active.t + duration, self._loss_ahead()
-        )
+        active.stop = min(math.inf if duration is None else active.t + duration, self._loss_ahead())
         t_end, settle = min(active.stop, plan.t_end), plan.phase.settle
         try:
             if settle is None:

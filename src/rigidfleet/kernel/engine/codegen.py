@@ -93,7 +93,9 @@ def unrolled_together(problems: Sequence[Problem], tables: Tables) -> UnrolledPr
         The problems have branches that depend on the state, or take different ones.
     """
     first, values = problems[0], numbers(problems)
-    ready = _prepared(first, flight_structure(first, values), values, lambda: FlightTrace(first, values))
+    ready = _prepared(
+        first, flight_structure(first, values), values, lambda: FlightTrace(first, values)
+    )
     before = interleaved([p.reference.d0 for p in problems])
     motion = interleaved([p.motion.coefficients for p in problems])
     return ready._replace(
@@ -120,7 +122,11 @@ def tables(given: Sequence[Disturbance]) -> Tables:
         return interleaved(parts).reshape(rows, 3 * agents)
 
     return Tables(
-        given[0].gust_step, packed("gust"), given[0].noise_step, packed("noise_r"), packed("noise_v")
+        given[0].gust_step,
+        packed("gust"),
+        given[0].noise_step,
+        packed("noise_r"),
+        packed("noise_v"),
     )
 
 
@@ -146,7 +152,10 @@ def _prepared(
         code = Code(trace())
         _KNOWN[name] = code, _compile(code, name), _compile_before(code, name)
     code, address, before = _KNOWN[name]
-    uniform, given = simd.empty((len(code.inputs),)), simd.pack(np.broadcast_to(values, (len(values), WIDTH)))
+    uniform, given = (
+        simd.empty((len(code.inputs),)),
+        simd.pack(np.broadcast_to(values, (len(values), WIDTH))),
+    )
     before(given.ctypes.data, uniform.ctypes.data)
     edges, reference = len(problem.graph.edges), problem.reference
     none = simd.empty((0, 1))
@@ -164,7 +173,9 @@ _KNOWN: dict[str, tuple[Code, int, Callable[[int, int], None]]] = {}
 
 
 @intrinsic
-def _call_code(_context, address, y, dy, gauge, uniform, before, time, motion, gust, noise_r, noise_v):
+def _call_code(
+    _context, address, y, dy, gauge, uniform, before, time, motion, gust, noise_r, noise_v
+):
     """Call straight-line code with the data of arrays."""
 
     def generate(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
@@ -191,7 +202,9 @@ def _closed_loop(t, y, dy, p, w):
     if p.gust.shape[0] > 0:
         gust, time[4], time[5], time[6], time[7] = spline_weights(t, p.gust_step, p.gust.shape[0])
     if p.noise_r.shape[0] > 0:
-        noise, time[8], time[9], time[10], time[11] = spline_weights(t, p.noise_step, p.noise_r.shape[0])
+        noise, time[8], time[9], time[10], time[11] = spline_weights(
+            t, p.noise_step, p.noise_r.shape[0]
+        )
     _call_code(
         p.address, y, dy, p.gauge, p.uniform, p.before, time, p.motion[piece:], p.gust[gust:], p.noise_r[noise:],
         p.noise_v[noise:],
@@ -258,9 +271,7 @@ def _compile_before(code: Code, name: str) -> Callable[[int, int], None]:
 
         return types.void(given, uniform), generate
 
-    address = compiled_for_c(
-        _before, f"before_{name}", arguments=2, _numbers_before=numbers_before
-    )
+    address = compiled_for_c(_before, f"before_{name}", arguments=2, _numbers_before=numbers_before)
     return ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)(address)
 
 
@@ -271,7 +282,9 @@ def _element(builder: ir.IRBuilder, array: ir.Value, index: int) -> ir.Value:
 
 
 def _valued(
-    builder: ir.IRBuilder, load: Callable[[ir.IRBuilder, Symbol], ir.Value], known: Sequence[Symbol] = ()
+    builder: ir.IRBuilder,
+    load: Callable[[ir.IRBuilder, Symbol], ir.Value],
+    known: Sequence[Symbol] = (),
 ) -> Callable[[Symbol | float], ir.Value]:
     """A function that returns the value of a symbol whose arguments it has returned before.
 

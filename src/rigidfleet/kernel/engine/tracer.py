@@ -373,9 +373,7 @@ def flight_structure(problem: Problem, values: Floats) -> bytes:
     """
     graph, law, control, given = problem.graph, problem.law, problem.control, problem.disturbance
     ends = np.cumsum([np.size(x) for x in _numbers_of(problem)])[-len(_MAY_BE_ZERO) - 1 :]
-    of = {
-        name: values[ends[k] : ends[k + 1]].any(axis=0) for k, name in enumerate(_MAY_BE_ZERO)
-    }
+    of = {name: values[ends[k] : ends[k + 1]].any(axis=0) for k, name in enumerate(_MAY_BE_ZERO)}
     if len(set(of["law.k_def"].tolist())) > 1:
         raise UnfitError("problems that take different branches")
     kinds = law.solver, law.iterations, problem.reference.kind, control.kind, given.active
@@ -383,7 +381,9 @@ def flight_structure(problem: Problem, values: Floats) -> bytes:
     there = [bool(x.any()) for x in of.values()]
     pairs = graph.edges.tolist(), graph.pairs.tolist()
     saturates = bool(problem.vehicles.saturate)
-    return repr(("flight", len(problem.vehicles.m), pairs, kinds, tables, saturates, there)).encode()
+    return repr(
+        ("flight", len(problem.vehicles.m), pairs, kinds, tables, saturates, there)
+    ).encode()
 
 
 class Code:
