@@ -19,7 +19,7 @@ from rigidfleet.simulation.active_phase import ActivePhase
 from rigidfleet.simulation.flight import Flight, simulate
 
 if TYPE_CHECKING:
-    from rigidfleet.kernel.engine.codegen import Tables  # imports the compiler
+    from rigidfleet.kernel.engine.batch import Vector  # imports the compiler
 
 T = TypeVar("T")
 
@@ -42,18 +42,15 @@ def simulate_together(missions: Sequence[Mission]) -> list[Result]:
     if len({mission.output_step for mission in missions}) > 1:
         return [simulate(mission) for mission in missions]
     flights = [Flight(mission) for mission in missions]
-    given: Tables | None = None
+    vector: Vector | None = None
     while True:
         going = [flight.begin() for flight in flights]
         if not any(going):
             return [flight.finish() for flight in flights]
         active = [flight.under_way() for flight, goes in zip(flights, going, strict=True) if goes]
         if all(going) and _alike(active):
-            from rigidfleet.kernel.engine import codegen
-
-            whole = _filled([phase.plan.problem.disturbance for phase in active])
-            given = given or codegen.tables(whole)
-            if not _fly(active, given):
+            vector = vector or _vector(active)
+            if not _fly(active, vector):
                 return [simulate(mission) for mission in missions]
             for flight in flights:
                 flight.arrive()
@@ -93,20 +90,27 @@ def _times(phase: ActivePhase) -> tuple[object, ...]:
     return plan.start, plan.t_end, plan.arrival, points, plan.integrator.rtol, len(phase.state.y)
 
 
-def _fly(active: Sequence[ActivePhase], given: Tables) -> bool:
+def _vector(active: Sequence[ActivePhase]) -> Vector:
+    """A vector for flights whose first phases these are."""
+    from rigidfleet.kernel.engine import batch, codegen
+
+    return batch.Vector(
+        codegen.tables(_filled([phase.plan.problem.disturbance for phase in active]))
+    )
+
+
+def _fly(active: Sequence[ActivePhase], vector: Vector) -> bool:
     """Fly phases to their end in common steps and record them; return whether they came there."""
-    from rigidfleet.kernel.engine import batch
     from rigidfleet.kernel.engine.tracer import UnfitError
 
     t_end = active[0].plan.t_end
     times = active[0].times(t_end)
     stretches = [phase.prepare(phase.plan.problem, times) for phase in active]
     try:
-        vector = batch.Vector(
+        vector.begin(
             _filled([stretch.problem for stretch in stretches]),
             _filled([phase.state for phase in active]),
             _filled([phase.extremes.monitor.monitor for phase in active]),
-            given,
             times,
             _filled([stretch.samples for stretch in stretches]),
         )

@@ -1,4 +1,4 @@
-"""Eight flights per SIMD vector: many flights of one problem, over all cores, or eight flights of missions that vary."""
+"""Eight flights per SIMD vector: many flights of one problem, over all cores, or flights of eight missions."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from rigidfleet.kernel.engine import lane_bounds, lane_steps, native
 from rigidfleet.kernel.engine.codegen import (
     Tables,
     integrate,
-    interleaved,
+    packed,
     unrolled,
     unrolled_together,
 )
@@ -39,6 +39,7 @@ from rigidfleet.kernel.records import (
     NO_TRAIL,
     IntegratorState,
     Monitor,
+    Trail,
     integrator,
 )
 from rigidfleet.typing import Bools, Floats, Ints
@@ -159,53 +160,78 @@ def _tables(given: Disturbance) -> tuple[object, ...]:
 
 
 class Vector:
-    """Eight flights in the lanes of a vector, integrated in common steps.
+    """Eight flights in the lanes of a vector, integrated in common steps, phase by phase.
 
     Parameters
     ----------
-    problems : of eight flights, which `fit_together`
-    states : (8,) of their integrators, at one time; their trails have the same number of rows
-    monitors : of their extremes, for the same pairs; steps that need not be searched are marked
-    given : tables of their disturbances
-    times, samples : times (K,) [s] to record, and an array (K, n) for each flight
-
-    Raises
-    ------
-    UnfitError
-        The problems take different branches.
+    given : tables of the flights' disturbances
     """
 
-    def __init__(
+    def __init__(self, given: Tables) -> None:
+        self._given = given
+        self._trails: list[Trail] = []
+
+    def begin(
         self,
         problems: Sequence[Problem],
         states: Sequence[IntegratorState],
         monitors: Sequence[Monitor],
-        given: Tables,
         times: Floats,
         samples: Sequence[Floats],
     ) -> None:
-        self._states, self._samples, self._times = states, samples, times
-        self._monitors = monitors
-        trails, n = [state.trail for state in states], len(states[0].y)
-        self._problem = unrolled_together(_alike(problems), given)._replace(
-            points=empty((5, n)), bounds=empty((len(trails[0].clock), lane_bounds.COLUMNS)),
-            radius=interleaved([x.radius for x in monitors]), pairs=monitors[0].pairs,
-            boxes=interleaved([x.boxes for x in monitors]).reshape(-1, 6),
-            limit=interleaved([np.minimum(p.vehicles.thrust_limit, _NO_LIMIT) for p in problems]),
-            forces=empty((2, len(trails[0].start))),
-        )  # fmt: skip
-        kept = [
-            [t.points for t in trails], [t.gauge for t in trails], [t.start for t in trails], samples,
-            [t.clock for t in trails],
-        ]  # fmt: skip
-        self._problem.kept[:] = [[x.ctypes.data for x in row] for row in kept]
-        K = pack(np.zeros((lane_steps.ROWS, n, WIDTH)))
-        K[lane_steps.ATOL] = interleaved([state.K[ATOL, :n] for state in states])
-        clock = np.array([states[0].clock[0], _FIRST_STEP_IN_VECTORS, LEAST_ERROR])
-        trail = NO_TRAIL._replace(clock=trails[0].clock)  # for its length
-        y, counts = interleaved([state.y for state in states]), np.zeros(6, dtype=np.int64)
-        self._state = IntegratorState(y, K, clock, counts, states[0].rtol, trail)
+        """Begin a phase.
+
+        Parameters
+        ----------
+        problems : of eight flights, which `fit_together`
+        states : of their integrators, at one time; their trails have the same number of rows
+        monitors : of their extremes, for the same pairs; steps that need not be searched are marked in them
+        times, samples : times (K,) [s] to record, and an array (K, n) for each flight
+
+        Raises
+        ------
+        UnfitError
+            The problems take different branches.
+        """
+        self._states, self._monitors, self._times = states, monitors, times
+        if len(self._trails) != len(states) or any(
+            state.trail is not trail for state, trail in zip(states, self._trails, strict=True)
+        ):
+            self._allocate()
+        self._kept[3] = [x.ctypes.data for x in samples]
+        limits = [np.minimum(p.vehicles.thrust_limit, _NO_LIMIT) for p in problems]
+        ready = unrolled_together(_alike(problems), self._given)
+        self._problem = ready._replace(kept=self._kept, limit=packed(limits), **self._room)
+        first = states[0]
+        K, n = self._K, len(first.y)
+        unpack(K)[: lane_steps.STAGES] = 0.0
+        unpack(K)[lane_steps.ATOL] = np.stack([state.K[ATOL, :n] for state in states], axis=-1)
+        clock = np.array([first.clock[0], _FIRST_STEP_IN_VECTORS, LEAST_ERROR])
+        y, count = packed([state.y for state in states]), np.zeros_like(first.count)
+        self._state = IntegratorState(y, K, clock, count, first.rtol, self._length)
         self._fresh = True
+
+    def _allocate(self) -> None:
+        """Arrays for these trails and monitors, which are those of the phases to come, too."""
+        states, monitors = self._states, self._monitors
+        self._trails = trails = [state.trail for state in states]
+        n, rows, forces = len(states[0].y), len(trails[0].clock), len(trails[0].start)
+        arrays = [[getattr(t, name) for t in trails] for name in ("points", "gauge", "start")]
+        arrays += [arrays[0], [t.clock for t in trails]]  # the fourth is that of samples
+        self._kept = np.array([[x.ctypes.data for x in row] for row in arrays])
+        self._K, self._length = (
+            empty((lane_steps.ROWS, n)),
+            NO_TRAIL._replace(clock=trails[0].clock),
+        )
+        self._room: dict[str, Any] = {
+            "points": empty((5, n)),
+            "bounds": empty((rows, lane_bounds.COLUMNS)),
+            "forces": empty((2, forces)),
+            "moments": np.zeros(2),
+            "radius": packed([x.radius for x in monitors]),
+            "pairs": monitors[0].pairs,
+            "boxes": packed([x.boxes for x in monitors]),
+        }
 
     def __call__(self, t_end: float, max_steps: int) -> int:
         """Go on to ``t_end`` [s]; return what `dopri5.integrate` returns. States, trails and samples are then known."""
@@ -222,10 +248,9 @@ class Vector:
             own.clock[:], own.count[:] = state.clock, state.count
         rows = np.arange(before, state.count[4]) + state.count[5]
         if len(rows):
-            lane_bounds.mark_quiet(
-                self._problem.bounds, rows % len(state.trail.clock), self._monitors
-            )
-        return status
+            rows %= len(self._length.clock)
+            lane_bounds.mark_quiet(self._problem.bounds, rows, self._monitors)
+        return int(status)
 
 
 #: Thrust that stands for no limit [N].
@@ -285,7 +310,7 @@ def fly_all(
     count, n = starts.shape
     ready = unrolled(problem)
 
-    def packed(x: Floats) -> LaneArray:
+    def in_lanes(x: Floats) -> LaneArray:
         if count % WIDTH:  # unused lanes of the last vector repeat the last flight
             x = x[np.minimum(np.arange(padded(count)), count - 1)]
         return pack(x.reshape(len(x) // WIDTH, WIDTH, x.shape[1]).swapaxes(1, 2))
@@ -302,7 +327,7 @@ def fly_all(
 
         return work
 
-    found = _share(begin, packed(starts), packed(before), threads)
+    found = _share(begin, in_lanes(starts), in_lanes(before), threads)
     y = unpack(found.y).swapaxes(1, 2).reshape(-1, n)[:count]
     finished = np.repeat(found.finished, WIDTH)[:count]
     evaluations = np.repeat(found.evaluations, WIDTH)[:count]

@@ -96,11 +96,11 @@ def unrolled_together(problems: Sequence[Problem], tables: Tables) -> UnrolledPr
     ready = _prepared(
         first, flight_structure(first, values), values, lambda: FlightTrace(first, values)
     )
-    before = interleaved([p.reference.d0 for p in problems])
-    motion = interleaved([p.motion.coefficients for p in problems])
+    motion = interleaved([p.motion.coefficients for p in problems], (-1, 36))
     return ready._replace(
-        before=before, knots=first.motion.knots, motion=motion.reshape(-1, 36), **tables._asdict()
-    )
+        before=packed([p.reference.d0 for p in problems]), knots=first.motion.knots, motion=motion,
+        **tables._asdict(),
+    )  # fmt: skip
 
 
 class Tables(NamedTuple):
@@ -116,26 +116,28 @@ class Tables(NamedTuple):
 def tables(given: Sequence[Disturbance]) -> Tables:
     """The tables of the disturbances of eight flights."""
 
-    def packed(name: str) -> LaneArray:
+    def table(name: str) -> LaneArray:
         parts = [getattr(x, name) for x in given]
         rows, agents, _ = parts[0].shape
-        return interleaved(parts).reshape(rows, 3 * agents)
+        return interleaved(parts, (rows, 3 * agents))
 
     return Tables(
-        given[0].gust_step,
-        packed("gust"),
-        given[0].noise_step,
-        packed("noise_r"),
-        packed("noise_v"),
+        given[0].gust_step, table("gust"), given[0].noise_step, table("noise_r"), table("noise_v")
     )
 
 
-def interleaved(parts: Sequence[Floats]) -> LaneArray:
-    """Lanes of eight arrays of one shape (...), one after the other in C order."""
+def packed(parts: Sequence[Floats]) -> LaneArray:
+    """Lanes (...) of eight small arrays of one shape (...)."""
+    return simd.pack(np.stack(parts, axis=-1))
+
+
+def interleaved(parts: Sequence[Floats], shape: tuple[int, ...]) -> LaneArray:
+    """Lanes of eight large arrays, in C order, as an array of some shape."""
     parts = [np.ascontiguousarray(x) for x in parts]
     made = simd.empty((parts[0].size,))
     _interleave(np.array([x.ctypes.data for x in parts]), made)
-    return made
+    lanes: LaneArray = made.reshape(shape)
+    return lanes
 
 
 @compiled

@@ -286,22 +286,25 @@ class Trace:
         return rebuilt(function)
 
 
-#: Numbers in which the problems of eight flights may differ; those of the law, and the slots' turn, are left out of the
-#: code where they are zero in all.
-_OF_FLIGHT = (
-    "vehicles.m", "vehicles.inverse", "vehicles.M", "vehicles.mean", "vehicles.thrust_limit", "vehicles.g",
-    "graph.weight", "graph.diagonal", "reference.d0", "reference.d1", "reference.p0", "reference.dp",
-    "motion.T1", "control.force", "control.k1", "control.k2", "disturbance.m", "disturbance.inverse",
-    "disturbance.drag", "disturbance.wind",
-    "law.alpha", "law.beta", "law.gamma", "law.mu", "law.k_def", "reference.turn",
+#: Numbers in which the problems of eight flights may differ, and arrays of numbers; those of the law, and the slots'
+#: turn, are left out of the code where they are zero in all.
+_NUMBERS = (
+    "vehicles.M", "vehicles.mean", "vehicles.g", "control.k1", "control.k2", "law.alpha", "law.beta", "law.gamma",
+    "law.mu", "law.k_def",
 )  # fmt: skip
-_MAY_BE_ZERO = _OF_FLIGHT[-6:]
-_numbers_of = attrgetter(*_OF_FLIGHT)
+_ARRAYS = (
+    "vehicles.m", "vehicles.inverse", "vehicles.thrust_limit", "graph.weight", "graph.diagonal", "reference.d0",
+    "reference.d1", "reference.p0", "reference.dp", "motion.T1", "control.force", "disturbance.m",
+    "disturbance.inverse", "disturbance.drag", "disturbance.wind", "reference.turn",
+)  # fmt: skip
+_MAY_BE_ZERO = (*_NUMBERS[5:], "reference.turn")
+_numbers_of, _arrays_of = attrgetter(*_NUMBERS), attrgetter(*_ARRAYS)
 
 
 def numbers(problems: Iterable[Problem]) -> Floats:
     """The numbers (U, B) in which B problems of one graph may differ, in the order of `FlightTrace`."""
-    return np.stack([np.concatenate([np.ravel(x) for x in _numbers_of(p)]) for p in problems], -1)
+    rows = [np.concatenate([_numbers_of(p), *[x.ravel() for x in _arrays_of(p)]]) for p in problems]
+    return np.stack(rows, axis=-1)
 
 
 class FlightTrace(Trace):
@@ -331,7 +334,10 @@ class FlightTrace(Trace):
     def _with_symbols(self, problem: Problem) -> Problem:
         parts: dict[str, dict[str, Any]] = {}
         index = 0
-        for name, x in zip(_OF_FLIGHT, _numbers_of(problem), strict=True):
+        given = zip(
+            (*_NUMBERS, *_ARRAYS), (*_numbers_of(problem), *_arrays_of(problem)), strict=True
+        )
+        for name, x in given:
             shape, size = np.shape(x), np.size(x)
             zero = name in _MAY_BE_ZERO and not self._values[index : index + size].any()
             made = [0.0 if zero else self.symbol("uniform", index + k) for k in range(size)]
@@ -340,9 +346,8 @@ class FlightTrace(Trace):
             parts.setdefault(part, {})[field] = found if shape else found.item()
             index += size
         parts["motion"]["coefficients"] = self._table(MOTION, (1, 6, 6))
-        given = problem.disturbance
         for name, which in (("gust", GUSTS), ("noise_r", NOISE_R), ("noise_v", NOISE_V)):
-            rows, *shape = getattr(given, name).shape
+            rows, *shape = getattr(problem.disturbance, name).shape
             parts["disturbance"][name] = self._table(which, (4 if rows else 0, *shape))
         parts["disturbance"] |= {"gust_step": GUST, "noise_step": NOISE}
         return problem._replace(
@@ -372,14 +377,14 @@ def flight_structure(problem: Problem, values: Floats) -> bytes:
         Some of the problems damp deformations, others do not, which is a branch of the law.
     """
     graph, law, control, given = problem.graph, problem.law, problem.control, problem.disturbance
-    ends = np.cumsum([np.size(x) for x in _numbers_of(problem)])[-len(_MAY_BE_ZERO) - 1 :]
-    of = {name: values[ends[k] : ends[k + 1]].any(axis=0) for k, name in enumerate(_MAY_BE_ZERO)}
-    if len(set(of["law.k_def"].tolist())) > 1:
+    damps = values[_NUMBERS.index("law.k_def")].astype(bool)
+    if damps.any() and not damps.all():
         raise UnfitError("problems that take different branches")
+    of_law = values[len(_NUMBERS) - len(_MAY_BE_ZERO) + 1 : len(_NUMBERS)]
+    there = [*of_law.any(axis=1).tolist(), bool(values[-3:].any())]
     kinds = law.solver, law.iterations, problem.reference.kind, control.kind, given.active
     tables = [len(x) > 0 for x in (given.gust, given.noise_r, given.noise_v)]
-    there = [bool(x.any()) for x in of.values()]
-    pairs = graph.edges.tolist(), graph.pairs.tolist()
+    pairs = graph.edges.tobytes(), graph.pairs.tobytes()
     saturates = bool(problem.vehicles.saturate)
     return repr(
         ("flight", len(problem.vehicles.m), pairs, kinds, tables, saturates, there)
