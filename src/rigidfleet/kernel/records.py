@@ -92,9 +92,7 @@ class Monitor(NamedTuple):
     struck: Pairs  # of a lost agent and one still flying
     columns: Pairs  # that may fly one below the other
     flags: Ints  # (4,) see `monitor.watch`
-    moves: (
-        Floats  # (2,) bounds of how far distances change over a step [m], see `monitor.bound_moves`
-    )
+    moves: Floats  # (2,) bounds of the change of any distance [m], see `monitor.bound_moves`
     recorder: int  # address of the recorder, with its arguments: `time` and `states` to evaluate at
     segment: int
     record: int
