@@ -485,6 +485,32 @@ def test_who_watches_a_large_formation_does_not_change_what_is_found(solver, mon
         assert (one.position == other.position).all()
 
 
+def test_no_step_is_overwritten_before_it_has_been_watched(monkeypatch):
+    """Where the other thread is slow and the flight stops often, to the bit what is found while the flight waits."""
+    mission, take = a_sphere(), watching.Extremes.take
+    here = threading.get_ident()
+
+    def flown() -> list[Any]:
+        flight = Flight(mission)
+        while flight.begin():
+            while flight.advance(0.03):
+                pass
+        return [phase.extremes for phase in flight.finish().phases]
+
+    def take_slowly(*given: Any, **options: Any) -> None:
+        if threading.get_ident() != here:
+            time.sleep(0.02)
+        take(*given, **options)
+
+    def take_here(extremes: Any, problem: Any, work: Any, state: Any) -> None:
+        extremes.take(problem, work, state, last=False)
+
+    monkeypatch.setattr(watching.Extremes, "take", take_slowly)
+    aside = flown()
+    monkeypatch.setattr(watching.Extremes, "hand_over", take_here)
+    assert aside == flown()
+
+
 def test_what_goes_wrong_in_the_thread_that_watches_is_raised(monkeypatch):
     """An error ends the flight; Ctrl-C while it is waited for ends it with what was flown and found."""
     mission, take = a_sphere(), watching.Extremes.take

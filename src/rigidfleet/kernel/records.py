@@ -94,9 +94,7 @@ class Monitor(NamedTuple):
     # (S,) steps of the trail in which no distance can be worse, and after which no force can, if that is known
     quiet: Bools
     calm: Bools
-    moves: (
-        Floats  # (2,) bounds of how far distances change over a step [m], see `monitor.bound_moves`
-    )
+    moves: Floats  # (2,) bounds of the change of any distance [m], see `monitor.bound_moves`
     recorder: int  # address of the recorder, with its arguments: `time` and `states` to evaluate at
     segment: int
     record: int

@@ -116,8 +116,9 @@ class ActivePhase:
     def _start(self, y: Floats, t: float) -> None:
         """Start to integrate the plan at a state (n,) and time [s]."""
         plan = self.plan
-        aside = plan.large and self.external is None
-        trail = self.extremes.begin(len(y), len(plan.edges), aside=aside)
+        #: Whether another thread searches the steps for extremes. It must not ask the user's force.
+        self.aside = plan.large and self.external is None
+        trail = self.extremes.begin(len(y), len(plan.edges), aside=self.aside)
         self.workspace, self.solver = equip(plan)
         self.state = integrator(self.plan, y, t, trail)
 
@@ -233,7 +234,7 @@ class ActivePhase:
         if not self.state.count[4] or self.flown is None:
             return
         work = self.workspace if self.solver is None else self.solver.aside.workspace
-        if last or self.solver is None or self.external is not None:
+        if last or not self.aside:
             self.extremes.take(self.flown, work, self.state, last=last)
         else:
             self.extremes.hand_over(self.flown, work, self.state)
@@ -318,13 +319,13 @@ class ActivePhase:
         stretch = self.prepare(problem, self.times(t_end))
         state, fresh = self.state, stretch.fresh
         status = records.PAUSED
-        most = _STEPS if self.solver is None else self.extremes.room
         go_on = native.Integration(
             problem, self.workspace, state, t_end, stretch.times, stretch.samples
         )
         try:
             while status == records.PAUSED:
                 begun = clock.perf_counter()
+                most = self.extremes.room(state) if self.aside else self.steps
                 status = go_on(fresh, min(self.steps, most))
                 took = max(clock.perf_counter() - begun, 1e-6)
                 if status == records.PAUSED:
@@ -333,7 +334,10 @@ class ActivePhase:
                 if self.external is not None:
                     self.external.check()
                 self.check()
-                if status == records.PAUSED or state.count[4] == len(state.trail.clock):
+                full = state.count[4] == len(state.trail.clock)
+                if self.aside:
+                    full = self.extremes.room(state) < 1
+                if status == records.PAUSED or full:
                     self.watch(last=False)
                 self.pause(self.t)
                 if status == records.PAUSED and self._stalled():

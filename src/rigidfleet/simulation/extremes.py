@@ -172,8 +172,13 @@ class Extremes:
         if aside:
             # Memory costs far more time when it is first touched than ever after. The rows that the integrator reaches
             # after it has handed over steps are touched while it flies these.
-            self._touching = self._beside().submit(trail.points[self.room :].fill, 0.0)
+            self._touching = self._beside().submit(trail.points[self._half :].fill, 0.0)
         return trail
+
+    @property
+    def _half(self) -> int:
+        """Steps that fit into the trail beside as many others and one that has stayed."""
+        return (len(self.trail.clock) - 1) // 2
 
     def _beside(self) -> ThreadPoolExecutor:
         """The other thread."""
@@ -214,19 +219,21 @@ class Extremes:
             flags[:3] = steps, steps, 2 if last else 1
         self.monitor(problem, work, state)
 
-    @property
-    def room(self) -> int:
-        """Number of steps for which the trail has room while another thread evaluates as many, and the one before."""
-        return (len(self.trail.clock) - 1) // 2
+    def room(self, state: records.IntegratorState) -> int:
+        """Number of steps for which the trail has room beside those that another thread evaluates."""
+        half, steps = self._half, int(state.count[4])
+        if self._touching is not None:
+            if not steps:
+                return half
+            self._touching.result()
+            self._touching = None
+        return half + 1 - steps  # at first, or after one that has stayed
 
     def hand_over(self, problem: Problem, work: Workspace, state: records.IntegratorState) -> None:
         """Let another thread evaluate the steps in the trail, `take`; no more than `room` may follow.
 
         Until `wait`, only that thread may use this monitor, ``work``, and what the problem's law changes.
         """
-        if self._touching is not None:
-            self._touching.result()
-            self._touching = None
         taken, count = state._replace(count=state.count.copy()), state.count
         # The last step stays, until its neighbour is known.
         count[4:] = 1, (count[5] + count[4] - 1) % len(state.trail.clock)

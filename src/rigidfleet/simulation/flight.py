@@ -478,11 +478,11 @@ class Flight:
         if own and not whole and not self.ending:
             self.ending = f"ended at t = {self.t:.2f} s, before the mission's end"
         self._finished = True
-        result = self.record(self.pieces, None if own else self._asked)
-        self._prepared.give_back(self._extremes)
         if self._ended is not None:  # no phase follows
             self._ended.release()
             self._ended = None
+        result = self.record(self.pieces, None if own else self._asked)
+        self._prepared.give_back(self._extremes)
         return result
 
     def record(

@@ -38,6 +38,9 @@ _SINGULAR = 400
 _WORK, _LEAST = 400_000_000, 9
 
 
+#: Agents whose vectors are turned at a time.
+_AT_ONCE = 4096
+
 #: Columns of a record that are those of the phase, also where a user's controller flies.
 _REFERENCES = "r_ref", "p", "motion", "rates", "T_ref", "wrench"
 _STATES = "position", "velocity"
@@ -94,8 +97,7 @@ class Unevaluated(NamedTuple):
             return r.copy(), v.copy()
         q, *cm = np.split(self.y[:, 6 * n + m :], [4, 7], axis=1)
         T = att.dcm_from_quaternion(q / np.linalg.norm(q, axis=1, keepdims=True))
-        r_cm, v_cm = (x[:, None] for x in cm)
-        return r_cm + r @ T, v_cm + v @ T
+        return _in_world(r, T, cm[0]), _in_world(v, T, cm[1])
 
     def evaluated(self, times: Floats, work: Workspace) -> Record:
         """Forces and references at the samples, times (K,) [s]."""
@@ -112,6 +114,18 @@ class Unevaluated(NamedTuple):
             of_phase = native.record(self.planned, work, times, self.y)
             for name in _REFERENCES:
                 getattr(out.of, name)[first : first + len(times)] = getattr(of_phase, name)
+
+
+def _in_world(x: Floats, T: Floats, origin: Floats) -> Floats:
+    """origin + T^T x of vectors x (K, N, 3) in body axes, world -> body T (K, 3, 3), and origin (K, 3).
+
+    Of some agents at a time: what is between stays in the cache, and no threads are started for so little.
+    """
+    out = np.empty(x.shape)
+    for k in range(0, x.shape[1], _AT_ONCE):
+        part = slice(k, k + _AT_ONCE)
+        np.add(origin[:, None], x[:, part] @ T, out=out[:, part])
+    return out
 
 
 @dataclass
