@@ -51,17 +51,13 @@ class Quantity:
     def __init__(self, values: Floats, who: Callable[..., str], rank: Floats, starts: Ints) -> None:
         """Take values with their ranks (K, ...), and the samples at which phases begin."""
         self.values, self.who = values, who
-        self.rank = rank.reshape(len(rank), -1)
-        self.most = self._most(starts)
-        if not all(rank < math.inf for rank in self.most):  # NaN, too
+        self.rank, flat = rank.reshape(len(rank), -1), rank.reshape(-1)
+        if not math.isfinite(flat @ flat):  # of all tests the fastest
             self.rank = np.where(np.isfinite(self.rank), self.rank, -np.inf)
-            self.most = self._most(starts)
-
-    def _most(self, starts: Ints) -> list[float]:
         places = self.rank.shape[1]
-        if not places:
-            return [-math.inf] * len(starts)
-        return np.maximum.reduceat(self.rank.reshape(-1), places * starts).tolist()
+        self.most = [-math.inf] * len(starts)
+        if places:
+            self.most = np.maximum.reduceat(self.rank.reshape(-1), places * starts).tolist()
 
 
 class Measurements:
