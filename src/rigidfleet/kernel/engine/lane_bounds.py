@@ -166,30 +166,58 @@ def bound_forces(t, p, row, before):
 def mark_quiet(bounds: LaneArray, rows: Ints, monitors: Sequence[Monitor]) -> None:
     """Mark the steps in some rows of eight flights' trails in which none of their monitors can find anything worse.
 
-    The last step has no neighbour yet. A step cannot hold a least value if its bound is above the least of those known and of those at the ends of steps;
+    A step cannot hold a least value if its bound is above the least of those known and of those at the ends of steps;
     or if it is no lower than the least of those before: then an earlier step has it, up to a tenth of `CLOSE`, which
-    the monitor does not tell apart.
+    the monitor does not tell apart. Near the end of a step no force can be greatest if neither its value there nor what
+    it promises is as great as the greatest at the ends of steps; the last step has no neighbour yet.
     """
-    found = unpack(bounds)[rows]  # (S, columns, 8)
-    bound, end = found[:, :ENDS], found[:, ENDS:STACKS]
-    known = np.empty((len(rows) + 1, ENDS, len(monitors)))
-    known[0] = np.stack([monitor.worst for monitor in monitors], axis=-1)[_QUANTITIES]
-    known[0, SPEEDS] *= np.abs(known[0, SPEEDS])
-    known[1:] = end
-    np.minimum.accumulate(known, axis=0, out=known)
-    above = bound > known[-1] + (_MARGIN + _SHARE * np.abs(known[-1]))
-    above |= bound >= known[:-1] - 0.1 * CLOSE
-    quiet = above.all(axis=1) & (found[:, STACKS] > _MARGIN)
-    nearest = bound[:, CLEARANCES].min(axis=0).tolist()
-    for lane, monitor in enumerate(monitors):
+    worst = np.array([monitor.worst for monitor in monitors]).T
+    known = np.concatenate([worst[_QUANTITIES], -worst[_OF_FORCES]])
+    known[SPEEDS] *= np.abs(known[SPEEDS])
+    quiet, calm = np.empty((2, len(rows), len(monitors)), dtype=np.bool_)
+    nearest = np.empty(len(monitors))
+    _mark(unpack(bounds), rows, known, known.copy(), quiet, calm, nearest)
+    for lane, (monitor, near) in enumerate(zip(monitors, nearest.tolist(), strict=True)):
         # Where an agent stands, lands or takes off, what is stored depends on every step.
-        landed = nearest[lane] <= monitor.pad + _MARGIN or monitor.standing.any()
-        landed = landed or len(monitor.fence) > 0 or monitor.low[:, 0].min() < np.inf
+        landed = near <= monitor.pad + _MARGIN or len(monitor.fence) > 0
+        landed = landed or monitor.standing.any() or monitor.low[:, 0].min() < np.inf
         monitor.quiet[rows] = False if landed else quiet[:, lane]
-    peak, end = found[:, FIRST_FORCE : FIRST_FORCE + FORCES], found[:, FIRST_FORCE + FORCES :]
-    worst = np.stack([monitor.worst for monitor in monitors], axis=-1)[_OF_FORCES]
-    floor = np.maximum(-worst, end.max(axis=0))
-    calm = ((peak <= floor) & ((end < floor) | (floor < -0.5 * _FAR))).all(axis=1)
-    calm[-1] = False
-    for lane, monitor in enumerate(monitors):
         monitor.calm[rows] = calm[:, lane]
+
+
+@compiled
+def _mark(bounds, rows, known, limit, quiet, calm, nearest):
+    """Of bounds (R, columns, 8), the steps (S, 8) to leave out, and the least bound of the clearance (8,).
+
+    ``known`` and ``limit`` (11, 8), which are overwritten, hold the worst values of distances and of forces.
+    """
+    steps, lanes = rows.shape[0], nearest.shape[0]
+    for lane in range(lanes):
+        nearest[lane] = _FAR
+    for k in range(steps):
+        found = bounds[rows[k]]
+        for c in range(ENDS):
+            for lane in range(lanes):
+                limit[c, lane] = min(limit[c, lane], found[ENDS + c, lane])
+        for c in range(FORCES):
+            for lane in range(lanes):
+                end = found[FIRST_FORCE + FORCES + c, lane]
+                limit[ENDS + c, lane] = max(limit[ENDS + c, lane], end)
+        for lane in range(lanes):
+            nearest[lane] = min(nearest[lane], found[CLEARANCES, lane])
+    for k in range(steps):
+        found = bounds[rows[k]]
+        for lane in range(lanes):
+            quiet[k, lane], calm[k, lane] = found[STACKS, lane] > _MARGIN, k + 1 < steps
+        for c in range(ENDS):
+            for lane in range(lanes):
+                bound, least, before = found[c, lane], limit[c, lane], known[c, lane]
+                above = bound > least + _MARGIN + _SHARE * abs(least)
+                quiet[k, lane] &= above or bound >= before - 0.1 * CLOSE
+                known[c, lane] = min(before, found[ENDS + c, lane])
+        for c in range(FORCES):
+            for lane in range(lanes):
+                peak, end = found[FIRST_FORCE + c, lane], found[FIRST_FORCE + FORCES + c, lane]
+                greatest = limit[ENDS + c, lane]
+                unlimited = greatest < -0.5 * _FAR  # thrust beyond a limit that is none
+                calm[k, lane] &= unlimited or (peak <= greatest and end < greatest)
