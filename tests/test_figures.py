@@ -1104,8 +1104,8 @@ def test_powers_of_ten_are_letters(triangle):
     raised = dict(zip("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789", strict=True))
     ticks = [(x, t.get_text()) for x, t in zip(ax.get_yticks(), ax.get_yticklabels(), strict=True)]
     assert len(ticks) > 1
-    for value, words in ticks:
-        assert 10.0 ** int("".join(raised[c] for c in words[2:])) == pytest.approx(value)
+    for value, text in ticks:
+        assert 10.0 ** int("".join(raised[c] for c in text[2:])) == pytest.approx(value)
     assert [style.power(value, 0) for value in (0.02, 1.0, 0.0)] == ["0.02", "10⁰", "0"]
 
 

@@ -96,7 +96,9 @@ def unrolled_together(problems: Sequence[Problem], tables: Tables) -> UnrolledPr
     ready = _prepared(
         first, flight_structure(first, values), values, lambda: FlightTrace(first, values)
     )
-    motion = interleaved([p.motion.coefficients for p in problems], (-1, 36))
+    motion = interleaved(
+        [p.motion.coefficients for p in problems], (len(first.motion.coefficients), 36)
+    )
     return ready._replace(
         before=packed([p.reference.d0 for p in problems]), knots=first.motion.knots, motion=motion,
         **tables._asdict(),
@@ -134,10 +136,9 @@ def packed(parts: Sequence[Floats]) -> LaneArray:
 def interleaved(parts: Sequence[Floats], shape: tuple[int, ...]) -> LaneArray:
     """Lanes of eight large arrays, in C order, as an array of some shape."""
     parts = [np.ascontiguousarray(x) for x in parts]
-    made = simd.empty((parts[0].size,))
-    _interleave(np.array([x.ctypes.data for x in parts]), made)
-    lanes: LaneArray = made.reshape(shape)
-    return lanes
+    made = simd.empty(shape)
+    _interleave(np.array([x.ctypes.data for x in parts]), made.reshape(-1))
+    return made
 
 
 @compiled
@@ -160,12 +161,12 @@ def _prepared(
     )
     before(given.ctypes.data, uniform.ctypes.data)
     edges, reference = len(problem.graph.edges), problem.reference
-    none = simd.empty((0, 1))
+    none, nobody = simd.empty((0, 1)), simd.empty((0,))
     return UnrolledProblem(
         address, uniform, simd.pack(np.zeros((edges, WIDTH))), np.zeros(MOMENT),
         simd.pack(np.zeros((len(code.gauge), WIDTH))), reference.t0, reference.T_b,
         np.zeros(0), none, 1.0, none, 1.0, none, none, np.zeros((5, WIDTH), dtype=np.int64),
-        none, none, none[:, 0], np.zeros((0, 2), dtype=np.int64), none, none[:, 0], none, np.zeros(2),
+        none, none, nobody, np.zeros((0, 2), dtype=np.int64), none, nobody, none, np.zeros(2),
     )  # fmt: skip
 
 

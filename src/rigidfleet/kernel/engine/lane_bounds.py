@@ -59,6 +59,13 @@ def _square(x, y, z):
     return x * x + y * y + z * z
 
 
+@inlined
+def _outside(below, above):
+    """How far something is below or above an interval [m]."""
+    outside = max(below, above)
+    return max(outside, 0.0)
+
+
 @compiled
 def bound_step(points, p, row):
     """Write the bounds of a step with control points (5, n), in lanes, into row ``row`` of ``p.bounds``."""
@@ -106,13 +113,13 @@ def bound_step(points, p, row):
             x_low, y_low, z_low = p.boxes[b, 0], p.boxes[b, 1], p.boxes[b, 2]
             x_high, y_high, z_high = p.boxes[b, 3], p.boxes[b, 4], p.boxes[b, 5]
             # The distance of the box about the control points, and that of the end.
-            a = max(max(x_low - x1, x0 - x_high), 0.0)
-            c = max(max(y_low - y1, y0 - y_high), 0.0)
-            d = max(max(z_low - z1, z0 - z_high), 0.0)
+            a = _outside(x_low - x1, x0 - x_high)
+            c = _outside(y_low - y1, y0 - y_high)
+            d = _outside(z_low - z1, z0 - z_high)
             far = min(far, _square(a, c, d))
-            a = max(max(x_low - x, x - x_high), 0.0)
-            c = max(max(y_low - y, y - y_high), 0.0)
-            d = max(max(z_low - z, z - z_high), 0.0)
+            a = _outside(x_low - x, x - x_high)
+            c = _outside(y_low - y, y - y_high)
+            d = _outside(z_low - z, z - z_high)
             far_end = min(far_end, _square(a, c, d))
         clear = min(clear, far * inverse_root_of(far + 1e-30) - p.radius[i])
         clear_end = min(clear_end, far_end * inverse_root_of(far_end + 1e-30) - p.radius[i])
@@ -132,7 +139,7 @@ def begin_forces(t, p):
 
 @compiled
 def bound_forces(t, p, row, before):
-    """Write the forces at the end t [s] of a step into row ``row``, and what they promise near the end of the one before.
+    """Write the forces at the end t [s] of a step into row ``row``, and what those of the row ``before`` promise.
 
     As `monitor.promise` says: the top of the parabola through three values, with twice the rise that counts there.
     """

@@ -190,7 +190,7 @@ def pack(x: Any) -> Packed:
 
 
 class _Last(threading.local):
-    """The tuples that a thread packed last, by their identity: flights call the kernel with the same ones repeatedly."""
+    """The tuples that a thread packed last, by identity: flights call the kernel with the same ones repeatedly."""
 
     def __init__(self) -> None:
         self.packed: dict[int, Packed] = {}

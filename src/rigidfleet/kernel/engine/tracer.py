@@ -381,7 +381,7 @@ def flight_structure(problem: Problem, values: Floats) -> bytes:
     if damps.any() and not damps.all():
         raise UnfitError("problems that take different branches")
     of_law = values[len(_NUMBERS) - len(_MAY_BE_ZERO) + 1 : len(_NUMBERS)]
-    there = [*of_law.any(axis=1).tolist(), bool(values[-3:].any())]
+    there = [bool(x.any()) for x in (*of_law, values[-3:])]
     kinds = law.solver, law.iterations, problem.reference.kind, control.kind, given.active
     tables = [len(x) > 0 for x in (given.gust, given.noise_r, given.noise_v)]
     pairs = graph.edges.tobytes(), graph.pairs.tobytes()
