@@ -14,6 +14,7 @@ from rigidfleet.kernel.gauge import read_gauge
 from rigidfleet.kernel.problem import Problem, workspace
 from rigidfleet.mission import Mission, load_mission
 from rigidfleet.result import Result
+from rigidfleet.simulation import together
 from rigidfleet.simulation.flight import Flight, simulate
 from rigidfleet.simulation.together import simulate_together
 
@@ -245,3 +246,52 @@ def test_arrays_of_eight_flights_become_lanes():
     for k, part in enumerate(parts):
         np.testing.assert_array_equal(unpack(made)[:, k], part.ravel())
     assert empty((3, 2)).ctypes.data % 64 == 0
+
+
+def test_marks_of_a_phase_side_by_side_do_not_outlast_it():
+    """A phase that is flown alone later finds no step marked: it searches all of them."""
+    flights = [Flight(mission) for mission in varied("narrow-passage", folding, 2)]
+    for _ in range(3):
+        for flight in flights:
+            flight.begin()
+        phases = [flight.under_way() for flight in flights]
+        vector = together._vector(phases)
+        assert together._fly(phases, vector)
+        for flight in flights:
+            flight.arrive()
+        for phase in phases:
+            monitor = phase.extremes.monitor.monitor
+            assert len(monitor.quiet) == len(phase.state.trail.clock)
+            assert not monitor.quiet.any()
+            assert not monitor.calm.any()
+
+
+def test_steps_that_are_left_out_hold_nothing_worse(monkeypatch):
+    """Extremes of all phases are those of a search of every step: distances to 1e-9 m, forces to 1e-3 in noise."""
+    missions = varied("windy-passage", windy)
+    few = simulate_together(missions)
+    monkeypatch.setattr(batch.lane_bounds, "mark_quiet", lambda *_: None)
+    for one, other in zip(few, simulate_together(missions), strict=True):
+        for phase, whole in zip(one.phases, other.phases, strict=True):
+            assert phase.extremes.keys() == whole.extremes.keys()
+            for name, found in phase.extremes.items():
+                distance = name in ("separation", "clearance", "lowest", "highest", "speed")
+                expected = whole.extremes[name].value
+                close = 1e-9 if distance else 1e-3 * abs(expected)
+                assert found.value == pytest.approx(expected, abs=close)
+
+
+def test_few_steps_are_searched():
+    """In calm and in noise most steps are marked, or the search would take as long as the flight."""
+    marked = [0, 0]
+
+    def counted(bounds: Any, rows: np.ndarray, monitors: Any) -> None:
+        original(bounds, rows, monitors)
+        marked[0] += len(rows) * len(monitors)
+        marked[1] += sum(int(m.quiet[rows].sum()) for m in monitors)
+
+    original = batch.lane_bounds.mark_quiet
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(batch.lane_bounds, "mark_quiet", counted)
+        simulate_together(varied("windy-passage", windy))
+    assert marked[1] > 0.7 * marked[0]

@@ -647,7 +647,7 @@ def watch_forces(p, w, state, monitor, steps, last):
     for step in range(steps):
         new = step > 0 or monitor.flags[3] == 0
         row = row_of(step, state)
-        if step > 0 and step + 1 < steps and known(monitor.calm, row):
+        if known(monitor.calm, row) and 0 < step < steps - 1:
             continue
         start, end = trail.clock[row, 0], end_of(step, state)
         after = trail.gauge[row]

@@ -151,7 +151,12 @@ class Extremes:
         self.standing[:] = self.stood
         self.of_vehicles, self.avoidance, self.led = {}, None, {}
         if len(self.trail.points):
-            self.monitor.monitor.flags.fill(0)
+            for marks in (
+                self.monitor.monitor.flags,
+                self.monitor.monitor.quiet,
+                self.monitor.monitor.calm,
+            ):
+                marks.fill(0)
 
     def begin(self, states: int, edges: int, *, aside: bool = False) -> records.Trail:
         """Begin to monitor an integrator with this many states; it must record its steps in the returned trail.

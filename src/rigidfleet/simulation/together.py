@@ -62,8 +62,8 @@ def simulate_together(missions: Sequence[Mission]) -> list[Result]:
 
 def _alike(active: Sequence[ActivePhase]) -> bool:
     """Whether phases differ in nothing but numbers, so that they can share steps."""
-    first = _times(active[0])
-    if not all(_plain(phase) and _times(phase) == first for phase in active):
+    first = _kind(active[0])
+    if not all(_plain(phase) and _kind(phase) == first for phase in active):
         return False
     from rigidfleet.kernel.engine import batch
 
@@ -83,11 +83,12 @@ def _plain(phase: ActivePhase) -> bool:
     )
 
 
-def _times(phase: ActivePhase) -> tuple[object, ...]:
-    """When a phase is flown, and all that the times to record follow from."""
-    plan = phase.plan
+def _kind(phase: ActivePhase) -> tuple[object, ...]:
+    """What phases that share steps have in common: when they are flown and recorded, and sizes of arrays."""
+    plan, extremes = phase.plan, phase.extremes
     points = tuple(t for t, _ in plan.through)
-    return plan.start, plan.t_end, plan.arrival, points, plan.integrator.rtol, len(phase.state.y)
+    times = plan.start, plan.t_end, plan.arrival, points
+    return *times, plan.integrator.rtol, len(phase.state.y), len(extremes.boxes)
 
 
 def _vector(active: Sequence[ActivePhase]) -> Vector:

@@ -29,8 +29,10 @@ def fly_runs(sweep: Sweep, runs: Sequence[int]) -> list[RunRecord]:
         from rigidfleet.sweep.final_states import fly_final_states
 
         return fly_final_states(sweep, runs)
-    groups = [runs[k : k + GROUP] for k in range(0, len(runs), GROUP)]
-    return [row for group in groups for row in _fly(sweep, group)]
+    groups: dict[int, list[int]] = {}
+    for run in runs:
+        groups.setdefault(run // GROUP, []).append(run)
+    return [row for group in groups.values() for row in _fly(sweep, group)]
 
 
 def _fly(sweep: Sweep, runs: Sequence[int]) -> list[RunRecord]:
@@ -40,13 +42,13 @@ def _fly(sweep: Sweep, runs: Sequence[int]) -> list[RunRecord]:
 
     begun = perf_counter()
     missions = {run: _tried(lambda run=run: sweep.mission_of(run)) for run in runs}
-    whole = [run for run, mission in missions.items() if not isinstance(mission, Exception)]
+    valid = [run for run, mission in missions.items() if not isinstance(mission, Exception)]
     flown: dict[int, Any] = dict(missions)
-    together = _tried(lambda: simulate_together([missions[run] for run in whole]))
+    together = _tried(lambda: simulate_together([missions[run] for run in valid]))
     if isinstance(together, Exception):
-        flown |= {run: _tried(lambda run=run: simulate(missions[run])) for run in whole}
+        flown |= {run: _tried(lambda run=run: simulate(missions[run])) for run in valid}
     else:
-        flown |= dict(zip(whole, together, strict=True))
+        flown |= dict(zip(valid, together, strict=True))
     shared = (perf_counter() - begun) / len(runs)
     return [_row(sweep, run, flown[run], shared) for run in runs]
 
