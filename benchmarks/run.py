@@ -49,7 +49,7 @@ FLIGHTS, SCIPYS = 1000, 5
 RTOL, ATOL = 1e-6, 1e-8
 SPREAD = 0.25
 #: Flights in wind of a round; runs of a sweep in another one, whole groups of eight.
-WINDY, RUNS = 2000, 24
+WINDY, RUNS = 5000, 96
 #: Missions flown, and their agents.
 FORMATIONS = {"establish-triangle": 3, "establish-cube": 8}
 #: Peers fly the same law: their positions may differ by no more [m].

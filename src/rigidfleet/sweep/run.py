@@ -41,16 +41,16 @@ def _fly(sweep: Sweep, runs: Sequence[int]) -> list[RunRecord]:
     from rigidfleet.simulation.together import simulate_together
 
     begun = perf_counter()
-    missions = {run: _tried(lambda run=run: sweep.mission_of(run)) for run in runs}
-    valid = [run for run, mission in missions.items() if not isinstance(mission, Exception)]
-    flown: dict[int, Any] = dict(missions)
-    together = _tried(lambda: simulate_together([missions[run] for run in valid]))
+    flown: dict[int, Any] = {run: _tried(lambda run=run: sweep.mission_of(run)) for run in runs}
+    valid = [run for run, mission in flown.items() if not isinstance(mission, Exception)]
+    together = _tried(lambda: simulate_together([flown[run] for run in valid]))
     if isinstance(together, Exception):
-        flown |= {run: _tried(lambda run=run: simulate(missions[run])) for run in valid}
-    else:
-        flown |= dict(zip(valid, together, strict=True))
+        together = [_tried(lambda run=run: simulate(flown[run])) for run in valid]
+    flown |= zip(valid, together, strict=True)
+    del together
     shared = (perf_counter() - begun) / len(runs)
-    return [_row(sweep, run, flown[run], shared) for run in runs]
+    # Each flight is let go of when it is judged: the next one's record takes its memory over.
+    return [_row(sweep, run, flown.pop(run), shared) for run in runs]
 
 
 def _tried(job: Callable[[], Any]) -> Any:
