@@ -38,6 +38,9 @@ _START = np.zeros(1, dtype=np.int64)
 #: longest.
 _SHORT, _INSTANT, _SHARE = 1e-3, 1e-6, 0.05
 
+#: Numbers from which on a product is shared out over threads.
+_PRODUCT = 10_000
+
 
 class Quantity:
     """Values (K, ...) at samples, with the name of their owner.
@@ -52,7 +55,8 @@ class Quantity:
         """Take values with their ranks (K, ...), and the samples at which phases begin."""
         self.values, self.who = values, who
         self.rank, flat = rank.reshape(len(rank), -1), rank.reshape(-1)
-        if not math.isfinite(flat @ flat):  # of all tests the fastest
+        # Of all tests of few numbers a product is the fastest; one of many would wake other threads, for a sum's time.
+        if not math.isfinite(flat @ flat if flat.size < _PRODUCT else flat.sum()):
             self.rank = np.where(np.isfinite(self.rank), self.rank, -np.inf)
         places = self.rank.shape[1]
         self.most = [-math.inf] * len(starts)

@@ -36,9 +36,12 @@ def whole(x: Numbers) -> Any:
 
 
 def zero(x: Numbers) -> Any:
-    """Zeros of the same shape, with which NumPy compares in half the time that it takes with a number."""
-    return np.zeros(np.shape(x))
+    """Zero: as zeros of the same shape if there are few, with which NumPy compares in half the time."""
+    return np.zeros(np.shape(x)) if np.size(x) <= _FEW else 0.0
 
+
+#: Greatest number of zeros: more would not stay in the processor's cache.
+_FEW = 100_000
 
 # -- boxes, balls, half spaces -------------------------------------------------------------------------
 
