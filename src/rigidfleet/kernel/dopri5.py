@@ -87,11 +87,17 @@ def until_knot(t, step):
 
 @inlined
 def step_size(t, h, t_end, p):
+    """Length of the next step [s], see `step_to_knot`."""
+    return step_to_knot(t, h, t_end, p.disturbance)
+
+
+@inlined
+def step_to_knot(t, h, t_end, disturbance):
     """Length of the next step [s]: about h at most, in equal steps up to the next knot of gusts or noise.
 
     Third derivatives of the disturbances jump at knots; the error of a step across one falls with h^4 only.
     """
-    rest, disturbance = t_end - t, p.disturbance
+    rest = t_end - t
     if disturbance.noise_r.shape[0] == 0 and disturbance.gust.shape[0] == 0:
         return min(h, rest)
     if disturbance.noise_r.shape[0] > 0:

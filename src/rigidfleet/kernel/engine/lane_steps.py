@@ -13,13 +13,11 @@ Both sums load the same numbers, and derivatives of positions are neither stored
 [r (3N), v (3N), int c (m)].
 """
 
-import math
-
 import numpy as np
 
 from rigidfleet.kernel.compiler.jit import compiled, inlined
 from rigidfleet.kernel.compiler.simd import spread
-from rigidfleet.kernel.dopri5 import until_knot
+from rigidfleet.kernel.dopri5 import step_to_knot
 from rigidfleet.kernel.engine.lane_bounds import begin_forces, bound_forces, bound_step
 from rigidfleet.kernel.vectors import filled, rough_inverse
 
@@ -166,15 +164,8 @@ def squared_errors(k, h, rtol, p):
 
 @inlined
 def step_size(t, h, t_end, p):
-    """As `dopri5.step_size`."""
-    rest = t_end - t
-    if p.noise_r.shape[0] == 0 and p.gust.shape[0] == 0:
-        return min(h, rest)
-    if p.noise_r.shape[0] > 0:
-        rest = min(rest, until_knot(t, p.noise_step))
-    if p.gust.shape[0] > 0:
-        rest = min(rest, until_knot(t, p.gust_step))
-    return rest / max(1.0, math.ceil(rest / h - 0.05))
+    """As `dopri5.step_size`; the tables of an `UnrolledProblem` are named as those of a `Disturbance`."""
+    return step_to_knot(t, h, t_end, p)
 
 
 @inlined
